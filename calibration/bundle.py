@@ -42,7 +42,7 @@ from tacsim.record.images import decode_image, encode_png
 FORMAT = FORMATS[-1]
 SERIAL = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
 SINCE = {"darkness": 5, "noise": 3, "region": 5, "view": 2}  # the first format that has the field
-DEPTH_FORMAT = 6  # from which on a light may tell what depth changes
+DEPTH_FORMAT, SLOPES_FORMAT = 6, 7  # from which on a light may tell what depth changes, and of slopes at depth
 
 Positive = Annotated[Length, Field(gt=0)]
 Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
@@ -77,7 +77,7 @@ class Provenance(Config):
 class Calibration(Config):
     """All that calibration has found out about one sensor."""
 
-    format: Literal[1, 2, 3, 4, 5, 6]
+    format: Literal[1, 2, 3, 4, 5, 6, 7]
     serial: Annotated[str, Field(pattern=SERIAL)]
     geometry: SensorGeometry  # of the picture that the models are for: the native one, or with `view` the rectified
     gel_size: tuple[Positive, Positive]  # x, y of the gel that the picture shows [m]
@@ -113,8 +113,11 @@ class Calibration(Config):
             raise ValueError(f"gel_size is {self.gel_size} m, the picture of its geometry shows {shown} m")
         if self.view is not None and self.view.geometry != self.geometry:
             raise ValueError(f"geometry is {self.geometry}, its view gives {self.view.geometry}")
-        if self.format < DEPTH_FORMAT and self.forward is not None and self.forward.depth is not None:
+        deep = None if self.forward is None else self.forward.depth
+        if self.format < DEPTH_FORMAT and deep is not None:
             raise ValueError(f"format {self.format} has no forward.depth")
+        if self.format < SLOPES_FORMAT and deep is not None and deep.slopes:
+            raise ValueError(f"format {self.format} has no forward.depth.slopes")
         for name in sorted(_later_than(self.format)):
             if getattr(self, name) is not None:
                 raise ValueError(f"format {self.format} has no {name}")

@@ -108,7 +108,7 @@ def _pattern(image: Float32, valid: NDArray[np.bool_]) -> Float32:
     """(n, 3) brightness of each block of the gel in each colour, relative to the mean."""
     import cv2
 
-    size = (valid.shape[1] // BLOCK, valid.shape[0] // BLOCK)
+    size = (max(valid.shape[1] // BLOCK, 1), max(valid.shape[0] // BLOCK, 1))
     whole = cv2.resize(valid.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
     parts = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))[whole]
     return np.asarray(parts / parts.mean(axis=0) - 1.0, dtype=np.float32)

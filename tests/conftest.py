@@ -20,6 +20,7 @@ import pytest
 pytest_plugins = ["tests.promises"]  # figures of what is promised of arms and cameras
 if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ.setdefault("TACSIM_THREADS", "1")  # every process has a core
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command has it: the last bits depend on it
 
 DEVICES = ("/dev/tty", "/dev/video", "/dev/v4l", "/dev/serial")
 

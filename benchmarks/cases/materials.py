@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from benchmarks.cases.squeeze import close, normal_forces
 from benchmarks.harness.measure import Measurement, Timing, step_cost, timed
 from benchmarks.harness.runner import Case
+from benchmarks.truth import laws
 from benchmarks.truth.clay import CLAY, COURANT, uniaxial_stress
 from tacsim.interface import FloatArray
 from tacsim.models.scene import Body, BodyMaterial, Box, Gel, GelMaterial, Scene
 from tacsim.physics.move import MoveStats
-from tacsim.physics.oracle import laws
 
 RIGID = GelMaterial(youngs_modulus=100e6, poisson_ratio=0.45)  # gels as plates: they give 1 um
 FreeAxes = tuple[float, float, float]  # by axis: 0 forbids motion, 1 allows it

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from benchmarks.harness.measure import Measurement, Timing, timed
 from benchmarks.harness.runner import Case
+from benchmarks.truth.layer import LayerContact, layer_contact
 from benchmarks.truth.limit import (
     DEPTH,
     ELEMENTS,
@@ -41,7 +42,6 @@ from tacsim.models.scene import (
     Sphere,
 )
 from tacsim.physics.move import MoveStats
-from tacsim.physics.oracle.layer import LayerContact, layer_contact
 
 if TYPE_CHECKING:
     from tacsim.physics.worlds.press import PressWorld

@@ -20,8 +20,8 @@ from scipy.interpolate import RegularGridInterpolator
 
 from benchmarks.harness.measure import Measurement, timed
 from benchmarks.truth.limit import DEPTH, GRID_HALF, LIMIT, RADIUS, load_limit, rms
+from benchmarks.truth.mls_mpm import GridScalars, GridVectors, Matrices, Vectors, clear, mat3, vec3
 from tacsim.compute.runtime import start, ti
-from tacsim.physics.oracle.mls_mpm import GridScalars, GridVectors, Matrices, Vectors, clear, mat3, vec3
 
 f32 = ti.f32
 

@@ -1,4 +1,4 @@
-"""MLS-MPM as textbooks print it (tacsim/physics/oracle/mls_mpm.py), on all cores: a cube between two frictionless
+"""MLS-MPM as textbooks print it (benchmarks/truth/mls_mpm.py), on all cores: a cube between two frictionless
 plates, which are planes of grid nodes. Units: mm, N, MPa, wave speed 1."""
 
 from functools import partial
@@ -7,8 +7,7 @@ import numpy as np
 
 from benchmarks.harness.measure import Measurement, step_cost, timed
 from benchmarks.truth.clay import CLAY, COURANT, uniaxial_stress
-from tacsim.compute.runtime import start, ti
-from tacsim.physics.oracle.mls_mpm import (
+from benchmarks.truth.mls_mpm import (
     GridScalars,
     GridVectors,
     Material,
@@ -16,6 +15,7 @@ from tacsim.physics.oracle.mls_mpm import (
     grid_to_particles,
     particles_to_grid,
 )
+from tacsim.compute.runtime import start, ti
 
 Force = ti.types.ndarray(dtype=ti.f32, ndim=1)
 

@@ -3,9 +3,9 @@
 The inverse of a light takes every pixel for itself. It cannot know that a pixel lies in the shade of another, nor which
 of two slopes of nearly one colour fits a surface. Both are known once there is a surface, so it is sought as
 
-    min over height h, slopes g of  sum over pixels, channels rho(c - light(g) - rest(h)) + STIFFNESS |g - grad h|^2
+    min over height h, slopes g of  sum over pixels, channels rho(c - light(g, h) - rest(h)) + STIFFNESS |g - grad h|^2
 
-for the seen change of colour c, of which rest(h) is what depth and cast shadows change: in turn a Gauss-Newton step in
+for the seen change of colour c, of which rest(h) is what cast shadows change: in turn a Gauss-Newton step in
 g, pixel by pixel, and the h whose slopes are nearest to it (Poisson's equation; half-quadratic splitting, Geman and
 Yang 1995). It starts from the inverse's height. rho is Cauchy's: a channel that no slope explains, being saturated or
 dirty, counts little.
@@ -64,14 +64,16 @@ class ForwardSteps:
         for _ in range(STEPS):
             slopes = np.stack(slopes_of(height, self._pitch), axis=-1)
             flat = slopes.reshape(-1, 2)
-            flat[rows] = self._step(flat[rows], colour, place, self._rest(height, rows, place))
+            relative = height * self._scale
+            deep = relative.ravel()[rows]
+            flat[rows] = self._step(flat[rows], colour, (*place, deep), self._rest(relative, place))
             height = integrate(slopes)
         return height
 
     def _step(
-        self, slope: Float32, colour: list[Float32], place: tuple[Float32, Float32], rest: Float32 | None
+        self, slope: Float32, colour: list[Float32], place: tuple[Float32, Float32, Float32], rest: Float32 | None
     ) -> Float32:
-        """(..., 2) slopes after a Gauss-Newton step from those of the surface."""
+        """(..., 2) slopes after a Gauss-Newton step from those of the surface, at places u, v, height."""
         here = self._light.change(slope, *place)[0]
         delta = np.eye(2, dtype=np.float32) * np.float32(DELTA)
         by_x, by_y = ((self._light.change(slope + step, *place)[0] - here) / np.float32(DELTA) for step in delta)
@@ -90,15 +92,13 @@ class ForwardSteps:
         least = np.minimum(1, EXTRAPOLATION * self._model.steepest / np.maximum(steepness, 1e-9))
         return np.asarray(better * least[..., None], dtype=np.float32)
 
-    def _rest(self, height: Float32, rows: NDArray[np.intp], place: tuple[Float32, Float32]) -> Float32 | None:
-        """(..., 3) change of colour of pixels `rows` (...) at places u, v by what a surface of this height (H, W) does
-        beside its slopes: its depth, and what it hides from the lamps."""
+    def _rest(self, relative: Float32, place: tuple[Float32, Float32]) -> Float32 | None:
+        """(..., 3) change of colour of pixels at places u, v (...,) by what a surface of this height (H, W) [widths of
+        the picture] hides from the lamps; None: nothing."""
         import cv2
 
-        relative = height * self._scale
-        deep = None if self._model.depth is None else self._light.depth(relative.ravel()[rows], *place)
         if self._model.shadows is None:
-            return deep
+            return None
         u, v = place
 
         def height_at(x: Float32, y: Float32) -> Float32:
@@ -107,5 +107,4 @@ class ForwardSteps:
             return np.asarray(seen, dtype=np.float32)
 
         horizons = [horizon(height_at, u, v * self._flat, lamp) for lamp in self._model.shadows.lamps]
-        shade = self._light.shadow(horizons, u, v)
-        return shade if deep is None else deep + shade
+        return self._light.shadow(horizons, u, v)

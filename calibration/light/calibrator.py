@@ -40,8 +40,16 @@ from calibration.light.labels import (
     inverse_model,
     label,
     near_contact,
+    too_dark,
 )
-from calibration.light.photometry import FEW_PRESSES, choose_size
+from calibration.light.photometry import (
+    FEW_PRESSES,
+    SLOPE_TERMS,
+    ModelSize,
+    NormalEquations,
+    choose_size,
+    solve,
+)
 from calibration.light.press import BallPress, Window, find_press, smooth, untouched_mean
 from calibration.light.refinement import RefinedGeometry, refine
 from calibration.light.shadows import DentShade, find_lamps
@@ -60,6 +68,7 @@ Image = NDArray[np.uint8]
 REFINEMENT_PIXELS = 2500  # of each press, about
 UNSHADED = 0.02  # share of the change of colour: where slopes leave no more, shadows are not looked for
 ROUNDS = 2  # of refining circles and lamps in turn
+SATURATED_ROUNDS = 2  # of telling which saturated pixels are predicted too dark
 SHADED_PIXELS = 1000  # the same with cast shadows, which have nine times the terms
 # A press is left out if the fitted dent leaves more of its change of colour unexplained than the smaller of
 MAX_UNEXPLAINED = 0.5  # share of the change
@@ -113,10 +122,9 @@ def calibrate_light(
     presses, refined = _refined(found, left_out, ball)
     presses, refined, shade = _shaded(presses, refined, ball)
     labels = [label(press, refined, ball) for press in presses]
-    besides = [beside_slopes(press, refined, ball, shade) for press in presses]
-    forward_sets = [forward_equations(p, g, b) for p, g, b in zip(presses, labels, besides, strict=True)]
+    besides = [beside_slopes(press, g, refined, ball, shade) for press, g in zip(presses, labels, strict=True)]
+    size, forward_sets = _equations(presses, labels, besides)
     inverse_sets = [inverse_equations(p, g) for p, g in zip(presses, labels, strict=True)]
-    size = choose_size(forward_sets)
     all_equations = functools.reduce(operator.add, forward_sets)
     steepest, deepest = max(rim_slope(press.circle, ball) for press in presses), deepest_dent(refined, ball)
     model = partial(forward_model, size=size, steepest=steepest, deepest=deepest / reference.shape[1], shade=shade)
@@ -147,6 +155,22 @@ def calibrate_light(
         presses=tuple(presses),
         frames=_names(frames),
     )
+
+
+def _equations(
+    presses: Sequence[BallPress], labels: Sequence[Float64], besides: Sequence[Float64]
+) -> tuple[ModelSize, list[NormalEquations]]:
+    """The size of the forward model, and each press's equations, with those of its saturated pixels that are predicted
+    too dark."""
+    sets = [forward_equations(p, g, b) for p, g, b in zip(presses, labels, besides, strict=True)]
+    size = choose_size(sets)
+    saturated = [k for k, press in enumerate(presses) if not press.lit[near_contact(press)].all()]
+    for _ in range(SATURATED_ROUNDS if saturated else 0):
+        weights = solve(functools.reduce(operator.add, sets), size)
+        for k in saturated:
+            known = presses[k], labels[k], besides[k]
+            sets[k] = forward_equations(*known, too_dark(*known, weights, size))
+    return size, sets
 
 
 def _names(frames: Sequence[tuple[str, Image]]) -> tuple[str, ...]:
@@ -260,7 +284,10 @@ def _shaded(
         return presses, refined, None
     windows, circles = [_window(press, SHADED_PIXELS) for press in presses], refined.circles
     shade = find_lamps(windows, circles, refined.thickness, ball, presses[0].shape)
-    sets = [forward_equations(p, label(p, refined, ball), beside_slopes(p, refined, ball, shade)) for p in presses]
+    slopes = [label(press, refined, ball) for press in presses]
+    sets = [
+        forward_equations(p, g, beside_slopes(p, g, refined, ball, shade)) for p, g in zip(presses, slopes, strict=True)
+    ]
     if not choose_size(sets).shadows:
         return presses, refined, None
     for _ in range(ROUNDS):  # circles tell where the lamps stand, and the lamps where the circles are
@@ -322,12 +349,11 @@ def _prediction(
     Slopes are found as in every picture: from each pixel's colour, then those of a surface that the forward model
     agrees with."""
     places = places_in_image(*press.shape[::-1])
-    light, _ = PhotometricLight(forward).change(gradient.astype(np.float32), *places)
+    height = None if forward.depth is None else (beside[..., 0] * forward.depth.deepest).astype(np.float32)
+    light, _ = PhotometricLight(forward).change(gradient.astype(np.float32), *places, height)
     predicted = light.astype(np.float64)
-    if forward.depth is not None:
-        predicted += beside[..., :DEPTH_TERMS] @ np.array(forward.depth.weights)
     if forward.shadows is not None:
-        predicted += beside[..., DEPTH_TERMS:] @ np.array(forward.shadows.weights)
+        predicted += beside[..., DEPTH_TERMS + SLOPE_TERMS :] @ np.array(forward.shadows.weights)
     predicted = smooth(predicted, BLUR) * mean
     seen = smooth(press.change, INVERSE_BLUR).astype(np.float32)
     slopes, _ = PolynomialSlopes(inverse, *(2 * place.astype(np.float64) for place in places))(seen)

@@ -10,11 +10,21 @@ from numpy.typing import NDArray
 
 from calibration.height.slope_polynomial import InverseModel, fit_inverse, inverse_features, to_normal
 from calibration.light.dent import dent_gradient, dent_height, whole_profile
-from calibration.light.photometry import FEW_PRESSES, ModelSize, NormalEquations, normal_equations, solve
+from calibration.light.photometry import (
+    FEW_PRESSES,
+    LARGEST,
+    SLOPE_SCALE,
+    ModelSize,
+    NormalEquations,
+    features,
+    normal_equations,
+    solve,
+    terms_of,
+)
 from calibration.light.press import FAR, NEAR, BallPress, smooth
 from calibration.light.refinement import RIM_BLUR, RefinedGeometry
 from calibration.light.shadows import DentShade
-from tacsim.models.photometric import DepthColour, PhotometricModel, depth_terms, place_in_image
+from tacsim.models.photometric import DepthColour, PhotometricModel, depth_terms, normal_terms, place_in_image
 from tacsim.models.shadows import CastShadows
 
 Float64 = NDArray[np.float64]
@@ -36,12 +46,16 @@ def deepest_dent(refined: RefinedGeometry, ball: float) -> float:
     return float(whole_profile(widest.radius, ball, refined.thickness)[1][0])
 
 
-def beside_slopes(press: BallPress, refined: RefinedGeometry, ball: float, shade: DentShade | None) -> Float64:
-    """(H, W, terms) of depth, and of cast shadows where there are any."""
+def beside_slopes(
+    press: BallPress, gradient: Float64, refined: RefinedGeometry, ball: float, shade: DentShade | None
+) -> Float64:
+    """(H, W, terms) of depth, of slopes (H, W, 2) at depth, and of cast shadows where there are any."""
     v, u = np.mgrid[: press.shape[0], : press.shape[1]].astype(np.float64)
     height = dent_height(u, v, press.circle, refined.thickness, ball)
     places = np.meshgrid(*place_in_image(press.shape[1], press.shape[0]))
-    deep = np.asarray(np.moveaxis(depth_terms(height, deepest_dent(refined, ball), *places), 0, -1), dtype=np.float64)
+    terms = depth_terms(height, deepest_dent(refined, ball), *places)
+    slopes = SLOPE_SCALE * terms[0] * normal_terms(gradient, LARGEST[0])
+    deep = np.ascontiguousarray(np.moveaxis(np.concatenate([terms, slopes]), 0, -1), dtype=np.float64)
     if shade is None:
         return deep
     dark = shade.terms(u.ravel(), v.ravel(), press.circle, refined.thickness, ball)
@@ -60,10 +74,28 @@ def _places(mask: NDArray[np.bool_]) -> tuple[Float64, Float64]:
     return u[columns], v[rows]
 
 
-def forward_equations(press: BallPress, gradient: Float64, beside: Float64) -> NormalEquations:
+def forward_equations(
+    press: BallPress, gradient: Float64, beside: Float64, counted: NDArray[np.bool_] | None = None
+) -> NormalEquations:
+    """`counted` (H, W, 3): what takes part; None: what is not saturated."""
     near = near_contact(press)
     change = smooth(press.change, BLUR)[near]
-    return normal_equations(gradient[near], *_places(near), change, press.lit[near], beside[near])
+    lit = press.lit if counted is None else counted
+    return normal_equations(gradient[near], *_places(near), change, lit[near], beside[near])
+
+
+def too_dark(
+    press: BallPress, gradient: Float64, beside: Float64, weights: Float64, size: ModelSize
+) -> NDArray[np.bool_]:
+    """(H, W, 3) what is not saturated, and what is where `weights` say less than is seen: a saturated pixel says "at
+    least so bright"."""
+    counted = press.lit.copy()
+    where = near_contact(press) & ~press.lit.all(axis=2)
+    light = features(gradient[where], *_places(where), *LARGEST)
+    said = np.concatenate([light, beside[where]], axis=1)[:, terms_of(size)] @ weights
+    seen = smooth(press.change, BLUR)[where]
+    counted[where] |= (seen > 0) & (said < seen)
+    return counted
 
 
 def _inverse_terms(press: BallPress, where: NDArray[np.bool_]) -> Float64:
@@ -88,14 +120,25 @@ def forward_model(
     """`deepest` [widths of the picture]."""
     weights = tuple((float(r), float(g), float(b)) for r, g, b in solve(pixels, size))
     dark = size.terms - size.shadows
-    light = dark - size.depth
+    slopes = dark - size.slopes
+    light = slopes - size.depth
     shadows = None
     if shade is not None and size.shadows:
         shadows = CastShadows(lamps=shade.lamps, weights=weights[dark:])
     return PhotometricModel(
         degree=size.degree, position=size.position, weights=weights[:light], steepest=steepest, blur=BLUR,
-        shadows=shadows, depth=DepthColour(deepest=deepest, weights=weights[light:dark]) if size.depth else None,
+        shadows=shadows, depth=_depth_colour(deepest, weights[light:slopes], weights[slopes:dark]),
     )  # fmt: skip
+
+
+Rows = tuple[tuple[float, float, float], ...]
+
+
+def _depth_colour(deepest: float, weights: Rows, slopes: Rows) -> DepthColour | None:
+    if not weights:
+        return None
+    unscaled = tuple((SLOPE_SCALE * r, SLOPE_SCALE * g, SLOPE_SCALE * b) for r, g, b in slopes)
+    return DepthColour(deepest=deepest, weights=weights, slopes=unscaled)
 
 
 def inverse_model(sets: Sequence[tuple[Float64, Float64]], steepest: float) -> InverseModel:

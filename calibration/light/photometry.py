@@ -27,6 +27,11 @@ CHUNK = 16384  # pixels that are summed at a time: fewer wake the threads of BLA
 MIN_IMPROVEMENT = 0.98  # factor of the left-out error that a larger model must reach
 SHADOW_IMPROVEMENT = 0.93  # the same of a model with cast shadows
 DEPTH_IMPROVEMENT = 0.99  # the same of one that knows the depth, which is known with few terms
+SLOPES_IMPROVEMENT = 0.995  # and of one to which slopes look otherwise at depth
+SLOPE_TERMS = term_count(LARGEST[0], 0)
+# By so much the terms of slopes at depth are smaller than others: the ridge holds them back ten times as strongly. Of
+# all slopes and depths a ball shows few together.
+SLOPE_SCALE = 0.1**0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,17 +42,18 @@ class ModelSize:
     position: int
     ridge: float
     depth: int = 0  # terms of the depth
+    slopes: int = 0  # terms of slopes at depth
     shadows: int = 0  # terms of cast shadows
 
     @property
     def terms(self) -> int:
-        return term_count(self.degree, self.position) + self.depth + self.shadows
+        return term_count(self.degree, self.position) + self.depth + self.slopes + self.shadows
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NormalEquations:
-    """Normal equations of one press for the terms of LARGEST, and after them those of depth and of cast shadows. Each
-    channel has its own where pixels are saturated in one and not in another."""
+    """Normal equations of one press for the terms of LARGEST, and after them those of depth, of slopes at depth and of
+    cast shadows. Each channel has its own where pixels are saturated in one and not in another."""
 
     square: Float64  # (1, terms, terms) of all channels, or (3, terms, terms)
     right: Float64  # (terms, 3)
@@ -156,7 +162,7 @@ def _pairs() -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 
 def solve(pixels: NormalEquations, size: ModelSize) -> Float64:
     """(terms, 3) ridge weights; `pixels`: the sum of all presses that count."""
-    part = _part(pixels, _terms_of(size))
+    part = _part(pixels, terms_of(size))
     return ridge_solution(part.square, part.right, size.ridge)
 
 
@@ -188,21 +194,23 @@ def left_out_error(presses: Sequence[NormalEquations], ridge: float) -> float:
 def choose_size(presses: Sequence[NormalEquations]) -> ModelSize:
     """Up to FEW_PRESSES a cubic that is the same everywhere. With more, the smallest model to which no larger one
     is clearly better at predicting left-out presses, each with its best ridge. Cast shadows, where they are among the
-    terms, are taken if they make it better by far; depth if they are, if it makes it better."""
+    terms, are taken if they make it better by far; depth if they are, if it makes it better; then slopes at depth."""
     if len(presses) <= FEW_PRESSES:
         return ModelSize(3, 0, FEW_RIDGE)
     error, size = _best_size(presses, 0)
-    depth = min(len(presses[0].right) - term_count(*LARGEST), DEPTH_TERMS)
-    shadows = len(presses[0].right) - term_count(*LARGEST) - depth
+    beside = len(presses[0].right) - term_count(*LARGEST)
+    shadows = max(beside - DEPTH_TERMS - SLOPE_TERMS, 0)
     if shadows:
         other_error, other = _best_size(presses, shadows)
         if other_error < SHADOW_IMPROVEMENT * error:
             error, size = other_error, other
-    if depth:
-        other_error, other = _best_ridge(presses, replace(size, depth=depth))
-        if other_error < DEPTH_IMPROVEMENT * error:
-            return other
-    return size
+    if not beside:
+        return size
+    deep_error, deep = _best_ridge(presses, replace(size, depth=DEPTH_TERMS))
+    other_error, other = _best_ridge(presses, replace(deep, slopes=term_count(size.degree, 0)))
+    if other_error < SLOPES_IMPROVEMENT * min(deep_error, DEPTH_IMPROVEMENT * error):
+        return other
+    return deep if deep_error < DEPTH_IMPROVEMENT * error else size
 
 
 def _best_size(presses: Sequence[NormalEquations], shadows: int) -> tuple[float, ModelSize]:
@@ -218,7 +226,7 @@ def _best_size(presses: Sequence[NormalEquations], shadows: int) -> tuple[float,
 
 def _best_ridge(presses: Sequence[NormalEquations], size: ModelSize) -> tuple[float, ModelSize]:
     """The left-out error of a size with its best ridge, and that size."""
-    use = _terms_of(size)
+    use = terms_of(size)
     parts = [_part(press, use) for press in presses]
     error, ridge = min((left_out_error(parts, ridge), ridge) for ridge in RIDGES)
     return error, replace(size, ridge=ridge)
@@ -229,13 +237,16 @@ def _part(of: NormalEquations, use: list[int]) -> NormalEquations:
     return NormalEquations(of.square[:, use][:, :, use], of.right[use], of.power, of.count)
 
 
-def _terms_of(size: ModelSize) -> list[int]:
-    """Where the terms of `size` stand among those of LARGEST."""
+def terms_of(size: ModelSize) -> list[int]:
+    """Where the terms of `size` stand among all."""
     normals, all_normals = term_count(size.degree, 0), term_count(LARGEST[0], 0)
     places = term_count(1, size.position) // term_count(1, 0)
-    deep, dark = term_count(*LARGEST), term_count(*LARGEST) + DEPTH_TERMS
+    deep = term_count(*LARGEST)
+    slopes = deep + DEPTH_TERMS
+    dark = slopes + SLOPE_TERMS
     return [
         *(place * all_normals + term for place in range(places) for term in range(normals)),
         *range(deep, deep + size.depth),
+        *range(slopes, slopes + size.slopes),
         *range(dark, dark + size.shadows),
     ]

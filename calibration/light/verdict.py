@@ -70,13 +70,6 @@ class KnownScale:
     gel_thickness: float | None = None  # [m]
     depths: tuple[tuple[str, float], ...] = ()  # frames whose indentation is known [m]
 
-    @property
-    def unchecked(self) -> str:
-        """In words, that ball and pitch are taken as they were given; "" where something else is known."""
-        if self.gel_size is not None or self.depths:
-            return ""
-        return "nothing checks the lengths that were given (ball, pixel pitch): a press of known depth would, --depth"
-
 
 def judge(fit: LightFit, scale: KnownScale, *, dots: bool = False) -> Verdict:
     """All findings, the worst first. `dots` are seen on the gel, and were not told."""
@@ -153,6 +146,11 @@ def _of_scale(fit: LightFit, scale: KnownScale) -> Iterable[Finding]:
         yield Finding(
             "usable", f"no contact is wider than {max(ratios):.2f} of the ball: light presses, a diameter given for "
             "the radius, or too small a pixel pitch", "measure ball and pitch; press as deep as the work will",
+        )  # fmt: skip
+    if scale.gel_size is None and not scale.depths:  # a pitch 1.6 times too large may look as good as the right one
+        yield Finding(
+            "usable", "nothing checks the lengths that were given, ball and pixel pitch",
+            "say what the picture shows of the gel (--size, or --kind), or how deep a press is (--depth)",
         )  # fmt: skip
     if scale.gel_size is not None:
         rows, columns, _ = fit.reference.shape

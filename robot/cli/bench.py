@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import typer
 
 from robot.cli.errors import UNUSABLE, complain
-from robot.cli.output import busy, notes
+from robot.cli.output import busy, notes, require_writable
 
 Group = Literal["all", "press", "squeeze", "materials", "scenes", "oracles", "real", "robot"]
 
@@ -69,6 +69,7 @@ def bench(
     Example: tacsim bench press --json press.json
     """
     require_checkout("tacsim bench")
+    require_writable(json_, "--json")
     with busy("loading"):
         from benchmarks import command as bench
     if from_:

@@ -14,6 +14,8 @@ from tacsim.models.text import printable
 
 OURS = {"tacsim", "calibration", "robot"}
 UNUSABLE, FAILED, INTERRUPTED = 2, 1, 130  # exit codes: bad configuration or usage, failure, Ctrl-C
+# What was named cannot be read or written there, whatever is done
+NO_PLACE = (FileExistsError, FileNotFoundError, IsADirectoryError, NotADirectoryError, PermissionError)
 UNTRUSTED = 3  # all was done, but the result is not to be trusted
 
 
@@ -42,57 +44,40 @@ class Guarded(TyperGroup):
 
 def explain(error: Exception) -> tuple[str, int]:
     """What to tell a person about `error`, and the exit code."""
-    from calibration.errors import CalibrationError
-    from robot.collect.job import SetError
-    from robot.deploy.policy import PolicyNotFound
-    from robot.open import CannotOpen, CodeNotFound
-    from robot.train.run_folder import RunError
-    from tacsim.config import ConfigError
-    from tacsim.interface import IncompatibleRig
-    from tacsim.physics.failure.dump import DumpError
-    from tacsim.record.episode import EpisodeError
-    from tacsim.tasks.task import BadDraws, GoalOutOfReach
-
-    unusable = (
-        BadDraws,
-        ConfigError,
-        CannotOpen,
-        CodeNotFound,
-        GoalOutOfReach,
-        PolicyNotFound,
-        IncompatibleRig,
-        CalibrationError,
-        DumpError,
-        EpisodeError,
-        RunError,
-        SetError,
-    )
-    if isinstance(error, unusable):
-        return str(error), UNUSABLE
     if _refused(error):
         return str(error), UNUSABLE
     if isinstance(error, ExceptionGroup):
         parts = [explain(part) for part in error.exceptions if isinstance(part, Exception)]
         return "\n".join([error.message, *(message for message, _ in parts)]), FAILED
     if isinstance(error, OSError):
+        code = UNUSABLE if isinstance(error, NO_PLACE) else FAILED
         named = isinstance(error.filename, str | bytes | os.PathLike)
         where = f"{printable(os.fsdecode(error.filename))}: " if named else ""
-        return f"{where}{error.strerror or str(error) or type(error).__name__}", FAILED
-    if type(error).__module__.partition(".")[0] in OURS:
+        why = error.strerror or str(error) or type(error).__name__
+        if isinstance(error, FileExistsError):
+            why = "exists already; nothing is overwritten, name another"
+        return f"{where}{why}", code
+    if _ours(type(error).__module__):
         return str(error) or type(error).__name__, FAILED
     return f"unexpected {type(error).__name__}: {error}\nRun again with --debug for the traceback.", FAILED
 
 
 def _refused(error: Exception) -> bool:
-    """True for what our own code says of a value, a file or a device that it was given: a bare ValueError or a
-    FileNotFoundError in words, and a RuntimeError of the one module that starts Taichi."""
+    """True for what our own code says of a value, a file or a device that it was given: a ValueError, ours or raised by
+    us, a FileNotFoundError in words, and a RuntimeError of the one module that starts Taichi."""
     trace = error.__traceback__
     while trace is not None and trace.tb_next is not None:
         trace = trace.tb_next
     module = str(trace.tb_frame.f_globals.get("__name__", "") if trace is not None else "")
-    in_words = type(error) is ValueError or (isinstance(error, FileNotFoundError) and error.errno is None)
-    ours = in_words and module.partition(".")[0] in OURS
-    return ours or (type(error) is RuntimeError and module == "tacsim.compute.runtime")
+    if isinstance(error, ValueError):
+        return _ours(type(error).__module__) or (type(error) is ValueError and _ours(module))
+    if isinstance(error, FileNotFoundError):
+        return error.errno is None and _ours(module)
+    return type(error) is RuntimeError and module == "tacsim.compute.runtime"
+
+
+def _ours(module: str) -> bool:
+    return module.partition(".")[0] in OURS
 
 
 def complain(message: str) -> None:

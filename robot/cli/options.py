@@ -30,25 +30,14 @@ def quantity(kind: str, low: float = -math.inf, high: float = math.inf) -> Calla
         from tacsim.models.quantity import parse as parse_quantity
 
         try:
-            value = parse_quantity(text, kind)
+            value = parse_quantity(text, kind, bare=kind != "length")
         except ValueError as error:
             raise typer.BadParameter(str(error)) from None
-        if kind == "length" and value != 0 and is_number(text):
-            raise typer.BadParameter(f"'{text}' has no unit; say '{text.strip()} mm', or m, cm, um")
         if not low <= value <= high:
             raise typer.BadParameter(f"{value:g}; allowed: {low:g} to {high:g} (SI units)")
         return value
 
     return parse
-
-
-def is_number(text: str) -> bool:
-    """A number without a unit."""
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
 
 
 def quantities(kind: str, count: int) -> Callable[[str], tuple[float, ...]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import datetime
@@ -16,10 +17,17 @@ from rich.text import Text
 
 from tacsim.models.text import escaped, printable
 
+NARROWEST = 60  # columns: in fewer a table loses its values; the terminal breaks its lines instead
+
 
 class SafeConsole(Console):
     """A console that shows control characters instead of obeying them. What a command prints may hold names and texts
     of files, recordings and devices, which must not move the cursor, change colours or turn the writing round."""
+
+    @property
+    def options(self) -> ConsoleOptions:
+        found = super().options
+        return found.update_width(max(found.max_width, NARROWEST))
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterator[Segment]:
         for segment in super().render(renderable, options):
@@ -50,6 +58,18 @@ def new_directory(out: Path | None, what: str) -> Path:
             with suppress(OSError):
                 place.rmdir()
     return folder
+
+
+def require_writable(file: Path | None, option: str, *, new: bool = False) -> None:
+    """Raises typer.BadParameter for a file that cannot be written, or with `new` is there: better now than after the
+    work."""
+    if file is None:
+        return
+    there = next(place for place in (file, *file.absolute().parents) if place.exists())
+    if new and there == file:
+        raise typer.BadParameter(f"{file} exists already; name a new file", param_hint=option)
+    if there.is_dir() == (there == file) or not os.access(there, os.W_OK):
+        raise typer.BadParameter(f"{file} cannot be written; name another file", param_hint=option)
 
 
 @contextmanager
@@ -170,4 +190,4 @@ def show_table(
         table.add_column(Text(column), justify="left" if number in left else "right")
     for row in rows:
         table.add_row(*map(Text, row))
-    SafeConsole(width=width, highlight=False).print(table)
+    SafeConsole(width=width, highlight=False).print(table, crop=False)

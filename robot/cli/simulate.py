@@ -32,8 +32,8 @@ def press(
     edge_radius: Annotated[Any, length("Of a box's or cylinder's edges; half an element if left out.")] = None,
     scale: Annotated[float, typer.Option(help="Metres per unit of the .stl file.")] = 1e-3,
     preset: Annotated[Literal["learn", "draft", "standard"], typer.Option(help="Resolution.")] = "standard",
-    model: Annotated[
-        str, typer.Option(help="The sensor: its name, the path of a YAML file, or of a calibrated bundle.")
+    sensor: Annotated[
+        str, typer.Option(help="Its name, the path of a YAML file, or of a calibrated bundle.")
     ] = "ideal",
     set_: Overrides = None,
     out: Out = None,
@@ -54,9 +54,9 @@ def press(
     if edge_radius is not None:
         shape.append(f"indenter.edge_radius={edge_radius!r}")
     scene = load_scene("press", [f"preset={preset}", *shape, *(set_ or [])])
-    sensor = load_sensor(model).model_copy(update={"view": None})
+    model = load_sensor(sensor).model_copy(update={"view": None})
     given = any(says_gel_size(text.partition("=")[0].split(".")) for text in set_ or [])
-    scene, said = fit_gel(scene, {"lower": sensor}, given=given)
+    scene, said = fit_gel(scene, {"lower": model}, given=given)
     for words in said:
         notes.print(words, markup=False)
     with busy("pressing (the first run compiles the kernels, up to half a minute)"):
@@ -65,8 +65,8 @@ def press(
 
         motion = presses.PressMotion(depth, slide, twist)
         with dumps_in(folder / "diverged"):
-            pressed = presses.press(scene, sensor, motion)
-    config = presses.press_report(scene, motion, pressed, sensor)
+            pressed = presses.press(scene, model, motion)
+    config = presses.press_report(scene, motion, pressed, model)
     with writing(folder, new=True):
         presses.write(folder, pressed, config)
     results.print(f"force            {config['force']:.4f} N")

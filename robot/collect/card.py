@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 
 from robot.collect.folder import FAILURES, SetFolder
+from robot.collect.job import SetError
 from robot.collect.presses import PressSet
 from robot.collect.table import WORDS, features
+from robot.studies.press import UNFELT
 from tacsim.models.scene import Mesh, Shape
 from tacsim.models.text import printable
 
@@ -91,13 +93,18 @@ All settings are in `collect.json`. Presses that failed, with the reason, are in
 
 
 def press_statistics(folder: SetFolder, settings: PressSet) -> str:
-    """Of all rows, and by object (Markdown)."""
+    """Of all rows, and by object (Markdown). Raises SetError for a file that cannot be read."""
+    import pyarrow as pa
     from pyarrow import parquet
 
-    names = ["object", "depth", "normal_force", "shear", "shear_force", "contact_area", "settled"]
+    names = ["object", "depth", "normal_force", "shear", "shear_force", "contact_area", "unfelt", "folded", "settled"]
     columns: dict[str, list[Any]] = {name: [] for name in names}
     for path in folder.files:
-        for name, values in parquet.read_table(path, columns=names).to_pydict().items():
+        try:
+            table = parquet.read_table(path, columns=names)
+        except (pa.ArrowInvalid, OSError):
+            raise SetError(f"{path} is damaged; delete it, and the same command makes it again") from None
+        for name, values in table.to_pydict().items():
             columns[name] += values
     of = {name: np.array(values) for name, values in columns.items()}
     if not len(of["object"]):
@@ -108,7 +115,8 @@ def press_statistics(folder: SetFolder, settings: PressSet) -> str:
     head = [f"{name} [{QUANTITIES[name][1]}]" for name in shown]
     lines = [
         f"\n## Statistics\n\n{len(of['object'])} presses, {len(folder.failures)} failed, "
-        f"{int((~of['settled']).sum())} not settled.\n",
+        f"{int((~of['settled']).sum())} not settled, {int((of['unfelt'] > UNFELT).sum())} with forces too small "
+        f"(`unfelt` above {UNFELT:g}), {int(of['folded'].sum())} folded.\n",
         _row(["", "presses", *head]),
         _row(["---"] * (2 + len(head))),
     ]

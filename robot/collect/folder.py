@@ -6,19 +6,18 @@ from __future__ import annotations
 import fcntl
 import hashlib
 import json
-import os
-import shutil
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from robot.collect.job import Job, Piece, SetError
-from robot.common.whole_file import write_whole
+from robot.common.whole_file import whole_folder, write_whole
 from robot.deploy.control_loop import versions
 from tacsim.models.text import printable
 
-FORMAT = 1
+FORMAT = 2
+SHOWN = 6  # differences between two commands that are told
 ABOUT, FAILURES, CARD = "collect.json", "failures.jsonl", "README.md"
 
 
@@ -67,8 +66,11 @@ class SetFolder:
         path = self.path / FAILURES
         if not path.exists():
             return {}
-        rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
-        return {int(row["index"]): str(row["reason"]) for row in rows}
+        try:
+            rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+            return {int(row["index"]): str(row["reason"]) for row in rows}
+        except (ValueError, KeyError, TypeError):
+            raise SetError(f"{path} cannot be read; delete it, and what failed is tried again") from None
 
 
 @contextmanager
@@ -104,19 +106,9 @@ def open_set(
 
 def _begin(path: Path, about: Mapping[str, Any], files: Mapping[str, bytes]) -> None:
     """All of it, or nothing."""
-    home = next(place for place in path.absolute().parents if place.is_dir())
-    partial = home / f".{path.name}.{os.getpid()}"
-    try:
-        partial.mkdir()
+    with suppress(FileExistsError), whole_folder(path) as partial:  # whoever was faster began it: seen as it is opened
         for name, data in {ABOUT: _text(about), **files}.items():
             write_whole(partial / name, data)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial.rename(path)
-    except BaseException as failure:
-        shutil.rmtree(partial, ignore_errors=True)
-        if isinstance(failure, OSError):
-            failure.filename = str(path)
-        raise
 
 
 def _text(about: Mapping[str, Any]) -> bytes:
@@ -148,9 +140,11 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _require_same(path: Path, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
-    old, new = (json.loads(_text({**about["settings"], "files": about["files"]})) for about in (before, now))
+    old, new = (_leaves(json.loads(_text({**about["settings"], "files": about["files"]}))) for about in (before, now))
     wrong = [f"{key} is {_short(old.get(key))} there and {_short(new.get(key))} here" for key in {**old, **new}
              if old.get(key) != new.get(key)]  # fmt: skip
+    if len(wrong) > SHOWN:
+        wrong[SHOWN:] = [f"{len(wrong) - SHOWN} more differ"]
     if now["count"] < before["count"]:
         wrong.append(f"it has {before['count']} already begun, {now['count']} are asked for")
     versions = (about["versions"].get("tacsim") for about in (before, now))
@@ -162,6 +156,13 @@ def _require_same(path: Path, before: Mapping[str, Any], now: Mapping[str, Any])
             f"{path} holds a set by another command ({printable(str(before['command']))}): {'; '.join(wrong)}. "
             "Give that command again to go on with it, or name a new folder"
         )
+
+
+def _leaves(value: Any, at: str = "") -> dict[str, Any]:
+    """What is in nested mappings, by path."""
+    if not isinstance(value, dict) or not value:
+        return {at: value}
+    return {path: leaf for key, each in value.items() for path, leaf in _leaves(each, f"{at}.{key}".strip(".")).items()}
 
 
 def _short(value: Any) -> str:

@@ -209,6 +209,8 @@ class PressWorker:
             "position": pose.position,
             "quaternion": pose.quaternion,
             "contact_area": float(pressed.contact.sum()) * pixel,
+            "unfelt": pressed.unfelt,
+            "folded": pressed.folded,
             "settled": all(move.settled for move in pressed.moves),
         }
 

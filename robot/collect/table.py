@@ -33,6 +33,9 @@ WORDS = {
     "position": "[m] of the middle of the object's bounding box in the sensor's frame, at the end",
     "quaternion": "(x, y, z, w) of the object in that frame, at the end",
     "contact_area": "[m^2] of `contact`",
+    "unfelt": "share of the depth that no contact point of the gel feels; above 0.125 a tip or edge is too narrow for "
+    "the mesh, and the forces are too small",
+    "folded": "whether the gel folds over itself; picture and height show the sheet that the camera sees",
     "settled": "whether all motions came to rest within the scene's tolerance",
 }
 ROWS_IN_GROUP = 25  # read at once by who wants one row: some 10 MB
@@ -59,6 +62,8 @@ def features(settings: PressSet) -> dict[str, Feature]:
         "position": triple,
         "quaternion": Feature("float64", (4,), None),
         "contact_area": number,
+        "unfelt": number,
+        "folded": Feature("bool", (1,), None),
         "settled": Feature("bool", (1,), None),
     }
 

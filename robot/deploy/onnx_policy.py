@@ -198,6 +198,11 @@ def _require_same_inputs(
                 "same features: train it anew, or use the version that its metadata name"
             )
         if not _fits(graph[key], shape):
+            if key == "goal":
+                raise PolicyNotFound(
+                    f"policy '{path}' was trained for task '{spec.task}', whose goal is {_array(graph[key])}; this "
+                    f"task's is {_floats(shape)}"
+                )
             raise PolicyNotFound(
                 f"policy '{path}': its input '{key}' is {_array(graph[key])}; wanted: {_floats(shape)}"
             )

@@ -121,25 +121,26 @@ def taichi() -> list[Check]:
     if sys.platform == "linux" and platform.machine() == "aarch64":
         advice = "simulate on another machine; hardware and replay work here"
         return [Check("taichi", "warn", "no Taichi wheel exists for linux aarch64", advice)]
-    from tacsim.compute.runtime import DEVICE, available, start, ti
+    from tacsim.compute.runtime import DEVICE, KERNELS, available, start, ti
 
     if not available(DEVICE):
         advice = "unset TACSIM_DEVICE to compute on the processor, or install the device's driver"
         return [Check("taichi", "fail", f"TACSIM_DEVICE is '{DEVICE}', which is not there", advice)]
     arch = start()
     version = ".".join(str(part) for part in ti.__version__)
-    return [Check("taichi", "ok", f"{version}, arch {arch}"), kernel_cache(Path(ti.cfg.offline_cache_file_path))]
+    return [Check("taichi", "ok", f"{version}, arch {arch}"), kernel_cache(KERNELS)]
 
 
 def kernel_cache(folder: Path) -> Check:
     """The folder of compiled kernels: without it every start compiles for tens of seconds."""
-    there = next(path for path in (folder, *folder.parents) if path.exists())
-    if not there.is_dir() or not os.access(there, os.W_OK):
+    from tacsim.compute.runtime import is_writable
+
+    if not is_writable(folder):
         advice = (
             "make it writable, or set TI_OFFLINE_CACHE_FILE_PATH to a folder that is; until then every start compiles"
         )
         return Check("kernel cache", "warn", f"{folder} is not writable", advice)
-    size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) if folder.exists() else 0
+    size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
     return Check("kernel cache", "ok", f"{folder}, {size / 1e6:.1f} MB" + ("" if size else " (first run compiles)"))
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 from collections.abc import Callable, Sequence
 from importlib import util
 from pathlib import Path
@@ -12,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from robot.common.whole_file import whole_folder
 from robot.export.arrow import Column
 from robot.export.lerobot_files import DataSet, write_json
 from robot.export.lerobot_mapping import (
@@ -64,18 +63,8 @@ def export_lerobot(
         require_video()
     episodes = [observe_episode(path) for path in paths]
     fps = _check(episodes, cut)
-    home = next(place for place in folder.absolute().parents if place.is_dir())
-    partial = home / f".{folder.name}.{os.getpid()}"
-    partial.mkdir()
-    try:
+    with whole_folder(folder) as partial:
         _write(episodes, partial, fps, task, maps, video, on_step)
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        partial.rename(folder)  # onto an empty folder, or nothing: onto another it fails
-    except BaseException as failure:
-        shutil.rmtree(partial, ignore_errors=True)
-        if isinstance(failure, OSError) and failure.filename is None:  # a disk that fills up does not say where
-            failure.filename = str(folder)
-        raise
 
 
 def _check(episodes: Sequence[ObservedEpisode], cut: bool) -> float:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.bundle import read_bundle
+from robot.common.whole_file import put_new
 from robot.export.rerun_log import EpisodeLog, blueprint
 from robot.rig.recorded import observe_episode
 from tacsim.models.hardware import CameraSensorConfig
@@ -69,7 +70,7 @@ def shown(recording: rr.RecordingStream) -> Iterator[Callable[[], None]]:
 def written(recording: rr.RecordingStream, file: Path) -> Iterator[Callable[[], None]]:
     """Whole, or not at all. Gives what raises the OSError that has ended the writing."""
     if file.exists():
-        raise FileExistsError(EEXIST, "exists already; name a new file, nothing is overwritten", str(file))
+        raise FileExistsError(EEXIST, "File exists", str(file))
     file.parent.mkdir(parents=True, exist_ok=True)
     partial = file.with_name(f".{file.name}.{os.getpid()}")
     try:
@@ -83,7 +84,7 @@ def written(recording: rr.RecordingStream, file: Path) -> Iterator[Callable[[], 
                 recording.disconnect()
                 copy.join()
             copy.check()
-        partial.rename(file)
+        put_new(partial, file)
     except BaseException:
         partial.unlink(missing_ok=True)
         raise

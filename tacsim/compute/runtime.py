@@ -8,15 +8,19 @@ Its compiler works on one kernel at a time for the whole process, and takes no c
 import contextlib
 import io
 import os
+import tempfile
 import threading
 import warnings
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 from tacsim.compute.front_end import quicken, without_module_search
 
 os.environ.setdefault("TI_LOG_LEVEL", "error")
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
+if not {"HOME", "XDG_CACHE_HOME"} & os.environ.keys():  # Taichi ends the process without both
+    os.environ["XDG_CACHE_HOME"] = str(Path("~/.cache").expanduser())
 
 with (
     warnings.catch_warnings(),
@@ -34,6 +38,8 @@ with contextlib.suppress(ImportError):  # private parts of Taichi, which another
 DEVICES = ("cpu", "cuda", "vulkan", "metal", "cpu-as-device")  # the last: what a device computes, without one
 # Where worlds are computed, by TACSIM_DEVICE. Read once: kernels are written for it when their modules are imported.
 DEVICE = os.environ.get("TACSIM_DEVICE") or "cpu"
+# Where compiled kernels are kept from one process to the next, if it can be written
+KERNELS = Path(os.environ.get("TI_OFFLINE_CACHE_FILE_PATH") or ti.lang.impl.default_cfg().offline_cache_file_path)
 
 _running: int | None = None  # process
 _launch_lock = threading.RLock()  # held by the thread that starts Taichi, compiles or launches
@@ -64,14 +70,27 @@ def _initialise() -> None:
             f"TACSIM_DEVICE is '{DEVICE}', but Taichi finds no such device or driver on this machine; unset it to "
             f"compute on the CPU"
         )
+    # Taichi crashes when the process ends where it cannot make the folder, even one in which it keeps nothing.
+    kept = is_writable(KERNELS)
     # ti.init prints "Starting on arch=..." whatever it is told; a command's output (JSON, say) must stay its own.
     with contextlib.redirect_stdout(io.StringIO()):
         # Without Taichi's own control-flow optimisation kernels compile in half the time and run as fast.
         ti.init(
-            arch=_architecture(DEVICE), default_fp=ti.f32, offline_cache=True, cfg_optimization=False,
-            log_level=ti.ERROR, enable_fallback=False,
+            arch=_architecture(DEVICE), default_fp=ti.f32, offline_cache=kept, cfg_optimization=False,
+            offline_cache_file_path=str(KERNELS) if kept else tempfile.gettempdir(), log_level=ti.ERROR,
+            enable_fallback=False,
         )  # fmt: skip
     ti.sync()  # completes the start, which only this thread may do; kernels may then be compiled in any
+
+
+def is_writable(folder: Path) -> bool:
+    """Whether files can be made in `folder`, which is made if need be."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError:
+        return False
+    return True
 
 
 @contextlib.contextmanager

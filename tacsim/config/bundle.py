@@ -16,7 +16,7 @@ from tacsim.config.document import LoadState, Node, from_plain, parse_text, show
 from tacsim.config.errors import Place, did_you_mean
 
 FILE, REFERENCE = "calibration.yaml", "reference.png"
-FORMATS = (1, 2, 3, 4, 5, 6)  # that are read; the last is written
+FORMATS = (1, 2, 3, 4, 5, 6, 7)  # that are read; the last is written
 OWN = "sensors"  # folder of sensors of one's own, beside the file that names them or in the current folder
 MAX_FILE_SIZE, MAX_PICTURE_SIZE = 1_000_000, 1 << 26  # [bytes] of the YAML, and of the picture
 AGAIN = "make it again with `tacsim calibrate sensor`"

@@ -7,8 +7,8 @@ the image, each from -1/2 to 1/2 across it, the relative change of colour (I - I
     sum over normal terms nx, ny, 1 - nz, nx^2, nx ny, ny^2, nx^3, ... (up to `degree`) of weight * product.
 
 No term is constant: the flat gel shows I0. Degree 1 at position 0 is the most that directional diffuse lights can do.
-Two things that the slope does not tell are added: the colour of what is pressed in, which differs from I0 where it is
-flat, too (:class:`DepthColour`), and what one place of the surface hides from another (tacsim.models.shadows).
+Two things that the slope does not tell are added: what is pressed in lies elsewhere in the light, and differs from I0
+where it is flat, too (:class:`DepthColour`); and one place of the surface hides another (tacsim.models.shadows).
 """
 
 from __future__ import annotations
@@ -33,16 +33,18 @@ DEPTH_TERMS = 5
 
 
 class DepthColour(Config):
-    """What depth changes of a colour, whatever the slope: pressed gel is nearer to lamps and camera, and thinner.
+    """What depth changes of a colour: pressed gel is nearer to lamps and camera, and thinner.
 
     With w = height into the gel / `deepest`, in 0..1 (beyond, as at the end), the relative change in each channel is
-    the sum over DEPTH_TERMS w, w u, w v, w^2, w^3 of weight * term.
+    the sum over DEPTH_TERMS w, w u, w v, w^2, w^3 of weight * term, whatever the slope; and w times the sum over the
+    normal terms of `slopes` * term: w is a third coordinate of the place, beside u and v.
     """
 
     deepest: Annotated[float, Field(gt=0, le=10)]  # height up to which it was calibrated [widths of the picture]
     weights: Annotated[
         tuple[tuple[Weight, Weight, Weight], ...], Field(min_length=DEPTH_TERMS, max_length=DEPTH_TERMS)
     ]  # of R, G, B
+    slopes: tuple[tuple[Weight, Weight, Weight], ...] = ()  # a row a normal term; (): slopes look alike at all depths
 
 
 class PhotometricModel(Config):
@@ -64,6 +66,9 @@ class PhotometricModel(Config):
             raise ValueError(
                 f"weights has {len(self.weights)} rows; degree {self.degree} at position {self.position} has {wanted}"
             )
+        rows, normals = len(self.depth.slopes) if self.depth else 0, term_count(self.degree, 0)
+        if rows not in (0, normals):
+            raise ValueError(f"depth.slopes has {rows} rows; degree {self.degree} has {normals}, or none")
         return self
 
 
@@ -99,8 +104,13 @@ def position_terms(u: Floating, v: Floating, position: int) -> list[Floating]:
 
 def depth_terms(height: Floating, deepest: float, u: Floating, v: Floating) -> Floating:
     """(DEPTH_TERMS, ...) for heights (...,) into the gel, in the unit of `deepest`, at places u, v in -1/2..1/2."""
-    w = np.clip(height * height.dtype.type(1 / deepest), 0, 1)
+    w = relative_depth(height, deepest)
     return np.stack([w, w * u, w * v, w * w, w * w * w])
+
+
+def relative_depth(height: Floating, deepest: float) -> Floating:
+    """(...,) w in 0..1 for heights (...,) into the gel, in the unit of `deepest`."""
+    return np.clip(height * height.dtype.type(1 / deepest), 0, 1)
 
 
 def place_in_image(columns: int, rows: int) -> tuple[Float64, Float64]:
@@ -133,31 +143,34 @@ class PhotometricLight:
         """mean: the untouched image's mean colour, by which changes are multiplied; 1: they stay relative."""
         self._model = model
         self._terms = term_count(model.degree, 0)
-        weights = (np.array(model.weights) * mean).astype(np.float32).reshape(-1, self._terms, 3)
+        slopes = () if model.depth is None else model.depth.slopes  # the depth is one more place
+        weights = (np.array(model.weights + slopes) * mean).astype(np.float32).reshape(-1, self._terms, 3)
         self._weights = np.ascontiguousarray(weights.transpose(0, 2, 1)).reshape(-1, self._terms)  # place and channel
         self._shadows = None if model.shadows is None else (np.array(model.shadows.weights) * mean).astype(np.float32)
         self._depth = None if model.depth is None else (np.array(model.depth.weights) * mean).astype(np.float32)
 
-    def change(self, gradient: Float32, u: Float32, v: Float32) -> tuple[Float32, int]:
+    def change(self, gradient: Float32, u: Float32, v: Float32, height: Float32 | None = None) -> tuple[Float32, int]:
         """(..., n, 3) change of colour under slopes (..., n, 2) at places u, v (..., n) in -1/2..1/2, before blur, and
-        how many of these slopes were clipped to the calibrated range."""
+        how many of these slopes were clipped to the calibrated range. `height` (..., n) into the gel [widths of the
+        picture], which counts where the model knows depth; None: as at the surface."""
         import cv2
 
         slopes, beyond = clipped(gradient, self._model.steepest)
-        places = np.stack(position_terms(u, v, self._model.position))
+        deep = self._model.depth if height is not None else None
+        terms = position_terms(u, v, self._model.position)
+        weights = self._weights[: 3 * len(terms)]
+        if deep is not None and height is not None and deep.slopes:
+            terms, weights = [*terms, relative_depth(height, deep.deepest)], self._weights
+        places = np.stack(terms)
         # Most of the work is this product of matrices, row by row: BLAS does one so small on this thread. A large one
         # it shares with threads that wait by spinning, which on a busy machine took 40 ms instead of half a one.
         normals = np.moveaxis(normal_terms(slopes, self._model.degree), 0, -2)  # (..., terms, n)
-        at_places = (self._weights @ normals).reshape(*normals.shape[:-2], len(places), 3, -1)
-        red, green, blue = np.einsum("...pcn,p...n->c...n", at_places, places)
+        at_places = (weights @ normals).reshape(*normals.shape[:-2], len(places), 3, -1)
+        colours = np.einsum("...pcn,p...n->c...n", at_places, places)
+        if deep is not None and height is not None and self._depth is not None:
+            colours += np.tensordot(self._depth, depth_terms(height, deep.deepest, u, v), axes=(0, 0))
+        red, green, blue = colours
         return np.asarray(cv2.merge([red, green, blue]), dtype=np.float32).reshape(*gradient.shape[:-1], 3), beyond
-
-    def depth(self, height: Float32, u: Float32, v: Float32) -> Float32:
-        """(..., 3) change of colour by heights (...,) [widths of the picture] at places u, v (...,), before
-        blur. Of a model with `depth`."""
-        assert self._depth is not None and self._model.depth is not None
-        terms = depth_terms(height, self._model.depth.deepest, u, v)
-        return np.asarray(np.tensordot(terms, self._depth, axes=(0, 0)), dtype=np.float32)
 
     def shadow(self, horizons: Sequence[Float32], u: Float32, v: Float32) -> Float32:
         """(..., 3) change of colour by cast shadows, for the horizons (...,) of each lamp at places u, v (...,), before

@@ -34,16 +34,21 @@ def units_text(kind: str) -> str:
     return ", ".join(unit for unit in UNITS[kind] if unit not in ("µm", "μm"))
 
 
-def parse(value: Any, kind: str) -> float:
-    """SI value of a number or of a text such as "2.92 mm". Raises ValueError that names the units allowed.
+def parse(value: Any, kind: str, *, bare: bool = True) -> float:
+    """SI value of a number or of a text such as "2.92 mm"; without `bare`, a text but "0" must have its unit. Raises
+    ValueError that names the units allowed.
 
     >>> parse("2.5 mm", "length")
     0.0025
     """
     si, example = list(UNITS[kind])[:2]
-    allowed = f"allowed: a number [{si}], or a text with its unit ({units_text(kind)}) such as '1.5 {example}'"
+    what = f"a number [{si}], or a text with its unit" if bare else "a number with its unit"
+    allowed = f"allowed: {what} ({units_text(kind)}) such as '1.5 {example}'"
     if isinstance(value, str):
-        value = _parse_text(value, kind, allowed)
+        number, has_unit = _parse_text(value, kind, allowed)
+        if not (bare or has_unit) and number != 0:
+            raise ValueError(f"{value!r} has no unit; say '{value.strip()} {example}', or {units_text(kind)}")
+        value = number
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise ValueError(f"{value!r} is no {kind}; {allowed}")
     try:
@@ -55,7 +60,8 @@ def parse(value: Any, kind: str) -> float:
     return number
 
 
-def _parse_text(text: str, kind: str, allowed: str) -> float:
+def _parse_text(text: str, kind: str, allowed: str) -> tuple[float, bool]:
+    """SI value, and whether it had a unit."""
     units = UNITS[kind]
     if len(text) > MAX_TEXT:
         raise ValueError(
@@ -66,9 +72,9 @@ def _parse_text(text: str, kind: str, allowed: str) -> float:
         raise ValueError(f"{text!r} is no {kind}; {allowed}")
     number, unit = match.groups()
     if not unit:
-        return float(number)
+        return float(number), False
     if unit in units:
-        return float(number) * units[unit]
+        return float(number) * units[unit], True
     for other, theirs in UNITS.items():
         if unit in theirs:
             raise ValueError(f"{text!r} is a {other}, not a {kind}; {allowed}")

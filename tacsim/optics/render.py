@@ -162,10 +162,8 @@ class Renderer:
 
         assert self.model.photometric is not None
         place = self._grid.in_image(*table.place())
-        colours, beyond = calibrated.change(table.fields[..., 1:], *place)
-        if self.model.photometric.depth is not None:
-            width = np.float32(self._grid.columns * self._grid.pitch)
-            colours += calibrated.depth(table.fields[..., 0] / width, *place)
+        width = np.float32(self._grid.columns * self._grid.pitch)
+        colours, beyond = calibrated.change(table.fields[..., 1:], *place, table.fields[..., 0] / width)
         if self.model.photometric.shadows is not None:
             colours += shadow_colours(calibrated, self.model.photometric.shadows, table, self._grid)
         self._beyond = beyond / (colours.size // 3)

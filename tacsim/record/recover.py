@@ -46,7 +46,7 @@ def recover(path: Path, target: Path) -> Recovery:
     if found.whole:
         return found
     if target.exists():
-        raise FileExistsError(errno.EEXIST, "is there already; nothing is overwritten, name another file", str(target))
+        raise FileExistsError(errno.EEXIST, "File exists", str(target))
     part: Path | None = None
     try:
         handle, name = tempfile.mkstemp(prefix=f".{target.name}.", suffix=".part", dir=target.parent)

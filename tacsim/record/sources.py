@@ -93,7 +93,8 @@ def only_or_named(names: list[str], name: str, path: Path, kind: str) -> str:
         return name
     if len(names) == 1:
         return names[0]
-    raise EpisodeError(f"{path}: no {kind} '{name}'; the recording has: {', '.join(names) or '(none)'}")
+    wrong = f"no {kind} '{name}'" if name else f"which {kind}? Name one"
+    raise EpisodeError(f"{path}: {wrong}; the recording has: {', '.join(names) or '(none)'}")
 
 
 def list_pictures(folder: Path) -> list[Path]:

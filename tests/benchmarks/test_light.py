@@ -14,7 +14,7 @@ from benchmarks.cases.real.labels import BadData, read_labels
 from benchmarks.cases.registry import description, select_cases
 from benchmarks.harness.runner import run_cases
 from benchmarks.pages.page import markdown
-from tacsim.physics.oracle.layer import layer_contact
+from benchmarks.truth.layer import layer_contact
 from tests.calibration.presses import BALL, COLUMNS, PITCH, ROWS, HiddenSensor
 
 BALLS = """\

@@ -25,7 +25,7 @@ from calibration.normaliser import normaliser_for_calibration, normaliser_for_ca
 from tacsim.config.bundle import digest
 from tacsim.interface import TactileFrame
 from tacsim.models.hardware import CameraSensorConfig
-from tacsim.models.photometric import DEPTH_TERMS, PhotometricModel
+from tacsim.models.photometric import DEPTH_TERMS, PhotometricModel, term_count
 from tacsim.models.sensor import CameraNoise, CanonicalGrid, SensorGeometry
 from tacsim.models.shadows import CastShadows
 from tacsim.optics.render import Renderer
@@ -77,8 +77,8 @@ def test_a_bundle_comes_back_bit_by_bit(bundle: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("format: 3", "format: 0", "has format 0, this version of tacsim reads 1, 2, 3, 4, 5, 6"),
-        ("format: 3", "format: 7", "has format 7, this version of tacsim reads 1, 2, 3, 4, 5, 6"),
+        ("format: 3", "format: 0", "has format 0, this version of tacsim reads 1, 2, 3, 4, 5, 6, 7"),
+        ("format: 3", "format: 8", "has format 8, this version of tacsim reads 1, 2, 3, 4, 5, 6, 7"),
         ("format: 3", "format: 2", "was changed since it was written"),
         ("format: 3", "form: 3", "names no format"),
         ("noise: null", "noise: {deviation: [1, 1, 1]}", "was changed since it was written"),
@@ -252,7 +252,13 @@ def test_geometry_and_view_must_agree(tmp_path: Path) -> None:
     light = calibration().model_dump()["forward"] | {"depth": depth}
     with pytest.raises(ValueError, match=r"format 5 has no forward\.depth"):
         Calibration.model_validate(calibration().model_dump() | {"forward": light, "format": 5})
-    assert Calibration.model_validate(calibration().model_dump() | {"forward": light, "format": 6}).forward is not None
+    older = calibration().model_dump() | {"forward": light, "format": 6}
+    assert Calibration.model_validate(older).forward is not None
+    rows = len(light["weights"]) // term_count(0, light["position"])  # of one place
+    slopes = older | {"forward": light | {"depth": depth | {"slopes": ((0.1, 0.0, 0.0),) * rows}}}
+    with pytest.raises(ValueError, match=r"format 6 has no forward\.depth\.slopes"):
+        Calibration.model_validate(slopes)
+    assert Calibration.model_validate(slopes | {"format": 7}).forward is not None
     assert pinhole((240, 320)).centre == (159.5, 119.5)
 
 

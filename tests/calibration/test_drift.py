@@ -175,6 +175,7 @@ def test_swapped_colours_are_told_by_the_calibrations_own_picture(
         normalise.take_reference(frame(sensor.empty()[..., ::-1]))
     even = np.full((80, 80, 3), (90.0, 100.0, 110.0), dtype=np.float32)
     assert not exchanged(even[..., ::-1], even, np.ones((80, 80), dtype=np.bool_))  # nothing tells them apart
+    assert not exchanged(even[:4, :4, ::-1], even[:4, :4], np.ones((4, 4), dtype=np.bool_))  # smaller than a block
 
 
 def test_the_drift_is_a_quadratic_through_what_is_calm() -> None:

@@ -71,10 +71,8 @@ def _error(press: BallPress, inside: ContactCircle, fit: LightFit, ball: float) 
     v, u = np.mgrid[:rows, :columns].astype(np.float64)
     light, places = PhotometricLight(fit.forward), places_in_image(columns, rows)
     slopes = dent_gradient(u, v, press.circle, fit.thickness, ball, RIM_BLUR).astype(np.float32)
-    change = light.change(slopes, *places)[0].astype(np.float64)
-    if fit.forward.depth is not None:
-        height = dent_height(u, v, press.circle, fit.thickness, ball) / columns
-        change += light.depth(height.astype(np.float32), *places)
+    height = (dent_height(u, v, press.circle, fit.thickness, ball) / columns).astype(np.float32)
+    change = light.change(slopes, *places, height)[0].astype(np.float64)
     if fit.forward.shadows is not None:
         shade = DentShade(fit.forward.shadows.lamps, press.shape)
         dark = shade.terms(u.ravel(), v.ravel(), press.circle, fit.thickness, ball)

@@ -98,7 +98,7 @@ class PunchRenderer:
         assert fit.forward is not None
         self._light = PhotometricLight(fit.forward, tuple(self._mean.tolist()))
         self._places = places_in_image(self._still.shape[1], self._still.shape[0])
-        self._blur, self._deep = fit.forward.blur, fit.forward.depth is not None
+        self._blur = fit.forward.blur
         self._pitch, self._thickness = labels.pixel_pitch, labels.gel_thickness[0]
 
     def dent(self, face: PunchFace, scale: float, depth: float) -> Float32:
@@ -106,7 +106,7 @@ class PunchRenderer:
         middle."""
         import cv2
 
-        from tacsim.physics.oracle.layer import layer_contact
+        from benchmarks.truth.layer import layer_contact
 
         material = GelMaterial()
         gap = np.where(face.mask((BOX, BOX), BOX // 2, BOX // 2, self._pitch, scale), 0.0, 1.0)
@@ -125,9 +125,7 @@ class PunchRenderer:
         v, u = np.mgrid[:rows, :columns].astype(np.float32)
         at = [np.float32(BOX // 2) + axis - np.float32(middle) for axis, middle in ((u, x), (v, y))]
         seen = np.asarray(cv2.remap(dent, at[0], at[1], cv2.INTER_LINEAR), dtype=np.float32)
-        change, _ = self._light.change(seen[..., :2], *self._places)
-        if self._deep:
-            change = change + self._light.depth(np.ascontiguousarray(seen[..., 2]), *self._places)
+        change, _ = self._light.change(seen[..., :2], *self._places, np.ascontiguousarray(seen[..., 2]))
         if self._blur > 0:
             change = np.asarray(cv2.GaussianBlur(change, (0, 0), self._blur), dtype=np.float32)
         picture: Image = np.rint(np.clip(self._still + change, 0, 255)).astype(np.uint8)

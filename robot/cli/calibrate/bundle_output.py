@@ -63,8 +63,6 @@ def write_calibration(
         written.append(folder / page.FILE)
         title = _title(serial, folder, profile)
         page.write_page(written[-1], title, fit, scale, verdict, residuals, facts)
-    if scale.unchecked:
-        notes.print(scale.unchecked, markup=False)
     for finding in verdict.findings:
         todo = f" Next: {finding.todo}" if finding.todo else ""
         notes.print(f"{finding.word}: {finding.what}.{todo}", markup=False)

@@ -13,7 +13,7 @@ import typer
 from robot.cli.calibrate.bundle_output import FRAMES, UNKNOWN, write_calibration
 from robot.cli.calibrate.session import confirm_free_gel, led, named_camera, picture_keeper
 from robot.cli.errors import UNTRUSTED
-from robot.cli.options import Out, Overrides, length, quantity
+from robot.cli.options import Out, Overrides, length, quantities, quantity
 from robot.cli.output import busy, new_directory, notes, results, warn
 
 if TYPE_CHECKING:
@@ -71,6 +71,14 @@ def sensor(
         Path | None,
         typer.Option(help="view.yaml of `tacsim calibrate lens`: frames are rectified by it.", show_default=False),
     ] = None,
+    size: Annotated[
+        Any,
+        typer.Option(
+            parser=quantities("length", 2),
+            metavar="LENGTH,LENGTH",
+            help="Width, height of the gel that the picture shows, by a ruler: they check the pitch.",
+        ),
+    ] = None,
     region: Annotated[
         str | None,
         typer.Option(
@@ -113,7 +121,7 @@ def sensor(
     if (frames is None) == (camera is None):
         raise typer.BadParameter("give either a folder of frames, or --camera to press now")
     asked = _asked(
-        ball_diameter, ball_radius, kind, pixel_pitch, view, region, known_depth, serial, out, markers=markers
+        ball_diameter, ball_radius, kind, pixel_pitch, view, size, region, known_depth, serial, out, markers=markers
     )
     _calibrate(asked, frames, reference, camera, set_ or [], presses)
 
@@ -136,7 +144,7 @@ def _calibrate(
     fit = _fitted(read, asked.ball / pitch, None if found is None else found.radius / pitch)
     from calibration.light.verdict import KnownScale
 
-    scale = KnownScale(pitch, asked.ball, asked.profile.gel_size, asked.profile.gel_thickness, asked.depths)
+    scale = KnownScale(pitch, asked.ball, asked.gel_size, asked.profile.gel_thickness, asked.depths)
     write_calibration(
         asked.folder, fit, read, asked.serial, scale, found, asked.profile, view=seen, region=asked.region
     )
@@ -150,11 +158,17 @@ class _Asked:
     profile: SensorProfile
     pitch: float | None  # of pixels on the gel [m]
     view: GelView | None
+    size: tuple[float, float] | None  # of the gel that the picture shows [m]
     region: PictureRegion | None
     depths: tuple[tuple[str, float], ...]
     markers: bool
     serial: str
     folder: Path
+
+    @property
+    def gel_size(self) -> tuple[float, float] | None:
+        """What is known of the gel that the picture shows: as told, of its kind, or of the view that was measured."""
+        return self.size or self.profile.gel_size or (self.view.size if self.view else None)
 
 
 def _asked(
@@ -163,6 +177,7 @@ def _asked(
     kind: str | None,
     pitch: float | None,
     view: Path | None,
+    size: tuple[float, float] | None,
     region: str | None,
     known_depth: list[str] | None,
     serial: str,
@@ -184,6 +199,8 @@ def _asked(
         raise typer.BadParameter("give either --pixel-pitch or --view")
     if pitch is None and view is None and profile.gel_size is None:
         raise typer.BadParameter("give --pixel-pitch or --view, or --kind with a pitch that is known beforehand")
+    if size is not None and min(size) <= 0:
+        raise typer.BadParameter("both lengths must be above 0", param_hint="--size")
     if not re.fullmatch(SERIAL, serial):
         raise typer.BadParameter(
             f"'{serial}' is no serial number: up to 64 letters, digits, '.', '_' and '-'", param_hint="--serial"
@@ -199,6 +216,7 @@ def _asked(
         profile=profile,
         pitch=pitch,
         view=None if view is None else load(GelView, view),
+        size=size,
         region=None if region is None else _region(region),
         depths=tuple(_known_depth(text) for text in known_depth or ()),
         markers=markers or profile.markers,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from robot.cli.options import Overrides
-from robot.cli.output import notes, one_bar, show_table
+from robot.cli.output import notes, one_bar, require_writable, show_table
 
 if TYPE_CHECKING:
     from robot.train.evaluate import Interval, Judged
@@ -38,8 +38,7 @@ def evaluate(
 
     Example: tacsim evaluate squeeze --policy learned --policy scripted --episodes 50
     """
-    if json_ is not None and json_.exists():
-        raise typer.BadParameter(f"{json_} exists already; name a new file", param_hint="--json")
+    require_writable(json_, "--json", new=True)
     from robot.train.evaluate import evaluate as judge_all
     from tacsim.config import load
     from tacsim.models.training import Training

@@ -16,7 +16,7 @@ from robot.rig.replay_rig import open_replay, recorded_rig
 from robot.studies.identify.simulation import Seen, shape_signals
 from tacsim import pose as se3
 from tacsim.geometry.shapes import extent
-from tacsim.interface import Action, EndOfEpisode, Observation, Pose
+from tacsim.interface import Action, EndOfEpisode, FloatArray, Observation, Pose
 from tacsim.models.rig import ReplayArmConfig, ReplaySensorConfig, RigConfig, SimSensorConfig
 from tacsim.models.scene import Scene
 from tacsim.models.sensor import CanonicalGrid, Markers
@@ -83,6 +83,7 @@ class Recordings:
         forces = [name for name in FORCES if name in there]
         timed = ["time"] if "time" in there else []
         rows = np.array(read_columns(path, ["x", "y", "z", *timed, *forces]))
+        self._require_metres(path, rows[:, 2])
         time = rows[:, 3] if timed else np.arange(len(rows), dtype=np.float64)
         if (np.diff(time) < 0).any():
             raise BadRecording(f"{path}: column 'time' goes back; give the moments in their order")
@@ -97,6 +98,17 @@ class Recordings:
             }
         readings = {f"lower.{name}": rows[:, 3 + len(timed) + k] for k, name in enumerate(forces)}
         return Press(_name(path), poses, readings, time, np.ones(len(rows), np.int64))
+
+    def _require_metres(self, path: Path, z: FloatArray) -> None:
+        """Raises BadRecording for an indenter below the gel, or gels that meet: no press, or no metres."""
+        thickness, lowest = self.scene.gel.size[2], float(z.min())
+        if self.scene.indenter is not None and lowest <= -thickness:
+            raise BadRecording(
+                f"{path}: z goes down to {lowest:g} m, through the gel of {thickness:g} m; give it in metres, 0 where "
+                "the indenter touches the untouched gel"
+            )
+        if self.scene.indenter is None and lowest <= 0.0:
+            raise BadRecording(f"{path}: z goes down to {lowest:g} m; it is the gap between the gels, in metres")
 
     # ------------------------------------------------------------------ episodes
 

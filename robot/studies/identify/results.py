@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
-import tempfile
 from datetime import date
 from pathlib import Path
 from typing import Any
@@ -13,6 +11,7 @@ import numpy as np
 import yaml
 
 from calibration.materials.parameters import Parameter
+from robot.common.whole_file import whole_folder
 from robot.studies.identify.identify import Identified
 from robot.studies.identify.motions import WHAT_TELLS
 from robot.studies.identify.picture import draw
@@ -50,20 +49,13 @@ def material(identified: Identified) -> dict[str, Any]:
 def write(folder: Path, identified: Identified) -> list[Path]:
     """Writes identified.json and identified.png, and if nothing speaks against the fit, material.yaml and scene.yaml,
     all at once: `folder`, which must not be there, comes with all of them or not at all. Raises OSError."""
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    made = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
-    try:
+    with whole_folder(folder) as made:
         text = json.dumps(as_json(identified), indent=1, allow_nan=False)
         (made / "identified.json").write_text(text + "\n", encoding="utf-8")
         draw(identified, told(identified), made / "identified.png")
         if not identified.findings:
             (made / "material.yaml").write_text(_material_text(identified), encoding="utf-8")
             (made / "scene.yaml").write_text(_scene_text(identified), encoding="utf-8")
-        made.chmod(0o755)
-        made.rename(folder)
-    except BaseException:
-        shutil.rmtree(made, ignore_errors=True)
-        raise
     return sorted(folder.iterdir())
 
 

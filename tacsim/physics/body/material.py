@@ -2,7 +2,7 @@
 
 Symmetric 3x3 matrices are stored as 6 numbers (xx, yy, zz, xy, xz, yz). Polynomials of one symmetric matrix commute
 and stay symmetric, so products of them need 6 numbers only: no SVD, no eigenvalues, no branch near equal ones.
-The same laws in float64 NumPy: tacsim/physics/oracle/laws.py.
+The same laws in float64 NumPy: benchmarks/truth/laws.py.
 """
 
 from tacsim.compute.runtime import ti

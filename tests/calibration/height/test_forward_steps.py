@@ -41,9 +41,7 @@ def seen(height: np.ndarray, of: PhotometricModel) -> np.ndarray:
     """(3, H, W) change of colour of a surface [px]."""
     slopes = np.stack(np.gradient(height)[::-1], axis=-1)
     light = PhotometricLight(of)
-    colour = light.change(slopes, U, V)[0]
-    if of.depth is not None:
-        colour = colour + light.depth(height / np.float32(COLUMNS), U, V)
+    colour = light.change(slopes, U, V, height / np.float32(COLUMNS))[0]
     if of.shadows is not None:
 
         def at(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -94,6 +92,18 @@ def test_slopes_are_found_where_depth_colours_the_gel() -> None:
     weights = ((0.25, -0.1, -0.2), *(((0.0, 0.0, 0.0),) * (DEPTH_TERMS - 1)))
     light = model(0.0).model_copy(update={"depth": DepthColour(deepest=8 / COLUMNS, weights=weights)})
     truth = bar()
+    change, touched = seen(truth, light), truth > 1.0
+    first, better = (angle(height, truth)[touched].mean() for height in both(change, light))
+    assert first > 4.0
+    assert better < 0.5 * first
+
+
+def test_slopes_are_found_that_look_otherwise_at_depth() -> None:
+    """Deep down a lamp tells twice as much of a slope: by its colour alone a bar's flank passes for a steeper one."""
+    weights = ((0.0, 0.0, 0.0),) * DEPTH_TERMS
+    plain = model(0.0)
+    depth = DepthColour(deepest=8 / COLUMNS, weights=weights, slopes=plain.weights)
+    light, truth = plain.model_copy(update={"depth": depth}), bar()
     change, touched = seen(truth, light), truth > 1.0
     first, better = (angle(height, truth)[touched].mean() for height in both(change, light))
     assert first > 4.0

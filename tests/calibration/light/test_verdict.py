@@ -15,7 +15,8 @@ from calibration.light.page import write_page
 from calibration.light.verdict import KnownScale, judge
 from tests.calibration.presses import BALL, BALL_PX, COLUMNS, PITCH, ROWS, HiddenSensor
 
-SCALE = KnownScale(PITCH, BALL)
+SIZE = (COLUMNS * PITCH, ROWS * PITCH)  # of the gel that the pictures show
+SCALE = KnownScale(PITCH, BALL, SIZE)
 
 
 def calibrated(count: int, ball: float = BALL_PX) -> LightFit:
@@ -37,8 +38,16 @@ def said(fit: LightFit, scale: KnownScale, word: str) -> str:
 
 
 def test_good_presses_are_good(fit: LightFit) -> None:
-    told = KnownScale(PITCH, BALL, (COLUMNS * PITCH, ROWS * PITCH), 8e-3)
+    told = KnownScale(PITCH, BALL, SIZE, 8e-3)
     assert said(fit, told, "good") == "good"
+
+
+def test_lengths_that_nothing_checks_are_not_called_good(fit: LightFit) -> None:
+    """Truth: 0.08 mm a pixel; with 0.128 mm said for it the presses are explained as well, and all slopes are wrong."""
+    wrong = calibrated(5, BALL_PX / 1.6)
+    for found, pitch in ((fit, PITCH), (wrong, 1.6 * PITCH)):
+        assert "nothing checks the lengths" in said(found, KnownScale(pitch, BALL), "usable")
+    assert "of the gel are to be seen" in said(wrong, KnownScale(1.6 * PITCH, BALL, SIZE), "do not trust")
 
 
 @pytest.mark.parametrize(("count", "word"), [(1, "do not trust"), (2, "do not trust"), (4, "usable")])
@@ -76,7 +85,7 @@ def test_two_solutions_for_the_radii_are_told(fit: LightFit) -> None:
     ids=["ball too small", "diameter for radius", "pitch too large", "pitch too small"],
 )
 def test_wrong_lengths_are_told(ball: float, pitch: float, words: str, word: str) -> None:
-    told = KnownScale(PITCH * pitch, BALL * ball, (COLUMNS * PITCH, ROWS * PITCH) if pitch != 1.0 else None)
+    told = KnownScale(PITCH * pitch, BALL * ball, SIZE if pitch != 1.0 else None)
     assert words in said(calibrated(5, BALL_PX * ball / pitch), told, word)
 
 
@@ -91,7 +100,7 @@ def test_contacts_that_are_all_as_wide_as_the_ball_tell_a_wrong_length(fit: Ligh
 def test_a_press_of_known_depth_tells_a_wrong_pitch(fit: LightFit) -> None:
     """Hertz's depth of a half-space, of which the presses are made, is 0.65 mm for the third."""
     depth = (("press 2", 0.65e-3),)
-    assert judge(fit, replace(SCALE, depths=depth)).word == "good"
+    assert judge(fit, KnownScale(PITCH, BALL, depths=depth)).word == "good"
     wrong = calibrated(5, BALL_PX / 1.6)
     told = said(wrong, KnownScale(1.6 * PITCH, BALL, depths=depth), "do not trust")
     assert "by the depth that is known" in told

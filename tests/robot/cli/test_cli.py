@@ -133,7 +133,8 @@ def test_exit_codes_of_errors() -> None:
     assert explain(ConfigError([]))[1] == 2
     assert explain(EpisodeError("x.mcap: is no episode")) == ("x.mcap: is no episode", 2)
     assert explain(IncompatibleRig("it lacks truth"))[1] == 2
-    assert explain(PermissionError(13, "Permission denied", "out")) == ("out: Permission denied", 1)
+    assert explain(PermissionError(13, "Permission denied", "out")) == ("out: Permission denied", 2)
+    assert explain(OSError(28, "No space left on device", "out")) == ("out: No space left on device", 1)
     assert "--debug" in explain(KeyError("slip"))[0]
     assert "no room" in explain(ExceptionGroup("two", [OSError("no room"), EpisodeError("bad")]))[0]
 

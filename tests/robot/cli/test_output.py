@@ -16,7 +16,7 @@ from rich.text import Text
 
 from robot.cli import app, errors
 from robot.cli.doctor import print_checks
-from robot.cli.output import SafeConsole, show_table
+from robot.cli.output import SafeConsole, require_writable, show_table
 from robot.doctor.machine import Check
 from tacsim.interface import RigSpec, SensorSpec, TactileFrame
 from tacsim.record.episode import EpisodeMeta, Step
@@ -109,3 +109,24 @@ def test_the_help_of_every_option_says_its_units() -> None:
         if Text.from_markup(words).plain != words.replace("\\[", "[")
     ]
     assert lost == []
+
+
+@pytest.mark.parametrize("columns", [1, 20])
+def test_a_narrow_terminal_loses_nothing(columns: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", str(columns))
+    table = Table(show_header=False, min_width=60)
+    table.add_row("peak force |Fz|", "0.59 N (upper, step 1)")
+    shown = io.StringIO()
+    SafeConsole(file=shown, soft_wrap=True).print(table)
+    assert "0.59 N (upper, step 1)" in shown.getvalue()
+
+
+def test_a_file_that_cannot_be_written_is_refused_before_the_work(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    require_writable(tmp_path / "new" / "file", "--json", new=True)
+    require_writable(tmp_path / "file", "--json")
+    for file, words in ((tmp_path / "file", "exists already"), (tmp_path / "file" / "new", "cannot be written")):
+        with pytest.raises(typer.BadParameter, match=words):
+            require_writable(file, "--json", new=True)
+    with pytest.raises(typer.BadParameter, match="cannot be written"):
+        require_writable(tmp_path, "--json")

@@ -42,8 +42,8 @@ def test_a_cut_recording_is_recovered_and_said(cut: Path, tmp_path: Path) -> Non
     assert len(read_episode(tmp_path / "cut.recovered.mcap").steps) == STEPS
     assert cut.read_bytes() == before
     again = tacsim("recover", "cut.mcap")
-    assert again.exit_code == 1 and "is there already; nothing is overwritten" in again.stderr
-    assert tacsim("recover", "cut.mcap", "--out", "cut.mcap").exit_code == 1
+    assert again.exit_code == 2 and "exists already; nothing is overwritten" in again.stderr
+    assert tacsim("recover", "cut.mcap", "--out", "cut.mcap").exit_code == 2
     assert cut.read_bytes() == before
     assert "nothing to recover" in tacsim("recover", "cut.recovered.mcap").stdout
     shown = tacsim("replay", "cut.recovered.mcap", "--out", "r")
@@ -73,4 +73,4 @@ def test_a_full_disk_leaves_nothing_half(cut: Path, tmp_path: Path) -> None:
     assert process.returncode == 1 and "cut.recovered.mcap: File too large" in process.stderr
     assert sorted(path.name for path in tmp_path.iterdir()) == ["cut.mcap", "whole.mcap"]
     missing = tacsim("recover", "cut.mcap", "--out", "none/new.mcap")
-    assert missing.exit_code == 1 and "none/new.mcap: No such file" in missing.stderr
+    assert missing.exit_code == 2 and "none/new.mcap: No such file" in missing.stderr

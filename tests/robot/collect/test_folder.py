@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import shlex
+import shutil
 import signal
 import subprocess
 import time
+from contextlib import ExitStack
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -14,12 +16,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from robot.collect import folder as folders
 from robot.collect.collect import collect
 from robot.collect.folder import open_set
 from robot.collect.job import Piece, SetError
 from robot.collect.objects import find_objects
 from robot.collect.workers import Stopped
+from robot.common import whole_file
+from tacsim.config import load_scene
 from tacsim.models.scene import Sphere
 from tests.robot.cli.invoked import START, environment, tacsim, told
 from tests.robot.collect.small import contents, job, rows
@@ -94,8 +97,10 @@ def test_another_command_is_refused_and_nothing_changes(whole: Path) -> None:
     before = {path: path.stat().st_mtime_ns for path in whole.rglob("*")}
     with pytest.raises(SetError, match=r"another command \(x\): seed is 0 there and 7 here"):
         collect(job(5, seed=7), whole, {}, "y")
-    with pytest.raises(SetError, match=r"files is .* there and .* here"):
+    with pytest.raises(SetError, match=r"files.objects/a.stl is null there and .* here"):
         collect(job(5), whole, {"objects/a.stl": b"solid"}, "y")
+    with pytest.raises(SetError, match=r"scene.indenter.friction is 0.6 there and 0.3 here"):
+        collect(job(5, scene=load_scene("press", ["preset=learn", "indenter.friction=0.3"])), whole, {}, "y")
     assert {path: path.stat().st_mtime_ns for path in whole.rglob("*")} == before
 
 
@@ -108,6 +113,36 @@ def test_a_folder_of_something_else_is_refused(tmp_path: Path) -> None:
     (tmp_path / "full/collect.json").write_text("{}")
     with pytest.raises(SetError, match=r"collect\.json cannot be read"):
         collect(job(1), tmp_path / "full", {}, "x")
+
+
+def test_what_was_damaged_is_named_with_what_to_do(whole: Path, tmp_path: Path) -> None:
+    shutil.copytree(whole, tmp_path / "set")
+    for text in ('{"index": 1, "rea', '{"index": 1}', "[1]"):
+        (tmp_path / "set/failures.jsonl").write_text(text)
+        with pytest.raises(SetError, match=r"failures\.jsonl cannot be read; delete it"):
+            collect(job(5), tmp_path / "set", {}, "x")
+    (tmp_path / "set/failures.jsonl").unlink()
+    (tmp_path / "set/data/train-00001.parquet").write_bytes(b"PAR1 no table")
+    with pytest.raises(SetError, match=r"train-00001\.parquet is damaged; delete it"):
+        collect(job(5), tmp_path / "set", {}, "x")
+    (tmp_path / "set/data/train-00001.parquet").unlink()
+    collect(job(5), tmp_path / "set", {}, "x")
+    assert contents(tmp_path / "set") == contents(whole)
+
+
+def test_who_begins_at_the_same_time_waits_for_who_was_faster(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    real, made = whole_file.tempfile.mkdtemp, job(1)
+
+    def late(**place: Any) -> str:
+        monkeypatch.undo()
+        monkeypatch.chdir(tmp_path)
+        held.enter_context(open_set(tmp_path / "set", made, made.settings.model_dump(mode="json"), {}, "x"))
+        return str(real(**place))
+
+    monkeypatch.setattr(whole_file.tempfile, "mkdtemp", late)
+    with ExitStack() as held, pytest.raises(SetError, match="another tacsim collect is at work"):
+        collect(made, tmp_path / "set", {}, "x")
+    assert [path.name for path in tmp_path.iterdir()] == ["set"]
 
 
 def test_nobody_else_writes_meanwhile(tmp_path: Path) -> None:
@@ -128,7 +163,7 @@ def test_a_full_disk_names_the_file_and_leaves_whole_ones(tmp_path: Path, monkey
         if written == 5:  # notes, reference, card, a file
             raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(folders.os, "fsync", full)
+    monkeypatch.setattr(whole_file.os, "fsync", full)
     with pytest.raises(OSError, match="No space left") as raised:
         collect(job(5), tmp_path / "set", {}, "x")
     assert str(raised.value.filename).endswith("train-00001.parquet")
@@ -141,7 +176,7 @@ def test_a_full_disk_at_the_begin_leaves_nothing(tmp_path: Path, monkeypatch: py
     def full(number: int) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(folders.os, "fsync", full)
+    monkeypatch.setattr(whole_file.os, "fsync", full)
     with pytest.raises(OSError, match="No space left"):
         collect(job(1), tmp_path / "set", {}, "x")
     assert list(tmp_path.iterdir()) == []

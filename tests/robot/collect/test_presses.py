@@ -17,7 +17,7 @@ from robot.collect.collect import collect
 from robot.collect.presses import PressSet
 from robot.collect.shapes import CLOSED_FORMS, meshes
 from robot.collect.table import WORDS
-from robot.studies.press import PressMotion, press
+from robot.studies.press import UNFELT, PressMotion, press
 from tacsim import pose as se3
 from tacsim.config import load_scene, load_sensor
 from tacsim.geometry.mesh import load_mesh
@@ -136,6 +136,19 @@ def test_the_card_has_statistics_of_the_rows(folder: Path) -> None:
     assert cells[2].strip() == "6"
     assert float(cells[3].split(",")[1]) == pytest.approx(float(np.median(depths)), rel=0.01)
     assert "6 presses, 0 failed" in text
+
+
+def test_a_press_whose_edge_the_gel_cannot_feel_is_told(tmp_path: Path) -> None:
+    """A wedge of 60 degrees 1 mm deep at draft: its force is a sixth too small, which nothing else of its row shows."""
+    import trimesh
+
+    wedge = trimesh.convex.convex_hull([(x, y, z) for x in (-3, 3) for y, z in ((0, 0), (-2.9, 5), (2.9, 5))])
+    objects = {"ball": Sphere(radius=3e-3), "wedge": Mesh(path="objects/wedge.stl")}
+    made = job(2, objects=objects, scene=load_scene("press", ["preset=draft"]), depth=(1e-3, 1e-3), pose="centred")
+    collect(made, tmp_path / "set", {"objects/wedge.stl": wedge.export(file_type="stl")}, "x")
+    ball, edge = rows(tmp_path / "set")
+    assert ball["unfelt"] < UNFELT < edge["unfelt"] < 0.25 and not (ball["folded"] or edge["folded"])
+    assert "1 with forces too small" in (tmp_path / "set/README.md").read_text()
 
 
 def test_a_press_that_fails_is_a_row_of_failures_and_the_set_goes_on(tmp_path: Path) -> None:

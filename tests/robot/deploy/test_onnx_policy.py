@@ -253,6 +253,11 @@ def test_a_file_that_is_no_policy_says_why(
     assert "\n" not in str(caught.value)
 
 
+def test_the_goal_of_another_task_is_called_so(write: Callable[..., Path]) -> None:
+    with pytest.raises(PolicyNotFound, match=r"was trained for task 'squeeze', whose goal is .* 1 x 2"):
+        OnnxPolicy(write(), GRID, (1e-3, 2e-3))
+
+
 def test_files_that_cannot_be_read(tmp_path: Path) -> None:
     path = tmp_path / "policy.onnx"
     with pytest.raises(PolicyNotFound, match="cannot be read: No such file"):

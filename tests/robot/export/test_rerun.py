@@ -130,7 +130,7 @@ def test_the_file_is_whole_and_never_written_over(tmp_path: Path) -> None:
     assert verified.returncode == 0 and "1 file verified without error" in verified.stdout + verified.stderr
     before = Path("a.rrd").read_bytes()
     again = tacsim("view", str(path), "--save", "a.rrd")
-    assert again.exit_code == 1 and "a.rrd: exists already" in again.stderr
+    assert again.exit_code == 2 and "a.rrd: exists already" in again.stderr
     assert Path("a.rrd").read_bytes() == before
     assert tacsim("view", str(path), "--save", "a.txt").exit_code == 2
     assert "none.mcap: no such file" in tacsim("view", "none.mcap", "--save", "none/b.rrd").stderr

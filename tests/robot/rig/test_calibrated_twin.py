@@ -230,7 +230,7 @@ def test_what_is_recorded_of_a_rig_means_the_same_again(finger: Path, tmp_path: 
 
 def test_a_press_with_a_bundle_has_its_picture_and_gel(finger: Path, tmp_path: Path) -> None:
     small = ("--preset", "learn", "--radius", "4 mm", "--depth", "0.4 mm")
-    done = tacsim("press", "sphere", *small, "--model", "finger", "--out", tmp_path / "pressed")
+    done = tacsim("press", "sphere", *small, "--sensor", "finger", "--out", tmp_path / "pressed")
     assert done.exit_code == 0, done.output
     assert "gel 16 x 12 mm in whole elements of 2 mm" in done.output
     picture = np.asarray(Image.open(tmp_path / "pressed" / "rgb.png")).astype(int)

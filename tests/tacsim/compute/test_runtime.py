@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -89,3 +91,18 @@ print(os.wait()[1])
     told = "Taichi runs in the parent process and does not survive a fork: start workers by 'spawn'"
     first, second, *rest = run(code).splitlines()
     assert first.startswith(told) and second.startswith(told) and rest == ["True", "0"]
+
+
+@pytest.mark.parametrize("cache", [None, "file/cache"], ids=["no HOME", "not writable"])
+def test_it_runs_to_the_end_where_no_kernels_can_be_kept(tmp_path: Path, cache: str | None) -> None:
+    """Taichi ends the process without a home directory, and crashes at its end without a cache: a service's, say."""
+    (tmp_path / "file").touch()
+    places = {name: value for name, value in os.environ.items() if name not in ("HOME", "XDG_CACHE_HOME")}
+    if cache is not None:
+        places["XDG_CACHE_HOME"] = str(tmp_path / cache)
+    code = "from tacsim.compute.runtime import start, ti\n@ti.kernel\ndef three() -> ti.i32: return 3\n"
+    (tmp_path / "small.py").write_text(f"{code}start()\nprint(three())\n")
+    command = [sys.executable, str(tmp_path / "small.py")]
+    places["PYTHONPATH"] = os.pathsep.join(sys.path)
+    done = subprocess.run(command, env=places, capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stdout) == (0, "3\n"), done.stderr

@@ -131,6 +131,24 @@ def test_wrong_models_are_refused() -> None:
         SensorModel(photometric=model(1, 0), lighting=Lighting(background=None))
 
 
+def test_slopes_look_otherwise_at_depth() -> None:
+    """Closed form: w n_x of weight 0.3 in red, for a slope of 0.75 (n_x = -0.6) at four depths."""
+    light, gradient = model(3, 2), np.zeros((1, 4, 2), dtype=np.float32)
+    gradient[..., 0] = 0.75
+    rows = ((0.3, 0.0, 0.0), *(((0.0, 0.0, 0.0),) * 9))
+    depth = DepthColour(deepest=0.04, weights=((0.0, 0.0, 0.0),) * DEPTH_TERMS, slopes=rows)
+    deep = PhotometricLight(light.model_copy(update={"depth": depth}))
+    u, v = (np.full((1, 4), value, dtype=np.float32) for value in (0.1, -0.2))
+    height = np.array([[-0.01, 0.0, 0.02, 0.1]], dtype=np.float32)
+    surface, _ = PhotometricLight(light).change(gradient, u, v)
+    np.testing.assert_allclose(deep.change(gradient, u, v)[0], surface, atol=1e-6)
+    wanted = np.array([0.0, 0.0, -0.09, -0.18])
+    found = deep.change(gradient, u, v, height)[0] - surface
+    np.testing.assert_allclose(found[0], np.stack([wanted, 0 * wanted, 0 * wanted], axis=-1), atol=1e-6)
+    with pytest.raises(ValidationError, match=r"depth\.slopes has 10 rows; degree 1 has 3, or none"):
+        PhotometricModel(**(model(1, 0).model_dump() | {"depth": depth}))
+
+
 def test_flat_gel_that_is_pressed_in_has_the_colour_of_its_depth() -> None:
     """Closed form: a surface pressed in evenly, which has no slope, at three depths; beyond the deepest as there."""
     weights = np.zeros((DEPTH_TERMS, 3))

@@ -17,6 +17,7 @@ from tacsim.models.rig import ReplayArmConfig, ReplaySensorConfig
 from tacsim.record.episode import EpisodeError, EpisodeMeta, Step
 from tacsim.record.images import encode_png, reference_attachments
 from tacsim.record.replay import ReplayArm, ReplayClock, ReplaySensor, recorded_period
+from tacsim.record.sources import only_or_named
 from tacsim.record.writer import Recorder
 
 
@@ -118,6 +119,8 @@ def test_height_and_flow_are_promised_only_if_recorded(episode: Path) -> None:
 def test_names_that_an_episode_has_not(episode: Path) -> None:
     with pytest.raises(EpisodeError, match=r"no sensor 'left'; the recording has: lower, upper, side"):
         ReplaySensor(sensor_facts(episode), "left", ReplayClock(0.1))
+    with pytest.raises(EpisodeError, match=r"which sensor\? Name one; the recording has: lower, upper, side"):
+        only_or_named(["lower", "upper", "side"], "", Path("a.mcap"), "sensor")
     with pytest.raises(EpisodeError, match=r"no arm 'left'; the recording has: lower, upper"):
         ReplayArm(arm_facts(episode), "left", ReplayClock(0.1))
 

@@ -16,10 +16,12 @@ from tacsim.optics.noise import noise_source
 from tacsim.optics.render import Renderer
 from tacsim.sim.sensor import SimSensor
 from tests.calibration.dotted import draw, lattice_points
-from tests.calibration.presses import BALL, PITCH, HiddenSensor
+from tests.calibration.presses import BALL, COLUMNS, PITCH, ROWS, HiddenSensor
 from tests.calibration.sources import save_picture, write_presses
 from tests.robot.cli.invoked import tacsim, told
 from tests.tacsim.optics.surfaces import flat
+
+SIZE = f"{COLUMNS * PITCH * 1e3} mm, {ROWS * PITCH * 1e3} mm"  # of the gel that the pictures show
 
 
 @pytest.fixture
@@ -38,7 +40,9 @@ def test_the_command_writes_a_bundle_and_a_picture(folder: Path, tmp_path: Path)
     assert (out / "residuals.png").stat().st_size > 10_000
     assert "press_3.png" in ran.output
     assert calibration.noise is not None and "noise, from beside the contacts: R, G, B" in ran.output
-    assert "nothing checks the lengths" in ran.stderr
+    assert "nothing checks the lengths" in ran.stderr and "verdict: usable" in ran.output
+    sure = tacsim("calibrate", "sensor", folder, *lengths, "--size", SIZE, "--out", tmp_path / "sure")
+    assert "verdict: good" in sure.output and "nothing checks the lengths" not in sure.stderr, sure.output
     again = tacsim("calibrate", "sensor", folder, *lengths, "--out", out)
     assert again.exit_code == 2
     assert "overwritten" in again.output
@@ -64,7 +68,7 @@ def test_a_folder_that_appears_meanwhile_is_left_alone(
     monkeypatch.setattr(calibrator, "calibrate_light", somebody_is_faster)
     lengths = ["--ball-radius", f"{BALL * 1e3} mm", "--pixel-pitch", f"{PITCH * 1e3} mm"]
     ran = tacsim("calibrate", "sensor", folder, *lengths, "--out", out)
-    assert ran.exit_code == 1 and "File exists" in ran.output
+    assert ran.exit_code == 2 and "exists already; nothing is overwritten" in ran.output
     assert [path.name for path in out.iterdir()] == ["calibration.yaml"]
     assert (out / "calibration.yaml").read_text(encoding="utf-8") == "another's"
 
@@ -101,7 +105,9 @@ def test_the_command_ends_in_a_verdict(folder: Path, tmp_path: Path) -> None:
         (("--ball-radius", "2.92 mm", "--pixel-pitch", "6e-5"), "has no unit"),
         (("--ball-radius", "2.92 m", "--pixel-pitch", "0.06 mm"), "allowed"),
         (("--ball-radius", "3 mm", "--ball-diameter", "6 mm", "--pixel-pitch", "0.06 mm"), "not both"),
+        (("--ball-radius", "nan", "--pixel-pitch", "0.06 mm"), "allowed: a number with its unit"),
         (("--ball-diameter", "6 mm", "--kind", "minni"), "known: mini,"),
+        (("--ball-diameter", "6 mm", "--pixel-pitch", "0.06 mm", "--size", "20 mm, 0 mm"), "above 0"),
         (("--ball-diameter", "6 mm", "--kind", "other"), "--pixel-pitch or --view"),
         (("--ball-diameter", "6 mm", "--pixel-pitch", "0.06 mm", "--depth", "press_9.png=1 mm"), "press_0.png"),
         (("--ball-diameter", "6 mm", "--pixel-pitch", "0.06 mm", "--depth", "press_1.png=1"), "say '1 mm'"),

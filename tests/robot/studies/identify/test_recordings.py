@@ -24,13 +24,18 @@ from tacsim.record.episode import EpisodeError
 
 TABLE = "time,x,y,z,fx,fz\n0,0,0,0.0001,0,0\n1,0,0,-0.0002,0,-0.1\n2,0.001,0,-0.0004,0.1,-0.3\n"
 
+GAPS = "time,x,y,z,fx,fz\n0,0,0,0.008,0,0\n1,0,0,0.0077,0,-0.1\n2,0.001,0,0.0075,0.1,-0.3\n"
+
 
 def test_a_table_of_heights_and_forces(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text(TABLE)
     press = Recordings(load_scene("press")).read(tmp_path / "a.csv")
     assert press.poses["indenter"][2].position == pytest.approx([1e-3, 0, 4e-3 - 0.4e-3])
     assert list(press.readings) == ["lower.fx", "lower.fz"] and press.readings["lower.fz"][2] == -0.3
-    squeeze = Recordings(load_scene("squeeze")).read(tmp_path / "a.csv")
+    with pytest.raises(BadRecording, match=r"down to -0.0004 m; it is the gap between the gels, in metres"):
+        Recordings(load_scene("squeeze")).read(tmp_path / "a.csv")
+    (tmp_path / "gap.csv").write_text(GAPS)
+    squeeze = Recordings(load_scene("squeeze")).read(tmp_path / "gap.csv")
     assert squeeze.poses["upper"][0].quaternion == pytest.approx(HALF_TURN_X.quaternion)
 
 
@@ -50,6 +55,10 @@ def test_a_table_of_another_ball(tmp_path: Path) -> None:
         ("x,y,z,fz\n0,0,0,1\n0,0,0,1\n", "2 moments"),
         (TABLE.replace("\n2,", "\n0.5,"), "goes back"),
         ("", "no column 'x'"),
+        (
+            "x,y,z,fz\n0,0,0,0\n0,0,-0.1,-1\n0,0,-0.3,-2\n",
+            "down to -0.3 m, through the gel of 0.004 m",
+        ),
     ],
 )
 def test_a_table_that_will_not_do_says_why(tmp_path: Path, text: str, message: str) -> None:
@@ -102,7 +111,7 @@ def test_a_script_that_is_none_says_why(tmp_path: Path, text: str, message: str)
 @pytest.fixture
 def identified(tmp_path: Path) -> Identified:
     """A body's fit to a linear law: no simulation."""
-    (tmp_path / "a.csv").write_text(TABLE)
+    (tmp_path / "a.csv").write_text(GAPS)
     scene = load_scene("squeeze", ["preset=learn"])
     press = Recordings(scene).read(tmp_path / "a.csv")
     noise, parameters = Noise(1e-4), parameters_of("body", scene)
@@ -151,7 +160,7 @@ def test_a_write_that_fails_leaves_nothing(
     monkeypatch.setattr(results, "draw", full)
     with pytest.raises(OSError, match="No space"):
         results.write(tmp_path / "new" / "clay", identified)
-    assert list((tmp_path / "new").iterdir()) == []
+    assert [path.name for path in tmp_path.iterdir()] == ["a.csv"]
 
 
 def test_a_coarser_force_sensor_tells_less(identified: Identified) -> None:

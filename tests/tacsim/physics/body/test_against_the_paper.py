@@ -1,9 +1,10 @@
-"""The product's substep of a body, laid out for vector registers, against the paper's own (physics/oracle/mls_mpm.py),
-stage by stage, from the same state: some particles yield, some do not."""
+"""The product's substep of a body, laid out for vector registers, against the paper's own
+(benchmarks/truth/mls_mpm.py), stage by stage, from the same state: some particles yield, some do not."""
 
 import numpy as np
 import pytest
 
+from benchmarks.truth import mls_mpm
 from tacsim.compute.runtime import start, ti
 from tacsim.geometry.sampling import body_points
 from tacsim.models.scene import Body as BodyModel
@@ -20,7 +21,6 @@ from tacsim.physics.body.transfers import (
 from tacsim.physics.exec import layout
 from tacsim.physics.exec.environment import Counts, Environment, Floats, Params, Partial
 from tacsim.physics.exec.lanes import NODES, PARTS
-from tacsim.physics.oracle import mls_mpm
 from tacsim.physics.worlds.hybrid_kernels import Drive, grid_update
 
 pytestmark = pytest.mark.cpu

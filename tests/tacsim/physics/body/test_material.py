@@ -8,11 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from benchmarks.truth import laws
 from tacsim.compute.runtime import start, ti
 from tacsim.models.scene import BodyMaterial, lame
 from tacsim.physics.body import material
 from tacsim.physics.body.plasticine import BodyParams, body_params
-from tacsim.physics.oracle import laws
 
 MU, BULK = 0.172, 1.67
 Strains = ti.types.ndarray(dtype=material.vec6, ndim=1)

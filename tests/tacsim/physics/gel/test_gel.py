@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from benchmarks.truth import laws
 from tacsim.compute.runtime import start, ti
 from tacsim.models.scene import Gel, GelMaterial
 from tacsim.physics.exec.environment import Counts, Environment, Floats, Params, Partial
@@ -32,7 +33,6 @@ from tacsim.physics.gel.kernels import (
     gels_of,
 )
 from tacsim.physics.gel.mass import gel_advance_filtered, gel_even, gel_means
-from tacsim.physics.oracle import laws
 
 pytestmark = pytest.mark.cpu
 

@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from benchmarks.truth import laws
 from tacsim.compute.runtime import start, ti
 from tacsim.models.scene import BodyMaterial, GelMaterial
-from tacsim.physics.oracle import laws
 from tacsim.physics.seed import kernels
 from tacsim.physics.seed.kernels import Matrices, Solid
 from tacsim.physics.seed.world import solid

@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.truth.layer import layer_contact
 from tacsim.geometry import tiles
 from tacsim.interface import Pose
 from tacsim.models.scene import Box, Cylinder, Gel, GelMaterial, Mesh, Shape, Sphere
 from tacsim.physics.contact.indenter import POINTS
 from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.physics.move import MoveCommand
-from tacsim.physics.oracle.layer import layer_contact
 from tacsim.physics.worlds import press
 from tests.tacsim.physics.worlds.pressing import move, world
 

@@ -22,13 +22,23 @@ class WrenchNoiseSource:
         self._deviation = np.repeat([noise.force, noise.torque], 3)
         self._drift = noise.drift
         self._key = (noise.seed, zlib.crc32(arm.encode()))
+        self._begin(0)
+
+    def _begin(self, episode: int) -> None:
+        self._episode, self._index = episode, -1
+        self._generator = np.random.default_rng((*self._key, episode))
+        self._reading, self._step, self._zero = np.zeros(6), np.zeros(6), np.zeros(6)
 
     def __call__(self, index: int, period: float, episode: int) -> FloatArray:
         """(6,) in period `index` from 0, each of `period` [s]; force [N], then torque [N m]."""
-        # Drawn from the episode's start: the zero is the sum of all steps until now.
-        drawn = np.random.default_rng((*self._key, episode)).standard_normal((index + 1, 2, 6))
-        zero = self._drift * np.sqrt(period / MINUTE) * drawn[:index, 1].sum(axis=0)
-        noise: FloatArray = self._deviation * (drawn[index, 0] + zero)
+        if episode != self._episode or index < self._index:
+            self._begin(episode)
+        while self._index < index:
+            self._index += 1
+            self._zero = self._zero + self._step
+            self._reading, self._step = self._generator.standard_normal((2, 6))
+        zero = self._drift * np.sqrt(period / MINUTE) * self._zero
+        noise: FloatArray = self._deviation * (self._reading + zero)
         return noise
 
 

@@ -51,7 +51,7 @@ def test_they_are_those_of_the_flat_observation_and_the_goal_of_the_episode() ->
 def test_what_is_remembered_is_the_mean_since_the_episode_began() -> None:
     env = make(features={"maps": [], "touch": ["depth", "wrench"], "remembered": ["wrench"]})
     for seed in (1, 2):
-        shown = [env.reset(seed=seed)[0]["touch"]]
+        shown = [env.reset(seed=seed, options={"variant": 0})[0]["touch"]]
         for push in (1.0, 0.5, 0.2):
             shown.append(env.step(np.array([push, -push], np.float32))[0]["touch"])
         told, means = np.array(shown)[:, 4:16], np.array(shown)[:, 16:]

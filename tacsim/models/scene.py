@@ -30,7 +30,7 @@ PRESETS: dict[Preset, tuple[float, float]] = {
 MACH_BY_TOLERANCE, MACH_BY_STRESS, SLOWEST_MACH, FASTEST_MACH = 3.0, 4.0, 0.001, 0.03
 MACH_BY_SHEAR = 0.1
 LIGHTER = 1.5  # so much faster may sensors go whose gels and body answer as if they were lighter: no indenter, no seed
-FLOW_MACH = 0.01  # of motions that flow into one another, where nothing is lighter
+FLOW_MACH = 0.02  # mean of motions that flow into one another, where nothing is lighter
 CATCHING = 0.5  # element sizes: an edge that is less round catches on the mesh
 MAX_CELLS = 5_000_000  # elements of one gel, or its particles in the seed's scheme; a standard gel has 12,800
 
@@ -193,7 +193,9 @@ class Settling(Config):
     tolerance: Annotated[float, Field(gt=0, le=1)] = 1e-2  # force balance, change of force, and creep to come, relative
     mach: Annotated[float, Field(gt=0, le=0.3)] | None = None  # peak speed / wave speed; None: see Scene.peak_mach
     max_substeps: Annotated[int, Field(ge=0, le=1_000_000)] = 2000  # hold at most this long a move
-    flow_mach: Annotated[float, Field(gt=0, le=0.3)] | None = None  # speed of motions that flow; None: Scene.flow_mach
+    flow_mach: Annotated[float, Field(gt=0, le=0.3)] | None = (
+        None  # mean speed of motions that flow; None: Scene.flow_mach
+    )
 
 
 class Scene(Config):
@@ -291,7 +293,7 @@ class Scene(Config):
 
     @property
     def flow_mach(self) -> float:
-        """Speed of motions that flow into one another, over the wave speed."""
+        """Mean speed of motions that flow into one another, over the wave speed; slower on short paths."""
         if self.settling.flow_mach is not None:
             return self.settling.flow_mach
         return FLOW_MACH if self.body is None else LIGHTER * FLOW_MACH

@@ -44,11 +44,11 @@ def test_a_squeeze_ends_where_a_slow_one_does() -> None:
 def test_a_control_step_ends_near_where_a_slow_one_does() -> None:
     settled, flowing = squeeze.control_step("draft", "hybrid", 1)
     assert settled.note == "" and settled.error < 1.0  # % of force, rms
-    assert settled.error < flowing.error < 8.0
+    assert flowing.error < 2.0
     for row in (settled, flowing):
         assert row.figures["first_step_percent"] <= row.figures["worst_percent"] < 15.0
     assert settled.substeps is not None and flowing.substeps is not None
-    assert flowing.substeps < settled.substeps / 4  # 0.1 mm at Mach 0.03 and no hold
+    assert flowing.substeps < settled.substeps / 3  # no hold
 
 
 def test_a_body_between_sensors_that_part_sideways_goes_half_way() -> None:

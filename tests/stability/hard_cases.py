@@ -114,7 +114,7 @@ def with_nan(times: int) -> dict[str, Any]:
 
 SHORT = {"hybrid.COURANT": 0.3, "press.COURANT": 0.3, "seed.COURANT": 0.3}
 TOO_LONG = {"hybrid.COURANT": 1.2, "press.COURANT": 1.2, "seed.COURANT": 1.5}
-RUSHED = Settling(mach=0.1, tolerance=1e-2, max_substeps=600, flow_mach=0.3)
+RUSHED = Settling(mach=0.1, tolerance=1e-2, max_substeps=600, flow_mach=0.15)
 USUAL = Settling(tolerance=1e-2, max_substeps=600)
 SLOWER = Settling(mach=0.05, tolerance=1e-2, max_substeps=600)
 BALL = indented(Sphere(radius=4e-3))

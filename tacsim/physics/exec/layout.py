@@ -24,15 +24,14 @@ ORIGIN = 22  # of the grid x, y, z [mm]
 SHAPE = 25  # of an indenter: three sizes [mm]
 SHAPE_ORIGIN = 28  # of its distance grid, node (0, 0, 0): x, y, z [mm]
 SHAPE_SPACING = 31  # of its distance grid [mm]
-WIDENING = 32  # share of an incompressible body's widening that is part of the motion its damping is against
-CENTRE = 33  # of the particles at the launch's start x, y, z [mm]
-INVERSE_INERTIA = 36  # inverse moment of inertia of the particles then: xx, yy, zz, xy, xz, yz [1/(MPa mm^5)]
-REFERENCE_CENTRE = 42  # of the particles in the reference of the body's grid x, y, z [mm]
-CARRIED = 45  # mean displacement gradient of the particles since then, row by row
-EDGE_RADIUS = 54  # of an indenter [mm]
-OWN = 55  # weight of a node's own acceleration, force over mass, in how it moves; 1 is true inertia
-FILTERED = 56  # weight of that filtered by its neighbours' (tacsim.physics.gel.mass, tacsim.physics.body.mass)
-PARAMS = 57
+CENTRE = 32  # of the particles at the launch's start x, y, z [mm]
+INVERSE_INERTIA = 35  # inverse moment of inertia of the particles then: xx, yy, zz, xy, xz, yz [1/(MPa mm^5)]
+REFERENCE_CENTRE = 41  # of the particles in the reference of the body's grid x, y, z [mm]
+CARRIED = 44  # mean displacement gradient of the particles since then, row by row
+EDGE_RADIUS = 53  # of an indenter [mm]
+OWN = 54  # weight of a node's own acceleration, force over mass, in how it moves; 1 is true inertia
+FILTERED = 55  # weight of that filtered by its neighbours' (tacsim.physics.gel.mass, tacsim.physics.body.mass)
+PARAMS = 56
 
 # counts (environments, COUNTS) int32
 ZERO = 0  # always 0: see tacsim.physics.exec.lanes.overwrite

@@ -22,9 +22,12 @@ from tacsim.physics.failure.health import LaunchSpan
 from tacsim.physics.units import MM
 
 PEAK_SLOPE = 1.875  # of the ramp, over its mean
-# Times of the gel's pressure wave through its thickness: the shortest ramp; the shortest step that flows, which takes
-# longer by as much as its speed changes; time of the hold between two readings of the forces
-SHORTEST_RAMP, SHORTEST_FLOW, READING_INTERVAL = 2.0, 1.25, 1.0
+# Times of the gel's pressure wave through its thickness: the shortest ramp; the shortest step that flows, and how soon
+# it has turned; time of the hold between two readings of the forces
+SHORTEST_RAMP, SHORTEST_FLOW, FLOW_RISE, READING_INTERVAL = 2.0, 1.25, 0.25, 1.0
+# A step that flows passes its target at this share of its mean velocity. Where the next one turns back, the frame goes
+# beyond, and what yields keeps it; where it goes on, the gel feels the braking.
+PASSING = 0.5
 # Gel thicknesses: shorter paths are followed slower than they may be, where the stop leaves a trace: in what yields, in
 # friction
 SHORT_PATH, SHORT_SLIDE = 0.5, 0.25
@@ -56,8 +59,8 @@ class Path:
     unfollowed: friction does not follow it: too fast, or slid by an edge that catches on the mesh.
     creeps: what it moves yields, and creeps on when it has ended.
 
-    rates: velocities at start and end, each (frames, 6), linear and angular, world axes [-, rad/mm]: instead of a ramp
-    from rest to rest the path is then the cubic that has them.
+    rates: velocities at start and end, each (frames, 6), linear and angular, world axes [-, rad/mm], of a path that is
+    not from rest to rest. The one turns into the other within `rise`, and a ramp does the rest of the way.
     """
 
     start: Sequence[Pose]
@@ -112,8 +115,11 @@ class Path:
             ramped: NDArray[np.float64] = ramp(t, self.rise) * whole
             return ramped
         before, after = (self.substeps * self.dt * rates[index] for rates in self.rates)
-        cubic: NDArray[np.float64] = t * t * (3 - 2 * t) * whole + t * (1 - t) * ((1 - t) * before - t * after)
-        return cubic
+        turned = np.minimum(t / self.rise, 1.0)  # the share u of the turn; its velocity falls as 1 - 3 u^2 + 2 u^3
+        flown = after * t + (before - after) * self.rise * (turned - turned**3 + turned**4 / 2)
+        left = whole - after - (before - after) * self.rise / 2
+        moved: NDArray[np.float64] = flown + ramp(t, self.rise) * left
+        return moved
 
     def span(self, names: Iterable[str], first: int, last: int) -> LaunchSpan:
         """Substeps first..last in words, and where the frames called `names` are at their end."""
@@ -195,19 +201,21 @@ def plan_flow(
     start: Sequence[Pose], end: Sequence[Pose], rates: NDArray[np.float64], mach: float, dt: float, lever: float,
     thickness: float,
 ) -> Path:  # fmt: skip
-    """The path of a step that flows: from `start`, left at `rates` (frames, 6), to `end`, passed at the mean velocity
-    of the step; at most Mach `mach`. Where velocities change it lasts longer, up to twice as long from rest. With no
-    displacement and at rest it has no substeps. Raises ValueError as `plan` does."""
+    """The path of a step that flows: from `start`, left at `rates` (frames, 6), to `end`, passed at PASSING of the mean
+    velocity of the step. That is Mach `mach`; slower with the root of the length where it is less than SHORT_PATH gel
+    thicknesses [mm], as in `plan`. With no displacement and at rest it has no substeps. Raises as `plan` does."""
     displacements = np.array([displacement_between(a, b) for a, b in zip(start, end, strict=True)])
     interval = math.ceil(READING_INTERVAL * thickness / dt)
     if not (displacements.any() or rates.any()):
         return Path(start, end, 0, dt, interval=interval)
     length = of_fastest_point(displacements, lever)
-    lasting = dt * _substeps(max(length / mach, SHORTEST_FLOW * thickness) / dt - ROUNDING, length, mach)
-    mean = displacements / lasting
-    lasting *= 1.0 + of_fastest_point(mean - rates, lever) / mach
-    substeps = _substeps(lasting / dt - ROUNDING, length, mach)
-    return Path(start, end, substeps, dt, interval=interval, rates=(rates, mean))
+    braked = math.sqrt(length * max(length, SHORT_PATH * thickness))
+    substeps = _substeps(max(braked / mach, SHORTEST_FLOW * thickness) / dt - ROUNDING, length, mach)
+    lasting = substeps * dt
+    rise = min(FLOW_RISE * thickness / lasting, 0.5)
+    return Path(
+        start, end, substeps, dt, interval=interval, rise=rise, rates=(rates, PASSING * displacements / lasting)
+    )  # fmt: skip
 
 
 def _substeps(count: float, length: float, mach: float) -> int:

@@ -41,7 +41,6 @@ from tacsim.physics.exec.layout import (
     RIGID_MASS_SCALE,
     STEP,
     STIFFNESS,
-    WIDENING,
 )  # fmt: skip
 from tacsim.physics.failure.diagnosis import volume_range
 from tacsim.physics.failure.health import (
@@ -67,6 +66,8 @@ COURANT = 0.5
 ZETA_GEL, ZETA_GEL_HELD = 0.8, 1.6  # zeta in rate = zeta c / thickness
 ZETA_BODY, ZETA_BODY_HELD = 0.6, 1.2  # zeta in rate = zeta c / gel thickness, against the driven affine motion
 ZETA_YIELDING_HELD = 0.3  # of a held body that yields: what creeps has only this drag to overcome
+# While motions flow: what drags a body makes forces too high, and what rings in the gel makes clay yield
+ZETA_GEL_FLOWING, ZETA_BODY_FLOWING = 1.2, 0.3
 # How nodes answer to forces: by their own acceleration, and by that filtered by (4 S - 1)^2, S the mean over the cells
 # round them. What the mesh resolves, S = 1, is six times as light; the shortest waves, S = 0, are as heavy as they are.
 TRUE_INERTIA = {OWN: 1.0, FILTERED: 0.0}
@@ -134,7 +135,10 @@ class HybridWorld(FemWorld):
         masses = {**self._masses(self._gel.density, self._body.density, step), **SELECTIVE_INERTIA}
         # the filter makes a body lighter, so its particles bear less: between stiff gels they shook, untold
         masses[STIFFNESS] = min(masses[STIFFNESS], LARGEST_SHARE * masses[BODY_MASS] / step**2)
-        return Inertia({**masses, **damping, WIDENING: 0.0}, step, held=held, flowing={WIDENING: 1.0})
+        flowing = {
+            GEL_DAMPING: ZETA_GEL_FLOWING / self._gel.thickness, BODY_DAMPING: ZETA_BODY_FLOWING / self._gel.thickness
+        }  # fmt: skip
+        return Inertia({**masses, **damping}, step, held=held, flowing=flowing)
 
     def _true_inertia(self) -> Inertia:
         assert self.scene.body is not None
@@ -142,7 +146,7 @@ class HybridWorld(FemWorld):
         density = kernel_density(self.scene.body.material.density, second)
         wave = math.sqrt(self._body.density / density)  # the body's pressure wave; the gel's has speed 1
         step = COURANT * min(self._body.cell / wave, self._gel.spacing)
-        undamped = {GEL_DAMPING: 0.0, BODY_DAMPING: 0.0, RIGID_MASS_SCALE: 1.0, WIDENING: 0.0}
+        undamped = {GEL_DAMPING: 0.0, BODY_DAMPING: 0.0, RIGID_MASS_SCALE: 1.0}
         return Inertia({**self._masses(self._gel.density, density, step), **TRUE_INERTIA, **undamped}, step, second)
 
     def _masses(self, gel: float, body: float, step: float) -> dict[int, float]:

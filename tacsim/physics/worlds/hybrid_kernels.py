@@ -90,8 +90,6 @@ def grid_update(env: ti.template(), part, it, drive: ti.template(), body: ti.tem
     A boost is added to every velocity: selective mass scaling of the slowest modes, the rigid motions of a body that
     hangs between two soft gels. Inertia is artificial here anyway; the resting state does not depend on it.
 
-    With `layout.WIDENING` that motion also widens as fast as a body must whose volume stays (docs/decisions/0002).
-
     Only a sensor that touches the body imposes anything; a body without contact is damped towards rest. Across the
     sensors' axis it is the body's own mean velocity while anything is driven: a body that rides on one
     sensor must not be dragged back by the other.
@@ -121,7 +119,6 @@ def grid_update(env: ti.template(), part, it, drive: ti.template(), body: ti.tem
     held = ti.select(touches0 or touches1, 1.0, 0.0)
     driven = held * (v0.norm_sqr() + v1.norm_sqr() + w0.norm_sqr() + w1.norm_sqr()) > 0.0
     mean_across = mean - axis * (mean.dot(axis) / length2)
-    widening = -0.5 * env.param(layout.WIDENING) * share * (v1 - v0).dot(axis) / length2
     reference_centre = env.param3(layout.REFERENCE_CENTRE)
     carried = ti.Matrix([[env.param(layout.CARRIED + 3 * i + j) for j in range(3)] for i in range(3)])
     nx, ny, nz = env.count(layout.GRID), env.count(layout.GRID + 1), env.count(layout.GRID + 2)
@@ -151,8 +148,7 @@ def grid_update(env: ti.template(), part, it, drive: ti.template(), body: ti.tem
                         t = only_upper + share * ti.max(0.0, ti.min(1.0, (x - p0).dot(axis) / length2))
                         imposed = held * ((1.0 - t) * (v0 + w0.cross(x - p0)) + t * (v1 + w1.cross(x - p1)))
                         if driven:
-                            across = (x - centre) - axis * ((x - centre).dot(axis) / length2)
-                            imposed = axis * (imposed.dot(axis) / length2) + mean_across + widening * across
+                            imposed = axis * (imposed.dot(axis) / length2) + mean_across
                         velocity -= damping * dt * (velocity - imposed)
                         for d in ti.static(range(3)):
                             moved[4 * n + d] = velocity[d]

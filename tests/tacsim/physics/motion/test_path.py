@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from tacsim.interface import Pose
@@ -76,6 +77,28 @@ def test_the_shortest_motion_lets_the_gel_follow() -> None:
     far = plan([Pose()], [Pose(np.array([0, 0, 1e-3]))], mach=0.05, dt=0.4, lever=10.0, thickness=4.0)
     assert far.substeps == 94
     assert short.rise == 0.5 and far.rise * far.substeps * far.dt == pytest.approx(4.0, rel=0.01)
+
+
+def flow(to: float, before: float) -> NDArray[np.float64]:
+    """Where a step that flows takes a frame, after each substep [mm]: to `to` [mm] from 0, left at `before` [-]."""
+    rates = np.array([[0.0, 0.0, before, 0.0, 0.0, 0.0]])
+    path = plan_flow([Pose()], [Pose(np.array([0, 0, to * 1e-3]))], rates, mach=0.03, dt=0.1, lever=9.0, thickness=4.0)
+    places: NDArray[np.float64] = path.drive(0, path.substeps)[:, 0, 3, 2].astype(float)
+    assert places[-1] == pytest.approx(to, abs=1e-6)
+    assert path.rates is not None and path.rates[1][0, 2] == pytest.approx(np.diff(places)[-1] / 0.1, abs=2e-4)
+    return places
+
+
+@pytest.mark.parametrize("to", [0.05, 0.2, 1.0])
+def test_a_step_that_flows_hardly_goes_beyond_its_target_whatever_comes_next(to: float) -> None:
+    """Clay keeps what goes beyond. A cubic from mean speed to mean speed, told to stay, went a seventh beyond."""
+    onward = flow(to, before=0.0)
+    assert onward.max() <= to + 1e-6 and (np.diff(onward) >= 0).all()
+    passed = np.diff(onward)[-1] / 0.1
+    assert passed == pytest.approx(0.5 * 0.03 * np.sqrt(to / 2.0), rel=0.05)
+    assert (np.diff(flow(to, passed)) >= 0).all()
+    beyond = [flow(next_step, passed).max() for next_step in (0.0, -to)]
+    assert 0.0 < max(beyond) < 0.021 * to
 
 
 def test_a_path_that_would_take_for_ever_is_refused() -> None:

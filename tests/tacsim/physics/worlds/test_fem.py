@@ -54,22 +54,24 @@ def test_frames_arrive_at_every_target_and_pass_it_at_speed() -> None:
         assert not stats.settled and stats.hold == 0, number
         assert np.array_equal(world.pose("indenter").position, target.position)
         rates = world.snapshot()["rates"][1]
-        assert -rates[2] + 6.0 * rates[5] == pytest.approx(0.01, rel=0.03)  # of the gel's rim, 6 mm from the axis
+        mean = 0.02 * np.sqrt(0.22 / 2.0)  # of the gel's rim, 6 mm from the axis: 0.22 mm of the 2 that go at Mach 0.02
+        assert -rates[2] + 6.0 * rates[5] == pytest.approx(mean / 2, rel=0.03)
         assert rates[5] / -rates[2] == pytest.approx(0.02 / 0.1)
 
 
 def test_equal_steps_make_a_steady_motion() -> None:
-    """From rest a step takes twice as long as the next; those that follow are all alike, at one speed."""
+    """Its speed is between half of the mean, at which it passes its targets, and 1.5 times that."""
     world = PressWorld(BALL)
     counts = [world.move(nearer(world), flow=True).substeps for _ in range(4)]
-    assert counts[1] == counts[2] == counts[3]
-    assert counts[0] == pytest.approx(2 * counts[1], abs=1)
+    assert counts == [counts[0]] * 4
     path = world._plan_flow(list(world._poses.values()), list(nearer(world).values()))
     speeds = path.drive(0, path.substeps)[:, :, 4, 2]
-    assert path.substeps == counts[1]
-    steady = STEP / 2 * 1e3 / (path.substeps * path.dt)
-    assert 0.0095 < steady <= 0.01
-    assert speeds == pytest.approx(np.broadcast_to([steady, -steady], speeds.shape), rel=1e-4)
+    assert path.substeps == counts[0]
+    mean = STEP / 2 * 1e3 / (path.substeps * path.dt)
+    assert mean == pytest.approx(0.02 * np.sqrt(0.05 / 2.0), rel=0.03)
+    shares = speeds * [1, -1] / mean
+    assert shares[-1] == pytest.approx(0.5, abs=0.01)
+    assert shares.min() > 0.49 and shares.max() < 1.5
 
 
 def test_forces_of_a_steady_squeeze_are_near_those_of_rest() -> None:
@@ -84,8 +86,7 @@ def test_forces_of_a_steady_squeeze_are_near_those_of_rest() -> None:
 
 
 def test_a_body_off_the_axis_is_not_driven_aside() -> None:
-    """It is damped against a widening round its own middle: round the sensors' axis, 1.5 mm away, 1.5 % of the force
-    would push it aside."""
+    """Damped against a widening round the sensors' axis, 1.5 mm away, 1.5 % of the force would push it aside."""
     world = HybridWorld(CUBE)
     world.move({n: Pose(world.pose(n).position + [1.5e-3, 0, 0], world.pose(n).quaternion) for n in world.sensors})
     world.move(nearer(world, 0.8e-3))
@@ -93,6 +94,21 @@ def test_a_body_off_the_axis_is_not_driven_aside() -> None:
         world.move(nearer(world), flow=True)
         aside = world.wrench("lower")[0] + world.wrench("upper")[0]  # the upper sensor's x axis is the world's too
         assert abs(aside) < 0.004 * force(world)
+
+
+def test_random_steps_that_flow_end_near_their_slow_limit() -> None:
+    """Where the next step turns back, a frame that arrives at speed goes beyond its target, and clay keeps it: arriving
+    with the whole mean speed of the step, on a cubic, forces were 8 % off (rms), 17 % at worst."""
+    slow = squeezed(CUBE.model_copy(update={"settling": Settling(mach=0.01, tolerance=3e-3)}))
+    flowing = HybridWorld(CUBE)
+    flowing.restore(slow.snapshot())
+    forces = []
+    for by in np.random.default_rng(0).uniform(-0.3e-3, 0.3e-3, 8):
+        flowing.move(nearer(flowing, by), flow=True)
+        slow.move(nearer(slow, by))
+        forces.append([force(flowing), force(slow)])
+    off = np.array(forces) @ [1, -1] / np.mean(forces)
+    assert np.sqrt(np.mean(off**2)) < 0.025
 
 
 def test_what_flows_comes_to_rest_once_nothing_is_asked_any_more() -> None:

@@ -7,8 +7,8 @@ anew has none to compare with, and is not filtered. Why: docs/decisions/0002.
 
 A node outside the body that hardly any particle reaches has forces as small as its mass, but stiffness that falls with
 the square of that: it drifts for thousands of substeps and takes stress from the particles that do reach it, which
-shows as creep. Such light nodes go with their neighbours (extended B-splines: Hoellig et al. 2001; in MPM: Yamaguchi
-et al. 2021).
+shows as creep. Such light nodes, at edges and corners, go with their neighbours (extended B-splines: Hoellig et al.
+2001; in MPM: Yamaguchi et al. 2021). Not with true inertia: there what they weigh counts.
 """
 
 from tacsim.compute.runtime import ti
@@ -19,7 +19,7 @@ from tacsim.physics.exec.lanes import NODES, ON_DEVICE, bounded, part_range, vec
 # In `changes` (environments, 3, nodes, 4): change of a node's momentum, and its mass; mean change of velocity of the
 # cell that a node begins; the first again, after the filter's first pass
 CHANGE, CELL, SECOND = 0, 1, 2
-LIGHT = 0.01  # particle masses: a node with less goes with its neighbours
+LIGHT = 0.05  # particle masses: a node with less goes with its neighbours
 
 
 @ti.func
@@ -95,7 +95,8 @@ def mean_of_cells(env: ti.template(), body: ti.template(), i, j, k):
 
 @ti.func
 def is_light(env: ti.template(), mass):
-    return mass < LIGHT * env.param(layout.BODY_MASS)  # false of a mass that is not a number
+    """Also false of a mass that is not a number."""
+    return mass < LIGHT * env.param(layout.BODY_MASS) and env.param(layout.FILTERED) > 0.0
 
 
 @ti.func

@@ -153,7 +153,7 @@ def grid_update(env: ti.template(), part, it, drive: ti.template(), body: ti.tem
                         if driven:
                             across = (x - centre) - axis * ((x - centre).dot(axis) / length2)
                             imposed = axis * (imposed.dot(axis) / length2) + mean_across + widening * across
-                        own = damping * ti.min(1.0, ti.sqrt(m / mass))  # what is light is soft: it rests as fast so
+                        own = damping * ti.min(1.0, ti.sqrt(m / mass))  # what is light is soft, so less holds it back
                         velocity -= own * dt * (velocity - imposed)
                         for d in ti.static(range(3)):
                             moved[4 * n + d] = velocity[d]

@@ -4,11 +4,6 @@ The change of a node's velocity in a substep, a, becomes OWN a + FILTERED (4 S -
 a node, each of which has the mean of its nodes by mass; as the gel's accelerations do (tacsim.physics.gel.mass). A
 node keeps its velocity from substep to substep and from launch to launch; the first substep on a grid that is laid
 anew has none to compare with, and is not filtered. Why: docs/decisions/0002.
-
-A node outside the body that hardly any particle reaches has forces as small as its mass, but stiffness that falls with
-the square of that: it drifts for thousands of substeps and takes stress from the particles that do reach it, which
-shows as creep. Such light nodes, at edges and corners, go with their neighbours (extended B-splines: Hoellig et al.
-2001; in MPM: Yamaguchi et al. 2021). Not with true inertia: there what they weigh counts.
 """
 
 from tacsim.compute.runtime import ti
@@ -19,7 +14,6 @@ from tacsim.physics.exec.lanes import NODES, ON_DEVICE, bounded, part_range, vec
 # In `changes` (environments, 3, nodes, 4): change of a node's momentum, and its mass; mean change of velocity of the
 # cell that a node begins; the first again, after the filter's first pass
 CHANGE, CELL, SECOND = 0, 1, 2
-LIGHT = 0.05  # particle masses: a node with less goes with its neighbours
 
 
 @ti.func
@@ -94,30 +88,9 @@ def mean_of_cells(env: ti.template(), body: ti.template(), i, j, k):
 
 
 @ti.func
-def is_light(env: ti.template(), mass):
-    """Also false of a mass that is not a number."""
-    return mass < LIGHT * env.param(layout.BODY_MASS) and env.param(layout.FILTERED) > 0.0
-
-
-@ti.func
-def catch_up(env: ti.template(), body: ti.template(), i, j, k):
-    """Change of velocity that takes a node to the mean of it and its neighbours, by mass; not at the grid's border."""
-    ny, nz = env.count(layout.GRID + 1), env.count(layout.GRID + 2)
-    base, total, masses, own = env.index * env.count(layout.CAPACITY), vec3(0.0), 0.0, vec3(0.0)
-    for n in range(27):
-        node = ((i + n // 9 - 1) * ny + j + n // 3 % 3 - 1) * nz + k + n % 3 - 1
-        mass, at, first = body.changes[changes_at(env, CHANGE, node) + 3], base + node // NODES, 4 * (node % NODES)
-        v = vec3([body.velocities[at][first + c] for c in range(3)])
-        own = ti.select(n == 13, v, own)
-        total += mass * v
-        masses += mass
-    return total / masses - own
-
-
-@ti.func
-def second_changes(env: ti.template(), part, it, body: ti.template()):
+def second_changes(env: ti.template(), part, body: ti.template()):
     """4 S - 1 of the changes of this part's nodes; 0 at the border, where what stood there in a grid of another shape
-    would count as mass. Of a light node, whose neighbours have summed its change before, also the change itself."""
+    would count as mass."""
     nx, ny, nz = env.count(layout.GRID), env.count(layout.GRID + 1), env.count(layout.GRID + 2)
     low, high = box_of_part(env, part)
     for i in range(low[0], high[0]):
@@ -126,16 +99,11 @@ def second_changes(env: ti.template(), part, it, body: ti.template()):
                 node, mean = (i * ny + j) * nz + k, vec3(0.0)
                 s, t = bounded(changes_at(env, CHANGE, node), 1), bounded(changes_at(env, SECOND, node), 1)
                 mass = body.changes[s + 3]
-                within = i > 0 and j > 0 and k > 0 and i < nx - 1 and j < ny - 1 and k < nz - 1
-                if mass != 0.0 and within:
+                if mass != 0.0 and i > 0 and j > 0 and k > 0 and i < nx - 1 and j < ny - 1 and k < nz - 1:
                     mean = mean_of_cells(env, body, i, j, k)
                 for c in ti.static(range(3)):
                     body.changes[t + c] = 4.0 * mass * mean[c] - body.changes[s + c]
                 body.changes[t + 3] = mass
-                if mass > 0.0 and within and is_light(env, mass) and has_velocities(env, it):
-                    change = mass * catch_up(env, body, i, j, k)
-                    for c in ti.static(range(3)):
-                        body.changes[s + c] = change[c]
 
 
 @ti.func
@@ -147,7 +115,7 @@ def filtered_change(env: ti.template(), body: ti.template(), it, i, j, k):
     mass, change = body.changes[s + 3], vec3(0.0)
     if mass != 0.0:  # one that is not a number must show
         change = vec3([body.changes[s + c] for c in range(3)]) / mass
-        if has_velocities(env, it) and i > 0 and j > 0 and k > 0 and not is_light(env, mass):
+        if has_velocities(env, it) and i > 0 and j > 0 and k > 0:
             second = vec3([body.changes[t + c] for c in range(3)]) / mass
             change *= env.param(layout.OWN)
             change += env.param(layout.FILTERED) * (4.0 * mean_of_cells(env, body, i, j, k) - second)

@@ -23,7 +23,7 @@ from tacsim.physics.units import MM
 SUBSTEPS_PER_LAUNCH = 80  # while frames are driven: a control step is one launch or two
 EARLIER_READINGS = 2  # that one is compared with: a single one may have the same phase of an oscillation
 FORESIGHT = 20.0  # readings
-LASTING = 50.0  # readings: how much longer a settled force of what flows keeps within the tolerance
+LASTING = 100.0  # readings: how much longer a settled force of what flows keeps within the tolerance
 FORCE_FLOOR = 1e-3  # residuals are relative to the contact force, but to no less than this share of E thickness^2
 
 
@@ -98,9 +98,9 @@ def creep_to_come(held: Sequence[ForceReading], age: float) -> float:
     force [-]. held: of the hold so far, three at least; age: readings since the motion's middle.
 
     Clay at yield creeps with the logarithm of time: its rate goes with 1 / (time since it began), so the creep is as
-    old as the shrinking of its rate over the last half of the hold says, but no younger than the motion. A swing hides
-    it where it turns, so the rate is no less than half of what it was. Two gels creep alike: the mean of their forces
-    moves the body as a whole, which swings longest, and is left out.
+    old as the shrinking of its rate over the last half of the hold says. It is no younger than the motion: what rings
+    hides it at first, and swings shrink faster. Two gels creep alike: the mean of their forces moves the body as a
+    whole, which swings longest, and is left out.
     """
     span = max(1, len(held) // 4)
     first, second, third = (_between(held[at].contact) for at in (-1 - 2 * span, -1 - span, -1))
@@ -108,8 +108,7 @@ def creep_to_come(held: Sequence[ForceReading], age: float) -> float:
     swings = before * now <= 0.0
     share = np.divide(now, before, out=np.zeros_like(now), where=~swings)
     began = np.maximum(span / np.maximum(1.0 - share, 1e-6), age)
-    rate = np.maximum(np.abs(now), 0.5 * np.abs(before)) / span
-    to_come = rate * began * np.log1p(LASTING / began)
+    to_come = np.abs(now) / span * began * np.log1p(LASTING / began)
     return float(to_come.max()) / max(float(np.abs(held[-1].contact).max()), held[-1].floor)
 
 
@@ -172,11 +171,14 @@ def run(motion: Motion, advance: Callable[[Path, int, int], ForceReading]) -> Mo
 
 
 def move_and_settle(path: Path, settling: Settling, *, balanced: bool) -> Motion:
-    """Follows `path`, then holds at its end until the residual is within tolerance or the hold budget is spent."""
+    """Follows `path`, then holds at its end until the residual is within tolerance or the hold budget is spent.
+
+    What creeps (`Path.creeps`) must have little to come at two readings: at one of them it may just turn.
+    """
     readings = yield from _follow(path)
     followed = len(readings)
     rest = replace(path, start=path.end, substeps=0, rates=None)
-    held, worst = 0, math.inf
+    held, worst, to_come = 0, math.inf, math.inf
     while held < settling.max_substeps:
         count = min(path.interval, settling.max_substeps - held)
         readings.append((yield Launch(rest, 0, count)))
@@ -185,10 +187,10 @@ def move_and_settle(path: Path, settling: Settling, *, balanced: bool) -> Motion
             worst = max(residual(readings[-1], earlier, balanced) for earlier in readings[-1 - EARLIER_READINGS : -1])
             worst = max(worst, still_to_come(*readings[-3:]))
         if path.creeps:
-            to_come = math.inf
+            before, to_come = to_come, math.inf
             if len(readings) - followed > EARLIER_READINGS:
                 to_come = creep_to_come(readings[followed:], (path.substeps / 2 + held) / path.interval)
-            worst = max(worst, to_come)
+            worst = max(worst, before, to_come)
         if worst <= settling.tolerance:
             break
     return _stats(readings, path.substeps, held, worst, settling, unfollowed=path.unfollowed)

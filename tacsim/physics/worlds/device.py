@@ -193,7 +193,7 @@ def scatter_of_hybrid(
                 if height > ceiling[e, g, (clock[0] + 1) % 2]:
                     ti.atomic_max(ceiling[e, g, (clock[0] + 1) % 2], height)
             elif n - 2 * columns < grid_nodes(env):
-                second_changes(env, n - 2 * columns, clock[0], ti.static(Body(particles, masses, velocities, changes)))
+                second_changes(env, n - 2 * columns, ti.static(Body(particles, masses, velocities, changes)))
     for e, node in ti.ndrange(counts.shape[0], most_nodes):
         env = ti.static(Environment(e, params, counts, partial))
         if is_active(env, clock) and node < grid_nodes(env):

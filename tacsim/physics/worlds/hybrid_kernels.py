@@ -153,8 +153,7 @@ def grid_update(env: ti.template(), part, it, drive: ti.template(), body: ti.tem
                         if driven:
                             across = (x - centre) - axis * ((x - centre).dot(axis) / length2)
                             imposed = axis * (imposed.dot(axis) / length2) + mean_across + widening * across
-                        own = damping * ti.min(1.0, ti.sqrt(m / mass))  # what is light is soft, so less holds it back
-                        velocity -= own * dt * (velocity - imposed)
+                        velocity -= damping * dt * (velocity - imposed)
                         for d in ti.static(range(3)):
                             moved[4 * n + d] = velocity[d]
                 body.velocities[base + at] = moved
@@ -268,7 +267,7 @@ def substeps(
                     cell_means(env, part, ti.select(stage % 6 == 2, CHANGE, SECOND), body)
                 for _motion in range(once_if(stage % 6 == 3)):
                     gel_advance_filtered(env, part, gels)
-                    second_changes(env, part, it, body)
+                    second_changes(env, part, body)
                 for _motion in range(once_if(stage % 6 == 5)):
                     grid_update(env, part, it, drive, body)
                 piece_done(sync, turn)

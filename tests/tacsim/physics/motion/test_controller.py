@@ -75,6 +75,15 @@ def test_a_creep_that_turns_is_as_old_as_the_motion() -> None:
     assert creep_to_come(held, 20.0) == pytest.approx(0.01 * 20 * np.log1p(LASTING / 20))
 
 
+def test_a_body_that_swings_between_two_gels_does_not_creep() -> None:
+    """What one gel feels more, the other feels less."""
+    forces = [np.array([[0.0, 0.0, -1.0 + swing], [0.0, 0.0, 1.0 + swing]]) for swing in (0.0, 0.01, 0.015)]
+    held = [ForceReading(force, force, 0.1, 0.0, 0) for force in forces]
+    assert creep_to_come(held, 20.0) == pytest.approx(0.0, abs=1e-12)
+    squeezed = [replace(each, contact=each.contact * [[1.0], [0.0]]) for each in held]
+    assert creep_to_come(squeezed, 20.0) > 0.01
+
+
 @pytest.mark.parametrize("creeps", [True, False])
 def test_what_creeps_with_the_logarithm_of_time_is_not_settled_before_its_time(creeps: bool) -> None:
     """Each change is within the tolerance from the start, and so is what a geometric rest of them would be."""

@@ -80,7 +80,7 @@ def test_the_shortest_motion_lets_the_gel_follow() -> None:
 
 
 def flow(to: float, before: float) -> NDArray[np.float64]:
-    """Where a step that flows takes a frame, after each substep [mm]: `to` from where it is [mm], left at `before` [-]."""
+    """Where a step that flows takes a frame, after each substep [mm]: to `to` [mm] from 0, left at `before` [-]."""
     rates = np.array([[0.0, 0.0, before, 0.0, 0.0, 0.0]])
     path = plan_flow([Pose()], [Pose(np.array([0, 0, to * 1e-3]))], rates, mach=0.03, dt=0.1, lever=9.0, thickness=4.0)
     places: NDArray[np.float64] = path.drive(0, path.substeps)[:, 0, 3, 2].astype(float)
@@ -91,7 +91,7 @@ def flow(to: float, before: float) -> NDArray[np.float64]:
 
 @pytest.mark.parametrize("to", [0.05, 0.2, 1.0])
 def test_a_step_that_flows_hardly_goes_beyond_its_target_whatever_comes_next(to: float) -> None:
-    """Clay keeps what goes beyond. The cubic from mean speed to mean speed went a seventh of a step beyond, told to stay."""
+    """Clay keeps what goes beyond. A cubic from mean speed to mean speed, told to stay, went a seventh beyond."""
     onward = flow(to, before=0.0)
     assert onward.max() <= to + 1e-6 and (np.diff(onward) >= 0).all()
     passed = np.diff(onward)[-1] / 0.1

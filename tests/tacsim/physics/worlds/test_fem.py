@@ -70,7 +70,7 @@ def test_equal_steps_make_a_steady_motion() -> None:
     mean = STEP / 2 * 1e3 / (path.substeps * path.dt)
     assert mean == pytest.approx(0.02 * np.sqrt(0.05 / 2.0), rel=0.03)
     shares = speeds * [1, -1] / mean
-    assert shares[[0, -1]] == pytest.approx(0.5, abs=0.1)
+    assert shares[-1] == pytest.approx(0.5, abs=0.01)
     assert shares.min() > 0.49 and shares.max() < 1.5
 
 
@@ -98,13 +98,12 @@ def test_a_body_off_the_axis_is_not_driven_aside() -> None:
 
 def test_random_steps_that_flow_end_near_their_slow_limit() -> None:
     """Where the next step turns back, a frame that arrives at speed goes beyond its target, and clay keeps it: arriving
-    with the whole speed of the step, and turning in as long as the step takes, forces are 7 % off (rms)."""
-    scene = CUBE.model_copy(update={"preset": "learn"})
-    slow = squeezed(scene.model_copy(update={"settling": Settling(mach=0.003, tolerance=1e-3)}))
-    flowing = HybridWorld(scene)
+    with the whole mean speed of the step, on a cubic, forces were 8 % off (rms), 17 % at worst."""
+    slow = squeezed(CUBE.model_copy(update={"settling": Settling(mach=0.01, tolerance=3e-3)}))
+    flowing = HybridWorld(CUBE)
     flowing.restore(slow.snapshot())
     forces = []
-    for by in np.random.default_rng(0).uniform(-0.3e-3, 0.3e-3, 12):
+    for by in np.random.default_rng(0).uniform(-0.3e-3, 0.3e-3, 8):
         flowing.move(nearer(flowing, by), flow=True)
         slow.move(nearer(slow, by))
         forces.append([force(flowing), force(slow)])

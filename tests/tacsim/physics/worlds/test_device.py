@@ -148,7 +148,7 @@ def episodes() -> dict[str, Any]:
     many.reset(seed=[1, 2])
     found = [many.step(np.array([[0.5, 1.0], [1.0, 0.2]], np.float32)) for _ in range(2)]
     many.reset(options={"reset_mask": np.array([True, False])})
-    found.append(many.step(np.array([[1.0, 1.0], [0.5, 0.5]], np.float32)))
+    found.append(many.step(np.array([[1.0, 0.2], [0.5, 0.5]], np.float32)))
     many.close()
     return {
         **{name: np.array([flats[name] for flats, *_ in found]) for name in ("wrench_lower", "height_upper")},

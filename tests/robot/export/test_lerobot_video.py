@@ -145,5 +145,5 @@ def test_a_full_disk_leaves_nothing_half(tmp_path: Path) -> None:
         text=True,
         timeout=120,
     )
-    assert process.returncode == 1 and ".mp4: File too large" in process.stderr, process.stderr
+    assert process.returncode == 1 and "error: set: File too large" in process.stderr, process.stderr
     assert sorted(tmp_path.iterdir()) == [path.absolute()]

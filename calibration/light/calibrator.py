@@ -33,6 +33,7 @@ from calibration.light.labels import (
     BLUR,
     INVERSE_BLUR,
     beside_slopes,
+    counted_pixels,
     deepest_dent,
     forward_equations,
     forward_model,
@@ -40,7 +41,6 @@ from calibration.light.labels import (
     inverse_model,
     label,
     near_contact,
-    too_dark,
 )
 from calibration.light.photometry import (
     FEW_PRESSES,
@@ -169,7 +169,7 @@ def _equations(
         weights = solve(functools.reduce(operator.add, sets), size)
         for k in saturated:
             known = presses[k], labels[k], besides[k]
-            sets[k] = forward_equations(*known, too_dark(*known, weights, size))
+            sets[k] = forward_equations(*known, counted_pixels(*known, weights, size))
     return size, sets
 
 

@@ -28,6 +28,7 @@ from tacsim.models.photometric import DepthColour, PhotometricModel, depth_terms
 from tacsim.models.shadows import CastShadows
 
 Float64 = NDArray[np.float64]
+Rows = tuple[tuple[float, float, float], ...]  # weights of R, G, B, a row a term
 
 BLUR = 0.8  # of the camera, and of what the forward model is fitted to [px]
 INVERSE_BLUR = 1.2  # of what the inverse is fitted to [px]
@@ -84,7 +85,7 @@ def forward_equations(
     return normal_equations(gradient[near], *_places(near), change, lit[near], beside[near])
 
 
-def too_dark(
+def counted_pixels(
     press: BallPress, gradient: Float64, beside: Float64, weights: Float64, size: ModelSize
 ) -> NDArray[np.bool_]:
     """(H, W, 3) what is not saturated, and what is where `weights` say less than is seen: a saturated pixel says "at
@@ -129,9 +130,6 @@ def forward_model(
         degree=size.degree, position=size.position, weights=weights[:light], steepest=steepest, blur=BLUR,
         shadows=shadows, depth=_depth_colour(deepest, weights[light:slopes], weights[slopes:dark]),
     )  # fmt: skip
-
-
-Rows = tuple[tuple[float, float, float], ...]
 
 
 def _depth_colour(deepest: float, weights: Rows, slopes: Rows) -> DepthColour | None:

@@ -193,9 +193,7 @@ class Settling(Config):
     tolerance: Annotated[float, Field(gt=0, le=1)] = 1e-2  # force balance, change of force, and creep to come, relative
     mach: Annotated[float, Field(gt=0, le=0.3)] | None = None  # peak speed / wave speed; None: see Scene.peak_mach
     max_substeps: Annotated[int, Field(ge=0, le=1_000_000)] = 2000  # hold at most this long a move
-    flow_mach: Annotated[float, Field(gt=0, le=0.3)] | None = (
-        None  # mean speed of motions that flow; None: Scene.flow_mach
-    )
+    flow_mach: Annotated[float, Field(gt=0, le=0.3)] | None = None  # mean speed where motions flow; None: Scene's
 
 
 class Scene(Config):

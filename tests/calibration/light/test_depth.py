@@ -8,7 +8,7 @@ import pytest
 from calibration.light.calibrator import calibrate_light
 from calibration.light.dent import ContactCircle
 from calibration.light.fit import LightFit
-from calibration.light.labels import too_dark
+from calibration.light.labels import counted_pixels
 from calibration.light.photometry import SLOPE_TERMS, ModelSize
 from calibration.light.press import BallPress, smooth
 from tacsim.models.photometric import DEPTH_TERMS, PhotometricLight, places_in_image
@@ -110,7 +110,7 @@ def test_which_saturated_pixels_are_predicted_too_dark() -> None:
     lit[90:110, 110:150, 0] = False
     press = BallPress("white", ContactCircle(*made.circle), change, 0 * change, lit)
     size, beside = ModelSize(3, 0, 1e-6), np.zeros((ROWS, COLUMNS, DEPTH_TERMS + SLOPE_TERMS))
-    counted = too_dark(press, made.gradient, beside, np.zeros((size.terms, 3)), size)
+    counted = counted_pixels(press, made.gradient, beside, np.zeros((size.terms, 3)), size)
     wanted = lit.copy()
     wanted[90:110, 110:130, 0] = True
     near = np.abs(np.arange(COLUMNS) - 130) > 4  # the change is smoothed first

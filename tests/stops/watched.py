@@ -67,8 +67,10 @@ class Trial:
         self.fast = FAST if measuring else BUSY_FAST
         self.lines: queue.Queue[str] = queue.Queue()
         self.worker: int | None = None
+        self.start = np.array(mock.faults.state().pose[:3])  # read before a program can move the arm from there
         self.proxy = _start("proxy.py", PROXY, mock.host)
         self.observer = _start("observer.py", mock.host, str(self.file))
+        assert _line(self.proxy) == _line(self.observer) == "ready"  # what a program connects to is there before it
         self.policy = _start("policy.py", json.dumps(wanted), str(GOES), start_new_session=True)
         self.reader = threading.Thread(target=self._read, daemon=True)
         self.reader.start()
@@ -77,20 +79,17 @@ class Trial:
         """Waits until the arm is on its way at full speed; False if the driver has stopped it before that, or it has
         come to its end, as happens on a machine that is too busy for its time-outs."""
         faults = self.mock.faults
-        assert _line(self.proxy) == _line(self.observer) == "ready"
         self.worker = int(json.loads(self.lines.get(timeout=PATIENCE))["worker"])
-        start = np.array(faults.state().pose[:3])
-
         far, speed = 0.0, 0.0
 
         def begun() -> bool:
             nonlocal far, speed
             state = faults.state()
-            far = float(np.linalg.norm(state.pose[:3] - start))
+            far = float(np.linalg.norm(state.pose[:3] - self.start))
             speed = float(np.linalg.norm(state.tcp_speed[:3]))
             return self._faulted() or far > 0.8 * GOES or (far > BEFORE and speed > self.fast)
 
-        until(begun, "motion")
+        until(begun, "motion", why=lambda: f"{far} m at {speed} m/s; the program says {list(self.lines.queue)}")
         return not self._faulted() and speed > self.fast
 
     def _faulted(self) -> bool:

@@ -2,7 +2,7 @@
 
     tacsim run sim --task stretch:StretchConfig --set "task.goal=2 mm"
 
-docs/tasks.md goes through it.
+docs/tasks.md says what each part is for.
 """
 
 from __future__ import annotations

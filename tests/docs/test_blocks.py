@@ -1,6 +1,7 @@
 """Every bash and python block of README.md and docs/*.md runs; `make test` runs the first Python block of each page.
 
-The blocks of one page run in order in one temporary folder, so a later block can use what an earlier one made.
+The blocks of one page run in order in one temporary folder, so a later block can use what an earlier one made; the
+examples lie there.
 A block is left out only by a comment right above it: ``<!-- not run: reason -->``.
 """
 
@@ -8,6 +9,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -89,6 +91,7 @@ FIRST = {block.page: block for block in reversed(BLOCKS) if block.language == "p
 
 
 def require_success(block: Block, folder: Path) -> None:
+    shutil.copytree(ROOT / "examples", folder, dirs_exist_ok=True, ignore=shutil.ignore_patterns("__pycache__"))
     status, output = run(block, folder)
     assert status == 0, (
         f"{block.page}:{block.line} ends with {status}:\n{block.code}\n--- its output:\n{output[-4000:]}"

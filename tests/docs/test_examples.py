@@ -32,9 +32,10 @@ def on_the_path() -> Iterator[None]:
     rigs_of_known_tasks()
 
 
-def test_the_docs_show_the_example_as_it_is_and_it_is_short() -> None:
+def test_the_docs_show_the_heart_of_the_example_as_it_is_and_it_is_short() -> None:
     code = (ROOT / "examples" / "stretch.py").read_text(encoding="utf-8")
-    assert f"'''{code}'''" in (ROOT / "docs" / "tasks.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "tasks.md").read_text(encoding="utf-8")
+    assert page.partition("```python\n")[2].partition("```")[0] in code
     assert len(code.splitlines()) <= 120
 
 

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tacsim import pose as se3
-from tacsim.geometry.shapes import DistanceGrid, distance, extent, farthest, sample
-from tacsim.geometry.tiles import TILE, tiled_distance
+from tacsim.geometry.shapes import distance, extent, farthest
+from tacsim.geometry.tiles import tiled_distance
 from tacsim.interface import FloatArray, Pose
 from tacsim.models.scene import Box, Cylinder, Gel, GelSurface, Indenter, Mesh, Scene
 from tacsim.models.sensor import SensorModel
@@ -164,10 +164,7 @@ def _gaps(indenter: Indenter, points: FloatArray, element: float) -> FloatArray:
     geometry = indenter.geometry
     if not isinstance(geometry, Mesh):
         return distance(geometry, points, indenter.rounding(element))
-    tiles = tiled_distance(geometry, GRID_SPACING)
-    first, end = tiles.around(points.min(axis=0), points.max(axis=0) + GRID_SPACING)
-    origin = tiles.origin + TILE * GRID_SPACING * first
-    return sample(DistanceGrid(tiles.values(first, end), origin, GRID_SPACING), points)[0]
+    return tiled_distance(geometry, GRID_SPACING).sample(points)[0]
 
 
 def _filled(mask: NDArray[np.bool_], width: int) -> NDArray[np.bool_]:

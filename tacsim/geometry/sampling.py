@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
-from tacsim.geometry.shapes import FloatArray, distance, extent, nearest_surface, no_particle, particles
-from tacsim.models.scene import Body, Shape
+from tacsim.geometry.shapes import FloatArray, distance, extent, no_particle, outward_normals, particles
+from tacsim.geometry.tiles import tiled_distance
+from tacsim.models.scene import Body, Mesh, Shape
 
 ITERATIONS = 20  # of mutual repulsion
 REACH = 1.1  # particles nearer than this push each other apart [spacings]; evenly spread ones are ~1.1 apart
@@ -35,7 +38,7 @@ def scattered(geometry: Shape, spacing: float, seed: int) -> FloatArray:
     layers = np.maximum(np.rint(size / spacing).astype(int), 1)
     cells = np.stack(np.meshgrid(*(np.arange(n) for n in layers), indexing="ij"), axis=-1).reshape(-1, 3)
     points = ((cells + random.random(cells.shape)) / layers - 0.5) * size
-    surface = nearest_surface(geometry, spacing)
+    surface = _surface(geometry, spacing)
     points = points[surface(points)[0] < 0]
     for _ in range(ITERATIONS):
         depth, normals = surface(points)
@@ -48,6 +51,16 @@ def scattered(geometry: Shape, spacing: float, seed: int) -> FloatArray:
     if not inside.any():
         raise no_particle(geometry, spacing)
     return np.asarray(points[inside])
+
+
+def _surface(geometry: Shape, spacing: float) -> Callable[[FloatArray], tuple[FloatArray, FloatArray]]:
+    """Function of points (n, 3) [m] for many calls: signed distance (n,) [m] and its gradient (n, 3) [-].
+
+    Exact for the closed forms; a mesh is asked once, at the nodes of a grid of `spacing` [m].
+    """
+    if isinstance(geometry, Mesh):
+        return tiled_distance(geometry, spacing).sample
+    return lambda points: (distance(geometry, points), outward_normals(geometry, points))
 
 
 def _repulsion(points: FloatArray, reach: float) -> FloatArray:

@@ -6,8 +6,6 @@ Everything here is in the shape's own frame: axes as in the scene, origin at the
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
@@ -35,7 +33,6 @@ FEWEST_LAYERS = 3  # of particles: one has no height, and two cannot bulge
 MAX_MISFIT = 0.1  # relative error of the size or the volume that the lattice of particles may have
 LEVEL = 1e-5  # sine of an angle below which a direction is level with a face; float32 rotations are 1e-7 off
 BAND = 2  # grid spacings round a mesh in which the distance is exact
-REMEMBERED = 8  # distance grids of meshes in one process, the latest used; most have 1 to 10 MB
 
 
 def extent(geometry: Shape) -> FloatArray:
@@ -198,68 +195,10 @@ def outward_normals(geometry: Shape, points: ArrayLike) -> FloatArray:
     return np.where(length > 1e-3, gradient / np.maximum(length, 1e-3), 0.0)
 
 
-def nearest_surface(geometry: Shape, spacing: float) -> Callable[[FloatArray], tuple[FloatArray, FloatArray]]:
-    """Function of points (n, 3) [m] for many calls: signed distance (n,) [m] and its gradient (n, 3) [-].
-
-    Exact for the closed forms; a mesh is asked once, at the nodes of a grid of `spacing` [m].
-    """
-    if isinstance(geometry, Mesh):
-        grid = distance_grid(geometry, spacing)
-        return lambda points: sample(grid, points)
-    return lambda points: (distance(geometry, points), outward_normals(geometry, points))
-
-
 def _outside_and_inside(beyond: FloatArray) -> FloatArray:
     """Distance from a convex product of intervals, from how far each coordinate (n, k) lies beyond its own."""
     outside = np.linalg.norm(np.maximum(beyond, 0.0), axis=1)
     return np.asarray(outside + np.minimum(beyond.max(axis=1), 0.0))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class DistanceGrid:
-    """Signed distance at the nodes of a regular grid; trilinear in between, see :func:`sample`."""
-
-    values: NDArray[np.float32]  # (nx, ny, nz) [m], negative inside
-    origin: FloatArray  # (3,) position of node (0, 0, 0) [m]
-    spacing: float  # [m]
-
-
-def distance_grid(geometry: Mesh, spacing: float) -> DistanceGrid:
-    """Signed distance on a grid of `spacing` [m] that covers a mesh's bounding box and BAND spacings round it.
-
-    Node values are exact (float32) within BAND spacings of the surface; further away the sign is right and the value
-    never too small, see :func:`tacsim.geometry.mesh.signed_distance_on_grid`. Interpolation adds up to 3/8 spacing^2 /
-    R at a surface of radius R, and a fraction of the spacing at sharp edges. Of a mesh that touches here and there see
-    :mod:`tacsim.geometry.tiles`.
-
-    It takes a second or more, so the process remembers the latest: asked again for the same spacing and the same bytes
-    of the same file, it gives the same object, whose arrays are read-only.
-
-    Raises ValueError for more than 20,000,000 nodes, and what :func:`tacsim.geometry.mesh.load_mesh` raises.
-    """
-    return _mesh_grid(geometry, fingerprint(geometry.path), spacing)
-
-
-def sample(grid: DistanceGrid, points: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Trilinear distance (n,) [m] and its gradient (n, 3) [-] at `points` (n, 3) [m]: the reference for kernels.
-
-    Outside the grid nothing is known: distance +inf, gradient 0.
-    """
-    at: FloatArray = (np.asarray(points, dtype=np.float64) - grid.origin) / grid.spacing
-    last = np.array(grid.values.shape) - 1
-    known: NDArray[np.bool_] = np.all((at >= 0) & (at <= last), axis=1)
-    cell = np.clip(np.floor(np.where(known[:, None], at, 0.0)).astype(int), 0, last - 1)
-    upper = np.where(known[:, None], at, 0.0) - cell  # weight of the upper node along each axis
-    value = np.zeros(len(at))
-    gradient = np.zeros((len(at), 3))
-    for corner in np.ndindex(2, 2, 2):
-        weight = np.where(corner, upper, 1.0 - upper)
-        node = grid.values[tuple((cell + corner).T)].astype(np.float64)
-        value += node * weight.prod(axis=1)
-        for axis in range(3):
-            others = np.delete(weight, axis, axis=1).prod(axis=1)
-            gradient[:, axis] += (node if corner[axis] else -node) * others / grid.spacing
-    return np.where(known, value, np.inf), np.where(known[:, None], gradient, 0.0)
 
 
 def centred(geometry: Mesh, expected: str | None = None) -> Trimesh:
@@ -276,25 +215,6 @@ def centred(geometry: Mesh, expected: str | None = None) -> Trimesh:
 def _mesh_extent(geometry: Mesh, content: str) -> tuple[float, ...]:
     """Size of the bounding box (3,) [m]. content: fingerprint of the file."""
     return tuple(float(side) for side in centred(geometry, content).extents)
-
-
-@lru_cache(maxsize=REMEMBERED)
-def _mesh_grid(geometry: Mesh, content: str, spacing: float) -> DistanceGrid:
-    """Read-only, for it is shared. content: see above."""
-    mesh = centred(geometry, content)
-    half = np.asarray(mesh.extents, np.float64) / 2 + BAND * spacing
-    nodes = np.ceil(2 * half / spacing - 1e-9) + 1
-    if nodes.prod() > MAX_NODES:
-        raise ValueError(
-            f"a distance grid of {_name(geometry)} at {_mm(spacing)} would have {nodes.prod():,.0f} nodes, the limit "
-            f"is {MAX_NODES:,}; use a larger spacing"
-        )
-    x, y, z = (spacing * np.arange(n) - edge for n, edge in zip(nodes, half, strict=True))
-    values = signed_distance_on_grid(make_surface(mesh), (x, y, z), BAND * spacing).astype(np.float32)
-    origin = -half
-    for array in (values, origin):
-        array.setflags(write=False)
-    return DistanceGrid(values, origin, spacing)
 
 
 def _name(geometry: Shape) -> str:

@@ -103,6 +103,13 @@ class TiledDistance:
             found[x, y, z] = self._tile(tuple(int(n) for n in first + tile))
         return found
 
+    def sample(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Distance (n,) [m] and its gradient (n, 3) [-] at `points` (n, 3) [m], trilinear between nodes.
+        Raises what `values` raises."""
+        first, end = self.around(points.min(axis=0), points.max(axis=0) + self.spacing)
+        origin = self.origin + TILE * self.spacing * first
+        return trilinear(self.values(first, end), (points - origin) / self.spacing, self.spacing)
+
     def _tile(self, index: tuple[int, ...]) -> NDArray[np.float32]:
         key = (*self._key, index)
         tile = _kept.pop(key, None)
@@ -137,6 +144,28 @@ class TiledDistance:
             start + self.spacing * (n * TILE + np.arange(TILE)) for start, n in zip(self.origin, index, strict=True)
         )
         return signed_distance_on_grid(self._surface, (x, y, z), BAND * self.spacing).astype(np.float32)
+
+
+def trilinear(values: NDArray[np.float32], at: FloatArray, spacing: float) -> tuple[FloatArray, FloatArray]:
+    """Values (n,) between the nodes of a grid, `spacing` [m] apart, and their gradient (n, 3) [1/m], at places (n, 3)
+    counted in nodes: the reference for kernels.
+
+    Outside the grid nothing is known: value +inf, gradient 0.
+    """
+    last = np.array(values.shape) - 1
+    known: NDArray[np.bool_] = np.all((at >= 0) & (at <= last), axis=1)
+    cell = np.clip(np.floor(np.where(known[:, None], at, 0.0)).astype(int), 0, last - 1)
+    upper = np.where(known[:, None], at, 0.0) - cell  # weight of the upper node along each axis
+    value = np.zeros(len(at))
+    gradient = np.zeros((len(at), 3))
+    for corner in np.ndindex(2, 2, 2):
+        weight = np.where(corner, upper, 1.0 - upper)
+        node = values[tuple((cell + corner).T)].astype(np.float64)
+        value += node * weight.prod(axis=1)
+        for axis in range(3):
+            others = np.delete(weight, axis, axis=1).prod(axis=1)
+            gradient[:, axis] += (node if corner[axis] else -node) * others / spacing
+    return np.where(known, value, np.inf), np.where(known[:, None], gradient, 0.0)
 
 
 def tiled_distance(geometry: Mesh, spacing: float) -> TiledDistance:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import time
 from itertools import pairwise
 from pathlib import Path
 
@@ -13,8 +12,9 @@ import pytest
 import trimesh
 
 from tacsim.geometry import shapes
-from tacsim.geometry.mesh import Axes, Surface, fingerprint, load_mesh, signed_distance_on_grid
-from tacsim.geometry.shapes import distance, distance_grid, extent, farthest, particles, sample, volume
+from tacsim.geometry.mesh import fingerprint, load_mesh
+from tacsim.geometry.shapes import distance, extent, farthest, particles, volume
+from tacsim.geometry.tiles import tiled_distance
 from tacsim.models.scene import Box, Cylinder, Mesh, Shape, Sphere
 
 MM = 1e-3
@@ -232,102 +232,31 @@ def test_mesh_grid_matches_the_closed_form(tmp_path: Path, make: str) -> None:
         "box": (trimesh.creation.box((4, 6, 3)), lambda p: distance(Box(size=(4 * MM, 6 * MM, 3 * MM)), p), 2e-9),
         "ell": (ell(), lambda p: ell_distance(p / MM) * MM, 2e-9),
     }[make]
-    grid = distance_grid(stl(tmp_path, mesh), spacing)
-    assert grid.values.dtype == np.float32
-    index = np.stack(np.indices(grid.values.shape), axis=-1).reshape(-1, 3)
-    truth = exact(grid.origin + spacing * index)
-    error = grid.values.ravel() - truth
+    grid = tiled_distance(stl(tmp_path, mesh), spacing)
+    values = grid.values(*grid.around(-grid.half, grid.half))
+    index = np.stack(np.indices(values.shape), axis=-1).reshape(-1, 3)
+    truth, found = exact(grid.origin + spacing * index), values.ravel()
     band = np.abs(truth) < shapes.BAND * spacing
-    assert np.abs(error[band]).max() < tolerance  # the sphere's is that of its facets, R (1 - cos(half an edge))
-    assert (np.sign(grid.values.ravel())[~band] == np.sign(truth[~band])).all()
-    assert (np.abs(grid.values.ravel()) > np.abs(truth) - tolerance)[~band].all()
-    assert np.abs(error).max() < 0.5 * spacing  # beyond the band, as promised
-    assert grid.values.min() < 0 < grid.values.max()
+    assert (
+        np.abs(found - truth)[band].max() < tolerance
+    )  # the sphere's is that of its facets, R (1 - cos(half an edge))
+    assert (np.sign(found) == np.sign(truth))[~band].all()
+    assert (np.abs(found) > np.abs(truth) - tolerance)[~band].all()
+    assert found.min() < 0 < found.max()
 
 
-def test_sample_is_trilinear_with_its_own_gradient() -> None:
-    spacing = 0.1 * MM
-    nodes = spacing * (np.stack(np.indices((45, 45, 45)), axis=-1) - 22.0)
-    values = distance(Sphere(radius=2 * MM), nodes.reshape(-1, 3)).reshape(45, 45, 45).astype(np.float32)
-    grid = shapes.DistanceGrid(values=values, origin=nodes[0, 0, 0], spacing=spacing)
-    rng = np.random.default_rng(2)
-    at = rng.normal(size=(500, 3))
-    at *= (2 * MM + rng.uniform(-0.2, 0.2, (500, 1)) * MM) / np.linalg.norm(at, axis=1, keepdims=True)
-    value, gradient = sample(grid, at)
-    assert np.abs(value - distance(Sphere(radius=2 * MM), at)).max() < 3 / 8 * spacing**2 / (1.75 * MM)
-    assert np.abs(gradient - at / np.linalg.norm(at, axis=1, keepdims=True)).max() < 1.1 * spacing / (1.75 * MM)
-    step = 1e-3 * spacing
-    for axis in range(3):
-        ahead, _ = sample(grid, at + step * np.eye(3)[axis])
-        slope = (ahead - value) / step
-        assert np.median(np.abs(slope - gradient[:, axis])) < 1e-6
-
-
-def test_sample_reproduces_a_linear_field_and_knows_nothing_outside() -> None:
-    slope, shape = np.array([2.0, -3.0, 5.0]), (4, 5, 6)
-    values = np.einsum("a,aijk->ijk", slope, np.indices(shape) * 0.5).astype(np.float32)
-    grid = shapes.DistanceGrid(values=values, origin=np.array([1.0, 2.0, 3.0]), spacing=0.5)
-    at = np.array([[1.0, 2.0, 3.0], [1.7, 2.3, 4.1], [2.5, 4.0, 5.5]])
-    value, gradient = sample(grid, at)
-    assert np.allclose(value, (at - grid.origin) @ slope)
-    assert np.allclose(gradient, slope)
-    value, gradient = sample(grid, [[0.9, 2.1, 3.1], [1.0, 2.0, 5.6]])
-    assert np.isposinf(value).all()
-    assert (gradient == 0).all()
-
-
-def test_a_fine_stl_is_gridded_within_seconds(tmp_path: Path) -> None:
-    mesh = trimesh.creation.icosphere(4, 4.0)
-    assert len(mesh.faces) == 5120
-    geometry = stl(tmp_path, mesh)
-    start = time.process_time()
-    grid = distance_grid(geometry, 0.1 * MM)
-    assert time.process_time() - start < 10.0
-    assert grid.values.shape == (85, 85, 85)
-    value, _ = sample(grid, [[0.0, 0.0, -4.1 * MM], [0.0, 0.0, -3.5 * MM]])
-    assert value == pytest.approx([0.1 * MM, -0.5 * MM], abs=2e-5)
-
-
-@pytest.fixture
-def gridded(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Nodes of each mesh grid that was computed."""
-    nodes = []
-
-    def counted(surface: Surface, axes: Axes, band: float) -> np.ndarray:
-        values = signed_distance_on_grid(surface, axes, band)
-        nodes.append(values.size)
-        return values
-
-    monkeypatch.setattr(shapes, "signed_distance_on_grid", counted)
-    return nodes
-
-
-def test_a_mesh_is_gridded_once_and_its_grid_is_read_only(tmp_path: Path, gridded: list[int]) -> None:
-    geometry = stl(tmp_path, wedge())
-    grid = distance_grid(geometry, 0.5 * MM)
-    assert distance_grid(Mesh(path=geometry.path), 0.5 * MM) is grid
-    assert gridded == [17 * 13 * 11]
-    for array in (grid.values, grid.origin):
-        with pytest.raises(ValueError, match="read-only"):
-            array[0] = 1.0
-    others = [
-        distance_grid(geometry, 0.4 * MM),
-        distance_grid(geometry.model_copy(update={"scale": 0.9 * MM}), 0.5 * MM),
-    ]
-    assert len(gridded) == 3 and len({id(each) for each in (grid, *others)}) == 3
-
-
-def test_a_rewritten_file_gives_a_new_grid(tmp_path: Path, gridded: list[int]) -> None:
+def test_a_rewritten_file_gives_a_new_grid(tmp_path: Path) -> None:
     """Even with the size and the times of the old one."""
     geometry = stl(tmp_path, trimesh.creation.icosphere(2, 3.0))
-    path, grid = Path(geometry.path), distance_grid(geometry, 0.5 * MM)
+    path, grid = Path(geometry.path), tiled_distance(geometry, 0.5 * MM)
     old = path.stat()
     stl(tmp_path, trimesh.creation.icosphere(2, 2.0))
     os.utime(path, ns=(old.st_atime_ns, old.st_mtime_ns))
     assert (path.stat().st_size, path.stat().st_mtime_ns) == (old.st_size, old.st_mtime_ns)
     assert extent(geometry) == pytest.approx(4 * MM, rel=0.05)
-    assert distance_grid(geometry, 0.5 * MM).values.min() == pytest.approx(-2 * MM, rel=0.05)
-    assert grid.values.min() == pytest.approx(-3 * MM, rel=0.05) and len(gridded) == 2
+    middle = np.zeros((1, 3))
+    assert tiled_distance(geometry, 0.5 * MM).sample(middle)[0] == pytest.approx(-2 * MM, rel=0.05)
+    assert grid.sample(middle)[0] == pytest.approx(-3 * MM, rel=0.05)
 
 
 def test_a_file_changed_between_two_looks_is_not_taken_for_the_old_one(tmp_path: Path) -> None:
@@ -336,14 +265,6 @@ def test_a_file_changed_between_two_looks_is_not_taken_for_the_old_one(tmp_path:
     stl(tmp_path, ell())
     with pytest.raises(ValueError, match=r"part\.stl: the file was changed while it was read"):
         load_mesh(geometry.path, geometry.scale, before)
-
-
-def test_bad_grids_are_refused(tmp_path: Path) -> None:
-    geometry = stl(tmp_path, wedge())
-    with pytest.raises(
-        ValueError, match=r"part\.stl at 0\.005 mm would have 5\d\d,\d{3},\d{3} nodes, .* a larger spacing"
-    ):
-        distance_grid(geometry, 0.005 * MM)
 
 
 @pytest.mark.parametrize("shape", [Box(size=(4e-3, 6e-3, 5e-3)), Cylinder(radius=2e-3, height=5e-3)])

@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from tacsim.geometry import tiles
 from tacsim.geometry.mesh import fingerprint, signed_distance_on_grid
-from tacsim.geometry.shapes import BAND, distance
-from tacsim.geometry.tiles import TILE, TiledDistance, share_tiles, tiled_distance
+from tacsim.geometry.shapes import distance
+from tacsim.geometry.tiles import TILE, TiledDistance, share_tiles, tiled_distance, trilinear
 from tacsim.models.scene import Mesh
 
 SPACING = 0.1e-3
@@ -28,15 +28,29 @@ def tiled(mesh: Mesh) -> TiledDistance:
     return tiled_distance(mesh, SPACING)
 
 
-def test_distances_are_exact_near_the_surface_and_right_in_sign_elsewhere(mesh: Mesh, tiled: TiledDistance) -> None:
-    first, end = tiled.around(-tiled.half, np.array([0.0, 0.0, 1.0]))
-    values = tiled.values(first, end)
-    axes = [o + SPACING * (TILE * a + np.arange(n)) for o, a, n in zip(tiled.origin, first, values.shape, strict=True)]
-    nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)[::7]
-    found, truth = values.reshape(-1)[::7], distance(mesh, nodes)
-    near = np.abs(truth) < BAND * SPACING
-    assert near.any() and np.abs(found - truth)[near].max() < 1e-9
-    assert (np.sign(found) == np.sign(truth))[~near].all() and (np.abs(found)[~near] >= 0.99 * BAND * SPACING).all()
+def test_between_nodes_it_is_trilinear_with_its_own_gradient() -> None:
+    spacing, radius = 0.1e-3, 2e-3
+    nodes = spacing * (np.stack(np.indices((45, 45, 45)), axis=-1) - 22.0)
+    values = (np.linalg.norm(nodes, axis=-1) - radius).astype(np.float32)
+    rng = np.random.default_rng(2)
+    at = rng.normal(size=(500, 3))
+    at *= (radius + rng.uniform(-0.2e-3, 0.2e-3, (500, 1))) / np.linalg.norm(at, axis=1, keepdims=True)
+    length = np.linalg.norm(at, axis=1)
+    value, gradient = trilinear(values, at / spacing + 22.0, spacing)
+    assert np.abs(value - (length - radius)).max() < 3 / 8 * spacing**2 / 1.75e-3
+    assert np.abs(gradient - at / length[:, None]).max() < 1.1 * spacing / 1.75e-3
+
+
+def test_a_linear_field_comes_back_and_nothing_is_known_outside() -> None:
+    slope, shape, origin = np.array([2.0, -3.0, 5.0]), (4, 5, 6), np.array([1.0, 2.0, 3.0])
+    values = np.einsum("a,aijk->ijk", slope, np.indices(shape) * 0.5).astype(np.float32)
+    at = np.array([[1.0, 2.0, 3.0], [1.7, 2.3, 4.1], [2.5, 4.0, 5.5]])
+    value, gradient = trilinear(values, (at - origin) / 0.5, 0.5)
+    assert np.allclose(value, (at - origin) @ slope)
+    assert np.allclose(gradient, slope)
+    value, gradient = trilinear(values, (np.array([[0.9, 2.1, 3.1], [1.0, 2.0, 5.6]]) - origin) / 0.5, 0.5)
+    assert np.isposinf(value).all()
+    assert (gradient == 0).all()
 
 
 def test_a_tile_is_the_same_whatever_it_is_laid_with(

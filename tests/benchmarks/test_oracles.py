@@ -28,15 +28,6 @@ def test_a_twist_is_beside_that_of_a_bonded_disc(monkeypatch: pytest.MonkeyPatch
     assert row.error < 5
 
 
-def test_a_cylinder_at_learn_is_beside_its_oracle() -> None:
-    rows = cylinder.squeezed("learn", 1)
-    forces = [row for row in rows if row.variant.endswith("force")]
-    heights = [row for row in rows if row.variant.endswith("height")]
-    assert len(forces) == len(heights) == 3 and all(row.note == "" for row in rows)
-    assert max(row.error for row in forces) < 20  # %
-    assert max(row.error for row in heights) < 1
-
-
 @pytest.mark.deep
 def test_a_cylinders_cycles_flow_and_settle(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cylinder, "CYCLES", (1, 2))

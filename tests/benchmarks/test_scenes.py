@@ -49,15 +49,6 @@ def test_a_second_world_is_the_first_once_more() -> None:
     assert row.figures["second_ms"] > 0 and row.figures["first_ms"] > 0
 
 
-@pytest.mark.deep
-def test_a_batch_goes_the_way_of_a_world_alone() -> None:
-    (row,) = scenes.batch(2, 1)
-    assert row.error == 0.0 and row.figures["force_n"] > 0.1
-    assert row.substeps and row.substeps > 0
-    each = row.figures["wall_per_environment_substep_us"]
-    assert each == pytest.approx(row.timing.median * 1e6 / (2 * row.substeps))
-
-
 def test_a_batch_that_diverges_is_no_row(monkeypatch: pytest.MonkeyPatch) -> None:
     lost = SimulationDiverged("lost", "made up")
     monkeypatch.setattr(Batch, "move", lambda self, targets: [None, lost])

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
-import random
 import socket
 import struct
 import time
@@ -286,15 +284,6 @@ def test_dashboard_pauses_and_plays(mock: MockUR) -> None:
 
 
 # -- abuse -----------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("port", [*PORTS, 30020])
-def test_garbage_on_every_port(mock: MockUR, port: int) -> None:
-    generator = random.Random(port)
-    for size in (1, 2, 3, 100, 5000, 200_000):
-        with contextlib.suppress(OSError), socket.create_connection((mock.host, port), TIMEOUT) as line:
-            line.sendall(generator.randbytes(size))  # it may cut the line
-    assert answers(mock) and mock.faults.state().safety == "NORMAL"
 
 
 def test_truncated_package_then_silence_and_oversize_package(mock: MockUR) -> None:

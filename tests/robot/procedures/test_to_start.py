@@ -12,14 +12,13 @@ from robot.arm.rtde import Reading
 from robot.common.kinematics import Kinematics, pose
 from robot.common.tcp import ArmFrames
 from robot.procedures.start_way import NoWay, Way, find_way, require_clear
-from robot.procedures.to_start import Guide, Halted, lead_to_start
+from robot.procedures.to_start import Guide, lead_to_start
 from tacsim import pose as se3
 from tacsim.config import load_rig
 from tacsim.interface import FloatArray, Pose
 from tacsim.models.hardware import Placement, Plane, UrArmConfig
 from tests.robot.cli.lab import Lab, copy_of
 from tests.robot.cli.test_start import AWAY, fast
-from tests.robot.waiting import until
 
 KINEMATICS = Kinematics("ur5e")
 TURNED = np.array([0.5, -0.2, 0.1, 0.0, 0.1, 0.3])  # from the start to where the arm stands [rad]
@@ -146,22 +145,3 @@ def test_two_arms_are_led_one_after_the_other(tmp_path: Path) -> None:
         assert all(distance < 2e-3 for distance in away.values()) and set(away) == {"lower", "upper"}
         assert all(len(names) <= 1 for names in moved), moved  # since the last question
         assert sum("stands at its start" in words for words in said) == 2
-
-
-@needs_arms
-@pytest.mark.deep
-def test_a_stop_brakes_and_a_no_leaves_every_arm(tmp_path: Path) -> None:
-    file = fast(copy_of("ur5e", tmp_path, 86))
-    with Lab(file, beside=AWAY) as lab:
-        config = load_rig(file).config
-        here = {name: faults.state().joints for name, faults in lab.faults.items()}
-        assert lead_to_start(config, lab.starts, Guide(lambda question: False, print)) == {}
-        looks = iter(range(1000))
-        guide = Guide(lambda question: True, lambda words: None, stop=lambda: next(looks) > 20)
-        with pytest.raises(Halted, match="was stopped on its way"):
-            lead_to_start(config, lab.starts, guide)
-        for name, faults in lab.faults.items():
-            halted = faults.state()
-            assert not halted.program and np.abs(np.array(halted.joints) - here[name]).max() < 0.1
-            until(lambda faults=faults: faults.state().rests, "rest")  # type: ignore[misc]
-            assert np.abs(np.array(faults.state().joints) - halted.joints).max() < 1e-3

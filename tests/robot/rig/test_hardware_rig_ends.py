@@ -6,8 +6,6 @@ import contextlib
 import os
 import re
 import signal
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -20,7 +18,7 @@ from robot.open import open_rig
 from tacsim.config import load_rig
 from tacsim.interface import Action, Pose
 from tests.robot.rig.bare_rig import Opened, bare_file, belongings, cameras_of, failing, needs_proc, opened
-from tests.robot.waiting import alive, until
+from tests.robot.waiting import until
 
 pytestmark = pytest.mark.usefixtures("no_pause")
 MOTIONS = {1, 2, 3, 4, 6, 9, 10, 11, 12, 18, 24, 25, 41, 45, 51, 52, 66}  # of the library: all that move an arm
@@ -105,24 +103,3 @@ def test_a_part_that_is_killed_ends_the_episode_in_clear_words(
     assert re.search(words, str(failed)), str(failed)
     assert len(failed.episode.steps) >= 3
     until(lambda: belongings() == before, "all is given back")
-
-
-@needs_proc
-@pytest.mark.deep
-def test_mocks_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
-    code = (
-        "import sys, time; from robot.open import open_rig\n"
-        "rig = open_rig(sys.argv[1]); print('open', flush=True); time.sleep(600)"
-    )
-    file = bare_file(tmp_path, 57)
-    words = [sys.executable, "-c", code, str(file)]
-    with cameras_of(load_rig(file).config), subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None and process.stdout.readline() == "open\n"
-        family = [
-            int(stat.parent.name)
-            for stat in Path("/proc").glob("[0-9]*/stat")
-            if stat.read_text().rpartition(")")[2].split()[1] == str(process.pid)
-        ]
-        assert len(family) == 3  # two workers and the controllers
-        process.kill()
-    until(lambda: not any(alive(pid) for pid in family), "all mocks and workers have ended")

@@ -1,7 +1,5 @@
 """Two gels round a plasticine body: balance, friction, frames, repeatability, guards."""
 
-import contextlib
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -120,7 +118,7 @@ def test_a_twist_rests_only_once_both_sensors_feel_the_same_torque() -> None:
     stats = w.move({"upper": Pose(w.pose("upper").position, turned.as_quat())})
     assert stats.settled
     about = [w.wrench("lower")[5], w.wrench("upper")[5]]  # the upper one's z axis points down
-    assert abs(about[0]) > 1e-4
+    assert about[0] > 1e-4  # dragged along, world +z = its own +z
     assert abs(about[0] - about[1]) <= w.scene.settling.tolerance * -w.wrench("lower")[2] * 0.01  # half the gel's width
 
 
@@ -211,18 +209,6 @@ def test_shear_is_held_by_friction_and_ends_at_the_coulomb_limit() -> None:
     assert w.truth().position[0] > 0.5e-3  # it slides along
 
 
-def test_a_twist_is_felt_by_both_sensors() -> None:
-    w = world()
-    squeeze(w, 0.6e-3)
-    pose = w.pose("upper")
-    turn = 0.1
-    w.move(
-        {"upper": Pose(pose.position, [np.cos(turn / 2), np.sin(turn / 2), 0, 0])}
-    )  # about world z, after the half-turn
-    assert w.wrench("lower")[5] > 1e-5  # dragged along, world +z = its own +z
-    assert w.wrench("upper")[5] == pytest.approx(w.wrench("lower")[5], rel=0.1)  # its z points down: same sign
-
-
 def tilt(w: HybridWorld, level: Pose, degrees: float) -> tuple[np.ndarray, np.ndarray]:
     """The upper sensor turned about world y, its origin where it was; both wrenches in world axes, about its origin."""
     turn = Rotation.from_euler("y", degrees, degrees=True) * Rotation.from_quat(level.quaternion)
@@ -291,22 +277,6 @@ def test_nothing_is_recompiled_for_a_second_scene() -> None:
     if compiled is None:
         pytest.skip("this Taichi does not show its compiled kernels")
     assert len(hybrid_kernels.substeps._primal.compiled_kernels) == compiled
-
-
-def test_a_nan_is_reported_and_rolled_back() -> None:
-    w = world()
-    squeeze(w, 0.2e-3)
-    w.arrays()["position"][7] = np.nan
-    with pytest.raises(SimulationDiverged, match=r"position\[7, 0\] is nan"):
-        w.move(shift(w, "upper", (0, 0, -0.1e-3)))
-    assert np.isnan(w.arrays()["position"]).sum() == 3  # as it was: nothing spread
-
-
-def test_an_impossible_motion_ends_in_an_error_or_a_finite_state() -> None:
-    w = world()
-    with contextlib.suppress(SimulationDiverged):
-        w.move(shift(w, "upper", (0, 0, -9e-3)))  # through the body into the lower gel
-    assert all(np.isfinite(a).all() for a in w.snapshot().values())
 
 
 def test_unknown_frames_are_refused() -> None:

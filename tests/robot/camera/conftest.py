@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from robot.camera import mjpeg
+from tests.robot.camera.mocked import WAIT
 from tests.robot.camera.servers import Server
 
 
@@ -29,3 +31,9 @@ def nothing_is_left() -> Iterator[None]:
     yield
     assert [t.name for t in set(threading.enumerate()) - threads if t.name.startswith("camera")] == []
     assert sockets() - open_sockets == set()
+
+
+@pytest.fixture
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A camera that a busy machine keeps from sending is not taken for a stalled one."""
+    monkeypatch.setattr(mjpeg, "READ_TIMEOUT", 2 * WAIT)

@@ -14,7 +14,6 @@ from contextlib import suppress
 import numpy as np
 import pytest
 
-from robot.camera import mjpeg
 from robot.camera.camera import BACK_OFF, Camera, StaleFrame
 from robot.camera.picture import WrongSource
 from robot.common import stamp
@@ -45,12 +44,6 @@ def mock(served: MockCamera) -> Iterator[MockCamera]:
     served.drop(0.0)
     served.resize(320, 240)
     until(lambda: served.state().clients == 0)
-
-
-@pytest.fixture
-def patient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A camera that a busy machine keeps from sending is not taken for a stalled one."""
-    monkeypatch.setattr(mjpeg, "READ_TIMEOUT", 2 * WAIT)
 
 
 def test_delivers_the_picture_without_its_strip(mock: MockCamera) -> None:

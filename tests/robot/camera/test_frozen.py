@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from robot.camera import mjpeg
 from robot.camera.camera import Camera, StaleFrame
 from robot.mock.camera.camera import MockCamera
 from tests.promises import Record
@@ -19,14 +18,8 @@ from tests.robot.camera.mocked import config as mock_config
 from tests.robot.camera.servers import Server, config, encoded, films, seen
 from tests.robot.waiting import until
 
-pytestmark = pytest.mark.usefixtures("nothing_is_left")
+pytestmark = pytest.mark.usefixtures("nothing_is_left", "patient")
 SAME = "has shown the same picture for"
-
-
-@pytest.fixture(autouse=True)
-def patient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A camera that a busy machine keeps from sending is not taken for a stalled one."""
-    monkeypatch.setattr(mjpeg, "READ_TIMEOUT", 2 * WAIT)
 
 
 def with_clock(image: np.ndarray, number: int) -> np.ndarray:

@@ -9,9 +9,8 @@ import pytest
 
 
 @pytest.fixture
-def empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def empty_folder(empty_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The folder that a command runs in, and a terminal that does not break lines."""
-    monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "200")
     monkeypatch.setenv("TERM", "dumb")
     monkeypatch.setattr(sys, "path", list(sys.path))  # `tacsim run` adds the folder

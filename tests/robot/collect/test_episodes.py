@@ -18,9 +18,7 @@ from tests.robot.cli.invoked import TINY, tacsim
 OVERRIDES = tuple(word for word in TINY if word != "--set")
 
 
-@pytest.fixture(autouse=True)
-def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+pytestmark = pytest.mark.usefixtures("empty_folder")
 
 
 def job(count: int, **more: object) -> EpisodeJob:

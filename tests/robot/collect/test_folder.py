@@ -27,10 +27,7 @@ from tacsim.models.scene import Sphere
 from tests.robot.cli.invoked import START, environment, tacsim, told
 from tests.robot.collect.small import contents, job, rows
 
-
-@pytest.fixture(autouse=True)
-def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+pytestmark = pytest.mark.usefixtures("empty_folder")
 
 
 @pytest.fixture(scope="module")

@@ -27,10 +27,7 @@ from tests.robot.cli.invoked import START, environment, tacsim
 from tests.robot.export.lerobot_reader import read_dataset
 from tests.robot.export.made_up import NAMES, PERIOD, made_up_step, record
 
-
-@pytest.fixture(autouse=True)
-def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+pytestmark = pytest.mark.usefixtures("empty_folder")
 
 
 def test_a_data_set_equals_the_recordings_bit_for_bit(tmp_path: Path) -> None:

@@ -26,9 +26,7 @@ needs_av = pytest.mark.skipif(util.find_spec("av") is None, reason="needs the ex
 IMAGES = [f"observation.images.{name}" for name in ("lower", "upper")]
 
 
-@pytest.fixture(autouse=True)
-def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+pytestmark = pytest.mark.usefixtures("empty_folder")
 
 
 @pytest.mark.skipif(util.find_spec("av") is not None, reason="PyAV is here")

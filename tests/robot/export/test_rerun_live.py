@@ -29,9 +29,7 @@ needs_rerun = pytest.mark.skipif(util.find_spec("rerun") is None, reason="needs 
 TRUTH = Truth(7e-3, np.zeros(3), np.zeros((20_000, 3), np.float32), {"lower": Pose()})
 
 
-@pytest.fixture(autouse=True)
-def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+pytestmark = pytest.mark.usefixtures("empty_folder")
 
 
 class NoViewer:

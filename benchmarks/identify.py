@@ -272,7 +272,6 @@ def row(
 
 
 def line(row: Row) -> str:
-    """A row of the table."""
     cells = []
     for name, found in row.parameters.items():
         words = WORDS.get(name, name)

@@ -39,8 +39,6 @@ class TouchNoise:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BallTouch:
-    """One touch."""
-
     tool: Pose  # world_from_tool; any fixed frame will do for the world
     contact: tuple[float, float]  # centre of the contact, x, y in the sensor's frame [m]
     depth: float  # how deep the ball is pressed into the gel [m]

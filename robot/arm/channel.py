@@ -21,8 +21,6 @@ TACTILE_SLOTS = 8
 
 
 class CommandKind(IntEnum):
-    """What a command asks for."""
-
     HOLD = 0
     TARGET = 1
     ZERO_WRENCH = 2

@@ -43,8 +43,6 @@ class StaleFrame(StaleObservationError, TimeoutError):
 
 @dataclass(frozen=True, slots=True)
 class CameraStatus:
-    """The state of a camera."""
-
     open: bool  # frames may come; False while it is being reopened, and after the end
     fps: float | None  # measured over the last frames; None before the second since opening [Hz]
     age: float | None  # of the newest frame, since exposure; None before the first [s]

@@ -47,8 +47,6 @@ FAILURES = (NoTouch, BadMeasurements, ActionError, OutsideLimits)  # what spoils
 
 @dataclass(frozen=True, slots=True)
 class BallTouchPlan:
-    """How to touch."""
-
     ball_radius: float  # [m]
     touches: int = 24
     tilt: float = math.radians(25.0)  # largest [rad]

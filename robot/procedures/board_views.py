@@ -35,8 +35,6 @@ ON_GEL = "lay the board on the gel, print side down, and leave it there"
 
 @dataclass(frozen=True, slots=True)
 class BoardViewPlan:
-    """What to take."""
-
     board: Board
     views: int = 12
     on_gel: bool = False  # the board lies on the gel: one view

@@ -36,8 +36,6 @@ NOISE_FRAMES = 8  # pictures without contact that tell the camera's noise
 
 @dataclass(frozen=True, slots=True)
 class BallPressPlan:
-    """What to take."""
-
     ball: float  # radius [px of the metric picture]
     presses: int = 8
     patience: float = 180.0  # for each step of the person's [s]

@@ -30,8 +30,6 @@ STRIDE = 2  # of the pictures each n-th row and column counts
 
 @dataclass(frozen=True, slots=True)
 class TapPlan:
-    """How to tap."""
-
     taps: int = 8
     depth: float = 0.2e-3  # beyond where the reset left the sensor, along its own z [m]
     lift: float = 1e-3  # back from there, between taps [m]

@@ -25,9 +25,9 @@ pytestmark = pytest.mark.usefixtures("empty_folder")
 COMMANDS = ("run", "press", "reproduce", "replay", "schema", "doctor", "debug", "bench", "mock", "compare")
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("command", [*COMMANDS, "train", "evaluate", "export policy"])
 def test_every_command_explains_itself_with_an_example(command: str) -> None:
-    result = tacsim(command, "--help")
+    result = tacsim(*command.split(), "--help")
     assert result.exit_code == 0
     assert f"Example: tacsim {command}" in result.stdout
 

@@ -21,9 +21,7 @@ def tree(command: Any) -> dict[str, Any]:
         (parameter.opts or [parameter.name])[0]: {
             "opts": [*parameter.opts, *parameter.secondary_opts],
             "default": str(parameter.default),
-            **{
-                key: getattr(parameter, key, None) for key in ("required", "multiple", "nargs", "metavar", "min", "max")
-            },
+            **{key: getattr(parameter, key, None) for key in ATTRIBUTES},
         }
         for parameter in command.params
     }

@@ -18,8 +18,6 @@ LARGEST = 1e6  # of a number in a command; what a controller takes is not known,
 
 @dataclass(frozen=True)
 class Command:
-    """One command of the script."""
-
     work: Work
     needs: str  # a call that older controllers lack: where the script's text is without it, the command does nothing
     every_cycle: bool  # done again in every cycle of the script; any other once, until the client writes 0

@@ -22,10 +22,3 @@ def test_without_the_extra_the_error_names_it(words: tuple[str, ...], monkeypatc
     assert result.exit_code == 2
     assert "needs torch" in result.stderr
     assert "pip install 'tacsim[train]'" in result.stderr
-
-
-@pytest.mark.parametrize("words", [("train",), ("evaluate",), ("export", "policy")])
-def test_every_command_explains_itself_with_an_example(words: tuple[str, ...]) -> None:
-    result = tacsim(*words, "--help")
-    assert result.exit_code == 0
-    assert f"Example: tacsim {' '.join(words)}" in result.stdout

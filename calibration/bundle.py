@@ -41,8 +41,6 @@ from tacsim.record.images import decode_image, encode_png
 
 FORMAT = FORMATS[-1]
 SERIAL = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
-SINCE = {"darkness": 5, "noise": 3, "region": 5, "view": 2}  # the first format that has the field
-DEPTH_FORMAT, SLOPES_FORMAT = 6, 7  # from which on a light may tell what depth changes, and of slopes at depth
 
 Positive = Annotated[Length, Field(gt=0)]
 Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
@@ -113,24 +111,11 @@ class Calibration(Config):
             raise ValueError(f"gel_size is {self.gel_size} m, the picture of its geometry shows {shown} m")
         if self.view is not None and self.view.geometry != self.geometry:
             raise ValueError(f"geometry is {self.geometry}, its view gives {self.view.geometry}")
-        deep = None if self.forward is None else self.forward.depth
-        if self.format < DEPTH_FORMAT and deep is not None:
-            raise ValueError(f"format {self.format} has no forward.depth")
-        if self.format < SLOPES_FORMAT and deep is not None and deep.slopes:
-            raise ValueError(f"format {self.format} has no forward.depth.slopes")
-        for name in sorted(_later_than(self.format)):
-            if getattr(self, name) is not None:
-                raise ValueError(f"format {self.format} has no {name}")
         return self
 
     def digest(self) -> str:
         """What `checksum` must be."""
-        return digest(self.model_dump(mode="json", exclude=_later_than(self.format)))
-
-
-def _later_than(number: int) -> set[str]:
-    """The fields that format `number` lacks."""
-    return {name for name, first in SINCE.items() if number < first}
+        return digest(self.model_dump(mode="json"))
 
 
 def write_bundle(folder: Path, calibration: Calibration, reference: NDArray[np.uint8]) -> Path:
@@ -141,8 +126,7 @@ def write_bundle(folder: Path, calibration: Calibration, reference: NDArray[np.u
     stamped = stamped.model_copy(update={"checksum": stamped.digest()})
     (folder / REFERENCE).write_bytes(png)
     path = folder / FILE
-    content = stamped.model_dump(mode="json", exclude=_later_than(stamped.format))
-    text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120)
+    text = yaml.safe_dump(stamped.model_dump(mode="json"), sort_keys=False, default_flow_style=None, width=120)
     path.write_text(text, encoding="utf-8")
     return path
 

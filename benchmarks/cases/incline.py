@@ -24,8 +24,8 @@ BRACKET, STEPS = (0.97, 1.03), 4  # tan(tilt) / friction, and how often it is ha
 STEEP = 1.1  # tan(tilt) / friction where the block slides for sure
 
 
-def on_incline(slope: float, half: int = HALF) -> tuple[World, float]:
-    """A block let go on the lower gel, gravity tilted towards x by tan(tilt) = `slope`; `half` substeps twice.
+def on_incline(slope: float) -> tuple[World, float]:
+    """A block let go on the lower gel, gravity tilted towards x by tan(tilt) = `slope`; HALF substeps twice.
 
     Returns the world and how far the block went in the second half [m]. What brakes a body towards rest also brakes
     its slide, so speeds mean nothing here; whether it moves at all, and the ratio of forces, do.
@@ -37,7 +37,7 @@ def on_incline(slope: float, half: int = HALF) -> tuple[World, float]:
             body=BLOCK,
             friction={"lower": FRICTION, "upper": FRICTION},
             gravity=(FIELD * np.sin(tilt), 0.0, -FIELD * np.cos(tilt)),
-            settling=Settling(tolerance=1e-9, max_substeps=half),  # never settled: both halves at full length
+            settling=Settling(tolerance=1e-9, max_substeps=HALF),  # never settled: both halves at full length
         )
     )
     upper = world.pose("upper")

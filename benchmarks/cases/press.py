@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -237,8 +236,8 @@ def _drag_row(timing: Timing, found: float, stats: MoveStats, truth: float, what
     return Measurement(timing, _percent(found, truth), "% of the drag", what, variant, stats.substeps, figures, note)
 
 
-def renew(say: Callable[[str], None], folder: Path = FOLDER) -> Limit:
-    """Computes the limit anew and writes it to `folder`: three meshes, the finest takes many minutes."""
+def renew(say: Callable[[str], None]) -> Limit:
+    """Computes the limit anew and writes it to FOLDER: three meshes, the finest takes many minutes."""
     profiles, forces, substeps = [], [], []
     for element in ELEMENTS:
         say(f"sphere_press: h = {element * 1e3:g} mm")
@@ -258,9 +257,8 @@ def renew(say: Callable[[str], None], folder: Path = FOLDER) -> Limit:
         "force_n": [round(force, 6) for force in forces],
         "substeps": substeps,
     }
-    folder.mkdir(parents=True, exist_ok=True)
-    np.save(folder / "sphere_press.npy", profile.astype(np.float32), allow_pickle=False)
-    (folder / "sphere_press.json").write_text(json.dumps(config, indent=1) + "\n", encoding="utf-8")
+    np.save(FOLDER / "sphere_press.npy", profile.astype(np.float32), allow_pickle=False)
+    (FOLDER / "sphere_press.json").write_text(json.dumps(config, indent=1) + "\n", encoding="utf-8")
     return Limit(profile, config)
 
 

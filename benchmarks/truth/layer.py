@@ -14,6 +14,9 @@ from scipy import fft
 
 FloatArray = NDArray[np.float64]
 
+TOLERANCE = 1e-6  # change of the pressure in one iteration, relative, at which it has converged
+ITERATIONS = 500  # at most
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LayerContact:
@@ -45,9 +48,8 @@ def compliance(k: FloatArray, thickness: float, youngs_modulus: float, poisson_r
 
 
 def layer_contact(
-    gap: FloatArray, depth: float, pixel: float, thickness: float, youngs_modulus: float, poisson_ratio: float,
-    tolerance: float = 1e-6, max_iterations: int = 500,
-) -> LayerContact:  # fmt: skip
+    gap: FloatArray, depth: float, pixel: float, thickness: float, youngs_modulus: float, poisson_ratio: float
+) -> LayerContact:
     """Presses a shape with undeformed `gap` (n, n) [m] (0 at its tip) by `depth` [m] into the layer.
 
     Solves p >= 0, u - (depth - gap) >= 0, p (u - (depth - gap)) = 0 by the conjugate-gradient method of Polonsky and
@@ -65,7 +67,7 @@ def layer_contact(
     pressure = np.where(target > 0, youngs_modulus * np.maximum(target, 0) / thickness, 0.0)
     direction = np.zeros_like(pressure)
     norm_before, conjugate = 1.0, 0.0
-    for _ in range(max_iterations):
+    for _ in range(ITERATIONS):
         mismatch = displacement(pressure) - target  # negative: indenter overlaps the layer
         contact = pressure > 0
         norm = float((mismatch[contact] ** 2).sum())
@@ -78,8 +80,6 @@ def layer_contact(
         conjugate = 0.0 if open_overlap.any() else 1.0
         pressure = np.where(open_overlap, pressure - step * mismatch, pressure)
         norm_before = norm
-        if np.abs(pressure - before).sum() < tolerance * pressure.sum():
+        if np.abs(pressure - before).sum() < TOLERANCE * pressure.sum():
             return LayerContact(pressure, displacement(pressure), pixel)
-    raise RuntimeError(
-        f"layer contact did not converge in {max_iterations} iterations; use a coarser grid or a looser tolerance"
-    )
+    raise RuntimeError(f"layer contact did not converge in {ITERATIONS} iterations; use a coarser grid")

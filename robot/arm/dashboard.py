@@ -82,9 +82,9 @@ class Dashboard(Closing):
         if self.ask("is in remote control").lower() == "false":
             raise DeviceError(f"{who}: the pendant has local control; switch it to remote control (top right corner)")
 
-    def unlock(self, who: str, patience: float = UNLOCK_PATIENCE) -> None:
+    def unlock(self, who: str) -> None:
         """Releases a protective stop. Raises EmergencyStop for any other stop, ProtectiveStop if it cannot be done."""
-        deadline = time.monotonic() + patience
+        deadline = time.monotonic() + UNLOCK_PATIENCE
         answer = ""
         while (safety := self.safety()) == "PROTECTIVE_STOP":
             if time.monotonic() > deadline:

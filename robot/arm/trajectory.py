@@ -56,22 +56,22 @@ def resting(position: FloatArray, rotation: FloatArray) -> MotionState:
     )
 
 
-def landing_speed(distance: float, acceleration: float, period: float = PERIOD) -> float:
+def landing_speed(distance: float, acceleration: float) -> float:
     """The highest speed of the next period that still allows a stop `distance` [m] ahead, exactly there [m/s].
 
     n periods that each brake by a = acceleration * period cover, from speed u, period * (n u - a n (n - 1) / 2). The
     least n whose last speed is at most a gives u; between whole n the law is linear, so it has no steps.
     """
-    slowing = acceleration * period
-    n = max(1, math.ceil(0.5 * (math.sqrt(1.0 + 8.0 * distance / (slowing * period)) - 1.0)))
-    return distance / (n * period) + 0.5 * slowing * (n - 1)
+    slowing = acceleration * PERIOD
+    n = max(1, math.ceil(0.5 * (math.sqrt(1.0 + 8.0 * distance / (slowing * PERIOD)) - 1.0)))
+    return distance / (n * PERIOD) + 0.5 * slowing * (n - 1)
 
 
-def stopping_distance(speed: float, acceleration: float, period: float = PERIOD) -> float:
+def stopping_distance(speed: float, acceleration: float) -> float:
     """Distance [m] covered from `speed` when every further period brakes as hard as allowed; at most v^2 / 2a."""
-    slowing = acceleration * period
+    slowing = acceleration * PERIOD
     n = math.floor(speed / slowing)
-    return period * (n * speed - 0.5 * slowing * n * (n + 1))
+    return PERIOD * (n * speed - 0.5 * slowing * n * (n + 1))
 
 
 def towards(
@@ -80,16 +80,15 @@ def towards(
     rotation: FloatArray,
     rates: Rates,
     allowed: Callable[[MotionState], bool] | None = None,
-    period: float = PERIOD,
 ) -> MotionState:
     """One period nearer to the target `position` (3,) [m] and `rotation` (3, 3).
 
     `allowed` says whether a motion state is allowed, judged by where it could still be stopped. Where it is not, the
     origin brakes straight on instead: its stopping point stays the one that was allowed before.
     """
-    velocity, moved, arrived = advance(position - now.position, now.velocity, rates.speed, rates.acceleration, period)
+    velocity, moved, arrived = advance(position - now.position, now.velocity, rates.speed, rates.acceleration)
     spin, turned, rotation_arrived = advance(
-        rotation_vector(rotation @ now.rotation.T), now.spin, rates.turn_rate, rates.turn_acceleration, period
+        rotation_vector(rotation @ now.rotation.T), now.spin, rates.turn_rate, rates.turn_acceleration
     )
     step = MotionState(
         position.copy() if arrived else now.position + moved,
@@ -99,15 +98,15 @@ def towards(
     )
     if allowed is None or allowed(step):
         return step
-    held = braking(now, rates.acceleration, rates.turn_acceleration, period)
+    held = braking(now, rates.acceleration, rates.turn_acceleration)
     return replace(held, rotation=step.rotation, spin=step.spin)  # limits hold for the origin; it may still turn
 
 
-def braking(now: MotionState, deceleration: float, turn_deceleration: float, period: float = PERIOD) -> MotionState:
+def braking(now: MotionState, deceleration: float, turn_deceleration: float) -> MotionState:
     """One period nearer to rest, straight on."""
-    velocity = slower(now.velocity, deceleration * period)
-    spin = slower(now.spin, turn_deceleration * period)
-    return MotionState(now.position + velocity * period, turn(spin * period) @ now.rotation, velocity, spin)
+    velocity = slower(now.velocity, deceleration * PERIOD)
+    spin = slower(now.spin, turn_deceleration * PERIOD)
+    return MotionState(now.position + velocity * PERIOD, turn(spin * PERIOD) @ now.rotation, velocity, spin)
 
 
 def stopping_point(motion: MotionState, deceleration: float) -> FloatArray:
@@ -120,19 +119,19 @@ def stopping_point(motion: MotionState, deceleration: float) -> FloatArray:
 
 
 def advance(
-    error: FloatArray, velocity: FloatArray, top: float, acceleration: float, period: float = PERIOD
+    error: FloatArray, velocity: FloatArray, top: float, acceleration: float
 ) -> tuple[FloatArray, FloatArray, bool]:
     """The next velocity towards a point `error` away, its displacement, and whether that arrives; vectors of any length
     alike, `top` and `acceleration` bound their norms."""
     distance = math.sqrt(float(error @ error))
-    speed = min(top, landing_speed(distance, acceleration, period))
+    speed = min(top, landing_speed(distance, acceleration))
     wanted = error * (speed / distance) if distance > 0.0 else np.zeros_like(velocity)
     change = wanted - velocity
-    excess = math.sqrt(float(change @ change)) / (acceleration * period)
+    excess = math.sqrt(float(change @ change)) / (acceleration * PERIOD)
     if excess > 1.0 + 1e-12:
         wanted = velocity + change / excess
-        return wanted, wanted * period, False
-    return wanted, wanted * period, speed * period >= distance * (1.0 - 1e-12)
+        return wanted, wanted * PERIOD, False
+    return wanted, wanted * PERIOD, speed * PERIOD >= distance * (1.0 - 1e-12)
 
 
 def slower(velocity: FloatArray, change: float) -> FloatArray:

@@ -84,10 +84,11 @@ def _round(half: float) -> list[tuple[float, float]]:
     return [(float(np.cos(angle)), half * float(np.sin(angle))) for angle in angles]
 
 
-def _prism(outline: FloatArray, height: float = 4.0, bevel: float = 0.3) -> Trimesh:
-    """With its lower edge cut off, which a sharp edge of a mesh that is slid would catch with."""
+def _prism(outline: FloatArray) -> Trimesh:
+    """4 mm high, with its lower edge cut off, which a sharp edge of a mesh that is slid would catch with."""
+    bevel = 0.3  # [mm]
     narrow = 1.0 - bevel / float(np.linalg.norm(outline, axis=1).max())
-    return _lofted(outline, [(narrow, 0.0), (1.0, bevel), (1.0, height)])
+    return _lofted(outline, [(narrow, 0.0), (1.0, bevel), (1.0, 4.0)])
 
 
 def _roof(length: float, width: float, height: float, ridge: float) -> Trimesh:

@@ -94,16 +94,15 @@ def identify(
     *,
     wanted: Sequence[str] = (),
     most_moments: int = MOMENTS,
-    two_meshes: bool = True,
     gel_error: float = 0.0,
     on_step: Callable[[str], None] = lambda words: None,
     on_run: Callable[[int, int], None] = lambda done, total: None,
 ) -> Identified:
     """Fits the materials of `scene` to the presses.
 
-    wanted: names of parameters; empty: all. most_moments: of a press, that are simulated. two_meshes: the way is found
-    on coarser meshes, and put right on the scene's own; else the scene's own does all. gel_error: standard
-    deviation of the gels' stiffness, as a share of it, carried into the body's intervals.
+    wanted: names of parameters; empty: all. most_moments: of a press, that are simulated. gel_error: standard
+    deviation of the gels' stiffness, as a share of it, carried into the body's intervals. The way is found on coarser
+    meshes, and put right on the scene's own.
 
     Raises NotIdentified, ValueError for a name that is none, CannotSimulate.
     """
@@ -118,13 +117,10 @@ def identify(
     start = scene_with(scene, {each.name: each.start for each in parameters})
     exact = Simulation(start, parameters, taken, recordings.seen, on_run)
     error = COARSE_ERROR
-    if two_meshes:
-        levels = [replace(exact, scene=coarser(start)), exact]
-        if kind == "body" and 2 * levels[0].scene.element <= scene.gel.size[2] / 2:  # else nothing is left of the gel
-            levels.insert(0, replace(exact, scene=coarser(levels[0].scene)))
-            error *= 2
-    else:
-        levels = [exact]
+    levels = [replace(exact, scene=coarser(start)), exact]
+    if kind == "body" and 2 * levels[0].scene.element <= scene.gel.size[2] / 2:  # else nothing is left of the gel
+        levels.insert(0, replace(exact, scene=coarser(levels[0].scene)))
+        error *= 2
     width = np.array([name.endswith(".width") for name in signals.channels])[signals.channel]
     fit = estimate(
         levels, replace(signals, noise=np.where(width, UNWEIGHED, signals.noise)), parameters, priors, error, on_step

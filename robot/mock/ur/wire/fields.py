@@ -61,6 +61,7 @@ def _register(array: str, index: int) -> Callable[[Machine], Values]:
 
 JOINT_MODES = {Mode.RUNNING: 253, Mode.IDLE: 255}  # running, idle; any other: POWERED_OFF
 POWERED_OFF = 239
+VOLTS = 48.0  # of all that is powered
 
 
 def _constant(*values: float) -> Callable[[Machine], Values]:
@@ -68,9 +69,9 @@ def _constant(*values: float) -> Callable[[Machine], Values]:
     return lambda machine: value
 
 
-def _powered(volts: float, count: int) -> Callable[[Machine], Values]:
+def _powered(count: int) -> Callable[[Machine], Values]:
     def read(machine: Machine) -> Values:
-        value = 0.0 if machine.mode is Mode.POWER_OFF else volts
+        value = 0.0 if machine.mode is Mode.POWER_OFF else VOLTS
         return (value,) * count if count > 1 else value
 
     return read
@@ -125,10 +126,10 @@ OUTPUTS: dict[str, Output] = {
     "speed_scaling": Output("DOUBLE", lambda m: m.arm.scale),
     "target_speed_fraction": Output("DOUBLE", lambda m: m.slider),
     "actual_momentum": Output("DOUBLE", _constant(0.0)),
-    "actual_main_voltage": Output("DOUBLE", _powered(48.0, 1)),
-    "actual_robot_voltage": Output("DOUBLE", _powered(48.0, 1)),
+    "actual_main_voltage": Output("DOUBLE", _powered(1)),
+    "actual_robot_voltage": Output("DOUBLE", _powered(1)),
     "actual_robot_current": Output("DOUBLE", _constant(0.0)),
-    "actual_joint_voltage": Output("VECTOR6D", _powered(48.0, 6)),
+    "actual_joint_voltage": Output("VECTOR6D", _powered(6)),
     "actual_digital_output_bits": Output("UINT64", lambda m: m.outputs.digital),
     "runtime_state": Output("UINT32", lambda m: int(m.runtime)),
     "elbow_position": Output("VECTOR3D", _elbow, since=((3, 5), (5, 0))),

@@ -48,14 +48,8 @@ class Failure(_Frozen):
     cause: str
 
 
-class Missing(_Frozen):
-    """A case that could not be measured with what there was; not a failure."""
-
-    group: Group
-    case: str
-    method: str
-    resolution: str
-    cause: str  # what is missing, and where it was looked for
+class Missing(Failure):
+    """A case that could not be measured with what there was, and where that was looked for; not a failure."""
 
 
 class Device(_Frozen):

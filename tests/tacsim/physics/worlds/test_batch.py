@@ -29,7 +29,7 @@ from tacsim.physics.exec.lanes import COPIES, MAX_NUMBERS
 from tacsim.physics.failure.health import LARGEST_GRID, SimulationDiverged
 from tacsim.physics.motion.load import LoadNotReached
 from tacsim.physics.move import MoveStats
-from tacsim.physics.world import World, make_world
+from tacsim.physics.world import World
 from tacsim.physics.worlds import press
 from tacsim.physics.worlds.base import RETRIES
 from tacsim.physics.worlds.batch import Batch
@@ -388,10 +388,3 @@ def test_wrong_targets_are_refused_before_anything_moves(fresh: Batch) -> None:
     with pytest.raises(ValueError, match="load of 'upper' is -1 N"):
         fresh.move([STAY] * 3, [None, {"upper": -1.0}, None])
     assert [state(world) for world in fresh.worlds] == before
-
-
-@pytest.mark.cpu
-def test_a_batch_of_one_is_a_world(fresh: Batch) -> None:
-    one, alone = Batch(SCENES[:1]), make_world(SCENES[0])
-    assert one.move([closed(alone, 0.4e-3)]) == [alone.move(closed(alone, 0.4e-3))]
-    assert_same(one.worlds, [alone])

@@ -251,23 +251,6 @@ def test_a_tilted_sensor_presses_on_the_side_to_which_it_leans() -> None:
 
 
 @pytest.mark.cpu
-def test_bitwise_repeatable_and_restorable() -> None:
-    results = []
-    w = world()
-    begin = w.snapshot()
-    for _ in range(2):
-        w.restore(begin)
-        squeeze(w, 0.4e-3)
-        results.append(w.snapshot())
-    other = world()
-    squeeze(other, 0.4e-3)
-    results.append(other.snapshot())
-    for result in results[1:]:
-        for name in result:
-            assert np.array_equal(result[name], results[0][name]), name
-
-
-@pytest.mark.cpu
 def test_nothing_is_recompiled_for_a_second_scene() -> None:
     world().move({})
     compiled = (

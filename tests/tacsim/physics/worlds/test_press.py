@@ -12,7 +12,6 @@ from tacsim.interface import Pose
 from tacsim.models.scene import Box, Cylinder, Gel, GelMaterial, Mesh, Shape, Sphere
 from tacsim.physics.contact.indenter import POINTS
 from tacsim.physics.failure.health import SimulationDiverged
-from tacsim.physics.move import MoveCommand
 from tacsim.physics.worlds import press
 from tests.tacsim.physics.worlds.pressing import move, world
 
@@ -221,31 +220,6 @@ def test_a_second_world_of_a_mesh_reads_the_file_but_computes_nothing_anew(
     move(third, (0, 0, -0.4e-3))
     assert computed.count("centred") == 1
     assert third.pose("indenter").position[2] == pytest.approx(1.7e-3, rel=0.01)
-
-
-@pytest.mark.cpu
-def test_a_motion_driven_launch_by_launch_is_the_move() -> None:
-    """Two worlds advanced in turns, each at its own phase, end as by `move`, to the bit."""
-    alone = [world(Sphere(radius=4e-3)) for _ in range(2)]
-    together = [world(Sphere(radius=4e-3)) for _ in range(2)]
-    targets = [{"indenter": Pose(np.array([0, 0, 3.9e-3 - deep]))} for deep in (0.2e-3, 0.5e-3)]
-    stats = [w.move(target) for w, target in zip(alone, targets, strict=True)]
-    motions = [w.motion(MoveCommand(target)) for w, target in zip(together, targets, strict=True)]
-    ends = {}
-    wanted = {index: next(motion) for index, motion in enumerate(motions)}
-    while wanted:
-        for index, launch in list(wanted.items()):
-            reading = together[index]._advance(launch.path, launch.first, launch.last)
-            try:
-                wanted[index] = motions[index].send(reading)
-            except StopIteration as end:
-                ends[index] = end.value
-                del wanted[index]
-    assert [ends[index] for index in range(2)] == stats
-    assert stats[0].substeps != stats[1].substeps
-    for a, b in zip(alone, together, strict=True):
-        left, right = a.snapshot(), b.snapshot()
-        assert all(left[name].tobytes() == right[name].tobytes() for name in left)
 
 
 def owned(thing: object) -> Iterator[np.ndarray]:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tacsim.control.approach import NoTouch
-from tacsim.interface import Action, Pose, SensorSpec
+from tacsim.interface import Pose, SensorSpec
 from tacsim.limits import LimitExceeded
 from tacsim.models.hardware import ArmLimits, Workspace
 from tacsim.physics.move import MoveStats
@@ -181,33 +181,6 @@ def test_an_untouched_gel_is_drawn_once(spring_world: Any) -> None:
         assert (image == 7).all()
         image[...] = 0
     assert len(rendered) == 1
-
-
-def test_second_episode_equals_the_first_bit_for_bit(open_springs: Any) -> None:
-    rig = open_springs("reposition")
-    episodes = []
-    for _ in range(2):
-        observations = [rig.reset()]
-        for _ in range(3):
-            pose = observations[-1].arms["upper"].pose
-            observations.append(rig.step(Action({"upper": shifted(pose, x=1e-4)}))[0])
-        episodes.append(observations)
-    for one, other in zip(*episodes, strict=True):
-        assert one.time == other.time
-        for name in ("lower", "upper"):
-            assert np.array_equal(one.tactile[name].image, other.tactile[name].image)
-            assert np.array_equal(one.tactile[name].height, other.tactile[name].height)
-            assert np.array_equal(one.arms[name].wrench, other.arms[name].wrench)
-            assert np.array_equal(one.arms[name].pose.position, other.arms[name].pose.position)
-
-
-def test_a_second_reset_needs_no_second_approach(open_springs: Any) -> None:
-    rig = open_springs()
-    rig.reset()
-    moves = len(rig.world.moves)
-    assert moves > 1
-    rig.reset()
-    assert len(rig.world.moves) == moves
 
 
 def test_placement_follows_the_seed(open_springs: Any) -> None:

@@ -86,18 +86,6 @@ def test_arms_are_told_what_is_seen_from_the_first_observation_on(bare: Opened) 
     assert all(np.isnan(channel.tactile.latest()["exposed"]) for channel in channels)
 
 
-def test_a_start_aside_is_drawn_from_the_seed(shared: Opened) -> None:
-    reset = shared.rig._reset
-    shared.rig._reset._placement = 2e-3  # type: ignore[attr-defined]
-    try:
-        places = [shared.rig.reset(seed).arms["left"].pose.position for seed in (1, 1, 2)]
-    finally:
-        reset._placement = 0.0  # type: ignore[attr-defined]
-    assert places[0] == pytest.approx(places[1], abs=20e-6)
-    assert float(np.abs(places[0] - places[2]).max()) > 50e-6
-    assert float(np.abs(places).max()) <= 2e-3 + 20e-6
-
-
 @pytest.mark.parametrize(("link_timeout", "lost"), [(2.0, False), (0.05, True)])
 def test_a_gap_between_packages_is_a_lost_link_only_beyond_its_time_out(link_timeout: float, lost: bool) -> None:
     now = time.monotonic()

@@ -35,15 +35,10 @@ def test_results_stand_in_the_order_of_the_calls(allowed: int) -> None:
     assert map_parallel([]) == []
 
 
-def test_as_many_run_at_once_as_may(allowed: int) -> None:
-    together = threading.Barrier(allowed, timeout=5.0)
-    map_parallel([together.wait] * allowed)  # a barrier is passed by all of them or by none
-
-
 def test_as_many_run_at_once_as_may_to_the_last_of_many(allowed: int) -> None:
     """Also the calling thread goes on to a next one."""
     together = threading.Barrier(allowed, timeout=2.0)
-    map_parallel([together.wait] * (3 * allowed))
+    map_parallel([together.wait] * (3 * allowed))  # a barrier is passed by so many or by none
 
 
 def test_an_interruption_ends_what_has_not_begun(allowed: int) -> None:

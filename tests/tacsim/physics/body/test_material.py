@@ -85,12 +85,6 @@ def returned(
     return full(e.astype(float)) + np.eye(3), flow.astype(float), full(tau.astype(float))
 
 
-def run(b: np.ndarray, limit: float) -> tuple[np.ndarray, np.ndarray]:
-    """Without hardening."""
-    b_new, _, tau = returned(b, np.zeros(len(b)), limit, 0.0)
-    return b_new, tau
-
-
 def drive(params: BodyParams, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Stress (n, 3, 3) and equivalent plastic strain (n,) of one material point after each of the increments d of
     deformation (n, 3, 3)."""
@@ -108,18 +102,9 @@ def drive(params: BodyParams, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray
 @pytest.mark.parametrize(("size", "tolerance"), [(1e-3, 2e-6), (0.05, 2e-6), (0.2, 5e-6), (0.6, 2e-4)])
 def test_elastic_stress_matches_the_reference(size: float, tolerance: float) -> None:
     b = random_b(500, size)
-    _, tau = run(b, 1e9)
+    _, _, tau = returned(b, np.zeros(len(b)), 1e9, 0.0)
     _, _, truth = laws.hencky_return(b, np.zeros(len(b)), MU, BULK, math.inf, 0.0)
     assert np.abs(tau - truth).max() < tolerance * np.abs(truth).max()
-
-
-@pytest.mark.parametrize("limit", [1e-3, 0.02, 0.07, 0.2])
-def test_plastic_return_matches_the_reference(limit: float) -> None:
-    b = random_b(500, 0.4)
-    b_new, tau = run(b, limit)
-    b_truth, _, tau_truth = laws.hencky_return(b, np.zeros(len(b)), MU, BULK, limit, 0.0)
-    assert np.abs(tau - tau_truth).max() < 3e-4 * np.abs(tau_truth).max()
-    assert np.abs(b_new - b_truth).max() < 3e-4
 
 
 @some
@@ -160,13 +145,9 @@ def test_the_law_is_objective(seed: int, size: float, hardening: float) -> None:
 def test_the_law_is_isotropic(seed: int, size: float, limit: float, hardening: float) -> None:
     """Stress and elastic state share the axes of b: they commute with it, whatever the axes are."""
     b, flow = random_b(10, size, seed), flows(10, seed)
-    b_new, flow_new, tau = returned(b, flow, limit, hardening)
+    b_new, _, tau = returned(b, flow, limit, hardening)
     for found in (tau, b_new):
         assert np.abs(found @ b - b @ found).max() < 1e-5 * np.abs(b - np.eye(3)).max() * max(np.abs(found).max(), 0.01)
-    swap = np.eye(3)[[1, 2, 0]]  # the material does not know x from y from z
-    _, flow_swapped, swapped = returned(swap @ b @ swap.T, flow, limit, hardening)
-    assert np.abs(swap @ tau @ swap.T - swapped).max() < 1e-5 * max(np.abs(tau).max(), 0.01)
-    assert np.abs(flow_new - flow_swapped).max() < 1e-5
 
 
 @some
@@ -230,7 +211,7 @@ def convected(b: np.ndarray, f: np.ndarray) -> np.ndarray:
 def test_tiny_strains_keep_their_digits() -> None:
     """Storing e = b - I: a strain of 1e-6 is still right to 1e-4, where b in float32 would have lost it all."""
     b = random_b(200, 1e-6)
-    _, tau = run(b, 1e9)
+    _, _, tau = returned(b, np.zeros(len(b)), 1e9, 0.0)
     e = b - np.eye(3)
     small = MU * (e - np.trace(e, axis1=1, axis2=2)[:, None, None] / 3 * np.eye(3))
     small += BULK / 2 * np.trace(e, axis1=1, axis2=2)[:, None, None] * np.eye(3)
@@ -250,12 +231,14 @@ def test_yield_norms() -> None:
 HARD = BodyMaterial(yield_stress=30e3, hardening_modulus=200e3)
 
 
-@pytest.mark.parametrize("hardening", [0.0, 0.05, 1.0])
-def test_hardening_matches_the_reference(hardening: float) -> None:
+@pytest.mark.parametrize(
+    ("limit", "hardening"), [(1e-3, 0.0), (0.02, 0.0), (0.07, 0.0), (0.2, 0.0), (0.05, 0.05), (0.05, 1.0)]
+)
+def test_plastic_return_matches_the_reference(limit: float, hardening: float) -> None:
     b = random_b(500, 0.4)
     flow = np.random.default_rng(4).uniform(0.0, 0.5, 500)
-    b_new, flow_new, tau = returned(b, flow, 0.05, hardening)
-    b_truth, flow_truth, tau_truth = laws.hencky_return(b, flow, MU, BULK, 0.05, hardening)
+    b_new, flow_new, tau = returned(b, flow, limit, hardening)
+    b_truth, flow_truth, tau_truth = laws.hencky_return(b, flow, MU, BULK, limit, hardening)
     assert (flow_truth > flow).sum() > 100  # some yield
     if hardening == 1.0:
         assert (flow_truth == flow).sum() > 100  # and some have hardened enough not to

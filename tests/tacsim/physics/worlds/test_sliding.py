@@ -27,8 +27,8 @@ def pressed_ball(friction: float, preset: str, deep: float = 0.5e-3) -> PressWor
 @pytest.mark.parametrize(
     ("preset", "friction", "ratio"),
     [
-        ("standard", 0.3, 0.32), ("standard", 0.6, 0.647), ("standard", 1.0, 1.098),
-        ("draft", 0.3, 0.32), ("draft", 0.6, 0.663), ("draft", 1.0, 1.148),
+        ("standard", 0.3, 0.32), ("standard", 0.6, 0.647), ("standard", 1.0, 1.098), ("standard", 1.5, 1.644),
+        ("draft", 0.3, 0.32), ("draft", 0.6, 0.663), ("draft", 1.0, 1.148), ("draft", 1.5, 1.685),
     ],
 )  # fmt: skip
 def test_a_slid_ball_is_dragged_by_all_its_friction_at_the_default_speed(
@@ -36,14 +36,9 @@ def test_a_slid_ball_is_dragged_by_all_its_friction_at_the_default_speed(
 ) -> None:
     """Ratios: of the contact that an axisymmetric finite-element solver (second order, neo-Hookean, 0.2 mm elements)
     finds under this ball, 0.5 mm deep, where it slides everywhere. At draft, with much friction, of the same mesh at
-    Mach 0.003: it lies 2.5 and 4.5 % above, since an element is as wide as the contact."""
+    Mach 0.003: it lies 2.5 and 4.5 % above, since an element is as wide as the contact. At 1.5, where it ploughs: of
+    the same mesh at Mach 0.001."""
     assert slide(pressed_ball(friction, preset), 2e-3) == pytest.approx(ratio, rel=0.02)
-
-
-@pytest.mark.parametrize(("preset", "ratio"), [("draft", 1.685), ("standard", 1.644)])
-def test_a_ball_slid_with_much_friction_is_dragged_by_all_of_it(preset: str, ratio: float) -> None:
-    """Where it ploughs, at mu = 1.5: of the same mesh at Mach 0.001."""
-    assert slide(pressed_ball(1.5, preset), 2e-3) == pytest.approx(ratio, rel=0.02)
 
 
 def test_a_steep_slide_in_two_is_one_and_nothing_shakes_apart() -> None:

@@ -41,7 +41,7 @@ from tacsim.record.images import decode_image, encode_png
 
 FORMAT = FORMATS[-1]
 SERIAL = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
-SINCE = {"darkness": 5, "noise": 3, "region": 5, "view": 2}  # the first format that has the field
+SINCE = {"darkness": 5, "noise": 3, "region": 5, "skin": 8, "view": 2}  # the first format that has the field
 DEPTH_FORMAT, SLOPES_FORMAT = 6, 7  # from which on a light may tell what depth changes, and of slopes at depth
 
 Positive = Annotated[Length, Field(gt=0)]
@@ -77,7 +77,7 @@ class Provenance(Config):
 class Calibration(Config):
     """All that calibration has found out about one sensor."""
 
-    format: Literal[1, 2, 3, 4, 5, 6, 7]
+    format: Literal[1, 2, 3, 4, 5, 6, 7, 8]
     serial: Annotated[str, Field(pattern=SERIAL)]
     geometry: SensorGeometry  # of the picture that the models are for: the native one, or with `view` the rectified
     gel_size: tuple[Positive, Positive]  # x, y of the gel that the picture shows [m]
@@ -91,6 +91,8 @@ class Calibration(Config):
     region: PictureRegion | None = None  # what of the camera's picture shows gel; None: all of it, or of the view
     markers: Markers | None = None  # None: no dots are printed on the gel
     noise: CameraNoise | None = None  # of the picture that the models are for; None: not measured
+    # share of the grain without contact that moves with the gel; None: none is known to
+    skin: Annotated[float, Field(gt=0, le=1)] | None = None
     tool_from_sensor: Placement | None = None  # None: not measured
     latency: Annotated[Time, Field(ge=0)] | None = None  # from exposure to arrival; None: not measured [s]
     residuals: tuple[Residual, ...] = ()

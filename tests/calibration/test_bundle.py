@@ -77,8 +77,8 @@ def test_a_bundle_comes_back_bit_by_bit(bundle: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("format: 3", "format: 0", "has format 0, this version of tacsim reads 1, 2, 3, 4, 5, 6, 7"),
-        ("format: 3", "format: 8", "has format 8, this version of tacsim reads 1, 2, 3, 4, 5, 6, 7"),
+        ("format: 3", "format: 0", "has format 0, this version of tacsim reads 1, 2, 3, 4, 5, 6, 7, 8"),
+        ("format: 3", "format: 9", "has format 9, this version of tacsim reads 1, 2, 3, 4, 5, 6, 7, 8"),
         ("format: 3", "format: 2", "was changed since it was written"),
         ("format: 3", "form: 3", "names no format"),
         ("noise: null", "noise: {deviation: [1, 1, 1]}", "was changed since it was written"),
@@ -185,7 +185,12 @@ def test_a_camera_with_a_calibration_finds_height(bundle: Path) -> None:
 # What older formats wrote, before there was a view (1) or noise (2); their checksum is of that content.
 @pytest.mark.parametrize(
     ("old", "without"),
-    [(1, {"view", "noise", "darkness", "region"}), (2, {"noise", "darkness", "region"}), (4, {"darkness", "region"})],
+    [
+        (1, {"view", "noise", "darkness", "region", "skin"}),
+        (2, {"noise", "darkness", "region", "skin"}),
+        (4, {"darkness", "region", "skin"}),
+        (7, {"skin"}),
+    ],
 )
 def test_a_bundle_of_an_older_format_still_loads(tmp_path: Path, old: int, without: set[str]) -> None:
     path = write_bundle(tmp_path, calibration().model_copy(update={"format": old}), PICTURE)
@@ -199,6 +204,13 @@ def test_a_bundle_of_an_older_format_still_loads(tmp_path: Path, old: int, witho
     assert read.format == old and read.view is None and read.noise is None and read.image_shape == (120, 160)
     assert normaliser_for_camera(camera(tmp_path), (1.0, 1.0), CanonicalGrid()).finds_height
     assert read_sensor_model(path).noise is None
+
+
+def test_a_bundle_keeps_the_skin_and_gives_it_to_the_twin(tmp_path: Path) -> None:
+    write_bundle(tmp_path, calibration().model_copy(update={"skin": 0.6, "format": 8}), PICTURE)
+    assert read_bundle(tmp_path)[0].skin == 0.6 == read_sensor_model(tmp_path).skin
+    write_bundle(tmp_path, calibration(), PICTURE)
+    assert read_bundle(tmp_path)[0].skin is None and read_sensor_model(tmp_path).skin == 0.0
 
 
 def test_a_bundle_keeps_the_noise_and_gives_it_to_the_twin(tmp_path: Path) -> None:
@@ -259,6 +271,8 @@ def test_geometry_and_view_must_agree(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"format 6 has no forward\.depth\.slopes"):
         Calibration.model_validate(slopes)
     assert Calibration.model_validate(slopes | {"format": 7}).forward is not None
+    with pytest.raises(ValueError, match="format 7 has no skin"):
+        Calibration.model_validate(calibration().model_dump() | {"skin": 0.5, "format": 7})
     assert pinhole((240, 320)).centre == (159.5, 119.5)
 
 

@@ -75,7 +75,7 @@ class Provenance(Config):
 class Calibration(Config):
     """All that calibration has found out about one sensor."""
 
-    format: Literal[1, 2, 3, 4, 5, 6, 7]
+    format: Literal[1, 2, 3, 4, 5, 6, 7, 8]
     serial: Annotated[str, Field(pattern=SERIAL)]
     geometry: SensorGeometry  # of the picture that the models are for: the native one, or with `view` the rectified
     gel_size: tuple[Positive, Positive]  # x, y of the gel that the picture shows [m]
@@ -89,6 +89,8 @@ class Calibration(Config):
     region: PictureRegion | None = None  # what of the camera's picture shows gel; None: all of it, or of the view
     markers: Markers | None = None  # None: no dots are printed on the gel
     noise: CameraNoise | None = None  # of the picture that the models are for; None: not measured
+    # share of the grain without contact that moves with the gel; None: none is known to
+    skin: Annotated[float, Field(gt=0, le=1)] | None = None
     tool_from_sensor: Placement | None = None  # None: not measured
     latency: Annotated[Time, Field(ge=0)] | None = None  # from exposure to arrival; None: not measured [s]
     residuals: tuple[Residual, ...] = ()

@@ -64,6 +64,7 @@ class LightFit:
         view: GelView | None = None,
         markers: Markers | None = None,
         noise: CameraNoise | None = None,
+        skin: float | None = None,
     ) -> Calibration:
         """The calibration of sensor `serial`, made now; `ball_radius`, `pixel_pitch` [m]. `write_bundle` sets the
         checksums."""
@@ -79,6 +80,7 @@ class LightFit:
             view=view,
             markers=markers,
             noise=noise,
+            skin=skin,
             residuals=tuple(
                 Residual(
                     frame=press.name,

@@ -115,6 +115,7 @@ def _unchanging(config: RigConfig) -> RigConfig:
         "darkness": None,
         "texture": 0.0,
         "texture_seed": 0,
+        "skin": 0.0,
         "noise": None,
         "name": "",
     }

@@ -16,7 +16,7 @@ from tacsim.config.document import LoadState, Node, from_plain, parse_text, show
 from tacsim.config.errors import Place, did_you_mean
 
 FILE, REFERENCE = "calibration.yaml", "reference.png"
-FORMATS = (1, 2, 3, 4, 5, 6, 7)  # that are read; the last is written
+FORMATS = (1, 2, 3, 4, 5, 6, 7, 8)  # that are read; the last is written
 OWN = "sensors"  # folder of sensors of one's own, beside the file that names them or in the current folder
 MAX_FILE_SIZE, MAX_PICTURE_SIZE = 1_000_000, 1 << 26  # [bytes] of the YAML, and of the picture
 AGAIN = "make it again with `tacsim calibrate sensor`"
@@ -120,6 +120,7 @@ def sensor_node(path: Path) -> Node:
         "darkness": content.get("darkness"),
         "markers": {**markers, "in_background": True} if isinstance(markers, dict) else markers,
         "texture": 0.0,  # the picture has the gel's own
+        "skin": content.get("skin") or 0.0,
         "noise": content.get("noise"),
         "view": content.get("view"),
         "source": f"calibration of {content.get('serial')}, {made}",

@@ -128,6 +128,8 @@ class SensorModel(Config):
     # Where the picture of `geometry` lies in the camera's own, which is delivered then; None: it is the camera's own.
     view: GelView | None = None
     texture: Annotated[Length, Field(ge=0)] = 2e-6  # standard deviation of the gel's surface texture [m]
+    # Share of the background picture's grain that is on the gel's skin, and moves with it; the rest stands still
+    skin: Annotated[float, Field(ge=0, le=1)] = 0.0
     texture_seed: Annotated[int, Field(ge=0)] = 0
     noise: CameraNoise | None = None  # of each picture that a sensor delivers; None: a camera without noise
     source: str = ""
@@ -150,6 +152,11 @@ class SensorModel(Config):
                 raise ValueError("markers.in_background: lighting.background is no picture that could show them")
             if self.geometry.camera_distance is not None:
                 raise ValueError("markers.in_background: dots of a picture are seen along parallel rays only")
+        if self.skin > 0:
+            if not isinstance(self.lighting.background, str):
+                raise ValueError("skin: lighting.background is no picture that could show it")
+            if self.geometry.camera_distance is not None:
+                raise ValueError("skin: that of a picture is seen along parallel rays only")
         return self
 
     @property

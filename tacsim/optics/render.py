@@ -31,6 +31,7 @@ from tacsim.optics.grid import PixelGrid, image_grid, strips
 from tacsim.optics.ink import lifted_ink
 from tacsim.optics.markers import check_fits, marker_transmission
 from tacsim.optics.shadows import shadow_colours
+from tacsim.optics.skin import lifted_skin
 from tacsim.optics.spline import line_matrices
 from tacsim.optics.surface import SurfaceTable, look_up
 
@@ -51,9 +52,9 @@ TABLE_ERROR = 0.5  # largest error of the table [grey levels]; narrower highligh
 class Renderer:
     """Renders the images of one simulated sensor. Everything that is the same in all frames is computed once.
 
-    The texture is fixed in the image: reference and contact frames share it, also under sideways motion. Dots that the
-    background shows are lifted off it and move with the gel. Of a model with a `view` it is the camera's own picture,
-    black beside the gel. The noise of the camera is added by the sensor (tacsim.optics.noise).
+    The texture is fixed in the image: reference and contact frames share it, also under sideways motion. Dots and skin
+    that the background shows are lifted off it and move with the gel. Of a model with a `view` it is the camera's own
+    picture, black beside the gel. The noise of the camera is added by the sensor (tacsim.optics.noise).
     Raises ValueError when markers do not fit on the gel or the background picture does not fit the image.
     """
 
@@ -80,6 +81,10 @@ class Renderer:
         elif model.markers is not None:
             check_fits(model.markers, gel_size)
         self._mean = untouched.mean(axis=(0, 1))
+        if model.skin > 0:
+            bare, skin = lifted_skin(untouched, model.skin, model.geometry.pixel_pitch)
+            self._unlit = self._unlit + (bare - untouched)
+            self._ink = skin if self._ink is None else self._ink * skin
         if model.photometric is not None:
             red, green, blue = self._mean.tolist()
             self._light = PhotometricLight(model.photometric, (red, green, blue))
@@ -115,15 +120,19 @@ class Renderer:
         return image if self._view is None else np.asarray(cv2.remap(image, *self._view, cv2.INTER_LINEAR), np.uint8)
 
     def _inked(self, surface: GelSurface, table: SurfaceTable, points: Float32) -> Callable[[slice], Float32] | None:
-        """Rows of an image -> (rows, W, 1 or 3) share of its light that each pixel keeps under the dots."""
+        """Rows of an image -> (rows, W, 1 or 3) share of its light that each pixel keeps under dots and skin."""
+        ink, dots = self._ink, None
         if self._markers is not None:
             at_rest = table.at_rest(points, self._grid) if table.folded else None
-            dots = marker_transmission(surface, self._markers, self.model.geometry, at_rest)
-            return lambda rows: dots[rows, :, None]
-        if self._ink is not None:
-            ink = self._ink
-            return lambda rows: look_up(ink, table.at_rest(points[rows], self._grid))
-        return None
+            dots = marker_transmission(surface, self._markers, self.model.geometry, at_rest)[..., None]
+        if ink is None:
+            return None if dots is None else dots.__getitem__
+
+        def kept(rows: slice) -> Float32:
+            share = look_up(ink, table.at_rest(points[rows], self._grid))
+            return share if dots is None else share * dots[rows]
+
+        return kept
 
     def _light_of(self, table: SurfaceTable, points: Float32, inside: Mask) -> Callable[[slice], Float32]:
         """Rows of an image -> (rows, W, 3) what light adds to the image without it; 255 is white."""

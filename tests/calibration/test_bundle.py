@@ -75,8 +75,8 @@ def test_a_bundle_comes_back_bit_by_bit(bundle: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("format: 3", "format: 0", "has format 0, this version of tacsim reads 1, 2, 3, 4, 5, 6, 7"),
-        ("format: 3", "format: 8", "has format 8, this version of tacsim reads 1, 2, 3, 4, 5, 6, 7"),
+        ("format: 3", "format: 0", "has format 0, this version of tacsim reads 1, 2, 3, 4, 5, 6, 7, 8"),
+        ("format: 3", "format: 9", "has format 9, this version of tacsim reads 1, 2, 3, 4, 5, 6, 7, 8"),
         ("format: 3", "format: 2", "was changed since it was written"),
         ("format: 3", "form: 3", "names no format"),
         ("noise: null", "noise: {deviation: [1, 1, 1]}", "was changed since it was written"),
@@ -183,7 +183,12 @@ def test_a_camera_with_a_calibration_finds_height(bundle: Path) -> None:
 # What older formats did not write: they had no view (1), noise (2), darkness or region (4).
 @pytest.mark.parametrize(
     ("old", "without"),
-    [(1, {"view", "noise", "darkness", "region"}), (2, {"noise", "darkness", "region"}), (4, {"darkness", "region"})],
+    [
+        (1, {"view", "noise", "darkness", "region", "skin"}),
+        (2, {"noise", "darkness", "region", "skin"}),
+        (4, {"darkness", "region", "skin"}),
+        (7, {"skin"}),
+    ],
 )
 def test_a_bundle_of_an_older_format_still_loads(bundle: Path, old: int, without: set[str]) -> None:
     content = yaml.safe_load((bundle / FILE).read_text(encoding="utf-8")) | {"format": old}
@@ -193,6 +198,13 @@ def test_a_bundle_of_an_older_format_still_loads(bundle: Path, old: int, without
     assert read.format == old and read.view is None and read.noise is None and read.image_shape == (120, 160)
     assert normaliser_for_camera(camera(bundle), (1.0, 1.0), CanonicalGrid()).finds_height
     assert read_sensor_model(bundle).noise is None
+
+
+def test_a_bundle_keeps_the_skin_and_gives_it_to_the_twin(tmp_path: Path) -> None:
+    write_bundle(tmp_path, calibration().model_copy(update={"skin": 0.6, "format": 8}), PICTURE)
+    assert read_bundle(tmp_path)[0].skin == 0.6 == read_sensor_model(tmp_path).skin
+    write_bundle(tmp_path, calibration(), PICTURE)
+    assert read_bundle(tmp_path)[0].skin is None and read_sensor_model(tmp_path).skin == 0.0
 
 
 def test_a_bundle_keeps_the_noise_and_gives_it_to_the_twin(tmp_path: Path) -> None:

@@ -39,6 +39,7 @@ def write_calibration(
     from calibration.bundle import write_bundle
     from calibration.light import page
     from calibration.light.residual_picture import draw
+    from calibration.light.skin import measure_skin
     from calibration.light.verdict import judge
 
     verdict = judge(fit, scale, dots=found is None and _shows_dots(fit))
@@ -47,13 +48,20 @@ def write_calibration(
         told = "tells direction" if profile.directed else "tells none"
         warn(f"the light of a {profile.title} {told}, that of these pictures does not do so: is --kind right?")
     noise = _noise(read, fit)
-    bundle = fit.to_calibration(serial, scale.ball_radius, scale.pixel_pitch, view=view, markers=found, noise=noise)
+    # of pictures with dots it is not asked: dots that were painted over leave other grain behind
+    skin = measure_skin(fit.presses, fit.reference, scale.pixel_pitch) if found is None else None
+    bundle = fit.to_calibration(
+        serial, scale.ball_radius, scale.pixel_pitch, view=view, markers=found, noise=noise, skin=skin
+    )
     warnings = (f"verdict: {verdict}", *bundle.provenance.warnings)
     provenance = bundle.provenance.model_copy(update={"warnings": warnings})
     bundle = bundle.model_copy(update={"provenance": provenance, "region": region})
     facts = [f"{profile.title}: {profile.source}; {profile.light}"]
     if noise is not None:
         facts.append(f"camera's noise {', '.join(f'{value:.2f}' for value in noise.deviation)} grey levels (R, G, B)")
+    if skin is not None:
+        facts.append(f"skin: {skin:.0%} of the grain of the picture without contact moves with the gel")
+        notes.print(facts[-1], markup=False)
     with writing(folder, new=not (folder / FRAMES).exists()):
         written = [write_bundle(folder, bundle, fit.reference)]
         residuals = folder / "residuals.png" if fit.predictions else None

@@ -24,7 +24,7 @@ from tacsim.config import ConfigError, load_rig, load_sensor
 from tacsim.interface import TactileFrame
 from tacsim.models.hardware import CameraSensorConfig
 from tacsim.models.scene import GelSurface
-from tacsim.models.sensor import CanonicalGrid, Markers, SensorGeometry, SensorModel
+from tacsim.models.sensor import CanonicalGrid, Lighting, Markers, SensorGeometry, SensorModel
 from tacsim.optics.render import Renderer
 from tacsim.optics.surface import surface_map
 from tests.robot.cli.invoked import TINY, tacsim
@@ -59,8 +59,9 @@ def hidden(markers: Markers | None = None) -> SensorModel:
     return SensorModel(geometry=SensorGeometry(width=240, height=190, pixel_pitch=PITCH), markers=markers, texture=0.0)
 
 
-def calibrate(folder: Path, sensor: SensorModel, *options: str, presses: int = 6) -> Path:
-    """A bundle of rendered presses of a ball, by the command line, as `sensors/finger` in `folder`."""
+def calibrate(folder: Path, sensor: SensorModel, *options: str, presses: int = 6, slide: float = 0.0) -> Path:
+    """A bundle of rendered presses of a ball, by the command line, as `sensors/finger` in `folder`; `slide` [m]: how
+    far each drags the gel along, one in this and another in that direction."""
     render, rng = Renderer(sensor, GEL), np.random.default_rng(0)
     frames = folder / "frames"
     frames.mkdir()
@@ -72,7 +73,7 @@ def calibrate(folder: Path, sensor: SensorModel, *options: str, presses: int = 6
     photograph("background.png", dent(0.0, 0.0, 0.0))
     photograph("background_2.png", dent(0.0, 0.0, 0.0))
     for number, ((x, y), depth) in enumerate(zip(PLACES[:presses], DEPTHS, strict=False)):
-        photograph(f"press_{number}.png", dent(depth, x, y))
+        photograph(f"press_{number}.png", dent(depth, x, y, (slide * np.cos(number), slide * np.sin(number))))
     sensors = folder / "sensors"
     sensors.mkdir()
     done = tacsim(
@@ -293,6 +294,22 @@ def test_the_dots_of_a_bundle_move_with_the_gel(dotted: Path) -> None:
         assert np.sqrt(((seen.flow - true.flow) ** 2).mean()) < 0.1 * PITCH
         assert seen.height.max() == pytest.approx(true.height.max(), rel=0.1)
         assert np.abs(render(surface).astype(float) - sensor(surface)).mean() < 1.5  # a dot is 80 grey levels dark
+
+
+def test_the_skin_of_a_bundle_moves_with_the_gel(tmp_path: Path) -> None:
+    """Grain that presses have dragged along is found to be skin, and the twin's is dragged as the sensor's own."""
+    light = np.array([110.0, 105.0, 100.0]) + np.random.default_rng(1).normal(0, 5, (190, 240, 1))
+    Image.fromarray(np.rint(light).astype(np.uint8)).save(tmp_path / "gel.png")
+    grainy = hidden().model_copy(update={"lighting": Lighting(background=str(tmp_path / "gel.png")), "skin": 1.0})
+    bundle = calibrate(tmp_path, grainy, slide=0.4e-3)
+    model = load_sensor(bundle)
+    assert 0.5 < model.skin <= 1.0
+    surface = dent(0.4e-3, 0.3e-3, -0.2e-3, (0.3e-3, -0.25e-3))
+    real, still = Renderer(grainy, GEL)(surface), model.model_copy(update={"skin": 0.0})
+    off, left = (
+        np.abs(Renderer(each, GEL)(surface).astype(float) - real)[60:130, 80:160].mean() for each in (model, still)
+    )
+    assert off < 0.6 * left
 
 
 def test_the_twin_of_an_askew_camera_delivers_its_picture(finger: Path, tmp_path: Path) -> None:

@@ -88,7 +88,7 @@ class Dagger:
             answers = act(self.actor, {key: value[-new:] for key, value in data.items()})
             losses["unmet_loss"] = float(np.square((answers - actions[-new:]) / spread.numpy()).mean())
         random = torch.Generator().manual_seed(self._seed * 1000 + number)
-        optimiser = torch.optim.AdamW(self.actor.parameters(), lr=settings.rate, weight_decay=settings.decay)
+        optimiser = torch.optim.Adam(self.actor.parameters(), lr=settings.rate)
         decay = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, settings.epochs)
         total = 0.0
         for epoch in range(settings.epochs):

@@ -21,7 +21,6 @@ class DaggerConfig(Config):
     epochs: Count = 60  # passes over all that was met so far, after each round
     batch: Count = 128
     rate: Rate = 1e-3  # of Adam; it falls to zero in each round
-    decay: Annotated[float, Field(ge=0, le=100)] = 0.0  # of the weights (AdamW): a student that knows less by heart
     pace: Annotated[float, Field(gt=0, le=1)] = 0.5  # share of the teacher's action that the student is shown
     noise: Annotated[float, Field(ge=0, le=1)] = 0.3  # of the teacher's actions in the first round, which it plays
 

@@ -106,6 +106,8 @@ class TiledDistance:
     def sample(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Distance (n,) [m] and its gradient (n, 3) [-] at `points` (n, 3) [m], trilinear between nodes.
         Raises what `values` raises."""
+        if not len(points):
+            return np.empty(0), np.empty((0, 3))
         first, end = self.around(points.min(axis=0), points.max(axis=0) + self.spacing)
         origin = self.origin + TILE * self.spacing * first
         return trilinear(self.values(first, end), (points - origin) / self.spacing, self.spacing)

@@ -70,6 +70,12 @@ def test_a_body_that_no_random_particle_falls_into_is_refused() -> None:
         scattered(ball, 1 * MM, seed=0)
 
 
+def test_a_sheet_of_a_mesh_that_no_particle_falls_into_is_refused(tmp_path: Path) -> None:
+    trimesh.creation.box((4.0, 4.0, 0.02)).export(tmp_path / "sheet.stl")
+    with pytest.raises(ValueError, match=r"sheet\.stl holds no particle at a spacing of 0\.5 mm"):
+        scattered(Mesh(path=str(tmp_path / "sheet.stl")), SPACING, seed=0)
+
+
 @pytest.mark.parametrize("sampling", ["lattice", "random"])
 @pytest.mark.parametrize(("thickness", "layers"), [(0.5 * MM, 1), (1 * MM, 2)])
 def test_a_sheet_of_one_or_two_layers_is_refused_with_what_to_choose(

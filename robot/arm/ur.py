@@ -28,6 +28,7 @@ from robot.arm.dashboard import Dashboard
 from robot.arm.package_log import PackageLog
 from robot.arm.shared_ring import Record
 from robot.arm.status import AT_CONNECTING, OUTLIVED, ArmStatus, status_of
+from robot.arm.trajectory import PERIOD
 from robot.arm.worker_config import check_host, worker_config
 from robot.common import Closing
 from robot.common.kinematics import Kinematics
@@ -49,6 +50,7 @@ from tacsim.models.hardware import UrArmConfig
 CONNECT_TIMEOUT = 10.0  # of the constructor and of recover [s]
 CLOSE_TIMEOUT = 1.2  # for the worker to brake and end its program; then it is killed [s]
 POLL = 2e-3  # between two looks at the worker's records while waiting [s]
+SLOW = 2.0 * PERIOD  # a loop whose median period is longer makes its arm slow [s]
 PARTNER_PATIENCE = 0.5  # how long a command waits for the state of the other arm of a keep-out [s]
 REST_SPEED, REST_TURN = 1e-3, 10e-3  # an arm slower than this is at rest [m/s, rad/s]
 _open: set[str] = set()  # names of the arms that are open in this process
@@ -377,6 +379,8 @@ class URArm(Closing):
                 text += f" (now {force:.1f} of {limits.force:g} N, {torque:.2f} of {limits.torque:g} N m)"
             elif status == ArmStatus.WORKSPACE_LIMIT:
                 text += f" ({self._region.broken(record['position']) or 'it is inside again'})"
+            elif status < ArmStatus.FORCE_LIMIT and (period := float(record["period"][0])) > SLOW:
+                text += f" (slowly: its loop takes {1e3 * period:.0f} ms, not 2; the machine is too busy)"
         worker = self._worker
         if worker is not None and status == ArmStatus.WORKER_DEAD:
             text += f" ({worker.last_words})"

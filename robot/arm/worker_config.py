@@ -49,7 +49,8 @@ def worker_config(
         host=config.host,
         model=config.model,
         refused_serial=MOCK_SERIAL if config.mock is None else None,
-        realtime=config.mock is None or config.mock.realtime,
+        # A maker's simulator shares this machine: a worker that comes before it would keep it waiting.
+        realtime=not config.simulator if config.mock is None else config.mock.realtime,
         parent=os.getpid(),
         segment=segment,
         world_from_base=se3.to_matrix(config.world_from_base.pose).tolist(),

@@ -102,6 +102,6 @@ def wait_for_arrival(arms: Mapping[str, CommandedArm], timeout: float) -> None:
         if time.monotonic() > deadline:
             name = moving[0]
             raise DeviceError(
-                f"arm '{name}' did not come to its target within {timeout:g} s; it {arms[name].driver.explain()}"
+                f"arm '{name}' did not come to its target within {timeout:g} s: {arms[name].driver.explain()}"
             )
         time.sleep(POLL)

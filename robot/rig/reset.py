@@ -24,6 +24,7 @@ RETREAT = 5e-3  # along the sensor's own axis, before anything else [m]
 TRAVEL = 60.0  # longest motion to the start [s]
 STEP = 5.0  # longest step of an approach [s]
 LOOK = 5e-3  # between two looks of an approach in motion [s]
+FARTHER = 0.1e-3  # an approach goes on while its arms come so much farther within TRAVEL [m]
 AT_END = 0.5  # an approach that has come to its end has met nothing when nothing is told for so long [s]
 PICTURE = 15.0  # longest wait for one that shows the gels at rest [s]
 PAUSE = 0.3  # a shaken arm comes to rest before its force is zeroed [s]
@@ -125,8 +126,9 @@ class HardwareReset:
         speed, longest = self._config.approach_speed, self._config.approach_distance
         going = {name: self._arms[name] for name in sense.look(guarded=True).pressed}
         ends = {name: se3.along_z(self._begun[name], longest) for name in going}
-        gone, before_end = 0.0, time.monotonic()
-        deadline = before_end + 2.0 * longest / speed + TRAVEL
+        gone = dict.fromkeys(going, 0.0)
+        before_end = farther = time.monotonic()
+        counted = 0.0  # of the arms' ways together, when they were last seen to come farther [m]
         try:
             while going:
                 touch = sense.look(guarded=True)
@@ -138,15 +140,17 @@ class HardwareReset:
                     else:  # NaN, too
                         going.pop(name).send(None)
                 for name, arm in going.items():
-                    gone = max(gone, se3.distance(arm.state().pose, self._begun[name])[0])
-                self._tell(f"approach: {1e3 * gone:.1f} mm of at most {1e3 * longest:g} mm")
+                    gone[name] = se3.distance(arm.state().pose, self._begun[name])[0]
+                self._tell(f"approach: {1e3 * max(gone.values()):.1f} mm of at most {1e3 * longest:g} mm")
+                if sum(gone.values()) > counted + FARTHER:
+                    counted, farther = sum(gone.values()), now
                 if waiting or not all(arm.at_target() for arm in going.values()):
                     before_end = now
                 elif going and now - before_end > AT_END:
-                    raise NoTouch(f"no touch after an approach of {1e3 * gone:.3g} mm; {ADVICE}")
-                if going and now > deadline:
-                    name, arm = next(iter(going.items()))
-                    raise DeviceError(f"arm '{name}' came to no end of its approach: {arm.driver.explain()}")
+                    raise NoTouch(f"no touch after an approach of {1e3 * max(gone.values()):.3g} mm; {ADVICE}")
+                if going and now - farther > TRAVEL:  # not after a time in all: a busy machine makes an arm slow
+                    why = "no new pictures or packages come" if waiting else next(iter(going.values())).driver.explain()
+                    raise DeviceError(f"the approach came no farther for {TRAVEL:g} s: {why}")
                 time.sleep(LOOK)
         except BaseException:
             for arm in self._arms.values():

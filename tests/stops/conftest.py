@@ -24,16 +24,18 @@ def controller(measuring: bool) -> Iterator[MockUR]:
 
 @pytest.fixture
 def trial(controller: MockUR, tmp_path: Path, measuring: bool) -> Iterator[Trial]:
+    instead: str | None = None
     for _ in range(TRIES):
         controller.faults.reset()
         made = Trial(controller, tmp_path, measuring=measuring)
         try:
-            if made.begin():
+            instead = made.begin()
+            if instead is None:
                 yield made
                 return
         finally:
             made.close()
-    pytest.fail(f"{TRIES} times the driver stopped the arm before anything happened: the machine is too busy")
+    pytest.fail(f"{TRIES} times the arm came to no full speed before anything happened; the last time: {instead}")
 
 
 @pytest.fixture

@@ -42,7 +42,6 @@ CASES = [
 
 @pytest.mark.often
 @pytest.mark.promise(7)
-@pytest.mark.timeout(120)
 @pytest.mark.parametrize(("kind", "ports"), CASES)
 def test_after_a_broken_line_nothing_moves_again(
     trial: Trial, kind: str, ports: str, back: float, watch: float, figure: Record
@@ -53,7 +52,6 @@ def test_after_a_broken_line_nothing_moves_again(
 
 @pytest.mark.deep
 @pytest.mark.promise(7)
-@pytest.mark.timeout(120)
 @pytest.mark.parametrize("ports", ["script", "dashboard"])
 @pytest.mark.parametrize("kind", BREAKS)
 def test_a_line_that_carries_nothing_may_break(

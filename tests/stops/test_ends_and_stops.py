@@ -40,7 +40,6 @@ ENDS: dict[str, Callable[[Trial], float]] = {
 @pytest.mark.deep
 @pytest.mark.often
 @pytest.mark.promise(6)
-@pytest.mark.timeout(120)
 @pytest.mark.parametrize("name", ENDS)
 def test_after_a_process_is_gone_nothing_moves_again(trial: Trial, name: str, watch: float, figure: Record) -> None:
     seen = trial.watch(ENDS[name](trial), watch)
@@ -81,7 +80,6 @@ def foreign(faults: FaultClient) -> None:
 @pytest.mark.deep
 @pytest.mark.often
 @pytest.mark.promise(7)
-@pytest.mark.timeout(120)
 @pytest.mark.parametrize("name", STOPS)
 def test_after_a_stop_of_the_controller_nothing_moves_again(
     trial: Trial, name: str, watch: float, figure: Record

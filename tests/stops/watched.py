@@ -31,6 +31,7 @@ ROOT = HERE.parents[1]
 PROXY = f"127.24.{os.getpid() >> 8 & 255}.{os.getpid() & 255}"
 LINK_TIMEOUT = 1.0  # of a patient arm [s]
 GOES = 0.28  # how far the arm is sent [m]
+BEGINS = 20.0  # it is under way after so long, if the machine lets it [s]
 BEFORE = 0.08  # it has gone so far when something happens [m]
 FAST, BUSY_FAST = 0.08, 0.02  # and goes faster than that [m/s]: measured; on a machine so busy that it slows the arm
 STILL, PACKAGES = 1e-3, 5  # the tool stands that is slower [m/s] for so many packages of 2 ms
@@ -75,22 +76,21 @@ class Trial:
         self.reader = threading.Thread(target=self._read, daemon=True)
         self.reader.start()
 
-    def begin(self) -> bool:
-        """Waits until the arm is on its way at full speed; False if the driver has stopped it before that, or it has
-        come to its end, as happens on a machine that is too busy for its time-outs."""
+    def begin(self) -> str | None:
+        """Waits until the arm is on its way at full speed. What it does instead, if the driver has stopped it before
+        that, it has come to its end, or it creeps, as happens on a machine that is too busy; else None."""
         faults = self.mock.faults
         self.worker = int(json.loads(self.lines.get(timeout=PATIENCE))["worker"])
-        far, speed = 0.0, 0.0
-
-        def begun() -> bool:
-            nonlocal far, speed
+        deadline = time.monotonic() + BEGINS
+        while not self._faulted() and time.monotonic() < deadline:
             state = faults.state()
             far = float(np.linalg.norm(state.pose[:3] - self.start))
-            speed = float(np.linalg.norm(state.tcp_speed[:3]))
-            return self._faulted() or far > 0.8 * GOES or (far > BEFORE and speed > self.fast)
-
-        until(begun, "motion", why=lambda: f"{far} m at {speed} m/s; the program says {list(self.lines.queue)}")
-        return not self._faulted() and speed > self.fast
+            if far > BEFORE and np.linalg.norm(state.tcp_speed[:3]) > self.fast:
+                return None
+            if far > 0.8 * GOES:
+                break
+            time.sleep(1e-3)
+        return f"{faults.state()}; the program said {list(self.lines.queue)}"
 
     def _faulted(self) -> bool:
         return any(ArmStatus[json.loads(line)["status"]].is_fault for line in list(self.lines.queue))

@@ -269,6 +269,19 @@ def test_nothing_is_left_after_close(
     arm.stop()
 
 
+def test_an_arm_whose_loop_is_slow_says_so(mock: MockUR, monkeypatch: pytest.MonkeyPatch) -> None:
+    with URArm(config(), "left") as arm:
+        record = arm._channel.states.latest()
+        assert record is not None
+        monkeypatch.setattr(arm._channel.states, "latest", lambda: record)
+        record["period"] = 1.9 * PERIOD, 9e-3, 9e-3
+        assert arm._explain(ArmStatus.OK) == "arm 'left' follows its target"
+        record["period"] = 7e-3, 9e-3, 9e-3
+        assert arm._explain(ArmStatus.OK).endswith("(slowly: its loop takes 7 ms, not 2; the machine is too busy)")
+        assert "slowly" not in arm._explain(ArmStatus.PROTECTIVE_STOP)
+        monkeypatch.undo()
+
+
 @pytest.mark.promise(14)
 @pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="counts open files as Linux shows them")
 def test_nothing_is_left_of_a_worker_that_died(mock: MockUR) -> None:

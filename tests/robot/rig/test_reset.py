@@ -272,11 +272,17 @@ def test_in_motion_each_arm_stops_when_its_own_gel_touches(moving: Moving) -> No
 
 def test_without_new_pictures_nothing_moves(moving: Moving, monkeypatch: pytest.MonkeyPatch) -> None:
     moving.silent = True
-    monkeypatch.setattr(resets, "TRAVEL", -60.0)  # gives up at once
-    with pytest.raises(DeviceError, match="came to no end of its approach"):
+    monkeypatch.setattr(resets, "TRAVEL", 0.0)  # gives up at once
+    with pytest.raises(DeviceError, match="came no farther for 0 s: no new pictures"):
         moving.reset.touch()
     assert moving.lower.pose.position == pytest.approx(LOWER.position)
     assert ("lower", "stop") in moving.log and ("upper", "stop") in moving.log
+
+
+def test_a_slow_approach_goes_on_while_it_comes_farther(moving: Moving, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(resets, "TRAVEL", 0.0)  # less than the whole takes
+    moving.reset.touch()
+    assert moving.log[-1] == "restart"
 
 
 def test_what_cannot_be_known_counts_as_touch(moving: Moving) -> None:

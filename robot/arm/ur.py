@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -103,7 +103,8 @@ class URArm(Closing):
         self._stop_told = False  # recover() found a protective stop: the next one unlocks it
         self._worker: Child | None = None
         # Those of the other arms are held, too: they may be opened, closed and opened again meanwhile.
-        self._segments = [segment_of(arm) for arm in (name, *(keep_out or {}))]
+        self._partner_names = tuple(keep_out or {})
+        self._segments = [segment_of(arm) for arm in (name, *self._partner_names)]
         gaps = (keep_out or {}).values()
         partners = [Partner(each.descriptor, gap) for each, gap in zip(self._segments[1:], gaps, strict=True)]
         self._channel, *self._others = map(Channel, self._segments)
@@ -379,6 +380,8 @@ class URArm(Closing):
                 text += f" (now {force:.1f} of {limits.force:g} N, {torque:.2f} of {limits.torque:g} N m)"
             elif status == ArmStatus.WORKSPACE_LIMIT:
                 text += f" ({self._region.broken(record['position']) or 'it is inside again'})"
+            elif status == ArmStatus.PARTNER_STOPPED:
+                text += "".join(f" (arm '{name}' {fault.text})" for name, fault in self._first_faults())
             elif status < ArmStatus.FORCE_LIMIT and (period := float(record["period"][0])) > SLOW:
                 text += f" (slowly: its loop takes {1e3 * period:.0f} ms, not 2; the machine is too busy)"
         worker = self._worker
@@ -387,6 +390,14 @@ class URArm(Closing):
         elif worker is not None and status == ArmStatus.LINK_LOST and worker.exit_status == OUTLIVED:
             text += " (a command took longer than link_timeout)"
         return text
+
+    def _first_faults(self) -> Iterator[tuple[str, ArmStatus]]:
+        """Of the other arms of a keep-out, those that did not stop because of another."""
+        for name, channel in zip(self._partner_names, self._others, strict=True):
+            record = channel.states.latest()
+            status = ArmStatus.CONNECTING if record is None else ArmStatus(int(record["status"]))
+            if status.is_fault and status != ArmStatus.PARTNER_STOPPED:
+                yield name, status
 
 
 _DASHBOARD_FIRST = (ArmStatus.PROTECTIVE_STOP, ArmStatus.EMERGENCY_STOP, ArmStatus.PROGRAM_STOPPED)

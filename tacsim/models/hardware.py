@@ -148,7 +148,8 @@ class UrArmConfig(Config):
     lookahead: Annotated[Time, Field(ge=0.03, le=0.2)] = 0.03  # of servoj [s]
     gain: Annotated[float, Field(ge=100, le=2000)] = 600.0  # of servoj
     latency: Annotated[Time, Field(ge=0, le=1.0)] = 0.0  # how old a state is when its package arrives [s]
-    # The controller at `host` is the maker's simulator (URSim) on this machine; in all else it counts as a real arm.
+    # The controller at `host` is the maker's simulator (URSim) on this machine; it may have a slower watchdog, and
+    # its driver no real-time priority; in all else it counts as a real arm.
     simulator: bool = False
     mock: MockArmConfig | None = None
 
@@ -160,10 +161,10 @@ class UrArmConfig(Config):
 
     @model_validator(mode="after")
     def _real_arms_have_a_watchdog(self) -> Self:
-        if self.mock is None and self.watchdog < SLOWEST_WATCHDOG:
+        if self.mock is None and not self.simulator and self.watchdog < SLOWEST_WATCHDOG:
             raise ValueError(
                 f"watchdog {self.watchdog:g} Hz: a real arm would go on for {1 / self.watchdog:.2g} s after its driver "
-                f"died; at least {SLOWEST_WATCHDOG:g} Hz (only a mock may be slower)"
+                f"died; at least {SLOWEST_WATCHDOG:g} Hz (only a mock or a simulator may be slower)"
             )
         return self
 

@@ -46,7 +46,7 @@ class MockArms(Child):
         version: Version | Sequence[Version] = VERSION,
         fault_port: int = FAULT_PORT,
         serial: str = MOCK_SERIAL,
-        ready_timeout: float = 10.0,
+        ready_timeout: float = 60.0,
         allow_network: bool = False,
         realtime: bool = False,
     ) -> None:

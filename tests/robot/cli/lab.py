@@ -36,6 +36,7 @@ def copy_of(rig: str, folder: Path, first: int) -> Path:
     text = re.sub(r"host: [\d.]+", lambda found: f"host: {mock_host(next(number))}", text)
     text = text.replace("simulator: false", "simulator: true")
     text = text.replace("link_timeout: 50 ms", "link_timeout: 2 s").replace("max_age: 200 ms", "max_age: 5 s")
+    text = text.replace("watchdog: 10", "watchdog: 0.5")
     number = iter(range(first, first + 9))
     text = re.sub(
         r"source: /dev/v4l/.*", lambda found: f"source: http://{mock_host(next(number))}:8081/?action=stream", text

@@ -13,7 +13,7 @@ from tests.robot.mock.wire_client import wire_host
 
 @pytest.fixture(scope="module")
 def running() -> Iterator[MockUR]:
-    with MockUR(wire_host(2), ready_timeout=60) as mock:
+    with MockUR(wire_host(2)) as mock:
         yield mock
 
 

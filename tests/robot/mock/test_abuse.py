@@ -29,7 +29,7 @@ SET_TCP, MOVE_J, MOVE_L, SOLVE, MOVE_PATH = 29, 1, 3, 46, 45
 
 @pytest.fixture(scope="module")
 def running() -> Iterator[MockArms]:
-    with MockArms([wire_host(90), wire_host(91)], ready_timeout=60) as arms:
+    with MockArms([wire_host(90), wire_host(91)]) as arms:
         yield arms
 
 
@@ -167,7 +167,7 @@ def test_a_slow_line_holds_only_so_much() -> None:
 
 
 def test_the_fault_client_tells_why_its_mock_has_ended() -> None:
-    with MockArms([wire_host(92)], ready_timeout=60) as mock:
+    with MockArms([wire_host(92)]) as mock:
         mock.fault_clients[0].state()
         os.kill(mock.pid, signal.SIGKILL)
         with pytest.raises(FaultError, match="has ended, killed by SIGKILL"):

@@ -171,7 +171,7 @@ def test_black_hole(mock: MockUR, faults: FaultClient) -> None:
 
 
 def test_a_black_hole_ends_as_quietly_as_any_mock() -> None:
-    with MockUR(wire_host(8), ready_timeout=60) as mock:
+    with MockUR(wire_host(8)) as mock:
         mock.faults.black_hole(True)
     assert mock.exit_status == 0
 

@@ -144,7 +144,7 @@ def abuse(arms: MockArms, seed: int, steps: int, ports: dict[int, Callable[[rand
 
 @pytest.fixture(scope="module")
 def arms() -> Iterator[MockArms]:
-    with MockArms([wire_host(93), wire_host(94)], ready_timeout=60) as running:
+    with MockArms([wire_host(93), wire_host(94)]) as running:
         yield running
 
 

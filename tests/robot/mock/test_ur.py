@@ -29,20 +29,20 @@ def exists(pid: int) -> bool:
 
 
 def test_close_leaves_nothing_and_may_be_repeated() -> None:
-    mock = MockUR(wire_host(10), ready_timeout=60)
+    mock = MockUR(wire_host(10))
     assert mock.running and mock.faults.state().tick >= 0
     mock.close()
     mock.close()
     assert not exists(mock.pid) and not mock.running
     with pytest.raises(FaultError):
         mock.faults.state()
-    with MockUR(wire_host(10), ready_timeout=60):
+    with MockUR(wire_host(10)):
         pass  # the ports are free again at once
 
 
 def test_options_arrive() -> None:
     joints = [0.1, -1.2, 1.3, -1.4, -1.5, 0.6]
-    with MockUR(wire_host(11), model="ur3e", joints=joints, fault_port=30555, ready_timeout=60) as mock:
+    with MockUR(wire_host(11), model="ur3e", joints=joints, fault_port=30555) as mock:
         assert mock.faults.port == 30555
         assert mock.faults.state().joints == pytest.approx(joints)
 
@@ -50,7 +50,7 @@ def test_options_arrive() -> None:
 def test_two_arms_in_one_process_do_not_touch() -> None:
     hosts = [wire_host(12), wire_host(13)]
     versions = [(5, 11, 0, 0), (5, 23, 1, 0)]
-    with MockArms(hosts, version=versions, ready_timeout=60) as arms, ControlClient(hosts[0]) as client:
+    with MockArms(hosts, version=versions) as arms, ControlClient(hosts[0]) as client:
         assert [struct.unpack(">4I", client.ask(118))] == versions[:1]
         assert dashboard(hosts[1], "PolyscopeVersion")[0].startswith("URSoftware 5.23.1.0 ")
         client.call(9, [0, 0, 0, 0, 0, 0.5, 2.0, 0])
@@ -77,9 +77,9 @@ def test_a_rig_file_says_the_version() -> None:
 
 def test_a_port_in_use_is_named() -> None:
     host = wire_host(14)
-    with MockUR(host, ready_timeout=60) as first:
+    with MockUR(host) as first:
         with pytest.raises(MockError, match=rf"cannot listen on {host}:\d+: .*in use"):
-            MockUR(host, ready_timeout=60)
+            MockUR(host)
         assert first.faults.state().safety == "NORMAL"
 
 
@@ -100,9 +100,9 @@ def test_addresses_that_are_refused(hosts: list[str], words: str) -> None:
 
 def test_joints_that_are_refused() -> None:
     with pytest.raises(MockError, match=r"within \+-2 pi"):
-        MockUR(wire_host(15), joints=[7, 0, 0, 0, 0, 0], ready_timeout=60)
+        MockUR(wire_host(15), joints=[7, 0, 0, 0, 0, 0])
     with pytest.raises(MockError, match="6 finite"):
-        MockUR(wire_host(15), joints=[0, 0], ready_timeout=60)
+        MockUR(wire_host(15), joints=[0, 0])
     for version in ((5, 11), (5, 11, 0, -1), (5, 11, 0, 2**32), (5, 11, 0, 0.5), (5, 11, 0, float("nan"))):
         with pytest.raises(ValueError, match="four whole numbers"):
             MockUR(wire_host(15), version=version)
@@ -112,7 +112,7 @@ def test_joints_that_are_refused() -> None:
 def test_it_dies_with_its_parent(end: signal.Signals) -> None:
     code = (
         "import sys, time; from robot.mock import MockUR\n"
-        f"mock = MockUR({wire_host(16)!r}, ready_timeout=60); print(mock.pid, flush=True); time.sleep(600)"
+        f"mock = MockUR({wire_host(16)!r}); print(mock.pid, flush=True); time.sleep(600)"
     )
     parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
     assert parent.stdout is not None
@@ -125,7 +125,7 @@ def test_it_dies_with_its_parent(end: signal.Signals) -> None:
 
 
 def test_a_stopped_process_is_ended_too() -> None:
-    with MockUR(wire_host(17), ready_timeout=60) as mock:
+    with MockUR(wire_host(17)) as mock:
         mock.faults.timeout = 0.2
         os.kill(mock.pid, signal.SIGSTOP)
         with pytest.raises(FaultError, match="no answer in time"):
@@ -134,7 +134,7 @@ def test_a_stopped_process_is_ended_too() -> None:
 
 
 def test_it_goes_on_after_a_pause_of_its_process() -> None:
-    with MockUR(wire_host(18), ready_timeout=60) as mock:
+    with MockUR(wire_host(18)) as mock:
         before = mock.faults.state()
         os.kill(mock.pid, signal.SIGSTOP)
         time.sleep(0.3)
@@ -156,7 +156,7 @@ def test_without_a_parent_it_runs_until_it_is_told() -> None:
 
 def test_a_client_killed_in_motion_with_and_without_watchdog() -> None:
     """Without the watchdog the arm goes on for ever, as a real one does; with it, the program ends."""
-    with MockUR(wire_host(20), ready_timeout=60) as mock:
+    with MockUR(wire_host(20)) as mock:
         for watchdog in (False, True):
             code = (
                 "import sys, time; from tests.robot.mock.wire_client import ControlClient\n"

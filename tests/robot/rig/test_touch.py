@@ -22,7 +22,6 @@ from robot.open import open_rig
 from robot.rig import touch
 from robot.rig.commanded_arm import CommandedArm
 from tacsim.interface import TactileSource
-from tacsim.models import hardware
 from tacsim.rig import Rig
 from tests.robot.cli.lab import Lab, copy_of
 
@@ -53,14 +52,10 @@ class Opened:
 
 @pytest.fixture(scope="module")
 def opened(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Opened]:
-    """A copy of the shipped one-arm file, with a watchdog that a real arm must not have, but no busy machine breaks."""
     file = copy_of("ur5e-one", tmp_path_factory.mktemp("rig"), 65)
-    file.write_text(file.read_text().replace("watchdog: 10", "watchdog: 0.5"))
     told: list[str] = []
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(hardware, "SLOWEST_WATCHDOG", 0.5)
-        with Lab(file) as lab, open_rig(file, confirm=lambda question: True, tell=told.append) as rig:
-            yield Opened(lab, rig, told)
+    with Lab(file) as lab, open_rig(file, confirm=lambda question: True, tell=told.append) as rig:
+        yield Opened(lab, rig, told)
 
 
 @pytest.mark.deep

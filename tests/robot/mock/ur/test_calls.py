@@ -65,7 +65,7 @@ def test_the_page_says_what_the_cases_show() -> None:
 
 @pytest.fixture(scope="module")
 def called() -> Iterator[MockUR]:
-    with MockUR(wire_host(40), ready_timeout=60) as mock:
+    with MockUR(wire_host(40)) as mock:
         yield mock
 
 

@@ -104,7 +104,7 @@ def test_what_is_no_payload(numbers: tuple[float, ...]) -> None:
 
 
 def test_a_mock_carries_what_it_was_started_with() -> None:
-    with MockUR(wire_host(30), payload=(0.4, *CENTRE), ready_timeout=60) as carrier:
+    with MockUR(wire_host(30), payload=(0.4, *CENTRE)) as carrier:
         for _ in range(2):
             with ControlClient(carrier.host) as client:
                 untold = client.wait(lambda state: True)
@@ -114,4 +114,4 @@ def test_a_mock_carries_what_it_was_started_with() -> None:
                 np.testing.assert_allclose(told["actual_TCP_force"], 0, atol=1e-9)
             carrier.faults.reset()
     with pytest.raises(MockError, match="payload"):
-        MockUR(wire_host(30), payload=(0.4, math.nan, 0, 0), ready_timeout=60)
+        MockUR(wire_host(30), payload=(0.4, math.nan, 0, 0))

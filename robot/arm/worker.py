@@ -53,6 +53,8 @@ PLAYING = 2  # of runtime_state
 PROTECTIVE_BIT = 1 << 2
 STOP_BITS = 1 << 3 | 1 << 4 | 1 << 5 | 1 << 6 | 1 << 7 | 1 << 8 | 1 << 9  # recovery, safeguard, emergency stops, fault
 MODEL_LENGTH, MODEL_TURN = 20e-3, 0.05  # FK of the named model and the controller's pose agree within [m, rad]
+TAKEN = 0.2  # what is measured so long after a new TCP or payload is by it, on the controller's clock [s]
+SILENT = 5.0  # longest wait for such a package [s]
 CLOSING = 0.6  # longest braking when the driver closes [s]
 PARENTLESS = 0.5  # longest braking when the driver is gone [s]
 CONNECTING = 60.0  # longest time to connect; the driver waits less, but it may be gone [s]
@@ -134,10 +136,11 @@ class Worker:
         config, control = self.config, self.control
         try:
             self._check_model(lambda: matrix(control.getTCPOffset()), "model")
-            self._set("the watchdog", control.setWatchdog, config.watchdog)
             self._set("the TCP", control.setTcp, config.tcp)
             self._set("the payload", control.setPayload, config.mass, config.mass_centre)
+            self._await_change()
             self._check_model(lambda: self.frames.flange_from_tool, "model and flange_from_tool")
+            self._set("the watchdog", control.setWatchdog, config.watchdog)
         except RuntimeError as failure:
             if isinstance(failure, DeviceError):
                 raise
@@ -166,6 +169,17 @@ class Worker:
     def _set(self, what: str, method: Any, *arguments: Any) -> None:
         if not method(*arguments):
             raise DeviceNotConnectedError(f"arm '{self.config.name}': the controller did not take {what} {arguments}")
+
+    def _await_change(self) -> None:
+        """Reads until a package is measured after what was set last. The answer to that comes by another connection
+        than the packages do: the next of these may be older, and show the weight of a payload untold."""
+        begin, deadline = float(self.record["stamp"]), time.monotonic() + SILENT
+        while not (self._read() and not 0.0 <= float(self.record["stamp"]) - begin < TAKEN):
+            if time.monotonic() > deadline:
+                raise DeviceNotConnectedError(
+                    f"arm '{self.config.name}': no RTDE package arrived that was measured after its payload was set"
+                )
+            time.sleep(PERIOD)
 
     def _check_model(self, tool: Callable[[], FloatArray], advice: str) -> None:
         """Raises unless the controller's pose agrees with the forward kinematics of the model and of `tool`, which

@@ -8,6 +8,7 @@ import os
 import re
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,7 @@ import pytest
 from robot.arm import shared_ring, worker
 from robot.arm.channel import Channel, WorkerConfig
 from robot.arm.status import ArmStatus
+from robot.arm.trajectory import PERIOD
 from robot.arm.worker_config import worker_config as config_of
 from robot.mock import MOCK_SERIAL, MockUR
 from tacsim.models.hardware import ArmLimits, MockArmConfig, Placement, UrArmConfig, Workspace
@@ -128,6 +130,40 @@ def test_an_arm_of_another_shape_is_left_as_it_was(mock: MockUR) -> None:
     assert asked & {*CHANGES} == set()
     assert mock.faults.state().payload == before
     assert not mock.faults.state().program  # its own was ended
+
+
+class Packages:
+    """The library's receiver of a controller whose packages come 0.1 s late."""
+
+    LATE = 50  # packages
+
+    def __init__(self) -> None:
+        self.now, self.told = 0, 0  # packages measured so far, and before the payload was told
+
+    def getTimestamp(self) -> float:
+        return max(0, self.now - self.LATE) * PERIOD
+
+    def getActualTCPForce(self) -> list[float]:
+        return [0.0, 0.0, -9.82 if self.now - self.LATE < self.told else 0.0, 0.0, 0.0, 0.0]
+
+    def sleep(self, seconds: float) -> None:
+        self.now += 1
+
+    def __getattr__(self, name: str) -> Callable[[], object]:
+        return lambda: 0 if name in ("getRuntimeState", "getSafetyStatusBits") else [0.0] * 6
+
+
+def test_what_is_felt_once_connected_is_felt_with_the_payload(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Packages that were measured before arrive after the controller's word that it has taken it."""
+    segment, packages = shared_ring.create(Channel.SIZE), Packages()
+    made = worker.Worker(worker_config(os.dup(segment.descriptor)))  # which closes its own
+    monkeypatch.setattr(worker.time, "sleep", packages.sleep)
+    made.receive = packages
+    packages.now = packages.told = 500
+    made._read()
+    assert made.record["tcp_force"][2] < -9.0
+    made._await_change()
+    assert made.record["tcp_force"][2] == 0.0
 
 
 def test_a_pinned_serial_number_tells_one_robot_from_another(mock: MockUR) -> None:

@@ -48,7 +48,7 @@ from tacsim.physics.worlds.base import RETRIES
 GEL = Gel(size=(10e-3, 10e-3, 4e-3))
 WIDE = Gel(size=(16e-3, 16e-3, 2e-3), material=GelMaterial(youngs_modulus=10e6, poisson_ratio=0.3), housing=None)
 CLAY = BodyMaterial(yield_stress=30e3)
-QUICK = Settling(mach=0.1, tolerance=1e-2, max_substeps=600)
+QUICK = Settling(mach=0.1, tolerance=1e-2, max_substeps=800)
 
 BOTH, PRESS = ("hybrid", "seed"), ("press",)
 
@@ -115,9 +115,9 @@ def with_nan(times: int) -> dict[str, Any]:
 SHORT = {"hybrid.COURANT": 0.3, "press.COURANT": 0.3, "seed.COURANT": 0.3}
 TOO_LONG = {"hybrid.COURANT": 1.2, "press.COURANT": 1.2, "seed.COURANT": 1.5}
 RUSHED = Settling(mach=0.1, tolerance=1e-2, max_substeps=600, flow_mach=0.15)
-USUAL = Settling(tolerance=1e-2, max_substeps=600)
+USUAL = Settling(tolerance=1e-2, max_substeps=800)
 PATIENT = Settling(mach=0.1, tolerance=1e-2)
-SLOWER = Settling(mach=0.05, tolerance=1e-2, max_substeps=600)
+SLOWER = Settling(mach=0.05, tolerance=1e-2, max_substeps=800)
 BALL = indented(Sphere(radius=4e-3))
 SMALL = cube(3e-3, gel=Gel(size=(8e-3, 8e-3, 4e-3)))
 ALWAYS = RETRIES + 1  # once in every attempt

@@ -10,9 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from tacsim.models.scene import BodyMaterial, lame
+from tacsim.physics.body.followers import Links, links, node_masses
 from tacsim.physics.body.material import ELASTIC
 from tacsim.physics.exec import layout
-from tacsim.physics.exec.lanes import CACHE_LINE, COPIES, LANES, MAX_NUMBERS, NODES, aligned_zeros, padded
+from tacsim.physics.exec.lanes import CACHE_LINE, COPIES, LANES, MAX_NUMBERS, NODES, PARTS, aligned_zeros, padded
 from tacsim.physics.units import MM, MPA
 
 BORDER = 4  # [cells] that a grid reaches beyond its particles' places, at most
@@ -78,7 +79,8 @@ class BodyState:
 
     rows: (E, PARTICLE_ROWS, W) one number of all particles a row (tacsim.physics.exec.layout), zeros behind the last
     particle; masses: (E, COPIES, strips, 4 NODES) momentum and mass of NODES neighbours along z, one copy a part;
-    velocities: (E, strips, 4 NODES); changes: (E, 3, strips, 4 NODES), of tacsim.physics.body.mass.
+    velocities: (E, strips, 4 NODES); changes: (E, 3, strips, 4 NODES), of tacsim.physics.body.mass; ends: (E, 2, 2, n)
+    and shares (E, 2, n) of light nodes, see tacsim.physics.body.followers.
     Lines of the grid have an even number of nodes where NODES is 2.
     """
 
@@ -93,7 +95,10 @@ class BodyState:
         self.masses = aligned_zeros(len(points), COPIES, 1, 4 * NODES)
         self.velocities = aligned_zeros(len(points), 1, 4 * NODES)
         self.changes = aligned_zeros(len(points), 3, 1, 4 * NODES)
+        self.ends = np.zeros((len(points), 2, 2, 1), np.int32)
+        self.shares = np.zeros((len(points), 2, 1), np.float32)
         self._laid: dict[int, Laid] = {}
+        self._linked: dict[int, tuple[Laid, tuple[int, int, int], Links]] = {}  # and how the grid was laid then
         self._grid: dict[int, tuple[int, int, int]] = {}  # nodes of the grids whose velocities outlive a launch
 
     def place(self, environment: int, points: np.ndarray, planes: np.ndarray) -> None:
@@ -252,7 +257,30 @@ class BodyState:
             velocities[:, : self.velocities.shape[1]] = self.velocities
             self.masses, self.velocities, self.changes = masses, velocities, changes
         counts[environment, layout.GRID_MOVES] = self._grid.get(environment) == shape
+        self._link(environment, origin, cell, shape, counts)
         counts[:, layout.STRIDE], counts[:, layout.CAPACITY] = self.rows.shape[2], self.masses.shape[2]
+
+    def _link(
+        self, environment: int, origin: np.ndarray, cell: float, shape: tuple[int, int, int], counts: np.ndarray
+    ) -> None:  # fmt: skip
+        """Finds light nodes and their leaders, which stay for as long as the particles' places on the grid do."""
+        laid, known = self.laid(environment), self._linked.get(environment)
+        if known is None or known[0] is not laid or known[1] != shape:
+            found = links(node_masses(self.reference(environment), origin, cell, shape))
+            known = self._linked[environment] = laid, shape, found
+            number = found.shares.shape[1]
+            if number > self.shares.shape[2]:
+                more = (0, number * 5 // 4 - self.shares.shape[2])
+                self.ends = np.pad(self.ends, ((0, 0), (0, 0), (0, 0), more))
+                self.shares = np.pad(self.shares, ((0, 0), (0, 0), more))
+            self.ends[environment, ..., :number], self.shares[environment, :, :number] = found.ends, found.shares
+        counts[:, layout.LINKS] = self.shares.shape[2]
+        for first, parts in zip((layout.PUSHES, layout.MOVES), known[2].parts, strict=True):
+            counts[environment, first : first + PARTS + 1] = parts
+
+    def links(self) -> tuple[np.ndarray, np.ndarray]:
+        """What kernels whose light nodes follow take besides `arguments`."""
+        return self.ends.reshape(-1), self.shares.reshape(-1)
 
     def arguments(self) -> tuple[np.ndarray, ...]:
         """What every kernel with a body takes, in this order."""

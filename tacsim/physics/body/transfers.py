@@ -85,6 +85,8 @@ class Body(NamedTuple):
     masses: Any
     velocities: Any
     changes: Any = None  # see tacsim.physics.body.mass
+    ends: Any = None  # these two: see tacsim.physics.body.followers
+    shares: Any = None
 
 
 @ti.func
@@ -271,8 +273,9 @@ def sums_of(rows: ti.template(), row: ti.template(), lane, a, b, c):
 
 @ti.func
 def moved_plane(plane, step):
-    """A tangent plane of the surface goes with the material, as F^-T does: m' = -L^T m; step: dt L."""
-    return plane - step.transpose() @ plane
+    """A tangent plane of the surface goes with the material, as F^-T does; step: dt L. Exactly: plane - step^T plane would
+    grow by half the square of each substep's turn, and a body that rolls would seem to shrink."""
+    return inverse_of(step).transpose() @ plane
 
 
 @ti.func

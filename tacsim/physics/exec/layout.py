@@ -46,7 +46,10 @@ SHAPE_NODES = 17  # of an indenter's distance grid, how many are loaded along x,
 ELEMENTS = 20  # of a gel along x, y, z
 SHAPE_FIRST = 23  # number of the first loaded node of an indenter's distance grid along x, y, z
 GRID_MOVES = 26  # 1: the grid's nodes have velocities from the launch before; 0: particles bring them
-COUNTS = 27
+LINKS = 27  # pairs of a light node of the grid and a leader that an environment has room for, in each order
+PUSHES = 28  # first pair of part 0, 1, ..., and the one after the last, by the leaders (tacsim.physics.body.followers)
+MOVES = 33  # the same by the light nodes
+COUNTS = 38
 
 # partial (environments, PARTS, NUMBERS) float32: what each part saw or summed
 SMALLEST_VOLUME = 0  # det F over the gel elements

@@ -64,7 +64,7 @@ class Health:
     @classmethod
     def read(cls, partial: NDArray[np.float32], courant: float = 0.0, *, sound: bool = False) -> Health:
         """Of all parts of one environment (PARTS, NUMBERS); NaN in any of them stays NaN."""
-        least, most, total = partial.min(axis=0), partial.max(axis=0), partial.sum(axis=0)
+        least, most, total = partial.min(axis=0), partial.max(axis=0), partial.sum(axis=0, dtype=np.float64)
         counts = [int(total[i]) if math.isfinite(total[i]) else -1 for i in (layout.OFF_GRID, layout.CAPPED)]
         return cls(
             float(least[layout.SMALLEST_VOLUME]), counts[0], float(least[layout.SMALLEST_STEP_VOLUME]),

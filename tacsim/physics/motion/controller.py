@@ -23,7 +23,7 @@ from tacsim.physics.units import MM
 SUBSTEPS_PER_LAUNCH = 80  # while frames are driven: a control step is one launch or two
 EARLIER_READINGS = 2  # that one is compared with: a single one may have the same phase of an oscillation
 FORESIGHT = 20.0  # readings
-LASTING = 100.0  # readings: how much longer a settled force of what flows keeps within the tolerance
+LASTING = 20.0  # readings: how much longer a settled force of what flows keeps within the tolerance
 FORCE_FLOOR = 1e-3  # residuals are relative to the contact force, but to no less than this share of E thickness^2
 
 

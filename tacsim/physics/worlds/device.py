@@ -8,6 +8,7 @@ Where its arrays are: tacsim.physics.worlds.device_state.
 """
 
 from tacsim.compute.runtime import ti
+from tacsim.physics.body.follow import Ends, follow, push_leaders
 from tacsim.physics.body.mass import CHANGE, SECOND, cell_means, grid_changes, second_changes
 from tacsim.physics.body.transfers import Body, Strips, grid_to_particles, particles_to_grid
 from tacsim.physics.contact.indenter import POINTS, Indenter, Pressure, Slip, Values, carry, indent
@@ -147,13 +148,14 @@ def elements_of_hybrid(
 def scatter_of_hybrid(
     clock: Clock, drive: Drive,
     nodes: Floats, surface: Floats, contact_force: Floats, corners: Floats, lattice: Lattice,
-    particles: Floats, masses: Strips, velocities: Strips, changes: Floats, histories: ContactHistories,
-    params: Params, counts: Counts, partial: Partial, ceiling: Ceiling, most_particles: ti.i32, most_nodes: ti.i32,
+    particles: Floats, masses: Strips, velocities: Strips, changes: Floats, ends: Ends, shares: Floats,
+    histories: ContactHistories, params: Params, counts: Counts, partial: Partial, ceiling: Ceiling,
+    most_particles: ti.i32, most_nodes: ti.i32, most_links: ti.i32,
 ):  # fmt: skip
     """Second third: contact, particles to the grid, motion of the gels' and the grid's nodes, whose masses are zero
     again afterwards.
 
-    most_particles, most_nodes: of the largest body and grid.
+    most_particles, most_nodes, most_links: of the largest body and grid.
     """
     for e, p in ti.ndrange(counts.shape[0], most_particles):
         env = ti.static(Environment(e, params, counts, partial))
@@ -174,6 +176,10 @@ def scatter_of_hybrid(
             elif n - 2 * columns < grid_nodes(env):
                 body = ti.static(Body(particles, masses, velocities, changes))
                 grid_changes(env, n - 2 * columns, body)
+    for e, n in ti.ndrange(counts.shape[0], most_links):
+        env = ti.static(Environment(e, params, counts, partial))
+        if is_active(env, clock) and n < env.count(layout.PUSHES + PARTS):
+            push_leaders(env, n, ti.static(Body(particles, masses, velocities, changes, ends, shares)))
     for e, n in ti.ndrange(counts.shape[0], 2 * columns + most_nodes):
         env = ti.static(Environment(e, params, counts, partial))
         if is_active(env, clock):
@@ -203,6 +209,10 @@ def scatter_of_hybrid(
         if is_active(env, clock) and node < grid_nodes(env):
             grid_update(env, node, clock[0], drive, ti.static(Body(particles, masses, velocities, changes)))
             masses[e * env.count(layout.CAPACITY) + node] = strip(0.0)
+    for e, n in ti.ndrange(counts.shape[0], most_links):
+        env = ti.static(Environment(e, params, counts, partial))
+        if is_active(env, clock) and n < env.count(layout.PUSHES + PARTS):
+            follow(env, n, ti.static(Body(particles, masses, velocities, changes, ends, shares)))
 
 
 @ti.kernel

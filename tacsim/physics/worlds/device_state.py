@@ -20,7 +20,7 @@ from tacsim.physics.contact.contact import ContactHistory
 from tacsim.physics.exec import layout
 from tacsim.physics.exec.device_arrays import DeviceArrays
 from tacsim.physics.exec.graph import Graph
-from tacsim.physics.exec.lanes import lanes, strip, vec3
+from tacsim.physics.exec.lanes import PARTS, lanes, strip, vec3
 from tacsim.physics.gel.gel import GelState
 from tacsim.physics.worlds.device import hybrid_substeps, press_substeps
 from tacsim.physics.worlds.survey import (
@@ -233,6 +233,9 @@ class DeviceHybrid(DeviceState):
             "masses": self.arrays.allocate("masses", strip, masses.shape[:-1]),
             "changes": self.arrays.allocate("changes", ti.f32, (self._body.changes.size,)),
             "sums": self.arrays.allocate("sums", ti.f32, (len(self._params), MOMENTS, BLOCKS)),
+            "ends": self.arrays.upload("ends", self._body.links()[0], ti.i32),
+            "shares": self.arrays.upload("shares", self._body.links()[1], ti.f32),
+            "most_links": int(self._counts[:, layout.PUSHES + PARTS].max()),
             "most_particles": max(self._body.counts),
             "most_nodes": int(self._counts[:, layout.GRID : layout.GRID + 3].prod(axis=1).max()),
         }  # fmt: skip

@@ -1,6 +1,7 @@
 """Kernels of two gels round a plasticine body: contact, transfers and motion, many substeps in one launch."""
 
 from tacsim.compute.runtime import ti
+from tacsim.physics.body.follow import Ends, follow, push_leaders
 from tacsim.physics.body.mass import CHANGE, SECOND, cell_means, filtered_change, grid_changes, second_changes
 from tacsim.physics.body.transfers import (
     Body,
@@ -40,6 +41,7 @@ from tacsim.physics.gel.kernels import (
 from tacsim.physics.gel.mass import gel_advance_filtered, gel_even, gel_means
 
 Drive = ti.types.ndarray(dtype=ti.f32, ndim=5)
+STAGES = 7  # of a substep
 TURN = 1.0 / 3.0  # share of the boost that rotations get: with more of it bodies overshoot when a slide stops
 
 ContactHistories = ti.types.ndarray(dtype=ContactHistory, ndim=3)
@@ -218,14 +220,15 @@ def gel_contact(
 def substeps(
     team: ti.i32, drive: Drive,
     nodes: Floats, surface: Floats, contact_force: Floats, corners: Floats, lattice: Lattice,
-    particles: Floats, masses: Strips, velocities: Strips, changes: Floats, histories: ContactHistories,
+    particles: Floats, masses: Strips, velocities: Strips, changes: Floats, ends: Ends, shares: Floats,
+    histories: ContactHistories,
     params: Params, counts: Counts, partial: Partial, sync: Sync,
 ):  # fmt: skip
     """Explicit substeps of every environment's scene in one launch, `team` threads an environment.
 
     Stages of a substep: what is scattered must be whole before it is summed, the sums whole before each pass of the
-    filters reads its neighbours', and what moves before it is gathered. A part is gathered in the stage in which it is
-    scattered again.
+    filters reads its neighbours', what moves before it leads, and what follows before it is gathered. A part is
+    gathered in the stage in which it is scattered again.
     """
     for task in range(sync.shape[0] * team * CHUNK):
         for _ in range(first_in_chunk(task)):
@@ -233,14 +236,14 @@ def substeps(
             index = sync[turn, ENVIRONMENT]
             env = ti.static(Environment(index, params, counts, partial))
             gels = ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 2))
-            body = ti.static(Body(particles, masses, velocities, changes))
+            body = ti.static(Body(particles, masses, velocities, changes, ends, shares))
             steps = env.count(layout.STEPS)
-            stages, own = 6 * steps + 1, own_part(task, team)
+            stages, own = STAGES * steps + 1, own_part(task, team)
             highest, known = ti.Vector([0.0, 0.0]), -1  # of the two gels, in this stage
             piece = next_piece(sync, turn, own, stages)
             while piece < stages * PARTS:
                 stage, part = piece // PARTS, piece % PARTS
-                it, scatters = stage // 6, stage % 6 == 0
+                it, scatters = stage // STAGES, stage % STAGES == 0
                 for _new in range(once_if(scatters and stage != known)):
                     known = stage
                     for g in ti.static(range(2)):
@@ -254,17 +257,20 @@ def substeps(
                     clear_masses(env, part, body)
                     particles_to_grid(env, part, it, body)
                     gel_forces(env, part, gels)
-                for _totals in range(once_if(stage % 6 == 1)):
+                for _totals in range(once_if(stage % STAGES == 1)):
                     gel_means(env, part, gels)
                     grid_changes(env, part, body)
-                for _even in range(once_if(stage % 6 == 2)):
+                    push_leaders(env, part, body)
+                for _even in range(once_if(stage % STAGES == 2)):
                     gel_even(env, part, gels)
-                for _cells in range(once_if(stage % 6 == 2 or stage % 6 == 4)):
-                    cell_means(env, part, ti.select(stage % 6 == 2, CHANGE, SECOND), body)
-                for _motion in range(once_if(stage % 6 == 3)):
+                for _cells in range(once_if(stage % STAGES == 2 or stage % STAGES == 4)):
+                    cell_means(env, part, ti.select(stage % STAGES == 2, CHANGE, SECOND), body)
+                for _motion in range(once_if(stage % STAGES == 3)):
                     gel_advance_filtered(env, part, gels)
                     second_changes(env, part, body)
-                for _motion in range(once_if(stage % 6 == 5)):
+                for _motion in range(once_if(stage % STAGES == 5)):
                     grid_update(env, part, it, drive, body)
+                for _light in range(once_if(stage % STAGES == 6)):
+                    follow(env, part, body)
                 piece_done(sync, turn)
                 piece = next_piece(sync, turn, own, stages)

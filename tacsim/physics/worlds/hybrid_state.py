@@ -124,7 +124,7 @@ class HybridState(FemState):
             self._gels.refresh()
             run_team(
                 substeps, drive, self._gels.arguments(), self._particles.arguments(),
-                self._particles.changes.reshape(-1), self._contact_history, self.params,
+                self._particles.changes.reshape(-1), *self._particles.links(), self._contact_history, self.params,
                 self.counts, self.partial, active=list(drives),
             )  # fmt: skip
         for index in drives:

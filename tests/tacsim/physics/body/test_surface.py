@@ -61,17 +61,18 @@ def flow(n: ti.i32, planes: Points, columns: Points, dt: ti.f32):
 
 
 def test_planes_go_with_the_material() -> None:
-    """Feet moved by F must lie on the moved planes: m' = F^-T m."""
+    """Feet moved by F must lie on the moved planes, m' = F^-T m, to rounding. What a substep turns too much adds up: a
+    ball of clay rolled 200 times lost 7 % of its force by it."""
     start()
     rng = np.random.default_rng(0)
     rate = rng.normal(scale=0.3, size=(3, 3))
-    steps = 2000
+    steps = 50
     planes = rng.normal(size=(20, 3)).astype(np.float32)
     planes[7] = 0.0
     moved = planes.copy()
     flow(steps, moved, np.ascontiguousarray(rate.T, np.float32), 1.0 / steps)
     f = np.linalg.matrix_power(np.eye(3) + rate / steps, steps)
-    assert moved == pytest.approx(planes @ np.linalg.inv(f), abs=2e-3)
+    assert moved == pytest.approx(planes @ np.linalg.inv(f), abs=2e-5)
     assert not moved[7].any()
 
 

@@ -88,11 +88,11 @@ def test_a_body_that_swings_between_two_gels_does_not_creep() -> None:
 def test_what_creeps_with_the_logarithm_of_time_is_not_settled_before_its_time(creeps: bool) -> None:
     """Each change is within the tolerance from the start, and so is what a geometric rest of them would be."""
     path = replace(Path([Pose()], [Pose()], 0, 0.4), creeps=creeps)
-    times = iter(range(20, 1000))
+    times = iter(range(8, 1000))
     stats = run(
         move_and_settle(path, Settling(max_substeps=100_000), balanced=False),
         lambda path, first, last: creeping(0.01, next(times)),
     )
-    after = 19 + stats.hold // path.interval
+    after = 7 + stats.hold // path.interval
     assert stats.settled
     assert (0.01 * np.log1p(LASTING / after) <= 1e-2) == creeps

@@ -87,15 +87,16 @@ def test_short_squeezes_end_where_slow_ones_do(by: float) -> None:
 
 
 def test_a_deep_squeeze_ends_near_the_slow_limit() -> None:
-    """60 % of a 5 mm cube, where the speed costs most; the slow limit is 2.496 N, at Mach 0.001 to a residual of 3e-5.
-    With velocities that go over particles in each substep it was 2.504, and these ended at 2.645 and 2.564."""
+    """60 % of a 5 mm cube, where the speed costs most; the slow limit is 2.545 N, at Mach 0.001 to a residual of 3e-5.
+    With velocities that go over particles in each substep it was 2.504, and these ended at 2.645 and 2.564; with light
+    nodes that drift 2.496, and 2.46 to 2.56."""
     forces = []
     for tolerance in (1e-2, 2e-3):
         w = world(settling={"tolerance": tolerance, "max_substeps": 100_000})
         for by in (2 * hybrid.CLEARANCE + 0.1e-3, 3e-3):
             assert w.move({**shift(w, "lower", (0, 0, by / 2)), **shift(w, "upper", (0, 0, -by / 2))}).settled
         forces.append(-w.wrench("lower")[2])
-    assert forces == pytest.approx([2.496, 2.496], rel=0.025)
+    assert forces == pytest.approx([2.545, 2.545], rel=0.035)
 
 
 def test_a_twisted_body_turns_as_far_as_in_the_slow_limit_and_soon_rests() -> None:

@@ -1,0 +1,95 @@
+"""Light nodes of the body's grid push their leaders and follow them (tacsim.physics.body.followers)."""
+
+from tacsim.compute.runtime import ti
+from tacsim.physics.body.mass import CHANGE, changes_at
+from tacsim.physics.body.transfers import node_sum
+from tacsim.physics.exec import layout
+from tacsim.physics.exec.lanes import NODES, ON_DEVICE, bounded, strip, vec4
+
+Ends = ti.types.ndarray(dtype=ti.i32, ndim=1)  # `Links.ends` of all environments
+
+PUSHES, MOVES = 0, 1  # the two tables of `Links`
+GETS, GIVES = 0, 1  # the two rows of each
+
+
+@ti.func
+def links_of_part(env: ti.template(), table: ti.template(), part):
+    """First of the pairs of a table that a part does, and the one after its last; on a device a part is one pair."""
+    if ti.static(ON_DEVICE):
+        return part, part + 1
+    else:
+        first = ti.static(layout.PUSHES if table == PUSHES else layout.MOVES)
+        return env.count(first + part), env.count(first + part + 1)
+
+
+@ti.func
+def end_of(env: ti.template(), body: ti.template(), table: ti.template(), row: ti.template(), n):
+    """A node of a pair."""
+    return body.ends[((env.index * 2 + table) * 2 + row) * env.count(layout.LINKS) + n]
+
+
+@ti.func
+def share_of(env: ti.template(), body: ti.template(), table: ti.template(), n):
+    return body.shares[(env.index * 2 + table) * env.count(layout.LINKS) + n]
+
+
+@ti.func
+def node_of(numbers, node):
+    """Four numbers of one node, of those of its strip."""
+    found = vec4([numbers[c] for c in range(4)])
+    for n in ti.static(range(1, NODES)):
+        if node % NODES == n:
+            found = vec4([numbers[4 * n + c] for c in range(4)])
+    return found
+
+
+@ti.func
+def in_strip(numbers, node):
+    """Four numbers of one node in a strip that has zeros elsewhere."""
+    found = strip(0.0)
+    for n in ti.static(range(NODES)):
+        if node % NODES == n:
+            for c in ti.static(range(4)):
+                found[4 * n + c] = numbers[c]
+    return found
+
+
+@ti.func
+def push_leaders(env: ti.template(), part, body: ti.template()):
+    """After `grid_changes`: changes of momentum, and masses, of light nodes go to this part's nodes that lead them;
+    this part's light nodes have none any more."""
+    dt, weight = env.param(layout.STEP), env.param3(layout.GRAVITY)
+    plane = env.count(layout.GRID + 1) * env.count(layout.GRID + 2)
+    first, last = links_of_part(env, MOVES, part)
+    for n in range(first, last):
+        s = changes_at(env, CHANGE, end_of(env, body, MOVES, GETS, n))
+        for c in ti.static(range(4)):
+            body.changes[s + c] = 0.0
+    first, last = links_of_part(env, PUSHES, part)
+    for n in range(first, last):
+        light = end_of(env, body, PUSHES, GIVES, n)
+        q = node_of(node_sum(env, light // plane, light // NODES, body), light)
+        for d in ti.static(range(3)):
+            q[d] += q[3] * dt * weight[d]
+        q *= share_of(env, body, PUSHES, n)
+        s = bounded(changes_at(env, CHANGE, end_of(env, body, PUSHES, GETS, n)), 1)
+        for c in ti.static(range(4)):
+            if ti.static(ON_DEVICE):
+                ti.atomic_add(body.changes[s + c], q[c])
+            else:
+                body.changes[s + c] = body.changes[s + c] + q[c]
+
+
+@ti.func
+def follow(env: ti.template(), part, body: ti.template()):
+    """After `grid_update`, which leaves light nodes at rest: they get the velocities that their leaders have."""
+    base = env.index * env.count(layout.CAPACITY)
+    first, last = links_of_part(env, MOVES, part)
+    for n in range(first, last):
+        light, heavy = end_of(env, body, MOVES, GETS, n), end_of(env, body, MOVES, GIVES, n)
+        velocity = share_of(env, body, MOVES, n) * node_of(body.velocities[base + heavy // NODES], heavy)
+        at = base + light // NODES
+        if ti.static(ON_DEVICE):
+            ti.atomic_add(body.velocities[at], in_strip(velocity, light))
+        else:
+            body.velocities[at] = body.velocities[at] + in_strip(velocity, light)

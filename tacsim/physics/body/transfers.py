@@ -273,8 +273,8 @@ def sums_of(rows: ti.template(), row: ti.template(), lane, a, b, c):
 
 @ti.func
 def moved_plane(plane, step):
-    """A tangent plane of the surface goes with the material, as F^-T does; step: dt L. Exactly: plane - step^T plane would
-    grow by half the square of each substep's turn, and a body that rolls would seem to shrink."""
+    """A tangent plane of the surface goes with the material, as F^-T does; step: dt L. To first order it would grow by
+    half the square of each substep's turn, and a body that rolls would seem to shrink."""
     return inverse_of(step).transpose() @ plane
 
 

@@ -88,7 +88,7 @@ EXPECTED: dict[str, dict[str, Callable[[Config], bool] | str]] = {
     "elastic, nu 0.45, to half": {"hybrid": keeps(0.7, 1.1), "seed": keeps(0.4, 1.1)},
     "elastic, nu 0.49, to half": {"hybrid": keeps(0.85, 1.1), "seed": keeps(0.6, 1.2)},
     "elastic, nu 0.499, to half": {"hybrid": keeps(0.95, 1.05), "seed": keeps(0.8, 1.1)},
-    # Two gels on one another with a film between: whether it rests within the budget hangs on a hair, and particles have
+    # Two gels on one another with a film between: whether it rests within the budget hangs on a hair. Particles have
     # strains that no node feels, which is told.
     "plasticine, k 0.01, to a tenth": {
         "hybrid": lambda f: f["least particle"] > 0.3 and f["most particle"] < 1.5 and f["guard_hits"] > 0,

@@ -78,7 +78,7 @@ def test_leaders_in_a_plane_give_their_mean_across_it() -> None:
 
 
 def test_a_node_that_its_followers_leave_no_mass_follows_too() -> None:
-    """Shares of leaders beyond the nearest are negative: six light nodes take more from one that is hardly heavy."""
+    """Shares of leaders beyond the nearest are negative: nine light nodes take more from one that is hardly heavy."""
     masses = np.zeros((11, 9, 9))
     masses[3, 4, 4], masses[4, 4, 4] = LIGHT, 8.0
     masses[5, 3:6, 3:6] = 0.99 * LIGHT

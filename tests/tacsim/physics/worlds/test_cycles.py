@@ -148,7 +148,7 @@ def test_a_settled_force_stays_while_it_is_held(preset: Preset, by: float) -> No
 
 
 def test_what_still_creeps_when_the_hold_must_end_is_not_settled() -> None:
-    """3 mm at `learn` come to rest in 56 substeps of hold; after 32 they have 2 % to lose."""
+    """3 mm at `learn` come to rest in 56 substeps of hold; after 32 they have 1.4 % to lose."""
     world = HybridWorld(Scene(preset="learn", body=CYLINDER, settling=Settling(max_substeps=32)))
     stats = closed(world, 3.0e-3)
     assert not stats.settled

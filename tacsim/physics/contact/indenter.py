@@ -247,10 +247,10 @@ def point_push(env: ti.template(), gels: ti.template(), indenter: ti.template(),
             memory = indenter.pressure[env.index, i, j]
             memory += follow * (rest - memory)
             limit = env.param(layout.FRICTION) * memory
-            ft, slip = friction(
-                indenter.slip[env.index, i, j], n, sliding, limit, TANGENT_STIFFNESS * k_n, c_n, dt
-            )  # fmt: skip
-            indenter.slip[env.index, i, j] = slip
+            slip = indenter.slip[env.index, i, j]
+            slip += dt * sliding - slip.dot(n) * n
+            ft, left = friction(slip, sliding, limit, TANGENT_STIFFNESS * k_n, c_n)
+            indenter.slip[env.index, i, j] = left * slip
             indenter.pressure[env.index, i, j] = memory
             force = area * (normal * n - ft)
             push = vec4(force[0], force[1], force[2], area * rest)

@@ -3,9 +3,9 @@
 The gel surface is the C1 quadratic B-spline over its top nodes; the renderer draws the same surface. The normal force
 is a penalty plus a multiplier that remembers (augmented Lagrangian, Simo & Laursen 1992), so that nothing overlaps at
 rest. Coulomb friction acts by an elastic slip with memory (Cundall & Strack 1979): without it, friction creeps and
-holds nothing. A particle remembers the point of the gel that it sticks to: a slip that is summed up from velocities
-comes back from a loop of stretch and shear with another value. Its limit follows the remembered normal force (Prakash & Clifton 1993): that of the instant makes sliding
-flutter.
+holds nothing. What is remembered is the point that a contact sticks to, its anchor: a slip summed up from velocities
+comes back from a loop of stretch, shear and turns with another value. The limit of friction follows the remembered
+normal force (Prakash & Clifton 1993): that of the instant makes sliding flutter.
 """
 
 from tacsim.compute.runtime import ti
@@ -19,7 +19,7 @@ ContactHistory = ti.types.vector(6, ti.f32)  # what contact remembers of a parti
 CONTACT_DAMPING = 0.3  # c = 0.3 k dt = 0.3 m / dt, for normal and tangential motion
 TANGENT_STIFFNESS = 0.5  # k_t / k_n
 MEMORY_RATE = 0.05  # share of a change of the normal force that its memory follows each substep
-FREE, ON_GEL, ON_HOUSING = 0.0, 1.0, 2.0  # what a particle sticks to
+FREE, ON_GEL, ON_HOUSING = 0.0, 1.0, 2.0  # what a particle's anchor is on
 SMALLEST_AREA = 0.1  # of the surface seen from above, over its unmoved one; below that it counts as folded
 
 
@@ -173,9 +173,9 @@ def highest_near(gels: ti.template(), row, i, j):
 def particle_contact(env: ti.template(), part, g, x, v, history, radius, gels: ti.template(), row, forces):
     """Force on one particle from gel g (or its housing); all in the sensor frame. The opposite acts on the gel's nodes.
 
-    x, v: position, and velocity relative to the moving sensor. history: the point of the untouched gel, or of the
-    housing, that it sticks to [mm], and which of these; the remembered normal force as the overlap whose penalty it
-    equals [mm]; how far the gel under it has moved aside [mm]. row: the gel's first in `surface`; forces: where those on its nodes
+    x, v: position, and velocity relative to the moving sensor. history: its anchor on the untouched gel or on the
+    housing [mm], and on which of these; the remembered normal force as the overlap whose penalty it equals [mm]; how
+    far the gel under it has moved aside [mm]. row: the gel's first in `surface`; forces: where those on its nodes
     begin. Returns whether it touches, whether it touches the housing, the force, and the new history.
     """
     h, k_n, dt = env.param(layout.GEL_SPACING), env.param(layout.STIFFNESS), env.param(layout.STEP)
@@ -184,7 +184,7 @@ def particle_contact(env: ti.template(), part, g, x, v, history, radius, gels: t
     nx, ny, layers = gels.nx, gels.ny, gels.layers
     in_contact, housed = False, False
     force = vec3(0.0)
-    stuck, holder = vec2(history[0], history[1]), history[2]
+    anchor, holder = vec2(history[0], history[1]), history[2]
     pressed = k_n * history[3]
     moved = vec2(0.0)
     overlap = 0.0
@@ -220,10 +220,12 @@ def particle_contact(env: ti.template(), part, g, x, v, history, radius, gels: t
                     vn = vr.dot(n)
                     fn, pressed = normal_force(k_n * gap, pressed, c_n * vn)
                     under = vec2(x[0], x[1]) - moved
-                    slip = under - stuck if holder == ON_GEL else vec2(0.0)
+                    if holder != ON_GEL:
+                        anchor, holder = under, ON_GEL
+                    slip = under - anchor
                     along = slip[0] * vec3(t1[0], t1[1], t1[2]) + slip[1] * vec3(t2[0], t2[1], t2[2])
                     ft, left = friction(along, vr - vn * n, mu * pressed, TANGENT_STIFFNESS * k_n, c_n)
-                    stuck, holder = under - left * slip, ON_GEL
+                    anchor += (1.0 - left) * slip
                     force = fn * n + ft
                     in_contact = True
                     overlap = gap
@@ -240,15 +242,17 @@ def particle_contact(env: ti.template(), part, g, x, v, history, radius, gels: t
                     n = vec3(0.0, 0.0, 1.0)
                     fn, pressed = normal_force(k_n * gap, pressed, c_n * v[2])
                     under = vec2(x[0], x[1])
-                    slip = under - stuck if holder == ON_HOUSING else vec2(0.0)
+                    if holder != ON_HOUSING:
+                        anchor, holder = under, ON_HOUSING
+                    slip = under - anchor
                     along, vt = vec3(slip[0], slip[1], 0.0), vec3(v[0], v[1], 0.0)
                     ft, left = friction(along, vt, mu * pressed, TANGENT_STIFFNESS * k_n, c_n)
-                    stuck, holder = under - left * slip, ON_HOUSING
+                    anchor += (1.0 - left) * slip
                     force = fn * n + ft
                     in_contact, housed = True, True
                     overlap = gap
     remembered = ContactHistory([0.0, 0.0, FREE, 0.0, moved[0], moved[1]])
     if in_contact:
-        remembered = ContactHistory([stuck[0], stuck[1], holder, pressed / k_n, moved[0], moved[1]])
+        remembered = ContactHistory([anchor[0], anchor[1], holder, pressed / k_n, moved[0], moved[1]])
         record_most(env, slot_of(part), layout.OVERLAP, overlap)
     return in_contact, housed, force, remembered

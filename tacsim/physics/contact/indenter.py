@@ -2,8 +2,8 @@
 
 Each surface cell carries 3 x 3 points of equal area. Normal pressure is what the surface's nodes carry (a multiplier
 that remembers; augmented Lagrangian, Simo & Laursen 1992) plus what a point adds to it by the overlap there: the gel
-gives way between nodes as a half-space does, though the mesh cannot. Friction remembers its elastic slip. Everything is
-in the sensor frame [mm, MPa]. Why: docs/physics.md.
+gives way between nodes as a half-space does, though the mesh cannot. Friction remembers where on the indenter a point
+sticks. Everything else is in the sensor frame [mm, MPa]. Why: docs/physics.md.
 """
 
 from typing import Any, NamedTuple
@@ -28,7 +28,7 @@ from tacsim.physics.exec.lanes import (
 from tacsim.physics.exec.team import once_if
 from tacsim.physics.gel.kernels import contact_force_start, surface_at, surface_row
 
-Slip = ti.types.ndarray(dtype=vec3, ndim=3)
+Anchor = ti.types.ndarray(dtype=vec3, ndim=3)  # of the quadrature points, on the indenter, in its own axes [mm]
 Pressure = ti.types.ndarray(dtype=ti.f32, ndim=3)
 Values = ti.types.ndarray(dtype=ti.f32, ndim=4)  # (environments, x, y, z)
 
@@ -47,7 +47,7 @@ MARGIN = 1.0  # elements: nothing passes so much in one substep, so cells that a
 class Indenter(NamedTuple):
     """The indenters of all environments inside a kernel: memory of the quadrature points, distances from a mesh."""
 
-    slip: Any
+    anchor: Any
     pressure: Any
     values: Any
 
@@ -216,7 +216,7 @@ def clearance(env: ti.template(), gels: ti.template(), row, i, j, shape: ti.temp
 @ti.func
 def forget(env: ti.template(), indenter: ti.template(), i, j):
     """What contact remembers of the quadrature point (i, j)."""
-    indenter.slip[env.index, i, j] = vec3(0.0)
+    indenter.anchor[env.index, i, j] = vec3(0.0)
     indenter.pressure[env.index, i, j] = 0.0
 
 
@@ -245,12 +245,13 @@ def point_push(env: ti.template(), gels: ti.template(), indenter: ti.template(),
             sliding = moving - closing * n
             rest = ti.max(pressure, 0.0)
             memory = indenter.pressure[env.index, i, j]
+            anchor = indenter.anchor[env.index, i, j] if memory > 0.0 else y
+            slip = anchor - y
+            slip -= slip.dot(n_local) * n_local
             memory += follow * (rest - memory)
             limit = env.param(layout.FRICTION) * memory
-            slip = indenter.slip[env.index, i, j]
-            slip += dt * sliding - slip.dot(n) * n
-            ft, left = friction(slip, sliding, limit, TANGENT_STIFFNESS * k_n, c_n)
-            indenter.slip[env.index, i, j] = left * slip
+            ft, left = friction(shape.rotate @ slip, sliding, limit, TANGENT_STIFFNESS * k_n, c_n)
+            indenter.anchor[env.index, i, j] = anchor - (1.0 - left) * slip
             indenter.pressure[env.index, i, j] = memory
             force = area * (normal * n - ft)
             push = vec4(force[0], force[1], force[2], area * rest)

@@ -11,7 +11,7 @@ from tacsim.compute.runtime import ti
 from tacsim.physics.body.follow import Ends, follow, push_leaders
 from tacsim.physics.body.mass import CHANGE, SECOND, cell_means, grid_changes, second_changes
 from tacsim.physics.body.transfers import Body, Strips, grid_to_particles, particles_to_grid
-from tacsim.physics.contact.indenter import POINTS, Indenter, Pressure, Slip, Values, carry, indent
+from tacsim.physics.contact.indenter import POINTS, Anchor, Indenter, Pressure, Values, carry, indent
 from tacsim.physics.exec import layout
 from tacsim.physics.exec.environment import Counts, Environment, Floats, Params, Partial, record_least
 from tacsim.physics.exec.graph import Graph
@@ -92,7 +92,7 @@ def column(env: ti.template(), gels: ti.template(), g, block):
 def press_substep(
     clock: Clock, drive: Drive,
     nodes: Floats, surface: Floats, contact_force: Floats, corners: Floats, lattice: Lattice,
-    slip: Slip, pressure: Pressure, values: Values,
+    anchor: Anchor, pressure: Pressure, values: Values,
     params: Params, counts: Counts, partial: Partial, layers: ti.i32,
 ):  # fmt: skip
     """One substep of every environment's indenter on its gel; see `tacsim.physics.worlds.press.press_substeps`."""
@@ -104,11 +104,11 @@ def press_substep(
                 clear_sums(env, n)
         if e + k + n == 0:
             clock[1] = clock[0]
-    for e, cell in ti.ndrange(counts.shape[0], slip.shape[1] * slip.shape[2] // (POINTS * POINTS)):
+    for e, cell in ti.ndrange(counts.shape[0], anchor.shape[1] * anchor.shape[2] // (POINTS * POINTS)):
         env = ti.static(Environment(e, params, counts, partial))
         if is_active(env, clock):
             gels = ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 1))
-            indent(env, cell, clock[0], drive, gels, ti.static(Indenter(slip, pressure, values)))
+            indent(env, cell, clock[0], drive, gels, ti.static(Indenter(anchor, pressure, values)))
     for e, n in ti.ndrange(counts.shape[0], lattice.shape[0] // LATTICE_ROWS):
         env = ti.static(Environment(e, params, counts, partial))
         if clock[1] < counts[e, layout.STEPS]:

@@ -192,13 +192,13 @@ class DevicePress(DeviceState):
     _substeps, _survey, _keep = press_substeps, press_survey, keep_press
 
     def __init__(
-        self, gels: GelState, numbers: Numbers, slip: np.ndarray, pressure: np.ndarray, values: Callable[[], Values]
+        self, gels: GelState, numbers: Numbers, anchor: np.ndarray, pressure: np.ndarray, values: Callable[[], Values]
     ) -> None:  # fmt: skip
         super().__init__(gels, numbers)
-        self._slip, self._pressure, self._values = slip, pressure, values
+        self._anchor, self._pressure, self._values = anchor, pressure, values
 
     def _state(self) -> dict[str, tuple[np.ndarray, Any]]:
-        return {**super()._state(), "slip": (self._slip, vec3), "pressure": (self._pressure, ti.f32)}
+        return {**super()._state(), "anchor": (self._anchor, vec3), "pressure": (self._pressure, ti.f32)}
 
     def _own(self) -> dict[str, Any]:
         values, version = self._values()

@@ -16,9 +16,9 @@ from tacsim.physics.contact.indenter import (
     POINTS,
     SMOOTHING,
     SPLINE_SMOOTHING,
+    Anchor,
     Indenter,
     Pressure,
-    Slip,
     Values,
     carry,
     indent,
@@ -80,7 +80,7 @@ TOO_MUCH = "cut off parts of mesh and gel that cannot touch; worlds of a smaller
 def press_substeps(
     team: ti.i32, drive: Drive,
     nodes: Floats, surface: Floats, contact_force: Floats, corners: Floats, lattice: Lattice,
-    slip: Slip, pressure: Pressure, values: Values,
+    anchor: Anchor, pressure: Pressure, values: Values,
     params: Params, counts: Counts, partial: Partial, sync: Sync,
 ):  # fmt: skip
     """Explicit substeps in one launch by `team` threads; drive: pose and velocity of the indenter, sensor frame."""
@@ -90,7 +90,7 @@ def press_substeps(
             index = sync[turn, ENVIRONMENT]
             env = ti.static(Environment(index, params, counts, partial))
             gels = ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 1))
-            indenter = ti.static(Indenter(slip, pressure, values))
+            indenter = ti.static(Indenter(anchor, pressure, values))
             stages, own = 2 * env.count(layout.STEPS), own_part(task, team)  # two a substep: forces, then motion
             piece = next_piece(sync, turn, own, stages)
             while piece < stages * PARTS:
@@ -148,8 +148,8 @@ class PressState(FemState):
         lattice = common_lattice(self.gel)
         self._gels = GelState(lattice, len(scenes), 1)
         nx, ny, _ = lattice.elements
-        self._slip = np.zeros((len(scenes), nx * POINTS, ny * POINTS, 3), np.float32)
-        self._pressure = np.zeros(self._slip.shape[:3], np.float32)  # of the contact points, as remembered [MPa]
+        self._anchor = np.zeros((len(scenes), nx * POINTS, ny * POINTS, 3), np.float32)
+        self._pressure = np.zeros(self._anchor.shape[:3], np.float32)  # of the contact points, as remembered [MPa]
         self.params = np.zeros((len(scenes), PARAMS), np.float32)
         self.counts = np.zeros((len(scenes), COUNTS), np.int32)
         self.counts[:, ELEMENTS : ELEMENTS + 3] = lattice.elements
@@ -163,13 +163,13 @@ class PressState(FemState):
 
             numbers = self.params, self.counts, self.partial
             self.device = DevicePress(
-                self._gels, numbers, self._slip, self._pressure, lambda: (self._values, self._covered)
+                self._gels, numbers, self._anchor, self._pressure, lambda: (self._values, self._covered)
             )
 
     @property
-    def slip(self) -> np.ndarray:
+    def anchor(self) -> np.ndarray:
         self._bring_back()
-        return self._slip
+        return self._anchor
 
     @property
     def pressure(self) -> np.ndarray:
@@ -225,7 +225,7 @@ class PressState(FemState):
             return
         self._gels.refresh()
         run_team(
-            press_substeps, drive, self._gels.arguments(), self._slip, self._pressure, self._values,
+            press_substeps, drive, self._gels.arguments(), self._anchor, self._pressure, self._values,
             self.params, self.counts, self.partial, active=list(drives),
         )  # fmt: skip
 
@@ -276,7 +276,7 @@ class PressWorld(FemWorld):
     def arrays(self) -> dict[str, np.ndarray]:
         state, i = self._state, self._index
         return {
-            "gel_displacement": state.gels.u[i], "gel_velocity": state.gels.v[i], "slip": state.slip[i],
+            "gel_displacement": state.gels.u[i], "gel_velocity": state.gels.v[i], "anchor": state.anchor[i],
             "pressure": state.pressure[i], "carried": state.gels.carried[i, 0], "sums": state.partial[i],
         }  # fmt: skip
 

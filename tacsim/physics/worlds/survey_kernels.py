@@ -201,7 +201,7 @@ def entries_of(dtype: Any) -> Any:
 
 
 press_survey = Graph(
-    begin_survey, survey_gels, (entries_of(vec3), {"entries": "slip"}), (entries_of(ti.f32), {"entries": "pressure"}),
+    begin_survey, survey_gels, (entries_of(vec3), {"entries": "anchor"}), (entries_of(ti.f32), {"entries": "pressure"}),
 )  # fmt: skip
 hybrid_survey = Graph(
     begin_survey, survey_gels, survey_particles, sum_blocks, (entries_of(ContactHistory), {"entries": "histories"})
@@ -252,7 +252,7 @@ def _named(name: str, **more: str) -> dict[str, str]:
 
 
 keep_gels = (keep_floats, _named("nodes")), (keep_floats, _named("surface", margin="no_margin"))
-keep_press = Graph(*keep_gels, (keep_entries(vec3), _named("slip")), (keep_entries(ti.f32), _named("pressure")))
+keep_press = Graph(*keep_gels, (keep_entries(vec3), _named("anchor")), (keep_entries(ti.f32), _named("pressure")))
 keep_hybrid = Graph(
     *keep_gels, (keep_floats, _named("particles", margin="no_margin")),
     (keep_strips, _named("velocities")), (keep_entries(ContactHistory), _named("histories")),

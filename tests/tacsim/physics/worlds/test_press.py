@@ -108,7 +108,7 @@ def test_moving_the_sensor_is_moving_the_indenter() -> None:
 @pytest.mark.parametrize(("friction", "within"), [(0.6, 5e-4), (3.0, 1e-5)])
 def test_twists_to_and_fro_take_nothing(friction: float, within: float) -> None:
     """What sticks to the ball turns with it. With an elastic slip that was summed up from velocities, in the sensor's
-    axes, force rose by 0.3 % from the fifth to the twentieth cycle; with a friction of 3, where nothing slips, by 0.01 %."""
+    axes, force rose by 0.3 % from the fifth to the twentieth cycle; where nothing slips (3.0) by 0.01 %."""
     w = world(Sphere(radius=4e-3), friction, preset="draft")
     move(w, (0, 0, -0.9e-3))
     forces = []

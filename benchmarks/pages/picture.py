@@ -45,15 +45,26 @@ def draw(rows: Sequence[Row], path: Path) -> None:
     for index, ((_, _, title, unit), points) in enumerate(shown):
         axes = plain(figure.add_subplot(1, len(shown), index + 1), title, "seconds (wall)", unit)
         axes.set(xscale="log", yscale="log")
-        for row in points:
+        if not points:
+            continue
+        axes.set_xlim(*_decades([row.seconds for row in points]))
+        axes.set_ylim(*_decades([row.error for row in points]))
+        places = axes.transAxes.inverted().transform(axes.transData.transform([(r.seconds, r.error) for r in points]))
+        for row, place in zip(points, places, strict=True):
             colour = f"C{methods.index(row.method)}"
             axes.plot(row.seconds, row.error, "o", color=colour)
             words = f"{row.method}\n{row.resolution.partition(',')[0]}"
-            axes.annotate(words, (row.seconds, row.error), (5, 4), textcoords="offset points", fontsize=7, color=colour)
-        if points:
-            axes.set_xlim(*_decades([row.seconds for row in points]))
-            axes.set_ylim(*_decades([row.error for row in points]))
+            left, below = place[0] > 0.7, any(_close_above(place, other) for other in places)
+            axes.annotate(
+                words, (row.seconds, row.error), (-5 if left else 5, -4 if below else 4), textcoords="offset points",
+                ha="right" if left else "left", va="top" if below else "bottom", fontsize=7, color=colour,
+            )  # fmt: skip
     save(figure, path)
+
+
+def _close_above(place: Sequence[float], other: Sequence[float]) -> bool:
+    """Whether words between two places in a panel, from 0 to 1 across it, would lie on one another."""
+    return abs(other[0] - place[0]) < 0.3 and 0.0 < other[1] - place[1] < 0.2
 
 
 def _decades(values: Sequence[float]) -> tuple[float, float]:

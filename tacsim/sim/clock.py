@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, replace
+from dataclasses import fields, replace
 from typing import Generic, TypeVar
 
 from tacsim import pose as se3
@@ -118,5 +118,5 @@ class SimClock:
         stats = self.stats
         if stats is None:
             return {}
-        found = {**asdict(stats), "shortened": sum(self._limited.values())}
-        return {name: float(value) for name, value in found.items()}
+        found = {each.name: float(getattr(stats, each.name)) for each in fields(stats)}
+        return {**found, "shortened": float(sum(self._limited.values()))}

@@ -131,6 +131,17 @@ def friction(slip, vt, limit, k_t, c_t):
 
 
 @ti.func
+def cling(anchor, under, t1, t2, vt, limit, k_t, c_t):
+    """Friction of a particle by its anchor. Returns the tangential force and the anchor, which slip moves.
+
+    anchor, under: where it sticks and where it is, both on the untouched surface; t1, t2: tangents of the surface.
+    """
+    slip = under - anchor
+    ft, left = friction(slip[0] * t1 + slip[1] * t2, vt, limit, k_t, c_t)
+    return ft, anchor + (1.0 - left) * slip
+
+
+@ti.func
 def surface_node(gels: ti.template(), i, j):
     """Index of the surface node (i, j) in a layer's row, repeated beyond the rim."""
     return ti.max(0, ti.min(i, gels.nx)) * (gels.ny + 1) + ti.max(0, ti.min(j, gels.ny))
@@ -189,7 +200,7 @@ def particle_contact(env: ti.template(), part, g, x, v, history, radius, gels: t
     moved = vec2(0.0)
     overlap = 0.0
     reach = 2.2 * 0.5 * h
-    c_n = CONTACT_DAMPING * k_n * dt / even_mobility(env)
+    c_n, k_t = CONTACT_DAMPING * k_n * dt / even_mobility(env), TANGENT_STIFFNESS * k_n
     if x[2] > -1.2 * h * layers and ti.abs(x[0]) < reach * nx and ti.abs(x[1]) < reach * ny:
         start = vec2(x[0] / h + 0.5 * nx, x[1] / h + 0.5 * ny)  # lattice coordinates, were the surface unmoved
         last = start - vec2(history[4], history[5]) / h
@@ -211,7 +222,8 @@ def particle_contact(env: ti.template(), part, g, x, v, history, radius, gels: t
                 depth = us[2] + h * (step[0] * t1[2] + step[1] * t2[2]) + radius - x[2]
                 if k_n * depth + pressed > 0.0:
                     vs = surface_sum(gels, row + nx + 3, i, j, wx, wy)
-                    n = vec3(t1[0], t1[1], t1[2]).cross(vec3(t2[0], t2[1], t2[2])).normalized()
+                    e1, e2 = vec3(t1[0], t1[1], t1[2]), vec3(t2[0], t2[1], t2[2])
+                    n = e1.cross(e2).normalized()
                     gap = depth * n[2]  # overlap; negative where they have parted
                     if gap > deepest:  # an overlap found late must not explode; counted
                         gap = deepest
@@ -222,10 +234,7 @@ def particle_contact(env: ti.template(), part, g, x, v, history, radius, gels: t
                     under = vec2(x[0], x[1]) - moved
                     if holder != ON_GEL:
                         anchor, holder = under, ON_GEL
-                    slip = under - anchor
-                    along = slip[0] * vec3(t1[0], t1[1], t1[2]) + slip[1] * vec3(t2[0], t2[1], t2[2])
-                    ft, left = friction(along, vr - vn * n, mu * pressed, TANGENT_STIFFNESS * k_n, c_n)
-                    anchor += (1.0 - left) * slip
+                    ft, anchor = cling(anchor, under, e1, e2, vr - vn * n, mu * pressed, k_t, c_n)
                     force = fn * n + ft
                     in_contact = True
                     overlap = gap
@@ -244,10 +253,8 @@ def particle_contact(env: ti.template(), part, g, x, v, history, radius, gels: t
                     under = vec2(x[0], x[1])
                     if holder != ON_HOUSING:
                         anchor, holder = under, ON_HOUSING
-                    slip = under - anchor
-                    along, vt = vec3(slip[0], slip[1], 0.0), vec3(v[0], v[1], 0.0)
-                    ft, left = friction(along, vt, mu * pressed, TANGENT_STIFFNESS * k_n, c_n)
-                    anchor += (1.0 - left) * slip
+                    e1, e2, vt = vec3(1.0, 0.0, 0.0), vec3(0.0, 1.0, 0.0), vec3(v[0], v[1], 0.0)
+                    ft, anchor = cling(anchor, under, e1, e2, vt, mu * pressed, k_t, c_n)
                     force = fn * n + ft
                     in_contact, housed = True, True
                     overlap = gap

@@ -84,8 +84,8 @@ def test_a_body_under_more_tension_than_it_can_bear_is_told() -> None:
 
 def test_what_sticks_comes_back_from_a_loop() -> None:
     """Nothing yields or slips here, so cycles take nothing once what is left of the first ones has gone. With an
-    elastic slip that was summed up from velocities, the gel under the body's edge crept by 0.15 um in each, and force
-    fell by 0.1 % in these twenty."""
+    elastic slip that was summed up from velocities, the gel under the body's edge crept, and force fell by 0.1 % in
+    these twenty."""
     stuck = {"lower": 5.0, "upper": 5.0}
     body = CYLINDER.model_copy(update={"material": BodyMaterial()})
     world = HybridWorld(Scene.model_validate({"preset": "learn", "body": body, "friction": stuck}))

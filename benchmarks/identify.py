@@ -128,7 +128,8 @@ def refitted(found: Identified, values: FloatArray, priors: Priors) -> Fit:
     signals = replace(found.signals, values=values, noise=fit.sigma)
     again = estimate([predict], signals, [replace(each, start=fit.value(each.name)) for each in fit.parameters],
                      priors, 0.0)  # fmt: skip
-    return replace(again, mesh_shift=fit.mesh_shift, runs=fit.runs).with_sigma(again.sigma)
+    kept = replace(again, mesh_shift=fit.mesh_shift, settled_shift=fit.settled_shift, runs=fit.runs)
+    return kept.with_sigma(again.sigma)
 
 
 def redrawn(found: Identified, values: FloatArray, seed: int, priors: Priors) -> tuple[Fit, Signals]:

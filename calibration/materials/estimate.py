@@ -33,7 +33,7 @@ SMALL_STEP = 0.01  # of the free numbers, likewise where all is told well
 UNTOLD = 0.6  # an interval of a free number that reaches farther each way tells nothing: a factor of 1.8
 HOPELESS = 5.0  # an interval that reaches so far at the start: there is no use in looking for it
 COARSE_ERROR = 0.05  # of a coarse simulation, where no fine one says better: share of the signal
-SETTLED_ERROR = 0.01  # of any simulation: what its settling leaves
+SETTLED_ERROR = 0.01  # of any simulation: what its settling leaves, in each number and, again, in a whole press
 MESH_LEFT = 0.5  # standard deviation of what is left of the mesh's error, over what the finer mesh changed
 
 
@@ -97,6 +97,7 @@ class Fit:
     free: FloatArray  # (p,)
     covariance: FloatArray  # (p, p) of the free numbers, with what the mesh, and those held, may be off
     mesh_shift: FloatArray  # (p,) how far the finer mesh moved them, or what it changed press by press
+    settled_shift: FloatArray  # (k, p) by how much each press and channel moves them that is off as a whole
     predicted: FloatArray  # (m,) with the zeros of the force
     sigma: FloatArray  # (m,) standard deviations that weighed: noise, and what the simulation is off
     system: FloatArray  # (m, n)
@@ -134,7 +135,8 @@ class Fit:
         """What its intervals were if the signals had these standard deviations."""
         p = len(self.free)
         spread = covariance_of(self.system, sigma, self.priors, self.held)[:p, :p]
-        return replace(self, sigma=sigma, covariance=spread + np.diag((MESH_LEFT * self.mesh_shift) ** 2))
+        spread = spread + np.diag((MESH_LEFT * self.mesh_shift) ** 2) + self.settled_shift.T @ self.settled_shift
+        return replace(self, sigma=sigma, covariance=spread)
 
     def influence(self, change: FloatArray) -> FloatArray:
         """(p,) how far the free numbers move if the simulation changes by `change` (m,)."""
@@ -382,6 +384,7 @@ def _refined(fitter: _Fitter, state: _State, fine: Predict | None, on_step: Call
         free=state.point.free,
         covariance=np.zeros((p, p)),
         mesh_shift=shift,
+        settled_shift=np.zeros((0, p)),
         predicted=state.predicted + fitter.zero_columns @ state.zeros,
         sigma=fitter.sigma,
         system=state.system,
@@ -391,9 +394,13 @@ def _refined(fitter: _Fitter, state: _State, fine: Predict | None, on_step: Call
     )
     scatter = float(((fitter.residual(state) / fitter.sigma) ** 2).sum() / fit.freedom)
     if fine is not None:
-        # What each press and channel is off may cancel in this sum, and not in that of what is left of it.
+        # What each press and channel is off may cancel in this sum, and not in that of what is left of it. What creeps
+        # still has one sign in all of a press, and so has what the finest mesh is off: it does not average out.
         rows = np.unique(np.stack([fitter.signals.press, fitter.signals.channel]), axis=1, return_inverse=True)[1]
-        apart = [fit.influence(np.where(rows.ravel() == k, off, 0.0)) for k in range(rows.max() + 1)]
-        fit = replace(fit, mesh_shift=np.maximum(np.abs(shift), np.sqrt(np.square(apart).sum(axis=0))))
+        press = rows.ravel() == np.arange(rows.max() + 1)[:, None]
+        apart = np.array([fit.influence(np.where(each, off, 0.0)) for each in press])
+        settled_shift = np.array([fit.influence(np.where(each, settled, 0.0)) for each in press])
+        mesh_shift = np.maximum(np.abs(shift), np.sqrt((apart**2).sum(axis=0)))
+        fit = replace(fit, mesh_shift=mesh_shift, settled_shift=settled_shift)
     noisier = fit.with_sigma(fitter.sigma * max(1.0, np.sqrt(scatter)))
     return replace(fit, covariance=noisier.covariance)

@@ -207,6 +207,17 @@ def test_errors_of_a_mesh_that_cancel_in_one_fit_still_count() -> None:
     assert low < E < high and np.log(high / low) / 2 > 1.96 * 0.7 * 0.5 * np.log(1.15) / np.sqrt(2)
 
 
+def test_what_settling_leaves_of_a_whole_press_does_not_average_out() -> None:
+    """A press that is off by 1 % as a whole, as one that has not come to rest: its 14 readings are no 14 opinions."""
+    right, priors = model(["youngs_modulus"], presses=1), Priors(place=1e-7, zero=1e-6)
+    signals = recorded(0, presses=1, noise=1e-4)
+    (clean,) = right([Point(np.array([STIFFNESS.free(E)]), np.zeros(1))])
+    fit = estimate([right, right], replace(signals, values=1.01 * clean), (STIFFNESS,), priors)
+    low, high = fit.interval("youngs_modulus")
+    assert fit.value("youngs_modulus") == pytest.approx(1.01 * E, rel=1e-3)
+    assert low < E < high < 1.05 * E
+
+
 def test_a_step_that_cannot_be_simulated_is_made_smaller() -> None:
     """A little beyond the true stiffness nothing can be simulated; the fit begins softer, and its step overshoots."""
     soft, signals = Parameter("youngs_modulus", 0.1e6, 1e3, 1e9), recorded(8)

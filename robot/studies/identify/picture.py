@@ -26,15 +26,8 @@ def draw(identified: Identified, table: Sequence[tuple[str, str, str]], path: Pa
     lines += [f"NOT TO BE USED: {each.words}"[:150] for each in identified.findings]
     left = len(identified.presses) - len(shown)
     lines += [f"and {left} more presses"] if left else []
-    figure.suptitle(
-        "\n".join(line.replace("$", r"\$") for line in lines),
-        x=0.02,
-        y=0.99,
-        ha="left",
-        va="top",
-        fontsize=9,
-        color=INK,
-    )
+    # no suptitle, for which tight_layout would leave room once more
+    figure.text(0.02, 0.99, "\n".join(line.replace("$", r"\$") for line in lines), va="top", fontsize=9, color=INK)
     for column, press in enumerate(shown):
         rows = [figure.add_subplot(3, len(shown), column + 1 + k * len(shown)) for k in range(3)]
         depth, aside = _depth(press), _aside(press)
@@ -101,5 +94,7 @@ def _residuals(identified: Identified, press: int, axes: Axes) -> None:
         rows = (signals.press == press) & (signals.channel == index)
         if rows.any():
             left = (signals.values[rows] - fit.predicted[rows]) / fit.sigma[rows]
-            axes.plot(left, ".-", markersize=4, linewidth=0.7, color=COLOURS[index % len(COLOURS)], label=channel)
+            again, number = divmod(index, len(COLOURS))  # there are more channels than colours
+            style = ("o-", "s--", "^:")[again % 3]
+            axes.plot(left, style, markersize=2.5, linewidth=0.7, color=COLOURS[number], label=channel)
     axes.legend(fontsize=6, frameon=False, ncols=2)

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import tempfile
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
 from robot.collect.job import Job, Piece, Worker
-from robot.common.process import end_with_parent, outside_working_folder, shielded
+from robot.common.process_pool import ProcessPool
 from tacsim.geometry.tiles import share_tiles
 
 AHEAD = 2  # pieces for each worker that wait or are being made
@@ -42,20 +41,18 @@ def in_this_process(job: Job, folder: Path, numbers: Sequence[int], stop: Stop) 
 
 def in_processes(job: Job, folder: Path, numbers: Sequence[int], stop: Stop, workers: int) -> Iterator[Piece]:
     """Makes the pieces in so many processes, and gives them as they are done. Raises Stopped, CollectFailed."""
-    context = multiprocessing.get_context("spawn")  # Taichi does not survive a fork
     waiting, running = deque(numbers), set[Future[Piece | str]]()
     with (
         _one_thread(),
         tempfile.TemporaryDirectory(prefix="tacsim-collect-", ignore_cleanup_errors=True) as shared,
-        ProcessPoolExecutor(min(workers, max(1, len(numbers))), context, _begin, (job, folder, Path(shared))) as pool,
+        ProcessPool(min(workers, max(1, len(numbers))), _begin, (job, folder, Path(shared))) as pool,
     ):
         try:
             while waiting or running:
                 if stop():
                     raise Stopped
-                with outside_working_folder(), shielded():
-                    while waiting and len(running) < AHEAD * workers:
-                        running.add(pool.submit(_piece, waiting.popleft()))
+                while waiting and len(running) < AHEAD * workers:
+                    running.add(pool.submit(_piece, waiting.popleft()))
                 done, running = wait(running, timeout=0.1, return_when=FIRST_COMPLETED)
                 for future in done:
                     yield result_of(future.result())
@@ -63,10 +60,6 @@ def in_processes(job: Job, folder: Path, numbers: Sequence[int], stop: Stop, wor
             if stop():  # the signal was for all processes
                 raise Stopped from failure
             raise CollectFailed("a worker was killed; is there memory enough for all? (--workers)") from failure
-        except BaseException:
-            for worker in multiprocessing.active_children():
-                worker.kill()  # signals that could be caught never reach it (`shielded`), and it writes nothing
-            raise
 
 
 def result_of(made: Piece | str) -> Piece:
@@ -97,9 +90,6 @@ def _begin(job: Job, folder: Path, shared: Path) -> None:
     """shared: where workers leave distances of meshes to each other, which take as long as ten presses each."""
     global _worker
     share_tiles(shared)
-    parent = multiprocessing.parent_process()
-    assert parent is not None and parent.pid is not None
-    end_with_parent(parent.pid)
     made: list[Worker] = []
 
     def worker() -> Worker:

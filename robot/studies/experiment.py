@@ -6,16 +6,15 @@ import contextlib
 import multiprocessing
 import os
 import queue
-import signal
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from robot.common.process import end_with_parent, outside_working_folder, shielded
+from robot.common.process import outside_working_folder, shielded
+from robot.common.process_pool import ProcessPool
 from tacsim.config import load_rig
 from tacsim.interface import Action, Observation, Pose, TactileFrame, Truth
 from tacsim.models.rig import RigConfig
@@ -70,20 +69,14 @@ def run_trials(
     workers = min(len(wanted), os.cpu_count() or 1)
     with outside_working_folder(), shielded():  # starts the process that removes its semaphores in the end
         steps: multiprocessing.Queue[tuple[str, str]] = context.Queue()
-    with ProcessPoolExecutor(workers, context, _start_worker, (steps,)) as pool:
-        try:
-            with outside_working_folder():
-                stop()  # once asked, a signal waits for its answer: it breaks no process off that is being started
-                running = {trial: pool.submit(_work, *trial) for trial in wanted}
-            while not all(future.done() for future in running.values()):
-                if stop():
-                    raise TrialsStopped("stopped before all trials were done")
-                with contextlib.suppress(queue.Empty):
-                    on_step(*steps.get(timeout=0.1))
-        except BaseException:
-            for worker in multiprocessing.active_children():
-                worker.terminate()
-            raise
+    with ProcessPool(workers, _start_worker, (steps,)) as pool:
+        stop()  # once asked, a signal waits for its answer: it breaks no process off that is being started
+        running = {trial: pool.submit(_work, *trial) for trial in wanted}
+        while not all(future.done() for future in running.values()):
+            if stop():
+                raise TrialsStopped("stopped before all trials were done")
+            with contextlib.suppress(queue.Empty):
+                on_step(*steps.get(timeout=0.1))
     found: dict[tuple[str, str], Trial] = {}
     for trial, future in running.items():
         try:
@@ -104,10 +97,6 @@ _steps: multiprocessing.Queue[tuple[str, str]] | None = None  # in a worker: to 
 def _start_worker(steps: multiprocessing.Queue[tuple[str, str]]) -> None:
     global _steps
     _steps = steps
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the first one ends the others
-    parent = multiprocessing.parent_process()
-    assert parent is not None and parent.pid is not None
-    end_with_parent(parent.pid)
 
 
 def _work(task: str, physics: str) -> Trial | str:

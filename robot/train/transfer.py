@@ -8,9 +8,8 @@ drawn to be.
 from __future__ import annotations
 
 import json
-import multiprocessing
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -18,6 +17,7 @@ from typing import Literal
 import numpy as np
 
 from robot.common.loopback import loopback_host
+from robot.common.process_pool import ProcessPool
 from robot.deploy.control_loop import EpisodeFailed, EpisodeSetup, run_episode
 from robot.deploy.onnx_policy import OnnxPolicy
 from robot.deploy.policy import load_policy, require_fit
@@ -115,18 +115,14 @@ def _one_by_one(study: Study, parts: Parts) -> Iterator[Played]:
 
 
 def _side_by_side(study: Study, parts: Parts, workers: int) -> Iterator[Played]:
-    context = multiprocessing.get_context("spawn")  # Taichi does not survive a fork
-    with ProcessPoolExecutor(workers, context) as pool:
+    with ProcessPool(workers) as pool:
         futures = [
             pool.submit(_apart, study, side, twin, [each for each in left if each[0] == policy])
             for (side, twin), left in parts.items()
             for policy in dict.fromkeys(name for name, _ in left)
         ]
-        try:
-            for future in as_completed(futures):
-                yield from future.result()
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)
+        for future in as_completed(futures):
+            yield from future.result()
 
 
 def _apart(study: Study, side: Side, twin: int, left: Sequence[tuple[str, int]]) -> list[Played]:

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import Future
 from pathlib import Path
 
 import pytest
@@ -53,10 +54,16 @@ def test_they_end_with_the_process_that_wants_them(number: signal.Signals, tmp_p
 
 @needs_proc
 def test_they_end_at_once_where_an_error_leaves_the_block() -> None:
-    with pytest.raises(RuntimeError, match="enough"), ProcessPool(1) as pool:
-        worker = pool.submit(os.getpid).result()
-        unwanted = pool.submit(time.sleep, LONG)
-        raise RuntimeError("enough")
+    begun: list[tuple[int, Future[None]]] = []
+
+    def leave() -> None:
+        with ProcessPool(1) as pool:
+            begun.append((pool.submit(os.getpid).result(), pool.submit(time.sleep, LONG)))
+            raise RuntimeError("enough")
+
+    with pytest.raises(RuntimeError, match="enough"):
+        leave()
+    ((worker, unwanted),) = begun
     assert not running(worker) and unwanted.exception() is not None
 
 

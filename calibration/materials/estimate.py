@@ -379,19 +379,11 @@ def _refined(fitter: _Fitter, state: _State, fine: Predict | None, on_step: Call
             break
     shift = state.point.free - begun
     fit = Fit(
-        parameters=fitter.parameters,
-        held=fitter.held.copy(),
-        free=state.point.free,
-        covariance=np.zeros((p, p)),
-        mesh_shift=shift,
-        settled_shift=np.zeros((0, p)),
-        predicted=state.predicted + fitter.zero_columns @ state.zeros,
-        sigma=fitter.sigma,
-        system=state.system,
-        nuisances=fitter.nuisances(state),
-        priors=fitter.priors,
+        parameters=fitter.parameters, held=fitter.held.copy(), free=state.point.free, covariance=np.zeros((p, p)),
+        mesh_shift=shift, settled_shift=np.zeros((0, p)), predicted=state.predicted + fitter.zero_columns @ state.zeros,
+        sigma=fitter.sigma, system=state.system, nuisances=fitter.nuisances(state), priors=fitter.priors,
         runs=fitter.runs,
-    )
+    )  # fmt: skip
     scatter = float(((fitter.residual(state) / fitter.sigma) ** 2).sum() / fit.freedom)
     if fine is not None:
         # What each press and channel is off may cancel in this sum, and not in that of what is left of it. What creeps

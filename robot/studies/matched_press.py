@@ -1,7 +1,8 @@
 """Simulated presses that match real frames: the same ball, in the same places, until the contact is as wide.
 
-A whole simulation, mechanics and light, can so be compared with frames of which nothing else is known. The depth is
-chosen by the width of the contact: the comparison judges shape and colour of a press, not its force or depth.
+A whole simulation, mechanics and light, can so be compared with frames of which nothing else is known. Depth and
+place are chosen so that the contact found in our picture is as wide as the real one, and where that is: the comparison
+judges shape and colour of a press, not its force or depth.
 """
 
 from __future__ import annotations
@@ -100,14 +101,12 @@ class _PressedGel:
         self._deepest = MAX_DEPTH * self._thickness
         self._last: tuple[float, float] | None = None  # contact radius [px] and depth [m] of the press before
         self._render = Renderer(sensor, scene.gel.size[:2])
-        self.untouched = self._seen(0.0, 0.0)
+        self.untouched = self._seen(*sensor.geometry.principal)
 
     def press(self, circle: Circle) -> tuple[Image, SurfaceMap, str]:
         """Picture and surface of a press with this contact circle [px]; and a word if it did not come out. Raises
         CannotPress, SimulationDiverged."""
-        pitch = self._sensor.geometry.pixel_pitch
-        u0, v0 = self._sensor.geometry.principal
-        x, y = (circle.x - u0) * pitch, (circle.y - v0) * pitch
+        pitch, place = self._sensor.geometry.pixel_pitch, np.array([circle.x, circle.y])
         contact = circle.radius * pitch
         self._require_room(contact, self.ball - np.sqrt(max(self.ball**2 - contact**2, 0.0)))
         hertz = contact**2 / self.ball
@@ -115,14 +114,17 @@ class _PressedGel:
         tried: list[tuple[float, float]] = []
         for _ in range(MAX_ATTEMPTS):
             settled = self._press_to(depth)
-            image, surface = self._seen(x, y)
+            image, surface = self._seen(*place)
             try:
-                radius = contact_circle(image, self.untouched[0], self.ball / pitch).radius
+                found = contact_circle(image, self.untouched[0], self.ball / pitch)
             except NoCircle as error:
                 return image, surface, f"our own picture: {error}"
+            # light pulls a found circle aside, in the real picture as in ours: both are to be found in one place
+            place += circle.x - found.x, circle.y - found.y
+            radius = found.radius
             self._last = radius, depth
             if abs(radius - circle.radius) <= RADIUS_TOLERANCE:
-                return image, surface, "" if settled else "not settled; raise settling.max_substeps"
+                return *self._seen(*place), "" if settled else "not settled; raise settling.max_substeps"
             tried.append((radius, depth))
             wanted = _next_depth(tried, circle.radius)
             if wanted > self._deepest and depth > CLOSE * self._deepest:
@@ -149,9 +151,16 @@ class _PressedGel:
         return self._world.move({"indenter": target}).settled
 
     def _seen(self, x: float, y: float) -> tuple[Image, SurfaceMap]:
-        surface = self._world.surface("lower")
-        at: GelSurface = replace(surface, origin=(surface.origin[0] + x, surface.origin[1] + y))
+        """Picture and surface with the middle of the gel at x, y [px]."""
+        at = placed(self._world.surface("lower"), x, y, self._sensor)
         return self._render(at), surface_map(at, self._grid, self._sensor.markers)
+
+
+def placed(surface: GelSurface, x: float, y: float, sensor: SensorModel) -> GelSurface:
+    """The surface with the middle of its gel at the pixel x, y."""
+    (u0, v0), pitch = sensor.geometry.principal, sensor.geometry.pixel_pitch
+    x0, y0 = surface.origin
+    return replace(surface, origin=(x0 + (x - u0) * pitch, y0 + (y - v0) * pitch))
 
 
 def _deeper(radius: float, depth: float, wanted: float) -> float:

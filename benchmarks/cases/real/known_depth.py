@@ -5,7 +5,6 @@ calibration by other presses; pictures and heights against the real ones.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -21,8 +20,10 @@ from benchmarks.cases.real.contact_radius import ELEMENT, ball_scene, press_to
 from benchmarks.cases.real.labels import BadData, Image, PressLabel, PressLabels, read_frames, read_labels
 from benchmarks.harness.measure import Measurement, Timing
 from benchmarks.harness.runner import Case
+from calibration.light.circle import Circle, NoCircle, contact_circle
+from robot.studies.matched_press import placed
 from tacsim.models.scene import GelSurface
-from tacsim.models.sensor import CanonicalGrid, SensorModel
+from tacsim.models.sensor import CanonicalGrid
 from tacsim.physics.world import make_world
 
 if TYPE_CHECKING:
@@ -49,8 +50,6 @@ def light_of(folder: Path, labels: PressLabels) -> BallSet:
 
 def known_depth(folder: Path, ball: float, repeat: int) -> list[Measurement]:
     """A ball pressed to a real press's depth, in calibrated light: picture and height. Seconds: to press and draw."""
-    from calibration.light.circle import NoCircle, contact_circle
-
     labels = read_labels(folder)
     of = light_of(folder, labels)
     reference, frames = read_frames(folder, labels)
@@ -59,17 +58,17 @@ def known_depth(folder: Path, ball: float, repeat: int) -> list[Measurement]:
     camera = CalibratedSensor(of, fit, labels.gel_size, reference)
     rows = []
     for press in sorted((p for p in frames if p.ball_radius == ball), key=lambda p: p.depth):
-        try:
-            at = contact_circle(frames[press], reference, ball / labels.pixel_pitch)
-        except NoCircle as error:
-            raise BadData(f"the real frame of {press.name}: {error}") from None
+        real = _circle(press, frames[press], reference, labels)
         wall, cpu = perf_counter(), process_time()
         settled = press_to(world, ball, press.depth).settled
-        surface = moved(world.surface("lower"), (at.x, at.y), camera.model)
-        image = camera.see(surface)
+        image = camera.see(placed(world.surface("lower"), real.x, real.y, camera.model))
         timing = Timing((perf_counter() - wall,), process_time() - cpu)
+        ours = _circle(press, image, reference, labels)  # light pulls it aside, as it does the real one
+        x, y = 2 * real.x - ours.x, 2 * real.y - ours.y
+        surface = placed(world.surface("lower"), x, y, camera.model)
+        image = camera.see(surface)
         cap = float(np.sqrt(2 * ball * press.depth - press.depth**2)) / labels.pixel_pitch
-        mask = circle_mask(reference.shape[:2], at.x, at.y, REACH * cap)
+        mask = circle_mask(reference.shape[:2], x, y, REACH * cap)
         figures = pictures(image, frames[press], reference, mask) | {"depth_mm": press.depth * 1e3}
         note = "" if settled else "not settled"
         rows.append(
@@ -78,7 +77,7 @@ def known_depth(folder: Path, ball: float, repeat: int) -> list[Measurement]:
                 f"{press.name}: picture", None, figures, note,
             )
         )  # fmt: skip
-        rows.append(_height(camera, surface, frames[press], press, (at.x, at.y), timing))
+        rows.append(_height(camera, surface, frames[press], press, (x, y), timing))
     return rows
 
 
@@ -111,11 +110,12 @@ class CalibratedSensor:
         return found.astype(np.float64)
 
 
-def moved(surface: GelSurface, to: tuple[float, float], model: SensorModel) -> GelSurface:
-    """The surface with the middle of its gel at this pixel."""
-    (u0, v0), pitch = model.geometry.principal, model.geometry.pixel_pitch
-    x, y = (to[0] - u0) * pitch, (to[1] - v0) * pitch
-    return replace(surface, origin=(surface.origin[0] + x, surface.origin[1] + y))
+def _circle(press: PressLabel, image: Image, reference: Image, labels: PressLabels) -> Circle:
+    """Where the contact is found. Raises BadData."""
+    try:
+        return contact_circle(image, reference, press.ball_radius / labels.pixel_pitch)
+    except NoCircle as error:
+        raise BadData(f"{press.name}: {error}") from None
 
 
 def circle_mask(shape: Iterable[int], x: float, y: float, radius: float) -> Mask:

@@ -72,12 +72,14 @@ def _write(path: Path, judged: Iterable[Judged]) -> None:
 
 
 def _show(judged: list[Judged]) -> None:
-    rows = []
-    for each in judged:
+    names, rows = [Path(each.policy).name for each in judged], []
+    if len(set(names)) < len(names):
+        names = [each.policy for each in judged]
+    for name, each in zip(names, judged, strict=True):
         mean, most = each.peak_force
         rows.append(
             (
-                each.policy,
+                name,
                 interval_text(each.success, 100, 0),
                 interval_text(each.distance, 1e3, 3),
                 interval_text(each.improvement, 100, 0),

@@ -12,7 +12,9 @@ import pytest
 from calibration.bundle import write_bundle
 from calibration.compare.compare import compare_frames
 from calibration.errors import BadFrames
-from calibration.frame_set import Frame, FrameSet
+from calibration.frame_set import Frame, FrameSet, Image
+from calibration.light.circle import Circle, contact_circle
+from robot.studies import matched_press
 from robot.studies.matched_press import _next_depth, _PressedGel, match_presses
 from tacsim.config import load_scene
 from tacsim.models.scene import Scene
@@ -60,8 +62,6 @@ def test_a_scene_against_frames(frames: FrameSet, tmp_path: Path, monkeypatch: p
 def test_ball_and_gel_are_those_of_the_bundle_unless_given(frames: FrameSet, tmp_path: Path, monkeypatch) -> None:
     """The calibration knows the ball of its presses, and how much gel its pictures show: 20.8 x 16 mm. A smaller gel
     would carry the motion of its border on to the picture's. The thickness nobody knows."""
-    from robot.studies import matched_press
-
     asked: list[Scene] = []
 
     def stop(real: FrameSet, scene: Scene, *more: object) -> None:
@@ -128,6 +128,28 @@ def test_a_press_that_diverges_is_reported_and_the_others_go_on(
     result = compare_frames(replace(made, notes=tuple(notes)), frames)
     assert [pair.b.name for pair in result.pairs] == ["press_0.png", "still.png"]
     assert any("press_1.png: not pressed" in words for words in result.notes)
+
+
+def test_both_contacts_are_in_one_place_however_light_pulls_a_circle(
+    frames: FrameSet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pull = np.array([2.0, -3.0])  # [px]
+
+    def pulled(image: Image, reference: Image, ball: float) -> Circle:
+        circle = contact_circle(image, reference, ball)
+        return replace(circle, x=circle.x + pull[0], y=circle.y + pull[1])
+
+    monkeypatch.setattr(matched_press, "contact_circle", pulled)
+    sensor, grid = sensor_of(), CanonicalGrid()
+    made, _ = match_presses(frames, scene_of("8 mm"), sensor, grid)
+    for frame, place in zip(made.frames[:2], PLACES, strict=True):
+        assert frame.surface is not None
+        dent = np.where(frame.surface.height > 0.1e-3, frame.surface.height, 0.0)
+        rows, columns = np.indices(dent.shape)
+        middle = np.array([(dent * columns).sum(), (dent * rows).sum()]) / dent.sum()
+        cells = middle - [(grid.columns - 1) / 2, (grid.rows - 1) / 2]
+        at = cells * grid.pitch / sensor.geometry.pixel_pitch + sensor.geometry.principal
+        assert at == pytest.approx(place, abs=0.5)
 
 
 def test_a_contact_that_the_gel_is_too_thin_for_is_refused_beforehand(frames: FrameSet) -> None:

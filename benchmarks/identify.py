@@ -27,7 +27,8 @@ import typer
 
 from calibration.materials.checks import findings
 from calibration.materials.covariance import covariance_of
-from calibration.materials.estimate import SETTLED_ERROR, UNTOLD, Fit, Point, Priors, Signals, estimate
+from calibration.materials.estimate import SETTLED_ERROR, UNTOLD, estimate
+from calibration.materials.fit import Fit, Point, Priors, Signals
 from calibration.materials.parameters import starts
 from calibration.materials.presses import Noise, Press, gathered, signals_of, thinned
 from robot.studies.identify.identify import MOMENTS, Identified, Kind, identify, parameters_of
@@ -129,7 +130,7 @@ def refitted(found: Identified, values: FloatArray, priors: Priors) -> Fit:
     again = estimate([predict], signals, [replace(each, start=fit.value(each.name)) for each in fit.parameters],
                      priors, 0.0)  # fmt: skip
     kept = replace(again, mesh_shift=fit.mesh_shift, settled_shift=fit.settled_shift, runs=fit.runs)
-    return kept.with_sigma(again.sigma)
+    return kept.with_sigma(again.sigma).widened(values - again.predicted, signals.series)
 
 
 def redrawn(found: Identified, values: FloatArray, seed: int, priors: Priors) -> tuple[Fit, Signals]:

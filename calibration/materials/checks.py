@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 from scipy.stats import chi2, norm
 
-from calibration.materials.estimate import Fit, Signals
+from calibration.materials.fit import Fit, Signals
 from tacsim.interface import FloatArray
 
 CHANCE = 1e-3  # a finding that chance alone would bring more seldom counts

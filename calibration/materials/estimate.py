@@ -14,11 +14,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.stats import t as student
 
 from calibration.errors import CalibrationError
 from calibration.materials.covariance import covariance_of
+from calibration.materials.fit import MESH_LEFT, Fit, Point, Predict, Priors, Signals
 from calibration.materials.parameters import Parameter, begins, starts
 from tacsim.interface import FloatArray
 
@@ -34,7 +33,6 @@ UNTOLD = 0.6  # an interval of a free number that reaches farther each way tells
 HOPELESS = 5.0  # an interval that reaches so far at the start: there is no use in looking for it
 COARSE_ERROR = 0.05  # of a coarse simulation, where no fine one says better: share of the signal
 SETTLED_ERROR = 0.01  # of any simulation: what its settling leaves, in each number and, again, in a whole press
-MESH_LEFT = 0.5  # standard deviation of what is left of the mesh's error, over what the finer mesh changed
 
 
 class NotIdentified(CalibrationError):
@@ -43,109 +41,6 @@ class NotIdentified(CalibrationError):
 
 class CannotSimulate(CalibrationError):
     """A press has no simulated counterpart with such materials."""
-
-
-@dataclass(frozen=True, slots=True)
-class Point:
-    """Where a simulation is run."""
-
-    free: FloatArray  # (p,) free numbers of the parameters
-    places: FloatArray  # (t,) how much nearer than recorded the parts of each press are [m]
-    size: float = 0.0  # logarithm of how much larger than stated the indenter is, its lowest point where it was
-
-
-Predict = Callable[[Sequence[Point]], list[FloatArray]]  # (m,) signals at each point
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Signals:
-    """What was measured in all presses, one number a row."""
-
-    values: FloatArray  # (m,) [N, or m]
-    noise: FloatArray  # (m,) standard deviation
-    press: NDArray[np.int64]  # (m,) index of its press
-    channel: NDArray[np.int64]  # (m,) index into `channels`
-    time: FloatArray  # (m,) [s]
-    channels: tuple[str, ...]
-    force: NDArray[np.bool_]  # (c,) channels that are forces, whose zero may be off
-
-    @property
-    def presses(self) -> int:
-        return int(self.press.max()) + 1
-
-    def zeros(self) -> FloatArray:
-        """(m, z) columns of the zeros: one for each press and each force that it has."""
-        pairs = sorted({(p, c) for p, c in zip(self.press.tolist(), self.channel.tolist(), strict=True)})
-        columns = [(self.press == p) & (self.channel == c) for p, c in pairs if self.force[c]]
-        return np.stack(columns, axis=1).astype(np.float64) if columns else np.zeros((len(self.values), 0))
-
-
-@dataclass(frozen=True, slots=True)
-class Priors:
-    """How well the nuisances are known beforehand: standard deviations."""
-
-    place: float  # [m]
-    zero: float  # [N]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Fit:
-    """An estimate and what it rests on. n = p + t + z unknowns: parameters, places, zeros."""
-
-    parameters: tuple[Parameter, ...]
-    held: NDArray[np.bool_]  # (p,) those that the data do not tell: they stayed at their start
-    free: FloatArray  # (p,)
-    covariance: FloatArray  # (p, p) of the free numbers, with what the mesh, and those held, may be off
-    mesh_shift: FloatArray  # (p,) how far the finer mesh moved them, or what it changed press by press
-    settled_shift: FloatArray  # (k, p) by how much each press and channel moves them that is off as a whole
-    predicted: FloatArray  # (m,) with the zeros of the force
-    sigma: FloatArray  # (m,) standard deviations that weighed: noise, and what the simulation is off
-    system: FloatArray  # (m, n)
-    nuisances: FloatArray  # (t + z,)
-    priors: FloatArray  # (t + z,) standard deviations of the nuisances
-    runs: int = 0  # simulated presses
-
-    @property
-    def told(self) -> tuple[Parameter, ...]:
-        return tuple(each for each, held in zip(self.parameters, self.held, strict=True) if not held)
-
-    @property
-    def untold(self) -> tuple[Parameter, ...]:
-        return tuple(each for each, held in zip(self.parameters, self.held, strict=True) if held)
-
-    @property
-    def freedom(self) -> int:
-        return max(1, len(self.predicted) - len(self.told))
-
-    def value(self, name: str) -> float:
-        index = self._index(name)
-        return self.parameters[index].value(float(self.free[index]))
-
-    def half(self, name: str) -> float:
-        """Half the 95 % interval of a free number."""
-        index = self._index(name)
-        return float(student.ppf(0.975, self.freedom) * np.sqrt(self.covariance[index, index]))
-
-    def interval(self, name: str) -> tuple[float, float]:
-        """95 %."""
-        index = self._index(name)
-        return self.parameters[index].between(float(self.free[index]), self.half(name))
-
-    def with_sigma(self, sigma: FloatArray) -> Fit:
-        """What its intervals were if the signals had these standard deviations."""
-        p = len(self.free)
-        spread = covariance_of(self.system, sigma, self.priors, self.held)[:p, :p]
-        spread = spread + np.diag((MESH_LEFT * self.mesh_shift) ** 2) + self.settled_shift.T @ self.settled_shift
-        return replace(self, sigma=sigma, covariance=spread)
-
-    def influence(self, change: FloatArray) -> FloatArray:
-        """(p,) how far the free numbers move if the simulation changes by `change` (m,)."""
-        covariance = covariance_of(self.system, self.sigma, self.priors, self.held, 0.0)
-        found: FloatArray = -(covariance @ self.system.T @ (change / self.sigma**2))[: len(self.free)]
-        return found
-
-    def _index(self, name: str) -> int:
-        return [each.name for each in self.parameters].index(name)
 
 
 @dataclass(slots=True, eq=False)
@@ -384,15 +279,14 @@ def _refined(fitter: _Fitter, state: _State, fine: Predict | None, on_step: Call
         sigma=fitter.sigma, system=state.system, nuisances=fitter.nuisances(state), priors=fitter.priors,
         runs=fitter.runs,
     )  # fmt: skip
-    scatter = float(((fitter.residual(state) / fitter.sigma) ** 2).sum() / fit.freedom)
+    series, residual = fitter.signals.series, fitter.residual(state)
+    scatter = float(((residual / fitter.sigma) ** 2).sum() / fit.freedom)
     if fine is not None:
-        # What each press and channel is off may cancel in this sum, and not in that of what is left of it. What creeps
-        # still has one sign in all of a press, and so has what the finest mesh is off: it does not average out.
-        rows = np.unique(np.stack([fitter.signals.press, fitter.signals.channel]), axis=1, return_inverse=True)[1]
-        press = rows.ravel() == np.arange(rows.max() + 1)[:, None]
-        apart = np.array([fit.influence(np.where(each, off, 0.0)) for each in press])
-        settled_shift = np.array([fit.influence(np.where(each, settled, 0.0)) for each in press])
-        mesh_shift = np.maximum(np.abs(shift), np.sqrt((apart**2).sum(axis=0)))
-        fit = replace(fit, mesh_shift=mesh_shift, settled_shift=settled_shift)
+        # What each series is off may cancel in this sum, and not in that of what is left of it. What creeps still has
+        # one sign in all of it, and so has what the finest mesh is off: it does not average out.
+        apart = np.sqrt((fit.influences(off, series) ** 2).sum(axis=0))
+        fit = replace(
+            fit, mesh_shift=np.maximum(np.abs(shift), apart), settled_shift=fit.influences(settled, series)
+        )  # fmt: skip
     noisier = fit.with_sigma(fitter.sigma * max(1.0, np.sqrt(scatter)))
-    return replace(fit, covariance=noisier.covariance)
+    return replace(fit, covariance=noisier.covariance).widened(residual, series)

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.materials.estimate import Signals
+from calibration.materials.fit import Signals
 from tacsim.interface import FloatArray, Pose
 from tacsim.pose import difference
 

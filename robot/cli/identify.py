@@ -165,7 +165,7 @@ class _Task:
             )
         folder = new_directory(options.out, f"identify-{self.kind}")
         with busy("loading"):
-            from calibration.materials.estimate import Priors
+            from calibration.materials.fit import Priors
             from calibration.materials.presses import Noise
             from robot.studies.identify.identify import identify
             from robot.studies.identify.recordings import Recordings, find_recordings, read_all

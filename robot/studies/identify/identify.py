@@ -10,7 +10,8 @@ from typing import Literal
 import numpy as np
 
 from calibration.materials.checks import Finding, findings, size_error
-from calibration.materials.estimate import COARSE_ERROR, Fit, Point, Priors, Signals, estimate
+from calibration.materials.estimate import COARSE_ERROR, estimate
+from calibration.materials.fit import Fit, Point, Priors, Signals
 from calibration.materials.parameters import Parameter
 from calibration.materials.presses import Noise, Press, gathered, signals_of, thinned
 from robot.studies.identify.recordings import Recordings
@@ -163,5 +164,5 @@ def outlook(identified: Identified, force_noise: float) -> dict[str, float]:
     force = signals.force[signals.channel]
     scale = np.where(force, force_noise / identified.noise.force, 1.0)
     sigma = np.sqrt(np.maximum(fit.sigma**2 - signals.noise**2, 0.0) + (signals.noise * scale) ** 2)
-    other = fit.with_sigma(sigma)
+    other = fit.with_sigma(sigma).widened(signals.values - fit.predicted, signals.series)
     return {each.name: other.half(each.name) for each in fit.told}

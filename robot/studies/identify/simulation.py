@@ -9,7 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.materials.estimate import CannotSimulate, Point
+from calibration.materials.estimate import CannotSimulate
+from calibration.materials.fit import Point
 from calibration.materials.parameters import Parameter
 from calibration.materials.presses import Press
 from tacsim import pose as se3

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from calibration.materials.checks import findings
-from calibration.materials.estimate import CannotSimulate, Fit, NotIdentified, Point, Predict, Priors, Signals, estimate
+from calibration.materials.estimate import CannotSimulate, NotIdentified, estimate
+from calibration.materials.fit import Fit, Point, Predict, Priors, Signals
 from calibration.materials.parameters import Parameter
 from tacsim.interface import FloatArray
 
@@ -216,6 +217,16 @@ def test_what_settling_leaves_of_a_whole_press_does_not_average_out() -> None:
     low, high = fit.interval("youngs_modulus")
     assert fit.value("youngs_modulus") == pytest.approx(1.01 * E, rel=1e-3)
     assert low < E < high < 1.05 * E
+
+
+def test_channels_that_contradict_each_other_widen_the_interval() -> None:
+    """One press says 10 % more than the truth and another 10 % less, as a simulation has it that no mesh puts right.
+    Each has 14 readings; they are two opinions, between which the truth may be anywhere."""
+    signals = recorded(0, presses=2, noise=1e-3)
+    (clean,) = model(["youngs_modulus"])([Point(np.array([STIFFNESS.free(E)]), np.zeros(2))])
+    said = np.where(signals.press == 0, 1.1, 0.9) * clean
+    low, high = fitted(replace(signals, values=said), STIFFNESS).interval("youngs_modulus")
+    assert low < 0.9 * E and high > 1.1 * E
 
 
 def test_a_step_that_cannot_be_simulated_is_made_smaller() -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibration.materials.estimate import Point
+from calibration.materials.fit import Point
 from calibration.materials.presses import Noise, gathered, signals_of
 from robot.studies.identify.recordings import Recordings
 from robot.studies.identify.simulation import Simulation

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from calibration.materials.checks import Finding
-from calibration.materials.estimate import Point, Priors, estimate
+from calibration.materials.estimate import estimate
+from calibration.materials.fit import Point, Priors
 from calibration.materials.presses import Noise, signals_of
 from robot.deploy.policy import load_policy
 from robot.deploy.python_policy import PolicyNotFound

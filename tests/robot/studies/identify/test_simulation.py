@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibration.materials.estimate import Point
+from calibration.materials.fit import Point
 from calibration.materials.parameters import Parameter
 from calibration.materials.presses import Noise, Press, gathered, signals_of, thinned
 from robot.studies.identify.identify import parameters_of

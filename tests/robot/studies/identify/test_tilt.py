@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from benchmarks.identify import planned
-from calibration.materials.estimate import Point
+from calibration.materials.fit import Point
 from robot.studies.identify.identify import parameters_of
 from robot.studies.identify.motions import motions
 from robot.studies.identify.simulation import Simulation

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibration.materials.estimate import Point, Priors
+from calibration.materials.fit import Point, Priors
 from calibration.materials.presses import Noise, Press
 from robot.studies.identify.identify import Identified, identify
 from robot.studies.identify.recordings import Recordings

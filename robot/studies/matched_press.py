@@ -133,7 +133,7 @@ class _PressedGel:
                 break
             depth = min(wanted, self._deepest)
         words = f"{abs(radius - circle.radius):.1f} px {'wider' if radius > circle.radius else 'narrower'}"
-        return image, surface, f"the contact is {words} than the real one"
+        return *self._seen(*place), f"the contact is {words} than the real one"
 
     def _require_room(self, contact: float, depth: float) -> None:
         """Raises CannotPress where a contact radius [m] needs a `depth` [m] beyond what is possible."""

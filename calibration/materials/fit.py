@@ -122,12 +122,13 @@ class Fit:
         return found
 
     def influences(self, change: FloatArray, series: NDArray[np.int64]) -> FloatArray:
-        """(k, p) the same of each series' part of the change."""
+        """(k, p) the same for each series' part of the change; `series` (m,): `Signals.series`."""
         return np.array([self.influence(np.where(series == each, change, 0.0)) for each in range(series.max() + 1)])
 
     def widened(self, residual: FloatArray, series: NDArray[np.int64]) -> Fit:
-        """With intervals that hold what the series pull apart, where that is more than they knew: what a simulation is
-        off lasts through a series, and its readings are no opinions apart (Liang and Zeger, Biometrika 73, 1986)."""
+        """With intervals as wide as the series (m,) pull its numbers apart, where that is more than they knew. What a
+        simulation is off lasts through a series, whose readings are no opinions of their own: the variance is that of
+        clusters (Liang and Zeger, Biometrika 73, 1986). residual: (m,) measured less `predicted`."""
         pulls = self.influences(residual, series)
         pulled = (pulls**2).sum(axis=0) * len(pulls) / max(1, len(pulls) - 1)
         more = np.maximum(0.0, pulled - np.diag(self.covariance))

@@ -172,7 +172,26 @@ class FrameNormaliser:
         """
         if self.reference is None:
             raise NoReference("no reference yet: call take_reference with a frame without contact (Rig.reset does)")
-        seen = self.reference.difference(self._rectify(frame.image))
+        self.beyond_range, self._sought = 0.0, False
+        seen = partial(_difference, self.reference, self._rectify, frame)
+        if frame.surface is None:
+            return self._found(frame, seen(), now)
+        surface = frame.surface
+        self._check(surface)
+        return TactileObservation(
+            image=lambda: _byte_image(canonical_part(seen(), self._grid)),
+            gradient=surface.gradient,
+            height=surface.height,
+            contact=(surface.height > CONTACT_HEIGHT) & self._valid,
+            valid=self._valid,
+            flow=surface.flow,
+            time=frame.time,
+            age=now - frame.time,
+            picture=lambda: frame.image,
+        )
+
+    def _found(self, frame: TactileFrame, seen: NDArray[np.float32], now: float) -> TactileObservation:
+        """All of it from the picture; seen: its difference from the reference."""
         change: NDArray[np.float32] = canonical_part(seen, self._grid)
         height, gradient, flow, drift = self._surface(frame, seen)
         if drift is not None:
@@ -191,12 +210,7 @@ class FrameNormaliser:
         )
 
     def _surface(self, frame: TactileFrame, change: NDArray[np.float32]) -> tuple[NDArray[np.float32] | None, ...]:
-        """Height, gradient and flow, from the source or from the picture; and the drift that is to be taken off the
-        canonical image."""
-        self.beyond_range, self._sought = 0.0, False
-        if frame.surface is not None:
-            self._check(frame.surface)
-            return frame.surface.height, frame.surface.gradient, frame.surface.flow, None
+        """Height, gradient and flow, and the drift that is to be taken off the canonical image."""
         height = gradient = flow = removed = None
         self._sought = any(part is not None for part in (self._find, self._markers, self._find_drift))
         if self._find_drift is not None:
@@ -380,6 +394,11 @@ def _of_bundle(path: str, image_shape: tuple[int, int], grid: CanonicalGrid) -> 
             "width and height of the sensor to those of the calibration, or calibrate again at this setting"
         )
     return normaliser_for_calibration(calibration, grid, untouched)
+
+
+def _difference(reference: Reference, rectify: Rectification, frame: TactileFrame) -> NDArray[np.float32]:
+    """(H, W, 3) relative change of the rectified picture."""
+    return reference.difference(rectify(frame.image))
 
 
 def _byte_image(change: NDArray[np.float32]) -> NDArray[np.uint8]:

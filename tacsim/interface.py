@@ -10,9 +10,9 @@ x along image columns, y along image rows, z out of the gel towards the object. 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Protocol, runtime_checkable
+from collections.abc import Callable, Mapping
+from dataclasses import KW_ONLY, dataclass, field
+from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,22 +58,59 @@ class SurfaceMap:
     flow: NDArray[np.float32] | None  # (m, n, 2) in-plane displacement at the marker lattice, sensor x, y [m]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class TactileFrame:
+Made = TypeVar("Made")
+
+
+class WhenSeen(Generic[Made]):
+    """A field of a dataclass, given as it is or as a function that makes it, called when the field is first looked at:
+    no picture is rendered for who looks at heights and forces only."""
+
+    def __init__(self, *default: Made) -> None:
+        self._default = default
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = name
+
+    def __get__(self, instance: object | None, owner: type | None = None) -> Made:
+        if instance is None:  # `dataclass` asks for the default so, and takes this error for none
+            if not self._default:
+                raise AttributeError(self._name)
+            return self._default[0]
+        value: Any = instance.__dict__[self._name]
+        if callable(value):
+            value = instance.__dict__[self._name] = value()
+        return value  # type: ignore[no-any-return]
+
+    def __set__(self, instance: object, value: Made | Callable[[], Made]) -> None:
+        instance.__dict__[self._name] = value
+
+
+class Sendable:
+    """A dataclass whose fields `WhenSeen` are made before it is copied or sent to another process."""
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: getattr(self, name) for name in self.__dict__}
+
+
+@dataclass(frozen=True, eq=False)
+class TactileFrame(Sendable):
     """What any source delivers: the picture as the camera gave it."""
 
-    image: NDArray[np.uint8]  # (H, W, 3) RGB
+    image: WhenSeen[NDArray[np.uint8]] = WhenSeen()  # (H, W, 3) RGB
+    _: KW_ONLY
     time: float  # exposure time on the rig's monotonic clock [s]
     index: int  # frame counter; a gap = dropped frames
     surface: SurfaceMap | None = None  # only from sources that know it
     stats: Mapping[str, float] = field(default_factory=dict)  # of the simulation for this frame: residual ...
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class TactileObservation:
+@dataclass(frozen=True, eq=False)
+class TactileObservation(Sendable):
     """Canonical touch: what a policy sees, the same for every source. What a sensor does not deliver is None."""
 
-    image: NDArray[np.uint8]  # (H, W, 3) clip(128 + 128 (I - I0) / mean(I0)) over the canonical area
+    # (H, W, 3) clip(128 + 128 (I - I0) / mean(I0)) over the canonical area
+    image: WhenSeen[NDArray[np.uint8]] = WhenSeen()
+    _: KW_ONLY
     gradient: NDArray[np.float32] | None  # (h, w, 2) surface slope [-]
     height: NDArray[np.float32] | None  # (h, w) into the gel, 0 at the contact-free rim [m]
     contact: NDArray[np.bool_]  # (h, w)
@@ -82,7 +119,7 @@ class TactileObservation:
     time: float  # exposure time [s]
     age: float  # time of the observation minus time of exposure [s]
     # (H, W, 3) RGB as the camera gave it: not canonical, so what learns from it learns one sensor's light, too
-    picture: NDArray[np.uint8] | None = None
+    picture: WhenSeen[NDArray[np.uint8] | None] = WhenSeen(None)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -13,6 +13,7 @@ from benchmarks.cases.squeeze import PRESETS
 from benchmarks.harness.measure import Measurement, Timing, once
 from benchmarks.harness.runner import Case
 from tacsim import pose as se3
+from tacsim.gym.features import SCALES
 from tacsim.interface import Action, Pose
 from tacsim.models.rig import SqueezeConfig
 from tacsim.rig import Rig
@@ -22,7 +23,7 @@ NUMBER = 16  # environments of a batch
 STEPS = 6  # of all, each timed
 WARM = 2  # before those
 ROUNDS = 10  # resets of each environment
-SMALLEST = ("width=16", "height=16", "pixel_pitch=1 mm")  # pictures for who does not look at them
+FELT = {"maps": ("height",), "touch": ("wrench",)}  # features of who looks at no picture
 SMALL = ("width=160", "height=120", "pixel_pitch=0.125 mm")
 
 
@@ -44,21 +45,24 @@ def random_actions(preset: str, motion: str, repeat: int) -> list[Measurement]:
     """Sixteen squeezes in one batch under random actions: heights and forces; at learn also with two pictures of
     160 x 120, and where motion flows their resets, each with a material, a size and a goal drawn from eight."""
     words = f"{motion}, heights and forces"
-    rows = [_random_actions(preset, [f"motion={motion}", *pictures(SMALLEST)], words, resets=False)[0]]
+    rows = _random_actions(preset, [f"motion={motion}"], words, resets=False, features=FELT)
     if preset == "learn":
         look = f"{motion}, two pictures of 160 x 120"
         rows += _random_actions(preset, [f"motion={motion}", *pictures(SMALL)], look, resets=motion == "flowing")
     return rows
 
 
-def _random_actions(preset: str, more: list[str], words: str, *, resets: bool) -> list[Measurement]:
+def _random_actions(
+    preset: str, more: list[str], words: str, *, resets: bool, features: dict[str, Any] | None = None
+) -> list[Measurement]:
     """Rows of a step and, with `resets`, of a reset."""
     import gymnasium
 
     import tacsim.gym.env  # noqa: F401  registers
 
     overrides = [f"scene.preset={preset}", "task.steps=1000", *more]
-    options: dict[str, Any] = {"overrides": overrides, "variants": list(BODIES)}
+    options: dict[str, Any] = {"overrides": overrides, "variants": list(BODIES), "features": features}
+    forces, newtons = ("wrench_upper", 1.0) if features is None else ("touch", SCALES["force"])
     many = gymnasium.make_vec("tacsim/Squeeze-v0", NUMBER, autoreset_mode="Disabled", **options)
     alone = gymnasium.make("tacsim/Squeeze-v0", **options).unwrapped
     rng = np.random.default_rng(0)
@@ -69,8 +73,8 @@ def _random_actions(preset: str, more: list[str], words: str, *, resets: bool) -
     alone.reset(seed=1)
     difference = 0.0
     for action in actions[:WARM]:
-        felt, felt_alone = (flats["wrench_upper"] for flats in (many.step(action)[0], alone.step(action[0])[0]))
-        difference = max(difference, float(np.abs(felt[0] - felt_alone).max()))
+        felt, felt_alone = (flats[forces] for flats in (many.step(action)[0], alone.step(action[0])[0]))
+        difference = max(difference, newtons * float(np.abs(felt[0] - felt_alone).max()))
     each = [once(partial(many.step, action))[0] for action in actions[WARM:]]
     timing = Timing(tuple(step.samples[0] for step in each), sum(step.processor for step in each) / STEPS)
     share = sum(timing.samples) / STEPS / NUMBER  # of one environment in a step: of the mean, for random steps differ

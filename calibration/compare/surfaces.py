@@ -63,12 +63,12 @@ def estimate_surfaces(
         return _recorded(frames)
     normaliser = normaliser_for_calibration(calibration, GRID)
     try:
-        normaliser.take_reference(TactileFrame(side.reference, 0.0, 0))
+        normaliser.take_reference(TactileFrame(side.reference, time=0.0, index=0))
         found: list[SurfaceEstimate | None] = []
         lost = []
         for frame in frames:
             try:
-                seen = normaliser(TactileFrame(frame.image, 0.0, 0), 0.0)
+                seen = normaliser(TactileFrame(frame.image, time=0.0, index=0), 0.0)
             except (StaleReference, MarkersLost) as why:
                 found.append(None)
                 lost.append(f"{frame.name}: {why}")

@@ -46,7 +46,8 @@ class CellSensor:
             if time.monotonic() > deadline:
                 raise TimeoutError(f"sensor '{self._name}': the mock cell has simulated nothing within {timeout:g} s")
             time.sleep(1e-3)
-        return TactileFrame(frame.images[self._name], frame.time, frame.index, frame.surfaces[self._name])
+        name = self._name
+        return TactileFrame(frame.images[name], time=frame.time, index=frame.index, surface=frame.surfaces[name])
 
     def close(self) -> None:
         """The rig closes the cell."""

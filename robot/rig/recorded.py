@@ -60,7 +60,7 @@ class ObservedEpisode:
         config = ReplaySensorConfig(driver="replay", source=str(self.path))
         with error_context(f"{self.path}: sensor '{name}'"):
             reference = reference_image(self.episode.meta.attachments, name)
-            untouched = first if reference is None else TactileFrame(reference, first.time, first.index)
+            untouched = first if reference is None else TactileFrame(reference, time=first.time, index=first.index)
             found = recorded_normaliser(config, name, untouched.image, self.canonical)
             found.take_reference(untouched)
         return found
@@ -93,7 +93,7 @@ class RecordedSurfaces:
             try:
                 found = _normaliser_of(sensor, name, untouched, rig)
                 if found is not None and (found.finds_height or found.finds_flow):
-                    found.take_reference(TactileFrame(untouched, 0.0, 0))
+                    found.take_reference(TactileFrame(untouched, time=0.0, index=0))
                     self._normalisers[name] = found
                 elif found is not None and not meta.spec.sensors[name].height:
                     self.notes += _dots_in(untouched, name)

@@ -50,9 +50,10 @@ class LineMatrix:
 
     def __matmul__(self, control: NDArray[np.float32]) -> NDArray[np.float32]:
         """(nodes, m) -> (n, m)"""
-        product: NDArray[np.float32] = self.weight[0] * control[self.index[0]]
-        for index, weight in zip(self.index[1:], self.weight[1:], strict=True):
-            product += weight * control[index]
+        first, *others = (np.take(control, index, axis=0) for index in self.index)
+        product: NDArray[np.float32] = np.multiply(first, self.weight[0], out=first)
+        for other, weight in zip(others, self.weight[1:], strict=True):
+            product += np.multiply(other, weight, out=other)
         return product
 
 

@@ -248,9 +248,10 @@ def _table_of(
     points = _table_points(surface)
     value_x, slope_x = _table_matrices(shape[0], points)
     value_y, slope_y = _table_matrices(shape[1], points)
-    value = _product(value_y, control, value_x)
-    by_x = _product(value_y, control, slope_x) / np.float32(surface.spacing)
-    by_y = _product(slope_y, control, value_x) / np.float32(surface.spacing)
+    values_x, slopes_x = _along_x(value_x, control), _along_x(slope_x, control)
+    value, by_y, by_x = value_y @ values_x, slope_y @ values_x, value_y @ slopes_x  # (rows, 3 * columns)
+    value, by_x, by_y = (each.reshape(len(each), 3, -1).transpose(1, 0, 2) for each in (value, by_x, by_y))
+    by_x, by_y = by_x / np.float32(surface.spacing), by_y / np.float32(surface.spacing)
     a, b, c, d = 1.0 + by_x[0], by_y[0], by_x[1], 1.0 + by_y[1]  # J = [[a, b], [c, d]]
     determinant = a * d - b * c
     folded = float(determinant.min()) <= 0.0
@@ -270,14 +271,11 @@ def _table_matrices(nodes: int, points: int) -> tuple[LineMatrix, LineMatrix]:
     return line_matrices(np.arange((nodes - 1) * points + 1) / points, nodes)
 
 
-def _product(along_y: LineMatrix, control: Float32, along_x: LineMatrix) -> Float32:
-    """(3, rows, columns): both matrices applied to (nx, ny, 3) control values."""
+def _along_x(matrix: LineMatrix, control: Float32) -> Float32:
+    """(ny, 3 * columns): the matrix applied along x to (nx, ny, 3) control values."""
     nx, ny, _ = control.shape
-    in_x = (along_x @ control.reshape(nx, ny * 3)).reshape(-1, ny, 3)
-    columns = len(in_x)
-    in_xy = along_y @ np.ascontiguousarray(in_x.transpose(1, 2, 0)).reshape(ny, 3 * columns)
-    product: Float32 = in_xy.reshape(-1, 3, columns).transpose(1, 0, 2)
-    return product
+    in_x = (matrix @ control.reshape(nx, ny * 3)).reshape(-1, ny, 3)
+    return np.ascontiguousarray(in_x.transpose(1, 2, 0)).reshape(ny, -1)
 
 
 def _table_points(surface: GelSurface) -> int:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from copy import deepcopy
+from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +16,31 @@ from tacsim.physics.world import World
 from tacsim.sim.clock import Delayed, SimClock
 
 
+@dataclass
+class SimCamera:
+    """What the camera of a simulated sensor gives of a gel's surface.
+
+    render: gel surface -> (H, W, 3) uint8 RGB.
+    noise: drawn from the seed of the episode and the index of the frame; None: no noise.
+    """
+
+    render: Callable[[GelSurface], NDArray[np.uint8]]
+    noise: NoiseSource | None = None
+    _untouched: NDArray[np.uint8] | None = field(default=None, init=False)  # with which each episode begins
+
+    def __call__(self, surface: GelSurface, index: int, episode: int) -> NDArray[np.uint8]:
+        """(H, W, 3) RGB."""
+        if surface.displacement.any():
+            image = self.render(surface)
+        else:
+            if self._untouched is None:
+                self._untouched = self.render(surface)
+            image = self._untouched.copy()  # nobody writes into what is kept
+        return image if self.noise is None else self.noise(image, index, episode)
+
+
 class SimSensor:
-    """One simulated tactile sensor. A picture is rendered when it is read, once for each state of the world.
+    """One simulated tactile sensor. A picture is rendered when it is first looked at, once for each frame.
 
     Args:
         render: gel surface -> (H, W, 3) uint8 RGB.
@@ -37,9 +61,8 @@ class SimSensor:
         delay: int = 0,
     ) -> None:
         self._world, self._clock, self._frame, self.spec = world, clock, frame, spec
-        self._render, self._sample, self._noise = render, sample, noise
+        self._camera, self._sample = SimCamera(render, noise), sample
         self._past = Delayed[TactileFrame](delay)
-        self._untouched: tuple[NDArray[np.uint8], SurfaceMap] | None = None
         self._index = self._episode = 0
 
     def read(self, timeout: float) -> TactileFrame:
@@ -47,30 +70,19 @@ class SimSensor:
         return self._past(self._clock, self._frame_now)
 
     def _frame_now(self) -> TactileFrame:
-        image, seen = self._look(self._world.surface(self._frame))
-        if self._noise is not None:
-            image = self._noise(image, self._index, self._episode)
+        surface = self._world.surface(self._frame)
         self._index += 1
         return TactileFrame(
-            image=image,
+            image=partial(self._camera, surface, self._index - 1, self._episode),
             time=self._clock.now(),
             index=self._index - 1,
-            surface=seen,
+            surface=self._sample(surface),
             stats=self._clock.diagnostics(),
         )
 
-    def _look(self, surface: GelSurface) -> tuple[NDArray[np.uint8], SurfaceMap]:
-        """Picture without noise, and heights. Those of an untouched gel, with which each episode begins, are kept."""
-        if surface.displacement.any():
-            return self._render(surface), self._sample(surface)
-        if self._untouched is None:
-            self._untouched = self._render(surface), self._sample(surface)
-        return deepcopy(self._untouched)  # nobody writes into what is kept
-
     def wear(self, render: Callable[[GelSurface], NDArray[np.uint8]], noise: NoiseSource | None, delay: int) -> None:
         """Other light and another camera, from the next episode on."""
-        self._render, self._noise = render, noise
-        self._past, self._untouched = Delayed[TactileFrame](delay), None
+        self._camera, self._past = SimCamera(render, noise), Delayed[TactileFrame](delay)
 
     def restart(self, episode: int = 0) -> None:
         """Counts frames from zero again; `episode` seeds the noise."""

@@ -23,8 +23,8 @@ def test_a_bundle_of_the_first_release_gives_the_heights_that_it_gave_then() -> 
     assert calibration.provenance.software == "tacsim 0.1.0" and len(calibration.residuals) == 8
     expected = json.loads((BUNDLE / "heights.json").read_text(encoding="utf-8"))
     normalise = normaliser_for_calibration(calibration, CanonicalGrid(), reference)
-    normalise.take_reference(TactileFrame(reference, 0.0, 0))
-    seen = normalise(TactileFrame(read_image(BUNDLE / "press.png"), 0.1, 1), now=0.2)
+    normalise.take_reference(TactileFrame(reference, time=0.0, index=0))
+    seen = normalise(TactileFrame(read_image(BUNDLE / "press.png"), time=0.1, index=1), now=0.2)
     assert seen.height is not None and seen.gradient is not None
     at = tuple(np.array([(cell["row"], cell["column"]) for cell in expected["cells"]]).T)
     # the last bits may differ: OpenCV and SciPy round differently from version to version

@@ -70,8 +70,8 @@ def test_a_sensor_is_calibrated_within_its_region(bundle: Path) -> None:
     assert calibration.geometry.pixel_pitch == pytest.approx(PITCH)
     normalise = normaliser_for_camera(camera(calibration=str(bundle / "out")), (1.0, 1.0), GRID)
     empty = np.asarray(Image.open(bundle / "frames" / "background.png"))
-    normalise.take_reference(TactileFrame(empty, 0.0, 0))
-    seen = normalise(TactileFrame(np.asarray(Image.open(bundle / "unseen.png")), 0.1, 1), now=0.2)
+    normalise.take_reference(TactileFrame(empty, time=0.0, index=0))
+    seen = normalise(TactileFrame(np.asarray(Image.open(bundle / "unseen.png")), time=0.1, index=1), now=0.2)
     assert seen.height is not None
     assert seen.height.max() == pytest.approx(0.45e-3, rel=0.15)
     y, x = np.unravel_index(seen.height.argmax(), seen.height.shape)
@@ -112,10 +112,10 @@ def test_a_camera_finds_flow_by_the_pitch_of_its_dots_within_a_region() -> None:
     normalise = normaliser_for_camera(camera(marker_pitch=1.9e-3, region=region), (16e-3, 16e-3), GRID)
     assert normalise.finds_flow and not normalise.finds_height
     with pytest.raises(ValueError, match="no lattice of dark dots"):
-        normalise.take_reference(TactileFrame(np.full((*SHAPE, 3), 100, dtype=np.uint8), 0.0, 0))
-    normalise.take_reference(TactileFrame(shown(render(flat()), 1), 0.0, 1))
+        normalise.take_reference(TactileFrame(np.full((*SHAPE, 3), 100, dtype=np.uint8), time=0.0, index=0))
+    normalise.take_reference(TactileFrame(shown(render(flat()), 1), time=0.0, index=1))
     slid = dent((0.5e-3, 0.4e-3), 0.4e-3, (0.3e-3, -0.1e-3))
-    seen = normalise(TactileFrame(shown(render(slid), 2), 0.1, 2), now=0.2)
+    seen = normalise(TactileFrame(shown(render(slid), 2), time=0.1, index=2), now=0.2)
     assert seen.flow is not None
     np.testing.assert_allclose(seen.flow, marker_flow(slid, markers), atol=0.2 * 0.065e-3)  # a fifth of a pixel
     with pytest.raises(ValidationError, match=r"give one of .*\(the others null\)"):

@@ -42,7 +42,7 @@ class Parts:
             raise OSError(f"{what} failed")
 
     def frame(self, value: int) -> TactileFrame:
-        return TactileFrame(np.full((4, 6, 3), value, np.uint8), self.time, 0)
+        return TactileFrame(np.full((4, 6, 3), value, np.uint8), time=self.time, index=0)
 
     def read(self, timeout: float) -> TactileFrame:
         self.note("read")
@@ -79,7 +79,16 @@ class Parts:
 
     def __call__(self, frame: TactileFrame, now: float) -> TactileObservation:
         mask = np.ones((4, 6), bool)
-        return TactileObservation(frame.image, None, None, ~mask, mask, None, frame.time, now - frame.time)
+        return TactileObservation(
+            frame.image,
+            gradient=None,
+            height=None,
+            contact=~mask,
+            valid=mask,
+            flow=None,
+            time=frame.time,
+            age=now - frame.time,
+        )
 
     def stop(self) -> None:
         self.note("stop")

@@ -121,8 +121,8 @@ def normaliser(repeat: int) -> list[Measurement]:
     render = Renderer(model, (20e-3, 20e-3))
     normalise = normaliser_for_calibration(calibration, grid)
     flat = replace(surface, displacement=np.zeros_like(surface.displacement))
-    normalise.take_reference(TactileFrame(render(flat), 0.0, 0))
-    frame = TactileFrame(render(surface), 0.0, 0)
+    normalise.take_reference(TactileFrame(render(flat), time=0.0, index=0))
+    frame = TactileFrame(render(surface), time=0.0, index=0)
     timing, seen = timed(partial(normalise, frame, 0.0), max(repeat, MIN_REPETITIONS))
     truth = surface_map(surface, grid, None).height
     assert seen.height is not None

@@ -96,7 +96,7 @@ class CalibratedSensor:
             self.model = read_sensor_model(Path(place))
             self._render = Renderer(self.model, gel_size)
         self._normalise = normaliser_for_calibration(calibration, GRID)
-        self._normalise.take_reference(TactileFrame(reference, 0.0, 0))
+        self._normalise.take_reference(TactileFrame(reference, time=0.0, index=0))
 
     def see(self, surface: GelSurface) -> Image:
         return self._render(surface)
@@ -105,7 +105,7 @@ class CalibratedSensor:
         """(h, w) [m] on the canonical grid, as the inverse model finds it."""
         from tacsim.interface import TactileFrame
 
-        found = self._normalise(TactileFrame(image, 0.0, 0), 0.0).height
+        found = self._normalise(TactileFrame(image, time=0.0, index=0), 0.0).height
         assert found is not None
         return found.astype(np.float64)
 

@@ -146,8 +146,8 @@ def test_a_bundle_rendered_and_found_again_gives_the_same_heights(tmp_path: Path
         normaliser_for_calibration(calibration, grid, reference),
         normaliser_for_pictures(model, (COLUMNS * PITCH, ROWS * PITCH), grid),
     ):
-        normalise.take_reference(TactileFrame(reference, 0.0, 0))
-        seen = normalise(TactileFrame(picture, 0.1, 1), now=0.2)
+        normalise.take_reference(TactileFrame(reference, time=0.0, index=0))
+        seen = normalise(TactileFrame(picture, time=0.1, index=1), now=0.2)
         assert seen.height is not None and seen.gradient is not None
         off = (seen.height - true.height)[seen.valid]
         assert np.sqrt((off**2).mean()) < 0.03 * true.height.max()

@@ -113,7 +113,7 @@ def test_without_its_distance_a_pinhole_would_be_seen_as_motion() -> None:
 def test_fast_path_and_picture_have_the_same_lattice() -> None:
     surface = drag((0.5e-3, -0.2e-3))
     render = Renderer(MODEL, GEL)
-    known = TactileFrame(render(surface), 0.0, 1, surface_map(surface, GRID, MARKERS))
+    known = TactileFrame(render(surface), time=0.0, index=1, surface=surface_map(surface, GRID, MARKERS))
     seen = []
     for normalise, shown in (
         (normaliser_for_simulation(MODEL, GEL, GRID), known),

@@ -158,14 +158,14 @@ def test_an_episode_is_a_side_with_its_surfaces(real: FrameSet) -> None:
         height=np.full((64, 64), 1e-4, dtype=np.float32), gradient=np.zeros((64, 64, 2), dtype=np.float32), flow=None
     )
     spec = RigSpec({"left": SensorSpec((200, 260), True, False, None)}, (), False, 0.1)
-    references = {"left": TactileFrame(real.reference, 0.0, 0)}
+    references = {"left": TactileFrame(real.reference, time=0.0, index=0)}
     meta = EpisodeMeta(
         rig="made", task=None, policy="none", seed=0, spec=spec, versions={},
         attachments=reference_attachments(references),
     )  # fmt: skip
     with Recorder(Path("e.mcap"), meta) as recorder:
         for k, shot in enumerate(real.frames):
-            frames = {"left": TactileFrame(shot.image, 0.1 * k, k, surface)}
+            frames = {"left": TactileFrame(shot.image, time=0.1 * k, index=k, surface=surface)}
             assert recorder.write(Step(index=k, time=0.1 * k, frames=frames, arms={}))
     read = read_frame_set(Path("e.mcap"))
     assert read.reference_from == "the recording's own"

@@ -66,7 +66,7 @@ def test_errors_and_checks_are_shown_the_same_way(capsys: pytest.CaptureFixture[
 def test_names_in_a_recording_are_shown_not_obeyed(tmp_path: Path) -> None:
     spec = RigSpec({"lower": SensorSpec((8, 8), False, False, None)}, (), truth=False, period=0.1)
     meta = EpisodeMeta("rig\nerror: all is lost" + EVIL, None, EVIL, 0, spec, {EVIL: EVIL})
-    frames = {"lower": TactileFrame(np.zeros((8, 8, 3), np.uint8), 0.0, 0)}
+    frames = {"lower": TactileFrame(np.zeros((8, 8, 3), np.uint8), time=0.0, index=0)}
     with Recorder("e.mcap", meta) as recorder:
         recorder.write(Step(0, 0.0, frames, {}))
     result = tacsim("replay", "e.mcap", "--out", "r")

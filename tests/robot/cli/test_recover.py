@@ -26,7 +26,7 @@ def cut(tmp_path: Path) -> Path:
     rng = np.random.default_rng(0)
     with Recorder("whole.mcap", EpisodeMeta("r", None, "p", 0, spec, {}, {"rig.yaml": b"name: r"})) as recorder:
         for k in range(STEPS + 1):
-            frame = TactileFrame(rng.integers(0, 255, (64, 64, 3), np.uint8), 0.1 * k, k)
+            frame = TactileFrame(rng.integers(0, 255, (64, 64, 3), np.uint8), time=0.1 * k, index=k)
             recorder.write(Step(k, 0.1 * k, {"lower": frame}, {}))
     data = (tmp_path / "whole.mcap").read_bytes()
     (tmp_path / "cut.mcap").write_bytes(data[: data.index(b"tacsim.close") - 3000])

@@ -60,7 +60,7 @@ def test_what_the_reproduction_tells() -> None:
     config = as_json({"squeeze": {"seed": made_up([1.0, 0.0, 1.0])}})
     assert set(config["squeeze"]["seed"]) >= {"step", "reward", "goal", "image_difference"}
     json.dumps(config, allow_nan=False)
-    dark, bright = (TactileFrame(np.full((2, 2, 3), value, np.uint8), 0.0, 0) for value in (250, 10))
+    dark, bright = (TactileFrame(np.full((2, 2, 3), value, np.uint8), time=0.0, index=0) for value in (250, 10))
     assert image_difference({"a": bright, "b": dark}, {"a": dark, "b": dark}) == 120.0  # no wrap-around of uint8
 
 

@@ -56,7 +56,7 @@ class Hand:
     def read(self, timeout: float) -> TactileFrame:
         if self.ticks >= self.frames:
             raise EndOfEpisode(f"{self.frames} frames")
-        return TactileFrame(np.full((8, 8, 3), self.ticks, np.uint8), self.now(), self.ticks)
+        return TactileFrame(np.full((8, 8, 3), self.ticks, np.uint8), time=self.now(), index=self.ticks)
 
     def state(self, at: float | None = None) -> ArmState:
         return ArmState(self.pose, np.zeros(6), np.zeros(6), None, self.now())
@@ -73,7 +73,7 @@ class Hand:
 
     def clear(self, seed: int) -> Mapping[str, TactileFrame]:
         self.ticks, self.resets = 0, self.resets + 1
-        return {"lower": TactileFrame(np.full((8, 8, 3), 200 + seed, np.uint8), 0.0, 0)}
+        return {"lower": TactileFrame(np.full((8, 8, 3), 200 + seed, np.uint8), time=0.0, index=0)}
 
     def touch(self) -> None:
         pass
@@ -86,7 +86,9 @@ class Hand:
 
     def __call__(self, frame: TactileFrame, now: float) -> TactileObservation:
         mask = np.ones((4, 4), bool)
-        return TactileObservation(frame.image, None, None, mask, mask, None, frame.time, 0.0)
+        return TactileObservation(
+            frame.image, gradient=None, height=None, contact=mask, valid=mask, flow=None, time=frame.time, age=0.0
+        )
 
     def truth(self) -> Truth:
         height = 10e-3 - self.pose.position[2]

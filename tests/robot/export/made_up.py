@@ -38,7 +38,7 @@ def made_up_step(index: int, names: Sequence[str], seed: int) -> Step:
             flow=rng.normal(0.0, 1e-4, (5, 7, 2)).astype(np.float32),
         )
         image = rng.integers(90, 160, (*SHAPE, 3), dtype=np.uint8)
-        return TactileFrame(image, PERIOD * index, index, surface)
+        return TactileFrame(image, time=PERIOD * index, index=index, surface=surface)
 
     def arm() -> ArmState:
         return ArmState(turned(rng, 0.1), rng.normal(size=6), rng.normal(size=6), None, PERIOD * index)

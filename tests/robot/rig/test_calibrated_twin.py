@@ -103,7 +103,7 @@ def finds(bundle: Path) -> tuple[Callable[[GelSurface], np.ndarray], FrameNormal
     calibration, untouched = read_bundle(bundle)
     normalise = normaliser_for_calibration(calibration, GRID, untouched)
     render = Renderer(read_sensor_model(bundle), GEL)
-    normalise.take_reference(TactileFrame(render(dent(0.0, 0.0, 0.0)), 0.0, 0))
+    normalise.take_reference(TactileFrame(render(dent(0.0, 0.0, 0.0)), time=0.0, index=0))
     return render, normalise
 
 
@@ -115,7 +115,7 @@ def test_the_circle_closes(finger: Path) -> None:
     dents = [(0.45e-3, -1.5e-3, 1e-3), (0.55e-3, 2.2e-3, -0.8e-3), (0.3e-3, 3e-3, 3e-3)]
     for number, (depth, x, y) in enumerate(dents, start=1):
         surface = dent(depth, x, y)
-        found = normalise(TactileFrame(render(surface), 0.1, number), now=0.1)
+        found = normalise(TactileFrame(render(surface), time=0.1, index=number), now=0.1)
         true = surface_map(surface, GRID, None)
         assert found.height is not None and found.gradient is not None
         pressed = found.valid & (true.height > 0.3 * depth)
@@ -287,7 +287,7 @@ def test_the_dots_of_a_bundle_move_with_the_gel(dotted: Path) -> None:
     assert markers is not None
     for number, slide in enumerate([(0.2e-3, -0.1e-3), (0.4e-3, -0.25e-3), (0.55e-3, -0.4e-3)], start=1):
         surface = dent(0.35e-3, 0.4e-3, -0.3e-3, slide)
-        seen = normalise(TactileFrame(render(surface), 0.1, number), now=0.1)
+        seen = normalise(TactileFrame(render(surface), time=0.1, index=number), now=0.1)
         true = surface_map(surface, GRID, markers)
         assert seen.flow is not None and true.flow is not None and seen.height is not None
         assert normalise.kept == 1.0 and np.abs(true.flow).max() > 0.8 * max(slide)
@@ -325,15 +325,15 @@ def test_the_twin_of_an_askew_camera_delivers_its_picture(finger: Path, tmp_path
     picture = askew[0](surface)
     assert picture.shape == (240, 320, 3) and not picture[:10].any()  # black beside the gel
     metric, native = (
-        normalise(TactileFrame(render(surface), 0.1, 1), now=0.1) for render, normalise in (straight, askew)
+        normalise(TactileFrame(render(surface), time=0.1, index=1), now=0.1) for render, normalise in (straight, askew)
     )
     assert metric.height is not None and native.height is not None
     both = metric.valid & native.valid
     assert both.sum() > 0.95 * metric.valid.sum()
     assert np.abs(metric.height - native.height)[both].max() < 0.03 * 0.5e-3
     by_model = normaliser_for_simulation(model, GEL, GRID)
-    by_model.take_reference(TactileFrame(askew[0](dent(0.0, 0.0, 0.0)), 0.0, 0))
-    seen = by_model(TactileFrame(picture, 0.1, 1, surface_map(surface, GRID, None)), now=0.1)
+    by_model.take_reference(TactileFrame(askew[0](dent(0.0, 0.0, 0.0)), time=0.0, index=0))
+    seen = by_model(TactileFrame(picture, time=0.1, index=1, surface=surface_map(surface, GRID, None)), now=0.1)
     assert np.abs(seen.image.astype(int) - metric.image).mean() < 1.0
 
 

@@ -25,7 +25,7 @@ def test_a_cameras_pictures_are_seen_by_its_own_model(tmp_path: Path) -> None:
     across = np.linspace(-1.0, 1.0, columns) ** 2 + np.linspace(-1.0, 1.0, rows)[:, None] ** 2
     untouched = np.full((rows, columns, 3), 120, np.uint8)
     pressed = untouched + (40 * np.exp(-20 * across)[..., None] * (1.0, -0.5, 0.2)).astype(np.uint8)
-    frames = [TactileFrame(image, 0.1 * k, k) for k, image in enumerate((untouched, pressed))]
+    frames = [TactileFrame(image, time=0.1 * k, index=k) for k, image in enumerate((untouched, pressed))]
     spec = RigSpec({"upper": SensorSpec((rows, columns), height=True, flow=False, arm=None)}, (), False, 0.1)
     attachments = {"rig.yaml": loaded.text.encode(), **reference_attachments({"upper": frames[0]})}
     path = tmp_path / "e.mcap"

@@ -77,7 +77,7 @@ class StubSensor:
     def read(self, timeout: float) -> TactileFrame:
         self._log.append("reference")
         self.late -= 1
-        return TactileFrame(np.zeros((4, 4, 3), np.uint8), 0.0 if self.late >= 0 else time.monotonic(), 0)
+        return TactileFrame(np.zeros((4, 4, 3), np.uint8), time=0.0 if self.late >= 0 else time.monotonic(), index=0)
 
     def close(self) -> None: ...
 

@@ -31,12 +31,23 @@ def touch(depth: float, drag: float, hidden: float = 0.0, time: float = 0.0) -> 
     flow[0, 1] = (0.6 * drag, -0.8 * drag)
     flow[1, 1] = np.nan  # a marker that was lost
     image = np.zeros((4, 4, 3), np.uint8)
-    return TactileObservation(image, np.zeros((4, 4, 2), np.float32), height, valid, valid, flow, time, 0.0)
+    return TactileObservation(
+        image,
+        gradient=np.zeros((4, 4, 2), np.float32),
+        height=height,
+        contact=valid,
+        valid=valid,
+        flow=flow,
+        time=time,
+        age=0.0,
+    )
 
 
 def blind() -> TactileObservation:
     seen = touch(0.0, 0.0)
-    return TactileObservation(seen.image, None, None, seen.contact, seen.valid, None, 0.0, 0.0)
+    return TactileObservation(
+        seen.image, gradient=None, height=None, contact=seen.contact, valid=seen.valid, flow=None, time=0.0, age=0.0
+    )
 
 
 def test_a_gel_pressed_or_dragged_too_far_ends_the_episode() -> None:

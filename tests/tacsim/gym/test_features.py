@@ -11,6 +11,7 @@ from gymnasium.utils.env_checker import check_env
 from pydantic import ValidationError
 
 from tacsim.interface import IncompatibleRig
+from tacsim.optics.render import Renderer
 from tests.tacsim.gym.small import SMALL, assert_equal, make, make_native
 
 FEATURES: dict[str, Any] = {"grid": {"rows": 4, "columns": 4, "pitch": "2 mm"}, "frames": 2}
@@ -28,6 +29,19 @@ def test_check_env_is_content_without_a_warning() -> None:
         check_env(env, skip_render_check=True)
     shapes = {key: box.shape for key, box in env.observation_space.items()}
     assert shapes == {"maps": (2 * 2 * 10, 4, 4), "flow": (2 * 2 * 2, 3, 4), "touch": (2 * 43,), "goal": (1,)}
+    env.close()
+
+
+@pytest.mark.parametrize(("maps", "pictures"), [(["height", "contact"], 0), (["image"], 2)])
+def test_no_picture_is_rendered_that_nobody_looks_at(
+    monkeypatch: pytest.MonkeyPatch, maps: list[str], pictures: int
+) -> None:
+    env, rendered = make(features={**FEATURES, "maps": maps}), []
+    env.reset(seed=1)
+    render = Renderer.__call__
+    monkeypatch.setattr(Renderer, "__call__", lambda *given: (rendered.append(0), render(*given))[1])
+    env.step(env.action_space.sample())
+    assert len(rendered) == pictures
     env.close()
 
 

@@ -35,7 +35,7 @@ rng = np.random.default_rng(0)
 for k in range(100000):
     image = rng.integers(0, 256, (48, 64, 3), dtype=np.uint8)
     image[0, 0] = k % 256
-    recorder.write(Step(index=k, time=0.1 * k, frames={"lower": TactileFrame(image, 0.1 * k, k)}, arms={}))
+    recorder.write(Step(index=k, time=0.1 * k, frames={"lower": TactileFrame(image, time=0.1 * k, index=k)}, arms={}))
     assert recorder.flush()
     print(k, flush=True)
 """
@@ -168,7 +168,7 @@ def test_a_disk_that_is_full_from_the_start_leaves_nothing(
 def test_a_step_that_cannot_be_encoded_ends_the_recording(
     tmp_path: Path, meta: EpisodeMeta, make_step: Callable[..., Step]
 ) -> None:
-    grey = TactileFrame(np.zeros((4, 4), np.uint8), 0.0, 0)
+    grey = TactileFrame(np.zeros((4, 4), np.uint8), time=0.0, index=0)
     with Recorder(tmp_path / "e.mcap", meta) as recorder:
         recorder.write(make_step(0))
         recorder.write(replace(make_step(1), frames={"lower": grey}))
@@ -189,7 +189,7 @@ def test_a_step_that_cannot_be_encoded_ends_the_recording(
     ],
 )
 def test_a_surface_that_would_lose_something_is_refused(surface: SurfaceMap, message: str) -> None:
-    frame = TactileFrame(np.zeros((4, 4, 3), np.uint8), 0.0, 0, surface)
+    frame = TactileFrame(np.zeros((4, 4, 3), np.uint8), time=0.0, index=0, surface=surface)
     with pytest.raises(ValueError, match=message):
         writer.encode_step(Step(index=0, time=0.0, frames={"lower": frame}, arms={}), 1e-3)
 

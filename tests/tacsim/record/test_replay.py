@@ -130,7 +130,7 @@ def test_the_only_sensor_of_an_episode_goes_by_any_name(
 ) -> None:
     spec = replace(meta.spec, sensors={"side": meta.spec.sensors["side"]}, arms=("upper",))
     step = make_step(0)
-    blank = TactileFrame(np.full((24, 32, 3), 9, np.uint8), 0.0, 0)
+    blank = TactileFrame(np.full((24, 32, 3), 9, np.uint8), time=0.0, index=0)
     config = replace(meta, spec=spec, attachments=reference_attachments({"side": blank}))
     with Recorder(tmp_path / "one.mcap", config) as recorder:
         recorder.write(replace(step, frames={"side": step.frames["side"]}, arms={"upper": step.arms["upper"]}))

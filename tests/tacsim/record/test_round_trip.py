@@ -185,7 +185,7 @@ def test_png_holds_rgb_not_bgr() -> None:
 
 def test_references_travel_as_attachments(tmp_path: Path, meta: EpisodeMeta) -> None:
     image = np.random.default_rng(0).integers(0, 256, (24, 32, 3), dtype=np.uint8)
-    attachments = reference_attachments({"lower": TactileFrame(image, 0.0, 0)})
+    attachments = reference_attachments({"lower": TactileFrame(image, time=0.0, index=0)})
     record(tmp_path / "e.mcap", replace(meta, attachments=attachments), [])
     read = read_episode(tmp_path / "e.mcap").meta.attachments
     assert same(reference_image(read, "lower"), image)

@@ -53,7 +53,7 @@ def _step(k: int, sensors: tuple[str, ...], arms: bool, reward: bool, width: int
     return Step(
         index=k,
         time=0.1 * k,
-        frames={name: TactileFrame(image, 0.1 * k, k) for name in sensors},
+        frames={name: TactileFrame(image, time=0.1 * k, index=k) for name in sensors},
         arms={name: ArmState(Pose(), np.zeros(6), wrench, None, 0.1 * k) for name in sensors} if arms else {},
         action=Action() if k else None,
         reward=-distance * 1e3 if reward else None,

@@ -23,7 +23,7 @@ def episode(times: list[float], age: float = 0.03, live: bool = True) -> Episode
         Step(
             index=k,
             time=time,
-            frames={"lower": TactileFrame(IMAGE, time - age, k)},
+            frames={"lower": TactileFrame(IMAGE, time=time - age, index=k)},
             arms={},
             info={"alignment_left": 1e-3 * k, "limits_hit_left": float(2 * k), **FRAMES} if live else {},
         )

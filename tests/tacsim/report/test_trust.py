@@ -26,7 +26,7 @@ def episode(*infos: dict[str, float]) -> Episode:
         Step(
             index=k,
             time=0.1 * k,
-            frames={"left_2": TactileFrame(IMAGE, 0.1 * k, k)},
+            frames={"left_2": TactileFrame(IMAGE, time=0.1 * k, index=k)},
             arms={},
             info={"contact_signal_left_2": 0.0} | info,
         )

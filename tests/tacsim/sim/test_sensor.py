@@ -140,25 +140,29 @@ def test_a_motion_beyond_the_limit_is_shortened_told_and_counted(spring_world: A
     assert clock.diagnostics()["shortened"] == 0.0
 
 
-def test_a_picture_is_rendered_once_a_state_and_only_when_read(spring_world: Any) -> None:
+def test_a_picture_is_rendered_when_it_is_looked_at_and_once(spring_world: Any) -> None:
+    """Whatever has happened since: it shows the gel as it was when the frame was read."""
     clock, lower, _ = make_arms(spring_world)
     approach_force(spring_world, 1.0)  # untouched, all states look alike
     rendered: list[float] = []
 
     def render(surface: Any) -> np.ndarray:
-        rendered.append(clock.now())
-        return np.zeros((4, 6, 3), np.uint8)
+        rendered.append(1e3 * float(np.abs(surface.displacement).max()))
+        return np.full((4, 6, 3), len(rendered), np.uint8)
 
     spec = SensorSpec((4, 6), height=True, flow=False, arm="lower")
     sensor = SimSensor(spring_world, clock, "lower", spec, render, lambda surface: None)  # type: ignore[arg-type, return-value]
     clock.tick()
-    assert rendered == []
     first = sensor.read(0.0)
     assert sensor.read(0.0) is first
+    was = 1e3 * float(np.abs(spring_world.surface("lower").displacement).max())
     lower.command(shifted(Pose(), z=1e-4))
     clock.tick()
     second = sensor.read(0.0)
-    assert rendered == pytest.approx([0.1, 0.2])
+    assert rendered == []
+    assert first.image is first.image and (first.image == 1).all()
+    assert rendered == [was]
+    assert (second.image == 2).all() and rendered[1] != was
     assert (first.index, second.index) == (0, 1)
     assert second.time == pytest.approx(0.2)
 

@@ -64,7 +64,9 @@ def touched(top: Top, height: float, middle: FloatArray, upper: FloatArray) -> O
         y = -side * cells[..., 1] + pose.position[1] - middle[1]
         depth = np.maximum(top(side * x, side * y) - z, 0.0).astype(np.float32)
         image = np.zeros((1, 1, 3), np.uint8)
-        tactile[name] = TactileObservation(image, None, depth, depth > 20e-6, valid, None, 0.0, 0.0)
+        tactile[name] = TactileObservation(
+            image, gradient=None, height=depth, contact=depth > 20e-6, valid=valid, flow=None, time=0.0, age=0.0
+        )
     arms = {name: ArmState(pose, np.zeros(6), np.zeros(6), None, 0.0) for name, pose in poses.items()}
     return Observation(tactile, arms, 0.0)
 

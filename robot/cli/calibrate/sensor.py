@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import shlex
 from dataclasses import dataclass
@@ -230,7 +231,7 @@ def _region(text: str) -> PictureRegion:
         points = [tuple(float(number) for number in point.split(",")) for point in text.split()]
     except ValueError:
         points = []
-    if len(points) < 3 or any(len(point) != 2 for point in points):
+    if len(points) < 3 or any(len(point) != 2 or not all(map(math.isfinite, point)) for point in points):
         raise typer.BadParameter(
             f"'{text}' is no polygon of three points or more; for example \"67,68 465,113 475,383 73,437\"",
             param_hint="--region",

@@ -145,7 +145,8 @@ def _calibrate(
     fit = _fitted(read, asked.ball / pitch, None if found is None else found.radius / pitch)
     from calibration.light.verdict import KnownScale
 
-    scale = KnownScale(pitch, asked.ball, asked.gel_size, asked.profile.gel_thickness, asked.depths)
+    published = asked.pitch is None and asked.view is None and asked.size is None
+    scale = KnownScale(pitch, asked.ball, asked.gel_size, asked.profile.gel_thickness, asked.depths, published)
     write_calibration(
         asked.folder, fit, read, asked.serial, scale, found, asked.profile, view=seen, region=asked.region
     )

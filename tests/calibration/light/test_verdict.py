@@ -48,6 +48,8 @@ def test_lengths_that_nothing_checks_are_not_called_good(fit: LightFit) -> None:
     for found, pitch in ((fit, PITCH), (wrong, 1.6 * PITCH)):
         assert "nothing checks the lengths" in said(found, KnownScale(pitch, BALL), "usable")
     assert "of the gel are to be seen" in said(wrong, KnownScale(1.6 * PITCH, BALL, SIZE), "do not trust")
+    shown = (1.6 * SIZE[0], 1.6 * SIZE[1])  # by a profile that is another sensor's, whose pitch was taken with it
+    assert "published" in said(wrong, KnownScale(1.6 * PITCH, BALL, shown, pitch_from_size=True), "usable")
 
 
 @pytest.mark.parametrize(("count", "word"), [(1, "do not trust"), (2, "do not trust"), (4, "usable")])

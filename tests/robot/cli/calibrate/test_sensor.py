@@ -96,6 +96,8 @@ def test_the_command_ends_in_a_verdict(folder: Path, tmp_path: Path) -> None:
     assert calibration.provenance.ball_radius == pytest.approx(BALL)
     assert calibration.provenance.warnings[0].startswith("verdict: do not trust")
     assert "do not trust" in (tmp_path / "out" / "verdict.html").read_text(encoding="utf-8")
+    ran = tacsim("calibrate", "sensor", folder, *lengths[:4], "--out", tmp_path / "published")  # its pitch is DIGIT's
+    assert "nothing checks it on yours" in ran.output and "mm of the gel" in ran.output
 
 
 @pytest.mark.parametrize(
@@ -179,6 +181,7 @@ def test_markers_are_measured_when_asked_for_and_noticed_when_not(tmp_path: Path
     ran = tacsim(*words, "--markers", "--out", tmp_path / "out")
     assert ran.exit_code == 0, ran.output
     assert "markers: 7 x 9, 1.9 mm apart, radius 0.3" in ran.stderr
+    assert "<li>markers: 7 x 9, 1.9 mm apart" in (tmp_path / "out" / "verdict.html").read_text(encoding="utf-8")
     calibration, reference = read_bundle(tmp_path / "out")
     markers = calibration.markers
     assert markers is not None and (markers.rows, markers.columns) == (7, 9)

@@ -121,6 +121,10 @@ def sensor(
     """
     if (frames is None) == (camera is None):
         raise typer.BadParameter("give either a folder of frames, or --camera to press now")
+    if camera is None and set_:
+        raise typer.BadParameter("it changes a camera's rig; a folder has none", param_hint="--set")
+    if camera is not None and reference is not None:
+        raise typer.BadParameter("with --camera it is taken first, of the free gel", param_hint="--reference")
     asked = _asked(
         ball_diameter, ball_radius, kind, pixel_pitch, view, size, region, known_depth, serial, out, markers=markers
     )

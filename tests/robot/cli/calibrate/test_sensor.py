@@ -115,12 +115,19 @@ def test_the_command_ends_in_a_verdict(folder: Path, tmp_path: Path) -> None:
         (("--ball-diameter", "6 mm", "--pixel-pitch", "0.06 mm", "--depth", "press_1.png=1"), "say '1 mm'"),
         (("--ball-diameter", "6 mm", "--pixel-pitch", "0.06 mm", "--serial", "my finger"), "'my finger' is no serial"),
         (("--ball-diameter", "6 mm", "--pixel-pitch", "0.06 mm", "--region", "9,9 900,9 9,90"), "900,9"),
+        (("--ball-diameter", "6 mm", "--pixel-pitch", "0.06 mm", "--set", "foo.bar=1"), "it changes a camera's rig"),
     ],
 )
 def test_the_command_refuses_lengths_that_may_be_wrong(folder: Path, words: tuple[str, ...], said: str) -> None:
     ran = tacsim("calibrate", "sensor", folder, *words, COLUMNS="300")
     assert ran.exit_code == 2
     assert said in ran.output
+
+
+def test_a_camera_takes_its_own_reference() -> None:
+    words = ("--camera", "http://127.0.0.1:9/", "--reference", "free.png", "--ball-diameter", "6 mm", "--kind", "mini")
+    ran = tacsim("calibrate", "sensor", *words, COLUMNS="300")
+    assert ran.exit_code == 2 and "taken first" in ran.output
 
 
 def test_the_command_measures_the_cameras_noise(folder: Path, tmp_path: Path) -> None:

@@ -142,7 +142,10 @@ def _of_scale(fit: LightFit, scale: KnownScale) -> Iterable[Finding]:
             "measure the ball by a calliper (its radius is half of that) and the pitch by a board or a ruler",
         )  # fmt: skip
     elif wide:
-        yield Finding("usable", f"the contact of {_names(wide)} is as wide as the ball", "look at it, and leave it out")
+        yield Finding(
+            "usable", f"the contact of {_names(wide)} is as wide as the ball",
+            "measure ball (is it the radius that was given?) and pitch; if both are right, leave it out",
+        )  # fmt: skip
     elif max(ratios) < NARROWEST:
         yield Finding(
             "usable", f"no contact is wider than {max(ratios):.2f} of the ball: light presses, a diameter given for "

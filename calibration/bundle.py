@@ -103,6 +103,11 @@ class Calibration(Config):
         """Rows, columns of the pictures that the sensor's camera delivers."""
         return (self.geometry.height, self.geometry.width) if self.view is None else self.view.image_shape
 
+    @property
+    def distrusted(self) -> bool:
+        """The verdict that was written with it is not to trust it."""
+        return any(words.startswith("verdict: do not trust") for words in self.provenance.warnings)
+
     @model_validator(mode="after")
     def _parts_agree(self) -> Self:
         if (self.forward is None) != (self.inverse is None) or (self.forward is None) == (self.darkness is None):

@@ -69,6 +69,7 @@ class KnownScale:
     gel_size: tuple[float, float] | None = None  # that the picture should show [m]
     gel_thickness: float | None = None  # [m]
     depths: tuple[tuple[str, float], ...] = ()  # frames whose indentation is known [m]
+    pitch_from_size: bool = False  # the pitch is published and follows from `gel_size`: neither checks the other
 
 
 def judge(fit: LightFit, scale: KnownScale, *, dots: bool = False) -> Verdict:
@@ -141,13 +142,23 @@ def _of_scale(fit: LightFit, scale: KnownScale) -> Iterable[Finding]:
             "measure the ball by a calliper (its radius is half of that) and the pitch by a board or a ruler",
         )  # fmt: skip
     elif wide:
-        yield Finding("usable", f"the contact of {_names(wide)} is as wide as the ball", "look at it, and leave it out")
+        yield Finding(
+            "usable", f"the contact of {_names(wide)} is as wide as the ball",
+            "measure ball (is it the radius that was given?) and pitch; if both are right, leave it out",
+        )  # fmt: skip
     elif max(ratios) < NARROWEST:
         yield Finding(
             "usable", f"no contact is wider than {max(ratios):.2f} of the ball: light presses, a diameter given for "
             "the radius, or too small a pixel pitch", "measure ball and pitch; press as deep as the work will",
         )  # fmt: skip
-    if scale.gel_size is None and not scale.depths:  # a pitch 1.6 times too large may look as good as the right one
+    # A pitch 1.6 times too large may look as good as the right one
+    if scale.pitch_from_size and not scale.depths:
+        yield Finding(
+            "usable", "the pixel pitch is the published one of this kind of sensor, and nothing checks it on yours",
+            "measure it (--pixel-pitch, --view) or the gel that the picture shows (--size), or say how deep a press is "
+            "(--depth)",
+        )  # fmt: skip
+    elif scale.gel_size is None and not scale.depths:
         yield Finding(
             "usable", "nothing checks the lengths that were given, ball and pixel pitch",
             "say what the picture shows of the gel (--size, or --kind), or how deep a press is (--depth)",

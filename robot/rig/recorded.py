@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.bundle import read_bundle
 from calibration.errors import CalibrationError, error_context
 from calibration.markers.flow import MarkersLost, find_markers
 from calibration.markers.lattice import NoLattice
@@ -95,6 +96,7 @@ class RecordedSurfaces:
                 if found is not None and (found.finds_height or found.finds_flow):
                     found.take_reference(TactileFrame(untouched, time=0.0, index=0))
                     self._normalisers[name] = found
+                    self.notes += _distrusted(sensor, name)
                 elif found is not None and not meta.spec.sensors[name].height:
                     self.notes += _dots_in(untouched, name)
             except (CalibrationError, ValueError) as why:
@@ -120,6 +122,16 @@ def _normaliser_of(
             sensor, sensor.size if rig.scene is None else rig.scene.gel.size[:2], rig.canonical
         )
     return None
+
+
+def _distrusted(sensor: SensorConfig, name: str) -> list[str]:
+    """A word on a calibration that says of itself that it is not to be trusted."""
+    path = sensor.calibration if isinstance(sensor, ReplaySensorConfig | CameraSensorConfig) else None
+    if path is None or not read_bundle(Path(path))[0].distrusted:
+        return []
+    return [
+        f"sensor {name}: the verdict on {path} is 'do not trust', so neither are its heights; see verdict.html there"
+    ]
 
 
 def _dots_in(untouched: NDArray[np.uint8], sensor: str) -> list[str]:

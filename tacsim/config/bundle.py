@@ -85,7 +85,7 @@ def read_files(path: Path) -> tuple[Path, dict[str, Any], bytes]:
         known = ", ".join(map(str, FORMATS))
         raise NoBundle(f"{file} has format {version}, this version of tacsim reads {known}; {AGAIN}")
     if state.problems:
-        raise NoBundle(f"{file} is damaged; {AGAIN}.\n" + "\n".join(map(str, state.problems)))
+        raise NoBundle(f"{file} is damaged; {AGAIN}. {'; '.join(map(str, state.problems))}")
     if version is None:
         raise NoBundle(f"{file} is no calibration: it names no format")
     return file, content, png
@@ -138,7 +138,9 @@ def _plain(node: Node) -> Any:
 
 
 def _beside(path: Path) -> str:
-    """A word on a bundle of nearly that name."""
+    """A word on a bundle of nearly that name, where `path` itself is not there."""
+    if path.exists():
+        return ""
     folder = path.parent
     try:
         names = [each.name for each in folder.iterdir() if is_bundle(each)]

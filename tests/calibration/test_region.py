@@ -91,11 +91,11 @@ def test_a_region_hides_what_is_beside_it() -> None:
         camera(calibration="x", region=REGION)
 
 
-@pytest.mark.parametrize("words", ["1,2 3,4", "a,b c,d e,f", "1 2 3"])
+@pytest.mark.parametrize("words", ["1,2 3,4", "a,b c,d e,f", "1 2 3", "nan,1 2,2 5,5", "1,1 inf,1 5,5"])
 def test_what_is_no_polygon_is_refused(words: str, tmp_path: Path) -> None:
     more = ["--ball-diameter", "4 mm", "--pixel-pitch", "0.1 mm", "--region", words]
-    done = tacsim("calibrate", "sensor", tmp_path, *more)
-    assert done.exit_code == 2 and "polygon" in done.output
+    done = tacsim("calibrate", "sensor", tmp_path, *more, COLUMNS="300")
+    assert done.exit_code == 2 and "is no polygon of three points" in done.output
 
 
 def test_a_camera_finds_flow_by_the_pitch_of_its_dots_within_a_region() -> None:

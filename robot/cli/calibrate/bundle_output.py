@@ -57,6 +57,8 @@ def write_calibration(
     provenance = bundle.provenance.model_copy(update={"warnings": warnings})
     bundle = bundle.model_copy(update={"provenance": provenance, "region": region})
     facts = [f"{profile.title}: {profile.source}; {profile.light}"]
+    if found is not None:
+        facts.append(_lattice(found))
     if noise is not None:
         facts.append(f"camera's noise {', '.join(f'{value:.2f}' for value in noise.deviation)} grey levels (R, G, B)")
     if skin is not None:
@@ -145,7 +147,10 @@ def _show(fit: LightFit, pitch: float, found: Markers | None) -> None:
     for name, why in fit.left_out:
         notes.print(f"left out: {name}: {why}", markup=False)
     if found is not None:
-        notes.print(
-            f"markers: {found.rows} x {found.columns}, {found.pitch * 1e3:.3g} mm apart, radius "
-            f"{found.radius * 1e3:.2g} mm"
-        )
+        notes.print(_lattice(found), markup=False)
+
+
+def _lattice(found: Markers) -> str:
+    return (
+        f"markers: {found.rows} x {found.columns}, {found.pitch * 1e3:.3g} mm apart, radius {found.radius * 1e3:.2g} mm"
+    )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import shlex
 from dataclasses import dataclass
@@ -120,6 +121,10 @@ def sensor(
     """
     if (frames is None) == (camera is None):
         raise typer.BadParameter("give either a folder of frames, or --camera to press now")
+    if camera is None and set_:
+        raise typer.BadParameter("it changes a camera's rig; a folder has none", param_hint="--set")
+    if camera is not None and reference is not None:
+        raise typer.BadParameter("with --camera it is taken first, of the free gel", param_hint="--reference")
     asked = _asked(
         ball_diameter, ball_radius, kind, pixel_pitch, view, size, region, known_depth, serial, out, markers=markers
     )
@@ -144,7 +149,8 @@ def _calibrate(
     fit = _fitted(read, asked.ball / pitch, None if found is None else found.radius / pitch)
     from calibration.light.verdict import KnownScale
 
-    scale = KnownScale(pitch, asked.ball, asked.gel_size, asked.profile.gel_thickness, asked.depths)
+    published = asked.pitch is None and asked.view is None and asked.size is None
+    scale = KnownScale(pitch, asked.ball, asked.gel_size, asked.profile.gel_thickness, asked.depths, published)
     write_calibration(
         asked.folder, fit, read, asked.serial, scale, found, asked.profile, view=seen, region=asked.region
     )
@@ -230,7 +236,7 @@ def _region(text: str) -> PictureRegion:
         points = [tuple(float(number) for number in point.split(",")) for point in text.split()]
     except ValueError:
         points = []
-    if len(points) < 3 or any(len(point) != 2 for point in points):
+    if len(points) < 3 or any(len(point) != 2 or not all(map(math.isfinite, point)) for point in points):
         raise typer.BadParameter(
             f"'{text}' is no polygon of three points or more; for example \"67,68 465,113 475,383 73,437\"",
             param_hint="--region",

@@ -48,6 +48,8 @@ def test_lengths_that_nothing_checks_are_not_called_good(fit: LightFit) -> None:
     for found, pitch in ((fit, PITCH), (wrong, 1.6 * PITCH)):
         assert "nothing checks the lengths" in said(found, KnownScale(pitch, BALL), "usable")
     assert "of the gel are to be seen" in said(wrong, KnownScale(1.6 * PITCH, BALL, SIZE), "do not trust")
+    shown = (1.6 * SIZE[0], 1.6 * SIZE[1])  # by a profile that is another sensor's, whose pitch was taken with it
+    assert "published" in said(wrong, KnownScale(1.6 * PITCH, BALL, shown, pitch_from_size=True), "usable")
 
 
 @pytest.mark.parametrize(("count", "word"), [(1, "do not trust"), (2, "do not trust"), (4, "usable")])
@@ -95,6 +97,9 @@ def test_contacts_that_are_all_as_wide_as_the_ball_tell_a_wrong_length(fit: Ligh
     wide = tuple(replace(press, circle=replace(press.circle, radius=0.93 * BALL_PX)) for press in fit.presses)
     assert "a/R = 0.93" in said(replace(fit, presses=wide), SCALE, "do not trust")
     assert judge(replace(fit, presses=(*fit.presses[:4], wide[4])), SCALE).word == "good"
+    widest = replace(wide[4], circle=replace(wide[4].circle, radius=0.97 * BALL_PX))
+    told = said(replace(fit, presses=(*fit.presses[:4], widest)), SCALE, "usable")
+    assert "press 4 is as wide as the ball" in told and "is it the radius that was given?" in told
 
 
 def test_a_press_of_known_depth_tells_a_wrong_pitch(fit: LightFit) -> None:

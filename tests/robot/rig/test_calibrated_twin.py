@@ -199,12 +199,14 @@ def test_a_bundle_that_is_not_whole_is_no_model(finger: Path, tmp_path: Path, sp
     (broken / "reference.png").write_bytes((finger / "reference.png").read_bytes())
     text = (finger / "calibration.yaml").read_text(encoding="utf-8")
     (broken / "calibration.yaml").write_text(spoil(text), encoding="utf-8")
-    with pytest.raises(ConfigError, match=words):
+    with pytest.raises(ConfigError, match=words) as said:
         load_sensor(broken)
+    assert r"\n" not in str(said.value)
     (broken / "calibration.yaml").write_text(text, encoding="utf-8")
     (broken / "reference.png").unlink()
-    with pytest.raises(ConfigError, match=r"reference\.png is not there"):
+    with pytest.raises(ConfigError, match=r"reference\.png is not there") as missing:
         load_sensor(broken)
+    assert "did you mean" not in str(missing.value)
 
 
 def test_the_gel_is_the_sensors_own_in_whole_elements(finger: Path) -> None:

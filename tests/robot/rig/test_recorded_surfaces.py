@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from calibration.bundle import read_bundle, write_bundle
 from tacsim.models.sensor import Markers, SensorGeometry, SensorModel
 from tacsim.optics.markers import marker_flow
 from tacsim.optics.render import Renderer
@@ -76,3 +77,18 @@ def test_a_replay_with_a_bundle_shows_its_heights_and_no_task(tmp_path: Path) ->
         assert task not in output and f">{task}" not in page
     again = tacsim("replay", str(tmp_path / "out" / "episode.mcap"), "--out", tmp_path / "again")
     assert again.exit_code == 0 and "finger: height" in (tmp_path / "again" / "report.html").read_text(encoding="utf-8")
+
+
+def test_a_replay_with_a_bundle_that_is_not_to_be_trusted_says_so(tmp_path: Path) -> None:
+    frames = tmp_path / "frames"
+    frames.mkdir()
+    for name, source in (("0.png", "reference.png"), ("1.png", "press.png")):
+        (frames / name).write_bytes((BUNDLE / source).read_bytes())
+    calibration, untouched = read_bundle(BUNDLE)
+    for word in ("usable", "do not trust"):
+        origin = calibration.provenance.model_copy(update={"warnings": (f"verdict: {word}; few presses",)})
+        folder = tmp_path / word.replace(" ", "-")
+        folder.mkdir()
+        write_bundle(folder, calibration.model_copy(update={"provenance": origin}), untouched)
+        output, _, _ = report(folder, frames, f"calibration={folder}")
+        assert ("is 'do not trust'" in " ".join(output.split())) == (word == "do not trust")

@@ -96,6 +96,8 @@ def test_the_command_ends_in_a_verdict(folder: Path, tmp_path: Path) -> None:
     assert calibration.provenance.ball_radius == pytest.approx(BALL)
     assert calibration.provenance.warnings[0].startswith("verdict: do not trust")
     assert "do not trust" in (tmp_path / "out" / "verdict.html").read_text(encoding="utf-8")
+    ran = tacsim("calibrate", "sensor", folder, *lengths[:4], "--out", tmp_path / "published")  # its pitch is DIGIT's
+    assert "nothing checks it on yours" in ran.output and "mm of the gel" in ran.output
 
 
 @pytest.mark.parametrize(
@@ -113,12 +115,19 @@ def test_the_command_ends_in_a_verdict(folder: Path, tmp_path: Path) -> None:
         (("--ball-diameter", "6 mm", "--pixel-pitch", "0.06 mm", "--depth", "press_1.png=1"), "say '1 mm'"),
         (("--ball-diameter", "6 mm", "--pixel-pitch", "0.06 mm", "--serial", "my finger"), "'my finger' is no serial"),
         (("--ball-diameter", "6 mm", "--pixel-pitch", "0.06 mm", "--region", "9,9 900,9 9,90"), "900,9"),
+        (("--ball-diameter", "6 mm", "--pixel-pitch", "0.06 mm", "--set", "foo.bar=1"), "it changes a camera's rig"),
     ],
 )
 def test_the_command_refuses_lengths_that_may_be_wrong(folder: Path, words: tuple[str, ...], said: str) -> None:
     ran = tacsim("calibrate", "sensor", folder, *words, COLUMNS="300")
     assert ran.exit_code == 2
     assert said in ran.output
+
+
+def test_a_camera_takes_its_own_reference() -> None:
+    words = ("--camera", "http://127.0.0.1:9/", "--reference", "free.png", "--ball-diameter", "6 mm", "--kind", "mini")
+    ran = tacsim("calibrate", "sensor", *words, COLUMNS="300")
+    assert ran.exit_code == 2 and "taken first" in ran.output
 
 
 def test_the_command_measures_the_cameras_noise(folder: Path, tmp_path: Path) -> None:
@@ -179,6 +188,7 @@ def test_markers_are_measured_when_asked_for_and_noticed_when_not(tmp_path: Path
     ran = tacsim(*words, "--markers", "--out", tmp_path / "out")
     assert ran.exit_code == 0, ran.output
     assert "markers: 7 x 9, 1.9 mm apart, radius 0.3" in ran.stderr
+    assert "<li>markers: 7 x 9, 1.9 mm apart" in (tmp_path / "out" / "verdict.html").read_text(encoding="utf-8")
     calibration, reference = read_bundle(tmp_path / "out")
     markers = calibration.markers
     assert markers is not None and (markers.rows, markers.columns) == (7, 9)

@@ -26,6 +26,7 @@ from tacsim.config.bundle import (
     REFERENCE,
     NoBundle,
     digest,
+    distrusts,
     find_bundle,
     read_files,
     require_unchanged,
@@ -106,7 +107,7 @@ class Calibration(Config):
     @property
     def distrusted(self) -> bool:
         """The verdict that was written with it is not to trust it."""
-        return any(words.startswith("verdict: do not trust") for words in self.provenance.warnings)
+        return any(map(distrusts, self.provenance.warnings))
 
     @model_validator(mode="after")
     def _parts_agree(self) -> Self:

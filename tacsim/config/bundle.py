@@ -110,7 +110,8 @@ def sensor_node(path: Path) -> Node:
     file, content, png = read_files(path)
     require_unchanged(file, content, png)
     markers, origin = content.get("markers"), content.get("provenance")
-    made = origin.get("made", "") if isinstance(origin, dict) else ""
+    origin = origin if isinstance(origin, dict) else {}
+    made, told = origin.get("made", ""), origin.get("warnings")
     model = {
         "name": content.get("serial"),
         "geometry": content.get("geometry"),
@@ -124,8 +125,14 @@ def sensor_node(path: Path) -> Node:
         "noise": content.get("noise"),
         "view": content.get("view"),
         "source": f"calibration of {content.get('serial')}, {made}",
+        "caution": next((words for words in told if distrusts(words)), "") if isinstance(told, list) else "",
     }
     return from_plain(model, Place(shown(file), 1), file.parent)
+
+
+def distrusts(warning: object) -> bool:
+    """A warning in a bundle is the verdict that it is not to be trusted."""
+    return isinstance(warning, str) and warning.startswith("verdict: do not trust")
 
 
 def _plain(node: Node) -> Any:

@@ -44,18 +44,19 @@ def with_gels_of_sensors(
 
 def fit_gel(scene: Scene, models: Mapping[str, SensorModel], *, given: bool = False) -> tuple[Scene, list[str]]:
     """The scene with gels as large along x, y as the largest `gel_size` of `models`, in whole elements, and that in
-    words; the scene as it is where no model says a size, or its own was `given`. Raises ConfigError for a gel that the
-    scene cannot mesh."""
+    words, with what calibrations say against themselves; the scene as it is where no model says a size, or its own was
+    `given`. Raises ConfigError for a gel that the scene cannot mesh."""
+    doubts = [f"sensor {name}: {model.name}: {model.caution}" for name, model in models.items() if model.caution]
     known = {name: model.gel_size for name, model in models.items() if model.gel_size is not None}
     if not known:
-        return scene, []
+        return scene, doubts
     size = scene.gel.size
     shown = "; ".join(
         f"{_millimetres(each)} by the calibration of {models[name].name} (sensor {name})"
         for name, each in known.items()
     )
     if given:
-        return scene, [f"gel {_millimetres(size)}, as said on the command line; {shown}"]
+        return scene, [f"gel {_millimetres(size)}, as said on the command line; {shown}", *doubts]
     element = scene.gel_element
     x, y = (max(2, round(max(each[axis] for each in known.values()) / element)) * element for axis in (0, 1))
     try:
@@ -64,7 +65,7 @@ def fit_gel(scene: Scene, models: Mapping[str, SensorModel], *, given: bool = Fa
         why = error.errors(include_url=False)[0]["msg"].removeprefix("Value error, ")
         raise ConfigError([Problem(Place("scene.gel.size"), "", f"{shown}: {why}")]) from None
     words = f"gel {_millimetres((x, y))} in whole elements of {element * 1e3:.3g} mm, {size[2] * 1e3:.3g} mm thick"
-    return fitted, [f"{words}: {shown}; the thickness is the scene's"]
+    return fitted, [f"{words}: {shown}; the thickness is the scene's", *doubts]
 
 
 def says_gel_size(path: Iterable[str]) -> bool:

@@ -133,6 +133,7 @@ class SensorModel(Config):
     texture_seed: Annotated[int, Field(ge=0)] = 0
     noise: CameraNoise | None = None  # of each picture that a sensor delivers; None: a camera without noise
     source: str = ""
+    caution: str = ""  # what its calibration says against itself; "": nothing
 
     @model_validator(mode="after")
     def _calibrated_change_has_a_base(self) -> Self:

@@ -224,6 +224,21 @@ def test_the_gel_is_the_sensors_own_in_whole_elements(finger: Path) -> None:
     assert not load_rig("sim").notes
 
 
+def test_a_calibration_that_is_not_to_be_trusted_says_so_wherever_it_stands(finger: Path) -> None:
+    calibration, untouched = read_bundle(finger)
+    assert not read_sensor_model(finger).caution
+    origin = calibration.provenance.model_copy(update={"warnings": ("verdict: do not trust; 2 presses",)})
+    doubted = finger.with_name("doubted")
+    doubted.mkdir(exist_ok=True)
+    write_bundle(doubted, calibration.model_copy(update={"provenance": origin}), untouched)
+    for more in ([], ["scene.gel.size=[20 mm, 20 mm, 4 mm]"]):
+        notes = load_rig("sim", overrides=["sensors.lower.model=doubted", *more]).notes
+        assert notes[-1] == "sensor lower: gs-7: verdict: do not trust; 2 presses"
+    pressed = ("press", "sphere", "--preset", "learn", "--radius", "4 mm", "--depth", "0.4 mm")
+    done = tacsim(*pressed, "--sensor", "doubted", "--out", finger.parent / "pressed")
+    assert done.exit_code == 0 and "do not trust; 2 presses" in " ".join(done.output.split())
+
+
 def test_what_is_recorded_of_a_rig_means_the_same_again(finger: Path, tmp_path: Path) -> None:
     for more in ([], ["scene.gel.size=[20 mm, 20 mm, 4 mm]"]):
         loaded = load_rig("sim", overrides=["sensors.lower.model=finger", *more])

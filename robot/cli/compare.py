@@ -62,7 +62,8 @@ def compare(
     """Compare frames of A with frames of B, each number beside what no contact and mere noise would score.
 
     Writes compare.json, compare.csv and compare.html. A may be a scene with a ball (press): then the ball is pressed in
-    the simulator where B's frames show a contact, and seen through B's calibration; --set changes that scene.
+    the simulator where B's frames show a contact, and seen through B's calibration; --set changes that scene, whose gel
+    has elements of 0.25 mm unless element_size or preset is set.
 
     Example: tacsim compare sim real --calibration-b bundle --fail-above contact_mae=8
     """
@@ -126,6 +127,7 @@ def _simulate_presses(name: str, truth: FrameSet, bundle: Path | None, overrides
     """A's frames by the simulator."""
     from calibration.bundle import read_bundle, read_sensor_model
     from calibration.errors import BadFrames
+    from robot.studies.matched_press import ELEMENT
     from tacsim.config import load_scene
     from tacsim.config.gel import fit_gel, says_gel_size
     from tacsim.models.scene import Sphere
@@ -138,6 +140,9 @@ def _simulate_presses(name: str, truth: FrameSet, bundle: Path | None, overrides
     if own:
         settings.append(f"indenter.geometry.radius={read_bundle(bundle)[0].provenance.ball_radius} m")
     scene = load_scene(name, settings)
+    if scene.element_size is None and not any(text.startswith("preset=") for text in overrides):
+        # two layers are the least that a gel may have
+        scene = load_scene(name, [*settings, f"element_size={min(ELEMENT, scene.gel.size[2] / 2)} m"])
     given = any(says_gel_size(text.partition("=")[0].split(".")) for text in overrides)
     scene, said = fit_gel(scene, {"of B": sensor}, given=given)
     if scene.indenter is not None and isinstance(ball := scene.indenter.geometry, Sphere):

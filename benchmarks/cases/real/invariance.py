@@ -14,11 +14,12 @@ import numpy as np
 
 from benchmarks.cases.real import balls
 from benchmarks.cases.real.balls import BallSet, Frames
-from benchmarks.cases.real.contact_radius import ELEMENT, ball_scene
+from benchmarks.cases.real.contact_radius import ball_scene
 from benchmarks.cases.real.known_depth import GRID, light_of
 from benchmarks.cases.real.labels import BadData, Image, read_labels
 from benchmarks.harness.measure import Measurement, Timing
 from benchmarks.harness.runner import Case, missing_case
+from robot.studies.matched_press import ELEMENT
 
 if TYPE_CHECKING:
     from calibration.bundle import Calibration

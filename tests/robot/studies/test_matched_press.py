@@ -8,18 +8,23 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.optimize import minimize_scalar
 
 from calibration.bundle import write_bundle
 from calibration.compare.compare import compare_frames
 from calibration.errors import BadFrames
 from calibration.frame_set import Frame, FrameSet, Image
 from calibration.light.circle import Circle, contact_circle
+from calibration.light.dent import dent_slope
 from robot.studies import matched_press
-from robot.studies.matched_press import _next_depth, _PressedGel, match_presses
+from robot.studies.matched_press import ELEMENT, _next_depth, _PressedGel, match_presses
 from tacsim.config import load_scene
+from tacsim.interface import Pose
 from tacsim.models.scene import Scene
 from tacsim.models.sensor import CameraNoise, CanonicalGrid, SensorGeometry, SensorModel
+from tacsim.optics.spline import displacement_and_jacobian
 from tacsim.physics.failure.health import LaunchSpan, SimulationDiverged
+from tacsim.physics.world import make_world
 from tests.calibration.presses import HiddenSensor
 from tests.calibration.sources import calibrated, save
 from tests.robot.cli.invoked import tacsim
@@ -75,11 +80,14 @@ def test_ball_and_gel_are_those_of_the_bundle_unless_given(frames: FrameSet, tmp
     Path("bundle").mkdir()
     write_bundle(Path("bundle"), calibration, reference)
     ball = calibration.provenance.ball_radius
-    for number, (settings, size, radius) in enumerate(
+    for number, (settings, size, radius, element) in enumerate(
         [
-            ((), (21e-3, 16e-3, 4e-3), ball),
-            (("indenter.geometry.radius=3 mm",), (21e-3, 16e-3, 4e-3), 3e-3),
-            (("gel.size=[12 mm, 12 mm, 8 mm]",), (12e-3, 12e-3, 8e-3), ball),
+            ((), (20.75e-3, 16e-3, 4e-3), ball, ELEMENT),
+            (("preset=standard",), (21e-3, 16e-3, 4e-3), ball, 0.5e-3),
+            (("element_size=1 mm",), (21e-3, 16e-3, 4e-3), ball, 1e-3),
+            (("indenter.geometry.radius=3 mm",), (20.75e-3, 16e-3, 4e-3), 3e-3, ELEMENT),
+            (("gel.size=[12 mm, 12 mm, 8 mm]",), (12e-3, 12e-3, 8e-3), ball, ELEMENT),
+            (("gel.size=[12 mm, 12 mm, 0.4 mm]",), (12e-3, 12e-3, 0.4e-3), ball, 0.2e-3),
         ]
     ):
         words = [word for setting in settings for word in ("--set", setting)]
@@ -87,7 +95,34 @@ def test_ball_and_gel_are_those_of_the_bundle_unless_given(frames: FrameSet, tmp
         assert "enough" in result.output
         assert asked[-1].gel.size == pytest.approx(size)
         assert asked[-1].indenter.geometry.radius == pytest.approx(radius)
+        assert asked[-1].element == pytest.approx(element)
         assert f"a ball of {radius * 1e3:.4g} mm radius" in result.output and "gel" in result.output
+
+
+@pytest.mark.parametrize(("element", "near"), [(ELEMENT, True), (0.5e-3, False)])
+def test_elements_are_fine_enough_for_the_skirt(element: float, near: bool) -> None:
+    """A light is calibrated on the elastic layer's skirt, so a simulated press must have it, too: elements of half a
+    millimetre round the rim, and put a tenth of its slope beside the contact."""
+    ball, depth, size = 2.5e-3, 0.4e-3, (10e-3, 10e-3, 5e-3)
+    settings = [SCENE[0], f"gel.size={[f'{1e3 * side} mm' for side in size]}", f"element_size={element} m"]
+    world = make_world(load_scene("press", settings))
+    pose = world.pose("indenter")
+    world.move({"indenter": Pose(np.array([*pose.position[:2], ball - depth]), pose.quaternion)})
+    at = np.linspace(0.02e-3, 4e-3, 400)
+    radii = np.linspace(0.1e-3, 3e-3, 300)
+    profiles = []  # of the surface where it has moved to, in directions between those of the mesh
+    for angle in np.arange(24) * np.pi / 12 + 0.07:
+        along = np.array([np.cos(angle), np.sin(angle)])
+        moved, _ = displacement_and_jacobian(world.surface("lower"), at[:, None] * along)
+        profiles.append(np.interp(radii, at + moved[:, :2] @ along, moved[:, 2]))
+    slope = np.gradient(np.mean(profiles, axis=0), radii)
+    contact = minimize_scalar(
+        lambda a: ((slope - dent_slope(radii, a, ball, size[2])) ** 2).sum(), bounds=(0.6e-3, 1.6e-3), method="bounded"
+    ).x
+    off = slope - dent_slope(radii, contact, ball, size[2])
+    skirt = (radii > 1.2 * contact) & (radii < 1.6 * contact)
+    rim = contact / np.sqrt(ball**2 - contact**2)
+    assert (np.abs(off[skirt]).max() < 0.05 * rim) == near
 
 
 def test_what_cannot_be_pressed_is_refused(frames: FrameSet) -> None:

@@ -134,7 +134,9 @@ class FrameNormaliser:
         # is found.
         measured = np.zeros_like(self._rectify.valid)
         canonical_part(measured, self._grid)[...] = self._on_image
-        reference = make_reference(rectified, self._rectify.valid, measured)
+        # Dots are found as well beside glare: only what is told by colour is refused for it.
+        colour = self._find is not None or self._markers is None
+        reference = make_reference(rectified, self._rectify.valid, measured, colour=colour)
         if self._untouched is not None and exchanged(rectified, self._untouched, self._rectify.valid):
             raise UnusableReference(
                 "red and blue are exchanged: the gel looks as in its calibration only with the channels in the other "

@@ -109,6 +109,18 @@ class FrameNormaliser:
         self._valid.flags.writeable = False
 
     @property
+    def shown(self) -> tuple[float, float]:
+        """x, y of the gel that the native picture shows, within its region [m]: the maps may show the middle alone."""
+        valid, pitch = self._rectify.valid, self._grid.pitch / self._grid.image_scale
+        down, across = (side.stop - side.start for side in seen_box(valid))
+        x, y = (
+            # what reaches the border of the view goes on beyond it; what ends before is all that a region lets be seen
+            size if (there + 2) * pitch >= min(size, whole * pitch) else there * pitch
+            for size, there, whole in zip(self._rectify.size, (across, down), valid.shape[::-1], strict=True)
+        )
+        return x, y
+
+    @property
     def stale(self) -> bool:
         """True when the reference is outdated: take a fresh one as soon as nothing touches."""
         return (self.drift or 0.0) > STALE_COLOUR or (self.drift_slope or 0.0) > STALE_SLOPE

@@ -109,6 +109,18 @@ class FrameNormaliser:
         self._valid.flags.writeable = False
 
     @property
+    def shown(self) -> tuple[float, float]:
+        """x, y of the gel that the native picture shows, within its region [m]: the maps may show the middle alone."""
+        valid, pitch = self._rectify.valid, self._grid.pitch / self._grid.image_scale
+        down, across = (side.stop - side.start for side in seen_box(valid))
+        x, y = (
+            # what reaches the border of the view goes on beyond it; what ends before is all that a region lets be seen
+            size if (there + 2) * pitch >= min(size, whole * pitch) else there * pitch
+            for size, there, whole in zip(self._rectify.size, (across, down), valid.shape[::-1], strict=True)
+        )
+        return x, y
+
+    @property
     def stale(self) -> bool:
         """True when the reference is outdated: take a fresh one as soon as nothing touches."""
         return (self.drift or 0.0) > STALE_COLOUR or (self.drift_slope or 0.0) > STALE_SLOPE
@@ -134,7 +146,9 @@ class FrameNormaliser:
         # is found.
         measured = np.zeros_like(self._rectify.valid)
         canonical_part(measured, self._grid)[...] = self._on_image
-        reference = make_reference(rectified, self._rectify.valid, measured)
+        # Dots are found as well beside glare, in a recording: a live arm stops by the colour of contacts, too.
+        colour = self._find is not None or self._markers is None or self._dots is not None
+        reference = make_reference(rectified, self._rectify.valid, measured, colour=colour)
         if self._untouched is not None and exchanged(rectified, self._untouched, self._rectify.valid):
             raise UnusableReference(
                 "red and blue are exchanged: the gel looks as in its calibration only with the channels in the other "

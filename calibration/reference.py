@@ -60,12 +60,20 @@ class Reference:
         return change
 
 
-def make_reference(image: Float32, valid: NDArray[np.bool_], measured: NDArray[np.bool_] | None = None) -> Reference:
+def make_reference(
+    image: Float32,
+    valid: NDArray[np.bool_],
+    measured: NDArray[np.bool_] | None = None,
+    *,
+    colour: bool = True,
+) -> Reference:
     """Checks a rectified contact-free image (H, W, 3), 0..255, on the gel (`valid`, (H, W)).
 
-    `measured` (H, W): the part of it that is checked, and over which the mean is taken; None: all.
+    `measured` (H, W): the part of it that is checked, and over which the mean is taken; None: all. `colour`: a surface
+    or a contact is told by changes of its colour, so it must not be saturated.
 
-    Raises UnusableReference when the gel is not in the image, too dark or saturated, or when shapes differ.
+    Raises UnusableReference when the gel is not in the image, too dark or (with `colour`) saturated, or when shapes
+    differ.
     """
     if image.ndim != 3 or image.shape[2] != 3 or image.shape[:2] != valid.shape:
         raise UnusableReference(f"reference is {image.shape}, expected {(*valid.shape, 3)}")
@@ -82,7 +90,7 @@ def make_reference(image: Float32, valid: NDArray[np.bool_], measured: NDArray[n
             "sensor's lights on, and is the exposure right?"
         )
     saturated = float((gel >= SATURATED).any(axis=1).mean())
-    if saturated > MAX_SATURATED_SHARE:
+    if colour and saturated > MAX_SATURATED_SHARE:
         raise UnusableReference(
             f"reference is saturated on {saturated:.1%} of the gel, at most {MAX_SATURATED_SHARE:.0%}: shorten the "
             "exposure or dim the lights"

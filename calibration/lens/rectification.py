@@ -31,6 +31,7 @@ class Rectification:
     pixels: NDArray[np.float32]  # (factor * H, factor * W, 2) native u, v of each look-up [px]
     factor: int  # look-ups along each side of one canonical pixel
     valid: NDArray[np.bool_]  # (H, W) the canonical pixel lies on the gel and in the native image
+    size: tuple[float, float]  # x, y of the gel that the native image shows, also beyond the canonical one [m]
 
     def __call__(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
         """(H, W, 3) rectified image, 0..255, of a native (rows, columns, 3) uint8 RGB image; 0 where not valid.
@@ -134,14 +135,14 @@ def from_corners(
     factor = _factor(project(grid.points()))
     # The perspective of points far beyond the gel may pass through infinity: look there at the gel's rim instead.
     points = _inside(grid.refined(factor).points(), size)
-    return _rectification(project(points), factor, grid.within(size), image_shape)
+    return _rectification(project(points), factor, grid.within(size), image_shape, size)
 
 
 def from_view(view: GelView, grid: PixelGrid) -> Rectification:
     """The map of a real camera whose view of the gel's plane was calibrated."""
     factor = _factor(view.project(_inside(grid.points(), view.size)))
     points = _inside(grid.refined(factor).points(), view.size)  # beyond the gel nothing is known of the lens
-    return _rectification(view.project(points), factor, grid.within(view.size), view.image_shape)
+    return _rectification(view.project(points), factor, grid.within(view.size), view.image_shape, view.size)
 
 
 def to_metric(view: GelView) -> Rectification:
@@ -159,11 +160,17 @@ def from_geometry(geometry: SensorGeometry, gel_size: tuple[float, float], grid:
     canonical pitch is a whole multiple of the pixel pitch."""
     factor = _limited(math.ceil(grid.pitch / geometry.pixel_pitch - 1e-9))
     pixels = grid.refined(factor).points() / geometry.pixel_pitch + geometry.principal
-    return _rectification(pixels, factor, grid.within(gel_size), (geometry.height, geometry.width))
+    shown = geometry.width * geometry.pixel_pitch, geometry.height * geometry.pixel_pitch
+    size = min(gel_size[0], shown[0]), min(gel_size[1], shown[1])
+    return _rectification(pixels, factor, grid.within(gel_size), (geometry.height, geometry.width), size)
 
 
 def _rectification(
-    pixels: NDArray[np.float64], factor: int, on_gel: NDArray[np.bool_], image_shape: tuple[int, int]
+    pixels: NDArray[np.float64],
+    factor: int,
+    on_gel: NDArray[np.bool_],
+    image_shape: tuple[int, int],
+    size: tuple[float, float],
 ) -> Rectification:
     rows, columns = image_shape
     margin = 0.5 + 1e-6  # an image reaches half a pixel beyond its outermost pixel centres
@@ -171,7 +178,7 @@ def _rectification(
     in_image = (u >= -margin) & (u <= columns - 1 + margin) & (v >= -margin) & (v <= rows - 1 + margin)
     height, width = on_gel.shape
     whole = in_image.reshape(height, factor, width, factor).all(axis=(1, 3))
-    return Rectification(image_shape, pixels.astype(np.float32), factor, whole & on_gel)
+    return Rectification(image_shape, pixels.astype(np.float32), factor, whole & on_gel, size)
 
 
 def _factor(pixels: NDArray[np.float64]) -> int:

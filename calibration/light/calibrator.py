@@ -26,7 +26,7 @@ from calibration.height.slope_polynomial import (
     to_normal,
 )
 from calibration.light.circle import NoCircle
-from calibration.light.darkness import find_dark_press, fit_darkness, tells_no_direction
+from calibration.light.darkness import DARK_UNEXPLAINED, find_dark_press, fit_darkness, tells_no_direction
 from calibration.light.dent import dent_gradient, dent_height, rim_slope
 from calibration.light.fit import LightFit, PressPrediction, compared, normal_angle
 from calibration.light.labels import (
@@ -73,7 +73,6 @@ SHADED_PIXELS = 1000  # the same with cast shadows, which have nine times the te
 # A press is left out if the fitted dent leaves more of its change of colour unexplained than the smaller of
 MAX_UNEXPLAINED = 0.5  # share of the change
 MAX_UNEXPLAINED_RATIO = 5.0  # times the median press's share, with three presses or more; at least GOOD_FIT
-DARK_UNEXPLAINED = 0.1  # the same of darkness that is no function of depth; 0.003 on real frames
 GOOD_FIT = 0.05  # share of the change: a press that is explained so well always stays
 ORDER_FRAMES = 9  # frames whose median tells the order of colours, at most
 MIN_SPREAD = 0.2  # share of the picture that presses spread over; else nothing is known of the rest

@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.errors import BadFrames
-from calibration.light.circle import NoCircle
+from calibration.light.circle import Circle, NoCircle
 from calibration.light.dent import FAR, MAX_RIM_RATIO, ContactCircle, depth_profile
 from calibration.light.photometry import FEW_PRESSES
-from calibration.light.press import BallPress, press_at, smooth
+from calibration.light.press import BallPress, press_at, smooth, untouched_mean
 from calibration.light.refinement import FIRST_THINNESS, MAX_GROUPS, RIVAL, THINNESS_BOUNDS
 from tacsim.models.darkness import DarknessModel
 
@@ -39,6 +39,7 @@ FIRST = (0.3, 0.4)  # share, reach [ball radii] that the search starts from
 BOUNDS = ((0.0, 0.05), (0.8, 1.5))  # of share, reach
 KNOTS = 24  # of the table
 FLATTEST = 0.01  # least slope of the table, over its mean
+DARK_UNEXPLAINED = 0.1  # share of darkness that is no function of a dent's depth, at most; 0.003 on real frames
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,6 +97,28 @@ def find_dark_press(name: str, image: Image, reference: Image, mean: Float64, ba
     circle = rough_contact((raw - np.median(raw, axis=(0, 1))) / mean)
     circle = replace(circle, radius=min(circle.radius, 0.9 * MAX_RIM_RATIO * ball))
     return press_at(name, image, reference, mean, circle, NEAR)
+
+
+def dark_circle(image: Image, reference: Image, ball: float) -> Circle:
+    """Finds the contact of a ball of radius `ball` [px] in `image` (H, W, 3), as a calibration from this press alone
+    would: :func:`calibration.light.circle.contact_circle` for a light that tells no direction. `reference` (H, W, 3) is
+    the same without contact.
+
+    Raises BadFrames for a reference that is dark or saturated, NoCircle when no ball's contact is seen.
+    """
+    mean = untouched_mean(reference)
+    try:
+        fit = fit_darkness([find_dark_press("", image, reference, mean, ball)], ball)
+    except BadFrames as why:
+        raise NoCircle(f"no ball's contact is seen: {why}") from None
+    explained = 1.0 - fit.unexplained[0]
+    if explained < 1.0 - DARK_UNEXPLAINED:
+        raise NoCircle(
+            f"no ball's contact is seen: the depth of a dent explains {max(explained, 0.0):.0%} of how dark it gets, "
+            f"{1 - DARK_UNEXPLAINED:.0%} are needed"
+        )
+    found = fit.presses[0].circle
+    return Circle(found.x, found.y, found.radius, explained)
 
 
 def fit_darkness(presses: Sequence[BallPress], ball: float) -> DarknessFit:

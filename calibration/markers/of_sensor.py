@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.lens.rectification import Rectification, from_geometry, from_view, region_mask
+from calibration.lens.rectification import Rectification, from_geometry, from_view, region_mask, seen_box
 from calibration.lens.view import GelView
 from calibration.markers.flow import MarkerFlow, NoMarkers, find_markers, marker_grid
 from calibration.markers.lattice import NoLattice
@@ -50,4 +52,8 @@ def seen_by_dots(
     markers = Markers(rows=rows, columns=columns, pitch=pitch, radius=radius * scale)
     flow = marker_flow(markers, geometry, size, region=region)
     assert flow is not None
-    return from_geometry(geometry, size, canonical_image(grid)).within(region), flow
+    rectify = from_geometry(geometry, size, canonical_image(grid)).within(region)
+    if region is not None:
+        down, across = (side.stop - side.start for side in seen_box(shown))
+        rectify = replace(rectify, size=(across * scale, down * scale))
+    return rectify, flow

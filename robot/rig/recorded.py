@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -97,6 +98,7 @@ class RecordedSurfaces:
                     found.take_reference(TactileFrame(untouched, time=0.0, index=0))
                     self._normalisers[name] = found
                     self.notes += _distrusted(sensor, name)
+                    self.notes += _middle_alone(sensor, name, found.shown, rig.canonical)
                 elif found is not None and not meta.spec.sensors[name].height:
                     self.notes += _dots_in(untouched, name)
             except (CalibrationError, ValueError) as why:
@@ -132,6 +134,27 @@ def _distrusted(sensor: SensorConfig, name: str) -> list[str]:
     return [
         f"sensor {name}: the verdict on {path} is 'do not trust', so neither are its heights; see verdict.html there"
     ]
+
+
+def _middle_alone(sensor: SensorConfig, name: str, shown: tuple[float, float], grid: CanonicalGrid) -> list[str]:
+    """A word on maps that are smaller than the gel `shown` in the picture (x, y) [m]. None of a model's: its size is
+    that of the rig file."""
+    if isinstance(sensor, CameraSensorConfig) and sensor.model is not None:
+        return []
+    maps = grid.columns * grid.pitch, grid.rows * grid.pitch
+    more = [
+        f"--set canonical.{key}={2 * math.ceil(there / grid.pitch / 2 - 1e-6)}"
+        for key, there, mapped in zip(("columns", "rows"), shown, maps, strict=True)
+        if there > mapped + grid.pitch
+    ]
+    if not more:
+        return []
+    middle, whole = (
+        " x ".join(f"{length * 1e3:.3g}" for length in size)
+        for size in ((min(maps[0], shown[0]), min(maps[1], shown[1])), shown)
+    )
+    words = f"maps show the middle {middle} mm of {whole} mm of gel; for all of it: tacsim run ... {' '.join(more)}"
+    return [f"sensor {name}: {words}"]
 
 
 def _dots_in(untouched: NDArray[np.uint8], sensor: str) -> list[str]:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from calibration.errors import BadFrames
 from calibration.frame_set import Frame, FrameSet
 from calibration.light.circle import Circle, NoCircle, contact_circle
+from calibration.light.darkness import dark_circle
 from tacsim.interface import Pose, SurfaceMap
 from tacsim.models.scene import GelSurface, Scene, Sphere
 from tacsim.models.sensor import CanonicalGrid, SensorModel
@@ -26,6 +27,8 @@ from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.physics.world import World, make_world
 
 Image = NDArray[np.uint8]
+# The contact circle in a picture, given the one without contact and the ball's radius [px]. Raises NoCircle, BadFrames
+CircleFinder = Callable[[Image, Image, float], Circle]
 
 # Edge of the gel's elements for such presses [m]. At 0.5 mm, two to four to a contact's radius, the surface rounds the
 # rim: its slope is up to a tenth of the rim's too steep 1.2 contact radii from the middle, and a classifier sees that
@@ -64,8 +67,10 @@ def match_presses(
             f"{sensor.geometry.width} x {sensor.geometry.height}; it belongs to another sensor or setting"
         )
     ball = scene.indenter.geometry.radius
-    circles, notes = _circles(real, ball / sensor.geometry.pixel_pitch)
-    gel = _PressedGel(scene, ball, sensor, grid)
+    # slopes make the colour of most lights; one that tells no direction shows a contact by how dark it is
+    find = contact_circle if sensor.darkness is None else dark_circle
+    circles, notes = _circles(real, find, ball / sensor.geometry.pixel_pitch)
+    gel = _PressedGel(scene, ball, sensor, grid, find)
     done: dict[str, Frame] = {}
     not_made: set[str] = set()
     # in the order of the depths the gel is only ever pressed farther: it does not peel off the ball
@@ -98,8 +103,8 @@ class _PressedGel:
     """One gel under a ball. It is pressed in the middle and its surface moved under the camera: what happens near the
     border of a gel is not told."""
 
-    def __init__(self, scene: Scene, ball: float, sensor: SensorModel, grid: CanonicalGrid) -> None:
-        self.ball, self._sensor, self._grid = ball, sensor, grid
+    def __init__(self, scene: Scene, ball: float, sensor: SensorModel, grid: CanonicalGrid, find: CircleFinder) -> None:
+        self.ball, self._sensor, self._grid, self._find = ball, sensor, grid, find
         self._world: World = make_world(scene)
         self._thickness = scene.gel.size[2]
         self._deepest = MAX_DEPTH * self._thickness
@@ -120,7 +125,7 @@ class _PressedGel:
             settled = self._press_to(depth)
             image, surface = self._seen(*place)
             try:
-                found = contact_circle(image, self.untouched[0], self.ball / pitch)
+                found = self._find(image, self.untouched[0], self.ball / pitch)
             except NoCircle as error:
                 return image, surface, f"our own picture: {error}"
             # light pulls a found circle aside, in the real picture as in ours: both are to be found in one place
@@ -183,13 +188,13 @@ def _next_depth(tried: list[tuple[float, float]], wanted: float) -> float:
     return _deeper(*near, wanted)
 
 
-def _circles(real: FrameSet, ball: float) -> tuple[dict[str, Circle], list[str]]:
+def _circles(real: FrameSet, find: CircleFinder, ball: float) -> tuple[dict[str, Circle], list[str]]:
     """Contact circles by the frame's name, and where none was found. Raises BadFrames when there is none at all."""
     found: dict[str, Circle] = {}
     notes = []
     for frame in real.frames:
         try:
-            found[frame.name] = contact_circle(frame.image, real.reference, ball)
+            found[frame.name] = find(frame.image, real.reference, ball)
         except NoCircle as error:
             notes.append(f"{frame.name}: not pressed: {error}")
     if not found:

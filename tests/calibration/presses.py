@@ -3,7 +3,7 @@ calibrator assumes)."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
@@ -82,3 +82,28 @@ class HiddenSensor:
             change = gaussian_filter(change, (self._spread, self._spread, 0))
         noise = self._rng.normal(0, self._noise, (ROWS, COLUMNS, 3))
         return np.clip(np.rint(self._base + change + drift + noise), 0, 255).astype(np.uint8)
+
+
+class DarkSensor(HiddenSensor):
+    """White light from behind a translucent skin. `share`, `reach` [px]: as tacsim.models.darkness says."""
+
+    def __init__(self, seed: int, share: float = 0.0, reach: float = 15.0, noise: float = 1.0) -> None:
+        super().__init__(seed, noise)
+        self._share, self._reach = share, reach
+        self._base = np.full((ROWS, COLUMNS, 3), (150.0, 160.0, 155.0))
+
+    def press(self, depth: float, x: float, y: float, drift: np.ndarray | float = 0.0, ball: float = BALL_PX) -> Made:
+        made = super().press(depth, x, y, drift, ball)
+        own = made.height - self._share * gaussian_filter(made.height, self._reach, mode="nearest")
+        return replace(made, image=self.seen(self.darkness(own * 1e3)))
+
+    def darkness(self, own: np.ndarray) -> np.ndarray:
+        return np.where(own > 0, 0.9 * (1 - np.exp(-own)), 1.2 * own)
+
+    def seen(self, darkness: np.ndarray) -> np.ndarray:
+        noise = self._rng.normal(0, self._noise, self._base.shape)
+        colour = self._base * (1 - darkness[..., None] * (1.0, 0.95, 0.9))
+        return np.clip(np.rint(colour + noise), 0, 255).astype(np.uint8)
+
+    def empty(self) -> np.ndarray:
+        return self.seen(np.zeros((ROWS, COLUMNS)))

@@ -11,6 +11,7 @@ from tacsim.models.scene import GelSurface
 from tacsim.models.sensor import CanonicalGrid, Markers, SensorModel
 from tacsim.optics.render import Renderer
 from tacsim.optics.surface import surface_map
+from tests.calibration.dotted import draw, lattice_points
 from tests.tacsim.optics.surfaces import dent, flat
 
 GEL = (20e-3, 20e-3)
@@ -156,3 +157,19 @@ def test_what_is_missing_or_wrong_is_said() -> None:
         normalise(_frame(_grey(90), elsewhere), now=2.0)
     with pytest.raises(ValueError, match="canonical image has"):
         FrameNormaliser(normalise._rectify, CanonicalGrid(rows=32))
+
+
+def test_glare_is_refused_where_colour_is_measured_and_not_where_dots_alone_are_followed() -> None:
+    light = np.full((240, 320, 3), 110.0)
+    light[:, :48] = 400.0  # 15 % of the picture; dots are dark there, too
+    centres = lattice_points(7, 9, 32.0) + (160, 120)
+    still, slid = (draw(centres + (shift, 0), 4.0, light=light) for shift in (0, 3))
+    by_colour = ReplaySensorConfig(driver="replay")
+    with pytest.raises(UnusableReference, match="saturated on 1"):
+        normaliser_for_recording(by_colour, (240, 320), GRID).take_reference(_frame(still))
+    by_dots = ReplaySensorConfig(driver="replay", marker_pitch=1.6e-3)
+    normalise = normaliser_for_recording(by_dots, (240, 320), GRID, still)
+    normalise.take_reference(TactileFrame(image=still, time=0.0, index=0))
+    flow = normalise(TactileFrame(image=slid, time=0.1, index=1), now=0.1).flow
+    assert flow is not None and normalise.markers_seen is not None and normalise.markers_seen.all()
+    np.testing.assert_allclose(flow, np.broadcast_to((0.15e-3, 0.0), flow.shape), atol=0.01e-3)

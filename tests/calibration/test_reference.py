@@ -34,6 +34,7 @@ def test_unusable_references_are_refused() -> None:
     glare[:3, :, 0] = 255.0
     with pytest.raises(UnusableReference, match=r"saturated on 15\.0% of the gel, at most 5%"):
         make_reference(glare, VALID)
+    make_reference(glare, VALID, colour=False)
     make_reference(glare, np.pad(VALID[3:], ((3, 0), (0, 0))))  # glare beside the gel does no harm
     with pytest.raises(UnusableReference, match="shows no gel"):
         make_reference(_grey(100.0), ~VALID)

@@ -277,9 +277,17 @@ def test_the_files_say_the_same_and_load_nothing(compared: Comparison, tmp_path:
     assert page.count("data:image/jpeg;base64,") == 6 * len(compared.pairs)
     assert "http://" not in page and "https://" not in page and "<script" not in page
     worst = max(compared.pairs, key=lambda pair: pair.numbers["contact_mae"])
-    assert page.index(f"<td>{worst.a.name}</td>") == min(
-        page.index(f"<td>{pair.a.name}</td>") for pair in compared.pairs
-    )
+    assert page.index(f">{worst.a.name}</td>") == min(page.index(f">{pair.a.name}</td>") for pair in compared.pairs)
+
+
+def test_the_columns_of_the_page_need_no_more_than_their_longest_word(compared: Comparison, tmp_path: Path) -> None:
+    """Heads in one line made the tables wider than a window of 1200 px, and their last columns were cut off."""
+    page = write(tmp_path, compared)[2].read_text(encoding="utf-8")
+    style = page[page.index("<style>") : page.index("</style>")]
+    for part, wrapped in (("thead th", "white-space: normal"), ("td.name", "overflow-wrap: anywhere")):
+        assert wrapped in style[style.rindex(part) :].partition("}")[0]
+    pairs = page[page.index('<table class="pairs">') :].partition("</table>")[0]
+    assert pairs.count('<td class="name">') == 2 * len(compared.pairs)
 
 
 def test_names_of_files_are_no_markup(good: FrameSet, real: FrameSet, tmp_path: Path) -> None:

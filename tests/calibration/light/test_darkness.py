@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from scipy.ndimage import gaussian_filter
 from typer.testing import CliRunner
 
 from calibration.bundle import read_bundle, read_sensor_model, write_bundle
 from calibration.height.darkness import DarknessSlopes
 from calibration.light.calibrator import NoDirection, calibrate_light
-from calibration.light.darkness import tells_no_direction
+from calibration.light.circle import NoCircle
+from calibration.light.darkness import dark_circle, tells_no_direction
 from calibration.light.fit import LightFit
 from calibration.light.page import write_page
 from calibration.light.verdict import KnownScale, judge
@@ -25,33 +25,8 @@ from tacsim.models.sensor import CanonicalGrid
 from tacsim.optics.grid import canonical_cells
 from tacsim.optics.render import Renderer
 from tacsim.optics.surface import sample_surface
-from tests.calibration.presses import BALL, BALL_PX, COLUMNS, PITCH, ROWS, HiddenSensor, Made
+from tests.calibration.presses import BALL, BALL_PX, COLUMNS, PITCH, ROWS, DarkSensor, HiddenSensor, Made
 from tests.tacsim.optics.surfaces import dent, flat
-
-
-class DarkSensor(HiddenSensor):
-    """White light from behind a translucent skin. `share`, `reach` [px]: as tacsim.models.darkness says."""
-
-    def __init__(self, seed: int, share: float = 0.0, reach: float = 15.0, noise: float = 1.0) -> None:
-        super().__init__(seed, noise)
-        self._share, self._reach = share, reach
-        self._base = np.full((ROWS, COLUMNS, 3), (150.0, 160.0, 155.0))
-
-    def press(self, depth: float, x: float, y: float, drift: np.ndarray | float = 0.0, ball: float = BALL_PX) -> Made:
-        made = super().press(depth, x, y, drift, ball)
-        own = made.height - self._share * gaussian_filter(made.height, self._reach, mode="nearest")
-        return replace(made, image=self.seen(self.darkness(own * 1e3)))
-
-    def darkness(self, own: np.ndarray) -> np.ndarray:
-        return np.where(own > 0, 0.9 * (1 - np.exp(-own)), 1.2 * own)
-
-    def seen(self, darkness: np.ndarray) -> np.ndarray:
-        noise = self._rng.normal(0, self._noise, self._base.shape)
-        colour = self._base * (1 - darkness[..., None] * (1.0, 0.95, 0.9))
-        return np.clip(np.rint(colour + noise), 0, 255).astype(np.uint8)
-
-    def empty(self) -> np.ndarray:
-        return self.seen(np.zeros((ROWS, COLUMNS)))
 
 
 class RingSensor(DarkSensor):
@@ -119,6 +94,30 @@ def test_one_lamp_brighter_than_the_others_still_tells_direction() -> None:
         reference = sensor.empty().astype(float)
         changes = [(press.image - reference) / 100 * (6.0, 1.0, 1.0) for press in sensor.presses(5)]
         assert not tells_no_direction(np.maximum(change, -0.05) for change in changes)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.4])
+def test_a_contact_is_found_by_its_darkness(share: float) -> None:
+    sensor = DarkSensor(6, share)
+    for depth in (0.35e-3, 0.65e-3):
+        x, y, radius = sensor.press(depth, 120, 90).circle
+        found = dark_circle(sensor.press(depth, 120, 90).image, sensor.empty(), BALL_PX)
+        assert np.hypot(found.x - x, found.y - y) < 0.5
+        assert found.radius == pytest.approx(radius, rel=0.08)
+        assert found.explained > 0.95
+
+
+def test_no_contact_is_found_in_what_darkness_does_not_tell() -> None:
+    sensor = DarkSensor(6)
+    with pytest.raises(NoCircle, match="no ball's contact is seen: colours change by"):
+        dark_circle(sensor.empty(), sensor.empty(), BALL_PX)
+    bar = sensor.empty()
+    bar[95:105, 60:200] //= 2
+    with pytest.raises(NoCircle, match=r"no ball's contact is seen: the depth of a dent explains .* 90% are needed"):
+        dark_circle(bar, sensor.empty(), BALL_PX)
+    twice = np.minimum(sensor.press(0.5e-3, 60, 60).image, sensor.press(0.5e-3, 200, 140).image)
+    with pytest.raises(NoCircle, match="a second contact"):
+        dark_circle(twice, sensor.empty(), BALL_PX)
 
 
 def test_flanks_that_are_dark_all_alike_tell_no_depth() -> None:

@@ -79,6 +79,38 @@ def test_a_replay_with_a_bundle_shows_its_heights_and_no_task(tmp_path: Path) ->
     assert again.exit_code == 0 and "finger: height" in (tmp_path / "again" / "report.html").read_text(encoding="utf-8")
 
 
+def test_a_replay_says_that_its_maps_show_the_middle_alone_and_how_to_see_all(tmp_path: Path) -> None:
+    """The picture shows 31.2 x 24.7 mm by its dots, the map is 16 x 16 mm."""
+    said = "sensor finger: maps show the middle 16 x 16 mm of 31.2 x 24.7 mm of gel; for all of it: tacsim run ..."
+    all_of_it = ("--set canonical.columns=126", "--set canonical.rows=100")
+    frames = record(tmp_path / "frames", MARKERS)
+    output, _, _ = report(tmp_path, frames, "marker_pitch=3.8 mm")
+    assert f"{said} {' '.join(all_of_it)}" in " ".join(output.split())
+    again = tacsim("replay", str(tmp_path / "out" / "episode.mcap"), "--out", tmp_path / "again")
+    assert said in " ".join(again.output.split())
+    words = [f"--set sensors.finger.source={frames}", "--set sensors.finger.marker_pitch=3.8mm", *all_of_it]
+    whole = tacsim("run", "replay", *" ".join(words).split(), "--out", tmp_path / "whole")
+    assert whole.exit_code == 0 and "the middle" not in whole.output
+
+
+def test_a_bundle_tells_how_much_its_maps_leave_out(tmp_path: Path) -> None:
+    """Of 20.8 x 16 mm the map leaves out the left and right, or nothing where a region shows no more than 16 x 16."""
+    frames = tmp_path / "frames"
+    frames.mkdir()
+    for name, source in (("0.png", "reference.png"), ("1.png", "press.png")):
+        (frames / name).write_bytes((BUNDLE / source).read_bytes())
+    output, _, _ = report(tmp_path, frames, f"calibration={BUNDLE}")
+    said = " ".join(output.split())
+    assert "the middle 16 x 16 mm of 20.8 x 16 mm of gel" in said and "canonical.columns=84" in said
+    assert "canonical.rows" not in said
+    calibration, untouched = read_bundle(BUNDLE)
+    inner = calibration.model_copy(update={"region": ((35, 5), (225, 5), (225, 195), (35, 195))})
+    (tmp_path / "inner").mkdir()
+    write_bundle(tmp_path / "inner", inner, untouched)
+    output, _, _ = report(tmp_path / "inner", frames, f"calibration={tmp_path / 'inner'}")
+    assert "the middle" not in output
+
+
 def test_a_replay_with_a_bundle_that_is_not_to_be_trusted_says_so(tmp_path: Path) -> None:
     frames = tmp_path / "frames"
     frames.mkdir()

@@ -25,7 +25,7 @@ from tacsim.models.sensor import CameraNoise, CanonicalGrid, SensorGeometry, Sen
 from tacsim.optics.spline import displacement_and_jacobian
 from tacsim.physics.failure.health import LaunchSpan, SimulationDiverged
 from tacsim.physics.world import make_world
-from tests.calibration.presses import HiddenSensor
+from tests.calibration.presses import DarkSensor, HiddenSensor
 from tests.calibration.sources import calibrated, save
 from tests.robot.cli.invoked import tacsim
 
@@ -62,6 +62,29 @@ def test_a_scene_against_frames(frames: FrameSet, tmp_path: Path, monkeypatch: p
     assert overall["surface_centroid"]["mean"] < 0.15e-3
     assert [pair["a"] for pair in config["pairs"]] == ["press_0.png", "press_1.png", "still.png"]
     assert config["pairs"][2]["flags"] == ["simulated: no contact", "real: no contact"]
+
+
+def test_presses_under_a_light_that_tells_no_direction_are_found_by_their_darkness(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A dent's slopes explain nothing there: its depth makes it dark."""
+    monkeypatch.chdir(tmp_path)
+    sensor = DarkSensor(3, 0.4)
+    press = Frame("press.png", sensor.press(DEPTHS[1], *PLACES[0]).image)
+    real = FrameSet("real", sensor.empty(), "made up", (press, Frame("still.png", sensor.empty())))
+    save(real, Path("real"))
+    calibration, reference = calibrated(sensor)
+    Path("bundle").mkdir()
+    write_bundle(Path("bundle"), calibration, reference)
+    words = [word for setting in SCENE for word in ("--set", setting)]
+    result = tacsim("compare", "press", "real", "--calibration-b", "bundle", "--out", "out", *words)
+    assert result.exit_code == 0, result.output
+    said = " ".join(result.output.split())
+    assert "still.png: not pressed: no ball's contact is seen" in said and " press.png: not pressed" not in said
+    overall = json.loads(Path("out/compare.json").read_text())["overall"]
+    assert overall["contact_ncc"]["mean"] > 0.95
+    assert overall["contact_mae"]["mean"] < 0.35 * overall["contact_mae"]["null"]
+    assert overall["surface_centroid"]["mean"] < 0.15e-3
 
 
 def test_ball_and_gel_are_those_of_the_bundle_unless_given(frames: FrameSet, tmp_path: Path, monkeypatch) -> None:

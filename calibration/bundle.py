@@ -26,7 +26,6 @@ from tacsim.config.bundle import (
     REFERENCE,
     NoBundle,
     digest,
-    distrusts,
     find_bundle,
     read_files,
     require_unchanged,
@@ -103,11 +102,6 @@ class Calibration(Config):
     def image_shape(self) -> tuple[int, int]:
         """Rows, columns of the pictures that the sensor's camera delivers."""
         return (self.geometry.height, self.geometry.width) if self.view is None else self.view.image_shape
-
-    @property
-    def distrusted(self) -> bool:
-        """The verdict that was written with it is not to trust it."""
-        return any(map(distrusts, self.provenance.warnings))
 
     @model_validator(mode="after")
     def _parts_agree(self) -> Self:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.bundle import read_bundle
+from calibration.bundle import read_sensor_model
 from calibration.errors import CalibrationError, error_context
 from calibration.markers.flow import MarkersLost, find_markers
 from calibration.markers.lattice import NoLattice
@@ -129,7 +129,7 @@ def _normaliser_of(
 def _distrusted(sensor: SensorConfig, name: str) -> list[str]:
     """A word on a calibration that says of itself that it is not to be trusted."""
     path = sensor.calibration if isinstance(sensor, ReplaySensorConfig | CameraSensorConfig) else None
-    if path is None or not read_bundle(Path(path))[0].distrusted:
+    if path is None or not read_sensor_model(Path(path)).caution:
         return []
     return [
         f"sensor {name}: the verdict on {path} is 'do not trust', so neither are its heights; see verdict.html there"

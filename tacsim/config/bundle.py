@@ -125,12 +125,12 @@ def sensor_node(path: Path) -> Node:
         "noise": content.get("noise"),
         "view": content.get("view"),
         "source": f"calibration of {content.get('serial')}, {made}",
-        "caution": next((words for words in told if distrusts(words)), "") if isinstance(told, list) else "",
+        "caution": next((words for words in told if _distrusts(words)), "") if isinstance(told, list) else "",
     }
     return from_plain(model, Place(shown(file), 1), file.parent)
 
 
-def distrusts(warning: object) -> bool:
+def _distrusts(warning: object) -> bool:
     """A warning in a bundle is the verdict that it is not to be trusted."""
     return isinstance(warning, str) and warning.startswith("verdict: do not trust")
 

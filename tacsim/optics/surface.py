@@ -29,7 +29,7 @@ from tacsim.models.sensor import CanonicalGrid, Markers
 from tacsim.optics.fold import EDGE_ON, visible_points
 from tacsim.optics.grid import PixelGrid, canonical_cells
 from tacsim.optics.markers import marker_flow
-from tacsim.optics.spline import LineMatrix, displacement_and_jacobian, line_matrices
+from tacsim.optics.spline import displacement_and_jacobian, refined
 
 Float32 = NDArray[np.float32]
 
@@ -83,9 +83,8 @@ class SurfaceTable:
     def of_nodes(self, values: Float32) -> Float32:
         """(rows, columns, 1) at the table's points of the spline whose control values are `values` (nx, ny)."""
         points = _table_points(self._surface)
-        along_x, _ = _table_matrices(values.shape[0], points)
-        along_y, _ = _table_matrices(values.shape[1], points)
-        return np.asarray((along_y @ (along_x @ values).T)[..., None], np.float32)
+        along_x, _ = refined(values, points)
+        return refined(np.ascontiguousarray(along_x.T), points)[0][..., None]
 
     def place(self) -> tuple[Float32, Float32]:
         """x and y (rows, columns) where each point is seen [m]."""
@@ -246,36 +245,24 @@ def _table_of(
     control = np.frombuffer(displacement, np.float32).reshape(shape)
     surface = GelSurface(control, spacing, origin)
     points = _table_points(surface)
-    value_x, slope_x = _table_matrices(shape[0], points)
-    value_y, slope_y = _table_matrices(shape[1], points)
-    values_x, slopes_x = _along_x(value_x, control), _along_x(slope_x, control)
-    value, by_y, by_x = value_y @ values_x, slope_y @ values_x, value_y @ slopes_x  # (rows, 3 * columns)
+    nx, ny, _ = shape
+    # along x, then along y, where rows are nodes along y, and columns x of one component after the other
+    in_x = (each.reshape(-1, ny, 3).transpose(1, 2, 0) for each in refined(control.reshape(nx, -1), points))
+    (value, by_y), (by_x, _) = (refined(np.ascontiguousarray(each).reshape(ny, -1), points) for each in in_x)
     value, by_x, by_y = (each.reshape(len(each), 3, -1).transpose(1, 0, 2) for each in (value, by_x, by_y))
-    by_x, by_y = by_x / np.float32(surface.spacing), by_y / np.float32(surface.spacing)
-    a, b, c, d = 1.0 + by_x[0], by_y[0], by_x[1], 1.0 + by_y[1]  # J = [[a, b], [c, d]]
+    # by lattice spacings: J is `spacing` times itself, and a gradient, as a ratio, what it is
+    a, b, c, d = spacing + by_x[0], by_y[0], by_x[1], spacing + by_y[1]  # J = [[a, b], [c, d]]
     determinant = a * d - b * c
     folded = float(determinant.min()) <= 0.0
     if folded:
-        determinant = np.maximum(determinant, np.float32(EDGE_ON))
+        determinant = np.maximum(determinant, np.float32(EDGE_ON * spacing**2))
     inverse = -1.0 / determinant  # the minus turns u_z into height
     gradient_x, gradient_y = (d * by_x[2] - c * by_y[2]) * inverse, (a * by_y[2] - b * by_x[2]) * inverse
     fields = np.stack([-value[2], gradient_x, gradient_y], axis=-1)
-    lateral = np.stack([value[0], value[1]], axis=-1) * np.float32(points / surface.spacing)
+    lateral = np.stack([value[0], value[1]], axis=-1) * np.float32(points / spacing)
     for array in (fields, lateral):
         array.setflags(write=False)
     return fields, lateral, folded
-
-
-@lru_cache(maxsize=16)
-def _table_matrices(nodes: int, points: int) -> tuple[LineMatrix, LineMatrix]:
-    return line_matrices(np.arange((nodes - 1) * points + 1) / points, nodes)
-
-
-def _along_x(matrix: LineMatrix, control: Float32) -> Float32:
-    """(ny, 3 * columns): the matrix applied along x to (nx, ny, 3) control values."""
-    nx, ny, _ = control.shape
-    in_x = (matrix @ control.reshape(nx, ny * 3)).reshape(-1, ny, 3)
-    return np.ascontiguousarray(in_x.transpose(1, 2, 0)).reshape(ny, -1)
 
 
 def _table_points(surface: GelSurface) -> int:

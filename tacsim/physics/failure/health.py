@@ -103,7 +103,9 @@ class SimulationDiverged(RuntimeError):
         return "; ".join([f"simulation diverged: {self.cause}{at}", self.where, *steps, self.advice, *dump])
 
 
-def check_launch(arrays: Callable[[], State], good: State, health: Health, where: LaunchSpan) -> Health:
+def check_launch(
+    arrays: Callable[[], State], good: State, health: Health, where: Callable[[], LaunchSpan]
+) -> Health:  # fmt: skip
     """`health` of a launch that changed the world's `arrays` from `good` to what they are.
 
     Raises SimulationDiverged if that is unphysical; the world rolls back and tries again.
@@ -112,7 +114,7 @@ def check_launch(arrays: Callable[[], State], good: State, health: Health, where
     if fault is not None:
         words, quantity = fault
         advice = TORN if quantity in ("node speed", "element length") else ADVICE
-        raise SimulationDiverged(words, where, advice, quantity=quantity, good=good, failed=arrays(), health=health)
+        raise SimulationDiverged(words, where(), advice, quantity=quantity, good=good, failed=arrays(), health=health)
     return health
 
 
@@ -150,7 +152,7 @@ def _fault(look: Callable[[], State], health: Health) -> tuple[str, diagnosis.Qu
 
 
 def require_room(
-    low: NDArray[Any], high: NDArray[Any], cell: float, where: LaunchSpan, most: int = LARGEST_GRID
+    low: NDArray[Any], high: NDArray[Any], cell: float, where: Callable[[], LaunchSpan], most: int = LARGEST_GRID
 ) -> None:
     """Raises SimulationDiverged for a grid from `low` to `high` (3,) [mm] with more nodes than `most`, what there is
     memory for, or LARGEST_GRID."""
@@ -159,4 +161,4 @@ def require_room(
     if not float(np.prod(counts)) <= most:
         size = " x ".join(f"{length:.4g}" for length in (counts - 1) * cell)
         needed = f"a grid of {np.prod(counts):.3g} nodes (limit {most:.3g})"
-        raise SimulationDiverged(f"particles spread over {size} mm, which needs {needed}", where, NO_ROOM)
+        raise SimulationDiverged(f"particles spread over {size} mm, which needs {needed}", where(), NO_ROOM)

@@ -135,14 +135,18 @@ class Launch:
         """It belongs to a motion that flows into the next."""
         return self.path.rates is not None
 
+    def span(self, frames: Sequence[str]) -> LaunchSpan:
+        """See `Path.span`."""
+        return self.path.span(frames, self.first, self.last)
+
 
 @dataclass(frozen=True)
 class PreparedLaunch:
     """A launch that one environment is ready for: its grid is fitted and its parameters are set."""
 
     launch: Launch
+    where: Callable[[], LaunchSpan]  # which part of the motion it is: words that only a failure needs
     drive: NDArray[np.float32]  # (n, frames, 6, 3) of the kernel
-    span: LaunchSpan
     before: State  # copies of the environment's arrays
 
 

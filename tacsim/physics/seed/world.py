@@ -7,8 +7,9 @@ to the scheme itself: bodies stick to each other (no friction coefficient), begi
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -223,7 +224,7 @@ class SeedWorld(BaseWorld):
 
     def _advance(self, path: Path, first: int, last: int) -> ForceReading:
         aside = int(self._aside.sum())
-        where = path.span(self.sensors, first, last)
+        where = partial(path.span, self.sensors, first, last)
         x0, y0 = self._fit_grid(path, first, last, where)
 
         seen = np.zeros((1, NUMBERS), np.float32)
@@ -236,7 +237,7 @@ class SeedWorld(BaseWorld):
         left = int(self._aside.sum()) - aside
         if not len(self._body_points()):
             cause = "every particle of the body left the grid"
-            raise SimulationDiverged(cause, where, quantity="particle speed", good=good, failed=self.arrays())
+            raise SimulationDiverged(cause, where(), quantity="particle speed", good=good, failed=self.arrays())
         integration = Integration(path.step, GEL_DAMPING, health.courant)
         overlap = self._overlap(path, last)
         return ForceReading(backing + self._gain, backing, self._floor, overlap, left, integration=integration)
@@ -254,7 +255,7 @@ class SeedWorld(BaseWorld):
             self._momentum, self._gain, self._backing, health, self._gel, self._body, step,
         )  # fmt: skip
 
-    def _fit_grid(self, path: Path, first: int, last: int, where: LaunchSpan) -> tuple[float, float]:
+    def _fit_grid(self, path: Path, first: int, last: int, where: Callable[[], LaunchSpan]) -> tuple[float, float]:
         """Makes the grid cover what the particles can reach; returns x, y of node (0, 0), whole multiples of dx."""
         faces = path.drive(first, last)[:, :, 3, 2]
         gels, body = self._x[: 2 * self._gels, :2], self._body_points()[:, :2]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import numpy as np
 
@@ -219,24 +220,25 @@ class HybridWorld(FemWorld):
     def prepare(self, launch: Launch) -> PreparedLaunch:
         """Fits the grid and sets this environment's parameters. Raises SimulationDiverged for a grid too large."""
         state, index, path = self._state, self._index, launch.path
-        drive = path.drive(launch.first, launch.last)
-        span = path.span(self._poses, launch.first, launch.last)
+        drive, where = path.drive(launch.first, launch.last), partial(launch.span, tuple(self._poses))
         cell = self._body.cell
         if state.partial[index, :, GREEN].max() > LARGEST_GREEN**2:
             state.particles.move_reference(index)
         extents = state.extents(index)
         low, high = bounds_of(extents)
-        require_room(low - BORDER * cell, high + BORDER * cell, cell, span, state.most_nodes)
+        require_room(low - BORDER * cell, high + BORDER * cell, cell, where, state.most_nodes)
         try:
             state.fit(index, cell, extents)
         except MemoryError as error:
-            raise SimulationDiverged(f"no memory for the grid round the particles ({error})", span, NO_ROOM) from None
+            raise SimulationDiverged(
+                f"no memory for the grid round the particles ({error})", where(), NO_ROOM
+            ) from None
         before = self._before_launch()
         state.params[index, STEP] = path.step
         self._write_body_inertia(state.moments(index))
         self._write_inertia(launch)
         Health.clear(state.partial[index])
-        return PreparedLaunch(launch, drive, span, before)
+        return PreparedLaunch(launch, where, drive, before)
 
     def _write_body_inertia(self, moments: Moments) -> None:
         """Centre, inverse moment of inertia and mean motion of the particles since their reference, for the kernels."""
@@ -254,7 +256,7 @@ class HybridWorld(FemWorld):
         volumes = volume_range(self.arrays()) if seen is None else seen.volumes
         sound = self._sound(volumes[0]) if seen is None else seen.sound
         health = Health.read(partial, self._courant(), sound=sound)
-        check_launch(self.arrays, prepared.before, health, prepared.span)
+        check_launch(self.arrays, prepared.before, health, prepared.where)
         rotations, origins = prepared.drive[-1, :, :3], prepared.drive[-1, :, 3]
         sums = partial.astype(np.float64)
         force, moment = sums[:, FORCE : FORCE + 12].sum(axis=0).reshape(2, 2, 3).swapaxes(0, 1)
@@ -301,7 +303,7 @@ class HybridWorld(FemWorld):
         if found > most:
             raise SimulationDiverged(
                 f"the gels lie {found:.3g} mm inside one another, which they do not feel (limit {most:.3g} mm)",
-                prepared.span, "keep the sensors further apart, or use physics 'seed'", retry=False,
+                prepared.where(), "keep the sensors further apart, or use physics 'seed'", retry=False,
                 good=prepared.before, failed=self.arrays(),
             )  # fmt: skip
         return found

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -285,21 +286,20 @@ class PressWorld(FemWorld):
 
     def prepare(self, launch: Launch) -> PreparedLaunch:
         """Sets this environment's parameters. Raises SimulationDiverged where too much of a mesh could be touched."""
-        path = launch.path
-        span = path.span(self._poses, launch.first, launch.last)
+        path, where = launch.path, partial(launch.span, tuple(self._poses))
         both = path.drive(launch.first, launch.last)
         drive = relative_drive(both[:, 0], both[:, 1])
         try:
             self._cover(drive)
         except ValueError as error:
-            raise SimulationDiverged(str(error), span, TOO_MUCH, retry=False) from None
+            raise SimulationDiverged(str(error), where(), TOO_MUCH, retry=False) from None
         except MemoryError as error:
             cause = f"no memory for the distances from the indenter's mesh ({error})"
-            raise SimulationDiverged(cause, span, TOO_MUCH, retry=False) from None
+            raise SimulationDiverged(cause, where(), TOO_MUCH, retry=False) from None
         before = self._before_launch()
         self._state.params[self._index, STEP] = path.step
         Health.clear(self._state.partial[self._index])
-        return PreparedLaunch(launch, drive, span, before)
+        return PreparedLaunch(launch, where, drive, before)
 
     def _cover(self, drive: np.ndarray) -> None:
         """Fills in a mesh's distances wherever the gel's surface may touch it in this launch."""
@@ -325,7 +325,7 @@ class PressWorld(FemWorld):
         partial = self._state.partial[self._index]
         seen = self._survey()
         health = Health.read(partial, self._courant(), sound=seen is not None and seen.sound)
-        check_launch(self.arrays, prepared.before, health, prepared.span)
+        check_launch(self.arrays, prepared.before, health, prepared.where)
         sums = partial.astype(np.float64).sum(axis=0)
         force, moment = sums[None, FORCE : FORCE + 3], sums[None, FORCE + 3 : FORCE + 6]
         backing = sums[None, BACKING : BACKING + 3]
@@ -371,7 +371,7 @@ class PressWorld(FemWorld):
                 f"between them: use a smaller element_size, such as {finer:.4g} mm"
             )
             before = prepared.before
-            raise SimulationDiverged(cause, prepared.span, advice, retry=False, good=before, failed=self.arrays())
+            raise SimulationDiverged(cause, prepared.where(), advice, retry=False, good=before, failed=self.arrays())
 
 
 def _require_resolved(geometry: Shape, gel: GelParams) -> None:

@@ -71,7 +71,7 @@ class Particles(BaseWorld):
     def launch(self, change: Callable[[dict[str, np.ndarray]], Any], seen: Health = WELL) -> Health:
         good = copies(self.state)
         change(self.state)
-        return check_launch(self.arrays, good, seen, HERE)
+        return check_launch(self.arrays, good, seen, lambda: HERE)
 
 
 def set_to(name: str, index: tuple[int, ...], value: float) -> Callable[[dict[str, np.ndarray]], None]:
@@ -197,11 +197,11 @@ def test_a_broken_state_is_told_before_anything_moves() -> None:
 
 
 def test_a_grid_without_end_is_refused() -> None:
-    require_room(np.zeros(3), np.full(3, 100.0), 1.0, HERE)
+    require_room(np.zeros(3), np.full(3, 100.0), 1.0, lambda: HERE)
     with pytest.raises(SimulationDiverged, match="spread over 1000 x 1000 x 1000 mm"):
-        require_room(np.zeros(3), np.full(3, 1000.0), 1.0, HERE)
+        require_room(np.zeros(3), np.full(3, 1000.0), 1.0, lambda: HERE)
     with pytest.raises(SimulationDiverged):
-        require_room(np.zeros(3), np.array([1.0, 1.0, 1e38], np.float32), 1e-3, HERE)
+        require_room(np.zeros(3), np.array([1.0, 1.0, 1e38], np.float32), 1e-3, lambda: HERE)
 
 
 def test_volumes_are_those_of_the_determinant() -> None:

@@ -10,6 +10,7 @@ x along image columns, y along image rows, z out of the gel towards the object. 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import KW_ONLY, dataclass, field
 from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
@@ -34,11 +35,11 @@ class Pose:
     def __post_init__(self) -> None:
         position = np.array(self.position, dtype=np.float64)
         quaternion = np.array(self.quaternion, dtype=np.float64)
-        if position.shape != (3,) or not np.isfinite(position).all():
+        if position.shape != (3,) or not all(map(math.isfinite, position.tolist())):
             raise ValueError(f"Pose.position must be 3 finite numbers [m], got {self.position!r}")
-        if quaternion.shape != (4,) or not np.isfinite(quaternion).all():
+        if quaternion.shape != (4,) or not all(map(math.isfinite, quaternion.tolist())):
             raise ValueError(f"Pose.quaternion must be 4 finite numbers (x, y, z, w), got {self.quaternion!r}")
-        norm = float(np.linalg.norm(quaternion))
+        norm = math.sqrt(quaternion.dot(quaternion))
         if abs(norm - 1.0) > 1e-3:
             raise ValueError(f"Pose.quaternion must have unit length, got length {norm:.6g}")
         if abs(norm - 1.0) > 1e-15:  # else keep the bits: a recorded pose reads back unchanged

@@ -252,6 +252,8 @@ class _Pool:
 
     def __call__(self, values: FloatArray, valid: NDArray[np.bool_]) -> FloatArray:
         """(channels, h, w) means of (rows, columns, channels) over valid cells; 0 where none is."""
+        if valid.all():
+            return self._sums(values[self._inside]).transpose(2, 0, 1) / self._every**2
         weights = valid[self._inside].astype(np.float64)[..., None]
         total, count = self._sums(values[self._inside] * weights), self._sums(weights)
         means: FloatArray = np.divide(total, count, out=np.zeros_like(total), where=count > 0)

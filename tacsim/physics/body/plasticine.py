@@ -314,8 +314,9 @@ def bounds(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def centre_of(x: np.ndarray) -> np.ndarray:
-    """Mean (3,) of points (n, 3) in float64; by columns, as `bounds`."""
-    return np.array([x[:, d].mean(dtype=np.float64) for d in range(x.shape[1])])
+    """Mean (3,) of points (n, 3) in float64."""
+    centre: np.ndarray = x.T.mean(axis=1, dtype=np.float64)
+    return centre
 
 
 def bounds_of(extents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

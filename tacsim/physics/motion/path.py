@@ -91,30 +91,28 @@ class Path:
         knots = np.arange(first * self.refine, last * self.refine + 1) / (max(self.substeps, 1) * self.refine)
         out = np.zeros((len(knots) - 1, len(self.start), 6, 3))
         for index, a in enumerate(self.start):
-            if not self.substeps:
-                out[:, index, :3], out[:, index, 3] = _matrix(*a.quaternion.tolist()), a.position * MM
-                continue
-            moved = self._displacements(index, knots)
-            if moved[:, 3:].any():
-                from scipy.spatial.transform import Rotation  # slow to import, and most motions turn nothing
+            out[:, index, :3], out[:, index, 3] = _matrix(*a.quaternion.tolist()), a.position * MM
+        if not self.substeps:
+            return np.ascontiguousarray(out, np.float32)
+        moved = self._displacements(knots)
+        out[:, :, 3] += moved[1:, :, :3]
+        out[:, :, 4] = np.diff(moved[..., :3], axis=0) / self.step
+        for index in np.flatnonzero(moved[..., 3:].any(axis=(0, 2))):
+            from scipy.spatial.transform import Rotation  # slow to import, and most motions turn nothing
 
-                turned = Rotation.from_rotvec(moved[:, 3:]) * Rotation.from_quat(a.quaternion)
-                out[:, index, :3] = turned[1:].as_matrix()
-                out[:, index, 5] = (turned[1:] * turned[:-1].inv()).as_rotvec() / self.step
-            else:
-                out[:, index, :3] = _matrix(*a.quaternion.tolist())
-            out[:, index, 3] = a.position * MM + moved[1:, :3]
-            out[:, index, 4] = np.diff(moved[:, :3], axis=0) / self.step
+            turned = Rotation.from_rotvec(moved[:, index, 3:]) * Rotation.from_quat(self.start[index].quaternion)
+            out[:, index, :3] = turned[1:].as_matrix()
+            out[:, index, 5] = (turned[1:] * turned[:-1].inv()).as_rotvec() / self.step
         return np.ascontiguousarray(out, np.float32)
 
-    def _displacements(self, index: int, knots: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(n, 6) of a frame from its start: [mm], rotation vector [rad], at shares `knots` (n,) of the time."""
-        t = np.clip(knots, 0.0, 1.0)[:, None]
-        whole = displacement_between(self.start[index], self.end[index])
+    def _displacements(self, knots: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(n, frames, 6) from the start: [mm], rotation vector [rad], at shares `knots` (n,) of the time."""
+        t = np.clip(knots, 0.0, 1.0)[:, None, None]
+        whole = displacements_between(self.start, self.end)
         if self.rates is None:
             ramped: NDArray[np.float64] = ramp(t, self.rise) * whole
             return ramped
-        before, after = (self.substeps * self.dt * rates[index] for rates in self.rates)
+        before, after = (self.substeps * self.dt * rates for rates in self.rates)
         turned = np.minimum(t / self.rise, 1.0)  # the share u of the turn; its velocity falls as 1 - 3 u^2 + 2 u^3
         flown = after * t + (before - after) * self.rise * (turned - turned**3 + turned**4 / 2)
         left = whole - after - (before - after) * self.rise / 2
@@ -126,9 +124,9 @@ class Path:
         if not self.substeps:
             return LaunchSpan("in the hold after the motion", dict(zip(names, self.start, strict=True)))
         words = f"in substeps {first} to {last} of {self.substeps} of the motion"
-        at, poses = np.array([last / max(self.substeps, 1)]), {}
-        for index, (name, a) in enumerate(zip(names, self.start, strict=True)):
-            moved, quaternion = self._displacements(index, at)[0], a.quaternion
+        at, poses = self._displacements(np.array([last / max(self.substeps, 1)]))[0], {}
+        for name, a, moved in zip(names, self.start, at, strict=True):
+            quaternion = a.quaternion
             if moved[3:].any():
                 from scipy.spatial.transform import Rotation
 
@@ -154,6 +152,11 @@ def displacement_between(a: Pose, b: Pose) -> NDArray[np.float64]:
     return displacement
 
 
+def displacements_between(start: Sequence[Pose], end: Sequence[Pose]) -> NDArray[np.float64]:
+    """(frames, 6): `displacement_between` of each."""
+    return np.array([displacement_between(a, b) for a, b in zip(start, end, strict=True)])
+
+
 def of_fastest_point(vectors: NDArray[np.float64], lever: float) -> float:
     """Displacements or rates (frames, 6), linear and angular, to that of the fastest point; `lever` [mm]: from a
     frame's origin to the gel's rim."""
@@ -163,12 +166,12 @@ def of_fastest_point(vectors: NDArray[np.float64], lever: float) -> float:
 
 def path_length(start: Sequence[Pose], end: Sequence[Pose], lever: float) -> float:
     """Of the fastest point [mm]; lever: see `of_fastest_point`."""
-    return of_fastest_point(np.array([displacement_between(a, b) for a, b in zip(start, end, strict=True)]), lever)
+    return of_fastest_point(displacements_between(start, end), lever)
 
 
 def path_along(start: Sequence[Pose], end: Sequence[Pose], lever: float) -> float:
     """What of it goes along the surface of the first frame, a sensor, turns included [mm]."""
-    displacements = np.array([displacement_between(a, b) for a, b in zip(start, end, strict=True)])
+    displacements = displacements_between(start, end)
     normal = se3.matrix(start[0])[:, 2]
     displacements[:, :3] -= np.outer(displacements[:, :3] @ normal, normal)
     return of_fastest_point(displacements, lever)
@@ -204,7 +207,7 @@ def plan_flow(
     """The path of a step that flows: from `start`, left at `rates` (frames, 6), to `end`, passed at PASSING of the mean
     velocity of the step. That is Mach `mach`; slower with the root of the length where it is less than SHORT_PATH gel
     thicknesses [mm], as in `plan`. With no displacement and at rest it has no substeps. Raises as `plan` does."""
-    displacements = np.array([displacement_between(a, b) for a, b in zip(start, end, strict=True)])
+    displacements = displacements_between(start, end)
     interval = math.ceil(READING_INTERVAL * thickness / dt)
     if not (displacements.any() or rates.any()):
         return Path(start, end, 0, dt, interval=interval)

@@ -253,7 +253,7 @@ class HybridWorld(FemWorld):
         """The forces after the launch. Raises SimulationDiverged if its state is unphysical."""
         partial = self._state.partial[self._index]
         seen = self._survey()
-        volumes = volume_range(self.arrays()) if seen is None else seen.volumes
+        volumes = volume_range(self._state.particles.e(self._index)) if seen is None else seen.volumes
         sound = self._sound(volumes[0]) if seen is None else seen.sound
         health = Health.read(partial, self._courant(), sound=sound)
         check_launch(self.arrays, prepared.before, health, prepared.where)

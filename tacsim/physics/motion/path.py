@@ -97,7 +97,7 @@ class Path:
         moved = self._displacements(knots)
         out[:, :, 3] += moved[1:, :, :3]
         out[:, :, 4] = np.diff(moved[..., :3], axis=0) / self.step
-        for index in np.flatnonzero(moved[..., 3:].any(axis=(0, 2))):
+        for index in np.flatnonzero(moved[..., 3:].any(axis=(0, 2))).tolist():
             from scipy.spatial.transform import Rotation  # slow to import, and most motions turn nothing
 
             turned = Rotation.from_rotvec(moved[:, index, 3:]) * Rotation.from_quat(self.start[index].quaternion)

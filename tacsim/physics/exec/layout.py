@@ -49,7 +49,8 @@ GRID_MOVES = 26  # 1: the grid's nodes have velocities from the launch before; 0
 LINKS = 27  # pairs of a light node of the grid and a leader that an environment has room for, in each order
 PUSHES = 28  # first pair of part 0, 1, ..., and the one after the last, by the leaders (tacsim.physics.body.followers)
 MOVES = 33  # the same by the light nodes
-COUNTS = 38
+EVERY = 38  # substeps after which the parts' numbers are kept: see `RECORDS`
+COUNTS = 39
 
 # partial (environments, PARTS, NUMBERS) float32: what each part saw or summed
 SMALLEST_VOLUME = 0  # det F over the gel elements
@@ -64,6 +65,9 @@ VELOCITY_SUM = 21  # sum of the particles' velocities
 HOUSING_FORCE = 24  # force on the housing of gel 0, gel 1: x, y, z [N]; of the last substep
 GREEN = 30  # largest |F^T F - I|^2 of a particle, F its deformation since the grid's reference
 NUMBERS = 31
+
+# records (environments, RECORDS, PARTS, NUMBERS) float32: `partial` as it was within the launch, every so many substeps
+RECORDS = 9
 
 # rows of a body's particles, one number of all of them each: float32
 PLANE = 0  # tangent plane x, y, z [1/mm] (tacsim.physics.body.surface)

@@ -119,11 +119,13 @@ def _between(contact: NDArray[np.float64]) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class Launch:
-    """What a motion wants next: substeps first..last of a path, then a ForceReading."""
+    """What a motion wants next: substeps first..last of a path, and ForceReadings at so many equal distances in it, the
+    last at its end."""
 
     path: Path
     first: int
     last: int
+    readings: int = 1
 
     @property
     def held(self) -> bool:
@@ -150,23 +152,23 @@ class PreparedLaunch:
     before: State  # copies of the environment's arrays
 
 
-# The logic of one world's motion, which touches no kernel: it yields a Launch and is sent the ForceReading at its end,
-# or thrown the SimulationDiverged that the launch ended in. So many worlds can advance in one launch of kernels, each
-# at its own phase of its own motion; `run` runs the motion of a single world.
-Motion = Generator[Launch, ForceReading, MoveStats]
+# The logic of one world's motion, which touches no kernel: it yields a Launch and is sent its ForceReadings, or thrown
+# the SimulationDiverged that the launch ended in. So many worlds can advance in one launch of kernels, each at its own
+# phase of its own motion; `run` runs the motion of a single world.
+Motion = Generator[Launch, Sequence[ForceReading], MoveStats]
 
 
-def run(motion: Motion, advance: Callable[[Path, int, int], ForceReading]) -> MoveStats:
+def run(motion: Motion, advance: Callable[[Launch], Sequence[ForceReading]]) -> MoveStats:
     """Runs one world's motion to its end. An interrupted motion is closed, so it rolls back."""
     try:
         wanted = next(motion)
         while True:
             try:
-                reading = advance(wanted.path, wanted.first, wanted.last)
+                readings = advance(wanted)
             except SimulationDiverged as failure:
                 wanted = motion.throw(failure)
             else:
-                wanted = motion.send(reading)
+                wanted = motion.send(readings)
     except StopIteration as end:
         stats: MoveStats = end.value
         return stats
@@ -174,27 +176,36 @@ def run(motion: Motion, advance: Callable[[Path, int, int], ForceReading]) -> Mo
         motion.close()
 
 
-def move_and_settle(path: Path, settling: Settling, *, balanced: bool) -> Motion:
+def move_and_settle(path: Path, settling: Settling, *, balanced: bool, most: int = 1) -> Motion:
     """Follows `path`, then holds at its end until the residual is within tolerance or the hold budget is spent.
 
     What creeps (`Path.creeps`) must have little to come at two readings: at one of them it may just turn.
+
+    most: readings that a launch can give. The first launch of the hold takes all without which nobody can tell, later
+    ones a quarter of those before: what is not at rest by then will not be soon.
     """
     readings = yield from _follow(path)
     followed = len(readings)
     rest = replace(path, start=path.end, substeps=0, rates=None)
     held, worst, to_come = 0, math.inf, math.inf
+    least = EARLIER_READINGS + 2 if path.creeps else EARLIER_READINGS + 1 - min(followed, 1)
+    most = max(1, min(most, SUBSTEPS_PER_LAUNCH // path.interval))
     while held < settling.max_substeps:
-        count = min(path.interval, settling.max_substeps - held)
-        readings.append((yield Launch(rest, 0, count)))
-        held += count
-        if len(readings) > EARLIER_READINGS:
-            worst = max(residual(readings[-1], earlier, balanced) for earlier in readings[-1 - EARLIER_READINGS : -1])
-            worst = max(worst, still_to_come(*readings[-3:]))
-        if path.creeps:
-            before, to_come = to_come, math.inf
-            if len(readings) - followed > EARLIER_READINGS:
-                to_come = creep_to_come(readings[followed:], (path.substeps / 2 + held) / path.interval)
-            worst = max(worst, before, to_come)
+        wanted = least if len(readings) == followed else max(1, (len(readings) - followed) // 4)
+        left = settling.max_substeps - held
+        wanted = min(wanted, most, math.ceil(left / path.interval))
+        for reading in (yield Launch(rest, 0, min(wanted * path.interval, left), wanted)):
+            readings.append(reading)
+            held = min(held + path.interval, settling.max_substeps)
+            if len(readings) > EARLIER_READINGS:
+                earlier = readings[-1 - EARLIER_READINGS : -1]
+                worst = max(residual(readings[-1], each, balanced) for each in earlier)
+                worst = max(worst, still_to_come(*readings[-3:]))
+            if path.creeps:
+                before, to_come = to_come, math.inf
+                if len(readings) - followed > EARLIER_READINGS:
+                    to_come = creep_to_come(readings[followed:], (path.substeps / 2 + held) / path.interval)
+                worst = max(worst, before, to_come)
         if worst <= settling.tolerance:
             break
     return _stats(readings, path.substeps, held, worst, settling, unfollowed=path.unfollowed)
@@ -207,10 +218,10 @@ def move_real_time(path: Path, settling: Settling, *, balanced: bool) -> Motion:
     return _stats(readings, path.substeps, 0, worst, settling)
 
 
-def move_flowing(path: Path, settling: Settling, *, balanced: bool) -> Motion:
+def move_flowing(path: Path, settling: Settling, *, balanced: bool, most: int = 1) -> Motion:
     """Follows `path`, which does not end at rest; the residual is the imbalance of forces there."""
     if not path.substeps:
-        return (yield from move_and_settle(path, settling, balanced=balanced))
+        return (yield from move_and_settle(path, settling, balanced=balanced, most=most))
     readings = yield from _follow(path)
     stats = _stats(readings, path.substeps, 0, residual(readings[-1], readings[-1], balanced), settling)
     return replace(stats, settled=False)
@@ -223,10 +234,10 @@ def come_to_rest(path: Path, motion: Motion) -> Motion:
     return replace(stats, substeps=path.substeps + stats.substeps)
 
 
-def _follow(path: Path) -> Generator[Launch, ForceReading, list[ForceReading]]:
+def _follow(path: Path) -> Generator[Launch, Sequence[ForceReading], list[ForceReading]]:
     readings: list[ForceReading] = []
     for first in range(0, path.substeps, SUBSTEPS_PER_LAUNCH):
-        readings.append((yield Launch(path, first, min(first + SUBSTEPS_PER_LAUNCH, path.substeps))))
+        readings += yield Launch(path, first, min(first + SUBSTEPS_PER_LAUNCH, path.substeps))
     return readings
 
 

@@ -78,7 +78,7 @@ class _NormalAxis:
 
 def keep_loads(
     world: LoadableWorld, start: Mapping[str, Pose], end: dict[str, Pose], loads: Mapping[str, float], refine: int, *,
-    balanced: bool,
+    balanced: bool, most: int = 1,
 ) -> Motion:  # fmt: skip
     """From `start` to `end` with `loads` [N] held; `end` (the same frames, in order) becomes where the motion ended.
 
@@ -93,17 +93,17 @@ def keep_loads(
     def force(name: str) -> float:
         return 0.0 - float(world.wrench(name)[2])  # never -0
 
-    def settle_at(share: float) -> Generator[Launch, ForceReading, None]:
+    def settle_at(share: float) -> Generator[Launch, Sequence[ForceReading], None]:
         """At `share` of the path, each loaded sensor off it by its travel."""
         poses = {name: se3.interpolate(start[name], target, share) for name, target in targets.items()}
         for name, axis in axes.items():
             z = se3.rotation(poses[name]).as_matrix()[:, 2]
             poses[name] = Pose(poses[name].position + axis.travel * z, poses[name].quaternion)
         path = replace(world.plan(list(end.values()), list(poses.values())), refine=refine)
-        done.append((yield from move_and_settle(path, scene.settling, balanced=balanced)))
+        done.append((yield from move_and_settle(path, scene.settling, balanced=balanced, most=most)))
         end.update(poses)
 
-    def correct_at(share: float) -> Generator[Launch, ForceReading, float]:
+    def correct_at(share: float) -> Generator[Launch, Sequence[ForceReading], float]:
         """The largest error [N] that is left."""
         for _ in range(CORRECTIONS):
             errors = {name: abs(axis.wanted - force(name)) for name, axis in axes.items()}

@@ -23,7 +23,7 @@ from tacsim.models.scene import FASTEST_MACH, BodyMaterial, Gel, GelMaterial, Ge
 from tacsim.physics.body.material import ELASTIC
 from tacsim.physics.exec.layout import NUMBERS
 from tacsim.physics.failure.health import Health, LaunchSpan, SimulationDiverged, check_launch, require_room
-from tacsim.physics.motion.controller import ForceReading, Integration, Motion, move_and_settle
+from tacsim.physics.motion.controller import ForceReading, Integration, Launch, Motion, move_and_settle
 from tacsim.physics.motion.load import keep_loads, require_loads
 from tacsim.physics.motion.path import Path, plan, resolve_targets
 from tacsim.physics.move import MoveCommand
@@ -222,9 +222,10 @@ class SeedWorld(BaseWorld):
                 f"of its {thickness * MM:.3g} mm; keep the upper at least {-thickness * MM:.3g} mm above the lower"
             )
 
-    def _advance(self, path: Path, first: int, last: int) -> ForceReading:
+    def _advance(self, launch: Launch) -> list[ForceReading]:
+        path, first, last = launch.path, launch.first, launch.last
         aside = int(self._aside.sum())
-        where = partial(path.span, self.sensors, first, last)
+        where = partial(launch.span, self.sensors)
         x0, y0 = self._fit_grid(path, first, last, where)
 
         seen = np.zeros((1, NUMBERS), np.float32)
@@ -240,7 +241,7 @@ class SeedWorld(BaseWorld):
             raise SimulationDiverged(cause, where(), quantity="particle speed", good=good, failed=self.arrays())
         integration = Integration(path.step, GEL_DAMPING, health.courant)
         overlap = self._overlap(path, last)
-        return ForceReading(backing + self._gain, backing, self._floor, overlap, left, integration=integration)
+        return [ForceReading(backing + self._gain, backing, self._floor, overlap, left, integration=integration)]
 
     @launching()
     def _launch(self, drive: Float32, dt: float, x0: float, y0: float, health: Float32) -> None:

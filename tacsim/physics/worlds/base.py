@@ -14,8 +14,7 @@ from tacsim.interface import Pose
 from tacsim.models.scene import Scene
 from tacsim.physics.failure import diagnosis, dump
 from tacsim.physics.failure.health import TORN, LaunchSpan, SimulationDiverged
-from tacsim.physics.motion.controller import ForceReading, Motion, run
-from tacsim.physics.motion.path import Path
+from tacsim.physics.motion.controller import ForceReading, Launch, Motion, run
 from tacsim.physics.move import MoveCommand, MoveStats
 from tacsim.physics.snapshot import State, snapshot_of
 
@@ -88,8 +87,8 @@ class BaseWorld(NotCopyable, ABC):
         return run(self.motion(MoveCommand(targets, loads or {}, duration, flow)), self._advance)
 
     @abstractmethod
-    def _advance(self, path: Path, first: int, last: int) -> ForceReading:
-        """Substeps first..last of a path in one launch. Raises SimulationDiverged if its state is unphysical."""
+    def _advance(self, launch: Launch) -> list[ForceReading]:
+        """Carries out one launch. Raises SimulationDiverged if its state is unphysical."""
 
     def motion(self, command: MoveCommand) -> Motion:
         """`move`, launch by launch. Raises RuntimeError, once begun, while another motion is running."""

@@ -122,9 +122,9 @@ class Batch(NotCopyable):
         return ends
 
     @launching()
-    def _advance(self, wanted: Mapping[int, Launch]) -> dict[int, ForceReading | SimulationDiverged]:
+    def _advance(self, wanted: Mapping[int, Launch]) -> dict[int, list[ForceReading] | SimulationDiverged]:
         """One launch for all environments that want one; an environment that fails does not touch the others."""
-        results: dict[int, ForceReading | SimulationDiverged] = {}
+        results: dict[int, list[ForceReading] | SimulationDiverged] = {}
         ready = {}
         for index, launch in wanted.items():
             try:

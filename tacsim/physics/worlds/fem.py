@@ -118,13 +118,18 @@ class FemWorld(BaseWorld):
     def _stop(self) -> None:
         """Sets the speed of everything to zero."""
 
+    @property
+    def _readings(self) -> int:
+        """How many a launch can give."""
+        return 1
+
     @abstractmethod
     def prepare(self, launch: Launch) -> PreparedLaunch:
         """Sets this environment's parameters for a launch. Raises SimulationDiverged if that cannot be done."""
 
     @abstractmethod
-    def outcome(self, prepared: PreparedLaunch) -> ForceReading:
-        """The forces after the launch. Raises SimulationDiverged if its state is unphysical."""
+    def outcome(self, prepared: PreparedLaunch) -> list[ForceReading]:
+        """The forces that the launch has read. Raises SimulationDiverged if its state is unphysical."""
 
     # ------------------------------------------------------------------ state
 
@@ -239,6 +244,7 @@ class FemWorld(BaseWorld):
         end = resolve_targets(self._poses, command.targets)
         require_loads(command.loads, self.sensors)
         begin, goals, settling = dict(self._poses), dict(end), self.scene.settling
+        balanced, most = self.balanced, self._readings
         a, b = list(begin.values()), list(end.values())
         path = None  # of a dynamic motion; others are planned anew for each attempt
         if command.duration is not None:
@@ -250,18 +256,22 @@ class FemWorld(BaseWorld):
         def from_rest(refine: int) -> Motion:
             self._switch_inertia(self._scaled if path is None else self._true)
             if path is not None:
-                return (yield from move_real_time(replace(path, refine=refine), settling, balanced=self.balanced))
+                return (yield from move_real_time(replace(path, refine=refine), settling, balanced=balanced))
             if command.loads:
                 end.update(goals)
-                return (yield from keep_loads(self, begin, end, command.loads, refine, balanced=self.balanced))
+                return (
+                    yield from keep_loads(
+                        self, begin, end, command.loads, refine, balanced=self.balanced, most=self._readings
+                    )
+                )
             quasi_static = replace(self.plan(a, b), refine=refine)
-            return (yield from move_and_settle(quasi_static, settling, balanced=self.balanced))
+            return (yield from move_and_settle(quasi_static, settling, balanced=balanced, most=most))
 
         def attempt(refine: int) -> Motion:
             flow = replace(flowing, refine=refine)
             if command.flow:
                 self._switch_inertia(self._scaled)
-                return move_flowing(flow, settling, balanced=self.balanced)
+                return move_flowing(flow, settling, balanced=balanced, most=most)
             return come_to_rest(flow, from_rest(refine)) if self._rates.any() else from_rest(refine)
 
         stats = yield from self._retried(command, attempt)
@@ -293,7 +303,7 @@ class FemWorld(BaseWorld):
         return replace(path, creeps=self.yields)
 
     @launching()  # around all of it: worlds of a batch share arrays, among them those that say which take part
-    def _advance(self, path: Path, first: int, last: int) -> ForceReading:
-        prepared = self.prepare(Launch(path, first, last))
+    def _advance(self, launch: Launch) -> list[ForceReading]:
+        prepared = self.prepare(launch)
         self._state.advance({self._index: prepared.drive})
         return self.outcome(prepared)

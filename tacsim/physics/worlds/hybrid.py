@@ -27,6 +27,7 @@ from tacsim.physics.exec.layout import (
     BODY_MASS,
     CARRIED,
     CENTRE,
+    EVERY,
     FILTERED,
     FORCE,
     FRICTION,
@@ -37,7 +38,9 @@ from tacsim.physics.exec.layout import (
     HOUSING,
     HOUSING_FORCE,
     INVERSE_INERTIA,
+    OVERLAP,
     OWN,
+    RECORDS,
     REFERENCE_CENTRE,
     RIGID_MASS_SCALE,
     STEP,
@@ -235,6 +238,7 @@ class HybridWorld(FemWorld):
             ) from None
         before = self._before_launch()
         state.params[index, STEP] = path.step
+        state.counts[index, EVERY] = -(-len(drive) // launch.readings)
         self._write_body_inertia(state.moments(index))
         self._write_inertia(launch)
         Health.clear(state.partial[index])
@@ -249,31 +253,46 @@ class HybridWorld(FemWorld):
         params[CENTRE : CENTRE + 3] = moments.centre
         params[INVERSE_INERTIA : INVERSE_INERTIA + 6] = inverse[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
 
-    def outcome(self, prepared: PreparedLaunch) -> ForceReading:
-        """The forces after the launch. Raises SimulationDiverged if its state is unphysical."""
+    def outcome(self, prepared: PreparedLaunch) -> list[ForceReading]:
+        """The forces in and after the launch. Raises SimulationDiverged if its state is unphysical."""
         partial = self._state.partial[self._index]
         seen = self._survey()
         volumes = volume_range(self._state.particles.e(self._index)) if seen is None else seen.volumes
         sound = self._sound(volumes[0]) if seen is None else seen.sound
         health = Health.read(partial, self._courant(), sound=sound)
         check_launch(self.arrays, prepared.before, health, prepared.where)
-        rotations, origins = prepared.drive[-1, :, :3], prepared.drive[-1, :, 3]
-        sums = partial.astype(np.float64)
-        force, moment = sums[:, FORCE : FORCE + 12].sum(axis=0).reshape(2, 2, 3).swapaxes(0, 1)
-        backing = sums[:, BACKING : BACKING + 3].reshape(2, -1, 3).sum(axis=1)  # which holds the housing too
-        backing += sums[:, HOUSING_FORCE : HOUSING_FORCE + 6].sum(axis=0).reshape(2, 3)
-        contact = np.einsum("gij,gj->gi", rotations, force)
-        backing = np.einsum("gij,gj->gi", rotations, backing)
-        centre = self._state.centre(self._index)
-        torque = (np.einsum("gij,gj->gi", rotations, moment) + _cross(origins - centre, contact)).sum(axis=0)
+        each, drive = self._numbers(prepared.launch.readings), prepared.drive[-1]
+        rotations, origins = drive[:, :3], drive[:, 3]  # sensors stand still where there are several readings
+        sums = each.astype(np.float64)
+        forces, moments = np.moveaxis(sums[..., FORCE : FORCE + 12].sum(axis=1).reshape(-1, 2, 2, 3), 2, 0)
+        backings = sums[..., BACKING : BACKING + 3].reshape(len(each), 2, -1, 3).sum(axis=2)  # of the housing too:
+        backings += sums[..., HOUSING_FORCE : HOUSING_FORCE + 6].sum(axis=1).reshape(-1, 2, 3)
+        contacts, backings, turns = (np.einsum("gij,ngj->ngi", rotations, of) for of in (forces, backings, moments))
+        torques = (turns + _cross(origins - self._state.centre(self._index), contacts)).sum(axis=1)
         lever = max(self._gel.half)
         gel_overlap = self._gel_overlap(prepared)
         hits = health.capped + (gel_overlap > 0.0) + self._torn(volumes[1])
-        return ForceReading(
-            contact, backing, self._floor, health.overlap, hits,
-            moment / lever, self._weight, torque / lever,
-            Integration(prepared.launch.path.step, self._damping(), health.courant), gel_overlap, volumes,
-        )  # fmt: skip
+        overlaps = each[..., OVERLAP].max(axis=1).tolist()
+        integration = Integration(prepared.launch.path.step, self._damping(), health.courant)
+        last = len(each) - 1
+        return [
+            ForceReading(
+                contacts[n], backings[n], self._floor, overlaps[n], hits if n == last else 0, moments[n] / lever,
+                self._weight, torques[n] / lever, integration, gel_overlap, volumes,
+            )
+            for n in range(len(each))
+        ]  # fmt: skip
+
+    def _numbers(self, readings: int) -> np.ndarray:
+        """(readings, PARTS, NUMBERS) of the parts, those of the launch's end last."""
+        state, i = self._state, self._index
+        if readings == 1:
+            return state.partial[i : i + 1]
+        return np.concatenate([state.records[i, : readings - 1], state.partial[i : i + 1]])
+
+    @property
+    def _readings(self) -> int:
+        return 1 if self._state.device is not None else 1 + RECORDS
 
     def _sound(self, smallest_volume: float) -> bool:
         """See Health.sound. Of whole arrays, since there are many small ones; what is wrong where, others find out."""
@@ -310,5 +329,5 @@ class HybridWorld(FemWorld):
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Cross products of rows (n, 3); np.cross takes three times as long for two."""
-    return np.stack([a[:, i] * b[:, j] - a[:, j] * b[:, i] for i, j in ((1, 2), (2, 0), (0, 1))], axis=1)
+    """Cross products of vectors (..., 3); np.cross takes three times as long for two."""
+    return np.stack([a[..., i] * b[..., j] - a[..., j] * b[..., i] for i, j in ((1, 2), (2, 0), (0, 1))], axis=-1)

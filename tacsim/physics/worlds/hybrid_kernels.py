@@ -41,6 +41,7 @@ from tacsim.physics.gel.kernels import (
 from tacsim.physics.gel.mass import gel_advance_filtered, gel_even, gel_means
 
 Drive = ti.types.ndarray(dtype=ti.f32, ndim=5)
+Records = ti.types.ndarray(dtype=ti.f32, ndim=4)
 STAGES = 7  # of a substep
 TURN = 1.0 / 3.0  # share of the boost that rotations get: with more of it bodies overshoot when a slide stops
 
@@ -216,13 +217,23 @@ def gel_contact(
         record_sum(env, slot, layout.HOUSING_FORCE + 3 * g + d, on_housing[d])
 
 
+@ti.func
+def keep_record(env: ti.template(), part, it, records: ti.template()):
+    """At the end of substep `it`, if it is one of those after which the part's numbers are wanted."""
+    every = env.count(layout.EVERY)
+    record = (it + 1) // every - 1
+    for _wanted in range(once_if((it + 1) % every == 0 and record < layout.RECORDS)):
+        for number in range(layout.NUMBERS):
+            records[env.index, record, part, number] = env.partial[env.index, part, number]
+
+
 @ti.kernel
 def substeps(
     team: ti.i32, drive: Drive,
     nodes: Floats, surface: Floats, contact_force: Floats, corners: Floats, lattice: Lattice,
     particles: Floats, masses: Strips, velocities: Strips, changes: Floats, ends: Ends, shares: Floats,
     histories: ContactHistories,
-    params: Params, counts: Counts, partial: Partial, sync: Sync,
+    params: Params, counts: Counts, partial: Partial, records: Records, sync: Sync,
 ):  # fmt: skip
     """Explicit substeps of every environment's scene in one launch, `team` threads an environment.
 
@@ -272,5 +283,7 @@ def substeps(
                     grid_update(env, part, it, drive, body)
                 for _light in range(once_if(stage % STAGES == 6)):
                     follow(env, part, body)
+                for _end in range(once_if(stage % STAGES == STAGES - 1)):
+                    keep_record(env, part, it, records)
                 piece_done(sync, turn)
                 piece = next_piece(sync, turn, own, stages)

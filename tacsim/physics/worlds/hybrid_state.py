@@ -16,7 +16,7 @@ from tacsim.physics.body.plasticine import STENCIL_REACH, BodyParams, BodyState,
 from tacsim.physics.body.surface import tangent_planes
 from tacsim.physics.contact.contact import ContactHistory
 from tacsim.physics.exec.lanes import ON_DEVICE, PARTS
-from tacsim.physics.exec.layout import COUNTS, ELEMENTS, NUMBERS, PARAMS
+from tacsim.physics.exec.layout import COUNTS, ELEMENTS, NUMBERS, PARAMS, RECORDS
 from tacsim.physics.exec.team import run_team
 from tacsim.physics.gel.gel import GelState, common_lattice, gel_params
 from tacsim.physics.units import MM
@@ -51,6 +51,7 @@ class HybridState(FemState):
         self.counts = np.zeros((len(scenes), COUNTS), np.int32)
         self.counts[:, ELEMENTS : ELEMENTS + 3] = self.gel[0].elements
         self.partial = np.zeros((len(scenes), PARTS, NUMBERS), np.float32)
+        self.records = np.zeros((len(scenes), RECORDS, PARTS, NUMBERS), np.float32)
         if ON_DEVICE:
             from tacsim.physics.worlds.device_state import DeviceHybrid
 
@@ -125,7 +126,7 @@ class HybridState(FemState):
             run_team(
                 substeps, drive, self._gels.arguments(), self._particles.arguments(),
                 self._particles.changes.reshape(-1), *self._particles.links(), self._contact_history, self.params,
-                self.counts, self.partial, active=list(drives),
+                self.counts, self.partial, self.records, active=list(drives),
             )  # fmt: skip
         for index in drives:
             self._particles.keep_grid(index, self.counts)

@@ -320,7 +320,7 @@ class PressWorld(FemWorld):
         top[..., :2] += np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
         return top.reshape(-1, 3)
 
-    def outcome(self, prepared: PreparedLaunch) -> ForceReading:
+    def outcome(self, prepared: PreparedLaunch) -> list[ForceReading]:
         """The forces after the launch. Raises SimulationDiverged if its state is unphysical."""
         partial = self._state.partial[self._index]
         seen = self._survey()
@@ -331,10 +331,11 @@ class PressWorld(FemWorld):
         backing = sums[None, BACKING : BACKING + 3]
         if prepared.launch.held or (not force.any() and prepared.launch.last == prepared.launch.path.substeps):
             self._require_seen(prepared, health.overlap)
-        return ForceReading(
+        reading = ForceReading(
             force, backing, self._floor, health.overlap, health.capped, moment / max(self._gel.half),
             integration=Integration(prepared.launch.path.step, self._damping(), health.courant),
         )  # fmt: skip
+        return [reading]
 
     def _require_seen(self, prepared: PreparedLaunch, overlap: float) -> None:
         """Raises SimulationDiverged if the indenter's lowest point over the gel has come into it between its contact

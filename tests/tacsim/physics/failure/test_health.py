@@ -55,7 +55,7 @@ class Particles(BaseWorld):
     def _run_command(self, command: MoveCommand) -> Motion:
         return self._retried(command, one_launch)
 
-    def _advance(self, path: Path, first: int, last: int) -> ForceReading:
+    def _advance(self, launch: Launch) -> list[ForceReading]:
         raise AssertionError("the test advances it")
 
     def arrays(self) -> dict[str, np.ndarray]:
@@ -128,11 +128,11 @@ def test_a_gel_node_that_races_and_a_crushed_particle_are_seen() -> None:
 def test_a_motion_starts_again_from_the_state_before_it() -> None:
     world, seen = Particles(), []
 
-    def advance(path: Path, first: int, last: int) -> ForceReading:
-        seen.append((path.refine, float(world.state["position"][0, 0])))
+    def advance(launch: Launch) -> list[ForceReading]:
+        seen.append((launch.path.refine, float(world.state["position"][0, 0])))
         world.state["position"] += 1.0
-        world.launch(set_to("velocity", (0, 0), 0.0 if path.refine == 2 else np.nan))
-        return REST
+        world.launch(set_to("velocity", (0, 0), 0.0 if launch.path.refine == 2 else np.nan))
+        return [REST]
 
     stats = run(world.motion(MoveCommand({})), advance)
     assert seen == [(1, 1.0), (2, 1.0)]
@@ -143,11 +143,11 @@ def test_a_motion_that_never_succeeds_leaves_the_world_as_it_was() -> None:
     world, steps = Particles(), []
     before = world.snapshot()
 
-    def advance(path: Path, first: int, last: int) -> ForceReading:
-        steps.append(path.refine)
+    def advance(launch: Launch) -> list[ForceReading]:
+        steps.append(launch.path.refine)
         world.launch(nothing)
         world.launch(lambda a: (a["position"].__iadd__(2.0), a["velocity"].__setitem__((1, 0), np.inf)))
-        return REST
+        return [REST]
 
     with pytest.raises(SimulationDiverged) as caught:
         run(world.motion(MoveCommand({})), advance)
@@ -167,7 +167,7 @@ def test_of_two_motions_in_step_one_fails_and_the_other_goes_on() -> None:
     good.state["position"] += 1.0
     bad.state["position"] += 1.0
     with pytest.raises(StopIteration) as ended:
-        motions[0].send(REST)
+        motions[0].send([REST])
     again = motions[1].throw(SimulationDiverged("too fast", HERE))
     assert ended.value.value == STATS
     assert (launches[1].path.refine, again.path.refine) == (1, 2)
@@ -178,7 +178,7 @@ def test_of_two_motions_in_step_one_fails_and_the_other_goes_on() -> None:
 def test_an_interrupted_motion_is_taken_back(error: type[BaseException]) -> None:
     world = Particles()
 
-    def advance(path: Path, first: int, last: int) -> ForceReading:
+    def advance(launch: Launch) -> list[ForceReading]:
         world.state["position"] += 1.0
         raise error
 

@@ -10,6 +10,7 @@ from tacsim.models.scene import Settling
 from tacsim.physics.motion.controller import (
     LASTING,
     ForceReading,
+    Launch,
     creep_to_come,
     move_and_settle,
     residual,
@@ -43,7 +44,7 @@ def test_what_creeps_is_held_until_little_is_left_of_it() -> None:
     path = Path([Pose()], [Pose()], 0, 0.4)
     stats = run(
         move_and_settle(path, Settling(max_substeps=100_000), balanced=False),
-        lambda path, first, last: reading(next(drags)),
+        lambda launch: [reading(next(drags))],
     )
     left = 0.1 * 0.95 ** (stats.hold // path.interval - 1)
     assert stats.settled
@@ -84,6 +85,29 @@ def test_a_body_that_swings_between_two_gels_does_not_creep() -> None:
     assert creep_to_come(squeezed, 20.0) > 0.01
 
 
+def test_a_launch_gives_several_readings_where_it_can() -> None:
+    """The first launch of the hold as many as it takes to tell, later ones a quarter of those before."""
+
+    def settled(most: int) -> tuple[int, list[int]]:
+        times, asked = iter(range(8, 1000)), list[int]()
+
+        def advance(launch: Launch) -> list[ForceReading]:
+            asked.append(launch.readings)
+            assert launch.last == launch.readings * launch.path.interval
+            return [creeping(0.02, next(times)) for _ in range(launch.readings)]
+
+        path = replace(Path([Pose()], [Pose()], 0, 0.4, interval=8), creeps=True)
+        stats = run(move_and_settle(path, Settling(max_substeps=100_000), balanced=False, most=most), advance)
+        assert stats.settled and stats.hold == 8 * sum(asked)
+        return stats.hold, asked
+
+    hold, one_by_one = settled(1)
+    longer, asked = settled(10)
+    assert set(one_by_one) == {1} and asked[:6] == [4, 1, 1, 1, 1, 2]
+    assert hold <= longer <= 1.25 * hold and len(asked) < len(one_by_one) / 2
+    assert max(settled(2)[1]) == 2
+
+
 @pytest.mark.parametrize("creeps", [True, False])
 def test_what_creeps_with_the_logarithm_of_time_is_not_settled_before_its_time(creeps: bool) -> None:
     """Each change is within the tolerance from the start, and so is what a geometric rest of them would be."""
@@ -91,7 +115,7 @@ def test_what_creeps_with_the_logarithm_of_time_is_not_settled_before_its_time(c
     times = iter(range(8, 1000))
     stats = run(
         move_and_settle(path, Settling(max_substeps=100_000), balanced=False),
-        lambda path, first, last: creeping(0.01, next(times)),
+        lambda launch: [creeping(0.01, next(times))],
     )
     after = 7 + stats.hold // path.interval
     assert stats.settled

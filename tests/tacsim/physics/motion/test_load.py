@@ -91,7 +91,7 @@ def test_the_sensor_that_went_too_far_is_named() -> None:
 
     motion = keep_loads(Stuck(), dict(end), end, {"lower": 0.4, "upper": 0.3}, 1, balanced=False)
     with pytest.raises(LoadNotReached, match=r"'upper' does not reach a load of 0\.3 N: 0 N after \+2\.5 mm"):
-        run(motion, lambda *launch: rest)
+        run(motion, lambda launch: [rest])
 
 
 def test_a_path_that_would_take_for_ever_is_refused_with_a_load_too() -> None:

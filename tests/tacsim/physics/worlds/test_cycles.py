@@ -8,6 +8,7 @@ import pytest
 from tacsim.interface import Pose
 from tacsim.models.scene import Body, BodyMaterial, Box, Cylinder, Preset, Scene, Settling, lame
 from tacsim.physics.failure.diagnosis import particle_volumes
+from tacsim.physics.motion.controller import Launch
 from tacsim.physics.move import MoveStats
 from tacsim.physics.worlds.hybrid import HybridWorld
 
@@ -129,10 +130,10 @@ def test_a_hold_is_the_same_however_it_is_cut_into_launches() -> None:
         by = np.array([0.0, 0.0, 1.5e-3])
         end = [Pose(pose.position + sign * by, pose.quaternion) for pose, sign in zip(start, (1, -1), strict=True)]
         path = world.plan(start, end)
-        world._advance(path, 0, path.substeps)
+        world._advance(Launch(path, 0, path.substeps))
         rest, before = replace(path, start=end, substeps=0), world.snapshot()["flow"].mean()
         for _ in range(64 // each):
-            world._advance(rest, 0, each)
+            world._advance(Launch(rest, 0, each))
         return float(world.snapshot()["flow"].mean() - before)
 
     assert flowed(4) == pytest.approx(flowed(64), rel=1e-4)
@@ -165,3 +166,21 @@ def test_what_still_creeps_when_the_hold_must_end_is_not_settled() -> None:
     stats = closed(world, 3.0e-3)
     assert not stats.settled
     assert stats.residual > 0.01
+
+
+def test_readings_within_a_launch_are_those_of_launches_that_end_there() -> None:
+    world = HybridWorld(Scene(preset="learn", body=CYLINDER))
+    close(world, 1.5e-3)
+    start = list(world._poses.values())
+    end = [Pose(pose.position + [1e-4, 0.0, 0.0], pose.quaternion) for pose in start]
+    path = world.plan(start, end)
+    world._advance(Launch(path, 0, path.substeps))
+    rest, before = replace(path, start=end, substeps=0), world.snapshot()
+    together = world._advance(Launch(rest, 0, 12, readings=3))
+    world.restore(before)
+    one_by_one = [world._advance(Launch(rest, 0, 4))[0] for _ in range(3)]
+    for one, other in zip(together, one_by_one, strict=True):
+        for name in ("contact", "backing", "moment", "torque", "overlap"):
+            np.testing.assert_allclose(getattr(one, name), getattr(other, name), atol=1e-5, err_msg=name)
+    changes = [np.abs(after.contact - before.contact).max() for before, after in zip(together, together[1:])]
+    assert min(changes) > 1e-4  # it has not come to rest, so a reading of another moment would show

@@ -21,6 +21,9 @@ from tacsim.physics.snapshot import State
 from tacsim.physics.units import MM
 
 SUBSTEPS_PER_LAUNCH = 80  # while frames are driven: a control step is one launch or two
+# While they are held. Between launches the grid of a body that flows on is laid anew: with 48, one that was squeezed to a
+# fifth did not come to rest.
+SUBSTEPS_PER_HOLD = 12
 EARLIER_READINGS = 2  # that one is compared with: a single one may have the same phase of an oscillation
 FORESIGHT = 20.0  # readings
 LASTING = 20.0  # readings: how much longer a settled force of what flows keeps within the tolerance
@@ -181,19 +184,17 @@ def move_and_settle(path: Path, settling: Settling, *, balanced: bool, most: int
 
     What creeps (`Path.creeps`) must have little to come at two readings: at one of them it may just turn.
 
-    most: readings that a launch can give. The first launch of the hold takes all without which nobody can tell, later
-    ones a quarter of those before: what is not at rest by then will not be soon.
+    most: readings that a launch can give. The first launch of the hold takes several, without which nobody can tell,
+    later ones a quarter of those before: what is not at rest by then will not be soon.
     """
     readings = yield from _follow(path)
     followed = len(readings)
     rest = replace(path, start=path.end, substeps=0, rates=None)
     held, worst, to_come = 0, math.inf, math.inf
-    least = EARLIER_READINGS + 2 if path.creeps else EARLIER_READINGS + 1 - min(followed, 1)
-    most = max(1, min(most, SUBSTEPS_PER_LAUNCH // path.interval))
+    most = max(1, min(most, SUBSTEPS_PER_HOLD // path.interval, 1 + EARLIER_READINGS))
     while held < settling.max_substeps:
-        wanted = least if len(readings) == followed else max(1, (len(readings) - followed) // 4)
-        left = settling.max_substeps - held
-        wanted = min(wanted, most, math.ceil(left / path.interval))
+        left, known = settling.max_substeps - held, len(readings) - followed
+        wanted = min(max(1, known // 4) if known else most, most, math.ceil(left / path.interval))
         for reading in (yield Launch(rest, 0, min(wanted * path.interval, left), wanted)):
             readings.append(reading)
             held = min(held + path.interval, settling.max_substeps)

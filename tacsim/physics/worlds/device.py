@@ -28,7 +28,7 @@ from tacsim.physics.gel.kernels import (
     surface_row,
 )
 from tacsim.physics.gel.mass import gel_advance_filtered, gel_even, gel_means
-from tacsim.physics.worlds.hybrid_kernels import ContactHistories, Drive, gel_contact, grid_update
+from tacsim.physics.worlds.hybrid_kernels import ContactHistories, Drive, Records, gel_contact, grid_update, keep_record
 from tacsim.physics.worlds.survey import BLOCKS
 from tacsim.physics.worlds.survey_kernels import Sums
 
@@ -218,10 +218,14 @@ def scatter_of_hybrid(
 @ti.kernel
 def gather_of_hybrid(
     clock: Clock, particles: Floats, masses: Strips, velocities: Strips,
-    params: Params, counts: Counts, partial: Partial, sums: Sums, most_particles: ti.i32,
+    params: Params, counts: Counts, partial: Partial, records: Records, sums: Sums, most_particles: ti.i32,
 ):  # fmt: skip
     """Last third: the grid back to the particles, and the sum of their velocities, block by block: an atomic addition a
     particle would queue for a few addresses, and in another order each time."""
+    for e, slot in ti.ndrange(counts.shape[0], PARTS):
+        env = ti.static(Environment(e, params, counts, partial))
+        if is_active(env, clock):
+            keep_record(env, slot, clock[0], records)
     for e, p in ti.ndrange(counts.shape[0], most_particles):
         env = ti.static(Environment(e, params, counts, partial))
         if is_active(env, clock) and p < env.count(layout.PARTICLES):

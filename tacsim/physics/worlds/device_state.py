@@ -211,10 +211,11 @@ class DeviceHybrid(DeviceState):
     _substeps, _survey, _keep = hybrid_substeps, hybrid_survey, keep_hybrid
 
     def __init__(
-        self, gels: GelState, numbers: Numbers, body: BodyState, contact_history: Callable[[], np.ndarray]
+        self, gels: GelState, numbers: Numbers, records: np.ndarray, body: BodyState,
+        contact_history: Callable[[], np.ndarray],
     ) -> None:  # fmt: skip
         super().__init__(gels, numbers)
-        self._body, self._contact_history = body, contact_history
+        self._records, self._body, self._contact_history = records, body, contact_history
 
     def _particles(self, index: int) -> int:
         return self._body.counts[index]
@@ -232,6 +233,7 @@ class DeviceHybrid(DeviceState):
         return {
             "masses": self.arrays.allocate("masses", strip, masses.shape[:-1]),
             "changes": self.arrays.allocate("changes", ti.f32, (self._body.changes.size,)),
+            "records": self.arrays.allocate("records", ti.f32, self._records.shape),
             "sums": self.arrays.allocate("sums", ti.f32, (len(self._params), MOMENTS, BLOCKS)),
             "ends": self.arrays.upload("ends", self._body.links()[0], ti.i32),
             "shares": self.arrays.upload("shares", self._body.links()[1], ti.f32),
@@ -248,6 +250,7 @@ class DeviceHybrid(DeviceState):
     def run(self, drive: np.ndarray) -> None:
         self._own()["masses"].fill(0)  # also where particles that left the grid have been added
         super().run(drive)
+        self.arrays.download(records=self._records)
 
     def moments(self, index: int) -> Moments:
         found = self.survey(index).moments

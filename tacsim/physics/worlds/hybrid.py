@@ -292,7 +292,7 @@ class HybridWorld(FemWorld):
 
     @property
     def _readings(self) -> int:
-        return 1 if self._state.device is not None else 1 + RECORDS
+        return 1 + RECORDS
 
     def _sound(self, smallest_volume: float) -> bool:
         """See Health.sound. Of whole arrays, since there are many small ones; what is wrong where, others find out."""

@@ -56,7 +56,9 @@ class HybridState(FemState):
             from tacsim.physics.worlds.device_state import DeviceHybrid
 
             numbers = self.params, self.counts, self.partial
-            self.device = DeviceHybrid(self._gels, numbers, self._particles, lambda: self._contact_history)
+            self.device = DeviceHybrid(
+                self._gels, numbers, self.records, self._particles, lambda: self._contact_history
+            )
 
     @property
     def particles(self) -> BodyState:

@@ -1,6 +1,7 @@
 """Bodies led to and fro."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -182,5 +183,5 @@ def test_readings_within_a_launch_are_those_of_launches_that_end_there() -> None
     for one, other in zip(together, one_by_one, strict=True):
         for name in ("contact", "backing", "moment", "torque", "overlap"):
             np.testing.assert_allclose(getattr(one, name), getattr(other, name), atol=1e-5, err_msg=name)
-    changes = [np.abs(after.contact - before.contact).max() for before, after in zip(together, together[1:])]
+    changes = [np.abs(after.contact - before.contact).max() for before, after in pairwise(together)]
     assert min(changes) > 1e-4  # it has not come to rest, so a reading of another moment would show

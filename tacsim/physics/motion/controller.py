@@ -21,8 +21,8 @@ from tacsim.physics.snapshot import State
 from tacsim.physics.units import MM
 
 SUBSTEPS_PER_LAUNCH = 80  # while frames are driven: a control step is one launch or two
-# While they are held. Between launches the grid of a body that flows on is laid anew: with 48, one that was squeezed to a
-# fifth did not come to rest.
+# While they are held. Between launches the grid of a body that flows on is laid anew: with 48, one that was squeezed to
+# a fifth did not come to rest.
 SUBSTEPS_PER_HOLD = 12
 EARLIER_READINGS = 2  # that one is compared with: a single one may have the same phase of an oscillation
 FORESIGHT = 20.0  # readings

@@ -250,7 +250,8 @@ class DeviceHybrid(DeviceState):
     def run(self, drive: np.ndarray) -> None:
         self._own()["masses"].fill(0)  # also where particles that left the grid have been added
         super().run(drive)
-        self.arrays.download(records=self._records)
+        if (self._counts[:, layout.EVERY] < self._counts[:, layout.STEPS]).any():
+            self.arrays.download(records=self._records)
 
     def moments(self, index: int) -> Moments:
         found = self.survey(index).moments

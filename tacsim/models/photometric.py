@@ -81,25 +81,31 @@ def normal_terms(gradient: Floating, degree: int) -> Floating:
     """(terms, ...) the terms of the normal for slopes (..., 2), in the order of the weights."""
     gx, gy = gradient[..., 0], gradient[..., 1]
     terms = np.empty((term_count(degree, 0), *gx.shape), dtype=gradient.dtype)
-    nz = 1.0 / np.sqrt(1.0 + gx * gx + gy * gy)
-    terms[0], terms[1], terms[2] = gx * -nz, gy * -nz, 1.0 - nz
-    last, here = [0, 1], 3
-    for _ in range(degree - 1):  # nx^a ny^b of one order higher: each by nx, and the last by ny
-        for term, factor in [*((term, 0) for term in last), (last[-1], 1)]:
-            np.multiply(terms[term], terms[factor], out=terms[here, ...])
-            here += 1
-        last = list(range(here - len(last) - 1, here))
+    nx, ny, tilt = terms[0, ...], terms[1, ...], terms[2, ...]
+    np.divide(-1.0, np.sqrt(1.0 + gx * gx + gy * gy), out=tilt)  # -nz
+    np.multiply(gx, tilt, out=nx)
+    np.multiply(gy, tilt, out=ny)
+    tilt += 1.0
+    _higher_orders(terms, (nx, ny), order=2, last=0, here=3)
     return terms
 
 
-def position_terms(u: Floating, v: Floating, position: int) -> list[Floating]:
-    """The terms of the place in the image for u, v (...,) in -1/2..1/2."""
-    products = [np.ones_like(u)]  # each by u, and the last by v, from one order to the next
-    last = products
-    for _ in range(position):
-        last = [*(term * u for term in last), last[-1] * v]
-        products = products + last
-    return products
+def position_terms(u: Floating, v: Floating, position: int) -> Floating:
+    """(terms, ...) the terms of the place in the image for u, v (...,) in -1/2..1/2."""
+    terms = np.empty((math.comb(position + 2, 2), *u.shape), dtype=u.dtype)
+    terms[0] = 1.0
+    _higher_orders(terms, (u, v), order=1, last=0, here=1)
+    return terms
+
+
+def _higher_orders(terms: Floating, factors: tuple[Floating, Floating], order: int, last: int, here: int) -> None:
+    """Fills `terms` from row `here` on with the products of two factors of this `order` and higher ones. The `order`
+    products of one order less start at row `last`: each by the first factor, and the last of them by the second."""
+    first, second = factors
+    while here < len(terms):
+        np.multiply(terms[last : last + order], first, out=terms[here : here + order])
+        np.multiply(terms[last + order - 1], second, out=terms[here + order, ...])
+        last, here, order = here, here + order + 1, order + 1
 
 
 def depth_terms(height: Floating, deepest: float, u: Floating, v: Floating) -> Floating:
@@ -157,16 +163,16 @@ class PhotometricLight:
 
         slopes, beyond = clipped(gradient, self._model.steepest)
         deep = self._model.depth if height is not None else None
-        terms = position_terms(u, v, self._model.position)
-        weights = self._weights[: 3 * len(terms)]
+        places = position_terms(u, v, self._model.position)
+        weights = self._weights[: 3 * len(places)]
         if deep is not None and height is not None and deep.slopes:
-            terms, weights = [*terms, relative_depth(height, deep.deepest)], self._weights
-        places = np.stack(terms)
+            places, weights = np.stack([*places, relative_depth(height, deep.deepest)]), self._weights
         # Most of the work is this product of matrices, row by row: BLAS does one so small on this thread. A large one
         # it shares with threads that wait by spinning, which on a busy machine took 40 ms instead of half a one.
-        normals = np.moveaxis(normal_terms(slopes, self._model.degree), 0, -2)  # (..., terms, n)
-        at_places = (weights @ normals).reshape(*normals.shape[:-2], len(places), 3, -1)
-        colours = np.einsum("...pcn,p...n->c...n", at_places, places)
+        normals = normal_terms(slopes, self._model.degree)
+        at_places = np.empty((len(weights), *normals.shape[1:]), dtype=np.float32)
+        np.matmul(weights, np.moveaxis(normals, 0, -2), out=np.moveaxis(at_places, 0, -2))
+        colours = np.einsum("pc...,p...->c...", at_places.reshape(len(places), 3, *normals.shape[1:]), places)
         if deep is not None and height is not None and self._depth is not None:
             colours += np.tensordot(self._depth, depth_terms(height, deep.deepest, u, v), axes=(0, 0))
         red, green, blue = colours

@@ -170,12 +170,14 @@ class Renderer:
         import cv2
 
         assert self.model.photometric is not None
-        place = self._grid.in_image(*table.place())
-        width = np.float32(self._grid.columns * self._grid.pitch)
-        colours, beyond = calibrated.change(table.fields[..., 1:], *place, table.fields[..., 0] / width)
+        part = table.part(self._grid)
+        place = self._grid.in_image(*(each[part] for each in table.place()))
+        fields, width = table.fields[part], np.float32(self._grid.columns * self._grid.pitch)
+        colours = np.zeros_like(table.fields)
+        colours[part], beyond = calibrated.change(fields[..., 1:], *place, fields[..., 0] / width)
         if self.model.photometric.shadows is not None:
             colours += shadow_colours(calibrated, self.model.photometric.shadows, table, self._grid)
-        self._beyond = beyond / (colours.size // 3)
+        self._beyond = beyond / place[0].size
         change = table.at(colours, points, inside)
         if self.model.photometric.blur > 0:
             cv2.GaussianBlur(change, (0, 0), self.model.photometric.blur, dst=change)

@@ -95,6 +95,16 @@ class SurfaceTable:
         y = origin_y + pitch * (np.arange(rows, dtype=np.float32)[:, None] + self._lateral[..., 1])
         return x, y
 
+    def part(self, grid: PixelGrid) -> tuple[slice, slice]:
+        """Rows and columns of the table that what is seen at the points of `grid` can be looked up in; at least one."""
+        # sideways motion, a neighbour to be linear to, and one to spare, as points are found to a part of one
+        reach = float(np.abs(self._lateral).max()) + 2.0
+        ends = np.array([[grid.x[0], grid.y[0]], [grid.x[-1], grid.y[-1]]])
+        ends = (ends - self._surface.origin) / self.pitch + [[-reach], [reach]]
+        rows, columns = self.fields.shape[:2]
+        (left, top), (right, bottom) = np.clip(ends, 0, (columns - 1, rows - 1)).astype(int).tolist()
+        return slice(top, bottom + 1), slice(left, right + 1)
+
     def at_places(self, values: Float32, x: Float32, y: Float32) -> Float32:
         """`values` (rows, columns) of the table's points at places x, y (...,) on the untouched gel [m], linear between
         them; beyond the gel as on its border."""
@@ -131,15 +141,16 @@ class SurfaceTable:
     def _of_one_sheet(self, grid: PixelGrid, fine: bool) -> tuple[Float32, NDArray[np.bool_]]:
         """:meth:`points` of a surface that does not fold over. Raises SurfaceFolded where it turns out to do so."""
         # Where the grid is finer than the table, points are found on a coarser one, twice as fine as the table or, not
-        # `fine`, just as fine, and are linear between those: the surface's sideways motion is smooth. The first errs
+        # `fine`, half as fine, and are linear between those: the surface's sideways motion is smooth. The first errs
         # less than the look-up rounds, the second about as much.
-        block = max(1, int(self.pitch / (grid.pitch * (2 if fine else 1))))  # points a coarse one, along a side
+        block = max(1, int(self.pitch * (0.5 if fine else 2.0) / grid.pitch))  # points a coarse one, along a side
         points = self._material_points(grid if block == 1 else _coarse(grid, block))
-        inside = self._on_gel(points)
         if block > 1:
             points = _fine(points, block, grid.shape)
-            inside = np.ones(grid.shape, dtype=np.bool_) if inside.all() else self._on_gel(points)
-        return points, inside
+        # where no sheet folds over, what lies within a border that is on the gel is on it, too
+        border = np.concatenate([points[0], points[-1], points[:, 0], points[:, -1]])
+        on_gel = self._on_gel(border[None]).all()
+        return points, np.ones(grid.shape, dtype=np.bool_) if on_gel else self._on_gel(points)
 
     def at_rest(self, points: Float32, grid: PixelGrid) -> Float32:
         """(H, W, 2) column, row in `grid` of where `points` of :meth:`points` lie on the untouched gel."""

@@ -87,6 +87,19 @@ class SurfaceTable:
         along_y, _ = _table_matrices(values.shape[1], points)
         return np.asarray((along_y @ (along_x @ values).T)[..., None], np.float32)
 
+    def part(self, grid: PixelGrid) -> tuple[slice, slice]:
+        """Rows and columns of the table in which all lies that is seen at the points of `grid`; at least one."""
+        # sideways motion, a neighbour to be linear to, and one to spare, as points are found to a part of one
+        reach = 2.0 + max(float(self._lateral.max()), -float(self._lateral.min()))
+
+        def along(first: float, number: int, points: int) -> slice:
+            start, stop = first / self.pitch - reach, (first + (number - 1) * grid.pitch) / self.pitch + reach
+            start, stop = (min(max(0, int(end)), points - 1) for end in (start, stop))
+            return slice(start, stop + 1)
+
+        (rows, columns), (origin_x, origin_y) = self.fields.shape[:2], self._surface.origin
+        return along(grid.y0 - origin_y, grid.rows, rows), along(grid.x0 - origin_x, grid.columns, columns)
+
     def place(self) -> tuple[Float32, Float32]:
         """x and y (rows, columns) where each point is seen [m]."""
         (rows, columns), pitch = self.fields.shape[:2], np.float32(self.pitch)
@@ -94,16 +107,6 @@ class SurfaceTable:
         x = origin_x + pitch * (np.arange(columns, dtype=np.float32) + self._lateral[..., 0])
         y = origin_y + pitch * (np.arange(rows, dtype=np.float32)[:, None] + self._lateral[..., 1])
         return x, y
-
-    def part(self, grid: PixelGrid) -> tuple[slice, slice]:
-        """Rows and columns of the table that what is seen at the points of `grid` can be looked up in; at least one."""
-        # sideways motion, a neighbour to be linear to, and one to spare, as points are found to a part of one
-        reach = float(np.abs(self._lateral).max()) + 2.0
-        ends = np.array([[grid.x[0], grid.y[0]], [grid.x[-1], grid.y[-1]]])
-        ends = (ends - self._surface.origin) / self.pitch + [[-reach], [reach]]
-        rows, columns = self.fields.shape[:2]
-        (left, top), (right, bottom) = np.clip(ends, 0, (columns - 1, rows - 1)).astype(int).tolist()
-        return slice(top, bottom + 1), slice(left, right + 1)
 
     def at_places(self, values: Float32, x: Float32, y: Float32) -> Float32:
         """`values` (rows, columns) of the table's points at places x, y (...,) on the untouched gel [m], linear between

@@ -144,9 +144,9 @@ class SurfaceTable:
     def _of_one_sheet(self, grid: PixelGrid, fine: bool) -> tuple[Float32, NDArray[np.bool_]]:
         """:meth:`points` of a surface that does not fold over. Raises SurfaceFolded where it turns out to do so."""
         # Where the grid is finer than the table, points are found on a coarser one, twice as fine as the table or, not
-        # `fine`, half as fine, and are linear between those: the surface's sideways motion is smooth. The first errs
+        # `fine`, just as fine, and are linear between those: the surface's sideways motion is smooth. The first errs
         # less than the look-up rounds, the second about as much.
-        block = max(1, int(self.pitch * (0.5 if fine else 2.0) / grid.pitch))  # points a coarse one, along a side
+        block = max(1, int(self.pitch / (grid.pitch * (2 if fine else 1))))  # points a coarse one, along a side
         points = self._material_points(grid if block == 1 else _coarse(grid, block))
         if block > 1:
             points = _fine(points, block, grid.shape)
@@ -166,15 +166,15 @@ class SurfaceTable:
 
     def _material_points(self, grid: PixelGrid) -> Float32:
         """(rows, columns, 2) material points [table points] under the image points of `grid`: X <- x - u(X)."""
+        import cv2
+
         seen = _table_coordinates(self._surface.origin, self.pitch, grid)
-        points, change = seen, seen
-        for _ in range(FIXED_POINT_STEPS):
-            moved = seen - look_up(self._lateral, points)
-            change = np.abs(moved - points)
-            points = moved
-            if float(change.max()) <= CONVERGED:
+        last, points = seen, seen - look_up(self._lateral, seen)
+        for _ in range(FIXED_POINT_STEPS - 1):
+            if cv2.norm(points, last, cv2.NORM_INF) <= CONVERGED:
                 return points
-        restless = change.max(axis=2) > CONVERGED
+            last, points = points, seen - look_up(self._lateral, points)
+        restless = np.abs(points - last).max(axis=2) > CONVERGED
         exact = material_points(self._surface, self._surface.origin + self.pitch * seen[restless].astype(np.float64))
         points[restless] = (exact - self._surface.origin) / self.pitch
         return points

@@ -56,6 +56,10 @@ def test_change_is_the_polynomial_written_out() -> None:
     assert beyond == 0
     scaled, _ = PhotometricLight(calibrated, (0.5, 1.0, 2.0)).change(gradient[8:12], u[8:12], v[8:12])
     np.testing.assert_allclose(scaled, change[8:12] * [0.5, 1.0, 2.0], atol=1e-6)
+    several = np.stack([gradient, -gradient])
+    both, _ = PhotometricLight(calibrated).change(several, np.stack([u, u]), np.stack([v, v]))
+    np.testing.assert_array_equal(both[0], change)
+    np.testing.assert_array_equal(both[1], PhotometricLight(calibrated).change(-gradient, u, v)[0])
 
 
 def test_slopes_beyond_the_calibrated_are_clipped_and_counted() -> None:

@@ -178,7 +178,8 @@ class PhotometricLight:
         at_places = np.empty((*weights.shape[:2], *u.shape), dtype=np.float32)
         by_row = np.moveaxis(at_places.reshape(-1, *u.shape), 0, -2)
         np.matmul(weights.reshape(-1, len(terms)), np.moveaxis(terms, 0, -2), out=by_row)
-        red, green, blue = np.einsum("pc...,p...->c...", at_places, places).reshape(3, 1, -1)
+        count = len(places)
+        red, green, blue = np.einsum("pcn,pn->cn", at_places.reshape(count, 3, -1), places.reshape(count, -1))
         return np.asarray(cv2.merge([red, green, blue]), dtype=np.float32).reshape(*gradient.shape[:-1], 3), beyond
 
     def shadow(self, horizons: Sequence[Float32], u: Float32, v: Float32) -> Float32:

@@ -74,9 +74,10 @@ class ForwardSteps:
         self, slope: Float32, colour: list[Float32], place: tuple[Float32, Float32, Float32], rest: Float32 | None
     ) -> Float32:
         """(..., 2) slopes after a Gauss-Newton step from those of the surface, at places u, v, height."""
-        here = self._light.change(slope, *place)[0]
-        delta = np.eye(2, dtype=np.float32) * np.float32(DELTA)
-        by_x, by_y = ((self._light.change(slope + step, *place)[0] - here) / np.float32(DELTA) for step in delta)
+        steps = np.float32(DELTA) * np.array([[0, 0], [1, 0], [0, 1]], dtype=np.float32)
+        slopes = slope + steps.reshape(3, *(1,) * (slope.ndim - 1), 2)
+        here, at_x, at_y = self._light.change(slopes, *(np.broadcast_to(each, slopes.shape[:-1]) for each in place))[0]
+        by_x, by_y = (at_x - here) / np.float32(DELTA), (at_y - here) / np.float32(DELTA)
         if rest is not None:
             here = here + rest
         xx = yy = np.full_like(colour[0], STIFFNESS)

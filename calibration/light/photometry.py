@@ -76,7 +76,7 @@ class NormalEquations:
 def features(gradient: Float64, u: Float64, v: Float64, degree: int, position: int) -> Float64:
     """(n, terms) for slopes (n, 2) at places u, v (n,) in -1/2..1/2."""
     normal = np.ascontiguousarray(np.moveaxis(normal_terms(gradient, degree), 0, -1))
-    place = np.stack(position_terms(u, v, position), axis=-1)
+    place = np.moveaxis(position_terms(u, v, position), 0, -1)
     return np.asarray((place[:, :, None] * normal[:, None, :]).reshape(len(gradient), -1), dtype=np.float64)
 
 
@@ -123,7 +123,7 @@ def _sums(gradient: Float64, u: Float64, v: Float64, change: Float64) -> tuple[F
         part = slice(start, start + CHUNK)
         normal = normal_terms(gradient[part], 2 * degree)
         normal = np.concatenate([normal, normal[2] * normal[:normals]])  # as _products has them
-        place = np.stack(position_terms(u[part], v[part], 2 * position))
+        place = position_terms(u[part], v[part], 2 * position)
         sums += normal @ place.T
         right += normal[:normals] @ (place[:places, None] * change[part].T).reshape(places * channels, -1).T
     of_normals, of_places = _pairs()

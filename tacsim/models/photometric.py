@@ -29,7 +29,7 @@ Float64 = NDArray[np.float64]
 Floating = NDArray[np.floating]
 
 Weight = Annotated[float, Field(allow_inf_nan=False)]
-DEPTH_TERMS = 5
+DEPTH_TERMS, DEPTH_POWERS = 5, 3
 
 
 class DepthColour(Config):
@@ -77,29 +77,37 @@ def term_count(degree: int, position: int) -> int:
     return math.comb(degree + 2, 2) * math.comb(position + 2, 2)
 
 
-def normal_terms(gradient: Floating, degree: int) -> Floating:
-    """(terms, ...) the terms of the normal for slopes (..., 2), in the order of the weights."""
+def normal_terms(gradient: Floating, degree: int, more: int = 0) -> Floating:
+    """(terms, ...) the terms of the normal for slopes (..., 2), in the order of the weights; and `more` rows that are
+    left to be filled."""
     gx, gy = gradient[..., 0], gradient[..., 1]
-    terms = np.empty((term_count(degree, 0), *gx.shape), dtype=gradient.dtype)
-    nz = 1.0 / np.sqrt(1.0 + gx * gx + gy * gy)
-    terms[0], terms[1], terms[2] = gx * -nz, gy * -nz, 1.0 - nz
-    last, here = [0, 1], 3
-    for _ in range(degree - 1):  # nx^a ny^b of one order higher: each by nx, and the last by ny
-        for term, factor in [*((term, 0) for term in last), (last[-1], 1)]:
-            np.multiply(terms[term], terms[factor], out=terms[here, ...])
-            here += 1
-        last = list(range(here - len(last) - 1, here))
+    count = term_count(degree, 0)
+    terms = np.empty((count + more, *gx.shape), dtype=gradient.dtype)
+    nx, ny, tilt = terms[0, ...], terms[1, ...], terms[2, ...]
+    np.divide(-1.0, np.sqrt(1.0 + gx * gx + gy * gy), out=tilt)  # -nz
+    np.multiply(gx, tilt, out=nx)
+    np.multiply(gy, tilt, out=ny)
+    tilt += 1.0
+    _higher_orders(terms[:count], (nx, ny), order=2, last=0, here=3)
     return terms
 
 
-def position_terms(u: Floating, v: Floating, position: int) -> list[Floating]:
-    """The terms of the place in the image for u, v (...,) in -1/2..1/2."""
-    products = [np.ones_like(u)]  # each by u, and the last by v, from one order to the next
-    last = products
-    for _ in range(position):
-        last = [*(term * u for term in last), last[-1] * v]
-        products = products + last
-    return products
+def position_terms(u: Floating, v: Floating, position: int) -> Floating:
+    """(terms, ...) the terms of the place in the image for u, v (...,) in -1/2..1/2."""
+    terms = np.empty((math.comb(position + 2, 2), *u.shape), dtype=u.dtype)
+    terms[0] = 1.0
+    _higher_orders(terms, (u, v), order=1, last=0, here=1)
+    return terms
+
+
+def _higher_orders(terms: Floating, factors: tuple[Floating, Floating], order: int, last: int, here: int) -> None:
+    """Fills `terms` from row `here` on with the products of two factors of this `order` and higher ones. The `order`
+    products of one order less start at row `last`: each by the first factor, and the last of them by the second."""
+    first, second = factors
+    while here < len(terms):
+        np.multiply(terms[last : last + order], first, out=terms[here : here + order])
+        np.multiply(terms[last + order - 1], second, out=terms[here + order, ...])
+        last, here, order = here, here + order + 1, order + 1
 
 
 def depth_terms(height: Floating, deepest: float, u: Floating, v: Floating) -> Floating:
@@ -142,12 +150,9 @@ class PhotometricLight:
     def __init__(self, model: PhotometricModel, mean: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> None:
         """mean: the untouched image's mean colour, by which changes are multiplied; 1: they stay relative."""
         self._model = model
-        self._terms = term_count(model.degree, 0)
-        slopes = () if model.depth is None else model.depth.slopes  # the depth is one more place
-        weights = (np.array(model.weights + slopes) * mean).astype(np.float32).reshape(-1, self._terms, 3)
-        self._weights = np.ascontiguousarray(weights.transpose(0, 2, 1)).reshape(-1, self._terms)  # place and channel
+        self._surface = _by_place(model.weights, term_count(model.degree, 0), mean)
+        self._deep = None if model.depth is None else _with_depth(self._surface, model.depth, mean)
         self._shadows = None if model.shadows is None else (np.array(model.shadows.weights) * mean).astype(np.float32)
-        self._depth = None if model.depth is None else (np.array(model.depth.weights) * mean).astype(np.float32)
 
     def change(self, gradient: Float32, u: Float32, v: Float32, height: Float32 | None = None) -> tuple[Float32, int]:
         """(..., n, 3) change of colour under slopes (..., n, 2) at places u, v (..., n) in -1/2..1/2, before blur, and
@@ -155,21 +160,26 @@ class PhotometricLight:
         picture], which counts where the model knows depth; None: as at the surface."""
         import cv2
 
+        degree, position, depth = self._model.degree, self._model.position, self._model.depth
         slopes, beyond = clipped(gradient, self._model.steepest)
-        deep = self._model.depth if height is not None else None
-        terms = position_terms(u, v, self._model.position)
-        weights = self._weights[: 3 * len(terms)]
-        if deep is not None and height is not None and deep.slopes:
-            terms, weights = [*terms, relative_depth(height, deep.deepest)], self._weights
-        places = np.stack(terms)
+        if height is None or depth is None or self._deep is None:
+            weights, terms, places = self._surface, normal_terms(slopes, degree), position_terms(u, v, position)
+        else:
+            weights, terms = self._deep, normal_terms(slopes, degree, more=DEPTH_POWERS)
+            places = position_terms(u, v, max(position, 1))
+            w, square, cube = terms[-DEPTH_POWERS:]
+            w[...] = relative_depth(height, depth.deepest)
+            np.multiply(w, w, out=square)
+            np.multiply(square, w, out=cube)
+            if depth.slopes:
+                places = np.concatenate([places, w[None]])
         # Most of the work is this product of matrices, row by row: BLAS does one so small on this thread. A large one
         # it shares with threads that wait by spinning, which on a busy machine took 40 ms instead of half a one.
-        normals = np.moveaxis(normal_terms(slopes, self._model.degree), 0, -2)  # (..., terms, n)
-        at_places = (weights @ normals).reshape(*normals.shape[:-2], len(places), 3, -1)
-        colours = np.einsum("...pcn,p...n->c...n", at_places, places)
-        if deep is not None and height is not None and self._depth is not None:
-            colours += np.tensordot(self._depth, depth_terms(height, deep.deepest, u, v), axes=(0, 0))
-        red, green, blue = colours
+        at_places = np.empty((*weights.shape[:2], *u.shape), dtype=np.float32)
+        by_row = np.moveaxis(at_places.reshape(-1, *u.shape), 0, -2)
+        np.matmul(weights.reshape(-1, len(terms)), np.moveaxis(terms, 0, -2), out=by_row)
+        count = len(places)
+        red, green, blue = np.einsum("pcn,pn->cn", at_places.reshape(count, 3, -1), places.reshape(count, -1))
         return np.asarray(cv2.merge([red, green, blue]), dtype=np.float32).reshape(*gradient.shape[:-1], 3), beyond
 
     def shadow(self, horizons: Sequence[Float32], u: Float32, v: Float32) -> Float32:
@@ -177,3 +187,23 @@ class PhotometricLight:
         blur. Of a model with shadows."""
         assert self._shadows is not None
         return np.asarray(np.tensordot(shadow_terms(horizons, u, v), self._shadows, axes=(0, 0)), dtype=np.float32)
+
+
+def _by_place(weights: Sequence[Sequence[float]], terms: int, mean: Sequence[float]) -> Float32:
+    """(places, 3, terms) of `weights` (places * terms, 3), times the colour `mean`."""
+    scaled = np.array(weights).reshape(-1, terms, 3) * mean
+    return np.ascontiguousarray(scaled.transpose(0, 2, 1), dtype=np.float32)
+
+
+def _with_depth(surface: Float32, depth: DepthColour, mean: Sequence[float]) -> Float32:
+    """(places, 3, terms) weights of the `surface` with those of a colour of depth: w, w^2 and w^3 are DEPTH_POWERS more
+    terms beside those of the normal, and w one more place if slopes look otherwise at depth."""
+    linear, by_u, by_v, square, cube = (np.array(depth.weights) * mean).astype(np.float32)
+    places, _, terms = surface.shape
+    slopes = _by_place(depth.slopes, terms, mean)
+    own = max(places, 3)  # 1, u and v in any case
+    weights = np.zeros((own + len(slopes), 3, terms + DEPTH_POWERS), dtype=np.float32)
+    weights[:places, :, :terms], weights[own:, :, :terms] = surface, slopes
+    weights[0, :, terms:] = np.stack([linear, square, cube], axis=-1)
+    weights[1, :, terms], weights[2, :, terms] = by_u, by_v
+    return weights

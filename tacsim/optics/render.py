@@ -44,6 +44,7 @@ TEXTURE_PITCH = 0.12e-3
 WHITE = np.float32(255.0)
 STEEPEST = 2.0  # largest slope in the table of light
 TABLE_POINTS = 256  # of that table, from slope 0 to STEEPEST
+BLUR_REACH = 2.5  # standard deviations that a camera's blur reaches: with OpenCV's 4 it is 0.01 grey levels another
 ASTRAY = 0.5  # [px] that a pixel put on the gel and back may be off
 LEAST_PIXELS = 128 * 128  # of a picture that is worth a table
 TABLE_ERROR = 0.5  # largest error of the table [grey levels]; narrower highlights are computed without it
@@ -170,15 +171,19 @@ class Renderer:
         import cv2
 
         assert self.model.photometric is not None
-        place = self._grid.in_image(*table.place())
-        width = np.float32(self._grid.columns * self._grid.pitch)
-        colours, beyond = calibrated.change(table.fields[..., 1:], *place, table.fields[..., 0] / width)
+        part = table.part(self._grid)
+        place = self._grid.in_image(*(each[part] for each in table.place()))
+        fields, width = table.fields[part], np.float32(self._grid.columns * self._grid.pitch)
+        colours = np.zeros_like(table.fields)
+        colours[part], beyond = calibrated.change(fields[..., 1:], *place, fields[..., 0] / width)
         if self.model.photometric.shadows is not None:
             colours += shadow_colours(calibrated, self.model.photometric.shadows, table, self._grid)
-        self._beyond = beyond / (colours.size // 3)
+        self._beyond = beyond / place[0].size
         change = table.at(colours, points, inside)
-        if self.model.photometric.blur > 0:
-            cv2.GaussianBlur(change, (0, 0), self.model.photometric.blur, dst=change)
+        blur = self.model.photometric.blur
+        if blur > 0:
+            side = 2 * math.ceil(BLUR_REACH * blur) + 1
+            cv2.GaussianBlur(change, (side, side), blur, dst=change)
         return change.__getitem__
 
 

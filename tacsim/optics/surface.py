@@ -86,6 +86,19 @@ class SurfaceTable:
         along_x, _ = refined(values, points)
         return refined(np.ascontiguousarray(along_x.T), points)[0][..., None]
 
+    def part(self, grid: PixelGrid) -> tuple[slice, slice]:
+        """Rows and columns of the table in which all lies that is seen at the points of `grid`; at least one."""
+        # sideways motion, a neighbour to be linear to, and one to spare, as points are found to a part of one
+        reach = 2.0 + max(float(self._lateral.max()), -float(self._lateral.min()))
+
+        def along(first: float, number: int, points: int) -> slice:
+            start, stop = first / self.pitch - reach, (first + (number - 1) * grid.pitch) / self.pitch + reach
+            start, stop = (min(max(0, int(end)), points - 1) for end in (start, stop))
+            return slice(start, stop + 1)
+
+        (rows, columns), (origin_x, origin_y) = self.fields.shape[:2], self._surface.origin
+        return along(grid.y0 - origin_y, grid.rows, rows), along(grid.x0 - origin_x, grid.columns, columns)
+
     def place(self) -> tuple[Float32, Float32]:
         """x and y (rows, columns) where each point is seen [m]."""
         (rows, columns), pitch = self.fields.shape[:2], np.float32(self.pitch)
@@ -134,11 +147,12 @@ class SurfaceTable:
         # less than the look-up rounds, the second about as much.
         block = max(1, int(self.pitch / (grid.pitch * (2 if fine else 1))))  # points a coarse one, along a side
         points = self._material_points(grid if block == 1 else _coarse(grid, block))
-        inside = self._on_gel(points)
         if block > 1:
             points = _fine(points, block, grid.shape)
-            inside = np.ones(grid.shape, dtype=np.bool_) if inside.all() else self._on_gel(points)
-        return points, inside
+        # where no sheet folds over, what lies within a border that is on the gel is on it, too
+        border = np.concatenate([points[0], points[-1], points[:, 0], points[:, -1]])
+        on_gel = self._on_gel(border[None]).all()
+        return points, np.ones(grid.shape, dtype=np.bool_) if on_gel else self._on_gel(points)
 
     def at_rest(self, points: Float32, grid: PixelGrid) -> Float32:
         """(H, W, 2) column, row in `grid` of where `points` of :meth:`points` lie on the untouched gel."""
@@ -151,15 +165,15 @@ class SurfaceTable:
 
     def _material_points(self, grid: PixelGrid) -> Float32:
         """(rows, columns, 2) material points [table points] under the image points of `grid`: X <- x - u(X)."""
+        import cv2
+
         seen = _table_coordinates(self._surface.origin, self.pitch, grid)
-        points, change = seen, seen
-        for _ in range(FIXED_POINT_STEPS):
-            moved = seen - look_up(self._lateral, points)
-            change = np.abs(moved - points)
-            points = moved
-            if float(change.max()) <= CONVERGED:
+        last, points = seen, seen - look_up(self._lateral, seen)
+        for _ in range(FIXED_POINT_STEPS - 1):
+            if cv2.norm(points, last, cv2.NORM_INF) <= CONVERGED:
                 return points
-        restless = change.max(axis=2) > CONVERGED
+            last, points = points, seen - look_up(self._lateral, points)
+        restless = np.abs(points - last).max(axis=2) > CONVERGED
         exact = material_points(self._surface, self._surface.origin + self.pitch * seen[restless].astype(np.float64))
         points[restless] = (exact - self._surface.origin) / self.pitch
         return points

@@ -9,6 +9,7 @@ from tacsim.models.photometric import (
     PhotometricLight,
     PhotometricModel,
     clipped,
+    depth_terms,
     normal_terms,
     places_in_image,
     term_count,
@@ -56,6 +57,10 @@ def test_change_is_the_polynomial_written_out() -> None:
     assert beyond == 0
     scaled, _ = PhotometricLight(calibrated, (0.5, 1.0, 2.0)).change(gradient[8:12], u[8:12], v[8:12])
     np.testing.assert_allclose(scaled, change[8:12] * [0.5, 1.0, 2.0], atol=1e-6)
+    several = np.stack([gradient, -gradient])
+    both, _ = PhotometricLight(calibrated).change(several, np.stack([u, u]), np.stack([v, v]))
+    np.testing.assert_array_equal(both[0], change)
+    np.testing.assert_array_equal(both[1], PhotometricLight(calibrated).change(-gradient, u, v)[0])
 
 
 def test_slopes_beyond_the_calibrated_are_clipped_and_counted() -> None:
@@ -147,6 +152,19 @@ def test_slopes_look_otherwise_at_depth() -> None:
     np.testing.assert_allclose(found[0], np.stack([wanted, 0 * wanted, 0 * wanted], axis=-1), atol=1e-6)
     with pytest.raises(ValidationError, match=r"depth\.slopes has 10 rows; degree 1 has 3, or none"):
         PhotometricModel(**(model(1, 0).model_dump() | {"depth": depth}))
+
+
+@pytest.mark.parametrize("position", [0, 1, 2])
+def test_colour_of_depth_knows_the_place_whether_or_not_slopes_do(position: int) -> None:
+    weights = RNG.uniform(-1.0, 1.0, (DEPTH_TERMS, 3))
+    depth = DepthColour(deepest=0.05, weights=tuple(map(tuple, weights.tolist())))
+    light = PhotometricLight(model(2, position).model_copy(update={"depth": depth}), (0.5, 1.0, 2.0))
+    gradient = RNG.uniform(-0.4, 0.4, (4, 6, 2)).astype(np.float32)
+    u, v = places_in_image(6, 4)
+    height = RNG.uniform(0.0, 0.05, (4, 6)).astype(np.float32)
+    deeper = light.change(gradient, u, v, height)[0] - light.change(gradient, u, v)[0]
+    wanted = np.moveaxis(depth_terms(height, 0.05, u, v), 0, -1) @ weights * [0.5, 1.0, 2.0]
+    np.testing.assert_allclose(deeper, wanted, atol=1e-5)
 
 
 def test_flat_gel_that_is_pressed_in_has_the_colour_of_its_depth() -> None:

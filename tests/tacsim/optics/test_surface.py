@@ -6,7 +6,7 @@ import pytest
 from tacsim.models.sensor import CanonicalGrid, Markers, SensorGeometry
 from tacsim.optics.grid import PixelGrid, canonical_cells, image_grid
 from tacsim.optics.spline import displacement_and_jacobian
-from tacsim.optics.surface import SurfaceFolded, material_points, sample_surface, surface_map
+from tacsim.optics.surface import SurfaceFolded, SurfaceTable, look_up, material_points, sample_surface, surface_map
 from tests.tacsim.optics.surfaces import dent, make_surface
 
 IMAGE = image_grid(SensorGeometry())
@@ -115,3 +115,29 @@ def test_bad_surfaces_are_named() -> None:
         sample_surface(replace(good, spacing=0.0), IMAGE)
     with pytest.raises(ValueError, match="sideways"):
         sample_surface(replace(good, displacement=good.displacement + np.float32(1.0)), IMAGE)
+
+
+@pytest.mark.parametrize(
+    "grid",
+    [
+        IMAGE,
+        PixelGrid(rows=30, columns=40, pitch=0.05e-3, x0=2e-3, y0=1e-3),
+        PixelGrid(rows=40, columns=60, pitch=0.1e-3, x0=6e-3, y0=-12e-3),
+    ],
+    ids=["image", "middle", "corner"],
+)
+def test_what_a_grid_shows_lies_in_its_part_of_the_table(grid: PixelGrid) -> None:
+    table = SurfaceTable(dent(slide=(0.6e-3, -0.4e-3)))
+    points, inside = table.points(grid)
+    np.testing.assert_array_equal(inside, grid.within((20e-3, 20e-3)))
+    part, outside = table.part(grid), np.ones_like(table.fields)
+    outside[part] = 0.0
+    assert not look_up(outside, points).any()
+    assert outside.mean() > 0.1
+
+
+def test_a_grid_beside_the_gel_has_a_part_of_its_table_too() -> None:
+    table = SurfaceTable(dent())
+    for x0, y0 in ((-40e-3, -3e-3), (40e-3, 30e-3)):
+        part = table.part(PixelGrid(rows=30, columns=40, pitch=0.05e-3, x0=x0, y0=y0))
+        assert table.fields[part].size > 0

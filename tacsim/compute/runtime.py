@@ -29,11 +29,7 @@ with (
     warnings.simplefilter("ignore")
     import taichi as ti
 
-with contextlib.suppress(ImportError):  # private parts of Taichi, which another version may not have
-    from taichi.lang import kernel_impl
-    from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext, Builder
-
-    quicken(kernel_impl, ASTTransformerContext, Builder)
+quicken(ti.lang)
 
 DEVICES = ("cpu", "cuda", "vulkan", "metal", "cpu-as-device")  # the last: what a device computes, without one
 # Where worlds are computed, by TACSIM_DEVICE. Read once: kernels are written for it when their modules are imported.

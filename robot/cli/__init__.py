@@ -99,8 +99,11 @@ def tacsim(
 
 def main() -> None:
     """Entry point of the `tacsim` command."""
-    # What is imported stays: to look through it every 700 new objects takes a tenth of a short command's time.
-    gc.set_threshold(100_000, 20, 20)
+    # What is imported stays: to look through it every 700 new objects takes a tenth of a short command's time, and once
+    # in it a fiftieth (a press makes 140,000).
+    gc.set_threshold(200_000, 20, 20)
+    # It would read what every installed package offers, to find plug-ins that watch models: there are none here.
+    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     # Our matrices are small: on a busy machine several threads wait for one another, spinning, and a calibration takes
     # three times the processor time. NumPy is not loaded yet.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

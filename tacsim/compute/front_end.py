@@ -10,6 +10,7 @@ Nothing here changes what is compiled: cached kernels are found as before (tests
 """
 
 import ast
+import gc
 import inspect
 import linecache
 import operator
@@ -18,7 +19,8 @@ import textwrap
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
-from types import SimpleNamespace
+from importlib import import_module
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 WHOLE = 2**31  # integers below are numbers of 32 bits and 64
@@ -41,15 +43,45 @@ OPERATORS: dict[type[ast.operator], Callable[[Any, Any], Any]] = {
 
 
 @contextmanager
-def without_module_search() -> Iterator[None]:
-    """For the import of Taichi: where each of its own functions is decorated, it has the caller's module looked for
-    among all that are loaded, and finds the caller's file without it."""
+def light_import() -> Iterator[None]:
+    """For the import of Taichi, once. Where each of its own functions is decorated, it has the caller's module looked for
+    among all that are loaded, and finds the caller's file without it. And it takes a fifth of the time for modules that
+    it hardly ever uses: to ask a server for news, and to find what is typed at a prompt."""
     search = inspect.getmodule
     inspect.getmodule = lambda *_: None
+    later = [_Later(name) for name in ("urllib.request", "dill") if name not in sys.modules]
+    sys.modules.update({module.__name__: module for module in later})
+    try:
+        with _no_collection():
+            yield
+    finally:
+        inspect.getmodule = search
+        for module in later:
+            module._leave()
+
+
+class _Later(ModuleType):
+    """What stands for a module until something is asked of it; only those see it who imported it meanwhile."""
+
+    def __getattr__(self, name: str) -> Any:
+        self._leave()
+        return getattr(import_module(self.__name__), name)
+
+    def _leave(self) -> None:
+        if sys.modules.get(self.__name__) is self:
+            del sys.modules[self.__name__]
+
+
+@contextmanager
+def _no_collection() -> Iterator[None]:
+    """While much is made that stays: to look through it again and again takes a tenth of the time."""
+    collects = gc.isenabled()
+    gc.disable()
     try:
         yield
     finally:
-        inspect.getmodule = search
+        if collects:
+            gc.enable()
 
 
 def quicken(lang: Any) -> None:
@@ -57,7 +89,7 @@ def quicken(lang: Any) -> None:
 
     lang: package taichi.lang. What another version of Taichi does not have stays as it is: slower, not broken.
     """
-    for part in (_quicken_reading, _quicken_values, _quicken_names, _quicken_nodes):
+    for part in (_quicken_reading, _quicken_kernels, _quicken_values, _quicken_names, _quicken_nodes):
         with suppress(AttributeError):
             part(lang)
 
@@ -80,6 +112,11 @@ def _quicken_reading(lang: Any) -> None:
         ast=lambda _: SimpleNamespace(**{**vars(ast), "parse": _parse}),
         textwrap=lambda _: SimpleNamespace(**{**vars(textwrap), "fill": _filled, "dedent": cache(textwrap.dedent)}),
     )
+
+
+def _quicken_kernels(lang: Any) -> None:
+    """How a kernel's tree is built: without a search for garbage."""
+    _replace(lang.kernel_impl.Kernel, materialize=_no_collection())
 
 
 def _quicken_values(lang: Any) -> None:

@@ -15,16 +15,19 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from tacsim.compute.front_end import quicken, without_module_search
+from tacsim.compute.front_end import light_import, quicken
 
 os.environ.setdefault("TI_LOG_LEVEL", "error")
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
+os.environ.setdefault(
+    "TI_SKIP_VERSION_CHECK", "ON"
+)  # which asks a server at the first start of a day, and of all later
 if not {"HOME", "XDG_CACHE_HOME"} & os.environ.keys():  # Taichi ends the process without both
     os.environ["XDG_CACHE_HOME"] = str(Path("~/.cache").expanduser())
 
 with (
     warnings.catch_warnings(),
-    without_module_search(),
+    light_import(),
 ):  # Taichi 1.7 imports deprecated parts of the standard library and of NumPy
     warnings.simplefilter("ignore")
     import taichi as ti

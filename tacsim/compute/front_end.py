@@ -44,9 +44,12 @@ OPERATORS: dict[type[ast.operator], Callable[[Any, Any], Any]] = {
 
 @contextmanager
 def light_import() -> Iterator[None]:
-    """For the import of Taichi, once. Where each of its own functions is decorated, it has the caller's module looked for
-    among all that are loaded, and finds the caller's file without it. And it takes a fifth of the time for modules that
-    it hardly ever uses: to ask a server for news, and to find what is typed at a prompt."""
+    """For the import of Taichi.
+
+    Where each of its own functions is decorated, it has the caller's module looked for among all that are loaded, and
+    finds the caller's file without it. And a fifth of the time is for modules that it hardly ever uses: to ask a server
+    for news, and to find what is typed at a prompt.
+    """
     search = inspect.getmodule
     inspect.getmodule = lambda *_: None
     later = [_Later(name) for name in ("urllib.request", "dill") if name not in sys.modules]

@@ -5,6 +5,7 @@ A second ``ti.init`` in one process crashes it, and fork after a start hangs: he
 Its compiler works on one kernel at a time for the whole process, and takes no care of threads: hence `launching`.
 """
 
+import atexit
 import contextlib
 import io
 import os
@@ -60,6 +61,7 @@ def start(cpu_only: str | None = None) -> str:
         if _running is None:
             _initialise()
             _running = os.getpid()
+            atexit.register(_finish)
     return DEVICE
 
 
@@ -80,6 +82,13 @@ def _initialise() -> None:
             enable_fallback=False,
         )  # fmt: skip
     ti.sync()  # completes the start, which only this thread may do; kernels may then be compiled in any
+
+
+def _finish() -> None:
+    """Ends Taichi, which writes down what it has compiled only then, and not at all if something still refers to it
+    when Python has ended. Half a minute of work would be lost."""
+    if _running == os.getpid() and _launch_lock.acquire(timeout=10):  # for good: no thread launches after this
+        ti.reset()
 
 
 def is_writable(folder: Path) -> bool:

@@ -165,6 +165,22 @@ def test_the_lines_of_a_function_are_those_that_inspect_finds(tmp_path: Path, mo
         assert function_source(function) is None  # inspect is asked
 
 
+def test_what_taichi_hardly_uses_is_imported_when_it_does() -> None:
+    code = """
+import sys
+import tacsim.compute.runtime
+print(sorted({"dill", "ssl", "urllib.request"} & sys.modules.keys()))
+from taichi import _version_check
+from taichi.lang import _wrap_inspect
+print(_wrap_inspect.dill.source.findsource.__name__, _version_check.request.Request.__name__)
+import dill, urllib.request
+print(type(dill).__name__, type(urllib.request).__name__)
+"""
+    command = [sys.executable, "-W", "ignore", "-c", code]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=100, check=True)
+    assert done.stdout == "[]\nfindsource Request\nmodule module\n"
+
+
 def test_another_taichi_stays_as_it_is() -> None:
     lang = SimpleNamespace(kernel_impl=SimpleNamespace(renamed=1, getsourcelines=1), expr=SimpleNamespace(Expr=2))
     quicken(lang)

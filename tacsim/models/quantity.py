@@ -124,5 +124,5 @@ class Config(BaseModel):
 
     model_config = ConfigDict(
         frozen=True, extra="forbid", validate_default=True, allow_inf_nan=False, protected_namespaces=(),
-        defer_build=hasattr(main, "_rebuild_lock"),  # not before pydantic 2.14
+        defer_build=hasattr(main, "_rebuild_lock"),  # pydantic 2.14 has it; 2.11 has not
     )  # fmt: skip

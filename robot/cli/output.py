@@ -7,15 +7,18 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import typer
 from rich.console import Console, ConsoleOptions, RenderableType
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.segment import Segment
-from rich.status import Status
 from rich.text import Text
 
 from tacsim.models.text import escaped, printable
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
+    from rich.status import Status
 
 NARROWEST = 60  # columns: in fewer a table loses its values; the terminal breaks its lines instead
 
@@ -112,14 +115,16 @@ def paused() -> Iterator[None]:
 @contextmanager
 def progress() -> Iterator[Progress]:
     """A progress bar on stderr; on no terminal it is silent."""
+    from rich import progress as rich
+
     columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
+        rich.TextColumn("{task.description}"),
+        rich.BarColumn(),
+        rich.MofNCompleteColumn(),
+        rich.TimeElapsedColumn(),
+        rich.TimeRemainingColumn(),
     )
-    with Progress(*columns, console=notes, transient=True, disable=not notes.is_terminal) as bar, _drawn(bar):
+    with rich.Progress(*columns, console=notes, transient=True, disable=not notes.is_terminal) as bar, _drawn(bar):
         yield bar
 
 

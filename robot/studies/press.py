@@ -218,7 +218,7 @@ def write(folder: Path, pressed: PressResult, config: dict[str, Any]) -> None:
     """Writes rgb.png, height.npy (float32 [m], one value a pixel), height.png and press.json. Raises OSError."""
     from PIL import Image
 
-    Image.fromarray(pressed.image).save(folder / "rgb.png")
+    Image.fromarray(pressed.image).save(folder / "rgb.png", compress_level=4)  # as small as by 6, in half the time
     np.save(folder / "height.npy", pressed.height.astype(np.float32), allow_pickle=False)
     write_height_picture(folder / "height.png", pressed.height, pressed.contact, config["pixel_pitch"])
     (folder / "press.json").write_text(json.dumps(config, indent=1, allow_nan=False) + "\n", encoding="utf-8")

@@ -5,6 +5,7 @@ A second ``ti.init`` in one process crashes it, and fork after a start hangs: he
 Its compiler works on one kernel at a time for the whole process, and takes no care of threads: hence `launching`.
 """
 
+import atexit
 import contextlib
 import io
 import os
@@ -15,25 +16,24 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from tacsim.compute.front_end import quicken, without_module_search
+from tacsim.compute.front_end import light_import, quicken
 
 os.environ.setdefault("TI_LOG_LEVEL", "error")
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
+os.environ.setdefault(
+    "TI_SKIP_VERSION_CHECK", "ON"
+)  # which asks a server at the first start of a day, and of all later
 if not {"HOME", "XDG_CACHE_HOME"} & os.environ.keys():  # Taichi ends the process without both
     os.environ["XDG_CACHE_HOME"] = str(Path("~/.cache").expanduser())
 
 with (
     warnings.catch_warnings(),
-    without_module_search(),
+    light_import(),
 ):  # Taichi 1.7 imports deprecated parts of the standard library and of NumPy
     warnings.simplefilter("ignore")
     import taichi as ti
 
-with contextlib.suppress(ImportError):  # private parts of Taichi, which another version may not have
-    from taichi.lang import kernel_impl
-    from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext, Builder
-
-    quicken(kernel_impl, ASTTransformerContext, Builder)
+quicken(ti.lang)
 
 DEVICES = ("cpu", "cuda", "vulkan", "metal", "cpu-as-device")  # the last: what a device computes, without one
 # Where worlds are computed, by TACSIM_DEVICE. Read once: kernels are written for it when their modules are imported.
@@ -61,6 +61,7 @@ def start(cpu_only: str | None = None) -> str:
         if _running is None:
             _initialise()
             _running = os.getpid()
+            atexit.register(_finish)
     return DEVICE
 
 
@@ -81,6 +82,13 @@ def _initialise() -> None:
             enable_fallback=False,
         )  # fmt: skip
     ti.sync()  # completes the start, which only this thread may do; kernels may then be compiled in any
+
+
+def _finish() -> None:
+    """Ends Taichi, which writes down what it has compiled only then, and not at all if something still refers to it
+    when Python has ended. Half a minute of work would be lost."""
+    if _running == os.getpid() and _launch_lock.acquire(timeout=10):  # for good: no thread launches after this
+        ti.reset()
 
 
 def is_writable(folder: Path) -> bool:

@@ -46,4 +46,4 @@ def write_height_picture(path: Path, height: NDArray[np.float32], contact: NDArr
         pen.text((MARGIN - 8, y), f"{(2 * share - 1) * half[1]:.3g}", "black", anchor="rm")
         pen.text((left + BAR + 8, y), f"{(top - share * (top - low)) * 1e3:.3f}", "black", anchor="lm")
     pen.text((MARGIN + wide / 2, 1.65 * MARGIN + high), "x [mm]; y downwards", "black", anchor="mm")
-    picture.save(path)
+    picture.save(path, compress_level=4)

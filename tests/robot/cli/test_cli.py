@@ -55,6 +55,16 @@ def test_the_command_multiplies_small_matrices_on_one_thread(said: str | None, t
     assert f"threads {threads}" in ran.stdout
 
 
+def test_a_command_prepares_itself_alone_and_a_wrong_one_is_told_of_all() -> None:
+    code = "import sys; from robot import cli\ntry: cli.main()\nfinally: print(len(cli.app.registered_commands))"
+    alone, wrong = (
+        subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, env=environment())
+        for words in (("schema", "-h"), ("schemma",))
+    )
+    assert alone.returncode == 0 and "tacsim schema" in alone.stdout and alone.stdout.endswith("\n1\n")
+    assert wrong.returncode == 2 and "'schema'" in wrong.stderr and int(wrong.stdout) > 10
+
+
 def test_version() -> None:
     result = tacsim("--version")
     assert result.exit_code == 0

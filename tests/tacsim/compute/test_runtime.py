@@ -106,3 +106,25 @@ def test_it_runs_to_the_end_where_no_kernels_can_be_kept(tmp_path: Path, cache: 
     places["PYTHONPATH"] = os.pathsep.join(sys.path)
     done = subprocess.run(command, env=places, capture_output=True, text=True, timeout=120)
     assert (done.returncode, done.stdout) == (0, "3\n"), done.stderr
+
+
+def test_compiled_kernels_are_kept_whatever_still_refers_to_taichi_at_the_end(tmp_path: Path) -> None:
+    code = """
+import ctypes
+from tacsim.compute.runtime import start, ti
+@ti.kernel
+def three() -> ti.i32:
+    return 3
+start()
+print(three())
+ctypes.pythonapi.Py_IncRef(ctypes.py_object(ti.lang.impl.get_runtime().prog))
+raise ValueError("an end by an error")
+"""
+    (tmp_path / "small.py").write_text(code)
+    environment = {**os.environ, "TI_OFFLINE_CACHE_FILE_PATH": str(tmp_path / "cache"), "TACSIM_DEVICE": "cpu"}
+    environment["PYTHONPATH"] = os.pathsep.join(sys.path)
+    command = [sys.executable, "-W", "ignore", str(tmp_path / "small.py")]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stdout) == (1, "3\n"), done.stderr
+    assert done.stderr.rstrip().endswith("an end by an error")
+    assert list((tmp_path / "cache").glob("*.tic"))

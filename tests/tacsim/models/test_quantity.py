@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 from typing import Annotated
 
 import pytest
@@ -12,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import Field, TypeAdapter, ValidationError
 
-from tacsim.models.quantity import UNITS, Length, parse
+from tacsim.models.quantity import UNITS, Config, Length, parse
 
 
 @pytest.mark.parametrize(
@@ -117,3 +118,32 @@ def test_as_a_field_bounds_hold_for_the_si_value() -> None:
     assert number == {"type": "number", "exclusiveMinimum": 0, "maximum": 0.01}
     assert text["type"] == "string"
     assert "mm" in text["pattern"]
+
+
+def test_threads_may_use_a_model_for_the_first_time_at_once() -> None:
+    """Validators are built when they are first used."""
+    for _ in range(20):
+
+        class Part(Config):
+            size: Length
+            tag: str = "none"
+
+        class Whole(Config):
+            first: Part
+            parts: tuple[Part, ...] = ()
+
+        together, found = threading.Barrier(6), []
+
+        def use(together: threading.Barrier = together, found: list[object] = found, whole: type = Whole) -> None:
+            together.wait()
+            try:
+                found.append(whole(first={"size": "2 mm"}, parts=({"size": 1},)).first.size)
+            except ValidationError as error:
+                found.append(error)
+
+        threads = [threading.Thread(target=use) for _ in range(together.parties)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert found == [2e-3] * together.parties

@@ -20,9 +20,7 @@ from tacsim.compute.front_end import light_import, quicken
 
 os.environ.setdefault("TI_LOG_LEVEL", "error")
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
-os.environ.setdefault(
-    "TI_SKIP_VERSION_CHECK", "ON"
-)  # which asks a server at the first start of a day, and of all later
+os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")  # it would ask a server for news
 if not {"HOME", "XDG_CACHE_HOME"} & os.environ.keys():  # Taichi ends the process without both
     os.environ["XDG_CACHE_HOME"] = str(Path("~/.cache").expanduser())
 

@@ -106,7 +106,8 @@ class SimulationDiverged(RuntimeError):
 def check_launch(
     arrays: Callable[[], State], good: State, health: Health, where: Callable[[], LaunchSpan]
 ) -> Health:  # fmt: skip
-    """`health` of a launch that changed the world's `arrays` from `good` to what they are.
+    """`health` of a launch that changed the world's `arrays` from `good` to what they are; where: which part of the
+    motion it was, asked only for a failure.
 
     Raises SimulationDiverged if that is unphysical; the world rolls back and tries again.
     """

@@ -82,7 +82,8 @@ def keep_loads(
 ) -> Motion:  # fmt: skip
     """From `start` to `end` with `loads` [N] held; `end` (the same frames, in order) becomes where the motion ended.
 
-    Before they touch, sensors go straight to their targets. Raises LoadNotReached.
+    Before they touch, sensors go straight to their targets. most: readings that a launch can give. Raises
+    LoadNotReached.
     """
     scene, targets = world.scene, dict(end)
     thickness = scene.gel.size[2]

@@ -259,11 +259,7 @@ class FemWorld(BaseWorld):
                 return (yield from move_real_time(replace(path, refine=refine), settling, balanced=balanced))
             if command.loads:
                 end.update(goals)
-                return (
-                    yield from keep_loads(
-                        self, begin, end, command.loads, refine, balanced=self.balanced, most=self._readings
-                    )
-                )
+                return (yield from keep_loads(self, begin, end, command.loads, refine, balanced=balanced, most=most))
             quasi_static = replace(self.plan(a, b), refine=refine)
             return (yield from move_and_settle(quasi_static, settling, balanced=balanced, most=most))
 

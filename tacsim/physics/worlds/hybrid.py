@@ -233,9 +233,8 @@ class HybridWorld(FemWorld):
         try:
             state.fit(index, cell, extents)
         except MemoryError as error:
-            raise SimulationDiverged(
-                f"no memory for the grid round the particles ({error})", where(), NO_ROOM
-            ) from None
+            cause = f"no memory for the grid round the particles ({error})"
+            raise SimulationDiverged(cause, where(), NO_ROOM) from None
         before = self._before_launch()
         state.params[index, STEP] = path.step
         state.counts[index, EVERY] = -(-len(drive) // launch.readings)

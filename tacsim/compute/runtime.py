@@ -11,6 +11,7 @@ import io
 import os
 import tempfile
 import threading
+import time
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -71,6 +72,8 @@ def _initialise() -> None:
         )
     # Taichi crashes when the process ends where it cannot make the folder, even one in which it keeps nothing.
     kept = is_writable(KERNELS)
+    if kept:
+        _break_stale_lock(KERNELS / "ticache.lock")
     # ti.init prints "Starting on arch=..." whatever it is told; a command's output (JSON, say) must stay its own.
     with contextlib.redirect_stdout(io.StringIO()):
         # Without Taichi's own control-flow optimisation kernels compile in half the time and run as fast.
@@ -87,6 +90,17 @@ def _finish() -> None:
     when Python has ended. Half a minute of work would be lost."""
     if _running == os.getpid() and _launch_lock.acquire(timeout=10):  # for good: no thread launches after this
         ti.reset()
+
+
+def _break_stale_lock(lock: Path) -> None:
+    """Removes the file that locks the kept kernels if it is older than a minute.
+
+    Taichi makes it to read or write them, a matter of milliseconds. A process killed meanwhile leaves it, and from then
+    on no process would read or keep a kernel: each would compile for a minute, in silence.
+    """
+    with contextlib.suppress(OSError):
+        if time.time() - lock.stat().st_mtime > 60:
+            lock.unlink()
 
 
 def is_writable(folder: Path) -> bool:

@@ -6,6 +6,7 @@ import multiprocessing
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -93,38 +94,43 @@ print(os.wait()[1])
     assert first.startswith(told) and second.startswith(told) and rest == ["True", "0"]
 
 
+def three(folder: Path, places: dict[str, str], more: str = "") -> subprocess.CompletedProcess[str]:
+    """A process that compiles a kernel and prints the three it gives, then does `more`. places: what says in its
+    environment where kernels are kept."""
+    code = "from tacsim.compute.runtime import start, ti\n@ti.kernel\ndef three() -> ti.i32: return 3\n"
+    (folder / "small.py").write_text(f"{code}start()\nprint(three())\n{more}")
+    elsewhere = ("HOME", "XDG_CACHE_HOME", "TI_OFFLINE_CACHE_FILE_PATH")
+    environment = {name: value for name, value in os.environ.items() if name not in elsewhere} | places
+    environment |= {"PYTHONPATH": os.pathsep.join(sys.path), "TACSIM_DEVICE": "cpu"}
+    command = [sys.executable, "-W", "ignore", str(folder / "small.py")]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120)
+
+
 @pytest.mark.parametrize("cache", [None, "file/cache"], ids=["no HOME", "not writable"])
 def test_it_runs_to_the_end_where_no_kernels_can_be_kept(tmp_path: Path, cache: str | None) -> None:
     """Taichi ends the process without a home directory, and crashes at its end without a cache: a service's, say."""
     (tmp_path / "file").touch()
-    places = {name: value for name, value in os.environ.items() if name not in ("HOME", "XDG_CACHE_HOME")}
-    if cache is not None:
-        places["XDG_CACHE_HOME"] = str(tmp_path / cache)
-    code = "from tacsim.compute.runtime import start, ti\n@ti.kernel\ndef three() -> ti.i32: return 3\n"
-    (tmp_path / "small.py").write_text(f"{code}start()\nprint(three())\n")
-    command = [sys.executable, str(tmp_path / "small.py")]
-    places["PYTHONPATH"] = os.pathsep.join(sys.path)
-    done = subprocess.run(command, env=places, capture_output=True, text=True, timeout=120)
+    done = three(tmp_path, {} if cache is None else {"XDG_CACHE_HOME": str(tmp_path / cache)})
     assert (done.returncode, done.stdout) == (0, "3\n"), done.stderr
 
 
 def test_compiled_kernels_are_kept_whatever_still_refers_to_taichi_at_the_end(tmp_path: Path) -> None:
-    code = """
-import ctypes
-from tacsim.compute.runtime import start, ti
-@ti.kernel
-def three() -> ti.i32:
-    return 3
-start()
-print(three())
-ctypes.pythonapi.Py_IncRef(ctypes.py_object(ti.lang.impl.get_runtime().prog))
-raise ValueError("an end by an error")
-"""
-    (tmp_path / "small.py").write_text(code)
-    environment = {**os.environ, "TI_OFFLINE_CACHE_FILE_PATH": str(tmp_path / "cache"), "TACSIM_DEVICE": "cpu"}
-    environment["PYTHONPATH"] = os.pathsep.join(sys.path)
-    command = [sys.executable, "-W", "ignore", str(tmp_path / "small.py")]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120)
+    referring = "import ctypes\nctypes.pythonapi.Py_IncRef(ctypes.py_object(ti.lang.impl.get_runtime().prog))\n"
+    places = {"TI_OFFLINE_CACHE_FILE_PATH": str(tmp_path / "cache")}
+    done = three(tmp_path, places, referring + 'raise ValueError("an end by an error")')
     assert (done.returncode, done.stdout) == (1, "3\n"), done.stderr
     assert done.stderr.rstrip().endswith("an end by an error")
     assert list((tmp_path / "cache").glob("*.tic"))
+
+
+@pytest.mark.parametrize(("age", "left"), [(61.0, False), (0.0, True)], ids=["of a killed process", "of another one"])
+def test_only_a_lock_that_a_killed_process_has_left_is_broken(tmp_path: Path, age: float, left: bool) -> None:
+    """Taichi locks what it keeps for milliseconds, and neither reads nor keeps kernels while the lock is there."""
+    lock = tmp_path / "cache" / "ticache.lock"
+    lock.parent.mkdir()
+    lock.touch()
+    os.utime(lock, (time.time() - age, time.time() - age))
+    done = three(tmp_path, {"TI_OFFLINE_CACHE_FILE_PATH": str(lock.parent)})
+    assert (done.returncode, done.stdout) == (0, "3\n"), done.stderr
+    assert lock.exists() == left
+    assert bool(list(lock.parent.glob("*.tic"))) != left

@@ -19,7 +19,7 @@ from benchmarks.cases.press import renew as renew
 from benchmarks.cases.real.labels import BadData
 from benchmarks.cases.registry import select_cases
 from benchmarks.harness.machine import backend
-from benchmarks.harness.runner import Case, Stopped, run_cases
+from benchmarks.harness.runner import NOT_MEASURED, Case, run_cases
 from benchmarks.harness.schema import GROUPS, Report
 from benchmarks.pages.page import COLUMNS, cells, setting, write_page
 from benchmarks.pages.picture import PICTURE, draw
@@ -67,14 +67,15 @@ def for_a_page(reports: Sequence[Report], paths: Sequence[Path]) -> list[Report]
     return [report, *(each for each in reports if each is not report)]
 
 
-def measure(group: str, repeat: int | None, *, baselines: bool, long: bool, data: Path | None) -> Report:
-    """A run of a group, or of all but robot. Raises BadParameter; Exit when it is stopped."""
+def measure(group: str, repeat: int | None, *, baselines: bool, long: bool, data: Path | None) -> tuple[Report, int]:
+    """A run of a group, or of all but robot; and the exit code of the signal that stopped it, or 0. Raises
+    BadParameter; Exit when the group robot is stopped."""
     if group == "real" and data is None:
         raise typer.BadParameter("the group real needs frames of a real sensor: --data DIR", param_hint="--data")
     if group not in ("real", "all") and data is not None:
         raise typer.BadParameter(f"the group {group} looks at no real frames", param_hint="--data")
     if group == "robot":
-        return _measure_robot(repeat or (5 if long else 1))
+        return _measure_robot(repeat or (5 if long else 1)), 0
     wanted = [name for name in GROUPS if group == name or (group == "all" and name != "robot")]
     try:
         cases = select_cases(wanted, baselines=baselines, long=long, data=data)
@@ -92,10 +93,8 @@ def measure(group: str, repeat: int | None, *, baselines: bool, long: bool, data
                 notes.print(f"{begun + 1}/{len(cases)} {words}", markup=False)
             begun += 1
 
-        try:
-            return run_cases(cases, repeat or 5, baselines=baselines, long=long, on_start=say, stop=interrupt)
-        except Stopped:
-            raise _stopped(interrupt) from None
+        report = run_cases(cases, repeat or 5, baselines=baselines, long=long, on_start=say, stop=interrupt)
+    return report, interrupt.exit_code
 
 
 def _measure_robot(repeat: int) -> Report:
@@ -124,17 +123,13 @@ def _run_promises(marked: str, repeat: int, file: Path, interrupt: Interrupt, *o
             if interrupt():
                 tests.terminate()
                 tests.wait()
-                raise _stopped(interrupt)
+                complain("stopped by a signal; nothing is written")
+                raise typer.Exit(interrupt.exit_code)
             time.sleep(0.1)
     if not file.is_file():
         complain(f"the tests of the promises ended with exit code {tests.returncode} before any of them ran")
         raise typer.Exit(1)
     return _read(file)
-
-
-def _stopped(interrupt: Interrupt) -> typer.Exit:
-    complain("stopped by a signal; nothing is written")
-    return typer.Exit(interrupt.exit_code)
 
 
 def show(reports: Sequence[Report]) -> None:
@@ -152,8 +147,11 @@ def show(reports: Sequence[Report]) -> None:
         console.print(table)
         for lack in report.missing:
             notes.print(f"not measured: {lack.case}: {lack.cause}", markup=False)
-        for failure in report.failures:
+        failed = [failure for failure in report.failures if failure.cause != NOT_MEASURED]
+        for failure in failed:
             complain(f"{failure.case}, {failure.method}, {failure.resolution}: {failure.cause}")
+        if left := len(report.failures) - len(failed):
+            complain(f"stopped by a signal: {left} cases were not measured")
 
 
 def write(reports: Sequence[Report], json: Path | None, docs: Path | None) -> None:

@@ -57,21 +57,21 @@ def _raise_missing(repeat: int) -> list[Measurement]:
     raise AssertionError("a case that lacks its frames was measured")
 
 
-class Stopped(RuntimeError):
-    """The run was stopped from outside."""
+NOT_MEASURED = "the run was stopped before it was measured"
 
 
 def run_cases(
     cases: Sequence[Case], repeat: int, *, baselines: bool, long: bool = False,
     on_start: Callable[[Case], None] = lambda case: None, stop: Callable[[], bool] = lambda: False,
 ) -> Report:  # fmt: skip
-    """Runs `cases` in turn. A case that raises or dies becomes a failure of the report. Raises Stopped."""
+    """Runs `cases` in turn until `stop`. A case that raises, dies or is not reached becomes a failure of the report."""
     run = Run()
     rows: list[Row] = []
     failures: list[Failure] = []
     missing = [Missing(**_names(case), cause=case.missing) for case in cases if case.missing]
     group_seconds: dict[Group, float] = {}
-    for together in _by_process([case for case in cases if not case.missing]):
+    measurable = [case for case in cases if not case.missing]
+    for together in _by_process(measurable):
         started = time.perf_counter()
         for case, found in _run(together, repeat, on_start, stop):
             if isinstance(found, str):
@@ -117,18 +117,16 @@ class _Worker:
         there.close()
 
     def next(self, stop: Callable[[], bool]) -> list[Row] | str | None:
-        """Rows of the next case, or what went wrong in words; None when the process has died. Raises Stopped."""
+        """Rows of the next case, or what went wrong in words; None when the process has died."""
         try:
             while not self._here.poll(0.1):
                 if stop():
-                    raise Stopped("stopped before all cases were over")
+                    return NOT_MEASURED
             found: list[Row] | str = self._here.recv()
             return found
         except EOFError:
             self._process.join(EXIT)
-            if stop():  # the signal was for all processes
-                raise Stopped("stopped before all cases were over") from None
-            return None
+            return NOT_MEASURED if stop() else None  # the signal was for all processes
 
     @property
     def exit_code(self) -> int | None:
@@ -147,6 +145,9 @@ def _run(
     worker: _Worker | None = None
     try:
         for index, case in enumerate(cases):
+            if stop():
+                yield case, NOT_MEASURED
+                continue
             on_start(case)
             worker = worker or _Worker(cases[index:], repeat)
             found = worker.next(stop)

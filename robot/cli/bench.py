@@ -58,7 +58,8 @@ def bench(
 ) -> None:
     """Measure how fast, how exact and how large: every row is time, error and peak memory of one run.
 
-    Compiling is not timed. Exit code 1 if a case failed.
+    Compiling is not timed. Exit code 1 if a case failed. Stopped by a signal, it shows what it has measured and writes
+    it to --json, but no pages.
 
     Group `real` needs --data; `all` leaves it out without. Group `robot` measures what is promised of arms and cameras,
     on mock hardware; it wants an idle machine, so `all` leaves it out.
@@ -72,6 +73,7 @@ def bench(
     require_writable(json_, "--json")
     with busy("loading"):
         from benchmarks import command as bench
+    stopped = 0
     if from_:
         if json_ is not None and len(from_) > 1:
             raise typer.BadParameter("one file holds one report: give --from once", param_hint="--json")
@@ -84,11 +86,13 @@ def bench(
         if renew:
             with busy("computing the limit of fine meshes"):
                 bench.renew(notes.print)
-        reports = [bench.measure(group, repeat, baselines=baselines, long=long, data=data)]
+        report, stopped = bench.measure(group, repeat, baselines=baselines, long=long, data=data)
+        reports = [report]
     bench.show(reports)
-    bench.write(reports, json_, docs)
-    if any(report.failures for report in reports):
-        raise typer.Exit(1)
+    if reports[0].results or not stopped:
+        bench.write(reports, json_, docs if not stopped else None)
+    if stopped or any(report.failures for report in reports):
+        raise typer.Exit(stopped or 1)
 
 
 def require_checkout(what: str) -> None:

@@ -17,7 +17,7 @@ from benchmarks.cases.press import layer_press
 from benchmarks.cases.registry import CASES, description, select_cases
 from benchmarks.harness import cache, measure
 from benchmarks.harness.measure import Measurement, Timing, forget_peak_memory, peak_memory, timed
-from benchmarks.harness.runner import Case, Stopped, run_cases
+from benchmarks.harness.runner import NOT_MEASURED, Case, run_cases
 from benchmarks.harness.schema import GROUPS, Group, Report, Row, json_schema
 
 
@@ -105,11 +105,22 @@ def tell_process(path: Path, repeat: int) -> list[Measurement]:
     return [Measurement(Timing((1.0,), 1.0), 0.0, "%", "nothing")]
 
 
-def test_a_stop_ends_the_running_case_at_once() -> None:
-    began = time.perf_counter()
-    with pytest.raises(Stopped):
-        run_cases([HANGS], 30, baselines=False, stop=lambda: time.perf_counter() - began > 0.3)
-    assert time.perf_counter() - began < 10
+def test_a_stop_ends_the_running_case_at_once_and_keeps_the_rows_of_those_before() -> None:
+    begun: list[Case] = []
+    stopped_at: list[float] = []
+
+    def stop() -> bool:
+        if HANGS in begun:
+            stopped_at.append(time.perf_counter())
+        return bool(stopped_at)
+
+    report = run_cases([WORKS, HANGS, RAISES], 30, baselines=False, on_start=begun.append, stop=stop)
+    assert time.perf_counter() - stopped_at[0] < 10
+    assert {row.case for row in report.results} == {WORKS.name}
+    assert [(failure.case, failure.cause) for failure in report.failures] == [
+        (HANGS.name, NOT_MEASURED), (RAISES.name, NOT_MEASURED),
+    ]  # fmt: skip
+    assert begun == [WORKS, HANGS]
     assert not [child for child in multiprocessing.active_children() if child.name.startswith("SpawnProcess")]
 
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
+from itertools import count
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -72,7 +73,8 @@ def made_up(width: int) -> Calibration:
 
 
 def calibrated_render(width: int, repeat: int) -> list[Measurement]:
-    """A picture of our gel under a ball, by the largest model that a calibration chooses."""
+    """A picture of our gel under a ball, by the largest model that a calibration chooses; of a surface not seen before,
+    as after each step."""
     import cv2
 
     from calibration.light.photometry import features
@@ -87,7 +89,10 @@ def calibrated_render(width: int, repeat: int) -> list[Measurement]:
     surface = world.surface("lower")
     model = SensorModel(geometry=calibration.geometry, photometric=forward, texture=0.0)
     render = Renderer(model, (20e-3, 20e-3))
-    timing, image = timed(partial(render, surface), max(repeat, MIN_REPETITIONS))
+    # each a thousandth of a micrometre another: what is kept of the last surface is of no use
+    others = (replace(surface, displacement=surface.displacement * np.float32(1 + 1e-6 * k)) for k in count(1))
+    timing, _ = timed(lambda: render(next(others)), max(repeat, MIN_REPETITIONS))
+    image = render(surface)
     # the same polynomial, term by term, in double precision and without strips
     sample = sample_surface(surface, image_grid(calibration.geometry))
     slopes, height = sample.gradient.astype(np.float64), sample.height.astype(np.float64) / VIEW[0]

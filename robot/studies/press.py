@@ -20,6 +20,7 @@ from tacsim.models.sensor import SensorModel
 from tacsim.optics.grid import image_grid
 from tacsim.optics.render import Renderer
 from tacsim.optics.surface import SurfaceSample, SurfaceTable, sample_surface
+from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.physics.move import MoveStats
 from tacsim.physics.worlds.press import CLEARANCE, GRID_SPACING, PressWorld
 from tacsim.report.height_picture import write_height_picture
@@ -78,7 +79,13 @@ def press(scene: Scene, sensor: SensorModel, motion: PressMotion, render: Render
     if any(motion.at) or motion.turn is not None:
         world.place({"indenter": Pose(np.array([*motion.at, below + CLEARANCE]), turn)})
     targets = _targets(world.pose("indenter"), below - motion.depth, motion)
-    moves = tuple(world.move({"indenter": target}) for target in targets)
+    try:
+        moves = tuple(world.move({"indenter": target}) for target in targets)
+    except SimulationDiverged as error:
+        if error.poses:
+            came = below - float(se3.relative(error.poses["lower"], error.poses["indenter"]).position[2])
+            error.advice += f"; it had come {came * 1e3:.3g} mm deep, of {motion.depth * 1e3:.3g} mm"
+        raise
     surface = world.surface("lower")
     seen = sample_surface(surface, image_grid(sensor.geometry))
     contact = _contact(world, scene, seen, sensor)

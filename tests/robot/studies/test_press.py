@@ -9,6 +9,7 @@ from scipy import ndimage
 from robot.studies.press import UNFELT, PressMotion, PressResult, press, press_report
 from tacsim.config import load_sensor
 from tacsim.models.scene import Box, Cylinder, Gel, Indenter, Mesh, Scene, Shape, Sphere
+from tacsim.physics.failure.health import SimulationDiverged
 
 SENSOR = load_sensor("ideal")
 
@@ -74,3 +75,11 @@ def test_a_press_that_does_not_fold_the_gel_says_so() -> None:
     motion = PressMotion(0.2e-3)
     scene, result = pressed("draft", motion, Sphere(radius=4e-3))
     assert press_report(scene, motion, result, SENSOR)["folded"] is False
+
+
+def test_a_press_too_deep_for_the_gel_says_how_deep_it_came() -> None:
+    with pytest.raises(SimulationDiverged, match=r"; it had come (\d\.\d+) mm deep, of 3\.9 mm") as error:
+        pressed("draft", PressMotion(3.9e-3), Sphere(radius=4e-3))
+    came = float(str(error.value).split("; it had come ")[1].split()[0])
+    assert 2.0 < came < 3.9
+    pressed("draft", PressMotion(0.9 * came * 1e-3), Sphere(radius=4e-3))

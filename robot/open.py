@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from pydantic import BaseModel, ValidationError
 
 from robot.common.code import CodeNotFound as CodeNotFound
 from robot.common.code import attribute
@@ -25,6 +27,7 @@ if TYPE_CHECKING:
     from tacsim.gym.env import TacsimEnv
     from tacsim.gym.vector import TacsimVectorEnv
 
+Model = TypeVar("Model", bound=BaseModel)
 Randomised = Randomisation | Mapping[str, Any] | str | Path | None
 
 # Which drivers go by which clock. A simulated sensor on hardware shows the gel as it would look at the arm's pose.
@@ -198,11 +201,20 @@ def _drawn(variants: Sequence[Sequence[str]], randomise: Randomised) -> Sequence
         raise ValueError("give variants, or a randomisation that draws them, not both")
     if isinstance(randomise, (str, Path)):
         return load(Randomisation, randomise).drawn()
-    return (randomise if isinstance(randomise, Randomisation) else Randomisation.model_validate(randomise)).drawn()
+    return _made_of(Randomisation, randomise, "randomise").drawn()
 
 
 def _features(given: Features | Mapping[str, Any] | None) -> Features | None:
-    return given if given is None or isinstance(given, Features) else Features.model_validate(given)
+    return None if given is None else _made_of(Features, given, "features")
+
+
+def _made_of(model: type[Model], given: Model | Mapping[str, Any], argument: str) -> Model:
+    """The model that an `argument` of a call is, or is made of. Raises ConfigError."""
+    try:
+        return given if isinstance(given, model) else model.model_validate(given)
+    except ValidationError as error:
+        problems = [Problem(Place(argument), ".".join(map(str, each["loc"])), each["msg"]) for each in error.errors()]
+        raise ConfigError(problems) from None
 
 
 def _env_of_hardware(config: RigConfig, render_mode: str | None, features: Features | None) -> TacsimEnv:
@@ -227,6 +239,8 @@ def _rigs_of_episodes(
     """The rig without a variant, then with each, and the variant in words."""
     found: list[tuple[RigConfig, str]] = []
     for more in ((), *variants):
+        if isinstance(more, str) or isinstance(overrides, str):
+            raise TypeError("overrides, and each of the variants, are lists of texts: ['scene.preset=draft']")
         try:
             config = load_with_task(rig, task, [*overrides, *more]).config
         except ConfigError as error:

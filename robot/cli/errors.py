@@ -49,6 +49,8 @@ def explain(error: Exception) -> tuple[str, int]:
     if isinstance(error, ExceptionGroup):
         parts = [explain(part) for part in error.exceptions if isinstance(part, Exception)]
         return "\n".join([error.message, *(message for message, _ in parts)]), FAILED
+    if isinstance(error, FileNotFoundError) and not _has_working_directory():
+        return "the working directory no longer exists; change to another folder", UNUSABLE
     if isinstance(error, OSError):
         code = UNUSABLE if isinstance(error, NO_PLACE) else FAILED
         named = isinstance(error.filename, str | bytes | os.PathLike)
@@ -74,6 +76,14 @@ def _refused(error: Exception) -> bool:
     if isinstance(error, FileNotFoundError):
         return error.errno is None and _ours(module)
     return type(error) is RuntimeError and module == "tacsim.compute.runtime"
+
+
+def _has_working_directory() -> bool:
+    try:
+        os.getcwd()
+    except FileNotFoundError:
+        return False
+    return True
 
 
 def _ours(module: str) -> bool:

@@ -131,13 +131,10 @@ def taichi() -> list[Check]:
 
 def kernel_cache(folder: Path) -> Check:
     """The folder of compiled kernels: without it every start compiles for tens of seconds."""
-    from tacsim.compute.runtime import is_writable
+    from tacsim.compute.runtime import ADVICE, is_writable
 
     if not is_writable(folder):
-        advice = (
-            "make it writable, or set TI_OFFLINE_CACHE_FILE_PATH to a folder that is; until then every start compiles"
-        )
-        return Check("kernel cache", "warn", f"{folder} is not writable", advice)
+        return Check("kernel cache", "warn", f"{folder} is not writable", ADVICE)
     size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
     return Check("kernel cache", "ok", f"{folder}, {size / 1e6:.1f} MB" + ("" if size else " (first run compiles)"))
 

@@ -9,6 +9,7 @@ import atexit
 import contextlib
 import io
 import os
+import re
 import tempfile
 import threading
 import time
@@ -39,6 +40,8 @@ DEVICES = ("cpu", "cuda", "vulkan", "metal", "cpu-as-device")  # the last: what 
 DEVICE = os.environ.get("TACSIM_DEVICE") or "cpu"
 # Where compiled kernels are kept from one process to the next, if it can be written
 KERNELS = Path(os.environ.get("TI_OFFLINE_CACHE_FILE_PATH") or ti.lang.impl.default_cfg().offline_cache_file_path)
+
+ADVICE = "make it writable, or set TI_OFFLINE_CACHE_FILE_PATH to a folder that is; until then every start compiles"
 
 _running: int | None = None  # process
 _launch_lock = threading.RLock()  # held by the thread that starts Taichi, compiles or launches
@@ -73,15 +76,25 @@ def _initialise() -> None:
     # Taichi crashes when the process ends where it cannot make the folder, even one in which it keeps nothing.
     kept = is_writable(KERNELS)
     if kept:
-        _break_stale_lock(KERNELS / "ticache.lock")
+        _mend(KERNELS)
+    else:
+        warnings.warn(f"compiled kernels cannot be kept: {KERNELS} is not writable; {ADVICE}", stacklevel=3)
     # ti.init prints "Starting on arch=..." whatever it is told; a command's output (JSON, say) must stay its own.
-    with contextlib.redirect_stdout(io.StringIO()):
-        # Without Taichi's own control-flow optimisation kernels compile in half the time and run as fast.
-        ti.init(
-            arch=_architecture(DEVICE), default_fp=ti.f32, offline_cache=kept, cfg_optimization=False,
-            offline_cache_file_path=str(KERNELS) if kept else tempfile.gettempdir(), log_level=ti.ERROR,
-            enable_fallback=False,
-        )  # fmt: skip
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):
+            # Without Taichi's own control-flow optimisation kernels compile in half the time and run as fast.
+            ti.init(
+                arch=_architecture(DEVICE), default_fp=ti.f32, offline_cache=kept, cfg_optimization=False,
+                offline_cache_file_path=str(KERNELS) if kept else tempfile.gettempdir(), log_level=ti.ERROR,
+                enable_fallback=False,
+            )  # fmt: skip
+    except RuntimeError as error:
+        if "memory allocation" not in str(error):
+            raise
+        raise RuntimeError(
+            "Taichi cannot reserve the gigabyte of address space that it starts with: allow this process more "
+            "(`ulimit -v unlimited`, or the memory limit of a job)"
+        ) from error
     ti.sync()  # completes the start, which only this thread may do; kernels may then be compiled in any
 
 
@@ -92,15 +105,24 @@ def _finish() -> None:
         ti.reset()
 
 
-def _break_stale_lock(lock: Path) -> None:
-    """Removes the file that locks the kept kernels if it is older than a minute.
+def _mend(kept: Path) -> None:
+    """Makes kernels be kept again where Taichi would neither read nor write any, and each process would compile for a
+    minute, in silence.
 
-    Taichi makes it to read or write them, a matter of milliseconds. A process killed meanwhile leaves it, and from then
-    on no process would read or keep a kernel: each would compile for a minute, in silence.
+    It locks them to read or write, a matter of milliseconds: a lock from another minute was left by a process that was
+    killed. And what its list says is kept it never writes anew: if a file is lost or cut, the list goes.
     """
+    lock, listed = kept / "ticache.lock", kept / "ticache.tcb"
     with contextlib.suppress(OSError):
-        if time.time() - lock.stat().st_mtime > 60:
+        if abs(time.time() - lock.stat().st_mtime) > 60:
             lock.unlink()
+    with contextlib.suppress(OSError):
+        # a kernel's key, its length before it, twice, then the size of its file
+        for key, size in re.findall(rb"(T[0-9a-f]{64})A\0{7}\1(.{8})", listed.read_bytes(), re.DOTALL):
+            file = kept / f"{key.decode()}.tic"
+            if not file.is_file() or file.stat().st_size != int.from_bytes(size, "little"):
+                listed.unlink()
+                return
 
 
 def is_writable(folder: Path) -> bool:

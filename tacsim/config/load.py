@@ -53,7 +53,7 @@ def load_rig(rig: str | Path, *, task: str | TaskConfig | None = None, overrides
     root = _open(RigConfig, rig, state)
     if task is not None:
         root = apply(root, RigConfig, Override(("task",), _task(task)), state)
-    given = [parsed for text in overrides if (parsed := parse_override(text, state)) is not None]
+    given = [parsed for text in _texts(overrides) if (parsed := parse_override(text, state)) is not None]
     of_task = [override for override in given if override.path[0] == "task"]
     of_rest = [override for override in given if override.path[0] != "task"]
     for override in of_task:
@@ -190,11 +190,17 @@ def load_task(source: str | Path, overrides: Sequence[str] = ()) -> TaskConfig:
 def _load(annotation: Any, source: str | Path, overrides: Sequence[str]) -> Any:
     state = LoadState()
     root = _open(annotation, source, state)
-    for text in overrides:
+    for text in _texts(overrides):
         override = parse_override(text, state)
         if override is not None:
             root = apply(root, annotation, override, state)
     return _validate(annotation, root, state)
+
+
+def _texts(overrides: Sequence[str]) -> Sequence[str]:
+    if isinstance(overrides, str):
+        raise TypeError(f"overrides are a list of texts, [{overrides!r}]; a single text was given")
+    return overrides
 
 
 def _open(annotation: Any, source: str | Path, state: LoadState) -> Node:

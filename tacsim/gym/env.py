@@ -36,6 +36,13 @@ CANNOT_BEGIN = (GoalOutOfReach, NoTouch, SimulationDiverged)  # with this draw
 MOST_REFUSED = 8  # draws in a row
 
 
+def options_of_reset(options: Mapping[str, Any] | None) -> dict[str, Any]:
+    """A copy. Raises ValueError for what is no mapping."""
+    if not isinstance(options, Mapping | None):
+        raise ValueError(f"options of a reset are a dict, got {options!r}")
+    return dict(options or {})
+
+
 @dataclass(frozen=True, slots=True)
 class Variant:
     """What differs from one episode to the next: the goal, what is between the gels, and how sensors see it."""
@@ -136,7 +143,7 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
         too many bad draws (BadDraws).
         """
         super().reset(seed=seed)
-        chosen, refused = dict(options or {}), list[str]()
+        chosen, refused = options_of_reset(options), list[str]()
         while not self._begun(chosen, refused):
             if len(refused) == MOST_REFUSED:
                 raise BadDraws(
@@ -171,8 +178,8 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
         chosen, played = options, None
         if self._variants and not {"task", "scene"} & set(options):
             number, self.next_variant = options.get("variant", self.next_variant), None
-            played = int(self.np_random.integers(len(self._variants))) if number is None else int(number)
-            if not 0 <= played < len(self._variants):
+            played = int(self.np_random.integers(len(self._variants))) if number is None else number
+            if not (isinstance(played, int | np.integer) and 0 <= played < len(self._variants)):
                 raise ValueError(f"this environment has variants 0 to {len(self._variants) - 1}, got {number}")
             chosen = {"task": self._variants[played].task, "scene": self._variants[played].scene}
             worn = self._variants[played].rig
@@ -180,6 +187,9 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
                 self._wear(worn)
         elif "variant" in options:
             raise ValueError("options: give a variant (of an environment that has some), or a task and a scene")
+        for name, kind in (("task", TaskConfig), ("scene", Scene)):
+            if name in chosen and not isinstance(chosen[name], kind):
+                raise ValueError(f"options: the {name} is a tacsim {kind.__name__}, got {chosen[name]!r}")
         if "task" in chosen:
             require_alike(self.task.config, chosen["task"])
         if "scene" in chosen:

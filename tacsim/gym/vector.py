@@ -13,7 +13,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.vector.utils import iterate
 from numpy.typing import NDArray
 
-from tacsim.gym.env import TacsimEnv
+from tacsim.gym.env import TacsimEnv, options_of_reset
 from tacsim.models.scene import Scene
 from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.physics.move import MoveCommand
@@ -88,7 +88,7 @@ class TacsimVectorEnv(SyncVectorEnv):
     ) -> tuple[Any, dict[str, Any]]:
         """As SyncVectorEnv.reset; options: `reset_mask`, and those of `TacsimEnv.reset`. Raises ResetNeeded for a mask
         that leaves out an environment that has never been reset."""
-        options = dict(options or {})  # gymnasium takes the mask out of what it is given
+        options = options_of_reset(options)  # a copy: gymnasium takes the mask out of what it is given
         mask = options.get("reset_mask")
         if isinstance(mask, np.ndarray) and mask.shape == (self.num_envs,):
             new = [i for i, member in enumerate(self._members) if member.env.phase == "new" and not mask[i]]

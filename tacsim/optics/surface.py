@@ -170,7 +170,8 @@ class SurfaceTable:
         seen = _table_coordinates(self._surface.origin, self.pitch, grid)
         last, points = seen, seen - look_up(self._lateral, seen)
         for _ in range(FIXED_POINT_STEPS - 1):
-            if cv2.norm(points, last, cv2.NORM_INF) <= CONVERGED:
+            # not cv2.norm of both: a signal that raises in it, such as Ctrl-C, ends the process (OpenCV 4.13)
+            if cv2.norm(cv2.absdiff(points, last), cv2.NORM_INF) <= CONVERGED:
                 return points
             last, points = points, seen - look_up(self._lateral, points)
         restless = np.abs(points - last).max(axis=2) > CONVERGED

@@ -98,11 +98,16 @@ def write_report(
     rows = strips(episode, series, FILMSTRIP, find)
     paths = {name: directory / name for name in ("summary.json", "report.png", "report.html")}
     directory.mkdir(parents=True, exist_ok=True)
-    paths["summary.json"].write_text(json.dumps(stats, indent=1, allow_nan=False) + "\n", encoding="utf-8")
     subtitle = " · ".join(f"{key}: {value}" for key, value in _headline(stats, series))
     few = [(row.label, [row.pictures[k] for k in figure.moments(len(row.pictures), figure.COLUMNS)]) for row in rows]
-    figure.save(figure.overview(few, series, _title(stats), subtitle), paths["report.png"])
-    paths["report.html"].write_text(_html(series, stats, rows), encoding="utf-8")
+    try:
+        paths["summary.json"].write_text(json.dumps(stats, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        figure.save(figure.overview(few, series, _title(stats), subtitle), paths["report.png"])
+        paths["report.html"].write_text(_html(series, stats, rows), encoding="utf-8")
+    except OSError:  # a full disk, say: no half of a report looks like one
+        for path in paths.values():
+            path.unlink(missing_ok=True)
+        raise
     return paths
 
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from robot.open import RIG_ATTACHMENT, CannotOpen, open_rig
+from robot.open import RIG_ATTACHMENT, CannotOpen, make_env, open_rig
 from tacsim.config import ConfigError, load_rig
 from tacsim.interface import Action, Needs
 from tacsim.record.episode import EpisodeMeta, Step
@@ -162,6 +163,22 @@ def test_a_wrong_file_is_a_config_error(tmp_path: Path) -> None:
 def test_a_loaded_configuration_takes_no_more_overrides() -> None:
     with pytest.raises(TypeError, match="loaded already"):
         open_rig(load_rig("sim"), overrides=["period=1 s"])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ({"overrides": "scene.preset=learn"}, "lists of texts"),
+        ({"variants": ["scene.preset=learn"]}, "lists of texts"),
+        ({"features": {"period": "often"}}, "features: "),
+        ({"features": 5}, "features: "),
+        ({"randomise": 5}, "randomise: "),
+    ],
+)
+def test_wrong_arguments_of_an_environment_are_told_in_words(arguments: dict[str, Any], said: str) -> None:
+    with pytest.raises((TypeError, ConfigError), match=said) as caught:
+        make_env(**arguments)
+    assert "pydantic" not in str(caught.value)
 
 
 @pytest.mark.parametrize("first", ["", "import tacsim.gym.plugin as p; p.install()\n"])

@@ -149,6 +149,13 @@ def test_exit_codes_of_errors() -> None:
     assert "no room" in explain(ExceptionGroup("two", [OSError("no room"), EpisodeError("bad")]))[0]
 
 
+def test_a_working_folder_that_is_gone_is_named() -> None:
+    code = "import os, tempfile; os.chdir(tempfile.mkdtemp()); os.rmdir(os.getcwd()); from robot.cli import main; main()"
+    command = [sys.executable, "-c", code, "run", "--steps", "1", "--out", "/nowhere/out"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (2, "error: the working directory no longer exists; change to another folder\n")
+
+
 @pytest.mark.parametrize("words", [("--debug", "replay", "missing.mcap"), ("replay", "missing.mcap", "--debug")])
 def test_debug_shows_the_traceback_wherever_it_stands(words: tuple[str, ...]) -> None:
     assert isinstance(tacsim(*words).exception, EpisodeError)

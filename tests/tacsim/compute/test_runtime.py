@@ -94,11 +94,13 @@ print(os.wait()[1])
     assert first.startswith(told) and second.startswith(told) and rest == ["True", "0"]
 
 
-def three(folder: Path, places: dict[str, str], more: str = "") -> subprocess.CompletedProcess[str]:
+def three(
+    folder: Path, places: dict[str, str], more: str = "", *, before: str = ""
+) -> subprocess.CompletedProcess[str]:
     """A process that compiles a kernel and prints the three it gives, then does `more`. places: what says in its
-    environment where kernels are kept."""
+    environment where kernels are kept; before: what it does once Taichi is imported."""
     code = "from tacsim.compute.runtime import start, ti\n@ti.kernel\ndef three() -> ti.i32: return 3\n"
-    (folder / "small.py").write_text(f"{code}start()\nprint(three())\n{more}")
+    (folder / "small.py").write_text(f"{code}{before}start()\nprint(three())\n{more}")
     elsewhere = ("HOME", "XDG_CACHE_HOME", "TI_OFFLINE_CACHE_FILE_PATH")
     environment = {name: value for name, value in os.environ.items() if name not in elsewhere} | places
     environment |= {"PYTHONPATH": os.pathsep.join(sys.path), "TACSIM_DEVICE": "cpu"}
@@ -110,8 +112,10 @@ def three(folder: Path, places: dict[str, str], more: str = "") -> subprocess.Co
 def test_it_runs_to_the_end_where_no_kernels_can_be_kept(tmp_path: Path, cache: str | None) -> None:
     """Taichi ends the process without a home directory, and crashes at its end without a cache: a service's, say."""
     (tmp_path / "file").touch()
-    done = three(tmp_path, {} if cache is None else {"XDG_CACHE_HOME": str(tmp_path / cache)})
+    told = "import warnings\nwarnings.simplefilter('default')\n"
+    done = three(tmp_path, {} if cache is None else {"XDG_CACHE_HOME": str(tmp_path / cache)}, before=told)
     assert (done.returncode, done.stdout) == (0, "3\n"), done.stderr
+    assert ("compiled kernels cannot be kept" in done.stderr) == (cache is not None)
 
 
 def test_compiled_kernels_are_kept_whatever_still_refers_to_taichi_at_the_end(tmp_path: Path) -> None:
@@ -123,8 +127,10 @@ def test_compiled_kernels_are_kept_whatever_still_refers_to_taichi_at_the_end(tm
     assert list((tmp_path / "cache").glob("*.tic"))
 
 
-@pytest.mark.parametrize(("age", "left"), [(61.0, False), (0.0, True)], ids=["of a killed process", "of another one"])
-def test_only_a_lock_that_a_killed_process_has_left_is_broken(tmp_path: Path, age: float, left: bool) -> None:
+@pytest.mark.parametrize(
+    ("age", "left"), [(61.0, False), (-3600.0, False), (0.0, True)], ids=["of a killed process", "of a wrong clock", "held"]
+)
+def test_only_a_lock_that_nobody_holds_is_broken(tmp_path: Path, age: float, left: bool) -> None:
     """Taichi locks what it keeps for milliseconds, and neither reads nor keeps kernels while the lock is there."""
     lock = tmp_path / "cache" / "ticache.lock"
     lock.parent.mkdir()
@@ -134,3 +140,30 @@ def test_only_a_lock_that_a_killed_process_has_left_is_broken(tmp_path: Path, ag
     assert (done.returncode, done.stdout) == (0, "3\n"), done.stderr
     assert lock.exists() == left
     assert bool(list(lock.parent.glob("*.tic"))) != left
+
+
+@pytest.mark.parametrize("size", [None, 0, 700], ids=["lost", "empty", "cut"])
+def test_a_kept_kernel_whose_file_is_damaged_is_kept_anew(tmp_path: Path, size: int | None) -> None:
+    """By itself Taichi compiles it in every process and never writes what its list says is there."""
+    places = {"TI_OFFLINE_CACHE_FILE_PATH": str(tmp_path / "cache")}
+    three(tmp_path, places)
+    (kept,) = (tmp_path / "cache").glob("*.tic")
+    whole = kept.read_bytes()
+    if size is None:
+        kept.unlink()
+    else:
+        kept.write_bytes(whole[:size])
+    done = three(tmp_path, places)
+    assert (done.returncode, done.stdout) == (0, "3\n"), done.stderr
+    assert kept.stat().st_size == len(whole)
+    kept.touch()
+    os.utime(kept, (0, 0))
+    three(tmp_path, places)
+    assert kept.stat().st_mtime == 0  # nothing was wrong: it was read
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="limits of POSIX")
+def test_too_little_address_space_is_told(tmp_path: Path) -> None:
+    limit = "import resource\nresource.setrlimit(resource.RLIMIT_AS, (2**30, 2**30))\n"
+    done = three(tmp_path, {"TI_OFFLINE_CACHE_FILE_PATH": str(tmp_path / "cache")}, before=limit)
+    assert done.stderr.rstrip().splitlines()[-1].startswith("RuntimeError: Taichi cannot reserve the gigabyte"), done.stderr

@@ -193,9 +193,12 @@ def test_a_rig_without_truth_is_refused(open_springs: Any) -> None:
         TacsimEnv(rig, make_task(SqueezeConfig(kind="squeeze")))
 
 
-def test_options_are_refused(open_springs: Any) -> None:
-    with pytest.raises(ValueError, match="'speed'"):
-        make_env(open_springs).reset(options={"speed": 1})
+@pytest.mark.parametrize(
+    ("options", "said"), [({"speed": 1}, "'speed'"), (5, "a dict, got 5"), ({"scene": 1}, "the scene is a tacsim Scene")]
+)
+def test_options_are_refused(options: Any, said: str, open_springs: Any) -> None:
+    with pytest.raises(ValueError, match=said):
+        make_env(open_springs).reset(options=options)
 
 
 def test_environments_are_registered_once() -> None:

@@ -198,6 +198,16 @@ def test_a_reset_alone_can_be_reported_and_nothing_cannot(tmp_path: Path) -> Non
     assert not (tmp_path / "none").exists()
 
 
+def test_half_of_a_report_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(figure: object, path: Path) -> None:
+        raise OSError(28, "No space left on device", str(path))
+
+    monkeypatch.setattr("tacsim.report.figure.save", full)
+    with pytest.raises(OSError, match="No space left"):
+        write_report(made_up(), tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
 def test_table_names_the_best_the_peak_and_what_was_lost() -> None:
     episode = made_up()
     episode.dropped, episode.complete = 2, False

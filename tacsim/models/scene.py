@@ -278,16 +278,22 @@ class Scene(Config):
         since density is scaled so that the wave speed is 1. What is elastic comes to the same rest from any speed, but
         for friction: it sticks where a stop finds the gel, which follows a drag with its shear wave.
         """
-        settling = self.settling
-        if settling.mach is not None:
-            return settling.mach
-        by_stress = self._mach_by_stress
-        if not math.isfinite(by_stress):
+        if self.settling.mach is not None:
+            return self.settling.mach
+        if not math.isfinite(self._mach_by_stress):
             mu, lam = lame(self.gel.material)
             return min(FASTEST_MACH, MACH_BY_SHEAR * math.sqrt(mu / (lam + 2 * mu)))
-        lighter = LIGHTER if self.physics == "hybrid" else 1.0
-        by_tolerance = max(lighter * MACH_BY_TOLERANCE * settling.tolerance, SLOWEST_MACH)
-        return min(by_tolerance, by_stress, lighter * FASTEST_MACH)
+        by_tolerance = self._lighter * MACH_BY_TOLERANCE * self.settling.tolerance
+        return min(max(by_tolerance, SLOWEST_MACH), self.fastest_mach)
+
+    @property
+    def fastest_mach(self) -> float:
+        """The most that this is for a body that yields, at any tolerance."""
+        return min(self._mach_by_stress, self._lighter * FASTEST_MACH)
+
+    @property
+    def _lighter(self) -> float:
+        return LIGHTER if self.physics == "hybrid" else 1.0
 
     @property
     def flow_mach(self) -> float:

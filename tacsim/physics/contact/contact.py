@@ -4,8 +4,9 @@ The gel surface is the C1 quadratic B-spline over its top nodes; the renderer dr
 is a penalty plus a multiplier that remembers (augmented Lagrangian, Simo & Laursen 1992), so that nothing overlaps at
 rest. Coulomb friction acts by an elastic slip with memory (Cundall & Strack 1979): without it, friction creeps and
 holds nothing. What is remembered is the point that a contact sticks to, its anchor: a slip summed up from velocities
-comes back from a loop of stretch, shear and turns with another value. The limit of friction follows the remembered
-normal force (Prakash & Clifton 1993): that of the instant makes sliding flutter.
+comes back from a loop of stretch, shear and turns with another value. The limit of a particle's friction is that of its
+normal force without the dashpot's: a limit that lags behind, as rigid indenters need it (indenter.py), drags up to 15 %
+too little where a contact grows while it slides.
 """
 
 from tacsim.compute.runtime import ti
@@ -106,19 +107,19 @@ def even_mobility(env: ti.template()):
 
 @ti.func
 def normal_force(spring, memory, drag):
-    """Normal force of a contact and its new memory, which carries the force at rest.
+    """Normal force of a contact, what of it is not of the dashpot, and its new memory, which carries the force at rest.
 
     spring: of the overlap; drag: of the dashpot, away from the contact.
     """
-    return ti.max(spring + memory - drag, 0.0), ti.max(memory + MEMORY_RATE * spring, 0.0)
+    held = ti.max(spring + memory, 0.0)
+    return ti.max(spring + memory - drag, 0.0), held, ti.max(memory + MEMORY_RATE * spring, 0.0)
 
 
 @ti.func
 def friction(slip, vt, limit, k_t, c_t):
     """Coulomb's law with stick. Returns the tangential force, and the share of the elastic slip that is left.
 
-    slip: elastic, and vt: velocity, both along the surface; limit: of the force, the coefficient times the remembered
-    normal force.
+    slip: elastic, and vt: velocity, both along the surface; limit: of the force, the coefficient times a normal force.
     """
     ft = -k_t * slip - c_t * vt
     size, left = ft.norm(), 1.0
@@ -230,11 +231,11 @@ def particle_contact(env: ti.template(), part, g, x, v, history, radius, gels: t
                         record_more(env, slot_of(part), layout.CAPPED, 1.0)
                     vr = v - vec3(vs[0], vs[1], vs[2])
                     vn = vr.dot(n)
-                    fn, pressed = normal_force(k_n * gap, pressed, c_n * vn)
+                    fn, held, pressed = normal_force(k_n * gap, pressed, c_n * vn)
                     under = vec2(x[0], x[1]) - moved
                     if holder != ON_GEL:
                         anchor, holder = under, ON_GEL
-                    ft, anchor = cling(anchor, under, e1, e2, vr - vn * n, mu * pressed, k_t, c_n)
+                    ft, anchor = cling(anchor, under, e1, e2, vr - vn * n, mu * held, k_t, c_n)
                     force = fn * n + ft
                     in_contact = True
                     overlap = gap
@@ -249,12 +250,12 @@ def particle_contact(env: ti.template(), part, g, x, v, history, radius, gels: t
                         gap = deepest
                         record_more(env, slot_of(part), layout.CAPPED, 1.0)
                     n = vec3(0.0, 0.0, 1.0)
-                    fn, pressed = normal_force(k_n * gap, pressed, c_n * v[2])
+                    fn, held, pressed = normal_force(k_n * gap, pressed, c_n * v[2])
                     under = vec2(x[0], x[1])
                     if holder != ON_HOUSING:
                         anchor, holder = under, ON_HOUSING
                     e1, e2, vt = vec3(1.0, 0.0, 0.0), vec3(0.0, 1.0, 0.0), vec3(v[0], v[1], 0.0)
-                    ft, anchor = cling(anchor, under, e1, e2, vt, mu * pressed, k_t, c_n)
+                    ft, anchor = cling(anchor, under, e1, e2, vt, mu * held, k_t, c_n)
                     force = fn * n + ft
                     in_contact, housed = True, True
                     overlap = gap

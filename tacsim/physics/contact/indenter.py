@@ -229,7 +229,7 @@ def point_push(env: ti.template(), gels: ti.template(), indenter: ti.template(),
     """
     h, k_n, dt = env.param(layout.GEL_SPACING), env.param(layout.STIFFNESS), env.param(layout.STEP)
     area = h * h / (POINTS * POINTS)
-    follow = dt / (h * gels.layers)  # friction's limit follows the pressure within a wave's time through the gel
+    follow = dt * env.param(layout.LIMIT_FOLLOWS)  # at once, slides would flutter (Prakash & Clifton 1993)
     c_n = CONTACT_DAMPING * env.param(layout.GEL_DENSITY) * h / (2.0 * dt)
     y = shape.rotate.transpose() @ (x - shape.centre)
     phi, n_local = signed_distance(env, shape.kind, shape.size, y, shape.grid)

@@ -31,7 +31,8 @@ CARRIED = 44  # mean displacement gradient of the particles since then, row by r
 EDGE_RADIUS = 53  # of an indenter [mm]
 OWN = 54  # weight of a node's own acceleration, force over mass, in how it moves; 1 is true inertia
 FILTERED = 55  # weight of that filtered by its neighbours' (tacsim.physics.gel.mass, tacsim.physics.body.mass)
-PARAMS = 56
+LIMIT_FOLLOWS = 56  # rate at which the limit of an indenter's friction follows the pressure [1/mm]
+PARAMS = 57
 
 # counts (environments, COUNTS) int32
 ZERO = 0  # always 0: see tacsim.physics.exec.lanes.overwrite

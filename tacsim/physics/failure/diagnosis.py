@@ -136,12 +136,30 @@ def _determinant(a: Floats, b: Floats, c: Floats) -> Floats:
 
 
 def place_of_worst(quantity: Quantity, good: State, failed: State, gel: tuple[float, float, float]) -> str:
-    """Which particle or gel node has the worst of `quantity` in `failed`, in words; "" where there is no such thing.
+    """Which particle or gel node has the worst of `quantity` in `failed`, in words; "" where there is no such thing. Of
+    `good`, the last physical state, where what was wrong has spread over half of `failed`: there it began.
 
-    Positions are those in `good`, the last physical state; `gel`: size of a gel [m].
+    Positions are those in `good`; `gel`: size of a gel [m].
     """
-    thickness = gel[2] * 1e3
-    values: NDArray[Any] | None = None  # the larger, the worse; by node or element of the gels, or by particle
+    values = _badness(quantity, failed, gel[2] * 1e3)
+    if values is not None and quantity != "not finite" and np.isfinite(values).mean() < 0.5:
+        values = _badness(quantity, good, gel[2] * 1e3)
+    if values is None:
+        return ""
+    flat = int(np.argmax(np.where(np.isfinite(values), values, np.inf)))
+    index = [int(i) for i in np.unravel_index(flat, values.shape)]
+    if values.ndim >= 4:
+        cells = np.array(failed["gel_displacement"].shape[1:4]) - 1
+        at = (np.array(index[1:4]) / cells - [0.5, 0.5, 1.0]) * np.array(gel) * 1e3
+        return f"node {index[1:4]} of the {SENSORS[index[0]]} gel, {millimetres(at)} mm at rest in its sensor frame"
+    if "position" in good and values.ndim and len(values) == len(good["position"]):
+        return f"particle {index[0]}, {millimetres(good['position'][index[0]])} mm in the world"
+    return ""
+
+
+def _badness(quantity: Quantity, failed: State, thickness: float) -> NDArray[Any] | None:
+    """By node or element of the gels, or by particle: the larger, the worse; `thickness` of a gel [mm]."""
+    values: NDArray[Any] | None = None
     if quantity == "not finite":
         values = next((~np.isfinite(a) for a in failed.values() if not np.isfinite(a).all()), None)
     elif quantity == "particle volume":
@@ -155,17 +173,7 @@ def place_of_worst(quantity: Quantity, good: State, failed: State, gel: tuple[fl
             values = None if elements is None else -elements
     elif "velocity" in failed:  # the gels of physics 'seed' consist of particles too
         values = np.abs(failed["velocity"])
-    if values is None:
-        return ""
-    flat = int(np.argmax(np.where(np.isfinite(values), values, np.inf)))
-    index = [int(i) for i in np.unravel_index(flat, values.shape)]
-    if values.ndim >= 4:
-        cells = np.array(failed["gel_displacement"].shape[1:4]) - 1
-        at = (np.array(index[1:4]) / cells - [0.5, 0.5, 1.0]) * np.array(gel) * 1e3
-        return f"node {index[1:4]} of the {SENSORS[index[0]]} gel, {millimetres(at)} mm at rest in its sensor frame"
-    if "position" in good and values.ndim and len(values) == len(good["position"]):
-        return f"particle {index[0]}, {millimetres(good['position'][index[0]])} mm in the world"
-    return ""
+    return values
 
 
 def millimetres(vector: NDArray[Any]) -> str:

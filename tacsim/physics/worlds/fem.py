@@ -31,9 +31,11 @@ from tacsim.physics.motion.controller import (
 from tacsim.physics.motion.inertia import Inertia, plan_real_time
 from tacsim.physics.motion.load import keep_loads, require_loads
 from tacsim.physics.motion.path import (
+    SHORT_GROWING,
     SHORT_PATH,
     SHORT_SLIDE,
     Path,
+    growth,
     path_along,
     path_length,
     plan,
@@ -52,6 +54,8 @@ if TYPE_CHECKING:  # a device's kernels
 # Of the speed of the gel's shear wave, of an indenter with friction: up to it a slide ends within 2 % of a slow one; at
 # 0.25 it is up to 3 % off, at 0.5 up to 17 %
 HURRIED_BY_SHEAR = 0.155
+# Of the fastest default for a body that yields: at twice it clay ends 2 % lower, at 4 times 9 to 11 %, at 7 times 26 %
+HURRIED_BY_STRESS = 3.0
 # Element sizes that an edge which catches on the mesh may be slid: further, drag is up to 50 % off
 SLID_BY_EDGES = 0.5
 
@@ -277,15 +281,18 @@ class FemWorld(BaseWorld):
 
     def plan(self, start: Sequence[Pose], end: Sequence[Pose]) -> Path:
         """The path between two poses of all driven frames, at the scene's speed."""
-        mach, gel, lever = self.scene.peak_mach, self._gel, max(self._gel.half)
+        mach, gel, lever, indenter = self.scene.peak_mach, self._gel, max(self._gel.half), self.scene.indenter
+        slides = indenter is not None and indenter.friction > 0.0
+        growing = growth(start, end) if slides else 0.0
         remembered = (path_length if self.yields else path_along)(start, end, lever)
-        short = SHORT_PATH if self.yields else SHORT_SLIDE
+        short = SHORT_PATH if self.yields else SHORT_SLIDE + (SHORT_GROWING - SHORT_SLIDE) * growing
         path = plan(
             start, end, mach, self._scaled.step, lever, gel.thickness, remembered=remembered, short=short
         )  # fmt: skip
-        path = replace(path, creeps=self.yields)
-        indenter = self.scene.indenter
-        if indenter is None or indenter.friction == 0.0:
+        path = replace(path, creeps=self.yields, growing=growing)
+        if self.yields:  # its own speed yields it
+            return replace(path, unfollowed=path.peak_mach(lever) > HURRIED_BY_STRESS * self.scene.fastest_mach)
+        if indenter is None or not slides:
             return path
         slid = path_along(start, end, 0.0)  # without turns
         catches = indenter.catches(self.scene.element) and slid > SLID_BY_EDGES * self.scene.element * MM * (1 + 1e-6)
@@ -296,7 +303,7 @@ class FemWorld(BaseWorld):
     def _plan_flow(self, start: Sequence[Pose], end: Sequence[Pose]) -> Path:
         mach, gel = self.scene.flow_mach, self._gel
         path = plan_flow(start, end, self._rates.copy(), mach, self._scaled.step, max(gel.half), gel.thickness)
-        return replace(path, creeps=self.yields)
+        return replace(path, creeps=self.yields, growing=0.0 if self.scene.indenter is None else growth(start, end))
 
     @launching()  # around all of it: worlds of a batch share arrays, among them those that say which take part
     def _advance(self, launch: Launch) -> list[ForceReading]:

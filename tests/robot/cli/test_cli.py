@@ -150,10 +150,15 @@ def test_exit_codes_of_errors() -> None:
 
 
 def test_a_working_folder_that_is_gone_is_named() -> None:
-    code = "import os, tempfile; os.chdir(tempfile.mkdtemp()); os.rmdir(os.getcwd()); from robot.cli import main; main()"
+    code = (
+        "import os, tempfile; os.chdir(tempfile.mkdtemp()); os.rmdir(os.getcwd()); from robot.cli import main; main()"
+    )
     command = [sys.executable, "-c", code, "run", "--steps", "1", "--out", "/nowhere/out"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)
-    assert (done.returncode, done.stderr) == (2, "error: the working directory no longer exists; change to another folder\n")
+    assert (done.returncode, done.stderr) == (
+        2,
+        "error: the working directory no longer exists; change to another folder\n",
+    )
 
 
 @pytest.mark.parametrize("words", [("--debug", "replay", "missing.mcap"), ("replay", "missing.mcap", "--debug")])

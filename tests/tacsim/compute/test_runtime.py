@@ -128,7 +128,9 @@ def test_compiled_kernels_are_kept_whatever_still_refers_to_taichi_at_the_end(tm
 
 
 @pytest.mark.parametrize(
-    ("age", "left"), [(61.0, False), (-3600.0, False), (0.0, True)], ids=["of a killed process", "of a wrong clock", "held"]
+    ("age", "left"),
+    [(61.0, False), (-3600.0, False), (0.0, True)],
+    ids=["of a killed process", "of a wrong clock", "held"],
 )
 def test_only_a_lock_that_nobody_holds_is_broken(tmp_path: Path, age: float, left: bool) -> None:
     """Taichi locks what it keeps for milliseconds, and neither reads nor keeps kernels while the lock is there."""
@@ -166,4 +168,6 @@ def test_a_kept_kernel_whose_file_is_damaged_is_kept_anew(tmp_path: Path, size: 
 def test_too_little_address_space_is_told(tmp_path: Path) -> None:
     limit = "import resource\nresource.setrlimit(resource.RLIMIT_AS, (2**30, 2**30))\n"
     done = three(tmp_path, {"TI_OFFLINE_CACHE_FILE_PATH": str(tmp_path / "cache")}, before=limit)
-    assert done.stderr.rstrip().splitlines()[-1].startswith("RuntimeError: Taichi cannot reserve the gigabyte"), done.stderr
+    assert done.stderr.rstrip().splitlines()[-1].startswith("RuntimeError: Taichi cannot reserve the gigabyte"), (
+        done.stderr
+    )

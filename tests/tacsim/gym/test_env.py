@@ -194,7 +194,8 @@ def test_a_rig_without_truth_is_refused(open_springs: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "said"), [({"speed": 1}, "'speed'"), (5, "a dict, got 5"), ({"scene": 1}, "the scene is a tacsim Scene")]
+    ("options", "said"),
+    [({"speed": 1}, "'speed'"), (5, "a dict, got 5"), ({"scene": 1}, "the scene is a tacsim Scene")],
 )
 def test_options_are_refused(options: Any, said: str, open_springs: Any) -> None:
     with pytest.raises(ValueError, match=said):

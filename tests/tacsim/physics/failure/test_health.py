@@ -125,6 +125,16 @@ def test_a_gel_node_that_races_and_a_crushed_particle_are_seen() -> None:
         world.launch(set_to("strain", (3, 2), -0.999))
 
 
+def test_what_has_spread_over_a_gel_is_placed_where_it_began() -> None:
+    good = {"gel_displacement": np.zeros((1, 3, 3, 2, 3)), "gel_velocity": np.zeros((1, 3, 3, 2, 3))}
+    good["gel_velocity"][0, 1, 1, 1, 2] = -0.4
+    failed = {name: np.full_like(array, np.nan) for name, array in good.items()}
+    place = diagnosis.place_of_worst("node speed", good, failed, (4e-3, 4e-3, 2e-3))
+    assert place.startswith("node [1, 1, 1] of the lower gel, (0.000, 0.000, 0.000) mm")
+    failed["gel_velocity"][...], failed["gel_velocity"][0, 2, 0, 0, 1] = 0.1, 3.0
+    assert "node [2, 0, 0]" in diagnosis.place_of_worst("node speed", good, failed, (4e-3, 4e-3, 2e-3))
+
+
 def test_a_motion_starts_again_from_the_state_before_it() -> None:
     world, seen = Particles(), []
 

@@ -117,6 +117,7 @@ TOO_LONG = {"hybrid.COURANT": 1.2, "press.COURANT": 1.2, "seed.COURANT": 1.5}
 RUSHED = Settling(mach=0.1, tolerance=1e-2, max_substeps=600, flow_mach=0.15)
 USUAL = Settling(tolerance=1e-2, max_substeps=800)
 PATIENT = Settling(mach=0.1, tolerance=1e-2)
+FOLLOWED = Settling(mach=0.02, tolerance=1e-2, max_substeps=800)
 SLOWER = Settling(mach=0.05, tolerance=1e-2, max_substeps=800)
 BALL = indented(Sphere(radius=4e-3))
 SMALL = cube(3e-3, gel=Gel(size=(8e-3, 8e-3, 4e-3)))
@@ -131,7 +132,9 @@ CASES: dict[str, Case] = {
         cube(material=BodyMaterial(yield_strain=0.01), gel=WIDE), squeeze_to(0.1, 8)
     ),
     "plasticine, k 0.05, to a fifth": Case(
-        cube(material=BodyMaterial(yield_strain=0.05), gel=WIDE), squeeze_to(0.2, 8)
+        # 21 N; at Mach 0.1 it would end with 37 to 44 N, mostly not at rest
+        cube(material=BodyMaterial(yield_strain=0.05), gel=WIDE, settling=FOLLOWED),
+        squeeze_to(0.2, 8),
     ),
     "hardly any yield stress": Case(cube(material=BodyMaterial(yield_stress=1.0)), squeeze_by(1.0e-3)),
     "body 10,000 times stiffer": Case(cube(material=BodyMaterial(youngs_modulus=1.45e9)), squeeze_by(1.0e-3)),

@@ -48,12 +48,17 @@ def worker() -> Iterator[Worker]:
         yield opened
 
 
+def even(f: Config) -> bool:
+    return abs(f["force"] - f["upper force"]) <= 0.02 * abs(f["force"])
+
+
 def balanced(f: Config) -> bool:
-    return f["settled"] == 1 and abs(f["force"] - f["upper force"]) <= 0.02 * abs(f["force"])
+    return f["settled"] == 1 and even(f)
 
 
 def held(f: Config) -> bool:
-    """Comes to rest; as fast as these are driven, friction could not follow, and that is not called settled."""
+    """Comes to rest; as fast as these are driven, friction, or what yields, could not follow, and that is not called
+    settled."""
     return f["residual"] <= 1e-2
 
 
@@ -123,7 +128,7 @@ EXPECTED: dict[str, dict[str, Callable[[Config], bool] | str]] = {
     # Its tip lies between contact points 0.33 mm apart: seen from 1 mm deep on.
     "sharp cone": {"press": "no contact point more than"},
     "sharp cone, deep": {"press": lambda f: f["least element"] > 0.5},
-    "Mach 0.3": {"hybrid": balanced, "seed": balanced},
+    "Mach 0.3": {"hybrid": lambda f: held(f) and even(f) and f["settled"] == 0, "seed": balanced},
     "Mach 0.3, press": {"press": lambda f: held(f) and PRESSED[0] < f["force"] < PRESSED[1]},
     # The gels give half of the 3 mm; a body without yield springs back.
     "impact, elastic": {"hybrid": lambda f: keeps(0.9, 1.05)(f) and f["height"] > 3.4e-3},

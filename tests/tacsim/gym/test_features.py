@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-
+from tacsim.config import ConfigError
 from tacsim.interface import IncompatibleRig
 from tacsim.optics.render import Renderer
 from tests.tacsim.gym.small import SMALL, assert_equal, make, make_native

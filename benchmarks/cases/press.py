@@ -214,6 +214,39 @@ def slid_edges(preset: Preset, repeat: int) -> list[Measurement]:
     return rows
 
 
+def slid_in(preset: str, repeat: int) -> list[Measurement]:
+    """Pressed in while they slide, in one oblique motion from above the gel: drag over normal force."""
+    settled = {"mach": SLIDE_SLOW[preset], "tolerance": 1e-3, "max_substeps": 500}
+    rows = []
+    for shape, friction, way in (
+        (Sphere(radius=6e-3), 0.8, (0.6e-3, 0.0, -0.3e-3)),
+        (Sphere(radius=3e-3), 1.5, (1.5e-3, 0.0, -0.8e-3)),
+        (Cylinder(radius=2.5e-3, height=5e-3), 0.6, (1e-3, 0.0, -0.4e-3)),
+        (Box(size=(4e-3, 4e-3, 4e-3)), 0.8, (1e-3, 1e-3, -0.5e-3)),
+    ):
+        indenter = Indenter(geometry=shape, friction=friction)
+        timing, (found, stats) = timed(partial(_drag_in, preset, indenter, way), 1, warm=lambda: None)
+        truth, _ = _drag_in(preset, indenter, way, **settled)
+        what = f"the same mesh at Mach {SLIDE_SLOW[preset]:g}"
+        rows.append(_drag_row(timing, found, stats, truth, what, f"{shape.shape}, friction {friction:g}"))
+    return rows
+
+
+def _drag_in(
+    preset: str, indenter: Indenter, way: tuple[float, float, float], **settling: float
+) -> tuple[float, MoveStats]:
+    """Drag over normal force after one motion by so much from where the indenter touches [m]."""
+    from tacsim.physics.worlds.press import CLEARANCE, PressWorld
+
+    scene = {"body": None, "preset": preset, "indenter": indenter, "settling": settling}
+    world = PressWorld(Scene.model_validate(scene))
+    pose = world.pose("indenter")
+    target = pose.position + way - [0.0, 0.0, CLEARANCE]
+    stats = world.move({"indenter": Pose(target, pose.quaternion)})
+    force = world.wrench("lower")
+    return float(np.hypot(force[0], force[1]) / -force[2]), stats
+
+
 def _drag(preset: str, indenter: Indenter, deep: float, length: float, **settling: float) -> tuple[float, MoveStats]:
     """Drag over normal force after a slide of so much, so deep [m]."""
     scene = Scene.model_validate(
@@ -332,6 +365,7 @@ CASES = (
     Case("press", "flat_punch", "tacsim", "h 0.5 mm", partial(flat_punch, 0.5e-3)),
     Case("press", "sliding_force", "tacsim", "h 1 mm", partial(sliding_force, 1e-3)),
     *(Case("press", "slid_ball", "tacsim", preset, partial(slid_ball, preset)) for preset in ("draft", "standard")),
+    *(Case("press", "slid_in", "tacsim", preset, partial(slid_in, preset)) for preset in ("draft", "standard")),
     Case("press", "slid_edges", "tacsim", "draft", partial(slid_edges, "draft")),
     Case("press", "slid_edges", "tacsim", "standard", partial(slid_edges, "standard"), long=True),
 )  # fmt: skip

@@ -14,7 +14,7 @@ from benchmarks.truth.gap import gaps
 from benchmarks.truth.roughness import print_roughness
 from tacsim.compute.threads import map_parallel
 from tacsim.interface import Pose
-from tacsim.models.scene import Scene
+from tacsim.models.scene import Body, BodyMaterial, Box, Preset, Scene, Settling
 from tacsim.physics.move import MoveStats
 from tacsim.physics.world import World, make_world
 
@@ -274,6 +274,39 @@ def _rough_row(preset: str, sampling: Literal["lattice", "random"], by: float, r
     )  # fmt: skip
 
 
+ASLANT = (0.6e-3, 0.0, -0.4e-3)  # of the upper sensor; the lower one goes the other way [m]
+KNEADED = {
+    "clay": BodyMaterial(youngs_modulus=0.5e6, poisson_ratio=0.45, yield_stress=20e3),
+    "elastic": BodyMaterial(youngs_modulus=0.5e6),
+}
+
+
+def closed_aslant(preset: Preset, repeat: int) -> list[Measurement]:
+    """A cube of 6 x 6 x 5 mm that is closed on and sheared in one motion from touch: the force along the gels."""
+    rows = []
+    for name, material in KNEADED.items():
+        timing, (found, stats) = timed(partial(_aslant, preset, material), 1, warm=lambda: None)
+        truth, _ = _aslant(preset, material, mach=0.002, tolerance=1e-3, max_substeps=2000)
+        figures, note = {"found_n": found, "truth_n": truth}, "" if stats.settled else "not settled"
+        error = abs(found / truth - 1) * 100
+        rows.append(Measurement(timing, error, "%", "the same mesh at Mach 0.002", name, stats.substeps, figures, note))
+    return rows
+
+
+def _aslant(preset: Preset, material: BodyMaterial, **settling: float) -> tuple[float, MoveStats]:
+    body = Body(geometry=Box(size=(6e-3, 6e-3, 5e-3)), material=material)
+    friction = {"lower": 0.4, "upper": 0.4}
+    world = make_world(Scene(body=body, preset=preset, friction=friction, settling=Settling(**settling)))  # type: ignore[arg-type]
+    truth = world.truth()
+    assert truth is not None
+    close(world, float(world.pose("upper").position[2]) - truth.height)
+    ways = {"upper": np.array(ASLANT), "lower": -np.array(ASLANT)}
+    stats = world.move(
+        {name: Pose(world.pose(name).position + way, world.pose(name).quaternion) for name, way in ways.items()}
+    )
+    return float(np.hypot(*world.wrench("upper")[:2])), stats
+
+
 SEED_DRAFT = "particles 0.5 mm, dx 1 mm"
 PRESETS = {
     "learn": "particles 1 mm, gel 2 mm",
@@ -319,4 +352,5 @@ CASES = (
         Case("squeeze", "roughness", "tacsim", PRESETS[preset], partial(roughness, preset), long=preset == "standard")
         for preset in ROUGH
     ),
+    *(Case("squeeze", "closed_aslant", "tacsim", PRESETS[p], partial(closed_aslant, p)) for p in ("draft", "standard")),
 )

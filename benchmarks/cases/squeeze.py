@@ -296,7 +296,7 @@ def closed_aslant(preset: Preset, repeat: int) -> list[Measurement]:
 def _aslant(preset: Preset, material: BodyMaterial, **settling: float) -> tuple[float, MoveStats]:
     body = Body(geometry=Box(size=(6e-3, 6e-3, 5e-3)), material=material)
     friction = {"lower": 0.4, "upper": 0.4}
-    world = make_world(Scene(body=body, preset=preset, friction=friction, settling=Settling(**settling)))  # type: ignore[arg-type]
+    world = make_world(Scene(body=body, preset=preset, friction=friction, settling=Settling(**settling)))
     truth = world.truth()
     assert truth is not None
     close(world, float(world.pose("upper").position[2]) - truth.height)

@@ -53,7 +53,7 @@ class VideoError:
         error, signal = (each.astype(np.int64) - other for each, other in ((decoded, picture), (picture, GREY)))
         contact = np.abs(signal) > CONTACT
         self._squares += [(error**2).sum(), (error[contact] ** 2).sum(), (signal[contact] ** 2).sum()]
-        self._counts += [error.size, contact.sum()]
+        self._counts += np.array([error.size, contact.sum()])
         self._most = max(self._most, int(np.abs(error).max()))
 
     def told(self) -> dict[str, float | int]:

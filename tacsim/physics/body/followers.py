@@ -87,7 +87,7 @@ def _fitted(light: np.ndarray, heavy: np.ndarray) -> tuple[np.ndarray, np.ndarra
     normal[:, 1:, 1:] += RIDGE * weights.sum(axis=1)[:, None, None] * np.eye(3)
     # the row of the inverse that gives the value at the node itself
     value = np.linalg.solve(normal, np.broadcast_to([[1.0], [0.0], [0.0], [0.0]], (len(nodes), 4, 1)))[:, :, 0]
-    shares = weights * (value @ basis.T)
+    shares: np.ndarray = weights * (value @ basis.T)
     row, column = np.nonzero(weights)
     follower = np.ravel_multi_index(tuple(nodes[row].T), light.shape)
     leader = np.ravel_multi_index(tuple((nodes[row] + offsets[column]).T), light.shape)

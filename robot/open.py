@@ -14,6 +14,7 @@ from robot.rig import RIG_ATTACHMENT as RIG_ATTACHMENT
 from robot.rig import CannotOpen as CannotOpen
 from tacsim.config import ConfigError, LoadedRig, load, load_rig
 from tacsim.config.errors import Place, Problem
+from tacsim.config.load import texts
 from tacsim.interface import RigSpec
 from tacsim.models.features import Features
 from tacsim.models.hardware import CameraSensorConfig
@@ -239,10 +240,8 @@ def _rigs_of_episodes(
     """The rig without a variant, then with each, and the variant in words."""
     found: list[tuple[RigConfig, str]] = []
     for more in ((), *variants):
-        if isinstance(more, str) or isinstance(overrides, str):
-            raise TypeError("overrides, and each of the variants, are lists of texts: ['scene.preset=draft']")
         try:
-            config = load_with_task(rig, task, [*overrides, *more]).config
+            config = load_with_task(rig, task, [*texts(overrides), *texts(more)]).config
         except ConfigError as error:
             if not more:
                 raise

@@ -131,10 +131,10 @@ def taichi() -> list[Check]:
 
 def kernel_cache(folder: Path) -> Check:
     """The folder of compiled kernels: without it every start compiles for tens of seconds."""
-    from tacsim.compute.runtime import ADVICE, is_writable
+    from tacsim.compute.runtime import TO_KEEP, is_writable
 
     if not is_writable(folder):
-        return Check("kernel cache", "warn", f"{folder} is not writable", ADVICE)
+        return Check("kernel cache", "warn", f"{folder} is not writable", TO_KEEP)
     size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
     return Check("kernel cache", "ok", f"{folder}, {size / 1e6:.1f} MB" + ("" if size else " (first run compiles)"))
 

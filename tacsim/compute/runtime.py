@@ -40,8 +40,8 @@ DEVICES = ("cpu", "cuda", "vulkan", "metal", "cpu-as-device")  # the last: what 
 DEVICE = os.environ.get("TACSIM_DEVICE") or "cpu"
 # Where compiled kernels are kept from one process to the next, if it can be written
 KERNELS = Path(os.environ.get("TI_OFFLINE_CACHE_FILE_PATH") or ti.lang.impl.default_cfg().offline_cache_file_path)
-
-ADVICE = "make it writable, or set TI_OFFLINE_CACHE_FILE_PATH to a folder that is; until then every start compiles"
+# What to do where it cannot
+TO_KEEP = "make it writable, or set TI_OFFLINE_CACHE_FILE_PATH to a folder that is; until then every start compiles"
 
 _running: int | None = None  # process
 _launch_lock = threading.RLock()  # held by the thread that starts Taichi, compiles or launches
@@ -78,7 +78,7 @@ def _initialise() -> None:
     if kept:
         _mend(KERNELS)
     else:
-        warnings.warn(f"compiled kernels cannot be kept: {KERNELS} is not writable; {ADVICE}", stacklevel=3)
+        warnings.warn(f"compiled kernels cannot be kept: {KERNELS} is not writable; {TO_KEEP}", stacklevel=3)
     # ti.init prints "Starting on arch=..." whatever it is told; a command's output (JSON, say) must stay its own.
     try:
         with contextlib.redirect_stdout(io.StringIO()):

@@ -53,7 +53,7 @@ def load_rig(rig: str | Path, *, task: str | TaskConfig | None = None, overrides
     root = _open(RigConfig, rig, state)
     if task is not None:
         root = apply(root, RigConfig, Override(("task",), _task(task)), state)
-    given = [parsed for text in _texts(overrides) if (parsed := parse_override(text, state)) is not None]
+    given = [parsed for text in texts(overrides) if (parsed := parse_override(text, state)) is not None]
     of_task = [override for override in given if override.path[0] == "task"]
     of_rest = [override for override in given if override.path[0] != "task"]
     for override in of_task:
@@ -190,16 +190,17 @@ def load_task(source: str | Path, overrides: Sequence[str] = ()) -> TaskConfig:
 def _load(annotation: Any, source: str | Path, overrides: Sequence[str]) -> Any:
     state = LoadState()
     root = _open(annotation, source, state)
-    for text in _texts(overrides):
+    for text in texts(overrides):
         override = parse_override(text, state)
         if override is not None:
             root = apply(root, annotation, override, state)
     return _validate(annotation, root, state)
 
 
-def _texts(overrides: Sequence[str]) -> Sequence[str]:
+def texts(overrides: Sequence[str]) -> Sequence[str]:
+    """The same. Raises TypeError for a single text, whose letters would be taken one by one."""
     if isinstance(overrides, str):
-        raise TypeError(f"overrides are a list of texts, [{overrides!r}]; a single text was given")
+        raise TypeError(f"overrides are lists of texts, [{overrides!r}]; a single text was given")
     return overrides
 
 

@@ -303,7 +303,7 @@ class FemWorld(BaseWorld):
     def _plan_flow(self, start: Sequence[Pose], end: Sequence[Pose]) -> Path:
         mach, gel = self.scene.flow_mach, self._gel
         path = plan_flow(start, end, self._rates.copy(), mach, self._scaled.step, max(gel.half), gel.thickness)
-        return replace(path, creeps=self.yields, growing=0.0 if self.scene.indenter is None else growth(start, end))
+        return replace(path, creeps=self.yields)
 
     @launching()  # around all of it: worlds of a batch share arrays, among them those that say which take part
     def _advance(self, launch: Launch) -> list[ForceReading]:

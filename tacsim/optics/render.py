@@ -33,7 +33,7 @@ from tacsim.optics.markers import check_fits, marker_transmission
 from tacsim.optics.shadows import shadow_colours
 from tacsim.optics.skin import lifted_skin
 from tacsim.optics.spline import line_matrices
-from tacsim.optics.surface import SurfaceTable, look_up
+from tacsim.optics.surface import SurfaceTable, look_up, spread, thinned
 
 Float32 = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -45,6 +45,8 @@ WHITE = np.float32(255.0)
 STEEPEST = 2.0  # largest slope in the table of light
 TABLE_POINTS = 256  # of that table, from slope 0 to STEEPEST
 BLUR_REACH = 2.5  # standard deviations that a camera's blur reaches: with OpenCV's 4 it is 0.01 grey levels another
+INTERPOLATED = 1.0 / 6.0  # mean of f (1 - f), the variance of linear interpolation at f between two values
+SAMPLED = 0.3  # a wider normal distribution keeps its variance to 5 % where it is sampled
 ASTRAY = 0.5  # [px] that a pixel put on the gel and back may be off
 LEAST_PIXELS = 128 * 128  # of a picture that is worth a table
 TABLE_ERROR = 0.5  # largest error of the table [grey levels]; narrower highlights are computed without it
@@ -104,9 +106,11 @@ class Renderer:
         import cv2
 
         table = SurfaceTable(surface)
-        seen = table.points(self._grid, fine=False)
-        light = self._light_of(table, *seen)
-        inked = self._inked(surface, table, seen[0])
+        # calibrated light is evaluated at the middles of blocks of pixels as large as the cells of the table
+        block = 1 if self._light is None or table.folded else table.points_a_cell(self._grid)
+        seen = table.points(thinned(self._grid, block), fine=False)
+        light = self._light_of(table, *seen, block)
+        inked = self._inked(surface, table, seen[0], block)
         del seen  # memory that is freed early is used again while it is warm
         image = np.empty((*self._grid.shape, 3), dtype=np.uint8)
 
@@ -120,9 +124,13 @@ class Renderer:
             cv2.addWeighted(lit, 1.0, unlit, 1.0, 0.0, image[strip], dtype=cv2.CV_8U)
         return image if self._view is None else np.asarray(cv2.remap(image, *self._view, cv2.INTER_LINEAR), np.uint8)
 
-    def _inked(self, surface: GelSurface, table: SurfaceTable, points: Float32) -> Callable[[slice], Float32] | None:
+    def _inked(
+        self, surface: GelSurface, table: SurfaceTable, points: Float32, block: int
+    ) -> Callable[[slice], Float32] | None:
         """Rows of an image -> (rows, W, 1 or 3) share of its light that each pixel keeps under dots and skin."""
         ink, dots = self._ink, None
+        if ink is not None or (self._markers is not None and table.folded):
+            points = spread(points, block, self._grid.shape)
         if self._markers is not None:
             at_rest = table.at_rest(points, self._grid) if table.folded else None
             dots = marker_transmission(surface, self._markers, self.model.geometry, at_rest)[..., None]
@@ -135,10 +143,10 @@ class Renderer:
 
         return kept
 
-    def _light_of(self, table: SurfaceTable, points: Float32, inside: Mask) -> Callable[[slice], Float32]:
+    def _light_of(self, table: SurfaceTable, points: Float32, inside: Mask, block: int) -> Callable[[slice], Float32]:
         """Rows of an image -> (rows, W, 3) what light adds to the image without it; 255 is white."""
         if self._light is not None:
-            return self._calibrated(self._light, table, points, inside)
+            return self._calibrated(self._light, table, points, inside, block).__getitem__
         if self.model.darkness is None:
             return self._shaded(table, points, inside)
         # at the points of the surface's table, of which there are fewer than pixels, as for calibrated slopes
@@ -160,31 +168,53 @@ class Renderer:
         return lambda rows: light_at(lights, slopes[rows])
 
     def _calibrated(
-        self, calibrated: PhotometricLight, table: SurfaceTable, points: Float32, inside: Mask
-    ) -> Callable[[slice], Float32]:
-        """Rows of an image -> (rows, W, 3) change of colour by the calibrated model, as its camera blurs it; 255 is
-        white.
+        self, calibrated: PhotometricLight, table: SurfaceTable, points: Float32, inside: Mask, block: int
+    ) -> Float32:
+        """(H, W, 3) change of colour by the calibrated model, as its camera blurs it; 255 is white.
 
-        Evaluated at the points of the surface's table, of which there are fewer than pixels, and linear between them:
-        at most half a grey level off, at the rim of a region of clipped slopes two and a half.
+        Evaluated at the `points` of the middles of blocks of `block` x `block` pixels, and linear between them: 0.03
+        grey levels off (rms), where a surface bends as sharply as a fine lattice can, up to one and a half.
         """
-        import cv2
-
         assert self.model.photometric is not None
-        part = table.part(self._grid)
-        place = self._grid.in_image(*(each[part] for each in table.place()))
-        fields, width = table.fields[part], np.float32(self._grid.columns * self._grid.pitch)
-        colours = np.zeros_like(table.fields)
-        colours[part], beyond = calibrated.change(fields[..., 1:], *place, fields[..., 0] / width)
-        if self.model.photometric.shadows is not None:
-            colours += shadow_colours(calibrated, self.model.photometric.shadows, table, self._grid)
-        self._beyond = beyond / place[0].size
-        change = table.at(colours, points, inside)
-        blur = self.model.photometric.blur
-        if blur > 0:
-            side = 2 * math.ceil(BLUR_REACH * blur) + 1
-            cv2.GaussianBlur(change, (side, side), blur, dst=change)
-        return change.__getitem__
+        grid, blur, shadows = self._grid, self.model.photometric.blur, self.model.photometric.shadows
+        fields, width = look_up(table.fields, points), np.float32(grid.columns * grid.pitch)
+        places = _places(grid, thinned(grid, block))
+        colours, beyond = calibrated.change(fields[..., 1:], *places, fields[..., 0] / width)
+        if shadows is not None:
+            colours += look_up(shadow_colours(calibrated, shadows, table, grid), points)
+        self._beyond = beyond / points[..., 0].size
+        change = spread(_blurred(colours, blur, block), block, grid.shape)
+        if not inside.all():
+            change[~table.on_gel(spread(points, block, grid.shape))] = 0.0
+        return change
+
+
+@lru_cache(maxsize=16)
+def _places(image: PixelGrid, grid: PixelGrid) -> tuple[Float32, Float32]:
+    """u and v (rows, columns) of the points of `grid` across an `image`, each from -1/2 to 1/2."""
+    u, v = image.in_image(grid.x.astype(np.float32), grid.y.astype(np.float32))
+    places = np.meshgrid(u, v)
+    for each in places:
+        each.flags.writeable = False
+    return places[0], places[1]
+
+
+def _blurred(colours: Float32, blur: float, block: int) -> Float32:
+    """Colours (rows, columns, 3) of blocks of `block` x `block` pixels, such that the picture they are spread to is
+    blurred by a normal distribution of standard deviation `blur` [px]."""
+    import cv2
+
+    # what is linear between values has the curvature of one that is blurred by this much [blocks^2]
+    variance = (blur / block) ** 2 - (INTERPOLATED if block > 1 else 0.0)
+    if variance > SAMPLED:
+        deviation = math.sqrt(variance)
+        side = 2 * math.ceil(BLUR_REACH * deviation) + 1
+        return np.asarray(cv2.GaussianBlur(colours, (side, side), deviation), dtype=np.float32)
+    if variance == 0.0:
+        return colours
+    # a normal distribution as narrow as this has another variance where it is sampled; below 0, it sharpens
+    weights = np.array([variance / 2, 1.0 - variance, variance / 2], dtype=np.float32)
+    return np.asarray(cv2.sepFilter2D(colours, -1, weights, weights), dtype=np.float32)
 
 
 def _look_ups(view: GelView) -> tuple[NDArray[np.int16], NDArray[np.uint16]]:

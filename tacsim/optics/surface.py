@@ -86,19 +86,6 @@ class SurfaceTable:
         along_x, _ = refined(values, points)
         return refined(np.ascontiguousarray(along_x.T), points)[0][..., None]
 
-    def part(self, grid: PixelGrid) -> tuple[slice, slice]:
-        """Rows and columns of the table in which all lies that is seen at the points of `grid`; at least one."""
-        # sideways motion, a neighbour to be linear to, and one to spare, as points are found to a part of one
-        reach = 2.0 + max(float(self._lateral.max()), -float(self._lateral.min()))
-
-        def along(first: float, number: int, points: int) -> slice:
-            start, stop = first / self.pitch - reach, (first + (number - 1) * grid.pitch) / self.pitch + reach
-            start, stop = (min(max(0, int(end)), points - 1) for end in (start, stop))
-            return slice(start, stop + 1)
-
-        (rows, columns), (origin_x, origin_y) = self.fields.shape[:2], self._surface.origin
-        return along(grid.y0 - origin_y, grid.rows, rows), along(grid.x0 - origin_x, grid.columns, columns)
-
     def place(self) -> tuple[Float32, Float32]:
         """x and y (rows, columns) where each point is seen [m]."""
         (rows, columns), pitch = self.fields.shape[:2], np.float32(self.pitch)
@@ -145,14 +132,16 @@ class SurfaceTable:
         # Where the grid is finer than the table, points are found on a coarser one, twice as fine as the table or, not
         # `fine`, just as fine, and are linear between those: the surface's sideways motion is smooth. The first errs
         # less than the look-up rounds, the second about as much.
-        block = max(1, int(self.pitch / (grid.pitch * (2 if fine else 1))))  # points a coarse one, along a side
-        points = self._material_points(grid if block == 1 else _coarse(grid, block))
-        if block > 1:
-            points = _fine(points, block, grid.shape)
+        block = max(1, self.points_a_cell(grid) // (2 if fine else 1))  # points a coarse one, along a side
+        points = spread(self._material_points(thinned(grid, block)), block, grid.shape)
         # where no sheet folds over, what lies within a border that is on the gel is on it, too
         border = np.concatenate([points[0], points[-1], points[:, 0], points[:, -1]])
-        on_gel = self._on_gel(border[None]).all()
-        return points, np.ones(grid.shape, dtype=np.bool_) if on_gel else self._on_gel(points)
+        on_gel = self.on_gel(border[None]).all()
+        return points, np.ones(grid.shape, dtype=np.bool_) if on_gel else self.on_gel(points)
+
+    def points_a_cell(self, grid: PixelGrid) -> int:
+        """Whole points of `grid` that lie along a side of one cell of the table; at least 1."""
+        return max(1, int(self.pitch / grid.pitch * (1 + 1e-6)))
 
     def at_rest(self, points: Float32, grid: PixelGrid) -> Float32:
         """(H, W, 2) column, row in `grid` of where `points` of :meth:`points` lie on the untouched gel."""
@@ -179,7 +168,7 @@ class SurfaceTable:
         points[restless] = (exact - self._surface.origin) / self.pitch
         return points
 
-    def _on_gel(self, points: Float32) -> NDArray[np.bool_]:
+    def on_gel(self, points: Float32) -> NDArray[np.bool_]:
         """(rows, columns) where material points [table points] lie on the table."""
         import cv2
 
@@ -293,19 +282,24 @@ def _table_coordinates(origin: tuple[float, float], pitch: float, grid: PixelGri
     return coordinates
 
 
-def _coarse(grid: PixelGrid, block: int) -> PixelGrid:
-    """The middles of blocks of `block` x `block` points, and one more block on each side."""
+def thinned(grid: PixelGrid, block: int) -> PixelGrid:
+    """The middles of blocks of `block` x `block` points, and one more block on each side; of 1, the grid itself."""
+    if block == 1:
+        return grid
     rows, columns = (-(-n // block) + 2 for n in grid.shape)
     shift = grid.pitch * (-(block + 1) / 2)  # from the first point to the middle of the block before it
     return PixelGrid(rows, columns, grid.pitch * block, grid.x0 + shift, grid.y0 + shift)
 
 
-def _fine(coarse: Float32, block: int, shape: tuple[int, int]) -> Float32:
-    """(rows, columns, 2) `coarse` values at the points of the grid of `shape` that :func:`_coarse` thinned out."""
+def spread(values: Float32, block: int, shape: tuple[int, int]) -> Float32:
+    """(rows, columns, n <= 4) at the points of the grid of `shape`, linear between `values` at those that
+    :func:`thinned` left of it."""
     import cv2
 
-    rows, columns = coarse.shape[:2]
-    fine = cv2.resize(coarse, (columns * block, rows * block), interpolation=cv2.INTER_LINEAR)
+    if block == 1:
+        return values
+    rows, columns = values.shape[:2]
+    fine = cv2.resize(values, (columns * block, rows * block), interpolation=cv2.INTER_LINEAR)
     return np.asarray(fine[block : block + shape[0], block : block + shape[1]], dtype=np.float32)
 
 

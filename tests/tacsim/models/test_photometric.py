@@ -1,5 +1,8 @@
+from pathlib import Path
+
 import numpy as np
 import pytest
+from PIL import Image
 from pydantic import ValidationError
 from scipy.ndimage import gaussian_filter
 
@@ -14,10 +17,10 @@ from tacsim.models.photometric import (
     places_in_image,
     term_count,
 )
-from tacsim.models.sensor import Lighting, SensorGeometry, SensorModel
+from tacsim.models.sensor import Lighting, Markers, SensorGeometry, SensorModel
 from tacsim.optics.grid import image_grid
 from tacsim.optics.render import Renderer
-from tacsim.optics.surface import sample_surface
+from tacsim.optics.surface import SurfaceTable, sample_surface
 from tests.tacsim.optics.surfaces import dent, flat, make_surface
 
 GEL = (20e-3, 20e-3)
@@ -85,9 +88,13 @@ def test_the_renderer_uses_it_in_place_of_the_lights() -> None:
     assert phong.beyond == 0.0
 
 
-@pytest.mark.parametrize(("width", "spacing"), [(640, 1e-3), (640, 0.5e-3), (320, 0.5e-3), (160, 0.5e-3)])
-def test_light_is_within_half_a_grey_level_of_the_formula(width: int, spacing: float) -> None:
-    """Of the polynomial written out term by term at every pixel in double precision, then blurred."""
+@pytest.mark.parametrize(
+    ("width", "spacing", "allowed"),
+    [(640, 1e-3, 0.6), (640, 0.5e-3, 1.7), (320, 0.5e-3, 0.8), (160, 0.5e-3, 0.03)],
+)
+def test_light_is_that_of_the_formula(width: int, spacing: float, allowed: float) -> None:
+    """Of the polynomial written out term by term at every pixel in double precision, then blurred. `allowed` [grey
+    levels], at worst: where the surface bends between the middles of blocks of pixels."""
     rows, blur = 3 * width // 4, 0.8
     geometry = SensorGeometry(width=width, height=rows, pixel_pitch=20e-3 / width)
     rng = np.random.default_rng(5)
@@ -114,8 +121,39 @@ def test_light_is_within_half_a_grey_level_of_the_formula(width: int, spacing: f
     error = np.abs(render(surface) - wanted)
     assert render.beyond == 0.0
     assert np.abs(wanted - untouched).max() > 30.0
-    assert error.max() < 0.5 + 0.5  # and half a level by rounding to whole ones
-    assert error.mean() < 0.26  # which alone gives 0.25 where the light varies
+    assert error.max() < 0.5 + allowed  # and half a level by rounding to whole ones
+    assert error.mean() < 0.21  # by rounding alone it is 0.205: beside the contact the light does not vary
+    assert (error > 1.0).mean() < 1.5e-3
+
+
+@pytest.mark.parametrize("size", [(20e-3, 20e-3), (11.5e-3, 9e-3)], ids=["gel wider", "picture wider"])
+@pytest.mark.parametrize("blur", [0.0, 0.8, 6.0])
+def test_blocks_of_pixels_show_what_pixels_show(
+    size: tuple[float, float], blur: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With dots and skin, and where the gel ends within the picture."""
+
+    def pressed_and_slid(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        near = np.exp(-((x - 1e-3) ** 2 + (y + 1e-3) ** 2) / 3e-3**2)
+        return 0.3e-3 * near, -0.2e-3 * near, -0.5e-3 * near
+
+    picture = np.random.default_rng(2).integers(90, 130, (480, 640, 3)).astype(np.uint8)
+    Image.fromarray(picture).save(tmp_path / "background.png")
+    sensor = SensorModel(
+        geometry=SensorGeometry(width=640, height=480, pixel_pitch=14e-3 / 640),
+        lighting=Lighting(background=str(tmp_path / "background.png")),
+        photometric=model(3, 2, steepest=1.0, blur=blur),
+        markers=Markers(rows=4, columns=4, pitch=2e-3, radius=0.3e-3),
+        skin=0.5,
+        texture=0.0,
+    )
+    render, surface = Renderer(sensor, size), make_surface(pressed_and_slid, size)
+    blocks = render(surface).astype(float)
+    monkeypatch.setattr(SurfaceTable, "points_a_cell", lambda self, grid: 1)
+    pixels = render(surface).astype(float)
+    assert np.abs(pixels - picture).max() > 30
+    off = np.abs(blocks - pixels)
+    assert off.mean() < 0.03 and (off > 1.0).sum() < 10  # the skin's grain is looked up to a 32nd of a pixel
 
 
 def test_texture_shows_as_on_the_flat_gel() -> None:

@@ -42,6 +42,7 @@ BEYOND = 3e-3  # and ends so far beyond where the ball should be [m]
 MOST_LEFT_OUT = 0.5  # of the touches; with more, something is wrong with the set-up
 FRESH = 0.02  # a picture of the approach is exposed at least so long after the last step [s]
 STEP_TIMEOUT = 5.0  # of one step of the approach [s]
+STILL_TOUCHED = 0.5  # of the depth of a touch; what is lifted and pressed so deep yet is not free
 FAILURES = (NoTouch, BadMeasurements, ActionError, OutsideLimits)  # what spoils one touch, and no more
 
 
@@ -77,7 +78,9 @@ def schedule(plan: BallTouchPlan) -> list[tuple[Rotation, FloatArray]]:
     for index in range(1, plan.touches):
         share = index / max(1, plan.touches - 1)
         tilt, radius = plan.tilt * math.sqrt(share), plan.spread * math.sqrt((index * GOLDEN_RATIO) % 1.0)
-        direction, at = index * GOLDEN_ANGLE, index * GOLDEN_ANGLE * 1.7 + 1.0
+        # Places go round twice as fast as tilts: told apart so, 6 to 12 touches find the place of the sensor 1.5 to 4
+        # times as exactly as at 1.7 times as fast, and 24 a tenth more so.
+        direction, at = index * GOLDEN_ANGLE, index * GOLDEN_ANGLE * 2.0
         axis = np.array([math.cos(direction), math.sin(direction), 0.0])
         touches.append((Rotation.from_rotvec(tilt * axis), radius * np.array([math.cos(at), math.sin(at)])))
     return touches
@@ -137,7 +140,12 @@ class _BallProber:
         raised leaves the arm as it is, for a person to look at."""
         move_to(self._arm, self._name, lifted)
         try:
-            self._observe(SETTLE)
+            left = self._depth(self._observe(SETTLE))
+            if left > STILL_TOUCHED * self._plan.depth:
+                raise BadMeasurements(
+                    f"lifted off the ball, the gel is still pressed by {1e3 * left:.2f} mm, so its picture is no "
+                    "reference: does something stick to it, did the light change, is the camera late?"
+                )
             self._rig.normalisers[self._sensor].take_reference(self._rig.frames[self._sensor])
             move_to(self._arm, self._name, begin)
             touch = self._approach(begin, travel)
@@ -152,9 +160,7 @@ class _BallProber:
         Raises NoTouch, BadMeasurements."""
 
         def touches() -> bool:
-            seen = self._observe(FRESH)
-            assert seen.height is not None
-            return float(seen.height.max(where=seen.valid, initial=0.0)) >= self._plan.depth
+            return self._depth(self._observe(FRESH)) >= self._plan.depth
 
         def advance(distance: float) -> None:
             due = time.monotonic() + self._plan.step / self._speed
@@ -170,6 +176,12 @@ class _BallProber:
         assert seen.height is not None
         contact, depth = locate_ball(seen.height.astype(np.float64), seen.valid, self._pitch, self._plan.ball_radius)
         return contact, depth, self._arm.state().pose
+
+    @staticmethod
+    def _depth(seen: TactileObservation) -> float:
+        """How deep the gel is pressed at most [m]."""
+        assert seen.height is not None
+        return float(seen.height.max(where=seen.valid, initial=0.0))
 
     def _observe(self, wait: float) -> TactileObservation:
         """What is seen in a picture exposed at least `wait` [s] from now."""

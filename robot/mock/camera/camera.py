@@ -97,7 +97,7 @@ class MockCamera(Child):
         return int(self._ask("push", picture=image))
 
     def stall(self, on: bool) -> None:
-        """No frame comes, connections stay."""
+        """No frame comes, connections stay; what was exposed and not yet sent is lost."""
         self._ask("stall", bool(on))
 
     def drop(self, probability: float) -> None:

@@ -67,6 +67,9 @@ class FrameSource:
             raise ValueError(f"no command '{name}'")
         with self._changed:
             self._faults = replace(self._faults, **{name: value})
+            if self._faults.stall:
+                self.counts["dropped"] += len(self._delayed)
+                self._delayed.clear()
             self._changed.notify_all()
 
     def state(self) -> dict[str, Any]:
@@ -116,7 +119,8 @@ class FrameSource:
                 number = self.counts["frames"]
             jpeg = self._expose(picture, stamp.Stamp(number, image, time.monotonic_ns() // 1000), faults)
             with self._changed:
-                if faults.drop > 0.0 and self._random.random() < faults.drop:
+                # one that was under way when a stall began would come after it, as if it were of then
+                if self._faults.stall or (faults.drop > 0.0 and self._random.random() < faults.drop):
                     self.counts["dropped"] += 1
                     continue
                 self._delayed.append((now + faults.delay, number, jpeg))
@@ -124,12 +128,12 @@ class FrameSource:
     def _until(self, tick: float, now: float) -> float | None:
         """How long there is nothing to do [s]; None: until `_changed` is notified."""
         due = [] if self._faults.stall else [tick]
-        if self._delayed and not self._faults.stall:
+        if self._delayed:
             due.append(self._delayed[0][0])
         return max(0.0, min(due) - now) if due else None
 
     def _send_delayed(self, now: float) -> None:
-        while self._delayed and self._delayed[0][0] <= now and not self._faults.stall:
+        while self._delayed and self._delayed[0][0] <= now:
             _, number, jpeg = self._delayed.popleft()
             if number > self._number:  # a shorter delay lets later frames pass
                 self._number, self._newest = number, (self._newest[0] + 1, jpeg)

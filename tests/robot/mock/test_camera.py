@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from PIL import Image
 
 from robot.errors import DeviceError, DeviceNotConnectedError
 from robot.mock.camera.camera import MockCamera
+from robot.mock.camera.stream import FrameSource
 from tests.robot.mock.camera_client import HOST, Client, get
 from tests.robot.waiting import alive, until
 
@@ -135,6 +137,44 @@ def test_an_unstamped_camera_has_noise_as_a_real_one() -> None:
             client.jpeg()
             one, two = (np.array(Image.open(io.BytesIO(client.jpeg()))).astype(int) for _ in range(2))
     assert (one != two).mean() > 0.1 and np.abs(one - 77).max() < 12
+
+
+def test_after_a_stall_nothing_comes_that_was_exposed_before_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither what waits for its delay nor what is just being encoded: without stamps it would count as of now."""
+    source = FrameSource(32, 24, fps=0.5, quality=90, stamped=False, noise=0)
+    exposing, goes_on = threading.Event(), threading.Event()
+    encode = source._encode
+
+    def slowly(picture: np.ndarray | None, *rest: Any) -> bytes:
+        jpeg = encode(picture, *rest)
+        if picture is not None and picture.max() == 0:
+            exposing.set()
+            assert goes_on.wait(10.0)
+        return jpeg
+
+    monkeypatch.setattr(source, "_encode", slowly)
+    thread = threading.Thread(target=source.run)
+    thread.start()
+    try:
+        sent = source.newest[0]
+        source.set_fault("delay", 0.05)
+        source.push(np.zeros((24, 32, 3), np.uint8))
+        assert exposing.wait(10.0)
+        source.set_fault("stall", True)
+        goes_on.set()
+        source.push(np.full((24, 32, 3), 200, np.uint8))
+        time.sleep(0.1)
+        assert source.newest[0] - sent <= 1  # the camera's own first frame
+        source.set_fault("stall", False)
+        seen = source.newest
+        while seen == source.newest:
+            time.sleep(1e-3)
+        assert np.asarray(Image.open(io.BytesIO(source.newest[1]))).mean() == pytest.approx(200, abs=2)
+        assert source.counts["dropped"] >= 1
+    finally:
+        goes_on.set()
+        source.close()
+        thread.join()
 
 
 def test_resize_and_brightness(camera: MockCamera) -> None:

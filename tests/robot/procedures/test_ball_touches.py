@@ -10,6 +10,7 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from importlib.util import find_spec
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,13 +19,16 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from calibration.poses.records import read_touches, touch_file, write_record
+from calibration.poses.robust_fit import BadMeasurements
 from robot.errors import DeviceError
 from robot.mock import MockCamera
 from robot.mock.fixtures import mock_host
+from robot.procedures import ball_touches
 from robot.procedures.ball_touches import BallTouchPlan, schedule, without_task
 from robot.procedures.session import CannotCalibrate, Session
 from tacsim import pose as se3
 from tacsim.config import ConfigError, load_rig
+from tacsim.control.approach import NoTouch
 from tacsim.interface import Pose
 from tacsim.models.hardware import Placement
 from tacsim.models.sensor import SensorModel
@@ -192,6 +196,29 @@ def test_a_real_arm_moves_only_after_a_persons_word(tmp_path: Path) -> None:
     done = tacsim(*words, *calibrated, "--out", tmp_path / "out")
     assert done.exit_code == 2
     assert "nobody confirmed (at a terminal); nothing was moved" in done.stderr
+
+
+@pytest.mark.parametrize(("left", "taken"), [(0.1e-3, True), (0.25e-3, False)])
+def test_what_still_shows_a_contact_is_no_reference(left: float, taken: bool) -> None:
+    """A picture that came late, or what sticks to the gel, would shift the next contact by a twentieth of a mm."""
+    here, references = [Pose()], []
+    seen = SimpleNamespace(height=np.array([[0.0, left], [0.0, 9.0]]), valid=np.array([[True, True], [True, False]]))
+    arm = SimpleNamespace(
+        command=lambda target: here.append(target) or target,
+        state=lambda: SimpleNamespace(pose=here[-1], twist=np.zeros(6)),
+    )
+    rig: Any = SimpleNamespace(
+        arms={"upper": arm},
+        sensors={"gel": SimpleNamespace(read=lambda timeout: SimpleNamespace(time=np.inf))},
+        normalisers={"gel": SimpleNamespace(take_reference=references.append)},
+        frames={"gel": "the picture"},
+        observe=lambda: SimpleNamespace(tactile={"gel": seen}),
+    )
+    plan = BallTouchPlan(ball_radius=BALL_RADIUS, depth=0.4e-3, step=0.1e-3)
+    prober = ball_touches._BallProber(rig, load_rig("ur5e").config, "upper", "gel", plan)
+    with pytest.raises(NoTouch if taken else BadMeasurements, match="no touch" if taken else "pressed by 0.25 mm"):
+        prober.touch(Pose(), Pose(), 0.2e-3)
+    assert references == (["the picture"] if taken else [])
 
 
 @pytest.mark.deep

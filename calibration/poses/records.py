@@ -7,6 +7,7 @@ that was cut off is recognised wherever the cut is.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
@@ -112,7 +113,10 @@ def write_record(path: Path, record: TouchFile | BoardPoseFile) -> Path:
         else:
             lines.append(yaml.safe_dump({key: value}))
     new = path.with_name(path.name + ".new")  # the old one stays whole until the new one is
-    new.write_text("".join(lines), encoding="utf-8")
+    with new.open("w", encoding="utf-8") as file:
+        file.write("".join(lines))
+        file.flush()
+        os.fsync(file.fileno())
     new.replace(path)
     return path
 

@@ -106,8 +106,9 @@ class Renderer:
         import cv2
 
         table = SurfaceTable(surface)
-        # calibrated light is evaluated at the middles of blocks of pixels as large as the cells of the table
-        block = 1 if self._light is None or table.folded else table.points_a_cell(self._grid)
+        # Calibrated light is looked up at the middles of blocks of pixels, two for each cell of the table along a side:
+        # its kinks lie at the table's points, and blocks as large as cells were up to 6 grey levels off beside them
+        block = 1 if self._light is None or table.folded else max(1, table.points_a_cell(self._grid) // 2)
         seen = table.points(thinned(self._grid, block), fine=False)
         light = self._light_of(table, *seen, block)
         inked = self._inked(surface, table, seen[0], block)
@@ -172,31 +173,24 @@ class Renderer:
     ) -> Float32:
         """(H, W, 3) change of colour by the calibrated model, as its camera blurs it; 255 is white.
 
-        Evaluated at the `points` of the middles of blocks of `block` x `block` pixels, and linear between them: 0.03
-        grey levels off (rms), where a surface bends as sharply as a fine lattice can, up to one and a half.
+        Evaluated at the points of the surface's table, of which there are fewer than pixels, and linear between them,
+        as between its values at `points`, the middles of blocks of `block` x `block` pixels: 0.03 grey levels off
+        (rms), where a surface bends most, one.
         """
         assert self.model.photometric is not None
         grid, blur, shadows = self._grid, self.model.photometric.blur, self.model.photometric.shadows
-        fields, width = look_up(table.fields, points), np.float32(grid.columns * grid.pitch)
-        places = _places(grid, thinned(grid, block))
-        colours, beyond = calibrated.change(fields[..., 1:], *places, fields[..., 0] / width)
+        part = table.part(grid)
+        place = grid.in_image(*(each[part] for each in table.place()))
+        fields, width = table.fields[part], np.float32(grid.columns * grid.pitch)
+        colours = np.zeros_like(table.fields)
+        colours[part], beyond = calibrated.change(fields[..., 1:], *place, fields[..., 0] / width)
         if shadows is not None:
-            colours += look_up(shadow_colours(calibrated, shadows, table, grid), points)
-        self._beyond = beyond / points[..., 0].size
-        change = spread(_blurred(colours, blur, block), block, grid.shape)
+            colours += shadow_colours(calibrated, shadows, table, grid)
+        self._beyond = beyond / place[0].size
+        change = spread(_blurred(look_up(colours, points), blur, block), block, grid.shape)
         if not inside.all():
             change[~table.on_gel(spread(points, block, grid.shape))] = 0.0
         return change
-
-
-@lru_cache(maxsize=16)
-def _places(image: PixelGrid, grid: PixelGrid) -> tuple[Float32, Float32]:
-    """u and v (rows, columns) of the points of `grid` across an `image`, each from -1/2 to 1/2."""
-    u, v = image.in_image(grid.x.astype(np.float32), grid.y.astype(np.float32))
-    places = np.meshgrid(u, v)
-    for each in places:
-        each.flags.writeable = False
-    return places[0], places[1]
 
 
 def _blurred(colours: Float32, blur: float, block: int) -> Float32:

@@ -86,6 +86,19 @@ class SurfaceTable:
         along_x, _ = refined(values, points)
         return refined(np.ascontiguousarray(along_x.T), points)[0][..., None]
 
+    def part(self, grid: PixelGrid) -> tuple[slice, slice]:
+        """Rows and columns of the table in which all lies that is seen at the points of `grid`; at least one."""
+        # sideways motion, a neighbour to be linear to, and one to spare, as points are found to a part of one
+        reach = 2.0 + max(float(self._lateral.max()), -float(self._lateral.min()))
+
+        def along(first: float, number: int, points: int) -> slice:
+            start, stop = first / self.pitch - reach, (first + (number - 1) * grid.pitch) / self.pitch + reach
+            start, stop = (min(max(0, int(end)), points - 1) for end in (start, stop))
+            return slice(start, stop + 1)
+
+        (rows, columns), (origin_x, origin_y) = self.fields.shape[:2], self._surface.origin
+        return along(grid.y0 - origin_y, grid.rows, rows), along(grid.x0 - origin_x, grid.columns, columns)
+
     def place(self) -> tuple[Float32, Float32]:
         """x and y (rows, columns) where each point is seen [m]."""
         (rows, columns), pitch = self.fields.shape[:2], np.float32(self.pitch)

@@ -90,7 +90,7 @@ def test_the_renderer_uses_it_in_place_of_the_lights() -> None:
 
 @pytest.mark.parametrize(
     ("width", "spacing", "allowed"),
-    [(640, 1e-3, 0.6), (640, 0.5e-3, 1.7), (320, 0.5e-3, 0.8), (160, 0.5e-3, 0.03)],
+    [(640, 1e-3, 0.5), (640, 0.5e-3, 0.5), (320, 0.5e-3, 0.5), (160, 0.5e-3, 0.5)],
 )
 def test_light_is_that_of_the_formula(width: int, spacing: float, allowed: float) -> None:
     """Of the polynomial written out term by term at every pixel in double precision, then blurred. `allowed` [grey

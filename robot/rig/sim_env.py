@@ -75,7 +75,7 @@ def _env(
         encoder=encoder,
         variants=variants,
         stage=simulation.stage,
-        wear=simulation.wear,
+        wear=lambda worn: simulation.wear(config if worn is None else worn),
     )
 
 

@@ -90,7 +90,7 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
         encoder: FeatureEncoder | None = None,
         variants: Sequence[Variant] = (),
         stage: Stage | None = None,
-        wear: Callable[[RigConfig], None] = lambda config: None,
+        wear: Callable[[RigConfig | None], None] = lambda config: None,
     ) -> None:
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
@@ -101,6 +101,7 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
         self.rig, self.task, self.render_mode = rig, task, render_mode
         self._variants, self._stage, self._wear = tuple(variants), stage, wear
         self._played: int | None = None  # the variant
+        self._worn: RigConfig | None = None  # of which sensors and arms are now; None: of the environment's rig
         self.next_variant: int | None = None  # that the next reset plays, if it can begin; None: a drawn one
         self.refused: list[str] = []  # draws that could not begin, and why, of all resets
         if space is None:
@@ -175,7 +176,7 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
         unknown = sorted(set(options) - {"variant", "task", "scene"})
         if unknown:
             raise ValueError(f"reset knows the options variant, task and scene, got {unknown}")
-        chosen, played = options, None
+        chosen, played, worn = options, None, None
         if self._variants and not {"task", "scene"} & set(options):
             number, self.next_variant = options.get("variant", self.next_variant), None
             played = int(self.np_random.integers(len(self._variants))) if number is None else number
@@ -183,8 +184,6 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
                 raise ValueError(f"this environment has variants 0 to {len(self._variants) - 1}, got {number}")
             chosen = {"task": self._variants[played].task, "scene": self._variants[played].scene}
             worn = self._variants[played].rig
-            if worn is not None and played != self._played:
-                self._wear(worn)
         elif "variant" in options:
             raise ValueError("options: give a variant (of an environment that has some), or a task and a scene")
         for name, kind in (("task", TaskConfig), ("scene", Scene)):
@@ -192,6 +191,9 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
                 raise ValueError(f"options: the {name} is a tacsim {kind.__name__}, got {chosen[name]!r}")
         if "task" in chosen:
             require_alike(self.task.config, chosen["task"])
+        if worn is not self._worn:
+            self._wear(worn)
+            self._worn = worn
         if "scene" in chosen:
             if self._stage is None:
                 raise ValueError(f"rig '{self.rig.name}' has but one scene; make its environment by robot.make_env")
@@ -268,6 +270,7 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
             reward, info = self._judged()
             flat = {key: value.copy() for key, value in self._flat.items()}
             info |= {"limit" if exceeded else "diverged": str(self._failure)}
+            info["is_success"] = info["is_success"] and not exceeded
             self._done = flat, self._for_all_left(reward) if exceeded else reward, exceeded, not exceeded, info
             return
         self._targets |= {name: pose for name, pose in self._sent.items() if pose is not None}
@@ -330,6 +333,8 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
         are padded with black below."""
         if self.render_mode is None:
             return None
+        if not self.rig.frames:
+            raise ResetNeeded("call reset() before render(): nothing was seen yet")
         images = [frame.image for frame in self.rig.frames.values()]
         rows = max(image.shape[0] for image in images)
         padded = [np.pad(image, ((0, rows - image.shape[0]), (0, 0), (0, 0))) for image in images]

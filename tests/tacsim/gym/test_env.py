@@ -156,15 +156,17 @@ def test_too_much_force_fails_the_task_and_no_end_is_better_than_going_on(open_s
 def test_a_limit_that_is_exceeded_ends_the_episode_and_says_which(open_springs: Any) -> None:
     box = "workspace: {lower: [-1 m, -1 m, -1 m], upper: [1 m, 1 m, 1 m]}"
     rig = open_springs("squeeze", f"arms.upper.limits={{{box}, force: 1 N}}")
-    env = TacsimEnv(rig, make_task(SqueezeConfig(kind="squeeze", steps=100)))
+    env = TacsimEnv(rig, make_task(SqueezeConfig(kind="squeeze", steps=100, success=5e-3)))
     env.reset(seed=0)
     for _ in range(60):
         _, reward, terminated, truncated, info = env.step(np.array([1.0, -1.0], np.float32))
         if terminated:
             break
+        assert info["is_success"] is True
     assert terminated
     assert not truncated
     assert "limits.force" in info["limit"]
+    assert info["is_success"] is False  # wherever it ended
     assert np.isfinite(reward)
     with pytest.raises(ResetNeeded):
         env.step(STILL)

@@ -217,6 +217,19 @@ def test_variants_are_drawn_by_the_seed_or_chosen() -> None:
     env.close()
 
 
+def test_a_scene_that_is_given_is_seen_by_the_environments_own_sensors() -> None:
+    """Whatever the variant before it looked like."""
+    env = make(variants=[["sensors.lower.model.texture=20 um"]])
+    given = {"scene": env.scene, "task": env.task.config}
+    own, _ = env.reset(seed=3, options=given)
+    other, _ = env.reset(seed=3, options={"variant": 0})
+    again, _ = env.reset(seed=3, options=given)
+    assert not np.array_equal(other["tactile_lower"], own["tactile_lower"])
+    for key, value in own.items():
+        np.testing.assert_array_equal(again[key], value)
+    env.close()
+
+
 def test_a_reset_with_a_new_body_and_goal() -> None:
     env = make(variants=())
     _, before = env.reset(seed=0)

@@ -78,8 +78,7 @@ def schedule(plan: BallTouchPlan) -> list[tuple[Rotation, FloatArray]]:
     for index in range(1, plan.touches):
         share = index / max(1, plan.touches - 1)
         tilt, radius = plan.tilt * math.sqrt(share), plan.spread * math.sqrt((index * GOLDEN_RATIO) % 1.0)
-        # Places go round twice as fast as tilts: told apart so, 6 to 12 touches find the place of the sensor 1.5 to 4
-        # times as exactly as at 1.7 times as fast, and 24 a tenth more so.
+        # twice as fast as tilts: even six touches then tell apart how the sensor is turned and where it sits
         direction, at = index * GOLDEN_ANGLE, index * GOLDEN_ANGLE * 2.0
         axis = np.array([math.cos(direction), math.sin(direction), 0.0])
         touches.append((Rotation.from_rotvec(tilt * axis), radius * np.array([math.cos(at), math.sin(at)])))

@@ -149,8 +149,8 @@ class SurfaceTable:
         points = spread(self._material_points(thinned(grid, block)), block, grid.shape)
         # where no sheet folds over, what lies within a border that is on the gel is on it, too
         border = np.concatenate([points[0], points[-1], points[:, 0], points[:, -1]])
-        on_gel = self.on_gel(border[None]).all()
-        return points, np.ones(grid.shape, dtype=np.bool_) if on_gel else self.on_gel(points)
+        on_gel = self._on_gel(border[None]).all()
+        return points, np.ones(grid.shape, dtype=np.bool_) if on_gel else self._on_gel(points)
 
     def points_a_cell(self, grid: PixelGrid) -> int:
         """Whole points of `grid` that lie along a side of one cell of the table; at least 1."""
@@ -181,7 +181,7 @@ class SurfaceTable:
         points[restless] = (exact - self._surface.origin) / self.pitch
         return points
 
-    def on_gel(self, points: Float32) -> NDArray[np.bool_]:
+    def _on_gel(self, points: Float32) -> NDArray[np.bool_]:
         """(rows, columns) where material points [table points] lie on the table."""
         import cv2
 

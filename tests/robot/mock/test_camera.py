@@ -167,8 +167,7 @@ def test_after_a_stall_nothing_comes_that_was_exposed_before_it(monkeypatch: pyt
         assert source.newest[0] - sent <= 1  # the camera's own first frame
         source.set_fault("stall", False)
         seen = source.newest
-        while seen == source.newest:
-            time.sleep(1e-3)
+        until(lambda: source.newest != seen, "a frame after the stall")
         assert np.asarray(Image.open(io.BytesIO(source.newest[1]))).mean() == pytest.approx(200, abs=2)
         assert source.counts["dropped"] >= 1
     finally:

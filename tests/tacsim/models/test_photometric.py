@@ -88,13 +88,9 @@ def test_the_renderer_uses_it_in_place_of_the_lights() -> None:
     assert phong.beyond == 0.0
 
 
-@pytest.mark.parametrize(
-    ("width", "spacing", "allowed"),
-    [(640, 1e-3, 0.5), (640, 0.5e-3, 0.5), (320, 0.5e-3, 0.5), (160, 0.5e-3, 0.5)],
-)
-def test_light_is_that_of_the_formula(width: int, spacing: float, allowed: float) -> None:
-    """Of the polynomial written out term by term at every pixel in double precision, then blurred. `allowed` [grey
-    levels], at worst: where the surface bends between the middles of blocks of pixels."""
+@pytest.mark.parametrize(("width", "spacing"), [(640, 1e-3), (640, 0.5e-3), (320, 0.5e-3), (160, 0.5e-3)])
+def test_light_is_within_half_a_grey_level_of_the_formula(width: int, spacing: float) -> None:
+    """Of the polynomial written out term by term at every pixel in double precision, then blurred."""
     rows, blur = 3 * width // 4, 0.8
     geometry = SensorGeometry(width=width, height=rows, pixel_pitch=20e-3 / width)
     rng = np.random.default_rng(5)
@@ -121,9 +117,8 @@ def test_light_is_that_of_the_formula(width: int, spacing: float, allowed: float
     error = np.abs(render(surface) - wanted)
     assert render.beyond == 0.0
     assert np.abs(wanted - untouched).max() > 30.0
-    assert error.max() < 0.5 + allowed  # and half a level by rounding to whole ones
+    assert error.max() < 0.5 + 0.5  # and half a level by rounding to whole ones
     assert error.mean() < 0.21  # by rounding alone it is 0.205: beside the contact the light does not vary
-    assert (error > 1.0).mean() < 1.5e-3
 
 
 @pytest.mark.parametrize("size", [(20e-3, 20e-3), (11.5e-3, 9e-3)], ids=["gel wider", "picture wider"])

@@ -98,7 +98,8 @@ class TacsimVectorEnv(SyncVectorEnv):
 
     def step(self, actions: Any) -> tuple[Any, ...]:
         """One control period of all. Raises what `TacsimEnv.step` raises for one of the actions, before anything
-        moves."""
+        moves. Any other error (a picture that cannot be made, a reset that cannot begin) comes when some have moved and
+        some may have been reset: reset all of them then."""
         self._advance(list(iterate(self.action_space, actions)))
         return super().step(actions)  # takes what is done now, resets what is to be reset, and puts it together
 

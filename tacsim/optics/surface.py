@@ -144,7 +144,7 @@ class SurfaceTable:
         """:meth:`points` of a surface that does not fold over. Raises SurfaceFolded where it turns out to do so."""
         # Where the grid is finer than the table, points are found on a coarser one, twice as fine as the table or, not
         # `fine`, just as fine, and are linear between those: the surface's sideways motion is smooth. The first errs
-        # less than the look-up rounds, the second about as much.
+        # less than the look-up rounds; the second about as much, but by half a pixel where a slide shears the surface.
         block = max(1, self.points_a_cell(grid) // (2 if fine else 1))  # points a coarse one, along a side
         points = spread(self._material_points(thinned(grid, block)), block, grid.shape)
         # where no sheet folds over, what lies within a border that is on the gel is on it, too

@@ -229,7 +229,7 @@ def point_push(env: ti.template(), gels: ti.template(), indenter: ti.template(),
     """
     h, k_n, dt = env.param(layout.GEL_SPACING), env.param(layout.STIFFNESS), env.param(layout.STEP)
     area = h * h / (POINTS * POINTS)
-    follow = dt * env.param(layout.LIMIT_FOLLOWS)  # at once, slides would flutter (Prakash & Clifton 1993)
+    follow = ti.min(dt * env.param(layout.LIMIT_FOLLOWS), 1.0)  # at once, slides would flutter (Prakash & Clifton 1993)
     c_n = CONTACT_DAMPING * env.param(layout.GEL_DENSITY) * h / (2.0 * dt)
     y = shape.rotate.transpose() @ (x - shape.centre)
     phi, n_local = signed_distance(env, shape.kind, shape.size, y, shape.grid)

@@ -296,9 +296,8 @@ class FemWorld(BaseWorld):
             return path
         slid = path_along(start, end, 0.0)  # without turns
         catches = indenter.catches(self.scene.element) and slid > SLID_BY_EDGES * self.scene.element * MM * (1 + 1e-6)
-        return replace(
-            path, unfollowed=catches or path.peak_mach(lever) > HURRIED_BY_SHEAR * math.sqrt(gel.mu / gel.density)
-        )
+        hurried = path.peak_mach(lever) > HURRIED_BY_SHEAR * math.sqrt(gel.mu / gel.density)
+        return replace(path, unfollowed=catches or hurried or indenter.snaps(slid, gel.thickness))
 
     def _plan_flow(self, start: Sequence[Pose], end: Sequence[Pose]) -> Path:
         mach, gel = self.scene.flow_mach, self._gel

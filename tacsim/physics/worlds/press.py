@@ -74,9 +74,10 @@ ZETA_GEL = 0.5  # of its damping, zeta c / thickness: it makes the gel lag, and 
 CLEARANCE = 0.1e-3  # gap between gel and indenter at construction [m]
 GRID_SPACING = 0.1e-3  # of a mesh's distance grid [m]
 UNSEEN = 0.5  # spacings of contact points: how deep an indenter may dip between them; the largest such ball: 0.35
-# The limit of friction follows the pressure within the time of a wave through the gel. In half of it slides flutter at
-# friction 1.5; but what is pressed in while it slides drags up to 11 % too little, and may follow so much quicker.
-GROWING_FOLLOWS = 4.0
+# At this friction the limit follows the pressure within the time of a wave through the gel: in half of it slides
+# flutter. Friction itself feeds that, so less of it may follow as much quicker, as may what is pressed in while it
+# slides, which would be dragged up to 11 % too little; up to so many times.
+FLUTTERING, QUICKEST = 1.5, 4.0
 MARGIN = 2.0  # elements: what is further from a mesh does not touch it in the next launch
 TOO_MUCH = "cut off parts of mesh and gel that cannot touch; worlds of a smaller batch have more room each"
 
@@ -302,10 +303,16 @@ class PressWorld(FemWorld):
             raise SimulationDiverged(cause, where(), TOO_MUCH, retry=False) from None
         before = self._before_launch()
         self._state.params[self._index, STEP] = path.step
-        quicker = 0.0 if launch.held else path.growing
-        self._state.params[self._index, LIMIT_FOLLOWS] = (1.0 + quicker * (GROWING_FOLLOWS - 1.0)) / self._gel.thickness
+        self._state.params[self._index, LIMIT_FOLLOWS] = self._follows(launch) / self._gel.thickness
         Health.clear(self._state.partial[self._index])
         return PreparedLaunch(launch, where, drive, before)
+
+    def _follows(self, launch: Launch) -> float:
+        """In how many parts of the time of a wave through the gel the limit of friction follows the pressure."""
+        indenter = self.scene.indenter
+        assert indenter is not None
+        steady = FLUTTERING / min(max(indenter.friction, FLUTTERING / QUICKEST), FLUTTERING)
+        return steady if launch.held else steady + launch.path.growing * (QUICKEST - steady)
 
     def _cover(self, drive: np.ndarray) -> None:
         """Fills in a mesh's distances wherever the gel's surface may touch it in this launch."""

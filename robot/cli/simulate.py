@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -86,18 +85,7 @@ def press(
         notes.print("note: the gel folds over itself; picture and height show the sheet that the camera sees")
     if not config["settled"]:
         held = "not held" if config["residual"] is None else f"relative residual {config['residual']:.2g}"
-        do = "raise settling.max_substeps"
-        if config["residual"] is not None and config["residual"] <= scene.settling.tolerance:
-            held, do = f"contact slips by inertia at Mach {scene.peak_mach:g}", "leave out settling.mach, or lower it"
-            from tacsim.models.scene import CATCHING, SNAPPED, SNAPPING
-
-            if scene.indenter is not None and scene.indenter.catches(scene.element) and any(motion.slide):
-                held = f"an edge sharper than {CATCHING * scene.element * 1e3:g} mm catches on the mesh as it is slid"
-                do = "give so large an --edge-radius for a drag to rely on"
-            elif scene.indenter is not None and scene.indenter.snaps(math.hypot(*motion.slide), scene.gel.size[2]):
-                held = f"at a friction above {SNAPPING:g} the gel lets go in snaps, which depend on the speed"
-                do = f"slide by {SNAPPED:g} of the gel's thickness at most for a drag to rely on"
-        notes.print(f"warning: not settled, {held}; {do}")
+        notes.print(f"warning: not settled, {config['unfollowed'] or f'{held}; raise settling.max_substeps'}")
     say_files(*sorted(folder.iterdir()))
 
 

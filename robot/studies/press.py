@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tacsim import pose as se3
-from tacsim.geometry.shapes import distance, extent, farthest
+from tacsim.geometry.shapes import distance, extent
 from tacsim.geometry.tiles import tiled_distance
 from tacsim.interface import FloatArray, Pose
 from tacsim.models.scene import Box, Cylinder, Gel, GelSurface, Indenter, Mesh, Scene
@@ -56,6 +56,7 @@ class PressResult:
     contact_radius: float  # of the circle with the area of contact [m]
     unfelt: float  # share of the depth of its lowest point that no contact point of the gel feels
     moves: tuple[MoveStats, ...]
+    unfollowed: str  # why one of them has not settled, whatever its residual, and what to do
     surface: GelSurface
     folded: bool  # it folds over itself somewhere: picture and height show the sheet that the camera sees
     pose: Pose  # of the indenter in the sensor's frame: the centre of its bounding box
@@ -75,12 +76,15 @@ def press(scene: Scene, sensor: SensorModel, motion: PressMotion, render: Render
     world = PressWorld(scene)
     start = world.pose("indenter")
     turn = start.quaternion if motion.turn is None else motion.turn
-    below = _below(scene, turn)
+    below = world.below(turn)
     if any(motion.at) or motion.turn is not None:
         world.place({"indenter": Pose(np.array([*motion.at, below + CLEARANCE]), turn)})
     targets = _targets(world.pose("indenter"), below - motion.depth, motion)
+    moves, unfollowed = [], ""
     try:
-        moves = tuple(world.move({"indenter": target}) for target in targets)
+        for target in targets:
+            moves.append(world.move({"indenter": target}))
+            unfollowed = world.unfollowed or unfollowed
     except SimulationDiverged as error:
         if error.poses:
             came = below - float(se3.relative(error.poses["lower"], error.poses["indenter"]).position[2])
@@ -97,7 +101,8 @@ def press(scene: Scene, sensor: SensorModel, motion: PressMotion, render: Render
         wrench=world.wrench("lower"),
         contact_radius=math.sqrt(area / math.pi),
         unfelt=world.unfelt,
-        moves=moves,
+        moves=tuple(moves),
+        unfollowed=unfollowed,
         surface=surface,
         folded=SurfaceTable(surface).folded,
         pose=se3.relative(world.pose("lower"), world.pose("indenter")),
@@ -114,18 +119,6 @@ def require_reachable(gel: Gel, motion: PressMotion) -> None:
     if not abs(motion.twist) <= MAX_TWIST:
         most = math.degrees(MAX_TWIST)
         raise ValueError(f"twist is {math.degrees(motion.twist):.4g} deg; at most {most:g} deg either way")
-
-
-def _below(scene: Scene, turn: FloatArray) -> float:
-    """How far the indenter's lowest point is below its origin, the centre of its bounding box [m]."""
-    assert scene.indenter is not None
-    geometry, upright = scene.indenter.geometry, not turn[:2].any()
-    if upright:
-        return float(extent(geometry)[2]) / 2
-    down = se3.rotate(se3.inverse(Pose(np.zeros(3), turn)), [0.0, 0.0, -1.0])
-    if isinstance(geometry, Mesh):
-        return float((tiled_distance(geometry, GRID_SPACING).vertices @ down).max())
-    return float(farthest(geometry, down, scene.indenter.rounding(scene.element)) @ down)
 
 
 def _targets(start: Pose, height: float, motion: PressMotion) -> list[Pose]:
@@ -190,8 +183,9 @@ def _filled(mask: NDArray[np.bool_], width: int) -> NDArray[np.bool_]:
 
 
 def press_report(scene: Scene, motion: PressMotion, pressed: PressResult, sensor: SensorModel) -> dict[str, Any]:
-    """The result as JSON, SI units. residual: None where nothing was held, so that none was measured; edge_radius: None
-    of a ball, which has no edges, and of a mesh, whose edges are as drawn."""
+    """The result as JSON, SI units. residual: None where nothing was held, so that none was measured; unfollowed: None
+    where friction was followed; edge_radius: None of a ball, which has no edges, and of a mesh, whose edges are as
+    drawn."""
     residual = max(move.residual for move in pressed.moves)
     return {
         "indenter": scene.indenter.model_dump(mode="json") if scene.indenter else None,
@@ -209,6 +203,7 @@ def press_report(scene: Scene, motion: PressMotion, pressed: PressResult, sensor
         "pixel_pitch": sensor.geometry.pixel_pitch,
         "unfelt": pressed.unfelt,
         "folded": pressed.folded,
+        "unfollowed": pressed.unfollowed or None,
         "settled": all(move.settled for move in pressed.moves),
         "residual": residual if math.isfinite(residual) else None,
         "substeps": sum(move.substeps for move in pressed.moves),

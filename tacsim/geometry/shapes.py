@@ -20,7 +20,7 @@ from tacsim.geometry.mesh import (
     signed_distance,
     signed_distance_on_grid,
 )
-from tacsim.models.scene import Box, Cylinder, Mesh, Shape, Sphere
+from tacsim.models.scene import Box, Cylinder, Indenter, Mesh, Shape, Sphere
 
 if TYPE_CHECKING:
     from trimesh import Trimesh
@@ -32,6 +32,7 @@ MAX_NODES = 20_000_000
 FEWEST_LAYERS = 3  # of particles: one has no height, and two cannot bulge
 MAX_MISFIT = 0.1  # relative error of the size or the volume that the lattice of particles may have
 LEVEL = 1e-5  # sine of an angle below which a direction is level with a face; float32 rotations are 1e-7 off
+SHARP = math.radians(30.0)  # facets of what is drawn round meet at less
 BAND = 2  # grid spacings round a mesh in which the distance is exact
 
 
@@ -65,6 +66,14 @@ def farthest(geometry: Box | Sphere | Cylinder, direction: ArrayLike, edge_radiu
         case Cylinder():
             rim = (geometry.radius - edge_radius) * along[:2] / max(float(np.linalg.norm(along[:2])), 1e-12)
             return np.append(rim, np.sign(along[2]) * (geometry.height / 2 - edge_radius)) + rounding
+
+
+def edge_radius(indenter: Indenter, element: float) -> float:
+    """Of an indenter's sharpest edges, on a gel of such elements [m]; infinite where it has none. A mesh has some where
+    two faces meet at more than SHARP, and they count as sharp, for they are as drawn."""
+    if not isinstance(indenter.geometry, Mesh):
+        return math.inf if isinstance(indenter.geometry, Sphere) else indenter.rounding(element)
+    return 0.0 if _sharpest(indenter.geometry, fingerprint(indenter.geometry.path)) > SHARP else math.inf
 
 
 def volume(geometry: Shape) -> float:
@@ -215,6 +224,13 @@ def centred(geometry: Mesh, expected: str | None = None) -> Trimesh:
 def _mesh_extent(geometry: Mesh, content: str) -> tuple[float, ...]:
     """Size of the bounding box (3,) [m]. content: fingerprint of the file."""
     return tuple(float(side) for side in centred(geometry, content).extents)
+
+
+@lru_cache(maxsize=64)
+def _sharpest(geometry: Mesh, content: str) -> float:
+    """Largest angle by which two faces of a mesh turn away from one another at an edge that sticks out [rad]."""
+    mesh = centred(geometry, content)
+    return float(mesh.face_adjacency_angles[mesh.face_adjacency_convex].max(initial=0.0))
 
 
 def _name(geometry: Shape) -> str:

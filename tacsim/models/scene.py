@@ -32,8 +32,6 @@ MACH_BY_SHEAR = 0.1
 LIGHTER = 1.5  # so much faster may sensors go whose gels and body answer as if they were lighter: no indenter, no seed
 FLOW_MACH = 0.02  # mean of motions that flow into one another, where nothing is lighter
 CATCHING = 0.5  # element sizes: an edge that is less round catches on the mesh
-# Above this friction a gel that is dragged by more than this share of its thickness lets go in snaps
-SNAPPING, SNAPPED = 1.0, 0.5
 MAX_CELLS = 5_000_000  # elements of one gel, or its particles in the seed's scheme; a standard gel has 12,800
 
 
@@ -169,16 +167,6 @@ class Indenter(Config):
                     f"edge_radius is {radius:g} m; at most half the shortest side of the {geometry.shape}, {half:g} m"
                 )
         return self
-
-    def catches(self, element: float) -> bool:
-        """Its edges are sharper than a mesh of such elements [m] follows in a slide: they hang on to its points and
-        snap off (docs/decisions/0002)."""
-        return isinstance(self.geometry, Box | Cylinder) and self.rounding(element) < CATCHING * element * (1 - 1e-9)
-
-    def snaps(self, slid: float, thickness: float) -> bool:
-        """Slid so far over a gel so thick [m], what it drags lets go in snaps, as rubber does (Schallamach 1971), and
-        how far they come depends on the speed: balls at draft end up to 17 % from slow ones."""
-        return self.friction > SNAPPING and slid > SNAPPED * thickness * (1 + 1e-6)
 
     def rounding(self, element: float) -> float:
         """Radius of its edges [m] on a mesh of such elements [m]: where none is given the least that does not catch,

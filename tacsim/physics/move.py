@@ -15,8 +15,8 @@ class MoveStats:
     substeps: int  # explicit substeps of motion and hold together
     hold: int  # of which hold
     residual: float  # largest relative force imbalance or change at the end, or change still to come [-]
-    # residual <= the scene's tolerance; and of an indenter with friction: no faster than it may be followed (at a
-    # `settling.mach`), nor slid by an edge that catches on the mesh (`Indenter.catches`)
+    # residual <= the scene's tolerance; and of an indenter with friction: slid as it can be followed
+    # (tacsim.physics.motion.slide), of a body that yields: no faster than it may be (at a `settling.mach`)
     settled: bool
     overlap: float  # deepest overlap of body (or indenter) and gel surface in the last substep [m]
     # times a guard changed the physics (particles set aside, gaps capped), found gels in one another, or a body under

@@ -209,7 +209,7 @@ def move_and_settle(path: Path, settling: Settling, *, balanced: bool, most: int
                 worst = max(worst, before, to_come)
         if worst <= settling.tolerance:
             break
-    return _stats(readings, path.substeps, held, worst, settling, unfollowed=path.unfollowed)
+    return _stats(readings, path.substeps, held, worst, settling, followed=not path.unfollowed)
 
 
 def move_real_time(path: Path, settling: Settling, *, balanced: bool) -> Motion:
@@ -244,14 +244,14 @@ def _follow(path: Path) -> Generator[Launch, Sequence[ForceReading], list[ForceR
 
 def _stats(
     readings: Sequence[ForceReading], substeps: int, held: int, worst: float, settling: Settling, *,
-    unfollowed: bool = False,
+    followed: bool = True,
 ) -> MoveStats:  # fmt: skip
     overlap = readings[-1].overlap / MM if readings else 0.0
     hits = sum(reading.guard_hits for reading in readings)
     last = readings[-1].integration if readings else Integration()
     smallest, largest = readings[-1].volumes if readings else (1.0, 1.0)
     return MoveStats(
-        substeps + held, held, worst, worst <= settling.tolerance and not unfollowed, overlap, hits,
+        substeps + held, held, worst, worst <= settling.tolerance and followed, overlap, hits,
         time_step=last.step / MM, damping=last.damping,
         courant=max((reading.integration.courant for reading in readings), default=0.0),
         gel_overlap=readings[-1].gel_overlap / MM if readings else 0.0,

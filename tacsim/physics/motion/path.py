@@ -29,8 +29,8 @@ SHORTEST_RAMP, SHORTEST_FLOW, FLOW_RISE, READING_INTERVAL = 2.0, 1.25, 0.25, 1.0
 # beyond, and what yields keeps it; where it goes on, the gel feels the braking.
 PASSING = 0.5
 # Gel thicknesses: shorter paths are followed slower than they may be, where the stop leaves a trace: in what yields, in
-# friction; and in friction all of the way, if the contact grows meanwhile
-SHORT_PATH, SHORT_SLIDE, SHORT_GROWING = 0.5, 0.25, 1.0
+# friction
+SHORT_PATH, SHORT_SLIDE = 0.5, 0.25
 ROUNDING = 1e-6  # of a number of substeps
 MOST_SUBSTEPS = 1_000_000  # of one motion: hours, and no motion that anybody means
 
@@ -56,9 +56,10 @@ class Path:
     Each nominal substep is cut into `refine` real ones; all counts of substeps are nominal. interval: substeps of the
     hold at its end between two readings of the forces. rise: share of the time in which the velocity rises, of `ramp`.
 
-    unfollowed: friction does not follow it: too fast, or slid by an edge that catches on the mesh.
+    unfollowed: why it does not end as a slow one, and what to do; empty where it does.
     creeps: what it moves yields, and creeps on when it has ended.
-    growing: how far it presses an indenter in while it slides it: see `growth`.
+    growing: how far it presses an indenter in while it slides it: see `tacsim.physics.motion.slide.growth`.
+    turning: how much of an indenter's drag lies across the way that it is slid: see `tacsim.physics.motion.slide.turn`.
 
     rates: velocities at start and end, each (frames, 6), linear and angular, world axes [-, rad/mm], of a path that is
     not from rest to rest. The one turns into the other within `rise`, and a ramp does the rest of the way.
@@ -71,9 +72,10 @@ class Path:
     refine: int = 1
     interval: int = 20
     rise: float = 0.5
-    unfollowed: bool = False
+    unfollowed: str = ""
     creeps: bool = False
     growing: float = 0.0
+    turning: float = 0.0
     rates: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
 
     @property
@@ -177,15 +179,6 @@ def path_along(start: Sequence[Pose], end: Sequence[Pose], lever: float) -> floa
     normal = se3.matrix(start[0])[:, 2]
     displacements[:, :3] -= np.outer(displacements[:, :3] @ normal, normal)
     return of_fastest_point(displacements, lever)
-
-
-def growth(start: Sequence[Pose], end: Sequence[Pose]) -> float:
-    """0 to 1: how far an indenter, the second frame, is pressed into the gel of the first while it slides along its
-    surface: 1 where it comes deeper by a quarter of its way along, or more."""
-    sensor, indenter = displacements_between(start, end)[:, :3]
-    closed = float((sensor - indenter) @ se3.matrix(start[0])[:, 2])
-    slid = path_along(start, end, 0.0)
-    return min(1.0, 4.0 * closed / slid) if slid > 0.0 and closed > 0.0 else 0.0
 
 
 def plan(

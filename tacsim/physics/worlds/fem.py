@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -31,14 +30,7 @@ from tacsim.physics.motion.controller import (
 from tacsim.physics.motion.inertia import Inertia, plan_real_time
 from tacsim.physics.motion.load import keep_loads, require_loads
 from tacsim.physics.motion.path import (
-    SHORT_GROWING,
-    SHORT_PATH,
-    SHORT_SLIDE,
     Path,
-    growth,
-    path_along,
-    path_length,
-    plan,
     plan_flow,
     resolve_targets,
 )
@@ -50,14 +42,6 @@ from tacsim.physics.worlds.base import BaseWorld
 if TYPE_CHECKING:  # a device's kernels
     from tacsim.physics.worlds.device_state import DeviceState
     from tacsim.physics.worlds.survey import Survey
-
-# Of the speed of the gel's shear wave, of an indenter with friction: up to it a slide ends within 2 % of a slow one; at
-# 0.25 it is up to 3 % off, at 0.5 up to 17 %
-HURRIED_BY_SHEAR = 0.155
-# Of the fastest default for a body that yields: at twice it clay ends 2 % lower, at 4 times 9 to 11 %, at 7 times 26 %
-HURRIED_BY_STRESS = 3.0
-# Element sizes that an edge which catches on the mesh may be slid: further, drag is up to 50 % off
-SLID_BY_EDGES = 0.5
 
 
 class FemState(ABC):
@@ -279,25 +263,9 @@ class FemWorld(BaseWorld):
         self._rates[...] = flowing.rates[1] if command.flow and flowing.rates is not None else 0.0
         return stats
 
+    @abstractmethod
     def plan(self, start: Sequence[Pose], end: Sequence[Pose]) -> Path:
         """The path between two poses of all driven frames, at the scene's speed."""
-        mach, gel, lever, indenter = self.scene.peak_mach, self._gel, max(self._gel.half), self.scene.indenter
-        slides = indenter is not None and indenter.friction > 0.0
-        growing = growth(start, end) if slides else 0.0
-        remembered = (path_length if self.yields else path_along)(start, end, lever)
-        short = SHORT_PATH if self.yields else SHORT_SLIDE + (SHORT_GROWING - SHORT_SLIDE) * growing
-        path = plan(
-            start, end, mach, self._scaled.step, lever, gel.thickness, remembered=remembered, short=short
-        )  # fmt: skip
-        path = replace(path, creeps=self.yields, growing=growing)
-        if self.yields:  # its own speed yields it
-            return replace(path, unfollowed=path.peak_mach(lever) > HURRIED_BY_STRESS * self.scene.fastest_mach)
-        if indenter is None or not slides:
-            return path
-        slid = path_along(start, end, 0.0)  # without turns
-        catches = indenter.catches(self.scene.element) and slid > SLID_BY_EDGES * self.scene.element * MM * (1 + 1e-6)
-        hurried = path.peak_mach(lever) > HURRIED_BY_SHEAR * math.sqrt(gel.mu / gel.density)
-        return replace(path, unfollowed=catches or hurried or indenter.snaps(slid, gel.thickness))
 
     def _plan_flow(self, start: Sequence[Pose], end: Sequence[Pose]) -> Path:
         mach, gel = self.scene.flow_mach, self._gel

@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 
 from tacsim.compute.runtime import start, ti
-from tacsim.geometry.shapes import MAX_NODES, extent, farthest
+from tacsim.geometry.shapes import MAX_NODES, edge_radius, extent, farthest
 from tacsim.geometry.tiles import TILE, TiledDistance, tiled_distance
 from tacsim.interface import Pose
 from tacsim.models.scene import Box, Cylinder, GelSurface, Mesh, Scene, Shape, Sphere
@@ -63,14 +63,21 @@ from tacsim.physics.gel.gel import GelParams, GelState, common_lattice, gel_para
 from tacsim.physics.gel.kernels import Lattice, gel_advance, gel_forces, gels_of
 from tacsim.physics.motion.controller import ForceReading, Integration, Launch, PreparedLaunch, force_floor
 from tacsim.physics.motion.inertia import Inertia, kernel_second
+from tacsim.physics.motion.path import SHORT_SLIDE, Path, path_along, plan
+from tacsim.physics.motion.slide import Slide, growth, turn
 from tacsim.physics.units import MM, MPA
 from tacsim.physics.worlds.fem import FemState, FemWorld, stack_drives
 from tacsim.physics.worlds.hybrid_kernels import Drive
+from tacsim.pose import inverse, relative, rotate
 
 # dt / (spacing / wave speed). Edges of a rigid box tear the surface up at 0.6, without a NaN; and the penalty falls
 # with the step's square, so 0.5 costs overlap.
 COURANT = 0.4
 ZETA_GEL = 0.5  # of its damping, zeta c / thickness: it makes the gel lag, and friction remembers that
+# Shares by which a slide across the drag that is there (`turn`) goes slower and is damped less: the direction of its
+# drag lags behind by the product of speed and damping
+TURNS_SLOWER, TURNS_LOOSER = 0.5, 0.5
+SHORT_GROWING = 1.0  # gel thicknesses: what is pressed in while it slides goes as slowly as a path of this length
 CLEARANCE = 0.1e-3  # gap between gel and indenter at construction [m]
 GRID_SPACING = 0.1e-3  # of a mesh's distance grid [m]
 UNSEEN = 0.5  # spacings of contact points: how deep an indenter may dip between them; the largest such ball: 0.35
@@ -242,6 +249,7 @@ class PressWorld(FemWorld):
     sensors = ("lower",)
     balanced = False
     yields = False
+    unfollowed = ""  # why the last motion has not settled, whatever its residual, and what to do
     unfelt = 0.0  # share of the indenter's depth in the untouched gel that no contact point feels, when last at rest
 
     def __init__(self, scene: Scene, state: PressState | None = None, index: int = 0) -> None:
@@ -264,6 +272,8 @@ class PressWorld(FemWorld):
         height = float(extent(scene.indenter.geometry)[2])
         turned = np.array([0.0, 0.0, np.sin(scene.indenter.yaw / 2), np.cos(scene.indenter.yaw / 2)])
         self._rates = np.zeros((2, 6))
+        self._touched = np.zeros(2)  # where the indenter was over the gel when it last did not touch it [mm]
+        self._edge_radius = MM * edge_radius(scene.indenter, scene.element)
         self._poses = {"lower": Pose(), "indenter": Pose(np.array([0.0, 0.0, height / 2 + CLEARANCE]), turned)}
 
     def _stop(self) -> None:
@@ -289,6 +299,49 @@ class PressWorld(FemWorld):
     def truth(self) -> None:
         return None
 
+    def _scalars(self) -> dict[str, np.ndarray]:
+        return {**super()._scalars(), "touched": self._touched}
+
+    def plan(self, start: Sequence[Pose], end: Sequence[Pose]) -> Path:
+        """The path between two poses of sensor and indenter, at the scene's speed; slower where friction turns the
+        drag, or grows meanwhile."""
+        gel, lever, indenter, mach = self._gel, max(self._gel.half), self.scene.indenter, self.scene.peak_mach
+        assert indenter is not None
+        growing, turning, force, self.unfollowed = 0.0, 0.0, self.wrench("lower")[:3], ""
+        if not force.any():
+            self._touched[:] = relative(*start).position[:2] * MM
+        if indenter.friction > 0.0:
+            growing, turning = growth(start, end), turn(start, end, force, indenter.friction)
+        path = plan(
+            start, end, (1.0 - TURNS_SLOWER * turning) * mach, self._scaled.step, lever, gel.thickness,
+            remembered=path_along(start, end, lever), short=SHORT_SLIDE + (SHORT_GROWING - SHORT_SLIDE) * growing,
+        )  # fmt: skip
+        if indenter.friction > 0.0 and path.substeps:
+            at = relative(*end)
+            slide = Slide(
+                length=path_along(start, end, 0.0),
+                away=float(np.linalg.norm(at.position[:2] * MM - self._touched)),
+                depth=(self.below(at.quaternion) - float(at.position[2])) * MM,
+                shear_mach=path.peak_mach(lever) / math.sqrt(gel.mu / gel.density),
+                friction=indenter.friction,
+                edge_radius=self._edge_radius,
+            )
+            self.unfollowed = slide.unfollowed(self.scene.element * MM, gel.thickness)
+        return replace(path, growing=growing, turning=turning, unfollowed=self.unfollowed)
+
+    def below(self, turn: np.ndarray) -> float:
+        """How far the indenter's lowest point is below its origin, the centre of its bounding box, if that is turned by
+        the quaternion `turn` (4,) [m]."""
+        assert self.scene.indenter is not None
+        geometry, mesh = self.scene.indenter.geometry, self._state.meshes[self._index]
+        if not turn[:2].any():
+            return float(extent(geometry)[2]) / 2
+        down = rotate(inverse(Pose(quaternion=turn)), [0.0, 0.0, -1.0])
+        if isinstance(geometry, Mesh):
+            assert mesh is not None
+            return float((mesh.vertices @ down).max())
+        return float(farthest(geometry, down, self.scene.indenter.rounding(self.scene.element)) @ down)
+
     def prepare(self, launch: Launch) -> PreparedLaunch:
         """Sets this environment's parameters. Raises SimulationDiverged where too much of a mesh could be touched."""
         path, where = launch.path, partial(launch.span, tuple(self._poses))
@@ -304,6 +357,8 @@ class PressWorld(FemWorld):
         before = self._before_launch()
         self._state.params[self._index, STEP] = path.step
         self._state.params[self._index, LIMIT_FOLLOWS] = self._follows(launch) / self._gel.thickness
+        looser = 0.0 if launch.held else TURNS_LOOSER * path.turning
+        self._state.params[self._index, GEL_DAMPING] = (1.0 - looser) * self._inertia.params[GEL_DAMPING]
         Health.clear(self._state.partial[self._index])
         return PreparedLaunch(launch, where, drive, before)
 

@@ -13,9 +13,9 @@ import trimesh
 
 from tacsim.geometry import shapes
 from tacsim.geometry.mesh import fingerprint, load_mesh
-from tacsim.geometry.shapes import distance, extent, farthest, particles, volume
+from tacsim.geometry.shapes import distance, edge_radius, extent, farthest, particles, volume
 from tacsim.geometry.tiles import tiled_distance
-from tacsim.models.scene import Box, Cylinder, Mesh, Shape, Sphere
+from tacsim.models.scene import Box, Cylinder, Indenter, Mesh, Shape, Sphere
 
 MM = 1e-3
 WEDGE = np.array([[0, 0, 0], [6, 0, 0], [0, 4, 0], [0, 0, 3.0]])  # a right-angled tetrahedron: no symmetry at all
@@ -63,6 +63,20 @@ def test_box_lattice_starts_half_a_spacing_inside_each_face() -> None:
     assert np.allclose(found.max(axis=0), [1.25 * MM, 2.25 * MM, 0.75 * MM])
     assert np.allclose(found.min(axis=0), -found.max(axis=0))
     assert len(np.unique(np.round(found[:, 2] / MM, 9))) == 4  # flat layers, no orange peel
+
+
+def test_how_sharp_the_edges_of_an_indenter_are(tmp_path: Path) -> None:
+    """A mesh's are sharp where it sticks out at more than 30 degrees; facets of a round one are no edges."""
+    cube, ball = trimesh.creation.box((4, 4, 4)), trimesh.creation.icosphere(subdivisions=3, radius=4.0)
+    for geometry, radius in (
+        (Sphere(radius=4 * MM), np.inf),
+        (Box(size=(4 * MM, 4 * MM, 4 * MM)), 0.5 * MM),
+        (Cylinder(radius=2 * MM, height=1 * MM), 0.25 * MM),
+        (stl(tmp_path, cube, "cube.stl"), 0.0),
+        (stl(tmp_path, ball, "ball.stl"), np.inf),
+    ):
+        assert edge_radius(Indenter(geometry=geometry), 1 * MM) == radius
+    assert edge_radius(Indenter(geometry=Box(size=(4 * MM, 4 * MM, 4 * MM)), edge_radius=0.1 * MM), 1 * MM) == 0.1 * MM
 
 
 @pytest.mark.parametrize(

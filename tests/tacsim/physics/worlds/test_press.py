@@ -258,6 +258,7 @@ def test_a_press_allocates_no_particles_or_grid() -> None:
     assert w.truth() is None
     assert set(w.snapshot()) == {
         "gel_displacement", "gel_velocity", "anchor", "pressure", "carried", "sums", "poses", "rates", "true_inertia",
+        "touched",
     }  # fmt: skip
 
 

@@ -1,0 +1,85 @@
+"""How an indenter with friction is slid over a gel: what makes it go slower, and what no default speed can follow.
+
+Contact that slips keeps the shear that a motion leaves in it. Why each of these: docs/physics.md, "Controller".
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacsim import pose as se3
+from tacsim.interface import Pose
+from tacsim.models.scene import CATCHING
+from tacsim.physics.motion.path import displacements_between, path_along
+
+# Of the speed of the gel's shear wave: up to it a slide ends within 2 % of a slow one; at 0.25 it is up to 3 % off, at
+# 0.5 up to 17 %
+HURRIED = 0.155
+# Element sizes that an edge which catches on the mesh may be slid: further, drag is up to 50 % off
+CAUGHT = 0.5
+# Gel thicknesses that an indenter may be slid: further, the gel bunches up and lets go in snaps, at a friction above
+# SNAPPING, sooner if it is so deep as walls may be; and under what is so many thicknesses deep, at any friction
+SNAPPED, SNAPPED_SOONER, SNAPPING = 0.5, 0.4, 1.0
+DEEP_WALLS, DEEP = 0.15, 0.25
+ROUNDING = 1e-6
+
+
+def growth(start: Sequence[Pose], end: Sequence[Pose]) -> float:
+    """0 to 1: how far an indenter, the second frame, is pressed into the gel of the first while it slides along its
+    surface: 1 where it comes deeper by a quarter of its way along, or more."""
+    sensor, indenter = displacements_between(start, end)[:, :3]
+    closed = float((sensor - indenter) @ se3.matrix(start[0])[:, 2])
+    slid = path_along(start, end, 0.0)
+    return min(1.0, 4.0 * closed / slid) if slid > 0.0 and closed > 0.0 else 0.0
+
+
+def turn(start: Sequence[Pose], end: Sequence[Pose], force: NDArray[np.float64], friction: float) -> float:
+    """0 to 1: what share of the drag that friction allows lies across the way that an indenter, the second frame, is
+    slid over the gel of the first; `force` (3,) on that, in its own axes [N]."""
+    sensor, indenter = displacements_between(start, end)[:, :3]
+    x, y, z = (indenter - sensor) @ se3.matrix(start[0])
+    slid, limit = math.hypot(x, y), friction * abs(force[2])
+    if slid <= ROUNDING * abs(z) or limit == 0.0:
+        return 0.0
+    return min(1.0, abs(force[0] * y - force[1] * x) / (limit * slid))
+
+
+@dataclass(frozen=True)
+class Slide:
+    """A motion of an indenter with friction over a gel, in [mm]."""
+
+    length: float  # along the surface
+    away: float  # how far along the surface it ends from where it came to the gel
+    depth: float  # of the indenter's lowest point below the untouched surface
+    shear_mach: float  # its peak speed over that of the gel's shear wave
+    friction: float
+    edge_radius: float  # of the indenter's edges; infinite where it has none
+
+    def unfollowed(self, element: float, thickness: float) -> str:
+        """Why it does not end as a slow one, and what to do; empty where it does. `element`: edge of an element of the
+        gel, and how thick that is."""
+        if self.shear_mach > HURRIED:
+            return "contact slips by inertia at that speed; leave out settling.mach, or lower it"
+        if self.depth <= 0.0:  # it is lifted off
+            return ""
+        catching = CATCHING * element
+        if self.edge_radius < catching * (1 - 1e-9) and self.length > CAUGHT * element * (1 + ROUNDING):
+            return (
+                f"an edge sharper than {catching:g} mm catches on the mesh as it is slid; for a drag to rely on, give "
+                f"it so large an edge_radius (--edge-radius; an STL file: draw it round), or a smaller element_size"
+            )
+        walls, steep = math.isfinite(self.edge_radius), self.friction > SNAPPING
+        deep = (DEEP_WALLS if walls or steep else DEEP) * thickness
+        far = (SNAPPED_SOONER if steep and self.depth > deep else SNAPPED) * thickness
+        if max(self.length, self.away) > far * (1 + ROUNDING) and (steep or self.depth > deep):
+            what = f"above {SNAPPING:g}" if steep else f"of {self.friction:g} under what is deeper than {deep:.3g} mm"
+            return (
+                f"slid by more than {far:.3g} mm, a gel {thickness:g} mm thick lets go in snaps at a friction {what}, "
+                f"which depend on the speed; for a drag to rely on, slide less far from where it came to the gel"
+            )
+        return ""

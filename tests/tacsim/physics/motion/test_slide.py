@@ -1,0 +1,87 @@
+"""How an indenter is slid: how far it is pressed in, how far its drag turns, and which slides are not followed."""
+
+import math
+
+import numpy as np
+import pytest
+
+from tacsim.interface import Pose
+from tacsim.physics.motion.slide import Slide, growth, turn
+from tacsim.pose import from_rotation_vector
+
+SENSOR, TURNED = Pose(), from_rotation_vector([0.1, 0.2, 0.3], [0.0, math.pi / 2, 0.0])  # its z axis is the world's x
+
+
+def moved(by: list[float]) -> tuple[list[Pose], list[Pose]]:
+    return [SENSOR, Pose()], [SENSOR, Pose(np.array(by))]
+
+
+@pytest.mark.parametrize(
+    ("by", "grows"),
+    [
+        ([1e-3, 0.0, 0.0], 0.0), ([1e-3, 0.0, -0.1e-3], 0.4), ([0.0, 1e-3, -0.5e-3], 1.0), ([1e-3, 0.0, 0.1e-3], 0.0),
+        ([0.0, 0.0, -1e-3], 0.0),
+    ],
+)  # fmt: skip
+def test_what_is_pressed_in_on_its_way_grows(by: list[float], grows: float) -> None:
+    assert growth(*moved(by)) == pytest.approx(grows)
+
+
+@pytest.mark.parametrize(
+    ("by", "force", "turns"),
+    [
+        ([1e-3, 0.0, 0.0], [0.3, 0.0, -1.0], 0.0),  # on along it, or straight back
+        ([-1e-3, 0.0, 0.0], [0.3, 0.0, -1.0], 0.0),
+        ([0.0, 1e-3, 0.0], [0.3, 0.0, -1.0], 0.5),  # across half of the drag that friction allows
+        ([1e-3, 1e-3, 0.0], [0.6, 0.0, -1.0], math.sqrt(0.5)),
+        ([0.0, 1e-3, 0.0], [0.9, 0.0, -1.0], 1.0),
+        ([0.0, 0.0, -1e-3], [0.3, 0.0, -1.0], 0.0),
+        ([1e-3, 0.0, 0.0], [0.0, 0.0, 0.0], 0.0),  # nothing is touched
+    ],
+)
+def test_a_way_across_the_drag_turns_it(by: list[float], force: list[float], turns: float) -> None:
+    assert turn(*moved(by), np.array(force), 0.6) == pytest.approx(turns)
+
+
+def test_a_turn_is_seen_from_the_sensor() -> None:
+    """Across the drag in the sensor's own axes, whichever of the two moves."""
+    along_x, along_z = np.array([1e-3, 0.0, 0.0]), np.array([0.0, 0.0, 1e-3])
+    force = np.array([0.0, 0.6, -1.0])
+    other = Pose(TURNED.position)
+    for by, turns in ((along_x, 0.0), (along_z, 1.0)):  # along the sensor's z, and against its x
+        assert turn([TURNED, other], [TURNED, Pose(other.position + by)], force, 0.6) == pytest.approx(turns, abs=1e-9)
+        sensor = Pose(TURNED.position - by, TURNED.quaternion)
+        assert turn([TURNED, other], [sensor, other], force, 0.6) == pytest.approx(turns, abs=1e-9)
+
+
+def slide(**changes: float) -> Slide:
+    usual = {"length": 1.0, "away": 1.0, "depth": 0.5, "shear_mach": 0.1, "friction": 0.6, "edge_radius": 0.5}
+    return Slide(**{**usual, **changes})
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({}, ""),
+        ({"shear_mach": 0.16}, "slips by inertia"),
+        ({"edge_radius": 0.4}, "sharper than 0.5 mm catches"),
+        ({"edge_radius": 0.4, "length": 0.5}, ""),
+        ({"edge_radius": 0.4, "length": 0.0, "depth": 2.0, "friction": 2.0}, ""),
+        ({"length": 2.1, "friction": 1.1, "depth": 0.0}, ""),  # lifted
+        ({"length": 2.1}, ""),
+        ({"length": 2.1, "depth": 0.7}, "2 mm.*friction of 0.6 under what is deeper than 0.6 mm"),
+        ({"length": 0.1, "away": 2.1, "depth": 0.7}, "friction of 0.6"),  # one of many small ones
+        ({"length": 2.1, "depth": 0.7, "edge_radius": math.inf}, ""),
+        ({"length": 2.1, "depth": 1.1, "edge_radius": math.inf}, "deeper than 1 mm"),
+        ({"length": 2.1, "friction": 1.1}, "friction above 1"),
+        ({"length": 1.9, "friction": 1.1}, ""),
+        ({"length": 1.9, "friction": 1.1, "depth": 0.7}, "1.6 mm.*friction above 1"),
+    ],
+)
+def test_which_slides_are_not_followed(changes: dict[str, float], words: str) -> None:
+    """Elements of 1 mm, a gel 4 mm thick."""
+    said = slide(**changes).unfollowed(1.0, 4.0)
+    assert bool(said) == bool(words)
+    if words:
+        with pytest.raises(AssertionError, match=words):
+            raise AssertionError(said)

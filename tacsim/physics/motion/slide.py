@@ -46,7 +46,7 @@ def turn(start: Sequence[Pose], end: Sequence[Pose], force: NDArray[np.float64],
     slid, limit = math.hypot(x, y), friction * abs(force[2])
     if slid <= ROUNDING * abs(z) or limit == 0.0:
         return 0.0
-    return min(1.0, abs(force[0] * y - force[1] * x) / (limit * slid))
+    return float(min(1.0, abs(force[0] * y - force[1] * x) / (limit * slid)))
 
 
 @dataclass(frozen=True)

@@ -232,6 +232,42 @@ def slid_in(preset: str, repeat: int) -> list[Measurement]:
     return rows
 
 
+def slid_turned(preset: str, repeat: int) -> list[Measurement]:
+    """Dragged by 1.3 mm, 0.5 mm deep, then by 0.7 mm square to that: how far the drag's vector is from a slow one's."""
+    settled = {"mach": SLIDE_SLOW[preset], "tolerance": 1e-3, "max_substeps": 500}
+    rows = []
+    for shape, friction in (
+        (Sphere(radius=5e-3), 0.4),
+        (Sphere(radius=RADIUS), 1.0),
+        (Cylinder(radius=2.5e-3, height=5e-3), 0.5),
+        (Box(size=(6e-3, 3.2e-3, 4e-3)), 0.4),
+    ):
+        indenter = Indenter(geometry=shape, friction=friction)
+        timing, (found, stats) = timed(partial(_turned, preset, indenter), 1, warm=lambda: None)
+        truth, _ = _turned(preset, indenter, **settled)
+        off = np.linalg.norm(found - truth) / np.linalg.norm(truth)
+        note = "" if stats.settled else "not settled"
+        figures = {"x": float(found[0]), "y": float(found[1]), "true_x": float(truth[0]), "true_y": float(truth[1])}
+        rows.append(
+            Measurement(
+                timing, 100.0 * float(off), "% of the drag", f"the same mesh at Mach {SLIDE_SLOW[preset]:g}",
+                f"{shape.shape}, friction {friction:g}", stats.substeps, figures, note,
+            )
+        )  # fmt: skip
+    return rows
+
+
+def _turned(preset: str, indenter: Indenter, **settling: float) -> tuple[Float64, MoveStats]:
+    """Drag along x and y over normal force after both legs."""
+    scene = {"body": None, "preset": preset, "indenter": indenter, "settling": settling}
+    world, _ = press(Scene.model_validate(scene), 0.5e-3)
+    for way in ([0.0, 1.3e-3, 0.0], [0.7e-3, 0.0, 0.0]):
+        pose = world.pose("indenter")
+        stats = world.move({"indenter": Pose(pose.position + way, pose.quaternion)})
+    force = world.wrench("lower")
+    return force[:2] / -force[2], stats
+
+
 def _drag_in(
     preset: str, indenter: Indenter, way: tuple[float, float, float], **settling: float
 ) -> tuple[float, MoveStats]:
@@ -366,6 +402,7 @@ CASES = (
     Case("press", "sliding_force", "tacsim", "h 1 mm", partial(sliding_force, 1e-3)),
     *(Case("press", "slid_ball", "tacsim", preset, partial(slid_ball, preset)) for preset in ("draft", "standard")),
     *(Case("press", "slid_in", "tacsim", preset, partial(slid_in, preset)) for preset in ("draft", "standard")),
+    *(Case("press", "slid_turned", "tacsim", preset, partial(slid_turned, preset)) for preset in ("draft", "standard")),
     Case("press", "slid_edges", "tacsim", "draft", partial(slid_edges, "draft")),
     Case("press", "slid_edges", "tacsim", "standard", partial(slid_edges, "standard"), long=True),
 )  # fmt: skip

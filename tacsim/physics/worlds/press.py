@@ -74,9 +74,10 @@ from tacsim.pose import inverse, relative, rotate
 # with the step's square, so 0.5 costs overlap.
 COURANT = 0.4
 ZETA_GEL = 0.5  # of its damping, zeta c / thickness: it makes the gel lag, and friction remembers that
-# Shares by which a slide across the drag that is there (`turn`) goes slower and is damped less: the direction of its
-# drag lags behind by the product of speed and damping
-TURNS_SLOWER, TURNS_LOOSER = 0.5, 0.5
+# Where a slide goes across the drag that is there (`turn`), its own lags behind in direction: by speed times damping, and
+# the more the less friction there is. So it has so much of its damping, and the friction itself is the share of its
+# speed, within these.
+TURNS_DAMPED, TURNS_AT = 0.4, (0.35, 0.7)
 SHORT_GROWING = 1.0  # gel thicknesses: what is pressed in while it slides goes as slowly as a path of this length
 CLEARANCE = 0.1e-3  # gap between gel and indenter at construction [m]
 GRID_SPACING = 0.1e-3  # of a mesh's distance grid [m]
@@ -303,17 +304,18 @@ class PressWorld(FemWorld):
         return {**super()._scalars(), "touched": self._touched}
 
     def plan(self, start: Sequence[Pose], end: Sequence[Pose]) -> Path:
-        """The path between two poses of sensor and indenter, at the scene's speed; slower where friction turns the
-        drag, or grows meanwhile."""
+        """The path between two poses of sensor and indenter, at the scene's speed; slower where the drag turns, or
+        grows because the indenter is pressed in."""
         gel, lever, indenter, mach = self._gel, max(self._gel.half), self.scene.indenter, self.scene.peak_mach
         assert indenter is not None
         growing, turning, force, self.unfollowed = 0.0, 0.0, self.wrench("lower")[:3], ""
-        if not force.any():
+        if not force.any():  # nothing else says where it came to the gel
             self._touched[:] = relative(*start).position[:2] * MM
         if indenter.friction > 0.0:
             growing, turning = growth(start, end), turn(start, end, force, indenter.friction)
+            mach *= 1.0 - turning * (1.0 - min(max(indenter.friction, TURNS_AT[0]), TURNS_AT[1]))
         path = plan(
-            start, end, (1.0 - TURNS_SLOWER * turning) * mach, self._scaled.step, lever, gel.thickness,
+            start, end, mach, self._scaled.step, lever, gel.thickness,
             remembered=path_along(start, end, lever), short=SHORT_SLIDE + (SHORT_GROWING - SHORT_SLIDE) * growing,
         )  # fmt: skip
         if indenter.friction > 0.0 and path.substeps:
@@ -357,8 +359,8 @@ class PressWorld(FemWorld):
         before = self._before_launch()
         self._state.params[self._index, STEP] = path.step
         self._state.params[self._index, LIMIT_FOLLOWS] = self._follows(launch) / self._gel.thickness
-        looser = 0.0 if launch.held else TURNS_LOOSER * path.turning
-        self._state.params[self._index, GEL_DAMPING] = (1.0 - looser) * self._inertia.params[GEL_DAMPING]
+        damped = 1.0 if launch.held else 1.0 - path.turning * (1.0 - TURNS_DAMPED)
+        self._state.params[self._index, GEL_DAMPING] = damped * self._inertia.params[GEL_DAMPING]
         Health.clear(self._state.partial[self._index])
         return PreparedLaunch(launch, where, drive, before)
 

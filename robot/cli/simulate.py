@@ -24,13 +24,16 @@ def press(
         Any, typer.Option(parser=quantities("length", 2), metavar="X,Y", help="Then slide by this much.")
     ] = "0,0",
     twist: Annotated[Any, angle("Then turn about the vertical.")] = "0",
-    radius: Annotated[Any, length("Of a sphere or cylinder.")] = "4 mm",
-    height: Annotated[Any, length("Of a cylinder.")] = "5 mm",
+    radius: Annotated[Any, length("Of a sphere or cylinder; 4 mm if left out.")] = None,
+    height: Annotated[Any, length("Of a cylinder; 5 mm if left out.")] = None,
     size: Annotated[
-        Any, typer.Option(parser=quantities("length", 3), metavar="X,Y,Z", help="Of a box.")
-    ] = "5 mm, 5 mm, 5 mm",
+        Any,
+        typer.Option(parser=quantities("length", 3), metavar="X,Y,Z", help="Of a box; 5, 5, 5 mm if left out."),
+    ] = None,
     edge_radius: Annotated[Any, length("Of a box's or cylinder's edges; half an element if left out.")] = None,
-    scale: Annotated[float, typer.Option(help="Metres per unit of the .stl file.")] = 1e-3,
+    scale: Annotated[
+        float | None, typer.Option(help="Metres per unit of the .stl file; 0.001 if left out.", show_default=False)
+    ] = None,
     preset: Annotated[Literal["learn", "draft", "standard"], typer.Option(help="Resolution.")] = "standard",
     sensor: Annotated[
         str, typer.Option(help="Its name, the path of a YAML file, or of a calibrated bundle.")
@@ -50,7 +53,7 @@ def press(
     from tacsim.config.gel import fit_gel, says_gel_size
 
     folder = new_directory(out, "press")
-    shape = [_geometry(indenter, radius, height, size, scale)]
+    shape = [_geometry(indenter, {"radius": radius, "height": height, "size": size, "scale": scale})]
     if edge_radius is not None:
         shape.append(f"indenter.edge_radius={edge_radius!r}")
     scene = load_scene("press", [f"preset={preset}", *shape, *(set_ or [])])
@@ -89,19 +92,27 @@ def press(
     say_files(*sorted(folder.iterdir()))
 
 
-def _geometry(indenter: str, radius: float, height: float, size: tuple[float, ...], scale: float) -> str:
-    """The override that puts an indenter into a scene. Raises typer.BadParameter for a name that is none."""
-    described: dict[str, dict[str, Any]] = {
-        "sphere": {"radius": radius},
-        "cylinder": {"radius": radius, "height": height},
-        "box": {"size": size},
+def _geometry(indenter: str, given: dict[str, Any]) -> str:
+    """The override that puts an indenter into a scene. Raises typer.BadParameter for a name that is none, and for what
+    is `given` of another."""
+    usual: dict[str, dict[str, Any]] = {
+        "sphere": {"radius": 4e-3},
+        "cylinder": {"radius": 4e-3, "height": 5e-3},
+        "box": {"size": (5e-3, 5e-3, 5e-3)},
     }
-    if indenter in described:
-        return f"indenter.geometry={json.dumps({'shape': indenter, **described[indenter]})}"
-    if not indenter.lower().endswith(".stl"):
+    mesh = {"path": str(Path(indenter).absolute()), "scale": 1e-3}
+    if indenter not in usual and not indenter.lower().endswith(".stl"):
         words = f"'{indenter}' is no indenter; allowed: sphere, cylinder, box, or the path of an .stl file"
         raise typer.BadParameter(words, param_hint="INDENTER")
-    return f"indenter.geometry={json.dumps({'shape': 'stl', 'path': str(Path(indenter).absolute()), 'scale': scale})}"
+    described = usual.get(indenter, mesh)
+    for name, value in given.items():
+        if value is not None and name not in described:
+            has = " and ".join(f"--{own}" for own in described if own != "path")
+            words = f"'{indenter}' has none; it has {has}"
+            raise typer.BadParameter(words, param_hint=f"--{name}")
+    own = {name: value for name, value in given.items() if value is not None}
+    shape = indenter if indenter in usual else "stl"
+    return f"indenter.geometry={json.dumps({'shape': shape, **described, **own})}"
 
 
 def reproduce(

@@ -200,6 +200,20 @@ def test_press_slides_and_twists_against_friction(tmp_path: Path) -> None:
     assert deep[:, 1].mean() == pytest.approx(159.5 + 0.5 / 0.0625, abs=3)  # +x is to the right, where the box went
 
 
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("sphere", "--size", "1 mm, 1 mm, 1 mm"), "--size: 'sphere' has none; it has --radius"),
+        (("cylinder", "--scale", "0.01"), "--scale: 'cylinder' has none; it has --radius and --height"),
+        (("box", "--radius", "3 mm"), "--radius: 'box' has none; it has --size"),
+        (("part.stl", "--height", "3 mm"), "--height: 'part.stl' has none; it has --scale"),
+    ],
+)
+def test_a_size_of_another_indenter_is_refused(words: tuple[str, ...], said: str) -> None:
+    result = tacsim("press", *words)
+    assert result.exit_code == 2 and said in " ".join(result.stderr.split())
+
+
 @pytest.mark.parametrize(("name", "content", "said"), [("e", b"", "is empty"), ("t", bytes(84) + b"x", "should have")])
 def test_a_broken_mesh_file_ends_with_2(name: str, content: bytes, said: str, tmp_path: Path) -> None:
     (tmp_path / f"{name}.stl").write_bytes(content)

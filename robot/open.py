@@ -196,6 +196,8 @@ def make_vector_env(
 
 
 def _drawn(variants: Sequence[Sequence[str]], randomise: Randomised) -> Sequence[Sequence[str]]:
+    if not isinstance(variants, Sequence):
+        raise TypeError(f"variants are a list of lists of overrides, [['task.goal=6 mm']]; {variants!r} was given")
     if randomise is None:
         return variants
     if variants:

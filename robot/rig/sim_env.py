@@ -21,6 +21,8 @@ from tacsim.models.sensor import Lighting
 from tacsim.sim.stage import StatePool, require_same_gels
 from tacsim.tasks import make_task
 
+MOST_ENVIRONMENTS = 10_000  # beyond any machine's memory
+
 Episodes = Sequence[tuple[RigConfig, str]]  # rigs, and what makes each of them in words
 
 
@@ -39,8 +41,8 @@ def open_vector_env(
 ) -> TacsimVectorEnv:
     """`number` of these environments in one batch. Raises CannotOpen, ValueError."""
     config, variants = episodes[0][0], _variants(episodes)
-    if number < 1:
-        raise ValueError(f"a vector environment needs at least one environment, got {number}")
+    if number not in range(1, MOST_ENVIRONMENTS + 1):
+        raise ValueError(f"a vector environment has 1 to {MOST_ENVIRONMENTS:,} environments, got {number!r}")
     modes = [mode.value for mode in AutoresetMode]
     if autoreset_mode not in (*AutoresetMode, *modes):
         raise ValueError(f"autoreset_mode must be one of {', '.join(modes)}, got {autoreset_mode!r}")
@@ -49,9 +51,9 @@ def open_vector_env(
             f"rig '{config.name}': physics 'seed' does not run in a batch; use physics 'hybrid', or "
             "gymnasium.make_vec(..., vectorization_mode='sync')"
         )
-    batch, pool = SharedBatch([config.scene] * number), StatePool()
+    batch, pool = SharedBatch([config.scene] * int(number)), StatePool()
     members = []
-    for index in range(number):
+    for index in range(int(number)):
         simulation = simulate(config, partial(batch.world, index), pool, parallel=False)
         members.append(Member(_env(simulation, config, variants, render_mode, features), simulation.clock))
     return TacsimVectorEnv(members, batch, autoreset_mode)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
@@ -197,16 +197,20 @@ def _load(annotation: Any, source: str | Path, overrides: Sequence[str]) -> Any:
     return _validate(annotation, root, state)
 
 
-def texts(overrides: Sequence[str]) -> Sequence[str]:
-    """The same. Raises TypeError for a single text, whose letters would be taken one by one."""
+def texts(overrides: object) -> Sequence[str]:
+    """The same. Raises TypeError for what is no list of texts; of a single text, letters would be taken one by one."""
     if isinstance(overrides, str):
         raise TypeError(f"overrides are lists of texts, [{overrides!r}]; a single text was given")
-    return overrides
+    if not (isinstance(overrides, Sequence) and all(isinstance(text, str) for text in overrides)):
+        raise TypeError(f"overrides are lists of texts, such as ['scene.preset=learn']; {overrides!r} was given")
+    return cast(Sequence[str], overrides)
 
 
 def _open(annotation: Any, source: str | Path, state: LoadState) -> Node:
     """The expanded tree of a file that was named by any path, or by the name of a shipped file or of a sensor of one's
-    own."""
+    own. Raises TypeError for what is neither."""
+    if not isinstance(source, str | Path):
+        raise TypeError(f"a configuration is given by its name, or by the path of its file; {source!r} was given")
     place = Place(str(source) or "(no name)")
     kind = kind_of(models(annotation))
     try:

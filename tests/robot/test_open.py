@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from robot.open import RIG_ATTACHMENT, CannotOpen, make_env, open_rig
+from robot.open import RIG_ATTACHMENT, CannotOpen, make_env, make_vector_env, open_rig
 from tacsim.config import ConfigError, load_rig
 from tacsim.interface import Action, Needs
 from tacsim.record.episode import EpisodeMeta, Step
@@ -169,7 +169,12 @@ def test_a_loaded_configuration_takes_no_more_overrides() -> None:
     ("arguments", "said"),
     [
         ({"overrides": "scene.preset=learn"}, "lists of texts"),
+        ({"overrides": 5}, "lists of texts, such as .*; 5 was given"),
+        ({"overrides": [None]}, r"\[None\] was given"),
         ({"variants": ["scene.preset=learn"]}, "lists of texts"),
+        ({"variants": [[["a"]]]}, r"\[\['a'\]\] was given"),
+        ({"variants": 3}, "list of lists of overrides, .*; 3 was given"),
+        ({"rig": 4}, "by the path of its file; 4 was given"),
         ({"features": {"period": "often"}}, "features: "),
         ({"features": 5}, "features: "),
         ({"randomise": 5}, "randomise: "),
@@ -179,6 +184,12 @@ def test_wrong_arguments_of_an_environment_are_told_in_words(arguments: dict[str
     with pytest.raises((TypeError, ConfigError), match=said) as caught:
         make_env(**arguments)
     assert "pydantic" not in str(caught.value)
+
+
+@pytest.mark.parametrize("number", [0, -1, 2.5, "2", 10**7])
+def test_a_number_of_environments_that_is_none_is_refused(number: Any) -> None:
+    with pytest.raises(ValueError, match=f"1 to 10,000 environments, got {number!r}"):
+        make_vector_env(number)
 
 
 @pytest.mark.parametrize("first", ["", "import tacsim.gym.plugin as p; p.install()\n"])

@@ -77,7 +77,7 @@ ZETA_GEL = 0.5  # of its damping, zeta c / thickness: it makes the gel lag, and 
 # Where a slide goes across the drag that is there (`turn`), its own lags behind in direction: by speed times damping,
 # and the more the less friction there is. So it has so much of its damping, and the friction itself is the share of
 # its speed, within these.
-TURNS_DAMPED, TURNS_AT = 0.4, (0.35, 0.7)
+TURNS_DAMPED, TURNS_AT = 0.4, (0.35, 0.5)
 SHORT_GROWING = 1.0  # gel thicknesses: what is pressed in while it slides goes as slowly as a path of this length
 CLEARANCE = 0.1e-3  # gap between gel and indenter at construction [m]
 GRID_SPACING = 0.1e-3  # of a mesh's distance grid [m]

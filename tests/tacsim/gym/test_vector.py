@@ -196,7 +196,7 @@ def test_what_cannot_be_a_batch_says_so() -> None:
         make_native(2, rig="mock", overrides=(), variants=())
     with pytest.raises(ValueError, match="one of NextStep, SameStep, Disabled, got 'Sometimes'"):
         make_native(2, "Sometimes")
-    with pytest.raises(ValueError, match="at least one"):
+    with pytest.raises(ValueError, match="1 to 10,000"):
         make_native(0)
     with pytest.raises(ValueError, match=r"variant 0: a new scene must keep gel\.size"):
         make_native(2, variants=[["scene.gel.size=[10 mm, 10 mm, 4 mm]"]])

@@ -9,7 +9,7 @@ sticks. Everything else is in the sensor frame [mm, MPa]. Why: docs/physics.md.
 from typing import Any, NamedTuple
 
 from tacsim.compute.runtime import ti
-from tacsim.physics.contact.contact import CONTACT_DAMPING, MEMORY_RATE, friction, surface_node
+from tacsim.physics.contact.contact import CONTACT_DAMPING, friction, surface_node
 from tacsim.physics.contact.distance import GRID, DistanceGrid, box_distance, signed_distance
 from tacsim.physics.exec import layout
 from tacsim.physics.exec.environment import record_most, record_sum
@@ -38,7 +38,8 @@ POINTS = 3  # quadrature points along one edge of a surface cell
 # surface acts twice, in what it feels and in what it hands on: a wave finds the half-space, to fourth order.
 SMOOTHING = 0.065
 SPLINE_SMOOTHING = 0.125  # of the quadratic B-spline over the same nodes
-TANGENT_STIFFNESS = 0.25  # over the normal one: meets the torsion of a bonded punch at elements of 1, 0.5 and 0.25 mm
+TANGENT_STIFFNESS = 0.375  # over the normal one: meets the torsion of a bonded punch at elements of 1, 0.5 and 0.25 mm
+CARRIED = 0.075  # share of a change of the pressure that nodes take over each substep
 FORGOTTEN = 1e-6  # shear moduli: a pressure below that is none
 TOUCHABLE = 0.5  # elements: a point farther from the indenter touches nothing
 MARGIN = 1.0  # elements: nothing passes so much in one substep, so cells that are farther have forgotten
@@ -165,7 +166,7 @@ def carry(env: ti.template(), part, gels: ti.template()):
             if j == 0 or j == gels.ny:
                 area *= 0.5
             # what hardly presses any more is let go of, not halved for ever
-            new = old + MEMORY_RATE * (total / area - old)
+            new = old + CARRIED * (total / area - old)
             gels.surface[at] = ti.select(total == 0.0 and new < least, 0.0, new)
         j += 1
         if j == row:

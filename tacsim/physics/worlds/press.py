@@ -79,13 +79,14 @@ ZETA_GEL = 0.5  # of its damping, zeta c / thickness: it makes the gel lag, and 
 # its speed, within these.
 TURNS_DAMPED, TURNS_AT = 0.4, (0.35, 0.5)
 SHORT_GROWING = 1.0  # gel thicknesses: what is pressed in while it slides goes as slowly as a path of this length
+WAVE = 1.5  # a point gives way as a half-space does to a wave of so many point spacings: contact is as wide as it is
 CLEARANCE = 0.1e-3  # gap between gel and indenter at construction [m]
 GRID_SPACING = 0.1e-3  # of a mesh's distance grid [m]
 UNSEEN = 0.5  # spacings of contact points: how deep an indenter may dip between them; the largest such ball: 0.35
 # At this friction the limit follows the pressure within the time of a wave through the gel: in half of it slides
 # flutter. Friction itself feeds that, so less of it may follow as much quicker, as may what is pressed in while it
 # slides, which would be dragged up to 11 % too little; up to so many times.
-FLUTTERING, QUICKEST = 1.5, 4.0
+FLUTTERING, QUICKEST = 1.5, 6.0
 MARGIN = 2.0  # elements: what is further from a mesh does not touch it in the next launch
 TOO_MUCH = "cut off parts of mesh and gel that cannot touch; worlds of a smaller batch have more room each"
 
@@ -120,10 +121,11 @@ def press_substeps(
 
 
 def contact_stiffness(gel: GelParams, step: float) -> float:
-    """Of a contact point [MPa/mm]: that of a half-space to the shortest wave of pressure that the points can carry, but
-    no more than the mass of the surface's nodes allows in a `step` [mm]."""
+    """Of a contact point [MPa/mm]: that of a half-space to a wave of pressure of WAVE point spacings, but no more than
+    the mass of the surface's nodes allows in a `step` [mm]."""
     mu, lam = gel.mu, gel.lam
-    half_space = (2 * math.pi * POINTS / gel.spacing) * 2 * mu * (lam + mu) / (lam + 2 * mu)  # k E / (2 (1 - nu^2))
+    wave_number = 2 * math.pi * POINTS / (WAVE * gel.spacing)
+    half_space = wave_number * 2 * mu * (lam + mu) / (lam + 2 * mu)  # k E / (2 (1 - nu^2))
     return min(half_space, gel.density * gel.spacing / (2 * step**2))
 
 

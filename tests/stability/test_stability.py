@@ -111,8 +111,8 @@ EXPECTED: dict[str, dict[str, Callable[[Config], bool] | str]] = {
         "seed": balanced,
     },
     # Half of the gel is borne, nine tenths are not.
-    "gel to a tenth, plate": {"press": "inverted or crushed"},
-    # Its edge tears the gel 3 mm deep; whether an element is crushed first or a node is thrown hangs on a hair.
+    # Which limit is met first, an element crushed or a node thrown, hangs on a hair; so it does 3 mm deep in a punch.
+    "gel to a tenth, plate": {"press": "of the lower gel"},
     "gel to a tenth, punch": {"press": "of the lower gel"},
     "one layer of particles": dict.fromkeys(("hybrid", "seed"), "a body needs 3"),
     "scene of 10 mm": {"hybrid": balanced, "seed": balanced},

@@ -9,7 +9,7 @@ sticks. Everything else is in the sensor frame [mm, MPa]. Why: docs/physics.md.
 from typing import Any, NamedTuple
 
 from tacsim.compute.runtime import ti
-from tacsim.physics.contact.contact import CONTACT_DAMPING, friction, surface_node
+from tacsim.physics.contact.contact import CONTACT_DAMPING, MEMORY_RATE, friction, surface_node
 from tacsim.physics.contact.distance import GRID, DistanceGrid, box_distance, signed_distance
 from tacsim.physics.exec import layout
 from tacsim.physics.exec.environment import record_most, record_sum
@@ -38,8 +38,10 @@ POINTS = 3  # quadrature points along one edge of a surface cell
 # surface acts twice, in what it feels and in what it hands on: a wave finds the half-space, to fourth order.
 SMOOTHING = 0.065
 SPLINE_SMOOTHING = 0.125  # of the quadratic B-spline over the same nodes
-TANGENT_STIFFNESS = 0.375  # over the normal one: meets the torsion of a bonded punch at elements of 1, 0.5 and 0.25 mm
-CARRIED = 0.075  # share of a change of the pressure that nodes take over each substep
+TANGENT_STIFFNESS = 0.25  # over the normal one: meets the torsion of a bonded punch at elements of 1, 0.5 and 0.25 mm
+# Share of a point's stiffness where it is little inside an indenter, or before it: so a contact is as wide as
+# independent finite elements find it. So many elements inside it has all of it, or edges would cut in.
+RIM, EDGE = 0.6, 0.05
 FORGOTTEN = 1e-6  # shear moduli: a pressure below that is none
 TOUCHABLE = 0.5  # elements: a point farther from the indenter touches nothing
 MARGIN = 1.0  # elements: nothing passes so much in one substep, so cells that are farther have forgotten
@@ -166,7 +168,7 @@ def carry(env: ti.template(), part, gels: ti.template()):
             if j == 0 or j == gels.ny:
                 area *= 0.5
             # what hardly presses any more is let go of, not halved for ever
-            new = old + CARRIED * (total / area - old)
+            new = old + MEMORY_RATE * (total / area - old)
             gels.surface[at] = ti.select(total == 0.0 and new < least, 0.0, new)
         j += 1
         if j == row:
@@ -236,7 +238,8 @@ def point_push(env: ti.template(), gels: ti.template(), indenter: ti.template(),
     phi, n_local = signed_distance(env, shape.kind, shape.size, y, shape.grid)
     touching, push = False, vec4(0.0)
     if phi < TOUCHABLE * h:
-        pressure = us[3] - k_n * phi
+        stiff = RIM + (1.0 - RIM) * ti.max(0.0, ti.min(1.0, -phi / (EDGE * h)))
+        pressure = us[3] - stiff * k_n * phi
         n = shape.rotate @ n_local  # out of the indenter: pushes the gel
         moving = shape.velocity + shape.spin.cross(x - shape.centre) - vec3(vs[0], vs[1], vs[2])  # relative to the gel
         closing = moving.dot(n)

@@ -6,16 +6,12 @@ Contact that slips keeps the shear that a motion leaves in it. Why each of these
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tacsim import pose as se3
-from tacsim.interface import Pose
 from tacsim.models.scene import CATCHING
-from tacsim.physics.motion.path import displacements_between, path_along
 
 # Of the speed of the gel's shear wave: up to it a slide ends within 2 % of a slow one; at 0.25 it is up to 3 % off, at
 # 0.5 up to 17 %
@@ -29,24 +25,20 @@ DEEP_WALLS, DEEP = 0.15, 0.25
 ROUNDING = 1e-6
 
 
-def growth(start: Sequence[Pose], end: Sequence[Pose]) -> float:
-    """0 to 1: how far an indenter, the second frame, is pressed into the gel of the first while it slides along its
-    surface: 1 where it comes deeper by a quarter of its way along, or more."""
-    sensor, indenter = displacements_between(start, end)[:, :3]
-    closed = float((sensor - indenter) @ se3.matrix(start[0])[:, 2])
-    slid = path_along(start, end, 0.0)
-    return min(1.0, 4.0 * closed / slid) if slid > 0.0 and closed > 0.0 else 0.0
+def growth(way: NDArray[np.float64]) -> float:
+    """0 to 1: how far an indenter is pressed into a gel while it goes `way` (3,), in the sensor's axes: 1 where it
+    comes deeper by a quarter of what it is slid, or more."""
+    slid = math.hypot(way[0], way[1])
+    return min(1.0, float(-4.0 * way[2] / slid)) if way[2] < 0.0 < slid else 0.0
 
 
-def turn(start: Sequence[Pose], end: Sequence[Pose], force: NDArray[np.float64], friction: float) -> float:
-    """0 to 1: what share of the drag that friction allows lies across the way that an indenter, the second frame, is
-    slid over the gel of the first; `force` (3,) on that, in its own axes [N]."""
-    sensor, indenter = displacements_between(start, end)[:, :3]
-    x, y, z = (indenter - sensor) @ se3.matrix(start[0])
-    slid, limit = math.hypot(x, y), friction * abs(force[2])
-    if slid <= ROUNDING * abs(z) or limit == 0.0:
+def turn(way: NDArray[np.float64], force: NDArray[np.float64], friction: float) -> float:
+    """0 to 1: what share of the drag that friction allows lies across the `way` (3,) that an indenter goes; `force`
+    (3,) on the sensor [N]; both in its axes."""
+    slid, limit = math.hypot(way[0], way[1]), friction * abs(force[2])
+    if slid <= ROUNDING * abs(way[2]) or limit == 0.0:
         return 0.0
-    return float(min(1.0, abs(force[0] * y - force[1] * x) / (limit * slid)))
+    return float(min(1.0, abs(force[0] * way[1] - force[1] * way[0]) / (limit * slid)))
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from tacsim.models.scene import Box, Cylinder, GelSurface, Mesh, Scene, Shape, S
 from tacsim.physics.contact.distance import BOX, CYLINDER, GRID, SPHERE
 from tacsim.physics.contact.indenter import (
     POINTS,
+    RIM,
     SMOOTHING,
     SPLINE_SMOOTHING,
     Anchor,
@@ -63,7 +64,7 @@ from tacsim.physics.gel.gel import GelParams, GelState, common_lattice, gel_para
 from tacsim.physics.gel.kernels import Lattice, gel_advance, gel_forces, gels_of
 from tacsim.physics.motion.controller import ForceReading, Integration, Launch, PreparedLaunch, force_floor
 from tacsim.physics.motion.inertia import Inertia, kernel_second
-from tacsim.physics.motion.path import SHORT_SLIDE, Path, path_along, plan
+from tacsim.physics.motion.path import SHORT_SLIDE, Path, path_along, path_length, plan
 from tacsim.physics.motion.slide import Slide, growth, turn
 from tacsim.physics.units import MM, MPA
 from tacsim.physics.worlds.fem import FemState, FemWorld, stack_drives
@@ -73,20 +74,21 @@ from tacsim.pose import inverse, relative, rotate
 # dt / (spacing / wave speed). Edges of a rigid box tear the surface up at 0.6, without a NaN; and the penalty falls
 # with the step's square, so 0.5 costs overlap.
 COURANT = 0.4
-ZETA_GEL = 0.5  # of its damping, zeta c / thickness: it makes the gel lag, and friction remembers that
+# Of its damping, zeta c / thickness: it makes the gel lag, and friction remembers that. What a drag lags by goes with
+# zeta over the speed of the shear wave, so no more than so many times that: of a gel beyond nu = 0.48 it is less.
+ZETA_GEL, ZETA_BY_SHEAR = 0.5, 2.55
 # Where a slide goes across the drag that is there (`turn`), its own lags behind in direction: by speed times damping,
 # and the more the less friction there is. So it has so much of its damping, and the friction itself is the share of
 # its speed, within these.
 TURNS_DAMPED, TURNS_AT = 0.4, (0.35, 0.5)
 SHORT_GROWING = 1.0  # gel thicknesses: what is pressed in while it slides goes as slowly as a path of this length
-WAVE = 1.5  # a point gives way as a half-space does to a wave of so many point spacings: contact is as wide as it is
 CLEARANCE = 0.1e-3  # gap between gel and indenter at construction [m]
 GRID_SPACING = 0.1e-3  # of a mesh's distance grid [m]
 UNSEEN = 0.5  # spacings of contact points: how deep an indenter may dip between them; the largest such ball: 0.35
 # At this friction the limit follows the pressure within the time of a wave through the gel: in half of it slides
 # flutter. Friction itself feeds that, so less of it may follow as much quicker, as may what is pressed in while it
 # slides, which would be dragged up to 11 % too little; up to so many times.
-FLUTTERING, QUICKEST = 1.5, 6.0
+FLUTTERING, QUICKEST = 1.5, 8.0
 MARGIN = 2.0  # elements: what is further from a mesh does not touch it in the next launch
 TOO_MUCH = "cut off parts of mesh and gel that cannot touch; worlds of a smaller batch have more room each"
 
@@ -121,11 +123,10 @@ def press_substeps(
 
 
 def contact_stiffness(gel: GelParams, step: float) -> float:
-    """Of a contact point [MPa/mm]: that of a half-space to a wave of pressure of WAVE point spacings, but no more than
-    the mass of the surface's nodes allows in a `step` [mm]."""
+    """Of a contact point [MPa/mm]: that of a half-space to the shortest wave of pressure that the points can carry, but
+    no more than the mass of the surface's nodes allows in a `step` [mm]."""
     mu, lam = gel.mu, gel.lam
-    wave_number = 2 * math.pi * POINTS / (WAVE * gel.spacing)
-    half_space = wave_number * 2 * mu * (lam + mu) / (lam + 2 * mu)  # k E / (2 (1 - nu^2))
+    half_space = (2 * math.pi * POINTS / gel.spacing) * 2 * mu * (lam + mu) / (lam + 2 * mu)  # k E / (2 (1 - nu^2))
     return min(half_space, gel.density * gel.spacing / (2 * step**2))
 
 
@@ -263,7 +264,9 @@ class PressWorld(FemWorld):
         self._index = index
         self._gel = self._state.gel[index]
         step = COURANT * self._gel.spacing
-        self._scaled = Inertia({GEL_DAMPING: ZETA_GEL / self._gel.thickness}, step)
+        self._shear = math.sqrt(self._gel.mu / self._gel.density)  # speed of its shear wave, over that of pressure
+        zeta = min(ZETA_GEL, ZETA_BY_SHEAR * self._shear)
+        self._scaled = Inertia({GEL_DAMPING: zeta / self._gel.thickness}, step)
         self._true = Inertia({GEL_DAMPING: 0.0}, step, kernel_second(self._gel, scene.gel.material.density))
         self._floor = force_floor(scene.gel.material.youngs_modulus * MPA, self._gel.thickness)
         params = {
@@ -290,7 +293,7 @@ class PressWorld(FemWorld):
     def reach(self) -> np.ndarray:
         """How far from the indenter the surface is still pressed [m], at its nodes (nx + 1, ny + 1)."""
         stiffness = float(self._state.params[self._index, STIFFNESS])
-        return np.asarray(self._state.gels.carried[self._index, 0] / (stiffness * MM))
+        return np.asarray(self._state.gels.carried[self._index, 0] / (RIM * stiffness * MM))
 
     def arrays(self) -> dict[str, np.ndarray]:
         state, i = self._state, self._index
@@ -310,28 +313,33 @@ class PressWorld(FemWorld):
         grows because the indenter is pressed in."""
         gel, lever, indenter, mach = self._gel, max(self._gel.half), self.scene.indenter, self.scene.peak_mach
         assert indenter is not None
-        growing, turning, force, self.unfollowed = 0.0, 0.0, self.wrench("lower")[:3], ""
-        if not force.any():  # nothing else says where it came to the gel
-            self._touched[:] = relative(*start).position[:2] * MM
+        growing, turning, self.unfollowed = 0.0, 0.0, ""
+        at = relative(*end)
+        way = (at.position - relative(*start).position) * MM
+        longest = path_length(start, end, lever)
+        faster = max(1.0, float(np.linalg.norm(way)) / longest) if longest > 0.0 else 1.0  # if they go opposite ways
         if indenter.friction > 0.0:
-            growing, turning = growth(start, end), turn(start, end, force, indenter.friction)
+            growing, turning = growth(way), turn(way, self.wrench("lower")[:3], indenter.friction)
             mach *= 1.0 - turning * (1.0 - min(max(indenter.friction, TURNS_AT[0]), TURNS_AT[1]))
         path = plan(
-            start, end, mach, self._scaled.step, lever, gel.thickness,
+            start, end, mach / faster, self._scaled.step, lever, gel.thickness,
             remembered=path_along(start, end, lever), short=SHORT_SLIDE + (SHORT_GROWING - SHORT_SLIDE) * growing,
         )  # fmt: skip
-        if indenter.friction > 0.0 and path.substeps:
-            at = relative(*end)
+        if indenter.friction > 0.0:
             slide = Slide(
-                length=path_along(start, end, 0.0),
+                length=math.hypot(way[0], way[1]),
                 away=float(np.linalg.norm(at.position[:2] * MM - self._touched)),
                 depth=(self.below(at.quaternion) - float(at.position[2])) * MM,
-                shear_mach=path.peak_mach(lever) / math.sqrt(gel.mu / gel.density),
+                shear_mach=faster * path.peak_mach(lever) / self._shear,
                 friction=indenter.friction,
                 edge_radius=self._edge_radius,
             )
-            self.unfollowed = slide.unfollowed(self.scene.element * MM, gel.thickness)
+            self.unfollowed = slide.unfollowed(min(self.scene.element * MM, gel.spacing), gel.thickness)
         return replace(path, growing=growing, turning=turning, unfollowed=self.unfollowed)
+
+    def place(self, poses: Mapping[str, Pose]) -> None:
+        super().place(poses)
+        self._touched[:] = relative(*self._poses.values()).position[:2] * MM
 
     def below(self, turn: np.ndarray) -> float:
         """How far the indenter's lowest point is below its origin, the centre of its bounding box, if that is turned by
@@ -401,6 +409,8 @@ class PressWorld(FemWorld):
         sums = partial.astype(np.float64).sum(axis=0)
         force, moment = sums[None, FORCE : FORCE + 3], sums[None, FORCE + 3 : FORCE + 6]
         backing = sums[None, BACKING : BACKING + 3]
+        if not force.any():
+            self._touched[:] = prepared.drive[-1, 0, 3, :2]
         if prepared.launch.held or (not force.any() and prepared.launch.last == prepared.launch.path.substeps):
             self._require_seen(prepared, health.overlap)
         reading = ForceReading(

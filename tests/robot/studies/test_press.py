@@ -47,12 +47,12 @@ def test_the_contact_of_a_slid_cylinder_has_no_holes() -> None:
 
 
 def test_a_press_whose_surface_folds_over_has_a_picture_and_says_so() -> None:
-    """A plate wider than the gel, half of it deep: the gel's rim rolls over, as that of rubber does. Force: the same at
-    Mach 0.004."""
+    """A plate wider than the gel, half of it deep: the gel's rim rolls over, as that of rubber does: sooner at
+    the default speed, whose force is 4 % above that at Mach 0.004."""
     motion = PressMotion(2e-3)
     scene, result = pressed("draft", motion, Box(size=(30e-3, 30e-3, 5e-3)))
     told = press_report(scene, motion, result, SENSOR)
-    assert told["folded"] is True and told["settled"] and told["force"] == pytest.approx(192.2, rel=0.02)
+    assert told["folded"] is True and told["settled"] and told["force"] == pytest.approx(1.038 * 195.1, rel=0.02)
     inner = result.height[:, 20:-20]  # the rest is the rim
     assert inner.min() > 1.9e-3 and inner.max() < 2.1e-3
     assert np.isfinite(result.height).all() and result.contact[:, 20:-20].mean() > 0.9

@@ -33,8 +33,8 @@ def pressed_ball(friction: float, preset: str, deep: float = 0.5e-3) -> PressWor
 @pytest.mark.parametrize(
     ("preset", "friction", "ratio"),
     [
-        ("standard", 0.3, 0.32), ("standard", 0.6, 0.647), ("standard", 1.0, 1.098), ("standard", 1.5, 1.666),
-        ("draft", 0.3, 0.32), ("draft", 0.6, 0.663), ("draft", 1.0, 1.148), ("draft", 1.5, 1.675),
+        ("standard", 0.3, 0.32), ("standard", 0.6, 0.647), ("standard", 1.0, 1.098), ("standard", 1.5, 1.657),
+        ("draft", 0.3, 0.32), ("draft", 0.6, 0.663), ("draft", 1.0, 1.147), ("draft", 1.5, 1.674),
     ],
 )  # fmt: skip
 def test_a_slid_ball_is_dragged_by_all_its_friction_at_the_default_speed(
@@ -48,10 +48,10 @@ def test_a_slid_ball_is_dragged_by_all_its_friction_at_the_default_speed(
 
 
 def test_a_steep_slide_in_two_is_one_and_nothing_shakes_apart() -> None:
-    """At mu = 1.5 corners of elements get narrow after 1.6 mm; 1.302 and 1.666 at Mach 0.001. They shook apart, and a
+    """At mu = 1.5 corners of elements get narrow after 1.6 mm; 1.302 and 1.656 at Mach 0.001. They shook apart, and a
     motion so retried ended at 1.60, one that came to rest again at 1.38."""
     w = pressed_ball(1.5, "standard")
-    for ratio in (1.302, 1.666):
+    for ratio in (1.302, 1.656):
         pose = w.pose("indenter")
         stats = w.move({"indenter": Pose(pose.position + [1e-3, 0, 0], pose.quaternion)})
         force = w.wrench("lower")
@@ -61,7 +61,7 @@ def test_a_steep_slide_in_two_is_one_and_nothing_shakes_apart() -> None:
 
 def test_a_short_slide_ends_as_a_slow_one() -> None:
     """0.3 and 0.6 mm at draft, where a part of the contact still sticks: the same mesh at Mach 0.001."""
-    for friction, ratios in ((0.3, (0.319, 0.325)), (0.6, (0.426, 0.651)), (1.0, (0.459, 0.818))):
+    for friction, ratios in ((0.3, (0.318, 0.325)), (0.6, (0.424, 0.651)), (1.0, (0.457, 0.815))):
         w = pressed_ball(friction, "draft")
         assert [slide(w, 0.3e-3), slide(w, 0.3e-3)] == pytest.approx(ratios, rel=0.02)
 
@@ -69,10 +69,10 @@ def test_a_short_slide_ends_as_a_slow_one() -> None:
 @pytest.mark.parametrize(
     ("shape", "friction", "way", "ratio"),
     [
-        (Sphere(radius=6e-3), 0.8, (0.6e-3, 0.0, 0.3e-3), 0.729),
-        (Cylinder(radius=2.5e-3, height=5e-3), 0.6, (1e-3, 0.0, 0.4e-3), 0.612),
-        (Box(size=(4e-3, 4e-3, 4e-3)), 0.8, (1e-3, 1e-3, 0.5e-3), 0.788),
-        (Sphere(radius=3e-3), 1.5, (1.5e-3, 0.0, 0.8e-3), 0.826),
+        (Sphere(radius=6e-3), 0.8, (0.6e-3, 0.0, 0.3e-3), 0.731),
+        (Cylinder(radius=2.5e-3, height=5e-3), 0.6, (1e-3, 0.0, 0.4e-3), 0.605),
+        (Box(size=(4e-3, 4e-3, 4e-3)), 0.8, (1e-3, 1e-3, 0.5e-3), 0.779),
+        (Sphere(radius=3e-3), 1.5, (1.5e-3, 0.0, 0.8e-3), 0.824),
     ],
 )
 def test_what_is_pressed_in_while_it_slides_is_dragged_as_slowly(
@@ -178,8 +178,8 @@ def test_a_slide_by_an_edge_that_catches_has_not_settled(
 @pytest.mark.parametrize(
     ("shape", "friction", "by", "ratios"),
     [
-        (Cylinder(radius=2e-3, height=4e-3), 0.7, (1e-3, 0.0), (0.7608, 0.2749)),
-        (Box(size=(5e-3, 3e-3, 4e-3)), 0.6, (1.039e-3, 0.6e-3), (0.663, 0.1072)),
+        (Cylinder(radius=2e-3, height=4e-3), 0.7, (1e-3, 0.0), (0.7571, 0.2889)),
+        (Box(size=(5e-3, 3e-3, 4e-3)), 0.6, (1.039e-3, 0.6e-3), (0.6624, 0.1209)),
     ],
 )
 def test_a_slide_and_less_than_half_of_it_back_end_as_slow_ones(
@@ -202,10 +202,10 @@ def test_a_slide_and_less_than_half_of_it_back_end_as_slow_ones(
 @pytest.mark.parametrize(
     ("preset", "shape", "friction", "deep", "ways", "ratios"),
     [
-        ("draft", Sphere(radius=5e-3), 0.4, 0.6e-3, ((0.0, 1.3e-3), (0.7e-3, 0.0)), (0.412, 0.1419)),
-        ("draft", Sphere(radius=4e-3), 0.7, 0.5e-3, ((1e-3, 0.0), (-0.3e-3, 0.7e-3)), (0.1855, 0.7247)),
-        ("draft", Box(size=(6e-3, 3.2e-3, 4e-3)), 0.38, 0.5e-3, ((0.0, 1.7e-3), (-1.3e-3, 0.0)), (-0.4387, 0.0766)),
-        ("draft", Cylinder(radius=2.5e-3, height=5e-3), 0.5, 0.4e-3, ((0.0, 1.3e-3), (1e-3, 0.0)), (0.5118, 0.1424)),
+        ("draft", Sphere(radius=5e-3), 0.4, 0.6e-3, ((0.0, 1.3e-3), (0.7e-3, 0.0)), (0.4119, 0.1419)),
+        ("draft", Sphere(radius=4e-3), 0.7, 0.5e-3, ((1e-3, 0.0), (-0.3e-3, 0.7e-3)), (0.187, 0.724)),
+        ("draft", Box(size=(6e-3, 3.2e-3, 4e-3)), 0.38, 0.5e-3, ((0.0, 1.7e-3), (-1.3e-3, 0.0)), (-0.4467, 0.0872)),
+        ("draft", Cylinder(radius=2.5e-3, height=5e-3), 0.5, 0.4e-3, ((0.0, 1.3e-3), (1e-3, 0.0)), (0.5077, 0.1461)),
         ("standard", Sphere(radius=5e-3), 0.3, 0.6e-3, ((0.0, 0.9e-3), (0.5e-3, 0.0)), (0.3039, 0.1063)),
     ],
 )
@@ -243,7 +243,7 @@ def test_many_small_slides_that_come_as_far_have_not_settled_either() -> None:
     other = PressWorld(w.scene)
     other.restore(w.snapshot())
     assert not other.move({"indenter": Pose(w.pose("indenter").position + [0.1e-3, 0, 0])}).settled
-    assert other.move({}).settled  # held on, what is there is at rest
+    assert not other.move({}).settled  # held on, it is no nearer to a slow one
     move(other, (0, 0, 2e-3))
     move(other, (0, 0, -2e-3))
     move(other, (0.6e-3, 0, 0))
@@ -277,7 +277,7 @@ def test_edges_of_a_file_catch_as_they_are_drawn(tmp_path: Path) -> None:
 @pytest.mark.parametrize("friction", [0.3, 1.0])
 def test_small_slides_end_as_slow_ones_and_cost_little(friction: float) -> None:
     """Four slides of 0.1 mm at draft, against the same mesh at Mach 0.001."""
-    slow = {0.3: (0.1493, 0.2606, 0.3189, 0.3232), 1.0: (0.1653, 0.3171, 0.4588, 0.5887)}[friction]
+    slow = {0.3: (0.1487, 0.26, 0.3182, 0.3228), 1.0: (0.1654, 0.3163, 0.4568, 0.5855)}[friction]
     w = pressed_ball(friction, "draft")
     ratios = [slide(w, 0.1e-3, 150) for _ in range(4)]
     assert ratios == pytest.approx(slow, rel=0.015)

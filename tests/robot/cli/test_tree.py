@@ -31,6 +31,8 @@ def tree(command: Any) -> dict[str, Any]:
 
 # The default depends on what is compared now: none of a scene, whose pictures are made in B's pixels
 CHANGED = {("tacsim compare", "--shift")}
+# What is left out is as before; told apart from what is given, a size of another indenter can be refused
+CHANGED |= {("tacsim press", option) for option in ("--radius", "--height", "--size", "--scale")}
 
 
 @pytest.mark.deep

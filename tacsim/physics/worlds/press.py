@@ -338,6 +338,7 @@ class PressWorld(FemWorld):
         return replace(path, growing=growing, turning=turning, unfollowed=self.unfollowed)
 
     def place(self, poses: Mapping[str, Pose]) -> None:
+        """See World. Where the indenter is then, it has come to the gel."""
         super().place(poses)
         self._touched[:] = relative(*self._poses.values()).position[:2] * MM
 
@@ -409,7 +410,7 @@ class PressWorld(FemWorld):
         sums = partial.astype(np.float64).sum(axis=0)
         force, moment = sums[None, FORCE : FORCE + 3], sums[None, FORCE + 3 : FORCE + 6]
         backing = sums[None, BACKING : BACKING + 3]
-        if not force.any():
+        if not force.any():  # here, not in `plan`, which flowing motions do not ask
             self._touched[:] = prepared.drive[-1, 0, 3, :2]
         if prepared.launch.held or (not force.any() and prepared.launch.last == prepared.launch.path.substeps):
             self._require_seen(prepared, health.overlap)

@@ -5,15 +5,6 @@ from __future__ import annotations
 import pytest
 
 from benchmarks.cases import press
-from benchmarks.harness.measure import Measurement
-
-
-def forces(coarse: Measurement, fine: Measurement, order: int) -> tuple[float, float]:
-    """Of the limit of fine meshes, from two of which the second is twice as fine; and of the layer [N]."""
-    assert coarse.figures["truth_n"] == fine.figures["truth_n"]
-    weight = 2**order
-    limit = (weight * fine.figures["force_n"] - coarse.figures["force_n"]) / (weight - 1)
-    return limit, fine.figures["truth_n"]
 
 
 def test_a_balls_dent_is_that_of_fine_meshes() -> None:
@@ -51,8 +42,7 @@ def test_a_shallow_balls_force_goes_to_that_of_an_elastic_layer(monkeypatch: pyt
 
 @pytest.mark.deep
 def test_a_flat_punchs_force_goes_to_that_of_an_elastic_layer() -> None:
-    """With h, since the mesh widens the punch by a share of an element; within a percent of the layer's."""
+    """Within a percent of the layer's at 0.5 mm (0.64, 0.16 at 0.25), within 4 at 1 mm (2.97)."""
     ((coarse,), (fine,)) = (press.flat_punch(h, 1) for h in (1e-3, 0.5e-3))
-    assert fine.error < 14.0  # %
-    limit, truth = forces(coarse, fine, order=1)
-    assert limit == pytest.approx(truth, rel=0.01)
+    assert fine.error < 1.0  # %
+    assert fine.error < coarse.error < 4.0

@@ -121,7 +121,8 @@ def press_substep(
 
 
 # One kernel may have local arrays in one of its loops only: Taichi 1.7 mixes up the constants of several (IR broken:
-# MatrixPtrStmt cannot have operand ConstStmt). So the substep of a body is three.
+# MatrixPtrStmt cannot have operand ConstStmt). So the substep of a body is three. A loop's length, if it is computed
+# where the loop begins, is a launch of its own on a device: hence all lengths at the beginning of a kernel.
 
 
 @ti.kernel
@@ -157,7 +158,12 @@ def scatter_of_hybrid(
 
     most_particles, most_nodes, most_links: of the largest body and grid.
     """
-    for e, p in ti.ndrange(counts.shape[0], most_particles):
+    columns = lattice.shape[0] // LATTICE_ROWS
+    most = 2 * columns + most_nodes
+    all_particles, all_nodes = counts.shape[0] * most_particles, counts.shape[0] * most_nodes
+    all_columns_and_nodes, all_links = counts.shape[0] * most, counts.shape[0] * most_links
+    for i in range(all_particles):
+        e, p = i // most_particles, i % most_particles
         env = ti.static(Environment(e, params, counts, partial))
         if is_active(env, clock) and p < env.count(layout.PARTICLES):
             gels = ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 2))
@@ -165,8 +171,8 @@ def scatter_of_hybrid(
             for g in range(2):
                 gel_contact(env, p, g, clock[0], drive, body, histories, gels, ceiling[e, g, clock[0] % 2])
             particles_to_grid(env, p, clock[0], body)
-    columns = lattice.shape[0] // LATTICE_ROWS
-    for e, n in ti.ndrange(counts.shape[0], 2 * columns + most_nodes):
+    for i in range(all_columns_and_nodes):
+        e, n = i // most, i % most
         env = ti.static(Environment(e, params, counts, partial))
         if is_active(env, clock):
             if n < 2 * columns:
@@ -176,40 +182,46 @@ def scatter_of_hybrid(
             elif n - 2 * columns < grid_nodes(env):
                 body = ti.static(Body(particles, masses, velocities, changes))
                 grid_changes(env, n - 2 * columns, body)
-    for e, n in ti.ndrange(counts.shape[0], most_links):
+    for i in range(all_links):
+        e, n = i // most_links, i % most_links
         env = ti.static(Environment(e, params, counts, partial))
         if is_active(env, clock) and n < env.count(layout.PUSHES + PARTS):
             push_leaders(env, n, ti.static(Body(particles, masses, velocities, changes, ends, shares)))
-    for e, n in ti.ndrange(counts.shape[0], 2 * columns + most_nodes):
+    for i in range(all_columns_and_nodes):
+        e, n = i // most, i % most
         env = ti.static(Environment(e, params, counts, partial))
         if is_active(env, clock):
             if n < 2 * columns:
                 gel_even(env, n, ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 2)))
             elif n - 2 * columns < grid_nodes(env):
                 cell_means(env, n - 2 * columns, CHANGE, ti.static(Body(particles, masses, velocities, changes)))
-    for e, n in ti.ndrange(counts.shape[0], 2 * columns + most_nodes):
+    for i in range(all_columns_and_nodes):
+        e, n = i // most, i % most
         env = ti.static(Environment(e, params, counts, partial))
         if is_active(env, clock):
             if n < 2 * columns:
                 gels = ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 2))
                 g, at = n // columns, n % columns
                 gel_advance_filtered(env, n, gels)
-                i, j = at // (gels.ny + 1), at % (gels.ny + 1)
-                height = surface[surface_at(gels, surface_row(env, gels, g) + i + 1, j + 1) + 2]
+                x, y = at // (gels.ny + 1), at % (gels.ny + 1)
+                height = surface[surface_at(gels, surface_row(env, gels, g) + x + 1, y + 1) + 2]
                 if height > ceiling[e, g, (clock[0] + 1) % 2]:
                     ti.atomic_max(ceiling[e, g, (clock[0] + 1) % 2], height)
             elif n - 2 * columns < grid_nodes(env):
                 second_changes(env, n - 2 * columns, ti.static(Body(particles, masses, velocities, changes)))
-    for e, node in ti.ndrange(counts.shape[0], most_nodes):
+    for i in range(all_nodes):
+        e, node = i // most_nodes, i % most_nodes
         env = ti.static(Environment(e, params, counts, partial))
         if is_active(env, clock) and node < grid_nodes(env):
             cell_means(env, node, SECOND, ti.static(Body(particles, masses, velocities, changes)))
-    for e, node in ti.ndrange(counts.shape[0], most_nodes):
+    for i in range(all_nodes):
+        e, node = i // most_nodes, i % most_nodes
         env = ti.static(Environment(e, params, counts, partial))
         if is_active(env, clock) and node < grid_nodes(env):
             grid_update(env, node, clock[0], drive, ti.static(Body(particles, masses, velocities, changes)))
             masses[e * env.count(layout.CAPACITY) + node] = strip(0.0)
-    for e, n in ti.ndrange(counts.shape[0], most_links):
+    for i in range(all_links):
+        e, n = i // most_links, i % most_links
         env = ti.static(Environment(e, params, counts, partial))
         if is_active(env, clock) and n < env.count(layout.PUSHES + PARTS):
             follow(env, n, ti.static(Body(particles, masses, velocities, changes, ends, shares)))
@@ -222,15 +234,20 @@ def gather_of_hybrid(
 ):  # fmt: skip
     """Last third: the grid back to the particles, and the sum of their velocities, block by block: an atomic addition a
     particle would queue for a few addresses, and in another order each time."""
-    for e, slot in ti.ndrange(counts.shape[0], PARTS):
+    slots, all_particles = counts.shape[0] * PARTS, counts.shape[0] * most_particles
+    blocks, sums_of_slots = counts.shape[0] * 3 * BLOCKS, counts.shape[0] * PARTS * 3
+    for i in range(slots):
+        e, slot = i // PARTS, i % PARTS
         env = ti.static(Environment(e, params, counts, partial))
         if is_active(env, clock):
             keep_record(env, slot, clock[0], records)
-    for e, p in ti.ndrange(counts.shape[0], most_particles):
+    for i in range(all_particles):
+        e, p = i // most_particles, i % most_particles
         env = ti.static(Environment(e, params, counts, partial))
         if is_active(env, clock) and p < env.count(layout.PARTICLES):
             grid_to_particles(env, p, ti.static(Body(particles, masses, velocities)))
-    for e, d, block in ti.ndrange(counts.shape[0], 3, BLOCKS):
+    for i in range(blocks):
+        e, d, block = i // (3 * BLOCKS), i // BLOCKS % 3, i % BLOCKS
         env = ti.static(Environment(e, params, counts, partial))
         if is_active(env, clock):
             row = (e * layout.PARTICLE_ROWS + layout.VELOCITY + d) * env.count(layout.STRIDE)
@@ -238,7 +255,8 @@ def gather_of_hybrid(
             for n in range((env.count(layout.PARTICLES) - block + BLOCKS - 1) // BLOCKS):
                 total += particles[row + n * BLOCKS + block]  # neighbouring threads read neighbours
             sums[e, d, block] = total
-    for e, slot, d in ti.ndrange(counts.shape[0], PARTS, 3):
+    for i in range(sums_of_slots):
+        e, slot, d = i // (3 * PARTS), i // 3 % PARTS, i % 3
         if clock[1] < counts[e, layout.STEPS]:
             total = 0.0
             for block in range(slot * BLOCKS // PARTS, (slot + 1) * BLOCKS // PARTS):

@@ -8,7 +8,7 @@ copies since they were asked for.
 
 import contextlib
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -39,6 +39,13 @@ Numbers = tuple[np.ndarray, np.ndarray, np.ndarray]  # params, counts, partial: 
 Values = tuple[np.ndarray, int]  # distances from meshes, and their version: another whenever they have changed
 
 
+def runs_of(numbers: Sequence[int]) -> list[tuple[int, int]]:
+    """Where neighbours among ascending numbers begin and end: [0, 1, 2, 5] is 0 up to 3, and 5 up to 6."""
+    starts = [n for i, n in enumerate(numbers) if i == 0 or numbers[i - 1] != n - 1]
+    ends = [n + 1 for i, n in enumerate(numbers) if i == len(numbers) - 1 or numbers[i + 1] != n + 1]
+    return list(zip(starts, ends, strict=True))
+
+
 class DeviceState(ABC):
     """The arrays of a FemState on the device."""
 
@@ -53,6 +60,8 @@ class DeviceState(ABC):
         self._shown = True  # the host's copies may have been written to since they were sent
         self._base = np.zeros((len(self._params), 3))  # what places in a survey are relative to
         self._found: dict[str, np.ndarray] = {}  # what is known of the present state: survey, surfaces, particles
+        self._surveys: dict[int, Survey] = {}  # of environments, from that
+        self._due: set[int] = set()  # environments whose present state is to be kept before anything changes it
 
     def _state(self) -> dict[str, tuple[np.ndarray, Any]]:
         """All that a motion changes, but for `partial`: the host's arrays, and what they consist of on the device, by
@@ -81,6 +90,7 @@ class DeviceState(ABC):
     def _send(self) -> dict[str, Any]:
         """The state on the device as anybody has left it."""
         if self._shown:
+            self._keep_due()
             self._gels.refresh()
             sent = self.arrays.sent
             try:
@@ -88,7 +98,7 @@ class DeviceState(ABC):
                     self.arrays.upload(name, host, dtype)
             finally:
                 if self.arrays.sent != sent:
-                    self._found = {}
+                    self._found, self._surveys = {}, {}
             self._shown = False
         return {name: self.arrays[name] for name in self._state()}
 
@@ -96,6 +106,7 @@ class DeviceState(ABC):
     def as_kept(self, moment: str) -> Iterator[None]:
         """While this lasts, the host's copies are what they were before the last "motion" (see `keep`) or "launch"."""
         with launching():
+            self._keep_due()
             self.bring_back()
             hosts = {name: host for name, (host, _) in self._state().items()}
             now = {name: host.copy() for name, host in hosts.items()}
@@ -117,8 +128,11 @@ class DeviceState(ABC):
     @launching()
     def survey(self, index: int) -> Survey:
         """What kernels find in an environment."""
-        found, particles = self._surveyed()[index], self._particles(index)
-        return survey_of(found, float(self._params[index, layout.GEL_SPACING]), particles, self._base[index])
+        found = self._surveyed()[index]
+        if index not in self._surveys:
+            spacing, particles = float(self._params[index, layout.GEL_SPACING]), self._particles(index)
+            self._surveys[index] = survey_of(found, spacing, particles, self._base[index])
+        return self._surveys[index]
 
     def _surveyed(self) -> np.ndarray:
         """(E, NUMBERS)"""
@@ -145,12 +159,22 @@ class DeviceState(ABC):
     def keep(self, index: int) -> None:
         """Keeps an environment's present state as that before a motion."""
         self._send()
-        self._copy(index, index + 1, "motion")
+        self._due.add(index)
+
+    def _keep_due(self) -> None:
+        """Neighbours in one call: in a batch all motions begin before the first launch."""
+        due, self._due = sorted(self._due), set()
+        for first, last in runs_of(due):
+            self._copy(first, last, "motion")
 
     def _copy(self, first: int, last: int, moment: str) -> None:
+        """Of environments `first` up to `last`; before a "launch" of those only that take part in it."""
         margin = (self._gels.arguments()[0].size - self._gels.nodes.size) // 2
         counts = self.arrays.upload("counts", self._counts, ti.i32)
-        arguments = {"first": first, "last": last, "counts": counts, "margin": margin, "no_margin": 0}
+        arguments = {
+            "first": first, "last": last, "resting": int(moment == "motion"), "counts": counts, "margin": margin,
+            "no_margin": 0,
+        }  # fmt: skip
         for name, (_, dtype) in self._state().items():
             arguments[name] = self.arrays[name]
             arguments[f"kept_{name}"] = self.arrays.allocate(f"{name} before {moment}", dtype, self.arrays[name].shape)
@@ -164,10 +188,11 @@ class DeviceState(ABC):
             **self._send(), **self._common(), **self._own(), "drive": self.arrays.upload("drive", drive, ti.f32),
             "ceiling": self.arrays.upload("ceiling", np.stack([highest, 0.0 * highest], axis=-1), ti.f32),
         }  # fmt: skip
+        self._keep_due()
         self._copy(0, len(drive), "launch")
         arguments["clock"].fill(0)
         self.arrays.forget(*self._state(), "ceiling", "partial")
-        self._ahead, self._found = True, {}
+        self._ahead, self._found, self._surveys = True, {}, {}
         self._substeps.run(arguments, drive.shape[1])
         self.arrays.download(partial=self._partial)
 

@@ -209,12 +209,14 @@ hybrid_survey = Graph(
 
 
 @ti.kernel
-def keep_floats(first: ti.i32, last: ti.i32, counts: Counts, source: Floats, target: Floats, margin: ti.i32):
-    """Copies environment `first`, or, of several up to `last`, those that move. margin: numbers before those of the
-    first of all environments, and behind those of the last."""
+def keep_floats(
+    first: ti.i32, last: ti.i32, resting: ti.i32, counts: Counts, source: Floats, target: Floats, margin: ti.i32
+):  # fmt: skip
+    """Copies environments `first` up to `last`: those that move, with `resting` all. margin: numbers before those of
+    the first of all environments, and behind those of the last."""
     each = (source.shape[0] - 2 * margin) // counts.shape[0]
     for e, n in ti.ndrange((first, last), each):
-        if last == first + 1 or counts[e, layout.STEPS] > 0:
+        if resting or counts[e, layout.STEPS] > 0:
             target[margin + e * each + n] = source[margin + e * each + n]
 
 
@@ -223,20 +225,20 @@ def keep_entries(dtype: Any) -> Any:
     array = ti.types.ndarray(dtype=dtype, ndim=3)
 
     @ti.kernel
-    def keep(first: ti.i32, last: ti.i32, counts: Counts, source: array, target: array):
+    def keep(first: ti.i32, last: ti.i32, resting: ti.i32, counts: Counts, source: array, target: array):
         for e, i, j in ti.ndrange((first, last), source.shape[1], source.shape[2]):
-            if last == first + 1 or counts[e, layout.STEPS] > 0:
+            if resting or counts[e, layout.STEPS] > 0:
                 target[e, i, j] = source[e, i, j]
 
     return keep
 
 
 @ti.kernel
-def keep_strips(first: ti.i32, last: ti.i32, counts: Counts, source: Strips, target: Strips):
+def keep_strips(first: ti.i32, last: ti.i32, resting: ti.i32, counts: Counts, source: Strips, target: Strips):
     """The same of nodes of grids."""
     nodes = source.shape[0] // counts.shape[0]
     for e, n in ti.ndrange((first, last), nodes):
-        if last == first + 1 or counts[e, layout.STEPS] > 0:
+        if resting or counts[e, layout.STEPS] > 0:
             target[e * nodes + n] = source[e * nodes + n]
 
 

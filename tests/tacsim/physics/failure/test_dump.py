@@ -89,6 +89,7 @@ def test_the_environment_goes_before_the_folder_of_a_command(tmp_path: Path, mon
     assert dump.FOLDER not in os.environ
 
 
+@pytest.mark.cpu
 def test_it_holds_all_that_a_replay_needs(made: Path) -> None:
     found = read(made)
     assert found.info.scene == SCENE

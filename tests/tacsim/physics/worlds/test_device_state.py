@@ -23,6 +23,7 @@ from tacsim.physics.failure import diagnosis
 from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.physics.motion.controller import SUBSTEPS_PER_LAUNCH
 from tacsim.physics.worlds.batch import Batch
+from tacsim.physics.worlds.device_state import runs_of
 from tacsim.physics.worlds.fem import FemWorld
 from tacsim.physics.worlds.hybrid import HybridWorld
 from tacsim.physics.worlds.hybrid_state import HybridState
@@ -178,6 +179,11 @@ def everything() -> dict[str, Any]:
         "verdicts": {"body": verdicts(second), "press": verdicts(PressWorld(press()))},
         "compared": {"body": compared(second), "press": compared(PressWorld(press()))},
     }
+
+
+def test_neighbours_are_kept_together() -> None:
+    assert runs_of([]) == []
+    assert runs_of([0, 1, 2, 5, 7, 8]) == [(0, 3), (5, 6), (7, 9)]
 
 
 @pytest.fixture(scope="module")

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from robot.studies.dump_view import open_world, replay
 from tacsim.interface import Pose
 from tacsim.models.scene import Body, BodyMaterial, Box, Gel, Indenter, Scene, Settling, Sphere
+from tacsim.physics.exec.lanes import ON_DEVICE
 from tacsim.physics.failure import dump
 from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.physics.seed.world import SeedWorld
@@ -154,6 +155,7 @@ def test_a_way_without_end_is_refused_before_what_flows_is_stopped() -> None:
     assert [{name: a.tobytes() for name, a in world.snapshot().items()} for world in batch.worlds] == before
 
 
+@pytest.mark.cpu
 def test_a_snapshot_on_the_way_goes_on_to_the_same_bits() -> None:
     world = squeezed()
     for _ in range(2):
@@ -167,6 +169,7 @@ def test_a_snapshot_on_the_way_goes_on_to_the_same_bits() -> None:
     assert ends[0] == ends[1]
 
 
+@pytest.mark.cpu
 def test_worlds_of_a_batch_flow_as_if_alone() -> None:
     batch, alone = Batch([CUBE, CUBE]), HybridWorld(CUBE)
     alone.move(nearer(alone, 0.8e-3))
@@ -179,6 +182,7 @@ def test_worlds_of_a_batch_flow_as_if_alone() -> None:
     assert not batch.worlds[1].snapshot()["rates"].any()
 
 
+@pytest.mark.cpu
 def test_a_batch_moves_in_real_time_as_if_alone() -> None:
     batch, alone = Batch([BALL, BALL]), PressWorld(BALL)
     alone.move(nearer(alone, 0.2e-3), duration=5e-3)
@@ -203,9 +207,12 @@ def test_a_step_that_diverges_is_taken_back_with_its_speed_and_dumped(
     assert failure.value.dump is not None
     found = dump.read(failure.value.dump)
     assert found.command.flow
-    assert replay(found, open_world(found)).identical
+    again = replay(found, open_world(found))
+    assert again.failure is not None and again.failure.cause == failure.value.cause
+    assert again.identical or ON_DEVICE  # which does not repeat its bits
 
 
+@pytest.mark.cpu
 def test_what_excludes_each_other_is_refused() -> None:
     world = PressWorld(BALL)
     with pytest.raises(ValueError, match="flowing motion"):

@@ -204,6 +204,7 @@ def test_the_grids_of_all_environments_together_are_bounded(tmp_path: Path) -> N
     assert state._values is laid and np.array_equal(state.counts, counts)
 
 
+@pytest.mark.cpu
 def test_a_second_world_of_a_mesh_reads_the_file_but_computes_nothing_anew(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -246,6 +247,7 @@ def owned(thing: object) -> Iterator[np.ndarray]:
                 yield from owned(part)
 
 
+@pytest.mark.cpu
 def test_a_press_allocates_no_particles_or_grid() -> None:
     """Its state is the gel, three numbers and one of each contact point on it, and little besides."""
     w = world(Sphere(radius=4e-3))

@@ -76,6 +76,34 @@ def edge_radius(indenter: Indenter, element: float) -> float:
     return 0.0 if _sharpest(indenter.geometry, fingerprint(indenter.geometry.path)) > SHARP else math.inf
 
 
+def edges(geometry: Shape, spacing: float) -> FloatArray:
+    """Points (n, 3) [m] on the edges that `edge_radius` speaks of, `spacing` [m] apart at most; none of a ball."""
+    match geometry:
+        case Box():
+            corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * extent(geometry) / 2
+            pairs = [(a, b) for i, a in enumerate(corners) for b in corners[i + 1 :] if (a != b).sum() == 1]
+            return _along(np.array(pairs), spacing)
+        case Sphere():
+            return np.empty((0, 3))
+        case Cylinder():
+            turns = np.linspace(0.0, 2 * np.pi, 1 + max(3, math.ceil(2 * np.pi * geometry.radius / spacing)))
+            rim = geometry.radius * np.stack([np.cos(turns), np.sin(turns), 0.0 * turns], axis=1)
+            return np.concatenate([rim + [0.0, 0.0, side * geometry.height / 2] for side in (-1, 1)])
+        case Mesh():
+            mesh = centred(geometry, fingerprint(geometry.path))
+            sharp = mesh.face_adjacency_convex & (mesh.face_adjacency_angles > SHARP)
+            return _along(np.asarray(mesh.vertices[mesh.face_adjacency_edges[sharp]]), spacing)
+
+
+def _along(pairs: FloatArray, spacing: float) -> FloatArray:
+    """Points (n, 3) on straight lines from one place to another, (k, 2, 3), both of these among them."""
+    if not len(pairs):
+        return np.empty((0, 3))
+    longest = float(np.linalg.norm(pairs[:, 1] - pairs[:, 0], axis=1).max())
+    shares = np.linspace(0.0, 1.0, 1 + max(1, math.ceil(longest / spacing)))[:, None, None]
+    return np.asarray(pairs[:, 0] + shares * (pairs[:, 1] - pairs[:, 0])).reshape(-1, 3)
+
+
 def volume(geometry: Shape) -> float:
     """Enclosed volume [m^3]. Raises what :func:`tacsim.geometry.mesh.load_mesh` raises."""
     match geometry:

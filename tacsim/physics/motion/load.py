@@ -1,7 +1,8 @@
 """Motion at a constant normal load: a sensor follows its target but along its own z axis, where its force is held.
 
-The path is cut into pieces, each a settled motion; after each the sensor moves along its z until the force is right, by
-the secant of the last two settled states (the first steps are short, for the stiffness is not known yet).
+The path is cut into pieces, each a settled motion on which the sensor also goes along its z by what the force is off;
+at the end it goes along its z alone until the force is right. Corrections are small: one that lets go of a contact, or
+presses what slips, changes its drag.
 """
 
 from __future__ import annotations
@@ -24,9 +25,11 @@ from tacsim.physics.move import MoveStats
 # All as shares of the gel's thickness
 PIECE = 0.06  # longest path between two corrections
 CORRECTION = 0.025  # longest correction
+ASSUMED = 0.02  # travel that would change a force by all of itself, until it has been measured: a shallow contact's
 TRAVEL = 0.6  # furthest from the target along z; beyond, the load counts as out of reach
 SMALLEST_LOAD = 1e-3  # that the tolerance is relative to at least, as a share of E thickness^2
 CORRECTIONS = 60  # after one piece
+LOOSE = 0.1  # share of the load that it may be off between two pieces
 
 
 class LoadNotReached(RuntimeError):
@@ -55,24 +58,25 @@ def require_loads(loads: Mapping[str, float], sensors: Sequence[str]) -> None:
 
 @dataclass
 class _NormalAxis:
-    """One sensor's z: the load wanted [N], travel from the target along z [m], and the settled state before."""
+    """One sensor's z: the load wanted [N], travel from the target along z [m], and how stiff the contact is."""
 
     wanted: float
     tolerance: float  # [N]
     travel: float = 0.0
-    before: tuple[float, float] | None = None  # travel, force
+    stiffness: float = 0.0  # [N/m] as last measured; 0: never
 
-    def correct(self, force: float, longest: float) -> None:
-        """Travels towards the load, at most by `longest` [m]: by the secant of two settled states where it is one."""
-        error = self.wanted - force
-        step = math.copysign(longest, error)
-        if self.before is not None and self.travel != self.before[0]:
-            stiffness = (force - self.before[1]) / (self.travel - self.before[0])
-            if stiffness > 0.0:
-                step = max(-longest, min(longest, error / stiffness))
+    def measure(self, travelled: float, gained: float) -> None:
+        """Takes the stiffness from a correction without a slide: how far [m], and what force that brought [N]."""
+        if travelled * gained > 0.0:
+            self.stiffness = gained / travelled
+
+    def correct(self, force: float, thickness: float) -> None:
+        """Travels towards the load; force: of the settled state that it starts from."""
+        longest, error = CORRECTION * thickness, self.wanted - force
+        stiffness = self.stiffness or force / (ASSUMED * thickness)
+        step = math.copysign(longest, error) if abs(error) >= stiffness * longest else error / stiffness
         if self.wanted == 0.0:  # a force fades towards nothing ever more slowly: go on until they part
             step = min(step, -longest / 4)
-        self.before = self.travel, force
         self.travel += step
 
 
@@ -104,20 +108,23 @@ def keep_loads(
         done.append((yield from move_and_settle(path, scene.settling, balanced=balanced, most=most)))
         end.update(poses)
 
-    def correct_at(share: float) -> Generator[Launch, Sequence[ForceReading], float]:
-        """The largest error [N] that is left."""
+    def correct_at(share: float, slack: float = 0.0) -> Generator[Launch, Sequence[ForceReading], float]:
+        """The largest error [N] that is left; slack: share of the load that is near enough."""
         for _ in range(CORRECTIONS):
             errors = {name: abs(axis.wanted - force(name)) for name, axis in axes.items()}
-            wrong = [name for name, axis in axes.items() if not errors[name] <= axis.tolerance]
+            wrong = [n for n, axis in axes.items() if not errors[n] <= max(axis.tolerance, slack * axis.wanted)]
             if not wrong:
                 return max(errors.values())
-            for name in wrong:
-                axes[name].correct(force(name), CORRECTION * thickness)
+            before = {name: (axes[name].travel, force(name)) for name in wrong}
+            for name, (_, felt) in before.items():
+                axes[name].correct(felt, thickness)
             beyond = [name for name in wrong if abs(axes[name].travel) > TRAVEL * thickness]
             if beyond:
                 wrong = beyond
                 break
             yield from settle_at(share)
+            for name, (travel, felt) in before.items():
+                axes[name].measure(axes[name].travel - travel, force(name) - felt)
         name = wrong[0]
         raise LoadNotReached(
             f"'{name}' does not reach a load of {axes[name].wanted:g} N: {force(name):.3g} N after "
@@ -130,8 +137,10 @@ def keep_loads(
     length = max(float(np.linalg.norm(targets[name].position - start[name].position)) for name in targets)
     pieces = max(1, math.ceil(length / (PIECE * thickness)))
     for piece in range(1, pieces + 1):
-        if piece > 1 and all(force(name) > 0.0 for name in loads):
-            yield from correct_at((piece - 1) / pieces)
+        if all(force(name) > 0.0 for name in loads):
+            yield from correct_at((piece - 1) / pieces, LOOSE)
+            for name, axis in axes.items():
+                axis.correct(force(name), thickness)
         yield from settle_at(piece / pieces)
     error = yield from correct_at(1.0)
     return replace(

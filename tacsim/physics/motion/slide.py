@@ -50,7 +50,7 @@ class Slide:
     depth: float  # of the indenter's lowest point below the untouched surface
     shear_mach: float  # its peak speed over that of the gel's shear wave
     friction: float
-    edge_radius: float  # of the indenter's edges; infinite where it has none
+    edge_radius: float  # of the indenter's edges; infinite where none reaches the gel
 
     def unfollowed(self, element: float, thickness: float) -> str:
         """Why it does not end as a slow one, and what to do; empty where it does. `element`: edge of an element of the
@@ -59,19 +59,20 @@ class Slide:
             return "contact slips by inertia at that speed; leave out settling.mach, or lower it"
         if self.depth <= 0.0:  # it is lifted off
             return ""
-        catching = CATCHING * element
-        if self.edge_radius < catching * (1 - 1e-9) and self.length > CAUGHT * element * (1 + ROUNDING):
+        catching, far = CATCHING * element, max(self.length, self.away) / (1 + ROUNDING)
+        if self.edge_radius < catching * (1 - 1e-9) and far > CAUGHT * element:
             return (
                 f"an edge sharper than {catching:g} mm catches on the mesh as it is slid; for a drag to rely on, give "
                 f"it so large an edge_radius (--edge-radius; an STL file: draw it round), or a smaller element_size"
             )
         walls, steep = math.isfinite(self.edge_radius), self.friction > SNAPPING
         deep = (DEEP_WALLS if walls or steep else DEEP) * thickness
-        far = (SNAPPED_SOONER if steep and self.depth > deep else SNAPPED) * thickness
-        if max(self.length, self.away) > far * (1 + ROUNDING) and (steep or self.depth > deep):
+        farthest = (SNAPPED_SOONER if steep and self.depth > deep else SNAPPED) * thickness
+        if far > farthest and (steep or self.depth > deep):
             what = f"above {SNAPPING:g}" if steep else f"of {self.friction:g} under what is deeper than {deep:.3g} mm"
             return (
-                f"slid by more than {far:.3g} mm, a gel {thickness:g} mm thick lets go in snaps at a friction {what}, "
-                f"which depend on the speed; for a drag to rely on, slide less far from where it came to the gel"
+                f"slid by more than {farthest:.3g} mm, a gel {thickness:g} mm thick lets go in snaps at a friction "
+                f"{what}, which depend on the speed; for a drag to rely on, slide less far from where it came to the "
+                f"gel"
             )
         return ""

@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 
 from tacsim.compute.runtime import start, ti
-from tacsim.geometry.shapes import MAX_NODES, edge_radius, extent, farthest
+from tacsim.geometry.shapes import MAX_NODES, edge_radius, edges, extent, farthest
 from tacsim.geometry.tiles import TILE, TiledDistance, tiled_distance
 from tacsim.interface import Pose
 from tacsim.models.scene import Box, Cylinder, GelSurface, Mesh, Scene, Shape, Sphere
@@ -89,6 +89,7 @@ UNSEEN = 0.5  # spacings of contact points: how deep an indenter may dip between
 # flutter. Friction itself feeds that, so less of it may follow as much quicker, as may what is pressed in while it
 # slides, which would be dragged up to 11 % too little; up to so many times.
 FLUTTERING, QUICKEST = 1.5, 8.0
+BULGE = 0.1  # of the depth of an indenter: how far the gel rises round it, at most
 MARGIN = 2.0  # elements: what is further from a mesh does not touch it in the next launch
 TOO_MUCH = "cut off parts of mesh and gel that cannot touch; worlds of a smaller batch have more room each"
 
@@ -279,7 +280,7 @@ class PressWorld(FemWorld):
         turned = np.array([0.0, 0.0, np.sin(scene.indenter.yaw / 2), np.cos(scene.indenter.yaw / 2)])
         self._rates = np.zeros((2, 6))
         self._touched = np.zeros(2)  # where the indenter was over the gel when it last did not touch it [mm]
-        self._edge_radius = MM * edge_radius(scene.indenter, scene.element)
+        self._edges = edges(scene.indenter.geometry, scene.element)
         self._poses = {"lower": Pose(), "indenter": Pose(np.array([0.0, 0.0, height / 2 + CLEARANCE]), turned)}
 
     def _stop(self) -> None:
@@ -326,16 +327,24 @@ class PressWorld(FemWorld):
             remembered=path_along(start, end, lever), short=SHORT_SLIDE + (SHORT_GROWING - SHORT_SLIDE) * growing,
         )  # fmt: skip
         if indenter.friction > 0.0:
+            depth = (self.below(at.quaternion) - float(at.position[2])) * MM
+            touch = self._edges_touch(at, BULGE * depth)
             slide = Slide(
                 length=math.hypot(way[0], way[1]),
                 away=float(np.linalg.norm(at.position[:2] * MM - self._touched)),
-                depth=(self.below(at.quaternion) - float(at.position[2])) * MM,
+                depth=depth,
                 shear_mach=faster * path.peak_mach(lever) / self._shear,
                 friction=indenter.friction,
-                edge_radius=self._edge_radius,
+                edge_radius=MM * edge_radius(indenter, self.scene.element) if touch else math.inf,
             )
             self.unfollowed = slide.unfollowed(min(self.scene.element * MM, gel.spacing), gel.thickness)
         return replace(path, growing=growing, turning=turning, unfollowed=self.unfollowed)
+
+    def _edges_touch(self, at: Pose, bulge: float) -> bool:
+        """Whether edges of the indenter, `at` this pose in the gel's frame, reach the gel; bulge: how far that rises
+        round it [mm]. Those at the back of an indenter do not, nor those of one that is wider than the gel."""
+        points = (rotate(at, self._edges) + at.position) * MM
+        return bool((np.all(np.abs(points[:, :2]) <= self._gel.half, axis=1) & (points[:, 2] <= bulge)).any())
 
     def place(self, poses: Mapping[str, Pose]) -> None:
         """See World. Where the indenter is then, it has come to the gel."""

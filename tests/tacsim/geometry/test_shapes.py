@@ -13,7 +13,7 @@ import trimesh
 
 from tacsim.geometry import shapes
 from tacsim.geometry.mesh import fingerprint, load_mesh
-from tacsim.geometry.shapes import distance, edge_radius, extent, farthest, particles, volume
+from tacsim.geometry.shapes import distance, edge_radius, edges, extent, farthest, particles, volume
 from tacsim.geometry.tiles import tiled_distance
 from tacsim.models.scene import Box, Cylinder, Indenter, Mesh, Shape, Sphere
 
@@ -77,6 +77,23 @@ def test_how_sharp_the_edges_of_an_indenter_are(tmp_path: Path) -> None:
     ):
         assert edge_radius(Indenter(geometry=geometry), 1 * MM) == radius
     assert edge_radius(Indenter(geometry=Box(size=(4 * MM, 4 * MM, 4 * MM)), edge_radius=0.1 * MM), 1 * MM) == 0.1 * MM
+
+
+def test_where_the_edges_of_an_indenter_are(tmp_path: Path) -> None:
+    box, cylinder = Box(size=(4 * MM, 2 * MM, 1 * MM)), Cylinder(radius=2 * MM, height=1 * MM)
+    on_box, on_rims = edges(box, 0.5 * MM), edges(cylinder, 0.5 * MM)
+    faces = np.isclose(np.abs(on_box), extent(box) / 2).sum(axis=1)
+    assert faces.min() == 2 and (faces == 3).sum() >= 8  # on two faces; and all corners
+    assert len(np.unique(on_box.round(9), axis=0)) >= 8 * 4 + 4  # every 0.5 mm of the long ones
+    assert np.allclose(np.hypot(*on_rims[:, :2].T), 2 * MM) and np.allclose(np.abs(on_rims[:, 2]), 0.5 * MM)
+    assert np.linalg.norm(np.diff(on_rims[: len(on_rims) // 2], axis=0), axis=1).max() <= 0.5 * MM
+    drawn = edges(stl(tmp_path, trimesh.creation.box((4, 2, 1)), "box.stl"), 0.5 * MM)
+    assert np.allclose(
+        np.sort(np.unique(drawn.round(9), axis=0), axis=0), np.sort(np.unique(on_box.round(9), axis=0), axis=0)
+    )
+    assert len(edges(Sphere(radius=4 * MM), 1 * MM)) == 0
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=4.0)
+    assert len(edges(stl(tmp_path, ball, "ball.stl"), 1 * MM)) == 0
 
 
 @pytest.mark.parametrize(

@@ -55,6 +55,38 @@ def test_the_load_stays_through_a_shear(physics: str) -> None:
     assert world.pose("upper").position[0] == pytest.approx(pose.position[0] + 0.4e-3, abs=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("legs", "drags"),
+    [
+        ([(1.2e-3, 0.0), (0.6e-3, 0.0)], [(0.765, 0.0), (0.782, 0.0)]),
+        ([(1.2e-3, 0.0), (-0.3e-3, 0.8e-3)], [(0.765, 0.0), (0.178, 0.739)]),
+    ],
+)
+def test_a_load_that_is_held_while_a_ball_is_slid_leaves_its_drag(
+    legs: list[tuple[float, float]], drags: list[tuple[float, float]]
+) -> None:
+    """Corrections that let go of the contact took a third of it. Drags: over the load, at Mach 0.001."""
+    ball = Indenter(geometry=Sphere(radius=4e-3), friction=0.7)
+    world = PressWorld(Scene(preset="draft", body=None, indenter=ball))
+    world.move(by(world, "indenter", (0, 0, -0.6e-3)))  # 0.5 mm deep
+    for leg, drag in zip(legs, drags, strict=True):
+        stats = world.move(by(world, "indenter", (*leg, 0.0)), loads={"lower": 0.3})
+        assert stats.settled and load(world, "lower") == pytest.approx(0.3, rel=0.01)
+        assert stats.substeps < 1400  # 1,460 and 1,340 when each piece was corrected
+        felt = world.wrench("lower")
+        assert np.hypot(*(felt[:2] / -felt[2] - drag)) < 0.02 * 0.7
+
+
+def test_a_load_on_a_sharp_edge_that_is_slid_has_not_settled() -> None:
+    """Though each piece of the path is shorter than what an edge may be slid."""
+    box = Indenter(geometry=Box(size=(5e-3, 5e-3, 4e-3)), friction=0.7, edge_radius=0.0)
+    world = PressWorld(Scene(preset="draft", body=None, indenter=box))
+    assert world.move({}, loads={"lower": 0.7}).settled
+    assert world.move(by(world, "indenter", (0.4e-3, 0.0, 0.0)), loads={"lower": 0.7}).settled
+    assert not world.move(by(world, "indenter", (0.4e-3, 0.0, 0.0)), loads={"lower": 0.7}).settled
+    assert "catches" in world.unfollowed
+
+
 def test_a_load_out_of_reach_is_an_error_and_nothing_has_moved() -> None:
     world = press()
     world.move(by(world, "indenter", (0, 0, 3e-3)))

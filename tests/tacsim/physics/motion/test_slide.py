@@ -46,8 +46,9 @@ def slide(**changes: float) -> Slide:
         ({}, ""),
         ({"shear_mach": 0.16}, "slips by inertia"),
         ({"edge_radius": 0.4}, "sharper than 0.5 mm catches"),
-        ({"edge_radius": 0.4, "length": 0.5}, ""),
-        ({"edge_radius": 0.4, "length": 0.0, "depth": 2.0, "friction": 2.0}, ""),
+        ({"edge_radius": 0.4, "length": 0.5, "away": 0.5}, ""),
+        ({"edge_radius": 0.4, "length": 0.1, "away": 0.6}, "sharper than 0.5 mm catches"),  # one of several short ones
+        ({"edge_radius": 0.4, "length": 0.0, "away": 0.0, "depth": 2.0, "friction": 2.0}, ""),
         ({"length": 2.1, "friction": 1.1, "depth": 0.0}, ""),  # lifted
         ({"length": 2.1}, ""),
         ({"length": 2.1, "depth": 0.7}, "2 mm.*friction of 0.6 under what is deeper than 0.6 mm"),

@@ -22,7 +22,8 @@ from tacsim.optics.render import Renderer
 from tacsim.optics.surface import SurfaceSample, SurfaceTable, sample_surface
 from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.physics.move import MoveStats
-from tacsim.physics.worlds.press import CLEARANCE, GRID_SPACING, PressWorld
+from tacsim.physics.worlds.press import CLEARANCE, PressWorld
+from tacsim.physics.worlds.press_state import GRID_SPACING
 from tacsim.report.height_picture import write_height_picture
 
 QUARTER_TURN = math.pi / 2  # a twist is cut into pieces of at most this: each motion takes the shorter rotation [rad]

@@ -78,6 +78,8 @@ def load_rig(rig: str | Path, *, task: str | TaskConfig | None = None, overrides
 def _task(task: str | TaskConfig) -> Node:
     if isinstance(task, str):
         return Node(task, Place(f"--task {task}"), Path.cwd(), text=task)
+    if not isinstance(task, BaseModel):
+        raise TypeError(f"a task is a name, the path of a file, or a configuration; {task!r} was given")
     return from_plain(task.model_dump(mode="json"), Place(f"--task {task.kind}"), Path.cwd())
 
 

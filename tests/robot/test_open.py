@@ -170,6 +170,7 @@ def test_a_loaded_configuration_takes_no_more_overrides() -> None:
     [
         ({"overrides": "scene.preset=learn"}, "lists of texts"),
         ({"overrides": 5}, "lists of texts, such as .*; 5 was given"),
+        ({"task": 5}, "a task is a name, the path of a file, or a configuration; 5 was given"),
         ({"overrides": [None]}, r"\[None\] was given"),
         ({"variants": ["scene.preset=learn"]}, "lists of texts"),
         ({"variants": [[["a"]]]}, r"\[\['a'\]\] was given"),

@@ -19,7 +19,8 @@ from tacsim.physics.move import MoveCommand, MoveStats
 from tacsim.physics.worlds.base import NotCopyable
 from tacsim.physics.worlds.hybrid import HybridWorld
 from tacsim.physics.worlds.hybrid_state import HybridState
-from tacsim.physics.worlds.press import PressState, PressWorld
+from tacsim.physics.worlds.press import PressWorld
+from tacsim.physics.worlds.press_state import PressState
 
 Result = MoveStats | SimulationDiverged | LoadNotReached | None
 

@@ -95,7 +95,7 @@ def press_substep(
     anchor: Anchor, pressure: Pressure, values: Values,
     params: Params, counts: Counts, partial: Partial, layers: ti.i32,
 ):  # fmt: skip
-    """One substep of every environment's indenter on its gel; see `tacsim.physics.worlds.press.press_substeps`."""
+    """One substep of every environment's indenter on its gel; see `tacsim.physics.worlds.press_kernels.substeps`."""
     for e, k, n in ti.ndrange(counts.shape[0], layers, lattice.shape[0] // LATTICE_ROWS):
         env = ti.static(Environment(e, params, counts, partial))
         if is_active(env, clock):

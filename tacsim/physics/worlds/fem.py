@@ -87,6 +87,7 @@ class FemWorld(BaseWorld):
 
     balanced: ClassVar[bool]  # contact forces on all gels add up to the weight of a free body
     yields: bool  # what is pressed yields: it keeps what a hurried motion does to it
+    unfollowed = ""  # why the last motion has not settled, whatever its residual, and what to do
 
     _state: FemState
     _index: int
@@ -232,7 +233,7 @@ class FemWorld(BaseWorld):
         end = resolve_targets(self._poses, command.targets)
         require_loads(command.loads, self.sensors)
         begin, goals, settling = dict(self._poses), dict(end), self.scene.settling
-        balanced, most = self.balanced, self._readings
+        balanced, most, self.unfollowed = self.balanced, self._readings, ""
         a, b = list(begin.values()), list(end.values())
         path = None  # of a dynamic motion; others are planned anew for each attempt
         if command.duration is not None:

@@ -187,15 +187,15 @@ class HybridWorld(FemWorld):
     def plan(self, start: Sequence[Pose], end: Sequence[Pose]) -> Path:
         """The path between two poses of the sensors, at the scene's speed: all of it is remembered by a body that
         yields, by friction alone what goes along a surface."""
-        scene, lever, unfollowed = self.scene, max(self._gel.half), ""
+        scene, lever, self.unfollowed = self.scene, max(self._gel.half), ""
         remembered = (path_length if self.yields else path_along)(start, end, lever)
         path = plan(
             start, end, scene.peak_mach, self._scaled.step, lever, self._gel.thickness, remembered=remembered,
             short=SHORT_PATH if self.yields else SHORT_SLIDE,
         )  # fmt: skip
         if self.yields and path.peak_mach(lever) > HURRIED * scene.fastest_mach:
-            unfollowed = "the speed itself makes the body yield; leave out settling.mach, or lower it"
-        return replace(path, creeps=self.yields, unfollowed=unfollowed)
+            self.unfollowed = "the speed itself makes the body yield; leave out settling.mach, or lower it"
+        return replace(path, creeps=self.yields, unfollowed=self.unfollowed)
 
     # ------------------------------------------------------------------ state
 

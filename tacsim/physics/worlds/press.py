@@ -7,68 +7,33 @@ from functools import partial
 
 import numpy as np
 
-from tacsim.compute.runtime import start, ti
-from tacsim.geometry.shapes import MAX_NODES, edge_radius, edges, extent, farthest
-from tacsim.geometry.tiles import TILE, TiledDistance, tiled_distance
+from tacsim.geometry.shapes import edge_radius, edges, extent, farthest
 from tacsim.interface import Pose
-from tacsim.models.scene import Box, Cylinder, GelSurface, Mesh, Scene, Shape, Sphere
-from tacsim.physics.contact.distance import BOX, CYLINDER, GRID, SPHERE
+from tacsim.models.scene import GelSurface, Mesh, Scene
 from tacsim.physics.contact.indenter import (
     POINTS,
     RIM,
     SMOOTHING,
     SPLINE_SMOOTHING,
-    Anchor,
-    Indenter,
-    Pressure,
-    Values,
-    carry,
-    indent,
 )
-from tacsim.physics.exec import layout
-from tacsim.physics.exec.environment import Counts, Environment, Floats, Params, Partial
-from tacsim.physics.exec.lanes import MAX_NUMBERS, ON_DEVICE, PARTS, aligned_zeros
 from tacsim.physics.exec.layout import (
     BACKING,
-    COUNTS,
-    EDGE_RADIUS,
-    ELEMENTS,
     FORCE,
     FRICTION,
     GEL_DAMPING,
-    KIND,
     LIMIT_FOLLOWS,
-    NUMBERS,
-    PARAMS,
-    SHAPE,
-    SHAPE_FIRST,
-    SHAPE_NODES,
-    SHAPE_ORIGIN,
-    SHAPE_SPACING,
     STEP,
     STIFFNESS,
 )  # fmt: skip
-from tacsim.physics.exec.team import (
-    CHUNK,
-    ENVIRONMENT,
-    Sync,
-    first_in_chunk,
-    next_piece,
-    once_if,
-    own_part,
-    piece_done,
-    run_team,
-)
 from tacsim.physics.failure.health import Health, SimulationDiverged, check_launch
-from tacsim.physics.gel.gel import GelParams, GelState, common_lattice, gel_params
-from tacsim.physics.gel.kernels import Lattice, gel_advance, gel_forces, gels_of
+from tacsim.physics.gel.gel import GelParams
 from tacsim.physics.motion.controller import ForceReading, Integration, Launch, PreparedLaunch, force_floor
 from tacsim.physics.motion.inertia import Inertia, kernel_second
 from tacsim.physics.motion.path import SHORT_SLIDE, Path, path_along, path_length, plan
 from tacsim.physics.motion.slide import Slide, growth, turn
 from tacsim.physics.units import MM, MPA
-from tacsim.physics.worlds.fem import FemState, FemWorld, stack_drives
-from tacsim.physics.worlds.hybrid_kernels import Drive
+from tacsim.physics.worlds.fem import FemWorld
+from tacsim.physics.worlds.press_state import PressState
 from tacsim.pose import inverse, relative, rotate
 
 # dt / (spacing / wave speed). Edges of a rigid box tear the surface up at 0.6, without a NaN; and the penalty falls
@@ -83,7 +48,6 @@ ZETA_GEL, ZETA_BY_SHEAR = 0.5, 2.55
 TURNS_DAMPED, TURNS_AT = 0.4, (0.35, 0.5)
 SHORT_GROWING = 1.0  # gel thicknesses: what is pressed in while it slides goes as slowly as a path of this length
 CLEARANCE = 0.1e-3  # gap between gel and indenter at construction [m]
-GRID_SPACING = 0.1e-3  # of a mesh's distance grid [m]
 UNSEEN = 0.5  # spacings of contact points: how deep an indenter may dip between them; the largest such ball: 0.35
 # At this friction the limit follows the pressure within the time of a wave through the gel: in half of it slides
 # flutter. Friction itself feeds that, so less of it may follow as much quicker, as may what is pressed in while it
@@ -92,35 +56,6 @@ FLUTTERING, QUICKEST = 1.5, 8.0
 BULGE = 0.1  # of the depth of an indenter: how far the gel rises round it, at most
 MARGIN = 2.0  # elements: what is further from a mesh does not touch it in the next launch
 TOO_MUCH = "cut off parts of mesh and gel that cannot touch; worlds of a smaller batch have more room each"
-
-
-@ti.kernel
-def press_substeps(
-    team: ti.i32, drive: Drive,
-    nodes: Floats, surface: Floats, contact_force: Floats, corners: Floats, lattice: Lattice,
-    anchor: Anchor, pressure: Pressure, values: Values,
-    params: Params, counts: Counts, partial: Partial, sync: Sync,
-):  # fmt: skip
-    """Explicit substeps in one launch by `team` threads; drive: pose and velocity of the indenter, sensor frame."""
-    for task in range(sync.shape[0] * team * CHUNK):
-        for _ in range(first_in_chunk(task)):
-            turn = task // CHUNK // team
-            index = sync[turn, ENVIRONMENT]
-            env = ti.static(Environment(index, params, counts, partial))
-            gels = ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 1))
-            indenter = ti.static(Indenter(anchor, pressure, values))
-            stages, own = 2 * env.count(layout.STEPS), own_part(task, team)  # two a substep: forces, then motion
-            piece = next_piece(sync, turn, own, stages)
-            while piece < stages * PARTS:
-                stage, part = piece // PARTS, piece % PARTS
-                for _forces in range(once_if(stage % 2 == 0)):
-                    indent(env, part, stage // 2, drive, gels, indenter)
-                    gel_forces(env, part, gels)
-                for _motion in range(once_if(stage % 2 == 1)):
-                    carry(env, part, gels)
-                    gel_advance(env, part, gels)
-                piece_done(sync, turn)
-                piece = next_piece(sync, turn, own, stages)
 
 
 def contact_stiffness(gel: GelParams, step: float) -> float:
@@ -153,108 +88,12 @@ def relative_drive(sensor: np.ndarray, indenter: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(out, np.float32)
 
 
-class PressState(FemState):
-    """Arrays of E environments that one launch of `press_substeps` advances; each environment is a PressWorld.
-
-    Environments share the gel's lattice; each has its own indenter, materials, friction and settling.
-    """
-
-    def __init__(self, scenes: Sequence[Scene]) -> None:
-        """Raises ValueError for gels that are not cut alike, and an indenter too fine for them."""
-        start()
-        self.gel = [gel_params(scene.gel, scene.element) for scene in scenes]
-        lattice = common_lattice(self.gel)
-        self._gels = GelState(lattice, len(scenes), 1)
-        nx, ny, _ = lattice.elements
-        self._anchor = np.zeros((len(scenes), nx * POINTS, ny * POINTS, 3), np.float32)
-        self._pressure = np.zeros(self._anchor.shape[:3], np.float32)  # of the contact points, as remembered [MPa]
-        self.params = np.zeros((len(scenes), PARAMS), np.float32)
-        self.counts = np.zeros((len(scenes), COUNTS), np.int32)
-        self.counts[:, ELEMENTS : ELEMENTS + 3] = lattice.elements
-        self.partial = np.zeros((len(scenes), PARTS, NUMBERS), np.float32)
-        self._values = np.zeros((len(scenes), 2, 2, 2), np.float32)
-        self._covered = 0  # how often they have changed: a device keeps its copy of them until they do
-        self.meshes = [self._set_shape(index, scene) for index, scene in enumerate(scenes)]
-        self._tiles: dict[int, tuple[np.ndarray, np.ndarray]] = {}  # first and end of those filled in
-        if ON_DEVICE:
-            from tacsim.physics.worlds.device_state import DevicePress
-
-            numbers = self.params, self.counts, self.partial
-            self.device = DevicePress(
-                self._gels, numbers, self._anchor, self._pressure, lambda: (self._values, self._covered)
-            )
-
-    @property
-    def anchor(self) -> np.ndarray:
-        self._bring_back()
-        return self._anchor
-
-    @property
-    def pressure(self) -> np.ndarray:
-        self._bring_back()
-        return self._pressure
-
-    def _set_shape(self, index: int, scene: Scene) -> TiledDistance | None:
-        """Writes one environment's indenter into params and counts; returns the distances of a mesh."""
-        assert scene.indenter is not None
-        _require_resolved(scene.indenter.geometry, self.gel[index])
-        kind, size, mesh = _shape_params(scene.indenter.geometry)
-        self.counts[index, KIND], self.params[index, SHAPE : SHAPE + 3] = kind, size
-        self.params[index, EDGE_RADIUS] = scene.indenter.rounding(scene.element) * MM
-        self.params[index, SHAPE_SPACING] = GRID_SPACING * MM
-        if mesh is not None:
-            self.params[index, SHAPE_ORIGIN : SHAPE_ORIGIN + 3] = mesh.origin * MM
-        return mesh
-
-    def cover(self, index: int, low: np.ndarray, high: np.ndarray) -> None:
-        """Fills in the distances of an environment's mesh between two corners (3,) [mm], axes of the mesh.
-
-        The memory of all environments grows if this one needs more. Raises ValueError for more nodes than one may have,
-        MemoryError where there is no memory for them; nothing has changed then.
-        """
-        mesh = self.meshes[index]
-        assert mesh is not None
-        first, end = mesh.around(low / MM, high / MM)
-        old = self._tiles.get(index)
-        if old is not None:
-            if (first >= old[0]).all() and (end <= old[1]).all():
-                return
-            both = np.minimum(first, old[0]), np.maximum(end, old[1])
-            if np.prod(TILE * (both[1] - both[0]).astype(float)) <= min(MAX_NODES, MAX_NUMBERS // len(self._values)):
-                first, end = both
-        values = mesh.values(first, end) * np.float32(MM)
-        held = self._values.shape[1:]
-        room = tuple(map(max, held, values.shape))
-        if room != held:
-            grown = aligned_zeros(len(self._values), *room)
-            grown[(slice(None), *map(slice, held))] = self._values
-            self._values = grown
-        nx, ny, nz = values.shape
-        self._values[index, :nx, :ny, :nz] = values
-        self.counts[index, SHAPE_FIRST : SHAPE_FIRST + 3] = TILE * first
-        self.counts[index, SHAPE_NODES : SHAPE_NODES + 3] = values.shape
-        self._tiles[index] = first, end
-        self._covered += 1
-
-    def advance(self, drives: Mapping[int, np.ndarray]) -> None:
-        drive = stack_drives(drives, self.counts)
-        if self.device is not None:
-            self.device.run(drive)
-            return
-        self._gels.refresh()
-        run_team(
-            press_substeps, drive, self._gels.arguments(), self._anchor, self._pressure, self._values,
-            self.params, self.counts, self.partial, active=list(drives),
-        )  # fmt: skip
-
-
 class PressWorld(FemWorld):
     """World of a scene with an indenter: the `lower` gel, and the `indenter` above it."""
 
     sensors = ("lower",)
     balanced = False
     yields = False
-    unfollowed = ""  # why the last motion has not settled, whatever its residual, and what to do
     unfelt = 0.0  # share of the indenter's depth in the untouched gel that no contact point feels, when last at rest
 
     def __init__(self, scene: Scene, state: PressState | None = None, index: int = 0) -> None:
@@ -408,7 +247,7 @@ class PressWorld(FemWorld):
         top = self._state.tops(self._index)[0].astype(np.float64)
         axes = (self._gel.spacing * (np.arange(n) - (n - 1) / 2) for n in top.shape[:2])
         top[..., :2] += np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-        return top.reshape(-1, 3)
+        return np.asarray(top.reshape(-1, 3))
 
     def outcome(self, prepared: PreparedLaunch) -> list[ForceReading]:
         """The forces after the launch. Raises SimulationDiverged if its state is unphysical."""
@@ -465,28 +304,3 @@ class PressWorld(FemWorld):
             )
             before = prepared.before
             raise SimulationDiverged(cause, prepared.where(), advice, retry=False, good=before, failed=self.arrays())
-
-
-def _require_resolved(geometry: Shape, gel: GelParams) -> None:
-    """Raises ValueError for an indenter that fits between the points at which the gel's surface feels it."""
-    narrow, spacing = float(extent(geometry)[:2].min()) * MM, gel.spacing / POINTS
-    if narrow < math.sqrt(2.0) * spacing:
-        layers = math.ceil(gel.thickness / (narrow * POINTS / math.sqrt(2.0)))
-        raise ValueError(
-            f"the indenter ({geometry.shape}) is {narrow:.4g} mm wide and fits between the gel's contact points, which "
-            f"lie {spacing:.4g} mm apart (element_size / {POINTS}): choose element_size at most "
-            f"{math.floor(1e4 * gel.thickness / layers) / 1e4:g} mm"
-        )
-
-
-def _shape_params(geometry: Shape) -> tuple[int, tuple[float, ...], TiledDistance | None]:
-    """Kind and size [mm] for the kernels (`signed_distance`), and the distances of a mesh."""
-    match geometry:
-        case Sphere():
-            return SPHERE, (geometry.radius * MM, 0.0, 0.0), None
-        case Cylinder():
-            return CYLINDER, (geometry.radius * MM, 0.0, geometry.height / 2 * MM), None
-        case Box():
-            return BOX, tuple(side / 2 * MM for side in geometry.size), None
-    mesh = tiled_distance(geometry, GRID_SPACING)
-    return GRID, tuple(float(side) * MM for side in mesh.half), mesh

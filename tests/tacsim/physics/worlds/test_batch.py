@@ -30,7 +30,7 @@ from tacsim.physics.failure.health import LARGEST_GRID, SimulationDiverged
 from tacsim.physics.motion.load import LoadNotReached
 from tacsim.physics.move import MoveStats
 from tacsim.physics.world import World
-from tacsim.physics.worlds import press
+from tacsim.physics.worlds import press_state
 from tacsim.physics.worlds.base import RETRIES
 from tacsim.physics.worlds.batch import Batch
 from tacsim.physics.worlds.hybrid import HybridWorld
@@ -287,7 +287,7 @@ def test_one_whose_mesh_needs_too_much_is_told_alone(
         def scarce(*shape: int) -> np.ndarray:
             raise MemoryError(f"Unable to allocate {shape[0]} of {shape[1:]}")
 
-        monkeypatch.setattr(press, "aligned_zeros", scarce)
+        monkeypatch.setattr(press_state, "aligned_zeros", scarce)
     down = [
         {"indenter": Pose(world.pose("indenter").position - [0.0, 0.0, 0.4e-3])} for world in (*batch.worlds, alone)
     ]

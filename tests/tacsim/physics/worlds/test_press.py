@@ -12,7 +12,7 @@ from tacsim.interface import Pose
 from tacsim.models.scene import Box, Cylinder, Gel, GelMaterial, Mesh, Shape, Sphere
 from tacsim.physics.contact.indenter import POINTS
 from tacsim.physics.failure.health import SimulationDiverged
-from tacsim.physics.worlds import press
+from tacsim.physics.worlds import press_state
 from tests.tacsim.physics.worlds.pressing import move, world
 
 
@@ -186,7 +186,7 @@ def test_both_ends_of_a_launch_are_laid_or_none(tmp_path: Path, monkeypatch: pyt
     drive = np.zeros((2, 1, 6, 3), np.float32)
     drive[:, 0, :3] = np.eye(3)
     drive[:, 0, 3] = (-7.0, 0.0, 1.0), (7.0, 0.0, 1.0)
-    for module in (press, tiles):
+    for module in (press_state, tiles):
         monkeypatch.setattr(module, "MAX_NODES", 8 * tiles.TILE**3)  # an end has 6 tiles, both and what is between 12
     with pytest.raises(ValueError, match="192 x 64 x 32 nodes"):
         w._cover(drive)

@@ -1,8 +1,9 @@
 """Motion at a constant normal load: a sensor follows its target but along its own z axis, where its force is held.
 
-The path is cut into pieces, each a settled motion on which the sensor also goes along its z by what the force is off;
-at the end it goes along its z alone until the force is right. Corrections are small: one that lets go of a contact, or
-presses what slips, changes its drag.
+The path is cut into pieces, each a settled motion. What of it brings the sensor nearer to the other frame along z is
+left out once they touch, and on each piece the sensor goes along its z by what the force is off; at the end it goes
+along its z alone until the force is right. Corrections are small: one that lets go of a contact, or presses what slips,
+changes its drag.
 """
 
 from __future__ import annotations
@@ -64,6 +65,7 @@ class _NormalAxis:
     tolerance: float  # [N]
     travel: float = 0.0
     stiffness: float = 0.0  # [N/m] as last measured; 0: never
+    retreat: float = math.inf  # last travel away from the contact [m]
 
     def measure(self, travelled: float, gained: float) -> None:
         """Takes the stiffness from a correction without a slide: how far [m], and what force that brought [N]."""
@@ -77,6 +79,11 @@ class _NormalAxis:
         step = math.copysign(longest, error) if abs(error) >= stiffness * longest else error / stiffness
         if self.wanted == 0.0:  # a force fades towards nothing ever more slowly: go on until they part
             step = min(step, -longest / 4)
+        elif force == 0.0:  # not there yet; or it went too far, and then back by halves, for a stiffness knows no gap
+            self.retreat = max(self.retreat / 2, longest / 64)
+            step = min(longest, self.retreat)
+        if step < 0.0:
+            self.retreat = -step
         self.travel += step
 
 
@@ -98,9 +105,17 @@ def keep_loads(
     def force(name: str) -> float:
         return 0.0 - float(world.wrench(name)[2])  # never -0
 
+    def on_path(share: float) -> dict[str, Pose]:
+        return {name: se3.interpolate(start[name], target, share) for name, target in targets.items()}
+
+    def gap(name: str, poses: Mapping[str, Pose]) -> float:
+        """Of a sensor's origin and that of the other frame, along the sensor's z [m]."""
+        (other,) = poses.keys() - {name}
+        return float((poses[other].position - poses[name].position) @ se3.rotation(poses[name]).as_matrix()[:, 2])
+
     def settle_at(share: float) -> Generator[Launch, Sequence[ForceReading], None]:
         """At `share` of the path, each loaded sensor off it by its travel."""
-        poses = {name: se3.interpolate(start[name], target, share) for name, target in targets.items()}
+        poses = on_path(share)
         for name, axis in axes.items():
             z = se3.rotation(poses[name]).as_matrix()[:, 2]
             poses[name] = Pose(poses[name].position + axis.travel * z, poses[name].quaternion)
@@ -139,8 +154,10 @@ def keep_loads(
     for piece in range(1, pieces + 1):
         if all(force(name) > 0.0 for name in loads):
             yield from correct_at((piece - 1) / pieces, LOOSE)
+            here, there = on_path((piece - 1) / pieces), on_path(piece / pieces)
             for name, axis in axes.items():
                 axis.correct(force(name), thickness)
+                axis.travel += (gap(name, there) - gap(name, here)) / len(axes)
         yield from settle_at(piece / pieces)
     error = yield from correct_at(1.0)
     return replace(

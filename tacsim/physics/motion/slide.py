@@ -41,11 +41,21 @@ def turn(way: NDArray[np.float64], force: NDArray[np.float64], friction: float) 
     return float(min(1.0, abs(force[0] * way[1] - force[1] * way[0]) / (limit * slid)))
 
 
+def release(way: NDArray[np.float64], force: NDArray[np.float64], friction: float) -> float:
+    """0 to 1: what share of the drag that friction allows is there, on the `force` (3,) on the sensor [N], while the
+    `way` (3,) of the indenter lifts it off; both in the sensor's axes."""
+    limit = friction * abs(force[2])
+    if way[2] <= 0.0 or limit == 0.0:
+        return 0.0
+    return float(min(1.0, math.hypot(force[0], force[1]) / limit) * way[2] / np.linalg.norm(way))
+
+
 @dataclass(frozen=True)
 class Slide:
     """A motion of an indenter with friction over a gel, in [mm]."""
 
     length: float  # along the surface
+    before: float  # of all slides before, since it came to the gel
     away: float  # how far along the surface it ends from where it came to the gel
     depth: float  # of the indenter's lowest point below the untouched surface
     shear_mach: float  # its peak speed over that of the gel's shear wave
@@ -59,8 +69,8 @@ class Slide:
             return "contact slips by inertia at that speed; leave out settling.mach, or lower it"
         if self.depth <= 0.0:  # it is lifted off
             return ""
-        catching, far = CATCHING * element, max(self.length, self.away) / (1 + ROUNDING)
-        if self.edge_radius < catching * (1 - 1e-9) and far > CAUGHT * element:
+        catching, slid = CATCHING * element, (self.before + self.length) / (1 + ROUNDING)
+        if self.edge_radius < catching * (1 - 1e-9) and slid > CAUGHT * element:
             return (
                 f"an edge sharper than {catching:g} mm catches on the mesh as it is slid; for a drag to rely on, give "
                 f"it so large an edge_radius (--edge-radius; an STL file: draw it round), or a smaller element_size"
@@ -68,6 +78,7 @@ class Slide:
         walls, steep = math.isfinite(self.edge_radius), self.friction > SNAPPING
         deep = (DEEP_WALLS if walls or steep else DEEP) * thickness
         farthest = (SNAPPED_SOONER if steep and self.depth > deep else SNAPPED) * thickness
+        far = max(self.length, self.away) / (1 + ROUNDING)
         if far > farthest and (steep or self.depth > deep):
             what = f"above {SNAPPING:g}" if steep else f"of {self.friction:g} under what is deeper than {deep:.3g} mm"
             return (

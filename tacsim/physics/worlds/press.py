@@ -30,7 +30,7 @@ from tacsim.physics.gel.gel import GelParams
 from tacsim.physics.motion.controller import ForceReading, Integration, Launch, PreparedLaunch, force_floor
 from tacsim.physics.motion.inertia import Inertia, kernel_second
 from tacsim.physics.motion.path import SHORT_SLIDE, Path, path_along, path_length, plan
-from tacsim.physics.motion.slide import Slide, growth, turn
+from tacsim.physics.motion.slide import Slide, growth, release, turn
 from tacsim.physics.units import MM, MPA
 from tacsim.physics.worlds.fem import FemWorld
 from tacsim.physics.worlds.press_state import PressState
@@ -46,6 +46,9 @@ ZETA_GEL, ZETA_BY_SHEAR = 0.5, 2.55
 # and the more the less friction there is. So it has so much of its damping, and the friction itself is the share of
 # its speed, within these.
 TURNS_DAMPED, TURNS_AT = 0.4, (0.35, 0.5)
+# Share of the speed for what is lifted with all of its drag (`release`): the gel comes up after it too late, and
+# contact that feels less for a moment slips. In three lifts of 0.1 mm a drag fell to 0.74 of its friction, settled.
+RELEASED = 0.35
 SHORT_GROWING = 1.0  # gel thicknesses: what is pressed in while it slides goes as slowly as a path of this length
 CLEARANCE = 0.1e-3  # gap between gel and indenter at construction [m]
 UNSEEN = 0.5  # spacings of contact points: how deep an indenter may dip between them; the largest such ball: 0.35
@@ -118,7 +121,8 @@ class PressWorld(FemWorld):
         height = float(extent(scene.indenter.geometry)[2])
         turned = np.array([0.0, 0.0, np.sin(scene.indenter.yaw / 2), np.cos(scene.indenter.yaw / 2)])
         self._rates = np.zeros((2, 6))
-        self._touched = np.zeros(2)  # where the indenter was over the gel when it last did not touch it [mm]
+        # where the indenter was over the gel when it last did not touch it, and how far it has been slid since [mm]
+        self._touched = np.zeros(3)
         self._edges = edges(scene.indenter.geometry, scene.element)
         self._poses = {"lower": Pose(), "indenter": Pose(np.array([0.0, 0.0, height / 2 + CLEARANCE]), turned)}
 
@@ -159,8 +163,10 @@ class PressWorld(FemWorld):
         longest = path_length(start, end, lever)
         faster = max(1.0, float(np.linalg.norm(way)) / longest) if longest > 0.0 else 1.0  # if they go opposite ways
         if indenter.friction > 0.0:
-            growing, turning = growth(way), turn(way, self.wrench("lower")[:3], indenter.friction)
+            force = self.wrench("lower")[:3]
+            growing, turning = growth(way), turn(way, force, indenter.friction)
             mach *= 1.0 - turning * (1.0 - min(max(indenter.friction, TURNS_AT[0]), TURNS_AT[1]))
+            mach *= 1.0 - release(way, force, indenter.friction) * (1.0 - RELEASED)
         path = plan(
             start, end, mach / faster, self._scaled.step, lever, gel.thickness,
             remembered=path_along(start, end, lever), short=SHORT_SLIDE + (SHORT_GROWING - SHORT_SLIDE) * growing,
@@ -170,7 +176,8 @@ class PressWorld(FemWorld):
             touch = self._edges_touch(at, BULGE * depth)
             slide = Slide(
                 length=math.hypot(way[0], way[1]),
-                away=float(np.linalg.norm(at.position[:2] * MM - self._touched)),
+                before=float(self._touched[2]),
+                away=float(np.linalg.norm(at.position[:2] * MM - self._touched[:2])),
                 depth=depth,
                 shear_mach=faster * path.peak_mach(lever) / self._shear,
                 friction=indenter.friction,
@@ -188,7 +195,7 @@ class PressWorld(FemWorld):
     def place(self, poses: Mapping[str, Pose]) -> None:
         """See World. Where the indenter is then, it has come to the gel."""
         super().place(poses)
-        self._touched[:] = relative(*self._poses.values()).position[:2] * MM
+        self._touched[:] = [*relative(*self._poses.values()).position[:2] * MM, 0.0]
 
     def below(self, turn: np.ndarray) -> float:
         """How far the indenter's lowest point is below its origin, the centre of its bounding box, if that is turned by
@@ -258,8 +265,11 @@ class PressWorld(FemWorld):
         sums = partial.astype(np.float64).sum(axis=0)
         force, moment = sums[None, FORCE : FORCE + 3], sums[None, FORCE + 3 : FORCE + 6]
         backing = sums[None, BACKING : BACKING + 3]
-        if not force.any():  # here, not in `plan`, which flowing motions do not ask
-            self._touched[:] = prepared.drive[-1, 0, 3, :2]
+        # here, not in `plan`, which flowing motions do not ask
+        if not force.any():
+            self._touched[:] = [*prepared.drive[-1, 0, 3, :2], 0.0]
+        else:
+            self._touched[2] += np.linalg.norm(prepared.drive[:, 0, 4, :2], axis=1).sum() * prepared.launch.path.step
         if prepared.launch.held or (not force.any() and prepared.launch.last == prepared.launch.path.substeps):
             self._require_seen(prepared, health.overlap)
         reading = ForceReading(

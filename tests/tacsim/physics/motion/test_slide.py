@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from tacsim.physics.motion.slide import Slide, growth, turn
+from tacsim.physics.motion.slide import Slide, growth, release, turn
 
 
 @pytest.mark.parametrize(
@@ -35,8 +35,32 @@ def test_a_way_across_the_drag_turns_it(by: list[float], force: list[float], tur
     assert turn(np.array(by), np.array(force), 0.6) == pytest.approx(turns)
 
 
+@pytest.mark.parametrize(
+    ("by", "force", "released"),
+    [
+        ([0.0, 0.0, 1e-3], [0.6, 0.0, -1.0], 1.0),
+        ([0.0, 0.0, 1e-3], [0.0, 0.3, -1.0], 0.5),  # half of the drag that friction allows
+        ([0.0, 0.0, 1e-3], [0.9, 0.0, -1.0], 1.0),
+        ([1e-3, 0.0, 1e-3], [0.6, 0.0, -1.0], math.sqrt(0.5)),
+        ([0.0, 0.0, -1e-3], [0.6, 0.0, -1.0], 0.0),
+        ([1e-3, 0.0, 0.0], [0.6, 0.0, -1.0], 0.0),
+        ([0.0, 0.0, 1e-3], [0.0, 0.0, 0.0], 0.0),  # nothing is touched
+    ],
+)
+def test_what_is_lifted_with_its_drag_is_released(by: list[float], force: list[float], released: float) -> None:
+    assert release(np.array(by), np.array(force), 0.6) == pytest.approx(released)
+
+
 def slide(**changes: float) -> Slide:
-    usual = {"length": 1.0, "away": 1.0, "depth": 0.5, "shear_mach": 0.1, "friction": 0.6, "edge_radius": 0.5}
+    usual = {
+        "length": 1.0,
+        "before": 0.0,
+        "away": 1.0,
+        "depth": 0.5,
+        "shear_mach": 0.1,
+        "friction": 0.6,
+        "edge_radius": 0.5,
+    }
     return Slide(**{**usual, **changes})
 
 
@@ -46,9 +70,12 @@ def slide(**changes: float) -> Slide:
         ({}, ""),
         ({"shear_mach": 0.16}, "slips by inertia"),
         ({"edge_radius": 0.4}, "sharper than 0.5 mm catches"),
-        ({"edge_radius": 0.4, "length": 0.5, "away": 0.5}, ""),
-        ({"edge_radius": 0.4, "length": 0.1, "away": 0.6}, "sharper than 0.5 mm catches"),  # one of several short ones
-        ({"edge_radius": 0.4, "length": 0.0, "away": 0.0, "depth": 2.0, "friction": 2.0}, ""),
+        ({"edge_radius": 0.4, "length": 0.5}, ""),
+        (
+            {"edge_radius": 0.4, "length": 0.1, "before": 0.5},
+            "sharper than 0.5 mm catches",
+        ),  # one of several short ones
+        ({"edge_radius": 0.4, "length": 0.0, "depth": 2.0, "friction": 2.0}, ""),
         ({"length": 2.1, "friction": 1.1, "depth": 0.0}, ""),  # lifted
         ({"length": 2.1}, ""),
         ({"length": 2.1, "depth": 0.7}, "2 mm.*friction of 0.6 under what is deeper than 0.6 mm"),

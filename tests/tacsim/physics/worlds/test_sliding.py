@@ -234,6 +234,31 @@ def test_a_long_slide_with_much_friction_has_not_settled(friction: float, by: fl
     assert stats.residual <= 1e-2 and stats.settled == settled
 
 
+def test_what_is_lifted_in_steps_after_a_slide_keeps_its_drag() -> None:
+    """Of the friction, after each lift, at Mach 0.001; at full speed it was 0.97, 0.88, 0.74."""
+    w = world(Cylinder(radius=3e-3, height=4e-3), 0.5, 1e-2, preset="draft", gel=Gel(), edge_radius=0.5e-3)
+    move(w, (0, 0, -0.45e-3))
+    move(w, (0.8e-3, 0, 0))
+    for lift, drag in ((0.1e-3, 1.041), (0.1e-3, 1.017), (0.08e-3, 1.004)):
+        move(w, (0, 0, lift))
+        force = w.wrench("lower")
+        assert abs(force[0] / force[2]) / 0.5 == pytest.approx(drag, abs=0.02)
+
+
+def test_an_edge_that_catches_is_told_after_a_slide_to_and_fro() -> None:
+    """It never comes far from where it touched, but each slide moves the points that hang on it."""
+    w = world(Box(size=(5e-3, 5e-3, 4e-3)), 0.6, 1e-2, preset="draft", gel=Gel(), edge_radius=0.0)
+    move(w, (0, 0, -0.4e-3))
+    told = []
+    for by in (0.4e-3, -0.4e-3):
+        pose = w.pose("indenter")
+        told.append(w.move({"indenter": Pose(pose.position + [by, 0, 0], pose.quaternion)}).settled)
+    assert told == [True, False]
+    pose = w.pose("indenter")
+    w.move({"indenter": Pose(pose.position + [0, 0, 1e-3], pose.quaternion)})  # off the gel, it starts anew
+    assert w.move({"indenter": Pose(pose.position, pose.quaternion)}).settled
+
+
 def test_many_small_slides_that_come_as_far_have_not_settled_either() -> None:
     """How far it is from where it came to the gel counts, and a snapshot knows that; lifted, it begins anew."""
     w = pressed_ball(1.1, "draft")

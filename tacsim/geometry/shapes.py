@@ -33,6 +33,7 @@ FEWEST_LAYERS = 3  # of particles: one has no height, and two cannot bulge
 MAX_MISFIT = 0.1  # relative error of the size or the volume that the lattice of particles may have
 LEVEL = 1e-5  # sine of an angle below which a direction is level with a face; float32 rotations are 1e-7 off
 SHARP = math.radians(30.0)  # facets of what is drawn round meet at less
+SLIVER = 10e-6  # [m] shorter edges of a file are what its float32 numbers made of a point
 BAND = 2  # grid spacings round a mesh in which the distance is exact
 
 
@@ -73,7 +74,7 @@ def edge_radius(indenter: Indenter, element: float) -> float:
     two faces meet at more than SHARP, and they count as sharp, for they are as drawn."""
     if not isinstance(indenter.geometry, Mesh):
         return math.inf if isinstance(indenter.geometry, Sphere) else indenter.rounding(element)
-    return 0.0 if _sharpest(indenter.geometry, fingerprint(indenter.geometry.path)) > SHARP else math.inf
+    return 0.0 if len(_sharp(indenter.geometry, fingerprint(indenter.geometry.path))) else math.inf
 
 
 def edges(geometry: Shape, spacing: float) -> FloatArray:
@@ -90,9 +91,7 @@ def edges(geometry: Shape, spacing: float) -> FloatArray:
             rim = geometry.radius * np.stack([np.cos(turns), np.sin(turns), 0.0 * turns], axis=1)
             return np.concatenate([rim + [0.0, 0.0, side * geometry.height / 2] for side in (-1, 1)])
         case Mesh():
-            mesh = centred(geometry, fingerprint(geometry.path))
-            sharp = mesh.face_adjacency_convex & (mesh.face_adjacency_angles > SHARP)
-            return _along(np.asarray(mesh.vertices[mesh.face_adjacency_edges[sharp]]), spacing)
+            return _along(_sharp(geometry, fingerprint(geometry.path)), spacing)
 
 
 def _along(pairs: FloatArray, spacing: float) -> FloatArray:
@@ -255,10 +254,12 @@ def _mesh_extent(geometry: Mesh, content: str) -> tuple[float, ...]:
 
 
 @lru_cache(maxsize=64)
-def _sharpest(geometry: Mesh, content: str) -> float:
-    """Largest angle by which two faces of a mesh turn away from one another at an edge that sticks out [rad]."""
+def _sharp(geometry: Mesh, content: str) -> FloatArray:
+    """Ends (n, 2, 3) [m] of the edges that stick out where two faces of a mesh meet at more than SHARP."""
     mesh = centred(geometry, content)
-    return float(mesh.face_adjacency_angles[mesh.face_adjacency_convex].max(initial=0.0))
+    sharp = mesh.face_adjacency_convex & (mesh.face_adjacency_angles > SHARP)
+    ends = np.asarray(mesh.vertices[mesh.face_adjacency_edges[sharp]], np.float64)
+    return ends[np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) > SLIVER]
 
 
 def _name(geometry: Shape) -> str:

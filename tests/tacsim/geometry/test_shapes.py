@@ -94,6 +94,11 @@ def test_where_the_edges_of_an_indenter_are(tmp_path: Path) -> None:
     assert len(edges(Sphere(radius=4 * MM), 1 * MM)) == 0
     ball = trimesh.creation.icosphere(subdivisions=3, radius=4.0)
     assert len(edges(stl(tmp_path, ball, "ball.stl"), 1 * MM)) == 0
+    turns = np.linspace(0.0, 2 * np.pi, 60, endpoint=False)
+    ring = np.stack([np.cos(turns), np.sin(turns), 0.0 * turns], axis=1)
+    blunt = trimesh.convex.convex_hull(np.concatenate([4.0 * ring, 1e-3 * ring + [0.0, 0.0, 1.0]]))
+    round_its_base = edges(stl(tmp_path, blunt, "cone.stl"), 1 * MM)  # and not at its tip, a ring of 2 um
+    assert np.allclose(round_its_base[:, 2], -0.5 * MM) and np.allclose(np.hypot(*round_its_base[:, :2].T), 4 * MM)
 
 
 @pytest.mark.parametrize(

@@ -65,25 +65,35 @@ def _force(world: World, by: FloatArray, *, flow: bool) -> float:
     return float(normal_forces(world).mean())
 
 
+def _apart(forces: FloatArray) -> float:
+    """By how many % of their mean the forces on two sensors (2,) differ."""
+    return float(np.ptp(forces) / forces.mean() * 100)
+
+
 def _row(
     preset: str, begin: Mapping[str, NDArray[Any]], truth: FloatArray, what: str, *, flow: bool, **settling: float
 ) -> Measurement:
     world, steps = make_world(squeeze_scene(preset, "hybrid", **settling)), _steps()
 
-    def run() -> tuple[FloatArray, int]:
+    def run() -> tuple[FloatArray, float, int]:
         world.restore(begin)
-        forces, substeps = [], 0
+        forces, apart, substeps = [], 0.0, 0
         for step in steps:
             substeps += _move(world, step, flow=flow)
-            forces.append(float(normal_forces(world).mean()))
-        return np.array(forces), substeps
+            felt = normal_forces(world)
+            forces.append(float(felt.mean()))
+            apart = max(apart, _apart(felt))
+        return np.array(forces), apart, substeps
 
-    timing, (forces, substeps) = timed(run, 1, warm=lambda: None)  # kernels are warm after the slow limit's start
+    timing, (forces, apart, substeps) = timed(
+        run, 1, warm=lambda: None
+    )  # kernels are warm after the slow limit's start
     errors = np.abs(forces - truth) / truth.mean() * 100
     each = Timing(tuple(sample / ACTIONS for sample in timing.samples), timing.processor / ACTIONS)
     return Measurement(
         each, float(np.sqrt(np.mean(errors**2))), "% of the mean force, rms", "the same poses, settled at Mach 0.003",
-        what, round(substeps / ACTIONS), {"worst_percent": float(errors.max()), "first_step_percent": float(errors[0])},
+        what, round(substeps / ACTIONS),
+        {"worst_percent": float(errors.max()), "first_step_percent": float(errors[0]), "sensors_apart_percent": apart},
         "a step: its seconds and substeps",
     )  # fmt: skip
 

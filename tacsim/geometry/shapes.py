@@ -259,7 +259,7 @@ def _sharp(geometry: Mesh, content: str) -> FloatArray:
     mesh = centred(geometry, content)
     sharp = mesh.face_adjacency_convex & (mesh.face_adjacency_angles > SHARP)
     ends = np.asarray(mesh.vertices[mesh.face_adjacency_edges[sharp]], np.float64)
-    return ends[np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) > SLIVER]
+    return np.asarray(ends[np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) > SLIVER])
 
 
 def _name(geometry: Shape) -> str:

@@ -65,11 +65,6 @@ def _force(world: World, by: FloatArray, *, flow: bool) -> float:
     return float(normal_forces(world).mean())
 
 
-def _apart(forces: FloatArray) -> float:
-    """By how many % of their mean the forces on two sensors (2,) differ."""
-    return float(np.ptp(forces) / forces.mean() * 100)
-
-
 def _row(
     preset: str, begin: Mapping[str, NDArray[Any]], truth: FloatArray, what: str, *, flow: bool, **settling: float
 ) -> Measurement:
@@ -82,12 +77,11 @@ def _row(
             substeps += _move(world, step, flow=flow)
             felt = normal_forces(world)
             forces.append(float(felt.mean()))
-            apart = max(apart, _apart(felt))
+            apart = max(apart, float(np.ptp(felt) / felt.mean() * 100))
         return np.array(forces), apart, substeps
 
-    timing, (forces, apart, substeps) = timed(
-        run, 1, warm=lambda: None
-    )  # kernels are warm after the slow limit's start
+    # kernels are warm after the slow limit's start
+    timing, (forces, apart, substeps) = timed(run, 1, warm=lambda: None)
     errors = np.abs(forces - truth) / truth.mean() * 100
     each = Timing(tuple(sample / ACTIONS for sample in timing.samples), timing.processor / ACTIONS)
     return Measurement(

@@ -32,6 +32,12 @@ def growth(way: NDArray[np.float64]) -> float:
     return min(1.0, float(-4.0 * way[2] / slid)) if way[2] < 0.0 < slid else 0.0
 
 
+def along(way: NDArray[np.float64]) -> float:
+    """0 to 1: what share of the `way` (3,) of an indenter goes along the surface; in the sensor's axes."""
+    length = float(np.linalg.norm(way))
+    return math.hypot(way[0], way[1]) / length if length > 0.0 else 0.0
+
+
 def turn(way: NDArray[np.float64], force: NDArray[np.float64], friction: float) -> float:
     """0 to 1: what share of the drag that friction allows lies across the `way` (3,) that an indenter goes; `force`
     (3,) on the sensor [N]; both in its axes."""

@@ -30,7 +30,7 @@ from tacsim.physics.gel.gel import GelParams
 from tacsim.physics.motion.controller import ForceReading, Integration, Launch, PreparedLaunch, force_floor
 from tacsim.physics.motion.inertia import Inertia, kernel_second
 from tacsim.physics.motion.path import SHORT_SLIDE, Path, path_along, path_length, plan
-from tacsim.physics.motion.slide import Slide, growth, release, turn
+from tacsim.physics.motion.slide import Slide, along, growth, release, turn
 from tacsim.physics.units import MM, MPA
 from tacsim.physics.worlds.fem import FemWorld
 from tacsim.physics.worlds.press_state import PressState
@@ -162,18 +162,20 @@ class PressWorld(FemWorld):
         way = (at.position - relative(*start).position) * MM
         longest = path_length(start, end, lever)
         faster = max(1.0, float(np.linalg.norm(way)) / longest) if longest > 0.0 else 1.0  # if they go opposite ways
+        depth, walls = 0.0, False
         if indenter.friction > 0.0:
             force = self.wrench("lower")[:3]
             growing, turning = growth(way), turn(way, force, indenter.friction)
+            depth = (self.below(at.quaternion) - float(at.position[2])) * MM
+            walls = self._edges_touch(at, BULGE * depth)
             mach *= 1.0 - turning * (1.0 - min(max(indenter.friction, TURNS_AT[0]), TURNS_AT[1]))
             mach *= 1.0 - release(way, force, indenter.friction) * (1.0 - RELEASED)
+            mach *= 1.0 - along(way) * (1.0 - 1.0 / max(indenter.friction, 1.0)) if walls else 1.0
         path = plan(
             start, end, mach / faster, self._scaled.step, lever, gel.thickness,
             remembered=path_along(start, end, lever), short=SHORT_SLIDE + (SHORT_GROWING - SHORT_SLIDE) * growing,
         )  # fmt: skip
         if indenter.friction > 0.0:
-            depth = (self.below(at.quaternion) - float(at.position[2])) * MM
-            touch = self._edges_touch(at, BULGE * depth)
             slide = Slide(
                 length=math.hypot(way[0], way[1]),
                 before=float(self._touched[2]),
@@ -181,7 +183,7 @@ class PressWorld(FemWorld):
                 depth=depth,
                 shear_mach=faster * path.peak_mach(lever) / self._shear,
                 friction=indenter.friction,
-                edge_radius=MM * edge_radius(indenter, self.scene.element) if touch else math.inf,
+                edge_radius=MM * edge_radius(indenter, self.scene.element) if walls else math.inf,
             )
             self.unfollowed = slide.unfollowed(min(self.scene.element * MM, gel.spacing), gel.thickness)
         return replace(path, growing=growing, turning=turning, unfollowed=self.unfollowed)

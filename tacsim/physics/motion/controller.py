@@ -184,8 +184,7 @@ def move_and_settle(path: Path, settling: Settling, *, balanced: bool, most: int
 
     What creeps (`Path.creeps`) must have little to come at two readings: at one of them it may just turn.
 
-    most: readings that a launch can give. The first launch of the hold takes several, without which nobody can tell,
-    later ones a quarter of those before: what is not at rest by then will not be soon.
+    most: readings that a launch can give. It takes several: one without them costs more than the substeps it saves.
     """
     readings = yield from _follow(path)
     followed = len(readings)
@@ -193,8 +192,8 @@ def move_and_settle(path: Path, settling: Settling, *, balanced: bool, most: int
     held, worst, to_come = 0, math.inf, math.inf
     most = max(1, min(most, SUBSTEPS_PER_HOLD // path.interval, 1 + EARLIER_READINGS))
     while held < settling.max_substeps:
-        left, known = settling.max_substeps - held, len(readings) - followed
-        wanted = min(max(1, known // 4) if known else most, most, math.ceil(left / path.interval))
+        left = settling.max_substeps - held
+        wanted = min(most, math.ceil(left / path.interval))
         for reading in (yield Launch(rest, 0, min(wanted * path.interval, left), wanted)):
             readings.append(reading)
             held = min(held + path.interval, settling.max_substeps)

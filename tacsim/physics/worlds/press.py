@@ -49,6 +49,9 @@ TURNS_DAMPED, TURNS_AT = 0.4, (0.35, 0.5)
 # Share of the speed for what is lifted with all of its drag (`release`): the gel comes up after it too late, and
 # contact that feels less for a moment slips. In three lifts of 0.1 mm a drag fell to 0.74 of its friction, settled.
 RELEASED = 0.35
+# Above this friction what has edges, and so walls, is slid more slowly, in proportion: its contact slips in many small
+# snaps, each of which loses more drag the quicker it is, up to 5 % at standard.
+WALLS_STICK = 0.7
 SHORT_GROWING = 1.0  # gel thicknesses: what is pressed in while it slides goes as slowly as a path of this length
 CLEARANCE = 0.1e-3  # gap between gel and indenter at construction [m]
 UNSEEN = 0.5  # spacings of contact points: how deep an indenter may dip between them; the largest such ball: 0.35
@@ -170,7 +173,8 @@ class PressWorld(FemWorld):
             walls = self._edges_touch(at, BULGE * depth)
             mach *= 1.0 - turning * (1.0 - min(max(indenter.friction, TURNS_AT[0]), TURNS_AT[1]))
             mach *= 1.0 - release(way, force, indenter.friction) * (1.0 - RELEASED)
-            mach *= 1.0 - along(way) * (1.0 - 1.0 / max(indenter.friction, 1.0)) if walls else 1.0
+            steep = WALLS_STICK / max(indenter.friction, WALLS_STICK) if walls else 1.0
+            mach *= 1.0 - along(way) * (1.0 - steep)
         path = plan(
             start, end, mach / faster, self._scaled.step, lever, gel.thickness,
             remembered=path_along(start, end, lever), short=SHORT_SLIDE + (SHORT_GROWING - SHORT_SLIDE) * growing,

@@ -86,7 +86,7 @@ def test_a_body_that_swings_between_two_gels_does_not_creep() -> None:
 
 
 def test_a_launch_gives_several_readings_where_it_can() -> None:
-    """The first launch of the hold as many as one may, later ones a quarter of those before."""
+    """As many as one may, and no more than the hold has left."""
 
     def settled(most: int) -> tuple[int, list[int]]:
         times, asked = iter(range(8, 1000)), list[int]()
@@ -103,9 +103,8 @@ def test_a_launch_gives_several_readings_where_it_can() -> None:
 
     hold, one_by_one = settled(1)
     longer, asked = settled(3)
-    assert set(one_by_one) == {1} and asked[:9] == [3, 1, 1, 1, 1, 1, 2, 2, 3]
-    assert hold <= longer <= hold + 2 * 4 and len(asked) < len(one_by_one) / 2
-    assert max(settled(2)[1]) == 2
+    assert set(one_by_one) == {1} and set(asked) == {3} and set(settled(2)[1]) == {2}
+    assert hold <= longer <= hold + 2 * 4
 
 
 @pytest.mark.parametrize("creeps", [True, False])

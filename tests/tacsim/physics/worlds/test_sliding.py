@@ -154,8 +154,21 @@ def test_edges_as_the_mesh_carries_them_end_a_long_slide_as_a_slow_one(
         indenter = Indenter(geometry=shape, friction=friction)
         w = world(shape, friction, preset="draft", gel=Gel(), settling=settling, indenter=indenter)
         w.move({"indenter": Pose(w.pose("indenter").position - [0, 0, 0.4e-3])})
-        ratios.append(slide(w, by, 4000))
+        ratios.append(slide(w, by, 5000))
     assert ratios[0] == pytest.approx(ratios[1], rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("friction", "deep", "by", "ratio"), [(1.5, 0.3e-3, 2e-3, 1.639), (1.2, 0.4e-3, 1.9e-3, 1.376)]
+)
+def test_walls_with_much_friction_end_a_long_slide_as_a_slow_one(
+    friction: float, deep: float, by: float, ratio: float
+) -> None:
+    """A cylinder R 2 mm at standard; ratios: at Mach 0.0025. They ended 2.2 and 2.9 % lower."""
+    cylinder = Indenter(geometry=Cylinder(radius=2e-3, height=4e-3), friction=friction)
+    w = world(cylinder.geometry, tolerance=1e-2, preset="standard", gel=Gel(), indenter=cylinder)
+    move(w, (0, 0, -deep - 0.1e-3))
+    assert slide(w, by, 2500) == pytest.approx(ratio, rel=0.02)
 
 
 @pytest.mark.parametrize(

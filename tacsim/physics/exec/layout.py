@@ -68,7 +68,7 @@ GREEN = 30  # largest |F^T F - I|^2 of a particle, F its deformation since the g
 NUMBERS = 31
 
 # records (environments, RECORDS, PARTS, NUMBERS) float32: `partial` as it was within the launch, every so many substeps
-RECORDS = 2
+RECORDS = 3
 
 # rows of a body's particles, one number of all of them each: float32
 PLANE = 0  # tangent plane x, y, z [1/mm] (tacsim.physics.body.surface)

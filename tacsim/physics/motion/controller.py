@@ -23,7 +23,7 @@ from tacsim.physics.units import MM
 SUBSTEPS_PER_LAUNCH = 80  # while frames are driven: a control step is one launch or two
 # While they are held. Between launches the grid of a body that flows on is laid anew: with 48, one that was squeezed to
 # a fifth did not come to rest.
-SUBSTEPS_PER_HOLD = 12
+SUBSTEPS_PER_HOLD = 16
 EARLIER_READINGS = 2  # that one is compared with: a single one may have the same phase of an oscillation
 FORESIGHT = 20.0  # readings
 LASTING = 20.0  # readings: how much longer a settled force of what flows keeps within the tolerance
@@ -98,13 +98,15 @@ def still_to_come(first: ForceReading, second: ForceReading, third: ForceReading
 
 def creep_to_come(held: Sequence[ForceReading], age: float) -> float:
     """How far the contact forces of a body that flows will fall in LASTING readings more, relative to the largest
-    force [-]. held: of the hold so far, three at least; age: readings since the motion's middle.
+    force [-]; infinite of fewer than three. held: of the hold so far; age: readings since the motion's middle.
 
     Clay at yield creeps with the logarithm of time: its rate goes with 1 / (time since it began), so the creep is as
     old as the shrinking of its rate over the last half of the hold says. It is no younger than the motion: what rings
     hides it at first, and swings shrink faster. Two gels creep alike: the mean of their forces moves the body as a
     whole, which swings longest, and is left out.
     """
+    if len(held) < 3:
+        return math.inf
     span = max(1, len(held) // 4)
     first, second, third = (_between(held[at].contact) for at in (-1 - 2 * span, -1 - span, -1))
     before, now = second - first, third - second
@@ -189,25 +191,20 @@ def move_and_settle(path: Path, settling: Settling, *, balanced: bool, most: int
     readings = yield from _follow(path)
     followed = len(readings)
     rest = replace(path, start=path.end, substeps=0, rates=None)
-    held, worst, to_come = 0, math.inf, math.inf
-    most = max(1, min(most, SUBSTEPS_PER_HOLD // path.interval, 1 + EARLIER_READINGS))
-    while held < settling.max_substeps:
+    held, worst = 0, math.inf
+    most = max(1, min(most, SUBSTEPS_PER_HOLD // path.interval))
+    while held < settling.max_substeps and worst > settling.tolerance:
         left = settling.max_substeps - held
         wanted = min(most, math.ceil(left / path.interval))
-        for reading in (yield Launch(rest, 0, min(wanted * path.interval, left), wanted)):
-            readings.append(reading)
-            held = min(held + path.interval, settling.max_substeps)
-            if len(readings) > EARLIER_READINGS:
-                earlier = readings[-1 - EARLIER_READINGS : -1]
-                worst = max(residual(readings[-1], each, balanced) for each in earlier)
-                worst = max(worst, still_to_come(*readings[-3:]))
-            if path.creeps:
-                before, to_come = to_come, math.inf
-                if len(readings) - followed > EARLIER_READINGS:
-                    to_come = creep_to_come(readings[followed:], (path.substeps / 2 + held) / path.interval)
-                worst = max(worst, before, to_come)
-        if worst <= settling.tolerance:
-            break
+        readings += yield Launch(rest, 0, min(wanted * path.interval, left), wanted)
+        held = min(held + wanted * path.interval, settling.max_substeps)
+        if len(readings) > EARLIER_READINGS:
+            earlier = readings[-1 - EARLIER_READINGS : -1]
+            worst = max(residual(readings[-1], each, balanced) for each in earlier)
+            worst = max(worst, still_to_come(*readings[-3:]))
+        if path.creeps:
+            age = (path.substeps / 2 + held) / path.interval
+            worst = max(worst, creep_to_come(readings[followed:-1], age - 1), creep_to_come(readings[followed:], age))
     return _stats(readings, path.substeps, held, worst, settling, followed=not path.unfollowed)
 
 

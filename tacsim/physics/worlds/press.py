@@ -50,8 +50,9 @@ TURNS_DAMPED, TURNS_AT = 0.4, (0.35, 0.5)
 # contact that feels less for a moment slips. In three lifts of 0.1 mm a drag fell to 0.74 of its friction, settled.
 RELEASED = 0.35
 # Above this friction what has edges, and so walls, is slid more slowly, in proportion: its contact slips in many small
-# snaps, each of which loses more drag the quicker it is, up to 5 % at standard.
-WALLS_STICK = 0.7
+# snaps, each of which loses more drag the quicker it is, up to 5 % at standard. The finer the mesh, the more of them:
+# it goes with the root of an element's size over the gel's thickness.
+WALLS_STICK = 2.0
 SHORT_GROWING = 1.0  # gel thicknesses: what is pressed in while it slides goes as slowly as a path of this length
 CLEARANCE = 0.1e-3  # gap between gel and indenter at construction [m]
 UNSEEN = 0.5  # spacings of contact points: how deep an indenter may dip between them; the largest such ball: 0.35
@@ -173,8 +174,9 @@ class PressWorld(FemWorld):
             walls = self._edges_touch(at, BULGE * depth)
             mach *= 1.0 - turning * (1.0 - min(max(indenter.friction, TURNS_AT[0]), TURNS_AT[1]))
             mach *= 1.0 - release(way, force, indenter.friction) * (1.0 - RELEASED)
-            steep = WALLS_STICK / max(indenter.friction, WALLS_STICK) if walls else 1.0
-            mach *= 1.0 - along(way) * (1.0 - steep)
+            if walls:
+                sticks = WALLS_STICK * math.sqrt(gel.spacing / gel.thickness)
+                mach *= 1.0 - along(way) * (1.0 - sticks / max(indenter.friction, sticks))
         path = plan(
             start, end, mach / faster, self._scaled.step, lever, gel.thickness,
             remembered=path_along(start, end, lever), short=SHORT_SLIDE + (SHORT_GROWING - SHORT_SLIDE) * growing,

@@ -22,6 +22,16 @@ CAUGHT = 0.5
 # SNAPPING, sooner if it is so deep as walls may be; and under what is so many thicknesses deep, at any friction
 SNAPPED, SNAPPED_SOONER, SNAPPING = 0.5, 0.4, 1.0
 DEEP_WALLS, DEEP = 0.15, 0.25
+# Where a slide goes across all of the drag that is there, its own lags behind in direction: by speed times damping, and
+# the more the less friction there is. So the friction itself is the share of its speed, within these.
+TURNS_AT = (0.35, 0.5)
+# Share of the speed for what is lifted with all of its drag: the gel comes up after it too late, and contact that feels
+# less for a moment slips. In three lifts of 0.1 mm a drag fell to 0.74 of its friction, settled.
+RELEASED = 0.35
+# Times the root of an element's size over the gel's thickness, the friction above which what has edges, and so walls,
+# is slid more slowly, in proportion: its contact slips in many small snaps, more of them the finer the mesh, each of
+# which loses more drag the quicker it is, up to 5 % at standard.
+WALLS_STICK = 2.0
 ROUNDING = 1e-6
 
 
@@ -30,12 +40,6 @@ def growth(way: NDArray[np.float64]) -> float:
     comes deeper by a quarter of what it is slid, or more."""
     slid = math.hypot(way[0], way[1])
     return min(1.0, float(-4.0 * way[2] / slid)) if way[2] < 0.0 < slid else 0.0
-
-
-def along(way: NDArray[np.float64]) -> float:
-    """0 to 1: what share of the `way` (3,) of an indenter goes along the surface; in the sensor's axes."""
-    length = float(np.linalg.norm(way))
-    return math.hypot(way[0], way[1]) / length if length > 0.0 else 0.0
 
 
 def turn(way: NDArray[np.float64], force: NDArray[np.float64], friction: float) -> float:
@@ -54,6 +58,19 @@ def release(way: NDArray[np.float64], force: NDArray[np.float64], friction: floa
     if way[2] <= 0.0 or limit == 0.0:
         return 0.0
     return float(min(1.0, math.hypot(force[0], force[1]) / limit) * way[2] / np.linalg.norm(way))
+
+
+def pace(way: NDArray[np.float64], force: NDArray[np.float64], friction: float, mesh: float | None) -> float:
+    """Share of the default speed at which an indenter goes the `way` (3,), so that it ends as a slow one; `force` (3,)
+    on the sensor [N], both in its axes. mesh: size of an element over the thickness of a gel that the indenter's edges
+    reach; None where they do not."""
+    share = 1.0 - turn(way, force, friction) * (1.0 - min(max(friction, TURNS_AT[0]), TURNS_AT[1]))
+    share *= 1.0 - release(way, force, friction) * (1.0 - RELEASED)
+    length = float(np.linalg.norm(way))
+    if mesh is not None and length > 0.0:
+        sticks = WALLS_STICK * math.sqrt(mesh)
+        share *= 1.0 - math.hypot(way[0], way[1]) / length * (1.0 - sticks / max(friction, sticks))
+    return share
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ from tacsim.physics.gel.gel import GelParams
 from tacsim.physics.motion.controller import ForceReading, Integration, Launch, PreparedLaunch, force_floor
 from tacsim.physics.motion.inertia import Inertia, kernel_second
 from tacsim.physics.motion.path import SHORT_SLIDE, Path, path_along, path_length, plan
-from tacsim.physics.motion.slide import Slide, along, growth, release, turn
+from tacsim.physics.motion.slide import Slide, growth, pace, turn
 from tacsim.physics.units import MM, MPA
 from tacsim.physics.worlds.fem import FemWorld
 from tacsim.physics.worlds.press_state import PressState
@@ -42,17 +42,9 @@ COURANT = 0.4
 # Of its damping, zeta c / thickness: it makes the gel lag, and friction remembers that. What a drag lags by goes with
 # zeta over the speed of the shear wave, so no more than so many times that: of a gel beyond nu = 0.48 it is less.
 ZETA_GEL, ZETA_BY_SHEAR = 0.5, 2.55
-# Where a slide goes across the drag that is there (`turn`), its own lags behind in direction: by speed times damping,
-# and the more the less friction there is. So it has so much of its damping, and the friction itself is the share of
-# its speed, within these.
-TURNS_DAMPED, TURNS_AT = 0.4, (0.35, 0.5)
-# Share of the speed for what is lifted with all of its drag (`release`): the gel comes up after it too late, and
-# contact that feels less for a moment slips. In three lifts of 0.1 mm a drag fell to 0.74 of its friction, settled.
-RELEASED = 0.35
-# Above this friction what has edges, and so walls, is slid more slowly, in proportion: its contact slips in many small
-# snaps, each of which loses more drag the quicker it is, up to 5 % at standard. The finer the mesh, the more of them:
-# it goes with the root of an element's size over the gel's thickness.
-WALLS_STICK = 2.0
+# Share of its damping that a slide has which goes across all of the drag that is there (`turn`), or its own would lag
+# behind in direction
+TURNS_DAMPED = 0.4
 SHORT_GROWING = 1.0  # gel thicknesses: what is pressed in while it slides goes as slowly as a path of this length
 CLEARANCE = 0.1e-3  # gap between gel and indenter at construction [m]
 UNSEEN = 0.5  # spacings of contact points: how deep an indenter may dip between them; the largest such ball: 0.35
@@ -161,22 +153,17 @@ class PressWorld(FemWorld):
         grows because the indenter is pressed in."""
         gel, lever, indenter, mach = self._gel, max(self._gel.half), self.scene.indenter, self.scene.peak_mach
         assert indenter is not None
-        growing, turning, self.unfollowed = 0.0, 0.0, ""
+        growing, turning, walls, depth, self.unfollowed = 0.0, 0.0, False, 0.0, ""
         at = relative(*end)
         way = (at.position - relative(*start).position) * MM
         longest = path_length(start, end, lever)
         faster = max(1.0, float(np.linalg.norm(way)) / longest) if longest > 0.0 else 1.0  # if they go opposite ways
-        depth, walls = 0.0, False
         if indenter.friction > 0.0:
             force = self.wrench("lower")[:3]
             growing, turning = growth(way), turn(way, force, indenter.friction)
             depth = (self.below(at.quaternion) - float(at.position[2])) * MM
             walls = self._edges_touch(at, BULGE * depth)
-            mach *= 1.0 - turning * (1.0 - min(max(indenter.friction, TURNS_AT[0]), TURNS_AT[1]))
-            mach *= 1.0 - release(way, force, indenter.friction) * (1.0 - RELEASED)
-            if walls:
-                sticks = WALLS_STICK * math.sqrt(gel.spacing / gel.thickness)
-                mach *= 1.0 - along(way) * (1.0 - sticks / max(indenter.friction, sticks))
+            mach *= pace(way, force, indenter.friction, gel.spacing / gel.thickness if walls else None)
         path = plan(
             start, end, mach / faster, self._scaled.step, lever, gel.thickness,
             remembered=path_along(start, end, lever), short=SHORT_SLIDE + (SHORT_GROWING - SHORT_SLIDE) * growing,

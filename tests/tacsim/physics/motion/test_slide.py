@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from tacsim.physics.motion.slide import Slide, growth, release, turn
+from tacsim.physics.motion.slide import Slide, growth, pace, release, turn
 
 
 @pytest.mark.parametrize(
@@ -49,6 +49,25 @@ def test_a_way_across_the_drag_turns_it(by: list[float], force: list[float], tur
 )
 def test_what_is_lifted_with_its_drag_is_released(by: list[float], force: list[float], released: float) -> None:
     assert release(np.array(by), np.array(force), 0.6) == pytest.approx(released)
+
+
+@pytest.mark.parametrize(
+    ("by", "force", "friction", "mesh", "share"),
+    [
+        ([1e-3, 0.0, 0.0], [0.6, 0.0, -1.0], 0.6, None, 1.0),
+        ([0.0, 1e-3, 0.0], [0.9, 0.0, -1.0], 0.3, None, 0.35),
+        ([0.0, 1e-3, 0.0], [0.9, 0.0, -1.0], 0.9, None, 0.5),
+        ([0.0, 0.0, 1e-3], [0.9, 0.0, -1.0], 0.6, None, 0.35),
+        ([1e-3, 0.0, 0.0], [0.0, 0.0, -1.0], 1.5, None, 1.0),
+        ([1e-3, 0.0, 0.0], [0.0, 0.0, -1.0], 1.5, 1 / 9, 4 / 9),  # walls, by two thirds over the friction
+        ([1e-3, 0.0, -1e-3], [0.0, 0.0, -1.0], 4 / 3, 1 / 9, 1 - math.sqrt(0.5) / 2),
+        ([0.0, 0.0, -1e-3], [0.0, 0.0, -1.0], 1.5, 1 / 9, 1.0),
+        ([1e-3, 0.0, 0.0], [0.0, 0.0, -1.0], 0.6, 1 / 9, 1.0),
+        ([0.0, 0.0, 0.0], [0.0, 0.0, -1.0], 1.5, 1 / 9, 1.0),
+    ],
+)
+def test_pace(by: list[float], force: list[float], friction: float, mesh: float | None, share: float) -> None:
+    assert pace(np.array(by), np.array(force), friction, mesh) == pytest.approx(share)
 
 
 def slide(**changes: float) -> Slide:

@@ -31,6 +31,7 @@ PASSING = 0.5
 # Gel thicknesses: shorter paths are followed slower than they may be, where the stop leaves a trace: in what yields, in
 # friction
 SHORT_PATH, SHORT_SLIDE = 0.5, 0.25
+LINGERING_KNOTS = 2001  # of the numbers that a path whose end takes longer is interpolated between
 ROUNDING = 1e-6  # of a number of substeps
 MOST_SUBSTEPS = 1_000_000  # of one motion: hours, and no motion that anybody means
 
@@ -49,12 +50,23 @@ def ramp(t: NDArray[np.float64], rise: float = 0.5) -> NDArray[np.float64]:
     return np.where(t < rise, PEAK_SLOPE * rise * half(up), 1.0 - PEAK_SLOPE * (1.0 - rise) * half(down))
 
 
+def lingering(rise: float, slower: float, last: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Times and shares of the way of a `ramp` whose end takes longer: `slower` times as long over the `last` share of
+    the way, from twice that on ever slower. The times go from 0 to how many times as long all of it takes."""
+    knots = np.linspace(0.0, 1.0, LINGERING_KNOTS)
+    shares = ramp(knots, rise)
+    near = np.clip(2.0 - (1.0 - shares) / last, 0.0, 1.0)
+    longer = 1.0 + (slower - 1.0) * near**2 * (3.0 - 2.0 * near)
+    return np.append(0.0, np.cumsum((longer[1:] + longer[:-1]) / 2.0)) / (LINGERING_KNOTS - 1), shares
+
+
 @dataclass(frozen=True)
 class Path:
     """Driven frames move from `start` to `end` in `substeps` nominal substeps of `dt` [mm, wave speed 1].
 
     Each nominal substep is cut into `refine` real ones; all counts of substeps are nominal. interval: substeps of the
     hold at its end between two readings of the forces. rise: share of the time in which the velocity rises, of `ramp`.
+    lingers: how many times slower its end is, and over which last share of the way, of a path from rest to rest.
 
     unfollowed: why it does not end as a slow one, and what to do; empty where it does.
     creeps: what it moves yields, and creeps on when it has ended.
@@ -72,6 +84,7 @@ class Path:
     refine: int = 1
     interval: int = 20
     rise: float = 0.5
+    lingers: tuple[float, float] | None = None
     unfollowed: str = ""
     creeps: bool = False
     growing: float = 0.0
@@ -84,8 +97,9 @@ class Path:
         return self.dt / self.refine
 
     def peak_mach(self, lever: float) -> float:
-        """Of its fastest point, of a path from rest to rest; lever: see `of_fastest_point`."""
-        return PEAK_SLOPE * path_length(self.start, self.end, lever) / (max(self.substeps, 1) * self.dt)
+        """Of its fastest point, of a path from rest to rest, at most; lever: see `of_fastest_point`."""
+        longer = 1.0 if self.lingers is None else float(lingering(self.rise, *self.lingers)[0][-1])
+        return PEAK_SLOPE * longer * path_length(self.start, self.end, lever) / (max(self.substeps, 1) * self.dt)
 
     def drive(self, first: int, last: int) -> NDArray[np.float32]:
         """(n, frames, 6, 3) f32 for substeps first..last, n = (last - first) refine.
@@ -114,14 +128,20 @@ class Path:
         t = np.clip(knots, 0.0, 1.0)[:, None, None]
         whole = displacements_between(self.start, self.end)
         if self.rates is None:
-            ramped: NDArray[np.float64] = ramp(t, self.rise) * whole
-            return ramped
+            return self._progress(t) * whole
         before, after = (self.substeps * self.dt * rates for rates in self.rates)
         turned = np.minimum(t / self.rise, 1.0)  # the share u of the turn; its velocity falls as 1 - 3 u^2 + 2 u^3
         flown = after * t + (before - after) * self.rise * (turned - turned**3 + turned**4 / 2)
         left = whole - after - (before - after) * self.rise / 2
         moved: NDArray[np.float64] = flown + ramp(t, self.rise) * left
         return moved
+
+    def _progress(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Shares of the way at shares `t` of the time, of a path from rest to rest."""
+        if self.lingers is None:
+            return ramp(t, self.rise)
+        times, shares = lingering(self.rise, *self.lingers)
+        return np.asarray(np.interp(t * times[-1], times, shares))
 
     def span(self, names: Iterable[str], first: int, last: int) -> LaunchSpan:
         """Substeps first..last in words, and where the frames called `names` are at their end."""
@@ -183,7 +203,7 @@ def path_along(start: Sequence[Pose], end: Sequence[Pose], lever: float) -> floa
 
 def plan(
     start: Sequence[Pose], end: Sequence[Pose], mach: float, dt: float, lever: float, thickness: float, *,
-    remembered: float = 0.0, short: float = SHORT_PATH,
+    remembered: float = 0.0, short: float = SHORT_PATH, slower: float = 1.0, last: float = 0.0,
 ) -> Path:  # fmt: skip
     """A path whose fastest point moves at peak Mach `mach`; it lasts no less than SHORTEST_RAMP gel thicknesses [mm],
     since a shorter jolt mostly makes the gel ring, and reaches its full speed within half of that.
@@ -191,6 +211,7 @@ def plan(
     remembered: length of the path [mm] whose stop leaves a trace: all of it in a body that yields; in friction what
     of it goes along the surface, where the stop finds the gel. The trace grows with how hard the path brakes, so
     those shorter than `short` gel thicknesses go slower: with the root of their length, the same braking for all.
+    slower: than that, how many times, the `last` [mm] of it is; see `lingering`.
 
     Raises ValueError for a path that takes more than MOST_SUBSTEPS.
     """
@@ -200,8 +221,12 @@ def plan(
         return Path(start, end, 0, dt, interval=interval)
     braked = math.sqrt(remembered * max(remembered, short * thickness))
     lasting = max(PEAK_SLOPE * max(length, braked) / mach, SHORTEST_RAMP * thickness)
-    rise = SHORTEST_RAMP * thickness / 2 / lasting
-    return Path(start, end, _substeps(lasting / dt, length, mach), dt, interval=interval, rise=rise)
+    rise, lingers = SHORTEST_RAMP * thickness / 2 / lasting, None
+    if slower > 1.0:
+        lingers = slower, last / length
+        lasting *= float(lingering(rise, *lingers)[0][-1])
+    substeps = _substeps(lasting / dt, length, mach)
+    return Path(start, end, substeps, dt, interval=interval, rise=rise, lingers=lingers)
 
 
 def plan_flow(

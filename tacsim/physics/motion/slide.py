@@ -29,9 +29,9 @@ TURNS_AT = (0.35, 0.5)
 # less for a moment slips. In three lifts of 0.1 mm a drag fell to 0.74 of its friction, settled.
 RELEASED = 0.35
 # Times the root of an element's size over the gel's thickness, the friction above which what has edges, and so walls,
-# is slid more slowly, in proportion: its contact slips in many small snaps, more of them the finer the mesh, each of
-# which loses more drag the quicker it is, up to 5 % at standard.
-WALLS_STICK = 2.0
+# ends a slide more slowly, in proportion: its contact slips in many small snaps, more of them the finer the mesh, and
+# each loses more drag the quicker it is, up to 5 % at standard. Only the last half of an element's size counts.
+WALLS_STICK, WALLS_LAST = 1.9, 0.5
 ROUNDING = 1e-6
 
 
@@ -60,17 +60,19 @@ def release(way: NDArray[np.float64], force: NDArray[np.float64], friction: floa
     return float(min(1.0, math.hypot(force[0], force[1]) / limit) * way[2] / np.linalg.norm(way))
 
 
-def pace(way: NDArray[np.float64], force: NDArray[np.float64], friction: float, mesh: float | None) -> float:
+def pace(way: NDArray[np.float64], force: NDArray[np.float64], friction: float) -> float:
     """Share of the default speed at which an indenter goes the `way` (3,), so that it ends as a slow one; `force` (3,)
-    on the sensor [N], both in its axes. mesh: size of an element over the thickness of a gel that the indenter's edges
-    reach; None where they do not."""
+    on the sensor [N], both in its axes."""
     share = 1.0 - turn(way, force, friction) * (1.0 - min(max(friction, TURNS_AT[0]), TURNS_AT[1]))
-    share *= 1.0 - release(way, force, friction) * (1.0 - RELEASED)
+    return share * (1.0 - release(way, force, friction) * (1.0 - RELEASED))
+
+
+def slower_walls(way: NDArray[np.float64], friction: float, mesh: float) -> float:
+    """How many times slower the last of the `way` (3,) of an indenter is, if its edges reach the gel, so that it ends
+    as a slow one. mesh: size of an element over the gel's thickness."""
     length = float(np.linalg.norm(way))
-    if mesh is not None and length > 0.0:
-        sticks = WALLS_STICK * math.sqrt(mesh)
-        share *= 1.0 - math.hypot(way[0], way[1]) / length * (1.0 - sticks / max(friction, sticks))
-    return share
+    along = math.hypot(way[0], way[1]) / length if length > 0.0 else 0.0
+    return 1.0 + along * max(0.0, friction / (WALLS_STICK * math.sqrt(mesh)) - 1.0)
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ from tacsim.physics.gel.gel import GelParams
 from tacsim.physics.motion.controller import ForceReading, Integration, Launch, PreparedLaunch, force_floor
 from tacsim.physics.motion.inertia import Inertia, kernel_second
 from tacsim.physics.motion.path import SHORT_SLIDE, Path, path_along, path_length, plan
-from tacsim.physics.motion.slide import Slide, growth, pace, turn
+from tacsim.physics.motion.slide import WALLS_LAST, Slide, growth, pace, slower_walls, turn
 from tacsim.physics.units import MM, MPA
 from tacsim.physics.worlds.fem import FemWorld
 from tacsim.physics.worlds.press_state import PressState
@@ -153,7 +153,7 @@ class PressWorld(FemWorld):
         grows because the indenter is pressed in."""
         gel, lever, indenter, mach = self._gel, max(self._gel.half), self.scene.indenter, self.scene.peak_mach
         assert indenter is not None
-        growing, turning, walls, depth, self.unfollowed = 0.0, 0.0, False, 0.0, ""
+        growing, turning, slower, walls, depth, self.unfollowed = 0.0, 0.0, 1.0, False, 0.0, ""
         at = relative(*end)
         way = (at.position - relative(*start).position) * MM
         longest = path_length(start, end, lever)
@@ -163,10 +163,12 @@ class PressWorld(FemWorld):
             growing, turning = growth(way), turn(way, force, indenter.friction)
             depth = (self.below(at.quaternion) - float(at.position[2])) * MM
             walls = self._edges_touch(at, BULGE * depth)
-            mach *= pace(way, force, indenter.friction, gel.spacing / gel.thickness if walls else None)
+            mach *= pace(way, force, indenter.friction)
+            slower = slower_walls(way, indenter.friction, gel.spacing / gel.thickness) if walls else 1.0
         path = plan(
             start, end, mach / faster, self._scaled.step, lever, gel.thickness,
             remembered=path_along(start, end, lever), short=SHORT_SLIDE + (SHORT_GROWING - SHORT_SLIDE) * growing,
+            slower=slower, last=WALLS_LAST * gel.spacing,
         )  # fmt: skip
         if indenter.friction > 0.0:
             slide = Slide(

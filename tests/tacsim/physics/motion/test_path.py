@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from tacsim.interface import Pose
-from tacsim.physics.motion.path import MOST_SUBSTEPS, PEAK_SLOPE, plan, plan_flow, ramp
+from tacsim.physics.motion.path import MOST_SUBSTEPS, PEAK_SLOPE, Path, plan, plan_flow, ramp
 
 
 @pytest.mark.parametrize("rise", [0.5, 0.1])
@@ -57,6 +57,30 @@ def test_short_ways_of_what_yields_brake_no_harder_than_long_ones() -> None:
     for short in (0.1, 0.5, 1.0):
         assert braking(short, yields=True) == pytest.approx(braking(2.0, yields=True), rel=1e-2)
         assert braking(short, yields=False) > 1.9 * braking(short, yields=True)
+
+
+@pytest.mark.parametrize("by", [2.0, 0.3])
+def test_a_path_that_lingers_ends_as_if_it_were_driven_more_slowly(by: float) -> None:
+    """Three times as slowly over the last 0.25 mm, from 0.5 mm on ever more so, and before that as it was."""
+    start, end = [Pose()], [Pose(np.array([by * 1e-3, 0.0, 0.0]))]
+    usual = plan(start, end, mach=0.02, dt=0.02, lever=10.0, thickness=4.0)
+    path = plan(start, end, mach=0.02, dt=0.02, lever=10.0, thickness=4.0, slower=3.0, last=0.25)
+
+    def drive(of: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Where it is, and how fast."""
+        rows = of.drive(0, of.substeps)[:, 0].astype(float)
+        return rows[:, 3, 0], rows[:, 4, 0]
+
+    (x, speed), (usual_x, usual_speed) = drive(path), drive(usual)
+    assert x[-1] == pytest.approx(by, abs=1e-6) and (speed >= 0.0).all()
+    for left, slower in ((0.05, 3.0), (0.2, 3.0), (0.375, 2.0), (0.55, 1.0), (1.0, 1.0)):
+        if left < by - 0.01:
+            was = np.interp(by - left, usual_x, usual_speed)
+            assert was / np.interp(by - left, x, speed) == pytest.approx(slower, rel=0.02)
+    assert speed.max() <= path.peak_mach(10.0) * 1.001
+    assert path.peak_mach(10.0) == pytest.approx(0.02, rel=1e-3)
+    refined = replace(path, refine=2).drive(0, path.substeps)[1::2, 0, 3, 0]
+    assert refined == pytest.approx(x, abs=1e-6)
 
 
 def test_refining_cuts_the_same_path_finer() -> None:

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from tacsim.physics.motion.slide import Slide, growth, pace, release, turn
+from tacsim.physics.motion.slide import Slide, growth, pace, release, slower_walls, turn
 
 
 @pytest.mark.parametrize(
@@ -52,22 +52,31 @@ def test_what_is_lifted_with_its_drag_is_released(by: list[float], force: list[f
 
 
 @pytest.mark.parametrize(
-    ("by", "force", "friction", "mesh", "share"),
+    ("by", "force", "friction", "share"),
     [
-        ([1e-3, 0.0, 0.0], [0.6, 0.0, -1.0], 0.6, None, 1.0),
-        ([0.0, 1e-3, 0.0], [0.9, 0.0, -1.0], 0.3, None, 0.35),
-        ([0.0, 1e-3, 0.0], [0.9, 0.0, -1.0], 0.9, None, 0.5),
-        ([0.0, 0.0, 1e-3], [0.9, 0.0, -1.0], 0.6, None, 0.35),
-        ([1e-3, 0.0, 0.0], [0.0, 0.0, -1.0], 1.5, None, 1.0),
-        ([1e-3, 0.0, 0.0], [0.0, 0.0, -1.0], 1.5, 1 / 9, 4 / 9),  # walls, by two thirds over the friction
-        ([1e-3, 0.0, -1e-3], [0.0, 0.0, -1.0], 4 / 3, 1 / 9, 1 - math.sqrt(0.5) / 2),
-        ([0.0, 0.0, -1e-3], [0.0, 0.0, -1.0], 1.5, 1 / 9, 1.0),
-        ([1e-3, 0.0, 0.0], [0.0, 0.0, -1.0], 0.6, 1 / 9, 1.0),
-        ([0.0, 0.0, 0.0], [0.0, 0.0, -1.0], 1.5, 1 / 9, 1.0),
+        ([1e-3, 0.0, 0.0], [0.6, 0.0, -1.0], 0.6, 1.0),
+        ([0.0, 1e-3, 0.0], [0.9, 0.0, -1.0], 0.3, 0.35),
+        ([0.0, 1e-3, 0.0], [0.9, 0.0, -1.0], 0.9, 0.5),
+        ([0.0, 0.0, 1e-3], [0.9, 0.0, -1.0], 0.6, 0.35),
+        ([1e-3, 0.0, 0.0], [0.0, 0.0, -1.0], 1.5, 1.0),
     ],
 )
-def test_pace(by: list[float], force: list[float], friction: float, mesh: float | None, share: float) -> None:
-    assert pace(np.array(by), np.array(force), friction, mesh) == pytest.approx(share)
+def test_pace(by: list[float], force: list[float], friction: float, share: float) -> None:
+    assert pace(np.array(by), np.array(force), friction) == pytest.approx(share)
+
+
+@pytest.mark.parametrize(
+    ("by", "friction", "slower"),
+    [
+        ([1e-3, 0.0, 0.0], 1.9, 3.0),  # where walls stick at a third of it
+        ([0.0, 1e-3, -1e-3], 1.9, 1.0 + math.sqrt(2.0)),
+        ([0.0, 0.0, -1e-3], 1.9, 1.0),
+        ([1e-3, 0.0, 0.0], 0.6, 1.0),
+        ([0.0, 0.0, 0.0], 1.9, 1.0),
+    ],
+)
+def test_walls_with_much_friction_end_a_slide_more_slowly(by: list[float], friction: float, slower: float) -> None:
+    assert slower_walls(np.array(by), friction, 1 / 9) == pytest.approx(slower)
 
 
 def slide(**changes: float) -> Slide:

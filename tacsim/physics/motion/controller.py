@@ -21,9 +21,10 @@ from tacsim.physics.snapshot import State
 from tacsim.physics.units import MM
 
 SUBSTEPS_PER_LAUNCH = 80  # while frames are driven: a control step is one launch or two
-# While they are held. Between launches the grid of a body that flows on is laid anew: with 48, one that was squeezed to
-# a fifth did not come to rest.
-SUBSTEPS_PER_HOLD = 16
+# While they are held: in the first launch, which has the four readings at `learn` without which nobody can tell of what
+# creeps, and in later ones, one reading at `draft`. Between launches the grid of a body that flows on is laid anew:
+# with 48, one that was squeezed to a fifth did not come to rest.
+SUBSTEPS_PER_HOLD = (16, 12)
 EARLIER_READINGS = 2  # that one is compared with: a single one may have the same phase of an oscillation
 FORESIGHT = 20.0  # readings
 LASTING = 20.0  # readings: how much longer a settled force of what flows keeps within the tolerance
@@ -186,16 +187,16 @@ def move_and_settle(path: Path, settling: Settling, *, balanced: bool, most: int
 
     What creeps (`Path.creeps`) must have little to come at two readings: at one of them it may just turn.
 
-    most: readings that a launch can give. It takes several: one without them costs more than the substeps it saves.
+    most: readings that a launch can give. It takes several: a launch costs more than the substeps that it would save.
     """
     readings = yield from _follow(path)
     followed = len(readings)
     rest = replace(path, start=path.end, substeps=0, rates=None)
     held, worst = 0, math.inf
-    most = max(1, min(most, SUBSTEPS_PER_HOLD // path.interval))
+    first, later = (max(1, min(most, substeps // path.interval)) for substeps in SUBSTEPS_PER_HOLD)
     while held < settling.max_substeps and worst > settling.tolerance:
         left = settling.max_substeps - held
-        wanted = min(most, math.ceil(left / path.interval))
+        wanted = min(later if held else first, math.ceil(left / path.interval))
         readings += yield Launch(rest, 0, min(wanted * path.interval, left), wanted)
         held = min(held + wanted * path.interval, settling.max_substeps)
         if len(readings) > EARLIER_READINGS:

@@ -30,8 +30,9 @@ TURNS_AT = (0.35, 0.5)
 RELEASED = 0.35
 # Times the root of an element's size over the gel's thickness, the friction above which what has edges, and so walls,
 # ends a slide more slowly, in proportion: its contact slips in many small snaps, more of them the finer the mesh, and
-# each loses more drag the quicker it is, up to 5 % at standard. Only the last half of an element's size counts.
-WALLS_STICK, WALLS_LAST = 1.9, 0.5
+# each loses more drag the quicker it is, up to 5 % at standard. Only the last half of an element's size counts. Beyond
+# the friction that this is measured at, contact sticks rather than slips.
+WALLS_STICK, WALLS_LAST, STEEPEST = 1.9, 0.5, 1.5
 ROUNDING = 1e-6
 
 
@@ -72,7 +73,7 @@ def slower_walls(way: NDArray[np.float64], friction: float, mesh: float) -> floa
     as a slow one. mesh: size of an element over the gel's thickness."""
     length = float(np.linalg.norm(way))
     along = math.hypot(way[0], way[1]) / length if length > 0.0 else 0.0
-    return 1.0 + along * max(0.0, friction / (WALLS_STICK * math.sqrt(mesh)) - 1.0)
+    return 1.0 + along * max(0.0, min(friction, STEEPEST) / (WALLS_STICK * math.sqrt(mesh)) - 1.0)
 
 
 @dataclass(frozen=True)

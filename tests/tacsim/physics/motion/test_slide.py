@@ -68,11 +68,13 @@ def test_pace(by: list[float], force: list[float], friction: float, share: float
 @pytest.mark.parametrize(
     ("by", "friction", "slower"),
     [
-        ([1e-3, 0.0, 0.0], 1.9, 3.0),  # where walls stick at a third of it
-        ([0.0, 1e-3, -1e-3], 1.9, 1.0 + math.sqrt(2.0)),
-        ([0.0, 0.0, -1e-3], 1.9, 1.0),
+        ([1e-3, 0.0, 0.0], 0.95, 1.5),  # where walls stick at two thirds of it
+        ([0.0, 1e-3, -1e-3], 0.95, 1.0 + math.sqrt(0.5) / 2.0),
+        ([1e-3, 0.0, 0.0], 1.5, 4.5 / 1.9),
+        ([1e-3, 0.0, 0.0], 100.0, 4.5 / 1.9),  # it sticks
+        ([0.0, 0.0, -1e-3], 1.5, 1.0),
         ([1e-3, 0.0, 0.0], 0.6, 1.0),
-        ([0.0, 0.0, 0.0], 1.9, 1.0),
+        ([0.0, 0.0, 0.0], 1.5, 1.0),
     ],
 )
 def test_walls_with_much_friction_end_a_slide_more_slowly(by: list[float], friction: float, slower: float) -> None:

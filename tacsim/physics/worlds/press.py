@@ -150,7 +150,7 @@ class PressWorld(FemWorld):
 
     def plan(self, start: Sequence[Pose], end: Sequence[Pose]) -> Path:
         """The path between two poses of sensor and indenter, at the scene's speed; slower where the drag turns, or
-        grows because the indenter is pressed in."""
+        grows because the indenter is pressed in, and at its end where walls with much friction slide."""
         gel, lever, indenter, mach = self._gel, max(self._gel.half), self.scene.indenter, self.scene.peak_mach
         assert indenter is not None
         growing, turning, slower, walls, depth, self.unfollowed = 0.0, 0.0, 1.0, False, 0.0, ""

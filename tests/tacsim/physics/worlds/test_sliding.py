@@ -164,7 +164,7 @@ def test_edges_as_the_mesh_carries_them_end_a_long_slide_as_a_slow_one(
 def test_walls_with_much_friction_end_a_long_slide_as_a_slow_one(
     friction: float, deep: float, by: float, ratio: float
 ) -> None:
-    """A cylinder R 2 mm at standard; ratios: at Mach 0.0025. They ended 2.2 and 2.9 % lower."""
+    """A cylinder R 2 mm at standard; ratios: at Mach 0.0025. They ended 2.9 and 2.2 % lower."""
     cylinder = Indenter(geometry=Cylinder(radius=2e-3, height=4e-3), friction=friction)
     w = world(cylinder.geometry, tolerance=1e-2, preset="standard", gel=Gel(), indenter=cylinder)
     move(w, (0, 0, -deep - 0.1e-3))

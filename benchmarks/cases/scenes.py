@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -134,6 +137,40 @@ def _made_and_moved(scene: Scene) -> tuple[World, float, float]:
     return world, (made - began) * 1e3, (time.perf_counter() - made) * 1e3
 
 
+FIRST_MOTION = """
+import time
+from tacsim.models.scene import Scene
+from tacsim.physics.world import make_world
+from tacsim.pose import Pose
+world = make_world(Scene(preset="draft"))
+pose = world.pose("upper")
+world.move({"upper": Pose(pose.position - [0, 0, 0.5e-3], pose.quaternion)})
+print(world.wrench("upper")[2], time.process_time())
+"""
+
+
+def first_motion(repeat: int) -> list[Measurement]:
+    """A process that makes the default scene's draft world and closes it by 0.5 mm: where no kernels are kept, then
+    where they are."""
+    with tempfile.TemporaryDirectory() as folder:
+        environment = {**os.environ, "TI_OFFLINE_CACHE_FILE_PATH": folder}
+        command = [sys.executable, "-W", "ignore", "-c", FIRST_MOTION]
+        samples: list[tuple[float, float, float]] = []  # force [N], processor's time, wall time [s]
+        for _ in range(1 + max(repeat, 1)):
+            began = time.perf_counter()
+            out = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=600, check=True)
+            force, taken = map(float, out.stdout.split())
+            samples.append((force, taken, time.perf_counter() - began))
+    rows = []
+    for variant, runs in (("kernels compiled", samples[:1]), ("kernels kept", samples[1:])):
+        forces, processor, seconds = zip(*runs, strict=True)
+        timing = Timing(seconds, float(np.median(processor)))
+        different = max(abs(force - samples[0][0]) for force in forces)
+        against = "the process that compiled them"
+        rows.append(Measurement(timing, different, "N", against, variant, figures={"force_n": abs(forces[0])}))
+    return rows
+
+
 def batch(count: int, repeat: int) -> list[Measurement]:
     """Draft squeezes moved by one launch, each closed by 0.1 mm without a hold: what a substep costs each of them."""
     from tacsim.physics.worlds.batch import Batch
@@ -171,5 +208,6 @@ CASES = (
     *(_indenter(n, f) for n, f in (("sphere", _ball), ("cylinder", _cylinder), ("box", _box), ("mesh", _mesh))),
     *(Case("scenes", f"body_{m}", "tacsim", PRESETS["draft"], partial(body, m)) for m in ("elastic", "plastic")),
     *(Case("scenes", "second_world", "tacsim", words, partial(second_world, p)) for p, words in PRESETS.items()),
+    Case("scenes", "first_motion", "tacsim", PRESETS["draft"], first_motion),
     *(Case("scenes", "batch", "tacsim", f"{n} x {PRESETS['draft']}", partial(batch, n)) for n in ENVIRONMENTS),
 )  # fmt: skip

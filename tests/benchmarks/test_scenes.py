@@ -49,6 +49,12 @@ def test_a_second_world_is_the_first_once_more() -> None:
     assert row.figures["second_ms"] > 0 and row.figures["first_ms"] > 0
 
 
+def test_a_first_motion_is_the_same_with_kernels_of_another_process() -> None:
+    rows = scenes.first_motion(1)
+    assert [row.variant for row in rows] == ["kernels compiled", "kernels kept"]
+    assert all(row.error == 0.0 and row.figures["force_n"] > 0.1 for row in rows)
+
+
 def test_a_batch_that_diverges_is_no_row(monkeypatch: pytest.MonkeyPatch) -> None:
     lost = SimulationDiverged("lost", "made up")
     monkeypatch.setattr(Batch, "move", lambda self, targets: [None, lost])

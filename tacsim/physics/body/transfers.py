@@ -280,10 +280,11 @@ def moved_plane(plane, step):
 
 @ti.func
 def gather(
-    body: ti.template(), grid: ti.template(), indices: ti.template(), nodes: ti.template(), sums: ti.template(), lane
+    body: ti.template(), grid: ti.template(), indices: ti.template(), nodes: ti.template(), nodes_x: ti.template(),
+    nodes_y: ti.template(), nodes_z: ti.template(), sums: ti.template(), lane,
 ):  # fmt: skip
-    """Velocities of the nodes of one particle's stencil: SUM, BY_X, BY_Y and BY_Z of them into `sums`; nodes: room for
-    the same by nodes of a strip."""
+    """Velocities of the nodes of one particle's stencil: SUM, BY_X, BY_Y and BY_Z of them into `sums`; nodes, ...: room
+    for the same by nodes of a strip."""
     for c in range(4 * NODES):
         total, by_x, by_y, by_z = 0.0, 0.0, 0.0, 0.0
         for s in ti.static(range(LINE)):
@@ -298,12 +299,12 @@ def gather(
             by_x += w * across
             by_y += w * mean(grid, W_X, lane, sloped[0], sloped[1], sloped[2])
             by_z += ti.select(c < 4, float(NODES * s), float(NODES * s + 1)) * here
-        nodes[SUM, c], nodes[BY_X, c], nodes[BY_Y, c], nodes[BY_Z, c] = total, by_x, by_y, by_z
-    for k in ti.static(range(4)):
+        nodes[c, 0], nodes_x[c, 0], nodes_y[c, 0], nodes_z[c, 0] = total, by_x, by_y, by_z
+    for k, of_strip in ti.static([(SUM, nodes), (BY_X, nodes_x), (BY_Y, nodes_y), (BY_Z, nodes_z)]):
         for d in ti.static(range(3)):
-            total = nodes[k, d]
+            total = of_strip[d, 0]
             for n in ti.static(range(1, NODES)):
-                total += nodes[k, 4 * n + d]
+                total += of_strip[4 * n + d, 0]
             sums[3 * k + d, lane] = total
 
 
@@ -345,7 +346,10 @@ def grid_to_particles(env: ti.template(), part, body: ti.template()):
     grid = filled(0.0, STENCIL, LANES)
     indices = filled(0, INDICES, LANES)
     sums = filled(0.0, 12, LANES)  # SUM, BY_X, BY_Y, BY_Z: three numbers each
-    nodes = filled(0.0, 4, 4 * NODES)  # the same of one particle, by nodes of a strip
+    # The same of one particle, by nodes of a strip. Four arrays: of one LLVM looks at 100 uses only to see that nothing
+    # else lies where it does, and would not merge lanes.
+    nodes, nodes_x = filled(0.0, 4 * NODES, 1), filled(0.0, 4 * NODES, 1)
+    nodes_y, nodes_z = filled(0.0, 4 * NODES, 1), filled(0.0, 4 * NODES, 1)
     extremes = filled(0.0, 8, LANES)  # see note_extremes
     for lane in range(LANES):
         extremes[6, lane] = 1e9
@@ -362,7 +366,7 @@ def grid_to_particles(env: ti.template(), part, body: ti.template()):
             for r in ti.static(range(12)):
                 sums[r, lane] = 0.0
         for lane in range(count):
-            gather(body, grid, indices, nodes, sums, lane)
+            gather(body, grid, indices, nodes, nodes_x, nodes_y, nodes_z, sums, lane)
         for lane in range(LANES):
             velocity, factor = three(sums, 3 * SUM, lane), 4.0 * slab.scale
             x = factor * (three(sums, 3 * BY_X, lane) - grid[AT, lane] * velocity)

@@ -1,5 +1,6 @@
 """Kernels of two gels round a plasticine body: contact, transfers and motion, many substeps in one launch."""
 
+from tacsim.compute.apart import apart
 from tacsim.compute.runtime import ti
 from tacsim.physics.body.follow import Ends, follow, push_leaders
 from tacsim.physics.body.mass import CHANGE, SECOND, cell_means, filtered_change, grid_changes, second_changes
@@ -28,6 +29,7 @@ from tacsim.physics.exec.lanes import (
     smallest_lane,
     strip,
     three,
+    vec2,
     vec3,
 )
 from tacsim.physics.exec.team import CHUNK, ENVIRONMENT, Sync, first_in_chunk, next_piece, once_if, own_part, piece_done
@@ -227,6 +229,58 @@ def keep_record(env: ti.template(), part, it, records: ti.template()):
             records[env.index, record, part, number] = env.partial[env.index, part, number]
 
 
+# Nearly all work is compiled apart from the kernel (see tacsim.compute.apart). Particles to grid is not: it is so large
+# that LLVM leaves it apart, looks up after each store where its arrays lie, and merges no lanes.
+
+
+@apart
+def on_gels(
+    work: ti.template(), index: ti.i32, part: ti.i32,
+    nodes: Floats, surface: Floats, contact_force: Floats, corners: Floats, lattice: Lattice,
+    params: Params, counts: Counts, partial: Partial,
+):  # fmt: skip
+    """work(env, part, gels)."""
+    env = ti.static(Environment(index, params, counts, partial))
+    work(env, part, ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 2)))
+
+
+@apart
+def on_body(
+    work: ti.template(), index: ti.i32, part: ti.i32,
+    particles: Floats, masses: Strips, velocities: Strips, changes: Floats, ends: Ends, shares: Floats,
+    params: Params, counts: Counts, partial: Partial,
+):  # fmt: skip
+    """work(env, part, body)."""
+    env = ti.static(Environment(index, params, counts, partial))
+    work(env, part, ti.static(Body(particles, masses, velocities, changes, ends, shares)))
+
+
+@apart
+def contact(
+    index: ti.i32, part: ti.i32, it: ti.i32, highest: vec2, drive: Drive,
+    nodes: Floats, surface: Floats, contact_force: Floats, corners: Floats, lattice: Lattice,
+    particles: Floats, masses: Strips, velocities: Strips, changes: Floats, ends: Ends, shares: Floats,
+    histories: ContactHistories, params: Params, counts: Counts, partial: Partial,
+):  # fmt: skip
+    """Contact of a part's particles with both gels; highest: contact_ceiling of each."""
+    env = ti.static(Environment(index, params, counts, partial))
+    gels = ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 2))
+    body = ti.static(Body(particles, masses, velocities, changes, ends, shares))
+    partial[index, part, layout.OVERLAP] = 0.0
+    for g in range(2):
+        gel_contact(env, part, g, it, drive, body, histories, gels, highest[g])
+
+
+@apart
+def grid_motion(
+    index: ti.i32, part: ti.i32, it: ti.i32, drive: Drive,
+    particles: Floats, masses: Strips, velocities: Strips, changes: Floats, ends: Ends, shares: Floats,
+    params: Params, counts: Counts, partial: Partial,
+):  # fmt: skip
+    env = ti.static(Environment(index, params, counts, partial))
+    grid_update(env, part, it, drive, ti.static(Body(particles, masses, velocities, changes, ends, shares)))
+
+
 @ti.kernel
 def substeps(
     team: ti.i32, drive: Drive,
@@ -246,11 +300,13 @@ def substeps(
             turn = task // CHUNK // team
             index = sync[turn, ENVIRONMENT]
             env = ti.static(Environment(index, params, counts, partial))
-            gels = ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 2))
+            of_gels = ti.static((nodes, surface, contact_force, corners, lattice))
+            gels = ti.static(gels_of(env, *of_gels, 2))
             body = ti.static(Body(particles, masses, velocities, changes, ends, shares))
+            shared = ti.static((params, counts, partial))
             steps = env.count(layout.STEPS)
             stages, own = STAGES * steps + 1, own_part(task, team)
-            highest, known = ti.Vector([0.0, 0.0]), -1  # of the two gels, in this stage
+            highest, known = vec2(0.0), -1  # of the two gels, in this stage
             piece = next_piece(sync, turn, own, stages)
             while piece < stages * PARTS:
                 stage, part = piece // PARTS, piece % PARTS
@@ -260,29 +316,27 @@ def substeps(
                     for g in ti.static(range(2)):
                         highest[g] = contact_ceiling(env, gels, g)
                 for _gather in range(once_if(scatters and it > 0)):
-                    grid_to_particles(env, part, body)
+                    on_body(grid_to_particles, index, part, *body, *shared)
                 for _scatter in range(once_if(scatters and it < steps)):
-                    partial[index, part, layout.OVERLAP] = 0.0
-                    for g in range(2):
-                        gel_contact(env, part, g, it, drive, body, histories, gels, highest[g])
+                    contact(index, part, it, highest, drive, *of_gels, *body, histories, *shared)
                     clear_masses(env, part, body)
                     particles_to_grid(env, part, it, body)
-                    gel_forces(env, part, gels)
+                    on_gels(gel_forces, index, part, *of_gels, *shared)
                 for _totals in range(once_if(stage % STAGES == 1)):
-                    gel_means(env, part, gels)
-                    grid_changes(env, part, body)
-                    push_leaders(env, part, body)
+                    on_gels(gel_means, index, part, *of_gels, *shared)
+                    on_body(grid_changes, index, part, *body, *shared)
+                    on_body(push_leaders, index, part, *body, *shared)
                 for _even in range(once_if(stage % STAGES == 2)):
-                    gel_even(env, part, gels)
+                    on_gels(gel_even, index, part, *of_gels, *shared)
                 for _cells in range(once_if(stage % STAGES == 2 or stage % STAGES == 4)):
                     cell_means(env, part, ti.select(stage % STAGES == 2, CHANGE, SECOND), body)
                 for _motion in range(once_if(stage % STAGES == 3)):
-                    gel_advance_filtered(env, part, gels)
-                    second_changes(env, part, body)
+                    on_gels(gel_advance_filtered, index, part, *of_gels, *shared)
+                    on_body(second_changes, index, part, *body, *shared)
                 for _motion in range(once_if(stage % STAGES == 5)):
-                    grid_update(env, part, it, drive, body)
+                    grid_motion(index, part, it, drive, *body, *shared)
                 for _light in range(once_if(stage % STAGES == 6)):
-                    follow(env, part, body)
+                    on_body(follow, index, part, *body, *shared)
                 for _end in range(once_if(stage % STAGES == STAGES - 1)):
                     keep_record(env, part, it, records)
                 piece_done(sync, turn)

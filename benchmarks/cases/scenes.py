@@ -166,8 +166,11 @@ def first_motion(repeat: int) -> list[Measurement]:
         forces, processor, seconds = zip(*runs, strict=True)
         timing = Timing(seconds, float(np.median(processor)))
         different = max(abs(force - samples[0][0]) for force in forces)
-        against = "the process that compiled them"
-        rows.append(Measurement(timing, different, "N", against, variant, figures={"force_n": abs(forces[0])}))
+        figures = {"force_n": abs(forces[0])}
+        rows.append(
+            Measurement(timing, different, "N", "the process that compiled them", variant, figures=figures,
+                        note="memory is of the process that starts it")
+        )  # fmt: skip
     return rows
 
 

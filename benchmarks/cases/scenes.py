@@ -158,8 +158,10 @@ def first_motion(repeat: int) -> list[Measurement]:
         samples: list[tuple[float, float, float]] = []  # force [N], processor's time, wall time [s]
         for _ in range(1 + max(repeat, 1)):
             began = time.perf_counter()
-            out = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=600, check=True)
-            force, taken = map(float, out.stdout.split())
+            done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=600)
+            if done.returncode:
+                raise RuntimeError(f"a process ended with {done.returncode}: {done.stderr.strip()[-500:]}")
+            force, taken = map(float, done.stdout.split())
             samples.append((force, taken, time.perf_counter() - began))
     rows = []
     for variant, runs in (("kernels compiled", samples[:1]), ("kernels kept", samples[1:])):

@@ -1,4 +1,4 @@
-"""Functions of a kernel that Taichi compiles apart from it: its real functions, as it means them to be.
+"""Functions that Taichi compiles apart from the kernel that calls them: its real functions, mended.
 
 Taichi compiles a kernel for as long as it is large, squared, and its functions are part of it: the squeeze took 20
 seconds. Apart from each other its pieces take 6, and LLVM, which compiles them last, puts small ones together again, to
@@ -11,7 +11,7 @@ from typing import Any
 
 from tacsim.compute.runtime import ti
 
-FUNCTIONS = 64  # made at once; all kernels of a process have some 20
+FUNCTIONS = 64  # made at once; the squeeze has 11
 
 
 def apart(function: Callable[..., Any]) -> Any:
@@ -65,7 +65,7 @@ class _Within:
 
 def _make_functions() -> Iterator[Any]:
     """Empty functions of Taichi's, each at a higher address than the one before: a kernel's key lists them in the order
-    in which the kernel needs them."""
+    in which the kernel needs them. (But for the one kernel of a process, if any, whose functions are of two lots.)"""
     core = ti.lang.kernel_impl._ti_core
     program = ti.lang.impl.get_runtime().prog
     number = 0

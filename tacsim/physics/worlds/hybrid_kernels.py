@@ -239,7 +239,7 @@ def on_gels(
     nodes: Floats, surface: Floats, contact_force: Floats, corners: Floats, lattice: Lattice,
     params: Params, counts: Counts, partial: Partial,
 ):  # fmt: skip
-    """work(env, part, gels)."""
+    """Does work(env, part, gels)."""
     env = ti.static(Environment(index, params, counts, partial))
     work(env, part, ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 2)))
 
@@ -250,13 +250,13 @@ def on_body(
     particles: Floats, masses: Strips, velocities: Strips, changes: Floats, ends: Ends, shares: Floats,
     params: Params, counts: Counts, partial: Partial,
 ):  # fmt: skip
-    """work(env, part, body)."""
+    """Does work(env, part, body)."""
     env = ti.static(Environment(index, params, counts, partial))
     work(env, part, ti.static(Body(particles, masses, velocities, changes, ends, shares)))
 
 
 @apart
-def contact(
+def contacts(
     index: ti.i32, part: ti.i32, it: ti.i32, highest: vec2, drive: Drive,
     nodes: Floats, surface: Floats, contact_force: Floats, corners: Floats, lattice: Lattice,
     particles: Floats, masses: Strips, velocities: Strips, changes: Floats, ends: Ends, shares: Floats,
@@ -277,6 +277,7 @@ def grid_motion(
     particles: Floats, masses: Strips, velocities: Strips, changes: Floats, ends: Ends, shares: Floats,
     params: Params, counts: Counts, partial: Partial,
 ):  # fmt: skip
+    """Does `grid_update`."""
     env = ti.static(Environment(index, params, counts, partial))
     grid_update(env, part, it, drive, ti.static(Body(particles, masses, velocities, changes, ends, shares)))
 
@@ -318,7 +319,7 @@ def substeps(
                 for _gather in range(once_if(scatters and it > 0)):
                     on_body(grid_to_particles, index, part, *body, *shared)
                 for _scatter in range(once_if(scatters and it < steps)):
-                    contact(index, part, it, highest, drive, *of_gels, *body, histories, *shared)
+                    contacts(index, part, it, highest, drive, *of_gels, *body, histories, *shared)
                     clear_masses(env, part, body)
                     particles_to_grid(env, part, it, body)
                     on_gels(gel_forces, index, part, *of_gels, *shared)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+
+from tests.tacsim.compute.fresh_process import run_script
 
 pytestmark = pytest.mark.cpu
 
@@ -82,14 +81,10 @@ print(a.tolist(), b.tolist())
 
 
 def run(tmp_path: Path, *arguments: str, shift: float = 1.0, seed: int = 0) -> tuple[str, set[str]]:
-    """What a fresh process prints, and the names of the compiled kernels kept so far."""
-    cache, script = tmp_path / "kept", tmp_path / "kernel.py"
-    script.write_text(KERNEL.replace("SHIFT", str(shift)), encoding="utf-8")
-    environment = {**os.environ, "TI_OFFLINE_CACHE_FILE_PATH": str(cache), "PYTHONHASHSEED": str(seed)}
-    command = [sys.executable, "-W", "ignore", str(script), *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=100, env=environment)
-    assert done.returncode == 0, done.stderr[-2000:]
-    return done.stdout, {each.name for each in cache.glob("*.tic")}
+    text = KERNEL.replace("SHIFT", str(shift))
+    return run_script(
+        tmp_path / "kernel.py", text, *arguments, kept=tmp_path / "kept", PYTHONHASHSEED=str(seed)
+    )  # fmt: skip
 
 
 EXPECTED = "[0.5, 1.25, 2.0] [-1.0, 0.9375, 7.5]\n"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import inspect
-import os
 import subprocess
 import sys
 from collections import namedtuple
@@ -14,6 +13,7 @@ from types import SimpleNamespace
 import pytest
 
 from tacsim.compute.front_end import function_source, quicken
+from tests.tacsim.compute.fresh_process import run_script
 
 KERNELS = """
 import sys
@@ -130,14 +130,7 @@ def last(a):
 
 
 def run(tmp_path: Path, front_end: str) -> tuple[str, set[str]]:
-    """What a fresh process prints, and the names of the compiled kernels that it keeps."""
-    cache, script = tmp_path / front_end, tmp_path / "kernels.py"
-    script.write_text(KERNELS, encoding="utf-8")
-    environment = {**os.environ, "TI_OFFLINE_CACHE_FILE_PATH": str(cache), "TACSIM_DEVICE": "cpu"}
-    command = [sys.executable, "-W", "ignore", str(script), front_end]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=100, env=environment)
-    assert done.returncode == 0, done.stderr[-2000:]
-    return done.stdout, {each.name for each in cache.glob("*.tic")}
+    return run_script(tmp_path / "kernels.py", KERNELS, front_end, kept=tmp_path / front_end)
 
 
 @pytest.mark.deep

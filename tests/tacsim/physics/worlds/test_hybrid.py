@@ -1,6 +1,7 @@
 """Two gels round a plasticine body: balance, friction, frames, repeatability, guards."""
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -292,10 +293,15 @@ from tacsim.models.scene import Scene
 from tacsim.physics.world import make_world
 make_world(Scene(preset="draft")).move({})"""
     kept = {"TI_OFFLINE_CACHE_FILE_PATH": str(tmp_path / "kept")}
-    environment = {**os.environ, **kept, "TI_PRINT_KERNEL_LLVM_IR_OPTIMIZED": "1"}
+    shown = {"TI_PRINT_KERNEL_LLVM_IR": "1", "TI_PRINT_KERNEL_LLVM_IR_OPTIMIZED": "1"}
+    environment = {**os.environ, **kept, **shown}
     subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment, timeout=250, check=True)
-    compiled = "".join(file.read_text(encoding="utf-8") for file in tmp_path.glob("*.ll"))
-    assert "define internal void @function_body" in compiled and "@apart" not in compiled
+    before, after = (
+        "".join(file.read_text(encoding="utf-8") for file in tmp_path.glob(f"*{which}*.ll"))
+        for which in ("generic_llvm_ir", "llvm_ir_optimized")
+    )
+    assert len(set(re.findall(r"define internal void @(apart_\d+)", before))) == 11
+    assert "define internal void @function_body" in after and "@apart" not in after
 
 
 def test_unknown_frames_are_refused() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
@@ -14,6 +14,7 @@ from robot.rig import RIG_ATTACHMENT as RIG_ATTACHMENT
 from robot.rig import CannotOpen as CannotOpen
 from tacsim.config import ConfigError, LoadedRig, load, load_rig
 from tacsim.config.errors import Place, Problem
+from tacsim.config.kinds import is_name
 from tacsim.config.load import texts
 from tacsim.interface import RigSpec
 from tacsim.models.features import Features
@@ -29,7 +30,11 @@ if TYPE_CHECKING:
     from tacsim.gym.vector import TacsimVectorEnv
 
 Model = TypeVar("Model", bound=BaseModel)
+Seen = Features | Mapping[str, Any] | Literal["default"] | None
 Randomised = Randomisation | Mapping[str, Any] | str | Path | None
+
+# What an environment of a simulated rig begins with; its own overrides come after.
+LEARNING = ("scene.preset=learn", "motion=flowing")
 
 # Which drivers go by which clock. A simulated sensor on hardware shows the gel as it would look at the arm's pose.
 ARM_DRIVERS = {"sim": {"sim"}, "replay": {"replay"}, "wall": {"ur"}}
@@ -147,20 +152,26 @@ def make_env(
     render_mode: str | None = None,
     variants: Sequence[Sequence[str]] = (),
     randomise: Randomised = None,
-    features: Features | Mapping[str, Any] | None = None,
+    features: Seen = "default",
+    learning: bool = True,
 ) -> TacsimEnv:
     """The Gymnasium environment of a task on a rig; entry point of "tacsim/Squeeze-v0" and its sisters.
 
     variants: overrides of scene and task, on top of `overrides`; each reset draws one of them from its seed. The state
     of first contact of each is computed once. The world of a simulated rig is made at the first reset.
     randomise: draws the variants (`tacsim.Randomisation`, what it is made of, or the name or path of its file).
-    features: what of its observations a policy learns from (`tacsim.Features`, or what it is made of); None: all.
+    features: what of its observations a policy learns from (`tacsim.Features`, or what it is made of). "default":
+    heights and touch features of order 1 (`default_features`). None: the whole observation, pictures included, in SI
+    units.
+    learning: the shipped simulated rig has preset `learn` and motion `flowing` (LEARNING), unless `overrides` say
+    otherwise. False, and for a rig file of one's own: as the files say.
 
     Raises what open_rig raises, IncompatibleRig for features that the rig does not have, and ValueError for variants
     that change what must stay (`TacsimEnv.reset`).
     """
-    episodes = _rigs_of_episodes(task, rig, overrides, _drawn(variants, randomise))
-    first, seen = episodes[0][0], _features(features)
+    episodes = _rigs_of_episodes(task, rig, overrides, _drawn(variants, randomise), learning)
+    first = episodes[0][0]
+    seen = _features(features, first)
     if first.clock == "sim":
         from robot.rig.sim_env import open_env
 
@@ -179,20 +190,21 @@ def make_vector_env(
     variants: Sequence[Sequence[str]] = (),
     autoreset_mode: str | AutoresetMode = "NextStep",
     randomise: Randomised = None,
-    features: Features | Mapping[str, Any] | None = None,
+    features: Seen = "default",
+    learning: bool = True,
 ) -> TacsimVectorEnv:
     """`num_envs` of these environments, whose simulations share launches: what ``gymnasium.make_vec`` makes.
 
     Raises as `make_env`, and CannotOpen for a rig that is not simulated, or by physics 'seed'.
     """
-    episodes = _rigs_of_episodes(task, rig, overrides, _drawn(variants, randomise))
+    episodes = _rigs_of_episodes(task, rig, overrides, _drawn(variants, randomise), learning)
     if episodes[0][0].clock != "sim":
         raise CannotOpen(
             f"rig '{episodes[0][0].name}' is not simulated: only simulations run many at once; use robot.make_env"
         )
     from robot.rig.sim_env import open_vector_env
 
-    return open_vector_env(episodes, num_envs, render_mode, autoreset_mode, _features(features))
+    return open_vector_env(episodes, num_envs, render_mode, autoreset_mode, _features(features, episodes[0][0]))
 
 
 def _drawn(variants: Sequence[Sequence[str]], randomise: Randomised) -> Sequence[Sequence[str]]:
@@ -207,7 +219,11 @@ def _drawn(variants: Sequence[Sequence[str]], randomise: Randomised) -> Sequence
     return _made_of(Randomisation, randomise, "randomise").drawn()
 
 
-def _features(given: Features | Mapping[str, Any] | None) -> Features | None:
+def _features(given: Seen, config: RigConfig) -> Features | None:
+    if isinstance(given, str) and given == "default":
+        from tacsim.gym.features import default_features
+
+        return default_features(config.canonical, tuple(config.sensors), tuple(config.arms))
     return None if given is None else _made_of(Features, given, "features")
 
 
@@ -237,13 +253,21 @@ def _env_of_hardware(config: RigConfig, render_mode: str | None, features: Featu
 
 
 def _rigs_of_episodes(
-    task: str | TaskConfig, rig: str | Path, overrides: Sequence[str], variants: Sequence[Sequence[str]]
+    task: str | TaskConfig,
+    rig: str | Path,
+    overrides: Sequence[str],
+    variants: Sequence[Sequence[str]],
+    learning: bool,
 ) -> list[tuple[RigConfig, str]]:
     """The rig without a variant, then with each, and the variant in words."""
     found: list[tuple[RigConfig, str]] = []
+    given = texts(overrides)
+    shipped = isinstance(rig, str) and is_name(rig)
+    if learning and shipped and load_with_task(rig, task, given).config.clock == "sim":
+        given = [*LEARNING, *given]
     for more in ((), *variants):
         try:
-            config = load_with_task(rig, task, [*texts(overrides), *texts(more)]).config
+            config = load_with_task(rig, task, [*given, *texts(more)]).config
         except ConfigError as error:
             if not more:
                 raise

@@ -98,7 +98,9 @@ def evaluate(
         drawn = drawn.model_copy(update={"draws": episodes, "seed": UNSEEN + seed})
     number = min(training.environments, episodes)
     sight = Features(maps=(), touch=("moved",), arms=tuple(config.arms)[:1], goal=False)  # nobody looks at it
-    envs = make_vector_env(number, training.task, training.rig, training.overrides, randomise=drawn, features=sight)
+    envs = make_vector_env(
+        number, training.task, training.rig, training.overrides, randomise=drawn, features=sight, learning=False
+    )
     try:
         for name in policies:
             _fitting(name, envs.members[0], config.canonical)

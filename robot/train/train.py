@@ -68,6 +68,7 @@ def environments(training: Training) -> TacsimVectorEnv:
         autoreset_mode=AutoresetMode.SAME_STEP,
         randomise=training.randomise,
         features=training.features,
+        learning=False,  # a training file says its preset and its motion
     )
 
 

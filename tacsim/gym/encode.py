@@ -46,7 +46,7 @@ BOUNDS = {
     "joints": 4 * math.pi,  # [rad]
 }
 
-FARTHEST = 1e4  # the same of features, which are numbers of order 1
+MAX_FEATURE = 100.0  # the same of features, which are numbers of order 1: a height of 100 mm, a force of 1 kN
 
 
 def flatten(observation: Observation, start: Mapping[str, Pose]) -> Flat:
@@ -138,7 +138,7 @@ def space_of_features(encoder: FeatureEncoder, config: RigConfig) -> spaces.Spac
         assert config.task is not None
         shapes["goal"] = np.atleast_1d(make_task(config.task).goal).shape
     space: spaces.Space[Any] = spaces.Dict(
-        {key: spaces.Box(-FARTHEST, FARTHEST, shape, np.float32) for key, shape in shapes.items()}
+        {key: spaces.Box(-MAX_FEATURE, MAX_FEATURE, shape, np.float32) for key, shape in shapes.items()}
     )
     return space
 

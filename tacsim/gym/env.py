@@ -64,7 +64,8 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
     observation is the last good one).
 
     info: distance [m], is_success, score, body_height [m], peak_force [N] and work [J] of the arms since reset, the
-    rig's diagnostics, and at the end what else the task measures; with variants also `variant`, the
+    preset of a simulated scene and its known force error (`preset`, `preset_error`), the rig's diagnostics, and at the
+    end what else the task measures; with variants also `variant`, the
     number of the one that is played, and at reset `drawn`, what it consists of, and `refused`: draws before it that
     could not begin, and why.
 
@@ -302,6 +303,9 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
             "peak_force": self._effort.peak,
             "work": self._effort.work,
         }
+        scene = self.scene
+        if scene is not None:
+            info |= {"preset": scene.preset, "preset_error": scene.preset_error}
         if self._played is not None:
             info["variant"] = self._played
         if self.phase == "over":

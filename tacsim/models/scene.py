@@ -24,6 +24,11 @@ Preset = Literal["learn", "draft", "standard"]
 PRESETS: dict[Preset, tuple[float, float]] = {
     "learn": (1.0e-3, 2.0e-3), "draft": (0.5e-3, 1.0e-3), "standard": (0.25e-3, 0.5e-3),
 }  # fmt: skip
+# Least and greatest error of the normal force of each preset [share], beside independent finite elements: a plasticine
+# cylinder between two gels, closed by 1, 2 and 3 mm (docs/physics.md, the table "closed by").
+PRESET_FORCE_ERROR: dict[Preset, tuple[float, float]] = {
+    "learn": (0.031, 0.108), "draft": (0.005, 0.041), "standard": (-0.006, 0.021),
+}  # fmt: skip
 # Peak Mach number of motions between states of rest: what a tolerance asks for and what the yield stress over the
 # P-wave modulus allows, within bounds; where nothing yields, a share of the speed of the gel's shear wave
 # (docs/decisions/0002).
@@ -289,6 +294,15 @@ class Scene(Config):
     @property
     def _lighter(self) -> float:
         return LIGHTER if self.physics == "hybrid" else 1.0
+
+    @property
+    def preset_error(self) -> str:
+        """The known force error of the preset, as a short text; "unknown" where the scene departs from the preset."""
+        changed = self.particle_spacing is not None or self.element_size is not None or self.physics == "seed"
+        if changed or self.body is None:
+            return "unknown"
+        least, greatest = (f"{100 * share:+.0f}" for share in PRESET_FORCE_ERROR[self.preset])
+        return f"force {least} to {greatest} %"
 
     @property
     def flow_mach(self) -> float:

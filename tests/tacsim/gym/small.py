@@ -24,17 +24,18 @@ VARIANTS = (
     ("scene.body.geometry.size=[4 mm, 3 mm, 5 mm]", "task.goal=4 mm"),
     ("scene.friction={lower: 0.3, upper: 0.9}", "scene.gel.material.youngs_modulus=0.2 MPa", "task.steps=2"),
 )
+AS_WRITTEN: dict[str, Any] = {"learning": False, "features": None}  # motions settle, and all is shown
 NAME = "tacsim/Squeeze-v0"
 assert tacsim.gym.env
 
 
 def make(**options: Any) -> Any:
-    options = {"overrides": SMALL, "variants": VARIANTS, **options}
+    options = {"overrides": SMALL, "variants": VARIANTS, **AS_WRITTEN, **options}
     return gymnasium.make(NAME, **options).unwrapped
 
 
 def make_native(number: int, mode: str = "NextStep", **options: Any) -> Any:
-    options = {"overrides": SMALL, "variants": VARIANTS, **options}
+    options = {"overrides": SMALL, "variants": VARIANTS, **AS_WRITTEN, **options}
     return gymnasium.make_vec(NAME, number, autoreset_mode=mode, **options)
 
 

@@ -25,7 +25,7 @@ from robot.cli.episode.view import view
 from robot.cli.errors import Guarded
 from robot.cli.identify import body, gel, identify
 from robot.cli.learn.evaluate import evaluate
-from robot.cli.learn.export import export, policy
+from robot.cli.learn.export import export, policy, policy_range
 from robot.cli.learn.train import train
 from robot.cli.learn.transfer import transfer
 from robot.cli.mock import mock
@@ -68,7 +68,7 @@ COMMANDS = {
     ),
     calibrate: (latency, lens, touch, hand_eye),
     collect: (press_set, episodes),
-    export: (policy, lerobot),
+    export: (policy, policy_range, lerobot),
     identify: (gel, body),
 }
 for group, commands in COMMANDS.items():

@@ -13,7 +13,7 @@ import typer
 from robot.cli.errors import FAILED, complain
 from robot.cli.interrupt import Interrupt
 from robot.cli.options import Out, Overrides
-from robot.cli.output import Bar, busy, new_directory, notes, one_bar, results, writing
+from robot.cli.output import Bar, busy, new_directory, notes, one_bar, results, warn, writing
 from robot.cli.question import ask, require_person
 
 if TYPE_CHECKING:
@@ -111,7 +111,7 @@ def _run(
     run that cannot start leaves none."""
     with busy("loading"):
         from robot.deploy.control_loop import EpisodeSetup
-        from robot.deploy.policy import load_policy, require_fit
+        from robot.deploy.policy import load_policy, require_fit, training_notes
         from robot.open import open_rig
         from tacsim.physics.failure.dump import dumps_in
         from tacsim.record.writer import Recorder
@@ -125,10 +125,14 @@ def _run(
     )
     recorder: Recorder | None = None
     fitting: list[Policy] = []
+    scene = loaded.config.scene
+    simulated = [scene] if scene is not None and loaded.config.clock == "sim" else []
 
     def fit(spec: RigSpec) -> None:
         fitting.append(load_policy(policy, task, spec, loaded.config.canonical))
         require_fit(loaded.config.name, spec, fitting[0], policy, task)
+        for words in training_notes(fitting[0], policy, simulated):
+            warn(words)
 
     with (
         dumps_in(folder / "diverged"),
@@ -192,8 +196,16 @@ def _drive(
 ) -> tuple[Episode, str]:
     """The episode, shown by the bar, and what ended it too early ("" when nothing did)."""
     from robot.deploy.control_loop import EpisodeFailed, run_episode
+    from robot.deploy.policy import outside_in_words
+    from tacsim.report.series import TRAINING
+
+    told = False
 
     def show(step: Step) -> None:
+        nonlocal told
+        if not told and step.info.get(TRAINING, 0.0) > 1.0:
+            told = True
+            warn(f"step {step.index}: policy '{setup.policy}': {outside_in_words(policy)}")
         bar.say(task.config.kind if task else rig.name)
         bar.count(step.index, None if steps == NO_END else steps)
 

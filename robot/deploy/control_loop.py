@@ -6,7 +6,7 @@ import platform
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from importlib import metadata
 from typing import Protocol
@@ -14,7 +14,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from robot.deploy.policy import require_fit
+from robot.deploy.policy import require_fit, training_info
 from tacsim.control.contact_signal import contact_signal
 from tacsim.interface import Action, EndOfEpisode, Observation, Policy, Pose, Truth
 from tacsim.models.sensor import CanonicalGrid
@@ -82,6 +82,7 @@ def run_episode(
     """Resets rig and policy, then runs exactly `steps` control steps; fewer only when a recording is over, `stop` says
     so, or on Ctrl-C. The episode's step 0 is the state after reset. Where the rig knows the truth of the body, its task
     judges by that; where all that it takes is felt, `Step.info` has the distance by touch alone (`felt_distance`), too.
+    Of a learned policy it has `training_distance`: above 1 the observation lies outside the range of its training.
 
     With a recorder the steps of the episode are those in its file, read when they are asked for: however long it is,
     it takes no memory. Without one they are kept in memory, with their pictures.
@@ -108,8 +109,10 @@ def run_episode(
     rig.packages()  # those of before are not of this episode
     log, thinking = _Log(rig, task, start, setup, recorder), False
 
-    def keep(observation: Observation, action: Action | None, sent: Mapping[str, Pose | None]) -> None:
-        step, truth = log.keep(observation, action, sent, time.perf_counter() - started)
+    def keep(
+        observation: Observation, action: Action | None, sent: Mapping[str, Pose | None], noted: Mapping[str, float]
+    ) -> None:
+        step, truth = log.keep(observation, action, sent, time.perf_counter() - started, noted)
         if on_step is not None:
             on_step(step)
         if watch is not None:
@@ -117,14 +120,15 @@ def run_episode(
 
     try:
         policy.reset()
-        keep(observation, None, {})
+        keep(observation, None, {}, {})
         while log.count <= steps and not stop():
             started = time.perf_counter()
             thinking = True
             action = policy(observation)
             thinking = False
+            noted = training_info(policy)
             observation, sent = rig.step(action)
-            keep(observation, action, sent)
+            keep(observation, action, sent, noted)
     except (EndOfEpisode, KeyboardInterrupt):
         pass
     except (Exception, SystemExit) as failure:  # a policy may call sys.exit
@@ -207,12 +211,18 @@ class _Log:
         self.count = 0
 
     def keep(
-        self, observation: Observation, action: Action | None, sent: Mapping[str, Pose | None], seconds: float
+        self,
+        observation: Observation,
+        action: Action | None,
+        sent: Mapping[str, Pose | None],
+        seconds: float,
+        noted: Mapping[str, float],
     ) -> tuple[Step, Truth | None]:
-        """The step of what the rig has delivered, which took so many `seconds`; and the truth that judged it. Raises
-        RecordingFailed."""
+        """The step of what the rig has delivered, which took so many `seconds`; and the truth that judged it. `noted`:
+        numbers of the policy for `Step.info`. Raises RecordingFailed."""
         truth = self._rig.truth()
         step = self._step(truth, observation, action, sent, seconds)
+        step = replace(step, info={**step.info, **noted}) if noted else step
         self.count += 1
         if self._recorder is None:
             self._kept.append(step)

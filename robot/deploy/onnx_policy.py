@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from robot.deploy.python_policy import PolicyNotFound
+from robot.deploy.training_range import RangeWatch, names_of
 from tacsim import pose as se3
 from tacsim.gym.features import FeatureEncoder
 from tacsim.interface import Action, Needs, Observation, Pose, RigSpec
@@ -46,7 +47,8 @@ class OnnxPolicy:
     """The policy in `path`, on a rig with this canonical grid.
 
     An action moves an arm from where it was last asked to go, as in training; from where it stands if a limit has kept
-    it from going there. The same file gives the same action for the same observations on any rig.
+    it from going there. The same file gives the same action for the same observations on any rig. `watch` says whether
+    the observations of the episode are such as the policy met in training.
 
     Args:
         goal: of the task [m]; None without one.
@@ -61,7 +63,13 @@ class OnnxPolicy:
         self._encoder = FeatureEncoder(self.spec.features, canonical)
         self._axes = tuple(Axis(axis.arm, axis.direction) for axis in self.spec.axes)
         self._targets: dict[str, Pose] = {}
+        self.watch = RangeWatch(self.spec.range, names_of(self.spec, np.size(goal)))
         _require_same_inputs(path, self.spec, self._encoder.inputs, self._session, goal)
+
+    @staticmethod
+    def spec_of(path: Path) -> PolicySpec:
+        """What the file says of itself, without a rig. Raises PolicyNotFound."""
+        return _spec(path, _session(path))
 
     @property
     def needs(self) -> Needs:
@@ -71,11 +79,13 @@ class OnnxPolicy:
 
     def reset(self) -> None:
         self._targets = {}
+        self.watch.reset()
 
     def __call__(self, observation: Observation) -> Action:
         """Raises PolicyFailed when the graph fails, or gives what is no action."""
         first = not self._targets
         seen = self._encoder.begin(observation, self._goal) if first else self._encoder(observation)
+        self.watch(seen)
         for axis in self._axes:
             now = observation.arms[axis.arm].pose
             if first or se3.distance(self._targets[axis.arm], now)[0] > ASTRAY * self.spec.max_step:

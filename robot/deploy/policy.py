@@ -3,15 +3,19 @@ file, or a person's Python code."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from robot.deploy.onnx_policy import OnnxPolicy, misfits
 from robot.deploy.python_policy import PolicyNotFound as PolicyNotFound
 from robot.deploy.python_policy import policy_of_code
 from robot.deploy.target_script import TargetScript
+from robot.deploy.training_range import outside_of_scenes
 from tacsim.config import config_root
 from tacsim.interface import IncompatibleRig, Policy, RigSpec
+from tacsim.models.scene import Scene
 from tacsim.models.sensor import CanonicalGrid
+from tacsim.report.series import TRAINING, TRAINING_KNOWN
 from tacsim.rig import require
 from tacsim.tasks import Task
 
@@ -62,6 +66,38 @@ def _shipped(task: Task | None) -> Path:
             f"policy 'learned': {asked}; there are: {there}. Make one: tacsim train, or take 'scripted'"
         )
     return path
+
+
+def training_info(policy: Policy) -> dict[str, float]:
+    """What a record says of the last observation of a learned policy, beside the range of its training; else empty."""
+    if not isinstance(policy, OnnxPolicy):
+        return {}
+    return {TRAINING_KNOWN: 0.0} if policy.watch.known is None else {TRAINING: policy.watch.now}
+
+
+def outside_in_words(policy: Policy | None) -> str:
+    """What a learned policy has observed in this episode that it did not observe in training; "" if nothing."""
+    return policy.watch.words() if isinstance(policy, OnnxPolicy) and policy.watch.is_outside else ""
+
+
+def has_training_range(policy: Policy | None) -> bool:
+    """Whether it is a learned policy that says what it observed in training."""
+    return isinstance(policy, OnnxPolicy) and policy.watch.known is not None
+
+
+def training_notes(policy: Policy | None, name: str, scenes: Sequence[Scene]) -> list[str]:
+    """What a person should know, before an episode begins, of the training of the policy called `name`: that its range
+    is unknown, or which parameters of simulated `scenes` it did not have. Empty for a policy that is not learned."""
+    if not isinstance(policy, OnnxPolicy):
+        return []
+    known = policy.watch.known
+    if known is None:
+        return [
+            f"policy '{name}': unknown training range, so nothing says whether it meets what it has learned; "
+            "tacsim export range measures it"
+        ]
+    outside = outside_of_scenes(known, scenes)
+    return [f"policy '{name}': the scene is outside its training: {'; '.join(outside)}"] if outside else []
 
 
 def require_fit(rig: str, spec: RigSpec, policy: Policy, name: str, task: Task | None) -> None:

@@ -41,9 +41,7 @@ class LeRobotEnv(gymnasium.Env[dict[str, Any], NDArray[np.floating[Any]]]):
     ) -> None:
         canonical = load_with_task(rig, task, overrides).config.canonical
         # as the rig's file says: the data sets that a policy learned from were recorded so
-        self._env = make_env(
-            task, rig, overrides, render_mode, randomise=randomise, features=None, learning=False
-        )
+        self._env = make_env(task, rig, overrides, render_mode, randomise=randomise, features=None, learning=False)
         spec, config = self._env.rig.spec, self._env.task.config
         self._mapping = LeRobotMapping(spec, canonical, maps=False)
         self.metadata = {**self.metadata, "render_fps": round(1.0 / spec.period)}

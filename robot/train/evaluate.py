@@ -12,12 +12,19 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from robot.deploy.policy import load_policy, require_fit
+from robot.deploy.policy import (
+    has_training_range,
+    load_policy,
+    outside_in_words,
+    require_fit,
+    training_notes,
+)
 from robot.open import load_with_task, make_vector_env
 from tacsim.gym.env import TacsimEnv
 from tacsim.gym.vector import TacsimVectorEnv
 from tacsim.interface import Policy
 from tacsim.models.features import Features
+from tacsim.models.scene import Scene
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.models.training import Training
 
@@ -44,6 +51,7 @@ class Ended(NamedTuple):
     success: bool
     peak_force: float  # the greatest normal force [N]
     improvement: float  # share of the distance at the start
+    outside: bool | None = None  # a learned policy observed what it did not observe in training; None: unknown
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +77,12 @@ class Judged:
         return bootstrap(np.array([each.improvement for each in self.episodes]))
 
     @property
+    def outside(self) -> float | None:
+        """Share of the episodes in which a learned policy left the range of its training; None where it is unknown."""
+        known = [each.outside for each in self.episodes if each.outside is not None]
+        return sum(known) / len(known) if known else None
+
+    @property
     def peak_force(self) -> tuple[float, float]:
         """Mean, and what one episode in twenty exceeds [N]."""
         forces = [each.peak_force for each in self.episodes]
@@ -76,6 +90,7 @@ class Judged:
 
 
 Say = Callable[[Judged], None]
+Warn = Callable[[str], None]
 
 
 def evaluate(
@@ -85,11 +100,13 @@ def evaluate(
     seed: int = 0,
     tell: Tell = lambda words, done, of: None,
     say: Say = lambda so_far: None,
+    warn: Warn = lambda words: None,
 ) -> list[Judged]:
     """Each policy in the same episodes, of bodies and goals drawn as in training but with other seeds.
 
     policies: "teacher" (acts by the truth), "random", and what `load_policy` knows: "scripted", "FILE.onnx" ...
     say: is told how the episodes so far ended, each time that all environments have played one.
+    warn: is told, once for each learned policy, which scenes are outside its training, or that its range is unknown.
     Raises PolicyNotFound, IncompatibleRig, and as `make_vector_env`.
     """
     config = load_with_task(training.rig, training.task, training.overrides).config
@@ -103,7 +120,9 @@ def evaluate(
     )
     try:
         for name in policies:
-            _fitting(name, envs.members[0], config.canonical)
+            policy = _fitting(name, envs.members[0], config.canonical)
+            for words in training_notes(policy, name, _scenes(envs.members[0])):
+                warn(words)
         return [_judge(envs, name, episodes, seed, config.canonical, tell, say) for name in policies]
     finally:
         envs.close()
@@ -121,7 +140,8 @@ def _judge(
             env.next_variant = (first + at) % len(env.variants) if env.variants else None
         _, info = envs.reset(seed=list(seeds))
         start = info["distance"]
-        actors = [_actor(name, env, canonical, each) for env, each in zip(members, seeds, strict=True)]
+        fitting = [_fitting(name, env, canonical) for env in members]
+        actors = [_actor(name, env, policy, each) for env, policy, each in zip(members, fitting, seeds, strict=True)]
         ends: dict[int, Ended] = {}
         while len(ends) < count:
             tell(name, len(rows) + len(ends), episodes)
@@ -137,20 +157,25 @@ def _judge(
                         bool(info["is_success"][i]),
                         float(info["peak_force"][i]),
                         max(0.0, 1.0 - float(info["distance"][i]) / float(start[i])),
+                        bool(outside_in_words(fitting[i])) if has_training_range(fitting[i]) else None,
                     )
         rows += [ends[i] for i in range(count)]
         say(Judged(name, tuple(rows[:episodes])))
     return Judged(name, tuple(rows[:episodes]))
 
 
-def _actor(name: str, env: TacsimEnv, canonical: CanonicalGrid, seed: int) -> Act:
+def _scenes(env: TacsimEnv) -> list[Scene]:
+    """All that its episodes may play."""
+    return [variant.scene for variant in env.variants] or ([] if env.scene is None else [env.scene])
+
+
+def _actor(name: str, env: TacsimEnv, policy: Policy | None, seed: int) -> Act:
     """The policy at the start of an episode."""
     if name == TEACHER:
         return lambda env: env.expert()
     if name == RANDOM:
         random = np.random.default_rng([UNSEEN, seed])
         return lambda env: random.uniform(-1.0, 1.0, len(env.task.axes)).astype(np.float32)
-    policy = _fitting(name, env, canonical)
     assert policy is not None
     policy.reset()
     return lambda env: env.ask(policy)

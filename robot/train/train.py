@@ -21,6 +21,7 @@ from robot.common.whole_file import write_whole
 from robot.open import load_with_task, make_vector_env
 from robot.train.dagger import Dagger
 from robot.train.export import export
+from robot.train.measure_range import measure_range, write_range
 from robot.train.network import PolicyNetwork
 from robot.train.run_folder import RunError, RunFolder, Tell, version
 from tacsim.config import ConfigError
@@ -158,7 +159,7 @@ def train(
     finally:
         envs.close()
     path = run.folder / POLICY
-    export_policy(run, path)
+    export_policy(run, path, tell)
     return path
 
 
@@ -166,8 +167,9 @@ def _refused(envs: TacsimVectorEnv) -> list[str]:
     return [words for env in envs.members for words in env.refused]
 
 
-def export_policy(run: RunFolder, path: Path) -> float:
-    """Writes the policy of a run, as far as it has come; returns how far the file's actions are from the network's.
+def export_policy(run: RunFolder, path: Path, tell: Tell = lambda words, done, of: None) -> float:
+    """Writes the policy of a run, as far as it has come, with the range of what it observes in training's episodes;
+    returns how far the file's actions are from the network's.
 
     Raises RunError without a checkpoint, ExportError, OSError.
     """
@@ -179,7 +181,10 @@ def export_policy(run: RunFolder, path: Path) -> float:
         actor.load_state_dict(state["actor"])
     steps = int(sum(row["steps"] for row in curve))
     trained = {**run.settings.spec.trained, "rounds": done, "steps": steps}
-    return export(actor, run.settings.spec.model_copy(update={"trained": trained}), run.settings.shapes, path)
+    spec = run.settings.spec.model_copy(update={"trained": trained})
+    worst = export(actor, spec, run.settings.shapes, path)
+    write_range(path, path, measure_range(path, tell=tell))
+    return worst
 
 
 def new_actor(run: RunFolder) -> PolicyNetwork:

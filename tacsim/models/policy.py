@@ -29,6 +29,28 @@ class ActionAxis(Config):
         return self
 
 
+class TrainingRange(Config):
+    """What a policy observed in its training, and what was simulated there; `robot.deploy.training_range` says how an
+    observation is compared with it. `tacsim export range` measures it."""
+
+    episodes: Annotated[int, Field(ge=2)]  # that it was measured in
+    low: tuple[float, ...]  # least of each number of an observation [encoded]
+    high: tuple[float, ...]
+    centre: tuple[float, ...]  # mean of the numbers and of their products
+    axes: tuple[tuple[float, ...], ...]  # (number - centre) times these has variance 1 along each
+    limit: Annotated[float, Field(gt=0)]  # greatest distance that training's own episodes keep
+    scene: dict[str, tuple[float, float]]  # least and greatest of each number of training's scenes, by key [SI]
+    words: dict[str, tuple[str, ...]] = {}  # the same of what is no number: shapes
+
+    @model_validator(mode="after")
+    def _fits(self) -> Self:
+        if len(self.low) != len(self.high):
+            raise ValueError(f"{len(self.low)} least numbers, but {len(self.high)} greatest")
+        if any(len(axis) != len(self.centre) for axis in self.axes):
+            raise ValueError(f"each axis has as many numbers as the centre, {len(self.centre)}")
+        return self
+
+
 class PolicySpec(Config):
     """A learned policy: what it sees, what its numbers do, and where it comes from."""
 
@@ -41,3 +63,4 @@ class PolicySpec(Config):
     axes: Annotated[tuple[ActionAxis, ...], Field(min_length=1, max_length=64)]
     max_step: Annotated[Length, Field(gt=0)]  # an action of 1 moves its arm so far [m]
     trained: dict[str, Any] = {}  # how it was made, for people
+    range: TrainingRange | None = None  # of its training; None: unknown

@@ -21,6 +21,8 @@ from tacsim.report.series import (
     PICTURES_LOST,
     PICTURES_REPEATED,
     STALE,
+    TRAINING,
+    TRAINING_KNOWN,
     Series,
 )
 
@@ -92,6 +94,30 @@ def timing_rows(stats: dict[str, Any]) -> list[tuple[str, str]]:
         if any(counts.values()):
             rows.append((f"pictures {word}", ", ".join(f"{name} {count}" for name, count in counts.items())))
     return rows
+
+
+def training_range(series: Series) -> dict[str, Any] | None:
+    """Whether what a learned policy observed lies in the range of its training: `known`, `largest` distance over the
+    limit, and the number of `steps_outside`. None for a policy that is not learned."""
+    distance = series.info.get(TRAINING, np.array([]))
+    distance = distance[np.isfinite(distance)]
+    if len(distance):
+        outside = int(np.count_nonzero(distance > 1.0))
+        return {"known": True, "largest": float(distance.max()), "steps_outside": outside, "steps": len(distance)}
+    unknown = np.isfinite(series.info.get(TRAINING_KNOWN, np.array([]))).any()
+    return {"known": False, "largest": None, "steps_outside": None, "steps": None} if unknown else None
+
+
+def training_rows(stats: dict[str, Any]) -> list[tuple[str, str]]:
+    """:func:`training_range` as rows of a table."""
+    if not stats["known"]:
+        return [("training range", "unknown: the policy does not say what it observed in training")]
+    if not stats["steps_outside"]:
+        return [("training range", f"kept (at most {stats['largest']:.2f} of the limit)")]
+    words = (
+        f"left in {stats['steps_outside']} of {stats['steps']} steps, by up to {stats['largest']:.1f} times the limit"
+    )
+    return [("training range", f"{words}; the policy has not learned what to do there")]
 
 
 def trust(series: Series) -> dict[str, dict[str, Any]] | None:

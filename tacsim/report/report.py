@@ -13,7 +13,7 @@ import numpy as np
 
 from tacsim.interface import FloatArray, SurfaceMap, TactileFrame, TactileObservation
 from tacsim.record.episode import Episode
-from tacsim.report.diagnostics import timing, timing_rows, trust, trust_rows
+from tacsim.report.diagnostics import timing, timing_rows, training_range, training_rows, trust, trust_rows
 from tacsim.report.series import SETTLED, Series
 
 if TYPE_CHECKING:
@@ -37,6 +37,7 @@ def summary(series: Series, *, complete: bool = True, dropped: int = 0) -> dict[
     [s], `contact_signal` (sensor -> list), `deepest` point and longest `flow` of a gel (sensor -> list [m]), its
     `steepest` slope (sensor -> list), `correlation` (sensor -> r between contact signal and force), `timing`
     (tacsim.report.diagnostics; null unless the rig is live), `trust` (the same; null if sensors know their surface),
+    `training_range` (the same; null for a policy that is not learned),
     `started` (ISO date and time with its zone).
     Unknown and infinite values are null.
     """
@@ -69,6 +70,7 @@ def summary(series: Series, *, complete: bool = True, dropped: int = 0) -> dict[
         "settled": None if settled is None else int(np.count_nonzero(np.nan_to_num(settled))),
         "timing": timing(series),
         "trust": trust(series),
+        "training_range": training_range(series),
         "complete": complete,
         "dropped": dropped,
         "versions": dict(meta.versions),
@@ -151,6 +153,8 @@ def _results(stats: Mapping[str, Any]) -> list[tuple[str, str]]:
         rows.append(("settled", f"{stats['settled']} of {stats['steps']} steps"))
     if stats["timing"] is not None:
         rows += timing_rows(stats["timing"])
+    if stats["training_range"] is not None:
+        rows += training_rows(stats["training_range"])
     if stats["trust"] is not None:
         rows += trust_rows(stats["trust"])
     if stats["dropped"]:

@@ -30,6 +30,8 @@ DEEPEST = "deepest_"  # of the height of its gel [m]
 STEEPEST = "steepest_"  # slope of its gel [-]
 LONGEST = "flow_"  # of its markers' displacements [m]
 SETTLED = "settled"
+TRAINING = "training_distance"  # of what the policy observed from its training's range, over the limit
+TRAINING_KNOWN = "training_range_known"  # 0: a learned policy that does not say what it observed in training
 FELT = "felt_distance"  # from the goal, by touch alone [m]
 _OF_ARMS = (ALIGNMENT, LIMITS, LOST)
 _SURFACE = (DEEPEST, STEEPEST, LONGEST)
@@ -67,7 +69,7 @@ class Series:
     def of(cls, episode: Episode) -> Self:
         """The numbers that a report shows, of the arms and sensors that the episode's metadata name."""
         count, spec = len(episode.steps), episode.meta.spec
-        shown = {SETTLED, FELT, *(key + name for key in _OF_ARMS for name in spec.arms)}
+        shown = {SETTLED, FELT, TRAINING, TRAINING_KNOWN, *(key + name for key in _OF_ARMS for name in spec.arms)}
         shown |= {key + name for key in _OF_SENSORS for name in spec.sensors}
         index = np.zeros(count, np.int64)
         own = {name: np.full(count, np.nan) for name in _OWN}

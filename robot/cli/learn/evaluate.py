@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from robot.cli.options import Overrides
-from robot.cli.output import notes, one_bar, require_writable, show_table
+from robot.cli.output import notes, one_bar, require_writable, show_table, warn
 
 if TYPE_CHECKING:
     from robot.train.evaluate import Interval, Judged
@@ -34,7 +34,8 @@ def evaluate(
     """Compare policies in the same episodes, whose bodies and goals no training has met.
 
     Success with Wilson's interval, distance and improvement (share of the distance at the start) with a bootstrap's,
-    all of 95 %; the peak of the normal force as mean and as what one episode in twenty exceeds.
+    all of 95 %; the peak of the normal force as mean and as what one episode in twenty exceeds; the share of episodes
+    in which a learned policy observed what it did not observe in its training.
 
     Example: tacsim evaluate squeeze --policy learned --policy scripted --episodes 50
     """
@@ -58,7 +59,7 @@ def evaluate(
             done, success = len(so_far.episodes), interval_text(so_far.success, 100, 0)
             notes.print(f"{so_far.policy}: {done} of {episodes} episodes, success {success} %", markup=False)
 
-        judged = judge_all(training, policy or ["teacher", "scripted", "random"], episodes, seed, tell, say)
+        judged = judge_all(training, policy or ["teacher", "scripted", "random"], episodes, seed, tell, say, warn)
     _show(judged)
 
 
@@ -84,9 +85,10 @@ def _show(judged: list[Judged]) -> None:
                 interval_text(each.distance, 1e3, 3),
                 interval_text(each.improvement, 100, 0),
                 f"{mean:.1f}, {most:.1f}",
+                "–" if each.outside is None else f"{100 * each.outside:.0f}",
             )
         )
-    columns = ("policy", "success [%]", "distance [mm]", "improvement [%]", "peak force [N]")
+    columns = ("policy", "success [%]", "distance [mm]", "improvement [%]", "peak force [N]", "outside training [%]")
     show_table(f"{len(judged[0].episodes)} unseen episodes, 95 % intervals", columns, rows, left={0})
 
 

@@ -55,7 +55,11 @@ def test_make_vec_moves_them_together() -> None:
     envs = gymnasium.make_vec("tacsim/Squeeze-v0", 2)
     assert isinstance(envs, TacsimVectorEnv)
     seen, info = envs.reset(seed=1)
-    assert {key: value.shape for key, value in seen.items()} == {"maps": (2, 2, 16, 16), "touch": (2, 25), "goal": (2, 1)}
+    assert {key: value.shape for key, value in seen.items()} == {
+        "maps": (2, 2, 16, 16),
+        "touch": (2, 25),
+        "goal": (2, 1),
+    }
     assert info["preset"].tolist() == ["learn", "learn"]
     envs.close()
 
@@ -116,5 +120,3 @@ def test_the_error_of_each_preset_is_that_of_the_physics_page() -> None:
         (row,) = re.findall(rf"^\| `?{preset}`? \|(.*)\|$", table, re.MULTILINE)
         errors = [float(cell.split(",")[1]) for cell in row.split("|")]  # substeps, force error [%], creep to come
         assert (100 * least, 100 * greatest) == pytest.approx((min(errors), max(errors)))
-
-

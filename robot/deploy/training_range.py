@@ -2,8 +2,8 @@
 
 Of each observation the numbers that the policy sees are taken (of a map or a flow, for each channel its mean, least
 and greatest), with the products of each pair of them: what belongs together, as the gap and the depth of the gels,
-shows in the products. Their distance from the mean of training, whitened by training's covariance (Mahalanobis 1936), is
-compared with a limit that training's own episodes keep: the split conformal quantile (Vovk et al. 2005) of each
+shows in the products. Their distance from the mean of training, whitened by training's covariance (Mahalanobis 1936),
+is compared with a limit that training's own episodes keep: the split conformal quantile (Vovk et al. 2005) of each
 episode's largest distance, in episodes that mean and covariance were not fitted to.
 """
 

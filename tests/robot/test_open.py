@@ -202,7 +202,7 @@ def test_gymnasium_finds_the_environments_without_an_import(first: str) -> None:
         f"env = gymnasium.make('{module}tacsim/Squeeze-v0', overrides={[*SMALL, 'task.goal=3 mm']!r})\n"
         "flat, info = env.reset(seed=1)\n"
         "flat, reward, *_ = env.step(env.action_space.sample())\n"
-        "assert flat in env.observation_space and reward < 0 and 'tactile_upper' in flat\n"
+        "assert flat in env.observation_space and reward < 0 and 'touch' in flat\n"
         "env.close()\n"
         "assert 'tacsim/Reposition-v0' in gymnasium.registry\n"
     )

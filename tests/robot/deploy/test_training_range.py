@@ -1,0 +1,173 @@
+"""A learned policy says when it observes what it did not observe in training, and does not pass where it cannot."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import pytest
+from onnx import helper
+
+from robot.deploy.control_loop import EpisodeSetup, run_episode
+from robot.deploy.onnx_policy import OnnxPolicy
+from robot.deploy.policy import has_training_range, load_policy, training_notes
+from robot.deploy.training_range import RangeWatch, measured, numbers_of, outside_of_scenes
+from robot.open import open_rig
+from robot.train.evaluate import evaluate
+from robot.train.measure_range import measure_range, write_range
+from tacsim.config import load_rig
+from tacsim.models.rig import SqueezeConfig
+from tacsim.models.scene import Scene
+from tacsim.report.report import summary
+from tacsim.report.series import Series
+from tacsim.tasks import make_task
+from tests.robot.cli.invoked import tacsim
+from tests.robot.deploy.test_onnx_policy import FEATURES, GRID, graph, spec
+from tests.robot.train.short import training
+from tests.tacsim.gym.small import SMALL
+
+SCENE = "scene.body.material"
+
+
+def pressed(stiffness: float, random: np.random.Generator) -> np.ndarray[Any, Any]:
+    """(30, 2) the gap of two sensors that close on a body, and how deep it goes into them: by its stiffness."""
+    closing = np.linspace(0, 1, 30) * random.uniform(0.5, 1.0)
+    return np.stack([1 - closing, stiffness * closing + random.normal(0, 0.005, 30)], axis=1)
+
+
+def share_outside(known: Any, episodes: list[np.ndarray[Any, Any]]) -> float:
+    watch, count = RangeWatch(known), 0
+    for episode in episodes:
+        watch.reset()
+        for numbers in episode:
+            watch({"touch": numbers})
+        count += watch.is_outside
+    return count / len(episodes)
+
+
+def test_a_stiffer_body_is_outside_and_an_unseen_one_within() -> None:
+    """Each number alone stays within what training met: only that they come together is new."""
+    random = np.random.default_rng(3)
+    known = measured([pressed(random.uniform(0.2, 0.8), random) for _ in range(200)], [])
+    unseen = [pressed(random.uniform(0.2, 0.8), random) for _ in range(300)]
+    assert share_outside(known, unseen) <= 0.05
+    stiff = [pressed(random.uniform(1.2, 1.6), random)[:18] for _ in range(50)]
+    assert max(each[:, 1].max() for each in stiff) < max(known.high) * 1.2
+    assert share_outside(known, stiff) >= 0.9
+    soft = [pressed(random.uniform(0.0, 0.02), random) for _ in range(50)]
+    assert share_outside(known, soft) >= 0.8
+
+
+def test_what_is_farthest_beyond_its_own_range_is_named() -> None:
+    random = np.random.default_rng(4)
+    known = measured([random.uniform(0, 1, (20, 2)) for _ in range(40)], [])
+    watch = RangeWatch(known, ["gap", "depth"])
+    watch({"touch": np.array([0.5, 0.5])})
+    assert not watch.is_outside
+    watch({"touch": np.array([0.5, 9.0])})
+    assert watch.is_outside
+    assert "depth is 9, in training 0" in watch.words()
+    watch.reset()
+    assert not watch.is_outside
+
+
+def test_of_a_map_mean_least_and_greatest_of_each_channel_count() -> None:
+    maps = np.arange(8.0).reshape(2, 2, 2)
+    assert numbers_of({"maps": maps, "goal": np.array([7.0])}).tolist() == [7.0, 1.5, 0.0, 3.0, 5.5, 4.0, 7.0]
+
+
+def scene(*overrides: str) -> Scene:
+    found = load_rig("sim", task="squeeze", overrides=overrides).config.scene
+    assert found is not None
+    return found
+
+
+@pytest.mark.parametrize(
+    ("override", "said"),
+    [
+        (f"{SCENE}.yield_stress=60 kPa", "body.material.yield_stress is 60000, in training 5000 to 20000"),
+        ("scene.friction={lower: 0.1, upper: 0.6}", "friction.lower is 0.1, in training 0.6"),
+        ("scene.gel.material.youngs_modulus=0.3 MPa", "gel.material.youngs_modulus is 300000, in training"),
+        ("scene.body.geometry.size=[20 mm, 10 mm, 10 mm]", r"body.geometry.size\[0\] is 0.02, in training 0.01"),
+        ("scene.body.geometry={shape: sphere, radius: 5 mm}", "body.geometry.shape is sphere, in training box"),
+        (f"{SCENE}={{youngs_modulus: 0.5 MPa}}", "body.material.yield_stress is not given, in training 5000 to 20000"),
+        ("scene.gravity=[0, 0, -9.81]", r"gravity\[2\] is -9.81, in training 0"),
+    ],
+)
+def test_the_parameter_of_a_scene_that_is_outside_is_named(override: str, said: str) -> None:
+    import re
+
+    met = [scene(f"{SCENE}.yield_stress={each}") for each in ("5 kPa", "20 kPa")]
+    known = measured([np.random.default_rng(0).normal(size=(9, 2)) for _ in range(4)], met)
+    assert outside_of_scenes(known, [scene(f"{SCENE}.yield_stress=12 kPa", "scene.preset=learn")]) == []
+    assert any(re.match(said, each) for each in outside_of_scenes(known, [scene(override)]))
+
+
+def written(path: Path, **changed: Any) -> Path:
+    model: onnx.ModelProto = graph()
+    helper.set_model_props(model, {"tacsim.spec": json.dumps(spec(**changed))})
+    path.write_bytes(model.SerializeToString())
+    return path
+
+
+@pytest.fixture(scope="module")
+def ranged(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A policy with the range of its training, measured by the shipped command's functions."""
+    path = tmp_path_factory.mktemp("policies") / "policy.onnx"
+    settings = training(features=FEATURES.model_dump(mode="json"))
+    written(path, trained={"training": settings.model_dump(mode="json")})
+    write_range(path, path, measure_range(path, episodes=24))
+    return path
+
+
+def test_its_range_is_measured_in_its_training_and_kept_in_the_file(ranged: Path) -> None:
+    policy = OnnxPolicy(ranged, GRID, 2e-3)
+    known = policy.watch.known
+    assert known is not None
+    assert known.episodes == 24
+    assert known.scene["body.material.yield_stress"] == pytest.approx((5e3, 20e3))
+    within = [scene(*SMALL, f"{SCENE}.yield_stress=12 kPa")]
+    assert training_notes(policy, "p", within) == []
+    (said,) = training_notes(policy, "p", [scene(*SMALL, f"{SCENE}.yield_stress=70 kPa")])
+    assert "body.material.yield_stress is 70000" in said
+
+
+def test_a_run_tells_each_steps_distance_and_its_summary_says_what_was_left(ranged: Path) -> None:
+    shares = {}
+    for yield_stress, steps in (("12 kPa", 3), ("400 kPa", 3)):
+        overrides = [*SMALL, f"{SCENE}.yield_stress={yield_stress}", "motion=settled"]
+        with open_rig("sim", task="squeeze", overrides=overrides) as rig:
+            task = make_task(SqueezeConfig(kind="squeeze", goal=2e-3 if yield_stress == "12 kPa" else 0.5e-3))
+            policy = load_policy(str(ranged), task, rig.spec, GRID)
+            episode = run_episode(rig, policy, task, steps, setup=EpisodeSetup(seed=1))
+        assert all("training_distance" in step.info for step in episode.steps[1:])
+        shares[yield_stress] = summary(Series.of(episode))["training_range"]
+    assert shares["12 kPa"]["known"] is True
+    assert shares["400 kPa"]["largest"] > 1.0
+    assert shares["400 kPa"]["steps_outside"] == 3  # a goal that training never had
+
+
+def test_a_policy_without_a_range_is_told_once_and_in_the_summary(tmp_path: Path) -> None:
+    path = written(tmp_path / "bare.onnx")
+    assert not has_training_range(OnnxPolicy(path, GRID, 2e-3))
+    words = [word for override in SMALL for word in ("--set", override)]
+    result = tacsim("run", "sim", "--policy", str(path), "--steps", "2", "--out", str(tmp_path / "out"), *words)
+    assert result.exit_code == 0, result.output
+    assert result.stderr.count("unknown training range") == 1
+    stats = json.loads((tmp_path / "out" / "summary.json").read_text(encoding="utf-8"))
+    assert stats["training_range"]["known"] is False
+    assert "training range" in result.stdout
+
+
+def test_evaluate_names_what_is_outside_once_and_counts_the_episodes(ranged: Path) -> None:
+    values = {"scene.body.material.yield_stress": {"uniform": ["60 kPa", "80 kPa"]}}
+    outside = training(features=FEATURES.model_dump(mode="json"), randomise={"draws": 3, "values": values})
+    said: list[str] = []
+    judged = evaluate(outside, [str(ranged), "teacher"], 3, warn=said.append)
+    assert len(said) == 1
+    assert "body.material.yield_stress is 6" in said[0] and "in training 5000 to 20000" in said[0]
+    assert judged[0].outside is not None
+    assert judged[1].outside is None

@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Iterator
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 
@@ -35,15 +36,23 @@ def envs() -> Iterator[SharedVecEnv]:
     opened.close()
 
 
-@pytest.mark.parametrize("maps", [[], ["height", "slope", "picture"]])
-def test_its_checker_finds_nothing_but_maps_that_are_no_pictures(maps: list[str]) -> None:
+def test_of_the_default_observation_it_makes_a_small_policy() -> None:
+    """10.2 million parameters where pictures and maps of 64 x 64 are seen."""
+    env = gymnasium.make("tacsim/Squeeze-v0")
+    policy = PPO("MultiInputPolicy", env, device="cpu").policy
+    assert sum(each.numel() for each in policy.parameters()) < 100_000
+    env.close()
+
+
+@pytest.mark.parametrize("features", [{**FEATURES, "maps": []}, {**FEATURES, "maps": ["height", "picture"]}, "default"])
+def test_its_checker_finds_nothing_but_maps_that_are_no_pictures(features: Any) -> None:
     """It takes whatever has three axes for a picture, and wants bytes; of heights they would be too coarse."""
-    env = make(features={**FEATURES, "maps": maps})
+    env = make(features=features)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         check_env(env, warn=True)
     said = [str(each.message) for each in caught]
-    assert bool(said) == bool(maps)
+    assert bool(said) == (features == "default" or bool(features["maps"]))
     assert all("image" in words for words in said)
 
 

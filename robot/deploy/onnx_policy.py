@@ -63,8 +63,11 @@ class OnnxPolicy:
         self._encoder = FeatureEncoder(self.spec.features, canonical)
         self._axes = tuple(Axis(axis.arm, axis.direction) for axis in self.spec.axes)
         self._targets: dict[str, Pose] = {}
-        self.watch = RangeWatch(self.spec.range, names_of(self.spec, np.size(goal)))
         _require_same_inputs(path, self.spec, self._encoder.inputs, self._session, goal)
+        try:
+            self.watch = RangeWatch(self.spec.range, names_of(self.spec, np.size(goal)), self.spec.features.frames)
+        except ValueError as failure:
+            raise PolicyNotFound(f"policy '{path}': {failure}") from None
 
     @staticmethod
     def spec_of(path: Path) -> PolicySpec:

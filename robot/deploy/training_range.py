@@ -1,10 +1,10 @@
 """Whether what a learned policy observes is what it observed in training.
 
-Of each observation the numbers that the policy sees are taken (of a map or a flow, for each channel its mean, least
-and greatest), with the products of each pair of them: what belongs together, as the gap and the depth of the gels,
-shows in the products. Their distance from the mean of training, whitened by training's covariance (Mahalanobis 1936),
-is compared with a limit that training's own episodes keep: the split conformal quantile (Vovk et al. 2005) of each
-episode's largest distance, in episodes that mean and covariance were not fitted to.
+Of the newest frame of each observation the numbers that the policy sees are taken (of a map or a flow, for each
+channel its mean, least and greatest), with the products of each pair of them: what belongs together, as the gap and
+the depth of the gels, shows in the products. Their distance from the mean of training, whitened by training's
+covariance (Mahalanobis 1936), is compared with a limit that training's own episodes keep: the split conformal quantile
+(Vovk et al. 2005) of each episode's largest distance, in episodes that mean and covariance were not fitted to.
 """
 
 from __future__ import annotations
@@ -19,22 +19,23 @@ from tacsim.interface import FloatArray
 from tacsim.models.policy import PolicySpec, TrainingRange
 from tacsim.models.scene import Scene
 
-MAX_PAIRED = 24  # numbers of which the products count, too: of 24 they are 300
-MAX_AXES = 128  # directions that are kept, those of the greatest variance beyond the noise
-FALSE_ALARMS = 0.02  # share of training's episodes that may be beyond the limit
-LEAST_VARIANCE = 1e-4  # of a whitened direction, beside 1 of a number
-LEAST_DEVIATION = 1e-3  # of a number: smaller deviations count as this much [encoded]
-PHYSICAL = ("gel", "gels", "body", "friction", "gravity")  # parts of a scene that a policy feels
+MAX_PAIRED = 12  # numbers of which the products count, too
+FALSE_ALARMS = 0.03  # share of training's episodes that may be beyond the limit
+LEAST_DEVIATION = 0.01  # of a number in training: one that varies less counts as if it varied so much [encoded]
+LEAST_VARIANCE = 0.01  # of a direction, beside 1 of a number: smaller ones are noise
 SLACK = 1e-6  # of a scene's number: what rounding leaves [share]
+PHYSICAL = ("gel", "gels", "body", "friction", "gravity")  # parts of a scene that a policy feels
 NOT_FELT = ("density", "seed")  # numbers in them that quasi-static motions do not depend on
 Seen = Mapping[str, NDArray[Any]]
 
 
-def numbers_of(seen: Seen) -> FloatArray:
-    """(n,) the numbers of one observation, in the order of `names_of`."""
+def numbers_of(seen: Seen, frames: int) -> FloatArray:
+    """(n,) the numbers of the newest of an observation's `frames`, in the order of `names_of`."""
     parts = []
     for key in sorted(seen):
         values = np.asarray(seen[key], np.float64)
+        if key != "goal":
+            values = values[-(len(values) // frames) :]
         if values.ndim == 1:
             parts.append(values)
         else:
@@ -45,9 +46,13 @@ def numbers_of(seen: Seen) -> FloatArray:
 
 def names_of(spec: PolicySpec, goals: int) -> list[str]:
     """Of the numbers of `numbers_of`; `goals`: numbers of the goal."""
-    found = {key: list(each.names) for key, each in spec.inputs.items() if key == "touch"}
-    for key in set(spec.inputs) - {"touch"}:
-        found[key] = [f"{name} {of}" for name in spec.inputs[key].names for of in ("mean", "least", "greatest")]
+    found: dict[str, list[str]] = {}
+    for key, each in spec.inputs.items():
+        newest = each.names[-(len(each.names) // spec.features.frames) :]
+        if key == "touch":
+            found[key] = list(newest)
+        else:
+            found[key] = [f"{name} {of}" for name in newest for of in ("mean", "least", "greatest")]
     if spec.features.goal:
         found["goal"] = [f"goal {at}" for at in range(goals)]
     return [name for key in sorted(found) for name in found[key]]
@@ -72,11 +77,10 @@ def measured(episodes: Sequence[FloatArray], scenes: Sequence[Scene]) -> Trainin
         raise ValueError(f"{len(episodes)} episodes say no range: take two at least, better a hundred")
     whole = np.concatenate(list(episodes))
     fitted = lifted(np.concatenate(list(episodes[::2])))
-    centre, deviation = fitted.mean(axis=0), np.maximum(fitted.std(axis=0), LEAST_DEVIATION)
-    variance, directions = np.linalg.eigh(
-        np.cov((fitted - centre) / deviation, rowvar=False).reshape(2 * (len(centre),))
-    )
-    variance, directions = variance[::-1][:MAX_AXES], directions[:, ::-1][:, :MAX_AXES]
+    centre, own = fitted.mean(axis=0), fitted.std(axis=0)
+    deviation = np.maximum(own, LEAST_DEVIATION)
+    covariance = np.atleast_2d(np.cov((fitted - centre) / deviation, rowvar=False))
+    variance, directions = np.linalg.eigh(covariance + np.diag(1.0 - (own / deviation) ** 2))
     scale = np.sqrt(np.maximum(variance, LEAST_VARIANCE) * len(variance))
     axes = (directions / scale / deviation[:, None]).T
     largest = np.sort([distances(each, centre, axes).max() for each in episodes[1::2]])
@@ -105,11 +109,24 @@ def _rounded(values: FloatArray) -> tuple[float, ...]:
 
 
 class RangeWatch:
-    """Compares what a policy observes in an episode with the range of its training."""
+    """Compares what a policy observes in an episode with the range of its training.
 
-    def __init__(self, known: TrainingRange | None, names: Sequence[str] = ()) -> None:
-        self.known, self._names = known, tuple(names)
+    Args:
+        known: None where it is unknown.
+        names: of the numbers of an observation; empty: they are not named.
+
+    Raises ValueError for a range of other numbers.
+    """
+
+    def __init__(self, known: TrainingRange | None, names: Sequence[str] = (), frames: int = 1) -> None:
+        self.known, self._names, self._frames = known, tuple(names), frames
         if known is not None:
+            expected = lifted(np.zeros(len(names))).shape if names else (len(known.centre),)
+            if (len(known.centre),) != expected or (names and len(known.low) != len(names)):
+                raise ValueError(
+                    f"the training range is of {len(known.low)} numbers, lifted to {len(known.centre)}; the policy sees "
+                    f"{len(names)}: measure it again with tacsim export range"
+                )
             self._centre, self._axes = np.array(known.centre), np.array(known.axes)
             self._low, self._high = np.array(known.low), np.array(known.high)
         self.reset()
@@ -124,7 +141,7 @@ class RangeWatch:
         """Takes the next observation."""
         if self.known is None:
             return
-        numbers = numbers_of(seen)
+        numbers = numbers_of(seen, self._frames)
         self.now = float(distances(numbers, self._centre, self._axes)) / self.known.limit
         if self.now > self.largest:
             self.largest, self._worst = self.now, numbers

@@ -113,7 +113,7 @@ def _round(
             if over[at]:
                 actions.append(idle)
                 continue
-            found[at].append(numbers_of({key: value[at] for key, value in seen.items()}))
+            found[at].append(numbers_of({key: value[at] for key, value in seen.items()}, policy.spec.features.frames))
             actions.append(env.ask(policy))
         seen, _, terminated, truncated, _ = envs.step(np.stack(actions))
         over |= terminated | truncated

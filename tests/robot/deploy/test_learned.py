@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from robot.deploy.control_loop import EpisodeSetup, run_episode
-from robot.deploy.policy import PolicyNotFound, load_policy, require_fit
+from robot.deploy.policy import PolicyNotFound, load_policy, outside_in_words, require_fit, training_notes
 from robot.open import open_rig
 from tacsim.config import config_root, load, load_rig
 from tacsim.models.training import Training
@@ -32,6 +32,24 @@ def test_each_runs_and_does_its_task(path: Path) -> None:
     first, last = (episode.steps[at].distance for at in (0, -1))
     assert first is not None and last is not None
     assert last < (1 - LEAST[path.stem]) * first
+
+
+@pytest.mark.parametrize(("yield_stress", "outside"), [("20 kPa", False), ("70 kPa", True)])
+def test_the_squeeze_says_that_it_never_met_such_stiff_clay(yield_stress: str, outside: bool) -> None:
+    """By what it feels, and by the parameter of the scene."""
+    training = load(Training, "squeeze")
+    overrides = [*training.overrides, f"scene.body.material.yield_stress={yield_stress}"]
+    loaded = load_rig(training.rig, task=training.task, overrides=overrides)
+    assert loaded.config.task is not None and loaded.config.scene is not None
+    task = make_task(loaded.config.task)
+    with open_rig(loaded) as rig:
+        policy = load_policy("learned", task, rig.spec, loaded.config.canonical)
+        episode = run_episode(rig, policy, task, task.config.steps, setup=EpisodeSetup(seed=1))
+    distances = [step.info["training_distance"] for step in episode.steps[1:]]
+    assert (max(distances) > 1.0) == outside
+    assert bool(outside_in_words(policy)) == outside
+    said = training_notes(policy, "learned", [loaded.config.scene])
+    assert any("body.material.yield_stress is 70000, in training 4000 to 40000" in each for each in said) == outside
 
 
 def test_they_are_small() -> None:

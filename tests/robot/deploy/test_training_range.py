@@ -76,7 +76,12 @@ def test_what_is_farthest_beyond_its_own_range_is_named() -> None:
 
 def test_of_a_map_mean_least_and_greatest_of_each_channel_count() -> None:
     maps = np.arange(8.0).reshape(2, 2, 2)
-    assert numbers_of({"maps": maps, "goal": np.array([7.0])}).tolist() == [7.0, 1.5, 0.0, 3.0, 5.5, 4.0, 7.0]
+    assert numbers_of({"maps": maps, "goal": np.array([7.0])}, 1).tolist() == [7.0, 1.5, 0.0, 3.0, 5.5, 4.0, 7.0]
+
+
+def test_of_several_frames_the_newest_counts() -> None:
+    seen = {"touch": np.array([1.0, 2.0, 3.0, 4.0]), "goal": np.array([5.0, 6.0])}
+    assert numbers_of(seen, 2).tolist() == [5.0, 6.0, 3.0, 4.0]
 
 
 def scene(*overrides: str) -> Scene:

@@ -94,7 +94,7 @@ def training_notes(policy: Policy | None, name: str, scenes: Sequence[Scene]) ->
     if known is None:
         return [
             f"policy '{name}': unknown training range, so nothing says whether it meets what it has learned; "
-            "tacsim export range measures it"
+            "tacsim export policy-range measures it"
         ]
     outside = outside_of_scenes(known, scenes)
     return [f"policy '{name}': the scene is outside its training: {'; '.join(outside)}"] if outside else []

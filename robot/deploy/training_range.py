@@ -124,8 +124,8 @@ class RangeWatch:
             expected = lifted(np.zeros(len(names))).shape if names else (len(known.centre),)
             if (len(known.centre),) != expected or (names and len(known.low) != len(names)):
                 raise ValueError(
-                    f"the training range is of {len(known.low)} numbers, lifted to {len(known.centre)}; the policy sees "
-                    f"{len(names)}: measure it again with tacsim export range"
+                    f"the training range is of {len(known.low)} numbers ({len(known.centre)} with products), the "
+                    f"policy sees {len(names)}: measure it again with tacsim export policy-range"
                 )
             self._centre, self._axes = np.array(known.centre), np.array(known.axes)
             self._low, self._high = np.array(known.low), np.array(known.high)

@@ -31,7 +31,7 @@ class ActionAxis(Config):
 
 class TrainingRange(Config):
     """What a policy observed in its training, and what was simulated there; `robot.deploy.training_range` says how an
-    observation is compared with it. `tacsim export range` measures it."""
+    observation is compared with it. `tacsim export policy-range` measures it."""
 
     episodes: Annotated[int, Field(ge=2)]  # that it was measured in
     low: tuple[float, ...]  # least of each number of an observation [encoded]

@@ -51,14 +51,14 @@ def policy_range(
     The policy acts itself in episodes drawn as the training file says. `tacsim run` and `tacsim evaluate` then say when
     observations leave that range, and which parameters of a simulated scene do. Needs onnx (extra `train`).
 
-    Example: tacsim export range mine.onnx --training squeeze --out mine-with-range.onnx
+    Example: tacsim export policy-range mine.onnx --training squeeze --out mine-with-range.onnx
     """
     from importlib.util import find_spec
 
     from robot.open import CannotOpen
 
     if find_spec("onnx") is None:
-        raise CannotOpen("tacsim export range needs onnx, which is not installed: pip install 'tacsim[train]'")
+        raise CannotOpen("tacsim export policy-range needs onnx, which is not installed: pip install 'tacsim[train]'")
     _require_new(out)
     if set_ and training is None:
         raise typer.BadParameter("--set changes a training file: name it with --training", param_hint="--set")

@@ -49,16 +49,16 @@ def share_outside(known: Any, episodes: list[np.ndarray[Any, Any]]) -> float:
 
 
 def test_a_stiffer_body_is_outside_and_an_unseen_one_within() -> None:
-    """Each number alone stays within what training met: only that they come together is new."""
+    """3 of 100 episodes of training are beyond the limit, give or take what 100 episodes of calibration leave open."""
     random = np.random.default_rng(3)
     known = measured([pressed(random.uniform(0.2, 0.8), random) for _ in range(200)], [])
-    unseen = [pressed(random.uniform(0.2, 0.8), random) for _ in range(300)]
-    assert share_outside(known, unseen) <= 0.05
-    stiff = [pressed(random.uniform(1.2, 1.6), random)[:18] for _ in range(50)]
-    assert max(each[:, 1].max() for each in stiff) < max(known.high) * 1.2
-    assert share_outside(known, stiff) >= 0.9
-    soft = [pressed(random.uniform(0.0, 0.02), random) for _ in range(50)]
-    assert share_outside(known, soft) >= 0.8
+    assert share_outside(known, [pressed(random.uniform(0.2, 0.8), random) for _ in range(300)]) <= 0.08
+    stiff = [pressed(random.uniform(1.2, 1.6), random) for _ in range(50)]
+    assert share_outside(known, stiff) >= 0.95
+    # no deeper than training was, but too early: it is the combination that is new
+    early = [each[each[:, 1] <= 0.8] for each in stiff]
+    assert max(each[:, 1].max() for each in early) <= max(known.high)
+    assert share_outside(known, early) >= 0.6
 
 
 def test_what_is_farthest_beyond_its_own_range_is_named() -> None:

@@ -82,7 +82,7 @@ def measured(episodes: Sequence[FloatArray], scenes: Sequence[Scene]) -> Trainin
     covariance = np.atleast_2d(np.cov((fitted - centre) / deviation, rowvar=False))
     variance, directions = np.linalg.eigh(covariance + np.diag(1.0 - (own / deviation) ** 2))
     scale = np.sqrt(np.maximum(variance, LEAST_VARIANCE) * len(variance))
-    axes = (directions / scale / deviation[:, None]).T
+    axes = (directions / scale) @ directions.T / deviation  # symmetric, so that no choice among equal directions shows
     largest = np.sort([distances(each, centre, axes).max() for each in episodes[1::2]])
     at = min(int(np.ceil((len(largest) + 1) * (1 - FALSE_ALARMS))), len(largest)) - 1
     numbers, words = ranges_of(scenes)
@@ -92,7 +92,7 @@ def measured(episodes: Sequence[FloatArray], scenes: Sequence[Scene]) -> Trainin
         high=_rounded(whole.max(axis=0)),
         centre=_rounded(centre),
         axes=tuple(_rounded(axis) for axis in axes),
-        limit=float(largest[at]),
+        limit=_rounded(largest[at : at + 1])[0],
         scene=numbers,
         words=words,
     )

@@ -101,7 +101,7 @@ def test_the_command_writes_a_table_and_a_file(tmp_path: Path) -> None:
 
 
 def test_what_was_played_is_in_the_file_when_it_is_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def stopped(training: Any, policies: Any, episodes: int, seed: int, tell: Any, say: Any) -> None:
+    def stopped(training: Any, policies: Any, episodes: int, seed: int, tell: Any, say: Any, warn: Any) -> None:
         say(Judged("teacher", (Ended(1e-4, True, 2.0, 0.9),)))
         raise KeyboardInterrupt
 

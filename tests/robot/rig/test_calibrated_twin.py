@@ -267,7 +267,7 @@ def test_rigs_and_environments_take_it(finger: Path) -> None:
         assert rig.spec.sensors["lower"].image_shape == (190, 240)
         touch = observation.tactile["lower"]
         assert touch.valid.sum() == 62 * 48 and (touch.image[~touch.valid.repeat(2, 0).repeat(2, 1)] == 128).all()
-    env = make_env("squeeze", overrides=overrides)
+    env = make_env("squeeze", overrides=overrides, features=None)
     first, _ = env.reset(seed=0)
     np.testing.assert_array_equal(first["valid_lower"], touch.valid)
     env.close()

@@ -9,14 +9,14 @@ from pathlib import Path
 
 import pytest
 
-from tests.tacsim.gym.small import SMALL, VARIANTS
+from tests.tacsim.gym.small import AS_WRITTEN, SMALL, VARIANTS
 
 ROOT = Path(__file__).parents[3]
 HEAD = f"""
 import multiprocessing, sys
 import gymnasium, numpy as np
 import tacsim.gym.env
-OPTIONS = dict(overrides={list(SMALL)!r}, variants={[list(each) for each in VARIANTS]!r})
+OPTIONS = dict(overrides={list(SMALL)!r}, variants={[list(each) for each in VARIANTS]!r}, **{AS_WRITTEN!r})
 NAME = "tacsim/Squeeze-v0"
 """
 ASYNC = """

@@ -144,7 +144,7 @@ def episodes() -> dict[str, Any]:
         "scene.settling.mach=0.05", "scene.settling.tolerance=0.1", "motion=flowing", "task.goal=3 mm",
         *(f"sensors.{name}.model.geometry.{what}" for name in ("lower", "upper") for what in ("width=16", "height=16")),
     ]  # fmt: skip
-    many = gymnasium.make_vec("tacsim/Squeeze-v0", 2, autoreset_mode="Disabled", overrides=small)
+    many = gymnasium.make_vec("tacsim/Squeeze-v0", 2, autoreset_mode="Disabled", overrides=small, features=None)
     many.reset(seed=[1, 2])
     found = [many.step(np.array([[0.5, 1.0], [1.0, 0.2]], np.float32)) for _ in range(2)]
     many.reset(options={"reset_mask": np.array([True, False])})

@@ -64,8 +64,9 @@ class OnnxPolicy:
         self._axes = tuple(Axis(axis.arm, axis.direction) for axis in self.spec.axes)
         self._targets: dict[str, Pose] = {}
         _require_same_inputs(path, self.spec, self._encoder.inputs, self._session, goal)
+        names = names_of(self.spec, 0 if goal is None else np.size(goal))
         try:
-            self.watch = RangeWatch(self.spec.range, names_of(self.spec, np.size(goal)), self.spec.features.frames)
+            self.watch = RangeWatch(self.spec.range, names, self.spec.features.frames)
         except ValueError as failure:
             raise PolicyNotFound(f"policy '{path}': {failure}") from None
 

@@ -60,6 +60,7 @@ class Arm:
         self.waypoint: FloatArray | None = None  # (4, 4) where the present move ends
         self.history: deque[FloatArray] = deque([self.q] * HISTORY, maxlen=HISTORY)
         self._next: FloatArray | None = None
+        self.acceleration, self.target_acceleration = np.zeros(6), np.zeros(6)  # of the TCP, over the last period
         self.update()
 
     # -- commands of a motion: at most one a control period ----------------------------------------------------------
@@ -106,6 +107,7 @@ class Arm:
         """Ends the control period; an arm without a command is braked. give_way: in force mode, the program's twist
         to that of the set point. Returns False where the set point is out of reach, and holds it."""
         wanted, before, begin, frame = self._next, self.target_qd, self.set_q, self.target_frame
+        twist, target_twist = self.twist, self.target_twist
         self._next = None
         if wanted is not None:
             self.target_qd = (wanted - self.target_q) / PERIOD
@@ -126,6 +128,8 @@ class Arm:
         self._servo(begin)
         self.history.append(self.q)
         self._update_actual()
+        self.acceleration = (self.twist - twist) / PERIOD
+        self.target_acceleration = (self.target_twist - target_twist) / PERIOD
         return reached is not None
 
     def settle(self) -> None:

@@ -15,7 +15,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from enum import IntEnum
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -25,7 +25,8 @@ from robot.mock.ur.machine.force_mode import ForceMode
 from robot.mock.ur.machine.load import NOTHING, Load, Mass, at_flange
 from robot.mock.ur.machine.motion import FREEDRIVE_DAMPING, FREEDRIVE_TURN_DAMPING, comply
 from robot.mock.ur.machine.registry import COMMANDS
-from robot.mock.ur.machine.script import Program
+from robot.mock.ur.machine.script import CONTROL_SCRIPT, DONE, Program
+from robot.mock.ur.machine.user_script import CompileError
 from robot.mock.ur.machine.version import VERSION, Version
 from tacsim.interface import FloatArray
 from tacsim.models.text import printable
@@ -100,6 +101,15 @@ class Outputs:
         return 10.0 * part if self.analog_is_voltage[index] else 0.004 + 0.016 * part
 
 
+class ScriptError(NamedTuple):
+    """Why a program was not begun, or has ended by an error; where in it, from 1 (0: not known)."""
+
+    text: str
+    line: int = 0
+    column: int = 0
+    users: bool = True  # a program of a user, not ur_rtde's control script
+
+
 class Machine:
     """One robot. `log` keeps the last lines of what happened, each with its time [s]."""
 
@@ -125,7 +135,8 @@ class Machine:
         self.force_mode: ForceMode | None = None
         self.watchdog: tuple[int, float] | None = None  # input_int_register, longest silence [s]
         self.watchdog_reset = 0  # tick at which its register was last written
-        self.script_errors: deque[str] = deque(maxlen=20)  # not yet told to those who listen
+        self.script_errors: deque[ScriptError] = deque(maxlen=20)  # not yet reported to those who listen
+        self.control_offset = 0  # of the registers of the last control script
         self.stop_reason = ""  # why the last program ended
         self.stopped_at = -math.inf  # time of the last protective stop [s]
         self.unlock_delay = UNLOCK_DELAY
@@ -191,9 +202,12 @@ class Machine:
         except ProgramError as error:
             self.stop_reason = f"not run: {error}"
             self.write_log(self.stop_reason)
-            self.script_errors.append(f"compile_error:{error}")
+            place = (error.line, error.column) if isinstance(error, CompileError) else ()
+            self.script_errors.append(ScriptError(str(error), *place))
             return False
         self.program, self.paused = program, False
+        if program.name == CONTROL_SCRIPT:
+            self.control_offset = program.int_offset
         self.write_log(f"program '{program.name}' started")
         return True
 
@@ -204,6 +218,10 @@ class Machine:
         if self.program is not None:
             self.program, self.stop_reason = None, why
             self.write_log(f"program stopped: {why}")
+
+    def end_wait(self) -> None:
+        """Writes what ur_rtde waits for while a program of its user runs, in the register where it looks."""
+        self.out_int[self.control_offset] = DONE
 
     def end_force_mode(self) -> None:
         if self.force_mode is not None:
@@ -310,8 +328,9 @@ class Machine:
         except TooFast as error:
             self.protective_stop(str(error))
         except ProgramError as error:
+            users = self.program is not None and self.program.name != CONTROL_SCRIPT
             self.stop(str(error))
-            self.script_errors.append(f"runtime_error:{error}")
+            self.script_errors.append(ScriptError(f"runtime_error:{error}", users=users))
         except Exception as error:  # what the mock did not foresee is the end of this program, not of the other arms
             traceback.print_exc()
             self.stop(f"error of the mock: {type(error).__name__}: {error}")

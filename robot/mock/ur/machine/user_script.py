@@ -6,7 +6,7 @@
     end
 
 That is all: no variables, conditions, loops, threads or functions. Like a controller that cannot compile a program, the
-mock does nothing of one with any other line, and says which.
+mock does nothing of one with any other line, and says which, in the words of a controller (CompileError).
 """
 
 from __future__ import annotations
@@ -36,12 +36,23 @@ CALLS: dict[str, Callable[..., MotionSteps | None]] = {}
 _SUMS: dict[type, Callable[[float, float], float]] = {ast.Add: operator.add, ast.Sub: operator.sub}
 
 
+class CompileError(ProgramError):
+    """A program that cannot be compiled: why, by the words of a controller; its line and column, from 1."""
+
+    def __init__(self, reason: str, text: str, line: int) -> None:
+        super().__init__(
+            f"{reason}:{text.rstrip()[:80]}: line {line}; the mock runs ur_rtde's control script, and lists of calls "
+            f"with numbers: {', '.join(CALLS)}"
+        )
+        self.line, self.column = line, len(text) - len(text.lstrip()) + 1
+
+
 class Pose(tuple[float, ...]):
     """p[...] of URScript; a list is joints."""
 
 
 def compiled(text: str) -> list[tuple[str, list[Any], dict[str, Any]]]:
-    """The calls of a program: name and arguments. Raises ProgramError with the first line that is no such call."""
+    """The calls of a program: name and arguments. Raises CompileError with the first line that is no such call."""
     found = []
     for number, line in enumerate(text.strip().splitlines(), start=1):
         words = line.partition("#")[0].strip()
@@ -51,15 +62,16 @@ def compiled(text: str) -> list[tuple[str, list[Any], dict[str, Any]]]:
             if len(words) > LONGEST_LINE:
                 raise ValueError
             call = ast.parse(words, mode="eval").body
-            if not isinstance(call, ast.Call) or not isinstance(call.func, ast.Name) or call.func.id not in CALLS:
+            if not isinstance(call, ast.Call) or not isinstance(call.func, ast.Name):
                 raise ValueError
+            if call.func.id not in CALLS:
+                raise CompileError(f"compile_error_name_not_found:{call.func.id}", line, number)
             named = {each.arg or "": _value(each.value) for each in call.keywords}
             found.append((call.func.id, [_value(each) for each in call.args], named))
             if len(found) > MOST_CALLS:
-                raise ProgramError(f"line {number}: the mock takes at most {MOST_CALLS} calls")
+                raise CompileError(f"compile_error: more than {MOST_CALLS} calls", line, number)
         except (SyntaxError, ValueError, TypeError, OverflowError, RecursionError, MemoryError):
-            runs = f"the mock runs ur_rtde's control script, and lists of calls with numbers: {', '.join(CALLS)}"
-            raise ProgramError(f"line {number}: '{words[:80]}': {runs}") from None
+            raise CompileError(f"syntax_error_on_line:{number}", line, number) from None
     return found
 
 

@@ -31,7 +31,8 @@ from robot.mock.ur.wire.rtde import BadPackage, InputRecipe, Session, packages
 if TYPE_CHECKING:
     from tacsim.models.hardware import Model  # pydantic and SciPy: half a second of start-up
 
-RTDE, DASHBOARD, SCRIPTS = 30004, 29999, (30001, 30002, 30003)
+RTDE, DASHBOARD, REALTIME = 30004, 29999, 30003
+SCRIPTS = (*primary.PORTS, REALTIME)
 PORTS = (RTDE, DASHBOARD, *SCRIPTS)
 MAX_CLIENTS = 256  # of one controller; more are closed at once
 MAX_PROGRAM, MAX_LINE = 1 << 20, 1 << 16  # a longer program or dashboard line cuts its client [bytes]
@@ -80,6 +81,7 @@ class Controller:
         self.inputs = Inputs()
         self.clients: dict[Connection, Session | None] = {}
         self._behind: set[Connection] = set()  # clients that sent more than was served so far
+        self._author: Connection | None = None  # who sent the last program
         self._listeners: list[socket.socket] = []
         self._boot_at: int | None = None  # tick at which a power cycle ends
         self._rate = (time.monotonic(), 0, 0.0)  # begun, ticks then, rate of the span before
@@ -199,11 +201,17 @@ class Controller:
                     self._stream(client, data)
 
     def _tell_script_errors(self) -> None:
+        """Reports on the ports where a controller does. ur_rtde does not read there: it waits 600 s for its register,
+        and sends its control script again. Its connection is cut, so that this call raises now."""
         while self.machine.script_errors:
-            data = primary.runtime_exception(self.machine.time, self.machine.script_errors.popleft())
+            error = self.machine.script_errors.popleft()
+            data = primary.runtime_exception(self.machine.time, error)
             for client in self.clients:
                 if client.port in primary.PORTS:
                     client.send(data, due=self._due())
+            if error.users and self._author is not None and self._author.port == REALTIME:
+                self._drop(self._author, reset=True)
+                self.machine.end_wait()
 
     def _stream(self, client: Connection, data: bytes) -> None:
         sent, dropped = client.sent, client.dropped
@@ -314,6 +322,7 @@ class Controller:
         program = client.received[: found.end()].decode("utf-8", errors="replace")
         del client.received[: found.end()]
         client.searched = 0
+        self._author = client
         if self.faults.remote_control:
             self.machine.start(program)
         else:

@@ -1,9 +1,11 @@
 """The fields of the RTDE: names, types, and where their values come from (Real-Time Data Exchange guide, Universal
-Robots).
+Robots, and the recipes of its own clients for Python and C++, all of whose fields are here).
 
-Real: everything about joints, TCP, elbow, forces on the tool, modes, registers, in- and outputs, payload. Constant,
-because nothing is modelled behind them: temperatures, voltages, currents, moments, momentum, inputs, what is plugged
-into the tool, accelerometer (the arm at rest).
+Real: everything about joints, TCP, elbow, forces on the tool, modes, registers, in- and outputs, payload. Constant, as
+a controller at rest would report them, because nothing is modelled behind them: temperatures, voltages, currents,
+moments, momentum, energy, wrenches from currents, ratios of position deviation and collision, encoders, Euromap 67,
+inputs, what is plugged into the tool, accelerometer (the arm at rest). A field without `since` is known to every
+version, also where the guide does not say when it was introduced.
 """
 
 from __future__ import annotations
@@ -16,6 +18,7 @@ from typing import cast
 import numpy as np
 
 from robot.common.kinematics import pose
+from robot.mock.ur.machine.arm import PERIOD
 from robot.mock.ur.machine.load import GRAVITY
 from robot.mock.ur.machine.machine import REGISTERS, Machine, Mode
 
@@ -115,9 +118,14 @@ OUTPUTS: dict[str, Output] = {
     "actual_TCP_force": Output("VECTOR6D", lambda m: m.load.felt.tolist()),
     "target_TCP_pose": Output("VECTOR6D", lambda m: pose(m.arm.target_frame).tolist()),
     "target_TCP_speed": Output("VECTOR6D", lambda m: m.arm.target_twist.tolist()),
+    "actual_TCP_acceleration": Output("VECTOR6D", lambda m: m.arm.acceleration.tolist()),
+    "target_TCP_acceleration": Output("VECTOR6D", lambda m: m.arm.target_acceleration.tolist()),
     "actual_digital_input_bits": Output("UINT64", _constant(0)),
+    "actual_configurable_digital_input_bits": Output("UINT64", _constant(0)),
     "joint_temperatures": Output("VECTOR6D", _constant(*[30.0] * 6)),
     "actual_execution_time": Output("DOUBLE", lambda m: m.work_time),
+    "target_execution_time": Output("DOUBLE", _constant(PERIOD)),
+    "control_step": Output("UINT64", lambda m: m.ticks),
     "robot_mode": Output("INT32", lambda m: int(m.mode)),
     "joint_mode": Output("VECTOR6INT32", lambda m: (JOINT_MODES.get(m.mode, POWERED_OFF),) * 6),
     "safety_mode": Output("INT32", lambda m: int(m.safety)),
@@ -129,12 +137,18 @@ OUTPUTS: dict[str, Output] = {
     "actual_main_voltage": Output("DOUBLE", _powered(1)),
     "actual_robot_voltage": Output("DOUBLE", _powered(1)),
     "actual_robot_current": Output("DOUBLE", _constant(0.0)),
+    "actual_robot_energy_consumed": Output("DOUBLE", _constant(0.0), since=((5, 23), (10, 11))),
+    "actual_robot_braking_energy_dissipated": Output("DOUBLE", _constant(0.0), since=((5, 23), (10, 11))),
     "actual_joint_voltage": Output("VECTOR6D", _powered(6)),
     "actual_digital_output_bits": Output("UINT64", lambda m: m.outputs.digital),
+    "actual_configurable_digital_output_bits": Output("UINT64", lambda m: m.outputs.digital >> 8 & 0xFF),
     "runtime_state": Output("UINT32", lambda m: int(m.runtime)),
     "elbow_position": Output("VECTOR3D", _elbow, since=((3, 5), (5, 0))),
     "elbow_velocity": Output("VECTOR3D", _elbow_velocity, since=((3, 5), (5, 0))),
     "tcp_force_scalar": Output("DOUBLE", lambda m: math.hypot(*m.load.felt[:3].tolist())),
+    "joint_position_deviation_ratio": Output("DOUBLE", _constant(0.0)),
+    "collision_detection_ratio": Output("DOUBLE", _constant(0.0)),
+    "time_scale_source": Output("INT32", _constant(0)),
     "analog_io_types": Output("UINT32", lambda m: m.outputs.analog_types),
     "tool_mode": Output("UINT32", lambda m: JOINT_MODES.get(m.mode, POWERED_OFF)),
     "tool_analog_input_types": Output("UINT32", _constant(0)),
@@ -143,14 +157,27 @@ OUTPUTS: dict[str, Output] = {
     "tool_output_voltage": Output("INT32", _constant(0)),
     "tool_output_current": Output("DOUBLE", _constant(0.0)),
     "tool_temperature": Output("DOUBLE", _constant(30.0)),
+    "tool_output_mode": Output("UINT8", _constant(0)),  # digital outputs
+    "tool_digital_output0_mode": Output("UINT8", _constant(1)),  # sinking (NPN)
+    "tool_digital_output1_mode": Output("UINT8", _constant(1)),
     "standard_analog_input0": Output("DOUBLE", _constant(0.0)),
     "standard_analog_input1": Output("DOUBLE", _constant(0.0)),
     "standard_analog_output0": Output("DOUBLE", lambda m: m.outputs.analog_value(0)),
     "standard_analog_output1": Output("DOUBLE", lambda m: m.outputs.analog_value(1)),
     "io_current": Output("DOUBLE", _constant(0.0)),
+    "euromap67_input_bits": Output("UINT32", _constant(0)),
+    "euromap67_output_bits": Output("UINT32", _constant(0)),
+    "euromap67_24V_voltage": Output("DOUBLE", _constant(0.0)),
+    "euromap67_24V_current": Output("DOUBLE", _constant(0.0)),
+    "encoder0_raw": Output("INT32", _constant(0)),
+    "encoder1_raw": Output("INT32", _constant(0)),
     "robot_status_bits": Output("UINT32", lambda m: m.status_bits),
     "safety_status_bits": Output("UINT32", lambda m: m.safety_status_bits),
     "ft_raw_wrench": Output("VECTOR6D", lambda m: m.raw_wrench.tolist(), since=((5, 9),)),
+    "wrench_calc_from_currents": Output("VECTOR6D", _constant(*[0.0] * 6)),
+    "target_gravity": Output("VECTOR3D", lambda m: m.load.gravity.tolist()),
+    "target_base_acceleration": Output("VECTOR6D", _constant(*[0.0] * 6)),
+    "target_base_wrench": Output("VECTOR6D", _constant(*[0.0] * 6)),
     "payload": Output("DOUBLE", lambda m: m.load.told.mass, since=((3, 11), (5, 5, 1))),
     "payload_cog": Output("VECTOR3D", lambda m: m.load.told.centre, since=((3, 11), (5, 5, 1))),
     "payload_inertia": Output("VECTOR6D", lambda m: m.load.inertia.tolist(), since=((3, 15), (5, 11))),

@@ -5,13 +5,15 @@ from __future__ import annotations
 
 import struct
 
+from robot.mock.ur.machine.machine import ScriptError
+
 PORTS = (30001, 30002)
 ROBOT_MESSAGE, RUNTIME_EXCEPTION, CONTROLLER = 20, 10, 0xFE
 _HEAD = struct.Struct(">iBQBBii")  # size, type, time [us], source, kind, line and column of the script
 
 
-def runtime_exception(time: float, text: str) -> bytes:
+def runtime_exception(time: float, error: ScriptError) -> bytes:
     """A package that says why a program has ended, or was not begun; time: since power-on [s]."""
-    words = text.encode()
-    size = _HEAD.size + len(words)
-    return _HEAD.pack(size, ROBOT_MESSAGE, round(1e6 * time), CONTROLLER, RUNTIME_EXCEPTION, 0, 0) + words
+    words = error.text.encode()
+    head = ROBOT_MESSAGE, round(1e6 * time), CONTROLLER, RUNTIME_EXCEPTION, error.line, error.column
+    return _HEAD.pack(_HEAD.size + len(words), *head) + words

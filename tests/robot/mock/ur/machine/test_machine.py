@@ -64,6 +64,19 @@ def test_actual_trails_target_and_both_speeds_agree(bench: Bench) -> None:
     np.testing.assert_allclose(displacement(before, bench.arm.frame) / PERIOD, bench.arm.twist, atol=1e-4)
 
 
+def test_accelerations_of_the_tcp_are_the_change_of_its_speeds(bench: Bench) -> None:
+    bench.call(10, [0.1, 0, 0, 0, 0, 0, 0.5, 0])
+    read = {name: OUTPUTS[name].read for name in ("actual_TCP_speed", "actual_TCP_acceleration")}
+    target = {name: OUTPUTS[name].read for name in ("target_TCP_speed", "target_TCP_acceleration")}
+    for speed, acceleration in (read.values(), target.values()):
+        bench.tick(10)
+        before = np.array(speed(bench.machine))
+        bench.tick()
+        change = (np.array(speed(bench.machine)) - before) / PERIOD
+        np.testing.assert_allclose(np.array(acceleration(bench.machine)), change, atol=1e-9)
+        assert change[0] > 0.1
+
+
 def test_elbow_velocity_is_that_of_its_position(bench: Bench) -> None:
     bench.write(9, [0.3, -0.2, 0.4, 0, 0, 0, 5.0, 0.0])
     bench.tick(300)

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import math
 import struct
+import subprocess
+import sys
+from pathlib import Path
 from socket import create_connection
 
 import numpy as np
@@ -69,10 +72,12 @@ def test_calls_are_done_in_their_order(bench: Bench) -> None:
 def test_a_line_that_is_no_such_call_is_refused_before_anything_is_done(bench: Bench, line: str) -> None:
     bench.call(10, [0.05, 0, 0, 0, 0, 0, 0.5, 0])
     assert not bench.machine.start(program("set_tool_digital_out(0, True)", line))
-    assert bench.machine.program is None and "line 3" in bench.machine.stop_reason
+    assert bench.machine.program is None and "line 3;" in bench.machine.stop_reason
     bench.until(lambda: bench.arm.rests)
     assert bench.machine.outputs.digital == 0
-    assert "compile_error:line 3" in bench.machine.script_errors[-1]
+    error = bench.machine.script_errors[-1]
+    kind = "compile_error_name_not_found:movec:" if line.startswith("movec") else "syntax_error_on_line:3:\t"
+    assert error.text.startswith(kind) and (error.line, error.column) == (3, 2) and error.users
 
 
 @pytest.mark.parametrize(
@@ -93,18 +98,61 @@ def test_a_line_that_is_no_such_call_is_refused_before_anything_is_done(bench: B
 def test_numbers_that_make_no_sense_end_the_program(bench: Bench, line: str) -> None:
     assert bench.machine.start(program(line))
     bench.until(lambda: bench.machine.program is None)
-    assert bench.machine.script_errors[-1].startswith("runtime_error:")
+    assert bench.machine.script_errors[-1].text.startswith("runtime_error:") and bench.machine.script_errors[-1].users
 
 
 def test_who_listens_to_the_primary_interface_is_told(mock: MockUR) -> None:
     with create_connection((mock.host, 30001), TIMEOUT) as listener, create_connection((mock.host, 30003)) as line:
         listener.settimeout(TIMEOUT)
         mock.faults.state()  # both are accepted
-        line.sendall(program("socket_open(1)").encode())
+        line.sendall(program("sync()", "  socket_open(1)").encode())
         data = b""
         while len(data) < 4 or len(data) < struct.unpack_from(">i", data)[0]:
             data += listener.recv(4096)
-    kind, _, _, what = struct.unpack_from(">BQBB", data, 4)
-    assert (kind, what) == (primary.ROBOT_MESSAGE, primary.RUNTIME_EXCEPTION)
-    assert b"compile_error:line 2: 'socket_open(1)'" in data
+    kind, _, _, what, row, column = struct.unpack_from(">BQBBii", data, 4)
+    assert (kind, what, row, column) == (primary.ROBOT_MESSAGE, primary.RUNTIME_EXCEPTION, 3, 4)
+    assert b"compile_error_name_not_found:socket_open:" in data
     assert "socket_open" in mock.faults.state().stop_reason
+
+
+WAITS = """
+import sys
+import rtde_control
+control = rtde_control.RTDEControlInterface(sys.argv[1])
+try:
+    print(getattr(control, sys.argv[2])(*sys.argv[3:]))
+except RuntimeError as error:
+    print("RuntimeError:", error)
+control.disconnect()
+control.reconnect()
+print(control.isSteady())
+"""
+
+
+@pytest.mark.parametrize("body", ["x = 1", "while True:\n\tsync()\nend", "if 1 > 0:\n\tsync()\nend", "movej([0,0])"])
+@pytest.mark.parametrize("call", ["sendCustomScript", "sendCustomScriptFunction", "sendCustomScriptFile"])
+def test_ur_rtde_does_not_wait_for_a_program_that_ends_by_an_error(
+    mock: MockUR, tmp_path: Path, call: str, body: str
+) -> None:
+    """A controller leaves it waiting for 600 s. Here the call raises, and a new connection works."""
+    pytest.importorskip("rtde_control")
+    given = [program(*body.splitlines())]
+    if call == "sendCustomScriptFunction":
+        given = ["mine", body]
+    elif call == "sendCustomScriptFile":
+        file = tmp_path / "mine.script"
+        file.write_text(given[0], encoding="utf-8")
+        given = [str(file)]
+    command = [sys.executable, "-c", WAITS, mock.host, call, *given]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT, check=True)
+    assert done.stdout.startswith("RuntimeError: write: ") and done.stdout.endswith("\nTrue\n"), done
+
+
+def test_a_client_that_reads_reports_is_not_cut(mock: MockUR) -> None:
+    with create_connection((mock.host, 30002), TIMEOUT) as line:
+        for name in ("first_thing", "second_thing"):
+            line.sendall(program(f"{name}()").encode())
+            data = b""
+            while name.encode() not in data:
+                data += line.recv(4096)
+                assert data, "the connection was closed"

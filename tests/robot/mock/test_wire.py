@@ -54,7 +54,8 @@ actual_robot_current:DOUBLE actual_joint_voltage:VECTOR6D actual_digital_output_
 joint_position_deviation_ratio:DOUBLE"""
 
 OTHERS = """payload:DOUBLE payload_cog:VECTOR3D payload_inertia:VECTOR6D ft_raw_wrench:VECTOR6D
-script_control_line:UINT32 actual_current_window:VECTOR6D elbow_position:VECTOR3D elbow_velocity:VECTOR3D robot_status_bits:UINT32
+script_control_line:UINT32 actual_current_window:VECTOR6D elbow_position:VECTOR3D elbow_velocity:VECTOR3D
+robot_status_bits:UINT32
 safety_status_bits:UINT32 safety_mode:INT32 io_current:DOUBLE tool_mode:UINT32 tcp_force_scalar:DOUBLE
 tcp_offset:VECTOR6D analog_io_types:UINT32 standard_analog_input0:DOUBLE standard_analog_output1:DOUBLE
 tool_analog_input_types:UINT32 tool_output_voltage:INT32 tool_output_current:DOUBLE tool_output_mode:UINT8

@@ -16,6 +16,7 @@ from robot.common.tcp import ArmFrames
 from tacsim.interface import FloatArray
 
 HISTORY = 1024  # state records that are kept: two seconds
+WINDOW = 500  # periods in the statistics of a worker
 COMMAND_SLOTS = 8
 TACTILE_SLOTS = 8
 
@@ -54,7 +55,10 @@ STATE = np.dtype(
         ("busy_until", np.float64),  # the worker waits for the controller until then at most [s]
         ("cycles", np.int64),  # periods of this worker
         ("overruns", np.int64),  # missed periods
-        ("period", np.float64, 3),  # median, 99th percentile and maximum of the last 500 [s]
+        ("period", np.float64, 3),  # median, 99th percentile and maximum of 500 periods, renewed every 500 [s]
+        ("late", np.int64),  # of the last 500 periods, those that took two or more
+        ("longest", np.float64),  # of the last 500 periods [s]
+        ("realtime", np.int64),  # 1: the worker has real-time priority
     ]
 )
 COMMAND = np.dtype(

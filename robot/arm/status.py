@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import signal
 import time
 from enum import IntEnum
 
 from robot.arm.shared_ring import Record
 from robot.errors import DeviceError, DeviceNotConnectedError, EmergencyStop, LinkLost, ProtectiveStop, SafetyViolation
-
-OUTLIVED = -signal.SIGALRM  # exit status of a worker whose call into the library outlived its time limit
 
 
 class ArmStatus(IntEnum):
@@ -68,8 +65,7 @@ _TEXTS = {
     ArmStatus.PROGRAM_STOPPED: "has no running program (watchdog, pendant or power); look why, then recover()",
     ArmStatus.PROTECTIVE_STOP: "made a protective stop; look why, then recover()",
     ArmStatus.EMERGENCY_STOP: "has an emergency or safeguard stop; a person must release it, then recover()",
-    ArmStatus.LINK_LOST: "does not answer any more; the controller stops by its own watchdog; check the cable, then "
-    "recover()",
+    ArmStatus.LINK_LOST: "does not answer any more; the controller stops by its own watchdog; see why, then recover()",
     ArmStatus.WORKER_DEAD: "lost its worker process; the controller stops by its watchdog; recover() starts another",
     ArmStatus.CLOSED: "is closed",
 }
@@ -90,13 +86,14 @@ _ERRORS: dict[ArmStatus, type[DeviceError]] = {
 }
 
 
-def status_of(record: Record | None, exit_status: int | None, patience: float) -> ArmStatus:
-    """What an arm is doing now, by the newest record of its worker and the exit status of that (None: it runs). A link
-    is lost once the newest package is older than `patience` [s], unless a call of the controller may take so long."""
+def status_of(record: Record | None, exit_status: int | None, patience: float, *, lost: bool = False) -> ArmStatus:
+    """What an arm is doing now, by the newest record of its worker and the exit status of that (None: it runs); lost:
+    the link was lost before it ended. A link is lost once the newest package is older than `patience` [s], unless a
+    call of the controller may take so long."""
     last = ArmStatus.WORKER_DEAD if record is None else ArmStatus(int(record["status"]))
     if record is None or last == ArmStatus.CONNECTING:
         return last if exit_status is None else ArmStatus.WORKER_DEAD
     if exit_status is not None:
-        return ArmStatus.LINK_LOST if last == ArmStatus.LINK_LOST or exit_status == OUTLIVED else ArmStatus.WORKER_DEAD
+        return ArmStatus.LINK_LOST if lost or last == ArmStatus.LINK_LOST else ArmStatus.WORKER_DEAD
     fresh = time.monotonic() <= max(float(record["time"]) + patience, float(record["busy_until"]))
     return last if fresh else ArmStatus.LINK_LOST

@@ -25,9 +25,10 @@ from robot.arm.channel import (
     tactile_record,
 )
 from robot.arm.dashboard import Dashboard
+from robot.arm.lost_link import died_of_lost_link, explain_lost_link
 from robot.arm.package_log import PackageLog
 from robot.arm.shared_ring import Record
-from robot.arm.status import AT_CONNECTING, OUTLIVED, ArmStatus, status_of
+from robot.arm.status import AT_CONNECTING, ArmStatus, status_of
 from robot.arm.trajectory import PERIOD
 from robot.arm.worker_config import check_host, worker_config
 from robot.common import Closing
@@ -102,6 +103,8 @@ class URArm(Closing):
         self._closed = False
         self._stop_told = False  # recover() found a protective stop: the next one unlocks it
         self._worker: Child | None = None
+        self._lost = False  # what status() found last
+        self._verdict: ArmStatus | None = None  # on a worker that has ended: the first cause, until there is another
         # Those of the other arms are held, too: they may be opened, closed and opened again meanwhile.
         self._partner_names = tuple(keep_out or {})
         self._segments = [segment_of(arm) for arm in (name, *self._partner_names)]
@@ -126,8 +129,18 @@ class URArm(Closing):
         """What the arm is doing now; never raises."""
         if self._closed:
             return ArmStatus.CLOSED
-        ended = 0 if (worker := self._worker) is None else worker.exit_status  # another thread may close it meanwhile
-        return status_of(self._channel.states.latest(), ended, self.config.link_timeout + 5 * POLL)
+        if self._verdict is not None:
+            return self._verdict
+        worker, lost = self._worker, self._lost  # another thread may close it meanwhile
+        ended = 0 if worker is None else worker.exit_status
+        if worker is not None and ended is not None and not lost:
+            lost = died_of_lost_link(ended, worker.printed)
+        record, patience = self._channel.states.latest(), self.config.link_timeout + 5 * POLL
+        status = status_of(record, ended, patience, lost=lost)
+        self._lost = status == ArmStatus.LINK_LOST
+        if worker is not None and ended is not None and worker is self._worker:
+            self._verdict = status
+        return status
 
     def explain(self) -> str:
         """The status in words, with its numbers."""
@@ -269,6 +282,7 @@ class URArm(Closing):
 
     def _start(self) -> None:
         """Starts a worker and waits until it is connected. Raises the error of a fault that it begins with."""
+        self._lost, self._verdict = False, None
         self._worker = Child(
             "robot.arm.worker",
             name=f"the worker of arm '{self.name}'",
@@ -321,10 +335,8 @@ class URArm(Closing):
         status = self.status()
         record = None if self._closed else self._channel.states.latest()
         if status == ArmStatus.LINK_LOST and record is not None:
-            age = time.monotonic() - float(record["time"])
             raise StaleObservationError(
-                f"arm '{self.name}': the link is lost, its last package is {1e3 * age:.0f} ms old (link_timeout = "
-                f"{1e3 * self.config.link_timeout:g} ms); see the cable, then recover()"
+                f"arm '{self.name}': the link is lost, {self._lost_link(record)}, then recover()"
             )
         if status in (ArmStatus.WORKER_DEAD, ArmStatus.CLOSED, ArmStatus.CONNECTING) or record is None:
             raise self._error(status)
@@ -387,9 +399,13 @@ class URArm(Closing):
         worker = self._worker
         if worker is not None and status == ArmStatus.WORKER_DEAD:
             text += f" ({worker.last_words})"
-        elif worker is not None and status == ArmStatus.LINK_LOST and worker.exit_status == OUTLIVED:
-            text += " (a command took longer than link_timeout)"
+        elif record is not None and status == ArmStatus.LINK_LOST:
+            text += f" ({self._lost_link(record)})"
         return text
+
+    def _lost_link(self, record: Record) -> str:
+        ended = 0 if self._worker is None else self._worker.exit_status
+        return explain_lost_link(record, self.config, ended, time.monotonic())
 
     def _first_faults(self) -> Iterator[tuple[str, ArmStatus]]:
         """Of the other arms of a keep-out, those that did not stop because of another."""

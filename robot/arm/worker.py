@@ -23,7 +23,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from robot.arm.channel import STATE, Channel, WorkerConfig
+from robot.arm.channel import STATE, WINDOW, Channel, WorkerConfig
 from robot.arm.confinement import TimeLimit, allow_time_limits, last_connections
 from robot.arm.dashboard import Dashboard
 from robot.arm.servo import Servo, is_healthy
@@ -65,7 +65,6 @@ BLIND = 5  # periods without a new package; then nothing is sent
 SUSPENDED = 5e-3  # a target that took this long was held up with its process, and comes too late [s]
 GRACE = 5  # periods in which a package may say why the controller takes no more commands
 FAILED = 3  # exit status; the reason is on stdout, as JSON
-WINDOW = 500  # periods in the statistics
 
 
 class Worker:
@@ -346,6 +345,7 @@ class Worker:
         self._periods[cycle % WINDOW] = beat - self._last
         self._last = beat
         record["cycles"] = cycle + 1
+        record["late"], record["longest"] = np.count_nonzero(self._periods >= 2.0 * PERIOD), self._periods.max()
         if cycle % WINDOW == WINDOW - 1:
             record["period"] = np.sort(self._periods)[[WINDOW // 2, WINDOW * 99 // 100, -1]]
         return deadline + PERIOD
@@ -383,10 +383,10 @@ def main() -> NoReturn:
     parent = Parent()  # the library prints
     allow_time_limits()
     config = WorkerConfig.of(parent.receive())
-    if config.realtime:
-        ask_for_realtime(WORKER)  # before the library starts its threads
+    realtime = config.realtime and ask_for_realtime(WORKER)  # before the library starts its threads
     try:
         worker = Worker(config)
+        worker.record["realtime"] = realtime
         with TimeLimit(CONNECTING):
             worker.connect()
     except (DeviceError, OSError) as failure:

@@ -129,6 +129,14 @@ class Child(Closing):
             return ""
         return ": ".join([self._end(), *self._last_lines(1)])
 
+    @property
+    def printed(self) -> str:
+        """Its standard error until now; nothing of one that is closed."""
+        if self._closed:
+            return ""
+        self._errors.seek(0)
+        return self._errors.read().decode(errors="replace")
+
     def check(self) -> None:
         """Raises `error` if the process has ended."""
         if not self.running:
@@ -219,10 +227,7 @@ class Child(Closing):
 
     def _last_lines(self, number: int) -> list[str]:
         """Of its standard error, at most `number`."""
-        if self._closed:
-            return []
-        self._errors.seek(0)
-        return self._errors.read().decode(errors="replace").strip().splitlines()[-number:]
+        return self.printed.strip().splitlines()[-number:]
 
 
 class Parent:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import time
+from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -24,6 +26,7 @@ TRIAL = 0.1  # share of a way that is gone first, and at most so many radians of
 TRIAL_TURN = 0.05
 REPEAT = 10e-3  # between two commands on a way [s]
 PATIENCE = 10.0  # longest time without getting on [s]
+PROGRESS = 10.0  # the time that is left is estimated from the progress in the last so many seconds
 BRAKING = 2.0  # longest time to come to rest [s]
 
 
@@ -109,13 +112,34 @@ def _lead(arm: StartArm, way: Way, guide: Guide) -> None:
         if not guide.ask(question):
             guide.tell(f"Arm '{arm.name}' stays where it is.")
             return
-        _move(arm, share, guide)
+        _move(arm, share, way.seconds, guide)
     guide.tell(f"Arm '{arm.name}' stands at its start.")
 
 
-def _move(arm: StartArm, share: float, guide: Guide) -> None:
+class Progress:
+    """Estimates the time that a path takes, from the progress measured last; `seconds`: planned for the whole path."""
+
+    def __init__(self, seconds: float) -> None:
+        self._seconds = seconds
+        self._samples: deque[tuple[float, float]] = deque()  # time [s], share
+
+    def add(self, now: float, share: float) -> None:
+        """Takes the share of the path that lies behind at the time `now` [s]."""
+        self._samples.append((now, share))
+        while now - self._samples[0][0] > PROGRESS:
+            self._samples.popleft()
+
+    def seconds_left(self, goal: float) -> float:
+        """Until the share `goal` of the path [s]: as planned in the first seconds, infinite if there is no progress."""
+        (begun, first), (now, last) = self._samples[0], self._samples[-1]
+        if now - begun < 0.2 * PROGRESS:
+            return max(0.0, goal - last) * self._seconds
+        return max(0.0, goal - last) * (now - begun) / (last - first) if last > first else math.inf
+
+
+def _move(arm: StartArm, share: float, seconds: float, guide: Guide) -> None:
     """Goes on until this share of the way. Whatever ends it brakes the arm."""
-    farthest, deadline = -1.0, time.monotonic() + PATIENCE
+    farthest, deadline, progress = -1.0, time.monotonic() + PATIENCE, Progress(seconds)
     try:
         while not arm.has_gone(share):
             if guide.stop():
@@ -129,7 +153,10 @@ def _move(arm: StartArm, share: float, guide: Guide) -> None:
                     f"arm '{arm.name}' does not get on, {100 * gone:.0f} % of its way gone; it {arm.explain()}. Is its "
                     "speed slider low, or the other arm near?"
                 )
-            guide.show(f"arm '{arm.name}': {100 * max(0.0, gone):.0f} % of the way (Ctrl-C brakes)")
+            progress.add(now, gone)
+            left = progress.seconds_left(share)
+            estimate = f"about {left:.0f} s left" if math.isfinite(left) else "no progress"
+            guide.show(f"arm '{arm.name}': {100 * max(0.0, gone):.0f} % of the way, {estimate} (Ctrl-C brakes)")
             time.sleep(REPEAT)
     except BaseException:
         arm.stop()

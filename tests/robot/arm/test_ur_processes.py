@@ -294,7 +294,7 @@ def test_nothing_is_left_of_a_worker_that_died(mock: MockUR) -> None:
     until(lambda: arm.status() == ArmStatus.LINK_LOST, "end of the worker")
     until(lambda: not worker.running, "end of the worker")
     assert arm.status() == ArmStatus.LINK_LOST
-    assert arm.explain().endswith("(a command took longer than link_timeout)")
+    assert ", a command took longer than link_timeout;" in arm.explain()
     arm.close()
     assert worker.exit_status == -signal.SIGALRM  # reaped, no zombie
     assert leftovers() == 0

@@ -12,7 +12,7 @@ from robot.arm.rtde import Reading
 from robot.common.kinematics import Kinematics, pose
 from robot.common.tcp import ArmFrames
 from robot.procedures.start_way import NoWay, Way, find_way, require_clear
-from robot.procedures.to_start import Guide, lead_to_start
+from robot.procedures.to_start import PROGRESS, Guide, Progress, lead_to_start
 from tacsim import pose as se3
 from tacsim.config import load_rig
 from tacsim.interface import FloatArray, Pose
@@ -70,6 +70,23 @@ def test_the_lengths_of_a_real_arm_are_allowed_for() -> None:
     found = find_way("arm", config, standing(config, at_start(config) + TURNED, calibration), start_of(config))
     flange = KINEMATICS.forward(found.end) @ calibration
     assert np.allclose(flange, ArmFrames.of(config).flange(se3.to_matrix(start_of(config))), atol=1e-9)
+
+
+@pytest.mark.parametrize("share_a_second", [0.02, 0.005, 0.0])
+def test_the_time_that_is_left_follows_the_measured_progress(share_a_second: float) -> None:
+    """Planned for 50 s: as planned at first; an arm that then creeps needs as long as it creeps."""
+    progress, gone = Progress(50.0), 0.0
+    for second in range(61):
+        progress.add(100.0 + second, gone)
+        if second == 0:
+            assert progress.seconds_left(1.0) == 50.0
+        if second == 30:  # half as fast, or as slow, as before
+            share_a_second /= 2.0
+        gone += share_a_second
+    left = progress.seconds_left(1.0)
+    reached = gone - share_a_second
+    expected = (1.0 - reached) / share_a_second if share_a_second else np.inf
+    assert left == pytest.approx(expected) and PROGRESS < 30.0
 
 
 def test_an_arm_at_its_start_has_no_way_to_go() -> None:

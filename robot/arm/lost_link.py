@@ -1,0 +1,54 @@
+"""Why a driver no longer hears of its arm: first cause and words, by what the worker measured of itself.
+
+A link that is cut may crash ur_rtde 1.6.5: its threads close the same connection at once, and the worker is gone before
+it can publish what happened. The library always reports the lost connection on standard error first, so that tells a
+lost link from a worker that died of something else.
+"""
+
+from __future__ import annotations
+
+import signal
+
+from robot.arm.channel import WINDOW
+from robot.arm.shared_ring import Record
+from robot.arm.trajectory import PERIOD
+from tacsim.models.hardware import UrArmConfig
+
+OUTLIVED = -signal.SIGALRM  # exit status of a worker whose call into the library outlived its time limit
+LIBRARY_REPORTS = (  # ur_rtde 1.6.5, after each failure of a connection and before it touches that connection again
+    "Lost connection to robot",
+    "Could not receive data from robot",
+    "Robot closed the connection",
+)
+MAX_LATE_SHARE = 0.02  # of the last periods of a punctual worker
+MAX_LATE_PERIOD = 0.5  # of link_timeout: the longest period of a punctual worker
+
+
+def died_of_lost_link(exit_status: int, printed: str) -> bool:
+    """True if a worker that ended without a word lost its link first; `printed` is its standard error."""
+    return exit_status == OUTLIVED or any(report in printed for report in LIBRARY_REPORTS)
+
+
+def explain_lost_link(record: Record, config: UrArmConfig, exit_status: int | None, now: float) -> str:
+    """What was measured when the link was lost, and what to do; exit_status: of the worker, None while it runs."""
+    lost = now if exit_status is None else float(record["written"])
+    age, unheard = lost - float(record["time"]), lost - float(record["written"])
+    text = f"its last package is {1e3 * age:.0f} ms old (link_timeout = {1e3 * config.link_timeout:g} ms)"
+    if exit_status == OUTLIVED:
+        text += ", a command took longer than link_timeout"
+    elif exit_status is not None and age < config.link_timeout:
+        text += ", the connection was closed or reset"
+    late, count = int(record["late"]), max(1, min(int(record["cycles"]), WINDOW))
+    longest = max(float(record["longest"]), unheard)
+    periods = f"{late} of its last {count} periods of {1e3 * PERIOD:g} ms were late, the longest {1e3 * longest:.0f} ms"
+    if late <= MAX_LATE_SHARE * count and longest <= MAX_LATE_PERIOD * config.link_timeout:
+        where = "check the cable" if config.mock is None else "see whether its mock controller still runs"
+        return f"{text}; its worker was punctual ({periods}); {where}"
+    if bool(record["realtime"]):
+        priority, advice = "with real-time priority", "give this machine less to do"
+    elif config.mock is not None:
+        priority, advice = "without real-time priority", "give this machine less to do, or say `mock: {realtime: true}`"
+    else:
+        priority = "real-time priority was not given"
+        advice = "allow it (`tacsim doctor` says how) or give this machine less to do"
+    return f"{text}; its worker was late itself ({periods}; {priority}); {advice}"

@@ -155,7 +155,7 @@ def make_env(
     features: Seen = "default",
     learning: bool = True,
 ) -> TacsimEnv:
-    """The Gymnasium environment of a task on a rig; entry point of "tacsim/Squeeze-v0" and its sisters.
+    """The Gymnasium environment of a task on a rig; entry point of "tacsim.gym:tacsim/Squeeze-v0" and its sisters.
 
     variants: overrides of scene and task, on top of `overrides`; each reset draws one of them from its seed. The state
     of first contact of each is computed once. The world of a simulated rig is made at the first reset.

@@ -19,7 +19,7 @@ def public_names(package: str) -> tuple[Callable[[str], object], Callable[[], li
 
     def public() -> dict[str, str]:
         if not homes:
-            import ast  # here, because each start of Python imports tacsim (tacsim.gym.plugin)
+            import ast  # here, because `import tacsim` is light
 
             for node in ast.walk(ast.parse(Path(module.__file__ or "").read_text(encoding="utf-8"))):
                 if isinstance(node, ast.ImportFrom) and node.module is not None:

@@ -8,6 +8,7 @@ import json
 import re
 import subprocess
 import sys
+import tarfile
 import tomllib
 import zipfile
 from collections.abc import Iterator
@@ -203,12 +204,33 @@ def test_constraints_are_pins_and_nothing_else(version: str) -> None:
     assert wanted <= {line.partition("==")[0] for line in pins}, "pyproject.toml changed: run `make lock`"
 
 
-def test_wheel_carries_packages_and_configs(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "hatchling", "build", "--target", "wheel", "--directory", str(tmp_path)]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=100)
+def build(target: str, root: Path, folder: Path) -> Path:
+    """A distribution of the sources at `root`, built in `folder` without the network."""
+    command = [sys.executable, "-m", "hatchling", "build", "--target", target, "--directory", str(folder)]
+    done = subprocess.run(command, cwd=root, capture_output=True, text=True, timeout=100)
     assert done.returncode == 0, done.stderr
-    (wheel,) = tmp_path.glob("*.whl")
-    carried = set(zipfile.ZipFile(wheel).namelist())
+    (made,) = folder.iterdir()
+    return made
+
+
+def contents(wheel: Path) -> dict[str, bytes]:
+    with zipfile.ZipFile(wheel) as archive:
+        return {name: archive.read(name) for name in archive.namelist()}
+
+
+def test_the_wheel_of_the_sdist_is_that_of_the_checkout(tmp_path: Path) -> None:
+    """As `python -m build` and pip make it: from the sdist, unpacked, and from nothing else."""
+    sdist = build("sdist", ROOT, tmp_path / "sdist")
+    with tarfile.open(sdist) as archive:
+        archive.extractall(tmp_path / "unpacked", filter="data")
+    (unpacked,) = (tmp_path / "unpacked").iterdir()
+    from_sdist = contents(build("wheel", unpacked, tmp_path / "wheel"))
+    assert from_sdist == contents(build("wheel", ROOT, tmp_path / "of_checkout"))
+    assert [name for name in from_sdist if name.endswith(".pth")] == []
+
+
+def test_wheel_carries_packages_and_configs(tmp_path: Path) -> None:
+    carried = set(contents(build("wheel", ROOT, tmp_path / "wheel")))
     configs = {path.relative_to(ROOT / "configs").as_posix() for path in (ROOT / "configs").rglob("*.yaml")}
     assert configs, "configs/ holds no YAML file"
     assert {f"tacsim/_configs/{config}" for config in configs} <= carried
@@ -218,5 +240,4 @@ def test_wheel_carries_packages_and_configs(tmp_path: Path) -> None:
     assert {top(entry.partition("/")[0]) for entry in carried} == {
         *PACKAGES,
         "tacsim-0",  # tacsim-0.1.0.dist-info
-        "tacsim_gymnasium",  # the .pth of tacsim/gym/plugin.py
     }

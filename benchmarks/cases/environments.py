@@ -58,7 +58,7 @@ def _random_actions(
     """Rows of a step and, with `resets`, of a reset."""
     import gymnasium
 
-    import tacsim.gym.env  # noqa: F401  registers
+    import tacsim.gym  # noqa: F401  registers
 
     overrides = [f"scene.preset={preset}", "task.steps=1000", *more]
     options: dict[str, Any] = {"overrides": overrides, "variants": list(BODIES), "features": features}

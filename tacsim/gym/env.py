@@ -1,8 +1,4 @@
-"""Gymnasium environments: Env = Rig + Task.
-
-Where tacsim is installed, ``gymnasium.make("tacsim/Squeeze-v0")`` finds them without an import (see
-tacsim.gym.plugin); from sources, ``gymnasium.make("tacsim.gym.env:tacsim/Squeeze-v0")`` does.
-"""
+"""Gymnasium environments: Env = Rig + Task. See tacsim.gym for how Gymnasium finds them."""
 
 from __future__ import annotations
 
@@ -18,7 +14,6 @@ from numpy.typing import NDArray
 from tacsim.control.approach import NoTouch
 from tacsim.gym import encode
 from tacsim.gym.features import FeatureEncoder
-from tacsim.gym.plugin import register_envs
 from tacsim.interface import Needs, Observation, Policy, Pose, Truth
 from tacsim.limits import LimitExceeded
 from tacsim.models.rig import RigConfig, TaskConfig
@@ -355,6 +350,3 @@ def require_alike(task: TaskConfig, other: TaskConfig) -> None:
         now, new = getattr(task, what, None), getattr(other, what, None)
         if now != new:
             raise ValueError(f"a new task must keep {what} of the environment's: {now}, got {new}")
-
-
-register_envs()

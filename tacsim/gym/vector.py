@@ -57,7 +57,7 @@ class Member:
 
 
 class TacsimVectorEnv(SyncVectorEnv):
-    """Environments that share launches: `gymnasium.make_vec("tacsim/Squeeze-v0", n)`.
+    """Environments that share launches: `gymnasium.make_vec("tacsim.gym:tacsim/Squeeze-v0", n)`.
 
     It is gymnasium's SyncVectorEnv, and each environment gives the results that it would give alone, bit for bit. What
     ends one episode (a limit, a simulation that diverges) leaves the others alone.

@@ -193,10 +193,9 @@ def test_a_number_of_environments_that_is_none_is_refused(number: Any) -> None:
         make_vector_env(number)
 
 
-@pytest.mark.parametrize("first", ["", "import tacsim.gym.plugin as p; p.install()\n"])
-def test_gymnasium_finds_the_environments_without_an_import(first: str) -> None:
-    """In a fresh process, with a small scene: by the module in the id, and by what the installed .pth runs at start."""
-    module = "" if first else "tacsim.gym.env:"
+@pytest.mark.parametrize(("first", "module"), [("", "tacsim.gym:"), ("import tacsim.gym\n", "")])
+def test_gymnasium_finds_the_environments_by_an_import_or_the_id(first: str, module: str) -> None:
+    """In a fresh process, with a small scene."""
     program = (
         f"{first}import gymnasium, sys\n"
         f"env = gymnasium.make('{module}tacsim/Squeeze-v0', overrides={[*SMALL, 'task.goal=3 mm']!r})\n"
@@ -212,8 +211,8 @@ def test_gymnasium_finds_the_environments_without_an_import(first: str) -> None:
 
 @pytest.mark.parametrize("module", ["tacsim.gym.encode", "tacsim.gym.env", "gymnasium"])
 def test_any_of_ours_may_import_gymnasium_first(module: str) -> None:
-    """Registration runs inside `import gymnasium`: it must not need a module of ours that is half imported."""
-    program = f"import tacsim.gym.plugin as p; p.install()\nimport {module}, gymnasium\n"
+    """Registration runs inside `import tacsim.gym`: it must not need a module of ours that is half imported."""
+    program = f"import {module}, tacsim.gym, gymnasium\n"
     program += "assert 'tacsim/Squeeze-v0' in gymnasium.registry\n"
     done = subprocess.run([sys.executable, "-W", "error", "-c", program], capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr

@@ -15,9 +15,8 @@ ROOT = Path(__file__).parents[3]
 HEAD = f"""
 import multiprocessing, sys
 import gymnasium, numpy as np
-import tacsim.gym.env
 OPTIONS = dict(overrides={list(SMALL)!r}, variants={[list(each) for each in VARIANTS]!r}, **{AS_WRITTEN!r})
-NAME = "tacsim/Squeeze-v0"
+NAME = "tacsim.gym:tacsim/Squeeze-v0"  # nothing else imports tacsim in a process that is spawned
 """
 ASYNC = """
 def steps(env):

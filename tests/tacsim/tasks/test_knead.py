@@ -156,7 +156,7 @@ def test_the_teacher_closes_by_what_is_left_of_the_height_and_no_more_than_the_c
 
 def test_its_environment_measures_at_the_end() -> None:
     env = gymnasium.make(
-        "tacsim/Knead-v0", overrides=[*QUICK, "task.steps=2"], features={"grid": {"rows": 8, "columns": 8}}
+        "tacsim.gym:tacsim/Knead-v0", overrides=[*QUICK, "task.steps=2"], features={"grid": {"rows": 8, "columns": 8}}
     )
     observation, info = env.reset(seed=1)
     assert env.action_space.shape == (4,) and observation["goal"].shape == (3,)

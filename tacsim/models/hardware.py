@@ -15,8 +15,9 @@ from tacsim.limits import Region, region
 from tacsim.models.geometry import PictureRegion
 from tacsim.models.quantity import Acceleration, Angle, Config, Force, Length, Speed, Time
 from tacsim.models.sensor import SensorModel
+from tacsim.models.text import MAX_NAME
 
-Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]
+Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=MAX_NAME)]
 Vector = tuple[Length, Length, Length]
 Corner = tuple[float, float]
 

@@ -11,6 +11,18 @@ def escaped(text: str, kept: str = "") -> str:
     return "".join(c if c.isprintable() or c in kept else c.encode("unicode_escape").decode("ascii") for c in text)
 
 
+MAX_NAME = 100  # characters of the name of a sensor or an arm
+
+
+def check_name(name: str, what: str, limit: int = MAX_NAME) -> None:
+    """Raises ValueError for a name of a file or a recording that is too long, or holds control characters."""
+    shown = f"the {what} name '{printable(name, 40)}'"
+    if len(name) > limit:
+        raise ValueError(f"{shown} has {len(name)} characters, at most {limit} are allowed")
+    if not name.isprintable():
+        raise ValueError(f"{shown} holds control characters")
+
+
 def printable(text: str, limit: int = 600) -> str:
     """`text` for any terminal: one line, control characters escaped, the middle of a very long one left out."""
     text = escaped(text)

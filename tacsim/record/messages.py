@@ -20,6 +20,7 @@ from google.protobuf.timestamp_pb2 import Timestamp
 from numpy.typing import NDArray
 
 from tacsim.interface import Action, ArmState, Pose, SurfaceMap, TactileFrame
+from tacsim.models.text import printable
 from tacsim.record import format_1
 from tacsim.record.episode import ArmPackages, EpisodeError, Recorded, Step
 from tacsim.record.images import decode_image, encode_png
@@ -179,7 +180,7 @@ def _step_message(step: Step) -> Any:
 def _last(messages: Messages, topic: str) -> bytes:
     found = messages.get(topic)
     if not found:
-        raise EpisodeError(f"a step names the message '{topic}', which is not there")
+        raise EpisodeError(f"a step names the message '{printable(topic, 200)}', which is not there")
     return found[-1]
 
 

@@ -24,13 +24,15 @@ from datetime import datetime
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from tacsim.interface import RigSpec
-from tacsim.models.text import printable
+from tacsim.models.text import check_name, printable
 from tacsim.record.episode import EpisodeError, EpisodeMeta
 
 FORMAT = "2"  # of the file; raised when an old reader would misread a new file
 READABLE = ("1", FORMAT)
 MAX_ATTACHMENT = 64 << 20  # [bytes]
 MAX_PARTS = 64  # sensors, and arms, of an episode
+MAX_FILES = 1000  # attachments, and versions
+MAX_FILE_NAME = 300  # characters of the name of an attachment
 META, CLOSE = "tacsim.episode", "tacsim.close"  # metadata records at the start and at the end
 STEP_TOPIC, BODY_TOPIC = "/step", "/body"
 
@@ -56,7 +58,9 @@ def unsealed(values: Mapping[str, str], what: str) -> dict[str, str]:
 
 
 def encode_meta(meta: EpisodeMeta) -> dict[str, str]:
-    """The metadata record of an episode, with the names of its attachments, which are records of their own."""
+    """The metadata record of an episode, with the names of its attachments, which are records of their own. Raises
+    ValueError for what `decode_meta` would refuse: too many parts, or a name that is too long."""
+    _check_parts(meta, tuple(meta.attachments))
     values = {
         "format": FORMAT,
         "rig": meta.rig,
@@ -94,14 +98,25 @@ def decode_meta(record: Mapping[str, str], what: str) -> tuple[EpisodeMeta, tupl
             started=datetime.fromisoformat(values["started"]) if "started" in values else None,
             wall_offset=int(values.get("wall_offset", "0")),
         )
-        if max(len(meta.spec.sensors), len(meta.spec.arms)) > MAX_PARTS:
-            raise ValueError(f"more than {MAX_PARTS} sensors or arms")
-        for name in (*meta.spec.sensors, *meta.spec.arms):
-            if not name.isprintable():
-                raise ValueError(f"the name {printable(name)} holds control characters")
-        return meta, _ATTACHMENTS.validate_json(values["attachments"])
+        attachments = _ATTACHMENTS.validate_json(values["attachments"])
+        _check_parts(meta, attachments)
+        return meta, attachments
     except (KeyError, ValueError, ValidationError) as failure:
         raise EpisodeError(f"{what}: its metadata cannot be read: {printable(str(failure))}") from failure
+
+
+def _check_parts(meta: EpisodeMeta, attachments: tuple[str, ...]) -> None:
+    """Raises ValueError for more parts, or longer names, than a report can show."""
+    if max(len(meta.spec.sensors), len(meta.spec.arms)) > MAX_PARTS:
+        raise ValueError(f"more than {MAX_PARTS} sensors or arms")
+    if max(len(attachments), len(meta.versions)) > MAX_FILES:
+        raise ValueError(f"more than {MAX_FILES} attachments or versions")
+    for name in meta.spec.sensors:
+        check_name(name, "sensor")
+    for name in meta.spec.arms:
+        check_name(name, "arm")
+    for name in attachments:
+        check_name(name, "attachment", MAX_FILE_NAME)
 
 
 def _checksum(values: Mapping[str, str]) -> str:

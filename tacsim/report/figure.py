@@ -25,6 +25,7 @@ INK, QUIET, GRID = "#22262b", "#6b737c", "#e3e6e9"
 GOAL = "#1f8a4c"
 COLOURS = ("#2a6db5", "#cf5b17", "#7a4fb0", "#b0891f", "#1b8f8f", "#a8325e")  # told apart by most colour-blind people
 THUMBNAIL = 320  # [px]
+MAX_GOAL = 9  # numbers of a goal that are shown
 TALLEST = 3.0  # height of a row of pictures, over the width of one
 DPI, WIDTH, COLUMNS = 100, 14.0, 6  # dots an inch, page width [inches], images in a row of the overview
 
@@ -107,7 +108,8 @@ def goal_text(goal: float | tuple[float, ...] | None) -> str:
         return "–"
     if isinstance(goal, (int, float)):
         return f"{goal * 1e3:.2f} mm"
-    return f"({', '.join(f'{value * 1e3:.2f}' for value in goal)}) mm"
+    more = ", ..." if len(goal) > MAX_GOAL else ""
+    return f"({', '.join(f'{value * 1e3:.2f}' for value in goal[:MAX_GOAL])}{more}) mm"
 
 
 def signal_against_force(series: Series) -> dict[str, tuple[FloatArray, FloatArray, float | None]]:

@@ -8,10 +8,13 @@ lost link from a worker that died of something else.
 from __future__ import annotations
 
 import signal
+from collections.abc import Callable
 
 from robot.arm.channel import WINDOW
 from robot.arm.shared_ring import Record
+from robot.arm.status import ArmStatus, status_of
 from robot.arm.trajectory import PERIOD
+from robot.common.process import Child
 from tacsim.models.hardware import UrArmConfig
 
 OUTLIVED = -signal.SIGALRM  # exit status of a worker whose call into the library outlived its time limit
@@ -22,6 +25,30 @@ LIBRARY_REPORTS = (  # ur_rtde 1.6.5, after each failure of a connection and bef
 )
 MAX_LATE_SHARE = 0.02  # of the last periods of a punctual worker
 MAX_LATE_PERIOD = 0.5  # of link_timeout: the longest period of a punctual worker
+
+
+class Verdict:
+    """What an arm is doing, by the records and the end of one worker. The first cause of an end is kept. `patience`:
+    a link is lost once its newest package is older [s]."""
+
+    def __init__(self, patience: float) -> None:
+        self._patience = patience
+        self._lost = False  # the link, when it was asked last
+        self._final: ArmStatus | None = None  # once the worker has ended
+
+    def status(self, worker: Child | None, latest: Callable[[], Record | None]) -> ArmStatus:
+        """`latest` gives the newest record; never raises."""
+        if self._final is not None:
+            return self._final
+        ended = 0 if worker is None else worker.exit_status
+        lost = self._lost
+        if worker is not None and ended is not None and not lost:
+            lost = died_of_lost_link(ended, worker.printed)
+        status = status_of(latest(), ended, self._patience, lost=lost)  # read now: nothing is written after the end
+        self._lost = status == ArmStatus.LINK_LOST
+        if worker is not None and ended is not None:
+            self._final = status
+        return status
 
 
 def died_of_lost_link(exit_status: int, printed: str) -> bool:

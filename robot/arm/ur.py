@@ -25,10 +25,10 @@ from robot.arm.channel import (
     tactile_record,
 )
 from robot.arm.dashboard import Dashboard
-from robot.arm.lost_link import died_of_lost_link, explain_lost_link
+from robot.arm.lost_link import Verdict, explain_lost_link
 from robot.arm.package_log import PackageLog
 from robot.arm.shared_ring import Record
-from robot.arm.status import AT_CONNECTING, ArmStatus, status_of
+from robot.arm.status import AT_CONNECTING, ArmStatus
 from robot.arm.trajectory import PERIOD
 from robot.arm.worker_config import check_host, worker_config
 from robot.common import Closing
@@ -103,8 +103,7 @@ class URArm(Closing):
         self._closed = False
         self._stop_told = False  # recover() found a protective stop: the next one unlocks it
         self._worker: Child | None = None
-        self._lost = False  # what status() found last
-        self._verdict: ArmStatus | None = None  # on a worker that has ended: the first cause, until there is another
+        self._verdict = Verdict(config.link_timeout + 5 * POLL)  # on the present worker
         # Those of the other arms are held, too: they may be opened, closed and opened again meanwhile.
         self._partner_names = tuple(keep_out or {})
         self._segments = [segment_of(arm) for arm in (name, *self._partner_names)]
@@ -129,18 +128,7 @@ class URArm(Closing):
         """What the arm is doing now; never raises."""
         if self._closed:
             return ArmStatus.CLOSED
-        if self._verdict is not None:
-            return self._verdict
-        worker, lost = self._worker, self._lost  # another thread may close it meanwhile
-        ended = 0 if worker is None else worker.exit_status
-        if worker is not None and ended is not None and not lost:
-            lost = died_of_lost_link(ended, worker.printed)
-        record, patience = self._channel.states.latest(), self.config.link_timeout + 5 * POLL
-        status = status_of(record, ended, patience, lost=lost)
-        self._lost = status == ArmStatus.LINK_LOST
-        if worker is not None and ended is not None and worker is self._worker:
-            self._verdict = status
-        return status
+        return self._verdict.status(self._worker, self._channel.states.latest)
 
     def explain(self) -> str:
         """The status in words, with its numbers."""
@@ -282,7 +270,7 @@ class URArm(Closing):
 
     def _start(self) -> None:
         """Starts a worker and waits until it is connected. Raises the error of a fault that it begins with."""
-        self._lost, self._verdict = False, None
+        self._verdict = Verdict(self.config.link_timeout + 5 * POLL)
         self._worker = Child(
             "robot.arm.worker",
             name=f"the worker of arm '{self.name}'",

@@ -132,10 +132,10 @@ class Child(Closing):
     @property
     def printed(self) -> str:
         """Its standard error until now; nothing of one that is closed."""
-        if self._closed:
-            return ""
-        self._errors.seek(0)
-        return self._errors.read().decode(errors="replace")
+        with contextlib.suppress(ValueError):  # it is closed
+            self._errors.seek(0)
+            return self._errors.read().decode(errors="replace")
+        return ""
 
     def check(self) -> None:
         """Raises `error` if the process has ended."""

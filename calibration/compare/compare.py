@@ -25,6 +25,7 @@ from calibration.drift import without_drift
 from calibration.errors import BadFrames
 from calibration.frame_set import Frame, FrameSet
 from tacsim.control.contact_signal import CONTACT_HEIGHT
+from tacsim.record.numbering import picture_numbers
 
 Image = NDArray[np.uint8]
 Float64 = NDArray[np.float64]
@@ -206,7 +207,30 @@ def paired(a: FrameSet, b: FrameSet, pairing: Pairing) -> tuple[list[tuple[Frame
             f"{a.name} has {len(a.frames)} frames, {b.name} {len(b.frames)}: which belong together? {len(common)} "
             "names are in both; pair these alone with --pair name, or give both the same number of frames"
         )
+    if pairing is Pairing.auto and (odd := _other_numbers(a, b)):
+        raise BadFrames(
+            f"{odd}: a picture may be missing, and which belong together? Pair those with a name in common by --pair "
+            "name, or, if the first belongs to the first and so on, say --pair order"
+        )
     return list(zip(a.frames, b.frames, strict=True)), ["paired in order: the names differ"] if not same else []
+
+
+def _other_numbers(a: FrameSet, b: FrameSet) -> str:
+    """Which numbers only one of two folders has in the names of its pictures, in words; empty where both have the same,
+    none in common, or where names are not those of pictures."""
+    names = [[Path(frame.name) for frame in each.frames] for each in (a, b)]
+    if not all(name.suffix for each in names for name in each):
+        return ""
+    found = [picture_numbers([name.stem for name in each]) for each in names]
+    first, second = (set(each or ()) for each in found)
+    if None in first | second or first == second or not first & second:
+        return ""
+    parts = [
+        f"{side.name} alone has number {', '.join(map(str, sorted(rest)[:8]))}{', ...' * (len(rest) > 8)}"
+        for side, rest in ((a, first - second), (b, second - first))
+        if rest
+    ]
+    return "; ".join(parts)
 
 
 def bootstrap(values: Float64, seed: int = 0) -> tuple[float, float]:

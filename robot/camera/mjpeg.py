@@ -41,6 +41,7 @@ class MjpegCapture:
         # An uncompressed picture is smaller; a longer part is not a picture of this size.
         self._limit = 3 * self._size[0] * self._size[1] + _CHUNK
         self._buffer = bytearray()
+        self._delimiter = b""  # the boundary as the camera sends it
         self._socket = _connect(config.source, self._what)
         try:
             self._answer, self._boundary = self._ask(config.source)
@@ -60,7 +61,7 @@ class MjpegCapture:
             answer.close()
             raise WrongSource(f"{self._what}: no HTTP answer ({type(error).__name__}: {error})") from error
         kind = answer.headers.get_content_type()
-        boundary = answer.headers.get_boundary()
+        boundary = _boundary(answer.headers.get("Content-Type", ""))
         if answer.status != 200:
             reason = f"HTTP status {answer.status} {answer.reason}; check the path (mjpg-streamer: /?action=stream)"
         elif kind != "multipart/x-mixed-replace":
@@ -68,7 +69,7 @@ class MjpegCapture:
         elif not boundary:
             reason = "a stream without boundary; is that an MJPEG camera?"
         else:
-            return answer, b"--" + boundary.strip('"').removeprefix("--").encode("latin-1")
+            return answer, boundary.encode("latin-1", "replace")
         answer.close()
         raise WrongSource(f"{self._what}: {reason}")
 
@@ -84,7 +85,7 @@ class MjpegCapture:
         """The bytes of the next picture."""
         line = self._line()
         skipped = 0
-        while not line.startswith(self._boundary):  # the end of the line after a picture; junk before the first
+        while not self._ends_part(line):  # the end of the line after a picture; junk before the first
             skipped += len(line) + 2
             if skipped > self._limit:
                 raise WrongSource(f"{self._what}: no boundary within {skipped} bytes; is that an MJPEG camera?")
@@ -113,13 +114,22 @@ class MjpegCapture:
         return self._take(length)
 
     def _until_boundary(self) -> bytes:
-        mark, start = b"\r\n" + self._boundary, 0
+        mark, start = b"\n" + self._delimiter, 0
         while (end := self._buffer.find(mark, start)) < 0:
             if len(self._buffer) > self._limit:
                 raise WrongSource(f"{self._what}: no end of the picture within {self._limit} bytes")
             start = max(0, len(self._buffer) - len(mark))
             self._receive()
-        return self._take(end)
+        return self._take(end).removesuffix(b"\r")
+
+    def _ends_part(self, line: bytes) -> bool:
+        """Whether a line is the boundary. The first one shows how many dashes this camera puts before it."""
+        if self._delimiter:
+            return line.startswith(self._delimiter)
+        found = line.lstrip(b"-").startswith(self._boundary)
+        if found:
+            self._delimiter = line[: line.index(self._boundary) + len(self._boundary)]
+        return found
 
     def _line(self) -> bytes:
         start = 0
@@ -148,6 +158,16 @@ class MjpegCapture:
     def close(self) -> None:
         self._answer.close()
         self._socket.close()
+
+
+def _boundary(content_type: str) -> str:
+    """The boundary in a stream's header without the dashes before it: servers state it with or without those, quoted
+    or not, and with characters that should be quoted."""
+    for part in content_type.split(";")[1:]:
+        key, _, value = part.partition("=")
+        if key.strip().lower() == "boundary":
+            return value.strip().strip('"').strip().lstrip("-")
+    return ""
 
 
 class DeadlineSocket(socket.socket):

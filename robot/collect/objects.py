@@ -9,6 +9,7 @@ from robot.collect.shapes import CLOSED_FORMS, meshes
 from tacsim.geometry.mesh import load_mesh
 from tacsim.models.scene import Mesh, Shape
 from tacsim.models.text import printable
+from tacsim.record.sources import visible_files
 
 SHAPES = "shapes"  # the word for those that come with tacsim
 FOLDER = "objects"  # of a set: its STL files
@@ -27,7 +28,7 @@ def find_objects(source: str, scale: float) -> tuple[dict[str, Shape], dict[str,
     folder = Path(source)
     if not folder.is_dir():
         raise ValueError(f"--objects {source}: is no folder; give a folder of STL files, or 'shapes'")
-    paths = sorted(path for path in folder.iterdir() if path.suffix.lower() == ".stl" and path.is_file())
+    paths = sorted(path for path in visible_files(folder, (".stl",)) if path.is_file())
     if not paths:
         raise ValueError(f"{folder} holds no STL file (folders in it are not searched); give another, or 'shapes'")
     problems = []

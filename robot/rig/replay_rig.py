@@ -20,12 +20,12 @@ from calibration.normaliser import (
 )
 from robot.rig import RIG_ATTACHMENT, CannotOpen
 from tacsim.config import load_rig
-from tacsim.interface import Arm, Normaliser, TactileFrame
+from tacsim.interface import Normaliser, TactileFrame
 from tacsim.models.hardware import CameraSensorConfig
 from tacsim.models.rig import ReplayArmConfig, ReplaySensorConfig, RigConfig, SimSensorConfig
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.record.episode import EpisodeMeta
-from tacsim.record.replay import ReplayArm, ReplayClock, ReplaySensor, recorded_period
+from tacsim.record.replay import ReplayArm, ReplayClock, ReplaySensor, match_sources, recorded_period
 from tacsim.record.sources import EPISODES, episode_meta
 from tacsim.rig import Rig
 
@@ -66,14 +66,15 @@ def open_replay(config: RigConfig) -> Rig:
             if not source.spec.height:  # what the frames don't carry, and the normaliser finds in them
                 source.spec = replace(source.spec, height=normaliser.finds_height, flow=normaliser.finds_flow)
             normalisers[name] = normaliser
-        arms: dict[str, Arm] = {}
+        arms: dict[str, ReplayArm] = {}
         for name, arm in there.items():
             arms[name] = ReplayArm(arm, name, clock)
             stack.callback(arms[name].close)
+        match_sources(sensors, arms)
         rig = Rig(
             name=config.name,
             sensors=sensors,
-            arms=arms,
+            arms=dict(arms),
             clock=clock,
             normalisers=normalisers,
             reset=ReplayReset(clock, sensors),

@@ -30,6 +30,7 @@ from tacsim.optics.darkness import darkened
 from tacsim.optics.grid import PixelGrid, image_grid, strips
 from tacsim.optics.ink import lifted_ink
 from tacsim.optics.markers import check_fits, marker_transmission
+from tacsim.optics.picture_file import BadPicture, opened_picture, upright_rgb, upright_size
 from tacsim.optics.shadows import shadow_colours
 from tacsim.optics.skin import lifted_skin
 from tacsim.optics.spline import line_matrices
@@ -294,18 +295,14 @@ def untouched_image(lighting: Lighting, shape: tuple[int, int]) -> Float32:
 
 def read_background(path: str, shape: tuple[int, int]) -> Float32:
     """(H, W, 3) RGB picture in 0..1. Raises ValueError when it cannot be read or is not H x W (before decoding it)."""
-    from PIL import Image
-
-    try:
-        with Image.open(Path(path), formats=("PNG", "JPEG", "BMP")) as picture:
-            if picture.size != (shape[1], shape[0]):
-                raise ValueError(
-                    f"lighting.background: '{path}' is {picture.width} x {picture.height} px, the sensor's image is "
-                    f"{shape[1]} x {shape[0]}; resize it"
-                )
-            return np.asarray(picture.convert("RGB"), dtype=np.float32) / np.float32(255.0)
-    except OSError as failure:
-        raise ValueError(f"lighting.background: '{path}' is no readable PNG, JPEG or BMP: {failure}") from failure
+    with opened_picture(Path(path), f"lighting.background: '{path}'") as picture:
+        rows, columns = upright_size(picture)
+        if (rows, columns) != shape:
+            raise BadPicture(
+                f"lighting.background: '{path}' is {columns} x {rows} px, the sensor's image is "
+                f"{shape[1]} x {shape[0]}; resize it"
+            )
+        return upright_rgb(picture, f"lighting.background: '{path}'").astype(np.float32) / np.float32(255.0)
 
 
 def texture_gradient(grid: PixelGrid, gel_size: tuple[float, float], deviation: float, seed: int) -> Float32:

@@ -12,13 +12,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tacsim.interface import TactileFrame
+from tacsim.optics.picture_file import (
+    FORMATS,
+    MAX_SIDE,
+    BadPicture,
+    check_size,
+    opened_picture,
+    upright_rgb,
+    upright_size,
+)
 from tacsim.record.episode import EpisodeError
 
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-MAX_SIDE = 4096  # [px] of a picture, each way
-FORMATS = ("PNG", "JPEG", "BMP")
 _REFERENCE = "reference/{}.png"  # attachment with the contact-free picture of a sensor
 
 
@@ -28,7 +35,7 @@ def encode_png(image: NDArray[np.uint8]) -> bytes:
 
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
         raise ValueError(f"image must be (H, W, 3) uint8 RGB, got {image.shape} {image.dtype}")
-    _check_size(image.shape[1], image.shape[0], "image")
+    check_size(image.shape[1], image.shape[0], "image")
     # OpenCV's default (level 1, run lengths) is twice as fast as asking for level 1, which also resets the strategy.
     written, data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
     if not written:
@@ -39,37 +46,31 @@ def encode_png(image: NDArray[np.uint8]) -> bytes:
 def decode_image(
     data: bytes, what: str, formats: tuple[str, ...] = FORMATS, size: tuple[int, int] | None = None
 ) -> NDArray[np.uint8]:
-    """(H, W, 3) uint8 RGB picture of an encoded one with 8 bits a channel.
+    """(H, W, 3) uint8 RGB picture of an encoded one with 8 bits a channel, turned as its EXIF orientation says.
 
-    Raises EpisodeError that names `what`, for unreadable data, and, before decoding them, for pictures beyond MAX_SIDE
-    and for those that have not the rows and columns of `size`.
+    Raises EpisodeError that names `what`, for unreadable data, and, before decoding them, for pictures beyond MAX_SIDE,
+    for those with more than 8 bits a channel, and for those that have not the rows and columns of `size`.
     """
     with _opened(io.BytesIO(data), what, formats) as picture:
-        if size is not None and (picture.height, picture.width) != size:
-            found = f"{picture.width} x {picture.height} pixels"
-            raise EpisodeError(f"{what}: {found}, but others of this sensor have {size[1]} x {size[0]}")
-        if picture.mode not in ("RGB", "RGBA", "L", "P"):
-            raise EpisodeError(f"{what}: pixel type '{picture.mode}'; 8 bits a channel are read, grey or colour")
-        return np.array(picture.convert("RGB"))
+        rows, columns = upright_size(picture)
+        if size is not None and (rows, columns) != size:
+            found = f"{columns} x {rows} pixels"
+            raise BadPicture(f"{what}: {found}, but others of this sensor have {size[1]} x {size[0]}")
+        return upright_rgb(picture, what)
 
 
 @contextmanager
 def _opened(source: Path | io.BytesIO, what: str, formats: tuple[str, ...]) -> Iterator[Image]:
-    """A picture of a size that is allowed, not yet decoded."""
-    from PIL import Image
-
+    """See `opened_picture`. Raises EpisodeError."""
     try:
-        with Image.open(source, formats=formats) as picture:
-            _check_size(*picture.size, what)
+        with opened_picture(source, what, formats) as picture:
             yield picture
-    except EpisodeError:
-        raise
-    except Exception as failure:  # a decoder that is fed damaged bytes may raise anything
-        raise EpisodeError(f"{what}: no readable picture ({', '.join(formats)}): {failure}") from failure
+    except BadPicture as failure:
+        raise EpisodeError(str(failure)) from failure.__cause__
 
 
 def read_image(path: Path) -> NDArray[np.uint8]:
-    """(H, W, 3) uint8 RGB picture of a file. Raises EpisodeError that names the file."""
+    """(H, W, 3) uint8 RGB picture of a file, see `decode_image`. Raises EpisodeError that names the file."""
     try:
         size = path.stat().st_size
         if size > 4 * MAX_SIDE * MAX_SIDE:  # more than any uncompressed picture within the limit needs
@@ -81,9 +82,10 @@ def read_image(path: Path) -> NDArray[np.uint8]:
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """(rows, columns) of a picture file, from its header alone. Raises EpisodeError that names the file."""
+    """(rows, columns) of a picture file as `read_image` gives it, from its header alone. Raises EpisodeError that names
+    the file."""
     with _opened(path, str(path), FORMATS) as picture:
-        return picture.height, picture.width
+        return upright_size(picture)
 
 
 def reference_attachments(references: Mapping[str, TactileFrame]) -> dict[str, bytes]:
@@ -95,8 +97,3 @@ def reference_image(attachments: Mapping[str, bytes], sensor: str) -> NDArray[np
     """The (H, W, 3) contact-free picture of a sensor among an episode's attachments; None when there is none."""
     name = _REFERENCE.format(sensor)
     return decode_image(attachments[name], f"attachment '{name}'") if name in attachments else None
-
-
-def _check_size(columns: int, rows: int, what: str) -> None:
-    if not (0 < columns <= MAX_SIDE and 0 < rows <= MAX_SIDE):
-        raise EpisodeError(f"{what}: {columns} x {rows} pixels; at least 1 and at most {MAX_SIDE} are allowed each way")

@@ -13,7 +13,7 @@ from mcap.records import Attachment, Channel, Footer, Header, Message, Metadata
 
 from tacsim.record.episode import Episode, EpisodeError, EpisodeMeta, Step
 from tacsim.record.messages import Messages, decode_step
-from tacsim.record.records import check_magic, read_records
+from tacsim.record.records import check_magic, foreign_file, listed_topics, read_records
 from tacsim.record.schemas import CLOSE, META, STEP_TOPIC, decode_meta, unsealed
 
 
@@ -93,6 +93,11 @@ class EpisodeFile:
             check_magic(self._file, str(self.path))
             self._records = read_records(self._file, self.path.stat().st_size, str(self.path))
             self.meta = self._read_meta()
+        except EpisodeError:
+            with self._file:
+                if (topics := listed_topics(self._file)) and STEP_TOPIC not in topics:
+                    raise foreign_file(self._file, str(self.path)) from None
+            raise
         except BaseException:
             self._file.close()
             raise

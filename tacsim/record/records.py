@@ -25,7 +25,9 @@ from mcap.writer import MCAP0_MAGIC
 from tacsim.record.episode import EpisodeError
 
 MAX_RECORD = 256 << 20  # [bytes]
+MAX_TOPICS = 20  # named in an error
 _HEAD = struct.Struct("<BQ")  # opcode, length
+_FOOTER = _HEAD.size + 20  # bytes of the last record
 _PARSERS: dict[int, Callable[[ReadDataStream], McapRecord]] = {
     Opcode.HEADER: Header.read,
     Opcode.FOOTER: Footer.read,
@@ -42,9 +44,60 @@ class _BadRecord(Exception):
 
 
 def check_magic(file: BinaryIO, what: str) -> None:
-    """Raises EpisodeError for a file that does not begin as MCAP files do."""
+    """Raises EpisodeError for a file that does not begin as MCAP files do, and for one with the profile of another
+    program, such as a ROS 2 bag: tacsim's own have none."""
     if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
         raise EpisodeError(f"{what}: not an MCAP file (it does not begin with the MCAP magic bytes)")
+    size = file.seek(0, io.SEEK_END)
+    file.seek(len(MCAP0_MAGIC))
+    with contextlib.suppress(_BadRecord):
+        _, first = next(_records(file, size - file.tell()), (0, None))
+        if isinstance(first, Header) and first.profile:
+            raise foreign_file(file, what)
+    file.seek(len(MCAP0_MAGIC))
+
+
+def foreign_file(file: BinaryIO, what: str) -> EpisodeError:
+    """The error for an MCAP file of another program: what it is, which topics it has, and what to do."""
+    size = file.seek(0, io.SEEK_END)
+    file.seek(len(MCAP0_MAGIC))
+    profile = ""
+    with contextlib.suppress(_BadRecord):
+        _, first = next(_records(file, size - file.tell()), (0, None))
+        profile = first.profile if isinstance(first, Header) else ""
+    kind = {"ros1": "a ROS 1 bag", "ros2": "a ROS 2 bag"}.get(profile, "a recording of another program")
+    topics = listed_topics(file)
+    there = sorted(f"{topic} ({schema})" if schema else topic for topic, schema in topics.items())
+    more = f" and {len(there) - MAX_TOPICS} more" if len(there) > MAX_TOPICS else ""
+    has = ", ".join(there[:MAX_TOPICS]) + more if there else "not listed (the file was cut off before its index)"
+    return EpisodeError(
+        f"{what}: {kind} in MCAP, no episode of tacsim, whose topics are not read. Its topics: {has}. Export the "
+        "camera's pictures to a folder of 8-bit PNG files, or to a video, and forces to a CSV file with a row a "
+        "picture; then replay those (docs/recording.md)"
+    )
+
+
+def listed_topics(file: BinaryIO) -> dict[str, str]:
+    """Topics of a finished file and the names of their schemas, from its index, which is never compressed; empty where
+    there is none."""
+    size = file.seek(0, io.SEEK_END)
+    end = size - len(MCAP0_MAGIC) - _FOOTER
+    if end < len(MCAP0_MAGIC):
+        return {}
+    file.seek(end)
+    schemas: dict[int, str] = {}
+    channels: list[Channel] = []
+    with contextlib.suppress(_BadRecord):
+        _, footer = next(_records(file, _FOOTER), (0, None))
+        if not isinstance(footer, Footer) or not len(MCAP0_MAGIC) <= footer.summary_start < end:
+            return {}
+        file.seek(footer.summary_start)
+        for _, record in _records(file, end - footer.summary_start):
+            if isinstance(record, Schema):
+                schemas[record.id] = record.name
+            elif isinstance(record, Channel):
+                channels.append(record)
+    return {each.topic: schemas.get(each.schema_id, "") for each in channels}
 
 
 def read_records(file: BinaryIO, size: int, what: str) -> Iterator[tuple[int, McapRecord]]:

@@ -5,7 +5,7 @@ Times are those of the replay's clock: a picture that was exposed 20 ms before i
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +16,7 @@ from tacsim.interface import ArmState, EndOfEpisode, Pose, SensorSpec, TactileFr
 from tacsim.models.rig import ReplayArmConfig, ReplaySensorConfig
 from tacsim.record.episode import EpisodeError
 from tacsim.record.images import read_image, reference_image
+from tacsim.record.numbering import Numbering, match_numbers, picture_numbers
 from tacsim.record.sources import (
     EPISODES,
     VIDEOS,
@@ -28,9 +29,10 @@ from tacsim.record.sources import (
     folder_images,
     list_pictures,
     only_or_named,
-    read_columns,
+    read_table,
     unknown_source,
     video_images,
+    video_length,
     video_rate,
 )
 
@@ -68,6 +70,7 @@ class ReplaySensor:
         self._config, self._name, self._clock = config, name, clock
         self._path = _source(config.source, f"sensors.{name}")
         self._reference = None if config.reference is None else read_image(Path(config.reference))
+        self._pictures: list[Path] | None = None  # of a folder
         self._frames = Cursor(self._open(), str(self._path))
         self._first, _ = _first(self._frames, self._path)
         rows, columns, _ = self._first.image.shape
@@ -97,6 +100,27 @@ class ReplaySensor:
             return replace(self._first, time=self._clock.now())
         return TactileFrame(image=self._reference, time=self._clock.now(), index=self._first.index)
 
+    def numbering(self, expected: int | None) -> Numbering | None:
+        """Of its frames; None of an episode, whose steps are complete and numbered from 0. expected: how many other
+        sources have, None if no source beside this has a count. Raises EpisodeError."""
+        if self._pictures is not None:
+            given = None if self._config.reference is None else Path(self._config.reference).resolve()
+            places = [k for k, path in enumerate(self._pictures) if path.resolve() == given]
+            numbers = picture_numbers([path.stem for path in self._pictures])
+            return Numbering(str(self._path), len(self._pictures), numbers, places[0] if places else None)
+        if self._path.suffix.lower() in EPISODES:
+            return None
+        count = video_length(self._path, -1 if expected is None else expected)
+        return Numbering(str(self._path), count, tuple(range(count)))
+
+    def keep(self, places: Sequence[int]) -> None:
+        """From now on only the pictures at these places of the folder are its frames."""
+        if self._pictures is None or list(places) == list(range(len(self._pictures))):
+            return
+        self._frames.close()
+        self._pictures = [self._pictures[place] for place in places]
+        self._first, _ = _first(self._frames, self._path)
+
     def close(self) -> None:
         self._frames.close()
 
@@ -104,8 +128,8 @@ class ReplaySensor:
         """A function that starts the frames, each with its age at its step [s]; 0 for pictures and videos."""
         path = self._path
         if path.is_dir():
-            pictures = list_pictures(path)
-            return lambda: _number(folder_images(pictures))
+            self._pictures = list_pictures(path)
+            return lambda: _number(folder_images(self._pictures or []))
         if path.suffix.lower() in VIDEOS and path.is_file():
             return lambda: _number(video_images(path))
         if path.suffix.lower() not in EPISODES or not path.is_file():
@@ -130,6 +154,8 @@ class ReplayArm:
     def __init__(self, config: ReplayArmConfig, name: str, clock: ReplayClock) -> None:
         self._config, self._name, self._clock = config, name, clock
         self._path = _source(config.source, f"arms.{name}")
+        self._rows: list[ArmState] | None = None  # of a table
+        self._numbers: tuple[int, ...] | None = None  # of those
         self._states = Cursor(self._open(), str(self._path))
         _first(self._states, self._path)
 
@@ -148,6 +174,16 @@ class ReplayArm:
     def recover(self) -> None:
         """Nothing to recover from."""
 
+    def numbering(self) -> Numbering | None:
+        """Of a table's rows; None of an episode, whose steps are complete and numbered from 0."""
+        return None if self._rows is None else Numbering(str(self._path), len(self._rows), self._numbers)
+
+    def keep(self, places: Sequence[int]) -> None:
+        """From now on only the table's rows at these places are its states."""
+        if self._rows is not None:
+            self._states.close()
+            self._rows = [replace(self._rows[place], time=k * self._clock.period) for k, place in enumerate(places)]
+
     def close(self) -> None:
         self._states.close()
 
@@ -163,8 +199,23 @@ class ReplayArm:
             raise EpisodeError(f"{path}: no record of an arm; give an episode ({', '.join(EPISODES)}) or a .csv file")
         columns = [self._config.force_column]
         columns += [] if self._config.width_column is None else [self._config.width_column]
-        states = finger_states(read_columns(path, columns), self._clock.period, lower=self._name == "lower")
-        return lambda: ((state, 0.0) for state in states)
+        rows, self._numbers = read_table(path, columns)
+        self._rows = finger_states(rows, self._clock.period, self._name == "lower", self._numbers)
+        return lambda: ((state, 0.0) for state in self._rows or [])
+
+
+def match_sources(sensors: Mapping[str, ReplaySensor], arms: Mapping[str, ReplayArm]) -> None:
+    """Frames and rows that belong together are those of one tick from now on. Pictures and rows go by their numbers
+    where all have some. Raises EpisodeError where it is not known which belong together."""
+    of_arms = {name: found for name, arm in arms.items() if (found := arm.numbering()) is not None}
+    if len(sensors) + len(of_arms) < 2:
+        return
+    expected = next((each.count for each in of_arms.values()), None)
+    of_sensors = {name: found for name, each in sensors.items() if (found := each.numbering(expected)) is not None}
+    if not of_sensors:
+        return
+    for name, places in match_numbers(of_sensors, of_arms).items():
+        (sensors[name] if name in of_sensors else arms[name]).keep(places)
 
 
 def recorded_period(config: ReplaySensorConfig, name: str) -> float:

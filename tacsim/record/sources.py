@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import math
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Generic, TypeVar
@@ -14,13 +14,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tacsim.interface import ArmState, EndOfEpisode, Pose, TactileFrame
+from tacsim.optics.picture_file import FORMATS, MAX_SIDE
 from tacsim.record.episode import EpisodeError, EpisodeMeta
-from tacsim.record.images import FORMATS, MAX_SIDE, image_size, read_image
+from tacsim.record.images import image_size, read_image
 from tacsim.record.reader import EpisodeFile
 
 EPISODES = (".mcap",)
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp")
+OTHER_PICTURES = (".tif", ".tiff", ".webp", ".gif", ".exr", ".hdr", ".pgm", ".ppm", ".pnm", ".npy", ".raw", ".jp2")
 MAX_CSV = 64 << 20  # [bytes]
+MAX_HEADER = 1 << 16  # [characters]
+NUMBER_COLUMNS = ("frame", "index")  # of a table: the numbers of its rows
+SEPARATORS = ",;\t"
 VIDEOS = (".avi", ".mp4", ".mkv", ".mov", ".m4v", ".webm", ".mpg", ".mpeg")
 
 if TYPE_CHECKING:
@@ -97,11 +102,19 @@ def only_or_named(names: list[str], name: str, path: Path, kind: str) -> str:
     raise EpisodeError(f"{path}: {wrong}; the recording has: {', '.join(names) or '(none)'}")
 
 
+def visible_files(folder: Path, endings: Collection[str]) -> list[Path]:
+    """Files of a folder with one of these endings, "2.png" before "10.png". Hidden files are left out: a Mac leaves
+    "._2.png" beside "2.png" where a disk is not its own."""
+    found = (path for path in folder.iterdir() if path.suffix.lower() in endings and not path.name.startswith("."))
+    return sorted(found, key=_natural)
+
+
 def list_pictures(folder: Path) -> list[Path]:
-    """Pictures of a folder, "2.png" before "10.png". Raises EpisodeError for none, unreadable ones or several sizes."""
-    paths = sorted((p for p in folder.iterdir() if p.suffix.lower() in PICTURES), key=_natural)
+    """Pictures of a folder, "2.png" before "10.png". Raises EpisodeError for none, unreadable ones, more than 8 bits a
+    channel, or several sizes."""
+    paths = visible_files(folder, PICTURES)
     if not paths:
-        raise EpisodeError(f"{folder}: no pictures in this folder ({', '.join(PICTURES)})")
+        raise EpisodeError(f"{folder}: no pictures in this folder ({', '.join(PICTURES)}){_instead(folder)}")
     rows, columns = image_size(paths[0])
     for path in paths[1:]:
         if (other := image_size(path)) != (rows, columns):
@@ -110,6 +123,15 @@ def list_pictures(folder: Path) -> list[Path]:
                 "all pictures of a folder must have one size"
             )
     return paths
+
+
+def _instead(folder: Path) -> str:
+    """What a folder without pictures holds that could be meant, in words."""
+    if (bags := visible_files(folder, EPISODES)) and (folder / "metadata.yaml").is_file():
+        return f"; it is the folder of a ROS 2 bag ({bags[0].name}), whose topics are not read: export its pictures"
+    if other := visible_files(folder, OTHER_PICTURES):
+        return f", but {len(other)} like {other[0].name}; save them as PNG with 8 bits a channel"
+    return ""
 
 
 def folder_images(paths: list[Path]) -> Iterator[NDArray[np.uint8]]:
@@ -124,6 +146,20 @@ def video_rate(path: Path) -> float | None:
     with _opened_video(path) as capture:
         rate = capture.get(cv2.CAP_PROP_FPS)
     return rate if math.isfinite(rate) and 0 < rate <= 1000 else None
+
+
+def video_length(path: Path, expected: int) -> int:
+    """Frames of a video: as its file states, or counted one by one where that is not the number `expected`, for some
+    files state it wrongly. Raises EpisodeError."""
+    import cv2
+
+    with _opened_video(path) as capture:
+        if capture.get(cv2.CAP_PROP_FRAME_COUNT) == expected:
+            return expected
+        count = 0
+        while capture.grab():
+            count += 1
+        return count
 
 
 def video_images(path: Path) -> Iterator[NDArray[np.uint8]]:
@@ -171,36 +207,53 @@ def unknown_source(path: Path) -> EpisodeError:
 
 
 def read_columns(path: Path, names: list[str]) -> list[tuple[float, ...]]:
-    """The named columns of a CSV file with a header, one tuple for each row.
+    """The named columns of a CSV file, see `read_table`."""
+    return read_table(path, names)[0]
+
+
+def read_table(path: Path, names: list[str]) -> tuple[list[tuple[float, ...]], tuple[int, ...] | None]:
+    """The named columns of a CSV file with a header, one tuple for each row, and the rows' numbers: those in a column
+    called one of NUMBER_COLUMNS; None without one. Columns are separated by comma, semicolon or tab.
 
     Raises EpisodeError for a file that is missing or too large, a missing column, a value that is not a finite number,
-    and a column `frame` that does not count the rows from 0.
+    and numbers of rows that are not whole and rising.
     """
     try:
         if path.stat().st_size > MAX_CSV:
             raise EpisodeError(f"{path}: {path.stat().st_size} bytes; at most {MAX_CSV} are read")
         with path.open(newline="", encoding="utf-8-sig") as file:
-            return _rows(csv.DictReader(file, skipinitialspace=True), path, names)
+            head = file.readline(MAX_HEADER)
+            file.seek(0)
+            separator = max(SEPARATORS, key=head.count)
+            return _rows(csv.DictReader(file, delimiter=separator, skipinitialspace=True), path, names)
     except (OSError, UnicodeDecodeError, csv.Error) as failure:
         raise EpisodeError(f"{path}: no readable CSV file: {failure}") from failure
 
 
-def _rows(reader: csv.DictReader[str], path: Path, names: list[str]) -> list[tuple[float, ...]]:
+def _rows(
+    reader: csv.DictReader[str], path: Path, names: list[str]
+) -> tuple[list[tuple[float, ...]], tuple[int, ...] | None]:
     header = [column.strip() for column in reader.fieldnames or []]
     reader.fieldnames = header
     for name in names:
         if name not in header:
             raise EpisodeError(f"{path}: no column '{name}'; it has: {', '.join(header) or '(nothing)'}")
-    rows = []
-    for number, row in enumerate(reader):
+    rows: list[tuple[float, ...]] = []
+    numbers: list[int] = []
+    counter = next((column for column in header if column.lower() in NUMBER_COLUMNS), None)
+    for row in reader:
         rows.append(tuple(_number(row[name], path, reader.line_num, name) for name in names))
-        if "frame" in header and _number(row["frame"], path, reader.line_num, "frame") != number:
-            raise EpisodeError(
-                f"{path}:{reader.line_num}: frame {row['frame']} in row {number}; give each frame a row, from 0"
-            )
+        if counter is not None:
+            value = _number(row[counter], path, reader.line_num, counter)
+            if value != int(value) or value <= (numbers[-1] if numbers else -1):
+                raise EpisodeError(
+                    f"{path}:{reader.line_num}: {counter} {row[counter]} in row {len(rows) - 1}; each row needs a "
+                    "whole number that is larger than the one before"
+                )
+            numbers.append(int(value))
     if not rows:
         raise EpisodeError(f"{path}: a header without rows")
-    return rows
+    return rows, None if counter is None else tuple(numbers)
 
 
 def _number(text: str | None, path: Path, line: int, column: str) -> float:
@@ -213,18 +266,22 @@ def _number(text: str | None, path: Path, line: int, column: str) -> float:
     return value
 
 
-def finger_states(rows: list[tuple[float, ...]], period: float, lower: bool) -> list[ArmState]:
+def finger_states(
+    rows: list[tuple[float, ...]], period: float, lower: bool, numbers: Sequence[int] | None = None
+) -> list[ArmState]:
     """Arm states of one finger of a parallel gripper from (force [N],) or (force [N], opening [m]) a row.
 
     World is the gripper: origin midway between the fingers, z along the closing direction. The fingers close evenly:
     the upper one sits at z = +opening / 2 and faces down, the lower one at -opening / 2 and faces up. Without an
     opening the pose stays at the origin. A pressing force pushes the sensor back into its mount: wrench Fz = -force;
-    the other five components were not measured and are 0. Twist: difference to the row before over `period` [s].
+    the other five components were not measured and are 0. Twist: difference to the row before over `period` [s], and
+    over as many of them as the rows' `numbers` are apart.
     """
     side = -1.0 if lower else 1.0
     quaternion = np.array([0.0, 0.0, 0.0, 1.0] if lower else [1.0, 0.0, 0.0, 0.0])  # half a turn about x
     place = [side * opening[0] / 2.0 if opening else 0.0 for _, *opening in rows]
-    speed = np.diff(place, prepend=place[0]) / period
+    counted = np.arange(len(rows)) if numbers is None else np.asarray(numbers)
+    speed = np.diff(place, prepend=place[0]) / (period * np.diff(counted, prepend=counted[0] - 1))
     return [
         ArmState(
             pose=Pose(np.array([0.0, 0.0, place[k]]), quaternion),

@@ -128,8 +128,9 @@ def _fit_lens(pictures: Path, board: Board, folder: Path) -> None:
     from calibration.lens.board import BadBoard, find_board
     from calibration.lens.view import BadView, fit_lens
     from tacsim.record.sources import PICTURES as ENDINGS
+    from tacsim.record.sources import visible_files
 
-    paths = sorted(path for path in pictures.iterdir() if path.suffix.lower() in ENDINGS)
+    paths = visible_files(pictures, ENDINGS)
     if not 0 < len(paths) <= PICTURES:
         raise BadView(f"{pictures} holds {len(paths)} pictures ({', '.join(ENDINGS)}); 1 to {PICTURES} are read")
     found: dict[str, Points] = {}

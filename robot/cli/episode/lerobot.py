@@ -47,7 +47,9 @@ def _recordings(given: list[Path]) -> list[Path]:
     """The files, and those in the folders by name. Raises typer.BadParameter for a folder without any."""
     found: list[Path] = []
     for path in given:
-        inside = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
+        inside = [path]
+        if path.is_dir():
+            inside = sorted(each for each in path.glob("*.mcap") if not each.name.startswith("."))
         if not inside:
             raise typer.BadParameter(f"{path} holds no recording (*.mcap)", param_hint="EPISODES")
         found += inside

@@ -254,7 +254,7 @@ def find_recordings(sources: Sequence[Path]) -> list[Path]:
                 path
                 for pattern in ("*", "*/episode.mcap")
                 for path in source.glob(pattern)
-                if path.is_file() and path.suffix.lower() in (TABLE, EPISODE)
+                if path.is_file() and path.suffix.lower() in (TABLE, EPISODE) and not path.name.startswith(".")
             )
             if not inside:
                 raise BadRecording(f"{source}: no recordings in this folder ({TABLE} or {EPISODE})")

@@ -211,6 +211,19 @@ def test_counts_that_differ_are_refused_unless_names_decide(real: FrameSet) -> N
         paired(replace(fewer, frames=(Frame("else.png", real.reference),)), real, Pairing.name)
 
 
+def test_folders_that_lack_different_pictures_are_not_paired_in_order(real: FrameSet) -> None:
+    """As many pictures on both sides, but a press without its picture in each: order would pair strangers."""
+    named = [Frame(f"press_{k}.png", frame.image) for k, frame in enumerate(real.frames)]
+    some, others = replace(real, name="a", frames=tuple(named[1:])), replace(real, name="b", frames=tuple(named[:-1]))
+    last = len(named) - 1
+    with pytest.raises(
+        BadFrames, match=rf"a alone has number {last}; b alone has number 0: .*--pair name.*--pair order"
+    ):
+        paired(some, others, Pairing.auto)
+    assert len(paired(some, others, Pairing.name)[0]) == last - 1
+    assert len(paired(some, others, Pairing.order)[0]) == last
+
+
 def test_one_frame_has_numbers_but_no_interval(good: FrameSet, real: FrameSet) -> None:
     result = compare_frames(replace(good, frames=good.frames[:1]), replace(real, frames=real.frames[:1]))
     error = result.overall["contact_mae"]

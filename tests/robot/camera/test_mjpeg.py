@@ -53,6 +53,29 @@ STREAMS = {
 }
 
 
+def stream(boundary: bytes, line: bytes, newline: bytes = b"\r\n", lengths: bool = False) -> list[bytes]:
+    """A server that states `boundary` in its header and puts `line` between its pictures."""
+    header = OK + b"Content-Type: multipart/x-mixed-replace; boundary=" + boundary + b"\r\n\r\n"
+    parts = []
+    for k in range(4):
+        lines = [line, b"Content-Type: image/jpeg", *([length(jpeg(10 * k))] if lengths else []), b"", b""]
+        parts.append(newline.join(lines) + jpeg(10 * k) + newline)
+    return [header, *parts, line + b"--" + newline]
+
+
+STREAMS |= {
+    "two dashes stated, four sent": stream(b"--here", b"----here"),
+    "two dashes stated, four sent, with lengths": stream(b"--here", b"----here", lengths=True),
+    "two dashes stated, two sent": stream(b"--here", b"--here"),
+    "no dashes sent": stream(b"here", b"here"),
+    "quoted, with blanks and signs": stream(b'"a b=c:/?"', b"--a b=c:/?"),
+    "signs that should be quoted": stream(b"a=b", b"--a=b"),
+    "line feeds alone": stream(b"here", b"--here", b"\n"),
+    "line feeds alone, with lengths": stream(b"here", b"--here", b"\n", lengths=True),
+    "a short boundary": stream(b"f", b"--f"),
+}
+
+
 @pytest.mark.parametrize("name", STREAMS)
 def test_streams_of_many_kinds_of_servers(server: Server, name: str) -> None:
     server.talk = says(*STREAMS[name])

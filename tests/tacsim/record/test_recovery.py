@@ -204,6 +204,30 @@ def test_other_formats_and_compressed_chunks_are_named(tmp_path: Path, meta: Epi
         read_episode(tmp_path / "new.mcap")
 
 
+@pytest.mark.parametrize("compression", [CompressionType.NONE, CompressionType.ZSTD, CompressionType.LZ4])
+@pytest.mark.parametrize("profile", ["ros2", ""])
+def test_a_recording_of_another_program_is_told_with_its_topics(
+    tmp_path: Path, compression: CompressionType, profile: str
+) -> None:
+    path = tmp_path / "bag_0.mcap"
+    with path.open("wb") as file:
+        stock = Writer(file, compression=compression)
+        stock.start(profile=profile)
+        schema = stock.register_schema("sensor_msgs/msg/CompressedImage", "ros2msg", b"string format\nuint8[] data")
+        channel = stock.register_channel("/finger/image/compressed", "cdr", schema)
+        for k in range(3):
+            stock.add_message(channel, k, b"\0\1\0\0" + bytes(40), k)
+        stock.finish()
+    kind = "a ROS 2 bag" if profile else "a recording of another program"
+    message = rf"{kind} in MCAP.* /finger/image/compressed \(sensor_msgs/msg/CompressedImage\)\. Export"
+    with pytest.raises(EpisodeError, match=message):
+        read_episode(path)
+    path.write_bytes(path.read_bytes()[:-200])  # cut off
+    if profile:
+        with pytest.raises(EpisodeError, match=r"a ROS 2 bag .* not listed"):
+            read_episode(path)
+
+
 def hostile(make_step: Callable[..., Step]) -> tuple[bytes, dict[str, bytes]]:
     messages = {message.topic: message.data for message in encode_step(make_step(1), 1e-3)}
     return messages.pop("/step"), messages

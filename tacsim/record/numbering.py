@@ -1,0 +1,123 @@
+"""Which frame of one recording belongs to which row of another: by their numbers where both have some."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from tacsim.record.episode import EpisodeError
+
+MAX_NAMED = 8  # numbers in an error
+DIGITS = re.compile(r"[0-9]+")
+
+
+@dataclass(frozen=True, slots=True)
+class Numbering:
+    """Frames of a sensor or rows of an arm's table, in order."""
+
+    source: str  # for errors
+    count: int
+    numbers: tuple[int | None, ...] | None  # one for each; None: not numbered
+    reference: int | None = None  # which of them is the picture without contact that the rig file names
+
+
+def picture_numbers(stems: Sequence[str]) -> tuple[int | None, ...] | None:
+    """The number in each picture's name: that part of the digits by which the names differ. Of several (a counter and
+    a time stamp) it is the one that counts most densely. A name of another pattern has None. None where names have no
+    such number, or one of them twice."""
+    patterns = [DIGITS.sub("#", stem.lower()) for stem in stems]
+    pattern, frequency = Counter(patterns).most_common(1)[0]
+    if frequency <= len(stems) / 2 or "#" not in pattern:
+        return None
+    values = [
+        [int(part) for part in DIGITS.findall(stem)] if of == pattern else None
+        for stem, of in zip(stems, patterns, strict=True)
+    ]
+    columns = list(zip(*(each for each in values if each is not None), strict=True))
+    spans = {k: max(column) - min(column) for k, column in enumerate(columns) if len(set(column)) == len(column)}
+    if not spans:
+        return None
+    chosen = min(spans, key=lambda k: (spans[k], -k))
+    return tuple(None if each is None else each[chosen] for each in values)
+
+
+def match_numbers(sensors: Mapping[str, Numbering], arms: Mapping[str, Numbering]) -> dict[str, list[int]]:
+    """Which items of each source belong to the ticks of one clock, by name; sources whose items all count are left out.
+
+    Numbered sources go by their numbers: every frame of a sensor must be in every other source; rows of an arm without
+    a picture are left out. Where one of them is not numbered, all must have the same count. Raises EpisodeError.
+    """
+    together = {**sensors, **arms}
+    if len(together) < 2:
+        return {}
+    kept = {name: _without_reference(each) for name, each in together.items()}
+    if any(each.numbers is None for each in together.values()):
+        _require_counts([(together[name], len(items)) for name, items in kept.items()])
+        return kept
+    numbered = {name: _by_number(together[name], items) for name, items in kept.items()}
+    first = next(iter(sensors))
+    wanted = list(numbered[first])
+    for name in together:
+        lacking = [number for number in wanted if number not in numbered[name]]
+        more = [] if name in arms else [number for number in numbered[name] if number not in numbered[first]]
+        if lacking or more:
+            raise _unmatched(together[first], together[name], lacking, more, list(numbered[name]))
+    return {name: [numbers[number] for number in wanted] for name, numbers in numbered.items()}
+
+
+def _without_reference(of: Numbering) -> list[int]:
+    """Places of all items, without a reference whose name has no number like the others'."""
+    skipped = of.reference if of.numbers is not None and of.reference is not None else None
+    if skipped is not None and of.numbers is not None and of.numbers[skipped] is not None:
+        skipped = None  # one of the series, such as its first picture
+    return [place for place in range(of.count) if place != skipped]
+
+
+def _by_number(of: Numbering, items: Sequence[int]) -> dict[int, int]:
+    """Place of each item by its number. Raises EpisodeError for an item without."""
+    assert of.numbers is not None
+    found = {number: place for place in items if (number := of.numbers[place]) is not None}
+    if len(found) < len(items):
+        raise EpisodeError(
+            f"{of.source}: {len(items) - len(found)} of {len(items)} names have no number like the others', so it is "
+            "not known which row of the table they belong to; move them out of the folder"
+        )
+    return found
+
+
+def _require_counts(found: Sequence[tuple[Numbering, int]]) -> None:
+    counts = {count for _, count in found}
+    if len(counts) == 1:
+        return
+    words = [f"{of.source} has {count}{_gaps(of)}" for of, count in found]
+    raise EpisodeError(
+        f"not the same number of frames and rows: {'; '.join(words)}. Which belong together is not known; give each "
+        "picture a number in its name and the table a column `frame` with these numbers, or make the counts equal"
+    )
+
+
+def _gaps(of: Numbering) -> str:
+    """Numbers that are missing between the first and the last, in words."""
+    there = {number for number in of.numbers or () if number is not None}
+    if not there or max(there) - min(there) >= 2 * len(there):  # every tenth frame, or time stamps
+        return ""
+    missing = [number for number in range(min(there), max(there)) if number not in there]
+    return f" (missing in its numbers: {_named(missing)})" if missing else ""
+
+
+def _unmatched(
+    first: Numbering, other: Numbering, lacking: Sequence[int], more: Sequence[int], there: Sequence[int]
+) -> EpisodeError:
+    parts = [f"{first.source} has number {_named(lacking)}, which {other.source} lacks"] if lacking else []
+    parts += [f"{other.source} has number {_named(more)}, which {first.source} lacks"] if more else []
+    return EpisodeError(
+        f"{'; '.join(parts)} (its numbers go from {min(there)} to {max(there)}). Frames and rows belong together by "
+        "number: give both the same numbers, or leave out what has no partner"
+    )
+
+
+def _named(numbers: Sequence[int]) -> str:
+    more = f" and {len(numbers) - MAX_NAMED} more" if len(numbers) > MAX_NAMED else ""
+    return ", ".join(map(str, numbers[:MAX_NAMED])) + more

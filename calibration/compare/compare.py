@@ -222,8 +222,9 @@ def _other_numbers(a: FrameSet, b: FrameSet) -> str:
     if not all(name.suffix for each in names for name in each):
         return ""
     found = [picture_numbers([name.stem for name in each]) for each in names]
-    first, second = (set(each or ()) for each in found)
-    if None in first | second or first == second or not first & second:
+    first, second = ({number for number in each or () if number is not None} for each in found)
+    unnumbered = any(each is None or None in each for each in found)
+    if unnumbered or first == second or not first & second:
         return ""
     parts = [
         f"{side.name} alone has number {', '.join(map(str, sorted(rest)[:8]))}{', ...' * (len(rest) > 8)}"

@@ -16,6 +16,8 @@ from robot.cli.output import busy, new_directory, notes, progress, results, say_
 if TYPE_CHECKING:
     from tacsim.report.figure4 import Trial
 
+AXES = ("roll", "pitch", "yaw")
+
 
 def press(
     indenter: Annotated[str, typer.Argument(help="sphere, cylinder, box, or the path of an .stl file.")],
@@ -34,14 +36,26 @@ def press(
     scale: Annotated[
         float | None, typer.Option(help="Metres per unit of the .stl file; 0.001 if left out.", show_default=False)
     ] = None,
+    down: Annotated[
+        Literal["-z", "+z", "-x", "+x", "-y", "+y"] | None,
+        typer.Option(help="Side of the indenter, in its own axes, that presses; -z if left out.", show_default=False),
+    ] = None,
+    rotation: Annotated[
+        Any,
+        typer.Option(
+            parser=quantities("angle", 3), metavar="ROLL,PITCH,YAW",
+            help="Turn it about the world's x, then y, then z, in place of --down.",
+        ),
+    ] = None,
     preset: Annotated[Literal["learn", "draft", "standard"], typer.Option(help="Resolution.")] = "standard",
     sensor: Annotated[
         str, typer.Option(help="Its name, the path of a YAML file, or of a calibrated bundle.")
     ] = "ideal",
     set_: Overrides = None,
     out: Out = None,
-) -> None:
-    """Press a rigid indenter on one gel: rgb.png, height.npy, height.png and press.json with force and contact radius.
+) -> None:  # fmt: skip
+    """Press a rigid indenter on one gel: rgb.png, height.npy, height.png, press.json with force and contact radius, and
+    side.png, which shows the side that presses.
 
     --set changes the scene, for example --set indenter.friction=0.3 (see tacsim schema scene).
 
@@ -56,6 +70,7 @@ def press(
     shape = [_geometry(indenter, {"radius": radius, "height": height, "size": size, "scale": scale})]
     if edge_radius is not None:
         shape.append(f"indenter.edge_radius={edge_radius!r}")
+    shape += _orientation(down, rotation)
     scene = load_scene("press", [f"preset={preset}", *shape, *(set_ or [])])
     model = load_sensor(sensor).model_copy(update={"view": None})
     given = any(says_gel_size(text.partition("=")[0].split(".")) for text in set_ or [])
@@ -71,7 +86,8 @@ def press(
             pressed = presses.press(scene, model, motion)
     config = presses.press_report(scene, motion, pressed, model)
     with writing(folder, new=True):
-        presses.write(folder, pressed, config)
+        presses.write(folder, pressed, config, scene, model)
+    results.print(f"pressing side    {config['pressing_side']}", markup=False)
     results.print(f"force            {config['force']:.4f} N")
     results.print(f"contact radius   {config['contact_radius'] * 1e3:.3f} mm")
     results.print(f"deepest          {config['deepest'] * 1e3:.3f} mm")
@@ -90,6 +106,16 @@ def press(
         held = "not held" if config["residual"] is None else f"relative residual {config['residual']:.2g}"
         notes.print(f"warning: not settled, {config['unfollowed'] or f'{held}; raise settling.max_substeps'}")
     say_files(*sorted(folder.iterdir()))
+
+
+def _orientation(down: str | None, rotation: tuple[float, ...] | None) -> list[str]:
+    """The overrides that turn an indenter. Raises typer.BadParameter for both ways at once."""
+    from tacsim.geometry.pressing_side import SIDES
+
+    if down is not None and rotation is not None:
+        raise typer.BadParameter("give --down or --rotation, not both", param_hint="--rotation")
+    angles = rotation if down is None else SIDES[down]
+    return [] if angles is None else [f"indenter.{axis}={angle!r}" for axis, angle in zip(AXES, angles, strict=False)]
 
 
 def _geometry(indenter: str, given: dict[str, Any]) -> str:

@@ -18,7 +18,8 @@ from robot.collect.job import Piece, Seconds
 from robot.collect.table import Row, parquet_bytes
 from robot.studies.press import PressMotion, PressResult, press, require_reachable
 from tacsim import pose as se3
-from tacsim.geometry.shapes import extent
+from tacsim.geometry.shapes import turned_extent
+from tacsim.interface import Pose
 from tacsim.models.quantity import Config
 from tacsim.models.scene import Mesh, Scene, Shape
 from tacsim.models.sensor import Markers, SensorModel
@@ -95,7 +96,10 @@ class PressSet(Config):
         at = low + (high - low) * [x, y]
         about = _within(self.tilt, tilt) * _direction(tilted)
         upright = se3.from_rotation_vector(np.zeros(3), [0.0, 0.0, 2 * np.pi * yaw])
-        turn = se3.compose(se3.from_rotation_vector(np.zeros(3), [*about, 0.0]), upright).quaternion
+        turned = se3.compose(se3.from_rotation_vector(np.zeros(3), [*about, 0.0]), upright)
+        if indenter.roll or indenter.pitch:  # which side is down is the scene's, yaw and tilt are drawn
+            turned = se3.compose(turned, Pose(quaternion=indenter.turn))
+        turn = turned.quaternion
         return name, scene, replace(motion, at=(float(at[0]), float(at[1])), turn=turn)
 
     def _room(self, geometry: Shape) -> tuple[Any, Any]:
@@ -104,7 +108,9 @@ class PressSet(Config):
         grid, gel = image_grid(self.sensor.geometry), np.array(self.scene.gel.size[:2]) / 2
         low = np.maximum(-gel, [grid.x[0], grid.y[0]])
         high = np.minimum(gel, [grid.x[-1], grid.y[-1]])
-        half, middle = float(extent(geometry)[:2].max()) / 2, (low + high) / 2
+        assert self.scene.indenter is not None
+        half = float(turned_extent(geometry, self.scene.indenter.turn)[:2].max()) / 2
+        middle = (low + high) / 2
         return np.minimum(low + half, middle), np.maximum(high - half, middle)
 
     def in_folder(self, folder: Path) -> PressSet:

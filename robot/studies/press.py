@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tacsim import pose as se3
+from tacsim.geometry.pressing_side import describe_side, pressing_side
 from tacsim.geometry.shapes import distance, extent
 from tacsim.geometry.tiles import tiled_distance
 from tacsim.interface import FloatArray, Pose
@@ -25,6 +26,7 @@ from tacsim.physics.move import MoveStats
 from tacsim.physics.worlds.press import CLEARANCE, PressWorld
 from tacsim.physics.worlds.press_state import GRID_SPACING
 from tacsim.report.height_picture import write_height_picture
+from tacsim.report.side_picture import write_side_picture
 
 QUARTER_TURN = math.pi / 2  # a twist is cut into pieces of at most this: each motion takes the shorter rotation [rad]
 MAX_TWIST = math.radians(3600.0)
@@ -190,6 +192,7 @@ def press_report(scene: Scene, motion: PressMotion, pressed: PressResult, sensor
     residual = max(move.residual for move in pressed.moves)
     return {
         "indenter": scene.indenter.model_dump(mode="json") if scene.indenter else None,
+        "pressing_side": describe_side(scene.indenter) if scene.indenter else None,
         "edge_radius": _edge_radius(scene),
         "gel": scene.gel.model_dump(mode="json"),
         "preset": scene.preset,
@@ -217,11 +220,18 @@ def _edge_radius(scene: Scene) -> float | None:
     return scene.indenter.rounding(scene.element) if isinstance(scene.indenter.geometry, Box | Cylinder) else None
 
 
-def write(folder: Path, pressed: PressResult, config: dict[str, Any]) -> None:
-    """Writes rgb.png, height.npy (float32 [m], one value a pixel), height.png and press.json. Raises OSError."""
+def write(folder: Path, pressed: PressResult, config: dict[str, Any], scene: Scene, sensor: SensorModel) -> None:
+    """Writes rgb.png, height.npy (float32 [m], one value a pixel), height.png, side.png and press.json. Raises
+    OSError."""
     from PIL import Image
 
+    assert scene.indenter is not None
     Image.fromarray(pressed.image).save(folder / "rgb.png", compress_level=4)  # as small as by 6, in half the time
     np.save(folder / "height.npy", pressed.height.astype(np.float32), allow_pickle=False)
     write_height_picture(folder / "height.png", pressed.height, pressed.contact, config["pixel_pitch"])
+    lowest = se3.transform(pressed.pose, pressing_side(scene.indenter).lowest_point)[:2]
+    write_side_picture(
+        folder / "side.png", scene.indenter.geometry, pressed.pose, lowest, pressed.height,
+        image_grid(sensor.geometry), scene.gel, f"pressing side: {config['pressing_side']}",
+    )  # fmt: skip
     (folder / "press.json").write_text(json.dumps(config, indent=1, allow_nan=False) + "\n", encoding="utf-8")

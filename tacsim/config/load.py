@@ -19,7 +19,7 @@ from tacsim.config.messages import report_errors
 from tacsim.config.references import Override, apply, parse_override, read_file
 from tacsim.models.hardware import UrArmConfig, weakened_limits
 from tacsim.models.rig import RigConfig, TaskConfig, any_task
-from tacsim.models.scene import Scene
+from tacsim.models.scene import Mesh, Scene
 from tacsim.models.sensor import SensorModel
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -72,6 +72,8 @@ def load_rig(rig: str | Path, *, task: str | TaskConfig | None = None, overrides
     config = _with_one_scene(config)
     if overrides and any(isinstance(arm, UrArmConfig) and arm.mock is None for arm in config.arms.values()):
         _require_limits(config, load_rig(rig, task=task).config)
+    if config.scene is not None:
+        notes = [*notes, *say_side(config.scene)]
     return LoadedRig(config, tuple(dict.fromkeys(state.sources)), tuple(notes))
 
 
@@ -165,6 +167,18 @@ def _check_scene(root: Node, own_scene: bool, state: LoadState) -> Node:
         what = "no arm and no sensor of this rig has driver 'sim', so nothing is simulated; leave scene out"
         state.report(root.items["scene"].place, "scene", what)
     return replace(root, value={name: entry for name, entry in root.items.items() if name != "scene"})
+
+
+def say_side(scene: Scene) -> list[str]:
+    """In words, which side of a scene's mesh presses, for a file does not show it. Empty without a readable mesh."""
+    from tacsim.geometry.pressing_side import describe_side
+
+    if scene.indenter is None or not isinstance(scene.indenter.geometry, Mesh):
+        return []
+    try:
+        return [f"pressing side: {describe_side(scene.indenter)}; indenter.roll and indenter.pitch choose another"]
+    except (OSError, ValueError):  # who makes the world says it
+        return []
 
 
 def load(model: type[Model], source: str | Path, overrides: Sequence[str] = ()) -> Model:

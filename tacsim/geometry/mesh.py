@@ -244,7 +244,7 @@ def signed_distance_on_grid(surface: Surface, axes: Axes, band: float) -> FloatA
     limit = band / surface.unit + surface.reach
     near = np.isfinite(surface.tree.query(points, distance_upper_bound=limit)[0])
     if not near.any():
-        near[np.argmin(surface.tree.query(points)[0])] = True
+        near[_nearest_node(surface, points, shape)] = True
     values = np.empty(len(points))
     triangle = np.empty(len(points), dtype=np.int64)
     values[near], triangle[near] = _nearest(surface, points[near])
@@ -258,6 +258,19 @@ def signed_distance_on_grid(surface: Surface, axes: Axes, band: float) -> FloatA
             values[rows] = _to_triangles(surface, points[rows], triangle[rows])[0]
         values[away] *= _signs(surface, points, far)[away]
     return (values * surface.unit).reshape(shape)
+
+
+def _nearest_node(surface: Surface, points: FloatArray, shape: tuple[int, int, int]) -> int:
+    """Index of the node of a grid (n, 3) of `shape`, into which no surface comes, that is nearest to a piece. It lies
+    on the grid's border; what is farther than the nearest corner is not searched for: among the many nodes that are
+    about as far from all pieces of a ball, a search for each would take a second a grid."""
+    index = np.stack(np.unravel_index(np.arange(len(points)), shape), axis=1)
+    last = np.array(shape) - 1
+    at_end = (index == 0) | (index == last)
+    border = np.flatnonzero(at_end.any(axis=1))
+    limit = float(surface.tree.query(points[at_end.all(axis=1)])[0].min())
+    away = surface.tree.query(points[border], distance_upper_bound=limit * (1 + 1e-9) + 1e-9)[0]
+    return int(border[np.argmin(away)])
 
 
 def _signs(surface: Surface, points: FloatArray, far: NDArray[np.bool_]) -> FloatArray:

@@ -20,7 +20,9 @@ from tacsim.geometry.mesh import (
     signed_distance,
     signed_distance_on_grid,
 )
+from tacsim.interface import Pose
 from tacsim.models.scene import Box, Cylinder, Indenter, Mesh, Shape, Sphere
+from tacsim.pose import inverse, matrix, rotate
 
 if TYPE_CHECKING:
     from trimesh import Trimesh
@@ -67,6 +69,36 @@ def farthest(geometry: Box | Sphere | Cylinder, direction: ArrayLike, edge_radiu
         case Cylinder():
             rim = (geometry.radius - edge_radius) * along[:2] / max(float(np.linalg.norm(along[:2])), 1e-12)
             return np.append(rim, np.sign(along[2]) * (geometry.height / 2 - edge_radius)) + rounding
+
+
+def turned_extent(geometry: Shape, turn: ArrayLike) -> FloatArray:
+    """Size (3,) [m] along world axes of a shape turned by the quaternion `turn` (4,). Raises what `extent` raises."""
+    quaternion = np.asarray(turn, dtype=np.float64)
+    if not quaternion[:3].any():
+        return extent(geometry)
+    axes = matrix(Pose(quaternion=quaternion))
+    match geometry:
+        case Box():
+            return np.asarray(np.abs(axes) @ np.array(geometry.size))
+        case Cylinder():
+            along = np.abs(axes[:, 2])
+            return geometry.height * along + 2 * geometry.radius * np.sqrt(np.maximum(1.0 - along**2, 0.0))
+        case Sphere():
+            return extent(geometry)
+        case Mesh():
+            return np.asarray(np.ptp(np.asarray(centred(geometry).vertices) @ axes.T, axis=0))
+
+
+def lowest_below(geometry: Shape, turn: ArrayLike, edge_radius: float = 0.0) -> float:
+    """How far the lowest point of a shape turned by the quaternion `turn` (4,) is below the centre of its own bounding
+    box [m]. edge_radius: of the edges of a box or cylinder, rounded within its size [m]."""
+    quaternion = np.asarray(turn, dtype=np.float64)
+    if not quaternion[:2].any():
+        return float(extent(geometry)[2]) / 2
+    down = rotate(inverse(Pose(quaternion=quaternion)), [0.0, 0.0, -1.0])
+    if isinstance(geometry, Mesh):
+        return float((np.asarray(centred(geometry).vertices) @ down).max())
+    return float(farthest(geometry, down, edge_radius) @ down)
 
 
 def edge_radius(indenter: Indenter, element: float) -> float:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
+from collections.abc import Callable, Iterator
 from functools import lru_cache
 from pathlib import Path
 
@@ -32,6 +33,7 @@ PIECES = (4_000, 100_000)  # at least, about at most
 # threads come here one after the other (`tacsim.compute.runtime.launching`).
 _kept: dict[tuple[Mesh, str, float, tuple[int, ...]], NDArray[np.float32]] = {}
 _folder: Path | None = None  # of tiles that other processes have, too
+_watcher: Callable[[str, int, int], None] | None = None
 
 
 def share_tiles(folder: Path | None) -> None:
@@ -40,6 +42,17 @@ def share_tiles(folder: Path | None) -> None:
     """
     global _folder
     _folder = folder
+
+
+@contextlib.contextmanager
+def watched_measuring(on_tile: Callable[[str, int, int], None]) -> Iterator[None]:
+    """In the block `on_tile` is given the mesh's path, how many tiles are done, and of how many, before each tile."""
+    global _watcher
+    before, _watcher = _watcher, on_tile
+    try:
+        yield
+    finally:
+        _watcher = before
 
 
 class TiledDistance:
@@ -98,7 +111,10 @@ class TiledDistance:
                 f"would be needed where it can touch; the limit is {MAX_NODES:,}"
             )
         found = np.empty(counts, np.float32)
-        for tile in np.ndindex(*(end - first)):
+        number = int(np.prod(end - first))
+        for done, tile in enumerate(np.ndindex(*(end - first))):
+            if _watcher is not None:
+                _watcher(self.name, done, number)
             x, y, z = (slice(n * TILE, (n + 1) * TILE) for n in tile)
             found[x, y, z] = self._tile(tuple(int(n) for n in first + tile))
         return found

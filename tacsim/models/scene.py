@@ -157,7 +157,21 @@ class Indenter(Config):
     # of a box's or cylinder's edges, rounded within its size [m]; None: as the mesh carries them (`rounding`); 0: sharp
     edge_radius: Annotated[Length, Field(ge=0)] | None = None
     friction: Annotated[float, Field(ge=0, le=5)] = 0.6
+    # Orientation: turned about world x by `roll`, then y by `pitch`, then z by `yaw`. 0, 0, 0: its own -z side presses.
+    roll: Angle = 0.0
+    pitch: Angle = 0.0
     yaw: Angle = 0.0
+
+    @property
+    def turn(self) -> NDArray[np.float64]:
+        """Its orientation in world as a quaternion (4,), x, y, z, w."""
+        (sx, sy, sz), (cx, cy, cz) = (
+            [of(angle / 2) for angle in (self.roll, self.pitch, self.yaw)] for of in (math.sin, math.cos)
+        )
+        return np.array([
+            sx * cy * cz - cx * sy * sz, cx * sy * cz + sx * cy * sz,
+            cx * cy * sz - sx * sy * cz, cx * cy * cz + sx * sy * sz,
+        ])  # fmt: skip
 
     @model_validator(mode="after")
     def _edges_fit(self) -> Self:

@@ -15,7 +15,7 @@ from calibration.materials.presses import Press
 from robot.rig.replay_rig import open_replay, recorded_rig
 from robot.studies.identify.simulation import Seen, shape_signals
 from tacsim import pose as se3
-from tacsim.geometry.shapes import extent
+from tacsim.geometry.shapes import lowest_below
 from tacsim.interface import Action, EndOfEpisode, FloatArray, Observation, Pose
 from tacsim.models.rig import ReplayArmConfig, ReplaySensorConfig, RigConfig, SimSensorConfig
 from tacsim.models.scene import Scene
@@ -70,7 +70,9 @@ class Recordings:
     def _half_height(self, path: Path) -> float:
         """From the lowest point of the indenter to its centre [m]."""
         assert self.scene.indenter is not None
-        return self._balls.get(_name(path), float(extent(self.scene.indenter.geometry)[2]) / 2)
+        indenter = self.scene.indenter
+        own = lowest_below(indenter.geometry, indenter.turn, indenter.rounding(self.scene.element))
+        return self._balls.get(_name(path), own)
 
     # ------------------------------------------------------------------ tables
 
@@ -89,7 +91,7 @@ class Recordings:
             raise BadRecording(f"{path}: column 'time' goes back; give the moments in their order")
         if self.scene.indenter is not None:
             up = np.array([0.0, 0.0, self._half_height(path)])
-            turned = se3.from_rotation_vector(np.zeros(3), [0.0, 0.0, self.scene.indenter.yaw]).quaternion
+            turned = self.scene.indenter.turn
             poses = {"indenter": tuple(Pose(row[:3] + up, turned) for row in rows)}
         else:
             poses = {
@@ -225,10 +227,7 @@ class Recordings:
             )
         assert self.scene.indenter is not None
         height = self._half_height(path) + CLEARANCE
-        return Pose(
-            np.array([0.0, 0.0, height]),
-            se3.from_rotation_vector(np.zeros(3), [0.0, 0.0, self.scene.indenter.yaw]).quaternion,
-        )
+        return Pose(np.array([0.0, 0.0, height]), self.scene.indenter.turn)
 
 
 def _name(path: Path) -> str:

@@ -14,7 +14,7 @@ from calibration.materials.fit import Point
 from calibration.materials.parameters import Parameter
 from calibration.materials.presses import Press
 from tacsim import pose as se3
-from tacsim.geometry.shapes import extent
+from tacsim.geometry.shapes import lowest_below
 from tacsim.interface import FloatArray, Pose
 from tacsim.models.scene import Box, Scene, Shape, Sphere
 from tacsim.models.sensor import CanonicalGrid, Markers
@@ -143,7 +143,8 @@ class Simulation:
         stated = scene.indenter.geometry if ball is None else Sphere(radius=ball)
         shape = resized(stated, math.exp(size)) if size else stated
         indenter = scene.indenter.model_copy(update={"geometry": shape})
-        return scene.model_copy(update={"indenter": indenter}), float(extent(shape)[2] - extent(stated)[2]) / 2
+        higher = lowest_below(shape, indenter.turn) - lowest_below(stated, indenter.turn)
+        return scene.model_copy(update={"indenter": indenter}), higher
 
     def _signals(self, batch: Batch, member: int, press: Press) -> list[float]:
         """One number for each channel of the press, as the world is now."""

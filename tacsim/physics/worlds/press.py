@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from tacsim.geometry.shapes import edge_radius, edges, extent, farthest
+from tacsim.geometry.shapes import edge_radius, edges, farthest, lowest_below
 from tacsim.interface import Pose
 from tacsim.models.scene import GelSurface, Mesh, Scene
 from tacsim.physics.contact.indenter import (
@@ -114,13 +114,13 @@ class PressWorld(FemWorld):
         }  # fmt: skip
         self._state.params[index, list(params)] = list(params.values())
         self._use_inertia(self._scaled)
-        height = float(extent(scene.indenter.geometry)[2])
-        turned = np.array([0.0, 0.0, np.sin(scene.indenter.yaw / 2), np.cos(scene.indenter.yaw / 2)])
         self._rates = np.zeros((2, 6))
         # where the indenter was over the gel when it last did not touch it, and how far it has been slid since [mm]
         self._touched = np.zeros(3)
         self._edges = edges(scene.indenter.geometry, scene.element)
-        self._poses = {"lower": Pose(), "indenter": Pose(np.array([0.0, 0.0, height / 2 + CLEARANCE]), turned)}
+        turned = scene.indenter.turn
+        above = self.below(turned) + CLEARANCE
+        self._poses = {"lower": Pose(), "indenter": Pose(np.array([0.0, 0.0, above]), turned)}
 
     def _stop(self) -> None:
         self._state.gels.v[self._index] = 0.0
@@ -198,14 +198,11 @@ class PressWorld(FemWorld):
         """How far the indenter's lowest point is below its origin, the centre of its bounding box, if that is turned by
         the quaternion `turn` (4,) [m]."""
         assert self.scene.indenter is not None
-        geometry, mesh = self.scene.indenter.geometry, self._state.meshes[self._index]
-        if not turn[:2].any():
-            return float(extent(geometry)[2]) / 2
-        down = rotate(inverse(Pose(quaternion=turn)), [0.0, 0.0, -1.0])
-        if isinstance(geometry, Mesh):
-            assert mesh is not None
-            return float((mesh.vertices @ down).max())
-        return float(farthest(geometry, down, self.scene.indenter.rounding(self.scene.element)) @ down)
+        mesh = self._state.meshes[self._index]
+        if mesh is not None and turn[:2].any():
+            return float((mesh.vertices @ rotate(inverse(Pose(quaternion=turn)), [0.0, 0.0, -1.0])).max())
+        indenter = self.scene.indenter
+        return lowest_below(indenter.geometry, turn, indenter.rounding(self.scene.element))
 
     def prepare(self, launch: Launch) -> PreparedLaunch:
         """Sets this environment's parameters. Raises SimulationDiverged where too much of a mesh could be touched."""

@@ -8,9 +8,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from tacsim.compute.runtime import start
-from tacsim.geometry.shapes import MAX_NODES, extent
+from tacsim.geometry.shapes import MAX_NODES, turned_extent
 from tacsim.geometry.tiles import TILE, TiledDistance, tiled_distance
-from tacsim.models.scene import Box, Cylinder, Scene, Shape, Sphere
+from tacsim.models.scene import Box, Cylinder, Indenter, Scene, Shape, Sphere
 from tacsim.physics.contact.distance import BOX, CYLINDER, GRID, SPHERE
 from tacsim.physics.contact.indenter import (
     POINTS,
@@ -84,7 +84,7 @@ class PressState(FemState):
     def _set_shape(self, index: int, scene: Scene) -> TiledDistance | None:
         """Writes one environment's indenter into params and counts; returns the distances of a mesh."""
         assert scene.indenter is not None
-        _require_resolved(scene.indenter.geometry, self.gel[index])
+        _require_resolved(scene.indenter, self.gel[index])
         kind, size, mesh = _shape_params(scene.indenter.geometry)
         self.counts[index, KIND], self.params[index, SHAPE : SHAPE + 3] = kind, size
         self.params[index, EDGE_RADIUS] = scene.indenter.rounding(scene.element) * MM
@@ -135,9 +135,11 @@ class PressState(FemState):
         )  # fmt: skip
 
 
-def _require_resolved(geometry: Shape, gel: GelParams) -> None:
+def _require_resolved(indenter: Indenter, gel: GelParams) -> None:
     """Raises ValueError for an indenter that fits between the points at which the gel's surface feels it."""
-    narrow, spacing = float(extent(geometry)[:2].min()) * MM, gel.spacing / POINTS
+    geometry = indenter.geometry
+    size = turned_extent(geometry, indenter.model_copy(update={"yaw": 0.0}).turn)  # no width depends on the yaw
+    narrow, spacing = float(size[:2].min()) * MM, gel.spacing / POINTS
     if narrow < math.sqrt(2.0) * spacing:
         layers = math.ceil(gel.thickness / (narrow * POINTS / math.sqrt(2.0)))
         raise ValueError(

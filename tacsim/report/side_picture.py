@@ -1,0 +1,96 @@
+"""An indenter on the gel, cut through where it is lowest: which side presses. By Pillow, as the height picture."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacsim.geometry.pressing_side import section
+from tacsim.interface import FloatArray, Pose
+from tacsim.models.scene import Gel, Shape
+from tacsim.optics.grid import PixelGrid
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+WIDTH, MARGIN, TEXT = 440, 48, 14  # of one section, round it, of a letter [px]
+SUPERSAMPLED = 2  # pixels drawn for one that is shown
+INDENTER, GEL, SURFACE, BACKING = (90, 100, 120), (196, 224, 236), (0, 96, 140), (150, 150, 150)
+TALLEST = 0.8  # widths of a section: what stands higher is cut off
+
+
+def write_side_picture(
+    path: Path, shape: Shape, pose: Pose, lowest: FloatArray, height: NDArray[np.float32], grid: PixelGrid, gel: Gel,
+    title: str,
+) -> None:  # fmt: skip
+    """A PNG of two sections, along x and along y, through the point `lowest` (x, y) [m].
+
+    pose: of the indenter in the sensor's frame; height: (H, W) of the gel's surface under each pixel of `grid` [m].
+    Raises OSError.
+    """
+    from PIL import Image as images
+    from PIL import ImageDraw, ImageFont
+
+    drawn = [_section(shape, pose, axis, lowest, height, grid, gel) for axis in (0, 1)]
+    tall = max(each.height for each in drawn)
+    picture = images.new("RGB", (2 * WIDTH + 3 * MARGIN, tall + 2 * MARGIN), "white")
+    pen = ImageDraw.Draw(picture, "RGB")
+    pen.font = ImageFont.load_default(TEXT)
+    pen.text((picture.width / 2, MARGIN / 2), title, "black", anchor="mm")
+    for k, (each, along, across) in enumerate(zip(drawn, "xy", "yx", strict=True)):
+        left, below = MARGIN + k * (WIDTH + MARGIN), MARGIN + tall
+        picture.paste(each, (left, below - each.height))
+        words = f"section along {along} at {across} = {lowest[1 - k] * 1e3:.2f} mm; gel {gel.size[k] * 1e3:.3g} mm wide"
+        pen.text((left + WIDTH / 2, below + MARGIN / 2), words, "black", anchor="mm")
+    picture.save(path, compress_level=4)
+
+
+def _section(
+    shape: Shape, pose: Pose, axis: int, lowest: FloatArray, height: NDArray[np.float32], grid: PixelGrid, gel: Gel
+) -> Image:
+    """The section along `axis`; to scale, z up."""
+    from PIL import Image as images
+    from PIL import ImageDraw
+
+    lines = section(shape, pose, 1 - axis, float(lowest[1 - axis]))[:, :, [axis, 2]]
+    wide = max(1.1 * gel.size[axis], min(2.2 * float(np.abs(lines[..., 0]).max(initial=0.0)), 2 * gel.size[axis]))
+    scale = SUPERSAMPLED * WIDTH / wide  # [px/m]
+    top = min(float(lines[..., 1].max(initial=0.0)) + 0.05 * wide, TALLEST * wide)
+    bottom = -gel.size[2] - 0.04 * wide
+
+    def pixels(points: FloatArray) -> list[tuple[float, float]]:
+        return [((x + wide / 2) * scale, (top - z) * scale) for x, z in points]
+
+    picture = images.new("RGB", (SUPERSAMPLED * WIDTH, round((top - bottom) * scale)), "white")
+    pen = ImageDraw.Draw(picture)
+    half, back = gel.size[axis] / 2, -gel.size[2]
+    surface = _surface(axis, lowest, height, grid)
+    outline = np.array([[-half, 0.0], *surface, [half, 0.0], [half, back], [-half, back]])
+    pen.polygon(pixels(outline), fill=GEL)
+    pen.rectangle([*pixels(np.array([[-half, back]]))[0], *pixels(np.array([[half, bottom]]))[0]], fill=BACKING)
+    for column in range(picture.width):  # between the first crossing and the second, the third and the fourth, ...
+        x = (column + 0.5) / scale - wide / 2
+        for low, high in _crossings(lines, x):
+            pen.line([(column, (top - high) * scale), (column, (top - low) * scale)], fill=INDENTER)
+    pen.line(pixels(outline[: len(surface) + 2]), fill=SURFACE, width=2 * SUPERSAMPLED)
+    return picture.resize((WIDTH, picture.height // SUPERSAMPLED), images.Resampling.LANCZOS)
+
+
+def _crossings(lines: FloatArray, x: float) -> FloatArray:
+    """(n, 2) lower and upper ends of what lies inside at `x`; lines: (m, 2, 2) of a closed outline, x and z [m]."""
+    start, end = lines[:, 0], lines[:, 1]
+    across = (start[:, 0] <= x) != (end[:, 0] <= x)
+    start, end = start[across], end[across]
+    z = np.sort(start[:, 1] + (x - start[:, 0]) / (end[:, 0] - start[:, 0]) * (end[:, 1] - start[:, 1]))
+    return z[: len(z) // 2 * 2].reshape(-1, 2)
+
+
+def _surface(axis: int, lowest: FloatArray, height: NDArray[np.float32], grid: PixelGrid) -> list[tuple[float, float]]:
+    """Points of the gel's surface in the section: place along it, z [m]."""
+    across = int(np.argmin(np.abs((grid.y if axis == 0 else grid.x) - lowest[1 - axis])))
+    along = grid.x if axis == 0 else grid.y
+    values = height[across] if axis == 0 else height[:, across]
+    return [(float(place), -float(value)) for place, value in zip(along, values, strict=True) if np.isfinite(value)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import datetime
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress
     from rich.status import Status
 
+QUIET = 1.0  # [s] what takes longer says how far it is
 NARROWEST = 60  # columns: in fewer a table loses its values; the terminal breaks its lines instead
 
 
@@ -166,6 +168,31 @@ def busy(words: str) -> Iterator[Callable[[str], None]]:
     else:
         notes.print(words)
         yield lambda now: None
+
+
+@contextmanager
+def measuring(say: Callable[[str], None], after: str) -> Iterator[None]:
+    """In the block it is said how far the measuring of a mesh is that takes longer than QUIET: on a terminal by `say`,
+    which then says `after`, else once, as a line."""
+    from tacsim.geometry.tiles import watched_measuring
+
+    began: dict[str, float] = {}
+    told: set[str] = set()
+
+    def tell(path: str, done: int, total: int) -> None:
+        if done == 0:
+            began[path] = time.monotonic()
+        elif time.monotonic() - began[path] > QUIET:
+            words = f"measuring the distances from {printable(path)}: {done} of {total} parts"
+            say(words)
+            if not notes.is_terminal and path not in told:
+                notes.print(words, markup=False)
+            told.add(path)
+            if done == total - 1:
+                say(after)
+
+    with watched_measuring(tell):
+        yield
 
 
 def say_files(*paths: Path) -> None:

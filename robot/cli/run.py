@@ -13,7 +13,7 @@ import typer
 from robot.cli.errors import FAILED, complain
 from robot.cli.interrupt import Interrupt
 from robot.cli.options import Out, Overrides
-from robot.cli.output import Bar, busy, new_directory, notes, one_bar, results, warn, writing
+from robot.cli.output import Bar, busy, measuring, new_directory, notes, one_bar, results, warn, writing
 from robot.cli.question import ask, require_person
 
 if TYPE_CHECKING:
@@ -137,6 +137,7 @@ def _run(
     with (
         dumps_in(folder / "diverged"),
         one_bar(begun) as bar,
+        measuring(bar.say, begun),
         open_rig(loaded, confirm=ask, dry_run=dry_run, check=fit, tell=bar.say) as rig,
         ExitStack() as stack,
     ):

@@ -11,7 +11,7 @@ import typer
 from robot.cli.errors import complain
 from robot.cli.interrupt import Interrupt
 from robot.cli.options import Out, Overrides, angle, length, quantities
-from robot.cli.output import busy, new_directory, notes, progress, results, say_files, writing
+from robot.cli.output import busy, measuring, new_directory, notes, progress, results, say_files, writing
 
 if TYPE_CHECKING:
     from tacsim.report.figure4 import Trial
@@ -77,13 +77,23 @@ def press(
     scene, said = fit_gel(scene, {"lower": model}, given=given)
     for words in said:
         notes.print(words, markup=False)
-    with busy("pressing (the first run compiles the kernels, up to half a minute)"):
+    with busy("pressing (the first run compiles the kernels, up to half a minute)") as say:
         from robot.studies import press as presses
         from tacsim.physics.failure.dump import dumps_in
+        from tacsim.physics.failure.health import SimulationDiverged
 
         motion = presses.PressMotion(depth, slide, twist)
-        with dumps_in(folder / "diverged"):
-            pressed = presses.press(scene, model, motion)
+        with dumps_in(folder / "diverged"), measuring(say, "pressing"):
+            try:
+                pressed = presses.press(scene, model, motion)
+            except SimulationDiverged as failure:
+                say("it failed; looking for a depth that is possible")
+                if (possible := presses.deepest_possible(scene, motion, failure)) is not None:
+                    failure.possible = (
+                        f"the gel cannot take {motion.depth * 1e3:g} mm of this indenter; {possible * 1e3:g} mm is "
+                        f"possible, tried with --depth '{possible * 1e3:g} mm'"
+                    )
+                raise
     config = presses.press_report(scene, motion, pressed, model)
     with writing(folder, new=True):
         presses.write(folder, pressed, config, scene, model)

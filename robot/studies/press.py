@@ -21,8 +21,10 @@ from tacsim.models.sensor import SensorModel
 from tacsim.optics.grid import image_grid
 from tacsim.optics.render import Renderer
 from tacsim.optics.surface import SurfaceSample, SurfaceTable, sample_surface
+from tacsim.physics.failure.dump import dumps_in
 from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.physics.move import MoveStats
+from tacsim.physics.worlds.base import POSSIBLE_SHARE
 from tacsim.physics.worlds.press import CLEARANCE, PressWorld
 from tacsim.physics.worlds.press_state import GRID_SPACING
 from tacsim.report.height_picture import write_height_picture
@@ -34,6 +36,7 @@ MAX_SLIDE = 3.0  # widths of the gel: beyond, it has left the gel
 # Share of the depth that the gel's contact points may leave unfelt. Balls of 1 mm and more, cylinders, boxes and stars
 # leave 11 % at most; wedges of 60 to 45 degrees 12 to 25 %, and press 10 to 25 % too little. More is refused.
 UNFELT = 0.125
+MAX_TRIALS = 3  # of a depth that is possible
 NEAR = 0.2  # elements: a surface point farther from the indenter is not pressed
 
 
@@ -90,8 +93,10 @@ def press(scene: Scene, sensor: SensorModel, motion: PressMotion, render: Render
             unfollowed = world.unfollowed or unfollowed
     except SimulationDiverged as error:
         if error.poses:
-            came = below - float(se3.relative(error.poses["lower"], error.poses["indenter"]).position[2])
-            error.advice += f"; it had come {came * 1e3:.3g} mm deep, of {motion.depth * 1e3:.3g} mm"
+            error.depth = below - float(se3.relative(error.poses["lower"], error.poses["indenter"]).position[2])
+            came = f"it had come {error.depth * 1e3:.3g} mm deep, of {motion.depth * 1e3:.3g} mm"
+            error.advice += f"; {came}"
+            error.possible = "" if not moves else error.possible  # words on a shift from where it waits say nothing
         raise
     surface = world.surface("lower")
     seen = sample_surface(surface, image_grid(sensor.geometry))
@@ -110,6 +115,32 @@ def press(scene: Scene, sensor: SensorModel, motion: PressMotion, render: Render
         folded=SurfaceTable(surface).folded,
         pose=se3.relative(world.pose("lower"), world.pose("indenter")),
     )
+
+
+def deepest_possible(scene: Scene, motion: PressMotion, failure: SimulationDiverged) -> float | None:
+    """A depth [m] that this press reaches, found by pressing again less deep than where it failed; None where the
+    failure was no matter of depth, or MAX_TRIALS found none."""
+    if failure.depth is None or not failure.retry or failure.depth > motion.depth * (1 - 1e-6):
+        return None
+    depth = failure.depth
+    with dumps_in(None):
+        for _ in range(MAX_TRIALS):
+            depth = _rounded_down(POSSIBLE_SHARE * depth)
+            world = PressWorld(scene)
+            pose = world.pose("indenter")
+            below = world.below(pose.quaternion)
+            try:
+                world.move({"indenter": Pose(np.array([*pose.position[:2], below - depth]), pose.quaternion)})
+            except SimulationDiverged:
+                continue
+            return depth
+    return None
+
+
+def _rounded_down(depth: float) -> float:
+    """To two digits [m], as it is printed."""
+    unit = 10.0 ** (math.floor(math.log10(depth)) - 1)
+    return math.floor(depth / unit) * unit
 
 
 def require_reachable(gel: Gel, motion: PressMotion) -> None:

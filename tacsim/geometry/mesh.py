@@ -268,7 +268,7 @@ def _nearest_node(surface: Surface, points: FloatArray, shape: tuple[int, int, i
     last = np.array(shape) - 1
     at_end = (index == 0) | (index == last)
     border = np.flatnonzero(at_end.any(axis=1))
-    limit = float(surface.tree.query(points[at_end.all(axis=1)])[0].min())
+    limit = float(np.min(surface.tree.query(points[at_end.all(axis=1)])[0]))
     away = surface.tree.query(points[border], distance_upper_bound=limit * (1 + 1e-9) + 1e-9)[0]
     return int(border[np.argmin(away)])
 

@@ -89,6 +89,8 @@ class SimulationDiverged(RuntimeError):
         self.cause, self.where, self.advice, self.retry, self.quantity = cause, str(where), advice, retry, quantity
         self.poses = where.poses if failed else {}
         self.good, self.failed, self.health = dict(good or {}), copies(failed or {}), health
+        self.possible = ""  # how far the motion can go, in words, where that is known: said first
+        self.depth: float | None = None  # that an indenter had reached in the untouched gel, of a press that failed [m]
         self.place = ""  # of the worst entry: which particle or node, where [mm]
         self.refine = 1  # the step was cut into so many at the last attempt
         self.dump: Path | None = None  # the folder that `tacsim debug` reads, if one was written
@@ -100,7 +102,9 @@ class SimulationDiverged(RuntimeError):
         dump = [self.no_dump] if self.no_dump else []
         if self.dump is not None:
             dump = [f"to look into it: tacsim debug {self.dump}"]
-        return "; ".join([f"simulation diverged: {self.cause}{at}", self.where, *steps, self.advice, *dump])
+        possible = [self.possible] if self.possible else []
+        cause = f"simulation diverged: {self.cause}{at}"
+        return "; ".join([*possible, cause, self.where, *steps, self.advice, *dump])
 
 
 def check_launch(

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NoReturn, Self
 
+import numpy as np
 from numpy.typing import NDArray
 
 from tacsim.interface import Pose
@@ -22,6 +23,7 @@ if TYPE_CHECKING:  # a device's kernels
     from tacsim.physics.worlds.survey import Survey
 
 RETRIES = 2  # each halves the time step
+POSSIBLE_SHARE = 0.9  # of how far a motion came that failed: an instability shows some launches after it began
 SMALLEST_CORNER = 0.0  # det F of a gel element at a corner: below, it is turned inside out
 NEW_WORLD = "restore a snapshot, or make a new world"
 
@@ -131,6 +133,7 @@ class BaseWorld(NotCopyable, ABC):
                 except BaseException:
                     self.restore(before)
                     raise
+        failure.possible = share_possible(self._poses, command.targets, failure.poses)
         failure.place = diagnosis.place_of_worst(failure.quantity, failure.good, failure.failed, self.scene.gel.size)
         dump.write_if_asked(self.scene, self._poses, command, before, failure)
         raise failure
@@ -148,3 +151,17 @@ class BaseWorld(NotCopyable, ABC):
             words = f"a gel element is turned inside out (volume ratio {corners.min():.3g} at a corner)"
             end = LaunchSpan("at the end of the motion and its hold", {**self._poses, **command.targets})
             raise SimulationDiverged(words, end, TORN, quantity="corner", failed=state)
+
+
+def share_possible(start: Mapping[str, Pose], targets: Mapping[str, Pose], failed: Mapping[str, Pose]) -> str:
+    """In words, how far a motion that failed with its frames at `failed` came, and what to ask for instead; empty where
+    that is not known, or where no frame is shifted."""
+    shifts = {name: float(np.linalg.norm(end.position - start[name].position)) for name, end in targets.items()}
+    name = max(shifts, key=shifts.__getitem__, default="")
+    if name not in failed or shifts[name] == 0.0:
+        return ""
+    came = min(float(np.linalg.norm(failed[name].position - start[name].position)), shifts[name])
+    return (
+        f"'{name}' came {came * 1e3:.3g} mm of the {shifts[name] * 1e3:.3g} mm that it was to move: ask for no more "
+        f"than about {POSSIBLE_SHARE * came * 1e3:.2g} mm from here"
+    )

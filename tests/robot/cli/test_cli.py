@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from itertools import pairwise
@@ -186,6 +187,35 @@ def test_press_measures_a_ball(tmp_path: Path) -> None:
     assert np.unravel_index(height.argmax(), height.shape) == pytest.approx((119.5, 159.5), abs=6)
     assert imread(tmp_path / "p" / "rgb.png").shape[:2] == (240, 320)
     assert imread(tmp_path / "p" / "height.png").shape[1] == 800
+
+
+def test_the_side_of_a_mesh_that_presses_is_said_shown_and_chosen(tmp_path: Path) -> None:
+    import trimesh
+
+    trimesh.creation.box((3.0, 4.0, 6.0)).export(tmp_path / "bar.stl")
+    press = ("press", "bar.stl", "--depth", "0.2 mm", "--preset", "draft")
+    lying = tacsim(*press, "--out", "lying")
+    assert lying.exit_code == 0, lying.output
+    assert "pressing side    -z of bar.stl, a flat face of 4 x 3 mm" in lying.stdout
+    turned = tacsim(*press, "--down", "+x", "--out", "turned")
+    assert "pressing side    +x of bar.stl, a flat face of 6 x 4 mm" in turned.stdout
+    rotated = tacsim(*press, "--rotation", "0, 90 deg, 0", "--out", "rotated")
+    force = [
+        json.loads((tmp_path / name / "press.json").read_text())["force"] for name in ("turned", "rotated", "lying")
+    ]
+    assert rotated.exit_code == 0 and force[0] == force[1] > 1.3 * force[2]
+    shown = [imread(tmp_path / name / "side.png") for name in ("lying", "turned")]
+    assert min(each.shape[1] for each in shown) > 800 and not np.array_equal(*(each[:200] for each in shown))
+    both = tacsim(*press, "--down", "+x", "--rotation", "0,0,0", "--out", "both")
+    assert both.exit_code == 2 and "give --down or --rotation, not both" in " ".join(both.stderr.split())
+
+
+def test_a_press_too_deep_says_first_what_is_possible(tmp_path: Path) -> None:
+    deep = tacsim("press", "sphere", "--depth", "3.9 mm", "--preset", "draft", "--out", "deep")
+    said = re.search(r"error: the gel cannot take 3\.9 mm of this indenter; ([\d.]+) mm is possible", deep.stderr)
+    assert deep.exit_code == 1 and said is not None
+    again = tacsim("press", "sphere", "--depth", f"{said[1]} mm", "--preset", "draft", "--out", "again")
+    assert again.exit_code == 0
 
 
 def test_press_slides_and_twists_against_friction(tmp_path: Path) -> None:

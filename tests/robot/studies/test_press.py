@@ -5,11 +5,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy import ndimage
+from scipy.spatial.transform import Rotation
 
-from robot.studies.press import UNFELT, PressMotion, PressResult, press, press_report
+from robot.studies.press import UNFELT, PressMotion, PressResult, deepest_possible, press, press_report
 from tacsim.config import load_sensor
+from tacsim.interface import Pose
 from tacsim.models.scene import Box, Cylinder, Gel, Indenter, Mesh, Scene, Shape, Sphere
 from tacsim.physics.failure.health import SimulationDiverged
+from tacsim.physics.worlds.press import PressWorld
 
 SENSOR = load_sensor("ideal")
 
@@ -84,3 +87,50 @@ def test_a_press_too_deep_for_the_gel_says_how_deep_it_came() -> None:
     came = float(str(error.value).split("; it had come ")[1].split()[0])
     assert 2.0 < came < 3.9
     pressed("draft", PressMotion(0.9 * came * 1e-3), Sphere(radius=4e-3))
+
+
+BAR = (3.0, 4.0, 6.0)  # [mm]
+
+
+@pytest.mark.parametrize(("angles", "size"), [({"pitch": 90.0}, (6, 4, 3)), ({"roll": -90.0, "yaw": 90.0}, (6, 3, 4))])
+def test_a_mesh_that_is_turned_presses_as_a_box_and_as_a_mesh_saved_turned(
+    angles: dict[str, float], size: tuple[float, float, float], tmp_path: Path
+) -> None:
+    import trimesh
+
+    bar = trimesh.creation.box(BAR)
+    bar.export(tmp_path / "bar.stl")
+    turned = Indenter.model_validate({name: f"{angle} deg" for name, angle in angles.items()})
+    bar.vertices = Rotation.from_quat(turned.turn).apply(bar.vertices)
+    bar.export(tmp_path / "turned.stl")
+    motion = PressMotion(0.4e-3)
+    radians = {name: float(np.radians(angle)) for name, angle in angles.items()}
+    force = {
+        "turned": pressed("draft", motion, Mesh(path=str(tmp_path / "bar.stl")), **radians)[1].wrench[2],
+        "saved turned": pressed("draft", motion, Mesh(path=str(tmp_path / "turned.stl")))[1].wrench[2],
+        "box": pressed("draft", motion, Box(size=tuple(1e-3 * side for side in size)), edge_radius=0.0)[1].wrench[2],
+        "as it lies": pressed("draft", motion, Mesh(path=str(tmp_path / "bar.stl")))[1].wrench[2],
+    }
+    assert force["turned"] == pytest.approx(force["saved turned"], rel=2e-3)
+    assert force["turned"] == pytest.approx(force["box"], rel=0.02)
+    assert abs(force["as it lies"] / force["turned"] - 1) > 0.2
+
+
+def test_a_depth_that_is_possible_is_found_for_one_that_is_not() -> None:
+    scene = Scene.model_validate({"body": None, "preset": "draft", "indenter": Indenter(geometry=Sphere(radius=4e-3))})
+    motion = PressMotion(3.9e-3)
+    with pytest.raises(SimulationDiverged) as failed:
+        press(scene, SENSOR, motion)
+    depth = deepest_possible(scene, motion, failed.value)
+    assert depth is not None and 2e-3 < depth < 3.9e-3
+    press(scene, SENSOR, PressMotion(depth))
+
+
+def test_a_move_that_fails_says_how_far_it_came() -> None:
+    scene = Scene.model_validate({"body": None, "preset": "draft", "indenter": Indenter(geometry=Sphere(radius=4e-3))})
+    world = PressWorld(scene)
+    start = world.pose("indenter")
+    with pytest.raises(SimulationDiverged, match=r"^'indenter' came (\d\.\d+) mm of the 3\.9 mm .* about") as failed:
+        world.move({"indenter": Pose(start.position - [0.0, 0.0, 3.9e-3], start.quaternion)})
+    possible = float(str(failed.value).split("no more than about ")[1].split()[0])
+    world.move({"indenter": Pose(start.position - [0.0, 0.0, 1e-3 * possible], start.quaternion)})

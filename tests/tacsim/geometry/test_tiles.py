@@ -154,3 +154,15 @@ def test_the_lowest_point_over_a_rectangle_is_that_of_the_edges_there(
     assert (np.abs(found[:2]) <= half + 1e-12).all()
     assert abs(distance(mesh, ((found - place) @ axes)[None])[0]) < 1e-9
     assert tiled.lowest(axes, place + [0.1, 0, 0], np.full(2, half)) is None
+
+
+def test_who_watches_is_told_how_far_a_mesh_is_measured(tmp_path: Path) -> None:
+    import trimesh
+
+    path = tmp_path / "ball.stl"
+    trimesh.creation.icosphere(2, 4.0).export(path)
+    mesh, told = tiled_distance(Mesh(path=str(path)), 0.2e-3), []
+    with watched_measuring(lambda *each: told.append(each)):
+        mesh.values(*mesh.around(-mesh.half, mesh.half))
+    number = len(told)
+    assert number > 1 and told == [(str(path), done, number) for done in range(number)]

@@ -144,6 +144,7 @@ class _Task:
 
     def __init__(self, kind: Kind, scene: str, options: Fitting, gel_error: float = 0.0) -> None:
         from tacsim.config import load_scene
+        from tacsim.config.load import say_side
 
         self.kind, self.options, self.gel_error = kind, options, gel_error
         self.wanted = [] if options.fit is None else [name.strip() for name in options.fit.split(",")]
@@ -153,6 +154,8 @@ class _Task:
             raise typer.BadParameter(f"scene '{self.scene.name}' has not {needs}", param_hint="--scene")
         if self.scene.physics == "seed":
             raise typer.BadParameter("physics 'seed' cannot be identified; use 'hybrid'", param_hint="--set")
+        for words in say_side(self.scene):
+            notes.print(words, markup=False)
 
     def run(self, sources: list[Path], indenter: Pose | None = None, balls: Mapping[str, float] | None = None) -> None:
         options = self.options

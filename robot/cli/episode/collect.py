@@ -114,6 +114,7 @@ def press(
         from robot.collect.presses import PressJob, PressSet
         from tacsim.config import load_scene, load_sensor
         from tacsim.config.gel import fit_gel, says_gel_size
+        from tacsim.geometry.pressing_side import pressing_side
 
         known, files = find_objects(objects, scale)
         model = load_sensor(sensor).model_copy(update={"view": None})
@@ -130,6 +131,9 @@ def press(
             PressSet, seed=seed, objects=known, scene=scene, sensor=model, depth=depth[:2], pose=pose,
             tilt=tilt[:2] if pose == "random" else (0.0, 0.0), shear=shear[:2], twist=twist[:2],
         )  # fmt: skip
+    if files and scene.indenter is not None:
+        name = pressing_side(scene.indenter).name
+        said = [*said, f"pressing side of each mesh: {name}; --set indenter.roll and indenter.pitch choose another"]
     for words in said:
         notes.print(words, markup=False)
     command = _command("press", given)

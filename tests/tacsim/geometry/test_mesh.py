@@ -11,7 +11,7 @@ import pytest
 import trimesh
 
 from tacsim.geometry import mesh as room
-from tacsim.geometry.mesh import load_mesh
+from tacsim.geometry.mesh import load_mesh, make_surface, signed_distance, signed_distance_on_grid
 
 BOX = trimesh.creation.box((3, 5, 2))
 BINARY: bytes = BOX.export(file_type="stl")

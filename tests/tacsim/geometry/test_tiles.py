@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from tacsim.geometry import tiles
 from tacsim.geometry.mesh import fingerprint, signed_distance_on_grid
 from tacsim.geometry.shapes import distance
-from tacsim.geometry.tiles import TILE, TiledDistance, share_tiles, tiled_distance, trilinear
+from tacsim.geometry.tiles import TILE, TiledDistance, share_tiles, tiled_distance, trilinear, watched_measuring
 from tacsim.models.scene import Mesh
 
 SPACING = 0.1e-3

@@ -93,10 +93,10 @@ def press(scene: Scene, sensor: SensorModel, motion: PressMotion, render: Render
             unfollowed = world.unfollowed or unfollowed
     except SimulationDiverged as error:
         if error.poses:
-            error.depth = below - float(se3.relative(error.poses["lower"], error.poses["indenter"]).position[2])
-            came = f"it had come {error.depth * 1e3:.3g} mm deep, of {motion.depth * 1e3:.3g} mm"
-            error.advice += f"; {came}"
-            error.possible = "" if not moves else error.possible  # words on a shift from where it waits say nothing
+            came = below - float(se3.relative(error.poses["lower"], error.poses["indenter"]).position[2])
+            error.advice += f"; it had come {came * 1e3:.3g} mm deep, of {motion.depth * 1e3:.3g} mm"
+            if not moves:  # it was the depth; a shift from where the indenter waits says less
+                error.depth, error.possible = came, ""
         raise
     surface = world.surface("lower")
     seen = sample_surface(surface, image_grid(sensor.geometry))
@@ -120,9 +120,9 @@ def press(scene: Scene, sensor: SensorModel, motion: PressMotion, render: Render
 def deepest_possible(scene: Scene, motion: PressMotion, failure: SimulationDiverged) -> float | None:
     """A depth [m] that this press reaches, found by pressing again less deep than where it failed; None where the
     failure was no matter of depth, or MAX_TRIALS found none."""
-    if failure.depth is None or not failure.retry or failure.depth > motion.depth * (1 - 1e-6):
+    if failure.depth is None or not failure.retry:
         return None
-    depth = failure.depth
+    depth = min(failure.depth, motion.depth)
     with dumps_in(None):
         for _ in range(MAX_TRIALS):
             depth = _rounded_down(POSSIBLE_SHARE * depth)

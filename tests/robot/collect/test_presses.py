@@ -22,6 +22,7 @@ from tacsim import pose as se3
 from tacsim.config import load_scene, load_sensor
 from tacsim.geometry.mesh import load_mesh
 from tacsim.geometry.shapes import distance
+from tacsim.interface import Pose
 from tacsim.models.scene import Mesh, Scene, Sphere
 from tacsim.optics.markers import rest_positions
 from tests.robot.collect.small import job, rows, settings
@@ -67,6 +68,18 @@ def test_pose_depth_and_contact_agree(tmp_path: Path) -> None:
     assert np.median(np.abs(distance(sphere, points))) < 0.02e-3
     assert np.linalg.norm(grid[contact].mean(axis=0) - row["position"][:2]) < 0.1e-3
     assert row["contact_area"] == pytest.approx(contact.sum() * 0.0625e-3**2)
+
+
+@pytest.mark.parametrize("pose", ["random", "centred"])
+def test_the_side_that_presses_is_that_of_the_scene(pose: str) -> None:
+    scene = load_scene("press", ["preset=draft", "indenter.roll=180 deg"])
+    made = settings(scene=scene, pose=pose, tilt=(0.0, np.radians(5.0) if pose == "random" else 0.0))
+    for index in range(4):
+        _, placed, motion = made.placed(index)
+        assert placed.indenter is not None
+        turn = placed.indenter.turn if motion.turn is None else motion.turn
+        own_z = se3.rotate(Pose(quaternion=turn), [0.0, 0.0, 1.0])
+        assert own_z[2] < -np.cos(np.radians(5.01))
 
 
 def test_flow_is_told_on_the_lattice_that_the_card_names(folder: Path) -> None:

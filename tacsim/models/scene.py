@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self, cast
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from tacsim.models.quantity import Acceleration, Angle, Config, Density, Length, Pressure
 
@@ -17,6 +17,7 @@ Modulus = Annotated[Pressure, Field(ge=1.0, le=1e12)]  # from a foam of liquid t
 MassDensity = Annotated[Density, Field(ge=1.0, le=1e5)]  # from an aerogel to beyond osmium [kg/m^3]
 Size3 = tuple[Annotated[Length, Field(gt=0)], Annotated[Length, Field(gt=0)], Annotated[Length, Field(gt=0)]]
 Along = Annotated[Acceleration, Field(ge=-1e5, le=1e5)]  # one axis [m/s^2]
+SensorName = Literal["lower", "upper"]
 PoissonRatio = Annotated[float, Field(ge=0.0, le=0.499)]
 
 Preset = Literal["learn", "draft", "standard"]
@@ -110,6 +111,41 @@ class Gel(Config):
     size: Size3 = (20e-3, 20e-3, 4e-3)  # x, y, thickness [m]
     material: GelMaterial = GelMaterial()
     housing: Annotated[Length, Field(ge=0)] | None = 0.3e-3  # None: no housing
+
+
+class GelOverride(Config):
+    """What one sensor's gel has of its own; what is not given here is as in the scene's `gel`."""
+
+    size: Size3 | None = None  # x, y, thickness [m]
+    material: GelMaterial | None = None  # of a material only the keys that are given
+    housing: Annotated[Length, Field(ge=0)] | None = None  # given as None: no housing
+    element_size: Annotated[Length, Field(gt=0)] | None = None  # overrides the scene's [m]
+
+    def apply_to(self, gel: Gel) -> Gel:
+        """`gel` with what is given here in place of its own."""
+        change: dict[str, Any] = {}
+        if self.size is not None:
+            change["size"] = self.size
+        if self.material is not None:
+            given = {key: getattr(self.material, key) for key in self.material.model_fields_set}
+            change["material"] = gel.material.model_copy(update=given)
+        if "housing" in self.model_fields_set:
+            change["housing"] = self.housing
+        return gel.model_copy(update=change)
+
+    @model_serializer(mode="wrap")
+    def _given_alone(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """What is not given must not be written: read again, it would count as given."""
+        whole = serialize(self)
+        if self.material is not None:
+            whole["material"] = {key: whole["material"][key] for key in self.material.model_fields_set}
+        return {key: value for key, value in whole.items() if key in self.model_fields_set}
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, GelOverride) and self.model_dump() == other.model_dump()
+
+    def __hash__(self) -> int:
+        return hash(self.model_dump_json())
 
 
 class Box(Config):
@@ -218,10 +254,11 @@ class Scene(Config):
     preset: Preset = "draft"
     particle_spacing: Annotated[Length, Field(gt=0)] | None = None  # overrides the preset
     element_size: Annotated[Length, Field(gt=0)] | None = None  # overrides the preset
-    gel: Gel = Gel()
+    gel: Gel = Gel()  # of every sensor
+    gels: dict[SensorName, GelOverride] = {}  # where one differs
     body: Body | None = Body()
     indenter: Indenter | None = None
-    friction: dict[Literal["lower", "upper"], Annotated[float, Field(ge=0, le=5)]] = {"lower": 0.6, "upper": 0.6}
+    friction: dict[SensorName, Annotated[float, Field(ge=0, le=5)]] = {"lower": 0.6, "upper": 0.6}
     gravity: tuple[Along, Along, Along] = (0.0, 0.0, 0.0)  # world axes [m/s^2]; acts on the body
     settling: Settling = Settling()
 
@@ -232,6 +269,9 @@ class Scene(Config):
         hardens = self.body is not None and self.body.material.hardening_modulus > 0
         asked = {"rigid indenter": self.indenter is not None, "hardening": hardens, "gravity": any(self.gravity)}
         lacking = [what for what, wanted in asked.items() if wanted]
+        if self.gels and (self.physics == "seed" or self.indenter is not None):
+            which = "an indenter presses the gel 'lower' alone" if self.indenter else "physics 'seed' has one gel for both"
+            raise ValueError(f"gels: {which}; write what is in gels.{next(iter(self.gels))} into gel, leave out gels")
         if self.physics == "seed" and lacking:
             raise ValueError(f"physics 'seed' has no {lacking[0]}; use physics 'hybrid'")
         if any(self.gravity) and self.body is None:
@@ -244,20 +284,27 @@ class Scene(Config):
     @model_validator(mode="after")
     def _resolvable(self) -> Self:
         """Each gel gets at least two layers of elements, and no more cells than a machine has memory for."""
-        name, edge = ("particle_spacing", self.spacing) if self.physics == "seed" else ("element_size", self.element)
-        edge = min(edge, self.gel.size[2] / 2)  # a thin gel is resolved finer than its preset
-        cells = math.prod(side / edge for side in self.gel.size)
+        for name in self.sensors:
+            self._require_resolvable(name)
+        return self
+
+    def _require_resolvable(self, sensor: str) -> None:
+        size, own = self.gel_of(sensor).size, self.gels.get(cast(SensorName, sensor), GelOverride())
+        name, edge = ("particle_spacing", self.spacing) if self.physics == "seed" else (
+            "element_size", self.element_of(sensor))
+        edge = min(edge, size[2] / 2)  # a thin gel is resolved finer than its preset
+        cells, of = math.prod(side / edge for side in size), f" of sensor '{sensor}'" if sensor in self.gels else ""
         if cells > MAX_CELLS:
             raise ValueError(
-                f"a gel of {' x '.join(f'{side:g}' for side in self.gel.size)} m has {cells:.3g} cells at "
+                f"a gel{of} of {' x '.join(f'{side:g}' for side in size)} m has {cells:.3g} cells at "
                 f"{name} {edge:g} m, the limit is {MAX_CELLS:,}; choose a larger {name} or a smaller gel"
             )
-        if self.element_size is not None and self.element_size > self.gel.size[2] / 2 * (1 + 1e-9):
+        given = self.element_size if own.element_size is None else own.element_size
+        if given is not None and given > size[2] / 2 * (1 + 1e-9):
             raise ValueError(
-                f"element_size {self.element_size:g} m is too coarse for a gel {self.gel.size[2]:g} m thick: it needs "
-                f"two layers of elements; choose at most {self.gel.size[2] / 2:g} m"
+                f"element_size {given:g} m is too coarse for a gel{of} {size[2]:g} m thick: it needs "
+                f"two layers of elements; choose at most {size[2] / 2:g} m"
             )
-        return self
 
     @model_validator(mode="after")
     def _followable(self) -> Self:
@@ -295,10 +342,15 @@ class Scene(Config):
         if self.settling.mach is not None:
             return self.settling.mach
         if not math.isfinite(self._mach_by_stress):
-            mu, lam = lame(self.gel.material)
-            return min(FASTEST_MACH, MACH_BY_SHEAR * math.sqrt(mu / (lam + 2 * mu)))
+            slowest = min(math.sqrt(mu / (lam + 2 * mu)) for mu, lam in self._gel_moduli)
+            return min(FASTEST_MACH, MACH_BY_SHEAR * slowest)
         by_tolerance = self._lighter * MACH_BY_TOLERANCE * self.settling.tolerance
         return min(max(by_tolerance, SLOWEST_MACH), self.fastest_mach)
+
+    @property
+    def _gel_moduli(self) -> list[tuple[float, float]]:
+        """Lamé constants of each gel [Pa]."""
+        return [lame(self.gel_of(name).material) for name in self.sensors]
 
     @property
     def fastest_mach(self) -> float:
@@ -335,10 +387,20 @@ class Scene(Config):
         """Edge of a gel element h_g [m]."""
         return PRESETS[self.preset][1] if self.element_size is None else self.element_size
 
-    @property
-    def gel_element(self) -> float:
+    def gel_of(self, sensor: str) -> Gel:
+        """The gel of a sensor: `gel` with what `gels` gives this sensor of its own."""
+        own = self.gels.get(cast(SensorName, sensor))
+        return self.gel if own is None else own.apply_to(self.gel)
+
+    def element_of(self, sensor: str) -> float:
+        """Edge of an element of a sensor's gel [m], before its thickness is divided into whole layers."""
+        own = self.gels.get(cast(SensorName, sensor))
+        return self.element if own is None or own.element_size is None else own.element_size
+
+    def gel_element(self, sensor: str) -> float:
         """The same as the gel's thickness allows: whole layers, two at least [m]."""
-        return self.gel.size[2] / max(2, round(self.gel.size[2] / self.element))
+        thickness = self.gel_of(sensor).size[2]
+        return thickness / max(2, round(thickness / self.element_of(sensor)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

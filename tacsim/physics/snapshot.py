@@ -11,6 +11,19 @@ from numpy.typing import NDArray
 from tacsim.interface import Pose
 
 State = Mapping[str, NDArray[Any]]  # arrays by name, in kernel units [mm, wave speed 1]
+SENSORS = ("lower", "upper")  # gels by index
+
+
+def gel_suffixes(groups: int) -> tuple[str, ...]:
+    """What follows the name of an array of gels: nothing where one array (gels, ...) holds all of them, which are then
+    cut alike; else each has an array (1, ...) of its own."""
+    return ("",) if groups == 1 else tuple(f"_{sensor}" for sensor in SENSORS)
+
+
+def gel_arrays(state: State, name: str) -> dict[int, NDArray[Any]]:
+    """The arrays of gels in a state that are called `name`, by the index of the first gel in each."""
+    found = {0: state[name]} if name in state else {}
+    return found | {g: state[f"{name}_{s}"] for g, s in enumerate(SENSORS) if f"{name}_{s}" in state}
 
 
 class Kept(Mapping[str, NDArray[Any]]):

@@ -87,12 +87,13 @@ class Stage:
 def require_same_gels(scene: Scene, other: Scene) -> None:
     """Raises ValueError where a rig cannot go from one scene to the other: sensors see one gel, and a batch has one
     lattice."""
-    kept = {
+    kept: dict[str, tuple[object, object]] = {
         "physics": (scene.physics, other.physics),
-        "gel.size [m]": (scene.gel.size, other.gel.size),
-        "the size of gel elements [m]": (scene.element, other.element),
         "a body": (scene.body is not None, other.body is not None),
     }
+    for name in scene.sensors:
+        kept[f"gel.size of sensor '{name}' [m]"] = scene.gel_of(name).size, other.gel_of(name).size
+        kept[f"the size of elements of the gel of '{name}' [m]"] = scene.element_of(name), other.element_of(name)
     for what, (now, new) in kept.items():
         if now != new:
             raise ValueError(f"a new scene must keep {what} of the rig's: {now}, got {new}; open another rig for it")

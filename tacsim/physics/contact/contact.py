@@ -13,7 +13,7 @@ from tacsim.compute.runtime import ti
 from tacsim.physics.exec import layout
 from tacsim.physics.exec.environment import record_more, record_most
 from tacsim.physics.exec.lanes import ON_DEVICE, add_four, filled, slot_of, vec2, vec3, vec4
-from tacsim.physics.gel.kernels import surface_at, surface_row
+from tacsim.physics.gel.kernels import surface_at
 
 ContactHistory = ti.types.vector(6, ti.f32)  # what contact remembers of a particle and a gel
 
@@ -35,7 +35,7 @@ def spline(a):
 
 
 @ti.func
-def surface_sum(gels: ti.template(), row, i, j, wx, wy):
+def surface_sum(gel: ti.template(), row, i, j, wx, wy):
     """Sum over the 3 x 3 nodes of a stencil from (i, j) on, weighted by wx and wy; row: the quantity's first.
 
     A loop over the four numbers of a node, of which a CPU makes vectors; all four nodes' first numbers at once would be
@@ -44,27 +44,27 @@ def surface_sum(gels: ti.template(), row, i, j, wx, wy):
     if ti.static(ON_DEVICE):
         total = vec4(0.0)
         for p, q in ti.static(ti.ndrange(3, 3)):
-            at = surface_at(gels, row + i + p + 1, j + q + 1)
-            total += (wx[p] * wy[q]) * vec4([gels.surface[at + c] for c in range(4)])
+            at = surface_at(gel, row + i + p + 1, j + q + 1)
+            total += (wx[p] * wy[q]) * vec4([gel.surface[at + c] for c in range(4)])
         return total
     else:
         sums = filled(0.0, 4, 1)
         for c in range(4):
             total = 0.0
             for p, q in ti.static(ti.ndrange(3, 3)):
-                total += (wx[p] * wy[q]) * gels.surface[surface_at(gels, row + i + p + 1, j + q + 1) + c]
+                total += (wx[p] * wy[q]) * gel.surface[surface_at(gel, row + i + p + 1, j + q + 1) + c]
             sums[c, 0] = total
         return vec4([sums[c, 0] for c in range(4)])
 
 
 @ti.func
-def surface_sums(gels: ti.template(), row, i, j, wx, wy, dx, dy):
+def surface_sums(gel: ti.template(), row, i, j, wx, wy, dx, dy):
     """The same sum, with the weights' derivatives by x, and by y."""
     if ti.static(ON_DEVICE):
         return (
-            surface_sum(gels, row, i, j, wx, wy),
-            surface_sum(gels, row, i, j, dx, wy),
-            surface_sum(gels, row, i, j, wx, dy),
+            surface_sum(gel, row, i, j, wx, wy),
+            surface_sum(gel, row, i, j, dx, wy),
+            surface_sum(gel, row, i, j, wx, dy),
         )
     else:
         sums = filled(0.0, 3, 4)
@@ -72,7 +72,7 @@ def surface_sums(gels: ti.template(), row, i, j, wx, wy, dx, dy):
             value, by_x, by_y = 0.0, 0.0, 0.0
             for p in ti.static(range(3)):
                 first, second, third = [
-                    gels.surface[surface_at(gels, row + i + p + 1, j + q + 1) + c] for q in range(3)
+                    gel.surface[surface_at(gel, row + i + p + 1, j + q + 1) + c] for q in range(3)
                 ]
                 line = wy[0] * first + wy[1] * second + wy[2] * third
                 value += wx[p] * line
@@ -143,9 +143,9 @@ def cling(anchor, under, t1, t2, vt, limit, k_t, c_t):
 
 
 @ti.func
-def surface_node(gels: ti.template(), i, j):
+def surface_node(gel: ti.template(), i, j):
     """Index of the surface node (i, j) in a layer's row, repeated beyond the rim."""
-    return ti.max(0, ti.min(i, gels.nx)) * (gels.ny + 1) + ti.max(0, ti.min(j, gels.ny))
+    return ti.max(0, ti.min(i, gel.nx)) * (gel.ny + 1) + ti.max(0, ti.min(j, gel.ny))
 
 
 @ti.func
@@ -162,38 +162,37 @@ def support_radius(plane, spacing):
 
 
 @ti.func
-def contact_ceiling(env: ti.template(), gels: ti.template(), g):
+def contact_ceiling(gel: ti.template()):
     """Height of the highest surface node [mm], at least 0: the spline stays below it, so nothing above it touches."""
-    row, highest = surface_row(env, gels, g), 0.0
-    for i in range(1, gels.nx + 2):
-        for j in range(1, gels.ny + 2):
-            height = gels.surface[surface_at(gels, row + i, j) + 2]
+    highest = 0.0
+    for i in range(1, gel.nx + 2):
+        for j in range(1, gel.ny + 2):
+            height = gel.surface[surface_at(gel, i, j) + 2]
             highest = ti.select(height > highest, height, highest)
     return highest
 
 
 @ti.func
-def highest_near(gels: ti.template(), row, i, j):
+def highest_near(gel: ti.template(), i, j):
     """Height of the highest of the 3 x 3 nodes of a stencil from (i, j) on [mm]."""
-    highest = gels.surface[surface_at(gels, row + i + 1, j + 1) + 2]
+    highest = gel.surface[surface_at(gel, i + 1, j + 1) + 2]
     for p, q in ti.static(ti.ndrange(3, 3)):
-        highest = ti.max(highest, gels.surface[surface_at(gels, row + i + p + 1, j + q + 1) + 2])
+        highest = ti.max(highest, gel.surface[surface_at(gel, i + p + 1, j + q + 1) + 2])
     return highest
 
 
 @ti.func
-def particle_contact(env: ti.template(), part, g, x, v, history, radius, gels: ti.template(), row, forces):
-    """Force on one particle from gel g (or its housing); all in the sensor frame. The opposite acts on the gel's nodes.
+def particle_contact(env: ti.template(), part, x, v, history, radius, gel: ti.template(), forces):
+    """Force on one particle from a gel (or its housing); all in the sensor frame. The opposite acts on the gel's nodes.
 
     x, v: position, and velocity relative to the moving sensor. history: its anchor on the untouched gel or on the
     housing [mm], and on which of these; the remembered normal force as the overlap whose penalty it equals [mm]; how
-    far the gel under it has moved aside [mm]. row: the gel's first in `surface`; forces: where those on its nodes
-    begin. Returns whether it touches, whether it touches the housing, the force, and the new history.
+    far the gel under it has moved aside [mm]. forces: where those on its nodes begin. Returns whether it touches, whether it touches the housing, the force, and the new history.
     """
-    h, k_n, dt = env.param(layout.GEL_SPACING), env.param(layout.STIFFNESS), env.param(layout.STEP)
-    mu, housing = env.param(layout.FRICTION + g), env.param(layout.HOUSING)
+    h, k_n, dt = env.param(layout.GEL_SPACING + gel.index), env.param(layout.STIFFNESS + gel.index), env.param(layout.STEP)
+    mu, housing = env.param(layout.FRICTION + gel.index), env.param(layout.HOUSING + gel.index)
     deepest = env.param(layout.BODY_CELL)  # two particle spacings: the largest overlap answered in full
-    nx, ny, layers = gels.nx, gels.ny, gels.layers
+    nx, ny, layers = gel.nx, gel.ny, gel.layers
     in_contact, housed = False, False
     force = vec3(0.0)
     anchor, holder = vec2(history[0], history[1]), history[2]
@@ -211,8 +210,8 @@ def particle_contact(env: ti.template(), part, g, x, v, history, radius, gels: t
         moved = vec2(history[4], history[5])
         # most particles near the gel lie behind others: its nodes are lower. Where it ends, the housing counts.
         ends = i < 0 or j < 0 or i + 2 > nx or j + 2 > ny
-        if ends or x[2] < highest_near(gels, row, i, j) + radius + 0.25 * deepest:
-            us, t1, t2 = surface_sums(gels, row, i, j, wx, wy, dx / h, dy / h)
+        if ends or x[2] < highest_near(gel, i, j) + radius + 0.25 * deepest:
+            us, t1, t2 = surface_sums(gel, 0, i, j, wx, wy, dx / h, dy / h)
             t1[0] += 1.0
             t2[1] += 1.0
             step = newton_step(t1, t2, start - a - vec2(us[0], us[1]) / h)
@@ -222,7 +221,7 @@ def particle_contact(env: ti.template(), part, g, x, v, history, radius, gels: t
             if inside:
                 depth = us[2] + h * (step[0] * t1[2] + step[1] * t2[2]) + radius - x[2]
                 if k_n * depth + pressed > 0.0:
-                    vs = surface_sum(gels, row + nx + 3, i, j, wx, wy)
+                    vs = surface_sum(gel, nx + 3, i, j, wx, wy)
                     e1, e2 = vec3(t1[0], t1[1], t1[2]), vec3(t2[0], t2[1], t2[2])
                     n = e1.cross(e2).normalized()
                     gap = depth * n[2]  # overlap; negative where they have parted
@@ -241,8 +240,8 @@ def particle_contact(env: ti.template(), part, g, x, v, history, radius, gels: t
                     overlap = gap
                     back = vec4(force[0], force[1], force[2], 0.0)
                     for p, q in ti.static(ti.ndrange(3, 3)):
-                        node = surface_node(gels, i + p, j + q)
-                        add_four(gels.contact_force, forces + 4 * node, -(wx[p] * wy[q]) * back)
+                        node = surface_node(gel, i + p, j + q)
+                        add_four(gel.contact_force, forces + 4 * node, -(wx[p] * wy[q]) * back)
             elif housing >= 0.0:
                 gap = radius - housing - x[2]
                 if k_n * gap + pressed > 0.0:

@@ -26,7 +26,7 @@ from tacsim.physics.exec.lanes import (
     vec4,
 )
 from tacsim.physics.exec.team import once_if
-from tacsim.physics.gel.kernels import contact_force_start, surface_at, surface_row
+from tacsim.physics.gel.kernels import contact_force_start, surface_at
 
 Anchor = ti.types.ndarray(dtype=vec3, ndim=3)  # of the quadrature points, on the indenter, in its own axes [mm]
 Pressure = ti.types.ndarray(dtype=ti.f32, ndim=3)
@@ -103,17 +103,17 @@ def by_weights(values: ti.template(), weights: ti.template()):
 
 
 @ti.func
-def patch_sum(gels: ti.template(), row, i, j, wx, wy):
+def patch_sum(gel: ti.template(), row, i, j, wx, wy):
     """Sum of a surface quantity over the 4 x 4 nodes round cell (i, j); row: the quantity's first."""
     total = vec4(0.0)
     for p, q in ti.static(ti.ndrange(4, 4)):
-        at = surface_at(gels, row + i + p, j + q)
-        total += (wx[p] * wy[q]) * vec4([gels.surface[at + c] for c in range(4)])
+        at = surface_at(gel, row + i + p, j + q)
+        total += (wx[p] * wy[q]) * vec4([gel.surface[at + c] for c in range(4)])
     return total
 
 
 @ti.func
-def patch_sums(gels: ti.template(), row, i, j, points: ti.template()):
+def patch_sums(gel: ti.template(), i, j, points: ti.template()):
     """The same at all points of a cell, of both quantities, into `points` (2 x 9, 4): along one axis, then the other.
 
     Each node is read once. A loop over its four numbers, as in `surface_sum`.
@@ -121,7 +121,7 @@ def patch_sums(gels: ti.template(), row, i, j, points: ti.template()):
     for quantity in range(2):
         for c in range(4):
             nodes = [
-                [gels.surface[surface_at(gels, row + quantity * (gels.nx + 3) + i + p, j + q) + c] for q in range(4)]
+                [gel.surface[surface_at(gel, quantity * (gel.nx + 3) + i + p, j + q) + c] for q in range(4)]
                 for p in range(4)
             ]
             for y in ti.static(range(POINTS)):
@@ -132,7 +132,7 @@ def patch_sums(gels: ti.template(), row, i, j, points: ti.template()):
 
 
 @ti.func
-def hand_on(gels: ti.template(), forces, i, j, pushes: ti.template()):
+def hand_on(gel: ti.template(), forces, i, j, pushes: ti.template()):
     """Adds what the points of cell (i, j) push, `pushes` (9, 4), to its 4 x 4 nodes: the other way round."""
     nodes = filled(0.0, 16, 4)
     for c in range(4):
@@ -142,34 +142,34 @@ def hand_on(gels: ti.template(), forces, i, j, pushes: ti.template()):
             for p in ti.static(range(4)):
                 nodes[4 * p + q, c] = by_weights(line, ti.static(WEIGHTS_OF_NODES[p]))
     for p, q in ti.static(ti.ndrange(4, 4)):
-        node = surface_node(gels, i + p - 1, j + q - 1)
-        add_four(gels.contact_force, forces + 4 * node, vec4([nodes[4 * p + q, c] for c in range(4)]))
+        node = surface_node(gel, i + p - 1, j + q - 1)
+        add_four(gel.contact_force, forces + 4 * node, vec4([nodes[4 * p + q, c] for c in range(4)]))
 
 
 @ti.func
-def carry(env: ti.template(), part, gels: ti.template()):
+def carry(env: ti.template(), part, gel: ti.template()):
     """Nodes take over a share of the pressure on them: this part's; on a device a part is one node."""
-    row = gels.ny + 1
-    count, h = (gels.nx + 1) * row, env.param(layout.GEL_SPACING)
+    row = gel.ny + 1
+    count, h = (gel.nx + 1) * row, env.param(layout.GEL_SPACING)
     blocks = (count + LANES - 1) // LANES
     first, last = part_range(blocks, part)
-    first_row, least = surface_row(env, gels, 0), FORGOTTEN * env.param(layout.GEL_MU)
+    least = FORGOTTEN * env.param(layout.GEL_MU)
     i, j = first * LANES // row, first * LANES % row
     for node in range(first * LANES, ti.min(last * LANES, count)):
         total = 0.0
         for copy in ti.static(range(COPIES)):
-            total += gels.contact_force[contact_force_start(env, gels, copy, 0) + 4 * node + 3]
-        at = surface_at(gels, first_row + i + 1, j + 1) + 3
-        old = gels.surface[at]
+            total += gel.contact_force[contact_force_start(gel, copy) + 4 * node + 3]
+        at = surface_at(gel, i + 1, j + 1) + 3
+        old = gel.surface[at]
         if total != 0.0 or old != 0.0:
             area = h * h
-            if i == 0 or i == gels.nx:
+            if i == 0 or i == gel.nx:
                 area *= 0.5
-            if j == 0 or j == gels.ny:
+            if j == 0 or j == gel.ny:
                 area *= 0.5
             # what hardly presses any more is let go of, not halved for ever
             new = old + MEMORY_RATE * (total / area - old)
-            gels.surface[at] = ti.select(total == 0.0 and new < least, 0.0, new)
+            gel.surface[at] = ti.select(total == 0.0 and new < least, 0.0, new)
         j += 1
         if j == row:
             i, j = i + 1, 0
@@ -189,7 +189,7 @@ def shape_of(env: ti.template(), it, drive: ti.template(), indenter: ti.template
 
 
 @ti.func
-def clearance(env: ti.template(), gels: ti.template(), row, i, j, shape: ti.template()):
+def clearance(env: ti.template(), gel: ti.template(), i, j, shape: ti.template()):
     """How much farther than TOUCHABLE all points of cell (i, j) are from the indenter, at least [mm].
 
     Nine points a cell, few of them near the indenter: its distance from the cell's middle decides; of a mesh, whose
@@ -198,9 +198,9 @@ def clearance(env: ti.template(), gels: ti.template(), row, i, j, shape: ti.temp
     h = env.param(layout.GEL_SPACING)
     middle = vec3(0.0)
     for p, q in ti.static(ti.ndrange(2, 2)):
-        node = surface_at(gels, row + i + p + 1, j + q + 1)
-        middle += 0.25 * vec3([gels.surface[node + c] for c in range(3)])
-    at = vec3((i + 0.5 - 0.5 * gels.nx) * h, (j + 0.5 - 0.5 * gels.ny) * h, 0.0)
+        node = surface_at(gel, i + p + 1, j + q + 1)
+        middle += 0.25 * vec3([gel.surface[node + c] for c in range(3)])
+    at = vec3((i + 0.5 - 0.5 * gel.nx) * h, (j + 0.5 - 0.5 * gel.ny) * h, 0.0)
     at += middle
     far, y = 0.0, shape.rotate.transpose() @ (at - shape.centre)
     if shape.kind == GRID:
@@ -210,8 +210,8 @@ def clearance(env: ti.template(), gels: ti.template(), row, i, j, shape: ti.temp
     # how far its points can lie from its middle
     reach = 0.0
     for p, q in ti.static(ti.ndrange(2, 2)):
-        node = surface_at(gels, row + i + p + 1, j + q + 1)
-        corner = vec3([gels.surface[node + c] for c in range(3)]) - middle
+        node = surface_at(gel, i + p + 1, j + q + 1)
+        corner = vec3([gel.surface[node + c] for c in range(3)]) - middle
         reach = ti.max(reach, (corner + h * vec3(p - 0.5, q - 0.5, 0.0)).norm_sqr())
     return far - ti.sqrt(reach) - TOUCHABLE * h
 
@@ -224,7 +224,7 @@ def forget(env: ti.template(), indenter: ti.template(), i, j):
 
 
 @ti.func
-def point_push(env: ti.template(), gels: ti.template(), indenter: ti.template(), shape: ti.template(), i, j, x, us, vs):
+def point_push(env: ti.template(), gel: ti.template(), indenter: ti.template(), shape: ti.template(), i, j, x, us, vs):
     """What the indenter does to the gel at the quadrature point (i, j), which is at x: whether it touches, force and
     pressure times area as a vector of four [N], overlap [mm].
 
@@ -265,15 +265,15 @@ def point_push(env: ti.template(), gels: ti.template(), indenter: ti.template(),
 
 
 @ti.func
-def indent(env: ti.template(), part, it, drive: ti.template(), gels: ti.template(), indenter: ti.template()):
-    """Contact of the indenter with this part's cells of gel 0. Notes its force and moment on the sensor, sensor axes.
+def indent(env: ti.template(), part, it, drive: ti.template(), gel: ti.template(), indenter: ti.template()):
+    """Contact of the indenter with this part's cells of the gel. Notes its force and moment on the sensor, sensor axes.
 
     drive: pose and velocity of the indenter in the sensor frame.
     """
-    nx, ny, h = gels.nx, gels.ny, env.param(layout.GEL_SPACING)
+    nx, ny, h = gel.nx, gel.ny, env.param(layout.GEL_SPACING)
     shape = ti.static(shape_of(env, it, drive, indenter))
     total, moment, deepest = vec3(0.0), vec3(0.0), 0.0
-    row, forces = surface_row(env, gels, 0), contact_force_start(env, gels, copy_of(part), 0)
+    forces = contact_force_start(gel, copy_of(part))
     first_cell, last_cell, low, high = 0, 0, 0, ny
     points = filled(0.0, 2 * POINTS * POINTS, 4)  # of one cell: what its points feel, and what they push
     pushes = filled(0.0, POINTS * POINTS, 4)
@@ -284,28 +284,28 @@ def indent(env: ti.template(), part, it, drive: ti.template(), gels: ti.template
         first_cell, last_cell = part_range(nx, part)
     for cell_i in range(first_cell, last_cell):
         for cell_j in range(low, high):
-            spare = clearance(env, gels, row, cell_i, cell_j, shape)
+            spare = clearance(env, gel, cell_i, cell_j, shape)
             if spare > 0.0:
                 if spare < MARGIN * h:
                     for p, q in ti.static(ti.ndrange(POINTS, POINTS)):
                         forget(env, indenter, cell_i * POINTS + p, cell_j * POINTS + q)
             else:
                 if ti.static(not ON_DEVICE):
-                    patch_sums(gels, row, cell_i, cell_j, points)
+                    patch_sums(gel, cell_i, cell_j, points)
                 pushed = False
                 for point in range(POINTS * POINTS):
                     i, j = cell_i * POINTS + point // POINTS, cell_j * POINTS + point % POINTS
                     wx, wy = weights_of(point // POINTS), weights_of(point % POINTS)
                     us, vs = vec4(0.0), vec4(0.0)
                     if ti.static(ON_DEVICE):
-                        us = patch_sum(gels, row, cell_i, cell_j, wx, wy)
-                        vs = patch_sum(gels, row + nx + 3, cell_i, cell_j, wx, wy)
+                        us = patch_sum(gel, 0, cell_i, cell_j, wx, wy)
+                        vs = patch_sum(gel, nx + 3, cell_i, cell_j, wx, wy)
                     else:
                         us = vec4([points[point, c] for c in range(4)])
                         vs = vec4([points[POINTS * POINTS + point, c] for c in range(4)])
                     at_rest = vec3((i + 0.5) / POINTS - 0.5 * nx, (j + 0.5) / POINTS - 0.5 * ny, 0.0)
                     x = h * at_rest + vec3(us[0], us[1], us[2])
-                    touching, push, overlap = point_push(env, gels, indenter, shape, i, j, x, us, vs)
+                    touching, push, overlap = point_push(env, gel, indenter, shape, i, j, x, us, vs)
                     if touching:
                         pushed = True
                         force = vec3(push[0], push[1], push[2])
@@ -317,11 +317,11 @@ def indent(env: ti.template(), part, it, drive: ti.template(), gels: ti.template
                             pushes[point, c] = push[c]
                     elif touching:
                         for p, q in ti.static(ti.ndrange(4, 4)):
-                            node = surface_node(gels, cell_i + p - 1, cell_j + q - 1)
-                            add_four(gels.contact_force, forces + 4 * node, (wx[p] * wy[q]) * push)
+                            node = surface_node(gel, cell_i + p - 1, cell_j + q - 1)
+                            add_four(gel.contact_force, forces + 4 * node, (wx[p] * wy[q]) * push)
                 if ti.static(not ON_DEVICE):
                     for _ in range(once_if(pushed)):
-                        hand_on(gels, forces, cell_i, cell_j, pushes)
+                        hand_on(gel, forces, cell_i, cell_j, pushes)
     slot = slot_of(part)
     if ti.static(ON_DEVICE):
         record_most(env, slot, layout.OVERLAP, deepest)

@@ -1,38 +1,39 @@
 """Where each number stands in the small arrays that kernels share with worlds. Units: mm, N, MPa, wave speed 1."""
 
 # params (environments, PARAMS) float32: constants of one environment
+# two numbers in a row are of gel 0 and gel 1
 STEP = 0  # time step [mm]
-GEL_SPACING = 1  # element edge [mm]
-GEL_MU = 2  # [MPa]
-GEL_LAMBDA = 3  # [MPa]
-GEL_DENSITY = 4  # [MPa]: over wave speed^2
-GEL_DAMPING = 5  # rate [1/mm]
-BODY_CELL = 6  # grid spacing [mm]
-BODY_MU = 7  # [MPa]
-BODY_BULK = 8  # [MPa]
-BODY_LIMIT = 9  # k = sigma_y / (2 mu), Frobenius norm [-]
-BODY_HARDENING = 10  # growth of the limit by equivalent plastic strain [-]
-BODY_MASS = 11  # of a particle [N mm]: over wave speed^2
-BODY_VOLUME = 12  # of a particle [mm^3]
-BODY_DAMPING = 13  # rate [1/mm], against the driven affine motion
-RIGID_MASS_SCALE = 14  # how much lighter the body answers to its total force [-]
-STIFFNESS = 15  # of one particle's contact [N/mm], or of the indenter's [MPa/mm]
-FRICTION = 16  # of gel 0 and gel 1 [-]
-HOUSING = 18  # below the gel's surface [mm]; negative: none
-GRAVITY = 19  # acceleration x, y, z [1/mm]
-ORIGIN = 22  # of the grid x, y, z [mm]
-SHAPE = 25  # of an indenter: three sizes [mm]
-SHAPE_ORIGIN = 28  # of its distance grid, node (0, 0, 0): x, y, z [mm]
-SHAPE_SPACING = 31  # of its distance grid [mm]
-CENTRE = 32  # of the particles at the launch's start x, y, z [mm]
-INVERSE_INERTIA = 35  # inverse moment of inertia of the particles then: xx, yy, zz, xy, xz, yz [1/(MPa mm^5)]
-REFERENCE_CENTRE = 41  # of the particles in the reference of the body's grid x, y, z [mm]
-CARRIED = 44  # mean displacement gradient of the particles since then, row by row
-EDGE_RADIUS = 53  # of an indenter [mm]
-OWN = 54  # weight of a node's own acceleration, force over mass, in how it moves; 1 is true inertia
-FILTERED = 55  # weight of that filtered by its neighbours' (tacsim.physics.gel.mass, tacsim.physics.body.mass)
-LIMIT_FOLLOWS = 56  # rate at which the limit of an indenter's friction follows the pressure [1/mm]
-PARAMS = 57
+GEL_SPACING = 1  # element edge [mm], two
+GEL_MU = 3  # [MPa], two
+GEL_LAMBDA = 5  # [MPa], two
+GEL_DENSITY = 7  # [MPa]: over wave speed^2, two
+GEL_DAMPING = 9  # rate [1/mm], two
+BODY_CELL = 11  # grid spacing [mm]
+BODY_MU = 12  # [MPa]
+BODY_BULK = 13  # [MPa]
+BODY_LIMIT = 14  # k = sigma_y / (2 mu), Frobenius norm [-]
+BODY_HARDENING = 15  # growth of the limit by equivalent plastic strain [-]
+BODY_MASS = 16  # of a particle [N mm]: over wave speed^2
+BODY_VOLUME = 17  # of a particle [mm^3]
+BODY_DAMPING = 18  # rate [1/mm], against the driven affine motion
+RIGID_MASS_SCALE = 19  # how much lighter the body answers to its total force [-]
+STIFFNESS = 20  # of one particle's contact [N/mm], two; or of the indenter's [MPa/mm]
+FRICTION = 22  # [-], two
+HOUSING = 24  # below the gel's surface [mm], two; negative: none
+GRAVITY = 26  # acceleration x, y, z [1/mm]
+ORIGIN = 29  # of the grid x, y, z [mm]
+SHAPE = 32  # of an indenter: three sizes [mm]
+SHAPE_ORIGIN = 35  # of its distance grid, node (0, 0, 0): x, y, z [mm]
+SHAPE_SPACING = 38  # of its distance grid [mm]
+CENTRE = 39  # of the particles at the launch's start x, y, z [mm]
+INVERSE_INERTIA = 42  # inverse moment of inertia of the particles then: xx, yy, zz, xy, xz, yz [1/(MPa mm^5)]
+REFERENCE_CENTRE = 48  # of the particles in the reference of the body's grid x, y, z [mm]
+CARRIED = 51  # mean displacement gradient of the particles since then, row by row
+EDGE_RADIUS = 60  # of an indenter [mm]
+OWN = 61  # weight of a node's own acceleration, force over mass, in how it moves; 1 is true inertia
+FILTERED = 62  # weight of that filtered by its neighbours' (tacsim.physics.gel.mass, tacsim.physics.body.mass)
+LIMIT_FOLLOWS = 63  # rate at which the limit of an indenter's friction follows the pressure [1/mm]
+PARAMS = 64
 
 # counts (environments, COUNTS) int32
 ZERO = 0  # always 0: see tacsim.physics.exec.lanes.overwrite
@@ -44,14 +45,20 @@ KIND = 14  # of indenter
 STRIDE = 15  # particles that an environment has room for
 CAPACITY = 16  # strips of grid nodes that an environment has room for, in each copy
 SHAPE_NODES = 17  # of an indenter's distance grid, how many are loaded along x, y, z
-ELEMENTS = 20  # of a gel along x, y, z
-SHAPE_FIRST = 23  # number of the first loaded node of an indenter's distance grid along x, y, z
-GRID_MOVES = 26  # 1: the grid's nodes have velocities from the launch before; 0: particles bring them
-LINKS = 27  # pairs of a light node of the grid and a leader that an environment has room for, in each order
-PUSHES = 28  # first pair of part 0, 1, ..., and the one after the last, by the leaders (tacsim.physics.body.followers)
-MOVES = 33  # the same by the light nodes
-EVERY = 38  # substeps after which the parts' numbers are kept: see `RECORDS`
-COUNTS = 39
+SHAPE_FIRST = 20  # number of the first loaded node of an indenter's distance grid along x, y, z
+GRID_MOVES = 23  # 1: the grid's nodes have velocities from the launch before; 0: particles bring them
+LINKS = 24  # pairs of a light node of the grid and a leader that an environment has room for, in each order
+PUSHES = 25  # first pair of part 0, 1, ..., and the one after the last, by the leaders (tacsim.physics.body.followers)
+MOVES = 30  # the same by the light nodes
+EVERY = 35  # substeps after which the parts' numbers are kept: see `RECORDS`
+ELEMENTS = 36  # of gel 0 along x, y, z, and of gel 1
+# where gel 0 and gel 1 of an environment begin in the arrays of tacsim.physics.gel.gel.GelState
+GEL_NODES = 42
+GEL_SURFACE = 44
+GEL_FORCES = 46
+GEL_CORNERS = 48
+GEL_LATTICE = 50  # in LANES numbers
+COUNTS = 52
 
 # partial (environments, PARTS, NUMBERS) float32: what each part saw or summed
 SMALLEST_VOLUME = 0  # det F over the gel elements

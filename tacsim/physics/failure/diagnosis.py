@@ -1,21 +1,22 @@
 """What is wrong in a state: volume ratios, speeds and numbers that are not finite, and where they are worst.
 
 A state holds the arrays of a world by name, in kernel units [mm, wave speed 1]. All worlds name alike what they have
-alike: `gel_displacement` and `gel_velocity` of gel lattices, `position` and `velocity` of particles, and their `strain`
+alike: `gel_displacement` and `gel_velocity` of gel lattices (see tacsim.physics.snapshot.gel_arrays), `position` and `velocity` of particles, and their `strain`
 b_e - I or `deformation_gradient`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tacsim.physics.snapshot import State
+from tacsim.physics.snapshot import SENSORS, State, gel_arrays
 
-SENSORS = ("lower", "upper")  # gels by index
 Floats = NDArray[np.float64]
+Size = tuple[float, float, float]
 Quantity = Literal["corner", "element length", "node speed", "particle speed", "particle volume", "not finite"]
 
 
@@ -65,23 +66,22 @@ def _squared_volumes(strain: NDArray[np.floating[Any]]) -> NDArray[np.floating[A
     return det
 
 
-def element_volumes(state: State, thickness: float) -> Floats | None:
-    """(gels, nx, ny, nz) volume ratio at the centres of the gels' elements; `thickness` of a gel [mm]."""
+def element_volumes(u: NDArray[Any], thickness: float) -> Floats:
+    """(gels, nx, ny, nz) volume ratio at the centres of the elements of gels with node displacements `u`
+    (gels, nx + 1, ny + 1, nz + 1, 3) [mm]; `thickness` of a gel [mm]."""
     with np.errstate(all="ignore"):
-        return _determinant(*_element_edges(state, thickness)) if "gel_displacement" in state else None
+        return _determinant(*_element_edges(u, thickness))
 
 
-def corner_volumes(state: State, thickness: float) -> Floats | None:
-    """(gels, nx, ny, nz) smallest volume ratio at the 8 corners of the gels' elements; `thickness` of a gel [mm].
+def corner_volumes(u: NDArray[Any], thickness: float) -> Floats:
+    """(gels, nx, ny, nz) smallest volume ratio at the 8 corners of the elements; arguments as above.
 
     The volume ratio at an element's centre, where its stress is computed, misses one that is turned over at a corner.
     """
-    if "gel_displacement" not in state:
-        return None
-    along = _edge_gradients(state, thickness)
+    along = _edge_gradients(u, thickness)
     for axis, edge in enumerate(along):
         edge[axis] += 1.0
-    n = [count - 1 for count in state["gel_displacement"].shape[1:4]]
+    n = [count - 1 for count in u.shape[1:4]]
     least = np.full((along[0].shape[1], *n), np.inf)
     with np.errstate(all="ignore"):
         for corner in np.ndindex(2, 2, 2):
@@ -91,35 +91,34 @@ def corner_volumes(state: State, thickness: float) -> Floats | None:
     return least
 
 
-def element_lengths(state: State, thickness: float) -> Floats:
-    """(gels, nx, ny, nz) length of the gels' elements, the least of those along x, y and z of the lattice through their
-    centres [mm]; `thickness` of a gel [mm]."""
-    h = thickness / (state["gel_displacement"].shape[3] - 1)
-    lengths: Floats = h * np.sqrt((_element_edges(state, thickness) ** 2).sum(axis=1)).min(axis=0)
+def element_lengths(u: NDArray[Any], thickness: float) -> Floats:
+    """(gels, nx, ny, nz) length of the elements, the least of those along x, y and z of the lattice through their
+    centres [mm]; arguments as above."""
+    h = thickness / (u.shape[3] - 1)
+    lengths: Floats = h * np.sqrt((_element_edges(u, thickness) ** 2).sum(axis=1)).min(axis=0)
     return lengths
 
 
-def nearly_at_rest(state: State, thickness: float) -> bool:
-    """Whether all displacement gradients along the gels' edges are below 1/3: I + such a gradient is diagonally
-    dominant, so no corner is turned over. Spares the price of `corner_volumes`.
+def nearly_at_rest(u: NDArray[Any], thickness: float) -> bool:
+    """Whether all displacement gradients along the edges are below 1/3: I + such a gradient is diagonally dominant, so
+    no corner is turned over. Spares the price of `corner_volumes`; arguments as above.
     """
-    u = state["gel_displacement"]
     most = max(float(np.abs(np.diff(u, axis=axis)).max()) for axis in (1, 2, 3))
     return bool(most < thickness / (u.shape[3] - 1) / 3.0)
 
 
-def _edge_gradients(state: State, thickness: float) -> list[Floats]:
+def _edge_gradients(displacement: NDArray[Any], thickness: float) -> list[Floats]:
     """Displacement gradients along the x, y and z edges of the gels' lattices: three (3, gels, nx, ny, nz), each one
     shorter along its own axis."""
-    u = np.moveaxis(state["gel_displacement"], -1, 0).astype(np.float64)
+    u = np.moveaxis(displacement, -1, 0).astype(np.float64)
     h = thickness / (u.shape[-1] - 1)
     return [np.diff(u, axis=axis) / h for axis in (2, 3, 4)]
 
 
-def _element_edges(state: State, thickness: float) -> Floats:
+def _element_edges(u: NDArray[Any], thickness: float) -> Floats:
     """(3, 3, gels, nx, ny, nz) mean edges of the elements over their length at rest, which are the columns of the
     deformation gradients at their centres."""
-    columns = _edge_gradients(state, thickness)
+    columns = _edge_gradients(u, thickness)
     for axis, column in enumerate(columns):
         for other in {0, 1, 2} - {axis}:
             ends = np.delete(column, -1, axis=other + 2), np.delete(column, 0, axis=other + 2)
@@ -135,45 +134,57 @@ def _determinant(a: Floats, b: Floats, c: Floats) -> Floats:
     )
 
 
-def place_of_worst(quantity: Quantity, good: State, failed: State, gel: tuple[float, float, float]) -> str:
+def place_of_worst(quantity: Quantity, good: State, failed: State, gels: Sequence[Size]) -> str:
     """Which particle or gel node has the worst of `quantity` in `failed`, in words; "" where there is no such thing. Of
     `good`, the last physical state, where what was wrong has spread over half of `failed`: there it began.
 
-    Positions are those in `good`; `gel`: size of a gel [m].
+    Positions are those in `good`; `gels`: size of each gel [m].
     """
-    values = _badness(quantity, failed, gel[2] * 1e3)
+    values, first = _badness(quantity, failed, gels)
     if values is not None and quantity != "not finite" and np.isfinite(values).mean() < 0.5:
-        values = _badness(quantity, good, gel[2] * 1e3)
+        values, first = _badness(quantity, good, gels)
     if values is None:
         return ""
-    flat = int(np.argmax(np.where(np.isfinite(values), values, np.inf)))
+    flat = int(np.argmax(_worst_first(values)))
     index = [int(i) for i in np.unravel_index(flat, values.shape)]
     if values.ndim >= 4:
-        cells = np.array(failed["gel_displacement"].shape[1:4]) - 1
-        at = (np.array(index[1:4]) / cells - [0.5, 0.5, 1.0]) * np.array(gel) * 1e3
-        return f"node {index[1:4]} of the {SENSORS[index[0]]} gel, {millimetres(at)} mm at rest in its sensor frame"
+        gel = first + index[0]
+        cells = np.array(gel_arrays(failed, "gel_displacement")[first].shape[1:4]) - 1
+        at = (np.array(index[1:4]) / cells - [0.5, 0.5, 1.0]) * np.array(gels[gel]) * 1e3
+        return f"node {index[1:4]} of the {SENSORS[gel]} gel, {millimetres(at)} mm at rest in its sensor frame"
     if "position" in good and values.ndim and len(values) == len(good["position"]):
         return f"particle {index[0]}, {millimetres(good['position'][index[0]])} mm in the world"
     return ""
 
 
-def _badness(quantity: Quantity, failed: State, thickness: float) -> NDArray[Any] | None:
-    """By node or element of the gels, or by particle: the larger, the worse; `thickness` of a gel [mm]."""
-    values: NDArray[Any] | None = None
+def _worst_first(values: NDArray[Any]) -> NDArray[Any]:
+    """What is not finite is the worst."""
+    return np.where(np.isfinite(values), values, np.inf)
+
+
+def _badness(quantity: Quantity, failed: State, gels: Sequence[Size]) -> tuple[NDArray[Any] | None, int]:
+    """By node or element of the gels, or by particle: the larger, the worse; and the index of the first gel in it.
+    `gels`: size of each gel [m]."""
+    found: list[tuple[NDArray[Any], int]] = []
+    displacements = gel_arrays(failed, "gel_displacement")
     if quantity == "not finite":
-        values = next((~np.isfinite(a) for a in failed.values() if not np.isfinite(a).all()), None)
+        of_gels = {f"{name}_{SENSORS[1]}" for name in ("gel_displacement", "gel_velocity")}
+        bad = [(~np.isfinite(a), int(name in of_gels)) for name, a in failed.items() if not np.isfinite(a).all()]
+        found = bad[:1]
     elif quantity == "particle volume":
         volumes = particle_volumes(failed)
-        values = None if volumes is None else -volumes
-    elif "gel_displacement" in failed and quantity != "particle speed":
+        found = [] if volumes is None else [(-volumes, 0)]
+    elif displacements and quantity != "particle speed":
         if quantity == "node speed":
-            values = np.abs(failed["gel_velocity"])
+            found = [(np.abs(v), g) for g, v in gel_arrays(failed, "gel_velocity").items()]
         else:
-            elements = corner_volumes(failed, thickness) if quantity == "corner" else element_lengths(failed, thickness)
-            values = None if elements is None else -elements
+            measure = corner_volumes if quantity == "corner" else element_lengths
+            found = [(-measure(u, gels[g][2] * 1e3), g) for g, u in displacements.items()]
     elif "velocity" in failed:  # the gels of physics 'seed' consist of particles too
-        values = np.abs(failed["velocity"])
-    return values
+        found = [(np.abs(failed["velocity"]), 0)]
+    if not found:
+        return None, 0
+    return max(found, key=lambda each: float(_worst_first(each[0]).max()))
 
 
 def millimetres(vector: NDArray[Any]) -> str:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from tacsim.interface import Pose
 from tacsim.physics.exec import layout
 from tacsim.physics.failure import diagnosis
-from tacsim.physics.snapshot import State, copies
+from tacsim.physics.snapshot import State, copies, gel_arrays
 
 SMALLEST_VOLUME_RATIO = 0.05  # det F of a gel element, elastic volume ratio of a particle; below, it counts as inverted
 SMALLEST_STEP_VOLUME = 0.1  # det(I + dt C) of a particle in one substep
@@ -145,7 +145,7 @@ def _fault(look: Callable[[], State], health: Health) -> tuple[str, diagnosis.Qu
     entry = diagnosis.not_finite(arrays)
     if entry is not None:
         return entry, "not finite"
-    node = float(np.abs(arrays["gel_velocity"]).max()) if "gel_velocity" in arrays else 0.0
+    node = max((float(np.abs(v).max()) for v in gel_arrays(arrays, "gel_velocity").values()), default=0.0)
     if node > FASTEST:
         return f"a gel node moves at {node:.3g} of the wave speed (limit {FASTEST})", "node speed"
     if diagnosis.clearly_uncrushed(arrays, SMALLEST_VOLUME_RATIO):

@@ -21,27 +21,28 @@ SKEW = 0.2
 
 
 @ti.func
-def displacement(gels: ti.template(), u, axis, layer, i, j, k):
-    at = u + k * layer + j + i * (gels.ny + 1)
-    return vec3([gels.nodes[at + d * axis] for d in range(3)])
+def displacement(gel: ti.template(), u, axis, layer, i, j, k):
+    at = u + k * layer + j + i * (gel.ny + 1)
+    return vec3([gel.nodes[at + d * axis] for d in range(3)])
 
 
 @ti.func
-def hold_corners(env: ti.template(), gels: ti.template(), block, u, axis, layer, to, row):
+def hold_corners(env: ti.template(), gel: ti.template(), block, u, axis, layer, to, row):
     """Adds the forces of narrow corners to those of a block of elements; arguments as of `element_block`."""
-    h, stiffness = env.param(layout.GEL_SPACING), env.param(layout.GEL_LAMBDA) + 2.0 * env.param(layout.GEL_MU)
+    h, mu, lam = [env.param(first + gel.index) for first in (layout.GEL_SPACING, layout.GEL_MU, layout.GEL_LAMBDA)]
+    stiffness = lam + 2.0 * mu
     share, dt = CORNER_STIFFNESS * stiffness * h * h / 8.0, env.param(layout.STEP)
-    bearable = BEARABLE * env.param(layout.GEL_DENSITY) * (h * h / dt) ** 2 / 2.0
+    bearable = BEARABLE * env.param(layout.GEL_DENSITY + gel.index) * (h * h / dt) ** 2 / 2.0
     for lane in range(LANES):
-        if gels.lattice[block][lane] > 0.0:
+        if gel.lattice[gel.lattice_start + block][lane] > 0.0:
             for corner in range(8):
                 i, j, k = corner // 4, corner // 2 % 2, corner % 2
                 sx, sy, sz = 1.0 - 2.0 * i, 1.0 - 2.0 * j, 1.0 - 2.0 * k
-                here = displacement(gels, u + lane, axis, layer, i, j, k)
+                here = displacement(gel, u + lane, axis, layer, i, j, k)
                 # edges, over their length at rest
-                ex = sx / h * (displacement(gels, u + lane, axis, layer, 1 - i, j, k) - here) + vec3(1.0, 0.0, 0.0)
-                ey = sy / h * (displacement(gels, u + lane, axis, layer, i, 1 - j, k) - here) + vec3(0.0, 1.0, 0.0)
-                ez = sz / h * (displacement(gels, u + lane, axis, layer, i, j, 1 - k) - here) + vec3(0.0, 0.0, 1.0)
+                ex = sx / h * (displacement(gel, u + lane, axis, layer, 1 - i, j, k) - here) + vec3(1.0, 0.0, 0.0)
+                ey = sy / h * (displacement(gel, u + lane, axis, layer, i, 1 - j, k) - here) + vec3(0.0, 1.0, 0.0)
+                ez = sz / h * (displacement(gel, u + lane, axis, layer, i, j, 1 - k) - here) + vec3(0.0, 0.0, 1.0)
                 x, y, z = ey.cross(ez), ez.cross(ex), ex.cross(ey)
                 lacking = NARROW - ex.dot(x)
                 if lacking > 0.0:
@@ -50,7 +51,7 @@ def hold_corners(env: ti.template(), gels: ti.template(), block, u, axis, layer,
                     fx, fy, fz = push * sx * x, push * sy * y, push * sz * z
                     for d in ti.static(range(3)):
                         at = to + lane + d * row
-                        gels.corners[at + 3 * row * (4 * (1 - i) + 2 * j + k)] += fx[d]
-                        gels.corners[at + 3 * row * (4 * i + 2 * (1 - j) + k)] += fy[d]
-                        gels.corners[at + 3 * row * (4 * i + 2 * j + 1 - k)] += fz[d]
-                        gels.corners[at + 3 * row * corner] -= fx[d] + fy[d] + fz[d]
+                        gel.corners[at + 3 * row * (4 * (1 - i) + 2 * j + k)] += fx[d]
+                        gel.corners[at + 3 * row * (4 * i + 2 * (1 - j) + k)] += fy[d]
+                        gel.corners[at + 3 * row * (4 * i + 2 * j + 1 - k)] += fz[d]
+                        gel.corners[at + 3 * row * corner] -= fx[d] + fy[d] + fz[d]

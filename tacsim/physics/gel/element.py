@@ -26,20 +26,20 @@ def fill(rows: ti.template(), row, values):
 
 @ti.func
 def element_block(
-    env: ti.template(), gels: ti.template(), block, u, axis, layer, to, row, rows: ti.template()
+    env: ti.template(), gel: ti.template(), block, u, axis, layer, to, row, rows: ti.template()
 ):  # fmt: skip
     """Forces of LANES elements on their corners; notes the smallest det F of each lane in row SMALLEST.
 
     u: where the displacement of the block's first node stands in `nodes`, `axis` and `layer` the distance to the next
     of each; to: where the forces go in `corners`, `row` the distance to the next corner or axis.
     """
-    h, mu, lam = env.param(layout.GEL_SPACING), env.param(layout.GEL_MU), env.param(layout.GEL_LAMBDA)
+    h, mu, lam = [env.param(first + gel.index) for first in (layout.GEL_SPACING, layout.GEL_MU, layout.GEL_LAMBDA)]
     zero, quarter = env.count(layout.ZERO), 0.25 / h
     for d in range(3):  # not unrolled here: kernels of more statements compile for much longer
         for i, j, k in ti.static(ti.ndrange(2, 2, 2)):
-            at = u + d * axis + k * layer + j + i * (gels.ny + 1)
-            fill(rows, 8 * d + 4 * i + 2 * j + k, load_lanes(gels.nodes, at))
-    fill(rows, WHOLE, gels.lattice[opaque(zero, block)])
+            at = u + d * axis + k * layer + j + i * (gel.ny + 1)
+            fill(rows, 8 * d + 4 * i + 2 * j + k, load_lanes(gel.nodes, at))
+    fill(rows, WHOLE, gel.lattice[opaque(zero, gel.lattice_start + block)])
     for lane in range(LANES):
         whole = rows[WHOLE, lane]
         area, stiffness = (0.25 * h * h) * whole, (HOURGLASS * 2.0 * mu * h / 8.0) * whole
@@ -82,9 +82,9 @@ def element_block(
                 rows[3 * k + d, lane] = yz[k] + odd[k]
                 rows[12 + 3 * k + d, lane] = yz[k] - odd[k]
     for r in range(24):
-        store_lanes(gels.corners, to + r * row, lanes([rows[r, lane] for lane in range(LANES)]), zero)
+        store_lanes(gel.corners, to + r * row, lanes([rows[r, lane] for lane in range(LANES)]), zero)
     most = 0.0
     for lane in range(LANES):
         most = ti.max(most, rows[SKEWED, lane])
     if most > (SKEW * HOURGLASS * mu * h * h) ** 2:
-        hold_corners(env, gels, block, u, axis, layer, to, row)
+        hold_corners(env, gel, block, u, axis, layer, to, row)

@@ -6,14 +6,27 @@ the P-wave speed is 1.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from tacsim.models.scene import Gel, GelSurface, lame
 from tacsim.physics.exec.lanes import COPIES, LANES, ON_DEVICE, PARTS, aligned_zeros, padded
-from tacsim.physics.exec.layout import GEL_DENSITY, GEL_LAMBDA, GEL_MU, GEL_SPACING
+from tacsim.physics.exec.layout import (
+    ELEMENTS,
+    GEL_CORNERS,
+    GEL_DENSITY,
+    GEL_FORCES,
+    GEL_LAMBDA,
+    GEL_LATTICE,
+    GEL_MU,
+    GEL_NODES,
+    GEL_SPACING,
+    GEL_SURFACE,
+)
+from tacsim.physics.snapshot import SENSORS, gel_suffixes
 from tacsim.physics.units import MM, MPA
 
 QUANTITIES = 6  # of a node
@@ -42,9 +55,10 @@ class GelParams:
     def half(self) -> tuple[float, float]:
         return self.elements[0] * self.spacing / 2, self.elements[1] * self.spacing / 2
 
-    def params(self) -> dict[int, float]:
-        """Entries of the array `params` (tacsim.physics.exec.layout)."""
-        return {GEL_SPACING: self.spacing, GEL_MU: self.mu, GEL_LAMBDA: self.lam, GEL_DENSITY: self.density}
+    def params(self, index: int = 0) -> dict[int, float]:
+        """Entries of the array `params` (tacsim.physics.exec.layout), of an environment's gel number `index`."""
+        entries = {GEL_SPACING: self.spacing, GEL_MU: self.mu, GEL_LAMBDA: self.lam, GEL_DENSITY: self.density}
+        return {entry + index: value for entry, value in entries.items()}
 
 
 def gel_params(gel: Gel, element: float) -> GelParams:
@@ -71,15 +85,17 @@ def gel_params(gel: Gel, element: float) -> GelParams:
     return GelParams((nx, ny, layers), spacing * MM, mu * MPA, lam * MPA)
 
 
-def common_lattice(gels: Sequence[GelParams]) -> GelParams:
-    """What the gels of all environments share: how they are cut. Raises ValueError if they are not cut alike."""
-    first = gels[0]
-    for index, gel in enumerate(gels):
-        if (gel.elements, gel.spacing) != (first.elements, first.spacing):
-            raise ValueError(
-                f"environments of a batch need one gel lattice: environment {index} has {_lattice_words(gel)}, "
-                f"environment 0 {_lattice_words(first)}; give both the same gel.size, preset and element_size"
-            )
+def common_lattices(worlds: Sequence[Sequence[GelParams]]) -> Sequence[GelParams]:
+    """What environments share: the lattice of each of their gels. Raises ValueError where two environments differ."""
+    first = worlds[0]
+    for index, gels in enumerate(worlds):
+        for name, gel, other in zip(SENSORS, gels, first, strict=False):
+            if (gel.elements, gel.spacing) != (other.elements, other.spacing):
+                raise ValueError(
+                    f"environments of a batch need one gel lattice: environment {index} has {_lattice_words(gel)} "
+                    f"({name}), environment 0 {_lattice_words(other)}; give both the same gel.size, preset and "
+                    f"element_size"
+                )
     return first
 
 
@@ -88,52 +104,23 @@ def _lattice_words(gel: GelParams) -> str:
     return f"{nx} x {ny} x {nz} elements of {gel.spacing:.4g} mm"
 
 
-class GelState:
-    """Nodes of all gels of all environments, laid out for the kernels.
+class GelGroup:
+    """Views of the gels of all environments that are cut alike, all of an environment or one.
 
     nodes: (E, gels, QUANTITIES, 3, nz + 1, P) displacement, velocity, force, and what their accelerations pass through
-    (tacsim/physics/gel/mass.py); axis; layer; the nodes of a layer as one row, node
-    (i, j) at i (ny + 1) + j, zeros behind the last. One run of equal operations then covers a whole layer.
+    (tacsim/physics/gel/mass.py); axis; layer; the nodes of a layer as one row, node (i, j) at i (ny + 1) + j, zeros
+    behind the last. One run of equal operations then covers a whole layer.
     surface: (E, gels, 2, nx + 3, ny + 3, 4) displacement and velocity of the surface, its rim repeated once outside;
     behind a displacement the pressure that the node carries [MPa], under an indenter.
-    contact_force: (E, COPIES, gels, P, 4) on the surface nodes, one copy a part; zeros between substeps.
-    corners: (E, PARTS, 2, 24, W) forces of the elements of two layers on their corners: corner, axis. On a device,
-    which works on all layers at once, (E, gels, nz, 24, W).
-    lattice: (LATTICE_ROWS, P) 1 at the first node of an element, else 0; 1 / share of a node's mass, 0 where there is
-    no node; weights of its neighbours before and after it along x, and along y, in a mean over the elements round it.
+    contact_force: (E, gels, COPIES, P, 4) on the surface nodes, one copy a part; zeros between substeps.
+    u, v, f: displacement [mm], velocity, and force in the last substep [N], (E, gels, nx + 1, ny + 1, nz + 1, 3).
     """
 
-    def __init__(self, params: GelParams, environments: int, gels: int) -> None:
-        nx, ny, nz = params.elements
-        row = ny + 1
-        nodes = (nx + 1) * row
-        width = padded(nodes)
-        pieces = PARTS // gels
-        blocks = -(-nodes // LANES)
-        halo = -(-(row + 1) // LANES)
-        longest = -(-blocks // pieces)
-        self._row = row
-        # Elements and nodes meet at offsets 0, 1, row and row + 1, so kernels read that far beyond both ends.
-        self._nodes, self.nodes = with_margins((environments, gels, QUANTITIES, 3, nz + 1, width), row + 1)
-        self.surface = np.zeros((environments, gels, 2, nx + 3, ny + 3, 4), np.float32)
-        self.contact_force = np.zeros((environments, COPIES, gels, width, 4), np.float32)
-        cut = (gels, nz, 24, blocks + halo) if ON_DEVICE else (PARTS, 2, 24, (longest + halo) * LANES)
-        self._corners, self.corners = with_margins((environments, *cut), row + 1)
-        self.lattice = np.zeros((LATTICE_ROWS, width), np.float32)
-        whole = np.zeros((nx + 1, row), np.float32)
-        whole[:-1, :-1] = 1.0
-        share = np.full((nx + 1, row), 1.0, np.float32)
-        share[[0, -1], :] *= 0.5
-        share[:, [0, -1]] *= 0.5
-        self.lattice[0, :nodes] = whole.ravel()
-        self.lattice[1, :nodes] = 1.0 / share.ravel()
-        for axis in (0, 1):
-            weights = np.full((2, nx + 1, row), 0.25, np.float32)  # before, after
-            ends = np.moveaxis(weights, 1 + axis, 0)
-            ends[0], ends[-1] = np.array([[[0.0], [0.5]], [[0.5], [0.0]]])
-            self.lattice[2 + 2 * axis : 4 + 2 * axis, :nodes] = weights.reshape(2, nodes)
-        self._shape = (nx + 1, row)
-        self._u, self._v, self._f = (self._view(quantity) for quantity in range(3))
+    def __init__(self, params: GelParams, nodes: np.ndarray, surface: np.ndarray, contact_force: np.ndarray) -> None:
+        nx, ny, _ = params.elements
+        self.params, self.nodes, self.surface, self.contact_force = params, nodes, surface, contact_force
+        self._shape = (nx + 1, ny + 1)
+        self.u, self.v, self.f = (self._view(quantity) for quantity in range(3))
 
     def _view(self, quantity: int) -> np.ndarray:
         nx1, ny1 = self._shape
@@ -143,33 +130,18 @@ class GelState:
         return lattice.transpose(0, 1, 4, 5, 3, 2)
 
     @property
-    def u(self) -> np.ndarray:
-        """Displacement [mm], (E, gels, nx + 1, ny + 1, nz + 1, 3), a view."""
-        return self._u
-
-    @property
-    def v(self) -> np.ndarray:
-        """Velocity, (E, gels, nx + 1, ny + 1, nz + 1, 3), a view."""
-        return self._v
-
-    @property
-    def f(self) -> np.ndarray:
-        """Force on the nodes in the last substep [N], (E, gels, nx + 1, ny + 1, nz + 1, 3), a view."""
-        return self._f
-
-    @property
     def carried(self) -> np.ndarray:
         """Pressure that the surface nodes carry [MPa], (E, gels, nx + 1, ny + 1), a view."""
         return self.surface[:, :, 0, 1:-1, 1:-1, 3]
 
-    def shortest(self, environment: int, spacing: float) -> float:
+    def shortest(self, environment: int) -> float:
         """The shortest edge of an element [mm], each along its direction at rest, so one that has turned seems shorter
         than it is; NaN if a displacement is."""
         nx1, ny1 = self._shape
         flat = self.nodes[environment, :, 0, :, :, : nx1 * ny1]
         u = flat.reshape(*flat.shape[:-1], nx1, ny1)  # gel, axis, layer, i, j
         edges = u[:, 0, :, 1:] - u[:, 0, :, :-1], u[:, 1, ..., 1:] - u[:, 1, ..., :-1], u[:, 2, 1:] - u[:, 2, :-1]
-        return spacing + min(float(edge.min()) for edge in edges)
+        return self.params.spacing + min(float(edge.min()) for edge in edges)
 
     def quiet(self, environment: int, fastest: float) -> bool:
         """Whether all displacements and velocities are finite, and no component of a velocity beyond `fastest`."""
@@ -177,32 +149,167 @@ class GelState:
         return bool(np.isfinite(moving).all()) and bool(np.abs(moving[:, 1]).max() <= fastest)
 
     def refresh(self) -> None:
-        """Copies the nodes' top layer to `surface`, and its rim outside: before a launch, since all may be written.
-
-        Writes zeros behind the last node: what stands there takes part in sums with weight 0, so it must be finite.
-        """
+        """See GelState."""
         nx1, ny1 = self._shape
         self.nodes[..., nx1 * ny1 :] = 0.0
-        for quantity, nodes in enumerate((self._u, self._v)):
+        for quantity, nodes in enumerate((self.u, self.v)):
             top = nodes[..., -1, :]
             surface = self.surface[:, :, quantity]
             surface[:, :, 1:-1, 1:-1, :3] = top
             surface[:, :, [0, -1], 1:-1] = surface[:, :, [1, -2], 1:-1]
             surface[:, :, :, [0, -1]] = surface[:, :, :, [1, -2]]
 
+
+class GelState:
+    """Nodes of all gels of all environments, laid out for the kernels: each array has one environment after the other,
+    in it one gel after the other, each as it is cut. Kernels are told where each begins (`write_layout`).
+
+    gels: in an environment. groups: views of those that are cut alike.
+    corners: for each environment, gel and part of it (2, 24, W) forces of the elements of two layers on their corners:
+    corner, axis. On a device, which works on all layers at once, for each environment and gel (nz, 24, W).
+    lattice: for each group (LATTICE_ROWS, P) 1 at the first node of an element, else 0; 1 / share of a node's mass, 0
+    where there is no node; weights of its neighbours before and after it along x, and along y, in a mean over the
+    elements round it.
+    """
+
+    def __init__(self, gels: Sequence[GelParams], environments: int) -> None:
+        self.gels, first = tuple(gels), gels[0]
+        alike = all((gel.elements, gel.spacing) == (first.elements, first.spacing) for gel in gels)
+        grouped = [(first, len(gels))] if alike else [(gel, 1) for gel in gels]
+        # Elements and nodes meet at offsets 0, 1, row and row + 1, so kernels read that far beyond both ends.
+        self.margin = padded(max(gel.elements[1] for gel in gels) + 2)
+        self._nodes, nodes, node_starts = _lay_out(_node_shape, grouped, environments, self.margin)
+        self._surface, surfaces, surface_starts = _lay_out(_surface_shape, grouped, environments)
+        self._forces, forces, force_starts = _lay_out(_force_shape, grouped, environments)
+        corner_shape = partial(_corner_shape, PARTS // len(gels))
+        self._corners, _, corner_starts = _lay_out(corner_shape, grouped, environments, self.margin)
+        self.groups = tuple(
+            GelGroup(params, *views) for (params, _), *views in zip(grouped, nodes, surfaces, forces, strict=True)
+        )
+        rows = [_lattice_rows(params) for params, _ in grouped]
+        self._lattice = np.concatenate([each.reshape(-1, LANES) for each in rows])
+        firsts = np.cumsum([0, *(each.size // LANES for each in rows)])
+        lattice_starts = [first for first, (_, number) in zip(firsts, grouped, strict=False) for _ in range(number)]
+        self._starts = {
+            GEL_NODES: node_starts, GEL_SURFACE: surface_starts, GEL_FORCES: force_starts, GEL_CORNERS: corner_starts,
+            GEL_LATTICE: lattice_starts,
+        }  # fmt: skip
+
+    def write_layout(self, counts: np.ndarray) -> None:
+        """Writes into the environments' counts (E, COUNTS) how gels are cut, and where each begins in the arrays."""
+        for g, gel in enumerate(self.gels):
+            counts[:, ELEMENTS + 3 * g : ELEMENTS + 3 * g + 3] = gel.elements
+            for entry, starts in self._starts.items():
+                counts[:, entry + g] = starts[g]
+
+    @property
+    def alike(self) -> GelGroup:
+        """All gels of an environment, which are cut alike."""
+        (group,) = self.groups
+        return group
+
+    @property
+    def columns(self) -> int:
+        """Of nodes of all gels of an environment."""
+        return sum((gel.elements[0] + 1) * (gel.elements[1] + 1) for gel in self.gels)
+
+    def arrays(self, environment: int) -> dict[str, np.ndarray]:
+        """Views of what a motion changes, by name (see tacsim.physics.snapshot.gel_suffixes)."""
+        names = gel_suffixes(len(self.groups))
+        views = {f"gel_displacement{name}": each.u[environment] for name, each in zip(names, self.groups, strict=True)}
+        return views | {f"gel_velocity{name}": each.v[environment] for name, each in zip(names, self.groups, strict=True)}
+
+    def tops(self, environment: int) -> list[np.ndarray]:
+        """Displacements of an environment's gel surfaces [mm], each (nx + 1, ny + 1, 3)."""
+        return [top for group in self.groups for top in group.u[environment, :, :, :, -1]]
+
+    def shortest(self, environment: int) -> list[float]:
+        """Of each group, see `GelGroup.shortest`."""
+        return [group.shortest(environment) for group in self.groups]
+
+    def clear(self, environment: int, *, velocity_only: bool = False) -> None:
+        """Stops all nodes, and lays them back to rest unless `velocity_only`."""
+        for group in self.groups:
+            group.v[environment] = 0.0
+            if not velocity_only:
+                group.u[environment] = 0.0
+
+    def quiet(self, environment: int, fastest: float) -> bool:
+        """See `GelGroup.quiet`."""
+        return all(group.quiet(environment, fastest) for group in self.groups)
+
+    def refresh(self) -> None:
+        """Copies the nodes' top layer to `surface`, and its rim outside: before a launch, since all may be written.
+
+        Writes zeros behind the last node: what stands there takes part in sums with weight 0, so it must be finite.
+        """
+        for group in self.groups:
+            group.refresh()
+
     def arguments(self) -> tuple[np.ndarray, ...]:
         """What every kernel with gels takes, in this order: nodes and corners with the margins round them."""
-        return (
-            self._nodes, self.surface.reshape(-1), self.contact_force.reshape(-1), self._corners,
-            self.lattice.reshape(-1, LANES),
-        )  # fmt: skip
+        return self._nodes, self._surface, self._forces, self._corners, self._lattice
 
 
-def with_margins(shape: tuple[int, ...], margin: int) -> tuple[np.ndarray, np.ndarray]:
-    """Zeros with `margin` more before and behind: the whole memory, and the array in its middle."""
-    margin = padded(margin)
-    memory = aligned_zeros(math.prod(shape) + 2 * margin)
-    return memory, memory[margin:-margin].reshape(shape)
+def _node_shape(gel: GelParams) -> tuple[int, ...]:
+    nx, ny, nz = gel.elements
+    return QUANTITIES, 3, nz + 1, padded((nx + 1) * (ny + 1))
+
+
+def _surface_shape(gel: GelParams) -> tuple[int, ...]:
+    nx, ny, _ = gel.elements
+    return 2, nx + 3, ny + 3, 4
+
+
+def _force_shape(gel: GelParams) -> tuple[int, ...]:
+    nx, ny, _ = gel.elements
+    return COPIES, padded((nx + 1) * (ny + 1)), 4
+
+
+def _corner_shape(pieces: int, gel: GelParams) -> tuple[int, ...]:
+    """pieces: parts that share a gel."""
+    nx, ny, nz = gel.elements
+    blocks, halo = padded((nx + 1) * (ny + 1)) // LANES, padded(ny + 2) // LANES
+    return (nz, 24, blocks + halo) if ON_DEVICE else (pieces, 2, 24, (-(-blocks // pieces) + halo) * LANES)
+
+
+def _lay_out(
+    shape_of: Callable[[GelParams], tuple[int, ...]], grouped: Sequence[tuple[GelParams, int]], environments: int,
+    margin: int = 0,
+) -> tuple[np.ndarray, list[np.ndarray], list[np.ndarray]]:  # fmt: skip
+    """Zeros for an array of each gel of each environment: the whole memory, with `margin` more numbers before and
+    behind; a view of each group (environments, gels, *shape); where each gel begins, (environments,)."""
+    shapes = [shape_of(params) for params, _ in grouped]
+    each = sum(number * math.prod(shape) for (_, number), shape in zip(grouped, shapes, strict=True))
+    memory = aligned_zeros(environments * each + 2 * margin)
+    inside = memory[margin : margin + environments * each].reshape(environments, each)
+    views, starts, first = [], [], 0
+    for (_, number), shape in zip(grouped, shapes, strict=True):
+        size = math.prod(shape)
+        views.append(inside[:, first : first + number * size].reshape(environments, number, *shape))
+        starts += [margin + first + g * size + each * np.arange(environments) for g in range(number)]
+        first += number * size
+    return memory, views, starts
+
+
+def _lattice_rows(gel: GelParams) -> np.ndarray:
+    """(LATTICE_ROWS, P) of GelState.lattice."""
+    nx, ny, _ = gel.elements
+    nodes, row = (nx + 1) * (ny + 1), ny + 1
+    lattice = np.zeros((LATTICE_ROWS, padded(nodes)), np.float32)
+    whole = np.zeros((nx + 1, row), np.float32)
+    whole[:-1, :-1] = 1.0
+    share = np.full((nx + 1, row), 1.0, np.float32)
+    share[[0, -1], :] *= 0.5
+    share[:, [0, -1]] *= 0.5
+    lattice[0, :nodes] = whole.ravel()
+    lattice[1, :nodes] = 1.0 / share.ravel()
+    for axis in (0, 1):
+        weights = np.full((2, nx + 1, row), 0.25, np.float32)  # before, after
+        ends = np.moveaxis(weights, 1 + axis, 0)
+        ends[0], ends[-1] = np.array([[[0.0], [0.5]], [[0.5], [0.0]]])
+        lattice[2 + 2 * axis : 4 + 2 * axis, :nodes] = weights.reshape(2, nodes)
+    return lattice
 
 
 def gel_surface(params: GelParams, top: np.ndarray) -> GelSurface:

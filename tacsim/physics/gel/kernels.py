@@ -23,13 +23,12 @@ from tacsim.physics.exec.lanes import (
     vec4,
 )
 from tacsim.physics.gel.element import ROWS, SMALLEST, element_block
-from tacsim.physics.gel.gel import QUANTITIES
 
 Lattice = ti.types.ndarray(dtype=lanes, ndim=1)
 
 
 class Gels(NamedTuple):
-    """The gels of all environments inside a kernel: the arrays of `GelState`, and how every gel is cut."""
+    """The gels of all environments inside a kernel: the arrays of `GelState`."""
 
     nodes: Any
     surface: Any
@@ -37,95 +36,117 @@ class Gels(NamedTuple):
     corners: Any
     lattice: Any
     number: Any  # of gels in an environment
+
+
+class Gel(NamedTuple):
+    """One gel of an environment inside a kernel: the arrays, how it is cut, and where it begins in them."""
+
+    nodes: Any
+    surface: Any
+    contact_force: Any
+    corners: Any
+    lattice: Any
+    index: Any  # 0 or 1
     nx: Any  # elements along x, y, z
     ny: Any
     layers: Any
+    surface_start: Any
+    force_start: Any
+    lattice_start: Any
 
 
 @ti.func
-def gels_of(
-    env: ti.template(), nodes: ti.template(), surface: ti.template(), contact_force: ti.template(),
-    corners: ti.template(), lattice: ti.template(), number: ti.template(),
-):  # fmt: skip
-    """The group of what every kernel with gels takes."""
-    nx, ny, layers = [env.count(layout.ELEMENTS + d) for d in range(3)]
-    return ti.static(Gels(nodes, surface, contact_force, corners, lattice, number, nx, ny, layers))
+def gel_of(env: ti.template(), gels: ti.template(), g):
+    """Gel number g of an environment."""
+    nx, ny, layers = [env.count(layout.ELEMENTS + 3 * g + d) for d in range(3)]
+    surface, force, lattice = [env.count(first + g) for first in (layout.GEL_SURFACE, layout.GEL_FORCES, layout.GEL_LATTICE)]
+    return ti.static(
+        Gel(
+            gels.nodes, gels.surface, gels.contact_force, gels.corners, gels.lattice, g, nx, ny, layers, surface, force,
+            lattice,
+        )
+    )  # fmt: skip
 
 
 @ti.func
-def surface_row(env: ti.template(), gels: ti.template(), g):
-    """First row of a gel's displacements in `surface`; its velocities begin nx + 3 rows further on."""
-    return (env.index * gels.number + g) * 2 * (gels.nx + 3)
+def columns_of(gel: ti.template()):
+    """Columns of nodes, in blocks of LANES."""
+    return ((gel.nx + 1) * (gel.ny + 1) + LANES - 1) // LANES
 
 
 @ti.func
-def surface_at(gels: ti.template(), row, column):
-    """Where the four numbers of a node stand in `surface`."""
-    return bounded(4 * (row * (gels.ny + 3) + column), 1)
+def surface_at(gel: ti.template(), row, column):
+    """Where the four numbers of a node stand in `surface`; velocities begin in row nx + 3."""
+    return bounded(gel.surface_start + 4 * (row * (gel.ny + 3) + column), 1)
 
 
 @ti.func
-def contact_force_start(env: ti.template(), gels: ti.template(), copy, g):
+def contact_force_start(gel: ti.template(), copy):
     """Where a gel's forces on its nodes begin in a copy of `contact_force`."""
-    blocks = ((gels.nx + 1) * (gels.ny + 1) + LANES - 1) // LANES
-    return ((env.index * COPIES + copy) * gels.number + g) * 4 * LANES * blocks
+    return gel.force_start + copy * 4 * LANES * columns_of(gel)
 
 
 @ti.func
-def margin(gels: ti.template()):
-    """Numbers before the first of `nodes` and `corners`."""
-    return (gels.ny + 2 + LANES - 1) // LANES * LANES
+def first_node(env: ti.template(), gel: ti.template()):
+    """Where the displacements of a gel begin in `nodes`."""
+    return env.count(layout.GEL_NODES + gel.index)
 
 
 @ti.func
-def node_block(gels: ti.template(), to, i, j, below, above, row, zero):
+def lattice_at(gel: ti.template(), row, block):
+    """Where a block of a row stands in `lattice`."""
+    return gel.lattice_start + row * columns_of(gel) + block
+
+
+@ti.func
+def node_block(gel: ti.template(), to, i, j, below, above, row, zero):
     """Internal force on LANES nodes along one axis, from the elements above them, at i in `corners`, and below, at j.
 
     to: where the force stands in `nodes`; below, above: 1 or 0, whether there are any; row: as for `element_block`.
     """
     under, over = lanes(0.0), lanes(0.0)
     for p, q in ti.static(ti.ndrange(2, 2)):  # of the element that has these nodes as its corners p, q
-        offset = (12 * p + 6 * q) * row - p * (gels.ny + 1) - q
-        under += load_lanes(gels.corners, i + offset)
-        over += load_lanes(gels.corners, j + 3 * row + offset)
-    store_lanes(gels.nodes, to, below * under + above * over, zero)
+        offset = (12 * p + 6 * q) * row - p * (gel.ny + 1) - q
+        under += load_lanes(gel.corners, i + offset)
+        over += load_lanes(gel.corners, j + 3 * row + offset)
+    store_lanes(gel.nodes, to, below * under + above * over, zero)
 
 
 @ti.func
 def gel_forces(env: ti.template(), part, gels: ti.template()):
     """Internal forces on this part's nodes of its gel. A layer of elements, then the nodes below it, and so on up."""
-    zero, nx, ny, layers = env.count(layout.ZERO), gels.nx, gels.ny, gels.layers
     pieces = PARTS // gels.number
-    g, piece = part // pieces, part % pieces
-    blocks = ((nx + 1) * (ny + 1) + LANES - 1) // LANES
+    piece = part % pieces
+    gel = ti.static(gel_of(env, gels, part // pieces))
+    zero, ny, layers, blocks = env.count(layout.ZERO), gel.ny, gel.layers, columns_of(gel)
     first, last = share_start(blocks, piece, pieces), share_start(blocks, piece + 1, pieces)
     halo = (ny + 1 + LANES) // LANES  # blocks before `first` whose elements reach into it
     row = ((blocks + pieces - 1) // pieces + halo) * LANES  # of corners
     layer = blocks * LANES
     axis = (layers + 1) * layer
-    u = margin(gels) + (env.index * gels.number + g) * 3 * QUANTITIES * axis
+    u, corners = first_node(env, gel), env.count(layout.GEL_CORNERS + gel.index)
     rows = filled(0.0, ROWS, LANES)
     for lane in range(LANES):
         rows[SMALLEST, lane] = 1e9
     for k in range(layers + 1):
-        here = margin(gels) + (2 * (env.index * PARTS + part) + k % 2) * 24 * row + (halo - first) * LANES
-        before = margin(gels) + (2 * (env.index * PARTS + part) + (k + 1) % 2) * 24 * row + (halo - first) * LANES
+        here = corners + (2 * piece + k % 2) * 24 * row + (halo - first) * LANES
+        before = corners + (2 * piece + (k + 1) % 2) * 24 * row + (halo - first) * LANES
         if k < layers:
             for block in range(ti.max(first - halo, 0), last):
                 element_block(
-                    env, gels, block, u + k * layer + block * LANES, axis, layer, here + block * LANES, row, rows
+                    env, gel, block, u + k * layer + block * LANES, axis, layer, here + block * LANES, row, rows
                 )  # fmt: skip
         below, above = ti.select(k < layers, 1.0, 0.0), ti.select(k > 0, 1.0, 0.0)
         for block in range(first, last):
             i, j = here + block * LANES, before + block * LANES
             for d in range(3):
                 to = u + (6 + d) * axis + k * layer + block * LANES
-                node_block(gels, to, i + d * row, j + d * row, below, above, row, zero)
+                node_block(gel, to, i + d * row, j + d * row, below, above, row, zero)
     record_least(env, part, layout.SMALLEST_VOLUME, smallest_lane(rows, SMALLEST))
 
 
 @ti.func
-def add_contact_forces(env: ti.template(), gels: ti.template(), g, first, last, forces, axis, zero):
+def add_contact_forces(env: ti.template(), gel: ti.template(), first, last, forces, axis, zero):
     """Adds the contact forces of all parts to those on a gel's surface nodes, `first` to `last` by blocks, and leaves
     zeros for the next substep. forces: where those along x begin, `axis` the distance to those along y and z."""
     push = filled(0.0, 4 * LANES, 1)
@@ -134,60 +155,72 @@ def add_contact_forces(env: ti.template(), gels: ti.template(), g, first, last, 
         for c in range(4 * LANES):
             total = 0.0
             for copy in ti.static(range(COPIES)):
-                start = bounded(contact_force_start(env, gels, copy, g) + block * 4 * LANES, 1)
-                total += gels.contact_force[start + c]
+                start = bounded(contact_force_start(gel, copy) + block * 4 * LANES, 1)
+                total += gel.contact_force[start + c]
             push[c, 0] = total
         for lane in range(LANES):
             for d in ti.static(range(4)):
                 turned[d, lane] = push[4 * lane + d, 0]
         for d in ti.static(range(3)):
             at = forces + d * axis + block * LANES
-            force = load_lanes(gels.nodes, at) + lanes([turned[d, lane] for lane in range(LANES)])
-            store_lanes(gels.nodes, at, force, zero)
+            force = load_lanes(gel.nodes, at) + lanes([turned[d, lane] for lane in range(LANES)])
+            store_lanes(gel.nodes, at, force, zero)
         for copy in ti.static(range(COPIES)):
             for quarter in range(4):
-                at = contact_force_start(env, gels, copy, g) + (block * 4 + quarter) * LANES
-                store_lanes(gels.contact_force, at, lanes(0.0), zero)
+                at = contact_force_start(gel, copy) + (block * 4 + quarter) * LANES
+                store_lanes(gel.contact_force, at, lanes(0.0), zero)
 
 
 @ti.func
-def nodes_of_part(gels: ti.template(), part):
-    """A part's gel, where it notes its sums, and its columns of nodes: first block, and the one after the last. On a
-    device a part is one column: of gel part // columns, number part % columns."""
+def gel_of_part(env: ti.template(), gels: ti.template(), part):
+    """Number of a part's gel. On a device a part is one column, of gel 0 or behind those of gel 0."""
+    if ti.static(not ON_DEVICE):
+        return part // (PARTS // gels.number)
+    elif ti.static(gels.number == 1):
+        return 0
+    else:
+        return ti.select(part < columns_of(ti.static(gel_of(env, gels, 0))), 0, 1)
+
+
+@ti.func
+def nodes_of_part(env: ti.template(), gels: ti.template(), gel: ti.template(), part):
+    """Where a part notes its sums, and its columns of nodes in its gel: first block, and the one after the last."""
     pieces = PARTS // gels.number
-    blocks = ((gels.nx + 1) * (gels.ny + 1) + LANES - 1) // LANES
-    g, slot, piece = part // pieces, part, part % pieces
+    blocks = columns_of(gel)
+    slot, piece = part, part % pieces
     first, last = share_start(blocks, piece, pieces), share_start(blocks, piece + 1, pieces)
     if ti.static(ON_DEVICE):
-        g, first = part // blocks, part % blocks
-        slot, last = g * pieces + first % pieces, first + 1
-    return g, slot, first, last
+        first = part
+        if gel.index > 0:
+            first = part - columns_of(ti.static(gel_of(env, gels, 0)))
+        slot, last = gel.index * pieces + first % pieces, first + 1
+    return slot, first, last
 
 
 @ti.func
 def gel_totals(env: ti.template(), part, gels: ti.template()):
     """Whole forces on this part's nodes of its gel, contact included. Their force on the backing is noted."""
-    zero, layers = env.count(layout.ZERO), gels.layers
-    blocks = ((gels.nx + 1) * (gels.ny + 1) + LANES - 1) // LANES
-    g, slot, first, last = nodes_of_part(gels, part)
+    gel = ti.static(gel_of(env, gels, gel_of_part(env, gels, part)))
+    zero, layers, blocks = env.count(layout.ZERO), gel.layers, columns_of(gel)
+    slot, first, last = nodes_of_part(env, gels, gel, part)
     layer = blocks * LANES
     axis = (layers + 1) * layer
-    u = margin(gels) + (env.index * gels.number + g) * 3 * QUANTITIES * axis
+    u = first_node(env, gel)
     for d in ti.static(range(3)):
         held = lanes(0.0)
         for block in range(first, last):
             force = load_lanes(gels.nodes, u + (6 + d) * axis + block * LANES)
-            held += ti.select(gels.lattice[blocks + block] > 0.0, force, 0.0)
+            held += ti.select(gels.lattice[lattice_at(gel, 1, block)] > 0.0, force, 0.0)
         record_sum(env, slot, layout.BACKING + d, held.sum())
     top = u + layers * layer
     if ti.static(ON_DEVICE):
-        at = contact_force_start(env, gels, 0, g) + 4 * first
+        at = contact_force_start(gel, 0) + 4 * first
         for d in ti.static(range(3)):
             gels.nodes[top + (6 + d) * axis + first] += gels.contact_force[at + d]
         for d in ti.static(range(4)):
             gels.contact_force[at + d] = 0.0
     else:
-        add_contact_forces(env, gels, g, first, last, top + 6 * axis, axis, zero)
+        add_contact_forces(env, gel, first, last, top + 6 * axis, axis, zero)
 
 
 @ti.func
@@ -195,18 +228,19 @@ def gel_advance(env: ti.template(), part, gels: ti.template()):
     """Symplectic Euler with lumped masses on this part's nodes of its gel, and their surface. Damps the old velocity
     only, so that force readings stay exact."""
     gel_totals(env, part, gels)
-    zero, dt, h, layers = env.count(layout.ZERO), env.param(layout.STEP), env.param(layout.GEL_SPACING), gels.layers
-    blocks = ((gels.nx + 1) * (gels.ny + 1) + LANES - 1) // LANES
-    g, _slot, first, last = nodes_of_part(gels, part)
+    gel = ti.static(gel_of(env, gels, gel_of_part(env, gels, part)))
+    zero, dt, layers, blocks = env.count(layout.ZERO), env.param(layout.STEP), gel.layers, columns_of(gel)
+    h = env.param(layout.GEL_SPACING + gel.index)
+    _slot, first, last = nodes_of_part(env, gels, gel, part)
     layer = blocks * LANES
     axis = (layers + 1) * layer
-    u = margin(gels) + (env.index * gels.number + g) * 3 * QUANTITIES * axis
-    keep = 1.0 - env.param(layout.GEL_DAMPING) * dt
-    rate = dt / (env.param(layout.GEL_DENSITY) * h * h * h)
+    u = first_node(env, gel)
+    keep = 1.0 - env.param(layout.GEL_DAMPING + gel.index) * dt
+    rate = dt / (env.param(layout.GEL_DENSITY + gel.index) * h * h * h)
     for k in range(1, layers + 1):
         scale = ti.select(k == layers, 2.0 * rate, rate)
         for block in range(first, last):
-            share = gels.lattice[opaque(zero, blocks + block)] * scale
+            share = gels.lattice[opaque(zero, lattice_at(gel, 1, block))] * scale
             for d in range(3):
                 x = u + d * axis + k * layer + block * LANES
                 v, f = x + 3 * axis, x + 6 * axis
@@ -220,13 +254,13 @@ def gel_advance(env: ti.template(), part, gels: ti.template()):
 @ti.func
 def lay_surface(env: ti.template(), part, gels: ti.template()):
     """This part's nodes of the top layer, displacement and velocity, to `surface`, and its rim outside."""
-    zero, nx, ny, layers = env.count(layout.ZERO), gels.nx, gels.ny, gels.layers
+    gel = ti.static(gel_of(env, gels, gel_of_part(env, gels, part)))
+    zero, nx, ny, layers = env.count(layout.ZERO), gel.nx, gel.ny, gel.layers
     row, count = ny + 1, (nx + 1) * (ny + 1)
     layer = (count + LANES - 1) // LANES * LANES
-    g, _slot, first, last = nodes_of_part(gels, part)
+    _slot, first, last = nodes_of_part(env, gels, gel, part)
     axis = (layers + 1) * layer
-    top = margin(gels) + (env.index * gels.number + g) * 3 * QUANTITIES * axis + layers * layer
-    first_row = surface_row(env, gels, g)
+    top = first_node(env, gel) + layers * layer
     i, j = first * LANES // row, first * LANES % row
     for block in range(first, last):
         for lane in range(ti.min(LANES, count - block * LANES)):
@@ -236,10 +270,10 @@ def lay_surface(env: ti.template(), part, gels: ti.template()):
                 at = vec4(0.0)
                 for d in ti.static(range(3)):
                     at[d] = gels.nodes[top + (3 * quantity + d) * axis + block * LANES + lane]
-                at[3] = gels.surface[surface_at(gels, first_row + quantity * (nx + 3) + i + 1, j + 1) + 3]
+                at[3] = gels.surface[surface_at(gel, quantity * (nx + 3) + i + 1, j + 1) + 3]
                 for p in range(p0, p1):
                     for q in range(q0, q1):
-                        to = surface_at(gels, first_row + quantity * (nx + 3) + p, q)
+                        to = surface_at(gel, quantity * (nx + 3) + p, q)
                         values = vec4([overwrite(zero, gels.surface[to + c], at[c]) for c in range(4)])
                         for c in ti.static(range(4)):
                             gels.surface[to + c] = values[c]

@@ -8,8 +8,16 @@ docs/decisions/0002. Rows of `nodes` behind the forces: means along z; 4 S - 1 o
 from tacsim.compute.runtime import ti
 from tacsim.physics.exec import layout
 from tacsim.physics.exec.lanes import LANES, lanes, load_lanes, opaque, store_lanes
-from tacsim.physics.gel.gel import QUANTITIES
-from tacsim.physics.gel.kernels import gel_totals, lay_surface, margin, nodes_of_part
+from tacsim.physics.gel.kernels import (
+    columns_of,
+    first_node,
+    gel_of,
+    gel_of_part,
+    gel_totals,
+    lattice_at,
+    lay_surface,
+    nodes_of_part,
+)
 
 
 @ti.func
@@ -21,23 +29,17 @@ def z_weights(k, layers):
 
 
 @ti.func
-def mean_across(gels: ti.template(), at, blocks, block, zero):
+def mean_across(gel: ti.template(), at, block, zero):
     """The same along x and y of LANES nodes, from `at` on."""
-    row = gels.ny + 1
-    weights = [gels.lattice[opaque(zero, r * blocks + block)] for r in range(2, 6)]
+    row = gel.ny + 1
+    weights = [gel.lattice[opaque(zero, lattice_at(gel, r, block))] for r in range(2, 6)]
     total = lanes(0.0)
     for dx in ti.static(range(-1, 2)):
-        line = 0.5 * load_lanes(gels.nodes, at + dx * row)
-        line += weights[2] * load_lanes(gels.nodes, at + dx * row - 1)
-        line += weights[3] * load_lanes(gels.nodes, at + dx * row + 1)
+        line = 0.5 * load_lanes(gel.nodes, at + dx * row)
+        line += weights[2] * load_lanes(gel.nodes, at + dx * row - 1)
+        line += weights[3] * load_lanes(gel.nodes, at + dx * row + 1)
         total += (0.5 if dx == 0 else weights[0] if dx < 0 else weights[1]) * line
     return total
-
-
-@ti.func
-def first_node(env: ti.template(), gels: ti.template(), g, axis):
-    """Where the displacements of a gel begin in `nodes`."""
-    return margin(gels) + (env.index * gels.number + g) * 3 * QUANTITIES * axis
 
 
 @ti.func
@@ -45,15 +47,15 @@ def gel_means(env: ti.template(), part, gels: ti.template()):
     """Whole forces on this part's nodes of its gel, and their means along z, as accelerations but for the mass of an
     inner node."""
     gel_totals(env, part, gels)
-    zero, layers = env.count(layout.ZERO), gels.layers
-    blocks = ((gels.nx + 1) * (gels.ny + 1) + LANES - 1) // LANES
-    g, _slot, first, last = nodes_of_part(gels, part)
+    gel = ti.static(gel_of(env, gels, gel_of_part(env, gels, part)))
+    zero, layers, blocks = env.count(layout.ZERO), gel.layers, columns_of(gel)
+    _slot, first, last = nodes_of_part(env, gels, gel, part)
     layer = blocks * LANES
     axis = (layers + 1) * layer
-    u = first_node(env, gels, g, axis)
+    u = first_node(env, gel)
     for k in range(1, layers + 1):
         for block in range(first, last):
-            share = gels.lattice[opaque(zero, blocks + block)]
+            share = gels.lattice[opaque(zero, lattice_at(gel, 1, block))]
             for d in range(3):
                 f = u + (6 + d) * axis + k * layer + block * LANES
                 below, here, above = z_weights(k, layers)
@@ -70,19 +72,19 @@ def gel_means(env: ti.template(), part, gels: ti.template()):
 @ti.func
 def gel_even(env: ti.template(), part, gels: ti.template()):
     """First pass of the filter: 4 S - 1 of the accelerations of this part's nodes, and its means along z."""
-    zero, layers = env.count(layout.ZERO), gels.layers
-    blocks = ((gels.nx + 1) * (gels.ny + 1) + LANES - 1) // LANES
-    g, _slot, first, last = nodes_of_part(gels, part)
+    gel = ti.static(gel_of(env, gels, gel_of_part(env, gels, part)))
+    zero, layers, blocks = env.count(layout.ZERO), gel.layers, columns_of(gel)
+    _slot, first, last = nodes_of_part(env, gels, gel, part)
     layer = blocks * LANES
     axis = (layers + 1) * layer
-    u = first_node(env, gels, g, axis)
+    u = first_node(env, gel)
     for k in range(1, layers + 1):
         scale = ti.select(k == layers, 2.0, 1.0)
         for block in range(first, last):
-            share = scale * gels.lattice[opaque(zero, blocks + block)]
+            share = scale * gels.lattice[opaque(zero, lattice_at(gel, 1, block))]
             for d in range(3):
                 f = u + (6 + d) * axis + k * layer + block * LANES
-                mean = mean_across(gels, f + 3 * axis, blocks, block, zero)
+                mean = mean_across(gel, f + 3 * axis, block, zero)
                 store_lanes(gels.nodes, f + 6 * axis, 4.0 * mean - share * load_lanes(gels.nodes, f), zero)
     for k in range(1, layers + 1):
         for block in range(first, last):
@@ -97,23 +99,24 @@ def gel_even(env: ti.template(), part, gels: ti.template()):
 @ti.func
 def gel_advance_filtered(env: ti.template(), part, gels: ti.template()):
     """Second pass, and the motion: see `tacsim.physics.gel.kernels.gel_advance`."""
-    zero, dt, h, layers = env.count(layout.ZERO), env.param(layout.STEP), env.param(layout.GEL_SPACING), gels.layers
-    blocks = ((gels.nx + 1) * (gels.ny + 1) + LANES - 1) // LANES
-    g, _slot, first, last = nodes_of_part(gels, part)
+    gel = ti.static(gel_of(env, gels, gel_of_part(env, gels, part)))
+    zero, dt, layers, blocks = env.count(layout.ZERO), env.param(layout.STEP), gel.layers, columns_of(gel)
+    h = env.param(layout.GEL_SPACING + gel.index)
+    _slot, first, last = nodes_of_part(env, gels, gel, part)
     layer = blocks * LANES
     axis = (layers + 1) * layer
-    u = first_node(env, gels, g, axis)
-    keep = 1.0 - env.param(layout.GEL_DAMPING) * dt
-    rate = dt / (env.param(layout.GEL_DENSITY) * h * h * h)
+    u = first_node(env, gel)
+    keep = 1.0 - env.param(layout.GEL_DAMPING + gel.index) * dt
+    rate = dt / (env.param(layout.GEL_DENSITY + gel.index) * h * h * h)
     own, even = env.param(layout.OWN), env.param(layout.FILTERED)
     for k in range(1, layers + 1):
         scale = ti.select(k == layers, 2.0, 1.0)
         for block in range(first, last):
-            share = gels.lattice[opaque(zero, blocks + block)] * scale
+            share = gels.lattice[opaque(zero, lattice_at(gel, 1, block))] * scale
             for d in range(3):
                 x = u + d * axis + k * layer + block * LANES
                 v, f = x + 3 * axis, x + 6 * axis
-                a = 4.0 * mean_across(gels, f + 9 * axis, blocks, block, zero) - load_lanes(gels.nodes, f + 6 * axis)
+                a = 4.0 * mean_across(gel, f + 9 * axis, block, zero) - load_lanes(gels.nodes, f + 6 * axis)
                 a = even * a + own * share * load_lanes(gels.nodes, f)
                 speed = keep * load_lanes(gels.nodes, v) + rate * a
                 place = load_lanes(gels.nodes, x) + dt * speed

@@ -97,9 +97,11 @@ def keep_loads(
     LoadNotReached.
     """
     scene, targets = world.scene, dict(end)
-    thickness = scene.gel.size[2]
-    smallest = SMALLEST_LOAD * scene.gel.material.youngs_modulus * thickness**2
-    axes = {name: _NormalAxis(load, scene.settling.tolerance * max(load, smallest)) for name, load in loads.items()}
+    gels = {name: scene.gel_of(name) for name in scene.sensors}
+    thickness = {name: gel.size[2] for name, gel in gels.items()}
+    smallest = {n: SMALLEST_LOAD * gel.material.youngs_modulus * thickness[n] ** 2 for n, gel in gels.items()}
+    tolerance = scene.settling.tolerance
+    axes = {name: _NormalAxis(load, tolerance * max(load, smallest[name])) for name, load in loads.items()}
     done: list[MoveStats] = []
 
     def force(name: str) -> float:
@@ -132,8 +134,8 @@ def keep_loads(
                 return max(errors.values())
             before = {name: (axes[name].travel, force(name)) for name in wrong}
             for name, (_, felt) in before.items():
-                axes[name].correct(felt, thickness)
-            beyond = [name for name in wrong if abs(axes[name].travel) > TRAVEL * thickness]
+                axes[name].correct(felt, thickness[name])
+            beyond = [name for name in wrong if abs(axes[name].travel) > TRAVEL * thickness[name]]
             if beyond:
                 wrong = beyond
                 break
@@ -143,20 +145,20 @@ def keep_loads(
         name = wrong[0]
         raise LoadNotReached(
             f"'{name}' does not reach a load of {axes[name].wanted:g} N: {force(name):.3g} N after "
-            f"{1e3 * axes[name].travel:+.3g} mm along its z axis from its target (limit {1e3 * TRAVEL * thickness:.3g} "
+            f"{1e3 * axes[name].travel:+.3g} mm along its z axis from its target (limit {1e3 * TRAVEL * thickness[name]:.3g} "
             f"mm); bring its target nearer to contact, or ask for another load"
         )
 
     world.plan(list(start.values()), list(targets.values()))  # raises ValueError for a path that is far too long
     end.update(start)
     length = max(float(np.linalg.norm(targets[name].position - start[name].position)) for name in targets)
-    pieces = max(1, math.ceil(length / (PIECE * thickness)))
+    pieces = max(1, math.ceil(length / (PIECE * min(thickness.values()))))
     for piece in range(1, pieces + 1):
         if all(force(name) > 0.0 for name in loads):
             yield from correct_at((piece - 1) / pieces, LOOSE)
             here, there = on_path((piece - 1) / pieces), on_path(piece / pieces)
             for name, axis in axes.items():
-                axis.correct(force(name), thickness)
+                axis.correct(force(name), thickness[name])
                 axis.travel += (gap(name, there) - gap(name, here)) / len(axes)
         yield from settle_at(piece / pieces)
     error = yield from correct_at(1.0)

@@ -17,7 +17,7 @@ from tacsim.physics.failure import diagnosis, dump
 from tacsim.physics.failure.health import TORN, LaunchSpan, SimulationDiverged
 from tacsim.physics.motion.controller import ForceReading, Launch, Motion, run
 from tacsim.physics.move import MoveCommand, MoveStats
-from tacsim.physics.snapshot import State, snapshot_of
+from tacsim.physics.snapshot import State, gel_arrays, snapshot_of
 
 if TYPE_CHECKING:  # a device's kernels
     from tacsim.physics.worlds.survey import Survey
@@ -134,7 +134,8 @@ class BaseWorld(NotCopyable, ABC):
                     self.restore(before)
                     raise
         failure.possible = share_possible(self._poses, command.targets, failure.poses)
-        failure.place = diagnosis.place_of_worst(failure.quantity, failure.good, failure.failed, self.scene.gel.size)
+        sizes = [self.scene.gel_of(name).size for name in self.sensors]
+        failure.place = diagnosis.place_of_worst(failure.quantity, failure.good, failure.failed, sizes)
         dump.write_if_asked(self.scene, self._poses, command, before, failure)
         raise failure
 
@@ -143,14 +144,16 @@ class BaseWorld(NotCopyable, ABC):
         seen = self._survey()
         if seen is not None and seen.smallest_corner > SMALLEST_CORNER:
             return
-        state, thickness = self.arrays(), self.scene.gel.size[2] * 1e3
-        if "gel_displacement" not in state or diagnosis.nearly_at_rest(state, thickness):
-            return
-        corners = diagnosis.corner_volumes(state, thickness)
-        if corners is not None and not corners.min() > SMALLEST_CORNER:
-            words = f"a gel element is turned inside out (volume ratio {corners.min():.3g} at a corner)"
-            end = LaunchSpan("at the end of the motion and its hold", {**self._poses, **command.targets})
-            raise SimulationDiverged(words, end, TORN, quantity="corner", failed=state)
+        state = self.arrays()
+        for g, u in gel_arrays(state, "gel_displacement").items():
+            thickness = self.scene.gel_of(self.sensors[g]).size[2] * 1e3
+            if diagnosis.nearly_at_rest(u, thickness):
+                continue
+            corners = diagnosis.corner_volumes(u, thickness)
+            if not corners.min() > SMALLEST_CORNER:
+                words = f"a gel element is turned inside out (volume ratio {corners.min():.3g} at a corner)"
+                end = LaunchSpan("at the end of the motion and its hold", {**self._poses, **command.targets})
+                raise SimulationDiverged(words, end, TORN, quantity="corner", failed=state)
 
 
 def share_possible(start: Mapping[str, Pose], targets: Mapping[str, Pose], failed: Mapping[str, Pose]) -> str:

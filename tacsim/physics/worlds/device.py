@@ -17,15 +17,17 @@ from tacsim.physics.exec.environment import Counts, Environment, Floats, Params,
 from tacsim.physics.exec.graph import Graph
 from tacsim.physics.exec.lanes import LANES, PARTS, smallest_lane, strip
 from tacsim.physics.gel.element import ROWS, SMALLEST, element_block
-from tacsim.physics.gel.gel import LATTICE_ROWS, QUANTITIES
 from tacsim.physics.gel.kernels import (
+    Gels,
     Lattice,
+    columns_of,
+    first_node,
     gel_advance,
-    gels_of,
-    margin,
+    gel_of,
+    gel_of_part,
     node_block,
+    nodes_of_part,
     surface_at,
-    surface_row,
 )
 from tacsim.physics.gel.mass import gel_advance_filtered, gel_even, gel_means
 from tacsim.physics.worlds.hybrid_kernels import ContactHistories, Drive, Records, gel_contact, grid_update, keep_record
@@ -62,30 +64,35 @@ def clear_sums(env: ti.template(), slot):
 
 
 @ti.func
-def element(env: ti.template(), gels: ti.template(), g, k, block):
-    """Forces of one element of gel g on its corners."""
-    gel, blocks = env.index * gels.number + g, (gels.nx + 1) * (gels.ny + 1)
-    axis, row = (gels.layers + 1) * blocks, blocks + gels.ny + 2
-    u = margin(gels) + gel * 3 * QUANTITIES * axis + k * blocks + block
-    to = margin(gels) + (gel * gels.layers + k) * 24 * row + gels.ny + 2 + block
-    rows = ti.Matrix.zero(ti.f32, ROWS, LANES)
-    rows[SMALLEST, 0] = 1e9
-    element_block(env, gels, block, u, axis, blocks, to, row, rows)
-    record_least(env, block % PARTS, layout.SMALLEST_VOLUME, smallest_lane(rows, SMALLEST))
+def element(env: ti.template(), gels: ti.template(), k, n):
+    """Forces of the element that begins at node column n, in layer k, on its corners."""
+    gel = ti.static(gel_of(env, gels, gel_of_part(env, gels, n)))
+    _slot, block, _last = nodes_of_part(env, gels, gel, n)
+    if k < gel.layers:
+        blocks = columns_of(gel)
+        axis, row = (gel.layers + 1) * blocks, blocks + gel.ny + 2
+        u = first_node(env, gel) + k * blocks + block
+        to = env.count(layout.GEL_CORNERS + gel.index) + k * 24 * row + gel.ny + 2 + block
+        rows = ti.Matrix.zero(ti.f32, ROWS, LANES)
+        rows[SMALLEST, 0] = 1e9
+        element_block(env, gel, block, u, axis, blocks, to, row, rows)
+        record_least(env, block % PARTS, layout.SMALLEST_VOLUME, smallest_lane(rows, SMALLEST))
 
 
 @ti.func
-def column(env: ti.template(), gels: ti.template(), g, block):
-    """Elements' forces on one column of nodes of gel g, from its backing to its surface."""
-    gel, blocks, layers = env.index * gels.number + g, (gels.nx + 1) * (gels.ny + 1), gels.layers
-    axis, row = (layers + 1) * blocks, blocks + gels.ny + 2
+def column(env: ti.template(), gels: ti.template(), n):
+    """Elements' forces on node column n, from its backing to its surface."""
+    gel = ti.static(gel_of(env, gels, gel_of_part(env, gels, n)))
+    _slot, block, _last = nodes_of_part(env, gels, gel, n)
+    blocks, layers = columns_of(gel), gel.layers
+    axis, row = (layers + 1) * blocks, blocks + gel.ny + 2
     for k in range(layers + 1):
-        i = margin(gels) + (gel * layers + ti.min(k, layers - 1)) * 24 * row + gels.ny + 2 + block
-        j = margin(gels) + (gel * layers + ti.max(k - 1, 0)) * 24 * row + gels.ny + 2 + block
+        corners = env.count(layout.GEL_CORNERS + gel.index) + gel.ny + 2 + block
+        i, j = corners + ti.min(k, layers - 1) * 24 * row, corners + ti.max(k - 1, 0) * 24 * row
         below, above = ti.select(k < layers, 1.0, 0.0), ti.select(k > 0, 1.0, 0.0)
         for d in ti.static(range(3)):
-            to = margin(gels) + (gel * 3 * QUANTITIES + 6 + d) * axis + k * blocks + block
-            node_block(gels, to, i + d * row, j + d * row, below, above, row, 0)
+            to = first_node(env, gel) + (6 + d) * axis + k * blocks + block
+            node_block(gel, to, i + d * row, j + d * row, below, above, row, 0)
 
 
 @ti.kernel
@@ -93,13 +100,13 @@ def press_substep(
     clock: Clock, drive: Drive,
     nodes: Floats, surface: Floats, contact_force: Floats, corners: Floats, lattice: Lattice,
     anchor: Anchor, pressure: Pressure, values: Values,
-    params: Params, counts: Counts, partial: Partial, layers: ti.i32,
+    params: Params, counts: Counts, partial: Partial, layers: ti.i32, columns: ti.i32,
 ):  # fmt: skip
     """One substep of every environment's indenter on its gel; see `tacsim.physics.worlds.press_kernels.substeps`."""
-    for e, k, n in ti.ndrange(counts.shape[0], layers, lattice.shape[0] // LATTICE_ROWS):
+    for e, k, n in ti.ndrange(counts.shape[0], layers, columns):
         env = ti.static(Environment(e, params, counts, partial))
         if is_active(env, clock):
-            element(env, ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 1)), 0, k, n)
+            element(env, ti.static(Gels(nodes, surface, contact_force, corners, lattice, 1)), k, n)
             if k == 0 and n < PARTS:
                 clear_sums(env, n)
         if e + k + n == 0:
@@ -107,14 +114,14 @@ def press_substep(
     for e, cell in ti.ndrange(counts.shape[0], anchor.shape[1] * anchor.shape[2] // (POINTS * POINTS)):
         env = ti.static(Environment(e, params, counts, partial))
         if is_active(env, clock):
-            gels = ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 1))
-            indent(env, cell, clock[0], drive, gels, ti.static(Indenter(anchor, pressure, values)))
-    for e, n in ti.ndrange(counts.shape[0], lattice.shape[0] // LATTICE_ROWS):
+            gels = ti.static(Gels(nodes, surface, contact_force, corners, lattice, 1))
+            indent(env, cell, clock[0], drive, ti.static(gel_of(env, gels, 0)), ti.static(Indenter(anchor, pressure, values)))
+    for e, n in ti.ndrange(counts.shape[0], columns):
         env = ti.static(Environment(e, params, counts, partial))
         if clock[1] < counts[e, layout.STEPS]:
-            gels = ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 1))
-            carry(env, n, gels)
-            column(env, gels, 0, n)
+            gels = ti.static(Gels(nodes, surface, contact_force, corners, lattice, 1))
+            carry(env, n, ti.static(gel_of(env, gels, 0)))
+            column(env, gels, n)
             gel_advance(env, n, gels)
         if e + n == 0:
             clock[0] += 1
@@ -128,20 +135,20 @@ def press_substep(
 @ti.kernel
 def elements_of_hybrid(
     clock: Clock, nodes: Floats, surface: Floats, contact_force: Floats, corners: Floats, lattice: Lattice,
-    params: Params, counts: Counts, partial: Partial, ceiling: Ceiling, layers: ti.i32,
+    params: Params, counts: Counts, partial: Partial, ceiling: Ceiling, layers: ti.i32, columns: ti.i32,
 ):  # fmt: skip
     """First third of a substep of every environment's two gels and body
     (`tacsim.physics.worlds.hybrid_kernels.substeps`): elements pull at their corners; what is summed starts from
     zero."""
-    for e, g, k, n in ti.ndrange(counts.shape[0], 2, layers, lattice.shape[0] // LATTICE_ROWS):
+    for e, k, n in ti.ndrange(counts.shape[0], layers, columns):
         env = ti.static(Environment(e, params, counts, partial))
         if is_active(env, clock):
-            element(env, ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 2)), g, k, n)
-            if g + k == 0 and n < PARTS:
+            element(env, ti.static(Gels(nodes, surface, contact_force, corners, lattice, 2)), k, n)
+            if k == 0 and n < PARTS:
                 clear_sums(env, n)
-            if k + n == 0:
-                ceiling[e, g, (clock[0] + 1) % 2] = 0.0
-        if e + g + k + n == 0:
+            if k == 0 and n < 2:
+                ceiling[e, n, (clock[0] + 1) % 2] = 0.0
+        if e + k + n == 0:
             clock[1] = clock[0]
 
 
@@ -151,22 +158,21 @@ def scatter_of_hybrid(
     nodes: Floats, surface: Floats, contact_force: Floats, corners: Floats, lattice: Lattice,
     particles: Floats, masses: Strips, velocities: Strips, changes: Floats, ends: Ends, shares: Floats,
     histories: ContactHistories, params: Params, counts: Counts, partial: Partial, ceiling: Ceiling,
-    most_particles: ti.i32, most_nodes: ti.i32, most_links: ti.i32,
+    columns: ti.i32, most_particles: ti.i32, most_nodes: ti.i32, most_links: ti.i32,
 ):  # fmt: skip
     """Second third: contact, particles to the grid, motion of the gels' and the grid's nodes, whose masses are zero
     again afterwards.
 
-    most_particles, most_nodes, most_links: of the largest body and grid.
+    columns: of nodes of both gels; most_particles, most_nodes, most_links: of the largest body and grid.
     """
-    columns = lattice.shape[0] // LATTICE_ROWS
-    most = 2 * columns + most_nodes
+    most = columns + most_nodes
     all_particles, all_nodes = counts.shape[0] * most_particles, counts.shape[0] * most_nodes
     all_columns_and_nodes, all_links = counts.shape[0] * most, counts.shape[0] * most_links
     for i in range(all_particles):
         e, p = i // most_particles, i % most_particles
         env = ti.static(Environment(e, params, counts, partial))
         if is_active(env, clock) and p < env.count(layout.PARTICLES):
-            gels = ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 2))
+            gels = ti.static(Gels(nodes, surface, contact_force, corners, lattice, 2))
             body = ti.static(Body(particles, masses, velocities))
             for g in range(2):
                 gel_contact(env, p, g, clock[0], drive, body, histories, gels, ceiling[e, g, clock[0] % 2])
@@ -175,13 +181,13 @@ def scatter_of_hybrid(
         e, n = i // most, i % most
         env = ti.static(Environment(e, params, counts, partial))
         if is_active(env, clock):
-            if n < 2 * columns:
-                gels = ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 2))
-                column(env, gels, n // columns, n % columns)
+            if n < columns:
+                gels = ti.static(Gels(nodes, surface, contact_force, corners, lattice, 2))
+                column(env, gels, n)
                 gel_means(env, n, gels)
-            elif n - 2 * columns < grid_nodes(env):
+            elif n - columns < grid_nodes(env):
                 body = ti.static(Body(particles, masses, velocities, changes))
-                grid_changes(env, n - 2 * columns, body)
+                grid_changes(env, n - columns, body)
     for i in range(all_links):
         e, n = i // most_links, i % most_links
         env = ti.static(Environment(e, params, counts, partial))
@@ -191,24 +197,25 @@ def scatter_of_hybrid(
         e, n = i // most, i % most
         env = ti.static(Environment(e, params, counts, partial))
         if is_active(env, clock):
-            if n < 2 * columns:
-                gel_even(env, n, ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 2)))
-            elif n - 2 * columns < grid_nodes(env):
-                cell_means(env, n - 2 * columns, CHANGE, ti.static(Body(particles, masses, velocities, changes)))
+            if n < columns:
+                gel_even(env, n, ti.static(Gels(nodes, surface, contact_force, corners, lattice, 2)))
+            elif n - columns < grid_nodes(env):
+                cell_means(env, n - columns, CHANGE, ti.static(Body(particles, masses, velocities, changes)))
     for i in range(all_columns_and_nodes):
         e, n = i // most, i % most
         env = ti.static(Environment(e, params, counts, partial))
         if is_active(env, clock):
-            if n < 2 * columns:
-                gels = ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 2))
-                g, at = n // columns, n % columns
+            if n < columns:
+                gels = ti.static(Gels(nodes, surface, contact_force, corners, lattice, 2))
                 gel_advance_filtered(env, n, gels)
-                x, y = at // (gels.ny + 1), at % (gels.ny + 1)
-                height = surface[surface_at(gels, surface_row(env, gels, g) + x + 1, y + 1) + 2]
+                gel = ti.static(gel_of(env, gels, gel_of_part(env, gels, n)))
+                _slot, at, _last = nodes_of_part(env, gels, gel, n)
+                x, y, g = at // (gel.ny + 1), at % (gel.ny + 1), gel.index
+                height = surface[surface_at(gel, x + 1, y + 1) + 2]
                 if height > ceiling[e, g, (clock[0] + 1) % 2]:
                     ti.atomic_max(ceiling[e, g, (clock[0] + 1) % 2], height)
-            elif n - 2 * columns < grid_nodes(env):
-                second_changes(env, n - 2 * columns, ti.static(Body(particles, masses, velocities, changes)))
+            elif n - columns < grid_nodes(env):
+                second_changes(env, n - columns, ti.static(Body(particles, masses, velocities, changes)))
     for i in range(all_nodes):
         e, node = i // most_nodes, i % most_nodes
         env = ti.static(Environment(e, params, counts, partial))

@@ -130,8 +130,8 @@ class DeviceState(ABC):
         """What kernels find in an environment."""
         found = self._surveyed()[index]
         if index not in self._surveys:
-            spacing, particles = float(self._params[index, layout.GEL_SPACING]), self._particles(index)
-            self._surveys[index] = survey_of(found, spacing, particles, self._base[index])
+            spacings = [float(self._params[index, layout.GEL_SPACING + g]) for g in range(len(self._gels.gels))]
+            self._surveys[index] = survey_of(found, spacings, self._particles(index), self._base[index])
         return self._surveys[index]
 
     def _surveyed(self) -> np.ndarray:
@@ -146,12 +146,18 @@ class DeviceState(ABC):
         return self._found["survey"]
 
     @launching()
-    def surfaces(self) -> np.ndarray:
-        """(E, gels, nx + 1, ny + 1, 3) displacements of the gels' surfaces [mm]."""
+    def tops(self, index: int) -> list[np.ndarray]:
+        """See GelState.tops."""
         self._send()
         if "surfaces" not in self._found:
-            self._found["surfaces"] = self.arrays.look("surface").reshape(self._gels.surface.shape)
-        return self._found["surfaces"][:, :, 0, 1:-1, 1:-1, :3]
+            self._found["surfaces"] = self.arrays.look("surface")
+        tops = []
+        for g, gel in enumerate(self._gels.gels):
+            nx, ny, _ = gel.elements
+            first = self._counts[index, layout.GEL_SURFACE + g]
+            whole = self._found["surfaces"][first : first + 4 * (nx + 3) * (ny + 3)].reshape(nx + 3, ny + 3, 4)
+            tops.append(whole[1:-1, 1:-1, :3])
+        return tops
 
     # ------------------------------------------------------------ launches
 
@@ -169,10 +175,9 @@ class DeviceState(ABC):
 
     def _copy(self, first: int, last: int, moment: str) -> None:
         """Of environments `first` up to `last`; before a "launch" of those only that take part in it."""
-        margin = (self._gels.arguments()[0].size - self._gels.nodes.size) // 2
         counts = self.arrays.upload("counts", self._counts, ti.i32)
         arguments = {
-            "first": first, "last": last, "resting": int(moment == "motion"), "counts": counts, "margin": margin,
+            "first": first, "last": last, "resting": int(moment == "motion"), "counts": counts, "margin": self._gels.margin,
             "no_margin": 0,
         }  # fmt: skip
         for name, (_, dtype) in self._state().items():
@@ -207,7 +212,8 @@ class DeviceState(ABC):
             "contact_force": self.arrays.allocate("contact_force", ti.f32, contact_force.shape),
             "corners": self.arrays.allocate("corners", ti.f32, corners.shape),
             "lattice": self.arrays.upload("lattice", lattice, lanes),
-            "gels": self._gels.nodes.shape[1], "layers": self._gels.nodes.shape[4] - 1,
+            "gels": len(self._gels.gels), "layers": max(gel.elements[2] for gel in self._gels.gels),
+            "columns": self._gels.columns,
         }  # fmt: skip
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from tacsim.compute.runtime import launching
 from tacsim.interface import Pose
 from tacsim.models.scene import GelSurface
-from tacsim.physics.exec.layout import FORCE, GEL_DAMPING, STEP, STEPS
+from tacsim.physics.exec.layout import FORCE, GEL_DAMPING, GEL_DENSITY, STEP, STEPS
 from tacsim.physics.failure.diagnosis import element_lengths
 from tacsim.physics.failure.health import LARGEST_COURANT
 from tacsim.physics.gel.gel import GelParams, GelState, gel_surface
@@ -35,7 +36,7 @@ from tacsim.physics.motion.path import (
     resolve_targets,
 )
 from tacsim.physics.move import MoveCommand
-from tacsim.physics.snapshot import Kept, State, copies, restore_arrays, snapshot_of
+from tacsim.physics.snapshot import Kept, State, copies, gel_arrays, restore_arrays, snapshot_of
 from tacsim.physics.units import MM
 from tacsim.physics.worlds.base import BaseWorld
 
@@ -65,9 +66,9 @@ class FemState(ABC):
         self._bring_back()
         return self._gels
 
-    def tops(self, index: int) -> NDArray[np.float32]:
-        """Displacements of an environment's gel surfaces [mm], (gels, nx + 1, ny + 1, 3)."""
-        return self._gels.u[index, :, :, :, -1] if self.device is None else self.device.surfaces()[index]
+    def tops(self, index: int) -> list[NDArray[np.float32]]:
+        """See GelState.tops."""
+        return self._gels.tops(index) if self.device is None else self.device.tops(index)
 
 
 def stack_drives(drives: Mapping[int, NDArray[np.float32]], counts: NDArray[np.int32]) -> NDArray[np.float32]:
@@ -91,7 +92,7 @@ class FemWorld(BaseWorld):
 
     _state: FemState
     _index: int
-    _gel: GelParams
+    _gels: tuple[GelParams, ...]  # by index
     _rates: NDArray[np.float64]  # (frames, 6) velocities at which a flowing motion has left them [-, rad/mm]
     _scaled: Inertia  # of quasi-static motions
     _true: Inertia  # of motions in real time
@@ -162,7 +163,8 @@ class FemWorld(BaseWorld):
         return wrench
 
     def surface(self, name: str) -> GelSurface:
-        return gel_surface(self._gel, self._state.tops(self._index)[self._sensor(name)])
+        index = self._sensor(name)
+        return gel_surface(self._gels[index], self._state.tops(self._index)[index])
 
     def _survey(self) -> Survey | None:
         device = self._state.device
@@ -217,15 +219,41 @@ class FemWorld(BaseWorld):
         """
         step = float(self._state.params[self._index, STEP])
         with np.errstate(all="ignore"):  # check_launch reports what is not finite
-            seen = self._survey()
-            shortest = seen.shortest if seen else self._state.gels.shortest(self._index, self._gel.spacing)
-            if shortest * LARGEST_COURANT < step:
-                shortest = float(element_lengths(self.arrays(), self._gel.thickness).min())
-        return step / max(shortest, 1e-6 * self._gel.spacing)
+            seen, waves = self._survey(), self._waves
+            lengths = list(seen.shortest) if seen else self._state.gels.shortest(self._index)
+            if len(lengths) < len(waves):  # gels that are cut alike were measured together
+                waves = (max(waves),)
+            if any(length * LARGEST_COURANT < step * wave for length, wave in zip(lengths, waves, strict=True)):
+                lengths, waves = self._measured_lengths(), self._waves
+        finest = 1e-6 * min(gel.spacing for gel in self._gels)
+        return max(step * wave / max(length, finest) for length, wave in zip(lengths, waves, strict=True))
+
+    def _measured_lengths(self) -> list[float]:
+        """Of each gel the length of its most squeezed element [mm]."""
+        arrays = gel_arrays(self.arrays(), "gel_displacement").items()
+        return [float(gel.min()) for g, u in arrays for gel in element_lengths(u, self._gels[g].thickness)]
 
     def _damping(self) -> float:
-        """Of the gel in the last launch: its rate times the wave's time through it [-]."""
-        return float(self._state.params[self._index, GEL_DAMPING]) * self._gel.thickness
+        """Of the gels in the last launch: their rate times the wave's time through them [-]."""
+        return float(self._state.params[self._index, GEL_DAMPING]) * self._gels[0].thickness
+
+    @property
+    def _waves(self) -> tuple[float, ...]:
+        """Speeds of the gels' pressure waves, over that which is 1."""
+        entries = self._inertia.params
+        return tuple(
+            math.sqrt(gel.density / entries.get(GEL_DENSITY + g, gel.density)) for g, gel in enumerate(self._gels)
+        )
+
+    @property
+    def _thickness(self) -> float:
+        """Of the thickest gel, in whose time motions are planned: it is the last to follow [mm]."""
+        return max(gel.thickness for gel in self._gels)
+
+    @property
+    def _lever(self) -> float:
+        """From a sensor's origin to the rim of the widest gel [mm]."""
+        return max(max(gel.half) for gel in self._gels)
 
     # ----------------------------------------------------------------- motion
 
@@ -237,7 +265,7 @@ class FemWorld(BaseWorld):
         a, b = list(begin.values()), list(end.values())
         path = None  # of a dynamic motion; others are planned anew for each attempt
         if command.duration is not None:
-            path = plan_real_time(a, b, command.duration, self._true, max(self._gel.half))
+            path = plan_real_time(a, b, command.duration, self._true, self._lever)
         elif not command.flow:
             self.plan(a, b)  # raises ValueError for a path that is far too long, before a stop
         flowing = self._plan_flow(a, b if command.flow else a)  # or to where the frames are: a stop
@@ -269,8 +297,8 @@ class FemWorld(BaseWorld):
         """The path between two poses of all driven frames, at the scene's speed."""
 
     def _plan_flow(self, start: Sequence[Pose], end: Sequence[Pose]) -> Path:
-        mach, gel = self.scene.flow_mach, self._gel
-        path = plan_flow(start, end, self._rates.copy(), mach, self._scaled.step, max(gel.half), gel.thickness)
+        mach, step = self.scene.flow_mach, self._scaled.step
+        path = plan_flow(start, end, self._rates.copy(), mach, step, self._lever, self._thickness)
         return replace(path, creeps=self.yields)
 
     @launching()  # around all of it: worlds of a batch share arrays, among them those that say which take part

@@ -106,7 +106,7 @@ class HybridWorld(FemWorld):
         self.scene = scene
         self._state: HybridState = HybridState([scene]) if state is None else state
         self._index = index
-        self._gel, self._body = self._state.gel[index], self._state.body[index]
+        self._gels, self._body = self._state.gel[index], self._state.body[index]
         self.yields = math.isfinite(scene.body.material.elastic_limit)
         height = float(extent(scene.body.geometry)[2])
         self._poses = {
@@ -114,17 +114,19 @@ class HybridWorld(FemWorld):
             "upper": Pose(np.array([0.0, 0.0, height + 2 * CLEARANCE]), HALF_TURN_X.quaternion),
         }
         self._rates = np.zeros((2, 6))
-        self._floor = force_floor(scene.gel.material.youngs_modulus * MPA, self._gel.thickness)
-        self._mach = scene.peak_mach
-        housing = scene.gel.housing
+        gels = [scene.gel_of(name) for name in self.sensors]
+        self._floor = min(  # of the softer, thinner gel
+            force_floor(gel.material.youngs_modulus * MPA, params.thickness)
+            for gel, params in zip(gels, self._gels, strict=True)
+        )
         # Inertia is scaled, weight is not: rho g [1e-9 N/mm^3] over the kernel's density, the P-wave modulus [MPa].
         self._body_force = scene.body.material.density * np.array(scene.gravity) * MPA / MM  # [N/mm^3]
         self._weight = self._body_force * self._body.volume * self._state.particles.counts[index]  # [N]
-        params = {
-            **self._gel.params(), **self._body.params(),
-            FRICTION: scene.friction["lower"], FRICTION + 1: scene.friction["upper"],
-            HOUSING: -1.0 if housing is None else housing * MM,
-        }  # fmt: skip
+        params = self._body.params()
+        for g, (name, gel) in enumerate(zip(self.sensors, gels, strict=True)):
+            params |= self._gels[g].params(g)
+            params[FRICTION + g] = scene.friction[name]  # type: ignore[index]
+            params[HOUSING + g] = -1.0 if gel.housing is None else gel.housing * MM
         self._state.params[index, list(params)] = list(params.values())
         self._scaled, self._true = self._scaled_inertia(height * MM), self._true_inertia()
         self._use_inertia(self._scaled)
@@ -133,49 +135,60 @@ class HybridWorld(FemWorld):
 
     def _scaled_inertia(self, height: float) -> Inertia:
         """Of quasi-static motions; height: of the body [mm]."""
-        step = COURANT * min(self._body.cell, self._gel.spacing)
+        step = COURANT * min(self._body.cell, *(gel.spacing for gel in self._gels))
         damping = {
-            GEL_DAMPING: ZETA_GEL / self._gel.thickness, BODY_DAMPING: ZETA_BODY / self._gel.thickness,
+            **self._gel_damping(ZETA_GEL), BODY_DAMPING: ZETA_BODY / self._thickness,
             # The body's slowest mode is its rigid translation between two soft gels: there it counts as lighter by
             # the number of particle layers.
             RIGID_MASS_SCALE: max(1.0, height / self._body.spacing - FILTERED_RIGID),
         }  # fmt: skip
         held = {
-            GEL_DAMPING: ZETA_GEL_HELD / self._gel.thickness,
-            BODY_DAMPING: (ZETA_YIELDING_HELD if self.yields else ZETA_BODY_HELD) / self._gel.thickness,
+            **self._gel_damping(ZETA_GEL_HELD),
+            BODY_DAMPING: (ZETA_YIELDING_HELD if self.yields else ZETA_BODY_HELD) / self._thickness,
         }
-        masses = {**self._masses(self._gel.density, self._body.density, step), **SELECTIVE_INERTIA}
-        # the filter makes a body lighter, so its particles bear less: between stiff gels they shook, untold
-        masses[STIFFNESS] = BORNE * min(masses[STIFFNESS], LARGEST_SHARE * masses[BODY_MASS] / step**2)
-        flowing = {
-            GEL_DAMPING: ZETA_GEL_FLOWING / self._gel.thickness, BODY_DAMPING: ZETA_BODY_FLOWING / self._gel.thickness
-        }  # fmt: skip
+        densities = [gel.density for gel in self._gels]
+        masses = {**self._masses(densities, self._body.density, step), **SELECTIVE_INERTIA}
+        for g in range(len(self._gels)):
+            # the filter makes a body lighter, so its particles bear less: between stiff gels they shook, untold
+            bearable = LARGEST_SHARE * masses[BODY_MASS] / step**2
+            masses[STIFFNESS + g] = BORNE * min(masses[STIFFNESS + g], bearable)
+        flowing = {**self._gel_damping(ZETA_GEL_FLOWING), BODY_DAMPING: ZETA_BODY_FLOWING / self._thickness}
         return Inertia({**masses, **damping}, step, held=held, flowing=flowing)
 
-    def _true_inertia(self) -> Inertia:
-        assert self.scene.body is not None
-        second = kernel_second(self._gel, self.scene.gel.material.density)
-        density = kernel_density(self.scene.body.material.density, second)
-        wave = math.sqrt(self._body.density / density)  # the body's pressure wave; the gel's has speed 1
-        step = COURANT * min(self._body.cell / wave, self._gel.spacing)
-        undamped = {GEL_DAMPING: 0.0, BODY_DAMPING: 0.0, RIGID_MASS_SCALE: 1.0}
-        return Inertia({**self._masses(self._gel.density, density, step), **TRUE_INERTIA, **undamped}, step, second)
+    def _gel_damping(self, zeta: float) -> dict[int, float]:
+        """Each gel by its own thickness: rate = zeta c / thickness."""
+        return {GEL_DAMPING + g: zeta / gel.thickness for g, gel in enumerate(self._gels)}
 
-    def _masses(self, gel: float, body: float, step: float) -> dict[int, float]:
+    def _true_inertia(self) -> Inertia:
+        """The pressure wave of the gel in which it is fastest has speed 1."""
+        assert self.scene.body is not None
+        materials = [self.scene.gel_of(name).material for name in self.sensors]
+        seconds = [kernel_second(gel, each.density) for gel, each in zip(self._gels, materials, strict=True)]
+        second = max(seconds)
+        density = kernel_density(self.scene.body.material.density, second)
+        densities = [gel.density * (second / own) ** 2 for gel, own in zip(self._gels, seconds, strict=True)]
+        wave = math.sqrt(self._body.density / density)  # the body's pressure wave
+        times = [gel.spacing * second / own for gel, own in zip(self._gels, seconds, strict=True)]
+        step = COURANT * min(self._body.cell / wave, *times)
+        undamped = {**self._gel_damping(0.0), BODY_DAMPING: 0.0, RIGID_MASS_SCALE: 1.0}
+        return Inertia({**self._masses(densities, density, step), **TRUE_INERTIA, **undamped}, step, second)
+
+    def _masses(self, gels: Sequence[float], body: float, step: float) -> dict[int, float]:
         """Entries of `params` that follow from the densities [MPa] and the substep [mm]."""
         particle = body * self._body.volume
-        # penalty of one particle against its share of a gel node: stable whichever of the two is lighter
-        share = gel * self._gel.spacing * self._body.spacing**2 / 2
-        reduced = 1.0 / (1.0 / particle + 1.0 / share)
         gravity = self._body_force / body  # [1/mm]
-        return {
-            GEL_DENSITY: gel, BODY_MASS: particle, STIFFNESS: reduced / step**2,
-            GRAVITY: gravity[0], GRAVITY + 1: gravity[1], GRAVITY + 2: gravity[2],
-        }  # fmt: skip
+        entries = {BODY_MASS: particle, GRAVITY: gravity[0], GRAVITY + 1: gravity[1], GRAVITY + 2: gravity[2]}
+        for g, (density, gel) in enumerate(zip(gels, self._gels, strict=True)):
+            # penalty of one particle against its share of a gel node: stable whichever of the two is lighter
+            share = density * gel.spacing * self._body.spacing**2 / 2
+            reduced = 1.0 / (1.0 / particle + 1.0 / share)
+            entries |= {GEL_DENSITY + g: density, STIFFNESS + g: reduced / step**2}
+        return entries
 
     def _stop(self) -> None:
         b, i = self._state.particles, self._index
-        for moving in (self._state.gels.v[i], b.v(i), b.c(i)):
+        self._state.gels.clear(i, velocity_only=True)
+        for moving in (b.v(i), b.c(i)):
             moving[...] = 0.0
         b.forget_grid(i)
 
@@ -190,10 +203,10 @@ class HybridWorld(FemWorld):
     def plan(self, start: Sequence[Pose], end: Sequence[Pose]) -> Path:
         """The path between two poses of the sensors, at the scene's speed: all of it is remembered by a body that
         yields, by friction alone what goes along a surface."""
-        scene, lever, self.unfollowed = self.scene, max(self._gel.half), ""
+        scene, lever, self.unfollowed = self.scene, self._lever, ""
         remembered = (path_length if self.yields else path_along)(start, end, lever)
         path = plan(
-            start, end, scene.peak_mach, self._scaled.step, lever, self._gel.thickness, remembered=remembered,
+            start, end, scene.peak_mach, self._scaled.step, lever, self._thickness, remembered=remembered,
             short=SHORT_PATH if self.yields else SHORT_SLIDE,
         )  # fmt: skip
         if self.yields and path.peak_mach(lever) > HURRIED * scene.fastest_mach:
@@ -206,7 +219,7 @@ class HybridWorld(FemWorld):
         state, i = self._state, self._index
         b = state.particles
         return {
-            "gel_displacement": state.gels.u[i], "gel_velocity": state.gels.v[i],
+            **state.gels.arrays(i),
             "position": b.x(i), "velocity": b.v(i), "affine": b.c(i), "strain": b.e(i), "flow": b.plastic_strain(i),
             "reference": b.reference(i), "gradient": b.gradient(i), "planes": b.plane(i),
             "contact": state.contact_history[i, :, : b.counts[i]], "sums": state.partial[i],
@@ -291,7 +304,7 @@ class HybridWorld(FemWorld):
         backings += sums[..., HOUSING_FORCE : HOUSING_FORCE + 6].sum(axis=1).reshape(-1, 2, 3)
         contacts, backings, turns = (np.einsum("gij,ngj->ngi", rotations, of) for of in (forces, backings, moments))
         torques = (turns + _cross(origins - self._state.centre(self._index), contacts)).sum(axis=1)
-        lever = max(self._gel.half)
+        lever = self._lever
         gel_overlap = self._gel_overlap(prepared)
         hits = health.capped + (gel_overlap > 0.0) + self._torn(volumes[1])
         overlaps = each[..., OVERLAP].max(axis=1).tolist()
@@ -337,10 +350,10 @@ class HybridWorld(FemWorld):
         """How deep the two gels lie in one another, without feeling it [mm]. Raises SimulationDiverged if too deep."""
         last = prepared.drive[-1].astype(np.float64)
         seen = self._survey()
-        if seen is not None and apart(self._gel, seen.tops[1], float(seen.tops[0, 3]), last[:, :3], last[:, 3]):
+        if seen is not None and apart(self._gels, seen.tops[1], float(seen.tops[0, 3]), last[:, :3], last[:, 3]):
             return 0.0
-        found = gel_overlap(self._gel, self._state.tops(self._index), last[:, :3], last[:, 3])
-        most = GEL_OVERLAP * self._gel.thickness
+        found = gel_overlap(self._gels, self._state.tops(self._index), last[:, :3], last[:, 3])
+        most = GEL_OVERLAP * min(gel.thickness for gel in self._gels)
         if found > most:
             raise SimulationDiverged(
                 f"the gels lie {found:.3g} mm inside one another, which they do not feel (limit {most:.3g} mm)",

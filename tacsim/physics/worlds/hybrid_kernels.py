@@ -33,13 +33,7 @@ from tacsim.physics.exec.lanes import (
     vec3,
 )
 from tacsim.physics.exec.team import CHUNK, ENVIRONMENT, Sync, first_in_chunk, next_piece, once_if, own_part, piece_done
-from tacsim.physics.gel.kernels import (
-    Lattice,
-    contact_force_start,
-    gel_forces,
-    gels_of,
-    surface_row,
-)
+from tacsim.physics.gel.kernels import Gels, Lattice, contact_force_start, gel_forces, gel_of
 from tacsim.physics.gel.mass import gel_advance_filtered, gel_even, gel_means
 
 Drive = ti.types.ndarray(dtype=ti.f32, ndim=5)
@@ -176,8 +170,9 @@ def gel_contact(
     spacing = 0.5 * env.param(layout.BODY_CELL)
     rate = env.param(layout.STEP) / env.param(layout.BODY_MASS)
     total, moment, on_housing = vec3(0.0), vec3(0.0), vec3(0.0)
-    stride, rows = env.count(layout.STRIDE), surface_row(env, gels, g)
-    forces = contact_force_start(env, gels, copy_of(part), g)
+    stride = env.count(layout.STRIDE)
+    gel = ti.static(gel_of(env, gels, g))
+    forces = contact_force_start(gel, copy_of(part))
     first, last = block_range(env, part)
     place = filled(0.0, 4, LANES)  # of a block's particles; how far they are away
     for block in range(first, last):
@@ -199,7 +194,7 @@ def gel_contact(
                 moving = three_rows(body.particles, at + layout.VELOCITY * stride, stride)
                 relative = back @ (moving - velocity - spin.cross(arm))
                 in_contact, housed, force, history = particle_contact(
-                    env, part, g, local, relative, histories[env.index, g, p], radius, gels, rows, forces
+                    env, part, local, relative, histories[env.index, g, p], radius, gel, forces
                 )
                 histories[env.index, g, p] = history
                 if in_contact:
@@ -241,7 +236,7 @@ def on_gels(
 ):  # fmt: skip
     """Does work(env, part, gels)."""
     env = ti.static(Environment(index, params, counts, partial))
-    work(env, part, ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 2)))
+    work(env, part, ti.static(Gels(nodes, surface, contact_force, corners, lattice, 2)))
 
 
 @apart
@@ -264,7 +259,7 @@ def contacts(
 ):  # fmt: skip
     """Contact of a part's particles with both gels; highest: contact_ceiling of each."""
     env = ti.static(Environment(index, params, counts, partial))
-    gels = ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 2))
+    gels = ti.static(Gels(nodes, surface, contact_force, corners, lattice, 2))
     body = ti.static(Body(particles, masses, velocities, changes, ends, shares))
     partial[index, part, layout.OVERLAP] = 0.0
     for g in range(2):
@@ -302,7 +297,7 @@ def substeps(
             index = sync[turn, ENVIRONMENT]
             env = ti.static(Environment(index, params, counts, partial))
             of_gels = ti.static((nodes, surface, contact_force, corners, lattice))
-            gels = ti.static(gels_of(env, *of_gels, 2))
+            gels = ti.static(Gels(*of_gels, 2))
             body = ti.static(Body(particles, masses, velocities, changes, ends, shares))
             shared = ti.static((params, counts, partial))
             steps = env.count(layout.STEPS)
@@ -315,7 +310,7 @@ def substeps(
                 for _new in range(once_if(scatters and stage != known)):
                     known = stage
                     for g in ti.static(range(2)):
-                        highest[g] = contact_ceiling(env, gels, g)
+                        highest[g] = contact_ceiling(ti.static(gel_of(env, gels, g)))
                 for _gather in range(once_if(scatters and it > 0)):
                     on_body(grid_to_particles, index, part, *body, *shared)
                 for _scatter in range(once_if(scatters and it < steps)):

@@ -16,9 +16,9 @@ from tacsim.physics.body.plasticine import STENCIL_REACH, BodyParams, BodyState,
 from tacsim.physics.body.surface import tangent_planes
 from tacsim.physics.contact.contact import ContactHistory
 from tacsim.physics.exec.lanes import ON_DEVICE, PARTS
-from tacsim.physics.exec.layout import COUNTS, ELEMENTS, NUMBERS, PARAMS, RECORDS
+from tacsim.physics.exec.layout import COUNTS, NUMBERS, PARAMS, RECORDS
 from tacsim.physics.exec.team import run_team
-from tacsim.physics.gel.gel import GelState, common_lattice, gel_params
+from tacsim.physics.gel.gel import GelParams, GelState, common_lattices, gel_params
 from tacsim.physics.units import MM
 from tacsim.physics.worlds.fem import FemState, stack_drives
 from tacsim.physics.worlds.hybrid_kernels import substeps
@@ -32,7 +32,7 @@ CLEARANCE = 0.1e-3  # gap between gels and body at construction [m]
 class HybridState(FemState):
     """Arrays of E environments that one launch of `substeps` advances; each environment is a HybridWorld.
 
-    Environments share the gels' lattice; each has its own body, materials, friction and settling.
+    Environments share the gels' lattices; each has its own body, materials, friction and settling.
     """
 
     device: DeviceHybrid | None = None
@@ -40,8 +40,8 @@ class HybridState(FemState):
     def __init__(self, scenes: Sequence[Scene]) -> None:
         """Raises ValueError for gels that are not cut alike."""
         start()
-        self.gel = [gel_params(scene.gel, scene.element) for scene in scenes]
-        self._gels = GelState(common_lattice(self.gel), len(scenes), 2)
+        self.gel = [_gels_of(scene) for scene in scenes]
+        self._gels = GelState(common_lattices(self.gel), len(scenes))
         placed = [_body_at_start(scene) for scene in scenes]
         self.body = [body for body, _, _ in placed]
         self._particles = BodyState([points for _, points, _ in placed], [planes for _, _, planes in placed])
@@ -49,7 +49,7 @@ class HybridState(FemState):
         self._contact_history = np.zeros((len(scenes), 2, max(self._particles.counts), ContactHistory.n), np.float32)
         self.params = np.zeros((len(scenes), PARAMS), np.float32)
         self.counts = np.zeros((len(scenes), COUNTS), np.int32)
-        self.counts[:, ELEMENTS : ELEMENTS + 3] = self.gel[0].elements
+        self._gels.write_layout(self.counts)
         self.partial = np.zeros((len(scenes), PARTS, NUMBERS), np.float32)
         self.records = np.zeros((len(scenes), RECORDS, PARTS, NUMBERS), np.float32)
         if ON_DEVICE:
@@ -106,18 +106,18 @@ class HybridState(FemState):
 
     def place(self, index: int, scene: Scene) -> None:
         """One environment as it is at the construction of another scene. Raises ValueError for gels cut otherwise."""
-        gel = gel_params(scene.gel, scene.element)
-        common_lattice([*self.gel, gel])
+        gels = _gels_of(scene)
+        common_lattices([*self.gel, gels])
         body, points, planes = _body_at_start(scene)
-        self.gel[index], self.body[index] = gel, body
-        self.gels.u[index], self.gels.v[index] = 0.0, 0.0
+        self.gel[index], self.body[index] = gels, body
+        self.gels.clear(index)
         self.particles.place(index, points, planes)
         missing = max(self.particles.counts) - self.contact_history.shape[2]
         if missing > 0:
             self._contact_history = np.pad(self.contact_history, ((0, 0), (0, 0), (0, missing), (0, 0)))
         self.contact_history[index], self.params[index], self.partial[index] = 0.0, 0.0, 0.0
         self.counts[index] = 0
-        self.counts[index, ELEMENTS : ELEMENTS + 3] = gel.elements
+        self._gels.write_layout(self.counts)
 
     def advance(self, drives: Mapping[int, np.ndarray]) -> None:
         drive = stack_drives(drives, self.counts)
@@ -132,6 +132,10 @@ class HybridState(FemState):
             )  # fmt: skip
         for index in drives:
             self._particles.keep_grid(index, self.counts)
+
+
+def _gels_of(scene: Scene) -> tuple[GelParams, ...]:
+    return tuple(gel_params(scene.gel_of(name), scene.element_of(name)) for name in scene.sensors)
 
 
 def _body_at_start(scene: Scene) -> tuple[BodyParams, np.ndarray, np.ndarray]:

@@ -102,6 +102,7 @@ class PressWorld(FemWorld):
         self._state: PressState = PressState([scene]) if state is None else state
         self._index = index
         self._gel = self._state.gel[index]
+        self._gels = (self._gel,)
         step = COURANT * self._gel.spacing
         self._shear = math.sqrt(self._gel.mu / self._gel.density)  # speed of its shear wave, over that of pressure
         zeta = min(ZETA_GEL, ZETA_BY_SHEAR * self._shear)
@@ -123,7 +124,7 @@ class PressWorld(FemWorld):
         self._poses = {"lower": Pose(), "indenter": Pose(np.array([0.0, 0.0, above]), turned)}
 
     def _stop(self) -> None:
-        self._state.gels.v[self._index] = 0.0
+        self._state.gels.clear(self._index, velocity_only=True)
 
     def surface(self, name: str) -> GelSurface:
         """The surface that its contact points lie on, which smooths the nodes less than their spline does."""
@@ -133,13 +134,13 @@ class PressWorld(FemWorld):
     def reach(self) -> np.ndarray:
         """How far from the indenter the surface is still pressed [m], at its nodes (nx + 1, ny + 1)."""
         stiffness = float(self._state.params[self._index, STIFFNESS])
-        return np.asarray(self._state.gels.carried[self._index, 0] / (RIM * stiffness * MM))
+        return np.asarray(self._state.gels.alike.carried[self._index, 0] / (RIM * stiffness * MM))
 
     def arrays(self) -> dict[str, np.ndarray]:
         state, i = self._state, self._index
         return {
-            "gel_displacement": state.gels.u[i], "gel_velocity": state.gels.v[i], "anchor": state.anchor[i],
-            "pressure": state.pressure[i], "carried": state.gels.carried[i, 0], "sums": state.partial[i],
+            **state.gels.arrays(i), "anchor": state.anchor[i],
+            "pressure": state.pressure[i], "carried": state.gels.alike.carried[i, 0], "sums": state.partial[i],
         }  # fmt: skip
 
     def truth(self) -> None:

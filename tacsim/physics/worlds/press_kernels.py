@@ -22,7 +22,7 @@ from tacsim.physics.exec.team import (
     own_part,
     piece_done,
 )
-from tacsim.physics.gel.kernels import Lattice, gel_advance, gel_forces, gels_of
+from tacsim.physics.gel.kernels import Gels, Lattice, gel_advance, gel_forces, gel_of
 from tacsim.physics.worlds.hybrid_kernels import Drive
 
 
@@ -39,17 +39,18 @@ def substeps(
             turn = task // CHUNK // team
             index = sync[turn, ENVIRONMENT]
             env = ti.static(Environment(index, params, counts, partial))
-            gels = ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 1))
+            gels = ti.static(Gels(nodes, surface, contact_force, corners, lattice, 1))
+            gel = ti.static(gel_of(env, gels, 0))
             indenter = ti.static(Indenter(anchor, pressure, values))
             stages, own = 2 * env.count(layout.STEPS), own_part(task, team)  # two a substep: forces, then motion
             piece = next_piece(sync, turn, own, stages)
             while piece < stages * PARTS:
                 stage, part = piece // PARTS, piece % PARTS
                 for _forces in range(once_if(stage % 2 == 0)):
-                    indent(env, part, stage // 2, drive, gels, indenter)
+                    indent(env, part, stage // 2, drive, gel, indenter)
                     gel_forces(env, part, gels)
                 for _motion in range(once_if(stage % 2 == 1)):
-                    carry(env, part, gels)
+                    carry(env, part, gel)
                     gel_advance(env, part, gels)
                 piece_done(sync, turn)
                 piece = next_piece(sync, turn, own, stages)

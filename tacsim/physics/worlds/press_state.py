@@ -19,7 +19,6 @@ from tacsim.physics.exec.lanes import MAX_NUMBERS, ON_DEVICE, PARTS, aligned_zer
 from tacsim.physics.exec.layout import (
     COUNTS,
     EDGE_RADIUS,
-    ELEMENTS,
     KIND,
     NUMBERS,
     PARAMS,
@@ -32,7 +31,7 @@ from tacsim.physics.exec.layout import (
 from tacsim.physics.exec.team import (
     run_team,
 )
-from tacsim.physics.gel.gel import GelParams, GelState, common_lattice, gel_params
+from tacsim.physics.gel.gel import GelParams, GelState, common_lattices, gel_params
 from tacsim.physics.units import MM
 from tacsim.physics.worlds.fem import FemState, stack_drives
 from tacsim.physics.worlds.press_kernels import substeps
@@ -50,14 +49,13 @@ class PressState(FemState):
         """Raises ValueError for gels that are not cut alike, and an indenter too fine for them."""
         start()
         self.gel = [gel_params(scene.gel, scene.element) for scene in scenes]
-        lattice = common_lattice(self.gel)
-        self._gels = GelState(lattice, len(scenes), 1)
-        nx, ny, _ = lattice.elements
+        self._gels = GelState(common_lattices([(gel,) for gel in self.gel]), len(scenes))
+        nx, ny, _ = self.gel[0].elements
         self._anchor = np.zeros((len(scenes), nx * POINTS, ny * POINTS, 3), np.float32)
         self._pressure = np.zeros(self._anchor.shape[:3], np.float32)  # of the contact points, as remembered [MPa]
         self.params = np.zeros((len(scenes), PARAMS), np.float32)
         self.counts = np.zeros((len(scenes), COUNTS), np.int32)
-        self.counts[:, ELEMENTS : ELEMENTS + 3] = lattice.elements
+        self._gels.write_layout(self.counts)
         self.partial = np.zeros((len(scenes), PARTS, NUMBERS), np.float32)
         self._values = np.zeros((len(scenes), 2, 2, 2), np.float32)
         self._covered = 0  # how often they have changed: a device keeps its copy of them until they do

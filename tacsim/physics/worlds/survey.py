@@ -3,6 +3,7 @@ them."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,14 +18,14 @@ BLOCKS = 256  # of a body's particles, for their sums
 # The numbers of one environment: float32
 NOT_FINITE = 0  # how many entries are not
 NODE_SPEED = 1  # largest component
-SHORTEST = 2  # by how much the shortest edge of an element is longer than at rest [mm]
-CORNER = 3  # smallest volume ratio at the elements' corners
-TOP = 4  # of the surface of gel 0, gel 1: largest |x|, largest |y|, lowest z, highest z of its displacements [mm]
-SQUARED_VOLUME, LARGEST_SQUARED_VOLUME = 12, 13  # smallest and largest det b_e of a particle
-LOW, HIGH = 14, 17  # of the particles' places on the grid: x, y, z [mm]
+SHORTEST = 2  # by how much the shortest edge of an element of gel 0, gel 1 is longer than at rest [mm]
+CORNER = 4  # smallest volume ratio at the elements' corners
+TOP = 5  # of the surface of gel 0, gel 1: largest |x|, largest |y|, lowest z, highest z of its displacements [mm]
+SQUARED_VOLUME, LARGEST_SQUARED_VOLUME = 13, 14  # smallest and largest det b_e of a particle
+LOW, HIGH = 15, 18  # of the particles' places on the grid: x, y, z [mm]
 # Sums over the particles, of r their place on the grid less `base`, d = x - place, x their place in space less `base`:
 # d, r, x x^T and r r^T (xx, yy, zz, xy, xz, yz), d r^T (row by row)
-SUMS = 20
+SUMS = 21
 MOVED, REFERENCE, SECOND, REFERENCE_SECOND, MOVED_REFERENCE = 0, 3, 6, 12, 18
 MOMENTS = 27
 NUMBERS = SUMS + MOMENTS
@@ -36,7 +37,7 @@ class Survey:
 
     finite: bool  # all its numbers are
     sound: bool  # and no gel node is too fast, no particle crushed: see `tacsim.physics.failure.health`
-    shortest: float  # edge of a gel element, along its direction at rest [mm]
+    shortest: tuple[float, ...]  # edge of an element of each gel, along its direction at rest [mm]
     smallest_corner: float  # volume ratio
     tops: NDArray[np.float32]  # (gels, 4) largest |x|, |y|, lowest and highest z of the surfaces' displacements [mm]
     extents: NDArray[np.float32]  # (1, 2, 3) lowest and highest places of the particles on their grid [mm]
@@ -44,8 +45,10 @@ class Survey:
     volumes: tuple[float, float] = (1.0, 1.0)  # least and largest elastic volume ratio of its particles
 
 
-def survey_of(numbers: NDArray[np.float32], spacing: float, particles: int = 0, base: Any = 0.0) -> Survey:
-    """Of an environment's numbers (NUMBERS,) as the kernels leave them; spacing: of its gels [mm]."""
+def survey_of(
+    numbers: NDArray[np.float32], spacings: Sequence[float], particles: int = 0, base: Any = 0.0
+) -> Survey:  # fmt: skip
+    """Of an environment's numbers (NUMBERS,) as the kernels leave them; spacings: of its gels' nodes [mm]."""
     finite = not numbers[NOT_FINITE]
     sound = bool(
         finite and numbers[NODE_SPEED] <= FASTEST and numbers[SQUARED_VOLUME] > (2.0 * SMALLEST_VOLUME_RATIO) ** 2
@@ -55,8 +58,8 @@ def survey_of(numbers: NDArray[np.float32], spacing: float, particles: int = 0, 
         volumes = np.ones(2, np.float32)
     least, largest = (float(volume) for volume in np.sqrt(volumes))
     return Survey(
-        finite, sound, spacing + float(numbers[SHORTEST]), float(numbers[CORNER]), numbers[TOP : TOP + 8].reshape(2, 4),
-        numbers[LOW : LOW + 6].reshape(1, 2, 3),
+        finite, sound, tuple(h + float(numbers[SHORTEST + g]) for g, h in enumerate(spacings)),
+        float(numbers[CORNER]), numbers[TOP : TOP + 8].reshape(2, 4), numbers[LOW : LOW + 6].reshape(1, 2, 3),
         _moments(numbers[SUMS:].astype(np.float64), particles, np.asarray(base, np.float64)) if particles else None,
         (least, largest),
     )  # fmt: skip

@@ -9,8 +9,6 @@ from tacsim.physics.exec import layout
 from tacsim.physics.exec.environment import Counts, Floats, Params
 from tacsim.physics.exec.graph import Graph
 from tacsim.physics.exec.lanes import vec3
-from tacsim.physics.gel.gel import LATTICE_ROWS, QUANTITIES
-from tacsim.physics.gel.kernels import Lattice
 from tacsim.physics.worlds.survey import (
     BLOCKS,
     CORNER,
@@ -68,7 +66,7 @@ def node_vector(nodes: ti.template(), at, axis):
 def begin_survey(found: Params):
     for e, n in ti.ndrange(found.shape[0], NUMBERS):
         least = n >= LOW and n < HIGH
-        for number in ti.static((SHORTEST, CORNER, SQUARED_VOLUME)):
+        for number in ti.static((SHORTEST, SHORTEST + 1, CORNER, SQUARED_VOLUME)):
             least = least or n == number
         most = (n >= HIGH and n < SUMS) or n == LARGEST_SQUARED_VOLUME
         for g in ti.static(range(2)):
@@ -79,48 +77,53 @@ def begin_survey(found: Params):
 
 @ti.kernel
 def survey_gels(
-    found: Params, nodes: Floats, surface: Floats, lattice: Lattice, params: Params, counts: Counts, layers: ti.i32,
+    found: Params, nodes: Floats, surface: Floats, params: Params, counts: Counts, layers: ti.i32, columns: ti.i32,
     gels: ti.i32,
 ):  # fmt: skip
-    """gels: of each environment. A node's element is the one that it begins."""
-    for e, g, k, n in ti.ndrange(counts.shape[0], gels, layers + 1, lattice.shape[0] // LATTICE_ROWS):
-        nx, ny = counts[e, layout.ELEMENTS], counts[e, layout.ELEMENTS + 1]
-        row, layer = ny + 1, lattice.shape[0] // LATTICE_ROWS
-        axis = (layers + 1) * layer
-        at = ny + 2 + (e * gels + g) * 3 * QUANTITIES * axis + k * layer + n  # behind the margin
-        i, j = n // row, n % row
-        bad = 0
-        for d in range(6):  # displacement, velocity
-            bad += is_bad(nodes[at + d * axis])
-        note_bad(found, e, bad)
-        u, v = node_vector(nodes, at, axis), node_vector(nodes, at + 3 * axis, axis)
-        note_most(found, e, NODE_SPEED, ti.abs(v).max())
-        if i < nx:
-            note_least(found, e, SHORTEST, nodes[at + row] - u[0])
-        if j < ny:
-            note_least(found, e, SHORTEST, nodes[at + axis + 1] - u[1])
-        if k < layers:
-            note_least(found, e, SHORTEST, nodes[at + 2 * axis + layer] - u[2])
-        else:
-            carried = 4 * (((e * gels + g) * 2 * (nx + 3) + i + 1) * (ny + 3) + j + 1) + 3
-            note_bad(found, e, is_bad(surface[carried]))
-            for d in ti.static(range(2)):
-                note_most(found, e, TOP + 4 * g + d, ti.abs(u[d]))
-            note_least(found, e, TOP + 4 * g + 2, u[2])
-            note_most(found, e, TOP + 4 * g + 3, u[2])
-        if i < nx and j < ny and k < layers:
-            h = params[e, layout.GEL_SPACING]
-            p = [
-                [[node_vector(nodes, at + a * row + b + c * layer, axis) for c in range(2)] for b in range(2)]
-                for a in range(2)
-            ]
-            least = 1e9
-            for a, b, c in ti.static(ti.ndrange(2, 2, 2)):
-                x = p[1][b][c] - p[0][b][c] + vec3(h, 0.0, 0.0)
-                y = p[a][1][c] - p[a][0][c] + vec3(0.0, h, 0.0)
-                z = p[a][b][1] - p[a][b][0] + vec3(0.0, 0.0, h)
-                least = ti.min(least, x.dot(y.cross(z)))
-            note_least(found, e, CORNER, least / (h * h * h))
+    """layers: of the thickest gel; columns: of nodes of all `gels` of an environment. A node's element is the one that
+    it begins."""
+    for e, k, column in ti.ndrange(counts.shape[0], layers + 1, columns):
+        first = (counts[e, layout.ELEMENTS] + 1) * (counts[e, layout.ELEMENTS + 1] + 1)  # columns of gel 0
+        g = ti.select(gels > 1 and column >= first, 1, 0)
+        n = column - g * first
+        nx, ny, nz = [counts[e, layout.ELEMENTS + 3 * g + d] for d in range(3)]
+        row, layer = ny + 1, (nx + 1) * (ny + 1)
+        axis = (nz + 1) * layer
+        if k <= nz:
+            at = counts[e, layout.GEL_NODES + g] + k * layer + n
+            i, j = n // row, n % row
+            bad = 0
+            for d in range(6):  # displacement, velocity
+                bad += is_bad(nodes[at + d * axis])
+            note_bad(found, e, bad)
+            u, v = node_vector(nodes, at, axis), node_vector(nodes, at + 3 * axis, axis)
+            note_most(found, e, NODE_SPEED, ti.abs(v).max())
+            if i < nx:
+                note_least(found, e, SHORTEST + g, nodes[at + row] - u[0])
+            if j < ny:
+                note_least(found, e, SHORTEST + g, nodes[at + axis + 1] - u[1])
+            if k < nz:
+                note_least(found, e, SHORTEST + g, nodes[at + 2 * axis + layer] - u[2])
+            else:
+                carried = counts[e, layout.GEL_SURFACE + g] + 4 * ((i + 1) * (ny + 3) + j + 1) + 3
+                note_bad(found, e, is_bad(surface[carried]))
+                for d in ti.static(range(2)):
+                    note_most(found, e, TOP + 4 * g + d, ti.abs(u[d]))
+                note_least(found, e, TOP + 4 * g + 2, u[2])
+                note_most(found, e, TOP + 4 * g + 3, u[2])
+            if i < nx and j < ny and k < nz:
+                h = params[e, layout.GEL_SPACING + g]
+                p = [
+                    [[node_vector(nodes, at + a * row + b + c * layer, axis) for c in range(2)] for b in range(2)]
+                    for a in range(2)
+                ]
+                least = 1e9
+                for a, b, c in ti.static(ti.ndrange(2, 2, 2)):
+                    x = p[1][b][c] - p[0][b][c] + vec3(h, 0.0, 0.0)
+                    y = p[a][1][c] - p[a][0][c] + vec3(0.0, h, 0.0)
+                    z = p[a][b][1] - p[a][b][0] + vec3(0.0, 0.0, h)
+                    least = ti.min(least, x.dot(y.cross(z)))
+                note_least(found, e, CORNER, least / (h * h * h))
 
 
 @ti.kernel

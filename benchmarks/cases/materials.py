@@ -150,7 +150,7 @@ def oedometer(element: float, repeat: int) -> list[Measurement]:
         return gel
 
     timing, gel = timed(run, repeat)
-    reached = 1 + float(gel.state.u[0, 0, :, :, -1, 2].mean()) / config.thickness
+    reached = 1 + float(gel.state.alike.u[0, 0, :, :, -1, 2].mean()) / config.thickness
     stress = config.mu * (reached - 1 / reached) + config.lam * math.log(reached) / reached
     pressure = float(gel.backing[2]) / (config.elements[0] * config.elements[1] * config.spacing**2)
     error = abs(abs(pressure / stress) - 1) * 100
@@ -209,7 +209,7 @@ def gel_wave(element: float, repeat: int) -> list[Measurement]:
 
         def run(axis: int = axis, free: FreeAxes = free, count: int = count) -> FloatArray:
             gel = GelBlock(config, dt, 0.0)
-            velocity = gel.state.v[0, 0, ..., axis]
+            velocity = gel.state.alike.v[0, 0, ..., axis]
             velocity[:] = 1e-3 * shape
             signal = np.empty(count)
             for step in range(count):

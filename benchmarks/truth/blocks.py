@@ -20,13 +20,7 @@ from tacsim.physics.exec.lanes import LANES, NODES, PARTS, share_start, strip, v
 from tacsim.physics.exec.team import CHUNK, Sync, first_in_chunk, next_piece, once_if, own_part, piece_done, run_team
 from tacsim.physics.gel.element import SMALLEST_STRETCH
 from tacsim.physics.gel.gel import GelParams, GelState
-from tacsim.physics.gel.kernels import (
-    Lattice,
-    gel_advance,
-    gel_forces,
-    gels_of,
-    margin,
-)
+from tacsim.physics.gel.kernels import Gels, Lattice, first_node, gel_advance, gel_forces, gel_of
 
 Steps = ti.types.ndarray(dtype=ti.i32, ndim=2)
 Scalars = ti.types.ndarray(dtype=ti.f32, ndim=1)
@@ -80,8 +74,9 @@ def gel_substeps(
     ti.loop_config(serialize=True)
     for _ in range(counts[0, layout.STEPS]):
         env = ti.static(Environment(0, params, counts, partial))
-        gels = ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 1))
-        nx, ny, layers = gels.nx, gels.ny, gels.layers
+        gels = ti.static(Gels(nodes, surface, contact_force, corners, lattice, 1))
+        gel = ti.static(gel_of(env, gels, 0))
+        nx, ny, layers = gel.nx, gel.ny, gel.layers
         for part in range(PARTS):
             gel_forces(env, part, gels)
         for part in range(PARTS):
@@ -91,7 +86,7 @@ def gel_substeps(
         for d in ti.static(range(3)):
             for k in range(1, layers + 1):
                 for n in range((nx + 1) * (ny + 1)):
-                    v = margin(gels) + ((3 + d) * (layers + 1) + k) * layer + n
+                    v = first_node(env, gel) + ((3 + d) * (layers + 1) + k) * layer + n
                     before = nodes[v]
                     after = keep[d] * before
                     if driven == 1 and k == layers and d == 2:
@@ -155,8 +150,8 @@ class GelBlock(Block):
 
     def __init__(self, params: GelParams, dt: float, damping: float) -> None:
         super().__init__({**params.params(), layout.GEL_DAMPING: damping}, dt)
-        self.state = GelState(params, 1, 1)
-        self.counts[:, layout.ELEMENTS : layout.ELEMENTS + 3] = params.elements
+        self.state = GelState([params], 1)
+        self.state.write_layout(self.counts)
         self._arguments = (*self.state.arguments(), self.params, self.counts, self.partial)
 
     def advance(self, substeps: int, keep: tuple[float, float, float], speed: float | None = None) -> None:

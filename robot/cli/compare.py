@@ -129,7 +129,7 @@ def _simulate_presses(name: str, truth: FrameSet, bundle: Path | None, overrides
     from calibration.errors import BadFrames
     from robot.studies.matched_press import ELEMENT
     from tacsim.config import load_scene
-    from tacsim.config.gel import fit_gel, says_gel_size
+    from tacsim.config.gel import fit_gel, gel_sizes_given
     from tacsim.models.scene import Sphere
     from tacsim.models.sensor import CanonicalGrid
 
@@ -143,8 +143,8 @@ def _simulate_presses(name: str, truth: FrameSet, bundle: Path | None, overrides
     if scene.element_size is None and not any(text.startswith("preset=") for text in overrides):
         # two layers are the least that a gel may have
         scene = load_scene(name, [*settings, f"element_size={min(ELEMENT, scene.gel.size[2] / 2)} m"])
-    given = any(says_gel_size(text.partition("=")[0].split(".")) for text in overrides)
-    scene, said = fit_gel(scene, {"of B": sensor}, given=given)
+    given = gel_sizes_given(text.partition("=")[0].split(".") for text in overrides)
+    scene, said = fit_gel(scene, {"of B": sensor}, given={"of B"} if given else ())
     if scene.indenter is not None and isinstance(ball := scene.indenter.geometry, Sphere):
         words = ", as in the calibration; for another --set 'indenter.geometry.radius=3 mm'" if own else ""
         said = [f"a ball of {ball.radius * 1e3:.4g} mm radius{words}", *said]

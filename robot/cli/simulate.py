@@ -64,7 +64,7 @@ def press(
     Example: tacsim press sphere --radius '3 mm' --depth '0.4 mm' --slide '1 mm, 0'
     """
     from tacsim.config import load_scene, load_sensor
-    from tacsim.config.gel import fit_gel, says_gel_size
+    from tacsim.config.gel import fit_gel, gel_sizes_given
 
     folder = new_directory(out, "press")
     shape = [_geometry(indenter, {"radius": radius, "height": height, "size": size, "scale": scale})]
@@ -73,7 +73,7 @@ def press(
     shape += _orientation(down, rotation)
     scene = load_scene("press", [f"preset={preset}", *shape, *(set_ or [])])
     model = load_sensor(sensor).model_copy(update={"view": None})
-    given = any(says_gel_size(text.partition("=")[0].split(".")) for text in set_ or [])
+    given = gel_sizes_given(text.partition("=")[0].split(".") for text in set_ or [])
     scene, said = fit_gel(scene, {"lower": model}, given=given)
     for words in said:
         notes.print(words, markup=False)

@@ -270,7 +270,7 @@ def _normaliser(name: str, config: object, rig: RigConfig) -> FrameNormaliser:
     if isinstance(config, CameraSensorConfig):
         return camera_normaliser(name, config, rig)
     assert isinstance(config, SimSensorConfig) and rig.scene is not None
-    return normaliser_for_simulation(config.model, rig.scene.gel.size[:2], rig.canonical)
+    return normaliser_for_simulation(config.model, rig.scene.gel_of(name).size[:2], rig.canonical)
 
 
 def camera_counts(name: str, camera: Camera) -> dict[str, float]:
@@ -285,5 +285,5 @@ def camera_normaliser(name: str, config: CameraSensorConfig, rig: RigConfig) -> 
     calibration.errors.CalibrationError, which names the sensor."""
     with error_context(f"sensors.{name}"):
         return normaliser_for_camera(
-            config, config.size if rig.scene is None else rig.scene.gel.size[:2], rig.canonical
+            config, config.size if rig.scene is None else rig.scene.gel_of(name).size[:2], rig.canonical
         )

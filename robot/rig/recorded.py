@@ -121,7 +121,7 @@ def _normaliser_of(
         return recorded_normaliser(sensor, name, untouched, rig.canonical)
     if isinstance(sensor, CameraSensorConfig):
         return normaliser_for_camera(
-            sensor, sensor.size if rig.scene is None else rig.scene.gel.size[:2], rig.canonical
+            sensor, sensor.size if rig.scene is None else rig.scene.gel_of(name).size[:2], rig.canonical
         )
     return None
 

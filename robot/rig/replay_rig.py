@@ -103,9 +103,9 @@ def recorded_normaliser(
     original = recorded_rig(Path(config.source or "")) if own else None
     sensor = None if original is None else original.sensors.get(name)
     if original is not None and original.scene is not None and isinstance(sensor, SimSensorConfig):
-        return normaliser_for_simulation(sensor.model, original.scene.gel.size[:2], grid)
+        return normaliser_for_simulation(sensor.model, original.scene.gel_of(name).size[:2], grid)
     if original is not None and isinstance(sensor, CameraSensorConfig):
-        gel = sensor.size if original.scene is None else original.scene.gel.size[:2]
+        gel = sensor.size if original.scene is None else original.scene.gel_of(name).size[:2]
         return normaliser_for_camera(sensor, gel, grid)
     replayed = sensor if isinstance(sensor, ReplaySensorConfig) else config
     return normaliser_for_recording(replayed, untouched.shape[:2], grid, untouched)

@@ -101,7 +101,7 @@ def simulate(
         arms=arms,
         clock=clock,
         normalisers={
-            name: normaliser_for_simulation(sensor.model, scene.gel.size[:2], config.canonical)
+            name: normaliser_for_simulation(sensor.model, scene.gel_of(name).size[:2], config.canonical)
             for name, sensor in models.items()
         },
         reset=SimReset(world, clock, sensors, touch_force, placement, pool),
@@ -161,4 +161,4 @@ def _sim_sensor(world: World, clock: SimClock, name: str, config: SimSensorConfi
 
 
 def _pictures(model: SensorModel, name: str, scene: Scene) -> tuple[Renderer, NoiseSource | None]:
-    return Renderer(model, scene.gel.size[:2]), noise_source(model, name)
+    return Renderer(model, scene.gel_of(name).size[:2]), noise_source(model, name)

@@ -20,7 +20,7 @@ from tacsim.physics.failure.diagnosis import corner_volumes, element_volumes, mi
 from tacsim.physics.failure.dump import MOMENTS, Dump, DumpError, dumps_in
 from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.physics.move import MoveStats
-from tacsim.physics.snapshot import State
+from tacsim.physics.snapshot import State, gel_arrays
 from tacsim.physics.world import World, make_world
 from tacsim.report.figure import COLOURS, INK, canvas, plain, save
 
@@ -87,18 +87,25 @@ def table(dump: Dump) -> dict[str, dict[str, str]]:
 def _figures(state: State, scene: Scene) -> dict[str, str]:
     if not state:
         return {}
-    bad, thickness = sum(int((~np.isfinite(a)).sum()) for a in state.values()), scene.gel.size[2] * 1e3
+    bad = sum(int((~np.isfinite(a)).sum()) for a in state.values())
     figures = {"numbers not finite": f"{bad:,} of {sum(a.size for a in state.values()):,}"}
-    for row, volumes in (
-        ("smallest volume ratio, gel elements", element_volumes(state, thickness)),
-        ("smallest at a corner of one", corner_volumes(state, thickness)),
-        ("smallest volume ratio, particles", particle_volumes(state)),
+    displacements = gel_arrays(state, "gel_displacement")
+    for row, ratios in (
+        ("smallest volume ratio, gel elements", element_volumes),
+        ("smallest at a corner of one", corner_volumes),
     ):
-        if volumes is not None:
-            figures[row] = _extreme(volumes)
-    for name, words in (("gel_velocity", "gel nodes"), ("velocity", "particles")):
-        if name in state:
-            figures[f"fastest of {words} [wave speed]"] = _extreme(np.abs(state[name]), largest=True)
+        thicknesses = {g: scene.gel_of(scene.sensors[g]).size[2] * 1e3 for g in displacements}
+        found = [ratios(u, thicknesses[g]).ravel() for g, u in displacements.items()]
+        if found:
+            figures[row] = _extreme(np.concatenate(found))
+    volumes = particle_volumes(state)
+    if volumes is not None:
+        figures["smallest volume ratio, particles"] = _extreme(volumes)
+    speeds = [np.abs(v).ravel() for v in gel_arrays(state, "gel_velocity").values()]
+    if speeds:
+        figures["fastest of gel nodes [wave speed]"] = _extreme(np.concatenate(speeds), largest=True)
+    if "velocity" in state:
+        figures["fastest of particles [wave speed]"] = _extreme(np.abs(state["velocity"]), largest=True)
     gels = len(scene.sensors)
     if "sums" in state:  # of the kernels' parts
         force = state["sums"][:, layout.FORCE : layout.FORCE + 6 * gels].sum(axis=0).reshape(gels, 6)
@@ -127,7 +134,8 @@ def draw(dump: Dump, path: Path) -> None:
     figure, scene = canvas(5.2 * len(moments), 4.6), dump.info.scene
     title = f"{dump.info.cause} at {dump.info.place}"
     figure.suptitle(title[:200].replace("$", r"\$"), fontsize=9, color=INK, x=0.01, ha="left")
-    depth, width = scene.gel.size[2] * 1.1e3, scene.gel.size[0] * 0.6e3
+    sizes = [scene.gel_of(name).size for name in scene.sensors]
+    depth, width = max(size[2] for size in sizes) * 1.1e3, max(size[0] for size in sizes) * 0.6e3
     heights = [float(pose.position[2]) * 1e3 for pose in dump.poses("before").values()]
     for column, moment in enumerate(moments):
         poses = dump.poses(moment)
@@ -144,10 +152,11 @@ def draw(dump: Dump, path: Path) -> None:
 
 def _draw_gels(axes: Axes, state: State, scene: Scene, poses: Mapping[str, Pose]) -> None:
     """Lattice lines of each gel's middle plane."""
-    for index, name in enumerate(scene.sensors if "gel_displacement" in state else ()):
-        u = state["gel_displacement"][index].astype(np.float64)
+    of_gels = [u for group in gel_arrays(state, "gel_displacement").values() for u in group]
+    for index, (name, displacement) in enumerate(zip(scene.sensors, of_gels, strict=False)):
+        u = displacement.astype(np.float64)
         shares = np.meshgrid(*(np.linspace(0.0, 1.0, n) for n in u.shape[:3]), indexing="ij")
-        at = (np.stack(shares, axis=-1) - [0.5, 0.5, 1.0]) * np.array(scene.gel.size) * 1e3 + u
+        at = (np.stack(shares, axis=-1) - [0.5, 0.5, 1.0]) * np.array(scene.gel_of(name).size) * 1e3 + u
         cut = at[:, u.shape[1] // 2]
         cut = np.where(np.abs(cut) < 1e6, cut, np.nan)  # what is absurd is left out, and so is NaN
         pose = poses[name]

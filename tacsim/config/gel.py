@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -10,17 +10,17 @@ from pydantic import ValidationError
 from tacsim.config.errors import ConfigError, Place, Problem
 from tacsim.models.hardware import CameraSensorConfig
 from tacsim.models.rig import RigConfig, SimSensorConfig
-from tacsim.models.scene import Scene
+from tacsim.models.scene import SENSORS, Scene
 from tacsim.models.sensor import SensorModel
 
 
 def with_gels_of_sensors(
-    config: RigConfig, load_sensor: Callable[[Path], SensorModel], *, given: bool
+    config: RigConfig, load_sensor: Callable[[Path], SensorModel], *, given: Collection[str] = ()
 ) -> tuple[RigConfig, list[str]]:
     """The rig with gels as large as its simulated sensors' own, and that in words.
 
-    load_sensor: reads the model of a mock camera that is given a calibration. given: the size was said on the command
-    line, which counts; the models then say none. Raises ConfigError.
+    load_sensor: reads the model of a mock camera that is given a calibration. given: sensors whose gel size was said on
+    the command line, which counts; their models then say none. Raises ConfigError.
     """
     if config.scene is None:
         return config, []
@@ -35,43 +35,76 @@ def with_gels_of_sensors(
     if given:
         update["sensors"] = {
             name: sensor.model_copy(update={"model": models[name].model_copy(update={"gel_size": None})})
-            if name in models and not isinstance(sensor, CameraSensorConfig)
+            if name in models and name in given and not isinstance(sensor, CameraSensorConfig)
             else sensor
             for name, sensor in config.sensors.items()
         }
     return config.model_copy(update=update), notes
 
 
-def fit_gel(scene: Scene, models: Mapping[str, SensorModel], *, given: bool = False) -> tuple[Scene, list[str]]:
-    """The scene with gels as large along x, y as the largest `gel_size` of `models`, in whole elements, and that in
-    words, with what calibrations say against themselves; the scene as it is where no model says a size, or its own was
-    `given`. Raises ConfigError for a gel that the scene cannot mesh."""
-    doubts = [f"sensor {name}: {model.name}: {model.caution}" for name, model in models.items() if model.caution]
-    known = {name: model.gel_size for name, model in models.items() if model.gel_size is not None}
-    if not known:
-        return scene, doubts
-    size = scene.gel.size
-    shown = "; ".join(
-        f"{_millimetres(each)} by the calibration of {models[name].name} (sensor {name})"
-        for name, each in known.items()
-    )
-    if given:
-        return scene, [f"gel {_millimetres(size)}, as said on the command line; {shown}", *doubts]
-    element = scene.gel_element
-    x, y = (max(2, round(max(each[axis] for each in known.values()) / element)) * element for axis in (0, 1))
+def fit_gel(
+    scene: Scene, models: Mapping[str, SensorModel], *, given: Collection[str] = ()
+) -> tuple[Scene, list[str]]:  # fmt: skip
+    """The scene with each gel as large along x, y as its sensor's model says (`gel_size`), in whole elements, and that
+    in words, with what calibrations say against themselves. Where all that is known is one size, it is that of `gel`,
+    so of both sensors, unless the scene gives one a size of its own. A size that was `given` stays. Raises ConfigError
+    for a gel that the scene cannot mesh."""
+    notes = [f"sensor {name}: {model.name}: {model.caution}" for name, model in models.items() if model.caution]
+    sizes = {name: model.gel_size for name, model in models.items() if model.gel_size is not None}
+    said = {
+        name: f"{_millimetres(size)} by the calibration of {models[name].name} (sensor {name})"
+        for name, size in sizes.items()
+    }
+    kept = {name: words for name, words in said.items() if name in given}
+    for size in dict.fromkeys(_millimetres(scene.gel_of(name).size) for name in kept):
+        of = [words for name, words in kept.items() if _millimetres(scene.gel_of(name).size) == size]
+        notes.insert(0, f"gel {size}, as said on the command line; {'; '.join(of)}")
+    wanted = {name: _whole_elements(size, scene.gel_element(name)) for name, size in sizes.items() if name not in given}
+    if not wanted:
+        return scene, notes
+    own = any(each.size is not None or each.element_size is not None for each in scene.gels.values())
+    shared = len(set(wanted.values())) == 1 and not own and not (set(given) & set(scene.sensors))
+    groups = [list(wanted)] if shared else [[name] for name in wanted]
+    for names in reversed(groups):
+        name, shown = names[0], "; ".join(said[name] for name in names)
+        x, y = wanted[name]
+        thickness, element = scene.gel_of(name).size[2], scene.gel_element(name)
+        scene = _with_size(scene, "gel" if shared else f"gels.{name}", (x, y, thickness), shown)
+        words = (
+            f"gel {_millimetres((x, y))} in whole elements of {element * 1e3:.3g} mm, {thickness * 1e3:.3g} mm thick"
+        )
+        notes.insert(0, f"{words}: {shown}; the thickness is the scene's")
+    return scene, notes
+
+
+def _whole_elements(size: tuple[float, float], element: float) -> tuple[float, float]:
+    x, y = (max(2, round(side / element)) * element for side in size)
+    return x, y
+
+
+def _with_size(scene: Scene, key: str, size: tuple[float, ...], why: str) -> Scene:
+    """The scene with this size of `gel`, or of `gels.NAME`. Raises ConfigError."""
+    whole = scene.model_dump()
+    part, *names = key.split(".")
+    target = whole[part] if not names else whole[part].setdefault(names[0], {})
+    target["size"] = size
     try:
-        fitted = Scene.model_validate(scene.model_dump() | {"gel": scene.gel.model_dump() | {"size": (x, y, size[2])}})
+        return Scene.model_validate(whole)
     except ValidationError as error:
-        why = error.errors(include_url=False)[0]["msg"].removeprefix("Value error, ")
-        raise ConfigError([Problem(Place("scene.gel.size"), "", f"{shown}: {why}")]) from None
-    words = f"gel {_millimetres((x, y))} in whole elements of {element * 1e3:.3g} mm, {size[2] * 1e3:.3g} mm thick"
-    return fitted, [f"{words}: {shown}; the thickness is the scene's", *doubts]
+        first = error.errors(include_url=False)[0]["msg"].removeprefix("Value error, ")
+        raise ConfigError([Problem(Place(f"scene.{key}.size"), "", f"{why}: {first}")]) from None
 
 
-def says_gel_size(path: Iterable[str]) -> bool:
-    """An override of this path says how large gels are."""
-    keys = [key for key in path if key not in ("task", "scene")]
-    return keys[:2] == ["gel", "size"]
+def gel_sizes_given(paths: Iterable[Iterable[str]]) -> frozenset[str]:
+    """The sensors whose gels overrides of these paths give a size: that of `gel` counts for all."""
+    found: set[str] = set()
+    for path in paths:
+        match [key for key in path if key not in ("task", "scene")]:
+            case ["gel", "size", *_]:
+                found |= set(SENSORS)
+            case ["gels", name, "size", *_]:
+                found.add(name)
+    return frozenset(found)
 
 
 def _millimetres(size: tuple[float, ...]) -> str:

@@ -13,7 +13,7 @@ from tacsim.config.annotation import default, models
 from tacsim.config.bundle import find_bundle
 from tacsim.config.document import LoadState, Node, as_json, dump, from_plain
 from tacsim.config.errors import ConfigError, Place, Problem
-from tacsim.config.gel import says_gel_size, with_gels_of_sensors
+from tacsim.config.gel import gel_sizes_given, with_gels_of_sensors
 from tacsim.config.kinds import NotFound, is_name, kind_of, resolve, shipped_file
 from tacsim.config.messages import report_errors
 from tacsim.config.references import Override, apply, parse_override, read_file
@@ -67,7 +67,7 @@ def load_rig(rig: str | Path, *, task: str | TaskConfig | None = None, overrides
         root = apply(root, RigConfig, override, state)
     root = _absolute_calibrations(_check_scene(root, own_scene, state))
     config, notes = with_gels_of_sensors(
-        _validate(RigConfig, root, state), load_sensor, given=any(says_gel_size(each.path) for each in given)
+        _validate(RigConfig, root, state), load_sensor, given=gel_sizes_given(each.path for each in given)
     )
     config = _with_one_scene(config)
     if overrides and any(isinstance(arm, UrArmConfig) and arm.mock is None for arm in config.arms.values()):

@@ -18,6 +18,7 @@ MassDensity = Annotated[Density, Field(ge=1.0, le=1e5)]  # from an aerogel to be
 Size3 = tuple[Annotated[Length, Field(gt=0)], Annotated[Length, Field(gt=0)], Annotated[Length, Field(gt=0)]]
 Along = Annotated[Acceleration, Field(ge=-1e5, le=1e5)]  # one axis [m/s^2]
 SensorName = Literal["lower", "upper"]
+SENSORS: tuple[SensorName, ...] = ("lower", "upper")
 PoissonRatio = Annotated[float, Field(ge=0.0, le=0.499)]
 
 Preset = Literal["learn", "draft", "standard"]
@@ -270,7 +271,9 @@ class Scene(Config):
         asked = {"rigid indenter": self.indenter is not None, "hardening": hardens, "gravity": any(self.gravity)}
         lacking = [what for what, wanted in asked.items() if wanted]
         if self.gels and (self.physics == "seed" or self.indenter is not None):
-            which = "an indenter presses the gel 'lower' alone" if self.indenter else "physics 'seed' has one gel for both"
+            which = (
+                "an indenter presses the gel 'lower' alone" if self.indenter else "physics 'seed' has one gel for both"
+            )
             raise ValueError(f"gels: {which}; write what is in gels.{next(iter(self.gels))} into gel, leave out gels")
         if self.physics == "seed" and lacking:
             raise ValueError(f"physics 'seed' has no {lacking[0]}; use physics 'hybrid'")
@@ -290,8 +293,9 @@ class Scene(Config):
 
     def _require_resolvable(self, sensor: str) -> None:
         size, own = self.gel_of(sensor).size, self.gels.get(cast(SensorName, sensor), GelOverride())
-        name, edge = ("particle_spacing", self.spacing) if self.physics == "seed" else (
-            "element_size", self.element_of(sensor))
+        name, edge = (
+            ("particle_spacing", self.spacing) if self.physics == "seed" else ("element_size", self.element_of(sensor))
+        )
         edge = min(edge, size[2] / 2)  # a thin gel is resolved finer than its preset
         cells, of = math.prod(side / edge for side in size), f" of sensor '{sensor}'" if sensor in self.gels else ""
         if cells > MAX_CELLS:

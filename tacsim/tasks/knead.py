@@ -31,8 +31,9 @@ class Knead(Task):
     config: KneadConfig
 
     def require_reachable(self, start: Truth) -> None:
-        sizes = zip(self.goal[:2], self.config.scene.gel.size[:2], "xy", strict=True)
-        for wanted, there, axis in sizes:
+        scene = self.config.scene
+        narrowest = np.min([scene.gel_of(name).size[:2] for name in scene.sensors], axis=0)
+        for wanted, there, axis in zip(self.goal[:2], narrowest.tolist(), "xy", strict=True):
             if wanted > there:
                 raise GoalOutOfReach(
                     f"task: the {self.config.shape} would be {1e3 * wanted:.3g} mm long along {axis}, the gels are "

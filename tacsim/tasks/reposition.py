@@ -25,7 +25,7 @@ class Reposition(Task):
 
     def require_reachable(self, start: Truth) -> None:
         there = start.position + [*self.config.goal, 0.0] - start.poses["lower"].position if start.poses else None
-        half = np.array(self.config.scene.gel.size[:2]) / 2
+        half = np.array(self.config.scene.gel_of("lower").size[:2]) / 2
         if there is not None and (np.abs(there[:2]) > half).any():
             goal = ", ".join(f"{1e3 * each:g}" for each in self.config.goal)
             raise GoalOutOfReach(

@@ -148,7 +148,8 @@ def _facts(world: World, stats: list[MoveStats]) -> dict[str, float]:
         "guard_hits": float(sum(s.guard_hits for s in stats)),
     }
     volumes = diagnosis.particle_volumes(state)
-    elements = diagnosis.element_volumes(state, world.scene.gel.size[2] * 1e3)  # type: ignore[attr-defined]
+    thickness = world.scene.gel.size[2] * 1e3  # type: ignore[attr-defined]
+    elements = diagnosis.element_volumes(state["gel_displacement"], thickness) if "gel_displacement" in state else None
     for name, values in (("particle", volumes), ("element", elements)):
         if values is not None:
             figures |= {f"least {name}": float(values.min()), f"most {name}": float(values.max())}

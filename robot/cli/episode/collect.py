@@ -113,13 +113,13 @@ def press(
         from robot.collect.objects import find_objects
         from robot.collect.presses import PressJob, PressSet
         from tacsim.config import load_scene, load_sensor
-        from tacsim.config.gel import fit_gel, says_gel_size
+        from tacsim.config.gel import fit_gel, gel_sizes_given
         from tacsim.geometry.pressing_side import pressing_side
 
         known, files = find_objects(objects, scale)
         model = load_sensor(sensor).model_copy(update={"view": None})
         scene = load_scene("press", [f"preset={preset}", *(set_ or [])])
-        own = any(says_gel_size(text.partition("=")[0].split(".")) for text in set_ or [])
+        own = gel_sizes_given(text.partition("=")[0].split(".") for text in set_ or [])
         scene, said = fit_gel(scene, {"lower": model}, given=own)
         background = model.lighting.background
         if isinstance(background, str):

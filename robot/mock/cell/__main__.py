@@ -56,7 +56,7 @@ class WorldCell:
         self.world: World = make_world(scene)
         self._initial = self.world.snapshot()
         self._models, self._grid = models, grid
-        self._renderers = {name: Renderer(model, scene.gel.size[:2]) for name, model in models.items()}
+        self._renderers = {name: Renderer(model, scene.gel_of(name).size[:2]) for name, model in models.items()}
         self._noise = {name: noise_source(model, name) for name, model in models.items()}
         self._pictures = count()
         self.stats: dict[str, float] = {}

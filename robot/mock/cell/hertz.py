@@ -44,12 +44,13 @@ class HertzCell:
         unknown = sorted(set(models) - set(scene.sensors))
         if unknown:
             raise ValueError(f"scene '{scene.name}' has no sensor '{unknown[0]}'; it has {', '.join(scene.sensors)}")
-        self._gel, self._grid, self._models = scene.gel, grid, dict(models)
+        self._grid, self._models = grid, dict(models)
+        self._gels = {name: scene.gel_of(name) for name in scene.sensors}
         above = Pose(np.array([0.0, 0.0, 4 * RADIUS + 2 * GAP]), np.array([1.0, 0.0, 0.0, 0.0]))
         self._poses = {name: above if name == "upper" else Pose() for name in scene.sensors}
         ahead = Pose(np.array([0.0, 0.0, RADIUS + GAP]))
         self._balls = {name: se3.compose(pose, ahead).position for name, pose in self._poses.items()}
-        self._renderers = {name: Renderer(model, scene.gel.size[:2]) for name, model in models.items()}
+        self._renderers = {name: Renderer(model, scene.gel_of(name).size[:2]) for name, model in models.items()}
         self._noise = {name: noise_source(model, name) for name, model in models.items()}
         self._pictures = count()
         self._drawn = lru_cache(KEPT)(self._draw)
@@ -70,18 +71,18 @@ class HertzCell:
         """Raises ValueError for a ball that would go through the gel; the sensors stay where they were then."""
         moved = {**self._poses, **poses}
         for name, ball in self._balls.items():
-            depth = _contact(moved[name], ball)[0]
-            if depth >= self._gel.size[2]:
+            depth, thickness = _contact(moved[name], ball)[0], self._gels[name].size[2]
+            if depth >= thickness:
                 raise ValueError(
                     f"sensor '{name}' is pressed {1e3 * depth:.2f} mm into a ball, its gel is "
-                    f"{1e3 * self._gel.size[2]:g} mm thick"
+                    f"{1e3 * thickness:g} mm thick"
                 )
         self._poses = moved
 
     def wrench(self, name: str) -> FloatArray:
         """(6,) on the sensor, about its origin, its axes [N, N m]: the ball pushes along its -z."""
         depth, x, y = _contact(self._poses[name], self._balls[name])
-        material = self._gel.material
+        material = self._gels[name].material
         modulus = material.youngs_modulus / (1.0 - material.poisson_ratio**2)
         force = 4.0 / 3.0 * modulus * np.sqrt(RADIUS) * max(0.0, depth) ** 1.5
         return np.array([0.0, 0.0, -force, -y * force, x * force, 0.0])
@@ -98,7 +99,7 @@ class HertzCell:
     def _draw(self, name: str, *steps: int) -> tuple[NDArray[np.uint8], SurfaceMap]:
         """The picture without noise, and the surface, with the ball at depth, x, y = GRAIN * steps [m]."""
         depth, x, y = (GRAIN * step for step in steps)
-        surface = dent(self._gel.size[:2], depth, x, y)
+        surface = dent(self._gels[name].size[:2], depth, x, y)
         return self._renderers[name](surface), surface_map(surface, self._grid, self._models[name].markers)
 
 

@@ -119,8 +119,10 @@ def identify(
     exact = Simulation(start, parameters, taken, recordings.seen, on_run)
     error = COARSE_ERROR
     levels = [replace(exact, scene=coarser(start)), exact]
-    if kind == "body" and 2 * levels[0].scene.element <= scene.gel.size[2] / 2:  # else nothing is left of the gel
-        levels.insert(0, replace(exact, scene=coarser(levels[0].scene)))
+    coarse = levels[0].scene
+    layers = [2 * coarse.element_of(name) <= scene.gel_of(name).size[2] / 2 for name in scene.sensors]
+    if kind == "body" and all(layers):  # else nothing is left of the gel
+        levels.insert(0, replace(exact, scene=coarser(coarse)))
         error *= 2
     width = np.array([name.endswith(".width") for name in signals.channels])[signals.channel]
     fit = estimate(

@@ -228,10 +228,13 @@ def scene_with(scene: Scene, values: Mapping[str, float]) -> Scene:
 
 
 def coarser(scene: Scene) -> Scene:
-    """The scene on a mesh twice as coarse, where the gel still has two layers of elements."""
-    return scene.model_copy(
-        update={
-            "element_size": min(2 * scene.element, scene.gel.size[2] / 2),
-            "particle_spacing": 2 * scene.spacing,
-        }
-    )
+    """The scene on a mesh twice as coarse, where each gel still has two layers of elements."""
+    layers = {name: scene.gel_of(name).size[2] / 2 for name in scene.sensors}
+    gels = {
+        name: own
+        if own.element_size is None
+        else own.model_copy(update={"element_size": min(2 * own.element_size, layers[name])})
+        for name, own in scene.gels.items()
+    }
+    update = {"element_size": min(2 * scene.element, *layers.values()), "particle_spacing": 2 * scene.spacing}
+    return scene.model_copy(update={**update, "gels": gels})

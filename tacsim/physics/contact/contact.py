@@ -71,9 +71,7 @@ def surface_sums(gel: ti.template(), row, i, j, wx, wy, dx, dy):
         for c in range(4):
             value, by_x, by_y = 0.0, 0.0, 0.0
             for p in ti.static(range(3)):
-                first, second, third = [
-                    gel.surface[surface_at(gel, row + i + p + 1, j + q + 1) + c] for q in range(3)
-                ]
+                first, second, third = [gel.surface[surface_at(gel, row + i + p + 1, j + q + 1) + c] for q in range(3)]
                 line = wy[0] * first + wy[1] * second + wy[2] * third
                 value += wx[p] * line
                 by_x += dx[p] * line
@@ -187,9 +185,14 @@ def particle_contact(env: ti.template(), part, x, v, history, radius, gel: ti.te
 
     x, v: position, and velocity relative to the moving sensor. history: its anchor on the untouched gel or on the
     housing [mm], and on which of these; the remembered normal force as the overlap whose penalty it equals [mm]; how
-    far the gel under it has moved aside [mm]. forces: where those on its nodes begin. Returns whether it touches, whether it touches the housing, the force, and the new history.
+    far the gel under it has moved aside [mm]. forces: where those on its nodes begin. Returns whether it touches,
+    whether it touches the housing, the force, and the new history.
     """
-    h, k_n, dt = env.param(layout.GEL_SPACING + gel.index), env.param(layout.STIFFNESS + gel.index), env.param(layout.STEP)
+    h, k_n, dt = (
+        env.param(layout.GEL_SPACING + gel.index),
+        env.param(layout.STIFFNESS + gel.index),
+        env.param(layout.STEP),
+    )
     mu, housing = env.param(layout.FRICTION + gel.index), env.param(layout.HOUSING + gel.index)
     deepest = env.param(layout.BODY_CELL)  # two particle spacings: the largest overlap answered in full
     nx, ny, layers = gel.nx, gel.ny, gel.layers

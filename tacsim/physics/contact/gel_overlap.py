@@ -40,7 +40,8 @@ def gel_overlap(gels: Sequence[GelParams], tops: Sequence[Floats], rotations: Fl
 def _places(gel: GelParams) -> Floats:
     """(nx + 1, ny + 1, 2) where the surface's nodes rest [mm]."""
     axes = [np.arange(n + 1) * gel.spacing for n in gel.elements[:2]]
-    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1) - np.array(gel.half)
+    places: Floats = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1) - np.array(gel.half)
+    return places
 
 
 def box_round(top: Floats) -> tuple[float, float, float, float]:

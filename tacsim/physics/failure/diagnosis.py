@@ -1,8 +1,8 @@
 """What is wrong in a state: volume ratios, speeds and numbers that are not finite, and where they are worst.
 
 A state holds the arrays of a world by name, in kernel units [mm, wave speed 1]. All worlds name alike what they have
-alike: `gel_displacement` and `gel_velocity` of gel lattices (see tacsim.physics.snapshot.gel_arrays), `position` and `velocity` of particles, and their `strain`
-b_e - I or `deformation_gradient`.
+alike: `gel_displacement` and `gel_velocity` of gel lattices (tacsim.physics.snapshot.gel_arrays), `position` and
+`velocity` of particles, and their `strain` b_e - I or `deformation_gradient`.
 """
 
 from __future__ import annotations

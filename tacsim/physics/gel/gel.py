@@ -217,7 +217,9 @@ class GelState:
         """Views of what a motion changes, by name (see tacsim.physics.snapshot.gel_suffixes)."""
         names = gel_suffixes(len(self.groups))
         views = {f"gel_displacement{name}": each.u[environment] for name, each in zip(names, self.groups, strict=True)}
-        return views | {f"gel_velocity{name}": each.v[environment] for name, each in zip(names, self.groups, strict=True)}
+        return views | {
+            f"gel_velocity{name}": each.v[environment] for name, each in zip(names, self.groups, strict=True)
+        }
 
     def tops(self, environment: int) -> list[np.ndarray]:
         """Displacements of an environment's gel surfaces [mm], each (nx + 1, ny + 1, 3)."""

@@ -59,7 +59,9 @@ class Gel(NamedTuple):
 def gel_of(env: ti.template(), gels: ti.template(), g):
     """Gel number g of an environment."""
     nx, ny, layers = [env.count(layout.ELEMENTS + 3 * g + d) for d in range(3)]
-    surface, force, lattice = [env.count(first + g) for first in (layout.GEL_SURFACE, layout.GEL_FORCES, layout.GEL_LATTICE)]
+    surface, force, lattice = [
+        env.count(first + g) for first in (layout.GEL_SURFACE, layout.GEL_FORCES, layout.GEL_LATTICE)
+    ]
     return ti.static(
         Gel(
             gels.nodes, gels.surface, gels.contact_force, gels.corners, gels.lattice, g, nx, ny, layers, surface, force,

@@ -143,10 +143,11 @@ def keep_loads(
             for name, (travel, felt) in before.items():
                 axes[name].measure(axes[name].travel - travel, force(name) - felt)
         name = wrong[0]
+        limit = 1e3 * TRAVEL * thickness[name]
         raise LoadNotReached(
             f"'{name}' does not reach a load of {axes[name].wanted:g} N: {force(name):.3g} N after "
-            f"{1e3 * axes[name].travel:+.3g} mm along its z axis from its target (limit {1e3 * TRAVEL * thickness[name]:.3g} "
-            f"mm); bring its target nearer to contact, or ask for another load"
+            f"{1e3 * axes[name].travel:+.3g} mm along its z axis from its target (limit {limit:.3g} mm); "
+            f"bring its target nearer to contact, or ask for another load"
         )
 
     world.plan(list(start.values()), list(targets.values()))  # raises ValueError for a path that is far too long

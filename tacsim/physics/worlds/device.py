@@ -115,7 +115,14 @@ def press_substep(
         env = ti.static(Environment(e, params, counts, partial))
         if is_active(env, clock):
             gels = ti.static(Gels(nodes, surface, contact_force, corners, lattice, 1))
-            indent(env, cell, clock[0], drive, ti.static(gel_of(env, gels, 0)), ti.static(Indenter(anchor, pressure, values)))
+            indent(
+                env,
+                cell,
+                clock[0],
+                drive,
+                ti.static(gel_of(env, gels, 0)),
+                ti.static(Indenter(anchor, pressure, values)),
+            )
     for e, n in ti.ndrange(counts.shape[0], columns):
         env = ti.static(Environment(e, params, counts, partial))
         if clock[1] < counts[e, layout.STEPS]:

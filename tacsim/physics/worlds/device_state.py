@@ -177,8 +177,8 @@ class DeviceState(ABC):
         """Of environments `first` up to `last`; before a "launch" of those only that take part in it."""
         counts = self.arrays.upload("counts", self._counts, ti.i32)
         arguments = {
-            "first": first, "last": last, "resting": int(moment == "motion"), "counts": counts, "margin": self._gels.margin,
-            "no_margin": 0,
+            "first": first, "last": last, "resting": int(moment == "motion"), "counts": counts,
+            "margin": self._gels.margin, "no_margin": 0,
         }  # fmt: skip
         for name, (_, dtype) in self._state().items():
             arguments[name] = self.arrays[name]

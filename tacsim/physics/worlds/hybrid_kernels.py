@@ -297,7 +297,7 @@ def substeps(
             index = sync[turn, ENVIRONMENT]
             env = ti.static(Environment(index, params, counts, partial))
             of_gels = ti.static((nodes, surface, contact_force, corners, lattice))
-            gels = ti.static(Gels(*of_gels, 2))
+            gels = ti.static(Gels(nodes, surface, contact_force, corners, lattice, 2))
             body = ti.static(Body(particles, masses, velocities, changes, ends, shares))
             shared = ti.static((params, counts, partial))
             steps = env.count(layout.STEPS)

@@ -32,7 +32,7 @@ def pressed(depth: float, x: float = 0.0) -> dict[str, Pose]:
 
 
 def test_force_is_that_of_hertz_and_pushes_the_sensor_back(cell: HertzCell) -> None:
-    material = cell._gel.material
+    material = cell._gels["lower"].material
     modulus = material.youngs_modulus / (1 - material.poisson_ratio**2)
     cell.move(pressed(0.4e-3, x=1e-3))
     for wrench in map(cell.wrench, ("lower", "upper")):

@@ -14,7 +14,6 @@ from tacsim.physics.exec.lanes import PARTS
 from tacsim.physics.exec.layout import (
     BACKING,
     COUNTS,
-    ELEMENTS,
     FILTERED,
     GEL_DAMPING,
     NUMBERS,
@@ -27,10 +26,10 @@ from tacsim.physics.gel.corner import CORNER_STIFFNESS, NARROW
 from tacsim.physics.gel.element import HOURGLASS
 from tacsim.physics.gel.gel import GelState, gel_params
 from tacsim.physics.gel.kernels import (
+    Gels,
     Lattice,
     gel_advance,
     gel_forces,
-    gels_of,
 )
 from tacsim.physics.gel.mass import gel_advance_filtered, gel_even, gel_means
 
@@ -49,7 +48,7 @@ def substep(
     ti.loop_config(serialize=True)
     for e in range(counts.shape[0]):
         env = ti.static(Environment(e, params, counts, partial))
-        gels = ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, number))
+        gels = ti.static(Gels(nodes, surface, contact_force, corners, lattice, number))
         for part in range(PARTS):
             gel_forces(env, part, gels)
         for part in range(PARTS * (advance == PLAIN)):
@@ -66,30 +65,30 @@ GEL = Gel(size=(6e-3, 5e-3, 4e-3), material=GelMaterial(poisson_ratio=0.48))
 DT, DAMPING = 0.3, 0.2
 
 
-def launch(
-    state: GelState, advance: int, element: float = 1e-3, gel: Gel = GEL, dt: float = DT
-) -> np.ndarray:  # fmt: skip
+def launch(state: GelState, advance: int, dt: float = DT) -> np.ndarray:
     """One substep, or its forces alone; (environments, PARTS, numbers) that it noted."""
     start()
-    params = gel_params(gel, element)
-    environments, gels = state.u.shape[:2]
+    environments = len(state.groups[0].u)
     numbers = np.zeros((environments, PARAMS), np.float32)
-    for index, value in {**params.params(), STEP: dt, GEL_DAMPING: DAMPING, OWN: 0.5, FILTERED: 1.0}.items():
+    values = {STEP: dt, OWN: 0.5, FILTERED: 1.0}
+    for g, params in enumerate(state.gels):
+        values |= params.params(g) | {GEL_DAMPING + g: DAMPING}
+    for index, value in values.items():
         numbers[:, index] = value
     counts = np.zeros((environments, COUNTS), np.int32)
-    counts[:, ELEMENTS : ELEMENTS + 3] = params.elements
+    state.write_layout(counts)
     partial = np.full((environments, PARTS, NUMBERS), 1e9, np.float32)
     state.refresh()
-    substep(gels, int(advance), *state.arguments(), numbers, counts, partial)
+    substep(len(state.gels), int(advance), *state.arguments(), numbers, counts, partial)
     return partial
 
 
 def run(displacement: np.ndarray, dt: float = DT) -> tuple[np.ndarray, float]:
     """Forces of a gel with the given nodal displacement [mm], and the smallest det F that its parts saw."""
-    state = GelState(gel_params(GEL, 1e-3), 1, 1)
-    state.u[0, 0] = displacement
+    state = GelState([gel_params(GEL, 1e-3)], 1)
+    state.alike.u[0, 0] = displacement
     partial = launch(state, FORCES, dt=dt)
-    return state.f[0, 0], float(partial[0, :, SMALLEST_VOLUME].min())
+    return state.alike.f[0, 0], float(partial[0, :, SMALLEST_VOLUME].min())
 
 
 def nodes() -> np.ndarray:
@@ -146,27 +145,44 @@ def test_narrow_corners_press_back_by_a_potential() -> None:
 def test_each_gel_of_each_environment_has_its_own_forces(element: float) -> None:
     """However many parts share a gel, and wherever its nodes begin in memory."""
     params = gel_params(GEL, element)
-    state = GelState(params, 2, 2)
-    state.u[:] = u = np.random.default_rng(1).normal(scale=0.05 * params.spacing, size=state.u.shape)
-    launch(state, FORCES, element)
+    state = GelState([params] * 2, 2)
+    state.alike.u[:] = u = np.random.default_rng(1).normal(scale=0.05 * params.spacing, size=state.alike.u.shape)
+    launch(state, FORCES)
     for environment, gel in np.ndindex(2, 2):
         truth = laws.gel_forces(u[environment, gel], params.spacing, params.mu, params.lam, HOURGLASS)
-        assert np.abs(state.f[environment, gel] - truth).max() < 3e-6 * np.abs(truth).max()
+        assert np.abs(state.alike.f[environment, gel] - truth).max() < 3e-6 * np.abs(truth).max()
+
+
+def test_gels_that_are_cut_differently_have_their_own_forces() -> None:
+    """Of three environments: each gel at its place in memory, with its own spacing and material."""
+    fine = Gel(size=(3.5e-3, 2e-3, 1.5e-3), material=GelMaterial(youngs_modulus=0.5e6, poisson_ratio=0.3))
+    gels = [gel_params(GEL, 1e-3), gel_params(fine, 0.5e-3)]
+    for order in (gels, gels[::-1]):
+        state, rng = GelState(order, 3), np.random.default_rng(4)
+        for params, group in zip(order, state.groups, strict=True):
+            group.u[:] = rng.normal(scale=0.05 * params.spacing, size=group.u.shape)
+        launch(state, FORCES)
+        for params, group in zip(order, state.groups, strict=True):
+            for environment in range(3):
+                u = group.u[environment, 0].astype(np.float64)
+                truth = laws.gel_forces(u, params.spacing, params.mu, params.lam, HOURGLASS)
+                assert np.abs(group.f[environment, 0] - truth).max() < 3e-6 * np.abs(truth).max()
 
 
 def test_a_substep_is_symplectic_euler_with_lumped_masses() -> None:
     """v <- (1 - alpha dt) v + dt (f + contact_force) / m, u <- u + dt v, held at the backing; the surface follows."""
     params = gel_params(GEL, 1e-3)
-    state = GelState(params, 1, 2)
+    state = GelState([params] * 2, 1)
     rng = np.random.default_rng(2)
-    count = np.prod(state.u.shape[2:4])
-    state.u[..., 1:, :] = u = rng.normal(scale=0.05, size=state.u[..., 1:, :].shape)
-    state.v[..., 1:, :] = v = rng.normal(scale=0.01, size=u.shape)
-    state.contact_force[..., :count, :3] = rng.normal(scale=0.01, size=state.contact_force[..., :count, :3].shape)
-    contact_force = state.contact_force.copy()
+    count = np.prod(state.alike.u.shape[2:4])
+    state.alike.u[..., 1:, :] = u = rng.normal(scale=0.05, size=state.alike.u[..., 1:, :].shape)
+    state.alike.v[..., 1:, :] = v = rng.normal(scale=0.01, size=u.shape)
+    pushed = state.alike.contact_force[..., :count, :3]
+    pushed[...] = rng.normal(scale=0.01, size=pushed.shape)
+    contact_force = state.alike.contact_force.copy()
     partial = launch(state, PLAIN)
-    assert not state.contact_force.any()  # zero for the next substep
-    share = np.full(state.u.shape[2:5], 1.0)
+    assert not state.alike.contact_force.any()  # zero for the next substep
+    share = np.full(state.alike.u.shape[2:5], 1.0)
     share[[0, -1]] *= 0.5
     share[:, [0, -1]] *= 0.5
     share[:, :, [0, -1]] *= 0.5
@@ -176,15 +192,15 @@ def test_a_substep_is_symplectic_euler_with_lumped_masses() -> None:
         force = laws.gel_forces(whole, params.spacing, params.mu, params.lam, HOURGLASS)
         held = partial[0].reshape(2, -1, NUMBERS)[gel, :, BACKING : BACKING + 3].sum(axis=0)
         assert held == pytest.approx(force[:, :, 0].sum(axis=(0, 1)), abs=1e-5 * np.abs(force).max())
-        contact = contact_force[0, :, gel, :count, :3].sum(axis=0, dtype=float).reshape(*state.u.shape[2:4], 3)
+        contact = contact_force[0, gel, :, :count, :3].sum(axis=0, dtype=float).reshape(*state.alike.u.shape[2:4], 3)
         force[:, :, -1] += contact
         velocity = (1 - DAMPING * DT) * v[0, gel] + DT * force[:, :, 1:] / mass
-        assert np.abs(state.v[0, gel, :, :, 1:] - velocity).max() < 1e-5 * np.abs(velocity).max()
-        assert np.abs(state.u[0, gel, :, :, 1:] - u[0, gel] - DT * velocity).max() < 1e-5 * np.abs(u).max()
-    assert not state.u[..., 0, :].any()
-    surface = state.surface.copy()
+        assert np.abs(state.alike.v[0, gel, :, :, 1:] - velocity).max() < 1e-5 * np.abs(velocity).max()
+        assert np.abs(state.alike.u[0, gel, :, :, 1:] - u[0, gel] - DT * velocity).max() < 1e-5 * np.abs(u).max()
+    assert not state.alike.u[..., 0, :].any()
+    surface = state.alike.surface.copy()
     state.refresh()
-    assert np.array_equal(surface[..., :3], state.surface[..., :3])
+    assert np.array_equal(surface[..., :3], state.alike.surface[..., :3])
 
 
 def test_rigid_motion_gives_no_force() -> None:
@@ -288,13 +304,13 @@ def test_forces_in_a_smooth_field_converge_at_second_order(nu: float) -> None:
     for element in (1e-3, 0.5e-3, 0.25e-3):
         params = gel_params(gel, element)
         x = np.stack(np.meshgrid(*[np.arange(n + 1.0) for n in params.elements], indexing="ij"), -1) * params.spacing
-        state = GelState(params, 1, 1)
-        state.u[0, 0] = waves(x)
-        launch(state, FORCES, element, gel)
+        state = GelState([params], 1)
+        state.alike.u[0, 0] = waves(x)
+        launch(state, FORCES)
         every = round(1e-3 / element)  # the nodes that all three have
         inside = (slice(every, -every, every),) * 3
         truth = divergence_of_stress(x[inside], params.mu, params.lam)
-        error = state.f[0, 0][inside] / params.spacing**3 - truth
+        error = state.alike.f[0, 0][inside] / params.spacing**3 - truth
         errors.append(np.sqrt((error**2).mean() / (truth**2).mean()))
     orders = np.log2(np.divide(errors[:-1], errors[1:]))
     assert orders == pytest.approx(2.0, abs=0.1)
@@ -346,20 +362,20 @@ def test_accelerations_are_filtered_by_means_over_elements() -> None:
     """Against the filter written out: accelerations a become a / 2 + (4 S - 1)^2 a. Its matrix is symmetric in the
     masses, and positive."""
     params, rng = gel_params(GEL, 1e-3), np.random.default_rng(5)
-    state = GelState(params, 1, 1)
-    state.u[0, 0] = 0.02 * rng.standard_normal(state.u[0, 0].shape)
-    state.u[0, 0, :, :, 0] = 0.0
+    state = GelState([params], 1)
+    state.alike.u[0, 0] = 0.02 * rng.standard_normal(state.alike.u[0, 0].shape)
+    state.alike.u[0, 0, :, :, 0] = 0.0
     launch(state, SELECTIVE)
-    share = np.ones(state.u.shape[2:5])
+    share = np.ones(state.alike.u.shape[2:5])
     for axis in range(3):
         ends = np.moveaxis(share, axis, 0)
         ends[[0, -1]] *= 0.5
     mass = params.density * params.spacing**3 * share[..., None]
-    own = state.f[0, 0] / mass
+    own = state.alike.f[0, 0] / mass
     own[:, :, 0] = 0.0
     once = 4 * means_over_elements(own) - own
     truth = 0.5 * own + 4 * means_over_elements(once) - once
-    error = state.v[0, 0] / DT - truth
+    error = state.alike.v[0, 0] / DT - truth
     assert np.abs(error).max() < 2e-5 * np.abs(truth).max()
     a, b = (rng.standard_normal(own.shape) for _ in range(2))
     a[:, :, 0] = b[:, :, 0] = 0.0

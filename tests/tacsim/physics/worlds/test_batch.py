@@ -201,14 +201,14 @@ def test_a_state_broken_before_is_told_in_its_place(fresh: Batch) -> None:
 
 @pytest.mark.cpu
 def test_a_body_far_away_enlarges_no_array_but_the_grid(fresh: Batch) -> None:
-    arrays = fresh._state.particles.rows, fresh._state.contact_history, fresh._state.gels.nodes
+    arrays = fresh._state.particles.rows, fresh._state.contact_history, fresh._state.gels.alike.nodes
     nodes = fresh._state.particles.masses.shape[2]
     for place in ("position", "reference"):
         fresh.worlds[0].arrays()[place][-1] += [0.0, 60.0, 0.0]
     stats = fresh.move([STAY, closed(fresh.worlds[1], 0.4e-3), None])[1]
     assert fresh._state.particles.masses.shape[2] > nodes
     assert all(a is b for a, b in zip(
-        arrays, (fresh._state.particles.rows, fresh._state.contact_history, fresh._state.gels.nodes), strict=True
+        arrays, (fresh._state.particles.rows, fresh._state.contact_history, fresh._state.gels.alike.nodes), strict=True
     ))  # fmt: skip
     alone = HybridWorld(SCENES[1])
     assert alone.move(closed(alone, 0.4e-3)) == stats

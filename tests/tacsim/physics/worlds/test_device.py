@@ -54,6 +54,12 @@ def squeeze(side: float, stress: float = 2e4) -> Scene:
     return Scene.model_validate({"body": body, "gel": GEL, "settling": QUICK, "gravity": [0.0, 0.0, -9.81]})
 
 
+def unlike(side: float) -> Scene:
+    """Another gel above: larger, thinner, stiffer and cut finer."""
+    above = {"size": [6e-3, 5e-3, 1.5e-3], "element_size": 0.5e-3, "material": {"youngs_modulus": 0.4e6}}
+    return Scene.model_validate({**squeeze(side).model_dump(), "gels": {"upper": above}})
+
+
 def closer(world: World, by: float, across: float = 0.0) -> dict[str, Pose]:
     """The upper one comes nearer by `by` [m], and goes aside."""
     name = "upper" if "upper" in world.sensors else "indenter"
@@ -76,7 +82,7 @@ def outcome(world: World, stats: MoveStats) -> dict[str, Any]:
             ]
         ),
         "wrench": np.array([world.wrench(name) for name in world.sensors]),
-        "surface": np.array([world.surface(name).displacement for name in world.sensors]),
+        "surface": np.concatenate([world.surface(name).displacement.ravel() for name in world.sensors]),
         **state,
     }
 
@@ -112,6 +118,10 @@ def all_outcomes(folder: Path) -> dict[str, Any]:
     for name, world, stats in (("one", first, ends[0]), ("other", second, ends[1])):
         assert isinstance(stats, MoveStats)
         note(name, outcome(world, stats))
+    two = Batch([unlike(2e-3), unlike(3e-3)])
+    ends_of_two = two.move([closer(world, 0.5e-3, 0.1e-3) for world in two.worlds])
+    assert isinstance(ends_of_two[1], MoveStats)
+    note("unlike", outcome(two.worlds[1], ends_of_two[1]))
     # a launch of environment 0 alone, in states that are unphysical; environment 1 rests
     last = (1, -1, -1, -1, 2)  # node of the upper gel, in the surface
     for name, array, entry, value in (("race", "velocity", (-1, 2), 20.0), ("invert", "gel_displacement", last, -6.0)):
@@ -198,7 +208,7 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], dict
 def test_both_go_the_same_way(pair: tuple[dict[str, Any], dict[str, Any]]) -> None:
     cpu, there = pair
     assert cpu.keys() == there.keys()
-    for name in ("press", "interrupted", "mesh", "one", "other"):
+    for name in ("press", "interrupted", "mesh", "one", "other", "unlike"):
         assert there[f"{name}.stats"] == pytest.approx(cpu[f"{name}.stats"], abs=1e-7)
         assert cpu[f"{name}.stats"][2] == 1, "not at rest: compares nothing"
         largest = np.abs(cpu[f"{name}.wrench"][:, :3]).max()

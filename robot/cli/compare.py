@@ -144,7 +144,7 @@ def _simulate_presses(name: str, truth: FrameSet, bundle: Path | None, overrides
         # two layers are the least that a gel may have
         scene = load_scene(name, [*settings, f"element_size={min(ELEMENT, scene.gel.size[2] / 2)} m"])
     given = gel_sizes_given(text.partition("=")[0].split(".") for text in overrides)
-    scene, said = fit_gel(scene, {"of B": sensor}, given={"of B"} if given else ())
+    scene, said = fit_gel(scene, {"of B": sensor}, given=given)
     if scene.indenter is not None and isinstance(ball := scene.indenter.geometry, Sphere):
         words = ", as in the calibration; for another --set 'indenter.geometry.radius=3 mm'" if own else ""
         said = [f"a ball of {ball.radius * 1e3:.4g} mm radius{words}", *said]

@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from tacsim.config.errors import ConfigError, Place, Problem
 from tacsim.models.hardware import CameraSensorConfig
 from tacsim.models.rig import RigConfig, SimSensorConfig
-from tacsim.models.scene import SENSORS, Scene
+from tacsim.models.scene import Scene
 from tacsim.models.sensor import SensorModel
 
 
@@ -19,8 +19,8 @@ def with_gels_of_sensors(
 ) -> tuple[RigConfig, list[str]]:
     """The rig with gels as large as its simulated sensors' own, and that in words.
 
-    load_sensor: reads the model of a mock camera that is given a calibration. given: sensors whose gel size was said on
-    the command line, which counts; their models then say none. Raises ConfigError.
+    load_sensor: reads the model of a mock camera that is given a calibration. given: see `fit_gel`; models of sensors
+    whose gel size was given then say none. Raises ConfigError.
     """
     if config.scene is None:
         return config, []
@@ -32,10 +32,11 @@ def with_gels_of_sensors(
             models[name] = sensor.model if sensor.model is not None else load_sensor(Path(sensor.calibration or ""))
     scene, notes = fit_gel(config.scene, models, given=given)
     update: dict[str, object] = {"scene": scene}
-    if given:
+    fixed = _sensors_given(config.scene, models, given)
+    if fixed:
         update["sensors"] = {
             name: sensor.model_copy(update={"model": models[name].model_copy(update={"gel_size": None})})
-            if name in models and name in given and not isinstance(sensor, CameraSensorConfig)
+            if name in fixed and not isinstance(sensor, CameraSensorConfig)
             else sensor
             for name, sensor in config.sensors.items()
         }
@@ -47,23 +48,24 @@ def fit_gel(
 ) -> tuple[Scene, list[str]]:  # fmt: skip
     """The scene with each gel as large along x, y as its sensor's model says (`gel_size`), in whole elements, and that
     in words, with what calibrations say against themselves. Where all that is known is one size, it is that of `gel`,
-    so of both sensors, unless the scene gives one a size of its own. A size that was `given` stays. Raises ConfigError
-    for a gel that the scene cannot mesh."""
+    so of both sensors, unless the scene gives one a size of its own. Sizes that were `given` on the command line stay:
+    "gel", or the names of sensors. Raises ConfigError for a gel that the scene cannot mesh."""
     notes = [f"sensor {name}: {model.name}: {model.caution}" for name, model in models.items() if model.caution]
     sizes = {name: model.gel_size for name, model in models.items() if model.gel_size is not None}
     said = {
         name: f"{_millimetres(size)} by the calibration of {models[name].name} (sensor {name})"
         for name, size in sizes.items()
     }
-    kept = {name: words for name, words in said.items() if name in given}
+    fixed = _sensors_given(scene, models, given)
+    kept = {name: words for name, words in said.items() if name in fixed}
     for size in dict.fromkeys(_millimetres(scene.gel_of(name).size) for name in kept):
         of = [words for name, words in kept.items() if _millimetres(scene.gel_of(name).size) == size]
         notes.insert(0, f"gel {size}, as said on the command line; {'; '.join(of)}")
-    wanted = {name: _whole_elements(size, scene.gel_element(name)) for name, size in sizes.items() if name not in given}
+    wanted = {name: _whole_elements(size, scene.gel_element(name)) for name, size in sizes.items() if name not in fixed}
     if not wanted:
         return scene, notes
     own = any(each.size is not None or each.element_size is not None for each in scene.gels.values())
-    shared = len(set(wanted.values())) == 1 and not own and not (set(given) & set(scene.sensors))
+    shared = len(set(wanted.values())) == 1 and not own and not fixed
     groups = [list(wanted)] if shared else [[name] for name in wanted]
     for names in reversed(groups):
         name, shown = names[0], "; ".join(said[name] for name in names)
@@ -96,15 +98,21 @@ def _with_size(scene: Scene, key: str, size: tuple[float, ...], why: str) -> Sce
 
 
 def gel_sizes_given(paths: Iterable[Iterable[str]]) -> frozenset[str]:
-    """The sensors whose gels overrides of these paths give a size: that of `gel` counts for all."""
+    """What overrides of these paths give a gel size: "gel", or sensors."""
     found: set[str] = set()
     for path in paths:
         match [key for key in path if key not in ("task", "scene")]:
             case ["gel", "size", *_]:
-                found |= set(SENSORS)
+                found.add("gel")
             case ["gels", name, "size", *_]:
                 found.add(name)
     return frozenset(found)
+
+
+def _sensors_given(scene: Scene, names: Iterable[str], given: Collection[str]) -> frozenset[str]:
+    """Those of the sensors `names` whose gels have a size that was given."""
+    own = {name for name, each in scene.gels.items() if each.size is not None}
+    return frozenset(name for name in names if name in given or ("gel" in given and name not in own))
 
 
 def _millimetres(size: tuple[float, ...]) -> str:

@@ -18,7 +18,6 @@ MassDensity = Annotated[Density, Field(ge=1.0, le=1e5)]  # from an aerogel to be
 Size3 = tuple[Annotated[Length, Field(gt=0)], Annotated[Length, Field(gt=0)], Annotated[Length, Field(gt=0)]]
 Along = Annotated[Acceleration, Field(ge=-1e5, le=1e5)]  # one axis [m/s^2]
 SensorName = Literal["lower", "upper"]
-SENSORS: tuple[SensorName, ...] = ("lower", "upper")
 PoissonRatio = Annotated[float, Field(ge=0.0, le=0.499)]
 
 Preset = Literal["learn", "draft", "standard"]

@@ -14,7 +14,9 @@ from hypothesis import strategies as st
 
 from tacsim.config import ConfigError, config_root, load_rig, load_scene, load_sensor
 
-SCENE_KEYS = "name, physics, preset, particle_spacing, element_size, gel, body, indenter, friction, gravity, settling"
+SCENE_KEYS = (
+    "name, physics, preset, particle_spacing, element_size, gel, gels, body, indenter, friction, gravity, settling"
+)
 LENGTH = "length > 0 m, bare in m or with a unit (m, mm, cm, um)"
 
 
@@ -39,6 +41,19 @@ TEXTS = {
                                  "a.yaml:4: body.geometry.radius: unknown key; allowed: shape, size"),
     "unknown entry": ("friction: {uper: 1, lower: 1}",
                       "a.yaml:1: friction.uper: unknown key; allowed: lower, upper; did you mean 'upper'?"),
+    "a gel of no sensor": ("gels:\n  uper: {housing: 0 mm}", "a.yaml:2: gels.uper: unknown key; allowed: lower, upper; did you mean 'upper'?"),
+    "unknown key of one gel": ("gels:\n  upper:\n    sise: [1, 1, 1]",
+                               "a.yaml:3: gels.upper.sise: unknown key; allowed: size, material, housing, element_size; did you mean 'size'?"),
+    "no material of one gel": ("gels:\n  upper:\n    material: jelly",
+                               "a.yaml:3: gels.upper.material: no material 'jelly'; allowed: cold-plasticine, dough, modelling-clay, seed, silicone, soft-clay"),
+    "a stiffness of one gel": ("gels: {lower: {material: {youngs_modulus: 0 kPa}}}",
+                               "a.yaml:1: gels.lower.material.youngs_modulus: 0 kPa is out of range; allowed: a pressure >= 1 Pa and <= 1e+12 Pa, bare in Pa or with a unit (Pa, kPa, MPa, GPa)"),
+    "two gels under an indenter": ("extends: press\ngels:\n  upper: {housing: 0 mm}",
+                                   "a.yaml:1: gels: an indenter presses the gel 'lower' alone; write what is in gels.upper into gel, leave out gels"),
+    "two gels of the seed": ("physics: seed\ngels:\n  upper: {housing: 0 mm}",
+                             "a.yaml:1: gels: physics 'seed' has one gel for both; write what is in gels.upper into gel, leave out gels"),
+    "a thin gel": ("gels:\n  upper: {size: [8 mm, 8 mm, 1 mm], element_size: 0.6 mm}",
+                   "a.yaml:1: element_size 0.0006 m is too coarse for a gel of sensor 'upper' 0.001 m thick: it needs two layers of elements; choose at most 0.0005 m"),
     "range": ("friction:\n  upper: 1\n  lower: 9", "a.yaml:3: friction.lower: 9 is out of range; allowed: a number >= 0 and <= 5"),
     "range of a quantity": ("element_size: -3 mm", f"a.yaml:1: element_size: -3 mm is out of range; allowed: a {LENGTH}, or null"),
     "a yield of nothing": ("body:\n  material:\n    yield_stress: 0 kPa",

@@ -200,6 +200,8 @@ def test_what_cannot_be_a_batch_says_so() -> None:
         make_native(0)
     with pytest.raises(ValueError, match=r"variant 0: a new scene must keep gel\.size"):
         make_native(2, variants=[["scene.gel.size=[10 mm, 10 mm, 4 mm]"]])
+    with pytest.raises(ValueError, match=r"variant 0: a new scene must keep gel\.size of sensor 'upper'"):
+        make_native(2, variants=[["scene.gels.upper.size=[10 mm, 10 mm, 4 mm]"]])
     with pytest.raises(ValueError, match="variant 1 may change nothing but scene, task"):
         make_native(2, variants=[[], ["period=50 ms"]])
     with pytest.raises(ValueError, match="variant 0: a new task must keep touch_force"):

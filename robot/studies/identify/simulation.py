@@ -236,5 +236,7 @@ def coarser(scene: Scene) -> Scene:
         else own.model_copy(update={"element_size": min(2 * own.element_size, layers[name])})
         for name, own in scene.gels.items()
     }
-    update = {"element_size": min(2 * scene.element, *layers.values()), "particle_spacing": 2 * scene.spacing}
-    return scene.model_copy(update={**update, "gels": gels})
+    own = {name for name, each in gels.items() if each.element_size is not None}
+    element = min([2 * scene.element, *(layers[name] for name in scene.sensors if name not in own)])
+    update = {"element_size": element, "particle_spacing": 2 * scene.spacing, "gels": gels}
+    return scene.model_copy(update=update)

@@ -92,9 +92,9 @@ def common_lattices(worlds: Sequence[Sequence[GelParams]]) -> Sequence[GelParams
         for name, gel, other in zip(SENSORS, gels, first, strict=False):
             if (gel.elements, gel.spacing) != (other.elements, other.spacing):
                 raise ValueError(
-                    f"environments of a batch need one gel lattice: environment {index} has {_lattice_words(gel)} "
-                    f"({name}), environment 0 {_lattice_words(other)}; give both the same gel.size, preset and "
-                    f"element_size"
+                    f"environments of a batch need one gel lattice: environment {index} has {_lattice_words(gel)}, "
+                    f"environment 0 {_lattice_words(other)} (sensor '{name}'); give both the same gel.size, preset "
+                    f"and element_size"
                 )
     return first
 

@@ -129,7 +129,7 @@ def test_worlds_of_a_batch_end_as_alone_and_share_the_lattice_of_each_sensor() -
         assert all(np.array_equal(each, state[name]) for name, each in together.snapshot().items())
     batch.replace(0, scenes[1])
     assert batch.move([commands[1], None])[0] == ends[1]
-    with pytest.raises(ValueError, match=r"environment 1 has 20 x 18 x 4 elements of 0\.5 mm \(upper\)"):
+    with pytest.raises(ValueError, match=r"environment 1 has 20 x 18 x 4 elements of 0\.5 mm.*\(sensor 'upper'\)"):
         Batch([scene(gels), scene({"lower": THICK, "upper": {**THIN, "size": [10e-3, 9e-3, 2e-3]}})])
 
 

@@ -73,13 +73,14 @@ def open_hardware(
     """
     real = [name for name, arm in config.arms.items() if isinstance(arm, UrArmConfig) and arm.mock is None]
     # first: a wrong calibration, host or limit, and what lacks, are known before anything is connected
+    for name in config.arms:
+        _ur_arm(config, name)
     normalisers = {name: _normaliser(name, sensor, config) for name, sensor in config.sensors.items()}
     spec = _spec(config, normalisers)
     _gel_monitor(config, spec.sensors, {})
     _require_gentle_approach(config)
-    for name, arm in config.arms.items():
-        assert isinstance(arm, UrArmConfig)
-        check_host(arm, name)
+    for name in config.arms:
+        check_host(_ur_arm(config, name), name)
     if check is not None:
         check(spec)
     with ExitStack() as stack:
@@ -127,14 +128,22 @@ def _sensor(name: str, config: RigConfig, cell: MockCell) -> Camera | CellSensor
     sensor = config.sensors[name]
     if isinstance(sensor, CameraSensorConfig):
         return Camera(sensor, name)
-    assert isinstance(sensor, SimSensorConfig)
-    return CellSensor(cell, name, sensor)
+    return CellSensor(cell, name, _simulated(config, name))
+
+
+def _simulated(config: RigConfig, name: str) -> SimSensorConfig:
+    """Raises ValueError for a sensor that is neither a camera nor simulated."""
+    sensor = config.sensors[name]
+    if not isinstance(sensor, SimSensorConfig):
+        raise ValueError(
+            f"rig '{config.name}': sensors.{name} has the driver '{sensor.driver}', which a rig of hardware cannot "
+            "open; use `driver: camera` or `driver: sim`"
+        )
+    return sensor
 
 
 def _arm(name: str, config: RigConfig, dry_run: bool) -> CommandedArm:
-    arm = config.arms[name]
-    assert isinstance(arm, UrArmConfig)
-    return CommandedArm(URArm(arm, name, keep_out=config.kept_out(name)), dry_run=dry_run)
+    return CommandedArm(URArm(_ur_arm(config, name), name, keep_out=config.kept_out(name)), dry_run=dry_run)
 
 
 def _clock(
@@ -180,8 +189,7 @@ def _spec(config: RigConfig, normalisers: Mapping[str, FrameNormaliser]) -> RigS
             size = (sensor.height, sensor.width)
             sensors[name] = SensorSpec(size, height=found.finds_height, flow=found.finds_flow, arm=sensor.arm)
         else:
-            assert isinstance(sensor, SimSensorConfig)
-            sensors[name] = _sensor_spec(sensor)
+            sensors[name] = _sensor_spec(_simulated(config, name))
     return RigSpec(sensors, tuple(config.arms), MockCell.will_know_truth(config), config.period)
 
 
@@ -192,8 +200,8 @@ def _sensor_spec(config: SimSensorConfig) -> SensorSpec:
 
 def _start_poses(config: RigConfig, cell: MockCell) -> dict[str, Pose]:
     starts = dict(cell.start_poses)
-    for name, arm in config.arms.items():
-        assert isinstance(arm, UrArmConfig)
+    for name in config.arms:
+        arm = _ur_arm(config, name)
         if arm.start is not None:
             starts[name] = arm.start.pose
         elif name not in starts:
@@ -228,24 +236,49 @@ def _require_gentle_approach(config: RigConfig) -> None:
     """Raises ValueError where a gel would be pressed beyond its limit before its camera could tell of the touch."""
     if config.start.touch_signal is None:
         return
-    for name, camera in config.sensors.items():
-        arm = None if camera.arm is None else config.arms[camera.arm]
-        if not isinstance(camera, CameraSensorConfig) or not isinstance(arm, UrArmConfig) or arm.limits.depth is None:
+    for name, sensor in config.sensors.items():
+        if sensor.arm is None or (depth := _ur_arm(config, sensor.arm).limits.depth) is None:
             continue
-        late = max(camera.latency, UNMEASURED) + 1.0 / camera.fps + REACTION
-        speed, depth = config.start.approach_speed, arm.limits.depth
+        late = _worst_latency(config, name)
+        speed = config.start.approach_speed
         if speed * late > depth:
             raise ValueError(
                 f"rig '{config.name}': start.approach_speed {1e3 * speed:g} mm/s is too fast: the camera of sensor "
                 f"'{name}' tells of a touch {1e3 * late:.0f} ms late, with its gel {1e3 * speed * late:.2g} mm deep, "
-                f"and limits.depth of arm '{camera.arm}' is {1e3 * depth:g} mm. At most {1e3 * depth / late:.2g} mm/s"
+                f"and limits.depth of arm '{sensor.arm}' is {1e3 * depth:g} mm. At most {1e3 * depth / late:.2g} mm/s"
             )
+
+
+def _worst_latency(config: RigConfig, name: str) -> float:
+    """Longest time from a touch to an arm that brakes, by the pictures of a sensor [s]. Raises ValueError for a driver
+    whose pictures come nobody knows when."""
+    sensor = config.sensors[name]
+    if isinstance(sensor, CameraSensorConfig):
+        return max(sensor.latency, UNMEASURED) + 1.0 / sensor.fps + REACTION
+    if isinstance(sensor, SimSensorConfig):
+        return 1.0 / SIMULATED_RATE + REACTION
+    raise ValueError(
+        f"rig '{config.name}': sensors.{name} has the driver '{sensor.driver}', whose latency is not known: "
+        f"nobody can tell how deep its gel is pressed before its picture shows a touch. State its worst latency in "
+        f"{_worst_latency.__module__}._worst_latency"
+    )
+
+
+def _ur_arm(config: RigConfig, name: str) -> UrArmConfig:
+    """Raises ValueError for an arm of a kind whose limits nothing here guards."""
+    arm = config.arms[name]
+    if not isinstance(arm, UrArmConfig):
+        raise ValueError(
+            f"rig '{config.name}': arms.{name} has the driver '{arm.driver}', which a rig of hardware cannot open: "
+            "neither its limits nor its stops are known here. Use `driver: ur`"
+        )
+    return arm
 
 
 def _gel_monitor(config: RigConfig, sensors: Mapping[str, SensorSpec], arms: Mapping[str, CommandedArm]) -> GelMonitor:
     """Reports to the arms what their gels show, and guards the gels. Raises DeviceError for a limit that cannot be
     guarded because its sensor delivers no height or flow."""
-    limits = {name: arm.limits for name, arm in config.arms.items() if isinstance(arm, UrArmConfig)}
+    limits = {name: _ur_arm(config, name).limits for name in config.arms}
     report = {name: arm.driver.report_tactile for name, arm in arms.items()}
     try:
         return GelMonitor(sensors, limits, report, SafetyViolation)
@@ -269,7 +302,8 @@ def _confirmation(config: RigConfig, cell: MockCell, confirm: Confirm | None, *,
 def _normaliser(name: str, config: object, rig: RigConfig) -> FrameNormaliser:
     if isinstance(config, CameraSensorConfig):
         return camera_normaliser(name, config, rig)
-    assert isinstance(config, SimSensorConfig) and rig.scene is not None
+    config = _simulated(rig, name)
+    assert rig.scene is not None
     return normaliser_for_simulation(config.model, rig.scene.gel_of(name).size[:2], rig.canonical)
 
 

@@ -35,7 +35,8 @@ PROMISES: tuple[tuple[str, str], ...] = (  # promise n is the n-th
     ("Box", "No target leaves the workspace, whatever is asked; an arm without limits does not connect."),
     (
         "Speed",
-        "Speed, acceleration and joint steps of what is sent stay within their limits; what is no pose makes it hold.",
+        "Speed, acceleration and joint steps of what is sent stay within their limits; so do speed and acceleration of "
+        "the measured arm when its controller slows it down, stalls or stops. What is no pose makes it hold.",
     ),
     ("Force", "Too much force stops the arm in the period of its package."),
     ("Stale", "A silent link is told and outlived; a frame beyond its age is refused."),
@@ -47,7 +48,8 @@ PROMISES: tuple[tuple[str, str], ...] = (  # promise n is the n-th
     ("Death", "A policy or a worker that is killed leaves a standing arm; another worker is there soon."),
     (
         "Stops",
-        "A stop is told by its kind and its first cause; an arm that has come to rest does not move before recover(), "
+        "A stop is told by its kind and its first cause, and so is an arm that does not follow or that another program "
+        "moves; an arm that has come to rest does not move before recover(), "
         "whatever failed, no program runs on, and no old command comes again.",
     ),
     ("One commander", "A second driver is refused, the first goes on."),

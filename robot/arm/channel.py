@@ -110,6 +110,8 @@ class WorkerConfig:
     joint_speed: float
     force: float
     torque: float
+    following_error: float
+    following_turn: float
     depth: float | None
     shear: float | None
     link_timeout: float

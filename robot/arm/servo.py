@@ -28,9 +28,21 @@ from dataclasses import replace
 import numpy as np
 
 from robot.arm.channel import CommandKind, WorkerConfig
+from robot.arm.following import FollowingMonitor, SpeedScaling, is_standing
 from robot.arm.shared_ring import Record
 from robot.arm.status import ArmStatus
-from robot.arm.trajectory import PERIOD, MotionState, Rates, braking, resting, stopping_point, towards
+from robot.arm.trajectory import (
+    PERIOD,
+    MotionState,
+    Rates,
+    braking,
+    is_at,
+    no_faster,
+    resting,
+    rotation_of,
+    stopping_point,
+    towards,
+)
 from robot.common.kinematics import Kinematics, inverse_frame, rotation, rotation_vector
 from robot.common.tcp import Measured
 from tacsim.interface import FloatArray
@@ -52,7 +64,6 @@ LEAST_SINGULAR_VALUE = 0.02  # of the Jacobian, lengths in reaches; below it the
 # Bound on the change of the least singular value for each radian that a joint turns: each of the six columns has a
 # length of at most sqrt(2) in these units, and turns with the joints before it.
 MAX_SINGULAR_VALUE_RATE = math.sqrt(12.0)
-RESTING, RESTING_TURN = 1e-3, 10e-3  # an arm slower than this is at rest [m/s, rad/s]
 PUSHED_AWAY, PUSHED_AWAY_TURN = 0.2e-3, 2e-3  # an arm farther than this from its held pose was moved [m, rad]
 LOOP_OFFSET = 2 * PERIOD  # between the loops of two arms [s]
 ZERO_PATIENCE = 0.5  # a wish to zero the wrench that is older is dropped [s]
@@ -87,6 +98,8 @@ class Servo:
             max(FAULT_TURN_DECELERATION, config.turn_acceleration),
         )
         self._fault_braking: tuple[float, float] | None = None  # None: the target was not yet reset after a fault
+        self._scaling = SpeedScaling()
+        self._following = FollowingMonitor(config, self.kinematics, self.frames)
         # of the last period
         self._before: tuple[MotionState | None, FloatArray | None, tuple[float, float] | None] = None, None, None
 
@@ -108,6 +121,27 @@ class Servo:
         if not self.status.is_fault or status >= ArmStatus.PROGRAM_STOPPED:
             self.status = max(self.status, status)
         self._goal = None
+
+    def on_scaling(self, reported: float) -> None:
+        """Takes over the controller's speed scaling, 0 to 1, once a period. When it falls, the target slows down at
+        once by the same part: the arm's lag stays as it was, and so does its speed in the controller's own time."""
+        left = self._scaling.update(reported)
+        if left < 1.0 and self.motion is not None and not self.motion.at_rest:
+            self._slow_target(left)
+
+    def _slow_target(self, share: float) -> None:
+        assert self.motion is not None
+        self.motion = replace(self.motion, velocity=share * self.motion.velocity, spin=share * self.motion.spin)
+
+    def check_following(self, measured: Measured, target: FloatArray, target_speeds: FloatArray) -> None:
+        """Trips on a new package: the arm is not where it was sent, or the controller's own target (6,) [rad, rad/s] is
+        not what was sent."""
+        self._following.update(self._sent, measured.stamp, self._scaling.value)
+        if self._following.is_moved_from_rest(target, target_speeds):
+            self.trip(ArmStatus.OTHER_PROGRAM)
+        shift, turn = self._following.error(measured.joints)
+        if shift > self.config.following_error or turn > self.config.following_turn:
+            self.trip(ArmStatus.NOT_FOLLOWING)
 
     def check_faults(self, measured: Measured, partners: Sequence[Record | None]) -> None:
         """Trips on the measured state: force, region, keep-out, faults of the other arms."""
@@ -161,7 +195,7 @@ class Servo:
             self._goal = None
         elif kind == CommandKind.TARGET and not self.status.is_fault and self.status != ArmStatus.WAITING:
             pose = command["pose"]
-            self._goal = pose[:3].copy(), _rotation(pose[3:])
+            self._goal = pose[:3].copy(), rotation_of(pose[3:])
             self._goal_time = float(command["time"])
             slow = float(command["speed"])
             self._rates = replace(self.config, speed=slow) if slow < self.config.speed else self.config
@@ -197,11 +231,13 @@ class Servo:
         if self.motion is None or (
             self.status in (ArmStatus.HOLD, ArmStatus.OBSERVATION_STALE) and self._was_moved(self.motion, measured)
         ):
-            self.motion, self._sent = resting(measured.sensor[:3, 3], measured.sensor[:3, :3]), measured.joints
-            self._clip_goal(self.motion)
-        elif self._sent is not None and self.motion.at_rest and _is_at(self.motion, self._goal):
+            self._clip_goal(self._begin_at(measured))
+        elif self._sent is not None and self.motion.at_rest and is_at(self.motion, self._goal):
             self.status = ArmStatus.OK
             return self._sent
+        elif self._scaling.value == 0.0 and is_standing(measured):  # no target ahead when it goes on
+            self._begin_at(measured)
+        assert self.motion is not None
         gaps = self._gaps(self.motion, partners)
 
         def allowed(motion: MotionState) -> bool:
@@ -212,13 +248,29 @@ class Servo:
                 return False
             return all(new >= 0.0 or new >= old for new, old in zip(self._gaps(motion, partners), gaps, strict=True))
 
-        wanted = towards(self.motion, *self._goal, self._rates, allowed)
+        wanted = towards(self.motion, *self._goal, self._scaled_rates(), allowed)
         joints = self._joints(wanted, measured)
         if joints is not None:
             self.status = ArmStatus.OK
             return self._send(wanted, joints)
         self.status = ArmStatus.OUT_OF_REACH
         return self._slow_down(measured)
+
+    def _scaled_rates(self) -> Rates:
+        rates, scaling = self._rates, self._scaling
+        if scaling.value == 1.0:
+            return rates
+        return replace(
+            self.config,
+            speed=scaling.speed(rates.speed, rates.acceleration),
+            turn_rate=scaling.speed(rates.turn_rate, rates.turn_acceleration),
+        )
+
+    def _begin_at(self, measured: Measured) -> MotionState:
+        """The target rests where the arm is."""
+        self.motion, self._sent = resting(measured.sensor[:3, 3], measured.sensor[:3, :3]), measured.joints
+        self._following.restart(self._sent)
+        return self.motion
 
     def withdraw(self) -> FloatArray | None:
         """Takes the last step back, which could not be sent in its period; returns the joints of the one before."""
@@ -257,6 +309,7 @@ class Servo:
             return
         here, twist = measured.sensor, measured.twist
         self.motion, self._sent = MotionState(here[:3, 3], here[:3, :3], twist[:3], twist[3:]), measured.joints
+        self._following.restart(self._sent)
         # It stands within half of the lookahead: the arm, which lags, must not be drawn on by a target ahead of it.
         fast = 2.0 * np.linalg.norm(twist.reshape(2, 3), axis=1) / self.config.lookahead
         self._fault_braking = max(self._hard[0], float(fast[0])), max(self._hard[1], float(fast[1]))
@@ -269,18 +322,14 @@ class Servo:
         lead = 0.5 * self.config.lookahead  # a target that speeds up at its limit is ahead of the arm by twice this
         self.motion = replace(
             self.motion,
-            velocity=_no_faster(self.motion.velocity, kept[:3], lead * self.config.acceleration),
-            spin=_no_faster(self.motion.spin, kept[3:], lead * self.config.turn_acceleration),
+            velocity=no_faster(self.motion.velocity, kept[:3], lead * self.config.acceleration),
+            spin=no_faster(self.motion.spin, kept[3:], lead * self.config.turn_acceleration),
         )
 
     def _was_moved(self, held: MotionState, measured: Measured) -> bool:
         """True if the arm rests away from its held pose (somebody moved it): the next target starts at the measured
         pose. Servo lag and the deflection by a contact are smaller than that, and cause no jump."""
-        if (
-            not held.at_rest
-            or np.abs(measured.twist[:3]).max() > RESTING
-            or np.abs(measured.twist[3:]).max() > RESTING_TURN
-        ):
+        if not (held.at_rest and is_standing(measured)):
             return False
         away = np.abs(measured.sensor[:3, 3] - held.position).max()
         turned = np.abs(rotation_vector(measured.sensor[:3, :3] @ held.rotation.T)).max()
@@ -364,28 +413,3 @@ def is_healthy(other: Record | None) -> bool:
         return False
     status = ArmStatus(int(other["status"]))
     return not status.is_fault and status != ArmStatus.CONNECTING
-
-
-def _no_faster(velocity: FloatArray, kept: FloatArray, more: float) -> FloatArray:
-    """`velocity` (3,), in its direction no faster than `kept` (3,) is, and so much `more`."""
-    speed = math.sqrt(float(velocity @ velocity))
-    if speed == 0.0:
-        return velocity
-    return velocity * min(1.0, (max(0.0, float(velocity @ kept) / speed) + more) / speed)
-
-
-def _is_at(motion: MotionState, goal: tuple[FloatArray, FloatArray]) -> bool:
-    position, rotation = goal
-    return np.array_equal(motion.position, position) and np.array_equal(motion.rotation, rotation)
-
-
-def _rotation(quaternion: FloatArray) -> FloatArray:
-    """(3, 3) of a quaternion x y z w of about unit length."""
-    x, y, z, w = (quaternion / np.linalg.norm(quaternion)).tolist()
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )

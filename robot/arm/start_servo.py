@@ -17,6 +17,7 @@ from typing import Protocol
 import numpy as np
 
 from robot.arm.channel import CommandKind, WorkerConfig
+from robot.arm.following import is_standing
 from robot.arm.servo import Servo
 from robot.arm.shared_ring import Record
 from robot.arm.status import ArmStatus
@@ -130,20 +131,30 @@ class StartServo(Servo):
             self._sent is None
             or self.motion is None
             or (self.motion.at_rest and self._was_moved(self.motion, measured))
+            or (self._scaling.value == 0.0 and is_standing(measured))
         ):
             if not goes:
                 return None if self._sent is None else self._sent
-            self.motion, self._sent = resting(measured.sensor[:3, 3], measured.sensor[:3, :3]), measured.joints
-            self._rate, self._stop = np.zeros(6), self.motion.position
+            self._begin_at(measured)
+            assert self._sent is not None
         if goes and float(np.abs(measured.joints - self._sent).max()) < LAG:
             assert self._share is not None
             goal = self._begin + self._share * (self._end - self._begin)
-            rate, moved, arrived = advance(goal - self._sent, self._rate, self._top, self._acceleration)
+            top = self._scaling.speed(self._top, self._acceleration)
+            rate, moved, arrived = advance(goal - self._sent, self._rate, top, self._acceleration)
             wanted = self._target(goal if arrived else self._sent + moved, np.zeros(6) if arrived else rate, measured)
             if self._keeps_clear(wanted, partners):
                 return self._follow(wanted)
         rate = slower(self._rate, self._acceleration * PERIOD)
         return self._follow(self._target(self._sent + rate * PERIOD, rate, measured))
+
+    def _begin_at(self, measured: Measured) -> MotionState:
+        self._rate, self._stop = np.zeros(6), measured.sensor[:3, 3]
+        return super()._begin_at(measured)
+
+    def _slow_target(self, share: float) -> None:
+        super()._slow_target(share)
+        self._rate = share * self._rate
 
     def _slow_after_stall(self, missed: float, twist: FloatArray) -> None:
         """As its base, in joints: those of the arm run out towards the target by the law of the controller."""

@@ -6,7 +6,15 @@ import time
 from enum import IntEnum
 
 from robot.arm.shared_ring import Record
-from robot.errors import DeviceError, DeviceNotConnectedError, EmergencyStop, LinkLost, ProtectiveStop, SafetyViolation
+from robot.errors import (
+    DeviceBusyError,
+    DeviceError,
+    DeviceNotConnectedError,
+    EmergencyStop,
+    LinkLost,
+    ProtectiveStop,
+    SafetyViolation,
+)
 
 
 class ArmStatus(IntEnum):
@@ -24,9 +32,11 @@ class ArmStatus(IntEnum):
     PARTNER_STOPPED = 13  # the other arm of a keep-out stopped, or its state is unknown
     GEL_LIMIT = 14  # its gel was pressed or dragged too far
     OFF_WAY = 15  # left its way to the start
+    NOT_FOLLOWING = 16  # was farther than limits.following_error from where it was sent
     PROGRAM_STOPPED = 20  # on the controller: its watchdog, the pendant, or power
-    PROTECTIVE_STOP = 21
-    EMERGENCY_STOP = 22  # also a safeguard stop, a safety violation, a fault
+    OTHER_PROGRAM = 21  # drives the arm: the controller's own target moves where ours rests
+    PROTECTIVE_STOP = 22
+    EMERGENCY_STOP = 23  # also a safeguard stop, a safety violation, a fault
     LINK_LOST = 30
     WORKER_DEAD = 31
     CLOSED = 32
@@ -34,6 +44,11 @@ class ArmStatus(IntEnum):
     @property
     def is_fault(self) -> bool:
         return self >= ArmStatus.FORCE_LIMIT
+
+    @property
+    def is_controller_stop(self) -> bool:
+        """Nothing is sent: our program does not run, or the controller has stopped it."""
+        return ArmStatus.PROGRAM_STOPPED <= self < ArmStatus.LINK_LOST
 
     @property
     def text(self) -> str:
@@ -62,6 +77,10 @@ _TEXTS = {
     ArmStatus.GEL_LIMIT: "pressed or dragged its gel farther than limits.depth or limits.shear and stopped; move it "
     "away, then recover()",
     ArmStatus.OFF_WAY: "left its way to the start and stopped; look why, then begin anew",
+    ArmStatus.NOT_FOLLOWING: "did not follow: it was farther than limits.following_error from where it was sent, and "
+    "stopped; look whether something holds it, a joint lags or another program moves it, then recover()",
+    ArmStatus.OTHER_PROGRAM: "is moved by another program on its controller, and is sent nothing; end that program, "
+    "then recover()",
     ArmStatus.PROGRAM_STOPPED: "has no running program (watchdog, pendant or power); look why, then recover()",
     ArmStatus.PROTECTIVE_STOP: "made a protective stop; look why, then recover()",
     ArmStatus.EMERGENCY_STOP: "has an emergency or safeguard stop; a person must release it, then recover()",
@@ -78,6 +97,7 @@ AT_CONNECTING = {  # what to do besides
 _ERRORS: dict[ArmStatus, type[DeviceError]] = {
     ArmStatus.CONNECTING: DeviceNotConnectedError,
     ArmStatus.PROGRAM_STOPPED: ProtectiveStop,
+    ArmStatus.OTHER_PROGRAM: DeviceBusyError,
     ArmStatus.PROTECTIVE_STOP: ProtectiveStop,
     ArmStatus.EMERGENCY_STOP: EmergencyStop,
     ArmStatus.LINK_LOST: LinkLost,

@@ -137,3 +137,27 @@ def advance(
 def slower(velocity: FloatArray, change: float) -> FloatArray:
     speed = math.sqrt(float(velocity @ velocity))
     return np.zeros_like(velocity) if speed <= change else velocity * (1.0 - change / speed)
+
+
+def no_faster(velocity: FloatArray, kept: FloatArray, more: float) -> FloatArray:
+    """`velocity` (3,), in its direction no faster than `kept` (3,) is, and so much `more`."""
+    speed = math.sqrt(float(velocity @ velocity))
+    if speed == 0.0:
+        return velocity
+    return velocity * min(1.0, (max(0.0, float(velocity @ kept) / speed) + more) / speed)
+
+
+def is_at(motion: MotionState, goal: tuple[FloatArray, FloatArray]) -> bool:
+    return np.array_equal(motion.position, goal[0]) and np.array_equal(motion.rotation, goal[1])
+
+
+def rotation_of(quaternion: FloatArray) -> FloatArray:
+    """(3, 3) of a quaternion x y z w of about unit length."""
+    x, y, z, w = (quaternion / np.linalg.norm(quaternion)).tolist()
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )

@@ -245,7 +245,7 @@ class URArm(Closing):
             if self._closed:
                 raise self._error(ArmStatus.CLOSED)
             told, self._stop_told = self._stop_told, False
-            if told or self.status() in _DASHBOARD_FIRST:
+            if told or self.status().is_controller_stop:
                 with Dashboard(self.config.host) as dashboard:
                     dashboard.unlock(f"arm '{self.name}'")
             self._end_worker()
@@ -402,6 +402,3 @@ class URArm(Closing):
             status = ArmStatus.CONNECTING if record is None else ArmStatus(int(record["status"]))
             if status.is_fault and status != ArmStatus.PARTNER_STOPPED:
                 yield name, status
-
-
-_DASHBOARD_FIRST = (ArmStatus.PROTECTIVE_STOP, ArmStatus.EMERGENCY_STOP, ArmStatus.PROGRAM_STOPPED)

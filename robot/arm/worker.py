@@ -46,6 +46,10 @@ VARIABLES = [  # of one package; a name that the library does not know would shi
     "actual_TCP_pose",
     "actual_TCP_speed",
     "actual_TCP_force",
+    "target_q",
+    "target_qd",
+    "speed_scaling",
+    "target_speed_fraction",
     "runtime_state",
     "safety_status_bits",
 ]
@@ -86,6 +90,7 @@ class Worker:
         self._rereads = 0  # of the same package
         self._refused = 0  # periods since the controller refused a command; 0: it did not
         self.state = self.frames.measure(self.record)
+        self.scaling, self.target, self.target_speeds = 1.0, np.zeros(6), np.zeros(6)  # of the newest package
         self._publish(ArmStatus.CONNECTING)
 
     # -- connecting ----------------------------------------------------------------------------------------------
@@ -227,7 +232,10 @@ class Worker:
             if stopped is not None:
                 self.servo.trip(stopped)
             command = self.channel.commands.newest()  # before the report: what was seen when it was decided counts
+            self.servo.on_scaling(self.scaling)
             self.servo.check_faults(self.state, partners)
+            if self._rereads == 0:
+                self.servo.check_following(self.state, self.target, self.target_speeds)
             self.servo.on_tactile(*self.channel.tactile.newest())
             if self.servo.status != before:
                 self._publish(self.servo.status)
@@ -239,7 +247,7 @@ class Worker:
                 ending = now + (PARENTLESS if orphan else CLOSING)
                 if orphan:
                     self.servo.trip(ArmStatus.CLOSED)
-            if stopped is not None or self.servo.status in _CONTROLLER_STOPS:
+            if stopped is not None or self.servo.status.is_controller_stop:
                 if ending is not None:
                     self._leave()
             else:
@@ -290,11 +298,14 @@ class Worker:
                 receive.getActualTCPSpeed(),
                 receive.getActualTCPForce(),
             )
+            target, target_speeds = receive.getTargetQ(), receive.getTargetQd()
+            scaling = receive.getSpeedScaling() * receive.getTargetSpeedFraction()  # limiter, slider on the pendant
             bits = receive.getRuntimeState(), receive.getSafetyStatusBits()
             if receive.getTimestamp() == stamp:
                 break
-        if stamp == float(record["stamp"]) or not np.isfinite(fields).all():
+        if stamp == float(record["stamp"]) or not np.isfinite([*fields, target, target_speeds, [scaling] * 6]).all():
             return False
+        self.scaling, self.target, self.target_speeds = scaling, np.array(target), np.array(target_speeds)
         record["joints"], record["joint_speeds"], record["tcp_pose"], record["tcp_speed"], record["tcp_force"] = fields
         record["stamp"], record["time"] = stamp, time.monotonic()
         self.state = self.frames.measure(record)
@@ -374,9 +385,6 @@ class Worker:
     def _leave(self) -> NoReturn:
         """Ends the process without the library's destructors, which may wait for an answer that never comes."""
         os._exit(0)
-
-
-_CONTROLLER_STOPS = (ArmStatus.PROGRAM_STOPPED, ArmStatus.PROTECTIVE_STOP, ArmStatus.EMERGENCY_STOP)
 
 
 def main() -> NoReturn:

@@ -69,6 +69,8 @@ def worker_config(
         joint_speed=limits.joint_speed,
         force=limits.force,
         torque=limits.torque,
+        following_error=limits.max_following_error,
+        following_turn=limits.max_following_turn,
         depth=limits.depth,
         shear=limits.shear,
         link_timeout=config.link_timeout,

@@ -87,8 +87,25 @@ class ArmLimits(Config):
     joint_speed: Annotated[float, Field(gt=0, le=3.14)] = 1.0  # of any joint; bounds the step of each period [rad/s]
     force: Annotated[Force, Field(gt=0, le=250.0)] = 30.0  # |force| beyond it stops the arm [N]
     torque: Annotated[float, Field(gt=0, le=50.0)] = 3.0  # |torque| about the sensor's origin [N m]
+    # How far the arm may be from where it was sent, its usual lag not counted; beyond it stops. None: as
+    # `max_following_error` and `max_following_turn` say.
+    following_error: Annotated[Length, Field(gt=0)] | None = None  # of the sensor's origin [m]
+    following_turn: Annotated[float, Field(gt=0)] | None = None  # of its axes [rad]
     depth: Annotated[Length, Field(gt=0)] | None = None  # deepest the gel may be pressed; None: not monitored [m]
     shear: Annotated[Length, Field(gt=0)] | None = None  # farthest its surface may be dragged; None: not monitored [m]
+
+    @property
+    def max_following_error(self) -> float:
+        """`following_error`, or 1 mm + `speed` x 10 ms + `acceleration` x (50 ms)^2 [m]: servoJ leads joints that
+        are to speed up fast a little beside the straight line."""
+        usual = 1e-3 + 10e-3 * self.speed + 50e-3**2 * self.acceleration
+        return usual if self.following_error is None else self.following_error
+
+    @property
+    def max_following_turn(self) -> float:
+        """`following_turn`, or 0.01 rad + `turn_rate` x 10 ms + `max_following_error` / 0.4 m [rad]."""
+        usual = 0.01 + 10e-3 * self.turn_rate + self.max_following_error / 0.4
+        return usual if self.following_turn is None else self.following_turn
 
     @property
     def region(self) -> Region:
@@ -246,11 +263,13 @@ def weakened_limits(before: UrArmConfig, after: UrArmConfig) -> list[str]:
     """The limits that `after` weakens, compared with `before`, as "key: from -> to"."""
     found = []
     keys = [f"limits.{key}" for key in ("speed", "turn_rate", "acceleration", "turn_acceleration", "joint_speed")]
-    keys += ["limits.force", "limits.torque", "limits.depth", "limits.shear"]
+    keys += ["limits.force", "limits.torque", "limits.max_following_error", "limits.max_following_turn"]
+    keys += ["limits.depth", "limits.shear"]
     keys += ["link_timeout", "action_timeout", "observation_timeout"]
     for key in keys:
         old, new = (attrgetter(key)(config) for config in (before, after))
         if old is not None and (new is None or new > old):
+            key = key.replace("max_following", "following")  # what holds, whether the file names it or not
             found.append(f"{key}: {old:g} -> {'not watched' if new is None else f'{new:g}'}")
     was, now = before.limits.workspace, after.limits.workspace
     if (np.array(now.lower) < was.lower).any() or (np.array(now.upper) > was.upper).any():

@@ -52,7 +52,6 @@ STOPS: dict[str, Callable[[FaultClient], None]] = {
     "safeguard stop, closed after 40 ms": lambda faults: blink(faults),
     "stop on the pendant": lambda faults: pendant(faults, "stop"),
     "pause on the pendant, play after 40 ms": lambda faults: pendant(faults, "pause", "play"),
-    "another program's script": lambda faults: foreign(faults),
 }
 
 
@@ -69,12 +68,6 @@ def pendant(faults: FaultClient, *words: str) -> None:
             dashboard.sendall(word.encode() + b"\n")
             assert dashboard.recv(1024)
             time.sleep(0.04)
-
-
-def foreign(faults: FaultClient) -> None:
-    with socket.create_connection((faults.host, 30003), timeout=PATIENCE) as script:
-        script.sendall(b"def other():\n  sleep(0.1)\nend\n")
-        time.sleep(0.04)
 
 
 @pytest.mark.deep

@@ -11,7 +11,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
@@ -119,13 +119,24 @@ class Trial:
         standstill."""
         until(lambda: self.mock.faults.state().rests, "rest", pause=0.05)
         end = self.mock.faults.state().tick + seconds / PERIOD
-        until(lambda: self.mock.faults.state().tick >= end, "end of the watch", pause=0.05)
+        self.watch_until(lambda: self.mock.faults.state().tick >= end)
+        return outcome(self.seen(), event, self.reports(event))
+
+    def watch_until(self, done: Callable[[], bool]) -> None:
+        """Ends the observer when `done`."""
+        until(done, "end of the watch", pause=0.05)
         assert self.observer.stdin is not None
         self.observer.stdin.close()
         assert self.observer.wait(PATIENCE) == 0
+
+    def seen(self) -> np.ndarray:
+        """PACKAGE (n,): what the observer saw, once it has ended."""
+        return np.load(self.file)
+
+    def reports(self, event: float) -> list[dict[str, Any]]:
+        """What the user's program has said since the time `event` [s]."""
         said = [json.loads(line) for line in self._said()]
-        after = [each for each in said if each["time"] > event]
-        return outcome(np.load(self.file), event, after)
+        return [each for each in said if each["time"] > event]
 
     def close(self) -> None:
         processes = (self.policy, self.proxy, self.observer)
@@ -151,10 +162,7 @@ class Trial:
 def outcome(seen: np.ndarray, event: float, said: list[dict[str, Any]]) -> Outcome:
     """seen: PACKAGE (n,); event: monotonic [s]; said: what the user's program said after it."""
     assert seen.dtype == PACKAGE
-    # The package that was on its way for the shortest time tells how the clocks stand to each other: of the last before
-    # the event, because a mock on a busy machine leaves periods out.
-    before = seen[seen["received"] <= event][-25:]
-    stamps = seen["timestamp"] - (event - (before["received"] - before["timestamp"]).min())
+    stamps = stamps_since(seen, event)
     assert np.diff(stamps).max() < 0.5, "the observer itself missed packages"
     speeds = np.linalg.norm(seen["velocity"], axis=1)
     now = int(np.searchsorted(stamps, 0.0))
@@ -171,6 +179,14 @@ def outcome(seen: np.ndarray, event: float, said: list[dict[str, Any]]) -> Outco
         told=said[0]["time"] - event if said else None,
         statuses=tuple(each["status"] for each in said),
     )
+
+
+def stamps_since(seen: np.ndarray, event: float) -> np.ndarray:
+    """(n,) times of packages (n,) since `event` (monotonic [s]), by the controller's clock [s]."""
+    # The package that was on its way for the shortest time tells how the clocks stand to each other: of the last before
+    # the event, because a mock on a busy machine leaves periods out.
+    before = seen[seen["received"] <= event][-25:]
+    return np.asarray(seen["timestamp"] - (event - (before["received"] - before["timestamp"]).min()))
 
 
 SETTLES = 50e-6  # an arm slower than 1 mm/s settles to less [m]

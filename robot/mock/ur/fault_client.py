@@ -193,6 +193,18 @@ class FaultClient:
         """The software that the controller claims to run."""
         self._ask("version", version=[major, minor, bugfix, build])
 
+    def slider(self, fraction: float) -> None:
+        """Moves the speed slider of the pendant, 0 to 1."""
+        self._ask("slider", fraction=fraction)
+
+    def hold(self, on: bool = True) -> None:
+        """Somebody holds the arm: it stands, whatever its program asks; let go, it follows its servos again."""
+        self._ask("hold", on=on)
+
+    def joint_lag(self, joint: int, seconds: float) -> None:
+        """Joint 0 to 5 trails a steady motion by so much; 4 ms at power-on."""
+        self._ask("joint_lag", joint=joint, seconds=seconds)
+
     # -- the load ----------------------------------------------------------------------------------------------------
 
     def wrench(self, wrench: Sequence[float]) -> None:

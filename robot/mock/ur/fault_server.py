@@ -192,6 +192,20 @@ def _unlock_delay(controller: Controller, seconds: float) -> None:
     controller.machine.unlock_delay = _number(seconds, "unlock delay", 0.0)
 
 
+def _slider(controller: Controller, fraction: float) -> None:
+    controller.machine.set_slider(_number(fraction, "speed slider", 0.0, 1.0))
+
+
+def _hold(controller: Controller, on: bool) -> None:
+    controller.machine.arm.held = bool(on)
+
+
+def _joint_lag(controller: Controller, joint: int, seconds: float) -> None:
+    if joint not in range(6):
+        raise ValueError(f"joint must be one of 0 to 5, got {joint}")
+    controller.machine.arm.servo_rates[joint] = 2.0 / _number(seconds, "lag", 1e-3, 60.0)
+
+
 def _switch(name: str) -> Callable[[Controller, bool], None]:
     def switch(controller: Controller, on: bool) -> None:
         setattr(controller.faults, name, bool(on))
@@ -226,6 +240,9 @@ ACTIONS: dict[str, Callable[..., Any]] = {
     "force_limit": _force_limit,
     "payload_mismatch": _payload_mismatch,
     "claim": _claim,
+    "slider": _slider,
+    "hold": _hold,
+    "joint_lag": _joint_lag,
     "version": _version,
     "clock_jump": _clock_jump,
     "tick_overrun": _tick_overrun,

@@ -14,7 +14,8 @@ from robot.arm.status import ArmStatus
 from robot.arm.trajectory import PERIOD
 from robot.common.kinematics import Kinematics, pose, rotation
 from robot.common.tcp import Measured, pose_of
-from robot.mock.ur.machine.arm import Arm
+from robot.mock.ur.machine.arm import Arm, MotionSteps
+from robot.mock.ur.machine.machine import SLIDER_RATE
 from robot.mock.ur.machine.motion import servoj
 from tacsim.interface import FloatArray, Pose
 
@@ -50,6 +51,8 @@ def worker_config(**changes: object) -> WorkerConfig:
         "joint_speed": 1.0,
         "force": 30.0,
         "torque": 3.0,
+        "following_error": 3.25e-3,
+        "following_turn": 23e-3,
         "depth": None,
         "shear": None,
         "link_timeout": 0.05,
@@ -98,6 +101,7 @@ class Bench:
         for _ in range(periods):
             self.time += PERIOD
             self.servo.check_faults(self.now, self.partners)
+            self.servo.check_following(self.now, self.q, np.zeros(6))
             joints = self.servo.step(self.time, self.now, self.partners)
             if joints is not None:
                 self.sent.append(joints)
@@ -120,8 +124,15 @@ class OnController:
         self.tick, self.number = 0, 0
         self.partners: list[Record | None] = [other([9.0, 9.0, 9.0])] * len(self.servo.config.partners)  # far away
         self.force, self.jump = 0.0, 0.0  # on the tool [N]; of the controller's clock [s]
+        self.slider, self.slider_rate = 1.0, SLIDER_RATE  # on the pendant; the speed scaling follows it
+        self.foreign: MotionSteps | None = None  # another program, which runs instead of ours
         self.packages: list[Measured] = []
+        self.reports: list[
+            tuple[float, FloatArray, FloatArray]
+        ] = []  # speed scaling, target_q, target_qd: one a package
         self.twists: list[FloatArray] = []  # (6,) of the sensor itself, one a period
+        self._number = -1  # of the package that was read last
+        self.statuses: list[ArmStatus] = []  # one a call of `period`
         self.ours: list[bool] = []  # whether the newest target in this period was made in it
         self.run(None)
 
@@ -140,8 +151,14 @@ class OnController:
 
     def period(self, late: int = 1) -> None:
         """The newest package that the worker knows is `late` periods old."""
-        known = self.packages[max(0, len(self.packages) - 1 - late)]
+        number = max(0, len(self.packages) - 1 - late)
+        known, (scaling, target, speeds) = self.packages[number], self.reports[number]
+        self.servo.on_scaling(scaling)
         self.servo.check_faults(known, self.partners)
+        if number != self._number:
+            self.servo.check_following(known, target, speeds)
+        self._number = number
+        self.statuses.append(self.servo.status)
         self.run(self.servo.step(self.time, known, self.partners))
 
     def stall(self, periods: int) -> None:
@@ -153,7 +170,11 @@ class OnController:
         """One period of the controller, with the joints that were sent in it."""
         self.ours.append(joints is not None and (self.joints is None or bool((joints != self.joints).any())))
         self.joints = self.joints if joints is None else joints
-        if self.joints is not None:
+        step = self.slider_rate * PERIOD
+        self.arm.scale += max(-step, min(step, self.slider - self.arm.scale))
+        if self.foreign is not None:
+            next(self.foreign, None)
+        elif self.joints is not None:
             next(servoj(self.arm, self.joints, PERIOD, self.servo.config.lookahead))
         self.arm.advance()
         self.tick += 1
@@ -162,6 +183,7 @@ class OnController:
         package["tcp_pose"], package["tcp_speed"] = self.arm.pose, self.arm.twist
         package["tcp_force"][2] = self.force
         self.packages.append(self.servo.frames.measure(package))
+        self.reports.append((self.arm.scale, self.arm.target_q, self.arm.target_qd))
         self.twists.append(self.packages[-1].twist)
 
 

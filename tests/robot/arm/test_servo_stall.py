@@ -93,13 +93,14 @@ def test_without_the_restart_it_would_not(monkeypatch: pytest.MonkeyPatch) -> No
 def test_a_stall_without_news_goes_on_from_rest_after_a_while() -> None:
     """The controller's clock has jumped back meanwhile: no package seems to be from after the stall."""
     arm = moving()
+    arm.jump = -100 * PERIOD
     arm.stall(20)
     target = arm.joints
     for _ in range(STALL_PATIENCE - 1):
-        arm.period(late=60)
+        arm.period()
         assert arm.joints is target
     for _ in range(500):
-        arm.period(late=60)
+        arm.period()
     assert np.linalg.norm(arm.twists[-1][:3]) > 0.99 * arm.servo.config.speed
     assert shares(arm)[1] <= 1.03
 

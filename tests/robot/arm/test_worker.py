@@ -146,6 +146,11 @@ class Packages:
     def getActualTCPForce(self) -> list[float]:
         return [0.0, 0.0, -9.82 if self.now - self.LATE < self.told else 0.0, 0.0, 0.0, 0.0]
 
+    def getSpeedScaling(self) -> float:
+        return 1.0
+
+    getTargetSpeedFraction = getSpeedScaling
+
     def sleep(self, seconds: float) -> None:
         self.now += 1
 

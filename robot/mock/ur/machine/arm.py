@@ -57,6 +57,8 @@ class Arm:
         self.set_q, self.set_qd = self.target_q.copy(), np.zeros(6)
         self.q, self.qd = self.target_q.copy(), np.zeros(6)
         self.scale = 1.0  # speed scaling now, 0 to 1
+        self.servo_rates = np.full(6, SERVO_RATE)  # of each joint; a fault may make one slow
+        self.held = False  # the tool is held: the joints stand, whatever their servos want
         self.waypoint: FloatArray | None = None  # (4, 4) where the present move ends
         self.history: deque[FloatArray] = deque([self.q] * HISTORY, maxlen=HISTORY)
         self._next: FloatArray | None = None
@@ -169,10 +171,14 @@ class Arm:
 
     def _servo(self, before: FloatArray) -> None:
         """One period of q'' = w^2 (set - q) - 2 w q', solved exactly for a set point in steady motion."""
-        speed, trail = self.set_qd, 2.0 / SERVO_RATE * self.set_qd
+        if self.held:
+            self.qd = np.zeros(6)
+            return
+        rates = self.servo_rates
+        speed, trail = self.set_qd, 2.0 / rates * self.set_qd
         error, rate = self.q - before + trail, self.qd - speed
-        drift, decay = (rate + SERVO_RATE * error) * PERIOD, math.exp(-SERVO_RATE * PERIOD)
-        error, rate = (error + drift) * decay, (rate - SERVO_RATE * drift) * decay
+        drift, decay = (rate + rates * error) * PERIOD, np.exp(-rates * PERIOD)
+        error, rate = (error + drift) * decay, (rate - rates * drift) * decay
         self.q, self.qd = self.set_q - trail + error, rate + speed
         if not speed.any() and float(np.abs(rate).max()) < REST and float(np.abs(error).max()) < 1e-12:
             self.q, self.qd = self.set_q.copy(), np.zeros(6)  # the tail of the exponential has no meaning

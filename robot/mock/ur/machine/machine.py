@@ -144,6 +144,7 @@ class Machine:
         self.work_time = 0.0  # what the last control period took to compute [s]
         self.log: deque[tuple[float, str]] = deque(maxlen=200)
         self._changing: tuple[int, Mode] | None = None  # tick at which the mode changes
+        self._starting: tuple[int, Program] | None = None  # tick at which a program begins that replaces another
 
     @property
     def time(self) -> float:
@@ -162,6 +163,12 @@ class Machine:
         if not self.paused:
             return Runtime.PLAYING
         return Runtime.PAUSED if self.arm.rests else Runtime.PAUSING
+
+    @property
+    def limiter(self) -> float:
+        """speed_scaling: "of the trajectory limiter" (RTDE guide). Times target_speed_fraction, which is the slider, it
+        is the speed scaling now (UR's ROS driver multiplies the two)."""
+        return min(1.0, self.arm.scale / self.slider) if self.slider > 0.0 else 0.0
 
     @property
     def status_bits(self) -> int:
@@ -188,14 +195,16 @@ class Machine:
 
     # -- program -----------------------------------------------------------------------------------------------------
 
-    def start(self, text: str) -> bool:
-        """Runs an uploaded program instead of the present one; False where the robot is in no state to."""
+    def start(self, text: str, delay: int = 0) -> bool:
+        """Runs an uploaded program instead of the present one, which ends `delay` periods before; False where the robot
+        is in no state to."""
         if not self.operational:
             self.write_log(f"program refused: robot {self.mode.name}, safety {self.safety.name}")
             return False
         if re.search(r"^[ \t]*def\s", text, re.M) is None:
             self.write_log(f"not run: {text[:60]!r}... is no program, or a secondary one")
             return False
+        replaces = self.program is not None
         self.stop("replaced by another program")
         try:
             program = Program(self, text)
@@ -205,15 +214,20 @@ class Machine:
             place = (error.line, error.column) if isinstance(error, CompileError) else ()
             self.script_errors.append(ScriptError(str(error), *place))
             return False
-        self.program, self.paused = program, False
-        if program.name == CONTROL_SCRIPT:
-            self.control_offset = program.int_offset
-        self.write_log(f"program '{program.name}' started")
+        self._starting = self.ticks + delay * replaces, program
+        self._begin()
         return True
+
+    def _begin(self) -> None:
+        if self._starting is not None and self.ticks >= self._starting[0]:
+            self.program, self.paused, self._starting = self._starting[1], False, None
+            if self.program.name == CONTROL_SCRIPT:
+                self.control_offset = self.program.int_offset
+            self.write_log(f"program '{self.program.name}' started")
 
     def stop(self, why: str) -> None:
         """Ends the program; the arm coasts to rest."""
-        self.watchdog, self.freedrive, self.arm.waypoint = None, None, None
+        self.watchdog, self.freedrive, self.arm.waypoint, self._starting = None, None, None, None
         self.end_force_mode()
         if self.program is not None:
             self.program, self.stop_reason = None, why
@@ -304,6 +318,7 @@ class Machine:
 
     def _tick(self) -> None:
         self._power()
+        self._begin()
         if self.watchdog is not None and (self.ticks - self.watchdog_reset) * PERIOD > self.watchdog[1]:
             self.stop(
                 f"RTDE watchdog: input_int_register_{self.watchdog[0]} was not written for {self.watchdog[1]:g} s"

@@ -37,6 +37,9 @@ PORTS = (RTDE, DASHBOARD, *SCRIPTS)
 MAX_CLIENTS = 256  # of one controller; more are closed at once
 MAX_PROGRAM, MAX_LINE = 1 << 20, 1 << 16  # a longer program or dashboard line cuts its client [bytes]
 BURST = 16  # packages or lines of one client that are served in one go; the others wait, and nothing more is read
+# From the end of a program to the begin of one that is uploaded instead [periods]. A controller has to stop the one and
+# to compile the other, and is STOPPED meanwhile; how long a real one is, is not published.
+START_DELAY = 5
 BOOT_AGAIN = 500  # control periods after which a restarted controller tries again to open its ports
 _PROGRAM_END = re.compile(rb"^end[ \t\r]*$", re.M)
 
@@ -324,7 +327,7 @@ class Controller:
         client.searched = 0
         self._author = client
         if self.faults.remote_control:
-            self.machine.start(program)
+            self.machine.start(program, START_DELAY)
         else:
             self.machine.write_log("program refused: the robot is not in remote control")
         return True

@@ -131,7 +131,7 @@ OUTPUTS: dict[str, Output] = {
     "safety_mode": Output("INT32", lambda m: int(m.safety)),
     "safety_status": Output("INT32", lambda m: int(m.safety), since=((3, 10), (5, 4))),
     "actual_tool_accelerometer": Output("VECTOR3D", lambda m: (GRAVITY * m.arm.frame[2, :3]).tolist()),
-    "speed_scaling": Output("DOUBLE", lambda m: m.arm.scale),
+    "speed_scaling": Output("DOUBLE", lambda m: m.limiter),
     "target_speed_fraction": Output("DOUBLE", lambda m: m.slider),
     "actual_momentum": Output("DOUBLE", _constant(0.0)),
     "actual_main_voltage": Output("DOUBLE", _powered(1)),

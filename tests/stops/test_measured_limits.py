@@ -154,7 +154,7 @@ def test_the_measured_arm_stays_within_its_limits(
     one_target = limits.speed * PERIOD / arm.config.lookahead  # [m/s]
     if not len(begin):
         return  # on a machine that is too busy targets come in heaps, and the arm follows those
-    fastest = float(speed.max() if measuring else speed[begin].max()) / limits.speed
+    fastest = float(speed.max() if event.runs_out else speed[begin].max()) / limits.speed
     most = 1.0 + event.margin * one_target / limits.speed
     begin = begin[~braked]
     change = np.linalg.norm(seen["velocity"][begin + WINDOW] - seen["velocity"][begin], axis=1) / (WINDOW * PERIOD)

@@ -148,9 +148,36 @@ def frame_warnings(
 
 
 def metric_picture(view: GelView) -> Callable[[Image], Image]:
-    """Native picture (H, W, 3) -> metric picture of the gel, both uint8."""
-    rectify = to_metric(view)
-    return lambda image: np.rint(rectify(image)).astype(np.uint8)
+    """Native picture (H, W, 3) -> metric picture of the gel, both uint8. Where the camera sees much finer, its picture
+    is first reduced by a whole factor, as means over areas."""
+    import cv2
+
+    pixel = np.array([(0.0, 0.0), (view.pixel_pitch, 0.0), (0.0, view.pixel_pitch)])
+    middle = view.project(pixel)
+    factor = int(np.linalg.norm(middle[1:] - middle[0], axis=1).min())
+    if factor < 2:
+        rectify = to_metric(view)
+        return lambda image: np.rint(rectify(image)).astype(np.uint8)
+    lens = view.lens
+    columns, rows = lens.width // factor, lens.height // factor
+    x, y = columns / lens.width, rows / lens.height
+    small = lens.model_copy(
+        update={
+            "width": columns,
+            "height": rows,
+            "focal": (lens.focal[0] * x, lens.focal[1] * y),
+            "centre": ((lens.centre[0] + 0.5) * x - 0.5, (lens.centre[1] + 0.5) * y - 0.5),
+        }
+    )
+    rectify = to_metric(view.model_copy(update={"lens": small}))
+
+    def reduced(image: Image) -> Image:
+        if image.shape[:2] != view.image_shape:
+            raise BadFrames(f"the picture has {image.shape[1]} x {image.shape[0]} px, its view {lens.width} x {lens.height}")
+        less = np.asarray(cv2.resize(image, (columns, rows), interpolation=cv2.INTER_AREA), dtype=np.uint8)
+        return np.rint(rectify(less)).astype(np.uint8)
+
+    return reduced
 
 
 def require_view_size(image_shape: tuple[int, int], view: GelView) -> None:

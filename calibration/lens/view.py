@@ -7,6 +7,7 @@ as predicts left-out dots better.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -26,6 +27,11 @@ MAX_FOCAL_DEVIATION = 0.03  # relative standard deviation of the focal length
 MIN_TILT = np.radians(8.0)  # of the board between pictures, root mean square [rad]
 MAX_MISFIT = 0.06  # of a plane: root mean square over the distance of neighbouring points
 MIN_POINTS = 6  # of a plane
+
+# A light is calibrated at no finer pixels than these: four a cell of the canonical grid, and so many in all
+CALIBRATED_PITCH = 0.25e-3 / 4  # [m]
+CALIBRATED_PIXELS = 160_000
+MIN_REDUCTION = 1.5  # factor of the pixel pitch, below which pictures are taken as they are
 
 Corners = tuple[Pair, Pair, Pair, Pair]
 
@@ -226,6 +232,22 @@ def view_of_corners(corners: Sequence[Pair], size: Pair, image_shape: tuple[int,
         pixel_pitch=1e-6 / float(np.sqrt(along[0] * along[1])),
         board="four corners",
     )
+
+
+def calibrated_view(view: GelView | None, pitch: float, image_shape: tuple[int, int]) -> tuple[GelView | None, float]:
+    """The view by which pictures of `image_shape` (rows, columns) are calibrated, and its pixel pitch [m]: the given
+    ones, or coarser ones for a camera that sees finer than the canonical grid. Then a picture that was metric by itself
+    (no view, `pitch` [m]) gets a view, which keeps the size of native pictures."""
+    rows, columns = image_shape
+    size = (columns * pitch, rows * pitch) if view is None else view.size
+    needed = max(CALIBRATED_PITCH, math.sqrt(size[0] * size[1] / CALIBRATED_PIXELS))
+    if needed < MIN_REDUCTION * pitch:
+        return view, pitch
+    if view is None:
+        left, top, right, bottom = -0.5, -0.5, columns - 0.5, rows - 0.5
+        view = view_of_corners(((left, top), (right, top), (right, bottom), (left, bottom)), size, image_shape)
+    coarse = size[0] / round(size[0] / needed)
+    return view.model_copy(update={"pixel_pitch": coarse}), coarse
 
 
 def _plane(lens: Lens, on_board: FloatArray, pixels: FloatArray) -> FloatArray:

@@ -26,6 +26,7 @@ from calibration.height.slope_polynomial import (
     to_normal,
 )
 from calibration.light.circle import NoCircle
+from calibration.light.consistency import blurred_presses, unlike_presses, untouched_contact
 from calibration.light.darkness import DARK_UNEXPLAINED, find_dark_press, fit_darkness, tells_no_direction
 from calibration.light.dent import dent_gradient, dent_height, rim_slope
 from calibration.light.fit import LightFit, PressPrediction, compared, normal_angle
@@ -51,6 +52,7 @@ from calibration.light.photometry import (
     solve,
 )
 from calibration.light.press import BallPress, Window, find_press, smooth, untouched_mean
+from calibration.light.press_shapes import fit_stretch, other_balls
 from calibration.light.refinement import RefinedGeometry, refine
 from calibration.light.shadows import DentShade, find_lamps
 from calibration.reference import STALE_COLOUR, exchanged
@@ -89,6 +91,7 @@ def calibrate_light(
     frames: Sequence[tuple[str, Image]],
     ball: float,
     erase: Callable[[Image], Image] | None = None,
+    untouched: Sequence[Image] = (),
 ) -> LightFit:
     """Calibrates the light of one sensor.
 
@@ -97,6 +100,7 @@ def calibrate_light(
         frames: names and pictures of presses, same size.
         ball: radius of the ball [px].
         erase: takes away the dots that are printed on the gel.
+        untouched: more pictures without contact, which are only checked.
 
     Which kind of light it is, the pictures tell: if colours change alike all round each contact, it tells no direction,
     and is calibrated as one that tells depth by darkness.
@@ -107,6 +111,7 @@ def calibrate_light(
     shown = reference
     if erase is not None:
         reference, frames = erase(reference), [(name, erase(image)) for name, image in frames]
+        untouched = [erase(image) for image in untouched]
     mean = untouched_mean(reference)
     dark = tells_no_direction((image - np.float64(reference)) / mean for _, image in frames[:ORDER_FRAMES])
     found: list[BallPress] = []
@@ -118,7 +123,11 @@ def calibrate_light(
             left_out.append((name, str(error)))
     if dark:
         return replace(_darkness(found, left_out, mean, reference, ball), reference=shown, frames=_names(frames))
-    presses, refined = _refined(found, left_out, ball)
+    _leave_out_strangers(found, left_out, reference, mean, ball)
+    presses, refined = _of_one_ball(*_refined(found, left_out, ball), left_out, ball)
+    contact = untouched_contact(presses, reference, mean, untouched, ball)
+    thin = [_window(press, SHADED_PIXELS) for press in presses]
+    stretch = fit_stretch(thin, refined.circles, refined.thickness, ball, presses[0].shape)
     presses, refined, shade = _shaded(presses, refined, ball)
     labels = [label(press, refined, ball) for press in presses]
     besides = [beside_slopes(press, g, refined, ball, shade) for press, g in zip(presses, labels, strict=True)]
@@ -153,7 +162,34 @@ def calibrate_light(
         reference=shown,
         presses=tuple(presses),
         frames=_names(frames),
+        stretch=stretch,
+        doubts=() if contact is None else (contact,),
     )
+
+
+def _leave_out_strangers(
+    found: list[BallPress], left_out: list[tuple[str, str]], reference: Image, mean: Float64, ball: float
+) -> None:
+    """Blurred pictures, and presses that the light of the others does not explain."""
+    for k, share in reversed(blurred_presses(found, reference, mean)):
+        why = f"blurred: {share:.0%} of the fine detail of other pictures; press again, held still and in focus"
+        left_out.append((found.pop(k).name, why))
+    for k in reversed(unlike_presses(found, [_window(press, SHADED_PIXELS) for press in found], ball)):
+        why = "the light of most other presses does not explain it: another sensor or ball, or a turned picture?"
+        left_out.append((found.pop(k).name, why))
+
+
+def _of_one_ball(
+    presses: list[BallPress], refined: RefinedGeometry, left_out: list[tuple[str, str]], ball: float
+) -> tuple[list[BallPress], RefinedGeometry]:
+    """Without the presses of another ball."""
+    windows = [_window(press, SHADED_PIXELS) for press in presses]
+    others, ratio = other_balls(windows, refined.circles, refined.thickness, ball, presses[0].shape)
+    if not others:
+        return presses, refined
+    why = f"its slopes are those of a ball {ratio:.2f} times as large as in the other presses: use one ball"
+    left_out += [(presses[k].name, why) for k in others]
+    return _refined([press for k, press in enumerate(presses) if k not in others], left_out, ball)
 
 
 def _equations(

@@ -15,6 +15,7 @@ from calibration.lens.view import GelView
 from calibration.light.dent import ContactCircle
 from calibration.light.photometry import ModelSize
 from calibration.light.press import FAR, BallPress, Image
+from calibration.light.press_shapes import Stretch
 from tacsim.models.darkness import DarknessModel
 from tacsim.models.photometric import PhotometricModel
 from tacsim.models.sensor import CameraNoise, Markers, SensorGeometry
@@ -54,6 +55,8 @@ class LightFit:
     presses: tuple[BallPress, ...]
     frames: tuple[str, ...]  # names of all that were given
     darkness: DarknessModel | None = None  # of a light that tells depth and no direction; lengths in pixels
+    stretch: Stretch | None = None  # of contacts, which are round; None: not measured
+    doubts: tuple[str, ...] = ()  # why the pictures are not to be trusted, and what to do after a colon
 
     def to_calibration(
         self,

@@ -14,7 +14,8 @@ from calibration.light.dent import contact_depth
 from calibration.light.fit import LightFit
 from tacsim.models.photometric import PhotometricLight, PhotometricModel
 
-Word = Literal["good", "usable", "do not trust"]
+Word = Literal["good", "usable", "unverified scale", "do not trust"]
+ORDER: tuple[Word, ...] = ("do not trust", "unverified scale", "usable", "good")  # the worst first
 Image = NDArray[np.uint8]
 
 GREY = "the pictures are grey"
@@ -26,6 +27,9 @@ CORRELATION = (0.97, 0.95)  # of predicted and real change of colour
 UNEXPLAINED = (0.15, 0.35)  # share of the change of colour that no dent explains
 RADIUS = (0.03, 0.08)  # uncertainty of the contact radii [-]
 SCALE = (0.05, 0.12)  # of lengths, by a press of known depth or by the size of the gel [-]
+# Ratio of the axes of contacts, less 1: round ones of five real sensors show 0.01 to 0.025
+STRETCH = (0.03, 0.05)
+MAX_LEFT_OUT = 1 / 3  # share of the presses
 DIRECTED = 0.1  # least share of the power of flanks' change of colour that differs from flank to flank
 MISFIT = 0.5  # error of one press over the error of predicting nothing: its circle does not fit
 WIDEST = 0.95  # contact radius over the ball's: no gel is pressed so far
@@ -54,7 +58,7 @@ class Verdict:
     @property
     def word(self) -> Word:
         words = [finding.word for finding in self.findings]
-        return "do not trust" if "do not trust" in words else "usable" if words else "good"
+        return next((word for word in ORDER if word in words), "good")
 
     def __str__(self) -> str:
         return "; ".join([self.word, *(f"{finding.what}: {finding.todo}" for finding in self.findings)])
@@ -70,17 +74,19 @@ class KnownScale:
     gel_thickness: float | None = None  # [m]
     depths: tuple[tuple[str, float], ...] = ()  # frames whose indentation is known [m]
     pitch_from_size: bool = False  # the pitch is published and follows from `gel_size`: neither checks the other
+    marker_pitches: tuple[float, float] | None = None  # of printed dots: as found by the pixel pitch, as told [m]
 
 
 def judge(fit: LightFit, scale: KnownScale, *, dots: bool = False) -> Verdict:
     """All findings, the worst first. `dots` are seen on the gel, and were not told."""
-    found = [*_of_presses(fit), *_of_pictures(fit), *_of_scale(fit, scale)]
+    found = [*_of_presses(fit), *_of_pictures(fit), *_of_shape(fit), *_of_scale(fit, scale)]
+    found += [Finding("do not trust", *_split(doubt)) for doubt in fit.doubts]
     if dots:  # a rig refuses such a bundle
         found.insert(
             0, Finding("do not trust", "dots are printed on the gel, and each will pass for a dent", "give --markers")
         )
     found += [Finding("usable", *_split(warning)) for warning in fit.warnings]
-    return Verdict(tuple(sorted(found, key=lambda finding: finding.word != "do not trust")))
+    return Verdict(tuple(sorted(found, key=lambda finding: ORDER.index(finding.word))))
 
 
 def _of_presses(fit: LightFit) -> Iterable[Finding]:
@@ -96,6 +102,12 @@ def _of_presses(fit: LightFit) -> Iterable[Finding]:
         RADIUS, fit.radius_uncertainty, "the contact radii are uncertain by {:.0%}",
         "press more often and deeper; is each picture of one ball, held still?",
     )  # fmt: skip
+    share = len(fit.left_out) / (count + len(fit.left_out))
+    if share > MAX_LEFT_OUT:
+        yield Finding(
+            "do not trust", f"{len(fit.left_out)} of {count + len(fit.left_out)} presses were left out",
+            "see why below, and press again: one ball, one sensor, one setting of its camera",
+        )  # fmt: skip
     misfit = [press.name for press in fit.predictions if press.error > MISFIT * press.null_error]
     if misfit:
         yield Finding("usable", f"the circle of {_names(misfit)} does not fit", "look at it, and leave it out")
@@ -132,6 +144,15 @@ def _of_pictures(fit: LightFit) -> Iterable[Finding]:
     )  # fmt: skip
 
 
+def _of_shape(fit: LightFit) -> Iterable[Finding]:
+    if fit.stretch is not None:
+        yield from _beyond(
+            STRETCH, fit.stretch.ratio - 1.0,
+            f"contacts of the ball are no circles: the ratio of their axes is {fit.stretch}; up to {1 + STRETCH[0]:g} "
+            "is not told from 1", "give pictures whose pixels are square, or the view of the gel (--view)",
+        )  # fmt: skip
+
+
 def _of_scale(fit: LightFit, scale: KnownScale) -> Iterable[Finding]:
     ball = scale.ball_radius / scale.pixel_pitch
     ratios = [press.circle.radius / ball for press in fit.presses]
@@ -152,16 +173,30 @@ def _of_scale(fit: LightFit, scale: KnownScale) -> Iterable[Finding]:
             "the radius, or too small a pixel pitch", "measure ball and pitch; press as deep as the work will",
         )  # fmt: skip
     # A pitch 1.6 times too large may look as good as the right one
-    if scale.pitch_from_size and not scale.depths:
-        yield Finding(
-            "usable", "the pixel pitch is the published one of this kind of sensor, and nothing checks it on yours",
-            "measure it (--pixel-pitch, --view) or the gel that the picture shows (--size), or say how deep a press is "
-            "(--depth)",
-        )  # fmt: skip
-    elif scale.gel_size is None and not scale.depths:
-        yield Finding(
-            "usable", "nothing checks the lengths that were given, ball and pixel pitch",
-            "say what the picture shows of the gel (--size, or --kind), or how deep a press is (--depth)",
+    if not scale.depths:
+        if scale.pitch_from_size:
+            yield Finding(
+                "unverified scale", "the pixel pitch is the published one of this kind of sensor, and nothing checks it",
+                "measure it (--pixel-pitch, --view) or the gel that the picture shows (--size), or say how deep a "
+                "press is (--depth)",
+            )  # fmt: skip
+        elif scale.gel_size is None and scale.marker_pitches is None:
+            yield Finding(
+                "unverified scale", "nothing checks the lengths that were given, ball and pixel pitch",
+                "say how deep a press is (--depth, which checks both), what the picture shows of the gel (--size, or "
+                "--kind), or how far its dots are apart (--marker-pitch)",
+            )  # fmt: skip
+        else:
+            yield Finding(
+                "usable", "the pixel pitch is checked and the ball's radius is not: half of it doubles each depth",
+                "say how deep a press is (--depth)",
+            )  # fmt: skip
+    if scale.marker_pitches is not None:
+        found, told = scale.marker_pitches
+        yield from _beyond(
+            SCALE, abs(math.log(found / told)),
+            f"at this pixel pitch the dots are {found * 1e3:.3g} mm apart, and {told * 1e3:.3g} mm were given",
+            "measure the pixel pitch by a board or a ruler",
         )  # fmt: skip
     if scale.gel_size is not None:
         rows, columns, _ = fit.reference.shape

@@ -18,6 +18,7 @@ UNUSABLE, FAILED, INTERRUPTED = 2, 1, 130  # exit codes: bad configuration or us
 # What was named cannot be read or written there, whatever is done
 NO_PLACE = (FileExistsError, FileNotFoundError, IsADirectoryError, NotADirectoryError, PermissionError)
 UNTRUSTED = 3  # all was done, but the result is not to be trusted
+UNVERIFIED = 4  # all was done, and nothing checks the lengths that the result is measured in
 
 
 class Guarded(TyperGroup):

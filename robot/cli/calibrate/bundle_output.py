@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from robot.cli.errors import UNTRUSTED
+from robot.cli.errors import UNTRUSTED, UNVERIFIED
 from robot.cli.output import notes, results, say_files, show_table, warn, writing
 
 if TYPE_CHECKING:
@@ -35,7 +35,8 @@ def write_calibration(
     view: GelView | None,
     region: PictureRegion | None,
 ) -> None:
-    """Shows the calibration, writes its bundle and the page of its verdict; exits with UNTRUSTED where it must."""
+    """Shows the calibration, writes its bundle and the page of its verdict; exits with UNTRUSTED or UNVERIFIED where it
+    must."""
     from calibration.bundle import write_bundle
     from calibration.light import page
     from calibration.light.residual_picture import draw
@@ -80,6 +81,8 @@ def write_calibration(
     say_files(*written)
     if verdict.word == "do not trust":
         raise typer.Exit(UNTRUSTED)
+    if verdict.word == "unverified scale":
+        raise typer.Exit(UNVERIFIED)
 
 
 def _title(serial: str, folder: Path, profile: SensorProfile) -> str:
@@ -144,6 +147,8 @@ def _show(fit: LightFit, pitch: float, found: Markers | None) -> None:
             f"contact radii ± {fit.radius_uncertainty:.1%}; gel {fit.thickness * pitch * 1e3:.1f} mm thick by the "
             "slopes round the contacts"
         )
+    if fit.stretch is not None:
+        results.print(f"ratio of the axes of contacts: {fit.stretch}")
     for name, why in fit.left_out:
         notes.print(f"left out: {name}: {why}", markup=False)
     if found is not None:

@@ -107,14 +107,17 @@ def sensor(
         ),
     ] = None,
     markers: Annotated[bool, typer.Option("--markers", help="Dots are printed on the gel.")] = False,
+    marker_pitch: Annotated[
+        Any, length("How far printed dots are apart, by a ruler: it checks the pixel pitch.", 1e-4, 1e-2)
+    ] = None,
     set_: Overrides = None,
     out: Out = None,
 ) -> None:
     """Calibrate a sensor's light from presses of a ball: colour of every slope, and slope of every colour.
 
     Contact circles are found by themselves. Writes calibration.yaml, reference.png and residuals.png, prints how well
-    each press is predicted by the others, and ends in a verdict, verdict.html: good, usable or do not trust (then the
-    exit code is 3), with the reasons and what to do next.
+    each press is predicted by the others, and ends in a verdict, verdict.html: good, usable, unverified scale (exit
+    code 4: nothing checks ball and pixel pitch) or do not trust (exit code 3), with reasons and what to do next.
 
     With --camera it leads you through it: the gel without contact, then press after press, each judged at once. The
     pictures are kept in frames/ beside the bundle, to calibrate from them again; Ctrl-C keeps what was taken.
@@ -126,8 +129,9 @@ def sensor(
     if camera is not None and reference is not None:
         raise typer.BadParameter("with --camera it is taken first, of the free gel", param_hint="--reference")
     asked = _asked(
-        ball_diameter, ball_radius, kind, pixel_pitch, view, size, region, known_depth, serial, out, markers=markers
-    )
+        ball_diameter, ball_radius, kind, pixel_pitch, view, size, region, known_depth, serial, out,
+        markers=markers, marker_pitch=marker_pitch,
+    )  # fmt: skip
     _calibrate(asked, frames, reference, camera, set_ or [], presses)
 
 
@@ -137,20 +141,21 @@ def _calibrate(
     """From the pictures of a folder, or of so many presses before a camera, to the bundle and its verdict."""
     if camera is not None:
         config, name = named_camera(camera, overrides, asked.profile.native)
-        seen, pitch = _geometry(asked, (config.height, config.width))
+        seen, pitch = _calibrated(asked, (config.height, config.width))
         read = _take_presses(camera, config, name, asked, presses, seen, pitch)
     else:
         assert frames is not None
         read = _read(frames, reference)
         _require_frames(asked.depths, [frame.name for frame in read.frames])
-        seen, pitch = _geometry(asked, read.shape)
+        seen, pitch = _calibrated(asked, read.shape)
     read = _straightened(read, asked.region, seen)
     found = _markers(read, pitch) if asked.markers else None
     fit = _fitted(read, asked.ball / pitch, None if found is None else found.radius / pitch)
     from calibration.light.verdict import KnownScale
 
     published = asked.pitch is None and asked.view is None and asked.size is None
-    scale = KnownScale(pitch, asked.ball, asked.gel_size, asked.profile.gel_thickness, asked.depths, published)
+    dots = None if found is None or asked.marker_pitch is None else (found.pitch, asked.marker_pitch)
+    scale = KnownScale(pitch, asked.ball, asked.gel_size, asked.profile.gel_thickness, asked.depths, published, dots)
     write_calibration(
         asked.folder, fit, read, asked.serial, scale, found, asked.profile, view=seen, region=asked.region
     )
@@ -168,13 +173,15 @@ class _Asked:
     region: PictureRegion | None
     depths: tuple[tuple[str, float], ...]
     markers: bool
+    marker_pitch: float | None  # of printed dots, as told [m]
     serial: str
     folder: Path
 
     @property
     def gel_size(self) -> tuple[float, float] | None:
         """What is known of the gel that the picture shows: as told, of its kind, or of the view that was measured."""
-        return self.size or self.profile.gel_size or (self.view.size if self.view else None)
+        measured = self.view is not None and self.view.board != "four corners"  # else the size is all that is known
+        return self.size or self.profile.gel_size or (self.view.size if self.view and measured else None)
 
 
 def _asked(
@@ -190,6 +197,7 @@ def _asked(
     out: Path | None,
     *,
     markers: bool,
+    marker_pitch: float | None,
 ) -> _Asked:
     """Checked, before anything slow is loaded; the folder is made."""
     from calibration.bundle import SERIAL
@@ -205,6 +213,9 @@ def _asked(
         raise typer.BadParameter("give either --pixel-pitch or --view")
     if pitch is None and view is None and profile.gel_size is None:
         raise typer.BadParameter("give --pixel-pitch or --view, or --kind with a pitch that is known beforehand")
+    if marker_pitch is not None and not (markers or profile.markers):
+        what = "it says how far printed dots are apart: give --markers, too"
+        raise typer.BadParameter(what, param_hint="--marker-pitch")
     if size is not None and min(size) <= 0:
         raise typer.BadParameter("both lengths must be above 0", param_hint="--size")
     if not re.fullmatch(SERIAL, serial):
@@ -226,6 +237,7 @@ def _asked(
         region=None if region is None else _region(region),
         depths=tuple(_known_depth(text) for text in known_depth or ()),
         markers=markers or profile.markers,
+        marker_pitch=marker_pitch,
         serial=serial,
         folder=folder,
     )
@@ -270,7 +282,9 @@ def _fitted(read: FrameSet, ball: float, dot: float | None) -> LightFit:
     named = [(frame.name, frame.image) for frame in read.frames]
     try:
         with busy(f"calibrating from {len(named)} press{'es' * (len(named) > 1)}"):
-            return calibrate_light(read.reference, named, ball, None if dot is None else DotEraser(dot))
+            erase = None if dot is None else DotEraser(dot)
+            more = [frame.image for frame in read.untouched]
+            return calibrate_light(read.reference, named, ball, erase, more)
     except NoDirection as why:
         from calibration.light.verdict import GREY, is_grey
 
@@ -293,6 +307,18 @@ def _require_frames(depths: tuple[tuple[str, float], ...], names: list[str]) -> 
     for name, _ in depths:
         if name not in names:
             raise typer.BadParameter(f"no frame '{name}'; there are {', '.join(names)}", param_hint="--depth")
+
+
+def _calibrated(asked: _Asked, shape: tuple[int, int]) -> tuple[GelView | None, float]:
+    """The view and the pixel pitch [m] of the pictures that are calibrated, from native ones of `shape` (rows,
+    columns)."""
+    from calibration.lens.view import calibrated_view
+
+    seen, pitch = _geometry(asked, shape)
+    view, coarse = calibrated_view(seen, pitch, shape)
+    if coarse != pitch:
+        notes.print(f"calibrated at {coarse * 1e3:.3g} mm a pixel: the pictures have {pitch * 1e3:.3g} mm")
+    return view, coarse
 
 
 def _geometry(asked: _Asked, shape: tuple[int, int]) -> tuple[GelView | None, float]:

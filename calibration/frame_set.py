@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from calibration.errors import BadFrames
 from calibration.lens.rectification import from_corners, region_mask, to_metric
 from calibration.lens.view import BadCorners, Corners, GelView
-from calibration.reference import SATURATED
+from calibration.reference import SATURATED, channels_swapped
 from tacsim.interface import SurfaceMap
 from tacsim.models.geometry import PictureRegion
 from tacsim.optics.grid import PixelGrid
@@ -143,6 +143,8 @@ def frame_warnings(
             found.append(f"saturated: {saturated:.0%} of the contact")
     change = (image - reference)[~contact]
     if len(change) and (drift := float(np.abs(np.median(change, axis=0)).max())) > STALE_CHANGE:
+        if channels_swapped(image.astype(np.float32), reference.astype(np.float32), ~contact):
+            return [*found, "red and blue are swapped: the untouched gel is that of the reference in the other order"]
         found.append(f"stale reference: the untouched gel has changed by {drift:.0f} grey levels")
     return found
 

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -33,11 +34,14 @@ from calibration.markers.of_sensor import marker_flow, seen_by_dots
 from calibration.reference import (
     LOST_COLOUR,
     LOST_SLOPE,
+    MIN_CONTACT_AREA,
     STALE_COLOUR,
     STALE_SLOPE,
     Reference,
     StaleReference,
     UnusableReference,
+    channels_swapped,
+    contact_area,
     exchanged,
     make_reference,
 )
@@ -49,6 +53,7 @@ from tacsim.models.rig import ReplaySensorConfig
 from tacsim.models.sensor import CanonicalGrid, SensorModel
 from tacsim.optics.grid import PixelGrid, canonical_cells, canonical_image
 
+DOT_LEVEL = 0.7  # of the mean: printed dots are darker
 BETTERED = 5  # format of bundles from which on the forward model betters heights: older ones give what they gave
 
 
@@ -83,6 +88,8 @@ class FrameNormaliser:
         self._see_by(rectify, markers)
         self._find_drift = DriftFinder(self._on_image.shape) if drifts and find is None else None
         self._untouched = untouched
+        # Why the reference may show a contact, in words; None: it does not, or there is no picture to compare it with
+        self.reference_doubt: str | None = None
         self._sought = False  # the last observation was found in a picture
         self.reference: Reference | None = None  # the present one; None before the first
         # Height and gradient, or flow, are found in pictures of sources that don't know their surface
@@ -154,6 +161,7 @@ class FrameNormaliser:
                 "red and blue are exchanged: the gel looks as in its calibration only with the channels in the other "
                 "order; give pictures in the order in which they were calibrated (this program's is RGB)"
             )
+        self._doubt_reference(reference)
         if self._markers is not None:
             self._markers.take_reference(frame.image, frame.index)
         elif self._find is not None:
@@ -161,9 +169,27 @@ class FrameNormaliser:
         self.reference = reference
         self.drift_slope = self.drift = None
 
+    def _doubt_reference(self, reference: Reference) -> None:
+        """Compares a new reference with the bundle's picture, and warns where it shows a contact."""
+        self.reference_doubt = None
+        if self._untouched is None:
+            return
+        valid = reference.valid
+        known = self._untouched / np.maximum(self._untouched[valid].mean(axis=0), 1.0)
+        dark = np.zeros_like(valid)
+        if self._markers is not None:  # printed dots need not lie where they lay
+            dark = _near_dots(reference.relative) | _near_dots(known)
+        area = contact_area(reference.relative - known, ~valid | dark, self._grid.pitch / self._grid.image_scale)
+        if area > MIN_CONTACT_AREA:
+            self.reference_doubt = (
+                f"the reference shows a contact of {area * 1e6:.1f} mm^2: it differs there from the picture without "
+                "contact that belongs to the calibration; take a reference of the free gel"
+            )
+            warnings.warn(self.reference_doubt, stacklevel=3)
+
     def diagnostics(self) -> dict[str, float]:
         """Quality of the last observation, where it was found in a picture, as far as it is known: `beyond`
-        (`beyond_range`), `drift`, `background` (`drift_slope`), `kept`, and `stale` (0 or 1)."""
+        (`beyond_range`), `drift`, `background` (`drift_slope`), `kept`, `stale` (0 or 1); and `touched_reference` (1) where the reference shows a contact."""
         if not self._sought:
             return {}
         known = {
@@ -172,6 +198,7 @@ class FrameNormaliser:
             "drift": self.drift,
             "background": self.drift_slope,
             "kept": self.kept if self.finds_flow else None,
+            "touched_reference": None if self.reference_doubt is None else 1.0,
         }
         return {name: value for name, value in known.items() if value is not None}
 
@@ -239,11 +266,23 @@ class FrameNormaliser:
             if found.drift is not None:
                 self.drift, self.drift_slope = found.drift, found.drift_slope
             height, gradient, removed = found.height, found.gradient, found.removed_drift
+        if self.stale:
+            self._require_order(change)
         self._require_light()
         if self._markers is not None:
             deep = None if height is None else (height, canonical_cells(self._grid))
             flow = self._markers(frame.image, frame.index, deep)
         return height, gradient, flow, removed
+
+    def _require_order(self, change: NDArray[np.float32]) -> None:
+        """Raises StaleReference for a picture with red and blue swapped, by its change (H, W, 3) from the reference."""
+        assert self.reference is not None
+        image = self.reference.image + change * self.reference.mean
+        if channels_swapped(image, self.reference.image, self.reference.valid):
+            raise StaleReference(
+                "red and blue are swapped: the untouched gel looks as in its reference only with the channels in the "
+                "other order; give frames and reference in one order (this program's is RGB)"
+            )
 
     def _require_light(self) -> None:
         """Raises StaleReference."""
@@ -421,6 +460,14 @@ def _byte_image(change: NDArray[np.float32]) -> NDArray[np.uint8]:
 
     # cv2 takes the absolute value before it saturates: what is below -1 would be folded up
     return np.asarray(cv2.convertScaleAbs(np.maximum(change, np.float32(-1.0)), alpha=128.0, beta=128.0))
+
+
+def _near_dots(relative: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """(H, W) pixels of an image (H, W, 3), relative to its mean, that printed dots darken, and those beside."""
+    import cv2
+
+    dark = (relative.max(axis=2) < DOT_LEVEL).astype(np.uint8)
+    return np.asarray(cv2.dilate(dark, np.ones((5, 5), dtype=np.uint8)), dtype=np.bool_)
 
 
 def _cells(pixels: NDArray[Any], grid: CanonicalGrid) -> NDArray[Any]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from calibration.lens.rectification import Rectification, seen_box
 from calibration.markers.dots import MIN_RADIUS, DotFinder
-from calibration.markers.lattice import Lattice, NoLattice, find_lattice, spread, usual_pitch
+from calibration.markers.lattice import Lattice, NoLattice, find_lattice, missing_line, spread, usual_pitch
 from calibration.markers.tracker import DotTracker
 from calibration.reference import UnusableReference
 from tacsim.models.sensor import Markers
@@ -36,6 +36,10 @@ MIN_VISIBLE = 0.25  # share of the dots that must be seen for a flow
 
 class NoMarkers(UnusableReference):
     """The reference does not show the lattice that the sensor should have."""
+
+
+class MissingDots(NoLattice):
+    """A picture shows a lattice that lacks a whole row or column."""
 
 
 class MarkersLost(RuntimeError):
@@ -100,6 +104,8 @@ class MarkerFlow:
         shown = int(lattice.present.sum())
         if shown < max(4.0, (1.0 - MAX_MISSING) * visible.sum()):
             raise NoMarkers(f"the reference shows {shown} of {visible.sum()} dots in view of {expected}: {advice}")
+        if (missing := missing_line(lattice.present, visible)) is not None:
+            raise NoMarkers(f"the reference shows no {expected}: {missing}; {advice}")
         if lattice.surplus > MAX_SURPLUS * lattice.present.size:
             raise NoMarkers(
                 f"the reference shows {lattice.surplus} dots more than {expected}: give the true rows and columns"
@@ -233,6 +239,9 @@ def find_markers(image: Image) -> tuple[Lattice, float]:
         radius *= 1.3
     if best is None:
         raise NoLattice("the picture shows no lattice of dark dots, at least 3 x 3")
+    if (missing := missing_line(best[0].present)) is not None:
+        size = " x ".join(str(count) for count in best[0].present.shape)
+        raise MissingDots(f"in a lattice of {size} dots {missing}: clean the gel, or light it evenly")
     return best
 
 
@@ -241,6 +250,8 @@ def require_no_markers(image: Image) -> None:
     of none each would be a dent."""
     try:
         lattice, _ = find_markers(image)
+    except MissingDots as why:
+        raise UnusableReference(f"{why}; and the sensor's model or calibration has no markers") from None
     except NoLattice:
         return
     rows, columns = lattice.present.shape

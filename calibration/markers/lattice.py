@@ -4,9 +4,13 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from scipy.spatial import KDTree
 
 Float64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -90,20 +94,53 @@ def _labels(points: Float64, pitch: float) -> dict[int, tuple[int, int]]:
     labels = {start: (0, 0)}
     taken = {(0, 0)}
     queue: deque[tuple[int, Float64, Float64]] = deque([(start, along, down)])
+    reached: list[tuple[int, Float64, Float64]] = []
     while queue:
         one, along, down = queue.popleft()
-        row, column = labels[one]
-        for side, step in (((0, 1), along), ((0, -1), -along), ((1, 0), down), ((-1, 0), -down)):
-            there = (row + side[0], column + side[1])
-            distance, other = tree.query(points[one] + step)
-            if distance > MAX_STEP_ERROR * pitch or other in labels or there in taken:
-                continue
-            labels[int(other)] = there
-            taken.add(there)
-            seen = (points[other] - points[one]) * (side[0] + side[1])
-            bent = (0.5 * (along + seen), down) if side[0] == 0 else (along, 0.5 * (down + seen))
-            queue.append((int(other), *bent))
+        reached.append((one, along, down))
+        found = _neighbours(tree, points, labels, taken, (one, along, down), pitch, 1)
+        if not (found or queue):  # a whole row may be missing: from there on by two steps
+            for from_there in reached:
+                found += _neighbours(tree, points, labels, taken, from_there, pitch, 2)
+        queue.extend(found)
     return labels
+
+
+def _neighbours(
+    tree: KDTree,
+    points: Float64,
+    labels: dict[int, tuple[int, int]],
+    taken: set[tuple[int, int]],
+    place: tuple[int, Float64, Float64],
+    pitch: float,
+    far: int,
+) -> list[tuple[int, Float64, Float64]]:
+    """The points `far` steps from one to all sides, each with the steps there; they are labelled here."""
+    one, along, down = place
+    row, column = labels[one]
+    new = []
+    for side, step in (((0, 1), along), ((0, -1), -along), ((1, 0), down), ((-1, 0), -down)):
+        there = (row + far * side[0], column + far * side[1])
+        distance, other = tree.query(points[one] + far * step)
+        if distance > MAX_STEP_ERROR * pitch or other in labels or there in taken:
+            continue
+        labels[int(other)] = there
+        taken.add(there)
+        seen = (points[other] - points[one]) * (side[0] + side[1]) / far
+        bent = (0.5 * (along + seen), down) if side[0] == 0 else (along, 0.5 * (down + seen))
+        new.append((int(other), *bent))
+    return new
+
+
+def missing_line(present: Mask, visible: Mask | None = None) -> str | None:
+    """The first row or column of a lattice (rows, columns) without any dot, in words; None: there is none. `visible`:
+    dots that could be seen; a line of fewer than 3 of them is not asked for."""
+    shown = np.ones_like(present) if visible is None else visible
+    for axis, name in ((1, "row"), (0, "column")):
+        empty = np.flatnonzero(~present.any(axis=axis) & (shown.sum(axis=axis) >= 3))
+        if len(empty):
+            return f"{name} {empty[0] + 1} of {present.shape[1 - axis]} shows no dot"
+    return None
 
 
 def _window(

@@ -42,6 +42,10 @@ DIRT_MISFIT = 0.1  # distance from the extrapolated place that is suspicious [pi
 DIRT_MISFIT_RATIO = 4.0  # ... if it is also so many times the median
 DIRT_GAIN = 0.25  # another point is the dot if its distance is less than this share
 
+# A dot that moves alone: two dots in one, or glare on it
+STRAY_MISFIT = 0.15  # distance from the extrapolated place [pitches]
+STRAY_MISFIT_RATIO = 2.5  # ... if it is also so many times that of each of its neighbours
+
 TINY = 1e-9  # keeps the map of a dot without any neighbour solvable
 
 
@@ -103,6 +107,7 @@ class DotTracker:
             partner = self._extended(partner, points)  # dots that have turned round
         if len(points) > int((partner >= 0).sum()):
             partner = self._without_dirt(partner, points)
+        partner = self._without_strays(partner, points)
         seen = partner >= 0
         displacement = np.zeros_like(self._rest)
         displacement[seen] = points[partner[seen]] - self._rest[seen]
@@ -223,6 +228,18 @@ class DotTracker:
         cleaned[suspects] = np.where(better, other, partner[suspects])
         once = np.bincount(cleaned[cleaned >= 0], minlength=len(points)).max() <= 1
         return cleaned if once else partner
+
+    def _without_strays(self, partner: Index, points: Float64) -> Index:
+        """`partner` without dots that lie aside from where those around extrapolate to, and whose neighbours hardly
+        do: at the rim of a contact several do."""
+        known = partner >= 0
+        if not known.any():
+            return partner
+        moved = np.where(known[:, None], points[partner] - self._rest, 0.0)
+        misfit = np.linalg.norm(self._extrapolated(np.arange(len(partner)), known, moved) - moved, axis=1)
+        limit = max(STRAY_MISFIT * self._pitch, DIRT_MISFIT_RATIO * float(np.median(misfit[known])))
+        around = (self._linked * np.where(known, misfit, 0.0)).max(axis=1)
+        return np.where(known & (misfit > np.maximum(limit, STRAY_MISFIT_RATIO * around)), -1, partner)
 
     def _extrapolated(self, asked: Index, known: Mask, moved: Float64) -> Float64:
         """(k, 2) displacement of the dots `asked`, by an affine map through that (n, 2) of the `known` ones near."""

@@ -37,8 +37,8 @@ BEFORE = {
 }
 KINDS = (("contact MAE [grey levels]", "error", 2), ("correlation", "correlation", 3), ("normals [deg]", "angle", 1))
 TIMES = 9  # that a picture is normalised for its time
-# A set of one press: nothing can be left out
-DARK, DARK_BALL, DARK_PITCH = "9dtact_sensor_1", 4e-3, 0.05102e-3  # its folder; ball radius, pixel pitch [m]
+# Sets of one press: nothing can be left out. Their folders; ball radius [m]; row, column, and pixel pitch [mm]
+DARK, DARK_BALL, DARK_SCALE = "9dtact_sensor_*", 4e-3, "camera_calibration_position_scale.npy"
 DARK_BEFORE = "-1.4 to 2.2 mm"  # heights that were found of a dent of 2.2 mm
 SUBSETS = (5, 8, 15)  # presses
 ANOTHER = 0.05  # of a radius: so far off is another solution, not the same one less exactly
@@ -79,19 +79,18 @@ def dark_row(home: Path) -> str:
     """Of the one press of a sensor whose light tells depth by darkness. Raises BadFrames, BadData."""
     reference = read_picture(home / "depth_calibration_ref.png")
     begun = process_time()
-    fit = calibrate_light(
-        reference, [("press", read_picture(home / "depth_calibration_sample.png"))], DARK_BALL / DARK_PITCH
-    )
+    pitch = 1e-3 * float(np.ravel(np.load(home / DARK_SCALE, allow_pickle=False))[2])
+    fit = calibrate_light(reference, [("press", read_picture(home / "depth_calibration_sample.png"))], DARK_BALL / pitch)
     cpu = process_time() - begun
     if fit.darkness is None:
         return row("9DTact", "height [mm]", DARK_BEFORE, "its light was taken for one that tells direction", "")
     (press,) = fit.presses
     depth, _ = DarknessSlopes(fit.darkness, press.shape, 1.0).depth(press.change.astype(np.float32))
     v, u = np.mgrid[: press.shape[0], : press.shape[1]].astype(np.float64)
-    off = depth - dent_height(u, v, press.circle, fit.thickness, DARK_BALL / DARK_PITCH)
+    off = depth - dent_height(u, v, press.circle, fit.thickness, DARK_BALL / pitch)
     off = off[press.distance() < press.circle.radius]
-    found = f"{1e3 * DARK_PITCH * np.sqrt(np.mean(off**2)):.3f} mm rms (on the press itself: the set has one)"
-    return row("9DTact, 1 press", "height in contact", DARK_BEFORE, found, f"{cpu:.1f} s")
+    found = f"{1e3 * pitch * np.sqrt(np.mean(off**2)):.3f} mm rms (on the press itself: the set has one)"
+    return row(f"9DTact {home.name.removeprefix('9dtact_')}, 1 press", "height in contact", DARK_BEFORE, found, f"{cpu:.1f} s")
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,7 +183,7 @@ def main(
     typer.echo(row(*["---"] * 5))
     for of in there:
         typer.echo("\n".join(rows_of(folder, of)))
-    for home in folder.rglob(DARK):
+    for home in sorted(folder.rglob(DARK)):
         if only in "9DTact":
             typer.echo(dark_row(home))
 

@@ -28,16 +28,24 @@ if TYPE_CHECKING:
 CASE = "invariance"
 FOLDS = 5
 MIN_PRESSES = 10
+THICKNESS = (2e-3, 8e-3)  # of a gel that its slopes tell [m]
 
 
-def invariance(folder: Path, of: BallSet, gel_size: tuple[float, float, float], repeat: int) -> list[Measurement]:
+def invariance(
+    folder: Path, of: BallSet, gel_size: tuple[float, float, float] | None, repeat: int
+) -> list[Measurement]:
     """Real presses beside the same by our gel, in five folds: distances, a classifier, drift. Seconds: of a press.
+
+    Whole presses are left out, of the calibration and of the classifier. `gel_size`: None: of a gel that is not known,
+    as large as the picture and as thick as the slopes round the contacts say; its variants begin with the set's name.
 
     *pictures*: our surface is found in our picture, as the real one in its own. *surfaces*: our simulation says it.
     """
     reference, frames = balls.read_balls(folder, of)
     if len(frames) < MIN_PRESSES:
         raise BadData(f"{of.name}: {len(frames)} presses; {MIN_PRESSES} are the least that say something")
+    named = "" if gel_size is not None else f"{of.name}, "
+    gel_size = _gel_of(folder, of, reference) if gel_size is None else gel_size
     wall, cpu, pressed, notes = 0.0, 0.0, 0, []
     by_source: dict[str, list[tuple[Comparison, Calibration | None]]] = {"pictures": [], "surfaces": []}
     for fold in range(FOLDS):
@@ -50,8 +58,16 @@ def invariance(folder: Path, of: BallSet, gel_size: tuple[float, float, float], 
     timing, note = Timing((wall / pressed,), cpu / pressed), "; ".join(notes)
     rows = []
     for source, folds in by_source.items():
-        rows += _rows(source, folds, timing, note)
+        rows += _rows(f"{named}{source}", folds, timing, note)
     return rows
+
+
+def _gel_of(folder: Path, of: BallSet, reference: Image) -> tuple[float, float, float]:
+    """Size of a gel of which only pictures are known [m]. Raises BadData."""
+    fit, _, _ = balls.calibrated(folder, of)
+    thickness = float(np.clip(fit.thickness * of.pixel_pitch, *THICKNESS))
+    across, down = (round(length * of.pixel_pitch, 3) for length in (reference.shape[1], reference.shape[0]))
+    return across, down, round(thickness, 4)
 
 
 def _rows(
@@ -72,7 +88,7 @@ def _rows(
             note,
         )
         for view in report.views
-        if source == "pictures" or view.view in ("gradient", "height")
+        if source.endswith("pictures") or view.view in ("gradient", "height")
     ]  # fmt: skip
     rows += [
         Measurement(
@@ -84,7 +100,7 @@ def _rows(
     ]  # fmt: skip
     overall = [pair for comparison, _ in folds for pair in comparison.pairs]
     kinds = [("gradient_angle", "gradient", "deg", 1.0), ("height_share", "height", "% of depth", 100.0)]
-    if source == "pictures":
+    if source.endswith("pictures"):
         kinds.insert(0, ("contact_mae", "picture", "grey", 1.0))
     for key, name, unit, scale in kinds:
         values, nulls = [pair.numbers[key] for pair in overall], [pair.null[key] for pair in overall]
@@ -134,11 +150,17 @@ def _fold(
 
 
 def cases(folder: Path) -> tuple[Case, ...]:
-    """The presses of the sensor whose gel is known; says what is missing. Raises ConfigError."""
+    """The presses of the sensor whose gel is known, and of every other set with enough of them; says what is missing.
+    Raises ConfigError."""
     labels, resolution = read_labels(folder), f"{FOLDS} folds, h {ELEMENT * 1e3:g} mm"
+    others = tuple(
+        Case("real", CASE, "tacsim", f"{other.name}, {resolution}", partial(invariance, folder, other, None), long=True)
+        for other in balls.read_sets(folder)
+        if other.name != labels.light and not other.dots and balls.is_there(folder, other)
+    )
     try:
         of = light_of(folder, labels)
     except BadData as error:
-        return (missing_case(CASE, str(error), resolution),)
+        return (missing_case(CASE, str(error), resolution), *others)
     size = (*labels.gel_size, labels.gel_thickness[0])
-    return (Case("real", CASE, "tacsim", resolution, partial(invariance, folder, of, size), long=True),)
+    return (Case("real", CASE, "tacsim", resolution, partial(invariance, folder, of, size), long=True), *others)

@@ -80,7 +80,9 @@ def dark_row(home: Path) -> str:
     reference = read_picture(home / "depth_calibration_ref.png")
     begun = process_time()
     pitch = 1e-3 * float(np.ravel(np.load(home / DARK_SCALE, allow_pickle=False))[2])
-    fit = calibrate_light(reference, [("press", read_picture(home / "depth_calibration_sample.png"))], DARK_BALL / pitch)
+    fit = calibrate_light(
+        reference, [("press", read_picture(home / "depth_calibration_sample.png"))], DARK_BALL / pitch
+    )
     cpu = process_time() - begun
     if fit.darkness is None:
         return row("9DTact", "height [mm]", DARK_BEFORE, "its light was taken for one that tells direction", "")
@@ -90,7 +92,9 @@ def dark_row(home: Path) -> str:
     off = depth - dent_height(u, v, press.circle, fit.thickness, DARK_BALL / pitch)
     off = off[press.distance() < press.circle.radius]
     found = f"{1e3 * pitch * np.sqrt(np.mean(off**2)):.3f} mm rms (on the press itself: the set has one)"
-    return row(f"9DTact {home.name.removeprefix('9dtact_')}, 1 press", "height in contact", DARK_BEFORE, found, f"{cpu:.1f} s")
+    return row(
+        f"9DTact {home.name.removeprefix('9dtact_')}, 1 press", "height in contact", DARK_BEFORE, found, f"{cpu:.1f} s"
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -175,7 +175,9 @@ def metric_picture(view: GelView) -> Callable[[Image], Image]:
 
     def reduced(image: Image) -> Image:
         if image.shape[:2] != view.image_shape:
-            raise BadFrames(f"the picture has {image.shape[1]} x {image.shape[0]} px, its view {lens.width} x {lens.height}")
+            raise BadFrames(
+                f"the picture has {image.shape[1]} x {image.shape[0]} px, its view {lens.width} x {lens.height}"
+            )
         less = np.asarray(cv2.resize(image, (columns, rows), interpolation=cv2.INTER_AREA), dtype=np.uint8)
         return np.rint(rectify(less)).astype(np.uint8)
 

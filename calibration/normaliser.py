@@ -189,7 +189,8 @@ class FrameNormaliser:
 
     def diagnostics(self) -> dict[str, float]:
         """Quality of the last observation, where it was found in a picture, as far as it is known: `beyond`
-        (`beyond_range`), `drift`, `background` (`drift_slope`), `kept`, `stale` (0 or 1); and `touched_reference` (1) where the reference shows a contact."""
+        (`beyond_range`), `drift`, `background` (`drift_slope`), `kept`, `stale` (0 or 1); and `touched_reference` (1)
+        where the reference shows a contact."""
         if not self._sought:
             return {}
         known = {

@@ -101,7 +101,9 @@ def untouched_contact(
             )
     changes = np.stack(
         [
-            np.where((press.distance() > NEAR * press.circle.radius)[..., None], press.change, np.nan).astype(np.float32)
+            np.where((press.distance() > NEAR * press.circle.radius)[..., None], press.change, np.nan).astype(
+                np.float32
+            )
             for press in presses
         ]
     )

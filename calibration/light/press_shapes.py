@@ -1,4 +1,4 @@
-"""What shape contacts have: ellipses where a pixel is wider than it is high, and slopes that ask for a ball of their own.
+"""What shape contacts have: ellipses where pixels are not square, and slopes that ask for a ball of their own.
 
 The presses are fitted together again, from circles that are refined, with more freedom: one ratio of axes and its
 direction for all, and for each press the blur of its rim and the radius of its ball. The light is eliminated as in

@@ -176,7 +176,8 @@ def _of_scale(fit: LightFit, scale: KnownScale) -> Iterable[Finding]:
     if not scale.depths:
         if scale.pitch_from_size:
             yield Finding(
-                "unverified scale", "the pixel pitch is the published one of this kind of sensor, and nothing checks it",
+                "unverified scale",
+                "the pixel pitch is the published one of this kind of sensor, and nothing checks it on yours",
                 "measure it (--pixel-pitch, --view) or the gel that the picture shows (--size), or say how deep a "
                 "press is (--depth)",
             )  # fmt: skip

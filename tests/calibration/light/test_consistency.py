@@ -6,81 +6,114 @@ import cv2
 import numpy as np
 import pytest
 
+from calibration.errors import BadFrames
 from calibration.light.calibrator import calibrate_light
-from calibration.light.fit import LightFit
+from calibration.light.consistency import blurred_presses, unlike_presses, untouched_contact
+from calibration.light.press import BallPress, Window, find_press, smooth, untouched_mean
+from calibration.light.press_shapes import fit_stretch, other_balls
 from calibration.light.verdict import KnownScale, judge
 from tests.calibration.presses import BALL, BALL_PX, COLUMNS, PITCH, ROWS, HiddenSensor
 
-Named = list[tuple[str, np.ndarray]]
 SCALE = KnownScale(PITCH, BALL, (COLUMNS * PITCH, ROWS * PITCH))
+PLACES = [(70, 60), (190, 140), (130, 100), (60, 150), (200, 60), (100, 50), (160, 60), (90, 120)]
+DEPTHS = [0.5e-3, 0.35e-3, 0.65e-3, 0.45e-3, 0.55e-3, 0.3e-3, 0.6e-3, 0.4e-3]
+
+
+def images(balls: list[float] | None = None) -> list[np.ndarray]:
+    """The same presses by the same sensor, of balls of these radii."""
+    sensor = HiddenSensor(3)
+    radii = [1.0] * 8 if balls is None else balls
+    shots = zip(DEPTHS, PLACES, radii, strict=True)
+    return [sensor.press(depth, x, y, ball=ratio * BALL_PX).image for depth, (x, y), ratio in shots]
+
+
+def found(shown: list[np.ndarray], empty: np.ndarray, ball: float = BALL_PX) -> list[BallPress]:
+    mean = untouched_mean(empty)
+    return [find_press(f"press {k}", image, empty, mean, ball) for k, image in enumerate(shown)]
+
+
+def windows(presses: list[BallPress]) -> list[Window]:
+    """Every third pixel of contact and skirt."""
+    cut = []
+    for press in presses:
+        v, u = np.nonzero(press.distance() < 2.3 * press.circle.radius)
+        keep = (u % 3 == 0) & (v % 3 == 0)
+        change = smooth(press.change, 0.8)[v[keep], u[keep]]
+        cut.append(Window(u[keep].astype(float), v[keep].astype(float), change))
+    return cut
 
 
 @pytest.fixture(scope="module")
-def good() -> tuple[np.ndarray, Named]:
-    sensor = HiddenSensor(3)
-    return sensor.empty(), [(f"press {i}", press.image) for i, press in enumerate(sensor.presses(8))]
+def empty() -> np.ndarray:
+    return HiddenSensor(3).empty()
 
 
-def fitted(reference: np.ndarray, frames: Named, untouched: tuple[np.ndarray, ...] = ()) -> LightFit:
-    return calibrate_light(reference, frames, BALL_PX, None, untouched)
+@pytest.mark.parametrize(("wide", "high", "angle"), [(1, 1, None), (1.08, 1, 0), (1, 1.33, 90), (0.93, 1, 90)])
+def test_pixels_that_are_not_square_are_measured(
+    empty: np.ndarray, wide: float, high: float, angle: float | None
+) -> None:
+    size = (round(COLUMNS * wide), round(ROWS * high))
+    presses = found([cv2.resize(image, size) for image in images()], cv2.resize(empty, size))
+    fit = fit_stretch(windows(presses), [press.circle for press in presses], 3 * BALL_PX, BALL_PX, presses[0].shape)
+    assert fit.ratio == pytest.approx(max(wide / high, high / wide), abs=0.015) and fit.uncertainty < 0.015
+    if angle is not None:
+        assert abs(fit.angle) == pytest.approx(angle, abs=4.0)
 
 
-def word(fit: LightFit) -> str:
-    return judge(fit, SCALE).word
-
-
-def test_square_pixels_are_told_from_wide_ones(good: tuple[np.ndarray, Named]) -> None:
-    reference, frames = good
-    plain = fitted(reference, frames)
-    assert plain.left_out == () and plain.doubts == () and word(plain) == "usable"
-    assert plain.stretch is not None and plain.stretch.ratio < 1.01
-    for wide, high, angle in ((1.08, 1.0, 0.0), (1.0, 1.33, 90.0)):
-        size = (round(COLUMNS * wide), round(ROWS * high))
-        fit = fitted(cv2.resize(reference, size), [(name, cv2.resize(image, size)) for name, image in frames])
-        assert fit.stretch is not None and fit.stretch.ratio == pytest.approx(max(wide, high), abs=0.01)
-        assert abs(fit.stretch.angle) == pytest.approx(angle, abs=3.0)
-        assert word(fit) == "do not trust" and "no circles" in str(judge(fit, SCALE))
-
-
-@pytest.mark.parametrize("ratio", [0.75, 1.3])
-def test_two_balls_are_told(good: tuple[np.ndarray, Named], ratio: float) -> None:
-    reference, frames = good
-    sensor = HiddenSensor(3)
-    other = [
-        (name, sensor.press(0.45e-3, x, y, ball=ratio * BALL_PX).image)
-        for (name, _), (x, y) in zip(frames[:4], [(70, 60), (190, 140), (130, 100), (60, 150)], strict=True)
-    ]
-    one = fitted(reference, [*frames[:7], other[0]])
-    assert [name for name, _ in one.left_out] == ["press 0"] and "ball" in one.left_out[0][1]
-    half = fitted(reference, [*other, *frames[4:]])
-    assert len(half.left_out) == 4 and word(half) == "do not trust"
+@pytest.mark.parametrize(
+    ("ratio", "other"), [(1.0, ()), (0.75, (7,)), (1.3, (2, 5)), (0.8, (0, 2, 4, 6)), (1.3, (0, 1, 3))]
+)
+def test_presses_of_another_ball_are_told(empty: np.ndarray, ratio: float, other: tuple[int, ...]) -> None:
+    presses = found(images([ratio if k in other else 1.0 for k in range(8)]), empty)
+    circles = [press.circle for press in presses]
+    told, size = other_balls(windows(presses), circles, 3 * BALL_PX, BALL_PX, presses[0].shape)
+    if len(other) == 4:  # then nobody knows which is the other one
+        assert set(told) in (set(other), set(range(8)) - set(other))
+        return
+    assert set(told) == set(other)
+    assert size == pytest.approx(ratio, rel=0.05)
 
 
 @pytest.mark.parametrize("turned", [np.flipud, np.fliplr, lambda image: image[::-1, ::-1]])
-def test_turned_pictures_are_left_out(good: tuple[np.ndarray, Named], turned: object) -> None:
+def test_presses_of_a_turned_sensor_are_told(turned: object) -> None:
+    """Under even light without a pattern of its own, so that the picture without contact gives nothing away."""
     assert callable(turned)
-    reference, frames = good
-    mixed = [(name, np.ascontiguousarray(turned(image)) if k in (1, 4) else image) for k, (name, image) in enumerate(frames)]
-    assert {name for name, _ in fitted(reference, mixed).left_out} == {"press 1", "press 4"}
+    even = HiddenSensor(3)
+    even._base = np.full_like(even._base, 110.0)
+    flat = even.empty()
+    shown = [press.image for press in even.presses(8)]
+    mixed = [np.ascontiguousarray(turned(image)) if k in (1, 4) else image for k, image in enumerate(shown)]
+    assert unlike_presses(found(shown, flat), windows(found(shown, flat)), BALL_PX) == []
+    presses = found(mixed, flat)
+    assert unlike_presses(presses, windows(presses), BALL_PX) == [1, 4]
 
 
-@pytest.mark.parametrize("which", [(1, 4), (0, 1, 2, 3), range(8)])
-def test_blurred_presses_are_left_out(good: tuple[np.ndarray, Named], which: tuple[int, ...]) -> None:
-    reference, frames = good
-    blurred = [(name, cv2.GaussianBlur(image, (0, 0), 2.0) if k in which else image) for k, (name, image) in enumerate(frames)]
-    if len(which) == 8:
-        with pytest.raises(Exception, match="blurred"):
-            fitted(reference, blurred)
-        return
-    fit = fitted(reference, blurred)
-    assert {name for name, why in fit.left_out if "blurred" in why} == {f"press {k}" for k in which}
-    assert (word(fit) == "do not trust") == (len(which) > 8 / 3)
+@pytest.mark.parametrize("which", [(), (1, 4), (0, 1, 2, 3), tuple(range(8))])
+def test_blurred_presses_are_told(empty: np.ndarray, which: tuple[int, ...]) -> None:
+    shown = [cv2.GaussianBlur(image, (0, 0), 1.5) if k in which else image for k, image in enumerate(images())]
+    told = blurred_presses(found(shown, empty), empty, untouched_mean(empty))
+    assert tuple(k for k, _ in told) == which
 
 
-def test_a_contact_in_pictures_without_contact_is_told(good: tuple[np.ndarray, Named]) -> None:
-    reference, frames = good
-    touched = HiddenSensor(3).press(0.12e-3, 230, 165).image
-    fit = fitted(touched, frames)
-    assert word(fit) == "do not trust" and "which no press shows" in fit.doubts[0]
-    fit = fitted(reference, frames, (reference, touched))
-    assert word(fit) == "do not trust" and "pictures 1 and 3 without contact differ" in fit.doubts[0]
+def test_a_contact_in_pictures_without_contact_is_told(empty: np.ndarray) -> None:
+    mean, again = untouched_mean(empty), HiddenSensor(3).empty()
+    touched = HiddenSensor(3).press(0.1e-3, 230, 165).image
+    presses = found(images(), empty)
+    assert untouched_contact(presses, empty, mean, [again], BALL_PX) is None
+    told = untouched_contact(presses, empty, mean, [again, touched], BALL_PX)
+    assert told is not None and "pictures 1 and 3 without contact differ" in told
+    told = untouched_contact(found(images(), touched), touched, mean, [], BALL_PX)
+    assert told is not None and "(230, 165) px, which no press shows" in told
+
+
+def test_a_set_of_two_balls_and_wide_pixels_is_not_trusted(empty: np.ndarray) -> None:
+    size = (round(1.08 * COLUMNS), ROWS)
+    frames = [(f"press {k}", cv2.resize(image, size)) for k, image in enumerate(images([0.75] * 4 + [1.0] * 4))]
+    fit = calibrate_light(cv2.resize(empty, size), frames, BALL_PX)
+    verdict = judge(fit, SCALE)
+    assert len(fit.left_out) == 4 and all("ball" in why for _, why in fit.left_out)
+    assert verdict.word == "do not trust"
+    assert "4 of 8 presses were left out" in str(verdict) and "contacts of the ball are no circles" in str(verdict)
+    blurred = [(name, cv2.GaussianBlur(image, (0, 0), 2.0)) for name, image in frames]
+    with pytest.raises(BadFrames, match="blurred: "):
+        calibrate_light(cv2.resize(empty, size), blurred, BALL_PX)

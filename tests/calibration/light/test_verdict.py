@@ -16,7 +16,8 @@ from calibration.light.verdict import KnownScale, judge
 from tests.calibration.presses import BALL, BALL_PX, COLUMNS, PITCH, ROWS, HiddenSensor
 
 SIZE = (COLUMNS * PITCH, ROWS * PITCH)  # of the gel that the pictures show
-SCALE = KnownScale(PITCH, BALL, SIZE)
+DEPTH = (("press 2", 0.65e-3),)  # of a half-space, of which the presses are made
+SCALE = KnownScale(PITCH, BALL, SIZE, depths=DEPTH)
 
 
 def calibrated(count: int, ball: float = BALL_PX) -> LightFit:
@@ -39,17 +40,29 @@ def said(fit: LightFit, scale: KnownScale, word: str) -> str:
 
 def test_good_presses_are_good(fit: LightFit) -> None:
     told = KnownScale(PITCH, BALL, SIZE, 8e-3)
-    assert said(fit, told, "good") == "good"
+    assert "the ball's radius is not" in said(fit, told, "usable")  # half of it doubles each depth
+    assert said(fit, SCALE, "good") == "good"
 
 
 def test_lengths_that_nothing_checks_are_not_called_good(fit: LightFit) -> None:
     """Truth: 0.08 mm a pixel; with 0.128 mm said for it the presses are explained as well, and all slopes are wrong."""
     wrong = calibrated(5, BALL_PX / 1.6)
     for found, pitch in ((fit, PITCH), (wrong, 1.6 * PITCH)):
-        assert "nothing checks the lengths" in said(found, KnownScale(pitch, BALL), "usable")
+        assert "nothing checks the lengths" in said(found, KnownScale(pitch, BALL), "unverified scale")
     assert "of the gel are to be seen" in said(wrong, KnownScale(1.6 * PITCH, BALL, SIZE), "do not trust")
     shown = (1.6 * SIZE[0], 1.6 * SIZE[1])  # by a profile that is another sensor's, whose pitch was taken with it
-    assert "published" in said(wrong, KnownScale(1.6 * PITCH, BALL, shown, pitch_from_size=True), "usable")
+    assert "published" in said(wrong, KnownScale(1.6 * PITCH, BALL, shown, pitch_from_size=True), "unverified scale")
+
+
+def test_too_many_left_out_are_no_calibration(fit: LightFit) -> None:
+    some = tuple((f"bad {k}", "no contact") for k in range(3))
+    assert "3 of 8 presses were left out" in said(replace(fit, left_out=some), SCALE, "do not trust")
+    assert judge(replace(fit, left_out=some[:2]), SCALE).word == "good"
+
+
+def test_marker_pitch_checks_the_pixel_pitch(fit: LightFit) -> None:
+    assert "nothing" not in said(fit, KnownScale(PITCH, BALL, marker_pitches=(1.5e-3, 1.51e-3)), "usable")
+    assert "dots are" in said(fit, KnownScale(PITCH, BALL, marker_pitches=(1.5e-3, 1.1e-3)), "do not trust")
 
 
 @pytest.mark.parametrize(("count", "word"), [(1, "do not trust"), (2, "do not trust"), (4, "usable")])

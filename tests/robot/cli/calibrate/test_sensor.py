@@ -33,16 +33,19 @@ def test_the_command_writes_a_bundle_and_a_picture(folder: Path, tmp_path: Path)
     lengths = ["--ball-radius", f"{BALL * 1e3} mm", "--pixel-pitch", f"{PITCH * 1e3} mm"]
     out = tmp_path / "out"
     ran = tacsim("calibrate", "sensor", folder, *lengths, "--serial", "s1", "--out", out)
-    assert ran.exit_code == 0, ran.output
+    assert ran.exit_code == 4, ran.output
     calibration, _ = read_bundle(out, "s1")
     assert len(calibration.residuals) == 5
     assert calibration.geometry.pixel_pitch == pytest.approx(PITCH)
     assert (out / "residuals.png").stat().st_size > 10_000
     assert "press_3.png" in ran.output
     assert calibration.noise is not None and "noise, from beside the contacts: R, G, B" in ran.output
-    assert "nothing checks the lengths" in ran.stderr and "verdict: usable" in ran.output
-    sure = tacsim("calibrate", "sensor", folder, *lengths, "--size", SIZE, "--out", tmp_path / "sure")
-    assert "verdict: good" in sure.output and "nothing checks the lengths" not in sure.stderr, sure.output
+    assert "nothing checks the lengths" in ran.stderr and "verdict: unverified scale" in ran.output
+    known = ("--size", SIZE, "--depth", "press_2.png=0.65 mm")
+    sure = tacsim("calibrate", "sensor", folder, *lengths, *known, "--out", tmp_path / "sure")
+    assert sure.exit_code == 0 and "verdict: good" in sure.output and "nothing checks the lengths" not in sure.stderr, (
+        sure.output
+    )
     again = tacsim("calibrate", "sensor", folder, *lengths, "--out", out)
     assert again.exit_code == 2
     assert "overwritten" in again.output
@@ -115,6 +118,7 @@ def test_the_command_ends_in_a_verdict(folder: Path, tmp_path: Path) -> None:
         (("--ball-diameter", "6 mm", "--pixel-pitch", "0.06 mm", "--depth", "press_1.png=1"), "say '1 mm'"),
         (("--ball-diameter", "6 mm", "--pixel-pitch", "0.06 mm", "--serial", "my finger"), "'my finger' is no serial"),
         (("--ball-diameter", "6 mm", "--pixel-pitch", "0.06 mm", "--region", "9,9 900,9 9,90"), "900,9"),
+        (("--ball-diameter", "6 mm", "--pixel-pitch", "0.06 mm", "--marker-pitch", "1 mm"), "give --markers, too"),
         (("--ball-diameter", "6 mm", "--pixel-pitch", "0.06 mm", "--set", "foo.bar=1"), "it changes a camera's rig"),
     ],
 )
@@ -136,7 +140,7 @@ def test_the_command_measures_the_cameras_noise(folder: Path, tmp_path: Path) ->
         image = again.photograph(np.zeros((200, 260, 2)), drift=2.0 * number)
         save_picture(folder / f"background_{number}.png", image)
     words = ["calibrate", "sensor", str(folder), "--ball-radius", f"{BALL} m", "--pixel-pitch", f"{PITCH} m"]
-    ran = tacsim(*words, "--out", tmp_path / "out")
+    ran = tacsim(*words, "--size", SIZE, "--out", tmp_path / "out")
     assert ran.exit_code == 0, ran.output
     assert "camera's noise, from 4 pictures without contact: R, G, B 1.5" in ran.output
     noise = read_bundle(tmp_path / "out")[0].noise
@@ -185,7 +189,7 @@ def test_markers_are_measured_when_asked_for_and_noticed_when_not(tmp_path: Path
         save_picture(home / f"press_{i}.png", dotted(sensor, press.image))
     save_picture(home / "background.png", dotted(sensor, sensor.empty()))
     words = ["calibrate", "sensor", str(home), "--ball-radius", f"{BALL} m", "--pixel-pitch", f"{PITCH} m"]
-    ran = tacsim(*words, "--markers", "--out", tmp_path / "out")
+    ran = tacsim(*words, "--markers", "--marker-pitch", "1.9 mm", "--out", tmp_path / "out")
     assert ran.exit_code == 0, ran.output
     assert "markers: 7 x 9, 1.9 mm apart, radius 0.3" in ran.stderr
     assert "<li>markers: 7 x 9, 1.9 mm apart" in (tmp_path / "out" / "verdict.html").read_text(encoding="utf-8")
@@ -208,3 +212,25 @@ def test_markers_are_measured_when_asked_for_and_noticed_when_not(tmp_path: Path
     ran = tacsim(*words, "--markers", "--out", tmp_path / "none")
     assert ran.exit_code == 2 and "leave --markers out" in told(ran.stderr)
     assert not (tmp_path / "none").exists()
+
+
+def test_fine_pictures_are_calibrated_no_finer_than_they_are_used(folder: Path, tmp_path: Path) -> None:
+    """Eight times as many pixels each way: the same heights, and native pictures are what the bundle is for."""
+    import cv2
+
+    for path in folder.glob("*.png"):
+        image = np.asarray(Image.open(path))
+        save_picture(path, cv2.resize(image, None, fx=8, fy=8, interpolation=cv2.INTER_CUBIC))
+    lengths = ["--ball-radius", f"{BALL * 1e3} mm", "--pixel-pitch", f"{PITCH / 8 * 1e3} mm"]
+    known = ("--size", SIZE, "--depth", "press_2.png=0.65 mm")
+    ran = tacsim("calibrate", "sensor", folder, *lengths, *known, "--out", tmp_path / "out")
+    assert ran.exit_code == 0 and "verdict: good" in ran.output, ran.output
+    calibration, reference = read_bundle(tmp_path / "out")
+    assert calibration.image_shape == (8 * ROWS, 8 * COLUMNS) and reference.shape[1] < 400
+    assert calibration.geometry.pixel_pitch == pytest.approx(0.0625e-3, rel=0.01)
+    normalise = normaliser_for_calibration(calibration, CanonicalGrid(), reference)
+    sight = [np.asarray(Image.open(folder / name)) for name in ("background.png", "press_2.png")]
+    normalise.take_reference(TactileFrame(image=sight[0], time=0.0, index=0))
+    seen = normalise(TactileFrame(image=sight[1], time=0.1, index=1), 0.1)
+    assert seen.height is not None and normalise.reference_doubt is None
+    assert float(seen.height.max()) == pytest.approx(0.65e-3, rel=0.1)

@@ -1,0 +1,66 @@
+"""A reference that shows a contact, and frames with red and blue swapped: told, and in which words."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+
+from calibration.frame_set import frame_warnings
+from calibration.light.calibrator import calibrate_light
+from calibration.normaliser import FrameNormaliser, normaliser_for_calibration
+from calibration.reference import StaleReference
+from tacsim.interface import TactileFrame
+from tacsim.models.sensor import CanonicalGrid
+from tests.calibration.presses import BALL, BALL_PX, PITCH, HiddenSensor
+
+
+@pytest.fixture(scope="module")
+def sensor() -> HiddenSensor:
+    return HiddenSensor(3)
+
+
+@pytest.fixture(scope="module")
+def normalise(sensor: HiddenSensor) -> FrameNormaliser:
+    frames = [(f"{i}", press.image) for i, press in enumerate(sensor.presses(5))]
+    fit = calibrate_light(sensor.empty(), frames, BALL_PX)
+    return normaliser_for_calibration(fit.to_calibration("s", BALL, PITCH), CanonicalGrid(), fit.reference)
+
+
+def frame(image: np.ndarray) -> TactileFrame:
+    return TactileFrame(image=image, time=0.0, index=0)
+
+
+@pytest.mark.parametrize("depth", [0.1e-3, 0.5e-3])
+def test_a_reference_that_shows_a_contact_is_told(
+    sensor: HiddenSensor, normalise: FrameNormaliser, depth: float
+) -> None:
+    with pytest.warns(UserWarning, match="the reference shows a contact"):
+        normalise.take_reference(frame(sensor.press(depth, 150, 90).image))
+    normalise(frame(sensor.empty()), 0.0)
+    assert normalise.diagnostics()["touched_reference"] == 1.0
+
+
+def test_a_lamp_that_has_drifted_is_no_contact(sensor: HiddenSensor, normalise: FrameNormaliser) -> None:
+    ramp = np.linspace(-10, 10, 260)[None, :, None] * np.array([1.0, -1.0, 0.5])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for image in (sensor.empty(), sensor.photograph(np.zeros((200, 260, 2)), ramp)):
+            normalise.take_reference(frame(image))
+            normalise(frame(image), 0.0)
+            assert normalise.reference_doubt is None and "touched_reference" not in normalise.diagnostics()
+
+
+def test_swapped_colours_of_frames_are_called_by_their_name(sensor: HiddenSensor, normalise: FrameNormaliser) -> None:
+    reference = sensor.empty()
+    normalise.take_reference(frame(reference))
+    for image in (sensor.empty(), sensor.press(0.5e-3, 150, 90).image):
+        swapped = np.ascontiguousarray(image[..., ::-1])
+        with pytest.raises(StaleReference, match="red and blue are swapped"):
+            normalise(frame(swapped), 0.0)
+        nothing = np.zeros(image.shape[:2], dtype=np.bool_)
+        assert any("red and blue are swapped" in word for word in frame_warnings(swapped, reference, nothing))
+    dimmer = np.rint(0.8 * sensor.press(0.5e-3, 150, 90).image).astype(np.uint8)
+    normalise(frame(dimmer), 0.0)
+    assert normalise.stale

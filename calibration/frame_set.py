@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from calibration.errors import BadFrames
 from calibration.lens.rectification import from_corners, region_mask, to_metric
 from calibration.lens.view import BadCorners, Corners, GelView
-from calibration.reference import SATURATED, channels_swapped
+from calibration.reference import SATURATED, channels_swapped, contact_area
 from tacsim.interface import SurfaceMap
 from tacsim.models.geometry import PictureRegion
 from tacsim.optics.grid import PixelGrid
@@ -39,6 +39,7 @@ MAX_FRAMES = 500
 MAX_MEMORY = 2 << 30  # of all pictures together [bytes]
 MEDIAN_FRAMES = 5  # so many frames with contacts in different places have the untouched gel as their median
 MAX_SATURATED_SHARE = 0.05  # of a contact
+MIN_CONTACT_SHARE = 0.001  # of a picture, in which two without contact differ as a contact does
 STALE_CHANGE = 4.0  # median change of the gel outside contact that makes a reference stale [grey levels]
 
 
@@ -146,6 +147,21 @@ def frame_warnings(
         if channels_swapped(image.astype(np.float32), reference.astype(np.float32), ~contact):
             return [*found, "red and blue are swapped: the untouched gel is that of the reference in the other order"]
         found.append(f"stale reference: the untouched gel has changed by {drift:.0f} grey levels")
+    return found
+
+
+def touched_untouched(of: FrameSet) -> list[str]:
+    """In words, which of the pictures without contact differ from the reference as a contact does: one of the two shows
+    one. Nothing is found where the reference is the only one."""
+    mean = np.maximum(of.reference.mean(axis=(0, 1)), 1.0).astype(np.float32)
+    everywhere = np.zeros(of.shape, dtype=np.bool_)
+    found = []
+    for frame in of.untouched:
+        change = (frame.image.astype(np.float32) - of.reference) / mean
+        if contact_area(change, everywhere, 1.0) > MIN_CONTACT_SHARE * everywhere.size:
+            found.append(
+                f"{of.name}: {of.reference_from} and {frame.name} differ as by a contact: does the reference show one?"
+            )
     return found
 
 

@@ -23,7 +23,7 @@ from calibration.compare.scorer import Numbers, Pair, Scorer, surface_errors
 from calibration.compare.surfaces import GRID, SurfaceEstimate, estimate_surfaces, flat_surface
 from calibration.drift import without_drift
 from calibration.errors import BadFrames
-from calibration.frame_set import Frame, FrameSet
+from calibration.frame_set import Frame, FrameSet, touched_untouched
 from tacsim.control.contact_signal import CONTACT_HEIGHT
 from tacsim.record.numbering import picture_numbers
 
@@ -150,7 +150,7 @@ def compare_frames(
     couples, left = paired(a, b, options.pairing)
     shift = not a.placed if options.shift is None else options.shift
     alignment = _alignment(a, b, couples, calibration_a, calibration_b, shift=shift)
-    notes: list[str] = [*a.notes, *b.notes]
+    notes: list[str] = [*a.notes, *b.notes, *touched_untouched(a), *touched_untouched(b)]
     found_a, said_a = estimate_surfaces(a, [frame for frame, _ in couples], calibration_a)
     found_b, said_b = estimate_surfaces(b, [frame for _, frame in couples], calibration_b)
     if found_a is not None and found_b is not None and calibration_b is not None:

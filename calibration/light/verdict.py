@@ -27,7 +27,7 @@ CORRELATION = (0.97, 0.95)  # of predicted and real change of colour
 UNEXPLAINED = (0.15, 0.35)  # share of the change of colour that no dent explains
 RADIUS = (0.03, 0.08)  # uncertainty of the contact radii [-]
 SCALE = (0.05, 0.12)  # of lengths, by a press of known depth or by the size of the gel [-]
-# Ratio of the axes of contacts, less 1: round ones of five real sensors show 0.01 to 0.025
+# Ratio of the axes of contacts, less 1 and twice its uncertainty: round ones of real sensors show 0.01 to 0.025
 STRETCH = (0.03, 0.05)
 MAX_LEFT_OUT = 1 / 3  # share of the presses
 DIRECTED = 0.1  # least share of the power of flanks' change of colour that differs from flank to flank
@@ -146,10 +146,12 @@ def _of_pictures(fit: LightFit) -> Iterable[Finding]:
 
 def _of_shape(fit: LightFit) -> Iterable[Finding]:
     if fit.stretch is not None:
+        unsure = 0.0 if math.isnan(fit.stretch.uncertainty) else 2 * fit.stretch.uncertainty
         yield from _beyond(
-            STRETCH, fit.stretch.ratio - 1.0,
-            f"contacts of the ball are no circles: the ratio of their axes is {fit.stretch}; up to {1 + STRETCH[0]:g} "
-            "is not told from 1", "give pictures whose pixels are square, or the view of the gel (--view)",
+            STRETCH, fit.stretch.ratio - 1.0 - unsure,
+            f"contacts of the ball are no circles: the ratio of their axes is {fit.stretch}; only below "
+            f"{1 + STRETCH[0] + unsure:.3f} it is not told from 1",
+            "give pictures whose pixels are square, or the view of the gel (--view)",
         )  # fmt: skip
 
 

@@ -7,7 +7,7 @@ import warnings
 import numpy as np
 import pytest
 
-from calibration.frame_set import frame_warnings
+from calibration.frame_set import Frame, FrameSet, frame_warnings, touched_untouched
 from calibration.light.calibrator import calibrate_light
 from calibration.normaliser import FrameNormaliser, normaliser_for_calibration
 from calibration.reference import StaleReference
@@ -64,3 +64,11 @@ def test_swapped_colours_of_frames_are_called_by_their_name(sensor: HiddenSensor
     dimmer = np.rint(0.8 * sensor.press(0.5e-3, 150, 90).image).astype(np.uint8)
     normalise(frame(dimmer), 0.0)
     assert normalise.stale
+
+
+def test_pictures_without_contact_are_compared_with_the_reference(sensor: HiddenSensor) -> None:
+    touched, still = sensor.press(0.2e-3, 150, 90).image, Frame("background_2.png", sensor.empty())
+    frames = (Frame("press.png", sensor.press(0.5e-3, 90, 90).image),)
+    assert touched_untouched(FrameSet("real", sensor.empty(), "background.png", frames, (still,))) == []
+    (said,) = touched_untouched(FrameSet("real", touched, "background.png", frames, (still,)))
+    assert "background.png and background_2.png differ as by a contact" in said

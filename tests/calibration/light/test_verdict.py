@@ -12,6 +12,7 @@ from calibration.light.calibrator import calibrate_light
 from calibration.light.dent import contact_depth
 from calibration.light.fit import LightFit
 from calibration.light.page import write_page
+from calibration.light.press_shapes import Stretch
 from calibration.light.verdict import KnownScale, judge
 from tests.calibration.presses import BALL, BALL_PX, COLUMNS, PITCH, ROWS, HiddenSensor
 
@@ -146,3 +147,11 @@ def test_the_page_says_it_first_and_harms_nobody(fit: LightFit, tmp_path: Path) 
     assert "<title>finger: do not trust</title>" in page and "Next:" in page and "a fact" in page
     assert "<script>" not in page and "http://" not in page
     assert np.all([press.name in page for press in fit.predictions])
+
+
+@pytest.mark.parametrize(
+    ("ratio", "uncertainty", "word"),
+    [(1.025, 0.0, "good"), (1.04, 0.001, "usable"), (1.08, 0.003, "do not trust"), (1.06, 0.02, "good")],
+)
+def test_contacts_are_no_ellipses(fit: LightFit, ratio: float, uncertainty: float, word: str) -> None:
+    assert judge(replace(fit, stretch=Stretch(ratio, 20.0, uncertainty)), SCALE).word == word

@@ -25,7 +25,8 @@ MIN_GROUPED = 4  # presses: of fewer nobody knows which one is wrong
 FINE = 1.0  # detail finer than this Gaussian is compared [px]
 MIN_FINE = 0.5  # least power of fine detail and noise, over the median of the others; real sensors show 0.9 and more
 CONTACT_BLUR = 3.0  # [px]
-MIN_CONTACT = 0.15  # strength of a contact in a picture without contact, over that of the presses
+MIN_CONTACT = 0.2  # strength of a contact in a picture without contact, over that of the presses
+MIN_EXPLAINED = 0.8  # share of it that a ball's dent must explain; drift and glare at the border have other shapes
 
 
 def unlike_presses(presses: Sequence[BallPress], windows: Sequence[Window], ball: float) -> list[int]:
@@ -128,5 +129,9 @@ def _dent(change: Float64, mean: Float64, reference: Image, ball: float, strengt
     try:
         circle = contact_circle(np.clip(np.rint(128 + change), 0, 255).astype(np.uint8), level, ball)
     except NoCircle:
+        return None
+    height, width = reference.shape[:2]
+    inside = min(circle.x, circle.y, width - 1 - circle.x, height - 1 - circle.y) >= circle.radius
+    if circle.explained < MIN_EXPLAINED or not inside:
         return None
     return f"({circle.x:.0f}, {circle.y:.0f}) px"

@@ -101,7 +101,7 @@ def test_two_solutions_for_the_radii_are_told(fit: LightFit) -> None:
     ids=["ball too small", "diameter for radius", "pitch too large", "pitch too small"],
 )
 def test_wrong_lengths_are_told(ball: float, pitch: float, words: str, word: str) -> None:
-    told = KnownScale(PITCH * pitch, BALL * ball, SIZE if pitch != 1.0 else None)
+    told = KnownScale(PITCH * pitch, BALL * ball, SIZE)
     assert words in said(calibrated(5, BALL_PX * ball / pitch), told, word)
 
 

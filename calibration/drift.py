@@ -13,6 +13,10 @@ Mask = NDArray[np.bool_]
 UNTOUCHED_CHANGE = 0.08  # an untouched pixel changes less than this, without drift [-]
 MIN_UNTOUCHED_SHARE = 0.15  # of the view, to measure a drift
 STRIDE = 5  # of the pixels from which it is measured
+# A contact in a picture that should show none: a patch that differs from a known picture ...
+CONTACT_CHANGE = 0.06  # by so much, without drift and noise [-]
+CONTACT_BLUR = 1.5  # [px of the canonical image]
+MIN_CONTACT_AREA = 0.6e-6  # and that is so large: a ball of 8 mm pressed 0.05 mm deep touches as much [m^2]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,3 +101,18 @@ class DriftFinder:
     def at(self, drift: Drift) -> Float32:
         """(n, 3) the drift at every STRIDE-th row and column [-]."""
         return np.asarray(np.einsum("ni,ic->nc", self._few, drift.weights), dtype=np.float32)
+
+
+def contact_area(change: Float32, ignored: NDArray[np.bool_], pitch: float) -> float:
+    """Area [m^2] of the largest patch in which two pictures without contact differ as a contact does, of their relative
+    change (H, W, 3) on pixels of `pitch` [m]; drift of the light and the pixels `ignored` (H, W) do not count."""
+    import cv2
+
+    planes = np.ascontiguousarray(np.moveaxis(change, -1, 0), dtype=np.float32)
+    find = DriftFinder(ignored.shape)
+    find.remove(planes, find(planes, ignored))
+    planes[:, ignored] = 0.0
+    smooth = [cv2.GaussianBlur(plane, (0, 0), CONTACT_BLUR) for plane in planes]
+    strong = (np.abs(smooth).max(axis=0) > CONTACT_CHANGE) & ~ignored
+    _, _, stats, _ = cv2.connectedComponentsWithStats(strong.astype(np.uint8))
+    return float(stats[1:, cv2.CC_STAT_AREA].max(initial=0)) * pitch**2

@@ -12,10 +12,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.drift import contact_area
 from calibration.errors import BadFrames
 from calibration.lens.rectification import from_corners, region_mask, to_metric
 from calibration.lens.view import BadCorners, Corners, GelView
-from calibration.reference import SATURATED, channels_swapped, contact_area
+from calibration.reference import SATURATED, channels_swapped
 from tacsim.interface import SurfaceMap
 from tacsim.models.geometry import PictureRegion
 from tacsim.optics.grid import PixelGrid

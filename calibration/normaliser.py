@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.bundle import BadBundle, Calibration, read_bundle
-from calibration.drift import DriftFinder, size_of
+from calibration.drift import MIN_CONTACT_AREA, DriftFinder, contact_area, size_of
 from calibration.errors import BadFrames
 from calibration.height.colour_table import GradientModel, from_model
 from calibration.height.darkness import DarknessSlopes
@@ -34,14 +34,12 @@ from calibration.markers.of_sensor import marker_flow, seen_by_dots
 from calibration.reference import (
     LOST_COLOUR,
     LOST_SLOPE,
-    MIN_CONTACT_AREA,
     STALE_COLOUR,
     STALE_SLOPE,
     Reference,
     StaleReference,
     UnusableReference,
     channels_swapped,
-    contact_area,
     exchanged,
     make_reference,
 )

@@ -28,10 +28,6 @@ LOST_COLOUR = 0.5  # [-]
 EXCHANGED_RATIO = 0.5  # if that brings the picture so much nearer to the known one
 ALIKE = 0.02  # unless it is this near already, each colour relative to its mean [-]
 BLOCK = 8  # side of the blocks that are compared [px]
-# A contact in a picture that should show none: a patch that differs from a known picture ...
-CONTACT_CHANGE = 0.06  # by so much, without drift and noise [-]
-CONTACT_BLUR = 1.5  # [px of the canonical image]
-MIN_CONTACT_AREA = 0.6e-6  # and that is so large: a ball of 8 mm pressed 0.05 mm deep touches as much [m^2]
 
 
 class UnusableReference(ValueError):
@@ -125,23 +121,6 @@ def channels_swapped(image: Float32, known: Float32, valid: NDArray[np.bool_]) -
         for picture in (image, image[..., ::-1])
     )
     return apart > 2 * ALIKE and swapped < EXCHANGED_RATIO * apart
-
-
-def contact_area(change: Float32, ignored: NDArray[np.bool_], pitch: float) -> float:
-    """Area [m^2] of the largest patch in which two pictures without contact differ as a contact does, of their relative
-    change (H, W, 3) on pixels of `pitch` [m]; drift of the light and the pixels `ignored` (H, W) do not count."""
-    import cv2
-
-    from calibration.drift import DriftFinder
-
-    planes = np.ascontiguousarray(np.moveaxis(change, -1, 0), dtype=np.float32)
-    find = DriftFinder(ignored.shape)
-    find.remove(planes, find(planes, ignored))
-    planes[:, ignored] = 0.0
-    smooth = [cv2.GaussianBlur(plane, (0, 0), CONTACT_BLUR) for plane in planes]
-    strong = (np.abs(smooth).max(axis=0) > CONTACT_CHANGE) & ~ignored
-    _, _, stats, _ = cv2.connectedComponentsWithStats(strong.astype(np.uint8))
-    return float(stats[1:, cv2.CC_STAT_AREA].max(initial=0)) * pitch**2
 
 
 def _pattern(image: Float32, valid: NDArray[np.bool_]) -> Float32:

@@ -25,7 +25,9 @@ MIN_GROUPED = 4  # presses: of fewer nobody knows which one is wrong
 FINE = 1.0  # detail finer than this Gaussian is compared [px]
 MIN_FINE = 0.5  # least power of fine detail and noise, over the median of the others; real sensors show 0.9 and more
 CONTACT_BLUR = 3.0  # [px]
-MIN_CONTACT = 0.2  # strength of a contact in a picture without contact, over that of the presses
+# Strength of a contact in a picture without contact, over that of the presses
+MIN_CONTACT = 0.2  # where two such pictures differ
+MIN_CONTACT_BESIDE = 0.3  # where the presses differ from it; far shadows of a DIGIT's presses show 0.26
 MIN_EXPLAINED = 0.8  # share of it that a ball's dent must explain; drift and glare at the border have other shapes
 
 
@@ -94,7 +96,7 @@ def untouched_contact(
     where they do not touch, or two such pictures differ by, looks like a ball's dent. None: nothing does."""
     strength = float(np.median([np.abs(smooth(press.change, CONTACT_BLUR)).max() for press in presses]))
     for number, other in enumerate(others, start=2):
-        where = _dent(other.astype(np.float64) - reference, mean, reference, ball, strength)
+        where = _dent(other.astype(np.float64) - reference, mean, reference, ball, MIN_CONTACT * strength)
         if where is not None:
             return (
                 f"pictures 1 and {number} without contact differ by a ball's contact at {where}: take pictures of the "
@@ -111,7 +113,7 @@ def untouched_contact(
     seen = np.isfinite(changes[..., 0]).sum(axis=0) >= min(3, len(presses))
     changes[:, ~seen] = 0.0
     usual = np.nanmedian(changes, axis=0).astype(np.float64)
-    where = _dent(usual * mean, mean, reference, ball, strength)
+    where = _dent(usual * mean, mean, reference, ball, MIN_CONTACT_BESIDE * strength)
     if where is None:
         return None
     return (
@@ -121,9 +123,9 @@ def untouched_contact(
 
 
 def _dent(change: Float64, mean: Float64, reference: Image, ball: float, strength: float) -> str | None:
-    """Where a change (H, W, 3) [grey levels] is strong and a ball's dent explains it; in words."""
+    """Where a change (H, W, 3) [grey levels] is beyond `strength` [-] and a ball's dent explains it; in words."""
     change = change - np.median(change, axis=(0, 1))
-    if not np.abs(smooth(change / mean, CONTACT_BLUR)).max() > MIN_CONTACT * strength:
+    if not np.abs(smooth(change / mean, CONTACT_BLUR)).max() > strength:
         return None
     level = np.full_like(reference, 128)
     try:

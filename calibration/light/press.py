@@ -101,7 +101,9 @@ def press_at(
     )
     strong = SECOND_CONTACT * float(near.max())
     if _patch_area(far, strong) > SECOND_AREA * _patch_area(near, strong):
-        raise BadFrames("there is a second contact in the picture; press one ball at a time")
+        raise BadFrames(
+            "there is a second contact in the picture, or one in the picture without contact; press one ball at a time"
+        )
     return BallPress(name, circle, change, drift, lit)
 
 

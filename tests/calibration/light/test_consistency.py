@@ -102,7 +102,7 @@ def test_a_contact_in_pictures_without_contact_is_told(empty: np.ndarray) -> Non
     assert untouched_contact(presses, empty, mean, [again], BALL_PX) is None
     told = untouched_contact(presses, empty, mean, [again, touched], BALL_PX)
     assert told is not None and "pictures 1 and 3 without contact differ" in told
-    touched = HiddenSensor(3).press(0.2e-3, 230, 165).image
+    touched = HiddenSensor(3).press(0.14e-3, 230, 165).image
     told = untouched_contact(found(images(), touched), touched, mean, [], BALL_PX)
     assert told is not None and "(230, 165) px, which no press shows" in told
 

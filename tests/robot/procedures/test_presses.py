@@ -116,7 +116,10 @@ def glaring() -> np.ndarray:
         (PRESSES[0], "it is in the same place as press 1; press elsewhere"),
         (glaring(), r"saturated: shorten the exposure|no ball's contact"),
         (SENSOR.press(0.5e-3, 8, 100).image, "the contact is cut off by the border of the picture"),
-        (np.maximum(PRESSES[1], PRESSES[3]), "there is a second contact in the picture; press one ball at a time"),
+        (
+            np.maximum(PRESSES[1], PRESSES[3]),
+            "there is a second contact in the picture, or one in the picture without contact; press one ball at a time",
+        ),
     ],
     ids=["no ball", "same place", "saturated", "cut off", "two balls"],
 )

@@ -75,9 +75,9 @@ def blurred_presses(presses: Sequence[BallPress], reference: Image, mean: Float6
     shares = []
     still = reference.astype(np.float64)
     for press in presses:
-        beside = (press.distance() > NEAR * press.circle.radius) & press.lit.all(axis=2)
+        beside = np.asarray((press.distance() > NEAR * press.circle.radius) & press.lit.all(axis=2), dtype=np.bool_)
         if not beside.any():
-            beside = press.lit.all(axis=2)
+            beside = np.asarray(press.lit.all(axis=2), dtype=np.bool_)
         if not beside.any():
             shares.append(1.0)
             continue

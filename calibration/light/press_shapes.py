@@ -113,7 +113,8 @@ def _fitted(
     for _ in range(MAX_STEPS):
         gradient, curvature = model.normal_equations(fit, free)
         for _ in range(8):
-            step = np.linalg.solve(curvature + damping * np.diag(np.diag(curvature) + 1e-12), -gradient)
+            damped = curvature + damping * np.diag(np.diag(curvature) + 1e-12)
+            step: Float64 = np.asarray(np.linalg.solve(damped, -gradient), dtype=np.float64)
             trial = _moved(fit, free, step[:own].reshape(len(windows), -1), step[own:], ball)
             trial_cost = model.cost(trial)
             if trial_cost < cost:

@@ -2,10 +2,23 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cache
 
 from tacsim.interface import Pose
+
+MIN_LAYERS = 12  # of particles over a body's height: with fewer its forces are too high (docs/physics.md)
+
+
+@cache
+def warn_of_few_layers() -> None:
+    """Writes one line to the terminal (stderr), once a process."""
+    logging.getLogger("tacsim").warning(
+        f"warning: a body has fewer than {MIN_LAYERS} layers of particles over its height: its forces are too high "
+        f"(draft or standard has more)"
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,8 +32,8 @@ class MoveStats:
     # (tacsim.physics.motion.slide), of a body that yields: no faster than it may be (at a `settling.mach`)
     settled: bool
     overlap: float  # deepest overlap of body (or indenter) and gel surface in the last substep [m]
-    # times a guard changed the physics (particles set aside, gaps capped), found gels in one another, or a body under
-    # more tension than it can bear (tacsim.physics.worlds.hybrid)
+    # times a guard changed the physics (particles set aside, gaps capped), found gels in one another, or tension in a
+    # body grow beyond what it can bear (tacsim.physics.worlds.hybrid)
     guard_hits: int
     retries: int = 0  # times the motion was started again with half the time step
     load_error: float = 0.0  # largest |force - load| of the sensors that hold a load [N]
@@ -31,6 +44,9 @@ class MoveStats:
     # least and largest elastic volume ratio of the body's particles at the end [-]; a body led to and fro keeps them
     smallest_volume: float = 1.0
     largest_volume: float = 1.0
+    # layers of particles over the body's mean height at the end (0: no body); whether they are fewer than MIN_LAYERS
+    particle_layers: float = 0.0
+    few_layers: bool = False
 
 
 @dataclass(frozen=True, slots=True)

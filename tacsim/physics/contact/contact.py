@@ -15,11 +15,13 @@ from tacsim.physics.exec.environment import record_more, record_most
 from tacsim.physics.exec.lanes import ON_DEVICE, add_four, filled, slot_of, vec2, vec3, vec4
 from tacsim.physics.gel.kernels import surface_at
 
-ContactHistory = ti.types.vector(6, ti.f32)  # what contact remembers of a particle and a gel
+ContactHistory = ti.types.vector(7, ti.f32)  # what contact remembers of a particle and a gel
 
 CONTACT_DAMPING = 0.3  # c = 0.3 k dt = 0.3 m / dt, for normal and tangential motion
 TANGENT_STIFFNESS = 0.5  # k_t / k_n
-MEMORY_RATE = 0.05  # share of a change of the normal force that its memory follows each substep
+# Share of a change of the normal force that its memory follows each substep. Motions in real time have 0: the memory
+# follows the overlap with a delay, so it creates energy, which only damping takes away.
+MEMORY_RATE = 0.05
 FREE, ON_GEL, ON_HOUSING = 0.0, 1.0, 2.0  # what a particle's anchor is on
 SMALLEST_AREA = 0.1  # of the surface seen from above, over its unmoved one; below that it counts as folded
 
@@ -104,13 +106,13 @@ def even_mobility(env: ti.template()):
 
 
 @ti.func
-def normal_force(spring, memory, drag):
+def normal_force(spring, memory, drag, rate):
     """Normal force of a contact, what of it is not of the dashpot, and its new memory, which carries the force at rest.
 
-    spring: of the overlap; drag: of the dashpot, away from the contact.
+    spring: of the overlap; drag: of the dashpot, away from the contact; rate: see MEMORY_RATE.
     """
     held = ti.max(spring + memory, 0.0)
-    return ti.max(spring + memory - drag, 0.0), held, ti.max(memory + MEMORY_RATE * spring, 0.0)
+    return ti.max(spring + memory - drag, 0.0), held, ti.max(memory + rate * spring, 0.0)
 
 
 @ti.func
@@ -138,6 +140,15 @@ def cling(anchor, under, t1, t2, vt, limit, k_t, c_t):
     slip = under - anchor
     ft, left = friction(slip[0] * t1 + slip[1] * t2, vt, limit, k_t, c_t)
     return ft, anchor + (1.0 - left) * slip
+
+
+@ti.func
+def keep_force(anchor, under, spring, memory, stiffened):
+    """Anchor and remembered normal force with which a contact pulls and presses as it did before its springs changed.
+
+    stiffened: the old stiffness over the new one, minus 1. under, spring: see `cling` and `normal_force`.
+    """
+    return anchor + stiffened * (anchor - under), ti.max(memory + stiffened * (spring + memory), 0.0)
 
 
 @ti.func
@@ -180,13 +191,13 @@ def highest_near(gel: ti.template(), i, j):
 
 
 @ti.func
-def particle_contact(env: ti.template(), part, x, v, history, radius, gel: ti.template(), forces):
+def particle_contact(env: ti.template(), part, x, v, history, radius, stiffened, gel: ti.template(), forces):
     """Force on one particle from a gel (or its housing); all in the sensor frame. The opposite acts on the gel's nodes.
 
     x, v: position, and velocity relative to the moving sensor. history: its anchor on the untouched gel or on the
     housing [mm], and on which of these; the remembered normal force as the overlap whose penalty it equals [mm]; how
-    far the gel under it has moved aside [mm]. forces: where those on its nodes begin. Returns whether it touches,
-    whether it touches the housing, the force, and the new history.
+    far the gel under it has moved aside [mm]; its radius [mm]. stiffened: see `keep_force`. forces: where those on the
+    gel's nodes begin. Returns whether it touches, whether it touches the housing, the force, and the new history.
     """
     h, k_n, dt = (
         env.param(layout.GEL_SPACING + gel.index),
@@ -204,6 +215,7 @@ def particle_contact(env: ti.template(), part, x, v, history, radius, gel: ti.te
     overlap = 0.0
     reach = 2.2 * 0.5 * h
     c_n, k_t = CONTACT_DAMPING * k_n * dt / even_mobility(env), TANGENT_STIFFNESS * k_n
+    rate = env.param(layout.MEMORY)
     if x[2] > -1.2 * h * layers and ti.abs(x[0]) < reach * nx and ti.abs(x[1]) < reach * ny:
         start = vec2(x[0] / h + 0.5 * nx, x[1] / h + 0.5 * ny)  # lattice coordinates, were the surface unmoved
         last = start - vec2(history[4], history[5]) / h
@@ -233,10 +245,11 @@ def particle_contact(env: ti.template(), part, x, v, history, radius, gel: ti.te
                         record_more(env, slot_of(part), layout.CAPPED, 1.0)
                     vr = v - vec3(vs[0], vs[1], vs[2])
                     vn = vr.dot(n)
-                    fn, held, pressed = normal_force(k_n * gap, pressed, c_n * vn)
                     under = vec2(x[0], x[1]) - moved
                     if holder != ON_GEL:
                         anchor, holder = under, ON_GEL
+                    anchor, pressed = keep_force(anchor, under, k_n * gap, pressed, stiffened)
+                    fn, held, pressed = normal_force(k_n * gap, pressed, c_n * vn, rate)
                     ft, anchor = cling(anchor, under, e1, e2, vr - vn * n, mu * held, k_t, c_n)
                     force = fn * n + ft
                     in_contact = True
@@ -252,17 +265,18 @@ def particle_contact(env: ti.template(), part, x, v, history, radius, gel: ti.te
                         gap = deepest
                         record_more(env, slot_of(part), layout.CAPPED, 1.0)
                     n = vec3(0.0, 0.0, 1.0)
-                    fn, held, pressed = normal_force(k_n * gap, pressed, c_n * v[2])
                     under = vec2(x[0], x[1])
                     if holder != ON_HOUSING:
                         anchor, holder = under, ON_HOUSING
+                    anchor, pressed = keep_force(anchor, under, k_n * gap, pressed, stiffened)
+                    fn, held, pressed = normal_force(k_n * gap, pressed, c_n * v[2], rate)
                     e1, e2, vt = vec3(1.0, 0.0, 0.0), vec3(0.0, 1.0, 0.0), vec3(v[0], v[1], 0.0)
                     ft, anchor = cling(anchor, under, e1, e2, vt, mu * held, k_t, c_n)
                     force = fn * n + ft
                     in_contact, housed = True, True
                     overlap = gap
-    remembered = ContactHistory([0.0, 0.0, FREE, 0.0, moved[0], moved[1]])
+    remembered = ContactHistory([0.0, 0.0, FREE, 0.0, moved[0], moved[1], radius])
     if in_contact:
-        remembered = ContactHistory([anchor[0], anchor[1], holder, pressed / k_n, moved[0], moved[1]])
+        remembered = ContactHistory([anchor[0], anchor[1], holder, pressed / k_n, moved[0], moved[1], radius])
         record_most(env, slot_of(part), layout.OVERLAP, overlap)
     return in_contact, housed, force, remembered

@@ -9,7 +9,7 @@ sticks. Everything else is in the sensor frame [mm, MPa]. Why: docs/physics.md.
 from typing import Any, NamedTuple
 
 from tacsim.compute.runtime import ti
-from tacsim.physics.contact.contact import CONTACT_DAMPING, MEMORY_RATE, friction, surface_node
+from tacsim.physics.contact.contact import CONTACT_DAMPING, friction, surface_node
 from tacsim.physics.contact.distance import GRID, DistanceGrid, box_distance, signed_distance
 from tacsim.physics.exec import layout
 from tacsim.physics.exec.environment import record_most, record_sum
@@ -168,8 +168,9 @@ def carry(env: ti.template(), part, gel: ti.template()):
             if j == 0 or j == gel.ny:
                 area *= 0.5
             # what hardly presses any more is let go of, not halved for ever
-            new = old + MEMORY_RATE * (total / area - old)
-            gel.surface[at] = ti.select(total == 0.0 and new < least, 0.0, new)
+            rate = env.param(layout.MEMORY)
+            new = old + rate * (total / area - old)
+            gel.surface[at] = ti.select(total == 0.0 and (new < least or rate == 0.0), 0.0, new)
         j += 1
         if j == row:
             i, j = i + 1, 0

@@ -33,7 +33,9 @@ EDGE_RADIUS = 60  # of an indenter [mm]
 OWN = 61  # weight of a node's own acceleration, force over mass, in how it moves; 1 is true inertia
 FILTERED = 62  # weight of that filtered by its neighbours' (tacsim.physics.gel.mass, tacsim.physics.body.mass)
 LIMIT_FOLLOWS = 63  # rate at which the limit of an indenter's friction follows the pressure [1/mm]
-PARAMS = 64
+MEMORY = 64  # share of a change of the normal force that the memory of a contact follows each substep; 0 in real time
+SPRINGS = 65  # stiffness of particles' contacts in the launch before over that in this one, two
+PARAMS = 67
 
 # counts (environments, COUNTS) int32
 ZERO = 0  # always 0: see tacsim.physics.exec.lanes.overwrite

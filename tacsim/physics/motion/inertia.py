@@ -2,8 +2,9 @@
 
 Quasi-static motions only want the state of rest, so each material gets the density at which its pressure wave travels
 at speed 1, and is damped. A motion of given duration is dynamic: densities are the materials' own, nothing is damped
-but by plastic flow, friction and the contact's dashpots. Kernel units stay mm and MPa; the gel's pressure wave keeps
-speed 1, so a kernel time of 1 mm is the time that this wave truly needs for 1 mm.
+but by plastic flow, friction and the contact's dashpots, and contact has no memory, which would create energy. Kernel
+units stay mm and MPa; the gel's pressure wave keeps speed 1, so a kernel time of 1 mm is the time that this wave truly
+needs for 1 mm.
 """
 
 from __future__ import annotations

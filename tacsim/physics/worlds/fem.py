@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from tacsim.compute.runtime import launching
 from tacsim.interface import Pose
 from tacsim.models.scene import GelSurface
-from tacsim.physics.exec.layout import FORCE, GEL_DAMPING, GEL_DENSITY, STEP, STEPS
+from tacsim.physics.exec.layout import FORCE, GEL_DAMPING, GEL_DENSITY, MEMORY, STEP, STEPS
 from tacsim.physics.failure.diagnosis import element_lengths
 from tacsim.physics.failure.health import LARGEST_COURANT
 from tacsim.physics.gel.gel import GelParams, GelState, gel_surface
@@ -35,7 +35,7 @@ from tacsim.physics.motion.path import (
     plan_flow,
     resolve_targets,
 )
-from tacsim.physics.move import MoveCommand
+from tacsim.physics.move import MoveCommand, MoveStats
 from tacsim.physics.snapshot import Kept, State, copies, gel_arrays, restore_arrays, snapshot_of
 from tacsim.physics.units import MM
 from tacsim.physics.worlds.base import BaseWorld
@@ -43,6 +43,9 @@ from tacsim.physics.worlds.base import BaseWorld
 if TYPE_CHECKING:  # a device's kernels
     from tacsim.physics.worlds.device_state import DeviceState
     from tacsim.physics.worlds.survey import Survey
+
+
+REST_TOLERANCE = 1e-4  # of the state of rest in which a motion in real time begins
 
 
 class FemState(ABC):
@@ -271,9 +274,13 @@ class FemWorld(BaseWorld):
         flowing = self._plan_flow(a, b if command.flow else a)  # or to where the frames are: a stop
 
         def from_rest(refine: int) -> Motion:
-            self._switch_inertia(self._scaled if path is None else self._true)
             if path is not None:
-                return (yield from move_real_time(replace(path, refine=refine), settling, balanced=balanced))
+                rest = Path(a, a, 0, self._scaled.step, refine, flowing.interval, creeps=self.yields)
+                held = yield from self._rest(rest)
+                self._switch_inertia(self._true)
+                stats = yield from move_real_time(replace(path, refine=refine), settling, balanced=balanced)
+                return replace(stats, substeps=held + stats.substeps, hold=held)
+            self._switch_inertia(self._scaled)
             if command.loads:
                 end.update(goals)
                 return (yield from keep_loads(self, begin, end, command.loads, refine, balanced=balanced, most=most))
@@ -290,7 +297,26 @@ class FemWorld(BaseWorld):
         stats = yield from self._retried(command, attempt)
         self._poses = end
         self._rates[...] = flowing.rates[1] if command.flow and flowing.rates is not None else 0.0
+        return self._judged(stats)
+
+    def _judged(self, stats: MoveStats) -> MoveStats:
+        """`stats` of a motion with what else is known of its end."""
         return stats
+
+    def _rest(self, path: Path) -> Generator[Launch, Sequence[ForceReading], int]:
+        """The hold before a first motion in real time, and its substeps; none if nothing touches a gel.
+
+        In real time no damping takes away what the last hold has left, and contact is a spring without a memory. So the
+        scene comes to rest on these springs first.
+        """
+        forces = self._state.partial[self._index, :, FORCE : FORCE + 6 * len(self.sensors)]
+        if self._inertia is not self._scaled or not forces.any():
+            return 0
+        settling = self.scene.settling
+        tight = settling.model_copy(update={"tolerance": min(settling.tolerance, REST_TOLERANCE)})
+        self._use_inertia(replace(self._scaled, params={**self._scaled.params, MEMORY: 0.0}))
+        stats = yield from move_and_settle(path, tight, balanced=self.balanced, most=self._readings)
+        return stats.substeps
 
     @abstractmethod
     def plan(self, start: Sequence[Pose], end: Sequence[Pose]) -> Path:

@@ -21,6 +21,7 @@ from tacsim.physics.body.plasticine import (
     fit_grid,
 )
 from tacsim.physics.body.surface import surface_points
+from tacsim.physics.contact.contact import MEMORY_RATE
 from tacsim.physics.contact.gel_overlap import apart, gel_overlap
 from tacsim.physics.exec.lanes import NODES
 from tacsim.physics.exec.layout import (
@@ -40,11 +41,13 @@ from tacsim.physics.exec.layout import (
     HOUSING,
     HOUSING_FORCE,
     INVERSE_INERTIA,
+    MEMORY,
     OVERLAP,
     OWN,
     RECORDS,
     REFERENCE_CENTRE,
     RIGID_MASS_SCALE,
+    SPRINGS,
     STEP,
     STIFFNESS,
 )  # fmt: skip
@@ -61,6 +64,7 @@ from tacsim.physics.failure.health import (
 from tacsim.physics.motion.controller import ForceReading, Integration, Launch, PreparedLaunch, force_floor
 from tacsim.physics.motion.inertia import Inertia, kernel_density, kernel_second
 from tacsim.physics.motion.path import SHORT_PATH, SHORT_SLIDE, Path, path_along, path_length, plan
+from tacsim.physics.move import MIN_LAYERS, MoveStats, warn_of_few_layers
 from tacsim.physics.snapshot import State
 from tacsim.physics.units import MM, MPA
 from tacsim.physics.worlds.fem import FemWorld
@@ -90,7 +94,7 @@ LARGEST_SHARE = 0.5  # of a particle's mass over the step's square: the largest 
 GEL_OVERLAP = 0.25  # of a gel's thickness: deeper in one another, gels that do not feel each other are refused
 # Yield stresses (Frobenius norm) of hydrostatic tension that nothing gives a squeezed body: beyond, particles have
 # strains that no node of the grid feels (docs/physics.md)
-TENSION = 3.0
+TENSION, TENSION_GROWTH = 3.0, 1.01  # and by how much it must have grown, since rounding changes it in each launch
 LARGEST_GREEN = 0.3  # norm of F^T F - I since the reference of the body's grid: beyond, the grid is laid anew
 
 
@@ -99,6 +103,8 @@ class HybridWorld(FemWorld):
 
     sensors = ("lower", "upper")
     balanced = True
+    _squashed = 1.0  # height of the body over that at construction, by the spread of its particles along z
+    _largest_volume = 1.0  # elastic volume ratio of a particle after the last launch; 1: none since a restore
 
     def __init__(self, scene: Scene, state: HybridState | None = None, index: int = 0) -> None:
         """The environment of scene number `index` in a `state` of several; or one alone in a state of its own."""
@@ -147,7 +153,7 @@ class HybridWorld(FemWorld):
             BODY_DAMPING: (ZETA_YIELDING_HELD if self.yields else ZETA_BODY_HELD) / self._thickness,
         }
         densities = [gel.density for gel in self._gels]
-        masses = {**self._masses(densities, self._body.density, step), **SELECTIVE_INERTIA}
+        masses = {**self._masses(densities, self._body.density, step), **SELECTIVE_INERTIA, MEMORY: MEMORY_RATE}
         for g in range(len(self._gels)):
             # the filter makes a body lighter, so its particles bear less: between stiff gels they shook, untold
             bearable = LARGEST_SHARE * masses[BODY_MASS] / step**2
@@ -170,7 +176,7 @@ class HybridWorld(FemWorld):
         wave = math.sqrt(self._body.density / density)  # the body's pressure wave
         times = [gel.spacing * second / own for gel, own in zip(self._gels, seconds, strict=True)]
         step = COURANT * min(self._body.cell / wave, *times)
-        undamped = {**self._gel_damping(0.0), BODY_DAMPING: 0.0, RIGID_MASS_SCALE: 1.0}
+        undamped = {**self._gel_damping(0.0), BODY_DAMPING: 0.0, RIGID_MASS_SCALE: 1.0, MEMORY: 0.0}
         return Inertia({**self._masses(densities, density, step), **TRUE_INERTIA, **undamped}, step, second)
 
     def _masses(self, gels: Sequence[float], body: float, step: float) -> dict[int, float]:
@@ -191,6 +197,23 @@ class HybridWorld(FemWorld):
         for moving in (b.v(i), b.c(i)):
             moving[...] = 0.0
         b.forget_grid(i)
+
+    def _switch_inertia(self, inertia: Inertia) -> None:
+        """See FemWorld. Contacts keep their forces: the next launch starts from springs of the stiffness before."""
+        params = self._state.params[self._index]
+        gels = len(self._gels)
+        springs, stiffness = params[SPRINGS : SPRINGS + gels], params[STIFFNESS : STIFFNESS + gels]
+        before = springs * stiffness
+        super()._switch_inertia(inertia)
+        springs[...] = before / stiffness
+
+    def _use_inertia(self, inertia: Inertia) -> None:
+        super()._use_inertia(inertia)
+        self._forget_springs()
+
+    def _forget_springs(self) -> None:
+        """The next launch starts from the forces that its own stiffness gives."""
+        self._state.params[self._index, SPRINGS : SPRINGS + len(self._gels)] = 1.0
 
     def _courant(self) -> float:
         """Of gels and body: the larger; the body's grid does not shrink with it."""
@@ -243,6 +266,7 @@ class HybridWorld(FemWorld):
 
     def _take_up(self, grid: State) -> None:
         state, i = self._state, self._index
+        self._largest_volume = 1.0
         if not grid:
             state.particles.forget_grid(i)
             return
@@ -274,7 +298,9 @@ class HybridWorld(FemWorld):
         before = self._before_launch()
         state.params[index, STEP] = path.step
         state.counts[index, EVERY] = -(-len(drive) // launch.readings)
-        self._write_body_inertia(state.moments(index))
+        moments = state.moments(index)
+        self._squashed = math.sqrt(moments.second[2, 2] / state.particles.counts[index]) / state.heights[index]
+        self._write_body_inertia(moments)
         self._write_inertia(launch)
         Health.clear(state.partial[index])
         return PreparedLaunch(launch, where, drive, before)
@@ -288,6 +314,14 @@ class HybridWorld(FemWorld):
         params[CENTRE : CENTRE + 3] = moments.centre
         params[INVERSE_INERTIA : INVERSE_INERTIA + 6] = inverse[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
 
+    def _judged(self, stats: MoveStats) -> MoveStats:
+        assert self.scene.body is not None
+        layers = self._squashed * float(extent(self.scene.body.geometry)[2]) / self.scene.spacing
+        few = layers < MIN_LAYERS
+        if few:
+            warn_of_few_layers()
+        return replace(stats, particle_layers=layers, few_layers=few)
+
     def outcome(self, prepared: PreparedLaunch) -> list[ForceReading]:
         """The forces in and after the launch. Raises SimulationDiverged if its state is unphysical."""
         partial = self._state.partial[self._index]
@@ -296,6 +330,7 @@ class HybridWorld(FemWorld):
         sound = self._sound(volumes[0]) if seen is None else seen.sound
         health = Health.read(partial, self._courant(), sound=sound)
         check_launch(self.arrays, prepared.before, health, prepared.where)
+        self._forget_springs()
         each, drive = self._numbers(prepared.launch.readings), prepared.drive[-1]
         rotations, origins = drive[:, :3], drive[:, 3]  # sensors stand still where there are several readings
         sums = each.astype(np.float64)
@@ -307,6 +342,7 @@ class HybridWorld(FemWorld):
         lever = self._lever
         gel_overlap = self._gel_overlap(prepared)
         hits = health.capped + (gel_overlap > 0.0) + self._torn(volumes[1])
+        self._largest_volume = volumes[1]
         overlaps = each[..., OVERLAP].max(axis=1).tolist()
         integration = Integration(prepared.launch.path.step, self._damping(), health.courant)
         last = len(each) - 1
@@ -340,11 +376,13 @@ class HybridWorld(FemWorld):
         )
 
     def _torn(self, largest: float) -> bool:
-        """Whether the largest elastic volume ratio needs a tension of more than TENSION yield stresses; of a body that
-        hardens nobody knows."""
+        """Whether the largest elastic volume ratio has grown in the launch to one that needs a tension of more than
+        TENSION yield stresses; unknown for a body that hardens. What an earlier launch has left is not counted again.
+        """
         body = self._body
         bearable = TENSION * 2.0 * body.mu * body.limit / body.bulk
-        return self.yields and not body.hardening and math.log(largest) > bearable
+        left = TENSION_GROWTH * math.log(self._largest_volume)
+        return self.yields and not body.hardening and math.log(largest) > max(bearable, left)
 
     def _gel_overlap(self, prepared: PreparedLaunch) -> float:
         """How deep the two gels lie in one another, without feeling it [mm]. Raises SimulationDiverged if too deep."""

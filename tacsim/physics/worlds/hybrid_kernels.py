@@ -169,6 +169,8 @@ def gel_contact(
     outward = vec3(rotate[0, 2], rotate[1, 2], rotate[2, 2])  # the sensor's z axis
     spacing = 0.5 * env.param(layout.BODY_CELL)
     rate = env.param(layout.STEP) / env.param(layout.BODY_MASS)
+    real_time = env.param(layout.MEMORY) == 0.0
+    stiffened = ti.select(it == 0, env.param(layout.SPRINGS + g) - 1.0, 0.0)
     total, moment, on_housing = vec3(0.0), vec3(0.0), vec3(0.0)
     stride = env.count(layout.STRIDE)
     gel = ti.static(gel_of(env, gels, g))
@@ -188,13 +190,17 @@ def gel_contact(
             radius = spacing  # at most
             if away < 2.5 * spacing:
                 radius = support_radius(three_rows(body.particles, at + layout.PLANE * stride, stride), spacing)
+                # A radius that follows the strain does work that no force takes from the body. Where nothing is damped
+                # that would drive waves, so a particle keeps the radius with which it came to the gel.
+                if real_time and histories[env.index, g, p][6] > 0.0:
+                    radius = histories[env.index, g, p][6]
             # one radius to touch, half a spacing for what the contact's memory still bridges
             if away < radius + 0.5 * spacing:
                 local = back @ arm
                 moving = three_rows(body.particles, at + layout.VELOCITY * stride, stride)
                 relative = back @ (moving - velocity - spin.cross(arm))
                 in_contact, housed, force, history = particle_contact(
-                    env, part, local, relative, histories[env.index, g, p], radius, gel, forces
+                    env, part, local, relative, histories[env.index, g, p], radius, stiffened, gel, forces
                 )
                 histories[env.index, g, p] = history
                 if in_contact:

@@ -44,6 +44,7 @@ class HybridState(FemState):
         self._gels = GelState(common_lattices(self.gel), len(scenes))
         placed = [_body_at_start(scene) for scene in scenes]
         self.body = [body for body, _, _ in placed]
+        self.heights = [float(points[:, 2].std()) for _, points, _ in placed]  # of the particles, standard deviation
         self._particles = BodyState([points for _, points, _ in placed], [planes for _, _, planes in placed])
         # of the contact law [mm]
         self._contact_history = np.zeros((len(scenes), 2, max(self._particles.counts), ContactHistory.n), np.float32)
@@ -109,7 +110,7 @@ class HybridState(FemState):
         gels = _gels_of(scene)
         common_lattices([*self.gel, gels])
         body, points, planes = _body_at_start(scene)
-        self.gel[index], self.body[index] = gels, body
+        self.gel[index], self.body[index], self.heights[index] = gels, body, float(points[:, 2].std())
         self.gels.clear(index)
         self.particles.place(index, points, planes)
         missing = max(self.particles.counts) - self.contact_history.shape[2]

@@ -10,6 +10,7 @@ import numpy as np
 from tacsim.geometry.shapes import edge_radius, edges, farthest, lowest_below
 from tacsim.interface import Pose
 from tacsim.models.scene import GelSurface, Mesh, Scene
+from tacsim.physics.contact.contact import MEMORY_RATE
 from tacsim.physics.contact.indenter import (
     POINTS,
     RIM,
@@ -22,6 +23,7 @@ from tacsim.physics.exec.layout import (
     FRICTION,
     GEL_DAMPING,
     LIMIT_FOLLOWS,
+    MEMORY,
     STEP,
     STIFFNESS,
 )  # fmt: skip
@@ -106,8 +108,10 @@ class PressWorld(FemWorld):
         step = COURANT * self._gel.spacing
         self._shear = math.sqrt(self._gel.mu / self._gel.density)  # speed of its shear wave, over that of pressure
         zeta = min(ZETA_GEL, ZETA_BY_SHEAR * self._shear)
-        self._scaled = Inertia({GEL_DAMPING: zeta / self._gel.thickness}, step)
-        self._true = Inertia({GEL_DAMPING: 0.0}, step, kernel_second(self._gel, scene.gel.material.density))
+        self._scaled = Inertia({GEL_DAMPING: zeta / self._gel.thickness, MEMORY: MEMORY_RATE}, step)
+        self._true = Inertia(
+            {GEL_DAMPING: 0.0, MEMORY: 0.0}, step, kernel_second(self._gel, scene.gel.material.density)
+        )
         self._floor = force_floor(scene.gel.material.youngs_modulus * MPA, self._gel.thickness)
         params = {
             **self._gel.params(), STIFFNESS: contact_stiffness(self._gel, step),

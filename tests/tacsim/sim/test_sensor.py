@@ -277,7 +277,8 @@ def test_every_picture_says_how_its_state_was_reached(spring_world: Any) -> None
     assert stats["residual"] == 0.001
     assert stats.keys() == {
         "substeps", "hold", "residual", "settled", "overlap", "guard_hits", "retries", "load_error", "time_step",
-        "damping", "courant", "gel_overlap", "smallest_volume", "largest_volume", "shortened",
+        "damping", "courant", "gel_overlap", "smallest_volume", "largest_volume", "particle_layers", "few_layers",
+        "shortened",
     }  # fmt: skip
     assert all(type(value) is float for value in stats.values())
 

@@ -10,7 +10,7 @@ from tacsim.interface import Pose
 from tacsim.models.scene import Body, BodyMaterial, Box, Cylinder, Preset, Scene, Settling, lame
 from tacsim.physics.failure.diagnosis import particle_volumes
 from tacsim.physics.motion.controller import Launch
-from tacsim.physics.move import MoveStats
+from tacsim.physics.move import MoveStats, warn_of_few_layers
 from tacsim.physics.worlds.hybrid import HybridWorld
 
 CYLINDER = Body(geometry=Cylinder(radius=5e-3, height=10e-3), material=BodyMaterial(yield_stress=30e3))
@@ -82,6 +82,31 @@ def test_a_body_under_more_tension_than_it_can_bear_is_told() -> None:
         strain[:, 3:] *= np.exp(2 / 3 * grown)[:, None]
         world.restore({**state, "strain": strain})
         assert (world.move({}).guard_hits > 0) == told
+
+
+def test_tension_that_a_squeeze_has_left_is_not_counted_again() -> None:
+    """Soft clay closed by a third keeps strains that no node feels. Every launch of the opening counted them."""
+    clay = Body(geometry=Box(size=(8e-3, 8e-3, 8e-3)), material=BodyMaterial(yield_stress=5e3))
+    world = HybridWorld(Scene(body=clay, preset="learn"))
+    closed = world.move(shifted(world, {"upper": np.array([0.0, 0.0, -2.8e-3])}))
+    assert closed.guard_hits > 0 and closed.largest_volume > 1.01
+    opened = world.move(shifted(world, {"upper": np.array([0.0, 0.0, 1.0e-3])}))
+    assert opened.guard_hits <= 1  # it is largest when the load has gone
+    opened = world.move(shifted(world, {"upper": np.array([0.0, 0.0, 4.0e-3])}))
+    assert opened.guard_hits == 0 and opened.largest_volume > 1.01
+
+
+def test_fewer_layers_of_particles_than_forces_need_are_told_once(caplog: pytest.LogCaptureFixture) -> None:
+    """Over the mean height at the end, which is below that of the corners that stand up between soft gels."""
+    warn_of_few_layers.cache_clear()
+    body = Body(geometry=Box(size=(7e-3, 7e-3, 7e-3)), material=BodyMaterial(yield_stress=5e3))
+    w = HybridWorld(Scene(body=body, settling=Settling(max_substeps=0)))
+    enough = w.move(shifted(w, {"lower": np.array([0.0, 0.0, 0.1e-3])}))
+    assert not enough.few_layers and enough.particle_layers == pytest.approx(14, rel=0.01) and not caplog.records
+    for _ in range(2):
+        few = w.move(shifted(w, {"upper": np.array([0.0, 0.0, -1e-3])}))
+    assert few.few_layers and 0.9 < few.particle_layers * 0.5e-3 / w.truth().height < 1.0
+    assert "fewer than 12 layers" in caplog.text and len(caplog.records) == 1
 
 
 def test_what_sticks_comes_back_from_a_loop() -> None:

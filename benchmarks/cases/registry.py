@@ -18,6 +18,7 @@ from benchmarks.cases import (
     press,
     random_steps,
     scenes,
+    slow_limit,
     squeeze,
 )
 from benchmarks.cases.real import (
@@ -41,6 +42,7 @@ CASES: tuple[Case, ...] = (
     *squeeze.CASES,
     *cycles.CASES,
     *random_steps.CASES,
+    *slow_limit.CASES,
     *large_strain.CASES,
     *incline.CASES,
     *materials.CASES,

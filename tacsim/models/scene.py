@@ -30,13 +30,15 @@ PRESETS: dict[Preset, tuple[float, float]] = {
 PRESET_FORCE_ERROR: dict[Preset, tuple[float, float]] = {
     "learn": (0.031, 0.108), "draft": (0.005, 0.041), "standard": (-0.006, 0.021),
 }  # fmt: skip
-# Peak Mach number of motions between states of rest: what a tolerance asks for and what the yield stress over the
-# P-wave modulus allows, within bounds; where nothing yields, a share of the speed of the gel's shear wave
-# (docs/decisions/0002).
-MACH_BY_TOLERANCE, MACH_BY_STRESS, SLOWEST_MACH, FASTEST_MACH = 3.0, 4.0, 0.001, 0.03
+# Peak Mach number of motions between states of rest at USUAL_TOLERANCE, and in proportion to a smaller tolerance: what
+# the yield stress allows over the stress that the motion costs, within bounds; where nothing yields, a share of the
+# speed of the gel's shear wave (docs/decisions/0002).
+MACH_BY_STRESS, SLOWEST_MACH, FASTEST_MACH, USUAL_TOLERANCE = 3.7, 0.001, 0.03, 1e-2
+# What the gel's motion adds to that stress: the impedance of its shear wave, and at most the body's own, times these
+GEL_STRESS, MAX_GEL_STRESS = 2.5, 2.0
 MACH_BY_SHEAR = 0.1
-LIGHTER = 1.5  # so much faster may sensors go whose gels and body answer as if they were lighter: no indenter, no seed
-FLOW_MACH = 0.02  # mean of motions that flow into one another, where nothing is lighter
+LIGHTER = 1.25  # so much faster may sensors go whose gels and body answer as if they were lighter: no indenter, no seed
+FLOW_MACH, LIGHTER_FLOW = 0.02, 1.5  # mean of motions that flow into one another; so much faster where they are lighter
 CATCHING = 0.5  # element sizes: an edge that is less round catches on the mesh
 MAX_CELLS = 5_000_000  # elements of one gel, or its particles in the seed's scheme; a standard gel has 12,800
 
@@ -103,6 +105,12 @@ def lame(material: GelMaterial | BodyMaterial) -> tuple[float, float]:
     """Lamé constants (mu, lambda) [Pa]."""
     modulus, nu = material.youngs_modulus, material.poisson_ratio
     return modulus / (2 * (1 + nu)), modulus * nu / ((1 + nu) * (1 - 2 * nu))
+
+
+def shear_impedance(material: GelMaterial) -> float:
+    """Stress over speed of its shear wave, over the speed of its pressure wave: sqrt(mu (lambda + 2 mu)) [Pa]."""
+    mu, lam = lame(material)
+    return math.sqrt(mu * (lam + 2 * mu))
 
 
 class Gel(Config):
@@ -323,11 +331,19 @@ class Scene(Config):
 
     @property
     def _mach_by_stress(self) -> float:
-        """Peak speed at which a motion costs a body no more stress than MACH_BY_STRESS times what it yields at."""
+        """Peak speed at which a motion costs a body no more stress than MACH_BY_STRESS times what it yields at.
+
+        A motion at Mach m costs the stress m M in the body, of P-wave modulus M, since density is scaled so that the
+        wave speed is 1; and m sqrt(mu M) in a gel, which gives way with its shear wave. A gel much stiffer than the
+        body hardly moves, so what it adds is bounded.
+        """
         if self.body is None:
             return math.inf
         mu, lam = lame(self.body.material)
-        return MACH_BY_STRESS * 2 * mu * self.body.material.elastic_limit / (lam + 2 * mu)
+        body = lam + 2 * mu
+        gel = max(shear_impedance(self.gel_of(name).material) for name in self.sensors)
+        stress = body + min(GEL_STRESS * gel, MAX_GEL_STRESS * body)
+        return MACH_BY_STRESS * 2 * mu * self.body.material.elastic_limit / stress
 
     @property
     def sensors(self) -> tuple[str, ...]:
@@ -338,17 +354,16 @@ class Scene(Config):
         """Peak speed of a motion between states of rest, over the wave speed; slower on short paths (physics.path).
 
         A body that yields keeps what the speed wrote into it. So without `settling.mach` the speed goes with the
-        tolerance, and with the body's yield stress over its P-wave modulus M: a motion at Mach m costs the stress m M,
-        since density is scaled so that the wave speed is 1. What is elastic comes to the same rest from any speed, but
-        for friction: it sticks where a stop finds the gel, which follows a drag with its shear wave.
+        tolerance and with the yield stress over the stress that the motion costs (`_mach_by_stress`). What is elastic
+        comes to the same rest from any speed, but for friction: it sticks where a stop finds the gel, which follows a
+        drag with its shear wave.
         """
         if self.settling.mach is not None:
             return self.settling.mach
         if not math.isfinite(self._mach_by_stress):
             slowest = min(math.sqrt(mu / (lam + 2 * mu)) for mu, lam in self._gel_moduli)
             return min(FASTEST_MACH, MACH_BY_SHEAR * slowest)
-        by_tolerance = self._lighter * MACH_BY_TOLERANCE * self.settling.tolerance
-        return min(max(by_tolerance, SLOWEST_MACH), self.fastest_mach)
+        return max(min(1.0, self.settling.tolerance / USUAL_TOLERANCE) * self.fastest_mach, SLOWEST_MACH)
 
     @property
     def _gel_moduli(self) -> list[tuple[float, float]]:
@@ -358,11 +373,7 @@ class Scene(Config):
     @property
     def fastest_mach(self) -> float:
         """The most that this is for a body that yields, at any tolerance."""
-        return min(self._mach_by_stress, self._lighter * FASTEST_MACH)
-
-    @property
-    def _lighter(self) -> float:
-        return LIGHTER if self.physics == "hybrid" else 1.0
+        return min(self._mach_by_stress, FASTEST_MACH * (LIGHTER if self.physics == "hybrid" else 1.0))
 
     @property
     def preset_error(self) -> str:
@@ -378,7 +389,7 @@ class Scene(Config):
         """Mean speed of motions that flow into one another, over the wave speed; slower on short paths."""
         if self.settling.flow_mach is not None:
             return self.settling.flow_mach
-        return FLOW_MACH if self.body is None else LIGHTER * FLOW_MACH
+        return FLOW_MACH if self.body is None else LIGHTER_FLOW * FLOW_MACH
 
     @property
     def spacing(self) -> float:

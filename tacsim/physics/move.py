@@ -29,7 +29,7 @@ class MoveStats:
     hold: int  # of which hold
     residual: float  # largest relative force imbalance or change at the end, or change still to come [-]
     # residual <= the scene's tolerance; and of an indenter with friction: slid as it can be followed
-    # (tacsim.physics.motion.slide), of a body that yields: no faster than it may be (at a `settling.mach`)
+    # (tacsim.physics.motion.slide), of a body: moved no faster than it bears
     settled: bool
     overlap: float  # deepest overlap of body (or indenter) and gel surface in the last substep [m]
     # times a guard changed the physics (particles set aside, gaps capped), found gels in one another, or tension in a
@@ -47,6 +47,9 @@ class MoveStats:
     # layers of particles over the body's mean height at the end (0: no body); whether they are fewer than MIN_LAYERS
     particle_layers: float = 0.0
     few_layers: bool = False
+    # share of the force between the sensors that the hold took from a body that yields, of what is left [-]: the stress
+    # that the speed itself cost
+    force_loss: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

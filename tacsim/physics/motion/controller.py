@@ -118,6 +118,15 @@ def creep_to_come(held: Sequence[ForceReading], age: float) -> float:
     return float(to_come.max()) / max(float(np.abs(held[-1].contact).max()), held[-1].floor)
 
 
+def force_loss(driven: ForceReading, rest: ForceReading) -> float:
+    """How much larger the force between the gels was at the end of a path than it is at rest, relative to that [-].
+
+    The difference is stress that the motion itself cost. A body that yields has flowed by it, and a slow one has not.
+    """
+    before, now = (float(np.linalg.norm(_between(reading.contact), axis=1).max()) for reading in (driven, rest))
+    return max(0.0, before - now) / max(now, rest.floor)
+
+
 def _between(contact: NDArray[np.float64]) -> NDArray[np.float64]:
     """What squeezes and shears a body that lies between gels: the forces on them (gels, 3) without their mean."""
     return contact - contact.mean(axis=0) if len(contact) > 1 else contact
@@ -206,7 +215,9 @@ def move_and_settle(path: Path, settling: Settling, *, balanced: bool, most: int
         if path.creeps:
             age = (path.substeps / 2 + held) / path.interval
             worst = max(worst, creep_to_come(readings[followed:-1], age - 1), creep_to_come(readings[followed:], age))
-    return _stats(readings, path.substeps, held, worst, settling, followed=not path.unfollowed)
+    lost = force_loss(readings[followed - 1], readings[-1]) if path.creeps and followed and held else 0.0
+    followable = not path.unfollowed and lost <= path.max_force_loss
+    return replace(_stats(readings, path.substeps, held, worst, settling, followed=followable), force_loss=lost)
 
 
 def move_real_time(path: Path, settling: Settling, *, balanced: bool) -> Motion:

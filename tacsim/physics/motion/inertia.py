@@ -31,13 +31,18 @@ class Inertia:
     step: float  # nominal substep [mm]
     second: float = math.nan  # kernel time of one second [mm]; quasi-static motions have no real time
     held: Mapping[int, float] = field(default_factory=dict)  # entries that differ while nothing is driven
-    flowing: Mapping[int, float] = field(default_factory=dict)  # and in motions that flow into one another
+    flowing: Mapping[int, float] = field(default_factory=dict)  # in motions that flow into one another
+    dragging: Mapping[int, float] = field(default_factory=dict)  # and in those that drag a body along
 
     def entries(self, launch: Launch | None = None) -> dict[int, float]:
         """The entries for a launch; None: of one that drives something."""
         if launch is None:
             return dict(self.params)
-        return {**self.params, **(self.held if launch.held else self.flowing if launch.flowing else {})}
+        if launch.held:
+            return {**self.params, **self.held}
+        if launch.flowing:
+            return {**self.params, **self.flowing}
+        return {**self.params, **(self.dragging if launch.path.dragging else {})}
 
     @property
     def real_time(self) -> bool:

@@ -22,6 +22,7 @@ from tacsim.physics.failure.health import LaunchSpan
 from tacsim.physics.units import MM
 
 PEAK_SLOPE = 1.875  # of the ramp, over its mean
+PEAK_BRAKING = 2.89  # of a ramp that rises quickly: its largest deceleration times the square of its time, over its way
 # Times of the gel's pressure wave through its thickness: the shortest ramp; the shortest step that flows, and how soon
 # it has turned; time of the hold between two readings of the forces
 SHORTEST_RAMP, SHORTEST_FLOW, FLOW_RISE, READING_INTERVAL = 2.0, 1.25, 0.25, 1.0
@@ -70,8 +71,11 @@ class Path:
 
     unfollowed: why it does not end as a slow one, and what to do; empty where it does.
     creeps: what it moves yields, and creeps on when it has ended.
+    max_force_loss: how much of its force the hold may take, if it shall end as a slow one: see
+    `tacsim.physics.motion.controller.force_loss`.
     growing: how far it presses an indenter in while it slides it: see `tacsim.physics.motion.slide.growth`.
     turning: how much of an indenter's drag lies across the way that it is slid: see `tacsim.physics.motion.slide.turn`.
+    dragging: it drags a body along the gels, which may slip.
 
     rates: velocities at start and end, each (frames, 6), linear and angular, world axes [-, rad/mm], of a path that is
     not from rest to rest. The one turns into the other within `rise`, and a ramp does the rest of the way.
@@ -87,8 +91,10 @@ class Path:
     lingers: tuple[float, float] | None = None
     unfollowed: str = ""
     creeps: bool = False
+    max_force_loss: float = math.inf
     growing: float = 0.0
     turning: float = 0.0
+    dragging: bool = False
     rates: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
 
     @property
@@ -203,7 +209,7 @@ def path_along(start: Sequence[Pose], end: Sequence[Pose], lever: float) -> floa
 
 def plan(
     start: Sequence[Pose], end: Sequence[Pose], mach: float, dt: float, lever: float, thickness: float, *,
-    remembered: float = 0.0, short: float = SHORT_PATH, slower: float = 1.0, last: float = 0.0,
+    remembered: float = 0.0, short: float = SHORT_PATH, slower: float = 1.0, last: float = 0.0, shortest: float = 0.0,
 ) -> Path:  # fmt: skip
     """A path whose fastest point moves at peak Mach `mach`; it lasts no less than SHORTEST_RAMP gel thicknesses [mm],
     since a shorter jolt mostly makes the gel ring, and reaches its full speed within half of that.
@@ -212,6 +218,7 @@ def plan(
     of it goes along the surface, where the stop finds the gel. The trace grows with how hard the path brakes, so
     those shorter than `short` gel thicknesses go slower: with the root of their length, the same braking for all.
     slower: than that, how many times, the `last` [mm] of it is; see `lingering`.
+    shortest: time [mm, wave speed 1] that it lasts at least.
 
     Raises ValueError for a path that takes more than MOST_SUBSTEPS.
     """
@@ -220,7 +227,7 @@ def plan(
     if length == 0:
         return Path(start, end, 0, dt, interval=interval)
     braked = math.sqrt(remembered * max(remembered, short * thickness))
-    lasting = max(PEAK_SLOPE * max(length, braked) / mach, SHORTEST_RAMP * thickness)
+    lasting = max(PEAK_SLOPE * max(length, braked) / mach, SHORTEST_RAMP * thickness, shortest)
     rise, lingers = SHORTEST_RAMP * thickness / 2 / lasting, None
     if slower > 1.0:
         lingers = slower, last / length

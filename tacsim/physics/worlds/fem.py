@@ -91,6 +91,7 @@ class FemWorld(BaseWorld):
 
     balanced: ClassVar[bool]  # contact forces on all gels add up to the weight of a free body
     yields: bool  # what is pressed yields: it keeps what a hurried motion does to it
+    max_force_loss = math.inf  # of `Path`
     unfollowed = ""  # why the last motion has not settled, whatever its residual, and what to do
 
     _state: FemState
@@ -295,6 +296,11 @@ class FemWorld(BaseWorld):
             return come_to_rest(flow, from_rest(refine)) if self._rates.any() else from_rest(refine)
 
         stats = yield from self._retried(command, attempt)
+        if stats.force_loss > self.max_force_loss:
+            self.unfollowed = (
+                f"the speed itself made the body yield: the hold took {stats.force_loss:.1%} of the force (limit "
+                f"{self.max_force_loss:.1%}); go there from the state before with a smaller settling.tolerance"
+            )
         self._poses = end
         self._rates[...] = flowing.rates[1] if command.flow and flowing.rates is not None else 0.0
         return self._judged(stats)

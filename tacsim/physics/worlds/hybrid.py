@@ -63,7 +63,7 @@ from tacsim.physics.failure.health import (
 )
 from tacsim.physics.motion.controller import ForceReading, Integration, Launch, PreparedLaunch, force_floor
 from tacsim.physics.motion.inertia import Inertia, kernel_density, kernel_second
-from tacsim.physics.motion.path import SHORT_PATH, SHORT_SLIDE, Path, path_along, path_length, plan
+from tacsim.physics.motion.path import PEAK_BRAKING, SHORT_PATH, SHORT_SLIDE, Path, path_along, path_length, plan
 from tacsim.physics.move import MIN_LAYERS, MoveStats, warn_of_few_layers
 from tacsim.physics.snapshot import State
 from tacsim.physics.units import MM, MPA
@@ -77,15 +77,27 @@ COURANT = 0.5
 ZETA_GEL, ZETA_GEL_HELD = 0.8, 1.6  # zeta in rate = zeta c / thickness
 ZETA_BODY, ZETA_BODY_HELD = 0.6, 1.2  # zeta in rate = zeta c / gel thickness, against the driven affine motion
 ZETA_YIELDING_HELD = 0.3  # of a held body that yields: what creeps has only this drag to overcome
+# Of a gel whose shear wave is at least so fast, over its pressure wave (nu 0.48): a nearly incompressible one gives way
+# with that wave, and is damped less in proportion, or it creeps
+FULLY_DAMPED = 0.196
+# Of a path that mostly goes along the gels, and drags a body: one that swings beyond where it is led keeps that
+DRAGGING, ZETA_GEL_DRAGGED, ZETA_BODY_DRAGGED = 0.5, 1.6, 1.2
+# Share of the friction that the inertia of a dragged body, and of the gel under it, takes away where it stops: at 0.045
+# drags end within 1 to 2 % of slow ones, at 0.1 4 % low; and so much less time than that asks for is never settled
+BRAKED, HURRIED_DRAG = 0.045, 1.5
 # While motions flow: what drags a body makes forces too high, and what rings in the gel makes clay yield
 ZETA_GEL_FLOWING, ZETA_BODY_FLOWING = 1.2, 0.3
 # How nodes answer to forces: by their own acceleration, and by that filtered by (4 S - 1)^2, S the mean over the cells
 # round them. What the mesh resolves, S = 1, is six times as light; the shortest waves, S = 0, are as heavy as they are.
 TRUE_INERTIA = {OWN: 1.0, FILTERED: 0.0}
 SELECTIVE_INERTIA = {OWN: 1 / 3, FILTERED: 2 / 3}
-FILTERED_RIGID = SELECTIVE_INERTIA[OWN] + 9.0 * SELECTIVE_INERTIA[FILTERED] - 1.0  # lighter by this are rigid motions
+LIGHTER_GEL = SELECTIVE_INERTIA[OWN] + 9.0 * SELECTIVE_INERTIA[FILTERED]  # what the mesh resolves
+FILTERED_RIGID = LIGHTER_GEL - 1.0  # lighter by this are rigid motions
 # Of the fastest default for a body that yields: at twice it clay ends 2 % lower, at 4 times 9 to 11 %, at 7 times 26 %
 HURRIED = 3.0
+# Share of its force that the hold may take from a body that yields, times the gel's thickness over the particles'
+# spacing (3.5 % at draft): beyond, motions end 3 to 30 % from slow ones. The coarser a body, the more it creeps anyway.
+MAX_FORCE_LOSS = 0.28
 # Of the contact's stiffness that particles and gel nodes bear one by one: all of them together are lighter. With all of
 # it a cube of 40 layers went to and fro between its gels without end, 3.8 N on one and 2.1 on the other; not with 0.9.
 # A heavier cube would stand still, too, but lag behind gels that drag it; with 0.65 slides are dragged 2 % less.
@@ -114,6 +126,7 @@ class HybridWorld(FemWorld):
         self._index = index
         self._gels, self._body = self._state.gel[index], self._state.body[index]
         self.yields = math.isfinite(scene.body.material.elastic_limit)
+        self.max_force_loss = MAX_FORCE_LOSS * self._body.spacing / max(gel.thickness for gel in self._gels)
         height = float(extent(scene.body.geometry)[2])
         self._poses = {
             "lower": Pose(),
@@ -159,11 +172,14 @@ class HybridWorld(FemWorld):
             bearable = LARGEST_SHARE * masses[BODY_MASS] / step**2
             masses[STIFFNESS + g] = BORNE * min(masses[STIFFNESS + g], bearable)
         flowing = {**self._gel_damping(ZETA_GEL_FLOWING), BODY_DAMPING: ZETA_BODY_FLOWING / self._thickness}
-        return Inertia({**masses, **damping}, step, held=held, flowing=flowing)
+        dragging = {**self._gel_damping(ZETA_GEL_DRAGGED), BODY_DAMPING: ZETA_BODY_DRAGGED / self._thickness}
+        return Inertia({**masses, **damping}, step, held=held, flowing=flowing, dragging=dragging)
 
     def _gel_damping(self, zeta: float) -> dict[int, float]:
-        """Each gel by its own thickness: rate = zeta c / thickness."""
-        return {GEL_DAMPING + g: zeta / gel.thickness for g, gel in enumerate(self._gels)}
+        """Each gel by its own thickness and shear wave: rate = zeta c / thickness, less where that wave is slow."""
+        shares = [min(1.0, math.sqrt(gel.mu / gel.density) / FULLY_DAMPED) for gel in self._gels]
+        rates = [zeta * share / gel.thickness for share, gel in zip(shares, self._gels, strict=True)]
+        return {GEL_DAMPING + g: rate for g, rate in enumerate(rates)}
 
     def _true_inertia(self) -> Inertia:
         """The pressure wave of the gel in which it is fastest has speed 1."""
@@ -228,13 +244,34 @@ class HybridWorld(FemWorld):
         yields, by friction alone what goes along a surface."""
         scene, lever, self.unfollowed = self.scene, self._lever, ""
         remembered = (path_length if self.yields else path_along)(start, end, lever)
+        along = path_along(start, end, lever)
+        drag = self._drag_time(along)
         path = plan(
             start, end, scene.peak_mach, self._scaled.step, lever, self._thickness, remembered=remembered,
-            short=SHORT_PATH if self.yields else SHORT_SLIDE,
+            short=SHORT_PATH if self.yields else SHORT_SLIDE, shortest=drag if scene.settling.mach is None else 0.0,
         )  # fmt: skip
+        path = replace(path, dragging=along > DRAGGING * path_length(start, end, lever))
         if self.yields and path.peak_mach(lever) > HURRIED * scene.fastest_mach:
             self.unfollowed = "the speed itself makes the body yield; leave out settling.mach, or lower it"
-        return replace(path, creeps=self.yields, unfollowed=self.unfollowed)
+        elif drag > HURRIED_DRAG * path.substeps * path.dt:
+            self.unfollowed = "the body slips by its inertia at that speed; leave out settling.mach, or lower it"
+        return replace(path, creeps=self.yields, max_force_loss=self.max_force_loss, unfollowed=self.unfollowed)
+
+    def _drag_time(self, along: float) -> float:
+        """Least time [mm, wave speed 1] of a path that goes `along` the gels [mm] and ends with all friction of a body
+        that slips. While that is braked, its inertia takes some of the friction away, and there it sticks.
+
+        0 where nothing is held between the gels, or no friction holds it."""
+        held = [max(0.0, -float(self.wrench(name)[2])) for name in self.sensors]
+        frictions = self.scene.friction["lower"], self.scene.friction["upper"]
+        limits = [friction * force for friction, force in zip(frictions, held, strict=True) if friction > 0.0]
+        if not limits or min(held) == 0.0:
+            return 0.0
+        params, count = self._scaled.params, self._state.particles.counts[self._index]
+        body = params[BODY_MASS] * count / (params[RIGID_MASS_SCALE] + FILTERED_RIGID)
+        heaviest = max(gel.density * gel.thickness for gel in self._gels)
+        layer = heaviest * (self._body.volume * count) ** (2 / 3) / (2.0 * LIGHTER_GEL)
+        return math.sqrt(PEAK_BRAKING * along * (body + layer) / (BRAKED * min(limits)))
 
     # ------------------------------------------------------------------ state
 

@@ -278,7 +278,7 @@ def test_every_picture_says_how_its_state_was_reached(spring_world: Any) -> None
     assert stats.keys() == {
         "substeps", "hold", "residual", "settled", "overlap", "guard_hits", "retries", "load_error", "time_step",
         "damping", "courant", "gel_overlap", "smallest_volume", "largest_volume", "particle_layers", "few_layers",
-        "shortened",
+        "force_loss", "shortened",
     }  # fmt: skip
     assert all(type(value) is float for value in stats.values())
 

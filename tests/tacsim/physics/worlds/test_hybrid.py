@@ -337,7 +337,8 @@ def test_the_upper_gel_carries_what_falls_up_and_both_differ_by_the_weight() -> 
 def over_the_rim(housing: float | None) -> HybridWorld:
     """A cube of 4 mm, 1 mm of it beyond the rim of both gels, squeezed by 1.2 mm."""
     gel = Gel(size=(10e-3, 10e-3, 4e-3), housing=housing)
-    w = world(Body(geometry=Box(size=(4e-3, 4e-3, 4e-3)), material=CLAY), gel=gel)
+    slower = {"tolerance": 5e-3, "mach": 0.02}  # at 0.03 it ends 6 % from a slow squeeze, and not settled
+    w = world(Body(geometry=Box(size=(4e-3, 4e-3, 4e-3)), material=CLAY), gel=gel, settling=slower)
     w.move({**shift(w, "lower", (4e-3, 0, 0)), **shift(w, "upper", (4e-3, 0, 0))})
     squeeze(w, 1.2e-3)
     return w

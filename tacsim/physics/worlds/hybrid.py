@@ -61,10 +61,17 @@ from tacsim.physics.failure.health import (
     check_launch,
     require_room,
 )
-from tacsim.physics.motion.controller import ForceReading, Integration, Launch, PreparedLaunch, force_floor
+from tacsim.physics.motion.controller import (
+    ForceReading,
+    Integration,
+    Launch,
+    Motion,
+    PreparedLaunch,
+    force_floor,
+)
 from tacsim.physics.motion.inertia import Inertia, kernel_density, kernel_second
 from tacsim.physics.motion.path import PEAK_BRAKING, SHORT_PATH, SHORT_SLIDE, Path, path_along, path_length, plan
-from tacsim.physics.move import MIN_LAYERS, MoveStats, warn_of_few_layers
+from tacsim.physics.move import MIN_LAYERS, MoveCommand, MoveStats, warn_of_few_layers
 from tacsim.physics.snapshot import State
 from tacsim.physics.units import MM, MPA
 from tacsim.physics.worlds.fem import FemWorld
@@ -213,6 +220,21 @@ class HybridWorld(FemWorld):
         for moving in (b.v(i), b.c(i)):
             moving[...] = 0.0
         b.forget_grid(i)
+
+    def _run_command(self, command: MoveCommand) -> Motion:
+        if command.duration is not None:
+            self._require_friction()
+        return (yield from super()._run_command(command))
+
+    def _require_friction(self) -> None:
+        """Raises ValueError for a motion in real time of a body that two gels hold without friction."""
+        touches = all(self.wrench(name)[2] < 0.0 for name in self.sensors)
+        if touches and not any(self.scene.friction.values()):
+            raise ValueError(
+                "friction.lower and friction.upper are 0: a body that gels squeeze without friction is in an unstable "
+                "balance, and in real time it leaves them within a second. Give one of them a friction above 0 (0.02 "
+                "holds it), or move without a duration"
+            )
 
     def _switch_inertia(self, inertia: Inertia) -> None:
         """See FemWorld. Contacts keep their forces: the next launch starts from springs of the stiffness before."""

@@ -174,7 +174,7 @@ def test_loads_and_the_seed_have_no_duration() -> None:
         SeedWorld(Scene(body=CUBE, gel=GEL, physics="seed")).move({}, duration=1e-3)
 
 
-@pytest.mark.parametrize(("friction", "yield_stress"), [(0.0, None), (0.6, None), (3.0, None), (0.6, 3e4), (3.0, 5e3)])
+@pytest.mark.parametrize(("friction", "yield_stress"), [(0.02, None), (0.6, None), (3.0, None), (0.6, 3e4), (3.0, 5e3)])
 def test_a_squeezed_body_held_still_keeps_its_force_and_its_energy(friction: float, yield_stress: float | None) -> None:
     """With the memory of contact that quasi-static motions have, the force was 17 % off after 0.03 s; with radii of
     particles that follow their strain, energy grew by a fifth from 0.25 to 0.45 s without friction."""
@@ -191,6 +191,17 @@ def test_a_squeezed_body_held_still_keeps_its_force_and_its_energy(friction: flo
     assert np.array(forces) == pytest.approx(forces[0].mean(), rel=1e-3)
     # what the step's order, positions after velocities, makes of a constant energy
     assert max(np.array(energies[1:]) / np.minimum.accumulate(energies[:-1])) < 1 + 2e-4
+
+
+def test_a_body_squeezed_without_friction_has_no_motion_in_real_time() -> None:
+    smooth = {"lower": 0.0, "upper": 0.0}
+    world = HybridWorld(Scene.model_validate({"preset": "learn", "body": CUBE, "friction": smooth}))
+    world.move({}, duration=1e-4)  # the body lies on one gel: nothing squeezes it
+    world.move(along_z(world, "upper", -0.5e-3))
+    before = world.wrench("upper")
+    with pytest.raises(ValueError, match="are 0: a body that gels squeeze without friction"):
+        world.move({}, duration=1e-3)
+    assert np.array_equal(world.wrench("upper"), before)
 
 
 def test_a_real_time_hold_begins_with_the_forces_of_the_rest_before_it() -> None:

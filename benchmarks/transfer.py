@@ -19,8 +19,8 @@ import typer
 
 from robot.studies.identify.motions import motions
 from tacsim.config import load, load_scene
+from tacsim.models.material import BodyMaterial, GelMaterial
 from tacsim.models.randomisation import Randomisation
-from tacsim.models.scene import BodyMaterial, GelMaterial
 from tacsim.models.training import Training
 
 SIGHTS = {"canonical": "squeeze", "raw": "squeeze-pictures"}  # training files

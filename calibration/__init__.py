@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from calibration.compare.compare import compare_frames as compare_frames
     from calibration.errors import BadFrames as BadFrames
     from calibration.errors import CalibrationError as CalibrationError
+    from calibration.frame_normaliser import FrameNormaliser as FrameNormaliser
     from calibration.frame_set import Frame as Frame
     from calibration.frame_set import FrameSet as FrameSet
     from calibration.frame_set import read_frame_set as read_frame_set
@@ -38,7 +39,6 @@ if TYPE_CHECKING:
     from calibration.light.noise import measure_noise as measure_noise
     from calibration.markers.flow import MarkerFlow as MarkerFlow
     from calibration.markers.flow import find_markers as find_markers
-    from calibration.normaliser import FrameNormaliser as FrameNormaliser
     from calibration.normaliser import normaliser_for_calibration as normaliser_for_calibration
     from calibration.normaliser import normaliser_for_camera as normaliser_for_camera
     from calibration.normaliser import normaliser_for_pictures as normaliser_for_pictures

@@ -1,27 +1,21 @@
-"""Native frame -> canonical observation, the same for simulated, mock, real and recorded sensors.
-
-`normaliser_for_...` makes the one of a sensor; calibration/height says how a picture becomes a height.
-"""
+"""The normaliser of each kind of sensor: `normaliser_for_...`. What it does: calibration/frame_normaliser.py."""
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibration.bundle import BadBundle, Calibration, read_bundle
-from calibration.drift import MIN_CONTACT_AREA, DriftFinder, contact_area, size_of
 from calibration.errors import BadFrames
+from calibration.frame_normaliser import FrameNormaliser
 from calibration.height.colour_table import GradientModel, from_model
 from calibration.height.darkness import DarknessSlopes
 from calibration.height.forward_steps import ForwardSteps
 from calibration.height.slope_polynomial import PolynomialSlopes
-from calibration.height.surface_finder import SurfaceFinder, canonical_part, extended_view
+from calibration.height.surface_finder import SurfaceFinder, extended_view
 from calibration.lens.rectification import (
     Rectification,
     from_corners,
@@ -29,288 +23,15 @@ from calibration.lens.rectification import (
     from_view,
     seen_box,
 )
-from calibration.markers.flow import MarkerFlow, NoMarkers, require_no_markers
+from calibration.markers.flow import NoMarkers
 from calibration.markers.of_sensor import marker_flow, seen_by_dots
-from calibration.reference import (
-    LOST_COLOUR,
-    LOST_SLOPE,
-    STALE_COLOUR,
-    STALE_SLOPE,
-    Reference,
-    StaleReference,
-    UnusableReference,
-    channels_swapped,
-    exchanged,
-    make_reference,
-)
-from tacsim.control.contact_signal import CONTACT_DIFFERENCE, CONTACT_HEIGHT
-from tacsim.interface import SurfaceMap, TactileFrame, TactileObservation
 from tacsim.models.geometry import PictureRegion
 from tacsim.models.hardware import CameraSensorConfig
 from tacsim.models.rig import ReplaySensorConfig
 from tacsim.models.sensor import CanonicalGrid, SensorModel
-from tacsim.optics.grid import PixelGrid, canonical_cells, canonical_image
+from tacsim.optics.grid import PixelGrid, canonical_image
 
-DOT_LEVEL = 0.7  # of the mean: printed dots are darker
 BETTERED = 5  # format of bundles from which on the forward model betters heights: older ones give what they gave
-
-
-class NoReference(RuntimeError):
-    """A frame was to be normalised before a reference was taken."""
-
-
-class FrameNormaliser:
-    """Rectifies a frame, compares it with the reference, and finds where there is contact.
-
-    Height, gradient and flow are those of the source where it knows them (simulation). Otherwise they are found in the
-    picture: height and gradient by `find`, flow by `markers`; what is not found is None.
-    """
-
-    def __init__(
-        self,
-        rectify: Rectification,
-        grid: CanonicalGrid,
-        find: SurfaceFinder | None = None,
-        markers: MarkerFlow | None = None,
-        *,
-        drifts: bool = False,
-        untouched: NDArray[np.float32] | None = None,
-        dots: Callable[[NDArray[np.uint8]], tuple[Rectification, MarkerFlow]] | None = None,
-    ) -> None:
-        """`rectify` gives the canonical image, or for a `find` its wider view. drifts: the light is real and may
-        drift from its reference; a `find` measures that itself. untouched: what `rectify` gives of the picture without
-        contact that belongs to the calibration. dots: what takes the place of `rectify` and `markers` once it is given
-        the native picture (rows, columns, 3) of the first reference, whose dots say how large the gel is; it raises
-        UnusableReference where there are none."""
-        self._grid, self._find, self._dots = grid, find, dots
-        self._see_by(rectify, markers)
-        self._find_drift = DriftFinder(self._on_image.shape) if drifts and find is None else None
-        self._untouched = untouched
-        # Why the reference may show a contact, in words; None: it does not, or there is no picture to compare it with
-        self.reference_doubt: str | None = None
-        self._sought = False  # the last observation was found in a picture
-        self.reference: Reference | None = None  # the present one; None before the first
-        # Height and gradient, or flow, are found in pictures of sources that don't know their surface
-        self.finds_height, self.finds_flow = find is not None, markers is not None or dots is not None
-        # Share of the pixels of the last picture whose colour lies beyond the calibrated slopes: they get the nearest
-        # calibrated slope. 0 where nothing had to be found
-        self.beyond_range = 0.0
-        # Relative change of the untouched gel's colour since the reference [-], in the last picture with enough of it;
-        # and the mean slope [degrees] that this drift looks like. None before such a picture; no slope without height
-        self.drift: float | None = None
-        self.drift_slope: float | None = None
-
-    def _see_by(self, rectify: Rectification, markers: MarkerFlow | None) -> None:
-        grid = self._grid
-        shape = (grid.rows * grid.image_scale, grid.columns * grid.image_scale)
-        spare = [there - wanted for there, wanted in zip(rectify.valid.shape, shape, strict=True)]
-        odd = any(extra % (2 * grid.image_scale) for extra in spare)
-        if min(spare) < 0 or odd or (self._find is None and any(spare)):
-            raise ValueError(f"rectification gives {rectify.valid.shape} px, the canonical image has {shape}")
-        self._rectify, self._markers = rectify, markers
-        self._on_image: NDArray[np.bool_] = canonical_part(rectify.valid, grid)
-        self._off_image = np.nonzero(~self._on_image)
-        self._valid: NDArray[np.bool_] = np.asarray(_cells(self._on_image, grid).all(axis=(1, 3)), dtype=np.bool_)
-        self._valid.flags.writeable = False
-
-    @property
-    def shown(self) -> tuple[float, float]:
-        """x, y of the gel that the native picture shows, within its region [m]: the maps may show the middle alone."""
-        valid, pitch = self._rectify.valid, self._grid.pitch / self._grid.image_scale
-        down, across = (side.stop - side.start for side in seen_box(valid))
-        x, y = (
-            # what reaches the border of the view goes on beyond it; what ends before is all that a region lets be seen
-            size if (there + 2) * pitch >= min(size, whole * pitch) else there * pitch
-            for size, there, whole in zip(self._rectify.size, (across, down), valid.shape[::-1], strict=True)
-        )
-        return x, y
-
-    @property
-    def stale(self) -> bool:
-        """True when the reference is outdated: take a fresh one as soon as nothing touches."""
-        return (self.drift or 0.0) > STALE_COLOUR or (self.drift_slope or 0.0) > STALE_SLOPE
-
-    @property
-    def markers_seen(self) -> NDArray[np.bool_] | None:
-        """(rows, columns) markers that were seen in the last picture in which flow was sought; that of the others is
-        the mean of their neighbours'. None for a sensor whose flow is not found in pictures."""
-        return None if self._markers is None else self._markers.seen
-
-    @property
-    def kept(self) -> float:
-        """Share of the reference's markers seen in that picture. 1 where nothing had to be found."""
-        return 1.0 if self._markers is None else self._markers.kept
-
-    def take_reference(self, frame: TactileFrame) -> None:
-        """Makes `frame`, taken without contact, the reference I0, and its markers' places their rest. Raises
-        UnusableReference (the old one then stays), or ValueError for a frame of another shape."""
-        if self._dots is not None and self._markers is None:
-            self._see_by(*self._dots(frame.image))
-        rectified = self._rectify(frame.image)
-        # The mean is that of the canonical image's pixels, so that what a policy sees does not depend on whether height
-        # is found.
-        measured = np.zeros_like(self._rectify.valid)
-        canonical_part(measured, self._grid)[...] = self._on_image
-        # Dots are found as well beside glare, in a recording: a live arm stops by the colour of contacts, too.
-        colour = self._find is not None or self._markers is None or self._dots is not None
-        reference = make_reference(rectified, self._rectify.valid, measured, colour=colour)
-        if self._untouched is not None and exchanged(rectified, self._untouched, self._rectify.valid):
-            raise UnusableReference(
-                "red and blue are exchanged: the gel looks as in its calibration only with the channels in the other "
-                "order; give pictures in the order in which they were calibrated (this program's is RGB)"
-            )
-        self._doubt_reference(reference)
-        if self._markers is not None:
-            self._markers.take_reference(frame.image, frame.index)
-        elif self._find is not None:
-            require_no_markers(frame.image)
-        self.reference = reference
-        self.drift_slope = self.drift = None
-
-    def _doubt_reference(self, reference: Reference) -> None:
-        """Compares a new reference with the bundle's picture, and warns where it shows a contact."""
-        self.reference_doubt = None
-        if self._untouched is None:
-            return
-        valid = reference.valid
-        known = self._untouched / np.maximum(self._untouched[valid].mean(axis=0), 1.0)
-        dark = np.zeros_like(valid)
-        if self._markers is not None:  # printed dots need not lie where they lay
-            dark = _near_dots(reference.relative) | _near_dots(known)
-        area = contact_area(reference.relative - known, ~valid | dark, self._grid.pitch / self._grid.image_scale)
-        if area > MIN_CONTACT_AREA:
-            self.reference_doubt = (
-                f"the reference shows a contact of {area * 1e6:.1f} mm^2: it differs there from the picture without "
-                "contact that belongs to the calibration; take a reference of the free gel"
-            )
-            warnings.warn(self.reference_doubt, stacklevel=3)
-
-    def diagnostics(self) -> dict[str, float]:
-        """Quality of the last observation, where it was found in a picture, as far as it is known: `beyond`
-        (`beyond_range`), `drift`, `background` (`drift_slope`), `kept`, `stale` (0 or 1); and `touched_reference` (1)
-        where the reference shows a contact."""
-        if not self._sought:
-            return {}
-        known = {
-            "stale": float(self.stale),
-            "beyond": self.beyond_range if self.finds_height else None,
-            "drift": self.drift,
-            "background": self.drift_slope,
-            "kept": self.kept if self.finds_flow else None,
-            "touched_reference": None if self.reference_doubt is None else 1.0,
-        }
-        return {name: value for name, value in known.items() if value is not None}
-
-    def __call__(self, frame: TactileFrame, now: float) -> TactileObservation:
-        """The observation of `frame` at time `now` [s].
-
-        The drift of a real light (`drifts`) since the reference, one quadratic over the gel, is removed from image,
-        gradient and height, where enough of the gel is untouched to measure it.
-
-        Raises NoReference; StaleReference when the light is another; MarkersLost when too few markers are seen;
-        ValueError for a frame of another shape.
-        """
-        if self.reference is None:
-            raise NoReference("no reference yet: call take_reference with a frame without contact (Rig.reset does)")
-        self.beyond_range, self._sought = 0.0, False
-        seen = partial(_difference, self.reference, self._rectify, frame)
-        if frame.surface is None:
-            return self._found(frame, seen(), now)
-        surface = frame.surface
-        self._check(surface)
-        return TactileObservation(
-            image=lambda: _byte_image(canonical_part(seen(), self._grid)),
-            gradient=surface.gradient,
-            height=surface.height,
-            contact=(surface.height > CONTACT_HEIGHT) & self._valid,
-            valid=self._valid,
-            flow=surface.flow,
-            time=frame.time,
-            age=now - frame.time,
-            picture=lambda: frame.image,
-        )
-
-    def _found(self, frame: TactileFrame, seen: NDArray[np.float32], now: float) -> TactileObservation:
-        """All of it from the picture; seen: its difference from the reference."""
-        change: NDArray[np.float32] = canonical_part(seen, self._grid)
-        height, gradient, flow, drift = self._surface(frame, seen)
-        if drift is not None:
-            change = np.subtract(change, drift, out=drift)
-            change[self._off_image] = 0.0
-        return TactileObservation(
-            image=_byte_image(change),
-            gradient=gradient,
-            height=height,
-            contact=self._contact(change) if height is None else (height > CONTACT_HEIGHT) & self._valid,
-            valid=self._valid,
-            flow=flow,
-            time=frame.time,
-            age=now - frame.time,
-            picture=frame.image,
-        )
-
-    def _surface(self, frame: TactileFrame, change: NDArray[np.float32]) -> tuple[NDArray[np.float32] | None, ...]:
-        """Height, gradient and flow, and the drift that is to be taken off the canonical image."""
-        height = gradient = flow = removed = None
-        self._sought = any(part is not None for part in (self._find, self._markers, self._find_drift))
-        if self._find_drift is not None:
-            drift = self._find_drift(np.ascontiguousarray(np.moveaxis(change, -1, 0)), ~self._on_image)
-            if drift.measured:
-                self.drift = size_of(self._find_drift.at(drift))
-                removed = self._find_drift.part(drift, (0, 0), self._on_image.shape)
-        if self._find is not None:
-            assert self.reference is not None
-            found = self._find(change, self.reference.relative)
-            self.beyond_range = found.beyond_range
-            if found.drift is not None:
-                self.drift, self.drift_slope = found.drift, found.drift_slope
-            height, gradient, removed = found.height, found.gradient, found.removed_drift
-        if self.stale:
-            self._require_order(change)
-        self._require_light()
-        if self._markers is not None:
-            deep = None if height is None else (height, canonical_cells(self._grid))
-            flow = self._markers(frame.image, frame.index, deep)
-        return height, gradient, flow, removed
-
-    def _require_order(self, change: NDArray[np.float32]) -> None:
-        """Raises StaleReference for a picture with red and blue swapped, by its change (H, W, 3) from the reference."""
-        assert self.reference is not None
-        image = self.reference.image + change * self.reference.mean
-        if channels_swapped(image, self.reference.image, self.reference.valid):
-            raise StaleReference(
-                "red and blue are swapped: the untouched gel looks as in its reference only with the channels in the "
-                "other order; give frames and reference in one order (this program's is RGB)"
-            )
-
-    def _require_light(self) -> None:
-        """Raises StaleReference."""
-        for measured, limit, words in (
-            (self.drift_slope, LOST_SLOPE, "slopes of {:.0f} degrees"),
-            (self.drift, LOST_COLOUR, "{:.0%} of its colour"),
-        ):
-            if measured is not None and measured > limit:
-                raise StaleReference(
-                    f"the untouched gel differs from its reference by {words.format(measured)}, too much to measure by "
-                    "it. Is a lamp out, or the exposure another? If not, take a fresh reference (Rig.reset does)"
-                )
-
-    def _contact(self, change: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """(h, w) where the colour, averaged over a cell and its neighbours, differs from the reference: not in the
-        flat middle of a contact, which has the colour of the untouched gel."""
-        import cv2
-
-        cell = _cells(change, self._grid).mean(axis=(1, 3), dtype=np.float32)
-        calm = cv2.blur(cell, (3, 3))
-        return np.asarray(np.abs(calm).max(axis=2) > CONTACT_DIFFERENCE, dtype=np.bool_) & self._valid
-
-    def _check(self, surface: SurfaceMap) -> None:
-        shape = (self._grid.rows, self._grid.columns)
-        if surface.height.shape != shape or surface.gradient.shape != (*shape, 2):
-            raise ValueError(
-                f"frame.surface has height {surface.height.shape} and gradient {surface.gradient.shape}, the canonical "
-                f"grid is {shape}; sample it on the grid of the rig"
-            )
 
 
 def normaliser_for_simulation(
@@ -446,30 +167,3 @@ def _of_bundle(path: str, image_shape: tuple[int, int], grid: CanonicalGrid) -> 
             "width and height of the sensor to those of the calibration, or calibrate again at this setting"
         )
     return normaliser_for_calibration(calibration, grid, untouched)
-
-
-def _difference(reference: Reference, rectify: Rectification, frame: TactileFrame) -> NDArray[np.float32]:
-    """(H, W, 3) relative change of the rectified picture."""
-    return reference.difference(rectify(frame.image))
-
-
-def _byte_image(change: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """(H, W, 3) clip(128 + 128 change), rounded; no change is exactly 128."""
-    import cv2
-
-    # cv2 takes the absolute value before it saturates: what is below -1 would be folded up
-    return np.asarray(cv2.convertScaleAbs(np.maximum(change, np.float32(-1.0)), alpha=128.0, beta=128.0))
-
-
-def _near_dots(relative: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """(H, W) pixels of an image (H, W, 3), relative to its mean, that printed dots darken, and those beside."""
-    import cv2
-
-    dark = (relative.max(axis=2) < DOT_LEVEL).astype(np.uint8)
-    return np.asarray(cv2.dilate(dark, np.ones((5, 5), dtype=np.uint8)), dtype=np.bool_)
-
-
-def _cells(pixels: NDArray[Any], grid: CanonicalGrid) -> NDArray[Any]:
-    """(h, scale, w, scale, ...) view of canonical pixels (H, W, ...), cell by cell."""
-    scale = grid.image_scale
-    return pixels.reshape(grid.rows, scale, grid.columns, scale, *pixels.shape[2:])

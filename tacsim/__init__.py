@@ -53,6 +53,8 @@ if TYPE_CHECKING:
     from tacsim.models.hardware import Placement as Placement
     from tacsim.models.hardware import UrArmConfig as UrArmConfig
     from tacsim.models.hardware import Workspace as Workspace
+    from tacsim.models.material import BodyMaterial as BodyMaterial
+    from tacsim.models.material import GelMaterial as GelMaterial
     from tacsim.models.quantity import Length as Length
     from tacsim.models.randomisation import Randomisation as Randomisation
     from tacsim.models.rig import KneadConfig as KneadConfig
@@ -65,11 +67,9 @@ if TYPE_CHECKING:
     from tacsim.models.rig import SqueezeConfig as SqueezeConfig
     from tacsim.models.rig import TaskConfig as TaskConfig
     from tacsim.models.scene import Body as Body
-    from tacsim.models.scene import BodyMaterial as BodyMaterial
     from tacsim.models.scene import Box as Box
     from tacsim.models.scene import Cylinder as Cylinder
     from tacsim.models.scene import Gel as Gel
-    from tacsim.models.scene import GelMaterial as GelMaterial
     from tacsim.models.scene import GelSurface as GelSurface
     from tacsim.models.scene import Indenter as Indenter
     from tacsim.models.scene import Mesh as Mesh

@@ -9,7 +9,8 @@ import numpy as np
 from benchmarks.harness.measure import Measurement, timed
 from benchmarks.harness.runner import Case
 from tacsim.interface import Pose
-from tacsim.models.scene import Body, BodyMaterial, Box, Gel, Scene, Settling
+from tacsim.models.material import BodyMaterial
+from tacsim.models.scene import Body, Box, Gel, Scene, Settling
 from tacsim.physics.world import World, make_world
 
 FRICTION = 0.5

@@ -15,7 +15,8 @@ from benchmarks.harness.runner import Case
 from benchmarks.truth import laws
 from benchmarks.truth.clay import CLAY, COURANT, uniaxial_stress
 from tacsim.interface import FloatArray
-from tacsim.models.scene import Body, BodyMaterial, Box, Gel, GelMaterial, Scene
+from tacsim.models.material import BodyMaterial, GelMaterial
+from tacsim.models.scene import Body, Box, Gel, Scene
 from tacsim.physics.move import MoveStats
 
 RIGID = GelMaterial(youngs_modulus=100e6, poisson_ratio=0.45)  # gels as plates: they give 1 um

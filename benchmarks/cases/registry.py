@@ -18,6 +18,7 @@ from benchmarks.cases import (
     press,
     random_steps,
     scenes,
+    slide,
     slow_limit,
     squeeze,
 )
@@ -39,6 +40,7 @@ from benchmarks.harness.schema import Group
 
 CASES: tuple[Case, ...] = (
     *press.CASES,
+    *slide.CASES,
     *squeeze.CASES,
     *cycles.CASES,
     *random_steps.CASES,

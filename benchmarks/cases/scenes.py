@@ -25,7 +25,8 @@ from benchmarks.cases.squeeze import (
 )
 from benchmarks.harness.measure import Measurement, Timing, timed
 from benchmarks.harness.runner import Case
-from tacsim.models.scene import Body, BodyMaterial, Box, Cylinder, Mesh, Scene, Shape, Sphere
+from tacsim.models.material import BodyMaterial
+from tacsim.models.scene import Body, Box, Cylinder, Mesh, Scene, Shape, Sphere
 from tacsim.physics.move import MoveStats
 from tacsim.physics.world import World, make_world
 

@@ -14,7 +14,8 @@ from benchmarks.truth.gap import gaps
 from benchmarks.truth.roughness import print_roughness
 from tacsim.compute.threads import map_parallel
 from tacsim.interface import Pose
-from tacsim.models.scene import Body, BodyMaterial, Box, Preset, Scene, Settling
+from tacsim.models.material import BodyMaterial
+from tacsim.models.scene import Body, Box, Preset, Scene, Settling
 from tacsim.physics.move import MoveStats
 from tacsim.physics.world import World, make_world
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tacsim.models.scene import BodyMaterial
+from tacsim.models.material import BodyMaterial
 
 CLAY = BodyMaterial(youngs_modulus=0.5e6, poisson_ratio=0.45, yield_stress=30e3)
 COURANT = 0.4

@@ -29,6 +29,17 @@ class CommandKind(IntEnum):
     GO_ON = 4  # along the way to the start; only an arm that was opened for it takes this
 
 
+@dataclass(frozen=True, slots=True)
+class Timing:
+    """How the servo loop kept time, over its last 500 periods."""
+
+    median: float  # of the period [s]
+    p99: float
+    longest: float
+    overruns: int  # missed periods of this worker
+    cycles: int  # periods of this worker
+
+
 # One controller package and the worker's judgement of it. Written every period, and again as soon as a fault is found.
 STATE = np.dtype(
     [

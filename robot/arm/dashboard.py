@@ -82,6 +82,21 @@ class Dashboard(Closing):
         if self.ask("is in remote control").lower() == "false":
             raise DeviceError(f"{who}: the pendant has local control; switch it to remote control (top right corner)")
 
+    def require_identity(self, name: str, model: str, serial: str | None, refused_serial: str | None) -> None:
+        """Raises DeviceNotConnectedError unless the robot is the one that the file of the arm `name` describes: by its
+        model, by its `serial` number where one is given, and not that of a mock where one is refused."""
+        found = self.serial()
+        if found == refused_serial:
+            raise DeviceNotConnectedError(f"{self.host} is a mock controller, but arm '{name}' has no `mock:` block")
+        if serial not in (None, found):
+            raise DeviceNotConnectedError(
+                f"the robot at {self.host} has the serial number {found}, but the file of arm '{name}' says "
+                f"serial: {serial}; is it the right robot?"
+            )
+        reported = self.model()
+        if reported is not None and not model.startswith(reported):
+            raise DeviceNotConnectedError(f"arm '{name}' is a {reported.upper()}, but its file says model: {model}")
+
     def unlock(self, who: str) -> None:
         """Releases a protective stop. Raises EmergencyStop for any other stop, ProtectiveStop if it cannot be done."""
         deadline = time.monotonic() + UNLOCK_PATIENCE

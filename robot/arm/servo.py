@@ -30,7 +30,7 @@ import numpy as np
 from robot.arm.channel import CommandKind, WorkerConfig
 from robot.arm.following import FollowingMonitor, SpeedScaling, is_standing
 from robot.arm.shared_ring import Record
-from robot.arm.status import ArmStatus
+from robot.arm.status import ArmStatus, is_healthy
 from robot.arm.trajectory import (
     PERIOD,
     MotionState,
@@ -43,7 +43,7 @@ from robot.arm.trajectory import (
     stopping_point,
     towards,
 )
-from robot.common.kinematics import Kinematics, inverse_frame, rotation, rotation_vector
+from robot.common.kinematics import Kinematics, SingularityGuard, inverse_frame, rotation, rotation_vector
 from robot.common.tcp import Measured
 from tacsim.interface import FloatArray
 from tacsim.limits import (
@@ -60,10 +60,6 @@ from tacsim.limits import (
 FAULT_DECELERATION = 5.0  # minimum deceleration after a fault [m/s^2]
 FAULT_TURN_DECELERATION = 50.0  # the same for rotations [rad/s^2]
 ALLOWED_OVERSHOOT = 0.5e-3  # how far outside its region the arm itself may come to rest; the target never leaves it [m]
-LEAST_SINGULAR_VALUE = 0.02  # of the Jacobian, lengths in reaches; below it the arm may only move away
-# Bound on the change of the least singular value for each radian that a joint turns: each of the six columns has a
-# length of at most sqrt(2) in these units, and turns with the joints before it.
-MAX_SINGULAR_VALUE_RATE = math.sqrt(12.0)
 PUSHED_AWAY, PUSHED_AWAY_TURN = 0.2e-3, 2e-3  # an arm farther than this from its held pose was moved [m, rad]
 LOOP_OFFSET = 2 * PERIOD  # between the loops of two arms [s]
 ZERO_PATIENCE = 0.5  # a wish to zero the wrench that is older is dropped [s]
@@ -91,8 +87,7 @@ class Servo:
         self._goal_time = -math.inf
         self._rates: Rates = config  # of the way to the goal
         self._tactile_read, self._exposed = tactile_read, math.nan  # reports read; exposure of the oldest picture [s]
-        # joints, and their margin to a singularity
-        self._last_singularity_check: tuple[FloatArray, float] | None = None
+        self._singularity = SingularityGuard(self.kinematics)
         self._hard = (
             max(FAULT_DECELERATION, config.acceleration),
             max(FAULT_TURN_DECELERATION, config.turn_acceleration),
@@ -363,18 +358,7 @@ class Servo:
         joints = self.kinematics.inverse(wanted @ controller_from_model, self._sent)
         if joints is None or joint_step_excess(self._sent, joints, self.config.joint_speed, PERIOD) > 1.0:
             return None
-        return None if self._nears_singularity(joints) else joints
-
-    def _nears_singularity(self, joints: FloatArray) -> bool:
-        """True if `joints` are too near to a singularity, and nearer than the joints sent last."""
-        assert self._sent is not None
-        if self._last_singularity_check is not None:
-            joints_then, margin_then = self._last_singularity_check
-            if MAX_SINGULAR_VALUE_RATE * float(np.abs(joints - joints_then).sum()) < margin_then:
-                return False
-        distance = self.kinematics.singularity(joints)
-        self._last_singularity_check = joints, distance - LEAST_SINGULAR_VALUE
-        return distance < LEAST_SINGULAR_VALUE and distance < self.kinematics.singularity(self._sent)
+        return None if self._singularity.is_nearer(joints, self._sent) else joints
 
     def _gaps(
         self, motion: MotionState, partners: Sequence[Record | None], end: FloatArray | None = None
@@ -405,11 +389,3 @@ class Servo:
         share = min(inside, longest / max(way, longest), most / max(angle, most))
         if share < 1.0:
             self._goal = start.position + share * (end - start.position), rotation(share * turn) @ start.rotation
-
-
-def is_healthy(other: Record | None) -> bool:
-    """True if the state of the other arm of a keep-out is known and without a fault."""
-    if other is None:
-        return False
-    status = ArmStatus(int(other["status"]))
-    return not status.is_fault and status != ArmStatus.CONNECTING

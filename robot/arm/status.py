@@ -117,3 +117,11 @@ def status_of(record: Record | None, exit_status: int | None, patience: float, *
         return ArmStatus.LINK_LOST if lost or last == ArmStatus.LINK_LOST else ArmStatus.WORKER_DEAD
     fresh = time.monotonic() <= max(float(record["time"]) + patience, float(record["busy_until"]))
     return last if fresh else ArmStatus.LINK_LOST
+
+
+def is_healthy(other: Record | None) -> bool:
+    """True if the state of the other arm of a keep-out is known and without a fault."""
+    if other is None:
+        return False
+    status = ArmStatus(int(other["status"]))
+    return not status.is_fault and status != ArmStatus.CONNECTING

@@ -11,7 +11,7 @@ import math
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from robot.arm.channel import (
     Channel,
     CommandKind,
     Partner,
+    Timing,
     command_record,
     segment_of,
     tactile_record,
@@ -56,17 +57,6 @@ PARTNER_PATIENCE = 0.5  # how long a command waits for the state of the other ar
 REST_SPEED, REST_TURN = 1e-3, 10e-3  # an arm slower than this is at rest [m/s, rad/s]
 _open: set[str] = set()  # names of the arms that are open in this process
 _opening = threading.Lock()
-
-
-@dataclass(frozen=True, slots=True)
-class Timing:
-    """How the servo loop kept time, over its last 500 periods."""
-
-    median: float  # of the period [s]
-    p99: float
-    longest: float
-    overruns: int  # missed periods of this worker
-    cycles: int  # periods of this worker
 
 
 class URArm(Closing):

@@ -26,10 +26,10 @@ import numpy as np
 from robot.arm.channel import STATE, WINDOW, Channel, WorkerConfig
 from robot.arm.confinement import TimeLimit, allow_time_limits, last_connections
 from robot.arm.dashboard import Dashboard
-from robot.arm.servo import Servo, is_healthy
+from robot.arm.servo import Servo
 from robot.arm.shared_ring import Segment
 from robot.arm.start_servo import StartServo
-from robot.arm.status import ArmStatus
+from robot.arm.status import ArmStatus, is_healthy
 from robot.arm.trajectory import PERIOD
 from robot.common.kinematics import Kinematics, displacement, matrix
 from robot.common.process import Lifeline, Parent
@@ -107,7 +107,7 @@ class Worker:
                     f"no controller at {config.host}: port {port} ({what}): {failure}; is it on, and the address right?"
                 ) from failure
         with Dashboard(config.host, PROBE_TIMEOUT) as dashboard:
-            self._check_identity(dashboard)
+            dashboard.require_identity(config.name, config.model, config.serial, config.refused_serial)
             dashboard.require_ready(f"arm '{config.name}'")
         try:
             import rtde_control
@@ -151,24 +151,6 @@ class Worker:
             raise DeviceNotConnectedError(
                 f"arm '{config.name}': the controller at {config.host} closed the connection; look why, then try again"
             ) from failure
-
-    def _check_identity(self, dashboard: Dashboard) -> None:
-        config = self.config
-        serial = dashboard.serial()
-        if serial == config.refused_serial:
-            raise DeviceNotConnectedError(
-                f"{config.host} is a mock controller, but arm '{config.name}' has no `mock:` block"
-            )
-        if config.serial not in (None, serial):
-            raise DeviceNotConnectedError(
-                f"the robot at {config.host} has the serial number {serial}, but the file of arm '{config.name}' says "
-                f"serial: {config.serial}; is it the right robot?"
-            )
-        model = dashboard.model()
-        if model is not None and not config.model.startswith(model):
-            raise DeviceNotConnectedError(
-                f"arm '{config.name}' is a {model.upper()}, but its file says model: {config.model}"
-            )
 
     def _set(self, what: str, method: Any, *arguments: Any) -> None:
         if not method(*arguments):

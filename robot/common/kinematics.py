@@ -24,6 +24,10 @@ if TYPE_CHECKING:
 
 JOINT_RANGE = 2 * math.pi  # joints turn from -JOINT_RANGE to +JOINT_RANGE (all e-Series user manuals)
 TOLERANCE = 1e-10  # of the inverse [m, rad]
+LEAST_SINGULAR_VALUE = 0.02  # of the Jacobian, lengths in reaches; below it the arm may only move away
+# Bound on the change of the least singular value for each radian that a joint turns: each of the six columns has a
+# length of at most sqrt(2) in these units, and turns with the joints before it.
+MAX_SINGULAR_VALUE_RATE = math.sqrt(12.0)
 
 
 @dataclass(frozen=True)
@@ -280,6 +284,24 @@ class Kinematics:
             if not max(abs(now - before) for now, before in zip(q.tolist(), begin, strict=True)) < 0.5:
                 return None
         return None
+
+
+class SingularityGuard:
+    """Judges joints by their distance to a singularity; spares its computation while the last result suffices."""
+
+    def __init__(self, kinematics: Kinematics) -> None:
+        self._kinematics = kinematics
+        self._last_check: tuple[FloatArray, float] | None = None  # joints, and their margin to a singularity
+
+    def is_nearer(self, joints: FloatArray, sent: FloatArray) -> bool:
+        """True if `joints` (6,) are too near to a singularity, and nearer than the joints (6,) `sent` last."""
+        if self._last_check is not None:
+            joints_then, margin_then = self._last_check
+            if MAX_SINGULAR_VALUE_RATE * float(np.abs(joints - joints_then).sum()) < margin_then:
+                return False
+        distance = self._kinematics.singularity(joints)
+        self._last_check = joints, distance - LEAST_SINGULAR_VALUE
+        return distance < LEAST_SINGULAR_VALUE and distance < self._kinematics.singularity(sent)
 
 
 def _nearest_turns(q: FloatArray, seed: Sequence[float] | FloatArray) -> FloatArray:

@@ -7,7 +7,8 @@ from collections.abc import Callable, Mapping
 from contextlib import ExitStack, closing
 
 from calibration.errors import error_context
-from calibration.normaliser import FrameNormaliser, normaliser_for_camera, normaliser_for_simulation
+from calibration.frame_normaliser import FrameNormaliser
+from calibration.normaliser import normaliser_for_camera, normaliser_for_simulation
 from robot.arm.ur import URArm
 from robot.arm.worker_config import check_host
 from robot.camera.camera import Camera

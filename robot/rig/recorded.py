@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from calibration.bundle import read_sensor_model
 from calibration.errors import CalibrationError, error_context
+from calibration.frame_normaliser import FrameNormaliser
 from calibration.markers.flow import MarkersLost, find_markers
 from calibration.markers.lattice import NoLattice
-from calibration.normaliser import FrameNormaliser, normaliser_for_camera
+from calibration.normaliser import normaliser_for_camera
 from calibration.reference import StaleReference
 from robot.rig.replay_rig import recorded_normaliser, recorded_rig, rig_of
 from tacsim.config.errors import ConfigError

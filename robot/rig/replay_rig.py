@@ -12,12 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.errors import error_context
-from calibration.normaliser import (
-    FrameNormaliser,
-    normaliser_for_camera,
-    normaliser_for_recording,
-    normaliser_for_simulation,
-)
+from calibration.frame_normaliser import FrameNormaliser
+from calibration.normaliser import normaliser_for_camera, normaliser_for_recording, normaliser_for_simulation
 from robot.rig import RIG_ATTACHMENT, CannotOpen
 from tacsim.config import load_rig
 from tacsim.interface import Normaliser, TactileFrame

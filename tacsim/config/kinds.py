@@ -15,9 +15,10 @@ from pydantic_core import core_schema
 
 from tacsim.config.bundle import FILE, OWN, is_bundle, own_names
 from tacsim.config.errors import did_you_mean
+from tacsim.models.material import BodyMaterial, GelMaterial
 from tacsim.models.randomisation import Randomisation
 from tacsim.models.rig import TASKS, RigConfig, any_task
-from tacsim.models.scene import BodyMaterial, GelMaterial, Scene
+from tacsim.models.scene import Scene
 from tacsim.models.sensor import SensorModel
 from tacsim.models.training import Training
 

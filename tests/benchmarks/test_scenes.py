@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from benchmarks.cases import large_strain, press, scenes, squeeze
+from benchmarks.cases import large_strain, scenes, slide, squeeze
 from benchmarks.cases.squeeze import close, squeeze_scene, world_in_contact
 from tacsim.interface import Pose
 from tacsim.physics.failure.health import SimulationDiverged
@@ -86,12 +86,12 @@ def test_a_sheared_body_rests_where_it_is() -> None:
 
 @pytest.mark.deep
 def test_the_plate_slides_until_friction_is_built_up() -> None:
-    (row,) = press.sliding_force(1e-3, 1)
+    (row,) = slide.sliding_force(1e-3, 1)
     assert row.figures["way_mm"] >= 2
     assert row.error < 1.0 and row.note == ""
 
 
 def test_a_plate_that_has_not_slid_far_enough_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(press, "SLIDES", 1)
-    (row,) = press.sliding_force(1e-3, 1)
+    monkeypatch.setattr(slide, "SLIDES", 1)
+    (row,) = slide.sliding_force(1e-3, 1)
     assert "still changes after 0.5 mm" in row.note and row.error > 20

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from calibration.drift import STRIDE, Drift, DriftFinder
+from calibration.frame_normaliser import FrameNormaliser
 from calibration.height.slope_polynomial import to_normal
 from calibration.light.fit import normal_angle
 from calibration.normaliser import (
-    FrameNormaliser,
     normaliser_for_calibration,
     normaliser_for_camera,
     normaliser_for_pictures,

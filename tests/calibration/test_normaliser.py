@@ -2,7 +2,8 @@ import cv2
 import numpy as np
 import pytest
 
-from calibration.normaliser import FrameNormaliser, NoReference, normaliser_for_recording, normaliser_for_simulation
+from calibration.frame_normaliser import FrameNormaliser, NoReference
+from calibration.normaliser import normaliser_for_recording, normaliser_for_simulation
 from calibration.reference import UnusableReference
 from tacsim.control.contact_signal import contact_signal
 from tacsim.interface import SurfaceMap, TactileFrame

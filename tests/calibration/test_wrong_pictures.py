@@ -7,9 +7,10 @@ import warnings
 import numpy as np
 import pytest
 
+from calibration.frame_normaliser import FrameNormaliser
 from calibration.frame_set import Frame, FrameSet, frame_warnings, touched_untouched
 from calibration.light.calibrator import calibrate_light
-from calibration.normaliser import FrameNormaliser, normaliser_for_calibration
+from calibration.normaliser import normaliser_for_calibration
 from calibration.reference import StaleReference
 from tacsim.interface import TactileFrame
 from tacsim.models.sensor import CanonicalGrid

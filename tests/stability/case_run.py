@@ -25,7 +25,7 @@ from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.physics.move import MoveStats
 from tacsim.physics.seed import world as seed_world
 from tacsim.physics.world import World, make_world
-from tacsim.physics.worlds import fem, hybrid, press
+from tacsim.physics.worlds import fem, hybrid_inertia, press
 from tacsim.physics.worlds.base import RETRIES
 
 
@@ -62,7 +62,7 @@ def run(name: str, physics: str) -> Outcome:
     while name == "endless":
         time.sleep(1.0)
     case = CASES[name]
-    modules = {"fem": fem, "hybrid": hybrid, "press": press, "seed": seed_world}
+    modules = {"fem": fem, "hybrid_inertia": hybrid_inertia, "press": press, "seed": seed_world}
     with ExitStack() as stack:
         for target, value in case.patch.items():
             module, _, attribute = target.partition(".")

@@ -30,19 +30,8 @@ from case_motions import (
     twist,
 )
 
-from tacsim.models.scene import (
-    Body,
-    BodyMaterial,
-    Box,
-    Cylinder,
-    Gel,
-    GelMaterial,
-    Indenter,
-    Mesh,
-    Scene,
-    Settling,
-    Sphere,
-)
+from tacsim.models.material import BodyMaterial, GelMaterial
+from tacsim.models.scene import Body, Box, Cylinder, Gel, Indenter, Mesh, Scene, Settling, Sphere
 from tacsim.physics.worlds.base import RETRIES
 
 GEL = Gel(size=(10e-3, 10e-3, 4e-3))
@@ -112,8 +101,8 @@ def with_nan(times: int) -> dict[str, Any]:
     return {"fem.copies": times, "seed.copies": times}
 
 
-SHORT = {"hybrid.COURANT": 0.3, "press.COURANT": 0.3, "seed.COURANT": 0.3}
-TOO_LONG = {"hybrid.COURANT": 1.2, "press.COURANT": 1.2, "seed.COURANT": 1.5}
+SHORT = {"hybrid_inertia.COURANT": 0.3, "press.COURANT": 0.3, "seed.COURANT": 0.3}
+TOO_LONG = {"hybrid_inertia.COURANT": 1.2, "press.COURANT": 1.2, "seed.COURANT": 1.5}
 RUSHED = Settling(mach=0.1, tolerance=1e-2, max_substeps=600, flow_mach=0.15)
 USUAL = Settling(tolerance=1e-2, max_substeps=800)
 PATIENT = Settling(mach=0.1, tolerance=1e-2)

@@ -19,7 +19,8 @@ from benchmarks.harness.measure import Measurement, timed
 from benchmarks.harness.runner import Case
 from calibration.light.circle import NoCircle, contact_circle
 from tacsim.interface import Pose
-from tacsim.models.scene import Gel, GelMaterial, Indenter, Scene, Settling, Sphere
+from tacsim.models.material import GelMaterial
+from tacsim.models.scene import Gel, Indenter, Scene, Settling, Sphere
 from tacsim.physics.move import MoveStats
 from tacsim.physics.world import World, make_world
 

@@ -30,7 +30,7 @@ from benchmarks.cases.real.labels import (
 )
 from benchmarks.harness.measure import Measurement, Timing
 from benchmarks.harness.runner import Case
-from tacsim.models.scene import GelMaterial
+from tacsim.models.material import GelMaterial
 
 if TYPE_CHECKING:
     from calibration.light.fit import LightFit

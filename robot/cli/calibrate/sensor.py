@@ -12,21 +12,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from robot.cli.calibrate.bundle_output import FRAMES, UNKNOWN, write_calibration
+from robot.cli.calibrate.light_fit import find_lattice, fit_light, read_presses, straighten
 from robot.cli.calibrate.session import confirm_free_gel, led, named_camera, picture_keeper
-from robot.cli.errors import UNTRUSTED
 from robot.cli.options import Out, Overrides, length, quantities, quantity
-from robot.cli.output import busy, new_directory, notes, results, warn
+from robot.cli.output import new_directory, notes, warn
 
 if TYPE_CHECKING:
     from calibration.frame_set import FrameSet
     from calibration.lens.view import Corners, GelView
-    from calibration.light.fit import LightFit
     from calibration.profiles import SensorProfile
     from tacsim.models.geometry import PictureRegion
     from tacsim.models.hardware import CameraSensorConfig
-    from tacsim.models.sensor import Markers
-
-MAX_PRESSES = 200  # 5 to 8 are enough
 
 calibrate = typer.Typer(no_args_is_help=True, help="Calibrate what stands behind a rig.")
 
@@ -145,12 +141,12 @@ def _calibrate(
         read = _take_presses(camera, config, name, asked, presses, seen, pitch)
     else:
         assert frames is not None
-        read = _read(frames, reference)
+        read = read_presses(frames, reference)
         _require_frames(asked.depths, [frame.name for frame in read.frames])
         seen, pitch = _calibrated(asked, read.shape)
-    read = _straightened(read, asked.region, seen)
-    found = _markers(read, pitch) if asked.markers else None
-    fit = _fitted(read, asked.ball / pitch, None if found is None else found.radius / pitch)
+    read = straighten(read, asked.region, seen)
+    found = find_lattice(read, pitch) if asked.markers else None
+    fit = fit_light(read, asked.ball / pitch, None if found is None else found.radius / pitch)
     from calibration.light.verdict import KnownScale
 
     published = asked.pitch is None and asked.view is None and asked.size is None
@@ -256,44 +252,6 @@ def _region(text: str) -> PictureRegion:
     return tuple((u, v) for u, v in points)
 
 
-def _read(frames: Path, reference: Path | None) -> FrameSet:
-    with busy("loading"):
-        from calibration.frame_set import read_folder
-    read = read_folder(frames, reference, MAX_PRESSES)
-    if read.estimated:
-        notes.print("no picture without contact: the median of all presses stands for it")
-    return read
-
-
-def _straightened(read: FrameSet, region: PictureRegion | None, view: GelView | None) -> FrameSet:
-    """Native pictures as they are calibrated: even beyond the region, and metric."""
-    from calibration.frame_set import rectified_by_view, within_region
-
-    if region is not None:
-        read = within_region(read, region)
-    return read if view is None else rectified_by_view(read, view)
-
-
-def _fitted(read: FrameSet, ball: float, dot: float | None) -> LightFit:
-    """`ball`, `dot`: radii [px]. Exits with UNTRUSTED where the light tells nothing."""
-    with busy("loading"):
-        from calibration.light.calibrator import NoDirection, calibrate_light
-        from calibration.markers.dots import DotEraser
-    named = [(frame.name, frame.image) for frame in read.frames]
-    try:
-        with busy(f"calibrating from {len(named)} press{'es' * (len(named) > 1)}"):
-            erase = None if dot is None else DotEraser(dot)
-            more = [frame.image for frame in read.untouched]
-            return calibrate_light(read.reference, named, ball, erase, more)
-    except NoDirection as why:
-        from calibration.light.verdict import GREY, is_grey
-
-        grey = f"; {GREY}: give the camera's own, in colour" if is_grey(read.reference) else ""
-        notes.print(f"{why}{grey}", markup=False)
-        results.print("verdict: do not trust; no bundle is written")
-        raise typer.Exit(UNTRUSTED) from None
-
-
 def _known_depth(text: str) -> tuple[str, float]:
     name, equals, depth = text.rpartition("=")
     if not equals:
@@ -392,20 +350,3 @@ def _take_presses(
     taken = tuple(Frame(name, image) for name, image in session.taken)
     more = tuple(Frame(f"background_{k}.png", image) for k, image in enumerate(untouched[:-1], start=1))
     return FrameSet(camera, untouched[-1], "background.png", taken, more)
-
-
-def _markers(read: FrameSet, pitch: float) -> Markers:
-    """The lattice of dots in the picture without contact."""
-    from calibration.markers.flow import find_markers
-    from calibration.markers.lattice import NoLattice
-    from tacsim.models.sensor import Markers
-
-    try:
-        lattice, radius = find_markers(read.reference)
-    except NoLattice as nothing:
-        raise typer.BadParameter(
-            f"{nothing}; leave --markers out if none are printed", param_hint="--markers"
-        ) from None
-    rows, columns = lattice.present.shape
-    places = tuple(tuple((float(x), float(y)) for x, y in row) for row in lattice.positions * pitch)
-    return Markers(rows=rows, columns=columns, pitch=lattice.pitch * pitch, radius=radius * pitch, places=places)

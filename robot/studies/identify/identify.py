@@ -17,7 +17,8 @@ from calibration.materials.presses import Noise, Press, gathered, signals_of, th
 from robot.studies.identify.recordings import Recordings
 from robot.studies.identify.simulation import Simulation, coarser, scene_with
 from tacsim.interface import FloatArray
-from tacsim.models.scene import Scene, lame
+from tacsim.models.material import lame
+from tacsim.models.scene import Scene
 
 Kind = Literal["gel", "body"]
 UNWEIGHED = (

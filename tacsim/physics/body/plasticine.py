@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tacsim.models.scene import BodyMaterial, lame
+from tacsim.models.material import BodyMaterial, lame
 from tacsim.physics.body.followers import Links, links, node_masses
 from tacsim.physics.body.material import ELASTIC
 from tacsim.physics.exec import layout

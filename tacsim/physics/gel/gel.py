@@ -12,7 +12,8 @@ from functools import partial
 
 import numpy as np
 
-from tacsim.models.scene import Gel, GelSurface, lame
+from tacsim.models.material import lame
+from tacsim.models.scene import Gel, GelSurface
 from tacsim.physics.exec.lanes import COPIES, LANES, ON_DEVICE, PARTS, aligned_zeros, padded
 from tacsim.physics.exec.layout import (
     ELEMENTS,

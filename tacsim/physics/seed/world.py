@@ -19,7 +19,8 @@ from scipy.spatial.transform import Rotation
 from tacsim.compute.runtime import launching, start
 from tacsim.geometry.sampling import body_points
 from tacsim.interface import Pose, Truth
-from tacsim.models.scene import FASTEST_MACH, BodyMaterial, Gel, GelMaterial, GelSurface, Scene, lame
+from tacsim.models.material import BodyMaterial, GelMaterial, lame
+from tacsim.models.scene import FASTEST_MACH, Gel, GelSurface, Scene
 from tacsim.physics.body.material import ELASTIC
 from tacsim.physics.exec.layout import NUMBERS
 from tacsim.physics.failure.health import Health, LaunchSpan, SimulationDiverged, check_launch, require_room

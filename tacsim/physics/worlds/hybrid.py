@@ -21,29 +21,21 @@ from tacsim.physics.body.plasticine import (
     fit_grid,
 )
 from tacsim.physics.body.surface import surface_points
-from tacsim.physics.contact.contact import MEMORY_RATE
 from tacsim.physics.contact.gel_overlap import apart, gel_overlap
 from tacsim.physics.exec.lanes import NODES
 from tacsim.physics.exec.layout import (
     BACKING,
-    BODY_DAMPING,
     BODY_MASS,
     CARRIED,
     CENTRE,
     EVERY,
-    FILTERED,
     FORCE,
     FRICTION,
-    GEL_DAMPING,
-    GEL_DENSITY,
-    GRAVITY,
     GREEN,
     HOUSING,
     HOUSING_FORCE,
     INVERSE_INERTIA,
-    MEMORY,
     OVERLAP,
-    OWN,
     RECORDS,
     REFERENCE_CENTRE,
     RIGID_MASS_SCALE,
@@ -69,47 +61,25 @@ from tacsim.physics.motion.controller import (
     PreparedLaunch,
     force_floor,
 )
-from tacsim.physics.motion.inertia import Inertia, kernel_density, kernel_second
+from tacsim.physics.motion.inertia import Inertia
 from tacsim.physics.motion.path import PEAK_BRAKING, SHORT_PATH, SHORT_SLIDE, Path, path_along, path_length, plan
 from tacsim.physics.move import MIN_LAYERS, MoveCommand, MoveStats, warn_of_few_layers
 from tacsim.physics.snapshot import State
 from tacsim.physics.units import MM, MPA
 from tacsim.physics.worlds.fem import FemWorld
+from tacsim.physics.worlds.hybrid_inertia import FILTERED_RIGID, LIGHTER_GEL, HybridInertia
 from tacsim.physics.worlds.hybrid_state import CLEARANCE, HybridState
 from tacsim.pose import HALF_TURN_X
 
-# dt / (smallest spacing / wave speed). At 0.8 the contact of body and gel fails, without a NaN.
-COURANT = 0.5
-# Damping of a driven motion falsifies its path, since gels yield and the body spreads; damping of the hold does not.
-ZETA_GEL, ZETA_GEL_HELD = 0.8, 1.6  # zeta in rate = zeta c / thickness
-ZETA_BODY, ZETA_BODY_HELD = 0.6, 1.2  # zeta in rate = zeta c / gel thickness, against the driven affine motion
-ZETA_YIELDING_HELD = 0.3  # of a held body that yields: what creeps has only this drag to overcome
-# Of a gel whose shear wave is at least so fast, over its pressure wave (nu 0.48): a nearly incompressible one gives way
-# with that wave, and is damped less in proportion, or it creeps
-FULLY_DAMPED = 0.196
-# Of a path that mostly goes along the gels, and drags a body: one that swings beyond where it is led keeps that
-DRAGGING, ZETA_GEL_DRAGGED, ZETA_BODY_DRAGGED = 0.5, 1.6, 1.2
+DRAGGING = 0.5  # least share of a path that goes along the gels: it drags the body
 # Share of the friction that the inertia of a dragged body, and of the gel under it, takes away where it stops: at 0.045
 # drags end within 1 to 2 % of slow ones, at 0.1 4 % low; and so much less time than that asks for is never settled
 BRAKED, HURRIED_DRAG = 0.045, 1.5
-# While motions flow: what drags a body makes forces too high, and what rings in the gel makes clay yield
-ZETA_GEL_FLOWING, ZETA_BODY_FLOWING = 1.2, 0.3
-# How nodes answer to forces: by their own acceleration, and by that filtered by (4 S - 1)^2, S the mean over the cells
-# round them. What the mesh resolves, S = 1, is six times as light; the shortest waves, S = 0, are as heavy as they are.
-TRUE_INERTIA = {OWN: 1.0, FILTERED: 0.0}
-SELECTIVE_INERTIA = {OWN: 1 / 3, FILTERED: 2 / 3}
-LIGHTER_GEL = SELECTIVE_INERTIA[OWN] + 9.0 * SELECTIVE_INERTIA[FILTERED]  # what the mesh resolves
-FILTERED_RIGID = LIGHTER_GEL - 1.0  # lighter by this are rigid motions
 # Of the fastest default for a body that yields: at twice it clay ends 2 % lower, at 4 times 9 to 11 %, at 7 times 26 %
 HURRIED = 3.0
 # Share of its force that the hold may take from a body that yields, times the gel's thickness over the particles'
 # spacing (3.5 % at draft): beyond, motions end 3 to 30 % from slow ones. The coarser a body, the more it creeps anyway.
 MAX_FORCE_LOSS = 0.28
-# Of the contact's stiffness that particles and gel nodes bear one by one: all of them together are lighter. With all of
-# it a cube of 40 layers went to and fro between its gels without end, 3.8 N on one and 2.1 on the other; not with 0.9.
-# A heavier cube would stand still, too, but lag behind gels that drag it; with 0.65 slides are dragged 2 % less.
-BORNE = 0.75
-LARGEST_SHARE = 0.5  # of a particle's mass over the step's square: the largest stiffness of its contact
 GEL_OVERLAP = 0.25  # of a gel's thickness: deeper in one another, gels that do not feel each other are refused
 # Yield stresses (Frobenius norm) of hydrostatic tension that nothing gives a squeezed body: beyond, particles have
 # strains that no node of the grid feels (docs/physics.md)
@@ -154,65 +124,11 @@ class HybridWorld(FemWorld):
             params[FRICTION + g] = scene.friction[name]  # type: ignore[index]
             params[HOUSING + g] = -1.0 if gel.housing is None else gel.housing * MM
         self._state.params[index, list(params)] = list(params.values())
-        self._scaled, self._true = self._scaled_inertia(height * MM), self._true_inertia()
+        self._inertias = HybridInertia(scene, self._gels, self._body, self._body_force)
+        self._scaled, self._true = self._inertias.scaled(height * MM, yields=self.yields), self._inertias.true()
         self._use_inertia(self._scaled)
 
     # ---------------------------------------------------------------- inertia
-
-    def _scaled_inertia(self, height: float) -> Inertia:
-        """Of quasi-static motions; height: of the body [mm]."""
-        step = COURANT * min(self._body.cell, *(gel.spacing for gel in self._gels))
-        damping = {
-            **self._gel_damping(ZETA_GEL), BODY_DAMPING: ZETA_BODY / self._thickness,
-            # The body's slowest mode is its rigid translation between two soft gels: there it counts as lighter by
-            # the number of particle layers.
-            RIGID_MASS_SCALE: max(1.0, height / self._body.spacing - FILTERED_RIGID),
-        }  # fmt: skip
-        held = {
-            **self._gel_damping(ZETA_GEL_HELD),
-            BODY_DAMPING: (ZETA_YIELDING_HELD if self.yields else ZETA_BODY_HELD) / self._thickness,
-        }
-        densities = [gel.density for gel in self._gels]
-        masses = {**self._masses(densities, self._body.density, step), **SELECTIVE_INERTIA, MEMORY: MEMORY_RATE}
-        for g in range(len(self._gels)):
-            # the filter makes a body lighter, so its particles bear less: between stiff gels they shook, untold
-            bearable = LARGEST_SHARE * masses[BODY_MASS] / step**2
-            masses[STIFFNESS + g] = BORNE * min(masses[STIFFNESS + g], bearable)
-        flowing = {**self._gel_damping(ZETA_GEL_FLOWING), BODY_DAMPING: ZETA_BODY_FLOWING / self._thickness}
-        dragging = {**self._gel_damping(ZETA_GEL_DRAGGED), BODY_DAMPING: ZETA_BODY_DRAGGED / self._thickness}
-        return Inertia({**masses, **damping}, step, held=held, flowing=flowing, dragging=dragging)
-
-    def _gel_damping(self, zeta: float) -> dict[int, float]:
-        """Each gel by its own thickness and shear wave: rate = zeta c / thickness, less where that wave is slow."""
-        shares = [min(1.0, math.sqrt(gel.mu / gel.density) / FULLY_DAMPED) for gel in self._gels]
-        rates = [zeta * share / gel.thickness for share, gel in zip(shares, self._gels, strict=True)]
-        return {GEL_DAMPING + g: rate for g, rate in enumerate(rates)}
-
-    def _true_inertia(self) -> Inertia:
-        """The pressure wave of the gel in which it is fastest has speed 1."""
-        assert self.scene.body is not None
-        materials = [self.scene.gel_of(name).material for name in self.sensors]
-        seconds = [kernel_second(gel, each.density) for gel, each in zip(self._gels, materials, strict=True)]
-        second = max(seconds)
-        density = kernel_density(self.scene.body.material.density, second)
-        densities = [gel.density * (second / own) ** 2 for gel, own in zip(self._gels, seconds, strict=True)]
-        wave = math.sqrt(self._body.density / density)  # the body's pressure wave
-        times = [gel.spacing * second / own for gel, own in zip(self._gels, seconds, strict=True)]
-        step = COURANT * min(self._body.cell / wave, *times)
-        undamped = {**self._gel_damping(0.0), BODY_DAMPING: 0.0, RIGID_MASS_SCALE: 1.0, MEMORY: 0.0}
-        return Inertia({**self._masses(densities, density, step), **TRUE_INERTIA, **undamped}, step, second)
-
-    def _masses(self, gels: Sequence[float], body: float, step: float) -> dict[int, float]:
-        """Entries of `params` that follow from the densities [MPa] and the substep [mm]."""
-        particle = body * self._body.volume
-        gravity = self._body_force / body  # [1/mm]
-        entries = {BODY_MASS: particle, GRAVITY: gravity[0], GRAVITY + 1: gravity[1], GRAVITY + 2: gravity[2]}
-        for g, (density, gel) in enumerate(zip(gels, self._gels, strict=True)):
-            # penalty of one particle against its share of a gel node: stable whichever of the two is lighter
-            share = density * gel.spacing * self._body.spacing**2 / 2
-            reduced = 1.0 / (1.0 / particle + 1.0 / share)
-            entries |= {GEL_DENSITY + g: density, STIFFNESS + g: reduced / step**2}
-        return entries
 
     def _stop(self) -> None:
         b, i = self._state.particles, self._index

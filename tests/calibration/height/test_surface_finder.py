@@ -6,14 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
+from calibration.frame_normaliser import FrameNormaliser
 from calibration.height.colour_table import from_model
 from calibration.height.surface_finder import SurfaceFinder, extended_view
-from calibration.normaliser import (
-    FrameNormaliser,
-    normaliser_for_camera,
-    normaliser_for_pictures,
-    normaliser_for_simulation,
-)
+from calibration.normaliser import normaliser_for_camera, normaliser_for_pictures, normaliser_for_simulation
 from tacsim.interface import TactileFrame, TactileObservation
 from tacsim.models.hardware import CameraSensorConfig
 from tacsim.models.scene import GelSurface

@@ -6,14 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
+from calibration.frame_normaliser import FrameNormaliser
 from calibration.lens.rectification import Rectification, from_corners, from_geometry
 from calibration.markers.flow import MarkerFlow, MarkersLost, NoMarkers, find_markers, marker_grid
-from calibration.normaliser import (
-    FrameNormaliser,
-    normaliser_for_camera,
-    normaliser_for_pictures,
-    normaliser_for_simulation,
-)
+from calibration.normaliser import normaliser_for_camera, normaliser_for_pictures, normaliser_for_simulation
 from calibration.reference import UnusableReference
 from tacsim.interface import TactileFrame
 from tacsim.models.hardware import CameraSensorConfig

@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 
 from robot.arm.channel import CommandKind, Partner, WorkerConfig, command_record
-from robot.arm.servo import MAX_SINGULAR_VALUE_RATE
 from robot.arm.status import ArmStatus
 from robot.arm.trajectory import PERIOD
-from robot.common.kinematics import rotation
+from robot.common.kinematics import MAX_SINGULAR_VALUE_RATE, rotation
 from tacsim.limits import region
 from tests.robot.arm.servo_bench import KINEMATICS, Bench, shifted, worker_config
 

@@ -116,7 +116,7 @@ def test_a_driver_that_died_while_it_connected_leaves_nothing(mock: MockUR) -> N
     until(lambda: not mock.faults.state().program, "end of the program")
 
 
-UNSEEN = "from robot.arm import worker; worker.Worker._check_identity = lambda *_: None; worker.main()"
+UNSEEN = "from robot.arm import worker; worker.Dashboard.require_identity = lambda *_: None; worker.main()"
 
 
 def test_an_arm_of_another_shape_is_left_as_it_was(mock: MockUR) -> None:

@@ -12,13 +12,9 @@ import pytest
 from PIL import Image
 
 from calibration.bundle import read_bundle, read_sensor_model, write_bundle
+from calibration.frame_normaliser import FrameNormaliser
 from calibration.lens.view import view_of_corners
-from calibration.normaliser import (
-    FrameNormaliser,
-    normaliser_for_calibration,
-    normaliser_for_camera,
-    normaliser_for_simulation,
-)
+from calibration.normaliser import normaliser_for_calibration, normaliser_for_camera, normaliser_for_simulation
 from robot.mock.cell.cell import _models
 from tacsim.config import ConfigError, load_rig, load_sensor
 from tacsim.interface import TactileFrame

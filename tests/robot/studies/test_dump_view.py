@@ -12,7 +12,8 @@ from typer.testing import Result
 
 from robot.studies import dump_view
 from tacsim.interface import Pose
-from tacsim.models.scene import Body, BodyMaterial, Box, Gel, Indenter, Scene, Settling, Sphere
+from tacsim.models.material import BodyMaterial
+from tacsim.models.scene import Body, Box, Gel, Indenter, Scene, Settling, Sphere
 from tacsim.physics.failure import health
 from tacsim.physics.failure.dump import DumpError, dumps_in, read
 from tacsim.physics.failure.health import SimulationDiverged

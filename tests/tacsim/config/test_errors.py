@@ -20,12 +20,6 @@ SCENE_KEYS = (
 LENGTH = "length > 0 m, bare in m or with a unit (m, mm, cm, um)"
 
 
-@pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
 def complaint(load=load_scene, source="a.yaml", **options) -> str:
     with pytest.raises(ConfigError) as caught:
         load(source, **options)

@@ -8,22 +8,10 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
+from tacsim.models.material import BodyMaterial, GelMaterial, lame, shear_impedance
 from tacsim.models.quantity import Config
 from tacsim.models.rig import RepositionConfig, RigConfig, SimArmConfig, SqueezeConfig
-from tacsim.models.scene import (
-    Body,
-    BodyMaterial,
-    Box,
-    Gel,
-    GelMaterial,
-    Indenter,
-    Mesh,
-    Scene,
-    Settling,
-    Sphere,
-    lame,
-    shear_impedance,
-)
+from tacsim.models.scene import Body, Box, Gel, Indenter, Mesh, Scene, Settling, Sphere
 from tacsim.models.sensor import CanonicalGrid
 
 

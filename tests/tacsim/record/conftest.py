@@ -1,15 +1,19 @@
-"""Steps and facts of a small made-up episode."""
+"""Steps and facts of a small made-up episode; a folder of pictures and a video."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from datetime import datetime, timedelta, timezone
+from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 from tacsim.interface import Action, ArmState, Pose, RigSpec, SensorSpec, SurfaceMap, TactileFrame
 from tacsim.record.episode import ArmPackages, EpisodeMeta, Step
+from tacsim.record.images import encode_png
+from tests.tacsim.record.replayed import picture
 
 
 def random_pose(rng: np.random.Generator) -> Pose:
@@ -92,3 +96,24 @@ def meta() -> EpisodeMeta:
         started=datetime(2026, 3, 4, 5, 6, 7, 891234, timezone(timedelta(hours=-3, minutes=-30))),
         wall_offset=1_772_610_000_123_456_789,
     )
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    path = tmp_path / "pictures"
+    path.mkdir()
+    for k in (10, 9, 1, 2):
+        (path / f"frame_{k}.png").write_bytes(encode_png(picture(k)))
+    (path / "notes.txt").write_text("no picture")
+    return path
+
+
+@pytest.fixture
+def video(tmp_path: Path) -> Path:
+    path = tmp_path / "v.avi"
+    out = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 25.0, (64, 48))
+    assert out.isOpened()
+    for k in range(5):
+        out.write(cv2.cvtColor(picture(k, (48, 64)), cv2.COLOR_RGB2BGR))
+    out.release()
+    return path

@@ -13,8 +13,9 @@ from scipy.stats import spearmanr
 from robot.open import open_rig
 from tacsim.config import load_rig
 from tacsim.interface import ArmState, FloatArray, Pose, Truth
+from tacsim.models.material import BodyMaterial
 from tacsim.models.rig import KneadConfig
-from tacsim.models.scene import Body, BodyMaterial, Box, Indenter, Scene
+from tacsim.models.scene import Body, Box, Indenter, Scene
 from tacsim.tasks import judge, make_task
 from tacsim.tasks.action import action_from
 from tacsim.tasks.knead import Knead, ScriptedKnead

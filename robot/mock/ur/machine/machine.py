@@ -13,7 +13,6 @@ import re
 import traceback
 from collections import deque
 from collections.abc import Callable, Sequence
-from enum import IntEnum
 from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -23,6 +22,7 @@ from robot.common.kinematics import JOINT_RANGE
 from robot.mock.ur.machine.arm import BRAKE, COAST, HOME, PERIOD, TOP, Arm, ProgramError, TooFast
 from robot.mock.ur.machine.force_mode import ForceMode
 from robot.mock.ur.machine.load import NOTHING, Load, Mass, at_flange
+from robot.mock.ur.machine.modes import SAFETY_BITS, Mode, Runtime, Safety
 from robot.mock.ur.machine.motion import FREEDRIVE_DAMPING, FREEDRIVE_TURN_DAMPING, comply
 from robot.mock.ur.machine.registry import COMMANDS
 from robot.mock.ur.machine.script import CONTROL_SCRIPT, DONE, Program
@@ -40,46 +40,6 @@ RELEASE = 50  # periods from idle to running
 SLIDER_RATE = 5.0  # how fast the speed scaling follows the slider [1/s]
 LINE = 500  # longest text of the log
 UNLOCK_DELAY = 0.0  # least time from a protective stop to its unlocking [s]; real robots want 5 s
-
-
-class Mode(IntEnum):
-    """robot_mode of the RTDE."""
-
-    BOOTING = 2
-    POWER_OFF = 3
-    POWER_ON = 4
-    IDLE = 5
-    RUNNING = 7
-
-
-class Safety(IntEnum):
-    """safety_mode of the RTDE."""
-
-    NORMAL = 1
-    REDUCED = 2
-    PROTECTIVE_STOP = 3
-    SAFEGUARD_STOP = 5
-    ROBOT_EMERGENCY_STOP = 7
-    FAULT = 9
-
-
-SAFETY_BITS = {  # safety_status_bits: bit 10 is "stopped due to safety"
-    Safety.NORMAL: 1 << 0,
-    Safety.REDUCED: 1 << 1,
-    Safety.PROTECTIVE_STOP: 1 << 2 | 1 << 10,
-    Safety.SAFEGUARD_STOP: 1 << 4 | 1 << 10,
-    Safety.ROBOT_EMERGENCY_STOP: 1 << 6 | 1 << 7 | 1 << 10,
-    Safety.FAULT: 1 << 9 | 1 << 10,
-}
-
-
-class Runtime(IntEnum):
-    """runtime_state of the RTDE."""
-
-    STOPPED = 1
-    PLAYING = 2
-    PAUSING = 3
-    PAUSED = 4
 
 
 class Outputs:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from robot.mock.ur.machine.machine import Machine, Runtime, Safety
+from robot.mock.ur.machine.machine import Machine
+from robot.mock.ur.machine.modes import Runtime, Safety
 
 GREETING = "Connected: Universal Robots Dashboard Server"
 _ROBOT = {"ur3e": "UR3", "ur5e": "UR5", "ur10e": "UR10"}  # `get robot model` leaves the e out

@@ -7,8 +7,9 @@ import pytest
 from benchmarks.truth import mls_mpm
 from tacsim.compute.runtime import start, ti
 from tacsim.geometry.sampling import body_points
+from tacsim.models.material import BodyMaterial
 from tacsim.models.scene import Body as BodyModel
-from tacsim.models.scene import BodyMaterial, Box
+from tacsim.models.scene import Box
 from tacsim.physics.body.mass import grid_changes
 from tacsim.physics.body.plasticine import BodyState, body_params
 from tacsim.physics.body.transfers import (

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.truth import laws
 from tacsim.compute.runtime import start, ti
-from tacsim.models.scene import BodyMaterial, lame
+from tacsim.models.material import BodyMaterial, lame
 from tacsim.physics.body import material
 from tacsim.physics.body.plasticine import BodyParams, body_params
 

@@ -11,7 +11,8 @@ from tacsim.compute.runtime import start, ti
 from tacsim.geometry.sampling import body_points
 from tacsim.geometry.shapes import distance, volume
 from tacsim.interface import Pose
-from tacsim.models.scene import Body, BodyMaterial, Box, Mesh, Scene, Sphere
+from tacsim.models.material import BodyMaterial
+from tacsim.models.scene import Body, Box, Mesh, Scene, Sphere
 from tacsim.physics.body.surface import surface_points, tangent_planes
 from tacsim.physics.body.transfers import moved_plane
 from tacsim.physics.exec.lanes import vec3

@@ -8,7 +8,8 @@ import pytest
 from benchmarks.truth.blocks import BodyBlock
 from benchmarks.truth.clay import COURANT
 from tacsim.geometry.sampling import body_points
-from tacsim.models.scene import Body, BodyMaterial, Box
+from tacsim.models.material import BodyMaterial
+from tacsim.models.scene import Body, Box
 from tacsim.physics.body.material import ELASTIC
 from tacsim.physics.body.plasticine import STENCIL_REACH, BodyParams, body_params
 from tacsim.physics.exec import layout

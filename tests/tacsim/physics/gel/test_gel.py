@@ -8,7 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.truth import laws
 from tacsim.compute.runtime import start, ti
-from tacsim.models.scene import Gel, GelMaterial
+from tacsim.models.material import GelMaterial
+from tacsim.models.scene import Gel
 from tacsim.physics.exec.environment import Counts, Environment, Floats, Params, Partial
 from tacsim.physics.exec.lanes import PARTS
 from tacsim.physics.exec.layout import (

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from tacsim.interface import Pose
-from tacsim.models.scene import Body, BodyMaterial, Box, Gel, GelMaterial, Indenter, Scene, Sphere
+from tacsim.models.material import BodyMaterial, GelMaterial
+from tacsim.models.scene import Body, Box, Gel, Indenter, Scene, Sphere
 from tacsim.physics.motion.inertia import FASTEST_DRIVE
 from tacsim.physics.seed.world import SeedWorld
 from tacsim.physics.world import World

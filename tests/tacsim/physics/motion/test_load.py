@@ -8,7 +8,8 @@ import pytest
 from numpy.typing import NDArray
 
 from tacsim.interface import Pose
-from tacsim.models.scene import Body, BodyMaterial, Box, Cylinder, Gel, Indenter, Scene, Sphere
+from tacsim.models.material import BodyMaterial
+from tacsim.models.scene import Body, Box, Cylinder, Gel, Indenter, Scene, Sphere
 from tacsim.physics.motion.controller import ForceReading, run
 from tacsim.physics.motion.load import SMALLEST_LOAD, LoadNotReached, keep_loads
 from tacsim.physics.motion.path import Path, plan

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.truth import laws
 from tacsim.compute.runtime import start, ti
-from tacsim.models.scene import BodyMaterial, GelMaterial
+from tacsim.models.material import BodyMaterial, GelMaterial
 from tacsim.physics.seed import kernels
 from tacsim.physics.seed.kernels import Matrices, Solid
 from tacsim.physics.seed.world import solid

@@ -5,7 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tacsim.interface import Pose
-from tacsim.models.scene import Body, BodyMaterial, Box, Gel, Scene, Settling
+from tacsim.models.material import BodyMaterial
+from tacsim.models.scene import Body, Box, Gel, Scene, Settling
 from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.physics.seed import world as seed_world
 from tacsim.physics.seed.world import HALF_TURN, SeedWorld

@@ -3,7 +3,8 @@
 import numpy as np
 
 from tacsim.interface import Pose
-from tacsim.models.scene import Gel, GelMaterial, Indenter, Scene, Shape
+from tacsim.models.material import GelMaterial
+from tacsim.models.scene import Gel, Indenter, Scene, Shape
 from tacsim.physics.worlds.press import PressWorld
 
 

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from tacsim.interface import Pose
-from tacsim.models.scene import Body, BodyMaterial, Box, Gel, Indenter, Scene, Sphere
+from tacsim.models.material import BodyMaterial
+from tacsim.models.scene import Body, Box, Gel, Indenter, Scene, Sphere
 from tacsim.physics.move import MoveCommand
 from tacsim.physics.seed.world import SeedWorld
 from tacsim.physics.world import World, make_world

@@ -11,19 +11,8 @@ import pytest
 
 from tacsim.geometry import tiles
 from tacsim.interface import Pose
-from tacsim.models.scene import (
-    Body,
-    BodyMaterial,
-    Box,
-    Cylinder,
-    Gel,
-    GelMaterial,
-    Indenter,
-    Mesh,
-    Scene,
-    Shape,
-    Sphere,
-)
+from tacsim.models.material import BodyMaterial, GelMaterial
+from tacsim.models.scene import Body, Box, Cylinder, Gel, Indenter, Mesh, Scene, Shape, Sphere
 from tacsim.physics.body import plasticine
 from tacsim.physics.exec.lanes import COPIES, MAX_NUMBERS
 from tacsim.physics.failure.health import LARGEST_GRID, SimulationDiverged

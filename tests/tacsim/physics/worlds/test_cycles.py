@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from tacsim.interface import Pose
-from tacsim.models.scene import Body, BodyMaterial, Box, Cylinder, Preset, Scene, Settling, lame
+from tacsim.models.material import BodyMaterial, lame
+from tacsim.models.scene import Body, Box, Cylinder, Preset, Scene, Settling
 from tacsim.physics.failure.diagnosis import particle_volumes
 from tacsim.physics.motion.controller import Launch
 from tacsim.physics.move import MoveStats, warn_of_few_layers

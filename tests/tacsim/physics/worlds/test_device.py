@@ -19,7 +19,8 @@ import pytest
 
 from tacsim.compute.runtime import available
 from tacsim.interface import Pose
-from tacsim.models.scene import Body, BodyMaterial, Box, Gel, Indenter, Mesh, Scene, Shape, Sphere
+from tacsim.models.material import BodyMaterial
+from tacsim.models.scene import Body, Box, Gel, Indenter, Mesh, Scene, Shape, Sphere
 from tacsim.physics.exec.device_arrays import DeviceArrays
 from tacsim.physics.exec.layout import SHAPE_FIRST
 from tacsim.physics.failure.health import SimulationDiverged

@@ -16,7 +16,8 @@ import numpy as np
 import pytest
 
 from tacsim.interface import Pose
-from tacsim.models.scene import Body, BodyMaterial, Box, Gel, Indenter, Scene, Sphere
+from tacsim.models.material import BodyMaterial
+from tacsim.models.scene import Body, Box, Gel, Indenter, Scene, Sphere
 from tacsim.physics.body.moments import moments_of
 from tacsim.physics.contact.gel_overlap import box_round
 from tacsim.physics.failure import diagnosis

@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from robot.studies.dump_view import open_world, replay
 from tacsim.interface import Pose
-from tacsim.models.scene import Body, BodyMaterial, Box, Gel, Indenter, Scene, Settling, Sphere
+from tacsim.models.material import BodyMaterial
+from tacsim.models.scene import Body, Box, Gel, Indenter, Scene, Settling, Sphere
 from tacsim.physics.exec.lanes import ON_DEVICE
 from tacsim.physics.failure import dump
 from tacsim.physics.failure.health import SimulationDiverged

@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from tacsim.config import load_scene
 from tacsim.interface import Pose
-from tacsim.models.scene import Body, BodyMaterial, Box, Gel, Scene
+from tacsim.models.material import BodyMaterial
+from tacsim.models.scene import Body, Box, Gel, Scene
 from tacsim.physics.exec.layout import HOUSING_FORCE
 from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.physics.worlds import hybrid, hybrid_kernels
@@ -166,7 +167,7 @@ def test_a_body_without_yield_answers_like_one_that_never_reaches_it() -> None:
     for material in (BodyMaterial(), BodyMaterial(yield_stress=1e12)):
         w = world(CUBE.model_copy(update={"material": material}))
         w.yields = True  # else the first is driven faster, and damped more while it is held
-        w._scaled = w._scaled_inertia(5.0)
+        w._scaled = w._inertias.scaled(5.0, yields=True)
         w._use_inertia(w._scaled)
         squeeze(w, 1.0e-3)
         states.append(w.snapshot())

@@ -9,7 +9,8 @@ import pytest
 from benchmarks.truth.layer import layer_contact
 from tacsim.geometry import tiles
 from tacsim.interface import Pose
-from tacsim.models.scene import Box, Cylinder, Gel, GelMaterial, Mesh, Shape, Sphere
+from tacsim.models.material import GelMaterial
+from tacsim.models.scene import Box, Cylinder, Gel, Mesh, Shape, Sphere
 from tacsim.physics.contact.indenter import POINTS
 from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.physics.worlds import press_state

@@ -8,7 +8,8 @@ import pytest
 import trimesh
 
 from tacsim.interface import Pose
-from tacsim.models.scene import Body, BodyMaterial, Box, Cylinder, Gel, Indenter, Mesh, Scene, Shape, Sphere
+from tacsim.models.material import BodyMaterial
+from tacsim.models.scene import Body, Box, Cylinder, Gel, Indenter, Mesh, Scene, Shape, Sphere
 from tacsim.physics.world import make_world
 from tacsim.physics.worlds.press import PressWorld
 from tests.tacsim.physics.worlds.pressing import move, world

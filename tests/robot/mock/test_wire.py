@@ -207,8 +207,8 @@ def test_a_program_in_small_pieces_and_two_in_one(mock: MockUR) -> None:
             line.sendall(text[start : start + 100])
             time.sleep(0.001)
         until(lambda: mock.faults.state().program, "the program runs")
-        line.sendall(text + text)
-        until(lambda: len([t for _, t in mock.faults.log() if "started" in t]) == 3, "two more started")
+        line.sendall(text + b"def second():\n  sync()\nend\n")  # at once: the second replaces the one before it starts
+        until(lambda: any("'second' started" in t for _, t in mock.faults.log()), "the second of two starts")
 
 
 def test_dashboard(mock: MockUR) -> None:

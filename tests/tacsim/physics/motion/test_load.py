@@ -172,7 +172,7 @@ def test_loads_that_make_no_sense_are_refused() -> None:
 
 def test_the_sensor_that_went_too_far_is_named() -> None:
     """Beside one that is wrong too, but in place: it sticks, and swings about its load."""
-    scene, rest = press().scene, ForceReading(np.zeros((2, 3)), np.zeros((2, 3)), 1.0, 0.0, 0)
+    scene, rest = Scene(), ForceReading(np.zeros((2, 3)), np.zeros((2, 3)), 1.0, 0.0, 0)
     end = {"lower": Pose(), "upper": Pose()}
 
     class Stuck:

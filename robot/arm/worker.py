@@ -65,9 +65,7 @@ CONNECTING = 60.0  # longest time to connect; the driver waits less, but it may 
 MARGIN = 10e-3  # a call in the loop takes at most so much longer than link_timeout: the driver tells then [s]
 ZEROING = 2.0  # longest time to zero the force sensor [s]
 ENDING = 3.0  # longest time to end the program; the driver waits less, but it may be gone [s]
-# Periods without a new package; then nothing is sent. What is sent to a controller that stalls arrives in one period
-# when it goes on, and the arm speeds up by all of it: with 5 to 119 % of its limit.
-BLIND = 2
+BLIND = 5  # periods without a new package; then nothing is sent
 SUSPENDED = 5e-3  # a target that took this long was held up with its process, and comes too late [s]
 GRACE = 5  # periods in which a package may say why the controller takes no more commands
 FAILED = 3  # exit status; the reason is on stdout, as JSON

@@ -44,8 +44,9 @@ def test_while_another_program_drives_the_arm_it_is_reported(
     assert said, "nothing was reported"
     since = stamps_since(seen, event)
     speed = np.linalg.norm(seen["velocity"], axis=1)
-    still = int(np.argmax((since > 0.0) & (speed < MOVES)))  # our own motion has ended
-    first = still + int(np.argmax(speed[still:] > MOVES))  # of the other program
+    log = trial.mock.faults.log()
+    (began,) = [when for when, text in log if "'other' started" in text]
+    first = int(np.argmax((seen["timestamp"] >= began) & (speed > MOVES)))  # of the other program's motion
     reported = said[0]["time"] - event
     name = "another program's script, 10 s" + ("" if moves_first else ", moves after 0.5 s")
     late = max(0.0, reported - float(since[first]))  # 0: before that, by the state of the program
@@ -53,9 +54,9 @@ def test_while_another_program_drives_the_arm_it_is_reported(
     figure(f"{name}: reported after it was sent", 1e3 * reported, "ms", at_most=None)
     assert reported < 1.0  # however busy the machine is: not when that program ends
     assert not measuring or late <= 20e-3
-    assert {each["status"] for each in said} <= {"PROGRAM_STOPPED", "OTHER_PROGRAM"}
+    assert said[0]["status"] in ("PROGRAM_STOPPED", "OTHER_PROGRAM")  # what comes later may be of a busy machine
     assert not trial.mock.faults.state().program
     moved = np.linalg.norm(seen["position"][-1] - seen["position"][first])
-    assert moved > 0.1  # the other program was not disturbed
+    assert moved > 0.1, log  # the other program was not disturbed
     quiet = since > SECONDS + 0.2
     assert speed[quiet].max() < MOVES  # and nothing moves after it

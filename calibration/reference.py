@@ -113,21 +113,30 @@ def exchanged(image: Float32, known: Float32, valid: NDArray[np.bool_]) -> bool:
 
 
 def channels_swapped(image: Float32, known: Float32, valid: NDArray[np.bool_]) -> bool:
-    """True when most of a picture (H, W, 3), which may show a contact, is the `known` one of the same gel only with red
-    and blue swapped: levels count, too, not only where each colour is bright."""
-    mean = np.maximum(known[valid].mean(axis=0), 1.0)
+    """True when most of a picture (H, W, 3), which may show a contact, is the `known` one of the same gel with red and
+    blue swapped, and is not as near to it with another gain of each channel (exposure, white balance). False where all
+    colours are equally even: such a swap looks like a change of the white balance."""
+    seen, wanted = _blocks(image, valid), _blocks(known, valid)
+    if not len(wanted):
+        return False
+    mean = np.maximum(wanted.mean(axis=0), 1.0)
+    gain = np.median(wanted / np.maximum(seen, 1.0), axis=0)
     apart, swapped = (
-        float(np.median((np.abs(picture[valid] - known[valid]) / mean).max(axis=1)))
-        for picture in (image, image[..., ::-1])
+        float(np.median((np.abs(levels - wanted) / mean).max(axis=1))) for levels in (seen * gain, seen[:, ::-1])
     )
-    return apart > 2 * ALIKE and swapped < EXCHANGED_RATIO * apart
+    return apart > ALIKE and swapped < EXCHANGED_RATIO * apart
 
 
-def _pattern(image: Float32, valid: NDArray[np.bool_]) -> Float32:
-    """(n, 3) brightness of each block of the gel in each colour, relative to the mean."""
+def _blocks(image: Float32, valid: NDArray[np.bool_]) -> Float32:
+    """(n, 3) mean level of each block that lies on the gel."""
     import cv2
 
     size = (max(valid.shape[1] // BLOCK, 1), max(valid.shape[0] // BLOCK, 1))
     whole = cv2.resize(valid.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
-    parts = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))[whole]
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.float32)[whole]
+
+
+def _pattern(image: Float32, valid: NDArray[np.bool_]) -> Float32:
+    """(n, 3) brightness of each block of the gel in each colour, relative to the mean."""
+    parts = _blocks(image, valid)
     return np.asarray(parts / parts.mean(axis=0) - 1.0, dtype=np.float32)

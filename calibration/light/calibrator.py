@@ -175,7 +175,10 @@ def _leave_out_strangers(
         why = f"blurred: {share:.0%} of the fine detail of other pictures; press again, held still and in focus"
         left_out.append((found.pop(k).name, why))
     for k in reversed(unlike_presses(found, [_window(press, SHADED_PIXELS) for press in found], ball)):
-        why = "the light of most other presses does not explain it: another sensor or ball, or a turned picture?"
+        why = (
+            "the light of most other presses does not explain it: another sensor or ball, a turned picture, or red and "
+            "blue swapped?"
+        )
         left_out.append((found.pop(k).name, why))
 
 

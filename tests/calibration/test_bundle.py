@@ -221,15 +221,16 @@ def seen_askew() -> GelView:
 
 def test_a_bundle_keeps_the_view_and_takes_native_pictures(tmp_path: Path) -> None:
     view = seen_askew()
-    write_bundle(tmp_path, calibration().model_copy(update={"view": view}), PICTURE)
+    native = (
+        np.random.default_rng(7).integers(60, 200, (12, 16, 3), dtype=np.uint8).repeat(20, axis=0).repeat(20, axis=1)
+    )
+    untouched = np.rint(to_metric(view)(native)).astype(np.uint8)
+    write_bundle(tmp_path, calibration().model_copy(update={"view": view}), untouched)
     read, _ = read_bundle(tmp_path)
     assert read.view == view and read.image_shape == (240, 320)
     with pytest.raises(BadBundle, match="calibrated on pictures of 320 x 240 px, this sensor delivers 160 x 120"):
         normaliser_for_camera(camera(tmp_path), (1.0, 1.0), CanonicalGrid())
     normalise = normaliser_for_camera(camera(tmp_path, 320, 240), (1.0, 1.0), CanonicalGrid())
-    native = (
-        np.random.default_rng(7).integers(60, 200, (12, 16, 3), dtype=np.uint8).repeat(20, axis=0).repeat(20, axis=1)
-    )
     normalise.take_reference(TactileFrame(image=native, time=0.0, index=0))
     brighter = native.copy()
     u, v = np.rint(view.project(np.array([[3e-3, -2e-3]]))[0]).astype(int)

@@ -66,7 +66,9 @@ def test_heights_of_an_unseen_press_come_back(share: float) -> None:
     assert all(prediction.correlation > 0.98 for prediction in fit.predictions)
     shallower = sorted(fit.predictions, key=lambda prediction: prediction.circle.radius)[:-1]
     assert all(prediction.angle < 4 for prediction in shallower)  # the deepest reaches beyond the others' table
-    assert judge(fit, KnownScale(PITCH, BALL)).word == "usable"  # four presses
+    assert judge(fit, KnownScale(PITCH, BALL)).word == "unverified scale"  # nothing checks the lengths
+    verdict = judge(fit, KnownScale(PITCH, BALL, depths=(("0", 0.5e-3),)))
+    assert verdict.word == "usable" and "4 presses could be used" in str(verdict)
 
 
 def test_one_press_gives_the_table_and_is_said_to_be_one(tmp_path: Path) -> None:
@@ -74,9 +76,11 @@ def test_one_press_gives_the_table_and_is_said_to_be_one(tmp_path: Path) -> None
     press = sensor.press(0.65e-3, 130, 100)
     fit = calibrate_light(sensor.empty(), [("one", press.image)], BALL_PX)
     assert height_error(fit, sensor, sensor.press(0.4e-3, 90, 80)) < 0.06
-    verdict = judge(fit, KnownScale(PITCH, BALL))
+    assert judge(fit, KnownScale(PITCH, BALL)).word == "unverified scale"
+    scale = KnownScale(PITCH, BALL, depths=(("one", 0.65e-3),))
+    verdict = judge(fit, scale)
     assert verdict.word == "usable" and "1 press could be used: that gives the table" in str(verdict)
-    write_page(tmp_path / "page.html", "dark", fit, KnownScale(PITCH, BALL), verdict, None, [])
+    write_page(tmp_path / "page.html", "dark", fit, scale, verdict, None, [])
     page = (tmp_path / "page.html").read_text(encoding="utf-8")
     assert "darkness that no depth explains" in page and "fewer than 3" not in page
 

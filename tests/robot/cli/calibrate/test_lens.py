@@ -72,7 +72,7 @@ def test_a_sensor_seen_askew_is_calibrated_through_its_view(tmp_path: Path) -> N
     ball = ["--ball-radius", f"{BALL} m"]
     seen = ["--view", tmp_path / "view" / "view.yaml"]
     code, _, err = run("sensor", frames, *ball, *seen, "--out", tmp_path / "bundle")
-    assert code == 0, err
+    assert code == 4, err  # four corners and a size say how large a pixel is, and nothing checks it
     calibration, reference = read_bundle(tmp_path / "bundle")
     assert calibration.view == load(GelView, tmp_path / "view" / "view.yaml")
     assert calibration.geometry == calibration.view.geometry

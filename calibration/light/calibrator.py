@@ -25,8 +25,9 @@ from calibration.height.slope_polynomial import (
     PolynomialSlopes,
     to_normal,
 )
+from calibration.light.checks.consistency import blurred_presses, unlike_presses, untouched_contact
+from calibration.light.checks.press_shapes import fit_stretch, other_balls
 from calibration.light.circle import NoCircle
-from calibration.light.consistency import blurred_presses, unlike_presses, untouched_contact
 from calibration.light.darkness import DARK_UNEXPLAINED, find_dark_press, fit_darkness, tells_no_direction
 from calibration.light.dent import dent_gradient, dent_height, rim_slope
 from calibration.light.fit import LightFit, PressPrediction, compared, normal_angle
@@ -52,7 +53,6 @@ from calibration.light.photometry import (
     solve,
 )
 from calibration.light.press import BallPress, Window, find_press, smooth, untouched_mean
-from calibration.light.press_shapes import fit_stretch, other_balls
 from calibration.light.refinement import RefinedGeometry, refine
 from calibration.light.shadows import DentShade, find_lamps
 from calibration.reference import STALE_COLOUR, exchanged
@@ -175,10 +175,7 @@ def _leave_out_strangers(
         why = f"blurred: {share:.0%} of the fine detail of other pictures; press again, held still and in focus"
         left_out.append((found.pop(k).name, why))
     for k in reversed(unlike_presses(found, [_window(press, SHADED_PIXELS) for press in found], ball)):
-        why = (
-            "the light of most other presses does not explain it: another sensor or ball, a turned picture, or red and "
-            "blue swapped?"
-        )
+        why = "most other presses do not explain it: another sensor or ball, turned, or red and blue swapped?"
         left_out.append((found.pop(k).name, why))
 
 
@@ -335,7 +332,7 @@ def _shaded(
 
 
 def _warnings(presses: Sequence[BallPress], mean: Float64, left_out: int) -> list[str]:
-    """What a person should look at in the frames; calibration.light.verdict judges the figures."""
+    """What a person should look at in the frames; calibration.light.checks.verdict judges the figures."""
     found = []
     drift = float(np.abs(np.median([(p.drift / mean).mean(axis=(0, 1)) for p in presses], axis=0)).max())
     if drift > STALE_COLOUR:

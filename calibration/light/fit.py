@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from calibration.bundle import FORMAT, Calibration, Provenance, Residual
 from calibration.height.slope_polynomial import InverseModel
 from calibration.lens.view import GelView
+from calibration.light.checks.press_shapes import Stretch
 from calibration.light.dent import ContactCircle
 from calibration.light.photometry import ModelSize
 from calibration.light.press import FAR, BallPress, Image
-from calibration.light.press_shapes import Stretch
 from tacsim.models.darkness import DarknessModel
 from tacsim.models.photometric import PhotometricModel
 from tacsim.models.sensor import CameraNoise, Markers, SensorGeometry

@@ -13,8 +13,8 @@ from robot.cli.output import notes, results, say_files, show_table, warn, writin
 if TYPE_CHECKING:
     from calibration.frame_set import FrameSet
     from calibration.lens.view import GelView
+    from calibration.light.checks.verdict import KnownScale
     from calibration.light.fit import LightFit
-    from calibration.light.verdict import KnownScale
     from calibration.profiles import SensorProfile
     from tacsim.models.geometry import PictureRegion
     from tacsim.models.sensor import CameraNoise, Markers
@@ -38,10 +38,10 @@ def write_calibration(
     """Shows the calibration, writes its bundle and the page of its verdict; exits with UNTRUSTED or UNVERIFIED where it
     must."""
     from calibration.bundle import write_bundle
-    from calibration.light import page
+    from calibration.light.checks import page
+    from calibration.light.checks.verdict import judge
     from calibration.light.residual_picture import draw
     from calibration.light.skin import measure_skin
-    from calibration.light.verdict import judge
 
     verdict = judge(fit, scale, dots=found is None and _shows_dots(fit))
     _show(fit, scale.pixel_pitch, found)

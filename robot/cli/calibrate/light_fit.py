@@ -50,7 +50,7 @@ def fit_light(read: FrameSet, ball: float, dot: float | None) -> LightFit:
             more = [frame.image for frame in read.untouched]
             return calibrate_light(read.reference, named, ball, erase, more)
     except NoDirection as why:
-        from calibration.light.verdict import GREY, is_grey
+        from calibration.light.checks.verdict import GREY, is_grey
 
         grey = f"; {GREY}: give the camera's own, in colour" if is_grey(read.reference) else ""
         notes.print(f"{why}{grey}", markup=False)

@@ -147,7 +147,7 @@ def _calibrate(
     read = straighten(read, asked.region, seen)
     found = find_lattice(read, pitch) if asked.markers else None
     fit = fit_light(read, asked.ball / pitch, None if found is None else found.radius / pitch)
-    from calibration.light.verdict import KnownScale
+    from calibration.light.checks.verdict import KnownScale
 
     published = asked.pitch is None and asked.view is None and asked.size is None
     dots = None if found is None or asked.marker_pitch is None else (found.pitch, asked.marker_pitch)

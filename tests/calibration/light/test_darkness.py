@@ -13,11 +13,11 @@ from typer.testing import CliRunner
 from calibration.bundle import read_bundle, read_sensor_model, write_bundle
 from calibration.height.darkness import DarknessSlopes
 from calibration.light.calibrator import NoDirection, calibrate_light
+from calibration.light.checks.page import write_page
+from calibration.light.checks.verdict import KnownScale, judge
 from calibration.light.circle import NoCircle
 from calibration.light.darkness import dark_circle, tells_no_direction
 from calibration.light.fit import LightFit
-from calibration.light.page import write_page
-from calibration.light.verdict import KnownScale, judge
 from calibration.normaliser import normaliser_for_calibration, normaliser_for_pictures
 from robot.cli import app
 from tacsim.interface import TactileFrame

@@ -229,7 +229,7 @@ def test_fine_pictures_are_calibrated_no_finer_than_they_are_used(folder: Path, 
     assert calibration.image_shape == (8 * ROWS, 8 * COLUMNS) and reference.shape[1] < 400
     assert calibration.geometry.pixel_pitch == pytest.approx(0.0625e-3, rel=0.01)
     normalise = normaliser_for_calibration(calibration, CanonicalGrid(), reference)
-    sight = [np.asarray(Image.open(folder / name)) for name in ("background.png", "press_2.png")]
+    sight = [np.asarray(Image.open(folder / name)) for name in ("Background.png", "press_2.png")]
     normalise.take_reference(TactileFrame(image=sight[0], time=0.0, index=0))
     seen = normalise(TactileFrame(image=sight[1], time=0.1, index=1), 0.1)
     assert seen.height is not None and normalise.reference_doubt is None

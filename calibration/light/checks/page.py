@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from calibration.light.checks.verdict import KnownScale, Verdict
 from calibration.light.fit import LightFit
-from calibration.light.verdict import KnownScale, Verdict
 
 FILE = "verdict.html"
 

@@ -85,7 +85,7 @@ class DriftError:
 
     change: Change
     fresh: float  # with a reference taken after the change
-    stale: float  # with the one from before
+    stale: float  # with the one from before; both NaN where no surface is found in pictures so changed
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,6 +149,8 @@ def invariance(
             fresh = _angle(folds, touched, change, change)
             stale = _angle(folds, touched, change, None)
             drifts.append(DriftError(change, fresh - angle, stale - angle))
+        if lost := [drift.change.name for drift in drifts if math.isnan(drift.stale) or math.isnan(drift.fresh)]:
+            notes.append(f"no surface of B is found, so no drift is measured, after: {'; '.join(lost)}")
     return Report(count, tuple(views), words, angle, tuple(drifts), tuple(notes))
 
 
@@ -311,7 +313,8 @@ def _angle(
     change: Change | None,
     of_reference: Change | None,
 ) -> float:
-    """Mean gradient angle error of B's changed frames against A's surfaces, where those are pressed [degrees]."""
+    """Mean gradient angle error of B's changed frames against A's surfaces, where those are pressed [degrees]; NaN
+    where no surface is found."""
     angles: list[float] = []
     for (comparison, calibration), one in zip(folds, touched, strict=True):
         assert comparison.surfaces_a is not None
@@ -328,4 +331,5 @@ def _angle(
             for seen, other in zip(truth, found, strict=True)
             if seen is not None and other is not None
         ]
-    return float(np.nanmean(angles))
+    measured = [angle for angle in angles if not math.isnan(angle)]
+    return float(np.mean(measured)) if measured else math.nan

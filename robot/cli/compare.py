@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -268,7 +269,10 @@ def _show_invariance(report: Report, width: int | None) -> None:
     title = f"Invariance, {report.presses} presses, patch {report.patch}"
     show_table(title, ("view", "rho (1)", "95 %", "AUC (1)", "95 %"), views, left={0}, width=width)
     if report.drifts:
-        drifts = ((row.change.name, f"{row.fresh:.2f}", f"{row.stale:.2f}") for row in report.drifts)
+        drifts = (
+            (row.change.name, *("–" if math.isnan(value) else f"{value:.2f}" for value in (row.fresh, row.stale)))
+            for row in report.drifts
+        )
         title = f"Extra gradient error under drift (°), beyond {report.angle:.1f}"
         show_table(title, ("change", "fresh reference", "stale"), drifts, left={0}, width=width)
     for words in report.notes:

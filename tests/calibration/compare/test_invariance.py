@@ -136,6 +136,19 @@ def test_a_fresh_reference_saves_from_a_change_of_gain(report: Report) -> None:
     assert 0 < report.angle < 5
 
 
+def test_a_change_after_which_no_surface_is_found_is_named(
+    real: FrameSet, calibration: Calibration, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from calibration.compare import invariance as module
+
+    lost = module.Change("lamps dimmed", "dim", (0.3, 0.3, 0.3))  # too much to measure by a reference from before
+    monkeypatch.setattr(module, "CHANGES", (lost,))
+    found = invariance([(compare_frames(replace(real, untouched=()), real, calibration, calibration), calibration)])
+    (drift,) = found.drifts
+    assert math.isfinite(drift.fresh) and math.isnan(drift.stale)
+    assert any("no drift is measured, after: lamps dimmed" in note for note in found.notes)
+
+
 def test_surfaces_and_drift_are_left_out_with_a_word(real: FrameSet) -> None:
     found = invariance([(compare_frames(replace(real, untouched=()), real), None)])
     assert [view.view for view in found.views] == ["raw", "difference"]

@@ -27,6 +27,7 @@ LOST_COLOUR = 0.5  # [-]
 # Red and blue are exchanged
 EXCHANGED_RATIO = 0.5  # if that brings the picture so much nearer to the known one
 ALIKE = 0.02  # unless it is this near already, each colour relative to its mean [-]
+MIN_SWAPPED_CHANGE = 0.01  # of each colour relative to its mean, beside another gain: less is no sign of a swap [-]
 BLOCK = 8  # side of the blocks that are compared [px]
 
 
@@ -124,7 +125,7 @@ def channels_swapped(image: Float32, known: Float32, valid: NDArray[np.bool_]) -
     apart, swapped = (
         float(np.median((np.abs(levels - wanted) / mean).max(axis=1))) for levels in (seen * gain, seen[:, ::-1])
     )
-    return apart > ALIKE and swapped < EXCHANGED_RATIO * apart
+    return apart > MIN_SWAPPED_CHANGE and swapped < EXCHANGED_RATIO * apart
 
 
 def _blocks(image: Float32, valid: NDArray[np.bool_]) -> Float32:

@@ -11,7 +11,7 @@ from calibration.frame_normaliser import FrameNormaliser
 from calibration.frame_set import Frame, FrameSet, frame_warnings, touched_untouched
 from calibration.light.calibrator import calibrate_light
 from calibration.normaliser import normaliser_for_calibration
-from calibration.reference import StaleReference
+from calibration.reference import StaleReference, channels_swapped
 from tacsim.interface import TactileFrame
 from tacsim.models.sensor import CanonicalGrid
 from tests.calibration.presses import BALL, BALL_PX, PITCH, HiddenSensor
@@ -65,6 +65,18 @@ def test_swapped_colours_of_frames_are_called_by_their_name(sensor: HiddenSensor
     dimmer = np.rint(0.8 * sensor.press(0.5e-3, 150, 90).image).astype(np.uint8)
     normalise(frame(dimmer), 0.0)
     assert normalise.stale
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_white_balance_as_strong_as_a_swap_is_no_swap(seed: int) -> None:
+    """Red gets the mean level of blue and blue that of red: only where on the gel they are bright tells them apart."""
+    sensor = HiddenSensor(seed)
+    everywhere = np.ones((200, 260), dtype=np.bool_)
+    reference, seen = (image.astype(np.float32) for image in (sensor.empty(), sensor.press(0.5e-3, 150, 90).image))
+    red, _, blue = reference.mean(axis=(0, 1))
+    balance = np.array([blue / red, 1.0, red / blue], dtype=np.float32)
+    assert not channels_swapped(np.clip(seen * balance, 0, 255), reference, everywhere)
+    assert channels_swapped(seen[..., ::-1], reference, everywhere)
 
 
 def test_pictures_without_contact_are_compared_with_the_reference(sensor: HiddenSensor) -> None:

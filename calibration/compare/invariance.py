@@ -85,7 +85,7 @@ class DriftError:
 
     change: Change
     fresh: float  # with a reference taken after the change
-    stale: float  # with the one from before; both NaN where no surface is found in pictures so changed
+    stale: float  # with the one from before; NaN, as fresh, where no surface is found
 
 
 @dataclass(frozen=True, slots=True)

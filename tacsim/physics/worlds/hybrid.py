@@ -117,7 +117,7 @@ class HybridWorld(FemWorld):
         )
         # Inertia is scaled, weight is not: rho g [1e-9 N/mm^3] over the kernel's density, the P-wave modulus [MPa].
         self._body_force = scene.body.material.density * np.array(scene.gravity) * MPA / MM  # [N/mm^3]
-        self._weight = self._body_force * self._body.volume * self._state.particles.counts[index]  # [N]
+        self._weight = self._body_force * self._body.volume * self._state.particle_counts[index]  # [N]
         params = self._body.params()
         for g, (name, gel) in enumerate(zip(self.sensors, gels, strict=True)):
             params |= self._gels[g].params(g)
@@ -205,7 +205,7 @@ class HybridWorld(FemWorld):
         limits = [friction * force for friction, force in zip(frictions, held, strict=True) if friction > 0.0]
         if not limits or min(held) == 0.0:
             return 0.0
-        params, count = self._scaled.params, self._state.particles.counts[self._index]
+        params, count = self._scaled.params, self._state.particle_counts[self._index]
         body = params[BODY_MASS] * count / (params[RIGID_MASS_SCALE] + FILTERED_RIGID)
         heaviest = max(gel.density * gel.thickness for gel in self._gels)
         layer = heaviest * (self._body.volume * count) ** (2 / 3) / (2.0 * LIGHTER_GEL)
@@ -274,7 +274,7 @@ class HybridWorld(FemWorld):
         state.params[index, STEP] = path.step
         state.counts[index, EVERY] = -(-len(drive) // launch.readings)
         moments = state.moments(index)
-        self._squashed = math.sqrt(moments.second[2, 2] / state.particles.counts[index]) / state.heights[index]
+        self._squashed = math.sqrt(moments.second[2, 2] / state.particle_counts[index]) / state.heights[index]
         self._write_body_inertia(moments)
         self._write_inertia(launch)
         Health.clear(state.partial[index])

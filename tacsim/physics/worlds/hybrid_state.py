@@ -62,6 +62,11 @@ class HybridState(FemState):
             )
 
     @property
+    def particle_counts(self) -> Sequence[int]:
+        """Particles of each environment; nothing is brought back from a device for them."""
+        return self._particles.counts
+
+    @property
     def particles(self) -> BodyState:
         self._bring_back()
         return self._particles

@@ -41,7 +41,6 @@ def test_a_squeeze_ends_where_a_slow_one_does() -> None:
 
 
 @pytest.mark.deep
-@pytest.mark.xfail(strict=True, reason="1.4 %: what yields remembers how fast it was driven (docs/physics.md)")
 def test_a_settled_squeeze_is_within_one_percent_of_a_slow_one() -> None:
     assert squeeze.squeeze("draft", "hybrid", 1)[1].error < 1.0  # % of force
 

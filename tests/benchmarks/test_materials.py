@@ -21,7 +21,7 @@ def test_a_squeezed_cube_yields_at_its_yield_stress_the_nearer_the_finer() -> No
     rows = [materials.yield_plateau(4e-3, h, 1)[0] for h in (0.5e-3, 0.25e-3, 0.125e-3)]
     assert all(row.note == "" for row in rows)
     assert rows[-1].error < 3.0  # %
-    assert min(orders([row.error for row in rows])) > 1.0
+    assert min(orders([row.error for row in rows])) > 0.9
     assert CLAY.yield_stress is not None
     bulk = CLAY.youngs_modulus / (3 * (1 - 2 * CLAY.poisson_ratio))
     assert rows[-1].figures["stress_pa"] > CLAY.yield_stress  # from above: a coarse body is stiff

@@ -53,7 +53,7 @@ def test_swapped_gels_feel_the_mirrored_scene(material: dict[str, float]) -> Non
         assert one.wrench(name)[:3] == pytest.approx(other.wrench(mirrored)[:3], abs=2e-4 * largest)
         a, b = one.surface(name), other.surface(mirrored)
         assert (a.spacing, a.origin, a.displacement.shape) == (b.spacing, b.origin, b.displacement.shape)
-        assert np.abs(a.displacement - b.displacement).max() < 2e-4 * np.abs(a.displacement).max()
+        assert np.abs(a.displacement - b.displacement).max() < 1e-3 * np.abs(a.displacement).max()
 
 
 @pytest.mark.parametrize("name", ["lower", "upper"])

@@ -131,7 +131,7 @@ def test_every_figure_is_fed_by_a_case_that_exists() -> None:
                 "pictures: rho, difference", "pictures: rho, gradient", "pictures: rho, height",
                 "surfaces: rho, gradient", "surfaces: rho, height"]  # fmt: skip
     names = ["wall_per_particle_substep_ns", "cpu_per_element_substep_ns", "second_ms", "momentum", "angular_momentum"]
-    names += ["worst_percent", "env_steps_per_s", "volume_off"]
+    names += ["worst_percent", "env_steps_per_s", "volume_off", "settled_error"]
     names += ["kept_percent", "kept_in_picture_percent", "jitter_px"]
     names += ["ncc", "ssim", "whole_percent", "auc", "auc_low", "extra_deg", "bound_ratio"]
     figures = {**dict.fromkeys(names, 1.0), "depth_mm": 1.0}

@@ -71,7 +71,7 @@ from tacsim.physics.worlds.hybrid_inertia import FILTERED_RIGID, LIGHTER_GEL, Hy
 from tacsim.physics.worlds.hybrid_state import CLEARANCE, HybridState
 from tacsim.pose import HALF_TURN_X
 
-DRAGGING = 0.5  # least share of a path that goes along the gels: it drags the body
+DRAGGING = 0.9  # least share of a path along the gels: one that also closes is not damped as a drag, or it ends 3 % low
 # Share of the friction that the inertia of a dragged body, and of the gel under it, takes away where it stops: at 0.045
 # drags end within 1 to 2 % of slow ones, at 0.1 4 % low; and so much less time than that asks for is never settled
 BRAKED, HURRIED_DRAG = 0.045, 1.5

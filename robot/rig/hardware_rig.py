@@ -252,7 +252,7 @@ def _require_gentle_approach(config: RigConfig) -> None:
 
 def _worst_latency(config: RigConfig, name: str) -> float:
     """Longest time from a touch to an arm that brakes, by the pictures of a sensor [s]. Raises ValueError for a driver
-    whose pictures come nobody knows when."""
+    whose latency is not known."""
     sensor = config.sensors[name]
     if isinstance(sensor, CameraSensorConfig):
         return max(sensor.latency, UNMEASURED) + 1.0 / sensor.fps + REACTION
@@ -260,7 +260,7 @@ def _worst_latency(config: RigConfig, name: str) -> float:
         return 1.0 / SIMULATED_RATE + REACTION
     raise ValueError(
         f"rig '{config.name}': sensors.{name} has the driver '{sensor.driver}', whose latency is not known: "
-        f"nobody can tell how deep its gel is pressed before its picture shows a touch. State its worst latency in "
+        f"how deep its gel is pressed before its picture shows a touch cannot be computed. State its worst latency in "
         f"{_worst_latency.__module__}._worst_latency"
     )
 

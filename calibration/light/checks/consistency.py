@@ -21,7 +21,7 @@ RIDGE = 1e-3
 # Two presses are of one sensor if the light of each explains the other up to the larger of these shares of its power
 MAX_UNLIKE = 0.2
 MAX_UNLIKE_RATIO = 4.0  # times the median link; a DIGIT, whose lamps stand low, shows 2.4
-MIN_GROUPED = 4  # presses: of fewer nobody knows which one is wrong
+MIN_GROUPED = 4  # presses: fewer do not show which one is wrong
 FINE = 1.0  # detail finer than this Gaussian is compared [px]
 MIN_FINE = 0.5  # least power of fine detail and noise, over the median of the others; real sensors show 0.9 and more
 CONTACT_BLUR = 3.0  # [px]

@@ -74,7 +74,7 @@ class KnownScale:
     gel_thickness: float | None = None  # [m]
     depths: tuple[tuple[str, float], ...] = ()  # frames whose indentation is known [m]
     pitch_from_size: bool = False  # the pitch is published and follows from `gel_size`: neither checks the other
-    marker_pitches: tuple[float, float] | None = None  # of printed dots: as found by the pixel pitch, as told [m]
+    marker_pitches: tuple[float, float] | None = None  # of printed dots: as found by the pixel pitch, as given [m]
 
 
 def judge(fit: LightFit, scale: KnownScale, *, dots: bool = False) -> Verdict:
@@ -150,7 +150,7 @@ def _of_shape(fit: LightFit) -> Iterable[Finding]:
         yield from _beyond(
             STRETCH, fit.stretch.ratio - 1.0 - unsure,
             f"contacts of the ball are no circles: the ratio of their axes is {fit.stretch}; only below "
-            f"{1 + STRETCH[0] + unsure:.3f} it is not told from 1",
+            f"{1 + STRETCH[0] + unsure:.3f} it cannot be distinguished from 1",
             "give pictures whose pixels are square, or the view of the gel (--view)",
         )  # fmt: skip
 
@@ -195,10 +195,10 @@ def _of_scale(fit: LightFit, scale: KnownScale) -> Iterable[Finding]:
                 "say how deep a press is (--depth)",
             )  # fmt: skip
     if scale.marker_pitches is not None:
-        found, told = scale.marker_pitches
+        found, given = scale.marker_pitches
         yield from _beyond(
-            SCALE, abs(math.log(found / told)),
-            f"at this pixel pitch the dots are {found * 1e3:.3g} mm apart, and {told * 1e3:.3g} mm were given",
+            SCALE, abs(math.log(found / given)),
+            f"at this pixel pitch the dots are {found * 1e3:.3g} mm apart, and {given * 1e3:.3g} mm were given",
             "measure the pixel pitch by a board or a ruler",
         )  # fmt: skip
     if scale.gel_size is not None:

@@ -169,7 +169,7 @@ class _Asked:
     region: PictureRegion | None
     depths: tuple[tuple[str, float], ...]
     markers: bool
-    marker_pitch: float | None  # of printed dots, as told [m]
+    marker_pitch: float | None  # of printed dots, as given [m]
     serial: str
     folder: Path
 

@@ -91,10 +91,15 @@ class FollowingMonitor:
         behind, ahead = jacobian @ (self._expected - joints), jacobian @ (self._target - joints)
         return _distance(behind[:3], ahead[:3]), _distance(behind[3:], ahead[3:])
 
+    @property
+    def has_settled(self) -> bool:
+        """True if packages have arrived since servoJ led the joints to a target that rests."""
+        return self._target is not None and self._rested >= SETTLED
+
     def is_moved_from_rest(self, target: FloatArray, speeds: FloatArray) -> bool:
         """True if the controller's own target (6,) [rad] moves, at speeds (6,) [rad/s], or lies elsewhere, where servoJ
         has come to rest: another program moves it."""
-        if self._target is None or self._rested < SETTLED:
+        if self._target is None or not self.has_settled:
             return False
         moves = float(np.abs(speeds).max()) > FOREIGN_SPEED
         return moves or float(np.abs(target - self._target).max()) > FOREIGN_SHIFT

@@ -323,8 +323,9 @@ class Servo:
 
     def _was_moved(self, held: MotionState, measured: Measured) -> bool:
         """True if the arm rests away from its held pose (somebody moved it): the next target starts at the measured
-        pose. Servo lag and the deflection by a contact are smaller than that, and cause no jump."""
-        if not (held.at_rest and is_standing(measured)):
+        pose. Servo lag and the deflection by a contact are smaller than that, and cause no jump. A package from before
+        the arm came to rest, which shows it elsewhere, says nothing."""
+        if not (held.at_rest and self._following.has_settled and is_standing(measured)):
             return False
         away = np.abs(measured.sensor[:3, 3] - held.position).max()
         turned = np.abs(rotation_vector(measured.sensor[:3, :3] @ held.rotation.T)).max()

@@ -198,9 +198,16 @@ def check_path(arm: URArm, joints: np.ndarray) -> None:
     """Box, planes, speed, acceleration and joint steps of what was really sent."""
     assert outside(arm, joints) == 0
     share = of_limits(arm, joints)
-    assert share["joint step"] <= 1 + 1e-9
-    assert share["speed"] <= 1 + 1e-4
-    assert share["acceleration"] <= 1 + 1e-2
+    assert share["joint step"] <= 1 + 1e-9, share
+    assert share["speed"] <= 1 + 1e-4, share
+    assert share["acceleration"] <= 1 + 1e-2, f"{share}, speeds around it [m/s]: {_around_worst(arm, joints)}"
+
+
+def _around_worst(arm: URArm, joints: np.ndarray) -> list[float]:
+    velocity, change, around = _changes(arm, joints)
+    worst = int(np.where(change > 1.01 * arm.config.limits.acceleration, around, 0.0).argmax())
+    speeds: list[float] = np.linalg.norm(velocity[max(0, worst - 5) : worst + 6], axis=1).round(4).tolist()
+    return speeds
 
 
 def leftovers() -> int:

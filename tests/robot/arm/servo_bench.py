@@ -149,6 +149,17 @@ class OnController:
         row = np.array([*target.position, *target.quaternion])
         self.servo.on_command(self.number, command_record(self.time - age, CommandKind.TARGET, row))
 
+    def hold(self) -> None:
+        self.number += 1
+        self.servo.on_command(self.number, command_record(self.time, CommandKind.HOLD, np.full(7, np.nan)))
+
+    @property
+    def target(self) -> FloatArray:
+        """(3,) of the sensor's origin at the joints that were sent last [m]."""
+        assert self.joints is not None
+        frame: FloatArray = KINEMATICS.forward(self.joints) @ self.servo.frames.tool_from_sensor
+        return frame[:3, 3]
+
     def period(self, late: int = 1) -> None:
         """The newest package that the worker knows is `late` periods old."""
         number = max(0, len(self.packages) - 1 - late)

@@ -239,3 +239,22 @@ def test_after_the_last_action_the_arm_goes_no_farther_than_its_time_out_allows(
     lag = arm.servo.config.lookahead + SETTLING * PERIOD
     assert 0.8 * speed * 0.2 < gone <= speed * (0.2 + lag)
     assert arm.servo.status == ArmStatus.HOLD and shares(arm)[1] <= 1.03
+
+
+@pytest.mark.promise(2)
+@pytest.mark.parametrize("late", [0, 5, 20, 40])
+def test_a_package_from_before_a_short_motion_does_not_move_the_held_target(late: int) -> None:
+    """Ten periods towards a goal, then a hold: the target has come to rest 1 mm on while the newest package shows the
+    arm at rest where it began. The next goal begins at the target; a step back would be a speed of 0.5 m/s."""
+    arm = OnController(action_timeout=60.0, speed=0.5, acceleration=5.0)
+    start, targets = arm.at, []
+    for _ in range(5):
+        arm.ask(shifted(start, 0.0, 0.05))
+        for period in range(25):
+            if period == 10:
+                arm.hold()
+            arm.period(late)
+            targets.append(arm.target)
+    velocity = np.diff(targets, axis=0) / PERIOD
+    assert np.abs(velocity).max() > 0.05
+    assert np.linalg.norm(np.diff(velocity, axis=0), axis=1).max() <= 5.0 * PERIOD * (1 + 1e-6)

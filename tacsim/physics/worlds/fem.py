@@ -297,9 +297,10 @@ class FemWorld(BaseWorld):
 
         stats = yield from self._retried(command, attempt)
         if stats.force_loss > self.max_force_loss:
+            slower = "settling.tolerance" if settling.mach is None else "settling.mach"
             self.unfollowed = (
                 f"the speed itself made the body yield: the hold took {stats.force_loss:.1%} of the force (limit "
-                f"{self.max_force_loss:.1%}); go there from the state before with a smaller settling.tolerance"
+                f"{self.max_force_loss:.1%}); go there from the state before with a smaller {slower}"
             )
         self._poses = end
         self._rates[...] = flowing.rates[1] if command.flow and flowing.rates is not None else 0.0

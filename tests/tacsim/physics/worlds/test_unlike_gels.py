@@ -36,9 +36,12 @@ def force(world: World, name: str) -> float:
     return -float(world.wrench(name)[2])
 
 
-@pytest.mark.parametrize("material", [{"youngs_modulus": 1e6}, CLAY])
-def test_swapped_gels_feel_the_mirrored_scene(material: dict[str, float]) -> None:
-    """The scene turned by half a turn about x has the other gel below."""
+@pytest.mark.parametrize(("material", "rounding"), [({"youngs_modulus": 1e6}, 2e-4), (CLAY, 1e-3)])
+def test_swapped_gels_feel_the_mirrored_scene(material: dict[str, float], rounding: float) -> None:
+    """The scene turned by half a turn about x has the other gel below.
+
+    `rounding`: difference of surfaces, of the largest displacement. A command that differs by one unit of float32
+    changes them by 1e-4 to 2e-4, and by 2e-4 to 1.4e-3 if the body yields."""
     body = {"geometry": {"shape": "box", "size": [4e-3, 4e-3, 3e-3]}, "material": material}
     friction = {"lower": 0.4, "upper": 0.8}
     one = make_world(scene({"lower": THICK, "upper": THIN}, body=body, friction=friction))
@@ -53,7 +56,7 @@ def test_swapped_gels_feel_the_mirrored_scene(material: dict[str, float]) -> Non
         assert one.wrench(name)[:3] == pytest.approx(other.wrench(mirrored)[:3], abs=2e-4 * largest)
         a, b = one.surface(name), other.surface(mirrored)
         assert (a.spacing, a.origin, a.displacement.shape) == (b.spacing, b.origin, b.displacement.shape)
-        assert np.abs(a.displacement - b.displacement).max() < 1e-3 * np.abs(a.displacement).max()
+        assert np.abs(a.displacement - b.displacement).max() < rounding * np.abs(a.displacement).max()
 
 
 @pytest.mark.parametrize("name", ["lower", "upper"])

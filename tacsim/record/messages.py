@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 
 from tacsim.interface import Action, ArmState, Pose, SurfaceMap, TactileFrame
 from tacsim.models.text import printable
-from tacsim.record import format_1
 from tacsim.record.episode import ArmPackages, EpisodeError, Recorded, Step
 from tacsim.record.images import decode_image, encode_png
 from tacsim.record.protobuf import (
@@ -118,11 +117,8 @@ def decode_step(
         sizes: rows and columns of the pictures by sensor, those of the first that is decoded: others are refused.
     """
     try:
-        if format_1.is_json(data):
-            record, info = format_1.step(data)
-        else:
-            record = parse(StepMessage, data)
-            info = {key: parse(Scalar, _last(messages, f"{STEP_TOPIC}/{key}")).value for key in record.info}
+        record = parse(StepMessage, data)
+        info = {key: parse(Scalar, _last(messages, f"{STEP_TOPIC}/{key}")).value for key in record.info}
         frames = {frame.sensor: frame for frame in record.frames}
         for frame in frames.values():
             for topic in _frame_topics(frame):
@@ -310,8 +306,7 @@ def _encode_arm(name: str, arm: ArmState, clock: _Clock) -> Iterator[Encoded]:
 
 def _decode_arm(name: str, messages: Messages) -> ArmState:
     pose = PoseInFrame.FromString(_last(messages, f"/{name}/pose")).pose
-    data = _last(messages, f"/{name}/arm")
-    arm = format_1.arm(data) if format_1.is_json(data) else parse(Arm, data)
+    arm = parse(Arm, _last(messages, f"/{name}/arm"))
     return ArmState(
         pose=_pose(pose),
         twist=np.array(six(arm, TWIST)),
@@ -334,8 +329,7 @@ def _decode_packages(records: Mapping[str, Any], messages: Messages, what: str, 
     if len(there) != told.count:
         raise EpisodeError(f"{what}: it names {told.count} packages of arm '{name}', but {len(there)} are there")
     try:
-        found = [format_1.package(data) if format_1.is_json(data) else parse(ArmPackage, data) for data in there]
-        rows = [package_row(package) for package in found]
+        rows = [package_row(parse(ArmPackage, data)) for data in there]
         return ArmPackages.of({field: [row[field] for row in rows] for field in PACKAGE_FIELDS}, told.lost)
     except (DecodeError, ValueError) as failure:
         raise EpisodeError(f"{what}: a package of arm '{name}' cannot be decoded: {failure}") from failure

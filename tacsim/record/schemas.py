@@ -6,7 +6,6 @@ Topics: /{sensor}/image foxglove.CompressedImage (PNG), /{sensor}/surface and /{
 /{arm}/arm tacsim.Arm; if asked for /{arm}/packages tacsim.ArmPackage (each package of the controller) and /body
 foxglove.PointCloud (particles of a simulated body, float32 [m]); /step/{name} tacsim.Scalar (each number of the step's
 info), and last in a step /step tacsim.Step, which names the others.
-Format 1 had JSON in place of tacsim's own messages (`format_1.py`).
 
 Clocks: every `time` in tacsim's messages is the rig's own clock [s], exact; a rig of hardware counts its computer's
 monotonic clock. Times of MCAP and of Foxglove's messages are the wall clock [ns since 1970, UTC]: the rig's clock plus
@@ -28,7 +27,6 @@ from tacsim.models.text import check_name, printable
 from tacsim.record.episode import EpisodeError, EpisodeMeta
 
 FORMAT = "2"  # of the file; raised when an old reader would misread a new file
-READABLE = ("1", FORMAT)
 MAX_ATTACHMENT = 64 << 20  # [bytes]
 MAX_PARTS = 64  # sensors, and arms, of an episode
 MAX_FILES = 1000  # attachments, and versions
@@ -82,9 +80,8 @@ def encode_meta(meta: EpisodeMeta) -> dict[str, str]:
 def decode_meta(record: Mapping[str, str], what: str) -> tuple[EpisodeMeta, tuple[str, ...]]:
     """The metadata of an episode without its attachments, and their names. Raises EpisodeError."""
     values = unsealed(record, what)
-    if values.get("format") not in READABLE:
-        readable = " and ".join(READABLE)
-        raise EpisodeError(f"{what}: episode format '{values.get('format')}', but this tacsim reads {readable}")
+    if values.get("format") != FORMAT:
+        raise EpisodeError(f"{what}: episode format '{values.get('format')}', but this tacsim reads {FORMAT}")
     try:
         task = values.get("task")
         meta = EpisodeMeta(
@@ -96,7 +93,7 @@ def decode_meta(record: Mapping[str, str], what: str) -> tuple[EpisodeMeta, tupl
             versions={printable(k): printable(v) for k, v in _NAMES.validate_json(values["versions"]).items()},
             goal=_GOAL.validate_json(values["goal"]),
             started=datetime.fromisoformat(values["started"]) if "started" in values else None,
-            wall_offset=int(values.get("wall_offset", "0")),
+            wall_offset=int(values["wall_offset"]),
         )
         attachments = _ATTACHMENTS.validate_json(values["attachments"])
         _check_parts(meta, attachments)

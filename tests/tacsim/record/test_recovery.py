@@ -194,14 +194,15 @@ def test_other_formats_and_compressed_chunks_are_named(tmp_path: Path, meta: Epi
         stock.finish()
     with pytest.raises(EpisodeError, match="mcap decompress"):
         read_episode(tmp_path / "zstd.mcap")
-    with (tmp_path / "new.mcap").open("wb") as file:
-        stock = Writer(file, compression=CompressionType.NONE)
-        stock.start()
-        changed = {key: value for key, value in config.items() if key != "crc32"} | {"format": "3"}
-        stock.add_metadata(META, sealed(changed))
-        stock.finish()
-    with pytest.raises(EpisodeError, match="episode format '3', but this tacsim reads 1 and 2"):
-        read_episode(tmp_path / "new.mcap")
+    for other in ("1", "3"):
+        with (tmp_path / "other.mcap").open("wb") as file:
+            stock = Writer(file, compression=CompressionType.NONE)
+            stock.start()
+            changed = {key: value for key, value in config.items() if key != "crc32"} | {"format": other}
+            stock.add_metadata(META, sealed(changed))
+            stock.finish()
+        with pytest.raises(EpisodeError, match=f"episode format '{other}', but this tacsim reads 2"):
+            read_episode(tmp_path / "other.mcap")
 
 
 @pytest.mark.parametrize("compression", [CompressionType.NONE, CompressionType.ZSTD, CompressionType.LZ4])

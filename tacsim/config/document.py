@@ -23,7 +23,6 @@ from tacsim.models.text import printable
 MAX_BYTES = 1_000_000
 MAX_DEPTH = 32
 MAX_NODES = 20_000  # of one load, referenced files included
-FORMER_KEYS = {"approach_way": "approach_distance"}  # of files for version 0.1.0: still read, as the key they are now
 _MAX_DIGITS = 64  # of a whole number
 
 _FLOAT = re.compile(
@@ -243,7 +242,7 @@ def _entries(node: yaml.MappingNode, origin: _Origin, path: tuple[str, ...]) -> 
         if not isinstance(key_node, yaml.ScalarNode):
             origin.state.report(place, ".".join(path), "a key must be a plain text, not a list or a mapping")
             continue
-        key = FORMER_KEYS.get(str(key_node.value), str(key_node.value))
+        key = str(key_node.value)
         dotted = ".".join((*path, key))
         if key == "<<":
             origin.state.report(place, dotted, "merge keys are not allowed; use 'extends: NAME' instead")

@@ -13,7 +13,7 @@ from typing import Any, get_args
 
 from tacsim.config import bundle
 from tacsim.config.annotation import allowed, child, default, keys, models, variant
-from tacsim.config.document import FORMER_KEYS, MAX_NODES, LoadState, Node, from_plain, parse_text, read_text, shown
+from tacsim.config.document import MAX_NODES, LoadState, Node, from_plain, parse_text, read_text, shown
 from tacsim.config.errors import Place, did_you_mean, join
 from tacsim.config.kinds import Kind, NotFound, kind_of, resolve
 from tacsim.models.quantity import Quantity
@@ -153,7 +153,7 @@ def parse_override(text: str, state: LoadState) -> Override | None:
     """``key.sub=value``, the value read as YAML; None after a reported problem."""
     place = Place(f"--set {text}")
     key, equals, value = text.partition("=")
-    path = tuple(FORMER_KEYS.get(part, part) for part in key.strip().split("."))
+    path = tuple(key.strip().split("."))
     if not equals or not all(path):
         state.report(place, "", "allowed: key.sub=value, for example scene.preset=standard")
         return None

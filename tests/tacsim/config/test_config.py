@@ -336,13 +336,6 @@ def test_the_loader_is_a_safe_one() -> None:
         names("robot")
 
 
-def test_a_key_of_version_0_1_0_is_read_under_its_present_name(tmp_path: Path) -> None:
-    path = tmp_path / "mine.yaml"
-    path.write_text("extends: ur5e\nstart: {approach_way: 7 mm}\n")
-    assert load_rig(path).config.start.approach_distance == 7e-3
-    assert load_rig("mock", overrides=["start.approach_way=3 mm"]).config.start.approach_distance == 3e-3
-
-
 def test_overrides_do_not_loosen_the_limits_of_a_real_arm() -> None:
     for override, words in {
         "arms.upper.limits.force=100": "limits.force: 20 -> 100",

@@ -22,7 +22,6 @@ from tacsim.config import ConfigError, load, load_sensor
 from tacsim.config.bundle import (
     AGAIN,
     FILE,
-    FORMATS,
     REFERENCE,
     NoBundle,
     digest,
@@ -39,7 +38,6 @@ from tacsim.models.sensor import CameraNoise, Markers, SensorGeometry, SensorMod
 from tacsim.record.episode import EpisodeError
 from tacsim.record.images import decode_image, encode_png
 
-FORMAT = FORMATS[-1]
 SERIAL = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
 
 Positive = Annotated[Length, Field(gt=0)]
@@ -75,16 +73,13 @@ class Provenance(Config):
 class Calibration(Config):
     """All that calibration has found out about one sensor."""
 
-    format: Literal[1, 2, 3, 4, 5, 6, 7, 8]
+    format: Literal[8] = 8
     serial: Annotated[str, Field(pattern=SERIAL)]
     geometry: SensorGeometry  # of the picture that the models are for: the native one, or with `view` the rectified
     gel_size: tuple[Positive, Positive]  # x, y of the gel that the picture shows [m]
     forward: PhotometricModel | None = None  # slope -> colour
     inverse: InverseModel | None = None  # colour -> slope
     darkness: DarknessModel | None = None  # both, of a light that tells depth and no direction
-    # Of the dent that a ball presses [m], [-]; None: that of an elastic layer, as it is taken to be now
-    skirt_length: Positive | None = None
-    skirt_fraction: Annotated[float, Field(gt=0)] | None = None
     view: GelView | None = None  # where the gel lies in the native picture; None: the native picture is metric
     region: PictureRegion | None = None  # what of the camera's picture shows gel; None: all of it, or of the view
     markers: Markers | None = None  # None: no dots are printed on the gel

@@ -31,8 +31,6 @@ from tacsim.models.rig import ReplaySensorConfig
 from tacsim.models.sensor import CanonicalGrid, SensorModel
 from tacsim.optics.grid import PixelGrid, canonical_image
 
-BETTERED = 5  # format of bundles from which on the forward model betters heights: older ones give what they gave
-
 
 def normaliser_for_simulation(
     model: SensorModel, gel_size: tuple[float, float], grid: CanonicalGrid
@@ -92,9 +90,8 @@ def normaliser_for_calibration(
     else:
         assert calibration.inverse is not None and calibration.forward is not None
         slopes = PolynomialSlopes(calibration.inverse, x, y)
-        if calibration.format >= BETTERED:
-            u, v = (np.asarray(place / 2, dtype=np.float32) for place in (x, y))
-            better = ForwardSteps(calibration.forward, u, v, wide.pitch, geometry.width * geometry.pixel_pitch)
+        u, v = (np.asarray(place / 2, dtype=np.float32) for place in (x, y))
+        better = ForwardSteps(calibration.forward, u, v, wide.pitch, geometry.width * geometry.pixel_pitch)
     dots = calibration.markers is not None
     find = SurfaceFinder(slopes, rectify.valid, grid, dots=dots, drifts=True, better=better)
     flow = marker_flow(calibration.markers, geometry, calibration.gel_size, calibration.view, calibration.region)

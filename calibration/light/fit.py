@@ -9,7 +9,7 @@ from importlib import metadata
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.bundle import FORMAT, Calibration, Provenance, Residual
+from calibration.bundle import Calibration, Provenance, Residual
 from calibration.height.slope_polynomial import InverseModel
 from calibration.lens.view import GelView
 from calibration.light.checks.press_shapes import Stretch
@@ -73,7 +73,6 @@ class LightFit:
         checksums."""
         rows, columns, _ = self.reference.shape
         return Calibration(
-            format=FORMAT,
             serial=serial,
             geometry=view.geometry if view else SensorGeometry(width=columns, height=rows, pixel_pitch=pixel_pitch),
             gel_size=(columns * pixel_pitch, rows * pixel_pitch),

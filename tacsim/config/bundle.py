@@ -16,7 +16,7 @@ from tacsim.config.document import LoadState, Node, from_plain, parse_text, show
 from tacsim.config.errors import Place, did_you_mean
 
 FILE, REFERENCE = "calibration.yaml", "reference.png"
-FORMATS = (1, 2, 3, 4, 5, 6, 7, 8)  # that are read; the last is written
+FORMAT = 8  # that is written and read
 OWN = "sensors"  # folder of sensors of one's own, beside the file that names them or in the current folder
 MAX_FILE_SIZE, MAX_PICTURE_SIZE = 1_000_000, 1 << 26  # [bytes] of the YAML, and of the picture
 AGAIN = "make it again with `tacsim calibrate sensor`"
@@ -81,9 +81,8 @@ def read_files(path: Path) -> tuple[Path, dict[str, Any], bytes]:
     root = parse_text(text, shown(file), file.parent, state)
     content = _plain(root)
     version = content.get("format") if isinstance(content, dict) else None
-    if version is not None and version not in FORMATS:
-        known = ", ".join(map(str, FORMATS))
-        raise NoBundle(f"{file} has format {version}, this version of tacsim reads {known}; {AGAIN}")
+    if version is not None and version != FORMAT:
+        raise NoBundle(f"{file} has format {version}, this version of tacsim reads {FORMAT}; {AGAIN}")
     if state.problems:
         raise NoBundle(f"{file} is damaged; {AGAIN}. {'; '.join(map(str, state.problems))}")
     if version is None:

@@ -36,14 +36,11 @@ PICTURE = RNG.integers(80, 120, (120, 160, 3), dtype=np.uint8)
 def calibration(serial: str = "gs-42") -> Calibration:
     weights = RNG.normal(0, 0.5, (3, 3))
     return Calibration(
-        format=3,
         serial=serial,
         geometry=SensorGeometry(width=160, height=120, pixel_pitch=0.1e-3),
         gel_size=(16e-3, 12e-3),
         forward=PhotometricModel(degree=1, position=0, weights=tuple(map(tuple, weights.tolist())), steepest=0.8),
         inverse=InverseModel(weights=tuple((0.0, 0.0) for _ in range(TERMS)), steepest=0.8),
-        skirt_length=0.8e-3,
-        skirt_fraction=0.6,
         provenance=Provenance(
             made="2026-01-01T00:00:00+00:00", software="tacsim", ball_radius=2.92e-3, frames=("a.png",)
         ),
@@ -75,17 +72,16 @@ def test_a_bundle_comes_back_bit_by_bit(bundle: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("format: 3", "format: 0", "has format 0, this version of tacsim reads 1, 2, 3, 4, 5, 6, 7, 8"),
-        ("format: 3", "format: 9", "has format 9, this version of tacsim reads 1, 2, 3, 4, 5, 6, 7, 8"),
-        ("format: 3", "format: 2", "was changed since it was written"),
-        ("format: 3", "form: 3", "names no format"),
+        ("format: 8", "format: 7", "has format 7, this version of tacsim reads 8; make it again"),
+        ("format: 8", "format: 9", "has format 9, this version of tacsim reads 8; make it again"),
+        ("format: 8", "form: 8", "names no format"),
         ("noise: null", "noise: {deviation: [1, 1, 1]}", "was changed since it was written"),
         ("noise: null", "noise: {deviation: [1, 1, -1]}", "is damaged"),
         ("noise: null", "noise: {deviation: [1, 1, 1], colours: [0.9, 0.9, -0.9]}", "is damaged"),
         ("serial: gs-42", "serial: gs-43", "was changed since it was written"),
         ("degree: 1", "degree: 2", "is damaged"),
-        ("skirt_fraction: 0.6", "skirt_fraction: six", "is damaged"),
-        ("skirt_fraction: 0.6", "skirt_fraction: 0.7", "was changed since it was written"),
+        ("ball_radius: 0.00292", "ball_radius: six", "is damaged"),
+        ("ball_radius: 0.00292", "ball_radius: 0.003", "was changed since it was written"),
     ],
 )
 def test_a_changed_or_older_file_is_refused(bundle: Path, old: str, new: str, words: str) -> None:
@@ -137,10 +133,10 @@ def test_what_is_no_file_or_too_large_is_refused_unread(bundle: Path, tmp_path_f
     [
         lambda text: text[: len(text) // 2],
         lambda text: "",
-        lambda text: text.replace("format: 3", "format: 3\nformat: 1", 1),
+        lambda text: text.replace("format: 8", "format: 8\nformat: 1", 1),
         lambda text: text + "more: 1\n",
-        lambda text: "format: 2\nx: !!python/object/apply:os.system [false]\n",
-        lambda text: "format: 2\nx: " + "[" * 5000,
+        lambda text: "format: 8\nx: !!python/object/apply:os.system [false]\n",
+        lambda text: "format: 8\nx: " + "[" * 5000,
         lambda text: re.sub(r"steepest: [0-9.]+", "steepest: .nan", text),
     ],
     ids=["half", "empty", "twice", "unknown key", "code", "deep", "nan"],
@@ -180,28 +176,8 @@ def test_a_camera_with_a_calibration_finds_height(bundle: Path) -> None:
     assert normaliser_for_calibration(read_bundle(bundle)[0], CanonicalGrid()).finds_height
 
 
-# What older formats did not write: they had no view (1), noise (2), darkness or region (4).
-@pytest.mark.parametrize(
-    ("old", "without"),
-    [
-        (1, {"view", "noise", "darkness", "region", "skin"}),
-        (2, {"noise", "darkness", "region", "skin"}),
-        (4, {"darkness", "region", "skin"}),
-        (7, {"skin"}),
-    ],
-)
-def test_a_bundle_of_an_older_format_still_loads(bundle: Path, old: int, without: set[str]) -> None:
-    content = yaml.safe_load((bundle / FILE).read_text(encoding="utf-8")) | {"format": old}
-    content = {name: value for name, value in content.items() if name not in without}
-    (bundle / FILE).write_text(yaml.safe_dump(content | {"checksum": digest(content)}), encoding="utf-8")
-    read, _ = read_bundle(bundle)
-    assert read.format == old and read.view is None and read.noise is None and read.image_shape == (120, 160)
-    assert normaliser_for_camera(camera(bundle), (1.0, 1.0), CanonicalGrid()).finds_height
-    assert read_sensor_model(bundle).noise is None
-
-
 def test_a_bundle_keeps_the_skin_and_gives_it_to_the_twin(tmp_path: Path) -> None:
-    write_bundle(tmp_path, calibration().model_copy(update={"skin": 0.6, "format": 8}), PICTURE)
+    write_bundle(tmp_path, calibration().model_copy(update={"skin": 0.6}), PICTURE)
     assert read_bundle(tmp_path)[0].skin == 0.6 == read_sensor_model(tmp_path).skin
     write_bundle(tmp_path, calibration(), PICTURE)
     assert read_bundle(tmp_path)[0].skin is None and read_sensor_model(tmp_path).skin == 0.0

@@ -39,7 +39,7 @@ BALL, DEPTH = 4e-3, 1e-3  # [m]
 
 def made_up(width: int) -> Calibration:
     """A calibration of the largest order for pictures of width x 3/4 width; its light is made up."""
-    from calibration.bundle import FORMAT, Calibration, Provenance
+    from calibration.bundle import Calibration, Provenance
     from calibration.height.slope_polynomial import InverseModel, fit_inverse, inverse_features, to_normal
     from tacsim.models.photometric import PhotometricLight
 
@@ -59,14 +59,11 @@ def made_up(width: int) -> Calibration:
     target = to_normal(slopes.reshape(-1, 2).astype(np.float64))
     inverse = fit_inverse([(terms.T @ terms, terms.T @ target)], with_position=True)
     return Calibration(
-        format=FORMAT,
         serial="made-up",
         geometry=SensorGeometry(width=shape[1], height=shape[0], pixel_pitch=VIEW[0] / width),
         gel_size=VIEW,
         forward=forward,
         inverse=InverseModel(weights=tuple((float(x), float(y)) for x, y in inverse), steepest=1.0),
-        skirt_length=0.5e-3,
-        skirt_fraction=0.6,
         provenance=Provenance(made="", software="tacsim", ball_radius=BALL, frames=()),
         reference="0" * 64,
     )

@@ -18,7 +18,7 @@ from tests.tacsim.optics.surfaces import dent, flat
 
 GEL, PITCH = (20e-3, 20e-3), 1.9e-3
 MARKERS = Markers(rows=5, columns=7, pitch=PITCH, radius=0.22e-3)
-BUNDLE = Path(__file__).parents[2] / "fixtures" / "bundle_0_1_0"
+BUNDLE = Path(__file__).parents[2] / "fixtures" / "bundle"
 SLIDES = [(0.0, 0.0), (0.2e-3, -0.1e-3), (0.4e-3, -0.2e-3)]
 
 

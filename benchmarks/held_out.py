@@ -18,14 +18,14 @@ import typer
 from benchmarks.cases.real import balls
 from benchmarks.cases.real.balls import BallSet
 from benchmarks.cases.real.clicked import clicked_errors, has_circles
-from benchmarks.cases.real.labels import BadData, Image, read_picture
+from benchmarks.cases.real.labels import BadData, read_picture
 from calibration.errors import BadFrames
 from calibration.height.darkness import DarknessSlopes
 from calibration.light.calibrator import calibrate_light
 from calibration.light.dent import dent_height
 from calibration.light.fit import LightFit
 from calibration.normaliser import normaliser_for_calibration
-from tacsim.interface import TactileFrame
+from tacsim.interface import Image, TactileFrame
 from tacsim.models.sensor import CanonicalGrid
 
 # Contact MAE, correlation, normals before shadows were known and slopes were those of a surface (decision 10)

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-Float32 = NDArray[np.float32]
-Mask = NDArray[np.bool_]
+from tacsim.interface import Float32, Mask
 
 UNTOUCHED_CHANGE = 0.08  # an untouched pixel changes less than this, without drift [-]
 MIN_UNTOUCHED_SHARE = 0.15  # of the view, to measure a drift

@@ -17,7 +17,7 @@ from calibration.errors import BadFrames
 from calibration.lens.rectification import from_corners, region_mask, to_metric
 from calibration.lens.view import BadCorners, Corners, GelView
 from calibration.reference import SATURATED, channels_swapped
-from tacsim.interface import SurfaceMap
+from tacsim.interface import Image, SurfaceMap
 from tacsim.models.geometry import PictureRegion
 from tacsim.optics.grid import PixelGrid
 from tacsim.record.episode import EpisodeError
@@ -32,8 +32,6 @@ from tacsim.record.sources import (
     unknown_source,
     video_images,
 )
-
-Image = NDArray[np.uint8]
 
 UNTOUCHED_NAMES = ("background", "reference", "ref", "empty", "no_contact", "bg", "frame0")  # of pictures, best first
 MAX_FRAMES = 500

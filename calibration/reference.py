@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-Float32 = NDArray[np.float32]
+from tacsim.interface import Float32
 
 SATURATED = 250.0  # a channel at or above this has lost its signal [grey levels]
 MAX_SATURATED_SHARE = 0.05  # of the gel; ten real sensors show 0 to 0.001

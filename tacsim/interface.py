@@ -18,7 +18,11 @@ from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+# Types of arrays, for all packages
 FloatArray = NDArray[np.float64]
+Float32 = NDArray[np.float32]
+Image = NDArray[np.uint8]  # (H, W, 3) RGB
+Mask = NDArray[np.bool_]
 
 
 def _unit_quaternion() -> FloatArray:

@@ -8,7 +8,6 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.harness.measure import Measurement, Timing, timed
 from benchmarks.harness.runner import Case
@@ -27,7 +26,7 @@ from benchmarks.truth.limit import (
     surface_profile,
 )
 from tacsim.geometry.shapes import extent
-from tacsim.interface import Pose
+from tacsim.interface import FloatArray, Pose
 from tacsim.models.material import GelMaterial
 from tacsim.models.scene import FASTEST_MACH, Box, Cylinder, Gel, Indenter, Scene, Shape, Sphere
 from tacsim.physics.move import MoveStats
@@ -35,7 +34,6 @@ from tacsim.physics.move import MoveStats
 if TYPE_CHECKING:
     from tacsim.physics.worlds.press import PressWorld
 
-Float64 = NDArray[np.float64]
 
 LAYER = "FFT elastic layer"
 FORCE_DEPTHS = (0.1e-3, 0.3e-3)
@@ -76,7 +74,7 @@ DEFAULT_MACH = FASTEST_MACH  # the controller's default at nu 0.45, a tenth of t
 OTHER_MACHS = (0.015, 0.05, 0.1)
 
 
-def profile(world: PressWorld) -> Float64:
+def profile(world: PressWorld) -> FloatArray:
     return surface_profile(world.surface("lower"))
 
 
@@ -194,7 +192,11 @@ def tacchi_press(repeat: int) -> list[Measurement]:
 
 
 def layer(
-    gap_of_radius: Callable[[Float64], Float64], depth: float, nu: float, pixels: int = 512, thickness: float = 4e-3
+    gap_of_radius: Callable[[FloatArray], FloatArray],
+    depth: float,
+    nu: float,
+    pixels: int = 512,
+    thickness: float = 4e-3,
 ) -> LayerContact:
     """The FFT solver on a periodic square of 32 mm, E = 0.145 MPa; lengths in m."""
     side = 32e-3
@@ -203,11 +205,11 @@ def layer(
     return layer_contact(gap, depth, side / pixels, thickness, 0.145e6, nu)
 
 
-def _ball_gap(r: Float64) -> Float64:
+def _ball_gap(r: FloatArray) -> FloatArray:
     return np.where(r < RADIUS, RADIUS - np.sqrt(np.maximum(RADIUS**2 - r**2, 0.0)), 1.0)
 
 
-def _punch_gap(r: Float64) -> Float64:
+def _punch_gap(r: FloatArray) -> FloatArray:
     return np.where(r < 3e-3, 0.0, 1.0)
 
 
@@ -222,7 +224,7 @@ def percent(value: float, truth: float) -> float:
     return abs(value / truth - 1.0) * 100.0
 
 
-def _largest(difference: Float64) -> float:
+def _largest(difference: FloatArray) -> float:
     """[µm]"""
     return float(np.abs(difference).max()) * 1e6
 

@@ -6,20 +6,18 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.cases.press import percent, press, press_scene
 from benchmarks.harness.measure import Measurement, Timing, timed
 from benchmarks.harness.runner import Case
 from benchmarks.truth.limit import RADIUS
-from tacsim.interface import Pose
+from tacsim.interface import FloatArray, Pose
 from tacsim.models.scene import Box, Cylinder, Indenter, Preset, Scene, Sphere
 from tacsim.physics.move import MoveStats
 
 if TYPE_CHECKING:
     from tacsim.physics.worlds.press import PressWorld
 
-Float64 = NDArray[np.float64]
 
 SLIDE, SLIDES = 0.5e-3, 20  # a plate slides so far at a time [m], and so often at most
 SLIDE_SLOW = {"draft": 0.001, "standard": 0.002}  # Mach number at which speed plays no part
@@ -128,7 +126,7 @@ def slid_turned(preset: str, repeat: int) -> list[Measurement]:
     return rows
 
 
-def _turned(preset: str, indenter: Indenter, **settling: float) -> tuple[Float64, MoveStats]:
+def _turned(preset: str, indenter: Indenter, **settling: float) -> tuple[FloatArray, MoveStats]:
     """Drag along x and y over normal force after both legs."""
     scene = {"body": None, "preset": preset, "indenter": indenter, "settling": settling}
     world, _ = press(Scene.model_validate(scene), 0.5e-3)

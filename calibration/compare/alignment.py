@@ -14,10 +14,8 @@ from numpy.typing import NDArray
 
 from calibration.compare.metrics import contact_region, patch_of, untouched_change
 from calibration.errors import BadFrames
+from tacsim.interface import Float32, FloatArray
 from tacsim.models.sensor import SensorGeometry
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 ASPECT_TOLERANCE = 0.02  # relative difference of the aspect ratios of two pictures that are scaled to each other
 MAX_SHIFT = 0.25  # share of the picture; beyond, the pairing is wrong, not the mounting
@@ -30,7 +28,7 @@ ECC_STEPS, ECC_TOLERANCE = 200, 1e-4
 class Alignment:
     """Where the pixels of B lie in the picture of A. Pixel centres are whole numbers, x right, y down."""
 
-    a_from_b: Float64  # (2, 3) affine: x, y in A of x, y in B
+    a_from_b: FloatArray  # (2, 3) affine: x, y in A of x, y in B
     shape: tuple[int, int]  # rows, columns of B
     source: tuple[int, int]  # ... of A
     shift: tuple[float, float] = (0.0, 0.0)  # the part of it that was found: how far A's contacts lie off B's [px of B]

@@ -14,7 +14,6 @@ from enum import StrEnum
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.bundle import Calibration
 from calibration.compare import metrics
@@ -25,10 +24,8 @@ from calibration.drift import without_drift
 from calibration.errors import BadFrames
 from calibration.frame_set import Frame, FrameSet, touched_untouched
 from tacsim.control.contact_signal import CONTACT_HEIGHT
+from tacsim.interface import FloatArray, Image
 from tacsim.record.numbering import picture_numbers
-
-Image = NDArray[np.uint8]
-Float64 = NDArray[np.float64]
 
 MAX_SHIFT_PAIRS = 40  # pairs from which the shift is found
 MAX_NOISE_FRAMES = 5  # untouched frames from which the floor is made
@@ -234,7 +231,7 @@ def _other_numbers(a: FrameSet, b: FrameSet) -> str:
     return "; ".join(parts)
 
 
-def bootstrap(values: Float64, seed: int = 0) -> tuple[float, float]:
+def bootstrap(values: FloatArray, seed: int = 0) -> tuple[float, float]:
     """95 % interval of the mean of values (n,), by resampling; NaN for fewer than MIN_PAIRS."""
     if len(values) < MIN_PAIRS:
         return math.nan, math.nan
@@ -328,7 +325,7 @@ def _overall(metric: Metric, pairs: Sequence[Pair], floor: float) -> Overall:
     )
 
 
-def _mean(values: Sequence[float] | Float64) -> float:
+def _mean(values: Sequence[float] | FloatArray) -> float:
     """Mean of what is known; NaN if nothing is. Infinite where one is: the PSNR of equal pictures."""
     array = np.asarray(values, dtype=np.float64)
     known = array[~np.isnan(array)]

@@ -24,10 +24,8 @@ from calibration.compare.compare import BOOTSTRAP_DRAWS, Comparison
 from calibration.compare.surfaces import GRID, estimate_surfaces
 from calibration.drift import without_drift
 from calibration.errors import BadFrames
-from calibration.frame_set import Image
 from tacsim.control.contact_signal import CONTACT_HEIGHT
-
-Float64 = NDArray[np.float64]
+from tacsim.interface import FloatArray, Image
 
 PATCH_SIDE = 5.2e-3  # where pixels have a known pitch [m]
 PATCH_SIDE_RADII = 3.0  # ... and else [radii of the median contact region]
@@ -154,12 +152,12 @@ def invariance(
     return Report(count, tuple(views), words, angle, tuple(drifts), tuple(notes))
 
 
-def distances(of_a: Float64, of_b: Float64, order: NDArray[np.intp]) -> tuple[Float64, Float64]:
+def distances(of_a: FloatArray, of_b: FloatArray, order: NDArray[np.intp]) -> tuple[FloatArray, FloatArray]:
     """(n,) of rows (n, d) of A and B that are partners, and (n - 1,) of rows of B that are neighbours in `order`."""
     return np.linalg.norm(of_a - of_b, axis=1), np.linalg.norm(np.diff(of_b[order], axis=0), axis=1)
 
 
-def classifier_scores(of_a: Float64, of_b: Float64) -> tuple[Float64, Float64]:
+def classifier_scores(of_a: FloatArray, of_b: FloatArray) -> tuple[FloatArray, FloatArray]:
     """(n,) scores of the presses of A and of B, each by a linear classifier that has not seen that press, of neither
     source: ridge regression on -1 and 1 in the first principal components, standardised."""
     count = len(of_a)
@@ -181,7 +179,7 @@ def classifier_scores(of_a: Float64, of_b: Float64) -> tuple[Float64, Float64]:
     return scores[:count], scores[count:]
 
 
-def area_under_curve(low: Float64, high: Float64, weight: Float64 | None = None) -> Float64:
+def area_under_curve(low: FloatArray, high: FloatArray, weight: FloatArray | None = None) -> FloatArray:
     """Probability that a score of `high` (n,) is above one of `low` (n,); ties count half (Mann and Whitney). `weight`
     (..., n): how often each press counts; without, once."""
     above = (high[:, None] > low[None, :]) + 0.5 * (high[:, None] == low[None, :])
@@ -189,7 +187,7 @@ def area_under_curve(low: Float64, high: Float64, weight: Float64 | None = None)
     return np.asarray(((times @ above) * times).sum(axis=-1) / times.sum(axis=-1) ** 2)
 
 
-def auc_interval(low: Float64, high: Float64, times: Float64) -> tuple[float, float]:
+def auc_interval(low: FloatArray, high: FloatArray, times: FloatArray) -> tuple[float, float]:
     """95 % interval of :func:`area_under_curve` by bootstrap; `times` (draws, n): how often each press is drawn.
 
     A press drawn twice meets its own partner twice as often as the estimate lets it, which moves all draws alike: they
@@ -201,7 +199,7 @@ def auc_interval(low: Float64, high: Float64, times: Float64) -> tuple[float, fl
     return float(below), float(above)
 
 
-def _view(name: str, of_a: Float64, of_b: Float64, signal: float, order: NDArray[np.intp]) -> Invariance:
+def _view(name: str, of_a: FloatArray, of_b: FloatArray, signal: float, order: NDArray[np.intp]) -> Invariance:
     rng = np.random.default_rng(0)
     count = len(of_a)
     score_a, score_b = classifier_scores(of_a, of_b)
@@ -240,9 +238,9 @@ def _patches(
     touched: dict[int, metrics.Patch],
     calibration: Calibration | None,
     half: float,
-) -> dict[str, tuple[Float64, Float64, Float64]]:
+) -> dict[str, tuple[FloatArray, FloatArray, FloatArray]]:
     """Of each view the patches (n, d) of A and of B, and the norms (n,) of B's change."""
-    found: dict[str, tuple[list[Float64], list[Float64], list[float]]] = {view: ([], [], []) for view in VIEWS}
+    found: dict[str, tuple[list[FloatArray], list[FloatArray], list[float]]] = {view: ([], [], []) for view in VIEWS}
     a0, b0 = comparison.alignment(comparison.a.reference), comparison.b.reference.astype(np.float32)
     level = b0.mean(axis=(0, 1))
     for k, patch in touched.items():
@@ -272,7 +270,9 @@ def _patches(
     }
 
 
-def _add(to: tuple[list[Float64], list[Float64], list[float]], a: Float64, b: Float64, change: Float64) -> None:
+def _add(
+    to: tuple[list[FloatArray], list[FloatArray], list[float]], a: FloatArray, b: FloatArray, change: FloatArray
+) -> None:
     to[0].append(a)
     to[1].append(b)
     to[2].append(float(np.linalg.norm(change)))
@@ -293,7 +293,7 @@ def _in_cells(
     return (x - u0) * scale + (GRID.columns - 1) / 2, (y - v0) * scale + (GRID.rows - 1) / 2, reach
 
 
-def _cut(field: NDArray[np.float32], x: float, y: float, half: float) -> Float64:
+def _cut(field: NDArray[np.float32], x: float, y: float, half: float) -> FloatArray:
     """(d,) values of a square patch of a field (H, W[, n]) round x, y, as far as `half` each way."""
     import cv2
 

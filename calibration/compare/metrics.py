@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tacsim.interface import FloatArray, Mask
+
 Picture = NDArray[np.uint8] | NDArray[np.floating]
-Float64 = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 WHITE = 255.0  # grey level
 WINDOW = 7  # side of the window of SSIM [px]
@@ -51,7 +51,7 @@ def peak_signal_to_noise(one: Picture, other: Picture, where: Mask | None = None
     return 10.0 * math.log10(WHITE**2 / square) if square > 0 else math.inf
 
 
-def similarity_map(one: Picture, other: Picture) -> Float64:
+def similarity_map(one: Picture, other: Picture) -> FloatArray:
     """(H, W) SSIM (Wang et al., IEEE TIP 2004), mean over channels: uniform window of 7 x 7, sample covariance,
     reflecting border. scikit-image's `structural_similarity` gives the same numbers."""
     import cv2
@@ -61,7 +61,7 @@ def similarity_map(one: Picture, other: Picture) -> Float64:
     if min(a.shape[:2]) < WINDOW:
         raise ValueError(f"pictures of {a.shape[1]} x {a.shape[0]} px are smaller than SSIM's window of {WINDOW} px")
 
-    def mean(picture: Float64) -> Float64:
+    def mean(picture: FloatArray) -> FloatArray:
         return np.asarray(cv2.blur(picture, (WINDOW, WINDOW), borderType=cv2.BORDER_REFLECT), dtype=np.float64)
 
     unbiased = WINDOW**2 / (WINDOW**2 - 1.0)
@@ -188,12 +188,12 @@ def _require_alike(one: NDArray[np.generic], other: NDArray[np.generic]) -> None
         raise ValueError(f"shapes differ: {one.shape} and {other.shape}; align them first")
 
 
-def _difference(one: NDArray[np.generic], other: NDArray[np.generic]) -> Float64:
+def _difference(one: NDArray[np.generic], other: NDArray[np.generic]) -> FloatArray:
     _require_alike(one, other)
     return np.asarray(one, dtype=np.float64) - np.asarray(other, dtype=np.float64)
 
 
-def _mean(values: Float64, where: Mask | None) -> float:
+def _mean(values: FloatArray, where: Mask | None) -> float:
     chosen = values if where is None else values[where]
     known = chosen[np.isfinite(chosen)]
     return float(known.mean()) if known.size else math.nan

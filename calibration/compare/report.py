@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from calibration.compare.compare import METRICS, Comparison, Metric, Overall
 from calibration.compare.invariance import CHANGES, VIEWS, Report
 from calibration.compare.judgement import judgement
-
-Image = NDArray[np.uint8]
+from tacsim.interface import Image
 
 MAX_PICTURED = 24  # pairs with pictures, the worst first
 THUMBNAIL = 240  # longer side [px]

@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.compare import metrics
 from calibration.compare.alignment import Alignment
@@ -14,8 +13,8 @@ from calibration.compare.surfaces import GRID, SurfaceEstimate, flat_surface
 from calibration.drift import without_drift
 from calibration.frame_set import Frame, FrameSet, frame_warnings
 from tacsim.control.contact_signal import CONTACT_HEIGHT
+from tacsim.interface import Mask
 
-Mask = NDArray[np.bool_]
 Numbers = dict[str, float]
 
 GRAIN_MARGIN = 5  # of a contact's border, whose edge would pass for grain [px]

@@ -15,10 +15,8 @@ from calibration.frame_set import Frame, FrameSet
 from calibration.markers.flow import MarkersLost
 from calibration.normaliser import normaliser_for_calibration
 from calibration.reference import StaleReference, UnusableReference
-from tacsim.interface import TactileFrame
+from tacsim.interface import Float32, TactileFrame
 from tacsim.models.sensor import CanonicalGrid
-
-Float32 = NDArray[np.float32]
 
 GRID = CanonicalGrid()  # on which surfaces are compared
 

@@ -12,10 +12,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from tacsim.interface import Float32
 from tacsim.models.sensor import Lighting, SensorModel
 from tacsim.optics.render import shade, untouched_image
-
-Float32 = NDArray[np.float32]
 
 MAX_SLOPE = 1.5  # along each axis [-]
 SLOPE_STEP = 0.02  # between the slopes at which the light is evaluated [-]

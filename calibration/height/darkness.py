@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from tacsim.interface import Float32
 from tacsim.models.darkness import DarknessModel
-
-Float32 = NDArray[np.float32]
 
 SMOOTHING = 1.0  # standard deviation of the Gaussian that takes off noise [px]
 

@@ -16,15 +16,12 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.height.integration import slopes_of
 from calibration.height.slope_polynomial import EXTRAPOLATION
+from tacsim.interface import Float32, Mask
 from tacsim.models.photometric import PhotometricLight, PhotometricModel
 from tacsim.models.shadows import horizon
-
-Float32 = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 
 STEPS = 3
 STIFFNESS = 0.4  # (error of colour that is usual / error of slope that is usual)^2

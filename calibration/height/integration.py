@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Float32 = NDArray[np.float32]
+from tacsim.interface import Float32
 
 UNTOUCHED_RIM = 0.5e-3  # width of the band along the border of the view that counts as untouched [m]
 

@@ -14,10 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from tacsim.interface import Float32, FloatArray
 from tacsim.models.quantity import Config
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 DEGREE = 3
 TERMS = 56
@@ -38,12 +36,12 @@ class InverseModel(Config):
 class PolynomialSlopes:
     """An inverse model made ready for pixels at places x, y (H, W) in -1..1 across the sensor's own image."""
 
-    def __init__(self, model: InverseModel, x: Float64, y: Float64) -> None:
+    def __init__(self, model: InverseModel, x: FloatArray, y: FloatArray) -> None:
         self._steepest = EXTRAPOLATION * model.steepest
         colours = [powers for powers in _colour_powers() if powers]
         self._powers: list[tuple[int, ...]] = [(), *colours]
         maps = {powers: np.zeros((2, *x.shape)) for powers in self._powers}
-        places: dict[tuple[int, ...], Float64] = {(): np.ones_like(x)}  # ten of them, each of many terms
+        places: dict[tuple[int, ...], FloatArray] = {(): np.ones_like(x)}  # ten of them, each of many terms
         for (colour, place), weight in zip(_terms(), model.weights, strict=True):
             if place not in places:
                 places[place] = places[place[:-1]] * (x, y)[place[-1]]
@@ -72,7 +70,7 @@ class PolynomialSlopes:
         return np.moveaxis(slope, 0, -1), np.asarray(beyond)
 
 
-def inverse_features(change: Float64, x: Float64, y: Float64) -> Float64:
+def inverse_features(change: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
     """(n, TERMS) of relative changes (n, 3) at places x, y (n,) in -1..1; contiguous per term."""
     inputs = np.stack([*(COLOUR_SCALE * change).T, x, y])
     found: dict[tuple[int, ...], int] = {}
@@ -87,13 +85,13 @@ def inverse_features(change: Float64, x: Float64, y: Float64) -> Float64:
     return terms.T
 
 
-def to_normal(gradient: Float64) -> Float64:
+def to_normal(gradient: FloatArray) -> FloatArray:
     """(..., 2) parts of the unit normal in the plane, of slopes (..., 2)."""
-    normal: Float64 = gradient / np.sqrt(1.0 + (gradient**2).sum(axis=-1, keepdims=True))
+    normal: FloatArray = gradient / np.sqrt(1.0 + (gradient**2).sum(axis=-1, keepdims=True))
     return normal
 
 
-def fit_inverse(sets: Sequence[tuple[Float64, Float64]], *, with_position: bool) -> Float64:
+def fit_inverse(sets: Sequence[tuple[FloatArray, FloatArray]], *, with_position: bool) -> FloatArray:
     """(TERMS, 2) weights from normal equations, one pair (TERMS, TERMS), (TERMS, 2) a press; without `with_position`
     those of all terms in x and y are 0. Those without colour always are: no change is no slope, wherever it is. The
     ridge grows with the number of pixels, which the first diagonal element counts."""

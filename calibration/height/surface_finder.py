@@ -19,11 +19,9 @@ from calibration.height.colour_table import GradientModel
 from calibration.height.forward_steps import ForwardSteps
 from calibration.height.integration import Integrator, slopes_of
 from calibration.lens.rectification import seen_box
+from tacsim.interface import Float32, Mask
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.optics.grid import PixelGrid, canonical_image
-
-Float32 = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 
 INK_LEVEL = 0.6  # a printed dot is darker in all channels, relative to the mean of the gel [-]
 DOT_RIM = 1  # width of the blurred edge of a dot [px]

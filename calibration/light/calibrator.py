@@ -14,7 +14,6 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.errors import BadFrames
 from calibration.height.darkness import DarknessSlopes
@@ -56,6 +55,7 @@ from calibration.light.press import BallPress, Window, find_press, smooth, untou
 from calibration.light.refinement import RefinedGeometry, refine
 from calibration.light.shadows import DentShade, find_lamps
 from calibration.reference import STALE_COLOUR, exchanged
+from tacsim.interface import FloatArray, Image
 from tacsim.models.photometric import (
     DEPTH_TERMS,
     PhotometricLight,
@@ -63,9 +63,6 @@ from tacsim.models.photometric import (
     places_in_image,
 )
 from tacsim.optics.darkness import darkened
-
-Float64 = NDArray[np.float64]
-Image = NDArray[np.uint8]
 
 REFINEMENT_PIXELS = 2500  # of each press, about
 UNSHADED = 0.02  # share of the change of colour: where slopes leave no more, shadows are not looked for
@@ -168,7 +165,7 @@ def calibrate_light(
 
 
 def _leave_out_strangers(
-    found: list[BallPress], left_out: list[tuple[str, str]], reference: Image, mean: Float64, ball: float
+    found: list[BallPress], left_out: list[tuple[str, str]], reference: Image, mean: FloatArray, ball: float
 ) -> None:
     """Blurred pictures, and presses that the light of the others does not explain."""
     for k, share in reversed(blurred_presses(found, reference, mean)):
@@ -193,7 +190,7 @@ def _of_one_ball(
 
 
 def _equations(
-    presses: Sequence[BallPress], labels: Sequence[Float64], besides: Sequence[Float64]
+    presses: Sequence[BallPress], labels: Sequence[FloatArray], besides: Sequence[FloatArray]
 ) -> tuple[ModelSize, list[NormalEquations]]:
     """The size of the forward model, and each press's equations, with those of its saturated pixels that are predicted
     too dark."""
@@ -213,7 +210,7 @@ def _names(frames: Sequence[tuple[str, Image]]) -> tuple[str, ...]:
 
 
 def _darkness(
-    found: list[BallPress], left_out: list[tuple[str, str]], mean: Float64, reference: Image, ball: float
+    found: list[BallPress], left_out: list[tuple[str, str]], mean: FloatArray, reference: Image, ball: float
 ) -> LightFit:
     """The calibration of a light that tells depth and no direction. Raises BadFrames where it does not do that, too."""
     if not found:
@@ -331,7 +328,7 @@ def _shaded(
     return [replace(p, circle=c) for p, c in zip(presses, refined.circles, strict=True)], refined, shade
 
 
-def _warnings(presses: Sequence[BallPress], mean: Float64, left_out: int) -> list[str]:
+def _warnings(presses: Sequence[BallPress], mean: FloatArray, left_out: int) -> list[str]:
     """What a person should look at in the frames; calibration.light.checks.verdict judges the figures."""
     found = []
     drift = float(np.abs(np.median([(p.drift / mean).mean(axis=(0, 1)) for p in presses], axis=0)).max())
@@ -373,11 +370,11 @@ def _window(press: BallPress, pixels: int = REFINEMENT_PIXELS) -> Window:
 
 def _prediction(
     press: BallPress,
-    gradient: Float64,
-    beside: Float64,
+    gradient: FloatArray,
+    beside: FloatArray,
     forward: PhotometricModel,
     inverse: InverseModel,
-    mean: Float64,
+    mean: FloatArray,
     reference: Image,
 ) -> PressPrediction:
     """Of a press labelled `gradient` (H, W, 2), `beside` (H, W, terms), by models made without it.

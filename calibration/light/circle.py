@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.light.dent import MAX_RIM_RATIO, dent_slope
-
-Float64 = NDArray[np.float64]
+from tacsim.interface import FloatArray
 
 BLUR = 1.5  # of images and of the fitted dent, against noise [px]
 WINDOW = 2.0  # half side of what the fit looks at [half widths of the bright patch]
@@ -75,7 +74,7 @@ def contact_circle(image: NDArray[np.uint8], reference: NDArray[np.uint8], ball_
 
 
 def _fitted(
-    seen: Float64, columns: NDArray[np.intp], rows: NDArray[np.intp], start: tuple[float, float, float], ball: float
+    seen: FloatArray, columns: NDArray[np.intp], rows: NDArray[np.intp], start: tuple[float, float, float], ball: float
 ) -> Circle:
     """The circle that explains best what is `seen` (3, n) in a window; `start`: x, y, radius, about [px]."""
     from scipy.optimize import minimize
@@ -83,7 +82,7 @@ def _fitted(
     power = float((seen**2).sum()), float(((seen - seen.mean(axis=1, keepdims=True)) ** 2).sum())
     largest = MAX_RIM_RATIO * ball
 
-    def unexplained(guess: Float64) -> float:
+    def unexplained(guess: FloatArray) -> float:
         if not MIN_RADIUS / 2 < guess[2] < largest:
             return 2.0
         return _unexplained(seen, power, columns - guess[0], rows - guess[1], float(guess[2]), ball)
@@ -98,14 +97,14 @@ def _fitted(
     return Circle(float(found.x[0]), float(found.x[1]), float(found.x[2]), 1.0 - float(found.fun))
 
 
-def _blurred(image: Float64) -> Float64:
+def _blurred(image: FloatArray) -> FloatArray:
     import cv2
 
     side = 2 * round(4 * BLUR) + 1
     return np.asarray(cv2.GaussianBlur(image, (side, side), BLUR, borderType=cv2.BORDER_REFLECT), dtype=np.float64)
 
 
-def _patch(difference: Float64) -> tuple[float, float, float]:
+def _patch(difference: FloatArray) -> tuple[float, float, float]:
     """Centre and half width of the brightest patch of the difference. Raises NoCircle for images that do not differ."""
     import cv2
 
@@ -121,7 +120,7 @@ def _patch(difference: Float64) -> tuple[float, float, float]:
 
 
 def _unexplained(
-    seen: Float64, power: tuple[float, float], dx: Float64, dy: Float64, contact: float, ball: float
+    seen: FloatArray, power: tuple[float, float], dx: FloatArray, dy: FloatArray, contact: float, ball: float
 ) -> float:
     """Share of the variance of `seen` (3, n) that no polynomial of the dent's slopes explains; `power`: sums of the
     squares of `seen`, and of its variations."""

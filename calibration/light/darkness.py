@@ -14,7 +14,6 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.errors import BadFrames
 from calibration.light.circle import Circle, NoCircle
@@ -22,10 +21,8 @@ from calibration.light.dent import FAR, MAX_RIM_RATIO, ContactCircle, depth_prof
 from calibration.light.photometry import FEW_PRESSES
 from calibration.light.press import BallPress, press_at, smooth, untouched_mean
 from calibration.light.refinement import FIRST_THINNESS, MAX_GROUPS, RIVAL, THINNESS_BOUNDS
+from tacsim.interface import FloatArray, Image
 from tacsim.models.darkness import DarknessModel
-
-Float64 = NDArray[np.float64]
-Image = NDArray[np.uint8]
 
 ALIKE = 0.6  # share of the power of a press's change that is the same all round, above which no direction is told
 ROUND = 2.5  # up to where it is looked at [contact radii]: a flank's neighbours are there, too
@@ -54,7 +51,7 @@ class DarknessFit:
     left_out: tuple[DarknessModel | None, ...]  # the model by all other presses, for each; None: there are none
 
 
-def rough_contact(change: Float64) -> ContactCircle:
+def rough_contact(change: FloatArray) -> ContactCircle:
     """Where a change of colour (H, W, 3) is strongest. Raises NoCircle."""
     import cv2
 
@@ -69,7 +66,7 @@ def rough_contact(change: Float64) -> ContactCircle:
     return ContactCircle(float(u.mean()), float(v.mean()), EDGE * float(np.sqrt(len(u) / np.pi)))
 
 
-def tells_no_direction(changes: Iterable[Float64]) -> bool:
+def tells_no_direction(changes: Iterable[FloatArray]) -> bool:
     """True where most changes of colour (H, W, 3) are the same all round their contacts, in each channel: what is
     strongest may be one flank alone, which in its own colour is round too, and not in the others."""
     shares = []
@@ -90,7 +87,7 @@ def tells_no_direction(changes: Iterable[Float64]) -> bool:
     return bool(shares) and float(np.median(shares)) > ALIKE
 
 
-def find_dark_press(name: str, image: Image, reference: Image, mean: Float64, ball: float) -> BallPress:
+def find_dark_press(name: str, image: Image, reference: Image, mean: FloatArray, ball: float) -> BallPress:
     """One frame's press: its circle, about, and its change of colour without drift; as calibration.light.press says.
     Raises NoCircle, BadFrames."""
     raw = image.astype(np.float64) - reference
@@ -148,9 +145,9 @@ def fit_darkness(presses: Sequence[BallPress], ball: float) -> DarknessFit:
 class _Window:
     """The n pixels of one press that take part."""
 
-    u: Float64
-    v: Float64
-    change: Float64  # (n, 3) relative
+    u: FloatArray
+    v: FloatArray
+    change: FloatArray  # (n, 3) relative
 
 
 class _Problem:
@@ -162,11 +159,11 @@ class _Problem:
         self.windows = [_window(press) for press in presses]
         self._features = functools.lru_cache(maxsize=8 * len(presses) + 8)(self._new_features)
 
-    def start(self, thinness: float) -> Float64:
+    def start(self, thinness: float) -> FloatArray:
         circles = [number for p in self.presses for number in (p.circle.x, p.circle.y, p.circle.radius)]
         return np.array([*circles, thinness, *FIRST])
 
-    def refined(self, start: Float64) -> tuple[Float64, float]:
+    def refined(self, start: FloatArray) -> tuple[FloatArray, float]:
         """The least near `start`, and its cost."""
         from scipy.optimize import least_squares
 
@@ -190,7 +187,7 @@ class _Problem:
         )
         return np.asarray(found.x, dtype=np.float64), float(found.cost)
 
-    def jackknife(self, best: Float64) -> list[float]:
+    def jackknife(self, best: FloatArray) -> list[float]:
         """Standard deviation of the scale of all radii by leaving out groups of presses; none for a single press."""
         count = len(self.presses)
         if count < 2:
@@ -203,7 +200,7 @@ class _Problem:
             scales.append(_log_ratio(part.refined(begin)[0], begin, signed=True))
         return [float(np.sqrt((groups - 1) / groups * np.sum((np.array(scales) - np.mean(scales)) ** 2)))]
 
-    def own_depth(self, i: int, at: Float64) -> Float64:
+    def own_depth(self, i: int, at: FloatArray) -> FloatArray:
         """(n,) depth beyond the share of that round it, in the window of press `i` [px]."""
         x, y, radius = map(float, at[3 * i : 3 * i + 3])
         thinness, share, reach = map(float, at[-3:])
@@ -213,12 +210,12 @@ class _Problem:
         distance = np.hypot(window.u - x, window.v - y)
         return np.asarray(np.interp(distance, _radii() * self._ball, own) * self._ball, dtype=np.float64)
 
-    def _new_features(self, i: int, at: tuple[float, ...]) -> Float64:
+    def _new_features(self, i: int, at: tuple[float, ...]) -> FloatArray:
         deep = self.own_depth(i, np.array([*([0.0] * 3 * i), *at])) / self._ball
         above, below = np.maximum(deep, 0.0), np.minimum(deep, 0.0)
         return np.stack([above, below, above**2][: 3 if len(self.presses) > FEW_PRESSES else 2], axis=-1)
 
-    def _residual(self, at: Float64) -> Float64:
+    def _residual(self, at: FloatArray) -> FloatArray:
         shared = tuple(map(float, at[-3:]))
         terms = [self._features(i, (*map(float, at[3 * i : 3 * i + 3]), *shared)) for i in range(len(self.presses))]
         rows, seen = np.concatenate(terms), np.concatenate([w.change.mean(axis=1) for w in self.windows])
@@ -227,7 +224,7 @@ class _Problem:
         return np.asarray(rows @ weights - seen, dtype=np.float64)
 
 
-def _log_ratio(one: Float64, other: Float64, *, signed: bool = False) -> float:
+def _log_ratio(one: FloatArray, other: FloatArray, *, signed: bool = False) -> float:
     """Mean logarithm of the ratio of radii."""
     ratio = float(np.mean(np.log(one[2:-3:3] / other[2:-3:3])))
     return ratio if signed else abs(ratio)
@@ -242,18 +239,18 @@ def _window(press: BallPress) -> _Window:
 
 
 @functools.cache
-def _radii() -> Float64:
+def _radii() -> FloatArray:
     return np.arange(0.0, FAR, STEP)
 
 
 @functools.lru_cache(maxsize=64)
-def _profile(contact: float, thinness: float) -> Float64:
+def _profile(contact: float, thinness: float) -> FloatArray:
     """Depth of a dent at :func:`_radii`; all in ball radii."""
     return depth_profile(_radii(), contact, 1.0, 1 / thinness)
 
 
 @functools.lru_cache(maxsize=8)
-def _mean_round(reach: float) -> Float64:
+def _mean_round(reach: float) -> FloatArray:
     """(n, n) from a profile at :func:`_radii` to that of its Gaussian mean over the plane."""
     from scipy.special import ive
 
@@ -262,11 +259,11 @@ def _mean_round(reach: float) -> Float64:
     return np.asarray(weights / np.maximum(weights.sum(axis=1, keepdims=True), 1e-300), dtype=np.float64)
 
 
-def _without(parts: Sequence[Float64], i: int) -> list[Float64]:
+def _without(parts: Sequence[FloatArray], i: int) -> list[FloatArray]:
     return [part for k, part in enumerate(parts) if k != i]
 
 
-def _table(depths: Sequence[Float64], seen: Sequence[Float64]) -> tuple[Float64, Float64]:
+def _table(depths: Sequence[FloatArray], seen: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
     """Knots (k,) and changes (k, 3) that fall from each to the next and are 0 at depth 0: the least squares of changes
     `seen` (n, 3) at `depths` (n,) by non-negative steps. Raises BadFrames where nothing falls."""
     from scipy.optimize import nnls
@@ -288,13 +285,13 @@ def _table(depths: Sequence[Float64], seen: Sequence[Float64]) -> tuple[Float64,
     return knots, changes - changes[below]
 
 
-def _model(table: tuple[Float64, Float64], share: float, reach: float) -> DarknessModel:
+def _model(table: tuple[FloatArray, FloatArray], share: float, reach: float) -> DarknessModel:
     knots, changes = table
     rows = tuple((float(r), float(g), float(b)) for r, g, b in changes)
     return DarknessModel(depths=tuple(map(float, knots)), changes=rows, share=share, reach=reach)
 
 
-def _unexplained(depth: Float64, seen: Float64, table: tuple[Float64, Float64]) -> float:
+def _unexplained(depth: FloatArray, seen: FloatArray, table: tuple[FloatArray, FloatArray]) -> float:
     knots, changes = table
     told = np.stack([np.interp(depth, knots, channel) for channel in changes.T], axis=-1)
     return float(((told - seen) ** 2).sum() / max(float((seen**2).sum()), 1e-300))

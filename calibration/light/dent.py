@@ -18,9 +18,8 @@ import functools
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Float64 = NDArray[np.float64]
+from tacsim.interface import FloatArray
 
 MAX_RIM_RATIO = 0.98  # contact radius over ball radius; the slope is infinite at 1
 POISSON = 0.48  # of silicone; between 0.45 and 0.495 the slope changes by 2 % of that at the circle
@@ -38,13 +37,13 @@ class ContactCircle:
     radius: float
 
 
-def hertz_slope(q: Float64) -> Float64:
+def hertz_slope(q: FloatArray) -> FloatArray:
     """Slope of the free surface outside a contact, over that at its circle; q: contact radius over distance, 0 to 1."""
     q = np.maximum(q, 1e-9)
     return np.asarray(2 / np.pi * (np.arcsin(q) / q - np.sqrt(1 - q * q)), dtype=np.float64)
 
 
-def layer_slope(distance: Float64, thinness: float) -> Float64:
+def layer_slope(distance: FloatArray, thinness: float) -> FloatArray:
     """The same on a layer at `distance` (n,) from the axis [contact radii, >= 1]; `thinness`: contact radius over the
     layer's thickness, 0 to 3.
 
@@ -65,7 +64,7 @@ def layer_slope(distance: Float64, thinness: float) -> Float64:
 
 
 @functools.cache
-def _missing_waves() -> tuple[Float64, Float64]:
+def _missing_waves() -> tuple[FloatArray, FloatArray]:
     """Numbers of waves over one thickness, and how much less than a half-space a layer answers, times the weights of
     Gauss's quadrature."""
     x, weights = np.polynomial.legendre.leggauss(48)
@@ -74,7 +73,7 @@ def _missing_waves() -> tuple[Float64, Float64]:
     return q, 5.0 * weights * (1 - answer)
 
 
-def dent_slope(distance: Float64, contact: float, ball: float, thickness: float = np.inf) -> Float64:
+def dent_slope(distance: FloatArray, contact: float, ball: float, thickness: float = np.inf) -> FloatArray:
     """Slope at `distance` from the axis of a ball in contact up to `contact` on a layer of `thickness`; in one unit.
 
     Raises ValueError for a circle as large as the ball.
@@ -89,8 +88,8 @@ def dent_slope(distance: Float64, contact: float, ball: float, thickness: float 
 
 
 def dent_gradient(
-    u: Float64, v: Float64, circle: ContactCircle, thickness: float, ball: float, blur: float = 0.0
-) -> Float64:
+    u: FloatArray, v: FloatArray, circle: ContactCircle, thickness: float, ball: float, blur: float = 0.0
+) -> FloatArray:
     """(..., 2) slopes of the height (into the gel) at pixels u, v (...,); `ball`: its radius, `thickness` of the layer
     [px].
 
@@ -113,7 +112,7 @@ def dent_gradient(
     return np.stack([-steepness * dx, -steepness * dy], axis=-1)
 
 
-def depth_profile(radii: Float64, contact: float, ball: float, thickness: float) -> Float64:
+def depth_profile(radii: FloatArray, contact: float, ball: float, thickness: float) -> FloatArray:
     """(n,) depth of a dent at `radii`, which rise evenly from 0; 0 at the last; all in one unit."""
     slope = dent_slope(radii, contact, ball, thickness)
     depth = np.concatenate([[0.0], np.cumsum((slope[1:] + slope[:-1]) / 2 * np.diff(radii))])
@@ -121,13 +120,13 @@ def depth_profile(radii: Float64, contact: float, ball: float, thickness: float)
 
 
 @functools.lru_cache(maxsize=64)
-def whole_profile(contact: float, ball: float, thickness: float) -> tuple[Float64, Float64]:
+def whole_profile(contact: float, ball: float, thickness: float) -> tuple[FloatArray, FloatArray]:
     """Radii up to FAR ball radii and the depth of a dent there [px]; for everybody, not to be written to."""
     radii = np.arange(0.0, FAR * ball, DEPTH_STEP)
     return radii, depth_profile(radii, contact, ball, thickness)
 
 
-def dent_height(u: Float64, v: Float64, circle: ContactCircle, thickness: float, ball: float) -> Float64:
+def dent_height(u: FloatArray, v: FloatArray, circle: ContactCircle, thickness: float, ball: float) -> FloatArray:
     """(...,) height (into the gel) of that dent at pixels u, v (...,) [px]; 0 at FAR ball radii."""
     radii, depth = whole_profile(circle.radius, ball, thickness)
     return np.asarray(np.interp(np.hypot(u - circle.x, v - circle.y), radii, depth), dtype=np.float64)

@@ -15,12 +15,11 @@ from calibration.lens.view import GelView
 from calibration.light.checks.press_shapes import Stretch
 from calibration.light.dent import ContactCircle
 from calibration.light.photometry import ModelSize
-from calibration.light.press import FAR, BallPress, Image
+from calibration.light.press import FAR, BallPress
+from tacsim.interface import FloatArray, Image
 from tacsim.models.darkness import DarknessModel
 from tacsim.models.photometric import PhotometricModel
 from tacsim.models.sensor import CameraNoise, Markers, SensorGeometry
-
-Float64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -106,7 +105,9 @@ class LightFit:
         )
 
 
-def compared(press: BallPress, predicted: Float64, angles: Float64, mean: Float64, reference: Image) -> PressPrediction:
+def compared(
+    press: BallPress, predicted: FloatArray, angles: FloatArray, mean: FloatArray, reference: Image
+) -> PressPrediction:
     """A press beside what was predicted of it: change of colour (H, W, 3) [grey levels], and how far the normals that
     were found are off (H, W) [degrees]."""
     distance = press.distance() / press.circle.radius
@@ -127,10 +128,10 @@ def compared(press: BallPress, predicted: Float64, angles: Float64, mean: Float6
     )
 
 
-def normal_angle(one: Float64, other: Float64) -> Float64:
+def normal_angle(one: FloatArray, other: FloatArray) -> FloatArray:
     """(...,) angle [degrees] between unit normals given by their parts (..., 2) in the plane."""
 
-    def full_normal(parts: Float64) -> Float64:
+    def full_normal(parts: FloatArray) -> FloatArray:
         square = (parts**2).sum(axis=-1, keepdims=True)
         shorter = parts * np.minimum(1.0, 0.999 / np.sqrt(np.maximum(square, 1e-12)))
         return np.concatenate([shorter, np.sqrt(1.0 - (shorter**2).sum(axis=-1, keepdims=True))], axis=-1)

@@ -24,10 +24,10 @@ from calibration.light.photometry import (
 from calibration.light.press import FAR, NEAR, BallPress, smooth
 from calibration.light.refinement import RIM_BLUR, RefinedGeometry
 from calibration.light.shadows import DentShade
+from tacsim.interface import FloatArray
 from tacsim.models.photometric import DepthColour, PhotometricModel, depth_terms, normal_terms, place_in_image
 from tacsim.models.shadows import CastShadows
 
-Float64 = NDArray[np.float64]
 Rows = tuple[tuple[float, float, float], ...]  # weights of R, G, B, a row a term
 
 BLUR = 0.8  # of the camera, and of what the forward model is fitted to [px]
@@ -35,7 +35,7 @@ INVERSE_BLUR = 1.2  # of what the inverse is fitted to [px]
 RIM_MARGIN = 5.0  # that contact and skirt reach further, whatever the radius [px]
 
 
-def label(press: BallPress, refined: RefinedGeometry, ball: float) -> Float64:
+def label(press: BallPress, refined: RefinedGeometry, ball: float) -> FloatArray:
     """(H, W, 2) slopes that are taken for the true ones."""
     v, u = np.mgrid[: press.shape[0], : press.shape[1]].astype(np.float64)
     return dent_gradient(u, v, press.circle, refined.thickness, ball, RIM_BLUR)
@@ -48,8 +48,8 @@ def deepest_dent(refined: RefinedGeometry, ball: float) -> float:
 
 
 def beside_slopes(
-    press: BallPress, gradient: Float64, refined: RefinedGeometry, ball: float, shade: DentShade | None
-) -> Float64:
+    press: BallPress, gradient: FloatArray, refined: RefinedGeometry, ball: float, shade: DentShade | None
+) -> FloatArray:
     """(H, W, terms) of depth, of slopes (H, W, 2) at depth, and of cast shadows where there are any."""
     v, u = np.mgrid[: press.shape[0], : press.shape[1]].astype(np.float64)
     height = dent_height(u, v, press.circle, refined.thickness, ball)
@@ -68,7 +68,7 @@ def near_contact(press: BallPress) -> NDArray[np.bool_]:
     return np.asarray(press.distance() < NEAR * press.circle.radius + RIM_MARGIN)
 
 
-def _places(mask: NDArray[np.bool_]) -> tuple[Float64, Float64]:
+def _places(mask: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
     """u, v in -1/2..1/2 across the picture of the pixels of a mask (H, W)."""
     rows, columns = np.nonzero(mask)
     u, v = place_in_image(mask.shape[1], mask.shape[0])
@@ -76,7 +76,7 @@ def _places(mask: NDArray[np.bool_]) -> tuple[Float64, Float64]:
 
 
 def forward_equations(
-    press: BallPress, gradient: Float64, beside: Float64, counted: NDArray[np.bool_] | None = None
+    press: BallPress, gradient: FloatArray, beside: FloatArray, counted: NDArray[np.bool_] | None = None
 ) -> NormalEquations:
     """`counted` (H, W, 3): what takes part; None: what is not saturated."""
     near = near_contact(press)
@@ -86,7 +86,7 @@ def forward_equations(
 
 
 def counted_pixels(
-    press: BallPress, gradient: Float64, beside: Float64, weights: Float64, size: ModelSize
+    press: BallPress, gradient: FloatArray, beside: FloatArray, weights: FloatArray, size: ModelSize
 ) -> NDArray[np.bool_]:
     """(H, W, 3) what is not saturated, and what is where `weights` say less than is seen: a saturated pixel says "at
     least so bright"."""
@@ -99,13 +99,13 @@ def counted_pixels(
     return counted
 
 
-def _inverse_terms(press: BallPress, where: NDArray[np.bool_]) -> Float64:
+def _inverse_terms(press: BallPress, where: NDArray[np.bool_]) -> FloatArray:
     """(n, terms) of the inverse at the pixels of a mask (H, W)."""
     u, v = _places(where)
     return inverse_features(smooth(press.change, INVERSE_BLUR)[where], 2 * u, 2 * v)
 
 
-def inverse_equations(press: BallPress, gradient: Float64) -> tuple[Float64, Float64]:
+def inverse_equations(press: BallPress, gradient: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Normal equations from contact and skirt, and from a tenth as many untouched pixels, whose slope is 0."""
     v, u = np.mgrid[: press.shape[0], : press.shape[1]]
     near, far = near_contact(press), press.distance() > FAR * press.circle.radius
@@ -139,6 +139,6 @@ def _depth_colour(deepest: float, weights: Rows, slopes: Rows) -> DepthColour | 
     return DepthColour(deepest=deepest, weights=weights, slopes=unscaled)
 
 
-def inverse_model(sets: Sequence[tuple[Float64, Float64]], steepest: float) -> InverseModel:
+def inverse_model(sets: Sequence[tuple[FloatArray, FloatArray]], steepest: float) -> InverseModel:
     weights = fit_inverse(sets, with_position=len(sets) > FEW_PRESSES)
     return InverseModel(weights=tuple((float(x), float(y)) for x, y in weights), steepest=steepest)

@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from calibration.drift import DriftFinder
 from calibration.light.press import FAR, BallPress, untouched_mean
 from calibration.reference import SATURATED
+from tacsim.interface import FloatArray, Image
 from tacsim.models.sensor import CameraNoise
 
-Float64 = NDArray[np.float64]
-Image = NDArray[np.uint8]
 Entry = TypeVar("Entry", bound=np.generic)
 
 TILE = 32  # side of the tiles; what is wider is drift, not noise [px]
@@ -61,7 +60,7 @@ def measure_press_noise(presses: Sequence[BallPress], reference: Image) -> Camer
     return _measured(np.concatenate(cut))
 
 
-def _measured(tiles: Float64) -> CameraNoise:
+def _measured(tiles: FloatArray) -> CameraNoise:
     """Of tiles (n, h, w, 3) of differences of two pictures. Raises NoiseUnknown."""
     if len(tiles) < MIN_TILES:
         raise NoiseUnknown(
@@ -89,7 +88,7 @@ def _measured(tiles: Float64) -> CameraNoise:
     )
 
 
-def _tiles(one: Image, other: Image) -> Float64:
+def _tiles(one: Image, other: Image) -> FloatArray:
     """(n, h, w, 3) the difference of two pictures tile by tile, drift and mean removed, where neither is black or
     saturated."""
     most, least = np.maximum(one, other).max(axis=2), np.minimum(one, other).min(axis=2)
@@ -102,7 +101,7 @@ def _tiles(one: Image, other: Image) -> Float64:
     return _free_tiles(np.asarray(np.moveaxis(planes, 0, -1) * level, dtype=np.float64), lost)
 
 
-def _free_tiles(still: Float64, lost: NDArray[np.bool_]) -> Float64:
+def _free_tiles(still: FloatArray, lost: NDArray[np.bool_]) -> FloatArray:
     """(n, h, w, 3) tiles of a difference (H, W, 3) that hold no `lost` pixel (H, W), each less its mean."""
     size = min(TILE, *still.shape[:2])
     tiles = _cut(still, size)[~_cut(lost[..., None], size).any(axis=(1, 2, 3))]
@@ -116,7 +115,7 @@ def _cut(picture: NDArray[Entry], size: int) -> NDArray[Entry]:
     return whole.swapaxes(1, 2).reshape(-1, size, size, channels)
 
 
-def _possible(covariance: Float64, deviation: Float64) -> tuple[float, float, float]:
+def _possible(covariance: FloatArray, deviation: FloatArray) -> tuple[float, float, float]:
     """Correlations R-G, R-B, G-B. Medians of tiles, taken one by one, need not fit together: the nearest that do."""
     scale = np.where(deviation > 0, deviation, 1.0)
     correlation = covariance / np.outer(scale, scale)

@@ -14,9 +14,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from tacsim.interface import FloatArray
 from tacsim.models.photometric import DEPTH_TERMS, normal_terms, position_terms, term_count
-
-Float64 = NDArray[np.float64]
 
 LARGEST = (5, 2)  # degree in the normal, degree in the place
 SIZES = ((1, 0), (3, 0), (5, 0), (1, 1), (3, 1), (5, 1), (1, 2), (3, 2), (5, 2))  # degree in the normal, in the place
@@ -55,8 +54,8 @@ class NormalEquations:
     """Normal equations of one press for the terms of LARGEST, and after them those of depth, of slopes at depth and of
     cast shadows. Each channel has its own where pixels are saturated in one and not in another."""
 
-    square: Float64  # (1, terms, terms) of all channels, or (3, terms, terms)
-    right: Float64  # (terms, 3)
+    square: FloatArray  # (1, terms, terms) of all channels, or (3, terms, terms)
+    right: FloatArray  # (terms, 3)
     power: float  # sum of the squares of the changes of colour
     count: int  # numbers summed
 
@@ -73,7 +72,7 @@ class NormalEquations:
         )
 
 
-def features(gradient: Float64, u: Float64, v: Float64, degree: int, position: int) -> Float64:
+def features(gradient: FloatArray, u: FloatArray, v: FloatArray, degree: int, position: int) -> FloatArray:
     """(n, terms) for slopes (n, 2) at places u, v (n,) in -1/2..1/2."""
     normal = np.ascontiguousarray(np.moveaxis(normal_terms(gradient, degree), 0, -1))
     place = np.moveaxis(position_terms(u, v, position), 0, -1)
@@ -81,12 +80,12 @@ def features(gradient: Float64, u: Float64, v: Float64, degree: int, position: i
 
 
 def normal_equations(
-    gradient: Float64,
-    u: Float64,
-    v: Float64,
-    change: Float64,
+    gradient: FloatArray,
+    u: FloatArray,
+    v: FloatArray,
+    change: FloatArray,
     lit: NDArray[np.bool_] | None = None,
-    beside: Float64 | None = None,
+    beside: FloatArray | None = None,
 ) -> NormalEquations:
     """Of n pixels: slopes (n, 2), places (n,), relative changes of colour (n, 3); `lit` (n, 3): what is not saturated,
     and counts; None: all; `beside` (n, terms): of depth and cast shadows; None: there are none."""
@@ -103,14 +102,16 @@ def normal_equations(
     return NormalEquations(np.stack(squares), right, float((counted**2).sum()), int(lit.sum()))
 
 
-def _all_sums(gradient: Float64, u: Float64, v: Float64, change: Float64, beside: Float64) -> tuple[Float64, Float64]:
+def _all_sums(
+    gradient: FloatArray, u: FloatArray, v: FloatArray, change: FloatArray, beside: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """G^T G and G^T `change` for G, the features of :func:`_sums` and beside them others (n, terms)."""
     square, right = _sums(gradient, u, v, np.concatenate([change, beside], axis=1))
     light, across = right[:, : change.shape[1]], right[:, change.shape[1] :]
     return np.block([[square, across], [across.T, beside.T @ beside]]), np.concatenate([light, beside.T @ change])
 
 
-def _sums(gradient: Float64, u: Float64, v: Float64, change: Float64) -> tuple[Float64, Float64]:
+def _sums(gradient: FloatArray, u: FloatArray, v: FloatArray, change: FloatArray) -> tuple[FloatArray, FloatArray]:
     """F^T F and F^T `change` (n, any) for F = features(gradient, u, v, *LARGEST), without F: each of its 126 columns is
     a term of the normal times one of the place, and of the products of two columns most are the same powers. What is
     left are 87 products of the normal times 15 of the place, summed over CHUNK pixels at a time."""
@@ -160,13 +161,13 @@ def _pairs() -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     return where(_powers(degree), _products()), where(_places(position), _places(2 * position))
 
 
-def solve(pixels: NormalEquations, size: ModelSize) -> Float64:
+def solve(pixels: NormalEquations, size: ModelSize) -> FloatArray:
     """(terms, 3) ridge weights; `pixels`: the sum of all presses that count."""
     part = _part(pixels, terms_of(size))
     return ridge_solution(part.square, part.right, size.ridge)
 
 
-def ridge_solution(square: Float64, right: Float64, ridge: float) -> Float64:
+def ridge_solution(square: FloatArray, right: FloatArray, ridge: float) -> FloatArray:
     """(terms, 3) solution of the normal equations (1 or 3, terms, terms), (terms, 3) with `ridge` times the mean
     diagonal added to the diagonal."""
     size = square.shape[-1]

@@ -11,10 +11,8 @@ from calibration.errors import BadFrames
 from calibration.light.circle import contact_circle
 from calibration.light.dent import MAX_RIM_RATIO, ContactCircle
 from calibration.reference import SATURATED, UnusableReference, make_reference
+from tacsim.interface import FloatArray, Image
 from tacsim.models.photometric import place_in_image
-
-Float64 = NDArray[np.float64]
-Image = NDArray[np.uint8]
 
 NEAR = 2.3  # contact and skirt reach this far [contact radii]
 FAR = 3.0  # beyond, the gel is untouched [contact radii]
@@ -30,8 +28,8 @@ class BallPress:
 
     name: str
     circle: ContactCircle
-    change: Float64  # (H, W, 3) relative change of colour, without drift
-    drift: Float64  # (H, W, 3) drift of the light since the reference [grey levels]
+    change: FloatArray  # (H, W, 3) relative change of colour, without drift
+    drift: FloatArray  # (H, W, 3) drift of the light since the reference [grey levels]
     lit: NDArray[np.bool_]  # (H, W, 3) not saturated
 
     @property
@@ -39,7 +37,7 @@ class BallPress:
         """Rows and columns."""
         return (self.lit.shape[0], self.lit.shape[1])
 
-    def distance(self) -> Float64:
+    def distance(self) -> FloatArray:
         """(H, W) from the middle of the contact [px]."""
         v, u = np.mgrid[: self.shape[0], : self.shape[1]]
         return np.asarray(np.hypot(u - self.circle.x, v - self.circle.y), dtype=np.float64)
@@ -49,12 +47,12 @@ class BallPress:
 class Window:
     """The n pixels of one press that take part."""
 
-    u: Float64  # (n,) columns [px]
-    v: Float64  # (n,) rows [px]
-    change: Float64  # (n, 3) relative change of colour
+    u: FloatArray  # (n,) columns [px]
+    v: FloatArray  # (n,) rows [px]
+    change: FloatArray  # (n, 3) relative change of colour
 
 
-def untouched_mean(reference: Image) -> Float64:
+def untouched_mean(reference: Image) -> FloatArray:
     """(3,) mean colour of a picture without contact. Raises BadFrames for one that is dark or saturated."""
     try:
         base = make_reference(reference.astype(np.float32), np.ones(reference.shape[:2], dtype=np.bool_))
@@ -63,7 +61,7 @@ def untouched_mean(reference: Image) -> Float64:
     return base.mean.astype(np.float64)
 
 
-def find_press(name: str, image: Image, reference: Image, mean: Float64, ball: float) -> BallPress:
+def find_press(name: str, image: Image, reference: Image, mean: FloatArray, ball: float) -> BallPress:
     """Contact circle of one frame, about, and its change of colour without drift.
 
     Args:
@@ -78,7 +76,7 @@ def find_press(name: str, image: Image, reference: Image, mean: Float64, ball: f
 
 
 def press_at(
-    name: str, image: Image, reference: Image, mean: Float64, circle: ContactCircle, reach: float = NEAR
+    name: str, image: Image, reference: Image, mean: FloatArray, circle: ContactCircle, reach: float = NEAR
 ) -> BallPress:
     """The same with a contact that is known, about; `reach`: how far it changes the gel [contact radii]. Raises
     BadFrames."""
@@ -107,7 +105,7 @@ def press_at(
     return BallPress(name, circle, change, drift, lit)
 
 
-def _patch_area(strength: Float64, strong: float) -> int:
+def _patch_area(strength: FloatArray, strong: float) -> int:
     """Pixels of the largest patch that is as strong as `strong` somewhere, and half as strong everywhere."""
     import cv2
 
@@ -117,7 +115,7 @@ def _patch_area(strength: Float64, strong: float) -> int:
     return int(np.bincount(numbers.ravel(), minlength=count)[peaks].max(initial=0))
 
 
-def _drift(difference: Float64, untouched: NDArray[np.bool_]) -> Float64:
+def _drift(difference: FloatArray, untouched: NDArray[np.bool_]) -> FloatArray:
     """(H, W, 3) change between reference and frame where nothing touches: a quadratic in the place, or its median
     where too little is untouched."""
     if untouched.mean() < MIN_UNTOUCHED_SHARE:
@@ -127,11 +125,11 @@ def _drift(difference: Float64, untouched: NDArray[np.bool_]) -> Float64:
     terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
     seen = terms[untouched]
     weights = np.linalg.solve(seen.T @ seen, seen.T @ difference[untouched])
-    quadratic: Float64 = terms @ weights
+    quadratic: FloatArray = terms @ weights
     return quadratic
 
 
-def smooth(image: Float64, deviation: float) -> Float64:
+def smooth(image: FloatArray, deviation: float) -> FloatArray:
     """Blurred by a Gaussian of this standard deviation [px]."""
     import cv2
 

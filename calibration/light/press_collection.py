@@ -6,15 +6,13 @@ import math
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.errors import BadFrames
 from calibration.light.circle import NoCircle
 from calibration.light.darkness import find_dark_press, tells_no_direction
 from calibration.light.dent import ContactCircle
 from calibration.light.press import find_press, untouched_mean
-
-Image = NDArray[np.uint8]
+from tacsim.interface import Image
 
 MIN_SEPARATION = 0.5  # of two presses' centres [larger contact radius]
 THIRDS = ("left", "middle", "right"), ("top", "middle", "bottom")

@@ -12,14 +12,12 @@ from dataclasses import dataclass, field, replace
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.light.dent import MAX_RIM_RATIO, ContactCircle, dent_gradient, dent_height
 from calibration.light.photometry import features
 from calibration.light.press import Window
 from calibration.light.shadows import DentShade
-
-Float64 = NDArray[np.float64]
+from tacsim.interface import FloatArray
 
 DEGREE = 3  # of the light during refinement; without shadows the same everywhere on the gel
 RIDGE = 1e-4
@@ -120,10 +118,10 @@ class _Problem:
     ball: float
     shade: DentShade | None = None
     cost: float = np.inf
-    _terms: list[Float64] = field(default_factory=list)
-    _square: Float64 = field(default_factory=lambda: np.zeros((0, 0)))
-    _weights: Float64 = field(default_factory=lambda: np.zeros((0, 3)))
-    _residuals: list[Float64] = field(default_factory=list)
+    _terms: list[FloatArray] = field(default_factory=list)
+    _square: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+    _weights: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    _residuals: list[FloatArray] = field(default_factory=list)
 
     def part(self, kept: Sequence[int]) -> _Problem:
         """The same of some of the presses."""
@@ -145,7 +143,7 @@ class _Problem:
     def part_costs(self) -> list[float]:
         return [float((residual**2).sum()) for residual in self._residuals]
 
-    def normal_equations(self) -> tuple[Float64, Float64]:
+    def normal_equations(self) -> tuple[FloatArray, FloatArray]:
         """Gradient and Gauss-Newton curvature of half the cost by (x, y, radius) of each circle, then the thinness of
         the gel. What the light can explain is projected out."""
         count = 3 * len(self.circles) + 1
@@ -171,7 +169,7 @@ class _Problem:
         curvature -= np.einsum("cpk,kl,cql->pq", onto, inverse, onto, optimize=True)
         return gradient, curvature
 
-    def moved(self, step: Float64) -> _Problem:
+    def moved(self, step: FloatArray) -> _Problem:
         circles = tuple(
             ContactCircle(
                 circle.x + dx, circle.y + dy, float(np.clip(circle.radius + dr, 1.0, MAX_RIM_RATIO * self.ball))
@@ -181,7 +179,7 @@ class _Problem:
         thinness = float(np.clip(self.thinness + np.clip(step[-1], -0.5, 0.5), *THINNESS_BOUNDS))
         return _Problem(self.windows, circles, thinness, self.ball, self.shade)
 
-    def _features(self, i: int, circle: ContactCircle, thinness: float) -> Float64:
+    def _features(self, i: int, circle: ContactCircle, thinness: float) -> FloatArray:
         window = self.windows[i]
         thickness = self.ball / thinness
         gradient = dent_gradient(window.u, window.v, circle, thickness, self.ball, RIM_BLUR)

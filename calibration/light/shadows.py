@@ -6,14 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.light.dent import ContactCircle, dent_gradient, whole_profile
 from calibration.light.photometry import features
 from calibration.light.press import Window
+from tacsim.interface import FloatArray
 from tacsim.models.shadows import Floats, horizon, shadow_terms
-
-Float64 = NDArray[np.float64]
 
 DEGREE, POSITION = 3, 2  # of the light beside which shadows are sought
 RIDGE = 1e-4
@@ -30,7 +28,7 @@ class DentShade:
     lamps: tuple[tuple[float, float], ...]  # [widths of the picture], from its middle
     shape: tuple[int, int]  # rows, columns
 
-    def terms(self, u: Float64, v: Float64, circle: ContactCircle, thickness: float, ball: float) -> Float64:
+    def terms(self, u: FloatArray, v: FloatArray, circle: ContactCircle, thickness: float, ball: float) -> FloatArray:
         """(n, terms) of the shadows at pixels u, v (n,), in the order of their weights."""
         rows, columns = self.shape
         radii, depth = whole_profile(circle.radius, ball, thickness)
@@ -50,12 +48,12 @@ class DentShade:
         horizons = [horizon(height, x, y, lamp) for lamp in self.lamps]
         return np.ascontiguousarray(shadow_terms(horizons, x, y * (columns / rows)).T, dtype=np.float64)
 
-    def light(self, gradient: Float64, u: Float64, v: Float64) -> Float64:
+    def light(self, gradient: FloatArray, u: FloatArray, v: FloatArray) -> FloatArray:
         """(n, terms) of the light beside shadows, for slopes (n, 2)."""
         x, y = self._places(u, v)
         return features(gradient, x, y * (self.shape[1] / self.shape[0]), DEGREE, POSITION)
 
-    def _places(self, u: Float64, v: Float64) -> tuple[Float64, Float64]:
+    def _places(self, u: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray]:
         rows, columns = self.shape
         return (u - (columns - 1) / 2) / columns, (v - (rows - 1) / 2) / columns
 
@@ -83,7 +81,7 @@ def find_lamps(
     changes = np.concatenate([window.change for window in thin])
     own = lit.T @ lit
 
-    def unexplained(place: Float64, channel: int) -> float:
+    def unexplained(place: FloatArray, channel: int) -> float:
         shade = DentShade(((float(place[0]), float(place[1])),), shape)
         dark = np.concatenate(
             [shade.terms(s.u, s.v, circle, thickness, ball)[:, ::3] for s, circle in zip(thin, circles, strict=True)]

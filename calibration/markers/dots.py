@@ -5,15 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacsim.interface import Float32, FloatArray, Image
 from tacsim.optics.ink import MIN_RADIUS as MIN_RADIUS
 from tacsim.optics.ink import DotEraser as DotEraser
 from tacsim.optics.ink import darkness, dot_filters
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Image = NDArray[np.uint8]
 
 # A dot is darker than its surroundings by at least this share of their light; the higher levels part it from others
 MIN_DARKNESS = (0.2, 0.35, 0.5)
@@ -26,8 +22,8 @@ MAX_ELONGATION = 2.0  # length over breadth
 class Dots:
     """The dots of one picture."""
 
-    centres: Float64  # (n, 2) u, v [px]
-    areas: Float64  # (n,) [px^2]
+    centres: FloatArray  # (n, 2) u, v [px]
+    areas: FloatArray  # (n,) [px^2]
 
     @property
     def radius(self) -> float:

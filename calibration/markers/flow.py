@@ -18,13 +18,9 @@ from calibration.markers.dots import MIN_RADIUS, DotFinder
 from calibration.markers.lattice import Lattice, NoLattice, find_lattice, missing_line, spread, usual_pitch
 from calibration.markers.tracker import DotTracker
 from calibration.reference import UnusableReference
+from tacsim.interface import Float32, FloatArray, Image, Mask
 from tacsim.models.sensor import Markers
 from tacsim.optics.grid import PixelGrid
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-Image = NDArray[np.uint8]
 
 DOT_RADIUS = 2.5  # on the grid on which dots are sought [px]
 MAX_MISSING = 0.3  # share of the dots in view that a reference may lack
@@ -144,7 +140,7 @@ class MarkerFlow:
             moved = self._onto_gel(self._rest + moved, *height) - self._rest
         return moved.astype(np.float32)
 
-    def _points(self, image: Image) -> Float64:
+    def _points(self, image: Image) -> FloatArray:
         """(n, 2) x, y of the dots in a native image [m]."""
         import cv2
 
@@ -158,17 +154,17 @@ class MarkerFlow:
         seen = cv2.remap(grey, *self._map, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         centres = self._find(np.asarray(seen, dtype=np.uint8)).centres
         column, row = np.rint(centres).astype(np.intp).T
-        found: Float64 = centres[self._whole[row, column]] * self._pitch + self._origin
+        found: FloatArray = centres[self._whole[row, column]] * self._pitch + self._origin
         return found
 
-    def _in_view(self, points: Float64) -> Mask:
+    def _in_view(self, points: FloatArray) -> Mask:
         """(...,) whole dots at `points` (..., 2) [m] lie in the picture and on the gel."""
         column, row = np.rint(np.moveaxis((points - self._origin) / self._pitch, -1, 0)).astype(np.intp)
         rows, columns = self._whole.shape
         inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
         return np.asarray(inside & self._whole[row.clip(0, rows - 1), column.clip(0, columns - 1)])
 
-    def _onto_gel(self, apparent: Float64, height: Float32, grid: PixelGrid) -> Float64:
+    def _onto_gel(self, apparent: FloatArray, height: Float32, grid: PixelGrid) -> FloatArray:
         """Where dots are (..., 2) that the pinhole shows at `apparent`: what is pressed towards it looks larger."""
         import cv2
 

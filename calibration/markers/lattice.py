@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from tacsim.interface import FloatArray, Mask
+
 if TYPE_CHECKING:
     from scipy.spatial import KDTree
 
-Float64 = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 MAX_STEP_ERROR = 0.3  # of a neighbour, from one step along the lattice [pitches]
 MIN_ROW_SHARE = 0.5  # dots of a row or column of the lattice [number of dots of the fullest one]
@@ -28,7 +28,7 @@ class NoLattice(ValueError):
 class Lattice:
     """Rows along y and columns along x, as nearly as the lattice lies along them."""
 
-    positions: Float64  # (rows, columns, 2); where no point is, the lattice's smooth continuation
+    positions: FloatArray  # (rows, columns, 2); where no point is, the lattice's smooth continuation
     present: Mask  # (rows, columns) a point is there
     surplus: int  # points that belong to the same lattice, but beyond its rows and columns
 
@@ -40,7 +40,7 @@ class Lattice:
         return float(np.median(np.concatenate([along, down])))
 
 
-def usual_pitch(points: Float64) -> float:
+def usual_pitch(points: FloatArray) -> float:
     """Median distance to the nearest neighbour, of points (n >= 2, 2)."""
     from scipy.spatial import KDTree
 
@@ -48,7 +48,7 @@ def usual_pitch(points: Float64) -> float:
     return float(np.median(np.asarray(away)[:, 1]))
 
 
-def find_lattice(points: Float64, shape: tuple[int, int] | None = None, pitch: float | None = None) -> Lattice:
+def find_lattice(points: FloatArray, shape: tuple[int, int] | None = None, pitch: float | None = None) -> Lattice:
     """The square lattice in `points` (n, 2), turned by less than 45 degrees; outliers and gaps may be among them.
 
     Args:
@@ -75,7 +75,7 @@ def find_lattice(points: Float64, shape: tuple[int, int] | None = None, pitch: f
     return Lattice(_completed(positions, present), present, len(labels) - len(which))
 
 
-def _labels(points: Float64, pitch: float) -> dict[int, tuple[int, int]]:
+def _labels(points: FloatArray, pitch: float) -> dict[int, tuple[int, int]]:
     """Row and column (from anywhere) of all points that hang together, by the index of the point: grown from its most
     regular place, each step from its neighbour's own."""
     from scipy.spatial import KDTree
@@ -93,8 +93,8 @@ def _labels(points: Float64, pitch: float) -> dict[int, tuple[int, int]]:
     start = int(np.argmax(regular.sum(axis=1) - 1e-3 * aside))
     labels = {start: (0, 0)}
     taken = {(0, 0)}
-    queue: deque[tuple[int, Float64, Float64]] = deque([(start, along, down)])
-    reached: list[tuple[int, Float64, Float64]] = []
+    queue: deque[tuple[int, FloatArray, FloatArray]] = deque([(start, along, down)])
+    reached: list[tuple[int, FloatArray, FloatArray]] = []
     while queue:
         one, along, down = queue.popleft()
         reached.append((one, along, down))
@@ -108,13 +108,13 @@ def _labels(points: Float64, pitch: float) -> dict[int, tuple[int, int]]:
 
 def _neighbours(
     tree: KDTree,
-    points: Float64,
+    points: FloatArray,
     labels: dict[int, tuple[int, int]],
     taken: set[tuple[int, int]],
-    place: tuple[int, Float64, Float64],
+    place: tuple[int, FloatArray, FloatArray],
     pitch: float,
     far: int,
-) -> list[tuple[int, Float64, Float64]]:
+) -> list[tuple[int, FloatArray, FloatArray]]:
     """The points `far` steps from one to all sides, each with the steps there; they are labelled here."""
     one, along, down = place
     row, column = labels[one]
@@ -144,7 +144,7 @@ def missing_line(present: Mask, visible: Mask | None = None) -> str | None:
 
 
 def _window(
-    points: Float64, at: NDArray[np.intp], shape: tuple[int, int] | None
+    points: FloatArray, at: NDArray[np.intp], shape: tuple[int, int] | None
 ) -> tuple[NDArray[np.intp], tuple[int, int]]:
     """First row and column, and how many, of the lattice among points (n, 2) labelled `at` (n, 2)."""
     first = at.min(axis=0)
@@ -166,13 +166,13 @@ def _window(
     return chosen, shape
 
 
-def _affine(points: Float64, at: NDArray[np.intp]) -> Float64:
+def _affine(points: FloatArray, at: NDArray[np.intp]) -> FloatArray:
     """(2, 3) from (1, row, column) to the place."""
     terms = np.column_stack([np.ones(len(at)), at])
     return np.asarray(np.linalg.lstsq(terms, points, rcond=None)[0].T, dtype=np.float64)
 
 
-def _completed(positions: Float64, present: Mask) -> Float64:
+def _completed(positions: FloatArray, present: Mask) -> FloatArray:
     """`positions` (rows, columns, 2) with what is missing: the affine lattice, bent as the neighbours are."""
     if present.all():
         return positions
@@ -183,7 +183,7 @@ def _completed(positions: Float64, present: Mask) -> Float64:
     return np.asarray(affine + bent, dtype=np.float64)
 
 
-def spread(values: Float64, known: Mask) -> Float64:
+def spread(values: FloatArray, known: Mask) -> FloatArray:
     """`values` (rows, columns, n), where not `known` the mean of the nearest neighbours that are, ring by ring."""
     if known.all() or not known.any():
         return values

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-Float64 = NDArray[np.float64]
+from tacsim.interface import FloatArray, Mask
+
 Index = NDArray[np.intp]
-Mask = NDArray[np.bool_]
 
 NEIGHBOUR_RADIUS = 1.6  # dots this near at rest are neighbours: the diagonal of a square is one [pitches]
 # A dot is matched with a point this near to its place [pitches]
@@ -53,7 +53,7 @@ TINY = 1e-9  # keeps the map of a dot without any neighbour solvable
 class Tracked:
     """Where the dots are."""
 
-    displacement: Float64  # (n, 2) against rest; the mean of its neighbours' for a dot that is not seen
+    displacement: FloatArray  # (n, 2) against rest; the mean of its neighbours' for a dot that is not seen
     seen: Mask  # (n,)
 
     @property
@@ -65,7 +65,7 @@ class Tracked:
 class DotTracker:
     """Follows dots, in any unit of length."""
 
-    def __init__(self, rest: Float64, pitch: float, in_view: Callable[[Float64], Mask] | None = None) -> None:
+    def __init__(self, rest: FloatArray, pitch: float, in_view: Callable[[FloatArray], Mask] | None = None) -> None:
         """`rest`: (n, 2) the dots at rest; `pitch`: usual distance of neighbours; `in_view`: whether a dot at places
         (..., 2) would be seen; None: everywhere. Raises ValueError for fewer than 4 dots, or one without neighbours."""
         from scipy.spatial import KDTree
@@ -94,7 +94,7 @@ class DotTracker:
         self._displacement = np.zeros_like(self._rest)
         self._velocity = np.zeros_like(self._rest)
 
-    def __call__(self, points: Float64, ahead: int = 1) -> Tracked:
+    def __call__(self, points: FloatArray, ahead: int = 1) -> Tracked:
         """The dots among `points` (k, 2), `ahead` frames after the last ones (0: the same frame again). The velocity is
         dropped for a frame before the last one, or far ahead."""
         predicted = 0 <= ahead <= MAX_PREDICTED_FRAMES
@@ -119,7 +119,7 @@ class DotTracker:
         self._displacement = displacement
         return Tracked(displacement.copy(), seen)
 
-    def _match(self, expected: Float64, points: Float64, radius: float = MATCH_RADIUS) -> Index:
+    def _match(self, expected: FloatArray, points: FloatArray, radius: float = MATCH_RADIUS) -> Index:
         """(n,) the point of each dot, -1 where none is near: the least sum of squared distances (Kuhn 1955)."""
         from scipy.optimize import linear_sum_assignment
 
@@ -138,7 +138,7 @@ class DotTracker:
         partner[rows[close]] = columns[close]
         return partner
 
-    def _best(self, expected: Float64, points: Float64, predicted: bool) -> Index:
+    def _best(self, expected: FloatArray, points: FloatArray, predicted: bool) -> Index:
         """(n,) partners by the guess that explains most dots; of equal ones, by the smoothest."""
         found = [self._grown(expected, points)]
         if predicted:
@@ -155,7 +155,7 @@ class DotTracker:
             best = max(found, key=lambda partner: self._score(partner, points))
         return best
 
-    def _score(self, partner: Index, points: Float64) -> tuple[int, float]:
+    def _score(self, partner: Index, points: FloatArray) -> tuple[int, float]:
         """How many dots have a partner, or would be out of view if they moved with the others, less the unmatched
         points; and how little displacement changes across edges."""
         seen = partner >= 0
@@ -167,7 +167,7 @@ class DotTracker:
         spare = len(points) - int(seen.sum())
         return int((seen | out).sum()) - spare, -float(change.mean()) if len(change) else 0.0
 
-    def _grown(self, guess: Float64, points: Float64) -> Index:
+    def _grown(self, guess: FloatArray, points: FloatArray) -> Index:
         """Partners of the largest coherent part of the dots that are certainly where they are guessed, and of those
         that are found from there by extrapolation."""
         partner = self._match(guess, points, CERTAIN_RADIUS)
@@ -175,7 +175,7 @@ class DotTracker:
         smooth = self._without_outliers(partner, points)
         return partner if smooth is partner else self._without_outliers(self._extended(smooth, points), points)
 
-    def _extended(self, partner: Index, points: Float64) -> Index:
+    def _extended(self, partner: Index, points: FloatArray) -> Index:
         """`partner`, and those found by extrapolation, outwards from the dots that have one."""
         partner = partner.copy()
         refused = np.zeros(len(partner), dtype=np.bool_)
@@ -191,7 +191,7 @@ class DotTracker:
             refused[asked[found < 0]] = True
         return partner
 
-    def _without_outliers(self, partner: Index, points: Float64) -> Index:
+    def _without_outliers(self, partner: Index, points: FloatArray) -> Index:
         """`partner` without those far from where the dots around extrapolate to, the worst first."""
         checked = partner
         every = np.arange(len(partner))
@@ -204,7 +204,7 @@ class DotTracker:
             checked = np.where(misfit > 0.9 * misfit.max(), -1, checked)
         return checked
 
-    def _without_dirt(self, partner: Index, points: Float64) -> Index:
+    def _without_dirt(self, partner: Index, points: FloatArray) -> Index:
         """`partner`, but where an unmatched point fits far better to the dots around than the matched one, that was a
         speck of dirt."""
         known = partner >= 0
@@ -229,7 +229,7 @@ class DotTracker:
         once = np.bincount(cleaned[cleaned >= 0], minlength=len(points)).max() <= 1
         return cleaned if once else partner
 
-    def _without_strays(self, partner: Index, points: Float64) -> Index:
+    def _without_strays(self, partner: Index, points: FloatArray) -> Index:
         """`partner` without dots that lie aside from where those around extrapolate to, and whose neighbours hardly
         do: at the rim of a contact several do."""
         known = partner >= 0
@@ -241,22 +241,22 @@ class DotTracker:
         around = (self._linked * np.where(known, misfit, 0.0)).max(axis=1)
         return np.where(known & (misfit > np.maximum(limit, STRAY_MISFIT_RATIO * around)), -1, partner)
 
-    def _extrapolated(self, asked: Index, known: Mask, moved: Float64) -> Float64:
+    def _extrapolated(self, asked: Index, known: Mask, moved: FloatArray) -> FloatArray:
         """(k, 2) displacement of the dots `asked`, by an affine map through that (n, 2) of the `known` ones near."""
         nearest, terms = self._nearest[asked], self._terms[asked]
         weighted = (terms * (self._weight[asked] * known[nearest])[..., None]).transpose(0, 2, 1)
         square = weighted @ terms + AFFINE_RIDGE * np.diag([TINY, 1.0, 1.0])
         right = weighted @ np.where(known[:, None], moved, 0.0)[nearest]
-        moved_there: Float64 = np.linalg.solve(square, right)[:, 0]
+        moved_there: FloatArray = np.linalg.solve(square, right)[:, 0]
         return moved_there
 
-    def _displacements(self, partner: Index, points: Float64) -> tuple[Float64, Mask]:
+    def _displacements(self, partner: Index, points: FloatArray) -> tuple[FloatArray, Mask]:
         """(n, 2) displacement, 0 without a partner; and (edges,) whether both ends have one."""
         seen = partner >= 0
         moved = np.where(seen[:, None], points[partner] - self._rest, 0.0) if len(points) else np.zeros_like(self._rest)
         return moved, seen[self._first] & seen[self._second]
 
-    def _coherent(self, partner: Index, points: Float64, stretch: float) -> Mask:
+    def _coherent(self, partner: Index, points: FloatArray, stretch: float) -> Mask:
         """(n,) dots with a partner, in the largest part whose edges are not overstretched."""
         from scipy.sparse import coo_array
         from scipy.sparse.csgraph import connected_components
@@ -273,7 +273,7 @@ class DotTracker:
         biggest = np.argmax(np.bincount(part, seen))
         return np.asarray((part == biggest) & seen)
 
-    def _filled(self, displacement: Float64, seen: Mask) -> Float64:
+    def _filled(self, displacement: FloatArray, seen: Mask) -> FloatArray:
         """`displacement` with the mean of its neighbours' at each dot that is not seen (a discrete Laplace equation);
         that of the last frame where nothing at all is seen."""
         lost = ~seen
@@ -287,12 +287,12 @@ class DotTracker:
         filled[lost] = np.linalg.lstsq(laplace[np.ix_(lost, lost)], right, rcond=None)[0]
         return filled
 
-    def _may_have_jumped(self, partner: Index, points: Float64) -> bool:
+    def _may_have_jumped(self, partner: Index, points: FloatArray) -> bool:
         """Both dots and points are unmatched, as if they belonged together."""
         lost, spare = int((partner < 0).sum()), len(points) - int((partner >= 0).sum())
         return min(lost, spare) > max(1.0, JUMP_SHARE * len(partner))
 
-    def _jumps(self, points: Float64, start: Float64) -> list[Float64]:
+    def _jumps(self, points: FloatArray, start: FloatArray) -> list[FloatArray]:
         """Shifts (2,) of the whole lattice that bring most dots near a point or out of view, the best first."""
         from scipy.spatial import KDTree
 
@@ -305,7 +305,7 @@ class DotTracker:
         there = start[None, :, :] + shifts[:, None, :]
         away, _ = KDTree(points).query(there, distance_upper_bound=CERTAIN_RADIUS * self._pitch)
         explained = (np.isfinite(away) | ~self._in_view(there)).sum(axis=1)
-        chosen: list[Float64] = []
+        chosen: list[FloatArray] = []
         for shift in shifts[np.argsort(-explained, kind="stable")]:
             if all(float(np.linalg.norm(shift - other)) > CERTAIN_RADIUS * self._pitch for other in chosen):
                 chosen.append(shift)

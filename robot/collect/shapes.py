@@ -6,14 +6,13 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacsim.interface import FloatArray
 from tacsim.models.scene import Box, Cylinder, Sphere
 
 if TYPE_CHECKING:
     from trimesh import Trimesh
 
-FloatArray = NDArray[np.float64]
 SIDES = 64  # corners of a circle
 
 CLOSED_FORMS: dict[str, Sphere | Cylinder | Box] = {

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibration.lens.board import BadBoard, Board, Points, find_board
-from robot.procedures.session import CannotCalibrate, FrameSource, Image, Session
-from tacsim.interface import FloatArray, TactileFrame
+from robot.procedures.session import CannotCalibrate, FrameSource, Session
+from tacsim.interface import FloatArray, Image, TactileFrame
 
 STILL = 0.003  # of the picture's longer side: a board whose points move less stands still
 HOLD = 0.4  # for so long [s]

@@ -12,17 +12,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.errors import BadFrames
 from calibration.light.press_collection import PressCollection
 from calibration.markers.dots import DotEraser
 from calibration.markers.flow import find_markers
 from calibration.markers.lattice import NoLattice
-from robot.procedures.session import CannotCalibrate, FrameSource, Image, Session
-from tacsim.interface import TactileFrame
-
-Float32 = NDArray[np.float32]
+from robot.procedures.session import CannotCalibrate, FrameSource, Session
+from tacsim.interface import Float32, Image, TactileFrame
 
 CELL = 8  # colour is averaged over so many pixels each way: noise and JPEG go, contacts stay
 MOTION = 4.0  # a cell that changes by more is in motion [grey levels]

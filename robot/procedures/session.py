@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.errors import CalibrationError
 from robot.arm.ur import URArm
@@ -22,7 +21,6 @@ from tacsim.interface import Arm, EndOfEpisode, Pose, TactileFrame
 from tacsim.models.hardware import CameraSensorConfig, UrArmConfig
 from tacsim.models.rig import RigConfig
 
-Image = NDArray[np.uint8]
 Measurement = TypeVar("Measurement")
 Part = TypeVar("Part")
 

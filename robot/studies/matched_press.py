@@ -11,13 +11,12 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.errors import BadFrames
 from calibration.frame_set import Frame, FrameSet
 from calibration.light.circle import Circle, NoCircle, contact_circle
 from calibration.light.darkness import dark_circle
-from tacsim.interface import Pose, SurfaceMap
+from tacsim.interface import Image, Pose, SurfaceMap
 from tacsim.models.scene import GelSurface, Scene, Sphere
 from tacsim.models.sensor import CanonicalGrid, SensorModel
 from tacsim.optics.noise import noise_source
@@ -26,7 +25,6 @@ from tacsim.optics.surface import surface_map
 from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.physics.world import World, make_world
 
-Image = NDArray[np.uint8]
 # The contact circle in a picture, given the one without contact and the ball's radius [px]. Raises NoCircle, BadFrames
 CircleFinder = Callable[[Image, Image, float], Circle]
 

@@ -15,11 +15,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from tacsim.interface import FloatArray
+
 if TYPE_CHECKING:
     from scipy.spatial import KDTree
     from trimesh import Trimesh
 
-FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 Axes = tuple[FloatArray, FloatArray, FloatArray]
 

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tacsim.geometry.mesh import FloatArray
 from tacsim.geometry.shapes import centred
-from tacsim.interface import Pose
+from tacsim.interface import FloatArray, Pose
 from tacsim.models.scene import Box, Cylinder, Indenter, Mesh, Shape, Sphere
 from tacsim.pose import inverse, matrix, rotate
 

@@ -7,8 +7,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from tacsim.geometry.shapes import FloatArray, distance, extent, no_particle, outward_normals, particles
+from tacsim.geometry.shapes import distance, extent, no_particle, outward_normals, particles
 from tacsim.geometry.tiles import tiled_distance
+from tacsim.interface import FloatArray
 from tacsim.models.scene import Body, Mesh, Shape
 
 ITERATIONS = 20  # of mutual repulsion

@@ -20,14 +20,13 @@ from tacsim.geometry.mesh import (
     signed_distance,
     signed_distance_on_grid,
 )
-from tacsim.interface import Pose
+from tacsim.interface import FloatArray, Pose
 from tacsim.models.scene import Box, Cylinder, Indenter, Mesh, Shape, Sphere
 from tacsim.pose import inverse, matrix, rotate
 
 if TYPE_CHECKING:
     from trimesh import Trimesh
 
-FloatArray = NDArray[np.float64]
 
 MAX_PARTICLES = 5_000_000
 MAX_NODES = 20_000_000

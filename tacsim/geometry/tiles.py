@@ -16,8 +16,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tacsim.geometry.mesh import FloatArray, fingerprint, make_surface, signed_distance_on_grid
+from tacsim.geometry.mesh import fingerprint, make_surface, signed_distance_on_grid
 from tacsim.geometry.shapes import BAND, LEVEL, MAX_NODES, centred
+from tacsim.interface import FloatArray
 from tacsim.models.scene import Mesh
 
 Index = NDArray[np.int64]

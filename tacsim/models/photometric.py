@@ -21,11 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from tacsim.interface import Float32, FloatArray
 from tacsim.models.quantity import Config
 from tacsim.models.shadows import CastShadows, shadow_terms
 
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 Floating = NDArray[np.floating]
 
 Weight = Annotated[float, Field(allow_inf_nan=False)]
@@ -121,7 +120,7 @@ def relative_depth(height: Floating, deepest: float) -> Floating:
     return np.clip(height * height.dtype.type(1 / deepest), 0, 1)
 
 
-def place_in_image(columns: int, rows: int) -> tuple[Float64, Float64]:
+def place_in_image(columns: int, rows: int) -> tuple[FloatArray, FloatArray]:
     """u (columns,) and v (rows,) of the pixels of an image."""
     return (np.arange(columns) + 0.5) / columns - 0.5, (np.arange(rows) + 0.5) / rows - 0.5
 

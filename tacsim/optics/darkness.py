@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacsim.interface import Float32
 from tacsim.models.darkness import DarknessModel
-
-Float32 = NDArray[np.float32]
 
 FINE = 6.0  # standard deviation of a Gaussian [px] beyond which it is evaluated on a coarser picture
 

@@ -13,15 +13,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
+from tacsim.interface import Float32, FloatArray
 
 EDGE = 1e-9  # share of a triangle by which a point may lie outside: no gap between neighbours
 EDGE_ON = 0.1  # det J of a sheet that is seen edge-on; its slope is as that of one this narrow in the picture
 BESIDE = -1e3  # column and row of what lies beside the gel
 
 
-def visible_points(places: Float64, height: Float32, shape: tuple[int, int]) -> tuple[Float32, NDArray[np.bool_]]:
+def visible_points(places: FloatArray, height: Float32, shape: tuple[int, int]) -> tuple[Float32, NDArray[np.bool_]]:
     """The points of a surface's table that an image shows.
 
     places: (rows, columns, 2) where the table's points are seen, column and row in the image; height: (rows, columns)
@@ -42,7 +41,9 @@ def visible_points(places: Float64, height: Float32, shape: tuple[int, int]) -> 
     return found.reshape(*shape, 2), np.isfinite(deepest).reshape(shape)
 
 
-def _covered(places: Float64, height: Float32, shape: tuple[int, int]) -> tuple[NDArray[np.intp], Float64, Float64]:
+def _covered(
+    places: FloatArray, height: Float32, shape: tuple[int, int]
+) -> tuple[NDArray[np.intp], FloatArray, FloatArray]:
     """Image points (n,) under triangles between two rows of a table (2, columns, ...) that face the camera, one entry a
     triangle: their table points (n, 2) from the first row on, and heights (n,)."""
     corners = np.indices(height.shape, dtype=np.float64)[::-1].transpose(1, 2, 0)  # column, row

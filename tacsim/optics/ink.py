@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Float32 = NDArray[np.float32]
-Image = NDArray[np.uint8]
+from tacsim.interface import Float32, Image
 
 EDGE_DARKNESS = 0.15  # of the blurred edge of a dot: the share of its light that is missing
 MAX_RADIUS = 2.5  # of what may be a dot [radii]

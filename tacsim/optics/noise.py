@@ -14,10 +14,8 @@ import zlib
 import numpy as np
 from numpy.typing import NDArray
 
+from tacsim.interface import Float32, Image
 from tacsim.models.sensor import CameraNoise, SensorModel
-
-Float32 = NDArray[np.float32]
-Image = NDArray[np.uint8]
 
 FIELDS = 4  # of noise, drawn once for a sensor
 SHIFTS = 64  # of a field, in rows and in columns

@@ -22,6 +22,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from tacsim.interface import Float32, Mask
 from tacsim.models.geometry import GelView
 from tacsim.models.photometric import PhotometricLight, places_in_image
 from tacsim.models.scene import GelSurface
@@ -35,9 +36,6 @@ from tacsim.optics.shadows import shadow_colours
 from tacsim.optics.skin import lifted_skin
 from tacsim.optics.spline import line_matrices
 from tacsim.optics.surface import SurfaceTable, look_up, spread, thinned
-
-Float32 = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 
 # Lattice of the gel's texture [m]. At this pitch its slopes have the spread (0.023 for 2 um) of Gomes' white noise on
 # 54 um pixels, but they belong to the gel: an image of another size shows the same texture.

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacsim.interface import Float32
 from tacsim.models.photometric import PhotometricLight
 from tacsim.models.shadows import CastShadows, horizon
 from tacsim.optics.grid import PixelGrid
 from tacsim.optics.surface import SurfaceTable, look_up
-
-Float32 = NDArray[np.float32]
 
 THIN = 2  # every so many points of the table along each side: shadows have soft edges
 

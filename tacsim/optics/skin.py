@@ -7,9 +7,8 @@ share of it is on the skin (`SensorModel.skin`); calibration.light.skin measures
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Float32 = NDArray[np.float32]
+from tacsim.interface import Float32
 
 FINE = 0.25e-3  # standard deviation of the blur that leaves light alone [m]
 DARKEST = 1.0  # least light that skin is told from [grey levels]

@@ -13,12 +13,11 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from tacsim.interface import FloatArray
 from tacsim.models.scene import GelSurface
 
-Float64 = NDArray[np.float64]
 
-
-def spline_weights(position: Float64, nodes: int) -> tuple[NDArray[np.intp], Float64, Float64]:
+def spline_weights(position: FloatArray, nodes: int) -> tuple[NDArray[np.intp], FloatArray, FloatArray]:
     """Nodes (..., 3), their weights and the derivatives of those, at `position` (...,) in lattice spacings."""
     inside = np.clip(position, 0.0, nodes - 1.0)
     centre = np.floor(inside + 0.5)
@@ -30,7 +29,7 @@ def spline_weights(position: Float64, nodes: int) -> tuple[NDArray[np.intp], Flo
     return index, weight, slope
 
 
-def displacement_and_jacobian(surface: GelSurface, points: Float64) -> tuple[Float64, Float64]:
+def displacement_and_jacobian(surface: GelSurface, points: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Displacement (n, 3) [m] and its derivative (n, 3, 2) by X, Y at material points (n, 2) [m]."""
     nx, ny, _ = surface.displacement.shape
     i, wx, dx = spline_weights((points[:, 0] - surface.origin[0]) / surface.spacing, nx)
@@ -58,7 +57,7 @@ class LineMatrix:
         return product
 
 
-def line_matrices(position: Float64, nodes: int) -> tuple[LineMatrix, LineMatrix]:
+def line_matrices(position: FloatArray, nodes: int) -> tuple[LineMatrix, LineMatrix]:
     """Two (n, nodes) matrices: control values along a line -> spline and its derivative by the position, at `position`
     (n,) in lattice spacings."""
     index, *weights = spline_weights(position, nodes)

@@ -23,15 +23,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tacsim.interface import SurfaceMap
+from tacsim.interface import Float32, SurfaceMap
 from tacsim.models.scene import GelSurface
 from tacsim.models.sensor import CanonicalGrid, Markers
 from tacsim.optics.fold import EDGE_ON, visible_points
 from tacsim.optics.grid import PixelGrid, canonical_cells
 from tacsim.optics.markers import marker_flow
 from tacsim.optics.spline import displacement_and_jacobian, refined
-
-Float32 = NDArray[np.float32]
 
 # The table is this fine or finer [m], but has no more than so many points for each lattice spacing. Height errs by 0.2
 # um rms by it, 2 um on steep flanks; on a lattice of 2 mm, whose gel is far less exact, by 1 um rms, 10 um.

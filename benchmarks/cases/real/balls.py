@@ -16,9 +16,10 @@ from typing import TYPE_CHECKING, Annotated, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from benchmarks.cases.real.labels import BadData, Image, Positive, read_picture
+from benchmarks.cases.real.labels import BadData, Positive, read_picture
 from benchmarks.harness.measure import Measurement, Timing
 from benchmarks.harness.runner import Case
+from tacsim.interface import Image
 from tacsim.models.quantity import Config
 
 if TYPE_CHECKING:

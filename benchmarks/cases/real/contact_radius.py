@@ -11,20 +11,17 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.cases.press import layer, press
-from benchmarks.cases.real.labels import BadData, Image, PressLabels, read_frames, read_labels
+from benchmarks.cases.real.labels import BadData, PressLabels, read_frames, read_labels
 from benchmarks.harness.measure import Measurement, timed
 from benchmarks.harness.runner import Case
 from calibration.light.circle import NoCircle, contact_circle
-from tacsim.interface import Pose
+from tacsim.interface import FloatArray, Image, Pose
 from tacsim.models.material import GelMaterial
 from tacsim.models.scene import Gel, Indenter, Scene, Settling, Sphere
 from tacsim.physics.move import MoveStats
 from tacsim.physics.world import World, make_world
-
-Float64 = NDArray[np.float64]
 
 ELEMENT = 0.5e-3  # [m]
 LAYER_PIXELS = 512
@@ -118,7 +115,7 @@ def theories(ball: float, depth: float, thickness: float) -> dict[str, float]:
     """Contact radius [m] by others: the cap cut off a ball by the rest plane (images made from a depth map), Hertz on a
     half-space, and the FFT layer."""
 
-    def gap(r: Float64) -> Float64:
+    def gap(r: FloatArray) -> FloatArray:
         return np.where(r < ball, ball - np.sqrt(np.maximum(ball**2 - r**2, 0.0)), 1.0)
 
     contact = layer(gap, depth, GelMaterial().poisson_ratio, LAYER_PIXELS, thickness)

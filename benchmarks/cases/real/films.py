@@ -19,9 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from benchmarks.cases.real.labels import BadData, Image, find
+from benchmarks.cases.real.labels import BadData, find
 from benchmarks.harness.measure import Measurement, Timing
 from benchmarks.harness.runner import Case
+from tacsim.interface import Image
 from tacsim.models.quantity import Config
 from tacsim.record.episode import EpisodeError
 

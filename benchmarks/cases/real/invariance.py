@@ -16,10 +16,11 @@ from benchmarks.cases.real import balls
 from benchmarks.cases.real.balls import BallSet, Frames
 from benchmarks.cases.real.contact_radius import ball_scene
 from benchmarks.cases.real.known_depth import GRID, light_of
-from benchmarks.cases.real.labels import BadData, Image, read_labels
+from benchmarks.cases.real.labels import BadData, read_labels
 from benchmarks.harness.measure import Measurement, Timing
 from benchmarks.harness.runner import Case, missing_case
 from robot.studies.matched_press import ELEMENT
+from tacsim.interface import Image
 
 if TYPE_CHECKING:
     from calibration.bundle import Calibration

@@ -12,16 +12,16 @@ from time import perf_counter, process_time
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.cases.real import balls
 from benchmarks.cases.real.balls import BallSet
 from benchmarks.cases.real.contact_radius import ELEMENT, ball_scene, press_to
-from benchmarks.cases.real.labels import BadData, Image, PressLabel, PressLabels, read_frames, read_labels
+from benchmarks.cases.real.labels import BadData, PressLabel, PressLabels, read_frames, read_labels
 from benchmarks.harness.measure import Measurement, Timing
 from benchmarks.harness.runner import Case
 from calibration.light.circle import Circle, NoCircle, contact_circle
 from robot.studies.matched_press import placed
+from tacsim.interface import FloatArray, Image, Mask
 from tacsim.models.scene import GelSurface
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.physics.world import make_world
@@ -29,8 +29,6 @@ from tacsim.physics.world import make_world
 if TYPE_CHECKING:
     from calibration.light.fit import LightFit
 
-Mask = NDArray[np.bool_]
-Float64 = NDArray[np.float64]
 
 CASE = "known_depth"
 GRID = CanonicalGrid()
@@ -101,7 +99,7 @@ class CalibratedSensor:
     def see(self, surface: GelSurface) -> Image:
         return self._render(surface)
 
-    def height(self, image: Image) -> Float64:
+    def height(self, image: Image) -> FloatArray:
         """(h, w) [m] on the canonical grid, as the inverse model finds it."""
         from tacsim.interface import TactileFrame
 

@@ -10,16 +10,14 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
+from tacsim.interface import Image
 from tacsim.models.quantity import Config, Length
 from tacsim.record.episode import EpisodeError
 from tacsim.record.images import read_image
 
 Positive = Annotated[Length, Field(gt=0)]
-Image = NDArray[np.uint8]
 
 OWN = "presses.yaml"
 SHIPPED = Path(__file__).parents[2] / "references" / OWN

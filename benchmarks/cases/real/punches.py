@@ -20,7 +20,6 @@ from benchmarks.cases.real import balls
 from benchmarks.cases.real.known_depth import light_of, pictures
 from benchmarks.cases.real.labels import (
     BadData,
-    Image,
     PressLabels,
     PunchLabel,
     find,
@@ -30,14 +29,12 @@ from benchmarks.cases.real.labels import (
 )
 from benchmarks.harness.measure import Measurement, Timing
 from benchmarks.harness.runner import Case
+from tacsim.interface import Float32, FloatArray, Image, Mask
 from tacsim.models.material import GelMaterial
 
 if TYPE_CHECKING:
     from calibration.light.fit import LightFit
 
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 CASE = "punch"
 BOX = 512  # pixels of the periodic square that the layer is solved on
@@ -54,7 +51,7 @@ EDGE_BLUR = 1.0  # by the gel's coating and the optics [px]
 class PunchFace:
     """The face of a punch that touches the gel."""
 
-    points: Float64  # (n, 2) in the image's axes, from the mesh's own axis [m]
+    points: FloatArray  # (n, 2) in the image's axes, from the mesh's own axis [m]
     triangles: NDArray[np.intp]  # (m, 3)
 
     def mask(self, shape: tuple[int, int], x: float, y: float, pitch: float, scale: float, rim: int = 0) -> Mask:

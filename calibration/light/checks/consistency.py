@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from calibration.light.circle import NoCircle, contact_circle
 from calibration.light.dent import dent_gradient
 from calibration.light.photometry import features
-from calibration.light.press import NEAR, BallPress, Image, Window, smooth
+from calibration.light.press import NEAR, BallPress, Window, smooth
 from calibration.light.refinement import RIM_BLUR
-
-Float64 = NDArray[np.float64]
+from tacsim.interface import FloatArray, Image
 
 FIRST_THICKNESS = 1e4  # of a gel that is taken to be thick [ball radii]
 RIDGE = 1e-3
@@ -51,7 +50,7 @@ def unlike_presses(presses: Sequence[BallPress], windows: Sequence[Window], ball
     return _outside_largest_group(apart)
 
 
-def _outside_largest_group(apart: Float64) -> list[int]:
+def _outside_largest_group(apart: FloatArray) -> list[int]:
     """Single linkage: links of the least spanning tree that are too long are cut."""
     from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 
@@ -64,12 +63,12 @@ def _outside_largest_group(apart: Float64) -> list[int]:
     return [int(k) for k in np.flatnonzero(group != largest)]
 
 
-def fine_power(picture: Float64, where: NDArray[np.bool_]) -> float:
+def fine_power(picture: FloatArray, where: NDArray[np.bool_]) -> float:
     """Power of fine detail and noise of a picture (H, W, 3) [grey levels] at the pixels `where` (H, W)."""
     return float(((picture - smooth(picture, FINE))[where] ** 2).mean())
 
 
-def blurred_presses(presses: Sequence[BallPress], reference: Image, mean: Float64) -> list[tuple[int, float]]:
+def blurred_presses(presses: Sequence[BallPress], reference: Image, mean: FloatArray) -> list[tuple[int, float]]:
     """Presses whose pictures show less fine detail beside the contact than the others', and than the picture without
     contact (H, W, 3) does if it is most of them; and the share of its power that is left."""
     shares = []
@@ -90,7 +89,7 @@ def blurred_presses(presses: Sequence[BallPress], reference: Image, mean: Float6
 
 
 def untouched_contact(
-    presses: Sequence[BallPress], reference: Image, mean: Float64, others: Sequence[Image], ball: float
+    presses: Sequence[BallPress], reference: Image, mean: FloatArray, others: Sequence[Image], ball: float
 ) -> str | None:
     """What speaks for a contact in a picture without contact: what all presses differ from `reference` (H, W, 3) by
     where they do not touch, or two such pictures differ by, looks like a ball's dent. None: nothing does."""
@@ -122,7 +121,7 @@ def untouched_contact(
     )
 
 
-def _dent(change: Float64, mean: Float64, reference: Image, ball: float, strength: float) -> str | None:
+def _dent(change: FloatArray, mean: FloatArray, reference: Image, ball: float, strength: float) -> str | None:
     """Where a change (H, W, 3) [grey levels] is beyond `strength` [-] and a ball's dent explains it; in words."""
     change = change - np.median(change, axis=(0, 1))
     if not np.abs(smooth(change / mean, CONTACT_BLUR)).max() > strength:

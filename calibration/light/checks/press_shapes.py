@@ -11,14 +11,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.light.dent import MAX_RIM_RATIO, ContactCircle, dent_gradient, dent_height
 from calibration.light.photometry import FEW_PRESSES, features
 from calibration.light.press import Window
 from calibration.light.refinement import RIM_BLUR, THINNESS_BOUNDS
-
-Float64 = NDArray[np.float64]
+from tacsim.interface import FloatArray
 
 DEGREE, RIDGE = 3, 1e-4  # of the light that is eliminated
 MAX_STEPS, MIN_GAIN = 12, 1e-4
@@ -48,8 +46,8 @@ class _Fit:
     """Parameters of n presses (n, 5): x, y, radius [px], log of the ball's radius, blur [px]; and three common ones:
     thinness of the gel, stretch along x over y, stretch along the diagonal."""
 
-    presses: Float64
-    common: Float64
+    presses: FloatArray
+    common: FloatArray
 
 
 def fit_stretch(
@@ -59,7 +57,7 @@ def fit_stretch(
     position = 1 if len(windows) > FEW_PRESSES else 0
     free = ((0, 1, 2, 4), (0, 1, 2))
 
-    def parts(chosen: slice) -> Float64:
+    def parts(chosen: slice) -> FloatArray:
         common = _fitted(windows[chosen], circles[chosen], ball / thickness, ball, shape, position, free).common
         return np.asarray(common[1:], dtype=np.float64)
 
@@ -114,7 +112,7 @@ def _fitted(
         gradient, curvature = model.normal_equations(fit, free)
         for _ in range(8):
             damped = curvature + damping * np.diag(np.diag(curvature) + 1e-12)
-            step: Float64 = np.asarray(np.linalg.solve(damped, -gradient), dtype=np.float64)
+            step: FloatArray = np.asarray(np.linalg.solve(damped, -gradient), dtype=np.float64)
             trial = _moved(fit, free, step[:own].reshape(len(windows), -1), step[own:], ball)
             trial_cost = model.cost(trial)
             if trial_cost < cost:
@@ -129,7 +127,7 @@ def _fitted(
 
 
 def _moved(
-    fit: _Fit, free: tuple[tuple[int, ...], tuple[int, ...]], by: Float64, common_by: Float64, ball: float
+    fit: _Fit, free: tuple[tuple[int, ...], tuple[int, ...]], by: FloatArray, common_by: FloatArray, ball: float
 ) -> _Fit:
     presses, common = fit.presses.copy(), fit.common.copy()
     presses[:, free[0]] += by
@@ -154,7 +152,9 @@ class _Model:
         prior = SCALE_PRIOR * self._power * len(self._windows) * float(fit.presses[:, 3].mean()) ** 2
         return sum(float((residual**2).sum()) for residual in residuals) + prior
 
-    def normal_equations(self, fit: _Fit, free: tuple[tuple[int, ...], tuple[int, ...]]) -> tuple[Float64, Float64]:
+    def normal_equations(
+        self, fit: _Fit, free: tuple[tuple[int, ...], tuple[int, ...]]
+    ) -> tuple[FloatArray, FloatArray]:
         """Gradient and Gauss-Newton curvature of half the cost; what the light can explain is projected out."""
         terms, weights, residuals, square = self._solved(fit)
         count, own, common = len(self._windows), free[0], free[1]
@@ -179,7 +179,7 @@ class _Model:
             curvature[np.ix_(at, at)] += SCALE_PRIOR * self._power / count
         return gradient, curvature
 
-    def _solved(self, fit: _Fit) -> tuple[list[Float64], Float64, list[Float64], Float64]:
+    def _solved(self, fit: _Fit) -> tuple[list[FloatArray], FloatArray, list[FloatArray], FloatArray]:
         """Terms of each press, weights of the light, residuals, and the square matrix of the light's equations."""
         terms = [self._terms(i, press, fit.common) for i, press in enumerate(fit.presses)]
         square = np.sum([t.T @ t for t in terms], axis=0)
@@ -188,7 +188,7 @@ class _Model:
         weights = np.asarray(np.linalg.solve(square, right), dtype=np.float64)
         return terms, weights, [w.change - t @ weights for t, w in zip(terms, self._windows, strict=True)], square
 
-    def _terms(self, i: int, press: Float64, common: Float64) -> Float64:
+    def _terms(self, i: int, press: FloatArray, common: FloatArray) -> FloatArray:
         """(n, terms) of the light, of a press whose contact is round once its picture is squeezed."""
         window, (x, y, radius, scale, blur), (thinness, along, across) = self._windows[i], press, common
         far = np.hypot(along, across)

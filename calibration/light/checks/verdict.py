@@ -8,15 +8,14 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.light.dent import contact_depth
 from calibration.light.fit import LightFit
+from tacsim.interface import Image
 from tacsim.models.photometric import PhotometricLight, PhotometricModel
 
 Word = Literal["good", "usable", "unverified scale", "do not trust"]
 ORDER: tuple[Word, ...] = ("do not trust", "unverified scale", "usable", "good")  # the worst first
-Image = NDArray[np.uint8]
 
 GREY = "the pictures are grey"
 

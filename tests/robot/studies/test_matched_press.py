@@ -13,13 +13,13 @@ from scipy.optimize import minimize_scalar
 from calibration.bundle import write_bundle
 from calibration.compare.compare import compare_frames
 from calibration.errors import BadFrames
-from calibration.frame_set import Frame, FrameSet, Image
+from calibration.frame_set import Frame, FrameSet
 from calibration.light.circle import Circle, contact_circle
 from calibration.light.dent import dent_slope
 from robot.studies import matched_press
 from robot.studies.matched_press import ELEMENT, _next_depth, _PressedGel, match_presses
 from tacsim.config import load_scene
-from tacsim.interface import Pose
+from tacsim.interface import Image, Pose
 from tacsim.models.scene import Scene
 from tacsim.models.sensor import CameraNoise, CanonicalGrid, SensorGeometry, SensorModel
 from tacsim.optics.spline import displacement_and_jacobian

@@ -17,7 +17,7 @@ from tacsim.gym.env import TacsimEnv  # registers
 from tacsim.gym.vector import TacsimVectorEnv
 from tacsim.interface import FloatArray
 from tacsim.models.sensor import CanonicalGrid
-from tacsim.tasks.action import vector_of
+from tacsim.tasks.task import vector_of
 
 NAMES = {"squeeze": "Squeeze", "reposition": "Reposition", "knead": "Knead"}
 TOGETHER, EVERY = 16, 10  # environments of a batch; steps from one comparison to the next

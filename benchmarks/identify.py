@@ -26,10 +26,8 @@ import numpy as np
 import typer
 
 from calibration.materials.checks import findings
-from calibration.materials.covariance import covariance_of
 from calibration.materials.estimate import SETTLED_ERROR, UNTOLD, estimate
-from calibration.materials.fit import Fit, Point, Priors, Signals
-from calibration.materials.parameters import starts
+from calibration.materials.fit import Fit, Point, Priors, Signals, covariance_of, starts
 from calibration.materials.presses import Noise, Press, gathered, signals_of, thinned
 from robot.studies.identify.identify import MOMENTS, Identified, Kind, identify, parameters_of
 from robot.studies.identify.motions import motions

@@ -29,10 +29,9 @@ from tacsim.config.bundle import (
     read_files,
     require_unchanged,
 )
-from tacsim.models.darkness import DarknessModel
 from tacsim.models.geometry import PictureRegion
 from tacsim.models.hardware import Placement
-from tacsim.models.photometric import PhotometricModel
+from tacsim.models.photometric import DarknessModel, PhotometricModel
 from tacsim.models.quantity import Config, Length, Time
 from tacsim.models.sensor import CameraNoise, Markers, SensorGeometry, SensorModel
 from tacsim.record.episode import EpisodeError

@@ -23,8 +23,7 @@ from calibration.lens.rectification import (
     from_view,
     seen_box,
 )
-from calibration.markers.flow import NoMarkers
-from calibration.markers.of_sensor import marker_flow, seen_by_dots
+from calibration.markers.flow import NoMarkers, marker_flow, seen_by_dots
 from tacsim.models.geometry import PictureRegion
 from tacsim.models.hardware import CameraSensorConfig
 from tacsim.models.rig import ReplaySensorConfig

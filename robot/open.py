@@ -17,8 +17,8 @@ from tacsim.config.errors import Place, Problem
 from tacsim.config.kinds import is_name
 from tacsim.config.load import texts
 from tacsim.interface import RigSpec
-from tacsim.models.features import Features
 from tacsim.models.hardware import CameraSensorConfig
+from tacsim.models.policy import Features
 from tacsim.models.randomisation import Randomisation
 from tacsim.models.rig import ReplaySensorConfig, RigConfig, TaskConfig
 from tacsim.rig import Rig

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from tacsim.config import load_scene as load_scene
     from tacsim.config import load_sensor as load_sensor
     from tacsim.config import load_task as load_task
-    from tacsim.control.approach import NoTouch as NoTouch
+    from tacsim.control.contact_signal import NoTouch as NoTouch
     from tacsim.control.contact_signal import contact_signal as contact_signal
     from tacsim.gym.env import TacsimEnv as TacsimEnv
     from tacsim.gym.features import FeatureEncoder as FeatureEncoder
@@ -45,8 +45,6 @@ if TYPE_CHECKING:
     from tacsim.interface import Truth as Truth
     from tacsim.limits import ActionError as ActionError
     from tacsim.limits import LimitExceeded as LimitExceeded
-    from tacsim.models.features import Features as Features
-    from tacsim.models.features import MapGrid as MapGrid
     from tacsim.models.hardware import ArmLimits as ArmLimits
     from tacsim.models.hardware import CameraSensorConfig as CameraSensorConfig
     from tacsim.models.hardware import KeepOut as KeepOut
@@ -55,6 +53,8 @@ if TYPE_CHECKING:
     from tacsim.models.hardware import Workspace as Workspace
     from tacsim.models.material import BodyMaterial as BodyMaterial
     from tacsim.models.material import GelMaterial as GelMaterial
+    from tacsim.models.policy import Features as Features
+    from tacsim.models.policy import MapGrid as MapGrid
     from tacsim.models.quantity import Length as Length
     from tacsim.models.randomisation import Randomisation as Randomisation
     from tacsim.models.rig import KneadConfig as KneadConfig

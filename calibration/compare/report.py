@@ -1,4 +1,5 @@
-"""A comparison as files: compare.json, compare.csv, and compare.html (one file, nothing from outside)."""
+"""A comparison as files: compare.json, compare.csv, and compare.html (one file, nothing from outside); the
+judgement in one sentence."""
 
 from __future__ import annotations
 
@@ -15,7 +16,6 @@ from numpy.typing import NDArray
 
 from calibration.compare.compare import METRICS, Comparison, Metric, Overall
 from calibration.compare.invariance import CHANGES, VIEWS, Report
-from calibration.compare.judgement import judgement
 from tacsim.interface import Image
 
 MAX_PICTURED = 24  # pairs with pictures, the worst first
@@ -248,3 +248,34 @@ def _known(record: Any, leave: str = "") -> dict[str, Any]:
 
 def _number(value: float | None) -> float | None:
     return None if value is None or not math.isfinite(value) else float(value)
+
+
+CLOSE_CORRELATION = 0.95  # of the change of colour in contact, from which two sources look alike ...
+CLOSE_SHARE = 0.25  # ... if their error there also is no larger share of what a picture without contact would score
+
+SAID = {"simulated": "the simulation", "real": "the real sensor"}
+
+
+def judgement(comparison: Comparison) -> str:
+    """Whether A looks like B in contact, and by how many grey levels and degrees."""
+    a, b = (SAID.get(name, name) for name in comparison.names)
+    error, alike = comparison.overall["contact_mae"], comparison.overall["contact_ncc"].mean
+    if math.isnan(error.mean):
+        return "No pair shows contact, so nothing can be judged."
+    if error.beats_null is None:
+        start = f"Too few pairs to judge how much {a} and {b} look alike in contact"
+    elif not error.beats_null:
+        start = f"In contact {a} looks no more like {b} than a picture without contact does"
+    elif alike >= CLOSE_CORRELATION and error.mean <= CLOSE_SHARE * error.null:
+        start = f"In contact {a} looks like {b}"
+    else:
+        start = f"In contact {a} resembles {b}, but is not close to it"
+    floor = "" if math.isnan(error.floor) else f", noise alone by {error.floor:.1f}"
+    picture = (
+        f"they differ by {error.mean:.1f} grey levels, where no contact at all would differ by {error.null:.1f}"
+        f"{floor}, and the change of colour correlates by {alike:.3f}"
+    )
+    normals, height = comparison.overall["gradient_angle"], comparison.overall["height_share"]
+    surface = "" if math.isnan(normals.mean) else f"; normals are {normals.mean:.1f}° apart (flat: {normals.null:.1f}°)"
+    surface += "" if math.isnan(height.mean) else f", heights {height.mean:.1%} of the indentation"
+    return f"{start}: {picture}{surface}."

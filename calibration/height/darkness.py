@@ -1,4 +1,4 @@
-"""Darkness -> slope, for a light that tells depth and no direction (tacsim.models.darkness)."""
+"""Darkness -> slope, for a light that tells depth and no direction (tacsim.models.photometric)."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tacsim.interface import Float32
-from tacsim.models.darkness import DarknessModel
+from tacsim.models.photometric import DarknessModel
 
 SMOOTHING = 1.0  # standard deviation of the Gaussian that takes off noise [px]
 

@@ -20,8 +20,7 @@ import numpy as np
 from calibration.height.integration import slopes_of
 from calibration.height.slope_polynomial import EXTRAPOLATION
 from tacsim.interface import Float32, Mask
-from tacsim.models.photometric import PhotometricLight, PhotometricModel
-from tacsim.models.shadows import horizon
+from tacsim.models.photometric import PhotometricLight, PhotometricModel, horizon
 
 STEPS = 3
 STIFFNESS = 0.4  # (error of colour that is usual / error of slope that is usual)^2

@@ -62,7 +62,7 @@ from tacsim.models.photometric import (
     PhotometricModel,
     places_in_image,
 )
-from tacsim.optics.darkness import darkened
+from tacsim.optics.render import darkened
 
 REFINEMENT_PIXELS = 2500  # of each press, about
 UNSHADED = 0.02  # share of the change of colour: where slopes leave no more, shadows are not looked for

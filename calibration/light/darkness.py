@@ -1,7 +1,7 @@
 """Presses of a ball under a light that tells no direction: how dark a pixel is tells of depth, not of slope.
 
 Such a light is known by its presses: on each ring round the middle of a contact the change of colour is the same. Then
-circles, the gel's thickness and the two numbers of tacsim.models.darkness are found together with a light in proportion
+circles, the gel's thickness and the two numbers of DarknessModel are found together with a light in proportion
 to depth, by one factor above 0 and one below (variable projection, as in calibration.light.refinement; a quadratic in a
 single press trades against its radius, so it takes several). The table itself is fitted to them last, and is monotone
 by construction. One press is enough for it: what others add is whether it holds for them.
@@ -22,7 +22,7 @@ from calibration.light.photometry import FEW_PRESSES
 from calibration.light.press import BallPress, press_at, smooth, untouched_mean
 from calibration.light.refinement import FIRST_THINNESS, MAX_GROUPS, RIVAL, THINNESS_BOUNDS
 from tacsim.interface import FloatArray, Image
-from tacsim.models.darkness import DarknessModel
+from tacsim.models.photometric import DarknessModel
 
 ALIKE = 0.6  # share of the power of a press's change that is the same all round, above which no direction is told
 ROUND = 2.5  # up to where it is looked at [contact radii]: a flank's neighbours are there, too

@@ -17,8 +17,7 @@ from calibration.light.dent import ContactCircle
 from calibration.light.photometry import ModelSize
 from calibration.light.press import FAR, BallPress
 from tacsim.interface import FloatArray, Image
-from tacsim.models.darkness import DarknessModel
-from tacsim.models.photometric import PhotometricModel
+from tacsim.models.photometric import DarknessModel, PhotometricModel
 from tacsim.models.sensor import CameraNoise, Markers, SensorGeometry
 
 

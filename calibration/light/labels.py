@@ -25,8 +25,14 @@ from calibration.light.press import FAR, NEAR, BallPress, smooth
 from calibration.light.refinement import RIM_BLUR, RefinedGeometry
 from calibration.light.shadows import DentShade
 from tacsim.interface import FloatArray
-from tacsim.models.photometric import DepthColour, PhotometricModel, depth_terms, normal_terms, place_in_image
-from tacsim.models.shadows import CastShadows
+from tacsim.models.photometric import (
+    CastShadows,
+    DepthColour,
+    PhotometricModel,
+    depth_terms,
+    normal_terms,
+    place_in_image,
+)
 
 Rows = tuple[tuple[float, float, float], ...]  # weights of R, G, B, a row a term
 

@@ -1,4 +1,5 @@
-"""Noise of a real camera: what differs between two pictures without contact, or beside the contact of a press."""
+"""Noise of a real camera: what differs between two pictures without contact, or beside the contact of a press; and the
+share of the untouched picture's grain that is on the gel's skin."""
 
 from __future__ import annotations
 
@@ -13,6 +14,7 @@ from calibration.light.press import FAR, BallPress, untouched_mean
 from calibration.reference import SATURATED
 from tacsim.interface import FloatArray, Image
 from tacsim.models.sensor import CameraNoise
+from tacsim.optics.ink import fine_part
 
 Entry = TypeVar("Entry", bound=np.generic)
 
@@ -124,3 +126,36 @@ def _possible(covariance: FloatArray, deviation: FloatArray) -> tuple[float, flo
     whole = (vectors * np.maximum(values, 0.0)) @ vectors.T
     whole /= np.sqrt(np.outer(np.diag(whole), np.diag(whole)))
     return float(whole[0, 1]), float(whole[0, 2]), float(whole[1, 2])
+
+
+NEARBY = (1.25, 2.2)  # where the skin has moved, and the light changes little [contact radii]
+FAR_OFF = (4.0, 8.0)  # where it has hardly, in about the same light
+MIN_PIXELS = 1000  # of either part of a press
+MIN_PRESSES = 4
+MIN_SHARE = 0.2  # a smaller one is not told from none; 0.07 at most is found on three real sensors without any
+CERTAIN = 3.0  # standard errors over presses that the share must be from none
+
+
+def measure_skin(presses: Sequence[BallPress], reference: NDArray[np.uint8], pixel_pitch: float) -> float | None:
+    """Share of the fine part of `reference` (H, W, 3) that moves with the gel, 0 to 1; None where the presses do not
+    tell that there is any. `pixel_pitch` [m].
+
+    Grain that stands still, of the camera or of dust on its lens, is seen again everywhere in a press. Skin is seen
+    again far from the contact; near it the gel has moved by a few pixels, and it is not.
+
+    It is low rather than high: skin that has moved by less than its grain counts as what stands still.
+    """
+    mean = reference.mean(axis=(0, 1))
+    grain = fine_part(reference.astype(np.float32), pixel_pitch)
+    shares = []
+    for press in presses:
+        change = fine_part((press.change * mean).astype(np.float32), pixel_pitch)
+        lit, distance = press.lit.all(axis=2), press.distance() / press.circle.radius
+        parts = [lit & (distance > least) & (distance < most) for least, most in (FAR_OFF, NEARBY)]
+        if min(int(part.sum()) for part in parts) >= MIN_PIXELS:
+            far, near = (1.0 + float((change[part] * grain[part]).sum() / (grain[part] ** 2).sum()) for part in parts)
+            shares.append(far - max(near, 0.0))
+    if len(shares) < MIN_PRESSES:
+        return None
+    share, error = float(np.median(shares)), float(np.std(shares, ddof=1)) / len(shares) ** 0.5
+    return min(share, 1.0) if share > max(MIN_SHARE, CERTAIN * error) else None

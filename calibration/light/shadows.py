@@ -11,7 +11,7 @@ from calibration.light.dent import ContactCircle, dent_gradient, whole_profile
 from calibration.light.photometry import features
 from calibration.light.press import Window
 from tacsim.interface import FloatArray
-from tacsim.models.shadows import Floats, horizon, shadow_terms
+from tacsim.models.photometric import Floats, horizon, shadow_terms
 
 DEGREE, POSITION = 3, 2  # of the light beside which shadows are sought
 RIDGE = 1e-4

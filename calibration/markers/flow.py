@@ -9,18 +9,21 @@ motion: flow is finite everywhere, and `seen` tells which of it was measured.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.lens.rectification import Rectification, seen_box
+from calibration.lens.rectification import Rectification, from_geometry, from_view, region_mask, seen_box
+from calibration.lens.view import GelView
 from calibration.markers.dots import MIN_RADIUS, DotFinder
 from calibration.markers.lattice import Lattice, NoLattice, find_lattice, missing_line, spread, usual_pitch
 from calibration.markers.tracker import DotTracker
 from calibration.reference import UnusableReference
 from tacsim.interface import Float32, FloatArray, Image, Mask
-from tacsim.models.sensor import Markers
-from tacsim.optics.grid import PixelGrid
+from tacsim.models.geometry import PictureRegion
+from tacsim.models.sensor import CanonicalGrid, Markers, SensorGeometry
+from tacsim.optics.grid import PixelGrid, canonical_image
 
 DOT_RADIUS = 2.5  # on the grid on which dots are sought [px]
 MAX_MISSING = 0.3  # share of the dots in view that a reference may lack
@@ -255,3 +258,46 @@ def require_no_markers(image: Image) -> None:
         f"the reference shows a lattice of {rows} x {columns} dark dots, {lattice.pitch:.3g} px apart, but the "
         "sensor's model or calibration has no markers: give it markers, or calibrate the sensor with --markers"
     )
+
+
+def marker_flow(
+    markers: Markers | None,
+    geometry: SensorGeometry,
+    gel_size: tuple[float, float],
+    seen: GelView | None = None,
+    region: PictureRegion | None = None,
+) -> MarkerFlow | None:
+    """The flow of known dots; None without. `seen`: the gel through lens and perspective; None: the picture is metric
+    by itself. `region`: what of the native picture shows gel; None: all of it."""
+    if markers is None:
+        return None
+    fine = marker_grid(markers, gel_size)
+    rectify = from_geometry(geometry, gel_size, fine) if seen is None else from_view(seen, fine)
+    return MarkerFlow(markers, rectify.within(region), fine, geometry.camera_distance)
+
+
+def seen_by_dots(
+    pitch: float, untouched: NDArray[np.uint8], grid: CanonicalGrid, region: PictureRegion | None = None
+) -> tuple[Rectification, MarkerFlow]:
+    """Where the gel lies, and its flow, by dots `pitch` [m] apart in a native picture (rows, columns, 3) without
+    contact. The camera looks straight on. Raises NoMarkers where no dots are seen."""
+    picture = untouched
+    if region is not None:
+        shown = region_mask(region, untouched.shape[:2])
+        level = np.median(untouched[shown], axis=0).astype(np.uint8)
+        picture = np.where(shown[..., None], untouched, level)
+    try:
+        lattice, radius = find_markers(picture)
+    except NoLattice as nothing:
+        raise NoMarkers(f"{nothing}: marker_pitch needs the dots of the picture without contact") from None
+    scale = pitch / lattice.pitch
+    (rows, columns), (high, wide) = lattice.present.shape, untouched.shape[:2]
+    geometry, size = SensorGeometry(width=wide, height=high, pixel_pitch=scale), (wide * scale, high * scale)
+    markers = Markers(rows=rows, columns=columns, pitch=pitch, radius=radius * scale)
+    flow = marker_flow(markers, geometry, size, region=region)
+    assert flow is not None
+    rectify = from_geometry(geometry, size, canonical_image(grid)).within(region)
+    if region is not None:
+        down, across = (side.stop - side.start for side in seen_box(shown))
+        rectify = replace(rectify, size=(across * scale, down * scale))
+    return rectify, flow

@@ -16,9 +16,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calibration.errors import CalibrationError
-from calibration.materials.covariance import covariance_of
-from calibration.materials.fit import MESH_LEFT, Fit, Point, Predict, Priors, Signals
-from calibration.materials.parameters import Parameter, begins, starts
+from calibration.materials.fit import (
+    MESH_LEFT,
+    Fit,
+    Parameter,
+    Point,
+    Predict,
+    Priors,
+    Signals,
+    begins,
+    covariance_of,
+    starts,
+)
 from tacsim.interface import FloatArray
 
 DIFFERENCE = 0.08  # step of a free number for its column of the Jacobian; simulations are exact to some 1e-3

@@ -1,17 +1,68 @@
-"""What a fit of materials is made of: where a simulation is run, what was measured, and what came out."""
+"""What a fit of materials is made of: its unknowns, where a simulation is run, what was measured, and what came out."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import t as student
 
-from calibration.materials.covariance import covariance_of
-from calibration.materials.parameters import Parameter
 from tacsim.interface import FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """One unknown of a material or a contact.
+
+    A fit works in its free number: the logarithm of what is positive (`log`); log(1/2 - nu) of Poisson's ratio, since
+    the bulk modulus of a nearly incompressible gel goes with 1 / (1/2 - nu) (`volume`); the value over `unit` of what
+    may be zero (`linear`).
+    """
+
+    name: str
+    start: float  # SI units
+    low: float
+    high: float
+    kind: Literal["log", "volume", "linear"] = "log"
+    unit: float = 1.0
+    begin: float | None = None  # where a fit begins, if not at the start, where it stays if nothing tells it
+
+    def free(self, value: float) -> float:
+        if self.kind == "log":
+            return math.log(value)
+        return math.log(0.5 - value) if self.kind == "volume" else value / self.unit
+
+    def value(self, free: float) -> float:
+        if self.kind == "log":
+            return math.exp(free)
+        return 0.5 - math.exp(free) if self.kind == "volume" else free * self.unit
+
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """Least and greatest free number."""
+        ends = sorted((self.free(self.low), self.free(self.high)))
+        return ends[0], ends[1]
+
+    def between(self, free: float, half: float) -> tuple[float, float]:
+        """The interval free - half .. free + half as values, within the bounds."""
+        low, high = self.bounds
+        ends = sorted(self.value(min(max(end, low), high)) for end in (free - half, free + half))
+        return ends[0], ends[1]
+
+
+def starts(parameters: Sequence[Parameter]) -> FloatArray:
+    """The free numbers at which what is not told stays."""
+    return np.array([each.free(each.start) for each in parameters])
+
+
+def begins(parameters: Sequence[Parameter]) -> FloatArray:
+    """The free numbers at which a fit begins."""
+    return np.array([each.free(each.start if each.begin is None else each.begin) for each in parameters])
+
 
 MESH_LEFT = 0.5  # standard deviation of what is left of the mesh's error, over what the finer mesh changed
 
@@ -136,3 +187,25 @@ class Fit:
 
     def _index(self, name: str) -> int:
         return [each.name for each in self.parameters].index(name)
+
+
+HELD = 0.5  # standard deviation of a free number that is held where it was, as far as the others' intervals go
+UNKNOWN = 100.0  # standard deviation of a free number of which nothing is known
+
+
+def covariance_of(
+    system: FloatArray, sigma: FloatArray, priors: FloatArray, held: NDArray[np.bool_], spread: float = HELD
+) -> FloatArray:
+    """(n, n) of all unknowns, from the system (m, n), whose last columns have `priors`. Parameters that are held have
+    no variance themselves; `spread` is what they may be off, as far as the others go."""
+    p, n = len(held), system.shape[1]
+    free = np.concatenate([~held, np.ones(n - p, np.bool_)])
+    known = np.concatenate([np.full(p, UNKNOWN), priors])[free]
+    rows = system / sigma[:, None]
+    scaled = rows[:, free] * known  # by what is known beforehand: then the information is never singular
+    found = np.zeros((n, n))
+    found[np.ix_(free, free)] = np.linalg.inv(scaled.T @ scaled + np.eye(len(known))) * np.outer(known, known)
+    for index in np.flatnonzero(held):
+        moved = found @ (rows.T @ rows[:, index])
+        found = found + spread**2 * np.outer(moved, moved)
+    return found

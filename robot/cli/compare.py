@@ -229,8 +229,7 @@ def _beyond_limits(limits: list[Limit], values: dict[str, float]) -> list[str]:
 
 
 def _show(result: Comparison, report: Report | None) -> None:
-    from calibration.compare.judgement import judgement
-    from calibration.compare.report import rows, shown, verdict
+    from calibration.compare.report import judgement, rows, shown, verdict
 
     results.print(judgement(result), markup=False)
     width = None if results.is_terminal else 160

@@ -25,7 +25,7 @@ from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.record.episode import EpisodeMeta, Step
 from tacsim.record.writer import Recorder
 from tacsim.tasks import GoalOutOfReach, Task, make_task
-from tacsim.tasks.action import action_from
+from tacsim.tasks.task import action_from
 
 RANDOM = "random"
 STEPS = 40  # of an episode without a task

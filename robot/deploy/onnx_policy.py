@@ -20,13 +20,11 @@ from robot.deploy.training_range import RangeWatch, names_of
 from tacsim import pose as se3
 from tacsim.gym.features import FeatureEncoder
 from tacsim.interface import Action, Needs, Observation, Pose, RigSpec
-from tacsim.models.features import Numbers
-from tacsim.models.policy import METADATA_KEY, PolicySpec
+from tacsim.models.policy import METADATA_KEY, Numbers, PolicySpec
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.models.text import printable
 from tacsim.tasks import Task
-from tacsim.tasks.action import action_from
-from tacsim.tasks.task import Axis
+from tacsim.tasks.task import Axis, action_from
 
 if TYPE_CHECKING:
     from onnxruntime import InferenceSession

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from tacsim.gym.features import PARTS, SCALES, FeatureEncoder, moved, unmoved
 from tacsim.interface import Action, IncompatibleRig, Observation, Pose, RigSpec
 from tacsim.limits import ActionError
-from tacsim.models.features import Features, Numbers, Quantity
+from tacsim.models.policy import Features, Numbers, Quantity
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.record.episode import Step
 

@@ -14,8 +14,8 @@ from tacsim.gym import encode
 from tacsim.gym.env import TacsimEnv, Variant, require_alike
 from tacsim.gym.features import FeatureEncoder
 from tacsim.gym.vector import Member, SharedBatch, TacsimVectorEnv
-from tacsim.models.features import Features
 from tacsim.models.hardware import Placement
+from tacsim.models.policy import Features
 from tacsim.models.rig import RigConfig, SimSensorConfig, WrenchNoise
 from tacsim.models.sensor import Lighting
 from tacsim.sim.stage import StatePool, require_same_gels

@@ -21,12 +21,11 @@ from tacsim.optics.render import Renderer
 from tacsim.optics.surface import surface_map
 from tacsim.physics.world import World, make_world
 from tacsim.rig import Rig
-from tacsim.sim.arm import SimArm
+from tacsim.sim.arm import SimArm, wrench_noise_source
 from tacsim.sim.clock import SimClock
 from tacsim.sim.reset import SimReset
 from tacsim.sim.sensor import SimSensor
 from tacsim.sim.stage import Stage, StatePool
-from tacsim.sim.wrench_noise import wrench_noise_source
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,7 +23,7 @@ from robot.open import load_with_task, make_vector_env
 from tacsim.gym.env import TacsimEnv
 from tacsim.gym.vector import TacsimVectorEnv
 from tacsim.interface import Policy
-from tacsim.models.features import Features
+from tacsim.models.policy import Features
 from tacsim.models.scene import Scene
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.models.training import Training

@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium.error import ResetNeeded
 from numpy.typing import NDArray
 
-from tacsim.control.approach import NoTouch
+from tacsim.control.contact_signal import NoTouch
 from tacsim.gym import encode
 from tacsim.gym.features import FeatureEncoder
 from tacsim.interface import Needs, Observation, Policy, Pose, Truth
@@ -22,9 +22,7 @@ from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.rig import Rig
 from tacsim.sim.stage import Stage
 from tacsim.tasks import BadDraws, GoalOutOfReach, make_task
-from tacsim.tasks.action import action_from, vector_of
-from tacsim.tasks.effort import Effort
-from tacsim.tasks.task import Task, judge
+from tacsim.tasks.task import Effort, Task, action_from, judge, vector_of
 
 Result = tuple[encode.Flat, float, bool, bool, dict[str, Any]]  # of a step
 CANNOT_BEGIN = (GoalOutOfReach, NoTouch, SimulationDiverged)  # with this draw

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from tacsim import pose as se3
 from tacsim.interface import ArmState, FloatArray, IncompatibleRig, Needs, Observation, Pose, TactileObservation
-from tacsim.models.features import Channel, Features, MapGrid, Numbers, Quantity
+from tacsim.models.policy import Channel, Features, MapGrid, Numbers, Quantity
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.tasks.reposition import pressed_at
 

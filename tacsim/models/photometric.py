@@ -8,13 +8,14 @@ the image, each from -1/2 to 1/2 across it, the relative change of colour (I - I
 
 No term is constant: the flat gel shows I0. Degree 1 at position 0 is the most that directional diffuse lights can do.
 Two things that the slope does not tell are added: what is pressed in lies elsewhere in the light, and differs from I0
-where it is flat, too (:class:`DepthColour`); and one place of the surface hides another (tacsim.models.shadows).
+where it is flat, too (:class:`DepthColour`); and one place of the surface hides another (:class:`CastShadows`).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from itertools import pairwise
 from typing import Annotated, Self
 
 import numpy as np
@@ -22,12 +23,105 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from tacsim.interface import Float32, FloatArray
-from tacsim.models.quantity import Config
-from tacsim.models.shadows import CastShadows, shadow_terms
+from tacsim.models.quantity import Config, Length
 
-Floating = NDArray[np.floating]
-
+Floats = NDArray[np.floating]
 Weight = Annotated[float, Field(allow_inf_nan=False)]
+
+
+class DarknessModel(Config):
+    """A light that tells depth and no direction: a translucent skin that darkens where it is pressed in.
+
+    What counts is the depth y of a point beyond a share of the mean depth round it,
+
+        y = h - share * (Gaussian mean of h, standard deviation `reach`),
+
+    because a dent throws light back on the gel beside it: real pictures are brighter round a contact than without one.
+    The relative change of colour is a table of y, the same everywhere. It is monotone, so it works both ways.
+    """
+
+    depths: Annotated[tuple[Length, ...], Field(min_length=2, max_length=256)]  # y, rising; below 0 beside a dent [m]
+    changes: tuple[tuple[Weight, Weight, Weight], ...]  # of R, G, B at each depth; their mean falls
+    share: Annotated[float, Field(ge=0, le=0.8)] = 0.0  # of the mean depth round a point
+    reach: Annotated[Length, Field(gt=0)] = 1e-3  # of that mean [m]
+
+    @model_validator(mode="after")
+    def _is_monotone(self) -> Self:
+        if len(self.changes) != len(self.depths):
+            raise ValueError(f"changes has {len(self.changes)} rows, depths has {len(self.depths)} numbers")
+        means = [sum(change) for change in self.changes]
+        if any(b <= a for a, b in pairwise(self.depths)):
+            raise ValueError("depths must rise")
+        if any(b >= a for a, b in pairwise(means)):
+            raise ValueError("changes: each row must be darker in the mean than the one before")
+        return self
+
+    def scaled(self, factor: float) -> DarknessModel:
+        """The same in another unit of length."""
+        return self.model_copy(
+            update={"depths": tuple(factor * depth for depth in self.depths), "reach": factor * self.reach}
+        )
+
+
+SHADOW_SLOPES = (0.1, 0.3, 0.75)  # horizons at which it begins to get dark [-]
+SHADOW_WIDTH = 1.5
+SHADOW_STEPS = tuple(0.012 * 1.3**k for k in range(14))  # from 1/80 to a third of the picture
+SHADOW_PLACES = 3  # position terms: 1, u, v
+LAMP_DISTANCE = 1e-3  # closer to a lamp, its direction is not defined
+
+
+class CastShadows(Config):
+    """The shadows of one sensor, whose lamps stand low beside the gel, as in a DIGIT: to the camera a dent is a bump.
+
+    A place of the surface is darker where the path to the lamp is steep:
+
+        horizon = max over SHADOW_STEPS s of (h(x + s e) - h(x)) / s,    e = direction from the place x to the lamp,
+
+    with the height h into the gel. The relative change of colour is, in each channel, the sum
+
+        over lamps, over SHADOW_SLOPES, over position terms 1, u, v of weight * ramp,
+
+    where `ramp` goes from 0 to 1 as the horizon goes from that slope to SHADOW_WIDTH times it. Neither the height of a
+    lamp nor its size is assumed. Lengths are in widths of the picture, places from its middle, x right, y down.
+    """
+
+    lamps: Annotated[
+        tuple[tuple[Weight, Weight], ...], Field(min_length=1, max_length=8)
+    ]  # x, y in the picture's plane
+    weights: tuple[tuple[Weight, Weight, Weight], ...]  # of R, G, B; rows by lamp, then by slope, then by position term
+
+    @model_validator(mode="after")
+    def _one_weight_a_term(self) -> Self:
+        wanted = len(self.lamps) * len(SHADOW_SLOPES) * SHADOW_PLACES
+        if len(self.weights) != wanted:
+            raise ValueError(f"weights has {len(self.weights)} rows; shadows of {len(self.lamps)} lamps have {wanted}")
+        return self
+
+
+def horizon(height: Callable[[Floats, Floats], Floats], x: Floats, y: Floats, lamp: tuple[float, float]) -> Floats:
+    """(...,) steepest way up towards the lamp from places x, y (...,), at least 0; `height` of places."""
+    to_x, to_y = lamp[0] - x, lamp[1] - y
+    distance = np.sqrt(to_x * to_x + to_y * to_y) + x.dtype.type(LAMP_DISTANCE)
+    to_x, to_y = to_x / distance, to_y / distance
+    here = height(x, y)
+    steepest = np.zeros_like(here)
+    for step in map(x.dtype.type, SHADOW_STEPS):
+        np.maximum(steepest, (height(x + step * to_x, y + step * to_y) - here) / step, out=steepest)
+    return steepest
+
+
+def shadow_terms(horizons: Sequence[Floats], u: Floats, v: Floats) -> Floats:
+    """(terms, ...) for the horizons (...,) of each lamp at places u, v (...,) in -1/2..1/2 across the picture, in the
+    order of the weights."""
+    places = (np.ones_like(u), u, v)
+    ramps = [
+        np.clip((towards - slope) / ((SHADOW_WIDTH - 1) * slope), 0.0, 1.0).astype(u.dtype)
+        for towards in horizons
+        for slope in SHADOW_SLOPES
+    ]
+    return np.stack([ramp * place for ramp in ramps for place in places])
+
+
 DEPTH_TERMS, DEPTH_POWERS = 5, 3
 
 
@@ -76,7 +170,7 @@ def term_count(degree: int, position: int) -> int:
     return math.comb(degree + 2, 2) * math.comb(position + 2, 2)
 
 
-def normal_terms(gradient: Floating, degree: int, more: int = 0) -> Floating:
+def normal_terms(gradient: Floats, degree: int, more: int = 0) -> Floats:
     """(terms, ...) the terms of the normal for slopes (..., 2), in the order of the weights; and `more` rows that are
     left to be filled."""
     gx, gy = gradient[..., 0], gradient[..., 1]
@@ -91,7 +185,7 @@ def normal_terms(gradient: Floating, degree: int, more: int = 0) -> Floating:
     return terms
 
 
-def position_terms(u: Floating, v: Floating, position: int) -> Floating:
+def position_terms(u: Floats, v: Floats, position: int) -> Floats:
     """(terms, ...) the terms of the place in the image for u, v (...,) in -1/2..1/2."""
     terms = np.empty((math.comb(position + 2, 2), *u.shape), dtype=u.dtype)
     terms[0] = 1.0
@@ -99,7 +193,7 @@ def position_terms(u: Floating, v: Floating, position: int) -> Floating:
     return terms
 
 
-def _higher_orders(terms: Floating, factors: tuple[Floating, Floating], order: int, last: int, here: int) -> None:
+def _higher_orders(terms: Floats, factors: tuple[Floats, Floats], order: int, last: int, here: int) -> None:
     """Fills `terms` from row `here` on with the products of two factors of this `order` and higher ones. The `order`
     products of one order less start at row `last`: each by the first factor, and the last of them by the second."""
     first, second = factors
@@ -109,13 +203,13 @@ def _higher_orders(terms: Floating, factors: tuple[Floating, Floating], order: i
         last, here, order = here, here + order + 1, order + 1
 
 
-def depth_terms(height: Floating, deepest: float, u: Floating, v: Floating) -> Floating:
+def depth_terms(height: Floats, deepest: float, u: Floats, v: Floats) -> Floats:
     """(DEPTH_TERMS, ...) for heights (...,) into the gel, in the unit of `deepest`, at places u, v in -1/2..1/2."""
     w = relative_depth(height, deepest)
     return np.stack([w, w * u, w * v, w * w, w * w * w])
 
 
-def relative_depth(height: Floating, deepest: float) -> Floating:
+def relative_depth(height: Floats, deepest: float) -> Floats:
     """(...,) w in 0..1 for heights (...,) into the gel, in the unit of `deepest`."""
     return np.clip(height * height.dtype.type(1 / deepest), 0, 1)
 

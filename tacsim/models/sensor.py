@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Discriminator, Field, Tag, model_validator
 
-from tacsim.models.darkness import DarknessModel
 from tacsim.models.geometry import GelView
 from tacsim.models.geometry import SensorGeometry as SensorGeometry
-from tacsim.models.photometric import PhotometricModel
+from tacsim.models.photometric import DarknessModel, PhotometricModel
 from tacsim.models.quantity import Config, Length
 
 Side = Annotated[Length, Field(gt=0)]

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from tacsim.models.features import Features
+from tacsim.models.policy import Features
 from tacsim.models.quantity import Config
 from tacsim.models.randomisation import Randomisation
 

@@ -1,6 +1,5 @@
 """Gel surface -> RGB image: by Phong shading, the method of Gomes et al. (RA-L 2021) that the seed paper uses, or by a
-calibrated polynomial (tacsim.models.photometric) where the sensor has one, or from height by a table
-(tacsim.models.darkness) where its light tells no direction.
+calibrated polynomial or a table of height (tacsim.models.photometric) where the sensor has one.
 
 Camera and lights stand behind the gel, on its -z side. There a surface pressed in by `height` has the unit normal
 
@@ -24,16 +23,13 @@ from numpy.typing import NDArray
 
 from tacsim.interface import Float32, Mask
 from tacsim.models.geometry import GelView
-from tacsim.models.photometric import PhotometricLight, places_in_image
+from tacsim.models.photometric import CastShadows, DarknessModel, PhotometricLight, horizon, places_in_image
 from tacsim.models.scene import GelSurface
 from tacsim.models.sensor import Lighting, SensorModel
-from tacsim.optics.darkness import darkened
 from tacsim.optics.grid import PixelGrid, image_grid, strips
-from tacsim.optics.ink import lifted_ink
+from tacsim.optics.ink import lifted_ink, lifted_skin
 from tacsim.optics.markers import check_fits, marker_transmission
 from tacsim.optics.picture_file import BadPicture, opened_picture, upright_rgb, upright_size
-from tacsim.optics.shadows import shadow_colours
-from tacsim.optics.skin import lifted_skin
 from tacsim.optics.spline import line_matrices
 from tacsim.optics.surface import SurfaceTable, look_up, spread, thinned
 
@@ -316,3 +312,52 @@ def texture_gradient(grid: PixelGrid, gel_size: tuple[float, float], deviation: 
     gradient = np.stack([by_x, by_y], axis=-1) / TEXTURE_PITCH
     gradient[~grid.within(gel_size)] = 0.0
     return np.ascontiguousarray(gradient, dtype=np.float32)
+
+
+THIN = 2  # every so many points of the table along each side: shadows have soft edges
+
+
+def shadow_colours(light: PhotometricLight, shadows: CastShadows, table: SurfaceTable, image: PixelGrid) -> Float32:
+    """(rows, columns, 3) change of colour by cast shadows at the table's points, of an image with these pixels.
+
+    The path to a lamp is followed over the surface as if it had moved only up and down: sideways motion is small beside
+    the length of a shadow.
+    """
+    x, y = (each[::THIN, ::THIN] for each in table.place())
+    u, v = image.in_image(x, y)
+    width, flat = np.float32(image.columns * image.pitch), np.float32(image.rows / image.columns)
+    # from places in picture widths, which start in the middle of the picture, to metres
+    start_x, start_y = x[0, 0] - u[0, 0] * width, y[0, 0] - v[0, 0] * flat * width
+    height = np.ascontiguousarray(table.fields[..., 0])
+
+    def height_at(x: Float32, y: Float32) -> Float32:
+        return table.at_places(height, start_x + width * x, start_y + width * y) / width
+
+    horizons = [horizon(height_at, u, v * flat, lamp) for lamp in shadows.lamps]
+    rows, columns = (np.arange(n, dtype=np.float32) / THIN for n in table.fields.shape[:2])
+    return look_up(light.shadow(horizons, u, v), np.stack(np.meshgrid(columns, rows), axis=-1))
+
+
+FINE = 6.0  # standard deviation of a Gaussian [px] beyond which it is evaluated on a coarser picture
+
+
+def darkened(model: DarknessModel, height: Float32, pitch: float) -> tuple[Float32, float]:
+    """(H, W, 3) relative change of colour under heights (H, W) into the gel on pixels of `pitch`, in the model's unit;
+    and the share of pixels that are deeper than its table."""
+    own = height - np.float32(model.share) * _mean_round(height, model.reach / pitch) if model.share else height
+    depths = np.array(model.depths)
+    change = np.stack([np.interp(own, depths, channel) for channel in np.array(model.changes).T], axis=-1)
+    return change.astype(np.float32), float(np.count_nonzero(own > depths[-1]) / own.size)
+
+
+def _mean_round(height: Float32, deviation: float) -> Float32:
+    """(H, W) Gaussian mean; the picture goes on as its mirror image."""
+    import cv2
+
+    coarser = max(1, int(deviation / FINE))
+    if coarser == 1:
+        return np.asarray(cv2.GaussianBlur(height, (0, 0), deviation, borderType=cv2.BORDER_REFLECT), np.float32)
+    rows, columns = height.shape
+    small = cv2.resize(height, (-(-columns // coarser), -(-rows // coarser)), interpolation=cv2.INTER_AREA)
+    small = cv2.GaussianBlur(small, (0, 0), deviation / coarser, borderType=cv2.BORDER_REFLECT)
+    return np.asarray(cv2.resize(small, (columns, rows), interpolation=cv2.INTER_LINEAR), np.float32)

@@ -1,13 +1,20 @@
-"""What a task is: a goal, the free axes of its action, and how a state is judged."""
+"""What a task is: a goal, the free axes of its action, and how a state is judged and what it takes of the
+arms."""
 
 from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
-from tacsim.interface import FloatArray, Needs, Observation, Policy, Truth
+import numpy as np
+from numpy.typing import NDArray
+
+from tacsim import pose as se3
+from tacsim.interface import Action, ArmState, FloatArray, Needs, Observation, Policy, Pose, Truth
+from tacsim.limits import ActionError
 from tacsim.models.rig import TaskConfig
 from tacsim.models.sensor import CanonicalGrid
 
@@ -117,3 +124,69 @@ def tolerance(x: float, bounds: tuple[float, float], margin: float) -> float:
     """
     outside = max(bounds[0] - x, x - bounds[1], 0.0)
     return math.exp(math.log(0.1) * (outside / margin) ** 2)
+
+
+def action_from(
+    vector: NDArray[np.floating[Any]], axes: Sequence[Axis], max_step: float, poses: Mapping[str, Pose]
+) -> Action:
+    """Component i moves its arm from `poses` by vector[i] * max_step [m] along its axis, rotation kept.
+
+    Raises ActionError for a wrong shape, a component that is not finite, or one outside [-1, 1].
+    """
+    given = np.asarray(vector)
+    if given.dtype.kind not in "fiub":
+        raise ActionError(f"action must be an array of {len(axes)} real numbers, got {vector!r}")
+    values = given.astype(np.float64)
+    if values.shape != (len(axes),):
+        raise ActionError(f"action must have shape ({len(axes)},), one number for each free axis, got {values.shape}")
+    # The margin admits 1.0 in any float precision.
+    if not np.isfinite(values).all() or float(np.abs(values).max(initial=0.0)) > 1.0 + 1e-6:
+        raise ActionError(
+            f"action components must be finite and within [-1, 1], got {values.tolist()}; "
+            "bound the policy's output (gymnasium.wrappers.ClipAction does it)"
+        )
+    positions = {axis.arm: np.array(poses[axis.arm].position) for axis in axes}
+    for axis, value in zip(axes, values, strict=True):
+        positions[axis.arm] += value * max_step * np.array(axis.direction)
+    return Action({arm: Pose(position, poses[arm].quaternion) for arm, position in positions.items()})
+
+
+def vector_of(action: Action, axes: Sequence[Axis], max_step: float, poses: Mapping[str, Pose]) -> NDArray[np.float32]:
+    """The vector that asks for `action` from `poses`: the inverse of `action_from`. What is longer than max_step is cut
+    to it, and what is not along an axis is left out; an arm that holds has zeros."""
+    vector = np.zeros(len(axes), np.float32)
+    for number, axis in enumerate(axes):
+        target = action.tool.get(axis.arm)
+        if target is not None:
+            vector[number] = (target.position - poses[axis.arm].position) @ np.array(axis.direction) / max_step
+    return vector.clip(-1.0, 1.0)
+
+
+class Effort:
+    """The greatest normal force of a sensor, and the work that the arms do, from the states after each control step.
+
+    Work is the sum over arms and steps of the force on the body times the way of its sensor, the force taken as the
+    mean of before and after (trapezoidal rule); turns are left out.
+    """
+
+    def __init__(self, arms: Mapping[str, ArmState]) -> None:
+        self._before = arms
+        self.peak = _greatest(arms)  # [N]
+        self.work = 0.0  # [J]
+
+    def add(self, arms: Mapping[str, ArmState]) -> None:
+        """The next states of the same arms."""
+        for name, now in arms.items():
+            before = self._before[name]
+            force = -0.5 * (_force(before) + _force(now))  # on the body
+            self.work += float(force @ (now.pose.position - before.pose.position))
+        self._before, self.peak = arms, max(self.peak, _greatest(arms))
+
+
+def _force(arm: ArmState) -> np.ndarray:
+    """(3,) on the sensor, world axes [N]."""
+    return se3.rotate(arm.pose, arm.wrench[:3])
+
+
+def _greatest(arms: Mapping[str, ArmState]) -> float:
+    return max((abs(float(arm.wrench[2])) for arm in arms.values()), default=0.0)

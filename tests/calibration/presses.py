@@ -85,7 +85,7 @@ class HiddenSensor:
 
 
 class DarkSensor(HiddenSensor):
-    """White light from behind a translucent skin. `share`, `reach` [px]: as tacsim.models.darkness says."""
+    """White light from behind a translucent skin. `share`, `reach` [px]: as tacsim.models.photometric says."""
 
     def __init__(self, seed: int, share: float = 0.0, reach: float = 15.0, noise: float = 1.0) -> None:
         super().__init__(seed, noise)

@@ -23,9 +23,8 @@ from calibration.normaliser import normaliser_for_calibration, normaliser_for_ca
 from tacsim.config.bundle import digest
 from tacsim.interface import TactileFrame
 from tacsim.models.hardware import CameraSensorConfig
-from tacsim.models.photometric import PhotometricModel
+from tacsim.models.photometric import CastShadows, PhotometricModel
 from tacsim.models.sensor import CameraNoise, CanonicalGrid, SensorGeometry
-from tacsim.models.shadows import CastShadows
 from tacsim.optics.render import Renderer
 from tests.tacsim.optics.surfaces import dent, flat
 

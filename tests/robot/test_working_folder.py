@@ -100,5 +100,5 @@ def test_a_script_beside_such_a_file_is_told_the_cause(folder: Path) -> None:
     done = python("-c", "import robot.open")
     assert f"'calibration' is {folder / 'calibration' / '__init__.py'}, not the package of tacsim" in done.stderr
     (folder / "robot.py").write_text("")
-    done = python("-c", "from tacsim.gym.plugin import make_env; make_env(task='squeeze')")
+    done = python("-c", "from tacsim.gym import make_env; make_env(task='squeeze')")
     assert f"'robot' is {folder / 'robot.py'}, not the package of tacsim: rename it" in done.stderr

@@ -1,4 +1,4 @@
-"""The verdict on a calibration as a page: one HTML file, nothing from outside."""
+"""The verdict on a calibration as a page (one HTML file, nothing from outside), and the picture of residuals in it."""
 
 from __future__ import annotations
 
@@ -35,3 +35,33 @@ def write_page(
         rows=sorted(fit.predictions, key=lambda press: -press.angle),
     )  # fmt: skip
     path.write_text(page, encoding="utf-8")
+
+
+MAX_PRESSES = 8  # drawn, the worst first
+HALF_SIDE = 2.0  # of what is drawn [contact radii]
+
+
+def draw(fit: LightFit, path: Path) -> None:
+    """Writes a PNG: of each press the change of colour as it was seen, as it is predicted by the others, and the
+    error, all in one scale. Raises ValueError for a fit of one press, which is predicted by none; OSError."""
+    from matplotlib.figure import Figure
+
+    predictions = sorted(fit.predictions, key=lambda press: -press.error)[:MAX_PRESSES]
+    if not predictions:
+        raise ValueError("a calibration from one press leaves none out: there is nothing to draw")
+    figure = Figure(figsize=(6.4, 1.9 * len(predictions)), layout="constrained")
+    axes = figure.subplots(len(predictions), 3, squeeze=False)
+    for row, press in zip(axes, predictions, strict=True):
+        reach = HALF_SIDE * press.circle.radius
+        rows = slice(max(0, round(press.circle.y - reach)), round(press.circle.y + reach) + 1)
+        columns = slice(max(0, round(press.circle.x - reach)), round(press.circle.x + reach) + 1)
+        seen, predicted = press.real[rows, columns], press.predicted[rows, columns]
+        for axis, change in zip(row, (seen, predicted, predicted - seen), strict=True):
+            axis.imshow(np.clip(128 + change, 0, 255).astype(np.uint8))
+            axis.set_xticks([])
+            axis.set_yticks([])
+        row[0].set_ylabel(press.name, fontsize=7)
+        row[2].set_title(f"{press.error:.1f} of {press.null_error:.1f} grey levels, {press.angle:.1f}°", fontsize=7)
+    axes[0, 0].set_title("seen", fontsize=8)
+    axes[0, 1].set_title("predicted by the other presses", fontsize=8)
+    figure.savefig(path, dpi=120)

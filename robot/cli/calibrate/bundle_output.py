@@ -39,9 +39,9 @@ def write_calibration(
     must."""
     from calibration.bundle import write_bundle
     from calibration.light.checks import page
+    from calibration.light.checks.page import draw
     from calibration.light.checks.verdict import judge
-    from calibration.light.residual_picture import draw
-    from calibration.light.skin import measure_skin
+    from calibration.light.noise import measure_skin
 
     verdict = judge(fit, scale, dots=found is None and _shows_dots(fit))
     _show(fit, scale.pixel_pitch, found)

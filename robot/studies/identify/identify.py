@@ -11,8 +11,7 @@ import numpy as np
 
 from calibration.materials.checks import Finding, findings, size_error
 from calibration.materials.estimate import COARSE_ERROR, estimate
-from calibration.materials.fit import Fit, Point, Priors, Signals
-from calibration.materials.parameters import Parameter
+from calibration.materials.fit import Fit, Parameter, Point, Priors, Signals
 from calibration.materials.presses import Noise, Press, gathered, signals_of, thinned
 from robot.studies.identify.recordings import Recordings
 from robot.studies.identify.simulation import Simulation, coarser, scene_with

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from calibration.materials.parameters import Parameter
+from calibration.materials.fit import Parameter
 from robot.common.whole_file import whole_folder
 from robot.studies.identify.identify import Identified
 from robot.studies.identify.motions import WHAT_TELLS

@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.materials.estimate import CannotSimulate
-from calibration.materials.fit import Point
-from calibration.materials.parameters import Parameter
+from calibration.materials.fit import Parameter, Point
 from calibration.materials.presses import Press
 from tacsim import pose as se3
 from tacsim.geometry.shapes import lowest_below

@@ -13,8 +13,7 @@ import pytest
 
 from calibration.compare.alignment import by_geometry, by_size
 from calibration.compare.compare import METRICS, Comparison, Options, bootstrap, compare_frames
-from calibration.compare.judgement import judgement
-from calibration.compare.report import as_json, figures, write
+from calibration.compare.report import as_json, figures, judgement, write
 from calibration.errors import BadFrames
 from calibration.frame_set import Frame, FrameSet, rectified_by_corners, rectified_shape
 from calibration.lens.view import BadCorners

@@ -8,8 +8,16 @@ import pytest
 
 from calibration.height.forward_steps import ForwardSteps
 from calibration.height.integration import Integrator, slopes_of
-from tacsim.models.photometric import DEPTH_TERMS, DepthColour, PhotometricLight, PhotometricModel, places_in_image
-from tacsim.models.shadows import SLOPES, CastShadows, horizon
+from tacsim.models.photometric import (
+    DEPTH_TERMS,
+    SHADOW_SLOPES,
+    CastShadows,
+    DepthColour,
+    PhotometricLight,
+    PhotometricModel,
+    horizon,
+    places_in_image,
+)
 
 ROWS, COLUMNS = 120, 160
 U, V = places_in_image(COLUMNS, ROWS)
@@ -20,9 +28,9 @@ LAMPS = ((1.0, 0.0), (-0.5, 0.9), (-0.5, -0.9))
 
 def model(dark: float) -> PhotometricModel:
     """A light in proportion to the normal; `dark`: how much darker a colour is at most where its lamp is hidden."""
-    weights = np.zeros((len(LAMPS), len(SLOPES), 3, 3))
+    weights = np.zeros((len(LAMPS), len(SHADOW_SLOPES), 3, 3))
     for lamp in range(3):
-        weights[lamp, :, 0, lamp] = -dark / len(SLOPES)
+        weights[lamp, :, 0, lamp] = -dark / len(SHADOW_SLOPES)
     shadows = CastShadows(lamps=LAMPS, weights=tuple(map(tuple, weights.reshape(-1, 3).tolist()))) if dark else None
     rows = (*map(tuple, ANSWER.tolist()), (0.0, 0.0, 0.0))
     return PhotometricModel(degree=1, position=0, weights=rows, steepest=1.2, shadows=shadows)

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from calibration.light.calibrator import calibrate_light
-from tacsim.models.photometric import PhotometricLight, places_in_image
-from tacsim.models.shadows import horizon
+from tacsim.models.photometric import PhotometricLight, horizon, places_in_image
 from tests.calibration.presses import BALL_PX, COLUMNS, PITCH, ROWS, HiddenSensor
 
 DISTANCE = 1.1  # of the lamps from the middle [widths of the picture]

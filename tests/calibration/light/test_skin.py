@@ -3,8 +3,8 @@ import numpy as np
 import pytest
 
 from calibration.light.dent import ContactCircle
+from calibration.light.noise import measure_skin
 from calibration.light.press import BallPress
-from calibration.light.skin import measure_skin
 
 PITCH, RADIUS, SIDE = 0.06e-3, 20.0, 260
 PLACES = [(70, 80), (180, 90), (130, 130), (90, 180), (185, 185)]

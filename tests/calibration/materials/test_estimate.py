@@ -10,8 +10,7 @@ import pytest
 
 from calibration.materials.checks import findings
 from calibration.materials.estimate import CannotSimulate, NotIdentified, estimate
-from calibration.materials.fit import Fit, Point, Predict, Priors, Signals
-from calibration.materials.parameters import Parameter
+from calibration.materials.fit import Fit, Parameter, Point, Predict, Priors, Signals
 from tacsim.interface import FloatArray
 
 E, NU, MU, RADIUS = 0.18e6, 0.47, 0.45, 4e-3

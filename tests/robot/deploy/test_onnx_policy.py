@@ -19,8 +19,7 @@ from robot.deploy.policy import PolicyNotFound, load_policy, require_fit
 from robot.open import open_rig
 from tacsim.gym.features import FeatureEncoder
 from tacsim.interface import IncompatibleRig, Needs
-from tacsim.models.features import Features, MapGrid
-from tacsim.models.policy import ActionAxis, PolicySpec
+from tacsim.models.policy import ActionAxis, Features, MapGrid, PolicySpec
 from tacsim.models.rig import SqueezeConfig
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.tasks import make_task

@@ -17,8 +17,7 @@ from robot.deploy.control_loop import EpisodeFailed, EpisodeSetup, run_episode
 from robot.deploy.onnx_policy import OnnxPolicy
 from tacsim.gym.features import FeatureEncoder
 from tacsim.interface import Action, Needs, Observation, Pose
-from tacsim.models.features import Features
-from tacsim.models.policy import ActionAxis, PolicySpec
+from tacsim.models.policy import ActionAxis, Features, PolicySpec
 from tacsim.models.sensor import CanonicalGrid
 from tests.robot.rig.bare_rig import Opened, bare_file, opened
 from tests.robot.waiting import until

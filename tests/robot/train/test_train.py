@@ -27,7 +27,7 @@ from robot.train.network import CLIP, FeatureLayers, PolicyNetwork  # noqa: E402
 from robot.train.run_folder import RunError, RunFolder  # noqa: E402
 from robot.train.train import begin, environments, export_policy, new_actor, train  # noqa: E402
 from tacsim.config import ConfigError  # noqa: E402
-from tacsim.control.approach import NoTouch  # noqa: E402
+from tacsim.control.contact_signal import NoTouch  # noqa: E402
 from tacsim.models.training import Training  # noqa: E402
 from tacsim.tasks import BadDraws, GoalOutOfReach  # noqa: E402
 from tests.robot.cli.invoked import START, environment, tacsim  # noqa: E402

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tacsim.control.approach import NoTouch, approach
+from tacsim.control.contact_signal import NoTouch, approach
 
 
 @pytest.mark.parametrize(("surface", "steps"), [(0.0, []), (2.5, [1.0, 2.0, 3.0])])

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from tacsim.gym.features import FeatureEncoder
 from tacsim.interface import ArmState, IncompatibleRig, Needs, Observation, Pose, TactileObservation
-from tacsim.models.features import Features, MapGrid
+from tacsim.models.policy import Features, MapGrid
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.pose import HALF_TURN_X
 

@@ -11,8 +11,8 @@ import pytest
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 
+from tacsim.gym import ENVIRONMENTS, register_envs
 from tacsim.gym.env import TacsimEnv
-from tacsim.gym.plugin import ENVIRONMENTS, register_envs
 from tacsim.interface import IncompatibleRig
 from tacsim.limits import ActionError
 from tacsim.models.rig import RepositionConfig, SqueezeConfig
@@ -212,7 +212,7 @@ def test_environments_are_registered_once() -> None:
 
 def test_any_policy_acts_as_an_environment_s_action(open_springs: Any) -> None:
     """What it asks of the arms is where the step takes them, as float32 can say it."""
-    from tacsim.tasks.action import action_from
+    from tacsim.tasks.task import action_from
 
     env = TacsimEnv(open_springs("squeeze"), make_task(SqueezeConfig(kind="squeeze", goal=7e-3, steps=3)))
     env.reset(seed=3)

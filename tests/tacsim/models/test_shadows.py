@@ -1,7 +1,15 @@
 import numpy as np
 import pytest
 
-from tacsim.models.shadows import PLACES, SLOPES, STEPS, WIDTH, CastShadows, horizon, shadow_terms
+from tacsim.models.photometric import (
+    SHADOW_PLACES,
+    SHADOW_SLOPES,
+    SHADOW_STEPS,
+    SHADOW_WIDTH,
+    CastShadows,
+    horizon,
+    shadow_terms,
+)
 
 CREST, FLANK = 0.01, 0.5  # of a ridge along y: its height [widths of the picture], its slope
 
@@ -10,7 +18,7 @@ def ridge(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return np.maximum(CREST - FLANK * np.abs(x), 0.0)
 
 
-@pytest.mark.parametrize("step", STEPS[3:8])
+@pytest.mark.parametrize("step", SHADOW_STEPS[3:8])
 def test_beside_a_ridge_the_horizon_is_its_crest(step: float) -> None:
     place = np.array([-step]), np.array([0.1])
     towards = horizon(ridge, *place, (1e4, 0.1))
@@ -31,8 +39,8 @@ def test_a_lamp_in_the_picture_is_seen_from_all_sides() -> None:
 
 def test_terms_grow_from_each_slope_on_and_stand_by_lamp_slope_and_place() -> None:
     u, v = np.array([0.2]), np.array([-0.3])
-    first, second = np.array([SLOPES[0] * (1 + WIDTH) / 2]), np.array([9.0])
-    terms = shadow_terms([first, second], u, v).reshape(2, len(SLOPES), PLACES)
+    first, second = np.array([SHADOW_SLOPES[0] * (1 + SHADOW_WIDTH) / 2]), np.array([9.0])
+    terms = shadow_terms([first, second], u, v).reshape(2, len(SHADOW_SLOPES), SHADOW_PLACES)
     ramps = [[0.5, 0.0, 0.0], [1.0, 1.0, 1.0]]
     np.testing.assert_allclose(terms, np.array(ramps)[..., None] * [1.0, 0.2, -0.3])
 

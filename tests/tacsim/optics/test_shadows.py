@@ -1,10 +1,16 @@
 import numpy as np
 import pytest
 
-from tacsim.models.photometric import PhotometricModel
+from tacsim.models.photometric import (
+    SHADOW_PLACES,
+    SHADOW_SLOPES,
+    SHADOW_STEPS,
+    SHADOW_WIDTH,
+    CastShadows,
+    PhotometricModel,
+)
 from tacsim.models.scene import GelSurface
 from tacsim.models.sensor import Lighting, SensorGeometry, SensorModel
-from tacsim.models.shadows import PLACES, SLOPES, STEPS, WIDTH, CastShadows
 from tacsim.optics.grid import image_grid
 from tacsim.optics.render import Renderer
 from tacsim.optics.surface import sample_surface
@@ -14,7 +20,7 @@ GEL = (20e-3, 20e-3)
 GEOMETRY = SensorGeometry(width=320, height=240, pixel_pitch=0.06e-3)
 LAMPS = ((1.5, 0.4), (-0.4, -0.3), (0.0, 0.9))
 LIGHT = PhotometricModel(degree=1, position=0, weights=((0.0, 0.0, 0.0),) * 3, steepest=2.0)
-DARK = np.zeros((3, len(SLOPES), PLACES, 3))
+DARK = np.zeros((3, len(SHADOW_SLOPES), SHADOW_PLACES, 3))
 for lamp in range(3):
     DARK[lamp, :, 0, lamp] = (-0.4, -0.2, -0.1)  # each lamp is of one colour
     DARK[lamp, 0, 1, lamp] = 0.2
@@ -51,12 +57,12 @@ def test_shadows_are_those_of_the_surface(surface: GelSurface) -> None:
     for lamp, (lamp_x, lamp_y) in enumerate(LAMPS):
         way = np.hypot(lamp_x - x, lamp_y - y)
         towards = np.zeros_like(x)
-        for step in np.geomspace(STEPS[0], STEPS[-1], 140):
+        for step in np.geomspace(SHADOW_STEPS[0], SHADOW_STEPS[-1], 140):
             at = [rows + 320 * step * (lamp_y - y) / way, columns + 320 * step * (lamp_x - x) / way]
             there = map_coordinates(whole, at, order=1, mode="nearest")
             towards = np.maximum(towards, (there - height) / step)
-        for slope, weights in zip(SLOPES, DARK[lamp], strict=True):
-            ramp = np.clip((towards - slope) / (slope * (WIDTH - 1)), 0, 1)
+        for slope, weights in zip(SHADOW_SLOPES, DARK[lamp], strict=True):
+            ramp = np.clip((towards - slope) / (slope * (SHADOW_WIDTH - 1)), 0, 1)
             change += ramp[..., None] * (weights[0] + weights[1] * x[..., None] + weights[2] * (y * 4 / 3)[..., None])
     true = np.clip(127.5 + 127.5 * change, 0, 255)
     seen = renderer(SHADOWS)(surface)[1::6, 1::6].astype(float)

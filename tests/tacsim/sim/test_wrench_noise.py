@@ -9,9 +9,8 @@ import pytest
 
 from tacsim.models.hardware import ArmLimits, Workspace
 from tacsim.models.rig import WrenchNoise
-from tacsim.sim.arm import SimArm
+from tacsim.sim.arm import SimArm, WrenchNoiseSource, wrench_noise_source
 from tacsim.sim.clock import SimClock
-from tacsim.sim.wrench_noise import WrenchNoiseSource, wrench_noise_source
 
 MODEL = WrenchNoise(force=0.02, torque=0.5e-3)
 

@@ -7,7 +7,7 @@ import pytest
 
 from tacsim.interface import ArmState, Pose
 from tacsim.pose import HALF_TURN_X
-from tacsim.tasks.effort import Effort
+from tacsim.tasks.task import Effort
 
 
 def upper(z: float, force: tuple[float, float, float]) -> ArmState:

@@ -11,7 +11,7 @@ from tacsim.interface import ArmState, FloatArray, Observation, Pose, TactileObs
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.optics.grid import canonical_cells
 from tacsim.pose import HALF_TURN_X
-from tacsim.tasks.felt_shape import FeltShape
+from tacsim.tasks.knead import FeltShape
 from tacsim.tasks.solids import Solid, chamfer
 
 GRID = CanonicalGrid()

@@ -17,8 +17,8 @@ from tacsim.models.material import BodyMaterial
 from tacsim.models.rig import KneadConfig
 from tacsim.models.scene import Body, Box, Indenter, Scene
 from tacsim.tasks import judge, make_task
-from tacsim.tasks.action import action_from
 from tacsim.tasks.knead import Knead, ScriptedKnead
+from tacsim.tasks.task import action_from
 
 QUICK = [
     "scene.preset=learn",

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibration.materials.fit import Point
-from calibration.materials.parameters import Parameter
+from calibration.materials.fit import Parameter, Point
 from calibration.materials.presses import Noise, Press, gathered, signals_of, thinned
 from robot.studies.identify.identify import parameters_of
 from robot.studies.identify.simulation import Simulation, coarser, scene_with

@@ -3,7 +3,6 @@ judgement in one sentence."""
 
 from __future__ import annotations
 
-import base64
 import csv
 import json
 import math
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 from calibration.compare.compare import METRICS, Comparison, Metric, Overall
 from calibration.compare.invariance import CHANGES, VIEWS, Report
 from tacsim.interface import Image
+from tacsim.report.report import data_url, finite, render_page
 
 MAX_PICTURED = 24  # pairs with pictures, the worst first
 THUMBNAIL = 240  # longer side [px]
@@ -32,6 +32,9 @@ CONTACT_MASK = (
     "those of a circle that was clicked: they do not compare."
 )
 FILES = ("compare.json", "compare.csv", "compare.html")
+CLOSE_CORRELATION = 0.95  # of the change of colour in contact, from which two sources look alike ...
+CLOSE_SHARE = 0.25  # ... if their error there also is no larger share of what a picture without contact would score
+SOURCE_NAMES = {"simulated": "the simulation", "real": "the real sensor"}
 
 
 def figures(comparison: Comparison, report: Report | None = None) -> dict[str, float]:
@@ -68,8 +71,8 @@ def as_json(comparison: Comparison, report: Report | None = None) -> dict[str, A
                 "a": pair.a.name,
                 "b": pair.b.name,
                 "flags": list(pair.flags),
-                "numbers": {key: _number(value) for key, value in pair.numbers.items()},
-                "null": {key: _number(value) for key, value in pair.null.items()},
+                "numbers": {key: finite(value) for key, value in pair.numbers.items()},
+                "null": {key: finite(value) for key, value in pair.null.items()},
             }
             for pair in comparison.pairs
         ],
@@ -79,9 +82,9 @@ def as_json(comparison: Comparison, report: Report | None = None) -> dict[str, A
             "presses": report.presses,
             "patch": report.patch,
             "views": {view.view: _known(view, leave="view") for view in report.views},
-            "gradient_angle": _number(report.angle),
+            "gradient_angle": finite(report.angle),
             "drift": {
-                drift.change.key: {"fresh": _number(drift.fresh), "stale": _number(drift.stale)}
+                drift.change.key: {"fresh": finite(drift.fresh), "stale": finite(drift.stale)}
                 for drift in report.drifts
             },
             "notes": list(report.notes),
@@ -124,7 +127,7 @@ def _write_csv(path: Path, comparison: Comparison) -> None:
         writer.writerow(["a", "b", *keys, *(f"null_{key}" for key in keys), "flags"])
         for pair in comparison.pairs:
             numbers = [*(pair.numbers.get(key) for key in keys), *(pair.null.get(key) for key in keys)]
-            cells = ["" if (value := _number(number)) is None else repr(value) for number in numbers]
+            cells = ["" if (value := finite(number)) is None else repr(value) for number in numbers]
             writer.writerow([_harmless(pair.a.name), _harmless(pair.b.name), *cells, "; ".join(pair.flags)])
 
 
@@ -134,8 +137,6 @@ def _harmless(name: str) -> str:
 
 
 def _html(comparison: Comparison, report: Report | None) -> str:
-    from jinja2 import Environment, StrictUndefined
-
     def worst(k: int) -> float:
         value = comparison.pairs[k].numbers[WORST_BY]
         return -math.inf if math.isnan(value) else value
@@ -143,10 +144,8 @@ def _html(comparison: Comparison, report: Report | None) -> str:
     order = sorted(range(len(comparison.pairs)), key=worst, reverse=True)
     known = rows(comparison)
     columns = [metric for metric, _ in known if metric.key not in ("psnr", "contact_psnr", "mae", "ssim")]
-    template = Environment(
-        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    ).from_string(Path(__file__).with_name("comparison.html.jinja").read_text(encoding="utf-8"))
-    return template.render(
+    return render_page(
+        Path(__file__).with_name("comparison.html.jinja"),
         comparison=comparison,
         report=report,
         judgement=judgement(comparison),
@@ -236,29 +235,19 @@ def _inline(picture: Image) -> str:
     how = cv2.INTER_AREA if scale < 1 else cv2.INTER_NEAREST
     small = cv2.resize(picture, size, interpolation=how)
     _, data = cv2.imencode(".jpg", small[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-    return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode("ascii")
+    return data_url(data.tobytes(), "jpeg")
 
 
 def _known(record: Any, leave: str = "") -> dict[str, Any]:
     """The fields of a flat record, NaN and infinity as None."""
     fields: Iterable[str] = record.__slots__
     values = ((name, getattr(record, name)) for name in fields if name != leave)
-    return {name: _number(value) if isinstance(value, float) else value for name, value in values}
-
-
-def _number(value: float | None) -> float | None:
-    return None if value is None or not math.isfinite(value) else float(value)
-
-
-CLOSE_CORRELATION = 0.95  # of the change of colour in contact, from which two sources look alike ...
-CLOSE_SHARE = 0.25  # ... if their error there also is no larger share of what a picture without contact would score
-
-SAID = {"simulated": "the simulation", "real": "the real sensor"}
+    return {name: finite(value) if isinstance(value, float) else value for name, value in values}
 
 
 def judgement(comparison: Comparison) -> str:
     """Whether A looks like B in contact, and by how many grey levels and degrees."""
-    a, b = (SAID.get(name, name) for name in comparison.names)
+    a, b = (SOURCE_NAMES.get(name, name) for name in comparison.names)
     error, alike = comparison.overall["contact_mae"], comparison.overall["contact_ncc"].mean
     if math.isnan(error.mean):
         return "No pair shows contact, so nothing can be judged."

@@ -21,6 +21,12 @@ Entry = TypeVar("Entry", bound=np.generic)
 TILE = 32  # side of the tiles; what is wider is drift, not noise [px]
 DARK = 2  # a channel at or below this has lost its noise [grey levels]
 MIN_TILES = 4
+SKIN_NEAR = (1.25, 2.2)  # where the skin has moved, and the light changes little [contact radii]
+SKIN_FAR = (4.0, 8.0)  # where it has hardly, in about the same light
+MIN_SKIN_PIXELS = 1000  # of either part of a press
+MIN_SKIN_PRESSES = 4
+MIN_SKIN_SHARE = 0.2  # a smaller one is not told from none; 0.07 at most is found on three real sensors without any
+MIN_STANDARD_ERRORS = 3.0  # standard errors over presses that the share must be from none
 
 
 class NoiseUnknown(ValueError):
@@ -128,14 +134,6 @@ def _possible(covariance: FloatArray, deviation: FloatArray) -> tuple[float, flo
     return float(whole[0, 1]), float(whole[0, 2]), float(whole[1, 2])
 
 
-NEARBY = (1.25, 2.2)  # where the skin has moved, and the light changes little [contact radii]
-FAR_OFF = (4.0, 8.0)  # where it has hardly, in about the same light
-MIN_PIXELS = 1000  # of either part of a press
-MIN_PRESSES = 4
-MIN_SHARE = 0.2  # a smaller one is not told from none; 0.07 at most is found on three real sensors without any
-CERTAIN = 3.0  # standard errors over presses that the share must be from none
-
-
 def measure_skin(presses: Sequence[BallPress], reference: NDArray[np.uint8], pixel_pitch: float) -> float | None:
     """Share of the fine part of `reference` (H, W, 3) that moves with the gel, 0 to 1; None where the presses do not
     tell that there is any. `pixel_pitch` [m].
@@ -151,11 +149,11 @@ def measure_skin(presses: Sequence[BallPress], reference: NDArray[np.uint8], pix
     for press in presses:
         change = fine_part((press.change * mean).astype(np.float32), pixel_pitch)
         lit, distance = press.lit.all(axis=2), press.distance() / press.circle.radius
-        parts = [lit & (distance > least) & (distance < most) for least, most in (FAR_OFF, NEARBY)]
-        if min(int(part.sum()) for part in parts) >= MIN_PIXELS:
+        parts = [lit & (distance > least) & (distance < most) for least, most in (SKIN_FAR, SKIN_NEAR)]
+        if min(int(part.sum()) for part in parts) >= MIN_SKIN_PIXELS:
             far, near = (1.0 + float((change[part] * grain[part]).sum() / (grain[part] ** 2).sum()) for part in parts)
             shares.append(far - max(near, 0.0))
-    if len(shares) < MIN_PRESSES:
+    if len(shares) < MIN_SKIN_PRESSES:
         return None
     share, error = float(np.median(shares)), float(np.std(shares, ddof=1)) / len(shares) ** 0.5
-    return min(share, 1.0) if share > max(MIN_SHARE, CERTAIN * error) else None
+    return min(share, 1.0) if share > max(MIN_SKIN_SHARE, MIN_STANDARD_ERRORS * error) else None

@@ -13,6 +13,10 @@ from scipy.stats import t as student
 
 from tacsim.interface import FloatArray
 
+MESH_LEFT = 0.5  # standard deviation of what is left of the mesh's error, over what the finer mesh changed
+HELD = 0.5  # standard deviation of a free number that is held where it was, as far as the others' intervals go
+UNKNOWN = 100.0  # standard deviation of a free number of which nothing is known
+
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
@@ -62,9 +66,6 @@ def starts(parameters: Sequence[Parameter]) -> FloatArray:
 def begins(parameters: Sequence[Parameter]) -> FloatArray:
     """The free numbers at which a fit begins."""
     return np.array([each.free(each.start if each.begin is None else each.begin) for each in parameters])
-
-
-MESH_LEFT = 0.5  # standard deviation of what is left of the mesh's error, over what the finer mesh changed
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,10 +188,6 @@ class Fit:
 
     def _index(self, name: str) -> int:
         return [each.name for each in self.parameters].index(name)
-
-
-HELD = 0.5  # standard deviation of a free number that is held where it was, as far as the others' intervals go
-UNKNOWN = 100.0  # standard deviation of a free number of which nothing is known
 
 
 def covariance_of(

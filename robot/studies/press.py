@@ -27,8 +27,7 @@ from tacsim.physics.move import MoveStats
 from tacsim.physics.worlds.base import POSSIBLE_SHARE
 from tacsim.physics.worlds.press import CLEARANCE, PressWorld
 from tacsim.physics.worlds.press_state import GRID_SPACING
-from tacsim.report.height_picture import write_height_picture
-from tacsim.report.side_picture import write_side_picture
+from tacsim.report.press_pictures import write_height_picture, write_side_picture
 
 QUARTER_TURN = math.pi / 2  # a twist is cut into pieces of at most this: each motion takes the shorter rotation [rad]
 MAX_TWIST = math.radians(3600.0)

@@ -1,8 +1,8 @@
 """What lies on the gel and moves with it: dark dots, painted over or lifted off a picture, and the skin.
 
-Skin is grain, print and dust in the picture of the untouched gel. What is finer than FINE is either on the skin, or the
-camera's own pattern and the noise of that one picture. Only a share of it is on the skin (`SensorModel.skin`), which
-calibration.light.noise measures.
+Skin is grain, print and dust in the picture of the untouched gel. What is finer than GRAIN_BLUR is either on the skin,
+or the camera's own pattern and the noise of that one picture. Only a share of it is on the skin (`SensorModel.skin`),
+which calibration.light.noise measures.
 """
 
 from __future__ import annotations
@@ -15,6 +15,8 @@ EDGE_DARKNESS = 0.15  # of the blurred edge of a dot: the share of its light tha
 MAX_RADIUS = 2.5  # of what may be a dot [radii]
 BLUR = 0.35  # of the picture [radii]
 MIN_RADIUS = 1.2  # of a dot that can be found [px]
+GRAIN_BLUR = 0.25e-3  # standard deviation of the blur that leaves light alone [m]
+MIN_LIGHT = 1.0  # least light that skin is told from [grey levels]
 
 
 def dot_filters(radius: float) -> tuple[int, float]:
@@ -63,15 +65,11 @@ def lifted_ink(picture: Image, radius: float) -> tuple[Image, Float32]:
     return clean, np.asarray(share, dtype=np.float32)
 
 
-FINE = 0.25e-3  # standard deviation of the blur that leaves light alone [m]
-DARKEST = 1.0  # least light that skin is told from [grey levels]
-
-
 def fine_part(picture: Float32, pixel_pitch: float) -> Float32:
     """(H, W, 3) what of a picture is finer than light; `pixel_pitch` [m]."""
     import cv2
 
-    slow = cv2.GaussianBlur(picture, (0, 0), FINE / pixel_pitch, borderType=cv2.BORDER_REPLICATE)
+    slow = cv2.GaussianBlur(picture, (0, 0), GRAIN_BLUR / pixel_pitch, borderType=cv2.BORDER_REPLICATE)
     return np.asarray(picture - slow, dtype=np.float32)
 
 
@@ -79,5 +77,5 @@ def lifted_skin(picture: Float32, share: float, pixel_pitch: float) -> tuple[Flo
     """The picture (H, W, 3) of an untouched gel without its skin, which is `share` of its fine part, and (H, W, 3) the
     share of light that the skin lets through, about 1: the product is the picture."""
     bare = picture - np.float32(share) * fine_part(picture, pixel_pitch)
-    clean = np.maximum(bare, np.float32(DARKEST)).astype(np.float32)
+    clean = np.maximum(bare, np.float32(MIN_LIGHT)).astype(np.float32)
     return clean, (picture / clean).astype(np.float32)

@@ -45,6 +45,8 @@ SAMPLED = 0.3  # a wider normal distribution keeps its variance to 5 % where it 
 ASTRAY = 0.5  # [px] that a pixel put on the gel and back may be off
 LEAST_PIXELS = 128 * 128  # of a picture that is worth a table
 TABLE_ERROR = 0.5  # largest error of the table [grey levels]; narrower highlights are computed without it
+SHADOW_STRIDE = 2  # every so many points of the table along each side: shadows have soft edges
+MAX_BLUR = 6.0  # standard deviation of a Gaussian [px] beyond which it is evaluated on a coarser picture
 
 
 class Renderer:
@@ -314,16 +316,13 @@ def texture_gradient(grid: PixelGrid, gel_size: tuple[float, float], deviation: 
     return np.ascontiguousarray(gradient, dtype=np.float32)
 
 
-THIN = 2  # every so many points of the table along each side: shadows have soft edges
-
-
 def shadow_colours(light: PhotometricLight, shadows: CastShadows, table: SurfaceTable, image: PixelGrid) -> Float32:
     """(rows, columns, 3) change of colour by cast shadows at the table's points, of an image with these pixels.
 
     The path to a lamp is followed over the surface as if it had moved only up and down: sideways motion is small beside
     the length of a shadow.
     """
-    x, y = (each[::THIN, ::THIN] for each in table.place())
+    x, y = (each[::SHADOW_STRIDE, ::SHADOW_STRIDE] for each in table.place())
     u, v = image.in_image(x, y)
     width, flat = np.float32(image.columns * image.pitch), np.float32(image.rows / image.columns)
     # from places in picture widths, which start in the middle of the picture, to metres
@@ -334,11 +333,8 @@ def shadow_colours(light: PhotometricLight, shadows: CastShadows, table: Surface
         return table.at_places(height, start_x + width * x, start_y + width * y) / width
 
     horizons = [horizon(height_at, u, v * flat, lamp) for lamp in shadows.lamps]
-    rows, columns = (np.arange(n, dtype=np.float32) / THIN for n in table.fields.shape[:2])
+    rows, columns = (np.arange(n, dtype=np.float32) / SHADOW_STRIDE for n in table.fields.shape[:2])
     return look_up(light.shadow(horizons, u, v), np.stack(np.meshgrid(columns, rows), axis=-1))
-
-
-FINE = 6.0  # standard deviation of a Gaussian [px] beyond which it is evaluated on a coarser picture
 
 
 def darkened(model: DarknessModel, height: Float32, pitch: float) -> tuple[Float32, float]:
@@ -354,7 +350,7 @@ def _mean_round(height: Float32, deviation: float) -> Float32:
     """(H, W) Gaussian mean; the picture goes on as its mirror image."""
     import cv2
 
-    coarser = max(1, int(deviation / FINE))
+    coarser = max(1, int(deviation / MAX_BLUR))
     if coarser == 1:
         return np.asarray(cv2.GaussianBlur(height, (0, 0), deviation, borderType=cv2.BORDER_REFLECT), np.float32)
     rows, columns = height.shape

@@ -38,6 +38,9 @@ TABLE_PITCH, MOST_POINTS = 0.125e-3, 8
 FIXED_POINT_STEPS = 20
 NEWTON_STEPS = 40
 CONVERGED = 1.0 / 64.0  # largest last step [table points]: half of what OpenCV's remap resolves
+TRIANGLE_MARGIN = 1e-9  # share of a triangle by which a point may lie outside: no gap between neighbours
+EDGE_ON = 0.1  # det J of a sheet that is seen edge-on; its slope is as that of one this narrow in the picture
+OUTSIDE = -1e3  # column and row of what lies beside the gel
 
 
 class SurfaceFolded(ValueError):
@@ -333,11 +336,6 @@ def _folded(points: NDArray[np.float64]) -> SurfaceFolded:
     )
 
 
-EDGE = 1e-9  # share of a triangle by which a point may lie outside: no gap between neighbours
-EDGE_ON = 0.1  # det J of a sheet that is seen edge-on; its slope is as that of one this narrow in the picture
-BESIDE = -1e3  # column and row of what lies beside the gel
-
-
 def visible_points(places: FloatArray, height: Float32, shape: tuple[int, int]) -> tuple[Float32, NDArray[np.bool_]]:
     """The points of a surface's table that an image shows.
 
@@ -346,7 +344,7 @@ def visible_points(places: FloatArray, height: Float32, shape: tuple[int, int]) 
 
     Returns (H, W, 2) column and row in the table, and (H, W) False where no sheet faces the camera.
     """
-    found = np.full((shape[0] * shape[1], 2), BESIDE, dtype=np.float32)
+    found = np.full((shape[0] * shape[1], 2), OUTSIDE, dtype=np.float32)
     deepest = np.full(len(found), -np.inf)
     for row in range(len(places) - 1):
         pixels, points, depth = _covered(places[row : row + 2], height[row : row + 2], shape)
@@ -370,8 +368,10 @@ def _covered(
     triangles = np.stack([np.concatenate([a, d]), np.concatenate([b, c]), np.concatenate([c, b])], axis=1)
     start, sides = triangles[:, 0, :2], triangles[:, 1:, :2] - triangles[:, :1, :2]
     area = sides[:, 0, 0] * sides[:, 1, 1] - sides[:, 0, 1] * sides[:, 1, 0]
-    first = np.maximum(np.ceil(triangles[:, :, :2].min(axis=1) - EDGE), 0).astype(np.intp)
-    last = np.minimum(np.floor(triangles[:, :, :2].max(axis=1) + EDGE), (shape[1] - 1, shape[0] - 1)).astype(np.intp)
+    first = np.maximum(np.ceil(triangles[:, :, :2].min(axis=1) - TRIANGLE_MARGIN), 0).astype(np.intp)
+    last = np.minimum(np.floor(triangles[:, :, :2].max(axis=1) + TRIANGLE_MARGIN), (shape[1] - 1, shape[0] - 1)).astype(
+        np.intp
+    )
     wide, high = np.maximum(last - first + 1, 0).T
     number = np.where(area > 0, wide * high, 0)  # of the image points in each box
 
@@ -381,7 +381,7 @@ def _covered(
     by_u, by_v = u - start[owner, 0], v - start[owner, 1]
     (one, two), area = sides[owner].transpose(1, 2, 0), area[owner]
     share = np.stack([by_u * two[1] - by_v * two[0], by_v * one[0] - by_u * one[1]], axis=1) / area[:, None]
-    inside = (share >= -EDGE).all(axis=1) & (share.sum(axis=1) <= 1.0 + EDGE)
+    inside = (share >= -TRIANGLE_MARGIN).all(axis=1) & (share.sum(axis=1) <= 1.0 + TRIANGLE_MARGIN)
     owner, share = owner[inside], share[inside]
     values = triangles[:, 0, 2:][owner]
     for corner in (1, 2):

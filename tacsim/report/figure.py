@@ -27,6 +27,7 @@ COLOURS = ("#2a6db5", "#cf5b17", "#7a4fb0", "#b0891f", "#1b8f8f", "#a8325e")  # 
 THUMBNAIL = 320  # [px]
 MAX_GOAL = 9  # numbers of a goal that are shown
 TALLEST = 3.0  # height of a row of pictures, over the width of one
+Draw = Callable[[Axes, Series], None]
 DPI, WIDTH, COLUMNS = 100, 14.0, 6  # dots an inch, page width [inches], images in a row of the overview
 
 
@@ -83,7 +84,7 @@ def png(image: NDArray[np.uint8]) -> bytes:
 def png_of(figure: Figure) -> bytes:
     """PNG file of a figure."""
     file = io.BytesIO()
-    figure.savefig(file, format="png")
+    save(figure, file)
     return file.getvalue()
 
 
@@ -135,11 +136,19 @@ def _line(axes: Axes, series: Series, values: FloatArray, colour: str, label: st
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
 
 
-def _lines(axes: Axes, series: Series, values: Mapping[str, FloatArray], scale: float = 1.0) -> None:
-    """A line for each name, in its colour."""
-    for name, colour in _colours(values):
-        _line(axes, series, values[name] * scale, colour, name)
-    _legend(axes)
+def _draw_lines(
+    title: str, unit: str, values_of: Callable[[Series], Mapping[str, FloatArray]], scale: float = 1.0
+) -> Draw:
+    """Draws `scale` times each of the named values over the steps."""
+
+    def draw(axes: Axes, series: Series) -> None:
+        plain(axes, title, "step", unit)
+        values = values_of(series)
+        for name, colour in _colours(values):
+            _line(axes, series, values[name] * scale, colour, name)
+        _legend(axes)
+
+    return draw
 
 
 def _legend(axes: Axes) -> None:
@@ -171,25 +180,9 @@ def _draw_distance(axes: Axes, series: Series) -> None:
 
 
 def _draw_force(axes: Axes, series: Series) -> None:
-    plain(axes, "force on each arm, |Fz|", "step", "N")
-    _lines(axes, series, series.force)
+    _draw_lines("force on each arm, |Fz|", "N", lambda of: of.force)(axes, series)
     axes.margins(y=0.12)
     axes.set_ylim(0.0, max(axes.get_ylim()[1], 1.12 * axes.dataLim.ymax))  # a nearly constant force is not cut off
-
-
-def _draw_signal(axes: Axes, series: Series) -> None:
-    plain(axes, "contact signal", "step", "signal")
-    _lines(axes, series, series.signals)
-
-
-def _draw_depth(axes: Axes, series: Series) -> None:
-    plain(axes, "deepest point of each gel", "step", "mm")
-    _lines(axes, series, series.deepest, 1e3)
-
-
-def _draw_flow(axes: Axes, series: Series) -> None:
-    plain(axes, "longest flow of each gel's markers", "step", "mm")
-    _lines(axes, series, series.flow, 1e3)
 
 
 def _draw_signal_against_force(axes: Axes, series: Series) -> None:
@@ -215,15 +208,15 @@ def _draw_timing(axes: Axes, series: Series) -> None:
     _legend(axes)
 
 
-def _panels(series: Series) -> list[Callable[[Axes, Series], None]]:
+def _panels(series: Series) -> list[Draw]:
     """The plots for which the episode has data."""
-    offered: list[tuple[bool, Callable[[Axes, Series], None]]] = [
+    offered: list[tuple[bool, Draw]] = [
         (bool(np.isfinite(series.reward).any()), _draw_reward),
         (bool(series.force), _draw_force),
-        (bool(series.signals), _draw_signal),
+        (bool(series.signals), _draw_lines("contact signal", "signal", lambda of: of.signals)),
         (bool(np.isfinite([series.distance, series.felt]).any()), _draw_distance),
-        (bool(series.deepest), _draw_depth),
-        (bool(series.flow), _draw_flow),
+        (bool(series.deepest), _draw_lines("deepest point of each gel", "mm", lambda of: of.deepest, 1e3)),
+        (bool(series.flow), _draw_lines("longest flow of each gel's markers", "mm", lambda of: of.flow, 1e3)),
         (bool(np.isfinite(series.after_reset().seconds).any()), _draw_timing),
         (bool(signal_against_force(series)), _draw_signal_against_force),
     ]
@@ -280,7 +273,7 @@ def _draw_strip(figure: Figure, place: SubplotSpec, name: str, pictures: Sequenc
             axes.set_ylabel(_literal(name), fontsize=10, color=INK)
 
 
-def save(figure: Figure, path: Path) -> None:
+def save(figure: Figure, path: Path | io.BytesIO) -> None:
     """Writes a figure as PNG. A character of a name that the font lacks is drawn as a box, without a warning."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph .* missing from", UserWarning)

@@ -52,7 +52,7 @@ def summary(series: Series, *, complete: bool = True, dropped: int = 0) -> dict[
         "task": meta.task,
         "policy": meta.policy,
         "seed": meta.seed,
-        "goal": [_number(each) for each in meta.goal] if isinstance(meta.goal, tuple) else _number(meta.goal),
+        "goal": [finite(each) for each in meta.goal] if isinstance(meta.goal, tuple) else finite(meta.goal),
         "started": None if meta.started is None else meta.started.isoformat(timespec="milliseconds"),
         "steps": len(done),
         "step": done.index.tolist(),
@@ -65,7 +65,7 @@ def summary(series: Series, *, complete: bool = True, dropped: int = 0) -> dict[
         "steepest": {name: _numbers(values) for name, values in done.steepest.items()},
         "flow": {name: _numbers(values) for name, values in done.flow.items()},
         "correlation": {name: pair[2] for name, pair in signal_against_force(series).items()},
-        "seconds_per_step": _number(np.median(done.seconds)) if len(done) else None,
+        "seconds_per_step": finite(np.median(done.seconds)) if len(done) else None,
         "seconds": _numbers(done.seconds),
         "settled": None if settled is None else int(np.count_nonzero(np.nan_to_num(settled))),
         "timing": timing(series),
@@ -214,27 +214,33 @@ def _headline(stats: Mapping[str, Any], series: Series) -> list[tuple[str, str]]
     return lines if started is None else [*lines, ("started", f"{started[:10]} {started[11:19]} {started[23:]}")]
 
 
-def _number(value: float | None) -> float | None:
+def finite(value: float | None) -> float | None:
+    """The number for a JSON file: None where it is not known or infinite."""
     return None if value is None or not math.isfinite(value) else float(value)
 
 
 def _numbers(values: FloatArray) -> list[float | None]:
-    return [_number(value) for value in values.tolist()]
+    return [finite(value) for value in values.tolist()]
 
 
-def _inline(content: bytes) -> str:
-    return "data:image/png;base64," + base64.b64encode(content).decode("ascii")
+def data_url(content: bytes, kind: str = "png") -> str:
+    """A picture of this kind, to stand in a page."""
+    return f"data:image/{kind};base64," + base64.b64encode(content).decode("ascii")
+
+
+def render_page(template: Path, **values: Any) -> str:
+    """The HTML page that a Jinja template makes of these values; texts are escaped."""
+    from jinja2 import Environment, StrictUndefined
+
+    page = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    return page.from_string(template.read_text(encoding="utf-8")).render(**values)
 
 
 def _html(series: Series, stats: Mapping[str, Any], strips: Sequence[Strip]) -> str:
-    from jinja2 import Environment, StrictUndefined
-
     from tacsim.report import figure
 
-    template = Environment(
-        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    ).from_string(Path(__file__).with_name("report.html.jinja").read_text(encoding="utf-8"))
-    return template.render(
+    return render_page(
+        Path(__file__).with_name("report.html.jinja"),
         title=_title(stats),
         about=[("rig", stats["rig"]), *_of_task(stats, [("task", stats["task"])]), *_headline(stats, series)],
         results=_results(stats),
@@ -243,9 +249,9 @@ def _html(series: Series, stats: Mapping[str, Any], strips: Sequence[Strip]) -> 
             {
                 "title": strip.title,
                 "note": strip.note,
-                "frames": [(picture.index, _inline(figure.png(picture.image))) for picture in strip.pictures],
+                "frames": [(picture.index, data_url(figure.png(picture.image))) for picture in strip.pictures],
             }
             for strip in strips
         ],
-        plots=_inline(figure.png_of(figure.plots(series))),
+        plots=data_url(figure.png_of(figure.plots(series))),
     )

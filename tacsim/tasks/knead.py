@@ -24,6 +24,10 @@ IN_STEPS = 30.0  # of the teacher: it takes so large a part of the height that i
 THERE = 0.2  # of max_step: so near to where it goes, the scripted policy turns
 AIMS = (1.0, -1.0, 0.0)  # of a stroke: to one side, to the other, to the middle
 GOLDEN_ANGLE = np.pi * (3.0 - 5.0**0.5)  # no two strokes of a ball's go one way
+REMEMBERED = 60  # touches; what was felt before has been kneaded since
+POINTS = 150  # kept of a touch
+CELLS = 1500  # of the box round the shape
+FAINT = 0.05  # of the greatest depth: less is the gel's own slope, or noise
 
 
 @dataclass(frozen=True)
@@ -191,12 +195,6 @@ class KneadTeacher(ScriptedKnead):
     def _closer(self, observation: Observation) -> float:
         left = estimated_height(observation) - self._task.goal[2]
         return min(self._by_force(observation), 0.5 * left / IN_STEPS)
-
-
-REMEMBERED = 60  # touches; what was felt before has been kneaded since
-POINTS = 150  # kept of a touch
-CELLS = 1500  # of the box round the shape
-FAINT = 0.05  # of the greatest depth: less is the gel's own slope, or noise
 
 
 class FeltShape:

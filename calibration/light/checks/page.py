@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-import base64
 from pathlib import Path
 
 import numpy as np
 
 from calibration.light.checks.verdict import KnownScale, Verdict
 from calibration.light.fit import LightFit
+from tacsim.report.report import data_url, render_page
 
 FILE = "verdict.html"
+MAX_PRESSES = 8  # drawn, the worst first
+HALF_SIDE = 2.0  # of what is drawn [contact radii]
 
 
 def write_page(
@@ -18,27 +20,19 @@ def write_page(
 ) -> None:
     """Writes the page of sensor `name`; `residuals`: the picture that is shown in it; `facts`: more of what is known of
     the sensor, in lines. Raises OSError."""
-    from jinja2 import Environment, StrictUndefined
-
     ball = scale.ball_radius / scale.pixel_pitch
     ratios = [press.circle.radius / ball for press in fit.presses]
-    template = Environment(
-        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    ).from_string(Path(__file__).with_name("verdict.html.jinja").read_text(encoding="utf-8"))
-    picture = None if residuals is None else base64.b64encode(residuals.read_bytes()).decode("ascii")
+    picture = None if residuals is None else data_url(residuals.read_bytes())
     means = {
         what: float(np.mean([getattr(press, what) for press in fit.predictions])) if fit.predictions else None
         for what in ("angle", "correlation", "error", "null_error")
     }
-    page = template.render(
-        name=name, fit=fit, scale=scale, verdict=verdict, picture=picture, facts=facts, ratios=ratios, means=means,
+    page = render_page(
+        Path(__file__).with_name("verdict.html.jinja"), name=name, fit=fit, scale=scale, verdict=verdict,
+        picture=picture, facts=facts, ratios=ratios, means=means,
         rows=sorted(fit.predictions, key=lambda press: -press.angle),
     )  # fmt: skip
     path.write_text(page, encoding="utf-8")
-
-
-MAX_PRESSES = 8  # drawn, the worst first
-HALF_SIDE = 2.0  # of what is drawn [contact radii]
 
 
 def draw(fit: LightFit, path: Path) -> None:

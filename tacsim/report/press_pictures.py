@@ -1,4 +1,5 @@
-"""An indenter on the gel, cut through where it is lowest: which side presses. By Pillow, as the height picture."""
+"""The pictures of a press: an indenter cut through where it is lowest, which shows the side that presses, and the map
+of heights. By Pillow and OpenCV, which a press needs anyway: importing matplotlib takes longer than the press."""
 
 from __future__ import annotations
 
@@ -20,6 +21,9 @@ WIDTH, MARGIN, TEXT = 440, 48, 14  # of one section, round it, of a letter [px]
 SUPERSAMPLED = 2  # pixels drawn for one that is shown
 INDENTER, GEL, SURFACE, BACKING = (90, 100, 120), (196, 224, 236), (0, 96, 140), (150, 150, 150)
 TALLEST = 0.8  # widths of a section: what stands higher is cut off
+MAP_WIDTH, MAP_MARGIN, BAR, MAP_TEXT = 800, 60, 20, 16  # of the whole, round the map, of the scale, of a letter [px]
+TICKS = 5
+TITLE = "height into the gel [mm]; contact outlined"
 
 
 def write_side_picture(
@@ -94,3 +98,40 @@ def _surface(axis: int, lowest: FloatArray, height: NDArray[np.float32], grid: P
     along = grid.x if axis == 0 else grid.y
     values = height[across] if axis == 0 else height[:, across]
     return [(float(place), -float(value)) for place, value in zip(along, values, strict=True) if np.isfinite(value)]
+
+
+def write_height_picture(path: Path, height: NDArray[np.float32], contact: NDArray[np.bool_], pitch: float) -> None:
+    """A PNG of `height` (H, W) [m], with the border of `contact` (H, W); `pitch`: of its pixels [m]. Raises OSError."""
+    import cv2
+    from PIL import Image as images
+    from PIL import ImageDraw, ImageFont
+
+    rows, columns = height.shape
+    wide = MAP_WIDTH - 3 * MAP_MARGIN - BAR
+    high = round(wide * rows / columns)
+    low, top = float(height.min()), float(height.max())
+    levels = np.rint((height - low) * (255 / max(top - low, 1e-12))).astype(np.uint8)
+    large = cv2.resize(levels, (wide, high), interpolation=cv2.INTER_LINEAR)
+    scale = np.repeat(np.linspace(255, 0, high).astype(np.uint8)[:, None], BAR, axis=1)
+    colours, bar = (cv2.applyColorMap(each, cv2.COLORMAP_VIRIDIS)[..., ::-1] for each in (large, scale))
+    colours = np.ascontiguousarray(colours)
+    touching = cv2.resize(contact.astype(np.uint8), (wide, high), interpolation=cv2.INTER_NEAREST)
+    borders, _ = cv2.findContours(touching, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    if not contact.all():
+        cv2.drawContours(colours, borders, -1, (255, 255, 255), 1, cv2.LINE_AA)
+
+    picture = images.new("RGB", (MAP_WIDTH, high + 2 * MAP_MARGIN), "white")
+    picture.paste(images.fromarray(colours), (MAP_MARGIN, MAP_MARGIN))
+    left = MAP_MARGIN + wide + MAP_MARGIN // 2
+    picture.paste(images.fromarray(np.ascontiguousarray(bar)), (left, MAP_MARGIN))
+    pen = ImageDraw.Draw(picture, "RGB")
+    pen.font = ImageFont.load_default(MAP_TEXT)
+    pen.text((MAP_MARGIN + wide / 2, MAP_MARGIN / 2), TITLE, "black", anchor="mm")
+    half = columns * pitch * 5e2, rows * pitch * 5e2  # [mm]
+    for share in np.linspace(0.0, 1.0, TICKS):
+        x, y = MAP_MARGIN + share * wide, MAP_MARGIN + share * high
+        pen.text((x, MAP_MARGIN + high + MAP_MARGIN / 4), f"{(2 * share - 1) * half[0]:.3g}", "black", anchor="mm")
+        pen.text((MAP_MARGIN - 8, y), f"{(2 * share - 1) * half[1]:.3g}", "black", anchor="rm")
+        pen.text((left + BAR + 8, y), f"{(top - share * (top - low)) * 1e3:.3f}", "black", anchor="lm")
+    pen.text((MAP_MARGIN + wide / 2, 1.65 * MAP_MARGIN + high), "x [mm]; y downwards", "black", anchor="mm")
+    picture.save(path, compress_level=4)

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations
 
 import numpy as np
+from numpy.linalg import inv
 from scipy.spatial.transform import Rotation
 
 from calibration.poses.ball_touch import deviation
-from calibration.poses.robust_fit import BadMeasurements, RobustFit, angular_spread, inverse, perturbed, robust_fit
+from calibration.poses.robust_fit import BadMeasurements, RobustFit, angular_spread, perturbed, robust_fit
 from tacsim import pose as se3
 from tacsim.interface import FloatArray, Pose
 
@@ -77,11 +77,12 @@ def fit_hand_eye(poses: Sequence[BoardPose], *, fixed: bool = False, noise: Hand
             f"the flange turns too little: one direction turns by only {np.degrees(spread):.1f} degrees, "
             f"{np.degrees(MIN_SPREAD):.0f} are needed. Turn it about all axes, 30 degrees and more"
         )
-    arm = inverse(flange) if fixed else flange  # arm_i camera board_i = mount, always the same
+    # arm_i camera board_i = mount, always the same
+    arm = np.asarray(inv(flange) if fixed else flange, dtype=np.float64)
     camera, mount = _start(arm, board)
     for _ in range(1 + REWEIGHTINGS):
         camera, mount, fit = _solved(arm, board, camera, mount, noise, fixed=fixed)
-    predicted = inverse(camera) @ inverse(arm) @ mount
+    predicted = inv(camera) @ inv(arm) @ mount
     turn = Rotation.from_matrix(predicted[:, :3, :3] @ np.swapaxes(board[:, :3, :3], 1, 2)).magnitude()
     missed = np.linalg.norm(predicted[:, :3, 3] - board[:, :3, 3], axis=1)
     return HandEyeFit(
@@ -98,12 +99,12 @@ def fit_hand_eye(poses: Sequence[BoardPose], *, fixed: bool = False, noise: Hand
 def _solved(
     arm: FloatArray, board: FloatArray, camera: FloatArray, mount: FloatArray, noise: HandEyeNoise, *, fixed: bool
 ) -> tuple[FloatArray, FloatArray, RobustFit]:
-    back = inverse(arm)
+    back = inv(arm)
     seen_turn = np.swapaxes(board[:, :3, :3], 1, 2)
     whiten = _whitening(camera, mount, arm, noise, fixed=fixed)
 
     def residuals(change: FloatArray) -> FloatArray:
-        predicted = inverse(perturbed(camera, change[:6])) @ back @ perturbed(mount, change[6:])
+        predicted = inv(perturbed(camera, change[:6])) @ back @ perturbed(mount, change[6:])
         turn = Rotation.from_matrix(predicted[:, :3, :3] @ seen_turn).as_rotvec()
         missed = np.concatenate([predicted[:, :3, 3] - board[:, :3, 3], turn], axis=1)
         whitened: FloatArray = np.einsum("nij,nj->ni", whiten, missed)
@@ -122,8 +123,8 @@ def _whitening(
     camera) and `after` (the board in the flange): it turns the board, and shifts it by turn x lever.
     """
     count = len(arm)
-    before = inverse(camera) @ inverse(arm) if fixed else np.broadcast_to(inverse(camera), (count, 4, 4))
-    after = np.broadcast_to(mount, (count, 4, 4)) if fixed else inverse(arm) @ mount
+    before = inv(camera) @ inv(arm) if fixed else np.broadcast_to(inv(camera), (count, 4, 4))
+    after = np.broadcast_to(mount, (count, 4, 4)) if fixed else inv(arm) @ mount
     lever, turn = after[:, :3, 3], before[:, :3, :3]
     effect = np.zeros((count, 6, 6))
     effect[:, :3, :3] = effect[:, 3:, 3:] = turn
@@ -131,15 +132,12 @@ def _whitening(
     robot = np.diag([noise.robot**2] * 3 + [noise.robot_turn**2] * 3)
     seen = np.diag([noise.board**2] * 3 + [noise.board_turn**2] * 3)
     covariance = seen + effect @ robot @ np.swapaxes(effect, 1, 2)
-    return np.linalg.inv(np.linalg.cholesky(covariance))
+    return inv(np.linalg.cholesky(covariance))
 
 
 def _cross(vectors: FloatArray) -> FloatArray:
     """(n, 3, 3) matrices C with C w = v x w."""
-    matrix = np.zeros((len(vectors), 3, 3))
-    x, y, z = vectors.T
-    matrix[:, 0, 1], matrix[:, 0, 2], matrix[:, 1, 2] = -z, y, -x
-    return matrix - np.swapaxes(matrix, 1, 2)
+    return np.swapaxes(np.cross(vectors[:, None], np.eye(3)), 1, 2)
 
 
 def _start(arm: FloatArray, board: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -152,7 +150,7 @@ def _start(arm: FloatArray, board: FloatArray) -> tuple[FloatArray, FloatArray]:
     for some in chosen:
         if angular_spread(arm[some, :3, :3]) < MIN_SPREAD / 2:
             continue
-        camera = closed_form(arm[some], board[some])
+        camera = _closed_form(arm[some], board[some])
         mounts = arm @ camera @ board
         between = np.linalg.norm(mounts[:, None, :3, 3] - mounts[None, :, :3, 3], axis=-1)
         between += np.linalg.norm(mounts[:, None, :3, 0] - mounts[None, :, :3, 0], axis=-1)
@@ -162,17 +160,14 @@ def _start(arm: FloatArray, board: FloatArray) -> tuple[FloatArray, FloatArray]:
     return camera, mount
 
 
-def closed_form(arm: FloatArray, board: FloatArray) -> FloatArray:
-    """(4, 4) the X for which arm_i X board_i (each (n, 4, 4)) is most nearly the same for all i (Park and Martin 1994):
-    rotation first (Procrustes over all pairs), then the shift."""
-    pairs = list(combinations(range(len(arm)), 2))
-    a = np.stack([inverse(arm[j]) @ arm[i] for i, j in pairs])
-    b = np.stack([board[j] @ inverse(board[i]) for i, j in pairs])
-    axes_a, axes_b = (Rotation.from_matrix(each[:, :3, :3]).as_rotvec() for each in (a, b))
-    u, _, vt = np.linalg.svd(axes_a.T @ axes_b)
+def _closed_form(arm: FloatArray, board: FloatArray) -> FloatArray:
+    """(4, 4) the X for which arm_i X board_i (each (n, 4, 4)) varies least over all i (Park and Martin 1994)."""
+    import cv2
+
     found = np.eye(4)
-    found[:3, :3] = turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-    matrix = (np.eye(3) - a[:, :3, :3]).reshape(-1, 3)
-    known = (a[:, :3, 3] - b[:, :3, 3] @ turn.T).reshape(-1)
-    found[:3, 3] = np.linalg.lstsq(matrix, known, rcond=None)[0]
+    turn, shift = cv2.calibrateHandEye(
+        list(arm[:, :3, :3]), list(arm[:, :3, 3]), list(board[:, :3, :3]), list(board[:, :3, 3]),
+        method=cv2.CALIB_HAND_EYE_PARK,
+    )  # fmt: skip
+    found[:3, :3], found[:3, 3] = turn, np.ravel(shift)
     return found

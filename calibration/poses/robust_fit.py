@@ -69,12 +69,12 @@ def robust_fit(residuals: Residuals, starts: Sequence[FloatArray], what: str) ->
                 f"{int((~keep).sum())} of {len(keep)} {what} disagree with the others: is what should be fixed "
                 "really fixed, do the poses belong to the pictures, and are lengths in metres?"
             )
-        found, before = _plain(residuals, found, keep).x, used
-        used = keep
+        fit, before = _plain(residuals, found, keep), used
+        found, used = fit.x, keep
         if (used == before).all():
             break
     everything = residuals(found)
-    jacobian = np.asarray(_plain(residuals, found, used).jac, dtype=np.float64)
+    jacobian = np.asarray(fit.jac, dtype=np.float64)
     information: FloatArray = jacobian.T @ jacobian
     scale = np.sqrt(np.maximum(np.diag(information), 1e-300))  # so that the rank does not depend on units
     if np.linalg.matrix_rank(information / np.outer(scale, scale), tol=1e-10) < len(found):
@@ -123,13 +123,3 @@ def perturbed(pose: FloatArray, change: FloatArray) -> FloatArray:
     result[:3, :3] = Rotation.from_rotvec(change[3:6]).as_matrix() @ pose[:3, :3]
     result[:3, 3] += change[:3]
     return result
-
-
-def inverse(frames: FloatArray) -> FloatArray:
-    """Inverses of rigid transforms (..., 4, 4)."""
-    back = np.zeros_like(frames)
-    turn = np.swapaxes(frames[..., :3, :3], -1, -2)
-    back[..., :3, :3] = turn
-    back[..., :3, 3] = -np.einsum("...ij,...j->...i", turn, frames[..., :3, 3])
-    back[..., 3, 3] = 1.0
-    return back

@@ -14,7 +14,7 @@ from robot.collect.presses import PressSet
 from robot.collect.table import WORDS, features
 from robot.studies.press import UNFELT
 from tacsim.models.scene import Mesh, Shape
-from tacsim.models.text import printable
+from tacsim.models.text import millimetres, printable
 
 QUANTITIES = {"depth": (1e3, "mm"), "normal_force": (1.0, "N"), "shear": (1e3, "mm"), "shear_force": (1.0, "N"),
               "contact_area": (1e6, "mm²")}  # fmt: skip
@@ -146,12 +146,10 @@ def _object(geometry: Shape) -> str:
     if isinstance(geometry, Mesh):
         return f"`{_cell(geometry.path)}`, {geometry.scale:g} m per unit"
     sizes = geometry.model_dump(mode="json")
-    return ", ".join([sizes.pop("shape"), *(f"{key} {_millimetres(value)}" for key, value in sizes.items())])
-
-
-def _millimetres(value: Any) -> str:
-    each = value if isinstance(value, list | tuple) else [value]
-    return f"{' x '.join(f'{1e3 * side:g}' for side in each)} mm"
+    shape = sizes.pop("shape")
+    return ", ".join(
+        [shape, *(f"{key} {millimetres(*np.atleast_1d(side), digits='g')}" for key, side in sizes.items())]
+    )
 
 
 def _range(between: tuple[float, float], scale: float, unit: str) -> str:

@@ -12,6 +12,7 @@ from tacsim.models.hardware import CameraSensorConfig
 from tacsim.models.rig import RigConfig, SimSensorConfig
 from tacsim.models.scene import Scene
 from tacsim.models.sensor import SensorModel
+from tacsim.models.text import millimetres
 
 
 def with_gels_of_sensors(
@@ -53,13 +54,13 @@ def fit_gel(
     notes = [f"sensor {name}: {model.name}: {model.caution}" for name, model in models.items() if model.caution]
     sizes = {name: model.gel_size for name, model in models.items() if model.gel_size is not None}
     said = {
-        name: f"{_millimetres(size)} by the calibration of {models[name].name} (sensor {name})"
+        name: f"{millimetres(*size)} by the calibration of {models[name].name} (sensor {name})"
         for name, size in sizes.items()
     }
     fixed = _sensors_given(scene, models, given)
     kept = {name: words for name, words in said.items() if name in fixed}
-    for size in dict.fromkeys(_millimetres(scene.gel_of(name).size) for name in kept):
-        of = [words for name, words in kept.items() if _millimetres(scene.gel_of(name).size) == size]
+    for size in dict.fromkeys(millimetres(*scene.gel_of(name).size[:2]) for name in kept):
+        of = [words for name, words in kept.items() if millimetres(*scene.gel_of(name).size[:2]) == size]
         notes.insert(0, f"gel {size}, as said on the command line; {'; '.join(of)}")
     wanted = {name: _whole_elements(size, scene.gel_element(name)) for name, size in sizes.items() if name not in fixed}
     if not wanted:
@@ -72,9 +73,7 @@ def fit_gel(
         x, y = wanted[name]
         thickness, element = scene.gel_of(name).size[2], scene.gel_element(name)
         scene = _with_size(scene, "gel" if shared else f"gels.{name}", (x, y, thickness), shown)
-        words = (
-            f"gel {_millimetres((x, y))} in whole elements of {element * 1e3:.3g} mm, {thickness * 1e3:.3g} mm thick"
-        )
+        words = f"gel {millimetres(x, y)} in whole elements of {element * 1e3:.3g} mm, {thickness * 1e3:.3g} mm thick"
         notes.insert(0, f"{words}: {shown}; the thickness is the scene's")
     return scene, notes
 
@@ -113,7 +112,3 @@ def _sensors_given(scene: Scene, names: Iterable[str], given: Collection[str]) -
     """Those of the sensors `names` whose gels have a size that was given."""
     own = {name for name, each in scene.gels.items() if each.size is not None}
     return frozenset(name for name in names if name in given or ("gel" in given and name not in own))
-
-
-def _millimetres(size: tuple[float, ...]) -> str:
-    return f"{size[0] * 1e3:.4g} x {size[1] * 1e3:.4g} mm"

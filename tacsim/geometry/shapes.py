@@ -22,6 +22,7 @@ from tacsim.geometry.mesh import (
 )
 from tacsim.interface import FloatArray, Pose
 from tacsim.models.scene import Box, Cylinder, Indenter, Mesh, Shape, Sphere
+from tacsim.models.text import millimetres
 from tacsim.pose import inverse, matrix, rotate
 
 if TYPE_CHECKING:
@@ -161,7 +162,8 @@ def particles(geometry: Shape, spacing: float) -> FloatArray:
     if estimate > MAX_PARTICLES or lattice > MAX_NODES:
         raise ValueError(
             f"{_name(geometry)} would need {estimate:,.0f} particles (on a lattice of {lattice:,.0f}) at a "
-            f"spacing of {_mm(spacing)}; the limit is {MAX_PARTICLES:,}: use a larger spacing or a smaller shape"
+            f"spacing of {millimetres(spacing)}; the limit is {MAX_PARTICLES:,}: use a larger spacing or a smaller "
+            "shape"
         )
     layers = _check_layers(geometry, size, spacing)
     axes = tuple((np.arange(n) - (n - 1) / 2) * spacing for n in layers)
@@ -177,14 +179,16 @@ def particles(geometry: Shape, spacing: float) -> FloatArray:
     misfit = len(found) / estimate - 1
     if isinstance(geometry, Mesh) and abs(misfit) > MAX_MISFIT:
         raise ValueError(
-            f"{_name(geometry)}: particles at a spacing of {_mm(spacing)} miss its volume by {misfit:+.0%} (limit "
-            f"{MAX_MISFIT:.0%}); parts are thinner than the spacing: use a smaller one"
+            f"{_name(geometry)}: particles at a spacing of {millimetres(spacing)} miss its volume by {misfit:+.0%} "
+            f"(limit {MAX_MISFIT:.0%}); parts are thinner than the spacing: use a smaller one"
         )
     return found
 
 
 def no_particle(geometry: Shape, spacing: float) -> ValueError:
-    return ValueError(f"{_name(geometry)} holds no particle at a spacing of {_mm(spacing)}; use a smaller spacing")
+    return ValueError(
+        f"{_name(geometry)} holds no particle at a spacing of {millimetres(spacing)}; use a smaller spacing"
+    )
 
 
 def _check_layers(geometry: Shape, size: FloatArray, spacing: float) -> NDArray[np.int_]:
@@ -193,8 +197,8 @@ def _check_layers(geometry: Shape, size: FloatArray, spacing: float) -> NDArray[
     if layers.min() < FEWEST_LAYERS:
         axis = int(np.argmin(size))
         found = (
-            f"only {_mm(size[axis])} along {'xyz'[axis]}, {size[axis] / spacing:.2g} layers of particles "
-            f"{_mm(spacing)} apart; a body needs {FEWEST_LAYERS}"
+            f"only {millimetres(size[axis])} along {'xyz'[axis]}, {size[axis] / spacing:.2g} layers of particles "
+            f"{millimetres(spacing)} apart; a body needs {FEWEST_LAYERS}"
         )
     else:
         misfit = layers * spacing / size - 1
@@ -202,14 +206,15 @@ def _check_layers(geometry: Shape, size: FloatArray, spacing: float) -> NDArray[
         if abs(misfit[axis]) <= MAX_MISFIT + 1e-9:
             return layers
         found = (
-            f"{_mm(size[axis])} along {'xyz'[axis]}, but {layers[axis]} layers of particles {_mm(spacing)} apart make "
-            f"{_mm(layers[axis] * spacing)} ({misfit[axis]:+.0%}, limit {MAX_MISFIT:.0%})"
+            f"{millimetres(size[axis])} along {'xyz'[axis]}, but {layers[axis]} layers of particles "
+            f"{millimetres(spacing)} apart make {millimetres(layers[axis] * spacing)} ({misfit[axis]:+.0%}, "
+            f"limit {MAX_MISFIT:.0%})"
         )
     fits = fitting_spacing(size, spacing)
-    finer = f"a particle_spacing of {_mm(fits)}, or " if volume(geometry) / fits**3 <= MAX_PARTICLES else ""
+    finer = f"a particle_spacing of {millimetres(fits)}, or " if volume(geometry) / fits**3 <= MAX_PARTICLES else ""
     raise ValueError(
         f"{_name(geometry)} is {found}: choose {finer}a size that along each axis is a whole number of times "
-        f"{_mm(spacing)}, at least {FEWEST_LAYERS}"
+        f"{millimetres(spacing)}, at least {FEWEST_LAYERS}"
     )
 
 
@@ -295,7 +300,3 @@ def _sharp(geometry: Mesh, content: str) -> FloatArray:
 
 def _name(geometry: Shape) -> str:
     return f"mesh {geometry.path}" if isinstance(geometry, Mesh) else geometry.shape
-
-
-def _mm(length: float) -> str:
-    return f"{length * 1e3:.4g} mm"

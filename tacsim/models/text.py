@@ -29,3 +29,8 @@ def printable(text: str, limit: int = 600) -> str:
     if len(text) <= limit:
         return text
     return f"{text[: limit // 2]} ... {text[-limit // 2 :]}"
+
+
+def millimetres(*lengths: float, digits: str = ".4g") -> str:
+    """Lengths [m] for a message: "4 x 3.5 mm"."""
+    return " x ".join(f"{1e3 * length:{digits}}" for length in lengths) + " mm"

@@ -101,23 +101,19 @@ def space_of(flat: Flat) -> spaces.Space[Flat]:
 def space_of_rig(config: RigConfig) -> spaces.Space[Flat]:
     """The same of a simulated rig that is described, but need not be opened."""
     grid = config.canonical
+    touches: dict[str, TactileObservation] = {}
     cells, pixels = (grid.rows, grid.columns), (grid.rows * grid.image_scale, grid.columns * grid.image_scale, 3)
-    flat: Flat = {}
+    height, contact = np.zeros(cells, np.float32), np.zeros(cells, np.bool_)
     for name, sensor in config.sensors.items():
         assert isinstance(sensor, SimSensorConfig)
-        flat[f"tactile_{name}"] = np.zeros(pixels, np.uint8)
-        flat |= {f"{key}_{name}": np.zeros(cells, np.int8) for key in ("contact", "valid")}
-        flat[f"height_{name}"], flat[f"gradient_{name}"] = (
-            np.zeros(cells, np.float32),
-            np.zeros((*cells, 2), np.float32),
-        )
-        markers = sensor.model.markers
-        if markers is not None:
-            flat[f"flow_{name}"] = np.zeros((markers.rows, markers.columns, 2), np.float32)
-    for name in config.arms:
-        numbers = {"pose": 9, "twist": 6, "wrench": 6}
-        flat |= {f"{key}_{name}": np.zeros(count, np.float32) for key, count in numbers.items()}
-    return space_of(flat)
+        dots = sensor.model.markers
+        touches[name] = TactileObservation(
+            np.zeros(pixels, np.uint8), gradient=np.zeros((*cells, 2), np.float32), height=height, contact=contact,
+            valid=contact, flow=None if dots is None else np.zeros((dots.rows, dots.columns, 2), np.float32),
+            time=0.0, age=0.0,
+        )  # fmt: skip
+    arms = dict.fromkeys(config.arms, ArmState(Pose(), np.zeros(6), np.zeros(6), None, 0.0))
+    return space_of(flatten(Observation(touches, arms, 0.0), dict.fromkeys(config.arms, Pose())))
 
 
 def space_of_features(encoder: FeatureEncoder, config: RigConfig) -> spaces.Space[Flat]:

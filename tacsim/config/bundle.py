@@ -12,7 +12,7 @@ import stat
 from pathlib import Path
 from typing import Any
 
-from tacsim.config.document import LoadState, Node, from_plain, parse_text, shown
+from tacsim.config.document import LoadState, Node, from_plain, parse_text, plain, shown
 from tacsim.config.errors import Place, did_you_mean
 
 FILE, REFERENCE = "calibration.yaml", "reference.png"
@@ -79,7 +79,7 @@ def read_files(path: Path) -> tuple[Path, dict[str, Any], bytes]:
         raise NoBundle(f"{file}: cannot be read: {failure}") from failure
     state = LoadState()
     root = parse_text(text, shown(file), file.parent, state)
-    content = _plain(root)
+    content = plain(root)
     version = content.get("format") if isinstance(content, dict) else None
     if version is not None and version != FORMAT:
         raise NoBundle(f"{file} has format {version}, this version of tacsim reads {FORMAT}; {AGAIN}")
@@ -132,15 +132,6 @@ def sensor_node(path: Path) -> Node:
 def _distrusts(warning: object) -> bool:
     """A warning in a bundle is the verdict that it is not to be trusted."""
     return isinstance(warning, str) and warning.startswith("verdict: do not trust")
-
-
-def _plain(node: Node) -> Any:
-    """The tree as it was written: 1.0 stays a float."""
-    if isinstance(node.value, dict):
-        return {key: _plain(child) for key, child in node.value.items()}
-    if isinstance(node.value, list):
-        return [_plain(child) for child in node.value]
-    return node.value
 
 
 def _beside(path: Path) -> str:

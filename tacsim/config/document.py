@@ -275,16 +275,17 @@ def _scalar(tag: str, text: str) -> tuple[bool | int | float | str | None, str]:
 
 def as_json(node: Node) -> str:
     """The tree as JSON. Whole floats become integers, so that ``1e5`` is a valid count."""
-    return json.dumps(_plain(node))
+    return json.dumps(plain(node, integers=True))
 
 
-def _plain(node: Node) -> Any:
+def plain(node: Node, *, integers: bool = False) -> Any:
+    """The tree as plain data, as it was written; with `integers`, whole floats become integers."""
     value = node.value
     if isinstance(value, dict):
-        return {key: _plain(child) for key, child in value.items()}
+        return {key: plain(child, integers=integers) for key, child in value.items()}
     if isinstance(value, list):
-        return [_plain(child) for child in value]
-    if isinstance(value, float) and value.is_integer() and abs(value) < 2**53:
+        return [plain(child, integers=integers) for child in value]
+    if integers and isinstance(value, float) and value.is_integer() and abs(value) < 2**53:
         return int(value)
     return value
 

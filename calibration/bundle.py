@@ -10,9 +10,7 @@ import hashlib
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
-import numpy as np
 import yaml
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from calibration.errors import CalibrationError
@@ -29,6 +27,7 @@ from tacsim.config.bundle import (
     read_files,
     require_unchanged,
 )
+from tacsim.interface import Image
 from tacsim.models.geometry import PictureRegion
 from tacsim.models.hardware import Placement
 from tacsim.models.photometric import DarknessModel, PhotometricModel
@@ -114,7 +113,7 @@ class Calibration(Config):
         return digest(self.model_dump(mode="json"))
 
 
-def write_bundle(folder: Path, calibration: Calibration, reference: NDArray[np.uint8]) -> Path:
+def write_bundle(folder: Path, calibration: Calibration, reference: Image) -> Path:
     """Writes the bundle into `folder`, which exists, and returns the path of its YAML file; the two checksums are set
     here. `reference`: (H, W, 3) RGB without contact. Raises OSError."""
     png = encode_png(reference)
@@ -127,7 +126,7 @@ def write_bundle(folder: Path, calibration: Calibration, reference: NDArray[np.u
     return path
 
 
-def read_bundle(path: Path, serial: str | None = None) -> tuple[Calibration, NDArray[np.uint8]]:
+def read_bundle(path: Path, serial: str | None = None) -> tuple[Calibration, Image]:
     """The calibration at `path` (its folder or YAML file, or its name if it lies in `sensors/`) and its picture without
     contact; `serial` is the sensor that it must belong to. Raises BadBundle."""
     try:

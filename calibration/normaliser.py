@@ -6,7 +6,6 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.bundle import BadBundle, Calibration, read_bundle
 from calibration.errors import BadFrames
@@ -24,6 +23,7 @@ from calibration.lens.rectification import (
     seen_box,
 )
 from calibration.markers.flow import NoMarkers, marker_flow, seen_by_dots
+from tacsim.interface import Image
 from tacsim.models.geometry import PictureRegion
 from tacsim.models.hardware import CameraSensorConfig
 from tacsim.models.rig import ReplaySensorConfig
@@ -68,7 +68,7 @@ def _of_model(model: SensorModel, gel_size: tuple[float, float], grid: PixelGrid
 
 
 def normaliser_for_calibration(
-    calibration: Calibration, grid: CanonicalGrid, untouched: NDArray[np.uint8] | None = None
+    calibration: Calibration, grid: CanonicalGrid, untouched: Image | None = None
 ) -> FrameNormaliser:
     """The normaliser of a sensor that was calibrated: geometry and inverse of its light are those of its bundle.
     untouched: the bundle's (metric) picture, against which the order of colours of each reference is checked."""
@@ -104,7 +104,7 @@ def normaliser_for_recording(
     config: ReplaySensorConfig,
     image_shape: tuple[int, int],
     grid: CanonicalGrid,
-    untouched: NDArray[np.uint8] | None = None,
+    untouched: Image | None = None,
 ) -> FrameNormaliser:
     """The normaliser of recorded frames of `image_shape` (rows, columns): by the sensor's calibration, by the dots that
     are seen in its picture without contact (`untouched`) and their distance, or through the four corners of the gel.
@@ -120,7 +120,7 @@ def normaliser_for_recording(
 
 
 def normaliser_for_dots(
-    pitch: float, untouched: NDArray[np.uint8], grid: CanonicalGrid, region: PictureRegion | None = None
+    pitch: float, untouched: Image, grid: CanonicalGrid, region: PictureRegion | None = None
 ) -> FrameNormaliser:
     """The normaliser of a sensor of which nothing is known but the distance of its printed dots, `pitch` [m], and its
     picture without contact: flow, no height. The camera looks straight on. Raises BadFrames where no dots are seen."""

@@ -11,9 +11,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tacsim.interface import Float32
+from tacsim.interface import Float32, Mask
 
 SATURATED = 250.0  # a channel at or above this has lost its signal [grey levels]
 MAX_SATURATED_SHARE = 0.05  # of the gel; ten real sensors show 0 to 0.001
@@ -46,7 +45,7 @@ class Reference:
     image: Float32  # (H, W, 3) rectified, 0..255
     mean: Float32  # (3,) over the gel
     relative: Float32  # (H, W, 3) I0 / mean(I0) [-]
-    valid: NDArray[np.bool_]  # (H, W)
+    valid: Mask  # (H, W)
     scale: Float32  # (H, W, 3) 1 / mean where valid, else 0
 
     def difference(self, image: Float32) -> Float32:
@@ -63,8 +62,8 @@ class Reference:
 
 def make_reference(
     image: Float32,
-    valid: NDArray[np.bool_],
-    measured: NDArray[np.bool_] | None = None,
+    valid: Mask,
+    measured: Mask | None = None,
     *,
     colour: bool = True,
 ) -> Reference:
@@ -101,7 +100,7 @@ def make_reference(
     return Reference(image.astype(np.float32), mean, image / mean, valid, scale)
 
 
-def exchanged(image: Float32, known: Float32, valid: NDArray[np.bool_]) -> bool:
+def exchanged(image: Float32, known: Float32, valid: Mask) -> bool:
     """True when an image (H, W, 3) is like the `known` one of the same gel only with red and blue exchanged.
 
     What counts is where on the gel each colour is bright, not the lamps' gain or the white balance. False where all
@@ -113,7 +112,7 @@ def exchanged(image: Float32, known: Float32, valid: NDArray[np.bool_]) -> bool:
     return apart > ALIKE and exchanged_apart < EXCHANGED_RATIO * apart
 
 
-def channels_swapped(image: Float32, known: Float32, valid: NDArray[np.bool_]) -> bool:
+def channels_swapped(image: Float32, known: Float32, valid: Mask) -> bool:
     """True when most of a picture (H, W, 3), which may show a contact, is the `known` one of the same gel with red and
     blue swapped, and is not as near to it with another gain of each channel (exposure, white balance). False where all
     colours are equally even: such a swap looks like a change of the white balance."""
@@ -128,7 +127,7 @@ def channels_swapped(image: Float32, known: Float32, valid: NDArray[np.bool_]) -
     return apart > MIN_SWAPPED_CHANGE and swapped < EXCHANGED_RATIO * apart
 
 
-def _blocks(image: Float32, valid: NDArray[np.bool_]) -> Float32:
+def _blocks(image: Float32, valid: Mask) -> Float32:
     """(n, 3) mean level of each block that lies on the gel."""
     import cv2
 
@@ -137,7 +136,7 @@ def _blocks(image: Float32, valid: NDArray[np.bool_]) -> Float32:
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.float32)[whole]
 
 
-def _pattern(image: Float32, valid: NDArray[np.bool_]) -> Float32:
+def _pattern(image: Float32, valid: Mask) -> Float32:
     """(n, 3) brightness of each block of the gel in each colour, relative to the mean."""
     parts = _blocks(image, valid)
     return np.asarray(parts / parts.mean(axis=0) - 1.0, dtype=np.float32)

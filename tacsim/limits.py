@@ -11,9 +11,9 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from tacsim.interface import Action, FloatArray, Pose
+from tacsim.interface import Action, FloatArray, Mask, Pose
 
 FARTHEST = 1e3  # from the origin: no sensor is sent beyond [m]
 ROUNDING = 1e-9  # of positions: this far outside still counts as inside [m]
@@ -66,7 +66,7 @@ def limit_step(target: Pose, now: Pose, max_step: float, max_turn: float) -> Pos
     return se3.interpolate(now, target, 1.0 / excess)
 
 
-def finite_targets(targets: ArrayLike) -> NDArray[np.bool_]:
+def finite_targets(targets: ArrayLike) -> Mask:
     """(...,) which of `targets` (..., 7), position [m] and quaternion x y z w, are poses: finite, the position within
     FARTHEST, the quaternion of unit length within 1e-3. All False for any other shape."""
     try:
@@ -78,7 +78,7 @@ def finite_targets(targets: ArrayLike) -> NDArray[np.bool_]:
     with np.errstate(over="ignore", invalid="ignore"):
         near = (np.abs(given[..., :3]) <= FARTHEST).all(-1)
         unit = np.abs(np.sqrt((given[..., 3:] ** 2).sum(-1)) - 1.0) <= 1e-3
-    valid: NDArray[np.bool_] = near & unit & np.isfinite(given).all(-1)
+    valid: Mask = near & unit & np.isfinite(given).all(-1)
     return valid
 
 

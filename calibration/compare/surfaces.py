@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.bundle import Calibration
 from calibration.errors import BadFrames
@@ -15,7 +14,7 @@ from calibration.frame_set import Frame, FrameSet
 from calibration.markers.flow import MarkersLost
 from calibration.normaliser import normaliser_for_calibration
 from calibration.reference import StaleReference, UnusableReference
-from tacsim.interface import Float32, TactileFrame
+from tacsim.interface import Float32, FloatArray, Mask, TactileFrame
 from tacsim.models.sensor import CanonicalGrid
 
 GRID = CanonicalGrid()  # on which surfaces are compared
@@ -28,9 +27,9 @@ class SurfaceEstimate:
     height: Float32  # (h, w) into the gel [m]
     gradient: Float32  # (h, w, 2) [-]
     flow: Float32 | None  # (m, n, 2) at the markers [m]
-    valid: NDArray[np.bool_]  # (h, w)
+    valid: Mask  # (h, w)
 
-    def moved(self, shift: NDArray[np.float64]) -> SurfaceEstimate:
+    def moved(self, shift: FloatArray) -> SurfaceEstimate:
         """The surface seen from `shift` (x, y) [cells] farther on. Its flow stays that of the same markers."""
         import cv2
 

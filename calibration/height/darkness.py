@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tacsim.interface import Float32
+from tacsim.interface import Float32, Mask
 from tacsim.models.photometric import DarknessModel
 
 SMOOTHING = 1.0  # standard deviation of the Gaussian that takes off noise [px]
@@ -24,7 +23,7 @@ class DarknessSlopes:
         self._depths = np.array(model.depths) / pitch
         self._darkness = -np.array(model.changes).mean(axis=1)
 
-    def depth(self, change: Float32) -> tuple[Float32, NDArray[np.bool_]]:
+    def depth(self, change: Float32) -> tuple[Float32, Mask]:
         """(H, W) depth of relative changes (H, W, 3), and where they lie beyond the table."""
         from scipy.fft import dctn, idctn
 
@@ -33,7 +32,7 @@ class DarknessSlopes:
         depth: Float32 = idctn(dctn(own, norm="ortho") * self._filter, norm="ortho")
         return depth, np.asarray((darkness < self._darkness[0]) | (darkness > self._darkness[-1]))
 
-    def __call__(self, change: Float32) -> tuple[Float32, NDArray[np.bool_]]:
+    def __call__(self, change: Float32) -> tuple[Float32, Mask]:
         """Slopes (H, W, 2) of relative changes (H, W, 3), and where these lie beyond the table."""
         depth, beyond = self.depth(change)
         by_y, by_x = np.gradient(depth)

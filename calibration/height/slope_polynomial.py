@@ -11,10 +11,9 @@ from collections.abc import Sequence
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
-from tacsim.interface import Float32, FloatArray
+from tacsim.interface import Float32, FloatArray, Mask
 from tacsim.models.quantity import Config
 
 DEGREE = 3
@@ -49,7 +48,7 @@ class PolynomialSlopes:
                 maps[colour][axis] += (weight[axis] * COLOUR_SCALE ** len(colour)) * places[place]
         self._maps = {powers: grid.astype(np.float32) for powers, grid in maps.items()}
 
-    def __call__(self, change: Float32) -> tuple[Float32, NDArray[np.bool_]]:
+    def __call__(self, change: Float32) -> tuple[Float32, Mask]:
         """Slopes (H, W, 2) of relative changes (H, W, 3); where they are steeper than calibrated they are clipped."""
         colours = [np.ascontiguousarray(change[..., channel]) for channel in range(3)]
         products: dict[tuple[int, ...], Float32] = {}

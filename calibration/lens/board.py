@@ -11,10 +11,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.errors import CalibrationError
-from tacsim.interface import FloatArray
+from tacsim.interface import FloatArray, Image
 from tacsim.models.quantity import parse
 
 DOT_BLURS = (2.0, 3.0, 5.0, 8.0, 12.0)  # standard deviations of the blurs that are tried, for dots of any size [px]
@@ -80,7 +79,7 @@ def parse_board(text: str) -> Board:
     return board
 
 
-def find_board(image: NDArray[np.uint8], board: Board, reference: NDArray[np.uint8] | None = None) -> Points:
+def find_board(image: Image, board: Board, reference: Image | None = None) -> Points:
     """The board's points in `image` (H, W, 3); `reference` (H, W, 3): the same without the board. Raises BadBoard."""
     if reference is not None and reference.shape != image.shape:
         raise BadBoard(
@@ -90,7 +89,7 @@ def find_board(image: NDArray[np.uint8], board: Board, reference: NDArray[np.uin
     return _find_charuco(image, board) if board.kind == "charuco" else _find_dots(image, board, reference)
 
 
-def _find_dots(image: NDArray[np.uint8], board: Board, reference: NDArray[np.uint8] | None) -> Points:
+def _find_dots(image: Image, board: Board, reference: Image | None) -> Points:
     import cv2
 
     grey = image.mean(axis=2, dtype=np.float32)
@@ -215,7 +214,7 @@ def _charuco(board: Board) -> Any:
     return cv2.aruco.CharucoBoard((board.columns, board.rows), board.pitch, board.marker, dictionary)
 
 
-def _find_charuco(image: NDArray[np.uint8], board: Board) -> Points:
+def _find_charuco(image: Image, board: Board) -> Points:
     import cv2
 
     printed = _charuco(board)

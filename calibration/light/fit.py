@@ -7,7 +7,6 @@ from datetime import UTC, datetime
 from importlib import metadata
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.bundle import Calibration, Provenance, Residual
 from calibration.height.slope_polynomial import InverseModel
@@ -16,7 +15,7 @@ from calibration.light.checks.press_shapes import Stretch
 from calibration.light.dent import ContactCircle
 from calibration.light.photometry import ModelSize
 from calibration.light.press import FAR, BallPress
-from tacsim.interface import FloatArray, Image
+from tacsim.interface import Float32, FloatArray, Image
 from tacsim.models.photometric import DarknessModel, PhotometricModel
 from tacsim.models.sensor import CameraNoise, Markers, SensorGeometry
 
@@ -30,8 +29,8 @@ class PressPrediction:
     error: float  # mean |error| in contact and near it (r < 1.5 a) [grey levels]
     null_error: float  # the same, if no change were predicted: the background alone
     correlation: float  # of predicted and real change there
-    predicted: NDArray[np.float32]  # (H, W, 3) change of colour [grey levels]
-    real: NDArray[np.float32]  # (H, W, 3) the same, as seen, without drift
+    predicted: Float32  # (H, W, 3) change of colour [grey levels]
+    real: Float32  # (H, W, 3) the same, as seen, without drift
     angle: float  # mean error of the normal by the inverse model in contact [degrees]
     untouched_angle: float  # the same, far from contact
 

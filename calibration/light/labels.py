@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.height.slope_polynomial import InverseModel, fit_inverse, inverse_features, to_normal
 from calibration.light.dent import dent_gradient, dent_height, whole_profile
@@ -24,7 +23,7 @@ from calibration.light.photometry import (
 from calibration.light.press import FAR, NEAR, BallPress, smooth
 from calibration.light.refinement import RIM_BLUR, RefinedGeometry
 from calibration.light.shadows import DentShade
-from tacsim.interface import FloatArray
+from tacsim.interface import FloatArray, Mask
 from tacsim.models.photometric import (
     CastShadows,
     DepthColour,
@@ -69,12 +68,12 @@ def beside_slopes(
     return np.concatenate([deep, dark.reshape(*press.shape, -1)], axis=-1)
 
 
-def near_contact(press: BallPress) -> NDArray[np.bool_]:
+def near_contact(press: BallPress) -> Mask:
     """(H, W) contact and skirt."""
     return np.asarray(press.distance() < NEAR * press.circle.radius + RIM_MARGIN)
 
 
-def _places(mask: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
+def _places(mask: Mask) -> tuple[FloatArray, FloatArray]:
     """u, v in -1/2..1/2 across the picture of the pixels of a mask (H, W)."""
     rows, columns = np.nonzero(mask)
     u, v = place_in_image(mask.shape[1], mask.shape[0])
@@ -82,7 +81,7 @@ def _places(mask: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
 
 
 def forward_equations(
-    press: BallPress, gradient: FloatArray, beside: FloatArray, counted: NDArray[np.bool_] | None = None
+    press: BallPress, gradient: FloatArray, beside: FloatArray, counted: Mask | None = None
 ) -> NormalEquations:
     """`counted` (H, W, 3): what takes part; None: what is not saturated."""
     near = near_contact(press)
@@ -93,7 +92,7 @@ def forward_equations(
 
 def counted_pixels(
     press: BallPress, gradient: FloatArray, beside: FloatArray, weights: FloatArray, size: ModelSize
-) -> NDArray[np.bool_]:
+) -> Mask:
     """(H, W, 3) what is not saturated, and what is where `weights` say less than is seen: a saturated pixel says "at
     least so bright"."""
     counted = press.lit.copy()
@@ -105,7 +104,7 @@ def counted_pixels(
     return counted
 
 
-def _inverse_terms(press: BallPress, where: NDArray[np.bool_]) -> FloatArray:
+def _inverse_terms(press: BallPress, where: Mask) -> FloatArray:
     """(n, terms) of the inverse at the pixels of a mask (H, W)."""
     u, v = _places(where)
     return inverse_features(smooth(press.change, INVERSE_BLUR)[where], 2 * u, 2 * v)

@@ -5,13 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.errors import BadFrames
 from calibration.light.circle import contact_circle
 from calibration.light.dent import MAX_RIM_RATIO, ContactCircle
 from calibration.reference import SATURATED, UnusableReference, make_reference
-from tacsim.interface import FloatArray, Image
+from tacsim.interface import FloatArray, Image, Mask
 from tacsim.models.photometric import place_in_image
 
 NEAR = 2.3  # contact and skirt reach this far [contact radii]
@@ -30,7 +29,7 @@ class BallPress:
     circle: ContactCircle
     change: FloatArray  # (H, W, 3) relative change of colour, without drift
     drift: FloatArray  # (H, W, 3) drift of the light since the reference [grey levels]
-    lit: NDArray[np.bool_]  # (H, W, 3) not saturated
+    lit: Mask  # (H, W, 3) not saturated
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -115,7 +114,7 @@ def _patch_area(strength: FloatArray, strong: float) -> int:
     return int(np.bincount(numbers.ravel(), minlength=count)[peaks].max(initial=0))
 
 
-def _drift(difference: FloatArray, untouched: NDArray[np.bool_]) -> FloatArray:
+def _drift(difference: FloatArray, untouched: Mask) -> FloatArray:
     """(H, W, 3) change between reference and frame where nothing touches: a quadratic in the place, or its median
     where too little is untouched."""
     if untouched.mean() < MIN_UNTOUCHED_SHARE:

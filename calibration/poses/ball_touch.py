@@ -13,12 +13,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from calibration.poses.robust_fit import BadMeasurements, RobustFit, angular_spread, perturbed, robust_fit
 from tacsim import pose as se3
-from tacsim.interface import FloatArray, Pose
+from tacsim.interface import FloatArray, Mask, Pose
 
 MIN_TOUCHES = 6  # touches: 18 equations for 9 numbers
 MIN_SPREAD = np.radians(5.0)  # of the tilts, see angular_spread [rad]
@@ -141,9 +140,7 @@ def _starts(turn: FloatArray, place: FloatArray, seen: FloatArray) -> list[Float
     return starts
 
 
-def locate_ball(
-    height: FloatArray, valid: NDArray[np.bool_], pitch: float, ball_radius: float
-) -> tuple[tuple[float, float], float]:
+def locate_ball(height: FloatArray, valid: Mask, pitch: float, ball_radius: float) -> tuple[tuple[float, float], float]:
     """Contact centre (x, y) [m] and depth [m] of a ball, in a surface `height` (h, w) [m] on the canonical grid.
 
     Fits a ball of `ball_radius` to the cap deeper than half of the deepest point, where the gel lies on the ball (by

@@ -11,12 +11,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from calibration.errors import CalibrationError
-from tacsim.interface import FloatArray
+from tacsim.interface import FloatArray, Mask
 
 OUTLIER_DISTANCE = 5.0  # of an outlier: norm of its residuals [standard deviations]
 MAX_OUTLIERS = 0.25  # share of the measurements
@@ -97,7 +96,7 @@ def robust_fit(residuals: Residuals, starts: Sequence[FloatArray], what: str) ->
     )
 
 
-def _plain(residuals: Residuals, start: FloatArray, keep: NDArray[np.bool_]) -> Any:
+def _plain(residuals: Residuals, start: FloatArray, keep: Mask) -> Any:
     def flat(parameters: FloatArray) -> FloatArray:
         return residuals(parameters)[keep].ravel()
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tacsim.interface import TactileObservation
+from tacsim.interface import Mask, TactileObservation
 
 CONTACT_HEIGHT = 20e-6  # deeper than this counts as contact: ten times the usual gel texture of 2 um [m]
 CONTACT_DIFFERENCE = 0.10  # relative change of colour that counts as contact; camera noise is 0.02 to 0.03 [-]
@@ -25,7 +24,7 @@ def contact_signal(observation: TactileObservation) -> float:
     return float(np.abs(observation.image[valid].astype(np.int16) - 128).mean() / 128.0)
 
 
-def pixel_mask(cells: NDArray[np.bool_], shape: tuple[int, int]) -> NDArray[np.bool_]:
+def pixel_mask(cells: Mask, shape: tuple[int, int]) -> Mask:
     """A mask over grid cells (h, w), spread to the pixels (H, W) of the canonical image. Raises ValueError if H, W are
     no whole multiple of h, w."""
     scale = shape[0] // cells.shape[0]

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tacsim.geometry.shapes import distance, extent, no_particle, outward_normals, particles
 from tacsim.geometry.tiles import tiled_distance
-from tacsim.interface import FloatArray
+from tacsim.interface import FloatArray, Mask
 from tacsim.models.scene import Body, Mesh, Shape
 
 ITERATIONS = 20  # of mutual repulsion
@@ -48,7 +47,7 @@ def scattered(geometry: Shape, spacing: float, seed: int) -> FloatArray:
         points -= (STEP * np.maximum(REACH * spacing - 2 * depth, 0.0))[:, None] * normals
         depth, normals = surface(points)
         points -= np.maximum(depth + MIN_DEPTH * spacing, 0.0)[:, None] * normals
-    inside: NDArray[np.bool_] = distance(geometry, points) < 0  # at sharp edges of a mesh its grid is not exact
+    inside: Mask = distance(geometry, points) < 0  # at sharp edges of a mesh its grid is not exact
     if not inside.any():
         raise no_particle(geometry, spacing)
     return np.asarray(points[inside])

@@ -9,12 +9,11 @@ from typing import Any, Literal
 import gymnasium
 import numpy as np
 from gymnasium.error import ResetNeeded
-from numpy.typing import NDArray
 
 from tacsim.control.contact_signal import NoTouch
 from tacsim.gym import encode
 from tacsim.gym.features import FeatureEncoder
-from tacsim.interface import Needs, Observation, Policy, Pose, Truth
+from tacsim.interface import Float32, Image, Needs, Observation, Policy, Pose, Truth
 from tacsim.limits import LimitExceeded
 from tacsim.models.rig import RigConfig, TaskConfig
 from tacsim.models.scene import Scene
@@ -46,7 +45,7 @@ class Variant:
     drawn: str = ""  # in words, for the record
 
 
-class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
+class TacsimEnv(gymnasium.Env[encode.Flat, Float32]):
     """A rig with a task. Observations: `tacsim.gym.encode.flatten`, or with an encoder what that makes of them.
     Actions: Box(-1, 1), one component for each free axis of the task, in units of its max_step from where the arm was
     last sent.
@@ -215,7 +214,7 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
 
     # ------------------------------------------------------------------- step
 
-    def step(self, action: NDArray[np.float32]) -> Result:
+    def step(self, action: Float32) -> Result:
         """One control period. Raises ActionError for an action outside the space, ResetNeeded after the end."""
         if self._done is None:
             self.begin_step(action)
@@ -229,7 +228,7 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
         result, self._done = self._done, None
         return result
 
-    def begin_step(self, action: NDArray[np.float32]) -> None:
+    def begin_step(self, action: Float32) -> None:
         """The first part of a step: commands the arms. The rig's clock ticks next, if the arms are `commanded`; then
         `end_step`. Raises as `step`."""
         if self.phase != "running":
@@ -305,7 +304,7 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
             info |= self.task.measures(truth, self._truth_at_start)
         return outcome.reward, info | dict(self.rig.diagnostics())
 
-    def expert(self) -> NDArray[np.float32]:
+    def expert(self) -> Float32:
         """What a teacher does here: by the truth, or where the task knows no rule, its `teacher`.
 
         Zeros where no episode is running.
@@ -319,13 +318,13 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
             self._teacher = self.task.teacher()
         return self.ask(self._teacher)
 
-    def ask(self, policy: Policy) -> NDArray[np.float32]:
+    def ask(self, policy: Policy) -> Float32:
         """What `policy` does here, as an action of this environment. A policy with a memory must be asked in every step
         of the episode, and reset before."""
         action = policy(self._observation)
         return vector_of(action, self.task.axes, self.task.config.max_step, self._targets)
 
-    def render(self) -> NDArray[np.uint8] | None:
+    def render(self) -> Image | None:
         """The native pictures of all sensors side by side, (H, W, 3) uint8 RGB, in the order of the rig; smaller ones
         are padded with black below."""
         if self.render_mode is None:

@@ -11,9 +11,9 @@ import numpy as np
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.vector.utils import iterate
-from numpy.typing import NDArray
 
 from tacsim.gym.env import TacsimEnv, options_of_reset
+from tacsim.interface import Float32
 from tacsim.models.scene import Scene
 from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.physics.move import MoveCommand
@@ -103,7 +103,7 @@ class TacsimVectorEnv(SyncVectorEnv):
         self._advance(list(iterate(self.action_space, actions)))
         return super().step(actions)  # takes what is done now, resets what is to be reset, and puts it together
 
-    def _advance(self, actions: Sequence[NDArray[np.float32]]) -> None:
+    def _advance(self, actions: Sequence[Float32]) -> None:
         """The step of all environments but those that are to be reset; their `step` then returns its result."""
         if len(actions) != self.num_envs:
             raise ValueError(f"{len(actions)} actions for {self.num_envs} environments; give one each")

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Annotated, Any, Literal, Self, cast
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
+from tacsim.interface import Float32, FloatArray
 from tacsim.models.material import BodyMaterial, GelMaterial, lame, shear_impedance
 from tacsim.models.quantity import Acceleration, Angle, Config, Length
 
@@ -135,7 +135,7 @@ class Indenter(Config):
     yaw: Angle = 0.0
 
     @property
-    def turn(self) -> NDArray[np.float64]:
+    def turn(self) -> FloatArray:
         """Its orientation in world as a quaternion (4,), x, y, z, w."""
         (sx, sy, sz), (cx, cy, cz) = (
             [of(angle / 2) for angle in (self.roll, self.pitch, self.yaw)] for of in (math.sin, math.cos)
@@ -352,6 +352,6 @@ class GelSurface:
     Between nodes the surface is the C1 quadratic B-spline with these control values; contact and renderer use the same.
     """
 
-    displacement: NDArray[np.float32]  # (nx, ny, 3) [m]; x grows with the first index, y with the second
+    displacement: Float32  # (nx, ny, 3) [m]; x grows with the first index, y with the second
     spacing: float  # [m]
     origin: tuple[float, float]  # x, y of node (0, 0) at rest, sensor frame [m]

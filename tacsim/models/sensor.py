@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Annotated, Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Discriminator, Field, Tag, model_validator
 
+from tacsim.interface import FloatArray
 from tacsim.models.geometry import GelView
 from tacsim.models.geometry import SensorGeometry as SensorGeometry
 from tacsim.models.photometric import DarknessModel, PhotometricModel
@@ -107,7 +107,7 @@ class CameraNoise(Config):
             raise ValueError(f"colours {self.colours}: no three colours can be correlated so")
         return self
 
-    def colour_matrix(self) -> NDArray[np.float64]:
+    def colour_matrix(self) -> FloatArray:
         """(3, 3) correlations of R, G, B."""
         red_green, red_blue, green_blue = self.colours
         return np.array([[1.0, red_green, red_blue], [red_green, 1.0, green_blue], [red_blue, green_blue, 1.0]])

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacsim.interface import Float32, FloatArray, Mask
 from tacsim.models.scene import GelSurface
 from tacsim.models.sensor import Markers, SensorGeometry
 from tacsim.optics.spline import displacement_and_jacobian
@@ -12,7 +12,7 @@ from tacsim.optics.spline import displacement_and_jacobian
 INK = 0.06  # fraction of the light that a dot lets through [-]
 
 
-def rest_positions(markers: Markers) -> NDArray[np.float64]:
+def rest_positions(markers: Markers) -> FloatArray:
     """(rows, columns, 2) x, y of the dots on the untouched gel [m]: an even lattice is centred on the sensor axis."""
     if markers.places is not None:
         return np.array(markers.places, dtype=np.float64)
@@ -32,14 +32,12 @@ def check_fits(markers: Markers, gel_size: tuple[float, float]) -> None:
         )
 
 
-def marker_flow(surface: GelSurface, markers: Markers) -> NDArray[np.float32]:
+def marker_flow(surface: GelSurface, markers: Markers) -> Float32:
     """(rows, columns, 2) in-plane displacement of the dots, sensor x, y [m]; of those behind a fold, too."""
     return _displacement(surface, markers)[..., :2].astype(np.float32)
 
 
-def marker_discs(
-    surface: GelSurface, markers: Markers, geometry: SensorGeometry
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def marker_discs(surface: GelSurface, markers: Markers, geometry: SensorGeometry) -> tuple[FloatArray, FloatArray]:
     """(rows, columns, 2) column u, row v of the dots in the image, and (rows, columns) their radii [px].
 
     Raises ValueError when the gel is pressed up to the camera.
@@ -59,16 +57,14 @@ def marker_discs(
     return centres, markers.radius * scale
 
 
-def _displacement(surface: GelSurface, markers: Markers) -> NDArray[np.float64]:
+def _displacement(surface: GelSurface, markers: Markers) -> FloatArray:
     """(rows, columns, 3) of the dots, sensor axes [m]."""
     rest = rest_positions(markers)
     displacement, _ = displacement_and_jacobian(surface, rest.reshape(-1, 2))
     return displacement.reshape(*rest.shape[:2], 3)
 
 
-def marker_coverage(
-    positions: NDArray[np.float64], radius: float | NDArray[np.float64], shape: tuple[int, int]
-) -> NDArray[np.float32]:
+def marker_coverage(positions: FloatArray, radius: float | FloatArray, shape: tuple[int, int]) -> Float32:
     """(rows, columns) fraction of each pixel that dots cover, for centres (..., 2) u, v and radii (...) or one [px].
 
     Anti-aliased at sub-pixel accuracy: the edge is a ramp one pixel wide. Dots outside the image are left out.
@@ -89,9 +85,7 @@ def marker_coverage(
     return coverage
 
 
-def _shown(
-    surface: GelSurface, markers: Markers, geometry: SensorGeometry, at_rest: NDArray[np.float32]
-) -> NDArray[np.bool_]:
+def _shown(surface: GelSurface, markers: Markers, geometry: SensorGeometry, at_rest: Float32) -> Mask:
     """(rows, columns) False for dots of which no pixel round their centres shows anything."""
     rest = rest_positions(markers)
     places = (rest + _displacement(surface, markers)[..., :2]) / geometry.pixel_pitch + geometry.principal
@@ -106,8 +100,8 @@ def _shown(
 
 
 def marker_transmission(
-    surface: GelSurface, markers: Markers, geometry: SensorGeometry, at_rest: NDArray[np.float32] | None = None
-) -> NDArray[np.float32]:
+    surface: GelSurface, markers: Markers, geometry: SensorGeometry, at_rest: Float32 | None = None
+) -> Float32:
     """(H, W) fraction of its light that each pixel keeps under the dots of the deformed surface.
 
     at_rest: (H, W, 2) column, row [px] where what each pixel shows lies on the untouched gel: of a surface that folds

@@ -17,9 +17,8 @@ from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import DecodeError, Message
 from google.protobuf.timestamp_pb2 import Timestamp
-from numpy.typing import NDArray
 
-from tacsim.interface import Action, ArmState, Pose, SurfaceMap, TactileFrame
+from tacsim.interface import Action, ArmState, Float32, Pose, SurfaceMap, TactileFrame
 from tacsim.models.text import printable
 from tacsim.record.episode import ArmPackages, EpisodeError, Recorded, Step
 from tacsim.record.images import decode_image, encode_png
@@ -228,7 +227,7 @@ def _decode_frame(
     return TactileFrame(image=pixels, time=record.time, index=record.index, surface=surface)
 
 
-def _join(name: str, fields: tuple[str, ...], *arrays: NDArray[np.float32]) -> NDArray[np.float32]:
+def _join(name: str, fields: tuple[str, ...], *arrays: Float32) -> Float32:
     """(h, w, fields) float32 from arrays that share (h, w). Raises ValueError for any other type or shape."""
     shapes = ", ".join(f"{array.shape} {array.dtype}" for array in arrays)
     rows_columns = {array.shape[:2] for array in arrays}
@@ -240,9 +239,7 @@ def _join(name: str, fields: tuple[str, ...], *arrays: NDArray[np.float32]) -> N
     return np.concatenate(arrays, axis=-1)
 
 
-def _encode_grid(
-    name: str, stamp: Timestamp, cells: NDArray[np.float32], fields: tuple[str, ...], width: float
-) -> bytes:
+def _encode_grid(name: str, stamp: Timestamp, cells: Float32, fields: tuple[str, ...], width: float) -> bytes:
     rows, columns, channels = cells.shape
     stride = channels * _FLOAT.itemsize
     pitch = width / columns
@@ -256,7 +253,7 @@ def _encode_grid(
     return grid.SerializeToString()
 
 
-def _decode_grid(data: bytes, fields: tuple[str, ...]) -> NDArray[np.float32]:
+def _decode_grid(data: bytes, fields: tuple[str, ...]) -> Float32:
     grid = Grid.FromString(data)
     layout = tuple((field.name, field.offset, field.type) for field in grid.fields)
     expected = tuple((name, i * _FLOAT.itemsize, PackedElementField.FLOAT32) for i, name in enumerate(fields))
@@ -270,7 +267,7 @@ def _decode_grid(data: bytes, fields: tuple[str, ...]) -> NDArray[np.float32]:
     return cells.astype(np.float32)
 
 
-def _encode_points(points: NDArray[np.float32], time: int) -> bytes:
+def _encode_points(points: Float32, time: int) -> bytes:
     """(n, 3) [m], in the world's frame. Raises ValueError for any other type or shape."""
     if points.dtype != np.float32 or points.ndim != 2 or points.shape[1] != 3:
         raise ValueError(f"particles of the body must be (n, 3) float32, got {points.shape} {points.dtype}")
@@ -282,7 +279,7 @@ def _encode_points(points: NDArray[np.float32], time: int) -> bytes:
     return cloud.SerializeToString()
 
 
-def _decode_points(data: bytes) -> NDArray[np.float32]:
+def _decode_points(data: bytes) -> Float32:
     cloud = PointCloud.FromString(data)
     if cloud.point_stride != 3 * _FLOAT.itemsize or len(cloud.data) % cloud.point_stride:
         raise EpisodeError(f"particles of the body: {len(cloud.data)} bytes, of {cloud.point_stride} each")

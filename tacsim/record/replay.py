@@ -9,10 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
-from tacsim.interface import ArmState, EndOfEpisode, Pose, SensorSpec, TactileFrame
+from tacsim.interface import ArmState, EndOfEpisode, Image, Pose, SensorSpec, TactileFrame
 from tacsim.models.rig import ReplayArmConfig, ReplaySensorConfig
 from tacsim.record.episode import EpisodeError
 from tacsim.record.images import read_image, reference_image
@@ -237,7 +234,7 @@ def _first(cursor: Cursor[T], path: Path) -> T:
         raise EpisodeError(f"{path}: a recording without frames") from None
 
 
-def _number(images: Iterator[NDArray[np.uint8]]) -> Iterator[tuple[TactileFrame, float]]:
+def _number(images: Iterator[Image]) -> Iterator[tuple[TactileFrame, float]]:
     for index, image in enumerate(images):
         yield TactileFrame(image=image, time=0.0, index=index), 0.0
 

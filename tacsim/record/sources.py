@@ -11,9 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Generic, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tacsim.interface import ArmState, EndOfEpisode, Pose, TactileFrame
+from tacsim.interface import ArmState, EndOfEpisode, Image, Pose, TactileFrame
 from tacsim.optics.picture_file import FORMATS, MAX_SIDE
 from tacsim.record.episode import EpisodeError, EpisodeMeta
 from tacsim.record.images import image_size, read_image
@@ -134,7 +133,7 @@ def _instead(folder: Path) -> str:
     return ""
 
 
-def folder_images(paths: list[Path]) -> Iterator[NDArray[np.uint8]]:
+def folder_images(paths: list[Path]) -> Iterator[Image]:
     """(H, W, 3) RGB pictures, decoded one by one."""
     return (read_image(path) for path in paths)
 
@@ -162,7 +161,7 @@ def video_length(path: Path, expected: int) -> int:
         return count
 
 
-def video_images(path: Path) -> Iterator[NDArray[np.uint8]]:
+def video_images(path: Path) -> Iterator[Image]:
     """(H, W, 3) RGB pictures of a video, decoded one by one. Raises EpisodeError, also for a video without frames."""
     import cv2
 

@@ -11,9 +11,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import EllipseCollection
 from matplotlib.ticker import MaxNLocator
-from numpy.typing import NDArray
 
-from tacsim.interface import Pose
+from tacsim.interface import Float32, FloatArray, Image, Pose
 from tacsim.pose import transform
 from tacsim.report.figure import GOAL, INK, QUIET, canvas, goal_text, plain, save, show_image
 
@@ -29,10 +28,10 @@ class Moment:
     """One control step as the figure shows it."""
 
     step: int
-    images: Mapping[str, NDArray[np.uint8]]  # (H, W, 3) RGB, by sensor
-    heights: Mapping[str, NDArray[np.float32]]  # (h, w) into the gel, by sensor [m]
+    images: Mapping[str, Image]  # (H, W, 3) RGB, by sensor
+    heights: Mapping[str, Float32]  # (h, w) into the gel, by sensor [m]
     poses: Mapping[str, Pose]  # world_from_sensor
-    points: NDArray[np.float32]  # (n, 3) body particles, world [m]
+    points: Float32  # (n, 3) body particles, world [m]
     force: float  # mean |Fz| of the arms [N]
 
 
@@ -166,7 +165,7 @@ def _draw_body(axes: Axes, trial: Trial, moment: Moment) -> None:
     axes.add_collection(body)
 
 
-def _gel_profile(height: NDArray[np.float32], pitch: float, pose: Pose, plane: float) -> NDArray[np.float64]:
+def _gel_profile(height: Float32, pitch: float, pose: Pose, plane: float) -> FloatArray:
     """(w, 3) gel surface in world where it meets the plane y = `plane`, from one edge of the gel to the other."""
     rows, columns = height.shape
     y, x = np.mgrid[:rows, :columns].astype(np.float64)
@@ -174,7 +173,7 @@ def _gel_profile(height: NDArray[np.float32], pitch: float, pose: Pose, plane: f
     sensor = np.stack([x, y, -height.astype(np.float64)], axis=-1)
     world = transform(pose, sensor.reshape(-1, 3)).reshape(rows, columns, 3)
     nearest = np.abs(world[:, :, 1] - plane).argmin(axis=0)
-    profile: NDArray[np.float64] = world[nearest, np.arange(columns)]
+    profile: FloatArray = world[nearest, np.arange(columns)]
     return profile
 
 

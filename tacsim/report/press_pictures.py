@@ -7,10 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tacsim.geometry.pressing_side import section
-from tacsim.interface import FloatArray, Pose
+from tacsim.interface import Float32, FloatArray, Mask, Pose
 from tacsim.models.scene import Gel, Shape
 from tacsim.optics.grid import PixelGrid
 
@@ -27,7 +26,7 @@ TITLE = "height into the gel [mm]; contact outlined"
 
 
 def write_side_picture(
-    path: Path, shape: Shape, pose: Pose, lowest: FloatArray, height: NDArray[np.float32], grid: PixelGrid, gel: Gel,
+    path: Path, shape: Shape, pose: Pose, lowest: FloatArray, height: Float32, grid: PixelGrid, gel: Gel,
     title: str,
 ) -> None:  # fmt: skip
     """A PNG of two sections, along x and along y, through the point `lowest` (x, y) [m].
@@ -53,7 +52,7 @@ def write_side_picture(
 
 
 def _section(
-    shape: Shape, pose: Pose, axis: int, lowest: FloatArray, height: NDArray[np.float32], grid: PixelGrid, gel: Gel
+    shape: Shape, pose: Pose, axis: int, lowest: FloatArray, height: Float32, grid: PixelGrid, gel: Gel
 ) -> Image:
     """The section along `axis`; to scale, z up."""
     from PIL import Image as images
@@ -92,7 +91,7 @@ def _crossings(lines: FloatArray, x: float) -> FloatArray:
     return z[: len(z) // 2 * 2].reshape(-1, 2)
 
 
-def _surface(axis: int, lowest: FloatArray, height: NDArray[np.float32], grid: PixelGrid) -> list[tuple[float, float]]:
+def _surface(axis: int, lowest: FloatArray, height: Float32, grid: PixelGrid) -> list[tuple[float, float]]:
     """Points of the gel's surface in the section: place along it, z [m]."""
     across = int(np.argmin(np.abs((grid.y if axis == 0 else grid.x) - lowest[1 - axis])))
     along = grid.x if axis == 0 else grid.y
@@ -100,7 +99,7 @@ def _surface(axis: int, lowest: FloatArray, height: NDArray[np.float32], grid: P
     return [(float(place), -float(value)) for place, value in zip(along, values, strict=True) if np.isfinite(value)]
 
 
-def write_height_picture(path: Path, height: NDArray[np.float32], contact: NDArray[np.bool_], pitch: float) -> None:
+def write_height_picture(path: Path, height: Float32, contact: Mask, pitch: float) -> None:
     """A PNG of `height` (H, W) [m], with the border of `contact` (H, W); `pitch`: of its pixels [m]. Raises OSError."""
     import cv2
     from PIL import Image as images

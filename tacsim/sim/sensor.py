@@ -6,10 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 
-import numpy as np
-from numpy.typing import NDArray
-
-from tacsim.interface import SensorSpec, SurfaceMap, TactileFrame
+from tacsim.interface import Image, SensorSpec, SurfaceMap, TactileFrame
 from tacsim.models.scene import GelSurface
 from tacsim.optics.noise import NoiseSource
 from tacsim.physics.world import World
@@ -24,11 +21,11 @@ class SimCamera:
     noise: drawn from the seed of the episode and the index of the frame; None: no noise.
     """
 
-    render: Callable[[GelSurface], NDArray[np.uint8]]
+    render: Callable[[GelSurface], Image]
     noise: NoiseSource | None = None
-    _untouched: NDArray[np.uint8] | None = field(default=None, init=False)  # with which each episode begins
+    _untouched: Image | None = field(default=None, init=False)  # with which each episode begins
 
-    def __call__(self, surface: GelSurface, index: int, episode: int) -> NDArray[np.uint8]:
+    def __call__(self, surface: GelSurface, index: int, episode: int) -> Image:
         """(H, W, 3) RGB."""
         if surface.displacement.any():
             image = self.render(surface)
@@ -55,7 +52,7 @@ class SimSensor:
         clock: SimClock,
         frame: str,
         spec: SensorSpec,
-        render: Callable[[GelSurface], NDArray[np.uint8]],
+        render: Callable[[GelSurface], Image],
         sample: Callable[[GelSurface], SurfaceMap],
         noise: NoiseSource | None = None,
         delay: int = 0,
@@ -80,7 +77,7 @@ class SimSensor:
             stats=self._clock.diagnostics(),
         )
 
-    def wear(self, render: Callable[[GelSurface], NDArray[np.uint8]], noise: NoiseSource | None, delay: int) -> None:
+    def wear(self, render: Callable[[GelSurface], Image], noise: NoiseSource | None, delay: int) -> None:
         """Other light and another camera, from the next episode on."""
         self._camera, self._past = SimCamera(render, noise), Delayed[TactileFrame](delay)
 

@@ -6,14 +6,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.light.circle import NoCircle, contact_circle
 from calibration.light.dent import dent_gradient
 from calibration.light.photometry import features
 from calibration.light.press import NEAR, BallPress, Window, smooth
 from calibration.light.refinement import RIM_BLUR
-from tacsim.interface import FloatArray, Image
+from tacsim.interface import FloatArray, Image, Mask
 
 FIRST_THICKNESS = 1e4  # of a gel that is taken to be thick [ball radii]
 RIDGE = 1e-3
@@ -63,7 +62,7 @@ def _outside_largest_group(apart: FloatArray) -> list[int]:
     return [int(k) for k in np.flatnonzero(group != largest)]
 
 
-def fine_power(picture: FloatArray, where: NDArray[np.bool_]) -> float:
+def fine_power(picture: FloatArray, where: Mask) -> float:
     """Power of fine detail and noise of a picture (H, W, 3) [grey levels] at the pixels `where` (H, W)."""
     return float(((picture - smooth(picture, FINE))[where] ** 2).mean())
 

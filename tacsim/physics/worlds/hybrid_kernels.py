@@ -329,7 +329,7 @@ def substeps(
             of_gels = ti.static(
                 (gel_arrays.nodes, gel_arrays.surface, gel_arrays.contact_force, gel_arrays.corners, gel_arrays.lattice)
             )
-            gels = ti.static(Gels(*of_gels, 2))
+            gels = ti.static(Gels(*of_gels, number=2))
             of_grid = ti.static((body_arrays.masses, body_arrays.velocities, body_arrays.changes))
             of_links = ti.static((body_arrays.ends, body_arrays.shares))
             body = ti.static(Body(body_arrays.particles, *of_grid, *of_links))

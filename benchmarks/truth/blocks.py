@@ -17,7 +17,7 @@ from tacsim.physics.body.transfers import (
 from tacsim.physics.exec import layout
 from tacsim.physics.exec.environment import Counts, Environment, Floats, Params, Partial
 from tacsim.physics.exec.lanes import LANES, NODES, PARTS, share_start, strip, vec3
-from tacsim.physics.exec.team import CHUNK, Sync, first_in_chunk, next_piece, once_if, own_part, piece_done, run_team
+from tacsim.physics.exec.team import CHUNK, Sync, first_in_chunk, next_piece, one_if, own_part, piece_done, run_team
 from tacsim.physics.gel.element import SMALLEST_STRETCH
 from tacsim.physics.gel.gel import GelParams, GelState
 from tacsim.physics.gel.kernels import Gels, Lattice, first_node, gel_advance, gel_forces, gel_of
@@ -44,12 +44,12 @@ def body_substeps(
             piece = next_piece(sync, 0, own, stages)
             while piece < stages * PARTS:
                 stage, part = piece // PARTS, piece % PARTS
-                for _gather in range(once_if(stage % 2 == 0 and stage > 0)):
+                for _gather in range(one_if(stage % 2 == 0 and stage > 0)):
                     grid_to_particles(env, part, body)
-                for _scatter in range(once_if(stage % 2 == 0 and stage < 2 * steps.shape[1])):
+                for _scatter in range(one_if(stage % 2 == 0 and stage < 2 * steps.shape[1])):
                     clear_masses(env, part, body)
                     particles_to_grid(env, part, 0, body)
-                for _motion in range(once_if(stage % 2 == 1)):
+                for _motion in range(one_if(stage % 2 == 1)):
                     for i in range(share_start(rows, part, PARTS), share_start(rows, part + 1, PARTS)):
                         for at in range(i * plane, (i + 1) * plane):
                             q = node_sum(env, i, at, body)
@@ -139,8 +139,7 @@ class BodyBlock(Block):
     def advance(self, substeps: int, keep: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> None:
         """keep: 0 forbids motion along an axis, 1 allows it. Raises RuntimeError if a particle left the grid."""
         steps = np.zeros((1, substeps), np.int32)
-        arguments = self.state.arguments()
-        run_team(body_substeps, steps, arguments, self.params, self.counts, self.partial, *keep)
+        run_team(body_substeps, steps, *self.state.arguments(), self.params, self.counts, self.partial, *keep)
         if self.partial[0, :, layout.OFF_GRID].any():
             raise RuntimeError("particles left the grid of a body block: fit it anew, or with a wider margin")
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from robot.cli.errors import complain
-from robot.cli.options import Out, Overrides
+from robot.cli.options import Out, Overrides, grouped
 from robot.cli.output import busy, counted, new_directory, notes, results, say_files, show_table, warn, writing
 
 if TYPE_CHECKING:
@@ -25,24 +25,33 @@ Pair = Literal["auto", "name", "order"]
 Limit = tuple[str, float, bool]  # name, value, True: above it is a failure
 
 
-def compare(
-    a: Annotated[str, typer.Argument(metavar="A", help="Folder of pictures, video, episode, or scene with a ball.")],
-    b: Annotated[Path, typer.Argument(metavar="B", help="Folder, video or episode that is taken for the truth.")],
+@dataclass(frozen=True)
+class Sources:
+    """Options that describe one of the two sources."""
+
     reference_a: Annotated[
         Path | None,
         typer.Option(help="A without contact.", show_default="background.png or the like, the episode's, or a median"),
-    ] = None,
-    reference_b: Annotated[Path | None, typer.Option(help="B without contact.", show_default="as for A")] = None,
+    ] = None
+    reference_b: Annotated[Path | None, typer.Option(help="B without contact.", show_default="as for A")] = None
     calibration_a: Annotated[
         Path | None, typer.Option(metavar="BUNDLE", help="A's calibration: metres, and height in its pictures.")
-    ] = None,
-    calibration_b: Annotated[Path | None, typer.Option(metavar="BUNDLE", help="B's calibration.")] = None,
+    ] = None
+    calibration_b: Annotated[Path | None, typer.Option(metavar="BUNDLE", help="B's calibration.")] = None
     corners_a: Annotated[
         str | None, typer.Option(metavar="U,V U,V U,V U,V", help="The gel's corners in A, clockwise from the top left.")
-    ] = None,
-    corners_b: Annotated[str | None, typer.Option(metavar="U,V U,V U,V U,V", help="The same in B.")] = None,
-    sensor_a: Annotated[str, typer.Option(help="Sensor of A, if its episode has more than one.")] = "",
-    sensor_b: Annotated[str, typer.Option(help="The same for B.")] = "",
+    ] = None
+    corners_b: Annotated[str | None, typer.Option(metavar="U,V U,V U,V U,V", help="The same in B.")] = None
+    sensor_a: Annotated[str, typer.Option(help="Sensor of A, if its episode has more than one.")] = ""
+    sensor_b: Annotated[str, typer.Option(help="The same for B.")] = ""
+
+
+@grouped
+def compare(
+    a: Annotated[str, typer.Argument(metavar="A", help="Folder of pictures, video, episode, or scene with a ball.")],
+    b: Annotated[Path, typer.Argument(metavar="B", help="Folder, video or episode that is taken for the truth.")],
+    *,
+    sources: Sources,
     pair: Annotated[Pair, typer.Option(help="auto: by name where all names are the same, else in order.")] = "auto",
     shift: Annotated[
         bool | None,
@@ -77,19 +86,21 @@ def compare(
         from calibration.compare.report import figures, write
         from calibration.errors import BadFrames
     limits = [*_limits(fail_above, "--fail-above"), *_limits(fail_below, "--fail-below")]
-    bundles = [None if path is None else read_bundle(path)[0] for path in (calibration_a, calibration_b)]
-    truth = _read(b, reference_b, sensor_b, bundles[1])
+    bundles = [
+        None if path is None else read_bundle(path)[0] for path in (sources.calibration_a, sources.calibration_b)
+    ]
+    truth = _read(b, sources.reference_b, sources.sensor_b, bundles[1])
     if _is_scene(a):
-        if corners_a or corners_b or reference_a or sensor_a:
+        if sources.corners_a or sources.corners_b or sources.reference_a or sources.sensor_a:
             raise BadFrames(f"A is the scene '{a}': it has no corners, reference or sensor, and B must be calibrated")
-        made = _simulate_presses(a, truth, calibration_b, set_ or [])
+        made = _simulate_presses(a, truth, sources.calibration_b, set_ or [])
     else:
         if set_:
             raise BadFrames(f"--set changes a scene, but A is no scene: {a}")
-        made = _read(Path(a), reference_a, sensor_a, bundles[0])
+        made = _read(Path(a), sources.reference_a, sources.sensor_a, bundles[0])
     # from here on all pictures are metric where a calibration says how
     bundles = [None if each is None else each.model_copy(update={"view": None}) for each in bundles]
-    made, truth = _rectify_corners(made, truth, (corners_a, corners_b), bundles)
+    made, truth = _rectify_corners(made, truth, (sources.corners_a, sources.corners_b), bundles)
     with counted("comparing") as on_step:
         result = run(made, truth, bundles[0], bundles[1], Options(Pairing(pair), shift), on_step)
     report = None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import math
 from collections.abc import Callable
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 from functools import wraps
 from pathlib import Path
 from typing import Annotated, Any, get_type_hints
@@ -58,25 +58,34 @@ def length(help_: str, low: float = -math.inf, high: float = math.inf) -> Any:
 
 
 def grouped(command: Callable[..., None]) -> Callable[..., None]:
-    """A command whose last parameter, `options`, is a dataclass: its fields become options of the command. So commands
-    can have a list of options in common."""
-    signature = inspect.signature(command, eval_str=True)
-    kind = signature.parameters["options"].annotation
-    own = [each for name, each in signature.parameters.items() if name != "options"]
-    hints = get_type_hints(kind, include_extras=True)
-    names = [field.name for field in fields(kind)]
-    shared = [
-        inspect.Parameter(field.name, own[0].kind, default=field.default, annotation=hints[field.name])
-        for field in fields(kind)
-    ]
+    """A command some of whose parameters are dataclasses: their fields become options of the command, in their place.
+
+    Several commands can share a dataclass, and a command with many options keeps a short list of parameters.
+    """
+    kinds: dict[str, Any] = {}
+    parameters: list[inspect.Parameter] = []
+    for name, parameter in inspect.signature(command, eval_str=True).parameters.items():
+        kind = parameter.annotation
+        if not is_dataclass(kind):
+            parameters.append(parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY))
+            continue
+        kinds[name], hints = kind, get_type_hints(kind, include_extras=True)
+        parameters += [
+            inspect.Parameter(
+                field.name, inspect.Parameter.KEYWORD_ONLY, default=field.default, annotation=hints[field.name]
+            )
+            for field in fields(kind)
+        ]
 
     @wraps(command)
     def run(**given: Any) -> None:
-        command(**{name: given[name] for name in given if name not in names},
-                options=kind(**{name: given[name] for name in names}))  # fmt: skip
+        groups = {
+            name: kind(**{field.name: given.pop(field.name) for field in fields(kind)}) for name, kind in kinds.items()
+        }
+        command(**given, **groups)
 
-    run.__signature__ = signature.replace(parameters=[*own, *shared])  # type: ignore[attr-defined]
-    run.__annotations__ = {each.name: each.annotation for each in (*own, *shared)}
+    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    run.__annotations__ = {each.name: each.annotation for each in parameters}
     return run
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -10,7 +11,7 @@ import typer
 
 from robot.cli.errors import complain
 from robot.cli.interrupt import Interrupt
-from robot.cli.options import Out, Overrides, angle, length, quantities
+from robot.cli.options import Out, Overrides, angle, grouped, length, quantities
 from robot.cli.output import busy, measuring, new_directory, notes, progress, results, say_files, writing
 
 if TYPE_CHECKING:
@@ -19,34 +20,44 @@ if TYPE_CHECKING:
 AXES = ("roll", "pitch", "yaw")
 
 
+@dataclass(frozen=True)
+class IndenterShape:
+    """Options that describe the indenter and how it is turned."""
+
+    radius: Annotated[Any, length("Of a sphere or cylinder; 4 mm if left out.")] = None
+    height: Annotated[Any, length("Of a cylinder; 5 mm if left out.")] = None
+    size: Annotated[
+        Any,
+        typer.Option(parser=quantities("length", 3), metavar="X,Y,Z", help="Of a box; 5, 5, 5 mm if left out."),
+    ] = None
+    edge_radius: Annotated[Any, length("Of a box's or cylinder's edges; half an element if left out.")] = None
+    scale: Annotated[
+        float | None, typer.Option(help="Metres per unit of the .stl file; 0.001 if left out.", show_default=False)
+    ] = None
+    down: Annotated[
+        Literal["-z", "+z", "-x", "+x", "-y", "+y"] | None,
+        typer.Option(help="Side of the indenter, in its own axes, that presses; -z if left out.", show_default=False),
+    ] = None
+    rotation: Annotated[
+        Any,
+        typer.Option(
+            parser=quantities("angle", 3),
+            metavar="ROLL,PITCH,YAW",
+            help="Turn it about the world's x, then y, then z, in place of --down.",
+        ),
+    ] = None
+
+
+@grouped
 def press(
     indenter: Annotated[str, typer.Argument(help="sphere, cylinder, box, or the path of an .stl file.")],
+    *,
     depth: Annotated[Any, length("How deep below the untouched gel.")] = "0.5 mm",
     slide: Annotated[
         Any, typer.Option(parser=quantities("length", 2), metavar="X,Y", help="Then slide by this much.")
     ] = "0,0",
     twist: Annotated[Any, angle("Then turn about the vertical.")] = "0",
-    radius: Annotated[Any, length("Of a sphere or cylinder; 4 mm if left out.")] = None,
-    height: Annotated[Any, length("Of a cylinder; 5 mm if left out.")] = None,
-    size: Annotated[
-        Any,
-        typer.Option(parser=quantities("length", 3), metavar="X,Y,Z", help="Of a box; 5, 5, 5 mm if left out."),
-    ] = None,
-    edge_radius: Annotated[Any, length("Of a box's or cylinder's edges; half an element if left out.")] = None,
-    scale: Annotated[
-        float | None, typer.Option(help="Metres per unit of the .stl file; 0.001 if left out.", show_default=False)
-    ] = None,
-    down: Annotated[
-        Literal["-z", "+z", "-x", "+x", "-y", "+y"] | None,
-        typer.Option(help="Side of the indenter, in its own axes, that presses; -z if left out.", show_default=False),
-    ] = None,
-    rotation: Annotated[
-        Any,
-        typer.Option(
-            parser=quantities("angle", 3), metavar="ROLL,PITCH,YAW",
-            help="Turn it about the world's x, then y, then z, in place of --down.",
-        ),
-    ] = None,
+    shape: IndenterShape,
     preset: Annotated[Literal["learn", "draft", "standard"], typer.Option(help="Resolution.")] = "standard",
     sensor: Annotated[
         str, typer.Option(help="Its name, the path of a YAML file, or of a calibrated bundle.")
@@ -67,14 +78,14 @@ def press(
     from tacsim.config.gel import fit_gel, gel_sizes_given
 
     folder = new_directory(out, "press")
-    shape = [_geometry(indenter, {"radius": radius, "height": height, "size": size, "scale": scale})]
-    if edge_radius is not None:
-        shape.append(f"indenter.edge_radius={edge_radius!r}")
-    shape += _orientation(down, rotation)
-    scene = load_scene("press", [f"preset={preset}", *shape, *(set_ or [])])
+    given = {name: getattr(shape, name) for name in ("radius", "height", "size", "scale")}
+    changes = [_geometry(indenter, given), *_orientation(shape.down, shape.rotation)]
+    if shape.edge_radius is not None:
+        changes.append(f"indenter.edge_radius={shape.edge_radius!r}")
+    scene = load_scene("press", [f"preset={preset}", *changes, *(set_ or [])])
     model = load_sensor(sensor).model_copy(update={"view": None})
-    given = gel_sizes_given(text.partition("=")[0].split(".") for text in set_ or [])
-    scene, said = fit_gel(scene, {"lower": model}, given=given)
+    sizes = gel_sizes_given(text.partition("=")[0].split(".") for text in set_ or [])
+    scene, said = fit_gel(scene, {"lower": model}, given=sizes)
     for words in said:
         notes.print(words, markup=False)
     with busy("pressing (the first run compiles the kernels, up to half a minute)") as say:
@@ -102,9 +113,9 @@ def press(
     results.print(f"contact radius   {config['contact_radius'] * 1e3:.3f} mm")
     results.print(f"deepest          {config['deepest'] * 1e3:.3f} mm")
     if config["edge_radius"] is not None:
-        given = config["indenter"]["edge_radius"]
-        words = " (what the mesh carries; --edge-radius '0 mm' for sharp edges)" if given is None else ""
-        results.print(f"edge radius      {config['edge_radius'] * 1e3:.3f} mm{' (sharp)' if given == 0 else words}")
+        asked = config["indenter"]["edge_radius"]
+        words = " (what the mesh carries; --edge-radius '0 mm' for sharp edges)" if asked is None else ""
+        results.print(f"edge radius      {config['edge_radius'] * 1e3:.3f} mm{' (sharp)' if asked == 0 else words}")
     if config["unfelt"] > presses.UNFELT:
         notes.print(
             f"warning: the gel feels {1 - config['unfelt']:.0%} of the depth: a tip or edge is too narrow for elements "

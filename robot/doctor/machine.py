@@ -120,13 +120,15 @@ def taichi() -> list[Check]:
         advice = "simulate on another machine; hardware and replay work here"
         return [Check("taichi", "warn", "no Taichi wheel exists for linux aarch64", advice)]
     from tacsim.compute.runtime import DEVICE, KERNELS, available, start, ti
+    from tacsim.compute.taichi_patches import are_enabled
 
     if not available(DEVICE):
         advice = "unset TACSIM_DEVICE to compute on the processor, or install the device's driver"
         return [Check("taichi", "fail", f"TACSIM_DEVICE is '{DEVICE}', which is not there", advice)]
     arch = start()
     version = ".".join(str(part) for part in ti.__version__)
-    return [Check("taichi", "ok", f"{version}, arch {arch}"), kernel_cache(KERNELS)]
+    patches = "" if are_enabled() else ", without patches (docs/taichi-patches.md)"
+    return [Check("taichi", "ok", f"{version}, arch {arch}{patches}"), kernel_cache(KERNELS)]
 
 
 def kernel_cache(folder: Path) -> Check:

@@ -9,16 +9,16 @@ import atexit
 import contextlib
 import io
 import os
-import re
 import tempfile
 import threading
-import time
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from tacsim.compute.front_end import light_import, quicken
+from tacsim.compute import taichi_patches
+from tacsim.compute.taichi_patches.front_end import light_import, replace_front_end
+from tacsim.compute.taichi_patches.kernel_cache import repair_kernel_cache
 
 os.environ.setdefault("TI_LOG_LEVEL", "error")
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
@@ -26,14 +26,16 @@ os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")  # it would ask a server fo
 if not {"HOME", "XDG_CACHE_HOME"} & os.environ.keys():  # Taichi ends the process without both
     os.environ["XDG_CACHE_HOME"] = str(Path("~/.cache").expanduser())
 
+_patched = taichi_patches.are_enabled()
 with (
     warnings.catch_warnings(),
-    light_import(),
+    light_import() if _patched else contextlib.nullcontext(),
 ):  # Taichi 1.7 imports deprecated parts of the standard library and of NumPy
     warnings.simplefilter("ignore")
     import taichi as ti
 
-quicken(ti.lang)
+if _patched:
+    replace_front_end(ti.lang)
 
 DEVICES = ("cpu", "cuda", "vulkan", "metal", "cpu-as-device")  # the last: what a device computes, without one
 # Where worlds are computed, by TACSIM_DEVICE. Read once: kernels are written for it when their modules are imported.
@@ -75,9 +77,9 @@ def _initialise() -> None:
         )
     # Taichi crashes when the process ends where it cannot make the folder, even one in which it keeps nothing.
     kept = is_writable(KERNELS)
-    if kept:
-        _mend(KERNELS)
-    else:
+    if kept and _patched:
+        repair_kernel_cache(KERNELS)
+    if not kept:
         warnings.warn(f"compiled kernels cannot be kept: {KERNELS} is not writable; {TO_KEEP}", stacklevel=3)
     # ti.init prints "Starting on arch=..." whatever it is told; a command's output (JSON, say) must stay its own.
     try:
@@ -103,26 +105,6 @@ def _finish() -> None:
     when Python has ended. Half a minute of work would be lost."""
     if _running == os.getpid() and _launch_lock.acquire(timeout=10):  # for good: no thread launches after this
         ti.reset()
-
-
-def _mend(kept: Path) -> None:
-    """Makes kernels be kept again where Taichi would neither read nor write any, and each process would compile for a
-    minute, in silence.
-
-    It locks them to read or write, a matter of milliseconds: a lock from another minute was left by a process that was
-    killed. And what its list says is kept it never writes anew: if a file is lost or cut, the list goes.
-    """
-    lock, listed = kept / "ticache.lock", kept / "ticache.tcb"
-    with contextlib.suppress(OSError):
-        if abs(time.time() - lock.stat().st_mtime) > 60:
-            lock.unlink()
-    with contextlib.suppress(OSError):
-        # a kernel's key, its length before it, twice, then the size of its file
-        for key, size in re.findall(rb"(T[0-9a-f]{64})A\0{7}\1(.{8})", listed.read_bytes(), re.DOTALL):
-            file = kept / f"{key.decode()}.tic"
-            if not file.is_file() or file.stat().st_size != int.from_bytes(size, "little"):
-                listed.unlink()
-                return
 
 
 def is_writable(folder: Path) -> bool:

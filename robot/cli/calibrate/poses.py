@@ -7,13 +7,14 @@ import math
 import shlex
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from robot.cli.calibrate.session import confirm_motion, led
-from robot.cli.options import Out, Overrides, angle, length
+from robot.cli.options import Out, Overrides, angle, grouped, length
 from robot.cli.output import busy, new_directory, notes, results, say_files, show_table, writing
 
 if TYPE_CHECKING:
@@ -29,22 +30,38 @@ Rig = Annotated[
 ]
 
 
+@dataclass(frozen=True)
+class TouchMotion:
+    """Options of the motion from touch to touch."""
+
+    number: Annotated[int, typer.Option("--touches", min=6, max=200, help="How many; more make it surer.")] = 24
+    tilt: Annotated[Any, angle("Largest tilt of the sensor.", 0.15, 0.8)] = "25 deg"
+    spread: Annotated[Any, length("How far from the middle of the gel the ball is met.", 0.5e-3, 20e-3)] = "3 mm"
+    depth: Annotated[Any, length("How deep the ball is pressed into the gel.", 0.05e-3, 2e-3)] = "0.4 mm"
+    lift: Annotated[Any, length("How far back along the sensor's axis between touches.", 2e-3, 50e-3)] = "6 mm"
+
+
+@dataclass(frozen=True)
+class TouchErrors:
+    """Standard deviations of what is measured."""
+
+    noise_centre: Annotated[Any, length("Standard deviation of the contact's centre, each axis.", 1e-6, 1e-2)] = (
+        "0.03 mm"
+    )
+    noise_depth: Annotated[Any, length("Standard deviation of the depth.", 1e-6, 1e-2)] = "0.05 mm"
+    noise_robot: Annotated[Any, length("Standard deviation of the arm's position, each axis.", 0.0, 1e-2)] = "0.05 mm"
+
+
+@grouped
 def touch(
     touches: Annotated[Path | None, typer.Argument(help="File of recorded touches (YAML); or give --rig.")] = None,
+    *,
     rig: Rig = None,
     arm: Annotated[str, typer.Option("--arm", help="The arm that touches; with --rig.")] = "",
     sensor: Annotated[str, typer.Option("--sensor", help="The sensor that it carries; with --rig.")] = "",
     ball_radius: Annotated[Any, length("Of the ball; with --rig.", 0.5e-3, 50e-3)] = None,
-    number: Annotated[int, typer.Option("--touches", min=6, max=200, help="How many; more make it surer.")] = 24,
-    tilt: Annotated[Any, angle("Largest tilt of the sensor.", 0.15, 0.8)] = "25 deg",
-    spread: Annotated[Any, length("How far from the middle of the gel the ball is met.", 0.5e-3, 20e-3)] = "3 mm",
-    depth: Annotated[Any, length("How deep the ball is pressed into the gel.", 0.05e-3, 2e-3)] = "0.4 mm",
-    lift: Annotated[Any, length("How far back along the sensor's axis between touches.", 2e-3, 50e-3)] = "6 mm",
-    noise_centre: Annotated[
-        Any, length("Standard deviation of the contact's centre, each axis.", 1e-6, 1e-2)
-    ] = "0.03 mm",
-    noise_depth: Annotated[Any, length("Standard deviation of the depth.", 1e-6, 1e-2)] = "0.05 mm",
-    noise_robot: Annotated[Any, length("Standard deviation of the arm's position, each axis.", 0.0, 1e-2)] = "0.05 mm",
+    motion: TouchMotion,
+    errors: TouchErrors,
     set_: Overrides = None,
     out: Out = None,
 ) -> None:
@@ -59,7 +76,7 @@ def touch(
     from calibration.poses.ball_touch import TouchNoise
     from calibration.poses.records import read_touches
 
-    noise = TouchNoise(noise_centre, noise_depth, noise_robot)
+    noise = TouchNoise(errors.noise_centre, errors.noise_depth, errors.noise_robot)
     _one_source(touches, rig)
     folder = new_directory(out, "touch")
     if touches is not None:
@@ -70,7 +87,7 @@ def touch(
     assert rig is not None
     if not (arm and sensor and ball_radius):
         raise typer.BadParameter("with --rig, give --arm, --sensor and --ball-radius")
-    plan = BallTouchPlan(ball_radius, number, tilt, spread, depth, lift)
+    plan = BallTouchPlan(ball_radius, motion.number, motion.tilt, motion.spread, motion.depth, motion.lift)
     _report_touch(_take_touches(rig, arm, sensor, plan, set_ or [], folder), noise, folder, arm)
 
 
@@ -145,21 +162,37 @@ def _report_touch(record: TouchFile, noise: TouchNoise, folder: Path, arm: str) 
     _write_report(folder, "touch.json", report)
 
 
+@dataclass(frozen=True)
+class ViewMotion:
+    """Options of the motion from pose to pose."""
+
+    number: Annotated[int, typer.Option("--poses", min=6, max=200, help="How many; more make it surer.")] = 20
+    tilt: Annotated[Any, angle("Largest tilt about each axis.", 0.1, 1.0)] = "30 deg"
+    pivot: Annotated[Any, length("How far before the sensor the point is that it turns about.", 0.0, 2.0)] = "0 mm"
+
+
+@dataclass(frozen=True)
+class BoardErrors:
+    """Standard deviations of what is measured."""
+
+    noise_board: Annotated[Any, length("Standard deviation of the board's place, each axis.", 1e-6, 0.1)] = "0.5 mm"
+    noise_turn: Annotated[Any, angle("The same of its direction.", 1e-6, math.radians(20.0))] = "0.15 deg"
+
+
+@grouped
 def hand_eye(
     poses: Annotated[
         Path | None, typer.Argument(help="File of recorded poses of flange and board (YAML); or give --rig.")
     ] = None,
+    *,
     rig: Rig = None,
     arm: Annotated[str, typer.Option("--arm", help="The arm that moves; with --rig.")] = "",
     camera: Annotated[str, typer.Option(help="Its source, as in a rig file; with --rig.")] = "",
     lens: Annotated[Path | None, typer.Option(help="lens.yaml of `tacsim calibrate lens`; with --rig.")] = None,
     board: Annotated[str, typer.Option(help="charuco:COLUMNSxROWS:SQUARE:MARKER[:DICTIONARY]; with --rig.")] = "",
     fixed: Annotated[bool, typer.Option("--fixed", help="The camera stands, the board rides; with --rig.")] = False,
-    number: Annotated[int, typer.Option("--poses", min=6, max=200, help="How many; more make it surer.")] = 20,
-    tilt: Annotated[Any, angle("Largest tilt about each axis.", 0.1, 1.0)] = "30 deg",
-    pivot: Annotated[Any, length("How far before the sensor the point is that it turns about.", 0.0, 2.0)] = "0 mm",
-    noise_board: Annotated[Any, length("Standard deviation of the board's place, each axis.", 1e-6, 0.1)] = "0.5 mm",
-    noise_turn: Annotated[Any, angle("The same of its direction.", 1e-6, math.radians(20.0))] = "0.15 deg",
+    motion: ViewMotion,
+    errors: BoardErrors,
     set_: Overrides = None,
     out: Out = None,
 ) -> None:
@@ -177,7 +210,7 @@ def hand_eye(
     from calibration.poses.hand_eye import HandEyeNoise
     from calibration.poses.records import read_board_poses
 
-    noise = HandEyeNoise(board=noise_board, board_turn=noise_turn)
+    noise = HandEyeNoise(board=errors.noise_board, board_turn=errors.noise_turn)
     _one_source(poses, rig)
     folder = new_directory(out, "hand-eye")
     if poses is not None:
@@ -193,7 +226,7 @@ def hand_eye(
     described = parse_board(board)
     if described.kind == "dots":
         raise CalibrationError("a lattice of dots looks the same from two sides: use a ChArUco board for hand-eye")
-    plan = BoardPosePlan(described, load(Lens, lens), number, tilt, pivot)
+    plan = BoardPosePlan(described, load(Lens, lens), motion.number, motion.tilt, motion.pivot)
     _report_hand_eye(_take_board_poses(rig, arm, camera, plan, set_ or [], folder, fixed=fixed), noise, folder)
 
 

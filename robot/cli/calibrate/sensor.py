@@ -14,7 +14,7 @@ import typer
 from robot.cli.calibrate.bundle_output import FRAMES, UNKNOWN, write_calibration
 from robot.cli.calibrate.light_fit import find_lattice, fit_light, read_presses, straighten
 from robot.cli.calibrate.session import confirm_free_gel, led, named_camera, picture_keeper
-from robot.cli.options import Out, Overrides, length, quantities, quantity
+from robot.cli.options import Out, Overrides, grouped, length, quantities, quantity
 from robot.cli.output import new_directory, notes, warn
 
 if TYPE_CHECKING:
@@ -32,17 +32,14 @@ def _group() -> None:
     """Calibrate what stands behind a rig."""
 
 
-@calibrate.command(
-    epilog='Example: [bold]tacsim calibrate sensor frames --ball-diameter "5.84 mm" --pixel-pitch "0.0593 mm"[/]'
-)
-def sensor(
-    frames: Annotated[
-        Path | None, typer.Argument(help="Folder of pictures of a ball's presses, 5 to 8 or more; or give --camera.")
-    ] = None,
-    ball_diameter: Annotated[
-        Any, length('Of the ball, as a calliper shows it, for example "5.84 mm".', 1e-4, 0.1)
-    ] = None,
-    ball_radius: Annotated[Any, length("Half of that, in its place.", 5e-5, 0.05)] = None,
+@dataclass(frozen=True)
+class Description:
+    """Options that describe ball, pictures and gel."""
+
+    ball_diameter: Annotated[Any, length('Of the ball, as a calliper shows it, for example "5.84 mm".', 1e-4, 0.1)] = (
+        None
+    )
+    ball_radius: Annotated[Any, length("Half of that, in its place.", 5e-5, 0.05)] = None
     kind: Annotated[
         str | None,
         typer.Option(
@@ -51,7 +48,57 @@ def sensor(
             help="mini, mini-markers, r1.5, digit, 9dtact or other: what is known of it beforehand, such as which part "
             "of the picture shows the gel, a first pixel pitch, dots.",
         ),
+    ] = None
+    pixel_pitch: Annotated[
+        Any,
+        length("Distance of two pixels on the gel; or give --view, or --kind.", 1e-7, 1e-2),
+    ] = None
+    view: Annotated[
+        Path | None,
+        typer.Option(help="view.yaml of `tacsim calibrate lens`: frames are rectified by it.", show_default=False),
+    ] = None
+    size: Annotated[
+        Any,
+        typer.Option(
+            parser=quantities("length", 2),
+            metavar="LENGTH,LENGTH",
+            help="Width, height of the gel that the picture shows, by a ruler: they check the pitch.",
+        ),
+    ] = None
+    region: Annotated[
+        str | None,
+        typer.Option(
+            metavar="U,V U,V U,V ...",
+            help="Corners of the polygon of the picture that shows gel \\[px]; beyond it nothing counts.",
+        ),
+    ] = None
+    serial: Annotated[
+        str, typer.Option(help="Serial number or name of the sensor; without --out, its folder is sensors/ and this.")
+    ] = UNKNOWN
+    known_depth: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--depth",
+            metavar="FRAME=LENGTH",
+            help="A press of known depth, which checks pitch and ball; may be repeated.",
+        ),
+    ] = None
+    markers: Annotated[bool, typer.Option("--markers", help="Dots are printed on the gel.")] = False
+    marker_pitch: Annotated[
+        Any, length("How far printed dots are apart, by a ruler: it checks the pixel pitch.", 1e-4, 1e-2)
+    ] = None
+
+
+@calibrate.command(
+    epilog='Example: [bold]tacsim calibrate sensor frames --ball-diameter "5.84 mm" --pixel-pitch "0.0593 mm"[/]'
+)
+@grouped
+def sensor(
+    frames: Annotated[
+        Path | None, typer.Argument(help="Folder of pictures of a ball's presses, 5 to 8 or more; or give --camera.")
     ] = None,
+    *,
+    described: Description,
     camera: Annotated[
         str | None,
         typer.Option(
@@ -60,29 +107,6 @@ def sensor(
         ),
     ] = None,
     presses: Annotated[int, typer.Option(min=1, max=100, help="How many; with --camera.")] = 8,
-    pixel_pitch: Annotated[
-        Any,
-        length("Distance of two pixels on the gel; or give --view, or --kind.", 1e-7, 1e-2),
-    ] = None,
-    view: Annotated[
-        Path | None,
-        typer.Option(help="view.yaml of `tacsim calibrate lens`: frames are rectified by it.", show_default=False),
-    ] = None,
-    size: Annotated[
-        Any,
-        typer.Option(
-            parser=quantities("length", 2),
-            metavar="LENGTH,LENGTH",
-            help="Width, height of the gel that the picture shows, by a ruler: they check the pitch.",
-        ),
-    ] = None,
-    region: Annotated[
-        str | None,
-        typer.Option(
-            metavar="U,V U,V U,V ...",
-            help="Corners of the polygon of the picture that shows gel \\[px]; beyond it nothing counts.",
-        ),
-    ] = None,
     reference: Annotated[
         Path | None,
         typer.Option(
@@ -90,21 +114,6 @@ def sensor(
             "beside it.",
             show_default="background.png or the like in FRAMES",
         ),
-    ] = None,
-    serial: Annotated[
-        str, typer.Option(help="Serial number or name of the sensor; without --out, its folder is sensors/ and this.")
-    ] = UNKNOWN,
-    known_depth: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--depth",
-            metavar="FRAME=LENGTH",
-            help="A press of known depth, which checks pitch and ball; may be repeated.",
-        ),
-    ] = None,
-    markers: Annotated[bool, typer.Option("--markers", help="Dots are printed on the gel.")] = False,
-    marker_pitch: Annotated[
-        Any, length("How far printed dots are apart, by a ruler: it checks the pixel pitch.", 1e-4, 1e-2)
     ] = None,
     set_: Overrides = None,
     out: Out = None,
@@ -124,10 +133,7 @@ def sensor(
         raise typer.BadParameter("it changes a camera's rig; a folder has none", param_hint="--set")
     if camera is not None and reference is not None:
         raise typer.BadParameter("with --camera it is taken first, of the free gel", param_hint="--reference")
-    asked = _asked(
-        ball_diameter, ball_radius, kind, pixel_pitch, view, size, region, known_depth, serial, out,
-        markers=markers, marker_pitch=marker_pitch,
-    )  # fmt: skip
+    asked = _asked(described, out)
     _calibrate(asked, frames, reference, camera, set_ or [], presses)
 
 
@@ -180,40 +186,27 @@ class _Asked:
         return self.size or self.profile.gel_size or (self.view.size if self.view and measured else None)
 
 
-def _asked(
-    diameter: float | None,
-    radius: float | None,
-    kind: str | None,
-    pitch: float | None,
-    view: Path | None,
-    size: tuple[float, float] | None,
-    region: str | None,
-    known_depth: list[str] | None,
-    serial: str,
-    out: Path | None,
-    *,
-    markers: bool,
-    marker_pitch: float | None,
-) -> _Asked:
+def _asked(given: Description, out: Path | None) -> _Asked:
     """Checked, before anything slow is loaded; the folder is made."""
     from calibration.bundle import SERIAL
     from calibration.profiles import PROFILES
 
-    if (radius is None) == (diameter is None):
+    if (given.ball_radius is None) == (given.ball_diameter is None):
         what = "give the ball's diameter (or its radius, not both): without it no slope is known"
         raise typer.BadParameter(what, param_hint="--ball-diameter")
-    if kind is not None and kind not in PROFILES:
-        raise typer.BadParameter(f"'{kind}'; known: {', '.join(PROFILES)}", param_hint="--kind")
-    profile = PROFILES["other" if kind is None else kind]
-    if pitch is not None and view is not None:
+    if given.kind is not None and given.kind not in PROFILES:
+        raise typer.BadParameter(f"'{given.kind}'; known: {', '.join(PROFILES)}", param_hint="--kind")
+    profile = PROFILES["other" if given.kind is None else given.kind]
+    if given.pixel_pitch is not None and given.view is not None:
         raise typer.BadParameter("give either --pixel-pitch or --view")
-    if pitch is None and view is None and profile.gel_size is None:
+    if given.pixel_pitch is None and given.view is None and profile.gel_size is None:
         raise typer.BadParameter("give --pixel-pitch or --view, or --kind with a pitch that is known beforehand")
-    if marker_pitch is not None and not (markers or profile.markers):
+    if given.marker_pitch is not None and not (given.markers or profile.markers):
         what = "it says how far printed dots are apart: give --markers, too"
         raise typer.BadParameter(what, param_hint="--marker-pitch")
-    if size is not None and min(size) <= 0:
+    if given.size is not None and min(given.size) <= 0:
         raise typer.BadParameter("both lengths must be above 0", param_hint="--size")
+    serial = given.serial
     if not re.fullmatch(SERIAL, serial):
         raise typer.BadParameter(
             f"'{serial}' is no serial number: up to 64 letters, digits, '.', '_' and '-'", param_hint="--serial"
@@ -225,15 +218,15 @@ def _asked(
     from tacsim.config import load
 
     return _Asked(
-        ball=(radius or 0.0) + (diameter or 0.0) / 2,  # one of them is not there
+        ball=(given.ball_radius or 0.0) + (given.ball_diameter or 0.0) / 2,  # one of them is None
         profile=profile,
-        pitch=pitch,
-        view=None if view is None else load(GelView, view),
-        size=size,
-        region=None if region is None else _region(region),
-        depths=tuple(_known_depth(text) for text in known_depth or ()),
-        markers=markers or profile.markers,
-        marker_pitch=marker_pitch,
+        pitch=given.pixel_pitch,
+        view=None if given.view is None else load(GelView, given.view),
+        size=given.size,
+        region=None if given.region is None else _region(given.region),
+        depths=tuple(_known_depth(text) for text in given.known_depth or ()),
+        markers=given.markers or profile.markers,
+        marker_pitch=given.marker_pitch,
         serial=serial,
         folder=folder,
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shlex
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
@@ -12,7 +13,7 @@ import typer
 
 from robot.cli.errors import FAILED, complain
 from robot.cli.interrupt import Interrupt
-from robot.cli.options import Overrides, quantity
+from robot.cli.options import Overrides, grouped, quantity
 from robot.cli.output import busy, notes, one_bar, results
 
 if TYPE_CHECKING:
@@ -70,18 +71,27 @@ def range_of(kind: str, help_: str) -> Any:
     return typer.Option(parser=between(kind), metavar="RANGE", help=help_)
 
 
+@dataclass(frozen=True)
+class PressRanges:
+    """Options whose values are drawn for each press."""
+
+    depth: Annotated[Any, range_of("length", "How deep below the untouched gel.")] = "0.1..1.0mm"
+    pose: Annotated[
+        Literal["random", "centred"], typer.Option(help="random: anywhere in the picture, turned any way.")
+    ] = "random"
+    tilt: Annotated[Any, range_of("angle", "Off the vertical, any way; of random poses.")] = "0..5deg"
+    shear: Annotated[Any, range_of("length", "Then sideways, any way.")] = "0"
+    twist: Annotated[Any, range_of("angle", "Then about the vertical.")] = "0"
+
+
+@grouped
 def press(
     out: OutSet,
+    *,
     objects: Annotated[
         str, typer.Option(metavar="DIR|shapes", help="A folder of STL files, or the twenty shapes of tacsim.")
     ] = "shapes",
-    depth: Annotated[Any, range_of("length", "How deep below the untouched gel.")] = "0.1..1.0mm",
-    pose: Annotated[
-        Literal["random", "centred"], typer.Option(help="random: anywhere in the picture, turned any way.")
-    ] = "random",
-    tilt: Annotated[Any, range_of("angle", "Off the vertical, any way; of random poses.")] = "0..5deg",
-    shear: Annotated[Any, range_of("length", "Then sideways, any way.")] = "0",
-    twist: Annotated[Any, range_of("angle", "Then about the vertical.")] = "0",
+    drawn: PressRanges,
     count: Count = 100,
     seed: Seed = 0,
     sensor: Annotated[
@@ -101,9 +111,9 @@ def press(
     Example: tacsim collect press --depth 0.1..1.0mm --count 500 --out presses
     """
     given = [
-        ("--objects", objects, None), ("--depth", depth.text, None), ("--pose", pose, None),
-        ("--tilt", tilt.text if pose == "random" else None, None), ("--shear", shear.text, "0"),
-        ("--twist", twist.text, "0"),
+        ("--objects", objects, None), ("--depth", drawn.depth.text, None), ("--pose", drawn.pose, None),
+        ("--tilt", drawn.tilt.text if drawn.pose == "random" else None, None), ("--shear", drawn.shear.text, "0"),
+        ("--twist", drawn.twist.text, "0"),
         ("--count", str(count), None), ("--seed", str(seed), None), ("--sensor", sensor, None),
         ("--preset", preset, None),
         ("--scale", f"{scale:g}", "0.001"), *(("--set", text, None) for text in set_ or []), ("--out", str(out), None),
@@ -128,8 +138,9 @@ def press(
             light = model.lighting.model_copy(update={"background": place})
             model = model.model_copy(update={"lighting": light})
         settings = _checked(
-            PressSet, seed=seed, objects=known, scene=scene, sensor=model, depth=depth[:2], pose=pose,
-            tilt=tilt[:2] if pose == "random" else (0.0, 0.0), shear=shear[:2], twist=twist[:2],
+            PressSet, seed=seed, objects=known, scene=scene, sensor=model,
+            depth=drawn.depth[:2], pose=drawn.pose, tilt=drawn.tilt[:2] if drawn.pose == "random" else (0.0, 0.0),
+            shear=drawn.shear[:2], twist=drawn.twist[:2],
         )  # fmt: skip
     if files and scene.indenter is not None:
         name = pressing_side(scene.indenter).name

@@ -25,12 +25,15 @@ from tacsim.physics.exec.lanes import (
     vec3,
     vec4,
 )
-from tacsim.physics.exec.team import once_if
+from tacsim.physics.exec.team import one_if
 from tacsim.physics.gel.kernels import contact_force_start, surface_at
 
 Anchor = ti.types.ndarray(dtype=vec3, ndim=3)  # of the quadrature points, on the indenter, in its own axes [mm]
 Pressure = ti.types.ndarray(dtype=ti.f32, ndim=3)
 Values = ti.types.ndarray(dtype=ti.f32, ndim=4)  # (environments, x, y, z)
+
+# How kernels on the CPU take these arrays
+IndenterArrays = ti.types.argpack(anchor=Anchor, pressure=Pressure, values=Values)
 
 POINTS = 3  # quadrature points along one edge of a surface cell
 # The surface under the points is that of the nodes, smoothed by this share of (k h)^2 of each wave of number k.
@@ -321,7 +324,7 @@ def indent(env: ti.template(), part, it, drive: ti.template(), gel: ti.template(
                             node = surface_node(gel, cell_i + p - 1, cell_j + q - 1)
                             add_four(gel.contact_force, forces + 4 * node, (wx[p] * wy[q]) * push)
                 if ti.static(not ON_DEVICE):
-                    for _ in range(once_if(pushed)):
+                    for _ in range(one_if(pushed)):
                         hand_on(gel, forces, cell_i, cell_j, pushes)
     slot = slot_of(part)
     if ti.static(ON_DEVICE):

@@ -15,6 +15,9 @@ Params = ti.types.ndarray(dtype=ti.f32, ndim=2)  # (environments, PARAMS): see t
 Counts = ti.types.ndarray(dtype=ti.i32, ndim=2)  # (environments, COUNTS)
 Partial = ti.types.ndarray(dtype=ti.f32, ndim=3)  # (environments, PARTS, NUMBERS)
 
+# How kernels take these arrays. Names of all argument packs of a kernel must differ: Taichi 1.7 confuses equal ones.
+EnvironmentArrays = ti.types.argpack(params=Params, counts=Counts, partial=Partial)
+
 
 class Environment(NamedTuple):
     """What every function of a kernel knows; numbers by their names in tacsim.physics.exec.layout."""

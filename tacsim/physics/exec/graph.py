@@ -6,7 +6,7 @@ from typing import Any
 
 from tacsim.compute.runtime import ti
 
-MANY = 20  # rounds in a call: substeps of most launches
+ROUNDS_PER_CALL = 20  # substeps of most launches
 
 
 class Graph:
@@ -20,7 +20,7 @@ class Graph:
 
     def run(self, arguments: Mapping[str, Any], rounds: int = 1) -> None:
         """arguments: arrays of the device and whole numbers, by the names of the kernels' parameters."""
-        for each, times in ((MANY, rounds // MANY), (1, rounds % MANY)):
+        for each, times in ((ROUNDS_PER_CALL, rounds // ROUNDS_PER_CALL), (1, rounds % ROUNDS_PER_CALL)):
             for _ in range(times):
                 if each not in self._compiled:
                     self._compiled[each] = self._compile(each)

@@ -48,6 +48,7 @@ NODES = 1 if ON_DEVICE or registers_of_four() else 2
 vec2 = ti.types.vector(2, ti.f32)
 vec3 = ti.types.vector(3, ti.f32)
 vec4 = ti.types.vector(4, ti.f32)
+ivec3 = ti.types.vector(3, ti.i32)
 lanes = ti.types.vector(LANES, ti.f32)  # one number of LANES neighbours
 strip = ti.types.vector(4 * NODES, ti.f32)  # four numbers of each of NODES neighbours
 

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from tacsim.compute.relaunch import launch
 from tacsim.compute.runtime import launching, ti
+from tacsim.compute.taichi_patches.repeated_launch import launch
 from tacsim.compute.threads import threads
 from tacsim.physics.exec.lanes import PARTS
 
@@ -68,7 +68,7 @@ def first_in_chunk(task):
 
 
 @ti.func
-def once_if(condition):
+def one_if(condition):
     return ti.select(condition, 1, 0)
 
 
@@ -85,12 +85,11 @@ def team_size(environments: int) -> int:
 
 @launching()
 def run_team(kernel: Any, drive: np.ndarray, *arguments: Any, active: Sequence[int] = (0,)) -> None:
-    """Launches `kernel(team, drive, ..., sync)`; tuples of arguments are spread.
+    """Launches `kernel(team, drive, *arguments, sync)`; a tuple of arrays is the argument for an argument pack.
 
     drive: (environments, substeps, ...); active: those that have substeps to do. Only they take turns: Taichi cuts a
     longer loop into as many equal pieces as there are threads, whether there is work in a piece or not.
     """
-    flat = [a for group in arguments for a in (group if isinstance(group, tuple) else (group,))]
     sync = np.zeros((len(active), 16), np.int32)
     sync[:, ENVIRONMENT] = active
-    launch(kernel, team_size(len(active)), drive, *flat, sync)
+    launch(kernel, team_size(len(active)), drive, *arguments, sync)

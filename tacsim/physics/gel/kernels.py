@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 from tacsim.compute.runtime import ti
 from tacsim.physics.exec import layout
-from tacsim.physics.exec.environment import record_least, record_sum
+from tacsim.physics.exec.environment import Floats, record_least, record_sum
 from tacsim.physics.exec.lanes import (
     COPIES,
     LANES,
@@ -25,6 +25,9 @@ from tacsim.physics.exec.lanes import (
 from tacsim.physics.gel.element import ROWS, SMALLEST, element_block
 
 Lattice = ti.types.ndarray(dtype=lanes, ndim=1)
+
+# `GelState.arguments`, as kernels take them
+GelArrays = ti.types.argpack(nodes=Floats, surface=Floats, contact_force=Floats, corners=Floats, lattice=Lattice)
 
 
 class Gels(NamedTuple):

@@ -141,7 +141,7 @@ def press_substep(
 
 @ti.kernel
 def elements_of_hybrid(
-    clock: Clock, nodes: Floats, surface: Floats, contact_force: Floats, corners: Floats, lattice: Lattice,
+    clock: Clock, nodes: Floats, corners: Floats, lattice: Lattice,
     params: Params, counts: Counts, partial: Partial, ceiling: Ceiling, layers: ti.i32, columns: ti.i32,
 ):  # fmt: skip
     """First third of a substep of every environment's two gels and body
@@ -150,7 +150,7 @@ def elements_of_hybrid(
     for e, k, n in ti.ndrange(counts.shape[0], layers, columns):
         env = ti.static(Environment(e, params, counts, partial))
         if is_active(env, clock):
-            element(env, ti.static(Gels(nodes, surface, contact_force, corners, lattice, 2)), k, n)
+            element(env, ti.static(Gels(nodes, None, None, corners, lattice, 2)), k, n)
             if k == 0 and n < PARTS:
                 clear_sums(env, n)
             if k == 0 and n < 2:

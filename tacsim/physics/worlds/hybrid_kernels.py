@@ -1,7 +1,7 @@
 """Kernels of two gels round a plasticine body: contact, transfers and motion, many substeps in one launch."""
 
-from tacsim.compute.apart import apart
 from tacsim.compute.runtime import ti
+from tacsim.compute.taichi_patches.separate_functions import compiled_separately
 from tacsim.physics.body.follow import Ends, follow, push_leaders
 from tacsim.physics.body.mass import CHANGE, SECOND, cell_means, filtered_change, grid_changes, second_changes
 from tacsim.physics.body.transfers import (
@@ -15,7 +15,15 @@ from tacsim.physics.body.transfers import (
 )
 from tacsim.physics.contact.contact import ContactHistory, contact_ceiling, particle_contact, support_radius
 from tacsim.physics.exec import layout
-from tacsim.physics.exec.environment import Counts, Environment, Floats, Params, Partial, record_sum
+from tacsim.physics.exec.environment import (
+    Counts,
+    Environment,
+    EnvironmentArrays,
+    Floats,
+    Params,
+    Partial,
+    record_sum,
+)
 from tacsim.physics.exec.lanes import (
     LANES,
     NODES,
@@ -23,6 +31,7 @@ from tacsim.physics.exec.lanes import (
     PARTS,
     copy_of,
     filled,
+    ivec3,
     load_rows,
     part_range,
     slot_of,
@@ -32,8 +41,8 @@ from tacsim.physics.exec.lanes import (
     vec2,
     vec3,
 )
-from tacsim.physics.exec.team import CHUNK, ENVIRONMENT, Sync, first_in_chunk, next_piece, once_if, own_part, piece_done
-from tacsim.physics.gel.kernels import Gels, Lattice, contact_force_start, gel_forces, gel_of
+from tacsim.physics.exec.team import CHUNK, ENVIRONMENT, Sync, first_in_chunk, next_piece, one_if, own_part, piece_done
+from tacsim.physics.gel.kernels import GelArrays, Gels, Lattice, contact_force_start, gel_forces, gel_of
 from tacsim.physics.gel.mass import gel_advance_filtered, gel_even, gel_means
 
 Drive = ti.types.ndarray(dtype=ti.f32, ndim=5)
@@ -42,6 +51,10 @@ STAGES = 7  # of a substep
 TURN = 1.0 / 3.0  # share of the boost that rotations get: with more of it bodies overshoot when a slide stops
 
 ContactHistories = ti.types.ndarray(dtype=ContactHistory, ndim=3)
+# `BodyState.arguments`, `changes` and `links`, as kernels take them
+BodyArrays = ti.types.argpack(
+    particles=Floats, masses=Strips, velocities=Strips, changes=Floats, ends=Ends, shares=Floats
+)
 
 
 @ti.func
@@ -225,16 +238,17 @@ def keep_record(env: ti.template(), part, it, records: ti.template()):
     """At the end of substep `it`, if it is one of those after which the part's numbers are wanted."""
     every = env.count(layout.EVERY)
     record = (it + 1) // every - 1
-    for _wanted in range(once_if((it + 1) % every == 0 and record < layout.RECORDS)):
+    for _wanted in range(one_if((it + 1) % every == 0 and record < layout.RECORDS)):
         for number in range(layout.NUMBERS):
             records[env.index, record, part, number] = env.partial[env.index, part, number]
 
 
-# Nearly all work is compiled apart from the kernel (see tacsim.compute.apart). Particles to grid is not: it is so large
-# that LLVM leaves it apart, looks up after each store where its arrays lie, and merges no lanes.
+# Nearly all work is compiled separately from the kernel. Particles to grid is not: it is so large that LLVM does not
+# inline it, reads after each store where its arrays are, and merges no lanes. Arrays that a function does not use are
+# None, since Taichi passes a separate function its arrays one by one.
 
 
-@apart
+@compiled_separately
 def on_gels(
     work: ti.template(), index: ti.i32, part: ti.i32,
     nodes: Floats, surface: Floats, contact_force: Floats, corners: Floats, lattice: Lattice,
@@ -245,51 +259,60 @@ def on_gels(
     work(env, part, ti.static(Gels(nodes, surface, contact_force, corners, lattice, 2)))
 
 
-@apart
+@compiled_separately
 def on_body(
     work: ti.template(), index: ti.i32, part: ti.i32,
-    particles: Floats, masses: Strips, velocities: Strips, changes: Floats, ends: Ends, shares: Floats,
+    particles: Floats, masses: Strips, velocities: Strips, changes: Floats,
     params: Params, counts: Counts, partial: Partial,
 ):  # fmt: skip
     """Does work(env, part, body)."""
     env = ti.static(Environment(index, params, counts, partial))
-    work(env, part, ti.static(Body(particles, masses, velocities, changes, ends, shares)))
+    work(env, part, ti.static(Body(particles, masses, velocities, changes)))
 
 
-@apart
+@compiled_separately
+def on_links(
+    work: ti.template(), index: ti.i32, part: ti.i32,
+    masses: Strips, velocities: Strips, changes: Floats, ends: Ends, shares: Floats,
+    params: Params, counts: Counts, partial: Partial,
+):  # fmt: skip
+    """Does work(env, part, body) with the links between light nodes and their leaders."""
+    env = ti.static(Environment(index, params, counts, partial))
+    work(env, part, ti.static(Body(None, masses, velocities, changes, ends, shares)))
+
+
+@compiled_separately
 def contacts(
-    index: ti.i32, part: ti.i32, it: ti.i32, highest: vec2, drive: Drive,
-    nodes: Floats, surface: Floats, contact_force: Floats, corners: Floats, lattice: Lattice,
-    particles: Floats, masses: Strips, velocities: Strips, changes: Floats, ends: Ends, shares: Floats,
+    place: ivec3, highest: vec2, drive: Drive, surface: Floats, contact_force: Floats, particles: Floats,
     histories: ContactHistories, params: Params, counts: Counts, partial: Partial,
 ):  # fmt: skip
-    """Contact of a part's particles with both gels; highest: contact_ceiling of each."""
+    """Contact of a part's particles with both gels.
+
+    place: environment, part, substep; highest: contact_ceiling of each gel.
+    """
+    index, part, it = place[0], place[1], place[2]
     env = ti.static(Environment(index, params, counts, partial))
-    gels = ti.static(Gels(nodes, surface, contact_force, corners, lattice, 2))
-    body = ti.static(Body(particles, masses, velocities, changes, ends, shares))
+    gels = ti.static(Gels(None, surface, contact_force, None, None, 2))
+    body = ti.static(Body(particles, None, None))
     partial[index, part, layout.OVERLAP] = 0.0
     for g in range(2):
         gel_contact(env, part, g, it, drive, body, histories, gels, highest[g])
 
 
-@apart
+@compiled_separately
 def grid_motion(
-    index: ti.i32, part: ti.i32, it: ti.i32, drive: Drive,
-    particles: Floats, masses: Strips, velocities: Strips, changes: Floats, ends: Ends, shares: Floats,
+    index: ti.i32, part: ti.i32, it: ti.i32, drive: Drive, velocities: Strips, changes: Floats,
     params: Params, counts: Counts, partial: Partial,
 ):  # fmt: skip
     """Does `grid_update`."""
     env = ti.static(Environment(index, params, counts, partial))
-    grid_update(env, part, it, drive, ti.static(Body(particles, masses, velocities, changes, ends, shares)))
+    grid_update(env, part, it, drive, ti.static(Body(None, None, velocities, changes)))
 
 
 @ti.kernel
 def substeps(
-    team: ti.i32, drive: Drive,
-    nodes: Floats, surface: Floats, contact_force: Floats, corners: Floats, lattice: Lattice,
-    particles: Floats, masses: Strips, velocities: Strips, changes: Floats, ends: Ends, shares: Floats,
-    histories: ContactHistories,
-    params: Params, counts: Counts, partial: Partial, records: Records, sync: Sync,
+    team: ti.i32, drive: Drive, gel_arrays: GelArrays, body_arrays: BodyArrays, histories: ContactHistories,
+    environments: EnvironmentArrays, records: Records, sync: Sync,
 ):  # fmt: skip
     """Explicit substeps of every environment's scene in one launch, `team` threads an environment.
 
@@ -301,11 +324,15 @@ def substeps(
         for _ in range(first_in_chunk(task)):
             turn = task // CHUNK // team
             index = sync[turn, ENVIRONMENT]
-            env = ti.static(Environment(index, params, counts, partial))
-            of_gels = ti.static((nodes, surface, contact_force, corners, lattice))
-            gels = ti.static(Gels(nodes, surface, contact_force, corners, lattice, 2))
-            body = ti.static(Body(particles, masses, velocities, changes, ends, shares))
-            shared = ti.static((params, counts, partial))
+            shared = ti.static((environments.params, environments.counts, environments.partial))
+            env = ti.static(Environment(index, *shared))
+            of_gels = ti.static(
+                (gel_arrays.nodes, gel_arrays.surface, gel_arrays.contact_force, gel_arrays.corners, gel_arrays.lattice)
+            )
+            gels = ti.static(Gels(*of_gels, number=2))
+            of_grid = ti.static((body_arrays.masses, body_arrays.velocities, body_arrays.changes))
+            of_links = ti.static((body_arrays.ends, body_arrays.shares))
+            body = ti.static(Body(body_arrays.particles, *of_grid, *of_links))
             steps = env.count(layout.STEPS)
             stages, own = STAGES * steps + 1, own_part(task, team)
             highest, known = vec2(0.0), -1  # of the two gels, in this stage
@@ -313,33 +340,36 @@ def substeps(
             while piece < stages * PARTS:
                 stage, part = piece // PARTS, piece % PARTS
                 it, scatters = stage // STAGES, stage % STAGES == 0
-                for _new in range(once_if(scatters and stage != known)):
+                for _new in range(one_if(scatters and stage != known)):
                     known = stage
                     for g in ti.static(range(2)):
                         highest[g] = contact_ceiling(ti.static(gel_of(env, gels, g)))
-                for _gather in range(once_if(scatters and it > 0)):
-                    on_body(grid_to_particles, index, part, *body, *shared)
-                for _scatter in range(once_if(scatters and it < steps)):
-                    contacts(index, part, it, highest, drive, *of_gels, *body, histories, *shared)
+                for _gather in range(one_if(scatters and it > 0)):
+                    on_body(grid_to_particles, index, part, body.particles, *of_grid, *shared)
+                for _scatter in range(one_if(scatters and it < steps)):
+                    place = ivec3(index, part, it)
+                    contacts(
+                        place, highest, drive, gels.surface, gels.contact_force, body.particles, histories, *shared
+                    )
                     clear_masses(env, part, body)
                     particles_to_grid(env, part, it, body)
                     on_gels(gel_forces, index, part, *of_gels, *shared)
-                for _totals in range(once_if(stage % STAGES == 1)):
+                for _totals in range(one_if(stage % STAGES == 1)):
                     on_gels(gel_means, index, part, *of_gels, *shared)
-                    on_body(grid_changes, index, part, *body, *shared)
-                    on_body(push_leaders, index, part, *body, *shared)
-                for _even in range(once_if(stage % STAGES == 2)):
+                    on_body(grid_changes, index, part, body.particles, *of_grid, *shared)
+                    on_links(push_leaders, index, part, *of_grid, *of_links, *shared)
+                for _even in range(one_if(stage % STAGES == 2)):
                     on_gels(gel_even, index, part, *of_gels, *shared)
-                for _cells in range(once_if(stage % STAGES == 2 or stage % STAGES == 4)):
+                for _cells in range(one_if(stage % STAGES == 2 or stage % STAGES == 4)):
                     cell_means(env, part, ti.select(stage % STAGES == 2, CHANGE, SECOND), body)
-                for _motion in range(once_if(stage % STAGES == 3)):
+                for _motion in range(one_if(stage % STAGES == 3)):
                     on_gels(gel_advance_filtered, index, part, *of_gels, *shared)
-                    on_body(second_changes, index, part, *body, *shared)
-                for _motion in range(once_if(stage % STAGES == 5)):
-                    grid_motion(index, part, it, drive, *body, *shared)
-                for _light in range(once_if(stage % STAGES == 6)):
-                    on_body(follow, index, part, *body, *shared)
-                for _end in range(once_if(stage % STAGES == STAGES - 1)):
+                    on_body(second_changes, index, part, body.particles, *of_grid, *shared)
+                for _motion in range(one_if(stage % STAGES == 5)):
+                    grid_motion(index, part, it, drive, body.velocities, body.changes, *shared)
+                for _light in range(one_if(stage % STAGES == 6)):
+                    on_links(follow, index, part, *of_grid, *of_links, *shared)
+                for _end in range(one_if(stage % STAGES == STAGES - 1)):
                     keep_record(env, part, it, records)
                 piece_done(sync, turn)
                 piece = next_piece(sync, turn, own, stages)

@@ -131,10 +131,11 @@ class HybridState(FemState):
             self.device.run(drive)
         else:
             self._gels.refresh()
+            body = self._particles
             run_team(
-                substeps, drive, self._gels.arguments(), self._particles.arguments(),
-                self._particles.changes.reshape(-1), *self._particles.links(), self._contact_history, self.params,
-                self.counts, self.partial, self.records, active=list(drives),
+                substeps, drive, self._gels.arguments(),
+                (*body.arguments(), body.changes.reshape(-1), *body.links()), self._contact_history,
+                (self.params, self.counts, self.partial), self.records, active=list(drives),
             )  # fmt: skip
         for index in drives:
             self._particles.keep_grid(index, self.counts)

@@ -1,16 +1,9 @@
 """Kernel of a rigid indenter on one gel."""
 
 from tacsim.compute.runtime import ti
-from tacsim.physics.contact.indenter import (
-    Anchor,
-    Indenter,
-    Pressure,
-    Values,
-    carry,
-    indent,
-)
+from tacsim.physics.contact.indenter import Indenter, IndenterArrays, carry, indent
 from tacsim.physics.exec import layout
-from tacsim.physics.exec.environment import Counts, Environment, Floats, Params, Partial
+from tacsim.physics.exec.environment import Environment, EnvironmentArrays
 from tacsim.physics.exec.lanes import PARTS
 from tacsim.physics.exec.team import (
     CHUNK,
@@ -18,38 +11,45 @@ from tacsim.physics.exec.team import (
     Sync,
     first_in_chunk,
     next_piece,
-    once_if,
+    one_if,
     own_part,
     piece_done,
 )
-from tacsim.physics.gel.kernels import Gels, Lattice, gel_advance, gel_forces, gel_of
+from tacsim.physics.gel.kernels import GelArrays, Gels, gel_advance, gel_forces, gel_of
 from tacsim.physics.worlds.hybrid_kernels import Drive
 
 
 @ti.kernel
 def substeps(
-    team: ti.i32, drive: Drive,
-    nodes: Floats, surface: Floats, contact_force: Floats, corners: Floats, lattice: Lattice,
-    anchor: Anchor, pressure: Pressure, values: Values,
-    params: Params, counts: Counts, partial: Partial, sync: Sync,
+    team: ti.i32, drive: Drive, gel_arrays: GelArrays, indenter_arrays: IndenterArrays,
+    environments: EnvironmentArrays, sync: Sync,
 ):  # fmt: skip
     """Explicit substeps in one launch by `team` threads; drive: pose and velocity of the indenter, sensor frame."""
     for task in range(sync.shape[0] * team * CHUNK):
         for _ in range(first_in_chunk(task)):
             turn = task // CHUNK // team
             index = sync[turn, ENVIRONMENT]
-            env = ti.static(Environment(index, params, counts, partial))
-            gels = ti.static(Gels(nodes, surface, contact_force, corners, lattice, 1))
+            env = ti.static(Environment(index, environments.params, environments.counts, environments.partial))
+            gels = ti.static(
+                Gels(
+                    gel_arrays.nodes,
+                    gel_arrays.surface,
+                    gel_arrays.contact_force,
+                    gel_arrays.corners,
+                    gel_arrays.lattice,
+                    1,
+                )
+            )
             gel = ti.static(gel_of(env, gels, 0))
-            indenter = ti.static(Indenter(anchor, pressure, values))
+            indenter = ti.static(Indenter(indenter_arrays.anchor, indenter_arrays.pressure, indenter_arrays.values))
             stages, own = 2 * env.count(layout.STEPS), own_part(task, team)  # two a substep: forces, then motion
             piece = next_piece(sync, turn, own, stages)
             while piece < stages * PARTS:
                 stage, part = piece // PARTS, piece % PARTS
-                for _forces in range(once_if(stage % 2 == 0)):
+                for _forces in range(one_if(stage % 2 == 0)):
                     indent(env, part, stage // 2, drive, gel, indenter)
                     gel_forces(env, part, gels)
-                for _motion in range(once_if(stage % 2 == 1)):
+                for _motion in range(one_if(stage % 2 == 1)):
                     carry(env, part, gel)
                     gel_advance(env, part, gels)
                 piece_done(sync, turn)

@@ -128,8 +128,8 @@ class PressState(FemState):
             return
         self._gels.refresh()
         run_team(
-            substeps, drive, self._gels.arguments(), self._anchor, self._pressure, self._values,
-            self.params, self.counts, self.partial, active=list(drives),
+            substeps, drive, self._gels.arguments(), (self._anchor, self._pressure, self._values),
+            (self.params, self.counts, self.partial), active=list(drives),
         )  # fmt: skip
 
 

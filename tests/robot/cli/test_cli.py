@@ -258,6 +258,7 @@ def test_a_broken_mesh_file_ends_with_2(name: str, content: bytes, said: str, tm
         ("TACSIM_THREADS", "0", "TACSIM_THREADS must be a whole number from 1 on"),
         ("TACSIM_DEVICE", "abacus", "TACSIM_DEVICE must be one of cpu"),
         ("TACSIM_DEVICE", "metal", "Taichi finds no such device"),
+        ("TACSIM_TAICHI_PATCHES", "off", "TACSIM_TAICHI_PATCHES must be 0 (off) or 1 (on)"),
     ],
 )
 def test_a_machine_that_is_not_there_ends_with_2(variable: str, value: str, said: str, tmp_path: Path) -> None:

@@ -286,9 +286,9 @@ def test_nothing_is_recompiled_for_a_second_scene() -> None:
 
 
 @pytest.mark.cpu
-def test_what_is_compiled_apart_is_put_back(tmp_path: Path) -> None:
-    """Functions that LLVM left apart would look up their arrays after each store, and merge no lanes: a quarter slower
-    (docs/decisions/0017)."""
+def test_functions_compiled_separately_are_inlined(tmp_path: Path) -> None:
+    """One that LLVM does not inline reads where its arrays are after each store, and merges no lanes: a quarter slower
+    (docs/taichi-patches.md)."""
     code = """
 from tacsim.models.scene import Scene
 from tacsim.physics.world import make_world
@@ -301,8 +301,8 @@ make_world(Scene(preset="draft")).move({})"""
         "".join(file.read_text(encoding="utf-8") for file in tmp_path.glob(f"*{which}*.ll"))
         for which in ("generic_llvm_ir", "llvm_ir_optimized")
     )
-    assert len(set(re.findall(r"define internal void @(apart_\d+)", before))) == 11
-    assert "define internal void @function_body" in after and "@apart" not in after
+    assert len(set(re.findall(r"define internal void @(compiled_separately_\d+)", before))) == 11
+    assert "define internal void @function_body" in after and "@compiled_separately" not in after
 
 
 def test_unknown_frames_are_refused() -> None:

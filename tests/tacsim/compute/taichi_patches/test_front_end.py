@@ -1,4 +1,4 @@
-"""The quicker front end changes no kernel, and still says where a mistake in one stands."""
+"""The faster front end changes no kernel, and an error in one still names its place."""
 
 from __future__ import annotations
 
@@ -8,11 +8,10 @@ import subprocess
 import sys
 from collections import namedtuple
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
-from tacsim.compute.front_end import function_source, quicken
+from tacsim.compute.taichi_patches.front_end import function_source
 from tests.tacsim.compute.fresh_process import run_script
 
 KERNELS = """
@@ -140,7 +139,7 @@ def test_cached_kernels_are_those_of_taichi_itself(tmp_path: Path) -> None:
     assert ours[0].startswith("6.0\n36.0\n") and "6.0\n36.0\n" in theirs[0]
 
 
-def test_a_mistake_in_a_kernel_is_told_with_its_place(tmp_path: Path) -> None:
+def test_an_error_in_a_kernel_names_its_place(tmp_path: Path) -> None:
     printed, _ = run(tmp_path, "ours")
     assert printed.startswith("6.0\n36.0\n")
     line = KERNELS.splitlines().index("    a[0] = nowhere") + 1
@@ -158,7 +157,7 @@ def test_the_lines_of_a_function_are_those_that_inspect_finds(tmp_path: Path, mo
         assert function_source(function) is None  # inspect is asked
 
 
-def test_what_taichi_hardly_uses_is_imported_when_it_does() -> None:
+def test_modules_that_taichi_rarely_uses_are_imported_at_first_use() -> None:
     code = """
 import sys
 import tacsim.compute.runtime
@@ -172,9 +171,3 @@ print(type(dill).__name__, type(urllib.request).__name__)
     command = [sys.executable, "-W", "ignore", "-c", code]
     done = subprocess.run(command, capture_output=True, text=True, timeout=100, check=True)
     assert done.stdout == "[]\nfindsource Request\nmodule module\n"
-
-
-def test_another_taichi_stays_as_it_is() -> None:
-    lang = SimpleNamespace(kernel_impl=SimpleNamespace(renamed=1, getsourcelines=1), expr=SimpleNamespace(Expr=2))
-    quicken(lang)
-    assert vars(lang.kernel_impl) == {"renamed": 1, "getsourcelines": 1} and vars(lang.expr) == {"Expr": 2}

@@ -1,12 +1,10 @@
-"""Taichi's front end, which turns the Python of a kernel into its own code anew in every process, in a third of the
-time.
+"""A faster front end for Taichi: it turns the Python of a kernel into Taichi's statements in a third of the time.
 
-Compiled kernels are kept on disk, but Taichi looks them up by what its front end makes of them. Most of that time went
-to what nobody reads: each node of the syntax tree had its place drawn for an error message, with a line of carets; each
-function had the file of its caller looked for among all modules, and its own text read and parsed again wherever it is
-inlined. Most of the rest goes to small things done ten thousand times: tables built for each sum, tests of each
-constant, each index and each call for what they hardly ever are.
-Nothing here changes what is compiled: cached kernels are found as before (tests/tacsim/compute/test_front_end.py).
+Taichi runs its front end in every process, because a kernel's cache key is computed from its output. Most of the time
+went to error messages (a drawing of the source line for each node of the syntax tree), to a search of all modules for
+the file of each function's caller, and to reading and parsing a function wherever it is inlined. Most of the rest is
+overhead per node: tables built for each sum, type tests of each constant, index and call.
+The output is the same to the byte, so the cache keys are (tests/tacsim/compute/taichi_patches/test_front_end.py).
 """
 
 import ast
@@ -23,9 +21,9 @@ from importlib import import_module
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
-WHOLE = 2**31  # integers below are numbers of 32 bits and 64
+INT32_LIMIT = 2**31
 
-# All but the product of matrices, which is Taichi's own
+# All but the matrix product, which is Taichi's own
 OPERATORS: dict[type[ast.operator], Callable[[Any, Any], Any]] = {
     ast.Add: operator.add,
     ast.Sub: operator.sub,
@@ -44,15 +42,15 @@ OPERATORS: dict[type[ast.operator], Callable[[Any, Any], Any]] = {
 
 @contextmanager
 def light_import() -> Iterator[None]:
-    """For the import of Taichi.
+    """Context of the import of Taichi.
 
-    Where each of its own functions is decorated, it has the caller's module looked for among all that are loaded, and
-    finds the caller's file without it. And a fifth of the time is for modules that it hardly ever uses: to ask a server
-    for news, and to find what is typed at a prompt.
+    Each decorator of Taichi's own functions searches all loaded modules for the caller's, and does not need it: the
+    search is replaced. Modules that take a fifth of the time and are rarely used (to ask a server for a newer version,
+    to read functions typed at a prompt) are imported at their first use.
     """
     search = inspect.getmodule
     inspect.getmodule = lambda *_: None
-    later = [_Later(name) for name in ("urllib.request", "dill") if name not in sys.modules]
+    later = [_LazyModule(name) for name in ("urllib.request", "dill") if name not in sys.modules]
     sys.modules.update({module.__name__: module for module in later})
     try:
         with _no_collection():
@@ -60,24 +58,24 @@ def light_import() -> Iterator[None]:
     finally:
         inspect.getmodule = search
         for module in later:
-            module._leave()
+            module._remove()
 
 
-class _Later(ModuleType):
-    """What stands for a module until something is asked of it; only those see it who imported it meanwhile."""
+class _LazyModule(ModuleType):
+    """Placeholder of a module, which is imported at the first attribute access."""
 
     def __getattr__(self, name: str) -> Any:
-        self._leave()
+        self._remove()
         return getattr(import_module(self.__name__), name)
 
-    def _leave(self) -> None:
+    def _remove(self) -> None:
         if sys.modules.get(self.__name__) is self:
             del sys.modules[self.__name__]
 
 
 @contextmanager
 def _no_collection() -> Iterator[None]:
-    """While much is made that stays: to look through it again and again takes a tenth of the time."""
+    """No garbage collection while many lasting objects are made: repeated collections take a tenth of the time."""
     collects = gc.isenabled()
     gc.disable()
     try:
@@ -87,26 +85,23 @@ def _no_collection() -> Iterator[None]:
             gc.enable()
 
 
-def quicken(lang: Any) -> None:
-    """Puts quicker functions in the place of Taichi's own; to be called before any of our kernels is defined.
+def replace_front_end(lang: Any) -> None:
+    """Replaces functions of package `lang` (taichi.lang) by faster ones; to be called before any kernel is defined.
 
-    lang: package taichi.lang. What another version of Taichi does not have stays as it is: slower, not broken.
+    Raises AttributeError for a version of Taichi that lacks one of them.
     """
-    for part in (_quicken_reading, _quicken_kernels, _quicken_values, _quicken_names, _quicken_nodes):
-        with suppress(AttributeError):
-            part(lang)
+    for part in (_replace_reading, _replace_collection, _replace_values, _replace_name_lookup, _replace_nodes):
+        part(lang)
 
 
 def _replace(owner: Any, **makers: Callable[[Any], Any]) -> None:
-    """Puts in the place of each function what is made of it. Raises AttributeError, before any is replaced, if one is
-    not there."""
-    quicker = {name: make(getattr(owner, name)) for name, make in makers.items()}
-    for name, function in quicker.items():
-        setattr(owner, name, function)
+    """Replaces attributes of `owner`; each maker gets the present value and returns the new one."""
+    for name, make in makers.items():
+        setattr(owner, name, make(getattr(owner, name)))
 
 
-def _quicken_reading(lang: Any) -> None:
-    """How a function's text is read: once."""
+def _replace_reading(lang: Any) -> None:
+    """Each function's source is read once."""
     _replace(
         lang.kernel_impl,
         _inside_class=lambda _: _inside_class,
@@ -117,21 +112,21 @@ def _quicken_reading(lang: Any) -> None:
     )
 
 
-def _quicken_kernels(lang: Any) -> None:
-    """How a kernel's tree is built: without a search for garbage."""
+def _replace_collection(lang: Any) -> None:
+    """No garbage collection while a kernel's syntax tree is processed."""
     _replace(lang.kernel_impl.Kernel, materialize=_no_collection())
 
 
-def _quicken_values(lang: Any) -> None:
-    """How the values of a kernel are wrapped: most are made by Taichi's core, or numbers."""
+def _replace_values(lang: Any) -> None:
+    """Fewer type tests where values are wrapped: most are numbers or made by Taichi's core."""
     expr, impl = lang.expr, lang.impl
     core, wrapped = expr._ti_core, expr.Expr
     integer, real, debug_info = core.make_const_expr_int, core.make_const_expr_fp, core.DebugInfo
     inner, get_runtime = core.Expr, impl.get_runtime
 
     def constant(value: Any) -> Any:
-        """None if it is no plain number."""
-        if type(value) is int and -WHOLE <= value < WHOLE:
+        """Taichi's constant; None unless `value` is a plain number."""
+        if type(value) is int and -INT32_LIMIT <= value < INT32_LIMIT:
             return integer(get_runtime().default_ip, value)
         return real(get_runtime().default_fp, value) if type(value) is float else None
 
@@ -184,8 +179,8 @@ def _quicken_values(lang: Any) -> None:
     _replace(impl, expr_init=declare, validate_subscript_index=validate)
 
 
-def _quicken_names(lang: Any) -> None:
-    """How names are looked up, and places told."""
+def _replace_name_lookup(lang: Any) -> None:
+    """Faster lookup of names, and short source locations in error messages."""
     context, matrix, absent = lang.ast.ast_transformer_utils.ASTTransformerContext, lang.matrix.Matrix, object()
 
     def look_up(slowly: Callable[[Any, str], Any]) -> Callable[[Any, str], Any]:
@@ -198,11 +193,11 @@ def _quicken_names(lang: Any) -> None:
 
         return get_var_by_name
 
-    _replace(context, get_pos_info=lambda _: _place, get_var_by_name=look_up)
+    _replace(context, get_pos_info=lambda _: _location, get_var_by_name=look_up)
 
 
-def _quicken_nodes(lang: Any) -> None:
-    """How the nodes of the syntax tree are built."""
+def _replace_nodes(lang: Any) -> None:
+    """Less overhead per node of the syntax tree."""
     module, transformer = lang.ast.ast_transformer, lang.ast.ast_transformer.ASTTransformer
     builtins = {id(known) for known in (print, min, max, int, bool, float, any, all, abs, pow, len, operator.matmul)}
     decorators = {id(getattr(module.impl, name)): name for name in ("static", "static_assert", "grouped")}
@@ -210,7 +205,7 @@ def _quicken_nodes(lang: Any) -> None:
     type_error = module.TaichiTypeError
 
     def name(_: Any) -> Any:
-        def build_Name(context: Any, node: Any) -> Any:  # notes no place: that of its statement is enough
+        def build_Name(context: Any, node: Any) -> Any:  # records no location: that of its statement is enough
             node.ptr = context.get_var_by_name(node.id)
             return node.ptr
 
@@ -248,7 +243,7 @@ def _quicken_nodes(lang: Any) -> None:
 
         return staticmethod(get_decorator)
 
-    _replace(module, ChainMap=lambda _: _merged)  # of a call's keywords, of which there are hardly ever any
+    _replace(module, ChainMap=lambda _: _merged)  # of a call's keywords, which are rare
     _replace(
         transformer,
         build_Name=name,
@@ -267,8 +262,10 @@ def _quicken_nodes(lang: Any) -> None:
 def _by_statement(
     build: Callable[[Any, Any, Any], Any], methods: dict[type, Callable[[Any, Any], Any]]
 ) -> Callable[[Any, Any, Any], Any]:
-    """Builder.__call__, which notes where a node stands, for statements alone: what is in one stands where it does.
-    methods: of all other nodes."""
+    """Builder.__call__, which records the location of a node, for statements only: a node inside has its statement's.
+
+    methods: for all other kinds of nodes.
+    """
 
     def build_node(self: Any, context: Any, node: ast.AST) -> Any:
         method = methods.get(type(node))
@@ -282,17 +279,17 @@ def _merged(*maps: dict[str, Any]) -> dict[str, Any]:
 
 
 def function_source(function: Any) -> tuple[list[str], int] | None:
-    """A function's lines, and the number of the first, as inspect finds them by reading word for word; None where it
-    must.
+    """A function's lines and the number of the first, as `inspect.getsourcelines`, which tokenizes; None where that is
+    needed.
 
-    A function ends before a line that is indented no more than it is; unless that is in a bracket or a text, but then
-    what is above it is no whole function.
+    A function ends before the next line that is indented no more than it is. If such a line lies in a bracket or a
+    string, the lines above it do not parse, and the search goes on.
     """
     code = function.__code__
     lines = linecache.getlines(code.co_filename)[code.co_firstlineno - 1 :]
     if not lines or not lines[0].lstrip().startswith(("def ", "@")) or hasattr(function, "__wrapped__"):
         return None
-    end = 1  # of what has been seen of it
+    end = 1  # behind the last line of code so far
     for number, line in enumerate([*lines[1:], "end of file"], 1):
         if not line.strip() or line.lstrip().startswith("#"):
             continue
@@ -309,13 +306,13 @@ def _indentation(line: str) -> int:
 
 
 def _filled(line: str, **_: int) -> str:
-    """What textwrap makes of a line that is not too long."""
+    """`textwrap.fill` of a line that is not too long."""
     return line.expandtabs(4).rstrip()
 
 
 def _parse(text: str) -> ast.Module:
-    """The tree of a function, parsed once. Taichi reads it again and again, as it does the bodies of static loops; all
-    that it takes out of it are a kernel's arguments, which are put back."""
+    """The syntax tree of a function, parsed once. Taichi removes the arguments of a kernel from it; they are put
+    back."""
     tree, arguments = _parsed(text)
     tree.body[0].args.args = list(arguments)  # type: ignore[attr-defined]
     return tree
@@ -327,12 +324,12 @@ def _parsed(text: str) -> tuple[ast.Module, tuple[ast.arg, ...]]:
     return tree, tuple(tree.body[0].args.args)  # type: ignore[attr-defined]
 
 
-def _place(context: Any, node: Any) -> str:
-    """Where a node of a kernel's syntax tree stands, for error messages."""
+def _location(context: Any, node: Any) -> str:
+    """Location of a node of a kernel's syntax tree, for error messages."""
     line, source = node.lineno + context.lineno_offset, context.src[node.lineno - 1]
     return f'File "{context.file}", line {line}, in {context.func.func.__name__}:\n{source}\n'
 
 
 def _inside_class(level_of_class_stackframe: int) -> bool:
-    """Whether a decorated function stands in a class. Level: of the frame in which the class is, from here."""
+    """Whether a decorated function is a method; level: of the frame of the class, counted from here."""
     return "__qualname__" in sys._getframe(level_of_class_stackframe - 1).f_locals

@@ -1,4 +1,4 @@
-"""Functions compiled apart from their kernel compute what they do as part of it, and are kept on disk as it is."""
+"""Functions compiled separately give right results, and every process finds them in the kernel cache."""
 
 from __future__ import annotations
 
@@ -11,19 +11,14 @@ from tests.tacsim.compute.fresh_process import run_script
 pytestmark = pytest.mark.cpu
 
 KERNEL = """
-import random, sys
+import random
 import numpy as np
-from tacsim.compute import apart as module
 from tacsim.compute.runtime import start, ti
+from tacsim.compute.taichi_patches.separate_functions import compiled_separately
 start()
 garbage = [bytearray(random.randrange(600, 3000)) for _ in range(20000)]  # and holes in it, where functions come to lie
 for n in random.sample(range(20000), 10000):
     garbage[n] = None
-if "part" in sys.argv:
-    class Without:
-        lang, func, real_func = ti.lang, ti.func, lambda function: ti.func(function).unknown
-    module.ti = Without
-apart = module.apart
 
 Floats = ti.types.ndarray(dtype=ti.f32, ndim=1)
 
@@ -46,19 +41,19 @@ def add(a: ti.template(), i):
 def halve(a: ti.template(), i):
     a[i] *= 0.5
 
-@apart
+@compiled_separately
 def summed(i: ti.i32, highest: ti.i32, a: Floats, b: Floats):
     b[i] = powers(a, i, highest)
 
-@apart
+@compiled_separately
 def one(work: ti.template(), i: ti.i32, a: Floats):
     work(a, i)
 
-@apart
+@compiled_separately
 def raise_by(amount: ti.template(), i: ti.i32, a: Floats):
     a[i] += amount
 
-@apart
+@compiled_separately
 def both(i: ti.i32, a: Floats, b: Floats):
     one(add, i, a)
     one(halve, i, b)
@@ -80,11 +75,9 @@ print(a.tolist(), b.tolist())
 """
 
 
-def run(tmp_path: Path, *arguments: str, shift: float = 1.0, seed: int = 0) -> tuple[str, set[str]]:
+def run(tmp_path: Path, shift: float = 1.0, seed: int = 0) -> tuple[str, set[str]]:
     text = KERNEL.replace("SHIFT", str(shift))
-    return run_script(
-        tmp_path / "kernel.py", text, *arguments, kept=tmp_path / "kept", PYTHONHASHSEED=str(seed)
-    )  # fmt: skip
+    return run_script(tmp_path / "kernel.py", text, kept=tmp_path / "kept", PYTHONHASHSEED=str(seed))
 
 
 EXPECTED = "[0.5, 1.25, 2.0] [-1.0, 0.9375, 7.5]\n"
@@ -101,7 +94,3 @@ def test_another_body_of_a_function_is_another_kernel(tmp_path: Path) -> None:
     assert run(tmp_path)[0] == EXPECTED
     printed, kept = run(tmp_path, shift=2.0)
     assert printed == "[1.5, 2.25, 3.0] [-0.5, 1.4375, 8.0]\n" and len(kept) == 2
-
-
-def test_another_taichi_compiles_them_as_part_of_their_kernel(tmp_path: Path) -> None:
-    assert run(tmp_path, "part")[0] == EXPECTED

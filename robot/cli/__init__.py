@@ -24,10 +24,7 @@ from robot.cli.episode.recover import recover
 from robot.cli.episode.view import view
 from robot.cli.errors import Guarded
 from robot.cli.identify import body, gel, identify
-from robot.cli.learn.evaluate import evaluate
-from robot.cli.learn.export import export, policy, policy_range
-from robot.cli.learn.train import train
-from robot.cli.learn.transfer import transfer
+from robot.cli.learn import evaluate, export, policy, policy_range, train, transfer
 from robot.cli.mock import mock
 from robot.cli.run import replay, run
 from robot.cli.simulate import press, reproduce

@@ -144,6 +144,11 @@ class Bar:
         """How many steps are done, and of how many; None: nobody knows."""
         self._bar.update(self._row, completed=done, total=total)
 
+    def report(self, words: str, done: int, total: int) -> None:
+        """Both."""
+        self.say(words)
+        self.count(done, total)
+
 
 @contextmanager
 def one_bar(words: str) -> Iterator[Bar]:

@@ -25,8 +25,8 @@ from benchmarks.pages.page import COLUMNS, cells, setting, write_page
 from benchmarks.pages.picture import PICTURE, draw
 from benchmarks.pages.reliability import ROOT, write_reliability
 from robot.cli.errors import complain
-from robot.cli.interrupt import Interrupt
 from robot.cli.output import busy, notes, progress, results, say_files
+from robot.cli.terminal import Interrupt
 
 
 def read(paths: Sequence[Path]) -> list[Report]:

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 import typer
 
 from robot.cli.errors import FAILED, complain
-from robot.cli.interrupt import Interrupt
 from robot.cli.options import Overrides, quantity
 from robot.cli.output import busy, notes, one_bar, results
+from robot.cli.terminal import Interrupt
 
 if TYPE_CHECKING:
     from robot.collect.collect import Collected

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from robot.cli.interrupt import Interrupt
 from robot.cli.output import results
+from robot.cli.terminal import Interrupt
 
 if TYPE_CHECKING:
     from robot.mock import FaultClient

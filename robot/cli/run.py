@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from robot.cli.errors import FAILED, complain
-from robot.cli.interrupt import Interrupt
 from robot.cli.options import Out, Overrides
 from robot.cli.output import Bar, busy, measuring, new_directory, notes, one_bar, results, warn, writing
-from robot.cli.question import ask, require_person
+from robot.cli.terminal import Interrupt, ask, require_person
 
 if TYPE_CHECKING:
     from robot.deploy.control_loop import EpisodeSetup

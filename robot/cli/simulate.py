@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from robot.cli.errors import complain
-from robot.cli.interrupt import Interrupt
 from robot.cli.options import Out, Overrides, angle, length, quantities
 from robot.cli.output import busy, measuring, new_directory, notes, progress, results, say_files, writing
+from robot.cli.terminal import Interrupt
 
 if TYPE_CHECKING:
     from tacsim.report.figure4 import Trial

@@ -8,10 +8,9 @@ import typer
 
 from robot.cli.doctor import print_checks
 from robot.cli.errors import complain
-from robot.cli.interrupt import Interrupt
 from robot.cli.options import Overrides
 from robot.cli.output import busy, notes
-from robot.cli.question import ask, has_person
+from robot.cli.terminal import Interrupt, ask, has_person
 
 
 def start(

@@ -7,10 +7,9 @@ from typing import Annotated, Any
 import typer
 
 from robot.cli.errors import complain
-from robot.cli.interrupt import Interrupt
 from robot.cli.options import Overrides, length
 from robot.cli.output import busy, notes, results
-from robot.cli.question import ask, require_person
+from robot.cli.terminal import Interrupt, ask, require_person
 
 
 def latency(

@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from robot.cli.errors import complain
-from robot.cli.interrupt import Interrupt
 from robot.cli.output import notes, progress, writing
-from robot.cli.question import ask, has_person, has_real_arm
+from robot.cli.terminal import Interrupt, ask, has_person, has_real_arm
 
 if TYPE_CHECKING:
     import numpy as np

@@ -10,9 +10,8 @@ from typing import Annotated
 import typer
 
 from robot.cli.bench import bench
-from robot.cli.calibrate.latency import latency
 from robot.cli.calibrate.lens import lens
-from robot.cli.calibrate.poses import hand_eye, touch
+from robot.cli.calibrate.poses import hand_eye, latency, touch
 from robot.cli.calibrate.sensor import calibrate
 from robot.cli.collect import collect, episodes
 from robot.cli.collect import press as press_set

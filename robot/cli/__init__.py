@@ -16,16 +16,14 @@ from robot.cli.calibrate.sensor import calibrate
 from robot.cli.collect import collect, episodes
 from robot.cli.collect import press as press_set
 from robot.cli.compare import compare
-from robot.cli.debug import debug
-from robot.cli.doctor import doctor, schema
+from robot.cli.doctor import doctor, schema, start
 from robot.cli.errors import Guarded
 from robot.cli.identify import body, gel, identify
 from robot.cli.learn import evaluate, export, policy, policy_range, train, transfer
 from robot.cli.mock import mock
 from robot.cli.recordings import lerobot, recover, view
 from robot.cli.run import replay, run
-from robot.cli.simulate import press, reproduce
-from robot.cli.start import start
+from robot.cli.simulate import debug, press, reproduce
 
 app = typer.Typer(
     name="tacsim",

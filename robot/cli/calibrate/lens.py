@@ -99,7 +99,7 @@ def _take_views(
     kept then, too. Raises CannotCalibrate, DeviceError."""
     from calibration.lens.view import MIN_PICTURES
     from robot.camera.camera import Camera
-    from robot.procedures.board_views import BoardViewPlan, record_board_views
+    from robot.procedures.boards import BoardViewPlan, record_board_views
     from robot.procedures.session import CannotCalibrate
 
     if 1 < views < MIN_PICTURES:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from calibration.poses.ball_touch import TouchNoise
     from calibration.poses.records import BoardPoseFile, TouchFile
     from robot.procedures.ball_touches import BallTouchPlan
-    from robot.procedures.board_poses import BoardPosePlan
+    from robot.procedures.boards import BoardPosePlan
     from robot.procedures.session import Session
     from tacsim.interface import Pose
 
@@ -187,7 +187,7 @@ def hand_eye(
         return
     from calibration.lens.board import parse_board
     from calibration.lens.view import Lens
-    from robot.procedures.board_poses import BoardPosePlan
+    from robot.procedures.boards import BoardPosePlan
     from tacsim.config import load
 
     if not (rig and arm and camera and lens and board):
@@ -204,7 +204,7 @@ def _take_board_poses(
 ) -> BoardPoseFile:
     """Looks now; what was recorded is kept in `folder`, whatever ends it."""
     from calibration.poses.records import board_pose_file
-    from robot.procedures.board_poses import open_arm, open_camera, record_board_poses
+    from robot.procedures.boards import open_arm, open_camera, record_board_poses
     from tacsim.config import load_rig
 
     config = load_rig(rig, overrides=overrides).config

@@ -26,8 +26,7 @@ from robot.arm.channel import (
     tactile_record,
 )
 from robot.arm.dashboard import Dashboard
-from robot.arm.lost_link import Verdict, explain_lost_link
-from robot.arm.package_log import PackageLog
+from robot.arm.lost_link import PackageLog, Verdict, explain_lost_link
 from robot.arm.shared_ring import Record
 from robot.arm.status import AT_CONNECTING, ArmStatus
 from robot.arm.trajectory import PERIOD

@@ -14,7 +14,6 @@ from robot.cli.output import busy, measuring, new_directory, notes, progress, re
 from robot.cli.terminal import Interrupt
 
 if TYPE_CHECKING:
-    from tacsim.physics.failure.dump import Dump
     from tacsim.report.figure4 import Trial
 
 AXES = ("roll", "pitch", "yaw")
@@ -223,44 +222,19 @@ def debug(
 
         found = read(dump)
         world = dump_view.open_world(found)
-    _print_error(found)
-    rows = {"": dump_view.TITLES, **dump_view.table(found)}
-    for row, values in rows.items():
+    results.print(found.info.message, markup=False)
+    results.print(", ".join(f"{name} {version}" for name, version in found.info.versions.items()), markup=False)
+    for row, values in {"": dump_view.TITLES, **dump_view.table(found)}.items():
         shown = "".join(f"{values.get(moment, ''):50}" for moment in dump_view.TITLES)
         results.print(f"{row:38}{shown.rstrip()}", markup=False)
     picture = (dump.parent if dump.name == "dump.json" else dump) / "debug.png"
     with busy("drawing"):
         dump_view.draw(found, picture)
-    diverged = False
+    failure = None
     if again:
         with busy("running the motion again"):
-            outcome = dump_view.replay(found, world)
-        diverged = outcome.failure is not None
-        if outcome.stats is not None:
-            retries, settled = outcome.stats.retries, "yes" if outcome.stats.settled else "no"
-            how = f"after {retries} retries" if retries else "at the first attempt"
-            said = f"does not diverge: reached its targets {how}, settled: {settled}"
-        elif outcome.identical:
-            said = "diverges again, exactly as recorded, to the last bit"
-        else:
-            said = f"diverges again, otherwise than recorded: {outcome.failure}"
-        results.print(f"replay    {said}", markup=False)
+            failure, outcome = dump_view.replay(found, world)
+        results.print(f"replay    {outcome}", markup=False)
     say_files(picture)
-    if diverged:
+    if failure is not None:
         raise typer.Exit(FAILED)
-
-
-def _print_error(dump: Dump) -> None:
-    info = dump.info
-    made = ", ".join(f"{name} {version}" for name, version in info.versions.items())
-    lines = {
-        "cause": info.cause,
-        "at": info.place,
-        "where": info.where,
-        "retried": f"down to 1/{info.refine} of the time step" if info.refine > 1 else "",
-        "written": f"{info.time}, {made}",
-        "advice": info.advice,
-    }
-    for name, line in lines.items():
-        if line:
-            results.print(f"{name:10}{line}", markup=False)

@@ -73,7 +73,7 @@ class URArm(Closing):
     SafetyViolation (it stands outside its workspace, or feels too much), DeviceAlreadyConnectedError.
     """
 
-    _way: tuple[FloatArray, FloatArray] | None = None  # of an arm that is led to its start (robot.arm.start_arm)
+    _way: tuple[FloatArray, FloatArray] | None = None  # of an arm that is led to its start (robot.procedures.to_start)
     _bearable: tuple[ArmStatus, ...] = ()  # faults that it may be opened with
 
     def __init__(

@@ -135,7 +135,7 @@ def press(
         name = pressing_side(scene.indenter).name
         said = [*said, f"pressing side of each mesh: {name}; --set indenter.roll and indenter.pitch choose another"]
     for words in said:
-        notes.print(words, markup=False)
+        notes.print(words)
     command = _command("press", given)
     _run(PressJob(settings, count), out, files, command, workers, ray)
 
@@ -228,12 +228,11 @@ def _say(done: Collected, count: int, seconds: float, out: Path) -> None:
         parts = ", ".join(f"{name} {100 * part / spent:.0f} %" for name, part in done.seconds.most_common())
         results.print(
             f"{done.made} made in {seconds:.1f} s by {len(done.workers)}: {done.made / seconds:.2f} a second; "
-            f"of their time {parts}; {done.bytes / 2**20:.1f} MiB written in {done.writing:.1f} s",
-            markup=False,
+            f"of their time {parts}; {done.bytes / 2**20:.1f} MiB written in {done.writing:.1f} s"
         )
     if done.failures:
-        notes.print(f"{len(done.failures)} of {count} failed; why is in {out / 'failures.jsonl'}", markup=False)
-    results.print(str(out), markup=False)
+        notes.print(f"{len(done.failures)} of {count} failed; why is in {out / 'failures.jsonl'}")
+    results.print(str(out))
 
 
 def _checked(model: Any, **values: Any) -> Any:

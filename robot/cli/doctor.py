@@ -128,7 +128,7 @@ def start(
             with busy("connecting") as show:
                 guide = Guide(
                     lambda question: ask(f"Rig '{config.name}': {question}"),
-                    lambda words: notes.print(words, markup=False),
+                    lambda words: notes.print(words),
                     show,
                     interrupt,
                 )
@@ -139,4 +139,4 @@ def start(
     if any(distance > 5e-3 for distance in away.values()) or not away:
         complain("not every arm stands at its start")
         raise typer.Exit(1)
-    notes.print(f"All arms stand at their starts. Next: tacsim run {rig} --dry-run", markup=False)
+    notes.print(f"All arms stand at their starts. Next: tacsim run {rig} --dry-run")

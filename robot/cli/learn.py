@@ -79,15 +79,13 @@ def train(
         path = _train(run)
     except BadDraws:
         if run.last()[0]:
-            notes.print(f"What was learned is kept. Make a file of it: tacsim export policy {run.folder}", markup=False)
+            notes.print(f"What was learned is kept. Make a file of it: tacsim export policy {run.folder}")
         raise
     except (KeyboardInterrupt, OSError):
-        notes.print(f"What was learned is kept. Go on: tacsim train --resume {run.folder}", markup=False)
+        notes.print(f"What was learned is kept. Go on: tacsim train --resume {run.folder}")
         raise
     say_files(path, run.folder / "curve.json")
-    notes.print(
-        f"Next: tacsim evaluate {task or run.settings.training.task} --policy {path} --policy scripted", markup=False
-    )
+    notes.print(f"Next: tacsim evaluate {task or run.settings.training.task} --policy {path} --policy scripted")
 
 
 def require_torch(command: str) -> None:
@@ -119,8 +117,7 @@ def _train(run: RunFolder) -> Path:
             f"round {figures['round']:.0f}: {1e3 * figures['distance']:.3f} mm from the goal, success "
             f"{100 * figures['success']:.0f} %, {figures['peak_force']:.1f} N at most, "
             f"{figures['steps'] / figures['seconds']:.0f} steps/s"
-            + (f", {figures['refused']:.0f} draws refused" if figures["refused"] else ""),
-            markup=False,
+            + (f", {figures['refused']:.0f} draws refused" if figures["refused"] else "")
         )
 
     with one_bar("starting") as bar:
@@ -144,7 +141,7 @@ def policy(
         from robot.train.train import export_policy
 
         worst = export_policy(RunFolder(run), out)
-    results.print(f"{out} ({out.stat().st_size / 1024:.0f} KiB), within {worst:.1g} of the network", markup=False)
+    results.print(f"{out} ({out.stat().st_size / 1024:.0f} KiB), within {worst:.1g} of the network")
 
 
 def policy_range(
@@ -183,7 +180,7 @@ def policy_range(
     with one_bar("starting") as bar:
         found = measure_range(policy, settings, episodes, bar.report)
     write_range(policy, out, found)
-    results.print(f"{out}: range of {found.episodes} episodes", markup=False)
+    results.print(f"{out}: range of {found.episodes} episodes")
 
 
 def _require_new(out: Path) -> None:
@@ -231,7 +228,7 @@ def evaluate(
             if json_ is not None:
                 _write(json_, played.values())
             done, success = len(so_far.episodes), _interval_text(so_far.success, 100, 0)
-            notes.print(f"{so_far.policy}: {done} of {episodes} episodes, success {success} %", markup=False)
+            notes.print(f"{so_far.policy}: {done} of {episodes} episodes, success {success} %")
 
         judged = judge_all(training, policy or ["teacher", "scripted", "random"], episodes, seed, bar.report, say, warn)
     _show_judged(judged)
@@ -317,7 +314,7 @@ def transfer(
         def report(words: str, done: int, of: int) -> None:
             bar.report(words, done, of)
             if not notes.is_terminal:
-                notes.print(f"{done} of {of}: {words}", markup=False)
+                notes.print(f"{done} of {of}: {words}")
 
         rows = summary(play(study, out, report, workers))
     with writing(out):

@@ -91,7 +91,7 @@ def lerobot(
 
     with counted("exporting") as on_step:
         export_lerobot(_recordings(episodes), folder, task=task, maps=maps, cut=cut, video=video, on_step=on_step)
-    notes.print(f'Load it: LeRobotDataset("{folder.name}", root="{folder}")', markup=False)
+    notes.print(f'Load it: LeRobotDataset("{folder.name}", root="{folder}")')
     say_files(folder)
 
 
@@ -127,15 +127,15 @@ def recover(
 
         found = recover_file(file, new)
     if found.whole:
-        results.print(f"{file} is whole: {found.steps} steps, its end and its index; nothing to recover", markup=False)
+        results.print(f"{file} is whole: {found.steps} steps, its end and its index; nothing to recover")
         return
     lost = [] if found.finished else ["the end: the recording was cut off, or its index is damaged"]
     lost += [f"bytes {begin} to {end}: a step that was not finished, or is damaged" for begin, end in found.damaged]
-    results.print(f"{found.steps} steps recovered; without:", markup=False)
+    results.print(f"{found.steps} steps recovered; without:")
     for words in [
         *lost[:20],
         *([f"... and {len(lost) - 20} more parts"] if len(lost) > 20 else []),
         *found.lacking[:20],
     ]:
-        results.print(f"  {words}", markup=False)
+        results.print(f"  {words}")
     say_files(new)

@@ -77,7 +77,7 @@ def run(
     sys.path.append(str(Path.cwd()))  # --policy mine:act finds mine.py here, as `python -m` would; after all else
     loaded = load_with_task(rig, task, set_ or [])
     for words in loaded.notes:
-        notes.print(words, markup=False)
+        notes.print(words)
     own_task = loaded.config.task
     if not dry_run:
         require_person(loaded.config)
@@ -256,6 +256,6 @@ def _report(episode: Episode, folder: Path, files: Sequence[Path]) -> None:
         paths = write_report(episode, folder, surfaces)
         stats = json.loads(paths["summary.json"].read_text(encoding="utf-8"))
     for words in surfaces.notes:
-        notes.print(words, markup=False)
+        notes.print(words)
     listed = [paths["report.html"], paths["report.png"], *files, paths["summary.json"]]
     results.print(end_table(stats, listed))

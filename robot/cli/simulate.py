@@ -76,7 +76,7 @@ def press(
     given = gel_sizes_given(text.partition("=")[0].split(".") for text in set_ or [])
     scene, said = fit_gel(scene, {"lower": model}, given=given)
     for words in said:
-        notes.print(words, markup=False)
+        notes.print(words)
     with busy("pressing (the first run compiles the kernels, up to half a minute)") as say:
         from robot.studies import press as presses
         from tacsim.physics.failure.dump import dumps_in
@@ -97,7 +97,7 @@ def press(
     config = presses.press_report(scene, motion, pressed, model)
     with writing(folder, new=True):
         presses.write(folder, pressed, config, scene, model)
-    results.print(f"pressing side    {config['pressing_side']}", markup=False)
+    results.print(f"pressing side    {config['pressing_side']}")
     results.print(f"force            {config['force']:.4f} N")
     results.print(f"contact radius   {config['contact_radius'] * 1e3:.3f} mm")
     results.print(f"deepest          {config['deepest'] * 1e3:.3f} mm")
@@ -222,11 +222,11 @@ def debug(
 
         found = read(dump)
         world = dump_view.open_world(found)
-    results.print(found.info.message, markup=False)
-    results.print(", ".join(f"{name} {version}" for name, version in found.info.versions.items()), markup=False)
+    results.print(found.info.message)
+    results.print(", ".join(f"{name} {version}" for name, version in found.info.versions.items()))
     for row, values in {"": dump_view.TITLES, **dump_view.table(found)}.items():
         shown = "".join(f"{values.get(moment, ''):50}" for moment in dump_view.TITLES)
-        results.print(f"{row:38}{shown.rstrip()}", markup=False)
+        results.print(f"{row:38}{shown.rstrip()}")
     picture = (dump.parent if dump.name == "dump.json" else dump) / "debug.png"
     with busy("drawing"):
         dump_view.draw(found, picture)
@@ -234,7 +234,7 @@ def debug(
     if again:
         with busy("running the motion again"):
             failure, outcome = dump_view.replay(found, world)
-        results.print(f"replay    {outcome}", markup=False)
+        results.print(f"replay    {outcome}")
     say_files(picture)
     if failure is not None:
         raise typer.Exit(FAILED)

@@ -57,7 +57,7 @@ def fit_light(read: FrameSet, ball: float, dot: float | None) -> LightFit:
         from calibration.light.checks.verdict import GREY, is_grey
 
         grey = f"; {GREY}: give the camera's own, in colour" if is_grey(read.reference) else ""
-        notes.print(f"{why}{grey}", markup=False)
+        notes.print(f"{why}{grey}")
         results.print("verdict: do not trust; no bundle is written")
         raise typer.Exit(UNTRUSTED) from None
 
@@ -120,7 +120,7 @@ def write_calibration(
         facts.append(f"camera's noise {', '.join(f'{value:.2f}' for value in noise.deviation)} grey levels (R, G, B)")
     if skin is not None:
         facts.append(f"skin: {skin:.0%} of the grain of the picture without contact moves with the gel")
-        notes.print(facts[-1], markup=False)
+        notes.print(facts[-1])
     with writing(folder, new=not (folder / FRAMES).exists()):
         written = [write_bundle(folder, bundle, fit.reference)]
         residuals = folder / "residuals.png" if fit.predictions else None
@@ -132,7 +132,7 @@ def write_calibration(
         page.write_page(written[-1], title, fit, scale, verdict, residuals, facts)
     for finding in verdict.findings:
         todo = f" Next: {finding.todo}" if finding.todo else ""
-        notes.print(f"{finding.word}: {finding.what}.{todo}", markup=False)
+        notes.print(f"{finding.word}: {finding.what}.{todo}")
     results.print(f"verdict: {verdict.word}")
     say_files(*written)
     if verdict.word == "do not trust":
@@ -155,7 +155,7 @@ def _noise(read: FrameSet, fit: LightFit) -> CameraNoise | None:
     try:
         noise = measure_noise(read.untouched_images) if still > 1 else measure_press_noise(fit.presses, fit.reference)
     except NoiseUnknown as why:
-        notes.print(f"camera's noise not measured: {why}", markup=False)
+        notes.print(f"camera's noise not measured: {why}")
         return None
     spread = ", ".join(f"{value:.2f}" for value in noise.deviation)
     notes.print(
@@ -206,9 +206,9 @@ def _show(fit: LightFit, pitch: float, found: Markers | None) -> None:
     if fit.stretch is not None:
         results.print(f"ratio of the axes of contacts: {fit.stretch}")
     for name, why in fit.left_out:
-        notes.print(f"left out: {name}: {why}", markup=False)
+        notes.print(f"left out: {name}: {why}")
     if found is not None:
-        notes.print(_lattice(found), markup=False)
+        notes.print(_lattice(found))
 
 
 def _lattice(found: Markers) -> str:

@@ -112,7 +112,7 @@ def _recording(
     with led(what, total, path, f"recorded: {path}; to calibrate from it again, without the arm: {again}") as session:
         yield session, write
     for why in session.left_out:
-        notes.print(f"left out: {why}", markup=False)
+        notes.print(f"left out: {why}")
 
 
 def _report_touch(record: TouchFile, noise: TouchNoise, folder: Path, arm: str) -> None:
@@ -133,7 +133,7 @@ def _report_touch(record: TouchFile, noise: TouchNoise, folder: Path, arm: str) 
         f"{1e3 * best:.3f} mm, {math.degrees(best_turn):.3f} deg); scatter {fit.scatter:.2f} of what the noise allows"
     )
     results.print("Write into the rig file:")
-    results.print(f"  arms:\n    {arm}:\n      tool_from_sensor: {_placement(fit.tool_from_sensor)}", markup=False)
+    results.print(f"  arms:\n    {arm}:\n      tool_from_sensor: {_placement(fit.tool_from_sensor)}")
     report = {
         "tool_from_sensor": pose_as_json(fit.tool_from_sensor, fit.covariance),
         "bound": fit.bound.tolist(),
@@ -240,7 +240,7 @@ def _report_hand_eye(record: BoardPoseFile, noise: Any, folder: Path) -> None:
         f"{name}: ± {1e3 * place:.3f} mm, ± {math.degrees(turn):.3f} deg; scatter {fit.scatter:.2f} of what the noise "
         f"allows; the flange's directions span {math.degrees(fit.spread):.0f} deg"
     )
-    results.print(f"  {name}: {_placement(fit.camera)}", markup=False)
+    results.print(f"  {name}: {_placement(fit.camera)}")
     report = {
         name: pose_as_json(fit.camera, fit.covariance),
         board: pose_as_json(fit.board),

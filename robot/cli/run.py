@@ -17,7 +17,7 @@ from robot.cli.terminal import Interrupt, ask, require_person
 
 if TYPE_CHECKING:
     from robot.deploy.control_loop import EpisodeSetup
-    from robot.export.rerun_live import LiveView
+    from robot.export.rerun_view import LiveView
     from tacsim.config import LoadedRig
     from tacsim.interface import Policy, RigSpec
     from tacsim.record.episode import Episode, EpisodeMeta, Step
@@ -167,7 +167,7 @@ def _views(spec: RigSpec, loaded: LoadedRig, files: Sequence[Path | None], stack
     """A viewer for None, a file for each path; closed with the stack, which says what they did not show."""
     if not files:
         return []
-    from robot.export.rerun_live import LiveView
+    from robot.export.rerun_view import LiveView
 
     def close(view: LiveView, name: str) -> None:
         view.close()

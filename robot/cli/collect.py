@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 import typer
 
 from robot.cli.errors import FAILED, complain
-from robot.cli.options import Overrides, quantity
+from robot.cli.options import Overrides, quantity, require_packages
 from robot.cli.output import busy, notes, one_bar, results
 from robot.cli.terminal import Interrupt
 
@@ -108,7 +108,7 @@ def press(
         ("--preset", preset, None),
         ("--scale", f"{scale:g}", "0.001"), *(("--set", text, None) for text in set_ or []), ("--out", str(out), None),
     ]  # fmt: skip
-    _require("pyarrow", "tacsim collect press", "export")
+    require_packages("tacsim collect press", "export", "pyarrow")
     with busy("loading"):
         from robot.collect.objects import find_objects
         from robot.collect.presses import PressJob, PressSet
@@ -247,15 +247,6 @@ def _checked(model: Any, **values: Any) -> Any:
         first = refused.errors(include_url=False)[0]
         where = ".".join(map(str, first["loc"]))
         raise SetError(f"{where}: {first['msg']}".removeprefix(": ").replace("Value error, ", "")) from None
-
-
-def _require(module: str, command: str, extra: str) -> None:
-    from importlib.util import find_spec
-
-    from robot.open import CannotOpen
-
-    if find_spec(module) is None:
-        raise CannotOpen(f"{command} needs {module}, which is not installed: pip install 'tacsim[{extra}]'")
 
 
 def _command(what: str, given: Sequence[tuple[str, str | None, str | None]]) -> str:

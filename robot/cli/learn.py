@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from robot.cli.options import Out, Overrides
+from robot.cli.options import Out, Overrides, require_packages
 from robot.cli.output import (
     busy,
     new_directory,
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from robot.train.transfer import Row
     from tacsim.models.training import Training
 
+TRAINING = ("torch", "stable_baselines3", "onnx", "onnxruntime")  # what the extra `train` brings
 export = typer.Typer(no_args_is_help=True, help="Write policies and recordings as files for others.")
 
 
@@ -52,7 +53,7 @@ def train(
 
     Example: tacsim train squeeze --out runs/squeeze-0
     """
-    require_torch("tacsim train")
+    require_packages("tacsim train", "train", *TRAINING)
     own = [f"algorithm={algorithm}"] * (algorithm is not None) + [f"seed={seed}"] * (seed is not None) + (set_ or [])
     if resume is not None:
         if task is not None or own or out is not None:
@@ -72,7 +73,10 @@ def train(
 
         training = load(Training, task, own)
         folder = new_directory(out, f"train-{training.task}")
-        run = _begin(training, folder)
+        with busy("loading"):
+            from robot.train.train import begin
+
+            run = begin(training, folder)
     from tacsim.tasks.task import BadDraws
 
     try:
@@ -86,27 +90,6 @@ def train(
         raise
     say_files(path, run.folder / "curve.json")
     notes.print(f"Next: tacsim evaluate {task or run.settings.training.task} --policy {path} --policy scripted")
-
-
-def require_torch(command: str) -> None:
-    """Raises CannotOpen without the extra `train`."""
-    from importlib.util import find_spec
-
-    from robot.open import CannotOpen
-
-    missing = [name for name in ("torch", "stable_baselines3", "onnx", "onnxruntime") if find_spec(name) is None]
-    if missing:
-        raise CannotOpen(
-            f"{command} needs {' and '.join(missing)}, which {'is' if len(missing) == 1 else 'are'} not installed: "
-            "pip install 'tacsim[train]'"
-        )
-
-
-def _begin(training: Training, folder: Path) -> RunFolder:
-    with busy("loading"):
-        from robot.train.train import begin
-
-        return begin(training, folder)
 
 
 def _train(run: RunFolder) -> Path:
@@ -134,7 +117,7 @@ def policy(
 
     Example: tacsim export policy runs/squeeze-0 --out squeeze.onnx
     """
-    require_torch("tacsim export policy")
+    require_packages("tacsim export policy", "train", *TRAINING)
     _require_new(out)
     with busy("exporting, and observing episodes of its training"):
         from robot.train.run_folder import RunFolder
@@ -163,12 +146,7 @@ def policy_range(
 
     Example: tacsim export policy-range mine.onnx --training squeeze --out mine-with-range.onnx
     """
-    from importlib.util import find_spec
-
-    from robot.open import CannotOpen
-
-    if find_spec("onnx") is None:
-        raise CannotOpen("tacsim export policy-range needs onnx, which is not installed: pip install 'tacsim[train]'")
+    require_packages("tacsim export policy-range", "train", "onnx")
     _require_new(out)
     if set_ and training is None:
         raise typer.BadParameter("--set changes a training file: name it with --training", param_hint="--set")

@@ -83,3 +83,16 @@ def grouped(command: Callable[..., None]) -> Callable[..., None]:
 def angle(help_: str, low: float = -math.inf, high: float = math.inf) -> Any:
     """An option that is an angle, `low` to `high` [rad]."""
     return typer.Option(parser=quantity("angle", low, high), metavar="ANGLE", help=help_)
+
+
+def require_packages(command: str, extra: str, *modules: str) -> None:
+    """Raises CannotOpen, with what to install, unless all modules are installed."""
+    from importlib.util import find_spec
+
+    from robot.open import CannotOpen
+
+    if missing := [name for name in modules if find_spec(name) is None]:
+        verb = "is" if len(missing) == 1 else "are"
+        raise CannotOpen(
+            f"{command} needs {' and '.join(missing)}, which {verb} not installed: pip install 'tacsim[{extra}]'"
+        )

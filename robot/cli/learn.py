@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from robot.train.evaluate import Interval, Judged
     from robot.train.run_folder import RunFolder
     from robot.train.transfer import Row
-    from tacsim.models.training import Training
 
 TRAINING = ("torch", "stable_baselines3", "onnx", "onnxruntime")  # what the extra `train` brings
 export = typer.Typer(no_args_is_help=True, help="Write policies and recordings as files for others.")

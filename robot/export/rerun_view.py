@@ -10,6 +10,7 @@ import contextlib
 import multiprocessing
 import os
 import queue
+import tempfile
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -17,7 +18,7 @@ from errno import EEXIST
 from importlib import util
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -169,13 +170,13 @@ def logged(spec: RigSpec, canonical: CanonicalGrid, rig: RigConfig | None, file:
 
     recording = rr.RecordingStream(APPLICATION)
     episode = EpisodeLog(recording, spec, canonical, _lattices(rig))
-    with _viewer(recording) if file is None else _file(recording, file) as flush:
+    with _viewer(recording) if file is None else _file(recording, file) as check:
         recording.send_blueprint(blueprint(spec))
-        flush()
+        check()
 
         def log(step: Step, observation: Observation, truth: Truth | None) -> None:
             episode.step(step, observation, truth)
-            flush()
+            check()
 
         yield log
 
@@ -189,28 +190,52 @@ def _viewer(recording: rr.RecordingStream) -> Iterator[Callable[[], None]]:
 
 @contextmanager
 def _file(recording: rr.RecordingStream, file: Path) -> Iterator[Callable[[], None]]:
-    """Gives what writes all that was logged until then. We write ourselves: Rerun reports no full disk."""
+    """Whole, or not at all. Gives what raises the OSError that has ended the writing."""
     if file.exists():
         raise FileExistsError(EEXIST, "File exists", str(file))
     file.parent.mkdir(parents=True, exist_ok=True)
     partial = file.with_name(f".{file.name}.{os.getpid()}")
-    stream = recording.binary_stream()
     try:
-        with partial.open("xb") as target:
-
-            def flush() -> None:
-                try:
-                    target.write(stream.read() or b"")
-                    target.flush()
-                except OSError as failure:
-                    raise OSError(failure.errno, failure.strerror, str(file)) from failure
-
-            yield flush
-            flush()
+        with partial.open("xb") as target, tempfile.TemporaryDirectory() as folder:
+            copy = _Copy(Path(folder) / "pipe", target, file)
+            copy.start()
+            recording.save(copy.pipe)
+            try:
+                yield copy.check
+            finally:
+                recording.disconnect()
+                copy.join()
+            copy.check()
         put_new(partial, file)
     except BaseException:
         partial.unlink(missing_ok=True)
         raise
+
+
+class _Copy(threading.Thread):
+    """Copies from a pipe, into which Rerun writes, into a file until the pipe is closed: Rerun itself reports no full
+    disk, or waits without end. Its binary stream is no way out: read more than once, it makes a damaged file (0.41)."""
+
+    def __init__(self, pipe: Path, target: BinaryIO, file: Path) -> None:
+        super().__init__(daemon=True)
+        os.mkfifo(pipe)
+        self.pipe, self._target, self._file = pipe, target, file
+        self._error: OSError | None = None
+
+    def run(self) -> None:
+        with self.pipe.open("rb") as source:
+            while data := source.read(1 << 16):
+                try:
+                    if self._error is None:
+                        self._target.write(data)
+                        self._target.flush()
+                except OSError as failure:  # what follows is read and discarded
+                    self._error = OSError(failure.errno, failure.strerror, str(self._file))
+
+    def check(self) -> None:
+        """Raises what went wrong."""
+        if self._error is not None:
+            raise self._error
 
 
 def require_rerun() -> None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 import typer
 
 from robot.cli.errors import FAILED, complain
-from robot.cli.options import Overrides, quantity, require_packages
+from robot.cli.options import Overrides, Preset, SensorModel, quantity, require_packages
 from robot.cli.output import busy, notes, one_bar, results
 from robot.cli.terminal import Interrupt
 
@@ -84,10 +84,8 @@ def press(
     twist: Annotated[Any, range_of("angle", "Then about the vertical.")] = "0",
     count: Count = 100,
     seed: Seed = 0,
-    sensor: Annotated[
-        str, typer.Option(help="Its name, the path of a YAML file, or of a calibrated bundle.")
-    ] = "ideal",
-    preset: Annotated[Literal["learn", "draft", "standard"], typer.Option(help="Resolution.")] = "standard",
+    sensor: SensorModel = "ideal",
+    preset: Preset = "standard",
     scale: Annotated[float, typer.Option(help="Metres per unit of the STL files.")] = 1e-3,
     workers: Workers = None,
     ray: Ray = None,

@@ -8,7 +8,7 @@ import typer
 
 from robot.cli.bench import require_checkout
 from robot.cli.errors import complain
-from robot.cli.options import Overrides
+from robot.cli.options import HardwareRig, Overrides
 from robot.cli.output import SafeConsole, busy, notes
 from robot.cli.terminal import Interrupt, ask, has_person
 
@@ -93,7 +93,7 @@ def print_checks(checks: list[machine.Check]) -> None:
 
 
 def start(
-    rig: Annotated[str, typer.Argument(help="A rig of hardware (ur5e, ur5e-one, mock), or the path of its file.")],
+    rig: HardwareRig,
     set_: Overrides = None,
 ) -> None:
     """Lead the arms of a rig to where an episode begins, from wherever they stand.

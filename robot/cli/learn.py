@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from robot.cli.options import Out, Overrides, require_packages
+from robot.cli.options import Out, Overrides, TrainingFile, require_packages
 from robot.cli.output import (
     busy,
     new_directory,
@@ -168,7 +168,7 @@ def _require_new(out: Path) -> None:
 
 
 def evaluate(
-    task: Annotated[str, typer.Argument(help="squeeze, reposition, knead, or the path of a training file.")],
+    task: TrainingFile,
     policy: Annotated[
         list[str] | None,
         typer.Option(

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from robot.cli.errors import FAILED, complain
-from robot.cli.options import Out, Overrides, angle, length, quantities
+from robot.cli.options import Out, Overrides, Preset, SensorModel, angle, length, quantities
 from robot.cli.output import busy, measuring, new_directory, notes, progress, results, say_files, writing
 from robot.cli.terminal import Interrupt
 
@@ -47,10 +47,8 @@ def press(
             help="Turn it about the world's x, then y, then z, in place of --down.",
         ),
     ] = None,
-    preset: Annotated[Literal["learn", "draft", "standard"], typer.Option(help="Resolution.")] = "standard",
-    sensor: Annotated[
-        str, typer.Option(help="Its name, the path of a YAML file, or of a calibrated bundle.")
-    ] = "ideal",
+    preset: Preset = "standard",
+    sensor: SensorModel = "ideal",
     set_: Overrides = None,
     out: Out = None,
 ) -> None:  # fmt: skip

@@ -14,7 +14,7 @@ import typer
 
 from robot.cli.calibrate.session import confirm_motion, led
 from robot.cli.errors import complain
-from robot.cli.options import Out, Overrides, angle, length
+from robot.cli.options import HardwareRig, Out, Overrides, angle, length
 from robot.cli.output import busy, new_directory, notes, results, say_files, show_table, writing
 from robot.cli.terminal import Interrupt, ask, require_person
 
@@ -280,7 +280,7 @@ def _write_report(folder: Path, name: str, report: dict[str, Any]) -> None:
 
 
 def latency(
-    rig: Annotated[str, typer.Argument(help="A rig of hardware, or the path of its file.")],
+    rig: HardwareRig,
     arm: Annotated[str, typer.Option("--arm", help="The arm that taps.")],
     sensor: Annotated[str, typer.Option("--sensor", help="The sensor that it carries.")],
     taps: Annotated[int, typer.Option(min=3, max=100, help="How many; more make it surer.")] = 8,

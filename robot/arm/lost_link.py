@@ -1,4 +1,4 @@
-"""Why a driver no longer hears of its arm: first cause and words, by what the worker measured of itself.
+"""Why a driver no longer receives from its arm (first cause and words), and the log of the packages that it received.
 
 A link that is cut may crash ur_rtde 1.6.5: its threads close the same connection at once, and the worker is gone before
 it can publish what happened. The library always reports the lost connection on standard error first, so that tells a

@@ -71,7 +71,7 @@ reliability: $(DEV)
 	@$(BIN)/tacsim bench robot --long --json benchmarks/reliability.json --docs docs
 
 # What needs torch, rerun or ray, in an environment of its own: make test shows that all else works without them.
-WITH_EXTRAS := tests/robot/train tests/robot/cli/learn tests/robot/export tests/robot/collect/test_cluster.py \
+WITH_EXTRAS := tests/robot/train tests/robot/cli/test_learn.py tests/robot/export tests/robot/collect/test_cluster.py \
   tests/tacsim/record/test_viewers.py
 extras: $(EXTRAS)
 

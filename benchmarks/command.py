@@ -25,8 +25,8 @@ from benchmarks.pages.page import COLUMNS, cells, setting, write_page
 from benchmarks.pages.picture import PICTURE, draw
 from benchmarks.pages.reliability import ROOT, write_reliability
 from robot.cli.errors import complain
-from robot.cli.interrupt import Interrupt
 from robot.cli.output import busy, notes, progress, results, say_files
+from robot.cli.terminal import Interrupt
 
 
 def read(paths: Sequence[Path]) -> list[Report]:
@@ -90,7 +90,7 @@ def measure(group: str, repeat: int | None, *, baselines: bool, long: bool, data
             words = f"{case.name}, {case.method}, {case.resolution}"
             bar.update(row, completed=begun, description=words)
             if not notes.is_terminal:  # a log has no bar
-                notes.print(f"{begun + 1}/{len(cases)} {words}", markup=False)
+                notes.print(f"{begun + 1}/{len(cases)} {words}")
             begun += 1
 
         report = run_cases(cases, repeat or 5, baselines=baselines, long=long, on_start=say, stop=interrupt)
@@ -143,10 +143,10 @@ def show(reports: Sequence[Report]) -> None:
         # a file or a pipe has no width; a table folded to 80 columns cannot be read there
         console = Console(width=None if results.is_terminal else 160, highlight=False)
         if len(reports) > 1:
-            console.print(setting(report), markup=False)
+            console.print(setting(report))
         console.print(table)
         for lack in report.missing:
-            notes.print(f"not measured: {lack.case}: {lack.cause}", markup=False)
+            notes.print(f"not measured: {lack.case}: {lack.cause}")
         failed = [failure for failure in report.failures if failure.cause != NOT_MEASURED]
         for failure in failed:
             complain(f"{failure.case}, {failure.method}, {failure.resolution}: {failure.cause}")

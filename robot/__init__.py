@@ -47,10 +47,10 @@ if TYPE_CHECKING:
     from robot.errors import ProtectiveStop as ProtectiveStop
     from robot.errors import SafetyViolation as SafetyViolation
     from robot.errors import StaleObservationError as StaleObservationError
-    from robot.export.jog import Jog as Jog
     from robot.export.lerobot_env import LeRobotEnv as LeRobotEnv
+    from robot.export.lerobot_rig import Jog as Jog
     from robot.export.lerobot_rig import LeRobotRig as LeRobotRig
-    from robot.export.tactile_camera import TactileCamera as TactileCamera
+    from robot.export.lerobot_rig import TactileCamera as TactileCamera
     from robot.open import CannotOpen as CannotOpen
     from robot.open import check_sensors as check_sensors
     from robot.open import make_env as make_env

@@ -1,4 +1,4 @@
-"""Why a driver no longer hears of its arm: first cause and words, by what the worker measured of itself.
+"""Why a driver no longer receives from its arm (first cause and words), and the log of the packages that it received.
 
 A link that is cut may crash ur_rtde 1.6.5: its threads close the same connection at once, and the worker is gone before
 it can publish what happened. The library always reports the lost connection on standard error first, so that tells a
@@ -10,12 +10,15 @@ from __future__ import annotations
 import signal
 from collections.abc import Callable
 
+import numpy as np
+
 from robot.arm.channel import WINDOW
-from robot.arm.shared_ring import Record
+from robot.arm.shared_ring import Record, Ring
 from robot.arm.status import ArmStatus, status_of
 from robot.arm.trajectory import PERIOD
 from robot.common.process import Child
 from tacsim.models.hardware import UrArmConfig
+from tacsim.record.episode import ArmPackages
 
 OUTLIVED = -signal.SIGALRM  # exit status of a worker whose call into the library outlived its time limit
 LIBRARY_REPORTS = (  # ur_rtde 1.6.5, after each failure of a connection and before it touches that connection again
@@ -79,3 +82,29 @@ def explain_lost_link(record: Record, config: UrArmConfig, exit_status: int | No
         priority = "real-time priority was not given"
         advice = "allow it (`tacsim doctor` says how) or give this machine less to do"
     return f"{text}; its worker was late itself ({periods}; {priority}); {advice}"
+
+
+class PackageLog:
+    """The packages since the last look, each once, and all of them if somebody looks every two seconds. What is
+    missing, here or on the way from the controller, shows in the controller's time stamps and is counted.
+
+    states: the worker's records, one a package, and another of the same one when a fault is found in it.
+    """
+
+    def __init__(self, states: Ring) -> None:
+        self._states = states
+        self._read = states.count
+        self._time = -np.inf  # of the last package, when it was read [s]
+        self._stamp = np.nan  # on the controller's clock [s]
+
+    def take(self) -> ArmPackages:
+        """The packages since the last call, or since this log was made."""
+        self._read, records = self._states.since(self._read)
+        records = records[records["stamp"] != 0.0]  # before its first package a worker has none to tell
+        records = records[np.diff(records["time"], prepend=self._time) > 0.0]
+        lost = 0
+        if len(records):
+            gaps = np.diff(records["stamp"], prepend=self._stamp)[0 if np.isfinite(self._stamp) else 1 :]
+            lost = int(np.maximum(np.round(gaps / PERIOD) - 1.0, 0.0).sum())  # a controller that restarts counts anew
+            self._time, self._stamp = float(records["time"][-1]), float(records["stamp"][-1])
+        return ArmPackages.of(records, lost)

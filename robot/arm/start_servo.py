@@ -12,7 +12,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Protocol
 
 import numpy as np
 
@@ -21,23 +20,17 @@ from robot.arm.following import is_standing
 from robot.arm.servo import Servo
 from robot.arm.shared_ring import Record
 from robot.arm.status import ArmStatus
-from robot.arm.trajectory import PERIOD, MotionState, Rates, advance, resting, slower, stopping_distance
+from robot.arm.trajectory import PERIOD, MotionState, advance, resting, slower, stopping_distance
 from robot.common.kinematics import Kinematics, inverse_frame, rotation_vector
 from robot.common.tcp import ArmFrames, Measured
 from tacsim.interface import FloatArray
+from tacsim.models.hardware import ArmLimits
 
 JOINT_SPEED, JOINT_ACCELERATION = 0.1, 0.5  # of the fastest joint, at most [rad/s, rad/s^2]
 OFF_WAY = 20e-3  # an arm with a joint farther than this from the way has left it [rad]
 LAG = 15e-3  # the target waits for an arm that is farther behind, such as one slowed down on its pendant [rad]
 SAMPLES = 100  # points of a way at which speeds are judged
 MARGIN = 0.95  # of the speeds there: they differ between the samples
-
-
-class WayRates(Rates, Protocol):
-    """What limits a motion along a way; tacsim.models.hardware.ArmLimits and WorkerConfig have it."""
-
-    @property
-    def joint_speed(self) -> float: ...  # [rad/s]
 
 
 def sensor_path(kinematics: Kinematics, frames: ArmFrames, joints: FloatArray) -> FloatArray:
@@ -47,7 +40,7 @@ def sensor_path(kinematics: Kinematics, frames: ArmFrames, joints: FloatArray) -
 
 
 def way_rates(
-    kinematics: Kinematics, frames: ArmFrames, begin: FloatArray, end: FloatArray, limits: WayRates
+    kinematics: Kinematics, frames: ArmFrames, begin: FloatArray, end: FloatArray, limits: ArmLimits | WorkerConfig
 ) -> tuple[float, float]:
     """Top speed [rad/s] and acceleration [rad/s^2] of the joint vector along the straight way from `begin` to `end`
     (6,), such that neither a joint nor the sensor ever exceeds its limits."""

@@ -26,8 +26,7 @@ from robot.arm.channel import (
     tactile_record,
 )
 from robot.arm.dashboard import Dashboard
-from robot.arm.lost_link import Verdict, explain_lost_link
-from robot.arm.package_log import PackageLog
+from robot.arm.lost_link import PackageLog, Verdict, explain_lost_link
 from robot.arm.shared_ring import Record
 from robot.arm.status import AT_CONNECTING, ArmStatus
 from robot.arm.trajectory import PERIOD
@@ -74,7 +73,7 @@ class URArm(Closing):
     SafetyViolation (it stands outside its workspace, or feels too much), DeviceAlreadyConnectedError.
     """
 
-    _way: tuple[FloatArray, FloatArray] | None = None  # of an arm that is led to its start (robot.arm.start_arm)
+    _way: tuple[FloatArray, FloatArray] | None = None  # of an arm that is led to its start (robot.procedures.to_start)
     _bearable: tuple[ArmStatus, ...] = ()  # faults that it may be opened with
 
     def __init__(

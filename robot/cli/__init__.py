@@ -10,28 +10,20 @@ from typing import Annotated
 import typer
 
 from robot.cli.bench import bench
-from robot.cli.calibrate.latency import latency
 from robot.cli.calibrate.lens import lens
-from robot.cli.calibrate.poses import hand_eye, touch
+from robot.cli.calibrate.poses import hand_eye, latency, touch
 from robot.cli.calibrate.sensor import calibrate
+from robot.cli.collect import collect, episodes
+from robot.cli.collect import press as press_set
 from robot.cli.compare import compare
-from robot.cli.debug import debug
-from robot.cli.doctor import doctor, schema
-from robot.cli.episode.collect import collect, episodes
-from robot.cli.episode.collect import press as press_set
-from robot.cli.episode.lerobot import lerobot
-from robot.cli.episode.recover import recover
-from robot.cli.episode.view import view
+from robot.cli.doctor import doctor, schema, start
 from robot.cli.errors import Guarded
 from robot.cli.identify import body, gel, identify
-from robot.cli.learn.evaluate import evaluate
-from robot.cli.learn.export import export, policy, policy_range
-from robot.cli.learn.train import train
-from robot.cli.learn.transfer import transfer
+from robot.cli.learn import evaluate, export, policy, policy_range, train, transfer
 from robot.cli.mock import mock
+from robot.cli.recordings import lerobot, recover, view
 from robot.cli.run import replay, run
-from robot.cli.simulate import press, reproduce
-from robot.cli.start import start
+from robot.cli.simulate import debug, press, reproduce
 
 app = typer.Typer(
     name="tacsim",

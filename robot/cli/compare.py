@@ -161,7 +161,7 @@ def _simulate_presses(name: str, truth: FrameSet, bundle: Path | None, overrides
         words = ", as in the calibration; for another --set 'indenter.geometry.radius=3 mm'" if own else ""
         said = [f"a ball of {ball.radius * 1e3:.4g} mm radius{words}", *said]
     for words in said:
-        notes.print(words, markup=False)
+        notes.print(words)
     notes.print("pressing (the first run compiles the kernels, up to half a minute)")
     from robot.studies.matched_press import match_presses
 
@@ -242,7 +242,7 @@ def _beyond_limits(limits: list[Limit], values: dict[str, float]) -> list[str]:
 def _show(result: Comparison, report: Report | None) -> None:
     from calibration.compare.report import judgement, rows, shown, verdict
 
-    results.print(judgement(result), markup=False)
+    results.print(judgement(result))
     width = None if results.is_terminal else 160
     overall_rows = (
         (
@@ -258,7 +258,7 @@ def _show(result: Comparison, report: Report | None) -> None:
     )
     if report is not None:
         _show_invariance(report, width)
-    notes.print(result.alignment.said, markup=False)
+    notes.print(result.alignment.said)
     for words in result.notes:
         warn(words)
     flagged = [pair for pair in result.pairs if pair.flags]

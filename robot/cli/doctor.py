@@ -1,4 +1,4 @@
-"""`tacsim schema` and `tacsim doctor`: what a file may say, and whether machine and rig are fit."""
+"""`tacsim schema`, `doctor` and `start`: what a file may say, whether machine and rig are fit, arms to their start."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from robot.cli.bench import require_checkout
-from robot.cli.options import Overrides
-from robot.cli.output import SafeConsole, busy
+from robot.cli.errors import complain
+from robot.cli.options import HardwareRig, Overrides
+from robot.cli.output import SafeConsole, busy, notes
+from robot.cli.terminal import Interrupt, ask, has_person
 
 if TYPE_CHECKING:
     from robot.doctor import machine
@@ -88,3 +90,53 @@ def print_checks(checks: list[machine.Check]) -> None:
             words.append(f"\n→ {check.advice}", style="italic")
         table.add_row(MARKS[check.state], check.name, words)
     SafeConsole().print(table)
+
+
+def start(
+    rig: HardwareRig,
+    set_: Overrides = None,
+) -> None:
+    """Lead the arms of a rig to where an episode begins, from wherever they stand.
+
+    Shows where each arm stands, offers to zero its force sensor, and moves it, one after the other, slowly and straight
+    in joint space. Nothing happens without a yes at the terminal; Ctrl-C brakes.
+
+    Example: tacsim start my.yaml
+    """
+    with busy("looking at the rig"):
+        from robot.doctor.rig import examine_arms
+        from robot.mock.cell.cell import MockCell
+        from robot.open import CannotOpen
+        from robot.procedures.to_start import Guide, Halted, lead_to_start
+        from tacsim.config import load_rig
+        from tacsim.models.hardware import UrArmConfig
+
+        config = load_rig(rig, overrides=set_ or []).config
+    arms = {name: arm for name, arm in config.arms.items() if isinstance(arm, UrArmConfig)}
+    if not arms:
+        raise CannotOpen(f"rig '{config.name}' has no UR arm: there is nothing to lead to its start")
+    if not has_person():
+        raise CannotOpen(
+            f"rig '{config.name}': no arm is led to its start without somebody who says yes; run this from a terminal"
+        )
+    with Interrupt() as interrupt, MockCell(config) as cell:
+        starts = {**cell.start_poses, **{name: arm.start.pose for name, arm in arms.items() if arm.start is not None}}
+        with busy("looking at the arms"):
+            checks = examine_arms(config, cell.start_poses, rig)
+        print_checks(checks)
+        try:
+            with busy("connecting") as show:
+                guide = Guide(
+                    lambda question: ask(f"Rig '{config.name}': {question}"),
+                    lambda words: notes.print(words),
+                    show,
+                    interrupt,
+                )
+                away = lead_to_start(config, starts, guide)
+        except Halted as halted:
+            complain(str(halted))
+            raise typer.Exit(interrupt.exit_code or 1) from None
+    if any(distance > 5e-3 for distance in away.values()) or not away:
+        complain("not every arm stands at its start")
+        raise typer.Exit(1)
+    notes.print(f"All arms stand at their starts. Next: tacsim run {rig} --dry-run")

@@ -155,7 +155,7 @@ class _Task:
         if self.scene.physics == "seed":
             raise typer.BadParameter("physics 'seed' cannot be identified; use 'hybrid'", param_hint="--set")
         for words in say_side(self.scene):
-            notes.print(words, markup=False)
+            notes.print(words)
 
     def run(self, sources: list[Path], indenter: Pose | None = None, balls: Mapping[str, float] | None = None) -> None:
         options = self.options
@@ -233,7 +233,7 @@ class _Task:
                 path = folder / f"{name}.csv"
                 path.write_text(table, encoding="utf-8")
                 steps = len(table.splitlines()) - 1
-                results.print(f"tacsim run {rig} --policy {path} --steps {steps} --out runs/{name}", markup=False)
+                results.print(f"tacsim run {rig} --policy {path} --steps {steps} --out runs/{name}")
 
 
 def _reach(half: float) -> str:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from robot.cli.interrupt import Interrupt
 from robot.cli.output import results
+from robot.cli.terminal import Interrupt
 
 if TYPE_CHECKING:
     from robot.mock import FaultClient
@@ -83,7 +83,7 @@ def mock(
         for each in camera_hosts:
             camera = stack.enter_context(MockCamera(each, camera_port, noise=2, allow_network=allow_network))
             devices.append(camera)
-            results.print(f"camera at {camera.url}", markup=False)
+            results.print(f"camera at {camera.url}")
         results.print("Ctrl-C ends them.")
         logs: dict[str, Log] = {}
         while not interrupt():
@@ -107,6 +107,6 @@ def _print_new(faults: FaultClient, printed: Log) -> Log:
     last = printed[-1] if printed else None
     for at, text in log[log.index(last) + 1 if last in log else 0 :]:
         if last is None or text != last[1]:
-            results.print(f"{faults.host} {at:.3f} s: {text}", markup=False)
+            results.print(f"{faults.host} {at:.3f} s: {text}")
         last = at, text
     return log

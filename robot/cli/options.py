@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import fields, is_dataclass
 from functools import wraps
 from pathlib import Path
-from typing import Annotated, Any, get_type_hints
+from typing import Annotated, Any, Literal, get_type_hints
 
 import typer
 
@@ -20,6 +20,12 @@ Overrides = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="Change a value of the configuration; may be repeated."),
 ]
+Preset = Annotated[Literal["learn", "draft", "standard"], typer.Option("--preset", help="Resolution.")]
+SensorModel = Annotated[
+    str, typer.Option("--sensor", help="Its name, the path of a YAML file, or of a calibrated bundle.")
+]
+HardwareRig = Annotated[str, typer.Argument(help="A rig of hardware (ur5e, ur5e-one, mock), or the path of its file.")]
+TrainingFile = Annotated[str, typer.Argument(help="squeeze, reposition, knead, or the path of a training file.")]
 
 
 def quantity(kind: str, low: float = -math.inf, high: float = math.inf) -> Callable[[str], float]:
@@ -92,3 +98,16 @@ def grouped(command: Callable[..., None]) -> Callable[..., None]:
 def angle(help_: str, low: float = -math.inf, high: float = math.inf) -> Any:
     """An option that is an angle, `low` to `high` [rad]."""
     return typer.Option(parser=quantity("angle", low, high), metavar="ANGLE", help=help_)
+
+
+def require_packages(command: str, extra: str, *modules: str) -> None:
+    """Raises CannotOpen, with what to install, unless all modules are installed."""
+    from importlib.util import find_spec
+
+    from robot.open import CannotOpen
+
+    if missing := [name for name in modules if find_spec(name) is None]:
+        verb = "is" if len(missing) == 1 else "are"
+        raise CannotOpen(
+            f"{command} needs {' and '.join(missing)}, which {verb} not installed: pip install 'tacsim[{extra}]'"
+        )

@@ -39,8 +39,8 @@ class SafeConsole(Console):
             yield segment if segment.control else segment._replace(text=escaped(segment.text, kept="\n\t"))
 
 
-results = SafeConsole(highlight=False, soft_wrap=True)  # stdout: what the command found
-notes = SafeConsole(stderr=True, highlight=False, soft_wrap=True)  # stderr: what it is doing
+results = SafeConsole(markup=False, emoji=False, highlight=False, soft_wrap=True)  # stdout: what the command found
+notes = SafeConsole(stderr=True, markup=False, emoji=False, highlight=False, soft_wrap=True)  # stderr: what it is doing
 
 
 def new_directory(out: Path | None, what: str) -> Path:
@@ -144,6 +144,11 @@ class Bar:
         """How many steps are done, and of how many; None: nobody knows."""
         self._bar.update(self._row, completed=done, total=total)
 
+    def report(self, words: str, done: int, total: int) -> None:
+        """Both."""
+        self.say(words)
+        self.count(done, total)
+
 
 @contextmanager
 def one_bar(words: str) -> Iterator[Bar]:
@@ -186,7 +191,7 @@ def measuring(say: Callable[[str], None], after: str) -> Iterator[None]:
             words = f"measuring the distances from {printable(path)}: {done} of {total} parts"
             say(words)
             if not notes.is_terminal and path not in told:
-                notes.print(words, markup=False)
+                notes.print(words)
             told.add(path)
             if done == total - 1:
                 say(after)
@@ -198,12 +203,12 @@ def measuring(say: Callable[[str], None], after: str) -> Iterator[None]:
 def say_files(*paths: Path) -> None:
     """Prints paths, one a line."""
     for path in paths:
-        results.print(printable(str(path)), markup=False)
+        results.print(printable(str(path)))
 
 
 def warn(words: str) -> None:
     """What a person should look at before trusting the result."""
-    notes.print(f"look at this: {words}", markup=False)
+    notes.print(f"look at this: {words}")
 
 
 def show_table(

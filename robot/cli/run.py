@@ -11,14 +11,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from robot.cli.errors import FAILED, complain
-from robot.cli.interrupt import Interrupt
 from robot.cli.options import Out, Overrides
 from robot.cli.output import Bar, busy, measuring, new_directory, notes, one_bar, results, warn, writing
-from robot.cli.question import ask, require_person
+from robot.cli.terminal import Interrupt, ask, require_person
 
 if TYPE_CHECKING:
     from robot.deploy.control_loop import EpisodeSetup
-    from robot.export.rerun_live import LiveView
+    from robot.export.rerun_view import LiveView
     from tacsim.config import LoadedRig
     from tacsim.interface import Policy, RigSpec
     from tacsim.record.episode import Episode, EpisodeMeta, Step
@@ -78,7 +77,7 @@ def run(
     sys.path.append(str(Path.cwd()))  # --policy mine:act finds mine.py here, as `python -m` would; after all else
     loaded = load_with_task(rig, task, set_ or [])
     for words in loaded.notes:
-        notes.print(words, markup=False)
+        notes.print(words)
     own_task = loaded.config.task
     if not dry_run:
         require_person(loaded.config)
@@ -168,7 +167,7 @@ def _views(spec: RigSpec, loaded: LoadedRig, files: Sequence[Path | None], stack
     """A viewer for None, a file for each path; closed with the stack, which says what they did not show."""
     if not files:
         return []
-    from robot.export.rerun_live import LiveView
+    from robot.export.rerun_view import LiveView
 
     def close(view: LiveView, name: str) -> None:
         view.close()
@@ -257,6 +256,6 @@ def _report(episode: Episode, folder: Path, files: Sequence[Path]) -> None:
         paths = write_report(episode, folder, surfaces)
         stats = json.loads(paths["summary.json"].read_text(encoding="utf-8"))
     for words in surfaces.notes:
-        notes.print(words, markup=False)
+        notes.print(words)
     listed = [paths["report.html"], paths["report.png"], *files, paths["summary.json"]]
     results.print(end_table(stats, listed))

@@ -1,4 +1,4 @@
-"""`tacsim press` and `tacsim reproduce`: simulation without a policy's episode."""
+"""`tacsim press`, `reproduce` and `debug`: simulation without a policy's episode."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from robot.cli.errors import complain
-from robot.cli.interrupt import Interrupt
-from robot.cli.options import Out, Overrides, angle, grouped, length, quantities
+from robot.cli.errors import FAILED, complain
+from robot.cli.options import Out, Overrides, Preset, SensorModel, angle, grouped, length, quantities
 from robot.cli.output import busy, measuring, new_directory, notes, progress, results, say_files, writing
+from robot.cli.terminal import Interrupt
 
 if TYPE_CHECKING:
     from tacsim.report.figure4 import Trial
@@ -58,10 +58,8 @@ def press(
     ] = "0,0",
     twist: Annotated[Any, angle("Then turn about the vertical.")] = "0",
     shape: IndenterShape,
-    preset: Annotated[Literal["learn", "draft", "standard"], typer.Option(help="Resolution.")] = "standard",
-    sensor: Annotated[
-        str, typer.Option(help="Its name, the path of a YAML file, or of a calibrated bundle.")
-    ] = "ideal",
+    preset: Preset = "standard",
+    sensor: SensorModel = "ideal",
     set_: Overrides = None,
     out: Out = None,
 ) -> None:  # fmt: skip
@@ -87,7 +85,7 @@ def press(
     sizes = gel_sizes_given(text.partition("=")[0].split(".") for text in set_ or [])
     scene, said = fit_gel(scene, {"lower": model}, given=sizes)
     for words in said:
-        notes.print(words, markup=False)
+        notes.print(words)
     with busy("pressing (the first run compiles the kernels, up to half a minute)") as say:
         from robot.studies import press as presses
         from tacsim.physics.failure.dump import dumps_in
@@ -108,7 +106,7 @@ def press(
     config = presses.press_report(scene, motion, pressed, model)
     with writing(folder, new=True):
         presses.write(folder, pressed, config, scene, model)
-    results.print(f"pressing side    {config['pressing_side']}", markup=False)
+    results.print(f"pressing side    {config['pressing_side']}")
     results.print(f"force            {config['force']:.4f} N")
     results.print(f"contact radius   {config['contact_radius'] * 1e3:.3f} mm")
     results.print(f"deepest          {config['deepest'] * 1e3:.3f} mm")
@@ -214,3 +212,38 @@ def _judge(trials: dict[str, dict[str, Trial]]) -> bool:
             results.print(f"{'FAILED' if problems else 'ok':8}{task}, {scheme}: {said}")
             failed = failed or bool(problems)
     return failed
+
+
+def debug(
+    dump: Annotated[Path, typer.Argument(help="Folder of a dump, named in the error: OUT/diverged/00.")],
+    again: Annotated[bool, typer.Option("--replay/--no-replay", help="Run the motion again.")] = True,
+) -> None:
+    """Look into a diverged simulation: a table, a cut through body and gels (debug.png), and the motion run again.
+
+    Exit code 1 if it diverges again. Dumps are written by tacsim run and reproduce below their --out folder, and by any
+    simulation into the folder that the environment variable TACSIM_DUMPS names.
+
+    Example: tacsim debug runs/first/diverged/00
+    """
+    with busy("reading"):
+        from robot.studies import dump_view
+        from tacsim.physics.failure.dump import read
+
+        found = read(dump)
+        world = dump_view.open_world(found)
+    results.print(found.info.message)
+    results.print(", ".join(f"{name} {version}" for name, version in found.info.versions.items()))
+    for row, values in {"": dump_view.TITLES, **dump_view.table(found)}.items():
+        shown = "".join(f"{values.get(moment, ''):50}" for moment in dump_view.TITLES)
+        results.print(f"{row:38}{shown.rstrip()}")
+    picture = (dump.parent if dump.name == "dump.json" else dump) / "debug.png"
+    with busy("drawing"):
+        dump_view.draw(found, picture)
+    failure = None
+    if again:
+        with busy("running the motion again"):
+            failure, outcome = dump_view.replay(found, world)
+        results.print(f"replay    {outcome}")
+    say_files(picture)
+    if failure is not None:
+        raise typer.Exit(FAILED)

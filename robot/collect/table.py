@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from robot.export.arrow import LABEL, Column, arrow_table
-from robot.export.lerobot_mapping import Feature
+from robot.export.lerobot_mapping import LABEL, Column, Feature, arrow_table
 
 if TYPE_CHECKING:
     from robot.collect.presses import PressSet

@@ -13,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from robot.collect.job import Job, Piece, Worker
-from robot.common.process_pool import ProcessPool
+from robot.common.process import ProcessPool
 from tacsim.geometry.tiles import share_tiles
 
 AHEAD = 2  # pieces for each worker that wait or are being made

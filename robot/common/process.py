@@ -5,13 +5,18 @@ each. A message with the key "error" says why the child could not do what it was
 robot.errors, it is the whole text of that error.
 
 A child ends when its standard input does or its parent is gone, so that it never outlives that one. Signals that end a
-program (Ctrl-C, SIGTERM, a lost terminal) are for the parent alone, which ends its children in order.
+program (Ctrl-C, SIGTERM, a lost terminal) are for the parent alone, which ends its children in order. The same holds of
+the processes of a ProcessPool.
+
+Children are not started by multiprocessing: its spawn runs the main module of the user's program again, so that a
+script without `if __name__ == "__main__"` could open no arm.
 """
 
 from __future__ import annotations
 
 import contextlib
 import json
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -20,8 +25,10 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
 from pathlib import Path
-from typing import IO, Any
+from types import TracebackType
+from typing import IO, Any, ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +48,9 @@ PARENT_CHECK = 0.2  # a child looks so often whether its parent is there [s]
 EXITING = 0x4  # of a process's flags in Linux: PF_EXITING
 ENDING = {getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)}
 LAST_LINES = 5  # of a dead child's standard error, in errors
+
+Given = ParamSpec("Given")
+Result = TypeVar("Result")
 
 
 @contextlib.contextmanager
@@ -349,3 +359,34 @@ def read_message(pipe: IO[bytes]) -> Message | None:
             return None
         arrays[name] = np.frombuffer(data, dtype).reshape(shape)
     return message, arrays
+
+
+class ProcessPool(ProcessPoolExecutor):
+    """A ProcessPoolExecutor whose processes end with this one, however that ends (kill -9), and at once where its block
+    is left by an exception. Signals that end a program are for this process alone.
+
+    begin, given: called in each process before its first piece.
+    """
+
+    def __init__(self, processes: int, begin: Callable[..., object] | None = None, given: tuple[Any, ...] = ()) -> None:
+        context = multiprocessing.get_context("spawn")  # Taichi does not survive a fork
+        super().__init__(processes, context, _begin, (os.getpid(), begin, given))
+
+    def submit(self, work: Callable[Given, Result], /, *args: Given.args, **more: Given.kwargs) -> Future[Result]:
+        """As ProcessPoolExecutor.submit, which starts processes when there is work for them."""
+        with outside_working_folder(), shielded():
+            return super().submit(work, *args, **more)
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> bool | None:
+        if kind is not None:
+            for process in multiprocessing.active_children():
+                process.kill()  # signals that could be caught never reach it (`shielded`)
+        return super().__exit__(kind, error, trace)
+
+
+def _begin(parent: int, begin: Callable[..., object] | None, given: tuple[Any, ...]) -> None:
+    end_with_parent(parent)
+    if begin is not None:
+        begin(*given)

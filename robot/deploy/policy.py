@@ -8,8 +8,7 @@ from pathlib import Path
 
 from robot.deploy.onnx_policy import OnnxPolicy, misfits
 from robot.deploy.python_policy import PolicyNotFound as PolicyNotFound
-from robot.deploy.python_policy import policy_of_code
-from robot.deploy.target_script import TargetScript
+from robot.deploy.python_policy import TargetScript, policy_of_code
 from robot.deploy.training_range import outside_of_scenes
 from tacsim.config import config_root
 from tacsim.interface import IncompatibleRig, Policy, RigSpec
@@ -24,7 +23,7 @@ def load_policy(name: str, task: Task | None, spec: RigSpec, canonical: Canonica
     """The policy called `name`, for a rig that delivers `spec` on this canonical grid (None: the usual one).
 
     "scripted": the task's own. "grip": closes until it feels contact, on any rig. "path/to/file.onnx": a learned one;
-    "learned": the shipped one of the task. "path/to/file.csv": a table of targets (robot.deploy.target_script).
+    "learned": the shipped one of the task. "path/to/file.csv": a table of targets (robot.deploy.python_policy).
     "package.module:attribute": an object with needs, reset and __call__ as tacsim.Policy has them, a class of such
     objects (made without arguments), or a function from Observation to Action. Runs code of that module, so name only
     modules you trust; of an ONNX file nothing is run but its operators.

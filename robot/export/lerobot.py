@@ -11,19 +11,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robot.common.whole_file import whole_folder
-from robot.export.arrow import Column
 from robot.export.lerobot_files import DataSet, write_json
 from robot.export.lerobot_mapping import (
     IMAGE,
+    Column,
     Feature,
+    ImageCounts,
     LeRobotMapping,
     Row,
+    Statistics,
     frames_per_second,
     outcome,
     task_in_words,
 )
 from robot.export.lerobot_video import require_video
-from robot.export.statistics import ImageCounts, Statistics
 from robot.rig.recorded import ObservedEpisode, observe_episode
 from tacsim.interface import IncompatibleRig
 from tacsim.record.episode import EpisodeError

@@ -13,10 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from robot.export.arrow import Column, arrow_table
-from robot.export.lerobot_mapping import Feature
+from robot.export.lerobot_mapping import Column, Feature, Statistics, arrow_table, column_statistics, merged
 from robot.export.lerobot_video import VideoColumn
-from robot.export.statistics import Statistics, column_statistics, merged
 
 if TYPE_CHECKING:
     import pyarrow as pa

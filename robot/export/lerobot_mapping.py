@@ -1,4 +1,4 @@
-"""What an episode is called in LeRobot: the one place that knows its names.
+"""What an episode is called in LeRobot: the one place that knows its names; its columns as Arrow, and their statistics.
 
 | feature                         | what                                                               |
 |---------------------------------|--------------------------------------------------------------------|
@@ -21,9 +21,10 @@ the state, velocities or not, in `.vel`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +36,9 @@ from tacsim.models.policy import Features, Numbers, Quantity
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.record.episode import Step
 
+if TYPE_CHECKING:
+    import pyarrow as pa
+
 Row = dict[str, NDArray[Any]]
 
 STATE, ACTION, REWARD, DONE = "observation.state", "action", "next.reward", "next.done"
@@ -42,6 +46,11 @@ IMAGE = "observation.images."
 MAPS = {"height": "observation.height.", "gradient": "observation.gradient.", "flow": "observation.flow."}
 MAP_AXES = ("rows", "columns", "xy")
 DRIVEN, OTHER = ".pos", ".vel"
+LABEL = "label"  # dtype of a feature whose numbers stand for its names
+Column = NDArray[Any] | Sequence[bytes]  # (rows, ...), or PNG pictures
+Statistics = dict[str, NDArray[Any]]
+
+QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,3 +186,117 @@ def task_in_words(kind: str | None, goal: float | tuple[float, ...] | None) -> s
     if kind == "knead" and len(sizes) == 3:
         return f"knead the body to a size of {sizes[0]} by {sizes[1]} by {sizes[2]}"
     return kind or "touch the body"
+
+
+def arrow_table(features: Mapping[str, Feature], columns: Mapping[str, Column]) -> pa.Table:
+    """One row group's worth of rows, in the order of `features`."""
+    import pyarrow as pa
+
+    arrays = [_array(feature, columns[name]) for name, feature in features.items()]
+    told = {"info": {"features": {name: _told(feature) for name, feature in features.items()}}}
+    schema = pa.schema(
+        [pa.field(name, array.type) for name, array in zip(features, arrays, strict=True)],
+        metadata={"huggingface": json.dumps(told)},
+    )
+    return pa.Table.from_arrays(arrays, schema=schema)
+
+
+def _array(feature: Feature, column: Column) -> pa.Array:
+    import pyarrow as pa
+
+    if feature.dtype == "image":
+        data = pa.array(column, pa.binary())
+        return pa.StructArray.from_arrays([data, pa.nulls(len(data), pa.string())], ["bytes", "path"])
+    numbers = np.ascontiguousarray(column)
+    array = pa.array(numbers.ravel())
+    if feature.shape == (1,):
+        return array
+    if len(feature.shape) == 1:
+        return pa.FixedSizeListArray.from_arrays(array, feature.shape[0])
+    for side in reversed(feature.shape):  # `datasets` keeps maps as lists of lists
+        array = pa.ListArray.from_arrays(np.arange(0, len(array) + 1, side, dtype=np.int32), array)
+    return array
+
+
+def _told(feature: Feature) -> dict[str, Any]:
+    """The feature in the words of `datasets`."""
+    if feature.dtype == "image":
+        return {"_type": "Image"}
+    if feature.dtype == LABEL:
+        return {"names": list(feature.names or ()), "_type": "ClassLabel"}
+    number = {"dtype": feature.dtype, "_type": "Value"}
+    if feature.shape == (1,):
+        return number
+    if len(feature.shape) == 1:
+        return {"feature": number, "length": feature.shape[0], "_type": "List"}
+    return {"shape": list(feature.shape), "dtype": feature.dtype, "_type": f"Array{len(feature.shape)}D"}
+
+
+class ImageCounts:
+    """How often each value occurs in the pictures of an episode, by channel: all statistics follow, exactly."""
+
+    def __init__(self) -> None:
+        self._counts = np.zeros((3, 256), np.int64)
+        self._pictures = 0
+
+    def add(self, image: NDArray[np.uint8]) -> None:
+        """(H, W, 3)."""
+        self._pictures += 1
+        for channel in range(3):
+            self._counts[channel] += np.bincount(image[..., channel].ravel(), minlength=256)
+
+    def statistics(self) -> Statistics:
+        """(3, 1, 1) each, of values / 255; `count` of pictures, (1,)."""
+        values = np.arange(256) / 255.0
+        total = self._counts.sum(axis=1)
+        mean = self._counts @ values / total
+        found = {
+            "min": values[(self._counts > 0).argmax(axis=1)],
+            "max": values[255 - (self._counts[:, ::-1] > 0).argmax(axis=1)],
+            "mean": mean,
+            "std": np.sqrt((self._counts * (values - mean[:, None]) ** 2).sum(axis=1) / total),
+        }
+        below = self._counts.cumsum(axis=1)
+        for name, share in QUANTILES.items():  # the least value with at least this share at or below it
+            found[name] = values[(below >= share * total[:, None]).argmax(axis=1)]
+        return {name: each.reshape(3, 1, 1) for name, each in found.items()} | {"count": np.array([self._pictures])}
+
+
+def column_statistics(values: NDArray[Any]) -> Statistics:
+    """Of the (frames, ...) of an episode: each number by itself; of a map (frames, h, w[, 2]) one for all its cells, in
+    a shape that spreads over the map."""
+    numbers = values.astype(np.float64)
+    over = (0,) if values.ndim <= 2 else (0, 1, 2)
+
+    def shaped(found: Any) -> NDArray[Any]:
+        return np.asarray(found).reshape(values.shape[1:] if len(over) == 1 else (1, 1, *values.shape[3:]))
+
+    found = {
+        "min": shaped(numbers.min(axis=over)),
+        "max": shaped(numbers.max(axis=over)),
+        "mean": shaped(numbers.mean(axis=over)),
+        "std": shaped(numbers.std(axis=over)),
+        "count": np.array([len(values)]),
+    }
+    quantiles = np.quantile(numbers, list(QUANTILES.values()), axis=over)
+    return found | {name: shaped(each) for name, each in zip(QUANTILES, quantiles, strict=True)}
+
+
+def merged(each: Sequence[Statistics]) -> Statistics:
+    """Of several episodes together, as LeRobot merges them: exact but for the quantiles, which are means of the
+    episodes', weighted by their frames."""
+    counts = np.array([float(found["count"][0]) for found in each])
+
+    def mean(name: str) -> NDArray[Any]:
+        return np.asarray(np.tensordot(counts, np.stack([found[name] for found in each]), axes=1) / counts.sum())
+
+    total = mean("mean")
+    spread = np.stack([found["std"] ** 2 + (found["mean"] - total) ** 2 for found in each])
+    whole = {
+        "min": np.min([found["min"] for found in each], axis=0),
+        "max": np.max([found["max"] for found in each], axis=0),
+        "mean": total,
+        "std": np.sqrt(np.tensordot(counts, spread, axes=1) / counts.sum()),
+        "count": np.array([int(counts.sum())]),
+    }
+    return whole | {name: mean(name) for name in QUANTILES}

@@ -1,6 +1,7 @@
-"""A rig as LeRobot's robots are: flat dictionaries of numbers and pictures, and no call for a reset.
+"""A rig, and one tactile camera of it, as LeRobot has robots and cameras; small steps by keys or a gamepad.
 
-What the numbers are, and what they are called, stands in `robot.export.lerobot_mapping`.
+A robot is flat dictionaries of numbers and pictures, without a call for a reset. What the numbers are, and what they
+are called, stands in `robot.export.lerobot_mapping`.
 """
 
 from __future__ import annotations
@@ -17,11 +18,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from robot.camera.camera import Camera, StaleFrame
 from robot.export.lerobot_mapping import IMAGE, STATE, LeRobotMapping
 from robot.open import load_with_task, open_rig, rig_spec
 from robot.rig.clock import WallClock
+from robot.rig.hardware_rig import camera_normaliser
+from tacsim.gym.features import SCALES
 from tacsim.interface import IncompatibleRig, Observation, Pose
 from tacsim.limits import ActionError
+from tacsim.models.hardware import CameraSensorConfig
 from tacsim.models.rig import RigConfig, TaskConfig
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.rig import Rig
@@ -30,6 +35,9 @@ Values = dict[str, float | NDArray[np.uint8]]
 
 SAME_RATE = 1e-3  # share by which a rate may differ from that of the rig
 LOOKS, HURRIED = 10, 0.75  # so many looks in a row, each after less than this share of a period, are another rate
+
+FIRST = 5.0  # longest wait for the picture without contact [s]
+POLL = 2e-3  # between two looks for a new picture [s]
 
 log = logging.getLogger(__name__)
 
@@ -180,3 +188,118 @@ class LeRobotRig:
                 "times. Give both the same rate: --dataset.fps=%g",
                 *(1e3 * longest, self.config.name, 1e3 * self.config.period, 1.0 / self.config.period),
             )
+
+
+class TactileCamera:
+    """One camera of a rig file. Its arms, if it has some, are left alone.
+
+    sensor: its name in the file; None: the only one. Raises what loading the file and its calibration raise, and
+    IncompatibleRig for a sensor that is no camera. Nothing is opened.
+    """
+
+    def __init__(self, rig: str | Path, sensor: str | None = None, overrides: Sequence[str] = ()) -> None:
+        config = load_with_task(rig, None, overrides).config
+        there = ", ".join(config.sensors)
+        if sensor is None and len(config.sensors) > 1:
+            raise IncompatibleRig(f"rig '{config.name}' has several sensors; name one of them: {there}")
+        self.name = next(iter(config.sensors)) if sensor is None else sensor
+        found = config.sensors.get(self.name)
+        if found is None:
+            raise IncompatibleRig(f"rig '{config.name}' has no sensor '{self.name}'; it has {there}")
+        if not isinstance(found, CameraSensorConfig):
+            raise IncompatibleRig(f"sensor '{self.name}' of rig '{config.name}' is {found.driver}, not a camera")
+        if found.mock is not None:
+            raise IncompatibleRig(
+                f"sensor '{self.name}' of rig '{config.name}' is a mock that its whole rig starts; name a camera that "
+                "runs by itself"
+            )
+        self.fps: float = found.fps  # that the camera is asked for
+        self.shape = picture_shape(config.canonical)  # of a picture: rows, columns, 3
+        self._config = found
+        self._normaliser = camera_normaliser(self.name, found, config)
+        self._camera: Camera | None = None
+        self._seen = -1  # index of the frame that `read_new` gave last
+
+    @property
+    def connected(self) -> bool:
+        return self._camera is not None
+
+    def connect(self) -> None:
+        """Opens the camera and takes its picture now as that without contact: nothing may touch the gel.
+
+        Raises DeviceError, and RuntimeError when it is connected already.
+        """
+        if self._camera is not None:
+            raise RuntimeError(f"sensor '{self.name}' is connected already")
+        with ExitStack() as stack:
+            camera = stack.enter_context(Camera(self._config, self.name))
+            self._normaliser.take_reference(camera.read(FIRST))
+            stack.pop_all()
+        self._camera, self._seen = camera, -1
+
+    def read(self, timeout: float = 1.0) -> NDArray[np.uint8]:
+        """The newest canonical picture, (H, W, 3) RGB. Raises TimeoutError without one within the sensor's max_age, and
+        RuntimeError when it is not connected."""
+        frame = self._opened().read(timeout)
+        self._seen = frame.index
+        return self._normaliser(frame, frame.time).image
+
+    def read_new(self, timeout: float) -> NDArray[np.uint8]:
+        """One that was not read before. Raises as `read`."""
+        camera, deadline = self._opened(), time.monotonic() + timeout
+        while camera.read(max(0.0, deadline - time.monotonic())).index == self._seen:
+            if time.monotonic() >= deadline:
+                raise StaleFrame(f"sensor '{self.name}': no new picture within {timeout:.3g} s")
+            time.sleep(POLL)
+        return self.read(timeout)
+
+    def age(self) -> float:
+        """Of the newest picture, since its exposure [s]. Raises RuntimeError when it is not connected."""
+        age = self._opened().status.age
+        return float("inf") if age is None else age
+
+    def close(self) -> None:
+        """Releases the camera. A second call does nothing."""
+        camera, self._camera = self._camera, None
+        if camera is not None:
+            camera.close()
+
+    def _opened(self) -> Camera:
+        if self._camera is None:
+            raise RuntimeError(f"sensor '{self.name}' is not connected: call connect() first")
+        return self._camera
+
+
+class Jog:
+    """Steps along the axes of the sensors at reset, as actions of a `LeRobotRig`; none turns. z is into what is felt.
+
+    Args:
+        rig: that the actions are for; it need not be connected.
+        step: of a full stroke [m].
+        arms: that move, each along its own sensor's axes; none named: all.
+
+    Raises IncompatibleRig for an arm that the rig has not, ValueError for a step that is none.
+    """
+
+    def __init__(self, rig: LeRobotRig, step: float, arms: Sequence[str] = ()) -> None:
+        there = rig.config.arms
+        if unknown := sorted(set(arms) - set(there)):
+            raise IncompatibleRig(f"rig '{rig.config.name}' has no arm '{unknown[0]}'; it has {', '.join(there)}")
+        if not 0.0 < step < 0.01:
+            raise ValueError(f"step must be a length below 10 mm, in m, got {step!r}")
+        self.names = tuple(rig.action_features)
+        self._step, self._arms = step, tuple(arms or there)
+        self._gone = np.zeros(3)  # [m]
+
+    def __call__(self, strokes: Sequence[float]) -> dict[str, float]:
+        """The action after one more step of (x, y, z) strokes, each within -1 and 1."""
+        self._gone = self._gone + self._step * np.clip(np.asarray(strokes, np.float64), -1.0, 1.0)
+        action = dict.fromkeys(self.names, 0.0)
+        for arm in self._arms:
+            for axis, gone in zip("xyz", self._gone / SCALES["moved"], strict=True):
+                action[f"moved_{axis}_{arm}.pos"] = float(gone)
+        return action
+
+    def reset(self) -> None:
+        """Starts again from the pose at reset."""
+        self._gone = np.zeros(3)

@@ -12,12 +12,8 @@ from robot.mock.camera.camera import MockCamera, MockCameraState
 from robot.mock.ur.fault_client import FaultClient, FaultError, Input, Inputs, MockState
 from robot.mock.ur.handle import MockArms, MockError, MockUR
 
-Door, DoorError = FaultClient, FaultError  # their names before 0.1, in users' tests
-
 __all__ = [
     "MOCK_SERIAL",
-    "Door",
-    "DoorError",
     "FaultClient",
     "FaultError",
     "Input",

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,26 +14,14 @@ from scipy.spatial.transform import Rotation
 from tacsim.geometry.shapes import distance
 from tacsim.interface import Pose
 from tacsim.models.scene import Scene
-from tacsim.physics.exec import layout
-from tacsim.physics.failure.diagnosis import corner_volumes, element_volumes, millimetres, particle_volumes
+from tacsim.physics.failure.diagnosis import corner_volumes, element_volumes, particle_volumes
 from tacsim.physics.failure.dump import MOMENTS, Dump, DumpError, dumps_in
 from tacsim.physics.failure.health import SimulationDiverged
-from tacsim.physics.move import MoveStats
 from tacsim.physics.snapshot import State, gel_arrays
 from tacsim.physics.world import World, make_world
 from tacsim.report.figure import COLOURS, INK, canvas, plain, save
 
 TITLES = {"before": "before the motion", "good": "last good", "failed": "failed"}
-MOST_DRAWN = 6000  # particles
-
-
-@dataclass(frozen=True, slots=True)
-class Replay:
-    """The outcome of running the motion again: a failure, or how it went."""
-
-    failure: SimulationDiverged | None
-    stats: MoveStats | None
-    identical: bool  # it failed with the same message, and every array in the same bytes
 
 
 def open_world(dump: Dump) -> World:
@@ -50,8 +37,9 @@ def open_world(dump: Dump) -> World:
     return world
 
 
-def replay(dump: Dump, world: World) -> Replay:
-    """Runs the motion again, with all its retries; leaves `world` in the state before it, or in the new one.
+def replay(dump: Dump, world: World) -> tuple[SimulationDiverged | None, str]:
+    """Runs the motion again, with all its retries: the failure, if it diverges again, and the outcome in words. Leaves
+    `world` in the state before the motion, or in the new one.
 
     Raises DumpError for a command that makes no sense in this scene, and LoadNotReached (tacsim.physics.motion.load) if
     it gets further this time, but a load is out of reach.
@@ -61,79 +49,52 @@ def replay(dump: Dump, world: World) -> Replay:
         with dumps_in(None):
             stats = world.move(command.targets, command.loads, command.duration, flow=command.flow)
     except SimulationDiverged as failure:
-        same = (failure.cause, failure.where) == (dump.info.cause, dump.info.where)
+        same = str(failure) == dump.info.message
         for moment, state in (("good", failure.good), ("failed", failure.failed)):
             recorded = dump.states[moment]
-            same &= recorded.keys() == state.keys()
+            same = same and recorded.keys() == state.keys()
             same = same and all(recorded[name].tobytes() == a.tobytes() for name, a in state.items())
-        return Replay(failure, None, same)
+        how = "exactly as recorded, to the last bit" if same else f"otherwise than recorded: {failure}"
+        return failure, f"diverges again, {how}"
     except (KeyError, ValueError) as error:
         raise DumpError(f"the motion cannot be run again: {error.args[0]}") from None
-    return Replay(None, stats, False)
-
-
-# ------------------------------------------------------------------ table
+    how = f"after {stats.retries} retries" if stats.retries else "at the first attempt"
+    settled = "yes" if stats.settled else "no"
+    return None, f"does not diverge: reached its targets {how}, settled: {settled}"
 
 
 def table(dump: Dump) -> dict[str, dict[str, str]]:
-    """Values by row and moment, of the moments that the dump holds."""
+    """Range of the volume ratios and of each array, by row and moment, of the moments that the dump holds."""
     rows: dict[str, dict[str, str]] = {}
     for moment in MOMENTS:
-        for row, value in _figures(dump.states[moment], dump.info.scene).items():
-            rows.setdefault(row, {})[moment] = value
-    return rows | {f"kernels: {key.replace('_', ' ')}": {"failed": seen} for key, seen in dump.info.health.items()}
+        for row, values in _quantities(dump.states[moment], dump.info.scene):
+            rows.setdefault(row, {})[moment] = _range(values)
+    return rows | {f"kernels: {key.replace('_', ' ')}": {"failed": value} for key, value in dump.info.health.items()}
 
 
-def _figures(state: State, scene: Scene) -> dict[str, str]:
-    if not state:
-        return {}
-    bad = sum(int((~np.isfinite(a)).sum()) for a in state.values())
-    figures = {"numbers not finite": f"{bad:,} of {sum(a.size for a in state.values()):,}"}
-    displacements = gel_arrays(state, "gel_displacement")
-    for row, ratios in (
-        ("smallest volume ratio, gel elements", element_volumes),
-        ("smallest at a corner of one", corner_volumes),
-    ):
-        thicknesses = {g: scene.gel_of(scene.sensors[g]).size[2] * 1e3 for g in displacements}
-        found = [ratios(u, thicknesses[g]).ravel() for g, u in displacements.items()]
-        if found:
-            figures[row] = _extreme(np.concatenate(found))
+def _quantities(state: State, scene: Scene) -> Iterator[tuple[str, NDArray[Any]]]:
     volumes = particle_volumes(state)
     if volumes is not None:
-        figures["smallest volume ratio, particles"] = _extreme(volumes)
-    speeds = [np.abs(v).ravel() for v in gel_arrays(state, "gel_velocity").values()]
-    if speeds:
-        figures["fastest of gel nodes [wave speed]"] = _extreme(np.concatenate(speeds), largest=True)
-    if "velocity" in state:
-        figures["fastest of particles [wave speed]"] = _extreme(np.abs(state["velocity"]), largest=True)
-    gels = len(scene.sensors)
-    if "sums" in state:  # of the kernels' parts
-        force = state["sums"][:, layout.FORCE : layout.FORCE + 6 * gels].sum(axis=0).reshape(gels, 6)
-        figures["contact force [N]"] = "  ".join(map(millimetres, force[:, :3]))
-        backing = state["sums"][:, layout.BACKING : layout.BACKING + 3].reshape(gels, -1, 3).sum(axis=1)
-        figures["force at backing [N]"] = "  ".join(map(millimetres, backing))
-    elif "backing" in state:
-        figures["force at backing [N]"] = "  ".join(map(millimetres, state["backing"][:, :3]))
-    return figures
+        yield "volume ratio, particles", volumes
+    gels = [(u, scene.gel_of(scene.sensors[g]).size[2] * 1e3) for g, u in gel_arrays(state, "gel_displacement").items()]
+    for row, ratios in (("gel elements", element_volumes), ("element corners", corner_volumes)):
+        if gels:
+            yield f"volume ratio, {row}", np.concatenate([ratios(u, thickness).ravel() for u, thickness in gels])
+    yield from state.items()
 
 
-def _extreme(values: NDArray[Any], largest: bool = False) -> str:
-    """The smallest (or largest) of the finite values, and how many are not finite."""
+def _range(values: NDArray[Any]) -> str:
     finite = values[np.isfinite(values)]
     bad = values.size - finite.size
-    found = f"{float(finite.max() if largest else finite.min()):.4g}" if finite.size else "none"
+    found = f"{float(finite.min()):.4g} to {float(finite.max()):.4g}" if finite.size else "none"
     return f"{found}  ({bad:,} not finite)" if bad else found
-
-
-# ------------------------------------------------------------------ picture
 
 
 def draw(dump: Dump, path: Path) -> None:
     """Writes a picture: a cut through body and gels in the world's x-z plane, at every moment that the dump holds."""
     moments = [moment for moment in MOMENTS if dump.states[moment]]
     figure, scene = canvas(5.2 * len(moments), 4.6), dump.info.scene
-    title = f"{dump.info.cause} at {dump.info.place}"
-    figure.suptitle(title[:200].replace("$", r"\$"), fontsize=9, color=INK, x=0.01, ha="left")
+    figure.suptitle(dump.info.message[:200].replace("$", r"\$"), fontsize=9, color=INK, x=0.01, ha="left")
     sizes = [scene.gel_of(name).size for name in scene.sensors]
     depth, width = max(size[2] for size in sizes) * 1.1e3, max(size[0] for size in sizes) * 0.6e3
     heights = [float(pose.position[2]) * 1e3 for pose in dump.poses("before").values()]
@@ -172,8 +133,7 @@ def _draw_particles(axes: Axes, state: State, scene: Scene) -> None:
     x, volumes = state["position"].astype(np.float64), particle_volumes(state)
     finite = np.abs(x).max(axis=1) < 1e6
     middle = float(np.median(x[finite, 1])) if finite.any() else 0.0
-    near = np.flatnonzero(finite & (np.abs(x[:, 1] - middle) <= scene.spacing * 1e3))
-    near = near[:: max(1, -(-len(near) // MOST_DRAWN))]
+    near = finite & (np.abs(x[:, 1] - middle) <= scene.spacing * 1e3)
     colour = np.ones(len(x)) if volumes is None else np.nan_to_num(volumes, nan=0.0, posinf=2.0, neginf=0.0)
     dots = axes.scatter(x[near, 0], x[near, 2], c=colour[near], s=6, cmap="coolwarm_r", vmin=0.8, vmax=1.2)
     axes.figure.colorbar(dots, ax=axes, shrink=0.6, label="volume ratio")

@@ -13,8 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from robot.common.process import outside_working_folder, shielded
-from robot.common.process_pool import ProcessPool
+from robot.common.process import ProcessPool, outside_working_folder, shielded
 from tacsim.config import load_rig
 from tacsim.interface import Action, Observation, Pose, TactileFrame, Truth
 from tacsim.models.rig import RigConfig

@@ -20,9 +20,8 @@ from gymnasium.vector import AutoresetMode
 from robot.common.whole_file import write_whole
 from robot.open import load_with_task, make_vector_env
 from robot.train.dagger import Dagger
-from robot.train.export import export
 from robot.train.measure_range import measure_range, write_range
-from robot.train.network import PolicyNetwork
+from robot.train.network import PolicyNetwork, export
 from robot.train.run_folder import RunError, RunFolder, Tell, version
 from tacsim.config import ConfigError
 from tacsim.config.errors import Place, Problem

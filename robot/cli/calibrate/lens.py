@@ -99,7 +99,7 @@ def _take_views(
     kept then, too. Raises CannotCalibrate, DeviceError."""
     from calibration.lens.view import MIN_PICTURES
     from robot.camera.camera import Camera
-    from robot.procedures.board_views import BoardViewPlan, record_board_views
+    from robot.procedures.boards import BoardViewPlan, record_board_views
     from robot.procedures.session import CannotCalibrate
 
     if 1 < views < MIN_PICTURES:
@@ -154,7 +154,7 @@ def _fit_lens(pictures: Path, board: Board, folder: Path) -> None:
         lens_, each = fit_lens(found, (rows, columns))
     show_table("Each picture", ("picture", "residual [px]"), [(name, f"{value:.2f}") for name, value in each.items()])
     for line in missing:
-        results.print(f"left out: {line}", markup=False)
+        results.print(f"left out: {line}")
     results.print(
         f"focal length {lens_.focal[0]:.1f}, {lens_.focal[1]:.1f} px; centre {lens_.centre[0]:.1f}, "
         f"{lens_.centre[1]:.1f} px; residual {lens_.residual:.2f} px"

@@ -1,4 +1,4 @@
-"""`tacsim calibrate touch` and `tacsim calibrate hand-eye`: where sensors and cameras sit on an arm."""
+"""`tacsim calibrate touch`, `hand-eye`, `latency`: where sensors and cameras sit on an arm, how late pictures are."""
 
 from __future__ import annotations
 
@@ -14,14 +14,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from robot.cli.calibrate.session import confirm_motion, led
-from robot.cli.options import Out, Overrides, angle, grouped, length
+from robot.cli.errors import complain
+from robot.cli.options import HardwareRig, Out, Overrides, angle, grouped, length
 from robot.cli.output import busy, new_directory, notes, results, say_files, show_table, writing
+from robot.cli.terminal import Interrupt, ask, require_person
 
 if TYPE_CHECKING:
     from calibration.poses.ball_touch import TouchNoise
     from calibration.poses.records import BoardPoseFile, TouchFile
     from robot.procedures.ball_touches import BallTouchPlan
-    from robot.procedures.board_poses import BoardPosePlan
+    from robot.procedures.boards import BoardPosePlan
     from robot.procedures.session import Session
     from tacsim.interface import Pose
 
@@ -127,7 +129,7 @@ def _recording(
     with led(what, total, path, f"recorded: {path}; to calibrate from it again, without the arm: {again}") as session:
         yield session, write
     for why in session.left_out:
-        notes.print(f"left out: {why}", markup=False)
+        notes.print(f"left out: {why}")
 
 
 def _report_touch(record: TouchFile, noise: TouchNoise, folder: Path, arm: str) -> None:
@@ -148,7 +150,7 @@ def _report_touch(record: TouchFile, noise: TouchNoise, folder: Path, arm: str) 
         f"{1e3 * best:.3f} mm, {math.degrees(best_turn):.3f} deg); scatter {fit.scatter:.2f} of what the noise allows"
     )
     results.print("Write into the rig file:")
-    results.print(f"  arms:\n    {arm}:\n      tool_from_sensor: {_placement(fit.tool_from_sensor)}", markup=False)
+    results.print(f"  arms:\n    {arm}:\n      tool_from_sensor: {_placement(fit.tool_from_sensor)}")
     report = {
         "tool_from_sensor": pose_as_json(fit.tool_from_sensor, fit.covariance),
         "bound": fit.bound.tolist(),
@@ -218,7 +220,7 @@ def hand_eye(
         return
     from calibration.lens.board import parse_board
     from calibration.lens.view import Lens
-    from robot.procedures.board_poses import BoardPosePlan
+    from robot.procedures.boards import BoardPosePlan
     from tacsim.config import load
 
     if not (rig and arm and camera and lens and board):
@@ -235,7 +237,7 @@ def _take_board_poses(
 ) -> BoardPoseFile:
     """Looks now; what was recorded is kept in `folder`, whatever ends it."""
     from calibration.poses.records import board_pose_file
-    from robot.procedures.board_poses import open_arm, open_camera, record_board_poses
+    from robot.procedures.boards import open_arm, open_camera, record_board_poses
     from tacsim.config import load_rig
 
     config = load_rig(rig, overrides=overrides).config
@@ -271,7 +273,7 @@ def _report_hand_eye(record: BoardPoseFile, noise: Any, folder: Path) -> None:
         f"{name}: ± {1e3 * place:.3f} mm, ± {math.degrees(turn):.3f} deg; scatter {fit.scatter:.2f} of what the noise "
         f"allows; the flange's directions span {math.degrees(fit.spread):.0f} deg"
     )
-    results.print(f"  {name}: {_placement(fit.camera)}", markup=False)
+    results.print(f"  {name}: {_placement(fit.camera)}")
     report = {
         name: pose_as_json(fit.camera, fit.covariance),
         board: pose_as_json(fit.board),
@@ -308,3 +310,49 @@ def _write_report(folder: Path, name: str, report: dict[str, Any]) -> None:
     with writing(folder):
         path.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
     say_files(path)
+
+
+def latency(
+    rig: HardwareRig,
+    arm: Annotated[str, typer.Option("--arm", help="The arm that taps.")],
+    sensor: Annotated[str, typer.Option("--sensor", help="The sensor that it carries.")],
+    taps: Annotated[int, typer.Option(min=3, max=100, help="How many; more make it surer.")] = 8,
+    depth: Annotated[Any, length("How deep, beyond the first touch.", 1e-6, 5e-3)] = "0.2 mm",
+    lift: Annotated[Any, length("How far back between taps.", 1e-6, 5e-3)] = "1 mm",
+    set_: Overrides = None,
+) -> None:
+    """Measure how late a camera is: its arm taps on something firm, and both records are laid over each other.
+
+    The arm MOVES: an episode's start (a person is asked before it approaches), then small taps along the sensor's z.
+    Put something firm, fixed to the table or held by the other arm, before the gel.
+
+    Example: tacsim calibrate latency ur5e --arm upper --sensor upper
+    """
+    from calibration.poses.latency import estimate_latency
+    from robot.open import open_rig
+    from robot.procedures.session import hardware_arm
+    from robot.procedures.taps import TapPlan, latency_entries, record_taps, without_latency
+    from tacsim.config import load_rig
+
+    config = load_rig(rig, overrides=set_ or []).config
+    opened = without_latency(config, arm, sensor)
+    require_person(config)
+    with Interrupt() as interrupt:
+        with busy("opening the rig") as say, open_rig(opened, confirm=ask, tell=say) as running:
+            say("tapping")
+            record = record_taps(running, opened, arm, sensor, TapPlan(taps, depth, lift), interrupt)
+        if interrupt():
+            complain("stopped by a signal; nothing is measured")
+            raise typer.Exit(interrupt.exit_code)
+    measured = estimate_latency(record.arm_times, record.depth, record.frame_times, record.change)
+    results.print(
+        f"sensors.{sensor} is {1e3 * measured.seconds:.1f} ms later than arms.{arm}, "
+        f"± {1e3 * measured.uncertainty:.1f} ms (correlation {measured.correlation:.3f}, {measured.samples} pictures)"
+    )
+    if record.clock != "arrival":
+        notes.print("The pictures bring their time of exposure along: what is left is the arm's.")
+        if measured.seconds > 3.0 * measured.uncertainty:
+            notes.print("warning: yet they seem later than the arm; is the arm's own latency in the file too large?")
+    results.print("Write into the rig file:")
+    for key, seconds in latency_entries(measured, record.clock, arm, hardware_arm(config, arm), sensor).items():
+        results.print(f"  {key}: {1e3 * seconds:.1f} ms")

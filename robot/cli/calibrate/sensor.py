@@ -11,8 +11,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from robot.cli.calibrate.bundle_output import FRAMES, UNKNOWN, write_calibration
-from robot.cli.calibrate.light_fit import find_lattice, fit_light, read_presses, straighten
+from robot.cli.calibrate.light import (
+    FRAMES,
+    UNKNOWN,
+    find_lattice,
+    fit_light,
+    read_presses,
+    straighten,
+    write_calibration,
+)
 from robot.cli.calibrate.session import confirm_free_gel, led, named_camera, picture_keeper
 from robot.cli.options import Out, Overrides, grouped, length, quantities, quantity
 from robot.cli.output import new_directory, notes, warn

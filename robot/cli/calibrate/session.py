@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from robot.cli.errors import complain
-from robot.cli.interrupt import Interrupt
 from robot.cli.output import notes, progress, writing
-from robot.cli.question import ask, has_person, has_real_arm
+from robot.cli.terminal import Interrupt, ask, has_person, has_real_arm
 
 if TYPE_CHECKING:
     import numpy as np
@@ -32,7 +31,7 @@ def led(what: str, total: int, kept: Path, note: str) -> Iterator[Session[Any]]:
     with Interrupt() as interrupt, progress() as bar:
         row = bar.add_task(what, total=total)
         session: Session[Any] = Session(
-            say=lambda words: notes.print(words, markup=False),
+            say=lambda words: notes.print(words),
             progress=lambda done: bar.update(row, completed=done),
             stop=interrupt,
         )
@@ -40,7 +39,7 @@ def led(what: str, total: int, kept: Path, note: str) -> Iterator[Session[Any]]:
             yield session
         finally:
             if kept.exists():
-                notes.print(note, markup=False)
+                notes.print(note)
     if interrupt():
         complain(f"stopped by a signal; {len(session.taken)} {what} are kept, nothing is calibrated")
         raise typer.Exit(interrupt.exit_code)

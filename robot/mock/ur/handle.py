@@ -94,11 +94,6 @@ class MockUR(MockArms):
         self.host = host
         self.faults = self.fault_clients[0]
 
-    @property
-    def door(self) -> FaultClient:
-        """The same as `faults`, by its old name."""
-        return self.faults
-
 
 def check_hosts(hosts: Sequence[str], allow_network: bool) -> None:
     """Raises ValueError unless the hosts are different loopback addresses, or the network is allowed."""

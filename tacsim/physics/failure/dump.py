@@ -1,28 +1,26 @@
 """Dumps of diverged motions: what is needed to look into one, and to run it again (`tacsim debug`).
 
-A dump is a folder: `dump.json` (scene, poses, command, cause, versions) and `state.npz`, whose arrays are named
-`before.*` (before the motion), `good.*` and `failed.*` (at the start and end of the launch that went wrong). A body or
-indenter from an STL file brings that file along. Nothing in a dump is executed.
+A dump is a folder: `dump.json` (scene, poses, command, message, versions) and `state.npz`, whose arrays are named
+`before.*` (before the motion), `good.*` and `failed.*` (at the start and end of the launch that failed). The STL file
+of a body or indenter is copied into it. Nothing in a dump is executed.
 """
 
 from __future__ import annotations
 
 import os
-import platform
 import shutil
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
-from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, ValidationError
+from pydantic import ValidationError
 
 from tacsim.interface import Pose
 from tacsim.models.quantity import Config
@@ -32,7 +30,7 @@ from tacsim.physics.move import MoveCommand
 from tacsim.physics.snapshot import State
 
 FOLDER = "TACSIM_DUMPS"  # environment variable: where dumps are written; none are without it, or where it is empty
-MOST_DUMPS = 20  # in one folder; training that diverges again and again must not fill the disk
+MAX_DUMPS = 20  # in one folder; training that diverges again and again must not fill the disk
 MOMENTS = ("before", "good", "failed")
 MESH = "shape.stl"
 
@@ -47,21 +45,16 @@ class DumpError(ValueError):
 class DumpInfo(Config):
     """`dump.json`."""
 
-    format: Literal["tacsim dump 1"] = "tacsim dump 1"
-    time: str  # UTC
-    cause: str
-    place: str  # of the worst particle or gel node
-    where: str  # in the motion
-    advice: str
-    refine: int = Field(ge=1)  # the step of the last attempt was the nominal one over this
+    format: Literal["tacsim dump 2"] = "tacsim dump 2"
+    message: str  # of the error: cause, place, part of the motion, advice
     scene: Scene
     poses: dict[str, PoseNumbers]  # before the motion
     targets: dict[str, PoseNumbers]
-    loads: dict[str, float] = {}  # [N]; dumps of older versions say nothing of them
-    duration: float | None = None  # [s]
-    flow: bool = False
-    failed_poses: dict[str, PoseNumbers]  # at the end of the launch that went wrong; empty if there was none
-    health: dict[str, str]  # what the kernels saw in that launch
+    loads: dict[str, float]  # [N]
+    duration: float | None  # [s]
+    flow: bool
+    failed_poses: dict[str, PoseNumbers]  # at the end of the launch that failed; empty if there was none
+    health: dict[str, str]  # what the kernels reported of that launch
     versions: dict[str, str]
 
 
@@ -74,7 +67,7 @@ class Dump:
 
     @property
     def command(self) -> MoveCommand:
-        """What the motion was asked for."""
+        """The motion."""
         info = self.info
         return MoveCommand(_poses(info.targets), info.loads, info.duration, info.flow)
 
@@ -95,9 +88,6 @@ def dumps_in(folder: Path | None) -> Iterator[None]:
         del os.environ[FOLDER]
         if given is not None:
             os.environ[FOLDER] = given
-
-
-# ------------------------------------------------------------------ writing
 
 
 def write_if_asked(
@@ -128,13 +118,13 @@ def write_if_asked(
 def _new_folder(parent: Path) -> Path:
     """A new folder 00 ... 19 below `parent`; several processes may do this at once."""
     parent.mkdir(parents=True, exist_ok=True)
-    for number in range(MOST_DUMPS):
+    for number in range(MAX_DUMPS):
         try:
             (parent / f"{number:02d}").mkdir()
         except FileExistsError:
             continue
         return parent / f"{number:02d}"
-    raise DumpError(f"it holds {MOST_DUMPS} dumps, which is the limit; remove some")
+    raise DumpError(f"it holds {MAX_DUMPS} dumps, which is the limit; remove some")
 
 
 def _write(
@@ -150,12 +140,7 @@ def _write(
     }
     np.savez_compressed(folder / "state.npz", **arrays)  # type: ignore[arg-type]  # mypy takes a name for allow_pickle
     info = DumpInfo(
-        time=datetime.now(UTC).isoformat(timespec="seconds"),
-        cause=failure.cause,
-        place=failure.place,
-        where=failure.where,
-        advice=failure.advice,
-        refine=failure.refine,
+        message=str(failure),
         scene=scene,
         poses=_numbers(poses),
         targets=_numbers(command.targets),
@@ -164,22 +149,9 @@ def _write(
         flow=command.flow,
         failed_poses=_numbers(failure.poses),
         health={} if failure.health is None else {k: f"{v:.9g}" for k, v in asdict(failure.health).items()},
-        versions={
-            "python": platform.python_version(),
-            "machine": f"{platform.system()} {platform.machine()}",
-            "tacsim": _version("tacsim"),
-            "numpy": np.__version__,
-            "taichi": _version("taichi"),
-        },
+        versions={d.name: d.version for d in metadata.distributions() if d.name in ("tacsim", "numpy", "taichi")},
     )
     (folder / "dump.json").write_text(info.model_dump_json(indent=1) + "\n", encoding="utf-8")  # last: now it is whole
-
-
-def _version(package: str) -> str:
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return "not installed"
 
 
 def _numbers(poses: Poses) -> dict[str, PoseNumbers]:
@@ -198,9 +170,6 @@ def _with_mesh(scene: Scene, path: str) -> tuple[Scene, str | None]:
         return scene, None
     geometry = owner.geometry.model_copy(update={"path": path})
     return scene.model_copy(update={part: owner.model_copy(update={"geometry": geometry})}), owner.geometry.path
-
-
-# ------------------------------------------------------------------ reading
 
 
 def read(folder: Path) -> Dump:

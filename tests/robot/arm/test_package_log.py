@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from robot.arm.channel import STATE
-from robot.arm.package_log import PackageLog
+from robot.arm.lost_link import PackageLog
 from robot.arm.shared_ring import Ring, create
 from robot.arm.ur import URArm
 from tests.robot.waiting import until

@@ -7,13 +7,13 @@ import time
 import numpy as np
 import pytest
 
-from robot.arm.start_arm import StartArm
 from robot.arm.start_servo import JOINT_SPEED, distance_from_way
 from robot.arm.status import ArmStatus
 from robot.arm.trajectory import PERIOD
 from robot.arm.ur import URArm
 from robot.errors import DeviceError, SafetyViolation
 from robot.mock import MockUR
+from robot.procedures.to_start import StartArm
 from tacsim.models.hardware import UrArmConfig, Workspace
 from tests.robot.arm.mocked import config, moved, servo_targets
 from tests.robot.waiting import until

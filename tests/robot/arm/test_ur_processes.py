@@ -133,7 +133,7 @@ def test_a_policy_that_dies_leaves_a_standing_arm_and_nothing_else(
 COMMAND = """
 import os, sys, time
 from robot.arm.ur import URArm
-from robot.cli.interrupt import Interrupt
+from robot.cli.terminal import Interrupt
 from tacsim.models.hardware import UrArmConfig
 from tests.robot.arm.mocked import at_full_speed, moved
 with Interrupt() as stop:

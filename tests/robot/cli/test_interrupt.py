@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 import typer
 
-from robot.cli.interrupt import Interrupt
+from robot.cli.terminal import Interrupt
 from tests.robot.cli.invoked import environment
 
 NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -86,7 +86,7 @@ LOST = """
 import sys, time
 from pathlib import Path
 from robot.cli.errors import complain
-from robot.cli.interrupt import Interrupt
+from robot.cli.terminal import Interrupt
 from robot.cli.output import progress, results
 with Interrupt() as interrupt, progress() as bar:
     row = bar.add_task("at work", total=None)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from robot.cli.question import ask
+from robot.cli.terminal import ask
 from tests.robot.cli.invoked import environment, tacsim
 from tests.robot.cli.lab import copy_of
 from tests.robot.cli.terminal import Terminal
@@ -21,8 +21,8 @@ ASKING = f"""
 import time
 from pathlib import Path
 from robot.cli.output import busy, notes, progress
-from robot.cli.question import ask
-from robot.cli.interrupt import Interrupt
+from robot.cli.terminal import ask
+from robot.cli.terminal import Interrupt
 def wait(moment):
     while not Path(moment).exists():
         time.sleep(0.01)
@@ -105,7 +105,7 @@ def test_without_a_terminal_no_real_arm_moves(tmp_path: Path, words: list[str]) 
 
 def test_a_question_that_nobody_could_read_is_not_asked(tmp_path: Path) -> None:
     """The input is a terminal, what is asked would go into a file."""
-    program = "from robot.cli.question import ask\nprint(ask('Yes?'))"
+    program = "from robot.cli.terminal import ask\nprint(ask('Yes?'))"
     outer, inner = os.openpty()
     done = subprocess.run(
         [sys.executable, "-c", program], stdin=inner, capture_output=True, text=True, timeout=60, env=environment()

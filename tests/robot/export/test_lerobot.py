@@ -15,8 +15,7 @@ import pytest
 from pyarrow import parquet
 
 from robot.export.lerobot_files import DataSet
-from robot.export.lerobot_mapping import Feature, frames_per_second
-from robot.export.statistics import ImageCounts, column_statistics, merged
+from robot.export.lerobot_mapping import Feature, ImageCounts, column_statistics, frames_per_second, merged
 from robot.open import open_rig
 from tacsim import pose as se3
 from tacsim.interface import Action, RigSpec

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 import robot.rig.reset
-from robot.export.jog import Jog
 from robot.export.lerobot_mapping import LeRobotMapping
-from robot.export.lerobot_rig import LeRobotRig
+from robot.export.lerobot_rig import Jog, LeRobotRig
 from robot.open import open_rig, rig_spec
 from tacsim import pose as se3
 from tacsim.config import load_rig

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from robot.export import lerobot_video
 from robot.export.lerobot_files import DataSet
-from robot.export.lerobot_mapping import Feature
-from robot.export.statistics import ImageCounts
+from robot.export.lerobot_mapping import Feature, ImageCounts
 from tacsim.record.images import encode_png
 from tests.robot.cli.invoked import START, environment, tacsim
 from tests.robot.export.lerobot_reader import read_dataset

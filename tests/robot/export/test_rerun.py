@@ -104,7 +104,7 @@ def test_recorded_particles_are_shown() -> None:
 
 def test_a_rig_is_looked_at_live_and_hardware_does_not_move(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[tuple[Any, ...]] = []
-    monkeypatch.setattr("robot.cli.episode.view.run", lambda rig, **more: asked.append((rig, more)))
+    monkeypatch.setattr("robot.cli.recordings.run", lambda rig, **more: asked.append((rig, more)))
     assert tacsim("view", "ur5e-one", "--steps", "3").exit_code == 0
     assert tacsim("view", "sim", "--task", "squeeze", "--save", "live.rrd").exit_code == 0
     (first, one), (second, two) = asked

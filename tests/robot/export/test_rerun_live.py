@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from robot.export import rerun_live
-from robot.export.rerun_live import LiveView
+from robot.export import rerun_view
+from robot.export.rerun_view import LiveView
 from robot.rig.recorded import observe_episode
 from tacsim.interface import Pose, Truth
 from tests.robot.cli.invoked import tacsim
@@ -35,18 +35,17 @@ pytestmark = pytest.mark.usefixtures("empty_folder")
 class NoViewer:
     """In the place of the process: takes nothing until it is told to."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def __init__(self) -> None:
         self.sent: list[Any] = []
         self.go = threading.Event()
         made: Any = object.__new__(LiveView)
-        made._line, made.left_out, made._ended = rerun_live.queue.Queue(rerun_live.WAITING), 0, False
+        made._line, made.left_out, made._ended = rerun_view.queue.Queue(rerun_view.WAITING), 0, False
         made._pipe = made._process = self
-        monkeypatch.setattr(rerun_live, "send", self.send)
         made._thread = threading.Thread(target=made._hand_over, daemon=True)
         made._thread.start()
         self.view: LiveView = made
 
-    def send(self, pipe: Any, seen: Any) -> None:
+    def send(self, seen: Any) -> None:
         self.go.wait()
         self.sent.append(seen)
 
@@ -65,16 +64,16 @@ def seen(steps: int = 3) -> Any:
     return observed.episode.meta.spec, steps
 
 
-def test_a_viewer_that_is_too_slow_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_viewer_that_is_too_slow_is_not_waited_for() -> None:
     """One step is on its way, WAITING are in line, all others are left out: nobody waits for any."""
     _, steps = seen()
-    stalled = NoViewer(monkeypatch)
+    stalled = NoViewer()
     stalled.view(*steps[0])
     while not stalled.view._line.empty():  # the first is on its way
         time.sleep(1e-3)
     for k in range(1, 10):
         stalled.view(*steps[k % 3])
-    assert stalled.view.left_out == 9 - rerun_live.WAITING and stalled.sent == []
+    assert stalled.view.left_out == 9 - rerun_view.WAITING and stalled.sent == []
     stalled.go.set()
     stalled.view.close()
     assert [each if each is None else each[0].index for each in stalled.sent] == [0, 1, 2, None]
@@ -135,12 +134,12 @@ def test_a_message_cut_short_is_the_end(tmp_path: Path, share: float) -> None:
     _, steps = seen()
     path = tmp_path / "sent"
     with Connection(os.open(path, os.O_WRONLY | os.O_CREAT)) as line:
-        rerun_live.send(line, steps[0])
+        line.send(steps[0])
     with Connection(os.open(path, os.O_RDONLY)) as line:
-        assert rerun_live._receive(line) is not None
+        assert rerun_view._receive(line) is not None
     os.truncate(path, int(share * path.stat().st_size))
     with Connection(os.open(path, os.O_RDONLY)) as line:
-        assert rerun_live._receive(line) is None
+        assert rerun_view._receive(line) is None
 
 
 @needs_rerun

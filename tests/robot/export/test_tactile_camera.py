@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from robot.camera.camera import Camera, StaleFrame
-from robot.export.tactile_camera import TactileCamera
+from robot.export.lerobot_rig import TactileCamera
 from robot.mock import MockCamera
 from robot.mock.fixtures import mock_host
 from tacsim.interface import IncompatibleRig

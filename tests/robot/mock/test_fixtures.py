@@ -29,7 +29,6 @@ def test_the_controller_is_there_and_can_be_broken(mock_ur):
 
 def test_it_is_whole_again_in_the_next_test(mock_ur):
     assert mock_ur.faults.state().safety == "NORMAL"
-    assert mock_ur.door is mock_ur.faults  # its name of before, in tests of users
 
 
 def test_the_camera_shows_what_is_pushed(mock_camera):

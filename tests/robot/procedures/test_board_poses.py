@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from calibration.poses.records import board_pose_file, write_record
 from robot.mock import MockCamera, MockState
 from robot.mock.fixtures import mock_host
-from robot.procedures.board_poses import BoardPosePlan, record_board_poses, schedule
+from robot.procedures.boards import BoardPosePlan, record_board_poses, schedule
 from robot.procedures.session import CannotCalibrate, Session
 from tacsim import pose as se3
 from tacsim.interface import Pose

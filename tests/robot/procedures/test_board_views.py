@@ -15,7 +15,7 @@ import pytest
 from calibration.lens.view import GelView, Lens
 from robot.mock import MockCamera
 from robot.mock.fixtures import mock_host
-from robot.procedures.board_views import ON_GEL, PROMPTS, BoardViewPlan, record_board_views
+from robot.procedures.boards import ON_GEL, PROMPTS, BoardViewPlan, record_board_views
 from robot.procedures.session import CannotCalibrate, Session
 from tacsim.config import load
 from tacsim.interface import EndOfEpisode, TactileFrame

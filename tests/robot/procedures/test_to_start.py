@@ -11,8 +11,7 @@ import pytest
 from robot.arm.rtde import Reading
 from robot.common.kinematics import Kinematics, pose
 from robot.common.tcp import ArmFrames
-from robot.procedures.start_way import NoWay, Way, find_way, require_clear
-from robot.procedures.to_start import PROGRESS, Guide, Progress, lead_to_start
+from robot.procedures.to_start import PROGRESS, Guide, NoWay, Progress, Way, find_way, lead_to_start, require_clear
 from tacsim import pose as se3
 from tacsim.config import load_rig
 from tacsim.interface import FloatArray, Pose

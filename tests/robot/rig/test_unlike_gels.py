@@ -117,8 +117,9 @@ def test_a_dump_holds_both_gels(rig_file: Path, monkeypatch: pytest.MonkeyPatch)
         world.move({})
     dump = read(rig_file.parent / "dumps" / "00")
     found = table(dump)
-    assert found["fastest of gel nodes [wave speed]"]["before"].startswith("0  (")
-    assert found["smallest volume ratio, gel elements"]["before"] == "1"
+    assert found["gel_velocity_upper"]["before"].startswith("none  (")
+    assert found["gel_velocity_lower"]["before"] == "0 to 0"
+    assert found["volume ratio, gel elements"]["before"] == "1 to 1"
     np.testing.assert_array_equal(
         open_world(dump).snapshot()["gel_displacement_lower"], broken["gel_displacement_lower"]
     )

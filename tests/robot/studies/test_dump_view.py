@@ -48,7 +48,7 @@ def test_a_dump_is_shown_drawn_and_replayed(physics: str, tmp_path: Path, monkey
     assert "of the wave speed (limit 0.005)" in result.stdout
     assert "diverges again, exactly as recorded, to the last bit" in result.stdout
     assert "before the motion" in result.stdout and "last good" in result.stdout and "failed" in result.stdout
-    assert "numbers not finite" in result.stdout and "smallest volume ratio" in result.stdout
+    assert "volume ratio, " in result.stdout
     picture = imread(place / "debug.png")
     assert picture.shape[1] > 1000 and np.ptp(picture[..., :3].mean(axis=2)) > 0.5
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out"]  # the replay wrote no dump
@@ -70,7 +70,8 @@ def test_a_motion_at_constant_load_is_replayed_with_its_load(
         world.move({}, loads)
     dump = read(tmp_path / "00")
     assert dump.info.loads == loads and dump.command.targets == {}
-    assert dump_view.replay(dump, dump_view.open_world(dump)).identical
+    failure, outcome = dump_view.replay(dump, dump_view.open_world(dump))
+    assert failure is not None and outcome == "diverges again, exactly as recorded, to the last bit"
 
 
 def test_the_table_tells_what_is_wrong(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -80,10 +81,9 @@ def test_the_table_tells_what_is_wrong(tmp_path: Path, monkeypatch: pytest.Monke
     gel = dump.states["failed"]["gel_displacement"][0, 2, 2]
     gel[4] = gel[3] - [0.0, 0.0, 1.5]  # the element is 1 mm high
     rows = dump_view.table(dump)
-    assert rows["numbers not finite"]["failed"].startswith("9 of ")
-    assert rows["numbers not finite"]["before"].startswith("0 of ")
-    assert float(rows["smallest at a corner of one"]["failed"]) == pytest.approx(-0.5, abs=1e-3)
-    assert "9 not finite" in rows["fastest of particles [wave speed]"]["failed"]
+    corners = rows["volume ratio, element corners"]
+    assert float(corners["failed"].split()[0]) == pytest.approx(-0.5, abs=1e-3)
+    assert "9 not finite" in rows["velocity"]["failed"] and "not finite" not in rows["velocity"]["before"]
     assert float(rows["kernels: overlap"]["failed"]) >= 0
     dump_view.draw(dump, tmp_path / "debug.png")
 

@@ -18,7 +18,7 @@ from stable_baselines3.common.env_checker import check_env  # noqa: E402
 from stable_baselines3.common.evaluation import evaluate_policy  # noqa: E402
 from stable_baselines3.common.vec_env import VecMonitor  # noqa: E402
 
-from robot.train.sb3 import FeaturesExtractor, SharedVecEnv  # noqa: E402
+from robot.train.reinforce import FeaturesExtractor, SharedVecEnv  # noqa: E402
 from tests.tacsim.gym.small import assert_equal, make, make_native  # noqa: E402
 
 FEATURES = {

@@ -22,8 +22,7 @@ import onnxruntime  # noqa: E402
 
 from robot.deploy.onnx_policy import OnnxPolicy  # noqa: E402
 from robot.train.dagger import LEAST_SPREAD, act  # noqa: E402
-from robot.train.export import MOST_BYTES, ExportError, export  # noqa: E402
-from robot.train.network import CLIP, FeatureLayers, PolicyNetwork  # noqa: E402
+from robot.train.network import CLIP, MOST_BYTES, ExportError, FeatureLayers, PolicyNetwork, export  # noqa: E402  # noqa: E402
 from robot.train.run_folder import RunError, RunFolder  # noqa: E402
 from robot.train.train import begin, environments, export_policy, new_actor, train  # noqa: E402
 from tacsim.config import ConfigError  # noqa: E402

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 import typer
 
 from robot.cli.errors import FAILED, complain
-from robot.cli.interrupt import Interrupt
-from robot.cli.options import Overrides, grouped, quantity
+from robot.cli.options import Overrides, Preset, SensorModel, grouped, quantity, require_packages
 from robot.cli.output import busy, notes, one_bar, results
+from robot.cli.terminal import Interrupt
 
 if TYPE_CHECKING:
     from robot.collect.collect import Collected
@@ -94,10 +94,8 @@ def press(
     drawn: PressRanges,
     count: Count = 100,
     seed: Seed = 0,
-    sensor: Annotated[
-        str, typer.Option(help="Its name, the path of a YAML file, or of a calibrated bundle.")
-    ] = "ideal",
-    preset: Annotated[Literal["learn", "draft", "standard"], typer.Option(help="Resolution.")] = "standard",
+    sensor: SensorModel = "ideal",
+    preset: Preset = "standard",
     scale: Annotated[float, typer.Option(help="Metres per unit of the STL files.")] = 1e-3,
     workers: Workers = None,
     ray: Ray = None,
@@ -118,7 +116,7 @@ def press(
         ("--preset", preset, None),
         ("--scale", f"{scale:g}", "0.001"), *(("--set", text, None) for text in set_ or []), ("--out", str(out), None),
     ]  # fmt: skip
-    _require("pyarrow", "tacsim collect press", "export")
+    require_packages("tacsim collect press", "export", "pyarrow")
     with busy("loading"):
         from robot.collect.objects import find_objects
         from robot.collect.presses import PressJob, PressSet
@@ -146,7 +144,7 @@ def press(
         name = pressing_side(scene.indenter).name
         said = [*said, f"pressing side of each mesh: {name}; --set indenter.roll and indenter.pitch choose another"]
     for words in said:
-        notes.print(words, markup=False)
+        notes.print(words)
     command = _command("press", given)
     _run(PressJob(settings, count), out, files, command, workers, ray)
 
@@ -239,12 +237,11 @@ def _say(done: Collected, count: int, seconds: float, out: Path) -> None:
         parts = ", ".join(f"{name} {100 * part / spent:.0f} %" for name, part in done.seconds.most_common())
         results.print(
             f"{done.made} made in {seconds:.1f} s by {len(done.workers)}: {done.made / seconds:.2f} a second; "
-            f"of their time {parts}; {done.bytes / 2**20:.1f} MiB written in {done.writing:.1f} s",
-            markup=False,
+            f"of their time {parts}; {done.bytes / 2**20:.1f} MiB written in {done.writing:.1f} s"
         )
     if done.failures:
-        notes.print(f"{len(done.failures)} of {count} failed; why is in {out / 'failures.jsonl'}", markup=False)
-    results.print(str(out), markup=False)
+        notes.print(f"{len(done.failures)} of {count} failed; why is in {out / 'failures.jsonl'}")
+    results.print(str(out))
 
 
 def _checked(model: Any, **values: Any) -> Any:
@@ -259,15 +256,6 @@ def _checked(model: Any, **values: Any) -> Any:
         first = refused.errors(include_url=False)[0]
         where = ".".join(map(str, first["loc"]))
         raise SetError(f"{where}: {first['msg']}".removeprefix(": ").replace("Value error, ", "")) from None
-
-
-def _require(module: str, command: str, extra: str) -> None:
-    from importlib.util import find_spec
-
-    from robot.open import CannotOpen
-
-    if find_spec(module) is None:
-        raise CannotOpen(f"{command} needs {module}, which is not installed: pip install 'tacsim[{extra}]'")
 
 
 def _command(what: str, given: Sequence[tuple[str, str | None, str | None]]) -> str:

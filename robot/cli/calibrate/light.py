@@ -1,4 +1,4 @@
-"""What `tacsim calibrate sensor` ends in: figures on the screen, the bundle, and the page of its verdict."""
+"""From presses of a ball to the fit of a sensor's light, its bundle and the page of its verdict."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from robot.cli.errors import UNTRUSTED, UNVERIFIED
-from robot.cli.output import notes, results, say_files, show_table, warn, writing
+from robot.cli.output import busy, notes, results, say_files, show_table, warn, writing
 
 if TYPE_CHECKING:
     from calibration.frame_set import FrameSet
@@ -19,8 +19,64 @@ if TYPE_CHECKING:
     from tacsim.models.geometry import PictureRegion
     from tacsim.models.sensor import CameraNoise, Markers
 
+MAX_PRESSES = 200  # 5 to 8 are enough
 UNKNOWN = "unknown"  # serial number of a sensor that nobody named
 FRAMES = "frames"  # folder in a bundle of the pictures that a camera took for it
+
+
+def read_presses(frames: Path, reference: Path | None) -> FrameSet:
+    with busy("loading"):
+        from calibration.frame_set import read_folder
+    read = read_folder(frames, reference, MAX_PRESSES)
+    if read.estimated:
+        notes.print("no picture without contact: the median of all presses stands for it")
+    return read
+
+
+def straighten(read: FrameSet, region: PictureRegion | None, view: GelView | None) -> FrameSet:
+    """Native pictures as they are calibrated: even beyond the region, and metric."""
+    from calibration.frame_set import rectified_by_view, within_region
+
+    if region is not None:
+        read = within_region(read, region)
+    return read if view is None else rectified_by_view(read, view)
+
+
+def fit_light(read: FrameSet, ball: float, dot: float | None) -> LightFit:
+    """`ball`, `dot`: radii [px]. Exits with UNTRUSTED where the light tells nothing."""
+    with busy("loading"):
+        from calibration.light.calibrator import NoDirection, calibrate_light
+        from calibration.markers.dots import DotEraser
+    named = [(frame.name, frame.image) for frame in read.frames]
+    try:
+        with busy(f"calibrating from {len(named)} press{'es' * (len(named) > 1)}"):
+            erase = None if dot is None else DotEraser(dot)
+            more = [frame.image for frame in read.untouched]
+            return calibrate_light(read.reference, named, ball, erase, more)
+    except NoDirection as why:
+        from calibration.light.checks.verdict import GREY, is_grey
+
+        grey = f"; {GREY}: give the camera's own, in colour" if is_grey(read.reference) else ""
+        notes.print(f"{why}{grey}")
+        results.print("verdict: do not trust; no bundle is written")
+        raise typer.Exit(UNTRUSTED) from None
+
+
+def find_lattice(read: FrameSet, pitch: float) -> Markers:
+    """The lattice of dots in the picture without contact."""
+    from calibration.markers.flow import find_markers
+    from calibration.markers.lattice import NoLattice
+    from tacsim.models.sensor import Markers
+
+    try:
+        lattice, radius = find_markers(read.reference)
+    except NoLattice as nothing:
+        raise typer.BadParameter(
+            f"{nothing}; leave --markers out if none are printed", param_hint="--markers"
+        ) from None
+    rows, columns = lattice.present.shape
+    places = tuple(tuple((float(x), float(y)) for x, y in row) for row in lattice.positions * pitch)
+    return Markers(rows=rows, columns=columns, pitch=lattice.pitch * pitch, radius=radius * pitch, places=places)
 
 
 def write_calibration(
@@ -64,7 +120,7 @@ def write_calibration(
         facts.append(f"camera's noise {', '.join(f'{value:.2f}' for value in noise.deviation)} grey levels (R, G, B)")
     if skin is not None:
         facts.append(f"skin: {skin:.0%} of the grain of the picture without contact moves with the gel")
-        notes.print(facts[-1], markup=False)
+        notes.print(facts[-1])
     with writing(folder, new=not (folder / FRAMES).exists()):
         written = [write_bundle(folder, bundle, fit.reference)]
         residuals = folder / "residuals.png" if fit.predictions else None
@@ -76,7 +132,7 @@ def write_calibration(
         page.write_page(written[-1], title, fit, scale, verdict, residuals, facts)
     for finding in verdict.findings:
         todo = f" Next: {finding.todo}" if finding.todo else ""
-        notes.print(f"{finding.word}: {finding.what}.{todo}", markup=False)
+        notes.print(f"{finding.word}: {finding.what}.{todo}")
     results.print(f"verdict: {verdict.word}")
     say_files(*written)
     if verdict.word == "do not trust":
@@ -99,7 +155,7 @@ def _noise(read: FrameSet, fit: LightFit) -> CameraNoise | None:
     try:
         noise = measure_noise(read.untouched_images) if still > 1 else measure_press_noise(fit.presses, fit.reference)
     except NoiseUnknown as why:
-        notes.print(f"camera's noise not measured: {why}", markup=False)
+        notes.print(f"camera's noise not measured: {why}")
         return None
     spread = ", ".join(f"{value:.2f}" for value in noise.deviation)
     notes.print(
@@ -150,9 +206,9 @@ def _show(fit: LightFit, pitch: float, found: Markers | None) -> None:
     if fit.stretch is not None:
         results.print(f"ratio of the axes of contacts: {fit.stretch}")
     for name, why in fit.left_out:
-        notes.print(f"left out: {name}: {why}", markup=False)
+        notes.print(f"left out: {name}: {why}")
     if found is not None:
-        notes.print(_lattice(found), markup=False)
+        notes.print(_lattice(found))
 
 
 def _lattice(found: Markers) -> str:

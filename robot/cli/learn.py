@@ -1,0 +1,318 @@
+"""Policies learned in simulation: `tacsim train`, `evaluate`, `transfer`, `export policy`, `export policy-range`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from robot.cli.options import Out, Overrides, TrainingFile, require_packages
+from robot.cli.output import (
+    busy,
+    new_directory,
+    notes,
+    one_bar,
+    require_writable,
+    results,
+    say_files,
+    show_table,
+    warn,
+    writing,
+)
+
+if TYPE_CHECKING:
+    from robot.train.evaluate import Interval, Judged
+    from robot.train.run_folder import RunFolder
+    from robot.train.transfer import Row
+
+TRAINING = ("torch", "stable_baselines3", "onnx", "onnxruntime")  # what the extra `train` brings
+export = typer.Typer(no_args_is_help=True, help="Write policies and recordings as files for others.")
+
+
+def train(
+    task: Annotated[
+        str | None, typer.Argument(help="squeeze, reposition, knead, or the path of a training file.")
+    ] = None,
+    algorithm: Annotated[
+        str | None,
+        typer.Option(help="dagger (a teacher shows), ppo or sac (from the reward alone).", show_default="the file's"),
+    ] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Same seed, same policy.", show_default="the file's")] = None,
+    resume: Annotated[
+        Path | None, typer.Option(help="The folder of a run that was stopped: it goes on to the same end.")
+    ] = None,
+    set_: Overrides = None,
+    out: Out = None,
+) -> None:
+    """Train a policy in simulation, and write it as a file for `tacsim run RIG --policy FILE`.
+
+    A checkpoint is kept after each round; whatever ends the run, `--resume` goes on. Needs the extra `train`.
+
+    Example: tacsim train squeeze --out runs/squeeze-0
+    """
+    require_packages("tacsim train", "train", *TRAINING)
+    own = [f"algorithm={algorithm}"] * (algorithm is not None) + [f"seed={seed}"] * (seed is not None) + (set_ or [])
+    if resume is not None:
+        if task is not None or own or out is not None:
+            raise typer.BadParameter(
+                f"a run goes on with its own settings ({resume / 'run.json'}): leave out all else, or begin a new run",
+                param_hint="--resume",
+            )
+        with busy("loading"):
+            from robot.train.run_folder import RunFolder
+
+            run = RunFolder(resume)
+    else:
+        if task is None:
+            raise typer.BadParameter("name a task (squeeze, reposition, knead), or a run that goes on (--resume)")
+        from tacsim.config import load
+        from tacsim.models.training import Training
+
+        training = load(Training, task, own)
+        folder = new_directory(out, f"train-{training.task}")
+        with busy("loading"):
+            from robot.train.train import begin
+
+            run = begin(training, folder)
+    from tacsim.tasks.task import BadDraws
+
+    try:
+        path = _train(run)
+    except BadDraws:
+        if run.last()[0]:
+            notes.print(f"What was learned is kept. Make a file of it: tacsim export policy {run.folder}")
+        raise
+    except (KeyboardInterrupt, OSError):
+        notes.print(f"What was learned is kept. Go on: tacsim train --resume {run.folder}")
+        raise
+    say_files(path, run.folder / "curve.json")
+    notes.print(f"Next: tacsim evaluate {task or run.settings.training.task} --policy {path} --policy scripted")
+
+
+def _train(run: RunFolder) -> Path:
+    from robot.train.train import train as go_on
+
+    def say(figures: Mapping[str, float]) -> None:
+        results.print(
+            f"round {figures['round']:.0f}: {1e3 * figures['distance']:.3f} mm from the goal, success "
+            f"{100 * figures['success']:.0f} %, {figures['peak_force']:.1f} N at most, "
+            f"{figures['steps'] / figures['seconds']:.0f} steps/s"
+            + (f", {figures['refused']:.0f} draws refused" if figures["refused"] else "")
+        )
+
+    with one_bar("starting") as bar:
+        return go_on(run, bar.report, say, warn)
+
+
+def policy(
+    run: Annotated[Path, typer.Argument(help="The folder of a training run, finished or not.")],
+    out: Annotated[Path, typer.Option("--out", help="The file to be written, FILE.onnx; it must not exist.")],
+) -> None:
+    """Write the policy of a training run as one ONNX file, which says of itself what it sees and does.
+
+    Needs the extra `train`; who runs the file needs the extra `policy` alone.
+
+    Example: tacsim export policy runs/squeeze-0 --out squeeze.onnx
+    """
+    require_packages("tacsim export policy", "train", *TRAINING)
+    _require_new(out)
+    with busy("exporting, and observing episodes of its training"):
+        from robot.train.run_folder import RunFolder
+        from robot.train.train import export_policy
+
+        worst = export_policy(RunFolder(run), out)
+    results.print(f"{out} ({out.stat().st_size / 1024:.0f} KiB), within {worst:.1g} of the network")
+
+
+def policy_range(
+    policy: Annotated[Path, typer.Argument(help="A policy, FILE.onnx.")],
+    out: Annotated[Path, typer.Option("--out", help="The file to be written, FILE.onnx; it must not exist.")],
+    training: Annotated[
+        str | None,
+        typer.Option(help="Name or path of the training file.", show_default="as the policy says that it was trained"),
+    ] = None,
+    episodes: Annotated[
+        int | None, typer.Option(min=2, max=10_000, help="To be played.", show_default="4 of each environment")
+    ] = None,
+    set_: Overrides = None,
+) -> None:
+    """Write a policy again, with the range of what it observes in episodes of its training.
+
+    The policy acts itself in episodes drawn as the training file says. `tacsim run` and `tacsim evaluate` then say when
+    observations leave that range, and which parameters of a simulated scene do. Needs onnx (extra `train`).
+
+    Example: tacsim export policy-range mine.onnx --training squeeze --out mine-with-range.onnx
+    """
+    require_packages("tacsim export policy-range", "train", "onnx")
+    _require_new(out)
+    if set_ and training is None:
+        raise typer.BadParameter("--set changes a training file: name it with --training", param_hint="--set")
+    from robot.train.measure_range import measure_range, write_range
+    from tacsim.config import load
+    from tacsim.models.training import Training
+
+    settings = None if training is None else load(Training, training, set_ or [])
+    with one_bar("starting") as bar:
+        found = measure_range(policy, settings, episodes, bar.report)
+    write_range(policy, out, found)
+    results.print(f"{out}: range of {found.episodes} episodes")
+
+
+def _require_new(out: Path) -> None:
+    if out.suffix != ".onnx":
+        raise typer.BadParameter(f"{out} must end in .onnx", param_hint="--out")
+    if out.exists():
+        raise typer.BadParameter(f"{out} exists already; name a new file, nothing is overwritten", param_hint="--out")
+
+
+def evaluate(
+    task: TrainingFile,
+    policy: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="teacher (by the truth), random, scripted, learned (the shipped one), FILE.onnx; may be repeated.",
+            show_default="teacher, scripted, random",
+        ),
+    ] = None,
+    episodes: Annotated[int, typer.Option(min=2, max=10_000, help="Of each policy.")] = 200,
+    seed: Annotated[int, typer.Option(min=0, help="Same seed, same episodes.")] = 0,
+    json_: Annotated[
+        Path | None, typer.Option("--json", help="Write how each episode ended, while it goes on.", show_default=False)
+    ] = None,
+    set_: Overrides = None,
+) -> None:
+    """Compare policies in the same episodes, whose bodies and goals no training has met.
+
+    Success with Wilson's interval, distance and improvement (share of the distance at the start) with a bootstrap's,
+    all of 95 %; the peak of the normal force as mean and as what one episode in twenty exceeds; the share of episodes
+    in which a learned policy observed what it did not observe in its training.
+
+    Example: tacsim evaluate squeeze --policy learned --policy scripted --episodes 50
+    """
+    require_writable(json_, "--json", new=True)
+    from robot.train.evaluate import evaluate as judge_all
+    from tacsim.config import load
+    from tacsim.models.training import Training
+
+    training = load(Training, task, set_ or [])
+    played: dict[str, Judged] = {}
+    with one_bar("starting") as bar:
+
+        def say(so_far: Judged) -> None:
+            played[so_far.policy] = so_far
+            if json_ is not None:
+                _write(json_, played.values())
+            done, success = len(so_far.episodes), _interval_text(so_far.success, 100, 0)
+            notes.print(f"{so_far.policy}: {done} of {episodes} episodes, success {success} %")
+
+        judged = judge_all(training, policy or ["teacher", "scripted", "random"], episodes, seed, bar.report, say, warn)
+    _show_judged(judged)
+
+
+def _write(path: Path, judged: Iterable[Judged]) -> None:
+    import json
+
+    from robot.common.whole_file import write_whole
+
+    ends = {each.policy: [end._asdict() for end in each.episodes] for each in judged}
+    write_whole(path, (json.dumps(ends, indent=1) + "\n").encode())
+
+
+def _show_judged(judged: list[Judged]) -> None:
+    names, rows = [Path(each.policy).name for each in judged], []
+    if len(set(names)) < len(names):
+        names = [each.policy for each in judged]
+    for name, each in zip(names, judged, strict=True):
+        mean, most = each.peak_force
+        rows.append(
+            (
+                name,
+                _interval_text(each.success, 100, 0),
+                _interval_text(each.distance, 1e3, 3),
+                _interval_text(each.improvement, 100, 0),
+                f"{mean:.1f}, {most:.1f}",
+                "–" if each.outside is None else f"{100 * each.outside:.0f}",
+            )
+        )
+    columns = ("policy", "success [%]", "distance [mm]", "improvement [%]", "peak force [N]", "outside training [%]")
+    show_table(f"{len(judged[0].episodes)} unseen episodes, 95 % intervals", columns, rows, left={0})
+
+
+def _interval_text(interval: Interval, scale: float, digits: int) -> str:
+    value, low, high = (f"{scale * number:.{digits}f}" for number in (interval.value, interval.low, interval.high))
+    return f"{value} ({low} to {high})"
+
+
+def transfer(
+    task: Annotated[str, typer.Argument(help="squeeze, reposition, knead, or the path of a task file.")],
+    policy: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="learned (the shipped one), scripted, FILE.onnx; may be repeated.", show_default="learned, scripted"
+        ),
+    ] = None,
+    twin: Annotated[
+        str | None,
+        typer.Option(help="Randomisation that draws the hidden twins: a name or path.", show_default="TASK-twin"),
+    ] = None,
+    episodes: Annotated[int, typer.Option(min=2, max=10_000, help="Of each policy on each side.")] = 20,
+    every: Annotated[int, typer.Option(min=1, max=10_000, help="Another twin every so many episodes.")] = 5,
+    steps: Annotated[
+        int | None, typer.Option(min=1, help="Control steps of an episode.", show_default="the task's")
+    ] = None,
+    workers: Annotated[int, typer.Option(min=1, max=64, help="Rigs side by side, each in a process of its own.")] = 1,
+    out: Annotated[Path, typer.Option(help="Folder; one that was begun goes on.")] = Path("runs/transfer"),
+    set_: Overrides = None,
+) -> None:
+    """Compare what policies reach in simulation and, over the real wire, on mock hardware whose hidden twin differs.
+
+    Each episode is played on both sides; the simulation has of the twin only the goal and the body's size. Killed
+    anywhere, the same command goes on, with further policies too. Writes transfer.json, transfer.png and how each
+    episode ended.
+
+    Example: tacsim transfer squeeze --policy learned --policy scripted --episodes 20
+    """
+    import json
+    from dataclasses import asdict
+
+    from robot.train.transfer import Study, picture, play, summary
+    from tacsim.config import load
+    from tacsim.models.randomisation import Randomisation
+
+    twins = load(Randomisation, f"{task}-twin" if twin is None else twin)
+    policies = tuple(policy or ("learned", "scripted"))
+    study = Study(task, policies, twins, episodes, every, steps, tuple(set_ or ()))
+    with writing(out):
+        out.mkdir(parents=True, exist_ok=True)
+    with one_bar("starting") as bar:
+
+        def report(words: str, done: int, of: int) -> None:
+            bar.report(words, done, of)
+            if not notes.is_terminal:
+                notes.print(f"{done} of {of}: {words}")
+
+        rows = summary(play(study, out, report, workers))
+    with writing(out):
+        (out / "transfer.json").write_text(json.dumps([asdict(row) for row in rows], indent=1) + "\n", encoding="utf-8")
+        picture(rows, out / "transfer.png")
+    _show_transfer(rows, episodes)
+    for name in ("transfer.json", "transfer.png"):
+        results.print(str(out / name))
+
+
+def _show_transfer(rows: list[Row], episodes: int) -> None:
+    shown = [
+        (
+            row.policy,
+            row.side,
+            _interval_text(row.success, 100, 0),
+            "–" if row.distance is None else _interval_text(row.distance, 1e3, 3),
+            "–" if row.agreement is None else f"{1e3 * row.agreement:.3f}",
+            str(row.failures),
+        )
+        for row in rows
+    ]
+    columns = ("policy", "", "success [%]", "distance [mm]", "felt - true, rms [mm]", "errors")
+    show_table(f"{episodes} episodes each, 95 % intervals", columns, shown, left={0, 1})

@@ -23,8 +23,8 @@ from tacsim.control.load_controller import load_controller
 from tacsim.interface import Normaliser, Pose, RigSpec, SensorSpec, TactileFrame, TactileSource
 from tacsim.models.hardware import CameraSensorConfig, UrArmConfig
 from tacsim.models.rig import RigConfig, SimSensorConfig
-from tacsim.report.series import ALIGNMENT, LIMITS, PICTURES_DAMAGED, PICTURES_LOST, PICTURES_REPEATED
 from tacsim.rig import Rig
+from tacsim.step_info import ALIGNMENT, LIMITS_HIT, PICTURES_DAMAGED, PICTURES_LOST, PICTURES_REPEATED
 
 Confirm = Callable[[str], bool]
 MISSED = 2.5  # an approach waits when no picture came for so many periods of its camera
@@ -170,7 +170,7 @@ def _diagnostics(
 ) -> Mapping[str, float]:
     values = {**cell.diagnostics(), **clock.diagnostics()}
     for name, arm in arms.items():
-        values |= {f"{ALIGNMENT}{name}": arm.alignment, f"{LIMITS}{name}": float(arm.limits_hit)}
+        values |= {f"{ALIGNMENT}{name}": arm.alignment, f"{LIMITS_HIT}{name}": float(arm.limits_hit)}
     for name, camera in cameras.items():
         values |= camera_counts(name, camera)
     return values

@@ -29,8 +29,8 @@ from tacsim.models.hardware import UrArmConfig
 from tacsim.models.randomisation import Randomisation
 from tacsim.models.training import Training
 from tacsim.record.episode import Episode
-from tacsim.report.series import FELT
 from tacsim.rig import Rig
+from tacsim.step_info import TACTILE_DISTANCE
 from tacsim.tasks import make_task
 
 Side = Literal["simulation", "twin"]
@@ -226,7 +226,7 @@ def _episode(study: Study, side: Side, rig: Rig, loaded: LoadedRig, policy: str,
         side,
         number,
         last,
-        episode.steps[-1].info.get(FELT) if episode.steps else None,
+        episode.steps[-1].info.get(TACTILE_DISTANCE) if episode.steps else None,
         success=last is not None and last <= task.config.success and within,
         peak_force=max(forces, default=0.0),
         error=error,

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from robot.cli.bench import require_checkout
+from robot.cli.bench import from_checkout, require_checkout
 from robot.cli.options import Overrides
 from robot.cli.output import SafeConsole, busy
 
@@ -31,9 +31,7 @@ def schema(
 
     if kind == "bench":
         require_checkout("tacsim schema bench")
-        from benchmarks.harness import schema as report
-
-        typer.echo(json.dumps(report.json_schema(), indent=2))
+        typer.echo(json.dumps(from_checkout("benchmarks.harness.schema").json_schema(), indent=2))
         return
     if kind not in KINDS:
         raise typer.BadParameter(f"no kind '{kind}'; allowed: {', '.join(KINDS)}, bench", param_hint="KIND")

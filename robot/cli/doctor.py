@@ -11,7 +11,7 @@ from robot.cli.options import Overrides
 from robot.cli.output import SafeConsole, busy
 
 if TYPE_CHECKING:
-    from robot.doctor import machine
+    from tacsim.models.driver import Check
 
 MARKS = {"ok": "[green]ok[/]", "warn": "[yellow]warn[/]", "fail": "[bold red]fail[/]"}
 
@@ -75,7 +75,7 @@ def doctor(
     raise typer.Exit(0 if report["ok"] else 1)
 
 
-def print_checks(checks: list[machine.Check]) -> None:
+def print_checks(checks: list[Check]) -> None:
     from rich.table import Table
     from rich.text import Text
 

@@ -27,24 +27,25 @@ def start(
     """
     with busy("looking at the rig"):
         from robot.doctor.rig import examine_arms
-        from robot.mock.cell.cell import MockCell
         from robot.open import CannotOpen
         from robot.procedures.to_start import Guide, Halted, lead_to_start
+        from robot.rig.parts import companion_of
         from tacsim.config import load_rig
-        from tacsim.models.hardware import UrArmConfig
+        from tacsim.models.hardware import UrArmConfig, parts_of
 
         config = load_rig(rig, overrides=set_ or []).config
-    arms = {name: arm for name, arm in config.arms.items() if isinstance(arm, UrArmConfig)}
+    arms = parts_of(config.arms, UrArmConfig)
     if not arms:
         raise CannotOpen(f"rig '{config.name}' has no UR arm: there is nothing to lead to its start")
     if not has_person():
         raise CannotOpen(
             f"rig '{config.name}': no arm is led to its start without somebody who says yes; run this from a terminal"
         )
-    with Interrupt() as interrupt, MockCell(config) as cell:
-        starts = {**cell.start_poses, **{name: arm.start.pose for name, arm in arms.items() if arm.start is not None}}
+    with Interrupt() as interrupt, companion_of(config) as companion:
+        of_mocks = {} if companion is None else companion.start_poses
+        starts = {**of_mocks, **{name: arm.start.pose for name, arm in arms.items() if arm.start is not None}}
         with busy("looking at the arms"):
-            checks = examine_arms(config, cell.start_poses, rig)
+            checks = examine_arms(config, of_mocks, rig)
         print_checks(checks)
         try:
             with busy("connecting") as show:

@@ -8,25 +8,18 @@ import platform
 import sys
 import tempfile
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from importlib import metadata
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
+from tacsim.models.driver import Check
+
 PYTHONS = ((3, 11), (3, 14))  # from, up to but without
 OPENCV = "opencv-contrib-python-headless"  # the distribution that provides cv2
-State = Literal["ok", "warn", "fail"]
-
-
-@dataclass(frozen=True, slots=True)
-class Check:
-    name: str
-    state: State
-    found: str
-    advice: str = ""  # what to do next; empty when all is well
 
 
 def examine() -> list[Check]:

@@ -19,8 +19,7 @@ from calibration.bundle import read_bundle
 from robot.common.whole_file import put_new
 from robot.export.rerun_log import EpisodeLog, blueprint
 from robot.rig.recorded import observe_episode
-from tacsim.models.hardware import CameraSensorConfig
-from tacsim.models.rig import RigConfig, SimSensorConfig
+from tacsim.models.rig import RigConfig
 from tacsim.optics.markers import rest_positions
 
 if TYPE_CHECKING:
@@ -121,10 +120,10 @@ def lattices(rig: RigConfig | None) -> Mapping[str, NDArray[np.float64]]:
     found: dict[str, NDArray[np.float64]] = {}
     for name, sensor in ({} if rig is None else rig.sensors).items():
         markers = None
-        if isinstance(sensor, CameraSensorConfig) and sensor.calibration is not None:
-            markers = read_bundle(Path(sensor.calibration))[0].markers
-        elif isinstance(sensor, SimSensorConfig | CameraSensorConfig) and sensor.model is not None:
-            markers = sensor.model.markers
+        if sensor.bundle is not None:
+            markers = read_bundle(Path(sensor.bundle))[0].markers
+        elif sensor.sensor_model is not None:
+            markers = sensor.sensor_model.markers
         if markers is not None:
             found[name] = rest_positions(markers)
     return found

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from robot.camera.camera import Camera, StaleFrame
 from robot.export.lerobot_rig import picture_shape
 from robot.open import load_with_task
-from robot.rig.hardware_rig import camera_normaliser
+from robot.rig.parts import sensor_of
 from tacsim.interface import IncompatibleRig
-from tacsim.models.hardware import CameraSensorConfig
+from tacsim.models.hardware import CameraSensorConfig, parts_of
 
 FIRST = 5.0  # longest wait for the picture without contact [s]
 POLL = 2e-3  # between two looks for a new picture [s]
@@ -34,12 +34,13 @@ class TactileCamera:
         if sensor is None and len(config.sensors) > 1:
             raise IncompatibleRig(f"rig '{config.name}' has several sensors; name one of them: {there}")
         self.name = next(iter(config.sensors)) if sensor is None else sensor
-        found = config.sensors.get(self.name)
-        if found is None:
+        if self.name not in config.sensors:
             raise IncompatibleRig(f"rig '{config.name}' has no sensor '{self.name}'; it has {there}")
-        if not isinstance(found, CameraSensorConfig):
-            raise IncompatibleRig(f"sensor '{self.name}' of rig '{config.name}' is {found.driver}, not a camera")
-        if found.mock is not None:
+        found = parts_of(config.sensors, CameraSensorConfig).get(self.name)
+        if found is None:
+            driver = config.sensors[self.name].driver
+            raise IncompatibleRig(f"sensor '{self.name}' of rig '{config.name}' is {driver}, not a camera")
+        if found.is_mock:
             raise IncompatibleRig(
                 f"sensor '{self.name}' of rig '{config.name}' is a mock that its whole rig starts; name a camera that "
                 "runs by itself"
@@ -47,7 +48,7 @@ class TactileCamera:
         self.fps: float = found.fps  # that the camera is asked for
         self.shape = picture_shape(config.canonical)  # of a picture: rows, columns, 3
         self._config = found
-        self._normaliser = camera_normaliser(self.name, found, config)
+        self._normaliser = sensor_of(config, self.name).normaliser()
         self._camera: Camera | None = None
         self._seen = -1  # index of the frame that `read_new` gave last
 

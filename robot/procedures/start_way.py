@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from robot.arm.rtde import Reading
+from robot.arm.controller.rtde import Reading
 from robot.arm.start_servo import sensor_path, way_rates
 from robot.common.kinematics import Kinematics, inverse_frame, matrix
 from robot.common.tcp import ArmFrames

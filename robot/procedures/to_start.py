@@ -11,14 +11,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from robot.arm.rtde import read_controller
+from robot.arm.controller.rtde import read_controller
 from robot.arm.start_arm import StartArm
 from robot.arm.status import ArmStatus
 from robot.errors import DeviceError
 from robot.procedures.start_way import Way, find_way, require_clear
 from tacsim import pose as se3
 from tacsim.interface import FloatArray, Pose
-from tacsim.models.hardware import UrArmConfig
+from tacsim.models.hardware import UrArmConfig, parts_of
 from tacsim.models.rig import RigConfig
 
 OFF_FORCE = 1.0  # a sensor that feels more at rest is to be zeroed [N]
@@ -53,7 +53,7 @@ def lead_to_start(config: RigConfig, starts: Mapping[str, Pose], guide: Guide) -
 
     Raises NoWay before anything is connected, Halted, and the error of an arm that is stopped; all arms brake then.
     """
-    arms = {name: arm for name, arm in config.arms.items() if isinstance(arm, UrArmConfig)}
+    arms = parts_of(config.arms, UrArmConfig)
     missing = [name for name in arms if name not in starts]
     if missing:
         raise DeviceError(

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from tacsim import pose as se3
 from tacsim.gym.features import FeatureEncoder
 from tacsim.interface import ArmState, IncompatibleRig, Needs, Observation, Pose, TactileObservation
-from tacsim.models.rig import RigConfig, SimSensorConfig
+from tacsim.models.rig import RigConfig
 from tacsim.tasks import make_task
 
 Flat = dict[str, NDArray[Any]]
@@ -104,14 +104,14 @@ def space_of_rig(config: RigConfig) -> spaces.Space[Flat]:
     cells, pixels = (grid.rows, grid.columns), (grid.rows * grid.image_scale, grid.columns * grid.image_scale, 3)
     flat: Flat = {}
     for name, sensor in config.sensors.items():
-        assert isinstance(sensor, SimSensorConfig)
+        assert sensor.sensor_model is not None
         flat[f"tactile_{name}"] = np.zeros(pixels, np.uint8)
         flat |= {f"{key}_{name}": np.zeros(cells, np.int8) for key in ("contact", "valid")}
         flat[f"height_{name}"], flat[f"gradient_{name}"] = (
             np.zeros(cells, np.float32),
             np.zeros((*cells, 2), np.float32),
         )
-        markers = sensor.model.markers
+        markers = sensor.sensor_model.markers
         if markers is not None:
             flat[f"flow_{name}"] = np.zeros((markers.rows, markers.columns, 2), np.float32)
     for name in config.arms:
@@ -146,7 +146,8 @@ def space_of_features(encoder: FeatureEncoder, config: RigConfig) -> spaces.Spac
 def _lattice(name: str, config: RigConfig) -> tuple[int, int]:
     """Rows and columns of a sensor's markers. Raises IncompatibleRig without such a sensor or markers."""
     sensor = config.sensors.get(name)
-    markers = sensor.model.markers if isinstance(sensor, SimSensorConfig) else None
+    model = None if sensor is None else sensor.sensor_model
+    markers = None if model is None else model.markers
     if markers is None:
         raise IncompatibleRig(f"the features ask for tactile flow, and sensor '{name}' of this rig has no markers")
     return markers.rows, markers.columns

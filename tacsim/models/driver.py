@@ -7,7 +7,6 @@ Its module is imported whenever a rig file is read, so it imports what is heavy 
 
 from __future__ import annotations
 
-import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
@@ -236,7 +235,7 @@ class Drivers:
 def installed_drivers() -> Drivers:
     """Looked up once in a process. Raises DriversMissing."""
     found, homes = Drivers(), dict[tuple[str, str], str]()
-    for entry in metadata.entry_points(group=GROUP):
+    for entry in sorted(metadata.entry_points(group=GROUP), key=lambda each: each.name):
         kind, _, name = entry.name.partition(".")
         home = "an unknown distribution" if entry.dist is None else entry.dist.name
         if kind not in BASES or not name:
@@ -267,7 +266,7 @@ def _load(entry: metadata.EntryPoint, kind: str, name: str) -> tuple[AnyPart | N
         found = entry.load()
     except Exception as failure:  # a distribution of somebody else's may fail in any way; other drivers still work
         return None, f"cannot be loaded: {type(failure).__name__}: {failure}"
-    if not (inspect.isclass(found) and issubclass(found, part)):
+    if not (isinstance(found, type) and issubclass(found, part)):
         return None, f"is no class that derives from tacsim.{driver.__name__}"
     if "wall" in getattr(found, "clocks", ()) and not issubclass(found, driver):
         return None, f"goes by the wall clock and does not derive from tacsim.{driver.__name__}"
@@ -275,11 +274,10 @@ def _load(entry: metadata.EntryPoint, kind: str, name: str) -> tuple[AnyPart | N
     if missing:
         words = f"does not state {', '.join(missing)}"
         return None, f"{words}, {WHY_LATENCY}" if "worst_latency" in missing else words
-    config: Any = getattr(found, "config_class", None)
-    names = get_args(config.model_fields["driver"].annotation) if inspect.isclass(config) else ()
-    if names != (name,):
+    usable: AnyPart = found  # it derives from one of the two
+    config = getattr(usable, "config_class", None)
+    if config is None or get_args(config.model_fields["driver"].annotation) != (name,):
         return None, f'has no config_class with `driver: Literal["{name}"]`'
-    usable: AnyPart = found  # type: ignore[assignment]  # derives from one of the two
     return usable, ""
 
 

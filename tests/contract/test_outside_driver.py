@@ -27,8 +27,8 @@ canonical: {{ rows: 32, columns: 32, pitch: 0.5 mm }}
 arms:
   hand:
     driver: gantry
-    start: {{ position: [0, 0, 0] }}
-    limits: {{ workspace: {{ lower: [-20 mm, -20 mm, -20 mm], upper: [20 mm, 20 mm, 20 mm] }}, depth: 0.5 mm }}
+    start: {{ position: [0, 0, 0], rotation: [180 deg, 0, 0] }}
+    limits: {{ workspace: {{ lower: [-20 mm, -20 mm, -20 mm], upper: [20 mm, 20 mm, 20 mm] }}, depth: {depth} }}
 sensors:
   tip: {{ driver: {driver}, arm: hand }}
 start: {{ touch_signal: {signal}, approach_speed: {speed} }}
@@ -54,9 +54,11 @@ def python(site: Path, folder: Path, *words: str, **more: str) -> subprocess.Com
     )
 
 
-def write_rig(folder: Path, driver: str = "skin", signal: str = "0.02", speed: str = "2 mm/s") -> Path:
+def write_rig(
+    folder: Path, driver: str = "skin", signal: str = "0.02", speed: str = "2 mm/s", depth: str = "2 mm"
+) -> Path:
     file = folder / "mine.yaml"
-    file.write_text(RIG.format(driver=driver, signal=signal, speed=speed))
+    file.write_text(RIG.format(driver=driver, signal=signal, speed=speed, depth=depth))
     return file
 
 
@@ -100,7 +102,7 @@ def _replayed(folder: Path) -> list[str]:
 
 
 def test_an_approach_that_is_too_fast_for_an_outside_sensor_is_refused(site: Path, tmp_path: Path) -> None:
-    rig = str(write_rig(tmp_path, speed="20 mm/s"))
+    rig = str(write_rig(tmp_path, speed="20 mm/s", depth="0.5 mm"))
     done = python(site, tmp_path, *COMMAND, "run", rig, "--policy", "grip", "--out", "out")
     assert done.returncode == 2, said(done)
     words = "20 mm/s is too fast: the picture of sensor 'tip' shows a touch 60 ms late, with its gel 1.2 mm deep, and "
@@ -113,7 +115,7 @@ def test_an_approach_that_is_too_fast_for_an_outside_sensor_is_refused(site: Pat
     [
         ("hasty", "is refused: the one of soft-touch (soft_touch.hasty:HastyDriver) does not state worst_latency, so"),
         ("torn", "cannot be loaded: ModuleNotFoundError: No module named 'no_such_vendor_library'"),
-        ("skim", "driver 'skim' is unknown; allowed: camera | replay | sim | skin; did you mean 'skin'?"),
+        ("skinn", "driver 'skinn' is unknown; allowed: camera | replay | sim | skin; did you mean 'skin'?"),
     ],
 )
 def test_an_unusable_driver_is_refused_with_its_reason(site: Path, tmp_path: Path, driver: str, words: str) -> None:

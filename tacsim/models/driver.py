@@ -12,7 +12,7 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from importlib import metadata
-from typing import Any, ClassVar, Generic, Literal, NamedTuple, Protocol, TypeVar, get_args
+from typing import Any, ClassVar, Generic, Literal, NamedTuple, Protocol, TypeVar, cast, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -274,7 +274,7 @@ def _load(entry: metadata.EntryPoint, kind: str, name: str) -> tuple[AnyPart | N
     if missing:
         words = f"does not state {', '.join(missing)}"
         return None, f"{words}, {WHY_LATENCY}" if "worst_latency" in missing else words
-    usable: AnyPart = found  # it derives from one of the two
+    usable = cast(AnyPart, found)  # it derives from one of the two
     config = getattr(usable, "config_class", None)
     if config is None or get_args(config.model_fields["driver"].annotation) != (name,):
         return None, f'has no config_class with `driver: Literal["{name}"]`'

@@ -52,5 +52,5 @@ def test_a_rig_without_mocks_imports_none(tmp_path: Path) -> None:
 
 def test_mocks_that_need_different_companions_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(UrDriver, "companion", property(lambda driver: "elsewhere:Cell"))
-    with pytest.raises(CannotOpen, match="different companions, elsewhere:Cell and robot.mock.cell.cell:MockCell"):
+    with pytest.raises(CannotOpen, match=r"different companions, elsewhere:Cell and robot\.mock"):
         companion_class(load_rig("mock").config)

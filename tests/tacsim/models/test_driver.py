@@ -76,15 +76,9 @@ def test_registry_with_a_sound_driver_finds_it(registered: dict[str, object]) ->
         (object(), "is no class that derives from tacsim.ArmDriver"),
         (CraneConfig, "is no class that derives from tacsim.ArmDriver"),
         (WallCrane, "goes by the wall clock and does not derive from tacsim.ArmDriver"),
-        (
-            type("Hoist", (drivers.ArmDriver,), {"config_class": CraneConfig}),
-            "does not state examine, open, worst_late",
-        ),
-        (type("Nameless", (ArmPart,), {"clocks": ("sim",)}), 'has no config_class with `driver: Literal["crane"]`'),
-        (
-            type("Other", (Crane,), {"config_class": SimArmConfig}),
-            'has no config_class with `driver: Literal["crane"]`',
-        ),
+        (SILENT, "does not state examine, open, worst_latency, so how deep a gel is pressed"),
+        (NAMELESS, 'has no config_class with `driver: Literal["crane"]`'),
+        (OTHER, 'has no config_class with `driver: Literal["crane"]`'),
     ],
 )
 def test_registry_with_an_unsound_driver_refuses_it(registered: dict[str, object], thing: object, words: str) -> None:

@@ -17,6 +17,7 @@ REACTION = 0.05  # from a picture that shows a touch to an arm that brakes [s]
 
 class UrDriver(ArmDriver[UrArmConfig]):
     config_class = UrArmConfig
+    keeps_distances = True
 
     @property
     def companion(self) -> str | None:

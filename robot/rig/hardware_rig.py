@@ -54,6 +54,7 @@ def open_hardware(
     spec = _spec(config, sensor_kinds, normalisers)
     _gel_monitor(config, spec.sensors, {})
     _require_gentle_approach(config, sensor_kinds, arm_kinds)
+    _require_keep_outs(config, arm_kinds)
     for driver in arm_kinds.values():
         driver.require()
     if check is not None:
@@ -178,7 +179,11 @@ def _touch_sense(
     if not carriers:
         return None
     if config.start.touch_signal is not None:
-        patience = MISSED / min(driver.sample_rate() for driver in sensor_drivers(config).values())
+        rates = [
+            _positive(driver.sample_rate(), driver, f"sensors.{name}", "a sample rate", "Hz")
+            for name, driver in sensor_drivers(config).items()
+        ]
+        patience = MISSED / min(rates)
         return PictureTouch(sensors, normalisers, monitor, config.start.touch_signal, patience)
     force = None if config.task is None else config.task.touch_force
     return None if force is None else ForceTouch(carriers, force)
@@ -192,7 +197,8 @@ def _require_gentle_approach(config: RigConfig, sensors: SensorDrivers, arms: Ar
         arm = driver.config.arm
         if arm is None or (depth := _limits(config, arm).depth) is None:
             continue
-        late = _latency(driver, f"sensors.{name}") + _latency(arms[arm], f"arms.{arm}")
+        late = _positive(driver.worst_latency(), driver, f"sensors.{name}", "a worst latency", "s")
+        late += _positive(arms[arm].worst_latency(), arms[arm], f"arms.{arm}", "a worst latency", "s")
         speed = config.start.approach_speed
         if speed * late > depth:
             raise ValueError(
@@ -202,15 +208,26 @@ def _require_gentle_approach(config: RigConfig, sensors: SensorDrivers, arms: Ar
             )
 
 
-def _latency(driver: SensorDriver[Any] | ArmDriver[Any], key: str) -> float:
-    """The worst latency that a driver states [s]. Raises ValueError for one that is no time."""
-    stated = driver.worst_latency()
+def _positive(stated: float, driver: SensorDriver[Any] | ArmDriver[Any], key: str, what: str, unit: str) -> float:
+    """What a driver states. Raises ValueError for a value that cannot be."""
     if not (math.isfinite(stated) and stated > 0.0):
         raise ValueError(
-            f"{key}: the driver '{driver.config.driver}' states a worst latency of {stated} s; it must be a time above "
-            "0 s, or how deep a gel is pressed before the arm brakes cannot be computed"
+            f"{key}: the driver '{driver.config.driver}' states {what} of {stated} {unit}; it must be finite and above "
+            "0, or an approach could press a gel too deep"
         )
     return stated
+
+
+def _require_keep_outs(config: RigConfig, arms: ArmDrivers) -> None:
+    """Raises ValueError for two arms that nothing keeps apart."""
+    for rule in config.keep_out:
+        first, second = (arms[name] for name in rule.arms)
+        if not (first.keeps_distances and type(first) is type(second)):
+            raise ValueError(
+                f"rig '{config.name}': keep_out of {' and '.join(rule.arms)}: their drivers, "
+                f"'{first.config.driver}' and '{second.config.driver}', do not keep their arms apart; leave keep_out "
+                "out, and keep them apart by workspaces and planes"
+            )
 
 
 def _limits(config: RigConfig, name: str) -> ArmLimits:

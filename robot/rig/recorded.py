@@ -16,9 +16,10 @@ from calibration.markers.flow import MarkersLost, find_markers
 from calibration.markers.lattice import NoLattice
 from calibration.reference import StaleReference
 from robot.rig.parts import sensor_of
-from robot.rig.replay_rig import recorded_normaliser, recorded_rig, rig_of
+from robot.rig.replay_rig import recorded_rig, rig_of
 from tacsim.config.errors import ConfigError
 from tacsim.interface import Normaliser, Observation, SurfaceMap, TactileFrame, TactileObservation
+from tacsim.models.driver import sensor_part
 from tacsim.models.hardware import SensorConfig
 from tacsim.models.rig import ReplaySensorConfig, RigConfig
 from tacsim.models.sensor import CanonicalGrid
@@ -63,7 +64,7 @@ class ObservedEpisode:
         with error_context(f"{self.path}: sensor '{name}'"):
             reference = reference_image(self.episode.meta.attachments, name)
             untouched = first if reference is None else TactileFrame(reference, time=first.time, index=first.index)
-            found = recorded_normaliser(config, name, untouched.image, self.canonical)
+            found = sensor_part(config, name, self.canonical).normaliser(untouched.image)
             found.take_reference(untouched)
         return found
 

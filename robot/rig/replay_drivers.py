@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import cast
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,7 +23,20 @@ class ReplaySensorPart(SensorPart[ReplaySensorConfig]):
             raise ValueError(f"{key}: no recording given; name one with --set {key}=PATH")
 
     def normaliser(self, untouched: NDArray[np.uint8] | None = None) -> Normaliser:
-        """By what the rig file says of the picture."""
+        """By what the rig file says of the picture; without by what an episode says of its own sensor."""
+        from robot.rig.parts import sensor_of
+        from robot.rig.replay_rig import recorded_rig
+
+        stated = (self.config.corners, self.config.calibration, self.config.marker_pitch)
+        original = recorded_rig(Path(self.config.source or "")) if stated == (None, None, None) else None
+        if original is None or self.name not in original.sensors:
+            return self._of_file(untouched)
+        part = sensor_of(original.model_copy(update={"canonical": self.grid}), self.name)
+        if original.clock == "replay":  # a recording of a recording: no further, they may name each other
+            return cast(ReplaySensorPart, part)._of_file(untouched)
+        return part.normaliser(untouched)
+
+    def _of_file(self, untouched: NDArray[np.uint8] | None) -> Normaliser:
         from calibration.normaliser import normaliser_for_recording
 
         if untouched is None:

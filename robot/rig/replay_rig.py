@@ -8,18 +8,13 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from calibration.errors import error_context
 from robot.rig import RIG_ATTACHMENT, CannotOpen
-from robot.rig.parts import sensor_of
-from robot.rig.replay_drivers import ReplaySensorPart
 from tacsim.config import load_rig
 from tacsim.interface import Normaliser, TactileFrame
+from tacsim.models.driver import sensor_part
 from tacsim.models.hardware import parts_of
 from tacsim.models.rig import ReplayArmConfig, ReplaySensorConfig, RigConfig
-from tacsim.models.sensor import CanonicalGrid
 from tacsim.record.episode import EpisodeMeta
 from tacsim.record.replay import ReplayArm, ReplayClock, ReplaySensor, match_sources, recorded_period
 from tacsim.record.sources import EPISODES, episode_meta
@@ -55,7 +50,7 @@ def open_replay(config: RigConfig) -> Rig:
             sensors[name] = source = ReplaySensor(sensor, name, clock)
             stack.callback(source.close)
             with error_context(f"sensors.{name}"):
-                normaliser = recorded_normaliser(sensor, name, source.reference().image, config.canonical)
+                normaliser = sensor_part(sensor, name, config.canonical).normaliser(source.reference().image)
             if not source.spec.height:  # what the frames don't carry, and the normaliser finds in them
                 source.spec = replace(source.spec, height=normaliser.finds_height, flow=normaliser.finds_flow)
             normalisers[name] = normaliser
@@ -85,18 +80,6 @@ def _common_period(rig: str, sensors: Mapping[str, ReplaySensorConfig]) -> float
             f"{periods[shortest]:.4g} s and sensors.{longest} every {periods[longest]:.4g} s; give two of one rate"
         )
     return periods[shortest]
-
-
-def recorded_normaliser(
-    config: ReplaySensorConfig, name: str, untouched: NDArray[np.uint8], grid: CanonicalGrid
-) -> Normaliser:
-    """By what the rig file says of the picture; without by what an episode says of its own sensor. `untouched`: the
-    native picture (rows, columns, 3) without contact."""
-    own = config.corners is None and config.calibration is None and config.marker_pitch is None
-    original = recorded_rig(Path(config.source or "")) if own else None
-    if original is None or name not in original.sensors:
-        return ReplaySensorPart(config, name, grid).normaliser(untouched)
-    return sensor_of(original.model_copy(update={"canonical": grid}), name).normaliser(untouched)
 
 
 def recorded_rig(source: Path) -> RigConfig | None:

@@ -189,6 +189,8 @@ class ArmDriver(ArmPart[ArmC], ABC):
     configuration has `limits: ArmLimits`, which the arm that it opens keeps."""
 
     clocks: ClassVar[tuple[ClockName, ...]] = ("wall",)
+    # The arm keeps its `keep_out` from arms of the same driver. Otherwise a rig file that asks for it is refused.
+    keeps_distances: ClassVar[bool] = False
 
     @property
     def companion(self) -> str | None:

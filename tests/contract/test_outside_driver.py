@@ -20,7 +20,7 @@ HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
 COMMAND = ("-c", "from robot.cli import main; main()")
 RIG = """
-name: hardware
+name: mine
 clock: wall
 period: 100 ms
 canonical: {{ rows: 32, columns: 32, pitch: 0.5 mm }}

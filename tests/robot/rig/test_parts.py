@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from robot.arm.driver import UrDriver
+from robot.open import open_rig
 from robot.rig import CannotOpen
 from robot.rig.parts import companion_class
 from tacsim.config import load_rig
@@ -48,6 +49,12 @@ def test_a_rig_without_mocks_imports_none(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert "127.0.0.1" in done.stdout and "arm: network" in done.stdout and "finger: camera" in done.stdout
     assert "mocks: []" in done.stdout
+
+
+def test_a_keep_out_that_a_driver_does_not_keep_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(UrDriver, "keeps_distances", False)
+    with pytest.raises(ValueError, match="keep_out of lower and upper: their drivers, 'ur' and 'ur', do not keep"):
+        open_rig("mock")
 
 
 def test_mocks_that_need_different_companions_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -100,6 +100,8 @@ for module in {LIGHT_IMPORTS!r}:
     importlib.import_module(module)
     loaded = {{name.partition(".")[0] for name in sys.modules}} & {HEAVY | {"trimesh", "PIL"}!r}
     assert not loaded, f"`import {{module}}` loads {{loaded}}: import it inside the function"
+drivers = sys.modules.get("tacsim.models.driver")
+assert drivers is None or not drivers.installed_drivers.cache_info().currsize, "drivers are looked up on import"
 sys.modules["tacsim.config"].load_rig("sim")
 assert not {{"taichi", "cv2"}} & set(sys.modules)
 """

@@ -240,7 +240,10 @@ def installed_drivers() -> Drivers:
     for entry in sorted(metadata.entry_points(group=GROUP), key=lambda each: each.name):
         kind, _, name = entry.name.partition(".")
         home = "an unknown distribution" if entry.dist is None else entry.dist.name
-        if kind not in BASES or not name:
+        if kind not in BASES:
+            why = f"{home} calls it '{entry.name}' in the group {GROUP}; call it 'sensor.{name}' or 'arm.{name}'"
+            for each in BASES:
+                found.refused[each][name] = why
             continue
         if (kind, name) in homes:
             why = f"{home} and {homes[kind, name]} both bring one; uninstall one of them"
@@ -248,7 +251,7 @@ def installed_drivers() -> Drivers:
             found.refused[kind][name] = why
             continue
         homes[kind, name] = home
-        driver, why = _load(entry, kind, name)
+        driver, why = _load(entry, kind, name, is_own=home == OWN)
         if driver is None:
             found.refused[kind][name] = f"the one of {home} ({entry.value}) {why}"
         else:
@@ -261,7 +264,7 @@ def installed_drivers() -> Drivers:
     return found
 
 
-def _load(entry: metadata.EntryPoint, kind: str, name: str) -> tuple[AnyPart | None, str]:
+def _load(entry: metadata.EntryPoint, kind: str, name: str, *, is_own: bool) -> tuple[AnyPart | None, str]:
     """The class of an entry point; else None, and why it is refused."""
     part, driver = BASES[kind]
     try:
@@ -270,7 +273,10 @@ def _load(entry: metadata.EntryPoint, kind: str, name: str) -> tuple[AnyPart | N
         return None, f"cannot be loaded: {type(failure).__name__}: {failure}"
     if not (isinstance(found, type) and issubclass(found, part)):
         return None, f"is no class that derives from tacsim.{driver.__name__}"
-    if "wall" in getattr(found, "clocks", ()) and not issubclass(found, driver):
+    clocks = getattr(found, "clocks", ())
+    if clocks != ("wall",) and not is_own:
+        return None, f"goes by the clocks {clocks}; simulations and replays have drivers of tacsim alone, so ('wall',)"
+    if "wall" in clocks and not issubclass(found, driver):
         return None, f"goes by the wall clock and does not derive from tacsim.{driver.__name__}"
     missing = sorted(getattr(found, "__abstractmethods__", ()))
     if missing:

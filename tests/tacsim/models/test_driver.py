@@ -94,6 +94,24 @@ def test_registry_with_one_name_twice_refuses_both(registered: dict[str, object]
     assert found.refused["arm"]["crane"] == "other and tacsim both bring one; uninstall one of them"
 
 
+@pytest.mark.parametrize(
+    ("key", "words"),
+    [
+        (
+            "other: arms.crane",
+            "other calls it 'arms.crane' in the group tacsim.drivers; call it 'sensor.crane' or 'arm.",
+        ),
+        ("other: arm.crane", "goes by the clocks ('sim',); simulations and replays have drivers of tacsim alone"),
+    ],
+)
+def test_registry_with_a_driver_that_no_rig_would_open_refuses_it(
+    registered: dict[str, object], key: str, words: str
+) -> None:
+    registered |= {"tacsim: arm.boom": Crane, key: Crane}
+    found = look_up()
+    assert found.usable["arm"] == {} and words in found.refused["arm"]["crane"]
+
+
 def test_registry_without_the_shipped_drivers_says_what_to_run(registered: dict[str, object]) -> None:
     registered["other: arm.crane"] = Crane
     with pytest.raises(DriversMissing, match=r"pip install -e \. --no-deps --no-build-isolation"):

@@ -12,15 +12,15 @@ from robot.common.code import CodeNotFound as CodeNotFound
 from robot.common.code import attribute
 from robot.rig import RIG_ATTACHMENT as RIG_ATTACHMENT
 from robot.rig import CannotOpen as CannotOpen
+from robot.rig.parts import check_parts, sensor_drivers
 from tacsim.config import ConfigError, LoadedRig, load, load_rig
 from tacsim.config.errors import Place, Problem
 from tacsim.config.kinds import is_name
 from tacsim.config.load import texts
 from tacsim.interface import RigSpec
-from tacsim.models.hardware import CameraSensorConfig
 from tacsim.models.policy import Features
 from tacsim.models.randomisation import Randomisation
-from tacsim.models.rig import ReplaySensorConfig, RigConfig, TaskConfig
+from tacsim.models.rig import RigConfig, TaskConfig
 from tacsim.rig import Rig
 
 if TYPE_CHECKING:
@@ -35,10 +35,6 @@ Randomised = Randomisation | Mapping[str, Any] | str | Path | None
 
 # What an environment of a simulated rig begins with; its own overrides come after.
 LEARNING = ("scene.preset=learn", "motion=flowing")
-
-# Which drivers go by which clock. A simulated sensor on hardware shows the gel as it would look at the arm's pose.
-ARM_DRIVERS = {"sim": {"sim"}, "replay": {"replay"}, "wall": {"ur"}}
-SENSOR_DRIVERS = {"sim": {"sim"}, "replay": {"replay"}, "wall": {"camera", "sim"}}
 
 
 def load_with_task(rig: str | Path, task: str | TaskConfig | None = None, overrides: Sequence[str] = ()) -> LoadedRig:
@@ -101,7 +97,7 @@ def open_rig(
         config = rig.config if isinstance(rig, LoadedRig) else rig
     else:
         config = load_with_task(rig, task, overrides).config
-    _check_parts(config)
+    check_parts(config)
     if dry_run and config.clock != "wall":
         raise CannotOpen(f"rig '{config.name}': a dry run is for hardware; this rig moves no real or mock arm")
     if config.clock == "wall":  # each kind loads what it needs and no more
@@ -130,7 +126,7 @@ def rig_spec(config: RigConfig) -> RigSpec:
 
     Raises what open_rig raises for a wrong file, a calibration and a recording.
     """
-    _check_parts(config)
+    check_parts(config)
     if config.clock == "wall":
         from robot.rig.hardware_rig import hardware_spec
 
@@ -275,45 +271,15 @@ def _rigs_of_episodes(
             raise ConfigError([*error.problems, of]) from None
         if config.task is None:
             raise CannotOpen(f"rig '{config.name}' has no task; an environment needs one")
-        _check_parts(config)
+        check_parts(config)
         found.append((config, "; ".join(more)))
     return found
 
 
 def check_sensors(config: RigConfig) -> None:
-    """Raises what opening the rig would raise about its cameras: CannotOpen, calibration.errors.CalibrationError."""
-    _check_parts(config)
-    cameras = {name: each for name, each in config.sensors.items() if isinstance(each, CameraSensorConfig)}
-    if cameras:
-        from robot.rig.hardware_rig import camera_normaliser
-
-        for name, camera in cameras.items():
-            camera_normaliser(name, camera, config)
-
-
-def _check_parts(config: RigConfig) -> None:
-    """All parts of a rig go by one clock, and every recorded sensor names its recording."""
-    parts: dict[str, tuple[str, set[str]]] = {
-        f"arms.{name}": (arm.driver, ARM_DRIVERS[config.clock]) for name, arm in config.arms.items()
-    }
-    parts |= {
-        f"sensors.{name}": (sensor.driver, SENSOR_DRIVERS[config.clock]) for name, sensor in config.sensors.items()
-    }
-    for key, (driver, allowed) in parts.items():
-        if driver not in allowed:
-            raise CannotOpen(
-                f"rig '{config.name}': {key} has driver '{driver}', which cannot go by clock '{config.clock}'; "
-                f"give it driver '{' or '.join(sorted(allowed))}', or change the clock"
-            )
-    for name, sensor in config.sensors.items():
-        if isinstance(sensor, CameraSensorConfig) and sensor.model is not None:
-            rows, columns = sensor.model.image_shape
-            if (columns, rows) != (sensor.width, sensor.height):
-                raise CannotOpen(
-                    f"rig '{config.name}': sensors.{name} delivers {sensor.width} x {sensor.height} px "
-                    f"(width, height), its model '{sensor.model.name}' shows {columns} x {rows}; "
-                    "make them alike"
-                )
-        if isinstance(sensor, ReplaySensorConfig) and sensor.source is None:
-            key = f"sensors.{name}.source"
-            raise CannotOpen(f"rig '{config.name}': {key}: no recording given; name one with --set {key}=PATH")
+    """Raises what opening the rig would raise about its sensors of hardware: CannotOpen,
+    calibration.errors.CalibrationError."""
+    check_parts(config)
+    if config.clock == "wall":
+        for driver in sensor_drivers(config).values():
+            driver.normaliser()

@@ -30,6 +30,8 @@ if TYPE_CHECKING:
     from tacsim.interface import ArmState as ArmState
     from tacsim.interface import Clock as Clock
     from tacsim.interface import EndOfEpisode as EndOfEpisode
+    from tacsim.interface import GelReading as GelReading
+    from tacsim.interface import HardwareArm as HardwareArm
     from tacsim.interface import IncompatibleRig as IncompatibleRig
     from tacsim.interface import Needs as Needs
     from tacsim.interface import Normaliser as Normaliser
@@ -45,10 +47,17 @@ if TYPE_CHECKING:
     from tacsim.interface import Truth as Truth
     from tacsim.limits import ActionError as ActionError
     from tacsim.limits import LimitExceeded as LimitExceeded
+    from tacsim.models.driver import ArmDriver as ArmDriver
+    from tacsim.models.driver import ArmExamination as ArmExamination
+    from tacsim.models.driver import Check as Check
+    from tacsim.models.driver import Companion as Companion
+    from tacsim.models.driver import SensorDriver as SensorDriver
+    from tacsim.models.hardware import ArmConfig as ArmConfig
     from tacsim.models.hardware import ArmLimits as ArmLimits
     from tacsim.models.hardware import CameraSensorConfig as CameraSensorConfig
     from tacsim.models.hardware import KeepOut as KeepOut
     from tacsim.models.hardware import Placement as Placement
+    from tacsim.models.hardware import SensorConfig as SensorConfig
     from tacsim.models.hardware import UrArmConfig as UrArmConfig
     from tacsim.models.hardware import Workspace as Workspace
     from tacsim.models.material import BodyMaterial as BodyMaterial

@@ -243,6 +243,55 @@ class Arm(Protocol):
     def close(self) -> None: ...
 
 
+@dataclass(frozen=True, slots=True)
+class GelReading:
+    """The state of the gels, as reported to an arm."""
+
+    exposed: float  # when the oldest picture of the rig was exposed, on its clock [s]
+    depth: float = math.nan  # of the arm's own gels, the deepest; NaN: not measured [m]
+    shear: float = math.nan  # of their surfaces, the largest; NaN: not measured [m]
+
+
+class HardwareArm(Arm, Protocol):
+    """An arm of a rig that goes by the wall clock. It keeps its limits, and holds when commands stop coming."""
+
+    @property
+    def latency(self) -> float:
+        """How old a state is when it arrives [s]."""
+        ...
+
+    @property
+    def alignment(self) -> float:
+        """Of the last state at a past moment: time from that moment to the nearest package [s]."""
+        ...
+
+    def command(self, target: Pose | None, speed: float | None = None) -> Pose | None:
+        """As `Arm.command`, at most at `speed` [m/s]. Raises ActionError (tacsim.limits) for what is out of reach, and
+        DeviceError (robot.errors) for an arm that cannot follow."""
+        ...
+
+    def at_rest(self) -> bool:
+        """True if neither the arm nor its target moves."""
+        ...
+
+    def arrived(self, target: Pose, *, within: float, turn: float) -> bool:
+        """True if it is at rest `within` [m] and `turn` [rad] of the target."""
+        ...
+
+    def zero_wrench(self) -> None:
+        """Zeroes its force sensor; it must be at rest and touch nothing."""
+        ...
+
+    def report_tactile(self, reading: GelReading | None) -> None:
+        """Reports what its gels show: beyond limits.depth or limits.shear it stops. None suspends that until the next
+        report."""
+        ...
+
+    def explain(self) -> str:
+        """Its status in words."""
+        ...
+
+
 class Clock(Protocol):
     """The rig's one clock: simulation advances physics in `tick`, hardware sleeps to its deadline."""
 
@@ -255,6 +304,16 @@ class Clock(Protocol):
 class Normaliser(Protocol):
     """Native frame of one sensor -> canonical observation."""
 
+    @property
+    def finds_height(self) -> bool:
+        """Height and gradient are found in the picture of a frame that does not carry its surface."""
+        ...
+
+    @property
+    def finds_flow(self) -> bool:
+        """The same of the flow."""
+        ...
+
     def take_reference(self, frame: TactileFrame) -> None:
         """Makes `frame`, taken without contact, the reference I0."""
         ...
@@ -262,7 +321,7 @@ class Normaliser(Protocol):
     def __call__(self, frame: TactileFrame, now: float) -> TactileObservation: ...
 
     def diagnostics(self) -> Mapping[str, float]:
-        """How trustworthy the last observation is (tacsim.report). Empty for sources that know their surface."""
+        """How trustworthy the last observation is (tacsim.step_info). Empty for sources that know their surface."""
         ...
 
 

@@ -107,6 +107,8 @@ for module in {LIGHT_IMPORTS!r}:
     importlib.import_module(module)
     loaded = {{name.partition(".")[0] for name in sys.modules}} & {HEAVY | {"trimesh", "PIL"}!r}
     assert not loaded, f"`import {{module}}` loads {{loaded}}: import it inside the function"
+drivers = sys.modules.get("tacsim.models.driver")
+assert drivers is None or not drivers.installed_drivers.cache_info().currsize, "drivers are looked up on import"
 sys.modules["tacsim.config"].load_rig("sim")
 assert not {{"taichi", "cv2"}} & set(sys.modules)
 """
@@ -181,11 +183,9 @@ def test_only_listed_functions_have_twelve_parameters_or_more() -> None:
     assert found == LONG_SIGNATURES and len(LONG_SIGNATURES) <= 5
 
 
-def test_only_the_command_that_runs_benchmarks_imports_them() -> None:
-    found = {name(path) for path, tree in TREES.items() if "benchmarks" in map(top, imports(tree))}
-    assert found == {"robot/cli/bench.py", "robot/cli/doctor.py"}
-    light = {name(path) for path, tree in TREES.items() if "benchmarks" in map(top, loaded_on_import(tree))}
-    assert light == set()
+def test_no_package_imports_the_benchmarks() -> None:
+    """They import the packages; `tacsim bench` finds them by name (robot/cli/bench.py)."""
+    assert [name(path) for path, tree in TREES.items() if "benchmarks" in map(top, imports(tree))] == []
 
 
 def test_every_folder_of_modules_is_a_package() -> None:

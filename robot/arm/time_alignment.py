@@ -7,11 +7,14 @@ the event, on one monotonic clock. Between two states the arm is interpolated.
 
 from __future__ import annotations
 
+import math
+import time as wall
 from bisect import bisect_left
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from scipy.spatial.transform import Rotation
 
+from robot.arm.trajectory import PERIOD
 from robot.errors import DeviceError
 from tacsim import pose as se3
 from tacsim.interface import ArmState, FloatArray, Pose
@@ -56,6 +59,28 @@ def state_at(
             f"{1e3 * max_gap:.1f} ms; was the link lost?"
         )
     return _between(a, b, time), min(time - a.time, b.time - time)
+
+
+def await_state_at(
+    time: float,
+    newest: Callable[[], ArmState],
+    history: Callable[[int | None], list[ArmState]],
+    arm: str,
+    link_timeout: float,
+) -> tuple[ArmState, float]:
+    """`state_at` for a past moment of the wall's clock [s], whose packages may still be on their way.
+
+    newest: reads the newest state. history: the last so many states, or all that are kept (None). link_timeout: a
+    longer gap between packages is a lost link [s]. Raises NotAligned for a moment that no package covers.
+    """
+    deadline = wall.monotonic() + link_timeout
+    while newest().time < time and wall.monotonic() < deadline:
+        wall.sleep(1e-3)
+    packages = max(8, math.ceil((wall.monotonic() - time) / PERIOD) + 8)  # from before that moment to now
+    states = history(packages)
+    if states and states[0].time > time:  # this process was held up meanwhile
+        states = history(None)
+    return state_at(time, states, arm, link_timeout)
 
 
 def _extrapolate(newest: ArmState, time: float, arm: str, reach: float) -> tuple[ArmState, float]:

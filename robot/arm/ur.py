@@ -25,10 +25,11 @@ from robot.arm.channel import (
     segment_of,
     tactile_record,
 )
-from robot.arm.dashboard import Dashboard
+from robot.arm.controller.dashboard import Dashboard
 from robot.arm.lost_link import PackageLog, Verdict, explain_lost_link
 from robot.arm.shared_ring import Record
 from robot.arm.status import AT_CONNECTING, ArmStatus
+from robot.arm.time_alignment import await_state_at
 from robot.arm.trajectory import PERIOD
 from robot.arm.worker_config import check_host, worker_config
 from robot.common import Closing
@@ -43,8 +44,7 @@ from robot.errors import (
     StaleObservationError,
 )
 from tacsim import pose as se3
-from tacsim.control.gel_monitor import GelReading
-from tacsim.interface import Action, ArmState, FloatArray, Pose
+from tacsim.interface import Action, ArmState, FloatArray, GelReading, Pose
 from tacsim.limits import ActionError, check_action, clip_to_region
 from tacsim.models.hardware import UrArmConfig
 
@@ -59,7 +59,7 @@ _opening = threading.Lock()
 
 
 class URArm(Closing):
-    """One UR arm, real or mock; implements tacsim.interface.Arm. A context manager.
+    """One UR arm, real or mock; implements tacsim.interface.HardwareArm. A context manager.
 
     Args:
         config: its address, what it carries, its limits.
@@ -86,6 +86,7 @@ class URArm(Closing):
     ) -> None:
         check_host(config, name)
         self.name, self.config, self._timeout = name, config, timeout
+        self.latency, self.alignment = config.latency, 0.0
         self._region = config.limits.region
         self._kinematics = Kinematics(config.model)
         self._lock = threading.RLock()
@@ -123,16 +124,20 @@ class URArm(Closing):
         """The status in words, with its numbers."""
         return self._explain(self.status())
 
-    def state(self) -> ArmState:
-        """The newest package, also of a stopped arm.
+    def state(self, at: float | None = None) -> ArmState:
+        """The newest package, also of a stopped arm; or the state at a past moment [s], between packages.
 
-        Raises StaleObservationError when it is older than `link_timeout`, DeviceNotConnectedError without a worker.
+        Raises StaleObservationError when the newest is older than `link_timeout`, DeviceNotConnectedError without a
+        worker, NotAligned for a moment that no package covers.
         """
-        return self._state(self._record())
+        if at is None:
+            return self._state(self._record())
+        state, self.alignment = await_state_at(at, self.state, self.history, self.name, self.config.link_timeout)
+        return state
 
-    def history(self, number: int = HISTORY - 1) -> list[ArmState]:
+    def history(self, number: int | None = None) -> list[ArmState]:
         """The last packages, oldest first, at most `number` (two seconds are kept); also after a lost link."""
-        return [self._state(record) for record in self._packages(number)]
+        return [self._state(record) for record in self._packages(HISTORY - 1 if number is None else number)]
 
     def package_log(self) -> PackageLog:
         """Every package from now on."""

@@ -25,7 +25,7 @@ import numpy as np
 
 from robot.arm.channel import STATE, WINDOW, Channel, WorkerConfig
 from robot.arm.confinement import TimeLimit, allow_time_limits, last_connections
-from robot.arm.dashboard import Dashboard
+from robot.arm.controller.dashboard import Dashboard
 from robot.arm.servo import Servo
 from robot.arm.shared_ring import Segment
 from robot.arm.start_servo import StartServo

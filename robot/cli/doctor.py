@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from robot.cli.bench import require_checkout
+from robot.cli.bench import from_checkout, require_checkout
 from robot.cli.errors import complain
 from robot.cli.options import HardwareRig, Overrides
 from robot.cli.output import SafeConsole, busy, notes
 from robot.cli.terminal import Interrupt, ask, has_person
 
 if TYPE_CHECKING:
-    from robot.doctor import machine
+    from tacsim.models.driver import Check
 
 MARKS = {"ok": "[green]ok[/]", "warn": "[yellow]warn[/]", "fail": "[bold red]fail[/]"}
 
@@ -33,9 +33,7 @@ def schema(
 
     if kind == "bench":
         require_checkout("tacsim schema bench")
-        from benchmarks.harness import schema as report
-
-        typer.echo(json.dumps(report.json_schema(), indent=2))
+        typer.echo(json.dumps(from_checkout("benchmarks.harness.schema").json_schema(), indent=2))
         return
     if kind not in KINDS:
         raise typer.BadParameter(f"no kind '{kind}'; allowed: {', '.join(KINDS)}, bench", param_hint="KIND")
@@ -79,7 +77,7 @@ def doctor(
     raise typer.Exit(0 if report["ok"] else 1)
 
 
-def print_checks(checks: list[machine.Check]) -> None:
+def print_checks(checks: list[Check]) -> None:
     from rich.table import Table
     from rich.text import Text
 
@@ -105,24 +103,25 @@ def start(
     """
     with busy("looking at the rig"):
         from robot.doctor.rig import examine_arms
-        from robot.mock.cell.cell import MockCell
         from robot.open import CannotOpen
         from robot.procedures.to_start import Guide, Halted, lead_to_start
+        from robot.rig.parts import companion_of
         from tacsim.config import load_rig
-        from tacsim.models.hardware import UrArmConfig
+        from tacsim.models.hardware import UrArmConfig, parts_of
 
         config = load_rig(rig, overrides=set_ or []).config
-    arms = {name: arm for name, arm in config.arms.items() if isinstance(arm, UrArmConfig)}
+    arms = parts_of(config.arms, UrArmConfig)
     if not arms:
         raise CannotOpen(f"rig '{config.name}' has no UR arm: there is nothing to lead to its start")
     if not has_person():
         raise CannotOpen(
             f"rig '{config.name}': no arm is led to its start without somebody who says yes; run this from a terminal"
         )
-    with Interrupt() as interrupt, MockCell(config) as cell:
-        starts = {**cell.start_poses, **{name: arm.start.pose for name, arm in arms.items() if arm.start is not None}}
+    with Interrupt() as interrupt, companion_of(config) as companion:
+        of_mocks = {} if companion is None else companion.start_poses
+        starts = {**of_mocks, **{name: arm.start.pose for name, arm in arms.items() if arm.start is not None}}
         with busy("looking at the arms"):
-            checks = examine_arms(config, cell.start_poses, rig)
+            checks = examine_arms(config, of_mocks, rig)
         print_checks(checks)
         try:
             with busy("connecting") as show:

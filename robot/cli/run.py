@@ -197,13 +197,13 @@ def _drive(
     """The episode, shown by the bar, and what ended it too early ("" when nothing did)."""
     from robot.deploy.control_loop import EpisodeFailed, run_episode
     from robot.deploy.policy import outside_in_words
-    from tacsim.report.series import TRAINING
+    from tacsim.step_info import TRAINING_DISTANCE
 
     told = False
 
     def show(step: Step) -> None:
         nonlocal told
-        if not told and step.info.get(TRAINING, 0.0) > 1.0:
+        if not told and step.info.get(TRAINING_DISTANCE, 0.0) > 1.0:
             told = True
             warn(f"step {step.index}: policy '{setup.policy}': {outside_in_words(policy)}")
         bar.say(task.config.kind if task else rig.name)

@@ -134,9 +134,7 @@ def require_person(config: RigConfig) -> None:
 
 def has_real_arm(config: RigConfig) -> bool:
     """Whether an arm of the rig is no mock; a maker's simulator counts as real."""
-    from tacsim.models.hardware import UrArmConfig
-
-    return any(isinstance(arm, UrArmConfig) and arm.mock is None for arm in config.arms.values())
+    return any(arm.is_real for arm in config.arms.values())
 
 
 def _forget_typed() -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from robot.collect.folder import FAILURES, SetFolder
 from robot.collect.job import SetError
 from robot.collect.presses import PressSet
-from robot.collect.table import WORDS, features
+from robot.collect.table import WORDS
 from robot.studies.press import UNFELT
 from tacsim.models.scene import Mesh, Shape
 from tacsim.models.text import millimetres, printable
@@ -24,7 +24,7 @@ def press_card(settings: PressSet, command: str, versions: Mapping[str, str], st
     """Markdown. statistics: as `press_statistics` gives them, where the set is whole."""
     geometry, lattice, scene = settings.sensor.geometry, settings.lattice, settings.scene
     material = scene.gel.material
-    columns = "\n".join(f"| `{name}` | {_kind(each)} | {WORDS[name]} |" for name, each in features(settings).items())
+    columns = "\n".join(f"| `{name}` | {_kind(each)} | {WORDS[name]} |" for name, each in settings.columns.items())
     objects = "\n".join(f"| `{_cell(name)}` | {_object(each)} |" for name, each in settings.objects.items())
     (u0, v0), pitch = geometry.principal, 1e3 * geometry.pixel_pitch
     dots = ", where the sensor's dots are printed," if settings.sensor.markers else ""

@@ -15,7 +15,8 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from robot.collect.job import Piece, Seconds
-from robot.collect.table import Row, parquet_bytes
+from robot.collect.table import Row, parquet_bytes, press_columns
+from robot.export.lerobot_mapping import Feature
 from robot.studies.press import PressMotion, PressResult, press, require_reachable
 from tacsim import pose as se3
 from tacsim.geometry.shapes import turned_extent
@@ -78,6 +79,11 @@ class PressSet(Config):
         grid = image_grid(self.sensor.geometry)
         rows, columns = (int(side * grid.pitch / FLOW_PITCH - 0.5) for side in grid.shape)
         return Markers(rows=max(1, min(rows, 100)), columns=max(1, min(columns, 100)), pitch=FLOW_PITCH)
+
+    @property
+    def columns(self) -> dict[str, Feature]:
+        """What each column of the set's files holds, by its name."""
+        return press_columns(tuple(self.objects), self.sensor.geometry, self.lattice)
 
     def placed(self, index: int) -> tuple[str, Scene, PressMotion]:
         """The object of a press, its scene and its motion. More options draw no other numbers for the rest."""
@@ -175,7 +181,7 @@ class PressWorker:
             except (SimulationDiverged, ValueError, MemoryError) as failure:
                 failures[index] = f"{type(failure).__name__}: {failure}"
         began = time.perf_counter()
-        data = parquet_bytes(self._set, [rows[index] for index in sorted(rows)]) if rows else None
+        data = parquet_bytes(self._set.columns, [rows[index] for index in sorted(rows)]) if rows else None
         seconds.add("file", time.perf_counter() - began)
         return Piece(number, data, dict(sorted(failures.items())), len(rows), seconds.by_part)
 

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
 from robot.export.lerobot_mapping import LABEL, Column, Feature, arrow_table
-
-if TYPE_CHECKING:
-    from robot.collect.presses import PressSet
+from tacsim.models.sensor import Markers, SensorGeometry
 
 Row = dict[str, Any]
 
@@ -40,14 +38,13 @@ WORDS = {
 ROWS_IN_GROUP = 25  # read at once by who wants one row: some 10 MB
 
 
-def features(settings: PressSet) -> dict[str, Feature]:
-    """By column."""
-    geometry, lattice = settings.sensor.geometry, settings.lattice
+def press_columns(objects: Sequence[str], geometry: SensorGeometry, lattice: Markers) -> dict[str, Feature]:
+    """What each column holds, by its name. `objects`: their names; `lattice`: the points whose flow is a column."""
     shape = (geometry.height, geometry.width)
     number, pair, triple = (Feature("float64", (n,), None) for n in (1, 2, 3))
     return {
         "index": Feature("int64", (1,), None),
-        "object": Feature(LABEL, (1,), tuple(settings.objects)),
+        "object": Feature(LABEL, (1,), tuple(objects)),
         "image": Feature("image", (*shape, 3), None),
         "height": Feature("float32", shape, None),
         "contact": Feature("image", shape, None),
@@ -67,13 +64,13 @@ def features(settings: PressSet) -> dict[str, Feature]:
     }
 
 
-def parquet_bytes(settings: PressSet, rows: Sequence[Row]) -> bytes:
+def parquet_bytes(columns: Mapping[str, Feature], rows: Sequence[Row]) -> bytes:
     """A file of these rows. Numbers are as they are, pictures PNG: nothing is lost."""
     from pyarrow import parquet
 
-    of = features(settings)
-    table = arrow_table(of, {name: _column(feature, [row[name] for row in rows]) for name, feature in of.items()})
-    maps = [f"{name}{'.list.element' * len(of[name].shape)}" for name in ("height", "flow")]
+    values = {name: _column(feature, [row[name] for row in rows]) for name, feature in columns.items()}
+    table = arrow_table(columns, values)
+    maps = [f"{name}{'.list.element' * len(columns[name].shape)}" for name in ("height", "flow")]
     buffer = io.BytesIO()
     parquet.write_table(
         table,

@@ -19,8 +19,8 @@ from tacsim.control.contact_signal import contact_signal
 from tacsim.interface import Action, EndOfEpisode, Observation, Policy, Pose, Truth
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.record.episode import Episode, EpisodeMeta, Step
-from tacsim.report.series import DEEPEST, FELT, LONGEST, LOST, STEEPEST
 from tacsim.rig import Rig
+from tacsim.step_info import MAX_DEPTH, MAX_FLOW, MAX_SLOPE, PACKAGES_LOST, TACTILE_DISTANCE
 from tacsim.tasks import GoalOutOfReach, Task, judge
 
 PARTICLES = 5_000  # of a body go into a recorded step, at most
@@ -182,11 +182,11 @@ def _surfaces(observation: Observation) -> dict[str, float]:
     found = {}
     for name, touch in observation.tactile.items():
         if touch.height is not None:
-            found[f"{DEEPEST}{name}"] = float(touch.height.max())
+            found[f"{MAX_DEPTH}{name}"] = float(touch.height.max())
         if touch.gradient is not None:
-            found[f"{STEEPEST}{name}"] = float(np.linalg.norm(touch.gradient, axis=2).max())
+            found[f"{MAX_SLOPE}{name}"] = float(np.linalg.norm(touch.gradient, axis=2).max())
         if touch.flow is not None:
-            found[f"{LONGEST}{name}"] = float(np.linalg.norm(touch.flow, axis=2).max())
+            found[f"{MAX_FLOW}{name}"] = float(np.linalg.norm(touch.flow, axis=2).max())
     return found
 
 
@@ -249,10 +249,10 @@ class _Log:
         info |= _surfaces(observation)
         info |= self._rig.diagnostics()
         packages = self._rig.packages()
-        info |= {f"{LOST}{name}": float(each.lost) for name, each in packages.items()}
+        info |= {f"{PACKAGES_LOST}{name}": float(each.lost) for name, each in packages.items()}
         distance = None if self._feel is None else self._feel(observation)
         if distance is not None:
-            info[FELT] = distance
+            info[TACTILE_DISTANCE] = distance
         outcome = None
         if truth is not None and self._start is not None:
             moved = truth.position - self._start.position

@@ -14,8 +14,8 @@ from tacsim.config import config_root
 from tacsim.interface import IncompatibleRig, Policy, RigSpec
 from tacsim.models.scene import Scene
 from tacsim.models.sensor import CanonicalGrid
-from tacsim.report.series import TRAINING, TRAINING_KNOWN
 from tacsim.rig import require
+from tacsim.step_info import TRAINING_DISTANCE, TRAINING_KNOWN
 from tacsim.tasks import Task
 
 
@@ -71,7 +71,7 @@ def training_info(policy: Policy) -> dict[str, float]:
     """What a record says of the last observation of a learned policy, beside the range of its training; else empty."""
     if not isinstance(policy, OnnxPolicy):
         return {}
-    return {TRAINING_KNOWN: 0.0} if policy.watch.known is None else {TRAINING: policy.watch.now}
+    return {TRAINING_KNOWN: 0.0} if policy.watch.known is None else {TRAINING_DISTANCE: policy.watch.now}
 
 
 def outside_in_words(policy: Policy | None) -> str:

@@ -8,30 +8,26 @@ import platform
 import sys
 import tempfile
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from importlib import metadata
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
+from tacsim.models.driver import Check, DriversMissing, installed_drivers
+
 PYTHONS = ((3, 11), (3, 14))  # from, up to but without
 OPENCV = "opencv-contrib-python-headless"  # the distribution that provides cv2
-State = Literal["ok", "warn", "fail"]
-
-
-@dataclass(frozen=True, slots=True)
-class Check:
-    name: str
-    state: State
-    found: str
-    advice: str = ""  # what to do next; empty when all is well
 
 
 def examine() -> list[Check]:
     """All checks, in the order in which problems should be mended. A check that itself breaks is a `fail`."""
-    functions = (python, packages, second_opencv, opencv, taichi, ur_rtde, processors, realtime, working_directory)
+    functions = (
+        *(python, packages, drivers, second_opencv, opencv, taichi, ur_rtde),
+        *(processors, realtime, working_directory),
+    )
     return [check for function in functions for check in _run(function)]
 
 
@@ -81,6 +77,21 @@ def _package(need: Requirement) -> Check:
     if need.specifier.contains(version, prereleases=True):
         return Check(name, "ok", version)
     return Check(name, "fail", f"{version}, but {need.specifier} is needed", advice)
+
+
+def drivers() -> list[Check]:
+    """The installed drivers of sensors and arms, and why others are refused."""
+    try:
+        found = installed_drivers()
+    except DriversMissing as missing:
+        return [Check("drivers", "fail", "those of tacsim are not registered", str(missing))]
+    words = "; ".join(f"{kind}s {', '.join(each)}" for kind, each in found.usable.items())
+    refused = [
+        Check(f"driver {kind} {name}", "warn", f"refused: {why}", "mend or uninstall its distribution")
+        for kind, each in found.refused.items()
+        for name, why in each.items()
+    ]
+    return [Check("drivers", "ok", words), *refused]
 
 
 def second_opencv() -> list[Check]:

@@ -22,11 +22,11 @@ from robot.camera.camera import Camera, StaleFrame
 from robot.export.lerobot_mapping import IMAGE, STATE, LeRobotMapping
 from robot.open import load_with_task, open_rig, rig_spec
 from robot.rig.clock import WallClock
-from robot.rig.hardware_rig import camera_normaliser
+from robot.rig.parts import sensor_of
 from tacsim.gym.features import SCALES
 from tacsim.interface import IncompatibleRig, Observation, Pose
 from tacsim.limits import ActionError
-from tacsim.models.hardware import CameraSensorConfig
+from tacsim.models.hardware import CameraSensorConfig, parts_of
 from tacsim.models.rig import RigConfig, TaskConfig
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.rig import Rig
@@ -203,12 +203,13 @@ class TactileCamera:
         if sensor is None and len(config.sensors) > 1:
             raise IncompatibleRig(f"rig '{config.name}' has several sensors; name one of them: {there}")
         self.name = next(iter(config.sensors)) if sensor is None else sensor
-        found = config.sensors.get(self.name)
-        if found is None:
+        if self.name not in config.sensors:
             raise IncompatibleRig(f"rig '{config.name}' has no sensor '{self.name}'; it has {there}")
-        if not isinstance(found, CameraSensorConfig):
-            raise IncompatibleRig(f"sensor '{self.name}' of rig '{config.name}' is {found.driver}, not a camera")
-        if found.mock is not None:
+        found = parts_of(config.sensors, CameraSensorConfig).get(self.name)
+        if found is None:
+            driver = config.sensors[self.name].driver
+            raise IncompatibleRig(f"sensor '{self.name}' of rig '{config.name}' is {driver}, not a camera")
+        if found.is_mock:
             raise IncompatibleRig(
                 f"sensor '{self.name}' of rig '{config.name}' is a mock that its whole rig starts; name a camera that "
                 "runs by itself"
@@ -216,7 +217,7 @@ class TactileCamera:
         self.fps: float = found.fps  # that the camera is asked for
         self.shape = picture_shape(config.canonical)  # of a picture: rows, columns, 3
         self._config = found
-        self._normaliser = camera_normaliser(self.name, found, config)
+        self._normaliser = sensor_of(config, self.name).normaliser()
         self._camera: Camera | None = None
         self._seen = -1  # index of the frame that `read_new` gave last
 

@@ -33,7 +33,7 @@ from tacsim.models.sensor import CanonicalGrid
 from tacsim.optics.grid import canonical_cells
 from tacsim.record.episode import ArmPackages, Step
 from tacsim.record.images import encode_png
-from tacsim.report.series import LIMITS
+from tacsim.step_info import LIMITS_HIT
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -138,7 +138,7 @@ class EpisodeLog:
             self._number("task/distance", 1e3 * step.distance)
         self._number("diagnostics/seconds", step.seconds)
         for name, value in step.info.items():
-            limit = name.removeprefix(LIMITS)
+            limit = name.removeprefix(LIMITS_HIT)
             self._number(f"diagnostics/{name}" if limit == name else f"limits/{limit}", value)
 
     def _statuses(self, name: str, packages: ArmPackages) -> None:

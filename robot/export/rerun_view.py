@@ -30,8 +30,7 @@ from robot.common.whole_file import put_new
 from robot.export.rerun_log import EpisodeLog, blueprint
 from robot.rig.recorded import observe_episode
 from tacsim.interface import Observation, RigSpec, Truth
-from tacsim.models.hardware import CameraSensorConfig
-from tacsim.models.rig import RigConfig, SimSensorConfig
+from tacsim.models.rig import RigConfig
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.optics.markers import rest_positions
 from tacsim.record.episode import Step
@@ -249,10 +248,10 @@ def _lattices(rig: RigConfig | None) -> Mapping[str, NDArray[np.float64]]:
     found: dict[str, NDArray[np.float64]] = {}
     for name, sensor in ({} if rig is None else rig.sensors).items():
         markers = None
-        if isinstance(sensor, CameraSensorConfig) and sensor.calibration is not None:
-            markers = read_bundle(Path(sensor.calibration))[0].markers
-        elif isinstance(sensor, SimSensorConfig | CameraSensorConfig) and sensor.model is not None:
-            markers = sensor.model.markers
+        if sensor.bundle is not None:
+            markers = read_bundle(Path(sensor.bundle))[0].markers
+        elif sensor.sensor_model is not None:
+            markers = sensor.sensor_model.markers
         if markers is not None:
             found[name] = rest_positions(markers)
     return found

@@ -1,4 +1,4 @@
-"""pytest fixtures of mock hardware for users: ``pytest_plugins = ["robot.mock.fixtures"]`` in a conftest.py.
+"""pytest fixtures of mock devices. Users take them, with that of a whole rig, from `robot.fixtures`.
 
 Each test process has loopback addresses of its own (127.0.0.0/8; on macOS they must be made first: ifconfig lo0 alias),
 so tests may run side by side.
@@ -6,15 +6,13 @@ so tests may run side by side.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from collections.abc import Iterator
 
 import pytest
 
 from robot.common.loopback import loopback_host
 from robot.mock.camera.camera import MockCamera
 from robot.mock.ur.handle import MockUR
-from tacsim.rig import Rig
 
 ROOM = 31  # second number of the addresses
 
@@ -48,16 +46,3 @@ def mock_camera() -> Iterator[MockCamera]:
     """One mock camera of 320 x 240 px with stamps: read `mock_camera.url`, feed it by `mock_camera.push`."""
     with MockCamera(mock_host(2)) as running:
         yield running
-
-
-@pytest.fixture
-def mock_rig() -> Iterator[Callable[..., Rig]]:
-    """Opens the whole mock cell: `mock_rig("task=reposition", ...)` takes overrides of configs/rigs/mock.yaml."""
-    from robot.open import open_rig
-
-    with ExitStack() as stack:
-
-        def opened(*overrides: str, rig: str = "mock", task: str | None = None) -> Rig:
-            return stack.enter_context(open_rig(rig, task=task, overrides=[*rig_addresses(), *overrides]))
-
-        yield opened

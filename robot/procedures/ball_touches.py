@@ -33,7 +33,6 @@ from tacsim import pose as se3
 from tacsim.control.contact_signal import NoTouch, approach
 from tacsim.interface import FloatArray, Pose, TactileObservation
 from tacsim.limits import ActionError
-from tacsim.models.hardware import CameraSensorConfig
 from tacsim.models.rig import RigConfig
 from tacsim.rig import Rig
 
@@ -64,7 +63,7 @@ def without_task(config: RigConfig, arm: str, sensor: str) -> RigConfig:
     if gel is None or gel.arm != arm:
         carried = ", ".join(name for name, each in config.sensors.items() if each.arm == arm) or "none"
         raise CannotCalibrate(f"rig '{config.name}': arm '{arm}' carries no sensor '{sensor}'; it carries: {carried}")
-    if isinstance(gel, CameraSensorConfig) and gel.model is None and gel.calibration is None:
+    if not gel.may_find_height:
         raise CannotCalibrate(
             f"sensors.{sensor} cannot tell how deep it is pressed; calibrate its light first (tacsim calibrate sensor)"
         )

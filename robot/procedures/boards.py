@@ -25,7 +25,6 @@ from calibration.poses.hand_eye import MIN_SPREAD, BoardPose
 from calibration.poses.robust_fit import angular_spread
 from robot.arm.ur import URArm
 from robot.camera.camera import Camera
-from robot.mock.cell.cell import MockCell
 from robot.procedures.session import (
     GOLDEN_ANGLE,
     GOLDEN_RATIO,
@@ -40,6 +39,7 @@ from robot.procedures.session import (
     hardware_arm,
     move_to,
 )
+from robot.rig.parts import companion_of
 from tacsim import pose as se3
 from tacsim.interface import FloatArray, Pose, TactileFrame
 from tacsim.limits import ActionError
@@ -102,7 +102,7 @@ def open_arm(config: RigConfig, arm: str) -> Iterator[URArm]:
             apart[other] = max(rule.distance, apart.get(other, 0.0))
     with ExitStack() as stack:
         # neither gels nor bodies: only arms
-        stack.enter_context(MockCell(config.model_copy(update={"sensors": {}, "scene": None, "task": None})))
+        stack.enter_context(companion_of(config.model_copy(update={"sensors": {}, "scene": None, "task": None})))
         arms = {}
         for name in (*apart, arm):
             keep_out = apart if name == arm else {arm: apart[name]}

@@ -18,7 +18,7 @@ from robot.errors import DeviceError
 from robot.rig.commanded_arm import CommandedArm
 from tacsim import pose as se3
 from tacsim.interface import Arm, EndOfEpisode, Pose, TactileFrame
-from tacsim.models.hardware import CameraSensorConfig, UrArmConfig
+from tacsim.models.hardware import CameraSensorConfig, UrArmConfig, parts_of
 from tacsim.models.rig import RigConfig
 
 Measurement = TypeVar("Measurement")
@@ -117,11 +117,10 @@ def handheld_camera(config: RigConfig, sensor: str) -> CameraSensorConfig:
 
 
 def _part(config: RigConfig, parts: Mapping[str, object], name: str, kind: type[Part], what: str) -> Part:
-    part = parts.get(name)
-    if not isinstance(part, kind):
-        known = ", ".join(each for each, other in parts.items() if isinstance(other, kind)) or "none"
-        raise CannotCalibrate(f"rig '{config.name}': '{name}' is {what}: {known}")
-    return part
+    found = parts_of(parts, kind)
+    if name not in found:
+        raise CannotCalibrate(f"rig '{config.name}': '{name}' is {what}: {', '.join(found) or 'none'}")
+    return found[name]
 
 
 def move_to(arm: Arm | URArm, name: str, target: Pose, timeout: float = TRAVEL_TIMEOUT) -> None:

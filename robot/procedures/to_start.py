@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from robot.arm.channel import CommandKind
-from robot.arm.rtde import Reading, read_controller
+from robot.arm.controller.rtde import read_controller
+from robot.arm.controller.rtde import Reading
 from robot.arm.start_servo import sensor_path, way_rates
 from robot.arm.status import ArmStatus
 from robot.arm.ur import URArm
@@ -22,7 +23,7 @@ from robot.errors import DeviceError
 from tacsim import pose as se3
 from tacsim.interface import FloatArray, Pose
 from tacsim.limits import Region
-from tacsim.models.hardware import UrArmConfig
+from tacsim.models.hardware import UrArmConfig, parts_of
 from tacsim.models.rig import RigConfig
 
 SAMPLE = 5e-3  # between two points of a way at which it is checked [rad of the joint that turns most]
@@ -201,7 +202,7 @@ def lead_to_start(config: RigConfig, starts: Mapping[str, Pose], guide: Guide) -
 
     Raises NoWay before anything is connected, Halted, and the error of an arm that is stopped; all arms brake then.
     """
-    arms = {name: arm for name, arm in config.arms.items() if isinstance(arm, UrArmConfig)}
+    arms = parts_of(config.arms, UrArmConfig)
     missing = [name for name in arms if name not in starts]
     if missing:
         raise DeviceError(

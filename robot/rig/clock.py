@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
+from typing import Protocol, cast
 
 import numpy as np
 
-from robot.camera.camera import Camera
-from robot.mock.cell.cell import MockCell
 from robot.rig.commanded_arm import CommandedArm, wait_for_arrival
+from tacsim.interface import TactileFrame, TactileSource
+from tacsim.models.driver import Companion
 
 ARRIVE = 10.0  # longest motion of a control period in lock step [s]
 SETTLED = 10e-3  # a force given to a mock controller is in its packages after this time [s]
@@ -67,16 +68,28 @@ class WallClock(_MonotonicClock):
         return {"period_median": median, "period_p99": p99, "period_max": longest, "periods_late": float(self.late)}
 
 
+class NumberedSource(Protocol):
+    """A sensor whose pictures carry the numbers that a companion gives them."""
+
+    def wait_for(self, image_number: int, timeout: float) -> TactileFrame: ...
+
+
 class LockStep(_MonotonicClock):
     """A period ends when the arms rest at their targets and the cell has drawn the pictures of just that pose."""
 
     real_time = False
 
     def __init__(
-        self, period: float, arms: Mapping[str, CommandedArm], cameras: Mapping[str, Camera], cell: MockCell
+        self,
+        period: float,
+        arms: Mapping[str, CommandedArm],
+        sensors: Mapping[str, TactileSource],
+        companion: Companion,
     ) -> None:
+        """sensors: those whose pictures the companion makes; each is a NumberedSource."""
         super().__init__(period)
-        self._arms, self._cameras, self._cell = arms, cameras, cell
+        self._arms, self._companion = arms, companion
+        self._sensors = {name: cast(NumberedSource, sensor) for name, sensor in sensors.items()}
 
     def tick(self) -> None:
         """Raises DeviceError: an arm does not arrive or is stopped, the cell fails, a picture does not come."""
@@ -85,8 +98,8 @@ class LockStep(_MonotonicClock):
 
     def wait_for_data(self) -> None:
         """Lets the cell follow, and waits until forces and pictures have arrived over the wire."""
-        for name, number in self._cell.step(pause=SETTLED).items():
-            self._cameras[name].wait_for(number, timeout=5.0)
+        for name, number in self._companion.step(pause=SETTLED).items():
+            self._sensors[name].wait_for(number, timeout=5.0)
 
     def restart(self) -> None:
         """Nothing runs between ticks."""

@@ -1,17 +1,13 @@
-"""A UR arm as a rig has it: it remembers where it was sent, and says what it did when a picture was exposed."""
+"""An arm of hardware as a rig has it: it remembers where it was sent, and counts the limits that it hit."""
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Mapping
 
-from robot.arm.time_alignment import state_at
-from robot.arm.trajectory import PERIOD
-from robot.arm.ur import URArm
 from robot.errors import DeviceError
 from tacsim import pose as se3
-from tacsim.interface import ArmState, Pose
+from tacsim.interface import ArmState, HardwareArm, Pose
 from tacsim.limits import ActionError
 
 NEAR, TURN = 2e-6, 2e-5  # an arm this near to its target has arrived [m, rad]
@@ -25,27 +21,14 @@ class CommandedArm:
     dry_run: no motion is ever sent.
     """
 
-    def __init__(self, driver: URArm, *, dry_run: bool = False) -> None:
+    def __init__(self, driver: HardwareArm, *, dry_run: bool = False) -> None:
         self.driver, self._dry_run = driver, dry_run
         self.target: Pose | None = None
-        self.alignment = 0.0  # of the last aligned state: time to the nearest package [s]
         self.limits_hit = 0  # targets that were shortened or refused
 
     def state(self, at: float | None = None) -> ArmState:
-        """Raises NotAligned for a moment that no package covers."""
-        driver = self.driver
-        if at is None:
-            return driver.state()
-        deadline = time.monotonic() + driver.config.link_timeout
-        while driver.state().time < at and time.monotonic() < deadline:  # its package is still on the way
-            time.sleep(1e-3)
-        packages = max(8, math.ceil((time.monotonic() - at) / PERIOD) + 8)  # from before that moment to now
-        max_gap = driver.config.link_timeout  # a longer gap is a lost link
-        states = driver.history(packages)
-        if states and states[0].time > at:  # this process was held up meanwhile
-            states = driver.history()
-        state, self.alignment = state_at(at, states, driver.name, max_gap)
-        return state
+        """Raises DeviceError for a moment that no state covers."""
+        return self.driver.state(at)
 
     def command(self, target: Pose | None) -> Pose | None:
         """In a dry run nothing is sent, and None says so."""

@@ -1,57 +1,32 @@
-"""Rigs that go by the wall clock: UR arms and cameras, real or mock, and simulated sensors on them."""
+"""Rigs that go by the wall clock: arms and sensors of hardware, real or mock, and simulated sensors on them."""
 
 from __future__ import annotations
 
-import time
+import math
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, closing
+from typing import Any
 
-from calibration.errors import error_context
-from calibration.frame_normaliser import FrameNormaliser
-from calibration.normaliser import normaliser_for_camera, normaliser_for_simulation
-from robot.arm.ur import URArm
-from robot.arm.worker_config import check_host
-from robot.camera.camera import Camera
 from robot.errors import DeviceError, SafetyViolation
-from robot.mock.cell.cell import MockCell
 from robot.rig.clock import LockStep, WallClock
 from robot.rig.commanded_arm import CommandedArm
+from robot.rig.parts import arm_drivers, companion_class, sensor_drivers, start_companion
 from robot.rig.reset import HardwareReset
 from robot.rig.touch import ForceTouch, PictureTouch, TouchSense
 from tacsim.control.gel_monitor import GelMonitor
 from tacsim.control.load_controller import load_controller
-from tacsim.interface import Normaliser, Pose, RigSpec, SensorSpec, TactileFrame, TactileSource
-from tacsim.models.hardware import CameraSensorConfig, UrArmConfig
-from tacsim.models.rig import RigConfig, SimSensorConfig
-from tacsim.report.series import ALIGNMENT, LIMITS, PICTURES_DAMAGED, PICTURES_LOST, PICTURES_REPEATED
+from tacsim.interface import Normaliser, Pose, RigSpec, SensorSpec, TactileSource
+from tacsim.models.driver import ArmDriver, Companion, SensorDriver
+from tacsim.models.hardware import ArmLimits
+from tacsim.models.rig import RigConfig
 from tacsim.rig import Rig
+from tacsim.step_info import ALIGNMENT, LIMITS_HIT
 
 Confirm = Callable[[str], bool]
+SensorDrivers = Mapping[str, SensorDriver[Any]]
+ArmDrivers = Mapping[str, ArmDriver[Any]]
 MISSED = 2.5  # an approach waits when no picture came for so many periods of its camera
-SIMULATED_RATE = 10.0  # of sensors without a camera [Hz]
-UNMEASURED = 0.05  # latency of a camera whose file says 0, as far as an approach may trust it [s]
-REACTION = 0.05  # from a picture that shows a touch to an arm that brakes [s]
 QUESTION = "Is the body in its place before the sensor, and everybody out of reach of the arm?"
-
-
-class CellSensor:
-    """A simulated sensor on a real or mock arm, without a camera: the mock cell's gel at the arm's measured pose."""
-
-    def __init__(self, cell: MockCell, name: str, config: SimSensorConfig) -> None:
-        self._cell, self._name, self.spec = cell, name, _sensor_spec(config)
-
-    def read(self, timeout: float) -> TactileFrame:
-        """The picture of the newest simulated state. Raises TimeoutError when there is none within `timeout` [s]."""
-        deadline = time.monotonic() + timeout
-        while (frame := self._cell.scene_frame) is None:
-            if time.monotonic() > deadline:
-                raise TimeoutError(f"sensor '{self._name}': the mock cell has simulated nothing within {timeout:g} s")
-            time.sleep(1e-3)
-        name = self._name
-        return TactileFrame(frame.images[name], time=frame.time, index=frame.index, surface=frame.surfaces[name])
-
-    def close(self) -> None:
-        """The rig closes the cell."""
 
 
 def open_hardware(
@@ -72,41 +47,49 @@ def open_hardware(
     Raises DeviceError for what cannot be opened, calibration.errors.CalibrationError for a calibration,
     ValueError for a rig that makes no sense.
     """
-    real = [name for name, arm in config.arms.items() if isinstance(arm, UrArmConfig) and arm.mock is None]
+    is_real = any(arm.is_real for arm in config.arms.values())
     # first: a wrong calibration, host or limit, and what lacks, are known before anything is connected
-    for name in config.arms:
-        _ur_arm(config, name)
-    normalisers = {name: _normaliser(name, sensor, config) for name, sensor in config.sensors.items()}
-    spec = _spec(config, normalisers)
+    sensor_kinds, arm_kinds = sensor_drivers(config), arm_drivers(config)
+    normalisers = {name: driver.normaliser() for name, driver in sensor_kinds.items()}
+    spec = _spec(config, sensor_kinds, normalisers)
     _gel_monitor(config, spec.sensors, {})
-    _require_gentle_approach(config)
-    for name in config.arms:
-        check_host(_ur_arm(config, name), name)
+    _require_gentle_approach(config, sensor_kinds, arm_kinds)
+    _require_keep_outs(config, arm_kinds)
+    for driver in arm_kinds.values():
+        driver.require()
     if check is not None:
         check(spec)
     with ExitStack() as stack:
-        cell = stack.enter_context(MockCell(config))
-        sensors = {name: stack.enter_context(closing(_sensor(name, config, cell))) for name in config.sensors}
-        arms = {name: stack.enter_context(closing(_arm(name, config, dry_run))) for name in config.arms}
-        cameras = {name: sensor for name, sensor in sensors.items() if isinstance(sensor, Camera)}
-        clock = _clock(config, cell, arms, cameras, real=bool(real))
-        for name, camera in cameras.items():
-            camera.spec = spec.sensors[name]
+        companion = start_companion(config)
+        if companion is not None:
+            stack.callback(companion.close)
+        sensors = {
+            name: stack.enter_context(closing(driver.open(spec.sensors[name], companion)))
+            for name, driver in sensor_kinds.items()
+        }
+        arms = {
+            name: stack.enter_context(closing(CommandedArm(driver.open(), dry_run=dry_run)))
+            for name, driver in arm_kinds.items()
+        }
+        clock = _clock(config, companion, arms, sensors, is_real=is_real)
         monitor = _gel_monitor(config, spec.sensors, arms)
         task = config.task
         reset = HardwareReset(
             arms={} if dry_run else arms,
             sensors=sensors,
-            start=_start_poses(config, cell),
+            start=_start_poses(config, companion),
             clock=clock,
             config=config.start,
             touch_sense=None if dry_run else _touch_sense(config, arms, sensors, normalisers, monitor),
-            confirm=_confirmation(config, cell, confirm, real=bool(real) and not dry_run),
+            confirm=_confirmation(config, companion, confirm, is_real=is_real and not dry_run),
             placement=0.0 if task is None else task.placement,
             tell=tell,
         )
 
-        logs = {name: arm.driver.package_log() for name, arm in arms.items() if config.record.arm_packages}
+        packages = arm_kinds if config.record.arm_packages else {}
+        logs = {
+            name: log for name, driver in packages.items() if (log := driver.package_log(arms[name].driver)) is not None
+        }
         rig = Rig(
             name=config.name,
             sensors=sensors,
@@ -114,10 +97,10 @@ def open_hardware(
             clock=clock,
             normalisers=normalisers,
             reset=reset,
-            truth=cell.truth if cell.knows_truth else None,
-            diagnostics=lambda: _diagnostics(cell, clock, arms, cameras),
+            truth=companion.truth if companion is not None and spec.truth else None,
+            diagnostics=lambda: _diagnostics(companion, clock, arms, sensor_kinds, sensors),
             packages=lambda: {name: log.take() for name, log in logs.items()},
-            on_close=cell.close,
+            on_close=None if companion is None else companion.close,
             on_tactile=monitor,
             load_control=load_controller(config.task),
         )
@@ -125,86 +108,56 @@ def open_hardware(
         return rig
 
 
-def _sensor(name: str, config: RigConfig, cell: MockCell) -> Camera | CellSensor:
-    sensor = config.sensors[name]
-    if isinstance(sensor, CameraSensorConfig):
-        return Camera(sensor, name)
-    return CellSensor(cell, name, _simulated(config, name))
+def hardware_spec(config: RigConfig) -> RigSpec:
+    """What a rig of hardware will deliver; nothing is opened. Raises CalibrationError, ValueError."""
+    drivers = sensor_drivers(config)
+    return _spec(config, drivers, {name: driver.normaliser() for name, driver in drivers.items()})
 
 
-def _simulated(config: RigConfig, name: str) -> SimSensorConfig:
-    """Raises ValueError for a sensor that is neither a camera nor simulated."""
-    sensor = config.sensors[name]
-    if not isinstance(sensor, SimSensorConfig):
-        raise ValueError(
-            f"rig '{config.name}': sensors.{name} has the driver '{sensor.driver}', which a rig of hardware cannot "
-            "open; use `driver: camera` or `driver: sim`"
-        )
-    return sensor
-
-
-def _arm(name: str, config: RigConfig, dry_run: bool) -> CommandedArm:
-    return CommandedArm(URArm(_ur_arm(config, name), name, keep_out=config.kept_out(name)), dry_run=dry_run)
+def _spec(config: RigConfig, drivers: SensorDrivers, normalisers: Mapping[str, Normaliser]) -> RigSpec:
+    sensors = {name: driver.spec(normalisers[name]) for name, driver in drivers.items()}
+    companion = companion_class(config)
+    truth = companion is not None and companion.will_know_truth(config)
+    return RigSpec(sensors, tuple(config.arms), truth, config.period)
 
 
 def _clock(
     config: RigConfig,
-    cell: MockCell,
+    companion: Companion | None,
     arms: Mapping[str, CommandedArm],
-    cameras: Mapping[str, Camera],
+    sensors: Mapping[str, TactileSource],
     *,
-    real: bool,
+    is_real: bool,
 ) -> LockStep | WallClock:
     """In lock step where everything waits for us: no real arm, and gels simulated here."""
-    if not cell.simulated:
+    if companion is None or not companion.is_simulated:
         return WallClock(config.period)
-    if config.lock_step and not real:
-        mock_cameras = {name: camera for name, camera in cameras.items() if name in cell.cameras}
-        return LockStep(config.period, arms, mock_cameras, cell)
-    cell.run_free()
-    return WallClock(config.period, cell.catch_up, real_time=config.contact == "hertz")
+    if config.lock_step and not is_real:
+        return LockStep(config.period, arms, {name: sensors[name] for name in companion.picture_sources}, companion)
+    companion.run_free()
+    return WallClock(config.period, companion.catch_up, real_time=config.contact == "hertz")
 
 
 def _diagnostics(
-    cell: MockCell, clock: LockStep | WallClock, arms: Mapping[str, CommandedArm], cameras: Mapping[str, Camera]
+    companion: Companion | None,
+    clock: LockStep | WallClock,
+    arms: Mapping[str, CommandedArm],
+    drivers: SensorDrivers,
+    sensors: Mapping[str, TactileSource],
 ) -> Mapping[str, float]:
-    values = {**cell.diagnostics(), **clock.diagnostics()}
+    values = {**({} if companion is None else companion.diagnostics()), **clock.diagnostics()}
     for name, arm in arms.items():
-        values |= {f"{ALIGNMENT}{name}": arm.alignment, f"{LIMITS}{name}": float(arm.limits_hit)}
-    for name, camera in cameras.items():
-        values |= camera_counts(name, camera)
+        values |= {f"{ALIGNMENT}{name}": arm.driver.alignment, f"{LIMITS_HIT}{name}": float(arm.limits_hit)}
+    for name, driver in drivers.items():
+        values |= driver.diagnostics(sensors[name])
     return values
 
 
-def hardware_spec(config: RigConfig) -> RigSpec:
-    """What a rig of hardware will deliver; nothing is opened. Raises CalibrationError, ValueError."""
-    return _spec(config, {name: _normaliser(name, sensor, config) for name, sensor in config.sensors.items()})
-
-
-def _spec(config: RigConfig, normalisers: Mapping[str, FrameNormaliser]) -> RigSpec:
-    """What the rig will deliver; for cameras also what the normaliser finds in the picture."""
-    sensors = {}
-    for name, sensor in config.sensors.items():
-        if isinstance(sensor, CameraSensorConfig):
-            found = normalisers[name]
-            size = (sensor.height, sensor.width)
-            sensors[name] = SensorSpec(size, height=found.finds_height, flow=found.finds_flow, arm=sensor.arm)
-        else:
-            sensors[name] = _sensor_spec(_simulated(config, name))
-    return RigSpec(sensors, tuple(config.arms), MockCell.will_know_truth(config), config.period)
-
-
-def _sensor_spec(config: SimSensorConfig) -> SensorSpec:
-    model = config.model
-    return SensorSpec(model.image_shape, height=True, flow=model.markers is not None, arm=config.arm)
-
-
-def _start_poses(config: RigConfig, cell: MockCell) -> dict[str, Pose]:
-    starts = dict(cell.start_poses)
-    for name in config.arms:
-        arm = _ur_arm(config, name)
-        if arm.start is not None:
-            starts[name] = arm.start.pose
+def _start_poses(config: RigConfig, companion: Companion | None) -> dict[str, Pose]:
+    starts = {} if companion is None else dict(companion.start_poses)
+    for name, arm in config.arms.items():
+        if arm.start_pose is not None:
+            starts[name] = arm.start_pose
         elif name not in starts:
             raise DeviceError(
                 f"arms.{name}.start is missing: give the sensor's world pose at the start of an episode, "
@@ -226,60 +179,72 @@ def _touch_sense(
     if not carriers:
         return None
     if config.start.touch_signal is not None:
-        rates = [each.fps for each in config.sensors.values() if isinstance(each, CameraSensorConfig)]
-        patience = MISSED / min(rates, default=SIMULATED_RATE)
+        rates = [
+            _positive(driver.sample_rate(), driver, f"sensors.{name}", "a sample rate", "Hz")
+            for name, driver in sensor_drivers(config).items()
+        ]
+        patience = MISSED / min(rates)
         return PictureTouch(sensors, normalisers, monitor, config.start.touch_signal, patience)
     force = None if config.task is None else config.task.touch_force
     return None if force is None else ForceTouch(carriers, force)
 
 
-def _require_gentle_approach(config: RigConfig) -> None:
-    """Raises ValueError where a gel would be pressed beyond its limit before its camera could tell of the touch."""
+def _require_gentle_approach(config: RigConfig, sensors: SensorDrivers, arms: ArmDrivers) -> None:
+    """Raises ValueError where a gel would be pressed beyond its limit before its picture could show the touch."""
     if config.start.touch_signal is None:
         return
-    for name, sensor in config.sensors.items():
-        if sensor.arm is None or (depth := _ur_arm(config, sensor.arm).limits.depth) is None:
+    for name, driver in sensors.items():
+        arm = driver.config.arm
+        if arm is None or (depth := _limits(config, arm).depth) is None:
             continue
-        late = _worst_latency(config, name)
+        late = _positive(driver.worst_latency(), driver, f"sensors.{name}", "a worst latency", "s")
+        late += _positive(arms[arm].worst_latency(), arms[arm], f"arms.{arm}", "a worst latency", "s")
         speed = config.start.approach_speed
         if speed * late > depth:
             raise ValueError(
-                f"rig '{config.name}': start.approach_speed {1e3 * speed:g} mm/s is too fast: the camera of sensor "
-                f"'{name}' tells of a touch {1e3 * late:.0f} ms late, with its gel {1e3 * speed * late:.2g} mm deep, "
-                f"and limits.depth of arm '{sensor.arm}' is {1e3 * depth:g} mm. At most {1e3 * depth / late:.2g} mm/s"
+                f"rig '{config.name}': start.approach_speed {1e3 * speed:g} mm/s is too fast: the picture of sensor "
+                f"'{name}' shows a touch {1e3 * late:.0f} ms late, with its gel {1e3 * speed * late:.2g} mm deep, "
+                f"and limits.depth of arm '{arm}' is {1e3 * depth:g} mm. At most {1e3 * depth / late:.2g} mm/s"
             )
 
 
-def _worst_latency(config: RigConfig, name: str) -> float:
-    """Longest time from a touch to an arm that brakes, by the pictures of a sensor [s]. Raises ValueError for a driver
-    whose latency is not known."""
-    sensor = config.sensors[name]
-    if isinstance(sensor, CameraSensorConfig):
-        return max(sensor.latency, UNMEASURED) + 1.0 / sensor.fps + REACTION
-    if isinstance(sensor, SimSensorConfig):
-        return 1.0 / SIMULATED_RATE + REACTION
-    raise ValueError(
-        f"rig '{config.name}': sensors.{name} has the driver '{sensor.driver}', whose latency is not known: "
-        f"how deep its gel is pressed before its picture shows a touch cannot be computed. State its worst latency in "
-        f"{_worst_latency.__module__}._worst_latency"
-    )
-
-
-def _ur_arm(config: RigConfig, name: str) -> UrArmConfig:
-    """Raises ValueError for an arm of a kind whose limits nothing here guards."""
-    arm = config.arms[name]
-    if not isinstance(arm, UrArmConfig):
+def _positive(stated: float, driver: SensorDriver[Any] | ArmDriver[Any], key: str, what: str, unit: str) -> float:
+    """What a driver states. Raises ValueError for a value that cannot be."""
+    if not (math.isfinite(stated) and stated > 0.0):
         raise ValueError(
-            f"rig '{config.name}': arms.{name} has the driver '{arm.driver}', which a rig of hardware cannot open: "
-            "neither its limits nor its stops are known here. Use `driver: ur`"
+            f"{key}: the driver '{driver.config.driver}' states {what} of {stated} {unit}; it must be finite and above "
+            "0, or an approach could press a gel too deep"
         )
-    return arm
+    return stated
+
+
+def _require_keep_outs(config: RigConfig, arms: ArmDrivers) -> None:
+    """Raises ValueError for two arms that nothing keeps apart."""
+    for rule in config.keep_out:
+        first, second = (arms[name] for name in rule.arms)
+        if not (first.keeps_distances and type(first) is type(second)):
+            raise ValueError(
+                f"rig '{config.name}': keep_out of {' and '.join(rule.arms)}: their drivers, "
+                f"'{first.config.driver}' and '{second.config.driver}', do not keep their arms apart; leave keep_out "
+                "out, and keep them apart by workspaces and planes"
+            )
+
+
+def _limits(config: RigConfig, name: str) -> ArmLimits:
+    """Raises ValueError for an arm without limits: nothing would guard it."""
+    arm = config.arms[name]
+    if arm.stop_limits is None:
+        raise ValueError(
+            f"rig '{config.name}': arms.{name} has the driver '{arm.driver}', whose configuration has no `limits`: "
+            "nothing says where the arm must stop. Give it `limits: ArmLimits`"
+        )
+    return arm.stop_limits
 
 
 def _gel_monitor(config: RigConfig, sensors: Mapping[str, SensorSpec], arms: Mapping[str, CommandedArm]) -> GelMonitor:
     """Reports to the arms what their gels show, and guards the gels. Raises DeviceError for a limit that cannot be
     guarded because its sensor delivers no height or flow."""
-    limits = {name: _ur_arm(config, name).limits for name in config.arms}
+    limits = {name: _limits(config, name) for name in config.arms}
     report = {name: arm.driver.report_tactile for name, arm in arms.items()}
     try:
         return GelMonitor(sensors, limits, report, SafetyViolation)
@@ -287,38 +252,17 @@ def _gel_monitor(config: RigConfig, sensors: Mapping[str, SensorSpec], arms: Map
         raise DeviceError(str(failure)) from None
 
 
-def _confirmation(config: RigConfig, cell: MockCell, confirm: Confirm | None, *, real: bool) -> Callable[[], bool]:
+def _confirmation(
+    config: RigConfig, companion: Companion | None, confirm: Confirm | None, *, is_real: bool
+) -> Callable[[], bool]:
     def ask() -> bool:
-        if real:
+        if is_real:
             question = (
                 QUESTION if len(config.arms) == 1 else QUESTION.replace("sensor", "sensors").replace("arm", "arms")
             )
             return confirm is not None and confirm(f"Rig '{config.name}': {question}")
-        cell.place()
+        if companion is not None:
+            companion.place()
         return True
 
     return ask
-
-
-def _normaliser(name: str, config: object, rig: RigConfig) -> FrameNormaliser:
-    if isinstance(config, CameraSensorConfig):
-        return camera_normaliser(name, config, rig)
-    config = _simulated(rig, name)
-    assert rig.scene is not None
-    return normaliser_for_simulation(config.model, rig.scene.gel_of(name).size[:2], rig.canonical)
-
-
-def camera_counts(name: str, camera: Camera) -> dict[str, float]:
-    """The frames of a camera that gave no picture, by their keys in a record."""
-    status = camera.status
-    counts = {PICTURES_LOST: status.dropped, PICTURES_DAMAGED: status.damaged, PICTURES_REPEATED: status.repeated}
-    return {key + name: float(count) for key, count in counts.items()}
-
-
-def camera_normaliser(name: str, config: CameraSensorConfig, rig: RigConfig) -> FrameNormaliser:
-    """The normaliser of one camera of a rig. Raises ValueError, and
-    calibration.errors.CalibrationError, which names the sensor."""
-    with error_context(f"sensors.{name}"):
-        return normaliser_for_camera(
-            config, config.size if rig.scene is None else rig.scene.gel_of(name).size[:2], rig.canonical
-        )

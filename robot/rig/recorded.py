@@ -12,16 +12,16 @@ from numpy.typing import NDArray
 
 from calibration.bundle import read_sensor_model
 from calibration.errors import CalibrationError, error_context
-from calibration.frame_normaliser import FrameNormaliser
 from calibration.markers.flow import MarkersLost, find_markers
 from calibration.markers.lattice import NoLattice
-from calibration.normaliser import normaliser_for_camera
 from calibration.reference import StaleReference
-from robot.rig.replay_rig import recorded_normaliser, recorded_rig, rig_of
+from robot.rig.parts import sensor_of
+from robot.rig.replay_rig import recorded_rig, rig_of
 from tacsim.config.errors import ConfigError
-from tacsim.interface import Observation, SurfaceMap, TactileFrame, TactileObservation
-from tacsim.models.hardware import CameraSensorConfig
-from tacsim.models.rig import ReplaySensorConfig, RigConfig, SensorConfig
+from tacsim.interface import Normaliser, Observation, SurfaceMap, TactileFrame, TactileObservation
+from tacsim.models.driver import sensor_part
+from tacsim.models.hardware import SensorConfig
+from tacsim.models.rig import ReplaySensorConfig, RigConfig
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.record.episode import Episode, EpisodeError, EpisodeMeta, Step
 from tacsim.record.images import reference_image
@@ -47,7 +47,7 @@ class ObservedEpisode:
         calibration.errors.CalibrationError where a frame cannot be normalised.
         """
         spec = self.episode.meta.spec
-        normalisers: dict[str, FrameNormaliser] = {}
+        normalisers: dict[str, Normaliser] = {}
         for step in self.episode.steps:
             lacking = [*(set(spec.sensors) - set(step.frames)), *(set(spec.arms) - set(step.arms))]
             if lacking:
@@ -58,13 +58,13 @@ class ObservedEpisode:
             tactile = {name: normalisers[name](frame, step.time) for name, frame in frames.items()}
             yield step, Observation(tactile, {name: step.arms[name] for name in spec.arms}, step.time)
 
-    def _normaliser(self, name: str, first: TactileFrame) -> FrameNormaliser:
+    def _normaliser(self, name: str, first: TactileFrame) -> Normaliser:
         """With the episode's picture without contact as its reference; without one, the first frame."""
         config = ReplaySensorConfig(driver="replay", source=str(self.path))
         with error_context(f"{self.path}: sensor '{name}'"):
             reference = reference_image(self.episode.meta.attachments, name)
             untouched = first if reference is None else TactileFrame(reference, time=first.time, index=first.index)
-            found = recorded_normaliser(config, name, untouched.image, self.canonical)
+            found = sensor_part(config, name, self.canonical).normaliser(untouched.image)
             found.take_reference(untouched)
         return found
 
@@ -78,7 +78,7 @@ class RecordedSurfaces:
 
     def __init__(self, meta: EpisodeMeta) -> None:
         """Raises EpisodeError for a reference that cannot be read. A rig file that cannot is noted."""
-        self._normalisers: dict[str, FrameNormaliser] = {}
+        self._normalisers: dict[str, Normaliser] = {}
         self.notes: list[str] = []
         try:
             rig = rig_of(meta)
@@ -91,16 +91,18 @@ class RecordedSurfaces:
             return
         for name, sensor in rig.sensors.items():
             untouched = reference_image(meta.attachments, name)
-            if untouched is None or name not in meta.spec.sensors:
+            if untouched is None or sensor.is_simulated or name not in meta.spec.sensors:
                 continue
             try:
-                found = _normaliser_of(sensor, name, untouched, rig)
-                if found is not None and (found.finds_height or found.finds_flow):
+                found = sensor_of(rig, name).normaliser(untouched)
+                if found.finds_height or found.finds_flow:
                     found.take_reference(TactileFrame(untouched, time=0.0, index=0))
                     self._normalisers[name] = found
                     self.notes += _distrusted(sensor, name)
-                    self.notes += _middle_alone(sensor, name, found.shown, rig.canonical)
-                elif found is not None and not meta.spec.sensors[name].height:
+                    shown: tuple[float, float] | None = getattr(found, "shown", None)
+                    if shown is not None and sensor.sensor_model is None:
+                        self.notes += _middle_alone(name, shown, rig.canonical)
+                elif not meta.spec.sensors[name].height:
                     self.notes += _dots_in(untouched, name)
             except (CalibrationError, ValueError) as why:
                 self.notes.append(f"sensor {name}: no height is shown: {why}")
@@ -115,21 +117,9 @@ class RecordedSurfaces:
             return None
 
 
-def _normaliser_of(
-    sensor: SensorConfig, name: str, untouched: NDArray[np.uint8], rig: RigConfig
-) -> FrameNormaliser | None:
-    if isinstance(sensor, ReplaySensorConfig):
-        return recorded_normaliser(sensor, name, untouched, rig.canonical)
-    if isinstance(sensor, CameraSensorConfig):
-        return normaliser_for_camera(
-            sensor, sensor.size if rig.scene is None else rig.scene.gel_of(name).size[:2], rig.canonical
-        )
-    return None
-
-
 def _distrusted(sensor: SensorConfig, name: str) -> list[str]:
     """A word on a calibration that says of itself that it is not to be trusted."""
-    path = sensor.calibration if isinstance(sensor, ReplaySensorConfig | CameraSensorConfig) else None
+    path = sensor.bundle
     if path is None or not read_sensor_model(Path(path)).caution:
         return []
     return [
@@ -137,11 +127,8 @@ def _distrusted(sensor: SensorConfig, name: str) -> list[str]:
     ]
 
 
-def _middle_alone(sensor: SensorConfig, name: str, shown: tuple[float, float], grid: CanonicalGrid) -> list[str]:
-    """A word on maps that are smaller than the gel `shown` in the picture (x, y) [m]. None of a model's: its size is
-    that of the rig file."""
-    if isinstance(sensor, CameraSensorConfig) and sensor.model is not None:
-        return []
+def _middle_alone(name: str, shown: tuple[float, float], grid: CanonicalGrid) -> list[str]:
+    """A note on maps that are smaller than the gel `shown` in the picture (x, y) [m]."""
     maps = grid.columns * grid.pitch, grid.rows * grid.pitch
     more = [
         f"--set canonical.{key}={2 * math.ceil(there / grid.pitch / 2 - 1e-6)}"

@@ -8,18 +8,13 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from calibration.errors import error_context
-from calibration.frame_normaliser import FrameNormaliser
-from calibration.normaliser import normaliser_for_camera, normaliser_for_recording, normaliser_for_simulation
 from robot.rig import RIG_ATTACHMENT, CannotOpen
 from tacsim.config import load_rig
 from tacsim.interface import Normaliser, TactileFrame
-from tacsim.models.hardware import CameraSensorConfig
-from tacsim.models.rig import ReplayArmConfig, ReplaySensorConfig, RigConfig, SimSensorConfig
-from tacsim.models.sensor import CanonicalGrid
+from tacsim.models.driver import sensor_part
+from tacsim.models.hardware import parts_of
+from tacsim.models.rig import ReplayArmConfig, ReplaySensorConfig, RigConfig
 from tacsim.record.episode import EpisodeMeta
 from tacsim.record.replay import ReplayArm, ReplayClock, ReplaySensor, match_sources, recorded_period
 from tacsim.record.sources import EPISODES, episode_meta
@@ -42,13 +37,10 @@ class ReplayReset:
 
 def open_replay(config: RigConfig) -> Rig:
     """Recorded sensors and arms. The control period is that of the recording. Raises CannotOpen, EpisodeError."""
-    there = {
-        name: arm for name, arm in config.arms.items() if isinstance(arm, ReplayArmConfig) and arm.source is not None
-    }
+    there = {name: arm for name, arm in parts_of(config.arms, ReplayArmConfig).items() if arm.source is not None}
     recorded = {
         name: sensor if sensor.arm in there else sensor.model_copy(update={"arm": None})
-        for name, sensor in config.sensors.items()
-        if isinstance(sensor, ReplaySensorConfig)
+        for name, sensor in parts_of(config.sensors, ReplaySensorConfig).items()
     }
     clock = ReplayClock(_common_period(config.name, recorded))
     with ExitStack() as stack:
@@ -58,7 +50,7 @@ def open_replay(config: RigConfig) -> Rig:
             sensors[name] = source = ReplaySensor(sensor, name, clock)
             stack.callback(source.close)
             with error_context(f"sensors.{name}"):
-                normaliser = recorded_normaliser(sensor, name, source.reference().image, config.canonical)
+                normaliser = sensor_part(sensor, name, config.canonical).normaliser(source.reference().image)
             if not source.spec.height:  # what the frames don't carry, and the normaliser finds in them
                 source.spec = replace(source.spec, height=normaliser.finds_height, flow=normaliser.finds_flow)
             normalisers[name] = normaliser
@@ -88,23 +80,6 @@ def _common_period(rig: str, sensors: Mapping[str, ReplaySensorConfig]) -> float
             f"{periods[shortest]:.4g} s and sensors.{longest} every {periods[longest]:.4g} s; give two of one rate"
         )
     return periods[shortest]
-
-
-def recorded_normaliser(
-    config: ReplaySensorConfig, name: str, untouched: NDArray[np.uint8], grid: CanonicalGrid
-) -> FrameNormaliser:
-    """By what the rig file says of the picture; without by what an episode says of its own sensor. `untouched`: the
-    native picture (rows, columns, 3) without contact."""
-    own = config.corners is None and config.calibration is None and config.marker_pitch is None
-    original = recorded_rig(Path(config.source or "")) if own else None
-    sensor = None if original is None else original.sensors.get(name)
-    if original is not None and original.scene is not None and isinstance(sensor, SimSensorConfig):
-        return normaliser_for_simulation(sensor.model, original.scene.gel_of(name).size[:2], grid)
-    if original is not None and isinstance(sensor, CameraSensorConfig):
-        gel = sensor.size if original.scene is None else original.scene.gel_of(name).size[:2]
-        return normaliser_for_camera(sensor, gel, grid)
-    replayed = sensor if isinstance(sensor, ReplaySensorConfig) else config
-    return normaliser_for_recording(replayed, untouched.shape[:2], grid, untouched)
 
 
 def recorded_rig(source: Path) -> RigConfig | None:

@@ -1,7 +1,7 @@
 """The reset of a rig of hardware: retreat, references, a person's confirmation, and a slow approach until touch.
 
 Only `Rig.reset` starts it, and nothing approaches before somebody has confirmed that the body lies where it should (on
-a mock rig robot.mock.cell.cell puts it there).
+a mock rig the companion of its mocks puts it there).
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ from tacsim.gym import encode
 from tacsim.gym.env import TacsimEnv, Variant, require_alike
 from tacsim.gym.features import FeatureEncoder
 from tacsim.gym.vector import Member, SharedBatch, TacsimVectorEnv
-from tacsim.models.hardware import Placement
+from tacsim.models.hardware import ArmConfig, Placement, SensorConfig, parts_of
 from tacsim.models.policy import Features
 from tacsim.models.rig import RigConfig, SimSensorConfig, WrenchNoise
 from tacsim.models.sensor import Lighting
@@ -121,9 +121,9 @@ def _unchanging(config: RigConfig) -> RigConfig:
         "noise": None,
         "name": "",
     }
-    sensors, arms = {}, {}
-    for name, sensor in config.sensors.items():
-        assert isinstance(sensor, SimSensorConfig)
+    sensors: dict[str, SensorConfig] = {}
+    arms: dict[str, ArmConfig] = {}
+    for name, sensor in parts_of(config.sensors, SimSensorConfig).items():
         sensors[name] = sensor.model_copy(update={"model": sensor.model.model_copy(update=look), "delay": 0})
     for name, arm in config.arms.items():
         arms[name] = arm.model_copy(update={"error": Placement(), "noise": WrenchNoise(), "delay": 0})

@@ -12,7 +12,7 @@ from tacsim.compute.threads import map_parallel, map_serial
 from tacsim.control.gel_monitor import GelMonitor
 from tacsim.control.load_controller import load_controller
 from tacsim.interface import Pose, SensorSpec
-from tacsim.models.hardware import Placement
+from tacsim.models.hardware import Placement, parts_of
 from tacsim.models.rig import RigConfig, SimArmConfig, SimSensorConfig
 from tacsim.models.scene import Scene
 from tacsim.models.sensor import SensorModel
@@ -41,11 +41,9 @@ class Simulation:
     def wear(self, config: RigConfig) -> None:
         """From the next episode on light, texture, noise and delay of the sensors, and error, noise and delay of the
         arms, are those of `config`; all else is that of the rig they were made with."""
-        for name, sensor in config.sensors.items():
-            assert isinstance(sensor, SimSensorConfig)
+        for name, sensor in parts_of(config.sensors, SimSensorConfig).items():
             self.sensors[name].wear(*_pictures(sensor.model, name, self.stage.scene), sensor.delay)
-        for name, arm in config.arms.items():
-            assert isinstance(arm, SimArmConfig)
+        for name, arm in parts_of(config.arms, SimArmConfig).items():
             self.arms[name].believe(_error(arm), arm.delay, wrench_noise_source(arm.noise, name))
 
 
@@ -78,13 +76,12 @@ def simulate(
             "use physics 'hybrid', or motion 'settled'"
         )
     frames = _frame_of_arm(config, scene)
-    models = {name: sensor for name, sensor in config.sensors.items() if isinstance(sensor, SimSensorConfig)}
+    models = parts_of(config.sensors, SimSensorConfig)
     world = Stage(scene, make_world if make is None else make)
     clock = SimClock(world, config.period, config.motion)
     sensors = {name: _sim_sensor(world, clock, name, sensor, config) for name, sensor in models.items()}
     arms: dict[str, SimArm] = {}
-    for name, arm in config.arms.items():
-        assert isinstance(arm, SimArmConfig)
+    for name, arm in parts_of(config.arms, SimArmConfig).items():
         limits = arm.limits
         speed = arm.speed if limits is None else min(arm.speed, limits.speed)
         turn_rate = arm.turn_rate if limits is None else min(arm.turn_rate, limits.turn_rate)
@@ -118,11 +115,7 @@ def _error(arm: SimArmConfig) -> Pose | None:
 
 
 def _gel_monitor(config: RigConfig, sensors: Mapping[str, SimSensor]) -> GelMonitor | None:
-    limits = {
-        name: arm.limits
-        for name, arm in config.arms.items()
-        if isinstance(arm, SimArmConfig) and arm.limits is not None
-    }
+    limits = {name: arm.stop_limits for name, arm in config.arms.items() if arm.stop_limits is not None}
     try:
         return GelMonitor({name: sensor.spec for name, sensor in sensors.items()}, limits, {}) if limits else None
     except ValueError as failure:

@@ -81,5 +81,5 @@ class ForceTouch:
     def look(self, *, guarded: bool) -> Touch:
         states = {name: arm.state() for name, arm in self._arms.items()}
         pressed = {name: -float(state.wrench[2]) / self._force for name, state in states.items()}
-        news = min(state.time + self._arms[name].driver.config.latency for name, state in states.items())
+        news = min(state.time + self._arms[name].driver.latency for name, state in states.items())
         return Touch(pressed, news)

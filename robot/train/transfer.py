@@ -25,12 +25,11 @@ from robot.open import open_rig
 from robot.train.evaluate import UNSEEN, Interval, bootstrap, wilson
 from tacsim.config import LoadedRig, load_rig
 from tacsim.interface import RigSpec
-from tacsim.models.hardware import UrArmConfig
 from tacsim.models.randomisation import Randomisation
 from tacsim.models.training import Training
 from tacsim.record.episode import Episode
-from tacsim.report.series import FELT
 from tacsim.rig import Rig
+from tacsim.step_info import TACTILE_DISTANCE
 from tacsim.tasks import make_task
 
 Side = Literal["simulation", "twin"]
@@ -129,8 +128,7 @@ def _apart(study: Study, side: Side, twin: int, left: Sequence[tuple[str, int]])
     """In a process of its own, whose mocks have addresses of their own."""
     words: list[str] = []
     if side == "twin":
-        for number, (name, arm) in enumerate(load_rig(RIGS[side]).config.arms.items(), start=1):
-            assert isinstance(arm, UrArmConfig)
+        for number, name in enumerate(load_rig(RIGS[side]).config.arms, start=1):
             host = loopback_host(number, ROOM)
             words += [f"arms.{name}.host={host}", f"sensors.{name}.source=http://{host}:8081/?action=stream"]
     return list(_on_twin(replace(study, overrides=(*study.overrides, *words)), side, twin, left))
@@ -226,7 +224,7 @@ def _episode(study: Study, side: Side, rig: Rig, loaded: LoadedRig, policy: str,
         side,
         number,
         last,
-        episode.steps[-1].info.get(FELT) if episode.steps else None,
+        episode.steps[-1].info.get(TACTILE_DISTANCE) if episode.steps else None,
         success=last is not None and last <= task.config.success and within,
         peak_force=max(forces, default=0.0),
         error=error,

@@ -8,8 +8,7 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from tacsim.config.errors import ConfigError, Place, Problem
-from tacsim.models.hardware import CameraSensorConfig
-from tacsim.models.rig import RigConfig, SimSensorConfig
+from tacsim.models.rig import RigConfig
 from tacsim.models.scene import Scene
 from tacsim.models.sensor import SensorModel
 from tacsim.models.text import millimetres
@@ -27,19 +26,14 @@ def with_gels_of_sensors(
         return config, []
     models: dict[str, SensorModel] = {}
     for name, sensor in config.sensors.items():
-        if isinstance(sensor, SimSensorConfig):
-            models[name] = sensor.model
-        elif isinstance(sensor, CameraSensorConfig) and sensor.mock is not None:
-            models[name] = sensor.model if sensor.model is not None else load_sensor(Path(sensor.calibration or ""))
+        if (model := sensor.rendered_model(load_sensor)) is not None:
+            models[name] = model
     scene, notes = fit_gel(config.scene, models, given=given)
     update: dict[str, object] = {"scene": scene}
     fixed = _sensors_given(config.scene, models, given)
     if fixed:
         update["sensors"] = {
-            name: sensor.model_copy(update={"model": models[name].model_copy(update={"gel_size": None})})
-            if name in fixed and not isinstance(sensor, CameraSensorConfig)
-            else sensor
-            for name, sensor in config.sensors.items()
+            name: sensor.without_gel_size() if name in fixed else sensor for name, sensor in config.sensors.items()
         }
     return config.model_copy(update=update), notes
 

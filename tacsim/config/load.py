@@ -17,8 +17,8 @@ from tacsim.config.gel import gel_sizes_given, with_gels_of_sensors
 from tacsim.config.kinds import NotFound, is_name, kind_of, resolve, shipped_file
 from tacsim.config.messages import report_errors
 from tacsim.config.references import Override, apply, parse_override, read_file
-from tacsim.models.hardware import UrArmConfig, weakened_limits
-from tacsim.models.rig import RigConfig, TaskConfig, any_task
+from tacsim.models.driver import DriversMissing
+from tacsim.models.rig import RigConfig, TaskConfig, any_task, rig_model
 from tacsim.models.scene import Mesh, Scene
 from tacsim.models.sensor import SensorModel
 
@@ -70,7 +70,7 @@ def load_rig(rig: str | Path, *, task: str | TaskConfig | None = None, overrides
         _validate(RigConfig, root, state), load_sensor, given=gel_sizes_given(each.path for each in given)
     )
     config = _with_one_scene(config)
-    if overrides and any(isinstance(arm, UrArmConfig) and arm.mock is None for arm in config.arms.values()):
+    if overrides and any(arm.is_real for arm in config.arms.values()):
         _require_limits(config, load_rig(rig, task=task).config)
     if config.scene is not None:
         notes = [*notes, *say_side(config.scene)]
@@ -97,8 +97,8 @@ def _require_limits(config: RigConfig, file: RigConfig) -> None:
     problems: list[str] = []
     for name, arm in config.arms.items():
         there = file.arms.get(name)
-        if isinstance(arm, UrArmConfig) and isinstance(there, UrArmConfig) and arm.mock is None:
-            problems += [f"arms.{name}.{what}" for what in weakened_limits(there, arm)]
+        if there is not None and arm.is_real:
+            problems += [f"arms.{name}.{what}" for what in arm.weakened_limits(there)]
     kept = {frozenset(apart.arms): apart.distance for apart in config.keep_out}
     problems += [
         f"keep_out of {' and '.join(apart.arms)}: less than {apart.distance:g} m"
@@ -228,6 +228,11 @@ def _open(annotation: Any, source: str | Path, state: LoadState) -> Node:
     if not isinstance(source, str | Path):
         raise TypeError(f"a configuration is given by its name, or by the path of its file; {source!r} was given")
     place = Place(str(source) or "(no name)")
+    if annotation is RigConfig:
+        try:
+            rig_model()
+        except DriversMissing as missing:
+            raise ConfigError([Problem(place, "", str(missing))]) from None
     kind = kind_of(models(annotation))
     try:
         path = Path(source)

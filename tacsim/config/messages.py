@@ -11,6 +11,7 @@ from pydantic_core import ErrorDetails
 from tacsim.config.annotation import allowed, child, keys, members, models, split, tag_of, variant
 from tacsim.config.document import LoadState, Node
 from tacsim.config.errors import did_you_mean, join
+from tacsim.models.driver import refused_driver
 from tacsim.models.text import printable
 
 
@@ -133,5 +134,7 @@ def _wrong_variant(location: Location) -> str:
     said = location.node.items.get(name)
     if said is None:
         return f"'{name}' is missing; allowed: {name}: {' | '.join(options)}"
+    if name == "driver" and (why := refused_driver(location.key.partition(".")[0], said.text)) is not None:
+        return f"driver {said.describe()} is refused: {why}; allowed: {' | '.join(options)}"
     hint = did_you_mean(said.text, options)
     return f"{name} {said.describe()} is unknown; allowed: {' | '.join(options)}{hint}"

@@ -4,22 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 
 import numpy as np
 
-from tacsim.interface import SensorSpec, TactileObservation
+from tacsim.interface import GelReading, SensorSpec, TactileObservation
 from tacsim.limits import LimitExceeded, exceeds
 from tacsim.models.hardware import ArmLimits
-
-
-@dataclass(frozen=True, slots=True)
-class GelReading:
-    """The state of the gels, as reported to an arm."""
-
-    exposed: float  # when the oldest picture of the rig was exposed, on its clock [s]
-    depth: float = math.nan  # of the arm's own gels, the deepest; NaN: not measured [m]
-    shear: float = math.nan  # of their surfaces, the largest; NaN: not measured [m]
 
 
 def depth_and_shear(tactile: TactileObservation) -> tuple[float, float]:

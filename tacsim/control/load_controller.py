@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from tacsim import pose as se3
 from tacsim.interface import Action, ArmState, FloatArray, Pose
 from tacsim.limits import LimitExceeded
-from tacsim.models.rig import RepositionConfig, TaskConfig
+from tacsim.models.rig import TaskConfig
 
 TOLERANCE = 0.01  # of the load: an error within it is left alone, so an arm at its load rests
 PROBE = 0.1  # of the longest correction: the length of one while no stiffness is known
@@ -104,4 +104,4 @@ class LoadController:
 
 def load_controller(task: TaskConfig | None) -> LoadController | None:
     """The controller of the loads of a rig's task; None if it asks for none."""
-    return LoadController(task.loads, task.max_step) if isinstance(task, RepositionConfig) and task.loads else None
+    return None if task is None or not task.held_loads else LoadController(task.held_loads, task.max_step)

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from tacsim import pose as se3
 from tacsim.gym.features import FeatureEncoder
 from tacsim.interface import ArmState, IncompatibleRig, Needs, Observation, Pose, TactileObservation
-from tacsim.models.rig import RigConfig, SimSensorConfig
+from tacsim.models.rig import RigConfig
 from tacsim.tasks import make_task
 
 Flat = dict[str, NDArray[Any]]
@@ -105,8 +105,8 @@ def space_of_rig(config: RigConfig) -> spaces.Space[Flat]:
     cells, pixels = (grid.rows, grid.columns), (grid.rows * grid.image_scale, grid.columns * grid.image_scale, 3)
     height, contact = np.zeros(cells, np.float32), np.zeros(cells, np.bool_)
     for name, sensor in config.sensors.items():
-        assert isinstance(sensor, SimSensorConfig)
-        dots = sensor.model.markers
+        assert sensor.sensor_model is not None
+        dots = sensor.sensor_model.markers
         touches[name] = TactileObservation(
             np.zeros(pixels, np.uint8), gradient=np.zeros((*cells, 2), np.float32), height=height, contact=contact,
             valid=contact, flow=None if dots is None else np.zeros((dots.rows, dots.columns, 2), np.float32),
@@ -142,7 +142,8 @@ def space_of_features(encoder: FeatureEncoder, config: RigConfig) -> spaces.Spac
 def _lattice(name: str, config: RigConfig) -> tuple[int, int]:
     """Rows and columns of a sensor's markers. Raises IncompatibleRig without such a sensor or markers."""
     sensor = config.sensors.get(name)
-    markers = sensor.model.markers if isinstance(sensor, SimSensorConfig) else None
+    model = None if sensor is None else sensor.sensor_model
+    markers = None if model is None else model.markers
     if markers is None:
         raise IncompatibleRig(f"the features ask for tactile flow, and sensor '{name}' of this rig has no markers")
     return markers.rows, markers.columns

@@ -1,10 +1,12 @@
-"""Configuration of hardware, real or mock: UR arms, their limits, cameras, the reset. Drivers are in `robot`."""
+"""Configuration of arms and sensors: what all have, limits, UR arms, cameras, the reset. Drivers: models/driver.py."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Callable, Mapping, Sequence
 from operator import attrgetter
-from typing import Annotated, Literal, Self
+from pathlib import Path
+from typing import Annotated, ClassVar, Literal, Self, TypeVar
 
 import numpy as np
 from pydantic import BeforeValidator, Field, field_validator, model_validator
@@ -113,6 +115,79 @@ class ArmLimits(Config):
         return region(self.workspace.lower, self.workspace.upper, [(each.point, each.normal) for each in self.planes])
 
 
+class SensorConfig(Config):
+    """What a rig file says of one sensor. That of a driver derives from it, says its `driver: Literal["..."]`, and adds
+    what it is about (docs/architecture.md, "To add a driver")."""
+
+    is_simulated: ClassVar[bool] = False  # its frames come from the simulation of the rig's scene
+    driver: str
+    arm: Name | None = None  # that carries it
+
+    @property
+    def sensor_model(self) -> SensorModel | None:
+        """The model of what its picture shows, where the file gives one."""
+        return None
+
+    @property
+    def bundle(self) -> str | None:
+        """The path of its calibration, where the file gives one."""
+        return None
+
+    @property
+    def is_mock(self) -> bool:
+        """A mock of it is started with the rig."""
+        return False
+
+    @property
+    def may_find_height(self) -> bool:
+        """False where the file rules out that it delivers the height of its gel."""
+        return True
+
+    def rendered_model(self, load: Callable[[Path], SensorModel]) -> SensorModel | None:
+        """What is rendered of it, where it is simulated or its camera is a mock. `load` reads a bundle's model."""
+        return None
+
+    def without_gel_size(self) -> Self:
+        """The same, where the rig's scene says how large the gel is and not its model."""
+        return self
+
+
+class ArmConfig(Config):
+    """What a rig file says of one arm; see SensorConfig. An arm of hardware has `limits: ArmLimits`, and may have a
+    `start: Placement`."""
+
+    records_packages: ClassVar[bool] = False  # its driver can record every package of its controller
+    driver: str
+
+    @property
+    def is_real(self) -> bool:
+        """A command of ours moves a machine, so a person must have said yes. A maker's simulator counts."""
+        return True
+
+    @property
+    def stop_limits(self) -> ArmLimits | None:
+        """Its limits, where it has some."""
+        return getattr(self, "limits", None)
+
+    @property
+    def start_pose(self) -> Pose | None:
+        """world_from_sensor where an episode begins, where the file says it."""
+        start: Placement | None = getattr(self, "start", None)
+        return None if start is None else start.pose
+
+    def weakened_limits(self, before: ArmConfig) -> list[str]:
+        """The limits that are weaker than in `before`, as "key: from -> to"."""
+        return _weakened(before, self, LIMIT_KEYS)
+
+
+Part = TypeVar("Part")
+
+
+def parts_of(parts: Mapping[str, object], config_class: type[Part]) -> dict[str, Part]:
+    """The arms or sensors of a rig whose configuration is of this class, by name."""
+    return {name: part for name, part in parts.items() if isinstance(part, config_class)}
+
+
 class Payload(Config):
     """The mass on the flange, for the controller's gravity compensation."""
 
@@ -140,9 +215,10 @@ class MockArmConfig(Config):
         return version
 
 
-class UrArmConfig(Config):
+class UrArmConfig(ArmConfig):
     """A Universal Robots arm through RTDE. With `mock` the same driver talks to a mock controller on loopback."""
 
+    records_packages: ClassVar[bool] = True
     driver: Literal["ur"]
     host: Annotated[str, Field(min_length=1, max_length=253)]
     model: Model = "ur5e"
@@ -171,6 +247,17 @@ class UrArmConfig(Config):
     simulator: bool = False
     mock: MockArmConfig | None = None
 
+    @property
+    def is_real(self) -> bool:
+        return self.mock is None
+
+    def weakened_limits(self, before: ArmConfig) -> list[str]:
+        found = _weakened(before, self, (*LIMIT_KEYS, "link_timeout", "action_timeout", "observation_timeout"))
+        was = getattr(before, "watchdog", None)
+        if was is not None and self.watchdog < was:
+            found.append(f"watchdog: {was:g} -> {self.watchdog:g}")
+        return found
+
     @model_validator(mode="after")
     def _simulator_or_mock(self) -> Self:
         if self.simulator and self.mock is not None:
@@ -195,13 +282,12 @@ class MockCameraConfig(Config):
     delay: Annotated[int, Field(ge=0, le=1)] = 0  # 1: its pictures are those of one motion of the cell ago
 
 
-class CameraSensorConfig(Config):
+class CameraSensorConfig(SensorConfig):
     """A tactile sensor seen by a camera: UVC, MJPEG over HTTP, a video or a folder of images as a stand-in."""
 
     driver: Literal["camera"]
     # http://... (MJPEG), a device by its serial path (/dev/v4l/by-id/...), a video file, or a folder of images.
     source: Annotated[str, Field(min_length=1, max_length=4096)]
-    arm: Name | None = None
     # What the picture shows, one of four: `model` (its geometry; of a mock also what is rendered), gel `corners`,
     # `calibration` (path of a bundle that `tacsim calibrate sensor` wrote; only it gives a real sensor's height), or
     # `marker_pitch` (distance of the dots printed on the gel: the first reference shows them; flow, but no height).
@@ -222,6 +308,27 @@ class CameraSensorConfig(Config):
     max_age: Annotated[Time, Field(gt=0, le=60.0)] = 0.2  # an older frame is refused [s]
     latency: Annotated[Time, Field(ge=0, le=2.0)] = 0.0  # from exposure to arrival [s]
     mock: MockCameraConfig | None = None
+
+    @property
+    def sensor_model(self) -> SensorModel | None:
+        return self.model
+
+    @property
+    def bundle(self) -> str | None:
+        return self.calibration
+
+    @property
+    def is_mock(self) -> bool:
+        return self.mock is not None
+
+    @property
+    def may_find_height(self) -> bool:
+        return self.model is not None or self.calibration is not None
+
+    def rendered_model(self, load: Callable[[Path], SensorModel]) -> SensorModel | None:
+        if self.mock is None:
+            return None
+        return self.model if self.model is not None else load(Path(self.calibration or ""))
 
     @model_validator(mode="after")
     def _one_geometry(self) -> Self:
@@ -259,23 +366,29 @@ class ResetConfig(Config):
     touch_signal: Annotated[float, Field(gt=0)] | None = None  # contact signal that counts as touch; None: by force
 
 
-def weakened_limits(before: UrArmConfig, after: UrArmConfig) -> list[str]:
-    """The limits that `after` weakens, compared with `before`, as "key: from -> to"."""
+LIMIT_KEYS = (
+    *(f"limits.{key}" for key in ("speed", "turn_rate", "acceleration", "turn_acceleration", "joint_speed")),
+    *("limits.force", "limits.torque", "limits.max_following_error", "limits.max_following_turn"),
+    *("limits.depth", "limits.shear"),
+)
+
+
+def _weakened(before: ArmConfig, after: ArmConfig, keys: Sequence[str]) -> list[str]:
+    """Which of the limits `keys` of `after` are weaker than those of `before`, as "key: from -> to"."""
+    if type(before) is not type(after):
+        return [f"driver: {before.driver} -> {after.driver}"]
+    old_limits, new_limits = before.stop_limits, after.stop_limits
+    if old_limits is None or new_limits is None:
+        return []
     found = []
-    keys = [f"limits.{key}" for key in ("speed", "turn_rate", "acceleration", "turn_acceleration", "joint_speed")]
-    keys += ["limits.force", "limits.torque", "limits.max_following_error", "limits.max_following_turn"]
-    keys += ["limits.depth", "limits.shear"]
-    keys += ["link_timeout", "action_timeout", "observation_timeout"]
     for key in keys:
         old, new = (attrgetter(key)(config) for config in (before, after))
         if old is not None and (new is None or new > old):
             key = key.replace("max_following", "following")  # what holds, whether the file names it or not
             found.append(f"{key}: {old:g} -> {'not watched' if new is None else f'{new:g}'}")
-    was, now = before.limits.workspace, after.limits.workspace
+    was, now = old_limits.workspace, new_limits.workspace
     if (np.array(now.lower) < was.lower).any() or (np.array(now.upper) > was.upper).any():
         found.append("limits.workspace: reaches farther")
-    if not set(before.limits.planes) <= set(after.limits.planes):
+    if not set(old_limits.planes) <= set(new_limits.planes):
         found.append("limits.planes: one is gone")
-    if after.watchdog < before.watchdog:
-        found.append(f"watchdog: {before.watchdog:g} -> {after.watchdog:g}")
     return found

@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, Self, Union, get_args
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal, Self, Union, get_args
 
-from pydantic import Field, model_validator
-from pydantic_core import PydanticCustomError
+from pydantic import ConfigDict, Field, GetCoreSchemaHandler, model_validator
+from pydantic_core import CoreSchema, PydanticCustomError
 
+from tacsim.models.driver import installed_drivers
 from tacsim.models.geometry import PictureRegion
-from tacsim.models.hardware import (
-    ArmLimits,
-    CameraSensorConfig,
-    KeepOut,
-    Name,
-    Placement,
-    ResetConfig,
-    UrArmConfig,
-)
+from tacsim.models.hardware import ArmConfig, ArmLimits, KeepOut, Name, Placement, ResetConfig, SensorConfig
 from tacsim.models.quantity import Config, Force, Length, Speed, Time
 from tacsim.models.scene import Scene
 from tacsim.models.sensor import CanonicalGrid, SensorModel
@@ -34,7 +29,7 @@ class WrenchNoise(Config):
     seed: Annotated[int, Field(ge=0)] = 0
 
 
-class SimArmConfig(Config):
+class SimArmConfig(ArmConfig):
     """A simulated arm: reaches every commanded pose exactly, within the motion that one control period allows."""
 
     driver: Literal["sim"]
@@ -48,8 +43,12 @@ class SimArmConfig(Config):
     noise: WrenchNoise = WrenchNoise()
     delay: Delay = 0  # its states are those of so many control periods ago
 
+    @property
+    def is_real(self) -> bool:
+        return False
 
-class ReplayArmConfig(Config):
+
+class ReplayArmConfig(ArmConfig):
     """Arm states of a recording: an episode (.mcap), or a CSV file with a row a frame."""
 
     driver: Literal["replay"]
@@ -57,20 +56,34 @@ class ReplayArmConfig(Config):
     force_column: str = "force_N"  # normal force, positive when pressed [N]
     width_column: str | None = "gripper_width_m"  # opening of a parallel gripper [m]
 
+    @property
+    def is_real(self) -> bool:
+        return False
 
-class SimSensorConfig(Config):
+
+class SimSensorConfig(SensorConfig):
+    is_simulated: ClassVar[bool] = True
     driver: Literal["sim"]
     arm: Name
     model: SensorModel = SensorModel()
     delay: Delay = 0  # its pictures are those of so many control periods ago
 
+    @property
+    def sensor_model(self) -> SensorModel:
+        return self.model
 
-class ReplaySensorConfig(Config):
+    def rendered_model(self, load: Callable[[Path], SensorModel]) -> SensorModel:
+        return self.model
+
+    def without_gel_size(self) -> Self:
+        return self.model_copy(update={"model": self.model.model_copy(update={"gel_size": None})})
+
+
+class ReplaySensorConfig(SensorConfig):
     """Recorded frames: an episode (.mcap), a folder of images, or a video."""
 
     driver: Literal["replay"]
     source: str | None = None
-    arm: Name | None = None
     fps: Annotated[float, Field(gt=0, le=1000)] = 30.0  # of a folder of images
     # Gel corners in the image (u, v) [px]: top left, top right, bottom right, bottom left; None: the whole image.
     corners: tuple[tuple[float, float], tuple[float, float], tuple[float, float], tuple[float, float]] | None = None
@@ -82,6 +95,10 @@ class ReplaySensorConfig(Config):
     # say how large the picture is, and are followed. Flow, but no height.
     marker_pitch: Annotated[Length, Field(gt=0)] | None = None
 
+    @property
+    def bundle(self) -> str | None:
+        return self.calibration
+
     @model_validator(mode="after")
     def _one_geometry(self) -> Self:
         if sum(each is not None for each in (self.corners, self.calibration, self.marker_pitch)) > 1:
@@ -89,10 +106,6 @@ class ReplaySensorConfig(Config):
         if self.region is not None and self.calibration is not None:
             raise ValueError("a calibration brings its own region: give it to `tacsim calibrate sensor --region`")
         return self
-
-
-ArmConfig = Annotated[SimArmConfig | UrArmConfig | ReplayArmConfig, Field(discriminator="driver")]
-SensorConfig = Annotated[SimSensorConfig | CameraSensorConfig | ReplaySensorConfig, Field(discriminator="driver")]
 
 
 class TaskConfig(Config):
@@ -110,6 +123,11 @@ class TaskConfig(Config):
         None  # of a normal force: an environment's episode fails beyond it (arms have limits of their own)
     )
     steps: Annotated[int, Field(ge=1, le=1_000_000)] = 40  # length of an episode
+
+    @property
+    def held_loads(self) -> Mapping[str, float]:
+        """Normal forces that arms hold while they move, by arm [N]."""
+        return {}
 
     @model_validator(mode="after")
     def _touch_is_no_failure(self) -> Self:
@@ -136,6 +154,10 @@ class RepositionConfig(TaskConfig):
     # height. [N]
     loads: dict[Name, Annotated[Force, Field(gt=0)]] = {}
     touch_force: Annotated[Force, Field(gt=0)] = 1.0  # at less, the upper gel slides
+
+    @property
+    def held_loads(self) -> Mapping[str, float]:
+        return self.loads
 
 
 class KneadConfig(TaskConfig):
@@ -170,7 +192,10 @@ class RecordConfig(Config):
 
 
 class RigConfig(Config):
-    """One rig file."""
+    """One rig file. Its arms and sensors are of the installed drivers, which are looked up when the first rig is read
+    or made (tacsim.models.driver)."""
+
+    model_config = ConfigDict(defer_build=True)
 
     name: str
     clock: Literal["sim", "wall", "replay"]
@@ -190,6 +215,10 @@ class RigConfig(Config):
     start: ResetConfig = ResetConfig()  # reset of rigs of hardware, real or mock
     record: RecordConfig = RecordConfig()
 
+    @classmethod
+    def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return handler(rig_model())
+
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         for name, sensor in self.sensors.items():
@@ -198,7 +227,7 @@ class RigConfig(Config):
         for index, apart in enumerate(self.keep_out):
             for name in apart.arms:
                 self._require_arm(name, "keep_out", index, "arms")
-        if self.record.arm_packages and not any(isinstance(arm, UrArmConfig) for arm in self.arms.values()):
+        if self.record.arm_packages and not any(arm.records_packages for arm in self.arms.values()):
             raise PydanticCustomError(
                 "no_packages",
                 "this rig has no UR arm, whose packages could be recorded; leave it out",
@@ -209,7 +238,7 @@ class RigConfig(Config):
                 "no_body", "only a simulated rig with a body knows its body; leave it out", {"at": ("record", "body")}
             )
         for name, arm in self.arms.items():
-            limits = None if isinstance(arm, ReplayArmConfig) else arm.limits
+            limits = arm.stop_limits
             if self.task is not None and limits is not None and not self.task.touch_force < limits.force:
                 raise PydanticCustomError(
                     "touch_beyond_limit",
@@ -221,9 +250,8 @@ class RigConfig(Config):
                         "at": ("arms", name, arm.driver, "limits", "force"),
                     },
                 )
-        if isinstance(self.task, RepositionConfig):
-            for name, load in self.task.loads.items():
-                self._check_load(name, load)
+        for name, load in ({} if self.task is None else self.task.held_loads).items():
+            self._check_load(name, load)
         return self
 
     def _require_arm(self, arm: str, *at: str | int) -> None:
@@ -234,10 +262,11 @@ class RigConfig(Config):
 
     def _check_load(self, name: str, load: float) -> None:
         """The arm that holds a load of the task must exist, and must not stop at that force."""
-        at = ("task", "reposition", "loads", name)
+        assert self.task is not None
+        at = ("task", self.task.kind, "loads", name)
         self._require_arm(name, *at)
         arm = self.arms[name]
-        limits = None if isinstance(arm, ReplayArmConfig) else arm.limits
+        limits = arm.stop_limits
         if limits is not None and not load < limits.force:
             raise PydanticCustomError(
                 "load_beyond_limit",
@@ -273,6 +302,18 @@ def rigs_of_known_tasks() -> None:
     """RigConfig takes the tasks that TASKS lists."""
     RigConfig.model_fields["task"].annotation = any_task() | None
     RigConfig.model_rebuild(force=True)
+
+
+def rig_model() -> type[RigConfig]:
+    """RigConfig, whose annotations name the configurations of all installed drivers. Raises DriversMissing."""
+    for kind, configs in ((kind, _config_classes(kind)) for kind in ("arm", "sensor")):
+        part: Any = Annotated[Union[tuple(configs)], Field(discriminator="driver")]  # noqa: UP007  # of as many as there are
+        RigConfig.model_fields[f"{kind}s"].annotation = dict[Name, part]
+    return RigConfig
+
+
+def _config_classes(kind: str) -> list[type[Config]]:
+    return [driver.config_class for driver in installed_drivers().usable[kind].values()]
 
 
 def _path(config: type[TaskConfig]) -> str:

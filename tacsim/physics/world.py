@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
 import numpy as np
@@ -75,11 +75,19 @@ class World(Protocol):
 
 
 def make_world(scene: Scene) -> World:
-    """The world of a scene: `seed` (one shared MPM grid), a rigid press, or two gels round a body."""
-    if scene.physics == "seed":
-        from tacsim.physics.seed.world import SeedWorld
+    """The world of a scene, by the scheme that its `physics` names."""
+    return SCHEMES[scene.physics](scene)
 
-        return SeedWorld(scene)
+
+def _seed_world(scene: Scene) -> World:
+    """One shared MPM grid."""
+    from tacsim.physics.seed.world import SeedWorld
+
+    return SeedWorld(scene)
+
+
+def _hybrid_world(scene: Scene) -> World:
+    """Elastic gels of finite elements: one that an indenter presses, or two round a body."""
     if scene.indenter is not None:
         from tacsim.physics.worlds.press import PressWorld
 
@@ -87,3 +95,6 @@ def make_world(scene: Scene) -> World:
     from tacsim.physics.worlds.hybrid import HybridWorld
 
     return HybridWorld(scene)
+
+
+SCHEMES: dict[str, Callable[[Scene], World]] = {"seed": _seed_world, "hybrid": _hybrid_world}  # by Scene.physics

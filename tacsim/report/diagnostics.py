@@ -9,21 +9,21 @@ from typing import Any
 import numpy as np
 
 from tacsim.interface import FloatArray
-from tacsim.report.series import (
+from tacsim.report.series import Series
+from tacsim.step_info import (
     ALIGNMENT,
-    BACKGROUND,
-    BEYOND,
-    DRIFT,
-    KEPT,
-    LIMITS,
-    LOST,
+    BACKGROUND_SLOPE,
+    COLOUR_DRIFT,
+    COLOURS_OUT_OF_RANGE,
+    LIMITS_HIT,
+    MARKERS_SEEN,
+    PACKAGES_LOST,
     PICTURES_DAMAGED,
     PICTURES_LOST,
     PICTURES_REPEATED,
-    STALE,
-    TRAINING,
+    STALE_REFERENCE,
+    TRAINING_DISTANCE,
     TRAINING_KNOWN,
-    Series,
 )
 
 PICTURES = {"lost": PICTURES_LOST, "damaged": PICTURES_DAMAGED, "shown again": PICTURES_REPEATED}
@@ -49,8 +49,8 @@ def timing(series: Series) -> dict[str, Any] | None:
         "asked_period": done.meta.spec.period,
         "age": {name: _spread(done.time - exposed) for name, exposed in done.exposed.items()},
         "alignment": {name: _spread(values) for name, values in arms.items()},
-        "limits_hit": {name: _newest(done.info.get(LIMITS + name)) for name in arms},
-        "packages_lost": {name: int(np.nansum(values)) for name, values in done.named(LOST).items()},
+        "limits_hit": {name: _newest(done.info.get(LIMITS_HIT + name)) for name in arms},
+        "packages_lost": {name: int(np.nansum(values)) for name, values in done.named(PACKAGES_LOST).items()},
         "pictures": {
             word: {name: _newest(values) for name, values in done.named(key).items()} for word, key in PICTURES.items()
         },
@@ -99,7 +99,7 @@ def timing_rows(stats: dict[str, Any]) -> list[tuple[str, str]]:
 def training_range(series: Series) -> dict[str, Any] | None:
     """Whether what a learned policy observed lies in the range of its training: `known`, `largest` distance over the
     limit, and the number of `steps_outside`. None for a policy that is not learned."""
-    distance = series.info.get(TRAINING, np.array([]))
+    distance = series.info.get(TRAINING_DISTANCE, np.array([]))
     distance = distance[np.isfinite(distance)]
     if len(distance):
         outside = int(np.count_nonzero(distance > 1.0))
@@ -125,7 +125,7 @@ def trust(series: Series) -> dict[str, dict[str, Any]] | None:
 
     None for an episode whose sensors know their surface by themselves.
     """
-    stale = series.named(STALE)
+    stale = series.named(STALE_REFERENCE)
     if not stale:
         return None
 
@@ -138,10 +138,10 @@ def trust(series: Series) -> dict[str, dict[str, Any]] | None:
         name: {
             "stale": int(np.count_nonzero(np.nan_to_num(told))),
             "steps": int(np.count_nonzero(~np.isnan(told))),
-            "drift": worst(DRIFT + name, np.max),
-            "background": worst(BACKGROUND + name, np.max),
-            "beyond": worst(BEYOND + name, np.max),
-            "kept": worst(KEPT + name, np.min),
+            "drift": worst(COLOUR_DRIFT + name, np.max),
+            "background": worst(BACKGROUND_SLOPE + name, np.max),
+            "beyond": worst(COLOURS_OUT_OF_RANGE + name, np.max),
+            "kept": worst(MARKERS_SEEN + name, np.min),
         }
         for name, told in stale.items()
     }

@@ -14,7 +14,8 @@ import numpy as np
 from tacsim.interface import FloatArray, SurfaceMap, TactileFrame, TactileObservation
 from tacsim.record.episode import Episode
 from tacsim.report.diagnostics import timing, timing_rows, training_range, training_rows, trust, trust_rows
-from tacsim.report.series import SETTLED, Series
+from tacsim.report.series import Series
+from tacsim.step_info import SETTLED
 
 if TYPE_CHECKING:
     from rich.table import Table

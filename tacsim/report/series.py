@@ -11,42 +11,19 @@ from numpy.typing import NDArray
 
 from tacsim.interface import FloatArray
 from tacsim.record.episode import Episode, EpisodeMeta
-
-# Keys of Step.info, before an arm's name
-ALIGNMENT = "alignment_"  # time from its state to the nearest package [s]
-LIMITS = "limits_hit_"  # targets that were shortened or refused so far
-LOST = "packages_lost_"  # packages of its controller that are missing in this step
-# Keys of Step.info, before a sensor's name
-PICTURES_LOST = "pictures_lost_"  # frames of its camera that never arrived, so far
-PICTURES_DAMAGED = "pictures_damaged_"  # frames that could not be read, so far
-PICTURES_REPEATED = "pictures_repeated_"  # frames that showed the picture of the one before again, so far
-SIGNAL = "contact_signal_"
-STALE = "stale_"  # 1: the reference does not fit any more
-DRIFT = "drift_"  # change of the untouched gel's colour since the reference [-]
-BACKGROUND = "background_"  # mean slope that a drift of the light would look like [degrees]
-BEYOND = "beyond_"  # share of the picture whose colours lie beyond the calibrated slopes
-KEPT = "kept_"  # share of the markers that were seen
-DEEPEST = "deepest_"  # of the height of its gel [m]
-STEEPEST = "steepest_"  # slope of its gel [-]
-LONGEST = "flow_"  # of its markers' displacements [m]
-SETTLED = "settled"
-TRAINING = "training_distance"  # of what the policy observed from its training's range, over the limit
-TRAINING_KNOWN = "training_range_known"  # 0: a learned policy that does not say what it observed in training
-FELT = "felt_distance"  # from the goal, by touch alone [m]
-_OF_ARMS = (ALIGNMENT, LIMITS, LOST)
-_SURFACE = (DEEPEST, STEEPEST, LONGEST)
-_OF_SENSORS = (
-    SIGNAL,
-    *_SURFACE,
-    STALE,
-    DRIFT,
-    BACKGROUND,
-    BEYOND,
-    KEPT,
-    PICTURES_LOST,
-    PICTURES_DAMAGED,
-    PICTURES_REPEATED,
+from tacsim.step_info import (
+    ARM_KEYS,
+    CONTACT_SIGNAL,
+    MAX_DEPTH,
+    MAX_FLOW,
+    MAX_SLOPE,
+    SENSOR_KEYS,
+    SETTLED,
+    TACTILE_DISTANCE,
+    TRAINING_DISTANCE,
+    TRAINING_KNOWN,
 )
+
 LARGEST = 1e15  # what a recording says beyond that, infinite or not a number, counts as unknown
 _OWN = ("time", "seconds", "reward", "distance")
 
@@ -69,8 +46,14 @@ class Series:
     def of(cls, episode: Episode) -> Self:
         """The numbers that a report shows, of the arms and sensors that the episode's metadata name."""
         count, spec = len(episode.steps), episode.meta.spec
-        shown = {SETTLED, FELT, TRAINING, TRAINING_KNOWN, *(key + name for key in _OF_ARMS for name in spec.arms)}
-        shown |= {key + name for key in _OF_SENSORS for name in spec.sensors}
+        shown = {
+            SETTLED,
+            TACTILE_DISTANCE,
+            TRAINING_DISTANCE,
+            TRAINING_KNOWN,
+            *(key + name for key in ARM_KEYS for name in spec.arms),
+        }
+        shown |= {key + name for key in SENSOR_KEYS for name in spec.sensors}
         index = np.zeros(count, np.int64)
         own = {name: np.full(count, np.nan) for name in _OWN}
         force, exposed, info = (_Columns(count, names) for names in (spec.arms, spec.sensors, shown))
@@ -115,27 +98,27 @@ class Series:
     @property
     def felt(self) -> FloatArray:
         """The distance from the goal by touch alone [m]."""
-        return self.info.get(FELT, np.full(len(self), np.nan))
+        return self.info.get(TACTILE_DISTANCE, np.full(len(self), np.nan))
 
     @property
     def signals(self) -> dict[str, FloatArray]:
         """The contact signal of every sensor that has one."""
-        return self.named(SIGNAL)
+        return self.named(CONTACT_SIGNAL)
 
     @property
     def deepest(self) -> dict[str, FloatArray]:
         """The deepest point of every gel whose height is known [m]."""
-        return self.named(DEEPEST)
+        return self.named(MAX_DEPTH)
 
     @property
     def steepest(self) -> dict[str, FloatArray]:
         """The steepest slope of every gel whose height is known [-]."""
-        return self.named(STEEPEST)
+        return self.named(MAX_SLOPE)
 
     @property
     def flow(self) -> dict[str, FloatArray]:
         """The longest displacement of a marker, of every gel whose flow is known [m]."""
-        return self.named(LONGEST)
+        return self.named(MAX_FLOW)
 
     def named(self, prefix: str) -> dict[str, FloatArray]:
         """Columns of `info` whose keys begin so, by the rest of the key."""

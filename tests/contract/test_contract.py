@@ -136,8 +136,8 @@ def rig(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 
 
 @pytest.fixture
-def live(rig: Rig) -> bool:
-    return rig.name in LIVE
+def live(request: pytest.FixtureRequest, rig: Rig) -> bool:
+    return request.node.callspec.params["rig"] in LIVE
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,8 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import ExitStack
-from pathlib import Path
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -28,9 +27,9 @@ from robot.mock.ur.handle import MockArms
 from robot.mock.ur.machine.version import VERSION, Version, parse_version
 from tacsim import pose as se3
 from tacsim.config import load_sensor
-from tacsim.interface import FloatArray, Pose, Truth
-from tacsim.models.hardware import CameraSensorConfig, UrArmConfig
-from tacsim.models.rig import RigConfig, SimSensorConfig
+from tacsim.interface import FloatArray, Pose, SensorSpec, TactileFrame, Truth
+from tacsim.models.hardware import CameraSensorConfig, MockCameraConfig, UrArmConfig, parts_of
+from tacsim.models.rig import RigConfig
 from tacsim.models.sensor import SensorModel
 
 POSTURE = (0.0, -1.5, 1.5, -1.5, -1.5, 0.0)  # seed of the joints at power-on: elbow up [rad]
@@ -49,9 +48,8 @@ class MockCell(Closing):
     def __init__(self, config: RigConfig) -> None:
         """Raises DeviceError (MockError, SimServerError) when a mock cannot be started."""
         self._config = config
-        self._arms = {
-            name: arm for name, arm in config.arms.items() if isinstance(arm, UrArmConfig) and arm.mock is not None
-        }
+        self._arms = {name: arm for name, arm in parts_of(config.arms, UrArmConfig).items() if arm.mock is not None}
+        cameras = _mock_cameras(config)
         self._frames = {name: _true_frames(arm) for name, arm in self._arms.items()}
         self._sensor_on: dict[str, str] = {}  # by arm: the sensor on it
         for name, sensor in config.sensors.items():
@@ -60,11 +58,7 @@ class MockCell(Closing):
         self.faults: dict[str, FaultClient] = {}
         self.cameras: dict[str, MockCamera] = {}
         self._sim_server: SimServer | None = None
-        self._delays = {
-            name: sensor.mock.delay
-            for name, sensor in config.sensors.items()
-            if isinstance(sensor, CameraSensorConfig) and sensor.mock is not None
-        }
+        self._delays = {name: mock.delay for name, (_, mock) in cameras.items()}
         self._scene_frame: SceneFrame | None = None
         self._pushed: dict[str, tuple[NDArray[np.uint8], int]] = {}  # by camera: its picture, and the number of that
         self._late: dict[str, deque[NDArray[np.uint8]]] = {}  # by camera: the last pictures, oldest first
@@ -79,9 +73,8 @@ class MockCell(Closing):
                 self._sim_server = stack.enter_context(
                     SimServer(config.scene, models, config.canonical, config.contact)
                 )
-            for name, sensor in config.sensors.items():
-                if isinstance(sensor, CameraSensorConfig) and sensor.mock is not None:
-                    self.cameras[name] = stack.enter_context(_camera(name, sensor))
+            for name, (camera, mock) in cameras.items():
+                self.cameras[name] = stack.enter_context(_camera(name, camera, mock))
             self.start_poses = {name: self._start_pose(name, arm) for name, arm in self._arms.items()}
             if self._arms:
                 controllers = MockArms(
@@ -127,13 +120,15 @@ class MockCell(Closing):
     # -------------------------------------------------------------- the scene
 
     @property
-    def simulated(self) -> bool:
+    def is_simulated(self) -> bool:
         return self._sim_server is not None
 
     @property
-    def knows_truth(self) -> bool:
-        """True if there is a simulated body."""
-        return self.will_know_truth(self._config)
+    def picture_sources(self) -> Collection[str]:
+        return self.cameras.keys()
+
+    def sensor(self, name: str, spec: SensorSpec) -> CellSensor:
+        return CellSensor(self, name, spec)
 
     @staticmethod
     def will_know_truth(config: RigConfig) -> bool:
@@ -253,14 +248,13 @@ def _true_frames(arm: UrArmConfig) -> ArmFrames:
 
 def _models(config: RigConfig) -> dict[str, SensorModel]:
     """Of the sensors that are simulated: before a mock camera, or read without one."""
-    found: dict[str, SensorModel] = {}
-    for name, sensor in config.sensors.items():
-        if isinstance(sensor, SimSensorConfig):
-            found[name] = sensor.model
-        elif isinstance(sensor, CameraSensorConfig) and sensor.mock is not None:
-            # the loader refuses a mock camera with neither
-            found[name] = sensor.model or load_sensor(Path(sensor.calibration or ""))
-    return found
+    models = {name: sensor.rendered_model(load_sensor) for name, sensor in config.sensors.items()}
+    return {name: model for name, model in models.items() if model is not None}
+
+
+def _mock_cameras(config: RigConfig) -> dict[str, tuple[CameraSensorConfig, MockCameraConfig]]:
+    cameras = parts_of(config.sensors, CameraSensorConfig)
+    return {name: (camera, camera.mock) for name, camera in cameras.items() if camera.mock is not None}
 
 
 def _version(arm: UrArmConfig) -> Version:
@@ -268,13 +262,32 @@ def _version(arm: UrArmConfig) -> Version:
     return VERSION if text is None else parse_version(text)
 
 
-def _camera(name: str, config: CameraSensorConfig) -> MockCamera:
-    assert config.mock is not None
+def _camera(name: str, config: CameraSensorConfig, mock: MockCameraConfig) -> MockCamera:
     url = urlsplit(config.source)
     if url.scheme != "http" or url.hostname is None or url.port is None:
         raise DeviceError(
             f"sensors.{name}.source: a mock camera needs an address on loopback such as "
             f"http://127.0.0.2:8081/?action=stream, got {config.source}"
         )
-    rate, quality = config.mock.fps, config.mock.quality
-    return MockCamera(url.hostname, url.port, config.width, config.height, rate, quality, stamped=config.stamped)
+    size = config.width, config.height
+    return MockCamera(url.hostname, url.port, *size, mock.fps, mock.quality, stamped=config.stamped)
+
+
+class CellSensor:
+    """A simulated sensor on a real or mock arm, without a camera: the mock cell's gel at the arm's measured pose."""
+
+    def __init__(self, cell: MockCell, name: str, spec: SensorSpec) -> None:
+        self._cell, self._name, self.spec = cell, name, spec
+
+    def read(self, timeout: float) -> TactileFrame:
+        """The picture of the newest simulated state. Raises TimeoutError when there is none within `timeout` [s]."""
+        deadline = time.monotonic() + timeout
+        while (frame := self._cell.scene_frame) is None:
+            if time.monotonic() > deadline:
+                raise TimeoutError(f"sensor '{self._name}': the mock cell has simulated nothing within {timeout:g} s")
+            time.sleep(1e-3)
+        name = self._name
+        return TactileFrame(frame.images[name], time=frame.time, index=frame.index, surface=frame.surfaces[name])
+
+    def close(self) -> None:
+        """The rig closes the cell."""

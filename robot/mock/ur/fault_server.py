@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from robot.mock.ur.machine.load import Mass, Wall
-from robot.mock.ur.machine.registry import LARGEST
+from robot.mock.ur.machine.program import LARGEST
 from robot.mock.ur.machine.version import check_version
 from robot.mock.ur.wire.connection import Connection
 from robot.mock.ur.wire.controller import PORTS, Controller, accept, lines, open_port

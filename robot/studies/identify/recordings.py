@@ -17,7 +17,8 @@ from robot.studies.identify.simulation import Seen, shape_signals
 from tacsim import pose as se3
 from tacsim.geometry.shapes import lowest_below
 from tacsim.interface import Action, EndOfEpisode, FloatArray, Observation, Pose
-from tacsim.models.rig import ReplayArmConfig, ReplaySensorConfig, RigConfig, SimSensorConfig
+from tacsim.models.hardware import UrArmConfig, parts_of
+from tacsim.models.rig import ReplayArmConfig, ReplaySensorConfig, RigConfig
 from tacsim.models.scene import Scene
 from tacsim.models.sensor import CanonicalGrid, Markers
 from tacsim.physics.worlds.press import CLEARANCE
@@ -129,7 +130,7 @@ class Recordings:
             canonical=CanonicalGrid() if original is None else original.canonical,
         )
         self.from_ur |= original is not None and any(
-            arm.driver == "ur" and arm.mock is None for arm in original.arms.values()
+            arm.is_real for arm in parts_of(original.arms, UrArmConfig).values()
         )
         roles = self._roles(path, list(carriers))
         with open_replay(config) as rig:
@@ -169,7 +170,7 @@ class Recordings:
         if touch.height is None:
             return
         config = None if original is None else original.sensors.get(sensor)
-        model = getattr(config, "model", None) if isinstance(config, SimSensorConfig) else None
+        model = config.sensor_model if config is not None and config.is_simulated else None
         markers: Markers | None = None if model is None else model.markers
         self.seen[role] = Seen(grid, markers, touch.valid)
 

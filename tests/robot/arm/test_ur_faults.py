@@ -21,7 +21,7 @@ from robot.errors import (
 )
 from robot.mock import MockUR
 from tacsim import pose as se3
-from tacsim.control.gel_monitor import GelReading
+from tacsim.interface import GelReading
 from tests.promises import Record
 from tests.robot.arm.mocked import (
     HOST,
@@ -259,7 +259,7 @@ def test_an_emergency_stop_waits_for_a_person(arm: URArm, mock: MockUR) -> None:
 
 @pytest.mark.promise(7)
 def test_a_program_stopped_from_outside_is_told(arm: URArm, mock: MockUR) -> None:
-    from robot.arm.dashboard import Dashboard
+    from robot.arm.controller.dashboard import Dashboard
 
     in_motion(arm, moved(arm.state().pose, x=0.1))
     with Dashboard(HOST) as dashboard:

@@ -12,7 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from robot.rig import hardware_rig
+from robot.arm.ur import URArm
+from robot.camera.camera import Camera
+from robot.mock.cell.cell import MockCell
 from tests.docs.test_blocks import all_blocks
 from tests.robot.cli.invoked import tacsim
 from tests.robot.cli.lab import Lab, copy_of
@@ -63,8 +65,8 @@ def test_what_does_not_fit_is_refused_before_anything_is_opened(
     def opened(*_: object, **__: object) -> None:
         pytest.fail("something was opened")
 
-    for part in ("MockCell", "Camera", "URArm"):
-        monkeypatch.setattr(getattr(hardware_rig, part), "__init__", opened)
+    for part in (MockCell, Camera, URArm):
+        monkeypatch.setattr(part, "__init__", opened)
     (tmp_path / "mine.py").write_text(
         "from tacsim import Needs\nclass NeedsHeight:\n    needs = Needs(height=True)\n"
         "    def reset(self): ...\n    def __call__(self, observation): ...\n"

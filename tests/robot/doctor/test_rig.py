@@ -8,13 +8,15 @@ from pathlib import Path
 
 import pytest
 
-import robot.doctor.rig
-from robot.doctor.machine import Check
+import robot.arm.controller.examine
+import robot.camera.driver
+import robot.mock.cell.cell
 from robot.doctor.rig import examine_rig
 from robot.mock import FaultClient, MockCamera, MockUR
 from robot.mock.cell.cell import MockCell
 from robot.mock.fixtures import mock_host
 from tacsim.config import load_rig
+from tacsim.models.driver import Check
 from tacsim.models.rig import RigConfig
 from tests.robot.cli.invoked import tacsim
 
@@ -43,8 +45,9 @@ def camera() -> Iterator[MockCamera]:
 
 @pytest.fixture
 def file(camera: MockCamera, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setattr(robot.doctor.rig, "TIMEOUT", 1.0)
-    monkeypatch.setattr(robot.doctor.rig, "CAMERA_TIME", 0.3)
+    monkeypatch.setattr(robot.arm.controller.examine, "TIMEOUT", 1.0)
+    monkeypatch.setattr(robot.camera.driver, "CHECK_TIMEOUT", 2.0)
+    monkeypatch.setattr(robot.camera.driver, "CHECK_TIME", 0.3)
     path = tmp_path / "looked.yaml"
     path.write_text(RIG.replace("HOST", mock_host(71)).replace("SOURCE", camera.url))
     return path
@@ -71,7 +74,7 @@ def looked(
             commanded.extend(entry for faults in self.faults.values() for entry in faults.received().entries)
             super().close()
 
-    monkeypatch.setattr(robot.doctor.rig, "MockCell", Faulty)
+    monkeypatch.setattr(robot.mock.cell.cell, "MockCell", Faulty)
     checks = examine_rig(load_rig(file, overrides=overrides).config)
     assert commanded == []  # it only looks
     return {check.name: check for check in checks}

@@ -47,7 +47,7 @@ def test_the_rig_opens_with_overrides(mock_rig, tmp_path):
 
 
 def test_it_works_as_a_plugin_of_somebody_elses_tests(tmp_path: Path) -> None:
-    (tmp_path / "conftest.py").write_text('pytest_plugins = ["robot.mock.fixtures"]\n')
+    (tmp_path / "conftest.py").write_text('pytest_plugins = ["robot.fixtures"]\n')
     (tmp_path / "test_theirs.py").write_text(THEIRS)
     done = subprocess.run(
         [sys.executable, "-W", "error", "-m", "pytest", "-q", "-p", "no:cacheprovider", str(tmp_path)],

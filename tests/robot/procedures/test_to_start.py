@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from robot.arm.rtde import Reading
+from robot.arm.controller.rtde import Reading
 from robot.common.kinematics import Kinematics, pose
 from robot.common.tcp import ArmFrames
 from robot.procedures.to_start import PROGRESS, Guide, NoWay, Progress, Way, find_way, lead_to_start, require_clear

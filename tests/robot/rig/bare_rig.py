@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import robot.rig.hardware_rig
+import robot.mock.cell.cell
 from robot.deploy.control_loop import EpisodeFailed, run_episode
 from robot.mock.camera.camera import MockCamera
 from robot.mock.cell.cell import MockCell
@@ -130,7 +130,7 @@ def opened(
 
     with cameras_of(config) as cameras:
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(robot.rig.hardware_rig, "MockCell", Kept)
+            patch.setattr(robot.mock.cell.cell, "MockCell", Kept)
             made = open_rig(config, dry_run=dry_run)
         with made:
             yield Opened(made, cells[0], cameras)

@@ -10,13 +10,12 @@ import signal
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import robot.rig.reset
-from robot.arm.time_alignment import NotAligned
+from robot.arm.time_alignment import NotAligned, await_state_at
 from robot.camera.camera import StaleFrame
 from robot.errors import DeviceError, EmergencyStop, ProtectiveStop, SafetyViolation
 from robot.open import open_rig
@@ -93,19 +92,14 @@ def test_a_gap_between_packages_is_a_lost_link_only_beyond_its_time_out(link_tim
     states = [
         ArmState(Pose(np.array([x, 0.0, 0.0])), zero, zero, zero, now - ago) for x, ago in ((0.0, 0.3), (3e-3, 0.0))
     ]
-    stub = SimpleNamespace(
-        name="left",
-        config=SimpleNamespace(link_timeout=link_timeout),
-        state=lambda: states[-1],
-        history=lambda number: states,
-    )
-    arm = CommandedArm(stub)  # type: ignore[arg-type]
+    asked = (now - 0.1, lambda: states[-1], lambda number: states, "left", link_timeout)
     if lost:
         with pytest.raises(NotAligned, match="was the link lost"):
-            arm.state(now - 0.1)
+            await_state_at(*asked)
     else:
-        assert arm.state(now - 0.1).pose.position == pytest.approx([2e-3, 0, 0])
-        assert arm.alignment == pytest.approx(0.1)
+        state, gap = await_state_at(*asked)
+        assert state.pose.position == pytest.approx([2e-3, 0, 0])
+        assert gap == pytest.approx(0.1)
 
 
 def test_a_process_held_up_while_it_asks_still_finds_its_moment() -> None:
@@ -114,11 +108,12 @@ def test_a_process_held_up_while_it_asks_still_finds_its_moment() -> None:
     kept = [
         ArmState(Pose(np.array([ago, 0.0, 0.0])), zero, zero, zero, now - ago) for ago in np.arange(1.0, 0.0, -2e-3)
     ]
-    stub = SimpleNamespace(
-        name="left", config=SimpleNamespace(link_timeout=0.05), state=lambda: kept[-1],
-        history=lambda number=1023: kept[-max(1, number - 100) :] if number < 1023 else kept,
-    )  # fmt: skip
-    assert CommandedArm(stub).state(now - 0.5).pose.position[0] == pytest.approx(0.5)  # type: ignore[arg-type]
+
+    def history(number: int | None) -> list[ArmState]:
+        return kept if number is None else kept[-max(1, number - 100) :]
+
+    state, _ = await_state_at(now - 0.5, lambda: kept[-1], history, "left", 0.05)
+    assert state.pose.position[0] == pytest.approx(0.5)
 
 
 @pytest.mark.parametrize(

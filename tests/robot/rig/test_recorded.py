@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from robot.rig.hardware_rig import camera_normaliser
+from robot.rig.parts import sensor_of
 from robot.rig.recorded import observe_episode
 from tacsim.config import load_rig
 from tacsim.interface import RigSpec, SensorSpec, TactileFrame
@@ -32,7 +32,7 @@ def test_a_cameras_pictures_are_seen_by_its_own_model(tmp_path: Path) -> None:
     with Recorder(path, EpisodeMeta("mock", None, "p", 0, spec, {}, attachments)) as recorder:
         for frame in frames:
             recorder.write(Step(frame.index, frame.time, {"upper": frame}, {}))
-    own = camera_normaliser("upper", camera, loaded.config)
+    own = sensor_of(loaded.config, "upper").normaliser()
     own.take_reference(frames[0])
     for frame, (_, observation) in zip(frames, observe_episode(path).steps(), strict=True):
         wanted, found = own(frame, frame.time), observation.tactile["upper"]

@@ -34,7 +34,7 @@ class StubArm:
     def report_tactile(self, shown: object) -> None:
         self.told = shown
 
-    def state(self) -> ArmState:
+    def state(self, at: float | None = None) -> ArmState:
         return ArmState(self.pose, np.zeros(6), np.zeros(6), np.zeros(6), 0.0)
 
     def command(self, target: Pose | None, speed: float | None = None) -> Pose | None:

@@ -18,10 +18,10 @@ from robot.arm.channel import HISTORY
 from robot.arm.shared_ring import Record
 from robot.arm.trajectory import PERIOD
 from robot.camera.camera import StaleFrame
+from robot.camera.driver import CameraDriver
 from robot.open import open_rig
-from robot.rig import hardware_rig, touch
+from robot.rig import touch
 from robot.rig.commanded_arm import CommandedArm
-from tacsim.config.load import load_rig
 from tacsim.interface import TactileSource
 from tacsim.rig import Rig
 from tests.robot.cli.lab import Lab, copy_of
@@ -122,19 +122,16 @@ def test_a_speed_that_would_press_a_gel_too_deep_is_refused_in_words(tmp_path: P
         open_rig(file)
 
 
-def test_a_driver_that_does_not_state_its_latency_is_refused(tmp_path: Path) -> None:
-    """As one that was just added to the rig file's union: no check may pass it by."""
+@pytest.mark.parametrize("stated", [math.nan, math.inf, 0.0, -0.1])
+def test_a_latency_that_is_no_time_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stated: float) -> None:
+    """One that is not stated at all is refused when the rig file is read: tests/contract/test_outside_driver.py."""
     file = copy_of("ur5e", tmp_path, 67)
-    file.write_text(file.read_text().replace("depth: null", "depth: 1 mm"))
-    config = load_rig(file).config
-    name, camera = next(iter(config.sensors.items()))
-    assert camera.arm is not None
-    unknown = SimpleNamespace(driver="new", arm=camera.arm)
-    with pytest.raises(ValueError, match=f"sensors.{name} has the driver 'new', whose latency is not known.*State"):
-        hardware_rig._require_gentle_approach(config.model_copy(update={"sensors": {name: unknown}}))
-    arms = {**config.arms, camera.arm: SimpleNamespace(driver="new", limits=config.arms[camera.arm].limits)}
-    with pytest.raises(ValueError, match=f"arms.{camera.arm} has the driver 'new'.*neither its limits nor its stops"):
-        hardware_rig._require_gentle_approach(config.model_copy(update={"arms": arms}))
+    text = file.read_text().replace("depth: null", "depth: 1 mm").replace("model: null", "model: ideal")
+    text = text.replace("width: 640", "width: 320").replace("height: 480", "height: 240")
+    file.write_text(re.sub(r"corners: .*", "", text))
+    monkeypatch.setattr(CameraDriver, "worst_latency", lambda driver: stated)
+    with pytest.raises(ValueError, match=r"sensors\.lower: the driver 'camera' states a worst latency of"):
+        open_rig(file)
 
 
 def test_a_signal_that_is_no_number_is_not_hidden_by_the_other_sensor(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from tacsim.control.gel_monitor import GelMonitor, GelReading
-from tacsim.interface import SensorSpec, TactileObservation
+from tacsim.control.gel_monitor import GelMonitor
+from tacsim.interface import GelReading, SensorSpec, TactileObservation
 from tacsim.limits import LimitExceeded
 from tacsim.models.hardware import ArmLimits, Workspace
 

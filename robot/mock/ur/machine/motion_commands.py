@@ -9,7 +9,6 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from itertools import takewhile
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,11 +17,9 @@ from robot.mock.ur.machine import motion
 from robot.mock.ur.machine.arm import PERIOD, MotionSteps, ProgramError
 from robot.mock.ur.machine.force_mode import ForceMode
 from robot.mock.ur.machine.motion import Waypoint
-from robot.mock.ur.machine.registry import LARGEST, command
+from robot.mock.ur.machine.program import LARGEST, Program
+from robot.mock.ur.machine.registry import command
 from tacsim.interface import FloatArray
-
-if TYPE_CHECKING:
-    from robot.mock.ur.machine.script import Program
 
 CONTACT_FOUND = 254  # the script gives it itself
 CONTACT_FORCE, CONTACT_ONSET = 5.0, 1.0  # a contact is felt from the one, and began at the other [N]

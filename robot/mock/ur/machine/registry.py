@@ -4,16 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from robot.mock.ur.machine.arm import MotionSteps
+from robot.mock.ur.machine.program import Program
 
-if TYPE_CHECKING:
-    from robot.mock.ur.machine.script import Program
-
-Work = Callable[["Program"], MotionSteps | None]
-
-LARGEST = 1e6  # of a number in a command; what a controller takes is not known, and no arm needs more [SI]
+Work = Callable[[Program], MotionSteps | None]
 
 
 @dataclass(frozen=True)

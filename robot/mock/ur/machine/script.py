@@ -1,184 +1,55 @@
 """The register protocol: what ur_rtde's control script does when it runs on a controller.
 
 The text of that script is recognised, not interpreted: which registers it uses, which calls its `$version` lines left
-in it, and the path that was written into it. Its loop, its threads and its answers are done here and in
+in it, and the path that was written into it. Its loop, its threads and its answers are done here, in `program`, and in
 `motion_commands` and `state_commands`, by the numbers of ur_rtde 1.6.5.
 """
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable
-from functools import cache
-from typing import TYPE_CHECKING
-
-import numpy as np
-
-from robot.common.kinematics import matrix
 from robot.mock.ur.machine import motion_commands, state_commands, user_script  # noqa: F401  # they enter COMMANDS
-from robot.mock.ur.machine.arm import Arm, MotionSteps, ProgramError
-from robot.mock.ur.machine.registry import COMMANDS, LARGEST
-from tacsim.interface import FloatArray
+from robot.mock.ur.machine.arm import MotionSteps
+from robot.mock.ur.machine.program import CONTROL_SCRIPT, DONE, READY, Program
+from robot.mock.ur.machine.registry import COMMANDS
+from robot.mock.ur.machine.state import MachineState
 
-if TYPE_CHECKING:
-    from robot.mock.ur.machine.machine import Machine
-
-CONTROL_SCRIPT = "rtde_control"
-READY, DONE = 1, 2  # answers in output_int_register_0
 STOP_SCRIPT = 255  # the command that ends the script
-LAST_OFFSET = 24  # of the registers: ur_rtde uses the 24 of each kind that begin at 0, or at 24
-_ENDED = object()
 
 
-class Program:
-    """One running program. `step` is one control period."""
+def make_program(machine: MachineState, text: str) -> Program:
+    """The program of a text, ready for its first step. Raises ProgramError where it cannot be compiled."""
+    program = Program(machine, text)
+    program.main = _control_loop(program) if program.name == CONTROL_SCRIPT else user_script.run(program)
+    return program
 
-    def __init__(self, machine: Machine, text: str) -> None:
-        self.machine: Machine = machine
-        self.arm: Arm = machine.arm
-        self.text = _of_version(text, machine.version)
-        named = re.search(r"^[ \t]*(def|sec)[ \t]+(\w+)", self.text, re.M)
-        self.kind, self.name = named.groups() if named else ("", "?")
-        self.int_offset, self.float_offset = (self._offset(kind) for kind in ("int", "float"))
-        self.threads: dict[str, MotionSteps] = {}
-        self.calls: dict[str, Callable[[], MotionSteps]] = {}  # what a repeating thread does next
-        self.stops_linear = False  # whether stopJ and stopL are stopl: see motion_commands.stop
-        self.speeds_linear = True  # whether the last speed command was speedl
-        self.force_gain, self.force_damping = 0.5, 0.025  # the script begins with these
-        self.internal = 0  # a command that the script gives itself
-        self.contact_steps = 0
-        self.servo_target: tuple[tuple[float, ...], FloatArray] | None = None  # pose asked for, its joints
-        self._writes = self._operation = 0  # of the asynchronous word
-        self._main = self._loop() if self.name == CONTROL_SCRIPT else user_script.run(self)
 
-    def step(self) -> None:
-        """Main program, then its threads. Raises ProgramError where the program ends with an error."""
-        if not _go_on(self._main):
-            self.machine.stop("stopped by its client" if self.name == CONTROL_SCRIPT else "it has come to its end")
-            return
-        for name, thread in list(self.threads.items()):
-            if self.threads.get(name) is thread and not _go_on(thread):
-                self.threads.pop(name, None)
-
-    # -- registers ---------------------------------------------------------------------------------------------------
-
-    def double(self, index: int) -> float:
-        return float(self.doubles(index, 1)[0])
-
-    def doubles(self, first: int, count: int = 6) -> FloatArray:
-        """Numbers of a command (count,). Raises ProgramError for any that no arm could follow."""
-        begin = first + self.float_offset
-        values = np.array(self.machine.in_double[begin : begin + count])
-        if not float(np.abs(values).max()) <= LARGEST:
-            raise ProgramError(f"command with a number that is not finite, or beyond {LARGEST:g}: {values.tolist()}")
-        return values
-
-    def frame(self, first: int) -> FloatArray:
-        """The pose in six registers, as frame (4, 4)."""
-        return matrix(self.doubles(first))
-
-    def integer(self, index: int) -> int:
-        return self.machine.in_int[index + self.int_offset]
-
-    def answer(self, values: FloatArray) -> None:
-        begin = self.float_offset
-        self.machine.out_double[begin : begin + len(values)] = values.tolist()
-
-    def answer_integer(self, value: int, index: int = 1) -> None:
-        self.machine.out_int[index + self.int_offset] = value
-
-    def _offset(self, kind: str) -> int:
-        found = re.search(rf"reg_offset_{kind} = # {kind} register offset\s*(\d+)", self.text)
-        offset = found.group(1) if found else "0"
-        if len(offset) > 9 or int(offset) > LAST_OFFSET:
-            raise ProgramError(f"{kind} register offset {offset[:9]}: at most {LAST_OFFSET}")
-        return int(offset)
-
-    # -- threads -----------------------------------------------------------------------------------------------------
-
-    def run(self, name: str, work: MotionSteps, *, tracked: bool = False) -> None:
-        """Starts a thread. `tracked`: its progress is in the asynchronous word."""
-
-        def tracking() -> MotionSteps:
-            self.signal(0)
+def _control_loop(program: Program) -> MotionSteps:
+    """The loop of the control script: one command of the client after the other."""
+    program.signal(-1)
+    program.answer_integer(READY, 0)
+    executing = False
+    while True:
+        command = program.integer(0)
+        if command == 0:
+            command, program.internal = program.internal, 0
+        work = _work(program, command)
+        if command in COMMANDS and COMMANDS[command].every_cycle:
             yield from work
-            self.signal(-1)
-
-        self.threads[name] = tracking() if tracked else work
-
-    def repeat(self, name: str, call: Callable[[], MotionSteps]) -> None:
-        """What the thread shall do for ever from its next round on; starts it where it does not run."""
-
-        def rounds() -> MotionSteps:
-            while True:
-                yield from self.calls[name]()
-
-        self.calls[name] = call
-        if name not in self.threads:
-            self.run(name, rounds())
-
-    def kill(self, name: str) -> bool:
-        """Ends a thread; False where it does not run."""
-        killed = self.threads.pop(name, None) is not None
-        if killed and name in ("move", "stop"):
-            self.signal(-1)
-            self.arm.waypoint = None
-        return killed
-
-    def signal(self, progress: int) -> None:
-        """The asynchronous word: 0 begins an operation, more is its progress, -1 its end."""
-        self._writes = (self._writes + 1) % 128
-        if progress == 0:
-            self._operation = (self._operation + 1) % 128
-        word = self._writes << 16 | self._operation << 24
-        self.answer_integer(word | (min(progress, 32767) | 1 << 15 if progress >= 0 else 0), 2)
-
-    # -- the script's loop -------------------------------------------------------------------------------------------
-
-    def _loop(self) -> MotionSteps:
-        self.signal(-1)
-        self.answer_integer(READY, 0)
-        executing = False
-        while True:
-            command = self.integer(0)
-            if command == 0:
-                command, self.internal = self.internal, 0
-            work = self._work(command)
-            if command in COMMANDS and COMMANDS[command].every_cycle:
-                yield from work
-                self.answer_integer(READY, 0)
-            elif command == 0:
-                executing = False
-                self.answer_integer(READY, 0)
-            elif not executing:
-                if command == STOP_SCRIPT:
-                    return
-                yield from work
-                self.answer_integer(DONE, 0)
-                executing = True
-            yield
-
-    def _work(self, command: int) -> MotionSteps:
-        """What the command does; nothing for one that this controller has not."""
-        known = COMMANDS.get(command)
-        if known is not None and known.needs in self.text:
-            yield from known.work(self) or ()
+            program.answer_integer(READY, 0)
+        elif command == 0:
+            executing = False
+            program.answer_integer(READY, 0)
+        elif not executing:
+            if command == STOP_SCRIPT:
+                return
+            yield from work
+            program.answer_integer(DONE, 0)
+            executing = True
+        yield
 
 
-def _go_on(work: MotionSteps) -> bool:
-    """One control period of `work`; False when it has ended."""
-    return next(work, _ENDED) is not _ENDED
-
-
-def _of_version(text: str, version: tuple[int, ...]) -> str:
-    """The text without lines for newer controllers. `$5.10|3.15 line` needs 5.10, or 3.15 of that major version."""
-
-    @cache
-    def has(needed: str) -> bool:
-        leasts = (tuple(int(number) for number in least.split(".") if number) for least in needed.split("|"))
-        return any(least[:1] == version[:1] and version >= least for least in leasts)
-
-    def kept(line: re.Match[str]) -> str:
-        return line[2] if has(line[1]) else ""
-
-    return re.sub(r"^[ \t]*\$([\d.|]{1,99})(.*)", kept, text, flags=re.M)
+def _work(program: Program, command: int) -> MotionSteps:
+    """What the command does; nothing for one that this controller has not."""
+    known = COMMANDS.get(command)
+    if known is not None and known.needs in program.text:
+        yield from known.work(program) or ()

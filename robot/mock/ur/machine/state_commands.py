@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from robot.common.kinematics import pose
 from robot.mock.ur.machine.arm import PERIOD, ProgramError
 from robot.mock.ur.machine.load import HEAVIEST, Mass
+from robot.mock.ur.machine.program import Program
 from robot.mock.ur.machine.registry import command
 from tacsim.interface import FloatArray
-
-if TYPE_CHECKING:
-    from robot.mock.ur.machine.script import Program
 
 STEEPEST = 100.0  # of set_gravity [m/s^2]
 NEAR_SINGULAR, SINGULAR = 0.05, 0.02  # of Kinematics.singularity, for get_freedrive_status

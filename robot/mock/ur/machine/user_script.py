@@ -15,7 +15,7 @@ import ast
 import operator
 import re
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -23,11 +23,8 @@ from robot.common.kinematics import matrix
 from robot.mock.ur.machine import motion
 from robot.mock.ur.machine.arm import PERIOD, MotionSteps, ProgramError
 from robot.mock.ur.machine.load import Mass
-from robot.mock.ur.machine.registry import LARGEST
+from robot.mock.ur.machine.program import LARGEST, Program
 from tacsim.interface import FloatArray
-
-if TYPE_CHECKING:
-    from robot.mock.ur.machine.script import Program
 
 LONGEST_LINE = 1000  # characters
 MOST_CALLS = 5000  # of one program

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import struct
 
-from robot.mock.ur.machine.machine import ScriptError
+from robot.mock.ur.machine.state import ScriptError
 
 PORTS = (30001, 30002)
 ROBOT_MESSAGE, RUNTIME_EXCEPTION, CONTROLLER = 20, 10, 0xFE

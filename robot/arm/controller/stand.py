@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from robot.arm.rtde import Reading
+from robot.arm.controller.rtde import Reading
 from robot.common.kinematics import Kinematics, displacement, inverse_frame, matrix, pose, rotation_vector
 from robot.common.tcp import ArmFrames
-from robot.doctor.machine import Check, State
 from tacsim import pose as se3
 from tacsim.interface import FloatArray, Pose
 from tacsim.limits import ROUNDING
+from tacsim.models.driver import Check, State
 from tacsim.models.hardware import UrArmConfig
 
 GRAVITY = 9.82  # [m/s^2]
@@ -81,14 +81,6 @@ def compare(name: str, config: UrArmConfig, now: Stand, start: Pose | None, file
     yield _payload(name, config, now)
     yield _tcp(name, config, now)
     yield _slider(name, now)
-
-
-def keep_out(first: tuple[str, Stand], second: tuple[str, Stand], distance: float, file: str) -> Check:
-    """Whether the sensors of two arms keep their distance [m]."""
-    gap = float(np.linalg.norm(first[1].sensor[:3, 3] - second[1].sensor[:3, 3]))
-    label = f"{first[0]}, {second[0]}: keep-out"
-    words = f"the sensors are {1e3 * gap:.0f} mm apart, at least {1e3 * distance:g} mm are asked for"
-    return Check(label, "ok" if gap > distance else "fail", words, "" if gap > distance else _lead(file))
 
 
 def _model(name: str, config: UrArmConfig, now: Stand) -> Check | None:

@@ -9,20 +9,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import robot.doctor.rig
-from robot.arm.rtde import Reading, read_controller
+from robot.arm.controller.rtde import Reading, read_controller
+from robot.arm.controller.stand import OFF_FORCE, compare, on_pendant, stand
 from robot.arm.ur import URArm
+from robot.camera.driver import CameraDriver
 from robot.common.kinematics import Kinematics, matrix, pose
 from robot.common.tcp import ArmFrames
-from robot.doctor.machine import Check
-from robot.doctor.rig import examine_rig
-from robot.doctor.stand import OFF_FORCE, compare, keep_out, on_pendant, stand
+from robot.doctor.rig import check_keep_out, examine_rig
 from robot.errors import DeviceNotConnectedError
 from robot.mock import MockUR
 from robot.mock.fixtures import mock_host
 from tacsim import pose as se3
 from tacsim.config import ConfigError, config_root, load_rig
-from tacsim.models.hardware import Placement, UrArmConfig
+from tacsim.models.driver import Check
+from tacsim.models.hardware import KeepOut, Placement, UrArmConfig
 from tests.robot.mock.wire_client import RtdeClient
 
 HOST = mock_host(77)
@@ -63,7 +63,7 @@ def by_name(checks: list[Check]) -> dict[str, Check]:
 def test_an_arm_out_of_its_box_is_told_with_all_that_differs_from_the_file(
     mock: MockUR, file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(robot.doctor.rig, "_camera", lambda name, camera: Check(name, "ok", ""))
+    monkeypatch.setattr(CameraDriver, "checks", lambda driver: [Check(driver.name, "ok", "")])
     before = mock.faults.received().last
     found = by_name(examine_rig(load_rig(file).config, "my.yaml"))
     assert mock.faults.received().last == before and not mock.faults.state().program  # it has only looked
@@ -201,11 +201,11 @@ def test_the_slider_is_read_from_the_controller(mock: MockUR) -> None:
 def test_sensors_nearer_than_their_keep_out_fail() -> None:
     config = shipped()
     reading = read_plain(config)
-    one = ("left", stand(config, reading))
     shifted = reading.tcp_pose + [2e-3, 0.0, 0.0, 0.0, 0.0, 0.0]
-    other = ("right", stand(config, _with(reading, tcp_pose=shifted)))
-    assert keep_out(one, other, 3e-3, "f").state == "fail"
-    assert keep_out(one, other, 1e-3, "f").state == "ok"
+    stands = {"left": stand(config, reading), "right": stand(config, _with(reading, tcp_pose=shifted))}
+    poses = {name: se3.from_matrix(each.sensor) for name, each in stands.items()}
+    for distance, state in ((3e-3, "fail"), (1e-3, "ok")):
+        assert check_keep_out(KeepOut(arms=("left", "right"), distance=distance), poses, "f").state == state
 
 
 def read_plain(config: UrArmConfig) -> Reading:

@@ -1,0 +1,45 @@
+"""The driver `ur`: a Universal Robots arm, real or mock."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, cast
+
+from tacsim.interface import HardwareArm, Pose
+from tacsim.models.driver import ArmDriver, ArmExamination
+from tacsim.models.hardware import UrArmConfig
+
+if TYPE_CHECKING:
+    from robot.arm.lost_link import PackageLog
+    from robot.arm.ur import URArm
+
+REACTION = 0.05  # from a picture that shows a touch to an arm that brakes [s]
+
+
+class UrDriver(ArmDriver[UrArmConfig]):
+    config_class = UrArmConfig
+    keeps_distances = True
+
+    @property
+    def companion(self) -> str | None:
+        return None if self.config.mock is None else "robot.mock.cell.cell:MockCell"
+
+    def require(self) -> None:
+        from robot.arm.worker_config import check_host
+
+        check_host(self.config, self.name)
+
+    def open(self) -> URArm:
+        from robot.arm.ur import URArm
+
+        return URArm(self.config, self.name, keep_out=self.keep_out)
+
+    def worst_latency(self) -> float:
+        return REACTION
+
+    def examine(self, start: Pose | None, file: str) -> ArmExamination:
+        from robot.arm.controller.examine import examine
+
+        return examine(self.name, self.config, start, file)
+
+    def package_log(self, arm: HardwareArm) -> PackageLog:
+        return cast("URArm", arm).package_log()

@@ -1,0 +1,134 @@
+"""What the robot behind the sockets is at one moment, and how its program ends.
+
+Programs and their commands change it; `machine.py` lets time pass in it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple, Protocol
+
+from robot.mock.ur.machine.arm import HOME, PERIOD, Arm
+from robot.mock.ur.machine.force_mode import ForceMode
+from robot.mock.ur.machine.load import NOTHING, Load, Mass
+from robot.mock.ur.machine.modes import Mode, Safety
+from robot.mock.ur.machine.version import VERSION, Version
+from tacsim.interface import FloatArray
+from tacsim.models.text import printable
+
+if TYPE_CHECKING:
+    from tacsim.models.hardware import Model  # pydantic and SciPy: half a second of start-up
+
+REGISTERS = 48  # of each kind and direction
+LINE = 500  # longest text of the log
+UNLOCK_DELAY = 0.0  # least time from a protective stop to its unlocking [s]; real robots want 5 s
+
+
+class Outputs:
+    """Digital and analog outputs."""
+
+    def __init__(self) -> None:
+        self.digital = 0  # bits 0-7 standard, 8-15 configurable, 16-17 tool
+        self.analog = [0.0, 0.0]  # fraction of the range
+        self.analog_is_voltage = [False, False]
+
+    @property
+    def analog_types(self) -> int:
+        """analog_io_types: bits 0 and 1 of the inputs, 2 and 3 of the outputs; 0 is a current, 1 a voltage."""
+        return self.analog_is_voltage[0] << 2 | self.analog_is_voltage[1] << 3
+
+    def analog_value(self, index: int) -> float:
+        """Of a standard analog output: [V] of 0-10 V, or [A] of 4-20 mA."""
+        part = self.analog[index]
+        return 10.0 * part if self.analog_is_voltage[index] else 0.004 + 0.016 * part
+
+
+class ScriptError(NamedTuple):
+    """Why a program was not begun, or has ended by an error; where in it, from 1 (0: not known)."""
+
+    text: str
+    line: int = 0
+    column: int = 0
+    users: bool = True  # a program of a user, not ur_rtde's control script
+
+
+class RunningProgram(Protocol):
+    """What the machine asks of the program that it runs (`program.py`)."""
+
+    name: str
+    int_offset: int  # of its integer registers
+
+    def step(self) -> None:
+        """One control period. Raises ProgramError where the program ends with an error."""
+        ...
+
+
+class MachineState:
+    """One robot at one moment. `log` keeps the last lines of what happened, each with its time [s]."""
+
+    def __init__(
+        self,
+        model: Model = "ur5e",
+        joints: Sequence[float] = HOME,
+        version: Version = VERSION,
+        tool: Mass = NOTHING,  # hangs on the flange
+    ) -> None:
+        self.version = version
+        self.arm, self.load, self.outputs = Arm(model, joints), Load(tool), Outputs()
+        self.load.update(self.arm)
+        self.ticks = 0
+        self.mode, self.safety = Mode.RUNNING, Safety.NORMAL
+        self.in_int, self.in_double = [0] * REGISTERS, [0.0] * REGISTERS
+        self.out_int, self.out_double = [0] * REGISTERS, [0.0] * REGISTERS
+        self.in_bits = 0  # input bit registers 0 to 127
+        self.slider = 1.0
+        self.program: RunningProgram | None = None
+        self.paused = False
+        self.freedrive: tuple[FloatArray, tuple[int, ...]] | None = None  # frame and free axes
+        self.force_mode: ForceMode | None = None
+        self.watchdog: tuple[int, float] | None = None  # input_int_register, longest silence [s]
+        self.watchdog_reset = 0  # tick at which its register was last written
+        self.script_errors: deque[ScriptError] = deque(maxlen=20)  # not yet reported to those who listen
+        self.control_offset = 0  # of the registers of the last control script
+        self.stop_reason = ""  # why the last program ended
+        self.stopped_at = -math.inf  # time of the last protective stop [s]
+        self.unlock_delay = UNLOCK_DELAY
+        self.clock_offset = 0.0  # of the timestamp that is sent [s]
+        self.work_time = 0.0  # what the last control period took to compute [s]
+        self.log: deque[tuple[float, str]] = deque(maxlen=200)
+        self._changing: tuple[int, Mode] | None = None  # tick at which the mode changes
+        self._starting: tuple[int, RunningProgram] | None = None  # tick at which a program begins that replaces another
+
+    @property
+    def time(self) -> float:
+        """Since power-on, in control periods [s]."""
+        return self.ticks * PERIOD
+
+    @property
+    def steady(self) -> bool:
+        """is_steady(): at rest, and not compliant."""
+        return self.arm.rests and self.freedrive is None and self.force_mode is None
+
+    def write_log(self, text: str) -> None:
+        self.log.append((self.time, printable(text[:LINE])))
+
+    def stop(self, why: str) -> None:
+        """Ends the program; the arm coasts to rest."""
+        self.watchdog, self.freedrive, self.arm.waypoint, self._starting = None, None, None, None
+        self.end_force_mode()
+        if self.program is not None:
+            self.program, self.stop_reason = None, why
+            self.write_log(f"program stopped: {why}")
+
+    def end_force_mode(self) -> None:
+        if self.force_mode is not None:
+            self.force_mode = None
+            self.arm.settle()
+
+    def protective_stop(self, why: str) -> None:
+        if self.safety in (Safety.NORMAL, Safety.REDUCED, Safety.SAFEGUARD_STOP):
+            self.safety, self.stopped_at = Safety.PROTECTIVE_STOP, self.time
+            self.write_log(f"protective stop: {why}")
+            self.stop(f"protective stop: {why}")

@@ -41,7 +41,7 @@ from robot.procedures.session import (
 )
 from robot.rig.parts import companion_of
 from tacsim import pose as se3
-from tacsim.interface import FloatArray, Pose, TactileFrame
+from tacsim.interface import FloatArray, Image, Pose, TactileFrame
 from tacsim.limits import ActionError
 from tacsim.models.hardware import CameraSensorConfig
 from tacsim.models.rig import RigConfig

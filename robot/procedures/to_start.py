@@ -12,8 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from robot.arm.channel import CommandKind
-from robot.arm.controller.rtde import read_controller
-from robot.arm.controller.rtde import Reading
+from robot.arm.controller.rtde import Reading, read_controller
 from robot.arm.start_servo import sensor_path, way_rates
 from robot.arm.status import ArmStatus
 from robot.arm.ur import URArm

@@ -1,4 +1,4 @@
-"""What a contributor meets first: CONTRIBUTING.md, the templates, and the workflow file, which does what .ci/run does."""
+"""CONTRIBUTING.md, the templates, and the workflow file, which does what .ci/run does."""
 
 from __future__ import annotations
 

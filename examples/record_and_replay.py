@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import sys
 import tempfile
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -23,16 +24,16 @@ def record(path: Path) -> list[Observation]:
     task = make_task(loaded.config.task)
     seen: list[Observation] = []
     setup = EpisodeSetup(policy="scripted", attachments={"rig.yaml": loaded.text.encode()})
-    recorders: list[Recorder] = []
-
-    def recorder(meta):  # called by run_episode when the references are known
-        recorders.append(Recorder(path, meta))
-        return recorders[0]
-
-    with open_rig(loaded) as rig:
-        keep = lambda step, observation, truth: seen.append(observation)  # noqa: E731
-        run_episode(rig, task.scripted(), task, STEPS, setup=setup, recorder=recorder, watch=keep)
-    recorders[0].close()
+    with ExitStack() as stack:
+        run_episode(
+            stack.enter_context(open_rig(loaded)),
+            task.scripted(),
+            task,
+            STEPS,
+            setup=setup,
+            recorder=lambda meta: stack.enter_context(Recorder(path, meta)),
+            watch=lambda step, observation, truth: seen.append(observation),
+        )
     return seen
 
 

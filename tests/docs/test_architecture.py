@@ -14,6 +14,7 @@ ROOMS = PAGE.partition("## Rooms")[2].partition("\n## ")[0]
 
 
 ENTRIES = 17  # of a folder, at most: more, and nobody finds anything
+MAX_LINES = 220  # of the page
 
 
 def named() -> list[str]:
@@ -36,6 +37,10 @@ def test_every_room_stands_on_the_page_once() -> None:
     assert sorted(named()) == folders(), (
         "docs/architecture.md: each folder of modules needs one row in the tables of rooms"
     )
+
+
+def test_the_architecture_is_one_page() -> None:
+    assert len(PAGE.splitlines()) <= MAX_LINES
 
 
 @pytest.mark.parametrize("room", folders())

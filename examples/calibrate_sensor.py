@@ -22,7 +22,7 @@ HELD_OUT = (1.5, -1.0, 0.5)
 
 def main() -> None:
     scene = load_scene("press", ["preset=draft", f"indenter.geometry.radius={RADIUS} m"])
-    sensor = load_sensor("ideal", ["geometry={width: 200, height: 150, pixel_pitch: 0.1 mm}"])
+    sensor = load_sensor("ideal", ["geometry={width: 128, height: 96, pixel_pitch: 0.15 mm}"])
     render, random = Renderer(sensor, scene.gel.size[:2]), np.random.default_rng(0)
 
     def photograph(image: np.ndarray) -> np.ndarray:

@@ -26,10 +26,7 @@ def record(path: Path) -> list[Observation]:
     setup = EpisodeSetup(policy="scripted", attachments={"rig.yaml": loaded.text.encode()})
     with ExitStack() as stack:
         run_episode(
-            stack.enter_context(open_rig(loaded)),
-            task.scripted(),
-            task,
-            STEPS,
+            *(stack.enter_context(open_rig(loaded)), task.scripted(), task, STEPS),
             setup=setup,
             recorder=lambda meta: stack.enter_context(Recorder(path, meta)),
             watch=lambda step, observation, truth: seen.append(observation),
@@ -43,10 +40,10 @@ def main() -> None:
         live = record(path)
         episode = read_episode(path)
         print(f"{path.stat().st_size / 1e3:.0f} kB, {len(episode.steps)} steps, complete: {episode.complete}")
-        rig_file = Path(folder) / "replay.yaml"
         parts = {"arms": "driver: replay", "sensors": "driver: replay, arm: upper"}
         lines = [f"{key}: {{upper: {{{what}, source: '{path}'}}}}" for key, what in parts.items()]
-        rig_file.write_text("\n".join(["name: replay", "clock: replay", *lines]) + "\n")
+        rig_file = Path(folder) / "replay.yaml"
+        rig_file.write_text("\n".join(["name: replay", "clock: replay", *lines]))
         with open_rig(rig_file) as rig:
             again = rig.reset()
 

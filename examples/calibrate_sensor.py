@@ -12,7 +12,7 @@ import sys
 import numpy as np
 
 from calibration import calibrate_light, normaliser_for_calibration
-from robot import PressMotion, press
+from robot import PressMotion, PressResult, press
 from tacsim import CanonicalGrid, Renderer, TactileFrame, load_scene, load_sensor, make_world
 
 RADIUS = 4e-3  # of the ball [m]
@@ -29,7 +29,7 @@ def main() -> None:
         """The picture with the noise of a camera."""
         return np.clip(np.rint(image + random.normal(0, 1.0, image.shape)), 0, 255).astype(np.uint8)
 
-    def pressed(x: float, y: float, depth: float):
+    def pressed(x: float, y: float, depth: float) -> PressResult:
         return press(scene, sensor, PressMotion(depth=depth * 1e-3, at=(x * 1e-3, y * 1e-3)), render)
 
     reference = photograph(render(make_world(scene).surface("lower")))

@@ -25,7 +25,7 @@ def layer_force(modulus: float, poisson: float, thickness: float) -> float:
     series = 1 - 2 * a * x + 4 * a**2 * x**2
     series -= 8 * (a**3 + 4 * math.pi**2 / 15 * b) * x**3
     series += 16 * a * (a**3 + 3 * math.pi**2 / 5 * b) * x**4
-    return 4 / 3 * modulus / (1 - poisson**2) * math.sqrt(RADIUS) * DEPTH**1.5 * series
+    return 4 / 3 * modulus / (1 - poisson**2) * math.sqrt(RADIUS * DEPTH**3) * series
 
 
 def main() -> None:

@@ -2,7 +2,7 @@
 
     python examples/calibrate_sensor.py
 
-The pictures are simulated here. Replace them with those of your own sensor, or use `tacsim calibrate sensor FOLDER`.
+The pictures are simulated here. Replace them with those of your sensor, or use `tacsim calibrate sensor FOLDER`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Collect labelled presses of a shape of your own in parquet, stop half-way, and continue to the same set.
+"""Collect labelled presses of a user-defined shape in parquet, stop half-way, and continue to the same set.
 
 python examples/collect_presses.py      # needs the extra `export`
 """

@@ -2,7 +2,7 @@
 
     python examples/compare_sources.py
 
-Every error stands beside the *null*, what a picture without contact scores. Here the real sensor is simulated too, with
+Every error is reported with the *null*, the error of a picture without contact. Here the real sensor is simulated too, with
 camera noise; one simulation of it has the right light, another draws no contact at all.
 """
 

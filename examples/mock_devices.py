@@ -1,4 +1,4 @@
-"""Test your own code against mock devices that speak the real protocols: a UR controller and a camera.
+"""Test your code against mock devices that speak the real protocols: a UR controller and a camera.
 
     python examples/mock_devices.py
 

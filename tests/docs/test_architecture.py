@@ -13,7 +13,7 @@ PAGE = (DOCS / "architecture.md").read_text(encoding="utf-8")
 ROOMS = PAGE.partition("## Rooms")[2].partition("\n## ")[0]
 
 
-ENTRIES = 17  # of a folder, at most: more, and nobody finds anything
+ENTRIES = 17  # of a folder, at most
 MAX_LINES = 220  # of the page
 
 

@@ -2,8 +2,8 @@
 
     python examples/compare_sources.py
 
-Every error is reported with the *null*, the error of a picture without contact. Here the real sensor is simulated too, with
-camera noise; one simulation of it has the right light, another draws no contact at all.
+Every error is reported with the *null*, the error of a picture without contact. Here the real sensor is simulated too,
+with camera noise; one simulation of it has the right light, another draws no contact at all.
 """
 
 from __future__ import annotations

@@ -36,7 +36,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         objects, folder = Path(name) / "objects", Path(name) / "presses"
         objects.mkdir()
-        trimesh.creation.capsule(height=4.0, radius=2.0, count=[12, 12]).export(objects / "capsule.stl")  # [mm]
+        trimesh.creation.capsule(height=4.0, radius=2.0, count=[8, 8]).export(objects / "capsule.stl")  # [mm]
         collect(objects, folder, 1)
         first = read(folder)
         collect(objects, folder, 3)  # continues: the first press is kept

@@ -1,4 +1,4 @@
-"""A task of your own: stretch the body along x, by squeezing it.
+"""A user-defined task: stretch the body along x, by squeezing it.
 
     tacsim run sim --task stretch:StretchConfig --set "task.goal=2 mm"
 

@@ -32,7 +32,6 @@ from robot.procedures.session import (
     SETTLE,
     CannotCalibrate,
     FrameSource,
-    Image,
     OutsideLimits,
     Session,
     frame_after,

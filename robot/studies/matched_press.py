@@ -30,7 +30,7 @@ CircleFinder = Callable[[Image, Image, float], Circle]
 
 # Edge of the gel's elements for such presses [m]. At 0.5 mm, two to four to a contact's radius, the surface rounds the
 # rim: its slope is up to a tenth of the rim's too steep 1.2 contact radii from the middle, and a classifier sees that
-# (decision 10).
+# (docs/measurements/light-and-shadows.md).
 ELEMENT = 0.25e-3
 RADIUS_TOLERANCE = 0.25  # the contact is as wide as the real one when its radius differs by no more [px]
 MAX_ATTEMPTS = 6  # presses that look for the depth

@@ -13,7 +13,8 @@ PAGE = (DOCS / "architecture.md").read_text(encoding="utf-8")
 ROOMS = PAGE.partition("## Rooms")[2].partition("\n## ")[0]
 
 
-ENTRIES = 17  # of a folder, at most: more, and nobody finds anything
+ENTRIES = 17  # of a folder, at most
+MAX_LINES = 220  # of the page
 
 
 def named() -> list[str]:
@@ -38,6 +39,10 @@ def test_every_room_stands_on_the_page_once() -> None:
     )
 
 
+def test_the_architecture_is_one_page() -> None:
+    assert len(PAGE.splitlines()) <= MAX_LINES
+
+
 @pytest.mark.parametrize("room", folders())
 def test_a_room_is_not_overfull(room: str) -> None:
     skipped = {"__init__.py", "__pycache__", "py.typed"}
@@ -45,10 +50,22 @@ def test_a_room_is_not_overfull(room: str) -> None:
     assert len(entries) <= ENTRIES, f"{room} holds {len(entries)} entries: make a room of some that belong together"
 
 
-@pytest.mark.parametrize("page", sorted(DOCS.rglob("*.md")), ids=lambda page: page.name)
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *sorted(DOCS.rglob("*.md"))]
+LINK = re.compile(r"\]\((?!https?:)([^)#]*)(?:#([^)]*))?\)")
+
+
+def anchors(page: Path) -> set[str]:
+    """The anchors that a web page of this text has, one a heading."""
+    headings = re.findall(r"^#+ +(.+?) *$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_links_between_pages_lead_somewhere(page: Path) -> None:
-    links = re.findall(r"\]\((?!https?:)([^)#]+)", page.read_text(encoding="utf-8"))
-    assert [link for link in links if not (page.parent / link).exists()] == []
+    links = LINK.findall(page.read_text(encoding="utf-8"))
+    targets = [((page.parent / path) if path else page, anchor) for path, anchor in links]
+    assert [str(target) for target, _ in targets if not target.exists()] == []
+    assert [f"{target.name}#{anchor}" for target, anchor in targets if anchor and anchor not in anchors(target)] == []
 
 
 def test_decisions_are_numbered_without_gaps() -> None:

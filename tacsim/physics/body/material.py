@@ -5,14 +5,16 @@ and stay symmetric, so products of them need 6 numbers only: no SVD, no eigenval
 The same laws in float64 NumPy: benchmarks/truth/laws.py.
 """
 
+import math
+
 from tacsim.compute.runtime import ti
 
 vec3 = ti.types.vector(3, ti.f32)
 vec6 = ti.types.vector(6, ti.f32)
 mat3 = ti.types.matrix(3, 3, ti.f32)
 
-LN_2 = 0.6931471805599453
-SQRT_2_3 = (2.0 / 3.0) ** 0.5  # equivalent plastic strain over the norm of the plastic strain increment
+LN_2 = math.log(2.0)
+SQRT_2_3 = math.sqrt(2.0 / 3.0)  # equivalent plastic strain over the norm of the plastic strain increment
 ELASTIC = 1e9  # elastic limit of a body that never yields: it runs no return mapping
 # Largest arguments of the series below: errors under float32's rounding, 1.4e-5 relative, 3e-6 absolute
 SERIES_LOG1P, SERIES_LOG, SERIES_EXP = 0.4, 0.5, 0.2

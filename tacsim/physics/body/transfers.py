@@ -73,9 +73,9 @@ from tacsim.physics.exec.lanes import (
 Strips = ti.types.ndarray(dtype=strip, ndim=1)  # masses, velocities
 
 # What node (i, j, n) gets is w_i w_j w_n (q + i ax + j ay + n az), each of these momentum x, y, z and mass.
-MOMENTUM, MOMENTUM_X, MOMENTUM_Y, MOMENTUM_Z = 0, 4, 8, 12
+MOMENTUM, MOMENTUM_X, MOMENTUM_Y, MOMENTUM_Z = range(0, 16, 4)
 # Sums over the stencil: plain, and by x, y, z with the node's number as a factor
-SUM, BY_X, BY_Y, BY_Z = 0, 1, 2, 3
+SUM, BY_X, BY_Y, BY_Z = range(4)
 
 
 class Body(NamedTuple):

@@ -22,7 +22,7 @@ TANGENT_STIFFNESS = 0.5  # k_t / k_n
 # Share of a change of the normal force that its memory follows each substep. Motions in real time have 0: the memory
 # follows the overlap with a delay, so it creates energy, which only damping takes away.
 MEMORY_RATE = 0.05
-FREE, ON_GEL, ON_HOUSING = 0.0, 1.0, 2.0  # what a particle's anchor is on
+FREE, ON_GEL, ON_HOUSING = map(float, range(3))  # what a particle's anchor is on
 SMALLEST_AREA = 0.1  # of the surface seen from above, over its unmoved one; below that it counts as folded
 
 

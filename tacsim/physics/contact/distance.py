@@ -6,7 +6,7 @@ from tacsim.compute.runtime import ti
 from tacsim.physics.exec import layout
 from tacsim.physics.exec.lanes import vec3
 
-SPHERE, CYLINDER, BOX, GRID = 0, 1, 2, 3
+SPHERE, CYLINDER, BOX, GRID = range(4)
 UNKNOWN = 1e9  # distance where none is known
 
 

@@ -11,10 +11,12 @@ HOURGLASS = 1.0 / 6.0  # the exact integral of a shear hourglass mode of a cube
 SMALLEST_STRETCH = 0.05  # J below this counts as inverted
 
 # Rows of an element block's own array: displacements of eight corners, axis by axis, then the forces on them;
-WHOLE = 24  # 1 if the element is inside the gel, else 0
-SMALLEST = 25  # det F so far
-SKEWED = 26  # squared force of the hourglass modes
-ROWS = 27
+_rows = layout.Layout()
+_rows.place(24)
+WHOLE = _rows.place()  # 1 if the element is inside the gel, else 0
+SMALLEST = _rows.place()  # det F so far
+SKEWED = _rows.place()  # squared force of the hourglass modes
+ROWS = _rows.size
 
 
 @ti.func

@@ -47,9 +47,7 @@ EDGE_RADIUS = _params.place()  # of an indenter [mm]
 OWN = _params.place()  # weight of a node's own acceleration, force over mass, in how it moves; 1 is true inertia
 FILTERED = _params.place()  # weight of the acceleration filtered by its neighbours' (gel/mass.py, body/mass.py)
 LIMIT_FOLLOWS = _params.place()  # rate at which the limit of an indenter's friction follows the pressure [1/mm]
-MEMORY = (
-    _params.place()
-)  # share of a change of the normal force that a contact's memory takes a substep; else 0
+MEMORY = _params.place()  # share of a change of the normal force that a contact's memory takes in a substep
 SPRINGS = _params.place(2)  # stiffness of particles' contacts in the launch before over that in this one, two
 PARAMS = _params.size
 

@@ -62,7 +62,8 @@ from tacsim.physics.motion.controller import (
     force_floor,
 )
 from tacsim.physics.motion.inertia import Inertia
-from tacsim.physics.motion.path import PEAK_BRAKING, SHORT_PATH, SHORT_SLIDE, Path, path_along, path_length, plan
+from tacsim.physics.motion.path import PEAK_BRAKING, Path, path_along, path_length, plan
+from tacsim.physics.motion.tuning import SHORT_PATH, SHORT_SLIDE
 from tacsim.physics.move import MIN_LAYERS, MoveCommand, MoveStats, warn_of_few_layers
 from tacsim.physics.snapshot import State
 from tacsim.physics.units import MM, MPA

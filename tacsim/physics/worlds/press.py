@@ -31,8 +31,9 @@ from tacsim.physics.failure.health import Health, SimulationDiverged, check_laun
 from tacsim.physics.gel.gel import GelParams
 from tacsim.physics.motion.controller import ForceReading, Integration, Launch, PreparedLaunch, force_floor
 from tacsim.physics.motion.inertia import Inertia, kernel_second
-from tacsim.physics.motion.path import SHORT_SLIDE, Path, path_along, path_length, plan
-from tacsim.physics.motion.slide import WALLS_LAST, Slide, growth, pace, slower_walls, turn
+from tacsim.physics.motion.path import Path, path_along, path_length, plan
+from tacsim.physics.motion.slide import Slide, growth, pace, slower_walls, turn
+from tacsim.physics.motion.tuning import SHORT_SLIDE, SLOWED_WALL_LENGTH
 from tacsim.physics.units import MM, MPA
 from tacsim.physics.worlds.fem import FemWorld
 from tacsim.physics.worlds.press_state import PressState
@@ -173,7 +174,7 @@ class PressWorld(FemWorld):
         path = plan(
             start, end, mach / faster, self._scaled.step, lever, gel.thickness,
             remembered=path_along(start, end, lever), short=SHORT_SLIDE + (SHORT_GROWING - SHORT_SLIDE) * growing,
-            slower=slower, last=WALLS_LAST * gel.spacing,
+            slower=slower, last=SLOWED_WALL_LENGTH * gel.spacing,
         )  # fmt: skip
         if indenter.friction > 0.0:
             slide = Slide(

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 from tacsim.compute.runtime import ti
 from tacsim.physics.body.material import (
-    ELASTIC,
+    UNREACHABLE_LIMIT,
     convect,
     full,
     gradient,
@@ -129,7 +129,7 @@ def return_block(
     """Return mapping of LANES particles: elastic and plastic strain in `old` -> in `new`, and Kirchhoff stress."""
     mu, bulk = env.param(layout.BODY_MU), env.param(layout.BODY_BULK)
     yield_strain, hardening = env.param(layout.BODY_LIMIT), env.param(layout.BODY_HARDENING)
-    if yield_strain < ELASTIC:
+    if yield_strain < UNREACHABLE_LIMIT:
         for lane in range(LANES):
             elastic, plastic_strain, tau, large = return_small_strain(
                 six(old, 0, lane), old[6, lane], mu, bulk, yield_strain, hardening

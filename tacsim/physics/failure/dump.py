@@ -28,11 +28,11 @@ from tacsim.interface import Pose
 from tacsim.models.quantity import Config
 from tacsim.models.scene import Mesh, Scene
 from tacsim.physics.failure.health import SimulationDiverged
+from tacsim.physics.failure.tuning import MAX_DUMPS
 from tacsim.physics.move import MoveCommand
 from tacsim.physics.snapshot import State
 
 FOLDER = "TACSIM_DUMPS"  # environment variable: where dumps are written; none are without it, or where it is empty
-MOST_DUMPS = 20  # in one folder; training that diverges again and again must not fill the disk
 MOMENTS = ("before", "good", "failed")
 MESH = "shape.stl"
 
@@ -128,13 +128,13 @@ def write_if_asked(
 def _new_folder(parent: Path) -> Path:
     """A new folder 00 ... 19 below `parent`; several processes may do this at once."""
     parent.mkdir(parents=True, exist_ok=True)
-    for number in range(MOST_DUMPS):
+    for number in range(MAX_DUMPS):
         try:
             (parent / f"{number:02d}").mkdir()
         except FileExistsError:
             continue
         return parent / f"{number:02d}"
-    raise DumpError(f"it holds {MOST_DUMPS} dumps, which is the limit; remove some")
+    raise DumpError(f"it holds {MAX_DUMPS} dumps, which is the limit; remove some")
 
 
 def _write(

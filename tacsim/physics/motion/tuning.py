@@ -1,7 +1,8 @@
 """Tuned constants of motions: controller, paths, slides and motions at constant load.
 
 Each entry: what it is, its unit, and the error without it. Sources: docs/physics.md ("Controller"),
-docs/decisions/0002-quasi-static-controller.md, and the tests in tests/tacsim/physics/motion.
+docs/measurements/physics.md, docs/decisions/0002-quasi-static-controller.md, and the tests in
+tests/tacsim/physics/motion.
 """
 
 # Controller: launches and holds

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from tacsim.physics.body.moments import Moments
 from tacsim.physics.exec.layout import Layout
-from tacsim.physics.failure.health import FASTEST, SMALLEST_VOLUME_RATIO
+from tacsim.physics.failure.tuning import MAX_SPEED
+from tacsim.physics.gel.tuning import MIN_VOLUME_RATIO
 
 BLOCKS = 256  # of a body's particles, for their sums
 
@@ -56,7 +57,7 @@ def survey_of(
     """Of an environment's numbers (NUMBERS,) as the kernels leave them; spacings: of its gels' nodes [mm]."""
     finite = not numbers[NOT_FINITE]
     sound = bool(
-        finite and numbers[NODE_SPEED] <= FASTEST and numbers[SQUARED_VOLUME] > (2.0 * SMALLEST_VOLUME_RATIO) ** 2
+        finite and numbers[NODE_SPEED] <= MAX_SPEED and numbers[SQUARED_VOLUME] > (2.0 * MIN_VOLUME_RATIO) ** 2
     )
     volumes = numbers[[SQUARED_VOLUME, LARGEST_SQUARED_VOLUME]]
     if not (particles and volumes.min() > 0.0):

@@ -16,8 +16,9 @@ import pytest
 from tacsim.interface import Pose
 from tacsim.models.scene import Gel, Indenter, Mesh, Scene, Settling, Sphere
 from tacsim.physics.failure import dump
-from tacsim.physics.failure.dump import MOST_DUMPS, DumpError, dumps_in, read
+from tacsim.physics.failure.dump import DumpError, dumps_in, read
 from tacsim.physics.failure.health import SimulationDiverged
+from tacsim.physics.failure.tuning import MAX_DUMPS
 from tacsim.physics.worlds.press import PressWorld
 
 TOO_DEEP = 5e-3
@@ -135,7 +136,7 @@ def test_dumps_are_numbered_and_few(tmp_path: Path) -> None:
     world = PressWorld(SCENE)
     with dumps_in(tmp_path):
         assert [press_through(world).dump for _ in range(2)] == [tmp_path / "00", tmp_path / "01"]
-        for number in range(2, MOST_DUMPS):
+        for number in range(2, MAX_DUMPS):
             (tmp_path / f"{number:02d}").mkdir()
         failure = press_through(world)
     assert failure.dump is None and "no dump could be written" in str(failure) and "holds 20 dumps" in str(failure)

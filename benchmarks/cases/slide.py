@@ -141,12 +141,13 @@ def _drag_in(
     preset: str, indenter: Indenter, way: tuple[float, float, float], **settling: float
 ) -> tuple[float, MoveStats]:
     """Drag over normal force after one motion by so much from where the indenter touches [m]."""
-    from tacsim.physics.worlds.press import CLEARANCE, PressWorld
+    from tacsim.physics.worlds.press import PressWorld
+    from tacsim.physics.worlds.tuning import INITIAL_GAP
 
     scene = {"body": None, "preset": preset, "indenter": indenter, "settling": settling}
     world = PressWorld(Scene.model_validate(scene))
     pose = world.pose("indenter")
-    target = pose.position + way - [0.0, 0.0, CLEARANCE]
+    target = pose.position + way - [0.0, 0.0, INITIAL_GAP]
     stats = world.move({"indenter": Pose(target, pose.quaternion)})
     force = world.wrench("lower")
     return float(np.hypot(force[0], force[1]) / -force[2]), stats

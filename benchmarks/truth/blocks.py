@@ -18,9 +18,9 @@ from tacsim.physics.exec import layout
 from tacsim.physics.exec.environment import Counts, Environment, Floats, Params, Partial
 from tacsim.physics.exec.lanes import LANES, NODES, PARTS, share_start, strip, vec3
 from tacsim.physics.exec.team import CHUNK, Sync, first_in_chunk, next_piece, one_if, own_part, piece_done, run_team
-from tacsim.physics.gel.element import SMALLEST_STRETCH
 from tacsim.physics.gel.gel import GelParams, GelState
 from tacsim.physics.gel.kernels import Gels, Lattice, first_node, gel_advance, gel_forces, gel_of
+from tacsim.physics.gel.tuning import MIN_VOLUME_RATIO
 
 Steps = ti.types.ndarray(dtype=ti.i32, ndim=2)
 Scalars = ti.types.ndarray(dtype=ti.f32, ndim=1)
@@ -158,7 +158,7 @@ class GelBlock(Block):
         self.counts[0, layout.STEPS] = substeps
         gel_substeps(*self._arguments, *keep, int(speed is not None), speed or 0.0)
         smallest = float(self.partial[0, :, layout.SMALLEST_VOLUME].min())
-        if not smallest > SMALLEST_STRETCH:
+        if not smallest > MIN_VOLUME_RATIO:
             raise RuntimeError(f"an element of a gel block shrank to {smallest:.3g} of its volume: drive it less far")
 
     @property

@@ -24,9 +24,8 @@ from tacsim.optics.surface import SurfaceSample, SurfaceTable, sample_surface
 from tacsim.physics.failure.dump import dumps_in
 from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.physics.move import MoveStats
-from tacsim.physics.worlds.base import POSSIBLE_SHARE
-from tacsim.physics.worlds.press import CLEARANCE, PressWorld
-from tacsim.physics.worlds.press_state import GRID_SPACING
+from tacsim.physics.worlds.press import PressWorld
+from tacsim.physics.worlds.tuning import INITIAL_GAP, MESH_GRID_SPACING, SAFE_PATH_SHARE
 from tacsim.report.press_pictures import write_height_picture, write_side_picture
 
 QUARTER_TURN = math.pi / 2  # a twist is cut into pieces of at most this: each motion takes the shorter rotation [rad]
@@ -83,7 +82,7 @@ def press(scene: Scene, sensor: SensorModel, motion: PressMotion, render: Render
     turn = start.quaternion if motion.turn is None else motion.turn
     below = world.below(turn)
     if any(motion.at) or motion.turn is not None:
-        world.place({"indenter": Pose(np.array([*motion.at, below + CLEARANCE]), turn)})
+        world.place({"indenter": Pose(np.array([*motion.at, below + INITIAL_GAP]), turn)})
     targets = _targets(world.pose("indenter"), below - motion.depth, motion)
     moves, unfollowed = [], ""
     try:
@@ -124,7 +123,7 @@ def deepest_possible(scene: Scene, motion: PressMotion, failure: SimulationDiver
     depth = min(failure.depth, motion.depth)
     with dumps_in(None):
         for _ in range(MAX_TRIALS):
-            depth = _rounded_down(POSSIBLE_SHARE * depth)
+            depth = _rounded_down(SAFE_PATH_SHARE * depth)
             world = PressWorld(scene)
             pose = world.pose("indenter")
             below = world.below(pose.quaternion)
@@ -197,7 +196,7 @@ def _gaps(indenter: Indenter, points: FloatArray, element: float) -> FloatArray:
     geometry = indenter.geometry
     if not isinstance(geometry, Mesh):
         return distance(geometry, points, indenter.rounding(element))
-    return tiled_distance(geometry, GRID_SPACING).sample(points)[0]
+    return tiled_distance(geometry, MESH_GRID_SPACING).sample(points)[0]
 
 
 def _filled(mask: NDArray[np.bool_], width: int) -> NDArray[np.bool_]:

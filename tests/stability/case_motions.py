@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from tacsim.interface import Pose
 from tacsim.physics.world import World
-from tacsim.physics.worlds import press
+from tacsim.physics.worlds.tuning import INITIAL_GAP
 
 Targets = Mapping[str, Pose]
 Motions = Callable[[World], Iterator[Targets]]
@@ -63,7 +63,7 @@ def push(depth: float, steps: int = 1) -> Motions:
 
     def motions(world: World) -> Iterator[Targets]:
         for _ in range(steps):
-            yield by(world, "indenter", z=-(depth + press.CLEARANCE) / steps)
+            yield by(world, "indenter", z=-(depth + INITIAL_GAP) / steps)
 
     return motions
 

@@ -26,7 +26,7 @@ from tacsim.physics.move import MoveStats
 from tacsim.physics.seed import world as seed_world
 from tacsim.physics.world import World, make_world
 from tacsim.physics.worlds import fem, hybrid_inertia, press
-from tacsim.physics.worlds.base import RETRIES
+from tacsim.physics.worlds.tuning import MAX_RETRIES
 
 
 @dataclass(frozen=True)
@@ -126,7 +126,7 @@ def _assert_consistent(world: World, stats: MoveStats, targets: Targets) -> None
     assert 0 <= stats.hold <= min(stats.substeps, settling.max_substeps)
     if stats.settled != (stats.residual <= settling.tolerance):  # what friction could not follow has not settled either
         assert not stats.settled and settling.mach is not None  # type: ignore[attr-defined]
-    assert stats.residual >= 0 and stats.overlap >= 0 and stats.guard_hits >= 0 and 0 <= stats.retries <= RETRIES
+    assert stats.residual >= 0 and stats.overlap >= 0 and stats.guard_hits >= 0 and 0 <= stats.retries <= MAX_RETRIES
     for name, pose in targets.items():
         assert np.allclose(world.pose(name).position, pose.position, atol=1e-12)
     assert all(np.isfinite(a).all() for a in world.snapshot().values())

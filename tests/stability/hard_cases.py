@@ -32,7 +32,7 @@ from case_motions import (
 
 from tacsim.models.material import BodyMaterial, GelMaterial
 from tacsim.models.scene import Body, Box, Cylinder, Gel, Indenter, Mesh, Scene, Settling, Sphere
-from tacsim.physics.worlds.base import RETRIES
+from tacsim.physics.worlds.tuning import MAX_RETRIES
 
 GEL = Gel(size=(10e-3, 10e-3, 4e-3))
 WIDE = Gel(size=(16e-3, 16e-3, 2e-3), material=GelMaterial(youngs_modulus=10e6, poisson_ratio=0.3), housing=None)
@@ -101,8 +101,8 @@ def with_nan(times: int) -> dict[str, Any]:
     return {"fem.copies": times, "seed.copies": times}
 
 
-SHORT = {"hybrid_inertia.COURANT": 0.3, "press.COURANT": 0.3, "seed.COURANT": 0.3}
-TOO_LONG = {"hybrid_inertia.COURANT": 1.2, "press.COURANT": 1.2, "seed.COURANT": 1.5}
+SHORT = {"hybrid_inertia.BODY_COURANT": 0.3, "press.PRESS_COURANT": 0.3, "seed.COURANT": 0.3}
+TOO_LONG = {"hybrid_inertia.BODY_COURANT": 1.2, "press.PRESS_COURANT": 1.2, "seed.COURANT": 1.5}
 RUSHED = Settling(mach=0.1, tolerance=1e-2, max_substeps=600, flow_mach=0.15)
 USUAL = Settling(tolerance=1e-2, max_substeps=800)
 PATIENT = Settling(mach=0.1, tolerance=1e-2)
@@ -110,7 +110,7 @@ FOLLOWED = Settling(mach=0.02, tolerance=1e-2, max_substeps=800)
 SLOWER = Settling(mach=0.05, tolerance=1e-2, max_substeps=800)
 BALL = indented(Sphere(radius=4e-3))
 SMALL = cube(3e-3, gel=Gel(size=(8e-3, 8e-3, 4e-3)))
-ALWAYS = RETRIES + 1  # once in every attempt
+ALWAYS = MAX_RETRIES + 1  # once in every attempt
 
 CASES: dict[str, Case] = {
     # materials at their limits

@@ -21,7 +21,7 @@ from tacsim.models.hardware import UrArmConfig, parts_of
 from tacsim.models.rig import ReplayArmConfig, ReplaySensorConfig, RigConfig
 from tacsim.models.scene import Scene
 from tacsim.models.sensor import CanonicalGrid, Markers
-from tacsim.physics.worlds.press import CLEARANCE
+from tacsim.physics.worlds.tuning import INITIAL_GAP
 from tacsim.record.reader import EpisodeFile
 from tacsim.record.sources import read_columns
 
@@ -227,7 +227,7 @@ class Recordings:
                 "rig; `tacsim calibrate touch` finds it)"
             )
         assert self.scene.indenter is not None
-        height = self._half_height(path) + CLEARANCE
+        height = self._half_height(path) + INITIAL_GAP
         return Pose(np.array([0.0, 0.0, height]), self.scene.indenter.turn)
 
 

@@ -8,8 +8,8 @@ from tacsim.physics.exec.lanes import NODES, ON_DEVICE, bounded, strip, vec4
 
 Ends = ti.types.ndarray(dtype=ti.i32, ndim=1)  # `Links.ends` of all environments
 
-PUSHES, MOVES = 0, 1  # the two tables of `Links`
-GETS, GIVES = 0, 1  # the two rows of each
+PUSHES, MOVES = range(2)  # the two tables of `Links`
+GETS, GIVES = range(2)  # the two rows of each
 
 
 @ti.func

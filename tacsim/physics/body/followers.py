@@ -1,7 +1,7 @@
 """Which nodes of the body's grid are light, and which heavier ones lead them.
 
 A node outside the body that hardly any particle reaches has a mass next to nothing, and drifts for thousands of
-substeps: what is measured then creeps. So a node with less than LIGHT particle masses has no motion of its own. Its
+substeps: what is measured then creeps. So a node with less than MAX_TIED_NODE_MASS has no motion of its own. Its
 velocity is that of the linear field which fits its leaders best, heavy nodes nearby; what pushes it, and its mass,
 pushes them in the same shares. A linear field is met exactly, so momentum and angular momentum stay. Extended B-splines
 do the same to a basis (Hoellig et al. 2001; in MPM Yamaguchi et al. 2021). Why linear: docs/decisions/0002.
@@ -16,12 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from tacsim.interface import FloatArray
+from tacsim.physics.body.tuning import MAX_LEADER_DISTANCE, MAX_LEADER_SPREAD, MAX_TIED_NODE_MASS, SLOPE_RIDGE
 from tacsim.physics.exec.lanes import PARTS
-
-LIGHT = 0.05  # particle masses: a node with less follows
-REACH = 3  # [cells] to a leader, at most; every particle has a heavy node within two cells of each that it reaches
-SPREAD = 1.0  # [cells] by which a leader may be farther than the nearest one
-RIDGE = 1e-8  # on slopes: leaders that lie in a plane tell none across it, which is 0 then
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,13 +53,13 @@ def node_masses(places: np.ndarray, origin: np.ndarray, cell: float, shape: tupl
 
 def following(masses: FloatArray) -> tuple[np.ndarray, np.ndarray, FloatArray]:
     """Followers, their leaders, and the leaders' shares, (n,) each; masses: of all nodes, in particle masses."""
-    light = (masses > 0.0) & (masses < LIGHT)
+    light = (masses > 0.0) & (masses < MAX_TIED_NODE_MASS)
     while True:
         found = _fitted(light, (masses > 0.0) & ~light)
         follower, leader, share = found
         carried = masses.ravel().copy()
         np.add.at(carried, leader, share * carried[follower])
-        sunk = (carried < LIGHT / 2).reshape(masses.shape) & (masses > 0.0) & ~light
+        sunk = (carried < MAX_TIED_NODE_MASS / 2).reshape(masses.shape) & (masses > 0.0) & ~light
         if not sunk.any():
             return found
         light |= sunk  # shares beyond the nearest leaders may be negative: one that they leave no mass follows, too
@@ -71,20 +67,21 @@ def following(masses: FloatArray) -> tuple[np.ndarray, np.ndarray, FloatArray]:
 
 def _fitted(light: np.ndarray, heavy: np.ndarray) -> tuple[np.ndarray, np.ndarray, FloatArray]:
     """The value at each light node of the linear field that fits its leaders best, weighted by 1 / distance^4."""
-    ball = np.arange(-REACH, REACH + 1)
+    ball = np.arange(-MAX_LEADER_DISTANCE, MAX_LEADER_DISTANCE + 1)
     offsets = np.stack(np.meshgrid(ball, ball, ball, indexing="ij"), axis=-1).reshape(-1, 3)
     distance = np.sqrt((offsets**2).sum(axis=1))
-    inside = (distance > 0.0) & (distance <= REACH)
+    inside = (distance > 0.0) & (distance <= MAX_LEADER_DISTANCE)
     offsets, distance = offsets[inside], distance[inside]
     nodes = np.argwhere(light)
-    leads = np.pad(heavy, REACH)[tuple((nodes[:, None] + offsets + REACH).transpose(2, 0, 1))]
+    padded = np.pad(heavy, MAX_LEADER_DISTANCE)
+    leads = padded[tuple((nodes[:, None] + offsets + MAX_LEADER_DISTANCE).transpose(2, 0, 1))]
     away = np.where(leads, distance, np.inf)
     nearest = away.min(axis=1, initial=np.inf)
     nodes, away, nearest = (rows[np.isfinite(nearest)] for rows in (nodes, away, nearest))
-    weights = np.where(away <= nearest[:, None] + SPREAD, away, np.inf) ** -4.0
+    weights = np.where(away <= nearest[:, None] + MAX_LEADER_SPREAD, away, np.inf) ** -4.0
     basis = np.column_stack([np.ones(len(offsets)), offsets])
     normal = (weights @ (basis[:, :, None] * basis[:, None, :]).reshape(-1, 16)).reshape(-1, 4, 4)
-    normal[:, 1:, 1:] += RIDGE * weights.sum(axis=1)[:, None, None] * np.eye(3)
+    normal[:, 1:, 1:] += SLOPE_RIDGE * weights.sum(axis=1)[:, None, None] * np.eye(3)
     # the row of the inverse that gives the value at the node itself
     value = np.linalg.solve(normal, np.broadcast_to([[1.0], [0.0], [0.0], [0.0]], (len(nodes), 4, 1)))[:, :, 0]
     shares: np.ndarray = weights * (value @ basis.T)

@@ -13,7 +13,7 @@ from tacsim.physics.exec.lanes import NODES, ON_DEVICE, bounded, part_range, vec
 
 # In `changes` (environments, 3, nodes, 4): change of a node's momentum, and its mass; mean change of velocity of the
 # cell that a node begins; the first again, after the filter's first pass
-CHANGE, CELL, SECOND = 0, 1, 2
+CHANGE, CELL, SECOND = range(3)
 
 
 @ti.func

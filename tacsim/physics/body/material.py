@@ -5,17 +5,18 @@ and stay symmetric, so products of them need 6 numbers only: no SVD, no eigenval
 The same laws in float64 NumPy: benchmarks/truth/laws.py.
 """
 
+import math
+
 from tacsim.compute.runtime import ti
+from tacsim.physics.body.tuning import MAX_EXP_ARGUMENT, MAX_LOG1P_ARGUMENT, MAX_LOG_ARGUMENT
 
 vec3 = ti.types.vector(3, ti.f32)
 vec6 = ti.types.vector(6, ti.f32)
 mat3 = ti.types.matrix(3, 3, ti.f32)
 
-LN_2 = 0.6931471805599453
-SQRT_2_3 = (2.0 / 3.0) ** 0.5  # equivalent plastic strain over the norm of the plastic strain increment
-ELASTIC = 1e9  # elastic limit of a body that never yields: it runs no return mapping
-# Largest arguments of the series below: errors under float32's rounding, 1.4e-5 relative, 3e-6 absolute
-SERIES_LOG1P, SERIES_LOG, SERIES_EXP = 0.4, 0.5, 0.2
+LN_2 = math.log(2.0)
+SQRT_2_3 = math.sqrt(2.0 / 3.0)  # equivalent plastic strain over the norm of the plastic strain increment
+UNREACHABLE_LIMIT = 1e9  # elastic limit of a body that never yields: it runs no return mapping
 
 
 @ti.func
@@ -87,7 +88,7 @@ def log1p_series(z):
 def log1p(x):
     """ln(1 + x), accurate in f32 for small x."""
     y = 0.0
-    if ti.abs(x) < SERIES_LOG1P:
+    if ti.abs(x) < MAX_LOG1P_ARGUMENT:
         y = log1p_series(x / (2.0 + x))
     else:
         y = ti.log(1.0 + x)
@@ -143,9 +144,9 @@ def logarithm(a):
     """log(I + a). Large strain (|a| > 0.5) falls back on log(I + a) = 2^n log((I + a)^(1/2^n)), n <= 3."""
     scale = 1.0
     root = a
-    if frobenius(a) > SERIES_LOG:
+    if frobenius(a) > MAX_LOG_ARGUMENT:
         for _ in range(3):
-            if frobenius(root) > SERIES_LOG:
+            if frobenius(root) > MAX_LOG_ARGUMENT:
                 root = square_root(root)
                 scale *= 2.0
     return scale * log_pade(root)
@@ -167,7 +168,7 @@ def exponential_minus_identity(x, norm):
     halvings = 0
     small = norm
     for _ in range(4):
-        if small > SERIES_EXP:
+        if small > MAX_EXP_ARGUMENT:
             small *= 0.5
             halvings += 1
     y = exponential_series((small / norm) * x)
@@ -213,7 +214,7 @@ def small_strain(e):
     shape = volume_preserving(e, (1.0 - t) / (1.0 + t))
     strain = 0.5 * log_pade(shape)
     strain = plus_identity(strain, -(strain[0] + strain[1] + strain[2]) / 3.0)  # dev(eps)
-    large = ti.select(ti.abs(x) > SERIES_LOG1P, 1, 0) | ti.select(square(shape) > SERIES_LOG**2, 1, 0)
+    large = ti.select(ti.abs(x) > MAX_LOG1P_ARGUMENT, 1, 0) | ti.select(square(shape) > MAX_LOG_ARGUMENT**2, 1, 0)
     return 0.5 * log1p_series(z), strain, (1.0 + t) / (1.0 - t), large
 
 
@@ -244,7 +245,7 @@ def return_small_strain(e, plastic_strain, mu, bulk, yield_strain, hardening):
     returned = plus_identity(growth * volume, volume - 1.0)
     yields = norm > yield_limit
     elastic = vec6([ti.select(yields, returned[c], e[c]) for c in ti.static(range(6))])
-    large = large | ti.select(2.0 * remaining * norm > SERIES_EXP, 1, 0)
+    large = large | ti.select(2.0 * remaining * norm > MAX_EXP_ARGUMENT, 1, 0)
     new_plastic_strain = plastic_strain + SQRT_2_3 * hardening_factor * ti.max(0.0, norm - yield_limit)
     return elastic, new_plastic_strain, plus_identity(2.0 * mu * remaining * strain, bulk * log_j), large
 

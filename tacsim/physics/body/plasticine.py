@@ -11,13 +11,11 @@ import numpy as np
 
 from tacsim.models.material import BodyMaterial, lame
 from tacsim.physics.body.followers import Links, links, node_masses
-from tacsim.physics.body.material import ELASTIC
+from tacsim.physics.body.material import UNREACHABLE_LIMIT
+from tacsim.physics.body.tuning import STENCIL_REACH
 from tacsim.physics.exec import layout
 from tacsim.physics.exec.lanes import CACHE_LINE, COPIES, LANES, MAX_NUMBERS, NODES, PARTS, aligned_zeros, padded
 from tacsim.physics.units import MM, MPA
-
-BORDER = 4  # [cells] that a grid reaches beyond its particles' places, at most
-STENCIL_REACH = 1.501  # [cells] from a particle: at and beyond that no node gets anything of it, whatever is rounded
 
 
 @dataclass(frozen=True)
@@ -58,7 +56,7 @@ def body_params(material: BodyMaterial, spacing: float, volume: float | None = N
     mu, lam = lame(material)
     limit = material.elastic_limit
     return BodyParams(
-        spacing * MM, mu * MPA, (lam + 2 * mu / 3) * MPA, limit if math.isfinite(limit) else ELASTIC,
+        spacing * MM, mu * MPA, (lam + 2 * mu / 3) * MPA, limit if math.isfinite(limit) else UNREACHABLE_LIMIT,
         (spacing**3 if volume is None else volume) * MM**3, material.hardening,
     )  # fmt: skip
 

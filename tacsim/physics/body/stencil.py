@@ -9,12 +9,15 @@ from tacsim.physics.exec.lanes import NODES, copy_of, vec3
 LINE = 2 if NODES == 2 else 3  # strips that hold three neighbours
 
 # Rows of a block's own arrays, LANES numbers each.
-AT = 0  # offset of the particle from the stencil's first node; along z from its first strip
-W_X, W_Y, W_Z = 3, 6, 9  # weights by axis
-STENCIL = W_Z + NODES * LINE
+_rows = layout.Layout()
+AT = _rows.place(3)  # offset of the particle from the stencil's first node; along z from its first strip
+W_X, W_Y, W_Z = _rows.place(3), _rows.place(3), _rows.place(NODES * LINE)  # weights by axis
+STENCIL = _rows.size
 # Whole numbers: the first strip of each of the stencil's 9 lines along z, then
-OFF, LARGE = 9, 10  # off the grid; strain for `return_any_strain`
-INDICES = 11
+_indices = layout.Layout()
+_indices.place(9)
+OFF, LARGE = _indices.place(), _indices.place()  # off the grid; strain for `return_any_strain`
+INDICES = _indices.size
 
 
 class Slab(NamedTuple):

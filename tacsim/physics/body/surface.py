@@ -14,11 +14,9 @@ from numpy.typing import NDArray
 
 from tacsim.geometry.shapes import distance, outward_normals
 from tacsim.models.scene import Shape
+from tacsim.physics.body.tuning import MIN_SURFACE_DISTANCE, SURFACE_DEPTH
 
 FloatArray = NDArray[np.floating]
-
-OUTER = 1.0  # particles at most so many spacings deep make the surface; those below are covered by them
-LEAST = 0.01  # smallest distance from the surface, in spacings: keeps the inverse finite
 
 
 def tangent_planes(geometry: Shape, points: NDArray[np.float64], spacing: float) -> NDArray[np.float64]:
@@ -28,10 +26,10 @@ def tangent_planes(geometry: Shape, points: NDArray[np.float64], spacing: float)
     Raises what :func:`tacsim.geometry.shapes.distance` raises.
     """
     depth = -distance(geometry, points)
-    outer = np.flatnonzero(depth <= OUTER * spacing)
+    outer = np.flatnonzero(depth <= SURFACE_DEPTH * spacing)
     planes = np.zeros((len(points), 3))
     normals = outward_normals(geometry, points[outer])
-    planes[outer] = normals / np.maximum(depth[outer], LEAST * spacing)[:, None]
+    planes[outer] = normals / np.maximum(depth[outer], MIN_SURFACE_DISTANCE * spacing)[:, None]
     return planes
 
 

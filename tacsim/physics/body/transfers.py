@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 from tacsim.compute.runtime import ti
 from tacsim.physics.body.material import (
-    ELASTIC,
+    UNREACHABLE_LIMIT,
     convect,
     full,
     gradient,
@@ -73,9 +73,9 @@ from tacsim.physics.exec.lanes import (
 Strips = ti.types.ndarray(dtype=strip, ndim=1)  # masses, velocities
 
 # What node (i, j, n) gets is w_i w_j w_n (q + i ax + j ay + n az), each of these momentum x, y, z and mass.
-MOMENTUM, MOMENTUM_X, MOMENTUM_Y, MOMENTUM_Z = 0, 4, 8, 12
+MOMENTUM, MOMENTUM_X, MOMENTUM_Y, MOMENTUM_Z = range(0, 16, 4)
 # Sums over the stencil: plain, and by x, y, z with the node's number as a factor
-SUM, BY_X, BY_Y, BY_Z = 0, 1, 2, 3
+SUM, BY_X, BY_Y, BY_Z = range(4)
 
 
 class Body(NamedTuple):
@@ -129,7 +129,7 @@ def return_block(
     """Return mapping of LANES particles: elastic and plastic strain in `old` -> in `new`, and Kirchhoff stress."""
     mu, bulk = env.param(layout.BODY_MU), env.param(layout.BODY_BULK)
     yield_strain, hardening = env.param(layout.BODY_LIMIT), env.param(layout.BODY_HARDENING)
-    if yield_strain < ELASTIC:
+    if yield_strain < UNREACHABLE_LIMIT:
         for lane in range(LANES):
             elastic, plastic_strain, tau, large = return_small_strain(
                 six(old, 0, lane), old[6, lane], mu, bulk, yield_strain, hardening

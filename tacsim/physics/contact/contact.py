@@ -10,6 +10,7 @@ too little where a contact grows while it slides.
 """
 
 from tacsim.compute.runtime import ti
+from tacsim.physics.contact.tuning import CONTACT_DAMPING, MIN_SURFACE_AREA, PARTICLE_TANGENTIAL_STIFFNESS
 from tacsim.physics.exec import layout
 from tacsim.physics.exec.environment import record_more, record_most
 from tacsim.physics.exec.lanes import ON_DEVICE, add_four, filled, slot_of, vec2, vec3, vec4
@@ -17,13 +18,7 @@ from tacsim.physics.gel.kernels import surface_at
 
 ContactHistory = ti.types.vector(7, ti.f32)  # what contact remembers of a particle and a gel
 
-CONTACT_DAMPING = 0.3  # c = 0.3 k dt = 0.3 m / dt, for normal and tangential motion
-TANGENT_STIFFNESS = 0.5  # k_t / k_n
-# Share of a change of the normal force that its memory follows each substep. Motions in real time have 0: the memory
-# follows the overlap with a delay, so it creates energy, which only damping takes away.
-MEMORY_RATE = 0.05
-FREE, ON_GEL, ON_HOUSING = 0.0, 1.0, 2.0  # what a particle's anchor is on
-SMALLEST_AREA = 0.1  # of the surface seen from above, over its unmoved one; below that it counts as folded
+FREE, ON_GEL, ON_HOUSING = map(float, range(3))  # what a particle's anchor is on
 
 
 @ti.func
@@ -94,7 +89,7 @@ def newton_step(t1, t2, miss):
     """
     det = t1[0] * t2[1] - t1[1] * t2[0]
     step = miss
-    if det > SMALLEST_AREA:
+    if det > MIN_SURFACE_AREA:
         step = vec2(t2[1] * miss[0] - t2[0] * miss[1], t1[0] * miss[1] - t1[1] * miss[0]) / det
     return step
 
@@ -109,7 +104,7 @@ def even_mobility(env: ti.template()):
 def normal_force(spring, memory, drag, rate):
     """Normal force of a contact, what of it is not of the dashpot, and its new memory, which carries the force at rest.
 
-    spring: of the overlap; drag: of the dashpot, away from the contact; rate: see MEMORY_RATE.
+    spring: of the overlap; drag: of the dashpot, away from the contact; rate: see FORCE_MEMORY_RATE.
     """
     held = ti.max(spring + memory, 0.0)
     return ti.max(spring + memory - drag, 0.0), held, ti.max(memory + rate * spring, 0.0)
@@ -214,7 +209,7 @@ def particle_contact(env: ti.template(), part, x, v, history, radius, stiffened,
     moved = vec2(0.0)
     overlap = 0.0
     reach = 2.2 * 0.5 * h
-    c_n, k_t = CONTACT_DAMPING * k_n * dt / even_mobility(env), TANGENT_STIFFNESS * k_n
+    c_n, k_t = CONTACT_DAMPING * k_n * dt / even_mobility(env), PARTICLE_TANGENTIAL_STIFFNESS * k_n
     rate = env.param(layout.MEMORY)
     if x[2] > -1.2 * h * layers and ti.abs(x[0]) < reach * nx and ti.abs(x[1]) < reach * ny:
         start = vec2(x[0] / h + 0.5 * nx, x[1] / h + 0.5 * ny)  # lattice coordinates, were the surface unmoved

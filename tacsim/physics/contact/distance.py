@@ -6,8 +6,8 @@ from tacsim.compute.runtime import ti
 from tacsim.physics.exec import layout
 from tacsim.physics.exec.lanes import vec3
 
-SPHERE, CYLINDER, BOX, GRID = 0, 1, 2, 3
-UNKNOWN = 1e9  # distance where none is known
+SPHERE, CYLINDER, BOX, GRID = range(4)
+UNKNOWN_DISTANCE = 1e9  # distance where none is known
 
 
 class DistanceGrid(NamedTuple):
@@ -62,7 +62,7 @@ def signed_distance(env: ti.template(), kind, size, y, grid: ti.template()):
     size: half extents of a box; radius, -, half height of a cylinder; radius of a sphere; of a mesh half extents of
     its bounding box. The world lays as much of a mesh's grid as can touch (`PressState.cover`).
     """
-    phi, n = UNKNOWN, vec3(0.0, 0.0, 1.0)
+    phi, n = UNKNOWN_DISTANCE, vec3(0.0, 0.0, 1.0)
     rounding = env.param(layout.EDGE_RADIUS)
     if kind == SPHERE:
         r = y.norm()
@@ -73,7 +73,7 @@ def signed_distance(env: ti.template(), kind, size, y, grid: ti.template()):
         phi -= rounding
     elif kind == CYLINDER:
         r = ti.sqrt(y[0] * y[0] + y[1] * y[1])
-        beyond = vec3(r - size[0] + rounding, -UNKNOWN, ti.abs(y[2]) - size[2] + rounding)
+        beyond = vec3(r - size[0] + rounding, -UNKNOWN_DISTANCE, ti.abs(y[2]) - size[2] + rounding)
         phi, radial = corner_distance(beyond, vec3(1.0))
         phi -= rounding
         n = vec3(radial[0] * y[0] / ti.max(r, 1e-12), radial[0] * y[1] / ti.max(r, 1e-12), radial[2] * direction(y)[2])

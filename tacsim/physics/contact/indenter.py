@@ -9,8 +9,18 @@ sticks. Everything else is in the sensor frame [mm, MPa]. Why: docs/physics.md.
 from typing import Any, NamedTuple
 
 from tacsim.compute.runtime import ti
-from tacsim.physics.contact.contact import CONTACT_DAMPING, friction, surface_node
+from tacsim.physics.contact.contact import friction, surface_node
 from tacsim.physics.contact.distance import GRID, DistanceGrid, box_distance, signed_distance
+from tacsim.physics.contact.tuning import (
+    CONTACT_DAMPING,
+    INDENTER_TANGENTIAL_STIFFNESS,
+    MAX_SUBSTEP_TRAVEL,
+    MAX_TOUCH_DISTANCE,
+    MIN_PRESSURE,
+    RIM_DEPTH,
+    RIM_STIFFNESS,
+    SURFACE_SMOOTHING,
+)
 from tacsim.physics.exec import layout
 from tacsim.physics.exec.environment import record_most, record_sum
 from tacsim.physics.exec.lanes import (
@@ -36,18 +46,7 @@ Values = ti.types.ndarray(dtype=ti.f32, ndim=4)  # (environments, x, y, z)
 IndenterArrays = ti.types.argpack(anchor=Anchor, pressure=Pressure, values=Values)
 
 POINTS = 3  # quadrature points along one edge of a surface cell
-# The surface under the points is that of the nodes, smoothed by this share of (k h)^2 of each wave of number k.
-# Elements with one integration point are twice that too soft for it (0.124 along the lattice, 0.135 across), and the
-# surface acts twice, in what it feels and in what it hands on: a wave finds the half-space, to fourth order.
-SMOOTHING = 0.065
 SPLINE_SMOOTHING = 0.125  # of the quadratic B-spline over the same nodes
-TANGENT_STIFFNESS = 0.25  # over the normal one: meets the torsion of a bonded punch at elements of 1, 0.5 and 0.25 mm
-# Share of a point's stiffness where it is little inside an indenter, or before it: so a contact is as wide as
-# independent finite elements find it. So many elements inside it has all of it, or edges would cut in.
-RIM, EDGE = 0.6, 0.05
-FORGOTTEN = 1e-6  # shear moduli: a pressure below that is none
-TOUCHABLE = 0.5  # elements: a point farther from the indenter touches nothing
-MARGIN = 1.0  # elements: nothing passes so much in one substep, so cells that are farther have forgotten
 
 
 class Indenter(NamedTuple):
@@ -72,11 +71,11 @@ class Shape(NamedTuple):
 
 def point_weights() -> tuple[tuple[float, ...], ...]:
     """Of the two nodes before and the two after a cell's middle, at each point along it: right for whatever is linear,
-    and for a parabola but for SMOOTHING, which is the same at all points."""
+    and for a parabola but for SURFACE_SMOOTHING, which is the same at all points."""
     first = 0.5 / POINTS  # distance from the nearest node; the middle one has two
-    spread = first**2 + 2 * SMOOTHING
+    spread = first**2 + 2 * SURFACE_SMOOTHING
     near, far = (spread - first) / 2, (spread + first) / 2
-    edge = (SMOOTHING - SPLINE_SMOOTHING) / 2
+    edge = (SURFACE_SMOOTHING - SPLINE_SMOOTHING) / 2
     return (near, 1 - near - far, far, 0.0), (edge, 0.5 - edge, 0.5 - edge, edge), (0.0, far, 1 - near - far, near)
 
 
@@ -156,7 +155,7 @@ def carry(env: ti.template(), part, gel: ti.template()):
     count, h = (gel.nx + 1) * row, env.param(layout.GEL_SPACING)
     blocks = (count + LANES - 1) // LANES
     first, last = part_range(blocks, part)
-    least = FORGOTTEN * env.param(layout.GEL_MU)
+    least = MIN_PRESSURE * env.param(layout.GEL_MU)
     i, j = first * LANES // row, first * LANES % row
     for node in range(first * LANES, ti.min(last * LANES, count)):
         total = 0.0
@@ -194,7 +193,7 @@ def shape_of(env: ti.template(), it, drive: ti.template(), indenter: ti.template
 
 @ti.func
 def clearance(env: ti.template(), gel: ti.template(), i, j, shape: ti.template()):
-    """How much farther than TOUCHABLE all points of cell (i, j) are from the indenter, at least [mm].
+    """How much farther than MAX_TOUCH_DISTANCE all points of cell (i, j) are from the indenter, at least [mm].
 
     Nine points a cell, few of them near the indenter: its distance from the cell's middle decides; of a mesh, whose
     distances are true only near it, that of its bounding box. A distance grows no faster than the path.
@@ -217,7 +216,7 @@ def clearance(env: ti.template(), gel: ti.template(), i, j, shape: ti.template()
         node = surface_at(gel, i + p + 1, j + q + 1)
         corner = vec3([gel.surface[node + c] for c in range(3)]) - middle
         reach = ti.max(reach, (corner + h * vec3(p - 0.5, q - 0.5, 0.0)).norm_sqr())
-    return far - ti.sqrt(reach) - TOUCHABLE * h
+    return far - ti.sqrt(reach) - MAX_TOUCH_DISTANCE * h
 
 
 @ti.func
@@ -241,8 +240,8 @@ def point_push(env: ti.template(), gel: ti.template(), indenter: ti.template(), 
     y = shape.rotate.transpose() @ (x - shape.centre)
     phi, n_local = signed_distance(env, shape.kind, shape.size, y, shape.grid)
     touching, push = False, vec4(0.0)
-    if phi < TOUCHABLE * h:
-        stiff = RIM + (1.0 - RIM) * ti.max(0.0, ti.min(1.0, -phi / (EDGE * h)))
+    if phi < MAX_TOUCH_DISTANCE * h:
+        stiff = RIM_STIFFNESS + (1.0 - RIM_STIFFNESS) * ti.max(0.0, ti.min(1.0, -phi / (RIM_DEPTH * h)))
         pressure = us[3] - stiff * k_n * phi
         n = shape.rotate @ n_local  # out of the indenter: pushes the gel
         moving = shape.velocity + shape.spin.cross(x - shape.centre) - vec3(vs[0], vs[1], vs[2])  # relative to the gel
@@ -258,7 +257,7 @@ def point_push(env: ti.template(), gel: ti.template(), indenter: ti.template(), 
             slip -= slip.dot(n_local) * n_local
             memory += follow * (rest - memory)
             limit = env.param(layout.FRICTION) * memory
-            ft, left = friction(shape.rotate @ slip, sliding, limit, TANGENT_STIFFNESS * k_n, c_n)
+            ft, left = friction(shape.rotate @ slip, sliding, limit, INDENTER_TANGENTIAL_STIFFNESS * k_n, c_n)
             indenter.anchor[env.index, i, j] = anchor - (1.0 - left) * slip
             indenter.pressure[env.index, i, j] = memory
             force = area * (normal * n - ft)
@@ -290,7 +289,7 @@ def indent(env: ti.template(), part, it, drive: ti.template(), gel: ti.template(
         for cell_j in range(low, high):
             spare = clearance(env, gel, cell_i, cell_j, shape)
             if spare > 0.0:
-                if spare < MARGIN * h:
+                if spare < MAX_SUBSTEP_TRAVEL * h:
                     for p, q in ti.static(ti.ndrange(POINTS, POINTS)):
                         forget(env, indenter, cell_i * POINTS + p, cell_j * POINTS + q)
             else:

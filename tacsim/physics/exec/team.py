@@ -21,9 +21,7 @@ CHUNK = 512  # Taichi runs loops of up to 512 iterations on one thread: every me
 PATIENCE = 8_000  # polls of a stage that is not done, after which a member leaves: some 0.5 ms
 
 # Columns of `sync`, a row (one cache line) for each environment that has substeps to do
-ENVIRONMENT = 0  # its index
-DONE = 1  # pieces of work so far
-CLAIMED = 2  # stages of part 0, 1, ... that somebody has taken
+ENVIRONMENT, DONE, CLAIMED = range(3)  # its index; pieces of work so far; stages taken of part 0, 1, ...
 
 Sync = ti.types.ndarray(dtype=ti.i32, ndim=2)
 

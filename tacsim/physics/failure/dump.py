@@ -26,6 +26,7 @@ from tacsim.interface import Pose
 from tacsim.models.quantity import Config
 from tacsim.models.scene import Mesh, Scene
 from tacsim.physics.failure.health import SimulationDiverged
+from tacsim.physics.failure.tuning import MAX_DUMPS
 from tacsim.physics.move import MoveCommand
 from tacsim.physics.snapshot import State
 

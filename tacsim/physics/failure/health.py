@@ -14,13 +14,9 @@ from numpy.typing import NDArray
 from tacsim.interface import Pose
 from tacsim.physics.exec import layout
 from tacsim.physics.failure import diagnosis
+from tacsim.physics.failure.tuning import MAX_COURANT, MAX_GRID_NODES, MAX_SPEED, MIN_STEP_VOLUME
+from tacsim.physics.gel.tuning import MIN_VOLUME_RATIO
 from tacsim.physics.snapshot import State, copies, gel_arrays
-
-SMALLEST_VOLUME_RATIO = 0.05  # det F of a gel element, elastic volume ratio of a particle; below, it counts as inverted
-SMALLEST_STEP_VOLUME = 0.1  # det(I + dt C) of a particle in one substep
-FASTEST = 0.5  # speed of a particle or gel node / wave speed
-LARGEST_COURANT = 1.0  # time step / time of the pressure wave through the smallest cell or most squeezed element
-LARGEST_GRID = 20_000_000  # nodes of one environment; 80 bytes each on a CPU, in four copies
 
 ADVICE = "move less far or slower"
 TORN = (
@@ -125,20 +121,20 @@ def check_launch(
 
 def _fault(look: Callable[[], State], health: Health) -> tuple[str, diagnosis.Quantity] | None:
     """What is unphysical, and the quantity that shows where; None when all is well."""
-    if not health.smallest_volume_ratio > SMALLEST_VOLUME_RATIO:
+    if not health.smallest_volume_ratio > MIN_VOLUME_RATIO:
         ratio = health.smallest_volume_ratio
         told = f"volume ratio {ratio:.3g}" if ratio > -1e3 else "torn without bound"
         return f"a gel element is inverted or crushed ({told})", "node speed"
-    if not health.smallest_step_volume > SMALLEST_STEP_VOLUME:
+    if not health.smallest_step_volume > MIN_STEP_VOLUME:
         ratio = health.smallest_step_volume
         return f"a particle lost its volume in one substep (ratio {ratio:.3g})", "particle speed"
-    if not health.fastest < FASTEST:
-        return f"a particle moves at {health.fastest:.3g} of the wave speed (limit {FASTEST})", "particle speed"
+    if not health.fastest < MAX_SPEED:
+        return f"a particle moves at {health.fastest:.3g} of the wave speed (limit {MAX_SPEED})", "particle speed"
     if health.off_grid:
         return f"particles left the grid ({health.off_grid} particle substeps)", "particle speed"
-    if health.courant > LARGEST_COURANT:
+    if health.courant > MAX_COURANT:
         words = f"the time step is {health.courant:.3g} of what the pressure wave takes through the most squeezed"
-        return f"{words} element or grid cell (limit {LARGEST_COURANT:g})", "element length"
+        return f"{words} element or grid cell (limit {MAX_COURANT:g})", "element length"
     if health.sound:
         return None
     arrays = look()
@@ -146,22 +142,22 @@ def _fault(look: Callable[[], State], health: Health) -> tuple[str, diagnosis.Qu
     if entry is not None:
         return entry, "not finite"
     node = max((float(np.abs(v).max()) for v in gel_arrays(arrays, "gel_velocity").values()), default=0.0)
-    if node > FASTEST:
-        return f"a gel node moves at {node:.3g} of the wave speed (limit {FASTEST})", "node speed"
-    if diagnosis.clearly_uncrushed(arrays, SMALLEST_VOLUME_RATIO):
+    if node > MAX_SPEED:
+        return f"a gel node moves at {node:.3g} of the wave speed (limit {MAX_SPEED})", "node speed"
+    if diagnosis.clearly_uncrushed(arrays, MIN_VOLUME_RATIO):
         return None
     volumes = diagnosis.particle_volumes(arrays)
-    if volumes is not None and not volumes.min() > SMALLEST_VOLUME_RATIO:
+    if volumes is not None and not volumes.min() > MIN_VOLUME_RATIO:
         return f"a particle is crushed (elastic volume ratio {volumes.min():.3g})", "particle volume"
     return None
 
 
 def require_room(
-    low: NDArray[Any], high: NDArray[Any], cell: float, where: Callable[[], LaunchSpan], most: int = LARGEST_GRID
+    low: NDArray[Any], high: NDArray[Any], cell: float, where: Callable[[], LaunchSpan], most: int = MAX_GRID_NODES
 ) -> None:
     """Raises SimulationDiverged for a grid from `low` to `high` (3,) [mm] with more nodes than `most`, what there is
-    memory for, or LARGEST_GRID."""
-    most = min(most, LARGEST_GRID)
+    memory for, or MAX_GRID_NODES."""
+    most = min(most, MAX_GRID_NODES)
     counts = (np.asarray(high, np.float64) - np.asarray(low, np.float64)) / cell + 1
     if not float(np.prod(counts)) <= most:
         size = " x ".join(f"{length:.4g}" for length in (counts - 1) * cell)

@@ -8,16 +8,7 @@ gradients of that volume: they add up to none, nor turn.
 from tacsim.compute.runtime import ti
 from tacsim.physics.exec import layout
 from tacsim.physics.exec.lanes import LANES, vec3
-
-# The volume ratio of a corner at which it begins to press back, and its bulk modulus over lambda + 2 mu. A gel that is
-# dragged by much friction has corners of 0.2 by its own law: at 0.4 a ball at mu = 1.5 lost a quarter of its drag.
-NARROW, CORNER_STIFFNESS = 0.15, 24.0
-# The squared frequency of a narrow corner, of nodes as light as the surface's, times that of the step: at most this. A
-# corner between edges that are stretched is stiffer by the squares of its faces, and shook itself apart.
-BEARABLE = 1.5
-# Gradient of the hourglass modes in an element below which no corner is looked at: for an element that is not much
-# sheared besides, corners are above NARROW then.
-SKEW = 0.2
+from tacsim.physics.gel.tuning import CORNER_STIFFNESS, MAX_CORNER_FREQUENCY, MIN_CORNER_RATIO
 
 
 @ti.func
@@ -32,7 +23,7 @@ def hold_corners(env: ti.template(), gel: ti.template(), block, u, axis, layer, 
     h, mu, lam = [env.param(first + gel.index) for first in (layout.GEL_SPACING, layout.GEL_MU, layout.GEL_LAMBDA)]
     stiffness = lam + 2.0 * mu
     share, dt = CORNER_STIFFNESS * stiffness * h * h / 8.0, env.param(layout.STEP)
-    bearable = BEARABLE * env.param(layout.GEL_DENSITY + gel.index) * (h * h / dt) ** 2 / 2.0
+    bearable = MAX_CORNER_FREQUENCY * env.param(layout.GEL_DENSITY + gel.index) * (h * h / dt) ** 2 / 2.0
     for lane in range(LANES):
         if gel.lattice[gel.lattice_start + block][lane] > 0.0:
             for corner in range(8):
@@ -44,7 +35,7 @@ def hold_corners(env: ti.template(), gel: ti.template(), block, u, axis, layer, 
                 ey = sy / h * (displacement(gel, u + lane, axis, layer, i, 1 - j, k) - here) + vec3(0.0, 1.0, 0.0)
                 ez = sz / h * (displacement(gel, u + lane, axis, layer, i, j, 1 - k) - here) + vec3(0.0, 0.0, 1.0)
                 x, y, z = ey.cross(ez), ez.cross(ex), ex.cross(ey)
-                lacking = NARROW - ex.dot(x)
+                lacking = MIN_CORNER_RATIO - ex.dot(x)
                 if lacking > 0.0:
                     square = x.norm_sqr() + y.norm_sqr() + z.norm_sqr() + (sx * x + sy * y + sz * z).norm_sqr()
                     push = ti.min(share, bearable / square) * lacking

@@ -5,16 +5,16 @@ from tacsim.compute.runtime import ti
 from tacsim.physics.body.material import lanes_log
 from tacsim.physics.exec import layout
 from tacsim.physics.exec.lanes import LANES, lanes, load_lanes, opaque, store_lanes, vec3
-from tacsim.physics.gel.corner import SKEW, hold_corners
-
-HOURGLASS = 1.0 / 6.0  # the exact integral of a shear hourglass mode of a cube
-SMALLEST_STRETCH = 0.05  # J below this counts as inverted
+from tacsim.physics.gel.corner import hold_corners
+from tacsim.physics.gel.tuning import HOURGLASS_STIFFNESS, MIN_SKEW, MIN_VOLUME_RATIO
 
 # Rows of an element block's own array: displacements of eight corners, axis by axis, then the forces on them;
-WHOLE = 24  # 1 if the element is inside the gel, else 0
-SMALLEST = 25  # det F so far
-SKEWED = 26  # squared force of the hourglass modes
-ROWS = 27
+_rows = layout.Layout()
+_rows.place(24)
+WHOLE = _rows.place()  # 1 if the element is inside the gel, else 0
+SMALLEST = _rows.place()  # det F so far
+SKEWED = _rows.place()  # squared force of the hourglass modes
+ROWS = _rows.size
 
 
 @ti.func
@@ -42,7 +42,7 @@ def element_block(
     fill(rows, WHOLE, gel.lattice[opaque(zero, gel.lattice_start + block)])
     for lane in range(LANES):
         whole = rows[WHOLE, lane]
-        area, stiffness = (0.25 * h * h) * whole, (HOURGLASS * 2.0 * mu * h / 8.0) * whole
+        area, stiffness = (0.25 * h * h) * whole, (HOURGLASS_STIFFNESS * 2.0 * mu * h / 8.0) * whole
         # columns of F; hourglass forces of the modes s_x s_y, s_y s_z, s_x s_z, s_x s_y s_z
         fx, fy, fz = vec3(1.0, 0.0, 0.0), vec3(0.0, 1.0, 0.0), vec3(0.0, 0.0, 1.0)
         hxy, hyz, hxz, hxyz = vec3(0.0), vec3(0.0), vec3(0.0), vec3(0.0)
@@ -64,7 +64,7 @@ def element_block(
         rows[SKEWED, lane] = hxy.norm_sqr() + hyz.norm_sqr() + hxz.norm_sqr() + hxyz.norm_sqr()
         x, y, z = fy.cross(fz), fz.cross(fx), fx.cross(fy)  # columns of the cofactor matrix
         jacobian = fx.dot(x)
-        safe = ti.max(jacobian, SMALLEST_STRETCH)  # keeps the logarithm finite; the partial sums report it
+        safe = ti.max(jacobian, MIN_VOLUME_RATIO)  # keeps the logarithm finite; the partial sums report it
         # neo-Hooke: P = mu F + (lambda ln J - mu) cof(F) / J
         pressure = (lam * lanes_log(safe) - mu) / safe
         rows[SMALLEST, lane] = ti.min(rows[SMALLEST, lane], ti.select(whole > 0.0, jacobian, 1.0))
@@ -86,5 +86,5 @@ def element_block(
     most = 0.0
     for lane in range(LANES):
         most = ti.max(most, rows[SKEWED, lane])
-    if most > (SKEW * HOURGLASS * mu * h * h) ** 2:
+    if most > (MIN_SKEW * HOURGLASS_STIFFNESS * mu * h * h) ** 2:
         hold_corners(env, gel, block, u, axis, layer, to, row)

@@ -16,24 +16,21 @@ from numpy.typing import NDArray
 from tacsim.models.scene import Settling
 from tacsim.physics.failure.health import LaunchSpan, SimulationDiverged
 from tacsim.physics.motion.path import Path
+from tacsim.physics.motion.tuning import (
+    COMPARED_READINGS,
+    FORECAST_READINGS,
+    MIN_FORCE_SHARE,
+    SUBSTEPS_PER_HOLD,
+    SUBSTEPS_PER_LAUNCH,
+)
 from tacsim.physics.move import MoveStats
 from tacsim.physics.snapshot import State
 from tacsim.physics.units import MM
 
-SUBSTEPS_PER_LAUNCH = 80  # while frames are driven: a control step is one launch or two
-# While they are held: in the first launch, which has the four readings at `learn` without which nobody can tell of what
-# creeps, and in later ones, one reading at `draft`. Between launches the grid of a body that flows on is laid anew:
-# with 48, one that was squeezed to a fifth did not come to rest.
-SUBSTEPS_PER_HOLD = (16, 12)
-EARLIER_READINGS = 2  # that one is compared with: a single one may have the same phase of an oscillation
-FORESIGHT = 20.0  # readings
-LASTING = 20.0  # readings: how much longer a settled force of what flows keeps within the tolerance
-FORCE_FLOOR = 1e-3  # residuals are relative to the contact force, but to no less than this share of E thickness^2
-
 
 def force_floor(modulus: float, thickness: float) -> float:
     """The smallest force [N] that residuals are relative to, of a gel with Young's modulus [MPa] and thickness [mm]."""
-    return FORCE_FLOOR * modulus * thickness**2
+    return MIN_FORCE_SHARE * modulus * thickness**2
 
 
 @dataclass(frozen=True)
@@ -88,17 +85,17 @@ def still_to_come(first: ForceReading, second: ForceReading, third: ForceReading
     """How far the contact forces will still creep, relative to the largest force [-]: what is left of a change that
     shrinks by the same share from reading to reading, as contact that slips ever more slowly does.
 
-    A change that swings leaves nothing; of one that hardly shrinks only FORESIGHT readings are looked ahead.
+    A change that swings leaves nothing; of one that hardly shrinks only the next FORECAST_READINGS count.
     """
     before, now = second.contact - first.contact, third.contact - second.contact
     creeping = before * now > 0.0
     share = np.minimum(now[creeping] / before[creeping], 1.0)
-    to_come = np.abs(now[creeping]) * np.minimum(share / np.maximum(1.0 - share, 1e-9), FORESIGHT)
+    to_come = np.abs(now[creeping]) * np.minimum(share / np.maximum(1.0 - share, 1e-9), FORECAST_READINGS)
     return float(to_come.max(initial=0.0)) / max(float(np.abs(third.contact).max()), third.floor)
 
 
 def creep_to_come(held: Sequence[ForceReading], age: float) -> float:
-    """How far the contact forces of a body that flows will fall in LASTING readings more, relative to the largest
+    """How far the contact forces of a body that flows will fall in FORECAST_READINGS more, relative to the largest
     force [-]; infinite of fewer than three. held: of the hold so far; age: readings since the motion's middle.
 
     Clay at yield creeps with the logarithm of time: its rate goes with 1 / (time since it began), so the creep is as
@@ -114,7 +111,7 @@ def creep_to_come(held: Sequence[ForceReading], age: float) -> float:
     swings = before * now <= 0.0
     share = np.divide(now, before, out=np.zeros_like(now), where=~swings)
     began = np.maximum(span / np.maximum(1.0 - share, 1e-6), age)
-    to_come = np.abs(now) / span * began * np.log1p(LASTING / began)
+    to_come = np.abs(now) / span * began * np.log1p(FORECAST_READINGS / began)
     return float(to_come.max()) / max(float(np.abs(held[-1].contact).max()), held[-1].floor)
 
 
@@ -208,8 +205,8 @@ def move_and_settle(path: Path, settling: Settling, *, balanced: bool, most: int
         wanted = min(later if held else first, math.ceil(left / path.interval))
         readings += yield Launch(rest, 0, min(wanted * path.interval, left), wanted)
         held = min(held + wanted * path.interval, settling.max_substeps)
-        if len(readings) > EARLIER_READINGS:
-            earlier = readings[-1 - EARLIER_READINGS : -1]
+        if len(readings) > COMPARED_READINGS:
+            earlier = readings[-1 - COMPARED_READINGS : -1]
             worst = max(residual(readings[-1], each, balanced) for each in earlier)
             worst = max(worst, still_to_come(*readings[-3:]))
         if path.creeps:

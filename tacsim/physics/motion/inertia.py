@@ -16,10 +16,9 @@ from dataclasses import dataclass, field
 from tacsim.interface import Pose
 from tacsim.physics.gel.gel import GelParams
 from tacsim.physics.motion.controller import Launch
-from tacsim.physics.motion.path import MOST_SUBSTEPS, PEAK_SLOPE, ROUNDING, Path, path_length
+from tacsim.physics.motion.path import PEAK_SLOPE, Path, path_length
+from tacsim.physics.motion.tuning import MAX_DRIVE_MACH, MAX_SUBSTEPS, ROUNDING
 from tacsim.physics.units import MM, MPA
-
-FASTEST_DRIVE = 0.3  # peak speed of a driven frame / the gel's wave speed
 
 
 @dataclass(frozen=True)
@@ -68,18 +67,19 @@ def plan_real_time(start: Sequence[Pose], end: Sequence[Pose], duration: float, 
     if not (math.isfinite(duration) and duration > 0):
         raise ValueError(f"duration is {duration:g} s: give a positive time, or None for a quasi-static motion")
     substep = inertia.step / inertia.second
-    if not ROUNDING <= duration / substep <= MOST_SUBSTEPS:
+    if not ROUNDING <= duration / substep <= MAX_SUBSTEPS:
         raise ValueError(
             f"duration is {duration:.3g} s; at substeps of {substep:.3g} s (of the materials) it must lie"
-            f" between {ROUNDING * substep:.3g} and {MOST_SUBSTEPS * substep:.3g} s: is it in seconds? if so, make "
+            f" between {ROUNDING * substep:.3g} and {MAX_SUBSTEPS * substep:.3g} s: is it in seconds? if so, make "
             f"several motions of it"
         )
     kernel_time, wave = duration * inertia.second, inertia.second / MM
     peak = PEAK_SLOPE * path_length(start, end, lever) / kernel_time
-    if peak > FASTEST_DRIVE:
+    if peak > MAX_DRIVE_MACH:
         raise ValueError(
-            f"within {duration:.3g} s a frame would reach {peak * wave:.3g} m/s; the limit is {FASTEST_DRIVE:g} of the "
-            f"gel's wave speed, {FASTEST_DRIVE * wave:.3g} m/s: give at least {duration * peak / FASTEST_DRIVE:.3g} s"
+            f"within {duration:.3g} s a frame would reach {peak * wave:.3g} m/s; the limit is {MAX_DRIVE_MACH:g} of "
+            f"the gel's wave speed, {MAX_DRIVE_MACH * wave:.3g} m/s: "
+            f"give at least {duration * peak / MAX_DRIVE_MACH:.3g} s"
         )
     substeps = math.ceil(kernel_time / inertia.step)
     return Path(start, end, substeps, kernel_time / substeps)

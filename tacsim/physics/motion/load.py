@@ -21,16 +21,16 @@ from tacsim.interface import Pose
 from tacsim.models.scene import Scene
 from tacsim.physics.motion.controller import ForceReading, Launch, Motion, move_and_settle
 from tacsim.physics.motion.path import Path
+from tacsim.physics.motion.tuning import (
+    INITIAL_LOAD_TRAVEL,
+    INTERMEDIATE_LOAD_TOLERANCE,
+    MAX_LOAD_CORRECTION,
+    MAX_LOAD_CORRECTIONS,
+    MAX_LOAD_STEP,
+    MAX_LOAD_TRAVEL,
+    MIN_FORCE_SHARE,
+)
 from tacsim.physics.move import MoveStats
-
-# All as shares of the gel's thickness
-PIECE = 0.06  # longest path between two corrections
-CORRECTION = 0.025  # longest correction
-ASSUMED = 0.02  # travel that would change a force by all of itself, until it has been measured: a shallow contact's
-TRAVEL = 0.6  # furthest from the target along z; beyond, the load counts as out of reach
-SMALLEST_LOAD = 1e-3  # that the tolerance is relative to at least, as a share of E thickness^2
-CORRECTIONS = 60  # after one piece
-LOOSE = 0.1  # share of the load that it may be off between two pieces
 
 
 class LoadNotReached(RuntimeError):
@@ -74,8 +74,8 @@ class _NormalAxis:
 
     def correct(self, force: float, thickness: float) -> None:
         """Travels towards the load; force: of the settled state that it starts from."""
-        longest, error = CORRECTION * thickness, self.wanted - force
-        stiffness = self.stiffness or force / (ASSUMED * thickness)
+        longest, error = MAX_LOAD_CORRECTION * thickness, self.wanted - force
+        stiffness = self.stiffness or force / (INITIAL_LOAD_TRAVEL * thickness)
         step = math.copysign(longest, error) if abs(error) >= stiffness * longest else error / stiffness
         if self.wanted == 0.0:  # a force fades towards nothing ever more slowly: go on until they part
             step = min(step, -longest / 4)
@@ -99,7 +99,7 @@ def keep_loads(
     scene, targets = world.scene, dict(end)
     gels = {name: scene.gel_of(name) for name in scene.sensors}
     thickness = {name: gel.size[2] for name, gel in gels.items()}
-    smallest = {n: SMALLEST_LOAD * gel.material.youngs_modulus * thickness[n] ** 2 for n, gel in gels.items()}
+    smallest = {n: MIN_FORCE_SHARE * gel.material.youngs_modulus * thickness[n] ** 2 for n, gel in gels.items()}
     tolerance = scene.settling.tolerance
     axes = {name: _NormalAxis(load, tolerance * max(load, smallest[name])) for name, load in loads.items()}
     done: list[MoveStats] = []
@@ -127,7 +127,7 @@ def keep_loads(
 
     def correct_at(share: float, slack: float = 0.0) -> Generator[Launch, Sequence[ForceReading], float]:
         """The largest error [N] that is left; slack: share of the load that is near enough."""
-        for _ in range(CORRECTIONS):
+        for _ in range(MAX_LOAD_CORRECTIONS):
             errors = {name: abs(axis.wanted - force(name)) for name, axis in axes.items()}
             wrong = [n for n, axis in axes.items() if not errors[n] <= max(axis.tolerance, slack * axis.wanted)]
             if not wrong:
@@ -135,7 +135,7 @@ def keep_loads(
             before = {name: (axes[name].travel, force(name)) for name in wrong}
             for name, (_, felt) in before.items():
                 axes[name].correct(felt, thickness[name])
-            beyond = [name for name in wrong if abs(axes[name].travel) > TRAVEL * thickness[name]]
+            beyond = [name for name in wrong if abs(axes[name].travel) > MAX_LOAD_TRAVEL * thickness[name]]
             if beyond:
                 wrong = beyond
                 break
@@ -143,7 +143,7 @@ def keep_loads(
             for name, (travel, felt) in before.items():
                 axes[name].measure(axes[name].travel - travel, force(name) - felt)
         name = wrong[0]
-        limit = 1e3 * TRAVEL * thickness[name]
+        limit = 1e3 * MAX_LOAD_TRAVEL * thickness[name]
         raise LoadNotReached(
             f"'{name}' does not reach a load of {axes[name].wanted:g} N: {force(name):.3g} N after "
             f"{1e3 * axes[name].travel:+.3g} mm along its z axis from its target (limit {limit:.3g} mm); "
@@ -153,10 +153,10 @@ def keep_loads(
     world.plan(list(start.values()), list(targets.values()))  # raises ValueError for a path that is far too long
     end.update(start)
     length = max(float(np.linalg.norm(targets[name].position - start[name].position)) for name in targets)
-    pieces = max(1, math.ceil(length / (PIECE * min(thickness.values()))))
+    pieces = max(1, math.ceil(length / (MAX_LOAD_STEP * min(thickness.values()))))
     for piece in range(1, pieces + 1):
         if all(force(name) > 0.0 for name in loads):
-            yield from correct_at((piece - 1) / pieces, LOOSE)
+            yield from correct_at((piece - 1) / pieces, INTERMEDIATE_LOAD_TOLERANCE)
             here, there = on_path((piece - 1) / pieces), on_path(piece / pieces)
             for name, axis in axes.items():
                 axis.correct(force(name), thickness[name])

@@ -19,22 +19,20 @@ from numpy.typing import NDArray
 from tacsim import pose as se3
 from tacsim.interface import Pose
 from tacsim.physics.failure.health import LaunchSpan
+from tacsim.physics.motion.tuning import (
+    FLOW_RISE_TIME,
+    MAX_SUBSTEPS,
+    MIN_FLOW_TIME,
+    MIN_RAMP_TIME,
+    PASSING_VELOCITY,
+    READING_INTERVAL,
+    ROUNDING,
+    SHORT_PATH,
+)
 from tacsim.physics.units import MM
 
 PEAK_SLOPE = 1.875  # of the ramp, over its mean
 PEAK_BRAKING = 2.89  # of a ramp that rises quickly: its largest deceleration times the square of its time, over its way
-# Times of the gel's pressure wave through its thickness: the shortest ramp; the shortest step that flows, and how soon
-# it has turned; time of the hold between two readings of the forces
-SHORTEST_RAMP, SHORTEST_FLOW, FLOW_RISE, READING_INTERVAL = 2.0, 1.25, 0.25, 1.0
-# A step that flows passes its target at this share of its mean velocity. Where the next one turns back, the frame goes
-# beyond, and what yields keeps it; where it goes on, the gel feels the braking.
-PASSING = 0.5
-# Gel thicknesses: shorter paths are followed slower than they may be, where the stop leaves a trace: in what yields, in
-# friction
-SHORT_PATH, SHORT_SLIDE = 0.5, 0.25
-LINGERING_KNOTS = 2001  # of the numbers that a path whose end takes longer is interpolated between
-ROUNDING = 1e-6  # of a number of substeps
-MOST_SUBSTEPS = 1_000_000  # of one motion: hours, and no motion that anybody means
 
 
 def ramp(t: NDArray[np.float64], rise: float = 0.5) -> NDArray[np.float64]:
@@ -54,11 +52,12 @@ def ramp(t: NDArray[np.float64], rise: float = 0.5) -> NDArray[np.float64]:
 def lingering(rise: float, slower: float, last: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Times and shares of the way of a `ramp` whose end takes longer: `slower` times as long over the `last` share of
     the way, from twice that on ever slower. The times go from 0 to how many times as long all of it takes."""
-    knots = np.linspace(0.0, 1.0, LINGERING_KNOTS)
+    knot_count = 2001  # of the numbers that a path whose end takes longer is interpolated between
+    knots = np.linspace(0.0, 1.0, knot_count)
     shares = ramp(knots, rise)
     near = np.clip(2.0 - (1.0 - shares) / last, 0.0, 1.0)
     longer = 1.0 + (slower - 1.0) * near**2 * (3.0 - 2.0 * near)
-    return np.append(0.0, np.cumsum((longer[1:] + longer[:-1]) / 2.0)) / (LINGERING_KNOTS - 1), shares
+    return np.append(0.0, np.cumsum((longer[1:] + longer[:-1]) / 2.0)) / (knot_count - 1), shares
 
 
 @dataclass(frozen=True)
@@ -211,7 +210,7 @@ def plan(
     start: Sequence[Pose], end: Sequence[Pose], mach: float, dt: float, lever: float, thickness: float, *,
     remembered: float = 0.0, short: float = SHORT_PATH, slower: float = 1.0, last: float = 0.0, shortest: float = 0.0,
 ) -> Path:  # fmt: skip
-    """A path whose fastest point moves at peak Mach `mach`; it lasts no less than SHORTEST_RAMP gel thicknesses [mm],
+    """A path whose fastest point moves at peak Mach `mach`; it lasts no less than MIN_RAMP_TIME gel thicknesses [mm],
     since a shorter jolt mostly makes the gel ring, and reaches its full speed within half of that.
 
     remembered: length of the path [mm] whose stop leaves a trace: all of it in a body that yields; in friction what
@@ -220,15 +219,15 @@ def plan(
     slower: than that, how many times, the `last` [mm] of it is; see `lingering`.
     shortest: time [mm, wave speed 1] that it lasts at least.
 
-    Raises ValueError for a path that takes more than MOST_SUBSTEPS.
+    Raises ValueError for a path that takes more than MAX_SUBSTEPS.
     """
     interval = math.ceil(READING_INTERVAL * thickness / dt)
     length = path_length(start, end, lever)
     if length == 0:
         return Path(start, end, 0, dt, interval=interval)
     braked = math.sqrt(remembered * max(remembered, short * thickness))
-    lasting = max(PEAK_SLOPE * max(length, braked) / mach, SHORTEST_RAMP * thickness, shortest)
-    rise, lingers = SHORTEST_RAMP * thickness / 2 / lasting, None
+    lasting = max(PEAK_SLOPE * max(length, braked) / mach, MIN_RAMP_TIME * thickness, shortest)
+    rise, lingers = MIN_RAMP_TIME * thickness / 2 / lasting, None
     if slower > 1.0:
         lingers = slower, last / length
         lasting *= float(lingering(rise, *lingers)[0][-1])
@@ -240,8 +239,8 @@ def plan_flow(
     start: Sequence[Pose], end: Sequence[Pose], rates: NDArray[np.float64], mach: float, dt: float, lever: float,
     thickness: float,
 ) -> Path:  # fmt: skip
-    """The path of a step that flows: from `start`, left at `rates` (frames, 6), to `end`, passed at PASSING of the mean
-    velocity of the step. That is Mach `mach`; slower with the root of the length where it is less than SHORT_PATH gel
+    """The path of a step that flows: from `start`, left at `rates` (frames, 6), to `end`, passed at PASSING_VELOCITY
+    times its mean. That is Mach `mach`; slower with the root of the length where it is less than SHORT_PATH gel
     thicknesses [mm], as in `plan`. With no displacement and at rest it has no substeps. Raises as `plan` does."""
     displacements = displacements_between(start, end)
     interval = math.ceil(READING_INTERVAL * thickness / dt)
@@ -249,20 +248,21 @@ def plan_flow(
         return Path(start, end, 0, dt, interval=interval)
     length = of_fastest_point(displacements, lever)
     braked = math.sqrt(length * max(length, SHORT_PATH * thickness))
-    substeps = _substeps(max(braked / mach, SHORTEST_FLOW * thickness) / dt - ROUNDING, length, mach)
+    substeps = _substeps(max(braked / mach, MIN_FLOW_TIME * thickness) / dt - ROUNDING, length, mach)
     lasting = substeps * dt
-    rise = min(FLOW_RISE * thickness / lasting, 0.5)
+    rise = min(FLOW_RISE_TIME * thickness / lasting, 0.5)
     return Path(
-        start, end, substeps, dt, interval=interval, rise=rise, rates=(rates, PASSING * displacements / lasting)
+        start, end, substeps, dt, interval=interval, rise=rise,
+        rates=(rates, PASSING_VELOCITY * displacements / lasting),
     )  # fmt: skip
 
 
 def _substeps(count: float, length: float, mach: float) -> int:
-    """`count` rounded up. Raises ValueError for a path of `length` [mm] that takes more than MOST_SUBSTEPS."""
-    if not count <= MOST_SUBSTEPS:
+    """`count` rounded up. Raises ValueError for a path of `length` [mm] that takes more than MAX_SUBSTEPS."""
+    if not count <= MAX_SUBSTEPS:
         raise ValueError(
             f"a path of {length / MM:.3g} m at Mach {mach:.3g} would take {count:.2g} substeps (limit "
-            f"{MOST_SUBSTEPS:,}); are the targets in metres? if so, go there in several motions, or faster"
+            f"{MAX_SUBSTEPS:,}); are the targets in metres? if so, go there in several motions, or faster"
         )
     return math.ceil(count)
 

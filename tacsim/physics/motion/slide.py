@@ -12,28 +12,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tacsim.models.scene import CATCHING
-
-# Of the speed of the gel's shear wave: up to it a slide ends within 2 % of a slow one; at 0.25 it is up to 3 % off, at
-# 0.5 up to 17 %
-HURRIED = 0.155
-# Element sizes that an edge which catches on the mesh may be slid: further, drag is up to 50 % off
-CAUGHT = 0.5
-# Gel thicknesses that an indenter may be slid: further, the gel bunches up and lets go in snaps, at a friction above
-# SNAPPING, sooner if it is so deep as walls may be; and under what is so many thicknesses deep, at any friction
-SNAPPED, SNAPPED_SOONER, SNAPPING = 0.5, 0.4, 1.0
-DEEP_WALLS, DEEP = 0.15, 0.25
-# Where a slide goes across all of the drag that is there, its own lags behind in direction: by speed times damping, and
-# the more the less friction there is. So the friction itself is the share of its speed, within these.
-TURNS_AT = (0.35, 0.5)
-# Share of the speed for what is lifted with all of its drag: the gel comes up after it too late, and contact that feels
-# less for a moment slips. In three lifts of 0.1 mm a drag fell to 0.74 of its friction, settled.
-RELEASED = 0.35
-# Times the root of an element's size over the gel's thickness, the friction above which what has edges, and so walls,
-# ends a slide more slowly, in proportion: its contact slips in many small snaps, more of them the finer the mesh, and
-# each loses more drag the quicker it is, up to 5 % at standard. Only the last half of an element's size counts. Beyond
-# the friction that this is measured at, contact sticks rather than slips.
-WALLS_STICK, WALLS_LAST, STEEPEST = 1.9, 0.5, 1.5
-ROUNDING = 1e-6
+from tacsim.physics.motion.tuning import (
+    DEEP_WITH_EDGES,
+    DEEP_WITHOUT_EDGES,
+    LIFTING_SPEED,
+    MAX_CAUGHT_SLIDE,
+    MAX_DEEP_SLIDE_LENGTH,
+    MAX_SLIDE_LENGTH,
+    MAX_SLIDE_SHEAR_MACH,
+    MAX_SNAP_FRICTION,
+    ROUNDING,
+    STEEP_FRICTION,
+    TURNING_SPEED_RANGE,
+    WALL_SNAP_FRICTION,
+)
 
 
 def growth(way: NDArray[np.float64]) -> float:
@@ -64,8 +56,9 @@ def release(way: NDArray[np.float64], force: NDArray[np.float64], friction: floa
 def pace(way: NDArray[np.float64], force: NDArray[np.float64], friction: float) -> float:
     """Share of the default speed at which an indenter goes the `way` (3,), so that it ends as a slow one; `force` (3,)
     on the sensor [N], both in its axes."""
-    share = 1.0 - turn(way, force, friction) * (1.0 - min(max(friction, TURNS_AT[0]), TURNS_AT[1]))
-    return share * (1.0 - release(way, force, friction) * (1.0 - RELEASED))
+    slowest, fastest = TURNING_SPEED_RANGE
+    share = 1.0 - turn(way, force, friction) * (1.0 - min(max(friction, slowest), fastest))
+    return share * (1.0 - release(way, force, friction) * (1.0 - LIFTING_SPEED))
 
 
 def slower_walls(way: NDArray[np.float64], friction: float, mesh: float) -> float:
@@ -73,7 +66,7 @@ def slower_walls(way: NDArray[np.float64], friction: float, mesh: float) -> floa
     as a slow one. mesh: size of an element over the gel's thickness."""
     length = float(np.linalg.norm(way))
     along = math.hypot(way[0], way[1]) / length if length > 0.0 else 0.0
-    return 1.0 + along * max(0.0, min(friction, STEEPEST) / (WALLS_STICK * math.sqrt(mesh)) - 1.0)
+    return 1.0 + along * max(0.0, min(friction, MAX_SNAP_FRICTION) / (WALL_SNAP_FRICTION * math.sqrt(mesh)) - 1.0)
 
 
 @dataclass(frozen=True)
@@ -91,22 +84,24 @@ class Slide:
     def unfollowed(self, element: float, thickness: float) -> str:
         """Why it does not end as a slow one, and what to do; empty where it does. `element`: edge of an element of the
         gel, and how thick that is."""
-        if self.shear_mach > HURRIED:
+        if self.shear_mach > MAX_SLIDE_SHEAR_MACH:
             return "contact slips by inertia at that speed; leave out settling.mach, or lower it"
         if self.depth <= 0.0:  # it is lifted off
             return ""
         catching, slid = CATCHING * element, (self.before + self.length) / (1 + ROUNDING)
-        if self.edge_radius < catching * (1 - 1e-9) and slid > CAUGHT * element:
+        if self.edge_radius < catching * (1 - 1e-9) and slid > MAX_CAUGHT_SLIDE * element:
             return (
                 f"an edge sharper than {catching:g} mm catches on the mesh as it is slid; for a drag to rely on, give "
                 f"it so large an edge_radius (--edge-radius; an STL file: draw it round), or a smaller element_size"
             )
-        walls, steep = math.isfinite(self.edge_radius), self.friction > SNAPPING
-        deep = (DEEP_WALLS if walls or steep else DEEP) * thickness
-        farthest = (SNAPPED_SOONER if steep and self.depth > deep else SNAPPED) * thickness
+        walls, steep = math.isfinite(self.edge_radius), self.friction > STEEP_FRICTION
+        deep = (DEEP_WITH_EDGES if walls or steep else DEEP_WITHOUT_EDGES) * thickness
+        farthest = (MAX_DEEP_SLIDE_LENGTH if steep and self.depth > deep else MAX_SLIDE_LENGTH) * thickness
         far = max(self.length, self.away) / (1 + ROUNDING)
         if far > farthest and (steep or self.depth > deep):
-            what = f"above {SNAPPING:g}" if steep else f"of {self.friction:g} under what is deeper than {deep:.3g} mm"
+            what = f"of {self.friction:g} under what is deeper than {deep:.3g} mm"
+            if steep:
+                what = f"above {STEEP_FRICTION:g}"
             return (
                 f"slid by more than {farthest:.3g} mm, a gel {thickness:g} mm thick lets go in snaps at a friction "
                 f"{what}, which depend on the speed; for a drag to rely on, slide less far from where it came to the "

@@ -10,7 +10,7 @@ All particles lie in one array: lower gel, upper gel, body. Loops are serial and
 from typing import Any, NamedTuple
 
 from tacsim.compute.runtime import ti
-from tacsim.physics.body.material import ELASTIC, full, stress_small_strain, vec6
+from tacsim.physics.body.material import UNREACHABLE_LIMIT, full, stress_small_strain, vec6
 
 f32 = ti.f32
 Vec3 = ti.types.vector(3, f32)
@@ -38,7 +38,7 @@ class Solid:
     volume: f32
     mu: f32
     lam: f32
-    limit: f32  # |dev e|_F at yield, sigma_y / (2 mu); ELASTIC for a body that never yields
+    limit: f32  # |dev e|_F at yield, sigma_y / (2 mu); UNREACHABLE_LIMIT for a body that never yields
 
 
 @ti.dataclass
@@ -195,7 +195,7 @@ def body_law(F, solid):
     elastic = F
     tau = Mat3(0.0)
     large = 1
-    if solid.limit >= ELASTIC:
+    if solid.limit >= UNREACHABLE_LIMIT:
         near, large = stress_small_strain(finger_strain(F), solid.mu, solid.lam + 2.0 / 3.0 * solid.mu)
         tau = full(near)
     if large != 0:

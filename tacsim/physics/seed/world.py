@@ -21,7 +21,7 @@ from tacsim.geometry.sampling import body_points
 from tacsim.interface import Pose, Truth
 from tacsim.models.material import BodyMaterial, GelMaterial, lame
 from tacsim.models.scene import FASTEST_MACH, Gel, GelSurface, Scene
-from tacsim.physics.body.material import ELASTIC
+from tacsim.physics.body.material import UNREACHABLE_LIMIT
 from tacsim.physics.exec.layout import NUMBERS
 from tacsim.physics.failure.health import Health, LaunchSpan, SimulationDiverged, check_launch, require_room
 from tacsim.physics.motion.controller import ForceReading, Integration, Launch, Motion, move_and_settle
@@ -29,24 +29,26 @@ from tacsim.physics.motion.load import keep_loads, require_loads
 from tacsim.physics.motion.path import Path, plan, resolve_targets
 from tacsim.physics.move import MoveCommand
 from tacsim.physics.seed.kernels import PAD, Solid, Step, advance
+from tacsim.physics.seed.tuning import (
+    BODY_ZETA,
+    BODY_ZETA_ACROSS,
+    CONTACT_REACH,
+    COURANT,
+    GEL_ZETA,
+    GRID_MARGIN,
+    GRID_OVERHANG,
+    MAX_TILT,
+    MIN_CELL_HEIGHT,
+    MIN_SUBSTEPS,
+    PARTICLES_PER_CELL_EDGE,
+    READING_INTERVAL,
+)
 from tacsim.physics.snapshot import copies, restore_arrays
 from tacsim.physics.units import MM, MPA
 from tacsim.physics.worlds.base import BaseWorld
 
 Float32 = NDArray[np.float32]
 
-CELL = 2  # grid spacing / particle spacing: 8 particles a cell
-COURANT = 0.5  # dt / (grid spacing / wave speed); unstable from 1.0
-REACH = 1.5  # [cells] gap at which contact through the grid begins
-GEL_DAMPING = 1.0  # zeta in alpha = zeta c / thickness
-BODY_DAMPING = 0.8  # likewise, rate against the driven motion, along z: near critical for the bounce between the gels
-SWAY_DAMPING = 0.12  # likewise across z, where the gels are softer
-READING_INTERVAL = 20  # substeps of the hold between two readings of the forces
-GENTLE = 60  # substeps of the shortest motion: a start in fewer is a blow, which leaves false plastic strain
-SIDE = 1.0  # the grid reaches this many gel widths beyond the gels' rim; a particle further out is set aside
-FINEST = 0.72  # vertical spacing / lateral spacing of the grid, down to which the number of layers is kept
-MARGIN = 3  # [cells] of grid round the particles
-TILT = 1e-3  # [rad] tilt up to here is ignored, beyond it is refused
 HALF_TURN = np.array([1.0, 0.0, 0.0, 0.0])  # quaternion of the upper sensor at yaw 0
 
 
@@ -75,7 +77,7 @@ def gel_lattice(gel: Gel, spacing: float) -> Lattice:
 def solid(material: GelMaterial | BodyMaterial, volume: float) -> Any:
     """Kernel constants of a material for particles of `volume` [mm^3]; density lambda + 2 mu makes the wave speed 1."""
     mu, lam = (modulus * MPA for modulus in lame(material))
-    limit = min(material.elastic_limit, ELASTIC) if isinstance(material, BodyMaterial) else ELASTIC
+    limit = min(material.elastic_limit, UNREACHABLE_LIMIT) if isinstance(material, BodyMaterial) else UNREACHABLE_LIMIT
     mass = (lam + 2 * mu) * volume
     return Solid(mass=mass, volume=volume, mu=mu, lam=lam, limit=limit)  # type: ignore[call-arg]  # a Taichi dataclass
 
@@ -91,7 +93,7 @@ class SeedWorld(BaseWorld):
         self.scene = scene
         self._mach = scene.peak_mach
         h = scene.spacing * MM
-        self._dx, self._dt = CELL * h, COURANT * CELL * h
+        self._dx, self._dt = PARTICLES_PER_CELL_EDGE * h, COURANT * PARTICLES_PER_CELL_EDGE * h
         self._lattice = gel_lattice(scene.gel, scene.spacing)
         self._gel = solid(scene.gel.material, h * h * self._lattice.layer)
         self._body = solid(scene.body.material, h**3)
@@ -101,7 +103,7 @@ class SeedWorld(BaseWorld):
 
     def _initialise(self, body: NDArray[np.float64]) -> None:
         """Stage 1 of the scheme: undeformed particles at rest, a clear gap between body and gels."""
-        h, gap = self._lattice.spacing, REACH * self._dx
+        h, gap = self._lattice.spacing, CONTACT_REACH * self._dx
         body = body + [0.0, 0.0, gap + h / 2 - body[:, 2].min()]
         self._poses = {
             "lower": Pose(),
@@ -199,17 +201,18 @@ class SeedWorld(BaseWorld):
         """The path between two poses of all driven frames, at the scene's speed."""
         lever = self._lattice.spacing * max(self._lattice.count[:2]) / np.sqrt(2)
         path = plan(start, end, self._mach, self._dt, lever, self.scene.gel.size[2] * MM)
-        return replace(path, substeps=max(path.substeps, GENTLE) if path.substeps else 0, interval=READING_INTERVAL)
+        substeps = max(path.substeps, MIN_SUBSTEPS) if path.substeps else 0
+        return replace(path, substeps=substeps, interval=READING_INTERVAL)
 
     def _upright(self, name: str, pose: Pose) -> Pose:
-        """`pose` without a tilt of up to TILT, which the scheme can't follow."""
+        """`pose` without a tilt of up to MAX_TILT, which the scheme can't follow."""
         flip = Rotation.identity() if name == "lower" else Rotation.from_quat(HALF_TURN)
         turn = (Rotation.from_quat(pose.quaternion) * flip.inv()).as_matrix()
         tilt = float(np.arctan2(np.hypot(turn[0, 2], turn[1, 2]), turn[2, 2]))
-        if tilt > TILT:
+        if tilt > MAX_TILT:
             raise ValueError(
                 f"physics 'seed' cannot tilt a sensor: '{name}' was asked to tilt by {np.degrees(tilt):.3g} deg "
-                f"(limit {np.degrees(TILT):.2g} deg); keep its z axis along world z, or use physics 'hybrid'"
+                f"(limit {np.degrees(MAX_TILT):.2g} deg); keep its z axis along world z, or use physics 'hybrid'"
             )
         yaw = Rotation.from_euler("z", np.arctan2(turn[1, 0], turn[0, 0]))
         return Pose(pose.position, (yaw * flip).as_quat())
@@ -240,7 +243,7 @@ class SeedWorld(BaseWorld):
         if not len(self._body_points()):
             cause = "every particle of the body left the grid"
             raise SimulationDiverged(cause, where(), quantity="particle speed", good=good, failed=self.arrays())
-        integration = Integration(path.step, GEL_DAMPING, health.courant)
+        integration = Integration(path.step, GEL_ZETA, health.courant)
         overlap = self._overlap(path, last)
         return [ForceReading(backing + self._gain, backing, self._floor, overlap, left, integration=integration)]
 
@@ -248,9 +251,9 @@ class SeedWorld(BaseWorld):
     def _launch(self, drive: Float32, dt: float, x0: float, y0: float, health: Float32) -> None:
         thickness = self.scene.gel.size[2] * MM
         step = Step(  # type: ignore[call-arg]  # a Taichi dataclass
-            dt=dt, dx=self._dx, x0=x0, y0=y0, thickness=thickness, reach=REACH * self._dx, cells=int(self._layers[0]),
-            gel_damping=GEL_DAMPING / thickness, body_damping=BODY_DAMPING / thickness,
-            sway_damping=SWAY_DAMPING / thickness, gels=self._gels,
+            dt=dt, dx=self._dx, x0=x0, y0=y0, thickness=thickness, reach=CONTACT_REACH * self._dx,
+            cells=int(self._layers[0]), gel_damping=GEL_ZETA / thickness, body_damping=BODY_ZETA / thickness,
+            sway_damping=BODY_ZETA_ACROSS / thickness, gels=self._gels,
         )  # fmt: skip
         advance(
             self._x, self._v, self._c, self._f, self._stress, self._aside, self._grid, drive, self._motion,
@@ -262,11 +265,11 @@ class SeedWorld(BaseWorld):
         faces = path.drive(first, last)[:, :, 3, 2]
         gels, body = self._x[: 2 * self._gels, :2], self._body_points()[:, :2]
         low, high = gels.min(axis=0), gels.max(axis=0)
-        side = SIDE * float((high - low).max())
+        side = GRID_OVERHANG * float((high - low).max())
         if len(body):
             low = np.minimum(low, np.maximum(body.min(axis=0), low - side))
             high = np.maximum(high, np.minimum(body.max(axis=0), high + side))
-        margin = MARGIN * self._dx + 2 * max(self._mach, FASTEST_MACH) * (last - first) * self._dt
+        margin = GRID_MARGIN * self._dx + 2 * max(self._mach, FASTEST_MACH) * (last - first) * self._dt
         room = [*(low - margin), faces.min()], [*(high + margin), faces.max()]
         require_room(np.array(room[0]), np.array(room[1]), self._dx, where)
         layers = self._fit_layers(faces)
@@ -288,7 +291,7 @@ class SeedWorld(BaseWorld):
         if room[-1] > room[0]:
             self._layers[0] = max(self._layers[0], round(float(room[-1] / self._layers[1])))
         elif room[-1] < room[0]:
-            if room[-1] < FINEST * self._layers[0]:
+            if room[-1] < MIN_CELL_HEIGHT * self._layers[0]:
                 self._layers[:] = max(round(float(room[-1])), 1), 1.0
             self._layers[1] = min(self._layers[1], room[-1] / self._layers[0])
         return int(self._layers[0])

@@ -18,13 +18,11 @@ from tacsim.physics.failure.health import TORN, LaunchSpan, SimulationDiverged
 from tacsim.physics.motion.controller import ForceReading, Launch, Motion, run
 from tacsim.physics.move import MoveCommand, MoveStats
 from tacsim.physics.snapshot import State, gel_arrays, snapshot_of
+from tacsim.physics.worlds.tuning import MAX_RETRIES, SAFE_PATH_SHARE
 
 if TYPE_CHECKING:  # a device's kernels
     from tacsim.physics.worlds.survey import Survey
 
-RETRIES = 2  # each halves the time step
-POSSIBLE_SHARE = 0.9  # of how far a motion came that failed: an instability shows some launches after it began
-SMALLEST_CORNER = 0.0  # det F of a gel element at a corner: below, it is turned inside out
 NEW_WORLD = "restore a snapshot, or make a new world"
 
 
@@ -120,7 +118,7 @@ class BaseWorld(NotCopyable, ABC):
             where = LaunchSpan("before the motion began")
             failure = SimulationDiverged(broken, where, NEW_WORLD, good=before, failed=before)
         else:
-            for retry in range(RETRIES + 1):
+            for retry in range(MAX_RETRIES + 1):
                 try:
                     stats = yield from attempt(2**retry)
                     self._require_upright(command)
@@ -142,7 +140,7 @@ class BaseWorld(NotCopyable, ABC):
     def _require_upright(self, command: MoveCommand) -> None:
         """Raises SimulationDiverged if a motion ended with a gel element inside out."""
         seen = self._survey()
-        if seen is not None and seen.smallest_corner > SMALLEST_CORNER:
+        if seen is not None and seen.smallest_corner > 0.0:
             return
         state = self.arrays()
         for g, u in gel_arrays(state, "gel_displacement").items():
@@ -150,7 +148,7 @@ class BaseWorld(NotCopyable, ABC):
             if diagnosis.nearly_at_rest(u, thickness):
                 continue
             corners = diagnosis.corner_volumes(u, thickness)
-            if not corners.min() > SMALLEST_CORNER:
+            if not corners.min() > 0.0:
                 words = f"a gel element is turned inside out (volume ratio {corners.min():.3g} at a corner)"
                 end = LaunchSpan("at the end of the motion and its hold", {**self._poses, **command.targets})
                 raise SimulationDiverged(words, end, TORN, quantity="corner", failed=state)
@@ -166,5 +164,5 @@ def share_possible(start: Mapping[str, Pose], targets: Mapping[str, Pose], faile
     came = min(float(np.linalg.norm(failed[name].position - start[name].position)), shifts[name])
     return (
         f"'{name}' came {came * 1e3:.3g} mm of the {shifts[name] * 1e3:.3g} mm that it was to move: ask for no more "
-        f"than about {POSSIBLE_SHARE * came * 1e3:.2g} mm from here"
+        f"than about {SAFE_PATH_SHARE * came * 1e3:.2g} mm from here"
     )

@@ -16,7 +16,7 @@ from tacsim.interface import Pose
 from tacsim.models.scene import GelSurface
 from tacsim.physics.exec.layout import FORCE, GEL_DAMPING, GEL_DENSITY, MEMORY, STEP, STEPS
 from tacsim.physics.failure.diagnosis import element_lengths
-from tacsim.physics.failure.health import LARGEST_COURANT
+from tacsim.physics.failure.tuning import MAX_COURANT
 from tacsim.physics.gel.gel import GelParams, GelState, gel_surface
 from tacsim.physics.motion.controller import (
     ForceReading,
@@ -39,13 +39,11 @@ from tacsim.physics.move import MoveCommand, MoveStats
 from tacsim.physics.snapshot import Kept, State, copies, gel_arrays, restore_arrays, snapshot_of
 from tacsim.physics.units import MM
 from tacsim.physics.worlds.base import BaseWorld
+from tacsim.physics.worlds.tuning import REST_TOLERANCE
 
 if TYPE_CHECKING:  # a device's kernels
     from tacsim.physics.worlds.device_state import DeviceState
     from tacsim.physics.worlds.survey import Survey
-
-
-REST_TOLERANCE = 1e-4  # of the state of rest in which a motion in real time begins
 
 
 class FemState(ABC):
@@ -227,7 +225,7 @@ class FemWorld(BaseWorld):
             lengths = list(seen.shortest) if seen else self._state.gels.shortest(self._index)
             if len(lengths) < len(waves):  # gels that are cut alike were measured together
                 waves = (max(waves),)
-            if any(length * LARGEST_COURANT < step * wave for length, wave in zip(lengths, waves, strict=True)):
+            if any(length * MAX_COURANT < step * wave for length, wave in zip(lengths, waves, strict=True)):
                 lengths, waves = self._measured_lengths(), self._waves
         finest = 1e-6 * min(gel.spacing for gel in self._gels)
         return max(step * wave / max(length, finest) for length, wave in zip(lengths, waves, strict=True))

@@ -13,14 +13,9 @@ from tacsim.geometry.shapes import extent
 from tacsim.interface import Pose, Truth
 from tacsim.models.scene import Scene
 from tacsim.physics.body.moments import Moments
-from tacsim.physics.body.plasticine import (
-    BORDER,
-    STENCIL_REACH,
-    bounds,
-    bounds_of,
-    fit_grid,
-)
+from tacsim.physics.body.plasticine import bounds, bounds_of, fit_grid
 from tacsim.physics.body.surface import surface_points
+from tacsim.physics.body.tuning import GRID_BORDER, STENCIL_REACH
 from tacsim.physics.contact.gel_overlap import apart, gel_overlap
 from tacsim.physics.exec.lanes import NODES
 from tacsim.physics.exec.layout import (
@@ -44,15 +39,9 @@ from tacsim.physics.exec.layout import (
     STIFFNESS,
 )  # fmt: skip
 from tacsim.physics.failure.diagnosis import volume_range
-from tacsim.physics.failure.health import (
-    FASTEST,
-    NO_ROOM,
-    SMALLEST_VOLUME_RATIO,
-    Health,
-    SimulationDiverged,
-    check_launch,
-    require_room,
-)
+from tacsim.physics.failure.health import NO_ROOM, Health, SimulationDiverged, check_launch, require_room
+from tacsim.physics.failure.tuning import MAX_SPEED
+from tacsim.physics.gel.tuning import MIN_VOLUME_RATIO
 from tacsim.physics.motion.controller import (
     ForceReading,
     Integration,
@@ -62,29 +51,27 @@ from tacsim.physics.motion.controller import (
     force_floor,
 )
 from tacsim.physics.motion.inertia import Inertia
-from tacsim.physics.motion.path import PEAK_BRAKING, SHORT_PATH, SHORT_SLIDE, Path, path_along, path_length, plan
+from tacsim.physics.motion.path import PEAK_BRAKING, Path, path_along, path_length, plan
+from tacsim.physics.motion.tuning import SHORT_PATH, SHORT_SLIDE
 from tacsim.physics.move import MIN_LAYERS, MoveCommand, MoveStats, warn_of_few_layers
 from tacsim.physics.snapshot import State
 from tacsim.physics.units import MM, MPA
 from tacsim.physics.worlds.fem import FemWorld
 from tacsim.physics.worlds.hybrid_inertia import FILTERED_RIGID, LIGHTER_GEL, HybridInertia
-from tacsim.physics.worlds.hybrid_state import CLEARANCE, HybridState
+from tacsim.physics.worlds.hybrid_state import HybridState
+from tacsim.physics.worlds.tuning import (
+    INITIAL_GAP,
+    MAX_BRAKING_FORCE,
+    MAX_DRAG_OVERSPEED,
+    MAX_FORCE_LOSS,
+    MAX_GEL_OVERLAP,
+    MAX_GREEN_STRAIN,
+    MAX_TENSION,
+    MAX_YIELDING_OVERSPEED,
+    MIN_DRAG_SHARE,
+    MIN_TENSION_GROWTH,
+)
 from tacsim.pose import HALF_TURN_X
-
-DRAGGING = 0.9  # least share of a path along the gels: one that also closes is not damped as a drag, or it ends 3 % low
-# Share of the friction that the inertia of a dragged body, and of the gel under it, takes away where it stops: at 0.045
-# drags end within 1 to 2 % of slow ones, at 0.1 4 % low; and so much less time than that asks for is never settled
-BRAKED, HURRIED_DRAG = 0.045, 1.5
-# Of the fastest default for a body that yields: at twice it clay ends 2 % lower, at 4 times 9 to 11 %, at 7 times 26 %
-HURRIED = 3.0
-# Share of its force that the hold may take from a body that yields, times the gel's thickness over the particles'
-# spacing (3.5 % at draft): beyond, motions end 3 to 30 % from slow ones. The coarser a body, the more it creeps anyway.
-MAX_FORCE_LOSS = 0.28
-GEL_OVERLAP = 0.25  # of a gel's thickness: deeper in one another, gels that do not feel each other are refused
-# Yield stresses (Frobenius norm) of hydrostatic tension that nothing gives a squeezed body: beyond, particles have
-# strains that no node of the grid feels (docs/physics.md)
-TENSION, TENSION_GROWTH = 3.0, 1.01  # and by how much it must have grown, since rounding changes it in each launch
-LARGEST_GREEN = 0.3  # norm of F^T F - I since the reference of the body's grid: beyond, the grid is laid anew
 
 
 class HybridWorld(FemWorld):
@@ -107,7 +94,7 @@ class HybridWorld(FemWorld):
         height = float(extent(scene.body.geometry)[2])
         self._poses = {
             "lower": Pose(),
-            "upper": Pose(np.array([0.0, 0.0, height + 2 * CLEARANCE]), HALF_TURN_X.quaternion),
+            "upper": Pose(np.array([0.0, 0.0, height + 2 * INITIAL_GAP]), HALF_TURN_X.quaternion),
         }
         self._rates = np.zeros((2, 6))
         gels = [scene.gel_of(name) for name in self.sensors]
@@ -188,10 +175,10 @@ class HybridWorld(FemWorld):
             start, end, scene.peak_mach, self._scaled.step, lever, self._thickness, remembered=remembered,
             short=SHORT_PATH if self.yields else SHORT_SLIDE, shortest=drag if scene.settling.mach is None else 0.0,
         )  # fmt: skip
-        path = replace(path, dragging=along > DRAGGING * path_length(start, end, lever))
-        if self.yields and path.peak_mach(lever) > HURRIED * scene.fastest_mach:
+        path = replace(path, dragging=along > MIN_DRAG_SHARE * path_length(start, end, lever))
+        if self.yields and path.peak_mach(lever) > MAX_YIELDING_OVERSPEED * scene.fastest_mach:
             self.unfollowed = "the speed itself makes the body yield; leave out settling.mach, or lower it"
-        elif drag > HURRIED_DRAG * path.substeps * path.dt:
+        elif drag > MAX_DRAG_OVERSPEED * path.substeps * path.dt:
             self.unfollowed = "the body slips by its inertia at that speed; leave out settling.mach, or lower it"
         return replace(path, creeps=self.yields, max_force_loss=self.max_force_loss, unfollowed=self.unfollowed)
 
@@ -209,7 +196,7 @@ class HybridWorld(FemWorld):
         body = params[BODY_MASS] * count / (params[RIGID_MASS_SCALE] + FILTERED_RIGID)
         heaviest = max(gel.density * gel.thickness for gel in self._gels)
         layer = heaviest * (self._body.volume * count) ** (2 / 3) / (2.0 * LIGHTER_GEL)
-        return math.sqrt(PEAK_BRAKING * along * (body + layer) / (BRAKED * min(limits)))
+        return math.sqrt(PEAK_BRAKING * along * (body + layer) / (MAX_BRAKING_FORCE * min(limits)))
 
     # ------------------------------------------------------------------ state
 
@@ -260,11 +247,11 @@ class HybridWorld(FemWorld):
         state, index, path = self._state, self._index, launch.path
         drive, where = path.drive(launch.first, launch.last), partial(launch.span, tuple(self._poses))
         cell = self._body.cell
-        if state.partial[index, :, GREEN].max() > LARGEST_GREEN**2:
+        if state.partial[index, :, GREEN].max() > MAX_GREEN_STRAIN**2:
             state.particles.move_reference(index)
         extents = state.extents(index)
         low, high = bounds_of(extents)
-        require_room(low - BORDER * cell, high + BORDER * cell, cell, where, state.most_nodes)
+        require_room(low - GRID_BORDER * cell, high + GRID_BORDER * cell, cell, where, state.most_nodes)
         try:
             state.fit(index, cell, extents)
         except MemoryError as error:
@@ -345,18 +332,18 @@ class HybridWorld(FemWorld):
         state, i = self._state, self._index
         others = state.particles.whole(i), state.contact_history[i], state.partial[i]
         return (
-            smallest_volume > 2.0 * SMALLEST_VOLUME_RATIO
-            and state.gels.quiet(i, FASTEST)
+            smallest_volume > 2.0 * MIN_VOLUME_RATIO
+            and state.gels.quiet(i, MAX_SPEED)
             and all(np.isfinite(a).all() for a in others)
         )
 
     def _torn(self, largest: float) -> bool:
         """Whether the largest elastic volume ratio has grown in the launch to one that needs a tension of more than
-        TENSION yield stresses; unknown for a body that hardens. What an earlier launch has left is not counted again.
+        MAX_TENSION; unknown for a body that hardens. What an earlier launch has left is not counted again.
         """
         body = self._body
-        bearable = TENSION * 2.0 * body.mu * body.limit / body.bulk
-        left = TENSION_GROWTH * math.log(self._largest_volume)
+        bearable = MAX_TENSION * 2.0 * body.mu * body.limit / body.bulk
+        left = MIN_TENSION_GROWTH * math.log(self._largest_volume)
         return self.yields and not body.hardening and math.log(largest) > max(bearable, left)
 
     def _gel_overlap(self, prepared: PreparedLaunch) -> float:
@@ -366,7 +353,7 @@ class HybridWorld(FemWorld):
         if seen is not None and apart(self._gels, seen.tops[1], float(seen.tops[0, 3]), last[:, :3], last[:, 3]):
             return 0.0
         found = gel_overlap(self._gels, self._state.tops(self._index), last[:, :3], last[:, 3])
-        most = GEL_OVERLAP * min(gel.thickness for gel in self._gels)
+        most = MAX_GEL_OVERLAP * min(gel.thickness for gel in self._gels)
         if found > most:
             raise SimulationDiverged(
                 f"the gels lie {found:.3g} mm inside one another, which they do not feel (limit {most:.3g} mm)",

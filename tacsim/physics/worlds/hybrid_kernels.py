@@ -44,11 +44,11 @@ from tacsim.physics.exec.lanes import (
 from tacsim.physics.exec.team import CHUNK, ENVIRONMENT, Sync, first_in_chunk, next_piece, one_if, own_part, piece_done
 from tacsim.physics.gel.kernels import GelArrays, Gels, Lattice, contact_force_start, gel_forces, gel_of
 from tacsim.physics.gel.mass import gel_advance_filtered, gel_even, gel_means
+from tacsim.physics.worlds.tuning import ROTATION_BOOST
 
 Drive = ti.types.ndarray(dtype=ti.f32, ndim=5)
 Records = ti.types.ndarray(dtype=ti.f32, ndim=4)
 STAGES = 7  # of a substep
-TURN = 1.0 / 3.0  # share of the boost that rotations get: with more of it bodies overshoot when a slide stops
 
 ContactHistories = ti.types.ndarray(dtype=ContactHistory, ndim=3)
 # `BodyState.arguments`, `changes` and `links`, as kernels take them
@@ -121,7 +121,11 @@ def grid_update(env: ti.template(), part, it, drive: ti.template(), body: ti.tem
     centre = env.param3(layout.CENTRE)
     torque = -moment_about(centre, p0, rotation(drive, env, it, 0), force0, part_sum(env, layout.FORCE + 3))
     torque -= moment_about(centre, p1, rotation(drive, env, it, 1), force1, part_sum(env, layout.FORCE + 9))
-    turn = (TURN * (env.param(layout.RIGID_MASS_SCALE) - 1.0) * dt) * symmetric(env, layout.INVERSE_INERTIA) @ torque
+    turn = (
+        (ROTATION_BOOST * (env.param(layout.RIGID_MASS_SCALE) - 1.0) * dt)
+        * symmetric(env, layout.INVERSE_INERTIA)
+        @ torque
+    )
     v0, v1 = row(drive, env, it, 0, 4), row(drive, env, it, 1, 4)
     w0, w1 = row(drive, env, it, 0, 5), row(drive, env, it, 1, 5)
     axis = p1 - p0

@@ -12,8 +12,9 @@ from tacsim.geometry.sampling import body_points
 from tacsim.geometry.shapes import extent, volume
 from tacsim.models.scene import Scene
 from tacsim.physics.body.moments import Moments, moments_of
-from tacsim.physics.body.plasticine import STENCIL_REACH, BodyParams, BodyState, body_params, centre_of
+from tacsim.physics.body.plasticine import BodyParams, BodyState, body_params, centre_of
 from tacsim.physics.body.surface import tangent_planes
+from tacsim.physics.body.tuning import STENCIL_REACH
 from tacsim.physics.contact.contact import ContactHistory
 from tacsim.physics.exec.lanes import ON_DEVICE, PARTS
 from tacsim.physics.exec.layout import COUNTS, NUMBERS, PARAMS, RECORDS
@@ -22,11 +23,10 @@ from tacsim.physics.gel.gel import GelParams, GelState, common_lattices, gel_par
 from tacsim.physics.units import MM
 from tacsim.physics.worlds.fem import FemState, stack_drives
 from tacsim.physics.worlds.hybrid_kernels import substeps
+from tacsim.physics.worlds.tuning import INITIAL_GAP
 
 if TYPE_CHECKING:
     from tacsim.physics.worlds.device_state import DeviceHybrid
-
-CLEARANCE = 0.1e-3  # gap between gels and body at construction [m]
 
 
 class HybridState(FemState):
@@ -152,4 +152,4 @@ def _body_at_start(scene: Scene) -> tuple[BodyParams, np.ndarray, np.ndarray]:
     points = body_points(scene.body, scene.spacing)
     body = body_params(scene.body.material, scene.spacing, volume=volume(scene.body.geometry) / len(points))
     planes = tangent_planes(scene.body.geometry, points, scene.spacing) / MM
-    return body, (points + [0.0, 0.0, height / 2 + CLEARANCE]) * MM, planes
+    return body, (points + [0.0, 0.0, height / 2 + INITIAL_GAP]) * MM, planes

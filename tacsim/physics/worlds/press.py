@@ -10,13 +10,8 @@ import numpy as np
 from tacsim.geometry.shapes import edge_radius, edges, farthest, lowest_below
 from tacsim.interface import Pose
 from tacsim.models.scene import GelSurface, Mesh, Scene
-from tacsim.physics.contact.contact import MEMORY_RATE
-from tacsim.physics.contact.indenter import (
-    POINTS,
-    RIM,
-    SMOOTHING,
-    SPLINE_SMOOTHING,
-)
+from tacsim.physics.contact.indenter import POINTS, SPLINE_SMOOTHING
+from tacsim.physics.contact.tuning import FORCE_MEMORY_RATE, RIM_STIFFNESS, SURFACE_SMOOTHING
 from tacsim.physics.exec.layout import (
     BACKING,
     FORCE,
@@ -31,31 +26,27 @@ from tacsim.physics.failure.health import Health, SimulationDiverged, check_laun
 from tacsim.physics.gel.gel import GelParams
 from tacsim.physics.motion.controller import ForceReading, Integration, Launch, PreparedLaunch, force_floor
 from tacsim.physics.motion.inertia import Inertia, kernel_second
-from tacsim.physics.motion.path import SHORT_SLIDE, Path, path_along, path_length, plan
-from tacsim.physics.motion.slide import WALLS_LAST, Slide, growth, pace, slower_walls, turn
+from tacsim.physics.motion.path import Path, path_along, path_length, plan
+from tacsim.physics.motion.slide import Slide, growth, pace, slower_walls, turn
+from tacsim.physics.motion.tuning import SHORT_SLIDE, SLOWED_WALL_LENGTH
 from tacsim.physics.units import MM, MPA
 from tacsim.physics.worlds.fem import FemWorld
 from tacsim.physics.worlds.press_state import PressState
+from tacsim.physics.worlds.tuning import (
+    FLUTTER_FRICTION,
+    INITIAL_GAP,
+    MAX_BULGE,
+    MAX_DIP,
+    MAX_LIMIT_RATE,
+    MESH_MARGIN,
+    PRESS_COURANT,
+    PRESS_ZETA,
+    PRESS_ZETA_BY_SHEAR,
+    SHORT_INDENTING_SLIDE,
+    TURNING_ZETA_SHARE,
+)
 from tacsim.pose import inverse, relative, rotate
 
-# dt / (spacing / wave speed). Edges of a rigid box tear the surface up at 0.6, without a NaN; and the penalty falls
-# with the step's square, so 0.5 costs overlap.
-COURANT = 0.4
-# Of its damping, zeta c / thickness: it makes the gel lag, and friction remembers that. What a drag lags by goes with
-# zeta over the speed of the shear wave, so no more than so many times that: of a gel beyond nu = 0.48 it is less.
-ZETA_GEL, ZETA_BY_SHEAR = 0.5, 2.55
-# Share of its damping that a slide has which goes across all of the drag that is there (`turn`), or its own would lag
-# behind in direction
-TURNS_DAMPED = 0.4
-SHORT_GROWING = 1.0  # gel thicknesses: what is pressed in while it slides goes as slowly as a path of this length
-CLEARANCE = 0.1e-3  # gap between gel and indenter at construction [m]
-UNSEEN = 0.5  # spacings of contact points: how deep an indenter may dip between them; the largest such ball: 0.35
-# At this friction the limit follows the pressure within the time of a wave through the gel: in half of it slides
-# flutter. Friction itself feeds that, so less of it may follow as much quicker, as may what is pressed in while it
-# slides, which would be dragged up to 11 % too little; up to so many times.
-FLUTTERING, QUICKEST = 1.5, 8.0
-BULGE = 0.1  # of the depth of an indenter: how far the gel rises round it, at most
-MARGIN = 2.0  # elements: what is further from a mesh does not touch it in the next launch
 TOO_MUCH = "cut off parts of mesh and gel that cannot touch; worlds of a smaller batch have more room each"
 
 
@@ -105,10 +96,10 @@ class PressWorld(FemWorld):
         self._index = index
         self._gel = self._state.gel[index]
         self._gels = (self._gel,)
-        step = COURANT * self._gel.spacing
+        step = PRESS_COURANT * self._gel.spacing
         self._shear = math.sqrt(self._gel.mu / self._gel.density)  # speed of its shear wave, over that of pressure
-        zeta = min(ZETA_GEL, ZETA_BY_SHEAR * self._shear)
-        self._scaled = Inertia({GEL_DAMPING: zeta / self._gel.thickness, MEMORY: MEMORY_RATE}, step)
+        zeta = min(PRESS_ZETA, PRESS_ZETA_BY_SHEAR * self._shear)
+        self._scaled = Inertia({GEL_DAMPING: zeta / self._gel.thickness, MEMORY: FORCE_MEMORY_RATE}, step)
         self._true = Inertia(
             {GEL_DAMPING: 0.0, MEMORY: 0.0}, step, kernel_second(self._gel, scene.gel.material.density)
         )
@@ -124,7 +115,7 @@ class PressWorld(FemWorld):
         self._touched = np.zeros(3)
         self._edges = edges(scene.indenter.geometry, scene.element)
         turned = scene.indenter.turn
-        above = self.below(turned) + CLEARANCE
+        above = self.below(turned) + INITIAL_GAP
         self._poses = {"lower": Pose(), "indenter": Pose(np.array([0.0, 0.0, above]), turned)}
 
     def _stop(self) -> None:
@@ -133,12 +124,12 @@ class PressWorld(FemWorld):
     def surface(self, name: str) -> GelSurface:
         """The surface that its contact points lie on, which smooths the nodes less than their spline does."""
         of_nodes = super().surface(name)
-        return replace(of_nodes, displacement=sharpened(of_nodes.displacement, SPLINE_SMOOTHING - SMOOTHING))
+        return replace(of_nodes, displacement=sharpened(of_nodes.displacement, SPLINE_SMOOTHING - SURFACE_SMOOTHING))
 
     def reach(self) -> np.ndarray:
         """How far from the indenter the surface is still pressed [m], at its nodes (nx + 1, ny + 1)."""
         stiffness = float(self._state.params[self._index, STIFFNESS])
-        return np.asarray(self._state.gels.alike.carried[self._index, 0] / (RIM * stiffness * MM))
+        return np.asarray(self._state.gels.alike.carried[self._index, 0] / (RIM_STIFFNESS * stiffness * MM))
 
     def arrays(self) -> dict[str, np.ndarray]:
         state, i = self._state, self._index
@@ -167,13 +158,14 @@ class PressWorld(FemWorld):
             force = self.wrench("lower")[:3]
             growing, turning = growth(way), turn(way, force, indenter.friction)
             depth = (self.below(at.quaternion) - float(at.position[2])) * MM
-            walls = self._edges_touch(at, BULGE * depth)
+            walls = self._edges_touch(at, MAX_BULGE * depth)
             mach *= pace(way, force, indenter.friction)
             slower = slower_walls(way, indenter.friction, gel.spacing / gel.thickness) if walls else 1.0
         path = plan(
             start, end, mach / faster, self._scaled.step, lever, gel.thickness,
-            remembered=path_along(start, end, lever), short=SHORT_SLIDE + (SHORT_GROWING - SHORT_SLIDE) * growing,
-            slower=slower, last=WALLS_LAST * gel.spacing,
+            remembered=path_along(start, end, lever),
+            short=SHORT_SLIDE + (SHORT_INDENTING_SLIDE - SHORT_SLIDE) * growing,
+            slower=slower, last=SLOWED_WALL_LENGTH * gel.spacing,
         )  # fmt: skip
         if indenter.friction > 0.0:
             slide = Slide(
@@ -224,7 +216,7 @@ class PressWorld(FemWorld):
         before = self._before_launch()
         self._state.params[self._index, STEP] = path.step
         self._state.params[self._index, LIMIT_FOLLOWS] = self._follows(launch) / self._gel.thickness
-        damped = 1.0 if launch.held else 1.0 - path.turning * (1.0 - TURNS_DAMPED)
+        damped = 1.0 if launch.held else 1.0 - path.turning * (1.0 - TURNING_ZETA_SHARE)
         self._state.params[self._index, GEL_DAMPING] = damped * self._inertia.params[GEL_DAMPING]
         Health.clear(self._state.partial[self._index])
         return PreparedLaunch(launch, where, drive, before)
@@ -233,15 +225,15 @@ class PressWorld(FemWorld):
         """In how many parts of the time of a wave through the gel the limit of friction follows the pressure."""
         indenter = self.scene.indenter
         assert indenter is not None
-        steady = FLUTTERING / min(max(indenter.friction, FLUTTERING / QUICKEST), FLUTTERING)
-        return steady if launch.held else steady + launch.path.growing * (QUICKEST - steady)
+        steady = FLUTTER_FRICTION / min(max(indenter.friction, FLUTTER_FRICTION / MAX_LIMIT_RATE), FLUTTER_FRICTION)
+        return steady if launch.held else steady + launch.path.growing * (MAX_LIMIT_RATE - steady)
 
     def _cover(self, drive: np.ndarray) -> None:
         """Fills in a mesh's distances wherever the gel's surface may touch it in this launch."""
         mesh = self._state.meshes[self._index]
         if mesh is None:
             return
-        margin, half = MARGIN * self._gel.spacing, mesh.half * MM
+        margin, half = MESH_MARGIN * self._gel.spacing, mesh.half * MM
         nodes = self._surface_nodes()
         at = np.concatenate([(nodes - rows[3]) @ rows[:3] for rows in drive[[0, -1], 0].astype(np.float64)])
         near = at[(np.abs(at) <= half + margin).all(axis=1)]
@@ -300,7 +292,7 @@ class PressWorld(FemWorld):
         depth = float(nodes[near, 2].min(initial=np.inf) - tip[2])
         self.unfelt = max(depth - overlap, 0.0) / -float(tip[2]) if tip[2] < 0.0 else 0.0
         # where points do touch, deeper by no more than a quarter of its way into the untouched gel
-        if depth - overlap > max(UNSEEN * spacing / POINTS, 0.0 if overlap == 0.0 else -tip[2] / 4):
+        if depth - overlap > max(MAX_DIP * spacing / POINTS, 0.0 if overlap == 0.0 else -tip[2] / 4):
             cause = f"the indenter is {depth:.3g} mm deep in the gel and touches no contact point of it"
             if overlap > 0.0:
                 cause = (

@@ -35,8 +35,7 @@ from tacsim.physics.gel.gel import GelParams, GelState, common_lattices, gel_par
 from tacsim.physics.units import MM
 from tacsim.physics.worlds.fem import FemState, stack_drives
 from tacsim.physics.worlds.press_kernels import substeps
-
-GRID_SPACING = 0.1e-3  # of a mesh's distance grid [m]
+from tacsim.physics.worlds.tuning import MESH_GRID_SPACING
 
 
 class PressState(FemState):
@@ -86,7 +85,7 @@ class PressState(FemState):
         kind, size, mesh = _shape_params(scene.indenter.geometry)
         self.counts[index, KIND], self.params[index, SHAPE : SHAPE + 3] = kind, size
         self.params[index, EDGE_RADIUS] = scene.indenter.rounding(scene.element) * MM
-        self.params[index, SHAPE_SPACING] = GRID_SPACING * MM
+        self.params[index, SHAPE_SPACING] = MESH_GRID_SPACING * MM
         if mesh is not None:
             self.params[index, SHAPE_ORIGIN : SHAPE_ORIGIN + 3] = mesh.origin * MM
         return mesh
@@ -156,5 +155,5 @@ def _shape_params(geometry: Shape) -> tuple[int, tuple[float, ...], TiledDistanc
             return CYLINDER, (geometry.radius * MM, 0.0, geometry.height / 2 * MM), None
         case Box():
             return BOX, tuple(side / 2 * MM for side in geometry.size), None
-    mesh = tiled_distance(geometry, GRID_SPACING)
+    mesh = tiled_distance(geometry, MESH_GRID_SPACING)
     return GRID, tuple(float(side) * MM for side in mesh.half), mesh

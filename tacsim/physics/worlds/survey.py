@@ -11,23 +11,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tacsim.physics.body.moments import Moments
-from tacsim.physics.failure.health import FASTEST, SMALLEST_VOLUME_RATIO
+from tacsim.physics.exec.layout import Layout
+from tacsim.physics.failure.tuning import MAX_SPEED
+from tacsim.physics.gel.tuning import MIN_VOLUME_RATIO
 
 BLOCKS = 256  # of a body's particles, for their sums
 
 # The numbers of one environment: float32
-NOT_FINITE = 0  # how many entries are not
-NODE_SPEED = 1  # largest component
-SHORTEST = 2  # by how much the shortest edge of an element of gel 0, gel 1 is longer than at rest [mm]
-CORNER = 4  # smallest volume ratio at the elements' corners
-TOP = 5  # of the surface of gel 0, gel 1: largest |x|, largest |y|, lowest z, highest z of its displacements [mm]
-SQUARED_VOLUME, LARGEST_SQUARED_VOLUME = 13, 14  # smallest and largest det b_e of a particle
-LOW, HIGH = 15, 18  # of the particles' places on the grid: x, y, z [mm]
+_numbers = Layout()
+NOT_FINITE = _numbers.place()  # how many entries are not
+NODE_SPEED = _numbers.place()  # largest component
+SHORTEST = _numbers.place(2)  # shortest edge of an element of gel 0, gel 1, less its length at rest [mm]
+CORNER = _numbers.place()  # smallest volume ratio at the elements' corners
+TOP = _numbers.place(8)  # surface displacements of gel 0, gel 1: largest |x|, |y|, lowest z, highest z [mm]
+SQUARED_VOLUME, LARGEST_SQUARED_VOLUME = _numbers.place(), _numbers.place()  # least and largest det b_e of a particle
+LOW, HIGH = _numbers.place(3), _numbers.place(3)  # of the particles' places on the grid: x, y, z [mm]
 # Sums over the particles, of r their place on the grid less `base`, d = x - place, x their place in space less `base`:
 # d, r, x x^T and r r^T (xx, yy, zz, xy, xz, yz), d r^T (row by row)
-SUMS = 21
-MOVED, REFERENCE, SECOND, REFERENCE_SECOND, MOVED_REFERENCE = 0, 3, 6, 12, 18
-MOMENTS = 27
+SUMS = _numbers.size
+_sums = Layout()
+MOVED, REFERENCE = _sums.place(3), _sums.place(3)
+SECOND, REFERENCE_SECOND = _sums.place(6), _sums.place(6)
+MOVED_REFERENCE = _sums.place(9)
+MOMENTS = _sums.size
 NUMBERS = SUMS + MOMENTS
 
 
@@ -51,7 +57,7 @@ def survey_of(
     """Of an environment's numbers (NUMBERS,) as the kernels leave them; spacings: of its gels' nodes [mm]."""
     finite = not numbers[NOT_FINITE]
     sound = bool(
-        finite and numbers[NODE_SPEED] <= FASTEST and numbers[SQUARED_VOLUME] > (2.0 * SMALLEST_VOLUME_RATIO) ** 2
+        finite and numbers[NODE_SPEED] <= MAX_SPEED and numbers[SQUARED_VOLUME] > (2.0 * MIN_VOLUME_RATIO) ** 2
     )
     volumes = numbers[[SQUARED_VOLUME, LARGEST_SQUARED_VOLUME]]
     if not (particles and volumes.min() > 0.0):

@@ -34,7 +34,7 @@ def diverge(scene: Scene, folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path
     world = make_world(scene)
     frame = "upper" if scene.indenter is None else "indenter"
     pose = world.pose(frame)
-    monkeypatch.setattr(health, "FASTEST", 0.005)
+    monkeypatch.setattr(health, "MAX_SPEED", 0.005)
     with dumps_in(folder), pytest.raises(SimulationDiverged):
         world.move({frame: Pose(pose.position - [0, 0, 0.5e-3], pose.quaternion)})
     return folder / "00"
@@ -65,7 +65,7 @@ def test_a_motion_at_constant_load_is_replayed_with_its_load(
 ) -> None:
     world = make_world(SCENES[physics])
     loads = {world.sensors[-1]: 0.3}
-    monkeypatch.setattr(health, "FASTEST", 1e-4)
+    monkeypatch.setattr(health, "MAX_SPEED", 1e-4)
     with dumps_in(tmp_path), pytest.raises(SimulationDiverged):
         world.move({}, loads)
     dump = read(tmp_path / "00")
@@ -112,7 +112,7 @@ def test_arrays_of_another_scene_are_refused(tmp_path: Path, monkeypatch: pytest
 
 def test_a_run_that_diverges_leaves_a_dump_and_says_where(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(health, "FASTEST", 1e-4)
+    monkeypatch.setattr(health, "MAX_SPEED", 1e-4)
     tiny = ("--set", "scene.particle_spacing=1 mm", "--set", "scene.element_size=2 mm")
     result = tacsim("run", "sim", "--steps", 2, "--out", "first", *tiny)
     assert result.exit_code == 1

@@ -8,10 +8,11 @@ from tacsim.geometry.sampling import body_points
 from tacsim.models.scene import Body as BodyModel
 from tacsim.models.scene import Box, Cylinder, Shape, Sphere
 from tacsim.physics.body.follow import Ends, follow, push_leaders
-from tacsim.physics.body.followers import LIGHT, following, links, node_masses
+from tacsim.physics.body.followers import following, links, node_masses
 from tacsim.physics.body.mass import grid_changes
-from tacsim.physics.body.plasticine import STENCIL_REACH, BodyState, bounds, fit_grid
+from tacsim.physics.body.plasticine import BodyState, bounds, fit_grid
 from tacsim.physics.body.transfers import Body, Strips
+from tacsim.physics.body.tuning import MAX_TIED_NODE_MASS, STENCIL_REACH
 from tacsim.physics.exec import layout
 from tacsim.physics.exec.environment import Counts, Environment, Floats, Params, Partial
 from tacsim.physics.exec.lanes import COPIES, NODES, PARTS
@@ -54,12 +55,12 @@ def test_what_follows_is_light_and_meets_linear_fields(shape: str, sampling: str
     expected = spline((points[:, None] - places) / CELL).prod(axis=2).sum(axis=0)
     assert masses.ravel() == pytest.approx(expected, abs=2e-5)
     follower, leader, share = following(masses)
-    light = np.flatnonzero((masses.ravel() > 0.0) & (masses.ravel() < LIGHT))
+    light = np.flatnonzero((masses.ravel() > 0.0) & (masses.ravel() < MAX_TIED_NODE_MASS))
     assert len(light) and set(light) <= set(follower) and not set(follower) & set(leader)
-    assert (masses.ravel()[leader] >= LIGHT).all()
+    assert (masses.ravel()[leader] >= MAX_TIED_NODE_MASS).all()
     carried = masses.ravel().copy()
     np.add.at(carried, leader, share * carried[follower])
-    assert carried[leader].min() > LIGHT / 2
+    assert carried[leader].min() > MAX_TIED_NODE_MASS / 2
     field = 0.3 + places @ [0.2, -0.7, 0.4]
     value = np.bincount(follower, share * field[leader], len(field))[light]
     assert value == pytest.approx(field[light], abs=1e-6)
@@ -69,7 +70,7 @@ def test_what_follows_is_light_and_meets_linear_fields(shape: str, sampling: str
 def test_leaders_in_a_plane_give_their_mean_across_it() -> None:
     """A sheet tells no slope across itself: what is off it moves as it does, whatever its distance."""
     masses = np.zeros((9, 9, 9))
-    masses[3:6, 3:6, 3], masses[4, 4, 5] = 8.0, LIGHT / 2
+    masses[3:6, 3:6, 3], masses[4, 4, 5] = 8.0, MAX_TIED_NODE_MASS / 2
     follower, leader, share = following(masses)
     x, y, _ = np.unravel_index(leader, masses.shape)
     assert set(follower) == {np.ravel_multi_index((4, 4, 5), masses.shape)}
@@ -80,8 +81,8 @@ def test_leaders_in_a_plane_give_their_mean_across_it() -> None:
 def test_a_node_that_its_followers_leave_no_mass_follows_too() -> None:
     """Shares of leaders beyond the nearest are negative: nine light nodes take more from one that is hardly heavy."""
     masses = np.zeros((11, 9, 9))
-    masses[3, 4, 4], masses[4, 4, 4] = LIGHT, 8.0
-    masses[5, 3:6, 3:6] = 0.99 * LIGHT
+    masses[3, 4, 4], masses[4, 4, 4] = MAX_TIED_NODE_MASS, 8.0
+    masses[5, 3:6, 3:6] = 0.99 * MAX_TIED_NODE_MASS
     follower, leader, share = following(masses)
     hardly = np.ravel_multi_index((3, 4, 4), masses.shape)
     assert hardly in follower and hardly not in leader

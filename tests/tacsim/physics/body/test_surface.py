@@ -16,7 +16,8 @@ from tacsim.models.scene import Body, Box, Mesh, Scene, Sphere
 from tacsim.physics.body.surface import surface_points, tangent_planes
 from tacsim.physics.body.transfers import moved_plane
 from tacsim.physics.exec.lanes import vec3
-from tacsim.physics.worlds.hybrid import CLEARANCE, HybridWorld
+from tacsim.physics.worlds.hybrid import HybridWorld
+from tacsim.physics.worlds.tuning import INITIAL_GAP
 
 MM = 1e-3
 SPACING = 0.5 * MM
@@ -84,7 +85,7 @@ def squeezed(geometry: Box | Sphere, sampling: str, by: float) -> HybridWorld:
     targets = {}
     for name, sign in (("lower", 1.0), ("upper", -1.0)):
         pose = world.pose(name)
-        targets[name] = Pose(pose.position + [0, 0, sign * (by / 2 + CLEARANCE)], pose.quaternion)
+        targets[name] = Pose(pose.position + [0, 0, sign * (by / 2 + INITIAL_GAP)], pose.quaternion)
     world.move(targets)
     return world
 

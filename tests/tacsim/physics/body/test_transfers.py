@@ -10,8 +10,9 @@ from benchmarks.truth.clay import COURANT
 from tacsim.geometry.sampling import body_points
 from tacsim.models.material import BodyMaterial
 from tacsim.models.scene import Body, Box
-from tacsim.physics.body.material import ELASTIC
-from tacsim.physics.body.plasticine import STENCIL_REACH, BodyParams, body_params
+from tacsim.physics.body.material import UNREACHABLE_LIMIT
+from tacsim.physics.body.plasticine import BodyParams, body_params
+from tacsim.physics.body.tuning import STENCIL_REACH
 from tacsim.physics.exec import layout
 from tacsim.physics.exec.lanes import NODES
 
@@ -62,11 +63,11 @@ def test_what_bends_comes_back_to_second_order() -> None:
     assert errors[0, 0] < np.abs(CURVATURE).max() * 3 * 1.0**2  # of cells of 1 mm
 
 
-@pytest.mark.parametrize(("limit", "yields"), [(ELASTIC, False), (0.5 * ELASTIC, True)])
+@pytest.mark.parametrize(("limit", "yields"), [(UNREACHABLE_LIMIT, False), (0.5 * UNREACHABLE_LIMIT, True)])
 def test_a_body_that_never_yields_runs_no_return_mapping(limit: float, yields: bool) -> None:
     """Told by a flow that has softened the body to nothing, which the return mapping alone looks at."""
     params = body_params(ELASTIC_BODY, 0.5e-3)
-    assert params.limit == ELASTIC
+    assert params.limit == UNREACHABLE_LIMIT
     hardening = 2.0**-10  # a power of two: what is left is 0 to the digit
     body = block(replace(params, limit=limit, hardening=hardening), 0.5e-3)
     body.state.plastic_strain()[:] = -limit / hardening

@@ -13,21 +13,16 @@ from scipy.spatial.transform import Rotation
 from tacsim.interface import Pose
 from tacsim.models.scene import Gel, Indenter, Scene, Settling, Sphere
 from tacsim.physics.failure import diagnosis, health
-from tacsim.physics.failure.health import (
-    LARGEST_COURANT,
-    Health,
-    LaunchSpan,
-    SimulationDiverged,
-    check_launch,
-    require_room,
-)
+from tacsim.physics.failure.health import Health, LaunchSpan, SimulationDiverged, check_launch, require_room
+from tacsim.physics.failure.tuning import MAX_COURANT
 from tacsim.physics.motion.controller import ForceReading, Launch, Motion, run
 from tacsim.physics.motion.path import Path
 from tacsim.physics.move import MoveCommand, MoveStats
 from tacsim.physics.snapshot import copies
 from tacsim.physics.worlds import press
-from tacsim.physics.worlds.base import RETRIES, BaseWorld
+from tacsim.physics.worlds.base import BaseWorld
 from tacsim.physics.worlds.press import PressWorld
+from tacsim.physics.worlds.tuning import MAX_RETRIES, PRESS_COURANT
 
 BALL = Scene(body=None, indenter=Indenter(geometry=Sphere(radius=4e-3)), gel=Gel(size=(10e-3, 10e-3, 4e-3)))
 STILL = Path([Pose()], [Pose()], substeps=0, dt=0.4)
@@ -161,11 +156,11 @@ def test_a_motion_that_never_succeeds_leaves_the_world_as_it_was() -> None:
 
     with pytest.raises(SimulationDiverged) as caught:
         run(world.motion(MoveCommand({})), advance)
-    assert steps == [2**retry for retry in range(RETRIES + 1)]
+    assert steps == [2**retry for retry in range(MAX_RETRIES + 1)]
     assert all(world.state[name].tobytes() == before[name].tobytes() for name in before)
     text = str(caught.value)
     assert "velocity[1, 0] is inf at particle 1, (1.000, 1.000, 1.000) mm in the world" in text
-    assert f"even with 1/{2**RETRIES} of the time step" in text and "move less far" in text
+    assert f"even with 1/{2**MAX_RETRIES} of the time step" in text and "move less far" in text
     assert caught.value.good["position"][0, 0] == 1.0 and caught.value.failed["position"][0, 0] == 3.0
 
 
@@ -258,7 +253,7 @@ def test_a_press_with_too_long_a_step_comes_out_right_by_retrying(monkeypatch: p
         return -float(world.wrench("lower")[2]), retries
 
     truth, none = pressed()
-    monkeypatch.setattr(press, "COURANT", 1.2)
+    monkeypatch.setattr(press, "PRESS_COURANT", 1.2)
     found, some = pressed()
     assert none == 0 and some > 0
     assert found == pytest.approx(truth, rel=0.06)
@@ -286,11 +281,11 @@ def test_the_step_is_measured_against_the_most_squeezed_element(gradient: np.nda
     world.move({})
     moved(world, gradient)
     courant = world._courant()
-    exact = press.COURANT / share
-    if exact > LARGEST_COURANT:
+    exact = PRESS_COURANT / share
+    if exact > MAX_COURANT:
         assert courant == pytest.approx(exact, rel=1e-4)
     else:
-        assert exact - 1e-4 <= courant <= LARGEST_COURANT
+        assert exact - 1e-4 <= courant <= MAX_COURANT
 
 
 def test_the_most_squeezed_element_is_the_shortest_one_whatever_its_volume() -> None:
@@ -303,7 +298,7 @@ def test_the_most_squeezed_element_is_the_shortest_one_whatever_its_volume() -> 
 
 def test_a_step_that_squeezed_elements_do_not_bear_is_halved(monkeypatch: pytest.MonkeyPatch) -> None:
     """Though nothing blows up, as is seen without the limit."""
-    monkeypatch.setattr(press, "COURANT", 0.8)
+    monkeypatch.setattr(press, "PRESS_COURANT", 0.8)
     world = PressWorld(BALL.model_copy(update={"settling": Settling(mach=0.1)}))
     clear = world.snapshot()
 
@@ -313,10 +308,10 @@ def test_a_step_that_squeezed_elements_do_not_bear_is_halved(monkeypatch: pytest
         return [world.move(way) for way in ways]
 
     with monkeypatch.context() as patch:
-        patch.setattr(health, "LARGEST_COURANT", np.inf)
+        patch.setattr(health, "MAX_COURANT", np.inf)
         assert all(stats.residual <= 1e-2 and stats.retries == 0 for stats in pressed())
     last = pressed()[-1]
-    assert last.retries == 1 and last.time_step == pytest.approx(0.4e-3) and 0.4 < last.courant < LARGEST_COURANT
+    assert last.retries == 1 and last.time_step == pytest.approx(0.4e-3) and 0.4 < last.courant < MAX_COURANT
 
 
 def test_a_motion_tells_by_which_numbers_it_went() -> None:

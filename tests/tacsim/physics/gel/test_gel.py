@@ -23,8 +23,6 @@ from tacsim.physics.exec.layout import (
     SMALLEST_VOLUME,
     STEP,
 )
-from tacsim.physics.gel.corner import CORNER_STIFFNESS, NARROW
-from tacsim.physics.gel.element import HOURGLASS
 from tacsim.physics.gel.gel import GelState, gel_params
 from tacsim.physics.gel.kernels import (
     Gels,
@@ -33,6 +31,7 @@ from tacsim.physics.gel.kernels import (
     gel_forces,
 )
 from tacsim.physics.gel.mass import gel_advance_filtered, gel_even, gel_means
+from tacsim.physics.gel.tuning import CORNER_STIFFNESS, HOURGLASS_STIFFNESS, MIN_CORNER_RATIO
 
 pytestmark = pytest.mark.cpu
 
@@ -101,12 +100,12 @@ def test_random_displacement_matches_the_reference() -> None:
     params = gel_params(GEL, 1e-3)
     u = np.random.default_rng(0).normal(scale=0.05, size=nodes().shape)
     f, _ = run(u)
-    truth = laws.gel_forces(u, params.spacing, params.mu, params.lam, HOURGLASS)
+    truth = laws.gel_forces(u, params.spacing, params.mu, params.lam, HOURGLASS_STIFFNESS)
     assert np.abs(f - truth).max() < 3e-6 * np.abs(truth).max()
 
 
 def corner_energy(u: np.ndarray, h: float, modulus: float) -> float:
-    """Of the corners narrower than NARROW, each of an eighth of its element."""
+    """Of the corners narrower than MIN_CORNER_RATIO, each of an eighth of its element."""
     x, energy = nodes() + u, 0.0
     for i, j, k in np.ndindex(2, 2, 2):
         here, edges = x[i : x.shape[0] - 1 + i, j : x.shape[1] - 1 + j, k : x.shape[2] - 1 + k], []
@@ -115,7 +114,7 @@ def corner_energy(u: np.ndarray, h: float, modulus: float) -> float:
             at[axis] = slice(1 - side, x.shape[axis] - side)
             edges.append((x[tuple(at)] - here) * (1 - 2 * side) / h)
         volume = np.linalg.det(np.stack(edges, axis=-1))
-        energy += float((np.maximum(NARROW - volume, 0.0) ** 2).sum()) * modulus / 2 * h**3 / 8
+        energy += float((np.maximum(MIN_CORNER_RATIO - volume, 0.0) ** 2).sum()) * modulus / 2 * h**3 / 8
     return energy
 
 
@@ -126,7 +125,7 @@ def test_narrow_corners_press_back_by_a_potential() -> None:
     rng = np.random.default_rng(5)
     u = rng.normal(scale=0.22, size=nodes().shape)
     f, _ = run(u, 0.05)
-    found = f - laws.gel_forces(u, params.spacing, params.mu, params.lam, HOURGLASS)
+    found = f - laws.gel_forces(u, params.spacing, params.mu, params.lam, HOURGLASS_STIFFNESS)
     modulus = CORNER_STIFFNESS * (params.lam + 2 * params.mu)
     largest = np.abs(found).max()
     assert largest > 0.01 * modulus
@@ -150,7 +149,7 @@ def test_each_gel_of_each_environment_has_its_own_forces(element: float) -> None
     state.alike.u[:] = u = np.random.default_rng(1).normal(scale=0.05 * params.spacing, size=state.alike.u.shape)
     launch(state, FORCES)
     for environment, gel in np.ndindex(2, 2):
-        truth = laws.gel_forces(u[environment, gel], params.spacing, params.mu, params.lam, HOURGLASS)
+        truth = laws.gel_forces(u[environment, gel], params.spacing, params.mu, params.lam, HOURGLASS_STIFFNESS)
         assert np.abs(state.alike.f[environment, gel] - truth).max() < 3e-6 * np.abs(truth).max()
 
 
@@ -166,7 +165,7 @@ def test_gels_that_are_cut_differently_have_their_own_forces() -> None:
         for params, group in zip(order, state.groups, strict=True):
             for environment in range(3):
                 u = group.u[environment, 0].astype(np.float64)
-                truth = laws.gel_forces(u, params.spacing, params.mu, params.lam, HOURGLASS)
+                truth = laws.gel_forces(u, params.spacing, params.mu, params.lam, HOURGLASS_STIFFNESS)
                 assert np.abs(group.f[environment, 0] - truth).max() < 3e-6 * np.abs(truth).max()
 
 
@@ -190,7 +189,7 @@ def test_a_substep_is_symplectic_euler_with_lumped_masses() -> None:
     mass = params.density * params.spacing**3 * share[..., 1:, None]
     for gel in range(2):
         whole = np.concatenate([np.zeros_like(u[0, gel, :, :, :1]), u[0, gel]], axis=2)
-        force = laws.gel_forces(whole, params.spacing, params.mu, params.lam, HOURGLASS)
+        force = laws.gel_forces(whole, params.spacing, params.mu, params.lam, HOURGLASS_STIFFNESS)
         held = partial[0].reshape(2, -1, NUMBERS)[gel, :, BACKING : BACKING + 3].sum(axis=0)
         assert held == pytest.approx(force[:, :, 0].sum(axis=(0, 1)), abs=1e-5 * np.abs(force).max())
         contact = contact_force[0, gel, :, :count, :3].sum(axis=0, dtype=float).reshape(*state.alike.u.shape[2:4], 3)

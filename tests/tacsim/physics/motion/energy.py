@@ -11,10 +11,12 @@ from numpy.typing import NDArray
 
 from tacsim import pose as se3
 from tacsim.physics.body.followers import following, node_masses
-from tacsim.physics.body.plasticine import STENCIL_REACH, bounds, fit_grid
-from tacsim.physics.contact.contact import ON_GEL, TANGENT_STIFFNESS
+from tacsim.physics.body.plasticine import bounds, fit_grid
+from tacsim.physics.body.tuning import STENCIL_REACH
+from tacsim.physics.contact.contact import ON_GEL
+from tacsim.physics.contact.tuning import PARTICLE_TANGENTIAL_STIFFNESS
 from tacsim.physics.exec import layout
-from tacsim.physics.gel.element import HOURGLASS
+from tacsim.physics.gel.tuning import HOURGLASS_STIFFNESS
 from tacsim.physics.worlds.hybrid import HybridWorld
 
 Array = NDArray[Any]
@@ -31,7 +33,7 @@ def of_gel(u: Array, v: Array, h: float, mu: float, lam: float, density: float) 
     energy = h**3 * float((mu / 2 * ((f**2).sum((-1, -2)) - 3 - 2 * log_volume) + lam / 2 * log_volume**2).sum())
     for axes in ((0, 1), (1, 2), (0, 2), (0, 1, 2)):  # hourglass modes
         mode = sum(np.prod(signs[key][list(axes)]) * at for key, at in corners.items())
-        energy += HOURGLASS * 2 * mu * h / 16 * float((np.asarray(mode) ** 2).sum())
+        energy += HOURGLASS_STIFFNESS * 2 * mu * h / 16 * float((np.asarray(mode) ** 2).sum())
     mass = np.full(u.shape[:3], density * h**3)
     mass[[0, -1]] /= 2
     mass[:, [0, -1]] /= 2
@@ -95,7 +97,7 @@ def of_contact(world: HybridWorld, state: Mapping[str, Array], params: Array, g:
     overlap = (at[:, 2] + history[:, 6] - x[:, 2]) * normal[:, 2] / np.linalg.norm(normal, axis=1)
     slip = x[:, :2] - h * (start - a) - history[:, :2]
     stuck = slip[:, :1] * t1 + slip[:, 1:] * t2
-    springs = (np.maximum(overlap + history[:, 3], 0) ** 2).sum() + TANGENT_STIFFNESS * (stuck**2).sum()
+    springs = (np.maximum(overlap + history[:, 3], 0) ** 2).sum() + PARTICLE_TANGENTIAL_STIFFNESS * (stuck**2).sum()
     return float(params[layout.STIFFNESS]) * float(springs) / 2
 
 

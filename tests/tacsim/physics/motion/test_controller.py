@@ -8,7 +8,6 @@ import pytest
 from tacsim.interface import Pose
 from tacsim.models.scene import Settling
 from tacsim.physics.motion.controller import (
-    LASTING,
     ForceReading,
     Launch,
     creep_to_come,
@@ -18,6 +17,7 @@ from tacsim.physics.motion.controller import (
     still_to_come,
 )
 from tacsim.physics.motion.path import Path
+from tacsim.physics.motion.tuning import FORECAST_READINGS
 
 
 def test_contact_forces_balance_the_weight_of_the_body() -> None:
@@ -66,14 +66,14 @@ def creeping(share: float, after: float) -> ForceReading:
 def test_of_a_creep_with_the_logarithm_of_time_is_told_what_is_to_come(before: int) -> None:
     """Whenever it began: the motion alone would have it 10 readings older than the hold."""
     held = [creeping(0.01, before + n) for n in range(1, 41)]
-    lost = 0.01 * np.log1p(LASTING / (before + 40))
+    lost = 0.01 * np.log1p(FORECAST_READINGS / (before + 40))
     told = creep_to_come(held, 40 + (10 if before > 10 else 1))
     assert 0.95 * lost < told < 1.25 * lost
 
 
 def test_a_creep_that_turns_is_as_old_as_the_motion() -> None:
     held = [reading(0.5 + 0.01 * change) for change in (0, 1, 0)]
-    assert creep_to_come(held, 20.0) == pytest.approx(0.01 * 20 * np.log1p(LASTING / 20))
+    assert creep_to_come(held, 20.0) == pytest.approx(0.01 * 20 * np.log1p(FORECAST_READINGS / 20))
 
 
 def test_a_body_that_swings_between_two_gels_does_not_creep() -> None:
@@ -118,4 +118,4 @@ def test_what_creeps_with_the_logarithm_of_time_is_not_settled_before_its_time(c
     )
     after = 7 + stats.hold // path.interval
     assert stats.settled
-    assert (0.01 * np.log1p(LASTING / after) <= 1e-2) == creeps
+    assert (0.01 * np.log1p(FORECAST_READINGS / after) <= 1e-2) == creeps

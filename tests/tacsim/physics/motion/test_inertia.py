@@ -6,7 +6,7 @@ import pytest
 from tacsim.interface import Pose
 from tacsim.models.material import BodyMaterial, GelMaterial
 from tacsim.models.scene import Body, Box, Gel, Indenter, Scene, Sphere
-from tacsim.physics.motion.inertia import FASTEST_DRIVE
+from tacsim.physics.motion.tuning import MAX_DRIVE_MACH
 from tacsim.physics.seed.world import SeedWorld
 from tacsim.physics.world import World
 from tacsim.physics.worlds.hybrid import HybridWorld
@@ -164,7 +164,7 @@ def test_the_advice_for_a_longer_duration_holds() -> None:
         world.move(along_z(world, "indenter", -0.1e-3), duration=1e-5)
     longer = float(str(refused.value).rsplit("at least ", 1)[1].split()[0])
     assert world.move(along_z(world, "indenter", -0.1e-3), duration=1.01 * longer).hold == 0
-    assert FASTEST_DRIVE < 0.5
+    assert MAX_DRIVE_MACH < 0.5
 
 
 @pytest.mark.cpu

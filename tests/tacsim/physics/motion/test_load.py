@@ -11,8 +11,9 @@ from tacsim.interface import Pose
 from tacsim.models.material import BodyMaterial
 from tacsim.models.scene import Body, Box, Cylinder, Gel, Indenter, Scene, Sphere
 from tacsim.physics.motion.controller import ForceReading, run
-from tacsim.physics.motion.load import SMALLEST_LOAD, LoadNotReached, keep_loads
+from tacsim.physics.motion.load import LoadNotReached, keep_loads
 from tacsim.physics.motion.path import Path, plan
+from tacsim.physics.motion.tuning import MIN_FORCE_SHARE
 from tacsim.physics.world import World, make_world
 from tacsim.physics.worlds.press import PressWorld
 
@@ -39,7 +40,7 @@ def test_a_load_is_found_from_without_contact_and_given_up_again() -> None:
     pressed = world.pose("lower").position
     assert pressed[2] > 0.2e-3 and np.abs(pressed[:2]).max() == 0  # came up to the indenter, and only that
     world.move({}, loads={"lower": 0.0})
-    tolerance = 1e-2 * SMALLEST_LOAD * 0.145 * 4.0**2  # of what counts as none
+    tolerance = 1e-2 * MIN_FORCE_SHARE * 0.145 * 4.0**2  # of what counts as none
     assert load(world, "lower") == pytest.approx(0.0, abs=tolerance)
     assert world.pose("lower").position[2] < pressed[2]
 

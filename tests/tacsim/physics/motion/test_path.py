@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from tacsim.interface import Pose
-from tacsim.physics.motion.path import MOST_SUBSTEPS, PEAK_SLOPE, Path, plan, plan_flow, ramp
+from tacsim.physics.motion.path import PEAK_SLOPE, Path, plan, plan_flow, ramp
+from tacsim.physics.motion.tuning import MAX_SUBSTEPS
 
 
 @pytest.mark.parametrize("rise", [0.5, 0.1])
@@ -134,4 +135,4 @@ def test_a_path_that_would_take_for_ever_is_refused() -> None:
     with pytest.raises(ValueError, match=r"500 m at Mach 0\.01 would take 1\.2e\+08 substeps"):
         plan_flow([Pose()], far, np.zeros((1, 6)), mach=0.01, dt=0.4, lever=10.0, thickness=4.0)
     slow = plan([Pose()], [Pose(np.array([0, 0, 50e-3]))], mach=0.001, dt=0.125, lever=10.0, thickness=4.0)
-    assert 0.7 * MOST_SUBSTEPS < slow.substeps < MOST_SUBSTEPS
+    assert 0.7 * MAX_SUBSTEPS < slow.substeps < MAX_SUBSTEPS

@@ -56,8 +56,8 @@ def pressed(squeezed):
 
 
 def test_a_free_body_keeps_its_momentum(monkeypatch):
-    monkeypatch.setattr(seed_world, "BODY_DAMPING", 0.0)
-    monkeypatch.setattr(seed_world, "SWAY_DAMPING", 0.0)
+    monkeypatch.setattr(seed_world, "BODY_ZETA", 0.0)
+    monkeypatch.setattr(seed_world, "BODY_ZETA_ACROSS", 0.0)
     world = make(tolerance=1e-9, max_substeps=40, mach=0.03)
     squeeze(world, -6e-3)  # out of reach of the gels
     x, v = world._body_points(), world._v[2 * world._gels :]

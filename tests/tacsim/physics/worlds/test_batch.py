@@ -15,15 +15,16 @@ from tacsim.models.material import BodyMaterial, GelMaterial
 from tacsim.models.scene import Body, Box, Cylinder, Gel, Indenter, Mesh, Scene, Shape, Sphere
 from tacsim.physics.body import plasticine
 from tacsim.physics.exec.lanes import COPIES, MAX_NUMBERS
-from tacsim.physics.failure.health import LARGEST_GRID, SimulationDiverged
+from tacsim.physics.failure.health import SimulationDiverged
+from tacsim.physics.failure.tuning import MAX_GRID_NODES
 from tacsim.physics.motion.load import LoadNotReached
 from tacsim.physics.move import MoveStats
 from tacsim.physics.world import World
 from tacsim.physics.worlds import press_state
-from tacsim.physics.worlds.base import RETRIES
 from tacsim.physics.worlds.batch import Batch
 from tacsim.physics.worlds.hybrid import HybridWorld
 from tacsim.physics.worlds.press import PressWorld
+from tacsim.physics.worlds.tuning import MAX_RETRIES
 
 GEL = Gel(size=(8e-3, 8e-3, 4e-3))
 CLAY = BodyMaterial(yield_stress=30e3)
@@ -146,7 +147,7 @@ def test_nobody_moves(fresh: Batch) -> None:
 
 
 @pytest.mark.cpu
-@pytest.mark.parametrize("fails", [1, RETRIES + 1])
+@pytest.mark.parametrize("fails", [1, MAX_RETRIES + 1])
 def test_one_that_diverges_is_taken_back_while_others_go_on(
     fresh: Batch, fails: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -177,7 +178,7 @@ def test_one_that_diverges_is_taken_back_while_others_go_on(
         assert fresh.worlds[1].wrench("lower")[2] == pytest.approx(force, rel=0.05)
     else:
         assert isinstance(ends[1], SimulationDiverged)
-        assert f"1/{2**RETRIES} of the time step" in str(ends[1])
+        assert f"1/{2**MAX_RETRIES} of the time step" in str(ends[1])
         assert state(fresh.worlds[1]) == before
 
 
@@ -223,7 +224,7 @@ def test_one_that_needs_more_grid_than_its_share_is_told_alone() -> None:
     """Its grid would be allowed in a world of its own; of four, in four copies, kernels could not count the nodes."""
     batch = Batch(SCENES[:1] * 4)
     most = batch._state.particles.most
-    assert most < LARGEST_GRID and 4 * COPIES * 4 * most <= MAX_NUMBERS
+    assert most < MAX_GRID_NODES and 4 * COPIES * 4 * most <= MAX_NUMBERS
     way = (most ** (1 / 3) - 9) * 2 * SCENES[0].spacing * 1e3  # [mm]; body and borders are another 17 cells
     for place in ("position", "reference"):
         batch.worlds[1].arrays()[place][-1] += [way, way, way]

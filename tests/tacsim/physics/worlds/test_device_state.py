@@ -22,7 +22,7 @@ from tacsim.physics.body.moments import moments_of
 from tacsim.physics.contact.gel_overlap import box_round
 from tacsim.physics.failure import diagnosis
 from tacsim.physics.failure.health import SimulationDiverged
-from tacsim.physics.motion.controller import SUBSTEPS_PER_LAUNCH
+from tacsim.physics.motion.tuning import SUBSTEPS_PER_LAUNCH
 from tacsim.physics.snapshot import gel_arrays
 from tacsim.physics.worlds.batch import Batch
 from tacsim.physics.worlds.device_state import runs_of

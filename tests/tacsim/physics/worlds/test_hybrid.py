@@ -16,8 +16,9 @@ from tacsim.models.material import BodyMaterial
 from tacsim.models.scene import Body, Box, Gel, Scene
 from tacsim.physics.exec.layout import HOUSING_FORCE
 from tacsim.physics.failure.health import SimulationDiverged
-from tacsim.physics.worlds import hybrid, hybrid_kernels
+from tacsim.physics.worlds import hybrid_kernels
 from tacsim.physics.worlds.hybrid import HybridWorld
+from tacsim.physics.worlds.tuning import INITIAL_GAP
 
 CLAY = BodyMaterial(yield_stress=30e3)
 CUBE = Body(geometry=Box(size=(6e-3, 6e-3, 5e-3)), material=CLAY)
@@ -34,7 +35,7 @@ def shift(w: HybridWorld, name: str, by: tuple[float, float, float]) -> dict[str
 
 def squeeze(w: HybridWorld, by: float) -> None:
     """Both sensors towards each other by `by` in all, in two moves, clearance included in the first."""
-    for part in (by / 2 + hybrid.CLEARANCE * 2, by / 2):
+    for part in (by / 2 + INITIAL_GAP * 2, by / 2):
         stats = w.move({**shift(w, "lower", (0, 0, part / 2)), **shift(w, "upper", (0, 0, -part / 2))})
         assert stats.settled and stats.guard_hits == 0, stats
 
@@ -99,7 +100,7 @@ def test_short_squeezes_end_where_slow_ones_do(by: float) -> None:
         assert w.move({**shift(w, "lower", (0, 0, part / 2)), **shift(w, "upper", (0, 0, -part / 2))}).settled
 
     slow = world(settling={"mach": 0.003, "tolerance": 1e-3, "max_substeps": 100_000})
-    close(slow, 2 * hybrid.CLEARANCE + 0.1e-3)
+    close(slow, 2 * INITIAL_GAP + 0.1e-3)
     touched = slow.snapshot()
     close(slow, by)
     fast = world()
@@ -115,7 +116,7 @@ def test_a_deep_squeeze_ends_near_the_slow_limit() -> None:
     forces = []
     for tolerance in (1e-2, 2e-3):
         w = world(settling={"tolerance": tolerance, "max_substeps": 100_000})
-        for by in (2 * hybrid.CLEARANCE + 0.1e-3, 3e-3):
+        for by in (2 * INITIAL_GAP + 0.1e-3, 3e-3):
             assert w.move({**shift(w, "lower", (0, 0, by / 2)), **shift(w, "upper", (0, 0, -by / 2))}).settled
         forces.append(-w.wrench("lower")[2])
     assert forces == pytest.approx([2.545, 2.545], rel=0.035)

@@ -31,7 +31,6 @@ from tacsim.physics.move import MoveCommand
 from tacsim.physics.snapshot import State
 
 FOLDER = "TACSIM_DUMPS"  # environment variable: where dumps are written; none are without it, or where it is empty
-MAX_DUMPS = 20  # in one folder; training that diverges again and again must not fill the disk
 MOMENTS = ("before", "good", "failed")
 MESH = "shape.stl"
 

@@ -16,7 +16,7 @@ import pytest
 from tacsim.interface import Pose
 from tacsim.models.scene import Gel, Indenter, Mesh, Scene, Settling, Sphere
 from tacsim.physics.failure import dump
-from tacsim.physics.failure.dump import MAX_DUMPS, DumpError, dumps_in, read
+from tacsim.physics.failure.dump import DumpError, dumps_in, read
 from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.physics.failure.tuning import MAX_DUMPS
 from tacsim.physics.worlds.press import PressWorld

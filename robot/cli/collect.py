@@ -5,14 +5,13 @@ from __future__ import annotations
 import re
 import shlex
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import typer
 
 from robot.cli.errors import FAILED, complain
-from robot.cli.options import Overrides, Preset, SensorModel, grouped, quantity, require_packages
+from robot.cli.options import OptionGroup, Overrides, Preset, SensorModel, grouped, quantity, require_packages
 from robot.cli.output import busy, notes, one_bar, results
 from robot.cli.terminal import Interrupt
 
@@ -71,8 +70,7 @@ def range_of(kind: str, help_: str) -> Any:
     return typer.Option(parser=between(kind), metavar="RANGE", help=help_)
 
 
-@dataclass(frozen=True)
-class PressRanges:
+class PressRanges(OptionGroup):
     """Options whose values are drawn for each press."""
 
     depth: Annotated[Any, range_of("length", "How deep below the untouched gel.")] = "0.1..1.0mm"

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from robot.cli.errors import complain
-from robot.cli.options import Out, Overrides, grouped
+from robot.cli.options import OptionGroup, Out, Overrides, grouped
 from robot.cli.output import busy, counted, new_directory, notes, results, say_files, show_table, warn, writing
 
 if TYPE_CHECKING:
@@ -25,8 +25,7 @@ Pair = Literal["auto", "name", "order"]
 Limit = tuple[str, float, bool]  # name, value, True: above it is a failure
 
 
-@dataclass(frozen=True)
-class Sources:
+class Sources(OptionGroup):
     """Options that describe one of the two sources."""
 
     reference_a: Annotated[

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from robot.cli.errors import UNUSABLE, complain
-from robot.cli.options import Out, Overrides, grouped, length, quantities, quantity
+from robot.cli.options import OptionGroup, Out, Overrides, grouped, length, quantities, quantity
 from robot.cli.output import busy, new_directory, notes, one_bar, results, say_files, show_table, warn, writing
 
 if TYPE_CHECKING:
@@ -40,8 +39,7 @@ Balls = Annotated[
 FORCE = quantity("force", 1e-6, 1e3)
 
 
-@dataclass(frozen=True)
-class Fitting:
+class Fitting(OptionGroup):
     """The options that both commands have."""
 
     fit: Annotated[str | None, typer.Option(metavar="NAMES", help="Only these, with commas between.")] = None

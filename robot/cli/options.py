@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable
-from dataclasses import fields, is_dataclass
-from functools import wraps
+from collections.abc import Callable, Mapping
+from functools import cached_property, update_wrapper
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_type_hints
 
@@ -63,36 +62,56 @@ def length(help_: str, low: float = -math.inf, high: float = math.inf) -> Any:
     return typer.Option(parser=quantity("length", low, high), metavar="LENGTH", help=help_)
 
 
+class OptionGroup:
+    """Options of one or several commands, as annotated attributes with defaults; see `grouped`."""
+
+    def __init__(self, **values: Any) -> None:
+        self.__dict__.update(values)
+
+
 def grouped(command: Callable[..., None]) -> Callable[..., None]:
-    """A command some of whose parameters are dataclasses: their fields become options of the command, in their place.
+    """A command some of whose parameters are groups: their attributes become options of the command, in their place."""
+    return _GroupedCommand(command)
 
-    Several commands can share a dataclass, and a command with many options keeps a short list of parameters.
-    """
-    kinds: dict[str, Any] = {}
-    parameters: list[inspect.Parameter] = []
-    for name, parameter in inspect.signature(command, eval_str=True).parameters.items():
-        kind = parameter.annotation
-        if not is_dataclass(kind):
-            parameters.append(parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY))
-            continue
-        kinds[name], hints = kind, get_type_hints(kind, include_extras=True)
-        parameters += [
-            inspect.Parameter(
-                field.name, inspect.Parameter.KEYWORD_ONLY, default=field.default, annotation=hints[field.name]
-            )
-            for field in fields(kind)
-        ]
 
-    @wraps(command)
-    def run(**given: Any) -> None:
+class _GroupedCommand:
+    """Its signature is read for the command that is called only: for all commands that would take 10 ms."""
+
+    def __init__(self, command: Callable[..., None]) -> None:
+        self._command = command
+        update_wrapper(self, command)
+
+    def __call__(self, **given: Any) -> None:
         groups = {
-            name: kind(**{field.name: given.pop(field.name) for field in fields(kind)}) for name, kind in kinds.items()
+            name: kind(**{option: given.pop(option) for option in kind.__annotations__})
+            for name, kind in self._groups.items()
         }
-        command(**given, **groups)
+        self._command(**given, **groups)
 
-    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-    run.__annotations__ = {each.name: each.annotation for each in parameters}
-    return run
+    @cached_property
+    def _parameters(self) -> Mapping[str, inspect.Parameter]:
+        return inspect.signature(self._command, eval_str=True).parameters
+
+    @cached_property
+    def _groups(self) -> dict[str, type[OptionGroup]]:
+        kinds = {name: parameter.annotation for name, parameter in self._parameters.items()}
+        return {name: kind for name, kind in kinds.items() if isinstance(kind, type) and issubclass(kind, OptionGroup)}
+
+    @property
+    def __signature__(self) -> inspect.Signature:
+        found: list[inspect.Parameter] = []
+        for name, parameter in self._parameters.items():
+            if name not in self._groups:
+                found.append(parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY))
+                continue
+            kind = self._groups[name]
+            found += [
+                inspect.Parameter(
+                    option, inspect.Parameter.KEYWORD_ONLY, default=getattr(kind, option), annotation=annotation
+                )
+                for option, annotation in get_type_hints(kind, include_extras=True).items()
+            ]
+        return inspect.Signature(found)
 
 
 def angle(help_: str, low: float = -math.inf, high: float = math.inf) -> Any:

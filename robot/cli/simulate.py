@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from robot.cli.errors import FAILED, complain
-from robot.cli.options import Out, Overrides, Preset, SensorModel, angle, grouped, length, quantities
+from robot.cli.options import OptionGroup, Out, Overrides, Preset, SensorModel, angle, grouped, length, quantities
 from robot.cli.output import busy, measuring, new_directory, notes, progress, results, say_files, writing
 from robot.cli.terminal import Interrupt
 
@@ -20,8 +19,7 @@ if TYPE_CHECKING:
 AXES = ("roll", "pitch", "yaw")
 
 
-@dataclass(frozen=True)
-class IndenterShape:
+class IndenterShape(OptionGroup):
     """Options that describe the indenter and how it is turned."""
 
     radius: Annotated[Any, length("Of a sphere or cylinder; 4 mm if left out.")] = None

@@ -7,7 +7,6 @@ import math
 import shlex
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,7 +14,7 @@ import typer
 
 from robot.cli.calibrate.session import confirm_motion, led
 from robot.cli.errors import complain
-from robot.cli.options import HardwareRig, Out, Overrides, angle, grouped, length
+from robot.cli.options import HardwareRig, OptionGroup, Out, Overrides, angle, grouped, length
 from robot.cli.output import busy, new_directory, notes, results, say_files, show_table, writing
 from robot.cli.terminal import Interrupt, ask, require_person
 
@@ -32,8 +31,7 @@ Rig = Annotated[
 ]
 
 
-@dataclass(frozen=True)
-class TouchMotion:
+class TouchMotion(OptionGroup):
     """Options of the motion from touch to touch."""
 
     number: Annotated[int, typer.Option("--touches", min=6, max=200, help="How many; more make it surer.")] = 24
@@ -43,8 +41,7 @@ class TouchMotion:
     lift: Annotated[Any, length("How far back along the sensor's axis between touches.", 2e-3, 50e-3)] = "6 mm"
 
 
-@dataclass(frozen=True)
-class TouchErrors:
+class TouchErrors(OptionGroup):
     """Standard deviations of what is measured."""
 
     noise_centre: Annotated[Any, length("Standard deviation of the contact's centre, each axis.", 1e-6, 1e-2)] = (
@@ -164,8 +161,7 @@ def _report_touch(record: TouchFile, noise: TouchNoise, folder: Path, arm: str) 
     _write_report(folder, "touch.json", report)
 
 
-@dataclass(frozen=True)
-class ViewMotion:
+class ViewMotion(OptionGroup):
     """Options of the motion from pose to pose."""
 
     number: Annotated[int, typer.Option("--poses", min=6, max=200, help="How many; more make it surer.")] = 20
@@ -173,8 +169,7 @@ class ViewMotion:
     pivot: Annotated[Any, length("How far before the sensor the point is that it turns about.", 0.0, 2.0)] = "0 mm"
 
 
-@dataclass(frozen=True)
-class BoardErrors:
+class BoardErrors(OptionGroup):
     """Standard deviations of what is measured."""
 
     noise_board: Annotated[Any, length("Standard deviation of the board's place, each axis.", 1e-6, 0.1)] = "0.5 mm"

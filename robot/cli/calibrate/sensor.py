@@ -21,7 +21,7 @@ from robot.cli.calibrate.light import (
     write_calibration,
 )
 from robot.cli.calibrate.session import confirm_free_gel, led, named_camera, picture_keeper
-from robot.cli.options import Out, Overrides, grouped, length, quantities, quantity
+from robot.cli.options import OptionGroup, Out, Overrides, grouped, length, quantities, quantity
 from robot.cli.output import new_directory, notes, warn
 
 if TYPE_CHECKING:
@@ -39,8 +39,7 @@ def _group() -> None:
     """Calibrate what stands behind a rig."""
 
 
-@dataclass(frozen=True)
-class Description:
+class Description(OptionGroup):
     """Options that describe ball, pictures and gel."""
 
     ball_diameter: Annotated[Any, length('Of the ball, as a calliper shows it, for example "5.84 mm".', 1e-4, 0.1)] = (

@@ -321,7 +321,7 @@ class Normaliser(Protocol):
     def __call__(self, frame: TactileFrame, now: float) -> TactileObservation: ...
 
     def diagnostics(self) -> Mapping[str, float]:
-        """How trustworthy the last observation is (tacsim.step_info). Empty for sources that know their surface."""
+        """How trustworthy the last observation is, by keys of `Step.info`. Empty where a source knows its surface."""
         ...
 
 

@@ -197,7 +197,7 @@ def _drive(
     """The episode, shown by the bar, and what ended it too early ("" when nothing did)."""
     from robot.deploy.control_loop import EpisodeFailed, run_episode
     from robot.deploy.policy import outside_in_words
-    from tacsim.step_info import TRAINING_DISTANCE
+    from tacsim.record.step_info import TRAINING_DISTANCE
 
     told = False
 

@@ -19,8 +19,8 @@ from tacsim.control.contact_signal import contact_signal
 from tacsim.interface import Action, EndOfEpisode, Observation, Policy, Pose, Truth
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.record.episode import Episode, EpisodeMeta, Step
+from tacsim.record.step_info import MAX_DEPTH, MAX_FLOW, MAX_SLOPE, PACKAGES_LOST, TACTILE_DISTANCE
 from tacsim.rig import Rig
-from tacsim.step_info import MAX_DEPTH, MAX_FLOW, MAX_SLOPE, PACKAGES_LOST, TACTILE_DISTANCE
 from tacsim.tasks import GoalOutOfReach, Task, judge
 
 PARTICLES = 5_000  # of a body go into a recorded step, at most

@@ -14,8 +14,8 @@ from tacsim.config import config_root
 from tacsim.interface import IncompatibleRig, Policy, RigSpec
 from tacsim.models.scene import Scene
 from tacsim.models.sensor import CanonicalGrid
+from tacsim.record.step_info import TRAINING_DISTANCE, TRAINING_KNOWN
 from tacsim.rig import require
-from tacsim.step_info import TRAINING_DISTANCE, TRAINING_KNOWN
 from tacsim.tasks import Task
 
 

@@ -33,7 +33,7 @@ from tacsim.models.sensor import CanonicalGrid
 from tacsim.optics.grid import canonical_cells
 from tacsim.record.episode import ArmPackages, Step
 from tacsim.record.images import encode_png
-from tacsim.step_info import LIMITS_HIT
+from tacsim.record.step_info import LIMITS_HIT
 
 if TYPE_CHECKING:
     import rerun as rr

@@ -19,8 +19,8 @@ from tacsim.interface import Normaliser, Pose, RigSpec, SensorSpec, TactileSourc
 from tacsim.models.driver import ArmDriver, Companion, SensorDriver
 from tacsim.models.hardware import ArmLimits
 from tacsim.models.rig import RigConfig
+from tacsim.record.step_info import ALIGNMENT, LIMITS_HIT
 from tacsim.rig import Rig
-from tacsim.step_info import ALIGNMENT, LIMITS_HIT
 
 Confirm = Callable[[str], bool]
 SensorDrivers = Mapping[str, SensorDriver[Any]]

@@ -28,8 +28,8 @@ from tacsim.interface import RigSpec
 from tacsim.models.randomisation import Randomisation
 from tacsim.models.training import Training
 from tacsim.record.episode import Episode
+from tacsim.record.step_info import TACTILE_DISTANCE
 from tacsim.rig import Rig
-from tacsim.step_info import TACTILE_DISTANCE
 from tacsim.tasks import make_task
 
 Side = Literal["simulation", "twin"]

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from tacsim.interface import FloatArray
-from tacsim.report.series import Series
-from tacsim.step_info import (
+from tacsim.record.step_info import (
     ALIGNMENT,
     BACKGROUND_SLOPE,
     COLOUR_DRIFT,
@@ -25,6 +24,7 @@ from tacsim.step_info import (
     TRAINING_DISTANCE,
     TRAINING_KNOWN,
 )
+from tacsim.report.series import Series
 
 PICTURES = {"lost": PICTURES_LOST, "damaged": PICTURES_DAMAGED, "shown again": PICTURES_REPEATED}
 MUCH_BEYOND, FEW_KEPT = 0.01, 0.8  # a warning is given above, and below

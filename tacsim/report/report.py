@@ -13,9 +13,9 @@ import numpy as np
 
 from tacsim.interface import FloatArray, SurfaceMap, TactileFrame, TactileObservation
 from tacsim.record.episode import Episode
+from tacsim.record.step_info import SETTLED
 from tacsim.report.diagnostics import timing, timing_rows, training_range, training_rows, trust, trust_rows
 from tacsim.report.series import Series
-from tacsim.step_info import SETTLED
 
 if TYPE_CHECKING:
     from rich.table import Table

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from tacsim.interface import FloatArray
 from tacsim.record.episode import Episode, EpisodeMeta
-from tacsim.step_info import (
+from tacsim.record.step_info import (
     ARM_KEYS,
     CONTACT_SIGNAL,
     MAX_DEPTH,

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from calibration.materials.fit import Signals
 from tacsim.interface import FloatArray, Pose
-from tacsim.pose import difference
+from tacsim.pose import pose_difference
 
 Quantity = Literal["force", "dent", "width", "slip"]
 QUANTITY: dict[str, Quantity] = {
@@ -36,7 +36,7 @@ class Press:
     @property
     def places(self) -> FloatArray:
         """(n, 6 k) where the k parts are, and how far they have turned: rotation vectors times ARM [m]."""
-        turned = [[ARM * difference(poses[0], pose)[3:] for pose in poses] for poses in self.poses.values()]
+        turned = [[ARM * pose_difference(poses[0], pose)[3:] for pose in poses] for poses in self.poses.values()]
         return np.hstack([*([pose.position for pose in poses] for poses in self.poses.values()), *turned])
 
     def at(self, moments: Sequence[int]) -> Press:

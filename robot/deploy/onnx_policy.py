@@ -92,7 +92,7 @@ class OnnxPolicy:
         self.watch(seen)
         for axis in self._axes:
             now = observation.arms[axis.arm].pose
-            if first or se3.distance(self._targets[axis.arm], now)[0] > ASTRAY * self.spec.max_step:
+            if first or se3.pose_distance(self._targets[axis.arm], now)[0] > ASTRAY * self.spec.max_step:
                 self._targets[axis.arm] = now
         action = action_from(self._infer(seen), self._axes, self.spec.max_step, self._targets)
         self._targets = {arm: pose for arm, pose in action.tool.items() if pose is not None}

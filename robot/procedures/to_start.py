@@ -76,7 +76,7 @@ def lead_to_start(config: RigConfig, starts: Mapping[str, Pose], guide: Guide) -
             others = {other: _place(arm) for other, arm in opened.items() if other != name}
             require_clear(name, ways[name], others, config.kept_out(name))
             _lead(each, ways[name], guide)
-        return {name: se3.distance(each.state().pose, starts[name])[0] for name, each in opened.items()}
+        return {name: se3.pose_distance(each.state().pose, starts[name])[0] for name, each in opened.items()}
 
 
 def _zero(arm: StartArm, guide: Guide) -> None:

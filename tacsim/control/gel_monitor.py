@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tacsim.interface import SensorSpec, TactileObservation
-from tacsim.limits import LimitExceeded, exceeds
+from tacsim.limits import LimitExceeded, exceeds_limit
 from tacsim.models.hardware import ArmLimits
 
 
@@ -79,7 +79,7 @@ class GelMonitor:
             if limits is None:
                 continue
             for what, value, limit in zip(("depth", "shear"), found, (limits.depth, limits.shear), strict=True):
-                if exceeds(value, limit):
+                if exceeds_limit(value, limit):
                     assert limit is not None
                     shown_as = "is not measured (markers lost?)" if math.isnan(value) else f"{1e3 * value:.3g} mm"
                     raise self._error(

@@ -68,11 +68,11 @@ class LoadController:
             raise LimitExceeded(f"arm '{name}' holds a load of {self.loads[name]:g} N, but feels {force} N")
         here = arm.pose.position
         axis = self._axes.setdefault(name, _AxisState(here, (here, force), arm.pose))
-        normal = se3.matrix(arm.pose)[:, 2]
+        normal = se3.rotation_matrix(arm.pose)[:, 2]
         self._learn(axis, float(normal @ (here - axis.before[0])), force)
         axis.before = here, force
         asked = axis.sent if asked is None else asked
-        normal = se3.matrix(asked)[:, 2]
+        normal = se3.rotation_matrix(asked)[:, 2]
         step = self._step(axis, self.loads[name], force)
         if abs(travel := float(normal @ (axis.sent.position - axis.began)) + step) > REACH:
             raise LimitExceeded(

@@ -70,8 +70,8 @@ def _touch(touch: TactileObservation) -> Flat:
 
 
 def _arm(arm: ArmState, start: Pose) -> Flat:
-    moved = se3.relative(start, arm.pose)
-    pose = np.concatenate([moved.position, se3.two_columns(moved)])
+    moved = se3.relative_pose(start, arm.pose)
+    pose = np.concatenate([moved.position, se3.rotation_columns(moved)])
     flat: Flat = {"pose": pose, "twist": arm.twist, "wrench": arm.wrench}
     if arm.joints is not None:
         flat["joints"] = arm.joints

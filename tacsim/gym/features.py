@@ -228,7 +228,7 @@ class FeatureEncoder:
             each = [self._stepped(name, arm.pose) / SCALES["stepped"] for name, arm in arms.items()]
         else:
             first, *others = arms.values()
-            each = [se3.relative(first.pose, arm.pose).position / SCALES["between"] for arm in others]
+            each = [se3.relative_pose(first.pose, arm.pose).position / SCALES["between"] for arm in others]
         return np.concatenate(each)
 
     def _pressure(self, name: str, arm: ArmState) -> FloatArray:
@@ -238,7 +238,7 @@ class FeatureEncoder:
 
     def _stepped(self, name: str, pose: Pose) -> FloatArray:
         """(3,) since the last observation [m]."""
-        now, before = (se3.relative(self._start[name], each).position for each in (pose, self._before[name]))
+        now, before = (se3.relative_pose(self._start[name], each).position for each in (pose, self._before[name]))
         return now - before
 
     def _centroid(self, touch: TactileObservation) -> FloatArray:
@@ -355,13 +355,13 @@ def _depths(touch: TactileObservation) -> FloatArray:
 
 def moved(start: Pose, pose: Pose) -> FloatArray:
     """(9,) where an arm is, seen from where it was at reset, encoded: position, and two columns of the rotation."""
-    away = se3.relative(start, pose)
-    return np.concatenate([away.position / SCALES["moved"], (se3.two_columns(away) - _UNTURNED) / SCALES["turn"]])
+    away = se3.relative_pose(start, pose)
+    return np.concatenate([away.position / SCALES["moved"], (se3.rotation_columns(away) - _UNTURNED) / SCALES["turn"]])
 
 
 def unmoved(start: Pose, numbers: NDArray[np.floating[Any]]) -> Pose:
     """The pose that `moved` makes these numbers of (9,). Raises ValueError for columns that span no plane, and for
     numbers that are not finite."""
     values = np.asarray(numbers, np.float64)
-    away = se3.from_two_columns(values[:3] * SCALES["moved"], values[3:] * SCALES["turn"] + _UNTURNED)
+    away = se3.from_rotation_columns(values[:3] * SCALES["moved"], values[3:] * SCALES["turn"] + _UNTURNED)
     return se3.compose(start, away)

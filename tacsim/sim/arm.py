@@ -81,7 +81,8 @@ class SimArm:
             return np.array(world.wrench(self._frame), dtype=np.float64)
         here = world.pose(self._frame)
         parts = [
-            se3.transform_wrench(se3.relative(here, world.pose(name)), world.wrench(name)) for name in world.sensors
+            se3.transform_wrench(se3.relative_pose(here, world.pose(name)), world.wrench(name))
+            for name in world.sensors
         ]
         reaction: FloatArray = -np.sum(parts, axis=0)
         return reaction

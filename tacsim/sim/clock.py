@@ -101,7 +101,8 @@ class SimClock:
         elif self.stats is not None:
             self.stats = replace(self.stats, substeps=0, hold=0)
         self.velocities = {
-            frame: se3.difference(old, self._world.pose(frame)) / self.period for frame, old in self._before.items()
+            frame: se3.pose_difference(old, self._world.pose(frame)) / self.period
+            for frame, old in self._before.items()
         }
         self._time += self.period
         self.periods += 1

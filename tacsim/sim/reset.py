@@ -144,7 +144,7 @@ def _close_gaps(world: World, most: float) -> float | None:
     if not wanted:
         return None
     before = world.snapshot()
-    world.place({name: se3.along_z(world.pose(name), gap) for name, gap in wanted.items()})
+    world.place({name: se3.translated_along_z(world.pose(name), gap) for name, gap in wanted.items()})
     if _least_force(world) > most:
         world.restore(before)
         return None
@@ -155,13 +155,13 @@ def _gap(truth: Truth, sensor: Pose) -> float:
     """From the gel's rest surface to the nearest face of the body, along the sensor's z [m]."""
     points = truth.points.astype(np.float64)
     radius = 0.5 * (truth.height - float(np.ptp(points[:, 2])))
-    axis = se3.matrix(sensor)[:, 2]
+    axis = se3.rotation_matrix(sensor)[:, 2]
     return float(((points - sensor.position) @ axis).min()) - radius
 
 
 def _advance(world: World, steps: Mapping[str, float]) -> MoveStats:
     """Moves each named sensor along its own z by its step [m]."""
-    return world.move({name: se3.along_z(world.pose(name), step) for name, step in steps.items()})
+    return world.move({name: se3.translated_along_z(world.pose(name), step) for name, step in steps.items()})
 
 
 def _least_force(world: World) -> float:

@@ -61,7 +61,7 @@ def test_a_lens_is_found_from_tilted_pictures(board: Board) -> None:
     # a pose through the lens that was found
     pose = facing(board, [0.3, -0.2, 0.1], 0.036)
     found, residual = board_pose(lens, find_board(photograph(board, pose, seed=99), board))
-    metres, radians = se3.distance(found, pose)
+    metres, radians = se3.pose_distance(found, pose)
     assert residual < 0.4 and metres < 0.6e-3 and np.degrees(radians) < 0.6
 
 

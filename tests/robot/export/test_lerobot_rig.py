@@ -47,7 +47,7 @@ def test_numbers_of_a_pose_are_that_pose() -> None:
     rng = np.random.default_rng(0)
     for _ in range(20):
         start, pose = turned(rng, 1.0), turned(rng, 1.0)
-        assert max(se3.distance(unmoved(start, moved(start, pose)), pose)) < 1e-12
+        assert max(se3.pose_distance(unmoved(start, moved(start, pose)), pose)) < 1e-12
 
 
 @pytest.mark.parametrize("rig", ["sim", "mock", "ur5e", "ur5e-one"])

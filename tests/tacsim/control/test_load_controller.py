@@ -30,7 +30,7 @@ class Wall:
 
     @property
     def depth(self) -> float:
-        return float(se3.relative(self.start, self.pose).position[2])
+        return float(se3.relative_pose(self.start, self.pose).position[2])
 
     @property
     def force(self) -> float:
@@ -44,7 +44,7 @@ class Wall:
         """share: of the way that its limits leave."""
         target = held(Action({"hand": asked}), {"hand": self.state()}).tool["hand"]
         assert target is not None
-        self.pose = se3.interpolate(self.pose, target, share)
+        self.pose = se3.interpolate_pose(self.pose, target, share)
         held.sent({"hand": self.pose})
 
 
@@ -71,7 +71,7 @@ def test_only_the_way_along_z_of_the_sensor_is_replaced() -> None:
     x, _, z = turned.as_matrix().T
     for count in range(1, 9):
         wall.period(held, Pose(wall.start.position + count * 0.1e-3 * x - 0.4e-3 * z, turned.as_quat()))
-        moved = se3.relative(wall.start, wall.pose).position
+        moved = se3.relative_pose(wall.start, wall.pose).position
         assert moved[:2] == pytest.approx([count * 0.1e-3, 0.0], abs=1e-12)
     assert wall.force == pytest.approx(LOAD, rel=TOLERANCE)
 

@@ -70,7 +70,7 @@ def test_pose_is_relative_to_reset_and_reads_back() -> None:
     observation = make_observation()
     vector = encode.flatten(observation, POSES)["pose_upper"].astype(float)
     now = observation.arms["upper"].pose
-    back = se3.compose(POSES["upper"], se3.from_two_columns(vector[:3], vector[3:]))
+    back = se3.compose(POSES["upper"], se3.from_rotation_columns(vector[:3], vector[3:]))
     assert back.position == pytest.approx(now.position, abs=1e-6)
     assert abs(back.quaternion @ now.quaternion) == pytest.approx(1.0, abs=1e-6)
     at_reset = encode.flatten(Observation({}, observation.arms, 1.0), {"upper": now})["pose_upper"]

@@ -48,8 +48,8 @@ def check_action(action: object, movable: Collection[str], rig: str) -> Action:
             raise ActionError(f"action for '{name}' must be a tacsim.Pose or None (holds), got {target!r}")
         if target is not None and np.abs(target.position).max() > MAX_POSITION:
             raise ActionError(
-                f"target of arm '{name}' is at {target.position.tolist()} m, more than {MAX_POSITION:g} m from the origin; "
-                "poses are in metres, in the world frame"
+                f"target of arm '{name}' is at {target.position.tolist()} m, more than {MAX_POSITION:g} m from the "
+                "origin; poses are in metres, in the world frame"
             )
     return action
 

@@ -81,8 +81,8 @@ def find_way(name: str, config: UrArmConfig, reading: Reading, start: Pose) -> W
         worst = int(beyond.argmax())
         if beyond[worst] > max(0.0, beyond[0], beyond[-1]) + NEAR_LINE:
             raise NoWay(
-                f"arm '{name}': on the straight way of the joints its sensor would come {walls.violated_face(path[worst])}; "
-                "jog it nearer to its start by hand first"
+                f"arm '{name}': on the straight way of the joints its sensor would come "
+                f"{walls.violated_face(path[worst])}; jog it nearer to its start by hand first"
             )
     else:
         sunk = min(path[0, 2], path[-1, 2], config.limits.workspace.lower[2]) - float(path[:, 2].min())

@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode
 from robot.rig import CannotOpen
 from robot.rig.sim_rig import Simulation, simulate
 from tacsim.gym import encode
-from tacsim.gym.env import TacsimEnv, Variant, require_alike
+from tacsim.gym.env import TacsimEnv, Variant, require_compatible_task
 from tacsim.gym.features import FeatureEncoder
 from tacsim.gym.vector import Member, SharedBatch, TacsimVectorEnv
 from tacsim.models.features import Features
@@ -77,7 +77,7 @@ def _env(
         encoder=encoder,
         variants=variants,
         stage=simulation.stage,
-        wear=lambda worn: simulation.wear(config if worn is None else worn),
+        apply_variation=lambda worn: simulation.wear(config if worn is None else worn),
     )
 
 
@@ -95,7 +95,7 @@ def _variants(episodes: Episodes) -> list[Variant]:
         assert config.task is not None
         try:
             require_same_gels(first.scene, config.scene)
-            require_alike(first.task, config.task)
+            require_compatible_task(first.task, config.task)
         except ValueError as error:
             raise ValueError(f"variant {number}: {error}") from None
         variants.append(Variant(config.task, config.scene, config, words))

@@ -14,15 +14,15 @@ ENVIRONMENTS = {"tacsim/Squeeze-v0": "squeeze", "tacsim/Reposition-v0": "reposit
 
 def make_env(**options: Any) -> Any:
     """An environment by robot.open.make_env. Raises ImportError where Python finds another `robot` first."""
-    return _opener().make_env(**options)
+    return _robot_open_module().make_env(**options)
 
 
 def make_vector_env(**options: Any) -> Any:
     """The same of robot.open.make_vector_env."""
-    return _opener().make_vector_env(**options)
+    return _robot_open_module().make_vector_env(**options)
 
 
-def _opener() -> ModuleType:
+def _robot_open_module() -> ModuleType:
     name = "robot.open"  # not an import statement: tacsim stays below robot
     try:
         return import_module(name)

@@ -18,7 +18,7 @@ from tacsim.models.features import Features
 from tacsim.models.hardware import Placement
 from tacsim.models.rig import RigConfig, SimSensorConfig, WrenchNoise
 from tacsim.models.sensor import Lighting
-from tacsim.sim.stage import StatePool, require_same_gels
+from tacsim.sim.scene_world import StatePool, require_same_gels
 from tacsim.tasks import make_task
 
 MOST_ENVIRONMENTS = 10_000  # beyond any machine's memory
@@ -76,8 +76,8 @@ def _env(
         space=space,
         encoder=encoder,
         variants=variants,
-        stage=simulation.stage,
-        apply_variation=lambda worn: simulation.wear(config if worn is None else worn),
+        scene_world=simulation.scene_world,
+        apply_variation=lambda worn: simulation.apply_variation(config if worn is None else worn),
     )
 
 

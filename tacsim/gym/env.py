@@ -20,7 +20,7 @@ from tacsim.models.rig import RigConfig, TaskConfig
 from tacsim.models.scene import Scene
 from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.rig import Rig
-from tacsim.sim.stage import Stage
+from tacsim.sim.scene_world import SceneWorld
 from tacsim.tasks import BadDraws, GoalOutOfReach, make_task
 from tacsim.tasks.action import action_from, vector_of
 from tacsim.tasks.effort import Effort
@@ -67,7 +67,7 @@ class TacsimEnv(gymnasium.Env[encode.FlatObservation, NDArray[np.float32]]):
         space: of the observations; None: the rig is reset once to learn the shapes.
         encoder: of the features that a learned policy sees; None: the environment shows all that there is.
         variants: each reset draws one of them, from its seed; none: the rig and the task stay as they are.
-        stage: what the rig simulates, where a reset may exchange its scene.
+        scene_world: what the rig simulates, where a reset may exchange its scene.
         wear: gives sensors and arms of the rig what `Variant.rig` says of them.
 
     Raises IncompatibleRig when the rig lacks what the task needs.
@@ -84,7 +84,7 @@ class TacsimEnv(gymnasium.Env[encode.FlatObservation, NDArray[np.float32]]):
         space: gymnasium.Space[encode.FlatObservation] | None = None,
         encoder: FeatureEncoder | None = None,
         variants: Sequence[Variant] = (),
-        stage: Stage | None = None,
+        scene_world: SceneWorld | None = None,
         apply_variation: Callable[[RigConfig | None], None] = lambda config: None,
     ) -> None:
         if render_mode not in (None, *self.metadata["render_modes"]):
@@ -94,7 +94,7 @@ class TacsimEnv(gymnasium.Env[encode.FlatObservation, NDArray[np.float32]]):
         self._view = encode.FlatView() if encoder is None else encoder
         rig.require(self._view.needs, "a choice of features")
         self.rig, self.task, self.render_mode = rig, task, render_mode
-        self._variants, self._stage, self._apply_variation = tuple(variants), stage, apply_variation
+        self._variants, self._scene_world, self._apply_variation = tuple(variants), scene_world, apply_variation
         self._played: int | None = None  # the variant
         self._applied_variation: RigConfig | None = (
             None  # of which sensors and arms are now; None: of the environment's rig
@@ -125,7 +125,7 @@ class TacsimEnv(gymnasium.Env[encode.FlatObservation, NDArray[np.float32]]):
     @property
     def scene(self) -> Scene | None:
         """Of the next reset, if none is chosen or drawn for it; None where it cannot be exchanged."""
-        return None if self._stage is None else self._stage.scene
+        return None if self._scene_world is None else self._scene_world.scene
 
     # ------------------------------------------------------------------ reset
 
@@ -192,9 +192,9 @@ class TacsimEnv(gymnasium.Env[encode.FlatObservation, NDArray[np.float32]]):
             self._apply_variation(variation)
             self._applied_variation = variation
         if "scene" in chosen:
-            if self._stage is None:
+            if self._scene_world is None:
                 raise ValueError(f"rig '{self.rig.name}' has but one scene; make its environment by robot.make_env")
-            self._stage.use(chosen["scene"])
+            self._scene_world.set_scene(chosen["scene"])
         if "task" in chosen:
             self.task = make_task(chosen["task"])
         self._played = played

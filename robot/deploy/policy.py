@@ -108,7 +108,7 @@ def require_fit(rig: str, spec: RigSpec, policy: Policy, name: str, task: Task |
         advice = "Leave the task out (task: null in the rig file, or --set task=null): then nothing is judged"
         require_needs(rig, spec, task.needs, who, advice)
         if not spec.truth:
-            require_needs(rig, spec, task.needs_to_feel, f"{who} (judged by touch, as nobody knows the truth)", advice)
+            require_needs(rig, spec, task.touch_needs, f"{who} (judged by touch, as nobody knows the truth)", advice)
     advice = "" if name == "grip" else "Take --policy grip, which needs pictures alone, or one of your own"
     require_needs(rig, spec, policy.needs, f"policy '{name}'", advice)
     if isinstance(policy, OnnxPolicy) and (found := misfits(policy, spec, task)):

@@ -22,9 +22,9 @@ from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.rig import Rig
 from tacsim.sim.scene_world import SceneWorld
 from tacsim.tasks import BadDraws, GoalOutOfReach, make_task
-from tacsim.tasks.action import action_from, vector_of
+from tacsim.tasks.action import action_of_vector, vector_of_action
 from tacsim.tasks.effort import Effort
-from tacsim.tasks.task import Task, judge
+from tacsim.tasks.task import Task, evaluate_outcome
 
 Result = tuple[encode.FlatObservation, float, bool, bool, dict[str, Any]]  # of a step
 RESET_ERRORS = (GoalOutOfReach, NoTouch, SimulationDiverged)  # with this draw
@@ -237,7 +237,7 @@ class TacsimEnv(gymnasium.Env[encode.FlatObservation, NDArray[np.float32]]):
         `end_step`. Raises as `step`."""
         if self.phase != "running":
             raise ResetNeeded("call reset() before step(): no episode is running")
-        requested = action_from(action, self.task.axes, self.task.config.max_step, self._targets)
+        requested = action_of_vector(action, self.task.axes, self.task.config.max_step, self._targets)
         self._failure = None
         try:
             self._sent = self.rig.command(requested)
@@ -296,7 +296,7 @@ class TacsimEnv(gymnasium.Env[encode.FlatObservation, NDArray[np.float32]]):
 
     def _evaluate_state(self) -> tuple[float, dict[str, Any]]:
         truth = self._require_truth()
-        outcome = judge(self.task, truth, self._truth_at_start)
+        outcome = evaluate_outcome(self.task, truth, self._truth_at_start)
         info: dict[str, Any] = {
             "distance": outcome.distance,
             "is_success": outcome.success,
@@ -332,7 +332,7 @@ class TacsimEnv(gymnasium.Env[encode.FlatObservation, NDArray[np.float32]]):
         """What `policy` does here, as an action of this environment. A policy with a memory must be asked in every step
         of the episode, and reset before."""
         action = policy(self._observation)
-        return vector_of(action, self.task.axes, self.task.config.max_step, self._targets)
+        return vector_of_action(action, self.task.axes, self.task.config.max_step, self._targets)
 
     def render(self) -> NDArray[np.uint8] | None:
         """The native pictures of all sensors side by side, (H, W, 3) uint8 RGB, in the order of the rig; smaller ones

@@ -24,7 +24,7 @@ from tacsim import pose as se3
 from tacsim.interface import ArmState, FloatArray, IncompatibleRig, Needs, Observation, Pose, TactileObservation
 from tacsim.models.features import Channel, Features, MapGrid, Numbers, Quantity
 from tacsim.models.sensor import CanonicalGrid
-from tacsim.tasks.reposition import pressed_at
+from tacsim.tasks.reposition import centre_of_pressure_in_sensor
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -242,7 +242,7 @@ class FeatureEncoder:
 
     def _pressure_centre_shift(self, name: str, arm: ArmState) -> FloatArray:
         """(2,) since the first touch of the episode [m]; 0 without contact."""
-        here = pressed_at(arm)
+        here = centre_of_pressure_in_sensor(arm)
         return np.zeros(2) if here is None else here - self._pressed.setdefault(name, here)
 
     def _last_displacement(self, name: str, pose: Pose) -> FloatArray:

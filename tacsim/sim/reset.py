@@ -137,8 +137,8 @@ def _next_distance(
 def _close_gaps(world: World, max_force: float) -> float | None:
     """Puts each sensor at CLEARANCE before the body's nearest particle, if there is a body and a gap.
 
-    Returns how far from there contact begins [m], None where that is not known. Undone if the force exceeds `max_force` [N]:
-    on a shared grid, contact begins at a distance.
+    Returns how far from there contact begins [m], None where that is not known. Undone if the force exceeds
+    `max_force` [N]: on a shared grid, contact begins at a distance.
     """
     truth = world.truth()
     if truth is None:

@@ -13,7 +13,7 @@ from tacsim.limits import ActionError
 from tacsim.tasks.task import Axis
 
 
-def action_from(
+def action_of_vector(
     vector: NDArray[np.floating[Any]], axes: Sequence[Axis], max_step: float, poses: Mapping[str, Pose]
 ) -> Action:
     """Component i moves its arm from `poses` by vector[i] * max_step [m] along its axis, rotation kept.
@@ -38,9 +38,11 @@ def action_from(
     return Action({arm: Pose(position, poses[arm].quaternion) for arm, position in positions.items()})
 
 
-def vector_of(action: Action, axes: Sequence[Axis], max_step: float, poses: Mapping[str, Pose]) -> NDArray[np.float32]:
-    """The vector that asks for `action` from `poses`: the inverse of `action_from`. What is longer than max_step is cut
-    to it, and what is not along an axis is left out; an arm that holds has zeros."""
+def vector_of_action(
+    action: Action, axes: Sequence[Axis], max_step: float, poses: Mapping[str, Pose]
+) -> NDArray[np.float32]:
+    """The vector that asks for `action` from `poses`: the inverse of `action_of_vector`. A motion longer than
+    max_step is cut to it, and a component along no axis is left out; an arm that holds has zeros."""
     vector = np.zeros(len(axes), np.float32)
     for number, axis in enumerate(axes):
         target = action.tool.get(axis.arm)

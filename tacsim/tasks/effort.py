@@ -19,22 +19,22 @@ class Effort:
 
     def __init__(self, arms: Mapping[str, ArmState]) -> None:
         self._before = arms
-        self.peak = _greatest(arms)  # [N]
+        self.peak = _max_normal_force(arms)  # [N]
         self.work = 0.0  # [J]
 
     def add(self, arms: Mapping[str, ArmState]) -> None:
         """The next states of the same arms."""
         for name, now in arms.items():
             before = self._before[name]
-            force = -0.5 * (_force(before) + _force(now))  # on the body
+            force = -0.5 * (_world_force(before) + _world_force(now))  # on the body
             self.work += float(force @ (now.pose.position - before.pose.position))
-        self._before, self.peak = arms, max(self.peak, _greatest(arms))
+        self._before, self.peak = arms, max(self.peak, _max_normal_force(arms))
 
 
-def _force(arm: ArmState) -> np.ndarray:
+def _world_force(arm: ArmState) -> np.ndarray:
     """(3,) on the sensor, world axes [N]."""
     return se3.rotate(arm.pose, arm.wrench[:3])
 
 
-def _greatest(arms: Mapping[str, ArmState]) -> float:
+def _max_normal_force(arms: Mapping[str, ArmState]) -> float:
     return max((abs(float(arm.wrench[2])) for arm in arms.values()), default=0.0)

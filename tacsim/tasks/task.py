@@ -63,7 +63,7 @@ class Task(ABC):
         return Needs(arms=frozenset(axis.arm for axis in self.axes))
 
     @property
-    def needs_to_feel(self) -> Needs:
+    def touch_needs(self) -> Needs:
         """What `estimator` needs besides; a rig that does not know the truth must have it."""
         return Needs(truth=True)
 
@@ -99,18 +99,18 @@ class Outcome:
     score: float  # 1 within success, 0.1 one reward_scale further out
 
 
-def judge(task: Task, truth: Truth, start: Truth) -> Outcome:
+def evaluate_outcome(task: Task, truth: Truth, start: Truth) -> Outcome:
     """Distance, reward, success and score of `truth`, in an episode that began at `start`."""
     config, distance = task.config, float(task.distance(truth, start))
     return Outcome(
         distance=distance,
         reward=-distance / config.reward_scale,
         success=distance <= config.success,
-        score=tolerance(distance, bounds=(0.0, config.success), margin=config.reward_scale),
+        score=tolerance_reward(distance, bounds=(0.0, config.success), margin=config.reward_scale),
     )
 
 
-def tolerance(x: float, bounds: tuple[float, float], margin: float) -> float:
+def tolerance_reward(x: float, bounds: tuple[float, float], margin: float) -> float:
     """1 for x within `bounds` (low, high), falling as a Gaussian to 0.1 at `margin` > 0 outside.
 
     The shaping of Tassa et al. 2018 (DeepMind Control Suite, section 3), Gaussian sigmoid.

@@ -212,7 +212,7 @@ def test_environments_are_registered_once() -> None:
 
 def test_any_policy_acts_as_an_environment_s_action(open_springs: Any) -> None:
     """What it asks of the arms is where the step takes them, as float32 can say it."""
-    from tacsim.tasks.action import action_from
+    from tacsim.tasks.action import action_of_vector
 
     env = TacsimEnv(open_springs("squeeze"), make_task(SqueezeConfig(kind="squeeze", goal=7e-3, steps=3)))
     env.reset(seed=3)
@@ -222,7 +222,7 @@ def test_any_policy_acts_as_an_environment_s_action(open_springs: Any) -> None:
         policy.reset()
         vector = env.policy_action(policy)
         policy.reset()
-        asked = action_from(vector, env.task.axes, env.task.config.max_step, env._targets).tool
+        asked = action_of_vector(vector, env.task.axes, env.task.config.max_step, env._targets).tool
         for arm, pose in wanted.items():
             now = asked[arm]
             assert pose is not None and now is not None

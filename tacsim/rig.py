@@ -154,7 +154,7 @@ class Rig:
         with self._stop_all_on_failure():
             sent = {name: arm.command(action.tool.get(name)) for name, arm in self.arms.items()}
         if self._load_control is not None:
-            self._load_control.sent(sent)
+            self._load_control.record_sent_poses(sent)
         return sent
 
     def tick(self) -> None:

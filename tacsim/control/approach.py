@@ -10,7 +10,7 @@ class NoTouch(RuntimeError):
 
 
 def approach(
-    touches: Callable[[], bool], advance: Callable[[float], None], step: float, longest: float, advice: str
+    touches: Callable[[], bool], advance: Callable[[float], None], step: float, max_distance: float, advice: str
 ) -> float:
     """Moves ahead in equal steps until something is touched. Returns the distance travelled [m].
 
@@ -20,7 +20,7 @@ def approach(
         touches: whether the gels touch by now; asked before every step.
         advance: goes this far [m] from where the approach began, and returns once the gels were observed there.
         step: between two contact checks [m].
-        longest: the approach ends here [m].
+        max_distance: the approach ends here [m].
         advice: what a person may do about it when nothing was touched.
 
     Raises NoTouch at the end of the approach, and what `touches` and `advance` raise.
@@ -28,7 +28,7 @@ def approach(
     distance = 0.0
     while not touches():
         distance += step
-        if distance > longest:
-            raise NoTouch(f"no touch after an approach of {1e3 * longest:.3g} mm; {advice}")
+        if distance > max_distance:
+            raise NoTouch(f"no touch after an approach of {1e3 * max_distance:.3g} mm; {advice}")
         advance(distance)
     return distance

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from robot.open import open_rig
 from tacsim import pose as se3
 from tacsim.config import ConfigError, load_rig
-from tacsim.control.load_controller import REACH, TOLERANCE, LoadController, load_controller
+from tacsim.control.load_controller import MAX_TRAVEL, TOLERANCE, LoadController, load_controller
 from tacsim.interface import Action, ArmState, Pose
 from tacsim.limits import LimitExceeded
 from tacsim.models.rig import RepositionConfig, SqueezeConfig
@@ -45,7 +45,7 @@ class Wall:
         target = held(Action({"hand": asked}), {"hand": self.state()}).tool["hand"]
         assert target is not None
         self.pose = se3.interpolate_pose(self.pose, target, share)
-        held.sent({"hand": self.pose})
+        held.record_sent_poses({"hand": self.pose})
 
 
 def holding(load: float = LOAD) -> LoadController:
@@ -112,7 +112,7 @@ def test_an_arm_with_nothing_to_press_stops_and_says_so() -> None:
         wall.period(held, None)
     with pytest.raises(LimitExceeded, match=r"'hand' does not reach its load of 2 N: it feels 1 N after \+5.* mm"):
         _twice(wall, held)
-    assert 0.9 * REACH < wall.depth <= REACH
+    assert 0.9 * MAX_TRAVEL < wall.depth <= MAX_TRAVEL
     held.reset()
     wall.period(held, None)  # a new episode begins anew
 

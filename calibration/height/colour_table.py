@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tacsim.models.sensor import Lighting, SensorModel
-from tacsim.optics.render import shade, untouched_image
+from tacsim.optics.render import phong_shading, untouched_image
 
 Float32 = NDArray[np.float32]
 
@@ -95,10 +95,10 @@ def from_lighting(lighting: Lighting, background: tuple[float, float, float]) ->
     steps = round(MAX_SLOPE / SLOPE_STEP)
     line = (np.arange(-steps, steps + 1) * SLOPE_STEP).astype(np.float32)
     slopes = np.stack(np.meshgrid(line, line), axis=-1)
-    flat = shade(np.zeros((1, 1, 2), dtype=np.float32), lighting)
+    flat = phong_shading(np.zeros((1, 1, 2), dtype=np.float32), lighting)
 
     def seen(at: Float32) -> Float32:
-        relative: Float32 = (np.clip(base + shade(at, lighting) - flat, 0.0, 1.0) - base) / base
+        relative: Float32 = (np.clip(base + phong_shading(at, lighting) - flat, 0.0, 1.0) - base) / base
         return relative
 
     colours = seen(slopes)

@@ -135,14 +135,14 @@ def from_corners(
     factor = _factor(project(grid.points()))
     # The perspective of points far beyond the gel may pass through infinity: look there at the gel's rim instead.
     points = _inside(grid.refined(factor).points(), size)
-    return _rectification(project(points), factor, grid.within(size), image_shape, size)
+    return _rectification(project(points), factor, grid.points_on_gel(size), image_shape, size)
 
 
 def from_view(view: GelView, grid: PixelGrid) -> Rectification:
     """The map of a real camera whose view of the gel's plane was calibrated."""
     factor = _factor(view.project(_inside(grid.points(), view.size)))
     points = _inside(grid.refined(factor).points(), view.size)  # beyond the gel nothing is known of the lens
-    return _rectification(view.project(points), factor, grid.within(view.size), view.image_shape, view.size)
+    return _rectification(view.project(points), factor, grid.points_on_gel(view.size), view.image_shape, view.size)
 
 
 def to_metric(view: GelView) -> Rectification:
@@ -162,7 +162,7 @@ def from_geometry(geometry: SensorGeometry, gel_size: tuple[float, float], grid:
     pixels = grid.refined(factor).points() / geometry.pixel_pitch + geometry.principal
     shown = geometry.width * geometry.pixel_pitch, geometry.height * geometry.pixel_pitch
     size = min(gel_size[0], shown[0]), min(gel_size[1], shown[1])
-    return _rectification(pixels, factor, grid.within(gel_size), (geometry.height, geometry.width), size)
+    return _rectification(pixels, factor, grid.points_on_gel(gel_size), (geometry.height, geometry.width), size)
 
 
 def _rectification(

@@ -62,7 +62,7 @@ from tacsim.models.photometric import (
     PhotometricModel,
     places_in_image,
 )
-from tacsim.optics.darkness import darkened
+from tacsim.optics.darkness import darken_by_depth
 
 Float64 = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -238,7 +238,7 @@ def _darkness(
         if model is None:
             continue
         v, u = np.mgrid[: press.shape[0], : press.shape[1]].astype(np.float64)
-        change, _ = darkened(model, dent_height(u, v, press.circle, fit.thickness, ball).astype(np.float32), 1.0)
+        change, _ = darken_by_depth(model, dent_height(u, v, press.circle, fit.thickness, ball).astype(np.float32), 1.0)
         slopes, _ = DarknessSlopes(model, press.shape, 1.0)(press.change.astype(np.float32))
         label = dent_gradient(u, v, press.circle, fit.thickness, ball)
         angles = normal_angle(to_normal(slopes.astype(np.float64)), to_normal(label))

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.light.press import BallPress
-from tacsim.optics.skin import fine_part
+from tacsim.optics.skin import high_pass
 
 NEARBY = (1.25, 2.2)  # where the skin has moved, and the light changes little [contact radii]
 FAR_OFF = (4.0, 8.0)  # where it has hardly, in about the same light
@@ -31,10 +31,10 @@ def measure_skin(presses: Sequence[BallPress], reference: NDArray[np.uint8], pix
     It is low rather than high: skin that has moved by less than its grain counts as what stands still.
     """
     mean = reference.mean(axis=(0, 1))
-    grain = fine_part(reference.astype(np.float32), pixel_pitch)
+    grain = high_pass(reference.astype(np.float32), pixel_pitch)
     shares = []
     for press in presses:
-        change = fine_part((press.change * mean).astype(np.float32), pixel_pitch)
+        change = high_pass((press.change * mean).astype(np.float32), pixel_pitch)
         lit, distance = press.lit.all(axis=2), press.distance() / press.circle.radius
         parts = [lit & (distance > least) & (distance < most) for least, most in (FAR_OFF, NEARBY)]
         if min(int(part.sum()) for part in parts) >= MIN_PIXELS:

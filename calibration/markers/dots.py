@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from tacsim.optics.ink import MIN_RADIUS as MIN_RADIUS
 from tacsim.optics.ink import DotEraser as DotEraser
-from tacsim.optics.ink import darkness, dot_filters
+from tacsim.optics.ink import dot_filters, local_darkness
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -50,7 +50,7 @@ class DotFinder:
 
     def __call__(self, image: Image) -> Dots:
         """The dots of a picture (H, W, 3) or of one channel of it (H, W)."""
-        dark = darkness(image, self._side, self._blur)
+        dark = local_darkness(image, self._side, self._blur)
         found = []
         for level in MIN_DARKNESS:
             dots, rest = self._blobs(dark, level)

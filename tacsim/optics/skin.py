@@ -11,21 +11,21 @@ from numpy.typing import NDArray
 
 Float32 = NDArray[np.float32]
 
-FINE = 0.25e-3  # standard deviation of the blur that leaves light alone [m]
-DARKEST = 1.0  # least light that skin is told from [grey levels]
+BLUR_DEVIATION = 0.25e-3  # standard deviation of the blur that leaves light alone [m]
+MIN_LIGHT = 1.0  # least light that skin is told from [grey levels]
 
 
-def fine_part(picture: Float32, pixel_pitch: float) -> Float32:
+def high_pass(picture: Float32, pixel_pitch: float) -> Float32:
     """(H, W, 3) what of a picture is finer than light; `pixel_pitch` [m]."""
     import cv2
 
-    slow = cv2.GaussianBlur(picture, (0, 0), FINE / pixel_pitch, borderType=cv2.BORDER_REPLICATE)
+    slow = cv2.GaussianBlur(picture, (0, 0), BLUR_DEVIATION / pixel_pitch, borderType=cv2.BORDER_REPLICATE)
     return np.asarray(picture - slow, dtype=np.float32)
 
 
-def lifted_skin(picture: Float32, share: float, pixel_pitch: float) -> tuple[Float32, Float32]:
+def separate_skin(picture: Float32, share: float, pixel_pitch: float) -> tuple[Float32, Float32]:
     """The picture (H, W, 3) of an untouched gel without its skin, which is `share` of its fine part, and (H, W, 3) the
     share of light that the skin lets through, about 1: the product is the picture."""
-    bare = picture - np.float32(share) * fine_part(picture, pixel_pitch)
-    clean = np.maximum(bare, np.float32(DARKEST)).astype(np.float32)
+    bare = picture - np.float32(share) * high_pass(picture, pixel_pitch)
+    clean = np.maximum(bare, np.float32(MIN_LIGHT)).astype(np.float32)
     return clean, (picture / clean).astype(np.float32)

@@ -3,16 +3,16 @@ import pytest
 
 from calibration.height.colour_table import MAX_SLOPE, from_lighting, from_model
 from tacsim.models.sensor import Light, Lighting, SensorModel
-from tacsim.optics.render import shade
+from tacsim.optics.render import phong_shading
 
 RNG = np.random.default_rng(1)
 
 
 def _change(slopes: np.ndarray, lighting: Lighting, background: tuple[float, float, float]) -> np.ndarray:
     """Relative change of colour by the renderer itself; slopes (n, 2) -> (1, n, 3)."""
-    flat = shade(np.zeros((1, 1, 2), dtype=np.float32), lighting)
+    flat = phong_shading(np.zeros((1, 1, 2), dtype=np.float32), lighting)
     base = np.array(background, dtype=np.float32)
-    return (np.clip(base + shade(slopes[None].astype(np.float32), lighting) - flat, 0, 1) - base) / base
+    return (np.clip(base + phong_shading(slopes[None].astype(np.float32), lighting) - flat, 0, 1) - base) / base
 
 
 def _angle(found: np.ndarray, true: np.ndarray) -> np.ndarray:

@@ -10,7 +10,7 @@ import pytest
 from tacsim.models.scene import GelSurface
 from tacsim.models.sensor import Markers, SensorGeometry, SensorModel
 from tacsim.optics import surface as surfaces
-from tacsim.optics.fold import visible_points
+from tacsim.optics.fold import visible_table_points
 from tacsim.optics.grid import PixelGrid, image_grid
 from tacsim.optics.markers import marker_transmission, rest_positions
 from tacsim.optics.render import Renderer
@@ -104,7 +104,7 @@ def test_what_faces_away_is_not_seen_and_neighbours_leave_no_gap() -> None:
     rows, columns = np.mgrid[0:5, 0:6].astype(float)
     height = (rows + columns).astype(np.float32)
     turned = 1.9 * np.stack([columns + 0.3 * rows, rows - 0.2 * columns], axis=-1) + [2.0, 3.0]
-    points, inside = visible_points(turned, height, (14, 16))
+    points, inside = visible_table_points(turned, height, (14, 16))
     v, u = np.nonzero(inside)
     back = np.linalg.solve(np.array([[1.0, 0.3], [-0.2, 1.0]]), (np.stack([u, v]) - [[2.0], [3.0]]) / 1.9)
     np.testing.assert_allclose(points[v, u], back.T, atol=1e-5)
@@ -113,7 +113,7 @@ def test_what_faces_away_is_not_seen_and_neighbours_leave_no_gap() -> None:
     )
     within = (all_back >= 0).all(axis=0) & (all_back[0] <= 5) & (all_back[1] <= 4)
     assert np.array_equal(inside.ravel(), within) and within.sum() > 40
-    assert not visible_points(turned[:, ::-1], height, (14, 16))[1].any()
+    assert not visible_table_points(turned[:, ::-1], height, (14, 16))[1].any()
 
 
 def test_dots_behind_a_fold_are_not_drawn() -> None:

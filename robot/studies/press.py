@@ -189,7 +189,7 @@ def _contact(world: PressWorld, scene: Scene, seen: SurfaceSample, sensor: Senso
         inner[near] = _gaps(scene.indenter, at[near], scene.element)
         gaps[rows, columns] = inner.reshape(valid.shape)
     table = SurfaceTable(world.surface("lower"))
-    reach, _ = table.seen(table.spline_values(world.reach().astype(np.float32)), grid)
+    reach, _ = table.sample_on_grid(table.spline_values(world.reach().astype(np.float32)), grid)
     return _filled(gaps < reach.reshape(gaps.shape), int(scene.element / sensor.geometry.pixel_pitch))
 
 

@@ -38,8 +38,8 @@ class _AxisState:
 class LoadController:
     """Secant force control: changes the actions of a policy so that arms hold `loads` along the z of their sensors.
 
-    Call it once a control period with the action and the latest arm states, then `record_sent_poses` with the poses that were really
-    sent. It replaces only the displacement along z; an arm without a target of its own still follows its load.
+    Call it once a control period with the action and the latest arm states, then `record_sent_poses` with the poses
+    that were sent. It replaces only the displacement along z; an arm without a target of its own still follows its load.
     """
 
     def __init__(self, loads: Mapping[str, float], max_correction: float) -> None:
@@ -60,7 +60,7 @@ class LoadController:
     def record_sent_poses(self, poses: Mapping[str, Pose | None]) -> None:
         """What the arms were really sent, after their limits; None: nothing was executed."""
         for name, axis in self._axes.items():
-            axis.record_sent_poses = poses.get(name) or axis.record_sent_poses
+            axis.sent = poses.get(name) or axis.sent
 
     def _loaded_target(self, name: str, requested: Pose | None, arm: ArmState) -> Pose:
         force = -float(arm.wrench[2])
@@ -71,15 +71,16 @@ class LoadController:
         normal = se3.rotation_matrix(arm.pose)[:, 2]
         self._update_stiffness(axis, float(normal @ (here - axis.before[0])), force)
         axis.before = here, force
-        requested = axis.record_sent_poses if requested is None else requested
+        requested = axis.sent if requested is None else requested
         normal = se3.rotation_matrix(requested)[:, 2]
         step = self._next_correction(axis, self.loads[name], force)
-        if abs(travel := float(normal @ (axis.record_sent_poses.position - axis.began)) + step) > MAX_TRAVEL:
+        if abs(travel := float(normal @ (axis.sent.position - axis.began)) + step) > MAX_TRAVEL:
             raise LimitExceeded(
                 f"arm '{name}' does not reach its load of {self.loads[name]:g} N: it feels {force:.3g} N after "
-                f"{1e3 * travel:+.3g} mm along its sensor's z (limit {1e3 * MAX_TRAVEL:g} mm); is anything there to press?"
+                f"{1e3 * travel:+.3g} mm along its sensor's z (limit {1e3 * MAX_TRAVEL:g} mm); is there anything to "
+                "press?"
             )
-        along = normal @ (axis.record_sent_poses.position - requested.position) + step
+        along = normal @ (axis.sent.position - requested.position) + step
         return Pose(requested.position + along * normal, requested.quaternion)
 
     def _update_stiffness(self, axis: _AxisState, displacement: float, force: float) -> None:

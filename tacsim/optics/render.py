@@ -110,11 +110,11 @@ class Renderer:
         # Calibrated light is looked up at the middles of blocks of pixels, two for each cell of the table along a side:
         # its kinks lie at the table's points, and blocks as large as cells were up to 6 grey levels off beside them
         block = 1 if self._light is None or table.folded else max(1, table.points_per_cell(self._grid) // 2)
-        visible = table.points(block_centres(self._grid, block), fine=False)
+        visible = table.table_points(block_centres(self._grid, block), fine=False)
         if (
             block > 1 and not visible[1].all()
         ):  # the gel's edge is seen, and is as sharp as the camera's blur lets it be
-            block, visible = 1, table.points(self._grid, fine=False)
+            block, visible = 1, table.table_points(self._grid, fine=False)
         light = self._light_contribution(table, *visible, block)
         transmission = self._ink_transmission(surface, table, visible[0], block)
         del visible  # memory that is freed early is used again while it is warm
@@ -138,13 +138,13 @@ class Renderer:
         if ink is not None:
             points = interpolate_blocks(points, block, self._grid.shape)
         if self._markers is not None:
-            at_rest = table.at_rest(points, self._grid) if table.folded else None
+            at_rest = table.rest_coordinates(points, self._grid) if table.folded else None
             dots = marker_transmission(surface, self._markers, self.model.geometry, at_rest)[..., None]
         if ink is None:
             return None if dots is None else dots.__getitem__
 
         def transmitted(rows: slice) -> Float32:
-            share = bilinear_lookup(ink, table.at_rest(points[rows], self._grid))
+            share = bilinear_lookup(ink, table.rest_coordinates(points[rows], self._grid))
             return share if dots is None else share * dots[rows]
 
         return transmitted
@@ -161,14 +161,14 @@ class Renderer:
         change, self._clipped_share = darken_by_depth(
             self.model.darkness, np.ascontiguousarray(table.fields[..., 0]), table.pitch
         )
-        return table.at(change * self._mean, points, inside).__getitem__
+        return table.interpolate_at(change * self._mean, points, inside).__getitem__
 
     def _phong_light(self, table: SurfaceTable, points: Float32, inside: Mask) -> Callable[[slice], Float32]:
         """Rows of an image -> (rows, W, 3) light of the lamps, by the slopes of surface and texture; 255 is white."""
         import cv2
 
         lighting = self.model.lighting
-        slopes = table.at(table.fields[..., 1:], points, inside)
+        slopes = table.interpolate_at(table.fields[..., 1:], points, inside)
         cv2.add(slopes, self._texture, dst=slopes)
         if not self._tabulated:
             self._lights, self._tabulated = light_table(lighting), True
@@ -189,15 +189,17 @@ class Renderer:
         """
         assert self.model.photometric is not None
         grid, blur, shadows = self._grid, self.model.photometric.blur, self.model.photometric.shadows
-        part = table.part(grid)
-        place = grid.image_coordinates(*(each[part] for each in table.place()))
+        part = table.visible_part(grid)
+        place = grid.image_coordinates(*(each[part] for each in table.deformed_coordinates()))
         fields, width = table.fields[part], np.float32(grid.columns * grid.pitch)
         colours = np.zeros_like(table.fields)
         colours[part], clipped = calibrated.change(fields[..., 1:], *place, fields[..., 0] / width)
         if shadows is not None:
             colours += shadow_colours(calibrated, shadows, table, grid)
         self._clipped_share = clipped / place[0].size
-        return interpolate_blocks(_blur_blocks(table.at(colours, points, inside), blur, block), block, grid.shape)
+        return interpolate_blocks(
+            _blur_blocks(table.interpolate_at(colours, points, inside), blur, block), block, grid.shape
+        )
 
 
 def _blur_blocks(colours: Float32, blur: float, block: int) -> Float32:

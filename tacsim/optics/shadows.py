@@ -21,7 +21,7 @@ def shadow_colours(light: PhotometricLight, shadows: CastShadows, table: Surface
     The way to a lamp is followed over the surface as if it had moved only up and down: sideways motion is small beside
     the length of a shadow.
     """
-    x, y = (each[::TABLE_STRIDE, ::TABLE_STRIDE] for each in table.place())
+    x, y = (each[::TABLE_STRIDE, ::TABLE_STRIDE] for each in table.deformed_coordinates())
     u, v = image.image_coordinates(x, y)
     width, flat = np.float32(image.columns * image.pitch), np.float32(image.rows / image.columns)
     # from places in picture widths, which start in the middle of the picture, to metres

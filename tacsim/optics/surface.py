@@ -125,7 +125,7 @@ class SurfaceTable:
 
     @staticmethod
     def interpolate_at(values: Float32, points: Float32, inside: NDArray[np.bool_]) -> Float32:
-        """The same where `table_points` and `inside` are known already."""
+        """The same where `points` and `inside` are known already."""
         seen = bilinear_lookup(values, points)
         if not inside.all():
             seen[~inside] = 0.0
@@ -143,7 +143,7 @@ class SurfaceTable:
         return visible_table_points((at - seen) * (self.pitch / grid.pitch), self.fields[..., 0], grid.shape)
 
     def _unfolded_points(self, grid: PixelGrid, fine: bool) -> tuple[Float32, NDArray[np.bool_]]:
-        """:meth:`table_points` of a surface that does not fold over. Raises SurfaceFolded where it turns out to do so."""
+        """:meth:`table_points` of a surface that does not fold over. Raises SurfaceFolded where it does."""
         # Where the grid is finer than the table, points are found on a coarser one, twice as fine as the table or, not
         # `fine`, just as fine, and are linear between those: the surface's sideways motion is smooth. The first errs
         # less than the look-up rounds; the second about as much, but by half a pixel where a slide shears the surface.
@@ -159,7 +159,7 @@ class SurfaceTable:
         return max(1, int(self.pitch / grid.pitch * (1 + 1e-6)))
 
     def rest_coordinates(self, points: Float32, grid: PixelGrid) -> Float32:
-        """(H, W, 2) column, row in `grid` of where `table_points` of :meth:`table_points` lie on the untouched gel."""
+        """(H, W, 2) column, row in `grid` of where `points` of :meth:`table_points` lie on the untouched gel."""
         import cv2
 
         scale = self.pitch / grid.pitch
@@ -294,7 +294,7 @@ def _points_per_spacing(surface: GelSurface) -> int:
 @lru_cache(maxsize=16)
 def _table_coordinates(origin: tuple[float, float], pitch: float, grid: PixelGrid) -> Float32:
     """(rows, columns, 2) where the points of `grid` lie in a table that starts at `origin` [table points]."""
-    coordinates = ((grid.table_points() - origin) / pitch).astype(np.float32)
+    coordinates = ((grid.points() - origin) / pitch).astype(np.float32)
     coordinates.flags.writeable = False
     return coordinates
 
@@ -321,8 +321,8 @@ def interpolate_blocks(values: Float32, block: int, shape: tuple[int, int]) -> F
 
 
 def bilinear_lookup(field: Float32, points: Float32) -> Float32:
-    """`field` (rows, columns, n <= 4) at fractional columns and rows `table_points` (H, W, 2), linear between entries; beyond
-    the border as on it. OpenCV rounds `table_points` to 1/32."""
+    """`field` (rows, columns, n <= 4) at fractional columns and rows `points` (H, W, 2), linear between entries; beyond
+    the border as on it. OpenCV rounds `points` to 1/32."""
     import cv2
 
     nothing = np.empty(0, dtype=np.float32)

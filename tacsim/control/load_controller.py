@@ -39,7 +39,7 @@ class LoadController:
     """Secant force control: changes the actions of a policy so that arms hold `loads` along the z of their sensors.
 
     Call it once a control period with the action and the latest arm states, then `record_sent_poses` with the poses
-    that were sent. It replaces only the displacement along z; an arm without a target of its own still follows its load.
+    that were sent. It replaces only the displacement along z; an arm without a target still follows its load.
     """
 
     def __init__(self, loads: Mapping[str, float], max_correction: float) -> None:

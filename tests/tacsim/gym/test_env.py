@@ -233,7 +233,7 @@ def test_any_policy_acts_as_an_environment_s_action(open_springs: Any) -> None:
 def test_the_expert_is_the_tasks_by_the_truth_and_holds_where_nothing_runs(open_springs: Any) -> None:
     env = TacsimEnv(open_springs("squeeze"), make_task(SqueezeConfig(kind="squeeze", goal=7e-3, steps=3)))
     env.reset(seed=3)
-    best = env.task.expert(env._require_truth(), env._require_truth_at_start)
+    best = env.task.expert(env._require_truth(), env._truth_at_start)
     assert best is not None
     assert env.expert().tolist() == best.astype(np.float32).tolist()
     for _ in range(env.task.config.steps):

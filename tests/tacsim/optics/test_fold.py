@@ -77,15 +77,15 @@ def test_a_surface_without_a_fold_goes_the_quick_way_and_either_way_shows_the_sa
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     table, grid = SurfaceTable(dent(slide=(0.6e-3, -0.4e-3))), image_grid(SensorGeometry())
-    quick, inside = table.points(grid)
+    quick, inside = table.table_points(grid)
     assert not table.folded
     table.folded = True
-    slow, same = table.points(grid)
+    slow, same = table.table_points(grid)
     assert np.array_equal(inside, same)
     np.testing.assert_allclose(slow[inside], quick[inside], atol=0.1)  # table points
     monkeypatch.delattr(surfaces, "visible_points")
     table.folded = False
-    assert np.array_equal(table.points(grid)[0], quick)
+    assert np.array_equal(table.table_points(grid)[0], quick)
 
 
 def test_a_fold_between_the_points_of_the_table_is_found_when_newton_finds_none(
@@ -121,7 +121,7 @@ def test_dots_behind_a_fold_are_not_drawn() -> None:
     markers = Markers(rows=12, columns=15, pitch=1e-3, radius=0.15e-3)
     surface, grid = folded(b), image_grid(geometry)
     table = SurfaceTable(surface)
-    at_rest = table.at_rest(table.points(grid)[0], grid)
+    at_rest = table.rest_coordinates(table.table_points(grid)[0], grid)
     light = marker_transmission(surface, markers, geometry, at_rest)
     rest = rest_positions(markers).reshape(-1, 2)
     own = rest @ ALONG

@@ -95,7 +95,7 @@ def test_steep_flanks_and_narrow_highlights_are_shaded_pixel_by_pixel(shininess:
     steepest = np.abs(sample_surface(surface, image_grid(model.geometry)).gradient).max()
     assert (steepest > MAX_SLOPE) != (light_table(model.lighting) is None)  # one reason at a time
     table = SurfaceTable(surface)
-    slopes, _ = table.seen(table.fields[..., 1:], image_grid(model.geometry), fine=False)
+    slopes, _ = table.sample_on_grid(table.fields[..., 1:], image_grid(model.geometry), fine=False)
     exact = 255.0 * unlit_image(model.lighting, slopes.shape[:2]) + phong_shading(slopes, model.lighting, white=255.0)
     image = Renderer(model, GEL)(surface)
     assert np.abs(image - exact.clip(0.0, 255.0)).max() < 0.5 + 1e-3

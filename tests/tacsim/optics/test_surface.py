@@ -137,9 +137,9 @@ def test_bad_surfaces_are_named() -> None:
 )
 def test_what_a_grid_shows_lies_in_its_part_of_the_table(grid: PixelGrid) -> None:
     table = SurfaceTable(dent(slide=(0.6e-3, -0.4e-3)))
-    points, inside = table.points(grid)
+    points, inside = table.table_points(grid)
     np.testing.assert_array_equal(inside, grid.points_on_gel((20e-3, 20e-3)))
-    part, outside = table.part(grid), np.ones_like(table.fields)
+    part, outside = table.visible_part(grid), np.ones_like(table.fields)
     outside[part] = 0.0
     assert not bilinear_lookup(outside, points).any()
     assert outside.mean() > 0.1
@@ -148,7 +148,7 @@ def test_what_a_grid_shows_lies_in_its_part_of_the_table(grid: PixelGrid) -> Non
 def test_a_grid_beside_the_gel_has_a_part_of_its_table_too() -> None:
     table = SurfaceTable(dent())
     for x0, y0 in ((-40e-3, -3e-3), (40e-3, 30e-3)):
-        part = table.part(PixelGrid(rows=30, columns=40, pitch=0.05e-3, x0=x0, y0=y0))
+        part = table.visible_part(PixelGrid(rows=30, columns=40, pitch=0.05e-3, x0=x0, y0=y0))
         assert table.fields[part].size > 0
 
 

@@ -31,14 +31,16 @@ from tacsim.models.rig import ReplaySensorConfig
 from tacsim.models.sensor import CanonicalGrid, SensorModel
 from tacsim.optics.grid import PixelGrid, canonical_image
 
-BETTERED = 5  # format of bundles from which on the forward model betters heights: older ones give what they gave
+FIRST_REFINED_FORMAT = (
+    5  # format of bundles from which on the forward model betters heights: older ones give what they gave
+)
 
 
 def normaliser_for_simulation(
     model: SensorModel, gel_size: tuple[float, float], grid: CanonicalGrid
 ) -> FrameNormaliser:
     """The normaliser of a simulated sensor; `gel_size`: x, y [m]."""
-    return FrameNormaliser(_of_model(model, gel_size, canonical_image(grid)), grid)
+    return FrameNormaliser(_normaliser_of_model(model, gel_size, canonical_image(grid)), grid)
 
 
 def normaliser_for_pictures(
@@ -52,7 +54,7 @@ def normaliser_for_pictures(
             f"the light of model '{model.name}' is a calibrated one, whose inverse stands in its bundle: give the "
             "camera `calibration: BUNDLE` in place of `model`"
         )
-    rectify = _of_model(model, gel_size, extended_view(grid, gel_size)).within(region)
+    rectify = _normaliser_of_model(model, gel_size, extended_view(grid, gel_size)).within(region)
     slopes: GradientModel
     if model.darkness is not None:
         shape = rectify.valid[seen_box(rectify.valid)].shape
@@ -65,7 +67,7 @@ def normaliser_for_pictures(
     )
 
 
-def _of_model(model: SensorModel, gel_size: tuple[float, float], grid: PixelGrid) -> Rectification:
+def _normaliser_of_model(model: SensorModel, gel_size: tuple[float, float], grid: PixelGrid) -> Rectification:
     """From the pictures that a sensor of this model delivers."""
     return from_geometry(model.geometry, gel_size, grid) if model.view is None else from_view(model.view, grid)
 
@@ -92,7 +94,7 @@ def normaliser_for_calibration(
     else:
         assert calibration.inverse is not None and calibration.forward is not None
         slopes = PolynomialSlopes(calibration.inverse, x, y)
-        if calibration.format >= BETTERED:
+        if calibration.format >= FIRST_REFINED_FORMAT:
             u, v = (np.asarray(place / 2, dtype=np.float32) for place in (x, y))
             better = ForwardSteps(calibration.forward, u, v, wide.pitch, geometry.width * geometry.pixel_pitch)
     dots = calibration.markers is not None

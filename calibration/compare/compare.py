@@ -21,9 +21,9 @@ from calibration.compare import metrics
 from calibration.compare.alignment import Alignment, by_geometry, by_size, find_shift
 from calibration.compare.scorer import Numbers, Pair, Scorer, surface_errors
 from calibration.compare.surfaces import GRID, SurfaceEstimate, estimate_surfaces, flat_surface
-from calibration.drift import without_drift
+from calibration.drift import subtract_drift
 from calibration.errors import BadFrames
-from calibration.frame_set import Frame, FrameSet, touched_untouched
+from calibration.frame_set import Frame, FrameSet, find_touched_references
 from tacsim.control.contact_signal import CONTACT_HEIGHT
 from tacsim.record.numbering import picture_numbers
 
@@ -150,7 +150,7 @@ def compare_frames(
     couples, left = paired(a, b, options.pairing)
     shift = not a.placed if options.shift is None else options.shift
     alignment = _alignment(a, b, couples, calibration_a, calibration_b, shift=shift)
-    notes: list[str] = [*a.notes, *b.notes, *touched_untouched(a), *touched_untouched(b)]
+    notes: list[str] = [*a.notes, *b.notes, *find_touched_references(a), *find_touched_references(b)]
     found_a, said_a = estimate_surfaces(a, [frame for frame, _ in couples], calibration_a)
     found_b, said_b = estimate_surfaces(b, [frame for _, frame in couples], calibration_b)
     if found_a is not None and found_b is not None and calibration_b is not None:
@@ -273,7 +273,7 @@ def _alignment(
     base_a, base_b = alignment(a.reference), b.reference.astype(np.float32)
     level = b.reference.mean(axis=(0, 1))
     changes = (
-        (without_drift(alignment(one.image) - base_a, level), without_drift(other.image - base_b, level))
+        (subtract_drift(alignment(one.image) - base_a, level), subtract_drift(other.image - base_b, level))
         for one, other in chosen
     )
     return find_shift(changes, alignment)

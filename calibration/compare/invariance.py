@@ -22,7 +22,7 @@ from calibration.bundle import Calibration
 from calibration.compare import metrics
 from calibration.compare.compare import BOOTSTRAP_DRAWS, Comparison
 from calibration.compare.surfaces import GRID, estimate_surfaces
-from calibration.drift import without_drift
+from calibration.drift import subtract_drift
 from calibration.errors import BadFrames
 from calibration.frame_set import Image
 from tacsim.control.contact_signal import CONTACT_HEIGHT
@@ -249,7 +249,7 @@ def _patches(
         pair, x, y = comparison.pairs[k], patch.x, patch.y
         seen_a, seen_b = comparison.alignment(pair.a.image), pair.b.image.astype(np.float32)
         still = _cut(b0, x, y, half)
-        differences = without_drift(seen_a - a0, level), without_drift(seen_b - b0, level)
+        differences = subtract_drift(seen_a - a0, level), subtract_drift(seen_b - b0, level)
         for view, one, other in (("raw", seen_a, seen_b), ("difference", *differences)):
             cut = _cut(other, x, y, half)
             zero = still if view == "raw" else 0.0

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from calibration.compare import metrics
 from calibration.compare.alignment import Alignment
 from calibration.compare.surfaces import GRID, SurfaceEstimate, flat_surface
-from calibration.drift import without_drift
+from calibration.drift import subtract_drift
 from calibration.frame_set import Frame, FrameSet, frame_warnings
 from tacsim.control.contact_signal import CONTACT_HEIGHT
 
@@ -50,7 +50,7 @@ class Scorer:
         seen_a, seen_b = self._alignment(a.image), b.image.astype(np.float32)
         change_a, change_b = seen_a - self._reference_a, seen_b - self._b.reference
         contact_a, contact_b = (
-            metrics.contact_region(without_drift(change, self._b.reference.mean(axis=(0, 1)))) & self._covered
+            metrics.contact_region(subtract_drift(change, self._b.reference.mean(axis=(0, 1)))) & self._covered
             for change in (change_a, change_b)
         )
         region = contact_a | contact_b

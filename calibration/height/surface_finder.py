@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.drift import STRIDE, DriftFinder, size_of
+from calibration.drift import PIXEL_STRIDE, DriftFinder, max_mean_change
 from calibration.height.colour_table import GradientModel
 from calibration.height.forward_steps import ForwardSteps
 from calibration.height.integration import Integrator, slopes_of
@@ -108,7 +108,7 @@ class SurfaceFinder:
             height=self._cells(height),
             gradient=np.stack([self._cells(by_x), self._cells(by_y)], axis=-1),
             beyond_range=float(np.count_nonzero(beyond_range & ~hidden) / beyond_range.size),
-            drift=None if changed is None else size_of(changed),
+            drift=None if changed is None else max_mean_change(changed),
             drift_slope=None if changed is None else self._angle(changed),
             removed_drift=self._drift_finder.part(drift.scaled(1.0 / known.gain), self._corner, self._image)
             if self._remove_drift and drift.measured
@@ -118,7 +118,7 @@ class SurfaceFinder:
     def _angle(self, change: Float32) -> float:
         """Mean angle [degrees] of the slopes that changes of colour (n, 3) at every STRIDE-th pixel look like."""
         slope = np.einsum("nsc,nc->ns", self._response, change)
-        steepness = np.hypot(slope[:, 0], slope[:, 1])[~self._unseen[::STRIDE, ::STRIDE].ravel()]
+        steepness = np.hypot(slope[:, 0], slope[:, 1])[~self._unseen[::PIXEL_STRIDE, ::PIXEL_STRIDE].ravel()]
         return float(np.degrees(np.arctan(steepness)).mean())
 
     def _prepared(self, picture: Float32) -> _PreparedReference:
@@ -181,7 +181,7 @@ def _response(slopes: GradientModel, shape: tuple[int, int]) -> Float32:
         change = np.zeros((*shape, 3), dtype=np.float32)
         change[..., channel] = COLOUR_STEP
         up, down = slopes(change)[0], slopes(-change)[0]
-        answers.append(((up - down) / (2 * COLOUR_STEP))[::STRIDE, ::STRIDE].reshape(-1, 2))
+        answers.append(((up - down) / (2 * COLOUR_STEP))[::PIXEL_STRIDE, ::PIXEL_STRIDE].reshape(-1, 2))
     return np.stack(answers, axis=-1)
 
 

@@ -55,7 +55,7 @@ from calibration.light.photometry import (
 from calibration.light.press import BallPress, Window, find_press, smooth, untouched_mean
 from calibration.light.refinement import RefinedGeometry, refine
 from calibration.light.shadows import DentShade, find_lamps
-from calibration.reference import STALE_COLOUR, exchanged
+from calibration.reference import STALE_COLOUR, is_channel_order_swapped
 from tacsim.models.photometric import (
     DEPTH_TERMS,
     PhotometricLight,
@@ -284,7 +284,7 @@ def _check(reference: Image, frames: Sequence[tuple[str, Image]]) -> None:
         )
     # the median of the frames shows the gel nearly without contact
     median = np.median(np.stack([image for _, image in frames[:ORDER_FRAMES]]), axis=0).astype(np.float32)
-    if exchanged(median, reference.astype(np.float32), np.ones(reference.shape[:2], dtype=np.bool_)):
+    if is_channel_order_swapped(median, reference.astype(np.float32), np.ones(reference.shape[:2], dtype=np.bool_)):
         raise BadFrames(
             "the frames are like the picture without contact only with red and blue exchanged: give all in one order"
         )

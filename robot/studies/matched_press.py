@@ -91,7 +91,7 @@ def match_presses(
         frames.append(made if noise is None else replace(made, image=noise(made.image, number + 1)))
     reference = gel.untouched[0] if noise is None else noise(gel.untouched[0], 0)
     return FrameSet(
-        f"scene {scene.name}", reference, "the untouched simulated gel", tuple(frames), simulated=True, placed=True
+        f"scene {scene.name}", reference, "the untouched simulated gel", tuple(frames), simulated=True, same_pixels=True
     ), notes
 
 

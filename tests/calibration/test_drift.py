@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from calibration.drift import STRIDE, Drift, DriftFinder
+from calibration.drift import PIXEL_STRIDE, Drift, DriftFinder
 from calibration.frame_normaliser import FrameNormaliser
 from calibration.height.slope_polynomial import to_normal
 from calibration.light.fit import normal_angle
@@ -17,7 +17,14 @@ from calibration.normaliser import (
     normaliser_for_pictures,
     normaliser_for_simulation,
 )
-from calibration.reference import LOST_COLOUR, LOST_SLOPE, STALE_SLOPE, StaleReference, UnusableReference, exchanged
+from calibration.reference import (
+    MAX_COLOUR_CHANGE,
+    MAX_SLOPE_CHANGE,
+    STALE_SLOPE,
+    StaleReference,
+    UnusableReference,
+    is_channel_order_swapped,
+)
 from tacsim.interface import TactileFrame, TactileObservation
 from tacsim.models.hardware import CameraSensorConfig
 from tacsim.models.sensor import CanonicalGrid, SensorModel
@@ -113,7 +120,7 @@ def test_nothing_is_told_by_another_light(change, normalise: FrameNormaliser, se
     normalise.take_reference(frame(bundle[1]))
     with pytest.raises(StaleReference, match=r"Is a lamp out.*take a fresh reference"):
         normalise(frame(change(sensor.press(0.5e-3, 130, 100).image.astype(float))), 0.0)
-    assert normalise.drift_slope > LOST_SLOPE or normalise.drift > LOST_COLOUR
+    assert normalise.drift_slope > MAX_SLOPE_CHANGE or normalise.drift > MAX_COLOUR_CHANGE
 
 
 def test_a_lamp_that_tilts_nothing_is_told_by_the_colour() -> None:
@@ -174,8 +181,12 @@ def test_swapped_colours_are_told_by_the_calibrations_own_picture(
     with pytest.raises(UnusableReference, match="red and blue are exchanged"):
         normalise.take_reference(frame(sensor.empty()[..., ::-1]))
     even = np.full((80, 80, 3), (90.0, 100.0, 110.0), dtype=np.float32)
-    assert not exchanged(even[..., ::-1], even, np.ones((80, 80), dtype=np.bool_))  # nothing tells them apart
-    assert not exchanged(even[:4, :4, ::-1], even[:4, :4], np.ones((4, 4), dtype=np.bool_))  # smaller than a block
+    assert not is_channel_order_swapped(
+        even[..., ::-1], even, np.ones((80, 80), dtype=np.bool_)
+    )  # nothing tells them apart
+    assert not is_channel_order_swapped(
+        even[:4, :4, ::-1], even[:4, :4], np.ones((4, 4), dtype=np.bool_)
+    )  # smaller than a block
 
 
 def test_the_drift_is_a_quadratic_through_what_is_calm() -> None:
@@ -189,7 +200,7 @@ def test_the_drift_is_a_quadratic_through_what_is_calm() -> None:
     finder = DriftFinder((120, 160))
     drift = finder(planes, hidden)
     assert drift.measured
-    np.testing.assert_allclose(finder.at(drift), true[:, ::STRIDE, ::STRIDE].reshape(3, -1).T, atol=2e-4)
+    np.testing.assert_allclose(finder.at(drift), true[:, ::PIXEL_STRIDE, ::PIXEL_STRIDE].reshape(3, -1).T, atol=2e-4)
     finder.remove(planes, drift)
     assert np.abs(planes[:, ~hidden & ~touched]).max() < 2e-4
     assert not finder(planes, np.ones_like(hidden)).measured

@@ -31,10 +31,10 @@ def read_presses(frames: Path, reference: Path | None) -> FrameSet:
 
 def straighten(read: FrameSet, region: PictureRegion | None, view: GelView | None) -> FrameSet:
     """Native pictures as they are calibrated: even beyond the region, and metric."""
-    from calibration.frame_set import rectified_by_view, within_region
+    from calibration.frame_set import rectified_by_view, restrict_to_region
 
     if region is not None:
-        read = within_region(read, region)
+        read = restrict_to_region(read, region)
     return read if view is None else rectified_by_view(read, view)
 
 

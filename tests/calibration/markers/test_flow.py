@@ -284,7 +284,7 @@ def test_who_finds_flow_says_so() -> None:
     plain = normaliser_for_camera(CameraSensorConfig(driver="camera", source="x"), GEL, GRID)
     assert isinstance(plain, FrameNormaliser)
     assert not plain.finds_flow
-    assert plain.markers_seen is None
+    assert plain.visible_markers is None
     assert plain.kept == 1.0
 
 

@@ -244,7 +244,7 @@ class FrameNormaliser:
             drift = self._find_drift(np.ascontiguousarray(np.moveaxis(change, -1, 0)), ~self._on_image)
             if drift.measured:
                 self.drift = max_mean_change(self._find_drift.at(drift))
-                removed = self._find_drift.part(drift, (0, 0), self._on_image.shape)
+                removed = self._find_drift.select_presses(drift, (0, 0), self._on_image.shape)
         if self._find is not None:
             assert self.reference is not None
             found = self._find(change, self.reference.relative)

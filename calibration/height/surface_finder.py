@@ -110,7 +110,7 @@ class SurfaceFinder:
             beyond_range=float(np.count_nonzero(beyond_range & ~hidden) / beyond_range.size),
             drift=None if changed is None else max_mean_change(changed),
             drift_slope=None if changed is None else self._angle(changed),
-            removed_drift=self._drift_finder.part(drift.scaled(1.0 / known.gain), self._corner, self._image)
+            removed_drift=self._drift_finder.select_presses(drift.scaled(1.0 / known.gain), self._corner, self._image)
             if self._remove_drift and drift.measured
             else None,
         )

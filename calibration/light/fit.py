@@ -15,7 +15,7 @@ from calibration.lens.view import GelView
 from calibration.light.checks.press_shapes import Stretch
 from calibration.light.dent import ContactCircle
 from calibration.light.photometry import ModelSize
-from calibration.light.press import FAR, BallPress, Image
+from calibration.light.press import UNTOUCHED_RADIUS, BallPress, Image
 from tacsim.models.darkness import DarknessModel
 from tacsim.models.photometric import PhotometricModel
 from tacsim.models.sensor import CameraNoise, Markers, SensorGeometry
@@ -47,7 +47,7 @@ class LightFit:
     size: ModelSize | None
     thickness: float  # of the gel, as the skirts of the dents tell it [px]
     radius_uncertainty: float  # of the scale of all contact radii [-]; NaN for a single press
-    unexplained: tuple[float, ...]  # share of each press's change of colour that no dent explains
+    residual_shares: tuple[float, ...]  # share of each press's change of colour that no dent explains
     predictions: tuple[PressPrediction, ...]
     left_out: tuple[tuple[str, str], ...]  # frames that took no part, and why
     warnings: tuple[str, ...]
@@ -56,7 +56,7 @@ class LightFit:
     frames: tuple[str, ...]  # names of all that were given
     darkness: DarknessModel | None = None  # of a light that tells depth and no direction; lengths in pixels
     stretch: Stretch | None = None  # of contacts, which are round; None: not measured
-    doubts: tuple[str, ...] = ()  # why the pictures are not to be trusted, and what to do after a colon
+    image_warnings: tuple[str, ...] = ()  # why the pictures are not to be trusted, and what to do after a colon
 
     def to_calibration(
         self,
@@ -107,14 +107,16 @@ class LightFit:
         )
 
 
-def compared(press: BallPress, predicted: Float64, angles: Float64, mean: Float64, reference: Image) -> PressPrediction:
+def compare_with_prediction(
+    press: BallPress, predicted: Float64, angles: Float64, mean: Float64, reference: Image
+) -> PressPrediction:
     """A press beside what was predicted of it: change of colour (H, W, 3) [grey levels], and how far the normals that
     were found are off (H, W) [degrees]."""
     distance = press.distance() / press.circle.radius
     untouched_here = np.float64(reference) + press.drift  # what this frame would show without contact
     predicted = np.clip(untouched_here + predicted, 0.0, 255.0) - untouched_here
     real = press.change * mean
-    contact, far = distance < 1.5, distance > FAR
+    contact, far = distance < 1.5, distance > UNTOUCHED_RADIUS
     return PressPrediction(
         press.name,
         press.circle,

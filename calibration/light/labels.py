@@ -9,19 +9,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.height.slope_polynomial import InverseModel, fit_inverse, inverse_features, to_normal
-from calibration.light.dent import dent_gradient, dent_height, whole_profile
+from calibration.light.dent import cached_profile, dent_gradient, dent_height
 from calibration.light.photometry import (
     FEW_PRESSES,
-    LARGEST,
+    MAX_SIZE,
     SLOPE_SCALE,
     ModelSize,
     NormalEquations,
-    features,
     normal_equations,
-    solve,
+    photometric_features,
+    solve_weights,
     terms_of,
 )
-from calibration.light.press import FAR, NEAR, BallPress, smooth
+from calibration.light.press import SKIRT_RADIUS, UNTOUCHED_RADIUS, BallPress, gaussian_blur
 from calibration.light.refinement import RIM_BLUR, RefinedGeometry
 from calibration.light.shadows import DentShade
 from tacsim.models.photometric import DepthColour, PhotometricModel, depth_terms, normal_terms, place_in_image
@@ -35,7 +35,7 @@ INVERSE_BLUR = 1.2  # of what the inverse is fitted to [px]
 RIM_MARGIN = 5.0  # that contact and skirt reach further, whatever the radius [px]
 
 
-def label(press: BallPress, refined: RefinedGeometry, ball: float) -> Float64:
+def label_slopes(press: BallPress, refined: RefinedGeometry, ball: float) -> Float64:
     """(H, W, 2) slopes that are taken for the true ones."""
     v, u = np.mgrid[: press.shape[0], : press.shape[1]].astype(np.float64)
     return dent_gradient(u, v, press.circle, refined.thickness, ball, RIM_BLUR)
@@ -44,10 +44,10 @@ def label(press: BallPress, refined: RefinedGeometry, ball: float) -> Float64:
 def deepest_dent(refined: RefinedGeometry, ball: float) -> float:
     """Depth of the widest contact [px]."""
     widest = max(refined.circles, key=lambda circle: circle.radius)
-    return float(whole_profile(widest.radius, ball, refined.thickness)[1][0])
+    return float(cached_profile(widest.radius, ball, refined.thickness)[1][0])
 
 
-def beside_slopes(
+def extra_forward_terms(
     press: BallPress, gradient: Float64, refined: RefinedGeometry, ball: float, shade: DentShade | None
 ) -> Float64:
     """(H, W, terms) of depth, of slopes (H, W, 2) at depth, and of cast shadows where there are any."""
@@ -55,7 +55,7 @@ def beside_slopes(
     height = dent_height(u, v, press.circle, refined.thickness, ball)
     places = np.meshgrid(*place_in_image(press.shape[1], press.shape[0]))
     terms = depth_terms(height, deepest_dent(refined, ball), *places)
-    slopes = SLOPE_SCALE * terms[0] * normal_terms(gradient, LARGEST[0])
+    slopes = SLOPE_SCALE * terms[0] * normal_terms(gradient, MAX_SIZE[0])
     deep = np.ascontiguousarray(np.moveaxis(np.concatenate([terms, slopes]), 0, -1), dtype=np.float64)
     if shade is None:
         return deep
@@ -63,12 +63,12 @@ def beside_slopes(
     return np.concatenate([deep, dark.reshape(*press.shape, -1)], axis=-1)
 
 
-def near_contact(press: BallPress) -> NDArray[np.bool_]:
+def contact_and_skirt(press: BallPress) -> NDArray[np.bool_]:
     """(H, W) contact and skirt."""
-    return np.asarray(press.distance() < NEAR * press.circle.radius + RIM_MARGIN)
+    return np.asarray(press.distance() < SKIRT_RADIUS * press.circle.radius + RIM_MARGIN)
 
 
-def _places(mask: NDArray[np.bool_]) -> tuple[Float64, Float64]:
+def _image_places(mask: NDArray[np.bool_]) -> tuple[Float64, Float64]:
     """u, v in -1/2..1/2 across the picture of the pixels of a mask (H, W)."""
     rows, columns = np.nonzero(mask)
     u, v = place_in_image(mask.shape[1], mask.shape[0])
@@ -76,39 +76,39 @@ def _places(mask: NDArray[np.bool_]) -> tuple[Float64, Float64]:
 
 
 def forward_equations(
-    press: BallPress, gradient: Float64, beside: Float64, counted: NDArray[np.bool_] | None = None
+    press: BallPress, gradient: Float64, extra_terms: Float64, counted: NDArray[np.bool_] | None = None
 ) -> NormalEquations:
     """`counted` (H, W, 3): what takes part; None: what is not saturated."""
-    near = near_contact(press)
-    change = smooth(press.change, BLUR)[near]
+    near = contact_and_skirt(press)
+    change = gaussian_blur(press.change, BLUR)[near]
     lit = press.lit if counted is None else counted
-    return normal_equations(gradient[near], *_places(near), change, lit[near], beside[near])
+    return normal_equations(gradient[near], *_image_places(near), change, lit[near], extra_terms[near])
 
 
 def counted_pixels(
-    press: BallPress, gradient: Float64, beside: Float64, weights: Float64, size: ModelSize
+    press: BallPress, gradient: Float64, extra_terms: Float64, weights: Float64, size: ModelSize
 ) -> NDArray[np.bool_]:
     """(H, W, 3) what is not saturated, and what is where `weights` say less than is seen: a saturated pixel says "at
     least so bright"."""
     counted = press.lit.copy()
-    where = near_contact(press) & ~press.lit.all(axis=2)
-    light = features(gradient[where], *_places(where), *LARGEST)
-    said = np.concatenate([light, beside[where]], axis=1)[:, terms_of(size)] @ weights
-    seen = smooth(press.change, BLUR)[where]
+    where = contact_and_skirt(press) & ~press.lit.all(axis=2)
+    light = photometric_features(gradient[where], *_image_places(where), *MAX_SIZE)
+    said = np.concatenate([light, extra_terms[where]], axis=1)[:, terms_of(size)] @ weights
+    seen = gaussian_blur(press.change, BLUR)[where]
     counted[where] |= (seen > 0) & (said < seen)
     return counted
 
 
 def _inverse_terms(press: BallPress, where: NDArray[np.bool_]) -> Float64:
     """(n, terms) of the inverse at the pixels of a mask (H, W)."""
-    u, v = _places(where)
-    return inverse_features(smooth(press.change, INVERSE_BLUR)[where], 2 * u, 2 * v)
+    u, v = _image_places(where)
+    return inverse_features(gaussian_blur(press.change, INVERSE_BLUR)[where], 2 * u, 2 * v)
 
 
 def inverse_equations(press: BallPress, gradient: Float64) -> tuple[Float64, Float64]:
     """Normal equations from contact and skirt, and from a tenth as many untouched pixels, whose slope is 0."""
     v, u = np.mgrid[: press.shape[0], : press.shape[1]]
-    near, far = near_contact(press), press.distance() > FAR * press.circle.radius
+    near, far = contact_and_skirt(press), press.distance() > UNTOUCHED_RADIUS * press.circle.radius
     far &= (u + 7 * v) % max(1, round(10 * int(far.sum()) / max(int(near.sum()), 1))) == 0
     target = np.where(far[..., None], 0.0, to_normal(gradient))
     terms = _inverse_terms(press, near | far)
@@ -119,7 +119,7 @@ def forward_model(
     pixels: NormalEquations, size: ModelSize, steepest: float, deepest: float, shade: DentShade | None
 ) -> PhotometricModel:
     """`deepest` [widths of the picture]."""
-    weights = tuple((float(r), float(g), float(b)) for r, g, b in solve(pixels, size))
+    weights = tuple((float(r), float(g), float(b)) for r, g, b in solve_weights(pixels, size))
     dark = size.terms - size.shadows
     slopes = dark - size.slopes
     light = slopes - size.depth

@@ -12,7 +12,7 @@ MAX_PRESSES = 8  # drawn, the worst first
 HALF_SIDE = 2.0  # of what is drawn [contact radii]
 
 
-def draw(fit: LightFit, path: Path) -> None:
+def draw_residuals(fit: LightFit, path: Path) -> None:
     """Writes a PNG: of each press the change of colour as it was seen, as it is predicted by the others, and the
     error, all in one scale. Raises ValueError for a fit of one press, which is predicted by none; OSError."""
     from matplotlib.figure import Figure

@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from calibration.light.press import BallPress
 from tacsim.optics.skin import high_pass
 
-NEARBY = (1.25, 2.2)  # where the skin has moved, and the light changes little [contact radii]
-FAR_OFF = (4.0, 8.0)  # where it has hardly, in about the same light
+NEAR_RADII = (1.25, 2.2)  # where the skin has moved, and the light changes little [contact radii]
+FAR_RADII = (4.0, 8.0)  # where it has hardly, in about the same light
 MIN_PIXELS = 1000  # of either part of a press
 MIN_PRESSES = 4
 MIN_SHARE = 0.2  # a smaller one is not told from none; 0.07 at most is found on three real sensors without any
-CERTAIN = 3.0  # standard errors over presses that the share must be from none
+MIN_STANDARD_ERRORS = 3.0  # standard errors over presses that the share must be from none
 
 
 def measure_skin(presses: Sequence[BallPress], reference: NDArray[np.uint8], pixel_pitch: float) -> float | None:
@@ -36,11 +36,11 @@ def measure_skin(presses: Sequence[BallPress], reference: NDArray[np.uint8], pix
     for press in presses:
         change = high_pass((press.change * mean).astype(np.float32), pixel_pitch)
         lit, distance = press.lit.all(axis=2), press.distance() / press.circle.radius
-        parts = [lit & (distance > least) & (distance < most) for least, most in (FAR_OFF, NEARBY)]
+        parts = [lit & (distance > least) & (distance < most) for least, most in (FAR_RADII, NEAR_RADII)]
         if min(int(part.sum()) for part in parts) >= MIN_PIXELS:
             far, near = (1.0 + float((change[part] * grain[part]).sum() / (grain[part] ** 2).sum()) for part in parts)
             shares.append(far - max(near, 0.0))
     if len(shares) < MIN_PRESSES:
         return None
     share, error = float(np.median(shares)), float(np.std(shares, ddof=1)) / len(shares) ** 0.5
-    return min(share, 1.0) if share > max(MIN_SHARE, CERTAIN * error) else None
+    return min(share, 1.0) if share > max(MIN_SHARE, MIN_STANDARD_ERRORS * error) else None

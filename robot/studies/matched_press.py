@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from calibration.errors import BadFrames
 from calibration.frame_set import Frame, FrameSet
-from calibration.light.circle import Circle, NoCircle, contact_circle
+from calibration.light.circle import Circle, NoCircle, find_contact_circle
 from calibration.light.darkness import dark_circle
 from tacsim.interface import Pose, SurfaceMap
 from tacsim.models.scene import GelSurface, Scene, Sphere
@@ -68,7 +68,7 @@ def match_presses(
         )
     ball = scene.indenter.geometry.radius
     # slopes make the colour of most lights; one that tells no direction shows a contact by how dark it is
-    find = contact_circle if sensor.darkness is None else dark_circle
+    find = find_contact_circle if sensor.darkness is None else dark_circle
     circles, notes = _circles(real, find, ball / sensor.geometry.pixel_pitch)
     gel = _PressedGel(scene, ball, sensor, grid, find)
     done: dict[str, Frame] = {}

@@ -294,10 +294,10 @@ def test_a_part_of_a_view_has_the_drift_of_the_whole() -> None:
     weights = np.random.default_rng(0).normal(0, 0.1, (6, 3)).astype(np.float32)
     finder, drift = DriftFinder((120, 160)), Drift(weights, measured=True)
     finder.remove(planes, drift)
-    np.testing.assert_allclose(finder.part(drift, (0, 0), (120, 160)), -np.moveaxis(planes, 0, -1), atol=1e-6)
+    np.testing.assert_allclose(finder.select_presses(drift, (0, 0), (120, 160)), -np.moveaxis(planes, 0, -1), atol=1e-6)
     np.testing.assert_allclose(
-        finder.part(drift, (11, 23), (60, 70)), -np.moveaxis(planes, 0, -1)[11:71, 23:93], atol=1e-6
+        finder.select_presses(drift, (11, 23), (60, 70)), -np.moveaxis(planes, 0, -1)[11:71, 23:93], atol=1e-6
     )
     np.testing.assert_allclose(
-        finder.part(drift, (-4, -6), (120, 160))[4:, 6:], -np.moveaxis(planes, 0, -1)[:116, :154], atol=1e-6
+        finder.select_presses(drift, (-4, -6), (120, 160))[4:, 6:], -np.moveaxis(planes, 0, -1)[:116, :154], atol=1e-6
     )

@@ -77,7 +77,7 @@ def calibrated_render(width: int, repeat: int) -> list[Measurement]:
     as after each step."""
     import cv2
 
-    from calibration.light.photometry import features
+    from calibration.light.photometry import photometric_features
     from tacsim.optics.grid import image_grid
     from tacsim.optics.render import Renderer
     from tacsim.optics.surface import sample_surface
@@ -98,7 +98,7 @@ def calibrated_render(width: int, repeat: int) -> list[Measurement]:
     slopes, height = sample.gradient.astype(np.float64), sample.height.astype(np.float64) / VIEW[0]
     steep = np.maximum(np.hypot(slopes[..., 0], slopes[..., 1]) / forward.steepest, 1.0)
     u, v = np.meshgrid(*place_in_image(image.shape[1], image.shape[0]))
-    terms = features((slopes / steep[..., None]).reshape(-1, 2), u.ravel(), v.ravel(), DEGREE, POSITION)
+    terms = photometric_features((slopes / steep[..., None]).reshape(-1, 2), u.ravel(), v.ravel(), DEGREE, POSITION)
     change = (terms @ np.array(forward.weights)).reshape(image.shape)
     assert forward.depth is not None
     deep = depth_terms(height, forward.depth.deepest, u, v)

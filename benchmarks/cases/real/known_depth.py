@@ -20,7 +20,7 @@ from benchmarks.cases.real.contact_radius import ELEMENT, ball_scene, press_to
 from benchmarks.cases.real.labels import BadData, Image, PressLabel, PressLabels, read_frames, read_labels
 from benchmarks.harness.measure import Measurement, Timing
 from benchmarks.harness.runner import Case
-from calibration.light.circle import Circle, NoCircle, contact_circle
+from calibration.light.circle import Circle, NoCircle, find_contact_circle
 from robot.studies.matched_press import placed
 from tacsim.models.scene import GelSurface
 from tacsim.models.sensor import CanonicalGrid
@@ -113,7 +113,7 @@ class CalibratedSensor:
 def _circle(press: PressLabel, image: Image, reference: Image, labels: PressLabels) -> Circle:
     """Where the contact is found. Raises BadData."""
     try:
-        return contact_circle(image, reference, press.ball_radius / labels.pixel_pitch)
+        return find_contact_circle(image, reference, press.ball_radius / labels.pixel_pitch)
     except NoCircle as error:
         raise BadData(f"{press.name}: {error}") from None
 

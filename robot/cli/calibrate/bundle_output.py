@@ -39,11 +39,11 @@ def write_calibration(
     must."""
     from calibration.bundle import write_bundle
     from calibration.light.checks import page
-    from calibration.light.checks.verdict import judge
-    from calibration.light.residual_picture import draw
+    from calibration.light.checks.verdict import evaluate_calibration
+    from calibration.light.residual_picture import draw_residuals
     from calibration.light.skin import measure_skin
 
-    verdict = judge(fit, scale, dots=found is None and _shows_dots(fit))
+    verdict = evaluate_calibration(fit, scale, dots=found is None and _shows_dots(fit))
     _show(fit, scale.pixel_pitch, found)
     if profile.directed is not None and profile.directed == (fit.darkness is not None):
         told = "tells direction" if profile.directed else "tells none"
@@ -69,7 +69,7 @@ def write_calibration(
         written = [write_bundle(folder, bundle, fit.reference)]
         residuals = folder / "residuals.png" if fit.predictions else None
         if residuals is not None:
-            draw(fit, residuals)
+            draw_residuals(fit, residuals)
             written.append(residuals)
         written.append(folder / page.FILE)
         title = _title(serial, folder, profile)

@@ -10,7 +10,7 @@ from calibration.light.dent import ContactCircle
 from calibration.light.fit import LightFit
 from calibration.light.labels import counted_pixels
 from calibration.light.photometry import SLOPE_TERMS, ModelSize
-from calibration.light.press import BallPress, smooth
+from calibration.light.press import BallPress, gaussian_blur
 from tacsim.models.photometric import DEPTH_TERMS, PhotometricLight, places_in_image
 from tacsim.optics.render import phong_shading
 from tests.calibration.presses import BALL_PX, COLUMNS, PITCH, ROWS, HiddenSensor, Made
@@ -42,7 +42,7 @@ def drawn(fit: LightFit, slopes: np.ndarray, height: np.ndarray) -> np.ndarray:
     light = PhotometricLight(fit.forward, tuple(fit.reference.mean(axis=(0, 1)).tolist()))
     places = places_in_image(COLUMNS, ROWS)
     change = light.change(slopes.astype(np.float32), *places, (height / (PITCH * COLUMNS)).astype(np.float32))[0]
-    return fit.reference + smooth(change.astype(float), fit.forward.blur)
+    return fit.reference + gaussian_blur(change.astype(float), fit.forward.blur)
 
 
 def test_the_colour_of_depth_is_found_and_holds_for_what_is_no_ball() -> None:

@@ -83,7 +83,7 @@ def test_a_surface_without_a_fold_goes_the_quick_way_and_either_way_shows_the_sa
     slow, same = table.table_points(grid)
     assert np.array_equal(inside, same)
     np.testing.assert_allclose(slow[inside], quick[inside], atol=0.1)  # table points
-    monkeypatch.delattr(surfaces, "visible_points")
+    monkeypatch.delattr(surfaces, "visible_table_points")
     table.folded = False
     assert np.array_equal(table.table_points(grid)[0], quick)
 

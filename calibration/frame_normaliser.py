@@ -79,7 +79,7 @@ class FrameNormaliser:
         self.finds_height, self.finds_flow = find is not None, markers is not None or dots is not None
         # Share of the pixels of the last picture whose colour lies beyond the calibrated slopes: they get the nearest
         # calibrated slope. 0 where nothing had to be found
-        self.beyond_range = 0.0
+        self.out_of_range_share = 0.0
         # Relative change of the untouched gel's colour since the reference [-], in the last picture with enough of it;
         # and the mean slope [degrees] that this drift looks like. None before such a picture; no slope without height
         self.drift: float | None = None
@@ -172,13 +172,13 @@ class FrameNormaliser:
 
     def diagnostics(self) -> dict[str, float]:
         """Quality of the last observation, where it was found in a picture, as far as it is known: `beyond`
-        (`beyond_range`), `drift`, `background` (`drift_slope`), `kept`, `stale` (0 or 1); and `touched_reference` (1)
+        (`out_of_range_share`), `drift`, `background` (`drift_slope`), `kept`, `stale` (0 or 1); and `touched_reference` (1)
         where the reference shows a contact."""
         if not self._sought:
             return {}
         known = {
             "stale": float(self.stale),
-            "beyond": self.beyond_range if self.finds_height else None,
+            "beyond": self.out_of_range_share if self.finds_height else None,
             "drift": self.drift,
             "background": self.drift_slope,
             "kept": self.visible_marker_share if self.finds_flow else None,
@@ -197,7 +197,7 @@ class FrameNormaliser:
         """
         if self.reference is None:
             raise NoReference("no reference yet: call take_reference with a frame without contact (Rig.reset does)")
-        self.beyond_range, self._sought = 0.0, False
+        self.out_of_range_share, self._sought = 0.0, False
         difference = partial(_relative_change, self.reference, self._rectify, frame)
         if frame.surface is None:
             return self._observation_from_image(frame, difference(), now)
@@ -248,7 +248,7 @@ class FrameNormaliser:
         if self._find is not None:
             assert self.reference is not None
             found = self._find(change, self.reference.relative)
-            self.beyond_range = found.beyond_range
+            self.out_of_range_share = found.out_of_range_share
             if found.drift is not None:
                 self.drift, self.drift_slope = found.drift, found.drift_slope
             height, gradient, removed = found.height, found.gradient, found.removed_drift

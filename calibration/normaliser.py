@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from calibration.bundle import BadBundle, Calibration, read_bundle
 from calibration.errors import BadFrames
 from calibration.frame_normaliser import FrameNormaliser
-from calibration.height.colour_table import GradientModel, from_model
+from calibration.height.colour_table import GradientModel, table_of_model
 from calibration.height.darkness import DarknessSlopes
 from calibration.height.forward_steps import ForwardSteps
 from calibration.height.slope_polynomial import PolynomialSlopes
@@ -60,7 +60,7 @@ def normaliser_for_pictures(
         shape = rectify.valid[seen_box(rectify.valid)].shape
         slopes = DarknessSlopes(model.darkness, shape, grid.pitch / grid.image_scale)
     else:
-        slopes = from_model(model)
+        slopes = table_of_model(model)
     find = SurfaceFinder(slopes, rectify.valid, grid, dots=model.markers is not None)
     return FrameNormaliser(
         rectify, grid, find, marker_flow(model.markers, model.geometry, gel_size, model.view, region)

@@ -23,7 +23,7 @@ from calibration.height.integration import Integrator, slopes_of
 from calibration.height.slope_polynomial import (
     InverseModel,
     PolynomialSlopes,
-    to_normal,
+    normal_of_slope,
 )
 from calibration.light.checks.consistency import find_blurred_presses, find_inconsistent_presses, find_reference_contact
 from calibration.light.checks.press_shapes import find_other_balls, fit_stretch
@@ -245,7 +245,7 @@ def _calibrate_darkness(
         change, _ = darken_by_depth(model, dent_height(u, v, press.circle, fit.thickness, ball).astype(np.float32), 1.0)
         slopes, _ = DarknessSlopes(model, press.shape, 1.0)(press.change.astype(np.float32))
         label = dent_gradient(u, v, press.circle, fit.thickness, ball)
-        angles = normal_angle(to_normal(slopes.astype(np.float64)), to_normal(label))
+        angles = normal_angle(normal_of_slope(slopes.astype(np.float64)), normal_of_slope(label))
         predictions.append(compare_with_prediction(press, change.astype(np.float64) * mean, angles, mean, reference))
     return LightFit(
         forward=None,
@@ -401,5 +401,5 @@ def _predict_press(
     steps = ForwardSteps(forward, *places, 1.0, float(press.shape[1]))
     height = steps(np.ascontiguousarray(np.moveaxis(seen, -1, 0)), integrate(slopes), nothing, integrate)
     found = np.stack(slopes_of(height, 1.0), axis=-1)
-    angles = normal_angle(to_normal(found.astype(np.float64)), to_normal(gradient))
+    angles = normal_angle(normal_of_slope(found.astype(np.float64)), normal_of_slope(gradient))
     return compare_with_prediction(press, predicted, angles, mean, reference)

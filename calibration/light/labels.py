@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.height.slope_polynomial import InverseModel, fit_inverse, inverse_features, to_normal
+from calibration.height.slope_polynomial import InverseModel, fit_inverse, inverse_features, normal_of_slope
 from calibration.light.dent import cached_profile, dent_gradient, dent_height
 from calibration.light.photometry import (
     FEW_PRESSES,
@@ -110,7 +110,7 @@ def inverse_equations(press: BallPress, gradient: Float64) -> tuple[Float64, Flo
     v, u = np.mgrid[: press.shape[0], : press.shape[1]]
     near, far = contact_and_skirt(press), press.distance() > UNTOUCHED_RADIUS * press.circle.radius
     far &= (u + 7 * v) % max(1, round(10 * int(far.sum()) / max(int(near.sum()), 1))) == 0
-    target = np.where(far[..., None], 0.0, to_normal(gradient))
+    target = np.where(far[..., None], 0.0, normal_of_slope(gradient))
     terms = _inverse_terms(press, near | far)
     return terms.T @ terms, terms.T @ target[near | far]
 

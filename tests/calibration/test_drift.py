@@ -9,7 +9,7 @@ import pytest
 
 from calibration.drift import PIXEL_STRIDE, Drift, DriftFinder
 from calibration.frame_normaliser import FrameNormaliser
-from calibration.height.slope_polynomial import to_normal
+from calibration.height.slope_polynomial import normal_of_slope
 from calibration.light.fit import normal_angle
 from calibration.normaliser import (
     normaliser_for_calibration,
@@ -68,7 +68,7 @@ def angle(seen: TactileObservation, press: Made) -> float:
     true = press.gradient[np.rint(v).clip(0, ROWS - 1).astype(int), np.rint(u).clip(0, COLUMNS - 1).astype(int)]
     inside = seen.valid & (np.hypot(u - press.circle[0], v - press.circle[1]) < press.circle[2])
     assert seen.gradient is not None
-    return float(normal_angle(to_normal(seen.gradient.astype(float)), to_normal(true))[inside].mean())
+    return float(normal_angle(normal_of_slope(seen.gradient.astype(float)), normal_of_slope(true))[inside].mean())
 
 
 @pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES)

@@ -40,7 +40,7 @@ BALL, DEPTH = 4e-3, 1e-3  # [m]
 def made_up(width: int) -> Calibration:
     """A calibration of the largest order for pictures of width x 3/4 width; its light is made up."""
     from calibration.bundle import FORMAT, Calibration, Provenance
-    from calibration.height.slope_polynomial import InverseModel, fit_inverse, inverse_features, to_normal
+    from calibration.height.slope_polynomial import InverseModel, fit_inverse, inverse_features, normal_of_slope
     from tacsim.models.photometric import PhotometricLight
 
     shape = (3 * width // 4, width)
@@ -56,7 +56,7 @@ def made_up(width: int) -> Calibration:
     change, _ = PhotometricLight(forward).change(slopes, *places_in_image(shape[1], shape[0]))
     u, v = np.meshgrid(*place_in_image(shape[1], shape[0]))
     terms = inverse_features(change.reshape(-1, 3).astype(np.float64), 2 * u.ravel(), 2 * v.ravel())
-    target = to_normal(slopes.reshape(-1, 2).astype(np.float64))
+    target = normal_of_slope(slopes.reshape(-1, 2).astype(np.float64))
     inverse = fit_inverse([(terms.T @ terms, terms.T @ target)], with_position=True)
     return Calibration(
         format=FORMAT,

@@ -172,8 +172,8 @@ class FrameNormaliser:
 
     def diagnostics(self) -> dict[str, float]:
         """Quality of the last observation, where it was found in a picture, as far as it is known: `beyond`
-        (`out_of_range_share`), `drift`, `background` (`drift_slope`), `kept`, `stale` (0 or 1); and `touched_reference` (1)
-        where the reference shows a contact."""
+        (`out_of_range_share`), `drift`, `background` (`drift_slope`), `kept`, `stale` (0 or 1); and `touched_reference`
+        (1) where the reference shows a contact."""
         if not self._sought:
             return {}
         known = {

@@ -28,7 +28,7 @@ from calibration.height.slope_polynomial import (
 from calibration.light.checks.consistency import find_blurred_presses, find_inconsistent_presses, find_reference_contact
 from calibration.light.checks.press_shapes import find_other_balls, fit_stretch
 from calibration.light.circle import NoCircle
-from calibration.light.darkness import MAX_RESIDUAL_SHARE, find_dark_press, fit_darkness, is_direction_free
+from calibration.light.darkness import MAX_DARKNESS_RESIDUAL, find_dark_press, fit_darkness, is_direction_free
 from calibration.light.dent import dent_gradient, dent_height, max_dent_slope
 from calibration.light.fit import LightFit, PressPrediction, compare_with_prediction, normal_angle
 from calibration.light.labels import (
@@ -224,7 +224,7 @@ def _calibrate_darkness(
         raise _no_presses_error(left_out)
     try:
         fit = fit_darkness(found, ball)
-        while max(fit.residual_shares) > MAX_RESIDUAL_SHARE and len(found) > 1:
+        while max(fit.residual_shares) > MAX_DARKNESS_RESIDUAL and len(found) > 1:
             worst = int(np.argmax(fit.residual_shares))
             left_out.append(
                 (found.pop(worst).name, f"depth explains only {1 - fit.residual_shares[worst]:.0%} of its darkness")
@@ -232,10 +232,10 @@ def _calibrate_darkness(
             fit = fit_darkness(found, ball)
     except BadFrames as why:
         raise NoDirection(f"{NO_DIRECTION}, and {why}") from None
-    if max(fit.residual_shares) > MAX_RESIDUAL_SHARE:
+    if max(fit.residual_shares) > MAX_DARKNESS_RESIDUAL:
         raise NoDirection(
-            f"{NO_DIRECTION}, and depth explains only {1 - max(fit.residual_shares):.0%} of how dark it gets: is the ball "
-            "round, its radius right, and exposure fixed?"
+            f"{NO_DIRECTION}, and depth explains only {1 - max(fit.residual_shares):.0%} of how dark it gets: is the "
+            "ball round, its radius right, and exposure fixed?"
         )
     predictions = []
     for press, model in zip(fit.presses, fit.left_out, strict=True):
@@ -307,8 +307,8 @@ def _refine_without_outlier(
         if refined.residual_shares[worst] <= limit:
             return [replace(p, circle=c) for p, c in zip(found, refined.circles, strict=True)], refined
         why = (
-            f"the fitted ball dent explains only {1 - refined.residual_shares[worst]:.0%} of the colour change (at least "
-            f"{1 - limit:.0%} needed)"
+            f"the fitted ball dent explains only {1 - refined.residual_shares[worst]:.0%} of the colour change (at "
+            f"least {1 - limit:.0%} needed)"
         )
         left_out.append((found.pop(worst).name, why))
     raise _no_presses_error(left_out)

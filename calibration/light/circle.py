@@ -69,8 +69,8 @@ def find_contact_circle(image: NDArray[np.uint8], reference: NDArray[np.uint8], 
                 "pressed)"
             )
     raise NoCircle(
-        f"no ball's contact is seen: a dent explains {max(circle.explained_share, 0.0):.0%} of the difference to the image "
-        f"without contact, {MIN_EXPLAINED_SHARE:.0%} are needed"
+        f"no ball's contact is seen: a dent explains {max(circle.explained_share, 0.0):.0%} of the difference to the "
+        f"image without contact, {MIN_EXPLAINED_SHARE:.0%} are needed"
     )
 
 

@@ -41,7 +41,7 @@ START = (0.3, 0.4)  # share, reach [ball radii] that the search starts from
 BOUNDS = ((0.0, 0.05), (0.8, 1.5))  # of share, reach
 KNOTS = 24  # of the table
 MIN_SLOPE_RATIO = 0.01  # least slope of the table, over its mean
-MAX_RESIDUAL_SHARE = 0.1  # share of darkness that is no function of a dent's depth, at most; 0.003 on real frames
+MAX_DARKNESS_RESIDUAL = 0.1  # share of darkness that is no function of a dent's depth, at most; 0.003 on real frames
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,10 +114,10 @@ def dark_circle(image: Image, reference: Image, ball: float) -> Circle:
     except BadFrames as why:
         raise NoCircle(f"no ball's contact is seen: {why}") from None
     explained = 1.0 - fit.residual_shares[0]
-    if explained < 1.0 - MAX_RESIDUAL_SHARE:
+    if explained < 1.0 - MAX_DARKNESS_RESIDUAL:
         raise NoCircle(
             f"no ball's contact is seen: the depth of a dent explains {max(explained, 0.0):.0%} of how dark it gets, "
-            f"{1 - MAX_RESIDUAL_SHARE:.0%} are needed"
+            f"{1 - MAX_DARKNESS_RESIDUAL:.0%} are needed"
         )
     found = fit.presses[0].circle
     return Circle(found.x, found.y, found.radius, explained)

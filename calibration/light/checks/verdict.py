@@ -209,7 +209,8 @@ def _check_scale(fit: LightFit, scale: KnownScale) -> Iterable[Finding]:
         off = max(abs(math.log(one / other)) for one, other in zip(shown, scale.gel_size, strict=True))
         yield from _exceed_limits(
             MAX_SCALE_ERROR, off,
-            f"at this pitch the picture shows {_size_text(shown)}, and {_size_text(scale.gel_size)} of the gel are to be seen",
+            f"at this pitch the picture shows {_size_text(shown)}, and {_size_text(scale.gel_size)} of the gel "
+            "are to be seen",
             "measure the pitch by a board or a ruler",
         )  # fmt: skip
     if scale.gel_thickness is not None:
@@ -238,7 +239,8 @@ def _check_thickness(fit: LightFit, scale: KnownScale, widest: float) -> Iterabl
     assert told is not None
     depth = widest**2 * scale.ball_radius
     yield from _exceed_limits(
-        MAX_DEPTH_RATIO, depth / told, f"the deepest press is {depth * 1e3:.1f} mm deep in a gel of {told * 1e3:.1f} mm",
+        MAX_DEPTH_RATIO, depth / told,
+        f"the deepest press is {depth * 1e3:.1f} mm deep in a gel of {told * 1e3:.1f} mm",
         "measure ball and pitch; press less deep",
     )  # fmt: skip
     by_slopes = fit.thickness * scale.pixel_pitch

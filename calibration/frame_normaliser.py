@@ -124,7 +124,7 @@ class FrameNormaliser:
     @property
     def visible_marker_share(self) -> float:
         """Share of the reference's markers seen in that picture. 1 where nothing had to be found."""
-        return 1.0 if self._markers is None else self._markers.visible_marker_share
+        return 1.0 if self._markers is None else self._markers.kept
 
     def take_reference(self, frame: TactileFrame) -> None:
         """Makes `frame`, taken without contact, the reference I0, and its markers' places their rest. Raises
@@ -243,8 +243,8 @@ class FrameNormaliser:
         if self._find_drift is not None:
             drift = self._find_drift(np.ascontiguousarray(np.moveaxis(change, -1, 0)), ~self._on_image)
             if drift.measured:
-                self.drift = max_mean_change(self._find_drift.at(drift))
-                removed = self._find_drift.select_presses(drift, (0, 0), self._on_image.shape)
+                self.drift = max_mean_change(self._find_drift.drift_at_stride(drift))
+                removed = self._find_drift.drift_on_part(drift, (0, 0), self._on_image.shape)
         if self._find is not None:
             assert self.reference is not None
             found = self._find(change, self.reference.relative)

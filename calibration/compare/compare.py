@@ -148,7 +148,7 @@ def compare_frames(
     """
     names = sides(a, b)
     couples, left = paired(a, b, options.pairing)
-    shift = not a.placed if options.shift is None else options.shift
+    shift = not a.same_pixels if options.shift is None else options.shift
     alignment = _alignment(a, b, couples, calibration_a, calibration_b, shift=shift)
     notes: list[str] = [*a.notes, *b.notes, *find_touched_references(a), *find_touched_references(b)]
     found_a, said_a = estimate_surfaces(a, [frame for frame, _ in couples], calibration_a)
@@ -191,7 +191,7 @@ def paired(a: FrameSet, b: FrameSet, pairing: Pairing) -> tuple[list[tuple[Frame
     """The frames that belong together, and notes on those left out. Raises BadFrames where that is ambiguous."""
     named_a, named_b = ({Path(frame.name).stem.lower(): frame for frame in each.frames} for each in (a, b))
     common = [name for name in named_a if name in named_b]
-    if a.placed and pairing is Pairing.auto:  # it says itself what it could not make
+    if a.same_pixels and pairing is Pairing.auto:  # it says itself what it could not make
         if not common:
             raise BadFrames(f"{a.name}: none of its frames could be made. " + "; ".join(a.notes))
         return [(named_a[name], named_b[name]) for name in common], []

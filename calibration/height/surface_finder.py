@@ -91,7 +91,7 @@ class SurfaceFinder:
         if self._dots:
             hidden = hidden | _ink_mask(known.planes + planes)
         drift = self._drift_finder(planes, hidden)
-        changed = self._drift_finder.at(drift) if drift.measured else None
+        changed = self._drift_finder.drift_at_stride(drift) if drift.measured else None
         if self._remove_drift:
             self._drift_finder.remove(planes, drift)
         gradient, beyond_range = self._slopes(np.moveaxis(planes, 0, -1))
@@ -110,7 +110,7 @@ class SurfaceFinder:
             out_of_range_share=float(np.count_nonzero(beyond_range & ~hidden) / beyond_range.size),
             drift=None if changed is None else max_mean_change(changed),
             drift_slope=None if changed is None else self._mean_angle(changed),
-            removed_drift=self._drift_finder.select_presses(drift.scaled(1.0 / known.gain), self._corner, self._image)
+            removed_drift=self._drift_finder.drift_on_part(drift.scaled(1.0 / known.gain), self._corner, self._image)
             if self._remove_drift and drift.measured
             else None,
         )

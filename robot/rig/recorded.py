@@ -99,7 +99,7 @@ class RecordedSurfaces:
                     found.take_reference(TactileFrame(untouched, time=0.0, index=0))
                     self._normalisers[name] = found
                     self.notes += _distrusted(sensor, name)
-                    self.notes += _middle_alone(sensor, name, found.shown, rig.canonical)
+                    self.notes += _middle_alone(sensor, name, found.visible_size, rig.canonical)
                 elif found is not None and not meta.spec.sensors[name].height:
                     self.notes += _dots_in(untouched, name)
             except (CalibrationError, ValueError) as why:

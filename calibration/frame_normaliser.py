@@ -17,7 +17,7 @@ from calibration.drift import MIN_CONTACT_AREA, DriftFinder, contact_area, max_m
 from calibration.height.surface_finder import SurfaceFinder, canonical_part
 from calibration.lens.rectification import (
     Rectification,
-    seen_box,
+    visible_box,
 )
 from calibration.markers.flow import MarkerFlow, require_no_markers
 from calibration.reference import (
@@ -102,7 +102,7 @@ class FrameNormaliser:
     def visible_size(self) -> tuple[float, float]:
         """x, y of the gel that the native picture shows, within its region [m]: the maps may show the middle alone."""
         valid, pitch = self._rectify.valid, self._grid.pitch / self._grid.image_scale
-        down, across = (side.stop - side.start for side in seen_box(valid))
+        down, across = (side.stop - side.start for side in visible_box(valid))
         x, y = (
             # what reaches the border of the view goes on beyond it; what ends before is all that a region lets be seen
             size if (there + 2) * pitch >= min(size, whole * pitch) else there * pitch

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from calibration.drift import contact_area
 from calibration.errors import BadFrames
-from calibration.lens.rectification import from_corners, region_mask, to_metric
+from calibration.lens.rectification import metric_rectification, rectification_of_corners, region_mask
 from calibration.lens.view import BadCorners, Corners, GelView
 from calibration.reference import SATURATED, is_contact_image_swapped
 from tacsim.interface import SurfaceMap
@@ -177,7 +177,7 @@ def metric_image_map(view: GelView) -> Callable[[Image], Image]:
     middle = view.project(pixel)
     factor = int(np.linalg.norm(middle[1:] - middle[0], axis=1).min())
     if factor < 2:
-        rectify = to_metric(view)
+        rectify = metric_rectification(view)
         return lambda image: np.rint(rectify(image)).astype(np.uint8)
     lens = view.lens
     columns, rows = lens.width // factor, lens.height // factor
@@ -190,7 +190,7 @@ def metric_image_map(view: GelView) -> Callable[[Image], Image]:
             "centre": ((lens.centre[0] + 0.5) * x - 0.5, (lens.centre[1] + 0.5) * y - 0.5),
         }
     )
-    rectify = to_metric(view.model_copy(update={"lens": small}))
+    rectify = metric_rectification(view.model_copy(update={"lens": small}))
 
     def reduced(image: Image) -> Image:
         if image.shape[:2] != view.image_shape:
@@ -243,7 +243,7 @@ def rectified_by_corners(frame_set: FrameSet, corners: Corners, shape: tuple[int
 
     rows, columns = shape
     grid = PixelGrid(rows, columns, 1.0, -(columns - 1) / 2, -(rows - 1) / 2)
-    rectify = from_corners(corners, (float(columns), float(rows)), frame_set.shape, grid)
+    rectify = rectification_of_corners(corners, (float(columns), float(rows)), frame_set.shape, grid)
     if not rectify.valid.all():
         raise BadCorners(f"corners {corners!r} reach beyond the picture; all of the gel must be seen")
     return _map_images(frame_set, lambda image: np.asarray(cv2.convertScaleAbs(rectify(image)), dtype=np.uint8))

@@ -18,10 +18,10 @@ from calibration.height.slope_polynomial import PolynomialSlopes
 from calibration.height.surface_finder import SurfaceFinder, extended_view
 from calibration.lens.rectification import (
     Rectification,
-    from_corners,
-    from_geometry,
-    from_view,
-    seen_box,
+    rectification_of_corners,
+    rectification_of_geometry,
+    rectification_of_view,
+    visible_box,
 )
 from calibration.markers.flow import NoMarkers
 from calibration.markers.of_sensor import marker_flow, seen_by_dots
@@ -57,7 +57,7 @@ def normaliser_for_pictures(
     rectify = _normaliser_of_model(model, gel_size, extended_view(grid, gel_size)).within(region)
     slopes: GradientModel
     if model.darkness is not None:
-        shape = rectify.valid[seen_box(rectify.valid)].shape
+        shape = rectify.valid[visible_box(rectify.valid)].shape
         slopes = DarknessSlopes(model.darkness, shape, grid.pitch / grid.image_scale)
     else:
         slopes = table_of_model(model)
@@ -69,7 +69,11 @@ def normaliser_for_pictures(
 
 def _normaliser_of_model(model: SensorModel, gel_size: tuple[float, float], grid: PixelGrid) -> Rectification:
     """From the pictures that a sensor of this model delivers."""
-    return from_geometry(model.geometry, gel_size, grid) if model.view is None else from_view(model.view, grid)
+    return (
+        rectification_of_geometry(model.geometry, gel_size, grid)
+        if model.view is None
+        else rectification_of_view(model.view, grid)
+    )
 
 
 def normaliser_for_calibration(
@@ -81,12 +85,12 @@ def normaliser_for_calibration(
     wide = extended_view(grid, calibration.gel_size)
     # One look-up from the native picture, whether it is metric by itself or seen through lens and perspective.
     if calibration.view is None:
-        rectify = from_geometry(geometry, calibration.gel_size, wide)
+        rectify = rectification_of_geometry(geometry, calibration.gel_size, wide)
     else:
-        rectify = from_view(calibration.view, wide)
+        rectify = rectification_of_view(calibration.view, wide)
     rectify = rectify.within(calibration.region)
     pixels = (wide.points() / geometry.pixel_pitch + geometry.principal + 0.5) / (geometry.width, geometry.height)
-    x, y = np.moveaxis(2.0 * pixels[seen_box(rectify.valid)] - 1.0, -1, 0)
+    x, y = np.moveaxis(2.0 * pixels[visible_box(rectify.valid)] - 1.0, -1, 0)
     slopes: GradientModel
     better = None
     if calibration.darkness is not None:
@@ -102,7 +106,7 @@ def normaliser_for_calibration(
     flow = marker_flow(calibration.markers, geometry, calibration.gel_size, calibration.view, calibration.region)
     known = None
     if untouched is not None:  # it is metric by itself, whatever the camera's picture is
-        known = from_geometry(geometry, calibration.gel_size, wide)(untouched)
+        known = rectification_of_geometry(geometry, calibration.gel_size, wide)(untouched)
     return FrameNormaliser(rectify, grid, find, flow, untouched=known)
 
 
@@ -121,7 +125,7 @@ def normaliser_for_recording(
         return normaliser_for_dots(config.marker_pitch, untouched, grid, config.region)
     if config.calibration is not None:
         return _of_bundle(config.calibration, image_shape, grid)
-    seen = from_corners(config.corners, config.size, image_shape, canonical_image(grid))
+    seen = rectification_of_corners(config.corners, config.size, image_shape, canonical_image(grid))
     return FrameNormaliser(seen.within(config.region), grid, drifts=True)
 
 
@@ -153,9 +157,9 @@ def normaliser_for_camera(
     shape = (config.height, config.width)
     if config.marker_pitch is not None:
         dots = partial(seen_by_dots, config.marker_pitch, grid=grid, region=config.region)
-        first = from_corners(None, config.size, shape, canonical_image(grid))
+        first = rectification_of_corners(None, config.size, shape, canonical_image(grid))
         return FrameNormaliser(first, grid, drifts=True, dots=dots)
-    seen = from_corners(config.corners, config.size, shape, canonical_image(grid))
+    seen = rectification_of_corners(config.corners, config.size, shape, canonical_image(grid))
     return FrameNormaliser(seen.within(config.region), grid, drifts=True)
 
 

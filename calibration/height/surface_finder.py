@@ -18,7 +18,7 @@ from calibration.drift import PIXEL_STRIDE, DriftFinder, max_mean_change
 from calibration.height.colour_table import GradientModel
 from calibration.height.forward_steps import ForwardSteps
 from calibration.height.integration import Integrator, slopes_of
-from calibration.lens.rectification import seen_box
+from calibration.lens.rectification import visible_box
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.optics.grid import PixelGrid, canonical_image
 
@@ -47,7 +47,7 @@ class SurfaceFinder:
     """Finds the surface of one sensor.
 
     Args:
-        slopes: the inverse of its light, on the pixels of :func:`seen_box`.
+        slopes: the inverse of its light, on the pixels of :func:`visible_box`.
         valid: (H, W) of :func:`extended_view`, as the rectification gives it.
         dots: dots are printed on the gel.
         drifts: the light is real and drifts: the drift, which is measured in any case, is removed.
@@ -65,7 +65,7 @@ class SurfaceFinder:
         better: ForwardSteps | None = None,
     ) -> None:
         self._slopes, self._grid, self._dots, self._better = slopes, grid, dots, better
-        self._box = seen_box(valid)
+        self._box = visible_box(valid)
         self._unseen = ~valid[self._box]
         self._pitch = grid.pitch / grid.image_scale
         self._drift_finder, self._remove_drift = DriftFinder(self._unseen.shape), drifts

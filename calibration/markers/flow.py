@@ -13,7 +13,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.lens.rectification import Rectification, seen_box
+from calibration.lens.rectification import Rectification, visible_box
 from calibration.markers.dots import MIN_RADIUS, DotFinder
 from calibration.markers.lattice import Lattice, NoLattice, find_lattice, missing_line, spread, usual_pitch
 from calibration.markers.tracker import DotTracker
@@ -67,7 +67,7 @@ class MarkerFlow:
             )
         self._markers, self._distance = markers, distance
         self._native = rectify.image_shape
-        box = seen_box(rectify.valid)
+        box = visible_box(rectify.valid)
         self._whole = _whole(rectify.valid[box], markers.radius / grid.pitch)
         self._shrink = max(1, math.floor(across * grid.pitch + 1e-6))
         self._map = _look_ups(rectify, self._shrink, box)

@@ -7,7 +7,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.lens.rectification import Rectification, from_geometry, from_view, region_mask, seen_box
+from calibration.lens.rectification import (
+    Rectification,
+    rectification_of_geometry,
+    rectification_of_view,
+    region_mask,
+    visible_box,
+)
 from calibration.lens.view import GelView
 from calibration.markers.flow import MarkerFlow, NoMarkers, find_markers, marker_grid
 from calibration.markers.lattice import NoLattice
@@ -28,7 +34,7 @@ def marker_flow(
     if markers is None:
         return None
     fine = marker_grid(markers, gel_size)
-    rectify = from_geometry(geometry, gel_size, fine) if seen is None else from_view(seen, fine)
+    rectify = rectification_of_geometry(geometry, gel_size, fine) if seen is None else rectification_of_view(seen, fine)
     return MarkerFlow(markers, rectify.within(region), fine, geometry.camera_distance)
 
 
@@ -52,8 +58,8 @@ def seen_by_dots(
     markers = Markers(rows=rows, columns=columns, pitch=pitch, radius=radius * scale)
     flow = marker_flow(markers, geometry, size, region=region)
     assert flow is not None
-    rectify = from_geometry(geometry, size, canonical_image(grid)).within(region)
+    rectify = rectification_of_geometry(geometry, size, canonical_image(grid)).within(region)
     if region is not None:
-        down, across = (side.stop - side.start for side in seen_box(shown))
+        down, across = (side.stop - side.start for side in visible_box(shown))
         rectify = replace(rectify, size=(across * scale, down * scale))
     return rectify, flow

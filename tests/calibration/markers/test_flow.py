@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from calibration.frame_normaliser import FrameNormaliser
-from calibration.lens.rectification import Rectification, from_corners, from_geometry
+from calibration.lens.rectification import Rectification, rectification_of_corners, rectification_of_geometry
 from calibration.markers.flow import MarkerFlow, MarkersLost, NoMarkers, find_markers, marker_grid
 from calibration.normaliser import normaliser_for_camera, normaliser_for_pictures, normaliser_for_simulation
 from calibration.reference import UnusableReference
@@ -130,7 +130,7 @@ def in_pixels(points: np.ndarray) -> np.ndarray:
 
 def plain_flow() -> MarkerFlow:
     grid = marker_grid(MARKERS, GEL)
-    return MarkerFlow(MARKERS, from_geometry(SensorGeometry(), GEL, grid), grid)
+    return MarkerFlow(MARKERS, rectification_of_geometry(SensorGeometry(), GEL, grid), grid)
 
 
 def moved(far: float) -> np.ndarray:
@@ -206,7 +206,7 @@ def through_corners(angle: float) -> tuple[Rectification, np.ndarray]:
     turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
     corners = gel @ turn * 20 * (1 + 0.012 * gel[:, :1]) + (320.0, 320.0)
     grid = marker_grid(MARKERS, (20e-3, 15e-3))
-    rectify = from_corners(tuple(map(tuple, corners)), (20e-3, 15e-3), (640, 640), grid)  # type: ignore[arg-type]
+    rectify = rectification_of_corners(tuple(map(tuple, corners)), (20e-3, 15e-3), (640, 640), grid)  # type: ignore[arg-type]
     return rectify, cv2.getPerspectiveTransform(gel.astype(np.float32), corners.astype(np.float32))
 
 

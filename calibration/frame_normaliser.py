@@ -119,12 +119,12 @@ class FrameNormaliser:
     def visible_markers(self) -> NDArray[np.bool_] | None:
         """(rows, columns) markers that were seen in the last picture in which flow was sought; that of the others is
         the mean of their neighbours'. None for a sensor whose flow is not found in pictures."""
-        return None if self._markers is None else self._markers.seen
+        return None if self._markers is None else self._markers.visible
 
     @property
     def visible_marker_share(self) -> float:
         """Share of the reference's markers seen in that picture. 1 where nothing had to be found."""
-        return 1.0 if self._markers is None else self._markers.kept
+        return 1.0 if self._markers is None else self._markers.visible_share
 
     def take_reference(self, frame: TactileFrame) -> None:
         """Makes `frame`, taken without contact, the reference I0, and its markers' places their rest. Raises
@@ -172,7 +172,7 @@ class FrameNormaliser:
 
     def diagnostics(self) -> dict[str, float]:
         """Quality of the last observation, where it was found in a picture, as far as it is known: `beyond`
-        (`out_of_range_share`), `drift`, `background` (`drift_slope`), `kept`, `stale` (0 or 1); and `touched_reference`
+        (`out_of_range_share`), `drift`, `background` (`drift_slope`), `visible_share`, `stale` (0 or 1); and `touched_reference`
         (1) where the reference shows a contact."""
         if not self._sought:
             return {}

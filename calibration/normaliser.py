@@ -24,7 +24,7 @@ from calibration.lens.rectification import (
     visible_box,
 )
 from calibration.markers.flow import NoMarkers
-from calibration.markers.of_sensor import marker_flow, seen_by_dots
+from calibration.markers.of_sensor import marker_flow, view_of_dots
 from tacsim.models.geometry import PictureRegion
 from tacsim.models.hardware import CameraSensorConfig
 from tacsim.models.rig import ReplaySensorConfig
@@ -135,7 +135,7 @@ def normaliser_for_dots(
     """The normaliser of a sensor of which nothing is known but the distance of its printed dots, `pitch` [m], and its
     picture without contact: flow, no height. The camera looks straight on. Raises BadFrames where no dots are seen."""
     try:
-        rectify, flow = seen_by_dots(pitch, untouched, grid, region)
+        rectify, flow = view_of_dots(pitch, untouched, grid, region)
     except NoMarkers as nothing:
         raise BadFrames(str(nothing)) from None
     return FrameNormaliser(rectify, grid, markers=flow, drifts=True)
@@ -156,7 +156,7 @@ def normaliser_for_camera(
         return normaliser_for_pictures(config.model, gel_size, grid, config.region)
     shape = (config.height, config.width)
     if config.marker_pitch is not None:
-        dots = partial(seen_by_dots, config.marker_pitch, grid=grid, region=config.region)
+        dots = partial(view_of_dots, config.marker_pitch, grid=grid, region=config.region)
         first = rectification_of_corners(None, config.size, shape, canonical_image(grid))
         return FrameNormaliser(first, grid, drifts=True, dots=dots)
     seen = rectification_of_corners(config.corners, config.size, shape, canonical_image(grid))

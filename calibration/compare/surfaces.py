@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from calibration.bundle import Calibration
 from calibration.errors import BadFrames
 from calibration.frame_set import Frame, FrameSet
-from calibration.markers.flow import MarkersLost
+from calibration.markers.flow import TooFewMarkers
 from calibration.normaliser import normaliser_for_calibration
 from calibration.reference import StaleReference, UnusableReference
 from tacsim.interface import TactileFrame
@@ -69,7 +69,7 @@ def estimate_surfaces(
         for frame in frames:
             try:
                 seen = normaliser(TactileFrame(frame.image, time=0.0, index=0), 0.0)
-            except (StaleReference, MarkersLost) as why:
+            except (StaleReference, TooFewMarkers) as why:
                 found.append(None)
                 lost.append(f"{frame.name}: {why}")
                 continue

@@ -53,14 +53,14 @@ class DotFinder:
         dark = local_darkness(image, self._side, self._blur)
         found = []
         for level in MIN_DARKNESS:
-            dots, rest = self._blobs(dark, level)
+            dots, rest = self._find_blobs(dark, level)
             found.append(dots)
             if rest is None:
                 break
             dark = rest
         return Dots(np.concatenate([d.centres for d in found]), np.concatenate([d.areas for d in found]))
 
-    def _blobs(self, dark: Float32, level: float) -> tuple[Dots, Float32 | None]:
+    def _find_blobs(self, dark: Float32, level: float) -> tuple[Dots, Float32 | None]:
         """The dots among the blobs beyond `level`, and what is left in blobs too large or long to be one."""
         import cv2
 

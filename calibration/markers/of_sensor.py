@@ -38,7 +38,7 @@ def marker_flow(
     return MarkerFlow(markers, rectify.within(region), fine, geometry.camera_distance)
 
 
-def seen_by_dots(
+def view_of_dots(
     pitch: float, untouched: NDArray[np.uint8], grid: CanonicalGrid, region: PictureRegion | None = None
 ) -> tuple[Rectification, MarkerFlow]:
     """Where the gel lies, and its flow, by dots `pitch` [m] apart in a native picture (rows, columns, 3) without

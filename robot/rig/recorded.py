@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from calibration.bundle import read_sensor_model
 from calibration.errors import CalibrationError, error_context
 from calibration.frame_normaliser import FrameNormaliser
-from calibration.markers.flow import MarkersLost, find_markers
+from calibration.markers.flow import TooFewMarkers, find_markers
 from calibration.markers.lattice import NoLattice
 from calibration.normaliser import normaliser_for_camera
 from calibration.reference import StaleReference
@@ -111,7 +111,7 @@ class RecordedSurfaces:
             return frame.surface
         try:
             return normalise(frame, frame.time)
-        except (StaleReference, MarkersLost, ValueError):  # the steps say so
+        except (StaleReference, TooFewMarkers, ValueError):  # the steps say so
             return None
 
 

@@ -7,18 +7,20 @@ from numpy.typing import NDArray
 
 from tacsim.interface import FloatArray
 
-HELD = 0.5  # standard deviation of a free number that is held where it was, as far as the others' intervals go
-UNKNOWN = 100.0  # standard deviation of a free number of which nothing is known
+HELD_DEVIATION = (
+    0.5  # standard deviation of a free number that is held where it was, as far as the others' intervals go
+)
+UNKNOWN_DEVIATION = 100.0  # standard deviation of a free number of which nothing is known
 
 
 def covariance_of(
-    system: FloatArray, sigma: FloatArray, priors: FloatArray, held: NDArray[np.bool_], spread: float = HELD
+    system: FloatArray, sigma: FloatArray, priors: FloatArray, held: NDArray[np.bool_], spread: float = HELD_DEVIATION
 ) -> FloatArray:
     """(n, n) of all unknowns, from the system (m, n), whose last columns have `priors`. Parameters that are held have
     no variance themselves; `spread` is what they may be off, as far as the others go."""
     p, n = len(held), system.shape[1]
     free = np.concatenate([~held, np.ones(n - p, np.bool_)])
-    known = np.concatenate([np.full(p, UNKNOWN), priors])[free]
+    known = np.concatenate([np.full(p, UNKNOWN_DEVIATION), priors])[free]
     rows = system / sigma[:, None]
     scaled = rows[:, free] * known  # by what is known beforehand: then the information is never singular
     found = np.zeros((n, n))

@@ -45,18 +45,18 @@ class Parameter:
         ends = sorted((self.free(self.low), self.free(self.high)))
         return ends[0], ends[1]
 
-    def between(self, free: float, half: float) -> tuple[float, float]:
+    def interval_values(self, free: float, half: float) -> tuple[float, float]:
         """The interval free - half .. free + half as values, within the bounds."""
         low, high = self.bounds
         ends = sorted(self.value(min(max(end, low), high)) for end in (free - half, free + half))
         return ends[0], ends[1]
 
 
-def starts(parameters: Sequence[Parameter]) -> FloatArray:
+def start_values(parameters: Sequence[Parameter]) -> FloatArray:
     """The free numbers at which what is not told stays."""
     return np.array([each.free(each.start) for each in parameters])
 
 
-def begins(parameters: Sequence[Parameter]) -> FloatArray:
+def fit_start_values(parameters: Sequence[Parameter]) -> FloatArray:
     """The free numbers at which a fit begins."""
     return np.array([each.free(each.start if each.begin is None else each.begin) for each in parameters])

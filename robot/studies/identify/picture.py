@@ -22,8 +22,8 @@ def draw(identified: Identified, table: Sequence[tuple[str, str, str]], path: Pa
     shown = identified.presses[:MOST_DRAWN]
     figure = canvas(max(3.4 * len(shown), 9.0), 9.5)
     lines = [f"{name.replace('_', ' ')}   {value}   (95 %: {interval})" for name, value, interval in table]
-    lines += [f"{each.name.replace('_', ' ')}   not told" for each in identified.fit.untold]
-    lines += [f"NOT TO BE USED: {each.words}"[:150] for each in identified.findings]
+    lines += [f"{each.name.replace('_', ' ')}   not told" for each in identified.fit.unidentified]
+    lines += [f"NOT TO BE USED: {each.text}"[:150] for each in identified.findings]
     left = len(identified.presses) - len(shown)
     lines += [f"and {left} more presses"] if left else []
     # no suptitle, for which tight_layout would leave room once more

@@ -15,7 +15,14 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calibration.poses.ball_touch import deviation
-from calibration.poses.robust_fit import BadMeasurements, RobustFit, angular_spread, inverse, perturbed, robust_fit
+from calibration.poses.robust_fit import (
+    BadMeasurements,
+    RobustFit,
+    angular_spread,
+    inverse_frames,
+    perturb_pose,
+    robust_fit,
+)
 from tacsim import pose as se3
 from tacsim.interface import FloatArray, Pose
 
@@ -77,11 +84,11 @@ def fit_hand_eye(poses: Sequence[BoardPose], *, fixed: bool = False, noise: Hand
             f"the flange turns too little: one direction turns by only {np.degrees(spread):.1f} degrees, "
             f"{np.degrees(MIN_SPREAD):.0f} are needed. Turn it about all axes, 30 degrees and more"
         )
-    arm = inverse(flange) if fixed else flange  # arm_i camera board_i = mount, always the same
-    camera, mount = _start(arm, board)
+    arm = inverse_frames(flange) if fixed else flange  # arm_i camera board_i = mount, always the same
+    camera, mount = _closed_form_start(arm, board)
     for _ in range(1 + REWEIGHTINGS):
-        camera, mount, fit = _solved(arm, board, camera, mount, noise, fixed=fixed)
-    predicted = inverse(camera) @ inverse(arm) @ mount
+        camera, mount, fit = _solve_poses(arm, board, camera, mount, noise, fixed=fixed)
+    predicted = inverse_frames(camera) @ inverse_frames(arm) @ mount
     turn = Rotation.from_matrix(predicted[:, :3, :3] @ np.swapaxes(board[:, :3, :3], 1, 2)).magnitude()
     missed = np.linalg.norm(predicted[:, :3, 3] - board[:, :3, 3], axis=1)
     return HandEyeFit(
@@ -95,25 +102,25 @@ def fit_hand_eye(poses: Sequence[BoardPose], *, fixed: bool = False, noise: Hand
     )
 
 
-def _solved(
+def _solve_poses(
     arm: FloatArray, board: FloatArray, camera: FloatArray, mount: FloatArray, noise: HandEyeNoise, *, fixed: bool
 ) -> tuple[FloatArray, FloatArray, RobustFit]:
-    back = inverse(arm)
+    back = inverse_frames(arm)
     seen_turn = np.swapaxes(board[:, :3, :3], 1, 2)
-    whiten = _whitening(camera, mount, arm, noise, fixed=fixed)
+    whiten = _whitening_matrices(camera, mount, arm, noise, fixed=fixed)
 
     def residuals(change: FloatArray) -> FloatArray:
-        predicted = inverse(perturbed(camera, change[:6])) @ back @ perturbed(mount, change[6:])
+        predicted = inverse_frames(perturb_pose(camera, change[:6])) @ back @ perturb_pose(mount, change[6:])
         turn = Rotation.from_matrix(predicted[:, :3, :3] @ seen_turn).as_rotvec()
         missed = np.concatenate([predicted[:, :3, 3] - board[:, :3, 3], turn], axis=1)
         whitened: FloatArray = np.einsum("nij,nj->ni", whiten, missed)
         return whitened
 
     fit = robust_fit(residuals, [np.zeros(12)], "poses")
-    return perturbed(camera, fit.parameters[:6]), perturbed(mount, fit.parameters[6:]), fit
+    return perturb_pose(camera, fit.parameters[:6]), perturb_pose(mount, fit.parameters[6:]), fit
 
 
-def _whitening(
+def _whitening_matrices(
     camera: FloatArray, mount: FloatArray, arm: FloatArray, noise: HandEyeNoise, *, fixed: bool
 ) -> FloatArray:
     """(n, 6, 6) matrices that make a pose's residuals six independent ones of variance 1.
@@ -122,19 +129,23 @@ def _whitening(
     camera) and `after` (the board in the flange): it turns the board, and shifts it by turn x lever.
     """
     count = len(arm)
-    before = inverse(camera) @ inverse(arm) if fixed else np.broadcast_to(inverse(camera), (count, 4, 4))
-    after = np.broadcast_to(mount, (count, 4, 4)) if fixed else inverse(arm) @ mount
+    before = (
+        inverse_frames(camera) @ inverse_frames(arm)
+        if fixed
+        else np.broadcast_to(inverse_frames(camera), (count, 4, 4))
+    )
+    after = np.broadcast_to(mount, (count, 4, 4)) if fixed else inverse_frames(arm) @ mount
     lever, turn = after[:, :3, 3], before[:, :3, :3]
     effect = np.zeros((count, 6, 6))
     effect[:, :3, :3] = effect[:, 3:, 3:] = turn
-    effect[:, :3, 3:] = turn @ -_cross(lever)
+    effect[:, :3, 3:] = turn @ -_cross_matrices(lever)
     robot = np.diag([noise.robot**2] * 3 + [noise.robot_turn**2] * 3)
     seen = np.diag([noise.board**2] * 3 + [noise.board_turn**2] * 3)
     covariance = seen + effect @ robot @ np.swapaxes(effect, 1, 2)
     return np.linalg.inv(np.linalg.cholesky(covariance))
 
 
-def _cross(vectors: FloatArray) -> FloatArray:
+def _cross_matrices(vectors: FloatArray) -> FloatArray:
     """(n, 3, 3) matrices C with C w = v x w."""
     matrix = np.zeros((len(vectors), 3, 3))
     x, y, z = vectors.T
@@ -142,7 +153,7 @@ def _cross(vectors: FloatArray) -> FloatArray:
     return matrix - np.swapaxes(matrix, 1, 2)
 
 
-def _start(arm: FloatArray, board: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _closed_form_start(arm: FloatArray, board: FloatArray) -> tuple[FloatArray, FloatArray]:
     """The closed form's camera and mount from all poses or a subset, whichever the poses agree with most."""
     random = np.random.default_rng(0)
     count = len(arm)
@@ -152,7 +163,7 @@ def _start(arm: FloatArray, board: FloatArray) -> tuple[FloatArray, FloatArray]:
     for some in chosen:
         if angular_spread(arm[some, :3, :3]) < MIN_SPREAD / 2:
             continue
-        camera = closed_form(arm[some], board[some])
+        camera = solve_closed_form(arm[some], board[some])
         mounts = arm @ camera @ board
         between = np.linalg.norm(mounts[:, None, :3, 3] - mounts[None, :, :3, 3], axis=-1)
         between += np.linalg.norm(mounts[:, None, :3, 0] - mounts[None, :, :3, 0], axis=-1)
@@ -162,12 +173,12 @@ def _start(arm: FloatArray, board: FloatArray) -> tuple[FloatArray, FloatArray]:
     return camera, mount
 
 
-def closed_form(arm: FloatArray, board: FloatArray) -> FloatArray:
+def solve_closed_form(arm: FloatArray, board: FloatArray) -> FloatArray:
     """(4, 4) the X for which arm_i X board_i (each (n, 4, 4)) is most nearly the same for all i (Park and Martin 1994):
     rotation first (Procrustes over all pairs), then the shift."""
     pairs = list(combinations(range(len(arm)), 2))
-    a = np.stack([inverse(arm[j]) @ arm[i] for i, j in pairs])
-    b = np.stack([board[j] @ inverse(board[i]) for i, j in pairs])
+    a = np.stack([inverse_frames(arm[j]) @ arm[i] for i, j in pairs])
+    b = np.stack([board[j] @ inverse_frames(board[i]) for i, j in pairs])
     axes_a, axes_b = (Rotation.from_matrix(each[:, :3, :3]).as_rotvec() for each in (a, b))
     u, _, vt = np.linalg.svd(axes_a.T @ axes_b)
     found = np.eye(4)

@@ -69,12 +69,12 @@ def robust_fit(residuals: Residuals, starts: Sequence[FloatArray], what: str) ->
                 f"{int((~keep).sum())} of {len(keep)} {what} disagree with the others: is what should be fixed "
                 "really fixed, do the poses belong to the pictures, and are lengths in metres?"
             )
-        found, before = _plain(residuals, found, keep).x, used
+        found, before = _fit_least_squares(residuals, found, keep).x, used
         used = keep
         if (used == before).all():
             break
     everything = residuals(found)
-    jacobian = np.asarray(_plain(residuals, found, used).jac, dtype=np.float64)
+    jacobian = np.asarray(_fit_least_squares(residuals, found, used).jac, dtype=np.float64)
     information: FloatArray = jacobian.T @ jacobian
     scale = np.sqrt(np.maximum(np.diag(information), 1e-300))  # so that the rank does not depend on units
     if np.linalg.matrix_rank(information / np.outer(scale, scale), tol=1e-10) < len(found):
@@ -97,7 +97,7 @@ def robust_fit(residuals: Residuals, starts: Sequence[FloatArray], what: str) ->
     )
 
 
-def _plain(residuals: Residuals, start: FloatArray, keep: NDArray[np.bool_]) -> Any:
+def _fit_least_squares(residuals: Residuals, start: FloatArray, keep: NDArray[np.bool_]) -> Any:
     def flat(parameters: FloatArray) -> FloatArray:
         return residuals(parameters)[keep].ravel()
 
@@ -116,7 +116,7 @@ def angular_spread(rotations: FloatArray) -> float:
     return float(np.arcsin(np.sqrt(np.clip(least, 0.0, 1.0))))
 
 
-def perturbed(pose: FloatArray, change: FloatArray) -> FloatArray:
+def perturb_pose(pose: FloatArray, change: FloatArray) -> FloatArray:
     """`pose` (4, 4), shifted by change[:3] [m] and turned about its own origin by the rotation vector change[3:]; both
     along the axes of the frame that the pose is given in."""
     result = pose.copy()
@@ -125,7 +125,7 @@ def perturbed(pose: FloatArray, change: FloatArray) -> FloatArray:
     return result
 
 
-def inverse(frames: FloatArray) -> FloatArray:
+def inverse_frames(frames: FloatArray) -> FloatArray:
     """Inverses of rigid transforms (..., 4, 4)."""
     back = np.zeros_like(frames)
     turn = np.swapaxes(frames[..., :3, :3], -1, -2)

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calibration.poses.hand_eye import BoardPose, HandEyeNoise, _whitening, closed_form, fit_hand_eye
-from calibration.poses.robust_fit import BadMeasurements, inverse
+from calibration.poses.hand_eye import BoardPose, HandEyeNoise, _whitening_matrices, fit_hand_eye, solve_closed_form
+from calibration.poses.robust_fit import BadMeasurements, inverse_frames
 from tacsim import pose as se3
 from tacsim.interface import Pose
 from tests.calibration.touches import posed
@@ -75,12 +75,12 @@ def test_weights_know_the_lever_of_a_robots_rotation(fixed: bool) -> None:
     stated = HandEyeNoise(board=0.3e-3, board_turn=np.radians(0.05), robot_turn=np.radians(0.2))
     seen = made_sights(np.random.default_rng(5), 900, fixed=fixed, stated=stated)
     flange, board = (np.stack([se3.to_matrix(getattr(each, name)) for each in seen]) for name in ("flange", "board"))
-    arm = inverse(flange) if fixed else flange
+    arm = inverse_frames(flange) if fixed else flange
     camera, mount = se3.to_matrix(CAMERA), se3.to_matrix(BOARD)
-    predicted = inverse(camera) @ inverse(arm) @ mount
+    predicted = inverse_frames(camera) @ inverse_frames(arm) @ mount
     turn = Rotation.from_matrix(predicted[:, :3, :3] @ np.swapaxes(board[:, :3, :3], 1, 2)).as_rotvec()
     missed = np.concatenate([predicted[:, :3, 3] - board[:, :3, 3], turn], axis=1)
-    even = np.einsum("nij,nj->ni", _whitening(camera, mount, arm, stated, fixed=fixed), missed)
+    even = np.einsum("nij,nj->ni", _whitening_matrices(camera, mount, arm, stated, fixed=fixed), missed)
     np.testing.assert_allclose(np.cov(even.T), np.eye(6), atol=0.25)  # standard deviation of an entry: 0.05
 
 
@@ -119,6 +119,6 @@ def test_the_closed_form_is_that_of_opencv() -> None:
         list(arm[:, :3, :3]), list(arm[:, :3, 3]), list(board[:, :3, :3]), list(board[:, :3, 3]),
         method=cv2.CALIB_HAND_EYE_PARK,
     )  # fmt: skip
-    found = closed_form(arm, board)
+    found = solve_closed_form(arm, board)
     np.testing.assert_allclose(found[:3, :3], turn, atol=2e-4)
     np.testing.assert_allclose(found[:3, 3], np.ravel(shift), atol=2e-4)

@@ -135,7 +135,7 @@ def pictures(image: Image, real: Image, reference: Image, mask: Mask) -> dict[st
         "null_grey": metrics.mean_absolute_error(reference, real, mask),
         "ssim": metrics.structural_similarity(image, real, mask),
         "null_ssim": metrics.structural_similarity(reference, real, mask),
-        "ncc": metrics.correlation(image - still, real - still, mask),
+        "ncc": metrics.image_correlation(image - still, real - still, mask),
     }
 
 

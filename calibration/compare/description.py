@@ -9,12 +9,12 @@ from calibration.compare.compare import Comparison
 CLOSE_CORRELATION = 0.95  # of the change of colour in contact, from which two sources look alike ...
 CLOSE_SHARE = 0.25  # ... if their error there also is no larger share of what a picture without contact would score
 
-SAID = {"simulated": "the simulation", "real": "the real sensor"}
+SIDE_NAMES = {"simulated": "the simulation", "real": "the real sensor"}
 
 
-def judgement(comparison: Comparison) -> str:
+def describe_comparison(comparison: Comparison) -> str:
     """Whether A looks like B in contact, and by how many grey levels and degrees."""
-    a, b = (SAID.get(name, name) for name in comparison.names)
+    a, b = (SIDE_NAMES.get(name, name) for name in comparison.names)
     error, alike = comparison.overall["contact_mae"], comparison.overall["contact_ncc"].mean
     if math.isnan(error.mean):
         return "No pair shows contact, so nothing can be judged."

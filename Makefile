@@ -23,7 +23,7 @@ PLUGINS := .venv-lerobot/installed
 
 help:
 	@echo "make run          install, then squeeze plasticine between two tactile sensors   (ARGS=\"--task reposition\")"
-	@echo "make test         install with dev extras, then lint, types, import contract, tests   (ARGS=\"-k rig\")"
+	@echo "make test         install with dev extras, then lint, types, import contract, vocabulary, tests   (ARGS=\"-k rig\")"
 	@echo "make check        the same without the tests"
 	@echo "make test-all     make test, then make test-deep: the long runs"
 	@echo "make test-gpu     the physics tests and the benchmark on CUDA, for docs/benchmarks.md   (without CUDA: says so, and fails)"
@@ -43,6 +43,7 @@ check: $(DEV)
 	@$(BIN)/mypy
 	@$(BIN)/mypy plugins/*/lerobot_*.py
 	@$(BIN)/lint-imports --no-logo
+	@$(BIN)/python tools/vocabulary.py
 
 # Two processes; the tests of a file stay in one of them, for what a module opens is opened once.
 PARALLEL := -n 2 --dist loadfile

@@ -17,7 +17,7 @@ from tacsim.gym.env import TacsimEnv  # registers
 from tacsim.gym.vector import TacsimVectorEnv
 from tacsim.interface import FloatArray
 from tacsim.models.sensor import CanonicalGrid
-from tacsim.tasks.task import vector_of
+from tacsim.tasks.task import vector_of_action
 
 NAMES = {"squeeze": "Squeeze", "reposition": "Reposition", "knead": "Knead"}
 TOGETHER, EVERY = 16, 10  # environments of a batch; steps from one comparison to the next
@@ -88,7 +88,7 @@ def _episodes(envs: TacsimVectorEnv, steps: int, random: np.random.Generator) ->
                 vector[:2] *= 0.2
             if number % 2:
                 poses = {name: arm.pose for name, arm in observation.arms.items()}
-                vector = vector_of(scripted[number](observation), env.task.axes, env.task.config.max_step, poses)
+                vector = vector_of_action(scripted[number](observation), env.task.axes, env.task.config.max_step, poses)
             actions.append(vector.astype(np.float32))
         _, _, terminated, truncated, _ = envs.step(np.array(actions))
         ended = terminated | truncated

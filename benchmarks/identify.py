@@ -25,10 +25,10 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from calibration.materials.checks import findings
-from calibration.materials.estimate import SETTLED_ERROR, UNTOLD, estimate
-from calibration.materials.fit import Fit, Point, Priors, Signals, covariance_of, starts
-from calibration.materials.presses import Noise, Press, gathered, signals_of, thinned
+from calibration.materials.checks import find_contradictions
+from calibration.materials.estimate import MAX_IDENTIFIED_HALF_INTERVAL, SETTLING_ERROR, estimate_materials
+from calibration.materials.fit import Fit, Point, Priors, Signals, covariance_of, start_values
+from calibration.materials.presses import Noise, Press, downsample_press, merge_repeated_readings, signals_of
 from robot.studies.identify.identify import MOMENTS, Identified, Kind, identify, parameters_of
 from robot.studies.identify.motions import motions
 from robot.studies.identify.recordings import Recordings, find_recordings, read_all
@@ -125,10 +125,10 @@ def refitted(found: Identified, values: FloatArray, priors: Priors) -> Fit:
         ]
 
     signals = replace(found.signals, values=values, noise=fit.sigma)
-    again = estimate([predict], signals, [replace(each, start=fit.value(each.name)) for each in fit.parameters],
-                     priors, 0.0)  # fmt: skip
+    parameters = [replace(each, start=fit.value(each.name)) for each in fit.parameters]
+    again = estimate_materials([predict], signals, parameters, priors, 0.0)
     kept = replace(again, mesh_shift=fit.mesh_shift, settled_shift=fit.settled_shift, runs=fit.runs)
-    return kept.with_sigma(again.sigma).widened(values - again.predicted, signals.series)
+    return kept.with_sigma(again.sigma).widen_intervals(values - again.predicted, signals.series)
 
 
 def redrawn(found: Identified, values: FloatArray, seed: int, priors: Priors) -> tuple[Fit, Signals]:
@@ -165,7 +165,7 @@ def measured(kind: Kind, number: int, folder: Path, draws: int, force_noise: flo
     spoilt = [_spoilt(press, force_noise, random) for press in presses]
     found = identify(kind, scene, recordings, spoilt, noise, priors)
     seconds = time.perf_counter() - began
-    clean = signals_of([thinned(gathered(press), MOMENTS) for press in presses], noise).values
+    clean = signals_of([downsample_press(merge_repeated_readings(press), MOMENTS) for press in presses], noise).values
     force = found.signals.force[found.signals.channel]
     alone = forces_alone(found)
     alone = replace(alone, fit=refitted(alone, alone.signals.values, priors))
@@ -254,14 +254,14 @@ def row(
     fit, names = found.fit, tuple(press.name for press in found.presses)
     parameters: dict[str, tuple[float, ...] | None] = {each.name: None for each in fit.parameters}
     again = [redrawn(found, clean, k, priors) for k in range(draws)]
-    for each in fit.told:
+    for each in fit.identified:
         one, value, true = each.name, fit.value(each.name), truth[each.name]
-        ends = [fit.interval(one) for fit, _ in again if one in {told.name for told in fit.told}]
+        ends = [fit.interval(one) for fit, _ in again if one in {told.name for told in fit.identified}]
         held = sum(low <= true <= high for low, high in ends)
         parameters[one] = (value / true - 1, *(end / true - 1 for end in fit.interval(one)), held, len(ends))
 
     def noticed_in(drawn: tuple[Fit, Signals]) -> bool:
-        return bool(findings(replace(drawn[0], sigma=found.checked.sigma), drawn[1], names, found.by_size))
+        return bool(find_contradictions(replace(drawn[0], sigma=found.checked.sigma), drawn[1], names, found.by_size))
 
     noticed = {"nothing wrong": sum(map(noticed_in, again))}
     for what, change in _faults(found).items():
@@ -301,10 +301,10 @@ def poisson(force_noise: float, heights: bool, balls: tuple[float, ...]) -> str:
         presses.append(Press("press", poses, readings, depths * 0, np.ones(len(depths), np.int64), radius * 1e-3))
     seen = {"lower": Seen(CanonicalGrid(), None, np.ones((64, 64), np.bool_))}
     simulation = Simulation(scene, tuple(parameters), tuple(presses), seen)
-    [values] = simulation([Point(starts(parameters), np.zeros(len(balls)))])
+    [values] = simulation([Point(start_values(parameters), np.zeros(len(balls)))])
     signals = replace(signals_of(presses, Noise(force_noise)), values=values)
-    fit = estimate([simulation], signals, parameters, Priors(PLACE, 10 * force_noise), SETTLED_ERROR)
-    if any(each.name == "poisson_ratio" for each in fit.untold):
+    fit = estimate_materials([simulation], signals, parameters, Priors(PLACE, 10 * force_noise), SETTLING_ERROR)
+    if any(each.name == "poisson_ratio" for each in fit.unidentified):
         return "not told"
     return "{:.3f} to {:.3f}".format(*fit.interval("poisson_ratio"))
 
@@ -317,7 +317,7 @@ def planned(scene: Scene, motion: str, moments: int) -> Press:
     count = len(upper)
     readings = {f"{gel}.{force}": np.zeros(count) for gel in ("lower", "upper") for force in ("fx", "fz")}
     poses = {"lower": (Pose(),) * count, "upper": tuple(upper)}
-    return thinned(Press(motion, poses, readings, np.arange(float(count)), np.ones(count, np.int64)), moments)
+    return downsample_press(Press(motion, poses, readings, np.arange(float(count)), np.ones(count, np.int64)), moments)
 
 
 def friction(motion: str, sensors: tuple[float, ...] = (0.02, 0.2, 1.0)) -> list[str]:
@@ -338,9 +338,11 @@ def friction(motion: str, sensors: tuple[float, ...] = (0.02, 0.2, 1.0)) -> list
         system, cells = np.column_stack([*columns, signals.zeros()]), []
         for noise in sensors:
             priors = np.array([PLACE, *[10 * noise] * 4])
-            known = covariance_of(system, np.hypot(noise, SETTLED_ERROR * base), priors, np.zeros(2, np.bool_))
+            known = covariance_of(system, np.hypot(noise, SETTLING_ERROR * base), priors, np.zeros(2, np.bool_))
             halves = 1.96 * np.sqrt(np.diag(known))[:2]
-            cells.append(" / ".join("no" if half > UNTOLD else f"{100 * half:.0f} %" for half in halves))
+            cells.append(
+                " / ".join("no" if half > MAX_IDENTIFIED_HALF_INTERVAL else f"{100 * half:.0f} %" for half in halves)
+            )
         apart = np.degrees(abs(np.arctan(lower) - np.arctan(upper_one)))
         lines.append(f"| {motion} | {lower:g} / {upper_one:g} | {apart:.0f} | {' | '.join(cells)} |")
     return lines

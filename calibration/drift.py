@@ -11,7 +11,7 @@ from tacsim.interface import Float32, Mask
 
 UNTOUCHED_CHANGE = 0.08  # an untouched pixel changes less than this, without drift [-]
 MIN_UNTOUCHED_SHARE = 0.15  # of the view, to measure a drift
-STRIDE = 5  # of the pixels from which it is measured
+PIXEL_STRIDE = 5  # of the pixels from which it is measured
 # A contact in a picture that should show none: a patch that differs from a known picture ...
 CONTACT_CHANGE = 0.06  # by so much, without drift and noise [-]
 CONTACT_BLUR = 1.5  # [px of the canonical image]
@@ -30,12 +30,12 @@ class Drift:
         return Drift(self.weights * factor, self.measured)
 
 
-def size_of(change: Float32) -> float:
+def max_mean_change(change: Float32) -> float:
     """Mean over the gel of changes of colour (n, 3), in the channel that changed most [-]."""
     return float(np.abs(change).mean(axis=0).max())
 
 
-def without_drift(change: NDArray[np.floating], level: NDArray[np.floating]) -> Float32:
+def subtract_drift(change: NDArray[np.floating], level: NDArray[np.floating]) -> Float32:
     """A change of colour (H, W, 3) [grey levels] since a picture whose mean colour is `level` (3,), its drift taken
     off; as it is, where too little is untouched to measure one."""
     scale = np.maximum(np.asarray(level, dtype=np.float32), 1.0)
@@ -53,13 +53,13 @@ class DriftFinder:
 
     def __init__(self, shape: tuple[int, int]) -> None:
         self._u, self._v = (np.linspace(-1, 1, count, dtype=np.float32) for count in reversed(shape))
-        u, v = np.meshgrid(self._u[::STRIDE], self._v[::STRIDE])
+        u, v = np.meshgrid(self._u[::PIXEL_STRIDE], self._v[::PIXEL_STRIDE])
         self._few = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1).reshape(-1, 6)
 
     def __call__(self, planes: Float32, hidden: Mask) -> Drift:
         """The drift in relative changes (3, H, W), without those `hidden` (H, W)."""
-        seen = planes[:, ::STRIDE, ::STRIDE].reshape(3, -1)
-        on_gel = ~hidden[::STRIDE, ::STRIDE].ravel()
+        seen = planes[:, ::PIXEL_STRIDE, ::PIXEL_STRIDE].reshape(3, -1)
+        on_gel = ~hidden[::PIXEL_STRIDE, ::PIXEL_STRIDE].ravel()
         weights = np.zeros((6, 3), dtype=np.float32)
         if on_gel.any():
             weights[0] = np.median(seen[:, on_gel], axis=1)
@@ -82,7 +82,7 @@ class DriftFinder:
             plane -= (one + v * self._v + vv * self._v * self._v)[:, None] + (u * self._u + uu * self._u * self._u)
             plane -= (uv * self._v)[:, None] * self._u
 
-    def part(self, drift: Drift, corner: tuple[int, int], shape: tuple[int, int]) -> Float32:
+    def drift_on_part(self, drift: Drift, corner: tuple[int, int], shape: tuple[int, int]) -> Float32:
         """(h, w, 3) the drift on pixels of `shape` (h, w), of which the first lies at row and column `corner` of the
         view; they may reach beyond it [-]."""
         v, u = (
@@ -97,7 +97,7 @@ class DriftFinder:
         change += (v * v)[:, None] * np.tile(by_vv, shape[1])
         return change.reshape(*shape, 3)
 
-    def at(self, drift: Drift) -> Float32:
+    def drift_at_stride(self, drift: Drift) -> Float32:
         """(n, 3) the drift at every STRIDE-th row and column [-]."""
         return np.asarray(np.einsum("ni,ic->nc", self._few, drift.weights), dtype=np.float32)
 

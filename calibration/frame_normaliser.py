@@ -13,23 +13,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.drift import MIN_CONTACT_AREA, DriftFinder, contact_area, size_of
+from calibration.drift import MIN_CONTACT_AREA, DriftFinder, contact_area, max_mean_change
 from calibration.height.surface_finder import SurfaceFinder, canonical_part
 from calibration.lens.rectification import (
     Rectification,
-    seen_box,
+    visible_box,
 )
 from calibration.markers.flow import MarkerFlow, require_no_markers
 from calibration.reference import (
-    LOST_COLOUR,
-    LOST_SLOPE,
+    MAX_COLOUR_CHANGE,
+    MAX_SLOPE_CHANGE,
     STALE_COLOUR,
     STALE_SLOPE,
     Reference,
     StaleReference,
     UnusableReference,
-    channels_swapped,
-    exchanged,
+    is_channel_order_swapped,
+    is_contact_image_swapped,
     make_reference,
 )
 from tacsim.control.contact_signal import CONTACT_DIFFERENCE, CONTACT_HEIGHT
@@ -68,7 +68,7 @@ class FrameNormaliser:
         the native picture (rows, columns, 3) of the first reference, whose dots say how large the gel is; it raises
         UnusableReference where there are none."""
         self._grid, self._find, self._dots = grid, find, dots
-        self._see_by(rectify, markers)
+        self._set_view(rectify, markers)
         self._find_drift = DriftFinder(self._on_image.shape) if drifts and find is None else None
         self._untouched = untouched
         # Why the reference may show a contact, in words; None: it does not, or there is no picture to compare it with
@@ -79,13 +79,13 @@ class FrameNormaliser:
         self.finds_height, self.finds_flow = find is not None, markers is not None or dots is not None
         # Share of the pixels of the last picture whose colour lies beyond the calibrated slopes: they get the nearest
         # calibrated slope. 0 where nothing had to be found
-        self.beyond_range = 0.0
+        self.out_of_range_share = 0.0
         # Relative change of the untouched gel's colour since the reference [-], in the last picture with enough of it;
         # and the mean slope [degrees] that this drift looks like. None before such a picture; no slope without height
         self.drift: float | None = None
         self.drift_slope: float | None = None
 
-    def _see_by(self, rectify: Rectification, markers: MarkerFlow | None) -> None:
+    def _set_view(self, rectify: Rectification, markers: MarkerFlow | None) -> None:
         grid = self._grid
         shape = (grid.rows * grid.image_scale, grid.columns * grid.image_scale)
         spare = [there - wanted for there, wanted in zip(rectify.valid.shape, shape, strict=True)]
@@ -95,14 +95,14 @@ class FrameNormaliser:
         self._rectify, self._markers = rectify, markers
         self._on_image: NDArray[np.bool_] = canonical_part(rectify.valid, grid)
         self._off_image = np.nonzero(~self._on_image)
-        self._valid: NDArray[np.bool_] = np.asarray(_cells(self._on_image, grid).all(axis=(1, 3)), dtype=np.bool_)
+        self._valid: NDArray[np.bool_] = np.asarray(_cell_view(self._on_image, grid).all(axis=(1, 3)), dtype=np.bool_)
         self._valid.flags.writeable = False
 
     @property
-    def shown(self) -> tuple[float, float]:
+    def visible_size(self) -> tuple[float, float]:
         """x, y of the gel that the native picture shows, within its region [m]: the maps may show the middle alone."""
         valid, pitch = self._rectify.valid, self._grid.pitch / self._grid.image_scale
-        down, across = (side.stop - side.start for side in seen_box(valid))
+        down, across = (side.stop - side.start for side in visible_box(valid))
         x, y = (
             # what reaches the border of the view goes on beyond it; what ends before is all that a region lets be seen
             size if (there + 2) * pitch >= min(size, whole * pitch) else there * pitch
@@ -116,21 +116,21 @@ class FrameNormaliser:
         return (self.drift or 0.0) > STALE_COLOUR or (self.drift_slope or 0.0) > STALE_SLOPE
 
     @property
-    def markers_seen(self) -> NDArray[np.bool_] | None:
+    def visible_markers(self) -> NDArray[np.bool_] | None:
         """(rows, columns) markers that were seen in the last picture in which flow was sought; that of the others is
         the mean of their neighbours'. None for a sensor whose flow is not found in pictures."""
-        return None if self._markers is None else self._markers.seen
+        return None if self._markers is None else self._markers.visible
 
     @property
-    def kept(self) -> float:
+    def visible_marker_share(self) -> float:
         """Share of the reference's markers seen in that picture. 1 where nothing had to be found."""
-        return 1.0 if self._markers is None else self._markers.kept
+        return 1.0 if self._markers is None else self._markers.visible_share
 
     def take_reference(self, frame: TactileFrame) -> None:
         """Makes `frame`, taken without contact, the reference I0, and its markers' places their rest. Raises
         UnusableReference (the old one then stays), or ValueError for a frame of another shape."""
         if self._dots is not None and self._markers is None:
-            self._see_by(*self._dots(frame.image))
+            self._set_view(*self._dots(frame.image))
         rectified = self._rectify(frame.image)
         # The mean is that of the canonical image's pixels, so that what a policy sees does not depend on whether height
         # is found.
@@ -139,12 +139,12 @@ class FrameNormaliser:
         # Dots are found as well beside glare, in a recording: a live arm stops by the colour of contacts, too.
         colour = self._find is not None or self._markers is None or self._dots is not None
         reference = make_reference(rectified, self._rectify.valid, measured, colour=colour)
-        if self._untouched is not None and exchanged(rectified, self._untouched, self._rectify.valid):
+        if self._untouched is not None and is_channel_order_swapped(rectified, self._untouched, self._rectify.valid):
             raise UnusableReference(
                 "red and blue are exchanged: the gel looks as in its calibration only with the channels in the other "
                 "order; give pictures in the order in which they were calibrated (this program's is RGB)"
             )
-        self._doubt_reference(reference)
+        self._warn_of_contact(reference)
         if self._markers is not None:
             self._markers.take_reference(frame.image, frame.index)
         elif self._find is not None:
@@ -152,7 +152,7 @@ class FrameNormaliser:
         self.reference = reference
         self.drift_slope = self.drift = None
 
-    def _doubt_reference(self, reference: Reference) -> None:
+    def _warn_of_contact(self, reference: Reference) -> None:
         """Compares a new reference with the bundle's picture, and warns where it shows a contact."""
         self.reference_doubt = None
         if self._untouched is None:
@@ -161,7 +161,7 @@ class FrameNormaliser:
         known = self._untouched / np.maximum(self._untouched[valid].mean(axis=0), 1.0)
         dark = np.zeros_like(valid)
         if self._markers is not None:  # printed dots need not lie where they lay
-            dark = _near_dots(reference.relative) | _near_dots(known)
+            dark = _dot_mask(reference.relative) | _dot_mask(known)
         area = contact_area(reference.relative - known, ~valid | dark, self._grid.pitch / self._grid.image_scale)
         if area > MIN_CONTACT_AREA:
             self.reference_doubt = (
@@ -172,16 +172,16 @@ class FrameNormaliser:
 
     def diagnostics(self) -> dict[str, float]:
         """Quality of the last observation, where it was found in a picture, as far as it is known: `beyond`
-        (`beyond_range`), `drift`, `background` (`drift_slope`), `kept`, `stale` (0 or 1); and `touched_reference` (1)
-        where the reference shows a contact."""
+        (`out_of_range_share`), `drift`, `background` (`drift_slope`), `visible_share`, `stale` (0 or 1);
+        and `touched_reference` (1) where the reference shows a contact."""
         if not self._sought:
             return {}
         known = {
             "stale": float(self.stale),
-            "beyond": self.beyond_range if self.finds_height else None,
+            "beyond": self.out_of_range_share if self.finds_height else None,
             "drift": self.drift,
             "background": self.drift_slope,
-            "kept": self.kept if self.finds_flow else None,
+            "kept": self.visible_marker_share if self.finds_flow else None,
             "touched_reference": None if self.reference_doubt is None else 1.0,
         }
         return {name: value for name, value in known.items() if value is not None}
@@ -197,14 +197,14 @@ class FrameNormaliser:
         """
         if self.reference is None:
             raise NoReference("no reference yet: call take_reference with a frame without contact (Rig.reset does)")
-        self.beyond_range, self._sought = 0.0, False
-        seen = partial(_difference, self.reference, self._rectify, frame)
+        self.out_of_range_share, self._sought = 0.0, False
+        difference = partial(_relative_change, self.reference, self._rectify, frame)
         if frame.surface is None:
-            return self._found(frame, seen(), now)
+            return self._observation_from_image(frame, difference(), now)
         surface = frame.surface
-        self._check(surface)
+        self._update_stale(surface)
         return TactileObservation(
-            image=lambda: _byte_image(canonical_part(seen(), self._grid)),
+            image=lambda: _encode_image(canonical_part(difference(), self._grid)),
             gradient=surface.gradient,
             height=surface.height,
             contact=(surface.height > CONTACT_HEIGHT) & self._valid,
@@ -215,18 +215,20 @@ class FrameNormaliser:
             picture=lambda: frame.image,
         )
 
-    def _found(self, frame: TactileFrame, seen: NDArray[np.float32], now: float) -> TactileObservation:
+    def _observation_from_image(
+        self, frame: TactileFrame, difference: NDArray[np.float32], now: float
+    ) -> TactileObservation:
         """All of it from the picture; seen: its difference from the reference."""
-        change: NDArray[np.float32] = canonical_part(seen, self._grid)
-        height, gradient, flow, drift = self._surface(frame, seen)
+        change: NDArray[np.float32] = canonical_part(difference, self._grid)
+        height, gradient, flow, drift = self._find_surface(frame, difference)
         if drift is not None:
             change = np.subtract(change, drift, out=drift)
             change[self._off_image] = 0.0
         return TactileObservation(
-            image=_byte_image(change),
+            image=_encode_image(change),
             gradient=gradient,
             height=height,
-            contact=self._contact(change) if height is None else (height > CONTACT_HEIGHT) & self._valid,
+            contact=self._contact_mask(change) if height is None else (height > CONTACT_HEIGHT) & self._valid,
             valid=self._valid,
             flow=flow,
             time=frame.time,
@@ -234,45 +236,45 @@ class FrameNormaliser:
             picture=frame.image,
         )
 
-    def _surface(self, frame: TactileFrame, change: NDArray[np.float32]) -> tuple[NDArray[np.float32] | None, ...]:
+    def _find_surface(self, frame: TactileFrame, change: NDArray[np.float32]) -> tuple[NDArray[np.float32] | None, ...]:
         """Height, gradient and flow, and the drift that is to be taken off the canonical image."""
         height = gradient = flow = removed = None
         self._sought = any(part is not None for part in (self._find, self._markers, self._find_drift))
         if self._find_drift is not None:
             drift = self._find_drift(np.ascontiguousarray(np.moveaxis(change, -1, 0)), ~self._on_image)
             if drift.measured:
-                self.drift = size_of(self._find_drift.at(drift))
-                removed = self._find_drift.part(drift, (0, 0), self._on_image.shape)
+                self.drift = max_mean_change(self._find_drift.drift_at_stride(drift))
+                removed = self._find_drift.drift_on_part(drift, (0, 0), self._on_image.shape)
         if self._find is not None:
             assert self.reference is not None
             found = self._find(change, self.reference.relative)
-            self.beyond_range = found.beyond_range
+            self.out_of_range_share = found.out_of_range_share
             if found.drift is not None:
                 self.drift, self.drift_slope = found.drift, found.drift_slope
             height, gradient, removed = found.height, found.gradient, found.removed_drift
         if self.stale:
-            self._require_order(change)
-        self._require_light()
+            self._require_channel_order(change)
+        self._require_stable_light()
         if self._markers is not None:
             deep = None if height is None else (height, canonical_cells(self._grid))
             flow = self._markers(frame.image, frame.index, deep)
         return height, gradient, flow, removed
 
-    def _require_order(self, change: NDArray[np.float32]) -> None:
+    def _require_channel_order(self, change: NDArray[np.float32]) -> None:
         """Raises StaleReference for a picture with red and blue swapped, by its change (H, W, 3) from the reference."""
         assert self.reference is not None
         image = self.reference.image + change * self.reference.mean
-        if channels_swapped(image, self.reference.image, self.reference.valid):
+        if is_contact_image_swapped(image, self.reference.image, self.reference.valid):
             raise StaleReference(
                 "red and blue are swapped: the untouched gel looks as in its reference only with the channels in the "
                 "other order; give frames and reference in one order (this program's is RGB)"
             )
 
-    def _require_light(self) -> None:
+    def _require_stable_light(self) -> None:
         """Raises StaleReference."""
         for measured, limit, words in (
-            (self.drift_slope, LOST_SLOPE, "slopes of {:.0f} degrees"),
-            (self.drift, LOST_COLOUR, "{:.0%} of its colour"),
+            (self.drift_slope, MAX_SLOPE_CHANGE, "slopes of {:.0f} degrees"),
+            (self.drift, MAX_COLOUR_CHANGE, "{:.0%} of its colour"),
         ):
             if measured is not None and measured > limit:
                 raise StaleReference(
@@ -280,16 +282,16 @@ class FrameNormaliser:
                     "it. Is a lamp out, or the exposure another? If not, take a fresh reference (Rig.reset does)"
                 )
 
-    def _contact(self, change: NDArray[np.float32]) -> NDArray[np.bool_]:
+    def _contact_mask(self, change: NDArray[np.float32]) -> NDArray[np.bool_]:
         """(h, w) where the colour, averaged over a cell and its neighbours, differs from the reference: not in the
         flat middle of a contact, which has the colour of the untouched gel."""
         import cv2
 
-        cell = _cells(change, self._grid).mean(axis=(1, 3), dtype=np.float32)
+        cell = _cell_view(change, self._grid).mean(axis=(1, 3), dtype=np.float32)
         calm = cv2.blur(cell, (3, 3))
         return np.asarray(np.abs(calm).max(axis=2) > CONTACT_DIFFERENCE, dtype=np.bool_) & self._valid
 
-    def _check(self, surface: SurfaceMap) -> None:
+    def _update_stale(self, surface: SurfaceMap) -> None:
         shape = (self._grid.rows, self._grid.columns)
         if surface.height.shape != shape or surface.gradient.shape != (*shape, 2):
             raise ValueError(
@@ -298,12 +300,12 @@ class FrameNormaliser:
             )
 
 
-def _difference(reference: Reference, rectify: Rectification, frame: TactileFrame) -> NDArray[np.float32]:
+def _relative_change(reference: Reference, rectify: Rectification, frame: TactileFrame) -> NDArray[np.float32]:
     """(H, W, 3) relative change of the rectified picture."""
     return reference.difference(rectify(frame.image))
 
 
-def _byte_image(change: NDArray[np.float32]) -> NDArray[np.uint8]:
+def _encode_image(change: NDArray[np.float32]) -> NDArray[np.uint8]:
     """(H, W, 3) clip(128 + 128 change), rounded; no change is exactly 128."""
     import cv2
 
@@ -311,7 +313,7 @@ def _byte_image(change: NDArray[np.float32]) -> NDArray[np.uint8]:
     return np.asarray(cv2.convertScaleAbs(np.maximum(change, np.float32(-1.0)), alpha=128.0, beta=128.0))
 
 
-def _near_dots(relative: NDArray[np.float32]) -> NDArray[np.bool_]:
+def _dot_mask(relative: NDArray[np.float32]) -> NDArray[np.bool_]:
     """(H, W) pixels of an image (H, W, 3), relative to its mean, that printed dots darken, and those beside."""
     import cv2
 
@@ -319,7 +321,7 @@ def _near_dots(relative: NDArray[np.float32]) -> NDArray[np.bool_]:
     return np.asarray(cv2.dilate(dark, np.ones((5, 5), dtype=np.uint8)), dtype=np.bool_)
 
 
-def _cells(pixels: NDArray[Any], grid: CanonicalGrid) -> NDArray[Any]:
+def _cell_view(pixels: NDArray[Any], grid: CanonicalGrid) -> NDArray[Any]:
     """(h, scale, w, scale, ...) view of canonical pixels (H, W, ...), cell by cell."""
     scale = grid.image_scale
     return pixels.reshape(grid.rows, scale, grid.columns, scale, *pixels.shape[2:])

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from calibration.drift import contact_area
 from calibration.errors import BadFrames
-from calibration.lens.rectification import from_corners, region_mask, to_metric
+from calibration.lens.rectification import metric_rectification, rectification_of_corners, region_mask
 from calibration.lens.view import BadCorners, Corners, GelView
-from calibration.reference import SATURATED, channels_swapped
+from calibration.reference import SATURATED, is_contact_image_swapped
 from tacsim.interface import Image, SurfaceMap
 from tacsim.models.geometry import PictureRegion
 from tacsim.optics.grid import PixelGrid
@@ -62,7 +62,7 @@ class FrameSet:
     untouched: tuple[Frame, ...] = ()  # more frames without contact
     estimated: bool = False  # the reference is the median of `frames`
     simulated: bool = False  # known to be rendered, not photographed
-    placed: bool = False  # made in the pixels of the frames that it is compared with, under their names
+    same_pixels: bool = False  # made in the pixels of the frames that it is compared with, under their names
     notes: tuple[str, ...] = ()  # what there is to know of it, in words
 
     @property
@@ -89,11 +89,13 @@ def read_frame_set(path: Path, reference: Path | None = None, sensor: str = "") 
             meta = episode_meta(path)
             name = only_or_named(list(meta.spec.sensors), sensor, path, "sensor")
             recorded = (frame for frame, _ in episode_frames(path, name))
-            frames = _limited(path, (Frame(f"step {k}", each.image, each.surface) for k, each in enumerate(recorded)))
-            return _frame_set(path, frames, reference, reference_image(meta.attachments, name))
+            frames = _read_limited(
+                path, (Frame(f"step {k}", each.image, each.surface) for k, each in enumerate(recorded))
+            )
+            return _make_frame_set(path, frames, reference, reference_image(meta.attachments, name))
         if path.is_file() and path.suffix.lower() in VIDEOS:
-            frames = _limited(path, (Frame(f"frame {k}", image) for k, image in enumerate(video_images(path))))
-            return _frame_set(path, frames, reference, None)
+            frames = _read_limited(path, (Frame(f"frame {k}", image) for k, image in enumerate(video_images(path))))
+            return _make_frame_set(path, frames, reference, None)
         raise unknown_source(path)
     except EpisodeError as error:
         raise BadFrames(str(error)) from None
@@ -106,19 +108,19 @@ def read_folder(folder: Path, reference: Path | None = None, max_frames: int = M
         raise BadFrames(f"{folder} is no folder; name the folder that holds the frames")
     try:
         paths = list_pictures(folder)
-        untouched = untouched_among(paths)
+        untouched = select_untouched(paths)
         if reference is None and untouched:
             reference = untouched[0]
         given = None if reference is None else reference.resolve()
         untouched = [path for path in untouched if path.resolve() != given]
         others = [path for path in paths if path.resolve() != given and path not in untouched]
-        frames = _read(folder, others, max_frames)
-        return _frame_set(folder, frames, reference, None, tuple(_read(folder, untouched, max_frames)))
+        frames = _read_images(folder, others, max_frames)
+        return _make_frame_set(folder, frames, reference, None, tuple(_read_images(folder, untouched, max_frames)))
     except EpisodeError as error:
         raise BadFrames(str(error)) from None
 
 
-def untouched_among(paths: Iterable[Path]) -> list[Path]:
+def select_untouched(paths: Iterable[Path]) -> list[Path]:
     """Pictures without contact by their names: background.png, background_2.png, ...; frame0.png only with just this
     name. In the order of UNTOUCHED_NAMES, those with a number last."""
     rank = {name: place for place, name in enumerate(UNTOUCHED_NAMES)}
@@ -143,13 +145,13 @@ def frame_warnings(
             found.append(f"saturated: {saturated:.0%} of the contact")
     change = (image - reference)[~contact]
     if len(change) and (drift := float(np.abs(np.median(change, axis=0)).max())) > STALE_CHANGE:
-        if channels_swapped(image.astype(np.float32), reference.astype(np.float32), ~contact):
+        if is_contact_image_swapped(image.astype(np.float32), reference.astype(np.float32), ~contact):
             return [*found, "red and blue are swapped: the untouched gel is that of the reference in the other order"]
         found.append(f"stale reference: the untouched gel has changed by {drift:.0f} grey levels")
     return found
 
 
-def touched_untouched(of: FrameSet) -> list[str]:
+def find_touched_references(of: FrameSet) -> list[str]:
     """In words, which of the pictures without contact differ from the reference as a contact does: one of the two shows
     one. Nothing is found where the reference is the only one."""
     mean = np.maximum(of.reference.mean(axis=(0, 1)), 1.0).astype(np.float32)
@@ -164,7 +166,7 @@ def touched_untouched(of: FrameSet) -> list[str]:
     return found
 
 
-def metric_picture(view: GelView) -> Callable[[Image], Image]:
+def metric_image_map(view: GelView) -> Callable[[Image], Image]:
     """Native picture (H, W, 3) -> metric picture of the gel, both uint8. Where the camera sees much finer, its picture
     is first reduced by a whole factor, as means over areas."""
     import cv2
@@ -173,7 +175,7 @@ def metric_picture(view: GelView) -> Callable[[Image], Image]:
     middle = view.project(pixel)
     factor = int(np.linalg.norm(middle[1:] - middle[0], axis=1).min())
     if factor < 2:
-        rectify = to_metric(view)
+        rectify = metric_rectification(view)
         return lambda image: np.rint(rectify(image)).astype(np.uint8)
     lens = view.lens
     columns, rows = lens.width // factor, lens.height // factor
@@ -186,7 +188,7 @@ def metric_picture(view: GelView) -> Callable[[Image], Image]:
             "centre": ((lens.centre[0] + 0.5) * x - 0.5, (lens.centre[1] + 0.5) * y - 0.5),
         }
     )
-    rectify = to_metric(view.model_copy(update={"lens": small}))
+    rectify = metric_rectification(view.model_copy(update={"lens": small}))
 
     def reduced(image: Image) -> Image:
         if image.shape[:2] != view.image_shape:
@@ -211,10 +213,10 @@ def require_view_size(image_shape: tuple[int, int], view: GelView) -> None:
 def rectified_by_view(frame_set: FrameSet, view: GelView) -> FrameSet:
     """The same as metric pictures of the gel. Raises BadFrames for pictures of another size than the view's."""
     require_view_size(frame_set.shape, view)
-    return _mapped(frame_set, metric_picture(view))
+    return _map_images(frame_set, metric_image_map(view))
 
 
-def within_region(frame_set: FrameSet, region: PictureRegion) -> FrameSet:
+def restrict_to_region(frame_set: FrameSet, region: PictureRegion) -> FrameSet:
     """The same where only the polygon `region` [px] counts: beyond it all pictures are even, and none differs from the
     reference by more than the gel does in the median. Raises BadCorners."""
     shown = region_mask(region, frame_set.shape)
@@ -227,7 +229,7 @@ def within_region(frame_set: FrameSet, region: PictureRegion) -> FrameSet:
         filled[~shown] = np.rint(np.clip(level + drift, 0, 255))
         return filled
 
-    return _mapped(frame_set, even)
+    return _map_images(frame_set, even)
 
 
 def rectified_by_corners(frame_set: FrameSet, corners: Corners, shape: tuple[int, int]) -> FrameSet:
@@ -239,10 +241,10 @@ def rectified_by_corners(frame_set: FrameSet, corners: Corners, shape: tuple[int
 
     rows, columns = shape
     grid = PixelGrid(rows, columns, 1.0, -(columns - 1) / 2, -(rows - 1) / 2)
-    rectify = from_corners(corners, (float(columns), float(rows)), frame_set.shape, grid)
+    rectify = rectification_of_corners(corners, (float(columns), float(rows)), frame_set.shape, grid)
     if not rectify.valid.all():
         raise BadCorners(f"corners {corners!r} reach beyond the picture; all of the gel must be seen")
-    return _mapped(frame_set, lambda image: np.asarray(cv2.convertScaleAbs(rectify(image)), dtype=np.uint8))
+    return _map_images(frame_set, lambda image: np.asarray(cv2.convertScaleAbs(rectify(image)), dtype=np.uint8))
 
 
 def rectified_shape(corners: Corners) -> tuple[int, int]:
@@ -252,7 +254,7 @@ def rectified_shape(corners: Corners) -> tuple[int, int]:
     return max(16, round(max(sides[1], sides[3]))), max(16, round(max(sides[0], sides[2])))
 
 
-def _mapped(of: FrameSet, change: Callable[[Image], Image]) -> FrameSet:
+def _map_images(of: FrameSet, change: Callable[[Image], Image]) -> FrameSet:
     """All pictures changed."""
     frames, untouched = (
         tuple(Frame(frame.name, change(frame.image), frame.surface) for frame in part)
@@ -261,7 +263,7 @@ def _mapped(of: FrameSet, change: Callable[[Image], Image]) -> FrameSet:
     return replace(of, reference=change(of.reference), frames=frames, untouched=untouched)
 
 
-def _read(folder: Path, paths: list[Path], max_frames: int) -> list[Frame]:
+def _read_images(folder: Path, paths: list[Path], max_frames: int) -> list[Frame]:
     """Raises BadFrames that names every picture which cannot be read."""
     unreadable: list[str] = []
 
@@ -272,13 +274,13 @@ def _read(folder: Path, paths: list[Path], max_frames: int) -> list[Frame]:
             except EpisodeError as error:
                 unreadable.append(str(error))
 
-    read = _limited(folder, frames(), max_frames)
+    read = _read_limited(folder, frames(), max_frames)
     if unreadable:
         raise BadFrames("\n".join(unreadable))
     return read
 
 
-def _limited(path: Path, frames: Iterable[Frame], max_frames: int = MAX_FRAMES) -> list[Frame]:
+def _read_limited(path: Path, frames: Iterable[Frame], max_frames: int = MAX_FRAMES) -> list[Frame]:
     """All frames; raises BadFrames as soon as they are too many."""
     read: list[Frame] = []
     memory = 0
@@ -292,7 +294,7 @@ def _limited(path: Path, frames: Iterable[Frame], max_frames: int = MAX_FRAMES) 
     return read
 
 
-def _frame_set(
+def _make_frame_set(
     path: Path, frames: list[Frame], reference: Path | None, own: Image | None, untouched: tuple[Frame, ...] = ()
 ) -> FrameSet:
     """The reference is the picture that was named, the recording's `own`, or the median."""

@@ -10,19 +10,19 @@ import numpy as np
 from calibration.bundle import BadBundle, Calibration, read_bundle
 from calibration.errors import BadFrames
 from calibration.frame_normaliser import FrameNormaliser
-from calibration.height.colour_table import GradientModel, from_model
+from calibration.height.colour_table import GradientModel, table_of_model
 from calibration.height.darkness import DarknessSlopes
 from calibration.height.forward_steps import ForwardSteps
 from calibration.height.slope_polynomial import PolynomialSlopes
 from calibration.height.surface_finder import SurfaceFinder, extended_view
 from calibration.lens.rectification import (
     Rectification,
-    from_corners,
-    from_geometry,
-    from_view,
-    seen_box,
+    rectification_of_corners,
+    rectification_of_geometry,
+    rectification_of_view,
+    visible_box,
 )
-from calibration.markers.flow import NoMarkers, marker_flow, seen_by_dots
+from calibration.markers.flow import NoMarkers, marker_flow, view_of_dots
 from tacsim.interface import Image
 from tacsim.models.geometry import PictureRegion
 from tacsim.models.hardware import CameraSensorConfig
@@ -35,7 +35,7 @@ def normaliser_for_simulation(
     model: SensorModel, gel_size: tuple[float, float], grid: CanonicalGrid
 ) -> FrameNormaliser:
     """The normaliser of a simulated sensor; `gel_size`: x, y [m]."""
-    return FrameNormaliser(_of_model(model, gel_size, canonical_image(grid)), grid)
+    return FrameNormaliser(_normaliser_of_model(model, gel_size, canonical_image(grid)), grid)
 
 
 def normaliser_for_pictures(
@@ -49,22 +49,26 @@ def normaliser_for_pictures(
             f"the light of model '{model.name}' is a calibrated one, whose inverse stands in its bundle: give the "
             "camera `calibration: BUNDLE` in place of `model`"
         )
-    rectify = _of_model(model, gel_size, extended_view(grid, gel_size)).within(region)
+    rectify = _normaliser_of_model(model, gel_size, extended_view(grid, gel_size)).within(region)
     slopes: GradientModel
     if model.darkness is not None:
-        shape = rectify.valid[seen_box(rectify.valid)].shape
+        shape = rectify.valid[visible_box(rectify.valid)].shape
         slopes = DarknessSlopes(model.darkness, shape, grid.pitch / grid.image_scale)
     else:
-        slopes = from_model(model)
+        slopes = table_of_model(model)
     find = SurfaceFinder(slopes, rectify.valid, grid, dots=model.markers is not None)
     return FrameNormaliser(
         rectify, grid, find, marker_flow(model.markers, model.geometry, gel_size, model.view, region)
     )
 
 
-def _of_model(model: SensorModel, gel_size: tuple[float, float], grid: PixelGrid) -> Rectification:
+def _normaliser_of_model(model: SensorModel, gel_size: tuple[float, float], grid: PixelGrid) -> Rectification:
     """From the pictures that a sensor of this model delivers."""
-    return from_geometry(model.geometry, gel_size, grid) if model.view is None else from_view(model.view, grid)
+    return (
+        rectification_of_geometry(model.geometry, gel_size, grid)
+        if model.view is None
+        else rectification_of_view(model.view, grid)
+    )
 
 
 def normaliser_for_calibration(
@@ -76,12 +80,12 @@ def normaliser_for_calibration(
     wide = extended_view(grid, calibration.gel_size)
     # One look-up from the native picture, whether it is metric by itself or seen through lens and perspective.
     if calibration.view is None:
-        rectify = from_geometry(geometry, calibration.gel_size, wide)
+        rectify = rectification_of_geometry(geometry, calibration.gel_size, wide)
     else:
-        rectify = from_view(calibration.view, wide)
+        rectify = rectification_of_view(calibration.view, wide)
     rectify = rectify.within(calibration.region)
     pixels = (wide.points() / geometry.pixel_pitch + geometry.principal + 0.5) / (geometry.width, geometry.height)
-    x, y = np.moveaxis(2.0 * pixels[seen_box(rectify.valid)] - 1.0, -1, 0)
+    x, y = np.moveaxis(2.0 * pixels[visible_box(rectify.valid)] - 1.0, -1, 0)
     slopes: GradientModel
     better = None
     if calibration.darkness is not None:
@@ -96,7 +100,7 @@ def normaliser_for_calibration(
     flow = marker_flow(calibration.markers, geometry, calibration.gel_size, calibration.view, calibration.region)
     known = None
     if untouched is not None:  # it is metric by itself, whatever the camera's picture is
-        known = from_geometry(geometry, calibration.gel_size, wide)(untouched)
+        known = rectification_of_geometry(geometry, calibration.gel_size, wide)(untouched)
     return FrameNormaliser(rectify, grid, find, flow, untouched=known)
 
 
@@ -115,7 +119,7 @@ def normaliser_for_recording(
         return normaliser_for_dots(config.marker_pitch, untouched, grid, config.region)
     if config.calibration is not None:
         return _of_bundle(config.calibration, image_shape, grid)
-    seen = from_corners(config.corners, config.size, image_shape, canonical_image(grid))
+    seen = rectification_of_corners(config.corners, config.size, image_shape, canonical_image(grid))
     return FrameNormaliser(seen.within(config.region), grid, drifts=True)
 
 
@@ -125,7 +129,7 @@ def normaliser_for_dots(
     """The normaliser of a sensor of which nothing is known but the distance of its printed dots, `pitch` [m], and its
     picture without contact: flow, no height. The camera looks straight on. Raises BadFrames where no dots are seen."""
     try:
-        rectify, flow = seen_by_dots(pitch, untouched, grid, region)
+        rectify, flow = view_of_dots(pitch, untouched, grid, region)
     except NoMarkers as nothing:
         raise BadFrames(str(nothing)) from None
     return FrameNormaliser(rectify, grid, markers=flow, drifts=True)
@@ -146,10 +150,10 @@ def normaliser_for_camera(
         return normaliser_for_pictures(config.model, gel_size, grid, config.region)
     shape = (config.height, config.width)
     if config.marker_pitch is not None:
-        dots = partial(seen_by_dots, config.marker_pitch, grid=grid, region=config.region)
-        first = from_corners(None, config.size, shape, canonical_image(grid))
+        dots = partial(view_of_dots, config.marker_pitch, grid=grid, region=config.region)
+        first = rectification_of_corners(None, config.size, shape, canonical_image(grid))
         return FrameNormaliser(first, grid, drifts=True, dots=dots)
-    seen = from_corners(config.corners, config.size, shape, canonical_image(grid))
+    seen = rectification_of_corners(config.corners, config.size, shape, canonical_image(grid))
     return FrameNormaliser(seen.within(config.region), grid, drifts=True)
 
 

@@ -21,13 +21,13 @@ MIN_MEAN_LEVEL = 8.0  # of each channel over the gel; below, noise and rounding 
 STALE_SLOPE = 2.0  # slope of the untouched gel; real sensors: 0.3 to 0.7 [degrees]
 STALE_COLOUR = 0.05  # change of the untouched gel's colour: a lamp's gain scales slopes and may tilt nothing [-]
 # ... and the light is another beyond:
-LOST_SLOPE = 20.0  # [degrees]
-LOST_COLOUR = 0.5  # [-]
+MAX_SLOPE_CHANGE = 20.0  # [degrees]
+MAX_COLOUR_CHANGE = 0.5  # [-]
 # Red and blue are exchanged
 EXCHANGED_RATIO = 0.5  # if that brings the picture so much nearer to the known one
-ALIKE = 0.02  # unless it is this near already, each colour relative to its mean [-]
+MAX_SAME_CHANGE = 0.02  # unless it is this near already, each colour relative to its mean [-]
 MIN_SWAPPED_CHANGE = 0.01  # of each colour relative to its mean, beside another gain: less is no sign of a swap [-]
-BLOCK = 8  # side of the blocks that are compared [px]
+BLOCK_SIZE = 8  # side of the blocks that are compared [px]
 
 
 class UnusableReference(ValueError):
@@ -100,23 +100,23 @@ def make_reference(
     return Reference(image.astype(np.float32), mean, image / mean, valid, scale)
 
 
-def exchanged(image: Float32, known: Float32, valid: Mask) -> bool:
+def is_channel_order_swapped(image: Float32, known: Float32, valid: Mask) -> bool:
     """True when an image (H, W, 3) is like the `known` one of the same gel only with red and blue exchanged.
 
     What counts is where on the gel each colour is bright, not the lamps' gain or the white balance. False where all
     colours are equally even.
     """
-    one, other = (_pattern(picture, valid) for picture in (image, known))
+    one, other = (_block_pattern(picture, valid) for picture in (image, known))
     apart = float(np.sqrt(((one - other) ** 2).mean()))
     exchanged_apart = float(np.sqrt(((one[:, ::-1] - other) ** 2).mean()))
-    return apart > ALIKE and exchanged_apart < EXCHANGED_RATIO * apart
+    return apart > MAX_SAME_CHANGE and exchanged_apart < EXCHANGED_RATIO * apart
 
 
-def channels_swapped(image: Float32, known: Float32, valid: Mask) -> bool:
+def is_contact_image_swapped(image: Float32, known: Float32, valid: Mask) -> bool:
     """True when most of a picture (H, W, 3), which may show a contact, is the `known` one of the same gel with red and
     blue swapped, and is not as near to it with another gain of each channel (exposure, white balance). False where all
     colours are equally even: such a swap looks like a change of the white balance."""
-    seen, wanted = _blocks(image, valid), _blocks(known, valid)
+    seen, wanted = _block_levels(image, valid), _block_levels(known, valid)
     if not len(wanted):
         return False
     mean = np.maximum(wanted.mean(axis=0), 1.0)
@@ -127,16 +127,16 @@ def channels_swapped(image: Float32, known: Float32, valid: Mask) -> bool:
     return apart > MIN_SWAPPED_CHANGE and swapped < EXCHANGED_RATIO * apart
 
 
-def _blocks(image: Float32, valid: Mask) -> Float32:
+def _block_levels(image: Float32, valid: Mask) -> Float32:
     """(n, 3) mean level of each block that lies on the gel."""
     import cv2
 
-    size = (max(valid.shape[1] // BLOCK, 1), max(valid.shape[0] // BLOCK, 1))
+    size = (max(valid.shape[1] // BLOCK_SIZE, 1), max(valid.shape[0] // BLOCK_SIZE, 1))
     whole = cv2.resize(valid.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.float32)[whole]
 
 
-def _pattern(image: Float32, valid: Mask) -> Float32:
+def _block_pattern(image: Float32, valid: Mask) -> Float32:
     """(n, 3) brightness of each block of the gel in each colour, relative to the mean."""
-    parts = _blocks(image, valid)
+    parts = _block_levels(image, valid)
     return np.asarray(parts / parts.mean(axis=0) - 1.0, dtype=np.float32)

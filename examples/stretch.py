@@ -61,7 +61,7 @@ class Stretch(Task):
     # From here on all is optional: the distance by touch alone, and a policy that finds its way by it.
 
     @property
-    def needs_to_feel(self) -> Needs:
+    def touch_needs(self) -> Needs:
         return Needs(BOTH, BOTH, height=True)
 
     def estimator(self, canonical: CanonicalGrid) -> Estimator:

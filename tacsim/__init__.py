@@ -117,7 +117,7 @@ if TYPE_CHECKING:
     from tacsim.tasks import Reposition as Reposition
     from tacsim.tasks import Squeeze as Squeeze
     from tacsim.tasks import Task as Task
-    from tacsim.tasks import judge as judge
+    from tacsim.tasks import evaluate_outcome as evaluate_outcome
     from tacsim.tasks import make_task as make_task
     from tacsim.tasks import register_task as register_task
     from tacsim.tasks.grip import Grip as Grip

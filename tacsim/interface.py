@@ -63,20 +63,20 @@ class SurfaceMap:
     flow: NDArray[np.float32] | None  # (m, n, 2) in-plane displacement at the marker lattice, sensor x, y [m]
 
 
-Made = TypeVar("Made")
+FieldValue = TypeVar("FieldValue")
 
 
-class WhenSeen(Generic[Made]):
+class LazyField(Generic[FieldValue]):
     """A field of a dataclass, given as it is or as a function that makes it, called when the field is first looked at:
     no picture is rendered for who looks at heights and forces only."""
 
-    def __init__(self, *default: Made) -> None:
+    def __init__(self, *default: FieldValue) -> None:
         self._default = default
 
     def __set_name__(self, owner: type, name: str) -> None:
         self._name = name
 
-    def __get__(self, instance: object | None, owner: type | None = None) -> Made:
+    def __get__(self, instance: object | None, owner: type | None = None) -> FieldValue:
         if instance is None:  # `dataclass` asks for the default so, and takes this error for none
             if not self._default:
                 raise AttributeError(self._name)
@@ -86,22 +86,22 @@ class WhenSeen(Generic[Made]):
             value = instance.__dict__[self._name] = value()
         return value  # type: ignore[no-any-return]
 
-    def __set__(self, instance: object, value: Made | Callable[[], Made]) -> None:
+    def __set__(self, instance: object, value: FieldValue | Callable[[], FieldValue]) -> None:
         instance.__dict__[self._name] = value
 
 
-class Sendable:
-    """A dataclass whose fields `WhenSeen` are made before it is copied or sent to another process."""
+class LazyFields:
+    """A dataclass whose fields `LazyField` are made before it is copied or sent to another process."""
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: getattr(self, name) for name in self.__dict__}
 
 
 @dataclass(frozen=True, eq=False)
-class TactileFrame(Sendable):
+class TactileFrame(LazyFields):
     """What any source delivers: the picture as the camera gave it."""
 
-    image: WhenSeen[NDArray[np.uint8]] = WhenSeen()  # (H, W, 3) RGB
+    image: LazyField[NDArray[np.uint8]] = LazyField()  # (H, W, 3) RGB
     _: KW_ONLY
     time: float  # exposure time on the rig's monotonic clock [s]
     index: int  # frame counter; a gap = dropped frames
@@ -110,11 +110,11 @@ class TactileFrame(Sendable):
 
 
 @dataclass(frozen=True, eq=False)
-class TactileObservation(Sendable):
+class TactileObservation(LazyFields):
     """Canonical touch: what a policy sees, the same for every source. What a sensor does not deliver is None."""
 
     # (H, W, 3) clip(128 + 128 (I - I0) / mean(I0)) over the canonical area
-    image: WhenSeen[NDArray[np.uint8]] = WhenSeen()
+    image: LazyField[NDArray[np.uint8]] = LazyField()
     _: KW_ONLY
     gradient: NDArray[np.float32] | None  # (h, w, 2) surface slope [-]
     height: NDArray[np.float32] | None  # (h, w) into the gel, 0 at the contact-free rim [m]
@@ -124,7 +124,7 @@ class TactileObservation(Sendable):
     time: float  # exposure time [s]
     age: float  # time of the observation minus time of exposure [s]
     # (H, W, 3) RGB as the camera gave it: not canonical, so what learns from it learns one sensor's light, too
-    picture: WhenSeen[NDArray[np.uint8] | None] = WhenSeen(None)
+    picture: LazyField[NDArray[np.uint8] | None] = LazyField(None)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -195,16 +195,16 @@ class Needs:
 
     def missing(self, spec: RigSpec) -> list[str]:
         """What `spec` does not deliver, each as a phrase for a person; empty when all is there."""
-        lacking = [f"sensor '{name}'" for name in sorted(self.sensors - set(spec.sensors))]
-        lacking += [f"arm '{name}'" for name in sorted(self.arms - set(spec.arms))]
+        missing = [f"sensor '{name}'" for name in sorted(self.sensors - set(spec.sensors))]
+        missing += [f"arm '{name}'" for name in sorted(self.arms - set(spec.arms))]
         for name, sensor in spec.sensors.items():
             if self.height and not sensor.height:
-                lacking.append(f"surface height of sensor '{name}' (it has no photometric calibration)")
+                missing.append(f"surface height of sensor '{name}' (it has no photometric calibration)")
             if self.flow and not sensor.flow:
-                lacking.append(f"tactile flow of sensor '{name}' (it has no markers)")
+                missing.append(f"tactile flow of sensor '{name}' (it has no markers)")
         if self.truth and not spec.truth:
-            lacking.append("ground truth of the body (only simulation has it)")
-        return lacking
+            missing.append("ground truth of the body (only simulation has it)")
+        return missing
 
 
 class IncompatibleRig(ValueError):

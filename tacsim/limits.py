@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from tacsim.interface import Action, FloatArray, Mask, Pose
 
-FARTHEST = 1e3  # from the origin: no sensor is sent beyond [m]
+MAX_POSITION = 1e3  # from the origin: no sensor is sent beyond [m]
 ROUNDING = 1e-9  # of positions: this far outside still counts as inside [m]
 
 
@@ -46,24 +46,24 @@ def check_action(action: object, movable: Collection[str], rig: str) -> Action:
             raise ActionError(f"action for '{name}', but rig '{rig}' moves only: {names}")
         if target is not None and not isinstance(target, Pose):
             raise ActionError(f"action for '{name}' must be a tacsim.Pose or None (holds), got {target!r}")
-        if target is not None and np.abs(target.position).max() > FARTHEST:
+        if target is not None and np.abs(target.position).max() > MAX_POSITION:
             raise ActionError(
-                f"target of arm '{name}' is at {target.position.tolist()} m, more than {FARTHEST:g} m from the origin; "
-                "poses are in metres, in the world frame"
+                f"target of arm '{name}' is at {target.position.tolist()} m, more than {MAX_POSITION:g} m from the "
+                "origin; poses are in metres, in the world frame"
             )
     return action
 
 
-def limit_step(target: Pose, now: Pose, max_step: float, max_turn: float) -> Pose:
+def limit_step(target: Pose, current: Pose, max_step: float, max_turn: float) -> Pose:
     """`target` itself if it is within `max_step` [m] and `max_turn` [rad] of `now`; otherwise the farthest such pose on
     the straight path to it, translation and rotation in proportion."""
     from tacsim import pose as se3  # SciPy takes half a second to load; the process that drives an arm needs none of it
 
-    metres, radians = se3.distance(now, target)
+    metres, radians = se3.pose_distance(current, target)
     excess = max(metres / max_step, radians / max_turn)
     if excess <= 1.0 + 1e-9:  # rounding
         return target
-    return se3.interpolate(now, target, 1.0 / excess)
+    return se3.interpolate_pose(current, target, 1.0 / excess)
 
 
 def finite_targets(targets: ArrayLike) -> Mask:
@@ -76,7 +76,7 @@ def finite_targets(targets: ArrayLike) -> Mask:
     if given.ndim == 0 or given.shape[-1] != 7:
         return np.zeros(given.shape[:-1], np.bool_)
     with np.errstate(over="ignore", invalid="ignore"):
-        near = (np.abs(given[..., :3]) <= FARTHEST).all(-1)
+        near = (np.abs(given[..., :3]) <= MAX_POSITION).all(-1)
         unit = np.abs(np.sqrt((given[..., 3:] ** 2).sum(-1)) - 1.0) <= 1e-3
     valid: Mask = near & unit & np.isfinite(given).all(-1)
     return valid
@@ -95,23 +95,23 @@ class Region:
         beyond: FloatArray = (np.asarray(points, dtype=np.float64) @ self.normals.T - self.offsets).max(-1)
         return beyond
 
-    def broken(self, point: ArrayLike) -> str:
+    def violated_face(self, point: ArrayLike) -> str:
         """The face that `point` (3,) lies farthest beyond, in words; empty inside."""
         beyond = self.normals @ np.asarray(point, dtype=np.float64) - self.offsets
         worst = int(beyond.argmax())
         return "" if beyond[worst] <= ROUNDING else f"{1e3 * beyond[worst]:.3g} mm beyond {self.names[worst]}"
 
 
-def region(lower: ArrayLike, upper: ArrayLike, planes: Iterable[tuple[ArrayLike, ArrayLike]] = ()) -> Region:
+def box_region(lower: ArrayLike, upper: ArrayLike, planes: Iterable[tuple[ArrayLike, ArrayLike]] = ()) -> Region:
     """The box from `lower` (3,) to `upper` (3,) [m], cut by `planes`: (point (3,) [m], normal (3,) into the region).
 
     Raises ValueError for a box or a cut without an inside, and for a normal that is zero.
     """
-    least, most = np.array(lower, dtype=np.float64), np.array(upper, dtype=np.float64)
-    if least.shape != (3,) or most.shape != (3,) or not (least < most).all():
+    lower_corner, most = np.array(lower, dtype=np.float64), np.array(upper, dtype=np.float64)
+    if lower_corner.shape != (3,) or most.shape != (3,) or not (lower_corner < most).all():
         raise ValueError(f"region: must run from a lower to an upper corner [m], got {lower!r} to {upper!r}")
-    normals, offsets = [*-np.eye(3), *np.eye(3)], [*-least, *most]
-    names = [f"the workspace's lower {axis} = {value:g} m" for axis, value in zip("xyz", least, strict=True)]
+    normals, offsets = [*-np.eye(3), *np.eye(3)], [*-lower_corner, *most]
+    names = [f"the workspace's lower {axis} = {value:g} m" for axis, value in zip("xyz", lower_corner, strict=True)]
     names += [f"the workspace's upper {axis} = {value:g} m" for axis, value in zip("xyz", most, strict=True)]
     for number, (point, normal) in enumerate(planes):
         into = np.array(normal, dtype=np.float64)
@@ -131,8 +131,8 @@ def fraction_inside(starts: ArrayLike, ends: ArrayLike, inside: Region) -> Float
     here = np.asarray(starts, dtype=np.float64) @ inside.normals.T - inside.offsets
     there = np.asarray(ends, dtype=np.float64) @ inside.normals.T - inside.offsets
     fractions: FloatArray = np.maximum(-here, 0.0) / (there - here).clip(min=ROUNDING)
-    least: FloatArray = np.where(there > ROUNDING, fractions, 1.0).min(-1)
-    return least
+    lower_corner: FloatArray = np.where(there > ROUNDING, fractions, 1.0).min(-1)
+    return lower_corner
 
 
 def fraction_clear(start: ArrayLike, end: ArrayLike, centre: ArrayLike, distance: float) -> float:
@@ -150,21 +150,21 @@ def fraction_clear(start: ArrayLike, end: ArrayLike, centre: ArrayLike, distance
 
 
 def clip_to_region(
-    target: Pose, now: Pose, inside: Region | None, spheres: Iterable[tuple[ArrayLike, float]] = ()
+    target: Pose, current: Pose, inside: Region | None, spheres: Iterable[tuple[ArrayLike, float]] = ()
 ) -> tuple[Pose, float]:
     """`target` itself if the straight path from `now` stays `inside` (None: anywhere) and outside the `spheres`
     (centre (3,), radius [m]); otherwise the farthest pose on it up to which it does. Also that fraction of the path."""
-    fraction = 1.0 if inside is None else float(fraction_inside(now.position, target.position, inside))
+    fraction = 1.0 if inside is None else float(fraction_inside(current.position, target.position, inside))
     for centre, radius in spheres:
-        fraction = min(fraction, fraction_clear(now.position, target.position, centre, radius))
+        fraction = min(fraction, fraction_clear(current.position, target.position, centre, radius))
     if fraction >= 1.0:
         return target, 1.0
     from tacsim import pose as se3
 
-    return se3.interpolate(now, target, fraction), fraction
+    return se3.interpolate_pose(current, target, fraction), fraction
 
 
-def braking_end(position: ArrayLike, velocity: ArrayLike, deceleration: float) -> FloatArray:
+def stopping_position(position: ArrayLike, velocity: ArrayLike, deceleration: float) -> FloatArray:
     """(3,) where something at `position` [m] comes to rest [m] if it brakes straight from `velocity` (3,) [m/s] with
     `deceleration` [m/s^2]: v^2 / 2a further."""
     moving = np.asarray(velocity, dtype=np.float64)
@@ -180,12 +180,12 @@ def exceeds_wrench(wrench: ArrayLike, force: float, torque: float) -> bool:
     return not (math.hypot(*load[:3]) <= force and math.hypot(*load[3:]) <= torque)
 
 
-def exceeds(value: float, limit: float | None) -> bool:
+def exceeds_limit(value: float, limit: float | None) -> bool:
     """True if `value` exceeds `limit`, or is not a number. Without a limit (None): False."""
     return limit is not None and not value <= limit
 
 
-def joint_step_excess(before: ArrayLike, after: ArrayLike, speed: float, period: float) -> float:
+def joint_speed_ratio(before: ArrayLike, after: ArrayLike, speed: float, period: float) -> float:
     """How much faster than `speed` [rad/s] the fastest joint goes from `before` to `after` (n,) [rad] within `period`
     [s]: 1 is at the limit; infinite for a number that is not finite."""
     step = np.abs(np.asarray(after, dtype=np.float64) - np.asarray(before, dtype=np.float64))

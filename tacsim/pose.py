@@ -27,9 +27,9 @@ def rotation(pose: Pose) -> Rotation:
     return Rotation.from_quat(np.array(pose.quaternion))  # a copy: SciPy refuses read-only arrays
 
 
-def matrix(pose: Pose) -> FloatArray:
+def rotation_matrix(pose: Pose) -> FloatArray:
     """The rotation matrix (3, 3) of a pose."""
-    x, y, z, w = _unit(*pose.quaternion.tolist())
+    x, y, z, w = _unit_pose(*pose.quaternion.tolist())
     xx, yy, zz, ww, xy, zw, xz, yw, yz, xw = x * x, y * y, z * z, w * w, x * y, z * w, x * z, y * w, y * z, x * w
     rows = (
         (xx - yy - zz + ww, 2 * (xy - zw), 2 * (xz + yw)),
@@ -39,12 +39,12 @@ def matrix(pose: Pose) -> FloatArray:
     return np.array(rows)
 
 
-def _unit(x: float, y: float, z: float, w: float) -> tuple[float, float, float, float]:
+def _unit_pose(x: float, y: float, z: float, w: float) -> tuple[float, float, float, float]:
     length = math.sqrt(x * x + y * y + z * z + w * w)
     return x / length, y / length, z / length, w / length
 
 
-def _apply(turn: FloatArray, vectors: FloatArray) -> FloatArray:
+def _rotate_vectors(turn: FloatArray, vectors: FloatArray) -> FloatArray:
     """(n, 3) vectors turned by a matrix (3, 3)."""
     turned: FloatArray = np.einsum("jk,ik->ij", turn, vectors)
     return turned
@@ -81,16 +81,16 @@ def from_matrix(matrix: ArrayLike) -> Pose:
 def to_matrix(pose: Pose) -> FloatArray:
     """Homogeneous matrix (4, 4) [m]."""
     whole = np.eye(4)
-    whole[:3, :3] = matrix(pose)
+    whole[:3, :3] = rotation_matrix(pose)
     whole[:3, 3] = pose.position
     return whole
 
 
 def compose(a_from_b: Pose, b_from_c: Pose) -> Pose:
     """a_from_c."""
-    position = a_from_b.position + _apply(matrix(a_from_b), b_from_c.position[None])[0]
-    (ax, ay, az, aw), (bx, by, bz, bw) = (_unit(*each.quaternion.tolist()) for each in (a_from_b, b_from_c))
-    turn = _unit(
+    position = a_from_b.position + _rotate_vectors(rotation_matrix(a_from_b), b_from_c.position[None])[0]
+    (ax, ay, az, aw), (bx, by, bz, bw) = (_unit_pose(*each.quaternion.tolist()) for each in (a_from_b, b_from_c))
+    turn = _unit_pose(
         aw * bx + bw * ax + (ay * bz - az * by),
         aw * by + bw * ay + (az * bx - ax * bz),
         aw * bz + bw * az + (ax * by - ay * bx),
@@ -99,19 +99,19 @@ def compose(a_from_b: Pose, b_from_c: Pose) -> Pose:
     return Pose(position, np.array(turn))
 
 
-def along_z(pose: Pose, distance: float) -> Pose:
+def translated_along_z(pose: Pose, distance: float) -> Pose:
     """`pose`, moved by `distance` [m] along its own z axis."""
     return compose(pose, Pose(np.array([0.0, 0.0, distance])))
 
 
 def inverse(a_from_b: Pose) -> Pose:
     """b_from_a."""
-    x, y, z, w = _unit(*a_from_b.quaternion.tolist())
+    x, y, z, w = _unit_pose(*a_from_b.quaternion.tolist())
     back = Pose(quaternion=np.array([-x, -y, -z, w]))
-    return Pose(-_apply(matrix(back), a_from_b.position[None])[0], back.quaternion)
+    return Pose(-_rotate_vectors(rotation_matrix(back), a_from_b.position[None])[0], back.quaternion)
 
 
-def relative(a: Pose, b: Pose) -> Pose:
+def relative_pose(a: Pose, b: Pose) -> Pose:
     """Pose of b as seen from a: ``a_from_b``, both given in one frame."""
     return compose(inverse(a), b)
 
@@ -124,7 +124,7 @@ def transform(a_from_b: Pose, points: ArrayLike) -> FloatArray:
 def rotate(a_from_b: Pose, vectors: ArrayLike) -> FloatArray:
     """(..., 3) directions, velocities or forces in the axes of b -> the same in the axes of a."""
     given = np.array(vectors, dtype=np.float64)
-    return _apply(matrix(a_from_b), given.reshape(-1, 3)).reshape(given.shape)
+    return _rotate_vectors(rotation_matrix(a_from_b), given.reshape(-1, 3)).reshape(given.shape)
 
 
 def transform_wrench(a_from_b: Pose, wrench: ArrayLike) -> FloatArray:
@@ -136,7 +136,7 @@ def transform_wrench(a_from_b: Pose, wrench: ArrayLike) -> FloatArray:
     return np.concatenate([force, torque + np.cross(a_from_b.position, force)])
 
 
-def difference(before: Pose, after: Pose) -> FloatArray:
+def pose_difference(before: Pose, after: Pose) -> FloatArray:
     """(6,) motion from one pose to another, in the axes of the frame both are given in: shift of the origin [m], and
     rotation vector [rad], the shorter rotation."""
     shift = after.position - before.position
@@ -146,13 +146,13 @@ def difference(before: Pose, after: Pose) -> FloatArray:
     return np.concatenate([shift, turn.as_rotvec()])
 
 
-def distance(a: Pose, b: Pose) -> tuple[float, float]:
+def pose_distance(a: Pose, b: Pose) -> tuple[float, float]:
     """Distance between two poses: of their origins [m], and of their axes as one angle [rad]."""
-    motion = difference(a, b)
+    motion = pose_difference(a, b)
     return float(np.linalg.norm(motion[:3])), float(np.linalg.norm(motion[3:]))
 
 
-def interpolate(a: Pose, b: Pose, s: float) -> Pose:
+def interpolate_pose(a: Pose, b: Pose, s: float) -> Pose:
     """The pose at the fraction `s` of the path from a to b: straight line, shorter rotation (slerp).
 
     Raises ValueError outside 0 <= s <= 1.
@@ -161,17 +161,17 @@ def interpolate(a: Pose, b: Pose, s: float) -> Pose:
         raise ValueError(f"interpolate: s must lie within 0 and 1, got {s}")
     from scipy.spatial.transform import Rotation
 
-    motion = s * difference(a, b)
+    motion = s * pose_difference(a, b)
     return Pose(a.position + motion[:3], (Rotation.from_rotvec(motion[3:]) * rotation(a)).as_quat())
 
 
-def two_columns(pose: Pose) -> FloatArray:
+def rotation_columns(pose: Pose) -> FloatArray:
     """(6,) first, then second column of the rotation matrix: continuous everywhere (Zhou et al. 2019), as no rotation
     vector and no set of angles is."""
-    return np.ascontiguousarray(matrix(pose)[:, :2].T).ravel()
+    return np.ascontiguousarray(rotation_matrix(pose)[:, :2].T).ravel()
 
 
-def from_two_columns(position: ArrayLike, columns: ArrayLike) -> Pose:
+def from_rotation_columns(position: ArrayLike, columns: ArrayLike) -> Pose:
     """The pose whose rotation has these two columns (6,), made orthonormal by Gram-Schmidt.
 
     Raises ValueError when they are parallel or zero.
@@ -181,7 +181,7 @@ def from_two_columns(position: ArrayLike, columns: ArrayLike) -> Pose:
     first, second = np.array(columns, dtype=np.float64).reshape(2, 3)
     area = float(np.linalg.norm(np.cross(first, second)))
     if not area > 1e-9:
-        raise ValueError(f"from_two_columns: columns {columns!r} span no plane")
+        raise ValueError(f"from_rotation_columns: columns {columns!r} span no plane")
     x = first / np.linalg.norm(first)
     y = second - (second @ x) * x
     y /= np.linalg.norm(y)

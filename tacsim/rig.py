@@ -103,14 +103,14 @@ class Rig:
         # A sensor that no arm carries may be addressed by its own name: the action is recorded, nothing moves.
         self._addressable = set(arms) | {sensor for sensor, spec in specs.items() if spec.arm is None}
 
-    def require(self, needs: Needs, who: str) -> None:
+    def require(self, needs: Needs, requester: str) -> None:
         """Raises IncompatibleRig with the difference when `who` needs what this rig does not deliver."""
-        require(self.name, self.spec, needs, who)
+        require_needs(self.name, self.spec, needs, requester)
 
     def reset(self, seed: int = 0) -> Observation:
         """Starts an episode: references without contact, then gentle contact. The same seed gives the same start. A
         reset that fails leaves the arms stopped."""
-        with self._stopped_together():
+        with self._stop_all_on_failure():
             self.references = dict(self._reset.clear(seed))
             for name, normaliser in self.normalisers.items():
                 normaliser.take_reference(self.references[name])
@@ -151,10 +151,10 @@ class Rig:
         check_action(action, self._addressable, self.name)
         if self._load_control is not None:
             action = self._load_control(action, self._arm_states)
-        with self._stopped_together():
+        with self._stop_all_on_failure():
             sent = {name: arm.command(action.tool.get(name)) for name, arm in self.arms.items()}
         if self._load_control is not None:
-            self._load_control.sent(sent)
+            self._load_control.record_sent_poses(sent)
         return sent
 
     def tick(self) -> None:
@@ -188,17 +188,17 @@ class Rig:
 
     def stop(self) -> None:
         """Stops all arms, each even when another fails to stop."""
-        _run_all([arm.stop for arm in self.arms.values()])
+        _call_all([arm.stop for arm in self.arms.values()])
 
     def close(self) -> None:
         """Stops all arms, then closes everything, each even when another fails. A step in another thread ends."""
         self._closed = True
         arms = [*(arm.stop for arm in self.arms.values()), *(arm.close for arm in self.arms.values())]
         others = [] if self._on_close is None else [self._on_close]
-        _run_all([*arms, *(sensor.close for sensor in self.sensors.values()), *others])
+        _call_all([*arms, *(sensor.close for sensor in self.sensors.values()), *others])
 
     @contextmanager
-    def _stopped_together(self) -> Iterator[None]:
+    def _stop_all_on_failure(self) -> Iterator[None]:
         """No arm goes on when something fails that concerns all of them, or when the rig was closed meanwhile: what an
         arm was asked after its stop is stopped here."""
         try:
@@ -221,16 +221,16 @@ class Rig:
         self.close()
 
 
-def require(rig: str, spec: RigSpec, needs: Needs, who: str, advice: str = "") -> None:
+def require_needs(rig: str, spec: RigSpec, needs: Needs, requester: str, advice: str = "") -> None:
     """Raises IncompatibleRig with the difference, and `advice`, when `who` needs what the rig does not deliver."""
     missing = needs.missing(spec)
     if missing:
         has = f"sensors {', '.join(spec.sensors)}; arms {', '.join(spec.arms) or '(none)'}"
-        words = f"{who} cannot run on rig '{rig}': it lacks {'; '.join(missing)}. It has {has}"
+        words = f"{requester} cannot run on rig '{rig}': it lacks {'; '.join(missing)}. It has {has}"
         raise IncompatibleRig(f"{words}. {advice}" if advice else words)
 
 
-def _run_all(calls: list[Callable[[], None]]) -> None:
+def _call_all(calls: list[Callable[[], None]]) -> None:
     """Runs all calls, then raises what failed; also when they are interrupted: every arm must get its stop."""
     failures: list[BaseException] = []
     for call in calls:

@@ -45,6 +45,7 @@ BENCHMARKS = {  # of the checkout alone: the wheel does not carry them
 }
 
 TEXT = {".py", ".md", ".toml", ".yaml", ".yml", ".txt", ".json", ".jinja", ".html", ".css", ".cfg", ".ini", ""}
+SHIPPED = (*PACKAGES, "configs", "constraints", "docs", "examples", "benchmarks", "tests", "tools", ".ci")
 SHIPPED = (*PACKAGES, "configs", "constraints", "docs", "examples", "benchmarks", "tests", ".ci", ".github")
 # Spelled in pieces, so that this file does not find itself.
 MACHINE_PATHS = re.compile(

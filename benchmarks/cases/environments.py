@@ -139,7 +139,7 @@ def _closed(rig: Rig, closing: float | None) -> tuple[float, float]:
             action = policy(observation)
         else:
             gone = min(gone + CLOSING, closing / 2)
-            action = Action({name: se3.along_z(pose, gone) for name, pose in start.items()})
+            action = Action({name: se3.translated_along_z(pose, gone) for name, pose in start.items()})
         before = observation
         observation, _ = rig.step(action)
         if all(_same(before.arms[name].pose, arm.pose) for name, arm in observation.arms.items()):

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.compare.metrics import contact_region, patch_of, untouched_change
+from calibration.compare.metrics import circle_of_region, contact_region, untouched_change
 from calibration.errors import BadFrames
 from tacsim.interface import Float32, FloatArray
 from tacsim.models.sensor import SensorGeometry
@@ -32,10 +32,10 @@ class Alignment:
     shape: tuple[int, int]  # rows, columns of B
     source: tuple[int, int]  # ... of A
     shift: tuple[float, float] = (0.0, 0.0)  # the part of it that was found: how far A's contacts lie off B's [px of B]
-    said: str = "pixel for pixel"
+    description: str = "pixel for pixel"
 
     @property
-    def covered(self) -> NDArray[np.bool_]:
+    def covered_mask(self) -> NDArray[np.bool_]:
         """(rows, columns) pixels of B that A shows."""
         rows, columns = self.shape
         u, v = np.meshgrid(np.arange(columns), np.arange(rows))
@@ -65,15 +65,15 @@ class Alignment:
         clipped: Float32 = np.clip(np.asarray(seen, dtype=np.float32), 0.0, 255.0)  # it overshoots at edges
         return clipped
 
-    def shifted(self, shift: tuple[float, float], said: str) -> Alignment:
+    def shifted(self, shift: tuple[float, float], description: str) -> Alignment:
         """The same, with A's pictures taken `shift` [px of B] farther on."""
         moved = np.eye(3)
         moved[:2, 2] = shift
         whole = np.vstack([self.a_from_b, [0.0, 0.0, 1.0]]) @ moved
-        return Alignment(whole[:2], self.shape, self.source, shift, f"{self.said}; {said}")
+        return Alignment(whole[:2], self.shape, self.source, shift, f"{self.description}; {description}")
 
 
-def by_size(source: tuple[int, int], shape: tuple[int, int]) -> Alignment:
+def align_by_size(source: tuple[int, int], shape: tuple[int, int]) -> Alignment:
     """A of `source` rows, columns scaled to B's `shape`: both show the same part of the gel.
     Raises BadFrames when their proportions differ."""
     if source == shape:
@@ -87,16 +87,16 @@ def by_size(source: tuple[int, int], shape: tuple[int, int]) -> Alignment:
         )
     # pixel centres are whole numbers, so a picture begins at -1/2
     matrix = np.array([[across, 0.0, (across - 1) / 2], [0.0, down, (down - 1) / 2]])
-    return Alignment(matrix, shape, source, said=f"A scaled by {1 / across:.3g} to the size of B")
+    return Alignment(matrix, shape, source, description=f"A scaled by {1 / across:.3g} to the size of B")
 
 
-def by_geometry(source: SensorGeometry, target: SensorGeometry) -> Alignment:
+def align_by_geometry(source: SensorGeometry, target: SensorGeometry) -> Alignment:
     """Both pictures on the gel, in metres, by their calibrated geometries."""
     scale = target.pixel_pitch / source.pixel_pitch
     offset = np.array(source.principal) - scale * np.array(target.principal)
     matrix = np.array([[scale, 0.0, offset[0]], [0.0, scale, offset[1]]])
     said = "by the calibrated geometries" if source != target else "pixel for pixel, of one geometry"
-    return Alignment(matrix, (target.height, target.width), (source.height, source.width), said=said)
+    return Alignment(matrix, (target.height, target.width), (source.height, source.width), description=said)
 
 
 def find_shift(changes: Iterable[tuple[Float32, Float32]], alignment: Alignment) -> Alignment:
@@ -106,7 +106,7 @@ def find_shift(changes: Iterable[tuple[Float32, Float32]], alignment: Alignment)
     with contact in both, the shift is found to a fraction of a pixel from the strength of the change, whatever its
     colours (enhanced correlation coefficient, Evangelidis and Psarakis 2008); the median of all holds.
     """
-    found = [shift for pair in changes if (shift := _shift(*pair)) is not None]
+    found = [shift for pair in changes if (shift := _find_image_shift(*pair)) is not None]
     if not found:
         return alignment.shifted((0.0, 0.0), "no pair shows contact on both sides, so no shift was looked for")
     shifts = np.array(found)
@@ -122,14 +122,14 @@ def find_shift(changes: Iterable[tuple[Float32, Float32]], alignment: Alignment)
     return alignment.shifted((x, y), f"shifted by {words}, the pairs agree within {scatter:.2f} px")
 
 
-def _shift(a: Float32, b: Float32) -> tuple[float, float] | None:
+def _find_image_shift(a: Float32, b: Float32) -> tuple[float, float] | None:
     """x, y from a point of `b` to the same in `a` [px]; None where there is no contact, or no shift to be found."""
     import cv2
 
-    patches = [patch_of(contact_region(change)) for change in (a, b)]
+    patches = [circle_of_region(contact_region(change)) for change in (a, b)]
     if patches[0] is None or patches[1] is None:
         return None
-    template, moved = _strength(b), _strength(a)
+    template, moved = _change_strength(b), _change_strength(a)
     start = np.eye(2, 3, dtype=np.float32)
     start[:, 2] = patches[0].x - patches[1].x, patches[0].y - patches[1].y
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, ECC_STEPS, ECC_TOLERANCE)
@@ -141,7 +141,7 @@ def _shift(a: Float32, b: Float32) -> tuple[float, float] | None:
     return float(warp[0, 2]), float(warp[1, 2])
 
 
-def _strength(change: Float32) -> Float32:
+def _change_strength(change: Float32) -> Float32:
     away = change - untouched_change(change)
     strength: Float32 = np.sqrt(np.einsum("ijk,ijk->ij", away, away)).astype(np.float32)
     return strength

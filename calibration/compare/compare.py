@@ -17,12 +17,12 @@ import numpy as np
 
 from calibration.bundle import Calibration
 from calibration.compare import metrics
-from calibration.compare.alignment import Alignment, by_geometry, by_size, find_shift
+from calibration.compare.alignment import Alignment, align_by_geometry, align_by_size, find_shift
 from calibration.compare.scorer import Numbers, Pair, Scorer, surface_errors
-from calibration.compare.surfaces import GRID, SurfaceEstimate, estimate_surfaces, flat_surface
-from calibration.drift import without_drift
+from calibration.compare.surfaces import GRID, SurfaceEstimate, estimate_surfaces, undeformed_surface
+from calibration.drift import subtract_drift
 from calibration.errors import BadFrames
-from calibration.frame_set import Frame, FrameSet, touched_untouched
+from calibration.frame_set import Frame, FrameSet, find_touched_references
 from tacsim.control.contact_signal import CONTACT_HEIGHT
 from tacsim.interface import FloatArray, Image
 from tacsim.record.numbering import picture_numbers
@@ -104,7 +104,7 @@ class Comparison:
     pairs: tuple[Pair, ...]
     overall: dict[str, Overall]
     notes: tuple[str, ...]
-    names: tuple[str, str] = ("A", "B")  # or "simulated", "real": see :func:`sides`
+    names: tuple[str, str] = ("A", "B")  # or "simulated", "real": see :func:`side_names`
     surfaces_a: tuple[SurfaceEstimate | None, ...] | None = None  # surfaces of the pairs, aligned; None: not known
     surfaces_b: tuple[SurfaceEstimate | None, ...] | None = None
 
@@ -126,7 +126,7 @@ class Options:
     shift: bool | None = None  # look for the shift between the two; None: unless A is made in the pixels of B
 
 
-USUAL = Options()
+DEFAULT_OPTIONS = Options()
 
 
 def compare_frames(
@@ -134,7 +134,7 @@ def compare_frames(
     b: FrameSet,
     calibration_a: Calibration | None = None,
     calibration_b: Calibration | None = None,
-    options: Options = USUAL,
+    options: Options = DEFAULT_OPTIONS,
     on_pair: Callable[[int, int], None] = lambda done, total: None,
 ) -> Comparison:
     """Compares A with B.
@@ -143,13 +143,13 @@ def compare_frames(
     the surfaces that a simulation has recorded count. `on_pair` is given how many pairs are done, and
     how many there are. Raises BadFrames.
     """
-    names = sides(a, b)
-    couples, left = paired(a, b, options.pairing)
-    shift = not a.placed if options.shift is None else options.shift
-    alignment = _alignment(a, b, couples, calibration_a, calibration_b, shift=shift)
-    notes: list[str] = [*a.notes, *b.notes, *touched_untouched(a), *touched_untouched(b)]
-    found_a, said_a = estimate_surfaces(a, [frame for frame, _ in couples], calibration_a)
-    found_b, said_b = estimate_surfaces(b, [frame for _, frame in couples], calibration_b)
+    names = side_names(a, b)
+    frame_pairs, left = pair_frames(a, b, options.pairing)
+    shift = not a.same_pixels if options.shift is None else options.shift
+    alignment = _find_alignment(a, b, frame_pairs, calibration_a, calibration_b, shift=shift)
+    notes: list[str] = [*a.notes, *b.notes, *find_touched_references(a), *find_touched_references(b)]
+    found_a, said_a = estimate_surfaces(a, [frame for frame, _ in frame_pairs], calibration_a)
+    found_b, said_b = estimate_surfaces(b, [frame for _, frame in frame_pairs], calibration_b)
     if found_a is not None and found_b is not None and calibration_b is not None:
         moved = np.array(alignment.shift) * calibration_b.geometry.pixel_pitch / GRID.pitch
         found_a = tuple(None if each is None else each.moved(moved) for each in found_a)
@@ -164,31 +164,31 @@ def compare_frames(
         notes += [f"{side}: no surface where nothing can be measured: {why}" for side, why in unknown if why]
     scorer = Scorer(a, b, alignment, names)
     pairs = []
-    for k, (frame_a, frame_b) in enumerate(couples):
-        on_pair(k, len(couples))
+    for k, (frame_a, frame_b) in enumerate(frame_pairs):
+        on_pair(k, len(frame_pairs))
         surface_a, surface_b = (None if found is None else found[k] for found in (found_a, found_b))
-        pairs.append(scorer.pair(frame_a, frame_b, surface_a, surface_b))
-    floor, of_floor = _floor(scorer, b, pairs, calibration_b)
-    overall = {metric.key: _overall(metric, pairs, floor.get(metric.key, math.nan)) for metric in METRICS}
-    notes += [*left, *of_floor, *scorer.swapped()]
+        pairs.append(scorer.score_pair(frame_a, frame_b, surface_a, surface_b))
+    floor, of_floor = _noise_floor(scorer, b, pairs, calibration_b)
+    overall = {metric.key: _summarise_metric(metric, pairs, floor.get(metric.key, math.nan)) for metric in METRICS}
+    notes += [*left, *of_floor, *scorer.swap_warning()]
     if len(pairs) < MIN_PAIRS:
         words = "pair" if len(pairs) == 1 else "pairs"
         notes.append(f"{len(pairs)} {words}: too few for intervals; {MIN_PAIRS} are the least")
     return Comparison(a, b, alignment, tuple(pairs), overall, tuple(notes), names, found_a, found_b)
 
 
-def sides(a: FrameSet, b: FrameSet) -> tuple[str, str]:
+def side_names(a: FrameSet, b: FrameSet) -> tuple[str, str]:
     """What the two are called: simulated and real where one alone is known to be simulated, else A and B."""
     if a.simulated == b.simulated:
         return "A", "B"
     return ("simulated", "real") if a.simulated else ("real", "simulated")
 
 
-def paired(a: FrameSet, b: FrameSet, pairing: Pairing) -> tuple[list[tuple[Frame, Frame]], list[str]]:
+def pair_frames(a: FrameSet, b: FrameSet, pairing: Pairing) -> tuple[list[tuple[Frame, Frame]], list[str]]:
     """The frames that belong together, and notes on those left out. Raises BadFrames where that is ambiguous."""
     named_a, named_b = ({Path(frame.name).stem.lower(): frame for frame in each.frames} for each in (a, b))
     common = [name for name in named_a if name in named_b]
-    if a.placed and pairing is Pairing.auto:  # it says itself what it could not make
+    if a.same_pixels and pairing is Pairing.auto:  # it says itself what it could not make
         if not common:
             raise BadFrames(f"{a.name}: none of its frames could be made. " + "; ".join(a.notes))
         return [(named_a[name], named_b[name]) for name in common], []
@@ -204,7 +204,7 @@ def paired(a: FrameSet, b: FrameSet, pairing: Pairing) -> tuple[list[tuple[Frame
             f"{a.name} has {len(a.frames)} frames, {b.name} {len(b.frames)}: which belong together? {len(common)} "
             "names are in both; pair these alone with --pair name, or give both the same number of frames"
         )
-    if pairing is Pairing.auto and (odd := _other_numbers(a, b)):
+    if pairing is Pairing.auto and (odd := _describe_unpaired(a, b)):
         raise BadFrames(
             f"{odd}: a picture may be missing, and which belong together? Pair those with a name in common by --pair "
             "name, or, if the first belongs to the first and so on, say --pair order"
@@ -212,7 +212,7 @@ def paired(a: FrameSet, b: FrameSet, pairing: Pairing) -> tuple[list[tuple[Frame
     return list(zip(a.frames, b.frames, strict=True)), ["paired in order: the names differ"] if not same else []
 
 
-def _other_numbers(a: FrameSet, b: FrameSet) -> str:
+def _describe_unpaired(a: FrameSet, b: FrameSet) -> str:
     """Which numbers only one of two folders has in the names of its pictures, in words; empty where both have the same,
     none in common, or where names are not those of pictures."""
     names = [[Path(frame.name) for frame in each.frames] for each in (a, b)]
@@ -231,7 +231,7 @@ def _other_numbers(a: FrameSet, b: FrameSet) -> str:
     return "; ".join(parts)
 
 
-def bootstrap(values: FloatArray, seed: int = 0) -> tuple[float, float]:
+def bootstrap_interval(values: FloatArray, seed: int = 0) -> tuple[float, float]:
     """95 % interval of the mean of values (n,), by resampling; NaN for fewer than MIN_PAIRS."""
     if len(values) < MIN_PAIRS:
         return math.nan, math.nan
@@ -241,17 +241,17 @@ def bootstrap(values: FloatArray, seed: int = 0) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def _alignment(
+def _find_alignment(
     a: FrameSet,
     b: FrameSet,
-    couples: Sequence[tuple[Frame, Frame]],
+    frame_pairs: Sequence[tuple[Frame, Frame]],
     calibration_a: Calibration | None,
     calibration_b: Calibration | None,
     *,
     shift: bool,
 ) -> Alignment:
     if calibration_a is not None and calibration_b is not None:
-        alignment = by_geometry(calibration_a.geometry, calibration_b.geometry)
+        alignment = align_by_geometry(calibration_a.geometry, calibration_b.geometry)
         for side, shape, said in ((a, alignment.source, "A"), (b, alignment.shape, "B")):
             if side.shape != shape:
                 raise BadFrames(
@@ -259,24 +259,24 @@ def _alignment(
                     f"{shape[1]} x {shape[0]}; it belongs to another sensor or setting"
                 )
     else:
-        alignment = by_size(a.shape, b.shape)
-    if not alignment.covered.any():
+        alignment = align_by_size(a.shape, b.shape)
+    if not alignment.covered_mask.any():
         raise BadFrames("A shows no part of the gel that B shows; are these the right calibrations?")
     if not shift:
         return alignment.shifted((0.0, 0.0), "no shift is sought")
-    chosen = couples if len(couples) <= MAX_SHIFT_PAIRS else [
-        couples[int(k)] for k in np.linspace(0, len(couples) - 1, MAX_SHIFT_PAIRS)
+    chosen = frame_pairs if len(frame_pairs) <= MAX_SHIFT_PAIRS else [
+        frame_pairs[int(k)] for k in np.linspace(0, len(frame_pairs) - 1, MAX_SHIFT_PAIRS)
     ]  # fmt: skip
     base_a, base_b = alignment(a.reference), b.reference.astype(np.float32)
     level = b.reference.mean(axis=(0, 1))
     changes = (
-        (without_drift(alignment(one.image) - base_a, level), without_drift(other.image - base_b, level))
+        (subtract_drift(alignment(one.image) - base_a, level), subtract_drift(other.image - base_b, level))
         for one, other in chosen
     )
     return find_shift(changes, alignment)
 
 
-def _floor(
+def _noise_floor(
     scorer: Scorer, b: FrameSet, pairs: Sequence[Pair], calibration: Calibration | None
 ) -> tuple[Numbers, list[str]]:
     """What pictures of B without contact score against each other, where the pairs have contact; and a note."""
@@ -285,26 +285,28 @@ def _floor(
     if not frames or not touched:
         why = f"{scorer.names[1]} has no second frame without contact" if not frames else "no pair has contact"
         return {}, [f"noise floor absent: {why}"]
-    floor = _means([scorer.pictures(frame.image, b.reference, pair.region) for frame in frames for pair in touched])
+    floor = _mean_scores(
+        [scorer.score_images(frame.image, b.reference, pair.region) for frame in frames for pair in touched]
+    )
     found, _ = estimate_surfaces(b, frames, calibration)
     pressed, _ = estimate_surfaces(b, [pair.b for pair in touched], calibration)
     if found is not None and pressed is not None:
         known = [each for each in pressed if each is not None]
         regions = [metrics.pressed_region(each.height, CONTACT_HEIGHT) & each.valid for each in known]
         scores = [
-            surface_errors(still, flat_surface(still), where, each)
+            surface_errors(still, undeformed_surface(still), where, each)
             for still in found if still is not None
             for where, each in zip(regions, known, strict=True)
         ]  # fmt: skip
-        floor |= _means(scores) if scores else {}
+        floor |= _mean_scores(scores) if scores else {}
     return floor, [f"noise floor from {len(frames)} more frames of {scorer.names[1]} without contact"]
 
 
-def _means(scores: Sequence[Numbers]) -> Numbers:
-    return {key: _mean([score[key] for score in scores]) for key in scores[0]}
+def _mean_scores(scores: Sequence[Numbers]) -> Numbers:
+    return {key: _known_mean([score[key] for score in scores]) for key in scores[0]}
 
 
-def _overall(metric: Metric, pairs: Sequence[Pair], floor: float) -> Overall:
+def _summarise_metric(metric: Metric, pairs: Sequence[Pair], floor: float) -> Overall:
     values, nulls = (
         np.array([numbers.get(metric.key, math.nan) for numbers in side])
         for side in ([pair.numbers for pair in pairs], [pair.null for pair in pairs])
@@ -312,20 +314,20 @@ def _overall(metric: Metric, pairs: Sequence[Pair], floor: float) -> Overall:
     known = values[np.isfinite(values)]
     both = np.isfinite(values) & np.isfinite(nulls)
     gain = (values[both] - nulls[both]) * (1.0 if metric.more_is_better else -1.0)
-    surely = bootstrap(gain)[0]
-    low, high = bootstrap(known)
+    surely = bootstrap_interval(gain)[0]
+    low, high = bootstrap_interval(known)
     return Overall(
-        mean=_mean(values),
+        mean=_known_mean(values),
         low=low,
         high=high,
-        null=_mean(nulls),
+        null=_known_mean(nulls),
         floor=floor,
         better=float((gain > 0).mean()) if gain.size else math.nan,
         beats_null=None if math.isnan(surely) else surely > 0,
     )
 
 
-def _mean(values: Sequence[float] | FloatArray) -> float:
+def _known_mean(values: Sequence[float] | FloatArray) -> float:
     """Mean of what is known; NaN if nothing is. Infinite where one is: the PSNR of equal pictures."""
     array = np.asarray(values, dtype=np.float64)
     known = array[~np.isnan(array)]

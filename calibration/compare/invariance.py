@@ -22,7 +22,7 @@ from calibration.bundle import Calibration
 from calibration.compare import metrics
 from calibration.compare.compare import BOOTSTRAP_DRAWS, Comparison
 from calibration.compare.surfaces import GRID, estimate_surfaces
-from calibration.drift import without_drift
+from calibration.drift import subtract_drift
 from calibration.errors import BadFrames
 from tacsim.control.contact_signal import CONTACT_HEIGHT
 from tacsim.interface import FloatArray, Image
@@ -98,7 +98,7 @@ class Report:
     notes: tuple[str, ...]
 
 
-def invariance(
+def measure_invariance(
     folds: Sequence[tuple[Comparison, Calibration | None]],
     on_step: Callable[[int, int], None] = lambda done, total: None,
 ) -> Report:
@@ -121,9 +121,9 @@ def invariance(
             f"{count} pairs show contact in B; {MIN_PRESSES} are needed to tell how far two presses are apart"
         )
     radii = [patch.radius for one in touched for patch in one.values()]
-    half, words = _size(folds[0][1], radii)
+    half, words = _patch_size(folds[0][1], radii)
     parts = [
-        _patches(comparison, one, calibration, half)
+        _cut_patches(comparison, one, calibration, half)
         for (comparison, calibration), one in zip(folds, touched, strict=True)
         if one
     ]
@@ -134,25 +134,25 @@ def invariance(
         on_step(len(views), steps)
         of_a, of_b = (np.concatenate([part[name][side] for part in parts]) for side in (0, 1))
         signal = float(np.mean(np.concatenate([part[name][2] for part in parts])))
-        views.append(_view(name, of_a, of_b, signal, np.argsort(radii)))
+        views.append(_measure_view(name, of_a, of_b, signal, np.argsort(radii)))
     notes = [] if "height" in common else ["gradient and height are left out: no surfaces on both sides"]
     angle = math.nan
     drifts: list[DriftError] = []
     if any(comparison.surfaces_a is None or calibration is None for comparison, calibration in folds):
         notes.append("no drift table: it needs surfaces of A and the calibration of B")
     else:
-        angle = _angle(folds, touched, None, None)
+        angle = _mean_gradient_angle(folds, touched, None, None)
         for k, change in enumerate(CHANGES):
             on_step(len(views) + k, steps)
-            fresh = _angle(folds, touched, change, change)
-            stale = _angle(folds, touched, change, None)
+            fresh = _mean_gradient_angle(folds, touched, change, change)
+            stale = _mean_gradient_angle(folds, touched, change, None)
             drifts.append(DriftError(change, fresh - angle, stale - angle))
         if lost := [drift.change.name for drift in drifts if math.isnan(drift.stale) or math.isnan(drift.fresh)]:
             notes.append(f"no surface of B is found, so no drift is measured, after: {'; '.join(lost)}")
     return Report(count, tuple(views), words, angle, tuple(drifts), tuple(notes))
 
 
-def distances(of_a: FloatArray, of_b: FloatArray, order: NDArray[np.intp]) -> tuple[FloatArray, FloatArray]:
+def partner_distances(of_a: FloatArray, of_b: FloatArray, order: NDArray[np.intp]) -> tuple[FloatArray, FloatArray]:
     """(n,) of rows (n, d) of A and B that are partners, and (n - 1,) of rows of B that are neighbours in `order`."""
     return np.linalg.norm(of_a - of_b, axis=1), np.linalg.norm(np.diff(of_b[order], axis=0), axis=1)
 
@@ -199,11 +199,11 @@ def auc_interval(low: FloatArray, high: FloatArray, times: FloatArray) -> tuple[
     return float(below), float(above)
 
 
-def _view(name: str, of_a: FloatArray, of_b: FloatArray, signal: float, order: NDArray[np.intp]) -> Invariance:
+def _measure_view(name: str, of_a: FloatArray, of_b: FloatArray, signal: float, order: NDArray[np.intp]) -> Invariance:
     rng = np.random.default_rng(0)
     count = len(of_a)
     score_a, score_b = classifier_scores(of_a, of_b)
-    to_partner, steps = distances(of_a, of_b, order)
+    to_partner, steps = partner_distances(of_a, of_b, order)
     apart, step = float(np.median(to_partner)), float(np.median(steps))
     drawn = rng.integers(0, count, (BOOTSTRAP_DRAWS, count))
     below = np.median(steps[rng.integers(0, count - 1, (BOOTSTRAP_DRAWS, count - 1))], axis=1)
@@ -225,7 +225,7 @@ def _view(name: str, of_a: FloatArray, of_b: FloatArray, signal: float, order: N
     )
 
 
-def _size(calibration: Calibration | None, radii: Sequence[float]) -> tuple[float, str]:
+def _patch_size(calibration: Calibration | None, radii: Sequence[float]) -> tuple[float, str]:
     """Half the side of the patch [px], and how large that is in words."""
     if calibration is not None:
         return PATCH_SIDE / 2 / calibration.geometry.pixel_pitch, f"{PATCH_SIDE * 1e3:g} mm"
@@ -233,7 +233,7 @@ def _size(calibration: Calibration | None, radii: Sequence[float]) -> tuple[floa
     return half, f"{2 * half:.0f} px: {PATCH_SIDE_RADII:g} radii of the usual contact region"
 
 
-def _patches(
+def _cut_patches(
     comparison: Comparison,
     touched: dict[int, metrics.Patch],
     calibration: Calibration | None,
@@ -246,23 +246,23 @@ def _patches(
     for k, patch in touched.items():
         pair, x, y = comparison.pairs[k], patch.x, patch.y
         seen_a, seen_b = comparison.alignment(pair.a.image), pair.b.image.astype(np.float32)
-        still = _cut(b0, x, y, half)
-        differences = without_drift(seen_a - a0, level), without_drift(seen_b - b0, level)
+        still = _cut_patch(b0, x, y, half)
+        differences = subtract_drift(seen_a - a0, level), subtract_drift(seen_b - b0, level)
         for view, one, other in (("raw", seen_a, seen_b), ("difference", *differences)):
-            cut = _cut(other, x, y, half)
+            cut = _cut_patch(other, x, y, half)
             zero = still if view == "raw" else 0.0
-            _add(found[view], _cut(one, x, y, half), cut, cut - zero)
+            _add_patches(found[view], _cut_patch(one, x, y, half), cut, cut - zero)
         surfaces = comparison.surfaces(k)
         if surfaces is None:
             continue
-        at_x, at_y, reach = _in_cells(comparison, k, calibration, x, y)
+        at_x, at_y, reach = _patch_in_cells(comparison, k, calibration, x, y)
         surface_a, surface_b = surfaces
         for view, one, other in (
             ("gradient", surface_a.gradient, surface_b.gradient),
             ("height", surface_a.height, surface_b.height),
         ):
-            cut = _cut(other, at_x, at_y, reach)
-            _add(found[view], _cut(one, at_x, at_y, reach), cut, cut)
+            cut = _cut_patch(other, at_x, at_y, reach)
+            _add_patches(found[view], _cut_patch(one, at_x, at_y, reach), cut, cut)
     return {
         view: (np.array(of_a), np.array(of_b), np.array(signals))
         for view, (of_a, of_b, signals) in found.items()
@@ -270,7 +270,7 @@ def _patches(
     }
 
 
-def _add(
+def _add_patches(
     to: tuple[list[FloatArray], list[FloatArray], list[float]], a: FloatArray, b: FloatArray, change: FloatArray
 ) -> None:
     to[0].append(a)
@@ -278,7 +278,7 @@ def _add(
     to[2].append(float(np.linalg.norm(change)))
 
 
-def _in_cells(
+def _patch_in_cells(
     comparison: Comparison, k: int, calibration: Calibration | None, x: float, y: float
 ) -> tuple[float, float, float]:
     """Centre of the patch of pair k on the canonical grid, and half its side [cells]."""
@@ -286,14 +286,14 @@ def _in_cells(
     if calibration is None:  # both surfaces were recorded
         surfaces = comparison.surfaces(k)
         assert surfaces is not None
-        patch = metrics.patch_of(metrics.pressed_region(surfaces[1].height, CONTACT_HEIGHT))
+        patch = metrics.circle_of_region(metrics.pressed_region(surfaces[1].height, CONTACT_HEIGHT))
         return (patch.x, patch.y, reach) if patch is not None else (GRID.columns / 2, GRID.rows / 2, reach)
     u0, v0 = calibration.geometry.principal
     scale = calibration.geometry.pixel_pitch / GRID.pitch
     return (x - u0) * scale + (GRID.columns - 1) / 2, (y - v0) * scale + (GRID.rows - 1) / 2, reach
 
 
-def _cut(field: NDArray[np.float32], x: float, y: float, half: float) -> FloatArray:
+def _cut_patch(field: NDArray[np.float32], x: float, y: float, half: float) -> FloatArray:
     """(d,) values of a square patch of a field (H, W[, n]) round x, y, as far as `half` each way."""
     import cv2
 
@@ -307,7 +307,7 @@ def _cut(field: NDArray[np.float32], x: float, y: float, half: float) -> FloatAr
     return np.asarray(cut, dtype=np.float64).ravel()
 
 
-def _angle(
+def _mean_gradient_angle(
     folds: Sequence[tuple[Comparison, Calibration | None]],
     touched: Sequence[dict[int, metrics.Patch]],
     change: Change | None,
@@ -325,7 +325,7 @@ def _angle(
         found, _ = estimate_surfaces(replace(comparison.b, reference=reference), frames, calibration)
         assert found is not None  # there is a calibration
         angles += [
-            metrics.gradient_angle(
+            metrics.mean_normal_angle(
                 seen.gradient, other.gradient, metrics.pressed_region(seen.height, CONTACT_HEIGHT) & other.valid
             )
             for seen, other in zip(truth, found, strict=True)

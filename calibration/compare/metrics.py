@@ -18,7 +18,7 @@ Picture = NDArray[np.uint8] | NDArray[np.floating]
 
 WHITE = 255.0  # grey level
 WINDOW = 7  # side of the window of SSIM [px]
-GRAIN = 1.0  # what a Gaussian of this deviation takes away is grain [px]
+GRAIN_DEVIATION = 1.0  # what a Gaussian of this deviation takes away is grain [px]
 CONTACT_BLUR = 2.0  # of a change of colour before contact is looked for in it, against noise [px]
 # A smoothed change shows contact beyond the largest of
 MIN_CHANGE = 5.0  # [grey levels]
@@ -26,7 +26,7 @@ MIN_CHANGE_TO_NOISE = 6.0  # times the noise of the picture
 MIN_CHANGE_SHARE = 0.25  # of the strongest change
 MEDIAN_PIXELS = 10000  # enough for a median
 MIN_PATCH = 30  # a smaller patch is dirt [px]
-CLOSING = 3  # radius of gaps in a contact that are closed [px]
+CLOSING_RADIUS = 3  # radius of gaps in a contact that are closed [px]
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,12 +40,12 @@ class Patch:
 
 def mean_absolute_error(one: Picture, other: Picture, where: Mask | None = None) -> float:
     """Mean |one - other| over pixels and channels [grey levels]."""
-    return _mean(np.abs(_difference(one, other)), where)
+    return _masked_mean(np.abs(_masked_difference(one, other)), where)
 
 
 def peak_signal_to_noise(one: Picture, other: Picture, where: Mask | None = None) -> float:
     """10 log10(255^2 / mean square error) [dB]; infinite for equal pictures."""
-    square = _mean(_difference(one, other) ** 2, where)
+    square = _masked_mean(_masked_difference(one, other) ** 2, where)
     if math.isnan(square):
         return math.nan
     return 10.0 * math.log10(WHITE**2 / square) if square > 0 else math.inf
@@ -81,10 +81,10 @@ def structural_similarity(one: Picture, other: Picture, where: Mask | None = Non
     if where is None:
         rim = WINDOW // 2
         return float(similarity[rim:-rim, rim:-rim].mean())
-    return _mean(similarity, where)
+    return _masked_mean(similarity, where)
 
 
-def correlation(one: Picture, other: Picture, where: Mask | None = None) -> float:
+def image_correlation(one: Picture, other: Picture, where: Mask | None = None) -> float:
     """Pearson's correlation of two changes of colour (normalised cross-correlation without shift), over pixels and
     channels; 0 if either does not vary."""
     _require_alike(one, other)
@@ -96,16 +96,18 @@ def correlation(one: Picture, other: Picture, where: Mask | None = None) -> floa
     return float(a @ b) / power if power > 1e-9 * a.size else 0.0
 
 
-def grain(change: Picture, where: Mask) -> float:
+def grain_deviation(change: Picture, where: Mask) -> float:
     """Standard deviation of what is finer than GRAIN pixels in a change of colour [grey levels]: noise, and texture of
     the skin."""
     import cv2
 
     picture = np.asarray(change, dtype=np.float32)
-    return math.sqrt(_mean(np.asarray(picture - cv2.GaussianBlur(picture, (0, 0), GRAIN), np.float64) ** 2, where))
+    return math.sqrt(
+        _masked_mean(np.asarray(picture - cv2.GaussianBlur(picture, (0, 0), GRAIN_DEVIATION), np.float64) ** 2, where)
+    )
 
 
-def gradient_angle(one: NDArray[np.floating], other: NDArray[np.floating], where: Mask | None = None) -> float:
+def mean_normal_angle(one: NDArray[np.floating], other: NDArray[np.floating], where: Mask | None = None) -> float:
     """Mean angle between the surface normals of two fields of slopes (h, w, 2) [degrees]."""
     a, b = (np.asarray(slopes, dtype=np.float64) for slopes in (one, other))
     if a.shape != b.shape or a.ndim != 3 or a.shape[2] != 2:
@@ -113,15 +115,15 @@ def gradient_angle(one: NDArray[np.floating], other: NDArray[np.floating], where
     # by the cross product too: the arc cosine alone loses angles below 1e-6
     dot = 1.0 + (a * b).sum(axis=-1)
     cross = np.stack([b[..., 1] - a[..., 1], a[..., 0] - b[..., 0], a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]])
-    return _mean(np.degrees(np.arctan2(np.sqrt((cross**2).sum(axis=0)), dot)), where)
+    return _masked_mean(np.degrees(np.arctan2(np.sqrt((cross**2).sum(axis=0)), dot)), where)
 
 
 def height_error(one: NDArray[np.floating], other: NDArray[np.floating], where: Mask | None = None) -> float:
     """Root mean square difference of two height maps (h, w), in their unit."""
-    return math.sqrt(_mean(_difference(one, other) ** 2, where))
+    return math.sqrt(_masked_mean(_masked_difference(one, other) ** 2, where))
 
 
-def overlap(one: Mask, other: Mask) -> float:
+def intersection_over_union(one: Mask, other: Mask) -> float:
     """Intersection over union of two masks; NaN if both are empty."""
     _require_alike(one, other)
     union = int((one | other).sum())
@@ -131,7 +133,7 @@ def overlap(one: Mask, other: Mask) -> float:
 def end_point_error(one: NDArray[np.floating], other: NDArray[np.floating]) -> float:
     """Mean distance of the ends of two displacement fields (m, n, 2) of the same markers, in their unit. A marker that
     either has not found (NaN) is left out."""
-    return _mean(np.sqrt((_difference(one, other) ** 2).sum(axis=-1)), None)
+    return _masked_mean(np.sqrt((_masked_difference(one, other) ** 2).sum(axis=-1)), None)
 
 
 def contact_region(change: NDArray[np.floating]) -> Mask:
@@ -151,8 +153,10 @@ def contact_region(change: NDArray[np.floating]) -> Mask:
     noise = 1.4826 * float(np.median(strength[strength <= np.median(strength)]))
     share = MIN_CHANGE_SHARE * float(np.percentile(strength, 99.8))
     found = strength > max(MIN_CHANGE, MIN_CHANGE_TO_NOISE * noise, share)
-    padded = np.pad(found, CLOSING)  # closing erodes what touches the border
-    closed = binary_closing(padded, iterations=CLOSING)[CLOSING:-CLOSING, CLOSING:-CLOSING]
+    padded = np.pad(found, CLOSING_RADIUS)  # closing erodes what touches the border
+    closed = binary_closing(padded, iterations=CLOSING_RADIUS)[
+        CLOSING_RADIUS:-CLOSING_RADIUS, CLOSING_RADIUS:-CLOSING_RADIUS
+    ]
     parts, _ = label(binary_fill_holes(closed | found))
     sizes = np.bincount(parts.ravel())
     sizes[0] = 0
@@ -168,14 +172,14 @@ def untouched_change(change: NDArray[np.floating]) -> NDArray[np.floating]:
     return np.asarray(np.median(pixels[away <= np.median(away)], axis=0))
 
 
-def pressed_region(height: NDArray[np.floating], least: float) -> Mask:
-    """(h, w) where a surface is pressed in by more than half of its depth, if that is deeper than `least` (same unit).
-    Under a ball on a half-space this is the contact circle (Hertz: half the depth at its rim)."""
+def pressed_region(height: NDArray[np.floating], min_depth: float) -> Mask:
+    """(h, w) where a surface is pressed in by more than half of its depth, if that is deeper than `min_depth` (same
+    unit). Under a ball on a half-space this is the contact circle (Hertz: half the depth at its rim)."""
     deepest = float(height.max(initial=0.0))
-    return np.asarray(height > 0.5 * deepest) if deepest > least else np.zeros(height.shape, dtype=np.bool_)
+    return np.asarray(height > 0.5 * deepest) if deepest > min_depth else np.zeros(height.shape, dtype=np.bool_)
 
 
-def patch_of(region: Mask) -> Patch | None:
+def circle_of_region(region: Mask) -> Patch | None:
     """The circle of a region (H, W) [px]; None when it is empty."""
     rows, columns = np.nonzero(region)
     if len(rows) == 0:
@@ -188,12 +192,12 @@ def _require_alike(one: NDArray[np.generic], other: NDArray[np.generic]) -> None
         raise ValueError(f"shapes differ: {one.shape} and {other.shape}; align them first")
 
 
-def _difference(one: NDArray[np.generic], other: NDArray[np.generic]) -> FloatArray:
+def _masked_difference(one: NDArray[np.generic], other: NDArray[np.generic]) -> FloatArray:
     _require_alike(one, other)
     return np.asarray(one, dtype=np.float64) - np.asarray(other, dtype=np.float64)
 
 
-def _mean(values: FloatArray, where: Mask | None) -> float:
+def _masked_mean(values: FloatArray, where: Mask | None) -> float:
     chosen = values if where is None else values[where]
     known = chosen[np.isfinite(chosen)]
     return float(known.mean()) if known.size else math.nan

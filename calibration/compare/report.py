@@ -1,5 +1,5 @@
 """A comparison as files: compare.json, compare.csv, and compare.html (one file, nothing from outside); the
-judgement in one sentence."""
+describe_comparison in one sentence."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from calibration.compare.invariance import CHANGES, VIEWS, Report
 from tacsim.interface import Image
 from tacsim.report.report import data_url, finite, render_page
 
-MAX_PICTURED = 24  # pairs with pictures, the worst first
+MAX_PAIR_IMAGES = 24  # pairs with pictures, the worst first
 THUMBNAIL = 240  # longer side [px]
 ZOOM_MARGIN = 0.3  # of the contact's width, that a zoomed picture shows round it
 JPEG_QUALITY = 85
-WORST_BY = "contact_mae"
+RANKING_METRIC = "contact_mae"
 FORMAT = 1
 
 CONTACT_MASK = (
@@ -34,38 +34,38 @@ CONTACT_MASK = (
 FILES = ("compare.json", "compare.csv", "compare.html")
 CLOSE_CORRELATION = 0.95  # of the change of colour in contact, from which two sources look alike ...
 CLOSE_SHARE = 0.25  # ... if their error there also is no larger share of what a picture without contact would score
-SOURCE_NAMES = {"simulated": "the simulation", "real": "the real sensor"}
+SIDE_NAMES = {"simulated": "the simulation", "real": "the real sensor"}
 
 
-def figures(comparison: Comparison, report: Report | None = None) -> dict[str, float]:
+def comparison_figures(comparison: Comparison, report: Report | None = None) -> dict[str, float]:
     """All figures that a threshold may name; NaN where not known. Units as in the JSON file."""
     found = {key: overall.mean for key, overall in comparison.overall.items()}
     for view in report.views if report else ():
         found |= {f"rho_{view.view}": view.rho, f"auc_{view.view}": view.auc, f"auc_low_{view.view}": view.auc_low}
     for drift in report.drifts if report else ():
         found |= {f"drift_{drift.change.key}": drift.fresh, f"stale_{drift.change.key}": drift.stale}
-    return {name: found.get(name, math.nan) for name in names()}
+    return {name: found.get(name, math.nan) for name in figure_names()}
 
 
-def names() -> list[str]:
+def figure_names() -> list[str]:
     """The names of all figures."""
     views = [f"{what}_{view}" for view in VIEWS for what in ("rho", "auc", "auc_low")]
     drifts = [f"{what}_{change.key}" for change in CHANGES for what in ("drift", "stale")]
     return [*(metric.key for metric in METRICS), *views, *drifts]
 
 
-def as_json(comparison: Comparison, report: Report | None = None) -> dict[str, Any]:
+def comparison_as_json(comparison: Comparison, report: Report | None = None) -> dict[str, Any]:
     """Everything as JSON: lengths in m, angles in degrees, contact radius and centroid in pixels of B; what is not
     known is null."""
     return {
         "format": FORMAT,
-        "judgement": judgement(comparison),
+        "describe_comparison": describe_comparison(comparison),
         "a": {"name": comparison.a.name, "is": comparison.names[0], "reference": comparison.a.reference_from},
         "b": {"name": comparison.b.name, "is": comparison.names[1], "reference": comparison.b.reference_from},
         "units": {metric.key: metric.si for metric in METRICS},
-        "alignment": {"said": comparison.alignment.said, "shift": list(comparison.alignment.shift)},
+        "alignment": {"said": comparison.alignment.description, "shift": list(comparison.alignment.shift)},
         "notes": list(comparison.notes),
-        "overall": {key: _known(overall) for key, overall in comparison.overall.items()},
+        "overall": {key: _known_fields(overall) for key, overall in comparison.overall.items()},
         "pairs": [
             {
                 "a": pair.a.name,
@@ -81,7 +81,7 @@ def as_json(comparison: Comparison, report: Report | None = None) -> dict[str, A
         else {
             "presses": report.presses,
             "patch": report.patch,
-            "views": {view.view: _known(view, leave="view") for view in report.views},
+            "views": {view.view: _known_fields(view, leave="view") for view in report.views},
             "gradient_angle": finite(report.angle),
             "drift": {
                 drift.change.key: {"fresh": finite(drift.fresh), "stale": finite(drift.stale)}
@@ -92,28 +92,28 @@ def as_json(comparison: Comparison, report: Report | None = None) -> dict[str, A
     }
 
 
-def write(folder: Path, comparison: Comparison, report: Report | None = None) -> list[Path]:
+def write_comparison(folder: Path, comparison: Comparison, report: Report | None = None) -> list[Path]:
     """Writes the three files into `folder`, which exists, and returns their paths. Raises OSError."""
     paths = [folder / name for name in FILES]
-    text = json.dumps(as_json(comparison, report), indent=1, allow_nan=False)
+    text = json.dumps(comparison_as_json(comparison, report), indent=1, allow_nan=False)
     paths[0].write_text(text + "\n", encoding="utf-8")
     _write_csv(paths[1], comparison)
-    paths[2].write_text(_html(comparison, report), encoding="utf-8")
+    paths[2].write_text(_render_html(comparison, report), encoding="utf-8")
     return paths
 
 
-def rows(comparison: Comparison) -> list[tuple[Metric, Overall]]:
+def known_metrics(comparison: Comparison) -> list[tuple[Metric, Overall]]:
     """The metrics that are known of at least one pair."""
     found = ((metric, comparison.overall[metric.key]) for metric in METRICS)
     return [(metric, overall) for metric, overall in found if not math.isnan(overall.mean)]
 
 
-def shown(value: float, metric: Metric) -> str:
+def format_metric(value: float, metric: Metric) -> str:
     """A number in the metric's unit for people; a dash where it is not known."""
     return "–" if math.isnan(value) else "∞" if math.isinf(value) else f"{value * metric.scale:.{metric.digits}f}"
 
 
-def verdict(overall: Overall) -> str:
+def describe_against_null(overall: Overall) -> str:
     """Against the null, in a word."""
     if overall.beats_null is None:
         return "–"
@@ -128,48 +128,48 @@ def _write_csv(path: Path, comparison: Comparison) -> None:
         for pair in comparison.pairs:
             numbers = [*(pair.numbers.get(key) for key in keys), *(pair.null.get(key) for key in keys)]
             cells = ["" if (value := finite(number)) is None else repr(value) for number in numbers]
-            writer.writerow([_harmless(pair.a.name), _harmless(pair.b.name), *cells, "; ".join(pair.flags)])
+            writer.writerow([_escape_formula(pair.a.name), _escape_formula(pair.b.name), *cells, "; ".join(pair.flags)])
 
 
-def _harmless(name: str) -> str:
+def _escape_formula(name: str) -> str:
     """A file's name that no spreadsheet takes for a formula."""
     return f"'{name}" if name[:1] in "=+-@\t\r" else name
 
 
-def _html(comparison: Comparison, report: Report | None) -> str:
+def _render_html(comparison: Comparison, report: Report | None) -> str:
     def worst(k: int) -> float:
-        value = comparison.pairs[k].numbers[WORST_BY]
+        value = comparison.pairs[k].numbers[RANKING_METRIC]
         return -math.inf if math.isnan(value) else value
 
     order = sorted(range(len(comparison.pairs)), key=worst, reverse=True)
-    known = rows(comparison)
+    known = known_metrics(comparison)
     columns = [metric for metric, _ in known if metric.key not in ("psnr", "contact_psnr", "mae", "ssim")]
     return render_page(
         Path(__file__).with_name("comparison.html.jinja"),
         comparison=comparison,
         report=report,
-        judgement=judgement(comparison),
+        describe_comparison=describe_comparison(comparison),
         mask=CONTACT_MASK,
         rows=known,
         columns=columns,
-        shown=shown,
-        verdict=verdict,
+        shown=format_metric,
+        verdict=describe_against_null,
         number=lambda value, digits=2: "–" if math.isnan(value) else f"{value:.{digits}f}",
-        pairs=[(comparison.pairs[k], _pictures(comparison, k)) for k in order[:MAX_PICTURED]],
-        rest=[comparison.pairs[k] for k in order[MAX_PICTURED:]],
+        pairs=[(comparison.pairs[k], _pair_images(comparison, k)) for k in order[:MAX_PAIR_IMAGES]],
+        rest=[comparison.pairs[k] for k in order[MAX_PAIR_IMAGES:]],
         nan=math.nan,
     )
 
 
-def _pictures(comparison: Comparison, k: int) -> list[tuple[str, str]]:
+def _pair_images(comparison: Comparison, k: int) -> list[tuple[str, str]]:
     """Captions and pictures (data URLs) of a pair."""
     pair = comparison.pairs[k]
     a, b = comparison.aligned(pair.a.image), pair.b.image
     base_a, base_b = comparison.aligned(comparison.a.reference), comparison.b.reference
-    change_a, change_b = (_grey(one, base) for one, base in ((a, base_a), (b, base_b)))
+    change_a, change_b = (_grey_image(one, base) for one, base in ((a, base_a), (b, base_b)))
     error = np.abs(a.astype(np.float32) - b).mean(axis=2)
     name_a, name_b = comparison.names
-    near = _near(pair.region)
+    near = _contact_box(pair.region)
     found = [
         (f"{name_b}, whole", b),
         (name_a, a[near]),
@@ -177,18 +177,18 @@ def _pictures(comparison: Comparison, k: int) -> list[tuple[str, str]]:
         (f"{name_a} − its reference", change_a[near]),
         (f"{name_b} − its reference", change_b[near]),
         (f"|{name_a} − {name_b}|, 0 to 64 grey; contact outlined",
-         _outlined(_coloured(error, 64.0), pair.region)[near]),
+         _outline_region(_false_colours(error, 64.0), pair.region)[near]),
     ]  # fmt: skip
     surfaces = comparison.surfaces(k)
     if surfaces is not None:
         height_a, height_b = (surface.height for surface in surfaces)
         deepest = max(float(height_a.max()), float(height_b.max()), 1e-6)
-        found += [(f"height of {side}, 0 to {deepest * 1e3:.2f} mm", _coloured(height, deepest))
+        found += [(f"height of {side}, 0 to {deepest * 1e3:.2f} mm", _false_colours(height, deepest))
                   for side, height in ((name_a, height_a), (name_b, height_b))]  # fmt: skip
-    return [(caption, _inline(picture)) for caption, picture in found]
+    return [(caption, _data_url(picture)) for caption, picture in found]
 
 
-def _near(region: NDArray[np.bool_]) -> tuple[slice, slice]:
+def _contact_box(region: NDArray[np.bool_]) -> tuple[slice, slice]:
     """Rows and columns of the largest contact of a region (H, W) and what lies round it; of the whole picture without
     contact."""
     from scipy.ndimage import label
@@ -205,12 +205,12 @@ def _near(region: NDArray[np.bool_]) -> tuple[slice, slice]:
     return down, across
 
 
-def _grey(image: Image, base: Image) -> Image:
+def _grey_image(image: Image, base: Image) -> Image:
     grey: Image = np.clip(128.0 + (image.astype(np.float32) - base), 0, 255).astype(np.uint8)
     return grey
 
 
-def _coloured(field: NDArray[np.floating], full: float) -> Image:
+def _false_colours(field: NDArray[np.floating], full: float) -> Image:
     """(H, W, 3) false colours of a field from 0 to `full`."""
     import cv2
 
@@ -218,7 +218,7 @@ def _coloured(field: NDArray[np.floating], full: float) -> Image:
     return np.asarray(cv2.applyColorMap(level, cv2.COLORMAP_INFERNO)[..., ::-1], dtype=np.uint8)
 
 
-def _outlined(picture: Image, region: NDArray[np.bool_]) -> Image:
+def _outline_region(picture: Image, region: NDArray[np.bool_]) -> Image:
     from scipy.ndimage import binary_dilation
 
     marked = picture.copy()
@@ -226,7 +226,7 @@ def _outlined(picture: Image, region: NDArray[np.bool_]) -> Image:
     return marked
 
 
-def _inline(picture: Image) -> str:
+def _data_url(picture: Image) -> str:
     import cv2
 
     rows_, columns = picture.shape[:2]
@@ -238,16 +238,16 @@ def _inline(picture: Image) -> str:
     return data_url(data.tobytes(), "jpeg")
 
 
-def _known(record: Any, leave: str = "") -> dict[str, Any]:
+def _known_fields(record: Any, leave: str = "") -> dict[str, Any]:
     """The fields of a flat record, NaN and infinity as None."""
     fields: Iterable[str] = record.__slots__
     values = ((name, getattr(record, name)) for name in fields if name != leave)
     return {name: finite(value) if isinstance(value, float) else value for name, value in values}
 
 
-def judgement(comparison: Comparison) -> str:
+def describe_comparison(comparison: Comparison) -> str:
     """Whether A looks like B in contact, and by how many grey levels and degrees."""
-    a, b = (SOURCE_NAMES.get(name, name) for name in comparison.names)
+    a, b = (SIDE_NAMES.get(name, name) for name in comparison.names)
     error, alike = comparison.overall["contact_mae"], comparison.overall["contact_ncc"].mean
     if math.isnan(error.mean):
         return "No pair shows contact, so nothing can be judged."

@@ -9,8 +9,8 @@ import numpy as np
 
 from calibration.compare import metrics
 from calibration.compare.alignment import Alignment
-from calibration.compare.surfaces import GRID, SurfaceEstimate, flat_surface
-from calibration.drift import without_drift
+from calibration.compare.surfaces import GRID, SurfaceEstimate, undeformed_surface
+from calibration.drift import subtract_drift
 from calibration.frame_set import Frame, FrameSet, frame_warnings
 from tacsim.control.contact_signal import CONTACT_HEIGHT
 from tacsim.interface import Mask
@@ -39,41 +39,45 @@ class Scorer:
 
     def __init__(self, a: FrameSet, b: FrameSet, alignment: Alignment, names: tuple[str, str]) -> None:
         self._b, self._alignment, self.names = b, alignment, names
-        self._covered = alignment.covered
+        self._covered = alignment.covered_mask
         self._whole = None if self._covered.all() else self._covered
         self._reference_a = alignment(a.reference)
         self._plain: list[float] = []  # correlations of the pairs as they are, and with red and blue exchanged
         self._swapped: list[float] = []
 
-    def pair(self, a: Frame, b: Frame, surface_a: SurfaceEstimate | None, surface_b: SurfaceEstimate | None) -> Pair:
+    def score_pair(
+        self, a: Frame, b: Frame, surface_a: SurfaceEstimate | None, surface_b: SurfaceEstimate | None
+    ) -> Pair:
         seen_a, seen_b = self._alignment(a.image), b.image.astype(np.float32)
         change_a, change_b = seen_a - self._reference_a, seen_b - self._b.reference
         contact_a, contact_b = (
-            metrics.contact_region(without_drift(change, self._b.reference.mean(axis=(0, 1)))) & self._covered
+            metrics.contact_region(subtract_drift(change, self._b.reference.mean(axis=(0, 1)))) & self._covered
             for change in (change_a, change_b)
         )
         region = contact_a | contact_b
-        numbers = self.pictures(seen_a, seen_b, region) | _contacts(contact_a, contact_b)
-        numbers["contact_ncc"] = metrics.correlation(change_a, change_b, region)
-        grain_b = self._grain(change_b, region)
-        numbers |= {key: abs(value - grain_b[key]) for key, value in self._grain(change_a, region).items()}
-        null = self.pictures(self._reference_a, seen_b, region) | _contacts(np.zeros_like(contact_b), contact_b)
-        null["contact_ncc"] = metrics.correlation(np.zeros_like(change_b), change_b, region)
+        numbers = self.score_images(seen_a, seen_b, region) | _contact_regions(contact_a, contact_b)
+        numbers["contact_ncc"] = metrics.image_correlation(change_a, change_b, region)
+        grain_b = self._grain_deviations(change_b, region)
+        numbers |= {key: abs(value - grain_b[key]) for key, value in self._grain_deviations(change_a, region).items()}
+        null = self.score_images(self._reference_a, seen_b, region) | _contact_regions(
+            np.zeros_like(contact_b), contact_b
+        )
+        null["contact_ncc"] = metrics.image_correlation(np.zeros_like(change_b), change_b, region)
         null |= grain_b  # the reference against itself has none
         if surface_a is not None and surface_b is not None:
-            numbers |= self._surfaces(surface_a, surface_b, surface_a)
-            null |= self._surfaces(flat_surface(surface_b), surface_b, surface_a)
+            numbers |= self._score_surfaces(surface_a, surface_b, surface_a)
+            null |= self._score_surfaces(undeformed_surface(surface_b), surface_b, surface_a)
         if region.any():
             self._plain.append(numbers["contact_ncc"])
-            self._swapped.append(metrics.correlation(change_a[..., ::-1], change_b, region))
+            self._swapped.append(metrics.image_correlation(change_a[..., ::-1], change_b, region))
         reference_b = self._b.reference.astype(np.float32)
         flags = [
             *(f"{self.names[0]}: {words}" for words in frame_warnings(seen_a, self._reference_a, contact_a)),
             *(f"{self.names[1]}: {words}" for words in frame_warnings(seen_b, reference_b, contact_b)),
         ]
-        return Pair(a, b, numbers, null, tuple(flags), region, metrics.patch_of(contact_b))
+        return Pair(a, b, numbers, null, tuple(flags), region, metrics.circle_of_region(contact_b))
 
-    def pictures(self, one: metrics.Picture, other: metrics.Picture, region: Mask) -> Numbers:
+    def score_images(self, one: metrics.Picture, other: metrics.Picture, region: Mask) -> Numbers:
         """Of two pictures whose contact is `region`."""
         similarity = metrics.similarity_map(one, other)
         rim = metrics.WINDOW // 2
@@ -89,18 +93,23 @@ class Scorer:
             "contact_ssim": float(similarity[region].mean()) if region.any() else math.nan,
         }
 
-    def _grain(self, change: metrics.Picture, region: Mask) -> Numbers:
+    def _grain_deviations(self, change: metrics.Picture, region: Mask) -> Numbers:
         """How grainy a change of colour is, beside a contact `region` and in it, border left out [grey levels]."""
         from scipy.ndimage import binary_dilation, binary_erosion
 
         beside = self._covered & ~binary_dilation(region, iterations=GRAIN_MARGIN)
         inside = binary_erosion(region, iterations=GRAIN_MARGIN)
-        return {"grain": metrics.grain(change, beside), "contact_grain": metrics.grain(change, inside)}
+        return {
+            "grain": metrics.grain_deviation(change, beside),
+            "contact_grain": metrics.grain_deviation(change, inside),
+        }
 
-    def _surfaces(self, a: SurfaceEstimate, b: SurfaceEstimate, shown: SurfaceEstimate) -> Numbers:
-        """Of A's surface against B's, where B or `shown` is pressed."""
-        pressed_a, pressed_b, of_shown = (metrics.pressed_region(t.height, CONTACT_HEIGHT) for t in (a, b, shown))
-        pressed = _contacts(pressed_a, pressed_b)
+    def _score_surfaces(self, a: SurfaceEstimate, b: SurfaceEstimate, other_surface: SurfaceEstimate) -> Numbers:
+        """Of A's surface against B's, where B or `other_surface` is pressed."""
+        pressed_a, pressed_b, of_shown = (
+            metrics.pressed_region(t.height, CONTACT_HEIGHT) for t in (a, b, other_surface)
+        )
+        pressed = _contact_regions(pressed_a, pressed_b)
         no_flow = a.flow is None or b.flow is None or a.flow.shape != b.flow.shape
         return surface_errors(a, b, (of_shown | pressed_b) & b.valid, b) | {
             "surface_iou": pressed["contact_iou"],
@@ -109,7 +118,7 @@ class Scorer:
             "marker_error": math.nan if no_flow else metrics.end_point_error(np.asarray(a.flow), np.asarray(b.flow)),
         }
 
-    def swapped(self) -> list[str]:
+    def swap_warning(self) -> list[str]:
         """A warning if the pairs agree better with red and blue exchanged."""
         plain, swapped = (float(np.mean(values)) if values else 0.0 for values in (self._plain, self._swapped))
         if swapped > 0.5 and swapped > plain + SWAPPED_GAIN:
@@ -125,17 +134,17 @@ def surface_errors(a: SurfaceEstimate, b: SurfaceEstimate, where: Mask, pressed:
     error = metrics.height_error(a.height, b.height, where)
     deepest = float(pressed.height.max(initial=0.0))
     return {
-        "gradient_angle": metrics.gradient_angle(a.gradient, b.gradient, where),
+        "gradient_angle": metrics.mean_normal_angle(a.gradient, b.gradient, where),
         "height_rmse": error,
         "height_share": error / deepest if deepest > CONTACT_HEIGHT else math.nan,
     }
 
 
-def _contacts(a: Mask, b: Mask) -> Numbers:
-    patch_a, patch_b = metrics.patch_of(a), metrics.patch_of(b)
+def _contact_regions(a: Mask, b: Mask) -> Numbers:
+    patch_a, patch_b = metrics.circle_of_region(a), metrics.circle_of_region(b)
     radius = abs((patch_a.radius if patch_a else 0.0) - (patch_b.radius if patch_b else 0.0))
     return {
-        "contact_iou": metrics.overlap(a, b),
+        "contact_iou": metrics.intersection_over_union(a, b),
         "contact_radius": radius if patch_a or patch_b else math.nan,
         "contact_centroid": math.hypot(patch_a.x - patch_b.x, patch_a.y - patch_b.y)
         if patch_a and patch_b

@@ -11,7 +11,7 @@ import numpy as np
 from calibration.bundle import Calibration
 from calibration.errors import BadFrames
 from calibration.frame_set import Frame, FrameSet
-from calibration.markers.flow import MarkersLost
+from calibration.markers.flow import TooFewMarkers
 from calibration.normaliser import normaliser_for_calibration
 from calibration.reference import StaleReference, UnusableReference
 from tacsim.interface import Float32, FloatArray, Mask, TactileFrame
@@ -57,7 +57,7 @@ def estimate_surfaces(
     treated alike. Raises BadFrames for a reference that cannot be used.
     """
     if calibration is None:
-        return _recorded(frames)
+        return _recorded_surfaces(frames)
     normaliser = normaliser_for_calibration(calibration, GRID)
     try:
         normaliser.take_reference(TactileFrame(side.reference, time=0.0, index=0))
@@ -66,7 +66,7 @@ def estimate_surfaces(
         for frame in frames:
             try:
                 seen = normaliser(TactileFrame(frame.image, time=0.0, index=0), 0.0)
-            except (StaleReference, MarkersLost) as why:
+            except (StaleReference, TooFewMarkers) as why:
                 found.append(None)
                 lost.append(f"{frame.name}: {why}")
                 continue
@@ -79,13 +79,13 @@ def estimate_surfaces(
     return tuple(found), "; ".join(lost)
 
 
-def flat_surface(like: SurfaceEstimate) -> SurfaceEstimate:
+def undeformed_surface(like: SurfaceEstimate) -> SurfaceEstimate:
     """The surface of a gel that nothing touches."""
     flow = None if like.flow is None else np.zeros_like(like.flow)
     return SurfaceEstimate(np.zeros_like(like.height), np.zeros_like(like.gradient), flow, like.valid)
 
 
-def _recorded(frames: Sequence[Frame]) -> tuple[tuple[SurfaceEstimate | None, ...] | None, str]:
+def _recorded_surfaces(frames: Sequence[Frame]) -> tuple[tuple[SurfaceEstimate | None, ...] | None, str]:
     shape = (GRID.rows, GRID.columns)
     found: list[SurfaceEstimate | None] = []
     for frame in frames:

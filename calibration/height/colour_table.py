@@ -14,15 +14,15 @@ from numpy.typing import NDArray
 
 from tacsim.interface import Float32
 from tacsim.models.sensor import Lighting, SensorModel
-from tacsim.optics.render import shade, untouched_image
+from tacsim.optics.render import phong_shading, untouched_image
 
 MAX_SLOPE = 1.5  # along each axis [-]
 SLOPE_STEP = 0.02  # between the slopes at which the light is evaluated [-]
-CELLS = 48  # along each colour
+TABLE_CELLS = 48  # along each colour
 COLOUR_NOISE = 0.02  # standard deviation of the relative change of colour: a camera's noise [-]
 SLOPE_PRIOR = 0.5  # standard deviation of slopes: where colours do not decide, the smaller slope is likelier [-]
 MAX_COLOUR_DISTANCE = 0.2  # between a colour and the nearest that the light can make; beyond, no slope has it [-]
-MARGIN = 0.08  # of the table beyond the colours of its light [-]
+TABLE_MARGIN = 0.08  # of the table beyond the colours of its light [-]
 
 
 class GradientModel(Protocol):
@@ -36,7 +36,7 @@ class GradientModel(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ColourTable:
-    """Inverse of a light that is the same everywhere on the gel. Make it by :func:`from_lighting`.
+    """Inverse of a light that is the same everywhere on the gel. Make it by :func:`table_of_lighting`.
 
     Each cell of colour space holds an affine map colour -> slope: the regularised Gauss-Newton step from the slope
     whose colour is nearest to the middle of the cell. So a coarse table is exact to second order.
@@ -55,9 +55,9 @@ class ColourTable:
         for colour, low, scale in zip(colours, self.low, self.scale, strict=True):
             at = (colour - low) * scale
             beyond |= at < 0
-            beyond |= at >= CELLS
-            np.clip(at, 0, CELLS - 1, out=at)
-            index *= CELLS
+            beyond |= at >= TABLE_CELLS
+            np.clip(at, 0, TABLE_CELLS - 1, out=at)
+            index *= TABLE_CELLS
             index += np.floor(at, out=at)
         flat = index.ravel().astype(np.intp)
         maps = np.ascontiguousarray(self.maps.take(flat, axis=0).T).reshape(8, *shape)
@@ -73,16 +73,16 @@ class ColourTable:
         return np.moveaxis(slope, 0, -1), beyond
 
 
-def from_model(model: SensorModel) -> ColourTable:
-    """The inverse of a simulated sensor's light, for its mean untouched colour. Raises what :func:`from_lighting`
+def table_of_model(model: SensorModel) -> ColourTable:
+    """The inverse of a simulated sensor's light, for its mean untouched colour. Raises what :func:`table_of_lighting`
     raises, and ValueError for a background picture that cannot be read."""
     untouched = untouched_image(model.lighting, (model.geometry.height, model.geometry.width))
     red, green, blue = untouched.mean(axis=(0, 1), dtype=np.float64)
-    return from_lighting(model.lighting, (float(red), float(green), float(blue)))
+    return table_of_lighting(model.lighting, (float(red), float(green), float(blue)))
 
 
 @lru_cache(maxsize=8)
-def from_lighting(lighting: Lighting, background: tuple[float, float, float]) -> ColourTable:
+def table_of_lighting(lighting: Lighting, background: tuple[float, float, float]) -> ColourTable:
     """Tabulates the inverse of a Phong light whose untouched gel shows the mean colour `background` (1 is white).
 
     Where the light does not tell slopes apart (a flank turned away from all lights but one), the smallest one wins.
@@ -94,23 +94,25 @@ def from_lighting(lighting: Lighting, background: tuple[float, float, float]) ->
     steps = round(MAX_SLOPE / SLOPE_STEP)
     line = (np.arange(-steps, steps + 1) * SLOPE_STEP).astype(np.float32)
     slopes = np.stack(np.meshgrid(line, line), axis=-1)
-    flat = shade(np.zeros((1, 1, 2), dtype=np.float32), lighting)
+    flat = phong_shading(np.zeros((1, 1, 2), dtype=np.float32), lighting)
 
-    def seen(at: Float32) -> Float32:
-        relative: Float32 = (np.clip(base + shade(at, lighting) - flat, 0.0, 1.0) - base) / base
+    def colours_at(at: Float32) -> Float32:
+        relative: Float32 = (np.clip(base + phong_shading(at, lighting) - flat, 0.0, 1.0) - base) / base
         return relative
 
-    colours = seen(slopes)
+    colours = colours_at(slopes)
     shifts = np.eye(2, dtype=np.float32) * np.float32(SLOPE_STEP / 2)
-    by_slope = np.stack([seen(slopes + shift) - seen(slopes - shift) for shift in shifts], axis=-1) / SLOPE_STEP
+    by_slope = (
+        np.stack([colours_at(slopes + shift) - colours_at(slopes - shift) for shift in shifts], axis=-1) / SLOPE_STEP
+    )
     if float(np.linalg.svd(by_slope[steps, steps], compute_uv=False)[1]) < COLOUR_NOISE / SLOPE_PRIOR:
         raise ValueError(
             "lighting: the colour of the gel does not tell its slope along both axes, so no height can be found; "
             "it needs lights from at least two sides, in different colours"
         )
-    low = colours.min(axis=(0, 1)) - MARGIN
-    scale = CELLS / (colours.max(axis=(0, 1)) + MARGIN - low)
-    lines = ((np.arange(CELLS) + 0.5)[:, None] / scale + low).T
+    low = colours.min(axis=(0, 1)) - TABLE_MARGIN
+    scale = TABLE_CELLS / (colours.max(axis=(0, 1)) + TABLE_MARGIN - low)
+    lines = ((np.arange(TABLE_CELLS) + 0.5)[:, None] / scale + low).T
     middles = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 3)
     nearest, off_gamut = _most_likely_slope(colours.reshape(-1, 3), slopes.reshape(-1, 2), middles)
     jacobian = by_slope.reshape(-1, 3, 2)[nearest].astype(np.float64)
@@ -136,6 +138,8 @@ def _most_likely_slope(
     asked = np.concatenate([middles / COLOUR_NOISE, np.zeros((len(middles), 2))], axis=1)
     distance, index = tree.query(asked, eps=0.1, distance_upper_bound=MAX_COLOUR_DISTANCE / COLOUR_NOISE)
     off_gamut = ~np.isfinite(distance)
-    where = distance_transform_edt(off_gamut.reshape(CELLS, CELLS, CELLS), return_distances=False, return_indices=True)
-    nearest_known = np.ravel_multi_index(tuple(where.reshape(3, -1)), (CELLS, CELLS, CELLS))
+    where = distance_transform_edt(
+        off_gamut.reshape(TABLE_CELLS, TABLE_CELLS, TABLE_CELLS), return_distances=False, return_indices=True
+    )
+    nearest_known = np.ravel_multi_index(tuple(where.reshape(3, -1)), (TABLE_CELLS, TABLE_CELLS, TABLE_CELLS))
     return np.asarray(index, dtype=np.intp)[nearest_known], np.asarray(off_gamut)

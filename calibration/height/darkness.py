@@ -7,7 +7,7 @@ import numpy as np
 from tacsim.interface import Float32, Mask
 from tacsim.models.photometric import DarknessModel
 
-SMOOTHING = 1.0  # standard deviation of the Gaussian that takes off noise [px]
+SMOOTHING_DEVIATION = 1.0  # standard deviation of the Gaussian that takes off noise [px]
 
 
 class DarknessSlopes:
@@ -19,7 +19,7 @@ class DarknessSlopes:
         waves = [np.pi * np.arange(count) / count for count in shape]
         square = waves[0][:, None] ** 2 + waves[1][None, :] ** 2  # [1 / px^2]
         round_it = model.share * np.exp(-square / 2 * (model.reach / pitch) ** 2)
-        self._filter = (np.exp(-square / 2 * SMOOTHING**2) / (1.0 - round_it)).astype(np.float32)
+        self._filter = (np.exp(-square / 2 * SMOOTHING_DEVIATION**2) / (1.0 - round_it)).astype(np.float32)
         self._depths = np.array(model.depths) / pitch
         self._darkness = -np.array(model.changes).mean(axis=1)
 

@@ -18,16 +18,18 @@ from collections.abc import Callable
 import numpy as np
 
 from calibration.height.integration import slopes_of
-from calibration.height.slope_polynomial import EXTRAPOLATION
+from calibration.height.slope_polynomial import MAX_EXTRAPOLATION
 from tacsim.interface import Float32, Mask
 from tacsim.models.photometric import PhotometricLight, PhotometricModel, horizon
 
 STEPS = 3
-STIFFNESS = 0.4  # (error of colour that is usual / error of slope that is usual)^2
-DOUBTED = 0.2  # error of colour from which on a channel counts little [-]
-TOUCHED = 0.1  # relative change of colour, below which a pixel keeps the inverse's slope: little to gain there
-DELTA = 0.02  # step of finite differences of colour by slope [-]
-ROW = 256  # pixels that are evaluated at a time
+PRIOR_WEIGHT = 0.4  # (error of colour that is usual / error of slope that is usual)^2
+MAX_CERTAIN_ERROR = 0.2  # error of colour from which on a channel counts little [-]
+MIN_CONTACT_CHANGE = (
+    0.1  # relative change of colour, below which a pixel keeps the inverse's slope: little to gain there
+)
+SLOPE_DELTA = 0.02  # step of finite differences of colour by slope [-]
+PIXELS_PER_ROW = 256  # pixels that are evaluated at a time
 
 
 class ForwardSteps:
@@ -51,10 +53,12 @@ class ForwardSteps:
     ) -> Float32:
         """The better height (H, W) for relative changes (3, H, W); pixels that are `hidden` (H, W) tell nothing.
         `integrate`: slopes (H, W, 2) -> height, in the unit of `pitch`."""
-        seen = np.flatnonzero((np.abs(change).max(axis=0) > TOUCHED) & ~hidden)
+        seen = np.flatnonzero((np.abs(change).max(axis=0) > MIN_CONTACT_CHANGE) & ~hidden)
         if not len(seen):
             return height
-        rows = np.resize(seen, (-(-len(seen) // ROW), ROW))  # the last row is filled up with pixels of the first
+        rows = np.resize(
+            seen, (-(-len(seen) // PIXELS_PER_ROW), PIXELS_PER_ROW)
+        )  # the last row is filled up with pixels of the first
         colour = [plane.ravel()[rows] for plane in change]
         place = self._u[rows], self._v[rows]
         for _ in range(STEPS):
@@ -62,34 +66,38 @@ class ForwardSteps:
             flat = slopes.reshape(-1, 2)
             relative = height * self._scale
             deep = relative.ravel()[rows]
-            flat[rows] = self._step(flat[rows], colour, (*place, deep), self._rest(relative, place))
+            flat[rows] = self._step(flat[rows], colour, (*place, deep), self._shadow_change(relative, place))
             height = integrate(slopes)
         return height
 
     def _step(
-        self, slope: Float32, colour: list[Float32], place: tuple[Float32, Float32, Float32], rest: Float32 | None
+        self,
+        slope: Float32,
+        colour: list[Float32],
+        place: tuple[Float32, Float32, Float32],
+        shadow_change: Float32 | None,
     ) -> Float32:
         """(..., 2) slopes after a Gauss-Newton step from those of the surface, at places u, v, height."""
-        steps = np.float32(DELTA) * np.array([[0, 0], [1, 0], [0, 1]], dtype=np.float32)
+        steps = np.float32(SLOPE_DELTA) * np.array([[0, 0], [1, 0], [0, 1]], dtype=np.float32)
         slopes = slope + steps.reshape(3, *(1,) * (slope.ndim - 1), 2)
         here, at_x, at_y = self._light.change(slopes, *(np.broadcast_to(each, slopes.shape[:-1]) for each in place))[0]
-        by_x, by_y = (at_x - here) / np.float32(DELTA), (at_y - here) / np.float32(DELTA)
-        if rest is not None:
-            here = here + rest
-        xx = yy = np.full_like(colour[0], STIFFNESS)
+        by_x, by_y = (at_x - here) / np.float32(SLOPE_DELTA), (at_y - here) / np.float32(SLOPE_DELTA)
+        if shadow_change is not None:
+            here = here + shadow_change
+        xx = yy = np.full_like(colour[0], PRIOR_WEIGHT)
         xy = right_x = right_y = np.zeros_like(colour[0])
         for channel, seen in enumerate(colour):
             error, x, y = seen - here[..., channel], by_x[..., channel], by_y[..., channel]
-            weight = 1 / (1 + (error / np.float32(DOUBTED)) ** 2)
+            weight = 1 / (1 + (error / np.float32(MAX_CERTAIN_ERROR)) ** 2)
             xx, xy, yy = xx + weight * x * x, xy + weight * x * y, yy + weight * y * y
             right_x, right_y = right_x + weight * x * error, right_y + weight * y * error
         step = np.stack([yy * right_x - xy * right_y, xx * right_y - xy * right_x], axis=-1)
         better = slope + step / (xx * yy - xy * xy)[..., None]
         steepness = np.hypot(better[..., 0], better[..., 1])
-        least = np.minimum(1, EXTRAPOLATION * self._model.steepest / np.maximum(steepness, 1e-9))
+        least = np.minimum(1, MAX_EXTRAPOLATION * self._model.steepest / np.maximum(steepness, 1e-9))
         return np.asarray(better * least[..., None], dtype=np.float32)
 
-    def _rest(self, relative: Float32, place: tuple[Float32, Float32]) -> Float32 | None:
+    def _shadow_change(self, relative: Float32, place: tuple[Float32, Float32]) -> Float32 | None:
         """(..., 3) change of colour of pixels at places u, v (...,) by what a surface of this height (H, W) [widths of
         the picture] hides from the lamps; None: nothing."""
         import cv2

@@ -6,7 +6,7 @@ import numpy as np
 
 from tacsim.interface import Float32
 
-UNTOUCHED_RIM = 0.5e-3  # width of the band along the border of the view that counts as untouched [m]
+RIM_WIDTH = 0.5e-3  # width of the band along the border of the view that counts as untouched [m]
 
 
 class Integrator:
@@ -25,7 +25,7 @@ class Integrator:
         inverse = pitch / eigenvalue
         inverse[0, 0] = 0.0  # slopes determine no constant
         self._inverse = inverse.astype(np.float32)
-        width = max(1, round(UNTOUCHED_RIM / pitch))
+        width = max(1, round(RIM_WIDTH / pitch))
         rim = np.ones(shape, dtype=np.bool_)
         rim[width:-width, width:-width] = False
         self._rim = np.flatnonzero(rim)

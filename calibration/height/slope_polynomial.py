@@ -19,7 +19,7 @@ from tacsim.models.quantity import Config
 DEGREE = 3
 TERMS = 56
 COLOUR_SCALE = 2.4  # brings changes of colour to about -2..2, the size of x and y
-EXTRAPOLATION = 1.1  # slopes reach up to this times the steepest calibrated one
+MAX_EXTRAPOLATION = 1.1  # slopes reach up to this times the steepest calibrated one
 RIDGE = 1e-6  # ridge weight per pixel
 
 Weight = Annotated[float, Field(allow_inf_nan=False)]
@@ -36,12 +36,12 @@ class PolynomialSlopes:
     """An inverse model made ready for pixels at places x, y (H, W) in -1..1 across the sensor's own image."""
 
     def __init__(self, model: InverseModel, x: FloatArray, y: FloatArray) -> None:
-        self._steepest = EXTRAPOLATION * model.steepest
-        colours = [powers for powers in _colour_powers() if powers]
+        self._steepest = MAX_EXTRAPOLATION * model.steepest
+        colours = [powers for powers in _colour_products() if powers]
         self._powers: list[tuple[int, ...]] = [(), *colours]
         maps = {powers: np.zeros((2, *x.shape)) for powers in self._powers}
         places: dict[tuple[int, ...], FloatArray] = {(): np.ones_like(x)}  # ten of them, each of many terms
-        for (colour, place), weight in zip(_terms(), model.weights, strict=True):
+        for (colour, place), weight in zip(_polynomial_terms(), model.weights, strict=True):
             if place not in places:
                 places[place] = places[place[:-1]] * (x, y)[place[-1]]
             for axis in range(2):
@@ -74,7 +74,7 @@ def inverse_features(change: FloatArray, x: FloatArray, y: FloatArray) -> FloatA
     inputs = np.stack([*(COLOUR_SCALE * change).T, x, y])
     found: dict[tuple[int, ...], int] = {}
     terms = np.empty((TERMS, len(x)))
-    for row, (colour, place) in enumerate(_terms()):
+    for row, (colour, place) in enumerate(_polynomial_terms()):
         factors = (*colour, *(3 + axis for axis in place))
         found[factors] = row
         if not factors:
@@ -84,7 +84,7 @@ def inverse_features(change: FloatArray, x: FloatArray, y: FloatArray) -> FloatA
     return terms.T
 
 
-def to_normal(gradient: FloatArray) -> FloatArray:
+def normal_of_slope(gradient: FloatArray) -> FloatArray:
     """(..., 2) parts of the unit normal in the plane, of slopes (..., 2)."""
     normal: FloatArray = gradient / np.sqrt(1.0 + (gradient**2).sum(axis=-1, keepdims=True))
     return normal
@@ -94,7 +94,9 @@ def fit_inverse(sets: Sequence[tuple[FloatArray, FloatArray]], *, with_position:
     """(TERMS, 2) weights from normal equations, one pair (TERMS, TERMS), (TERMS, 2) a press; without `with_position`
     those of all terms in x and y are 0. Those without colour always are: no change is no slope, wherever it is. The
     ridge grows with the number of pixels, which the first diagonal element counts."""
-    use = np.array([i for i, (colour, axes) in enumerate(_terms()) if colour and (with_position or not axes)])
+    use = np.array(
+        [i for i, (colour, axes) in enumerate(_polynomial_terms()) if colour and (with_position or not axes)]
+    )
     square = sum((s[np.ix_(use, use)] for s, _ in sets), np.zeros((len(use), len(use))))
     right = sum((r[use] for _, r in sets), np.zeros((len(use), 2)))
     weights = np.zeros((TERMS, 2))
@@ -102,16 +104,16 @@ def fit_inverse(sets: Sequence[tuple[FloatArray, FloatArray]], *, with_position:
     return weights
 
 
-def _colour_powers() -> list[tuple[int, ...]]:
+def _colour_products() -> list[tuple[int, ...]]:
     """Products of colours as sorted channels: (), (0,), ..., (0, 0), (0, 1), ..., (2, 2, 2)."""
     return [c for order in range(DEGREE + 1) for c in itertools.combinations_with_replacement(range(3), order)]
 
 
-def _terms() -> list[tuple[tuple[int, ...], tuple[int, ...]]]:
+def _polynomial_terms() -> list[tuple[tuple[int, ...], tuple[int, ...]]]:
     """(channels, axes) of every term: products of at most DEGREE colours and places together."""
     return [
         (colour, place)
-        for colour in _colour_powers()
+        for colour in _colour_products()
         for order in range(DEGREE + 1 - len(colour))
         for place in itertools.combinations_with_replacement(range(2), order)
     ]

@@ -14,16 +14,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.drift import STRIDE, DriftFinder, size_of
+from calibration.drift import PIXEL_STRIDE, DriftFinder, max_mean_change
 from calibration.height.colour_table import GradientModel
 from calibration.height.forward_steps import ForwardSteps
 from calibration.height.integration import Integrator, slopes_of
-from calibration.lens.rectification import seen_box
+from calibration.lens.rectification import visible_box
 from tacsim.interface import Float32, Mask
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.optics.grid import PixelGrid, canonical_image
 
-INK_LEVEL = 0.6  # a printed dot is darker in all channels, relative to the mean of the gel [-]
+MAX_INK_LEVEL = 0.6  # a printed dot is darker in all channels, relative to the mean of the gel [-]
 DOT_RIM = 1  # width of the blurred edge of a dot [px]
 FILL_WIDTH = 1.5  # slopes under a dot are the mean of those around, weighted by a Gaussian of this deviation [px]
 COLOUR_STEP = 0.02  # of the finite differences of slope by colour [-]
@@ -35,7 +35,7 @@ class FoundSurface:
 
     height: Float32  # (h, w) into the gel, 0 at the contact-free border of the view [m]
     gradient: Float32  # (h, w, 2) of the height [-]
-    beyond_range: float  # share of the view's pixels whose colour lies beyond the calibrated slopes
+    out_of_range_share: float  # share of the view's pixels whose colour lies beyond the calibrated slopes
     drift: float | None  # mean relative change of the untouched gel's colour [-]; None: too little of it
     drift_slope: float | None  # mean angle of the slopes that this change would look like [degrees]
     removed_drift: Float32 | None  # (H, W, 3) drift taken off the canonical image's change; None: nothing is taken off
@@ -45,7 +45,7 @@ class SurfaceFinder:
     """Finds the surface of one sensor.
 
     Args:
-        slopes: the inverse of its light, on the pixels of :func:`seen_box`.
+        slopes: the inverse of its light, on the pixels of :func:`visible_box`.
         valid: (H, W) of :func:`extended_view`, as the rectification gives it.
         dots: dots are printed on the gel.
         drifts: the light is real and drifts: the drift, which is measured in any case, is removed.
@@ -63,7 +63,7 @@ class SurfaceFinder:
         better: ForwardSteps | None = None,
     ) -> None:
         self._slopes, self._grid, self._dots, self._better = slopes, grid, dots, better
-        self._box = seen_box(valid)
+        self._box = visible_box(valid)
         self._unseen = ~valid[self._box]
         self._pitch = grid.pitch / grid.image_scale
         self._drift_finder, self._remove_drift = DriftFinder(self._unseen.shape), drifts
@@ -71,7 +71,7 @@ class SurfaceFinder:
         self._image = (grid.rows * grid.image_scale, grid.columns * grid.image_scale)
         corner = [(there - own) // 2 for there, own in zip(valid.shape, self._image, strict=True)]
         self._corner = (corner[0] - self._box[0].start, corner[1] - self._box[1].start)
-        self._response = _response(slopes, self._unseen.shape)
+        self._response = _slope_response(slopes, self._unseen.shape)
         self._integrate = Integrator(self._unseen.shape, self._pitch)
         self._shape = valid.shape
         self._any_unseen = bool(self._unseen.any())
@@ -81,21 +81,21 @@ class SurfaceFinder:
         """The surface of a view (H, W, 3) of relative changes; `reference`: I0 / mean(I0), (H, W, 3); what
         follows from it is cached per array object."""
         if self._known is None or self._known.picture is not reference:
-            self._known = self._prepared(reference)
+            self._known = self._prepare_reference(reference)
         known, hidden = self._known, self._known.hidden
         planes = np.empty((3, *self._unseen.shape), dtype=np.float32)  # planes are several times as fast as pixels
         for channel in range(3):
             np.multiply(change[(*self._box, channel)], known.gain[channel], out=planes[channel])
         if self._dots:
-            hidden = hidden | _ink(known.planes + planes)
+            hidden = hidden | _ink_mask(known.planes + planes)
         drift = self._drift_finder(planes, hidden)
-        changed = self._drift_finder.at(drift) if drift.measured else None
+        changed = self._drift_finder.drift_at_stride(drift) if drift.measured else None
         if self._remove_drift:
             self._drift_finder.remove(planes, drift)
         gradient, beyond_range = self._slopes(np.moveaxis(planes, 0, -1))
         by_x, by_y = np.ascontiguousarray(gradient[..., 0]), np.ascontiguousarray(gradient[..., 1])
         if self._dots:
-            _fill((by_x, by_y), hidden)
+            _fill_hidden((by_x, by_y), hidden)
         if self._any_unseen:
             by_x[self._unseen] = by_y[self._unseen] = 0.0  # what is not seen is taken as flat
         height = self._integrate(np.stack([by_x, by_y], axis=-1))
@@ -103,30 +103,30 @@ class SurfaceFinder:
             height = self._better(planes, height, hidden, self._integrate)
         by_x, by_y = slopes_of(height, self._pitch)
         return FoundSurface(
-            height=self._cells(height),
-            gradient=np.stack([self._cells(by_x), self._cells(by_y)], axis=-1),
-            beyond_range=float(np.count_nonzero(beyond_range & ~hidden) / beyond_range.size),
-            drift=None if changed is None else size_of(changed),
-            drift_slope=None if changed is None else self._angle(changed),
-            removed_drift=self._drift_finder.part(drift.scaled(1.0 / known.gain), self._corner, self._image)
+            height=self._cell_means(height),
+            gradient=np.stack([self._cell_means(by_x), self._cell_means(by_y)], axis=-1),
+            out_of_range_share=float(np.count_nonzero(beyond_range & ~hidden) / beyond_range.size),
+            drift=None if changed is None else max_mean_change(changed),
+            drift_slope=None if changed is None else self._mean_angle(changed),
+            removed_drift=self._drift_finder.drift_on_part(drift.scaled(1.0 / known.gain), self._corner, self._image)
             if self._remove_drift and drift.measured
             else None,
         )
 
-    def _angle(self, change: Float32) -> float:
+    def _mean_angle(self, change: Float32) -> float:
         """Mean angle [degrees] of the slopes that changes of colour (n, 3) at every STRIDE-th pixel look like."""
         slope = np.einsum("nsc,nc->ns", self._response, change)
-        steepness = np.hypot(slope[:, 0], slope[:, 1])[~self._unseen[::STRIDE, ::STRIDE].ravel()]
+        steepness = np.hypot(slope[:, 0], slope[:, 1])[~self._unseen[::PIXEL_STRIDE, ::PIXEL_STRIDE].ravel()]
         return float(np.degrees(np.arctan(steepness)).mean())
 
-    def _prepared(self, picture: Float32) -> _PreparedReference:
+    def _prepare_reference(self, picture: Float32) -> _PreparedReference:
         reference = picture[self._box]
-        hidden = self._unseen | _ink(np.moveaxis(reference, -1, 0)) if self._dots else self._unseen
+        hidden = self._unseen | _ink_mask(np.moveaxis(reference, -1, 0)) if self._dots else self._unseen
         # the light that is known is that of all the gel, without its dots
         gain = (1.0 / reference[~hidden].mean(axis=0)).astype(np.float32)
         return _PreparedReference(picture, np.ascontiguousarray(np.moveaxis(reference * gain, -1, 0)), gain, hidden)
 
-    def _cells(self, plane: Float32) -> Float32:
+    def _cell_means(self, plane: Float32) -> Float32:
         """(h, w) means over the cells of the canonical grid, of a plane of the seen box; 0 beyond it."""
         import cv2
 
@@ -163,27 +163,27 @@ def canonical_part(picture: NDArray[Any], grid: CanonicalGrid) -> NDArray[Any]:
     return picture[top : top + rows, left : left + columns]
 
 
-def _ink(relative: Float32) -> Mask:
+def _ink_mask(relative: Float32) -> Mask:
     """(H, W) where an image (3, H, W) relative to the mean of the gel shows a printed dot."""
     import cv2
 
-    dark = (np.maximum(np.maximum(relative[0], relative[1]), relative[2]) < INK_LEVEL).view(np.uint8)
+    dark = (np.maximum(np.maximum(relative[0], relative[1]), relative[2]) < MAX_INK_LEVEL).view(np.uint8)
     side = 2 * DOT_RIM + 1
     return np.asarray(cv2.dilate(dark, np.ones((side, side), dtype=np.uint8))).view(np.bool_)
 
 
-def _response(slopes: GradientModel, shape: tuple[int, int]) -> Float32:
+def _slope_response(slopes: GradientModel, shape: tuple[int, int]) -> Float32:
     """(n, 2, 3) derivative of the slope by colour, at every STRIDE-th row and column."""
     answers = []
     for channel in range(3):
         change = np.zeros((*shape, 3), dtype=np.float32)
         change[..., channel] = COLOUR_STEP
         up, down = slopes(change)[0], slopes(-change)[0]
-        answers.append(((up - down) / (2 * COLOUR_STEP))[::STRIDE, ::STRIDE].reshape(-1, 2))
+        answers.append(((up - down) / (2 * COLOUR_STEP))[::PIXEL_STRIDE, ::PIXEL_STRIDE].reshape(-1, 2))
     return np.stack(answers, axis=-1)
 
 
-def _fill(slopes: tuple[Float32, Float32], hidden: Mask) -> None:
+def _fill_hidden(slopes: tuple[Float32, Float32], hidden: Mask) -> None:
     """Sets planes of slopes (H, W) in the hidden pixels to a weighted mean of those around."""
     import cv2
 

@@ -19,9 +19,9 @@ from tacsim.models.quantity import parse
 DOT_BLURS = (2.0, 3.0, 5.0, 8.0, 12.0)  # standard deviations of the blurs that are tried, for dots of any size [px]
 MAX_POINTS = 100  # along a board
 MIN_CORNERS = 6  # of a ChArUco board
-MAX_BEYOND = 0.5  # share of a border with further dots beyond it: more, and the board is larger than said
+MAX_OUTER_DOT_SHARE = 0.5  # share of a border with further dots beyond it: more, and the board is larger than said
 MIN_CONTRAST = 0.4  # of a dot's pixels, share of its maximum
-SAME_PLACE = 0.35  # distance of two points at the same place [distance of neighbours]
+MAX_SAME_POINT_DISTANCE = 0.35  # distance of two points at the same place [distance of neighbours]
 
 
 class BadBoard(CalibrationError):
@@ -75,7 +75,7 @@ def parse_board(text: str) -> Board:
     board = Board(parts[0], columns, rows, metres[0])
     if board.kind == "charuco":
         board = replace(board, marker=metres[1], dictionary=parts[4] if len(parts) == 5 else board.dictionary)
-        _charuco(board)  # refuses an unknown dictionary now
+        _charuco_board(board)  # refuses an unknown dictionary now
     return board
 
 
@@ -99,13 +99,13 @@ def _find_dots(image: Image, board: Board, reference: Image | None) -> Points:
     for scale in DOT_BLURS:
         around = cv2.GaussianBlur(grey, (0, 0), 3.0 * scale)
         contrast = np.asarray(around - cv2.GaussianBlur(grey, (0, 0), scale), dtype=np.float64)
-        found = _lattice(contrast, board)
+        found = _find_dot_lattice(contrast, board)
         if isinstance(found, int):
             most = max(most, found)
             continue
         lattice, blobs = found
-        _require_whole(lattice, blobs, board)
-        refined = _centred(contrast, lattice)
+        _require_complete_lattice(lattice, blobs, board)
+        refined = _refine_centres(contrast, lattice)
         rows, columns = np.mgrid[: lattice.shape[0], : lattice.shape[1]]
         on_board = np.stack([columns, rows], axis=-1) * board.pitch
         steps = np.linalg.norm(np.diff(refined, axis=1), axis=-1)
@@ -116,7 +116,7 @@ def _find_dots(image: Image, board: Board, reference: Image | None) -> Points:
     )
 
 
-def _lattice(contrast: FloatArray, board: Board) -> tuple[FloatArray, FloatArray] | int:
+def _find_dot_lattice(contrast: FloatArray, board: Board) -> tuple[FloatArray, FloatArray] | int:
     """(rows, columns, 2) dots [px], row by row along u and right-handed, and (m, 2) all blobs; the blobs' number where
     they form no such lattice."""
     import cv2
@@ -138,7 +138,7 @@ def _lattice(contrast: FloatArray, board: Board) -> tuple[FloatArray, FloatArray
             if not done:
                 continue
             lattice = np.asarray(centres, dtype=np.float64).reshape(rows, columns, 2)
-            if not _even(lattice):
+            if not _is_even(lattice):
                 continue
             if abs(_mean_step(lattice, 1)[0]) < abs(_mean_step(lattice, 0)[0]):
                 lattice = lattice.swapaxes(0, 1)
@@ -147,12 +147,12 @@ def _lattice(contrast: FloatArray, board: Board) -> tuple[FloatArray, FloatArray
     return len(blobs)
 
 
-def _even(lattice: FloatArray) -> bool:
+def _is_even(lattice: FloatArray) -> bool:
     """True if each step from dot to dot is much like the one before: OpenCV may take a dot of the next row."""
     for axis in (0, 1):
         steps = np.diff(lattice, axis=axis)
         change = np.linalg.norm(np.diff(steps, axis=axis), axis=-1)
-        if (change > SAME_PLACE * np.linalg.norm(steps, axis=-1).mean()).any():
+        if (change > MAX_SAME_POINT_DISTANCE * np.linalg.norm(steps, axis=-1).mean()).any():
             return False
     return True
 
@@ -161,20 +161,20 @@ def _mean_step(lattice: FloatArray, axis: int) -> FloatArray:
     return np.asarray(np.diff(lattice, axis=axis).reshape(-1, 2).mean(axis=0), dtype=np.float64)
 
 
-def _require_whole(lattice: FloatArray, blobs: FloatArray, board: Board) -> None:
+def _require_complete_lattice(lattice: FloatArray, blobs: FloatArray, board: Board) -> None:
     """Raises BadBoard where the lattice goes on beyond its border: the board is larger than it was said to be."""
     for grid in (lattice, lattice[::-1], lattice.swapaxes(0, 1), lattice[:, ::-1].swapaxes(0, 1)):
         beyond = 2.0 * grid[0] - grid[1]
         near = np.linalg.norm(beyond[:, None] - blobs[None], axis=-1).min(axis=1)
-        there = near < SAME_PLACE * np.linalg.norm(grid[0] - grid[1], axis=-1)
-        if there.mean() > MAX_BEYOND:
+        there = near < MAX_SAME_POINT_DISTANCE * np.linalg.norm(grid[0] - grid[1], axis=-1)
+        if there.mean() > MAX_OUTER_DOT_SHARE:
             raise BadBoard(
                 f"the picture shows more dots than {board.columns} x {board.rows}: {int(there.sum())} lie beyond one "
                 "border. Count again: all dots that are seen belong to the board"
             )
 
 
-def _centred(contrast: FloatArray, lattice: FloatArray) -> FloatArray:
+def _refine_centres(contrast: FloatArray, lattice: FloatArray) -> FloatArray:
     """The dots' centres of gravity, each within half the distance to its neighbours."""
     import cv2
 
@@ -201,7 +201,7 @@ def _centred(contrast: FloatArray, lattice: FloatArray) -> FloatArray:
     return found
 
 
-def _charuco(board: Board) -> Any:
+def _charuco_board(board: Board) -> Any:
     import cv2
 
     code = getattr(cv2.aruco, board.dictionary, None)
@@ -217,7 +217,7 @@ def _charuco(board: Board) -> Any:
 def _find_charuco(image: Image, board: Board) -> Points:
     import cv2
 
-    printed = _charuco(board)
+    printed = _charuco_board(board)
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     found: Any = cv2.aruco.CharucoDetector(printed).detectBoard(grey)
     corners, names, _, markers = found  # each None where nothing is seen

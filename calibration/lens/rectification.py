@@ -20,12 +20,13 @@ from tacsim.models.sensor import SensorGeometry
 from tacsim.optics.grid import PixelGrid, image_grid
 
 MIN_REGION = 0.02  # of a picture, that a region must enclose
-MAX_FACTOR = 16  # look-ups along each side of one canonical pixel
+MAX_LOOKUPS_PER_SIDE = 16  # look-ups along each side of one canonical pixel
 
 
 @dataclass(frozen=True, eq=False)
 class Rectification:
-    """The map of one sensor. Make it by :func:`from_corners`, :func:`from_view` or :func:`from_geometry`."""
+    """The map of one sensor. Make it by :func:`rectification_of_corners`,
+    :func:`rectification_of_view` or :func:`rectification_of_geometry`."""
 
     image_shape: tuple[int, int]  # rows, columns of the native image
     pixels: NDArray[np.float32]  # (factor * H, factor * W, 2) native u, v of each look-up [px]
@@ -79,7 +80,7 @@ class Rectification:
         anyway; an empty fraction where all are whole pixels), and which of them are not valid (None: all are)."""
         import cv2
 
-        box = seen_box(self.valid)
+        box = visible_box(self.valid)
         finer = tuple(slice(side.start * self.factor, side.stop * self.factor) for side in box)
         look_ups, fraction = cv2.convertMaps(self.pixels[finer], np.empty(0, dtype=np.float32), cv2.CV_16SC2)
         hidden = ~self.valid[box]
@@ -106,7 +107,7 @@ def region_mask(region: PictureRegion, image_shape: tuple[int, int]) -> NDArray[
     return np.asarray(shown, dtype=np.bool_)
 
 
-def from_corners(
+def rectification_of_corners(
     corners: Corners | None, size: tuple[float, float], image_shape: tuple[int, int], grid: PixelGrid
 ) -> Rectification:
     """The map of a real camera, as a perspective through the four corners of the gel.
@@ -132,40 +133,42 @@ def from_corners(
     def project(points: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.asarray(cv2.perspectiveTransform(points * 1e3, image_from_gel), dtype=np.float64)
 
-    factor = _factor(project(grid.points()))
+    factor = _lookups_per_side(project(grid.points()))
     # The perspective of points far beyond the gel may pass through infinity: look there at the gel's rim instead.
-    points = _inside(grid.refined(factor).points(), size)
-    return _rectification(project(points), factor, grid.within(size), image_shape, size)
+    points = _is_inside(grid.refined(factor).points(), size)
+    return _make_rectification(project(points), factor, grid.points_on_gel(size), image_shape, size)
 
 
-def from_view(view: GelView, grid: PixelGrid) -> Rectification:
+def rectification_of_view(view: GelView, grid: PixelGrid) -> Rectification:
     """The map of a real camera whose view of the gel's plane was calibrated."""
-    factor = _factor(view.project(_inside(grid.points(), view.size)))
-    points = _inside(grid.refined(factor).points(), view.size)  # beyond the gel nothing is known of the lens
-    return _rectification(view.project(points), factor, grid.within(view.size), view.image_shape, view.size)
+    factor = _lookups_per_side(view.project(_is_inside(grid.points(), view.size)))
+    points = _is_inside(grid.refined(factor).points(), view.size)  # beyond the gel nothing is known of the lens
+    return _make_rectification(view.project(points), factor, grid.points_on_gel(view.size), view.image_shape, view.size)
 
 
-def to_metric(view: GelView) -> Rectification:
+def metric_rectification(view: GelView) -> Rectification:
     """The map of a real camera to its metric picture (see `GelView.geometry`), for fits over all of the gel."""
-    return from_view(view, image_grid(view.geometry))
+    return rectification_of_view(view, image_grid(view.geometry))
 
 
-def _inside(points: NDArray[np.float64], size: tuple[float, float]) -> NDArray[np.float64]:
+def _is_inside(points: NDArray[np.float64], size: tuple[float, float]) -> NDArray[np.float64]:
     x, y = size[0] / 2, size[1] / 2
     return np.clip(points, (-x, -y), (x, y))
 
 
-def from_geometry(geometry: SensorGeometry, gel_size: tuple[float, float], grid: PixelGrid) -> Rectification:
+def rectification_of_geometry(
+    geometry: SensorGeometry, gel_size: tuple[float, float], grid: PixelGrid
+) -> Rectification:
     """The map of a simulated (or already rectified) image: `x = (u - u0) * pixel_pitch`. Exact means of areas where the
     canonical pitch is a whole multiple of the pixel pitch."""
-    factor = _limited(math.ceil(grid.pitch / geometry.pixel_pitch - 1e-9))
+    factor = _limit_lookups(math.ceil(grid.pitch / geometry.pixel_pitch - 1e-9))
     pixels = grid.refined(factor).points() / geometry.pixel_pitch + geometry.principal
     shown = geometry.width * geometry.pixel_pitch, geometry.height * geometry.pixel_pitch
     size = min(gel_size[0], shown[0]), min(gel_size[1], shown[1])
-    return _rectification(pixels, factor, grid.within(gel_size), (geometry.height, geometry.width), size)
+    return _make_rectification(pixels, factor, grid.points_on_gel(gel_size), (geometry.height, geometry.width), size)
 
 
-def _rectification(
+def _make_rectification(
     pixels: NDArray[np.float64],
     factor: int,
     on_gel: NDArray[np.bool_],
@@ -181,24 +184,25 @@ def _rectification(
     return Rectification(image_shape, pixels.astype(np.float32), factor, whole & on_gel, size)
 
 
-def _factor(pixels: NDArray[np.float64]) -> int:
+def _lookups_per_side(pixels: NDArray[np.float64]) -> int:
     """Native pixels along one canonical pixel, in the middle of the grid, rounded up."""
     middle = pixels[pixels.shape[0] // 2, pixels.shape[1] // 2]
     right = pixels[pixels.shape[0] // 2, pixels.shape[1] // 2 - 1] - middle
     below = pixels[pixels.shape[0] // 2 - 1, pixels.shape[1] // 2] - middle
-    return _limited(math.ceil(max(float(np.hypot(*right)), float(np.hypot(*below))) - 0.01))
+    return _limit_lookups(math.ceil(max(float(np.hypot(*right)), float(np.hypot(*below))) - 0.01))
 
 
-def _limited(factor: int) -> int:
-    if factor > MAX_FACTOR:
+def _limit_lookups(factor: int) -> int:
+    if factor > MAX_LOOKUPS_PER_SIDE:
         raise ValueError(
-            f"the native image has {factor} pixels along one canonical pixel, at most {MAX_FACTOR} are averaged; "
+            f"the native image has {factor} pixels along one canonical pixel, at most {MAX_LOOKUPS_PER_SIDE} are "
+            "averaged; "
             "check the gel's size and the canonical pitch [m]"
         )
     return max(factor, 1)
 
 
-def seen_box(valid: NDArray[np.bool_]) -> tuple[slice, slice]:
+def visible_box(valid: NDArray[np.bool_]) -> tuple[slice, slice]:
     """Rows and columns of a view in which gel is seen. Raises ValueError when there are none."""
     rows, columns = np.flatnonzero(valid.any(axis=1)), np.flatnonzero(valid.any(axis=0))
     if len(rows) < 2 or len(columns) < 2:

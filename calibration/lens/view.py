@@ -44,7 +44,7 @@ class BadCorners(CalibrationError):
     """The four corners are not those of a rectangle in a picture."""
 
 
-def pinhole(image_shape: tuple[int, int], distortion: Sequence[float] = ()) -> Lens:
+def pinhole_lens(image_shape: tuple[int, int], distortion: Sequence[float] = ()) -> Lens:
     """A lens of which nothing is known, with the picture's longer side for its focal length. `distortion`: k1, k2, and
     its centre from the picture's middle, over the longer side."""
     rows, columns = image_shape
@@ -157,9 +157,9 @@ def fit_view(
     middle = points.board.mean(axis=0)
     local: FloatArray = np.asarray(points.board - middle, dtype=np.float64)
     if lens is not None:
-        perspective = _plane(lens, local, points.image)
+        perspective = _fit_homography(lens, local, points.image)
     else:
-        lens, perspective = _distorted(local, points.image, image_shape)
+        lens, perspective = _fit_distortion(local, points.image, image_shape)
     missed = lens.project(seen_along(perspective, local)) - points.image
     residual = float(np.sqrt((missed**2).sum(axis=1).mean()))
     if not residual <= MAX_MISFIT * points.spacing:
@@ -219,9 +219,11 @@ def view_of_corners(corners: Sequence[Pair], size: Pair, image_shape: tuple[int,
     """The view of a gel of `size` (x, y) [m] by its corners in the picture: top left, top right, bottom right, bottom
     left [px]. No residual tells whether they are right. Raises BadCorners."""
     check_corners(corners, image_shape)
-    lens = pinhole(image_shape)
+    lens = pinhole_lens(image_shape)
     x, y = size[0] / 2, size[1] / 2
-    perspective = _plane(lens, np.array([(-x, -y), (x, -y), (x, y), (-x, y)]), np.array(corners, dtype=np.float64))
+    perspective = _fit_homography(
+        lens, np.array([(-x, -y), (x, -y), (x, y), (-x, y)]), np.array(corners, dtype=np.float64)
+    )
     perspective /= perspective[2, 2]
     middle = lens.project(seen_along(perspective, 1e-6 * np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)])))
     along = np.linalg.norm(middle[1:] - middle[0], axis=1)  # [px / um]
@@ -250,7 +252,7 @@ def calibrated_view(view: GelView | None, pitch: float, image_shape: tuple[int, 
     return view.model_copy(update={"pixel_pitch": coarse}), coarse
 
 
-def _plane(lens: Lens, on_board: FloatArray, pixels: FloatArray) -> FloatArray:
+def _fit_homography(lens: Lens, on_board: FloatArray, pixels: FloatArray) -> FloatArray:
     """(3, 3) perspective from points (n, 2) [m] to lines of sight."""
     import cv2
 
@@ -263,19 +265,19 @@ def _plane(lens: Lens, on_board: FloatArray, pixels: FloatArray) -> FloatArray:
     return perspective
 
 
-def _distorted(on_board: FloatArray, pixels: FloatArray, image_shape: tuple[int, int]) -> tuple[Lens, FloatArray]:
+def _fit_distortion(on_board: FloatArray, pixels: FloatArray, image_shape: tuple[int, int]) -> tuple[Lens, FloatArray]:
     """Lens and perspective with as many terms of distortion (k1, k2, its centre) as predict left-out points best."""
     unit = float(np.abs(on_board).max())
     scale = np.diag([unit, unit, 1.0])
     best: tuple[float, Lens, FloatArray] | None = None
-    first = _plane(pinhole(image_shape), on_board, pixels) @ scale
+    first = _fit_homography(pinhole_lens(image_shape), on_board, pixels) @ scale
     start = np.append((first / first[2, 2]).ravel()[:8], (0.0, 0.0, 0.0, 0.0))
     for terms in (0, 1, 2, 4):
         if 8 + terms > len(pixels):
             break
 
         def lens_and_plane(p: FloatArray) -> tuple[Lens, FloatArray]:
-            return pinhole(image_shape, p[8:].tolist()), np.append(p[:8], 1.0).reshape(3, 3) @ np.linalg.inv(scale)
+            return pinhole_lens(image_shape, p[8:].tolist()), np.append(p[:8], 1.0).reshape(3, 3) @ np.linalg.inv(scale)
 
         def missed(p: FloatArray) -> FloatArray:
             lens, plane = lens_and_plane(p)

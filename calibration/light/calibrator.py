@@ -22,26 +22,26 @@ from calibration.height.integration import Integrator, slopes_of
 from calibration.height.slope_polynomial import (
     InverseModel,
     PolynomialSlopes,
-    to_normal,
+    normal_of_slope,
 )
-from calibration.light.checks.consistency import blurred_presses, unlike_presses, untouched_contact
-from calibration.light.checks.press_shapes import fit_stretch, other_balls
+from calibration.light.checks.consistency import find_blurred_presses, find_inconsistent_presses, find_reference_contact
+from calibration.light.checks.press_shapes import find_other_balls, fit_stretch
 from calibration.light.circle import NoCircle
-from calibration.light.darkness import DARK_UNEXPLAINED, find_dark_press, fit_darkness, tells_no_direction
-from calibration.light.dent import dent_gradient, dent_height, rim_slope
-from calibration.light.fit import LightFit, PressPrediction, compared, normal_angle
+from calibration.light.darkness import MAX_DARKNESS_RESIDUAL, find_dark_press, fit_darkness, is_direction_free
+from calibration.light.dent import dent_gradient, dent_height, max_dent_slope
+from calibration.light.fit import LightFit, PressPrediction, compare_with_prediction, normal_angle
 from calibration.light.labels import (
     BLUR,
     INVERSE_BLUR,
-    beside_slopes,
+    contact_and_skirt,
     counted_pixels,
     deepest_dent,
+    extra_forward_terms,
     forward_equations,
     forward_model,
     inverse_equations,
     inverse_model,
-    label,
-    near_contact,
+    label_slopes,
 )
 from calibration.light.photometry import (
     FEW_PRESSES,
@@ -49,12 +49,12 @@ from calibration.light.photometry import (
     ModelSize,
     NormalEquations,
     choose_size,
-    solve,
+    solve_weights,
 )
-from calibration.light.press import BallPress, Window, find_press, smooth, untouched_mean
-from calibration.light.refinement import RefinedGeometry, refine
+from calibration.light.press import BallPress, Window, find_press, gaussian_blur, mean_reference_colour
+from calibration.light.refinement import RefinedGeometry, refine_geometry
 from calibration.light.shadows import DentShade, find_lamps
-from calibration.reference import STALE_COLOUR, exchanged
+from calibration.reference import STALE_COLOUR, is_channel_order_swapped
 from tacsim.interface import FloatArray, Image
 from tacsim.models.photometric import (
     DEPTH_TERMS,
@@ -62,21 +62,21 @@ from tacsim.models.photometric import (
     PhotometricModel,
     places_in_image,
 )
-from tacsim.optics.render import darkened
+from tacsim.optics.render import darken_by_depth
 
 REFINEMENT_PIXELS = 2500  # of each press, about
-UNSHADED = 0.02  # share of the change of colour: where slopes leave no more, shadows are not looked for
-ROUNDS = 2  # of refining circles and lamps in turn
+MIN_SHADOW_RESIDUAL = 0.02  # share of the change of colour: where slopes leave no more, shadows are not looked for
+REFINEMENT_ROUNDS = 2  # of refining circles and lamps in turn
 SATURATED_ROUNDS = 2  # of telling which saturated pixels are predicted too dark
 SHADED_PIXELS = 1000  # the same with cast shadows, which have nine times the terms
 # A press is left out if the fitted dent leaves more of its change of colour unexplained than the smaller of
-MAX_UNEXPLAINED = 0.5  # share of the change
-MAX_UNEXPLAINED_RATIO = 5.0  # times the median press's share, with three presses or more; at least GOOD_FIT
-GOOD_FIT = 0.05  # share of the change: a press that is explained so well always stays
+MAX_RESIDUAL_SHARE = 0.5  # share of the change
+MAX_RESIDUAL_RATIO = 5.0  # times the median press's share, with three presses or more; at least MAX_GOOD_RESIDUAL
+MAX_GOOD_RESIDUAL = 0.05  # share of the change: a press that is explained so well always stays
 ORDER_FRAMES = 9  # frames whose median tells the order of colours, at most
 MIN_SPREAD = 0.2  # share of the picture that presses spread over; else nothing is known of the rest
 NO_DIRECTION = "this light tells no direction: all flanks of a dent change alike"
-BAD_NORMALS = 8.0  # errors of a press's normals that deserve a warning [degrees]
+MAX_NORMAL_ERROR = 8.0  # errors of a press's normals that deserve a warning [degrees]
 
 
 class NoDirection(BadFrames):
@@ -104,13 +104,13 @@ def calibrate_light(
 
     Raises BadFrames, with what is wrong in every frame, when no press can be used; NoDirection.
     """
-    _check(reference, frames)
+    _require_valid_frames(reference, frames)
     shown = reference
     if erase is not None:
         reference, frames = erase(reference), [(name, erase(image)) for name, image in frames]
         untouched = [erase(image) for image in untouched]
-    mean = untouched_mean(reference)
-    dark = tells_no_direction((image - np.float64(reference)) / mean for _, image in frames[:ORDER_FRAMES])
+    mean = mean_reference_colour(reference)
+    dark = is_direction_free((image - np.float64(reference)) / mean for _, image in frames[:ORDER_FRAMES])
     found: list[BallPress] = []
     left_out: list[tuple[str, str]] = []
     for name, image in frames:
@@ -119,25 +119,29 @@ def calibrate_light(
         except (NoCircle, BadFrames) as error:
             left_out.append((name, str(error)))
     if dark:
-        return replace(_darkness(found, left_out, mean, reference, ball), reference=shown, frames=_names(frames))
-    _leave_out_strangers(found, left_out, reference, mean, ball)
-    presses, refined = _of_one_ball(*_refined(found, left_out, ball), left_out, ball)
-    contact = untouched_contact(presses, reference, mean, untouched, ball)
-    thin = [_window(press, SHADED_PIXELS) for press in presses]
+        return replace(
+            _calibrate_darkness(found, left_out, mean, reference, ball), reference=shown, frames=_join_names(frames)
+        )
+    _leave_out_outliers(found, left_out, reference, mean, ball)
+    presses, refined = _leave_out_other_balls(*_refine_without_outlier(found, left_out, ball), left_out, ball)
+    contact = find_reference_contact(presses, reference, mean, untouched, ball)
+    thin = [_press_window(press, SHADED_PIXELS) for press in presses]
     stretch = fit_stretch(thin, refined.circles, refined.thickness, ball, presses[0].shape)
-    presses, refined, shade = _shaded(presses, refined, ball)
-    labels = [label(press, refined, ball) for press in presses]
-    besides = [beside_slopes(press, g, refined, ball, shade) for press, g in zip(presses, labels, strict=True)]
-    size, forward_sets = _equations(presses, labels, besides)
+    presses, refined, shade = _fit_shadows(presses, refined, ball)
+    labels = [label_slopes(press, refined, ball) for press in presses]
+    extra_terms_of_presses = [
+        extra_forward_terms(press, g, refined, ball, shade) for press, g in zip(presses, labels, strict=True)
+    ]
+    size, forward_sets = _forward_equations(presses, labels, extra_terms_of_presses)
     inverse_sets = [inverse_equations(p, g) for p, g in zip(presses, labels, strict=True)]
     all_equations = functools.reduce(operator.add, forward_sets)
-    steepest, deepest = max(rim_slope(press.circle, ball) for press in presses), deepest_dent(refined, ball)
+    steepest, deepest = max(max_dent_slope(press.circle, ball) for press in presses), deepest_dent(refined, ball)
     model = partial(forward_model, size=size, steepest=steepest, deepest=deepest / reference.shape[1], shade=shade)
     predictions = tuple(
-        _prediction(
+        _predict_press(
             press,
             labels[i],
-            besides[i],
+            extra_terms_of_presses[i],
             model(all_equations - forward_sets[i]),
             inverse_model([*inverse_sets[:i], *inverse_sets[i + 1 :]], steepest),
             mean,
@@ -152,104 +156,104 @@ def calibrate_light(
         size=size,
         thickness=refined.thickness,
         radius_uncertainty=refined.radius_uncertainty(),
-        unexplained=refined.unexplained,
+        residual_shares=refined.residual_shares,
         predictions=predictions,
         left_out=tuple(left_out),
-        warnings=(*_warnings(presses, mean, len(left_out)), *_badly_predicted(predictions)),
+        warnings=(*_warnings(presses, mean, len(left_out)), *_poorly_predicted(predictions)),
         reference=shown,
         presses=tuple(presses),
-        frames=_names(frames),
+        frames=_join_names(frames),
         stretch=stretch,
-        doubts=() if contact is None else (contact,),
+        image_warnings=() if contact is None else (contact,),
     )
 
 
-def _leave_out_strangers(
+def _leave_out_outliers(
     found: list[BallPress], left_out: list[tuple[str, str]], reference: Image, mean: FloatArray, ball: float
 ) -> None:
     """Blurred pictures, and presses that the light of the others does not explain."""
-    for k, share in reversed(blurred_presses(found, reference, mean)):
+    for k, share in reversed(find_blurred_presses(found, reference, mean)):
         why = f"blurred: {share:.0%} of the fine detail of other pictures; press again, held still and in focus"
         left_out.append((found.pop(k).name, why))
-    for k in reversed(unlike_presses(found, [_window(press, SHADED_PIXELS) for press in found], ball)):
+    for k in reversed(find_inconsistent_presses(found, [_press_window(press, SHADED_PIXELS) for press in found], ball)):
         why = "most other presses do not explain it: another sensor or ball, turned, or red and blue swapped?"
         left_out.append((found.pop(k).name, why))
 
 
-def _of_one_ball(
+def _leave_out_other_balls(
     presses: list[BallPress], refined: RefinedGeometry, left_out: list[tuple[str, str]], ball: float
 ) -> tuple[list[BallPress], RefinedGeometry]:
     """Without the presses of another ball."""
-    windows = [_window(press, SHADED_PIXELS) for press in presses]
-    others, ratio = other_balls(windows, refined.circles, refined.thickness, ball, presses[0].shape)
+    windows = [_press_window(press, SHADED_PIXELS) for press in presses]
+    others, ratio = find_other_balls(windows, refined.circles, refined.thickness, ball, presses[0].shape)
     if not others:
         return presses, refined
     why = f"its slopes are those of a ball {ratio:.2f} times as large as in the other presses: use one ball"
     left_out += [(presses[k].name, why) for k in others]
-    return _refined([press for k, press in enumerate(presses) if k not in others], left_out, ball)
+    return _refine_without_outlier([press for k, press in enumerate(presses) if k not in others], left_out, ball)
 
 
-def _equations(
-    presses: Sequence[BallPress], labels: Sequence[FloatArray], besides: Sequence[FloatArray]
+def _forward_equations(
+    presses: Sequence[BallPress], labels: Sequence[FloatArray], extra_terms_of_presses: Sequence[FloatArray]
 ) -> tuple[ModelSize, list[NormalEquations]]:
     """The size of the forward model, and each press's equations, with those of its saturated pixels that are predicted
     too dark."""
-    sets = [forward_equations(p, g, b) for p, g, b in zip(presses, labels, besides, strict=True)]
+    sets = [forward_equations(p, g, b) for p, g, b in zip(presses, labels, extra_terms_of_presses, strict=True)]
     size = choose_size(sets)
-    saturated = [k for k, press in enumerate(presses) if not press.lit[near_contact(press)].all()]
+    saturated = [k for k, press in enumerate(presses) if not press.lit[contact_and_skirt(press)].all()]
     for _ in range(SATURATED_ROUNDS if saturated else 0):
-        weights = solve(functools.reduce(operator.add, sets), size)
+        weights = solve_weights(functools.reduce(operator.add, sets), size)
         for k in saturated:
-            known = presses[k], labels[k], besides[k]
+            known = presses[k], labels[k], extra_terms_of_presses[k]
             sets[k] = forward_equations(*known, counted_pixels(*known, weights, size))
     return size, sets
 
 
-def _names(frames: Sequence[tuple[str, Image]]) -> tuple[str, ...]:
+def _join_names(frames: Sequence[tuple[str, Image]]) -> tuple[str, ...]:
     return tuple(name for name, _ in frames)
 
 
-def _darkness(
+def _calibrate_darkness(
     found: list[BallPress], left_out: list[tuple[str, str]], mean: FloatArray, reference: Image, ball: float
 ) -> LightFit:
     """The calibration of a light that tells depth and no direction. Raises BadFrames where it does not do that, too."""
     if not found:
-        raise _nothing_left(left_out)
+        raise _no_presses_error(left_out)
     try:
         fit = fit_darkness(found, ball)
-        while max(fit.unexplained) > DARK_UNEXPLAINED and len(found) > 1:
-            worst = int(np.argmax(fit.unexplained))
+        while max(fit.residual_shares) > MAX_DARKNESS_RESIDUAL and len(found) > 1:
+            worst = int(np.argmax(fit.residual_shares))
             left_out.append(
-                (found.pop(worst).name, f"depth explains only {1 - fit.unexplained[worst]:.0%} of its darkness")
+                (found.pop(worst).name, f"depth explains only {1 - fit.residual_shares[worst]:.0%} of its darkness")
             )
             fit = fit_darkness(found, ball)
     except BadFrames as why:
         raise NoDirection(f"{NO_DIRECTION}, and {why}") from None
-    if max(fit.unexplained) > DARK_UNEXPLAINED:
+    if max(fit.residual_shares) > MAX_DARKNESS_RESIDUAL:
         raise NoDirection(
-            f"{NO_DIRECTION}, and depth explains only {1 - max(fit.unexplained):.0%} of how dark it gets: is the ball "
-            "round, its radius right, and exposure fixed?"
+            f"{NO_DIRECTION}, and depth explains only {1 - max(fit.residual_shares):.0%} of how dark it gets: is the "
+            "ball round, its radius right, and exposure fixed?"
         )
     predictions = []
     for press, model in zip(fit.presses, fit.left_out, strict=True):
         if model is None:
             continue
         v, u = np.mgrid[: press.shape[0], : press.shape[1]].astype(np.float64)
-        change, _ = darkened(model, dent_height(u, v, press.circle, fit.thickness, ball).astype(np.float32), 1.0)
+        change, _ = darken_by_depth(model, dent_height(u, v, press.circle, fit.thickness, ball).astype(np.float32), 1.0)
         slopes, _ = DarknessSlopes(model, press.shape, 1.0)(press.change.astype(np.float32))
         label = dent_gradient(u, v, press.circle, fit.thickness, ball)
-        angles = normal_angle(to_normal(slopes.astype(np.float64)), to_normal(label))
-        predictions.append(compared(press, change.astype(np.float64) * mean, angles, mean, reference))
+        angles = normal_angle(normal_of_slope(slopes.astype(np.float64)), normal_of_slope(label))
+        predictions.append(compare_with_prediction(press, change.astype(np.float64) * mean, angles, mean, reference))
     return LightFit(
         forward=None,
         inverse=None,
         size=None,
         thickness=fit.thickness,
         radius_uncertainty=fit.radius_uncertainty,
-        unexplained=fit.unexplained,
+        residual_shares=fit.residual_shares,
         predictions=tuple(predictions),
         left_out=tuple(left_out),
-        warnings=(*_warnings(fit.presses, mean, len(left_out)), *_badly_predicted(predictions)),
+        warnings=(*_warnings(fit.presses, mean, len(left_out)), *_poorly_predicted(predictions)),
         reference=reference,
         presses=fit.presses,
         frames=(),
@@ -257,7 +261,7 @@ def _darkness(
     )
 
 
-def _nothing_left(left_out: Sequence[tuple[str, str]]) -> BadFrames:
+def _no_presses_error(left_out: Sequence[tuple[str, str]]) -> BadFrames:
     alike: dict[str, list[tuple[str, str]]] = {}
     for name, why in left_out:
         alike.setdefault(re.sub(r"\d+", "", why), []).append((name, why))
@@ -267,7 +271,7 @@ def _nothing_left(left_out: Sequence[tuple[str, str]]) -> BadFrames:
     return BadFrames("no frame can be used. " + "; ".join(said))
 
 
-def _check(reference: Image, frames: Sequence[tuple[str, Image]]) -> None:
+def _require_valid_frames(reference: Image, frames: Sequence[tuple[str, Image]]) -> None:
     """Raises BadFrames for none, for other sizes, and for red and blue exchanged."""
     if not frames:
         raise BadFrames("no frame of a press; give at least one, better 5 to 8, beside the one without contact")
@@ -281,49 +285,50 @@ def _check(reference: Image, frames: Sequence[tuple[str, Image]]) -> None:
         )
     # the median of the frames shows the gel nearly without contact
     median = np.median(np.stack([image for _, image in frames[:ORDER_FRAMES]]), axis=0).astype(np.float32)
-    if exchanged(median, reference.astype(np.float32), np.ones(reference.shape[:2], dtype=np.bool_)):
+    if is_channel_order_swapped(median, reference.astype(np.float32), np.ones(reference.shape[:2], dtype=np.bool_)):
         raise BadFrames(
             "the frames are like the picture without contact only with red and blue exchanged: give all in one order"
         )
 
 
-def _refined(
+def _refine_without_outlier(
     found: list[BallPress], left_out: list[tuple[str, str]], ball: float
 ) -> tuple[list[BallPress], RefinedGeometry]:
     """Refines all circles, leaves the worst outlier out, and refines again. Raises BadFrames when nothing is left."""
     while found:
-        refined = refine([_window(press) for press in found], [press.circle for press in found], ball)
-        limit = MAX_UNEXPLAINED
+        refined = refine_geometry([_press_window(press) for press in found], [press.circle for press in found], ball)
+        limit = MAX_RESIDUAL_SHARE
         if len(found) > 2:
-            limit = min(limit, max(MAX_UNEXPLAINED_RATIO * float(np.median(refined.unexplained)), GOOD_FIT))
-        worst = int(np.argmax(refined.unexplained))
-        if refined.unexplained[worst] <= limit:
+            limit = min(limit, max(MAX_RESIDUAL_RATIO * float(np.median(refined.residual_shares)), MAX_GOOD_RESIDUAL))
+        worst = int(np.argmax(refined.residual_shares))
+        if refined.residual_shares[worst] <= limit:
             return [replace(p, circle=c) for p, c in zip(found, refined.circles, strict=True)], refined
         why = (
-            f"the fitted ball dent explains only {1 - refined.unexplained[worst]:.0%} of the colour change (at least "
-            f"{1 - limit:.0%} needed)"
+            f"the fitted ball dent explains only {1 - refined.residual_shares[worst]:.0%} of the colour change (at "
+            f"least {1 - limit:.0%} needed)"
         )
         left_out.append((found.pop(worst).name, why))
-    raise _nothing_left(left_out)
+    raise _no_presses_error(left_out)
 
 
-def _shaded(
+def _fit_shadows(
     presses: list[BallPress], refined: RefinedGeometry, ball: float
 ) -> tuple[list[BallPress], RefinedGeometry, DentShade | None]:
     """Where cast shadows are seen: their lamps, and the circles refined with them, which else grow towards the shade
     and take it for skirt. Else what was given, and None."""
-    if len(presses) <= FEW_PRESSES or np.mean(refined.unexplained) < UNSHADED:
+    if len(presses) <= FEW_PRESSES or np.mean(refined.residual_shares) < MIN_SHADOW_RESIDUAL:
         return presses, refined, None
-    windows, circles = [_window(press, SHADED_PIXELS) for press in presses], refined.circles
+    windows, circles = [_press_window(press, SHADED_PIXELS) for press in presses], refined.circles
     shade = find_lamps(windows, circles, refined.thickness, ball, presses[0].shape)
-    slopes = [label(press, refined, ball) for press in presses]
+    slopes = [label_slopes(press, refined, ball) for press in presses]
     sets = [
-        forward_equations(p, g, beside_slopes(p, g, refined, ball, shade)) for p, g in zip(presses, slopes, strict=True)
+        forward_equations(p, g, extra_forward_terms(p, g, refined, ball, shade))
+        for p, g in zip(presses, slopes, strict=True)
     ]
     if not choose_size(sets).shadows:
         return presses, refined, None
-    for _ in range(ROUNDS):  # circles tell where the lamps stand, and the lamps where the circles are
-        refined = refine(windows, refined.circles, ball, shade, (ball / refined.thickness,))
+    for _ in range(REFINEMENT_ROUNDS):  # circles tell where the lamps stand, and the lamps where the circles are
+        refined = refine_geometry(windows, refined.circles, ball, shade, (ball / refined.thickness,))
         shade = find_lamps(windows, refined.circles, refined.thickness, ball, presses[0].shape)
     return [replace(p, circle=c) for p, c in zip(presses, refined.circles, strict=True)], refined, shade
 
@@ -347,9 +352,9 @@ def _warnings(presses: Sequence[BallPress], mean: FloatArray, left_out: int) -> 
     return found
 
 
-def _badly_predicted(predictions: Sequence[PressPrediction]) -> list[str]:
+def _poorly_predicted(predictions: Sequence[PressPrediction]) -> list[str]:
     """Only with three or more: of two presses either may be the bad one."""
-    bad = [prediction for prediction in predictions if prediction.angle > BAD_NORMALS]
+    bad = [prediction for prediction in predictions if prediction.angle > MAX_NORMAL_ERROR]
     if len(predictions) < 3 or not bad:
         return []
     worst = max(prediction.angle for prediction in bad)
@@ -359,39 +364,39 @@ def _badly_predicted(predictions: Sequence[PressPrediction]) -> list[str]:
     ]
 
 
-def _window(press: BallPress, pixels: int = REFINEMENT_PIXELS) -> Window:
+def _press_window(press: BallPress, pixels: int = REFINEMENT_PIXELS) -> Window:
     """Pixels of contact and skirt, thinned out to about so many."""
-    v, u = np.nonzero(near_contact(press))
+    v, u = np.nonzero(contact_and_skirt(press))
     thin = max(1, round(np.sqrt(len(u) / pixels)))
     keep = (u % thin == 0) & (v % thin == 0) & press.lit[v, u].all(axis=1)
     u, v = u[keep], v[keep]
-    return Window(u.astype(np.float64), v.astype(np.float64), smooth(press.change, BLUR)[v, u])
+    return Window(u.astype(np.float64), v.astype(np.float64), gaussian_blur(press.change, BLUR)[v, u])
 
 
-def _prediction(
+def _predict_press(
     press: BallPress,
     gradient: FloatArray,
-    beside: FloatArray,
+    extra_terms: FloatArray,
     forward: PhotometricModel,
     inverse: InverseModel,
     mean: FloatArray,
     reference: Image,
 ) -> PressPrediction:
-    """Of a press labelled `gradient` (H, W, 2), `beside` (H, W, terms), by models made without it.
+    """Of a press labelled `gradient` (H, W, 2), `extra_terms` (H, W, terms), by models made without it.
     Slopes are found as in every picture: from each pixel's colour, then those of a surface that the forward model
     agrees with."""
     places = places_in_image(*press.shape[::-1])
-    height = None if forward.depth is None else (beside[..., 0] * forward.depth.deepest).astype(np.float32)
+    height = None if forward.depth is None else (extra_terms[..., 0] * forward.depth.deepest).astype(np.float32)
     light, _ = PhotometricLight(forward).change(gradient.astype(np.float32), *places, height)
     predicted = light.astype(np.float64)
     if forward.shadows is not None:
-        predicted += beside[..., DEPTH_TERMS + SLOPE_TERMS :] @ np.array(forward.shadows.weights)
-    predicted = smooth(predicted, BLUR) * mean
-    seen = smooth(press.change, INVERSE_BLUR).astype(np.float32)
+        predicted += extra_terms[..., DEPTH_TERMS + SLOPE_TERMS :] @ np.array(forward.shadows.weights)
+    predicted = gaussian_blur(predicted, BLUR) * mean
+    seen = gaussian_blur(press.change, INVERSE_BLUR).astype(np.float32)
     slopes, _ = PolynomialSlopes(inverse, *(2 * place.astype(np.float64) for place in places))(seen)
     integrate, nothing = Integrator(press.shape, 1.0), np.zeros(press.shape, dtype=np.bool_)
     steps = ForwardSteps(forward, *places, 1.0, float(press.shape[1]))
     height = steps(np.ascontiguousarray(np.moveaxis(seen, -1, 0)), integrate(slopes), nothing, integrate)
     found = np.stack(slopes_of(height, 1.0), axis=-1)
-    angles = normal_angle(to_normal(found.astype(np.float64)), to_normal(gradient))
-    return compared(press, predicted, angles, mean, reference)
+    angles = normal_angle(normal_of_slope(found.astype(np.float64)), normal_of_slope(gradient))
+    return compare_with_prediction(press, predicted, angles, mean, reference)

@@ -20,10 +20,10 @@ from calibration.light.dent import MAX_RIM_RATIO, dent_slope
 from tacsim.interface import FloatArray
 
 BLUR = 1.5  # of images and of the fitted dent, against noise [px]
-WINDOW = 2.0  # half side of what the fit looks at [half widths of the bright patch]
+WINDOW_RATIO = 2.0  # half side of what the fit looks at [half widths of the bright patch]
 MIN_RADIUS = 4.0  # of a circle that differs from noise [px]
-MIN_EXPLAINED = 0.7  # share of the difference that a ball's dent must explain
-AT_RIM = 0.98  # contact radius over the largest that a ball can have, from which a larger ball is tried
+MIN_EXPLAINED_SHARE = 0.7  # share of the difference that a ball's dent must explain
+MAX_CONTACT_RATIO = 0.98  # contact radius over the largest that a ball can have, from which a larger ball is tried
 
 
 class NoCircle(ValueError):
@@ -37,10 +37,10 @@ class Circle:
     x: float
     y: float
     radius: float
-    explained: float  # share of the difference that the dent explains, 0 to 1
+    explained_share: float  # share of the difference that the dent explains, 0 to 1
 
 
-def contact_circle(image: NDArray[np.uint8], reference: NDArray[np.uint8], ball_radius: float) -> Circle:
+def find_contact_circle(image: NDArray[np.uint8], reference: NDArray[np.uint8], ball_radius: float) -> Circle:
     """Finds the contact of a ball of known radius [px] in `image` (H, W, 3); `reference` is the same without contact.
 
     Raises ValueError when the two images differ in size, NoCircle when no ball's contact is seen.
@@ -50,61 +50,65 @@ def contact_circle(image: NDArray[np.uint8], reference: NDArray[np.uint8], ball_
             f"the image is {image.shape[1]} x {image.shape[0]} px, the one without contact "
             f"{reference.shape[1]} x {reference.shape[0]}; they must be of one camera"
         )
-    difference = _blurred(image.astype(np.float64) - reference)
+    difference = _blur_image(image.astype(np.float64) - reference)
     difference -= np.median(difference, axis=(0, 1))
-    x, y, size = _patch(difference)
-    window = round(WINDOW * size) + 6
+    x, y, size = _brightest_patch(difference)
+    window = round(WINDOW_RATIO * size) + 6
     columns = np.arange(max(round(x) - window, 0), min(round(x) + window + 1, image.shape[1]))
     rows = np.arange(max(round(y) - window, 0), min(round(y) + window + 1, image.shape[0]))
-    seen = np.ascontiguousarray(difference[np.ix_(rows, columns)].reshape(-1, 3).T)
-    circle = _fitted(seen, columns, rows, (x, y, size), ball_radius)
-    if circle.explained >= MIN_EXPLAINED and circle.radius >= MIN_RADIUS:
+    observed = np.ascontiguousarray(difference[np.ix_(rows, columns)].reshape(-1, 3).T)
+    circle = _fit_circle(observed, columns, rows, (x, y, size), ball_radius)
+    if circle.explained_share >= MIN_EXPLAINED_SHARE and circle.radius >= MIN_RADIUS:
         return circle
-    if circle.radius > AT_RIM * MAX_RIM_RATIO * ball_radius:
-        larger = _fitted(seen, columns, rows, (x, y, size), 2 * ball_radius)
-        if larger.explained >= MIN_EXPLAINED:
+    if circle.radius > MAX_CONTACT_RATIO * MAX_RIM_RATIO * ball_radius:
+        larger = _fit_circle(observed, columns, rows, (x, y, size), 2 * ball_radius)
+        if larger.explained_share >= MIN_EXPLAINED_SHARE:
             raise NoCircle(
                 "the contact is wider than the ball can be: pixel pitch or the ball's radius is wrong (or no ball was "
                 "pressed)"
             )
     raise NoCircle(
-        f"no ball's contact is seen: a dent explains {max(circle.explained, 0.0):.0%} of the difference to the image "
-        f"without contact, {MIN_EXPLAINED:.0%} are needed"
+        f"no ball's contact is seen: a dent explains {max(circle.explained_share, 0.0):.0%} of the difference to the "
+        f"image without contact, {MIN_EXPLAINED_SHARE:.0%} are needed"
     )
 
 
-def _fitted(
-    seen: FloatArray, columns: NDArray[np.intp], rows: NDArray[np.intp], start: tuple[float, float, float], ball: float
+def _fit_circle(
+    observed: FloatArray,
+    columns: NDArray[np.intp],
+    rows: NDArray[np.intp],
+    start: tuple[float, float, float],
+    ball: float,
 ) -> Circle:
-    """The circle that explains best what is `seen` (3, n) in a window; `start`: x, y, radius, about [px]."""
+    """The circle that explains best what is `observed` (3, n) in a window; `start`: x, y, radius, about [px]."""
     from scipy.optimize import minimize
 
-    power = float((seen**2).sum()), float(((seen - seen.mean(axis=1, keepdims=True)) ** 2).sum())
+    power = float((observed**2).sum()), float(((observed - observed.mean(axis=1, keepdims=True)) ** 2).sum())
     largest = MAX_RIM_RATIO * ball
 
-    def unexplained(guess: FloatArray) -> float:
+    def residual_share(guess: FloatArray) -> float:
         if not MIN_RADIUS / 2 < guess[2] < largest:
             return 2.0
-        return _unexplained(seen, power, columns - guess[0], rows - guess[1], float(guess[2]), ball)
+        return _residual_share(observed, power, columns - guess[0], rows - guess[1], float(guess[2]), ball)
 
     x, y, size = start
     first = np.array([x, y, min(size, 0.95 * largest)])
     simplex = first + np.array([[0, 0, 0], [2, 0, 0], [0, 2, 0], [0, 0, -0.15 * first[2]]])
     found = minimize(
-        unexplained, first, method="Nelder-Mead",
+        residual_share, first, method="Nelder-Mead",
         options={"xatol": 0.02, "fatol": 1e-7, "maxiter": 400, "initial_simplex": simplex},
     )  # fmt: skip
     return Circle(float(found.x[0]), float(found.x[1]), float(found.x[2]), 1.0 - float(found.fun))
 
 
-def _blurred(image: FloatArray) -> FloatArray:
+def _blur_image(image: FloatArray) -> FloatArray:
     import cv2
 
     side = 2 * round(4 * BLUR) + 1
     return np.asarray(cv2.GaussianBlur(image, (side, side), BLUR, borderType=cv2.BORDER_REFLECT), dtype=np.float64)
 
 
-def _patch(difference: FloatArray) -> tuple[float, float, float]:
+def _brightest_patch(difference: FloatArray) -> tuple[float, float, float]:
     """Centre and half width of the brightest patch of the difference. Raises NoCircle for images that do not differ."""
     import cv2
 
@@ -119,16 +123,16 @@ def _patch(difference: FloatArray) -> tuple[float, float, float]:
     return float(columns.min()) + width / 2, float(rows.min()) + height / 2, max(width, height) / 2
 
 
-def _unexplained(
-    seen: FloatArray, power: tuple[float, float], dx: FloatArray, dy: FloatArray, contact: float, ball: float
+def _residual_share(
+    observed: FloatArray, power: tuple[float, float], dx: FloatArray, dy: FloatArray, contact: float, ball: float
 ) -> float:
-    """Share of the variance of `seen` (3, n) that no polynomial of the dent's slopes explains; `power`: sums of the
-    squares of `seen`, and of its variations."""
+    """Share of the variance of `observed` (3, n) that no polynomial of the dent's slopes explains; `power`: sums of the
+    squares of `observed`, and of its variations."""
     r = np.hypot(dx[None, :], dy[:, None])
     steepness = dent_slope(r, contact, ball) / np.maximum(r, 1e-12)
-    x, y = (_blurred(steepness * part).ravel() for part in (dx[None, :], dy[:, None]))
+    x, y = (_blur_image(steepness * part).ravel() for part in (dx[None, :], dy[:, None]))
     features = np.stack([np.ones_like(x), y, y * y, x, x * y, x * x])
     # normal equations: few well-scaled columns, and a hundred solutions an image
-    right = features @ seen.T
+    right = features @ observed.T
     weights, *_ = np.linalg.lstsq(features @ features.T, right, rcond=None)
     return (power[0] - float((weights * right).sum())) / power[1]

@@ -17,26 +17,28 @@ import numpy as np
 
 from calibration.errors import BadFrames
 from calibration.light.circle import Circle, NoCircle
-from calibration.light.dent import FAR, MAX_RIM_RATIO, ContactCircle, depth_profile
+from calibration.light.dent import MAX_RADIUS_RATIO, MAX_RIM_RATIO, ContactCircle, depth_profile
 from calibration.light.photometry import FEW_PRESSES
-from calibration.light.press import BallPress, press_at, smooth, untouched_mean
-from calibration.light.refinement import FIRST_THINNESS, MAX_GROUPS, RIVAL, THINNESS_BOUNDS
+from calibration.light.press import BallPress, gaussian_blur, make_press, mean_reference_colour
+from calibration.light.refinement import FIRST_THINNESS, MAX_ALTERNATIVE_COST, MAX_GROUPS, THINNESS_BOUNDS
 from tacsim.interface import FloatArray, Image
 from tacsim.models.photometric import DarknessModel
 
-ALIKE = 0.6  # share of the power of a press's change that is the same all round, above which no direction is told
-ROUND = 2.5  # up to where it is looked at [contact radii]: a flank's neighbours are there, too
+MAX_UNIFORM_SHARE = (
+    0.6  # share of the power of a press's change that is the same all round, above which no direction is told
+)
+FLANK_RADIUS = 2.5  # up to where it is looked at [contact radii]: a flank's neighbours are there, too
 BLUR = 2.0  # through which the darkness of presses is looked at [px]
 MIN_CONTRAST = 0.03  # relative change of colour in the middle of a contact
-EDGE = 1.3  # contact radius over the radius where a press is half as dark as in its middle, about
-NEAR = 3.0  # a press changes the gel up to here [contact radii]
+EDGE_RATIO = 1.3  # contact radius over the radius where a press is half as dark as in its middle, about
+PRESS_RADIUS = 3.0  # a press changes the gel up to here [contact radii]
 PIXELS = 1200  # of each press, about
 STEP = 1 / 30  # of radii [ball radii]
-FIRST = (0.3, 0.4)  # share, reach [ball radii] that the search starts from
+START = (0.3, 0.4)  # share, reach [ball radii] that the search starts from
 BOUNDS = ((0.0, 0.05), (0.8, 1.5))  # of share, reach
 KNOTS = 24  # of the table
-FLATTEST = 0.01  # least slope of the table, over its mean
-DARK_UNEXPLAINED = 0.1  # share of darkness that is no function of a dent's depth, at most; 0.003 on real frames
+MIN_SLOPE_RATIO = 0.01  # least slope of the table, over its mean
+MAX_DARKNESS_RESIDUAL = 0.1  # share of darkness that is no function of a dent's depth, at most; 0.003 on real frames
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,7 +48,7 @@ class DarknessFit:
     presses: tuple[BallPress, ...]  # with their circles refined
     thickness: float  # of the gel
     radius_uncertainty: float  # of the scale of all radii [-]; NaN for a single press with one solution
-    unexplained: tuple[float, ...]  # share of each press's darkness that no table explains
+    residual_shares: tuple[float, ...]  # share of each press's darkness that no table explains
     model: DarknessModel
     left_out: tuple[DarknessModel | None, ...]  # the model by all other presses, for each; None: there are none
 
@@ -55,7 +57,7 @@ def rough_contact(change: FloatArray) -> ContactCircle:
     """Where a change of colour (H, W, 3) is strongest. Raises NoCircle."""
     import cv2
 
-    strength = np.abs(smooth(change, BLUR)).mean(axis=2)
+    strength = np.abs(gaussian_blur(change, BLUR)).mean(axis=2)
     peak = float(strength.max())
     if not peak > MIN_CONTRAST:
         raise NoCircle(f"no ball's contact is seen: colours change by {peak:.1%} at most")
@@ -63,10 +65,10 @@ def rough_contact(change: FloatArray) -> ContactCircle:
     numbers = np.asarray(patches, dtype=np.intp)
     inside = numbers == numbers.ravel()[strength.argmax()]
     v, u = np.nonzero(inside)
-    return ContactCircle(float(u.mean()), float(v.mean()), EDGE * float(np.sqrt(len(u) / np.pi)))
+    return ContactCircle(float(u.mean()), float(v.mean()), EDGE_RATIO * float(np.sqrt(len(u) / np.pi)))
 
 
-def tells_no_direction(changes: Iterable[FloatArray]) -> bool:
+def is_direction_free(changes: Iterable[FloatArray]) -> bool:
     """True where most changes of colour (H, W, 3) are the same all round their contacts, in each channel: what is
     strongest may be one flank alone, which in its own colour is round too, and not in the others."""
     shares = []
@@ -78,13 +80,13 @@ def tells_no_direction(changes: Iterable[FloatArray]) -> bool:
             continue
         v, u = np.mgrid[: change.shape[0], : change.shape[1]]
         distance = np.hypot(u - circle.x, v - circle.y)
-        near = distance < ROUND * circle.radius
+        near = distance < FLANK_RADIUS * circle.radius
         rings = (distance[near] * (12 / circle.radius)).astype(np.intp)
         count = np.maximum(np.bincount(rings), 1)
-        seen = smooth(change, BLUR)[near]
-        means = np.stack([np.bincount(rings, channel) / count for channel in seen.T])
-        shares.append(float(((count * means**2).sum(axis=1) / np.maximum((seen**2).sum(axis=0), 1e-300)).min()))
-    return bool(shares) and float(np.median(shares)) > ALIKE
+        observed = gaussian_blur(change, BLUR)[near]
+        means = np.stack([np.bincount(rings, channel) / count for channel in observed.T])
+        shares.append(float(((count * means**2).sum(axis=1) / np.maximum((observed**2).sum(axis=0), 1e-300)).min()))
+    return bool(shares) and float(np.median(shares)) > MAX_UNIFORM_SHARE
 
 
 def find_dark_press(name: str, image: Image, reference: Image, mean: FloatArray, ball: float) -> BallPress:
@@ -93,7 +95,7 @@ def find_dark_press(name: str, image: Image, reference: Image, mean: FloatArray,
     raw = image.astype(np.float64) - reference
     circle = rough_contact((raw - np.median(raw, axis=(0, 1))) / mean)
     circle = replace(circle, radius=min(circle.radius, 0.9 * MAX_RIM_RATIO * ball))
-    return press_at(name, image, reference, mean, circle, NEAR)
+    return make_press(name, image, reference, mean, circle, PRESS_RADIUS)
 
 
 def dark_circle(image: Image, reference: Image, ball: float) -> Circle:
@@ -103,16 +105,16 @@ def dark_circle(image: Image, reference: Image, ball: float) -> Circle:
 
     Raises BadFrames for a reference that is dark or saturated, NoCircle when no ball's contact is seen.
     """
-    mean = untouched_mean(reference)
+    mean = mean_reference_colour(reference)
     try:
         fit = fit_darkness([find_dark_press("", image, reference, mean, ball)], ball)
     except BadFrames as why:
         raise NoCircle(f"no ball's contact is seen: {why}") from None
-    explained = 1.0 - fit.unexplained[0]
-    if explained < 1.0 - DARK_UNEXPLAINED:
+    explained = 1.0 - fit.residual_shares[0]
+    if explained < 1.0 - MAX_DARKNESS_RESIDUAL:
         raise NoCircle(
             f"no ball's contact is seen: the depth of a dent explains {max(explained, 0.0):.0%} of how dark it gets, "
-            f"{1 - DARK_UNEXPLAINED:.0%} are needed"
+            f"{1 - MAX_DARKNESS_RESIDUAL:.0%} are needed"
         )
     found = fit.presses[0].circle
     return Circle(found.x, found.y, found.radius, explained)
@@ -124,18 +126,22 @@ def fit_darkness(presses: Sequence[BallPress], ball: float) -> DarknessFit:
     problem = _Problem(presses, ball)
     ends = sorted((problem.refined(problem.start(thinness)) for thinness in FIRST_THINNESS), key=lambda end: end[1])
     best, cost = ends[0]
-    rivals = [_log_ratio(end, best) for end, other in ends[1:] if other < RIVAL * cost]
-    depths = [problem.own_depth(i, best) for i in range(len(presses))]
-    seen = [problem.windows[i].change for i in range(len(presses))]
-    whole = _table(depths, seen)
-    models = [whole] + [_table(_without(depths, i), _without(seen, i)) for i in range(len(presses)) if len(presses) > 1]
-    finished = [_model(table, float(best[-2]), float(best[-1]) * ball) for table in models]
+    rivals = [_log_ratio(end, best) for end, other in ends[1:] if other < MAX_ALTERNATIVE_COST * cost]
+    depths = [problem.local_depth(i, best) for i in range(len(presses))]
+    observed = [problem.windows[i].change for i in range(len(presses))]
+    whole = _fit_table(depths, observed)
+    models = [whole] + [
+        _fit_table(_leave_one_out(depths, i), _leave_one_out(observed, i))
+        for i in range(len(presses))
+        if len(presses) > 1
+    ]
+    finished = [_make_model(table, float(best[-2]), float(best[-1]) * ball) for table in models]
     circles = [ContactCircle(*map(float, best[3 * i : 3 * i + 3])) for i in range(len(presses))]
     return DarknessFit(
         presses=tuple(replace(press, circle=circle) for press, circle in zip(presses, circles, strict=True)),
         thickness=ball / float(best[-3]),
         radius_uncertainty=float(max([*problem.jackknife(best), *rivals], default=np.nan)),
-        unexplained=tuple(_unexplained(*pair, whole) for pair in zip(depths, seen, strict=True)),
+        residual_shares=tuple(_residual_share(*pair, whole) for pair in zip(depths, observed, strict=True)),
         model=finished[0],
         left_out=tuple(finished[1:]) or (None,),
     )
@@ -156,12 +162,12 @@ class _Problem:
 
     def __init__(self, presses: Sequence[BallPress], ball: float) -> None:
         self.presses, self._ball = presses, ball
-        self.windows = [_window(press) for press in presses]
+        self.windows = [_press_window(press) for press in presses]
         self._features = functools.lru_cache(maxsize=8 * len(presses) + 8)(self._new_features)
 
     def start(self, thinness: float) -> FloatArray:
         circles = [number for p in self.presses for number in (p.circle.x, p.circle.y, p.circle.radius)]
-        return np.array([*circles, thinness, *FIRST])
+        return np.array([*circles, thinness, *START])
 
     def refined(self, start: FloatArray) -> tuple[FloatArray, float]:
         """The least near `start`, and its cost."""
@@ -200,28 +206,28 @@ class _Problem:
             scales.append(_log_ratio(part.refined(begin)[0], begin, signed=True))
         return [float(np.sqrt((groups - 1) / groups * np.sum((np.array(scales) - np.mean(scales)) ** 2)))]
 
-    def own_depth(self, i: int, at: FloatArray) -> FloatArray:
+    def local_depth(self, i: int, at: FloatArray) -> FloatArray:
         """(n,) depth beyond the share of that round it, in the window of press `i` [px]."""
         x, y, radius = map(float, at[3 * i : 3 * i + 3])
         thinness, share, reach = map(float, at[-3:])
-        profile = _profile(radius / self._ball, thinness)
-        own = profile - share * (_mean_round(reach) @ profile)
+        profile = _dent_profile(radius / self._ball, thinness)
+        own = profile - share * (_local_mean_matrix(reach) @ profile)
         window = self.windows[i]
         distance = np.hypot(window.u - x, window.v - y)
-        return np.asarray(np.interp(distance, _radii() * self._ball, own) * self._ball, dtype=np.float64)
+        return np.asarray(np.interp(distance, _profile_radii() * self._ball, own) * self._ball, dtype=np.float64)
 
     def _new_features(self, i: int, at: tuple[float, ...]) -> FloatArray:
-        deep = self.own_depth(i, np.array([*([0.0] * 3 * i), *at])) / self._ball
+        deep = self.local_depth(i, np.array([*([0.0] * 3 * i), *at])) / self._ball
         above, below = np.maximum(deep, 0.0), np.minimum(deep, 0.0)
         return np.stack([above, below, above**2][: 3 if len(self.presses) > FEW_PRESSES else 2], axis=-1)
 
     def _residual(self, at: FloatArray) -> FloatArray:
         shared = tuple(map(float, at[-3:]))
         terms = [self._features(i, (*map(float, at[3 * i : 3 * i + 3]), *shared)) for i in range(len(self.presses))]
-        rows, seen = np.concatenate(terms), np.concatenate([w.change.mean(axis=1) for w in self.windows])
+        rows, observed = np.concatenate(terms), np.concatenate([w.change.mean(axis=1) for w in self.windows])
         square = rows.T @ rows
-        weights = np.linalg.solve(square + 1e-9 * np.trace(square) * np.eye(len(square)), rows.T @ seen)
-        return np.asarray(rows @ weights - seen, dtype=np.float64)
+        weights = np.linalg.solve(square + 1e-9 * np.trace(square) * np.eye(len(square)), rows.T @ observed)
+        return np.asarray(rows @ weights - observed, dtype=np.float64)
 
 
 def _log_ratio(one: FloatArray, other: FloatArray, *, signed: bool = False) -> float:
@@ -230,45 +236,45 @@ def _log_ratio(one: FloatArray, other: FloatArray, *, signed: bool = False) -> f
     return ratio if signed else abs(ratio)
 
 
-def _window(press: BallPress) -> _Window:
-    v, u = np.nonzero((press.distance() < NEAR * press.circle.radius) & press.lit.all(axis=2))
+def _press_window(press: BallPress) -> _Window:
+    v, u = np.nonzero((press.distance() < PRESS_RADIUS * press.circle.radius) & press.lit.all(axis=2))
     thin = max(1, round(np.sqrt(len(u) / PIXELS)))
     keep = (u % thin == 0) & (v % thin == 0)
     u, v = u[keep], v[keep]
-    return _Window(u.astype(np.float64), v.astype(np.float64), smooth(press.change, BLUR)[v, u])
+    return _Window(u.astype(np.float64), v.astype(np.float64), gaussian_blur(press.change, BLUR)[v, u])
 
 
 @functools.cache
-def _radii() -> FloatArray:
-    return np.arange(0.0, FAR, STEP)
+def _profile_radii() -> FloatArray:
+    return np.arange(0.0, MAX_RADIUS_RATIO, STEP)
 
 
 @functools.lru_cache(maxsize=64)
-def _profile(contact: float, thinness: float) -> FloatArray:
-    """Depth of a dent at :func:`_radii`; all in ball radii."""
-    return depth_profile(_radii(), contact, 1.0, 1 / thinness)
+def _dent_profile(contact: float, thinness: float) -> FloatArray:
+    """Depth of a dent at :func:`_profile_radii`; all in ball radii."""
+    return depth_profile(_profile_radii(), contact, 1.0, 1 / thinness)
 
 
 @functools.lru_cache(maxsize=8)
-def _mean_round(reach: float) -> FloatArray:
-    """(n, n) from a profile at :func:`_radii` to that of its Gaussian mean over the plane."""
+def _local_mean_matrix(reach: float) -> FloatArray:
+    """(n, n) from a profile at :func:`_profile_radii` to that of its Gaussian mean over the plane."""
     from scipy.special import ive
 
-    r, s = _radii()[:, None], _radii()[None, :]
+    r, s = _profile_radii()[:, None], _profile_radii()[None, :]
     weights = s * np.exp(-(((r - s) / reach) ** 2) / 2) * ive(0, r * s / reach**2)
     return np.asarray(weights / np.maximum(weights.sum(axis=1, keepdims=True), 1e-300), dtype=np.float64)
 
 
-def _without(parts: Sequence[FloatArray], i: int) -> list[FloatArray]:
+def _leave_one_out(parts: Sequence[FloatArray], i: int) -> list[FloatArray]:
     return [part for k, part in enumerate(parts) if k != i]
 
 
-def _table(depths: Sequence[FloatArray], seen: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+def _fit_table(depths: Sequence[FloatArray], observed: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
     """Knots (k,) and changes (k, 3) that fall from each to the next and are 0 at depth 0: the least squares of changes
-    `seen` (n, 3) at `depths` (n,) by non-negative steps. Raises BadFrames where nothing falls."""
+    `observed` (n, 3) at `depths` (n,) by non-negative steps. Raises BadFrames where nothing falls."""
     from scipy.optimize import nnls
 
-    deep, change = np.concatenate(depths), np.concatenate(seen)
+    deep, change = np.concatenate(depths), np.concatenate(observed)
     lowest, highest = min(float(deep.min()), -1e-3 * float(deep.max())), float(deep.max())
     below = max(2, round(KNOTS * -lowest / (highest - lowest)))
     knots = np.concatenate([np.linspace(lowest, 0.0, below + 1), np.linspace(0.0, highest, KNOTS + 1)[1:]])
@@ -280,18 +286,18 @@ def _table(depths: Sequence[FloatArray], seen: Sequence[FloatArray]) -> tuple[Fl
     total = steps.sum(axis=0)
     if not (total > 0).all():
         raise BadFrames("how dark it is does not grow with the depth")
-    steps = np.maximum(steps, FLATTEST * total * ((high - low) / (highest - lowest))[:, None])
+    steps = np.maximum(steps, MIN_SLOPE_RATIO * total * ((high - low) / (highest - lowest))[:, None])
     changes = -np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
     return knots, changes - changes[below]
 
 
-def _model(table: tuple[FloatArray, FloatArray], share: float, reach: float) -> DarknessModel:
+def _make_model(table: tuple[FloatArray, FloatArray], share: float, reach: float) -> DarknessModel:
     knots, changes = table
     rows = tuple((float(r), float(g), float(b)) for r, g, b in changes)
     return DarknessModel(depths=tuple(map(float, knots)), changes=rows, share=share, reach=reach)
 
 
-def _unexplained(depth: FloatArray, seen: FloatArray, table: tuple[FloatArray, FloatArray]) -> float:
+def _residual_share(depth: FloatArray, observed: FloatArray, table: tuple[FloatArray, FloatArray]) -> float:
     knots, changes = table
     told = np.stack([np.interp(depth, knots, channel) for channel in changes.T], axis=-1)
-    return float(((told - seen) ** 2).sum() / max(float((seen**2).sum()), 1e-300))
+    return float(((told - observed) ** 2).sum() / max(float((observed**2).sum()), 1e-300))

@@ -23,8 +23,8 @@ from tacsim.interface import FloatArray
 
 MAX_RIM_RATIO = 0.98  # contact radius over ball radius; the slope is infinite at 1
 POISSON = 0.48  # of silicone; between 0.45 and 0.495 the slope changes by 2 % of that at the circle
-FAR = 6.0  # up to which a dent is followed [ball radii]
-STEP = 0.25  # of the radii at which a blurred slope is found [px]
+MAX_RADIUS_RATIO = 6.0  # up to which a dent is followed [ball radii]
+RADIUS_STEP = 0.25  # of the radii at which a blurred slope is found [px]
 DEPTH_STEP = 1.0  # of those at which the depth is found [px]
 
 
@@ -55,7 +55,7 @@ def layer_slope(distance: FloatArray, thinness: float) -> FloatArray:
 
     if thinness < 1e-3:
         return hertz_slope(1 / distance)
-    waves, weights = _missing_waves()
+    waves, weights = _layer_quadrature()
     waves = waves * thinness  # of one contact radius
     less = weights * (np.sin(waves) - waves * np.cos(waves)) / waves**2 * thinness
     at = np.append(distance, 1.0)
@@ -64,7 +64,7 @@ def layer_slope(distance: FloatArray, thinness: float) -> FloatArray:
 
 
 @functools.cache
-def _missing_waves() -> tuple[FloatArray, FloatArray]:
+def _layer_quadrature() -> tuple[FloatArray, FloatArray]:
     """Numbers of waves over one thickness, and how much less than a half-space a layer answers, times the weights of
     Gauss's quadrature."""
     x, weights = np.polynomial.legendre.leggauss(48)
@@ -102,10 +102,10 @@ def dent_gradient(
     if blur == 0:
         slope = dent_slope(r, circle.radius, ball, thickness)
     else:
-        reach = np.arange(0.0, float(r.max(initial=0.0)) + 4 * blur + 2 * STEP, STEP)
+        reach = np.arange(0.0, float(r.max(initial=0.0)) + 4 * blur + 2 * RADIUS_STEP, RADIUS_STEP)
         profile = dent_slope(reach, circle.radius, ball, thickness)
-        side = round(4 * blur / STEP)
-        kernel = np.exp(-((np.arange(-side, side + 1) * STEP / blur) ** 2) / 2)
+        side = round(4 * blur / RADIUS_STEP)
+        kernel = np.exp(-((np.arange(-side, side + 1) * RADIUS_STEP / blur) ** 2) / 2)
         odd = np.concatenate([-profile[side:0:-1], profile])  # to the other side of the axis it slopes the other way
         slope = np.interp(r, reach[: len(reach) - side], np.convolve(odd, kernel / kernel.sum(), mode="valid"))
     steepness = slope / np.maximum(r, 1e-9)
@@ -120,15 +120,15 @@ def depth_profile(radii: FloatArray, contact: float, ball: float, thickness: flo
 
 
 @functools.lru_cache(maxsize=64)
-def whole_profile(contact: float, ball: float, thickness: float) -> tuple[FloatArray, FloatArray]:
+def cached_profile(contact: float, ball: float, thickness: float) -> tuple[FloatArray, FloatArray]:
     """Radii up to FAR ball radii and the depth of a dent there [px]; for everybody, not to be written to."""
-    radii = np.arange(0.0, FAR * ball, DEPTH_STEP)
+    radii = np.arange(0.0, MAX_RADIUS_RATIO * ball, DEPTH_STEP)
     return radii, depth_profile(radii, contact, ball, thickness)
 
 
 def dent_height(u: FloatArray, v: FloatArray, circle: ContactCircle, thickness: float, ball: float) -> FloatArray:
     """(...,) height (into the gel) of that dent at pixels u, v (...,) [px]; 0 at FAR ball radii."""
-    radii, depth = whole_profile(circle.radius, ball, thickness)
+    radii, depth = cached_profile(circle.radius, ball, thickness)
     return np.asarray(np.interp(np.hypot(u - circle.x, v - circle.y), radii, depth), dtype=np.float64)
 
 
@@ -137,7 +137,7 @@ def contact_depth(contact: float, ball: float, thickness: float) -> float:
     one unit."""
     from scipy.special import j1
 
-    waves, weights = _missing_waves()
+    waves, weights = _layer_quadrature()
     waves = waves * (contact / thickness)
     less = 4 / np.pi * weights * (np.sin(waves) - waves * np.cos(waves)) / waves**2 * (contact / thickness)
     inside = np.linspace(0.05, 1.0, 20)
@@ -146,6 +146,6 @@ def contact_depth(contact: float, ball: float, thickness: float) -> float:
     return contact**2 / ball * pressure * (1 - float((less / waves).sum()))
 
 
-def rim_slope(circle: ContactCircle, ball: float) -> float:
+def max_dent_slope(circle: ContactCircle, ball: float) -> float:
     """The steepest slope of the dent [-]."""
     return circle.radius / float(np.sqrt(ball**2 - circle.radius**2))

@@ -14,7 +14,7 @@ from calibration.lens.view import GelView
 from calibration.light.checks.press_shapes import Stretch
 from calibration.light.dent import ContactCircle
 from calibration.light.photometry import ModelSize
-from calibration.light.press import FAR, BallPress
+from calibration.light.press import UNTOUCHED_RADIUS, BallPress
 from tacsim.interface import Float32, FloatArray, Image
 from tacsim.models.photometric import DarknessModel, PhotometricModel
 from tacsim.models.sensor import CameraNoise, Markers, SensorGeometry
@@ -44,7 +44,7 @@ class LightFit:
     size: ModelSize | None
     thickness: float  # of the gel, as the skirts of the dents tell it [px]
     radius_uncertainty: float  # of the scale of all contact radii [-]; NaN for a single press
-    unexplained: tuple[float, ...]  # share of each press's change of colour that no dent explains
+    residual_shares: tuple[float, ...]  # share of each press's change of colour that no dent explains
     predictions: tuple[PressPrediction, ...]
     left_out: tuple[tuple[str, str], ...]  # frames that took no part, and why
     warnings: tuple[str, ...]
@@ -53,7 +53,7 @@ class LightFit:
     frames: tuple[str, ...]  # names of all that were given
     darkness: DarknessModel | None = None  # of a light that tells depth and no direction; lengths in pixels
     stretch: Stretch | None = None  # of contacts, which are round; None: not measured
-    doubts: tuple[str, ...] = ()  # why the pictures are not to be trusted, and what to do after a colon
+    image_warnings: tuple[str, ...] = ()  # why the pictures are not to be trusted, and what to do after a colon
 
     def to_calibration(
         self,
@@ -103,7 +103,7 @@ class LightFit:
         )
 
 
-def compared(
+def compare_with_prediction(
     press: BallPress, predicted: FloatArray, angles: FloatArray, mean: FloatArray, reference: Image
 ) -> PressPrediction:
     """A press beside what was predicted of it: change of colour (H, W, 3) [grey levels], and how far the normals that
@@ -112,7 +112,7 @@ def compared(
     untouched_here = np.float64(reference) + press.drift  # what this frame would show without contact
     predicted = np.clip(untouched_here + predicted, 0.0, 255.0) - untouched_here
     real = press.change * mean
-    contact, far = distance < 1.5, distance > FAR
+    contact, far = distance < 1.5, distance > UNTOUCHED_RADIUS
     return PressPrediction(
         press.name,
         press.circle,

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.drift import DriftFinder
-from calibration.light.press import FAR, BallPress, untouched_mean
+from calibration.light.press import UNTOUCHED_RADIUS, BallPress, mean_reference_colour
 from calibration.reference import SATURATED
 from tacsim.interface import FloatArray, Image
 from tacsim.models.sensor import CameraNoise
@@ -19,7 +19,7 @@ from tacsim.optics.ink import fine_part
 Entry = TypeVar("Entry", bound=np.generic)
 
 TILE = 32  # side of the tiles; what is wider is drift, not noise [px]
-DARK = 2  # a channel at or below this has lost its noise [grey levels]
+MAX_DARK_LEVEL = 2  # a channel at or below this has lost its noise [grey levels]
 MIN_TILES = 4
 SKIN_NEAR = (1.25, 2.2)  # where the skin has moved, and the light changes little [contact radii]
 SKIN_FAR = (4.0, 8.0)  # where it has hardly, in about the same light
@@ -52,23 +52,23 @@ def measure_noise(frames: Sequence[Image]) -> CameraNoise:
     pairs = [pair for pair in zip(frames, frames[apart:], strict=False) if not np.array_equal(*pair)]
     if not pairs:
         raise NoiseUnknown("the pictures without contact are all the same one; take them from the running camera")
-    return _measured(np.concatenate([_tiles(*pair) for pair in pairs]))
+    return _noise_of_tiles(np.concatenate([_difference_tiles(*pair) for pair in pairs]))
 
 
 def measure_press_noise(presses: Sequence[BallPress], reference: Image) -> CameraNoise:
     """The same from presses and the one `reference` (H, W, 3) without contact, where nothing touches: farther than FAR
     contact radii from the middle. Noise of both is taken to be alike; what has changed between them in small, such as
     dirt, counts as noise. Raises NoiseUnknown."""
-    mean = untouched_mean(reference)
-    dark = (reference <= DARK).any(axis=2)
+    mean = mean_reference_colour(reference)
+    dark = (reference <= MAX_DARK_LEVEL).any(axis=2)
     cut = []
     for press in presses:
-        touched = press.distance() < FAR * press.circle.radius
-        cut.append(_free_tiles(press.change * mean, touched | dark | ~press.lit.all(axis=2)))
-    return _measured(np.concatenate(cut))
+        touched = press.distance() < UNTOUCHED_RADIUS * press.circle.radius
+        cut.append(_valid_tiles(press.change * mean, touched | dark | ~press.lit.all(axis=2)))
+    return _noise_of_tiles(np.concatenate(cut))
 
 
-def _measured(tiles: FloatArray) -> CameraNoise:
+def _noise_of_tiles(tiles: FloatArray) -> CameraNoise:
     """Of tiles (n, h, w, 3) of differences of two pictures. Raises NoiseUnknown."""
     if len(tiles) < MIN_TILES:
         raise NoiseUnknown(
@@ -88,7 +88,7 @@ def _measured(tiles: FloatArray) -> CameraNoise:
     ends = tiles.shape[2] / (tiles.shape[2] - 1), tiles.shape[1] / (tiles.shape[1] - 1)
     usual = float(np.median(pixels))
     beside = [end * float(np.median(products)) / usual for end, products in zip(ends, (along_x, along_y), strict=True)]
-    red_green, red_blue, green_blue = _possible(covariance, deviation)
+    red_green, red_blue, green_blue = _nearest_correlations(covariance, deviation)
     return CameraNoise(
         deviation=(float(deviation[0]), float(deviation[1]), float(deviation[2])),
         colours=(red_green, red_blue, green_blue),
@@ -96,34 +96,34 @@ def _measured(tiles: FloatArray) -> CameraNoise:
     )
 
 
-def _tiles(one: Image, other: Image) -> FloatArray:
+def _difference_tiles(one: Image, other: Image) -> FloatArray:
     """(n, h, w, 3) the difference of two pictures tile by tile, drift and mean removed, where neither is black or
     saturated."""
     most, least = np.maximum(one, other).max(axis=2), np.minimum(one, other).min(axis=2)
-    lost = np.asarray((most >= SATURATED) | (least <= DARK))
+    lost = np.asarray((most >= SATURATED) | (least <= MAX_DARK_LEVEL))
     level = np.maximum(one.mean(axis=(0, 1)), 1.0)
     change = other.astype(np.float32) - one
     planes = np.ascontiguousarray(np.moveaxis(change / level.astype(np.float32), -1, 0), dtype=np.float32)
     find = DriftFinder((one.shape[0], one.shape[1]))
     find.remove(planes, find(planes, lost))
-    return _free_tiles(np.asarray(np.moveaxis(planes, 0, -1) * level, dtype=np.float64), lost)
+    return _valid_tiles(np.asarray(np.moveaxis(planes, 0, -1) * level, dtype=np.float64), lost)
 
 
-def _free_tiles(still: FloatArray, lost: NDArray[np.bool_]) -> FloatArray:
+def _valid_tiles(difference: FloatArray, lost: NDArray[np.bool_]) -> FloatArray:
     """(n, h, w, 3) tiles of a difference (H, W, 3) that hold no `lost` pixel (H, W), each less its mean."""
-    size = min(TILE, *still.shape[:2])
-    tiles = _cut(still, size)[~_cut(lost[..., None], size).any(axis=(1, 2, 3))]
+    size = min(TILE, *difference.shape[:2])
+    tiles = _cut_tiles(difference, size)[~_cut_tiles(lost[..., None], size).any(axis=(1, 2, 3))]
     return np.asarray(tiles - tiles.mean(axis=(1, 2), keepdims=True), dtype=np.float64)
 
 
-def _cut(picture: NDArray[Entry], size: int) -> NDArray[Entry]:
+def _cut_tiles(picture: NDArray[Entry], size: int) -> NDArray[Entry]:
     """(n, size, size, channels) of (H, W, channels); what is left over at the right and lower border is dropped."""
     rows, columns, channels = picture.shape[0] // size, picture.shape[1] // size, picture.shape[2]
     whole = picture[: rows * size, : columns * size].reshape(rows, size, columns, size, channels)
     return whole.swapaxes(1, 2).reshape(-1, size, size, channels)
 
 
-def _possible(covariance: FloatArray, deviation: FloatArray) -> tuple[float, float, float]:
+def _nearest_correlations(covariance: FloatArray, deviation: FloatArray) -> tuple[float, float, float]:
     """Correlations R-G, R-B, G-B. Medians of tiles, taken one by one, need not fit together: the nearest that do."""
     scale = np.where(deviation > 0, deviation, 1.0)
     correlation = covariance / np.outer(scale, scale)

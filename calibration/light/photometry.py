@@ -17,17 +17,17 @@ from numpy.typing import NDArray
 from tacsim.interface import FloatArray
 from tacsim.models.photometric import DEPTH_TERMS, normal_terms, position_terms, term_count
 
-LARGEST = (5, 2)  # degree in the normal, degree in the place
+MAX_SIZE = (5, 2)  # degree in the normal, degree in the place
 SIZES = ((1, 0), (3, 0), (5, 0), (1, 1), (3, 1), (5, 1), (1, 2), (3, 2), (5, 2))  # degree in the normal, in the place
 RIDGES = (1e-6, 1e-5, 1e-4, 1e-3)  # times the mean of the diagonal of the normal equations
 FEW_PRESSES = 3  # up to this number they cover too little of the image for light that varies over it
 FEW_RIDGE = 1e-3
-CHUNK = 16384  # pixels that are summed at a time: fewer wake the threads of BLAS too often, more leave the cache
+CHUNK_PIXELS = 16384  # pixels that are summed at a time: fewer wake the threads of BLAS too often, more leave the cache
 MIN_IMPROVEMENT = 0.98  # factor of the left-out error that a larger model must reach
 SHADOW_IMPROVEMENT = 0.93  # the same of a model with cast shadows
 DEPTH_IMPROVEMENT = 0.99  # the same of one that knows the depth, which is known with few terms
 SLOPES_IMPROVEMENT = 0.995  # and of one to which slopes look otherwise at depth
-SLOPE_TERMS = term_count(LARGEST[0], 0)
+SLOPE_TERMS = term_count(MAX_SIZE[0], 0)
 # By so much the terms of slopes at depth are smaller than others: the ridge holds them back ten times as strongly. Of
 # all slopes and depths a ball shows few together.
 SLOPE_SCALE = 0.1**0.5
@@ -72,7 +72,7 @@ class NormalEquations:
         )
 
 
-def features(gradient: FloatArray, u: FloatArray, v: FloatArray, degree: int, position: int) -> FloatArray:
+def photometric_features(gradient: FloatArray, u: FloatArray, v: FloatArray, degree: int, position: int) -> FloatArray:
     """(n, terms) for slopes (n, 2) at places u, v (n,) in -1/2..1/2."""
     normal = np.ascontiguousarray(np.moveaxis(normal_terms(gradient, degree), 0, -1))
     place = np.moveaxis(position_terms(u, v, position), 0, -1)
@@ -85,85 +85,93 @@ def normal_equations(
     v: FloatArray,
     change: FloatArray,
     lit: NDArray[np.bool_] | None = None,
-    beside: FloatArray | None = None,
+    extra_terms: FloatArray | None = None,
 ) -> NormalEquations:
     """Of n pixels: slopes (n, 2), places (n,), relative changes of colour (n, 3); `lit` (n, 3): what is not saturated,
-    and counts; None: all; `beside` (n, terms): of depth and cast shadows; None: there are none."""
-    more = np.zeros((len(u), 0)) if beside is None else beside
+    and counts; None: all; `extra_terms` (n, terms): of depth and cast shadows; None: there are none."""
+    more = np.zeros((len(u), 0)) if extra_terms is None else extra_terms
     if lit is None or lit.all():
-        square, right = _all_sums(gradient, u, v, change, more)
+        square, right = _normal_sums_with_extra(gradient, u, v, change, more)
         return NormalEquations(square[None], right, float((change**2).sum()), change.size)
     counted = change * lit
-    square, right = _all_sums(gradient, u, v, counted, more)
+    square, right = _normal_sums_with_extra(gradient, u, v, counted, more)
     squares = []
     for saturated in (~lit).T:
-        lost, _ = _all_sums(gradient[saturated], u[saturated], v[saturated], counted[saturated], more[saturated])
+        lost, _ = _normal_sums_with_extra(
+            gradient[saturated], u[saturated], v[saturated], counted[saturated], more[saturated]
+        )
         squares.append(square - lost)
     return NormalEquations(np.stack(squares), right, float((counted**2).sum()), int(lit.sum()))
 
 
-def _all_sums(
-    gradient: FloatArray, u: FloatArray, v: FloatArray, change: FloatArray, beside: FloatArray
+def _normal_sums_with_extra(
+    gradient: FloatArray, u: FloatArray, v: FloatArray, change: FloatArray, extra_terms: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """G^T G and G^T `change` for G, the features of :func:`_sums` and beside them others (n, terms)."""
-    square, right = _sums(gradient, u, v, np.concatenate([change, beside], axis=1))
+    """G^T G and G^T `change` for G, the features of :func:`_normal_sums` and extra_terms them others (n, terms)."""
+    square, right = _normal_sums(gradient, u, v, np.concatenate([change, extra_terms], axis=1))
     light, across = right[:, : change.shape[1]], right[:, change.shape[1] :]
-    return np.block([[square, across], [across.T, beside.T @ beside]]), np.concatenate([light, beside.T @ change])
+    return np.block([[square, across], [across.T, extra_terms.T @ extra_terms]]), np.concatenate(
+        [light, extra_terms.T @ change]
+    )
 
 
-def _sums(gradient: FloatArray, u: FloatArray, v: FloatArray, change: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _normal_sums(
+    gradient: FloatArray, u: FloatArray, v: FloatArray, change: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """F^T F and F^T `change` (n, any) for F = features(gradient, u, v, *LARGEST), without F: each of its 126 columns is
     a term of the normal times one of the place, and of the products of two columns most are the same powers. What is
     left are 87 products of the normal times 15 of the place, summed over CHUNK pixels at a time."""
-    degree, position = LARGEST
-    normals, places = len(_powers(degree)), len(_places(position))
-    sums = np.zeros((len(_products()), len(_places(2 * position))))
+    degree, position = MAX_SIZE
+    normals, places = len(_normal_powers(degree)), len(_place_powers(position))
+    sums = np.zeros((len(_normal_products()), len(_place_powers(2 * position))))
     channels = change.shape[1]
     right = np.zeros((normals, places * channels))
-    for start in range(0, len(gradient), CHUNK):
-        part = slice(start, start + CHUNK)
+    for start in range(0, len(gradient), CHUNK_PIXELS):
+        part = slice(start, start + CHUNK_PIXELS)
         normal = normal_terms(gradient[part], 2 * degree)
         normal = np.concatenate([normal, normal[2] * normal[:normals]])  # as _products has them
         place = position_terms(u[part], v[part], 2 * position)
         sums += normal @ place.T
         right += normal[:normals] @ (place[:places, None] * change[part].T).reshape(places * channels, -1).T
-    of_normals, of_places = _pairs()
+    of_normals, of_places = _product_indices()
     square = sums[of_normals[None, :, None, :], of_places[:, None, :, None]]  # (places, normals, places, normals)
     by_place = right.reshape(normals, places, channels).swapaxes(0, 1)
     return square.reshape(places * normals, -1), by_place.reshape(-1, channels)
 
 
-def _powers(degree: int) -> list[tuple[int, ...]]:
+def _normal_powers(degree: int) -> list[tuple[int, ...]]:
     """Powers of nx, ny and 1 - nz of the terms of the normal, in their order."""
     higher = [(order - b, b, 0) for order in range(2, degree + 1) for b in range(order + 1)]
     return [(1, 0, 0), (0, 1, 0), (0, 0, 1), *higher]
 
 
-def _products() -> list[tuple[int, ...]]:
+def _normal_products() -> list[tuple[int, ...]]:
     """The same of all products of two terms of the normal (and a few more): terms of twice the degree, and the terms
     times 1 - nz."""
-    return [*_powers(2 * LARGEST[0]), *((a, b, c + 1) for a, b, c in _powers(LARGEST[0]))]
+    return [*_normal_powers(2 * MAX_SIZE[0]), *((a, b, c + 1) for a, b, c in _normal_powers(MAX_SIZE[0]))]
 
 
-def _places(position: int) -> list[tuple[int, ...]]:
+def _place_powers(position: int) -> list[tuple[int, ...]]:
     """Powers of u and v of the terms of the place."""
     return [(order - b, b) for order in range(position + 1) for b in range(order + 1)]
 
 
 @functools.cache
-def _pairs() -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _product_indices() -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Where the products of each two terms stand: those of the normal (n, n), and those of the place (m, m)."""
 
     def where(powers: list[tuple[int, ...]], products: list[tuple[int, ...]]) -> NDArray[np.intp]:
         return np.array([[products.index(tuple(np.add(one, other))) for other in powers] for one in powers])
 
-    degree, position = LARGEST
-    return where(_powers(degree), _products()), where(_places(position), _places(2 * position))
+    degree, position = MAX_SIZE
+    return where(_normal_powers(degree), _normal_products()), where(
+        _place_powers(position), _place_powers(2 * position)
+    )
 
 
-def solve(pixels: NormalEquations, size: ModelSize) -> FloatArray:
+def solve_weights(pixels: NormalEquations, size: ModelSize) -> FloatArray:
     """(terms, 3) ridge weights; `pixels`: the sum of all presses that count."""
-    part = _part(pixels, terms_of(size))
+    part = _select_terms(pixels, terms_of(size))
     return ridge_solution(part.square, part.right, size.ridge)
 
 
@@ -199,13 +207,13 @@ def choose_size(presses: Sequence[NormalEquations]) -> ModelSize:
     if len(presses) <= FEW_PRESSES:
         return ModelSize(3, 0, FEW_RIDGE)
     error, size = _best_size(presses, 0)
-    beside = len(presses[0].right) - term_count(*LARGEST)
-    shadows = max(beside - DEPTH_TERMS - SLOPE_TERMS, 0)
+    extra_terms = len(presses[0].right) - term_count(*MAX_SIZE)
+    shadows = max(extra_terms - DEPTH_TERMS - SLOPE_TERMS, 0)
     if shadows:
         other_error, other = _best_size(presses, shadows)
         if other_error < SHADOW_IMPROVEMENT * error:
             error, size = other_error, other
-    if not beside:
+    if not extra_terms:
         return size
     deep_error, deep = _best_ridge(presses, replace(size, depth=DEPTH_TERMS))
     other_error, other = _best_ridge(presses, replace(deep, slopes=term_count(size.degree, 0)))
@@ -228,21 +236,21 @@ def _best_size(presses: Sequence[NormalEquations], shadows: int) -> tuple[float,
 def _best_ridge(presses: Sequence[NormalEquations], size: ModelSize) -> tuple[float, ModelSize]:
     """The left-out error of a size with its best ridge, and that size."""
     use = terms_of(size)
-    parts = [_part(press, use) for press in presses]
+    parts = [_select_terms(press, use) for press in presses]
     error, ridge = min((left_out_error(parts, ridge), ridge) for ridge in RIDGES)
     return error, replace(size, ridge=ridge)
 
 
-def _part(of: NormalEquations, use: list[int]) -> NormalEquations:
+def _select_terms(of: NormalEquations, use: list[int]) -> NormalEquations:
     """The equations of some of the terms."""
     return NormalEquations(of.square[:, use][:, :, use], of.right[use], of.power, of.count)
 
 
 def terms_of(size: ModelSize) -> list[int]:
     """Where the terms of `size` stand among all."""
-    normals, all_normals = term_count(size.degree, 0), term_count(LARGEST[0], 0)
+    normals, all_normals = term_count(size.degree, 0), term_count(MAX_SIZE[0], 0)
     places = term_count(1, size.position) // term_count(1, 0)
-    deep = term_count(*LARGEST)
+    deep = term_count(*MAX_SIZE)
     slopes = deep + DEPTH_TERMS
     dark = slopes + SLOPE_TERMS
     return [

@@ -7,14 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibration.errors import BadFrames
-from calibration.light.circle import contact_circle
+from calibration.light.circle import find_contact_circle
 from calibration.light.dent import MAX_RIM_RATIO, ContactCircle
 from calibration.reference import SATURATED, UnusableReference, make_reference
 from tacsim.interface import FloatArray, Image, Mask
 from tacsim.models.photometric import place_in_image
 
-NEAR = 2.3  # contact and skirt reach this far [contact radii]
-FAR = 3.0  # beyond, the gel is untouched [contact radii]
+SKIRT_RADIUS = 2.3  # contact and skirt reach this far [contact radii]
+UNTOUCHED_RADIUS = 3.0  # beyond, the gel is untouched [contact radii]
 MIN_UNTOUCHED_SHARE = 0.15  # of the picture, for a drift that varies over it
 MAX_SATURATED_SHARE = 0.4  # of the contact
 SECOND_CONTACT = 0.7  # strength of a second patch, over that of the contact, that makes it a contact too ...
@@ -51,7 +51,7 @@ class Window:
     change: FloatArray  # (n, 3) relative change of colour
 
 
-def untouched_mean(reference: Image) -> FloatArray:
+def mean_reference_colour(reference: Image) -> FloatArray:
     """(3,) mean colour of a picture without contact. Raises BadFrames for one that is dark or saturated."""
     try:
         base = make_reference(reference.astype(np.float32), np.ones(reference.shape[:2], dtype=np.bool_))
@@ -69,13 +69,13 @@ def find_press(name: str, image: Image, reference: Image, mean: FloatArray, ball
 
     Raises NoCircle, BadFrames.
     """
-    half = contact_circle(_halved(image), _halved(reference), ball / 2)
+    half = find_contact_circle(_halve_image(image), _halve_image(reference), ball / 2)
     circle = ContactCircle(2 * half.x + 0.5, 2 * half.y + 0.5, min(2 * half.radius, 0.95 * MAX_RIM_RATIO * ball))
-    return press_at(name, image, reference, mean, circle)
+    return make_press(name, image, reference, mean, circle)
 
 
-def press_at(
-    name: str, image: Image, reference: Image, mean: FloatArray, circle: ContactCircle, reach: float = NEAR
+def make_press(
+    name: str, image: Image, reference: Image, mean: FloatArray, circle: ContactCircle, reach: float = SKIRT_RADIUS
 ) -> BallPress:
     """The same with a contact that is known, about; `reach`: how far it changes the gel [contact radii]. Raises
     BadFrames."""
@@ -86,15 +86,16 @@ def press_at(
     v, u = np.mgrid[:height, :width].astype(np.float64)
     distance = np.hypot(u - circle.x, v - circle.y)
     lit = (image < SATURATED) & (reference < SATURATED)
-    drift = _drift(raw, (distance > reach * circle.radius) & lit.all(axis=2))
+    drift = _fit_drift(raw, (distance > reach * circle.radius) & lit.all(axis=2))
     contact = distance < circle.radius
     saturated = 1.0 - float(lit[contact].all(axis=1).mean()) if contact.any() else 1.0
     if saturated > MAX_SATURATED_SHARE:
         raise BadFrames(f"{saturated:.0%} of the contact is saturated: shorten the exposure or press less")
     change = (raw - drift) / mean
-    strength = np.abs(smooth(change, 3.0)).max(axis=2)
+    strength = np.abs(gaussian_blur(change, 3.0)).max(axis=2)
     near, far = (
-        np.where(part, strength, 0.0) for part in (distance < 1.5 * circle.radius, distance > FAR * circle.radius)
+        np.where(part, strength, 0.0)
+        for part in (distance < 1.5 * circle.radius, distance > UNTOUCHED_RADIUS * circle.radius)
     )
     strong = SECOND_CONTACT * float(near.max())
     if _patch_area(far, strong) > SECOND_AREA * _patch_area(near, strong):
@@ -114,7 +115,7 @@ def _patch_area(strength: FloatArray, strong: float) -> int:
     return int(np.bincount(numbers.ravel(), minlength=count)[peaks].max(initial=0))
 
 
-def _drift(difference: FloatArray, untouched: Mask) -> FloatArray:
+def _fit_drift(difference: FloatArray, untouched: Mask) -> FloatArray:
     """(H, W, 3) change between reference and frame where nothing touches: a quadratic in the place, or its median
     where too little is untouched."""
     if untouched.mean() < MIN_UNTOUCHED_SHARE:
@@ -128,14 +129,14 @@ def _drift(difference: FloatArray, untouched: Mask) -> FloatArray:
     return quadratic
 
 
-def smooth(image: FloatArray, deviation: float) -> FloatArray:
+def gaussian_blur(image: FloatArray, deviation: float) -> FloatArray:
     """Blurred by a Gaussian of this standard deviation [px]."""
     import cv2
 
     return np.asarray(cv2.GaussianBlur(image, (0, 0), deviation), dtype=np.float64)
 
 
-def _halved(image: Image) -> Image:
+def _halve_image(image: Image) -> Image:
     import cv2
 
     size = (image.shape[1] // 2, image.shape[0] // 2)

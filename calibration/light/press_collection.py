@@ -9,9 +9,9 @@ import numpy as np
 
 from calibration.errors import BadFrames
 from calibration.light.circle import NoCircle
-from calibration.light.darkness import find_dark_press, tells_no_direction
+from calibration.light.darkness import find_dark_press, is_direction_free
 from calibration.light.dent import ContactCircle
-from calibration.light.press import find_press, untouched_mean
+from calibration.light.press import find_press, mean_reference_colour
 from tacsim.interface import Image
 
 MIN_SEPARATION = 0.5  # of two presses' centres [larger contact radius]
@@ -32,7 +32,7 @@ class PressCollection:
     def __init__(self, reference: Image, ball: float, rectify: Callable[[Image], Image] | None = None) -> None:
         self._rectify = rectify if rectify is not None else lambda image: image
         self._reference = self._rectify(reference)
-        self._mean = untouched_mean(self._reference)
+        self._mean = mean_reference_colour(self._reference)
         self._ball = ball
         self._circles: list[ContactCircle] = []
 
@@ -41,10 +41,10 @@ class PressCollection:
         """Contacts of the presses so far, in the metric picture [px]."""
         return tuple(self._circles)
 
-    def offer(self, image: Image) -> ContactCircle:
+    def add_image(self, image: Image) -> ContactCircle:
         """Takes a native picture and returns its contact; raises BadFrames with why it is refused."""
         seen = self._rectify(image)
-        dark = tells_no_direction([(seen - np.float64(self._reference)) / self._mean])
+        dark = is_direction_free([(seen - np.float64(self._reference)) / self._mean])
         find = find_dark_press if dark else find_press
         try:
             circle = find("press", seen, self._reference, self._mean, self._ball).circle

@@ -14,7 +14,7 @@ from typing import Self
 import numpy as np
 
 from calibration.light.dent import MAX_RIM_RATIO, ContactCircle, dent_gradient, dent_height
-from calibration.light.photometry import features
+from calibration.light.photometry import photometric_features
 from calibration.light.press import Window
 from calibration.light.shadows import DentShade
 from tacsim.interface import FloatArray
@@ -28,7 +28,7 @@ DELTA = 0.05  # step of finite differences [px]; of the gel's thinness [-]
 # Thinness of the gel: the ball's radius over the gel's thickness
 FIRST_THINNESS = (0.1, 1.0)  # the refinement starts from a thick gel and from a thin one
 THINNESS_BOUNDS = (0.02, 3.0)
-RIVAL = 1.2  # times the least cost, up to which what the other start leads to is a solution too
+MAX_ALTERNATIVE_COST = 1.2  # times the least cost, up to which what the other start leads to is a solution too
 MAX_GROUPS = 8  # that are left out in turn to tell the uncertainty of radii
 
 
@@ -38,7 +38,7 @@ class RefinedGeometry:
 
     circles: tuple[ContactCircle, ...]
     thickness: float  # of the gel, as its skirts tell it [px]; above two ball radii it hardly matters
-    unexplained: tuple[float, ...]  # share of the power of each press's change of colour
+    residual_shares: tuple[float, ...]  # share of the power of each press's change of colour
     _ends: tuple[_Problem, ...]  # what each start led to, the best first
 
     def radius_uncertainty(self) -> float:
@@ -52,15 +52,15 @@ class RefinedGeometry:
         groups = min(count, MAX_GROUPS)
         scales = []
         for group in range(groups):
-            kept = [i for i in range(count) if i % groups != group]
-            refined = _descended(best.part(kept).solved())
-            scales.append(_scale(refined, best.part(kept)))
+            selected = [i for i in range(count) if i % groups != group]
+            refined = _minimise(best.select_presses(selected).solved())
+            scales.append(_log_scale(refined, best.select_presses(selected)))
         spread = np.sqrt((groups - 1) / groups * np.sum((np.array(scales) - np.mean(scales)) ** 2))
-        rivals = [abs(_scale(other, best)) for other in others if other.cost < RIVAL * best.cost]
+        rivals = [abs(_log_scale(other, best)) for other in others if other.cost < MAX_ALTERNATIVE_COST * best.cost]
         return float(max([spread, *rivals]))
 
 
-def refine(
+def refine_geometry(
     windows: Sequence[Window],
     start: Sequence[ContactCircle],
     ball: float,
@@ -73,7 +73,7 @@ def refine(
     Fixed windows, so that two states compare: they are cut round `start` and stay.
     """
     ends = sorted(
-        (_descended(_Problem(windows, tuple(start), first, ball, shade).solved()) for first in thinness),
+        (_minimise(_Problem(windows, tuple(start), first, ball, shade).solved()) for first in thinness),
         key=lambda problem: problem.cost,
     )
     best = ends[0]
@@ -82,7 +82,7 @@ def refine(
     return RefinedGeometry(best.circles, ball / best.thinness, shares, tuple(ends))
 
 
-def _descended(state: _Problem) -> _Problem:
+def _minimise(state: _Problem) -> _Problem:
     """From `state` to the least cost near it, by Levenberg and Marquardt's steps."""
     damping = 1e-2
     for _ in range(MAX_STEPS):
@@ -102,7 +102,7 @@ def _descended(state: _Problem) -> _Problem:
     return state
 
 
-def _scale(one: _Problem, other: _Problem) -> float:
+def _log_scale(one: _Problem, other: _Problem) -> float:
     """Mean logarithm of the ratio of radii."""
     pairs = zip(one.circles, other.circles, strict=True)
     return float(np.mean([np.log(circle.radius / was.radius) for circle, was in pairs]))
@@ -123,9 +123,9 @@ class _Problem:
     _weights: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
     _residuals: list[FloatArray] = field(default_factory=list)
 
-    def part(self, kept: Sequence[int]) -> _Problem:
+    def select_presses(self, selected: Sequence[int]) -> _Problem:
         """The same of some of the presses."""
-        windows, circles = [self.windows[i] for i in kept], tuple(self.circles[i] for i in kept)
+        windows, circles = [self.windows[i] for i in selected], tuple(self.circles[i] for i in selected)
         return _Problem(windows, circles, self.thinness, self.ball, self.shade)
 
     def solved(self) -> Self:
@@ -186,6 +186,6 @@ class _Problem:
         # colour that goes with the depth would else be explained by circles that are too large, and beside the contact
         depth = dent_height(window.u, window.v, circle, thickness, self.ball)[:, None] / self.ball
         if self.shade is None:
-            return np.concatenate([features(gradient, window.u, window.v, DEGREE, 0), depth], axis=1)
+            return np.concatenate([photometric_features(gradient, window.u, window.v, DEGREE, 0), depth], axis=1)
         dark = self.shade.terms(window.u, window.v, circle, thickness, self.ball)
         return np.concatenate([self.shade.light(gradient, window.u, window.v), depth, dark], axis=1)

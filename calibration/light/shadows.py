@@ -7,15 +7,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.light.dent import ContactCircle, dent_gradient, whole_profile
-from calibration.light.photometry import features
+from calibration.light.dent import ContactCircle, cached_profile, dent_gradient
+from calibration.light.photometry import photometric_features
 from calibration.light.press import Window
 from tacsim.interface import FloatArray
 from tacsim.models.photometric import Floats, horizon, shadow_terms
 
 DEGREE, POSITION = 3, 2  # of the light beside which shadows are sought
 RIDGE = 1e-4
-PIXELS = 600  # of each press, about, that tell where lamps stand
+PIXELS_PER_PRESS = 600  # of each press, about, that tell where lamps stand
 DISTANCES = (0.35, 0.7, 1.3, 4.0)  # of lamps from the middle of the picture at which the search starts [widths]
 DIRECTIONS = 10
 SEARCH_STEPS = 30
@@ -31,7 +31,7 @@ class DentShade:
     def terms(self, u: FloatArray, v: FloatArray, circle: ContactCircle, thickness: float, ball: float) -> FloatArray:
         """(n, terms) of the shadows at pixels u, v (n,), in the order of their weights."""
         rows, columns = self.shape
-        radii, depth = whole_profile(circle.radius, ball, thickness)
+        radii, depth = cached_profile(circle.radius, ball, thickness)
         depth = depth / columns
         steps, last, scale = np.diff(depth, append=depth[-1]), len(depth) - 1, columns / (radii[1] - radii[0])
         x, y = self._places(u, v)
@@ -51,7 +51,7 @@ class DentShade:
     def light(self, gradient: FloatArray, u: FloatArray, v: FloatArray) -> FloatArray:
         """(n, terms) of the light beside shadows, for slopes (n, 2)."""
         x, y = self._places(u, v)
-        return features(gradient, x, y * (self.shape[1] / self.shape[0]), DEGREE, POSITION)
+        return photometric_features(gradient, x, y * (self.shape[1] / self.shape[0]), DEGREE, POSITION)
 
     def _places(self, u: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray]:
         rows, columns = self.shape
@@ -71,7 +71,7 @@ def find_lamps(
     """
     from scipy.optimize import minimize
 
-    thin = [_thinned(window) for window in windows]
+    thin = [_downsample_window(window) for window in windows]
     nobody = DentShade((), shape)
     light = [
         nobody.light(dent_gradient(s.u, s.v, circle, thickness, ball), s.u, s.v)
@@ -106,6 +106,6 @@ def find_lamps(
     return DentShade(tuple(lamps), shape)
 
 
-def _thinned(window: Window) -> Window:
-    keep = slice(None, None, max(1, len(window.u) // PIXELS))
+def _downsample_window(window: Window) -> Window:
+    keep = slice(None, None, max(1, len(window.u) // PIXELS_PER_PRESS))
     return Window(window.u[keep], window.v[keep], window.change[keep])

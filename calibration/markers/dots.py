@@ -9,7 +9,7 @@ import numpy as np
 from tacsim.interface import Float32, FloatArray, Image
 from tacsim.optics.ink import MIN_RADIUS as MIN_RADIUS
 from tacsim.optics.ink import DotEraser as DotEraser
-from tacsim.optics.ink import darkness, dot_filters
+from tacsim.optics.ink import dot_filters, local_darkness
 
 # A dot is darker than its surroundings by at least this share of their light; the higher levels part it from others
 MIN_DARKNESS = (0.2, 0.35, 0.5)
@@ -46,17 +46,17 @@ class DotFinder:
 
     def __call__(self, image: Image) -> Dots:
         """The dots of a picture (H, W, 3) or of one channel of it (H, W)."""
-        dark = darkness(image, self._side, self._blur)
+        dark = local_darkness(image, self._side, self._blur)
         found = []
         for level in MIN_DARKNESS:
-            dots, rest = self._blobs(dark, level)
+            dots, rest = self._find_blobs(dark, level)
             found.append(dots)
             if rest is None:
                 break
             dark = rest
         return Dots(np.concatenate([d.centres for d in found]), np.concatenate([d.areas for d in found]))
 
-    def _blobs(self, dark: Float32, level: float) -> tuple[Dots, Float32 | None]:
+    def _find_blobs(self, dark: Float32, level: float) -> tuple[Dots, Float32 | None]:
         """The dots among the blobs beyond `level`, and what is left in blobs too large or long to be one."""
         import cv2
 

@@ -3,7 +3,7 @@
 Dots are sought on a metric grid of their own, fine enough for their size whatever the canonical grid is. The reference
 tells which dot is which row and column (:mod:`calibration.markers.lattice`), and where it rests;
 :mod:`calibration.markers.tracker` follows it from there. A dot that is not seen gets the mean of its neighbours'
-motion: flow is finite everywhere, and `seen` tells which of it was measured.
+motion: flow is finite everywhere, and `visible` tells which of it was measured.
 """
 
 from __future__ import annotations
@@ -14,10 +14,23 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.lens.rectification import Rectification, from_geometry, from_view, region_mask, seen_box
+from calibration.lens.rectification import (
+    Rectification,
+    rectification_of_geometry,
+    rectification_of_view,
+    region_mask,
+    visible_box,
+)
 from calibration.lens.view import GelView
 from calibration.markers.dots import MIN_RADIUS, DotFinder
-from calibration.markers.lattice import Lattice, NoLattice, find_lattice, missing_line, spread, usual_pitch
+from calibration.markers.lattice import (
+    Lattice,
+    NoLattice,
+    describe_missing_line,
+    fill_from_neighbours,
+    find_lattice,
+    median_pitch,
+)
 from calibration.markers.tracker import DotTracker
 from calibration.reference import UnusableReference
 from tacsim.interface import Float32, FloatArray, Image, Mask
@@ -27,10 +40,10 @@ from tacsim.optics.grid import PixelGrid, canonical_image
 
 DOT_RADIUS = 2.5  # on the grid on which dots are sought [px]
 MAX_MISSING = 0.3  # share of the dots in view that a reference may lack
-MAX_SURPLUS = 0.1  # dots beyond the lattice's rows and columns [number of its dots]
+MAX_EXTRA_SHARE = 0.1  # dots beyond the lattice's rows and columns [number of its dots]
 PINHOLE_ITERATIONS = 4
-MIN_PRESENT = 0.75  # share of its dots that an unknown lattice must show
-MIN_VISIBLE = 0.25  # share of the dots that must be seen for a flow
+MIN_PRESENT_SHARE = 0.75  # share of its dots that an unknown lattice must show
+MIN_VISIBLE_SHARE = 0.25  # share of the dots that must be seen for a flow
 
 
 class NoMarkers(UnusableReference):
@@ -41,7 +54,7 @@ class MissingDots(NoLattice):
     """A picture shows a lattice that lacks a whole row or column."""
 
 
-class MarkersLost(RuntimeError):
+class TooFewMarkers(RuntimeError):
     """Too few dots are seen for a flow."""
 
 
@@ -58,7 +71,7 @@ class MarkerFlow:
         self, markers: Markers, rectify: Rectification, grid: PixelGrid, distance: float | None = None
     ) -> None:
         """Raises ValueError when the image shows the dots too small, or no gel."""
-        across = _native_pixels(rectify, grid)
+        across = _native_pixels_per_metre(rectify, grid)
         if across * markers.radius < MIN_RADIUS:
             raise ValueError(
                 f"markers of radius {markers.radius * 1e3:g} mm are {across * markers.radius:.2g} px in the image, at "
@@ -66,10 +79,10 @@ class MarkerFlow:
             )
         self._markers, self._distance = markers, distance
         self._native = rectify.image_shape
-        box = seen_box(rectify.valid)
-        self._whole = _whole(rectify.valid[box], markers.radius / grid.pitch)
+        box = visible_box(rectify.valid)
+        self._whole = _complete_disc_mask(rectify.valid[box], markers.radius / grid.pitch)
         self._shrink = max(1, math.floor(across * grid.pitch + 1e-6))
-        self._map = _look_ups(rectify, self._shrink, box)
+        self._map = _lookup_map(rectify, self._shrink, box)
         self._pitch = grid.pitch
         self._origin = np.array([grid.x0, grid.y0]) + grid.pitch * np.array([box[1].start, box[0].start])
         self._find = DotFinder(markers.radius / grid.pitch)
@@ -78,39 +91,39 @@ class MarkerFlow:
         self._seen: Mask = np.zeros((markers.rows, markers.columns), dtype=np.bool_)
 
     @property
-    def seen(self) -> Mask:
+    def visible(self) -> Mask:
         """(rows, columns) dots that the last picture showed; the flow of the others is that of their neighbours."""
         return self._seen
 
     @property
-    def kept(self) -> float:
+    def visible_share(self) -> float:
         """Share of the reference's dots that the last picture showed."""
         return float(self._seen.sum() / self._present.sum()) if self._tracker is not None else 0.0
 
     def take_reference(self, image: Image, index: int = 0) -> None:
         """Takes a native image (rows, columns, 3) without contact as rest, and forgets all motion so far. Raises
         NoMarkers; what was the reference then stays."""
-        points = self._points(image)
+        points = self._find_points(image)
         markers = self._markers
         expected = f"a lattice of {markers.rows} x {markers.columns} dots, {markers.pitch * 1e3:g} mm apart"
         advice = "is the sensor's light on, is nothing touched, and are its markers those of the model or calibration?"
         try:
             lattice = find_lattice(points, (markers.rows, markers.columns), markers.pitch)
         except NoLattice as nothing:
-            apart = f" {usual_pitch(points) * 1e3:.3g} mm apart" if len(points) > 1 else ""
+            apart = f" {median_pitch(points) * 1e3:.3g} mm apart" if len(points) > 1 else ""
             raise NoMarkers(f"the reference shows {len(points)} dots{apart}, not {expected}: {advice}") from nothing
-        visible = self._in_view(lattice.positions)
+        visible = self._is_in_view(lattice.positions)
         shown = int(lattice.present.sum())
         if shown < max(4.0, (1.0 - MAX_MISSING) * visible.sum()):
             raise NoMarkers(f"the reference shows {shown} of {visible.sum()} dots in view of {expected}: {advice}")
-        if (missing := missing_line(lattice.present, visible)) is not None:
+        if (missing := describe_missing_line(lattice.present, visible)) is not None:
             raise NoMarkers(f"the reference shows no {expected}: {missing}; {advice}")
-        if lattice.surplus > MAX_SURPLUS * lattice.present.size:
+        if lattice.extra_points > MAX_EXTRA_SHARE * lattice.present.size:
             raise NoMarkers(
-                f"the reference shows {lattice.surplus} dots more than {expected}: give the true rows and columns"
+                f"the reference shows {lattice.extra_points} dots more than {expected}: give the true rows and columns"
             )
         try:
-            tracker = DotTracker(lattice.positions[lattice.present], lattice.pitch, self._in_view)
+            tracker = DotTracker(lattice.positions[lattice.present], lattice.pitch, self._is_in_view)
         except ValueError as error:
             raise NoMarkers(f"the reference shows no {expected}: {error}") from error
         self._tracker, self._index = tracker, index
@@ -121,29 +134,30 @@ class MarkerFlow:
         """(rows, columns, 2) displacement against the reference along x, y [m] of the native image of frame `index`.
 
         `height` (h, w) [m] on its grid: how deep the gel is pressed, for a camera whose distance is known.
-        Raises MarkersLost; ValueError without a reference, or for an image of another shape.
+        Raises TooFewMarkers; ValueError without a reference, or for an image of another shape.
         """
         if self._tracker is None:
             raise ValueError("no reference yet: call take_reference first")
-        tracked = self._tracker(self._points(image), index - self._index)
+        tracked = self._tracker(self._find_points(image), index - self._index)
         self._index = index
         seen = self._present.copy()
-        seen[self._present] = tracked.seen
+        seen[self._present] = tracked.visible
         self._seen = seen
-        if tracked.visible_share < MIN_VISIBLE:
+        if tracked.visible_share < MIN_VISIBLE_SHARE:
             self._tracker.reset()  # so few say nothing of the motion
-            raise MarkersLost(
-                f"{tracked.seen.sum()} of {len(tracked.seen)} markers are seen, at least {MIN_VISIBLE:.0%} are needed "
+            raise TooFewMarkers(
+                f"{tracked.visible.sum()} of {len(tracked.visible)} markers are seen, at least {MIN_VISIBLE_SHARE:.0%} "
+                "are needed "
                 "for a flow: is the light on, and the gel whole? If so, take a fresh reference"
             )
         moved = np.zeros_like(self._rest)
         moved[self._present] = tracked.displacement
-        moved = spread(moved, self._present)
+        moved = fill_from_neighbours(moved, self._present)
         if self._distance is not None and height is not None:
-            moved = self._onto_gel(self._rest + moved, *height) - self._rest
+            moved = self._undo_pinhole(self._rest + moved, *height) - self._rest
         return moved.astype(np.float32)
 
-    def _points(self, image: Image) -> FloatArray:
+    def _find_points(self, image: Image) -> FloatArray:
         """(n, 2) x, y of the dots in a native image [m]."""
         import cv2
 
@@ -160,14 +174,14 @@ class MarkerFlow:
         found: FloatArray = centres[self._whole[row, column]] * self._pitch + self._origin
         return found
 
-    def _in_view(self, points: FloatArray) -> Mask:
+    def _is_in_view(self, points: FloatArray) -> Mask:
         """(...,) whole dots at `points` (..., 2) [m] lie in the picture and on the gel."""
         column, row = np.rint(np.moveaxis((points - self._origin) / self._pitch, -1, 0)).astype(np.intp)
         rows, columns = self._whole.shape
         inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
         return np.asarray(inside & self._whole[row.clip(0, rows - 1), column.clip(0, columns - 1)])
 
-    def _onto_gel(self, apparent: FloatArray, height: Float32, grid: PixelGrid) -> FloatArray:
+    def _undo_pinhole(self, apparent: FloatArray, height: Float32, grid: PixelGrid) -> FloatArray:
         """Where dots are (..., 2) that the pinhole shows at `apparent`: what is pressed towards it looks larger."""
         import cv2
 
@@ -187,7 +201,7 @@ def marker_grid(markers: Markers, gel_size: tuple[float, float]) -> PixelGrid:
     return PixelGrid(rows, columns, pitch, -(columns - 1) / 2 * pitch, -(rows - 1) / 2 * pitch)
 
 
-def _whole(valid: Mask, radius: float) -> Mask:
+def _complete_disc_mask(valid: Mask, radius: float) -> Mask:
     """Places in a mask about which a whole disc of `radius` [px] is valid; the centre of a cut one is not its own."""
     import cv2
 
@@ -197,7 +211,7 @@ def _whole(valid: Mask, radius: float) -> Mask:
     return np.asarray(cv2.erode(padded, disc)[1:-1, 1:-1], dtype=np.bool_)
 
 
-def _native_pixels(rectify: Rectification, grid: PixelGrid) -> float:
+def _native_pixels_per_metre(rectify: Rectification, grid: PixelGrid) -> float:
     """Pixels of the native image along a metre of the gel, in its middle, where they are fewest."""
     row, column = (length * rectify.factor // 2 for length in grid.shape)
     beside = rectify.pixels[row, column - 1] - rectify.pixels[row, column]
@@ -206,7 +220,7 @@ def _native_pixels(rectify: Rectification, grid: PixelGrid) -> float:
     return float(min(np.hypot(*beside), np.hypot(*below))) / step
 
 
-def _look_ups(
+def _lookup_map(
     rectify: Rectification, shrink: int, box: tuple[slice, slice]
 ) -> tuple[NDArray[np.int16], NDArray[np.uint16]]:
     """Where the middle of each pixel in `box` lies in the native image made smaller, in OpenCV's fixed point."""
@@ -232,13 +246,13 @@ def find_markers(image: Image) -> tuple[Lattice, float]:
         except NoLattice:
             pass
         else:
-            regular = lattice.present.mean() > MIN_PRESENT and min(lattice.present.shape) > 2
+            regular = lattice.present.mean() > MIN_PRESENT_SHARE and min(lattice.present.shape) > 2
             if regular and (best is None or lattice.present.sum() > best[0].present.sum()):
                 best = lattice, dots.radius
         radius *= 1.3
     if best is None:
         raise NoLattice("the picture shows no lattice of dark dots, at least 3 x 3")
-    if (missing := missing_line(best[0].present)) is not None:
+    if (missing := describe_missing_line(best[0].present)) is not None:
         size = " x ".join(str(count) for count in best[0].present.shape)
         raise MissingDots(f"in a lattice of {size} dots {missing}: clean the gel, or light it evenly")
     return best
@@ -272,11 +286,11 @@ def marker_flow(
     if markers is None:
         return None
     fine = marker_grid(markers, gel_size)
-    rectify = from_geometry(geometry, gel_size, fine) if seen is None else from_view(seen, fine)
+    rectify = rectification_of_geometry(geometry, gel_size, fine) if seen is None else rectification_of_view(seen, fine)
     return MarkerFlow(markers, rectify.within(region), fine, geometry.camera_distance)
 
 
-def seen_by_dots(
+def view_of_dots(
     pitch: float, untouched: NDArray[np.uint8], grid: CanonicalGrid, region: PictureRegion | None = None
 ) -> tuple[Rectification, MarkerFlow]:
     """Where the gel lies, and its flow, by dots `pitch` [m] apart in a native picture (rows, columns, 3) without
@@ -296,8 +310,8 @@ def seen_by_dots(
     markers = Markers(rows=rows, columns=columns, pitch=pitch, radius=radius * scale)
     flow = marker_flow(markers, geometry, size, region=region)
     assert flow is not None
-    rectify = from_geometry(geometry, size, canonical_image(grid)).within(region)
+    rectify = rectification_of_geometry(geometry, size, canonical_image(grid)).within(region)
     if region is not None:
-        down, across = (side.stop - side.start for side in seen_box(shown))
+        down, across = (side.stop - side.start for side in visible_box(shown))
         rectify = replace(rectify, size=(across * scale, down * scale))
     return rectify, flow

@@ -30,7 +30,7 @@ class Lattice:
 
     positions: FloatArray  # (rows, columns, 2); where no point is, the lattice's smooth continuation
     present: Mask  # (rows, columns) a point is there
-    surplus: int  # points that belong to the same lattice, but beyond its rows and columns
+    extra_points: int  # points that belong to the same lattice, but beyond its rows and columns
 
     @property
     def pitch(self) -> float:
@@ -40,7 +40,7 @@ class Lattice:
         return float(np.median(np.concatenate([along, down])))
 
 
-def usual_pitch(points: FloatArray) -> float:
+def median_pitch(points: FloatArray) -> float:
     """Median distance to the nearest neighbour, of points (n >= 2, 2)."""
     from scipy.spatial import KDTree
 
@@ -60,22 +60,22 @@ def find_lattice(points: FloatArray, shape: tuple[int, int] | None = None, pitch
     """
     if len(points) < 4:
         raise NoLattice(f"{len(points)} dots found, a lattice has at least 4")
-    found = usual_pitch(points) if pitch is None else pitch
-    labels = _labels(points, found)
+    found = median_pitch(points) if pitch is None else pitch
+    labels = _label_points(points, found)
     if len(labels) < 4 or min(np.ptp(list(labels.values()), axis=0)) < 1:
         raise NoLattice(f"{len(points)} dots found, but no rows and columns of them about {found:.3g} apart")
     which, at = np.array(list(labels)), np.array(list(labels.values()))  # at: row, column
-    low, size = _window(points[which], at, shape)
+    low, size = _lattice_window(points[which], at, shape)
     inside = ((at >= low) & (at < low + size)).all(axis=1)
     which, at = which[inside], at[inside] - low
     present = np.zeros(size, dtype=np.bool_)
     present[at[:, 0], at[:, 1]] = True
     positions = np.zeros((*size, 2))
     positions[at[:, 0], at[:, 1]] = points[which]
-    return Lattice(_completed(positions, present), present, len(labels) - len(which))
+    return Lattice(_complete_lattice(positions, present), present, len(labels) - len(which))
 
 
-def _labels(points: FloatArray, pitch: float) -> dict[int, tuple[int, int]]:
+def _label_points(points: FloatArray, pitch: float) -> dict[int, tuple[int, int]]:
     """Row and column (from anywhere) of all points that hang together, by the index of the point: grown from its most
     regular place, each step from its neighbour's own."""
     from scipy.spatial import KDTree
@@ -98,15 +98,15 @@ def _labels(points: FloatArray, pitch: float) -> dict[int, tuple[int, int]]:
     while queue:
         one, along, down = queue.popleft()
         reached.append((one, along, down))
-        found = _neighbours(tree, points, labels, taken, (one, along, down), pitch, 1)
+        found = _find_neighbours(tree, points, labels, taken, (one, along, down), pitch, 1)
         if not (found or queue):  # a whole row may be missing: from there on by two steps
             for from_there in reached:
-                found += _neighbours(tree, points, labels, taken, from_there, pitch, 2)
+                found += _find_neighbours(tree, points, labels, taken, from_there, pitch, 2)
         queue.extend(found)
     return labels
 
 
-def _neighbours(
+def _find_neighbours(
     tree: KDTree,
     points: FloatArray,
     labels: dict[int, tuple[int, int]],
@@ -132,7 +132,7 @@ def _neighbours(
     return new
 
 
-def missing_line(present: Mask, visible: Mask | None = None) -> str | None:
+def describe_missing_line(present: Mask, visible: Mask | None = None) -> str | None:
     """The first row or column of a lattice (rows, columns) without any dot, in words; None: there is none. `visible`:
     dots that could be seen; a line of fewer than 3 of them is not asked for."""
     shown = np.ones_like(present) if visible is None else visible
@@ -143,7 +143,7 @@ def missing_line(present: Mask, visible: Mask | None = None) -> str | None:
     return None
 
 
-def _window(
+def _lattice_window(
     points: FloatArray, at: NDArray[np.intp], shape: tuple[int, int] | None
 ) -> tuple[NDArray[np.intp], tuple[int, int]]:
     """First row and column, and how many, of the lattice among points (n, 2) labelled `at` (n, 2)."""
@@ -159,31 +159,31 @@ def _window(
         for column in range(min(0, filled.shape[1] - shape[1]), max(0, filled.shape[1] - shape[1]) + 1):
             part = filled[max(row, 0) : row + shape[0], max(column, 0) : column + shape[1]]
             low = first + (row, column)
-            middle = _affine(points, at) @ np.array([1.0, *(low + (np.array(shape) - 1) / 2)])
+            middle = _fit_affine(points, at) @ np.array([1.0, *(low + (np.array(shape) - 1) / 2)])
             score = (int(part.sum()), -float(np.hypot(*middle)))
             if score > best or best[0] < 0:
                 best, chosen = score, low
     return chosen, shape
 
 
-def _affine(points: FloatArray, at: NDArray[np.intp]) -> FloatArray:
+def _fit_affine(points: FloatArray, at: NDArray[np.intp]) -> FloatArray:
     """(2, 3) from (1, row, column) to the place."""
     terms = np.column_stack([np.ones(len(at)), at])
     return np.asarray(np.linalg.lstsq(terms, points, rcond=None)[0].T, dtype=np.float64)
 
 
-def _completed(positions: FloatArray, present: Mask) -> FloatArray:
+def _complete_lattice(positions: FloatArray, present: Mask) -> FloatArray:
     """`positions` (rows, columns, 2) with what is missing: the affine lattice, bent as the neighbours are."""
     if present.all():
         return positions
     at = np.argwhere(np.ones_like(present))
     terms = np.column_stack([np.ones(len(at)), at])
-    affine = (terms @ _affine(positions[present], np.argwhere(present)).T).reshape(positions.shape)
-    bent = spread(np.where(present[..., None], positions - affine, 0.0), present)
+    affine = (terms @ _fit_affine(positions[present], np.argwhere(present)).T).reshape(positions.shape)
+    bent = fill_from_neighbours(np.where(present[..., None], positions - affine, 0.0), present)
     return np.asarray(affine + bent, dtype=np.float64)
 
 
-def spread(values: FloatArray, known: Mask) -> FloatArray:
+def fill_from_neighbours(values: FloatArray, known: Mask) -> FloatArray:
     """`values` (rows, columns, n), where not `known` the mean of the nearest neighbours that are, ring by ring."""
     if known.all() or not known.any():
         return values

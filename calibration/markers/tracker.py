@@ -21,10 +21,10 @@ Index = NDArray[np.intp]
 NEIGHBOUR_RADIUS = 1.6  # dots this near at rest are neighbours: the diagonal of a square is one [pitches]
 # A dot is matched with a point this near to its place [pitches]
 MATCH_RADIUS = 0.45  # where the place is predicted
-CERTAIN_RADIUS = 0.25  # where others are going to rely on it
+STRICT_MATCH_RADIUS = 0.25  # where others are going to rely on it
 # Change of displacement across an edge, at most [pitches]
 MAX_STRETCH = 0.4  # within a part that other dots are matched from
-MAX_STRETCH_FOLLOWED = 0.75  # where each dot was followed from frame to frame
+MAX_STRETCH_TRACKED = 0.75  # where each dot was followed from frame to frame
 # Extrapolation of displacement: an affine map through known dots, weighted by exp(-(distance / range)^2)
 EXTRAPOLATION_NEIGHBOURS = 20  # nearest dots that take part
 EXTRAPOLATION_RANGE = 1.0  # [pitches]
@@ -43,8 +43,8 @@ DIRT_MISFIT_RATIO = 4.0  # ... if it is also so many times the median
 DIRT_GAIN = 0.25  # another point is the dot if its distance is less than this share
 
 # A dot that moves alone: two dots in one, or glare on it
-STRAY_MISFIT = 0.15  # distance from the extrapolated place [pitches]
-STRAY_MISFIT_RATIO = 2.5  # ... if it is also so many times that of each of its neighbours
+OUTLIER_MISFIT = 0.15  # distance from the extrapolated place [pitches]
+OUTLIER_MISFIT_RATIO = 2.5  # ... if it is also so many times that of each of its neighbours
 
 TINY = 1e-9  # keeps the map of a dot without any neighbour solvable
 
@@ -54,12 +54,12 @@ class Tracked:
     """Where the dots are."""
 
     displacement: FloatArray  # (n, 2) against rest; the mean of its neighbours' for a dot that is not seen
-    seen: Mask  # (n,)
+    visible: Mask  # (n,)
 
     @property
     def visible_share(self) -> float:
         """Of the dots."""
-        return float(self.seen.mean())
+        return float(self.visible.mean())
 
 
 class DotTracker:
@@ -99,27 +99,27 @@ class DotTracker:
         dropped for a frame before the last one, or far ahead."""
         predicted = 0 <= ahead <= MAX_PREDICTED_FRAMES
         expected = self._rest + self._displacement + (ahead * self._velocity if predicted else 0.0)
-        partner = self._match(expected, points)
-        coherent = self._coherent(partner, points, MAX_STRETCH)
+        partner = self._match_points(expected, points)
+        coherent = self._coherent_part(partner, points, MAX_STRETCH)
         if not predicted or self._may_have_jumped(partner, points) or (coherent != (partner >= 0)).any():
-            partner = self._best(expected, points, predicted)
+            partner = self._best_match(expected, points, predicted)
         elif int((partner >= 0).sum()) < min(len(partner), len(points)):
-            partner = self._extended(partner, points)  # dots that have turned round
+            partner = self._extend_match(partner, points)  # dots that have turned round
         if len(points) > int((partner >= 0).sum()):
             partner = self._without_dirt(partner, points)
-        partner = self._without_strays(partner, points)
-        seen = partner >= 0
+        partner = self._remove_local_outliers(partner, points)
+        visible = partner >= 0
         displacement = np.zeros_like(self._rest)
-        displacement[seen] = points[partner[seen]] - self._rest[seen]
-        displacement = self._filled(displacement, seen)
+        displacement[visible] = points[partner[visible]] - self._rest[visible]
+        displacement = self._fill_hidden(displacement, visible)
         if ahead > 0 and predicted:
             self._velocity = (displacement - self._displacement) / ahead
         elif not predicted:
             self._velocity = np.zeros_like(self._rest)
         self._displacement = displacement
-        return Tracked(displacement.copy(), seen)
+        return Tracked(displacement.copy(), visible)
 
-    def _match(self, expected: FloatArray, points: FloatArray, radius: float = MATCH_RADIUS) -> Index:
+    def _match_points(self, expected: FloatArray, points: FloatArray, radius: float = MATCH_RADIUS) -> Index:
         """(n,) the point of each dot, -1 where none is near: the least sum of squared distances (Kuhn 1955)."""
         from scipy.optimize import linear_sum_assignment
 
@@ -138,67 +138,69 @@ class DotTracker:
         partner[rows[close]] = columns[close]
         return partner
 
-    def _best(self, expected: FloatArray, points: FloatArray, predicted: bool) -> Index:
+    def _best_match(self, expected: FloatArray, points: FloatArray, predicted: bool) -> Index:
         """(n,) partners by the guess that explains most dots; of equal ones, by the smoothest."""
-        found = [self._grown(expected, points)]
+        found = [self._grow_match(expected, points)]
         if predicted:
-            matched = self._match(expected, points)
-            found.append(np.where(self._coherent(matched, points, MAX_STRETCH_FOLLOWED), matched, -1))
-            best = max(found, key=lambda partner: self._score(partner, points))
+            matched = self._match_points(expected, points)
+            found.append(np.where(self._coherent_part(matched, points, MAX_STRETCH_TRACKED), matched, -1))
+            best = max(found, key=lambda partner: self._match_score(partner, points))
             if not self._may_have_jumped(best, points):
                 return best
-        found.append(self._grown(self._rest, points))
-        best = max(found, key=lambda partner: self._score(partner, points))
-        if self._score(best, points)[0] < (1.0 - JUMP_SHARE) * len(best):  # else all the rest is dirt and drop-outs
+        found.append(self._grow_match(self._rest, points))
+        best = max(found, key=lambda partner: self._match_score(partner, points))
+        if self._match_score(best, points)[0] < (1.0 - JUMP_SHARE) * len(
+            best
+        ):  # else all the rest is dirt and drop-outs
             last = self._rest + self._displacement
-            found += [self._grown(last + jump, points) for jump in self._jumps(points, last)]
-            best = max(found, key=lambda partner: self._score(partner, points))
+            found += [self._grow_match(last + jump, points) for jump in self._propose_jumps(points, last)]
+            best = max(found, key=lambda partner: self._match_score(partner, points))
         return best
 
-    def _score(self, partner: Index, points: FloatArray) -> tuple[int, float]:
+    def _match_score(self, partner: Index, points: FloatArray) -> tuple[int, float]:
         """How many dots have a partner, or would be out of view if they moved with the others, less the unmatched
         points; and how little displacement changes across edges."""
-        seen = partner >= 0
-        if not seen.any():
+        visible = partner >= 0
+        if not visible.any():
             return -len(points), 0.0
         moved, both = self._displacements(partner, points)
         change = ((moved[self._first] - moved[self._second]) ** 2).sum(axis=1)[both]
-        out = ~seen & ~self._in_view(self._rest + self._filled(moved, seen))
-        spare = len(points) - int(seen.sum())
-        return int((seen | out).sum()) - spare, -float(change.mean()) if len(change) else 0.0
+        out = ~visible & ~self._in_view(self._rest + self._fill_hidden(moved, visible))
+        spare = len(points) - int(visible.sum())
+        return int((visible | out).sum()) - spare, -float(change.mean()) if len(change) else 0.0
 
-    def _grown(self, guess: FloatArray, points: FloatArray) -> Index:
+    def _grow_match(self, guess: FloatArray, points: FloatArray) -> Index:
         """Partners of the largest coherent part of the dots that are certainly where they are guessed, and of those
         that are found from there by extrapolation."""
-        partner = self._match(guess, points, CERTAIN_RADIUS)
-        partner = self._extended(np.where(self._coherent(partner, points, MAX_STRETCH), partner, -1), points)
-        smooth = self._without_outliers(partner, points)
-        return partner if smooth is partner else self._without_outliers(self._extended(smooth, points), points)
+        partner = self._match_points(guess, points, STRICT_MATCH_RADIUS)
+        partner = self._extend_match(np.where(self._coherent_part(partner, points, MAX_STRETCH), partner, -1), points)
+        smooth = self._remove_far_points(partner, points)
+        return partner if smooth is partner else self._remove_far_points(self._extend_match(smooth, points), points)
 
-    def _extended(self, partner: Index, points: FloatArray) -> Index:
+    def _extend_match(self, partner: Index, points: FloatArray) -> Index:
         """`partner`, and those found by extrapolation, outwards from the dots that have one."""
         partner = partner.copy()
         refused = np.zeros(len(partner), dtype=np.bool_)
         for _ in range(len(partner)):
             known = partner >= 0
-            asked = np.flatnonzero(~known & (self._linked @ known >= MIN_KNOWN_NEIGHBOURS) & ~refused)
+            requested = np.flatnonzero(~known & (self._linked @ known >= MIN_KNOWN_NEIGHBOURS) & ~refused)
             free = np.setdiff1d(np.arange(len(points)), partner[known])
-            if not (len(asked) and len(free)):
+            if not (len(requested) and len(free)):
                 break
-            moved = self._extrapolated(asked, known, points[partner] - self._rest)
-            found = self._match(self._rest[asked] + moved, points[free], EXTRAPOLATION_RADIUS)
-            partner[asked[found >= 0]] = free[found[found >= 0]]
-            refused[asked[found < 0]] = True
+            moved = self._extrapolate(requested, known, points[partner] - self._rest)
+            found = self._match_points(self._rest[requested] + moved, points[free], EXTRAPOLATION_RADIUS)
+            partner[requested[found >= 0]] = free[found[found >= 0]]
+            refused[requested[found < 0]] = True
         return partner
 
-    def _without_outliers(self, partner: Index, points: FloatArray) -> Index:
+    def _remove_far_points(self, partner: Index, points: FloatArray) -> Index:
         """`partner` without those far from where the dots around extrapolate to, the worst first."""
         checked = partner
         every = np.arange(len(partner))
         while (checked >= 0).any():
             known = checked >= 0
             moved = np.where(known[:, None], points[checked] - self._rest, 0.0)
-            misfit = np.where(known, np.linalg.norm(self._extrapolated(every, known, moved) - moved, axis=1), 0.0)
+            misfit = np.where(known, np.linalg.norm(self._extrapolate(every, known, moved) - moved, axis=1), 0.0)
             if misfit.max() <= EXTRAPOLATION_RADIUS * self._pitch:
                 break
             checked = np.where(misfit > 0.9 * misfit.max(), -1, checked)
@@ -211,7 +213,7 @@ class DotTracker:
         if not known.any():
             return partner
         moved = np.where(known[:, None], points[partner] - self._rest, 0.0)
-        misfit = np.linalg.norm(self._extrapolated(np.arange(len(partner)), known, moved) - moved, axis=1)
+        misfit = np.linalg.norm(self._extrapolate(np.arange(len(partner)), known, moved) - moved, axis=1)
         limit = max(DIRT_MISFIT * self._pitch, DIRT_MISFIT_RATIO * float(np.median(misfit[known])))
         suspects = np.flatnonzero(known & (misfit > limit))
         if not len(suspects):
@@ -220,8 +222,8 @@ class DotTracker:
         cleaned[suspects] = -1
         free = np.setdiff1d(np.arange(len(points)), cleaned[cleaned >= 0])
         moved[suspects] = 0.0  # their neighbours must not be extrapolated from them
-        there = self._rest[suspects] + self._extrapolated(suspects, cleaned >= 0, moved)
-        found = self._match(there, points[free], CERTAIN_RADIUS)
+        there = self._rest[suspects] + self._extrapolate(suspects, cleaned >= 0, moved)
+        found = self._match_points(there, points[free], STRICT_MATCH_RADIUS)
         other = free[found]
         away = [np.linalg.norm(points[p] - there, axis=1) for p in (other, partner[suspects])]
         better = (found >= 0) & (away[0] < DIRT_GAIN * away[1])
@@ -229,22 +231,23 @@ class DotTracker:
         once = np.bincount(cleaned[cleaned >= 0], minlength=len(points)).max() <= 1
         return cleaned if once else partner
 
-    def _without_strays(self, partner: Index, points: FloatArray) -> Index:
+    def _remove_local_outliers(self, partner: Index, points: FloatArray) -> Index:
         """`partner` without dots that lie aside from where those around extrapolate to, and whose neighbours hardly
         do: at the rim of a contact several do."""
         known = partner >= 0
         if not known.any():
             return partner
         moved = np.where(known[:, None], points[partner] - self._rest, 0.0)
-        misfit = np.linalg.norm(self._extrapolated(np.arange(len(partner)), known, moved) - moved, axis=1)
-        limit = max(STRAY_MISFIT * self._pitch, DIRT_MISFIT_RATIO * float(np.median(misfit[known])))
+        misfit = np.linalg.norm(self._extrapolate(np.arange(len(partner)), known, moved) - moved, axis=1)
+        limit = max(OUTLIER_MISFIT * self._pitch, DIRT_MISFIT_RATIO * float(np.median(misfit[known])))
         around = (self._linked * np.where(known, misfit, 0.0)).max(axis=1)
-        return np.where(known & (misfit > np.maximum(limit, STRAY_MISFIT_RATIO * around)), -1, partner)
+        return np.where(known & (misfit > np.maximum(limit, OUTLIER_MISFIT_RATIO * around)), -1, partner)
 
-    def _extrapolated(self, asked: Index, known: Mask, moved: FloatArray) -> FloatArray:
-        """(k, 2) displacement of the dots `asked`, by an affine map through that (n, 2) of the `known` ones near."""
-        nearest, terms = self._nearest[asked], self._terms[asked]
-        weighted = (terms * (self._weight[asked] * known[nearest])[..., None]).transpose(0, 2, 1)
+    def _extrapolate(self, requested: Index, known: Mask, moved: FloatArray) -> FloatArray:
+        """(k, 2) displacement of the dots `requested`, by an affine map through that (n, 2) of the `known` ones
+        near."""
+        nearest, terms = self._nearest[requested], self._terms[requested]
+        weighted = (terms * (self._weight[requested] * known[nearest])[..., None]).transpose(0, 2, 1)
         square = weighted @ terms + AFFINE_RIDGE * np.diag([TINY, 1.0, 1.0])
         right = weighted @ np.where(known[:, None], moved, 0.0)[nearest]
         moved_there: FloatArray = np.linalg.solve(square, right)[:, 0]
@@ -252,37 +255,39 @@ class DotTracker:
 
     def _displacements(self, partner: Index, points: FloatArray) -> tuple[FloatArray, Mask]:
         """(n, 2) displacement, 0 without a partner; and (edges,) whether both ends have one."""
-        seen = partner >= 0
-        moved = np.where(seen[:, None], points[partner] - self._rest, 0.0) if len(points) else np.zeros_like(self._rest)
-        return moved, seen[self._first] & seen[self._second]
+        visible = partner >= 0
+        moved = (
+            np.where(visible[:, None], points[partner] - self._rest, 0.0) if len(points) else np.zeros_like(self._rest)
+        )
+        return moved, visible[self._first] & visible[self._second]
 
-    def _coherent(self, partner: Index, points: FloatArray, stretch: float) -> Mask:
+    def _coherent_part(self, partner: Index, points: FloatArray, stretch: float) -> Mask:
         """(n,) dots with a partner, in the largest part whose edges are not overstretched."""
         from scipy.sparse import coo_array
         from scipy.sparse.csgraph import connected_components
 
-        seen = partner >= 0
+        visible = partner >= 0
         moved, both = self._displacements(partner, points)
         change = moved[self._first] - moved[self._second]
         sound = both & ((change**2).sum(axis=1) < (stretch * self._pitch) ** 2)
         if (sound == both).all():
-            return seen
+            return visible
         first, second = self._first[sound], self._second[sound]
         graph = coo_array((np.ones(len(first), dtype=np.int8), (first, second)), shape=(len(partner), len(partner)))
         _, part = connected_components(graph, directed=False)
-        biggest = np.argmax(np.bincount(part, seen))
-        return np.asarray((part == biggest) & seen)
+        biggest = np.argmax(np.bincount(part, visible))
+        return np.asarray((part == biggest) & visible)
 
-    def _filled(self, displacement: FloatArray, seen: Mask) -> FloatArray:
+    def _fill_hidden(self, displacement: FloatArray, visible: Mask) -> FloatArray:
         """`displacement` with the mean of its neighbours' at each dot that is not seen (a discrete Laplace equation);
         that of the last frame where nothing at all is seen."""
-        lost = ~seen
+        lost = ~visible
         if not lost.any():
             return displacement
-        if not seen.any():
+        if not visible.any():
             return self._displacement.copy()
         laplace = np.diag(self._linked.sum(axis=1)) - self._linked
-        right = self._linked[np.ix_(lost, seen)] @ displacement[seen]
+        right = self._linked[np.ix_(lost, visible)] @ displacement[visible]
         filled = displacement.copy()
         filled[lost] = np.linalg.lstsq(laplace[np.ix_(lost, lost)], right, rcond=None)[0]
         return filled
@@ -292,22 +297,22 @@ class DotTracker:
         lost, spare = int((partner < 0).sum()), len(points) - int((partner >= 0).sum())
         return min(lost, spare) > max(1.0, JUMP_SHARE * len(partner))
 
-    def _jumps(self, points: FloatArray, start: FloatArray) -> list[FloatArray]:
+    def _propose_jumps(self, points: FloatArray, start: FloatArray) -> list[FloatArray]:
         """Shifts (2,) of the whole lattice that bring most dots near a point or out of view, the best first."""
         from scipy.spatial import KDTree
 
         middle = np.argsort(((self._rest - self._rest.mean(axis=0)) ** 2).sum(axis=1))[:JUMP_SEEDS]
         shifts = (points[None, :, :] - start[middle][:, None, :]).reshape(-1, 2)
         length = np.linalg.norm(shifts, axis=1)
-        shifts = shifts[(length < MAX_JUMP * self._pitch) & (length > CERTAIN_RADIUS * self._pitch)]
+        shifts = shifts[(length < MAX_JUMP * self._pitch) & (length > STRICT_MATCH_RADIUS * self._pitch)]
         if not len(shifts):
             return []
         there = start[None, :, :] + shifts[:, None, :]
-        away, _ = KDTree(points).query(there, distance_upper_bound=CERTAIN_RADIUS * self._pitch)
+        away, _ = KDTree(points).query(there, distance_upper_bound=STRICT_MATCH_RADIUS * self._pitch)
         explained = (np.isfinite(away) | ~self._in_view(there)).sum(axis=1)
         chosen: list[FloatArray] = []
         for shift in shifts[np.argsort(-explained, kind="stable")]:
-            if all(float(np.linalg.norm(shift - other)) > CERTAIN_RADIUS * self._pitch for other in chosen):
+            if all(float(np.linalg.norm(shift - other)) > STRICT_MATCH_RADIUS * self._pitch for other in chosen):
                 chosen.append(shift)
             if len(chosen) == JUMP_CANDIDATES:
                 break

@@ -18,8 +18,8 @@ from scipy.stats import chi2, norm
 from calibration.materials.fit import Fit, Signals
 from tacsim.interface import FloatArray
 
-CHANCE = 1e-3  # a finding that chance alone would bring more seldom counts
-SIZE_ALLOWED = 0.05  # of an indenter: moves the stiffness by 3 to 4 %
+MAX_PROBABILITY = 1e-3  # a finding that chance alone would bring more seldom counts
+MAX_SIZE_ERROR = 0.05  # of an indenter: moves the stiffness by 3 to 4 %
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,39 +27,41 @@ class Finding:
     """Something that speaks against the fit."""
 
     kind: Literal["misfit", "drift", "size"]
-    words: str
-    chance: float  # of the like without a cause
+    text: str
+    probability: float  # of the like without a cause
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Suspect:
+class _CandidateCause:
     """A cause that a fit of materials leaves out: one more linear unknown."""
 
     column: FloatArray  # (m,)
     kind: Literal["drift", "size"]
-    words: Callable[[float, float], str]  # of its size and twice its standard deviation
+    text: Callable[[float, float], str]  # of its size and twice its standard deviation
     allowed: float = 0.0  # as large as this it does no harm
 
 
-def findings(fit: Fit, signals: Signals, names: tuple[str, ...], by_size: FloatArray | None = None) -> list[Finding]:
+def find_contradictions(
+    fit: Fit, signals: Signals, names: tuple[str, ...], by_size: FloatArray | None = None
+) -> list[Finding]:
     """What speaks against the fit; causes first, they explain a misfit too.
 
     names: of the presses. by_size: (m, b) derivative of the signals by the logarithm of the size of each indenter.
     """
-    suspects = _drifts(signals, names)
+    candidates = _drift_candidates(signals, names)
     for column in () if by_size is None else by_size.T:
         pressed = ", ".join(names[press] for press in sorted(set(signals.press[column != 0].tolist())))
-        suspects.append(_Suspect(column, "size", partial(_size_in_words, pressed), SIZE_ALLOWED))
-    return _caused(fit, signals, suspects) or _misfits(fit, signals, names)
+        candidates.append(_CandidateCause(column, "size", partial(_describe_size, pressed), MAX_SIZE_ERROR))
+    return _test_candidates(fit, signals, candidates) or _find_misfits(fit, signals, names)
 
 
-def size_error(fit: Fit, by_size: FloatArray) -> float:
+def indenter_size_error(fit: Fit, by_size: FloatArray) -> float:
     """Standard deviation of the logarithm of an indenter's size, if the signals alone were to tell it; of several the
     greatest. by_size: (m, b)."""
-    return max(_one_more(fit, [column], np.zeros(len(column)))[1] for column in by_size.T)
+    return max(_fit_one_more(fit, [column], np.zeros(len(column)))[1] for column in by_size.T)
 
 
-def _drifts(signals: Signals, names: tuple[str, ...]) -> list[_Suspect]:
+def _drift_candidates(signals: Signals, names: tuple[str, ...]) -> list[_CandidateCause]:
     """Zeros that drift: a slope over the time of each press, for each of its forces."""
     found = []
     for press, force in sorted({(p, c) for p, c in zip(signals.press.tolist(), signals.channel.tolist(), strict=True)}):
@@ -68,46 +70,46 @@ def _drifts(signals: Signals, names: tuple[str, ...]) -> list[_Suspect]:
         rows = (signals.press == press) & (signals.channel == force)
         time = np.where(rows, signals.time, 0.0)
         middle, length = time[rows].mean(), max(float(np.ptp(time[rows])), 1e-9)
-        words = partial(_drift_in_words, names[press], signals.channels[force])
-        found.append(_Suspect(np.where(rows, (time - middle) / length, 0.0), "drift", words))
+        words = partial(_describe_drift, names[press], signals.channels[force])
+        found.append(_CandidateCause(np.where(rows, (time - middle) / length, 0.0), "drift", words))
     return found
 
 
-def _drift_in_words(press: str, channel: str, size: float, spread: float) -> str:
+def _describe_drift(press: str, channel: str, size: float, spread: float) -> str:
     return (
         f"{press}: the zero of {channel} drifts by {size:+.3g} N from beginning to end (give or take {spread:.2g}); "
         "let the sensor warm up, zero it before each press, and record again"
     )
 
 
-def _size_in_words(presses: str, size: float, spread: float) -> str:
+def _describe_size(presses: str, size: float, spread: float) -> str:
     return (
         f"{presses}: felt and seen is an indenter about {math.exp(size):.2f} times as large as stated (give or take "
         f"{100 * spread:.0f} %), or of another shape; measure it, and check the pixel pitch of the sensor"
     )
 
 
-def _caused(fit: Fit, signals: Signals, suspects: list[_Suspect]) -> list[Finding]:
+def _test_candidates(fit: Fit, signals: Signals, candidates: list[_CandidateCause]) -> list[Finding]:
     """The suspects that the signals show, each as one more unknown beside all others of the fit."""
     found: list[Finding] = []
     residual = (signals.values - fit.predicted) / fit.sigma
     seen: list[FloatArray] = []  # the columns of those found before: one that is wrong pulls at all others
-    while len(seen) < len(suspects):
-        sizes = [_one_more(fit, [*seen, each.column], residual) for each in suspects]
+    while len(seen) < len(candidates):
+        sizes = [_fit_one_more(fit, [*seen, each.column], residual) for each in candidates]
         clear = [
-            max(abs(size) - each.allowed, 0.0) / spread for each, (size, spread) in zip(suspects, sizes, strict=True)
+            max(abs(size) - each.allowed, 0.0) / spread for each, (size, spread) in zip(candidates, sizes, strict=True)
         ]
         worst = int(np.argmax(clear))
-        chance = float(2 * norm.sf(clear[worst])) * len(suspects)
-        if chance > CHANCE:
+        chance = float(2 * norm.sf(clear[worst])) * len(candidates)
+        if chance > MAX_PROBABILITY:
             break
-        seen.append(suspects[worst].column)
+        seen.append(candidates[worst].column)
         size, spread = sizes[worst]
-        found.append(Finding(suspects[worst].kind, suspects[worst].words(size, 2 * spread), chance))
+        found.append(Finding(candidates[worst].kind, candidates[worst].text(size, 2 * spread), chance))
     return found
 
 
-def _one_more(fit: Fit, columns: list[FloatArray], residual: FloatArray) -> tuple[float, float]:
+def _fit_one_more(fit: Fit, columns: list[FloatArray], residual: FloatArray) -> tuple[float, float]:
     """What the fit gives for the last of these further linear unknowns, and its standard deviation."""
     p = len(fit.free)
     rows = np.column_stack([fit.system, *columns]) / fit.sigma[:, None]
@@ -123,25 +125,25 @@ def _one_more(fit: Fit, columns: list[FloatArray], residual: FloatArray) -> tupl
     return float(solved[-1]), 1.0 / last
 
 
-def _misfits(fit: Fit, signals: Signals, names: tuple[str, ...]) -> list[Finding]:
+def _find_misfits(fit: Fit, signals: Signals, names: tuple[str, ...]) -> list[Finding]:
     found = []
     residual = (signals.values - fit.predicted) / fit.sigma
     whole = float((residual**2).sum())
-    chance = float(chi2.sf(whole, fit.freedom))
-    worst = _worst(residual, signals, names)
-    if chance < CHANCE:
+    chance = float(chi2.sf(whole, fit.degrees_of_freedom))
+    worst = _worst_channel(residual, signals, names)
+    if chance < MAX_PROBABILITY:
         found.append(
             Finding(
                 "misfit",
-                f"no such material gives these signals: off by {math.sqrt(whole / fit.freedom):.1f} times what noise "
-                f"and mesh explain, most of all {worst}; is the indenter or body of that shape and size and in that "
-                "place, are axes and units right, is the noise larger than stated?",
+                f"no such material gives these signals: off by {math.sqrt(whole / fit.degrees_of_freedom):.1f} times "
+                f"what noise and mesh explain, most of all {worst}; is the indenter or body of that shape and size and "
+                "in that place, are axes and units right, is the noise larger than stated?",
                 chance,
             )
         )
         return found
-    chance = _runs(residual, signals)
-    if chance < CHANCE and whole > 0.5 * fit.freedom:
+    chance = _runs_test(residual, signals)
+    if chance < MAX_PROBABILITY and whole > 0.5 * fit.degrees_of_freedom:
         found.append(
             Finding(
                 "misfit",
@@ -153,7 +155,7 @@ def _misfits(fit: Fit, signals: Signals, names: tuple[str, ...]) -> list[Finding
     return found
 
 
-def _worst(residual: FloatArray, signals: Signals, names: tuple[str, ...]) -> str:
+def _worst_channel(residual: FloatArray, signals: Signals, names: tuple[str, ...]) -> str:
     """The press and channel that fit worst, in words."""
     sizes = {}
     for p in range(signals.presses):
@@ -164,7 +166,7 @@ def _worst(residual: FloatArray, signals: Signals, names: tuple[str, ...]) -> st
     return max(sizes, key=lambda name: sizes[name])
 
 
-def _runs(residual: FloatArray, signals: Signals) -> float:
+def _runs_test(residual: FloatArray, signals: Signals) -> float:
     """Chance of so few runs of equal signs (Wald & Wolfowitz 1940), over all presses and channels in order of time."""
     runs = expected = variance = 0.0
     for p in range(signals.presses):

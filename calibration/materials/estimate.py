@@ -17,31 +17,33 @@ import numpy as np
 
 from calibration.errors import CalibrationError
 from calibration.materials.fit import (
-    MESH_LEFT,
+    MESH_ERROR_SHARE,
     Fit,
     Parameter,
     Point,
     Predict,
     Priors,
     Signals,
-    begins,
     covariance_of,
-    starts,
+    fit_start_values,
+    start_values,
 )
 from tacsim.interface import FloatArray
 
-DIFFERENCE = 0.08  # step of a free number for its column of the Jacobian; simulations are exact to some 1e-3
+PARAMETER_DIFFERENCE = 0.08  # step of a free number for its column of the Jacobian; simulations are exact to some 1e-3
 PLACE_DIFFERENCE = 0.02e-3  # the same of places [m]
-LONGEST = 0.7  # a step changes no free number by more: a factor of two
-MOST_STEPS, FEWER_STEPS, MOST_FINE = 12, 2, 4
-SMALL_GAIN = 0.2  # of the sum of squares: the noise alone gives it a standard deviation of more than one
-SMALL_SHARE = 0.01  # of the sum of squares, where a coarse mesh keeps it large
-SMALL_SPREAD = 0.3  # of their standard deviations, likewise
-SMALL_STEP = 0.01  # of the free numbers, likewise where all is told well
-UNTOLD = 0.6  # an interval of a free number that reaches farther each way tells nothing: a factor of 1.8
-HOPELESS = 5.0  # an interval that reaches so far at the start: there is no use in looking for it
+MAX_STEP = 0.7  # a step changes no free number by more: a factor of two
+MAX_STEPS, MAX_SECANT_STEPS, MAX_FINE_STEPS = 12, 2, 4
+MIN_GAIN = 0.2  # of the sum of squares: the noise alone gives it a standard deviation of more than one
+MIN_GAIN_SHARE = 0.01  # of the sum of squares, where a coarse mesh keeps it large
+MIN_STEP_DEVIATIONS = 0.3  # of their standard deviations, likewise
+MIN_STEP = 0.01  # of the free numbers, likewise where all is told well
+MAX_IDENTIFIED_HALF_INTERVAL = (
+    0.6  # an interval of a free number that reaches farther each way tells nothing: a factor of 1.8
+)
+MAX_START_HALF_INTERVAL = 5.0  # an interval that reaches so far at the start: there is no use in looking for it
 COARSE_ERROR = 0.05  # of a coarse simulation, where no fine one says better: share of the signal
-SETTLED_ERROR = 0.01  # of any simulation: what its settling leaves, in each number and, again, in a whole press
+SETTLING_ERROR = 0.01  # of any simulation: what its settling leaves, in each number and, again, in a whole press
 
 
 class NotIdentified(CalibrationError):
@@ -75,7 +77,7 @@ class _Fitter:
 
     def linearise(self, predict: Predict, point: Point, zeros: FloatArray) -> _State:
         """One batch: the point itself, each free number changed a little, and all places at once."""
-        steps = np.where(point.free + DIFFERENCE > self.high, -DIFFERENCE, DIFFERENCE)
+        steps = np.where(point.free + PARAMETER_DIFFERENCE > self.high, -PARAMETER_DIFFERENCE, PARAMETER_DIFFERENCE)
         points = [point, *(replace(point, free=point.free + step) for step in np.diag(steps))]
         points.append(replace(point, places=point.places + PLACE_DIFFERENCE))
         found = self.run(predict, points)
@@ -92,11 +94,13 @@ class _Fitter:
         p, system = len(self.held), before.system.copy()
         step = np.concatenate([point.free - before.point.free, point.places - before.point.places])
         missed = predicted - before.predicted - system[:, : len(step)] @ step
-        scale = np.append(np.ones(p), PLACE_DIFFERENCE / DIFFERENCE)
+        scale = np.append(np.ones(p), PLACE_DIFFERENCE / PARAMETER_DIFFERENCE)
         for press in range(self.signals.presses):
             rows, columns = np.flatnonzero(self.signals.press == press), [*range(p), p + press]
             scaled = step[columns] / scale
-            weight = scaled @ scaled + DIFFERENCE**2  # what a smaller step missed is the simulation's own noise
+            weight = (
+                scaled @ scaled + PARAMETER_DIFFERENCE**2
+            )  # what a smaller step missed is the simulation's own noise
             system[np.ix_(rows, columns)] += np.outer(missed[rows], scaled / scale / weight)
         return _State(point, zeros, predicted, system)
 
@@ -130,21 +134,21 @@ class _Fitter:
         found: FloatArray = np.linalg.lstsq(whole, right, rcond=1e-12)[0]
         return found
 
-    def small(self, state: _State, step: FloatArray, least: float) -> bool:
-        """Whether a step changes no free number by more than `least`, or than a part of its standard deviation."""
+    def is_small(self, state: _State, step: FloatArray, limit: float) -> bool:
+        """Whether a step changes no free number by more than `limit`, or than a part of its standard deviation."""
         p = len(self.held)
         spread = np.sqrt(np.diag(covariance_of(state.system, self.sigma, self.priors, self.held, 0.0))[:p])
-        return bool((np.abs(step[:p]) < np.maximum(least, SMALL_SPREAD * spread)).all())
+        return bool((np.abs(step[:p]) < np.maximum(limit, MIN_STEP_DEVIATIONS * spread)).all())
 
     def moved(self, state: _State, step: FloatArray) -> tuple[Point, FloatArray]:
         """Point and zeros after a step, within the bounds."""
         p, t = len(self.held), self.signals.presses
-        free = np.clip(state.point.free + np.clip(step[:p], -LONGEST, LONGEST), self.low, self.high)
+        free = np.clip(state.point.free + np.clip(step[:p], -MAX_STEP, MAX_STEP), self.low, self.high)
         return Point(free, state.point.places + step[p : p + t]), state.zeros + step[p + t :]
 
-    def stepped(self, state: _State) -> _State:
+    def after_full_step(self, state: _State) -> _State:
         """After a whole step, and with what is held back at its start, as the system foresees it."""
-        back = np.where(self.held, starts(self.parameters) - state.point.free, 0.0)
+        back = np.where(self.held, start_values(self.parameters) - state.point.free, 0.0)
         begun = _State(
             replace(state.point, free=state.point.free + back), state.zeros,
             state.predicted + state.system[:, : len(back)] @ back, state.system,
@@ -155,7 +159,7 @@ class _Fitter:
 
     def reach(self, state: _State) -> FloatArray:
         """(p,) half the 95 % intervals of the free numbers, as far as the noise alone goes; 0 for those held."""
-        sigma = np.hypot(self.signals.noise, SETTLED_ERROR * np.abs(state.predicted))
+        sigma = np.hypot(self.signals.noise, SETTLING_ERROR * np.abs(state.predicted))
         covariance = covariance_of(state.system, sigma, self.priors, self.held, 0.0)
         found: FloatArray = 1.96 * np.sqrt(np.diag(covariance))[: len(self.held)]
         return found
@@ -175,7 +179,7 @@ class _Fitter:
         return True
 
 
-def estimate(
+def estimate_materials(
     levels: Sequence[Predict],
     signals: Signals,
     parameters: Sequence[Parameter],
@@ -192,65 +196,70 @@ def estimate(
     first (`Fit.untold`). Raises NotIdentified when nothing is told, CannotSimulate when no smaller step helps.
     """
     fitter = _Fitter(signals, parameters, priors)
-    begin = Point(begins(parameters), np.zeros(signals.presses))
+    begin = Point(fit_start_values(parameters), np.zeros(signals.presses))
     on_step("first run")
     state = fitter.linearise(levels[0], begin, np.zeros(fitter.zero_columns.shape[1]))
-    while fitter.hold(state, fitter.reach(state), HOPELESS):
+    while fitter.hold(state, fitter.reach(state), MAX_START_HALF_INTERVAL):
         pass
-    kept = np.where(fitter.held, starts(parameters), begin.free)
+    kept = np.where(fitter.held, start_values(parameters), begin.free)
     if (kept != begin.free).any():
         state = fitter.linearise(levels[0], replace(begin, free=kept), state.zeros)
-    state = _coarse(fitter, levels[0], state, coarse_error, on_step, secant=len(levels) > 2)
+    state = _fit_coarse(fitter, levels[0], state, coarse_error, on_step, secant=len(levels) > 2)
     for level in levels[1:-1]:
         on_step("next mesh")
         found = fitter.linearise(level, state.point, state.zeros)
-        state = _brought_back(fitter, level, found)
-        most = FEWER_STEPS if state is found else 2 * FEWER_STEPS
-        state = fitter.stepped(_coarse(fitter, level, state, coarse_error / 2, on_step, most))
-    while fitter.hold(state, fitter.reach(state), UNTOLD):
-        state = fitter.stepped(state)
+        state = _restore_unidentified(fitter, level, found)
+        max_steps = MAX_SECANT_STEPS if state is found else 2 * MAX_SECANT_STEPS
+        state = fitter.after_full_step(_fit_coarse(fitter, level, state, coarse_error / 2, on_step, max_steps))
+    while fitter.hold(state, fitter.reach(state), MAX_IDENTIFIED_HALF_INTERVAL):
+        state = fitter.after_full_step(state)
     while True:
-        fit = _refined(fitter, state, levels[-1] if len(levels) > 1 else None, on_step)
+        fit = _refine_fit(fitter, state, levels[-1] if len(levels) > 1 else None, on_step)
         plain = fit.with_sigma(fit.sigma)  # signals that scatter more than they should are no lack of them
-        if not fitter.hold(state, np.array([plain.half(each.name) for each in parameters]), UNTOLD):
+        if not fitter.hold(
+            state, np.array([plain.half_interval(each.name) for each in parameters]), MAX_IDENTIFIED_HALF_INTERVAL
+        ):
             return fit
-        state = fitter.stepped(state)
+        state = fitter.after_full_step(state)
 
 
-def _brought_back(fitter: _Fitter, predict: Predict, state: _State) -> _State:
+def _restore_unidentified(fitter: _Fitter, predict: Predict, state: _State) -> _State:
     """The state, with parameters that nothing tells there (friction at which nothing slips) back where they began if
     that tells them: a step went too far."""
-    begun, lost = begins(fitter.parameters), ~fitter.held & (fitter.reach(state) > UNTOLD)
+    begun, lost = (
+        fit_start_values(fitter.parameters),
+        ~fitter.held & (fitter.reach(state) > MAX_IDENTIFIED_HALF_INTERVAL),
+    )
     if not (lost & (state.point.free != begun)).any():
         return state
     point = replace(state.point, free=np.where(lost, begun, state.point.free))
     back = fitter.linearise(predict, point, state.zeros)
-    return back if (fitter.reach(back)[lost] <= UNTOLD).any() else state
+    return back if (fitter.reach(back)[lost] <= MAX_IDENTIFIED_HALF_INTERVAL).any() else state
 
 
-def _coarse(
+def _fit_coarse(
     fitter: _Fitter,
     predict: Predict,
     state: _State,
     error: float,
     on_step: Callable[[str], None],
-    most: int = MOST_STEPS,
+    max_steps: int = MAX_STEPS,
     secant: bool = False,
 ) -> _State:
-    """Damped steps by the simulation `predict`, off by a share of about `error`, `most` of them. secant: one run each,
-    the system brought up to date by what the step found; else linearised anew, a batch each."""
+    """Damped steps by the simulation `predict`, off by a share of about `error`, `max_steps` of them. secant: one run
+    each, the system brought up to date by what the step found; else linearised anew, a batch each."""
     damping = 1e-3
-    for count in range(most):
+    for count in range(max_steps):
         fitter.sigma = np.hypot(fitter.signals.noise, error * np.abs(state.predicted))
         step = fitter.step(state, damping)
-        if fitter.small(state, step, error / 2):
+        if fitter.is_small(state, step, error / 2):
             break
         on_step(f"step {count + 1}")
         try:
             point, zeros = fitter.moved(state, step)
             after = fitter.secant(predict, state, point, zeros) if secant else fitter.linearise(predict, point, zeros)
         except CannotSimulate:
-            if count + 1 == most:
+            if count + 1 == max_steps:
                 raise
             damping = max(damping, 1e-3) * 100  # the step went too far
             continue
@@ -260,26 +269,26 @@ def _coarse(
         else:
             state = replace(state, system=after.system) if secant else state
             damping = max(damping, 1e-3) * 10
-        if abs(gain) < max(SMALL_GAIN, SMALL_SHARE * fitter.cost(state)):
+        if abs(gain) < max(MIN_GAIN, MIN_GAIN_SHARE * fitter.cost(state)):
             break
     return state
 
 
-def _refined(fitter: _Fitter, state: _State, fine: Predict | None, on_step: Callable[[str], None]) -> Fit:
+def _refine_fit(fitter: _Fitter, state: _State, fine: Predict | None, on_step: Callable[[str], None]) -> Fit:
     """Goes on with the differences between a finer simulation and the coarse one, and ends with the intervals."""
     p = len(fitter.held)
     begun, coarse = state.point.free, state.predicted
-    for count in range(0 if fine is None else MOST_FINE):
+    for count in range(0 if fine is None else MAX_FINE_STEPS):
         assert fine is not None
         on_step(f"finer mesh, run {count + 1}")
         exact = fitter.run(fine, [state.point])[0]
         if count == 0:
             off = exact - coarse
-        noise, settled = fitter.signals.noise, SETTLED_ERROR * np.abs(exact)
-        fitter.sigma = np.sqrt(noise**2 + settled**2 + (MESH_LEFT * off) ** 2)
+        noise, settled = fitter.signals.noise, SETTLING_ERROR * np.abs(exact)
+        fitter.sigma = np.sqrt(noise**2 + settled**2 + (MESH_ERROR_SHARE * off) ** 2)
         here = _State(state.point, state.zeros, exact, state.system)
-        state = fitter.stepped(here)
-        if fitter.small(here, state.point.free - here.point.free, SMALL_STEP):
+        state = fitter.after_full_step(here)
+        if fitter.is_small(here, state.point.free - here.point.free, MIN_STEP):
             break
     shift = state.point.free - begun
     fit = Fit(
@@ -289,13 +298,13 @@ def _refined(fitter: _Fitter, state: _State, fine: Predict | None, on_step: Call
         runs=fitter.runs,
     )  # fmt: skip
     series, residual = fitter.signals.series, fitter.residual(state)
-    scatter = float(((residual / fitter.sigma) ** 2).sum() / fit.freedom)
+    scatter = float(((residual / fitter.sigma) ** 2).sum() / fit.degrees_of_freedom)
     if fine is not None:
         # What each series is off may cancel in this sum, and not in that of what is left of it. What creeps still has
         # one sign in all of it, and so has what the finest mesh is off: it does not average out.
-        apart = np.sqrt((fit.influences(off, series) ** 2).sum(axis=0))
+        apart = np.sqrt((fit.parameter_changes(off, series) ** 2).sum(axis=0))
         fit = replace(
-            fit, mesh_shift=np.maximum(np.abs(shift), apart), settled_shift=fit.influences(settled, series)
+            fit, mesh_shift=np.maximum(np.abs(shift), apart), settled_shift=fit.parameter_changes(settled, series)
         )  # fmt: skip
     noisier = fit.with_sigma(fitter.sigma * max(1.0, np.sqrt(scatter)))
-    return replace(fit, covariance=noisier.covariance).widened(residual, series)
+    return replace(fit, covariance=noisier.covariance).widen_intervals(residual, series)

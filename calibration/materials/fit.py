@@ -13,7 +13,7 @@ from scipy.stats import t as student
 
 from tacsim.interface import FloatArray
 
-MESH_LEFT = 0.5  # standard deviation of what is left of the mesh's error, over what the finer mesh changed
+MESH_ERROR_SHARE = 0.5  # standard deviation of what is left of the mesh's error, over what the finer mesh changed
 HELD = 0.5  # standard deviation of a free number that is held where it was, as far as the others' intervals go
 UNKNOWN = 100.0  # standard deviation of a free number of which nothing is known
 
@@ -33,7 +33,7 @@ class Parameter:
     high: float
     kind: Literal["log", "volume", "linear"] = "log"
     unit: float = 1.0
-    begin: float | None = None  # where a fit begins, if not at the start, where it stays if nothing tells it
+    begin: float | None = None  # where a fit fit_start_values, if not at the start, where it stays if nothing tells it
 
     def free(self, value: float) -> float:
         if self.kind == "log":
@@ -51,20 +51,20 @@ class Parameter:
         ends = sorted((self.free(self.low), self.free(self.high)))
         return ends[0], ends[1]
 
-    def between(self, free: float, half: float) -> tuple[float, float]:
+    def interval_values(self, free: float, half: float) -> tuple[float, float]:
         """The interval free - half .. free + half as values, within the bounds."""
         low, high = self.bounds
         ends = sorted(self.value(min(max(end, low), high)) for end in (free - half, free + half))
         return ends[0], ends[1]
 
 
-def starts(parameters: Sequence[Parameter]) -> FloatArray:
+def start_values(parameters: Sequence[Parameter]) -> FloatArray:
     """The free numbers at which what is not told stays."""
     return np.array([each.free(each.start) for each in parameters])
 
 
-def begins(parameters: Sequence[Parameter]) -> FloatArray:
-    """The free numbers at which a fit begins."""
+def fit_start_values(parameters: Sequence[Parameter]) -> FloatArray:
+    """The free numbers at which a fit fit_start_values."""
     return np.array([each.free(each.start if each.begin is None else each.begin) for each in parameters])
 
 
@@ -135,53 +135,55 @@ class Fit:
     runs: int = 0  # simulated presses
 
     @property
-    def told(self) -> tuple[Parameter, ...]:
+    def identified(self) -> tuple[Parameter, ...]:
         return tuple(each for each, held in zip(self.parameters, self.held, strict=True) if not held)
 
     @property
-    def untold(self) -> tuple[Parameter, ...]:
+    def unidentified(self) -> tuple[Parameter, ...]:
         return tuple(each for each, held in zip(self.parameters, self.held, strict=True) if held)
 
     @property
-    def freedom(self) -> int:
-        return max(1, len(self.predicted) - len(self.told))
+    def degrees_of_freedom(self) -> int:
+        return max(1, len(self.predicted) - len(self.identified))
 
     def value(self, name: str) -> float:
         index = self._index(name)
         return self.parameters[index].value(float(self.free[index]))
 
-    def half(self, name: str) -> float:
+    def half_interval(self, name: str) -> float:
         """Half the 95 % interval of a free number."""
         index = self._index(name)
-        return float(student.ppf(0.975, self.freedom) * np.sqrt(self.covariance[index, index]))
+        return float(student.ppf(0.975, self.degrees_of_freedom) * np.sqrt(self.covariance[index, index]))
 
     def interval(self, name: str) -> tuple[float, float]:
         """95 %."""
         index = self._index(name)
-        return self.parameters[index].between(float(self.free[index]), self.half(name))
+        return self.parameters[index].interval_values(float(self.free[index]), self.half_interval(name))
 
     def with_sigma(self, sigma: FloatArray) -> Fit:
         """What its intervals were if the signals had these standard deviations."""
         p = len(self.free)
         spread = covariance_of(self.system, sigma, self.priors, self.held)[:p, :p]
-        spread = spread + np.diag((MESH_LEFT * self.mesh_shift) ** 2) + self.settled_shift.T @ self.settled_shift
+        spread = spread + np.diag((MESH_ERROR_SHARE * self.mesh_shift) ** 2) + self.settled_shift.T @ self.settled_shift
         return replace(self, sigma=sigma, covariance=spread)
 
-    def influence(self, change: FloatArray) -> FloatArray:
+    def parameter_change(self, change: FloatArray) -> FloatArray:
         """(p,) how far the free numbers move if the simulation changes by `change` (m,)."""
         covariance = covariance_of(self.system, self.sigma, self.priors, self.held, 0.0)
         found: FloatArray = -(covariance @ self.system.T @ (change / self.sigma**2))[: len(self.free)]
         return found
 
-    def influences(self, change: FloatArray, series: NDArray[np.int64]) -> FloatArray:
+    def parameter_changes(self, change: FloatArray, series: NDArray[np.int64]) -> FloatArray:
         """(k, p) the same for each series' part of the change; `series` (m,): `Signals.series`."""
-        return np.array([self.influence(np.where(series == each, change, 0.0)) for each in range(series.max() + 1)])
+        return np.array(
+            [self.parameter_change(np.where(series == each, change, 0.0)) for each in range(series.max() + 1)]
+        )
 
-    def widened(self, residual: FloatArray, series: NDArray[np.int64]) -> Fit:
+    def widen_intervals(self, residual: FloatArray, series: NDArray[np.int64]) -> Fit:
         """With intervals as wide as the series (m,) pull its numbers apart, where that is more than they knew. What a
         simulation is off lasts through a series, whose readings are no opinions of their own: the variance is that of
         clusters (Liang and Zeger, Biometrika 73, 1986). residual: (m,) measured less `predicted`."""
-        pulls = self.influences(residual, series)
+        pulls = self.parameter_changes(residual, series)
         pulled = (pulls**2).sum(axis=0) * len(pulls) / max(1, len(pulls) - 1)
         more = np.maximum(0.0, pulled - np.diag(self.covariance))
         return replace(self, covariance=self.covariance + np.diag(more))

@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 
 from calibration.materials.fit import Signals
 from tacsim.interface import FloatArray, Pose
-from tacsim.pose import difference
+from tacsim.pose import pose_difference
 
 Quantity = Literal["force", "dent", "width", "slip"]
 QUANTITY: dict[str, Quantity] = {
     "fx": "force", "fy": "force", "fz": "force", "dent": "dent", "width": "width", "slip_x": "slip", "slip_y": "slip",
 }  # fmt: skip
-ARM = 5e-3  # about half a gel: from its middle to its edge [m]
-STILL = 1e-6  # parts that move less are in the same place [m]
-CORNER = np.cos(np.radians(20.0))  # of the directions of two steps: beyond, a path turns
+ROTATION_LEVER = 5e-3  # about half a gel: from its middle to its edge [m]
+MAX_STILL_MOTION = 1e-6  # parts that move less are in the same place [m]
+MIN_CORNER_COSINE = np.cos(np.radians(20.0))  # of the directions of two steps: beyond, a path turns
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,7 +36,9 @@ class Press:
     @property
     def places(self) -> FloatArray:
         """(n, 6 k) where the k parts are, and how far they have turned: rotation vectors times ARM [m]."""
-        turned = [[ARM * difference(poses[0], pose)[3:] for pose in poses] for poses in self.poses.values()]
+        turned = [
+            [ROTATION_LEVER * pose_difference(poses[0], pose)[3:] for pose in poses] for poses in self.poses.values()
+        ]
         return np.hstack([*([pose.position for pose in poses] for poses in self.poses.values()), *turned])
 
     def at(self, moments: Sequence[int]) -> Press:
@@ -61,10 +63,10 @@ class Noise:
     slip: float = 10e-6  # of the mean of a flow [m]
 
 
-def gathered(press: Press) -> Press:
+def merge_repeated_readings(press: Press) -> Press:
     """Readings taken in one place become their mean."""
     places = press.places
-    moved = np.abs(np.diff(places, axis=0)).max(axis=1) > STILL
+    moved = np.abs(np.diff(places, axis=0)).max(axis=1) > MAX_STILL_MOTION
     group = np.concatenate([[0], np.cumsum(moved)])
     first = [int(np.flatnonzero(group == k)[0]) for k in range(group[-1] + 1)]
     result = press.at(first)
@@ -77,11 +79,11 @@ def gathered(press: Press) -> Press:
     )
 
 
-def thinned(press: Press, most: int) -> Press:
-    """At most about `most` moments, evenly along the path; its ends and the places where it turns are kept."""
+def downsample_press(press: Press, max_moments: int) -> Press:
+    """At most about `max_moments` moments, evenly along the path; its ends and the places where it turns are kept."""
     places = press.places
     count = len(places)
-    if count <= most:
+    if count <= max_moments:
         return press
     steps = np.diff(places, axis=0)
     lengths = np.linalg.norm(steps, axis=1)
@@ -89,9 +91,9 @@ def thinned(press: Press, most: int) -> Press:
     kept = {0, count - 1}
     for k in range(1, count - 1):
         both = lengths[k - 1] * lengths[k]
-        if both > 0 and steps[k - 1] @ steps[k] < CORNER * both:
+        if both > 0 and steps[k - 1] @ steps[k] < MIN_CORNER_COSINE * both:
             kept.add(k)
-    kept |= {int(np.argmin(np.abs(along - at))) for at in np.linspace(0.0, along[-1], most)}
+    kept |= {int(np.argmin(np.abs(along - at))) for at in np.linspace(0.0, along[-1], max_moments)}
     return press.at(sorted(kept))
 
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calibration.poses.robust_fit import BadMeasurements, RobustFit, angular_spread, perturbed, robust_fit
+from calibration.poses.robust_fit import BadMeasurements, RobustFit, angular_spread, perturb_pose, robust_fit
 from tacsim import pose as se3
 from tacsim.interface import FloatArray, Mask, Pose
 
@@ -83,25 +83,25 @@ def fit_touches(touches: Sequence[BallTouch], ball_radius: float, noise: TouchNo
         raise BadMeasurements(f"{len(touches)} touches are too few; at least {MIN_TOUCHES} are needed, 24 are good")
     turn = np.stack([se3.rotation(touch.tool).as_matrix() for touch in touches])
     place = np.stack([touch.tool.position for touch in touches])
-    seen = np.array([(*touch.contact, ball_radius - touch.depth) for touch in touches])
-    _check_spread(turn, seen)
+    contacts = np.array([(*touch.contact, ball_radius - touch.depth) for touch in touches])
+    _check_spread(turn, contacts)
     sigma = np.sqrt(np.array([noise.centre, noise.centre, noise.depth]) ** 2 + noise.robot**2)
 
     def solve(base: FloatArray, starts: list[FloatArray]) -> RobustFit:
         def residuals(change: FloatArray) -> FloatArray:
-            sensor = perturbed(base, change)
+            sensor = perturb_pose(base, change)
             in_tool = np.einsum("nji,nj->ni", turn, change[6:9] - place)
-            residual: FloatArray = ((in_tool - sensor[:3, 3]) @ sensor[:3, :3] - seen) / sigma
+            residual: FloatArray = ((in_tool - sensor[:3, 3]) @ sensor[:3, :3] - contacts) / sigma
             return residual
 
         return robust_fit(residuals, starts, "touches")
 
     identity = np.eye(4)
-    rough = solve(identity, _starts(turn, place, seen))
-    base, ball = perturbed(identity, rough.parameters[:6]), rough.parameters[6:9]
+    rough = solve(identity, _start_poses(turn, place, contacts))
+    base, ball = perturb_pose(identity, rough.parameters[:6]), rough.parameters[6:9]
     fit = solve(base, [np.concatenate([np.zeros(6), ball])])  # again, where the rotation vector is small
     return TouchFit(
-        tool_from_sensor=se3.from_matrix(perturbed(base, fit.parameters[:6])),
+        tool_from_sensor=se3.from_matrix(perturb_pose(base, fit.parameters[:6])),
         ball=fit.parameters[6:9],
         covariance=fit.covariance[:6, :6],
         bound=fit.bound[:6, :6],
@@ -111,14 +111,14 @@ def fit_touches(touches: Sequence[BallTouch], ball_radius: float, noise: TouchNo
     )
 
 
-def _check_spread(turn: FloatArray, seen: FloatArray) -> None:
+def _check_spread(turn: FloatArray, contacts: FloatArray) -> None:
     tilts = angular_spread(turn)
     if tilts < MIN_SPREAD:
         raise BadMeasurements(
             f"the tilts differ too little: one direction turns by only {np.degrees(tilts):.1f} degrees, "
             f"{np.degrees(MIN_SPREAD):.0f} are needed. Tilt the sensor about both axes of its gel, 20 degrees and more"
         )
-    spread = float(np.sqrt(max(0.0, np.linalg.eigvalsh(np.cov(seen[:, :2].T))[0])))
+    spread = float(np.sqrt(max(0.0, np.linalg.eigvalsh(np.cov(contacts[:, :2].T))[0])))
     if spread < MIN_CONTACT_SPREAD:
         raise BadMeasurements(
             f"the contacts lie too near to a point or a line on the gel: they spread by {1e3 * spread:.2f} mm in one "
@@ -126,7 +126,7 @@ def _check_spread(turn: FloatArray, seen: FloatArray) -> None:
         )
 
 
-def _starts(turn: FloatArray, place: FloatArray, seen: FloatArray) -> list[FloatArray]:
+def _start_poses(turn: FloatArray, place: FloatArray, contacts: FloatArray) -> list[FloatArray]:
     """Starts of the fit: the 24 rotations of a cube; for each, the rest is a linear problem."""
     count = len(turn)
     matrix = np.zeros((count, 3, 6))
@@ -134,7 +134,7 @@ def _starts(turn: FloatArray, place: FloatArray, seen: FloatArray) -> list[Float
     matrix[:, :, 3:] = -np.eye(3)
     starts = []
     for rotation in Rotation.create_group("O"):
-        known = -(place + np.einsum("nij,nj->ni", turn, seen @ rotation.as_matrix().T))
+        known = -(place + np.einsum("nij,nj->ni", turn, contacts @ rotation.as_matrix().T))
         shift_and_ball = np.linalg.lstsq(matrix.reshape(-1, 6), known.ravel(), rcond=None)[0]
         starts.append(np.concatenate([shift_and_ball[:3], rotation.as_rotvec(), shift_and_ball[3:]]))
     return starts

@@ -15,7 +15,13 @@ from numpy.linalg import inv
 from scipy.spatial.transform import Rotation
 
 from calibration.poses.ball_touch import deviation
-from calibration.poses.robust_fit import BadMeasurements, RobustFit, angular_spread, perturbed, robust_fit
+from calibration.poses.robust_fit import (
+    BadMeasurements,
+    RobustFit,
+    angular_spread,
+    perturb_pose,
+    robust_fit,
+)
 from tacsim import pose as se3
 from tacsim.interface import FloatArray, Pose
 
@@ -79,9 +85,9 @@ def fit_hand_eye(poses: Sequence[BoardPose], *, fixed: bool = False, noise: Hand
         )
     # arm_i camera board_i = mount, always the same
     arm = np.asarray(inv(flange) if fixed else flange, dtype=np.float64)
-    camera, mount = _start(arm, board)
+    camera, mount = _closed_form_start(arm, board)
     for _ in range(1 + REWEIGHTINGS):
-        camera, mount, fit = _solved(arm, board, camera, mount, noise, fixed=fixed)
+        camera, mount, fit = _solve_poses(arm, board, camera, mount, noise, fixed=fixed)
     predicted = inv(camera) @ inv(arm) @ mount
     turn = Rotation.from_matrix(predicted[:, :3, :3] @ np.swapaxes(board[:, :3, :3], 1, 2)).magnitude()
     missed = np.linalg.norm(predicted[:, :3, 3] - board[:, :3, 3], axis=1)
@@ -96,25 +102,25 @@ def fit_hand_eye(poses: Sequence[BoardPose], *, fixed: bool = False, noise: Hand
     )
 
 
-def _solved(
+def _solve_poses(
     arm: FloatArray, board: FloatArray, camera: FloatArray, mount: FloatArray, noise: HandEyeNoise, *, fixed: bool
 ) -> tuple[FloatArray, FloatArray, RobustFit]:
     back = inv(arm)
     seen_turn = np.swapaxes(board[:, :3, :3], 1, 2)
-    whiten = _whitening(camera, mount, arm, noise, fixed=fixed)
+    whiten = _whitening_matrices(camera, mount, arm, noise, fixed=fixed)
 
     def residuals(change: FloatArray) -> FloatArray:
-        predicted = inv(perturbed(camera, change[:6])) @ back @ perturbed(mount, change[6:])
+        predicted = inv(perturb_pose(camera, change[:6])) @ back @ perturb_pose(mount, change[6:])
         turn = Rotation.from_matrix(predicted[:, :3, :3] @ seen_turn).as_rotvec()
         missed = np.concatenate([predicted[:, :3, 3] - board[:, :3, 3], turn], axis=1)
         whitened: FloatArray = np.einsum("nij,nj->ni", whiten, missed)
         return whitened
 
     fit = robust_fit(residuals, [np.zeros(12)], "poses")
-    return perturbed(camera, fit.parameters[:6]), perturbed(mount, fit.parameters[6:]), fit
+    return perturb_pose(camera, fit.parameters[:6]), perturb_pose(mount, fit.parameters[6:]), fit
 
 
-def _whitening(
+def _whitening_matrices(
     camera: FloatArray, mount: FloatArray, arm: FloatArray, noise: HandEyeNoise, *, fixed: bool
 ) -> FloatArray:
     """(n, 6, 6) matrices that make a pose's residuals six independent ones of variance 1.
@@ -128,19 +134,19 @@ def _whitening(
     lever, turn = after[:, :3, 3], before[:, :3, :3]
     effect = np.zeros((count, 6, 6))
     effect[:, :3, :3] = effect[:, 3:, 3:] = turn
-    effect[:, :3, 3:] = turn @ -_cross(lever)
+    effect[:, :3, 3:] = turn @ -_cross_matrices(lever)
     robot = np.diag([noise.robot**2] * 3 + [noise.robot_turn**2] * 3)
     seen = np.diag([noise.board**2] * 3 + [noise.board_turn**2] * 3)
     covariance = seen + effect @ robot @ np.swapaxes(effect, 1, 2)
     return inv(np.linalg.cholesky(covariance))
 
 
-def _cross(vectors: FloatArray) -> FloatArray:
+def _cross_matrices(vectors: FloatArray) -> FloatArray:
     """(n, 3, 3) matrices C with C w = v x w."""
     return np.swapaxes(np.cross(vectors[:, None], np.eye(3)), 1, 2)
 
 
-def _start(arm: FloatArray, board: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _closed_form_start(arm: FloatArray, board: FloatArray) -> tuple[FloatArray, FloatArray]:
     """The closed form's camera and mount from all poses or a subset, whichever the poses agree with most."""
     random = np.random.default_rng(0)
     count = len(arm)

@@ -55,13 +55,13 @@ def estimate_latency(
     latency [s]. Raises NoLatency when the signals do not correlate, or fit several latencies, ValueError for arrays
     that are no signals.
     """
-    arm_times, arm = _signal(depth_times, depth, "depth")
-    times, seen = _signal(touch_times, touch, "touch")
+    arm_times, arm = _check_signal(depth_times, depth, "depth")
+    times, observed = _check_signal(touch_times, touch, "touch")
     low, high = search
     if not low < high:
         raise ValueError(f"search must be two growing bounds [s], got {search}")
     covered = (times - high >= arm_times[0]) & (times - low <= arm_times[-1])
-    times, seen = times[covered], seen[covered]
+    times, observed = times[covered], observed[covered]
     if len(times) < MIN_SAMPLES:
         raise NoLatency(
             f"only {len(times)} pictures lie where the arm's record covers latencies of {low:g} to {high:g} s, "
@@ -69,28 +69,28 @@ def estimate_latency(
         )
 
     shifts = np.arange(low, high + 0.5 * COARSE_STEP, COARSE_STEP)
-    curve = np.array([_correlation(np.interp(times - shift, arm_times, arm), seen) for shift in shifts])
+    curve = np.array([_correlation(np.interp(times - shift, arm_times, arm), observed) for shift in shifts])
     best = int(np.argmax(curve))
     _check_peak(shifts, curve, best)
 
-    fit = partial(_fit, float(shifts[best]), arm_times, arm)
-    shift, likeness = fit(times, seen)
+    fit = partial(_fit_shift, float(shifts[best]), arm_times, arm)
+    shift, likeness = fit(times, observed)
     parts = np.array_split(np.arange(len(times)), JACKKNIFE_BLOCKS)
-    without = np.array([fit(np.delete(times, gone), np.delete(seen, gone))[0] for gone in parts])
+    without = np.array([fit(np.delete(times, gone), np.delete(observed, gone))[0] for gone in parts])
     spread = (JACKKNIFE_BLOCKS - 1) / JACKKNIFE_BLOCKS * float(((without - without.mean()) ** 2).sum())
     return Latency(seconds=shift, uncertainty=float(np.sqrt(spread)), correlation=likeness, samples=len(times))
 
 
-def _fit(
-    shift: float, arm_times: FloatArray, arm: FloatArray, times: FloatArray, seen: FloatArray
+def _fit_shift(
+    shift: float, arm_times: FloatArray, arm: FloatArray, times: FloatArray, observed: FloatArray
 ) -> tuple[float, float]:
     """Response and shift in turn, from the coarse `shift` on: the shift [s], and the correlation there."""
     likeness = 0.0
     for _ in range(ITERATIONS):
-        response = _response(np.interp(times - shift, arm_times, arm), seen)
+        response = _fit_response(np.interp(times - shift, arm_times, arm), observed)
         expected = np.interp(arm, *response)  # the touch that a camera without latency would show
         found = minimize_scalar(
-            lambda tried, touch=expected: -_correlation(np.interp(times - tried, arm_times, touch), seen),
+            lambda tried, touch=expected: -_correlation(np.interp(times - tried, arm_times, touch), observed),
             bounds=(shift - PEAK_HALF_WIDTH, shift + PEAK_HALF_WIDTH),
             method="bounded",
             options={"xatol": 1e-6},
@@ -99,7 +99,7 @@ def _fit(
     return shift, likeness
 
 
-def _response(depth: FloatArray, touch: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _fit_response(depth: FloatArray, touch: FloatArray) -> tuple[FloatArray, FloatArray]:
     """The growing function of depth that fits the touch best: its abscissae, growing, and its values."""
     order = np.argsort(depth, kind="stable")
     fitted = np.asarray(isotonic_regression(touch[order]).x, dtype=np.float64)
@@ -108,7 +108,7 @@ def _response(depth: FloatArray, touch: FloatArray) -> tuple[FloatArray, FloatAr
     return abscissae, np.add.reduceat(fitted, first) / counts
 
 
-def _signal(times: ArrayLike, values: ArrayLike, what: str) -> tuple[FloatArray, FloatArray]:
+def _check_signal(times: ArrayLike, values: ArrayLike, what: str) -> tuple[FloatArray, FloatArray]:
     t, x = np.array(times, dtype=np.float64), np.array(values, dtype=np.float64)
     if t.ndim != 1 or t.shape != x.shape or len(t) < 2:
         raise ValueError(f"{what}: needs as many times as values, two at least, got shapes {t.shape} and {x.shape}")

@@ -31,7 +31,7 @@ MAX_ENTRIES = 1000  # of a file
 Count = Annotated[int | None, Field(ge=0, le=MAX_ENTRIES)]  # entries of a whole file; None: written by hand, not given
 
 
-def _whole(entries: tuple[Entry, ...], info: ValidationInfo) -> tuple[Entry, ...]:
+def _require_complete(entries: tuple[Entry, ...], info: ValidationInfo) -> tuple[Entry, ...]:
     """Refuses a file that was cut off."""
     count = info.data.get("count")
     if count is not None and count != len(entries):
@@ -57,7 +57,7 @@ class TouchFile(Config):
 
     ball_radius: Annotated[Length, Field(gt=0)]
     count: Count = None
-    touches: Annotated[tuple[TouchEntry, ...], Field(max_length=MAX_ENTRIES), AfterValidator(_whole)]
+    touches: Annotated[tuple[TouchEntry, ...], Field(max_length=MAX_ENTRIES), AfterValidator(_require_complete)]
 
     def measurements(self) -> list[BallTouch]:
         return [BallTouch(each.tool.pose, each.contact, each.depth) for each in self.touches]
@@ -75,7 +75,7 @@ class BoardPoseFile(Config):
 
     camera: Literal["flange", "fixed"] = "flange"  # rides on the flange before a fixed board, or the other way round
     count: Count = None
-    poses: Annotated[tuple[BoardPoseEntry, ...], Field(max_length=MAX_ENTRIES), AfterValidator(_whole)]
+    poses: Annotated[tuple[BoardPoseEntry, ...], Field(max_length=MAX_ENTRIES), AfterValidator(_require_complete)]
 
     def measurements(self) -> list[BoardPose]:
         return [BoardPose(each.flange.pose, each.board.pose) for each in self.poses]
@@ -93,13 +93,17 @@ def read_board_poses(path: Path) -> BoardPoseFile:
 
 def touch_file(touches: Sequence[BallTouch], ball_radius: float) -> TouchFile:
     """What `write_record` shall write of touches."""
-    entries = tuple(TouchEntry(tool=placement(t.tool), contact=t.contact, depth=max(0.0, t.depth)) for t in touches)
+    entries = tuple(
+        TouchEntry(tool=placement_of_pose(t.tool), contact=t.contact, depth=max(0.0, t.depth)) for t in touches
+    )
     return TouchFile(ball_radius=ball_radius, count=len(entries), touches=entries)
 
 
 def board_pose_file(board_poses: Sequence[BoardPose], *, fixed: bool) -> BoardPoseFile:
     """What `write_record` shall write of poses of a board."""
-    entries = tuple(BoardPoseEntry(flange=placement(s.flange), board=placement(s.board)) for s in board_poses)
+    entries = tuple(
+        BoardPoseEntry(flange=placement_of_pose(s.flange), board=placement_of_pose(s.board)) for s in board_poses
+    )
     return BoardPoseFile(camera="fixed" if fixed else "flange", count=len(entries), poses=entries)
 
 
@@ -121,7 +125,7 @@ def write_record(path: Path, record: TouchFile | BoardPoseFile) -> Path:
     return path
 
 
-def placement(pose: Pose) -> Placement:
+def placement_of_pose(pose: Pose) -> Placement:
     """A pose as files write it: position [m] and rotation vector [rad]."""
     x, y, z = (float(value) for value in pose.position)
     a, b, c = (float(value) for value in rotation(pose).as_rotvec())
@@ -130,7 +134,7 @@ def placement(pose: Pose) -> Placement:
 
 def pose_as_json(pose: Pose, covariance: FloatArray | None = None) -> dict[str, Any]:
     """A pose for JSON [m, rad]; `covariance` (6, 6): of shift and rotation vector."""
-    found: dict[str, Any] = placement(pose).model_dump(mode="json")
+    found: dict[str, Any] = placement_of_pose(pose).model_dump(mode="json")
     if covariance is not None:
         found["covariance"] = covariance.tolist()
     return found

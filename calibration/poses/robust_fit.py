@@ -68,7 +68,7 @@ def robust_fit(residuals: Residuals, starts: Sequence[FloatArray], what: str) ->
                 f"{int((~keep).sum())} of {len(keep)} {what} disagree with the others: is what should be fixed "
                 "really fixed, do the poses belong to the pictures, and are lengths in metres?"
             )
-        fit, before = _plain(residuals, found, keep), used
+        fit, before = _fit_least_squares(residuals, found, keep), used
         found, used = fit.x, keep
         if (used == before).all():
             break
@@ -96,7 +96,7 @@ def robust_fit(residuals: Residuals, starts: Sequence[FloatArray], what: str) ->
     )
 
 
-def _plain(residuals: Residuals, start: FloatArray, keep: Mask) -> Any:
+def _fit_least_squares(residuals: Residuals, start: FloatArray, keep: Mask) -> Any:
     def flat(parameters: FloatArray) -> FloatArray:
         return residuals(parameters)[keep].ravel()
 
@@ -115,7 +115,7 @@ def angular_spread(rotations: FloatArray) -> float:
     return float(np.arcsin(np.sqrt(np.clip(least, 0.0, 1.0))))
 
 
-def perturbed(pose: FloatArray, change: FloatArray) -> FloatArray:
+def perturb_pose(pose: FloatArray, change: FloatArray) -> FloatArray:
     """`pose` (4, 4), shifted by change[:3] [m] and turned about its own origin by the rotation vector change[3:]; both
     along the axes of the frame that the pose is given in."""
     result = pose.copy()

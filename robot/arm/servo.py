@@ -47,14 +47,14 @@ from robot.common.kinematics import Kinematics, SingularityGuard, inverse_frame,
 from robot.common.tcp import Measured
 from tacsim.interface import FloatArray
 from tacsim.limits import (
-    braking_end,
-    exceeds,
+    box_region,
+    exceeds_limit,
     exceeds_wrench,
     finite_targets,
     fraction_inside,
-    joint_step_excess,
-    region,
+    joint_speed_ratio,
     segment_distance,
+    stopping_position,
 )
 
 FAULT_DECELERATION = 5.0  # minimum deceleration after a fault [m/s^2]
@@ -73,7 +73,7 @@ class Servo:
     def __init__(self, config: WorkerConfig, commands_read: int = 0, tactile_read: int = 0) -> None:
         self.config, self.frames = config, config.frames
         self.kinematics = Kinematics(config.model)  # type: ignore[arg-type]  # a Model, from JSON
-        self.region = region(config.lower, config.upper, [(point, normal) for point, normal in config.planes])
+        self.region = box_region(config.lower, config.upper, [(point, normal) for point, normal in config.planes])
         self.status = ArmStatus.CONNECTING  # until the first `check_faults`
         self.motion: MotionState | None = None  # of the servo target; None: nothing is sent and the controller holds
         self.commands_read, self.rejected, self.shortened = commands_read, 0, 0
@@ -163,7 +163,7 @@ class Servo:
 
     def _check_place(self, measured: Measured) -> None:
         if (
-            self.region.excess(braking_end(measured.sensor[:3, 3], measured.twist[:3], self._hard[0]))
+            self.region.excess(stopping_position(measured.sensor[:3, 3], measured.twist[:3], self._hard[0]))
             > ALLOWED_OVERSHOOT
         ):
             self.trip(ArmStatus.WORKSPACE_LIMIT)
@@ -175,7 +175,7 @@ class Servo:
         self._tactile_read, self._exposed = number, float(report["exposed"])
         config = self.config
         if not math.isnan(self._exposed) and (
-            exceeds(float(report["depth"]), config.depth) or exceeds(float(report["shear"]), config.shear)
+            exceeds_limit(float(report["depth"]), config.depth) or exceeds_limit(float(report["shear"]), config.shear)
         ):
             self.trip(ArmStatus.GEL_LIMIT)
 
@@ -357,7 +357,7 @@ class Servo:
         wanted = self.frames.flange(sensor)
         controller_from_model = inverse_frame(measured.flange) @ self.kinematics.forward(measured.joints)
         joints = self.kinematics.inverse(wanted @ controller_from_model, self._sent)
-        if joints is None or joint_step_excess(self._sent, joints, self.config.joint_speed, PERIOD) > 1.0:
+        if joints is None or joint_speed_ratio(self._sent, joints, self.config.joint_speed, PERIOD) > 1.0:
             return None
         return None if self._singularity.is_nearer(joints, self._sent) else joints
 

@@ -103,7 +103,7 @@ def _between(a: ArmState, b: ArmState, time: float) -> ArmState:
         return mixed
 
     return ArmState(
-        pose=se3.interpolate(a.pose, b.pose, s),
+        pose=se3.interpolate_pose(a.pose, b.pose, s),
         twist=mix(a.twist, b.twist),
         wrench=mix(a.wrench, b.wrench),
         joints=None if a.joints is None or b.joints is None else mix(a.joints, b.joints),

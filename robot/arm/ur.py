@@ -154,7 +154,7 @@ class URArm(Closing):
 
     def arrived(self, target: Pose, *, within: float = 50e-6, turn: float = 1e-3) -> bool:
         """True if the arm stands still `within` [m] and `turn` [rad] of `target`."""
-        metres, radians = se3.distance(self.state().pose, target)
+        metres, radians = se3.pose_distance(self.state().pose, target)
         return metres <= within and radians <= turn and self.at_rest()
 
     def timing(self) -> Timing:
@@ -373,7 +373,7 @@ class URArm(Closing):
                 limits = self.config.limits
                 text += f" (now {force:.1f} of {limits.force:g} N, {torque:.2f} of {limits.torque:g} N m)"
             elif status == ArmStatus.WORKSPACE_LIMIT:
-                text += f" ({self._region.broken(record['position']) or 'it is inside again'})"
+                text += f" ({self._region.violated_face(record['position']) or 'it is inside again'})"
             elif status == ArmStatus.PARTNER_STOPPED:
                 text += "".join(f" (arm '{name}' {fault.text})" for name, fault in self._first_faults())
             elif status < ArmStatus.FORCE_LIMIT and (period := float(record["period"][0])) > SLOW:

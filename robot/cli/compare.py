@@ -81,8 +81,8 @@ def compare(
         from calibration.bundle import read_bundle
         from calibration.compare.compare import Options, Pairing
         from calibration.compare.compare import compare_frames as run
-        from calibration.compare.invariance import invariance as measure_invariance
-        from calibration.compare.report import figures, write
+        from calibration.compare.invariance import measure_invariance
+        from calibration.compare.report import comparison_figures, write_comparison
         from calibration.errors import BadFrames
     limits = [*_limits(fail_above, "--fail-above"), *_limits(fail_below, "--fail-below")]
     bundles = [
@@ -106,10 +106,10 @@ def compare(
     if invariance:
         with counted("invariance") as on_step:
             report = measure_invariance([(result, bundles[1])], on_step=on_step)
-    values = figures(result, report)
+    values = comparison_figures(result, report)
     beyond = _beyond_limits(limits, values)
     with writing(folder, new=True), busy("writing"):
-        written = write(folder, result, report)
+        written = write_comparison(folder, result, report)
     _show(result, report)
     say_files(*written)
     for words in beyond:
@@ -203,14 +203,16 @@ def _corners(text: str) -> Corners:
 
 def _limits(texts: list[str] | None, option: str) -> list[Limit]:
     """Parsed METRIC=VALUE. A length may carry its unit."""
-    from calibration.compare.report import names
+    from calibration.compare.report import figure_names
     from tacsim.models.quantity import parse
 
     found = []
     for text in texts or []:
         name, equals, value = text.partition("=")
-        if name not in names():
-            raise typer.BadParameter(f"'{name}' is no figure; there are: {', '.join(names())}", param_hint=option)
+        if name not in figure_names():
+            raise typer.BadParameter(
+                f"'{name}' is no figure; there are: {', '.join(figure_names())}", param_hint=option
+            )
         try:
             number = parse(value.strip(), "length") if name in LENGTHS else float(value)
         except ValueError as error:
@@ -239,17 +241,22 @@ def _beyond_limits(limits: list[Limit], values: dict[str, float]) -> list[str]:
 
 
 def _show(result: Comparison, report: Report | None) -> None:
-    from calibration.compare.report import judgement, rows, shown, verdict
+    from calibration.compare.report import (
+        describe_against_null,
+        describe_comparison,
+        format_metric,
+        known_metrics,
+    )
 
-    results.print(judgement(result))
+    results.print(describe_comparison(result))
     width = None if results.is_terminal else 160
     overall_rows = (
         (
-            metric.label, metric.unit or "1", shown(overall.mean, metric),
-            f"{shown(overall.low, metric)} to {shown(overall.high, metric)}",
-            shown(overall.null, metric), shown(overall.floor, metric), verdict(overall),
+            metric.label, metric.unit or "1", format_metric(overall.mean, metric),
+            f"{format_metric(overall.low, metric)} to {format_metric(overall.high, metric)}",
+            format_metric(overall.null, metric), format_metric(overall.floor, metric), describe_against_null(overall),
         )
-        for metric, overall in rows(result)
+        for metric, overall in known_metrics(result)
     )  # fmt: skip
     columns = ("metric", "unit", " against ".join(result.names), "95 % interval", "null", "floor", "than null")
     show_table(
@@ -257,7 +264,7 @@ def _show(result: Comparison, report: Report | None) -> None:
     )
     if report is not None:
         _show_invariance(report, width)
-    notes.print(result.alignment.said)
+    notes.print(result.alignment.description)
     for words in result.notes:
         warn(words)
     flagged = [pair for pair in result.pairs if pair.flags]

@@ -198,9 +198,9 @@ class _Task:
         title = f"{self.kind.capitalize()}, {len(found.presses)} recordings, {found.fit.runs} simulated"
         show_table(title, ("", "value", "95 %"), told(found), left={0})
         looks = {sensor: outlook(found, sensor) for sensor in dict.fromkeys((noise.force, *OUTLOOK))}
-        rows = [(each.name, *(_reach(look[each.name]) for look in looks.values())) for each in found.fit.told]
+        rows = [(each.name, *(_reach(look[each.name]) for look in looks.values())) for each in found.fit.identified]
         show_table("With another force sensor, 95 %", ("noise", *(f"{one:g} N" for one in looks)), rows, left={0})
-        for each in found.fit.untold:
+        for each in found.fit.unidentified:
             motion = WHAT_TELLS[self.kind][each.name]
             warn(
                 f"{each.name} is not told by these recordings and stays as it was; '{motion}' would tell it: "
@@ -213,11 +213,11 @@ class _Task:
             )
         say_files(*files)
         for finding in found.findings:
-            complain(finding.words)
+            complain(finding.text)
         if found.findings:
             complain(f"no material is written: {folder / 'identified.png'} shows why")
             raise typer.Exit(UNUSABLE)
-        if self.wanted and (missing := [each.name for each in found.fit.untold]):
+        if self.wanted and (missing := [each.name for each in found.fit.unidentified]):
             complain(f"asked for and not told: {', '.join(missing)}")
             raise typer.Exit(UNUSABLE)
 
@@ -236,6 +236,6 @@ class _Task:
 
 def _reach(half: float) -> str:
     """Half an interval of a free number, in words."""
-    from calibration.materials.estimate import UNTOLD
+    from calibration.materials.estimate import MAX_IDENTIFIED_HALF_INTERVAL
 
-    return f"± {100 * half:.2g} %" if half < UNTOLD else "nothing"
+    return f"± {100 * half:.2g} %" if half < MAX_IDENTIFIED_HALF_INTERVAL else "nothing"

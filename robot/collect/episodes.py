@@ -25,7 +25,7 @@ from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.record.episode import EpisodeMeta, Step
 from tacsim.record.writer import Recorder
 from tacsim.tasks import GoalOutOfReach, Task, make_task
-from tacsim.tasks.task import action_from
+from tacsim.tasks.task import action_of_vector
 
 RANDOM = "random"
 STEPS = 40  # of an episode without a task
@@ -147,7 +147,7 @@ class RandomPolicy:
     def __call__(self, observation: Observation) -> Action:
         vector: Any = self._random.uniform(-1.0, 1.0, len(self._task.axes))
         poses = {name: arm.pose for name, arm in observation.arms.items()}
-        return action_from(vector, self._task.axes, self._task.config.max_step, poses)
+        return action_of_vector(vector, self._task.axes, self._task.config.max_step, poses)
 
 
 def _policy(

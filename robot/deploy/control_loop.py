@@ -21,7 +21,7 @@ from tacsim.models.sensor import CanonicalGrid
 from tacsim.record.episode import Episode, EpisodeMeta, Step
 from tacsim.record.step_info import MAX_DEPTH, MAX_FLOW, MAX_SLOPE, PACKAGES_LOST, TACTILE_DISTANCE
 from tacsim.rig import Rig
-from tacsim.tasks import GoalOutOfReach, Task, judge
+from tacsim.tasks import GoalOutOfReach, Task, evaluate_outcome
 
 PARTICLES = 5_000  # of a body go into a recorded step, at most
 PACKAGES = ("tacsim", "numpy", "taichi", "opencv-contrib-python-headless", "gymnasium")
@@ -204,7 +204,7 @@ class _Log:
         meta = _meta(rig, task, setup)
         self._rig, self._task, self._start, self._body = rig, task, start, setup.body
         self._recorder = None if recorder is None else recorder(meta)
-        can_feel = task is not None and not task.needs_to_feel.missing(rig.spec)
+        can_feel = task is not None and not task.touch_needs.missing(rig.spec)
         self._feel = task.estimator(setup.canonical) if task is not None and can_feel else None
         self._kept: list[Step] = []
         self.episode = Episode(meta, self._kept if self._recorder is None else self._recorder.steps)
@@ -257,7 +257,7 @@ class _Log:
         if truth is not None and self._start is not None:
             moved = truth.position - self._start.position
             info |= {"body_height": truth.height, "body_x": float(moved[0]), "body_y": float(moved[1])}
-            outcome = None if self._task is None else judge(self._task, truth, self._start)
+            outcome = None if self._task is None else evaluate_outcome(self._task, truth, self._start)
         return Step(
             index=self.count,
             time=observation.time,

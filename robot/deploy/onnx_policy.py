@@ -24,7 +24,7 @@ from tacsim.models.policy import METADATA_KEY, Numbers, PolicySpec
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.models.text import printable
 from tacsim.tasks import Task
-from tacsim.tasks.task import Axis, action_from
+from tacsim.tasks.task import Axis, action_of_vector
 
 if TYPE_CHECKING:
     from onnxruntime import InferenceSession
@@ -90,9 +90,9 @@ class OnnxPolicy:
         self.watch(seen)
         for axis in self._axes:
             now = observation.arms[axis.arm].pose
-            if first or se3.distance(self._targets[axis.arm], now)[0] > ASTRAY * self.spec.max_step:
+            if first or se3.pose_distance(self._targets[axis.arm], now)[0] > ASTRAY * self.spec.max_step:
                 self._targets[axis.arm] = now
-        action = action_from(self._infer(seen), self._axes, self.spec.max_step, self._targets)
+        action = action_of_vector(self._infer(seen), self._axes, self.spec.max_step, self._targets)
         self._targets = {arm: pose for arm, pose in action.tool.items() if pose is not None}
         return action
 

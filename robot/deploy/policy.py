@@ -15,7 +15,7 @@ from tacsim.interface import IncompatibleRig, Policy, RigSpec
 from tacsim.models.scene import Scene
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.record.step_info import TRAINING_DISTANCE, TRAINING_KNOWN
-from tacsim.rig import require
+from tacsim.rig import require_needs
 from tacsim.tasks import Task
 
 
@@ -105,10 +105,10 @@ def require_fit(rig: str, spec: RigSpec, policy: Policy, name: str, task: Task |
     if task is not None:
         who = f"task '{task.config.kind}'"
         advice = "Leave the task out (task: null in the rig file, or --set task=null): then nothing is judged"
-        require(rig, spec, task.needs, who, advice)
+        require_needs(rig, spec, task.needs, who, advice)
         if not spec.truth:
-            require(rig, spec, task.needs_to_feel, f"{who} (judged by touch, as nobody knows the truth)", advice)
+            require_needs(rig, spec, task.touch_needs, f"{who} (judged by touch, as nobody knows the truth)", advice)
     advice = "" if name == "grip" else "Take --policy grip, which needs pictures alone, or one of your own"
-    require(rig, spec, policy.needs, f"policy '{name}'", advice)
+    require_needs(rig, spec, policy.needs, f"policy '{name}'", advice)
     if isinstance(policy, OnnxPolicy) and (found := misfits(policy, spec, task)):
         raise IncompatibleRig(f"policy '{name}' cannot run on rig '{rig}': it was trained for {'; '.join(found)}")

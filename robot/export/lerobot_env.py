@@ -75,7 +75,7 @@ class LeRobotEnv(gymnasium.Env[dict[str, Any], NDArray[np.floating[Any]]]):
         """One control period. Raises ActionError for what stands for no pose, ResetNeeded after the end."""
         if np.shape(action) != self.action_space.shape:
             raise ActionError(f"an action has shape {self.action_space.shape}, got {np.shape(action)}")
-        asked = self._env.ask(_Fixed(self._mapping.decoded(action)))
+        asked = self._env.policy_action(_Fixed(self._mapping.decoded(action)))
         _, reward, terminated, truncated, info = self._env.step(asked)
         return _observed(self._mapping.observed(self._env.observation)), reward, terminated, truncated, info
 

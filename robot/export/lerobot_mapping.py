@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tacsim.gym.features import PARTS, SCALES, FeatureEncoder, moved, unmoved
+from tacsim.gym.features import PARTS, SCALES, FeatureEncoder, decode_pose_change, encode_pose_change
 from tacsim.interface import Action, IncompatibleRig, Observation, Pose, RigSpec
 from tacsim.limits import ActionError
 from tacsim.models.policy import Features, Numbers, Quantity
@@ -116,7 +116,7 @@ class LeRobotMapping:
 
     def encoded(self, poses: Mapping[str, Pose]) -> NDArray[np.float32]:
         """(9 arms,) of the pose of each arm."""
-        each = [moved(start, poses[arm]) for arm, start in self._start.items()]
+        each = [encode_pose_change(start, poses[arm]) for arm, start in self._start.items()]
         return np.concatenate(each).astype(np.float32)
 
     def decoded(self, numbers: NDArray[np.floating[Any]]) -> Action:
@@ -125,7 +125,7 @@ class LeRobotMapping:
         tool: dict[str, Pose | None] = {}
         for (arm, start), values in zip(self._start.items(), each, strict=True):
             try:
-                tool[arm] = unmoved(start, values)
+                tool[arm] = decode_pose_change(start, values)
             except ValueError as failure:
                 raise ActionError(f"the action of arm '{arm}', {values.tolist()}, is no pose: {failure}") from None
         return Action(tool)

@@ -142,9 +142,9 @@ def record_board_poses(arm: URArm, camera: FrameSource, plan: BoardPosePlan, ses
             for done, rotation in enumerate(schedule(plan)):
                 session.progress(done)
                 session.check()
-                turned = se3.compose(se3.along_z(start, plan.pivot), Pose(quaternion=rotation.as_quat()))
+                turned = se3.compose(se3.translated_along_z(start, plan.pivot), Pose(quaternion=rotation.as_quat()))
                 try:
-                    move_to(arm, arm.name, se3.along_z(turned, -plan.pivot))
+                    move_to(arm, arm.name, se3.translated_along_z(turned, -plan.pivot))
                     board = _find_board(camera, plan)
                 except (OutsideLimits, ActionError, BadBoard, BadView) as failure:
                     session.left_out.append(f"pose {done + 1}: {failure}")

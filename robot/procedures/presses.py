@@ -67,7 +67,7 @@ def record_presses(camera: FrameSource, plan: BallPressPlan, session: Session[tu
             )
             image = monitor.wait_for_press()
             try:
-                circle = collection.offer(image)
+                circle = collection.add_image(image)
             except BadFrames as why:
                 session.left_out.append(str(why))
                 session.say(f"Not taken: {why}.")

@@ -131,11 +131,11 @@ def move_to(arm: Arm | URArm, name: str, target: Pose, timeout: float = TRAVEL_T
     deadline = time.monotonic() + timeout
     while True:
         sent = arm.command(target)
-        if sent is not None and max(se3.distance(sent, target)) > SHORTENED:
+        if sent is not None and max(se3.pose_distance(sent, target)) > SHORTENED:
             arm.stop()
             raise OutsideLimits("the path leads out of the arm's limits (workspace, planes or keep_out)")
         state = arm.state()
-        metres, radians = se3.distance(state.pose, target)
+        metres, radians = se3.pose_distance(state.pose, target)
         if metres < AT_TARGET and radians < AT_ROTATION and np.linalg.norm(state.twist[:3]) < STANDSTILL:
             return
         if time.monotonic() > deadline:

@@ -92,7 +92,7 @@ def record_taps(
     mover.suspend_tactile_guard()  # pictures are looked at one by one here, not observed
     start = mover.state().pose
     axis = se3.rotation(start).apply([0.0, 0.0, 1.0])
-    above, below = se3.along_z(start, -plan.lift), se3.along_z(start, plan.depth)
+    above, below = se3.translated_along_z(start, -plan.lift), se3.translated_along_z(start, plan.depth)
     travel = (plan.lift + plan.depth) / limits.speed + 2.0 * limits.speed / limits.acceleration
     reference = rig.references[sensor].image[::STRIDE, ::STRIDE].astype(np.int16)
     record = TapRecord()

@@ -97,7 +97,8 @@ def find_way(name: str, config: UrArmConfig, reading: Reading, start: Pose) -> W
         worst = int(beyond.argmax())
         if beyond[worst] > max(0.0, beyond[0], beyond[-1]) + NEAR_LINE:
             raise NoWay(
-                f"arm '{name}': on the straight way of the joints its sensor would come {walls.broken(path[worst])}; "
+                f"arm '{name}': on the straight way of the joints its sensor would come "
+                f"{walls.violated_face(path[worst])}; "
                 "jog it nearer to its start by hand first"
             )
     else:
@@ -224,7 +225,7 @@ def lead_to_start(config: RigConfig, starts: Mapping[str, Pose], guide: Guide) -
             others = {other: arm.state().pose.position for other, arm in opened.items() if other != name}
             require_clear(name, ways[name], others, config.kept_out(name))
             _lead(each, ways[name], guide)
-        return {name: se3.distance(each.state().pose, starts[name])[0] for name, each in opened.items()}
+        return {name: se3.pose_distance(each.state().pose, starts[name])[0] for name, each in opened.items()}
 
 
 def _zero(arm: StartArm, guide: Guide) -> None:

@@ -39,7 +39,7 @@ class CommandedArm:
         except ActionError:
             self.limits_hit += 1
             raise
-        self.limits_hit += target is not None and sent is not None and max(se3.distance(target, sent)) > SHORTENED
+        self.limits_hit += target is not None and sent is not None and max(se3.pose_distance(target, sent)) > SHORTENED
         return sent
 
     def send(self, target: Pose | None, speed: float | None = None) -> Pose | None:

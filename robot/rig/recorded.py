@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from calibration.bundle import read_sensor_model
 from calibration.errors import CalibrationError, error_context
-from calibration.markers.flow import MarkersLost, find_markers
+from calibration.markers.flow import TooFewMarkers, find_markers
 from calibration.markers.lattice import NoLattice
 from calibration.reference import StaleReference
 from robot.rig.parts import sensor_of
@@ -113,7 +113,7 @@ class RecordedSurfaces:
             return frame.surface
         try:
             return normalise(frame, frame.time)
-        except (StaleReference, MarkersLost, ValueError):  # the steps say so
+        except (StaleReference, TooFewMarkers, ValueError):  # the steps say so
             return None
 
 

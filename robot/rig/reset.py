@@ -91,7 +91,7 @@ class HardwareReset:
         self._begun = {name: Pose(pose.position + shift, pose.quaternion) for name, pose in self._start.items()}
         if self._arms:
             self._tell("to the start")
-        self._go({name: se3.along_z(arm.state().pose, -RETREAT) for name, arm in self._arms.items()}, TRAVEL)
+        self._go({name: se3.translated_along_z(arm.state().pose, -RETREAT) for name, arm in self._arms.items()}, TRAVEL)
         self._go(self._begun, TRAVEL)
         if self._arms:
             time.sleep(PAUSE)
@@ -125,7 +125,7 @@ class HardwareReset:
         pictures or packages come, they wait."""
         speed, longest = self._config.approach_speed, self._config.approach_distance
         going = {name: self._arms[name] for name in sense.look(guarded=True).pressed}
-        ends = {name: se3.along_z(self._begun[name], longest) for name in going}
+        ends = {name: se3.translated_along_z(self._begun[name], longest) for name in going}
         gone = dict.fromkeys(going, 0.0)
         before_end = farther = time.monotonic()
         counted = 0.0  # of the arms' ways together, when they were last seen to come farther [m]
@@ -140,7 +140,7 @@ class HardwareReset:
                     else:  # NaN, too
                         going.pop(name).send(None)
                 for name, arm in going.items():
-                    gone[name] = se3.distance(arm.state().pose, self._begun[name])[0]
+                    gone[name] = se3.pose_distance(arm.state().pose, self._begun[name])[0]
                 self._tell(f"approach: {1e3 * max(gone.values()):.1f} mm of at most {1e3 * longest:g} mm")
                 if sum(gone.values()) > counted + FARTHER:
                     counted, farther = sum(gone.values()), now
@@ -168,7 +168,7 @@ class HardwareReset:
             return not going
 
         def advance(distance: float) -> None:
-            self._go({name: se3.along_z(self._begun[name], distance) for name in going}, STEP)
+            self._go({name: se3.translated_along_z(self._begun[name], distance) for name in going}, STEP)
             self._clock.wait_for_data()
 
         approach(touches, advance, self._config.approach_step, self._config.approach_distance, ADVICE)

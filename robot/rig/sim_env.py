@@ -11,14 +11,14 @@ from gymnasium.vector import AutoresetMode
 from robot.rig import CannotOpen
 from robot.rig.sim_rig import Simulation, simulate
 from tacsim.gym import encode
-from tacsim.gym.env import TacsimEnv, Variant, require_alike
+from tacsim.gym.env import TacsimEnv, Variant, require_compatible_task
 from tacsim.gym.features import FeatureEncoder
 from tacsim.gym.vector import Member, SharedBatch, TacsimVectorEnv
 from tacsim.models.hardware import ArmConfig, Placement, SensorConfig, parts_of
 from tacsim.models.policy import Features
 from tacsim.models.rig import RigConfig, SimSensorConfig, WrenchNoise
 from tacsim.models.sensor import Lighting
-from tacsim.sim.stage import StatePool, require_same_gels
+from tacsim.sim.scene_world import StatePool, require_same_gels
 from tacsim.tasks import make_task
 
 MOST_ENVIRONMENTS = 10_000  # beyond any machine's memory
@@ -76,8 +76,8 @@ def _env(
         space=space,
         encoder=encoder,
         variants=variants,
-        stage=simulation.stage,
-        wear=lambda worn: simulation.wear(config if worn is None else worn),
+        scene_world=simulation.scene_world,
+        apply_variation=lambda worn: simulation.apply_variation(config if worn is None else worn),
     )
 
 
@@ -95,7 +95,7 @@ def _variants(episodes: Episodes) -> list[Variant]:
         assert config.task is not None
         try:
             require_same_gels(first.scene, config.scene)
-            require_alike(first.task, config.task)
+            require_compatible_task(first.task, config.task)
         except ValueError as error:
             raise ValueError(f"variant {number}: {error}") from None
         variants.append(Variant(config.task, config.scene, config, words))

@@ -24,8 +24,8 @@ from tacsim.rig import Rig
 from tacsim.sim.arm import SimArm, wrench_noise_source
 from tacsim.sim.clock import SimClock
 from tacsim.sim.reset import SimReset
+from tacsim.sim.scene_world import SceneWorld, StatePool
 from tacsim.sim.sensor import SimSensor
-from tacsim.sim.stage import Stage, StatePool
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,23 +34,23 @@ class Simulation:
 
     rig: Rig
     clock: SimClock
-    stage: Stage
+    scene_world: SceneWorld
     sensors: Mapping[str, SimSensor]
     arms: Mapping[str, SimArm]
 
-    def wear(self, config: RigConfig) -> None:
+    def apply_variation(self, config: RigConfig) -> None:
         """From the next episode on light, texture, noise and delay of the sensors, and error, noise and delay of the
         arms, are those of `config`; all else is that of the rig they were made with."""
         for name, sensor in parts_of(config.sensors, SimSensorConfig).items():
-            self.sensors[name].wear(*_pictures(sensor.model, name, self.stage.scene), sensor.delay)
+            self.sensors[name].apply_variation(*_pictures(sensor.model, name, self.scene_world.scene), sensor.delay)
         for name, arm in parts_of(config.arms, SimArmConfig).items():
-            self.arms[name].believe(_error(arm), arm.delay, wrench_noise_source(arm.noise, name))
+            self.arms[name].set_measurement_errors(_error(arm), arm.delay, wrench_noise_source(arm.noise, name))
 
 
 def open_sim(config: RigConfig) -> Rig:
     """One world seen as sensors, arms and a clock. Raises CannotOpen."""
     simulation = simulate(config)
-    simulation.stage.world()
+    simulation.scene_world.world()
     return simulation.rig
 
 
@@ -77,7 +77,7 @@ def simulate(
         )
     frames = _frame_of_arm(config, scene)
     models = parts_of(config.sensors, SimSensorConfig)
-    world = Stage(scene, make_world if make is None else make)
+    world = SceneWorld(scene, make_world if make is None else make)
     clock = SimClock(world, config.period, config.motion)
     sensors = {name: _sim_sensor(world, clock, name, sensor, config) for name, sensor in models.items()}
     arms: dict[str, SimArm] = {}

@@ -18,7 +18,7 @@ from tacsim.config import load_rig
 from tacsim.interface import Action, Observation, Pose, TactileFrame, Truth
 from tacsim.models.rig import RigConfig
 from tacsim.report.figure4 import Moment, Trial
-from tacsim.tasks import Task, judge, make_task
+from tacsim.tasks import Task, evaluate_outcome, make_task
 
 MIN_FALL = 5.0  # both ends of a reward curve must lie more than this many times the distance allowed below its peak
 PEAK_AT = 0.7  # a trial goes on beyond the goal until its peak lies at this share of its curve
@@ -132,7 +132,7 @@ def run_trial(task: str, physics: str, on_step: Callable[[], None] = lambda: Non
             truth = rig.truth()
             assert truth is not None
             start = truth if start is None else start
-            distances.append(judge(goal, truth, start).distance)
+            distances.append(evaluate_outcome(goal, truth, start).distance)
             differences.append(image_difference(rig.frames, rig.references))
             moments.append(_moment(step, rig.frames, observation, truth))
             on_step()

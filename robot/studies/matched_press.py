@@ -14,7 +14,7 @@ import numpy as np
 
 from calibration.errors import BadFrames
 from calibration.frame_set import Frame, FrameSet
-from calibration.light.circle import Circle, NoCircle, contact_circle
+from calibration.light.circle import Circle, NoCircle, find_contact_circle
 from calibration.light.darkness import dark_circle
 from tacsim.interface import Image, Pose, SurfaceMap
 from tacsim.models.scene import GelSurface, Scene, Sphere
@@ -66,7 +66,7 @@ def match_presses(
         )
     ball = scene.indenter.geometry.radius
     # slopes make the colour of most lights; one that tells no direction shows a contact by how dark it is
-    find = contact_circle if sensor.darkness is None else dark_circle
+    find = find_contact_circle if sensor.darkness is None else dark_circle
     circles, notes = _circles(real, find, ball / sensor.geometry.pixel_pitch)
     gel = _PressedGel(scene, ball, sensor, grid, find)
     done: dict[str, Frame] = {}
@@ -89,7 +89,7 @@ def match_presses(
         frames.append(made if noise is None else replace(made, image=noise(made.image, number + 1)))
     reference = gel.untouched[0] if noise is None else noise(gel.untouched[0], 0)
     return FrameSet(
-        f"scene {scene.name}", reference, "the untouched simulated gel", tuple(frames), simulated=True, placed=True
+        f"scene {scene.name}", reference, "the untouched simulated gel", tuple(frames), simulated=True, same_pixels=True
     ), notes
 
 

@@ -91,7 +91,7 @@ def press(scene: Scene, sensor: SensorModel, motion: PressMotion, render: Render
             unfollowed = world.unfollowed or unfollowed
     except SimulationDiverged as error:
         if error.poses:
-            came = below - float(se3.relative(error.poses["lower"], error.poses["indenter"]).position[2])
+            came = below - float(se3.relative_pose(error.poses["lower"], error.poses["indenter"]).position[2])
             error.advice += f"; it had come {came * 1e3:.3g} mm deep, of {motion.depth * 1e3:.3g} mm"
             if not moves:  # it was the depth; a shift from where the indenter waits says less
                 error.depth, error.possible = came, ""
@@ -111,7 +111,7 @@ def press(scene: Scene, sensor: SensorModel, motion: PressMotion, render: Render
         unfollowed=unfollowed,
         surface=surface,
         folded=SurfaceTable(surface).folded,
-        pose=se3.relative(world.pose("lower"), world.pose("indenter")),
+        pose=se3.relative_pose(world.pose("lower"), world.pose("indenter")),
     )
 
 
@@ -170,7 +170,7 @@ def _contact(world: PressWorld, scene: Scene, seen: SurfaceSample, sensor: Senso
     """(H, W) True where the indenter presses on the surface seen by a pixel."""
     assert scene.indenter is not None
     grid, margin = image_grid(sensor.geometry), NEAR * scene.element
-    from_sensor = se3.relative(world.pose("indenter"), world.pose("lower"))
+    from_sensor = se3.relative_pose(world.pose("indenter"), world.pose("lower"))
     half = extent(scene.indenter.geometry) / 2 + margin
     corners = se3.transform(se3.inverse(from_sensor), half * (2.0 * np.indices((2, 2, 2)).reshape(3, -1).T - 1.0))
     rows, columns = (
@@ -187,7 +187,7 @@ def _contact(world: PressWorld, scene: Scene, seen: SurfaceSample, sensor: Senso
         inner[near] = _gaps(scene.indenter, at[near], scene.element)
         gaps[rows, columns] = inner.reshape(valid.shape)
     table = SurfaceTable(world.surface("lower"))
-    reach, _ = table.seen(table.of_nodes(world.reach().astype(np.float32)), grid)
+    reach, _ = table.sample_on_grid(table.spline_values(world.reach().astype(np.float32)), grid)
     return _filled(gaps < reach.reshape(gaps.shape), int(scene.element / sensor.geometry.pixel_pitch))
 
 

@@ -178,7 +178,7 @@ def _actor(name: str, env: TacsimEnv, policy: Policy | None, seed: int) -> Act:
         return lambda env: random.uniform(-1.0, 1.0, len(env.task.axes)).astype(np.float32)
     assert policy is not None
     policy.reset()
-    return lambda env: env.ask(policy)
+    return lambda env: env.policy_action(policy)
 
 
 def _fitting(name: str, env: TacsimEnv, canonical: CanonicalGrid) -> Policy | None:

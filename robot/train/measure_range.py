@@ -114,7 +114,7 @@ def _round(
                 actions.append(idle)
                 continue
             found[at].append(numbers_of({key: value[at] for key, value in seen.items()}, policy.spec.features.frames))
-            actions.append(env.ask(policy))
+            actions.append(env.policy_action(policy))
         seen, _, terminated, truncated, _ = envs.step(np.stack(actions))
         over |= terminated | truncated
     return [np.array(each) for each in found]

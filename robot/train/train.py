@@ -79,7 +79,7 @@ def begin(training: Training, folder: Path) -> RunFolder:
     envs.close()
     config = load_with_task(training.rig, training.task, training.overrides).config
     assert config.task is not None
-    _require_playable(training, [(each.task, each.scene, each.drawn) for each in envs.members[0].variants])
+    _require_playable(training, [(each.task, each.scene, each.description) for each in envs.members[0].variants])
     task, encoder = make_task(config.task), FeatureEncoder(training.features, config.canonical)
     spec = PolicySpec(
         task=config.task.kind,

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from tacsim.interface import GelReading, SensorSpec, TactileObservation
-from tacsim.limits import LimitExceeded, exceeds
+from tacsim.limits import LimitExceeded, exceeds_limit
 from tacsim.models.hardware import ArmLimits
 
 
@@ -45,11 +45,14 @@ class GelMonitor:
         self._arm_of = {name: spec.arm for name, spec in sensors.items() if spec.arm is not None}
         self._limits, self._report, self._error = dict(limits), dict(report), error
         for name, arm in self._arm_of.items():
-            own = limits.get(arm)
-            if own is None:
+            limits_of_arm = limits.get(arm)
+            if limits_of_arm is None:
                 continue
             spec = sensors[name]
-            for what, limit, measured in (("depth", own.depth, spec.height), ("shear", own.shear, spec.flow)):
+            for what, limit, measured in (
+                ("depth", limits_of_arm.depth, spec.height),
+                ("shear", limits_of_arm.shear, spec.flow),
+            ):
                 if limit is not None and not measured:
                     raise ValueError(
                         f"arms.{arm}.limits.{what}: sensor '{name}' does not measure it (no calibration, no markers): "
@@ -59,17 +62,21 @@ class GelMonitor:
     def __call__(self, tactile: Mapping[str, TactileObservation]) -> None:
         """`tactile`: by sensor name. Every arm gets its report before anything is raised."""
         exposed = min((observation.time for observation in tactile.values()), default=math.nan)
-        shown = {name: depth_and_shear(tactile[name]) for name in self._arm_of if name in tactile}
+        measured = {name: depth_and_shear(tactile[name]) for name in self._arm_of if name in tactile}
         for arm, report in self._report.items():
-            own = [found for name, found in shown.items() if self._arm_of[name] == arm] or [(math.nan, math.nan)]
-            report(GelReading(exposed, *np.max(own, axis=0).tolist()))  # NaN if any is: not measured is not safe
-        for name, found in shown.items():
+            limits_of_arm = [found for name, found in measured.items() if self._arm_of[name] == arm] or [
+                (math.nan, math.nan)
+            ]
+            report(
+                GelReading(exposed, *np.max(limits_of_arm, axis=0).tolist())
+            )  # NaN if any is: not measured is not safe
+        for name, found in measured.items():
             arm = self._arm_of[name]
             limits = self._limits.get(arm)
             if limits is None:
                 continue
             for what, value, limit in zip(("depth", "shear"), found, (limits.depth, limits.shear), strict=True):
-                if exceeds(value, limit):
+                if exceeds_limit(value, limit):
                     assert limit is not None
                     shown_as = "is not measured (markers lost?)" if math.isnan(value) else f"{1e3 * value:.3g} mm"
                     raise self._error(

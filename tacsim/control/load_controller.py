@@ -18,11 +18,11 @@ from tacsim.limits import LimitExceeded
 from tacsim.models.rig import TaskConfig
 
 TOLERANCE = 0.01  # of the load: an error within it is left alone, so an arm at its load rests
-PROBE = 0.1  # of the longest correction: the length of one while no stiffness is known
+PROBE_SHARE = 0.1  # of the longest correction: the length of one while no stiffness is known
 # Largest change of stiffness a period, as forces are noisy; smaller towards soft, where corrections are longer
-HARDER, SOFTER = 2.0, 1.25
-SMALLEST = 1e-6  # a shorter displacement gives no stiffness [m]
-REACH = 5e-3  # farthest from where the arm began along z; beyond, the load counts as out of reach [m]
+MAX_STIFFENING, MAX_SOFTENING = 2.0, 1.25
+MIN_DISPLACEMENT = 1e-6  # a shorter displacement gives no stiffness [m]
+MAX_TRAVEL = 5e-3  # farthest from where the arm began along z; beyond, the load counts as out of reach [m]
 
 
 @dataclass
@@ -38,13 +38,13 @@ class _AxisState:
 class LoadController:
     """Secant force control: changes the actions of a policy so that arms hold `loads` along the z of their sensors.
 
-    Call it once a control period with the action and the latest arm states, then `sent` with the poses that were really
-    sent. It replaces only the displacement along z; an arm without a target of its own still follows its load.
+    Call it once a control period with the action and the latest arm states, then `record_sent_poses` with the poses
+    that were sent. It replaces only the displacement along z; an arm without a target still follows its load.
     """
 
-    def __init__(self, loads: Mapping[str, float], longest: float) -> None:
+    def __init__(self, loads: Mapping[str, float], max_correction: float) -> None:
         """loads: normal force by arm name, > 0 when pressed [N]; longest: correction of one period, > 0 [m]."""
-        self.loads, self._longest = dict(loads), longest
+        self.loads, self._max_correction = dict(loads), max_correction
         self._axes: dict[str, _AxisState] = {}
 
     def reset(self) -> None:
@@ -54,52 +54,53 @@ class LoadController:
     def __call__(self, action: Action, arms: Mapping[str, ArmState]) -> Action:
         """`action` with each loaded arm's displacement along z replaced. Raises LimitExceeded when a load is out of
         reach, or a force is not finite."""
-        held = {name: self._target(name, action.tool.get(name), arms[name]) for name in self.loads}
+        held = {name: self._loaded_target(name, action.tool.get(name), arms[name]) for name in self.loads}
         return Action({**action.tool, **held})
 
-    def sent(self, poses: Mapping[str, Pose | None]) -> None:
+    def record_sent_poses(self, poses: Mapping[str, Pose | None]) -> None:
         """What the arms were really sent, after their limits; None: nothing was executed."""
         for name, axis in self._axes.items():
             axis.sent = poses.get(name) or axis.sent
 
-    def _target(self, name: str, asked: Pose | None, arm: ArmState) -> Pose:
+    def _loaded_target(self, name: str, requested: Pose | None, arm: ArmState) -> Pose:
         force = -float(arm.wrench[2])
         if not math.isfinite(force):
             raise LimitExceeded(f"arm '{name}' holds a load of {self.loads[name]:g} N, but feels {force} N")
         here = arm.pose.position
         axis = self._axes.setdefault(name, _AxisState(here, (here, force), arm.pose))
-        normal = se3.matrix(arm.pose)[:, 2]
-        self._learn(axis, float(normal @ (here - axis.before[0])), force)
+        normal = se3.rotation_matrix(arm.pose)[:, 2]
+        self._update_stiffness(axis, float(normal @ (here - axis.before[0])), force)
         axis.before = here, force
-        asked = axis.sent if asked is None else asked
-        normal = se3.matrix(asked)[:, 2]
-        step = self._step(axis, self.loads[name], force)
-        if abs(travel := float(normal @ (axis.sent.position - axis.began)) + step) > REACH:
+        requested = axis.sent if requested is None else requested
+        normal = se3.rotation_matrix(requested)[:, 2]
+        step = self._next_correction(axis, self.loads[name], force)
+        if abs(travel := float(normal @ (axis.sent.position - axis.began)) + step) > MAX_TRAVEL:
             raise LimitExceeded(
                 f"arm '{name}' does not reach its load of {self.loads[name]:g} N: it feels {force:.3g} N after "
-                f"{1e3 * travel:+.3g} mm along its sensor's z (limit {1e3 * REACH:g} mm); is anything there to press?"
+                f"{1e3 * travel:+.3g} mm along its sensor's z (limit {1e3 * MAX_TRAVEL:g} mm); is there anything to "
+                "press?"
             )
-        along = normal @ (axis.sent.position - asked.position) + step
-        return Pose(asked.position + along * normal, asked.quaternion)
+        along = normal @ (axis.sent.position - requested.position) + step
+        return Pose(requested.position + along * normal, requested.quaternion)
 
-    def _learn(self, axis: _AxisState, displacement: float, force: float) -> None:
+    def _update_stiffness(self, axis: _AxisState, displacement: float, force: float) -> None:
         """The stiffness from the last displacement along z [m] and the force after it [N]; a force that fell as the
         sensor pressed came from elsewhere (the body slid, tipped or yielded) and teaches nothing."""
         change = force - axis.before[1]
-        if abs(displacement) < SMALLEST or not change / displacement > 0:
+        if abs(displacement) < MIN_DISPLACEMENT or not change / displacement > 0:
             return
         found = change / displacement
         known = axis.stiffness
-        axis.stiffness = found if known is None else min(max(found, known / SOFTER), known * HARDER)
+        axis.stiffness = found if known is None else min(max(found, known / MAX_SOFTENING), known * MAX_STIFFENING)
 
-    def _step(self, axis: _AxisState, load: float, force: float) -> float:
+    def _next_correction(self, axis: _AxisState, load: float, force: float) -> float:
         """The next correction, positive towards the object [m]."""
         error = load - force
         if abs(error) <= TOLERANCE * load:
             return 0.0
         if axis.stiffness is None:
-            return math.copysign(PROBE * self._longest, error)
-        return max(-self._longest, min(self._longest, error / axis.stiffness))
+            return math.copysign(PROBE_SHARE * self._max_correction, error)
+        return max(-self._max_correction, min(self._max_correction, error / axis.stiffness))
 
 
 def load_controller(task: TaskConfig | None) -> LoadController | None:

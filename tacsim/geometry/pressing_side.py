@@ -12,7 +12,7 @@ import numpy as np
 from tacsim.geometry.shapes import centred
 from tacsim.interface import FloatArray, Pose
 from tacsim.models.scene import Box, Cylinder, Indenter, Mesh, Shape, Sphere
-from tacsim.pose import inverse, matrix, rotate
+from tacsim.pose import inverse, rotate, rotation_matrix
 
 if TYPE_CHECKING:
     from trimesh import Trimesh
@@ -38,7 +38,7 @@ def pressing_side(indenter: Indenter) -> PressingSide:
     pose = Pose(quaternion=indenter.turn)
     down = rotate(inverse(pose), [0.0, 0.0, -1.0])
     mesh = facets(indenter.geometry)
-    vertices = np.asarray(mesh.vertices, np.float64) @ matrix(pose).T
+    vertices = np.asarray(mesh.vertices, np.float64) @ rotation_matrix(pose).T
     height = float(np.ptp(vertices[:, 2]))
     low = vertices[:, 2] <= vertices[:, 2].min() + LEVEL_SHARE * height
     part = vertices[low]
@@ -69,7 +69,7 @@ def section(geometry: Shape, pose: Pose, axis: int, at: float) -> FloatArray:
     from trimesh.intersections import mesh_plane
 
     mesh = facets(geometry)
-    mesh.vertices = np.asarray(mesh.vertices) @ matrix(pose).T + pose.position
+    mesh.vertices = np.asarray(mesh.vertices) @ rotation_matrix(pose).T + pose.position
     normal = np.eye(3)[axis]
     lines = mesh_plane(mesh, normal, at * normal)  # type: ignore[no-untyped-call]
     return np.asarray(lines, np.float64).reshape(-1, 2, 3)

@@ -23,7 +23,7 @@ from tacsim.geometry.mesh import (
 from tacsim.interface import FloatArray, Pose
 from tacsim.models.scene import Box, Cylinder, Indenter, Mesh, Shape, Sphere
 from tacsim.models.text import millimetres
-from tacsim.pose import inverse, matrix, rotate
+from tacsim.pose import inverse, rotate, rotation_matrix
 
 if TYPE_CHECKING:
     from trimesh import Trimesh
@@ -76,7 +76,7 @@ def turned_extent(geometry: Shape, turn: ArrayLike) -> FloatArray:
     quaternion = np.asarray(turn, dtype=np.float64)
     if not quaternion[:3].any():
         return extent(geometry)
-    axes = matrix(Pose(quaternion=quaternion))
+    axes = rotation_matrix(Pose(quaternion=quaternion))
     match geometry:
         case Box():
             return np.asarray(np.abs(axes) @ np.array(geometry.size))

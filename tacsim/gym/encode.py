@@ -33,7 +33,7 @@ from tacsim.interface import ArmState, IncompatibleRig, Needs, Observation, Pose
 from tacsim.models.rig import RigConfig
 from tacsim.tasks import make_task
 
-Flat = dict[str, NDArray[Any]]
+FlatObservation = dict[str, NDArray[Any]]
 
 # Largest magnitude of each kind of float key: far beyond what is physical here, so a value outside is an error.
 BOUNDS = {
@@ -49,18 +49,18 @@ BOUNDS = {
 MAX_FEATURE = 100.0  # the same of features, which are numbers of order 1: a height of 100 mm, a force of 1 kN
 
 
-def flatten(observation: Observation, start: Mapping[str, Pose]) -> Flat:
+def flatten_observation(observation: Observation, start: Mapping[str, Pose]) -> FlatObservation:
     """The observation as a flat dict of fresh arrays; `start` holds each arm's pose at reset."""
-    flat: Flat = {}
+    flat: FlatObservation = {}
     for name, touch in observation.tactile.items():
-        flat |= {f"{key}_{name}": value for key, value in _touch(touch).items()}
+        flat |= {f"{key}_{name}": value for key, value in _flatten_touch(touch).items()}
     for name, arm in observation.arms.items():
-        flat |= {f"{key}_{name}": value for key, value in _arm(arm, start[name]).items()}
+        flat |= {f"{key}_{name}": value for key, value in _flatten_arm(arm, start[name]).items()}
     return flat
 
 
-def _touch(touch: TactileObservation) -> Flat:
-    flat: Flat = {
+def _flatten_touch(touch: TactileObservation) -> FlatObservation:
+    flat: FlatObservation = {
         "tactile": touch.image.copy(),
         "contact": touch.contact.astype(np.int8),
         "valid": touch.valid.astype(np.int8),
@@ -69,10 +69,10 @@ def _touch(touch: TactileObservation) -> Flat:
     return flat | {key: value.astype(np.float32) for key, value in optional.items() if value is not None}
 
 
-def _arm(arm: ArmState, start: Pose) -> Flat:
-    moved = se3.relative(start, arm.pose)
-    pose = np.concatenate([moved.position, se3.two_columns(moved)])
-    flat: Flat = {"pose": pose, "twist": arm.twist, "wrench": arm.wrench}
+def _flatten_arm(arm: ArmState, start: Pose) -> FlatObservation:
+    moved = se3.relative_pose(start, arm.pose)
+    pose = np.concatenate([moved.position, se3.rotation_columns(moved)])
+    flat: FlatObservation = {"pose": pose, "twist": arm.twist, "wrench": arm.wrench}
     if arm.joints is not None:
         flat["joints"] = arm.joints
     return {key: value.astype(np.float32) for key, value in flat.items()}
@@ -83,22 +83,22 @@ class FlatView:
 
     needs = Needs()
 
-    def begin(self, observation: Observation, goal: object = None) -> Flat:
+    def begin(self, observation: Observation, goal: object = None) -> FlatObservation:
         """The first observation of an episode."""
         self._start = {name: arm.pose for name, arm in observation.arms.items()}
-        return flatten(observation, self._start)
+        return flatten_observation(observation, self._start)
 
-    def __call__(self, observation: Observation) -> Flat:
-        return flatten(observation, self._start)
+    def __call__(self, observation: Observation) -> FlatObservation:
+        return flatten_observation(observation, self._start)
 
 
-def space_of(flat: Flat) -> spaces.Space[Flat]:
+def space_of(flat: FlatObservation) -> spaces.Space[FlatObservation]:
     """The Gymnasium space that `flat` and everything flattened from the same rig lies in."""
-    space: spaces.Space[Any] = spaces.Dict({key: _space(key, value) for key, value in flat.items()})
+    space: spaces.Space[Any] = spaces.Dict({key: _box_space(key, value) for key, value in flat.items()})
     return space
 
 
-def space_of_rig(config: RigConfig) -> spaces.Space[Flat]:
+def space_of_rig(config: RigConfig) -> spaces.Space[FlatObservation]:
     """The same of a simulated rig that is described, but need not be opened."""
     grid = config.canonical
     touches: dict[str, TactileObservation] = {}
@@ -113,10 +113,10 @@ def space_of_rig(config: RigConfig) -> spaces.Space[Flat]:
             time=0.0, age=0.0,
         )  # fmt: skip
     arms = dict.fromkeys(config.arms, ArmState(Pose(), np.zeros(6), np.zeros(6), None, 0.0))
-    return space_of(flatten(Observation(touches, arms, 0.0), dict.fromkeys(config.arms, Pose())))
+    return space_of(flatten_observation(Observation(touches, arms, 0.0), dict.fromkeys(config.arms, Pose())))
 
 
-def space_of_features(encoder: FeatureEncoder, config: RigConfig) -> spaces.Space[Flat]:
+def space_of_features(encoder: FeatureEncoder, config: RigConfig) -> spaces.Space[FlatObservation]:
     """Of what `encoder` makes of this rig, whose task has a goal."""
     features = encoder.features
     numbers = {key: len(each.names) for key, each in encoder.inputs.items()}
@@ -124,7 +124,7 @@ def space_of_features(encoder: FeatureEncoder, config: RigConfig) -> spaces.Spac
     if features.maps:
         shapes["maps"] = (numbers["maps"], features.grid.rows, features.grid.columns)
     if features.flow:
-        lattices = {name: _lattice(name, config) for name in features.sensors}
+        lattices = {name: _marker_shape(name, config) for name in features.sensors}
         if len(set(lattices.values())) > 1:
             raise IncompatibleRig(f"flow of sensors with different markers makes no array: {lattices}")
         shapes["flow"] = (numbers["flow"], *next(iter(lattices.values())))
@@ -139,7 +139,7 @@ def space_of_features(encoder: FeatureEncoder, config: RigConfig) -> spaces.Spac
     return space
 
 
-def _lattice(name: str, config: RigConfig) -> tuple[int, int]:
+def _marker_shape(name: str, config: RigConfig) -> tuple[int, int]:
     """Rows and columns of a sensor's markers. Raises IncompatibleRig without such a sensor or markers."""
     sensor = config.sensors.get(name)
     model = None if sensor is None else sensor.sensor_model
@@ -149,7 +149,7 @@ def _lattice(name: str, config: RigConfig) -> tuple[int, int]:
     return markers.rows, markers.columns
 
 
-def _space(key: str, value: NDArray[Any]) -> spaces.Space[Any]:
+def _box_space(key: str, value: NDArray[Any]) -> spaces.Space[Any]:
     if value.dtype == np.uint8:
         return spaces.Box(0, 255, value.shape, np.uint8)
     if value.dtype == np.int8:

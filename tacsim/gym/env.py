@@ -19,16 +19,16 @@ from tacsim.models.rig import RigConfig, TaskConfig
 from tacsim.models.scene import Scene
 from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.rig import Rig
-from tacsim.sim.stage import Stage
+from tacsim.sim.scene_world import SceneWorld
 from tacsim.tasks import BadDraws, GoalOutOfReach, make_task
-from tacsim.tasks.task import Effort, Task, action_from, judge, vector_of
+from tacsim.tasks.task import Effort, Task, action_of_vector, evaluate_outcome, vector_of_action
 
-Result = tuple[encode.Flat, float, bool, bool, dict[str, Any]]  # of a step
-CANNOT_BEGIN = (GoalOutOfReach, NoTouch, SimulationDiverged)  # with this draw
-MOST_REFUSED = 8  # draws in a row
+Result = tuple[encode.FlatObservation, float, bool, bool, dict[str, Any]]  # of a step
+RESET_ERRORS = (GoalOutOfReach, NoTouch, SimulationDiverged)  # with this draw
+MAX_REJECTED_DRAWS = 8  # draws in a row
 
 
-def options_of_reset(options: Mapping[str, Any] | None) -> dict[str, Any]:
+def copy_reset_options(options: Mapping[str, Any] | None) -> dict[str, Any]:
     """A copy. Raises ValueError for what is no mapping."""
     if not isinstance(options, Mapping | None):
         raise ValueError(f"options of a reset are a dict, got {options!r}")
@@ -42,13 +42,12 @@ class Variant:
     task: TaskConfig
     scene: Scene
     rig: RigConfig | None  # light and noise of its sensors, errors and delays; None: as the environment's
-    drawn: str = ""  # in words, for the record
+    description: str = ""  # in words, for the record
 
 
-class TacsimEnv(gymnasium.Env[encode.Flat, Float32]):
-    """A rig with a task. Observations: `tacsim.gym.encode.flatten`, or with an encoder what that makes of them.
-    Actions: Box(-1, 1), one component for each free axis of the task, in units of its max_step from where the arm was
-    last sent.
+class TacsimEnv(gymnasium.Env[encode.FlatObservation, Float32]):
+    """A rig with a task. Observations: `tacsim.gym.encode.flatten_observation`, or the features of an encoder. Actions:
+    Box(-1, 1), one component for each free axis of the task, in units of its max_step from the last commanded pose.
 
     An episode terminates only when a limit of an arm, or the task's force_limit, is exceeded (info["limit"] says
     which). Its last reward then stands for all steps that are left too, each at most -1: no end is better than going
@@ -65,7 +64,7 @@ class TacsimEnv(gymnasium.Env[encode.Flat, Float32]):
         space: of the observations; None: the rig is reset once to learn the shapes.
         encoder: of the features that a learned policy sees; None: the environment shows all that there is.
         variants: each reset draws one of them, from its seed; none: the rig and the task stay as they are.
-        stage: what the rig simulates, where a reset may exchange its scene.
+        scene_world: what the rig simulates, where a reset may exchange its scene.
         wear: gives sensors and arms of the rig what `Variant.rig` says of them.
 
     Raises IncompatibleRig when the rig lacks what the task needs.
@@ -79,11 +78,11 @@ class TacsimEnv(gymnasium.Env[encode.Flat, Float32]):
         task: Task,
         render_mode: str | None = None,
         *,
-        space: gymnasium.Space[encode.Flat] | None = None,
+        space: gymnasium.Space[encode.FlatObservation] | None = None,
         encoder: FeatureEncoder | None = None,
         variants: Sequence[Variant] = (),
-        stage: Stage | None = None,
-        wear: Callable[[RigConfig | None], None] = lambda config: None,
+        scene_world: SceneWorld | None = None,
+        apply_variation: Callable[[RigConfig | None], None] = lambda config: None,
     ) -> None:
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
@@ -92,13 +91,15 @@ class TacsimEnv(gymnasium.Env[encode.Flat, Float32]):
         self._view = encode.FlatView() if encoder is None else encoder
         rig.require(self._view.needs, "a choice of features")
         self.rig, self.task, self.render_mode = rig, task, render_mode
-        self._variants, self._stage, self._wear = tuple(variants), stage, wear
+        self._variants, self._scene_world, self._apply_variation = tuple(variants), scene_world, apply_variation
         self._played: int | None = None  # the variant
-        self._worn: RigConfig | None = None  # of which sensors and arms are now; None: of the environment's rig
+        self._applied_variation: RigConfig | None = (
+            None  # of which sensors and arms are now; None: of the environment's rig
+        )
         self.next_variant: int | None = None  # that the next reset plays, if it can begin; None: a drawn one
         self.refused: list[str] = []  # draws that could not begin, and why, of all resets
         if space is None:
-            self._begin(seed=0)
+            self._begin_episode(seed=0)
             space = encode.space_of(self._flat)
         self.observation_space = space
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (len(task.axes),), np.float32)
@@ -121,13 +122,13 @@ class TacsimEnv(gymnasium.Env[encode.Flat, Float32]):
     @property
     def scene(self) -> Scene | None:
         """Of the next reset, if none is chosen or drawn for it; None where it cannot be exchanged."""
-        return None if self._stage is None else self._stage.scene
+        return None if self._scene_world is None else self._scene_world.scene
 
     # ------------------------------------------------------------------ reset
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[encode.Flat, dict[str, Any]]:
+    ) -> tuple[encode.FlatObservation, dict[str, Any]]:
         """The same seed gives the same episode. A drawn variant that cannot begin (a goal out of reach, no gentle
         contact, a simulation that diverges) is drawn anew.
 
@@ -137,76 +138,76 @@ class TacsimEnv(gymnasium.Env[encode.Flat, Float32]):
         too many bad draws (BadDraws).
         """
         super().reset(seed=seed)
-        chosen, refused = options_of_reset(options), list[str]()
-        while not self._begun(chosen, refused):
-            if len(refused) == MOST_REFUSED:
+        chosen, refused = copy_reset_options(options), list[str]()
+        while not self._try_begin_episode(chosen, refused):
+            if len(refused) == MAX_REJECTED_DRAWS:
                 raise BadDraws(
-                    f"{MOST_REFUSED} draws in a row cannot begin an episode, the last with {refused[-1]}; narrow the "
-                    "distributions"
+                    f"{MAX_REJECTED_DRAWS} draws in a row cannot begin an episode, the last with {refused[-1]}; narrow "
+                    "the distributions"
                 )
-        info = self._judged()[1]
+        info = self._evaluate_state()[1]
         if self._played is not None:
-            info["drawn"] = self._variants[self._played].drawn
+            info["drawn"] = self._variants[self._played].description
         if refused:
             info["refused"] = "\n".join(refused)
         return self._flat, info
 
-    def _begun(self, options: dict[str, Any], refused: list[str]) -> bool:
+    def _try_begin_episode(self, options: dict[str, Any], refused: list[str]) -> bool:
         """Chooses and begins an episode; False, and why in `refused`, for a drawn one that cannot begin."""
-        self._choose(options)
+        self._choose_scene_and_task(options)
         try:
-            self._begin(seed=int(self.np_random.integers(2**31)))
-        except CANNOT_BEGIN as failure:
+            self._begin_episode(seed=int(self.np_random.integers(2**31)))
+        except RESET_ERRORS as failure:
             if self._played is None or options:
                 raise
-            refused.append(f"{self._variants[self._played].drawn}: {failure}")
+            refused.append(f"{self._variants[self._played].description}: {failure}")
             self.refused.append(refused[-1])
             return False
         return True
 
-    def _choose(self, options: dict[str, Any]) -> None:
+    def _choose_scene_and_task(self, options: dict[str, Any]) -> None:
         """The task and the scene of the next episode."""
         unknown = sorted(set(options) - {"variant", "task", "scene"})
         if unknown:
             raise ValueError(f"reset knows the options variant, task and scene, got {unknown}")
-        chosen, played, worn = options, None, None
+        chosen, played, variation = options, None, None
         if self._variants and not {"task", "scene"} & set(options):
             number, self.next_variant = options.get("variant", self.next_variant), None
             played = int(self.np_random.integers(len(self._variants))) if number is None else number
             if not (isinstance(played, int | np.integer) and 0 <= played < len(self._variants)):
                 raise ValueError(f"this environment has variants 0 to {len(self._variants) - 1}, got {number}")
             chosen = {"task": self._variants[played].task, "scene": self._variants[played].scene}
-            worn = self._variants[played].rig
+            variation = self._variants[played].rig
         elif "variant" in options:
             raise ValueError("options: give a variant (of an environment that has some), or a task and a scene")
         for name, kind in (("task", TaskConfig), ("scene", Scene)):
             if name in chosen and not isinstance(chosen[name], kind):
                 raise ValueError(f"options: the {name} is a tacsim {kind.__name__}, got {chosen[name]!r}")
         if "task" in chosen:
-            require_alike(self.task.config, chosen["task"])
-        if worn is not self._worn:
-            self._wear(worn)
-            self._worn = worn
+            require_compatible_task(self.task.config, chosen["task"])
+        if variation is not self._applied_variation:
+            self._apply_variation(variation)
+            self._applied_variation = variation
         if "scene" in chosen:
-            if self._stage is None:
+            if self._scene_world is None:
                 raise ValueError(f"rig '{self.rig.name}' has but one scene; make its environment by robot.make_env")
-            self._stage.use(chosen["scene"])
+            self._scene_world.set_scene(chosen["scene"])
         if "task" in chosen:
             self.task = make_task(chosen["task"])
         self._played = played
 
-    def _begin(self, seed: int) -> None:
+    def _begin_episode(self, seed: int) -> None:
         self.phase, self._failure, self._done = "new", None, None
         observation = self.rig.reset(seed)
         self._targets: dict[str, Pose] = {name: arm.pose for name, arm in observation.arms.items()}  # last sent there
-        self._truth_at_start = self._truth()
+        self._truth_at_start = self._require_truth()
         self.task.require_reachable(self._truth_at_start)
         self._effort = Effort(observation.arms)
         self._count, self.phase = 0, "running"
         self._observation, self._teacher = observation, None
-        self._flat: encode.Flat = self._view.begin(observation, self.task.goal)
+        self._flat: encode.FlatObservation = self._view.begin(observation, self.task.goal)
 
-    def _truth(self) -> Truth:
+    def _require_truth(self) -> Truth:
         truth = self.rig.truth()
         if truth is None:
             raise RuntimeError(f"rig '{self.rig.name}' promises ground truth in its spec, but delivers none")
@@ -233,10 +234,10 @@ class TacsimEnv(gymnasium.Env[encode.Flat, Float32]):
         `end_step`. Raises as `step`."""
         if self.phase != "running":
             raise ResetNeeded("call reset() before step(): no episode is running")
-        asked = action_from(action, self.task.axes, self.task.config.max_step, self._targets)
+        requested = action_of_vector(action, self.task.axes, self.task.config.max_step, self._targets)
         self._failure = None
         try:
-            self._sent = self.rig.command(asked)
+            self._sent = self.rig.command(requested)
         except LimitExceeded as failure:
             self.fail(failure)
 
@@ -260,33 +261,39 @@ class TacsimEnv(gymnasium.Env[encode.Flat, Float32]):
         if self._failure is not None:
             self.phase = "over"
             exceeded = isinstance(self._failure, LimitExceeded)
-            reward, info = self._judged()
+            reward, info = self._evaluate_state()
             flat = {key: value.copy() for key, value in self._flat.items()}
             info |= {"limit" if exceeded else "diverged": str(self._failure)}
             info["is_success"] = info["is_success"] and not exceeded
-            self._done = flat, self._for_all_left(reward) if exceeded else reward, exceeded, not exceeded, info
+            self._done = (
+                flat,
+                self._reward_for_remaining_steps(reward) if exceeded else reward,
+                exceeded,
+                not exceeded,
+                info,
+            )
             return
         self._targets |= {name: pose for name, pose in self._sent.items() if pose is not None}
         self._observation = observation
         self._effort.add(observation.arms)
         self._flat = self._view(observation)
-        most, peak = self.task.config.force_limit, self._effort.peak
-        failed = most is not None and peak > most
+        max_force, peak = self.task.config.force_limit, self._effort.peak
+        failed = max_force is not None and peak > max_force
         truncated = not failed and self._count >= self.task.config.steps
         if failed or truncated:
             self.phase = "over"
-        reward, info = self._judged()
+        reward, info = self._evaluate_state()
         if failed:
-            info |= {"limit": f"a normal force of {peak:.2f} N, beyond the task's force_limit of {most:g} N"}
-            info["is_success"], reward = False, self._for_all_left(reward)
+            info |= {"limit": f"a normal force of {peak:.2f} N, beyond the task's force_limit of {max_force:g} N"}
+            info["is_success"], reward = False, self._reward_for_remaining_steps(reward)
         self._done = self._flat, reward, failed, truncated, info
 
-    def _for_all_left(self, reward: float) -> float:
+    def _reward_for_remaining_steps(self, reward: float) -> float:
         return reward + (self.task.config.steps - self._count) * min(reward, -1.0)
 
-    def _judged(self) -> tuple[float, dict[str, Any]]:
-        truth = self._truth()
-        outcome = judge(self.task, truth, self._truth_at_start)
+    def _evaluate_state(self) -> tuple[float, dict[str, Any]]:
+        truth = self._require_truth()
+        outcome = evaluate_outcome(self.task, truth, self._truth_at_start)
         info: dict[str, Any] = {
             "distance": outcome.distance,
             "is_success": outcome.success,
@@ -311,18 +318,18 @@ class TacsimEnv(gymnasium.Env[encode.Flat, Float32]):
         """
         if self.phase != "running":
             return np.zeros(len(self.task.axes), np.float32)
-        best = self.task.expert(self._truth(), self._truth_at_start)
+        best = self.task.expert(self._require_truth(), self._truth_at_start)
         if best is not None:
             return np.asarray(best, np.float32)
         if self._teacher is None:
             self._teacher = self.task.teacher()
-        return self.ask(self._teacher)
+        return self.policy_action(self._teacher)
 
-    def ask(self, policy: Policy) -> Float32:
+    def policy_action(self, policy: Policy) -> Float32:
         """What `policy` does here, as an action of this environment. A policy with a memory must be asked in every step
         of the episode, and reset before."""
         action = policy(self._observation)
-        return vector_of(action, self.task.axes, self.task.config.max_step, self._targets)
+        return vector_of_action(action, self.task.axes, self.task.config.max_step, self._targets)
 
     def render(self) -> Image | None:
         """The native pictures of all sensors side by side, (H, W, 3) uint8 RGB, in the order of the rig; smaller ones
@@ -340,7 +347,7 @@ class TacsimEnv(gymnasium.Env[encode.Flat, Float32]):
         self.rig.close()
 
 
-def require_alike(task: TaskConfig, other: TaskConfig) -> None:
+def require_compatible_task(task: TaskConfig, other: TaskConfig) -> None:
     """Raises ValueError where an environment cannot go from one task to the other: only its goal, its steps and how it
     is judged may change."""
     for what in ("kind", "touch_force", "placement", "loads"):

@@ -24,7 +24,7 @@ from tacsim import pose as se3
 from tacsim.interface import ArmState, FloatArray, IncompatibleRig, Needs, Observation, Pose, TactileObservation
 from tacsim.models.policy import Channel, Features, MapGrid, Numbers, Quantity
 from tacsim.models.sensor import CanonicalGrid
-from tacsim.tasks.reposition import pressed_at
+from tacsim.tasks.reposition import centre_of_pressure_in_sensor
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -69,8 +69,8 @@ PARTS: dict[str, dict[str, str]] = {
     "between": {f"between_{axis}": "between" for axis in "xyz"},
 }
 MAX_MAP_CELLS = 16  # along a side of a map that nobody chose
-_UNTURNED = np.array([1.0, 0.0, 0.0, 0.0, 1.0, 0.0])
-_OF_SENSORS = ("area", "depth", "centroid", "shear")
+_IDENTITY_COLUMNS = np.array([1.0, 0.0, 0.0, 0.0, 1.0, 0.0])
+_SENSOR_QUANTITIES = ("area", "depth", "centroid", "shear")
 
 
 def default_features(canonical: CanonicalGrid, sensors: Sequence[str], arms: Sequence[str]) -> Features:
@@ -104,8 +104,8 @@ class FeatureEncoder:
     def __init__(self, features: Features, canonical: CanonicalGrid) -> None:
         self.features = features
         canonical_maps = set(features.maps) - {"picture"}
-        self._pool = _Pool(features.grid, canonical) if canonical_maps else None
-        self._rows, self._columns = (_centres(n, canonical.pitch) for n in (canonical.rows, canonical.columns))
+        self._cell_means = _CellMeans(features.grid, canonical) if canonical_maps else None
+        self._rows, self._columns = (_cell_centres(n, canonical.pitch) for n in (canonical.rows, canonical.columns))
         self._cell_area = canonical.pitch**2
         self._goal: Arrays = {}
         self._start: Mapping[str, Pose] = {}
@@ -129,12 +129,14 @@ class FeatureEncoder:
         wanted = self.features
         found: dict[str, list[tuple[str, float]]] = {}
         if wanted.maps:
-            found["maps"] = [part for name in wanted.sensors for kind in wanted.maps for part in _named(kind, name)]
+            found["maps"] = [
+                part for name in wanted.sensors for kind in wanted.maps for part in _named_parts(kind, name)
+            ]
         if wanted.flow:
-            found["flow"] = [part for name in wanted.sensors for part in _named("flow", name)]
+            found["flow"] = [part for name in wanted.sensors for part in _named_parts("flow", name)]
         if wanted.touch:
-            found["touch"] = self._parts(wanted.touch)
-            found["touch"] += [(f"{name} mean", scale) for name, scale in self._parts(wanted.remembered)]
+            found["touch"] = self._touch_parts(wanted.touch)
+            found["touch"] += [(f"{name} mean", scale) for name, scale in self._touch_parts(wanted.remembered)]
         ages = [f" -{age}" if age else "" for age in reversed(range(wanted.frames))]
         return {
             key: Numbers(
@@ -144,12 +146,15 @@ class FeatureEncoder:
             for key, parts in found.items()
         }
 
-    def _parts(self, quantities: Sequence[Quantity]) -> list[tuple[str, float]]:
+    def _touch_parts(self, quantities: Sequence[Quantity]) -> list[tuple[str, float]]:
         """Name and scale of all that `touch` says of them."""
         wanted = self.features
-        owners = {kind: wanted.sensors if kind in _OF_SENSORS else wanted.arms for kind in quantities}
+        owners = {kind: wanted.sensors if kind in _SENSOR_QUANTITIES else wanted.arms for kind in quantities}
         return [
-            part for kind, names in owners.items() for name in names[kind == "between" :] for part in _named(kind, name)
+            part
+            for kind, names in owners.items()
+            for name in names[kind == "between" :]
+            for part in _named_parts(kind, name)
         ]
 
     def begin(self, observation: Observation, goal: float | Sequence[float] | None = None) -> Arrays:
@@ -165,13 +170,13 @@ class FeatureEncoder:
         self._pressed, self._before = {}, self._start
         self._sums, self._count = 0.0, 0
         self._frames.extend([self._encode(observation)] * self.features.frames)
-        return self._stacked()
+        return self._stack_frames()
 
     def __call__(self, observation: Observation) -> Arrays:
         self._frames.append(self._encode(observation))
-        return self._stacked()
+        return self._stack_frames()
 
-    def _stacked(self) -> Arrays:
+    def _stack_frames(self) -> Arrays:
         arrays = {key: np.concatenate([frame[key] for frame in self._frames]) for key in self._frames[-1]}
         return arrays | {key: value.copy() for key, value in self._goal.items()}
 
@@ -180,30 +185,34 @@ class FeatureEncoder:
         touches = [observation.tactile[name] for name in wanted.sensors]
         arrays: Arrays = {}
         if wanted.maps:
-            arrays["maps"] = np.concatenate([self._map(touch, kind) for touch in touches for kind in wanted.maps])
+            arrays["maps"] = np.concatenate(
+                [self._encode_map(touch, kind) for touch in touches for kind in wanted.maps]
+            )
         if wanted.flow:
-            arrays["flow"] = np.concatenate([_flow(touch).transpose(2, 0, 1) / SCALES["flow"] for touch in touches])
+            arrays["flow"] = np.concatenate(
+                [_require_flow(touch).transpose(2, 0, 1) / SCALES["flow"] for touch in touches]
+            )
         if wanted.touch:
             arms = {name: observation.arms[name] for name in wanted.arms}
-            told: dict[str, FloatArray] = {
-                quantity: self._numbers(quantity, touches, arms) for quantity in wanted.touch
+            quantities: dict[str, FloatArray] = {
+                quantity: self._encode_quantity(quantity, touches, arms) for quantity in wanted.touch
             }
             if wanted.remembered:
-                self._sums = self._sums + np.concatenate([told[quantity] for quantity in wanted.remembered])
+                self._sums = self._sums + np.concatenate([quantities[quantity] for quantity in wanted.remembered])
                 self._count += 1
-                told["means"] = self._sums / self._count
-            arrays["touch"] = np.concatenate(list(told.values()))
+                quantities["means"] = self._sums / self._count
+            arrays["touch"] = np.concatenate(list(quantities.values()))
             self._before = {name: arm.pose for name, arm in arms.items()}
         return {key: value.astype(np.float32) for key, value in arrays.items()}
 
-    def _map(self, touch: TactileObservation, kind: Channel) -> FloatArray:
+    def _encode_map(self, touch: TactileObservation, kind: Channel) -> FloatArray:
         """(channels, h, w) of one sensor."""
         if kind == "picture":
-            return _parts(touch.picture, self.features.grid) / SCALES["picture"] - 1.0
-        assert self._pool is not None
-        return self._pool(_channel(touch, kind), touch.valid)
+            return _image_means(touch.picture, self.features.grid) / SCALES["picture"] - 1.0
+        assert self._cell_means is not None
+        return self._cell_means(_encode_channel(touch, kind), touch.valid)
 
-    def _numbers(
+    def _encode_quantity(
         self, quantity: Quantity, touches: Sequence[TactileObservation], arms: Mapping[str, ArmState]
     ) -> FloatArray:
         """All that `touch` says of one quantity."""
@@ -215,42 +224,42 @@ class FeatureEncoder:
         elif quantity == "centroid":
             each = [self._centroid(touch) / SCALES["centroid"] for touch in touches]
         elif quantity == "shear":
-            each = [_flow(touch).mean(axis=(0, 1)) / SCALES["shear"] for touch in touches]
+            each = [_require_flow(touch).mean(axis=(0, 1)) / SCALES["shear"] for touch in touches]
         elif quantity == "wrench":
             each = [
                 np.concatenate([a.wrench[:3] / SCALES["force"], a.wrench[3:] / SCALES["torque"]]) for a in arms.values()
             ]
         elif quantity == "pressure":
-            each = [self._pressure(name, arm) / SCALES["pressure"] for name, arm in arms.items()]
+            each = [self._pressure_centre_shift(name, arm) / SCALES["pressure"] for name, arm in arms.items()]
         elif quantity == "moved":
-            each = [moved(self._start[name], arm.pose) for name, arm in arms.items()]
+            each = [encode_pose_change(self._start[name], arm.pose) for name, arm in arms.items()]
         elif quantity == "stepped":
-            each = [self._stepped(name, arm.pose) / SCALES["stepped"] for name, arm in arms.items()]
+            each = [self._last_displacement(name, arm.pose) / SCALES["stepped"] for name, arm in arms.items()]
         else:
             first, *others = arms.values()
-            each = [se3.relative(first.pose, arm.pose).position / SCALES["between"] for arm in others]
+            each = [se3.relative_pose(first.pose, arm.pose).position / SCALES["between"] for arm in others]
         return np.concatenate(each)
 
-    def _pressure(self, name: str, arm: ArmState) -> FloatArray:
+    def _pressure_centre_shift(self, name: str, arm: ArmState) -> FloatArray:
         """(2,) since the first touch of the episode [m]; 0 without contact."""
-        here = pressed_at(arm)
+        here = centre_of_pressure_in_sensor(arm)
         return np.zeros(2) if here is None else here - self._pressed.setdefault(name, here)
 
-    def _stepped(self, name: str, pose: Pose) -> FloatArray:
+    def _last_displacement(self, name: str, pose: Pose) -> FloatArray:
         """(3,) since the last observation [m]."""
-        now, before = (se3.relative(self._start[name], each).position for each in (pose, self._before[name]))
+        now, before = (se3.relative_pose(self._start[name], each).position for each in (pose, self._before[name]))
         return now - before
 
     def _centroid(self, touch: TactileObservation) -> FloatArray:
         """(2,) of what is pressed in where there is contact [m]; the middle without contact."""
-        pressed = _height(touch).clip(min=0.0) * touch.contact
+        pressed = _require_height(touch).clip(min=0.0) * touch.contact
         total = float(pressed.sum())
         if total == 0.0:
             return np.zeros(2)
         return np.array([pressed.sum(axis=0) @ self._columns, pressed.sum(axis=1) @ self._rows]) / total
 
 
-class _Pool:
+class _CellMeans:
     """Means over the cells of a finer grid with the same centre.
 
     Raises IncompatibleRig when a cell is no whole number of the finer cells, or lies beyond them.
@@ -275,20 +284,20 @@ class _Pool:
     def __call__(self, values: FloatArray, valid: NDArray[np.bool_]) -> FloatArray:
         """(channels, h, w) means of (rows, columns, channels) over valid cells; 0 where none is."""
         if valid.all():
-            return self._sums(values[self._inside]).transpose(2, 0, 1) / self._every**2
+            return self._block_sums(values[self._inside]).transpose(2, 0, 1) / self._every**2
         weights = valid[self._inside].astype(np.float64)[..., None]
-        total, count = self._sums(values[self._inside] * weights), self._sums(weights)
+        total, count = self._block_sums(values[self._inside] * weights), self._block_sums(weights)
         means: FloatArray = np.divide(total, count, out=np.zeros_like(total), where=count > 0)
         return means.transpose(2, 0, 1)
 
-    def _sums(self, values: FloatArray) -> FloatArray:
+    def _block_sums(self, values: FloatArray) -> FloatArray:
         rows, columns = self._shape
         blocks = values.reshape(rows, self._every, columns, self._every, values.shape[-1])
         total: FloatArray = blocks.sum(axis=(1, 3))
         return total
 
 
-def _parts(picture: NDArray[np.uint8] | None, grid: MapGrid) -> FloatArray:
+def _image_means(picture: NDArray[np.uint8] | None, grid: MapGrid) -> FloatArray:
     """(3, h, w) means over the parts of a picture [grey levels], which differ in size by a pixel at most."""
     if picture is None:
         raise IncompatibleRig("the policy sees pictures as the camera gave them, and this sensor delivers none")
@@ -305,20 +314,20 @@ def _parts(picture: NDArray[np.uint8] | None, grid: MapGrid) -> FloatArray:
     return means
 
 
-def _named(kind: str, owner: str) -> list[tuple[str, float]]:
+def _named_parts(kind: str, owner: str) -> list[tuple[str, float]]:
     return [(f"{part}_{owner}", SCALES[scale]) for part, scale in PARTS[kind].items()]
 
 
-def _centres(cells: int, pitch: float) -> FloatArray:
+def _cell_centres(cells: int, pitch: float) -> FloatArray:
     """(cells,) of the cells along one axis, sensor frame [m]."""
     return (np.arange(cells, dtype=np.float64) - (cells - 1) / 2) * pitch
 
 
-def _channel(touch: TactileObservation, kind: Channel) -> FloatArray:
+def _encode_channel(touch: TactileObservation, kind: Channel) -> FloatArray:
     """(h, w, channels) of the canonical grid, encoded."""
     values: NDArray[Any]
     if kind == "height":
-        values = _height(touch)[..., None]
+        values = _require_height(touch)[..., None]
     elif kind == "slope":
         if touch.gradient is None:
             raise IncompatibleRig("the policy sees slopes, and this sensor delivers none")
@@ -333,13 +342,13 @@ def _channel(touch: TactileObservation, kind: Channel) -> FloatArray:
     return encoded
 
 
-def _height(touch: TactileObservation) -> FloatArray:
+def _require_height(touch: TactileObservation) -> FloatArray:
     if touch.height is None:
         raise IncompatibleRig("the policy sees heights, and this sensor delivers none")
     return touch.height.astype(np.float64)
 
 
-def _flow(touch: TactileObservation) -> FloatArray:
+def _require_flow(touch: TactileObservation) -> FloatArray:
     if touch.flow is None:
         raise IncompatibleRig("the policy sees tactile flow, and this sensor has no markers")
     return touch.flow.astype(np.float64)
@@ -347,21 +356,23 @@ def _flow(touch: TactileObservation) -> FloatArray:
 
 def _depths(touch: TactileObservation) -> FloatArray:
     """(2,) greatest depth, and mean depth where there is contact [m]; 0 without contact."""
-    height = _height(touch)
+    height = _require_height(touch)
     greatest = height.max(where=touch.valid, initial=0.0)
     mean = height.mean(where=touch.contact) if touch.contact.any() else 0.0
     return np.array([greatest, mean])
 
 
-def moved(start: Pose, pose: Pose) -> FloatArray:
+def encode_pose_change(start: Pose, pose: Pose) -> FloatArray:
     """(9,) where an arm is, seen from where it was at reset, encoded: position, and two columns of the rotation."""
-    away = se3.relative(start, pose)
-    return np.concatenate([away.position / SCALES["moved"], (se3.two_columns(away) - _UNTURNED) / SCALES["turn"]])
+    away = se3.relative_pose(start, pose)
+    return np.concatenate(
+        [away.position / SCALES["moved"], (se3.rotation_columns(away) - _IDENTITY_COLUMNS) / SCALES["turn"]]
+    )
 
 
-def unmoved(start: Pose, numbers: NDArray[np.floating[Any]]) -> Pose:
+def decode_pose_change(start: Pose, numbers: NDArray[np.floating[Any]]) -> Pose:
     """The pose that `moved` makes these numbers of (9,). Raises ValueError for columns that span no plane, and for
     numbers that are not finite."""
     values = np.asarray(numbers, np.float64)
-    away = se3.from_two_columns(values[:3] * SCALES["moved"], values[3:] * SCALES["turn"] + _UNTURNED)
+    away = se3.from_rotation_columns(values[:3] * SCALES["moved"], values[3:] * SCALES["turn"] + _IDENTITY_COLUMNS)
     return se3.compose(start, away)

@@ -12,7 +12,7 @@ from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.vector.utils import iterate
 
-from tacsim.gym.env import TacsimEnv, options_of_reset
+from tacsim.gym.env import TacsimEnv, copy_reset_options
 from tacsim.interface import Float32
 from tacsim.models.scene import Scene
 from tacsim.physics.failure.health import SimulationDiverged
@@ -41,11 +41,11 @@ class SharedBatch:
 
     def move(self, commands: Sequence[MoveCommand | None]) -> list[Any]:
         """`Batch.move`; the rigs of one file ask for motions of one kind."""
-        asked = [command for command in commands if command is not None]
-        if not asked or self._batch is None:
+        requested = [command for command in commands if command is not None]
+        if not requested or self._batch is None:
             return [None] * len(commands)
         targets = [None if command is None else command.targets for command in commands]
-        return list(self._batch.move(targets, duration=asked[0].duration, flow=asked[0].flow))
+        return list(self._batch.move(targets, duration=requested[0].duration, flow=requested[0].flow))
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,12 +88,12 @@ class TacsimVectorEnv(SyncVectorEnv):
     ) -> tuple[Any, dict[str, Any]]:
         """As SyncVectorEnv.reset; options: `reset_mask`, and those of `TacsimEnv.reset`. Raises ResetNeeded for a mask
         that leaves out an environment that has never been reset."""
-        options = options_of_reset(options)  # a copy: gymnasium takes the mask out of what it is given
+        options = copy_reset_options(options)  # a copy: gymnasium takes the mask out of what it is given
         mask = options.get("reset_mask")
         if isinstance(mask, np.ndarray) and mask.shape == (self.num_envs,):
             new = [i for i, member in enumerate(self._members) if member.env.phase == "new" and not mask[i]]
             if new:
-                raise ResetNeeded(f"environment {_listed(new)} has no episode yet: reset it, too")
+                raise ResetNeeded(f"environment {_list_indices(new)} has no episode yet: reset it, too")
         return super().reset(seed=seed, options=options)
 
     def step(self, actions: Any) -> tuple[Any, ...]:
@@ -111,7 +111,9 @@ class TacsimVectorEnv(SyncVectorEnv):
         phases = [member.env.phase for member in self._members]
         over = [i for i, phase in enumerate(phases) if phase == "new" or (phase == "over" and not resets)]
         if over:
-            raise ResetNeeded(f"no episode runs in environment {_listed(over)}: call reset(), or with a reset_mask")
+            raise ResetNeeded(
+                f"no episode runs in environment {_list_indices(over)}: call reset(), or with a reset_mask"
+            )
         stepping = {i: m for i, m in enumerate(self._members) if phases[i] == "running"}
         commands: list[MoveCommand | None] = [None] * self.num_envs
         try:
@@ -134,5 +136,5 @@ class TacsimVectorEnv(SyncVectorEnv):
             member.env.end_step()
 
 
-def _listed(indices: Sequence[int]) -> str:
+def _list_indices(indices: Sequence[int]) -> str:
     return ", ".join(map(str, indices))

@@ -13,7 +13,7 @@ from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from tacsim import pose as se3
 from tacsim.interface import Pose
-from tacsim.limits import Region, region
+from tacsim.limits import Region, box_region
 from tacsim.models.geometry import PictureRegion
 from tacsim.models.quantity import Acceleration, Angle, Config, Force, Length, Speed, Time
 from tacsim.models.sensor import SensorModel
@@ -112,7 +112,9 @@ class ArmLimits(Config):
     @property
     def region(self) -> Region:
         """Where the sensor's origin may be: the workspace, cut by the planes."""
-        return region(self.workspace.lower, self.workspace.upper, [(each.point, each.normal) for each in self.planes])
+        return box_region(
+            self.workspace.lower, self.workspace.upper, [(each.point, each.normal) for each in self.planes]
+        )
 
 
 class SensorConfig(Config):

@@ -39,14 +39,14 @@ class PixelGrid:
         """(rows, columns, 2) x, y of every point [m]"""
         return np.stack(np.meshgrid(self.x, self.y), axis=-1)
 
-    def within(self, size: tuple[float, float]) -> NDArray[np.bool_]:
+    def points_on_gel(self, size: tuple[float, float]) -> NDArray[np.bool_]:
         """(rows, columns) True where a point lies on a gel of `size` (x, y) [m], centred on the sensor axis."""
         margin = 1e-9
         inside_x = np.abs(self.x) <= size[0] / 2 + margin
         inside_y = np.abs(self.y) <= size[1] / 2 + margin
         return inside_y[:, None] & inside_x[None, :]
 
-    def in_image(self, x: NDArray[np.float32], y: NDArray[np.float32]) -> tuple[NDArray[Any], NDArray[Any]]:
+    def image_coordinates(self, x: NDArray[np.float32], y: NDArray[np.float32]) -> tuple[NDArray[Any], NDArray[Any]]:
         """u, v: where points x, y [m] lie across an image of these pixels, each from -1/2 to 1/2."""
         middle_x = self.x0 + (self.columns - 1) / 2 * self.pitch
         middle_y = self.y0 + (self.rows - 1) / 2 * self.pitch
@@ -70,13 +70,13 @@ class PixelGrid:
         )
 
 
-STRIP = 32_768  # pixels
+STRIP_PIXELS = 32_768  # pixels
 
 
-def strips(rows: int, columns: int) -> list[slice]:
+def image_strips(rows: int, columns: int) -> list[slice]:
     """Rows of an image cut into strips of about STRIP pixels: work on one stays in the processor's cache, which is
     twice as fast; smaller ones cost more calls than they save."""
-    height = max(1, STRIP // columns)
+    height = max(1, STRIP_PIXELS // columns)
     return [slice(top, min(top + height, rows)) for top in range(0, rows, height)]
 
 

@@ -26,7 +26,7 @@ def dot_filters(radius: float) -> tuple[int, float]:
     return 2 * int(np.ceil(MAX_RADIUS * radius)) + 1, BLUR * radius
 
 
-def darkness(image: Image, side: int, blur: float) -> Float32:
+def local_darkness(image: Image, side: int, blur: float) -> Float32:
     """(H, W) share of the light that is missing against the frame of `side` x `side` px round each place."""
     import cv2
 
@@ -51,12 +51,12 @@ class DotEraser:
         """The picture (H, W, 3) without its dots."""
         import cv2
 
-        inked = (darkness(image, self._side, self._blur) > EDGE_DARKNESS).astype(np.uint8)
+        inked = (local_darkness(image, self._side, self._blur) > EDGE_DARKNESS).astype(np.uint8)
         wider = cv2.dilate(inked, np.ones((3, 3), dtype=np.uint8))
         return np.asarray(cv2.inpaint(image, wider, 3.0, cv2.INPAINT_TELEA), dtype=np.uint8)
 
 
-def lifted_ink(picture: Image, radius: float) -> tuple[Image, Float32]:
+def separate_ink(picture: Image, radius: float) -> tuple[Image, Float32]:
     """The picture (H, W, 3) of an untouched gel without its dots of about `radius` [px], and (H, W, 3) the share of
     their light that they let through, 1 beside them: the product is the picture. Raises ValueError for dots too small
     to be found."""
@@ -73,7 +73,7 @@ def fine_part(picture: Float32, pixel_pitch: float) -> Float32:
     return np.asarray(picture - slow, dtype=np.float32)
 
 
-def lifted_skin(picture: Float32, share: float, pixel_pitch: float) -> tuple[Float32, Float32]:
+def separate_skin(picture: Float32, share: float, pixel_pitch: float) -> tuple[Float32, Float32]:
     """The picture (H, W, 3) of an untouched gel without its skin, which is `share` of its fine part, and (H, W, 3) the
     share of light that the skin lets through, about 1: the product is the picture."""
     bare = picture - np.float32(share) * fine_part(picture, pixel_pitch)

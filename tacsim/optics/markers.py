@@ -9,7 +9,7 @@ from tacsim.models.scene import GelSurface
 from tacsim.models.sensor import Markers, SensorGeometry
 from tacsim.optics.spline import displacement_and_jacobian
 
-INK = 0.06  # fraction of the light that a dot lets through [-]
+INK_TRANSMISSION = 0.06  # fraction of the light that a dot lets through [-]
 
 
 def rest_positions(markers: Markers) -> FloatArray:
@@ -21,7 +21,7 @@ def rest_positions(markers: Markers) -> FloatArray:
     return np.stack(np.meshgrid(x, y), axis=-1)
 
 
-def check_fits(markers: Markers, gel_size: tuple[float, float]) -> None:
+def require_dots_on_gel(markers: Markers, gel_size: tuple[float, float]) -> None:
     """Raises ValueError when a dot lies off the gel."""
     reach = np.abs(rest_positions(markers)).reshape(-1, 2).max(axis=0) + markers.radius
     if reach[0] > gel_size[0] / 2 or reach[1] > gel_size[1] / 2:
@@ -34,7 +34,7 @@ def check_fits(markers: Markers, gel_size: tuple[float, float]) -> None:
 
 def marker_flow(surface: GelSurface, markers: Markers) -> Float32:
     """(rows, columns, 2) in-plane displacement of the dots, sensor x, y [m]; of those behind a fold, too."""
-    return _displacement(surface, markers)[..., :2].astype(np.float32)
+    return _dot_displacement(surface, markers)[..., :2].astype(np.float32)
 
 
 def marker_discs(surface: GelSurface, markers: Markers, geometry: SensorGeometry) -> tuple[FloatArray, FloatArray]:
@@ -42,7 +42,7 @@ def marker_discs(surface: GelSurface, markers: Markers, geometry: SensorGeometry
 
     Raises ValueError when the gel is pressed up to the camera.
     """
-    displacement = _displacement(surface, markers)
+    displacement = _dot_displacement(surface, markers)
     nearer = np.ones(displacement.shape[:2])
     if geometry.camera_distance is not None:
         room = geometry.camera_distance + displacement[..., 2]
@@ -57,7 +57,7 @@ def marker_discs(surface: GelSurface, markers: Markers, geometry: SensorGeometry
     return centres, markers.radius * scale
 
 
-def _displacement(surface: GelSurface, markers: Markers) -> FloatArray:
+def _dot_displacement(surface: GelSurface, markers: Markers) -> FloatArray:
     """(rows, columns, 3) of the dots, sensor axes [m]."""
     rest = rest_positions(markers)
     displacement, _ = displacement_and_jacobian(surface, rest.reshape(-1, 2))
@@ -85,18 +85,18 @@ def marker_coverage(positions: FloatArray, radius: float | FloatArray, shape: tu
     return coverage
 
 
-def _shown(surface: GelSurface, markers: Markers, geometry: SensorGeometry, at_rest: Float32) -> Mask:
+def _visible_dots(surface: GelSurface, markers: Markers, geometry: SensorGeometry, at_rest: Float32) -> Mask:
     """(rows, columns) False for dots of which no pixel round their centres shows anything."""
     rest = rest_positions(markers)
-    places = (rest + _displacement(surface, markers)[..., :2]) / geometry.pixel_pitch + geometry.principal
+    places = (rest + _dot_displacement(surface, markers)[..., :2]) / geometry.pixel_pitch + geometry.principal
     rest = rest / geometry.pixel_pitch + geometry.principal
     reach = max(markers.radius / geometry.pixel_pitch, 2.0)
-    shown = np.zeros(rest.shape[:2], dtype=np.bool_)
+    visible = np.zeros(rest.shape[:2], dtype=np.bool_)
     for step in np.ndindex(3, 3):
         u, v = np.moveaxis(np.rint(places).astype(np.intp) + np.array(step) - 1, -1, 0)
         there = at_rest[v.clip(0, geometry.height - 1), u.clip(0, geometry.width - 1)]
-        shown |= np.linalg.norm(there - rest, axis=-1) <= reach
-    return shown
+        visible |= np.linalg.norm(there - rest, axis=-1) <= reach
+    return visible
 
 
 def marker_transmission(
@@ -109,7 +109,7 @@ def marker_transmission(
     """
     centres, radii = marker_discs(surface, markers, geometry)
     if at_rest is not None:
-        shown = _shown(surface, markers, geometry, at_rest)
-        centres, radii = centres[shown], radii[shown]
+        visible = _visible_dots(surface, markers, geometry, at_rest)
+        centres, radii = centres[visible], radii[visible]
     coverage = marker_coverage(centres, radii, (geometry.height, geometry.width))
-    return np.float32(1.0) - np.float32(1.0 - INK) * coverage
+    return np.float32(1.0) - np.float32(1.0 - INK_TRANSMISSION) * coverage

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from tacsim.interface import Float32, Image
 from tacsim.models.sensor import CameraNoise, SensorModel
 
-FIELDS = 4  # of noise, drawn once for a sensor
-SHIFTS = 64  # of a field, in rows and in columns
-HALVINGS = 20  # of the interval in which a field's scale is sought
+NOISE_FIELDS = 4  # of noise, drawn once for a sensor
+FIELD_SHIFTS = 64  # of a field, in rows and in columns
+BISECTION_STEPS = 20  # of the interval in which a field's scale is sought
 
 
 class NoiseSource:
@@ -39,8 +39,8 @@ class NoiseSource:
         self._shape = shape
         self._key = (noise.seed, zlib.crc32(sensor.encode()))
         rng = np.random.default_rng(self._key)
-        size = (shape[0] + SHIFTS - 1, shape[1] + SHIFTS - 1)
-        self._fields = [_field(noise, size, rng) for _ in range(FIELDS)]
+        size = (shape[0] + FIELD_SHIFTS - 1, shape[1] + FIELD_SHIFTS - 1)
+        self._fields = [_draw_field(noise, size, rng) for _ in range(NOISE_FIELDS)]
 
     def __call__(self, image: Image, frame: int, episode: int = 0) -> Image:
         """The picture (H, W, 3) as the camera delivers it; black and white are its limits. `frame`, `episode`: numbers
@@ -49,7 +49,9 @@ class NoiseSource:
 
         if image.shape != (*self._shape, 3):
             raise ValueError(f"image is {image.shape}, the noise is for {(*self._shape, 3)}")
-        which, down, right = np.random.default_rng((*self._key, episode, frame)).integers((FIELDS, SHIFTS, SHIFTS))
+        which, down, right = np.random.default_rng((*self._key, episode, frame)).integers(
+            (NOISE_FIELDS, FIELD_SHIFTS, FIELD_SHIFTS)
+        )
         rows, columns = self._shape
         drawn = self._fields[which][down : down + rows, right : right + columns]
         return np.asarray(cv2.add(image, drawn, dtype=cv2.CV_8U), dtype=np.uint8)
@@ -60,32 +62,32 @@ def noise_source(model: SensorModel, sensor: str) -> NoiseSource | None:
     return None if model.noise is None else NoiseSource(model.noise, model.image_shape, sensor)
 
 
-def _field(noise: CameraNoise, size: tuple[int, int], rng: np.random.Generator) -> NDArray[np.int8]:
+def _draw_field(noise: CameraNoise, size: tuple[int, int], rng: np.random.Generator) -> NDArray[np.int8]:
     """(rows, columns, 3) noise in whole grey levels."""
     field = rng.standard_normal((*size, 3), dtype=np.float32)
     along_x, along_y = noise.neighbours
-    _chain(field, along_y)
-    _chain(field.transpose(1, 0, 2), along_x)
+    _correlate_rows(field, along_y)
+    _correlate_rows(field.transpose(1, 0, 2), along_x)
     values, vectors = np.linalg.eigh(noise.colour_matrix())
     field @= (vectors * np.sqrt(np.maximum(values, 0.0))).T.astype(np.float32)
     whole = np.zeros(field.shape, dtype=np.int8)
     for channel, deviation in enumerate(noise.deviation):
         if deviation > 0:
-            whole[..., channel] = _rounded(field[..., channel], deviation)
+            whole[..., channel] = _scale_and_round(field[..., channel], deviation)
     return whole
 
 
-def _chain(field: Float32, correlation: float) -> None:
+def _correlate_rows(field: Float32, correlation: float) -> None:
     """Correlates each row of independent normal numbers with the one before; their spread stays 1."""
     fresh = np.float32(np.sqrt(1.0 - correlation**2))
     for row in range(1, len(field)):
         field[row] = np.float32(correlation) * field[row - 1] + fresh * field[row]
 
 
-def _rounded(field: Float32, deviation: float) -> Float32:
+def _scale_and_round(field: Float32, deviation: float) -> Float32:
     """The normal numbers, scaled so that `deviation` is their standard deviation after rounding."""
     low, high = 0.0, deviation + 1.0
-    for _ in range(HALVINGS):
+    for _ in range(BISECTION_STEPS):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if np.rint(np.float32(middle) * field).std() < deviation else (low, middle)
     return np.asarray(np.clip(np.rint(np.float32(high) * field), -127, 127), dtype=np.float32)

@@ -28,7 +28,7 @@ class BadPicture(ValueError):
 
 
 @contextmanager
-def opened_picture(source: Path | io.BytesIO, what: str, formats: tuple[str, ...] = FORMATS) -> Iterator[Image]:
+def open_picture(source: Path | io.BytesIO, what: str, formats: tuple[str, ...] = FORMATS) -> Iterator[Image]:
     """A picture of an allowed size and pixel type, not yet decoded. Raises BadPicture that names `what`, also for
     whatever the decoder raises in the block."""
     from PIL import Image
@@ -42,7 +42,7 @@ def opened_picture(source: Path | io.BytesIO, what: str, formats: tuple[str, ...
         raise
     except Exception as failure:  # a decoder that is fed damaged bytes may raise anything
         raise BadPicture(
-            f"{what}: no readable picture ({', '.join(formats)}): {_other_format(source) or failure}"
+            f"{what}: no readable picture ({', '.join(formats)}): {_describe_format(source) or failure}"
         ) from failure
 
 
@@ -86,7 +86,7 @@ def _check_depth(picture: Image, what: str) -> None:
         )
 
 
-def _other_format(source: Path | io.BytesIO) -> str:
+def _describe_format(source: Path | io.BytesIO) -> str:
     """In words, which other format the data have; empty for none that is known."""
     try:
         if isinstance(source, io.BytesIO):

@@ -26,25 +26,25 @@ from tacsim.models.geometry import GelView
 from tacsim.models.photometric import CastShadows, DarknessModel, PhotometricLight, horizon, places_in_image
 from tacsim.models.scene import GelSurface
 from tacsim.models.sensor import Lighting, SensorModel
-from tacsim.optics.grid import PixelGrid, image_grid, strips
-from tacsim.optics.ink import lifted_ink, lifted_skin
-from tacsim.optics.markers import check_fits, marker_transmission
-from tacsim.optics.picture_file import BadPicture, opened_picture, upright_rgb, upright_size
+from tacsim.optics.grid import PixelGrid, image_grid, image_strips
+from tacsim.optics.ink import separate_ink, separate_skin
+from tacsim.optics.markers import marker_transmission, require_dots_on_gel
+from tacsim.optics.picture_file import BadPicture, open_picture, upright_rgb, upright_size
 from tacsim.optics.spline import line_matrices
-from tacsim.optics.surface import SurfaceTable, look_up, spread, thinned
+from tacsim.optics.surface import SurfaceTable, bilinear_lookup, block_centres, interpolate_blocks
 
 # Lattice of the gel's texture [m]. At this pitch its slopes have the spread (0.023 for 2 um) of Gomes' white noise on
 # 54 um pixels, but they belong to the gel: an image of another size shows the same texture.
 TEXTURE_PITCH = 0.12e-3
 WHITE = np.float32(255.0)
-STEEPEST = 2.0  # largest slope in the table of light
-TABLE_POINTS = 256  # of that table, from slope 0 to STEEPEST
+MAX_SLOPE = 2.0  # largest slope in the table of light
+LIGHT_TABLE_POINTS = 256  # of that table, from slope 0 to STEEPEST
 BLUR_REACH = 2.5  # standard deviations that a camera's blur reaches: with OpenCV's 4 it is 0.01 grey levels another
-INTERPOLATED = 1.0 / 6.0  # mean of f (1 - f), the variance of linear interpolation at f between two values
-SAMPLED = 0.3  # a wider normal distribution keeps its variance to 5 % where it is sampled
-ASTRAY = 0.5  # [px] that a pixel put on the gel and back may be off
-LEAST_PIXELS = 128 * 128  # of a picture that is worth a table
-TABLE_ERROR = 0.5  # largest error of the table [grey levels]; narrower highlights are computed without it
+INTERPOLATION_VARIANCE = 1.0 / 6.0  # mean of f (1 - f), the variance of linear interpolation at f between two values
+MIN_SAMPLED_VARIANCE = 0.3  # a wider normal distribution keeps its variance to 5 % where it is sampled
+MAX_PROJECTION_ERROR = 0.5  # [px] that a pixel put on the gel and back may be off
+MIN_TABLE_PIXELS = 128 * 128  # of a picture that is worth a table
+MAX_TABLE_ERROR = 0.5  # largest error of the table [grey levels]; narrower highlights are computed without it
 SHADOW_STRIDE = 2  # every so many points of the table along each side: shadows have soft edges
 MAX_BLUR = 6.0  # standard deviation of a Gaussian [px] beyond which it is evaluated on a coarser picture
 
@@ -62,27 +62,27 @@ class Renderer:
         """`gel_size`: x, y [m]."""
         self.model = model
         self._grid = image_grid(model.geometry)
-        self._view = None if model.view is None else _look_ups(model.view)
+        self._view = None if model.view is None else _view_map(model.view)
         self._markers, self._ink = model.markers, None
         self._texture = texture_gradient(self._grid, gel_size, model.texture, model.texture_seed)
-        self._beyond = 0.0
+        self._clipped_share = 0.0
         self._light: PhotometricLight | None = None
         self._lights: Float32 | None = None  # the table of Phong lights, once it is asked for
-        self._tabulated = self._grid.rows * self._grid.columns < LEAST_PIXELS  # nothing is left to tabulate
+        self._tabulated = self._grid.rows * self._grid.columns < MIN_TABLE_PIXELS  # nothing is left to tabulate
         untouched = WHITE * untouched_image(model.lighting, self._grid.shape)
         # Of the image without the lights
         calibrated = model.photometric or model.darkness
         self._unlit = untouched if calibrated else WHITE * unlit_image(model.lighting, self._grid.shape)
         if model.markers is not None and model.markers.in_background:
             radius = model.markers.radius / model.geometry.pixel_pitch
-            clean, self._ink = lifted_ink(np.rint(untouched).astype(np.uint8), radius)
+            clean, self._ink = separate_ink(np.rint(untouched).astype(np.uint8), radius)
             self._unlit = self._unlit + (clean - untouched)
             untouched, self._markers = clean.astype(np.float32), None
         elif model.markers is not None:
-            check_fits(model.markers, gel_size)
+            require_dots_on_gel(model.markers, gel_size)
         self._mean = untouched.mean(axis=(0, 1))
         if model.skin > 0:
-            bare, skin = lifted_skin(untouched, model.skin, model.geometry.pixel_pitch)
+            bare, skin = separate_skin(untouched, model.skin, model.geometry.pixel_pitch)
             self._unlit = self._unlit + (bare - untouched)
             self._ink = skin if self._ink is None else self._ink * skin
         if model.photometric is not None:
@@ -93,10 +93,10 @@ class Renderer:
                 self._unlit = self._unlit + self._light.change(self._texture, *places)[0]
 
     @property
-    def beyond(self) -> float:
+    def clipped_share(self) -> float:
         """Fraction of the last image's surface whose slope, or depth, was clipped to the calibrated range; 0 for Phong
         lights."""
-        return self._beyond
+        return self._clipped_share
 
     def __call__(self, surface: GelSurface) -> NDArray[np.uint8]:
         """(H, W, 3) RGB image of the surface. Raises what :func:`tacsim.optics.surface.sample_surface` raises."""
@@ -105,69 +105,75 @@ class Renderer:
         table = SurfaceTable(surface)
         # Calibrated light is looked up at the middles of blocks of pixels, two for each cell of the table along a side:
         # its kinks lie at the table's points, and blocks as large as cells were up to 6 grey levels off beside them
-        block = 1 if self._light is None or table.folded else max(1, table.points_a_cell(self._grid) // 2)
-        seen = table.points(thinned(self._grid, block), fine=False)
-        if block > 1 and not seen[1].all():  # the gel's edge is seen, and is as sharp as the camera's blur lets it be
-            block, seen = 1, table.points(self._grid, fine=False)
-        light = self._light_of(table, *seen, block)
-        inked = self._inked(surface, table, seen[0], block)
-        del seen  # memory that is freed early is used again while it is warm
+        block = 1 if self._light is None or table.folded else max(1, table.points_per_cell(self._grid) // 2)
+        visible = table.table_points(block_centres(self._grid, block), fine=False)
+        if (
+            block > 1 and not visible[1].all()
+        ):  # the gel's edge is seen, and is as sharp as the camera's blur lets it be
+            block, visible = 1, table.table_points(self._grid, fine=False)
+        light = self._light_contribution(table, *visible, block)
+        transmission = self._ink_transmission(surface, table, visible[0], block)
+        del visible  # memory that is freed early is used again while it is warm
         image = np.empty((*self._grid.shape, 3), dtype=np.uint8)
 
-        for strip in strips(*self._grid.shape):
+        for strip in image_strips(*self._grid.shape):
             lit, unlit = light(strip), self._unlit[strip]
-            if inked is not None:
-                share = inked(strip)
+            if transmission is not None:
+                share = transmission(strip)
                 lit, unlit = lit * share, unlit * share
             # Rounds, and saturates at black and white. cv2.add is the same to the bit, but goes to IPP in blocks of
             # 1 kB, each of which asks the processor for its name: 15 ms a picture of 640 x 480 in a virtual machine.
             cv2.addWeighted(lit, 1.0, unlit, 1.0, 0.0, image[strip], dtype=cv2.CV_8U)
         return image if self._view is None else np.asarray(cv2.remap(image, *self._view, cv2.INTER_LINEAR), np.uint8)
 
-    def _inked(
+    def _ink_transmission(
         self, surface: GelSurface, table: SurfaceTable, points: Float32, block: int
     ) -> Callable[[slice], Float32] | None:
         """Rows of an image -> (rows, W, 1 or 3) share of its light that each pixel keeps under dots and skin."""
         ink, dots = self._ink, None
         if ink is not None:
-            points = spread(points, block, self._grid.shape)
+            points = interpolate_blocks(points, block, self._grid.shape)
         if self._markers is not None:
-            at_rest = table.at_rest(points, self._grid) if table.folded else None
+            at_rest = table.rest_coordinates(points, self._grid) if table.folded else None
             dots = marker_transmission(surface, self._markers, self.model.geometry, at_rest)[..., None]
         if ink is None:
             return None if dots is None else dots.__getitem__
 
-        def kept(rows: slice) -> Float32:
-            share = look_up(ink, table.at_rest(points[rows], self._grid))
+        def transmitted(rows: slice) -> Float32:
+            share = bilinear_lookup(ink, table.rest_coordinates(points[rows], self._grid))
             return share if dots is None else share * dots[rows]
 
-        return kept
+        return transmitted
 
-    def _light_of(self, table: SurfaceTable, points: Float32, inside: Mask, block: int) -> Callable[[slice], Float32]:
+    def _light_contribution(
+        self, table: SurfaceTable, points: Float32, inside: Mask, block: int
+    ) -> Callable[[slice], Float32]:
         """Rows of an image -> (rows, W, 3) what light adds to the image without it; 255 is white."""
         if self._light is not None:
-            return self._calibrated(self._light, table, points, inside, block).__getitem__
+            return self._calibrated_light(self._light, table, points, inside, block).__getitem__
         if self.model.darkness is None:
-            return self._shaded(table, points, inside)
+            return self._phong_light(table, points, inside)
         # at the points of the surface's table, of which there are fewer than pixels, as for calibrated slopes
-        change, self._beyond = darkened(self.model.darkness, np.ascontiguousarray(table.fields[..., 0]), table.pitch)
-        return table.at(change * self._mean, points, inside).__getitem__
+        change, self._clipped_share = darken_by_depth(
+            self.model.darkness, np.ascontiguousarray(table.fields[..., 0]), table.pitch
+        )
+        return table.interpolate_at(change * self._mean, points, inside).__getitem__
 
-    def _shaded(self, table: SurfaceTable, points: Float32, inside: Mask) -> Callable[[slice], Float32]:
+    def _phong_light(self, table: SurfaceTable, points: Float32, inside: Mask) -> Callable[[slice], Float32]:
         """Rows of an image -> (rows, W, 3) light of the lamps, by the slopes of surface and texture; 255 is white."""
         import cv2
 
         lighting = self.model.lighting
-        slopes = table.at(table.fields[..., 1:], points, inside)
+        slopes = table.interpolate_at(table.fields[..., 1:], points, inside)
         cv2.add(slopes, self._texture, dst=slopes)
         if not self._tabulated:
             self._lights, self._tabulated = light_table(lighting), True
         lights = self._lights
-        if lights is None or not max(-float(slopes.min()), float(slopes.max())) <= STEEPEST:
-            return lambda rows: shade(slopes[rows], lighting, white=255.0)
+        if lights is None or not max(-float(slopes.min()), float(slopes.max())) <= MAX_SLOPE:
+            return lambda rows: phong_shading(slopes[rows], lighting, white=255.0)
         return lambda rows: light_at(lights, slopes[rows])
 
-    def _calibrated(
+    def _calibrated_light(
         self, calibrated: PhotometricLight, table: SurfaceTable, points: Float32, inside: Mask, block: int
     ) -> Float32:
         """(H, W, 3) change of colour by the calibrated model, as its camera blurs it; 255 is white.
@@ -179,25 +185,27 @@ class Renderer:
         """
         assert self.model.photometric is not None
         grid, blur, shadows = self._grid, self.model.photometric.blur, self.model.photometric.shadows
-        part = table.part(grid)
-        place = grid.in_image(*(each[part] for each in table.place()))
+        part = table.visible_part(grid)
+        place = grid.image_coordinates(*(each[part] for each in table.deformed_coordinates()))
         fields, width = table.fields[part], np.float32(grid.columns * grid.pitch)
         colours = np.zeros_like(table.fields)
-        colours[part], beyond = calibrated.change(fields[..., 1:], *place, fields[..., 0] / width)
+        colours[part], clipped = calibrated.change(fields[..., 1:], *place, fields[..., 0] / width)
         if shadows is not None:
             colours += shadow_colours(calibrated, shadows, table, grid)
-        self._beyond = beyond / place[0].size
-        return spread(_blurred(table.at(colours, points, inside), blur, block), block, grid.shape)
+        self._clipped_share = clipped / place[0].size
+        return interpolate_blocks(
+            _blur_blocks(table.interpolate_at(colours, points, inside), blur, block), block, grid.shape
+        )
 
 
-def _blurred(colours: Float32, blur: float, block: int) -> Float32:
+def _blur_blocks(colours: Float32, blur: float, block: int) -> Float32:
     """Colours (rows, columns, 3) of blocks of `block` x `block` pixels, such that the picture they are spread to is
     blurred by a normal distribution of standard deviation `blur` [px]."""
     import cv2
 
     # what is linear between values has the curvature of one that is blurred by this much [blocks^2]
-    variance = (blur / block) ** 2 - (INTERPOLATED if block > 1 else 0.0)
-    if variance > SAMPLED:
+    variance = (blur / block) ** 2 - (INTERPOLATION_VARIANCE if block > 1 else 0.0)
+    if variance > MIN_SAMPLED_VARIANCE:
         deviation = math.sqrt(variance)
         side = 2 * math.ceil(BLUR_REACH * deviation) + 1
         return np.asarray(cv2.GaussianBlur(colours, (side, side), deviation), dtype=np.float32)
@@ -208,7 +216,7 @@ def _blurred(colours: Float32, blur: float, block: int) -> Float32:
     return np.asarray(cv2.sepFilter2D(colours, -1, weights, weights), dtype=np.float32)
 
 
-def _look_ups(view: GelView) -> tuple[NDArray[np.int16], NDArray[np.uint16]]:
+def _view_map(view: GelView) -> tuple[NDArray[np.int16], NDArray[np.uint16]]:
     """Where each pixel of the camera's picture lies in the metric one, in OpenCV's fixed point; far off beside it."""
     import cv2
 
@@ -216,15 +224,15 @@ def _look_ups(view: GelView) -> tuple[NDArray[np.int16], NDArray[np.uint16]]:
     pixels = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).astype(np.float64)
     on_gel = view.on_gel(pixels)
     # a lens is known as far as the gel reaches: beyond, its inverse may lead back into the picture
-    astray = ~(np.linalg.norm(view.project(on_gel) - pixels, axis=-1) < ASTRAY)
+    unreliable = ~(np.linalg.norm(view.project(on_gel) - pixels, axis=-1) < MAX_PROJECTION_ERROR)
     metric = on_gel / geometry.pixel_pitch + geometry.principal
-    metric[astray] = -10.0
+    metric[unreliable] = -10.0
     metric = np.clip(metric, -10.0, max(geometry.width, geometry.height) + 10.0)
     whole, fraction = cv2.convertMaps(metric.astype(np.float32), np.empty(0, dtype=np.float32), cv2.CV_16SC2)
     return np.asarray(whole, dtype=np.int16), np.asarray(fraction, dtype=np.uint16)
 
 
-def shade(gradient: Float32, lighting: Lighting, white: float = 1.0) -> Float32:
+def phong_shading(gradient: Float32, lighting: Lighting, white: float = 1.0) -> Float32:
     """(H, W, 3) diffuse and specular light from a surface of slopes (H, W, 2), with white at `white`. Lights in any
     order give the same bits: they are sorted before they are summed."""
     import cv2
@@ -250,16 +258,16 @@ def shade(gradient: Float32, lighting: Lighting, white: float = 1.0) -> Float32:
 @lru_cache(maxsize=8)
 def light_table(lighting: Lighting) -> Float32 | None:
     """(n, n, 3) light at slopes from -STEEPEST to STEEPEST, rows by y; 255 is white. None for highlights so narrow that
-    light between the points is more than TABLE_ERROR off."""
+    light between the points is more than MAX_TABLE_ERROR off."""
 
     def light(first: float, number: int) -> Float32:
-        along = ((first + np.arange(number)) * (STEEPEST / TABLE_POINTS)).astype(np.float32)
-        return shade(np.stack(np.meshgrid(along, along), axis=-1), lighting, white=255.0)
+        along = ((first + np.arange(number)) * (MAX_SLOPE / LIGHT_TABLE_POINTS)).astype(np.float32)
+        return phong_shading(np.stack(np.meshgrid(along, along), axis=-1), lighting, white=255.0)
 
-    table = light(-TABLE_POINTS, 2 * TABLE_POINTS + 1)
-    middles = light(0.5 - TABLE_POINTS, 2 * TABLE_POINTS)
+    table = light(-LIGHT_TABLE_POINTS, 2 * LIGHT_TABLE_POINTS + 1)
+    middles = light(0.5 - LIGHT_TABLE_POINTS, 2 * LIGHT_TABLE_POINTS)
     between = (table[1:, 1:] + table[:-1, 1:] + table[1:, :-1] + table[:-1, :-1]) / 4
-    if not float(np.abs(between - middles).max()) <= TABLE_ERROR:
+    if not float(np.abs(between - middles).max()) <= MAX_TABLE_ERROR:
         return None
     table.flags.writeable = False
     return table
@@ -267,7 +275,9 @@ def light_table(lighting: Lighting) -> Float32 | None:
 
 def light_at(table: Float32, gradient: Float32) -> Float32:
     """(H, W, 3) light at slopes (H, W, 2) no steeper than STEEPEST, linear in a table of :func:`light_table`."""
-    return look_up(table, gradient * np.float32(TABLE_POINTS / STEEPEST) + np.float32(TABLE_POINTS))
+    return bilinear_lookup(
+        table, gradient * np.float32(LIGHT_TABLE_POINTS / MAX_SLOPE) + np.float32(LIGHT_TABLE_POINTS)
+    )
 
 
 def unlit_image(lighting: Lighting, shape: tuple[int, int]) -> Float32:
@@ -278,20 +288,20 @@ def unlit_image(lighting: Lighting, shape: tuple[int, int]) -> Float32:
         background = read_background(lighting.background, shape)
     else:
         background = np.broadcast_to(np.array(lighting.background, dtype=np.float32), (*shape, 3))
-    flat = shade(np.zeros((1, 1, 2), dtype=np.float32), lighting)
+    flat = phong_shading(np.zeros((1, 1, 2), dtype=np.float32), lighting)
     return background - flat
 
 
 def untouched_image(lighting: Lighting, shape: tuple[int, int]) -> Float32:
     """(H, W, 3) the picture of the flat gel."""
-    flat = shade(np.zeros((1, 1, 2), dtype=np.float32), lighting)
+    flat = phong_shading(np.zeros((1, 1, 2), dtype=np.float32), lighting)
     untouched: Float32 = np.clip(unlit_image(lighting, shape) + flat, 0.0, 1.0)
     return untouched
 
 
 def read_background(path: str, shape: tuple[int, int]) -> Float32:
     """(H, W, 3) RGB picture in 0..1. Raises ValueError when it cannot be read or is not H x W (before decoding it)."""
-    with opened_picture(Path(path), f"lighting.background: '{path}'") as picture:
+    with open_picture(Path(path), f"lighting.background: '{path}'") as picture:
         rows, columns = upright_size(picture)
         if (rows, columns) != shape:
             raise BadPicture(
@@ -312,7 +322,7 @@ def texture_gradient(grid: PixelGrid, gel_size: tuple[float, float], deviation: 
     by_x = (slope_x @ (value_y @ noise).T).T
     by_y = (value_x @ (slope_y @ noise).T).T
     gradient = np.stack([by_x, by_y], axis=-1) / TEXTURE_PITCH
-    gradient[~grid.within(gel_size)] = 0.0
+    gradient[~grid.points_on_gel(gel_size)] = 0.0
     return np.ascontiguousarray(gradient, dtype=np.float32)
 
 
@@ -322,31 +332,31 @@ def shadow_colours(light: PhotometricLight, shadows: CastShadows, table: Surface
     The path to a lamp is followed over the surface as if it had moved only up and down: sideways motion is small beside
     the length of a shadow.
     """
-    x, y = (each[::SHADOW_STRIDE, ::SHADOW_STRIDE] for each in table.place())
-    u, v = image.in_image(x, y)
+    x, y = (each[::SHADOW_STRIDE, ::SHADOW_STRIDE] for each in table.deformed_coordinates())
+    u, v = image.image_coordinates(x, y)
     width, flat = np.float32(image.columns * image.pitch), np.float32(image.rows / image.columns)
     # from places in picture widths, which start in the middle of the picture, to metres
     start_x, start_y = x[0, 0] - u[0, 0] * width, y[0, 0] - v[0, 0] * flat * width
     height = np.ascontiguousarray(table.fields[..., 0])
 
     def height_at(x: Float32, y: Float32) -> Float32:
-        return table.at_places(height, start_x + width * x, start_y + width * y) / width
+        return table.interpolate_at_rest(height, start_x + width * x, start_y + width * y) / width
 
     horizons = [horizon(height_at, u, v * flat, lamp) for lamp in shadows.lamps]
     rows, columns = (np.arange(n, dtype=np.float32) / SHADOW_STRIDE for n in table.fields.shape[:2])
-    return look_up(light.shadow(horizons, u, v), np.stack(np.meshgrid(columns, rows), axis=-1))
+    return bilinear_lookup(light.shadow(horizons, u, v), np.stack(np.meshgrid(columns, rows), axis=-1))
 
 
-def darkened(model: DarknessModel, height: Float32, pitch: float) -> tuple[Float32, float]:
+def darken_by_depth(model: DarknessModel, height: Float32, pitch: float) -> tuple[Float32, float]:
     """(H, W, 3) relative change of colour under heights (H, W) into the gel on pixels of `pitch`, in the model's unit;
     and the share of pixels that are deeper than its table."""
-    own = height - np.float32(model.share) * _mean_round(height, model.reach / pitch) if model.share else height
+    own = height - np.float32(model.share) * _local_mean(height, model.reach / pitch) if model.share else height
     depths = np.array(model.depths)
     change = np.stack([np.interp(own, depths, channel) for channel in np.array(model.changes).T], axis=-1)
     return change.astype(np.float32), float(np.count_nonzero(own > depths[-1]) / own.size)
 
 
-def _mean_round(height: Float32, deviation: float) -> Float32:
+def _local_mean(height: Float32, deviation: float) -> Float32:
     """(H, W) Gaussian mean; the picture goes on as its mirror image."""
     import cv2
 

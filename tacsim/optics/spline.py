@@ -65,7 +65,7 @@ def line_matrices(position: FloatArray, nodes: int) -> tuple[LineMatrix, LineMat
     return LineMatrix(index.T, value), LineMatrix(index.T, derivative)
 
 
-def refined(control: NDArray[np.float32], points: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def refine_spline(control: NDArray[np.float32], points: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """The spline through control values (nodes, m), and its slope by the position in lattice spacings, at every
     1/`points` of a spacing, an even number: (n, m) both, n = (nodes - 1) points + 1.
 
@@ -78,12 +78,12 @@ def refined(control: NDArray[np.float32], points: int) -> tuple[NDArray[np.float
     # sliding_window_view of NumPy takes longer than the products
     neighbours = np.ndarray((nodes, 3, m), ends_repeat.dtype, ends_repeat, strides=(row, row, item))
     between = slice(points // 2, points // 2 + (nodes - 1) * points + 1)  # a node's points lie on both sides of it
-    value, slope = ((weights @ neighbours).reshape(-1, m)[between] for weights in _near_a_node(points))
+    value, slope = ((weights @ neighbours).reshape(-1, m)[between] for weights in _node_weights(points))
     return value, slope
 
 
 @lru_cache(maxsize=8)
-def _near_a_node(points: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _node_weights(points: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """(points, 3) both: weights of a node and its neighbours at the points nearest to it, and their derivatives."""
     _, weight, slope = spline_weights(np.arange(points) / points + 0.5, 3)
     return weight.astype(np.float32), slope.astype(np.float32)

@@ -30,16 +30,16 @@ from tacsim.models.scene import GelSurface
 from tacsim.models.sensor import CanonicalGrid, Markers
 from tacsim.optics.grid import PixelGrid, canonical_cells
 from tacsim.optics.markers import marker_flow
-from tacsim.optics.spline import displacement_and_jacobian, refined
+from tacsim.optics.spline import displacement_and_jacobian, refine_spline
 
 # The table is this fine or finer [m], but has no more than so many points for each lattice spacing. Height errs by 0.2
 # um rms by it, 2 um on steep flanks; on a lattice of 2 mm, whose gel is far less exact, by 1 um rms, 10 um.
-TABLE_PITCH, MOST_POINTS = 0.125e-3, 8
+TABLE_PITCH, MAX_POINTS_PER_SPACING = 0.125e-3, 8
 FIXED_POINT_STEPS = 20
 NEWTON_STEPS = 40
-CONVERGED = 1.0 / 64.0  # largest last step [table points]: half of what OpenCV's remap resolves
+MAX_LAST_STEP = 1.0 / 64.0  # largest last step [table points]: half of what OpenCV's remap resolves
 TRIANGLE_MARGIN = 1e-9  # share of a triangle by which a point may lie outside: no gap between neighbours
-EDGE_ON = 0.1  # det J of a sheet that is seen edge-on; its slope is as that of one this narrow in the picture
+MIN_JACOBIAN = 0.1  # det J of a sheet that is seen edge-on; its slope is as that of one this narrow in the picture
 OUTSIDE = -1e3  # column and row of what lies beside the gel
 
 
@@ -60,12 +60,12 @@ def sample_surface(surface: GelSurface, grid: PixelGrid) -> SurfaceSample:
     """Height and gradient of the deformed surface at the points of `grid`.
 
     Where the surface folds over itself it is the sheet that the camera sees, and its slope is that of a sheet with
-    det J of EDGE_ON where it turns away.
+    det J of MIN_JACOBIAN where it turns away.
 
     Raises ValueError for an invalid surface (shape, NaN, more sideways motion than the gel is wide).
     """
     table = SurfaceTable(surface)
-    seen, valid = table.seen(table.fields, grid)
+    seen, valid = table.sample_on_grid(table.fields, grid)
     return SurfaceSample(seen[..., 0], seen[..., 1:], valid)
 
 
@@ -79,16 +79,16 @@ class SurfaceTable:
         """Raises what :func:`sample_surface` raises."""
         check_surface(surface)
         self._surface = surface
-        self.fields, self._lateral, self.folded = _table(surface)
-        self.pitch = surface.spacing / _table_points(surface)  # [m]
+        self.fields, self._lateral, self.folded = _tabulate(surface)
+        self.pitch = surface.spacing / _points_per_spacing(surface)  # [m]
 
-    def of_nodes(self, values: Float32) -> Float32:
+    def spline_values(self, values: Float32) -> Float32:
         """(rows, columns, 1) at the table's points of the spline whose control values are `values` (nx, ny)."""
-        points = _table_points(self._surface)
-        along_x, _ = refined(values, points)
-        return refined(np.ascontiguousarray(along_x.T), points)[0][..., None]
+        points = _points_per_spacing(self._surface)
+        along_x, _ = refine_spline(values, points)
+        return refine_spline(np.ascontiguousarray(along_x.T), points)[0][..., None]
 
-    def part(self, grid: PixelGrid) -> tuple[slice, slice]:
+    def visible_part(self, grid: PixelGrid) -> tuple[slice, slice]:
         """Rows and columns of the table in which all lies that is seen at the points of `grid`; at least one."""
         # sideways motion, a neighbour to be linear to, and one to spare, as points are found to a part of one
         reach = 2.0 + max(float(self._lateral.max()), -float(self._lateral.min()))
@@ -101,7 +101,7 @@ class SurfaceTable:
         (rows, columns), (origin_x, origin_y) = self.fields.shape[:2], self._surface.origin
         return along(grid.y0 - origin_y, grid.rows, rows), along(grid.x0 - origin_x, grid.columns, columns)
 
-    def place(self) -> tuple[Float32, Float32]:
+    def deformed_coordinates(self) -> tuple[Float32, Float32]:
         """x and y (rows, columns) where each point is seen [m]."""
         (rows, columns), pitch = self.fields.shape[:2], np.float32(self.pitch)
         origin_x, origin_y = (np.float32(each) for each in self._surface.origin)
@@ -109,57 +109,59 @@ class SurfaceTable:
         y = origin_y + pitch * (np.arange(rows, dtype=np.float32)[:, None] + self._lateral[..., 1])
         return x, y
 
-    def at_places(self, values: Float32, x: Float32, y: Float32) -> Float32:
+    def interpolate_at_rest(self, values: Float32, x: Float32, y: Float32) -> Float32:
         """`values` (rows, columns) of the table's points at places x, y (...,) on the untouched gel [m], linear between
         them; beyond the gel as on its border."""
         origin_x, origin_y = (np.float32(each) for each in self._surface.origin)
         pitch = np.float32(self.pitch)
-        return look_up(values, np.stack([(x - origin_x) / pitch, (y - origin_y) / pitch], axis=-1))
+        return bilinear_lookup(values, np.stack([(x - origin_x) / pitch, (y - origin_y) / pitch], axis=-1))
 
-    def seen(self, values: Float32, grid: PixelGrid, *, fine: bool = True) -> tuple[Float32, NDArray[np.bool_]]:
+    def sample_on_grid(
+        self, values: Float32, grid: PixelGrid, *, fine: bool = True
+    ) -> tuple[Float32, NDArray[np.bool_]]:
         """`values` (rows, columns, n <= 4) of the table's points, linear between them, as seen at the points of `grid`:
         (H, W, n), 0 outside the gel; and (H, W) False there. Not `fine` will do for colours.
         """
-        points, inside = self.points(grid, fine=fine)
-        return self.at(values, points, inside), inside
+        points, inside = self.table_points(grid, fine=fine)
+        return self.interpolate_at(values, points, inside), inside
 
     @staticmethod
-    def at(values: Float32, points: Float32, inside: NDArray[np.bool_]) -> Float32:
+    def interpolate_at(values: Float32, points: Float32, inside: NDArray[np.bool_]) -> Float32:
         """The same where `points` and `inside` are known already."""
-        seen = look_up(values, points)
+        seen = bilinear_lookup(values, points)
         if not inside.all():
             seen[~inside] = 0.0
         return seen
 
-    def points(self, grid: PixelGrid, *, fine: bool = True) -> tuple[Float32, NDArray[np.bool_]]:
+    def table_points(self, grid: PixelGrid, *, fine: bool = True) -> tuple[Float32, NDArray[np.bool_]]:
         """(H, W, 2) column, row in the table of what is seen at the points of `grid`; (H, W) False outside the gel."""
         if not self.folded:
             try:
-                return self._of_one_sheet(grid, fine)
+                return self._unfolded_points(grid, fine)
             except SurfaceFolded:  # between the points of the table
                 pass
         seen = _table_coordinates(self._surface.origin, self.pitch, grid)[0, 0].astype(np.float64)
         at = np.indices(self.fields.shape[:2], dtype=np.float64)[::-1].transpose(1, 2, 0) + self._lateral
-        return visible_points((at - seen) * (self.pitch / grid.pitch), self.fields[..., 0], grid.shape)
+        return visible_table_points((at - seen) * (self.pitch / grid.pitch), self.fields[..., 0], grid.shape)
 
-    def _of_one_sheet(self, grid: PixelGrid, fine: bool) -> tuple[Float32, NDArray[np.bool_]]:
-        """:meth:`points` of a surface that does not fold over. Raises SurfaceFolded where it turns out to do so."""
+    def _unfolded_points(self, grid: PixelGrid, fine: bool) -> tuple[Float32, NDArray[np.bool_]]:
+        """:meth:`table_points` of a surface that does not fold over. Raises SurfaceFolded where it does."""
         # Where the grid is finer than the table, points are found on a coarser one, twice as fine as the table or, not
         # `fine`, just as fine, and are linear between those: the surface's sideways motion is smooth. The first errs
         # less than the look-up rounds; the second about as much, but by half a pixel where a slide shears the surface.
-        block = max(1, self.points_a_cell(grid) // (2 if fine else 1))  # points a coarse one, along a side
-        points = spread(self._material_points(thinned(grid, block)), block, grid.shape)
+        block = max(1, self.points_per_cell(grid) // (2 if fine else 1))  # points a coarse one, along a side
+        points = interpolate_blocks(self._material_points(block_centres(grid, block)), block, grid.shape)
         # where no sheet folds over, what lies within a border that is on the gel is on it, too
         border = np.concatenate([points[0], points[-1], points[:, 0], points[:, -1]])
-        on_gel = self._on_gel(border[None]).all()
-        return points, np.ones(grid.shape, dtype=np.bool_) if on_gel else self._on_gel(points)
+        on_gel = self._is_on_table(border[None]).all()
+        return points, np.ones(grid.shape, dtype=np.bool_) if on_gel else self._is_on_table(points)
 
-    def points_a_cell(self, grid: PixelGrid) -> int:
+    def points_per_cell(self, grid: PixelGrid) -> int:
         """Whole points of `grid` that lie along a side of one cell of the table; at least 1."""
         return max(1, int(self.pitch / grid.pitch * (1 + 1e-6)))
 
-    def at_rest(self, points: Float32, grid: PixelGrid) -> Float32:
-        """(H, W, 2) column, row in `grid` of where `points` of :meth:`points` lie on the untouched gel."""
+    def rest_coordinates(self, points: Float32, grid: PixelGrid) -> Float32:
+        """(H, W, 2) column, row in `grid` of where `points` of :meth:`table_points` lie on the untouched gel."""
         import cv2
 
         scale = self.pitch / grid.pitch
@@ -172,24 +174,24 @@ class SurfaceTable:
         import cv2
 
         seen = _table_coordinates(self._surface.origin, self.pitch, grid)
-        last, points = seen, seen - look_up(self._lateral, seen)
+        last, points = seen, seen - bilinear_lookup(self._lateral, seen)
         for _ in range(FIXED_POINT_STEPS - 1):
             # not cv2.norm of both: a signal that raises in it, such as Ctrl-C, ends the process (OpenCV 4.13)
-            if cv2.norm(cv2.absdiff(points, last), cv2.NORM_INF) <= CONVERGED:
+            if cv2.norm(cv2.absdiff(points, last), cv2.NORM_INF) <= MAX_LAST_STEP:
                 return points
-            last, points = points, seen - look_up(self._lateral, points)
-        restless = np.abs(points - last).max(axis=2) > CONVERGED
+            last, points = points, seen - bilinear_lookup(self._lateral, points)
+        restless = np.abs(points - last).max(axis=2) > MAX_LAST_STEP
         exact = material_points(self._surface, self._surface.origin + self.pitch * seen[restless].astype(np.float64))
         points[restless] = (exact - self._surface.origin) / self.pitch
         return points
 
-    def _on_gel(self, points: Float32) -> NDArray[np.bool_]:
+    def _is_on_table(self, points: Float32) -> NDArray[np.bool_]:
         """(rows, columns) where material points [table points] lie on the table."""
         import cv2
 
         rows, columns = self.fields.shape[:2]
-        first: Any = (-CONVERGED, -CONVERGED)  # OpenCV 4.13 declares arrays only, and takes these too
-        last: Any = (columns - 1 + CONVERGED, rows - 1 + CONVERGED)
+        first: Any = (-MAX_LAST_STEP, -MAX_LAST_STEP)  # OpenCV 4.13 declares arrays only, and takes these too
+        last: Any = (columns - 1 + MAX_LAST_STEP, rows - 1 + MAX_LAST_STEP)
         inside = cv2.inRange(points, first, last)
         return np.asarray(inside, dtype=np.bool_)
 
@@ -221,11 +223,11 @@ def material_points(surface: GelSurface, points: NDArray[np.float64]) -> NDArray
         deformation = np.eye(2) + jacobian[:, :2, :]
         folded = np.linalg.det(deformation) <= 0.0
         if folded.any():
-            raise _folded(found[folded])
+            raise _is_folded(found[folded])
         move = np.linalg.solve(deformation, residual[..., None])[..., 0]
         length = np.linalg.norm(move, axis=1, keepdims=True)
         found -= move * np.minimum(1.0, surface.spacing / np.maximum(length, 1e-300))  # at most one lattice cell a step
-    raise _folded(found[np.abs(residual).max(axis=1) >= 1e-9])
+    raise _is_folded(found[np.abs(residual).max(axis=1) >= 1e-9])
 
 
 def check_surface(surface: GelSurface) -> None:
@@ -248,33 +250,33 @@ def check_surface(surface: GelSurface) -> None:
         raise ValueError(f"gel surface moved {lateral:.3g} m sideways, more than the gel is wide ({width:.3g} m)")
 
 
-def _table(surface: GelSurface) -> tuple[Float32, Float32, bool]:
+def _tabulate(surface: GelSurface) -> tuple[Float32, Float32, bool]:
     """(height, gradient x, gradient y) and (u_x, u_y [table points]) at material points over the gel, rows along y; and
     whether the surface folds over at some of them. The slope of what faces away is that of a sheet seen edge-on: it is
     read only between such points and visible ones."""
     displacement = np.asarray(surface.displacement, dtype=np.float32)
-    return _table_of(displacement.tobytes(), displacement.shape, surface.spacing, tuple(surface.origin))
+    return _cached_table(displacement.tobytes(), displacement.shape, surface.spacing, tuple(surface.origin))
 
 
 @lru_cache(maxsize=4)  # a picture and a map of one surface are asked one after the other
-def _table_of(
+def _cached_table(
     displacement: bytes, shape: tuple[int, ...], spacing: float, origin: tuple[float, float]
 ) -> tuple[Float32, Float32, bool]:
     """The same for everybody: not to be written to."""
     control = np.frombuffer(displacement, np.float32).reshape(shape)
     surface = GelSurface(control, spacing, origin)
-    points = _table_points(surface)
+    points = _points_per_spacing(surface)
     nx, ny, _ = shape
     # along x, then along y, where rows are nodes along y, and columns x of one component after the other
-    in_x = (each.reshape(-1, ny, 3).transpose(1, 2, 0) for each in refined(control.reshape(nx, -1), points))
-    (value, by_y), (by_x, _) = (refined(np.ascontiguousarray(each).reshape(ny, -1), points) for each in in_x)
+    in_x = (each.reshape(-1, ny, 3).transpose(1, 2, 0) for each in refine_spline(control.reshape(nx, -1), points))
+    (value, by_y), (by_x, _) = (refine_spline(np.ascontiguousarray(each).reshape(ny, -1), points) for each in in_x)
     value, by_x, by_y = (each.reshape(len(each), 3, -1).transpose(1, 0, 2) for each in (value, by_x, by_y))
     # by lattice spacings: J is `spacing` times itself, and a gradient, as a ratio, what it is
     a, b, c, d = spacing + by_x[0], by_y[0], by_x[1], spacing + by_y[1]  # J = [[a, b], [c, d]]
     determinant = a * d - b * c
     folded = float(determinant.min()) <= 0.0
     if folded:
-        determinant = np.maximum(determinant, np.float32(EDGE_ON * spacing**2))
+        determinant = np.maximum(determinant, np.float32(MIN_JACOBIAN * spacing**2))
     inverse = -1.0 / determinant  # the minus turns u_z into height
     gradient_x, gradient_y = (d * by_x[2] - c * by_y[2]) * inverse, (a * by_y[2] - b * by_x[2]) * inverse
     fields = np.stack([-value[2], gradient_x, gradient_y], axis=-1)
@@ -284,9 +286,11 @@ def _table_of(
     return fields, lateral, folded
 
 
-def _table_points(surface: GelSurface) -> int:
+def _points_per_spacing(surface: GelSurface) -> int:
     """Table points for each lattice spacing: even, so that every kink of the gradient lies on one."""
-    return max(4, 2 * math.ceil(surface.spacing / (2 * max(TABLE_PITCH, surface.spacing / MOST_POINTS)) - 1e-9))
+    return max(
+        4, 2 * math.ceil(surface.spacing / (2 * max(TABLE_PITCH, surface.spacing / MAX_POINTS_PER_SPACING)) - 1e-9)
+    )
 
 
 @lru_cache(maxsize=16)
@@ -297,7 +301,7 @@ def _table_coordinates(origin: tuple[float, float], pitch: float, grid: PixelGri
     return coordinates
 
 
-def thinned(grid: PixelGrid, block: int) -> PixelGrid:
+def block_centres(grid: PixelGrid, block: int) -> PixelGrid:
     """The middles of blocks of `block` x `block` points, and one more block on each side; of 1, the grid itself."""
     if block == 1:
         return grid
@@ -306,9 +310,9 @@ def thinned(grid: PixelGrid, block: int) -> PixelGrid:
     return PixelGrid(rows, columns, grid.pitch * block, grid.x0 + shift, grid.y0 + shift)
 
 
-def spread(values: Float32, block: int, shape: tuple[int, int]) -> Float32:
+def interpolate_blocks(values: Float32, block: int, shape: tuple[int, int]) -> Float32:
     """(rows, columns, n <= 4) at the points of the grid of `shape`, linear between `values` at those that
-    :func:`thinned` left of it."""
+    :func:`block_centres` left of it."""
     import cv2
 
     if block == 1:
@@ -318,7 +322,7 @@ def spread(values: Float32, block: int, shape: tuple[int, int]) -> Float32:
     return np.asarray(fine[block : block + shape[0], block : block + shape[1]], dtype=np.float32)
 
 
-def look_up(field: Float32, points: Float32) -> Float32:
+def bilinear_lookup(field: Float32, points: Float32) -> Float32:
     """`field` (rows, columns, n <= 4) at fractional columns and rows `points` (H, W, 2), linear between entries; beyond
     the border as on it. OpenCV rounds `points` to 1/32."""
     import cv2
@@ -328,7 +332,7 @@ def look_up(field: Float32, points: Float32) -> Float32:
     return np.asarray(found, dtype=np.float32)
 
 
-def _folded(points: NDArray[np.float64]) -> SurfaceFolded:
+def _is_folded(points: NDArray[np.float64]) -> SurfaceFolded:
     x, y = points[0] * 1e3
     return SurfaceFolded(
         f"the gel surface folds over at {len(points)} points, first at x = {x:.3f} mm, y = {y:.3f} mm: it is no height "
@@ -336,7 +340,9 @@ def _folded(points: NDArray[np.float64]) -> SurfaceFolded:
     )
 
 
-def visible_points(places: FloatArray, height: Float32, shape: tuple[int, int]) -> tuple[Float32, NDArray[np.bool_]]:
+def visible_table_points(
+    places: FloatArray, height: Float32, shape: tuple[int, int]
+) -> tuple[Float32, NDArray[np.bool_]]:
     """The points of a surface's table that an image shows.
 
     places: (rows, columns, 2) where the table's points are seen, column and row in the image; height: (rows, columns)
@@ -347,7 +353,7 @@ def visible_points(places: FloatArray, height: Float32, shape: tuple[int, int]) 
     found = np.full((shape[0] * shape[1], 2), OUTSIDE, dtype=np.float32)
     deepest = np.full(len(found), -np.inf)
     for row in range(len(places) - 1):
-        pixels, points, depth = _covered(places[row : row + 2], height[row : row + 2], shape)
+        pixels, points, depth = _covered_points(places[row : row + 2], height[row : row + 2], shape)
         order = np.argsort(depth)  # of one pixel the last is kept
         order = order[depth[order] > deepest[pixels[order]]]
         pixels, points, depth = pixels[order], points[order], depth[order]
@@ -357,7 +363,7 @@ def visible_points(places: FloatArray, height: Float32, shape: tuple[int, int]) 
     return found.reshape(*shape, 2), np.isfinite(deepest).reshape(shape)
 
 
-def _covered(
+def _covered_points(
     places: FloatArray, height: Float32, shape: tuple[int, int]
 ) -> tuple[NDArray[np.intp], FloatArray, FloatArray]:
     """Image points (n,) under triangles between two rows of a table (2, columns, ...) that face the camera, one entry a

@@ -17,7 +17,7 @@ from tacsim.optics.picture_file import (
     MAX_SIDE,
     BadPicture,
     check_size,
-    opened_picture,
+    open_picture,
     upright_rgb,
     upright_size,
 )
@@ -61,9 +61,9 @@ def decode_image(
 
 @contextmanager
 def _opened(source: Path | io.BytesIO, what: str, formats: tuple[str, ...]) -> Iterator[Image]:
-    """See `opened_picture`. Raises EpisodeError."""
+    """See `open_picture`. Raises EpisodeError."""
     try:
-        with opened_picture(source, what, formats) as picture:
+        with open_picture(source, what, formats) as picture:
             yield picture
     except BadPicture as failure:
         raise EpisodeError(str(failure)) from failure.__cause__

@@ -83,9 +83,9 @@ class SimArm:
         self._max_step, self._max_turn = max_step, max_turn
         self._limits, self._keep_out = limits, tuple(keep_out)
         self._region = None if limits is None else limits.region
-        self.believe(error, delay, noise)
+        self.set_measurement_errors(error, delay, noise)
 
-    def believe(self, error: Pose | None, delay: int, noise: WrenchNoiseSource | None = None) -> None:
+    def set_measurement_errors(self, error: Pose | None, delay: int, noise: WrenchNoiseSource | None = None) -> None:
         """Another error, delay and noise, from the next episode on."""
         self._error, self._past, self._noise = error, Delayed[ArmState](delay), noise
 
@@ -101,14 +101,14 @@ class SimArm:
         if self._noise is not None:
             wrench = wrench + self._noise(self._clock.periods, self._clock.period, self._clock.episode)
         return ArmState(
-            pose=self._believed(),
+            pose=self._measured_pose(),
             twist=self._clock.velocities.get(self._frame, np.zeros(6)).copy(),
             wrench=wrench,
             joints=None,
             time=self._clock.now(),
         )
 
-    def _believed(self) -> Pose:
+    def _measured_pose(self) -> Pose:
         here = self._world.pose(self._frame)
         return here if self._error is None else se3.compose(here, self._error)
 
@@ -119,7 +119,8 @@ class SimArm:
             return np.array(world.wrench(self._frame), dtype=np.float64)
         here = world.pose(self._frame)
         parts = [
-            se3.transform_wrench(se3.relative(here, world.pose(name)), world.wrench(name)) for name in world.sensors
+            se3.transform_wrench(se3.relative_pose(here, world.pose(name)), world.wrench(name))
+            for name in world.sensors
         ]
         reaction: FloatArray = -np.sum(parts, axis=0)
         return reaction
@@ -129,9 +130,9 @@ class SimArm:
         self._check_wrench()
         if target is None:
             return None
-        now = self._believed()
-        allowed, _ = clip_to_region(target, now, self._region, self._spheres())
-        allowed = limit_step(allowed, now, self._max_step, self._max_turn)
+        measured = self._measured_pose()
+        allowed, _ = clip_to_region(target, measured, self._region, self._spheres())
+        allowed = limit_step(allowed, measured, self._max_step, self._max_turn)
         real = allowed if self._error is None else se3.compose(allowed, se3.inverse(self._error))
         self._clock.command(self._frame, real, limited=allowed is not target)
         return allowed

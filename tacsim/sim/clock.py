@@ -23,16 +23,16 @@ class Delayed(Generic[Value]):
         self._past: deque[Value] = deque(maxlen=delay + 1)
         self._version = -1
 
-    def __call__(self, clock: SimClock, look: Callable[[], Value]) -> Value:
-        """`look` is called once for each state of the world."""
+    def __call__(self, clock: SimClock, observe: Callable[[], Value]) -> Value:
+        """`observe` is called once for each state of the world."""
         if self._version != clock.version or not self._past:
             if clock.now() == 0.0:
                 self._past.clear()
-            self._past.append(look())
+            self._past.append(observe())
             self._version = clock.version
         return self._past[0]
 
-    def forget(self) -> None:
+    def clear(self) -> None:
         self._past.clear()
 
 
@@ -101,7 +101,8 @@ class SimClock:
         elif self.stats is not None:
             self.stats = replace(self.stats, substeps=0, hold=0)
         self.velocities = {
-            frame: se3.difference(old, self._world.pose(frame)) / self.period for frame, old in self._before.items()
+            frame: se3.pose_difference(old, self._world.pose(frame)) / self.period
+            for frame, old in self._before.items()
         }
         self._time += self.period
         self.periods += 1

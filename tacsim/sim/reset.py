@@ -13,15 +13,15 @@ from tacsim.interface import Pose, TactileFrame, Truth
 from tacsim.physics.move import MoveStats
 from tacsim.physics.world import World
 from tacsim.sim.clock import SimClock
+from tacsim.sim.scene_world import SceneWorld, StatePool
 from tacsim.sim.sensor import SimSensor
-from tacsim.sim.stage import Stage, StatePool
 
 CLEARANCE = 0.05e-3  # gap that an approach begins at [m]
 FIRST_TOUCH = 0.01e-3  # its first step, beyond that gap: flat bodies then press with about 0.05 N [m]
-FIRST_STEP = 0.1e-3  # its longest [m]
+MAX_STEP = 0.1e-3  # its longest [m]
 TOUCH_TOLERANCE = 0.2  # the touch force may be exceeded by this fraction
-MOST_MOVES = 80  # of one approach
-SMALLEST_STEP = 1e-8  # an approach that needs finer steps has met something that never gives a gentle force [m]
+MAX_MOVES = 80  # of one approach
+MIN_STEP = 1e-8  # an approach that needs finer steps has met something that never gives a gentle force [m]
 
 
 class SimReset:
@@ -36,26 +36,26 @@ class SimReset:
 
     def __init__(
         self,
-        stage: Stage,
+        scene_world: SceneWorld,
         clock: SimClock,
         sensors: Mapping[str, SimSensor],
         touch_force: float | None,
         placement: float = 0.0,
         pool: StatePool | None = None,
     ) -> None:
-        self._stage, self._clock, self._sensors = stage, clock, sensors
+        self._scene_world, self._clock, self._sensors = scene_world, clock, sensors
         self._touch_force, self._placement = touch_force, placement
         self._pool = StatePool() if pool is None else pool
         self._offset = np.zeros(2)
 
     def clear(self, seed: int) -> Mapping[str, TactileFrame]:
-        stage = self._stage
-        stage.rewind()
+        scene_world = self._scene_world
+        scene_world.rewind()
         self._offset = self._placement * np.random.default_rng(seed).uniform(-1.0, 1.0, size=2)
         if self._offset.any():
             shift = np.append(self._offset, 0.0)
-            poses = {name: stage.pose(name) for name in stage.sensors}
-            stage.place({name: Pose(pose.position + shift, pose.quaternion) for name, pose in poses.items()})
+            poses = {name: scene_world.pose(name) for name in scene_world.sensors}
+            scene_world.place({name: Pose(pose.position + shift, pose.quaternion) for name, pose in poses.items()})
         self._clock.restart(episode=seed)
         for sensor in self._sensors.values():
             sensor.restart(seed)
@@ -65,13 +65,17 @@ class SimReset:
         """Raises NoTouch when no gentle contact is found."""
         if self._touch_force is None:
             return
-        start = (self._stage.scene.model_dump_json(), *self._offset.tolist(), self._touch_force)  # numbers: -0.0 is 0.0
+        start = (
+            self._scene_world.scene.model_dump_json(),
+            *self._offset.tolist(),
+            self._touch_force,
+        )  # numbers: -0.0 is 0.0
         touched = self._pool.find(start)
         if touched is None:
-            stats = approach_force(self._stage, self._touch_force)
-            self._pool.keep(start, self._stage.snapshot(), stats)
+            stats = approach_force(self._scene_world, self._touch_force)
+            self._pool.store(start, self._scene_world.snapshot(), stats)
         else:
-            self._stage.restore(touched[0])
+            self._scene_world.restore(touched[0])
             stats = touched[1]
         self._clock.restart(stats)
 
@@ -83,21 +87,21 @@ def approach_force(world: World, touch_force: float) -> MoveStats | None:
     touch_force * (1 + TOUCH_TOLERANCE) is undone by restoring the world, so that the body keeps no trace of it, and its
     end bounds the steps that follow. Returns how the last move went, None if there was none. Raises NoTouch.
     """
-    most = touch_force * (1 + TOUCH_TOLERANCE)
-    begins, stats = _close_gaps(world, most), None
+    max_force = touch_force * (1 + TOUCH_TOLERANCE)
+    begins, stats = _close_gaps(world, max_force), None
     here, bound = 0.0, math.inf  # travelled by each sensor; where the force is too large [m]
-    tried = [(here, _least_force(world))]  # (distance, force) of every state tried
+    tried = [(here, _min_force(world))]  # (distance, force) of every state tried
     step = 0.0
-    for _ in range(MOST_MOVES):
+    for _ in range(MAX_MOVES):
         if tried[-1][0] == here and tried[-1][1] >= touch_force:
             return stats
         step = _next_distance(tried, here, bound, touch_force * (1 + TOUCH_TOLERANCE / 2), begins) - here
-        if step < SMALLEST_STEP:
+        if step < MIN_STEP:
             break
         before = world.snapshot()
-        stats = _advance(world, dict.fromkeys(world.sensors, step))
-        tried.append((here + step, _least_force(world)))
-        if tried[-1][1] > most:
+        stats = _advance_sensors(world, dict.fromkeys(world.sensors, step))
+        tried.append((here + step, _min_force(world)))
+        if tried[-1][1] > max_force:
             world.restore(before)
             bound = here + step
         else:
@@ -110,12 +114,12 @@ def approach_force(world: World, touch_force: float) -> MoveStats | None:
 
 
 def _next_distance(
-    tried: list[tuple[float, float]], here: float, bound: float, wanted: float, begins: float | None
+    tried: list[tuple[float, float]], here: float, bound: float, desired: float, begins: float | None
 ) -> float:
-    """The distance [m] at which the force `wanted` [N] is expected, between `here` and `bound`: on the secant through
+    """The distance [m] at which the force `desired` [N] is expected, between `here` and `bound`: on the secant through
     the last two states in contact. One of them may be that in which contact `begins`; where that is not known, it is
     taken to be half-way to the first state in contact."""
-    farthest = min(bound, here + FIRST_STEP)
+    farthest = min(bound, here + MAX_STEP)
     contacts = [(distance, force) for distance, force in tried if force > 0][-2:]
     if not contacts:
         return farthest if begins is None or here > 0.0 else min(farthest, begins + FIRST_TOUCH)
@@ -123,47 +127,47 @@ def _next_distance(
         contacts.insert(0, (begins, 0.0))
     x, force = contacts[-1]
     if len(contacts) == 2 and (force - contacts[0][1]) * (x - contacts[0][0]) > 0:
-        aim = x + (wanted - force) * (x - contacts[0][0]) / (force - contacts[0][1])
+        aim = x + (desired - force) * (x - contacts[0][0]) / (force - contacts[0][1])
     else:
-        aim = here + (x - here) * (0.5 + 0.5 * wanted / force) if force > wanted else farthest
+        aim = here + (x - here) * (0.5 + 0.5 * desired / force) if force > desired else farthest
     margin = 0.01 * (farthest - here)
     return min(max(aim, here + margin), farthest if bound > farthest else farthest - margin)
 
 
-def _close_gaps(world: World, most: float) -> float | None:
+def _close_gaps(world: World, max_force: float) -> float | None:
     """Puts each sensor at CLEARANCE before the body's nearest particle, if there is a body and a gap.
 
-    Returns how far from there contact begins [m], None where that is not known. Undone if the force exceeds `most` [N]:
-    on a shared grid, contact begins at a distance.
+    Returns how far from there contact begins [m], None where that is not known. Undone if the force exceeds
+    `max_force` [N]: on a shared grid, contact begins at a distance.
     """
     truth = world.truth()
     if truth is None:
         return None
-    gaps = {name: _gap(truth, world.pose(name)) - CLEARANCE for name in world.sensors}
-    wanted = {name: gap for name, gap in gaps.items() if gap > 0}
-    if not wanted:
+    gaps = {name: _gap_to_body(truth, world.pose(name)) - CLEARANCE for name in world.sensors}
+    desired = {name: gap for name, gap in gaps.items() if gap > 0}
+    if not desired:
         return None
     before = world.snapshot()
-    world.place({name: se3.along_z(world.pose(name), gap) for name, gap in wanted.items()})
-    if _least_force(world) > most:
+    world.place({name: se3.translated_along_z(world.pose(name), gap) for name, gap in desired.items()})
+    if _min_force(world) > max_force:
         world.restore(before)
         return None
-    return CLEARANCE if len(wanted) == len(gaps) else None
+    return CLEARANCE if len(desired) == len(gaps) else None
 
 
-def _gap(truth: Truth, sensor: Pose) -> float:
+def _gap_to_body(truth: Truth, sensor: Pose) -> float:
     """From the gel's rest surface to the nearest face of the body, along the sensor's z [m]."""
     points = truth.points.astype(np.float64)
     radius = 0.5 * (truth.height - float(np.ptp(points[:, 2])))
-    axis = se3.matrix(sensor)[:, 2]
+    axis = se3.rotation_matrix(sensor)[:, 2]
     return float(((points - sensor.position) @ axis).min()) - radius
 
 
-def _advance(world: World, steps: Mapping[str, float]) -> MoveStats:
+def _advance_sensors(world: World, steps: Mapping[str, float]) -> MoveStats:
     """Moves each named sensor along its own z by its step [m]."""
-    return world.move({name: se3.along_z(world.pose(name), step) for name, step in steps.items()})
+    return world.move({name: se3.translated_along_z(world.pose(name), step) for name, step in steps.items()})
 
 
-def _least_force(world: World) -> float:
+def _min_force(world: World) -> float:
     """Smallest normal force over the sensors, positive when pressed [N]."""
     return min(-float(world.wrench(name)[2]) for name in world.sensors)

@@ -77,13 +77,13 @@ class SimSensor:
             stats=self._clock.diagnostics(),
         )
 
-    def wear(self, render: Callable[[GelSurface], Image], noise: NoiseSource | None, delay: int) -> None:
+    def apply_variation(self, render: Callable[[GelSurface], Image], noise: NoiseSource | None, delay: int) -> None:
         """Other light and another camera, from the next episode on."""
         self._camera, self._past = SimCamera(render, noise), Delayed[TactileFrame](delay)
 
     def restart(self, episode: int = 0) -> None:
         """Counts frames from zero again; `episode` seeds the noise."""
-        self._past.forget()
+        self._past.clear()
         self._index, self._episode = 0, episode
 
     def close(self) -> None:

@@ -9,7 +9,16 @@ from tacsim.models.rig import KneadConfig, RepositionConfig, SqueezeConfig, Task
 from tacsim.tasks.knead import Knead
 from tacsim.tasks.reposition import Reposition
 from tacsim.tasks.squeeze import Squeeze
-from tacsim.tasks.task import Axis, BadDraws, Estimator, GoalOutOfReach, Outcome, Task, judge, tolerance
+from tacsim.tasks.task import (
+    Axis,
+    BadDraws,
+    Estimator,
+    GoalOutOfReach,
+    Outcome,
+    Task,
+    evaluate_outcome,
+    tolerance_reward,
+)
 
 __all__ = [
     "Axis",
@@ -21,13 +30,13 @@ __all__ = [
     "Reposition",
     "Squeeze",
     "Task",
-    "judge",
+    "evaluate_outcome",
     "make_task",
     "register_task",
-    "tolerance",
+    "tolerance_reward",
 ]
 
-_MADE_OF: dict[type[TaskConfig], Callable[[Any], Task]] = {
+_TASK_OF_CONFIG: dict[type[TaskConfig], Callable[[Any], Task]] = {
     SqueezeConfig: Squeeze,
     RepositionConfig: Reposition,
     KneadConfig: Knead,
@@ -43,11 +52,11 @@ def register_task(config: type[TaskConfig], task: Callable[[Any], Task]) -> None
     Raises ValueError for a config without a kind of its own.
     """
     know_task(config)
-    _MADE_OF[config] = task
+    _TASK_OF_CONFIG[config] = task
 
 
 def make_task(config: TaskConfig) -> Task:
     """The task that `config` describes. Raises ValueError for one that nobody registered."""
-    if type(config) not in _MADE_OF:
+    if type(config) not in _TASK_OF_CONFIG:
         raise ValueError(f"no task is made of {type(config).__name__}: register_task makes yours known")
-    return _MADE_OF[type(config)](config)
+    return _TASK_OF_CONFIG[type(config)](config)

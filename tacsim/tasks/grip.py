@@ -47,7 +47,7 @@ class Grip:
             return Action({arm or sensor: None for sensor, arm in self._carriers.items()})
         return Action(
             {
-                arm or sensor: se3.along_z(Pose() if arm is None else observation.arms[arm].pose, self._step)
+                arm or sensor: se3.translated_along_z(Pose() if arm is None else observation.arms[arm].pose, self._step)
                 for sensor, arm in self._carriers.items()
             }
         )

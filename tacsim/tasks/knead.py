@@ -15,14 +15,23 @@ from tacsim.interface import Action, ArmState, FloatArray, Needs, Observation, P
 from tacsim.models.rig import KneadConfig
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.optics.grid import canonical_cells
-from tacsim.tasks.solids import Solid, centred, chamfer, earth_movers, iou, spread
+from tacsim.tasks.solids import (
+    Solid,
+    centre_points,
+    chamfer_distance,
+    earth_movers_distance,
+    intersection_over_union,
+    select_evenly,
+)
 from tacsim.tasks.squeeze import BOTH, estimated_height
 from tacsim.tasks.task import Axis, Estimator, GoalOutOfReach, Task
 
-OF_YIELD = 0.9  # most pressure of the teacher, over the yield stress: clay that is pressed harder is flattened
-IN_STEPS = 30.0  # of the teacher: it takes so large a part of the height that is left in each control step
-THERE = 0.2  # of max_step: so near to where it goes, the scripted policy turns
-AIMS = (1.0, -1.0, 0.0)  # of a stroke: to one side, to the other, to the middle
+MAX_PRESSURE_SHARE = (
+    0.9  # most pressure of the teacher, over the yield stress: clay that is pressed harder is flattened
+)
+CLOSING_STEPS = 30.0  # of the teacher: it takes so large a part of the height that is left in each control step
+ARRIVAL_SHARE = 0.2  # of max_step: so near to where it goes, the scripted policy turns
+STROKE_TARGETS = (1.0, -1.0, 0.0)  # of a stroke: to one side, to the other, to the middle
 GOLDEN_ANGLE = np.pi * (3.0 - 5.0**0.5)  # no two strokes of a ball's go one way
 REMEMBERED = 60  # touches; what was felt before has been kneaded since
 POINTS = 150  # kept of a touch
@@ -47,7 +56,7 @@ class Knead(Task):
                 )
 
     @property
-    def needs_to_feel(self) -> Needs:
+    def touch_needs(self) -> Needs:
         return Needs(BOTH, BOTH, height=True)
 
     @property
@@ -75,15 +84,15 @@ class Knead(Task):
     @cached_property
     def solid(self) -> Solid:
         rod = self.config.shape == "rod"
-        return Solid.rod(self.volume, self.config.slenderness) if rod else Solid.ball(self.volume)
+        return Solid.make_rod(self.volume, self.config.slenderness) if rod else Solid.make_ball(self.volume)
 
     def distance(self, truth: Truth, start: Truth) -> float:
-        return chamfer(centred(truth.points), self.solid, self.volume)
+        return chamfer_distance(centre_points(truth.points), self.solid, self.volume)
 
     def measures(self, truth: Truth, start: Truth) -> Mapping[str, float]:
         """How alike body and solid are in other words: `earth_movers` [m], `iou` [-], and of each the improvement
         since `start`: 0 none (or worse), 1 all."""
-        now, then = (self._measured(each) for each in (truth, start))
+        now, then = (self._shape_measures(each) for each in (truth, start))
         better = {
             "chamfer": 1.0 - now["chamfer"] / then["chamfer"],
             "earth_movers": 1.0 - now["earth_movers"] / then["earth_movers"],
@@ -91,23 +100,23 @@ class Knead(Task):
         }
         return now | {f"{name}_improvement": max(0.0, share) for name, share in better.items()}
 
-    def _measured(self, truth: Truth) -> dict[str, float]:
-        body = centred(truth.points)
+    def _shape_measures(self, truth: Truth) -> dict[str, float]:
+        body = centre_points(truth.points)
         return {
-            "chamfer": chamfer(body, self.solid, self.volume),
-            "earth_movers": earth_movers(spread(body), self.solid.spread),
-            "iou": iou(body, self.solid),
+            "chamfer": chamfer_distance(body, self.solid, self.volume),
+            "earth_movers": earth_movers_distance(select_evenly(body), self.solid.sample_points),
+            "iou": intersection_over_union(body, self.solid),
         }
 
     def estimator(self, canonical: CanonicalGrid) -> Estimator:
-        shape = FeltShape(self.volume, canonical)
+        shape = TactileShape(self.volume, canonical)
 
-        def felt(observation: Observation) -> float | None:
-            shape.feel(observation)
+        def tactile_estimate(observation: Observation) -> float | None:
+            shape.add_observation(observation)
             points = shape.points()
-            return None if points is None else chamfer(points, self.solid, self.volume)
+            return None if points is None else chamfer_distance(points, self.solid, self.volume)
 
-        return felt
+        return tactile_estimate
 
     def scripted(self, *, through: bool = False) -> Policy:
         return ScriptedKnead(self, through)
@@ -115,7 +124,7 @@ class Knead(Task):
     def teacher(self) -> Policy:
         body = self.config.scene.body
         yields = None if body is None else body.material.yield_stress
-        return ScriptedKnead(self, False) if yields is None else KneadTeacher(self, False, OF_YIELD * yields)
+        return ScriptedKnead(self, False) if yields is None else KneadTeacher(self, False, MAX_PRESSURE_SHARE * yields)
 
 
 class ScriptedKnead:
@@ -149,40 +158,43 @@ class ScriptedKnead:
         lower, upper = observation.arms["lower"], observation.arms["upper"]
         if self._start is None:
             self._start = np.array(upper.pose.position)
-        closer = self._closer(observation)
-        beside = self._beside(upper.pose.position[:2] - self._start[:2])
+        closing = self._closing_step(observation)
+        lateral = self._lateral_step(upper.pose.position[:2] - self._start[:2])
         return Action(
             {
-                "lower": Pose(lower.pose.position + [0.0, 0.0, closer], lower.pose.quaternion),
-                "upper": Pose(upper.pose.position + [*beside, -closer], upper.pose.quaternion),
+                "lower": Pose(lower.pose.position + [0.0, 0.0, closing], lower.pose.quaternion),
+                "upper": Pose(upper.pose.position + [*lateral, -closing], upper.pose.quaternion),
             }
         )
 
-    def _closer(self, observation: Observation) -> float:
+    def _closing_step(self, observation: Observation) -> float:
         """How far each sensor goes towards the other [m]."""
         if not self._through and estimated_height(observation) <= self._task.goal[2]:
             return -0.2 * self._task.config.max_step
-        return self._by_force(observation)
+        return self._force_step(observation)
 
-    def _by_force(self, observation: Observation) -> float:
-        """As `_closer`, to the force that it holds."""
+    def _force_step(self, observation: Observation) -> float:
+        """As `_closing_step`, to the force that it holds."""
         longest = self._task.config.max_step
         force = -0.5 * float(observation.arms["lower"].wrench[2] + observation.arms["upper"].wrench[2])
         return float(np.clip(self.gain * (self._force - force), -longest, longest))
 
-    def _beside(self, now: FloatArray) -> FloatArray:
+    def _lateral_step(self, now: FloatArray) -> FloatArray:
         """(2,) step of the upper sensor, `now` so far beside where it began [m]: to one side, to the other, and through
         the middle again. It goes on as the sensor moves, not by a clock: who learns from it sees that, too."""
         longest = self._task.config.max_step
         moved, self._before = now - self._before, now
-        along = float(moved @ self._side())
-        part = 1 if along < -THERE * longest else 2 if float(now @ self._side()) < 0 else 0
-        while float(np.linalg.norm(left := AIMS[part] * self._reach * self._side() - now)) < THERE * longest:
+        along = float(moved @ self._stroke_direction())
+        part = 1 if along < -ARRIVAL_SHARE * longest else 2 if float(now @ self._stroke_direction()) < 0 else 0
+        while (
+            float(np.linalg.norm(left := STROKE_TARGETS[part] * self._reach * self._stroke_direction() - now))
+            < ARRIVAL_SHARE * longest
+        ):
             part = (part + 1) % 3
             self._strokes += part == 0
         return left * min(1.0, 0.9 * longest / float(np.linalg.norm(left)))
 
-    def _side(self) -> FloatArray:
+    def _stroke_direction(self) -> FloatArray:
         """(2,) where the first half of this stroke goes, unit vector."""
         turn = 0.5 * np.pi if self._task.config.shape == "rod" else GOLDEN_ANGLE * self._strokes
         return np.array([np.cos(turn), np.sin(turn)])
@@ -192,12 +204,12 @@ class KneadTeacher(ScriptedKnead):
     """Knows how much clay there is and how hard it is. It closes the slower, the nearer the height is to the solid's,
     and stays there. `pressure` is only a limit."""
 
-    def _closer(self, observation: Observation) -> float:
+    def _closing_step(self, observation: Observation) -> float:
         left = estimated_height(observation) - self._task.goal[2]
-        return min(self._by_force(observation), 0.5 * left / IN_STEPS)
+        return min(self._force_step(observation), 0.5 * left / CLOSING_STEPS)
 
 
-class FeltShape:
+class TactileShape:
     """Gathers the points of the body's surface that the gels `lower` and `upper` touch, in axes that turn with it.
 
     A body that neither gel slides on turns by (way of one gel over the other) / (its height); the wider its contact is
@@ -212,9 +224,9 @@ class FeltShape:
         self._world_from_body = np.eye(3)
         self._before: FloatArray | None = None  # (2,) from the lower sensor to the upper, at the last touch [m]
 
-    def feel(self, observation: Observation) -> None:
+    def add_observation(self, observation: Observation) -> None:
         """The next observation. Raises ValueError for a sensor without height."""
-        below, above = (self._touched(observation.tactile[n], observation.arms[n]) for n in ("lower", "upper"))
+        below, above = (self._contact_points(observation.tactile[n], observation.arms[n]) for n in ("lower", "upper"))
         if not len(below) or not len(above):
             self._before = None  # where it turns to now cannot be felt
             return
@@ -222,7 +234,7 @@ class FeltShape:
         height = max(top - bottom, 1e-6)
         lower, upper = (observation.arms[name].pose.position[:2] for name in ("lower", "upper"))
         if self._before is not None:
-            self._turn(upper - lower - self._before, below, above, height)
+            self._rotate_body(upper - lower - self._before, below, above, height)
         self._before = upper - lower
         up = self._world_from_body[2]  # in body axes
         for touch in self._touches:
@@ -255,7 +267,7 @@ class FeltShape:
         centred: FloatArray = shape - shape.mean(axis=0)
         return centred
 
-    def _touched(self, touch: TactileObservation, arm: ArmState) -> FloatArray:
+    def _contact_points(self, touch: TactileObservation, arm: ArmState) -> FloatArray:
         """(n, 3) where the gel touches the body, world [m]."""
         if touch.height is None:
             raise ValueError("the shape of a body is felt by the gel's height, and this sensor delivers none")
@@ -263,7 +275,7 @@ class FeltShape:
         there = touch.contact & (touch.height > FAINT * deepest)
         return se3.transform(arm.pose, np.column_stack([self._cells[there], -touch.height[there]]))
 
-    def _turn(self, way: FloatArray, below: FloatArray, above: FloatArray, height: float) -> None:
+    def _rotate_body(self, way: FloatArray, below: FloatArray, above: FloatArray, height: float) -> None:
         """By the way (2,) that the upper gel has moved over the lower [m]."""
         length = float(np.linalg.norm(way))
         if length == 0.0:

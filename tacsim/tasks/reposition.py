@@ -14,7 +14,7 @@ from tacsim.models.sensor import CanonicalGrid
 from tacsim.tasks.task import Axis, Estimator, GoalOutOfReach, Task
 
 REACHED = 0.02e-3  # the scripted policy holds when its estimate is this close to the goal [m]
-LEAST_FORCE = 0.01  # a smaller normal force counts as no contact [N]
+MIN_FORCE = 0.01  # a smaller normal force counts as no contact [N]
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +34,7 @@ class Reposition(Task):
             )
 
     @property
-    def needs_to_feel(self) -> Needs:
+    def touch_needs(self) -> Needs:
         return Needs(arms=frozenset({"lower", "upper"}))
 
     @property
@@ -52,7 +52,7 @@ class Reposition(Task):
     def estimator(self, canonical: CanonicalGrid) -> Estimator:
         start: FloatArray | None = None
 
-        def felt(observation: Observation) -> float | None:
+        def tactile_estimate(observation: Observation) -> float | None:
             nonlocal start
             position = estimated_position(observation)
             if position is None:
@@ -60,7 +60,7 @@ class Reposition(Task):
             start = position if start is None else start
             return math.hypot(*(position - start - np.array(self.config.goal)))
 
-        return felt
+        return tactile_estimate
 
     def expert(self, truth: Truth, start: Truth) -> FloatArray:
         """Straight for the goal, as fast as the longer axis may go."""
@@ -116,14 +116,14 @@ def estimated_position(observation: Observation) -> FloatArray | None:
 
 def centre_of_pressure(arm: ArmState) -> FloatArray | None:
     """(3,) the point of the gel's rest plane where the normal force acts, world [m]; None without contact."""
-    here = pressed_at(arm)
+    here = centre_of_pressure_in_sensor(arm)
     return None if here is None else se3.transform(arm.pose, np.append(here, 0.0))
 
 
-def pressed_at(arm: ArmState) -> FloatArray | None:
+def centre_of_pressure_in_sensor(arm: ArmState) -> FloatArray | None:
     """(2,) the same in the axes of the sensor.
 
     A force at (x, y, 0) in the sensor frame has the moment (y Fz, -x Fz, ...), hence x = -My / Fz, y = Mx / Fz.
     """
     _, _, force, moment_x, moment_y, _ = arm.wrench
-    return None if -force < LEAST_FORCE else np.array([-moment_y / force, moment_x / force])
+    return None if -force < MIN_FORCE else np.array([-moment_y / force, moment_x / force])

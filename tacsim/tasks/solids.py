@@ -17,7 +17,7 @@ from tacsim.geometry import shapes
 from tacsim.interface import FloatArray
 from tacsim.models.scene import Cylinder, Sphere
 
-POINTS = 500  # of the earth mover's distance
+SAMPLE_POINTS = 500  # of the earth mover's distance
 ROD_CELLS = 12  # particles of a target across its diameter
 
 
@@ -28,11 +28,11 @@ class Solid:
     geometry: Sphere | Cylinder
 
     @staticmethod
-    def ball(volume: float) -> Solid:
+    def make_ball(volume: float) -> Solid:
         return Solid(Sphere(radius=(3.0 * volume / (4.0 * np.pi)) ** (1 / 3)))
 
     @staticmethod
-    def rod(volume: float, slenderness: float) -> Solid:
+    def make_rod(volume: float, slenderness: float) -> Solid:
         """slenderness: length over diameter."""
         radius = (volume / (2.0 * np.pi * slenderness)) ** (1 / 3)
         return Solid(Cylinder(radius=radius, height=2.0 * radius * slenderness))
@@ -56,20 +56,20 @@ class Solid:
         return points
 
     @cached_property
-    def spread(self) -> FloatArray:
+    def sample_points(self) -> FloatArray:
         """(POINTS, 3) of `points`."""
-        points: FloatArray = spread(self.points)
+        points: FloatArray = select_evenly(self.points)
         return points
 
 
-def centred(points: ArrayLike) -> FloatArray:
+def centre_points(points: ArrayLike) -> FloatArray:
     """Points from their mean."""
     given = np.asarray(points, dtype=np.float64)
     moved: FloatArray = given - given.mean(axis=0)
     return moved
 
 
-def chamfer(body: FloatArray, solid: Solid, volume: float) -> float:
+def chamfer_distance(body: FloatArray, solid: Solid, volume: float) -> float:
     """Mean of how far the body's particles lie outside the solid, and how far the solid's points lie from the body [m].
 
     Each particle covers the points that are no farther than half the diagonal of its cube, so that a body that fills
@@ -83,7 +83,7 @@ def chamfer(body: FloatArray, solid: Solid, volume: float) -> float:
     return float(0.5 * (outside + bare))
 
 
-def earth_movers(one: FloatArray, other: FloatArray) -> float:
+def earth_movers_distance(one: FloatArray, other: FloatArray) -> float:
     """Mean way that the points of one cloud have to go to become the other, of as many points, at best [m]."""
     from scipy.optimize import linear_sum_assignment
     from scipy.spatial.distance import cdist
@@ -92,13 +92,13 @@ def earth_movers(one: FloatArray, other: FloatArray) -> float:
     return float(ways[linear_sum_assignment(ways)].mean())
 
 
-def spread(points: FloatArray, number: int = POINTS) -> FloatArray:
+def select_evenly(points: FloatArray, number: int = SAMPLE_POINTS) -> FloatArray:
     """(number, 3) of the points, the same ones each time; some twice where there are too few."""
     order = np.random.default_rng(0).permutation(len(points))
     return points[np.resize(order, number)]
 
 
-def iou(body: FloatArray, solid: Solid) -> float:
+def intersection_over_union(body: FloatArray, solid: Solid) -> float:
     """Intersection over union of the two, which have the same volume [-]: of a share f of the body that lies inside the
     solid, f / (2 - f)."""
     inside = float((solid.distance(body) <= 0.0).mean())

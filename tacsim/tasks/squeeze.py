@@ -12,7 +12,7 @@ from tacsim.models.sensor import CanonicalGrid
 from tacsim.tasks.task import Axis, Estimator, GoalOutOfReach, Task
 
 BOTH = frozenset({"lower", "upper"})
-LEAST_SHARE = 0.1  # of the sensors' way that a body is taken to give
+MIN_BODY_SHARE = 0.1  # of the sensors' way that a body is taken to give
 REACHED = 0.01e-3  # the scripted policy holds when its estimate is this close to the goal [m]
 
 
@@ -31,7 +31,7 @@ class Squeeze(Task):
             )
 
     @property
-    def needs_to_feel(self) -> Needs:
+    def touch_needs(self) -> Needs:
         return Needs(BOTH, BOTH, height=True)
 
     @property
@@ -46,18 +46,18 @@ class Squeeze(Task):
         return abs(truth.height - self.config.goal)
 
     def estimator(self, canonical: CanonicalGrid) -> Estimator:
-        def felt(observation: Observation) -> float | None:
+        def tactile_estimate(observation: Observation) -> float | None:
             touched = all(observation.tactile[name].contact.any() for name in BOTH)
             return abs(estimated_height(observation) - self.config.goal) if touched else None
 
-        return felt
+        return tactile_estimate
 
     def expert(self, truth: Truth, start: Truth) -> FloatArray:
         """Both sensors close by what is left of the height, over the share of their way that the body has taken since
         `start` (the gels take the rest), as fast as they may. Where that share stays what it was, nobody is there
         sooner."""
-        closed, taken = _gap(start) - _gap(truth), start.height - truth.height
-        share = min(max(taken / closed, LEAST_SHARE), 1.0) if closed > 0 else 1.0
+        closed, taken = _sensor_gap(start) - _sensor_gap(truth), start.height - truth.height
+        share = min(max(taken / closed, MIN_BODY_SHARE), 1.0) if closed > 0 else 1.0
         half = np.clip((truth.height - self.config.goal) / share / 2 / self.config.max_step, -1.0, 1.0)
         return np.array([half, -half])
 
@@ -98,16 +98,16 @@ class ScriptedSqueeze:
 def estimated_height(observation: Observation) -> float:
     """Height of the body [m], estimated by touch: the gap between the gels' rest surfaces plus the depth in each."""
     gap = float(observation.arms["upper"].pose.position[2] - observation.arms["lower"].pose.position[2])
-    return gap + indentation(observation.tactile["lower"]) + indentation(observation.tactile["upper"])
+    return gap + max_depth(observation.tactile["lower"]) + max_depth(observation.tactile["upper"])
 
 
-def indentation(touch: TactileObservation) -> float:
+def max_depth(touch: TactileObservation) -> float:
     """Greatest depth of the body in the gel [m]; 0 without contact."""
     if touch.height is None:
         raise ValueError("indentation: this sensor delivers no surface height")
     return max(0.0, float(touch.height.max(where=touch.valid, initial=0.0)))
 
 
-def _gap(truth: Truth) -> float:
+def _sensor_gap(truth: Truth) -> float:
     """Between the sensors, along world z [m]."""
     return float(truth.poses["upper"].position[2] - truth.poses["lower"].position[2])

@@ -70,7 +70,7 @@ class Task(ABC):
         return Needs(arms=frozenset(axis.arm for axis in self.axes))
 
     @property
-    def needs_to_feel(self) -> Needs:
+    def touch_needs(self) -> Needs:
         """What `estimator` needs besides; a rig that does not know the truth must have it."""
         return Needs(truth=True)
 
@@ -106,18 +106,18 @@ class Outcome:
     score: float  # 1 within success, 0.1 one reward_scale further out
 
 
-def judge(task: Task, truth: Truth, start: Truth) -> Outcome:
+def evaluate_outcome(task: Task, truth: Truth, start: Truth) -> Outcome:
     """Distance, reward, success and score of `truth`, in an episode that began at `start`."""
     config, distance = task.config, float(task.distance(truth, start))
     return Outcome(
         distance=distance,
         reward=-distance / config.reward_scale,
         success=distance <= config.success,
-        score=tolerance(distance, bounds=(0.0, config.success), margin=config.reward_scale),
+        score=tolerance_reward(distance, bounds=(0.0, config.success), margin=config.reward_scale),
     )
 
 
-def tolerance(x: float, bounds: tuple[float, float], margin: float) -> float:
+def tolerance_reward(x: float, bounds: tuple[float, float], margin: float) -> float:
     """1 for x within `bounds` (low, high), falling as a Gaussian to 0.1 at `margin` > 0 outside.
 
     The shaping of Tassa et al. 2018 (DeepMind Control Suite, section 3), Gaussian sigmoid.
@@ -126,7 +126,7 @@ def tolerance(x: float, bounds: tuple[float, float], margin: float) -> float:
     return math.exp(math.log(0.1) * (outside / margin) ** 2)
 
 
-def action_from(
+def action_of_vector(
     vector: NDArray[np.floating[Any]], axes: Sequence[Axis], max_step: float, poses: Mapping[str, Pose]
 ) -> Action:
     """Component i moves its arm from `poses` by vector[i] * max_step [m] along its axis, rotation kept.
@@ -151,9 +151,11 @@ def action_from(
     return Action({arm: Pose(position, poses[arm].quaternion) for arm, position in positions.items()})
 
 
-def vector_of(action: Action, axes: Sequence[Axis], max_step: float, poses: Mapping[str, Pose]) -> NDArray[np.float32]:
-    """The vector that asks for `action` from `poses`: the inverse of `action_from`. What is longer than max_step is cut
-    to it, and what is not along an axis is left out; an arm that holds has zeros."""
+def vector_of_action(
+    action: Action, axes: Sequence[Axis], max_step: float, poses: Mapping[str, Pose]
+) -> NDArray[np.float32]:
+    """The vector that asks for `action` from `poses`: the inverse of `action_of_vector`. What is longer than max_step
+    is cut to it, and what is not along an axis is left out; an arm that holds has zeros."""
     vector = np.zeros(len(axes), np.float32)
     for number, axis in enumerate(axes):
         target = action.tool.get(axis.arm)
@@ -171,22 +173,22 @@ class Effort:
 
     def __init__(self, arms: Mapping[str, ArmState]) -> None:
         self._before = arms
-        self.peak = _greatest(arms)  # [N]
+        self.peak = _max_normal_force(arms)  # [N]
         self.work = 0.0  # [J]
 
     def add(self, arms: Mapping[str, ArmState]) -> None:
         """The next states of the same arms."""
         for name, now in arms.items():
             before = self._before[name]
-            force = -0.5 * (_force(before) + _force(now))  # on the body
+            force = -0.5 * (_world_force(before) + _world_force(now))  # on the body
             self.work += float(force @ (now.pose.position - before.pose.position))
-        self._before, self.peak = arms, max(self.peak, _greatest(arms))
+        self._before, self.peak = arms, max(self.peak, _max_normal_force(arms))
 
 
-def _force(arm: ArmState) -> np.ndarray:
+def _world_force(arm: ArmState) -> np.ndarray:
     """(3,) on the sensor, world axes [N]."""
     return se3.rotate(arm.pose, arm.wrench[:3])
 
 
-def _greatest(arms: Mapping[str, ArmState]) -> float:
+def _max_normal_force(arms: Mapping[str, ArmState]) -> float:
     return max((abs(float(arm.wrench[2])) for arm in arms.values()), default=0.0)

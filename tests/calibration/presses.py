@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter
 
 from calibration.light.dent import dent_slope
 from tacsim.models.sensor import Light, Lighting
-from tacsim.optics.render import shade
+from tacsim.optics.render import phong_shading
 
 ROWS, COLUMNS = 200, 260
 PITCH = 0.08e-3  # [m]
@@ -76,8 +76,8 @@ class HiddenSensor:
         return [self.press(d * 1e-3, x + jx, y + jy) for d, (x, y), (jx, jy) in spread][:count]
 
     def photograph(self, gradient: np.ndarray, drift: np.ndarray | float = 0.0) -> np.ndarray:
-        flat = shade(np.zeros((1, 1, 2), dtype=np.float32), self.lighting)
-        change = 255 * (shade(gradient.astype(np.float32), self.lighting) - flat)
+        flat = phong_shading(np.zeros((1, 1, 2), dtype=np.float32), self.lighting)
+        change = 255 * (phong_shading(gradient.astype(np.float32), self.lighting) - flat)
         if self._spread:
             change = gaussian_filter(change, (self._spread, self._spread, 0))
         noise = self._rng.normal(0, self._noise, (ROWS, COLUMNS, 3))

@@ -17,8 +17,8 @@ from calibration.bundle import (
     write_bundle,
 )
 from calibration.height.slope_polynomial import TERMS, InverseModel
-from calibration.lens.rectification import to_metric
-from calibration.lens.view import GelView, pinhole, view_of_corners
+from calibration.lens.rectification import metric_rectification
+from calibration.lens.view import GelView, pinhole_lens, view_of_corners
 from calibration.normaliser import normaliser_for_calibration, normaliser_for_camera
 from tacsim.config.bundle import digest
 from tacsim.interface import TactileFrame
@@ -199,7 +199,7 @@ def test_a_bundle_keeps_the_view_and_takes_native_pictures(tmp_path: Path) -> No
     native = (
         np.random.default_rng(7).integers(60, 200, (12, 16, 3), dtype=np.uint8).repeat(20, axis=0).repeat(20, axis=1)
     )
-    untouched = np.rint(to_metric(view)(native)).astype(np.uint8)
+    untouched = np.rint(metric_rectification(view)(native)).astype(np.uint8)
     write_bundle(tmp_path, calibration().model_copy(update={"view": view}), untouched)
     read, _ = read_bundle(tmp_path)
     assert read.view == view and read.image_shape == (240, 320)
@@ -215,7 +215,7 @@ def test_a_bundle_keeps_the_view_and_takes_native_pictures(tmp_path: Path) -> No
     # canonical pixels of 0.125 mm, the sensor's axis between 63 and 64
     assert columns.mean() == pytest.approx(63.5 + 24, abs=1.0) and rows.mean() == pytest.approx(63.5 - 16, abs=1.0)
     # one look-up from native pixels shows the same as the metric picture does
-    metric = np.rint(to_metric(view)(brighter)).astype(np.uint8)
+    metric = np.rint(metric_rectification(view)(brighter)).astype(np.uint8)
     assert metric.shape == (120, 160, 3)
     at_once = normalise._rectify(brighter)
     plain = normaliser_for_calibration(calibration(), CanonicalGrid())._rectify(metric)
@@ -226,7 +226,7 @@ def test_geometry_and_view_must_agree(tmp_path: Path) -> None:
     other = seen_askew().model_copy(update={"pixel_pitch": 0.2e-3})
     with pytest.raises(ValueError, match="its view gives"):
         Calibration.model_validate(calibration().model_dump() | {"view": other.model_dump()})
-    assert pinhole((240, 320)).centre == (159.5, 119.5)
+    assert pinhole_lens((240, 320)).centre == (159.5, 119.5)
 
 
 def test_shadows_are_kept_and_are_none_in_bundles_that_lack_the_field(tmp_path: Path) -> None:

@@ -7,9 +7,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from calibration.drift import STRIDE, Drift, DriftFinder
+from calibration.drift import PIXEL_STRIDE, Drift, DriftFinder
 from calibration.frame_normaliser import FrameNormaliser
-from calibration.height.slope_polynomial import to_normal
+from calibration.height.slope_polynomial import normal_of_slope
 from calibration.light.fit import normal_angle
 from calibration.normaliser import (
     normaliser_for_calibration,
@@ -17,7 +17,14 @@ from calibration.normaliser import (
     normaliser_for_pictures,
     normaliser_for_simulation,
 )
-from calibration.reference import LOST_COLOUR, LOST_SLOPE, STALE_SLOPE, StaleReference, UnusableReference, exchanged
+from calibration.reference import (
+    MAX_COLOUR_CHANGE,
+    MAX_SLOPE_CHANGE,
+    STALE_SLOPE,
+    StaleReference,
+    UnusableReference,
+    is_channel_order_swapped,
+)
 from tacsim.interface import TactileFrame, TactileObservation
 from tacsim.models.hardware import CameraSensorConfig
 from tacsim.models.sensor import CanonicalGrid, SensorModel
@@ -61,7 +68,7 @@ def angle(seen: TactileObservation, press: Made) -> float:
     true = press.gradient[np.rint(v).clip(0, ROWS - 1).astype(int), np.rint(u).clip(0, COLUMNS - 1).astype(int)]
     inside = seen.valid & (np.hypot(u - press.circle[0], v - press.circle[1]) < press.circle[2])
     assert seen.gradient is not None
-    return float(normal_angle(to_normal(seen.gradient.astype(float)), to_normal(true))[inside].mean())
+    return float(normal_angle(normal_of_slope(seen.gradient.astype(float)), normal_of_slope(true))[inside].mean())
 
 
 @pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES)
@@ -113,7 +120,7 @@ def test_nothing_is_told_by_another_light(change, normalise: FrameNormaliser, se
     normalise.take_reference(frame(bundle[1]))
     with pytest.raises(StaleReference, match=r"Is a lamp out.*take a fresh reference"):
         normalise(frame(change(sensor.press(0.5e-3, 130, 100).image.astype(float))), 0.0)
-    assert normalise.drift_slope > LOST_SLOPE or normalise.drift > LOST_COLOUR
+    assert normalise.drift_slope > MAX_SLOPE_CHANGE or normalise.drift > MAX_COLOUR_CHANGE
 
 
 def test_a_lamp_that_tilts_nothing_is_told_by_the_colour() -> None:
@@ -174,8 +181,12 @@ def test_swapped_colours_are_told_by_the_calibrations_own_picture(
     with pytest.raises(UnusableReference, match="red and blue are exchanged"):
         normalise.take_reference(frame(sensor.empty()[..., ::-1]))
     even = np.full((80, 80, 3), (90.0, 100.0, 110.0), dtype=np.float32)
-    assert not exchanged(even[..., ::-1], even, np.ones((80, 80), dtype=np.bool_))  # nothing tells them apart
-    assert not exchanged(even[:4, :4, ::-1], even[:4, :4], np.ones((4, 4), dtype=np.bool_))  # smaller than a block
+    assert not is_channel_order_swapped(
+        even[..., ::-1], even, np.ones((80, 80), dtype=np.bool_)
+    )  # nothing tells them apart
+    assert not is_channel_order_swapped(
+        even[:4, :4, ::-1], even[:4, :4], np.ones((4, 4), dtype=np.bool_)
+    )  # smaller than a block
 
 
 def test_the_drift_is_a_quadratic_through_what_is_calm() -> None:
@@ -189,7 +200,7 @@ def test_the_drift_is_a_quadratic_through_what_is_calm() -> None:
     finder = DriftFinder((120, 160))
     drift = finder(planes, hidden)
     assert drift.measured
-    np.testing.assert_allclose(finder.at(drift), true[:, ::STRIDE, ::STRIDE].reshape(3, -1).T, atol=2e-4)
+    np.testing.assert_allclose(finder.at(drift), true[:, ::PIXEL_STRIDE, ::PIXEL_STRIDE].reshape(3, -1).T, atol=2e-4)
     finder.remove(planes, drift)
     assert np.abs(planes[:, ~hidden & ~touched]).max() < 2e-4
     assert not finder(planes, np.ones_like(hidden)).measured
@@ -283,10 +294,10 @@ def test_a_part_of_a_view_has_the_drift_of_the_whole() -> None:
     weights = np.random.default_rng(0).normal(0, 0.1, (6, 3)).astype(np.float32)
     finder, drift = DriftFinder((120, 160)), Drift(weights, measured=True)
     finder.remove(planes, drift)
-    np.testing.assert_allclose(finder.part(drift, (0, 0), (120, 160)), -np.moveaxis(planes, 0, -1), atol=1e-6)
+    np.testing.assert_allclose(finder.select_presses(drift, (0, 0), (120, 160)), -np.moveaxis(planes, 0, -1), atol=1e-6)
     np.testing.assert_allclose(
-        finder.part(drift, (11, 23), (60, 70)), -np.moveaxis(planes, 0, -1)[11:71, 23:93], atol=1e-6
+        finder.select_presses(drift, (11, 23), (60, 70)), -np.moveaxis(planes, 0, -1)[11:71, 23:93], atol=1e-6
     )
     np.testing.assert_allclose(
-        finder.part(drift, (-4, -6), (120, 160))[4:, 6:], -np.moveaxis(planes, 0, -1)[:116, :154], atol=1e-6
+        finder.select_presses(drift, (-4, -6), (120, 160))[4:, 6:], -np.moveaxis(planes, 0, -1)[:116, :154], atol=1e-6
     )

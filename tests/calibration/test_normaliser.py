@@ -172,5 +172,5 @@ def test_glare_is_refused_where_colour_is_measured_and_not_where_dots_alone_are_
     normalise = normaliser_for_recording(by_dots, (240, 320), GRID, still)
     normalise.take_reference(TactileFrame(image=still, time=0.0, index=0))
     flow = normalise(TactileFrame(image=slid, time=0.1, index=1), now=0.1).flow
-    assert flow is not None and normalise.markers_seen is not None and normalise.markers_seen.all()
+    assert flow is not None and normalise.visible_markers is not None and normalise.visible_markers.all()
     np.testing.assert_allclose(flow, np.broadcast_to((0.15e-3, 0.0), flow.shape), atol=0.01e-3)

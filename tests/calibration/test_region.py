@@ -10,7 +10,7 @@ from PIL import Image
 from pydantic import ValidationError
 
 from calibration.bundle import read_bundle
-from calibration.lens.rectification import from_corners
+from calibration.lens.rectification import rectification_of_corners
 from calibration.lens.view import BadCorners
 from calibration.normaliser import normaliser_for_camera
 from tacsim.interface import TactileFrame
@@ -81,7 +81,7 @@ def test_a_sensor_is_calibrated_within_its_region(bundle: Path) -> None:
 
 
 def test_a_region_hides_what_is_beside_it() -> None:
-    whole = from_corners(None, (16e-3, 16e-3), SHAPE, canonical_image(GRID))
+    whole = rectification_of_corners(None, (16e-3, 16e-3), SHAPE, canonical_image(GRID))
     inside = whole.within(((0, 0), (SHAPE[1] / 2, 0), (SHAPE[1] / 2, SHAPE[0]), (0, SHAPE[0])))
     assert inside.valid.sum() == pytest.approx(whole.valid.sum() / 2, rel=0.02)
     assert not inside.valid[:, 70:].any() and whole.within(None) is whole

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from calibration.frame_normaliser import FrameNormaliser
-from calibration.frame_set import Frame, FrameSet, frame_warnings, touched_untouched
+from calibration.frame_set import Frame, FrameSet, find_touched_references, frame_warnings
 from calibration.light.calibrator import calibrate_light
 from calibration.normaliser import normaliser_for_calibration
-from calibration.reference import StaleReference, channels_swapped
+from calibration.reference import StaleReference, is_contact_image_swapped
 from tacsim.interface import TactileFrame
 from tacsim.models.sensor import CanonicalGrid
 from tests.calibration.presses import BALL, BALL_PX, PITCH, HiddenSensor
@@ -75,13 +75,13 @@ def test_a_white_balance_as_strong_as_a_swap_is_no_swap(seed: int) -> None:
     reference, seen = (image.astype(np.float32) for image in (sensor.empty(), sensor.press(0.5e-3, 150, 90).image))
     red, _, blue = reference.mean(axis=(0, 1))
     balance = np.array([blue / red, 1.0, red / blue], dtype=np.float32)
-    assert not channels_swapped(np.clip(seen * balance, 0, 255), reference, everywhere)
-    assert channels_swapped(seen[..., ::-1], reference, everywhere)
+    assert not is_contact_image_swapped(np.clip(seen * balance, 0, 255), reference, everywhere)
+    assert is_contact_image_swapped(seen[..., ::-1], reference, everywhere)
 
 
 def test_pictures_without_contact_are_compared_with_the_reference(sensor: HiddenSensor) -> None:
     touched, still = sensor.press(0.2e-3, 150, 90).image, Frame("background_2.png", sensor.empty())
     frames = (Frame("press.png", sensor.press(0.5e-3, 90, 90).image),)
-    assert touched_untouched(FrameSet("real", sensor.empty(), "background.png", frames, (still,))) == []
-    (said,) = touched_untouched(FrameSet("real", touched, "background.png", frames, (still,)))
+    assert find_touched_references(FrameSet("real", sensor.empty(), "background.png", frames, (still,))) == []
+    (said,) = find_touched_references(FrameSet("real", touched, "background.png", frames, (still,)))
     assert "background.png and background_2.png differ as by a contact" in said

@@ -14,16 +14,16 @@ from tacsim.interface import Action, Pose
 from tacsim.limits import (
     ROUNDING,
     ActionError,
-    braking_end,
+    box_region,
     check_action,
     clip_to_region,
     exceeds_wrench,
     finite_targets,
     fraction_clear,
     fraction_inside,
-    joint_step_excess,
+    joint_speed_ratio,
     limit_step,
-    region,
+    stopping_position,
 )
 from tests.promises import Record
 
@@ -50,7 +50,7 @@ def test_a_longer_motion_is_cut_on_the_straight_way(longest: float, widest: floa
     target = moved([0.3e-3, 0.0, -0.4e-3], [0.0, 0.02, 0.0])
     sent = limit_step(target, START, longest, widest)
     assert np.allclose(sent.position - START.position, share * np.array([0.3e-3, 0, -0.4e-3]), atol=1e-12)
-    assert np.allclose(se3.difference(START, sent)[3:], [0.0, share * 0.02, 0.0], atol=1e-9)
+    assert np.allclose(se3.pose_difference(START, sent)[3:], [0.0, share * 0.02, 0.0], atol=1e-9)
 
 
 @given(
@@ -64,7 +64,7 @@ def test_what_is_sent_never_exceeds_a_limit(
 ) -> None:
     target = moved(shift, turn)
     sent = limit_step(target, START, longest, widest)
-    metres, radians = se3.distance(START, sent)
+    metres, radians = se3.pose_distance(START, sent)
     assert metres <= longest * (1 + 1e-6)
     assert radians <= widest + 1e-6
     if sent is not target:  # nothing was given away: one limit is used up
@@ -103,7 +103,7 @@ def test_a_pose_that_is_not_finite_cannot_even_be_made() -> None:
 
 
 BOX = ([-0.1, -0.2, 0.0], [0.1, 0.2, 0.3])
-SLOPE = region(*BOX, planes=[([0.0, 0.0, 0.1], [1.0, 0.0, 1.0])])  # keeps x + z >= 0.1
+SLOPE = box_region(*BOX, planes=[([0.0, 0.0, 0.1], [1.0, 0.0, 1.0])])  # keeps x + z >= 0.1
 points = st.tuples(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5), st.floats(-0.5, 0.5)).map(np.array)
 
 
@@ -194,18 +194,18 @@ def test_the_way_keeps_clear_of_a_sphere(
 
 
 def test_a_region_says_which_wall_is_broken() -> None:
-    assert SLOPE.broken([0.05, 0.0, 0.15]) == ""
-    assert "2 mm beyond the workspace's upper x = 0.1 m" in SLOPE.broken([0.102, 0.0, 0.15])
-    assert "beyond plane 0" in SLOPE.broken([-0.05, 0.0, 0.05])
+    assert SLOPE.violated_face([0.05, 0.0, 0.15]) == ""
+    assert "2 mm beyond the workspace's upper x = 0.1 m" in SLOPE.violated_face([0.102, 0.0, 0.15])
+    assert "beyond plane 0" in SLOPE.violated_face([-0.05, 0.0, 0.05])
     with pytest.raises(ValueError, match="plane 0 has no normal"):
-        region(*BOX, planes=[([0, 0, 0], [0, 0, 0])])
+        box_region(*BOX, planes=[([0, 0, 0], [0, 0, 0])])
     with pytest.raises(ValueError, match="lower to an upper corner"):
-        region(BOX[1], BOX[0])
+        box_region(BOX[1], BOX[0])
 
 
 def test_braking_ends_where_the_speed_is_spent() -> None:
-    assert np.allclose(braking_end([0, 0, 0.1], [0, 0, -0.1], 0.5), [0, 0, 0.09])
-    assert np.allclose(braking_end([0, 0, 0.1], [0, 0, 0], 0.5), [0, 0, 0.1])
+    assert np.allclose(stopping_position([0, 0, 0.1], [0, 0, -0.1], 0.5), [0, 0, 0.09])
+    assert np.allclose(stopping_position([0, 0, 0.1], [0, 0, 0], 0.5), [0, 0, 0.1])
 
 
 def test_loads_and_steps_that_are_too_large_or_no_numbers() -> None:
@@ -213,5 +213,5 @@ def test_loads_and_steps_that_are_too_large_or_no_numbers() -> None:
     assert exceeds_wrench([3.0, 0, 4.1, 0, 0, 0.0], 5.0, 1.0)
     assert exceeds_wrench([0, 0, 0, 0.8, 0, 0.8], 5.0, 1.0)
     assert exceeds_wrench([math.nan, 0, 0, 0, 0, 0], 5.0, 1.0) and exceeds_wrench([0, 0, 0, 0, math.nan, 0], 5.0, 1.0)
-    assert joint_step_excess(np.zeros(6), [0, 0, -0.002, 0, 0, 0.001], 1.0, 2e-3) == pytest.approx(1.0)
-    assert joint_step_excess(np.zeros(6), [0, 0, math.nan, 0, 0, 0], 1.0, 2e-3) == math.inf
+    assert joint_speed_ratio(np.zeros(6), [0, 0, -0.002, 0, 0, 0.001], 1.0, 2e-3) == pytest.approx(1.0)
+    assert joint_speed_ratio(np.zeros(6), [0, 0, math.nan, 0, 0, 0], 1.0, 2e-3) == math.inf

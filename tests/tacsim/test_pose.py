@@ -64,26 +64,26 @@ def test_a_load_off_the_origin_makes_a_torque() -> None:
 
 def test_difference_is_in_the_outer_axes() -> None:
     after = se3.compose(QUARTER, se3.from_rotation_vector([0.5, 0.0, 0.0], [0.3, 0.0, 0.0]))
-    assert np.allclose(se3.difference(QUARTER, after), [0.0, 0.5, 0.0, 0.0, 0.3, 0.0])
+    assert np.allclose(se3.pose_difference(QUARTER, after), [0.0, 0.5, 0.0, 0.0, 0.3, 0.0])
 
 
 def test_interpolation_takes_the_shorter_way_at_even_speed() -> None:
     a = se3.from_rotation_vector([0.0, 0.0, 0.0], [0.0, 0.0, math.radians(170)])
     b = se3.from_rotation_vector([4.0, -2.0, 1.0], [0.0, 0.0, math.radians(-170)])
-    quarter = se3.interpolate(a, b, 0.25)
+    quarter = se3.interpolate_pose(a, b, 0.25)
     assert np.allclose(quarter.position, [1.0, -0.5, 0.25])
     assert same(quarter, se3.from_rotation_vector([1.0, -0.5, 0.25], [0.0, 0.0, math.radians(175)]))
-    assert same(se3.interpolate(a, b, 0.0), a)
-    assert same(se3.interpolate(a, b, 1.0), b)
+    assert same(se3.interpolate_pose(a, b, 0.0), a)
+    assert same(se3.interpolate_pose(a, b, 1.0), b)
     for s in (-0.1, 1.1, math.nan):
         with pytest.raises(ValueError, match="within 0 and 1"):
-            se3.interpolate(a, b, s)
+            se3.interpolate_pose(a, b, s)
 
 
 def test_two_columns_are_columns() -> None:
-    assert np.allclose(se3.two_columns(QUARTER), [0, 1, 0, -1, 0, 0])
+    assert np.allclose(se3.rotation_columns(QUARTER), [0, 1, 0, -1, 0, 0])
     with pytest.raises(ValueError, match="span no plane"):
-        se3.from_two_columns([0, 0, 0], [1, 2, 3, 2, 4, 6])
+        se3.from_rotation_columns([0, 0, 0], [1, 2, 3, 2, 4, 6])
 
 
 def mirrored() -> list[list[float]]:
@@ -120,7 +120,7 @@ def test_composition_is_one_map_after_the_other(a_from_b: Pose, b_from_c: Pose, 
 @given(poses, poses)
 def test_relative_and_inverse_undo(a: Pose, b: Pose) -> None:
     assert same(se3.compose(a, se3.inverse(a)), Pose())
-    assert same(se3.compose(a, se3.relative(a, b)), b)
+    assert same(se3.compose(a, se3.relative_pose(a, b)), b)
 
 
 @given(poses)
@@ -128,7 +128,7 @@ def test_representations_round_trip_and_never_mirror(pose: Pose) -> None:
     matrix = se3.to_matrix(pose)
     assert np.linalg.det(matrix[:3, :3]) == pytest.approx(1.0)
     assert same(se3.from_matrix(matrix), pose)
-    assert same(se3.from_two_columns(pose.position, se3.two_columns(pose)), pose)
+    assert same(se3.from_rotation_columns(pose.position, se3.rotation_columns(pose)), pose)
     assert same(se3.from_rotation_vector(pose.position, se3.rotation(pose).as_rotvec()), pose)
 
 
@@ -145,8 +145,8 @@ def test_power_of_a_wrench_is_the_same_in_every_frame(
 
 @given(poses, poses, st.floats(0.0, 1.0))
 def test_interpolation_divides_the_way(a: Pose, b: Pose, s: float) -> None:
-    metres, radians = se3.distance(a, b)
-    at = se3.interpolate(a, b, s)
-    assert se3.distance(a, at) == pytest.approx((s * metres, s * radians), abs=1e-6)
-    assert se3.distance(at, b) == pytest.approx(((1 - s) * metres, (1 - s) * radians), abs=1e-6)
+    metres, radians = se3.pose_distance(a, b)
+    at = se3.interpolate_pose(a, b, s)
+    assert se3.pose_distance(a, at) == pytest.approx((s * metres, s * radians), abs=1e-6)
+    assert se3.pose_distance(at, b) == pytest.approx(((1 - s) * metres, (1 - s) * radians), abs=1e-6)
     assert radians <= math.pi + 1e-9

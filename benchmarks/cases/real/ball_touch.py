@@ -42,7 +42,7 @@ def touch_ball(touches: int, repeat: int) -> list[Measurement]:
     for k in range(SETS):
         mount, found = made_up()
         fit = fit_touches(found, BALL)
-        errors[k], bounds[k] = se3.distance(fit.tool_from_sensor, mount), fit.best_deviation
+        errors[k], bounds[k] = se3.pose_distance(fit.tool_from_sensor, mount), fit.best_deviation
     timing, _ = timed(lambda: fit_touches(found, BALL), repeat)
     ratios = np.sqrt((errors**2).mean(axis=0) / (bounds**2).mean(axis=0))
     millimetres, degrees = float(np.median(errors[:, 0])) * 1e3, float(np.degrees(np.median(errors[:, 1])))

@@ -164,9 +164,9 @@ def _mean(predictions: Sequence[PressPrediction], what: str) -> float:
 
 def _interval(unit: str, values: Sequence[float]) -> dict[str, float]:
     """Median, and 95 % interval of the mean by bootstrap over presses."""
-    from calibration.compare.compare import bootstrap
+    from calibration.compare.compare import bootstrap_interval
 
-    low, high = bootstrap(np.array(values))
+    low, high = bootstrap_interval(np.array(values))
     return {f"median_{unit}": float(np.median(values)), f"low_{unit}": low, f"high_{unit}": high}
 
 

@@ -21,7 +21,7 @@ from calibration.light.calibrator import calibrate_light
 from calibration.light.dent import MAX_RIM_RATIO, ContactCircle, dent_gradient, dent_height
 from calibration.light.fit import LightFit
 from calibration.light.labels import BLUR
-from calibration.light.press import BallPress, press_at, smooth, untouched_mean
+from calibration.light.press import BallPress, gaussian_blur, make_press, mean_reference_colour
 from calibration.light.refinement import RIM_BLUR
 from calibration.light.shadows import DentShade
 from tacsim.models.photometric import PhotometricLight, places_in_image
@@ -49,7 +49,7 @@ def clicked_errors(folder: Path, of: BallSet) -> list[float]:
         for name, image in frames[fold::FOLDS]:
             circle = corrected(clicked[name], fit, clicked, ball)
             try:
-                press = press_at(name, image, reference, untouched_mean(reference), circle)
+                press = make_press(name, image, reference, mean_reference_colour(reference), circle)
             except BadFrames:
                 continue
             found.append(_error(press, clicked[name], fit, ball))
@@ -67,7 +67,7 @@ def corrected(circle: ContactCircle, fit: LightFit, clicked: Mapping[str, Contac
 def _error(press: BallPress, inside: ContactCircle, fit: LightFit, ball: float) -> float:
     assert fit.forward is not None
     rows, columns = press.shape
-    mean = untouched_mean(fit.reference)
+    mean = mean_reference_colour(fit.reference)
     v, u = np.mgrid[:rows, :columns].astype(np.float64)
     light, places = PhotometricLight(fit.forward), places_in_image(columns, rows)
     slopes = dent_gradient(u, v, press.circle, fit.thickness, ball, RIM_BLUR).astype(np.float32)
@@ -78,7 +78,7 @@ def _error(press: BallPress, inside: ContactCircle, fit: LightFit, ball: float) 
         dark = shade.terms(u.ravel(), v.ravel(), press.circle, fit.thickness, ball)
         change += (dark @ np.array(fit.forward.shadows.weights)).reshape(change.shape)
     still = fit.reference + press.drift
-    drawn = np.clip(still + smooth(change, BLUR) * mean, 0.0, 255.0) - still
+    drawn = np.clip(still + gaussian_blur(change, BLUR) * mean, 0.0, 255.0) - still
     where = replace(press, circle=inside).distance() < inside.radius
     return float(np.abs(drawn - press.change * mean)[where].mean())
 

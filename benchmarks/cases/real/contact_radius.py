@@ -16,7 +16,7 @@ from benchmarks.cases.press import layer, press
 from benchmarks.cases.real.labels import BadData, PressLabels, read_frames, read_labels
 from benchmarks.harness.measure import Measurement, timed
 from benchmarks.harness.runner import Case
-from calibration.light.circle import NoCircle, contact_circle
+from calibration.light.circle import NoCircle, find_contact_circle
 from tacsim.interface import FloatArray, Image, Pose
 from tacsim.models.material import GelMaterial
 from tacsim.models.scene import Gel, Indenter, Scene, Settling, Sphere
@@ -144,7 +144,7 @@ class RenderedSensor:
     def radius(self, image: Image, background: Image, ball: float, what: str) -> float:
         """[px]. Raises BadData that says which image shows no contact."""
         try:
-            return contact_circle(image, background, ball / self._pitch).radius
+            return find_contact_circle(image, background, ball / self._pitch).radius
         except NoCircle as error:
             raise BadData(f"{what}: {error}") from None
 

@@ -40,7 +40,7 @@ BALL, DEPTH = 4e-3, 1e-3  # [m]
 def made_up(width: int) -> Calibration:
     """A calibration of the largest order for pictures of width x 3/4 width; its light is made up."""
     from calibration.bundle import Calibration, Provenance
-    from calibration.height.slope_polynomial import InverseModel, fit_inverse, inverse_features, to_normal
+    from calibration.height.slope_polynomial import InverseModel, fit_inverse, inverse_features, normal_of_slope
     from tacsim.models.photometric import PhotometricLight
 
     shape = (3 * width // 4, width)
@@ -56,7 +56,7 @@ def made_up(width: int) -> Calibration:
     change, _ = PhotometricLight(forward).change(slopes, *places_in_image(shape[1], shape[0]))
     u, v = np.meshgrid(*place_in_image(shape[1], shape[0]))
     terms = inverse_features(change.reshape(-1, 3).astype(np.float64), 2 * u.ravel(), 2 * v.ravel())
-    target = to_normal(slopes.reshape(-1, 2).astype(np.float64))
+    target = normal_of_slope(slopes.reshape(-1, 2).astype(np.float64))
     inverse = fit_inverse([(terms.T @ terms, terms.T @ target)], with_position=True)
     return Calibration(
         serial="made-up",
@@ -74,7 +74,7 @@ def calibrated_render(width: int, repeat: int) -> list[Measurement]:
     as after each step."""
     import cv2
 
-    from calibration.light.photometry import features
+    from calibration.light.photometry import photometric_features
     from tacsim.optics.grid import image_grid
     from tacsim.optics.render import Renderer
     from tacsim.optics.surface import sample_surface
@@ -95,7 +95,7 @@ def calibrated_render(width: int, repeat: int) -> list[Measurement]:
     slopes, height = sample.gradient.astype(np.float64), sample.height.astype(np.float64) / VIEW[0]
     steep = np.maximum(np.hypot(slopes[..., 0], slopes[..., 1]) / forward.steepest, 1.0)
     u, v = np.meshgrid(*place_in_image(image.shape[1], image.shape[0]))
-    terms = features((slopes / steep[..., None]).reshape(-1, 2), u.ravel(), v.ravel(), DEGREE, POSITION)
+    terms = photometric_features((slopes / steep[..., None]).reshape(-1, 2), u.ravel(), v.ravel(), DEGREE, POSITION)
     change = (terms @ np.array(forward.weights)).reshape(image.shape)
     assert forward.depth is not None
     deep = depth_terms(height, forward.depth.deepest, u, v)

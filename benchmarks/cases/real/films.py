@@ -72,7 +72,7 @@ def marker_film(film: Film, path: Path, repeat: int) -> list[Measurement]:
     from calibration.light.noise import NoiseUnknown, measure_noise
     from calibration.markers.dots import DotFinder
     from calibration.markers.flow import find_markers
-    from calibration.markers.lattice import NoLattice, usual_pitch
+    from calibration.markers.lattice import NoLattice, median_pitch
     from calibration.markers.tracker import DotTracker
 
     frames = _frames(path)
@@ -85,7 +85,7 @@ def marker_film(film: Film, path: Path, repeat: int) -> list[Measurement]:
         raise BadData(f"{path}: its first frame has no markers: {nothing}") from None
     find = DotFinder(radius)
     rest = find(first).centres
-    tracker = DotTracker(rest, usual_pitch(rest))
+    tracker = DotTracker(rest, median_pitch(rest))
     samples, processor, still, moved = [], [], [], np.zeros_like(rest)
     seen = np.ones(len(rest), dtype=np.bool_)
     always, fewest, out = seen.copy(), len(rest), np.zeros_like(seen)
@@ -95,13 +95,13 @@ def marker_film(film: Film, path: Path, repeat: int) -> list[Measurement]:
         tracked = tracker(find(image).centres)
         samples.append(perf_counter() - wall)
         processor.append(process_time() - cpu)
-        always &= tracked.seen
-        fewest = min(fewest, int(tracked.seen.sum()))
-        out |= ~tracked.seen & _cut(rest + tracked.displacement, radius, image)
+        always &= tracked.visible
+        fewest = min(fewest, int(tracked.visible.sum()))
+        out |= ~tracked.visible & _cut(rest + tracked.displacement, radius, image)
         moved = np.where(np.abs(tracked.displacement) > np.abs(moved), tracked.displacement, moved)
         resting = resting and float(np.abs(image.astype(np.float32) - first).mean()) < STILL
         if resting:
-            still.append(np.where(tracked.seen[:, None], tracked.displacement, np.nan))
+            still.append(np.where(tracked.visible[:, None], tracked.displacement, np.nan))
             at_rest = [*at_rest, image][:REST_FRAMES]
     if not samples:
         raise BadData(f"{path}: a film of a single frame")

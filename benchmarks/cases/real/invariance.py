@@ -74,7 +74,7 @@ def _gel_of(folder: Path, of: BallSet, reference: Image) -> tuple[float, float, 
 def _rows(
     source: str, folds: list[tuple[Comparison, Calibration | None]], timing: Timing, note: str
 ) -> list[Measurement]:
-    from calibration.compare.invariance import invariance as invariance_of
+    from calibration.compare.invariance import measure_invariance as invariance_of
 
     report = invariance_of(folds)
     rows = [

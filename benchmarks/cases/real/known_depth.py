@@ -19,7 +19,7 @@ from benchmarks.cases.real.contact_radius import ELEMENT, ball_scene, press_to
 from benchmarks.cases.real.labels import BadData, PressLabel, PressLabels, read_frames, read_labels
 from benchmarks.harness.measure import Measurement, Timing
 from benchmarks.harness.runner import Case
-from calibration.light.circle import Circle, NoCircle, contact_circle
+from calibration.light.circle import Circle, NoCircle, find_contact_circle
 from robot.studies.matched_press import placed
 from tacsim.interface import FloatArray, Image, Mask
 from tacsim.models.scene import GelSurface
@@ -111,7 +111,7 @@ class CalibratedSensor:
 def _circle(press: PressLabel, image: Image, reference: Image, labels: PressLabels) -> Circle:
     """Where the contact is found. Raises BadData."""
     try:
-        return contact_circle(image, reference, press.ball_radius / labels.pixel_pitch)
+        return find_contact_circle(image, reference, press.ball_radius / labels.pixel_pitch)
     except NoCircle as error:
         raise BadData(f"{press.name}: {error}") from None
 
@@ -133,7 +133,7 @@ def pictures(image: Image, real: Image, reference: Image, mask: Mask) -> dict[st
         "null_grey": metrics.mean_absolute_error(reference, real, mask),
         "ssim": metrics.structural_similarity(image, real, mask),
         "null_ssim": metrics.structural_similarity(reference, real, mask),
-        "ncc": metrics.correlation(image - still, real - still, mask),
+        "ncc": metrics.image_correlation(image - still, real - still, mask),
     }
 
 

@@ -148,7 +148,7 @@ def fit_placement(
     still = draw.reference.astype(np.float32)
     changes = [frame.astype(np.float32) - still for frame in frames]
     strongest = max(changes, key=lambda change: float((change**2).mean()))
-    patch = metrics.patch_of(metrics.contact_region(strongest))
+    patch = metrics.circle_of_region(metrics.contact_region(strongest))
     if patch is None:
         raise BadData("no contact is seen in the frames of the punch")
     middle = face.points[np.unique(face.triangles)].mean(axis=0) / pitch

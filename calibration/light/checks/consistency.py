@@ -7,29 +7,33 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from calibration.light.circle import NoCircle, contact_circle
+from calibration.light.circle import NoCircle, find_contact_circle
 from calibration.light.dent import dent_gradient
-from calibration.light.photometry import features
-from calibration.light.press import NEAR, BallPress, Window, smooth
+from calibration.light.photometry import photometric_features
+from calibration.light.press import SKIRT_RADIUS, BallPress, Window, gaussian_blur
 from calibration.light.refinement import RIM_BLUR
 from tacsim.interface import FloatArray, Image, Mask
 
 FIRST_THICKNESS = 1e4  # of a gel that is taken to be thick [ball radii]
 RIDGE = 1e-3
 # Two presses are of one sensor if the light of each explains the other up to the larger of these shares of its power
-MAX_UNLIKE = 0.2
-MAX_UNLIKE_RATIO = 4.0  # times the median link; a DIGIT, whose lamps stand low, shows 2.4
+MAX_LINK = 0.2
+MAX_LINK_RATIO = 4.0  # times the median link; a DIGIT, whose lamps stand low, shows 2.4
 MIN_GROUPED = 4  # presses: fewer do not show which one is wrong
-FINE = 1.0  # detail finer than this Gaussian is compared [px]
-MIN_FINE = 0.5  # least power of fine detail and noise, over the median of the others; real sensors show 0.9 and more
+FINE_DEVIATION = 1.0  # detail finer than this Gaussian is compared [px]
+MIN_FINE_POWER_RATIO = (
+    0.5  # least power of fine detail and noise, over the median of the others; real sensors show 0.9 and more
+)
 CONTACT_BLUR = 3.0  # [px]
 # Strength of a contact in a picture without contact, over that of the presses
-MIN_CONTACT = 0.2  # where two such pictures differ
-MIN_CONTACT_BESIDE = 0.3  # where the presses differ from it; far shadows of a DIGIT's presses show 0.26
-MIN_EXPLAINED = 0.8  # share of it that a ball's dent must explain; drift and glare at the border have other shapes
+MIN_REFERENCE_CONTACT = 0.2  # where two such pictures differ
+MIN_COMMON_CONTACT = 0.3  # where the presses differ from it; far shadows of a DIGIT's presses show 0.26
+MIN_EXPLAINED_SHARE = (
+    0.8  # share of it that a ball's dent must explain; drift and glare at the border have other shapes
+)
 
 
-def unlike_presses(presses: Sequence[BallPress], windows: Sequence[Window], ball: float) -> list[int]:
+def find_inconsistent_presses(presses: Sequence[BallPress], windows: Sequence[Window], ball: float) -> list[int]:
     """The presses that those of the largest group do not predict: each press alone gives a light, and two presses
     belong together if the lights of both explain both. `ball`: its radius [px]."""
     if len(presses) < MIN_GROUPED:
@@ -37,7 +41,7 @@ def unlike_presses(presses: Sequence[BallPress], windows: Sequence[Window], ball
     sets = []
     for press, window in zip(presses, windows, strict=True):
         gradient = dent_gradient(window.u, window.v, press.circle, FIRST_THICKNESS * ball, ball, RIM_BLUR)
-        terms = features(gradient, window.u, window.v, 3, 0)
+        terms = photometric_features(gradient, window.u, window.v, 3, 0)
         sets.append((terms.T @ terms, terms.T @ window.change, float((window.change**2).sum())))
     unexplained = np.zeros((len(sets), len(sets)))
     for i, (square, right, _) in enumerate(sets):
@@ -45,16 +49,16 @@ def unlike_presses(presses: Sequence[BallPress], windows: Sequence[Window], ball
         light = np.linalg.solve(regular, right)
         for j, (other, wanted, power) in enumerate(sets):
             unexplained[i, j] = 1 - (2 * (light * wanted).sum() - (light * (other @ light)).sum()) / max(power, 1e-300)
-    apart = (unexplained + unexplained.T) / 2
-    return _outside_largest_group(apart)
+    link_costs = (unexplained + unexplained.T) / 2
+    return _outside_largest_group(link_costs)
 
 
-def _outside_largest_group(apart: FloatArray) -> list[int]:
+def _outside_largest_group(link_costs: FloatArray) -> list[int]:
     """Single linkage: links of the least spanning tree that are too long are cut."""
     from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 
-    tree = minimum_spanning_tree(np.maximum(apart, 1e-9)).toarray()
-    limit = max(MAX_UNLIKE, MAX_UNLIKE_RATIO * float(np.median(tree[tree > 0])))
+    tree = minimum_spanning_tree(np.maximum(link_costs, 1e-9)).toarray()
+    limit = max(MAX_LINK, MAX_LINK_RATIO * float(np.median(tree[tree > 0])))
     count, group = connected_components(np.where(tree <= limit, tree, 0.0), directed=False)
     if count == 1:
         return []
@@ -64,16 +68,18 @@ def _outside_largest_group(apart: FloatArray) -> list[int]:
 
 def fine_power(picture: FloatArray, where: Mask) -> float:
     """Power of fine detail and noise of a picture (H, W, 3) [grey levels] at the pixels `where` (H, W)."""
-    return float(((picture - smooth(picture, FINE))[where] ** 2).mean())
+    return float(((picture - gaussian_blur(picture, FINE_DEVIATION))[where] ** 2).mean())
 
 
-def blurred_presses(presses: Sequence[BallPress], reference: Image, mean: FloatArray) -> list[tuple[int, float]]:
+def find_blurred_presses(presses: Sequence[BallPress], reference: Image, mean: FloatArray) -> list[tuple[int, float]]:
     """Presses whose pictures show less fine detail beside the contact than the others', and than the picture without
     contact (H, W, 3) does if it is most of them; and the share of its power that is left."""
     shares = []
     still = reference.astype(np.float64)
     for press in presses:
-        beside = np.asarray((press.distance() > NEAR * press.circle.radius) & press.lit.all(axis=2), dtype=np.bool_)
+        beside = np.asarray(
+            (press.distance() > SKIRT_RADIUS * press.circle.radius) & press.lit.all(axis=2), dtype=np.bool_
+        )
         if not beside.any():
             beside = np.asarray(press.lit.all(axis=2), dtype=np.bool_)
         if not beside.any():
@@ -82,19 +88,21 @@ def blurred_presses(presses: Sequence[BallPress], reference: Image, mean: FloatA
         own = fine_power(still + press.change * mean, beside)
         shares.append(own / max(fine_power(still, beside), 1e-12))
     usual = max(float(np.median(shares)), 1.0) if shares else 1.0  # most of them may be blurred
-    if max(shares, default=0.0) < MIN_FINE:
+    if max(shares, default=0.0) < MIN_FINE_POWER_RATIO:
         usual = 1.0
-    return [(k, share / usual) for k, share in enumerate(shares) if share < MIN_FINE * usual]
+    return [(k, share / usual) for k, share in enumerate(shares) if share < MIN_FINE_POWER_RATIO * usual]
 
 
-def untouched_contact(
+def find_reference_contact(
     presses: Sequence[BallPress], reference: Image, mean: FloatArray, others: Sequence[Image], ball: float
 ) -> str | None:
     """What speaks for a contact in a picture without contact: what all presses differ from `reference` (H, W, 3) by
     where they do not touch, or two such pictures differ by, looks like a ball's dent. None: nothing does."""
-    strength = float(np.median([np.abs(smooth(press.change, CONTACT_BLUR)).max() for press in presses]))
+    strength = float(np.median([np.abs(gaussian_blur(press.change, CONTACT_BLUR)).max() for press in presses]))
     for number, other in enumerate(others, start=2):
-        where = _dent(other.astype(np.float64) - reference, mean, reference, ball, MIN_CONTACT * strength)
+        where = _describe_dent(
+            other.astype(np.float64) - reference, mean, reference, ball, MIN_REFERENCE_CONTACT * strength
+        )
         if where is not None:
             return (
                 f"pictures 1 and {number} without contact differ by a ball's contact at {where}: take pictures of the "
@@ -102,7 +110,7 @@ def untouched_contact(
             )
     changes = np.stack(
         [
-            np.where((press.distance() > NEAR * press.circle.radius)[..., None], press.change, np.nan).astype(
+            np.where((press.distance() > SKIRT_RADIUS * press.circle.radius)[..., None], press.change, np.nan).astype(
                 np.float32
             )
             for press in presses
@@ -111,7 +119,7 @@ def untouched_contact(
     seen = np.isfinite(changes[..., 0]).sum(axis=0) >= min(3, len(presses))
     changes[:, ~seen] = 0.0
     usual = np.nanmedian(changes, axis=0).astype(np.float64)
-    where = _dent(usual * mean, mean, reference, ball, MIN_CONTACT_BESIDE * strength)
+    where = _describe_dent(usual * mean, mean, reference, ball, MIN_COMMON_CONTACT * strength)
     if where is None:
         return None
     return (
@@ -120,18 +128,18 @@ def untouched_contact(
     )
 
 
-def _dent(change: FloatArray, mean: FloatArray, reference: Image, ball: float, strength: float) -> str | None:
+def _describe_dent(change: FloatArray, mean: FloatArray, reference: Image, ball: float, strength: float) -> str | None:
     """Where a change (H, W, 3) [grey levels] is beyond `strength` [-] and a ball's dent explains it; in words."""
     change = change - np.median(change, axis=(0, 1))
-    if not np.abs(smooth(change / mean, CONTACT_BLUR)).max() > strength:
+    if not np.abs(gaussian_blur(change / mean, CONTACT_BLUR)).max() > strength:
         return None
     level = np.full_like(reference, 128)
     try:
-        circle = contact_circle(np.clip(np.rint(128 + change), 0, 255).astype(np.uint8), level, ball)
+        circle = find_contact_circle(np.clip(np.rint(128 + change), 0, 255).astype(np.uint8), level, ball)
     except NoCircle:
         return None
     height, width = reference.shape[:2]
     inside = min(circle.x, circle.y, width - 1 - circle.x, height - 1 - circle.y) >= circle.radius
-    if circle.explained < MIN_EXPLAINED or not inside:
+    if circle.explained_share < MIN_EXPLAINED_SHARE or not inside:
         return None
     return f"({circle.x:.0f}, {circle.y:.0f}) px"

@@ -35,7 +35,7 @@ def write_page(
     path.write_text(page, encoding="utf-8")
 
 
-def draw(fit: LightFit, path: Path) -> None:
+def draw_residuals(fit: LightFit, path: Path) -> None:
     """Writes a PNG: of each press the change of colour as it was seen, as it is predicted by the others, and the
     error, all in one scale. Raises ValueError for a fit of one press, which is predicted by none; OSError."""
     from matplotlib.figure import Figure

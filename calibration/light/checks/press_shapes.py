@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibration.light.dent import MAX_RIM_RATIO, ContactCircle, dent_gradient, dent_height
-from calibration.light.photometry import FEW_PRESSES, features
+from calibration.light.photometry import FEW_PRESSES, photometric_features
 from calibration.light.press import Window
 from calibration.light.refinement import RIM_BLUR, THINNESS_BOUNDS
 from tacsim.interface import FloatArray
@@ -58,7 +58,7 @@ def fit_stretch(
     free = ((0, 1, 2, 4), (0, 1, 2))
 
     def parts(chosen: slice) -> FloatArray:
-        common = _fitted(windows[chosen], circles[chosen], ball / thickness, ball, shape, position, free).common
+        common = _minimise(windows[chosen], circles[chosen], ball / thickness, ball, shape, position, free).common
         return np.asarray(common[1:], dtype=np.float64)
 
     found, spread = parts(slice(None)), float("nan")
@@ -70,7 +70,7 @@ def fit_stretch(
     return Stretch(float(np.exp(2 * np.hypot(*found))), angle, spread)
 
 
-def other_balls(
+def find_other_balls(
     windows: Sequence[Window], circles: Sequence[ContactCircle], thickness: float, ball: float, shape: tuple[int, int]
 ) -> tuple[tuple[int, ...], float]:
     """Which presses, the smaller part of them, are of a ball of another radius than the rest, and how large it is over
@@ -78,7 +78,7 @@ def other_balls(
     if len(windows) <= FEW_PRESSES:
         return (), 1.0
     free = ((0, 1, 2, 3, 4), (0, 1, 2))
-    balls = _fitted(windows, circles, ball / thickness, ball, shape, 0, free).presses[:, 3]
+    balls = _minimise(windows, circles, ball / thickness, ball, shape, 0, free).presses[:, 3]
     order = np.argsort(balls)
     gaps = np.diff(balls[order])
     cut = int(np.argmax(gaps)) + 1
@@ -91,7 +91,7 @@ def other_balls(
     return tuple(int(k) for k in few), ratio
 
 
-def _fitted(
+def _minimise(
     windows: Sequence[Window],
     circles: Sequence[ContactCircle],
     thinness: float,
@@ -113,7 +113,7 @@ def _fitted(
         for _ in range(8):
             damped = curvature + damping * np.diag(np.diag(curvature) + 1e-12)
             step: FloatArray = np.asarray(np.linalg.solve(damped, -gradient), dtype=np.float64)
-            trial = _moved(fit, free, step[:own].reshape(len(windows), -1), step[own:], ball)
+            trial = _step_fit(fit, free, step[:own].reshape(len(windows), -1), step[own:], ball)
             trial_cost = model.cost(trial)
             if trial_cost < cost:
                 break
@@ -126,7 +126,7 @@ def _fitted(
     return fit
 
 
-def _moved(
+def _step_fit(
     fit: _Fit, free: tuple[tuple[int, ...], tuple[int, ...]], by: FloatArray, common_by: FloatArray, ball: float
 ) -> _Fit:
     presses, common = fit.presses.copy(), fit.common.copy()
@@ -148,7 +148,7 @@ class _Model:
         self._power = sum(float((window.change**2).sum()) for window in windows)
 
     def cost(self, fit: _Fit) -> float:
-        _, _, residuals, _ = self._solved(fit)
+        _, _, residuals, _ = self._solve_light(fit)
         prior = SCALE_PRIOR * self._power * len(self._windows) * float(fit.presses[:, 3].mean()) ** 2
         return sum(float((residual**2).sum()) for residual in residuals) + prior
 
@@ -156,7 +156,7 @@ class _Model:
         self, fit: _Fit, free: tuple[tuple[int, ...], tuple[int, ...]]
     ) -> tuple[FloatArray, FloatArray]:
         """Gradient and Gauss-Newton curvature of half the cost; what the light can explain is projected out."""
-        terms, weights, residuals, square = self._solved(fit)
+        terms, weights, residuals, square = self._solve_light(fit)
         count, own, common = len(self._windows), free[0], free[1]
         size = len(own) * count + len(common)
         gradient, curvature, onto = np.zeros(size), np.zeros((size, size)), np.zeros((3, size, len(square)))
@@ -179,7 +179,7 @@ class _Model:
             curvature[np.ix_(at, at)] += SCALE_PRIOR * self._power / count
         return gradient, curvature
 
-    def _solved(self, fit: _Fit) -> tuple[list[FloatArray], FloatArray, list[FloatArray], FloatArray]:
+    def _solve_light(self, fit: _Fit) -> tuple[list[FloatArray], FloatArray, list[FloatArray], FloatArray]:
         """Terms of each press, weights of the light, residuals, and the square matrix of the light's equations."""
         terms = [self._terms(i, press, fit.common) for i, press in enumerate(fit.presses)]
         square = np.sum([t.T @ t for t in terms], axis=0)
@@ -201,4 +201,4 @@ class _Model:
         depth = dent_height(u, v, circle, thickness, ball)[:, None] / self._ball
         rows, columns = self._shape
         place = (window.u + 0.5) / columns - 0.5, (window.v + 0.5) / rows - 0.5
-        return np.concatenate([features(gradient, *place, DEGREE, self._position), depth], axis=1)
+        return np.concatenate([photometric_features(gradient, *place, DEGREE, self._position), depth], axis=1)

@@ -19,24 +19,26 @@ ORDER: tuple[Word, ...] = ("do not trust", "unverified scale", "usable", "good")
 
 GREY = "the pictures are grey"
 
-MIN_PRESSES, ENOUGH_PRESSES = 3, 5
+MIN_PRESSES, GOOD_PRESSES = 3, 5
 # Means over all presses, each predicted by the others: up to the first good, beyond the second not to be trusted
-NORMALS = (5.0, 8.0)  # errors of the normals in contact [degrees]
-CORRELATION = (0.97, 0.95)  # of predicted and real change of colour
-UNEXPLAINED = (0.15, 0.35)  # share of the change of colour that no dent explains
-RADIUS = (0.03, 0.08)  # uncertainty of the contact radii [-]
-SCALE = (0.05, 0.12)  # of lengths, by a press of known depth or by the size of the gel [-]
+MAX_NORMAL_ERROR = (5.0, 8.0)  # errors of the normals in contact [degrees]
+MIN_CORRELATION = (0.97, 0.95)  # of predicted and real change of colour
+MAX_RESIDUAL_SHARE = (0.15, 0.35)  # share of the change of colour that no dent explains
+MAX_RADIUS_UNCERTAINTY = (0.03, 0.08)  # uncertainty of the contact radii [-]
+MAX_SCALE_ERROR = (0.05, 0.12)  # of lengths, by a press of known depth or by the size of the gel [-]
 # Ratio of the axes of contacts, less 1 and twice its uncertainty: round ones of real sensors show 0.01 to 0.025
-STRETCH = (0.03, 0.05)
+MAX_STRETCH = (0.03, 0.05)
 MAX_LEFT_OUT = 1 / 3  # share of the presses
-DIRECTED = 0.1  # least share of the power of flanks' change of colour that differs from flank to flank
-MISFIT = 0.5  # error of one press over the error of predicting nothing: its circle does not fit
-WIDEST = 0.95  # contact radius over the ball's: no gel is pressed so far
-WIDE = 0.9  # the same of all presses together: some are always lighter
-NARROWEST = 0.35  # the same of the widest contact, below which the slopes are few or the radius is a diameter
-DEEPEST = (0.5, 0.9)  # depth over the thickness of the gel
-THIN = 1.5  # thickness of a gel over the ball's radius, up to which the slopes tell it
-THICKNESS = 2.5  # factor between the gel's thickness by its slopes and as it is told
+MIN_DIRECTED_SHARE = 0.1  # least share of the power of flanks' change of colour that differs from flank to flank
+MAX_ERROR_RATIO = 0.5  # error of one press over the error of predicting nothing: its circle does not fit
+MAX_CONTACT_RATIO = 0.95  # contact radius over the ball's: no gel is pressed so far
+MAX_COMMON_CONTACT_RATIO = 0.9  # the same of all presses together: some are always lighter
+MIN_WIDEST_CONTACT_RATIO = (
+    0.35  # the same of the widest contact, below which the slopes are few or the radius is a diameter
+)
+MAX_DEPTH_RATIO = (0.5, 0.9)  # depth over the thickness of the gel
+MAX_IDENTIFIABLE_THICKNESS = 1.5  # thickness of a gel over the ball's radius, up to which the slopes tell it
+MAX_THICKNESS_RATIO = 2.5  # factor between the gel's thickness by its slopes and as it is told
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,29 +78,29 @@ class KnownScale:
     marker_pitches: tuple[float, float] | None = None  # of printed dots: as found by the pixel pitch, as given [m]
 
 
-def judge(fit: LightFit, scale: KnownScale, *, dots: bool = False) -> Verdict:
+def evaluate_calibration(fit: LightFit, scale: KnownScale, *, dots: bool = False) -> Verdict:
     """All findings, the worst first. `dots` are seen on the gel, and were not told."""
-    found = [*_of_presses(fit), *_of_pictures(fit), *_of_shape(fit), *_of_scale(fit, scale)]
-    found += [Finding("do not trust", *_split(doubt)) for doubt in fit.doubts]
+    found = [*_check_presses(fit), *_check_images(fit), *_check_shape(fit), *_check_scale(fit, scale)]
+    found += [Finding("do not trust", *_split_warning(doubt)) for doubt in fit.image_warnings]
     if dots:  # a rig refuses such a bundle
         found.insert(
             0, Finding("do not trust", "dots are printed on the gel, and each will pass for a dent", "give --markers")
         )
-    found += [Finding("usable", *_split(warning)) for warning in fit.warnings]
+    found += [Finding("usable", *_split_warning(warning)) for warning in fit.warnings]
     return Verdict(tuple(sorted(found, key=lambda finding: ORDER.index(finding.word))))
 
 
-def _of_presses(fit: LightFit) -> Iterable[Finding]:
+def _check_presses(fit: LightFit) -> Iterable[Finding]:
     count = len(fit.presses)
-    if count < ENOUGH_PRESSES:
+    if count < GOOD_PRESSES:
         # depth needs one table, which one press gives; slopes need colours of all directions everywhere
         word: Word = "do not trust" if count < MIN_PRESSES and fit.darkness is None else "usable"
         todo = "press five at least, eight are good"
         if fit.darkness is not None:
             todo = "that gives the table of darkness, five presses tell whether it holds"
         yield Finding(word, f"{count} press{'es' * (count > 1)} could be used", todo)
-    yield from _beyond(
-        RADIUS, fit.radius_uncertainty, "the contact radii are uncertain by {:.0%}",
+    yield from _exceed_limits(
+        MAX_RADIUS_UNCERTAINTY, fit.radius_uncertainty, "the contact radii are uncertain by {:.0%}",
         "press more often and deeper; is each picture of one ball, held still?",
     )  # fmt: skip
     share = len(fit.left_out) / (count + len(fit.left_out))
@@ -107,68 +109,68 @@ def _of_presses(fit: LightFit) -> Iterable[Finding]:
             "do not trust", f"{len(fit.left_out)} of {count + len(fit.left_out)} presses were left out",
             "see why below, and press again: one ball, one sensor, one setting of its camera",
         )  # fmt: skip
-    misfit = [press.name for press in fit.predictions if press.error > MISFIT * press.null_error]
+    misfit = [press.name for press in fit.predictions if press.error > MAX_ERROR_RATIO * press.null_error]
     if misfit:
-        yield Finding("usable", f"the circle of {_names(misfit)} does not fit", "look at it, and leave it out")
+        yield Finding("usable", f"the circle of {_join_names(misfit)} does not fit", "look at it, and leave it out")
 
 
-def _of_pictures(fit: LightFit) -> Iterable[Finding]:
-    unexplained = float(np.mean(fit.unexplained))
+def _check_images(fit: LightFit) -> Iterable[Finding]:
+    unexplained = float(np.mean(fit.residual_shares))
     if fit.forward is not None and is_grey(fit.reference):
         yield Finding(
             "do not trust", f"{GREY}, and one number a pixel cannot tell slopes of two directions",
             "calibrate from the camera's own pictures, in colour",
         )  # fmt: skip
-    if fit.forward is not None and undirected(fit.forward):
+    if fit.forward is not None and is_undirected(fit.forward):
         yield Finding(
             "do not trust", "this light tells no direction: all flanks of a dent change alike",
             "slopes cannot be found in such pictures; only how dark it is tells of depth",
         )  # fmt: skip
-    yield from _beyond(
-        UNEXPLAINED, unexplained, "{:.0%} of what the presses change is no smooth function of the slope",
+    yield from _exceed_limits(
+        MAX_RESIDUAL_SHARE, unexplained, "{:.0%} of what the presses change is no smooth function of the slope",
         "shadows, or a light that tells no direction; is the ball a ball, and exposure fixed?",
     )  # fmt: skip
     if not fit.predictions:
         return
-    yield from _beyond(
-        NORMALS, float(np.mean([press.angle for press in fit.predictions])),
+    yield from _exceed_limits(
+        MAX_NORMAL_ERROR, float(np.mean([press.angle for press in fit.predictions])),
         "normals of presses that took no part are off by {:.1f} degrees",
         "look at residuals.png: what do the worst show?",
     )  # fmt: skip
     correlation = float(np.mean([press.correlation for press in fit.predictions]))
-    yield from _beyond(
-        (-CORRELATION[0], -CORRELATION[1]), -correlation,
+    yield from _exceed_limits(
+        (-MIN_CORRELATION[0], -MIN_CORRELATION[1]), -correlation,
         f"pictures of presses that took no part are predicted with a correlation of {correlation:.3f}",
         "exposure and white balance fixed? a picture without contact of the same session?",
     )  # fmt: skip
 
 
-def _of_shape(fit: LightFit) -> Iterable[Finding]:
+def _check_shape(fit: LightFit) -> Iterable[Finding]:
     if fit.stretch is not None:
         unsure = 0.0 if math.isnan(fit.stretch.uncertainty) else 2 * fit.stretch.uncertainty
-        yield from _beyond(
-            STRETCH, fit.stretch.ratio - 1.0 - unsure,
+        yield from _exceed_limits(
+            MAX_STRETCH, fit.stretch.ratio - 1.0 - unsure,
             f"contacts of the ball are no circles: the ratio of their axes is {fit.stretch}; only below "
-            f"{1 + STRETCH[0] + unsure:.3f} it cannot be distinguished from 1",
+            f"{1 + MAX_STRETCH[0] + unsure:.3f} it cannot be distinguished from 1",
             "give pictures whose pixels are square, or the view of the gel (--view)",
         )  # fmt: skip
 
 
-def _of_scale(fit: LightFit, scale: KnownScale) -> Iterable[Finding]:
+def _check_scale(fit: LightFit, scale: KnownScale) -> Iterable[Finding]:
     ball = scale.ball_radius / scale.pixel_pitch
     ratios = [press.circle.radius / ball for press in fit.presses]
-    wide = [press.name for press, ratio in zip(fit.presses, ratios, strict=True) if ratio > WIDEST]
-    if len(wide) > len(ratios) / 3 or (len(ratios) >= MIN_PRESSES and min(ratios) > WIDE):
+    wide = [press.name for press, ratio in zip(fit.presses, ratios, strict=True) if ratio > MAX_CONTACT_RATIO]
+    if len(wide) > len(ratios) / 3 or (len(ratios) >= MIN_PRESSES and min(ratios) > MAX_COMMON_CONTACT_RATIO):
         yield Finding(
             "do not trust", f"pitch or radius is wrong: contact radius over ball radius a/R = {np.median(ratios):.2f}",
             "measure the ball by a calliper (its radius is half of that) and the pitch by a board or a ruler",
         )  # fmt: skip
     elif wide:
         yield Finding(
-            "usable", f"the contact of {_names(wide)} is as wide as the ball",
+            "usable", f"the contact of {_join_names(wide)} is as wide as the ball",
             "measure ball (is it the radius that was given?) and pitch; if both are right, leave it out",
         )  # fmt: skip
-    elif max(ratios) < NARROWEST:
+    elif max(ratios) < MIN_WIDEST_CONTACT_RATIO:
         yield Finding(
             "usable", f"no contact is wider than {max(ratios):.2f} of the ball: light presses, a diameter given for "
             "the radius, or too small a pixel pitch", "measure ball and pitch; press as deep as the work will",
@@ -195,8 +197,8 @@ def _of_scale(fit: LightFit, scale: KnownScale) -> Iterable[Finding]:
             )  # fmt: skip
     if scale.marker_pitches is not None:
         found, given = scale.marker_pitches
-        yield from _beyond(
-            SCALE, abs(math.log(found / given)),
+        yield from _exceed_limits(
+            MAX_SCALE_ERROR, abs(math.log(found / given)),
             f"at this pixel pitch the dots are {found * 1e3:.3g} mm apart, and {given * 1e3:.3g} mm were given",
             "measure the pixel pitch by a board or a ruler",
         )  # fmt: skip
@@ -204,16 +206,17 @@ def _of_scale(fit: LightFit, scale: KnownScale) -> Iterable[Finding]:
         rows, columns, _ = fit.reference.shape
         shown = columns * scale.pixel_pitch, rows * scale.pixel_pitch
         off = max(abs(math.log(one / other)) for one, other in zip(shown, scale.gel_size, strict=True))
-        yield from _beyond(
-            SCALE, off,
-            f"at this pitch the picture shows {_size(shown)}, and {_size(scale.gel_size)} of the gel are to be seen",
+        yield from _exceed_limits(
+            MAX_SCALE_ERROR, off,
+            f"at this pitch the picture shows {_size_text(shown)}, and {_size_text(scale.gel_size)} of the gel "
+            "are to be seen",
             "measure the pitch by a board or a ruler",
         )  # fmt: skip
     if scale.gel_thickness is not None:
-        yield from _of_thickness(fit, scale, max(ratios))
+        yield from _check_thickness(fit, scale, max(ratios))
     known = dict(scale.depths)
     # What slopes say of a thick gel is too uncertain for this: the far end of its skirts is taken for drift
-    layer = fit.thickness if fit.thickness < THIN * ball else 1e4 * ball
+    layer = fit.thickness if fit.thickness < MAX_IDENTIFIABLE_THICKNESS * ball else 1e4 * ball
     if scale.gel_thickness is not None:
         layer = scale.gel_thickness / scale.pixel_pitch
     factors = [
@@ -223,30 +226,31 @@ def _of_scale(fit: LightFit, scale: KnownScale) -> Iterable[Finding]:
     ]
     if factors:
         factor = float(np.median(factors))
-        yield from _beyond(
-            SCALE, abs(math.log(factor)),
+        yield from _exceed_limits(
+            MAX_SCALE_ERROR, abs(math.log(factor)),
             f"pitch or radius is wrong: by the depth that is known contacts are {factor:.2f} times as wide as found "
             f"(a/R = {np.median(ratios):.2f})", "measure pitch and ball; is the depth counted from the first touch?",
         )  # fmt: skip
 
 
-def _of_thickness(fit: LightFit, scale: KnownScale, widest: float) -> Iterable[Finding]:
+def _check_thickness(fit: LightFit, scale: KnownScale, widest: float) -> Iterable[Finding]:
     told = scale.gel_thickness
     assert told is not None
     depth = widest**2 * scale.ball_radius
-    yield from _beyond(
-        DEEPEST, depth / told, f"the deepest press is {depth * 1e3:.1f} mm deep in a gel of {told * 1e3:.1f} mm",
+    yield from _exceed_limits(
+        MAX_DEPTH_RATIO, depth / told,
+        f"the deepest press is {depth * 1e3:.1f} mm deep in a gel of {told * 1e3:.1f} mm",
         "measure ball and pitch; press less deep",
     )  # fmt: skip
     by_slopes = fit.thickness * scale.pixel_pitch
-    if by_slopes < told / THICKNESS:
+    if by_slopes < told / MAX_THICKNESS_RATIO:
         yield Finding(
             "usable", f"round the contacts the gel moves like one of {by_slopes * 1e3:.1f} mm, it is told to have "
             f"{told * 1e3:.1f} mm", "is the pixel pitch right?",
         )  # fmt: skip
 
 
-def _beyond(limits: tuple[float, float], value: float, what: str, todo: str) -> Iterable[Finding]:
+def _exceed_limits(limits: tuple[float, float], value: float, what: str, todo: str) -> Iterable[Finding]:
     """A finding where `value` passes the first limit; NaN is nothing."""
     if value > limits[0]:
         yield Finding("do not trust" if value > limits[1] else "usable", what.format(value), todo)
@@ -257,25 +261,25 @@ def is_grey(image: Image) -> bool:
     return bool((image == image[..., :1]).all())
 
 
-def undirected(model: PhotometricModel) -> bool:
+def is_undirected(model: PhotometricModel) -> bool:
     """True where flanks to all sides have nearly one change of colour."""
     turn = np.arange(8) * np.pi / 4
     slopes = 0.6 * model.steepest * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
     middle = np.zeros(8, dtype=np.float32)
     change, _ = PhotometricLight(model).change(slopes.astype(np.float32), middle, middle)
     away = change - change.mean(axis=0)
-    return float((away**2).sum()) < DIRECTED * float((change**2).sum())
+    return float((away**2).sum()) < MIN_DIRECTED_SHARE * float((change**2).sum())
 
 
-def _names(names: list[str]) -> str:
+def _join_names(names: list[str]) -> str:
     return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
 
 
-def _size(size: tuple[float, float]) -> str:
+def _size_text(size: tuple[float, float]) -> str:
     return f"{size[0] * 1e3:.1f} x {size[1] * 1e3:.1f} mm"
 
 
-def _split(warning: str) -> tuple[str, str]:
+def _split_warning(warning: str) -> tuple[str, str]:
     """A warning "what: what to do" in two."""
     what, _, todo = warning.partition(": ")
     return what, todo

@@ -196,7 +196,7 @@ def _view_from_corners(picture: Path, numbers: list[float], size: tuple[float, f
 def _report_view(view: GelView, image: NDArray[np.uint8], folder: Path) -> None:
     import numpy as np
 
-    from calibration.lens.rectification import to_metric
+    from calibration.lens.rectification import metric_rectification
     from tacsim.record.images import encode_png
 
     geometry = view.geometry
@@ -206,7 +206,7 @@ def _report_view(view: GelView, image: NDArray[np.uint8], folder: Path) -> None:
         f"{geometry.width} x {geometry.height} px"
     )
     with writing(folder):
-        (folder / "rectified.png").write_bytes(encode_png(np.rint(to_metric(view)(image)).astype(np.uint8)))
+        (folder / "rectified.png").write_bytes(encode_png(np.rint(metric_rectification(view)(image)).astype(np.uint8)))
         say_files(_write(folder / "view.yaml", view), folder / "rectified.png")
 
 

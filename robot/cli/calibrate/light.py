@@ -35,10 +35,10 @@ def read_presses(frames: Path, reference: Path | None) -> FrameSet:
 
 def straighten(read: FrameSet, region: PictureRegion | None, view: GelView | None) -> FrameSet:
     """Native pictures as they are calibrated: even beyond the region, and metric."""
-    from calibration.frame_set import rectified_by_view, within_region
+    from calibration.frame_set import rectified_by_view, restrict_to_region
 
     if region is not None:
-        read = within_region(read, region)
+        read = restrict_to_region(read, region)
     return read if view is None else rectified_by_view(read, view)
 
 
@@ -95,11 +95,11 @@ def write_calibration(
     must."""
     from calibration.bundle import write_bundle
     from calibration.light.checks import page
-    from calibration.light.checks.page import draw
-    from calibration.light.checks.verdict import judge
+    from calibration.light.checks.page import draw_residuals
+    from calibration.light.checks.verdict import evaluate_calibration
     from calibration.light.noise import measure_skin
 
-    verdict = judge(fit, scale, dots=found is None and _shows_dots(fit))
+    verdict = evaluate_calibration(fit, scale, dots=found is None and _shows_dots(fit))
     _show(fit, scale.pixel_pitch, found)
     if profile.directed is not None and profile.directed == (fit.darkness is not None):
         told = "tells direction" if profile.directed else "tells none"
@@ -125,7 +125,7 @@ def write_calibration(
         written = [write_bundle(folder, bundle, fit.reference)]
         residuals = folder / "residuals.png" if fit.predictions else None
         if residuals is not None:
-            draw(fit, residuals)
+            draw_residuals(fit, residuals)
             written.append(residuals)
         written.append(folder / page.FILE)
         title = _title(serial, folder, profile)

@@ -292,9 +292,9 @@ def _show_fit(title: str, columns: tuple[str, ...], rows: list[tuple[str, ...]],
 
 def _placement(pose: Pose) -> str:
     """A pose as a rig file writes it, to the tenth of a micrometre."""
-    from calibration.poses.records import placement
+    from calibration.poses.records import placement_of_pose
 
-    placed = placement(pose)
+    placed = placement_of_pose(pose)
     position = ", ".join(f"{1e3 * each:.4f} mm" for each in placed.position)
     rotation = ", ".join(f"{math.degrees(each):.4f} deg" for each in placed.rotation)
     return f"{{ position: [{position}], rotation: [{rotation}] }}"

@@ -328,13 +328,13 @@ def _take_presses(
     A signal ends the command; what was taken is kept then, too. Raises CannotCalibrate, BadFrames, DeviceError.
     """
     from calibration.errors import BadFrames
-    from calibration.frame_set import Frame, FrameSet, metric_picture, require_view_size
+    from calibration.frame_set import Frame, FrameSet, metric_image_map, require_view_size
     from robot.camera.camera import Camera
     from robot.procedures.presses import BallPressPlan, record_presses
 
     if view is not None:
         require_view_size((config.height, config.width), view)
-    rectify = None if view is None else metric_picture(view)
+    rectify = None if view is None else metric_image_map(view)
     plan = BallPressPlan(asked.ball / pitch, presses, rectify=rectify, markers=asked.markers)
     frames = asked.folder / FRAMES
     again = f"tacsim calibrate sensor {shlex.quote(str(frames))} --serial {shlex.quote(asked.serial)} ..."

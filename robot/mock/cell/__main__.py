@@ -25,7 +25,7 @@ from tacsim.models.sensor import CanonicalGrid, SensorModel
 from tacsim.optics.noise import noise_source
 from tacsim.optics.render import Renderer
 from tacsim.optics.surface import surface_map
-from tacsim.pose import distance
+from tacsim.pose import pose_distance
 
 if TYPE_CHECKING:
     from tacsim.physics.world import World
@@ -71,7 +71,7 @@ class WorldCell:
     def move(self, poses: Mapping[str, Pose]) -> None:
         targets = {}
         for name, pose in poses.items():
-            metres, radians = distance(self.world.pose(name), pose)
+            metres, radians = pose_distance(self.world.pose(name), pose)
             if max(metres, 0.1 * radians) > SAME:
                 targets[name] = pose
         if targets:

@@ -9,10 +9,10 @@ from typing import Literal
 
 import numpy as np
 
-from calibration.materials.checks import Finding, findings, size_error
-from calibration.materials.estimate import COARSE_ERROR, estimate
+from calibration.materials.checks import Finding, find_contradictions, indenter_size_error
+from calibration.materials.estimate import COARSE_ERROR, estimate_materials
 from calibration.materials.fit import Fit, Parameter, Point, Priors, Signals
-from calibration.materials.presses import Noise, Press, gathered, signals_of, thinned
+from calibration.materials.presses import Noise, Press, downsample_press, merge_repeated_readings, signals_of
 from robot.studies.identify.recordings import Recordings
 from robot.studies.identify.simulation import Simulation, coarser, scene_with
 from tacsim.interface import FloatArray
@@ -49,7 +49,7 @@ class Identified:
     @property
     def size_error(self) -> float | None:
         """Standard deviation of the size of an indenter by these presses alone, as a share of it."""
-        return None if self.by_size is None else size_error(self.checked, self.by_size)
+        return None if self.by_size is None else indenter_size_error(self.checked, self.by_size)
 
 
 def parameters_of(kind: Kind, scene: Scene) -> tuple[Parameter, ...]:
@@ -113,7 +113,7 @@ def identify(
     if unknown:
         raise ValueError(f"'{unknown[0]}' is nothing that can be identified of a {kind}; allowed: {', '.join(names)}")
     parameters = tuple(each for each in parameters if not wanted or each.name in wanted)
-    taken = tuple(thinned(gathered(press), most_moments) for press in presses)
+    taken = tuple(downsample_press(merge_repeated_readings(press), most_moments) for press in presses)
     signals = signals_of(taken, noise)
     start = scene_with(scene, {each.name: each.start for each in parameters})
     exact = Simulation(start, parameters, taken, recordings.seen, on_run)
@@ -125,7 +125,7 @@ def identify(
         levels.insert(0, replace(exact, scene=coarser(coarse)))
         error *= 2
     width = np.array([name.endswith(".width") for name in signals.channels])[signals.channel]
-    fit = estimate(
+    fit = estimate_materials(
         levels, replace(signals, noise=np.where(width, UNWEIGHED, signals.noise)), parameters, priors, error, on_step
     )  # fmt: skip
     if gel_error > 0 and kind == "body":
@@ -139,7 +139,7 @@ def identify(
         by_size = np.stack([np.where(balls[signals.press] == ball, by_all, 0.0) for ball in np.unique(balls)], axis=1)
     sigma = np.sqrt(fit.sigma**2 - np.where(width, UNWEIGHED**2 - signals.noise**2, 0.0))
     checked = replace(fit, sigma=sigma)
-    against = findings(checked, signals, tuple(press.name for press in taken), by_size)
+    against = find_contradictions(checked, signals, tuple(press.name for press in taken), by_size)
     return Identified(kind, found, fit, taken, signals, tuple(against), noise, checked, by_size)
 
 
@@ -156,7 +156,7 @@ def _with_gel_error(fit: Fit, signals: Signals, error: float) -> Fit:
             by_gel = by_gel - fit.system[:, index]
         elif each.name == "hardening_modulus":
             by_gel = by_gel - fit.free[index] * fit.system[:, index]
-    shift = fit.influence(by_gel)
+    shift = fit.parameter_change(by_gel)
     return replace(fit, covariance=fit.covariance + error**2 * np.outer(shift, shift))
 
 
@@ -166,5 +166,5 @@ def outlook(identified: Identified, force_noise: float) -> dict[str, float]:
     force = signals.force[signals.channel]
     scale = np.where(force, force_noise / identified.noise.force, 1.0)
     sigma = np.sqrt(np.maximum(fit.sigma**2 - signals.noise**2, 0.0) + (signals.noise * scale) ** 2)
-    other = fit.with_sigma(sigma).widened(signals.values - fit.predicted, signals.series)
-    return {each.name: other.half(each.name) for each in fit.told}
+    other = fit.with_sigma(sigma).widen_intervals(signals.values - fit.predicted, signals.series)
+    return {each.name: other.half_interval(each.name) for each in fit.identified}

@@ -214,7 +214,7 @@ class Recordings:
         for each in observations:
             sensor = Pose() if arm is None or arm not in each.arms else each.arms[arm].pose
             indenter = each.arms["indenter"].pose if "indenter" in each.arms else self._place(path, original)
-            found.append(se3.relative(sensor, indenter))
+            found.append(se3.relative_pose(sensor, indenter))
         return {"indenter": tuple(found)}
 
     def _place(self, path: Path, original: RigConfig | None) -> Pose:

@@ -35,7 +35,7 @@ def in_words(parameter: Parameter, value: float) -> str:
 def told(identified: Identified) -> list[tuple[str, str, str]]:
     """Name, value and 95 % interval of each parameter, for a person."""
     rows = []
-    for each in identified.fit.told:
+    for each in identified.fit.identified:
         low, high = identified.fit.interval(each.name)
         rows.append((
             each.name, in_words(each, identified.fit.value(each.name)),
@@ -79,10 +79,10 @@ def as_json(identified: Identified) -> dict[str, Any]:
                 "moved_by_mesh": float(fit.mesh_shift[index]),
             }
             for index, each in enumerate(fit.parameters)
-            if each in fit.told
+            if each in fit.identified
         },
-        "untold": {each.name: WHAT_TELLS[identified.kind][each.name] for each in fit.untold},
-        "findings": [{"kind": each.kind, "words": each.words} for each in identified.findings],
+        "untold": {each.name: WHAT_TELLS[identified.kind][each.name] for each in fit.unidentified},
+        "findings": [{"kind": each.kind, "words": each.text} for each in identified.findings],
         "noise": {"force": identified.noise.force, "dent": identified.noise.dent, "slip": identified.noise.slip},
         "presses": [press.name for press in identified.presses],
         "simulated": fit.runs,
@@ -94,7 +94,7 @@ def as_json(identified: Identified) -> dict[str, Any]:
 def _origin(identified: Identified) -> str:
     names = [printable(press.name) for press in identified.presses]
     what = "presses" if identified.kind == "gel" else "squeezes"
-    held = ", ".join(each.name for each in identified.fit.untold)
+    held = ", ".join(each.name for each in identified.fit.unidentified)
     kept = f" Not told by them, as it was before: {held}." if held else ""
     return (
         f"Identified {date.today().isoformat()} from {len(names)} {what} ({', '.join(names[:6])}"
@@ -105,13 +105,13 @@ def _origin(identified: Identified) -> str:
 def _material_text(identified: Identified) -> str:
     """A material file, the intervals beside the numbers."""
     fit, lines = identified.fit, [f"# A {identified.kind}, identified. Beside a number: its 95 % interval."]
-    found = {each.name for each in fit.told}
+    found = {each.name for each in fit.identified}
     for key, value in material(identified).items():
         note = ""
         if key in found:
             low, high = fit.interval(key)
             note = f" # {low:.6g} to {high:.6g}"
-        elif key in {each.name for each in fit.untold}:
+        elif key in {each.name for each in fit.unidentified}:
             note = " # not told by the recordings: as it was"
         lines.append(f"{key}: {json.dumps(float(f'{value:.6g}') if isinstance(value, float) else value)}{note}")
     lines.append(yaml.safe_dump({"source": _origin(identified)}, width=110, allow_unicode=True).rstrip())
@@ -130,8 +130,8 @@ def draw(identified: Identified, table: Sequence[tuple[str, str, str]], path: Pa
     shown = identified.presses[:MOST_DRAWN]
     figure = canvas(max(3.4 * len(shown), 9.0), 9.5)
     lines = [f"{name.replace('_', ' ')}   {value}   (95 %: {interval})" for name, value, interval in table]
-    lines += [f"{each.name.replace('_', ' ')}   not told" for each in identified.fit.untold]
-    lines += [f"NOT TO BE USED: {each.words}"[:150] for each in identified.findings]
+    lines += [f"{each.name.replace('_', ' ')}   not told" for each in identified.fit.unidentified]
+    lines += [f"NOT TO BE USED: {each.text}"[:150] for each in identified.findings]
     left = len(identified.presses) - len(shown)
     lines += [f"and {left} more presses"] if left else []
     # no suptitle, for which tight_layout would leave room once more

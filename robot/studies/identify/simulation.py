@@ -192,7 +192,7 @@ def _path(press: Press, place: float) -> dict[str, list[Pose]]:
             Pose(pose.position - np.array([0.0, 0.0, place]), pose.quaternion) for pose in path["indenter"]
         ]
     else:
-        path["upper"] = [se3.along_z(pose, place) for pose in path["upper"]]
+        path["upper"] = [se3.translated_along_z(pose, place) for pose in path["upper"]]
     return path
 
 

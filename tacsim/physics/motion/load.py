@@ -108,7 +108,7 @@ def keep_loads(
         return 0.0 - float(world.wrench(name)[2])  # never -0
 
     def on_path(share: float) -> dict[str, Pose]:
-        return {name: se3.interpolate(start[name], target, share) for name, target in targets.items()}
+        return {name: se3.interpolate_pose(start[name], target, share) for name, target in targets.items()}
 
     def gap(name: str, poses: Mapping[str, Pose]) -> float:
         """Of a sensor's origin and that of the other frame, along the sensor's z [m]."""

@@ -167,7 +167,7 @@ class Path:
 @lru_cache(maxsize=64)
 def _matrix(*quaternion: float) -> NDArray[np.float64]:
     """Rotation matrix (3, 3) of a frame that does not turn: most never do."""
-    return se3.matrix(Pose(quaternion=np.array(quaternion)))
+    return se3.rotation_matrix(Pose(quaternion=np.array(quaternion)))
 
 
 def displacement_between(a: Pose, b: Pose) -> NDArray[np.float64]:
@@ -201,7 +201,7 @@ def path_length(start: Sequence[Pose], end: Sequence[Pose], lever: float) -> flo
 def path_along(start: Sequence[Pose], end: Sequence[Pose], lever: float) -> float:
     """What of it goes along the surface of the first frame, a sensor, turns included [mm]."""
     displacements = displacements_between(start, end)
-    normal = se3.matrix(start[0])[:, 2]
+    normal = se3.rotation_matrix(start[0])[:, 2]
     displacements[:, :3] -= np.outer(displacements[:, :3] @ normal, normal)
     return of_fastest_point(displacements, lever)
 

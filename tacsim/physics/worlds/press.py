@@ -45,7 +45,7 @@ from tacsim.physics.worlds.tuning import (
     SHORT_INDENTING_SLIDE,
     TURNING_ZETA_SHARE,
 )
-from tacsim.pose import inverse, relative, rotate
+from tacsim.pose import inverse, relative_pose, rotate
 
 TOO_MUCH = "cut off parts of mesh and gel that cannot touch; worlds of a smaller batch have more room each"
 
@@ -150,8 +150,8 @@ class PressWorld(FemWorld):
         gel, lever, indenter, mach = self._gel, max(self._gel.half), self.scene.indenter, self.scene.peak_mach
         assert indenter is not None
         growing, turning, slower, walls, depth, self.unfollowed = 0.0, 0.0, 1.0, False, 0.0, ""
-        at = relative(*end)
-        way = (at.position - relative(*start).position) * MM
+        at = relative_pose(*end)
+        way = (at.position - relative_pose(*start).position) * MM
         longest = path_length(start, end, lever)
         faster = max(1.0, float(np.linalg.norm(way)) / longest) if longest > 0.0 else 1.0  # if they go opposite ways
         if indenter.friction > 0.0:
@@ -189,7 +189,7 @@ class PressWorld(FemWorld):
     def place(self, poses: Mapping[str, Pose]) -> None:
         """See World. Where the indenter is then, it has come to the gel."""
         super().place(poses)
-        self._touched[:] = [*relative(*self._poses.values()).position[:2] * MM, 0.0]
+        self._touched[:] = [*relative_pose(*self._poses.values()).position[:2] * MM, 0.0]
 
     def below(self, turn: np.ndarray) -> float:
         """How far the indenter's lowest point is below its origin, the centre of its bounding box, if that is turned by

@@ -11,9 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibration.compare.alignment import by_geometry, by_size
-from calibration.compare.compare import METRICS, Comparison, Options, bootstrap, compare_frames
-from calibration.compare.report import as_json, figures, judgement, write
+from calibration.compare.alignment import align_by_geometry, align_by_size
+from calibration.compare.compare import METRICS, Comparison, Options, bootstrap_interval, compare_frames
+from calibration.compare.description import describe_comparison
+from calibration.compare.report import comparison_as_json, comparison_figures, write_comparison
 from calibration.errors import BadFrames
 from calibration.frame_set import Frame, FrameSet, rectified_by_corners, rectified_shape
 from calibration.lens.view import BadCorners
@@ -62,7 +63,7 @@ def test_a_blank_beats_no_null(real: FrameSet) -> None:
         assert result.overall[key].beats_null is False, key
         assert result.overall[key].mean == result.overall[key].null
     assert all("A: no contact" in pair.flags for pair in result.pairs)
-    assert "no shift was looked for" in result.alignment.said
+    assert "no shift was looked for" in result.alignment.description
 
 
 def test_another_light_is_told_from_the_right_one(other: FrameSet, real: FrameSet, compared: Comparison) -> None:
@@ -89,12 +90,12 @@ def test_a_picture_of_twice_the_size_is_scaled(good: FrameSet, real: FrameSet) -
     result = compare_frames(twice, real)
     assert result.overall["contact_ncc"].mean > 0.98
     assert result.alignment.shift == pytest.approx((0.0, 0.0), abs=0.1)
-    assert "scaled by 0.5" in result.alignment.said
+    assert "scaled by 0.5" in result.alignment.description
 
 
 def test_pixel_centres_stay_whole_numbers_under_a_scale() -> None:
     """The outer borders coincide, not the centres of the first pixels."""
-    aligned = by_size((40, 60), (20, 30))
+    aligned = align_by_size((40, 60), (20, 30))
     corners = np.array([[-0.5, -0.5, 1.0], [29.5, 19.5, 1.0]])
     assert corners @ aligned.a_from_b.T == pytest.approx(np.array([[-0.5, -0.5], [59.5, 39.5]]))
 
@@ -102,10 +103,10 @@ def test_pixel_centres_stay_whole_numbers_under_a_scale() -> None:
 def test_geometries_place_both_on_the_gel() -> None:
     source = SensorGeometry(width=100, height=80, pixel_pitch=0.1e-3)
     target = SensorGeometry(width=60, height=40, pixel_pitch=0.2e-3, centre=(20.0, 10.0))
-    aligned = by_geometry(source, target)
+    aligned = align_by_geometry(source, target)
     assert aligned.a_from_b @ [20.0, 10.0, 1.0] == pytest.approx(source.principal)
     assert aligned.a_from_b @ [25.0, 10.0, 1.0] == pytest.approx(np.add(source.principal, (10.0, 0.0)))
-    covered = aligned.covered
+    covered = aligned.covered_mask
     assert covered[10, 20]
     assert not covered[39, 59]  # 7.8 mm to the right of the axis; A reaches 5 mm
 
@@ -209,25 +210,25 @@ def test_pairs_that_are_none_are_not_shifted(real: FrameSet) -> None:
     elsewhere = side(HiddenSensor(3), places=[(190, 140), (70, 60), (60, 150), (200, 60), (130, 50)])
     result = compare_frames(elsewhere, real)
     assert result.alignment.shift == (0.0, 0.0)
-    assert "not shifted" in result.alignment.said
+    assert "not shifted" in result.alignment.description
 
 
 def test_the_bootstrap_has_the_width_of_the_mean() -> None:
     values = np.random.default_rng(1).normal(5, 2, 400)
-    low, high = bootstrap(values)
+    low, high = bootstrap_interval(values)
     assert low < values.mean() < high
     assert high - low == pytest.approx(2 * 1.96 * values.std() / 20, rel=0.1)
-    assert all(math.isnan(bound) for bound in bootstrap(values[:2]))
+    assert all(math.isnan(bound) for bound in bootstrap_interval(values[:2]))
 
 
 # files
 
 
 def test_the_files_say_the_same_and_load_nothing(compared: Comparison, tmp_path: Path) -> None:
-    paths = write(tmp_path, compared)
+    paths = write_comparison(tmp_path, compared)
     assert [path.name for path in paths] == ["compare.json", "compare.csv", "compare.html"]
     config = json.loads(paths[0].read_text(encoding="utf-8"))
-    assert config == as_json(compared)
+    assert config == comparison_as_json(compared)
     assert config["overall"]["gradient_angle"]["mean"] is None
     with paths[1].open(encoding="utf-8", newline="") as file:
         table = list(csv.DictReader(file))
@@ -243,7 +244,7 @@ def test_the_files_say_the_same_and_load_nothing(compared: Comparison, tmp_path:
 
 def test_the_columns_of_the_page_need_no_more_than_their_longest_word(compared: Comparison, tmp_path: Path) -> None:
     """Heads in one line made the tables wider than a window of 1200 px, and their last columns were cut off."""
-    page = write(tmp_path, compared)[2].read_text(encoding="utf-8")
+    page = write_comparison(tmp_path, compared)[2].read_text(encoding="utf-8")
     style = page[page.index("<style>") : page.index("</style>")]
     for part, wrapped in (("thead th", "white-space: normal"), ("td.name", "overflow-wrap: anywhere")):
         assert wrapped in style[style.rindex(part) :].partition("}")[0]
@@ -255,7 +256,7 @@ def test_names_of_files_are_no_markup(good: FrameSet, real: FrameSet, tmp_path: 
     evil = "<img src=x onerror=alert(1)>.png"
     frames = (replace(good.frames[0], name=evil), *good.frames[1:])
     result = compare_frames(replace(good, frames=frames, name="<b>A</b>"), real)
-    page = write(tmp_path, result)[2].read_text(encoding="utf-8")
+    page = write_comparison(tmp_path, result)[2].read_text(encoding="utf-8")
     assert evil not in page and "<b>A</b>" not in page
     assert "&lt;img src=x" in page
 
@@ -263,13 +264,13 @@ def test_names_of_files_are_no_markup(good: FrameSet, real: FrameSet, tmp_path: 
 def test_a_comparison_with_itself_can_be_written(real: FrameSet, tmp_path: Path) -> None:
     result = compare_frames(real, real)
     assert result.overall["psnr"].mean == math.inf
-    config = json.loads(write(tmp_path, result)[0].read_text(encoding="utf-8"))
+    config = json.loads(write_comparison(tmp_path, result)[0].read_text(encoding="utf-8"))
     assert config["overall"]["mae"]["mean"] == 0.0
     assert config["overall"]["psnr"]["mean"] is None
 
 
 def test_every_metric_is_a_figure(compared: Comparison) -> None:
-    values = figures(compared)
+    values = comparison_figures(compared)
     assert {metric.key for metric in METRICS} <= set(values)
     assert values["contact_mae"] == compared.overall["contact_mae"].mean
     assert math.isnan(values["rho_gradient"])
@@ -314,33 +315,33 @@ def test_what_could_not_be_made_is_left_out_and_said(good: FrameSet, real: Frame
 def test_a_simulation_and_its_truth_are_called_so(good: FrameSet, real: FrameSet, tmp_path: Path) -> None:
     result = compare_frames(replace(good, simulated=True), real)
     assert result.names == ("simulated", "real")
-    page = write(tmp_path, result)[2].read_text(encoding="utf-8")
+    page = write_comparison(tmp_path, result)[2].read_text(encoding="utf-8")
     assert "simulated against real" in page and "A against B" not in page
     assert compare_frames(good, replace(real, simulated=True)).names == ("real", "simulated")
-    assert as_json(result)["a"]["is"] == "simulated"
+    assert comparison_as_json(result)["a"]["is"] == "simulated"
 
 
 def test_the_judgement_is_one_plain_sentence(
     compared: Comparison, other: FrameSet, good: FrameSet, real: FrameSet, tmp_path: Path
 ) -> None:
-    close = judgement(compared)
+    close = describe_comparison(compared)
     assert close.startswith("In contact A looks like B: they differ by 1.") and "noise alone by 1." in close
-    assert "no more like B than a picture without contact" in judgement(compare_frames(other, real))
+    assert "no more like B than a picture without contact" in describe_comparison(compare_frames(other, real))
     dull = changed(good, lambda image: np.rint(0.5 * (image + np.float64(good.reference))).astype(np.uint8))
-    assert "A resembles B, but is not close to it" in judgement(compare_frames(dull, real))
-    assert "no more like B than a picture without contact" in judgement(compare_frames(blank(real), real))
+    assert "A resembles B, but is not close to it" in describe_comparison(compare_frames(dull, real))
+    assert "no more like B than a picture without contact" in describe_comparison(compare_frames(blank(real), real))
     few = compare_frames(replace(good, frames=good.frames[:1]), replace(real, frames=real.frames[:1]))
-    assert judgement(few).startswith("Too few pairs to judge")
+    assert describe_comparison(few).startswith("Too few pairs to judge")
     still = compare_frames(blank(real), blank(real))
-    assert judgement(still) == "No pair shows contact, so nothing can be judged."
-    page = write(tmp_path, compared)[2].read_text(encoding="utf-8")
+    assert describe_comparison(still) == "No pair shows contact, so nothing can be judged."
+    page = write_comparison(tmp_path, compared)[2].read_text(encoding="utf-8")
     assert page.index(close[:40]) < page.index("<table")
 
 
 def test_every_table_of_the_page_has_units(compared: Comparison, tmp_path: Path) -> None:
-    page = write(tmp_path, compared)[2].read_text(encoding="utf-8")
+    page = write_comparison(tmp_path, compared)[2].read_text(encoding="utf-8")
     assert "<td>grey</td>" in page and "contact NCC of the difference [1]" in page
-    assert as_json(compared)["units"]["height_rmse"] == "m"
+    assert comparison_as_json(compared)["units"]["height_rmse"] == "m"
     assert "quarter of the strongest change" in page  # which pixels the figures are of
 
 

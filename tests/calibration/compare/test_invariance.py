@@ -18,10 +18,10 @@ from calibration.compare.invariance import (
     area_under_curve,
     auc_interval,
     classifier_scores,
-    distances,
-    invariance,
+    measure_invariance,
+    partner_distances,
 )
-from calibration.compare.report import as_json, figures, names, write
+from calibration.compare.report import comparison_as_json, comparison_figures, figure_names, write_comparison
 from calibration.errors import BadFrames
 from calibration.frame_set import Frame, FrameSet
 from tests.calibration.presses import HiddenSensor
@@ -49,7 +49,7 @@ def test_a_weighted_press_counts_as_often_as_it_is_drawn() -> None:
 
 def test_the_ratio_is_of_partners_and_neighbours() -> None:
     of_b = np.array([[0.0], [30.0], [10.0], [20.0]])  # in this order neighbours are 10 apart
-    assert [np.median(each) for each in distances(of_b + 4.0, of_b, np.array([0, 2, 3, 1]))] == [4.0, 10.0]
+    assert [np.median(each) for each in partner_distances(of_b + 4.0, of_b, np.array([0, 2, 3, 1]))] == [4.0, 10.0]
 
 
 def test_a_classifier_finds_a_difference_and_no_other() -> None:
@@ -102,7 +102,7 @@ def good(real: FrameSet, calibration: Calibration) -> Comparison:
 
 @pytest.fixture(scope="module")
 def report(good: Comparison, calibration: Calibration) -> Report:
-    return invariance([(good, calibration)])
+    return measure_invariance([(good, calibration)])
 
 
 def test_a_good_simulation_is_nearer_than_the_next_press(report: Report) -> None:
@@ -122,7 +122,7 @@ def test_another_light_is_seen_in_the_picture_but_hardly_in_the_surface(
     sensor = HiddenSensor(8)
     own, _ = calibrated(HiddenSensor(8))
     result = compare_frames(replace(side(sensor, 6), untouched=()), real, own, calibration)
-    found = invariance([(result, calibration)])
+    found = measure_invariance([(result, calibration)])
     views = {view.view: view for view in found.views}
     assert views["raw"].rho > 1 and views["raw"].auc == 1.0
     assert views["difference"].rho > 1
@@ -143,14 +143,16 @@ def test_a_change_after_which_no_surface_is_found_is_named(
 
     lost = module.Change("lamps dimmed", "dim", (0.3, 0.3, 0.3))  # too much to measure by a reference from before
     monkeypatch.setattr(module, "CHANGES", (lost,))
-    found = invariance([(compare_frames(replace(real, untouched=()), real, calibration, calibration), calibration)])
+    found = measure_invariance(
+        [(compare_frames(replace(real, untouched=()), real, calibration, calibration), calibration)]
+    )
     (drift,) = found.drifts
     assert math.isfinite(drift.fresh) and math.isnan(drift.stale)
     assert any("no drift is measured, after: lamps dimmed" in note for note in found.notes)
 
 
 def test_surfaces_and_drift_are_left_out_with_a_word(real: FrameSet) -> None:
-    found = invariance([(compare_frames(replace(real, untouched=()), real), None)])
+    found = measure_invariance([(compare_frames(replace(real, untouched=()), real), None)])
     assert [view.view for view in found.views] == ["raw", "difference"]
     assert found.drifts == () and math.isnan(found.angle)
     assert len(found.notes) == 2
@@ -161,18 +163,18 @@ def test_surfaces_and_drift_are_left_out_with_a_word(real: FrameSet) -> None:
 def test_too_few_presses_are_refused(real: FrameSet) -> None:
     few = replace(real, frames=real.frames[:3])
     with pytest.raises(BadFrames, match="3 pairs show contact in B; 4 are needed"):
-        invariance([(compare_frames(few, few), None)])
+        measure_invariance([(compare_frames(few, few), None)])
 
 
 def test_the_report_is_in_all_files(good: Comparison, report: Report, tmp_path: Path) -> None:
-    config = as_json(good, report)["invariance"]
+    config = comparison_as_json(good, report)["invariance"]
     assert config["views"]["gradient"]["rho"] == report.views[2].rho
     assert config["drift"]["gain_down"]["fresh"] == report.drifts[0].fresh
-    values = figures(good, report)
-    assert set(values) == set(names())
+    values = comparison_figures(good, report)
+    assert set(values) == set(figure_names())
     assert values["auc_low_height"] == report.views[3].auc_low
     assert values["stale_offset"] == report.drifts[3].stale
-    page = write(tmp_path, good, report)[2].read_text(encoding="utf-8")
+    page = write_comparison(tmp_path, good, report)[2].read_text(encoding="utf-8")
     assert "gain −30 %" in page and f"{report.views[2].rho:.2f}" in page
     assert page.count("data:image/jpeg;base64,") == 8 * len(good.pairs)  # heights too
 
@@ -189,7 +191,7 @@ def test_drift_of_the_light_does_not_give_the_source_away(real: FrameSet, calibr
     sensor.empty()
     good = replace(side(sensor, 6, name="good"), reference=real.reference, untouched=())
     plain, changed_light = (
-        {view.view: view for view in invariance([(compare_frames(good, each), None)]).views}["difference"]
+        {view.view: view for view in measure_invariance([(compare_frames(good, each), None)]).views}["difference"]
         for each in (real, changed(real, drifted))
     )
     assert changed_light.distance < 1.2 * plain.distance

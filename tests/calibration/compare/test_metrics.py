@@ -58,16 +58,16 @@ def test_a_mask_limits_every_number_to_its_pixels() -> None:
     assert metrics.structural_similarity(one, other, where) < metrics.structural_similarity(one, other) < 1.0
     nowhere = np.zeros_like(where)
     for of in (metrics.mean_absolute_error, metrics.peak_signal_to_noise, metrics.structural_similarity,
-               metrics.correlation):  # fmt: skip
+               metrics.image_correlation):  # fmt: skip
         assert math.isnan(of(one, other, nowhere))
 
 
 def test_correlation_knows_sign_and_scale_but_not_a_blank() -> None:
     change = RNG.normal(0, 1, (20, 30, 3))
-    assert metrics.correlation(change, 3 * change + 7) == pytest.approx(1.0)
-    assert metrics.correlation(change, -change) == pytest.approx(-1.0)
-    assert metrics.correlation(np.zeros_like(change), change) == 0.0
-    assert abs(metrics.correlation(change, RNG.normal(0, 1, change.shape))) < 0.1
+    assert metrics.image_correlation(change, 3 * change + 7) == pytest.approx(1.0)
+    assert metrics.image_correlation(change, -change) == pytest.approx(-1.0)
+    assert metrics.image_correlation(np.zeros_like(change), change) == 0.0
+    assert abs(metrics.image_correlation(change, RNG.normal(0, 1, change.shape))) < 0.1
 
 
 @pytest.mark.parametrize("degrees", [0.0, 1e-4, 3.0, 30.0, 80.0])
@@ -75,13 +75,13 @@ def test_the_angle_between_a_tilted_and_a_flat_surface(degrees: float) -> None:
     flat = np.zeros((6, 7, 2))
     tilted = np.zeros((6, 7, 2))
     tilted[..., 1] = math.tan(math.radians(degrees))
-    assert metrics.gradient_angle(flat, tilted) == pytest.approx(degrees, abs=1e-9)
-    assert metrics.gradient_angle(tilted, tilted) == 0.0
+    assert metrics.mean_normal_angle(flat, tilted) == pytest.approx(degrees, abs=1e-9)
+    assert metrics.mean_normal_angle(tilted, tilted) == 0.0
 
 
 def test_opposite_slopes_are_twice_as_far_apart() -> None:
     slopes = np.full((4, 4, 2), [0.3, 0.0])
-    assert metrics.gradient_angle(slopes, -slopes) == pytest.approx(2 * math.degrees(math.atan(0.3)))
+    assert metrics.mean_normal_angle(slopes, -slopes) == pytest.approx(2 * math.degrees(math.atan(0.3)))
 
 
 def test_heights_and_markers() -> None:
@@ -97,16 +97,16 @@ def test_heights_and_markers() -> None:
 def test_two_shifted_squares_overlap_by_a_third() -> None:
     one, other = np.zeros((20, 20), dtype=bool), np.zeros((20, 20), dtype=bool)
     one[5:15, 2:12], other[5:15, 7:17] = True, True
-    assert metrics.overlap(one, other) == pytest.approx(50 / 150)
-    assert math.isnan(metrics.overlap(np.zeros_like(one), np.zeros_like(one)))
+    assert metrics.intersection_over_union(one, other) == pytest.approx(50 / 150)
+    assert math.isnan(metrics.intersection_over_union(np.zeros_like(one), np.zeros_like(one)))
 
 
 def test_a_disc_is_a_patch_of_its_centre_and_radius() -> None:
-    patch = metrics.patch_of(disc(70.0, 50.0, 20.0))
+    patch = metrics.circle_of_region(disc(70.0, 50.0, 20.0))
     assert patch is not None
     assert (patch.x, patch.y) == pytest.approx((70.0, 50.0))
     assert patch.radius == pytest.approx(20.0, abs=0.1)
-    assert metrics.patch_of(np.zeros((5, 5), dtype=bool)) is None
+    assert metrics.circle_of_region(np.zeros((5, 5), dtype=bool)) is None
 
 
 def test_contact_is_found_beside_noise_and_drift_and_its_hole_is_filled() -> None:
@@ -114,7 +114,7 @@ def test_contact_is_found_beside_noise_and_drift_and_its_hole_is_filled() -> Non
     change = RNG.normal(0, 2, (120, 160, 3)) + np.array([6.0, -3.0, 8.0])
     change[ring] += [40.0, -30.0, 0.0]
     region = metrics.contact_region(change)
-    assert metrics.overlap(region, disc(80, 60, 25)) > 0.85
+    assert metrics.intersection_over_union(region, disc(80, 60, 25)) > 0.85
     assert region[60, 80]
 
 
@@ -122,7 +122,7 @@ def test_the_region_means_the_same_in_a_dim_picture() -> None:
     v, u = np.mgrid[:120, :160]
     bump = np.exp(-((u - 80) ** 2 + (v - 60) ** 2) / (2 * 15**2))[..., None] * np.array([1.0, -0.5, 0.2])
     bright, dim = metrics.contact_region(90 * bump), metrics.contact_region(30 * bump)
-    assert metrics.overlap(bright, dim) > 0.97
+    assert metrics.intersection_over_union(bright, dim) > 0.97
 
 
 @pytest.mark.parametrize("deviation", [0.5, 2.0, 5.0])
@@ -139,7 +139,7 @@ def test_the_pressed_region_of_hertz_is_the_contact_circle() -> None:
     q = np.maximum(r / a, 1.0)
     outside = depth / np.pi * ((2 - q**2) * np.arcsin(1 / q) + np.sqrt(q * q - 1))
     height = np.where(r < a, depth - r**2 / (2 * radius), outside)
-    patch = metrics.patch_of(metrics.pressed_region(height, 1e-3))
+    patch = metrics.circle_of_region(metrics.pressed_region(height, 1e-3))
     assert patch is not None
     assert patch.radius == pytest.approx(a, abs=0.4)
     assert not metrics.pressed_region(height, 2 * depth).any()
@@ -153,9 +153,9 @@ def test_what_does_not_fit_together_is_refused() -> None:
     with pytest.raises(ValueError, match="smaller than SSIM's window"):
         metrics.similarity_map(NOISE[:5], NOISE[:5])
     with pytest.raises(ValueError, match="slopes must be"):
-        metrics.gradient_angle(np.zeros((3, 3, 2)), np.zeros((3, 4, 2)))
+        metrics.mean_normal_angle(np.zeros((3, 3, 2)), np.zeros((3, 4, 2)))
     with pytest.raises(ValueError, match="shapes differ"):
-        metrics.overlap(np.zeros((2, 2), dtype=bool), np.zeros((2, 3), dtype=bool))
+        metrics.intersection_over_union(np.zeros((2, 2), dtype=bool), np.zeros((2, 3), dtype=bool))
 
 
 def test_grain_is_what_a_small_blur_takes_away() -> None:
@@ -169,6 +169,6 @@ def test_grain_is_what_a_small_blur_takes_away() -> None:
     noise = RNG.normal(0, 3, (120, 160, 3))
     v, u = np.mgrid[:120, :160]
     dent = 60 * np.exp(-((u - 80) ** 2 + (v - 60) ** 2) / (2 * 20**2))[..., None] * np.ones(3)
-    assert metrics.grain(noise + dent, where) == pytest.approx(3 * math.sqrt(left), rel=0.02)
-    assert metrics.grain(dent, where) < 0.2
-    assert math.isnan(metrics.grain(noise, np.zeros_like(where)))
+    assert metrics.grain_deviation(noise + dent, where) == pytest.approx(3 * math.sqrt(left), rel=0.02)
+    assert metrics.grain_deviation(dent, where) < 0.2
+    assert math.isnan(metrics.grain_deviation(noise, np.zeros_like(where)))

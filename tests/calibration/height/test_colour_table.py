@@ -1,18 +1,18 @@
 import numpy as np
 import pytest
 
-from calibration.height.colour_table import MAX_SLOPE, from_lighting, from_model
+from calibration.height.colour_table import MAX_SLOPE, table_of_lighting, table_of_model
 from tacsim.models.sensor import Light, Lighting, SensorModel
-from tacsim.optics.render import shade
+from tacsim.optics.render import phong_shading
 
 RNG = np.random.default_rng(1)
 
 
 def _change(slopes: np.ndarray, lighting: Lighting, background: tuple[float, float, float]) -> np.ndarray:
     """Relative change of colour by the renderer itself; slopes (n, 2) -> (1, n, 3)."""
-    flat = shade(np.zeros((1, 1, 2), dtype=np.float32), lighting)
+    flat = phong_shading(np.zeros((1, 1, 2), dtype=np.float32), lighting)
     base = np.array(background, dtype=np.float32)
-    return (np.clip(base + shade(slopes[None].astype(np.float32), lighting) - flat, 0, 1) - base) / base
+    return (np.clip(base + phong_shading(slopes[None].astype(np.float32), lighting) - flat, 0, 1) - base) / base
 
 
 def _angle(found: np.ndarray, true: np.ndarray) -> np.ndarray:
@@ -30,7 +30,7 @@ def _random_slopes(steepest: float, count: int = 4000) -> np.ndarray:
 def test_slopes_come_back_from_their_colour() -> None:
     model = SensorModel()
     slopes = _random_slopes(0.4)
-    found, beyond = from_model(model)(_change(slopes, model.lighting, (0.42, 0.44, 0.46)))
+    found, beyond = table_of_model(model)(_change(slopes, model.lighting, (0.42, 0.44, 0.46)))
     error = _angle(found[0], slopes)
     assert error.mean() < 0.1
     assert error.max() < 1.0
@@ -51,21 +51,21 @@ def test_lights_that_nobody_has_seen_before() -> None:
         )
         lighting = Lighting(lights=lights, background=(0.4, 0.4, 0.4))
         slopes = _random_slopes(0.5)
-        found, _ = from_lighting(lighting, (0.4, 0.4, 0.4))(_change(slopes, lighting, (0.4, 0.4, 0.4)))
+        found, _ = table_of_lighting(lighting, (0.4, 0.4, 0.4))(_change(slopes, lighting, (0.4, 0.4, 0.4)))
         error = _angle(found[0], slopes)
         assert error.mean() < 0.3
         assert np.quantile(error, 0.99) < 2.0
 
 
 def test_no_change_is_no_slope() -> None:
-    found, beyond = from_model(SensorModel())(np.zeros((2, 3, 3), dtype=np.float32))
+    found, beyond = table_of_model(SensorModel())(np.zeros((2, 3, 3), dtype=np.float32))
     assert np.abs(found).max() < 1e-3
     assert not beyond.any()
 
 
 def test_colours_beyond_the_light_are_clipped_and_flagged() -> None:
     change = np.array([[[2.5, 2.5, 2.5], [-0.9, -0.9, -0.9], [0.0, 0.0, 0.0]]], dtype=np.float32)
-    found, beyond = from_model(SensorModel())(change)
+    found, beyond = table_of_model(SensorModel())(change)
     assert beyond.tolist() == [[True, True, False]]
     assert np.isfinite(found).all()
     assert np.abs(found).max() <= MAX_SLOPE
@@ -80,9 +80,9 @@ def test_colours_beyond_the_light_are_clipped_and_flagged() -> None:
 )
 def test_a_light_that_tells_no_slope_is_refused(lights: tuple[Light, ...]) -> None:
     with pytest.raises(ValueError, match="lights from at least two sides"):
-        from_lighting(Lighting(lights=lights), (0.4, 0.4, 0.4))
+        table_of_lighting(Lighting(lights=lights), (0.4, 0.4, 0.4))
 
 
 def test_a_black_gel_is_refused() -> None:
     with pytest.raises(ValueError, match="black in a channel"):
-        from_lighting(Lighting(), (0.4, 0.0, 0.4))
+        table_of_lighting(Lighting(), (0.4, 0.0, 0.4))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from calibration.frame_normaliser import FrameNormaliser
-from calibration.height.colour_table import from_model
+from calibration.height.colour_table import table_of_model
 from calibration.height.surface_finder import SurfaceFinder, extended_view
 from calibration.normaliser import normaliser_for_camera, normaliser_for_pictures, normaliser_for_simulation
 from tacsim.interface import TactileFrame, TactileObservation
@@ -67,7 +67,7 @@ def both(surface: GelSurface, model: SensorModel = MODEL, sent=lambda image: ima
     ):
         normalise.take_reference(frame(sent(render(flat()))))
         seen.append(normalise(frame(sent(render(surface)), shown, model), now=0.0))
-        assert normalise.beyond_range == 0.0
+        assert normalise.out_of_range_share == 0.0
     return seen
 
 
@@ -160,11 +160,11 @@ def test_colours_that_no_slope_has_are_counted() -> None:
     image = Renderer(MODEL, GEL)(flat())
     normalise.take_reference(frame(image))
     normalise(frame(image), now=0.0)
-    assert normalise.beyond_range == 0.0
+    assert normalise.out_of_range_share == 0.0
     spoiled = image.copy()
     spoiled[100:140, 100:160] = 255
     seen = normalise(frame(spoiled), now=0.0)
-    assert normalise.beyond_range == pytest.approx(40 * 60 / (240 * 320), rel=0.1)
+    assert normalise.out_of_range_share == pytest.approx(40 * 60 / (240 * 320), rel=0.1)
     assert np.isfinite(seen.height).all()
 
 
@@ -172,7 +172,7 @@ def test_a_lamp_that_drifts_is_no_dent() -> None:
     """A sensor that was calibrated has a real lamp: a change that is smooth over all the gel is taken for its drift."""
     wide = normaliser_for_pictures(MODEL, GEL, GRID)
     valid = wide._rectify.valid
-    slopes = from_model(MODEL)
+    slopes = table_of_model(MODEL)
     found = []
     for drifts in (False, True):
         normalise = FrameNormaliser(wide._rectify, GRID, SurfaceFinder(slopes, valid, GRID, dots=False, drifts=drifts))

@@ -2,7 +2,7 @@ import cv2
 import numpy as np
 import pytest
 
-from calibration.lens.rectification import from_corners, from_geometry
+from calibration.lens.rectification import rectification_of_corners, rectification_of_geometry
 from calibration.lens.view import BadCorners
 from tacsim.models.sensor import CanonicalGrid, SensorGeometry
 from tacsim.optics.grid import canonical_image
@@ -30,7 +30,7 @@ def _photograph(corners: tuple[tuple[float, float], ...], shape: tuple[int, int]
 
 
 def test_perspective_is_undone() -> None:
-    rectify = from_corners(CORNERS, SIZE, (480, 640), GRID)
+    rectify = rectification_of_corners(CORNERS, SIZE, (480, 640), GRID)
     points = GRID.points() * 1e3
     expected = _colour(points[..., 0], points[..., 1])
     found = rectify(_photograph(CORNERS, (480, 640)))
@@ -44,13 +44,13 @@ def test_perspective_is_undone() -> None:
 
 def test_averaging_calms_the_cameras_noise() -> None:
     noise = np.random.default_rng(0).normal(100.0, 6.0, (480, 640, 3))
-    calm = from_corners(CORNERS, SIZE, (480, 640), GRID)(np.rint(noise).astype(np.uint8))
+    calm = rectification_of_corners(CORNERS, SIZE, (480, 640), GRID)(np.rint(noise).astype(np.uint8))
     assert calm.std() < 6.0 / 2.4  # 2.3 x 3.1 native pixels in each; bilinear look-up alone would keep 6 / 1.5
 
 
 def test_whole_image_with_equal_pixels_is_the_identity() -> None:
     image = np.random.default_rng(1).integers(0, 256, (128, 128, 3)).astype(np.uint8)
-    rectify = from_corners(None, SIZE, (128, 128), GRID)
+    rectify = rectification_of_corners(None, SIZE, (128, 128), GRID)
     assert rectify.valid.all()
     np.testing.assert_array_equal(rectify(image), image)
 
@@ -58,7 +58,7 @@ def test_whole_image_with_equal_pixels_is_the_identity() -> None:
 def test_simulated_image_is_averaged_over_whole_blocks() -> None:
     geometry = SensorGeometry()  # 320 x 240 px of 0.0625 mm: 2 x 2 of them a canonical pixel
     image = np.random.default_rng(2).integers(0, 256, (240, 320, 3)).astype(np.uint8)
-    rectify = from_geometry(geometry, (20e-3, 20e-3), GRID)
+    rectify = rectification_of_geometry(geometry, (20e-3, 20e-3), GRID)
     found = rectify(image)
     blocks = image.reshape(120, 2, 160, 2, 3).astype(np.float64).mean(axis=(1, 3))
     np.testing.assert_allclose(found[4:124], blocks[:, 16:144], atol=1e-4)
@@ -72,20 +72,22 @@ def test_off_axis_geometry_shifts_the_picture() -> None:
     image = np.zeros((240, 320, 3), dtype=np.uint8)
     image[30:32, 100:102] = 255
     geometry = SensorGeometry(centre=(100.5 - 2 * 10.5, 30.5 + 2 * 5.5))  # the spot is 10.5 canonical px right, 5.5 up
-    found = from_geometry(geometry, (20e-3, 20e-3), GRID)(image)
+    found = rectification_of_geometry(geometry, (20e-3, 20e-3), GRID)(image)
     assert np.argwhere(found[..., 0] > 200).tolist() == [[64 - 6, 64 + 10]]
 
 
 def test_pixels_off_the_gel_are_invalid() -> None:
-    rectify = from_geometry(SensorGeometry(), (8e-3, 4e-3), GRID)
+    rectify = rectification_of_geometry(SensorGeometry(), (8e-3, 4e-3), GRID)
     assert rectify.valid.sum() == 64 * 32
     assert rectify.valid[64 - 16 : 64 + 16, 64 - 32 : 64 + 32].all()
-    small = from_corners(CORNERS, (8e-3, 4e-3), (480, 640), GRID)
+    small = rectification_of_corners(CORNERS, (8e-3, 4e-3), (480, 640), GRID)
     np.testing.assert_array_equal(small.valid, rectify.valid)
 
 
 def test_gel_partly_outside_the_image_is_invalid_there() -> None:
-    rectify = from_corners(((-100.0, 10.0), (300.0, 10.0), (300.0, 230.0), (-100.0, 230.0)), SIZE, (240, 320), GRID)
+    rectify = rectification_of_corners(
+        ((-100.0, 10.0), (300.0, 10.0), (300.0, 230.0), (-100.0, 230.0)), SIZE, (240, 320), GRID
+    )
     assert not rectify.valid[:, :31].any()
     assert rectify.valid[:, 33:].all()
 
@@ -102,11 +104,11 @@ def test_gel_partly_outside_the_image_is_invalid_there() -> None:
 )
 def test_bad_corners_are_refused(corners: tuple[tuple[float, float], ...], message: str) -> None:
     with pytest.raises(BadCorners, match=message):
-        from_corners(corners, SIZE, (480, 640), GRID)  # type: ignore[arg-type]
+        rectification_of_corners(corners, SIZE, (480, 640), GRID)  # type: ignore[arg-type]
 
 
 def test_another_image_is_refused() -> None:
-    rectify = from_corners(CORNERS, SIZE, (480, 640), GRID)
+    rectify = rectification_of_corners(CORNERS, SIZE, (480, 640), GRID)
     with pytest.raises(ValueError, match=r"image is \(240, 320, 3\) uint8, this sensor delivers \(480, 640, 3\)"):
         rectify(np.zeros((240, 320, 3), dtype=np.uint8))
     with pytest.raises(ValueError, match="float64"):
@@ -115,4 +117,4 @@ def test_another_image_is_refused() -> None:
 
 def test_a_pitch_in_millimetres_by_mistake_is_refused() -> None:
     with pytest.raises(ValueError, match="at most 16 are averaged"):
-        from_corners(CORNERS, (16e-6, 16e-6), (480, 640), GRID)
+        rectification_of_corners(CORNERS, (16e-6, 16e-6), (480, 640), GRID)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from calibration.lens.board import BadBoard, Board, find_board, parse_board
-from calibration.lens.rectification import from_corners, from_view, to_metric
+from calibration.lens.rectification import metric_rectification, rectification_of_corners, rectification_of_view
 from calibration.lens.view import BadCorners, BadView, Lens, board_pose, fit_lens, fit_view, view_of_corners
 from tacsim import pose as se3
 from tacsim.models.sensor import CanonicalGrid
@@ -61,7 +61,7 @@ def test_a_lens_is_found_from_tilted_pictures(board: Board) -> None:
     # a pose through the lens that was found
     pose = facing(board, [0.3, -0.2, 0.1], 0.036)
     found, residual = board_pose(lens, find_board(photograph(board, pose, seed=99), board))
-    metres, radians = se3.distance(found, pose)
+    metres, radians = se3.pose_distance(found, pose)
     assert residual < 0.4 and metres < 0.6e-3 and np.degrees(radians) < 0.6
 
 
@@ -105,13 +105,13 @@ def test_the_rectified_picture_shows_even_dots() -> None:
     pose = facing(DOTS, [0.2, -0.12, 0.1], 0.032)
     picture = photograph(DOTS, pose)
     view = fit_view(find_board(picture, DOTS), SHAPE, size=(25e-3, 20e-3))  # all dots
-    rectify = to_metric(view)
+    rectify = metric_rectification(view)
     assert rectify.valid.shape == (view.geometry.height, view.geometry.width)
     even = np.rint(rectify(picture)).astype(np.uint8)
     found = find_board(even, DOTS).image.reshape(7, 9, 2) * view.pixel_pitch
     for axis in (0, 1):
         np.testing.assert_allclose(np.linalg.norm(np.diff(found, axis=axis), axis=-1), 2.5e-3, rtol=0.015)
-    canonical = from_view(view, canonical_image(CanonicalGrid()))
+    canonical = rectification_of_view(view, canonical_image(CanonicalGrid()))
     assert canonical(picture).shape == (128, 128, 3) and canonical.valid[40:88, 20:108].all()
 
 
@@ -176,7 +176,10 @@ def test_corners_and_their_view_agree() -> None:
     corners = ((67.0, 68.0), (465.0, 113.0), (475.0, 383.0), (73.0, 437.0))
     grid = canonical_image(CanonicalGrid())
     view = view_of_corners(corners, (16e-3, 16e-3), SHAPE)
-    by_corners, by_view = from_corners(corners, (16e-3, 16e-3), SHAPE, grid), from_view(view, grid)
+    by_corners, by_view = (
+        rectification_of_corners(corners, (16e-3, 16e-3), SHAPE, grid),
+        rectification_of_view(view, grid),
+    )
     np.testing.assert_allclose(by_view.pixels, by_corners.pixels, atol=0.01)
     with pytest.raises(BadCorners, match="no convex quadrangle"):
         view_of_corners(corners[::-1], (16e-3, 16e-3), SHAPE)

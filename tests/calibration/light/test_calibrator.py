@@ -5,7 +5,7 @@ import pytest
 
 from calibration.errors import BadFrames
 from calibration.height.integration import Integrator
-from calibration.height.slope_polynomial import PolynomialSlopes, to_normal
+from calibration.height.slope_polynomial import PolynomialSlopes, normal_of_slope
 from calibration.light.calibrator import calibrate_light
 from calibration.light.dent import ContactCircle, dent_gradient
 from calibration.light.fit import LightFit, normal_angle
@@ -33,7 +33,9 @@ def found_slopes(fit: LightFit, image: np.ndarray) -> np.ndarray:
 def angle_in_contact(fit: LightFit, unseen: Made) -> float:
     v, u = np.mgrid[:ROWS, :COLUMNS]
     inside = np.hypot(u - unseen.circle[0], v - unseen.circle[1]) < unseen.circle[2]
-    angles = normal_angle(to_normal(found_slopes(fit, unseen.image).astype(float)), to_normal(unseen.gradient))
+    angles = normal_angle(
+        normal_of_slope(found_slopes(fit, unseen.image).astype(float)), normal_of_slope(unseen.gradient)
+    )
     return float(angles[inside].mean())
 
 

@@ -14,9 +14,9 @@ from calibration.bundle import read_bundle, read_sensor_model, write_bundle
 from calibration.height.darkness import DarknessSlopes
 from calibration.light.calibrator import NoDirection, calibrate_light
 from calibration.light.checks.page import write_page
-from calibration.light.checks.verdict import KnownScale, judge
+from calibration.light.checks.verdict import KnownScale, evaluate_calibration
 from calibration.light.circle import NoCircle
-from calibration.light.darkness import dark_circle, tells_no_direction
+from calibration.light.darkness import dark_circle, is_direction_free
 from calibration.light.fit import LightFit
 from calibration.normaliser import normaliser_for_calibration, normaliser_for_pictures
 from robot.cli import app
@@ -66,8 +66,8 @@ def test_heights_of_an_unseen_press_come_back(share: float) -> None:
     assert all(prediction.correlation > 0.98 for prediction in fit.predictions)
     shallower = sorted(fit.predictions, key=lambda prediction: prediction.circle.radius)[:-1]
     assert all(prediction.angle < 4 for prediction in shallower)  # the deepest reaches beyond the others' table
-    assert judge(fit, KnownScale(PITCH, BALL)).word == "unverified scale"  # nothing checks the lengths
-    verdict = judge(fit, KnownScale(PITCH, BALL, depths=(("0", 0.5e-3),)))
+    assert evaluate_calibration(fit, KnownScale(PITCH, BALL)).word == "unverified scale"  # nothing checks the lengths
+    verdict = evaluate_calibration(fit, KnownScale(PITCH, BALL, depths=(("0", 0.5e-3),)))
     assert verdict.word == "usable" and "4 presses could be used" in str(verdict)
 
 
@@ -76,9 +76,9 @@ def test_one_press_gives_the_table_and_is_said_to_be_one(tmp_path: Path) -> None
     press = sensor.press(0.65e-3, 130, 100)
     fit = calibrate_light(sensor.empty(), [("one", press.image)], BALL_PX)
     assert height_error(fit, sensor, sensor.press(0.4e-3, 90, 80)) < 0.06
-    assert judge(fit, KnownScale(PITCH, BALL)).word == "unverified scale"
+    assert evaluate_calibration(fit, KnownScale(PITCH, BALL)).word == "unverified scale"
     scale = KnownScale(PITCH, BALL, depths=(("one", 0.65e-3),))
-    verdict = judge(fit, scale)
+    verdict = evaluate_calibration(fit, scale)
     assert verdict.word == "usable" and "1 press could be used: that gives the table" in str(verdict)
     write_page(tmp_path / "page.html", "dark", fit, scale, verdict, None, [])
     page = (tmp_path / "page.html").read_text(encoding="utf-8")
@@ -88,7 +88,7 @@ def test_one_press_gives_the_table_and_is_said_to_be_one(tmp_path: Path) -> None
 def test_the_pictures_tell_which_light_it_is() -> None:
     for sensor, alike in ((HiddenSensor(3), False), (DarkSensor(3), True), (DarkSensor(3, 0.4), True)):
         reference = sensor.empty().astype(float)
-        assert tells_no_direction((p.image - reference) / 100 for p in sensor.presses(4)) is alike
+        assert is_direction_free((p.image - reference) / 100 for p in sensor.presses(4)) is alike
 
 
 def test_one_lamp_brighter_than_the_others_still_tells_direction() -> None:
@@ -97,7 +97,7 @@ def test_one_lamp_brighter_than_the_others_still_tells_direction() -> None:
         sensor = HiddenSensor(seed, noise=0.5)
         reference = sensor.empty().astype(float)
         changes = [(press.image - reference) / 100 * (6.0, 1.0, 1.0) for press in sensor.presses(5)]
-        assert not tells_no_direction(np.maximum(change, -0.05) for change in changes)
+        assert not is_direction_free(np.maximum(change, -0.05) for change in changes)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.4])
@@ -108,7 +108,7 @@ def test_a_contact_is_found_by_its_darkness(share: float) -> None:
         found = dark_circle(sensor.press(depth, 120, 90).image, sensor.empty(), BALL_PX)
         assert np.hypot(found.x - x, found.y - y) < 0.5
         assert found.radius == pytest.approx(radius, rel=0.08)
-        assert found.explained > 0.95
+        assert found.explained_share > 0.95
 
 
 def test_no_contact_is_found_in_what_darkness_does_not_tell() -> None:

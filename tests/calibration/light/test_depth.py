@@ -10,9 +10,9 @@ from calibration.light.dent import ContactCircle
 from calibration.light.fit import LightFit
 from calibration.light.labels import counted_pixels
 from calibration.light.photometry import SLOPE_TERMS, ModelSize
-from calibration.light.press import BallPress, smooth
+from calibration.light.press import BallPress, gaussian_blur
 from tacsim.models.photometric import DEPTH_TERMS, PhotometricLight, places_in_image
-from tacsim.optics.render import shade
+from tacsim.optics.render import phong_shading
 from tests.calibration.presses import BALL_PX, COLUMNS, PITCH, ROWS, HiddenSensor, Made
 
 DEEP = np.array([-25.0, 18.0, 10.0]) / 0.5e-3  # grey levels a metre of depth
@@ -26,8 +26,8 @@ def deeper(made: Made) -> Made:
 
 def faded(sensor: HiddenSensor, made: Made) -> Made:
     """The deeper a slope lies, the less the lamps tell of it."""
-    flat = shade(np.zeros((1, 1, 2), dtype=np.float32), sensor.lighting)
-    lit = 255 * (shade(made.gradient.astype(np.float32), sensor.lighting) - flat)
+    flat = phong_shading(np.zeros((1, 1, 2), dtype=np.float32), sensor.lighting)
+    lit = 255 * (phong_shading(made.gradient.astype(np.float32), sensor.lighting) - flat)
     image = made.image - FADE * np.maximum(made.height, 0.0)[..., None] * lit
     return replace(deeper(made), image=np.clip(np.rint(image), 0, 255).astype(np.uint8))
 
@@ -42,7 +42,7 @@ def drawn(fit: LightFit, slopes: np.ndarray, height: np.ndarray) -> np.ndarray:
     light = PhotometricLight(fit.forward, tuple(fit.reference.mean(axis=(0, 1)).tolist()))
     places = places_in_image(COLUMNS, ROWS)
     change = light.change(slopes.astype(np.float32), *places, (height / (PITCH * COLUMNS)).astype(np.float32))[0]
-    return fit.reference + smooth(change.astype(float), fit.forward.blur)
+    return fit.reference + gaussian_blur(change.astype(float), fit.forward.blur)
 
 
 def test_the_colour_of_depth_is_found_and_holds_for_what_is_no_ball() -> None:

@@ -5,7 +5,7 @@ import pytest
 
 from calibration.light.dent import ContactCircle
 from calibration.light.noise import NoiseUnknown, measure_noise, measure_press_noise
-from calibration.light.press import BallPress, untouched_mean
+from calibration.light.press import BallPress, mean_reference_colour
 
 SHAPE = (200, 260)
 V, U = np.mgrid[: SHAPE[0], : SHAPE[1]] / 100.0
@@ -106,7 +106,7 @@ def test_the_noise_that_is_drawn_is_measured_again() -> None:
 def presses(circles: list[tuple[float, float, float]]) -> tuple[list[BallPress], np.ndarray]:
     """Presses with contact of so many pixels, in which the picture is a wild one, and the one picture without."""
     reference, *frames = camera(1 + len(circles))
-    mean, lit = untouched_mean(reference), np.ones((*SHAPE, 3), dtype=bool)
+    mean, lit = mean_reference_colour(reference), np.ones((*SHAPE, 3), dtype=bool)
     v, u = np.mgrid[: SHAPE[0], : SHAPE[1]]
     made = []
     for frame, (x, y, radius) in zip(frames, circles, strict=True):

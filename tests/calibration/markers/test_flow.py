@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from calibration.frame_normaliser import FrameNormaliser
-from calibration.lens.rectification import Rectification, from_corners, from_geometry
-from calibration.markers.flow import MarkerFlow, MarkersLost, NoMarkers, find_markers, marker_grid
+from calibration.lens.rectification import Rectification, rectification_of_corners, rectification_of_geometry
+from calibration.markers.flow import MarkerFlow, NoMarkers, TooFewMarkers, find_markers, marker_grid
 from calibration.normaliser import normaliser_for_camera, normaliser_for_pictures, normaliser_for_simulation
 from calibration.reference import UnusableReference
 from tacsim.interface import TactileFrame
@@ -71,7 +71,7 @@ def errors(model: SensorModel, story: list[GelSurface], sent: Callable[[np.ndarr
         assert seen.flow.dtype == np.float32
         assert model.markers is not None
         found.append(np.linalg.norm(seen.flow - marker_flow(surface, model.markers), axis=2))
-        assert normalise.kept == 1.0
+        assert normalise.visible_share == 1.0
     return np.array(found)
 
 
@@ -130,7 +130,7 @@ def in_pixels(points: np.ndarray) -> np.ndarray:
 
 def plain_flow() -> MarkerFlow:
     grid = marker_grid(MARKERS, GEL)
-    return MarkerFlow(MARKERS, from_geometry(SensorGeometry(), GEL, grid), grid)
+    return MarkerFlow(MARKERS, rectification_of_geometry(SensorGeometry(), GEL, grid), grid)
 
 
 def moved(far: float) -> np.ndarray:
@@ -152,8 +152,8 @@ def test_drop_outs_are_filled_and_flagged(drop: float) -> None:
         error = np.linalg.norm(found - true, axis=2)
         assert np.median(error[there]) < 5e-6
         assert (error[there] < 0.1e-3).mean() > 0.97
-        assert flow.kept == pytest.approx(there.mean(), abs=0.03)
-        assert not flow.seen[~there].any()
+        assert flow.visible_share == pytest.approx(there.mean(), abs=0.03)
+        assert not flow.visible[~there].any()
         if drop:
             assert np.median(error[~there]) < 0.12e-3  # neighbours' mean, 1.2 mm dragged
 
@@ -180,7 +180,7 @@ def test_a_jump_in_time_and_place_keeps_who_is_who(jump: float) -> None:
     assert np.linalg.norm(found - shift, axis=2).max() < 0.05e-3
     back = flow(draw(in_pixels(rest), 4.0), 3)  # an index that goes backwards: another episode
     assert np.abs(back).max() < 5e-6
-    assert flow.kept == 1.0
+    assert flow.visible_share == 1.0
 
 
 def test_a_fresh_reference_is_rest() -> None:
@@ -206,7 +206,7 @@ def through_corners(angle: float) -> tuple[Rectification, np.ndarray]:
     turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
     corners = gel @ turn * 20 * (1 + 0.012 * gel[:, :1]) + (320.0, 320.0)
     grid = marker_grid(MARKERS, (20e-3, 15e-3))
-    rectify = from_corners(tuple(map(tuple, corners)), (20e-3, 15e-3), (640, 640), grid)  # type: ignore[arg-type]
+    rectify = rectification_of_corners(tuple(map(tuple, corners)), (20e-3, 15e-3), (640, 640), grid)  # type: ignore[arg-type]
     return rectify, cv2.getPerspectiveTransform(gel.astype(np.float32), corners.astype(np.float32))
 
 
@@ -221,7 +221,7 @@ def test_a_rotated_camera_tells_flow_in_the_axes_of_the_sensor(angle: float) -> 
 
     rest = rest_positions(MARKERS)
     flow.take_reference(photograph(rest))
-    assert flow.kept == 1.0
+    assert flow.visible_share == 1.0
     np.testing.assert_allclose(flow(photograph(rest + moved(0.5e-3)), 1), moved(0.5e-3), atol=15e-6)
 
 
@@ -265,11 +265,11 @@ def test_dots_that_vanish_all_at_once_are_an_error_and_not_a_flow() -> None:
     normalise.take_reference(frame(render(flat())))
     shown = render(drag((0.4e-3, 0.0)))
     normalise(frame(shown, 1), now=0.0)
-    with pytest.raises(MarkersLost, match="0 of 99 markers are seen"):
+    with pytest.raises(TooFewMarkers, match="0 of 99 markers are seen"):
         normalise(frame(np.zeros_like(shown), 2), now=0.0)
-    assert normalise.kept == 0.0
+    assert normalise.visible_share == 0.0
     normalise(frame(shown, 3), now=0.0)  # the light is on again
-    assert normalise.kept == 1.0
+    assert normalise.visible_share == 1.0
 
 
 def test_dots_that_the_image_cannot_show_are_refused() -> None:
@@ -284,8 +284,8 @@ def test_who_finds_flow_says_so() -> None:
     plain = normaliser_for_camera(CameraSensorConfig(driver="camera", source="x"), GEL, GRID)
     assert isinstance(plain, FrameNormaliser)
     assert not plain.finds_flow
-    assert plain.markers_seen is None
-    assert plain.kept == 1.0
+    assert plain.visible_markers is None
+    assert plain.visible_share == 1.0
 
 
 @pytest.mark.parametrize(("radius", "pitch", "angle"), [(4.0, 24.0, 0.0), (2.5, 13.0, 0.2), (8.0, 40.0, -0.3)])

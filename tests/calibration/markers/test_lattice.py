@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from calibration.markers.lattice import NoLattice, find_lattice, spread
+from calibration.markers.lattice import NoLattice, fill_from_neighbours, find_lattice
 from tests.calibration.dotted import lattice_points
 
 
@@ -16,7 +16,7 @@ def test_rows_and_columns_are_found_whatever_the_order_and_the_turn(angle: float
         lattice = find_lattice(shuffled(true), shape, pitch)
         np.testing.assert_allclose(lattice.positions, true, atol=1e-9)
         assert lattice.present.all()
-        assert lattice.surplus == 0
+        assert lattice.extra_points == 0
         assert lattice.pitch == pytest.approx(2.0)
 
 
@@ -42,7 +42,7 @@ def test_of_a_larger_lattice_the_part_nearest_the_middle_is_taken() -> None:
     true = lattice_points(9, 11, 1.0)
     lattice = find_lattice(shuffled(true), (5, 5), 1.0)
     np.testing.assert_allclose(lattice.positions, true[2:7, 3:8], atol=1e-9)
-    assert lattice.surplus == 99 - 25
+    assert lattice.extra_points == 99 - 25
 
 
 def test_what_is_no_lattice_is_refused() -> None:
@@ -58,6 +58,6 @@ def test_what_is_unknown_takes_the_mean_of_its_neighbours() -> None:
     values = np.arange(12.0).reshape(3, 4, 1)
     known = np.ones((3, 4), dtype=bool)
     known[1, 1] = False
-    np.testing.assert_allclose(spread(values, known), values)  # linear, so the mean is right
+    np.testing.assert_allclose(fill_from_neighbours(values, known), values)  # linear, so the mean is right
     known[:, 2:] = False
-    assert np.isfinite(spread(values, known)).all()
+    assert np.isfinite(fill_from_neighbours(values, known)).all()

@@ -29,7 +29,7 @@ def wrong(
     found = tracker(points, ahead)
     assert np.isfinite(found.displacement).all()
     error = np.linalg.norm(found.displacement - moved, axis=1)
-    return int((error[found.seen & there] > 0.1).sum()), int((found.seen & there).sum())
+    return int((error[found.visible & there] > 0.1).sum()), int((found.visible & there).sum())
 
 
 @pytest.mark.parametrize(("lost", "dirt", "least"), [(0.0, 0, 1.0), (0.1, 3, 0.99), (0.3, 0, 0.98)])
@@ -89,8 +89,8 @@ def test_a_lost_dot_moves_with_its_neighbours_and_is_known_when_it_comes_back() 
         moved = drag((0.2 * step, 0.0))
         points = REST + moved
         found = tracker(points if step in (0, 9) else np.delete(points, gone, axis=0))
-        assert found.seen[gone] == (step in (0, 9))
-        assert found.seen.sum() == 99 - (step not in (0, 9))
+        assert found.visible[gone] == (step in (0, 9))
+        assert found.visible.sum() == 99 - (step not in (0, 9))
         # what a mean over those round it, 1.5 mm away, misses of a bump 4 mm wide
         assert np.linalg.norm(found.displacement[gone] - moved[gone]) <= 0.25 * np.linalg.norm(moved[gone])
 

@@ -45,5 +45,5 @@ def test_a_dot_that_jumps_alone_counts_as_not_seen(aside: tuple[float, float]) -
     points = rest + moved
     points[double] += 1.5 * np.array(aside)
     found = tracker(points)
-    assert not found.seen[double] and found.seen.sum() == len(rest) - 1
+    assert not found.visible[double] and found.visible.sum() == len(rest) - 1
     assert np.linalg.norm(found.displacement - moved, axis=1).max() < 0.1

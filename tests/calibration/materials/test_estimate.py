@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibration.materials.checks import findings
-from calibration.materials.estimate import CannotSimulate, NotIdentified, estimate
+from calibration.materials.checks import find_contradictions
+from calibration.materials.estimate import CannotSimulate, NotIdentified, estimate_materials
 from calibration.materials.fit import Fit, Parameter, Point, Predict, Priors, Signals
 from tacsim.interface import FloatArray
 
@@ -68,7 +68,9 @@ def recorded(seed: int, presses: int = 3, power: float = 1.5, drift: float = 0.0
 
 
 def fitted(signals: Signals, *parameters: Parameter, **more) -> Fit:
-    return estimate([model([each.name for each in parameters])], signals, parameters, PRIORS, coarse_error=0.0, **more)
+    return estimate_materials(
+        [model([each.name for each in parameters])], signals, parameters, PRIORS, coarse_error=0.0, **more
+    )
 
 
 def test_stiffness_and_friction_of_a_ball_on_a_half_space() -> None:
@@ -76,7 +78,7 @@ def test_stiffness_and_friction_of_a_ball_on_a_half_space() -> None:
     for name, truth in (("youngs_modulus", E), ("friction", MU)):
         low, high = fit.interval(name)
         assert low < truth < high and high / low < 1.15
-    assert findings(fit, recorded(1), ("a", "b", "c")) == []
+    assert find_contradictions(fit, recorded(1), ("a", "b", "c")) == []
 
 
 def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
@@ -93,8 +95,8 @@ def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
 def test_what_a_half_space_does_not_tell_is_refused() -> None:
     """Hertz' law knows E / (1 - nu^2) alone: Poisson's ratio stays where it was, and is named."""
     fit = fitted(recorded(2), STIFFNESS, POISSON)
-    assert [each.name for each in fit.untold] == ["poisson_ratio"]
-    assert [each.name for each in fit.told] == ["youngs_modulus"]
+    assert [each.name for each in fit.unidentified] == ["poisson_ratio"]
+    assert [each.name for each in fit.identified] == ["youngs_modulus"]
     assert fit.value("poisson_ratio") == pytest.approx(POISSON.start)
     assert fit.value("youngs_modulus") / (1 - POISSON.start**2) == pytest.approx(E / (1 - NU**2), rel=0.1)
     low, high = fit.interval("youngs_modulus")
@@ -119,28 +121,28 @@ def test_a_way_that_leads_to_where_nothing_slips_goes_on_from_its_start() -> Non
     tells friction, and it would be held where it began."""
     parameters, signals = (STIFFNESS, Parameter("friction", 0.3, 0.01, 5.0)), recorded(9)
     log = parameters[1].free
-    fit = estimate(
+    fit = estimate_materials(
         [sticking(log, 0.4, 5.0), sticking(log, 1.0, 0.6), sticking(log, 1.0, 0.6)], signals, parameters, PRIORS
     )
-    assert fit.untold == () and fit.value("friction") == pytest.approx(MU, rel=0.03)
+    assert fit.unidentified == () and fit.value("friction") == pytest.approx(MU, rel=0.03)
 
 
 def test_friction_is_found_from_where_things_slip_although_they_stick_at_what_was_thought() -> None:
     """The force of what sticks does not depend on friction; nothing told of it stays what was thought, 0.8."""
     thought = replace(FRICTION, begin=0.25)
     level = sticking(thought.free, 1.0, 0.6)
-    fit = estimate([level], recorded(9), (STIFFNESS, thought), PRIORS, coarse_error=0.0)
-    assert fit.untold == () and fit.value("friction") == pytest.approx(MU, rel=0.03)
+    fit = estimate_materials([level], recorded(9), (STIFFNESS, thought), PRIORS, coarse_error=0.0)
+    assert fit.unidentified == () and fit.value("friction") == pytest.approx(MU, rel=0.03)
     level = sticking(thought.free, 1.0, 0.2)
-    fit = estimate([level], recorded(9), (STIFFNESS, thought), PRIORS, coarse_error=0.0)
-    assert [each.name for each in fit.untold] == ["friction"] and fit.value("friction") == pytest.approx(0.8)
+    fit = estimate_materials([level], recorded(9), (STIFFNESS, thought), PRIORS, coarse_error=0.0)
+    assert [each.name for each in fit.unidentified] == ["friction"] and fit.value("friction") == pytest.approx(0.8)
 
 
 def test_steps_that_move_less_than_a_mesh_is_wrong_are_not_made() -> None:
     """Meshes that are 5 % and 2 % off, three presses: 22 points each with steps that only noise asks for."""
     names, signals = ["youngs_modulus", "friction"], recorded(10)
     levels = [model(names, stiffer=stiffer) for stiffer in (1.05, 1.02, 1.0)]
-    fit = estimate(levels, signals, (STIFFNESS, FRICTION), PRIORS)
+    fit = estimate_materials(levels, signals, (STIFFNESS, FRICTION), PRIORS)
     assert fit.value("youngs_modulus") == pytest.approx(E, rel=0.03) and fit.runs <= 3 * 17
 
 
@@ -155,25 +157,27 @@ def test_a_press_that_does_not_slide_tells_no_friction() -> None:
     def predict(points: Sequence[Point]) -> list[FloatArray]:
         return [each[::2] for each in model(["youngs_modulus", "friction"])(points)]
 
-    fit = estimate([predict], still, (STIFFNESS, FRICTION), PRIORS, coarse_error=0.0)
-    assert [each.name for each in fit.untold] == ["friction"]
+    fit = estimate_materials([predict], still, (STIFFNESS, FRICTION), PRIORS, coarse_error=0.0)
+    assert [each.name for each in fit.unidentified] == ["friction"]
 
 
 def test_noise_of_a_robots_own_sensor_is_refused() -> None:
     with pytest.raises(NotIdentified, match="tell nothing of youngs_modulus"):
-        estimate([model(["youngs_modulus"])], recorded(4, noise=3.0), (STIFFNESS,), Priors(2e-5, 3.0), coarse_error=0.0)
+        estimate_materials(
+            [model(["youngs_modulus"])], recorded(4, noise=3.0), (STIFFNESS,), Priors(2e-5, 3.0), coarse_error=0.0
+        )
 
 
 def test_a_zero_that_drifts_is_noticed() -> None:
     signals = recorded(5, drift=0.1)
-    found = findings(fitted(signals, STIFFNESS, FRICTION), signals, ("a", "b", "c"))
-    assert [each.kind for each in found] == ["drift"] and "b: the zero of fz drifts by +0.1" in found[0].words
+    found = find_contradictions(fitted(signals, STIFFNESS, FRICTION), signals, ("a", "b", "c"))
+    assert [each.kind for each in found] == ["drift"] and "b: the zero of fz drifts by +0.1" in found[0].text
 
 
 def test_a_contact_of_another_shape_is_noticed() -> None:
     """The force of a flat punch is proportional to the depth, that of a ball to its power of 3/2."""
     signals = recorded(6, power=1.0)
-    found = findings(fitted(signals, STIFFNESS, FRICTION), signals, ("a", "b", "c"))
+    found = find_contradictions(fitted(signals, STIFFNESS, FRICTION), signals, ("a", "b", "c"))
     assert found and found[0].kind in ("misfit", "drift")
 
 
@@ -181,7 +185,7 @@ def test_nothing_is_noticed_where_nothing_is_wrong() -> None:
     noticed = 0
     for seed in range(100, 200):
         signals = recorded(seed)
-        noticed += bool(findings(fitted(signals, STIFFNESS, FRICTION), signals, ("a", "b", "c")))
+        noticed += bool(find_contradictions(fitted(signals, STIFFNESS, FRICTION), signals, ("a", "b", "c")))
     assert noticed <= 2
 
 
@@ -189,8 +193,8 @@ def test_a_coarse_simulation_is_put_right_by_a_finer_one() -> None:
     """A coarse mesh that is 15 % too stiff; the interval keeps half of what the finer one changed."""
     parameters, signals = (STIFFNESS, FRICTION), recorded(7)
     names = [each.name for each in parameters]
-    right = estimate([model(names)], signals, parameters, PRIORS, coarse_error=0.0)
-    fit = estimate([model(names, stiffer=1.15), model(names)], signals, parameters, PRIORS)
+    right = estimate_materials([model(names)], signals, parameters, PRIORS, coarse_error=0.0)
+    fit = estimate_materials([model(names, stiffer=1.15), model(names)], signals, parameters, PRIORS)
     assert fit.value("youngs_modulus") == pytest.approx(right.value("youngs_modulus"), rel=0.02)
     assert fit.mesh_shift[0] == pytest.approx(np.log(1.15), abs=0.03)
     low, high = fit.interval("youngs_modulus")
@@ -202,7 +206,9 @@ def test_errors_of_a_mesh_that_cancel_in_one_fit_still_count() -> None:
     is left of each, half of it, moves the stiffness by up to 0.5 log(1.15) / 2, twice in quadrature."""
     signals, right = recorded(7, presses=2), model(["youngs_modulus"], presses=2)
     stiffer = np.where(signals.press == 0, 1.15, 1 / 1.15)
-    fit = estimate([lambda points: [stiffer * each for each in right(points)], right], signals, (STIFFNESS,), PRIORS)
+    fit = estimate_materials(
+        [lambda points: [stiffer * each for each in right(points)], right], signals, (STIFFNESS,), PRIORS
+    )
     low, high = fit.interval("youngs_modulus")
     assert low < E < high and np.log(high / low) / 2 > 1.96 * 0.7 * 0.5 * np.log(1.15) / np.sqrt(2)
 
@@ -212,7 +218,7 @@ def test_what_settling_leaves_of_a_whole_press_does_not_average_out() -> None:
     right, priors = model(["youngs_modulus"], presses=1), Priors(place=1e-7, zero=1e-6)
     signals = recorded(0, presses=1, noise=1e-4)
     (clean,) = right([Point(np.array([STIFFNESS.free(E)]), np.zeros(1))])
-    fit = estimate([right, right], replace(signals, values=1.01 * clean), (STIFFNESS,), priors)
+    fit = estimate_materials([right, right], replace(signals, values=1.01 * clean), (STIFFNESS,), priors)
     low, high = fit.interval("youngs_modulus")
     assert fit.value("youngs_modulus") == pytest.approx(1.01 * E, rel=1e-3)
     assert low < E < high < 1.05 * E
@@ -240,5 +246,5 @@ def test_a_step_that_cannot_be_simulated_is_made_smaller() -> None:
         return right(points)
 
     # the linear step from 0.1 MPa asks for 0.1 exp(0.8) MPa, bounded by a factor of two: 0.201 MPa
-    fit = estimate([predict], signals, (soft,), PRIORS, coarse_error=0.0)
+    fit = estimate_materials([predict], signals, (soft,), PRIORS, coarse_error=0.0)
     assert refused and fit.value("youngs_modulus") == pytest.approx(E, rel=0.05)

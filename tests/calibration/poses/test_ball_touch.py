@@ -21,7 +21,7 @@ def test_without_noise_the_truth_comes_back_from_any_mounting() -> None:
         other = posed(turned, [0.05, -0.02, 0.1])
         perturbed = [replace(touch, tool=se3.compose(touch.tool, se3.inverse(other))) for touch in touches]
         fit = fit_touches(perturbed, BALL_RADIUS)
-        metres, radians = se3.distance(fit.tool_from_sensor, se3.compose(other, sensor))
+        metres, radians = se3.pose_distance(fit.tool_from_sensor, se3.compose(other, sensor))
         assert metres < 1e-8 and radians < 1e-6
         np.testing.assert_allclose(fit.ball, ball, atol=1e-8)
         assert all(fit.used)
@@ -32,7 +32,9 @@ def test_errors_are_those_of_the_bound_and_as_stated() -> None:
     for seed in range(25):
         touches, sensor, _ = made_touches(np.random.default_rng(seed))
         fit = fit_touches(touches, BALL_RADIUS)
-        errors.append((*se3.distance(fit.tool_from_sensor, sensor), *fit.best_deviation, *fit.deviation, fit.scatter))
+        errors.append(
+            (*se3.pose_distance(fit.tool_from_sensor, sensor), *fit.best_deviation, *fit.deviation, fit.scatter)
+        )
         assert all(fit.used)
     metres, radians, best, best_turn, stated, stated_turn, scatter = np.sqrt((np.array(errors) ** 2).mean(axis=0))
     # 25 sets of 3 axes each: a ratio has a standard deviation of 8 to 12 %
@@ -49,7 +51,7 @@ def test_one_bad_touch_is_found_and_left_out(off: float) -> None:
     touches[5] = replace(bad, contact=(bad.contact[0] + off, bad.contact[1]))
     fit = fit_touches(touches, BALL_RADIUS)
     assert [i for i, used in enumerate(fit.used) if not used] == [5]
-    metres, radians = se3.distance(fit.tool_from_sensor, sensor)
+    metres, radians = se3.pose_distance(fit.tool_from_sensor, sensor)
     assert metres < 0.12e-3 and np.degrees(radians) < 1.2
     assert abs(abs(fit.residuals[5, 0]) - off) < 0.2e-3  # the table says by how much
 
@@ -57,7 +59,7 @@ def test_one_bad_touch_is_found_and_left_out(off: float) -> None:
 def test_a_wrong_radius_goes_along_the_sensors_axis_and_nowhere_else() -> None:
     touches, _, _ = made_touches(np.random.default_rng(4))
     right, wrong = (fit_touches(touches, radius) for radius in (BALL_RADIUS, BALL_RADIUS + 0.3e-3))
-    shift = se3.relative(right.tool_from_sensor, wrong.tool_from_sensor)
+    shift = se3.relative_pose(right.tool_from_sensor, wrong.tool_from_sensor)
     np.testing.assert_allclose(shift.position, [0, 0, -0.3e-3], atol=1e-6)
     assert wrong.scatter == pytest.approx(right.scatter, rel=1e-3)
 

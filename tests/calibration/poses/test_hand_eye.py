@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calibration.poses.hand_eye import BoardPose, HandEyeNoise, _whitening, fit_hand_eye
+from calibration.poses.hand_eye import BoardPose, HandEyeNoise, _whitening_matrices, fit_hand_eye
 from calibration.poses.robust_fit import BadMeasurements
 from tacsim import pose as se3
 from tacsim.interface import Pose
@@ -39,7 +39,7 @@ def made_sights(
         turn = Rotation.from_rotvec(np.radians(spread) * random.normal(size=3))
         flange = posed(turn, np.array([0.5, 0.1, 0.3]) + 0.05 * random.normal(size=3))
         carried = se3.compose(flange, BOARD if fixed else CAMERA)
-        seen = se3.relative(CAMERA, carried) if fixed else se3.relative(carried, BOARD)
+        seen = se3.relative_pose(CAMERA, carried) if fixed else se3.relative_pose(carried, BOARD)
         found.append(
             BoardPose(shaken(flange, stated.robot, stated.robot_turn), shaken(seen, stated.board, stated.board_turn))
         )
@@ -50,7 +50,7 @@ def made_sights(
 def test_without_noise_the_truth_comes_back(fixed: bool) -> None:
     fit = fit_hand_eye(made_sights(np.random.default_rng(0), 8, fixed=fixed, noise=0.0), fixed=fixed)
     for found, true in ((fit.camera, CAMERA), (fit.board, BOARD)):
-        metres, radians = se3.distance(found, true)
+        metres, radians = se3.pose_distance(found, true)
         assert metres < 1e-8 and radians < 1e-7
     assert fit.residuals.max() < 1e-7 and all(fit.used)
 
@@ -60,7 +60,7 @@ def test_errors_with_the_noise_of_the_notes_are_as_stated(fixed: bool) -> None:
     errors = []
     for seed in range(8):
         fit = fit_hand_eye(made_sights(np.random.default_rng(seed), fixed=fixed), fixed=fixed)
-        errors.append((*se3.distance(fit.camera, CAMERA), *fit.deviation, fit.scatter))
+        errors.append((*se3.pose_distance(fit.camera, CAMERA), *fit.deviation, fit.scatter))
         assert all(fit.used)
     metres, radians, stated, stated_turn, scatter = np.sqrt((np.array(errors) ** 2).mean(axis=0))
     assert np.median([each[0] for each in errors]) < 0.45e-3
@@ -79,7 +79,7 @@ def test_weights_know_the_lever_of_a_robots_rotation(fixed: bool) -> None:
     predicted = np.linalg.inv(camera) @ np.linalg.inv(arm) @ mount
     turn = Rotation.from_matrix(predicted[:, :3, :3] @ np.swapaxes(board[:, :3, :3], 1, 2)).as_rotvec()
     missed = np.concatenate([predicted[:, :3, 3] - board[:, :3, 3], turn], axis=1)
-    even = np.einsum("nij,nj->ni", _whitening(camera, mount, arm, stated, fixed=fixed), missed)
+    even = np.einsum("nij,nj->ni", _whitening_matrices(camera, mount, arm, stated, fixed=fixed), missed)
     np.testing.assert_allclose(np.cov(even.T), np.eye(6), atol=0.25)  # standard deviation of an entry: 0.05
 
 
@@ -90,7 +90,7 @@ def test_bad_poses_are_found_and_left_out() -> None:
         seen[index] = replace(seen[index], board=se3.compose(seen[index].board, off))
     fit = fit_hand_eye(seen)
     assert [i for i, used in enumerate(fit.used) if not used] == [3, 11, 17]
-    metres, radians = se3.distance(fit.camera, CAMERA)
+    metres, radians = se3.pose_distance(fit.camera, CAMERA)
     assert metres < 1.5e-3 and np.degrees(radians) < 0.25
 
 

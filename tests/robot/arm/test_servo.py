@@ -13,7 +13,7 @@ from robot.arm.channel import CommandKind, Partner, WorkerConfig, command_record
 from robot.arm.status import ArmStatus
 from robot.arm.trajectory import PERIOD
 from robot.common.kinematics import MAX_SINGULAR_VALUE_RATE, rotation
-from tacsim.limits import region
+from tacsim.limits import box_region
 from tests.robot.arm.servo_bench import KINEMATICS, Bench, shifted, worker_config
 
 
@@ -100,7 +100,7 @@ def test_a_turn_at_full_speed_close_to_a_wall_does_not_bulge_out() -> None:
     bench = Bench(action_timeout=60.0, speed=0.2)
     start = bench.at
     floor = float(start.position[2]) - 0.1
-    bench.servo.region = region([-1.0, -1.0, floor], [1.0, 1.0, 1.0])
+    bench.servo.region = box_region([-1.0, -1.0, floor], [1.0, 1.0, 1.0])
     bench.ask(shifted(start, 0.0, 0.0, -0.1))
     bench.run(280)
     bench.ask(shifted(start, 0.1, 0.1, -0.1))

@@ -32,7 +32,7 @@ def test_between_two_states_all_of_it_is_exact() -> None:
     made = states(np.arange(0.0, 1.0, 0.02))
     for time in (0.001, 0.5031, 0.9799):
         found, error = state_at(time, made, "left")
-        shift, angle = se3.distance(found.pose, state(time).pose)
+        shift, angle = se3.pose_distance(found.pose, state(time).pose)
         assert shift < 1e-12 and angle < 1e-7  # acos-free, but rounding of a quaternion is what it is
         np.testing.assert_allclose(found.wrench, state(time).wrench, atol=1e-12)
         np.testing.assert_allclose(found.twist, state(time).twist, atol=1e-12)
@@ -60,7 +60,7 @@ def test_turns_take_the_shorter_way() -> None:
 def test_extrapolated_with_its_twist_and_no_further_than_the_reach() -> None:
     made = states([0.0, 0.01])
     found, error = state_at(0.018, made, "left", reach=0.01)
-    shift, angle = se3.distance(found.pose, state(0.018).pose)
+    shift, angle = se3.pose_distance(found.pose, state(0.018).pose)
     assert shift < 1e-12 and angle < 1e-7 and error == pytest.approx(0.008)
     with pytest.raises(NotAligned, match=r"10\.5 ms after its newest state, limit 10\.0 ms"):
         state_at(0.0205, made, "left", reach=0.01)
@@ -105,8 +105,8 @@ def test_injected_latencies_leave_less_than_a_millisecond_of_motion() -> None:
         made.append(ArmState(measured.pose, measured.twist, measured.wrench, None, here - table["arm"]))
         while arrival <= here:
             aligned, _ = state_at(arrival - table["camera"], made, "left")
-            worst = max(worst, se3.distance(aligned.pose, truth(exposed).pose)[0])
-            late = max(late, se3.distance(measured.pose, truth(exposed).pose)[0])
+            worst = max(worst, se3.pose_distance(aligned.pose, truth(exposed).pose)[0])
+            late = max(late, se3.pose_distance(measured.pose, truth(exposed).pose)[0])
             count += 1
             arrival, exposed = next(frames, (np.inf, 0.0))
     assert count > 100

@@ -21,9 +21,9 @@ from robot.arm.trajectory import (
     towards,
 )
 from robot.common.kinematics import rotation, rotation_vector
-from tacsim.limits import region
+from tacsim.limits import box_region
 
-BOX = region([-0.1, -0.1, -0.1], [0.1, 0.1, 0.1], planes=[([0, 0, 0.12], [-1.0, 0.0, -1.0])])
+BOX = box_region([-0.1, -0.1, -0.1], [0.1, 0.1, 0.1], planes=[([0, 0, 0.12], [-1.0, 0.0, -1.0])])
 inside = st.tuples(*[st.floats(-0.1, 0.1)] * 3).map(np.array).filter(lambda point: bool(BOX.excess(point) <= 0))
 turns = st.tuples(*[st.floats(-1.5, 1.5)] * 3).map(np.array)
 rates = st.builds(

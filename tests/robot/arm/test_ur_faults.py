@@ -115,13 +115,13 @@ def test_an_arm_whose_sensors_are_not_seen_any_more_stands(mock: MockUR) -> None
         def under_way() -> bool:
             arm.report_tactile(GelReading(time.monotonic()))
             arm.command(far)
-            return se3.distance(start, arm.state().pose)[0] > 2e-3
+            return se3.pose_distance(start, arm.state().pose)[0] > 2e-3
 
         until(under_way, "motion", pause=0.02)
         until(lambda: arm.status() == ArmStatus.OBSERVATION_STALE, "blind")
         until(arm.at_rest, "rest")
         held = arm.state().pose
-        assert se3.distance(start, held)[0] < 0.1
+        assert se3.pose_distance(start, held)[0] < 0.1
         arm.command(far)  # asked again, but nobody has seen anything since
         since = mock.faults.received().last
         until(lambda: len(servo_targets(mock.faults.received(since).entries)) > 50, "held targets")
@@ -146,7 +146,7 @@ def test_without_actions_the_arm_holds_and_goes_on_from_there(mock: MockUR, meas
         figure("hold told after the last action (time-out 200 ms)", 1e3 * float(held_at - asked), "ms", at_most=210)
         until(arm.at_rest, "rest")
         held = arm.state().pose
-        assert 2e-3 < se3.distance(start, held)[0] < 0.1  # stopped on the way
+        assert 2e-3 < se3.pose_distance(start, held)[0] < 0.1  # stopped on the way
         since = mock.faults.received().last
         until(lambda: len(servo_targets(mock.faults.received(since).entries)) > 20, "held targets")
         assert np.ptp(servo_targets(mock.faults.received(since).entries), axis=0).max() < 1e-12

@@ -51,7 +51,7 @@ def test_state_speaks_of_the_sensor_in_the_world(arm: URArm, mock: MockUR) -> No
         arm.config.world_from_base.pose, se3.compose(se3.from_matrix(matrix(there.pose)), TOOL_FROM_SENSOR.pose)
     )
     state = arm.state()
-    assert max(se3.distance(state.pose, expected)) < 1e-9
+    assert max(se3.pose_distance(state.pose, expected)) < 1e-9
     assert state.joints is not None and np.allclose(state.joints, there.joints)
     assert there.payload == pytest.approx(0.4)
     assert there.watchdog
@@ -83,7 +83,7 @@ def test_twist_is_the_change_of_the_pose(arm: URArm) -> None:
         if 0.0 < c.time - a.time < 0.1 and float(np.linalg.norm(b.twist[:3])) > 0.02:
             checked += 1
             # Packages may be skipped or late, so the way is compared by direction, and the speed by its limits.
-            way = se3.difference(a.pose, c.pose)
+            way = se3.pose_difference(a.pose, c.pose)
             assert way[:3] @ b.twist[:3] > 0.9 * np.linalg.norm(way[:3]) * np.linalg.norm(b.twist[:3])
             assert way[3:] @ b.twist[3:] > 0.9 * np.linalg.norm(way[3:]) * np.linalg.norm(b.twist[3:])
             # A controller that is late meets several targets in one of its periods, and hurries after the last.

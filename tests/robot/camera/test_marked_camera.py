@@ -99,7 +99,7 @@ def test_flow_is_promised_and_delivered(gel: Gel, rig: Rig) -> None:
     touch = seen(rig, lambda touch: touch.height.max() > 0.2e-3).tactile["finger"]
     true = surface_map(slid, load_rig(gel.path).config.canonical, gel.model.markers)
     assert true.flow is not None and np.abs(true.flow).max() > 0.15e-3
-    dots = rig.normalisers["finger"].markers_seen  # type: ignore[attr-defined]
+    dots = rig.normalisers["finger"].visible_markers  # type: ignore[attr-defined]
     assert dots.mean() > 0.9
     off = np.linalg.norm(touch.flow - true.flow, axis=-1)[dots]
     assert np.median(off) < 15e-6 and off.max() < 80e-6

@@ -54,7 +54,7 @@ def test_arms_are_led_to_their_start_and_a_dry_run_follows(tmp_path: Path) -> No
         start = lab.config.arms["arm"].start  # type: ignore[union-attr]
         pose = np.array(lab.faults["arm"].state().pose)  # base and world are one, and the TCP is the sensor
         assert start is not None and np.linalg.norm(pose[:3] - start.position) < 1e-3
-        assert se3.distance(start.pose, se3.from_rotation_vector(pose[:3], pose[3:]))[1] < 5e-3
+        assert se3.pose_distance(start.pose, se3.from_rotation_vector(pose[:3], pose[3:]))[1] < 5e-3
         done = tacsim("run", str(file), "--dry-run", "--steps", "2", "--out", "dry")
         assert done.exit_code == 0, done.output
 

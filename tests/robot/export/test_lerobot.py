@@ -84,7 +84,7 @@ def test_state_and_action_mean_what_their_names_and_scales_say(tmp_path: Path) -
             for found, pose in ((state, arm.pose), (action, asked[name])):
                 position = [found[f"moved_{axis}_{name}"] for axis in "xyz"]
                 columns_of_turn = [found[f"turn_{c}{axis}_{name}"] + (c == axis) for c in "xy" for axis in "xyz"]
-                away = se3.distance(se3.compose(start, se3.from_two_columns(position, columns_of_turn)), pose)
+                away = se3.pose_distance(se3.compose(start, se3.from_rotation_columns(position, columns_of_turn)), pose)
                 assert max(away) < 1e-6
             wrench = [state[f"{what}_{axis}_{name}"] for what in ("force", "torque") for axis in "xyz"]
             assert np.allclose(wrench, arm.wrench, rtol=1e-6)

@@ -15,7 +15,7 @@ from robot.export.lerobot_rig import Jog, LeRobotRig
 from robot.open import open_rig, rig_spec
 from tacsim import pose as se3
 from tacsim.config import load_rig
-from tacsim.gym.features import SCALES, moved, unmoved
+from tacsim.gym.features import SCALES, decode_pose_change, encode_pose_change
 from tacsim.interface import IncompatibleRig, Pose, RigSpec
 from tacsim.limits import ActionError
 from tacsim.models.sensor import CanonicalGrid
@@ -46,7 +46,7 @@ def test_numbers_of_a_pose_are_that_pose() -> None:
     rng = np.random.default_rng(0)
     for _ in range(20):
         start, pose = turned(rng, 1.0), turned(rng, 1.0)
-        assert max(se3.distance(unmoved(start, moved(start, pose)), pose)) < 1e-12
+        assert max(se3.pose_distance(decode_pose_change(start, encode_pose_change(start, pose)), pose)) < 1e-12
 
 
 @pytest.mark.parametrize("rig", ["sim", "mock", "ur5e", "ur5e-one"])
@@ -88,7 +88,7 @@ def test_what_is_sent_is_what_the_limits_let_through(bare: LeRobotRig) -> None:
     assert list(near) == list(asked) and np.allclose(list(near.values()), list(asked.values()), atol=1e-4)
     far = bare.send(asked | {"moved_x_west.pos": 1e4})  # 10 m and more: the workspace ends at 30 mm
     start = Pose()
-    unit = moved(start, Pose(np.array([30e-3, 0.0, 0.0])))[0]
+    unit = encode_pose_change(start, Pose(np.array([30e-3, 0.0, 0.0])))[0]
     assert far["moved_x_west.pos"] == pytest.approx(unit, rel=1e-3)
     for _ in range(200):
         found = bare.observe()["moved_x_west.pos"]
@@ -157,7 +157,7 @@ def test_simulated_time_passes_with_each_action() -> None:
         before = made.observe()
         step = made.config.period
         asked = {name: float(before[name]) for name in made.action_features}  # type: ignore[arg-type]
-        asked["moved_z_lower.pos"] += float(moved(Pose(), Pose(np.array([0.0, 0.0, 0.05e-3])))[2])
+        asked["moved_z_lower.pos"] += float(encode_pose_change(Pose(), Pose(np.array([0.0, 0.0, 0.05e-3])))[2])
         begin = made._opened().now()
         sent = made.send(asked)
         assert made._opened().now() - begin == pytest.approx(step)

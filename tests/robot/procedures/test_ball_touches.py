@@ -88,8 +88,8 @@ def test_a_file_of_touches_gives_the_lines_for_the_rig_file(tmp_path: Path) -> N
     printed = Placement.model_validate(lines["arms"]["upper"]["tool_from_sensor"]).pose
     kept = report["tool_from_sensor"]
     exact = se3.from_rotation_vector(kept["position"], kept["rotation"])
-    assert max(se3.distance(printed, exact)) < 2e-6
-    metres, radians = se3.distance(exact, sensor)
+    assert max(se3.pose_distance(printed, exact)) < 2e-6
+    metres, radians = se3.pose_distance(exact, sensor)
     assert metres < 0.12e-3 and np.degrees(radians) < 1.2
     np.testing.assert_allclose(report["ball"], ball, atol=0.2e-3)
     assert np.array(report["tool_from_sensor"]["covariance"]).shape == (6, 6)
@@ -105,7 +105,7 @@ def test_a_file_is_read_whole_or_not_at_all(tmp_path: Path) -> None:
     path = write_record(tmp_path / "touches.yaml", touch_file(touches, BALL_RADIUS))
     whole, text = read_touches(path), path.read_text()
     for back, wrote in zip(whole.measurements(), touches, strict=True):
-        assert max(se3.distance(back.tool, wrote.tool)) < 1e-12
+        assert max(se3.pose_distance(back.tool, wrote.tool)) < 1e-12
         assert (back.contact, back.depth) == (wrote.contact, wrote.depth)
     assert len(text.splitlines()) == 3 + 8 and [each.name for each in tmp_path.iterdir()] == ["touches.yaml"]
     for end in (
@@ -240,12 +240,12 @@ def test_a_mock_arm_finds_where_its_sensor_sits(tmp_path: Path) -> None:
     assert done.exit_code == 0, done.output
     report = json.loads((tmp_path / "out" / "touch.json").read_text())
     found = report["tool_from_sensor"]
-    off = se3.relative(true, se3.from_rotation_vector(found["position"], found["rotation"]))
-    was = se3.relative(true, nominal)
+    off = se3.relative_pose(true, se3.from_rotation_vector(found["position"], found["rotation"]))
+    was = se3.relative_pose(true, nominal)
     assert np.linalg.norm(was.position) > 1.5e-3
     np.testing.assert_allclose(off.position[:2], 0.0, atol=0.1e-3)
     assert abs(off.position[2]) < 0.15e-3  # the depth's own bias goes wholly along z
-    assert np.degrees(se3.distance(Pose(), off)[1]) < 0.8 < 5.0 < np.degrees(se3.distance(true, nominal)[1])
+    assert np.degrees(se3.pose_distance(Pose(), off)[1]) < 0.8 < 5.0 < np.degrees(se3.pose_distance(true, nominal)[1])
     kept = tmp_path / "out" / "touches.yaml"
     assert len(read_touches(kept).touches) == len(report["used"]) >= 6
     assert f"without the arm: tacsim calibrate touch {kept}" in told(done.stderr)

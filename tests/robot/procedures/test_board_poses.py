@@ -63,7 +63,7 @@ def test_a_file_of_poses_tells_where_the_camera_sits(fixed: bool, tmp_path: Path
     assert f"{name}: {{ position: [" in said and "scatter" in said
     report = json.loads((tmp_path / "out" / "hand-eye.json").read_text())
     found = se3.from_rotation_vector(report[name]["position"], report[name]["rotation"])
-    metres, radians = se3.distance(found, CAMERA)
+    metres, radians = se3.pose_distance(found, CAMERA)
     assert metres < 1e-3 and np.degrees(radians) < 0.15
     assert np.array(report["residuals"]).shape == (30, 2) and all(report["used"])
 
@@ -104,7 +104,7 @@ class Eye(SeenArm):
             self._camera.stall(True)
             self._shown = None
         elif self._shown is None:
-            seen = se3.relative(se3.compose(flange, self._mount), self._board)
+            seen = se3.relative_pose(se3.compose(flange, self._mount), self._board)
             self._camera.push(photograph(CHARUCO, seen))
             self._camera.stall(False)
             self._shown = flange
@@ -128,7 +128,7 @@ def test_a_mock_arm_finds_where_its_camera_sits(tmp_path: Path) -> None:
     assert code == 0, err
     report = json.loads((tmp_path / "out" / "hand-eye.json").read_text())
     found = report["flange_from_camera"]
-    metres, radians = se3.distance(true, se3.from_rotation_vector(found["position"], found["rotation"]))
+    metres, radians = se3.pose_distance(true, se3.from_rotation_vector(found["position"], found["rotation"]))
     assert metres < 0.4e-3 and np.degrees(radians) < 0.4
     assert sum(report["used"]) >= 7
     assert len(yaml.safe_load((tmp_path / "out" / "poses.yaml").read_text())["poses"]) == len(report["used"])

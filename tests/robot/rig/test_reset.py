@@ -52,7 +52,7 @@ class StubArm:
         return target
 
     def arrived(self, target: Pose, **within: float) -> bool:
-        return se3.distance(self.pose, target)[0] < 1e-9
+        return se3.pose_distance(self.pose, target)[0] < 1e-9
 
     def at_rest(self) -> bool:
         return True
@@ -147,7 +147,7 @@ def test_it_retreats_along_its_own_axis_then_goes_to_the_start() -> None:
     assert back["lower"].position == pytest.approx([5e-3, 0, -RETREAT])
     assert back["upper"].position == pytest.approx([5e-3, 0, 10e-3 + RETREAT])  # it faces down
     there = dict(scene.motions()[2:])
-    assert se3.distance(there["lower"], LOWER)[0] == se3.distance(there["upper"], UPPER)[0] == 0.0
+    assert se3.pose_distance(there["lower"], LOWER)[0] == se3.pose_distance(there["upper"], UPPER)[0] == 0.0
 
 
 def test_forces_are_zeroed_when_what_is_felt_is_of_now_and_references_come_last() -> None:

@@ -14,7 +14,7 @@ from calibration.bundle import write_bundle
 from calibration.compare.compare import compare_frames
 from calibration.errors import BadFrames
 from calibration.frame_set import Frame, FrameSet
-from calibration.light.circle import Circle, contact_circle
+from calibration.light.circle import Circle, find_contact_circle
 from calibration.light.dent import dent_slope
 from robot.studies import matched_press
 from robot.studies.matched_press import ELEMENT, _next_depth, _PressedGel, match_presses
@@ -194,7 +194,7 @@ def test_both_contacts_are_in_one_place_however_light_pulls_a_circle(
     pull = np.array([2.0, -3.0])  # [px]
 
     def pulled(image: Image, reference: Image, ball: float) -> Circle:
-        circle = contact_circle(image, reference, ball)
+        circle = find_contact_circle(image, reference, ball)
         return replace(circle, x=circle.x + pull[0], y=circle.y + pull[1])
 
     monkeypatch.setattr(matched_press, "contact_circle", pulled)

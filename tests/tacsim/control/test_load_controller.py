@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from robot.open import open_rig
 from tacsim import pose as se3
 from tacsim.config import ConfigError, load_rig
-from tacsim.control.load_controller import REACH, TOLERANCE, LoadController, load_controller
+from tacsim.control.load_controller import MAX_TRAVEL, TOLERANCE, LoadController, load_controller
 from tacsim.interface import Action, ArmState, Pose
 from tacsim.limits import LimitExceeded
 from tacsim.models.rig import RepositionConfig, SqueezeConfig
@@ -30,7 +30,7 @@ class Wall:
 
     @property
     def depth(self) -> float:
-        return float(se3.relative(self.start, self.pose).position[2])
+        return float(se3.relative_pose(self.start, self.pose).position[2])
 
     @property
     def force(self) -> float:
@@ -44,8 +44,8 @@ class Wall:
         """share: of the way that its limits leave."""
         target = held(Action({"hand": asked}), {"hand": self.state()}).tool["hand"]
         assert target is not None
-        self.pose = se3.interpolate(self.pose, target, share)
-        held.sent({"hand": self.pose})
+        self.pose = se3.interpolate_pose(self.pose, target, share)
+        held.record_sent_poses({"hand": self.pose})
 
 
 def holding(load: float = LOAD) -> LoadController:
@@ -71,7 +71,7 @@ def test_only_the_way_along_z_of_the_sensor_is_replaced() -> None:
     x, _, z = turned.as_matrix().T
     for count in range(1, 9):
         wall.period(held, Pose(wall.start.position + count * 0.1e-3 * x - 0.4e-3 * z, turned.as_quat()))
-        moved = se3.relative(wall.start, wall.pose).position
+        moved = se3.relative_pose(wall.start, wall.pose).position
         assert moved[:2] == pytest.approx([count * 0.1e-3, 0.0], abs=1e-12)
     assert wall.force == pytest.approx(LOAD, rel=TOLERANCE)
 
@@ -112,7 +112,7 @@ def test_an_arm_with_nothing_to_press_stops_and_says_so() -> None:
         wall.period(held, None)
     with pytest.raises(LimitExceeded, match=r"'hand' does not reach its load of 2 N: it feels 1 N after \+5.* mm"):
         _twice(wall, held)
-    assert 0.9 * REACH < wall.depth <= REACH
+    assert 0.9 * MAX_TRAVEL < wall.depth <= MAX_TRAVEL
     held.reset()
     wall.period(held, None)  # a new episode begins anew
 

@@ -34,7 +34,7 @@ def make_observation(flow: bool = True, joints: bool = False) -> Observation:
 
 
 def test_keys_shapes_and_types() -> None:
-    flat = encode.flatten(make_observation(joints=True), POSES)
+    flat = encode.flatten_observation(make_observation(joints=True), POSES)
     assert {key: (value.shape, value.dtype.name) for key, value in flat.items()} == {
         "tactile_finger": ((8, 12, 3), "uint8"),
         "contact_finger": ((4, 6), "int8"),
@@ -51,14 +51,14 @@ def test_keys_shapes_and_types() -> None:
 
 
 def test_what_is_not_there_has_no_key() -> None:
-    flat = encode.flatten(make_observation(flow=False), POSES)
+    flat = encode.flatten_observation(make_observation(flow=False), POSES)
     assert "flow_finger" not in flat
     assert "joints_upper" not in flat
 
 
 def test_values_are_kept_and_copied() -> None:
     observation = make_observation()
-    flat = encode.flatten(observation, POSES)
+    flat = encode.flatten_observation(observation, POSES)
     touch = observation.tactile["finger"]
     for key, value in (("tactile", touch.image), ("height", touch.height), ("contact", touch.contact)):
         assert value is not None
@@ -68,17 +68,17 @@ def test_values_are_kept_and_copied() -> None:
 
 def test_pose_is_relative_to_reset_and_reads_back() -> None:
     observation = make_observation()
-    vector = encode.flatten(observation, POSES)["pose_upper"].astype(float)
+    vector = encode.flatten_observation(observation, POSES)["pose_upper"].astype(float)
     now = observation.arms["upper"].pose
-    back = se3.compose(POSES["upper"], se3.from_two_columns(vector[:3], vector[3:]))
+    back = se3.compose(POSES["upper"], se3.from_rotation_columns(vector[:3], vector[3:]))
     assert back.position == pytest.approx(now.position, abs=1e-6)
     assert abs(back.quaternion @ now.quaternion) == pytest.approx(1.0, abs=1e-6)
-    at_reset = encode.flatten(Observation({}, observation.arms, 1.0), {"upper": now})["pose_upper"]
+    at_reset = encode.flatten_observation(Observation({}, observation.arms, 1.0), {"upper": now})["pose_upper"]
     assert at_reset == pytest.approx([0, 0, 0, 1, 0, 0, 0, 1, 0], abs=1e-7)
 
 
 def test_the_space_holds_what_was_flattened_and_refuses_the_absurd() -> None:
-    flat = encode.flatten(make_observation(joints=True), POSES)
+    flat = encode.flatten_observation(make_observation(joints=True), POSES)
     space = encode.space_of(flat)
     assert flat in space
     assert flat | {"height_finger": flat["height_finger"] + np.float32(1.0)} not in space  # a metre deep

@@ -212,7 +212,7 @@ def test_environments_are_registered_once() -> None:
 
 def test_any_policy_acts_as_an_environment_s_action(open_springs: Any) -> None:
     """What it asks of the arms is where the step takes them, as float32 can say it."""
-    from tacsim.tasks.task import action_from
+    from tacsim.tasks.task import action_of_vector
 
     env = TacsimEnv(open_springs("squeeze"), make_task(SqueezeConfig(kind="squeeze", goal=7e-3, steps=3)))
     env.reset(seed=3)
@@ -220,9 +220,9 @@ def test_any_policy_acts_as_an_environment_s_action(open_springs: Any) -> None:
     for _ in range(2):
         wanted = policy(env._observation).tool
         policy.reset()
-        vector = env.ask(policy)
+        vector = env.policy_action(policy)
         policy.reset()
-        asked = action_from(vector, env.task.axes, env.task.config.max_step, env._targets).tool
+        asked = action_of_vector(vector, env.task.axes, env.task.config.max_step, env._targets).tool
         for arm, pose in wanted.items():
             now = asked[arm]
             assert pose is not None and now is not None
@@ -233,7 +233,7 @@ def test_any_policy_acts_as_an_environment_s_action(open_springs: Any) -> None:
 def test_the_expert_is_the_tasks_by_the_truth_and_holds_where_nothing_runs(open_springs: Any) -> None:
     env = TacsimEnv(open_springs("squeeze"), make_task(SqueezeConfig(kind="squeeze", goal=7e-3, steps=3)))
     env.reset(seed=3)
-    best = env.task.expert(env._truth(), env._truth_at_start)
+    best = env.task.expert(env._require_truth(), env._truth_at_start)
     assert best is not None
     assert env.expert().tolist() == best.astype(np.float32).tolist()
     for _ in range(env.task.config.steps):

@@ -79,13 +79,13 @@ def test_the_renderer_uses_it_in_place_of_the_lights() -> None:
     render = Renderer(sensor, GEL)
     base = np.rint(255 * np.array([0.42, 0.44, 0.46]))
     np.testing.assert_array_equal(render(flat()).reshape(-1, 3), np.tile(base, (76800, 1)))
-    assert render.beyond == 0.0
+    assert render.clipped_share == 0.0
     seen = render(dent())
     assert np.abs(seen - base).max() > 5
-    assert render.beyond > 0.01
+    assert render.clipped_share > 0.01
     phong = Renderer(SensorModel(texture=0.0), GEL)
     phong(dent())
-    assert phong.beyond == 0.0
+    assert phong.clipped_share == 0.0
 
 
 @pytest.mark.parametrize(("width", "spacing"), [(640, 1e-3), (640, 0.5e-3), (320, 0.5e-3), (160, 0.5e-3)])
@@ -115,7 +115,7 @@ def test_light_is_within_half_a_grey_level_of_the_formula(width: int, spacing: f
     wanted = np.clip(untouched + untouched * gaussian_filter(change, (blur, blur, 0), truncate=5.0), 0.0, 255.0)
     render = Renderer(SensorModel(geometry=geometry, photometric=calibrated, texture=0.0), GEL)
     error = np.abs(render(surface) - wanted)
-    assert render.beyond == 0.0
+    assert render.clipped_share == 0.0
     assert np.abs(wanted - untouched).max() > 30.0
     assert error.max() < 0.5 + 0.5  # and half a level by rounding to whole ones
     assert error.mean() < 0.21  # by rounding alone it is 0.205: beside the contact the light does not vary
@@ -144,7 +144,7 @@ def test_blocks_of_pixels_show_what_pixels_show(
     )
     render, surface = Renderer(sensor, size), make_surface(pressed_and_slid, size)
     blocks = render(surface).astype(float)
-    monkeypatch.setattr(SurfaceTable, "points_a_cell", lambda self, grid: 1)
+    monkeypatch.setattr(SurfaceTable, "points_per_cell", lambda self, grid: 1)
     pixels = render(surface).astype(float)
     assert np.abs(pixels - picture).max() > 30
     off = np.abs(blocks - pixels)

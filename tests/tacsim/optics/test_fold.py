@@ -10,10 +10,11 @@ import pytest
 from tacsim.models.scene import GelSurface
 from tacsim.models.sensor import Markers, SensorGeometry, SensorModel
 from tacsim.optics import surface as surfaces
+from tacsim.optics.fold import visible_table_points
 from tacsim.optics.grid import PixelGrid, image_grid
 from tacsim.optics.markers import marker_transmission, rest_positions
 from tacsim.optics.render import Renderer
-from tacsim.optics.surface import SurfaceTable, sample_surface, visible_points
+from tacsim.optics.surface import SurfaceTable, sample_surface
 from tests.tacsim.optics.surfaces import dent, make_surface
 
 MM = 1e-3
@@ -76,15 +77,15 @@ def test_a_surface_without_a_fold_goes_the_quick_way_and_either_way_shows_the_sa
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     table, grid = SurfaceTable(dent(slide=(0.6e-3, -0.4e-3))), image_grid(SensorGeometry())
-    quick, inside = table.points(grid)
+    quick, inside = table.table_points(grid)
     assert not table.folded
     table.folded = True
-    slow, same = table.points(grid)
+    slow, same = table.table_points(grid)
     assert np.array_equal(inside, same)
     np.testing.assert_allclose(slow[inside], quick[inside], atol=0.1)  # table points
-    monkeypatch.delattr(surfaces, "visible_points")
+    monkeypatch.delattr(surfaces, "visible_table_points")
     table.folded = False
-    assert np.array_equal(table.points(grid)[0], quick)
+    assert np.array_equal(table.table_points(grid)[0], quick)
 
 
 def test_a_fold_between_the_points_of_the_table_is_found_when_newton_finds_none(
@@ -103,7 +104,7 @@ def test_what_faces_away_is_not_seen_and_neighbours_leave_no_gap() -> None:
     rows, columns = np.mgrid[0:5, 0:6].astype(float)
     height = (rows + columns).astype(np.float32)
     turned = 1.9 * np.stack([columns + 0.3 * rows, rows - 0.2 * columns], axis=-1) + [2.0, 3.0]
-    points, inside = visible_points(turned, height, (14, 16))
+    points, inside = visible_table_points(turned, height, (14, 16))
     v, u = np.nonzero(inside)
     back = np.linalg.solve(np.array([[1.0, 0.3], [-0.2, 1.0]]), (np.stack([u, v]) - [[2.0], [3.0]]) / 1.9)
     np.testing.assert_allclose(points[v, u], back.T, atol=1e-5)
@@ -112,7 +113,7 @@ def test_what_faces_away_is_not_seen_and_neighbours_leave_no_gap() -> None:
     )
     within = (all_back >= 0).all(axis=0) & (all_back[0] <= 5) & (all_back[1] <= 4)
     assert np.array_equal(inside.ravel(), within) and within.sum() > 40
-    assert not visible_points(turned[:, ::-1], height, (14, 16))[1].any()
+    assert not visible_table_points(turned[:, ::-1], height, (14, 16))[1].any()
 
 
 def test_dots_behind_a_fold_are_not_drawn() -> None:
@@ -120,7 +121,7 @@ def test_dots_behind_a_fold_are_not_drawn() -> None:
     markers = Markers(rows=12, columns=15, pitch=1e-3, radius=0.15e-3)
     surface, grid = folded(b), image_grid(geometry)
     table = SurfaceTable(surface)
-    at_rest = table.at_rest(table.points(grid)[0], grid)
+    at_rest = table.rest_coordinates(table.table_points(grid)[0], grid)
     light = marker_transmission(surface, markers, geometry, at_rest)
     rest = rest_positions(markers).reshape(-1, 2)
     own = rest @ ALONG

@@ -28,4 +28,4 @@ def test_canonical_pixels_share_the_area_of_their_cell() -> None:
 
 def test_within_is_the_gel() -> None:
     grid = PixelGrid(rows=5, columns=5, pitch=1e-3, x0=-2e-3, y0=-2e-3)
-    np.testing.assert_array_equal(grid.within((4e-3, 2e-3)).sum(axis=1), [0, 5, 5, 5, 0])
+    np.testing.assert_array_equal(grid.points_on_gel((4e-3, 2e-3)).sum(axis=1), [0, 5, 5, 5, 0])

@@ -3,10 +3,10 @@ import pytest
 
 from tacsim.models.sensor import Markers, SensorGeometry, SensorModel
 from tacsim.optics.markers import (
-    check_fits,
     marker_coverage,
     marker_discs,
     marker_flow,
+    require_dots_on_gel,
     rest_positions,
 )
 from tacsim.optics.render import Renderer
@@ -63,7 +63,7 @@ def test_rendered_dots_are_dark_where_the_surface_carries_them() -> None:
 
 
 def test_a_lattice_larger_than_the_gel_is_refused() -> None:
-    check_fits(MARKERS, (11.1e-3, 6.6e-3))
+    require_dots_on_gel(MARKERS, (11.1e-3, 6.6e-3))
     with pytest.raises(ValueError, match=r"5 x 8 dots at 1.5 mm need a gel of 11.00 x 6.50 mm, the gel is 10 x 10 mm"):
         Renderer(SensorModel(markers=MARKERS), (10e-3, 10e-3))
 

@@ -10,11 +10,11 @@ from tacsim.models.sensor import Light, Lighting, SensorGeometry, SensorModel
 from tacsim.optics import render
 from tacsim.optics.grid import PixelGrid, image_grid
 from tacsim.optics.render import (
-    STEEPEST,
+    MAX_SLOPE,
     Renderer,
     light_at,
     light_table,
-    shade,
+    phong_shading,
     texture_gradient,
     unlit_image,
 )
@@ -63,7 +63,7 @@ def test_shading_is_phongs_formula() -> None:
         shininess=6.5,
     )
     slopes = np.array([(0.0, 0.0), (0.7, -0.2), (-0.4, 0.9), (-1.5, -1.0), (2.5, 0.1)], dtype=np.float32)
-    found = shade(slopes[None], lighting)[0]
+    found = phong_shading(slopes[None], lighting)[0]
     view = np.array([0.0, 0.0, -1.0])
     for slope, colour in zip(slopes, found, strict=True):
         normal = np.array([-slope[0], -slope[1], -1.0]) / np.sqrt(1.0 + slope @ slope)
@@ -77,13 +77,13 @@ def test_shading_is_phongs_formula() -> None:
 
 
 def test_light_that_is_looked_up_is_within_half_a_grey_level() -> None:
-    slopes = np.random.default_rng(2).uniform(-STEEPEST, STEEPEST, (300, 300, 2)).astype(np.float32)
-    slopes[0, :4] = [(STEEPEST, STEEPEST), (-STEEPEST, STEEPEST), (STEEPEST, -STEEPEST), (-STEEPEST, -STEEPEST)]
+    slopes = np.random.default_rng(2).uniform(-MAX_SLOPE, MAX_SLOPE, (300, 300, 2)).astype(np.float32)
+    slopes[0, :4] = [(MAX_SLOPE, MAX_SLOPE), (-MAX_SLOPE, MAX_SLOPE), (MAX_SLOPE, -MAX_SLOPE), (-MAX_SLOPE, -MAX_SLOPE)]
     slopes[1:100] *= 0.05
     for lighting in (SMOOTH.lighting, Lighting(lights=SMOOTH.lighting.lights[:1], shininess=40.0)):
         table = light_table(lighting)
         assert table is not None
-        error = light_at(table, slopes) - shade(slopes, lighting, white=255.0)
+        error = light_at(table, slopes) - phong_shading(slopes, lighting, white=255.0)
         assert np.abs(error).max() < 0.6  # half a level, and the look-up's own rounding
         assert np.sqrt(np.mean(error**2)) < 0.05
 
@@ -93,10 +93,10 @@ def test_steep_flanks_and_narrow_highlights_are_shaded_pixel_by_pixel(shininess:
     model = SMOOTH.model_copy(update={"lighting": Lighting(shininess=shininess)})
     surface = dent(depth=depth)
     steepest = np.abs(sample_surface(surface, image_grid(model.geometry)).gradient).max()
-    assert (steepest > STEEPEST) != (light_table(model.lighting) is None)  # one reason at a time
+    assert (steepest > MAX_SLOPE) != (light_table(model.lighting) is None)  # one reason at a time
     table = SurfaceTable(surface)
-    slopes, _ = table.seen(table.fields[..., 1:], image_grid(model.geometry), fine=False)
-    exact = 255.0 * unlit_image(model.lighting, slopes.shape[:2]) + shade(slopes, model.lighting, white=255.0)
+    slopes, _ = table.sample_on_grid(table.fields[..., 1:], image_grid(model.geometry), fine=False)
+    exact = 255.0 * unlit_image(model.lighting, slopes.shape[:2]) + phong_shading(slopes, model.lighting, white=255.0)
     image = Renderer(model, GEL)(surface)
     assert np.abs(image - exact.clip(0.0, 255.0)).max() < 0.5 + 1e-3
 
@@ -129,7 +129,7 @@ def test_lights_that_differ_are_tabulated_once_each_and_small_pictures_not_at_al
 def test_order_of_lights_changes_no_bit() -> None:
     lights = SMOOTH.lighting.lights
     gradient = sample_surface(dent(), image_grid(SMOOTH.geometry)).gradient
-    images = [shade(gradient, Lighting(lights=order)) for order in itertools.permutations(lights)]
+    images = [phong_shading(gradient, Lighting(lights=order)) for order in itertools.permutations(lights)]
     for image in images[1:]:
         np.testing.assert_array_equal(image, images[0])
 

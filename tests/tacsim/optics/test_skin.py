@@ -7,8 +7,8 @@ from pydantic import ValidationError
 
 from tacsim.models.scene import GelSurface
 from tacsim.models.sensor import Lighting, Markers, SensorGeometry, SensorModel
-from tacsim.optics.ink import fine_part, lifted_skin
 from tacsim.optics.render import Renderer
+from tacsim.optics.skin import high_pass, separate_skin
 from tests.tacsim.optics.surfaces import flat, make_surface
 
 GEL, PITCH = (20e-3, 16e-3), 0.08e-3
@@ -45,7 +45,7 @@ def test_untouched_gel_is_the_picture_to_the_bit(untouched: tuple[Path, np.ndarr
 def test_skin_moves_with_the_gel_and_light_stays(untouched: tuple[Path, np.ndarray], skin: float) -> None:
     path, picture = untouched
     seen = Renderer(model(path, skin), GEL)(sheared())[20:-20, 20:-20].astype(float)
-    grain = fine_part(picture.astype(np.float32), PITCH)
+    grain = high_pass(picture.astype(np.float32), PITCH)
     light = (picture - grain)[20:-20, 20:-20]
     moved = np.roll(grain, SHIFT[::-1], axis=(0, 1))[20:-20, 20:-20]
     grain = grain[20:-20, 20:-20]
@@ -69,7 +69,7 @@ def test_drawn_dots_lie_on_the_skin(untouched: tuple[Path, np.ndarray]) -> None:
 def test_what_lets_no_light_through_stays_finite() -> None:
     picture = np.zeros((40, 50, 3), dtype=np.float32)
     picture[10, 10] = 200
-    clean, share = lifted_skin(picture, 1.0, PITCH)
+    clean, share = separate_skin(picture, 1.0, PITCH)
     assert np.isfinite(share).all() and (clean > 0).all()
     np.testing.assert_allclose(clean * share, picture, atol=1e-3)
 

@@ -9,12 +9,12 @@ from tacsim.optics.spline import displacement_and_jacobian
 from tacsim.optics.surface import (
     SurfaceFolded,
     SurfaceTable,
-    look_up,
+    bilinear_lookup,
+    block_centres,
+    interpolate_blocks,
     material_points,
     sample_surface,
-    spread,
     surface_map,
-    thinned,
 )
 from tests.tacsim.optics.surfaces import dent, make_surface
 
@@ -91,7 +91,7 @@ def test_newton_finds_no_single_point_in_a_fold() -> None:
 def test_beyond_the_gel_nothing_is_seen() -> None:
     surface = make_surface(lambda x, y: (0 * x, 0 * x, 0 * x - 1e-4), size=(10e-3, 6e-3))
     sample = sample_surface(surface, IMAGE)
-    np.testing.assert_array_equal(sample.valid, IMAGE.within((10e-3, 6e-3)))
+    np.testing.assert_array_equal(sample.valid, IMAGE.points_on_gel((10e-3, 6e-3)))
     assert 0.1 < sample.valid.mean() < 0.9
     np.testing.assert_allclose(sample.height[sample.valid], 1e-4, rtol=1e-5)
     assert not sample.height[~sample.valid].any()
@@ -137,25 +137,25 @@ def test_bad_surfaces_are_named() -> None:
 )
 def test_what_a_grid_shows_lies_in_its_part_of_the_table(grid: PixelGrid) -> None:
     table = SurfaceTable(dent(slide=(0.6e-3, -0.4e-3)))
-    points, inside = table.points(grid)
-    np.testing.assert_array_equal(inside, grid.within((20e-3, 20e-3)))
-    part, outside = table.part(grid), np.ones_like(table.fields)
+    points, inside = table.table_points(grid)
+    np.testing.assert_array_equal(inside, grid.points_on_gel((20e-3, 20e-3)))
+    part, outside = table.visible_part(grid), np.ones_like(table.fields)
     outside[part] = 0.0
-    assert not look_up(outside, points).any()
+    assert not bilinear_lookup(outside, points).any()
     assert outside.mean() > 0.1
 
 
 def test_a_grid_beside_the_gel_has_a_part_of_its_table_too() -> None:
     table = SurfaceTable(dent())
     for x0, y0 in ((-40e-3, -3e-3), (40e-3, 30e-3)):
-        part = table.part(PixelGrid(rows=30, columns=40, pitch=0.05e-3, x0=x0, y0=y0))
+        part = table.visible_part(PixelGrid(rows=30, columns=40, pitch=0.05e-3, x0=x0, y0=y0))
         assert table.fields[part].size > 0
 
 
 @pytest.mark.parametrize("block", [1, 2, 3, 5])
 def test_values_at_the_middles_of_blocks_are_spread_over_their_points(block: int) -> None:
     grid = PixelGrid(rows=31, columns=44, pitch=0.05e-3, x0=2e-3, y0=1e-3)
-    blocks = thinned(grid, block)
+    blocks = block_centres(grid, block)
     assert blocks.shape == (grid.shape if block == 1 else (-(-31 // block) + 2, -(-44 // block) + 2))
-    found = spread(blocks.points().astype(np.float32), block, grid.shape)  # linear in x and in y
+    found = interpolate_blocks(blocks.points().astype(np.float32), block, grid.shape)  # linear in x and in y
     np.testing.assert_allclose(found, grid.points(), atol=1e-9)

@@ -26,11 +26,11 @@ def test_an_arm_with_an_error_goes_where_it_believes_the_target_to_be(spring_wor
     clock = SimClock(spring_world, 0.1)
     arm = SimArm(spring_world, clock, "upper", 1.0, 1.0, error=ERROR)
     real, believed = spring_world.pose("upper"), arm.state().pose
-    assert se3.distance(believed, se3.compose(real, ERROR)) == pytest.approx((0.0, 0.0), abs=1e-12)
+    assert se3.pose_distance(believed, se3.compose(real, ERROR)) == pytest.approx((0.0, 0.0), abs=1e-12)
     sent = arm.command(down(believed, 0.4e-3))
     clock.tick()
     assert sent is not None
-    assert se3.distance(arm.state().pose, sent) == pytest.approx((0.0, 0.0), abs=1e-9)
+    assert se3.pose_distance(arm.state().pose, sent) == pytest.approx((0.0, 0.0), abs=1e-9)
     assert spring_world.pose("upper").position == pytest.approx(real.position - [0, 0, 0.4e-3], abs=1e-9)
 
 

@@ -15,8 +15,8 @@ from tacsim.physics.move import MoveStats
 from tacsim.sim.arm import SimArm
 from tacsim.sim.clock import SimClock
 from tacsim.sim.reset import TOUCH_TOLERANCE, SimReset, approach_force
+from tacsim.sim.scene_world import SceneWorld, StatePool
 from tacsim.sim.sensor import SimSensor
-from tacsim.sim.stage import Stage, StatePool
 
 
 def shifted(pose: Pose, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Pose:
@@ -199,7 +199,7 @@ def test_placement_follows_the_seed(open_springs: Any) -> None:
 
 def test_without_touch_force_the_gels_stay_clear(spring_world: Any) -> None:
     clock = SimClock(spring_world, 0.1)
-    SimReset(Stage(spring_world.scene, lambda scene: spring_world), clock, {}, None).touch()
+    SimReset(SceneWorld(spring_world.scene, lambda scene: spring_world), clock, {}, None).touch()
     assert spring_world.moves == []
 
 
@@ -314,11 +314,11 @@ def test_a_start_that_comes_again_is_not_approached_again(open_springs: Any) -> 
 
 def test_a_pool_keeps_the_states_used_last() -> None:
     state = {"x": np.zeros(100)}  # 800 bytes
-    pool = StatePool(most=2000)
+    pool = StatePool(max_bytes=2000)
     for key in ("a", "b"):
-        pool.keep(key, state, None)
+        pool.store(key, state, None)
     assert pool.find("a") == (state, None)
-    pool.keep("c", state, None)
+    pool.store("c", state, None)
     assert pool.find("b") is None and pool.find("a") is not None and pool.find("c") is not None
 
 

@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from tacsim.interface import Action, Pose
 from tacsim.limits import ActionError
-from tacsim.tasks.task import Axis, action_from, vector_of
+from tacsim.tasks.action import action_of_vector, vector_of_action
+from tacsim.tasks.task import Axis
 
 AXES = (Axis("lower", (0.0, 0.0, 1.0)), Axis("upper", (1.0, 0.0, 0.0)), Axis("upper", (0.0, 1.0, 0.0)))
 POSES = {
@@ -21,7 +22,7 @@ POSES = {
 
 def test_a_vector_moves_each_arm_along_its_axes() -> None:
     vector = np.array([0.5, -1.0, 0.25], np.float32)
-    action = action_from(vector, AXES, 2e-4, POSES)
+    action = action_of_vector(vector, AXES, 2e-4, POSES)
     assert action.tool["lower"].position == pytest.approx([0.1, 0.2, 0.3 + 1e-4], abs=1e-12)  # type: ignore[union-attr]
     assert action.tool["upper"].position == pytest.approx([1.0 - 2e-4, 2.0 + 5e-5, 3.0], abs=1e-12)  # type: ignore[union-attr]
     assert np.array_equal(action.tool["upper"].quaternion, POSES["upper"].quaternion)  # type: ignore[union-attr]
@@ -40,11 +41,13 @@ def test_a_vector_moves_each_arm_along_its_axes() -> None:
 )
 def test_a_vector_that_is_no_action_is_refused(vector: Any, message: str) -> None:
     with pytest.raises(ActionError, match=message):
-        action_from(np.array(vector), AXES, 2e-4, POSES)
+        action_of_vector(np.array(vector), AXES, 2e-4, POSES)
 
 
 def test_the_vector_of_an_action_asks_for_it_as_far_as_axes_and_lengths_allow() -> None:
     vector = np.array([0.5, -1.0, 0.25], np.float32)
-    assert vector_of(action_from(vector, AXES, 2e-4, POSES), AXES, 2e-4, POSES) == pytest.approx(vector, abs=1e-6)
+    assert vector_of_action(action_of_vector(vector, AXES, 2e-4, POSES), AXES, 2e-4, POSES) == pytest.approx(
+        vector, abs=1e-6
+    )
     far = Pose(POSES["upper"].position + [1e-3, -1e-4, 5e-3], POSES["upper"].quaternion)
-    assert vector_of(Action({"upper": far, "lower": None}), AXES, 2e-4, POSES).tolist() == [0.0, 1.0, -0.5]
+    assert vector_of_action(Action({"upper": far, "lower": None}), AXES, 2e-4, POSES).tolist() == [0.0, 1.0, -0.5]

@@ -16,9 +16,9 @@ from tacsim.interface import ArmState, FloatArray, Pose, Truth
 from tacsim.models.material import BodyMaterial
 from tacsim.models.rig import KneadConfig
 from tacsim.models.scene import Body, Box, Indenter, Scene
-from tacsim.tasks import judge, make_task
+from tacsim.tasks import evaluate_outcome, make_task
+from tacsim.tasks.action import action_of_vector
 from tacsim.tasks.knead import Knead, ScriptedKnead
-from tacsim.tasks.task import action_from
 
 QUICK = [
     "scene.preset=learn",
@@ -58,7 +58,7 @@ def test_a_rig_with_another_body_kneads_that_one() -> None:
 
 def test_a_cube_is_judged_where_it_lies() -> None:
     task = make_task(config(shape="ball"))
-    outcome = judge(task, cube(8e-3), cube(8e-3))
+    outcome = evaluate_outcome(task, cube(8e-3), cube(8e-3))
     assert 0 < outcome.distance < 0.1e-3 and outcome.success
     measures = task.measures(cube(8e-3), cube(8e-3))
     assert measures["chamfer"] == outcome.distance
@@ -88,7 +88,7 @@ def kneaded(steps: int, policy: str, *overrides: str) -> tuple[dict[str, float],
                 both.append((task.distance(now, start), felt))
             poses = {name: arm.pose for name, arm in observation.arms.items()}
             vector = random.uniform(-1, 1, 4) * [0.2, 0.2, 1, 1]
-            action = acts(observation) if policy == "scripted" else action_from(vector, task.axes, 0.5e-3, poses)
+            action = acts(observation) if policy == "scripted" else action_of_vector(vector, task.axes, 0.5e-3, poses)
             observation, _ = rig.step(action)
         truth = rig.truth()
     assert truth is not None
@@ -119,7 +119,7 @@ def test_the_scripted_policy_turns_where_the_sensor_stands_not_by_the_clock() ->
     for share in (1.0, 0.5):
         policy, now, way = ScriptedKnead(task, True), np.zeros(2), []
         for _ in range(int(300 / share)):
-            step = policy._beside(now)
+            step = policy._lateral_step(now)
             assert np.linalg.norm(step) <= 0.9 * task.config.max_step + 1e-12
             now = now + share * step
             way.append(now.copy())

@@ -14,10 +14,10 @@ from tacsim.interface import Action, Observation, Truth
 from tacsim.models.rig import RepositionConfig, SqueezeConfig
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.tasks import make_task
+from tacsim.tasks.action import action_of_vector
 from tacsim.tasks.grip import Grip
 from tacsim.tasks.reposition import centre_of_pressure, estimated_position
 from tacsim.tasks.squeeze import estimated_height
-from tacsim.tasks.task import action_from
 
 SQUEEZE = SqueezeConfig(kind="squeeze", goal=9.7e-3, max_step=0.2e-3)
 REPOSITION = RepositionConfig(kind="reposition", goal=(2e-3, -1e-3), max_step=0.2e-3)
@@ -190,7 +190,7 @@ def by_the_expert(rig: Any, task: Any, steps: int) -> list[float]:
     for _ in range(steps):
         poses = {name: arm.pose for name, arm in observation.arms.items()}
         vector = task.expert(rig.truth(), start)
-        observation, _ = rig.step(action_from(vector, task.axes, task.config.max_step, poses))
+        observation, _ = rig.step(action_of_vector(vector, task.axes, task.config.max_step, poses))
         distances.append(task.distance(rig.truth(), start))
     return distances
 

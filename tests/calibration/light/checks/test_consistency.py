@@ -8,10 +8,10 @@ import pytest
 
 from calibration.errors import BadFrames
 from calibration.light.calibrator import calibrate_light
-from calibration.light.checks.consistency import blurred_presses, unlike_presses, untouched_contact
-from calibration.light.checks.press_shapes import fit_stretch, other_balls
-from calibration.light.checks.verdict import KnownScale, judge
-from calibration.light.press import BallPress, Window, find_press, smooth, untouched_mean
+from calibration.light.checks.consistency import find_blurred_presses, find_inconsistent_presses, find_reference_contact
+from calibration.light.checks.press_shapes import find_other_balls, fit_stretch
+from calibration.light.checks.verdict import KnownScale, evaluate_calibration
+from calibration.light.press import BallPress, Window, find_press, gaussian_blur, mean_reference_colour
 from tests.calibration.presses import BALL, BALL_PX, COLUMNS, PITCH, ROWS, HiddenSensor
 
 SCALE = KnownScale(PITCH, BALL, (COLUMNS * PITCH, ROWS * PITCH))
@@ -28,7 +28,7 @@ def images(balls: list[float] | None = None) -> list[np.ndarray]:
 
 
 def found(shown: list[np.ndarray], empty: np.ndarray, ball: float = BALL_PX) -> list[BallPress]:
-    mean = untouched_mean(empty)
+    mean = mean_reference_colour(empty)
     return [find_press(f"press {k}", image, empty, mean, ball) for k, image in enumerate(shown)]
 
 
@@ -38,7 +38,7 @@ def windows(presses: list[BallPress]) -> list[Window]:
     for press in presses:
         v, u = np.nonzero(press.distance() < 2.3 * press.circle.radius)
         keep = (u % 3 == 0) & (v % 3 == 0)
-        change = smooth(press.change, 0.8)[v[keep], u[keep]]
+        change = gaussian_blur(press.change, 0.8)[v[keep], u[keep]]
         cut.append(Window(u[keep].astype(float), v[keep].astype(float), change))
     return cut
 
@@ -66,7 +66,7 @@ def test_pixels_that_are_not_square_are_measured(
 def test_presses_of_another_ball_are_told(empty: np.ndarray, ratio: float, other: tuple[int, ...]) -> None:
     presses = found(images([ratio if k in other else 1.0 for k in range(8)]), empty)
     circles = [press.circle for press in presses]
-    told, size = other_balls(windows(presses), circles, 3 * BALL_PX, BALL_PX, presses[0].shape)
+    told, size = find_other_balls(windows(presses), circles, 3 * BALL_PX, BALL_PX, presses[0].shape)
     if len(other) == 4:  # then nobody knows which is the other one
         assert set(told) in (set(other), set(range(8)) - set(other))
         return
@@ -83,27 +83,27 @@ def test_presses_of_a_turned_sensor_are_told(turned: object) -> None:
     flat = even.empty()
     shown = [press.image for press in even.presses(8)]
     mixed = [np.ascontiguousarray(turned(image)) if k in (1, 4) else image for k, image in enumerate(shown)]
-    assert unlike_presses(found(shown, flat), windows(found(shown, flat)), BALL_PX) == []
+    assert find_inconsistent_presses(found(shown, flat), windows(found(shown, flat)), BALL_PX) == []
     presses = found(mixed, flat)
-    assert unlike_presses(presses, windows(presses), BALL_PX) == [1, 4]
+    assert find_inconsistent_presses(presses, windows(presses), BALL_PX) == [1, 4]
 
 
 @pytest.mark.parametrize("which", [(), (1, 4), (0, 1, 2, 3), tuple(range(8))])
 def test_blurred_presses_are_told(empty: np.ndarray, which: tuple[int, ...]) -> None:
     shown = [cv2.GaussianBlur(image, (0, 0), 1.5) if k in which else image for k, image in enumerate(images())]
-    told = blurred_presses(found(shown, empty), empty, untouched_mean(empty))
+    told = find_blurred_presses(found(shown, empty), empty, mean_reference_colour(empty))
     assert tuple(k for k, _ in told) == which
 
 
 def test_a_contact_in_pictures_without_contact_is_told(empty: np.ndarray) -> None:
-    mean, again = untouched_mean(empty), HiddenSensor(3).empty()
+    mean, again = mean_reference_colour(empty), HiddenSensor(3).empty()
     touched = HiddenSensor(3).press(0.1e-3, 230, 165).image
     presses = found(images(), empty)
-    assert untouched_contact(presses, empty, mean, [again], BALL_PX) is None
-    told = untouched_contact(presses, empty, mean, [again, touched], BALL_PX)
+    assert find_reference_contact(presses, empty, mean, [again], BALL_PX) is None
+    told = find_reference_contact(presses, empty, mean, [again, touched], BALL_PX)
     assert told is not None and "pictures 1 and 3 without contact differ" in told
     touched = HiddenSensor(3).press(0.14e-3, 230, 165).image
-    told = untouched_contact(found(images(), touched), touched, mean, [], BALL_PX)
+    told = find_reference_contact(found(images(), touched), touched, mean, [], BALL_PX)
     assert told is not None and "(230, 165) px, which no press shows" in told
 
 
@@ -111,7 +111,7 @@ def test_a_set_of_two_balls_and_wide_pixels_is_not_trusted(empty: np.ndarray) ->
     size = (round(1.08 * COLUMNS), ROWS)
     frames = [(f"press {k}", cv2.resize(image, size)) for k, image in enumerate(images([0.75] * 4 + [1.0] * 4))]
     fit = calibrate_light(cv2.resize(empty, size), frames, BALL_PX)
-    verdict = judge(fit, SCALE)
+    verdict = evaluate_calibration(fit, SCALE)
     assert len(fit.left_out) == 4 and all("ball" in why for _, why in fit.left_out)
     assert verdict.word == "do not trust"
     assert "4 of 8 presses were left out" in str(verdict) and "contacts of the ball are no circles" in str(verdict)

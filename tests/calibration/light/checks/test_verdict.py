@@ -11,7 +11,7 @@ import pytest
 from calibration.light.calibrator import calibrate_light
 from calibration.light.checks.page import write_page
 from calibration.light.checks.press_shapes import Stretch
-from calibration.light.checks.verdict import KnownScale, judge
+from calibration.light.checks.verdict import KnownScale, evaluate_calibration
 from calibration.light.dent import contact_depth
 from calibration.light.fit import LightFit
 from tests.calibration.presses import BALL, BALL_PX, COLUMNS, PITCH, ROWS, HiddenSensor
@@ -34,7 +34,7 @@ def fit() -> LightFit:
 
 def said(fit: LightFit, scale: KnownScale, word: str) -> str:
     """What is found, of a verdict that must be `word`."""
-    verdict = judge(fit, scale)
+    verdict = evaluate_calibration(fit, scale)
     assert verdict.word == word, verdict
     return str(verdict)
 
@@ -58,7 +58,7 @@ def test_lengths_that_nothing_checks_are_not_called_good(fit: LightFit) -> None:
 def test_too_many_left_out_are_no_calibration(fit: LightFit) -> None:
     some = tuple((f"bad {k}", "no contact") for k in range(3))
     assert "3 of 8 presses were left out" in said(replace(fit, left_out=some), SCALE, "do not trust")
-    assert judge(replace(fit, left_out=some[:2]), SCALE).word == "good"
+    assert evaluate_calibration(replace(fit, left_out=some[:2]), SCALE).word == "good"
 
 
 def test_marker_pitch_checks_the_pixel_pitch(fit: LightFit) -> None:
@@ -110,7 +110,7 @@ def test_contacts_that_are_all_as_wide_as_the_ball_tell_a_wrong_length(fit: Ligh
     what a ball can do. One press that deep may be, all of them are not."""
     wide = tuple(replace(press, circle=replace(press.circle, radius=0.93 * BALL_PX)) for press in fit.presses)
     assert "a/R = 0.93" in said(replace(fit, presses=wide), SCALE, "do not trust")
-    assert judge(replace(fit, presses=(*fit.presses[:4], wide[4])), SCALE).word == "good"
+    assert evaluate_calibration(replace(fit, presses=(*fit.presses[:4], wide[4])), SCALE).word == "good"
     widest = replace(wide[4], circle=replace(wide[4].circle, radius=0.97 * BALL_PX))
     told = said(replace(fit, presses=(*fit.presses[:4], widest)), SCALE, "usable")
     assert "press 4 is as wide as the ball" in told and "is it the radius that was given?" in told
@@ -119,7 +119,7 @@ def test_contacts_that_are_all_as_wide_as_the_ball_tell_a_wrong_length(fit: Ligh
 def test_a_press_of_known_depth_tells_a_wrong_pitch(fit: LightFit) -> None:
     """Hertz's depth of a half-space, of which the presses are made, is 0.65 mm for the third."""
     depth = (("press 2", 0.65e-3),)
-    assert judge(fit, KnownScale(PITCH, BALL, depths=depth)).word == "good"
+    assert evaluate_calibration(fit, KnownScale(PITCH, BALL, depths=depth)).word == "good"
     wrong = calibrated(5, BALL_PX / 1.6)
     told = said(wrong, KnownScale(1.6 * PITCH, BALL, depths=depth), "do not trust")
     assert "by the depth that is known" in told
@@ -141,7 +141,7 @@ def test_a_light_without_direction_is_told(fit: LightFit) -> None:
 
 def test_the_page_says_it_first_and_harms_nobody(fit: LightFit, tmp_path: Path) -> None:
     bad = replace(fit, left_out=(("<script>.png", "no contact"),), radius_uncertainty=float("nan"))
-    verdict = judge(replace(fit, radius_uncertainty=0.15), SCALE)
+    verdict = evaluate_calibration(replace(fit, radius_uncertainty=0.15), SCALE)
     write_page(tmp_path / "page.html", "finger", bad, SCALE, verdict, None, ["a fact"])
     page = (tmp_path / "page.html").read_text(encoding="utf-8")
     assert "<title>finger: do not trust</title>" in page and "Next:" in page and "a fact" in page
@@ -154,4 +154,4 @@ def test_the_page_says_it_first_and_harms_nobody(fit: LightFit, tmp_path: Path) 
     [(1.025, 0.0, "good"), (1.04, 0.001, "usable"), (1.08, 0.003, "do not trust"), (1.06, 0.02, "good")],
 )
 def test_contacts_are_no_ellipses(fit: LightFit, ratio: float, uncertainty: float, word: str) -> None:
-    assert judge(replace(fit, stretch=Stretch(ratio, 20.0, uncertainty)), SCALE).word == word
+    assert evaluate_calibration(replace(fit, stretch=Stretch(ratio, 20.0, uncertainty)), SCALE).word == word

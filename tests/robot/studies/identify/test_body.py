@@ -54,4 +54,4 @@ def test_stiffness_and_yield_of_a_body_in_some_tens_of_squeezes(squeeze: Press) 
 def test_a_zero_that_drifts_during_a_squeeze_is_noticed(squeeze: Press) -> None:
     drifting = squeeze.readings["lower.fz"] + 1.0 * np.linspace(0, 1, len(GAPS))
     result = found(replace(squeeze, readings=squeeze.readings | {"lower.fz": drifting}))
-    assert [each.kind for each in result.findings] == ["drift"] and "lower.fz drifts by +" in result.findings[0].words
+    assert [each.kind for each in result.findings] == ["drift"] and "lower.fz drifts by +" in result.findings[0].text

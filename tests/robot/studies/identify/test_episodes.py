@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from calibration.materials.fit import Point
-from calibration.materials.presses import Noise, gathered, signals_of
+from calibration.materials.presses import Noise, merge_repeated_readings, signals_of
 from robot.studies.identify.recordings import Recordings
 from robot.studies.identify.simulation import Simulation
 from tacsim.config import load_scene
@@ -34,7 +34,7 @@ def test_a_recording_simulated_again(
     assert recorded.exit_code == 0, recorded.output
     known = load_scene(scene, ["preset=learn"])
     recordings = Recordings(known)
-    press = gathered(recordings.read(Path("runs/one/episode.mcap")))
+    press = merge_repeated_readings(recordings.read(Path("runs/one/episode.mcap")))
     assert press.name == "one" and {"lower.fx", "lower.fz", "lower.dent"} <= set(press.readings)
     signals = signals_of([press], Noise())
     [again] = Simulation(known, (), (press,), recordings.seen)([Point(np.zeros(0), np.zeros(1))])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from calibration.materials.checks import Finding
-from calibration.materials.estimate import estimate
+from calibration.materials.estimate import estimate_materials
 from calibration.materials.fit import Point, Priors
 from calibration.materials.presses import Noise, signals_of
 from robot.deploy.policy import load_policy
@@ -123,8 +123,8 @@ def identified(tmp_path: Path) -> Identified:
         begun = np.array([each.free(each.start) for each in parameters])
         return [signals.values + slopes @ (point.free - begun - 0.01) for point in points]
 
-    fit = estimate([predict], signals, parameters, Priors(1e-6, 1e-6), coarse_error=0.0)
-    found = scene_with(scene, {each.name: fit.value(each.name) for each in fit.told})
+    fit = estimate_materials([predict], signals, parameters, Priors(1e-6, 1e-6), coarse_error=0.0)
+    found = scene_with(scene, {each.name: fit.value(each.name) for each in fit.identified})
     return Identified("body", found, fit, (press,), signals, (), noise, fit)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from calibration.materials.fit import Parameter, Point
-from calibration.materials.presses import Noise, Press, gathered, signals_of, thinned
+from calibration.materials.presses import Noise, Press, downsample_press, merge_repeated_readings, signals_of
 from robot.studies.identify.identify import parameters_of
 from robot.studies.identify.simulation import Simulation, coarser, scene_with
 from tacsim.config import load_scene
@@ -73,7 +73,7 @@ def test_a_place_moves_the_parts_nearer() -> None:
 def test_readings_in_one_place_become_their_mean() -> None:
     press = pressed([(0, 0.1), (0, -0.1), (0, -0.1), (0, -0.1), (0, -0.2)])
     press.readings["lower.fz"][:] = [0, 1, 2, 6, 9]
-    result = gathered(press)
+    result = merge_repeated_readings(press)
     assert result.readings["lower.fz"].tolist() == [0, 3, 9] and result.repeats.tolist() == [1, 3, 1]
     assert signals_of([result], Noise(force=0.3)).noise[4] == pytest.approx(0.3 / np.sqrt(3))
 
@@ -81,7 +81,7 @@ def test_readings_in_one_place_become_their_mean() -> None:
 def test_a_thinned_path_keeps_its_turns() -> None:
     down = [(0.0, 0.1 - 0.02 * k) for k in range(40)]
     aside = [(0.05 * k, down[-1][1]) for k in range(1, 40)]
-    places = thinned(pressed(down + aside), 8).places
+    places = downsample_press(pressed(down + aside), 8).places
     assert len(places) <= 11
     for turn in (down[0], down[-1], aside[-1]):
         assert np.abs(places[:, [0, 2]] * 1e3 - [turn[0], 4 + turn[1]]).sum(axis=1).min() < 1e-9

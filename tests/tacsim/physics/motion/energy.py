@@ -78,7 +78,7 @@ def of_contact(world: HybridWorld, state: Mapping[str, Array], params: Array, g:
     history = state["contact"][g].astype(float)
     on = history[:, 2] == ON_GEL
     history = history[on]
-    x = ((state["position"].astype(float) - 1e3 * pose.position) @ se3.matrix(pose))[on]
+    x = ((state["position"].astype(float) - 1e3 * pose.position) @ se3.rotation_matrix(pose))[on]
     u = state["gel_displacement"][g][:, :, -1].astype(float)
     n = np.array(u.shape[:2]) - 1
     start = x[:, :2] / h + n / 2

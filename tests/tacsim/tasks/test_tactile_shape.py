@@ -11,8 +11,8 @@ from tacsim.interface import ArmState, FloatArray, Observation, Pose, TactileObs
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.optics.grid import canonical_cells
 from tacsim.pose import HALF_TURN_X
-from tacsim.tasks.knead import FeltShape
-from tacsim.tasks.solids import Solid, chamfer
+from tacsim.tasks.solids import Solid, chamfer_distance
+from tacsim.tasks.tactile_shape import TactileShape
 
 GRID = CanonicalGrid()
 DEPTH = 0.3e-3  # of the body in each gel [m]
@@ -20,7 +20,7 @@ BALL, ROD = 4e-3, (3e-3, 9e-3)  # radius; radius, length [m]
 Top = Callable[[FloatArray, FloatArray], FloatArray]  # half the thickness of a body over x, y from its middle; 0 beside
 
 
-def size_of(shape: FeltShape, volume: float) -> FloatArray:
+def size_of(shape: TactileShape, volume: float) -> FloatArray:
     """Of a cloud of points, each of which stands for a cube."""
     points = shape.points()
     assert points is not None
@@ -86,24 +86,24 @@ def volume_of_bar(half: FloatArray) -> float:
 
 def test_a_ball_that_rolls_in_all_directions_is_felt_as_a_ball() -> None:
     volume = 4 / 3 * np.pi * BALL**3
-    shape = FeltShape(volume, GRID)
+    shape = TactileShape(volume, GRID)
     for upper in path(0.5 * np.pi * 2 * BALL, 0.0, np.pi / 2):
-        shape.feel(touched(ball, 2 * BALL, upper / 2, upper))
+        shape.add_observation(touched(ball, 2 * BALL, upper / 2, upper))
     points = shape.points()
     assert points is not None
-    assert chamfer(points, Solid.ball(volume), volume) < 0.05e-3
+    assert chamfer_distance(points, Solid.make_ball(volume), volume) < 0.05e-3
 
 
 def test_a_rod_that_rolls_across_its_axis_is_felt_as_a_rod() -> None:
     volume = np.pi * ROD[0] ** 2 * ROD[1]
-    shape, target = FeltShape(volume, GRID), Solid.rod(volume, ROD[1] / (2 * ROD[0]))
+    shape, target = TactileShape(volume, GRID), Solid.make_rod(volume, ROD[1] / (2 * ROD[0]))
     distances = []
     for number, upper in enumerate(path(0.5 * np.pi * 2 * ROD[0], np.pi / 2)):
-        shape.feel(touched(rod, 2 * ROD[0], upper / 2, upper))
+        shape.add_observation(touched(rod, 2 * ROD[0], upper / 2, upper))
         if number in (0, 26):
             points = shape.points()
             assert points is not None
-            distances.append(chamfer(points, target, volume))
+            distances.append(chamfer_distance(points, target, volume))
     assert distances[1] < 0.05e-3
     assert distances[0] > 4 * distances[1]  # one touch does not tell that it is round
 
@@ -112,12 +112,12 @@ def test_a_rod_that_rolls_across_its_axis_is_felt_as_a_rod() -> None:
 def test_what_is_not_round_is_felt_as_it_has_turned(half: FloatArray) -> None:
     """An elliptic bar turns by the way of the upper gel over its height at that moment, and shows its other width."""
     volume, turn, before = float(2 * np.pi * half.prod()), 0.0, 0.0
-    shape = FeltShape(volume, GRID)
+    shape = TactileShape(volume, GRID)
     for upper in path(0.5 * np.pi * (half[1] + half[2]), np.pi / 2):
         for _ in range(2):
             height = 2 * float(np.hypot(half[1] * np.sin(turn), half[2] * np.cos(turn)))
             turn, before = turn - (upper[1] - before) / height, upper[1]
-        shape.feel(touched(bar(turn, half), height, upper / 2, upper))
+        shape.add_observation(touched(bar(turn, half), height, upper / 2, upper))
     assert size_of(shape, volume)[1:] == pytest.approx(2 * half[1:], rel=0.1)
 
 
@@ -129,23 +129,23 @@ def test_a_slab_is_sheared_not_turned() -> None:
     """Wide contacts of a flat body: what is felt of it stays flat, however far the gel goes."""
     half = np.array([6e-3, 6e-3, 1.2e-3])
     volume = float(8 * half.prod())
-    shape = FeltShape(volume, GRID)
+    shape = TactileShape(volume, GRID)
     for upper in [*path(6e-3, np.pi / 2)][:15]:
-        shape.feel(touched(slab(half), 2 * half[2], upper / 2, upper))
+        shape.add_observation(touched(slab(half), 2 * half[2], upper / 2, upper))
     assert size_of(shape, volume) == pytest.approx(2 * half, rel=0.1)
 
 
 def test_what_has_been_flattened_is_felt_flat_and_as_wide_as_its_volume_asks() -> None:
     """The corners of a slab are not felt at once: its contact is narrower by a fifth than the body."""
     volume, there = 8 * 4e-3 * 5e-3 * 2.5e-3, np.zeros(2)
-    shape = FeltShape(volume, GRID)
-    shape.feel(touched(slab(np.array([3e-3, 3e-3, 4e-3])), 8e-3, there, there))
-    shape.feel(touched(slab(np.array([3.2e-3, 4e-3, 2.5e-3])), 5e-3, there, there))
+    shape = TactileShape(volume, GRID)
+    shape.add_observation(touched(slab(np.array([3e-3, 3e-3, 4e-3])), 8e-3, there, there))
+    shape.add_observation(touched(slab(np.array([3.2e-3, 4e-3, 2.5e-3])), 5e-3, there, there))
     assert size_of(shape, volume) == pytest.approx([8e-3, 10e-3, 5e-3], rel=0.07)
 
 
 def test_without_touch_nothing_is_known() -> None:
-    shape = FeltShape(1e-7, GRID)
+    shape = TactileShape(1e-7, GRID)
     away = touched(lambda x, y: np.zeros_like(x), 8e-3, np.zeros(2), np.zeros(2))
-    shape.feel(away)
+    shape.add_observation(away)
     assert shape.points() is None

@@ -15,12 +15,12 @@ from tacsim.physics.move import MoveStats
 from tacsim.physics.world import World, make_world
 
 State = Mapping[str, NDArray[Any]]
-MOST_BYTES = 256_000_000  # of kept states
+MAX_BYTES = 256_000_000  # of kept states
 
 
-class Stage:
+class SceneWorld:
     """The world of the present scene, to be used as that world. It is made when it is first needed: until then nothing
-    of a simulation runs, so a process may fork. `use` exchanges the scene between episodes.
+    of a simulation runs, so a process may fork. `set_scene` exchanges the scene between episodes.
 
     Args:
         make: a new world of a scene.
@@ -31,7 +31,7 @@ class Stage:
         self._world: World | None = None
         self._begin: State = {}
 
-    def use(self, scene: Scene) -> None:
+    def set_scene(self, scene: Scene) -> None:
         """From the next `rewind` on. Raises ValueError for a scene whose gels are cut otherwise."""
         if scene != self.scene:
             require_same_gels(self.scene, scene)
@@ -87,39 +87,39 @@ class Stage:
 def require_same_gels(scene: Scene, other: Scene) -> None:
     """Raises ValueError where a rig cannot go from one scene to the other: sensors see one gel, and a batch has one
     lattice."""
-    kept: dict[str, tuple[object, object]] = {
+    unchanging: dict[str, tuple[object, object]] = {
         "physics": (scene.physics, other.physics),
         "a body": (scene.body is not None, other.body is not None),
     }
     for name in scene.sensors:
-        kept[f"gel.size of sensor '{name}' [m]"] = scene.gel_of(name).size, other.gel_of(name).size
-        kept[f"the size of elements of the gel of '{name}' [m]"] = scene.element_of(name), other.element_of(name)
-    for what, (now, new) in kept.items():
+        unchanging[f"gel.size of sensor '{name}' [m]"] = scene.gel_of(name).size, other.gel_of(name).size
+        unchanging[f"the size of elements of the gel of '{name}' [m]"] = scene.element_of(name), other.element_of(name)
+    for what, (now, new) in unchanging.items():
         if now != new:
             raise ValueError(f"a new scene must keep {what} of the rig's: {now}, got {new}; open another rig for it")
 
 
 class StatePool:
     """States that motions from a known start ended in, so that the same motion need not be computed again. A state is a
-    function of its key alone, so results do not depend on what is kept: the states used last, MOST_BYTES of them."""
+    function of its key alone, so results do not depend on what is kept: the states used last, MAX_BYTES of them."""
 
-    def __init__(self, most: int = MOST_BYTES) -> None:
-        self._most, self._bytes = most, 0
-        self._kept: OrderedDict[object, tuple[State, MoveStats | None]] = OrderedDict()
+    def __init__(self, max_bytes: int = MAX_BYTES) -> None:
+        self._max_bytes, self._bytes = max_bytes, 0
+        self._states: OrderedDict[object, tuple[State, MoveStats | None]] = OrderedDict()
 
     def find(self, key: object) -> tuple[State, MoveStats | None] | None:
         """The state and how its last motion went; None for a key that is not kept."""
-        if key in self._kept:
-            self._kept.move_to_end(key)
-        return self._kept.get(key)
+        if key in self._states:
+            self._states.move_to_end(key)
+        return self._states.get(key)
 
-    def keep(self, key: object, state: State, stats: MoveStats | None) -> None:
-        self._kept[key] = state, stats
-        self._bytes += _size(state)
-        while self._bytes > self._most and len(self._kept) > 1:
-            _, (oldest, _) = self._kept.popitem(last=False)
-            self._bytes -= _size(oldest)
+    def store(self, key: object, state: State, stats: MoveStats | None) -> None:
+        self._states[key] = state, stats
+        self._bytes += _state_bytes(state)
+        while self._bytes > self._max_bytes and len(self._states) > 1:
+            _, (oldest, _) = self._states.popitem(last=False)
+            self._bytes -= _state_bytes(oldest)
 
 
-def _size(state: State) -> int:
+def _state_bytes(state: State) -> int:
     return sum(a.nbytes for a in state.values())

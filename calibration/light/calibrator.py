@@ -25,7 +25,6 @@ from calibration.height.slope_polynomial import (
     to_normal,
 )
 from calibration.light.checks.consistency import blurred_presses, unlike_presses, untouched_contact
-from calibration.light.checks.press_shapes import fit_stretch, other_balls
 from calibration.light.circle import NoCircle
 from calibration.light.darkness import DARK_UNEXPLAINED, find_dark_press, fit_darkness, tells_no_direction
 from calibration.light.dent import dent_gradient, dent_height, rim_slope
@@ -52,6 +51,7 @@ from calibration.light.photometry import (
     solve,
 )
 from calibration.light.press import BallPress, Window, find_press, smooth, untouched_mean
+from calibration.light.press_shapes import fit_stretch, other_balls
 from calibration.light.refinement import RefinedGeometry, refine
 from calibration.light.shadows import DentShade, find_lamps
 from calibration.reference import STALE_COLOUR, exchanged

@@ -9,9 +9,9 @@ import pytest
 from calibration.errors import BadFrames
 from calibration.light.calibrator import calibrate_light
 from calibration.light.checks.consistency import blurred_presses, unlike_presses, untouched_contact
-from calibration.light.checks.press_shapes import fit_stretch, other_balls
 from calibration.light.checks.verdict import KnownScale, judge
 from calibration.light.press import BallPress, Window, find_press, smooth, untouched_mean
+from calibration.light.press_shapes import fit_stretch, other_balls
 from tests.calibration.presses import BALL, BALL_PX, COLUMNS, PITCH, ROWS, HiddenSensor
 
 SCALE = KnownScale(PITCH, BALL, (COLUMNS * PITCH, ROWS * PITCH))

@@ -11,10 +11,10 @@ import numpy as np
 from calibration.bundle import Calibration, Provenance, Residual
 from calibration.height.slope_polynomial import InverseModel
 from calibration.lens.view import GelView
-from calibration.light.checks.press_shapes import Stretch
 from calibration.light.dent import ContactCircle
 from calibration.light.photometry import ModelSize
 from calibration.light.press import UNTOUCHED_RADIUS, BallPress
+from calibration.light.press_shapes import Stretch
 from tacsim.interface import Float32, FloatArray, Image
 from tacsim.models.photometric import DarknessModel, PhotometricModel
 from tacsim.models.sensor import CameraNoise, Markers, SensorGeometry

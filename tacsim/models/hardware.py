@@ -119,7 +119,7 @@ class ArmLimits(Config):
 
 class SensorConfig(Config):
     """What a rig file says of one sensor. That of a driver derives from it, says its `driver: Literal["..."]`, and adds
-    what it is about (docs/architecture.md, "To add a driver")."""
+    what it is about (docs/drivers.md)."""
 
     is_simulated: ClassVar[bool] = False  # its frames come from the simulation of the rig's scene
     driver: str

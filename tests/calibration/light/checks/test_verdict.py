@@ -10,10 +10,10 @@ import pytest
 
 from calibration.light.calibrator import calibrate_light
 from calibration.light.checks.page import write_page
-from calibration.light.checks.press_shapes import Stretch
 from calibration.light.checks.verdict import KnownScale, evaluate_calibration
 from calibration.light.dent import contact_depth
 from calibration.light.fit import LightFit
+from calibration.light.press_shapes import Stretch
 from tests.calibration.presses import BALL, BALL_PX, COLUMNS, PITCH, ROWS, HiddenSensor
 
 SIZE = (COLUMNS * PITCH, ROWS * PITCH)  # of the gel that the pictures show

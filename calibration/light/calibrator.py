@@ -25,7 +25,7 @@ from calibration.height.slope_polynomial import (
     normal_of_slope,
 )
 from calibration.light.checks.consistency import find_blurred_presses, find_inconsistent_presses, find_reference_contact
-from calibration.light.checks.press_shapes import find_other_balls
+from calibration.light.press_shapes import find_other_balls
 from calibration.light.circle import NoCircle
 from calibration.light.darkness import MAX_DARKNESS_RESIDUAL, find_dark_press, fit_darkness, is_direction_free
 from calibration.light.dent import dent_gradient, dent_height, max_dent_slope

@@ -25,7 +25,6 @@ from calibration.height.slope_polynomial import (
     normal_of_slope,
 )
 from calibration.light.checks.consistency import find_blurred_presses, find_inconsistent_presses, find_reference_contact
-from calibration.light.press_shapes import find_other_balls
 from calibration.light.circle import NoCircle
 from calibration.light.darkness import MAX_DARKNESS_RESIDUAL, find_dark_press, fit_darkness, is_direction_free
 from calibration.light.dent import dent_gradient, dent_height, max_dent_slope
@@ -52,7 +51,7 @@ from calibration.light.photometry import (
     solve_weights,
 )
 from calibration.light.press import BallPress, Window, find_press, gaussian_blur, mean_reference_colour
-from calibration.light.press_shapes import fit_stretch
+from calibration.light.press_shapes import find_other_balls, fit_stretch
 from calibration.light.refinement import RefinedGeometry, refine_geometry
 from calibration.light.shadows import DentShade, find_lamps
 from calibration.reference import STALE_COLOUR, is_channel_order_swapped

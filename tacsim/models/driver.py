@@ -218,7 +218,7 @@ class ArmDriver(ArmPart[ArmC], ABC):
 
 
 AnyPart = type[SensorPart[Any]] | type[ArmPart[Any]]
-BASES: dict[str, tuple[type, type]] = {"sensor": (SensorPart, SensorDriver), "arm": (ArmPart, ArmDriver)}
+BASE_CLASSES: dict[str, tuple[type, type]] = {"sensor": (SensorPart, SensorDriver), "arm": (ArmPart, ArmDriver)}
 
 
 class DriversMissing(ValueError):
@@ -229,8 +229,8 @@ class DriversMissing(ValueError):
 class Drivers:
     """The installed drivers, by kind ("sensor", "arm") and name, and why others are refused."""
 
-    usable: Mapping[str, dict[str, AnyPart]] = field(default_factory=lambda: {kind: {} for kind in BASES})
-    refused: Mapping[str, dict[str, str]] = field(default_factory=lambda: {kind: {} for kind in BASES})
+    usable: Mapping[str, dict[str, AnyPart]] = field(default_factory=lambda: {kind: {} for kind in BASE_CLASSES})
+    refused: Mapping[str, dict[str, str]] = field(default_factory=lambda: {kind: {} for kind in BASE_CLASSES})
 
 
 @cache
@@ -240,9 +240,9 @@ def installed_drivers() -> Drivers:
     for entry in sorted(metadata.entry_points(group=GROUP), key=lambda each: each.name):
         kind, _, name = entry.name.partition(".")
         home = "an unknown distribution" if entry.dist is None else entry.dist.name
-        if kind not in BASES:
+        if kind not in BASE_CLASSES:
             why = f"{home} calls it '{entry.name}' in the group {GROUP}; call it 'sensor.{name}' or 'arm.{name}'"
-            for each in BASES:
+            for each in BASE_CLASSES:
                 found.refused[each][name] = why
             continue
         if (kind, name) in homes:
@@ -266,7 +266,7 @@ def installed_drivers() -> Drivers:
 
 def _load(entry: metadata.EntryPoint, kind: str, name: str, *, is_own: bool) -> tuple[AnyPart | None, str]:
     """The class of an entry point; else None, and why it is refused."""
-    part, driver = BASES[kind]
+    part, driver = BASE_CLASSES[kind]
     try:
         found = entry.load()
     except Exception as failure:  # a distribution of somebody else's may fail in any way; other drivers still work

@@ -1,4 +1,4 @@
-"""Patches of Taichi's private parts: shorter starts and launches, the same results (docs/taichi-patches.md).
+"""Patches of Taichi's private parts: shorter starts and launches (docs/taichi-patches.md).
 
 They apply to the versions in KNOWN_VERSIONS only. TACSIM_TAICHI_PATCHES=0 turns all of them off.
 """
@@ -30,7 +30,7 @@ def are_enabled() -> bool:
     if version not in KNOWN_VERSIONS:
         warnings.warn(
             f"Taichi {version} runs without tacsim's patches, which are known for {', '.join(KNOWN_VERSIONS)}: results "
-            "are the same, starts take longer (docs/taichi-patches.md)",
+            "agree to rounding, starts take longer (docs/taichi-patches.md)",
             stacklevel=2,
         )
         return False

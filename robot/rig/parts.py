@@ -1,4 +1,4 @@
-"""The drivers of a rig's parts, and the companion that runs beside its mocks."""
+"""The drivers of a rig's parts, and the companion that runs with its mocks."""
 
 from __future__ import annotations
 

@@ -45,7 +45,7 @@ class Check:
 
 
 class Companion(Protocol):
-    """What runs beside a rig's mocks, such as the simulation that feeds them. Made of the rig's configuration, entered
+    """What runs with a rig's mocks, such as the simulation that feeds them. Made of the rig's configuration, entered
     as a context manager; its `close` ends all of it."""
 
     @property
@@ -269,7 +269,7 @@ def _load(entry: metadata.EntryPoint, kind: str, name: str, *, is_own: bool) -> 
     part, driver = BASE_CLASSES[kind]
     try:
         found = entry.load()
-    except Exception as failure:  # a distribution of somebody else's may fail in any way; other drivers still work
+    except Exception as failure:  # whatever a distribution of another author raises: other drivers still work
         return None, f"cannot be loaded: {type(failure).__name__}: {failure}"
     if not (isinstance(found, type) and issubclass(found, part)):
         return None, f"is no class that derives from tacsim.{driver.__name__}"

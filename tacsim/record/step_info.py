@@ -1,4 +1,4 @@
-"""Keys of `Step.info`: what a step of an episode says beside its frames, states and actions."""
+"""Keys of `Step.info`: what a step of an episode holds in addition to frames, states and actions."""
 
 from __future__ import annotations
 

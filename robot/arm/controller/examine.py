@@ -83,7 +83,7 @@ def _controller(name: str, config: UrArmConfig, dashboard: Dashboard) -> Iterato
     yield Check(
         f"{name}: model",
         "fail" if wrong else "ok",
-        f"{(model or 'not told').upper()}, serial number {serial}",
+        f"{(model or 'not reported').upper()}, serial number {serial}",
         f"the file says {config.model}; correct one of the two" if wrong else "",
     )
     if config.serial not in (None, serial):

@@ -39,7 +39,7 @@ class Program:
         self.contact_steps = 0
         self.servo_target: tuple[tuple[float, ...], FloatArray] | None = None  # pose asked for, its joints
         self._writes = self._operation = 0  # of the asynchronous word
-        self.main: MotionSteps = iter(())  # what it does, besides its threads
+        self.main: MotionSteps = iter(())  # what it does, in addition to its threads
 
     def step(self) -> None:
         """Main program, then its threads. Raises ProgramError where the program ends with an error."""
@@ -97,7 +97,7 @@ class Program:
         self.threads[name] = tracking() if tracked else work
 
     def repeat(self, name: str, call: Callable[[], MotionSteps]) -> None:
-        """What the thread shall do for ever from its next round on; starts it where it does not run."""
+        """What the thread does for ever from its next round on; starts it where it does not run."""
 
         def rounds() -> MotionSteps:
             while True:

@@ -114,21 +114,21 @@ class MachineState:
     def write_log(self, text: str) -> None:
         self.log.append((self.time, printable(text[:LINE])))
 
-    def stop(self, why: str) -> None:
+    def stop(self, reason: str) -> None:
         """Ends the program; the arm coasts to rest."""
         self.watchdog, self.freedrive, self.arm.waypoint, self._starting = None, None, None, None
         self.end_force_mode()
         if self.program is not None:
-            self.program, self.stop_reason = None, why
-            self.write_log(f"program stopped: {why}")
+            self.program, self.stop_reason = None, reason
+            self.write_log(f"program stopped: {reason}")
 
     def end_force_mode(self) -> None:
         if self.force_mode is not None:
             self.force_mode = None
             self.arm.settle()
 
-    def protective_stop(self, why: str) -> None:
+    def protective_stop(self, reason: str) -> None:
         if self.safety in (Safety.NORMAL, Safety.REDUCED, Safety.SAFEGUARD_STOP):
             self.safety, self.stopped_at = Safety.PROTECTIVE_STOP, self.time
-            self.write_log(f"protective stop: {why}")
-            self.stop(f"protective stop: {why}")
+            self.write_log(f"protective stop: {reason}")
+            self.stop(f"protective stop: {reason}")

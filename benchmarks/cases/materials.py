@@ -122,7 +122,7 @@ def gel_step(repeat: int) -> list[Measurement]:
         return close(world, 0.2e-3)
 
     timing, stats = timed(run, repeat, warm=lambda: None)
-    elements = 2 * math.prod(round(side / scene.element) for side in scene.gel.size)
+    elements = 2 * math.prod(round(side / scene.effective_element_size) for side in scene.gel.size)
     forces = normal_forces(world)
     return [
         Measurement(

@@ -169,7 +169,7 @@ def _targets(start: Pose, height: float, motion: PressMotion) -> list[Pose]:
 def _contact(world: PressWorld, scene: Scene, seen: SurfaceSample, sensor: SensorModel) -> NDArray[np.bool_]:
     """(H, W) True where the indenter presses on the surface seen by a pixel."""
     assert scene.indenter is not None
-    grid, margin = image_grid(sensor.geometry), NEAR * scene.element
+    grid, margin = image_grid(sensor.geometry), NEAR * scene.effective_element_size
     from_sensor = se3.relative_pose(world.pose("indenter"), world.pose("lower"))
     half = extent(scene.indenter.geometry) / 2 + margin
     corners = se3.transform(se3.inverse(from_sensor), half * (2.0 * np.indices((2, 2, 2)).reshape(3, -1).T - 1.0))
@@ -184,18 +184,18 @@ def _contact(world: PressWorld, scene: Scene, seen: SurfaceSample, sensor: Senso
     gaps = np.full(seen.valid.shape, np.inf)
     if near.any():
         inner = np.full(len(at), np.inf)
-        inner[near] = _gaps(scene.indenter, at[near], scene.element)
+        inner[near] = _gaps(scene.indenter, at[near], scene.effective_element_size)
         gaps[rows, columns] = inner.reshape(valid.shape)
     table = SurfaceTable(world.surface("lower"))
     reach, _ = table.sample_on_grid(table.spline_values(world.reach().astype(np.float32)), grid)
-    return _filled(gaps < reach.reshape(gaps.shape), int(scene.element / sensor.geometry.pixel_pitch))
+    return _filled(gaps < reach.reshape(gaps.shape), int(scene.effective_element_size / sensor.geometry.pixel_pitch))
 
 
 def _gaps(indenter: Indenter, points: FloatArray, element: float) -> FloatArray:
     """(n,) distance of points (n, 3) from the indenter, in its frame; of a mesh, as physics has it [m]."""
     geometry = indenter.geometry
     if not isinstance(geometry, Mesh):
-        return distance(geometry, points, indenter.rounding(element))
+        return distance(geometry, points, indenter.effective_edge_radius(element))
     return tiled_distance(geometry, MESH_GRID_SPACING).sample(points)[0]
 
 
@@ -225,7 +225,7 @@ def press_report(scene: Scene, motion: PressMotion, pressed: PressResult, sensor
         "edge_radius": _edge_radius(scene),
         "gel": scene.gel.model_dump(mode="json"),
         "preset": scene.preset,
-        "element_size": scene.element,
+        "element_size": scene.effective_element_size,
         "depth": motion.depth,
         "slide": list(motion.slide),
         "twist": motion.twist,
@@ -246,7 +246,11 @@ def press_report(scene: Scene, motion: PressMotion, pressed: PressResult, sensor
 def _edge_radius(scene: Scene) -> float | None:
     """Of the indenter's edges [m]; None where its geometry has none or says it."""
     assert scene.indenter is not None
-    return scene.indenter.rounding(scene.element) if isinstance(scene.indenter.geometry, Box | Cylinder) else None
+    return (
+        scene.indenter.effective_edge_radius(scene.effective_element_size)
+        if isinstance(scene.indenter.geometry, Box | Cylinder)
+        else None
+    )
 
 
 def write(folder: Path, pressed: PressResult, config: dict[str, Any], scene: Scene, sensor: SensorModel) -> None:

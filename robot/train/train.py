@@ -33,7 +33,7 @@ from tacsim.interface import Pose, Truth
 from tacsim.models.policy import ActionAxis, PolicySpec
 from tacsim.models.rig import TaskConfig
 from tacsim.models.scene import Scene
-from tacsim.models.text import printable
+from tacsim.models.text import printable_line
 from tacsim.models.training import Training
 from tacsim.tasks import GoalOutOfReach, make_task
 
@@ -200,7 +200,7 @@ def _fitting(run: RunFolder) -> Iterator[None]:
     try:
         yield
     except (KeyError, RuntimeError, ValueError) as failure:
-        words = printable(str(failure).splitlines()[0])
+        words = printable_line(str(failure).splitlines()[0])
         raise RunError(f"{run.folder}: its checkpoint does not fit its settings: {words}") from None
 
 

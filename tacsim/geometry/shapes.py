@@ -105,7 +105,7 @@ def edge_radius(indenter: Indenter, element: float) -> float:
     """Of an indenter's sharpest edges, on a gel of such elements [m]; infinite where it has none. A mesh has some where
     two faces meet at more than SHARP, and they count as sharp, for they are as drawn."""
     if not isinstance(indenter.geometry, Mesh):
-        return math.inf if isinstance(indenter.geometry, Sphere) else indenter.rounding(element)
+        return math.inf if isinstance(indenter.geometry, Sphere) else indenter.effective_edge_radius(element)
     return 0.0 if len(_sharp(indenter.geometry, fingerprint(indenter.geometry.path))) else math.inf
 
 

@@ -72,7 +72,9 @@ class Recordings:
         """From the lowest point of the indenter to its centre [m]."""
         assert self.scene.indenter is not None
         indenter = self.scene.indenter
-        own = lowest_below(indenter.geometry, indenter.turn, indenter.rounding(self.scene.element))
+        own = lowest_below(
+            indenter.geometry, indenter.turn, indenter.effective_edge_radius(self.scene.effective_element_size)
+        )
         return self._balls.get(_name(path), own)
 
     # ------------------------------------------------------------------ tables

@@ -236,6 +236,6 @@ def coarser(scene: Scene) -> Scene:
         for name, own in scene.gels.items()
     }
     own = {name for name, each in gels.items() if each.element_size is not None}
-    element = min([2 * scene.element, *(layers[name] for name in scene.sensors if name not in own)])
+    element = min([2 * scene.effective_element_size, *(layers[name] for name in scene.sensors if name not in own)])
     update = {"element_size": element, "particle_spacing": 2 * scene.spacing, "gels": gels}
     return scene.model_copy(update=update)

@@ -176,7 +176,7 @@ class HybridWorld(FemWorld):
             short=SHORT_PATH if self.yields else SHORT_SLIDE, shortest=drag if scene.settling.mach is None else 0.0,
         )  # fmt: skip
         path = replace(path, dragging=along > MIN_DRAG_SHARE * path_length(start, end, lever))
-        if self.yields and path.peak_mach(lever) > MAX_YIELDING_OVERSPEED * scene.fastest_mach:
+        if self.yields and path.peak_mach(lever) > MAX_YIELDING_OVERSPEED * scene.max_mach:
             self.unfollowed = "the speed itself makes the body yield; leave out settling.mach, or lower it"
         elif drag > MAX_DRAG_OVERSPEED * path.substeps * path.dt:
             self.unfollowed = "the body slips by its inertia at that speed; leave out settling.mach, or lower it"

@@ -142,7 +142,7 @@ class HybridState(FemState):
 
 
 def _gels_of(scene: Scene) -> tuple[GelParams, ...]:
-    return tuple(gel_params(scene.gel_of(name), scene.element_of(name)) for name in scene.sensors)
+    return tuple(gel_params(scene.gel_of(name), scene.element_size_of(name)) for name in scene.sensors)
 
 
 def _body_at_start(scene: Scene) -> tuple[BodyParams, np.ndarray, np.ndarray]:

@@ -47,7 +47,7 @@ class PressState(FemState):
     def __init__(self, scenes: Sequence[Scene]) -> None:
         """Raises ValueError for gels that are not cut alike, and an indenter too fine for them."""
         start()
-        self.gel = [gel_params(scene.gel, scene.element) for scene in scenes]
+        self.gel = [gel_params(scene.gel, scene.effective_element_size) for scene in scenes]
         self._gels = GelState(common_lattices([(gel,) for gel in self.gel]), len(scenes))
         nx, ny, _ = self.gel[0].elements
         self._anchor = np.zeros((len(scenes), nx * POINTS, ny * POINTS, 3), np.float32)
@@ -84,7 +84,7 @@ class PressState(FemState):
         _require_resolved(scene.indenter, self.gel[index])
         kind, size, mesh = _shape_params(scene.indenter.geometry)
         self.counts[index, KIND], self.params[index, SHAPE : SHAPE + 3] = kind, size
-        self.params[index, EDGE_RADIUS] = scene.indenter.rounding(scene.element) * MM
+        self.params[index, EDGE_RADIUS] = scene.indenter.effective_edge_radius(scene.effective_element_size) * MM
         self.params[index, SHAPE_SPACING] = MESH_GRID_SPACING * MM
         if mesh is not None:
             self.params[index, SHAPE_ORIGIN : SHAPE_ORIGIN + 3] = mesh.origin * MM

@@ -95,7 +95,7 @@ def test_a_tilted_object_reaches_as_deep_as_it_shall() -> None:
     _, scene, motion = made.placed(1)
     assert scene.indenter is not None and motion.turn is not None
     pressed = press(scene, made.sensor, motion)
-    radius = scene.indenter.rounding(scene.element)
+    radius = scene.indenter.effective_edge_radius(scene.effective_element_size)
     corners = (np.array([4e-3, 5e-3, 5e-3]) / 2 - radius) * (2 * np.indices((2, 2, 2)).reshape(3, -1).T - 1)
     lowest = se3.transform(pressed.pose, corners)[:, 2].min() - radius
     assert lowest == pytest.approx(-motion.depth, abs=1e-9)

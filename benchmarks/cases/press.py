@@ -25,7 +25,7 @@ from benchmarks.truth.limit import (
     rms,
     surface_profile,
 )
-from tacsim.geometry.shapes import extent
+from tacsim.geometry.shapes import bounding_size
 from tacsim.interface import FloatArray, Pose
 from tacsim.models.material import GelMaterial
 from tacsim.models.scene import MAX_MACH, Box, Cylinder, Gel, Indenter, Scene, Shape, Sphere
@@ -64,7 +64,7 @@ def press(scene: Scene, depth: float) -> tuple[PressWorld, MoveStats]:
     assert scene.indenter is not None
     world = PressWorld(scene)
     pose = world.pose("indenter")
-    height = float(extent(scene.indenter.geometry)[2]) / 2 - depth
+    height = float(bounding_size(scene.indenter.geometry)[2]) / 2 - depth
     stats = world.move({"indenter": Pose(np.array([*pose.position[:2], height]), pose.quaternion)})
     return world, stats
 

@@ -179,7 +179,7 @@ def busy(words: str) -> Iterator[Callable[[str], None]]:
 def measuring(say: Callable[[str], None], after: str) -> Iterator[None]:
     """In the block it is said how far the measuring of a mesh is that takes longer than QUIET: on a terminal by `say`,
     which then says `after`, else once, as a line."""
-    from tacsim.geometry.tiles import watched_measuring
+    from tacsim.geometry.tiles import report_tiles
 
     began: dict[str, float] = {}
     told: set[str] = set()
@@ -196,7 +196,7 @@ def measuring(say: Callable[[str], None], after: str) -> Iterator[None]:
             if done == total - 1:
                 say(after)
 
-    with watched_measuring(tell):
+    with report_tiles(tell):
         yield
 
 

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tacsim import pose as se3
-from tacsim.geometry.pressing_side import describe_side, pressing_side
-from tacsim.geometry.shapes import distance, extent
-from tacsim.geometry.tiles import tiled_distance
+from tacsim.geometry.pressing_side import describe_side, find_pressing_side
+from tacsim.geometry.shapes import bounding_size, shape_distance
+from tacsim.geometry.tiles import cached_tiled_distance
 from tacsim.interface import FloatArray, Pose
 from tacsim.models.scene import Box, Cylinder, Gel, GelSurface, Indenter, Mesh, Scene
 from tacsim.models.sensor import SensorModel
@@ -171,7 +171,7 @@ def _contact(world: PressWorld, scene: Scene, seen: SurfaceSample, sensor: Senso
     assert scene.indenter is not None
     grid, margin = image_grid(sensor.geometry), NEAR * scene.effective_element_size
     from_sensor = se3.relative_pose(world.pose("indenter"), world.pose("lower"))
-    half = extent(scene.indenter.geometry) / 2 + margin
+    half = bounding_size(scene.indenter.geometry) / 2 + margin
     corners = se3.transform(se3.inverse(from_sensor), half * (2.0 * np.indices((2, 2, 2)).reshape(3, -1).T - 1.0))
     rows, columns = (
         slice(*np.searchsorted(places, (corners[:, axis].min(), corners[:, axis].max())))
@@ -195,8 +195,8 @@ def _gaps(indenter: Indenter, points: FloatArray, element: float) -> FloatArray:
     """(n,) distance of points (n, 3) from the indenter, in its frame; of a mesh, as physics has it [m]."""
     geometry = indenter.geometry
     if not isinstance(geometry, Mesh):
-        return distance(geometry, points, indenter.effective_edge_radius(element))
-    return tiled_distance(geometry, MESH_GRID_SPACING).sample(points)[0]
+        return shape_distance(geometry, points, indenter.effective_edge_radius(element))
+    return cached_tiled_distance(geometry, MESH_GRID_SPACING).sample_distance(points)[0]
 
 
 def _filled(mask: NDArray[np.bool_], width: int) -> NDArray[np.bool_]:
@@ -262,7 +262,7 @@ def write(folder: Path, pressed: PressResult, config: dict[str, Any], scene: Sce
     Image.fromarray(pressed.image).save(folder / "rgb.png", compress_level=4)  # as small as by 6, in half the time
     np.save(folder / "height.npy", pressed.height.astype(np.float32), allow_pickle=False)
     write_height_picture(folder / "height.png", pressed.height, pressed.contact, config["pixel_pitch"])
-    lowest = se3.transform(pressed.pose, pressing_side(scene.indenter).lowest_point)[:2]
+    lowest = se3.transform(pressed.pose, find_pressing_side(scene.indenter).lowest_point)[:2]
     write_side_picture(
         folder / "side.png", scene.indenter.geometry, pressed.pose, lowest, pressed.height,
         image_grid(sensor.geometry), scene.gel, f"pressing side: {config['pressing_side']}",

@@ -25,7 +25,7 @@ from robot.train.network import PolicyNetwork, export
 from robot.train.run_folder import RunError, RunFolder, Tell, version
 from tacsim.config import ConfigError
 from tacsim.config.errors import Place, Problem
-from tacsim.geometry.shapes import extent
+from tacsim.geometry.shapes import bounding_size
 from tacsim.gym.encode import space_of_features
 from tacsim.gym.features import FeatureEncoder
 from tacsim.gym.vector import TacsimVectorEnv
@@ -109,7 +109,7 @@ def _require_playable(training: Training, drawn: list[tuple[TaskConfig, Scene | 
     for task, scene, told in [*drawn, *limits]:
         if scene is None or scene.body is None:
             continue
-        height = float(extent(scene.body.geometry)[2])
+        height = float(bounding_size(scene.body.geometry)[2])
         poses = dict.fromkeys(scene.sensors, Pose())
         try:
             make_task(task).require_reachable(

@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from tacsim.geometry.shapes import edge_radius, edges, farthest, lowest_below
+from tacsim.geometry.shapes import depth_below_centre, edge_points, edge_radius, farthest_point
 from tacsim.interface import Pose
 from tacsim.models.scene import GelSurface, Mesh, Scene
 from tacsim.physics.contact.indenter import POINTS, SPLINE_SMOOTHING
@@ -113,7 +113,7 @@ class PressWorld(FemWorld):
         self._rates = np.zeros((2, 6))
         # where the indenter was over the gel when it last did not touch it, and how far it has been slid since [mm]
         self._touched = np.zeros(3)
-        self._edges = edges(scene.indenter.geometry, scene.effective_element_size)
+        self._edges = edge_points(scene.indenter.geometry, scene.effective_element_size)
         turned = scene.indenter.turn
         above = self.below(turned) + INITIAL_GAP
         self._poses = {"lower": Pose(), "indenter": Pose(np.array([0.0, 0.0, above]), turned)}
@@ -199,7 +199,9 @@ class PressWorld(FemWorld):
         if mesh is not None and turn[:2].any():
             return float((mesh.vertices @ rotate(inverse(Pose(quaternion=turn)), [0.0, 0.0, -1.0])).max())
         indenter = self.scene.indenter
-        return lowest_below(indenter.geometry, turn, indenter.effective_edge_radius(self.scene.effective_element_size))
+        return depth_below_centre(
+            indenter.geometry, turn, indenter.effective_edge_radius(self.scene.effective_element_size)
+        )
 
     def prepare(self, launch: Launch) -> PreparedLaunch:
         """Sets this environment's parameters. Raises SimulationDiverged where too much of a mesh could be touched."""
@@ -287,7 +289,7 @@ class PressWorld(FemWorld):
             tip = (
                 rows[:3]
                 @ (
-                    farthest(
+                    farthest_point(
                         geometry, down, self.scene.indenter.effective_edge_radius(self.scene.effective_element_size)
                     )
                     * MM

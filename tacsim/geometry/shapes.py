@@ -72,7 +72,7 @@ def farthest_point(geometry: Box | Sphere | Cylinder, direction: ArrayLike, edge
 
 
 def rotated_bounding_size(geometry: Shape, turn: ArrayLike) -> FloatArray:
-    """Size (3,) [m] along world axes of a shape turned by the quaternion `turn` (4,). Raises what `bounding_size` raises."""
+    """Size (3,) [m] along world axes of a shape turned by the quaternion `turn` (4,). Raises as `bounding_size`."""
     quaternion = np.asarray(turn, dtype=np.float64)
     if not quaternion[:3].any():
         return bounding_size(geometry)

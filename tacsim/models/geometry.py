@@ -108,16 +108,16 @@ class GelView(Config):
 
     def project(self, points: FloatArray) -> FloatArray:
         """(..., 2) pixels of points (..., 2) of the gel [m]."""
-        seen = lines_of_sight(np.array(self.perspective), points.reshape(-1, 2))
+        seen = ray_slopes(np.array(self.perspective), points.reshape(-1, 2))
         return self.lens.project(seen).reshape(points.shape)
 
     def on_gel(self, pixels: FloatArray) -> FloatArray:
         """(..., 2) points of the gel's plane [m] at pixels (..., 2): the inverse of :meth:`project`."""
         back = np.linalg.inv(np.array(self.perspective))
-        return lines_of_sight(back, self.lens.directions(pixels.reshape(-1, 2))).reshape(pixels.shape)
+        return ray_slopes(back, self.lens.directions(pixels.reshape(-1, 2))).reshape(pixels.shape)
 
 
-def lines_of_sight(perspective: FloatArray, points: FloatArray) -> FloatArray:
+def ray_slopes(perspective: FloatArray, points: FloatArray) -> FloatArray:
     """(n, 2) x / z, y / z of perspective (x, y, 1), for points (n, 2)."""
     lines = points @ perspective[:, :2].T + perspective[:, 2]
     seen: FloatArray = lines[:, :2] / lines[:, 2:]

@@ -90,7 +90,7 @@ def _is_one_letter_off(unit: str, known: str) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Quantity:
-    """Marks a float field as a quantity: pydantic reads it by :func:`parse_quantity`, the JSON schema shows its units."""
+    """Marks a float field as a quantity: pydantic reads it by :func:`parse_quantity`; the JSON schema has its units."""
 
     kind: str
 

@@ -86,8 +86,8 @@ class Randomisation(Config):
         ]
 
     def limits(self) -> list[list[str]]:
-        """Overrides like those of `draw_overrides`: the first draw with one value at an end of its range, for each that has one.
-        Other seeds may draw what lies near."""
+        """Overrides like those of `draw_overrides`: the first draw with one value at an end of its range, for each
+        value with ends. Other seeds may draw what lies near."""
         first = self.draw_overrides()[0]
         return [
             [*first[:at], f"{key}={end}", *first[at + 1 :]]

@@ -292,7 +292,8 @@ def register_task_config(config: type[TaskConfig]) -> None:
     same = [each for each in TASKS if get_args(each.model_fields["kind"].annotation) == kinds]
     if any(_config_path(each) != _config_path(config) for each in same):
         raise ValueError(
-            f"{config.__name__}: there is a task of kind '{kinds[0]}' already, {_config_path(same[0])}; name it otherwise"
+            f"{config.__name__}: there is a task of kind '{kinds[0]}' already, {_config_path(same[0])}; "
+            "name it otherwise"
         )
     TASKS[:] = [each for each in TASKS if each not in same] + [config]
     rebuild_rig_config()

@@ -28,7 +28,7 @@ PRESETS: dict[Preset, tuple[float, float]] = {
 PRESET_FORCE_ERROR: dict[Preset, tuple[float, float]] = {
     "learn": (0.031, 0.108), "draft": (0.005, 0.041), "standard": (-0.006, 0.021),
 }  # fmt: skip
-# Peak Mach number of motions between states of rest at DEFAULT_TOLERANCE, and in proportion to a smaller tolerance: what
+# Peak Mach number of motions between states of rest at DEFAULT_TOLERANCE, in proportion to a smaller tolerance: what
 # the yield stress allows over the stress that the motion costs, within bounds; where nothing yields, a share of the
 # speed of the gel's shear wave (docs/decisions/0002).
 MACH_BY_STRESS, MIN_MACH, MAX_MACH, DEFAULT_TOLERANCE = 3.7, 0.001, 0.03, 1e-2
@@ -131,7 +131,8 @@ class Indenter(Config):
     """A rigid body pressed on one gel; no particles are needed for it."""
 
     geometry: Shape = Sphere(radius=4e-3)
-    # of a box's or cylinder's edges, rounded within its size [m]; None: as the mesh carries them (`effective_edge_radius`); 0: sharp
+    # of a box's or cylinder's edges, rounded within its size [m]; None: as the mesh carries them
+    # (`effective_edge_radius`); 0: sharp
     edge_radius: Annotated[Length, Field(ge=0)] | None = None
     friction: Annotated[float, Field(ge=0, le=5)] = 0.6
     # Orientation: turned about world x by `roll`, then y by `pitch`, then z by `yaw`. 0, 0, 0: its own -z side presses.

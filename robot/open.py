@@ -211,8 +211,8 @@ def _drawn(variants: Sequence[Sequence[str]], randomise: Randomised) -> Sequence
     if variants:
         raise ValueError("give variants, or a randomisation that draws them, not both")
     if isinstance(randomise, (str, Path)):
-        return load(Randomisation, randomise).drawn()
-    return _made_of(Randomisation, randomise, "randomise").drawn()
+        return load(Randomisation, randomise).draw_overrides()
+    return _made_of(Randomisation, randomise, "randomise").draw_overrides()
 
 
 def _features(given: Seen, config: RigConfig) -> Features | None:

@@ -71,11 +71,11 @@ def yield_plateau(side: float, spacing: float, repeat: int) -> list[Measurement]
 def plasticine_alone(side: float, spacing: float, repeat: int) -> list[Measurement]:
     """A free cube of clay, drawn apart until it yields: the plasticine's own substep, without gels and contact."""
     from benchmarks.truth.blocks import BodyBlock
-    from tacsim.geometry.shapes import particles
+    from tacsim.geometry.shapes import lattice_particles
     from tacsim.physics.body.plasticine import body_params
 
     config = body_params(CLAY, spacing)
-    rest = particles(Box(size=(side, side, side)), spacing) * 1e3
+    rest = lattice_particles(Box(size=(side, side, side)), spacing) * 1e3
     rest -= rest.mean(axis=0)
     dt, rate, substeps = COURANT * config.cell, 2.0 * config.limit / side * 1e-3, 60
 
@@ -122,7 +122,7 @@ def gel_step(repeat: int) -> list[Measurement]:
         return close(world, 0.2e-3)
 
     timing, stats = timed(run, repeat, warm=lambda: None)
-    elements = 2 * math.prod(round(side / scene.element) for side in scene.gel.size)
+    elements = 2 * math.prod(round(side / scene.effective_element_size) for side in scene.gel.size)
     forces = normal_forces(world)
     return [
         Measurement(
@@ -226,12 +226,12 @@ def gel_wave(element: float, repeat: int) -> list[Measurement]:
 def body_wave(spacing: float, repeat: int) -> list[Measurement]:
     """Standing half wave in a free block, other directions held: frequency c / 2L."""
     from benchmarks.truth.blocks import BodyBlock
-    from tacsim.geometry.shapes import particles
+    from tacsim.geometry.shapes import lattice_particles
     from tacsim.physics.body.plasticine import body_params
 
     config = body_params(BodyMaterial(youngs_modulus=0.5e6, poisson_ratio=0.45), spacing)
     dt, length = COURANT * config.cell, 8.0
-    rest = particles(Box(size=(4e-3, 4e-3, 8e-3)), spacing) * 1e3
+    rest = lattice_particles(Box(size=(4e-3, 4e-3, 8e-3)), spacing) * 1e3
     phase = np.pi * (rest[:, 2] - rest[:, 2].min() + config.spacing / 2) / length
     rows = []
     for name, axis, speed in (("pressure wave", 2, 1.0), ("shear wave", 0, math.sqrt(config.mu / config.density))):
@@ -274,13 +274,13 @@ def _wave_row(timing: Timing, found: float, truth: float, variant: str, count: i
 def momentum(repeat: int) -> list[Measurement]:
     """A free body that spins, stretches and yields over 5,000 substeps."""
     from benchmarks.truth.blocks import BodyBlock
-    from tacsim.geometry.shapes import particles
+    from tacsim.geometry.shapes import lattice_particles
     from tacsim.physics.body.plasticine import body_params
 
     spacing, steps, batch = 0.5e-3, 5000, 20
     config = body_params(CLAY, spacing)
     dt = COURANT * config.cell
-    rest = particles(Box(size=(4e-3, 3e-3, 5e-3)), spacing) * 1e3
+    rest = lattice_particles(Box(size=(4e-3, 3e-3, 5e-3)), spacing) * 1e3
     gradient = np.array([[0.02, -0.02, 0.0], [0.03, -0.02, 0.01], [0.0, -0.01, 0.01]]) * 0.5
     drift = np.array([0.004, -0.002, 0.003])
 

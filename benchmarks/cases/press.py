@@ -25,10 +25,10 @@ from benchmarks.truth.limit import (
     rms,
     surface_profile,
 )
-from tacsim.geometry.shapes import extent
+from tacsim.geometry.shapes import bounding_size
 from tacsim.interface import FloatArray, Pose
 from tacsim.models.material import GelMaterial
-from tacsim.models.scene import FASTEST_MACH, Box, Cylinder, Gel, Indenter, Scene, Shape, Sphere
+from tacsim.models.scene import MAX_MACH, Box, Cylinder, Gel, Indenter, Scene, Shape, Sphere
 from tacsim.physics.move import MoveStats
 
 if TYPE_CHECKING:
@@ -64,12 +64,12 @@ def press(scene: Scene, depth: float) -> tuple[PressWorld, MoveStats]:
     assert scene.indenter is not None
     world = PressWorld(scene)
     pose = world.pose("indenter")
-    height = float(extent(scene.indenter.geometry)[2]) / 2 - depth
+    height = float(bounding_size(scene.indenter.geometry)[2]) / 2 - depth
     stats = world.move({"indenter": Pose(np.array([*pose.position[:2], height]), pose.quaternion)})
     return world, stats
 
 
-DEFAULT_MACH = FASTEST_MACH  # the controller's default at nu 0.45, a tenth of the shear wave's speed
+DEFAULT_MACH = MAX_MACH  # the controller's default at nu 0.45, a tenth of the shear wave's speed
 # Half of it; more; and a third of the shear wave's speed, where contact sticks and slips by inertia.
 OTHER_MACHS = (0.015, 0.05, 0.1)
 

@@ -44,7 +44,7 @@ class Cube:
     """A cube of side [mm] in the middle of a dense grid, its plates touching it."""
 
     def __init__(self, side: float, spacing: float) -> None:
-        from tacsim.geometry.shapes import particles
+        from tacsim.geometry.shapes import lattice_particles
         from tacsim.models.scene import Box
         from tacsim.physics.body.plasticine import body_params
 
@@ -56,7 +56,7 @@ class Cube:
         )  # fmt: skip
         room = 3 * self.dx + 0.2 * side
         cells = round((side + 2 * room) / self.dx) + 1
-        cube = particles(Box(size=(side * 1e-3,) * 3), spacing * 1e-3) * 1e3
+        cube = lattice_particles(Box(size=(side * 1e-3,) * 3), spacing * 1e-3) * 1e3
         points = cube - cube.min(axis=0) + spacing / 2 + room
         self.x = np.ascontiguousarray(points, np.float32)
         self.v = np.zeros_like(self.x)

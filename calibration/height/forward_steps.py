@@ -20,7 +20,7 @@ import numpy as np
 from calibration.height.integration import slopes_of
 from calibration.height.slope_polynomial import MAX_EXTRAPOLATION
 from tacsim.interface import Float32, Mask
-from tacsim.models.photometric import PhotometricLight, PhotometricModel, horizon
+from tacsim.models.photometric import PhotometricLight, PhotometricModel, horizon_slope
 
 STEPS = 3
 PRIOR_WEIGHT = 0.4  # (error of colour that is usual / error of slope that is usual)^2
@@ -111,5 +111,5 @@ class ForwardSteps:
             seen = cv2.remap(relative, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
             return np.asarray(seen, dtype=np.float32)
 
-        horizons = [horizon(height_at, u, v * self._flat, lamp) for lamp in self._model.shadows.lamps]
-        return self._light.shadow(horizons, u, v)
+        horizons = [horizon_slope(height_at, u, v * self._flat, lamp) for lamp in self._model.shadows.lamps]
+        return self._light.shadow_change(horizons, u, v)

@@ -14,7 +14,7 @@ import numpy as np
 
 from calibration.errors import CalibrationError
 from tacsim.interface import FloatArray, Image
-from tacsim.models.quantity import parse
+from tacsim.models.quantity import parse_quantity
 
 DOT_BLURS = (2.0, 3.0, 5.0, 8.0, 12.0)  # standard deviations of the blurs that are tried, for dots of any size [px]
 MAX_POINTS = 100  # along a board
@@ -67,7 +67,7 @@ def parse_board(text: str) -> Board:
     if not (3 <= columns <= MAX_POINTS and 3 <= rows <= MAX_POINTS):
         raise BadBoard(f"'{text}': {columns} x {rows}; allowed: 3 to {MAX_POINTS} each way")
     try:
-        metres = [parse(length, "length") for length in lengths]
+        metres = [parse_quantity(length, "length") for length in lengths]
     except ValueError as error:
         raise BadBoard(f"'{text}': {error}") from None
     if not all(1e-5 <= each <= 1.0 for each in metres) or (len(metres) == 2 and metres[1] >= metres[0]):

@@ -19,7 +19,7 @@ from tacsim import pose as se3
 from tacsim.interface import FloatArray, Pose
 from tacsim.models.geometry import GelView as GelView
 from tacsim.models.geometry import Lens as Lens
-from tacsim.models.geometry import Pair, seen_along
+from tacsim.models.geometry import Pair, ray_slopes
 
 MIN_PICTURES = 6  # for a lens
 MAX_RESIDUAL = 1.5  # of a lens, root mean square [px]
@@ -160,7 +160,7 @@ def fit_view(
         perspective = _fit_homography(lens, local, points.image)
     else:
         lens, perspective = _fit_distortion(local, points.image, image_shape)
-    missed = lens.project(seen_along(perspective, local)) - points.image
+    missed = lens.project(ray_slopes(perspective, local)) - points.image
     residual = float(np.sqrt((missed**2).sum(axis=1).mean()))
     if not residual <= MAX_MISFIT * points.spacing:
         raise BadView(
@@ -171,14 +171,14 @@ def fit_view(
     back: FloatArray = np.asarray(np.linalg.inv(perspective), dtype=np.float64)
     axis = ((columns - 1) / 2, (rows - 1) / 2) if centre is None else centre
     near = lens.directions(np.array([axis, (axis[0] + 1.0, axis[1]), (axis[0], axis[1] + 1.0)]))
-    origin, right, below = seen_along(back, near)
+    origin, right, below = ray_slopes(back, near)
     along = right - origin
     pitch = float(np.sqrt(np.hypot(*along) * np.hypot(*(below - origin))))
     turn = np.arctan2(along[1], along[0])
     board_from_gel = np.array(
         [[np.cos(turn), -np.sin(turn), origin[0]], [np.sin(turn), np.cos(turn), origin[1]], [0, 0, 1.0]]
     )
-    on_gel = seen_along(np.linalg.inv(board_from_gel), local)
+    on_gel = ray_slopes(np.linalg.inv(board_from_gel), local)
     if size is None:
         step = 0.5 * points.spacing * pitch
         reach = np.minimum(on_gel.max(axis=0), -on_gel.min(axis=0)) + step
@@ -225,7 +225,7 @@ def view_of_corners(corners: Sequence[Pair], size: Pair, image_shape: tuple[int,
         lens, np.array([(-x, -y), (x, -y), (x, y), (-x, y)]), np.array(corners, dtype=np.float64)
     )
     perspective /= perspective[2, 2]
-    middle = lens.project(seen_along(perspective, 1e-6 * np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)])))
+    middle = lens.project(ray_slopes(perspective, 1e-6 * np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)])))
     along = np.linalg.norm(middle[1:] - middle[0], axis=1)  # [px / um]
     return GelView(
         lens=lens,
@@ -281,7 +281,7 @@ def _fit_distortion(on_board: FloatArray, pixels: FloatArray, image_shape: tuple
 
         def missed(p: FloatArray) -> FloatArray:
             lens, plane = lens_and_plane(p)
-            off: FloatArray = (lens.project(seen_along(plane, on_board)) - pixels).ravel()
+            off: FloatArray = (lens.project(ray_slopes(plane, on_board)) - pixels).ravel()
             return off
 
         from scipy.optimize import least_squares

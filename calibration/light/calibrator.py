@@ -60,7 +60,7 @@ from tacsim.models.photometric import (
     DEPTH_TERMS,
     PhotometricLight,
     PhotometricModel,
-    places_in_image,
+    image_grid_places,
 )
 from tacsim.optics.render import darken_by_depth
 
@@ -385,7 +385,7 @@ def _predict_press(
     """Of a press labelled `gradient` (H, W, 2), `extra_terms` (H, W, terms), by models made without it.
     Slopes are found as in every picture: from each pixel's colour, then those of a surface that the forward model
     agrees with."""
-    places = places_in_image(*press.shape[::-1])
+    places = image_grid_places(*press.shape[::-1])
     height = None if forward.depth is None else (extra_terms[..., 0] * forward.depth.deepest).astype(np.float32)
     light, _ = PhotometricLight(forward).change(gradient.astype(np.float32), *places, height)
     predicted = light.astype(np.float64)

@@ -29,8 +29,8 @@ from tacsim.models.photometric import (
     DepthColour,
     PhotometricModel,
     depth_terms,
+    image_axes,
     normal_terms,
-    place_in_image,
 )
 
 Rows = tuple[tuple[float, float, float], ...]  # weights of R, G, B, a row a term
@@ -58,7 +58,7 @@ def extra_forward_terms(
     """(H, W, terms) of depth, of slopes (H, W, 2) at depth, and of cast shadows where there are any."""
     v, u = np.mgrid[: press.shape[0], : press.shape[1]].astype(np.float64)
     height = dent_height(u, v, press.circle, refined.thickness, ball)
-    places = np.meshgrid(*place_in_image(press.shape[1], press.shape[0]))
+    places = np.meshgrid(*image_axes(press.shape[1], press.shape[0]))
     terms = depth_terms(height, deepest_dent(refined, ball), *places)
     slopes = SLOPE_SCALE * terms[0] * normal_terms(gradient, MAX_SIZE[0])
     deep = np.ascontiguousarray(np.moveaxis(np.concatenate([terms, slopes]), 0, -1), dtype=np.float64)
@@ -76,7 +76,7 @@ def contact_and_skirt(press: BallPress) -> Mask:
 def _image_places(mask: Mask) -> tuple[FloatArray, FloatArray]:
     """u, v in -1/2..1/2 across the picture of the pixels of a mask (H, W)."""
     rows, columns = np.nonzero(mask)
-    u, v = place_in_image(mask.shape[1], mask.shape[0])
+    u, v = image_axes(mask.shape[1], mask.shape[0])
     return u[columns], v[rows]
 
 

@@ -11,7 +11,7 @@ from calibration.light.circle import find_contact_circle
 from calibration.light.dent import MAX_RIM_RATIO, ContactCircle
 from calibration.reference import SATURATED, UnusableReference, make_reference
 from tacsim.interface import FloatArray, Image, Mask
-from tacsim.models.photometric import place_in_image
+from tacsim.models.photometric import image_axes
 
 SKIRT_RADIUS = 2.3  # contact and skirt reach this far [contact radii]
 UNTOUCHED_RADIUS = 3.0  # beyond, the gel is untouched [contact radii]
@@ -121,7 +121,7 @@ def _fit_drift(difference: FloatArray, untouched: Mask) -> FloatArray:
     if untouched.mean() < MIN_UNTOUCHED_SHARE:
         level = np.median(difference[untouched], axis=0) if untouched.any() else np.zeros(3)
         return np.broadcast_to(level, difference.shape).copy()
-    u, v = np.meshgrid(*place_in_image(difference.shape[1], difference.shape[0]))
+    u, v = np.meshgrid(*image_axes(difference.shape[1], difference.shape[0]))
     terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
     seen = terms[untouched]
     weights = np.linalg.solve(seen.T @ seen, seen.T @ difference[untouched])

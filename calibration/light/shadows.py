@@ -11,7 +11,7 @@ from calibration.light.dent import ContactCircle, cached_profile, dent_gradient
 from calibration.light.photometry import photometric_features
 from calibration.light.press import Window
 from tacsim.interface import FloatArray
-from tacsim.models.photometric import Floats, horizon, shadow_terms
+from tacsim.models.photometric import Floats, horizon_slope, shadow_terms
 
 DEGREE, POSITION = 3, 2  # of the light beside which shadows are sought
 RIDGE = 1e-4
@@ -45,7 +45,7 @@ class DentShade:
             before = at.astype(np.intp)
             return np.asarray(depth[before] + (at - before) * steps[before], dtype=np.float64)
 
-        horizons = [horizon(height, x, y, lamp) for lamp in self.lamps]
+        horizons = [horizon_slope(height, x, y, lamp) for lamp in self.lamps]
         return np.ascontiguousarray(shadow_terms(horizons, x, y * (columns / rows)).T, dtype=np.float64)
 
     def light(self, gradient: FloatArray, u: FloatArray, v: FloatArray) -> FloatArray:

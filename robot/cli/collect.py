@@ -120,7 +120,7 @@ def press(
         from robot.collect.presses import PressJob, PressSet
         from tacsim.config import load_scene, load_sensor
         from tacsim.config.gel import fit_gel, gel_sizes_given
-        from tacsim.geometry.pressing_side import pressing_side
+        from tacsim.geometry.pressing_side import find_pressing_side
 
         known, files = find_objects(objects, scale)
         model = load_sensor(sensor).model_copy(update={"view": None})
@@ -139,7 +139,7 @@ def press(
             shear=drawn.shear[:2], twist=drawn.twist[:2],
         )  # fmt: skip
     if files and scene.indenter is not None:
-        name = pressing_side(scene.indenter).name
+        name = find_pressing_side(scene.indenter).name
         said = [*said, f"pressing side of each mesh: {name}; --set indenter.roll and indenter.pitch choose another"]
     for words in said:
         notes.print(words)

@@ -204,7 +204,7 @@ def _corners(text: str) -> Corners:
 def _limits(texts: list[str] | None, option: str) -> list[Limit]:
     """Parsed METRIC=VALUE. A length may carry its unit."""
     from calibration.compare.report import figure_names
-    from tacsim.models.quantity import parse
+    from tacsim.models.quantity import parse_quantity
 
     found = []
     for text in texts or []:
@@ -214,7 +214,7 @@ def _limits(texts: list[str] | None, option: str) -> list[Limit]:
                 f"'{name}' is no figure; there are: {', '.join(figure_names())}", param_hint=option
             )
         try:
-            number = parse(value.strip(), "length") if name in LENGTHS else float(value)
+            number = parse_quantity(value.strip(), "length") if name in LENGTHS else float(value)
         except ValueError as error:
             raise typer.BadParameter(f"'{text}': {error}", param_hint=option) from None
         if not equals or number != number:

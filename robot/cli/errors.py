@@ -11,7 +11,7 @@ from rich.text import Text
 from typer.core import TyperGroup
 
 from robot.cli.output import SafeConsole
-from tacsim.models.text import printable
+from tacsim.models.text import printable_line
 
 OURS = {"tacsim", "calibration", "robot"}
 UNUSABLE, FAILED, INTERRUPTED = 2, 1, 130  # exit codes: bad configuration or usage, failure, Ctrl-C
@@ -56,7 +56,7 @@ def explain(error: Exception) -> tuple[str, int]:
     if isinstance(error, OSError):
         code = UNUSABLE if isinstance(error, NO_PLACE) else FAILED
         named = isinstance(error.filename, str | bytes | os.PathLike)
-        where = f"{printable(os.fsdecode(error.filename))}: " if named else ""
+        where = f"{printable_line(os.fsdecode(error.filename))}: " if named else ""
         why = error.strerror or str(error) or type(error).__name__
         if isinstance(error, FileExistsError):
             why = "exists already; nothing is overwritten, name another"

@@ -32,7 +32,7 @@ def quantity(kind: str, low: float = -math.inf, high: float = math.inf) -> Calla
     person who leaves it out means millimetres as often as metres."""
 
     def parse(text: str) -> float:
-        from tacsim.models.quantity import parse as parse_quantity
+        from tacsim.models.quantity import parse_quantity as parse_quantity
 
         try:
             value = parse_quantity(text, kind, bare=kind != "length")

@@ -15,7 +15,7 @@ from rich.console import Console, ConsoleOptions, RenderableType
 from rich.segment import Segment
 from rich.text import Text
 
-from tacsim.models.text import escaped, printable
+from tacsim.models.text import escape_text, printable_line
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -36,7 +36,7 @@ class SafeConsole(Console):
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterator[Segment]:
         for segment in super().render(renderable, options):
-            yield segment if segment.control else segment._replace(text=escaped(segment.text, kept="\n\t"))
+            yield segment if segment.control else segment._replace(text=escape_text(segment.text, kept="\n\t"))
 
 
 results = SafeConsole(markup=False, emoji=False, highlight=False, soft_wrap=True)  # stdout: what the command found
@@ -138,7 +138,7 @@ class Bar:
 
     def say(self, words: str) -> None:
         """What is being done."""
-        self._bar.update(self._row, description=escaped(words))
+        self._bar.update(self._row, description=escape_text(words))
 
     def count(self, done: int, total: int | None) -> None:
         """How many steps are done, and of how many; None: nobody knows."""
@@ -169,7 +169,7 @@ def busy(words: str) -> Iterator[Callable[[str], None]]:
     """Says what takes long; on a terminal with a spinner, which can be given other words, else as one line."""
     if notes.is_terminal:
         with notes.status(words) as status, _drawn(status):
-            yield lambda now: status.update(escaped(now))
+            yield lambda now: status.update(escape_text(now))
     else:
         notes.print(words)
         yield lambda now: None
@@ -179,7 +179,7 @@ def busy(words: str) -> Iterator[Callable[[str], None]]:
 def measuring(say: Callable[[str], None], after: str) -> Iterator[None]:
     """In the block it is said how far the measuring of a mesh is that takes longer than QUIET: on a terminal by `say`,
     which then says `after`, else once, as a line."""
-    from tacsim.geometry.tiles import watched_measuring
+    from tacsim.geometry.tiles import report_tiles
 
     began: dict[str, float] = {}
     told: set[str] = set()
@@ -188,7 +188,7 @@ def measuring(say: Callable[[str], None], after: str) -> Iterator[None]:
         if done == 0:
             began[path] = time.monotonic()
         elif time.monotonic() - began[path] > QUIET:
-            words = f"measuring the distances from {printable(path)}: {done} of {total} parts"
+            words = f"measuring the distances from {printable_line(path)}: {done} of {total} parts"
             say(words)
             if not notes.is_terminal and path not in told:
                 notes.print(words)
@@ -196,14 +196,14 @@ def measuring(say: Callable[[str], None], after: str) -> Iterator[None]:
             if done == total - 1:
                 say(after)
 
-    with watched_measuring(tell):
+    with report_tiles(tell):
         yield
 
 
 def say_files(*paths: Path) -> None:
     """Prints paths, one a line."""
     for path in paths:
-        results.print(printable(str(path)))
+        results.print(printable_line(str(path)))
 
 
 def warn(words: str) -> None:

@@ -14,7 +14,7 @@ import typer
 
 from robot.cli.errors import complain
 from robot.cli.output import paused
-from tacsim.models.text import escaped
+from tacsim.models.text import escape_text
 
 if TYPE_CHECKING:
     from tacsim.models.rig import RigConfig
@@ -111,7 +111,7 @@ def ask(question: str, *, default: bool = False) -> bool:
             for number in before:
                 signal.signal(number, end)
             _forget_typed()
-            return typer.confirm(escaped(question), default=default, err=True)
+            return typer.confirm(escape_text(question), default=default, err=True)
         except typer.Abort:
             if signals:
                 raise KeyboardInterrupt from None

@@ -14,7 +14,7 @@ from robot.collect.presses import PressSet
 from robot.collect.table import WORDS
 from robot.studies.press import UNFELT
 from tacsim.models.scene import Mesh, Shape
-from tacsim.models.text import millimetres, printable
+from tacsim.models.text import millimetres, printable_line
 
 QUANTITIES = {"depth": (1e3, "mm"), "normal_force": (1.0, "N"), "shear": (1e3, "mm"), "shear_force": (1.0, "N"),
               "contact_area": (1e6, "mm²")}  # fmt: skip
@@ -71,8 +71,8 @@ Sensor: {_cell(settings.sensor.name)}, {geometry.width} x {geometry.height} px. 
 
 Gel: {x:g} x {y:g} x {thickness:g} mm, Young's modulus {material.youngs_modulus * 1e-3:g} kPa, Poisson's ratio
 {material.poisson_ratio:g}; friction {scene.indenter.friction if scene.indenter else 0:g}; elements of
-{scene.element * 1e3:g} mm (preset {scene.preset}). Edges of boxes and cylinders are rounded by
-{scene.element * 500:g} mm or a quarter of their shortest side, unless `collect.json` says otherwise.
+{scene.effective_element_size * 1e3:g} mm (preset {scene.preset}). Edges of boxes and cylinders are rounded by
+{scene.effective_element_size * 500:g} mm or a quarter of their shortest side, unless `collect.json` says otherwise.
 
 Drawn evenly by seed {settings.seed}: {"; ".join(ranges)}.
 Press i is of object i mod {len(settings.objects)}; it depends on the seed and i alone.
@@ -158,4 +158,4 @@ def _range(between: tuple[float, float], scale: float, unit: str) -> str:
 
 
 def _cell(text: str) -> str:
-    return printable(text).replace("|", "\\|").replace("`", "'")
+    return printable_line(text).replace("|", "\\|").replace("`", "'")

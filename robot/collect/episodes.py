@@ -47,7 +47,7 @@ class EpisodeSet(Config):
         """The rig of an episode, with what is drawn for it."""
         more: list[str] = []
         if self.randomise is not None:
-            more = self.randomise.model_copy(update={"draws": index + 1}).drawn()[index]
+            more = self.randomise.model_copy(update={"draws": index + 1}).draw_overrides()[index]
         return load_with_task(self.rig, self.task, [*self.overrides, *more])
 
 

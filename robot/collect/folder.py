@@ -14,7 +14,7 @@ from typing import Any
 from robot.collect.job import Job, Piece, SetError
 from robot.common.whole_file import whole_folder, write_whole
 from robot.deploy.control_loop import versions
-from tacsim.models.text import printable
+from tacsim.models.text import printable_line
 
 FORMAT = 2
 SHOWN = 6  # differences between two commands that are told
@@ -136,7 +136,7 @@ def _read(path: Path) -> dict[str, Any]:
     except (ValueError, KeyError, TypeError) as failure:
         if isinstance(failure, SetError):
             raise
-        raise SetError(f"{path / ABOUT} cannot be read: {printable(str(failure))}; name a new folder") from None
+        raise SetError(f"{path / ABOUT} cannot be read: {printable_line(str(failure))}; name a new folder") from None
 
 
 def _require_same(path: Path, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
@@ -153,7 +153,7 @@ def _require_same(path: Path, before: Mapping[str, Any], now: Mapping[str, Any])
         wrong.append(f"it was begun by tacsim {first}, this is {second}")
     if wrong:
         raise SetError(
-            f"{path} holds a set by another command ({printable(str(before['command']))}): {'; '.join(wrong)}. "
+            f"{path} holds a set by another command ({printable_line(str(before['command']))}): {'; '.join(wrong)}. "
             "Give that command again to go on with it, or name a new folder"
         )
 
@@ -166,7 +166,7 @@ def _leaves(value: Any, at: str = "") -> dict[str, Any]:
 
 
 def _short(value: Any) -> str:
-    return printable(json.dumps(value), 80)
+    return printable_line(json.dumps(value), 80)
 
 
 def _require_whole(path: Path, digests: Mapping[str, str]) -> None:

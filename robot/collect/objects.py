@@ -8,7 +8,7 @@ from typing import Any
 from robot.collect.shapes import CLOSED_FORMS, meshes
 from tacsim.geometry.mesh import load_mesh
 from tacsim.models.scene import Mesh, Shape
-from tacsim.models.text import printable
+from tacsim.models.text import printable_line
 from tacsim.record.sources import visible_files
 
 SHAPES = "shapes"  # the word for those that come with tacsim
@@ -40,7 +40,7 @@ def find_objects(source: str, scale: float) -> tuple[dict[str, Shape], dict[str,
     stems = [path.stem for path in paths]
     problems += [f"{folder}: two files are called {stem}" for stem in sorted({s for s in stems if stems.count(s) > 1})]
     problems += [
-        f"{printable(str(path))}: the name of an object must be readable; rename the file"
+        f"{printable_line(str(path))}: the name of an object must be readable; rename the file"
         for path in paths
         if not path.stem.isprintable() or not path.stem.strip()
     ]

@@ -19,7 +19,7 @@ from robot.collect.table import Row, parquet_bytes, press_columns
 from robot.export.lerobot_mapping import Feature
 from robot.studies.press import PressMotion, PressResult, press, require_reachable
 from tacsim import pose as se3
-from tacsim.geometry.shapes import turned_extent
+from tacsim.geometry.shapes import rotated_bounding_size
 from tacsim.interface import Pose
 from tacsim.models.quantity import Config
 from tacsim.models.scene import Mesh, Scene, Shape
@@ -115,7 +115,7 @@ class PressSet(Config):
         low = np.maximum(-gel, [grid.x[0], grid.y[0]])
         high = np.minimum(gel, [grid.x[-1], grid.y[-1]])
         assert self.scene.indenter is not None
-        half = float(turned_extent(geometry, self.scene.indenter.turn)[:2].max()) / 2
+        half = float(rotated_bounding_size(geometry, self.scene.indenter.turn)[:2].max()) / 2
         middle = (low + high) / 2
         return np.minimum(low + half, middle), np.maximum(high - half, middle)
 

@@ -22,7 +22,7 @@ from tacsim.gym.features import FeatureEncoder
 from tacsim.interface import Action, Needs, Observation, Pose, RigSpec
 from tacsim.models.policy import METADATA_KEY, Numbers, PolicySpec
 from tacsim.models.sensor import CanonicalGrid
-from tacsim.models.text import printable
+from tacsim.models.text import printable_line
 from tacsim.tasks import Task
 from tacsim.tasks.task import Axis, action_of_vector
 
@@ -184,8 +184,8 @@ def _spec(path: Path, session: InferenceSession) -> PolicySpec:
         first = failure.errors()[0]
         where = ".".join(map(str, first["loc"])) or "text"
         raise PolicyNotFound(
-            f"policy '{path}': its metadata '{METADATA_KEY}' cannot be read: {printable(where)}: "
-            f"{printable(first['msg'])}; was it exported by another version?"
+            f"policy '{path}': its metadata '{METADATA_KEY}' cannot be read: {printable_line(where)}: "
+            f"{printable_line(first['msg'])}; was it exported by another version?"
         ) from None
 
 
@@ -242,4 +242,4 @@ def _floats(shape: Shape) -> str:
 
 def _words(failure: Exception) -> str:
     """The first line of what onnxruntime says, fit for a terminal."""
-    return printable((str(failure).strip().splitlines() or [repr(failure)])[0][:300])
+    return printable_line((str(failure).strip().splitlines() or [repr(failure)])[0][:300])

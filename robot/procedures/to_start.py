@@ -218,12 +218,14 @@ def lead_to_start(config: RigConfig, starts: Mapping[str, Pose], guide: Guide) -
         opened: dict[str, StartArm] = {}
         for name, arm in arms.items():
             way = ways[name]
-            opened[name] = stack.enter_context(StartArm(arm, name, way.begin, way.end, keep_out=config.kept_out(name)))
+            opened[name] = stack.enter_context(
+                StartArm(arm, name, way.begin, way.end, keep_out=config.keep_out_distances(name))
+            )
         for each in opened.values():
             _zero(each, guide)
         for name, each in opened.items():
             others = {other: arm.state().pose.position for other, arm in opened.items() if other != name}
-            require_clear(name, ways[name], others, config.kept_out(name))
+            require_clear(name, ways[name], others, config.keep_out_distances(name))
             _lead(each, ways[name], guide)
         return {name: se3.pose_distance(each.state().pose, starts[name])[0] for name, each in opened.items()}
 

@@ -33,7 +33,10 @@ def sensor_drivers(config: RigConfig) -> dict[str, SensorDriver[Any]]:
 
 def arm_drivers(config: RigConfig) -> dict[str, ArmDriver[Any]]:
     """By name, of a rig that goes by the wall clock (`check_parts`)."""
-    return {name: cast(ArmDriver[Any], arm_part(arm, name, config.kept_out(name))) for name, arm in config.arms.items()}
+    return {
+        name: cast(ArmDriver[Any], arm_part(arm, name, config.keep_out_distances(name)))
+        for name, arm in config.arms.items()
+    }
 
 
 def check_parts(config: RigConfig) -> None:

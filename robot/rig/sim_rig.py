@@ -85,7 +85,7 @@ def simulate(
         limits = arm.limits
         speed = arm.speed if limits is None else min(arm.speed, limits.speed)
         turn_rate = arm.turn_rate if limits is None else min(arm.turn_rate, limits.turn_rate)
-        apart = [(frames[other], distance) for other, distance in config.kept_out(name).items()]
+        apart = [(frames[other], distance) for other, distance in config.keep_out_distances(name).items()]
         longest, turn = speed * config.period, turn_rate * config.period
         noise = wrench_noise_source(arm.noise, name)
         arms[name] = SimArm(world, clock, frames[name], longest, turn, limits, apart, _error(arm), arm.delay, noise)

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from tacsim.geometry.shapes import distance
+from tacsim.geometry.shapes import shape_distance
 from tacsim.interface import Pose
 from tacsim.models.scene import Scene
 from tacsim.physics.failure.diagnosis import corner_volumes, element_volumes, particle_volumes
@@ -147,6 +147,6 @@ def _draw_indenter(axes: Axes, scene: Scene, poses: Mapping[str, Pose]) -> None:
     x, z = np.meshgrid(a, a, indexing="ij")
     points = np.stack([x.ravel(), np.zeros(x.size), z.ravel()], axis=1)
     local = Rotation.from_quat(pose.quaternion).inv().apply(points)
-    value = distance(scene.indenter.geometry, local).reshape(x.shape)
+    value = shape_distance(scene.indenter.geometry, local).reshape(x.shape)
     at = pose.position * 1e3
     axes.contour(x * 1e3 + at[0], z * 1e3 + at[2], value, levels=[0.0], colors=INK, linewidths=1.2)

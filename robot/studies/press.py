@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tacsim import pose as se3
-from tacsim.geometry.pressing_side import describe_side, pressing_side
-from tacsim.geometry.shapes import distance, extent
-from tacsim.geometry.tiles import tiled_distance
+from tacsim.geometry.pressing_side import describe_side, find_pressing_side
+from tacsim.geometry.shapes import bounding_size, shape_distance
+from tacsim.geometry.tiles import cached_tiled_distance
 from tacsim.interface import FloatArray, Pose
 from tacsim.models.scene import Box, Cylinder, Gel, GelSurface, Indenter, Mesh, Scene
 from tacsim.models.sensor import SensorModel
@@ -169,9 +169,9 @@ def _targets(start: Pose, height: float, motion: PressMotion) -> list[Pose]:
 def _contact(world: PressWorld, scene: Scene, seen: SurfaceSample, sensor: SensorModel) -> NDArray[np.bool_]:
     """(H, W) True where the indenter presses on the surface seen by a pixel."""
     assert scene.indenter is not None
-    grid, margin = image_grid(sensor.geometry), NEAR * scene.element
+    grid, margin = image_grid(sensor.geometry), NEAR * scene.effective_element_size
     from_sensor = se3.relative_pose(world.pose("indenter"), world.pose("lower"))
-    half = extent(scene.indenter.geometry) / 2 + margin
+    half = bounding_size(scene.indenter.geometry) / 2 + margin
     corners = se3.transform(se3.inverse(from_sensor), half * (2.0 * np.indices((2, 2, 2)).reshape(3, -1).T - 1.0))
     rows, columns = (
         slice(*np.searchsorted(places, (corners[:, axis].min(), corners[:, axis].max())))
@@ -184,19 +184,19 @@ def _contact(world: PressWorld, scene: Scene, seen: SurfaceSample, sensor: Senso
     gaps = np.full(seen.valid.shape, np.inf)
     if near.any():
         inner = np.full(len(at), np.inf)
-        inner[near] = _gaps(scene.indenter, at[near], scene.element)
+        inner[near] = _gaps(scene.indenter, at[near], scene.effective_element_size)
         gaps[rows, columns] = inner.reshape(valid.shape)
     table = SurfaceTable(world.surface("lower"))
     reach, _ = table.sample_on_grid(table.spline_values(world.reach().astype(np.float32)), grid)
-    return _filled(gaps < reach.reshape(gaps.shape), int(scene.element / sensor.geometry.pixel_pitch))
+    return _filled(gaps < reach.reshape(gaps.shape), int(scene.effective_element_size / sensor.geometry.pixel_pitch))
 
 
 def _gaps(indenter: Indenter, points: FloatArray, element: float) -> FloatArray:
     """(n,) distance of points (n, 3) from the indenter, in its frame; of a mesh, as physics has it [m]."""
     geometry = indenter.geometry
     if not isinstance(geometry, Mesh):
-        return distance(geometry, points, indenter.rounding(element))
-    return tiled_distance(geometry, MESH_GRID_SPACING).sample(points)[0]
+        return shape_distance(geometry, points, indenter.effective_edge_radius(element))
+    return cached_tiled_distance(geometry, MESH_GRID_SPACING).sample_distance(points)[0]
 
 
 def _filled(mask: NDArray[np.bool_], width: int) -> NDArray[np.bool_]:
@@ -225,7 +225,7 @@ def press_report(scene: Scene, motion: PressMotion, pressed: PressResult, sensor
         "edge_radius": _edge_radius(scene),
         "gel": scene.gel.model_dump(mode="json"),
         "preset": scene.preset,
-        "element_size": scene.element,
+        "element_size": scene.effective_element_size,
         "depth": motion.depth,
         "slide": list(motion.slide),
         "twist": motion.twist,
@@ -246,7 +246,11 @@ def press_report(scene: Scene, motion: PressMotion, pressed: PressResult, sensor
 def _edge_radius(scene: Scene) -> float | None:
     """Of the indenter's edges [m]; None where its geometry has none or says it."""
     assert scene.indenter is not None
-    return scene.indenter.rounding(scene.element) if isinstance(scene.indenter.geometry, Box | Cylinder) else None
+    return (
+        scene.indenter.effective_edge_radius(scene.effective_element_size)
+        if isinstance(scene.indenter.geometry, Box | Cylinder)
+        else None
+    )
 
 
 def write(folder: Path, pressed: PressResult, config: dict[str, Any], scene: Scene, sensor: SensorModel) -> None:
@@ -258,7 +262,7 @@ def write(folder: Path, pressed: PressResult, config: dict[str, Any], scene: Sce
     Image.fromarray(pressed.image).save(folder / "rgb.png", compress_level=4)  # as small as by 6, in half the time
     np.save(folder / "height.npy", pressed.height.astype(np.float32), allow_pickle=False)
     write_height_picture(folder / "height.png", pressed.height, pressed.contact, config["pixel_pitch"])
-    lowest = se3.transform(pressed.pose, pressing_side(scene.indenter).lowest_point)[:2]
+    lowest = se3.transform(pressed.pose, find_pressing_side(scene.indenter).lowest_point)[:2]
     write_side_picture(
         folder / "side.png", scene.indenter.geometry, pressed.pose, lowest, pressed.height,
         image_grid(sensor.geometry), scene.gel, f"pressing side: {config['pressing_side']}",

@@ -19,7 +19,7 @@ from robot.common.whole_file import write_whole
 from robot.train.network import PolicyNetwork
 from robot.train.run_folder import RunError, Tell
 from tacsim.gym.vector import TacsimVectorEnv
-from tacsim.models.text import printable
+from tacsim.models.text import printable_line
 from tacsim.models.training import Training
 
 LEAST_SPREAD = 0.02  # of an axis's actions: less of it is not learned more exactly
@@ -137,6 +137,6 @@ def _all_met(folder: Path, last: int) -> tuple[Arrays, NDArray[np.float32]]:
             with np.load(path, allow_pickle=False) as file:
                 parts.append({key: file[key] for key in file.files})
         except (ValueError, EOFError, BadZipFile) as failure:
-            raise RunError(f"{path} cannot be read: {printable(str(failure))}; train anew") from None
+            raise RunError(f"{path} cannot be read: {printable_line(str(failure))}; train anew") from None
     whole = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
     return whole, whole.pop("action")

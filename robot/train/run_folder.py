@@ -13,7 +13,7 @@ from pydantic import Field, ValidationError
 from robot.common.whole_file import write_whole
 from tacsim.models.policy import PolicySpec
 from tacsim.models.quantity import Config
-from tacsim.models.text import printable
+from tacsim.models.text import printable_line
 from tacsim.models.training import Training
 
 FORMAT = 1  # of run.json and of checkpoints; other versions are refused
@@ -51,12 +51,12 @@ class RunFolder:
             written = json.loads(text)["format"]
             if written != FORMAT:
                 raise RunError(
-                    f"{path} has format {printable(str(written))}, this version of tacsim goes on with {FORMAT}: "
+                    f"{path} has format {printable_line(str(written))}, this version of tacsim goes on with {FORMAT}: "
                     "go on with the version that began the run, or train anew"
                 )
             self.settings = RunSettings.model_validate_json(text)
         except (ValidationError, json.JSONDecodeError, TypeError, KeyError) as failure:
-            raise RunError(f"{path} cannot be read: {printable(str(failure).splitlines()[0])}") from None
+            raise RunError(f"{path} cannot be read: {printable_line(str(failure).splitlines()[0])}") from None
 
     @classmethod
     def make(cls, folder: Path, training: Training, spec: PolicySpec, shapes: Mapping[str, tuple[int, ...]]) -> Self:
@@ -89,7 +89,7 @@ class RunFolder:
         except RunError:
             raise
         except Exception as failure:  # torch has no common base of what a broken file raises
-            words = printable((str(failure).splitlines() or [repr(failure)])[0][:200])
+            words = printable_line((str(failure).splitlines() or [repr(failure)])[0][:200])
             raise RunError(f"{path} is no checkpoint of this version: {words}; train anew") from None
 
 

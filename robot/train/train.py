@@ -25,7 +25,7 @@ from robot.train.network import PolicyNetwork, export
 from robot.train.run_folder import RunError, RunFolder, Tell, version
 from tacsim.config import ConfigError
 from tacsim.config.errors import Place, Problem
-from tacsim.geometry.shapes import extent
+from tacsim.geometry.shapes import bounding_size
 from tacsim.gym.encode import space_of_features
 from tacsim.gym.features import FeatureEncoder
 from tacsim.gym.vector import TacsimVectorEnv
@@ -33,7 +33,7 @@ from tacsim.interface import Pose, Truth
 from tacsim.models.policy import ActionAxis, PolicySpec
 from tacsim.models.rig import TaskConfig
 from tacsim.models.scene import Scene
-from tacsim.models.text import printable
+from tacsim.models.text import printable_line
 from tacsim.models.training import Training
 from tacsim.tasks import GoalOutOfReach, make_task
 
@@ -109,7 +109,7 @@ def _require_playable(training: Training, drawn: list[tuple[TaskConfig, Scene | 
     for task, scene, told in [*drawn, *limits]:
         if scene is None or scene.body is None:
             continue
-        height = float(extent(scene.body.geometry)[2])
+        height = float(bounding_size(scene.body.geometry)[2])
         poses = dict.fromkeys(scene.sensors, Pose())
         try:
             make_task(task).require_reachable(
@@ -200,7 +200,7 @@ def _fitting(run: RunFolder) -> Iterator[None]:
     try:
         yield
     except (KeyError, RuntimeError, ValueError) as failure:
-        words = printable(str(failure).splitlines()[0])
+        words = printable_line(str(failure).splitlines()[0])
         raise RunError(f"{run.folder}: its checkpoint does not fit its settings: {words}") from None
 
 

@@ -172,7 +172,7 @@ def _on_twin(study: Study, side: Side, twin: int, left: Sequence[tuple[str, int]
 def _loaded(study: Study, side: Side, twin: int, number: int, policy: str | None = None) -> LoadedRig:
     """The rig of an episode: its task's values are drawn anew for each episode, all others for each twin. What only the
     training of a policy draws, for each episode."""
-    drawn = study.twins.model_copy(update={"draws": max(study.episodes, twin + 1)}).drawn()
+    drawn = study.twins.model_copy(update={"draws": max(study.episodes, twin + 1)}).draw_overrides()
     words = [word for word in drawn[twin] if not word.startswith("task.")]
     words += [word for word in drawn[number] if word.startswith("task.")]
     if side == "simulation":
@@ -198,7 +198,7 @@ def _own_simulation(policy: str | None, task: str, number: int) -> list[str]:
     if drawn is None:
         return list(training.overrides)
     unseen = drawn.model_copy(update={"draws": number + 1, "seed": UNSEEN + drawn.seed})
-    return [*training.overrides, *unseen.drawn()[number]]
+    return [*training.overrides, *unseen.draw_overrides()[number]]
 
 
 def _episode(study: Study, side: Side, rig: Rig, loaded: LoadedRig, policy: str, number: int) -> Played:

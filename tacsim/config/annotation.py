@@ -12,7 +12,7 @@ from pydantic_core import to_jsonable_python
 
 from tacsim.config.document import Node
 from tacsim.config.kinds import kind_of, names
-from tacsim.models.quantity import UNITS, Quantity, units_text
+from tacsim.models.quantity import UNITS, Quantity, list_units
 
 _BOUNDS = ((Gt, "gt", ">"), (Ge, "ge", ">="), (Lt, "lt", "<"), (Le, "le", "<="))
 
@@ -126,7 +126,7 @@ def _allowed_member(annotation: Any) -> str:
     quantity = next((item.kind for item in metadata if isinstance(item, Quantity)), None)
     if quantity is not None:
         si = next(iter(UNITS[quantity]))
-        return f"a {quantity}{_bounds(metadata, ' ' + si)}, bare in {si} or with a unit ({units_text(quantity)})"
+        return f"a {quantity}{_bounds(metadata, ' ' + si)}, bare in {si} or with a unit ({list_units(quantity)})"
     if origin is Literal:
         return " | ".join(str(option) for option in args)
     if origin in (tuple, list):

@@ -18,7 +18,7 @@ from typing import Any, ClassVar
 import yaml
 
 from tacsim.config.errors import Place, Problem
-from tacsim.models.text import printable
+from tacsim.models.text import printable_line
 
 MAX_BYTES = 1_000_000
 MAX_DEPTH = 32
@@ -63,7 +63,7 @@ class Node:
             return f"a list of {len(self.value)}"
         if self.value is None:
             return "nothing (null)"
-        short = printable(self.text, 80)
+        short = printable_line(self.text, 80)
         return f"'{short}'" if isinstance(self.value, str) else short
 
 
@@ -265,7 +265,9 @@ def _scalar(tag: str, text: str) -> tuple[bool | int | float | str | None, str]:
         return int(text), ""
     if tag in ("int", "float"):
         number = float(text.lower().replace(".inf", "inf").replace(".nan", "nan"))
-        return number, "" if math.isfinite(number) else f"{printable(text, 80)} is not finite; give a finite number"
+        return number, "" if math.isfinite(
+            number
+        ) else f"{printable_line(text, 80)} is not finite; give a finite number"
     try:
         text.encode("utf-8")
     except UnicodeEncodeError:

@@ -6,7 +6,7 @@ import difflib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from tacsim.models.text import printable
+from tacsim.models.text import printable_line
 
 _SHOWN = 30  # a broken file can have thousands of problems
 
@@ -31,7 +31,7 @@ class Problem:
     text: str
 
     def __str__(self) -> str:
-        return printable(": ".join(part for part in (str(self.place), self.key, self.text) if part))
+        return printable_line(": ".join(part for part in (str(self.place), self.key, self.text) if part))
 
 
 class ConfigError(ValueError):

@@ -56,7 +56,11 @@ def fit_gel(
     for size in dict.fromkeys(millimetres(*scene.gel_of(name).size[:2]) for name in kept):
         of = [words for name, words in kept.items() if millimetres(*scene.gel_of(name).size[:2]) == size]
         notes.insert(0, f"gel {size}, as said on the command line; {'; '.join(of)}")
-    wanted = {name: _whole_elements(size, scene.gel_element(name)) for name, size in sizes.items() if name not in fixed}
+    wanted = {
+        name: _whole_elements(size, scene.fitted_element_size(name))
+        for name, size in sizes.items()
+        if name not in fixed
+    }
     if not wanted:
         return scene, notes
     own = any(each.size is not None or each.element_size is not None for each in scene.gels.values())
@@ -65,7 +69,7 @@ def fit_gel(
     for names in reversed(groups):
         name, shown = names[0], "; ".join(said[name] for name in names)
         x, y = wanted[name]
-        thickness, element = scene.gel_of(name).size[2], scene.gel_element(name)
+        thickness, element = scene.gel_of(name).size[2], scene.fitted_element_size(name)
         scene = _with_size(scene, "gel" if shared else f"gels.{name}", (x, y, thickness), shown)
         words = f"gel {millimetres(x, y)} in whole elements of {element * 1e3:.3g} mm, {thickness * 1e3:.3g} mm thick"
         notes.insert(0, f"{words}: {shown}; the thickness is the scene's")

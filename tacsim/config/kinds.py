@@ -17,7 +17,7 @@ from tacsim.config.bundle import FILE, OWN, is_bundle, own_names
 from tacsim.config.errors import did_you_mean
 from tacsim.models.material import BodyMaterial, GelMaterial
 from tacsim.models.randomisation import Randomisation
-from tacsim.models.rig import TASKS, RigConfig, any_task, rig_model
+from tacsim.models.rig import TASKS, RigConfig, rig_model, task_annotation
 from tacsim.models.scene import Scene
 from tacsim.models.sensor import SensorModel
 from tacsim.models.training import Training
@@ -39,7 +39,7 @@ KINDS = {
     kind.name: kind
     for kind in (
         Kind("rig", "rigs", (RigConfig,), rig_model),
-        Kind("task", "tasks", TASKS, any_task),
+        Kind("task", "tasks", TASKS, task_annotation),
         Kind("scene", "scenes", (Scene,), lambda: Scene),
         Kind("sensor", "sensors", (SensorModel,), lambda: SensorModel),
         Kind("randomisation", "randomisations", (Randomisation,), lambda: Randomisation),

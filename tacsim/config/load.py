@@ -18,7 +18,7 @@ from tacsim.config.kinds import NotFound, is_name, kind_of, resolve, shipped_fil
 from tacsim.config.messages import report_errors
 from tacsim.config.references import Override, apply, parse_override, read_file
 from tacsim.models.driver import DriversMissing
-from tacsim.models.rig import RigConfig, TaskConfig, any_task, rig_model
+from tacsim.models.rig import RigConfig, TaskConfig, rig_model, task_annotation
 from tacsim.models.scene import Mesh, Scene
 from tacsim.models.sensor import SensorModel
 
@@ -147,7 +147,7 @@ def _scene_of_task(root: Node) -> Node:
     task = root.items.get("task")
     if _has(root, "scene") or task is None or not task.items:
         return root
-    scene = task.items.get("scene") or from_plain(default(any_task(), task, "scene"), task.place, task.folder)
+    scene = task.items.get("scene") or from_plain(default(task_annotation(), task, "scene"), task.place, task.folder)
     return root if scene.is_empty else replace(root, value={**root.items, "scene": scene})
 
 
@@ -199,7 +199,7 @@ def load_sensor(source: str | Path, overrides: Sequence[str] = ()) -> SensorMode
 
 def load_task(source: str | Path, overrides: Sequence[str] = ()) -> TaskConfig:
     """Reads a task of any kind. Raises ConfigError."""
-    config: TaskConfig = _load(any_task(), source, overrides)
+    config: TaskConfig = _load(task_annotation(), source, overrides)
     return config
 
 

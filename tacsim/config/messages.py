@@ -12,7 +12,7 @@ from tacsim.config.annotation import allowed, child, keys, members, models, spli
 from tacsim.config.document import LoadState, Node
 from tacsim.config.errors import did_you_mean, join
 from tacsim.models.driver import refused_driver
-from tacsim.models.text import printable
+from tacsim.models.text import printable_line
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +102,7 @@ def _text(detail: ErrorDetails, location: Location) -> str:
     if kind.startswith(("greater_than", "less_than")):
         return f"{location.node.text} is out of range; allowed: {allowed(location.annotation)}"
     if location.annotation is None or not members(location.annotation):
-        return printable(detail["msg"])
+        return printable_line(detail["msg"])
     return f"{location.node.describe()} does not fit; allowed: {allowed(location.annotation)}"
 
 
@@ -113,7 +113,7 @@ def _unknown_key(detail: ErrorDetails, location: Location) -> str:
         return f"unknown key; allowed: {', '.join(known)}{did_you_mean(name, known)}"
     if detail["type"] == "string_pattern_mismatch":
         return f"'{name}' is no name; allowed: lower-case letters, digits and _, a letter first"
-    return printable(f"unknown key; {detail['msg']}")
+    return printable_line(f"unknown key; {detail['msg']}")
 
 
 def _wrong_length(kind: str, context: dict[str, Any], location: Location) -> str:

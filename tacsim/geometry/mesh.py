@@ -35,12 +35,12 @@ _REPAIR = (
 )
 
 
-def fingerprint(path: str | Path) -> str:
+def file_fingerprint(path: str | Path) -> str:
     """SHA-256 of an STL file's bytes as they are now, by which to remember what was made of them.
 
     Raises FileNotFoundError; ValueError for what is no file, is not named .stl, is empty or larger than 64 MiB.
     """
-    return hashlib.sha256(_read(Path(path))).hexdigest()
+    return hashlib.sha256(_read_stl(Path(path))).hexdigest()
 
 
 def load_mesh(path: str | Path, scale: float, expected: str | None = None) -> Trimesh:
@@ -53,18 +53,18 @@ def load_mesh(path: str | Path, scale: float, expected: str | None = None) -> Tr
     or of absurd size.
     """
     path = Path(path)
-    data = _read(path)
+    data = _read_stl(path)
     if expected is not None and hashlib.sha256(data).hexdigest() != expected:
         raise ValueError(f"{path}: the file was changed while it was read; try again")
-    mesh = _decode(data, path)
-    _check(mesh, scale, path)
+    mesh = _decode_stl(data, path)
+    _require_closed(mesh, scale, path)
     mesh.apply_scale(scale)  # type: ignore[no-untyped-call]
     if mesh.volume < 0:
         mesh.invert()
     return mesh
 
 
-def _read(path: Path) -> bytes:
+def _read_stl(path: Path) -> bytes:
     if path.suffix.lower() != ".stl":
         raise ValueError(f"{path}: is no STL file (its name ends in '{path.suffix}'); export the mesh as .stl")
     if not path.exists():
@@ -79,8 +79,8 @@ def _read(path: Path) -> bytes:
     return path.read_bytes()
 
 
-def _decode(data: bytes, path: Path) -> Trimesh:
-    count = _count(data, path)
+def _decode_stl(data: bytes, path: Path) -> Trimesh:
+    count = _count_triangles(data, path)
     if count == 0:
         raise ValueError(f"{path}: the mesh is empty (no triangles); export it again")
     if count > MAX_TRIANGLES:
@@ -88,7 +88,7 @@ def _decode(data: bytes, path: Path) -> Trimesh:
     import trimesh
 
     try:
-        with _quiet():
+        with _silence_trimesh():
             loaded = trimesh.load_mesh(io.BytesIO(data), file_type="stl", process=False)
     except Exception as error:  # the decoder raises whatever its parser stumbles over
         raise ValueError(f"{path}: is no readable STL ({error}); export the mesh again") from error
@@ -98,7 +98,7 @@ def _decode(data: bytes, path: Path) -> Trimesh:
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
+def _silence_trimesh() -> Iterator[None]:
     """Keeps trimesh off the terminal; numbers that its text parser would only warn of become errors."""
     logger = logging.getLogger("trimesh")
     level = logger.level
@@ -111,7 +111,7 @@ def _quiet() -> Iterator[None]:
         logger.setLevel(level)
 
 
-def _count(data: bytes, path: Path) -> int:
+def _count_triangles(data: bytes, path: Path) -> int:
     """Triangles of an STL file, from its structure alone. Binary files may begin with "solid": the length decides."""
     stated = int.from_bytes(data[80:_HEADER], "little") if len(data) >= _HEADER else None
     if stated is not None and len(data) == _HEADER + _RECORD * stated:
@@ -135,7 +135,7 @@ def _count(data: bytes, path: Path) -> int:
     )
 
 
-def _check(mesh: Trimesh, scale: float, path: Path) -> None:
+def _require_closed(mesh: Trimesh, scale: float, path: Path) -> None:
     """Merges the corners that STL repeats, then refuses what has no well-defined inside. Coordinates in file units."""
     if not np.isfinite(mesh.vertices).all():
         bad = int((~np.isfinite(mesh.vertices).all(axis=1)).sum())
@@ -216,15 +216,15 @@ def signed_distance(surface: Surface, points: FloatArray) -> FloatArray:
     lies beyond best + reach; k grows until it does. Sign: angle-weighted pseudonormals, Baerentzen and Aanaes, IEEE
     Trans. Vis. Comput. Graph. 11(3), 2005, theorem 1.
     """
-    return _nearest(surface, points / surface.unit)[0] * surface.unit
+    return _nearest_triangles(surface, points / surface.unit)[0] * surface.unit
 
 
-def away_from_surface(surface: Surface, points: FloatArray) -> FloatArray:
+def distance_gradient(surface: Surface, points: FloatArray) -> FloatArray:
     """Unit gradient (n, 3) [-] of the signed distance at `points` (n, 3) [m]: the outward direction of the nearest
     point of the surface; a point on the surface itself gets the normal there."""
     at = points / surface.unit
-    value, triangle = _nearest(surface, at)
-    closest = _to_triangles(surface, at, triangle)[1]
+    value, triangle = _nearest_triangles(surface, at)
+    closest = _triangle_distances(surface, at, triangle)[1]
     on, normals = np.abs(value) < 1e-6, _pseudonormals(surface, closest, triangle)
     gradient = np.where(on[:, None], normals, (at - closest) * np.sign(value)[:, None])
     return np.asarray(gradient / np.linalg.norm(gradient, axis=1, keepdims=True))
@@ -248,16 +248,16 @@ def signed_distance_on_grid(surface: Surface, axes: Axes, band: float) -> FloatA
         near[_nearest_node(surface, points, shape)] = True
     values = np.empty(len(points))
     triangle = np.empty(len(points), dtype=np.int64)
-    values[near], triangle[near] = _nearest(surface, points[near])
+    values[near], triangle[near] = _nearest_triangles(surface, points[near])
     far = ~near.reshape(shape)
     if far.any():
         source = distance_transform_edt(far, return_distances=False, return_indices=True)
         triangle = triangle[np.ravel_multi_index(tuple(source), shape).ravel()]
         away = far.ravel()
-        for chunk in _chunks(len(points), _CHUNK):
+        for chunk in _row_chunks(len(points), _CHUNK):
             rows = np.flatnonzero(away[chunk]) + chunk.start
-            values[rows] = _to_triangles(surface, points[rows], triangle[rows])[0]
-        values[away] *= _signs(surface, points, far)[away]
+            values[rows] = _triangle_distances(surface, points[rows], triangle[rows])[0]
+        values[away] *= _node_signs(surface, points, far)[away]
     return (values * surface.unit).reshape(shape)
 
 
@@ -274,39 +274,39 @@ def _nearest_node(surface: Surface, points: FloatArray, shape: tuple[int, int, i
     return int(border[np.argmin(away)])
 
 
-def _signs(surface: Surface, points: FloatArray, far: NDArray[np.bool_]) -> FloatArray:
+def _node_signs(surface: Surface, points: FloatArray, far: NDArray[np.bool_]) -> FloatArray:
     """Sign at the nodes that are `far`: no connected region of them crosses the surface, so one node decides for it."""
     from scipy.ndimage import label
 
     regions, count = label(far)
     found, first = np.unique(regions, return_index=True)
     signs = np.zeros(count + 1)
-    signs[1:] = np.where(_nearest(surface, points[first[found > 0]])[0] < 0, -1.0, 1.0)
+    signs[1:] = np.where(_nearest_triangles(surface, points[first[found > 0]])[0] < 0, -1.0, 1.0)
     return np.asarray(signs[regions.ravel()])
 
 
-def _chunks(count: int, size: int) -> Iterator[slice]:
+def _row_chunks(count: int, size: int) -> Iterator[slice]:
     return (slice(start, min(start + size, count)) for start in range(0, count, size))
 
 
-def _nearest(surface: Surface, points: FloatArray) -> tuple[FloatArray, IntArray]:
+def _nearest_triangles(surface: Surface, points: FloatArray) -> tuple[FloatArray, IntArray]:
     """Signed distance (n,) and nearest triangle (n,) of `points` (n, 3). [unit]"""
     value, triangle = np.empty(len(points)), np.empty(len(points), dtype=np.int64)
     todo, k = np.arange(len(points)), min(16, len(surface.parent))
     while todo.size:
         later = []
-        for part in _chunks(len(todo), max(1, _CHUNK // k)):
+        for part in _row_chunks(len(todo), max(1, _CHUNK // k)):
             rows = todo[part]
-            value[rows], triangle[rows], complete = _among_nearest(surface, points[rows], k)
+            value[rows], triangle[rows], complete = _nearest_of_pieces(surface, points[rows], k)
             later.append(rows[~complete])
         todo, k = np.concatenate(later), min(4 * k, len(surface.parent))
     return value, triangle
 
 
-def _among_nearest(surface: Surface, points: FloatArray, k: int) -> tuple[FloatArray, IntArray, NDArray[np.bool_]]:
+def _nearest_of_pieces(surface: Surface, points: FloatArray, k: int) -> tuple[FloatArray, IntArray, NDArray[np.bool_]]:
     """Signed distance to the triangles of the k nearest pieces, the nearest one, and whether no other can be nearer."""
     away, piece = (np.asarray(found).reshape(len(points), k) for found in surface.tree.query(points, k=k))
-    bound, _ = _to_triangles(surface, points, surface.parent[piece[:, 0]])
+    bound, _ = _triangle_distances(surface, points, surface.parent[piece[:, 0]])
     # A piece lies in a disc: a lower bound of its distance spares most of the exact ones.
     offset = points[:, None, :] - surface.centre[piece]
     normal = surface.normals[surface.parent[piece], 0]
@@ -314,7 +314,7 @@ def _among_nearest(surface: Surface, points: FloatArray, k: int) -> tuple[FloatA
     sideways = np.linalg.norm(offset - height[..., None] * normal, axis=2) - surface.radius[piece]
     row, column = np.nonzero(np.hypot(height, np.maximum(sideways, 0.0)) <= bound[:, None] * (1 + 1e-9) + 1e-9)
     triangle = surface.parent[piece[row, column]]
-    distance, closest = _to_triangles(surface, points[row], triangle)
+    distance, closest = _triangle_distances(surface, points[row], triangle)
     order = np.lexsort((distance, row))
     best = order[np.searchsorted(row[order], np.arange(len(points)))]
     outward = _pseudonormals(surface, closest[best], triangle[best])
@@ -323,7 +323,7 @@ def _among_nearest(surface: Surface, points: FloatArray, k: int) -> tuple[FloatA
     return np.where(inside, -distance[best], distance[best]), triangle[best], complete
 
 
-def _to_triangles(surface: Surface, points: FloatArray, triangle: IntArray) -> tuple[FloatArray, FloatArray]:
+def _triangle_distances(surface: Surface, points: FloatArray, triangle: IntArray) -> tuple[FloatArray, FloatArray]:
     """Distance (n,) of each point from its triangle, and the closest point (n, 3). [unit]"""
     from trimesh.triangles import closest_point
 

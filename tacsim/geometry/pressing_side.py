@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tacsim.geometry.shapes import centred
+from tacsim.geometry.shapes import centred_mesh
 from tacsim.interface import FloatArray, Pose
 from tacsim.models.scene import Box, Cylinder, Indenter, Mesh, Shape, Sphere
 from tacsim.pose import inverse, rotate, rotation_matrix
@@ -33,11 +33,11 @@ class PressingSide:
     lowest_point: FloatArray  # (3,) the middle of that, in the indenter's own axes [m]
 
 
-def pressing_side(indenter: Indenter) -> PressingSide:
+def find_pressing_side(indenter: Indenter) -> PressingSide:
     """Of an indenter as its scene turns it. Raises what :func:`tacsim.geometry.mesh.load_mesh` raises."""
     pose = Pose(quaternion=indenter.turn)
     down = rotate(inverse(pose), [0.0, 0.0, -1.0])
-    mesh = facets(indenter.geometry)
+    mesh = surface_mesh(indenter.geometry)
     vertices = np.asarray(mesh.vertices, np.float64) @ rotation_matrix(pose).T
     height = float(np.ptp(vertices[:, 2]))
     low = vertices[:, 2] <= vertices[:, 2].min() + LEVEL_SHARE * height
@@ -58,24 +58,24 @@ def pressing_side(indenter: Indenter) -> PressingSide:
 
 def describe_side(indenter: Indenter) -> str:
     """One line: "-z of cone.stl, a flat face of 6 x 6 mm"."""
-    side, geometry = pressing_side(indenter), indenter.geometry
+    side, geometry = find_pressing_side(indenter), indenter.geometry
     name = Path(geometry.path).name if isinstance(geometry, Mesh) else f"the {geometry.shape}"
     return f"{side.name} of {name}, {side.lowest}"
 
 
-def section(geometry: Shape, pose: Pose, axis: int, at: float) -> FloatArray:
+def section_lines(geometry: Shape, pose: Pose, axis: int, at: float) -> FloatArray:
     """Where the surface of a shape at `pose` cuts the plane x = `at` (axis 0) or y = `at` (axis 1) [m]: straight lines
     (n, 2, 3), in no order [m]."""
     from trimesh.intersections import mesh_plane
 
-    mesh = facets(geometry)
+    mesh = surface_mesh(geometry)
     mesh.vertices = np.asarray(mesh.vertices) @ rotation_matrix(pose).T + pose.position
     normal = np.eye(3)[axis]
     lines = mesh_plane(mesh, normal, at * normal)  # type: ignore[no-untyped-call]
     return np.asarray(lines, np.float64).reshape(-1, 2, 3)
 
 
-def facets(geometry: Shape) -> Trimesh:
+def surface_mesh(geometry: Shape) -> Trimesh:
     """A closed mesh [m] in the shape's own frame; of a ball or a cylinder a fine approximation."""
     from trimesh import creation
 
@@ -88,7 +88,7 @@ def facets(geometry: Shape) -> Trimesh:
         case Cylinder():
             made = creation.cylinder(geometry.radius, geometry.height, sections=128)
         case Mesh():
-            made = centred(geometry)
+            made = centred_mesh(geometry)
     return made
 
 

@@ -16,44 +16,44 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tacsim.geometry.mesh import fingerprint, make_surface, signed_distance_on_grid
-from tacsim.geometry.shapes import BAND, LEVEL, MAX_NODES, centred
+from tacsim.geometry.mesh import file_fingerprint, make_surface, signed_distance_on_grid
+from tacsim.geometry.shapes import EXACT_BAND, LEVEL_SINE, MAX_NODES, centred_mesh
 from tacsim.interface import FloatArray
 from tacsim.models.scene import Mesh
 
 Index = NDArray[np.int64]
 
-TILE = 32  # nodes along an edge
-SURFACES = 64  # meshes remembered in one process, the latest used; most have 1 to 4 MB
-KEPT = 2_000  # tiles in one process, of all meshes, those used last: 260 MB; one grid has 610 at most
-SHARED = 4_000  # tiles in a folder that processes share: 520 MB
-PIECE = 4  # grid spacings: edge of the pieces that the surface is cut into for the search
-PIECES = (4_000, 100_000)  # at least, about at most
+TILE_NODES = 32  # nodes along an edge
+MAX_SURFACES = 64  # meshes remembered in one process, the latest used; most have 1 to 4 MB
+MAX_TILES = 2_000  # tiles in one process, of all meshes, those used last: 260 MB; one grid has 610 at most
+MAX_SHARED_TILES = 4_000  # tiles in a folder that processes share: 520 MB
+PIECE_SIZE = 4  # grid spacings: edge of the pieces that the surface is cut into for the search
+PIECE_COUNT_RANGE = (4_000, 100_000)  # at least, about at most
 
 # By file, content, spacing and number, so that a tile keeps no mesh in memory; the oldest first. Worlds of several
 # threads come here one after the other (`tacsim.compute.runtime.launching`).
-_kept: dict[tuple[Mesh, str, float, tuple[int, ...]], NDArray[np.float32]] = {}
-_folder: Path | None = None  # of tiles that other processes have, too
-_watcher: Callable[[str, int, int], None] | None = None
+_tiles: dict[tuple[Mesh, str, float, tuple[int, ...]], NDArray[np.float32]] = {}
+_shared_folder: Path | None = None  # of tiles that other processes have, too
+_on_tile: Callable[[str, int, int], None] | None = None
 
 
 def share_tiles(folder: Path | None) -> None:
     """From now on tiles are also written into this folder, and taken from there: what one process has computed, others
     with the same folder need not. A tile has the same bits either way; a folder that is full or gone costs time alone.
     """
-    global _folder
-    _folder = folder
+    global _shared_folder
+    _shared_folder = folder
 
 
 @contextlib.contextmanager
-def watched_measuring(on_tile: Callable[[str, int, int], None]) -> Iterator[None]:
+def report_tiles(on_tile: Callable[[str, int, int], None]) -> Iterator[None]:
     """In the block `on_tile` is given the mesh's path, how many tiles are done, and of how many, before each tile."""
-    global _watcher
-    before, _watcher = _watcher, on_tile
+    global _on_tile
+    before, _on_tile = _on_tile, on_tile
     try:
         yield
     finally:
-        _watcher = before
+        _on_tile = before
 
 
 class TiledDistance:
@@ -61,16 +61,16 @@ class TiledDistance:
 
     def __init__(self, geometry: Mesh, content: str, spacing: float) -> None:
         """content: fingerprint of the file. Raises what :func:`tacsim.geometry.mesh.load_mesh` raises."""
-        mesh = centred(geometry, content)
+        mesh = centred_mesh(geometry, content)
         self.name = geometry.path
         self.spacing = spacing
         self.vertices: FloatArray = np.asarray(mesh.vertices, np.float64)  # (n, 3)
         self._faces = np.asarray(mesh.faces, np.int64)  # (m, 3)
         self.half: FloatArray = np.asarray(mesh.extents, np.float64) / 2  # of the bounding box (3,)
-        self.origin: FloatArray = -self.half - BAND * spacing
-        fewest, most = PIECES
-        self._surface = make_surface(mesh, int(np.clip(2.3 * mesh.area / (PIECE * spacing) ** 2, fewest, most)))
-        self._last = np.ceil((self.half - self.origin) / spacing + BAND).astype(np.int64) // TILE
+        self.origin: FloatArray = -self.half - EXACT_BAND * spacing
+        fewest, most = PIECE_COUNT_RANGE
+        self._surface = make_surface(mesh, int(np.clip(2.3 * mesh.area / (PIECE_SIZE * spacing) ** 2, fewest, most)))
+        self._last = np.ceil((self.half - self.origin) / spacing + EXACT_BAND).astype(np.int64) // TILE_NODES
         self._key = geometry, content, spacing
 
     def lowest(self, axes: FloatArray, place: FloatArray, half: FloatArray) -> FloatArray | None:
@@ -92,20 +92,22 @@ class TiledDistance:
         if not over.any():
             return None
         start, step, enter, leave = start[over], step[over], enter[over], leave[over]
-        level = np.abs(step[:, 2]) <= LEVEL * np.linalg.norm(step, axis=1)
+        level = np.abs(step[:, 2]) <= LEVEL_SINE * np.linalg.norm(step, axis=1)
         share = np.where(level, (enter + leave) / 2, np.where(step[:, 2] > 0, enter, leave))
         points = start + share[:, None] * step
         return np.asarray(points[np.argmin(points[:, 2])])
 
-    def around(self, low: FloatArray, high: FloatArray) -> tuple[Index, Index]:
+    def tile_range(self, low: FloatArray, high: FloatArray) -> tuple[Index, Index]:
         """The first tile (3,) and the one after the last, along each axis, that points between two corners lie in."""
-        first, last = (np.floor((at - self.origin) / (self.spacing * TILE)).astype(np.int64) for at in (low, high))
+        first, last = (
+            np.floor((at - self.origin) / (self.spacing * TILE_NODES)).astype(np.int64) for at in (low, high)
+        )
         return np.clip(first, 0, self._last), np.clip(last, 0, self._last) + 1
 
     def values(self, first: Index, end: Index) -> NDArray[np.float32]:
         """Distances [m] at the nodes of tiles `first` (3,) to before `end`. Exact within BAND spacings of the surface,
         else as :func:`tacsim.geometry.mesh.signed_distance_on_grid` says. Raises ValueError for too many nodes."""
-        counts = (end - first) * TILE
+        counts = (end - first) * TILE_NODES
         if np.prod(counts.astype(float)) > MAX_NODES:
             raise ValueError(
                 f"mesh {self.name}: a grid of {' x '.join(map(str, counts))} nodes {self.spacing * 1e3:.4g} mm apart "
@@ -114,58 +116,61 @@ class TiledDistance:
         found = np.empty(counts, np.float32)
         number = int(np.prod(end - first))
         for done, tile in enumerate(np.ndindex(*(end - first))):
-            if _watcher is not None:
-                _watcher(self.name, done, number)
-            x, y, z = (slice(n * TILE, (n + 1) * TILE) for n in tile)
-            found[x, y, z] = self._tile(tuple(int(n) for n in first + tile))
+            if _on_tile is not None:
+                _on_tile(self.name, done, number)
+            x, y, z = (slice(n * TILE_NODES, (n + 1) * TILE_NODES) for n in tile)
+            found[x, y, z] = self._find_tile(tuple(int(n) for n in first + tile))
         return found
 
-    def sample(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def sample_distance(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Distance (n,) [m] and its gradient (n, 3) [-] at `points` (n, 3) [m], trilinear between nodes.
         Raises what `values` raises."""
         if not len(points):
             return np.empty(0), np.empty((0, 3))
-        first, end = self.around(points.min(axis=0), points.max(axis=0) + self.spacing)
-        origin = self.origin + TILE * self.spacing * first
-        return trilinear(self.values(first, end), (points - origin) / self.spacing, self.spacing)
+        first, end = self.tile_range(points.min(axis=0), points.max(axis=0) + self.spacing)
+        origin = self.origin + TILE_NODES * self.spacing * first
+        return trilinear_interpolation(self.values(first, end), (points - origin) / self.spacing, self.spacing)
 
-    def _tile(self, index: tuple[int, ...]) -> NDArray[np.float32]:
+    def _find_tile(self, index: tuple[int, ...]) -> NDArray[np.float32]:
         key = (*self._key, index)
-        tile = _kept.pop(key, None)
+        tile = _tiles.pop(key, None)
         if tile is None:
-            tile = self._shared(index)
-        _kept[key] = tile
-        if len(_kept) > KEPT:
-            del _kept[next(iter(_kept))]
+            tile = self._load_shared_tile(index)
+        _tiles[key] = tile
+        if len(_tiles) > MAX_TILES:
+            del _tiles[next(iter(_tiles))]
         return tile
 
-    def _shared(self, index: tuple[int, ...]) -> NDArray[np.float32]:
+    def _load_shared_tile(self, index: tuple[int, ...]) -> NDArray[np.float32]:
         """The tile as another process has left it, or computed and left for others."""
-        if _folder is None:
-            return self._computed(index)
+        if _shared_folder is None:
+            return self._compute_tile(index)
         geometry, content, spacing = self._key
         name = repr((geometry.model_dump(exclude={"path"}), content, spacing, index))
-        path = _folder / hashlib.sha256(name.encode()).hexdigest()
+        path = _shared_folder / hashlib.sha256(name.encode()).hexdigest()
         with contextlib.suppress(OSError):
             data = path.read_bytes()
-            if len(data) == 4 * TILE**3:
-                return np.frombuffer(data, np.float32).reshape(TILE, TILE, TILE)
-        tile = self._computed(index)
+            if len(data) == 4 * TILE_NODES**3:
+                return np.frombuffer(data, np.float32).reshape(TILE_NODES, TILE_NODES, TILE_NODES)
+        tile = self._compute_tile(index)
         with contextlib.suppress(OSError):
-            if sum(1 for _ in _folder.iterdir()) < SHARED:
+            if sum(1 for _ in _shared_folder.iterdir()) < MAX_SHARED_TILES:
                 partial = path.with_suffix(f".{os.getpid()}")
                 partial.write_bytes(tile.tobytes())
                 partial.replace(path)
         return tile
 
-    def _computed(self, index: tuple[int, ...]) -> NDArray[np.float32]:
+    def _compute_tile(self, index: tuple[int, ...]) -> NDArray[np.float32]:
         x, y, z = (
-            start + self.spacing * (n * TILE + np.arange(TILE)) for start, n in zip(self.origin, index, strict=True)
+            start + self.spacing * (n * TILE_NODES + np.arange(TILE_NODES))
+            for start, n in zip(self.origin, index, strict=True)
         )
-        return signed_distance_on_grid(self._surface, (x, y, z), BAND * self.spacing).astype(np.float32)
+        return signed_distance_on_grid(self._surface, (x, y, z), EXACT_BAND * self.spacing).astype(np.float32)
 
 
-def trilinear(values: NDArray[np.float32], at: FloatArray, spacing: float) -> tuple[FloatArray, FloatArray]:
+def trilinear_interpolation(
+    values: NDArray[np.float32], at: FloatArray, spacing: float
+) -> tuple[FloatArray, FloatArray]:
     """Values (n,) between the nodes of a grid, `spacing` [m] apart, and their gradient (n, 3) [1/m], at places (n, 3)
     counted in nodes: the reference for kernels.
 
@@ -187,9 +192,9 @@ def trilinear(values: NDArray[np.float32], at: FloatArray, spacing: float) -> tu
     return np.where(known, value, np.inf), np.where(known[:, None], gradient, 0.0)
 
 
-def tiled_distance(geometry: Mesh, spacing: float) -> TiledDistance:
+def cached_tiled_distance(geometry: Mesh, spacing: float) -> TiledDistance:
     """The same for the same bytes of the same file, so nothing is computed twice in one process."""
-    return _remembered(geometry, fingerprint(geometry.path), spacing)
+    return _make_cached(geometry, file_fingerprint(geometry.path), spacing)
 
 
-_remembered = lru_cache(maxsize=SURFACES)(TiledDistance)
+_make_cached = lru_cache(maxsize=MAX_SURFACES)(TiledDistance)

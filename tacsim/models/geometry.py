@@ -39,7 +39,7 @@ class SensorGeometry(Config):
         return ((self.width - 1) / 2.0, (self.height - 1) / 2.0) if self.centre is None else self.centre
 
 
-PROJECTED = 1 << 16  # points at a time: OpenCV makes the Jacobian along, 240 bytes a point
+PROJECTION_CHUNK = 1 << 16  # points at a time: OpenCV makes the Jacobian along, 240 bytes a point
 
 
 class Lens(Config):
@@ -62,8 +62,8 @@ class Lens(Config):
         import cv2
 
         found = np.empty((len(directions), 2))
-        for start in range(0, len(directions), PROJECTED):
-            part = slice(start, start + PROJECTED)
+        for start in range(0, len(directions), PROJECTION_CHUNK):
+            part = slice(start, start + PROJECTION_CHUNK)
             ahead = np.concatenate([directions[part], np.ones((len(directions[part]), 1))], axis=1)
             pixels, _ = cv2.projectPoints(ahead, np.zeros(3), np.zeros(3), self.matrix, np.array(self.distortion))
             found[part] = pixels.reshape(-1, 2)
@@ -108,16 +108,16 @@ class GelView(Config):
 
     def project(self, points: FloatArray) -> FloatArray:
         """(..., 2) pixels of points (..., 2) of the gel [m]."""
-        seen = seen_along(np.array(self.perspective), points.reshape(-1, 2))
+        seen = ray_slopes(np.array(self.perspective), points.reshape(-1, 2))
         return self.lens.project(seen).reshape(points.shape)
 
     def on_gel(self, pixels: FloatArray) -> FloatArray:
         """(..., 2) points of the gel's plane [m] at pixels (..., 2): the inverse of :meth:`project`."""
         back = np.linalg.inv(np.array(self.perspective))
-        return seen_along(back, self.lens.directions(pixels.reshape(-1, 2))).reshape(pixels.shape)
+        return ray_slopes(back, self.lens.directions(pixels.reshape(-1, 2))).reshape(pixels.shape)
 
 
-def seen_along(perspective: FloatArray, points: FloatArray) -> FloatArray:
+def ray_slopes(perspective: FloatArray, points: FloatArray) -> FloatArray:
     """(n, 2) x / z, y / z of perspective (x, y, 1), for points (n, 2)."""
     lines = points @ perspective[:, :2].T + perspective[:, 2]
     seen: FloatArray = lines[:, :2] / lines[:, 2:]

@@ -23,11 +23,11 @@ Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=MAX_NAME)]
 Vector = tuple[Length, Length, Length]
 Corner = tuple[float, float]
 
-SLOWEST_WATCHDOG = 10.0  # of a real arm [Hz]
+MIN_WATCHDOG_RATE = 10.0  # of a real arm [Hz]
 POLYSCOPE = r"[0-9]{1,9}(\.[0-9]{1,9}){1,3}"  # a version of it
 
 
-def _as_text(value: object) -> object:
+def _serial_text(value: object) -> object:
     """A serial number without quotes is an integer to YAML."""
     return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
 
@@ -53,7 +53,7 @@ class Workspace(Config):
     upper: Vector  # the opposite corner [m]
 
     @model_validator(mode="after")
-    def _has_an_inside(self) -> Self:
+    def _require_volume(self) -> Self:
         for axis, low, high in zip("xyz", self.lower, self.upper, strict=True):
             if not low < high:
                 raise ValueError(f"no inside: {axis} runs from {low:g} to {high:g} m; lower must be below upper")
@@ -67,7 +67,7 @@ class Plane(Config):
     normal: tuple[float, float, float]  # of any length
 
     @model_validator(mode="after")
-    def _has_a_normal(self) -> Self:
+    def _require_normal(self) -> Self:
         if float(np.linalg.norm(self.normal)) < 1e-9:
             raise ValueError("normal must not be zero")
         return self
@@ -225,7 +225,7 @@ class UrArmConfig(ArmConfig):
     host: Annotated[str, Field(min_length=1, max_length=253)]
     model: Model = "ur5e"
     # Serial number that the robot must have, as its dashboard tells it; None: any.
-    serial: Annotated[str, BeforeValidator(_as_text), Field(min_length=1, max_length=64)] | None = None
+    serial: Annotated[str, BeforeValidator(_serial_text), Field(min_length=1, max_length=64)] | None = None
     world_from_base: Placement
     flange_from_tool: Placement = Placement()  # the tool centre point (TCP) that the controller is given
     tool_from_sensor: Placement = Placement()
@@ -268,10 +268,10 @@ class UrArmConfig(ArmConfig):
 
     @model_validator(mode="after")
     def _real_arms_have_a_watchdog(self) -> Self:
-        if self.mock is None and not self.simulator and self.watchdog < SLOWEST_WATCHDOG:
+        if self.mock is None and not self.simulator and self.watchdog < MIN_WATCHDOG_RATE:
             raise ValueError(
                 f"watchdog {self.watchdog:g} Hz: a real arm would go on for {1 / self.watchdog:.2g} s after its driver "
-                f"died; at least {SLOWEST_WATCHDOG:g} Hz (only a mock or a simulator may be slower)"
+                f"died; at least {MIN_WATCHDOG_RATE:g} Hz (only a mock or a simulator may be slower)"
             )
         return self
 
@@ -333,7 +333,7 @@ class CameraSensorConfig(SensorConfig):
         return self.model if self.model is not None else load(Path(self.calibration or ""))
 
     @model_validator(mode="after")
-    def _one_geometry(self) -> Self:
+    def _require_one_geometry(self) -> Self:
         if sum(each is not None for each in (self.model, self.corners, self.calibration, self.marker_pitch)) > 1:
             raise ValueError(
                 "give one of model, corners, calibration, marker_pitch (the others null): each says where the gel lies "

@@ -41,7 +41,7 @@ class BodyMaterial(Config):
     source: str = ""
 
     @model_validator(mode="after")
-    def _one_yield(self) -> Self:
+    def _require_one_yield(self) -> Self:
         if self.yield_stress is not None and self.yield_strain is not None:
             raise ValueError("give yield_stress or yield_strain, not both")
         if self.hardening_modulus > 0 and self.yield_stress is None and self.yield_strain is None:
@@ -61,18 +61,18 @@ class BodyMaterial(Config):
             return self.yield_strain
         if self.yield_stress is None:
             return math.inf
-        mu, _ = lame(self)
+        mu, _ = elastic_constants(self)
         frobenius = self.yield_stress * (math.sqrt(2.0 / 3.0) if self.yield_norm == "uniaxial" else 1.0)
         return frobenius / (2.0 * mu)
 
     @property
     def hardening(self) -> float:
         """Growth of `elastic_limit` by equivalent plastic strain p [-]: 2 mu k = sqrt(2/3) (sigma_y + H p)."""
-        mu, _ = lame(self)
+        mu, _ = elastic_constants(self)
         return math.sqrt(2.0 / 3.0) * self.hardening_modulus / (2.0 * mu)
 
 
-def lame(material: GelMaterial | BodyMaterial) -> tuple[float, float]:
+def elastic_constants(material: GelMaterial | BodyMaterial) -> tuple[float, float]:
     """Lamé constants (mu, lambda) [Pa]."""
     modulus, nu = material.youngs_modulus, material.poisson_ratio
     return modulus / (2 * (1 + nu)), modulus * nu / ((1 + nu) * (1 - 2 * nu))
@@ -80,5 +80,5 @@ def lame(material: GelMaterial | BodyMaterial) -> tuple[float, float]:
 
 def shear_impedance(material: GelMaterial) -> float:
     """Stress over speed of its shear wave, over the speed of its pressure wave: sqrt(mu (lambda + 2 mu)) [Pa]."""
-    mu, lam = lame(material)
+    mu, lam = elastic_constants(material)
     return math.sqrt(mu * (lam + 2 * mu))

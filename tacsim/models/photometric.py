@@ -91,14 +91,16 @@ class CastShadows(Config):
     weights: tuple[tuple[Weight, Weight, Weight], ...]  # of R, G, B; rows by lamp, then by slope, then by position term
 
     @model_validator(mode="after")
-    def _one_weight_a_term(self) -> Self:
+    def _require_weight_count(self) -> Self:
         wanted = len(self.lamps) * len(SHADOW_SLOPES) * SHADOW_PLACES
         if len(self.weights) != wanted:
             raise ValueError(f"weights has {len(self.weights)} rows; shadows of {len(self.lamps)} lamps have {wanted}")
         return self
 
 
-def horizon(height: Callable[[Floats, Floats], Floats], x: Floats, y: Floats, lamp: tuple[float, float]) -> Floats:
+def horizon_slope(
+    height: Callable[[Floats, Floats], Floats], x: Floats, y: Floats, lamp: tuple[float, float]
+) -> Floats:
     """(...,) steepest way up towards the lamp from places x, y (...,), at least 0; `height` of places."""
     to_x, to_y = lamp[0] - x, lamp[1] - y
     distance = np.sqrt(to_x * to_x + to_y * to_y) + x.dtype.type(LAMP_DISTANCE)
@@ -153,7 +155,7 @@ class PhotometricModel(Config):
     depth: DepthColour | None = None  # None: flat gel has one colour, however deep it is pressed
 
     @model_validator(mode="after")
-    def _one_weight_a_term(self) -> Self:
+    def _require_weight_count(self) -> Self:
         wanted = term_count(self.degree, self.position)
         if len(self.weights) != wanted:
             raise ValueError(
@@ -181,7 +183,7 @@ def normal_terms(gradient: Floats, degree: int, more: int = 0) -> Floats:
     np.multiply(gx, tilt, out=nx)
     np.multiply(gy, tilt, out=ny)
     tilt += 1.0
-    _higher_orders(terms[:count], (nx, ny), order=2, last=0, here=3)
+    _fill_products(terms[:count], (nx, ny), order=2, last=0, here=3)
     return terms
 
 
@@ -189,11 +191,11 @@ def position_terms(u: Floats, v: Floats, position: int) -> Floats:
     """(terms, ...) the terms of the place in the image for u, v (...,) in -1/2..1/2."""
     terms = np.empty((math.comb(position + 2, 2), *u.shape), dtype=u.dtype)
     terms[0] = 1.0
-    _higher_orders(terms, (u, v), order=1, last=0, here=1)
+    _fill_products(terms, (u, v), order=1, last=0, here=1)
     return terms
 
 
-def _higher_orders(terms: Floats, factors: tuple[Floats, Floats], order: int, last: int, here: int) -> None:
+def _fill_products(terms: Floats, factors: tuple[Floats, Floats], order: int, last: int, here: int) -> None:
     """Fills `terms` from row `here` on with the products of two factors of this `order` and higher ones. The `order`
     products of one order less start at row `last`: each by the first factor, and the last of them by the second."""
     first, second = factors
@@ -214,18 +216,18 @@ def relative_depth(height: Floats, deepest: float) -> Floats:
     return np.clip(height * height.dtype.type(1 / deepest), 0, 1)
 
 
-def place_in_image(columns: int, rows: int) -> tuple[FloatArray, FloatArray]:
+def image_axes(columns: int, rows: int) -> tuple[FloatArray, FloatArray]:
     """u (columns,) and v (rows,) of the pixels of an image."""
     return (np.arange(columns) + 0.5) / columns - 0.5, (np.arange(rows) + 0.5) / rows - 0.5
 
 
-def places_in_image(columns: int, rows: int) -> tuple[Float32, Float32]:
+def image_grid_places(columns: int, rows: int) -> tuple[Float32, Float32]:
     """u and v (rows, columns) of the pixels of an image."""
-    u, v = np.meshgrid(*place_in_image(columns, rows))
+    u, v = np.meshgrid(*image_axes(columns, rows))
     return u.astype(np.float32), v.astype(np.float32)
 
 
-def clipped(gradient: Float32, steepest: float) -> tuple[Float32, int]:
+def clip_slopes(gradient: Float32, steepest: float) -> tuple[Float32, int]:
     """Slopes (..., 2) no steeper than `steepest`, of unchanged direction, and how many had been. In memory the slopes
     by x and those by y lie apart."""
     planes = np.ascontiguousarray(np.moveaxis(gradient, -1, 0))
@@ -243,8 +245,8 @@ class PhotometricLight:
     def __init__(self, model: PhotometricModel, mean: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> None:
         """mean: the untouched image's mean colour, by which changes are multiplied; 1: they stay relative."""
         self._model = model
-        self._surface = _by_place(model.weights, term_count(model.degree, 0), mean)
-        self._deep = None if model.depth is None else _with_depth(self._surface, model.depth, mean)
+        self._surface = _weights_by_place(model.weights, term_count(model.degree, 0), mean)
+        self._deep = None if model.depth is None else _append_depth_weights(self._surface, model.depth, mean)
         self._shadows = None if model.shadows is None else (np.array(model.shadows.weights) * mean).astype(np.float32)
 
     def change(self, gradient: Float32, u: Float32, v: Float32, height: Float32 | None = None) -> tuple[Float32, int]:
@@ -254,7 +256,7 @@ class PhotometricLight:
         import cv2
 
         degree, position, depth = self._model.degree, self._model.position, self._model.depth
-        slopes, beyond = clipped(gradient, self._model.steepest)
+        slopes, beyond = clip_slopes(gradient, self._model.steepest)
         if height is None or depth is None or self._deep is None:
             weights, terms, places = self._surface, normal_terms(slopes, degree), position_terms(u, v, position)
         else:
@@ -275,25 +277,25 @@ class PhotometricLight:
         red, green, blue = np.einsum("pcn,pn->cn", at_places.reshape(count, 3, -1), places.reshape(count, -1))
         return np.asarray(cv2.merge([red, green, blue]), dtype=np.float32).reshape(*gradient.shape[:-1], 3), beyond
 
-    def shadow(self, horizons: Sequence[Float32], u: Float32, v: Float32) -> Float32:
+    def shadow_change(self, horizons: Sequence[Float32], u: Float32, v: Float32) -> Float32:
         """(..., 3) change of colour by cast shadows, for the horizons (...,) of each lamp at places u, v (...,), before
         blur. Of a model with shadows."""
         assert self._shadows is not None
         return np.asarray(np.tensordot(shadow_terms(horizons, u, v), self._shadows, axes=(0, 0)), dtype=np.float32)
 
 
-def _by_place(weights: Sequence[Sequence[float]], terms: int, mean: Sequence[float]) -> Float32:
+def _weights_by_place(weights: Sequence[Sequence[float]], terms: int, mean: Sequence[float]) -> Float32:
     """(places, 3, terms) of `weights` (places * terms, 3), times the colour `mean`."""
     scaled = np.array(weights).reshape(-1, terms, 3) * mean
     return np.ascontiguousarray(scaled.transpose(0, 2, 1), dtype=np.float32)
 
 
-def _with_depth(surface: Float32, depth: DepthColour, mean: Sequence[float]) -> Float32:
+def _append_depth_weights(surface: Float32, depth: DepthColour, mean: Sequence[float]) -> Float32:
     """(places, 3, terms) weights of the `surface` with those of a colour of depth: w, w^2 and w^3 are DEPTH_POWERS more
     terms beside those of the normal, and w one more place if slopes look otherwise at depth."""
     linear, by_u, by_v, square, cube = (np.array(depth.weights) * mean).astype(np.float32)
     places, _, terms = surface.shape
-    slopes = _by_place(depth.slopes, terms, mean)
+    slopes = _weights_by_place(depth.slopes, terms, mean)
     own = max(places, 3)  # 1, u and v in any case
     weights = np.zeros((own + len(slopes), 3, terms + DEPTH_POWERS), dtype=np.float32)
     weights[:places, :, :terms], weights[own:, :, :terms] = surface, slopes

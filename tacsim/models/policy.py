@@ -38,7 +38,7 @@ class Features(Config):
     frames: Annotated[int, Field(ge=1, le=16)] = 1  # the last observations, oldest first
 
     @model_validator(mode="after")
-    def _says_something(self) -> Self:
+    def _require_contents(self) -> Self:
         for name, listed in {
             "sensors": self.sensors,
             "arms": self.arms,
@@ -67,7 +67,7 @@ class Numbers(Config):
     scales: tuple[float, ...]  # SI value that is encoded as 1
 
     @model_validator(mode="after")
-    def _alike(self) -> Self:
+    def _require_equal_lengths(self) -> Self:
         if len(self.names) != len(self.scales):
             raise ValueError(f"{len(self.names)} names, but {len(self.scales)} scales")
         return self
@@ -84,7 +84,7 @@ class ActionAxis(Config):
     direction: tuple[Component, Component, Component]  # unit vector, world
 
     @model_validator(mode="after")
-    def _is_a_direction(self) -> Self:
+    def _require_unit_vector(self) -> Self:
         if abs(math.hypot(*self.direction) - 1.0) > 1e-6:
             raise ValueError(f"direction {self.direction} is no unit vector")
         return self
@@ -104,7 +104,7 @@ class TrainingRange(Config):
     words: dict[str, tuple[str, ...]] = {}  # the same of what is no number: shapes
 
     @model_validator(mode="after")
-    def _fits(self) -> Self:
+    def _require_equal_lengths(self) -> Self:
         if len(self.low) != len(self.high):
             raise ValueError(f"{len(self.low)} least numbers, but {len(self.high)} greatest")
         if any(len(axis) != len(self.centre) for axis in self.axes):

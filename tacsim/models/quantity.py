@@ -29,12 +29,12 @@ _QUANTITY = re.compile(rf"({_NUMBER})\s*([^\s0-9.]\S*)?")
 MAX_TEXT = 100  # characters of a quantity
 
 
-def units_text(kind: str) -> str:
+def list_units(kind: str) -> str:
     """The units of a kind, for messages: "m, mm, cm, um"."""
     return ", ".join(unit for unit in UNITS[kind] if unit not in ("µm", "μm"))
 
 
-def parse(value: Any, kind: str, *, bare: bool = True) -> float:
+def parse_quantity(value: Any, kind: str, *, bare: bool = True) -> float:
     """SI value of a number or of a text such as "2.92 mm"; without `bare`, a text but "0" must have its unit. Raises
     ValueError that names the units allowed.
 
@@ -43,11 +43,11 @@ def parse(value: Any, kind: str, *, bare: bool = True) -> float:
     """
     si, example = list(UNITS[kind])[:2]
     what = f"a number [{si}], or a text with its unit" if bare else "a number with its unit"
-    allowed = f"allowed: {what} ({units_text(kind)}) such as '1.5 {example}'"
+    allowed = f"allowed: {what} ({list_units(kind)}) such as '1.5 {example}'"
     if isinstance(value, str):
         number, has_unit = _parse_text(value, kind, allowed)
         if not (bare or has_unit) and number != 0:
-            raise ValueError(f"{value!r} has no unit; say '{value.strip()} {example}', or {units_text(kind)}")
+            raise ValueError(f"{value!r} has no unit; say '{value.strip()} {example}', or {list_units(kind)}")
         value = number
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise ValueError(f"{value!r} is no {kind}; {allowed}")
@@ -79,23 +79,25 @@ def _parse_text(text: str, kind: str, allowed: str) -> tuple[float, bool]:
         if unit in theirs:
             raise ValueError(f"{text!r} is a {other}, not a {kind}; {allowed}")
     close = [known for known in units if unit.lower() == known.lower()]
-    close = close or [known for known in units if _one_letter_off(unit, known)]
+    close = close or [known for known in units if _is_one_letter_off(unit, known)]
     hint = f"; did you mean '{number} {close[0]}'?" if len(close) == 1 else ""
     raise ValueError(f"{text!r}: no unit '{unit}' for a {kind}; {allowed}{hint}")
 
 
-def _one_letter_off(unit: str, known: str) -> bool:
+def _is_one_letter_off(unit: str, known: str) -> bool:
     return len(unit) == len(known) > 1 and sum(a != b for a, b in zip(unit, known, strict=True)) == 1
 
 
 @dataclass(frozen=True, slots=True)
 class Quantity:
-    """Marks a float field as a quantity: pydantic reads it by :func:`parse`, the JSON schema shows its units."""
+    """Marks a float field as a quantity: pydantic reads it by :func:`parse_quantity`; the JSON schema has its units."""
 
     kind: str
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        return core_schema.no_info_before_validator_function(lambda value: parse(value, self.kind), handler(source))
+        return core_schema.no_info_before_validator_function(
+            lambda value: parse_quantity(value, self.kind), handler(source)
+        )
 
     def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
         units = "|".join(re.escape(unit) for unit in UNITS[self.kind])

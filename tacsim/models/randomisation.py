@@ -16,7 +16,7 @@ from tacsim.models.quantity import Config
 Number = float | str  # bare, or a text with its unit ("5 mm")
 Entry = Number | tuple[Number, ...]  # of a list each element is drawn by itself
 _NUMBER = re.compile(r"\s*([-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?)\s*([^\s0-9.]\S*)?\s*")
-_TRIES = 1000  # draws of a normal until one is within its bounds
+_MAX_DRAWS = 1000  # draws of a normal until one is within its bounds
 
 
 class Distribution(Config):
@@ -30,7 +30,7 @@ class Distribution(Config):
     choice: Annotated[tuple[Entry, ...], Field(min_length=1, max_length=10_000)] | None = None
 
     @model_validator(mode="after")
-    def _one_that_can_be_drawn(self) -> Self:
+    def _require_one_distribution(self) -> Self:
         given = [k for k in ("uniform", "log_uniform", "normal", "choice") if getattr(self, k) is not None]
         if len(given) != 1:
             raise ValueError(
@@ -42,28 +42,28 @@ class Distribution(Config):
             )
         if self.choice is None:
             for elements in self._elements():
-                _check(elements, given[0])
+                _require_drawable(elements, given[0])
         return self
 
     def draw(self, random: np.random.Generator) -> str:
         """As a YAML text."""
         if self.choice is not None:
-            return _text(self.choice[int(random.integers(len(self.choice)))])
-        drawn = [_draw(elements, self, random) for elements in self._elements()]
+            return _entry_text(self.choice[int(random.integers(len(self.choice)))])
+        drawn = [_draw_elements(elements, self, random) for elements in self._elements()]
         first = (self.uniform or self.log_uniform or self.normal or ((),))[0]
         return f"[{', '.join(drawn)}]" if isinstance(first, tuple) else drawn[0]
 
     def ends(self) -> list[str]:
         """The least and the greatest that can be drawn, as YAML texts; none of a choice."""
-        return [_text(end) for end in self.within or self.uniform or self.log_uniform or ()]
+        return [_entry_text(end) for end in self.within or self.uniform or self.log_uniform or ()]
 
     def _elements(self) -> list[tuple[tuple[float, ...], str]]:
         """For each element its numbers (two; of a normal four: mean, deviation, bounds), and their unit."""
         ends = [*(self.uniform or self.log_uniform or self.normal or ()), *(self.within or ())]
         columns = [end if isinstance(end, tuple) else (end,) for end in ends]
         if len({len(column) for column in columns}) > 1 or len({isinstance(end, tuple) for end in ends}) > 1:
-            raise ValueError(f"all of {', '.join(map(_text, ends))} must be numbers, or lists of one length")
-        return [_numbers(row) for row in zip(*columns, strict=True)]
+            raise ValueError(f"all of {', '.join(map(_entry_text, ends))} must be numbers, or lists of one length")
+        return [_sort_numbers(row) for row in zip(*columns, strict=True)]
 
 
 class Randomisation(Config):
@@ -74,7 +74,7 @@ class Randomisation(Config):
     seed: Annotated[int, Field(ge=0)] = 0
     values: Annotated[dict[str, Distribution], Field(min_length=1, max_length=100)]
 
-    def drawn(self) -> list[list[str]]:
+    def draw_overrides(self) -> list[list[str]]:
         """Overrides ``key=value``, one list for each draw. What is drawn for one key does not depend on the others, nor
         on how many are drawn."""
         return [
@@ -86,9 +86,9 @@ class Randomisation(Config):
         ]
 
     def limits(self) -> list[list[str]]:
-        """Overrides like those of `drawn`: the first draw with one value at an end of its range, for each that has one.
-        Other seeds may draw what lies near."""
-        first = self.drawn()[0]
+        """Overrides like those of `draw_overrides`: the first draw with one value at an end of its range, for each
+        value with ends. Other seeds may draw what lies near."""
+        first = self.draw_overrides()[0]
         return [
             [*first[:at], f"{key}={end}", *first[at + 1 :]]
             for at, (key, each) in enumerate(self.values.items())
@@ -96,7 +96,7 @@ class Randomisation(Config):
         ]
 
 
-def _numbers(row: Sequence[Number]) -> tuple[tuple[float, ...], str]:
+def _sort_numbers(row: Sequence[Number]) -> tuple[tuple[float, ...], str]:
     found = []
     for number in row:
         match = _NUMBER.fullmatch(str(number))
@@ -109,7 +109,7 @@ def _numbers(row: Sequence[Number]) -> tuple[tuple[float, ...], str]:
     return tuple(number for number, _ in found), units.pop()
 
 
-def _check(elements: tuple[tuple[float, ...], str], kind: str) -> None:
+def _require_drawable(elements: tuple[tuple[float, ...], str], kind: str) -> None:
     numbers, _ = elements
     least, greatest = numbers[-2:]
     if not least <= greatest:
@@ -124,7 +124,7 @@ def _check(elements: tuple[tuple[float, ...], str], kind: str) -> None:
             raise ValueError(f"mean {mean:g} is not within [{least:g}, {greatest:g}]")
 
 
-def _draw(elements: tuple[tuple[float, ...], str], kind: Distribution, random: np.random.Generator) -> str:
+def _draw_elements(elements: tuple[tuple[float, ...], str], kind: Distribution, random: np.random.Generator) -> str:
     numbers, unit = elements
     least, greatest = numbers[-2:]
     if kind.log_uniform is not None:
@@ -133,12 +133,12 @@ def _draw(elements: tuple[tuple[float, ...], str], kind: Distribution, random: n
         value = random.uniform(least, greatest)
     else:
         mean, deviation = numbers[:2]
-        tries = random.normal(mean, deviation, _TRIES)
+        tries = random.normal(mean, deviation, _MAX_DRAWS)
         inside = tries[(tries >= least) & (tries <= greatest)]
         # Bounds that are this narrow cut a piece out of the bell that is flat.
         value = float(inside[0]) if len(inside) else random.uniform(least, greatest)
     return f"{value:.9g} {unit}".strip()
 
 
-def _text(entry: Entry | Any) -> str:
+def _entry_text(entry: Entry | Any) -> str:
     return f"[{', '.join(map(str, entry))}]" if isinstance(entry, tuple) else str(entry)

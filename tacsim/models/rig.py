@@ -100,7 +100,7 @@ class ReplaySensorConfig(SensorConfig):
         return self.calibration
 
     @model_validator(mode="after")
-    def _one_geometry(self) -> Self:
+    def _require_one_geometry(self) -> Self:
         if sum(each is not None for each in (self.corners, self.calibration, self.marker_pitch)) > 1:
             raise ValueError("give one of corners, calibration, marker_pitch: each says where the gel lies")
         if self.region is not None and self.calibration is not None:
@@ -130,7 +130,7 @@ class TaskConfig(Config):
         return {}
 
     @model_validator(mode="after")
-    def _touch_is_no_failure(self) -> Self:
+    def _require_touch_below_limit(self) -> Self:
         if self.force_limit is not None and not self.touch_force < self.force_limit:
             raise ValueError(
                 f"force_limit {self.force_limit:g} N: a reset presses by touch_force, {self.touch_force:g} N; give more"
@@ -176,7 +176,7 @@ class KneadConfig(TaskConfig):
 TASKS: list[type[TaskConfig]] = [SqueezeConfig, RepositionConfig, KneadConfig]  # shipped ones, and those made known
 
 
-def any_task() -> Any:
+def task_annotation() -> Any:
     """The annotation of a task of any known kind."""
     return Annotated[Union[tuple(TASKS)], Field(discriminator="kind")]  # noqa: UP007  # of as many as there are
 
@@ -220,7 +220,7 @@ class RigConfig(Config):
         return handler(rig_model())
 
     @model_validator(mode="after")
-    def _consistent(self) -> Self:
+    def _require_consistent(self) -> Self:
         for name, sensor in self.sensors.items():
             if sensor.arm is not None:
                 self._require_arm(sensor.arm, "sensors", name, sensor.driver, "arm")
@@ -274,7 +274,7 @@ class RigConfig(Config):
                 {"arm": name, "force": f"{limits.force:g}", "at": at},
             )
 
-    def kept_out(self, arm: str) -> dict[str, float]:
+    def keep_out_distances(self, arm: str) -> dict[str, float]:
         """Least distances [m] of `arm` to other arms, by their names."""
         found: dict[str, float] = {}
         for apart in self.keep_out:
@@ -284,23 +284,24 @@ class RigConfig(Config):
         return found
 
 
-def know_task(config: type[TaskConfig]) -> None:
+def register_task_config(config: type[TaskConfig]) -> None:
     """Files and rigs may have tasks of this kind from now on. Raises ValueError for one without a kind of its own."""
     kinds = get_args(config.model_fields["kind"].annotation)
     if len(kinds) != 1:
         raise ValueError(f"{config.__name__} must derive from tacsim.TaskConfig and say its kind: Literal['...']")
     same = [each for each in TASKS if get_args(each.model_fields["kind"].annotation) == kinds]
-    if any(_path(each) != _path(config) for each in same):
+    if any(_config_path(each) != _config_path(config) for each in same):
         raise ValueError(
-            f"{config.__name__}: there is a task of kind '{kinds[0]}' already, {_path(same[0])}; name it otherwise"
+            f"{config.__name__}: there is a task of kind '{kinds[0]}' already, {_config_path(same[0])}; "
+            "name it otherwise"
         )
     TASKS[:] = [each for each in TASKS if each not in same] + [config]
-    rigs_of_known_tasks()
+    rebuild_rig_config()
 
 
-def rigs_of_known_tasks() -> None:
+def rebuild_rig_config() -> None:
     """RigConfig takes the tasks that TASKS lists."""
-    RigConfig.model_fields["task"].annotation = any_task() | None
+    RigConfig.model_fields["task"].annotation = task_annotation() | None
     RigConfig.model_rebuild(force=True)
 
 
@@ -316,5 +317,5 @@ def _config_classes(kind: str) -> list[type[Config]]:
     return [driver.config_class for driver in installed_drivers().usable[kind].values()]
 
 
-def _path(config: type[TaskConfig]) -> str:
+def _config_path(config: type[TaskConfig]) -> str:
     return f"{config.__module__}.{config.__qualname__}"

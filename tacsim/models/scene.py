@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from tacsim.interface import Float32, FloatArray
-from tacsim.models.material import BodyMaterial, GelMaterial, lame, shear_impedance
+from tacsim.models.material import BodyMaterial, GelMaterial, elastic_constants, shear_impedance
 from tacsim.models.quantity import Acceleration, Angle, Config, Length
 
 Edge = Annotated[Length, Field(ge=1e-5, le=10.0)]  # of a body or an indenter [m]
@@ -28,16 +28,21 @@ PRESETS: dict[Preset, tuple[float, float]] = {
 PRESET_FORCE_ERROR: dict[Preset, tuple[float, float]] = {
     "learn": (0.031, 0.108), "draft": (0.005, 0.041), "standard": (-0.006, 0.021),
 }  # fmt: skip
-# Peak Mach number of motions between states of rest at USUAL_TOLERANCE, and in proportion to a smaller tolerance: what
+# Peak Mach number of motions between states of rest at DEFAULT_TOLERANCE, in proportion to a smaller tolerance: what
 # the yield stress allows over the stress that the motion costs, within bounds; where nothing yields, a share of the
 # speed of the gel's shear wave (docs/decisions/0002).
-MACH_BY_STRESS, SLOWEST_MACH, FASTEST_MACH, USUAL_TOLERANCE = 3.7, 0.001, 0.03, 1e-2
+MACH_BY_STRESS, MIN_MACH, MAX_MACH, DEFAULT_TOLERANCE = 3.7, 0.001, 0.03, 1e-2
 # What the gel's motion adds to that stress: the impedance of its shear wave, and at most the body's own, times these
 GEL_STRESS, MAX_GEL_STRESS = 2.5, 2.0
 MACH_BY_SHEAR = 0.1
-LIGHTER = 1.25  # so much faster may sensors go whose gels and body answer as if they were lighter: no indenter, no seed
-FLOW_MACH, LIGHTER_FLOW = 0.02, 1.5  # mean of motions that flow into one another; so much faster where they are lighter
-CATCHING = 0.5  # element sizes: an edge that is less round catches on the mesh
+LIGHT_SPEED_FACTOR = (
+    1.25  # so much faster may sensors go whose gels and body answer as if they were lighter: no indenter, no seed
+)
+FLOW_MACH, LIGHT_FLOW_FACTOR = (
+    0.02,
+    1.5,
+)  # mean of motions that flow into one another; so much faster where they are lighter
+MIN_EDGE_RATIO = 0.5  # element sizes: an edge that is less round catches on the mesh
 MAX_CELLS = 5_000_000  # elements of one gel, or its particles in the seed's scheme; a standard gel has 12,800
 
 
@@ -70,7 +75,7 @@ class GelOverride(Config):
         return gel.model_copy(update=change)
 
     @model_serializer(mode="wrap")
-    def _given_alone(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
+    def _serialize_given_only(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
         """What is not given must not be written: read again, it would count as given."""
         whole = serialize(self)
         if self.material is not None:
@@ -126,7 +131,8 @@ class Indenter(Config):
     """A rigid body pressed on one gel; no particles are needed for it."""
 
     geometry: Shape = Sphere(radius=4e-3)
-    # of a box's or cylinder's edges, rounded within its size [m]; None: as the mesh carries them (`rounding`); 0: sharp
+    # of a box's or cylinder's edges, rounded within its size [m]; None: as the mesh carries them
+    # (`effective_edge_radius`); 0: sharp
     edge_radius: Annotated[Length, Field(ge=0)] | None = None
     friction: Annotated[float, Field(ge=0, le=5)] = 0.6
     # Orientation: turned about world x by `roll`, then y by `pitch`, then z by `yaw`. 0, 0, 0: its own -z side presses.
@@ -146,30 +152,30 @@ class Indenter(Config):
         ])  # fmt: skip
 
     @model_validator(mode="after")
-    def _edges_fit(self) -> Self:
+    def _require_small_edges(self) -> Self:
         geometry, radius = self.geometry, self.edge_radius or 0.0
         if radius > 0 and not isinstance(geometry, Box | Cylinder):
             has = "a sphere has no edges" if isinstance(geometry, Sphere) else "the edges of an STL file are as drawn"
             raise ValueError(f"edge_radius is {radius:g} m, but {has}; leave it out")
         if isinstance(geometry, Box | Cylinder):
-            half = _shortest_side(geometry) / 2
+            half = _min_side(geometry) / 2
             if radius > half:
                 raise ValueError(
                     f"edge_radius is {radius:g} m; at most half the shortest side of the {geometry.shape}, {half:g} m"
                 )
         return self
 
-    def rounding(self, element: float) -> float:
+    def effective_edge_radius(self, element: float) -> float:
         """Radius of its edges [m] on a mesh of such elements [m]: where none is given the least that does not catch,
         but no more than a quarter of its shortest side; 0 of a ball, and of a mesh, whose edges are as drawn."""
         if not isinstance(self.geometry, Box | Cylinder):
             return 0.0
         if self.edge_radius is not None:
             return self.edge_radius
-        return min(CATCHING * element, _shortest_side(self.geometry) / 4)
+        return min(MIN_EDGE_RATIO * element, _min_side(self.geometry) / 4)
 
 
-def _shortest_side(geometry: Box | Cylinder) -> float:
+def _min_side(geometry: Box | Cylinder) -> float:
     return min(geometry.size if isinstance(geometry, Box) else (2 * geometry.radius, geometry.height))
 
 
@@ -199,7 +205,7 @@ class Scene(Config):
     settling: Settling = Settling()
 
     @model_validator(mode="after")
-    def _consistent(self) -> Self:
+    def _require_consistent(self) -> Self:
         if (self.body is None) == (self.indenter is None):
             raise ValueError("give a body (between two gels) or an indenter (on one gel), not both and not neither")
         hardens = self.body is not None and self.body.material.hardening_modulus > 0
@@ -220,7 +226,7 @@ class Scene(Config):
         return self
 
     @model_validator(mode="after")
-    def _resolvable(self) -> Self:
+    def _require_resolution(self) -> Self:
         """Each gel gets at least two layers of elements, and no more cells than a machine has memory for."""
         for name in self.sensors:
             self._require_resolvable(name)
@@ -229,7 +235,9 @@ class Scene(Config):
     def _require_resolvable(self, sensor: str) -> None:
         size, own = self.gel_of(sensor).size, self.gels.get(cast(SensorName, sensor), GelOverride())
         name, edge = (
-            ("particle_spacing", self.spacing) if self.physics == "seed" else ("element_size", self.element_of(sensor))
+            ("particle_spacing", self.spacing)
+            if self.physics == "seed"
+            else ("element_size", self.element_size_of(sensor))
         )
         edge = min(edge, size[2] / 2)  # a thin gel is resolved finer than its preset
         cells, of = math.prod(side / edge for side in size), f" of sensor '{sensor}'" if sensor in self.gels else ""
@@ -246,13 +254,13 @@ class Scene(Config):
             )
 
     @model_validator(mode="after")
-    def _followable(self) -> Self:
+    def _require_settling_speed(self) -> Self:
         """What yields can be followed at the speed that its stress asks for, or a speed is given."""
         allowed = self._mach_by_stress
-        if self.settling.mach is None and allowed < SLOWEST_MACH:
+        if self.settling.mach is None and allowed < MIN_MACH:
             raise ValueError(
                 f"this body yields at so small a stress for its stiffness that it must be moved at Mach {allowed:.2g} "
-                f"(default speeds end at {SLOWEST_MACH:g}), or the speed itself makes it yield; give it a higher "
+                f"(default speeds end at {MIN_MACH:g}), or the speed itself makes it yield; give it a higher "
                 f"yield_stress, a lower youngs_modulus or poisson_ratio, or set settling.mach and see what it costs"
             )
         return self
@@ -267,7 +275,7 @@ class Scene(Config):
         """
         if self.body is None:
             return math.inf
-        mu, lam = lame(self.body.material)
+        mu, lam = elastic_constants(self.body.material)
         body = lam + 2 * mu
         gel = max(shear_impedance(self.gel_of(name).material) for name in self.sensors)
         stress = body + min(GEL_STRESS * gel, MAX_GEL_STRESS * body)
@@ -290,18 +298,18 @@ class Scene(Config):
             return self.settling.mach
         if not math.isfinite(self._mach_by_stress):
             slowest = min(math.sqrt(mu / (lam + 2 * mu)) for mu, lam in self._gel_moduli)
-            return min(FASTEST_MACH, MACH_BY_SHEAR * slowest)
-        return max(min(1.0, self.settling.tolerance / USUAL_TOLERANCE) * self.fastest_mach, SLOWEST_MACH)
+            return min(MAX_MACH, MACH_BY_SHEAR * slowest)
+        return max(min(1.0, self.settling.tolerance / DEFAULT_TOLERANCE) * self.max_mach, MIN_MACH)
 
     @property
     def _gel_moduli(self) -> list[tuple[float, float]]:
         """Lamé constants of each gel [Pa]."""
-        return [lame(self.gel_of(name).material) for name in self.sensors]
+        return [elastic_constants(self.gel_of(name).material) for name in self.sensors]
 
     @property
-    def fastest_mach(self) -> float:
+    def max_mach(self) -> float:
         """The most that this is for a body that yields, at any tolerance."""
-        return min(self._mach_by_stress, FASTEST_MACH * (LIGHTER if self.physics == "hybrid" else 1.0))
+        return min(self._mach_by_stress, MAX_MACH * (LIGHT_SPEED_FACTOR if self.physics == "hybrid" else 1.0))
 
     @property
     def preset_error(self) -> str:
@@ -317,7 +325,7 @@ class Scene(Config):
         """Mean speed of motions that flow into one another, over the wave speed; slower on short paths."""
         if self.settling.flow_mach is not None:
             return self.settling.flow_mach
-        return FLOW_MACH if self.body is None else LIGHTER_FLOW * FLOW_MACH
+        return FLOW_MACH if self.body is None else LIGHT_FLOW_FACTOR * FLOW_MACH
 
     @property
     def spacing(self) -> float:
@@ -325,7 +333,7 @@ class Scene(Config):
         return PRESETS[self.preset][0] if self.particle_spacing is None else self.particle_spacing
 
     @property
-    def element(self) -> float:
+    def effective_element_size(self) -> float:
         """Edge of a gel element h_g [m]."""
         return PRESETS[self.preset][1] if self.element_size is None else self.element_size
 
@@ -334,15 +342,15 @@ class Scene(Config):
         own = self.gels.get(cast(SensorName, sensor))
         return self.gel if own is None else own.apply_to(self.gel)
 
-    def element_of(self, sensor: str) -> float:
+    def element_size_of(self, sensor: str) -> float:
         """Edge of an element of a sensor's gel [m], before its thickness is divided into whole layers."""
         own = self.gels.get(cast(SensorName, sensor))
-        return self.element if own is None or own.element_size is None else own.element_size
+        return self.effective_element_size if own is None or own.element_size is None else own.element_size
 
-    def gel_element(self, sensor: str) -> float:
+    def fitted_element_size(self, sensor: str) -> float:
         """The same as the gel's thickness allows: whole layers, two at least [m]."""
         thickness = self.gel_of(sensor).size[2]
-        return thickness / max(2, round(thickness / self.element_of(sensor)))
+        return thickness / max(2, round(thickness / self.element_size_of(sensor)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

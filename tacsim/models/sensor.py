@@ -39,7 +39,7 @@ class Light(Config):
     specular: Channel = 0.35
 
     @model_validator(mode="after")
-    def _has_direction(self) -> Self:
+    def _require_direction(self) -> Self:
         if sum(c * c for c in self.direction) < 1e-12:
             raise ValueError("direction must not be zero")
         if self.direction[2] > 0:
@@ -68,7 +68,7 @@ class Lighting(Config):
     background: Background | None = (0.42, 0.44, 0.46)  # colour of the untouched gel, or the path of a picture
 
     @model_validator(mode="after")
-    def _one_base(self) -> Self:
+    def _require_one_base(self) -> Self:
         if self.ambient > 0 and self.background is not None:
             raise ValueError("ambient has no effect beside a background; set background to null, or ambient to 0")
         return self
@@ -87,7 +87,7 @@ class Markers(Config):
     in_background: bool = False
 
     @model_validator(mode="after")
-    def _one_place_a_dot(self) -> Self:
+    def _require_place_per_dot(self) -> Self:
         if self.places is not None and [len(row) for row in self.places] != [self.columns] * self.rows:
             raise ValueError(f"places must be {self.rows} rows of {self.columns} dots each, x and y of every dot")
         return self
@@ -102,7 +102,7 @@ class CameraNoise(Config):
     seed: Annotated[int, Field(ge=0)] = 0
 
     @model_validator(mode="after")
-    def _correlations_are_possible(self) -> Self:
+    def _require_valid_correlations(self) -> Self:
         if np.linalg.eigvalsh(self.colour_matrix())[0] < -1e-6:
             raise ValueError(f"colours {self.colours}: no three colours can be correlated so")
         return self
@@ -135,7 +135,7 @@ class SensorModel(Config):
     caution: str = ""  # what its calibration says against itself; "": nothing
 
     @model_validator(mode="after")
-    def _calibrated_change_has_a_base(self) -> Self:
+    def _require_calibration_base(self) -> Self:
         told = [name for name in ("photometric", "darkness") if getattr(self, name) is not None]
         if len(told) == 2:
             raise ValueError("photometric and darkness are two lights; give one of them")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 
-def escaped(text: str, kept: str = "") -> str:
+def escape_text(text: str, kept: str = "") -> str:
     """`text` with control characters, and those that turn the direction of writing, written out (``\\x1b``), except
     those in `kept`. What is escaped already stays as it is."""
     if text.isprintable():
@@ -16,16 +16,16 @@ MAX_NAME = 100  # characters of the name of a sensor or an arm
 
 def check_name(name: str, what: str, limit: int = MAX_NAME) -> None:
     """Raises ValueError for a name of a file or a recording that is too long, or holds control characters."""
-    shown = f"the {what} name '{printable(name, 40)}'"
+    shown = f"the {what} name '{printable_line(name, 40)}'"
     if len(name) > limit:
         raise ValueError(f"{shown} has {len(name)} characters, at most {limit} are allowed")
     if not name.isprintable():
         raise ValueError(f"{shown} holds control characters")
 
 
-def printable(text: str, limit: int = 600) -> str:
+def printable_line(text: str, limit: int = 600) -> str:
     """`text` for any terminal: one line, control characters escaped, the middle of a very long one left out."""
-    text = escaped(text)
+    text = escape_text(text)
     if len(text) <= limit:
         return text
     return f"{text[: limit // 2]} ... {text[-limit // 2 :]}"

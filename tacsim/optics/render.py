@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from tacsim.interface import Float32, Mask
 from tacsim.models.geometry import GelView
-from tacsim.models.photometric import CastShadows, DarknessModel, PhotometricLight, horizon, places_in_image
+from tacsim.models.photometric import CastShadows, DarknessModel, PhotometricLight, horizon_slope, image_grid_places
 from tacsim.models.scene import GelSurface
 from tacsim.models.sensor import Lighting, SensorModel
 from tacsim.optics.grid import PixelGrid, image_grid, image_strips
@@ -89,7 +89,7 @@ class Renderer:
             red, green, blue = self._mean.tolist()
             self._light = PhotometricLight(model.photometric, (red, green, blue))
             if model.texture > 0:
-                places = places_in_image(self._grid.columns, self._grid.rows)
+                places = image_grid_places(self._grid.columns, self._grid.rows)
                 self._unlit = self._unlit + self._light.change(self._texture, *places)[0]
 
     @property
@@ -342,9 +342,9 @@ def shadow_colours(light: PhotometricLight, shadows: CastShadows, table: Surface
     def height_at(x: Float32, y: Float32) -> Float32:
         return table.interpolate_at_rest(height, start_x + width * x, start_y + width * y) / width
 
-    horizons = [horizon(height_at, u, v * flat, lamp) for lamp in shadows.lamps]
+    horizons = [horizon_slope(height_at, u, v * flat, lamp) for lamp in shadows.lamps]
     rows, columns = (np.arange(n, dtype=np.float32) / SHADOW_STRIDE for n in table.fields.shape[:2])
-    return bilinear_lookup(light.shadow(horizons, u, v), np.stack(np.meshgrid(columns, rows), axis=-1))
+    return bilinear_lookup(light.shadow_change(horizons, u, v), np.stack(np.meshgrid(columns, rows), axis=-1))
 
 
 def darken_by_depth(model: DarknessModel, height: Float32, pitch: float) -> tuple[Float32, float]:

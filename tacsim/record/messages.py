@@ -19,7 +19,7 @@ from google.protobuf.message import DecodeError, Message
 from google.protobuf.timestamp_pb2 import Timestamp
 
 from tacsim.interface import Action, ArmState, Float32, Pose, SurfaceMap, TactileFrame
-from tacsim.models.text import printable
+from tacsim.models.text import printable_line
 from tacsim.record.episode import ArmPackages, EpisodeError, Recorded, Step
 from tacsim.record.images import decode_image, encode_png
 from tacsim.record.protobuf import (
@@ -175,7 +175,7 @@ def _step_message(step: Step) -> Any:
 def _last(messages: Messages, topic: str) -> bytes:
     found = messages.get(topic)
     if not found:
-        raise EpisodeError(f"a step names the message '{printable(topic, 200)}', which is not there")
+        raise EpisodeError(f"a step names the message '{printable_line(topic, 200)}', which is not there")
     return found[-1]
 
 

@@ -23,7 +23,7 @@ from datetime import datetime
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from tacsim.interface import RigSpec
-from tacsim.models.text import check_name, printable
+from tacsim.models.text import check_name, printable_line
 from tacsim.record.episode import EpisodeError, EpisodeMeta
 
 FORMAT = "2"  # of the file; raised when an old reader would misread a new file
@@ -85,12 +85,14 @@ def decode_meta(record: Mapping[str, str], what: str) -> tuple[EpisodeMeta, tupl
     try:
         task = values.get("task")
         meta = EpisodeMeta(
-            rig=printable(values["rig"]),
-            task=None if task is None else printable(task),
-            policy=printable(values["policy"]),
+            rig=printable_line(values["rig"]),
+            task=None if task is None else printable_line(task),
+            policy=printable_line(values["policy"]),
             seed=int(values["seed"]),
             spec=_SPEC.validate_json(values["spec"]),
-            versions={printable(k): printable(v) for k, v in _NAMES.validate_json(values["versions"]).items()},
+            versions={
+                printable_line(k): printable_line(v) for k, v in _NAMES.validate_json(values["versions"]).items()
+            },
             goal=_GOAL.validate_json(values["goal"]),
             started=datetime.fromisoformat(values["started"]) if "started" in values else None,
             wall_offset=int(values["wall_offset"]),
@@ -99,7 +101,7 @@ def decode_meta(record: Mapping[str, str], what: str) -> tuple[EpisodeMeta, tupl
         _check_parts(meta, attachments)
         return meta, attachments
     except (KeyError, ValueError, ValidationError) as failure:
-        raise EpisodeError(f"{what}: its metadata cannot be read: {printable(str(failure))}") from failure
+        raise EpisodeError(f"{what}: its metadata cannot be read: {printable_line(str(failure))}") from failure
 
 
 def _check_parts(meta: EpisodeMeta, attachments: tuple[str, ...]) -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tacsim.geometry.pressing_side import section
+from tacsim.geometry.pressing_side import section_lines
 from tacsim.interface import Float32, FloatArray, Mask, Pose
 from tacsim.models.scene import Gel, Shape
 from tacsim.optics.grid import PixelGrid
@@ -58,7 +58,7 @@ def _section(
     from PIL import Image as images
     from PIL import ImageDraw
 
-    lines = section(shape, pose, 1 - axis, float(lowest[1 - axis]))[:, :, [axis, 2]]
+    lines = section_lines(shape, pose, 1 - axis, float(lowest[1 - axis]))[:, :, [axis, 2]]
     wide = max(1.1 * gel.size[axis], min(2.2 * float(np.abs(lines[..., 0]).max(initial=0.0)), 2 * gel.size[axis]))
     scale = SUPERSAMPLED * WIDTH / wide  # [px/m]
     top = min(float(lines[..., 1].max(initial=0.0)) + 0.05 * wide, TALLEST * wide)

@@ -93,7 +93,10 @@ def require_same_gels(scene: Scene, other: Scene) -> None:
     }
     for name in scene.sensors:
         unchanging[f"gel.size of sensor '{name}' [m]"] = scene.gel_of(name).size, other.gel_of(name).size
-        unchanging[f"the size of elements of the gel of '{name}' [m]"] = scene.element_of(name), other.element_of(name)
+        unchanging[f"the size of elements of the gel of '{name}' [m]"] = (
+            scene.element_size_of(name),
+            other.element_size_of(name),
+        )
     for what, (now, new) in unchanging.items():
         if now != new:
             raise ValueError(f"a new scene must keep {what} of the rig's: {now}, got {new}; open another rig for it")

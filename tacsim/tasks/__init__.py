@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from tacsim.models.rig import KneadConfig, RepositionConfig, SqueezeConfig, TaskConfig, know_task
+from tacsim.models.rig import KneadConfig, RepositionConfig, SqueezeConfig, TaskConfig, register_task_config
 from tacsim.tasks.knead import Knead
 from tacsim.tasks.reposition import Reposition
 from tacsim.tasks.squeeze import Squeeze
@@ -51,7 +51,7 @@ def register_task(config: type[TaskConfig], task: Callable[[Any], Task]) -> None
 
     Raises ValueError for a config without a kind of its own.
     """
-    know_task(config)
+    register_task_config(config)
     _TASK_OF_CONFIG[config] = task
 
 

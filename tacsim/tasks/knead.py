@@ -79,7 +79,7 @@ class Knead(Task):
         body = self.config.scene.body
         if body is None:
             raise ValueError("task 'knead' needs a scene with a body, whose volume its solid has")
-        return shapes.volume(body.geometry)
+        return shapes.enclosed_volume(body.geometry)
 
     @cached_property
     def solid(self) -> Solid:

@@ -40,19 +40,19 @@ class Solid:
     @property
     def size(self) -> FloatArray:
         """(3,) along world x, y, z [m]."""
-        size: FloatArray = shapes.extent(self.geometry)[[2, 1, 0]]
+        size: FloatArray = shapes.bounding_size(self.geometry)[[2, 1, 0]]
         return size
 
     def distance(self, points: FloatArray) -> FloatArray:
         """Signed distance (n,) of points (n, 3), world axes, from its middle [m]; negative inside."""
-        distance: FloatArray = shapes.distance(self.geometry, points[:, [2, 1, 0]])
+        distance: FloatArray = shapes.shape_distance(self.geometry, points[:, [2, 1, 0]])
         return distance
 
     @cached_property
     def points(self) -> FloatArray:
         """Points (n, 3) that fill it evenly, world axes, from its middle [m]."""
         spacing = 2.0 * self.geometry.radius / ROD_CELLS
-        points: FloatArray = shapes.particles(self.geometry, spacing)[:, [2, 1, 0]]
+        points: FloatArray = shapes.lattice_particles(self.geometry, spacing)[:, [2, 1, 0]]
         return points
 
     @cached_property

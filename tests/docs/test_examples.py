@@ -13,7 +13,7 @@ import pytest
 from robot.deploy.control_loop import run_episode
 from robot.open import CodeNotFound, load_with_task, make_env, make_vector_env, open_rig
 from tacsim.config import ConfigError, json_schema
-from tacsim.models.rig import TASKS, TaskConfig, rigs_of_known_tasks
+from tacsim.models.rig import TASKS, TaskConfig, rebuild_rig_config
 from tacsim.tasks import make_task, register_task
 from tests.tacsim.gym.small import SMALL
 
@@ -29,7 +29,7 @@ def on_the_path() -> Iterator[None]:
     yield
     sys.path.remove(str(ROOT / "examples"))
     TASKS[:] = before  # as other tests expect it
-    rigs_of_known_tasks()
+    rebuild_rig_config()
 
 
 def test_the_docs_show_the_heart_of_the_example_as_it_is_and_it_is_short() -> None:

@@ -24,7 +24,7 @@ from calibration.light.labels import BLUR
 from calibration.light.press import BallPress, gaussian_blur, make_press, mean_reference_colour
 from calibration.light.refinement import RIM_BLUR
 from calibration.light.shadows import DentShade
-from tacsim.models.photometric import PhotometricLight, places_in_image
+from tacsim.models.photometric import PhotometricLight, image_grid_places
 
 FOLDS = 5
 WIDEST = (
@@ -69,7 +69,7 @@ def _error(press: BallPress, inside: ContactCircle, fit: LightFit, ball: float) 
     rows, columns = press.shape
     mean = mean_reference_colour(fit.reference)
     v, u = np.mgrid[:rows, :columns].astype(np.float64)
-    light, places = PhotometricLight(fit.forward), places_in_image(columns, rows)
+    light, places = PhotometricLight(fit.forward), image_grid_places(columns, rows)
     slopes = dent_gradient(u, v, press.circle, fit.thickness, ball, RIM_BLUR).astype(np.float32)
     height = (dent_height(u, v, press.circle, fit.thickness, ball) / columns).astype(np.float32)
     change = light.change(slopes, *places, height)[0].astype(np.float64)

@@ -20,8 +20,8 @@ from tacsim.models.photometric import (
     DepthColour,
     PhotometricModel,
     depth_terms,
-    place_in_image,
-    places_in_image,
+    image_axes,
+    image_grid_places,
     term_count,
 )
 from tacsim.models.scene import Sphere
@@ -53,8 +53,8 @@ def made_up(width: int) -> Calibration:
         depth=DepthColour(deepest=DEPTH / VIEW[0], weights=((-0.1, 0.05, 0.02),) * DEPTH_TERMS),
     )  # fmt: skip
     slopes = rng.uniform(-0.6, 0.6, (*shape, 2)).astype(np.float32)
-    change, _ = PhotometricLight(forward).change(slopes, *places_in_image(shape[1], shape[0]))
-    u, v = np.meshgrid(*place_in_image(shape[1], shape[0]))
+    change, _ = PhotometricLight(forward).change(slopes, *image_grid_places(shape[1], shape[0]))
+    u, v = np.meshgrid(*image_axes(shape[1], shape[0]))
     terms = inverse_features(change.reshape(-1, 3).astype(np.float64), 2 * u.ravel(), 2 * v.ravel())
     target = normal_of_slope(slopes.reshape(-1, 2).astype(np.float64))
     inverse = fit_inverse([(terms.T @ terms, terms.T @ target)], with_position=True)
@@ -94,7 +94,7 @@ def calibrated_render(width: int, repeat: int) -> list[Measurement]:
     sample = sample_surface(surface, image_grid(calibration.geometry))
     slopes, height = sample.gradient.astype(np.float64), sample.height.astype(np.float64) / VIEW[0]
     steep = np.maximum(np.hypot(slopes[..., 0], slopes[..., 1]) / forward.steepest, 1.0)
-    u, v = np.meshgrid(*place_in_image(image.shape[1], image.shape[0]))
+    u, v = np.meshgrid(*image_axes(image.shape[1], image.shape[0]))
     terms = photometric_features((slopes / steep[..., None]).reshape(-1, 2), u.ravel(), v.ravel(), DEGREE, POSITION)
     change = (terms @ np.array(forward.weights)).reshape(image.shape)
     assert forward.depth is not None

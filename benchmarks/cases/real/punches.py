@@ -87,14 +87,14 @@ class PunchRenderer:
     """Draws dents of a punch in calibrated light."""
 
     def __init__(self, fit: LightFit, labels: PressLabels) -> None:
-        from tacsim.models.photometric import PhotometricLight, places_in_image
+        from tacsim.models.photometric import PhotometricLight, image_grid_places
 
         self.reference = fit.reference
         self._still = fit.reference.astype(np.float32)
         self._mean = self._still.mean(axis=(0, 1))
         assert fit.forward is not None
         self._light = PhotometricLight(fit.forward, tuple(self._mean.tolist()))
-        self._places = places_in_image(self._still.shape[1], self._still.shape[0])
+        self._places = image_grid_places(self._still.shape[1], self._still.shape[0])
         self._blur = fit.forward.blur
         self._pitch, self._thickness = labels.pixel_pitch, labels.gel_thickness[0]
 

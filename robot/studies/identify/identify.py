@@ -16,7 +16,7 @@ from calibration.materials.presses import Noise, Press, downsample_press, merge_
 from robot.studies.identify.recordings import Recordings
 from robot.studies.identify.simulation import Simulation, coarser, scene_with
 from tacsim.interface import FloatArray
-from tacsim.models.material import lame
+from tacsim.models.material import elastic_constants
 from tacsim.models.scene import Scene
 
 Kind = Literal["gel", "body"]
@@ -65,7 +65,7 @@ def parameters_of(kind: Kind, scene: Scene) -> tuple[Parameter, ...]:
         )
     assert scene.body is not None
     material = scene.body.material
-    limit, (shear, _) = material.elastic_limit, lame(material)
+    limit, (shear, _) = material.elastic_limit, elastic_constants(material)
     strength = math.sqrt(1.5) * 2 * shear * limit if math.isfinite(limit) else YIELD_SHARE * material.youngs_modulus
     frictions = (
         Parameter(
@@ -120,7 +120,7 @@ def identify(
     error = COARSE_ERROR
     levels = [replace(exact, scene=coarser(start)), exact]
     coarse = levels[0].scene
-    layers = [2 * coarse.element_of(name) <= scene.gel_of(name).size[2] / 2 for name in scene.sensors]
+    layers = [2 * coarse.element_size_of(name) <= scene.gel_of(name).size[2] / 2 for name in scene.sensors]
     if kind == "body" and all(layers):  # else nothing is left of the gel
         levels.insert(0, replace(exact, scene=coarser(coarse)))
         error *= 2

@@ -8,7 +8,7 @@ import math
 from collections.abc import Sequence
 from itertools import pairwise
 
-from tacsim.geometry.shapes import extent
+from tacsim.geometry.shapes import bounding_size
 from tacsim.models.scene import Scene
 
 PRESS_DEPTH, SLIDE_DEPTH = 0.25, 0.2  # of the gel's thickness
@@ -48,8 +48,8 @@ def motions(scene: Scene) -> dict[str, str]:
             "slide": _table("lower", _slid(SLIDE_DEPTH * thickness)),
         }
     assert scene.body is not None
-    height = float(extent(scene.body.geometry)[2])
-    width = float(extent(scene.body.geometry)[0])
+    height = float(bounding_size(scene.body.geometry)[2])
+    width = float(bounding_size(scene.body.geometry)[0])
     return {
         "squeeze": _table("upper", _squeezed(height)),
         "slide": _table("upper", _dragged(height)),

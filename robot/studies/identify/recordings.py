@@ -15,7 +15,7 @@ from calibration.materials.presses import Press
 from robot.rig.replay_rig import open_replay, recorded_rig
 from robot.studies.identify.simulation import Seen, shape_signals
 from tacsim import pose as se3
-from tacsim.geometry.shapes import lowest_below
+from tacsim.geometry.shapes import depth_below_centre
 from tacsim.interface import Action, EndOfEpisode, FloatArray, Observation, Pose
 from tacsim.models.hardware import UrArmConfig, parts_of
 from tacsim.models.rig import ReplayArmConfig, ReplaySensorConfig, RigConfig
@@ -72,7 +72,9 @@ class Recordings:
         """From the lowest point of the indenter to its centre [m]."""
         assert self.scene.indenter is not None
         indenter = self.scene.indenter
-        own = lowest_below(indenter.geometry, indenter.turn, indenter.rounding(self.scene.element))
+        own = depth_below_centre(
+            indenter.geometry, indenter.turn, indenter.effective_edge_radius(self.scene.effective_element_size)
+        )
         return self._balls.get(_name(path), own)
 
     # ------------------------------------------------------------------ tables

@@ -18,7 +18,7 @@ from robot.common.whole_file import whole_folder
 from robot.studies.identify.identify import Identified
 from robot.studies.identify.motions import WHAT_TELLS
 from tacsim.interface import FloatArray
-from tacsim.models.text import printable
+from tacsim.models.text import printable_line
 from tacsim.report.figure import COLOURS, INK, QUIET, canvas, plain, save
 
 UNITS = {"youngs_modulus": ("kPa", 1e-3), "yield_stress": ("kPa", 1e-3), "hardening_modulus": ("kPa", 1e-3)}
@@ -92,7 +92,7 @@ def as_json(identified: Identified) -> dict[str, Any]:
 
 
 def _origin(identified: Identified) -> str:
-    names = [printable(press.name) for press in identified.presses]
+    names = [printable_line(press.name) for press in identified.presses]
     what = "presses" if identified.kind == "gel" else "squeezes"
     held = ", ".join(each.name for each in identified.fit.unidentified)
     kept = f" Not told by them, as it was before: {held}." if held else ""

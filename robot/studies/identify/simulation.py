@@ -13,7 +13,7 @@ from calibration.materials.estimate import CannotSimulate
 from calibration.materials.fit import Parameter, Point
 from calibration.materials.presses import Press
 from tacsim import pose as se3
-from tacsim.geometry.shapes import lowest_below
+from tacsim.geometry.shapes import depth_below_centre
 from tacsim.interface import FloatArray, Pose
 from tacsim.models.scene import Box, Scene, Shape, Sphere
 from tacsim.models.sensor import CanonicalGrid, Markers
@@ -142,7 +142,7 @@ class Simulation:
         stated = scene.indenter.geometry if ball is None else Sphere(radius=ball)
         shape = resized(stated, math.exp(size)) if size else stated
         indenter = scene.indenter.model_copy(update={"geometry": shape})
-        higher = lowest_below(shape, indenter.turn) - lowest_below(stated, indenter.turn)
+        higher = depth_below_centre(shape, indenter.turn) - depth_below_centre(stated, indenter.turn)
         return scene.model_copy(update={"indenter": indenter}), higher
 
     def _signals(self, batch: Batch, member: int, press: Press) -> list[float]:
@@ -236,6 +236,6 @@ def coarser(scene: Scene) -> Scene:
         for name, own in scene.gels.items()
     }
     own = {name for name, each in gels.items() if each.element_size is not None}
-    element = min([2 * scene.element, *(layers[name] for name in scene.sensors if name not in own)])
+    element = min([2 * scene.effective_element_size, *(layers[name] for name in scene.sensors if name not in own)])
     update = {"element_size": element, "particle_spacing": 2 * scene.spacing, "gels": gels}
     return scene.model_copy(update=update)

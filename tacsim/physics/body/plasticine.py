@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tacsim.models.material import BodyMaterial, lame
+from tacsim.models.material import BodyMaterial, elastic_constants
 from tacsim.physics.body.followers import Links, links, node_masses
 from tacsim.physics.body.material import UNREACHABLE_LIMIT
 from tacsim.physics.body.tuning import STENCIL_REACH
@@ -53,7 +53,7 @@ class BodyParams:
 
 def body_params(material: BodyMaterial, spacing: float, volume: float | None = None) -> BodyParams:
     """`spacing` [m]; `volume` of one particle [m^3], without it spacing^3."""
-    mu, lam = lame(material)
+    mu, lam = elastic_constants(material)
     limit = material.elastic_limit
     return BodyParams(
         spacing * MM, mu * MPA, (lam + 2 * mu / 3) * MPA, limit if math.isfinite(limit) else UNREACHABLE_LIMIT,

@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tacsim.geometry.shapes import distance, outward_normals
+from tacsim.geometry.shapes import outward_normals, shape_distance
 from tacsim.models.scene import Shape
 from tacsim.physics.body.tuning import MIN_SURFACE_DISTANCE, SURFACE_DEPTH
 
@@ -23,9 +23,9 @@ def tangent_planes(geometry: Shape, points: NDArray[np.float64], spacing: float)
     """Planes m (n, 3) [1/m] of body particles at `points` (n, 3) [m], the shape's own frame; zero deep inside.
 
     Where several faces are equally near (the edge of a box), n is their mean direction.
-    Raises what :func:`tacsim.geometry.shapes.distance` raises.
+    Raises what :func:`tacsim.geometry.shapes.shape_distance` raises.
     """
-    depth = -distance(geometry, points)
+    depth = -shape_distance(geometry, points)
     outer = np.flatnonzero(depth <= SURFACE_DEPTH * spacing)
     planes = np.zeros((len(points), 3))
     normals = outward_normals(geometry, points[outer])

@@ -12,7 +12,7 @@ from functools import partial
 
 import numpy as np
 
-from tacsim.models.material import lame
+from tacsim.models.material import elastic_constants
 from tacsim.models.scene import Gel, GelSurface
 from tacsim.physics.exec.lanes import COPIES, LANES, ON_DEVICE, PARTS, aligned_zeros, padded
 from tacsim.physics.exec.layout import (
@@ -82,7 +82,7 @@ def gel_params(gel: Gel, element: float) -> GelParams:
             f"gel size {gel.size} m makes {nx} x {ny} x {layers} elements of {spacing * 1e3:.4g} mm; its surface is a "
             f"spline and needs two along each axis: choose an element_size of at most {most * 1e3:.4g} mm"
         )
-    mu, lam = lame(gel.material)
+    mu, lam = elastic_constants(gel.material)
     return GelParams((nx, ny, layers), spacing * MM, mu * MPA, lam * MPA)
 
 

@@ -19,8 +19,8 @@ from scipy.spatial.transform import Rotation
 from tacsim.compute.runtime import launching, start
 from tacsim.geometry.sampling import body_points
 from tacsim.interface import Pose, Truth
-from tacsim.models.material import BodyMaterial, GelMaterial, lame
-from tacsim.models.scene import FASTEST_MACH, Gel, GelSurface, Scene
+from tacsim.models.material import BodyMaterial, GelMaterial, elastic_constants
+from tacsim.models.scene import MAX_MACH, Gel, GelSurface, Scene
 from tacsim.physics.body.material import UNREACHABLE_LIMIT
 from tacsim.physics.exec.layout import NUMBERS
 from tacsim.physics.failure.health import Health, LaunchSpan, SimulationDiverged, check_launch, require_room
@@ -76,7 +76,7 @@ def gel_lattice(gel: Gel, spacing: float) -> Lattice:
 
 def solid(material: GelMaterial | BodyMaterial, volume: float) -> Any:
     """Kernel constants of a material for particles of `volume` [mm^3]; density lambda + 2 mu makes the wave speed 1."""
-    mu, lam = (modulus * MPA for modulus in lame(material))
+    mu, lam = (modulus * MPA for modulus in elastic_constants(material))
     limit = min(material.elastic_limit, UNREACHABLE_LIMIT) if isinstance(material, BodyMaterial) else UNREACHABLE_LIMIT
     mass = (lam + 2 * mu) * volume
     return Solid(mass=mass, volume=volume, mu=mu, lam=lam, limit=limit)  # type: ignore[call-arg]  # a Taichi dataclass
@@ -269,7 +269,7 @@ class SeedWorld(BaseWorld):
         if len(body):
             low = np.minimum(low, np.maximum(body.min(axis=0), low - side))
             high = np.maximum(high, np.minimum(body.max(axis=0), high + side))
-        margin = GRID_MARGIN * self._dx + 2 * max(self._mach, FASTEST_MACH) * (last - first) * self._dt
+        margin = GRID_MARGIN * self._dx + 2 * max(self._mach, MAX_MACH) * (last - first) * self._dt
         room = [*(low - margin), faces.min()], [*(high + margin), faces.max()]
         require_room(np.array(room[0]), np.array(room[1]), self._dx, where)
         layers = self._fit_layers(faces)

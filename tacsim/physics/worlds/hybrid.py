@@ -9,7 +9,7 @@ from functools import partial
 
 import numpy as np
 
-from tacsim.geometry.shapes import extent
+from tacsim.geometry.shapes import bounding_size
 from tacsim.interface import Pose, Truth
 from tacsim.models.scene import Scene
 from tacsim.physics.body.moments import Moments
@@ -91,7 +91,7 @@ class HybridWorld(FemWorld):
         self._gels, self._body = self._state.gel[index], self._state.body[index]
         self.yields = math.isfinite(scene.body.material.elastic_limit)
         self.max_force_loss = MAX_FORCE_LOSS * self._body.spacing / max(gel.thickness for gel in self._gels)
-        height = float(extent(scene.body.geometry)[2])
+        height = float(bounding_size(scene.body.geometry)[2])
         self._poses = {
             "lower": Pose(),
             "upper": Pose(np.array([0.0, 0.0, height + 2 * INITIAL_GAP]), HALF_TURN_X.quaternion),
@@ -176,7 +176,7 @@ class HybridWorld(FemWorld):
             short=SHORT_PATH if self.yields else SHORT_SLIDE, shortest=drag if scene.settling.mach is None else 0.0,
         )  # fmt: skip
         path = replace(path, dragging=along > MIN_DRAG_SHARE * path_length(start, end, lever))
-        if self.yields and path.peak_mach(lever) > MAX_YIELDING_OVERSPEED * scene.fastest_mach:
+        if self.yields and path.peak_mach(lever) > MAX_YIELDING_OVERSPEED * scene.max_mach:
             self.unfollowed = "the speed itself makes the body yield; leave out settling.mach, or lower it"
         elif drag > MAX_DRAG_OVERSPEED * path.substeps * path.dt:
             self.unfollowed = "the body slips by its inertia at that speed; leave out settling.mach, or lower it"
@@ -278,7 +278,7 @@ class HybridWorld(FemWorld):
 
     def _judged(self, stats: MoveStats) -> MoveStats:
         assert self.scene.body is not None
-        layers = self._squashed * float(extent(self.scene.body.geometry)[2]) / self.scene.spacing
+        layers = self._squashed * float(bounding_size(self.scene.body.geometry)[2]) / self.scene.spacing
         few = layers < MIN_LAYERS
         if few:
             warn_of_few_layers()

@@ -9,7 +9,7 @@ import numpy as np
 
 from tacsim.compute.runtime import start
 from tacsim.geometry.sampling import body_points
-from tacsim.geometry.shapes import extent, volume
+from tacsim.geometry.shapes import bounding_size, enclosed_volume
 from tacsim.models.scene import Scene
 from tacsim.physics.body.moments import Moments, moments_of
 from tacsim.physics.body.plasticine import BodyParams, BodyState, body_params, centre_of
@@ -142,14 +142,14 @@ class HybridState(FemState):
 
 
 def _gels_of(scene: Scene) -> tuple[GelParams, ...]:
-    return tuple(gel_params(scene.gel_of(name), scene.element_of(name)) for name in scene.sensors)
+    return tuple(gel_params(scene.gel_of(name), scene.element_size_of(name)) for name in scene.sensors)
 
 
 def _body_at_start(scene: Scene) -> tuple[BodyParams, np.ndarray, np.ndarray]:
     """A scene's body: parameters, particles at construction (n, 3) [mm], their tangent planes (n, 3) [1/mm]."""
     assert scene.body is not None
-    height = float(extent(scene.body.geometry)[2])
+    height = float(bounding_size(scene.body.geometry)[2])
     points = body_points(scene.body, scene.spacing)
-    body = body_params(scene.body.material, scene.spacing, volume=volume(scene.body.geometry) / len(points))
+    body = body_params(scene.body.material, scene.spacing, volume=enclosed_volume(scene.body.geometry) / len(points))
     planes = tangent_planes(scene.body.geometry, points, scene.spacing) / MM
     return body, (points + [0.0, 0.0, height / 2 + INITIAL_GAP]) * MM, planes

@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from tacsim.geometry.shapes import edge_radius, edges, farthest, lowest_below
+from tacsim.geometry.shapes import depth_below_centre, edge_points, edge_radius, farthest_point
 from tacsim.interface import Pose
 from tacsim.models.scene import GelSurface, Mesh, Scene
 from tacsim.physics.contact.indenter import POINTS, SPLINE_SMOOTHING
@@ -113,7 +113,7 @@ class PressWorld(FemWorld):
         self._rates = np.zeros((2, 6))
         # where the indenter was over the gel when it last did not touch it, and how far it has been slid since [mm]
         self._touched = np.zeros(3)
-        self._edges = edges(scene.indenter.geometry, scene.element)
+        self._edges = edge_points(scene.indenter.geometry, scene.effective_element_size)
         turned = scene.indenter.turn
         above = self.below(turned) + INITIAL_GAP
         self._poses = {"lower": Pose(), "indenter": Pose(np.array([0.0, 0.0, above]), turned)}
@@ -175,9 +175,9 @@ class PressWorld(FemWorld):
                 depth=depth,
                 shear_mach=faster * path.peak_mach(lever) / self._shear,
                 friction=indenter.friction,
-                edge_radius=MM * edge_radius(indenter, self.scene.element) if walls else math.inf,
+                edge_radius=MM * edge_radius(indenter, self.scene.effective_element_size) if walls else math.inf,
             )
-            self.unfollowed = slide.unfollowed(min(self.scene.element * MM, gel.spacing), gel.thickness)
+            self.unfollowed = slide.unfollowed(min(self.scene.effective_element_size * MM, gel.spacing), gel.thickness)
         return replace(path, growing=growing, turning=turning, unfollowed=self.unfollowed)
 
     def _edges_touch(self, at: Pose, bulge: float) -> bool:
@@ -199,7 +199,9 @@ class PressWorld(FemWorld):
         if mesh is not None and turn[:2].any():
             return float((mesh.vertices @ rotate(inverse(Pose(quaternion=turn)), [0.0, 0.0, -1.0])).max())
         indenter = self.scene.indenter
-        return lowest_below(indenter.geometry, turn, indenter.rounding(self.scene.element))
+        return depth_below_centre(
+            indenter.geometry, turn, indenter.effective_edge_radius(self.scene.effective_element_size)
+        )
 
     def prepare(self, launch: Launch) -> PreparedLaunch:
         """Sets this environment's parameters. Raises SimulationDiverged where too much of a mesh could be touched."""
@@ -284,7 +286,16 @@ class PressWorld(FemWorld):
                 return
             tip = lowest * MM
         else:
-            tip = rows[:3] @ (farthest(geometry, down, self.scene.indenter.rounding(self.scene.element)) * MM) + rows[3]
+            tip = (
+                rows[:3]
+                @ (
+                    farthest_point(
+                        geometry, down, self.scene.indenter.effective_edge_radius(self.scene.effective_element_size)
+                    )
+                    * MM
+                )
+                + rows[3]
+            )
             if (np.abs(tip[:2]) > half).any():
                 return
         nodes = self._surface_nodes()

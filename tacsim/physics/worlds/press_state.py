@@ -8,8 +8,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from tacsim.compute.runtime import start
-from tacsim.geometry.shapes import MAX_NODES, turned_extent
-from tacsim.geometry.tiles import TILE, TiledDistance, tiled_distance
+from tacsim.geometry.shapes import MAX_NODES, rotated_bounding_size
+from tacsim.geometry.tiles import TILE_NODES, TiledDistance, cached_tiled_distance
 from tacsim.models.scene import Box, Cylinder, Indenter, Scene, Shape, Sphere
 from tacsim.physics.contact.distance import BOX, CYLINDER, GRID, SPHERE
 from tacsim.physics.contact.indenter import (
@@ -47,7 +47,7 @@ class PressState(FemState):
     def __init__(self, scenes: Sequence[Scene]) -> None:
         """Raises ValueError for gels that are not cut alike, and an indenter too fine for them."""
         start()
-        self.gel = [gel_params(scene.gel, scene.element) for scene in scenes]
+        self.gel = [gel_params(scene.gel, scene.effective_element_size) for scene in scenes]
         self._gels = GelState(common_lattices([(gel,) for gel in self.gel]), len(scenes))
         nx, ny, _ = self.gel[0].elements
         self._anchor = np.zeros((len(scenes), nx * POINTS, ny * POINTS, 3), np.float32)
@@ -84,7 +84,7 @@ class PressState(FemState):
         _require_resolved(scene.indenter, self.gel[index])
         kind, size, mesh = _shape_params(scene.indenter.geometry)
         self.counts[index, KIND], self.params[index, SHAPE : SHAPE + 3] = kind, size
-        self.params[index, EDGE_RADIUS] = scene.indenter.rounding(scene.element) * MM
+        self.params[index, EDGE_RADIUS] = scene.indenter.effective_edge_radius(scene.effective_element_size) * MM
         self.params[index, SHAPE_SPACING] = MESH_GRID_SPACING * MM
         if mesh is not None:
             self.params[index, SHAPE_ORIGIN : SHAPE_ORIGIN + 3] = mesh.origin * MM
@@ -98,13 +98,15 @@ class PressState(FemState):
         """
         mesh = self.meshes[index]
         assert mesh is not None
-        first, end = mesh.around(low / MM, high / MM)
+        first, end = mesh.tile_range(low / MM, high / MM)
         old = self._tiles.get(index)
         if old is not None:
             if (first >= old[0]).all() and (end <= old[1]).all():
                 return
             both = np.minimum(first, old[0]), np.maximum(end, old[1])
-            if np.prod(TILE * (both[1] - both[0]).astype(float)) <= min(MAX_NODES, MAX_NUMBERS // len(self._values)):
+            if np.prod(TILE_NODES * (both[1] - both[0]).astype(float)) <= min(
+                MAX_NODES, MAX_NUMBERS // len(self._values)
+            ):
                 first, end = both
         values = mesh.values(first, end) * np.float32(MM)
         held = self._values.shape[1:]
@@ -115,7 +117,7 @@ class PressState(FemState):
             self._values = grown
         nx, ny, nz = values.shape
         self._values[index, :nx, :ny, :nz] = values
-        self.counts[index, SHAPE_FIRST : SHAPE_FIRST + 3] = TILE * first
+        self.counts[index, SHAPE_FIRST : SHAPE_FIRST + 3] = TILE_NODES * first
         self.counts[index, SHAPE_NODES : SHAPE_NODES + 3] = values.shape
         self._tiles[index] = first, end
         self._covered += 1
@@ -135,7 +137,7 @@ class PressState(FemState):
 def _require_resolved(indenter: Indenter, gel: GelParams) -> None:
     """Raises ValueError for an indenter that fits between the points at which the gel's surface feels it."""
     geometry = indenter.geometry
-    size = turned_extent(geometry, indenter.model_copy(update={"yaw": 0.0}).turn)  # no width depends on the yaw
+    size = rotated_bounding_size(geometry, indenter.model_copy(update={"yaw": 0.0}).turn)  # no width depends on the yaw
     narrow, spacing = float(size[:2].min()) * MM, gel.spacing / POINTS
     if narrow < math.sqrt(2.0) * spacing:
         layers = math.ceil(gel.thickness / (narrow * POINTS / math.sqrt(2.0)))
@@ -155,5 +157,5 @@ def _shape_params(geometry: Shape) -> tuple[int, tuple[float, ...], TiledDistanc
             return CYLINDER, (geometry.radius * MM, 0.0, geometry.height / 2 * MM), None
         case Box():
             return BOX, tuple(side / 2 * MM for side in geometry.size), None
-    mesh = tiled_distance(geometry, MESH_GRID_SPACING)
+    mesh = cached_tiled_distance(geometry, MESH_GRID_SPACING)
     return GRID, tuple(float(side) * MM for side in mesh.half), mesh

@@ -15,12 +15,12 @@ from tacsim.models.photometric import (
     DepthColour,
     PhotometricLight,
     PhotometricModel,
-    horizon,
-    places_in_image,
+    horizon_slope,
+    image_grid_places,
 )
 
 ROWS, COLUMNS = 120, 160
-U, V = places_in_image(COLUMNS, ROWS)
+U, V = image_grid_places(COLUMNS, ROWS)
 Y, X = np.mgrid[:ROWS, :COLUMNS].astype(np.float32)
 ANSWER = np.array([[0.8, -0.4, -0.4], [0.0, 0.7, -0.7]])  # of R, G, B to nx, ny: three lamps
 LAMPS = ((1.0, 0.0), (-0.5, 0.9), (-0.5, -0.9))
@@ -57,7 +57,7 @@ def seen(height: np.ndarray, of: PhotometricModel) -> np.ndarray:
             return cv2.remap(height, *place, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) / np.float32(COLUMNS)
 
         flat = np.float32(ROWS / COLUMNS)
-        colour = colour + light.shadow([horizon(at, U, V * flat, lamp) for lamp in of.shadows.lamps], U, V)
+        colour = colour + light.shadow_change([horizon_slope(at, U, V * flat, lamp) for lamp in of.shadows.lamps], U, V)
     return np.ascontiguousarray(np.moveaxis(colour, -1, 0))
 
 

@@ -10,7 +10,7 @@ from calibration.light.calibrator import calibrate_light
 from calibration.light.dent import ContactCircle, dent_gradient
 from calibration.light.fit import LightFit, normal_angle
 from calibration.markers.dots import DotEraser
-from tacsim.models.photometric import PhotometricLight, place_in_image, places_in_image
+from tacsim.models.photometric import PhotometricLight, image_axes, image_grid_places
 from tests.calibration.dotted import draw, lattice_points
 from tests.calibration.presses import BALL_PX, COLUMNS, PITCH, ROWS, HiddenSensor, Made
 
@@ -25,7 +25,7 @@ def found_slopes(fit: LightFit, image: np.ndarray) -> np.ndarray:
 
     reference = fit.reference.astype(np.float32)
     change = cv2.GaussianBlur((image - reference) / reference.mean(axis=(0, 1)), (0, 0), 1.2)
-    u, v = place_in_image(COLUMNS, ROWS)
+    u, v = image_axes(COLUMNS, ROWS)
     slopes, _ = PolynomialSlopes(fit.inverse, *np.meshgrid(2 * u, 2 * v))(change)
     return slopes
 
@@ -109,7 +109,7 @@ def test_any_presses_give_the_same_circles(spread: float) -> None:
 def test_forward_model_draws_an_unseen_press(sensor: HiddenSensor, calibrated: tuple[LightFit, list[Made]]) -> None:
     fit, _ = calibrated
     unseen = sensor.press(0.45e-3, 140, 110)
-    places = places_in_image(COLUMNS, ROWS)
+    places = image_grid_places(COLUMNS, ROWS)
     change, _ = PhotometricLight(fit.forward).change(unseen.gradient.astype(np.float32), *places)
     drawn = fit.reference + change * fit.reference.mean(axis=(0, 1))
     v, u = np.mgrid[:ROWS, :COLUMNS]

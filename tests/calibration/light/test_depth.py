@@ -11,7 +11,7 @@ from calibration.light.fit import LightFit
 from calibration.light.labels import counted_pixels
 from calibration.light.photometry import SLOPE_TERMS, ModelSize
 from calibration.light.press import BallPress, gaussian_blur
-from tacsim.models.photometric import DEPTH_TERMS, PhotometricLight, places_in_image
+from tacsim.models.photometric import DEPTH_TERMS, PhotometricLight, image_grid_places
 from tacsim.optics.render import phong_shading
 from tests.calibration.presses import BALL_PX, COLUMNS, PITCH, ROWS, HiddenSensor, Made
 
@@ -40,7 +40,7 @@ def drawn(fit: LightFit, slopes: np.ndarray, height: np.ndarray) -> np.ndarray:
     """(H, W, 3) grey levels of a surface of this height [m]."""
     assert fit.forward is not None
     light = PhotometricLight(fit.forward, tuple(fit.reference.mean(axis=(0, 1)).tolist()))
-    places = places_in_image(COLUMNS, ROWS)
+    places = image_grid_places(COLUMNS, ROWS)
     change = light.change(slopes.astype(np.float32), *places, (height / (PITCH * COLUMNS)).astype(np.float32))[0]
     return fit.reference + gaussian_blur(change.astype(float), fit.forward.blur)
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from calibration.light.calibrator import calibrate_light
-from tacsim.models.photometric import PhotometricLight, horizon, places_in_image
+from tacsim.models.photometric import PhotometricLight, horizon_slope, image_grid_places
 from tests.calibration.presses import BALL_PX, COLUMNS, PITCH, ROWS, HiddenSensor
 
 DISTANCE = 1.1  # of the lamps from the middle [widths of the picture]
@@ -60,7 +60,7 @@ def test_shadows_are_found_and_hold_for_what_is_no_ball(monkeypatch: pytest.Monk
     bar = 6 / (1 + np.exp((np.abs(across) - 9) / 3)) / (1 + np.exp((np.abs(along) - 30) / 3))
     slopes = np.stack(np.gradient(bar)[::-1], axis=-1)
     change = in_shade(sensor.photograph(slopes), bar, lamps).astype(float) - sensor.empty()
-    u, v = places_in_image(COLUMNS, ROWS)
+    u, v = image_grid_places(COLUMNS, ROWS)
 
     def height(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         at = [(each * COLUMNS + (n - 1) / 2).astype(np.float32) for each, n in ((x, COLUMNS), (y, ROWS))]
@@ -72,7 +72,9 @@ def test_shadows_are_found_and_hold_for_what_is_no_ball(monkeypatch: pytest.Monk
         light = PhotometricLight(each.forward, tuple(sensor.empty().mean(axis=(0, 1)).tolist()))
         predicted = light.change(slopes.astype(np.float32), u, v)[0]
         if each.forward.shadows is not None:
-            towards = [horizon(height, u, v * np.float32(ROWS / COLUMNS), lamp) for lamp in each.forward.shadows.lamps]
-            predicted = predicted + light.shadow(towards, u, v)
+            towards = [
+                horizon_slope(height, u, v * np.float32(ROWS / COLUMNS), lamp) for lamp in each.forward.shadows.lamps
+            ]
+            predicted = predicted + light.shadow_change(towards, u, v)
         off.append(np.abs(predicted - change)[cast(bar, lamps).max(axis=2) > 0.2].mean())
     assert off[0] < 0.5 * off[1]  # 2.4 and 7.1 grey levels

@@ -21,7 +21,7 @@ from robot.studies.press import UNFELT, PressMotion, press
 from tacsim import pose as se3
 from tacsim.config import load_scene, load_sensor
 from tacsim.geometry.mesh import load_mesh
-from tacsim.geometry.shapes import distance
+from tacsim.geometry.shapes import shape_distance
 from tacsim.interface import Pose
 from tacsim.models.scene import Mesh, Scene, Sphere
 from tacsim.optics.markers import rest_positions
@@ -65,7 +65,7 @@ def test_pose_depth_and_contact_agree(tmp_path: Path) -> None:
     grid = np.stack(np.meshgrid(np.arange(320) - 159.5, np.arange(240) - 119.5), axis=-1) * 0.0625e-3
     assert row["depth"] == pytest.approx(sphere.radius - row["position"][2], abs=1e-12)
     points = np.dstack([grid, -np.array(row["height"])])[contact] - row["position"]
-    assert np.median(np.abs(distance(sphere, points))) < 0.02e-3
+    assert np.median(np.abs(shape_distance(sphere, points))) < 0.02e-3
     assert np.linalg.norm(grid[contact].mean(axis=0) - row["position"][:2]) < 0.1e-3
     assert row["contact_area"] == pytest.approx(contact.sum() * 0.0625e-3**2)
 
@@ -95,7 +95,7 @@ def test_a_tilted_object_reaches_as_deep_as_it_shall() -> None:
     _, scene, motion = made.placed(1)
     assert scene.indenter is not None and motion.turn is not None
     pressed = press(scene, made.sensor, motion)
-    radius = scene.indenter.rounding(scene.element)
+    radius = scene.indenter.effective_edge_radius(scene.effective_element_size)
     corners = (np.array([4e-3, 5e-3, 5e-3]) / 2 - radius) * (2 * np.indices((2, 2, 2)).reshape(3, -1).T - 1)
     lowest = se3.transform(pressed.pose, corners)[:, 2].min() - radius
     assert lowest == pytest.approx(-motion.depth, abs=1e-9)

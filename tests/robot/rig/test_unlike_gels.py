@@ -130,5 +130,5 @@ def test_a_dump_holds_both_gels(rig_file: Path, monkeypatch: pytest.MonkeyPatch)
 def test_identification_coarsens_both_gels() -> None:
     gels = "gels={upper: {size: [20 mm, 20 mm, 2 mm], element_size: 0.25 mm}, lower: {material: {density: 900}}}"
     scene = coarser(load_scene("squeeze", [gels, "preset=standard"]))
-    assert (scene.element_of("lower"), scene.element_of("upper")) == (1e-3, 0.5e-3)
-    assert coarser(coarser(scene)).element_of("upper") == 1e-3  # two layers
+    assert (scene.element_size_of("lower"), scene.element_size_of("upper")) == (1e-3, 0.5e-3)
+    assert coarser(coarser(scene)).element_size_of("upper") == 1e-3  # two layers

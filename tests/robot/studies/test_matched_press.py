@@ -118,7 +118,7 @@ def test_ball_and_gel_are_those_of_the_bundle_unless_given(frames: FrameSet, tmp
         assert "enough" in result.output
         assert asked[-1].gel.size == pytest.approx(size)
         assert asked[-1].indenter.geometry.radius == pytest.approx(radius)
-        assert asked[-1].element == pytest.approx(element)
+        assert asked[-1].effective_element_size == pytest.approx(element)
         assert f"a ball of {radius * 1e3:.4g} mm radius" in result.output and "gel" in result.output
 
 

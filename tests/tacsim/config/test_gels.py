@@ -20,8 +20,10 @@ gels:
 """
     scene = load_scene(write("a.yaml", text))
     lower, upper = scene.gel_of("lower"), scene.gel_of("upper")
-    assert lower == scene.gel and scene.element_of("lower") == 1e-3
-    assert upper.size == pytest.approx((16e-3, 24e-3, 2e-3)) and scene.gel_element("upper") == pytest.approx(0.5e-3)
+    assert lower == scene.gel and scene.element_size_of("lower") == 1e-3
+    assert upper.size == pytest.approx((16e-3, 24e-3, 2e-3)) and scene.fitted_element_size("upper") == pytest.approx(
+        0.5e-3
+    )
     assert (upper.material.youngs_modulus, upper.material.poisson_ratio) == (0.2e6, 0.45)  # the first is the gel's
     assert upper.housing == lower.housing == 0.3e-3
 

@@ -10,8 +10,8 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from tacsim.geometry.pressing_side import SIDES, describe_side, pressing_side, section
-from tacsim.geometry.shapes import extent, lowest_below, turned_extent
+from tacsim.geometry.pressing_side import SIDES, describe_side, find_pressing_side, section_lines
+from tacsim.geometry.shapes import bounding_size, depth_below_centre, rotated_bounding_size
 from tacsim.interface import Pose
 from tacsim.models.scene import Box, Cylinder, Indenter, Mesh, Shape, Sphere
 
@@ -47,7 +47,7 @@ def test_the_side_that_is_asked_for_is_the_one_that_is_down(side: str, bar: Mesh
     assert Rotation.from_quat(indenter.turn).apply(outward) == pytest.approx([0, 0, -1], abs=1e-12)
     size = sorted(np.delete([2, 4, 8], AXES[side[1]]), reverse=True)
     assert describe_side(indenter) == f"{side} of bar.stl, a flat face of {size[0]} x {size[1]} mm"
-    assert pressing_side(indenter).lowest_point == pytest.approx(extent(bar) / 2 * outward, abs=1e-9)
+    assert find_pressing_side(indenter).lowest_point == pytest.approx(bounding_size(bar) / 2 * outward, abs=1e-9)
 
 
 def test_points_edges_and_other_directions_are_named(cone: Mesh, bar: Mesh) -> None:
@@ -71,13 +71,13 @@ def test_size_and_depth_of_what_is_turned(shape: Shape | None, bar: Mesh) -> Non
         "sphere": lambda: trimesh.creation.icosphere(5, 3e-3),
     }
     points = Rotation.from_quat(turn).apply(made.get(geometry.shape, made["box"])().vertices)
-    assert turned_extent(geometry, turn) == pytest.approx(np.ptp(points, axis=0), rel=1e-3)
-    assert lowest_below(geometry, turn) == pytest.approx(-points[:, 2].min(), rel=1e-3)
+    assert rotated_bounding_size(geometry, turn) == pytest.approx(np.ptp(points, axis=0), rel=1e-3)
+    assert depth_below_centre(geometry, turn) == pytest.approx(-points[:, 2].min(), rel=1e-3)
 
 
 def test_a_section_lies_in_its_plane_and_closes(cone: Mesh) -> None:
     pose = Pose(np.array([1e-3, 2e-3, 5e-3]), Indenter(roll=math.pi).turn)
-    lines = section(cone, pose, 1, 2e-3)
+    lines = section_lines(cone, pose, 1, 2e-3)
     assert np.ptp(lines[..., 1]) < 1e-12
     assert lines[..., 2].min() == pytest.approx(2e-3) and lines[..., 2].max() == pytest.approx(8e-3)
     assert np.ptp(lines[..., 0]) == pytest.approx(6e-3, rel=1e-2)

@@ -9,8 +9,8 @@ import pytest
 import trimesh
 from scipy.spatial import KDTree
 
-from tacsim.geometry.sampling import body_points, scattered
-from tacsim.geometry.shapes import distance, particles, volume
+from tacsim.geometry.sampling import blue_noise_points, body_points
+from tacsim.geometry.shapes import enclosed_volume, lattice_particles, shape_distance
 from tacsim.models.scene import Body, Box, Cylinder, Mesh, Shape, Sphere
 
 MM = 1e-3
@@ -25,12 +25,12 @@ def ball(folder: Path) -> Mesh:
 
 def check_random(geometry: Shape) -> None:
     found = body_points(Body(geometry=geometry, sampling="random"), SPACING)
-    assert (distance(geometry, found) < 0).all()
-    assert len(found) * SPACING**3 == pytest.approx(volume(geometry), rel=0.05)  # each is given volume / n
+    assert (shape_distance(geometry, found) < 0).all()
+    assert len(found) * SPACING**3 == pytest.approx(enclosed_volume(geometry), rel=0.05)  # each is given volume / n
     nearest = KDTree(found).query(found, k=2)[0][:, 1] / SPACING
     assert nearest.min() > 0.5  # independent points: < 0.1
     assert nearest.mean() > 0.85  # independent points: 0.55
-    depth = -distance(geometry, found) / SPACING
+    depth = -shape_distance(geometry, found) / SPACING
     phase = np.exp(2j * np.pi * found[depth > 2] / SPACING).mean(axis=0)
     assert np.abs(phase).max() < 0.25  # no layers inside; a lattice gives 1
     # the outermost are about half a spacing deep, so that the surface is covered
@@ -54,7 +54,7 @@ def test_the_seed_decides() -> None:
 
 
 def test_a_lattice_is_the_default() -> None:
-    assert np.array_equal(body_points(Body(geometry=SHAPES[0]), SPACING), particles(SHAPES[0], SPACING))
+    assert np.array_equal(body_points(Body(geometry=SHAPES[0]), SPACING), lattice_particles(SHAPES[0], SPACING))
 
 
 def test_what_cannot_be_sampled_is_refused_either_way() -> None:
@@ -65,15 +65,15 @@ def test_what_cannot_be_sampled_is_refused_either_way() -> None:
 def test_a_body_that_no_random_particle_falls_into_is_refused() -> None:
     """One particle of a lattice fits; one at random in the same cell may lie outside."""
     ball = Sphere(radius=0.5 * MM)
-    assert len(scattered(ball, 1 * MM, seed=2)) == 1
+    assert len(blue_noise_points(ball, 1 * MM, seed=2)) == 1
     with pytest.raises(ValueError, match="sphere holds no particle at a spacing of 1 mm"):
-        scattered(ball, 1 * MM, seed=0)
+        blue_noise_points(ball, 1 * MM, seed=0)
 
 
 def test_a_sheet_of_a_mesh_that_no_particle_falls_into_is_refused(tmp_path: Path) -> None:
     trimesh.creation.box((4.0, 4.0, 0.02)).export(tmp_path / "sheet.stl")
     with pytest.raises(ValueError, match=r"sheet\.stl holds no particle at a spacing of 0\.5 mm"):
-        scattered(Mesh(path=str(tmp_path / "sheet.stl")), SPACING, seed=0)
+        blue_noise_points(Mesh(path=str(tmp_path / "sheet.stl")), SPACING, seed=0)
 
 
 @pytest.mark.parametrize("sampling", ["lattice", "random"])

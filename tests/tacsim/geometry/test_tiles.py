@@ -8,9 +8,16 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from tacsim.geometry import tiles
-from tacsim.geometry.mesh import fingerprint, signed_distance_on_grid
-from tacsim.geometry.shapes import distance
-from tacsim.geometry.tiles import TILE, TiledDistance, share_tiles, tiled_distance, trilinear, watched_measuring
+from tacsim.geometry.mesh import file_fingerprint, signed_distance_on_grid
+from tacsim.geometry.shapes import shape_distance
+from tacsim.geometry.tiles import (
+    TILE_NODES,
+    TiledDistance,
+    cached_tiled_distance,
+    report_tiles,
+    share_tiles,
+    trilinear_interpolation,
+)
 from tacsim.models.scene import Mesh
 
 SPACING = 0.1e-3
@@ -25,7 +32,7 @@ def mesh(tmp_path_factory: pytest.TempPathFactory) -> Mesh:
 
 @pytest.fixture
 def tiled(mesh: Mesh) -> TiledDistance:
-    return tiled_distance(mesh, SPACING)
+    return cached_tiled_distance(mesh, SPACING)
 
 
 def test_between_nodes_it_is_trilinear_with_its_own_gradient() -> None:
@@ -36,7 +43,7 @@ def test_between_nodes_it_is_trilinear_with_its_own_gradient() -> None:
     at = rng.normal(size=(500, 3))
     at *= (radius + rng.uniform(-0.2e-3, 0.2e-3, (500, 1))) / np.linalg.norm(at, axis=1, keepdims=True)
     length = np.linalg.norm(at, axis=1)
-    value, gradient = trilinear(values, at / spacing + 22.0, spacing)
+    value, gradient = trilinear_interpolation(values, at / spacing + 22.0, spacing)
     assert np.abs(value - (length - radius)).max() < 3 / 8 * spacing**2 / 1.75e-3
     assert np.abs(gradient - at / length[:, None]).max() < 1.1 * spacing / 1.75e-3
 
@@ -45,10 +52,12 @@ def test_a_linear_field_comes_back_and_nothing_is_known_outside() -> None:
     slope, shape, origin = np.array([2.0, -3.0, 5.0]), (4, 5, 6), np.array([1.0, 2.0, 3.0])
     values = np.einsum("a,aijk->ijk", slope, np.indices(shape) * 0.5).astype(np.float32)
     at = np.array([[1.0, 2.0, 3.0], [1.7, 2.3, 4.1], [2.5, 4.0, 5.5]])
-    value, gradient = trilinear(values, (at - origin) / 0.5, 0.5)
+    value, gradient = trilinear_interpolation(values, (at - origin) / 0.5, 0.5)
     assert np.allclose(value, (at - origin) @ slope)
     assert np.allclose(gradient, slope)
-    value, gradient = trilinear(values, (np.array([[0.9, 2.1, 3.1], [1.0, 2.0, 5.6]]) - origin) / 0.5, 0.5)
+    value, gradient = trilinear_interpolation(
+        values, (np.array([[0.9, 2.1, 3.1], [1.0, 2.0, 5.6]]) - origin) / 0.5, 0.5
+    )
     assert np.isposinf(value).all()
     assert (gradient == 0).all()
 
@@ -58,14 +67,16 @@ def test_a_tile_is_the_same_whatever_it_is_laid_with(
 ) -> None:
     one, two = np.array([1, 0, 0]), np.array([2, 1, 1])
     alone = tiled.values(one, two)
-    monkeypatch.setattr(tiles, "_kept", {})
-    other = TiledDistance(mesh, fingerprint(mesh.path), SPACING)
-    assert np.array_equal(other.values(np.zeros(3, int), two + 1)[TILE : 2 * TILE, :TILE, :TILE], alone)
+    monkeypatch.setattr(tiles, "_tiles", {})
+    other = TiledDistance(mesh, file_fingerprint(mesh.path), SPACING)
+    assert np.array_equal(
+        other.values(np.zeros(3, int), two + 1)[TILE_NODES : 2 * TILE_NODES, :TILE_NODES, :TILE_NODES], alone
+    )
 
 
 def test_a_tile_far_from_the_surface_is_all_inside(tmp_path: Path) -> None:
     trimesh.creation.box((14.0, 14.0, 14.0)).export(tmp_path / "cube.stl")
-    tiled = tiled_distance(Mesh(path=str(tmp_path / "cube.stl")), SPACING)
+    tiled = cached_tiled_distance(Mesh(path=str(tmp_path / "cube.stl")), SPACING)
     middle = np.array([2, 2, 2])
     values = tiled.values(middle, middle + 1)
     assert values.max() < -3e-3
@@ -75,24 +86,24 @@ def test_the_latest_tiles_of_all_meshes_are_kept_and_others_are_laid_again_alike
     mesh: Mesh, tiled: TiledDistance, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first, end = np.array([1, 0, 0]), np.array([3, 2, 1])
-    smaller = tiled_distance(mesh.model_copy(update={"scale": 0.5e-3}), SPACING)
+    smaller = cached_tiled_distance(mesh.model_copy(update={"scale": 0.5e-3}), SPACING)
     expected, other = tiled.values(first, end), smaller.values(first, first + 1)
     laid: list[int] = []
     monkeypatch.setattr(tiles, "signed_distance_on_grid", lambda *a: (laid.append(1), signed_distance_on_grid(*a))[1])
-    monkeypatch.setattr(tiles, "KEPT", 3)
-    monkeypatch.setattr(tiles, "_kept", {})
+    monkeypatch.setattr(tiles, "MAX_TILES", 3)
+    monkeypatch.setattr(tiles, "_tiles", {})
 
     def lays(tiled: TiledDistance, first: np.ndarray, end: np.ndarray, expected: np.ndarray) -> int:
         laid.clear()
-        assert np.array_equal(tiled.values(first, end), expected) and len(tiles._kept) <= 3
+        assert np.array_equal(tiled.values(first, end), expected) and len(tiles._tiles) <= 3
         return len(laid)
 
     assert lays(tiled, first, end, expected) == 4
-    second = np.array([1, 1, 0]), np.array([2, 2, 1]), expected[:TILE, TILE:]
+    second = np.array([1, 1, 0]), np.array([2, 2, 1]), expected[:TILE_NODES, TILE_NODES:]
     assert lays(tiled, *second) == 0  # the first of the four is gone, this one is now the latest used
     assert lays(smaller, first, first + 1, other) == 1
     assert lays(tiled, *second) == 0
-    assert lays(tiled, first, first + 1, expected[:TILE, :TILE]) == 1
+    assert lays(tiled, first, first + 1, expected[:TILE_NODES, :TILE_NODES]) == 1
     assert lays(tiled, first, end, expected) >= 2
 
 
@@ -110,7 +121,7 @@ def test_a_tile_that_another_process_has_left_is_not_computed_again(
     monkeypatch.setattr(tiles, "signed_distance_on_grid", lambda *a: (laid.append(1), signed_distance_on_grid(*a))[1])
 
     def lays(of: TiledDistance = tiled) -> int:
-        monkeypatch.setattr(tiles, "_kept", {})  # as a process that begins
+        monkeypatch.setattr(tiles, "_tiles", {})  # as a process that begins
         laid.clear()
         assert np.array_equal(of.values(first, end), expected) or of is not tiled
         return len(laid)
@@ -122,12 +133,12 @@ def test_a_tile_that_another_process_has_left_is_not_computed_again(
         assert (lays(), lays()) == (4, 0)
         elsewhere = tmp_path / "again.stl"
         elsewhere.write_bytes(Path(mesh.path).read_bytes())
-        assert lays(tiled_distance(mesh.model_copy(update={"path": str(elsewhere)}), SPACING)) == 0
-        assert lays(tiled_distance(mesh.model_copy(update={"scale": 0.9e-3}), SPACING)) == 4
+        assert lays(cached_tiled_distance(mesh.model_copy(update={"path": str(elsewhere)}), SPACING)) == 0
+        assert lays(cached_tiled_distance(mesh.model_copy(update={"scale": 0.9e-3}), SPACING)) == 4
         files = sorted((tmp_path / "shared").iterdir())
         files[0].write_bytes(files[0].read_bytes()[:-1])  # cut short
-        monkeypatch.setattr(tiles, "SHARED", 8)
-        lays(), lays(tiled_distance(mesh.model_copy(update={"scale": 0.8e-3}), SPACING))
+        monkeypatch.setattr(tiles, "MAX_SHARED_TILES", 8)
+        lays(), lays(cached_tiled_distance(mesh.model_copy(update={"scale": 0.8e-3}), SPACING))
         assert len(list((tmp_path / "shared").iterdir())) == 8
     finally:
         share_tiles(None)
@@ -152,7 +163,7 @@ def test_the_lowest_point_over_a_rectangle_is_that_of_the_edges_there(
     over = points[(np.abs(points[:, :2]) <= half).all(axis=1)]
     assert found[2] == pytest.approx(over[:, 2].min(), abs=3e-6)
     assert (np.abs(found[:2]) <= half + 1e-12).all()
-    assert abs(distance(mesh, ((found - place) @ axes)[None])[0]) < 1e-9
+    assert abs(shape_distance(mesh, ((found - place) @ axes)[None])[0]) < 1e-9
     assert tiled.lowest(axes, place + [0.1, 0, 0], np.full(2, half)) is None
 
 
@@ -161,8 +172,8 @@ def test_who_watches_is_told_how_far_a_mesh_is_measured(tmp_path: Path) -> None:
 
     path = tmp_path / "ball.stl"
     trimesh.creation.icosphere(2, 4.0).export(path)
-    mesh, told = tiled_distance(Mesh(path=str(path)), 0.2e-3), []
-    with watched_measuring(lambda *each: told.append(each)):
-        mesh.values(*mesh.around(-mesh.half, mesh.half))
+    mesh, told = cached_tiled_distance(Mesh(path=str(path)), 0.2e-3), []
+    with report_tiles(lambda *each: told.append(each)):
+        mesh.values(*mesh.tile_range(-mesh.half, mesh.half))
     number = len(told)
     assert number > 1 and told == [(str(path), done, number) for done in range(number)]

@@ -62,7 +62,7 @@ def test_what_cannot_be_is_refused_with_its_key_before_anything_is_simulated() -
 @pytest.mark.parametrize("name", names("randomisation"))
 def test_every_shipped_one_fits_its_task(name: str) -> None:
     found = load(Randomisation, name)
-    for overrides in found.drawn()[:3]:
+    for overrides in found.draw_overrides()[:3]:
         rig = "mock" if name.endswith("-twin") else "sim"
         task = name.removesuffix("-twin")
         assert load_rig(rig, task=task, overrides=overrides).config.scene is not None
@@ -85,7 +85,7 @@ def test_a_draw_that_cannot_begin_is_told_and_drawn_anew() -> None:
         flat, info = env.reset(seed=seed)
         assert_equal(flat, began[seed][0])
         assert (info["drawn"], info.get("refused", "")) == began[seed][1:]
-    bad = next(number for number, goal in enumerate(Randomisation(**SOME_BAD).drawn()) if "3.3" in goal[0])
+    bad = next(number for number, goal in enumerate(Randomisation(**SOME_BAD).draw_overrides()) if "3.3" in goal[0])
     with pytest.raises(GoalOutOfReach):  # a variant that somebody chose is played or not
         env.reset(options={"variant": bad})
 

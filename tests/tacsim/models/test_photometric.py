@@ -11,10 +11,10 @@ from tacsim.models.photometric import (
     DepthColour,
     PhotometricLight,
     PhotometricModel,
-    clipped,
+    clip_slopes,
     depth_terms,
+    image_grid_places,
     normal_terms,
-    places_in_image,
     term_count,
 )
 from tacsim.models.sensor import Lighting, Markers, SensorGeometry, SensorModel
@@ -50,7 +50,7 @@ def test_terms_are_the_powers_of_the_normal() -> None:
 def test_change_is_the_polynomial_written_out() -> None:
     calibrated = model(2, 1)
     gradient = RNG.uniform(-0.4, 0.4, (20, 30, 2)).astype(np.float32)
-    u, v = places_in_image(30, 20)
+    u, v = image_grid_places(30, 20)
     change, beyond = PhotometricLight(calibrated).change(gradient, u, v)
     row, column = 4, 17
     normal = [float(t) for t in normal_terms(gradient[row, column].astype(float), 2)]
@@ -68,10 +68,10 @@ def test_change_is_the_polynomial_written_out() -> None:
 
 def test_slopes_beyond_the_calibrated_are_clipped_and_counted() -> None:
     gradient = np.array([[[3.0, 4.0], [0.3, 0.4]]], dtype=np.float32)
-    shorter, beyond = clipped(gradient, 1.0)
+    shorter, beyond = clip_slopes(gradient, 1.0)
     np.testing.assert_allclose(shorter, [[[0.6, 0.8], [0.3, 0.4]]], rtol=1e-6)
     assert beyond == 1
-    assert PhotometricLight(model(3, 0, steepest=1.0)).change(gradient, *places_in_image(2, 1))[1] == 1
+    assert PhotometricLight(model(3, 0, steepest=1.0)).change(gradient, *image_grid_places(2, 1))[1] == 1
 
 
 def test_the_renderer_uses_it_in_place_of_the_lights() -> None:
@@ -193,7 +193,7 @@ def test_colour_of_depth_knows_the_place_whether_or_not_slopes_do(position: int)
     depth = DepthColour(deepest=0.05, weights=tuple(map(tuple, weights.tolist())))
     light = PhotometricLight(model(2, position).model_copy(update={"depth": depth}), (0.5, 1.0, 2.0))
     gradient = RNG.uniform(-0.4, 0.4, (4, 6, 2)).astype(np.float32)
-    u, v = places_in_image(6, 4)
+    u, v = image_grid_places(6, 4)
     height = RNG.uniform(0.0, 0.05, (4, 6)).astype(np.float32)
     deeper = light.change(gradient, u, v, height)[0] - light.change(gradient, u, v)[0]
     wanted = np.moveaxis(depth_terms(height, 0.05, u, v), 0, -1) @ weights * [0.5, 1.0, 2.0]
@@ -211,7 +211,7 @@ def test_flat_gel_that_is_pressed_in_has_the_colour_of_its_depth() -> None:
         SensorModel(geometry=geometry, lighting=Lighting(background=(0.5, 0.5, 0.5)), photometric=light, texture=0.0),
         GEL,
     )
-    u, _ = places_in_image(320, 240)
+    u, _ = image_grid_places(320, 240)
     for millimetres in (0.0, 0.5, 1.0, 1.6):
         pressed = make_surface(lambda x, y, h=millimetres: (x * 0, x * 0, x * 0 - h * 1e-3))
         w = min(millimetres, 1.0)

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import Field, TypeAdapter, ValidationError
 
-from tacsim.models.quantity import UNITS, Config, Length, parse
+from tacsim.models.quantity import UNITS, Config, Length, parse_quantity
 
 
 @pytest.mark.parametrize(
@@ -39,7 +39,7 @@ from tacsim.models.quantity import UNITS, Config, Length, parse
     ],
 )
 def test_si_value(text: str | float, kind: str, si: float) -> None:
-    assert parse(text, kind) == pytest.approx(si, rel=1e-12)
+    assert parse_quantity(text, kind) == pytest.approx(si, rel=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -64,7 +64,7 @@ def test_si_value(text: str | float, kind: str, si: float) -> None:
 )  # fmt: skip
 def test_refusal_says_what_is_allowed(value: object, message: str) -> None:
     with pytest.raises(ValueError) as caught:
-        parse(value, "length")
+        parse_quantity(value, "length")
     assert message in str(caught.value)
     assert "allowed: a number [m]" in str(caught.value)
 
@@ -76,13 +76,13 @@ def test_a_text_of_any_length_is_answered_at_once_and_in_short(text: str) -> Non
     with pytest.raises(
         ValueError, match=r"has \d+ characters, at most 100 are read; allowed: a number \[m\]"
     ) as caught:
-        parse(text, "length")
+        parse_quantity(text, "length")
     assert len(str(caught.value)) < 300
 
 
 def test_an_ambiguous_unit_gets_no_suggestion() -> None:
     with pytest.raises(ValueError) as caught:
-        parse("3 xm", "length")  # mm, cm and um are equally near
+        parse_quantity("3 xm", "length")  # mm, cm and um are equally near
     assert "did you mean" not in str(caught.value)
 
 
@@ -93,13 +93,13 @@ def test_an_ambiguous_unit_gets_no_suggestion() -> None:
 def test_every_number_with_every_unit(number: float, kind_and_unit: tuple[str, str]) -> None:
     kind, unit = kind_and_unit
     if math.isfinite(number * UNITS[kind][unit]):
-        assert parse(f"{number!r} {unit}", kind) == number * UNITS[kind][unit]
+        assert parse_quantity(f"{number!r} {unit}", kind) == number * UNITS[kind][unit]
 
 
 @given(st.text())
 def test_any_text_is_a_finite_number_or_a_value_error(text: str) -> None:
     try:
-        number = parse(text, "length")
+        number = parse_quantity(text, "length")
     except ValueError as error:
         number, complaint = 0.0, str(error)
     else:

@@ -66,12 +66,12 @@ def test_an_element_whose_bounds_are_one_number_is_that_number(kind: str) -> Non
 
 def test_a_draw_depends_on_seed_number_and_key_alone() -> None:
     values = {"a.b": Distribution(uniform=(0.0, 1.0)), "c": Distribution(uniform=(0.0, 1.0))}
-    one = Randomisation(draws=5, values=values).drawn()
-    assert one == Randomisation(draws=5, values=values).drawn()
-    assert one[:3] == Randomisation(draws=3, values=values).drawn()
-    alone = Randomisation(draws=5, values={"c": values["c"]}).drawn()
+    one = Randomisation(draws=5, values=values).draw_overrides()
+    assert one == Randomisation(draws=5, values=values).draw_overrides()
+    assert one[:3] == Randomisation(draws=3, values=values).draw_overrides()
+    alone = Randomisation(draws=5, values={"c": values["c"]}).draw_overrides()
     assert [each[1:] for each in one] == alone
-    assert one != Randomisation(draws=5, seed=1, values=values).drawn()
+    assert one != Randomisation(draws=5, seed=1, values=values).draw_overrides()
     assert len({each[0] for each in one}) == 5
     assert one[0][0].startswith("a.b=0.")
 

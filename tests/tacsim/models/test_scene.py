@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from tacsim.models.material import BodyMaterial, GelMaterial, lame, shear_impedance
+from tacsim.models.material import BodyMaterial, GelMaterial, elastic_constants, shear_impedance
 from tacsim.models.quantity import Config
 from tacsim.models.rig import RepositionConfig, RigConfig, SimArmConfig, SqueezeConfig
 from tacsim.models.scene import Body, Box, Gel, Indenter, Mesh, Scene, Settling, Sphere
@@ -53,7 +53,7 @@ def test_what_must_be_positive_is_refused_where_it_enters(model: type[Config], k
 
 
 def test_the_coarsest_gel_has_two_layers() -> None:
-    assert Scene(element_size=2e-3).element == 2e-3
+    assert Scene(element_size=2e-3).effective_element_size == 2e-3
 
 
 @pytest.mark.parametrize("modulus", [0.5, 1e308])
@@ -145,7 +145,7 @@ def test_a_smaller_tolerance_goes_slower_within_bounds() -> None:
 def test_what_yields_at_a_small_strain_goes_slower() -> None:
     soft, stiff = clay(0.15e6), clay(10e6)
     assert Scene(body=soft).peak_mach == 0.0375 and Scene(body=soft, physics="seed").peak_mach == 0.03
-    mu, lam = lame(stiff.material)
+    mu, lam = elastic_constants(stiff.material)
     yield_stress, impedance = 2 * mu * stiff.material.elastic_limit, shear_impedance(GelMaterial())
     assert Scene(body=stiff).peak_mach == pytest.approx(3.7 * yield_stress / (lam + 2 * mu + 2.5 * impedance))
     # the bulk counts: what a motion costs in stress grows with it, at the same yield

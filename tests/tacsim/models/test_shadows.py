@@ -7,7 +7,7 @@ from tacsim.models.photometric import (
     SHADOW_STEPS,
     SHADOW_WIDTH,
     CastShadows,
-    horizon,
+    horizon_slope,
     shadow_terms,
 )
 
@@ -21,19 +21,19 @@ def ridge(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("step", SHADOW_STEPS[3:8])
 def test_beside_a_ridge_the_horizon_is_its_crest(step: float) -> None:
     place = np.array([-step]), np.array([0.1])
-    towards = horizon(ridge, *place, (1e4, 0.1))
+    towards = horizon_slope(ridge, *place, (1e4, 0.1))
     assert towards == pytest.approx(CREST / step, rel=1e-4)
-    assert horizon(ridge, *place, (-1e4, 0.1)) == 0.0
+    assert horizon_slope(ridge, *place, (-1e4, 0.1)) == 0.0
 
 
 def test_along_a_ridge_nothing_is_hidden() -> None:
-    along = horizon(ridge, np.array([-0.05]), np.array([0.0]), (-0.05, 1e4))
+    along = horizon_slope(ridge, np.array([-0.05]), np.array([0.0]), (-0.05, 1e4))
     assert along == pytest.approx(0.0, abs=1e-12)
 
 
 def test_a_lamp_in_the_picture_is_seen_from_all_sides() -> None:
     x, y = np.array([-0.06, 0.06, 0.0]), np.array([0.0, 0.0, 0.06])
-    hill = horizon(lambda x, y: 0.01 * np.exp(-(x * x + y * y) / 2e-4), x, y, (0.0, 0.0))
+    hill = horizon_slope(lambda x, y: 0.01 * np.exp(-(x * x + y * y) / 2e-4), x, y, (0.0, 0.0))
     assert hill == pytest.approx(hill[0], rel=1e-6) and hill[0] > 0.1
 
 

@@ -16,7 +16,7 @@ from robot.mock.ur.machine.load import NOTHING, Load, Mass
 from robot.mock.ur.machine.modes import Mode, Safety
 from robot.mock.ur.machine.version import VERSION, Version
 from tacsim.interface import FloatArray
-from tacsim.models.text import printable
+from tacsim.models.text import printable_line
 
 if TYPE_CHECKING:
     from tacsim.models.hardware import Model  # pydantic and SciPy: half a second of start-up
@@ -112,7 +112,7 @@ class MachineState:
         return self.arm.rests and self.freedrive is None and self.force_mode is None
 
     def write_log(self, text: str) -> None:
-        self.log.append((self.time, printable(text[:LINE])))
+        self.log.append((self.time, printable_line(text[:LINE])))
 
     def stop(self, reason: str) -> None:
         """Ends the program; the arm coasts to rest."""

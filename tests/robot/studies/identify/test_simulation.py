@@ -92,4 +92,4 @@ def test_what_a_scene_thinks_is_where_a_fit_begins() -> None:
     found = {each.name: each.start for each in parameters_of("body", scene)}
     assert found["yield_stress"] == pytest.approx(30e3 * np.sqrt(1.5))
     assert scene_with(scene, found).body.material.elastic_limit == pytest.approx(scene.body.material.elastic_limit)
-    assert coarser(scene).element == 2e-3 and coarser(coarser(scene)).element == 2e-3
+    assert coarser(scene).effective_element_size == 2e-3 and coarser(coarser(scene)).effective_element_size == 2e-3

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.truth import laws
 from tacsim.compute.runtime import start, ti
-from tacsim.models.material import BodyMaterial, lame
+from tacsim.models.material import BodyMaterial, elastic_constants
 from tacsim.physics.body import material
 from tacsim.physics.body.plasticine import BodyParams, body_params
 
@@ -223,7 +223,7 @@ def test_yield_norms() -> None:
     uniaxial = BodyMaterial(yield_stress=30e3)
     frobenius = BodyMaterial(yield_stress=30e3, yield_norm="frobenius")
     assert frobenius.elastic_limit / uniaxial.elastic_limit == pytest.approx(math.sqrt(1.5))
-    mu, _ = lame(uniaxial)
+    mu, _ = elastic_constants(uniaxial)
     deviator = 2 * mu * uniaxial.elastic_limit  # |dev tau|_F at yield = sqrt(2/3) sigma
     assert deviator * math.sqrt(1.5) == pytest.approx(30e3)
 

@@ -9,7 +9,7 @@ import trimesh
 from benchmarks.truth.roughness import print_roughness
 from tacsim.compute.runtime import start, ti
 from tacsim.geometry.sampling import body_points
-from tacsim.geometry.shapes import distance, volume
+from tacsim.geometry.shapes import enclosed_volume, shape_distance
 from tacsim.interface import Pose
 from tacsim.models.material import BodyMaterial
 from tacsim.models.scene import Body, Box, Mesh, Scene, Sphere
@@ -33,10 +33,10 @@ def test_outer_particles_know_the_surface(geometry: Box | Sphere, sampling: str)
     points = body_points(Body.model_validate({"geometry": geometry, "sampling": sampling}), SPACING)
     planes = tangent_planes(geometry, points, SPACING)
     known = planes.any(axis=1)
-    assert np.array_equal(known, distance(geometry, points) > -SPACING * 1.0000001)
+    assert np.array_equal(known, shape_distance(geometry, points) > -SPACING * 1.0000001)
     feet = surface_points(points, planes)
     assert np.array_equal(feet[~known], points[~known])
-    off = np.abs(distance(geometry, feet[known]))
+    off = np.abs(shape_distance(geometry, feet[known]))
     if isinstance(geometry, Sphere):
         assert off.max() < 0.011 * SPACING  # particles on the surface itself stand in the least depth
     else:  # at an edge two faces are equally near, and the mean direction leads between them
@@ -107,7 +107,7 @@ def test_random_and_lattice_bodies_press_alike_and_weigh_the_same() -> None:
     for sampling in ("lattice", "random"):
         world = squeezed(CUBE, sampling, 1e-3)
         forces.append(world.wrench("lower")[2])
-        assert len(world.truth().points) * world._body.volume == pytest.approx(volume(CUBE) * 1e9, rel=1e-9)
+        assert len(world.truth().points) * world._body.volume == pytest.approx(enclosed_volume(CUBE) * 1e9, rel=1e-9)
     assert forces[1] == pytest.approx(forces[0], rel=0.03)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tacsim.interface import Pose
-from tacsim.models.material import BodyMaterial, lame
+from tacsim.models.material import BodyMaterial, elastic_constants
 from tacsim.models.scene import Body, Box, Cylinder, Preset, Scene, Settling
 from tacsim.physics.failure.diagnosis import particle_volumes
 from tacsim.physics.motion.controller import Launch
@@ -75,7 +75,7 @@ def test_a_body_under_more_tension_than_it_can_bear_is_told() -> None:
     assert volumes is not None
     assert (stats.smallest_volume, stats.largest_volume) == pytest.approx((volumes.min(), volumes.max()), rel=1e-6)
     assert 0.96 < stats.smallest_volume < stats.largest_volume < 1.02 and stats.guard_hits == 0
-    mu, lam = lame(CUBE.material)
+    mu, lam = elastic_constants(CUBE.material)
     for tension, told in ((1.0, False), (6.0, True)):  # yield stresses (Frobenius norm)
         grown = tension * 2 * mu * CUBE.material.elastic_limit / (lam + 2 * mu / 3) * sign
         strain = state["strain"].copy()

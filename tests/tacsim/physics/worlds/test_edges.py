@@ -7,7 +7,7 @@ import pytest
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
-from tacsim.geometry.shapes import extent
+from tacsim.geometry.shapes import bounding_size
 from tacsim.interface import Pose
 from tacsim.models.scene import Box, Cylinder, Gel, Mesh, Shape, Sphere
 from tacsim.physics.failure import diagnosis
@@ -30,7 +30,7 @@ def test_a_rounded_punch_presses_as_in_finite_elements(depth: float, force: floa
 def deep(shape: Shape, preset: str, rotation: Rotation, depth: float) -> PressWorld:
     """A world in which the shape's lowest point has come to rest `depth` below the untouched gel."""
     w = world(shape, tolerance=1e-2, preset=preset, gel=Gel())
-    half = extent(shape) / 2
+    half = bounding_size(shape) / 2
     reach = float(np.abs(rotation.as_matrix()[2]) @ half)
     for height in (reach + 0.1e-3, reach - depth):
         assert w.move({"indenter": Pose(np.array([0, 0, height]), rotation.as_quat())}).settled

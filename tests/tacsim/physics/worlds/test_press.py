@@ -188,7 +188,9 @@ def test_both_ends_of_a_launch_are_laid_or_none(tmp_path: Path, monkeypatch: pyt
     drive[:, 0, :3] = np.eye(3)
     drive[:, 0, 3] = (-7.0, 0.0, 1.0), (7.0, 0.0, 1.0)
     for module in (press_state, tiles):
-        monkeypatch.setattr(module, "MAX_NODES", 8 * tiles.TILE**3)  # an end has 6 tiles, both and what is between 12
+        monkeypatch.setattr(
+            module, "MAX_NODES", 8 * tiles.TILE_NODES**3
+        )  # an end has 6 tiles, both and what is between 12
     with pytest.raises(ValueError, match="192 x 64 x 32 nodes"):
         w._cover(drive)
     w._cover(drive[:1])

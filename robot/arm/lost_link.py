@@ -47,7 +47,9 @@ class StatusHistory:
         is_lost = self._is_link_lost
         if worker is not None and ended is not None and not is_lost:
             is_lost = ended_by_lost_link(ended, worker.printed)
-        status = status_of(latest(), ended, self._timeout, lost=is_lost)  # read last: nothing is written after the exit
+        status = status_of(
+            latest(), ended, self._timeout, is_link_lost=is_lost
+        )  # read last: nothing is written after the exit
         self._is_link_lost = status == ArmStatus.LINK_LOST
         if worker is not None and ended is not None:
             self._final_status = status

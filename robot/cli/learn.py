@@ -81,7 +81,7 @@ def train(
     try:
         path = _train(run)
     except BadDraws:
-        if run.last()[0]:
+        if run.load_checkpoint()[0]:
             notes.print(f"What was learned is kept. Make a file of it: tacsim export policy {run.folder}")
         raise
     except (KeyboardInterrupt, OSError):

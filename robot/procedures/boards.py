@@ -150,7 +150,7 @@ def record_board_poses(arm: URArm, camera: FrameSource, plan: BoardPosePlan, ses
                     session.left_out.append(f"pose {done + 1}: {failure}")
                     continue
                 sensor = se3.compose(base_from_world, arm.state().pose)
-                session.take(BoardPose(se3.compose(sensor, sensor_from_flange), board))
+                session.add_measurement(BoardPose(se3.compose(sensor, sensor_from_flange), board))
             move_to(arm, arm.name, start)
     finally:
         arm.stop()
@@ -185,11 +185,11 @@ def record_board_views(camera: FrameSource, plan: BoardViewPlan, session: Sessio
             number = len(earlier) + 1
             session.progress(len(earlier))
             prompt = ON_GEL if plan.on_gel else f"hold the board still, {PROMPTS[len(earlier) % len(PROMPTS)]}"
-            session.say(f"View {number} of {plan.views}: {prompt}.")
+            session.report(f"View {number} of {plan.views}: {prompt}.")
             image, points = _next_view(frames, plan, earlier, session)
             earlier.append(points)
-            session.take((f"view_{number:02d}.png", image))
-            session.say(f"Taken: {len(points.image)} points, {points.spacing:.0f} px apart.")
+            session.add_measurement((f"view_{number:02d}.png", image))
+            session.report(f"Taken: {len(points.image)} points, {points.spacing:.0f} px apart.")
         session.progress(len(earlier))
 
 
@@ -221,7 +221,7 @@ def _next_view(
                 reason = f"the board is seen as in view {same}; tilt it, or hold it elsewhere"
         if frame.time - reminded >= REMINDER_INTERVAL:
             session.left_out.append(reason)
-            session.say(f"Skipped: {reason}.")
+            session.report(f"Skipped: {reason}.")
             reminded = frame.time
         if frame.time - begun > plan.timeout:
             raise CannotCalibrate(f"given up after {plan.timeout:g} s without a view; the last: {reason}")

@@ -133,7 +133,7 @@ def train(
     complete.
     """
     torch.set_num_threads(1)  # small networks; sums have the same order on any machine
-    done, state, curve = run.last()
+    done, state, curve = run.load_checkpoint()
     envs = make_environments(run.settings.training)
     try:
         learner = _make_learner(envs, run)
@@ -153,7 +153,7 @@ def train(
             curve.append({"round": number + 1, **figures, "refused": count, "seconds": time.perf_counter() - began})
             # before the checkpoint: a completed round is not reported again
             write_whole(run.folder / CURVE, json.dumps(curve, indent=1).encode())
-            run.keep(number, learner.state(), curve)
+            run.save_checkpoint(number, learner.state(), curve)
             report_result(curve[-1])
     finally:
         envs.close()
@@ -172,7 +172,7 @@ def export_policy(run: RunFolder, path: Path, report_progress: ReportProgress = 
 
     Raises RunError without a checkpoint, ExportError, OSError.
     """
-    done, state, curve = run.last()
+    done, state, curve = run.load_checkpoint()
     if not done:
         raise RunError(f"{run.folder} has no checkpoint: no round of its training is complete")
     actor = new_actor(run)
@@ -182,7 +182,7 @@ def export_policy(run: RunFolder, path: Path, report_progress: ReportProgress = 
     trained = {**run.settings.spec.trained, "rounds": done, "steps": steps}
     spec = run.settings.spec.model_copy(update={"trained": trained})
     max_difference = export(actor, spec, run.settings.shapes, path)
-    write_range(path, path, measure_range(path, tell=report_progress))
+    write_range(path, path, measure_range(path, report_progress=report_progress))
     return max_difference
 
 

@@ -49,7 +49,7 @@ def weights(run: RunFolder) -> dict[str, Any]:
         elif isinstance(value, int | float):
             found[at] = value
 
-    walk(run.last()[1], "")
+    walk(run.load_checkpoint()[1], "")
     return found
 
 
@@ -70,7 +70,7 @@ def test_train_killed_run_continues_bit_for_bit(algorithm: str, tmp_path: Path) 
     cut = begin_run(settings, tmp_path / "cut")
     with pytest.raises(Killed):
         train(cut, kill_in_round_2)
-    assert cut.last()[0] == 2
+    assert cut.load_checkpoint()[0] == 2
     train(RunFolder(tmp_path / "cut"))
     assert weights(cut) == weights(whole) != {}
     assert (tmp_path / "cut/policy.onnx").read_bytes() == (tmp_path / "whole/policy.onnx").read_bytes()
@@ -78,7 +78,7 @@ def test_train_killed_run_continues_bit_for_bit(algorithm: str, tmp_path: Path) 
 
 
 def test_train_kill_after_last_checkpoint_keeps_curve(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    run, keep = begin_run(training(dagger={"rounds": 1, "epochs": 1}), tmp_path / "run"), RunFolder.keep
+    run, keep = begin_run(training(dagger={"rounds": 1, "epochs": 1}), tmp_path / "run"), RunFolder.save_checkpoint
 
     def kept_and_killed(*given: Any) -> None:
         keep(*given)
@@ -88,7 +88,7 @@ def test_train_kill_after_last_checkpoint_keeps_curve(tmp_path: Path, monkeypatc
     with pytest.raises(Killed):
         train(run)
     train(run)
-    assert json.loads((run.folder / "curve.json").read_text()) == run.last()[2] != []
+    assert json.loads((run.folder / "curve.json").read_text()) == run.load_checkpoint()[2] != []
 
 
 def test_train_other_seed_gives_other_policy(tmp_path: Path) -> None:
@@ -129,9 +129,9 @@ def test_train_full_disk_raises_and_keeps_checkpoint(tmp_path: Path) -> None:
         train(run, fill_in_round_2)
     assert failed.value.filename == str(run.folder / "checkpoint.pt")
     assert not (run.folder / ".checkpoint.pt.part").is_symlink()
-    assert run.last()[0] == 1
+    assert run.load_checkpoint()[0] == 1
     train(run)
-    assert run.last()[0] == 3
+    assert run.load_checkpoint()[0] == 3
 
 
 @pytest.mark.parametrize("maps", [(), ("height", "slope")])
@@ -153,7 +153,7 @@ def test_export_file_acts_like_network(maps: tuple[str, ...], tmp_path: Path) ->
     assert policy.spec.trained["training"]["features"]["frames"] == 2
     assert policy.spec.trained["steps"] == 9
     actor, session = new_actor(run), onnxruntime.InferenceSession(path)
-    actor.load_state_dict(run.last()[1]["actor"])
+    actor.load_state_dict(run.load_checkpoint()[1]["actor"])
     random = np.random.default_rng(3)
     for scale in (0.1, 1.0, 30.0):
         seen = {
@@ -245,7 +245,7 @@ def test_train_bad_draw_is_reported_and_repeated(
     run = begin_run(training(randomise=drawn, algorithm=algorithm), tmp_path / "run")
     assert train(run, warn=told.append).exists()
     assert told == ["drawn again: scene.friction.upper=0.6: nothing there"]
-    assert sum(row["refused"] for row in run.last()[2]) >= 1
+    assert sum(row["refused"] for row in run.load_checkpoint()[2]) >= 1
 
 
 def test_train_many_bad_draws_raise_and_keep_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -260,7 +260,7 @@ def test_train_many_bad_draws_raise_and_keep_checkpoint(tmp_path: Path, monkeypa
 
     with pytest.raises(BadDraws, match=r"8 draws in a row cannot begin .*nothing there"):
         train(run, then_none)
-    assert run.last()[0] == 1
+    assert run.load_checkpoint()[0] == 1
     assert export_policy(run, tmp_path / "kept.onnx") <= 1e-5
     result = tacsim("train", "--resume", str(run.folder))
     assert result.exit_code == 2 and "nothing there" in result.output, result.output
@@ -351,7 +351,7 @@ def test_dagger_round_reports_loss_before_learning(tmp_path: Path) -> None:
     assert "unmet_loss" not in curve[0]  # in the first round the teacher acts
     met = [dict(np.load(run.folder / f"round-{number:03d}.npz")) for number in range(3)]
     actor = new_actor(run)
-    actor.load_state_dict(run.last()[1]["actor"])
+    actor.load_state_dict(run.load_checkpoint()[1]["actor"])
     for number in (1, 2):
         wanted = np.concatenate([each["action"] for each in met[: number + 1]])
         off = (infer_actions(actor, met[number]) - met[number]["action"]) / wanted.std(axis=0).clip(min=MIN_SPREAD)

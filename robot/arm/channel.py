@@ -77,7 +77,7 @@ COMMAND = np.dtype(
         ("time", np.float64),
         ("kind", np.int64),
         ("target", np.float64, 7),  # position, quaternion x y z w
-        ("speed", np.float64),  # maximum, besides limits.speed [m/s]
+        ("speed", np.float64),  # maximum, in addition to limits.speed [m/s]
         ("fraction", np.float64),  # of the path to the start, 0 to 1: move up to there
     ]
 )

@@ -52,10 +52,10 @@ class ArmFrames:
         fixed = (config.world_from_base, config.flange_from_tool, config.tool_from_sensor)
         return cls(*(to_matrix(frame.pose) for frame in fixed))
 
-    def flange(self, world_from_sensor: FloatArray) -> FloatArray:
-        """base_from_flange (4, 4) at which the sensor has the pose (4, 4)."""
-        frame: FloatArray = self._base_from_world @ world_from_sensor @ self._sensor_from_flange
-        return frame
+    def flange(self, target: FloatArray) -> FloatArray:
+        """base_from_flange (4, 4) at which the sensor is at `target`, world_from_sensor (4, 4)."""
+        flange: FloatArray = self._base_from_world @ target @ self._sensor_from_flange
+        return flange
 
     def measure(self, package: NDArray[np.void]) -> Measured:
         """Converts one package of the controller: a record () with stamp, and joints, tcp_pose, tcp_speed, tcp_force,

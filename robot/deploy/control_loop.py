@@ -21,7 +21,7 @@ from tacsim.models.sensor import CanonicalGrid
 from tacsim.record.episode import Episode, EpisodeMeta, Step
 from tacsim.record.step_info import MAX_DEPTH, MAX_FLOW, MAX_SLOPE, PACKAGES_LOST, TACTILE_DISTANCE
 from tacsim.rig import Rig
-from tacsim.tasks import GoalOutOfReach, Task, judge
+from tacsim.tasks import GoalOutOfReach, Task, evaluate_outcome
 
 MAX_PARTICLES = 5_000  # of a body in a recorded step
 PACKAGES = ("tacsim", "numpy", "taichi", "opencv-contrib-python-headless", "gymnasium")
@@ -208,7 +208,7 @@ class _EpisodeLog:
         meta = _make_meta(rig, task, setup)
         self._rig, self._task, self._start, self._has_body = rig, task, start, setup.body
         self._recorder = None if recorder is None else recorder(meta)
-        has_tactile_estimate = task is not None and not task.needs_to_feel.missing(rig.spec)
+        has_tactile_estimate = task is not None and not task.touch_needs.missing(rig.spec)
         self._tactile_estimator = task.estimator(setup.canonical) if task is not None and has_tactile_estimate else None
         self._steps: list[Step] = []
         self.episode = Episode(meta, self._steps if self._recorder is None else self._recorder.steps)
@@ -261,7 +261,7 @@ class _EpisodeLog:
         if truth is not None and self._start is not None:
             moved = truth.position - self._start.position
             info |= {"body_height": truth.height, "body_x": float(moved[0]), "body_y": float(moved[1])}
-            outcome = None if self._task is None else judge(self._task, truth, self._start)
+            outcome = None if self._task is None else evaluate_outcome(self._task, truth, self._start)
         return Step(
             index=self.count,
             time=observation.time,

@@ -24,7 +24,7 @@ from tacsim.models.policy import METADATA_KEY, Numbers, PolicySpec
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.models.text import printable
 from tacsim.tasks import Task
-from tacsim.tasks.task import Axis, action_from
+from tacsim.tasks.task import Axis, action_of_vector
 
 if TYPE_CHECKING:
     from onnxruntime import InferenceSession
@@ -92,7 +92,7 @@ class OnnxPolicy:
             now = observation.arms[axis.arm].pose
             if first or se3.pose_distance(self._targets[axis.arm], now)[0] > MAX_LAG_STEPS * self.spec.max_step:
                 self._targets[axis.arm] = now
-        action = action_from(self._infer(features), self._axes, self.spec.max_step, self._targets)
+        action = action_of_vector(self._infer(features), self._axes, self.spec.max_step, self._targets)
         self._targets = {arm: pose for arm, pose in action.tool.items() if pose is not None}
         return action
 

@@ -15,7 +15,7 @@ from tacsim.interface import IncompatibleRig, Policy, RigSpec
 from tacsim.models.scene import Scene
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.record.step_info import TRAINING_DISTANCE, TRAINING_KNOWN
-from tacsim.rig import require
+from tacsim.rig import require_needs
 from tacsim.tasks import Task
 
 
@@ -113,10 +113,12 @@ def require_fit(rig: str, spec: RigSpec, policy: Policy, name: str, task: Task |
     if task is not None:
         who = f"task '{task.config.kind}'"
         advice = "Omit the task (task: null in the rig file, or --set task=null): then steps are not judged"
-        require(rig, spec, task.needs, who, advice)
+        require_needs(rig, spec, task.needs, who, advice)
         if not spec.truth:
-            require(rig, spec, task.needs_to_feel, f"{who} (judged by touch, because the truth is not known)", advice)
+            require_needs(
+                rig, spec, task.touch_needs, f"{who} (judged by touch, because the truth is not known)", advice
+            )
     advice = "" if name == "grip" else "Use --policy grip, which needs only pictures, or your own policy"
-    require(rig, spec, policy.needs, f"policy '{name}'", advice)
+    require_needs(rig, spec, policy.needs, f"policy '{name}'", advice)
     if isinstance(policy, OnnxPolicy) and (found := find_mismatches(policy, spec, task)):
         raise IncompatibleRig(f"policy '{name}' cannot run on rig '{rig}': it was trained for {'; '.join(found)}")

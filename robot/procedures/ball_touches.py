@@ -109,7 +109,10 @@ def record_ball_touches(
                     tilted = Pose(quaternion=(se3.rotation(start) * rotation).as_quat())
                     centre = se3.rotate(tilted, np.array([*place, plan.ball_radius]))
                     touching = Pose(np.mean(centres, axis=0) - centre, tilted.quaternion)
-                    lifted, begin = se3.along_z(touching, -plan.lift), se3.along_z(touching, -APPROACH_DISTANCE)
+                    lifted, begin = (
+                        se3.translated_along_z(touching, -plan.lift),
+                        se3.translated_along_z(touching, -APPROACH_DISTANCE),
+                    )
                     travel = APPROACH_DISTANCE + APPROACH_MARGIN
                 try:
                     contact, depth, pose = prober.touch(lifted, begin, travel)
@@ -163,7 +166,7 @@ class _BallProber:
 
         def advance(distance: float) -> None:
             due = time.monotonic() + self._plan.step / self._speed
-            move_to(self._arm, self._name, se3.along_z(begin, distance), STEP_TIMEOUT)
+            move_to(self._arm, self._name, se3.translated_along_z(begin, distance), STEP_TIMEOUT)
             time.sleep(max(0.0, due - time.monotonic()))
 
         advice = (

@@ -67,7 +67,7 @@ def record_presses(camera: FrameSource, plan: BallPressPlan, session: Session[tu
             )
             image = monitor.wait_for_press()
             try:
-                circle = collection.offer(image)
+                circle = collection.add_image(image)
             except BadFrames as reason:
                 session.left_out.append(str(reason))
                 session.report(f"Not taken: {reason}.")

@@ -120,7 +120,7 @@ def _play_round(
             found[at].append(
                 extract_numbers({key: value[at] for key, value in features.items()}, policy.spec.features.frames)
             )
-            actions.append(env.ask(policy))
+            actions.append(env.policy_action(policy))
         features, _, terminated, truncated, _ = envs.step(np.stack(actions))
         over |= terminated | truncated
     return [np.array(each) for each in found]

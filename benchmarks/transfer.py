@@ -117,7 +117,7 @@ def training(sight: str, materials: str, folder: Path) -> Training:
 def train(folder: Path, cells: Sequence[tuple[str, str]]) -> None:
     """Needs the extra `train`."""
     from robot.train.run_folder import RunFolder
-    from robot.train.train import POLICY, begin
+    from robot.train.train import POLICY, begin_run
     from robot.train.train import train as go_on
 
     for sight, materials in cells:
@@ -125,9 +125,9 @@ def train(folder: Path, cells: Sequence[tuple[str, str]]) -> None:
         if (run / POLICY).exists():
             continue
         if not run.exists():
-            begin(training(sight, materials, folder), run)
+            begin_run(training(sight, materials, folder), run)
         typer.echo(run.name)
-        go_on(RunFolder(run), say=lambda figures: typer.echo(str(figures)))
+        go_on(RunFolder(run), report_result=lambda figures: typer.echo(str(figures)))
 
 
 def play(folder: Path, episodes: int, every: int, preset: str, workers: int) -> None:

@@ -1,4 +1,4 @@
-"""What the driver of an arm and its worker process exchange: a configuration at the start, then records both ways."""
+"""Data exchanged by the driver of an arm and its worker process: one configuration, then records both ways."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from robot.arm import shared_ring
 from robot.common.tcp import ArmFrames
 from tacsim.interface import FloatArray
 
-HISTORY = 1024  # state records that are kept: two seconds
-WINDOW = 500  # periods in the statistics of a worker
+HISTORY = 1024  # state records in memory: two seconds
+STATISTICS_PERIODS = 500  # periods in the statistics of a worker
 COMMAND_SLOTS = 8
 TACTILE_SLOTS = 8
 
@@ -26,21 +26,21 @@ class CommandKind(IntEnum):
     TARGET = 1
     ZERO_WRENCH = 2
     CLOSE = 3
-    GO_ON = 4  # along the way to the start; only an arm that was opened for it takes this
+    CONTINUE_TO_START = 4  # along the path to the start; only an arm that was opened for it accepts this
 
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """How the servo loop kept time, over its last 500 periods."""
+    """Periods of the servo loop, over the last 500."""
 
     median: float  # of the period [s]
     p99: float
-    longest: float
+    max_period: float
     overruns: int  # missed periods of this worker
     cycles: int  # periods of this worker
 
 
-# One controller package and the worker's judgement of it. Written every period, and again as soon as a fault is found.
+# One controller package and the worker's status. Written every period, and again as soon as a fault is found.
 STATE = np.dtype(
     [
         ("time", np.float64),  # when the package was read, monotonic clock [s]
@@ -59,16 +59,16 @@ STATE = np.dtype(
         ("safety_bits", np.int64),  # safety_status_bits of the controller
         ("status", np.int64),
         ("resting", np.int64),  # the servo target is at rest
-        ("commands_read", np.int64),  # commands read so far
-        ("zeroed", np.int64),  # how often this worker has zeroed the wrench
-        ("rejected", np.int64),  # commands that were not poses
-        ("shortened", np.int64),  # targets clipped to the workspace
-        ("busy_until", np.float64),  # the worker waits for the controller until then at most [s]
+        ("commands_read", np.int64),  # commands read by this worker
+        ("zeroed", np.int64),  # times that this worker has zeroed the wrench
+        ("rejected", np.int64),  # targets that were not poses
+        ("clipped", np.int64),  # targets clipped to the workspace
+        ("busy_until", np.float64),  # latest end of a call to the controller that takes long [s]
         ("cycles", np.int64),  # periods of this worker
         ("overruns", np.int64),  # missed periods
-        ("period", np.float64, 3),  # median, 99th percentile and maximum of 500 periods, renewed every 500 [s]
-        ("late", np.int64),  # of the last 500 periods, those that took two or more
-        ("longest", np.float64),  # of the last 500 periods [s]
+        ("period", np.float64, 3),  # median, 99th percentile and maximum of 500 periods, updated every 500 [s]
+        ("late", np.int64),  # periods among the last 500 that took two or more
+        ("longest", np.float64),  # longest of the last 500 periods [s]
         ("realtime", np.int64),  # 1: the worker has real-time priority
     ]
 )
@@ -76,13 +76,13 @@ COMMAND = np.dtype(
     [
         ("time", np.float64),
         ("kind", np.int64),
-        ("pose", np.float64, 7),  # position, quaternion x y z w
-        ("speed", np.float64),  # at most this fast, and never faster than limits.speed [m/s]
-        ("share", np.float64),  # of the way to the start, 0 to 1: up to there
+        ("target", np.float64, 7),  # position, quaternion x y z w
+        ("speed", np.float64),  # maximum, in addition to limits.speed [m/s]
+        ("fraction", np.float64),  # of the path to the start, 0 to 1: move up to there
     ]
 )
-# What the driver reports after every observation: exposure time of the oldest picture (NaN: do not guard by pictures
-# now), indentation depth and shear of the arm's own gel (NaN: unknown).
+# Report of the driver after every observation: exposure time of the oldest picture (NaN: the guard by pictures is off),
+# indentation depth and shear of the arm's own gel (NaN: unknown).
 TACTILE = np.dtype([("exposed", np.float64), ("depth", np.float64), ("shear", np.float64)])
 
 
@@ -96,7 +96,7 @@ class Partner:
 
 @dataclass(frozen=True)
 class WorkerConfig:
-    """Everything a worker needs, in plain numbers: it imports neither pydantic nor SciPy, so it starts quickly."""
+    """Configuration of a worker, in plain numbers: without pydantic and SciPy the worker starts quickly."""
 
     name: str
     host: str
@@ -133,7 +133,9 @@ class WorkerConfig:
     gain: float
     partners: list[Partner]
     serial: str | None = None  # of the robot; None: any
-    way: list[list[float]] | None = None  # joints (2, 6): the arm may go straight from the first to the second, no more
+    start_path: list[list[float]] | None = (
+        None  # joints (2, 6): the arm may only move straight from the first to the second
+    )
 
     @property
     def frames(self) -> ArmFrames:
@@ -141,14 +143,14 @@ class WorkerConfig:
         return ArmFrames(*map(np.array, fixed))
 
     @staticmethod
-    def of(given: dict[str, Any]) -> WorkerConfig:
-        """From the dictionary that `asdict` makes, as JSON carries it."""
+    def from_dict(given: dict[str, Any]) -> WorkerConfig:
+        """From the dictionary that `asdict` returns, after JSON."""
         return WorkerConfig(**{**given, "partners": [Partner(**partner) for partner in given["partners"]]})
 
 
 class Channel:
-    """The shared memory of one arm: states from its worker; commands and tactile reports from its driver. None: of a
-    closed arm; there is nothing in it."""
+    """The shared memory of one arm: states from its worker, commands and tactile reports from its driver. Without a
+    segment (None: a closed arm) it is empty."""
 
     _STATES = shared_ring.Ring.size(STATE, HISTORY)
     _BOTH = _STATES + shared_ring.Ring.size(COMMAND, COMMAND_SLOTS)
@@ -165,22 +167,22 @@ _segments: WeakValueDictionary[str, shared_ring.Segment] = WeakValueDictionary()
 _segments_lock = threading.Lock()
 
 
-def segment_of(arm: str) -> shared_ring.Segment:
-    """The memory of an arm of this process: made when it or an arm that keeps its distance from it is opened, and gone
-    when none of them is open any more. Raises OSError."""
+def shared_segment(arm: str) -> shared_ring.Segment:
+    """The memory of an arm of this process. It is created when this arm or another arm of its keep-out is opened, and
+    freed when none of them is open. Raises OSError."""
     with _segments_lock:
-        segment = _segments.get(arm) or shared_ring.create(Channel.SIZE)
+        segment = _segments.get(arm) or shared_ring.create_segment(Channel.SIZE)
         _segments[arm] = segment
         return segment
 
 
-def command_record(
-    time: float, kind: CommandKind, pose: FloatArray | None = None, speed: float = math.inf, share: float = 0.0
+def make_command_record(
+    time: float, kind: CommandKind, target: FloatArray | None = None, speed: float = math.inf, fraction: float = 0.0
 ) -> shared_ring.Record:
-    """A command record; `pose` (7,) and top `speed` [m/s] for CommandKind.TARGET, `share` for CommandKind.GO_ON."""
-    return np.array((time, kind, np.zeros(7) if pose is None else pose, speed, share), COMMAND)
+    """A command record: `target` (7,) and max `speed` [m/s] for TARGET, `fraction` for CONTINUE_TO_START."""
+    return np.array((time, kind, np.zeros(7) if target is None else target, speed, fraction), COMMAND)
 
 
-def tactile_record(exposed: float, depth: float, shear: float) -> shared_ring.Record:
-    """A tactile report; see TACTILE."""
+def make_tactile_record(exposed: float, depth: float, shear: float) -> shared_ring.Record:
+    """A tactile report record; see TACTILE."""
     return np.array((exposed, depth, shear), TACTILE)

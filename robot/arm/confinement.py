@@ -1,9 +1,9 @@
-"""What ur_rtde may not do once it is connected: connect anew, or keep its process waiting.
+"""Limits on ur_rtde after it has connected: it cannot reconnect, and it cannot block its process.
 
-By the source of ur_rtde 1.6.5, `RTDEControlInterface` answers any failure of its connection, in the call that meets it
-as well as in its receiving thread, with `reconnect()`: new connections to the dashboard, the script port and the RTDE,
-its control script uploaded anew, and the command sent again. That program moves the arm, after the driver has told that
-the link is lost, and it has no watchdog. No option turns it off.
+By the source of ur_rtde 1.6.5, `RTDEControlInterface` answers any failure of its connection, in the failing call and in
+its receiving thread, with `reconnect()`: it connects to the dashboard, the script port and the RTDE again, uploads its
+control script again, and sends the command again. That program moves the arm after the driver has reported a lost link,
+and it has no watchdog. No option turns this off.
 """
 
 from __future__ import annotations
@@ -19,34 +19,34 @@ from types import TracebackType
 
 
 @contextlib.contextmanager
-def last_connections() -> Iterator[None]:
-    """Connections that are made inside are the last of this process: afterwards it can open no descriptor any more,
-    not even in place of one that it closes. Needs standard streams that are open."""
-    # The lowest free one: all below it are in use, and all that is opened inside lies above it.
+def forbid_later_connections() -> Iterator[None]:
+    """Connections made inside the block are the last of this process: after it the process cannot open a descriptor,
+    not even in place of a closed one. The standard streams must be open."""
+    # The lowest free descriptor: all below are in use, and all that the block opens lie above.
     limit = os.open(os.devnull, os.O_RDONLY)
     try:
         yield
-        _send_at_once(limit)
+        _set_no_delay(limit)
     finally:
         os.close(limit)
     resource.setrlimit(resource.RLIMIT_NOFILE, (limit, limit))
 
 
-def _send_at_once(above: int) -> None:
-    """Sets TCP_NODELAY on the sockets with descriptors above this one: ur_rtde does, but Boost then closes the socket
-    and opens another one to connect. Without it a command may wait 40 ms for an acknowledgement."""
+def _set_no_delay(min_descriptor: int) -> None:
+    """Sets TCP_NODELAY on the sockets with descriptors above `min_descriptor`. ur_rtde sets it, but Boost then closes
+    that socket and connects another. Without it a command may wait 40 ms for an acknowledgement."""
     for entry in Path("/proc/self/fd").iterdir():
-        if int(entry.name) > above:
-            with contextlib.suppress(OSError):  # no socket
-                link = socket.socket(fileno=int(entry.name))
-                if link.family in (socket.AF_INET, socket.AF_INET6):
-                    link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-                link.detach()
+        if int(entry.name) > min_descriptor:
+            with contextlib.suppress(OSError):  # not a socket
+                connection = socket.socket(fileno=int(entry.name))
+                if connection.family in (socket.AF_INET, socket.AF_INET6):
+                    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                connection.detach()
 
 
 class TimeLimit:
-    """The kernel ends this process if a block takes longer than `seconds`, even while a library holds the interpreter.
-    A context manager that can be used again; one at a time."""
+    """The kernel ends this process if a block takes longer than `seconds`, even while a library holds the interpreter
+    lock. A reusable context manager; only one may be active."""
 
     def __init__(self, seconds: float) -> None:
         self.seconds = seconds
@@ -60,7 +60,7 @@ class TimeLimit:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
 
 
-def allow_time_limits() -> None:
-    """Gives SIGALRM its default effect, also where the parent ignores or blocks it: what a time limit relies on."""
+def enable_time_limits() -> None:
+    """Restores the default effect of SIGALRM, which a TimeLimit needs, if the parent ignores or blocks the signal."""
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGALRM})

@@ -1,11 +1,11 @@
-"""Whether an arm follows: the speed scaling of its controller, and where the arm must be by what it was sent.
+"""Following error of an arm: the controller's speed scaling, and the joints expected from the targets that were sent.
 
-servoJ leads the joints to the newest target like a lag of first order with the time constant `lookahead`, and runs in
-the time of the controller's speed scaling: at 0.1 ten times as slowly. A target that ignores the scaling gets far
-ahead, and the arm catches up at a speed that no limit of ours bounds. So the target runs in the same time.
+servoJ moves the joints to the newest target with a first-order lag of time constant `lookahead`, in the time of the
+controller's speed scaling: at 0.1 ten times as slowly. A target that ignores the scaling gets far ahead, and the arm
+catches up at a speed that none of our limits bounds. So the target runs in the same scaled time.
 
-The model here is a slower lag than servoJ has: an arm that follows is never behind it. How far the arm is from the line
-between the model and the target is its following error; the usual lag is no part of it.
+The model here has a slower lag than servoJ, so an arm that follows is never behind it. The following error is the
+distance of the arm from the line between the model and the target; the normal lag does not add to it.
 """
 
 from __future__ import annotations
@@ -18,101 +18,106 @@ from robot.common.kinematics import Kinematics
 from robot.common.tcp import ArmFrames, Measured
 from tacsim.interface import FloatArray
 
-# How fast the speed scaling changes [1/s]: Universal Robots' ROS driver lets it rise by 0.01 in each period of 2 ms.
+# Rate of change of the speed scaling [1/s]: Universal Robots' ROS driver raises it by 0.01 in each period of 2 ms.
 SCALING_RATE = 5.0
-# Up, the target follows more slowly: an arm that begins to move while the scaling rises speeds up by the rate of
-# both, 1.45 times as much as its target.
+# The target follows a rising scaling more slowly: an arm that starts while the scaling rises accelerates by both,
+# 1.45 times as much as its target.
 RISE_RATE = SCALING_RATE / 1.5
-SLOWER_LAG = 1.5  # time constant of the model, in that of servoJ
-DELAY = 10e-3  # added to it: target to controller, joints behind their set points, package to worker [s]
-LONGEST = 0.2  # between two packages; a larger step, or one back, is a jump of the controller's clock [s]
-SETTLED = 8.0  # time constants after which servoJ has led the joints to a target that rests
-FOREIGN_SPEED, FOREIGN_SHIFT = 2e-3, 1e-3  # of the controller's own target, where servoJ would let it rest [rad/s, rad]
-RESTING, RESTING_TURN = 1e-3, 10e-3  # an arm slower than this is at rest [m/s, rad/s]
+SLOW_LAG_RATIO = 1.5  # time constant of the model divided by that of servoJ
+MAX_DELAY = 10e-3  # added to it: target to controller, joints behind their setpoints, package to worker [s]
+MAX_PACKAGE_GAP = 0.2  # between two packages; a larger or negative step is a jump of the controller's clock [s]
+SETTLING_TIME_CONSTANTS = 8.0  # time constants after which servoJ has moved the joints to a target at rest
+OTHER_PROGRAM_SPEED, OTHER_PROGRAM_SHIFT = (
+    2e-3,
+    1e-3,
+)  # of the controller's own target while ours is at rest [rad/s, rad]
+MAX_REST_SPEED, MAX_REST_TURN_RATE = 1e-3, 10e-3  # a slower arm is at rest [m/s, rad/s]
 
 
 class SpeedScaling:
-    """The speed scaling that a target has to reckon with: as reported, with the rate that it can really change at."""
+    """The speed scaling that the target uses: the reported one, limited to its real rate of change."""
 
     def __init__(self) -> None:
         self.value = 1.0
 
     def update(self, reported: float) -> float:
-        """One period nearer to what the controller reports. Returns the part of the speed that is left: below 1 when
-        the scaling falls."""
+        """Moves one period towards the reported scaling. Returns the factor for the present speed: below 1 when the
+        scaling falls."""
         before = self.value
         change = min(1.0, max(0.0, reported)) - before
         self.value += min(RISE_RATE * PERIOD, max(-SCALING_RATE * PERIOD, change))
         return min(1.0, self.value / before) if before > 0.0 else 1.0
 
     def speed(self, speed: float, acceleration: float) -> float:
-        """Top speed [m/s or rad/s] of a target: below full scaling, no more than lets the arm speed up within
+        """Maximum speed [m/s or rad/s] of a target. Below full scaling it is small enough that the arm stays within
         `acceleration` when the scaling rises at its full rate."""
         return speed if self.value == 1.0 else self.value * min(speed, acceleration / SCALING_RATE)
 
 
 class FollowingMonitor:
-    """Where the arm is, against where it was sent. Times are those of the controller's packages."""
+    """Compares the measured joints with those that were sent. Times are those of the controller's packages."""
 
     def __init__(self, config: WorkerConfig, kinematics: Kinematics, frames: ArmFrames) -> None:
         self._kinematics, self._lookahead = kinematics, config.lookahead
         self._flange_from_sensor = frames.flange_from_tool @ frames.tool_from_sensor
-        self._expected: FloatArray | None = None  # joints (6,) that the arm has at least come to
-        self._target: FloatArray | None = None  # joints (6,) sent last
-        self._stamp = np.nan
-        self._rested = 0.0  # for how many time constants of servoJ the target has rested
+        self._expected_joints: FloatArray | None = None  # joints (6,) that the arm has reached or passed
+        self._sent_joints: FloatArray | None = None  # joints (6,) of the last target
+        self._last_stamp = np.nan
+        self._rest_time_constants = 0.0  # rest of the target, in time constants of servoJ
 
     def restart(self, joints: FloatArray | None) -> None:
-        """The target begins anew at `joints` (6,), where the arm is."""
-        self._expected = self._target = joints
-        self._rested = 0.0
+        """Restarts the target at the present `joints` (6,) of the arm."""
+        self._expected_joints = self._sent_joints = joints
+        self._rest_time_constants = 0.0
 
-    def update(self, sent: FloatArray | None, stamp: float, scaling: float) -> None:
-        """A new package, of the time `stamp` [s]; `sent` (6,): joints of the newest target; None: nothing is sent."""
-        passed = stamp - self._stamp
-        passed = passed if 0.0 <= passed <= LONGEST else PERIOD
-        self._stamp = stamp
-        if sent is None:
+    def update(self, sent_joints: FloatArray | None, stamp: float, scaling: float) -> None:
+        """Takes a new package with time `stamp` [s]. `sent_joints` (6,): the newest target; None: nothing is sent."""
+        elapsed = stamp - self._last_stamp
+        elapsed = elapsed if 0.0 <= elapsed <= MAX_PACKAGE_GAP else PERIOD
+        self._last_stamp = stamp
+        if sent_joints is None:
             return
-        if self._expected is None or self._target is None:
-            self.restart(sent)
+        if self._expected_joints is None or self._sent_joints is None:
+            self.restart(sent_joints)
             return
-        rests = bool((sent == self._target).all())
-        self._rested = self._rested + scaling * passed / self._lookahead if rests else 0.0
-        share = np.exp(-passed / (DELAY + SLOWER_LAG * self._lookahead / max(scaling, 1e-3)))
-        self._expected = sent + share * (self._expected - sent)
-        self._target = sent
+        is_resting = bool((sent_joints == self._sent_joints).all())
+        self._rest_time_constants = (
+            self._rest_time_constants + scaling * elapsed / self._lookahead if is_resting else 0.0
+        )
+        share = np.exp(-elapsed / (MAX_DELAY + SLOW_LAG_RATIO * self._lookahead / max(scaling, 1e-3)))
+        self._expected_joints = sent_joints + share * (self._expected_joints - sent_joints)
+        self._sent_joints = sent_joints
 
     def error(self, joints: FloatArray) -> tuple[float, float]:
-        """How far the sensor of an arm with these joints (6,) is from where it was sent [m, rad]."""
-        if self._expected is None or self._target is None:
+        """Distance of the sensor at `joints` (6,) from where it was sent [m, rad]."""
+        if self._expected_joints is None or self._sent_joints is None:
             return 0.0, 0.0
         jacobian = self._kinematics.jacobian(joints, self._flange_from_sensor)
-        behind, ahead = jacobian @ (self._expected - joints), jacobian @ (self._target - joints)
-        return _distance(behind[:3], ahead[:3]), _distance(behind[3:], ahead[3:])
+        to_expected, to_sent = jacobian @ (self._expected_joints - joints), jacobian @ (self._sent_joints - joints)
+        return _distance_to_segment(to_expected[:3], to_sent[:3]), _distance_to_segment(to_expected[3:], to_sent[3:])
 
     @property
     def has_settled(self) -> bool:
-        """True if packages have arrived since servoJ led the joints to a target that rests."""
-        return self._target is not None and self._rested >= SETTLED
+        """True if packages have arrived since servoJ moved the joints to a target at rest."""
+        return self._sent_joints is not None and self._rest_time_constants >= SETTLING_TIME_CONSTANTS
 
-    def is_moved_from_rest(self, target: FloatArray, speeds: FloatArray) -> bool:
-        """True if the controller's own target (6,) [rad] moves, at speeds (6,) [rad/s], or lies elsewhere, where servoJ
-        has come to rest: another program moves it."""
-        if self._target is None or not self.has_settled:
+    def is_moved_from_rest(self, target_joints: FloatArray, target_speeds: FloatArray) -> bool:
+        """True if the controller's own target (6,) [rad] moves, with speeds (6,) [rad/s], or differs from ours although
+        servoJ has settled: another program moves the arm."""
+        if self._sent_joints is None or not self.has_settled:
             return False
-        moves = float(np.abs(speeds).max()) > FOREIGN_SPEED
-        return moves or float(np.abs(target - self._target).max()) > FOREIGN_SHIFT
+        is_moving = float(np.abs(target_speeds).max()) > OTHER_PROGRAM_SPEED
+        return is_moving or float(np.abs(target_joints - self._sent_joints).max()) > OTHER_PROGRAM_SHIFT
 
 
-def _distance(begin: FloatArray, end: FloatArray) -> float:
-    """From the origin to the segment between two points (3,)."""
+def _distance_to_segment(begin: FloatArray, end: FloatArray) -> float:
+    """Distance of the origin from the segment between two points (3,)."""
     along = end - begin
     share = min(1.0, max(0.0, -float(begin @ along) / max(float(along @ along), 1e-18)))
     return float(np.linalg.norm(begin + share * along))
 
 
-def is_standing(measured: Measured) -> bool:
-    """True if the arm itself does not move."""
+def is_standing_still(measured: Measured) -> bool:
+    """True if the measured speeds of the arm are those of rest."""
     twist = np.abs(measured.twist)
-    return bool(twist[:3].max() <= RESTING and twist[3:].max() <= RESTING_TURN)
+    return bool(twist[:3].max() <= MAX_REST_SPEED and twist[3:].max() <= MAX_REST_TURN_RATE)

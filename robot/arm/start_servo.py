@@ -1,9 +1,10 @@
 """The servo of an arm that is led to its start: straight in joint space, slowly, and nowhere else.
 
 An arm that stands outside its workspace follows no ordinary command. Here the region is replaced by the way: the
-measured joints must be on it, within OFF_WAY. Targets are refused; CommandKind.GO_ON moves the arm along the way, up to
-a share of it, and must be repeated within `action_timeout` as any command. Limits of force, the keep-out, the partners,
-the link, the stops of the controller and the driver's death are guarded as ever, by the same code.
+measured joints must be on it, within OFF_WAY. Targets are refused; CommandKind.CONTINUE_TO_START moves the arm along
+the way, up to a share of it, and must be repeated within `action_timeout` as any command. Limits of force, the
+keep-out, the partners, the link, the stops of the controller and the driver's death are guarded as ever, by the same
+code.
 """
 
 from __future__ import annotations
@@ -16,11 +17,11 @@ from itertools import pairwise
 import numpy as np
 
 from robot.arm.channel import CommandKind, WorkerConfig
-from robot.arm.following import is_standing
+from robot.arm.following import is_standing_still
 from robot.arm.servo import Servo
 from robot.arm.shared_ring import Record
 from robot.arm.status import ArmStatus
-from robot.arm.trajectory import PERIOD, MotionState, advance, resting, slower, stopping_distance
+from robot.arm.trajectory import PERIOD, MotionState, motion_at_rest, reduce_speed, step_velocity, stopping_distance
 from robot.common.kinematics import Kinematics, inverse_frame, rotation_vector
 from robot.common.tcp import ArmFrames, Measured
 from tacsim.interface import FloatArray
@@ -72,16 +73,16 @@ class _Target:
     joints: FloatArray  # (6,) [rad]
     rate: FloatArray  # (6,) [rad/s]
     motion: MotionState  # of the sensor
-    stop: FloatArray  # (3,) where the sensor comes to rest if it brakes from then on [m]
+    stopping_point: FloatArray  # (3,) where the sensor comes to rest if it brakes from then on [m]
 
 
 class StartServo(Servo):
-    """As its base, for the one way of `config.way`."""
+    """As its base, for the one way of `config.start_path`."""
 
     def __init__(self, config: WorkerConfig, commands_read: int = 0, tactile_read: int = 0) -> None:
         super().__init__(config, commands_read, tactile_read)
-        assert config.way is not None
-        self._begin, self._end = np.array(config.way)
+        assert config.start_path is not None
+        self._begin, self._end = np.array(config.start_path)
         self._top, self._acceleration = way_rates(self.kinematics, self.frames, self._begin, self._end, config)
         self._flange_from_sensor = self.frames.flange_from_tool @ self.frames.tool_from_sensor
         self._share: float | None = None  # up to where it may go; None: it stays
@@ -89,9 +90,9 @@ class StartServo(Servo):
         self._rate = np.zeros(6)  # of the target [rad/s]
         self._stop = np.zeros(3)  # where the sensor would come to rest if the target braked now [m]
 
-    def _check_place(self, measured: Measured) -> None:
+    def _check_position(self, measured: Measured) -> None:
         if distance_from_way(measured.joints, self._begin, self._end) > OFF_WAY:
-            self.trip(ArmStatus.OFF_WAY)
+            self.enter_fault(ArmStatus.OFF_PATH)
 
     def check_faults(self, measured: Measured, partners: Sequence[Record | None]) -> None:
         if self.status == ArmStatus.WAITING:  # what was asked meanwhile is forgotten
@@ -103,63 +104,65 @@ class StartServo(Servo):
         if command is None or number == self.commands_read:
             return
         super().on_command(number, command)
-        self.rejected += self._goal is not None
-        self._goal = self._share = None
-        share = float(command["share"])
-        if int(command["kind"]) == CommandKind.GO_ON and 0.0 <= share <= 1.0:
+        self.rejected += self._allowed_target is not None
+        self._allowed_target = self._share = None
+        share = float(command["fraction"])
+        if int(command["kind"]) == CommandKind.CONTINUE_TO_START and 0.0 <= share <= 1.0:
             self._share, self._share_time = share, float(command["time"])
 
     def step(self, time: float, measured: Measured, partners: Sequence[Record | None]) -> FloatArray | None:
         """The joints (6,) to send in this period; None: send nothing, the controller holds."""
         if self.status.is_fault:
             return super().step(time, measured, partners)
-        self._before = self.motion, self._sent, self._fault_braking
-        if self._waits_for_package(time, measured):
-            return self._sent
+        self._previous_step = self.motion, self._sent_joints, self._fault_braking
+        if self._is_waiting_for_package(time, measured):
+            return self._sent_joints
         waits = self.status == ArmStatus.WAITING
         goes = not waits and self._share is not None and time - self._share_time <= self.config.action_timeout
         if not waits:
             self.status = ArmStatus.OK if goes else ArmStatus.HOLD
         if (
-            self._sent is None
+            self._sent_joints is None
             or self.motion is None
-            or (self.motion.at_rest and self._was_moved(self.motion, measured))
-            or (self._scaling.value == 0.0 and is_standing(measured))
+            or (self.motion.is_at_rest and self._was_pushed(self.motion, measured))
+            or (self._scaling.value == 0.0 and is_standing_still(measured))
         ):
             if not goes:
-                return None if self._sent is None else self._sent
-            self._begin_at(measured)
-            assert self._sent is not None
-        if goes and float(np.abs(measured.joints - self._sent).max()) < LAG:
+                return None if self._sent_joints is None else self._sent_joints
+            self._start_at(measured)
+            assert self._sent_joints is not None
+        if goes and float(np.abs(measured.joints - self._sent_joints).max()) < LAG:
             assert self._share is not None
             goal = self._begin + self._share * (self._end - self._begin)
             top = self._scaling.speed(self._top, self._acceleration)
-            rate, moved, arrived = advance(goal - self._sent, self._rate, top, self._acceleration)
-            wanted = self._target(goal if arrived else self._sent + moved, np.zeros(6) if arrived else rate, measured)
+            rate, moved, arrived = step_velocity(goal - self._sent_joints, self._rate, top, self._acceleration)
+            wanted = self._target(
+                goal if arrived else self._sent_joints + moved, np.zeros(6) if arrived else rate, measured
+            )
             if self._keeps_clear(wanted, partners):
                 return self._follow(wanted)
-        rate = slower(self._rate, self._acceleration * PERIOD)
-        return self._follow(self._target(self._sent + rate * PERIOD, rate, measured))
+        rate = reduce_speed(self._rate, self._acceleration * PERIOD)
+        return self._follow(self._target(self._sent_joints + rate * PERIOD, rate, measured))
 
-    def _begin_at(self, measured: Measured) -> MotionState:
+    def _start_at(self, measured: Measured) -> MotionState:
         self._rate, self._stop = np.zeros(6), measured.sensor[:3, 3]
-        return super()._begin_at(measured)
+        return super()._start_at(measured)
 
-    def _slow_target(self, share: float) -> None:
-        super()._slow_target(share)
-        self._rate = share * self._rate
+    def _scale_velocity(self, factor: float) -> None:
+        super()._scale_velocity(factor)
+        self._rate = factor * self._rate
 
     def _slow_after_stall(self, missed: float, twist: FloatArray) -> None:
         """As its base, in joints: those of the arm run out towards the target by the law of the controller."""
         self._rate = self._rate * math.exp(-missed / self.config.lookahead)
 
     @property
-    def stop(self) -> FloatArray | None:
-        return super().stop if self.status.is_fault or self.motion is None else self._stop
+    def stopping_point(self) -> FloatArray | None:
+        return super().stopping_point if self.status.is_fault or self.motion is None else self._stop
 
     def _follow(self, target: _Target) -> FloatArray:
-        self._rate, self._stop = target.rate, target.stop
-        return self._send(target.motion, target.joints)
+        self._rate, self._stop = target.rate, target.stopping_point
+        return self._set_target(target.motion, target.joints)
 
     def _target(self, joints: FloatArray, rate: FloatArray, measured: Measured) -> _Target:
         """A real arm's own lengths, which the model does not contain, follow from `measured`."""
@@ -172,7 +175,7 @@ class StartServo(Servo):
 
         here = sensor(joints)
         if not rate.any():
-            return _Target(joints, rate, resting(here[:3, 3], here[:3, :3]), here[:3, 3])
+            return _Target(joints, rate, motion_at_rest(here[:3, 3], here[:3, :3]), here[:3, 3])
         before = sensor(joints - rate * PERIOD)
         velocity = (here[:3, 3] - before[:3, 3]) / PERIOD
         spin = rotation_vector(here[:3, :3] @ before[:3, :3].T) / PERIOD
@@ -183,6 +186,6 @@ class StartServo(Servo):
     def _keeps_clear(self, target: _Target, partners: Sequence[Record | None]) -> bool:
         """True if the arm could still stop clear of the other arms, or moves away from them."""
         assert self.motion is not None
-        before = self._gaps(self.motion, partners, self._stop)
-        now = self._gaps(target.motion, partners, target.stop)
+        before = self._braking_gaps(self.motion, partners, self._stop)
+        now = self._braking_gaps(target.motion, partners, target.stopping_point)
         return all(new >= 0.0 or new >= old for new, old in zip(now, before, strict=True))

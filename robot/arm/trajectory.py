@@ -1,9 +1,9 @@
-"""Trajectories from the present pose to a target, one servo period at a time, within limits of speed and acceleration.
+"""Trajectories from the present pose to a target, in steps of one servo period, limited in speed and acceleration.
 
-The sensor's origin and its axes are planned separately, each with limits of its own: in every period the velocity
-changes by at most acceleration times period, and the speed still allows a stop on the target. The laws are in discrete
+Position and rotation of the sensor are planned separately, each with its own limits: in every period the velocity
+changes by at most acceleration times period, and the speed still allows a stop on the target. The laws use discrete
 time, so they hold exactly for the poses that are sent: the second difference of the positions is within the
-acceleration, and the target is met without overshoot.
+acceleration, and the target is reached without overshoot.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from tacsim.interface import FloatArray
 PERIOD = 2e-3  # of the servo loop [s]
 
 
-class Rates(Protocol):
-    """Limits of a motion; tacsim.models.hardware.ArmLimits has them."""
+class MotionLimits(Protocol):
+    """Limits of a motion. tacsim.models.hardware.ArmLimits and WorkerConfig follow this protocol."""
 
     @property
     def speed(self) -> float: ...  # [m/s]
@@ -45,72 +45,74 @@ class MotionState:
     spin: FloatArray  # (3,) angular velocity [rad/s]
 
     @property
-    def at_rest(self) -> bool:
+    def is_at_rest(self) -> bool:
         return not self.velocity.any() and not self.spin.any()
 
 
-def resting(position: FloatArray, rotation: FloatArray) -> MotionState:
-    """At rest at `position` (3,) [m] with axes `rotation` (3, 3)."""
+def motion_at_rest(position: FloatArray, rotation: FloatArray) -> MotionState:
+    """A motion state at rest at `position` (3,) [m] with axes `rotation` (3, 3)."""
     return MotionState(
         np.array(position, dtype=np.float64), np.array(rotation, dtype=np.float64), np.zeros(3), np.zeros(3)
     )
 
 
-def landing_speed(distance: float, acceleration: float) -> float:
-    """The highest speed of the next period that still allows a stop `distance` [m] ahead, exactly there [m/s].
+def max_landing_speed(distance: float, acceleration: float) -> float:
+    """The maximum speed of the next period [m/s] that still allows a stop exactly `distance` [m] ahead.
 
-    n periods that each brake by a = acceleration * period cover, from speed u, period * (n u - a n (n - 1) / 2). The
-    least n whose last speed is at most a gives u; between whole n the law is linear, so it has no steps.
+    From speed u, n periods that each brake by a = acceleration * period cover period * (n u - a n (n - 1) / 2). The
+    smallest n whose last speed is at most a gives u. Between whole n the law is linear, so it is continuous.
     """
-    slowing = acceleration * PERIOD
-    n = max(1, math.ceil(0.5 * (math.sqrt(1.0 + 8.0 * distance / (slowing * PERIOD)) - 1.0)))
-    return distance / (n * PERIOD) + 0.5 * slowing * (n - 1)
+    speed_step = acceleration * PERIOD
+    n = max(1, math.ceil(0.5 * (math.sqrt(1.0 + 8.0 * distance / (speed_step * PERIOD)) - 1.0)))
+    return distance / (n * PERIOD) + 0.5 * speed_step * (n - 1)
 
 
 def stopping_distance(speed: float, acceleration: float) -> float:
-    """Distance [m] covered from `speed` when every further period brakes as hard as allowed; at most v^2 / 2a."""
-    slowing = acceleration * PERIOD
-    n = math.floor(speed / slowing)
-    return PERIOD * (n * speed - 0.5 * slowing * n * (n + 1))
+    """Distance [m] covered from `speed` [m/s] when every period brakes by the maximum; at most v^2 / 2a."""
+    speed_step = acceleration * PERIOD
+    n = math.floor(speed / speed_step)
+    return PERIOD * (n * speed - 0.5 * speed_step * n * (n + 1))
 
 
-def towards(
-    now: MotionState,
-    position: FloatArray,
-    rotation: FloatArray,
-    rates: Rates,
-    allowed: Callable[[MotionState], bool] | None = None,
+def step_towards(
+    motion: MotionState,
+    target_position: FloatArray,
+    target_rotation: FloatArray,
+    limits: MotionLimits,
+    is_allowed: Callable[[MotionState], bool] | None = None,
 ) -> MotionState:
-    """One period nearer to the target `position` (3,) [m] and `rotation` (3, 3).
+    """The motion state one period later, on the path to `target_position` (3,) [m] and `target_rotation` (3, 3).
 
-    `allowed` says whether a motion state is allowed, judged by where it could still be stopped. Where it is not, the
-    origin brakes straight on instead: its stopping point stays the one that was allowed before.
+    `is_allowed` decides by the stopping point of a motion state. If the next state is not allowed, the origin brakes
+    straight ahead instead: its stopping point stays the one that was allowed before.
     """
-    velocity, moved, arrived = advance(position - now.position, now.velocity, rates.speed, rates.acceleration)
-    spin, turned, rotation_arrived = advance(
-        rotation_vector(rotation @ now.rotation.T), now.spin, rates.turn_rate, rates.turn_acceleration
+    velocity, shift, arrived = step_velocity(
+        target_position - motion.position, motion.velocity, limits.speed, limits.acceleration
+    )
+    spin, rotation_step, rotation_arrived = step_velocity(
+        rotation_vector(target_rotation @ motion.rotation.T), motion.spin, limits.turn_rate, limits.turn_acceleration
     )
     step = MotionState(
-        position.copy() if arrived else now.position + moved,
-        rotation.copy() if rotation_arrived else turn(turned) @ now.rotation,
+        target_position.copy() if arrived else motion.position + shift,
+        target_rotation.copy() if rotation_arrived else turn(rotation_step) @ motion.rotation,
         velocity,
         spin,
     )
-    if allowed is None or allowed(step):
+    if is_allowed is None or is_allowed(step):
         return step
-    held = braking(now, rates.acceleration, rates.turn_acceleration)
-    return replace(held, rotation=step.rotation, spin=step.spin)  # limits hold for the origin; it may still turn
+    braked = step_braking(motion, limits.acceleration, limits.turn_acceleration)
+    return replace(braked, rotation=step.rotation, spin=step.spin)  # the limits apply to the origin; it may still turn
 
 
-def braking(now: MotionState, deceleration: float, turn_deceleration: float) -> MotionState:
-    """One period nearer to rest, straight on."""
-    velocity = slower(now.velocity, deceleration * PERIOD)
-    spin = slower(now.spin, turn_deceleration * PERIOD)
-    return MotionState(now.position + velocity * PERIOD, turn(spin * PERIOD) @ now.rotation, velocity, spin)
+def step_braking(motion: MotionState, deceleration: float, turn_deceleration: float) -> MotionState:
+    """The motion state one period later when it brakes straight ahead; decelerations in [m/s^2] and [rad/s^2]."""
+    velocity = reduce_speed(motion.velocity, deceleration * PERIOD)
+    spin = reduce_speed(motion.spin, turn_deceleration * PERIOD)
+    return MotionState(motion.position + velocity * PERIOD, turn(spin * PERIOD) @ motion.rotation, velocity, spin)
 
 
-def stopping_point(motion: MotionState, deceleration: float) -> FloatArray:
-    """(3,) where the origin comes to rest when it brakes from now on [m]."""
+def find_stopping_point(motion: MotionState, deceleration: float) -> FloatArray:
+    """(3,) where the origin stops when it brakes from now on [m]."""
     speed = math.sqrt(float(motion.velocity @ motion.velocity))
     if speed == 0.0:
         return motion.position
@@ -118,41 +120,41 @@ def stopping_point(motion: MotionState, deceleration: float) -> FloatArray:
     return point
 
 
-def advance(
-    error: FloatArray, velocity: FloatArray, top: float, acceleration: float
+def step_velocity(
+    error: FloatArray, velocity: FloatArray, max_speed: float, acceleration: float
 ) -> tuple[FloatArray, FloatArray, bool]:
-    """The next velocity towards a point `error` away, its displacement, and whether that arrives; vectors of any length
-    alike, `top` and `acceleration` bound their norms."""
+    """The next velocity towards a point at distance vector `error`, its displacement in one period, and whether that
+    reaches the point. Vectors may have any length; `max_speed` and `acceleration` bound their norms."""
     distance = math.sqrt(float(error @ error))
-    speed = min(top, landing_speed(distance, acceleration))
-    wanted = error * (speed / distance) if distance > 0.0 else np.zeros_like(velocity)
-    change = wanted - velocity
+    speed = min(max_speed, max_landing_speed(distance, acceleration))
+    new_velocity = error * (speed / distance) if distance > 0.0 else np.zeros_like(velocity)
+    change = new_velocity - velocity
     excess = math.sqrt(float(change @ change)) / (acceleration * PERIOD)
     if excess > 1.0 + 1e-12:
-        wanted = velocity + change / excess
-        return wanted, wanted * PERIOD, False
-    return wanted, wanted * PERIOD, speed * PERIOD >= distance * (1.0 - 1e-12)
+        new_velocity = velocity + change / excess
+        return new_velocity, new_velocity * PERIOD, False
+    return new_velocity, new_velocity * PERIOD, speed * PERIOD >= distance * (1.0 - 1e-12)
 
 
-def slower(velocity: FloatArray, change: float) -> FloatArray:
+def reduce_speed(velocity: FloatArray, max_change: float) -> FloatArray:
     speed = math.sqrt(float(velocity @ velocity))
-    return np.zeros_like(velocity) if speed <= change else velocity * (1.0 - change / speed)
+    return np.zeros_like(velocity) if speed <= max_change else velocity * (1.0 - max_change / speed)
 
 
-def no_faster(velocity: FloatArray, kept: FloatArray, more: float) -> FloatArray:
-    """`velocity` (3,), in its direction no faster than `kept` (3,) is, and so much `more`."""
+def limit_speed(velocity: FloatArray, reference: FloatArray, margin: float) -> FloatArray:
+    """`velocity` (3,) limited to the speed of `reference` (3,) along it plus `margin`."""
     speed = math.sqrt(float(velocity @ velocity))
     if speed == 0.0:
         return velocity
-    return velocity * min(1.0, (max(0.0, float(velocity @ kept) / speed) + more) / speed)
+    return velocity * min(1.0, (max(0.0, float(velocity @ reference) / speed) + margin) / speed)
 
 
-def is_at(motion: MotionState, goal: tuple[FloatArray, FloatArray]) -> bool:
-    return np.array_equal(motion.position, goal[0]) and np.array_equal(motion.rotation, goal[1])
+def is_at_target(motion: MotionState, target: tuple[FloatArray, FloatArray]) -> bool:
+    return np.array_equal(motion.position, target[0]) and np.array_equal(motion.rotation, target[1])
 
 
-def rotation_of(quaternion: FloatArray) -> FloatArray:
-    """(3, 3) of a quaternion x y z w of about unit length."""
+def rotation_from_quaternion(quaternion: FloatArray) -> FloatArray:
+    """Rotation matrix (3, 3) of a quaternion x y z w of about unit length."""
     x, y, z, w = (quaternion / np.linalg.norm(quaternion)).tolist()
     return np.array(
         [

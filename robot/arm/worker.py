@@ -1,13 +1,13 @@
 """The process that talks to one UR arm: `python -m robot.arm.worker`, with its WorkerConfig as JSON on stdin.
 
-The only importer of ur_rtde, in a process of its own because the library may crash, hang, or hold the interpreter's
-lock while it waits for a silent controller. It cannot reconnect (robot.arm.confinement): a worker that has lost its
-connection ends, and the driver starts another one. For a real arm it asks for real-time priority, and runs on without
-it.
+The only importer of ur_rtde, in its own process because the library may crash, hang, or hold the interpreter lock
+while it waits for a controller that does not answer. It cannot reconnect (robot.arm.confinement): a worker that has
+lost its connection ends, and the driver starts another one. For a real arm it requests real-time priority, and runs
+without it if refused.
 
-The loop, every 2 ms, in this order: read the newest package and publish it; end if the driver or the connection is
-gone; check safety bits, force, region, other arms and gels, and publish a fault before anything that may block; read
-the newest command; compute the next servo target and send it.
+The loop, every 2 ms, in this order: read the newest package and publish it; end if the driver has ended or the
+connection is lost; check safety bits, force, region, other arms and gels, and publish a fault before any call that may
+block; read the newest command; compute the next servo target and send it.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from robot.arm.channel import STATE, WINDOW, Channel, WorkerConfig
-from robot.arm.confinement import TimeLimit, allow_time_limits, last_connections
+from robot.arm.channel import STATE, STATISTICS_PERIODS, Channel, WorkerConfig
+from robot.arm.confinement import TimeLimit, enable_time_limits, forbid_later_connections
 from robot.arm.controller.dashboard import Dashboard
 from robot.arm.servo import Servo
 from robot.arm.shared_ring import Segment
@@ -39,7 +39,7 @@ from tacsim.interface import FloatArray
 
 PORTS = {30004: "RTDE", 30003: "script"}
 PROBE_TIMEOUT = 2.0  # of a TCP connection [s]
-VARIABLES = [  # of one package; a name that the library does not know would shift the others
+VARIABLES = [  # of one package; an unknown name would shift the others
     "timestamp",
     "actual_q",
     "actual_qd",
@@ -56,19 +56,19 @@ VARIABLES = [  # of one package; a name that the library does not know would shi
 PLAYING = 2  # of runtime_state
 PROTECTIVE_BIT = 1 << 2
 STOP_BITS = 1 << 3 | 1 << 4 | 1 << 5 | 1 << 6 | 1 << 7 | 1 << 8 | 1 << 9  # recovery, safeguard, emergency stops, fault
-MODEL_LENGTH, MODEL_TURN = 20e-3, 0.05  # FK of the named model and the controller's pose agree within [m, rad]
-TAKEN = 0.2  # what is measured so long after a new TCP or payload is by it, on the controller's clock [s]
-SILENT = 5.0  # longest wait for such a package [s]
-CLOSING = 0.6  # longest braking when the driver closes [s]
-PARENTLESS = 0.5  # longest braking when the driver is gone [s]
-CONNECTING = 60.0  # longest time to connect; the driver waits less, but it may be gone [s]
-MARGIN = 10e-3  # a call in the loop takes at most so much longer than link_timeout: the driver tells then [s]
-ZEROING = 2.0  # longest time to zero the force sensor [s]
-ENDING = 3.0  # longest time to end the program; the driver waits less, but it may be gone [s]
-BLIND = 5  # periods without a new package; then nothing is sent
-SUSPENDED = 5e-3  # a target that took this long was held up with its process, and comes too late [s]
-GRACE = 5  # periods in which a package may say why the controller takes no more commands
-FAILED = 3  # exit status; the reason is on stdout, as JSON
+MAX_MODEL_SHIFT, MAX_MODEL_TURN = 20e-3, 0.05  # FK of the named model and the controller's pose agree within [m, rad]
+SETTING_DELAY = 0.2  # after it, on the controller's clock, packages use a new TCP or payload [s]
+MAX_PACKAGE_WAIT = 5.0  # for such a package [s]
+MAX_CLOSING_TIME = 0.6  # of braking when the driver closes [s]
+MAX_BRAKING_WITHOUT_PARENT = 0.5  # of braking when the driver has ended [s]
+MAX_CONNECTING_TIME = 60.0  # the driver waits less, but it may have ended [s]
+CALL_MARGIN = 10e-3  # a call in the loop may exceed link_timeout by this; the driver reports it [s]
+MAX_ZEROING_TIME = 2.0  # of the force sensor [s]
+MAX_ENDING_TIME = 3.0  # of the program; the driver waits less, but it may have ended [s]
+MAX_MISSED_PACKAGES = 5  # periods without a new package; beyond it nothing is sent
+MAX_TARGET_DELAY = 5e-3  # of computing; a later target comes from a suspended process and is not sent [s]
+REPORT_PERIODS = 5  # periods in which a package may report why the controller refuses commands
+FAILED_EXIT_STATUS = 3  # the reason is on stdout, as JSON
 
 
 class Worker:
@@ -81,30 +81,34 @@ class Worker:
         self.record = np.zeros((), STATE)
         self.record["top_speed"] = config.speed
         self.partners = [Channel(Segment(partner.segment)) for partner in config.partners]
-        servo = Servo if config.way is None else StartServo
+        servo = Servo if config.start_path is None else StartServo
         self.servo = servo(config, commands_read=self.channel.commands.count, tactile_read=self.channel.tactile.count)
-        self._periods = np.full(WINDOW, PERIOD)
-        self._limit = TimeLimit(config.link_timeout + MARGIN)  # of calls into the library
-        self._driver = Lifeline(config.parent)  # opens a file: not once it is connected
-        self._last = 0.0  # when the last period ended
-        self._rereads = 0  # of the same package
-        self._refused = 0  # periods since the controller refused a command; 0: it did not
+        self._periods = np.full(STATISTICS_PERIODS, PERIOD)
+        self._call_limit = TimeLimit(config.link_timeout + CALL_MARGIN)  # for calls into the library
+        self._driver = Lifeline(config.parent)  # opens a file, which is impossible after connecting
+        self._last_period_end = 0.0  # [s]
+        self._rereads = 0  # reads of the same package
+        self._refused_periods = 0  # since the controller refused a command; 0: not refused
         self.state = self.frames.measure(self.record)
-        self.scaling, self.target, self.target_speeds = 1.0, np.zeros(6), np.zeros(6)  # of the newest package
+        self.scaling, self.controller_target, self.controller_target_speeds = (
+            1.0,
+            np.zeros(6),
+            np.zeros(6),
+        )  # of the newest package
         self._publish(ArmStatus.CONNECTING)
 
     # -- connecting ----------------------------------------------------------------------------------------------
 
     def connect(self) -> None:
-        """Raises a DeviceError that says what is wrong. Blocks if the controller falls silent half way: the driver
-        kills the process then."""
+        """Connects to the controller. Raises a DeviceError with the cause. Blocks if the controller stops answering;
+        the driver then kills the process."""
         config = self.config
         for port, what in PORTS.items():
             try:
                 socket.create_connection((config.host, port), PROBE_TIMEOUT).close()
             except OSError as failure:
                 raise DeviceNotConnectedError(
-                    f"no controller at {config.host}: port {port} ({what}): {failure}; is it on, and the address right?"
+                    f"no controller at {config.host}: port {port} ({what}): {failure}; is it on, is the address right?"
                 ) from failure
         with Dashboard(config.host, PROBE_TIMEOUT) as dashboard:
             dashboard.require_identity(config.name, config.model, config.serial, config.refused_serial)
@@ -118,49 +122,50 @@ class Worker:
                 "3.11 or 3.12 on x86-64 Linux"
             ) from failure
         try:
-            with last_connections():
+            with forbid_later_connections():
                 self.receive: Any = rtde_receive.RTDEReceiveInterface(config.host, 500.0, VARIABLES)
                 self.control: Any = rtde_control.RTDEControlInterface(config.host, 500.0)
         except Exception as failure:  # the library raises RuntimeError for everything
             if "in use" in str(failure).lower():
                 raise DeviceBusyError(
-                    f"arm '{config.name}' at {config.host} is controlled by another program; end that one first"
+                    f"arm '{config.name}' at {config.host} is controlled by another program; end that program first"
                 ) from failure
             raise DeviceNotConnectedError(f"arm '{config.name}' at {config.host}: {failure}") from failure
         try:
-            self._set_up()
+            self._configure_controller()
         except DeviceError:
-            if self._read() or time.monotonic() - float(self.record["time"]) < config.link_timeout:  # it answers
-                with TimeLimit(ENDING), contextlib.suppress(RuntimeError):
+            # stops the script of a controller that still answers
+            if self._read_package() or time.monotonic() - float(self.record["time"]) < config.link_timeout:
+                with TimeLimit(MAX_ENDING_TIME), contextlib.suppress(RuntimeError):
                     self.control.stopScript()
             raise
 
-    def _set_up(self) -> None:
-        """Changes what the controller keeps (TCP, payload) only when the model is known to be the right one."""
+    def _configure_controller(self) -> None:
+        """Sets TCP and payload of the controller, which keeps them, only after the model has been checked."""
         config, control = self.config, self.control
         try:
             self._check_model(lambda: matrix(control.getTCPOffset()), "model")
-            self._set("the TCP", control.setTcp, config.tcp)
-            self._set("the payload", control.setPayload, config.mass, config.mass_centre)
-            self._await_change()
+            self._apply_setting("the TCP", control.setTcp, config.tcp)
+            self._apply_setting("the payload", control.setPayload, config.mass, config.mass_centre)
+            self._wait_for_settings()
             self._check_model(lambda: self.frames.flange_from_tool, "model and flange_from_tool")
-            self._set("the watchdog", control.setWatchdog, config.watchdog)
+            self._apply_setting("the watchdog", control.setWatchdog, config.watchdog)
         except RuntimeError as failure:
             if isinstance(failure, DeviceError):
                 raise
             raise DeviceNotConnectedError(
-                f"arm '{config.name}': the controller at {config.host} closed the connection; look why, then try again"
+                f"arm '{config.name}': the controller at {config.host} closed the connection; find out why, then retry"
             ) from failure
 
-    def _set(self, what: str, method: Any, *arguments: Any) -> None:
+    def _apply_setting(self, what: str, method: Any, *arguments: Any) -> None:
         if not method(*arguments):
             raise DeviceNotConnectedError(f"arm '{self.config.name}': the controller did not take {what} {arguments}")
 
-    def _await_change(self) -> None:
-        """Reads until a package is measured after what was set last. The answer to that comes by another connection
-        than the packages do: the next of these may be older, and show the weight of a payload untold."""
-        begin, deadline = float(self.record["stamp"]), time.monotonic() + SILENT
-        while not (self._read() and not 0.0 <= float(self.record["stamp"]) - begin < TAKEN):
+    def _wait_for_settings(self) -> None:
+        """Reads until a package is measured after the last setting. The answer to a setting and the packages come by
+        different connections: the next package may be older, with forces for the former payload."""
+        begin, deadline = float(self.record["stamp"]), time.monotonic() + MAX_PACKAGE_WAIT
+        while not (self._read_package() and not 0.0 <= float(self.record["stamp"]) - begin < SETTING_DELAY):
             if time.monotonic() > deadline:
                 raise DeviceNotConnectedError(
                     f"arm '{self.config.name}': no RTDE package arrived that was measured after its payload was set"
@@ -173,15 +178,15 @@ class Worker:
         kinematics = Kinematics(self.config.model)  # type: ignore[arg-type]  # a Model, from JSON
         found, deadline = "no RTDE package with a pose arrived within 1 s", time.monotonic() + 1.0
         while True:
-            if self._read():
+            if self._read_package():
                 expected = kinematics.forward(self.record["joints"], tool())
                 difference = displacement(expected, matrix(self.record["tcp_pose"]))
                 shift, turn = float(np.linalg.norm(difference[:3])), float(np.linalg.norm(difference[3:]))
-                if shift <= MODEL_LENGTH and turn <= MODEL_TURN:
+                if shift <= MAX_MODEL_SHIFT and turn <= MAX_MODEL_TURN:
                     return
                 found = (
-                    f"its tool is {1e3 * shift:.0f} mm and {turn:.2f} rad from where a {self.config.model} would "
-                    f"have it; check {advice}"
+                    f"its tool is {1e3 * shift:.0f} mm and {turn:.2f} rad from the pose of a {self.config.model} at "
+                    f"these joints; check {advice}"
                 )
             if time.monotonic() > deadline:
                 raise DeviceNotConnectedError(f"arm '{self.config.name}': {found}")
@@ -190,86 +195,86 @@ class Worker:
     # -- the loop ------------------------------------------------------------------------------------------------
 
     def run(self, parent: Parent) -> NoReturn:
-        """Runs until the driver closes, or driver or connection is gone; tells `parent` of the first status."""
-        gc.freeze()  # keeps what is loaded out of collections in the middle of a period
-        self._last = time.monotonic()
-        deadline = self._last + PERIOD
-        ending: float | None = None  # when the last braking is cut off
+        """Runs until the driver closes or ends, or the connection is lost; reports the first status to `parent`."""
+        gc.freeze()  # a collection in a period does not scan the loaded modules
+        self._last_period_end = time.monotonic()
+        deadline = self._last_period_end + PERIOD
+        exit_deadline: float | None = None  # latest end of the last braking [s]
         while True:
-            with self._limit:
-                self._rereads = 0 if self._read() else self._rereads + 1
+            with self._call_limit:
+                self._rereads = 0 if self._read_package() else self._rereads + 1
                 connected = self.receive.isConnected() and self.control.isConnected()
             self._publish(self.servo.status)
-            orphan = self._driver.cut()
+            is_orphan = self._driver.cut()
             now = time.monotonic()
-            # Periods count, not time: a process that was suspended reads again first, packages may be waiting.
-            blind = self._rereads > BLIND
-            if not connected or (blind and now - float(self.record["time"]) > self.config.link_timeout):
-                self._lose_link()
+            # Counts periods, not time: after a suspension, packages may be waiting to be read.
+            is_blind = self._rereads > MAX_MISSED_PACKAGES
+            if not connected or (is_blind and now - float(self.record["time"]) > self.config.link_timeout):
+                self._end_with_lost_link()
             partners = self._read_partners(now)
-            before = self.servo.status
-            stopped = self._controller_stop()
-            if stopped is None and self._refused > GRACE:
-                stopped = ArmStatus.PROGRAM_STOPPED
-            if stopped is not None:
-                self.servo.trip(stopped)
-            command = self.channel.commands.newest()  # before the report: what was seen when it was decided counts
-            self.servo.on_scaling(self.scaling)
+            status_before = self.servo.status
+            stop_status = self._controller_stop()
+            if stop_status is None and self._refused_periods > REPORT_PERIODS:
+                stop_status = ArmStatus.PROGRAM_STOPPED
+            if stop_status is not None:
+                self.servo.enter_fault(stop_status)
+            command = self.channel.commands.newest()  # read before the report, so the report is not older
+            self.servo.on_speed_scaling(self.scaling)
             self.servo.check_faults(self.state, partners)
             if self._rereads == 0:
-                self.servo.check_following(self.state, self.target, self.target_speeds)
+                self.servo.check_following(self.state, self.controller_target, self.controller_target_speeds)
             self.servo.on_tactile(*self.channel.tactile.newest())
-            if self.servo.status != before:
+            if self.servo.status != status_before:
                 self._publish(self.servo.status)
-                if before == ArmStatus.CONNECTING:
-                    with contextlib.suppress(BrokenPipeError):  # the driver has died: the next period sees it
+                if status_before == ArmStatus.CONNECTING:
+                    with contextlib.suppress(BrokenPipeError):  # the driver has ended: the next period detects it
                         parent.send({"connected": True})
             self.servo.on_command(*command)
-            if ending is None and (orphan or self.servo.close_requested):
-                ending = now + (PARENTLESS if orphan else CLOSING)
-                if orphan:
-                    self.servo.trip(ArmStatus.CLOSED)
-            if stopped is not None or self.servo.status.is_controller_stop:
-                if ending is not None:
-                    self._leave()
+            if exit_deadline is None and (is_orphan or self.servo.close_requested):
+                exit_deadline = now + (MAX_BRAKING_WITHOUT_PARENT if is_orphan else MAX_CLOSING_TIME)
+                if is_orphan:
+                    self.servo.enter_fault(ArmStatus.CLOSED)
+            if stop_status is not None or self.servo.status.is_controller_stop:
+                if exit_deadline is not None:
+                    self._exit_process()
             else:
-                if not blind:
-                    self._act(partners)
-                if ending is not None and (self.servo.resting or now > ending):
+                if not is_blind:
+                    self._send_step(partners)
+                if exit_deadline is not None and (self.servo.is_at_rest or now > exit_deadline):
                     self._end_program()
-                    self._leave()
-            deadline = self._sleep(deadline)
+                    self._exit_process()
+            deadline = self._sleep_until(deadline)
 
-    def _act(self, partners: list[Any]) -> None:
-        if self._refused:  # the next packages say why
-            self._refused += 1
+    def _send_step(self, partners: list[Any]) -> None:
+        if self._refused_periods:  # the next packages report why
+            self._refused_periods += 1
             return
         now = time.monotonic()
         joints = self.servo.step(now, self.state, partners)
-        if time.monotonic() - now > SUSPENDED:
-            joints = self.servo.withdraw()
+        if time.monotonic() - now > MAX_TARGET_DELAY:
+            joints = self.servo.undo_last_step()
         config, control = self.config, self.control
-        with self._limit, self._lost_link():
+        with self._call_limit, self._ending_on_lost_link():
             if joints is None:
-                alive = control.kickWatchdog()
+                is_accepted = control.kickWatchdog()
             else:
-                alive = control.servoJ(joints.tolist(), 0.0, 0.0, PERIOD, config.lookahead, config.gain)
-        if not alive:
-            self._refused = 1
-        elif self.servo.zero_due(now):
+                is_accepted = control.servoJ(joints.tolist(), 0.0, 0.0, PERIOD, config.lookahead, config.gain)
+        if not is_accepted:
+            self._refused_periods = 1
+        elif self.servo.take_zero_request(now):
             self._zero_wrench()
 
     def _zero_wrench(self) -> None:
-        self.record["busy_until"] = time.monotonic() + ZEROING
+        self.record["busy_until"] = time.monotonic() + MAX_ZEROING_TIME
         self._publish(self.servo.status)
-        with TimeLimit(ZEROING), self._lost_link():
+        with TimeLimit(MAX_ZEROING_TIME), self._ending_on_lost_link():
             if self.control.zeroFtSensor():
                 self.record["zeroed"] += 1
         self.record["busy_until"] = 0.0
 
-    def _read(self) -> bool:
-        """Reads the newest package into the record; True if it is new. All fields are of one package: its time stamp is
-        the same before and after. A package with a NaN or an infinity is ignored."""
+    def _read_package(self) -> bool:
+        """Reads the newest package into the record. True if it is new. All fields are of one package: its time stamp is
+        the same before and after reading. A package with a NaN or an infinity is ignored."""
         receive, record = self.receive, self.record
         while True:
             stamp = receive.getTimestamp()
@@ -287,7 +292,8 @@ class Worker:
                 break
         if stamp == float(record["stamp"]) or not np.isfinite([*fields, target, target_speeds, [scaling] * 6]).all():
             return False
-        self.scaling, self.target, self.target_speeds = scaling, np.array(target), np.array(target_speeds)
+        self.scaling = scaling
+        self.controller_target, self.controller_target_speeds = np.array(target), np.array(target_speeds)
         record["joints"], record["joint_speeds"], record["tcp_pose"], record["tcp_speed"], record["tcp_force"] = fields
         record["stamp"], record["time"] = stamp, time.monotonic()
         self.state = self.frames.measure(record)
@@ -305,28 +311,25 @@ class Worker:
 
     def _read_partners(self, now: float) -> list[Any]:
         """The newest record of each other arm; None where it is missing, too old, or not healthy."""
-        seen: list[Any] = []
+        records: list[Any] = []
         for partner in self.partners:
             record = partner.states.latest()
             if record is not None and now - float(record["written"]) > self.config.link_timeout:
                 record = None
-            seen.append(record if is_healthy(record) else None)
-        return seen
+            records.append(record if is_healthy(record) else None)
+        return records
 
     def _publish(self, status: ArmStatus) -> None:
         record, servo = self.record, self.servo
-        record["written"], record["status"], record["resting"] = time.monotonic(), status, servo.resting
-        record["commands_read"], record["rejected"], record["shortened"] = (
-            servo.commands_read,
-            servo.rejected,
-            servo.shortened,
-        )
+        record["written"], record["status"], record["resting"] = time.monotonic(), status, servo.is_at_rest
+        counts = servo.commands_read, servo.rejected, servo.clipped
+        record["commands_read"], record["rejected"], record["clipped"] = counts
         record["target"] = record["position"] if servo.motion is None else servo.motion.position
-        record["stopping_point"] = record["position"] if servo.stop is None else servo.stop
+        record["stopping_point"] = record["position"] if servo.stopping_point is None else servo.stopping_point
         self.channel.states.write(record)
 
-    def _sleep(self, deadline: float) -> float:
-        """Sleeps until the absolute deadline and returns the next one. Missed periods are skipped, and counted."""
+    def _sleep_until(self, deadline: float) -> float:
+        """Sleeps until `deadline` and returns the next one. Missed periods are skipped and counted."""
         record, cycle = self.record, int(self.record["cycles"])
         late = time.monotonic() - deadline
         if late < 0.0:
@@ -334,61 +337,61 @@ class Worker:
         elif late > PERIOD:
             record["overruns"] += int(late / PERIOD)
             deadline += late
-        beat = time.monotonic()
-        self._periods[cycle % WINDOW] = beat - self._last
-        self._last = beat
+        period_end = time.monotonic()
+        self._periods[cycle % STATISTICS_PERIODS] = period_end - self._last_period_end
+        self._last_period_end = period_end
         record["cycles"] = cycle + 1
         record["late"], record["longest"] = np.count_nonzero(self._periods >= 2.0 * PERIOD), self._periods.max()
-        if cycle % WINDOW == WINDOW - 1:
-            record["period"] = np.sort(self._periods)[[WINDOW // 2, WINDOW * 99 // 100, -1]]
+        if cycle % STATISTICS_PERIODS == STATISTICS_PERIODS - 1:
+            record["period"] = np.sort(self._periods)[[STATISTICS_PERIODS // 2, STATISTICS_PERIODS * 99 // 100, -1]]
         return deadline + PERIOD
 
     # -- ending --------------------------------------------------------------------------------------------------
 
     @contextlib.contextmanager
-    def _lost_link(self) -> Iterator[None]:
-        """What the library raises inside is that it has lost its connection and cannot have another."""
+    def _ending_on_lost_link(self) -> Iterator[None]:
+        """Ends the worker with LINK_LOST if the library raises: it has lost its connection and cannot reconnect."""
         try:
             yield
         except RuntimeError:
-            self._lose_link()
+            self._end_with_lost_link()
 
-    def _lose_link(self) -> NoReturn:
+    def _end_with_lost_link(self) -> NoReturn:
         self._publish(ArmStatus.LINK_LOST)
-        self._leave()
+        self._exit_process()
 
     def _end_program(self) -> None:
-        """Both calls block on the controller; the driver kills a worker that takes too long."""
-        with TimeLimit(ENDING), self._lost_link():
+        """Stops the motion and the program. Both calls wait for the controller; the driver kills a slow worker."""
+        with TimeLimit(MAX_ENDING_TIME), self._ending_on_lost_link():
             if self.servo.motion is not None:
                 self.control.servoStop(10.0)
             self.control.stopScript()
 
-    def _leave(self) -> NoReturn:
-        """Ends the process without the library's destructors, which may wait for an answer that never comes."""
+    def _exit_process(self) -> NoReturn:
+        """Ends the process without the library's destructors, which may wait for an answer forever."""
         os._exit(0)
 
 
 def main() -> NoReturn:
     parent = Parent()  # the library prints
-    allow_time_limits()
-    config = WorkerConfig.of(parent.receive())
+    enable_time_limits()
+    config = WorkerConfig.from_dict(parent.receive())
     realtime = config.realtime and ask_for_realtime(WORKER)  # before the library starts its threads
     try:
         worker = Worker(config)
         worker.record["realtime"] = realtime
-        with TimeLimit(CONNECTING):
+        with TimeLimit(MAX_CONNECTING_TIME):
             worker.connect()
     except (DeviceError, OSError) as failure:
         kind = type(failure) if isinstance(failure, DeviceError) else DeviceNotConnectedError
-        with contextlib.suppress(BrokenPipeError):  # the driver has died
+        with contextlib.suppress(BrokenPipeError):  # the driver has ended
             parent.send({"error": str(failure), "kind": kind.__name__})
-        os._exit(FAILED)
+        os._exit(FAILED_EXIT_STATUS)
     try:
         worker.run(parent)
-    except BaseException:  # not to the interpreter's end, where the library's destructors wait
+    except BaseException:  # without the library's destructors, which may block
         traceback.print_exc()
-        os._exit(FAILED)
+        os._exit(FAILED_EXIT_STATUS)
 
 
 if __name__ == "__main__":

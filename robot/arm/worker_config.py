@@ -1,4 +1,4 @@
-"""From an arm in a rig file to the configuration of its worker, and the check of its host."""
+"""Converts an arm of a rig file to the configuration of its worker, and checks its host."""
 
 from __future__ import annotations
 
@@ -25,31 +25,31 @@ def check_host(config: UrArmConfig, name: str) -> None:
         )
     if config.simulator and not loopback:
         raise DeviceNotConnectedError(
-            f"arm '{name}' is said to be a simulator (`simulator: true`), but its host {config.host} is outside this "
+            f"arm '{name}' is declared as a simulator (`simulator: true`), but its host {config.host} is outside this "
             "machine, where a real arm may answer; remove `simulator: true`, or give the simulator's loopback address"
         )
     if config.mock is None and not config.simulator and loopback:
         raise DeviceNotConnectedError(
-            f"arm '{name}' is a real one, but its host {config.host} is this machine; give its address, or add `mock: "
+            f"arm '{name}' is a real arm, but its host {config.host} is this machine; give its address, or add `mock: "
             "{}` for a mock controller, or `simulator: true` for the maker's simulator (URSim)"
         )
 
 
-def worker_config(
+def make_worker_config(
     config: UrArmConfig,
     name: str,
     segment: int,
     partners: Sequence[Partner],
-    way: tuple[FloatArray, FloatArray] | None = None,
+    start_path: tuple[FloatArray, FloatArray] | None = None,
 ) -> WorkerConfig:
-    """`way`: joints (6,) that it may go between, straight; None: it follows commands within its limits."""
+    """`start_path`: joints (6,) at both ends of the only allowed path, straight; None: it follows commands."""
     limits, tool = config.limits, se3.to_matrix(config.flange_from_tool.pose)
     return WorkerConfig(
         name=name,
         host=config.host,
         model=config.model,
         refused_serial=MOCK_SERIAL if config.mock is None else None,
-        # A maker's simulator shares this machine: a worker that comes before it would keep it waiting.
+        # URSim shares this machine: a worker with real-time priority would slow it down.
         realtime=not config.simulator if config.mock is None else config.mock.realtime,
         parent=os.getpid(),
         segment=segment,
@@ -81,5 +81,5 @@ def worker_config(
         gain=config.gain,
         partners=list(partners),
         serial=config.serial,
-        way=None if way is None else [end.tolist() for end in way],
+        start_path=None if start_path is None else [end.tolist() for end in start_path],
     )

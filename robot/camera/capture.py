@@ -1,7 +1,7 @@
-"""One opened source of pictures: an MJPEG stream, a UVC camera, a folder of pictures or a video.
+"""An open source of pictures: an MJPEG stream, a UVC camera, a folder of pictures or a video.
 
-A capture does not recover by itself: when it fails, the driver (`robot.camera.camera`) closes it and opens another. A
-read of a live source waits little longer than `READ_TIMEOUT`.
+A capture does not recover by itself: after a failure the driver (`robot.camera.camera`) closes it and opens another. A
+read of a live source waits slightly longer than `READ_TIMEOUT`.
 """
 
 from __future__ import annotations
@@ -15,24 +15,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robot.camera.mjpeg import MjpegCapture
-from robot.camera.picture import READ_TIMEOUT, Picture, WrongSource, decode_jpeg, frame_size, wrong_size
+from robot.camera.picture import READ_TIMEOUT, Picture, WrongSource, decode_jpeg, frame_size, wrong_size_error
 from robot.errors import DeviceNotConnectedError
 from tacsim.interface import EndOfEpisode
 from tacsim.models.hardware import CameraSensorConfig
 
 
 class Capture(Protocol):
-    """An opened source, as the driver needs it."""
+    """An open source, as the driver uses it."""
 
-    live: bool  # goes on in real time, so it is reopened when it fails
+    live: bool  # runs in real time, so it is reopened after a failure
 
     def read(self) -> Picture:
         """Waits for the next frame. Raises DamagedFrame, WrongSource, EndOfEpisode, OSError (TimeoutError: stalled);
-        all but the first end the capture."""
+        all except DamagedFrame end the capture."""
         ...
 
     def interrupt(self) -> None:
-        """Makes a `read` in another thread return soon; nothing to do where it does so anyway."""
+        """Makes a `read` in another thread return soon. The default, for reads that end by themselves, does nothing."""
         return
 
     def close(self) -> None: ...
@@ -49,17 +49,17 @@ def open_capture(config: CameraSensorConfig, name: str, stop: threading.Event) -
 
 
 def source_kind(config: CameraSensorConfig, name: str) -> str:
-    """ "stream", "uvc", "folder" or "video". Raises WrongSource for any other source, or a setting that this kind does
-    not have."""
+    """Kind of the source: "stream", "uvc", "folder" or "video". Raises WrongSource for any other source, or a setting
+    that this kind does not have."""
     source, where = config.source, f"sensor '{name}': source '{config.source}'"
     if source.startswith("http://"):
         kind = "stream"
     elif "://" in source:
-        raise WrongSource(f"{where}: only http:// streams (MJPEG) are read")
+        raise WrongSource(f"{where}: only http:// streams (MJPEG) are supported")
     elif source.lstrip("-").isdigit() or source.startswith("/dev/video"):
         raise WrongSource(
-            f"{where} is an index; indices change with each plug and boot, so two sensors get exchanged unnoticed. "
-            "Name the camera by its serial number: a path in /dev/v4l/by-id/ that ends in -index0"
+            f"{where} is an index; indices change at boot and with each connection, so two sensors may be swapped. "
+            "Use the serial number of the camera: a path in /dev/v4l/by-id/ that ends in -index0"
         )
     elif source.startswith("/dev/"):
         kind = "uvc"
@@ -70,30 +70,30 @@ def source_kind(config: CameraSensorConfig, name: str) -> str:
         kind = "folder" if path.is_dir() else "video"
     if kind != "uvc" and (config.exposure is not None or config.white_balance is not None):
         raise WrongSource(
-            f"{where}: exposure and white_balance are set through UVC only; fix them where the picture is made, and "
-            "leave them out here"
+            f"{where}: exposure and white_balance can be set for UVC cameras only; set them at the source of the "
+            "picture and remove them here"
         )
     return kind
 
 
 class UvcCapture(Capture):
-    """A UVC camera of Linux (V4L2) by its serial path: size, rate, exposure, white balance are set and read back."""
+    """A UVC camera on Linux (V4L2) by its serial path. Sets size, rate, exposure and white balance, and reads back."""
 
     live = True
 
     def __init__(self, config: CameraSensorConfig, name: str) -> None:
         import cv2
 
-        self._what = f"sensor '{name}': {config.source}"
+        self._description = f"sensor '{name}': {config.source}"
         self._size = frame_size(config)
         self._timeout = READ_TIMEOUT + 3.0 / config.fps
         if not Path(config.source).exists():
-            raise DeviceNotConnectedError(f"{self._what}: no such device; is it plugged in? (ls /dev/v4l/by-id)")
+            raise DeviceNotConnectedError(f"{self._description}: no such device; is it connected? (ls /dev/v4l/by-id)")
         self._capture = cv2.VideoCapture(config.source, cv2.CAP_V4L2)
         try:
             if not self._capture.isOpened():
                 raise DeviceNotConnectedError(
-                    f"{self._what}: cannot be opened; another program holds it, or this user may not (group video)"
+                    f"{self._description}: cannot be opened; another program uses it, or no permission (group video)"
                 )
             self._configure(config)
         except BaseException:
@@ -106,25 +106,26 @@ class UvcCapture(Capture):
 
         self._capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*"MJPG"))
         self._capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
-        self._keep(cv2.CAP_PROP_FRAME_WIDTH, self._size[1], "width [px]", 0.5)
-        self._keep(cv2.CAP_PROP_FRAME_HEIGHT, self._size[0], "height [px]", 0.5)
-        self._keep(cv2.CAP_PROP_FPS, config.fps, "fps", 0.05 * config.fps)
+        self._apply_setting(cv2.CAP_PROP_FRAME_WIDTH, self._size[1], "width [px]", 0.5)
+        self._apply_setting(cv2.CAP_PROP_FRAME_HEIGHT, self._size[0], "height [px]", 0.5)
+        self._apply_setting(cv2.CAP_PROP_FPS, config.fps, "fps", 0.05 * config.fps)
         if config.exposure is not None:
-            self._keep(cv2.CAP_PROP_AUTO_EXPOSURE, 1, "automatic exposure (1: off)", 0.1)
-            self._keep(cv2.CAP_PROP_EXPOSURE, config.exposure, "exposure", 0.01 * abs(config.exposure) + 1e-9)
+            self._apply_setting(cv2.CAP_PROP_AUTO_EXPOSURE, 1, "automatic exposure (1: off)", 0.1)
+            self._apply_setting(cv2.CAP_PROP_EXPOSURE, config.exposure, "exposure", 0.01 * abs(config.exposure) + 1e-9)
         if config.white_balance is not None:
-            self._keep(cv2.CAP_PROP_AUTO_WB, 0, "automatic white balance", 0.1)
-            self._keep(cv2.CAP_PROP_WB_TEMPERATURE, config.white_balance, "white_balance [K]", 0.5)
+            self._apply_setting(cv2.CAP_PROP_AUTO_WB, 0, "automatic white balance", 0.1)
+            self._apply_setting(cv2.CAP_PROP_WB_TEMPERATURE, config.white_balance, "white_balance [K]", 0.5)
         if self._capture.get(cv2.CAP_PROP_FOURCC) == cv2.VideoWriter.fourcc(*"MJPG"):
-            self._capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)  # JPEGs as they come: OpenCV's decoder hides damage
+            self._capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)  # JPEGs undecoded: OpenCV's decoder hides damage
 
-    def _keep(self, setting: int, value: float, what: str, tolerance: float) -> None:
-        taken = self._capture.set(setting, value)
-        got = self._capture.get(setting)
-        if not abs(got - value) <= tolerance:
+    def _apply_setting(self, setting: int, value: float, what: str, tolerance: float) -> None:
+        is_accepted = self._capture.set(setting, value)
+        actual = self._capture.get(setting)
+        if not abs(actual - value) <= tolerance:
             raise WrongSource(
-                f"{self._what}: {what} was set to {value:g} and reads back {got:g}{'' if taken else ' (refused)'}; "
-                "give what the camera has (v4l2-ctl --list-formats-ext, --list-ctrls)"
+                f"{self._description}: {what} was set to {value:g} and reads back {actual:g}"
+                f"{'' if is_accepted else ' (refused)'}; choose a value that the camera supports "
+                "(v4l2-ctl --list-formats-ext, --list-ctrls)"
             )
 
     def read(self) -> Picture:
@@ -132,12 +133,12 @@ class UvcCapture(Capture):
 
         ready, _ = cv2.VideoCapture.waitAny([self._capture], timeoutNs=int(1e9 * self._timeout))
         if not ready:
-            raise TimeoutError(f"{self._what}: no frame for {self._timeout:.2g} s")
-        there, image = self._capture.retrieve()  # waitAny has grabbed it already
+            raise TimeoutError(f"{self._description}: no frame for {self._timeout:.2g} s")
+        is_retrieved, image = self._capture.retrieve()  # waitAny has grabbed it already
         arrival = time.monotonic()
-        if not there or image is None:
-            raise ConnectionError(f"{self._what}: no frame; was it unplugged?")
-        # The buffer's time stamp by V4L2: the monotonic clock with nearly all drivers, 0 or an epoch with others.
+        if not is_retrieved or image is None:
+            raise ConnectionError(f"{self._description}: no frame; was it disconnected?")
+        # V4L2 time stamp of the buffer: monotonic clock for most drivers, 0 or epoch time for others.
         exposure = self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3
         return Picture(self._rgb(image), arrival, exposure if 0.0 <= arrival - exposure < 1.0 else None)
 
@@ -145,9 +146,9 @@ class UvcCapture(Capture):
         import cv2
 
         if image.ndim == 1 or 1 in image.shape[:2]:  # the bytes of a JPEG
-            return decode_jpeg(image.tobytes(), self._size, self._what)
+            return decode_jpeg(image.tobytes(), self._size, self._description)
         if image.shape != (*self._size, 3):
-            raise wrong_size(self._what, image.shape[:2], self._size)
+            raise wrong_size_error(self._description, image.shape[:2], self._size)
         return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
     def close(self) -> None:
@@ -155,7 +156,7 @@ class UvcCapture(Capture):
 
 
 class PlayedCapture(Capture):
-    """A folder of pictures or a video, played once at its rate, as a stand-in for a camera."""
+    """A folder of pictures or a video, played once at its rate, in place of a camera."""
 
     live = False
 
@@ -163,7 +164,7 @@ class PlayedCapture(Capture):
         from tacsim.record.episode import EpisodeError
         from tacsim.record.sources import folder_images, list_pictures, video_images, video_rate
 
-        self._what = f"sensor '{name}': {config.source}"
+        self._description = f"sensor '{name}': {config.source}"
         self._size = frame_size(config)
         self._stop = stop
         path = Path(config.source)
@@ -173,25 +174,25 @@ class PlayedCapture(Capture):
             else:
                 rate, self._images = video_rate(path) or config.fps, video_images(path)
         except (EpisodeError, OSError) as error:
-            raise WrongSource(f"{self._what}: {error}") from error
+            raise WrongSource(f"{self._description}: {error}") from error
         self._period = 1.0 / rate
-        self._due: float | None = None  # when the next picture is shown
+        self._next_time: float | None = None  # of the next picture [s]
 
     def read(self) -> Picture:
         from tacsim.record.episode import EpisodeError
 
-        if self._due is not None and self._stop.wait(max(0.0, self._due - time.monotonic())):
-            raise EndOfEpisode(f"{self._what}: closed")
+        if self._next_time is not None and self._stop.wait(max(0.0, self._next_time - time.monotonic())):
+            raise EndOfEpisode(f"{self._description}: closed")
         try:
             image = next(self._images, None)
         except (EpisodeError, OSError) as error:
-            raise WrongSource(f"{self._what}: {error}") from error
+            raise WrongSource(f"{self._description}: {error}") from error
         if image is None:
-            raise EndOfEpisode(f"{self._what} is over")
+            raise EndOfEpisode(f"{self._description}: no more pictures")
         if image.shape != (*self._size, 3):
-            raise wrong_size(self._what, image.shape[:2], self._size)
+            raise wrong_size_error(self._description, image.shape[:2], self._size)
         now = time.monotonic()
-        self._due = now + self._period if self._due is None else max(self._due + self._period, now)
+        self._next_time = now + self._period if self._next_time is None else max(self._next_time + self._period, now)
         return Picture(image, now, None)
 
     def close(self) -> None:

@@ -23,9 +23,9 @@ from robot.cli.output import (
 )
 
 if TYPE_CHECKING:
-    from robot.train.evaluate import Interval, Judged
+    from robot.train.evaluate import EvaluationResult, Interval
     from robot.train.run_folder import RunFolder
-    from robot.train.transfer import Row
+    from robot.train.transfer import SummaryRow
 
 TRAINING = ("torch", "stable_baselines3", "onnx", "onnxruntime")  # what the extra `train` brings
 export = typer.Typer(no_args_is_help=True, help="Write policies and recordings as files for others.")
@@ -73,15 +73,15 @@ def train(
         training = load(Training, task, own)
         folder = new_directory(out, f"train-{training.task}")
         with busy("loading"):
-            from robot.train.train import begin
+            from robot.train.train import begin_run
 
-            run = begin(training, folder)
+            run = begin_run(training, folder)
     from tacsim.tasks.task import BadDraws
 
     try:
         path = _train(run)
     except BadDraws:
-        if run.last()[0]:
+        if run.load_checkpoint()[0]:
             notes.print(f"What was learned is kept. Make a file of it: tacsim export policy {run.folder}")
         raise
     except (KeyboardInterrupt, OSError):
@@ -197,10 +197,10 @@ def evaluate(
     from tacsim.models.training import Training
 
     training = load(Training, task, set_ or [])
-    played: dict[str, Judged] = {}
+    played: dict[str, EvaluationResult] = {}
     with one_bar("starting") as bar:
 
-        def say(so_far: Judged) -> None:
+        def say(so_far: EvaluationResult) -> None:
             played[so_far.policy] = so_far
             if json_ is not None:
                 _write(json_, played.values())
@@ -211,7 +211,7 @@ def evaluate(
     _show_judged(judged)
 
 
-def _write(path: Path, judged: Iterable[Judged]) -> None:
+def _write(path: Path, judged: Iterable[EvaluationResult]) -> None:
     import json
 
     from robot.common.whole_file import write_whole
@@ -220,7 +220,7 @@ def _write(path: Path, judged: Iterable[Judged]) -> None:
     write_whole(path, (json.dumps(ends, indent=1) + "\n").encode())
 
 
-def _show_judged(judged: list[Judged]) -> None:
+def _show_judged(judged: list[EvaluationResult]) -> None:
     names, rows = [Path(each.policy).name for each in judged], []
     if len(set(names)) < len(names):
         names = [each.policy for each in judged]
@@ -277,7 +277,7 @@ def transfer(
     import json
     from dataclasses import asdict
 
-    from robot.train.transfer import Study, picture, play, summary
+    from robot.train.transfer import Study, draw_figure, play_study, summarise
     from tacsim.config import load
     from tacsim.models.randomisation import Randomisation
 
@@ -293,16 +293,16 @@ def transfer(
             if not notes.is_terminal:
                 notes.print(f"{done} of {of}: {words}")
 
-        rows = summary(play(study, out, report, workers))
+        rows = summarise(play_study(study, out, report, workers))
     with writing(out):
         (out / "transfer.json").write_text(json.dumps([asdict(row) for row in rows], indent=1) + "\n", encoding="utf-8")
-        picture(rows, out / "transfer.png")
+        draw_figure(rows, out / "transfer.png")
     _show_transfer(rows, episodes)
     for name in ("transfer.json", "transfer.png"):
         results.print(str(out / name))
 
 
-def _show_transfer(rows: list[Row], episodes: int) -> None:
+def _show_transfer(rows: list[SummaryRow], episodes: int) -> None:
     shown = [
         (
             row.policy,

@@ -196,7 +196,7 @@ def _drive(
 ) -> tuple[Episode, str]:
     """The episode, shown by the bar, and what ended it too early ("" when nothing did)."""
     from robot.deploy.control_loop import EpisodeFailed, run_episode
-    from robot.deploy.policy import outside_in_words
+    from robot.deploy.policy import describe_outside
     from tacsim.record.step_info import TRAINING_DISTANCE
 
     told = False
@@ -205,7 +205,7 @@ def _drive(
         nonlocal told
         if not told and step.info.get(TRAINING_DISTANCE, 0.0) > 1.0:
             told = True
-            warn(f"step {step.index}: policy '{setup.policy}': {outside_in_words(policy)}")
+            warn(f"step {step.index}: policy '{setup.policy}': {describe_outside(policy)}")
         bar.say(task.config.kind if task else rig.name)
         bar.count(step.index, None if steps == NO_END else steps)
 

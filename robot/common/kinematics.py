@@ -2,10 +2,10 @@
 
 Standard Denavit-Hartenberg frames with the nominal lengths that Universal Robots publishes ("DH Parameters for
 calculations of kinematics and dynamics", support article 16316). A real arm is calibrated in the factory and differs
-from these by up to a millimetre or so: read poses from the controller, use this for reach, speed and singularities.
+from these by about a millimetre: read poses from the controller, use this module for reach, speed and singularities.
 
-Frames are homogeneous matrices (4, 4), lengths [m], angles [rad]. `tool` is the tool centre point (TCP) seen from the
-flange. A UR pose is (6,): position and rotation vector, both in base axes.
+Frames are homogeneous matrices (4, 4), lengths [m], angles [rad]. `tool` is flange_from_tcp, the tool
+centre point (TCP) in flange axes. A UR pose is (6,): position and rotation vector, both in base axes.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ if TYPE_CHECKING:
 
 JOINT_RANGE = 2 * math.pi  # joints turn from -JOINT_RANGE to +JOINT_RANGE (all e-Series user manuals)
 TOLERANCE = 1e-10  # of the inverse [m, rad]
-LEAST_SINGULAR_VALUE = 0.02  # of the Jacobian, lengths in reaches; below it the arm may only move away
-# Bound on the change of the least singular value for each radian that a joint turns: each of the six columns has a
-# length of at most sqrt(2) in these units, and turns with the joints before it.
+MIN_SINGULAR_VALUE = 0.02  # of the Jacobian, lengths divided by the reach; below it the arm may only move away
+# Bound on the change of the minimum singular value per radian of joint motion: each of the six columns has a length of
+# at most sqrt(2) in these units, and rotates with the joints before it.
 MAX_SINGULAR_VALUE_RATE = math.sqrt(12.0)
 
 
 @dataclass(frozen=True)
 class Lengths:
-    """DH lengths [m] (alpha = pi/2, 0, 0, pi/2, -pi/2, 0), and top speeds of the joints [rad/s] (user manuals)."""
+    """DH lengths [m] (alpha = pi/2, 0, 0, pi/2, -pi/2, 0) and maximum joint speeds [rad/s] (user manuals)."""
 
     a2: float
     a3: float
@@ -100,7 +100,7 @@ def pose(frame: FloatArray) -> FloatArray:
 
 
 def inverse_frame(frame: FloatArray) -> FloatArray:
-    """The frame (4, 4) that undoes another."""
+    """Inverse of a frame (4, 4)."""
     back = np.eye(4)
     back[:3, :3] = frame[:3, :3].T
     back[:3, 3] = -frame[:3, :3].T @ frame[:3, 3]
@@ -108,35 +108,35 @@ def inverse_frame(frame: FloatArray) -> FloatArray:
 
 
 def displacement(before: FloatArray, after: FloatArray) -> FloatArray:
-    """(6,) from one frame (4, 4) to another: shift of the origin [m] and rotation vector [rad], in base axes."""
+    """Displacement (6,) between two frames (4, 4): shift of the origin [m], rotation vector [rad], base axes."""
     return np.concatenate([after[:3, 3] - before[:3, 3], rotation_vector(after[:3, :3] @ before[:3, :3].T)])
 
 
 class Kinematics:
-    """One arm of a model. Joints `q` are (6,) [rad], counted from the base."""
+    """Kinematics of one arm model. Joints `q` are (6,) [rad], numbered from the base."""
 
     def __init__(self, model: Model = "ur5e") -> None:
         self.model = model
         self.lengths = MODELS[model]
-        self.joint_speeds = np.array(self.lengths.joint_speeds)  # top speeds (6,) [rad/s]
+        self.joint_speeds = np.array(self.lengths.joint_speeds)  # maximum (6,) [rad/s]
 
     @property
     def reach(self) -> float:
-        """Farthest the wrist gets from the shoulder [m]."""
+        """Maximum distance of the wrist from the shoulder [m]."""
         return abs(self.lengths.a2) + abs(self.lengths.a3)
 
     def forward(self, q: Sequence[float] | FloatArray, tool: FloatArray | None = None) -> FloatArray:
-        """base_from_tcp (4, 4) at joints q; of the flange when there is no tool."""
+        """base_from_tcp (4, 4) at joints q; base_from_flange without a tool."""
         return self._chain(q, tool)[0]
 
     def jacobian(self, q: Sequence[float] | FloatArray, tool: FloatArray | None = None) -> FloatArray:
-        """(6, 6): joint speeds [rad/s] to the velocity of the TCP [m/s] and its turn rate [rad/s], in base axes."""
+        """Jacobian (6, 6): joint speeds [rad/s] to velocity [m/s] and turn rate [rad/s] of the TCP, in base axes."""
         return self.forward_and_jacobian(q, tool)[1]
 
     def forward_and_jacobian(
         self, q: Sequence[float] | FloatArray, tool: FloatArray | None = None
     ) -> tuple[FloatArray, FloatArray]:
-        """Both, for little more than the price of one."""
+        """Forward kinematics and Jacobian, computed together."""
         frame, (c1, s1, x2, y2, z2, x3, y3, z3, x4, y4, z4, ax, ay, az, x5, y5, z5, bx, by, bz) = self._chain(q, tool)
         px, py, pz = frame[:3, 3].tolist()
         # Column of a joint: axis x (TCP - a point of the axis), axis. The axes of joints 2, 3, 4 are (s1, -c1, 0).
@@ -164,10 +164,10 @@ class Kinematics:
     def inverse(
         self, target: FloatArray, seed: Sequence[float] | FloatArray, tool: FloatArray | None = None
     ) -> FloatArray | None:
-        """Joints (6,) that bring the TCP to `target` (4, 4), the solution nearest to `seed`; None if there is none.
+        """Joints (6,) that place the TCP at `target` (4, 4): the solution nearest to `seed`; None if there is none.
 
-        A target near the seed's own is found by Newton's method, any other among the up to eight closed solutions.
-        None also for targets that are not finite, or that need a joint beyond its range.
+        Newton's method finds a target near the pose of the seed. Otherwise the nearest of up to eight closed-form
+        solutions is taken. None also for a target that is not finite or needs a joint beyond its range.
         """
         if not np.isfinite(target).all() or not np.isfinite(seed).all():
             return None
@@ -178,15 +178,15 @@ class Kinematics:
         return min(self.solutions(flange, seed), key=lambda q: float(np.abs(q - seed).max()), default=None)
 
     def singularity(self, q: Sequence[float] | FloatArray) -> float:
-        """How far the arm is from a singular pose: least singular value of the Jacobian at the flange, with lengths
-        measured in reaches. 0 is singular; a UR arm in the middle of its workspace has 0.1 to 0.3."""
+        """Distance from a singular pose: minimum singular value of the Jacobian at the flange, lengths divided by the
+        reach. 0 is singular; a UR arm in the middle of its workspace has 0.1 to 0.3."""
         jacobian = self.jacobian(q)
         jacobian[:3] /= self.reach
         return float(np.linalg.svd(jacobian, compute_uv=False)[-1])
 
     def solutions(self, flange: FloatArray, seed: Sequence[float] | FloatArray) -> list[FloatArray]:
-        """All joint vectors (6,) that bring the flange to the frame (4, 4), each turned as near to `seed` as its range
-        allows. Where the wrist is singular (joint 5 at 0 or pi) joint 6 keeps the seed's value.
+        """All joint vectors (6,) that place the flange at the frame (4, 4), each with the full turns nearest to `seed`
+        within the joint range. At a singular wrist (joint 5 at 0 or pi) joint 6 has the seed's value.
 
         The three parallel axes decouple the arm: joint 1 from the wrist centre, 5 and 6 from the direction of the
         flange, 2 to 4 as a planar arm (Hawkins, "Analytic inverse kinematics for the Universal Robots UR-5/UR-10
@@ -255,13 +255,13 @@ class Kinematics:
         )
 
     def _newton(self, target: FloatArray, seed: FloatArray, tool: FloatArray | None) -> FloatArray | None:
-        """Newton's method from the seed; None unless it converges at once and stays close."""
+        """Newton's method from the seed; None if it does not converge in a few steps or leaves the seed."""
         q, begin = seed, seed.tolist()
         (tx, ty, tz, px), (ux, uy, uz, py), (vx, vy, vz, pz), _ = target.tolist()
         for _ in range(7):
             frame, jacobian = self.forward_and_jacobian(q, tool)
             (ax, ay, az, ox), (bx, by, bz, oy), (cx, cy, cz, oz), _ = frame.tolist()
-            # sin(angle) axis of the turn that is left: half the sum of (axis now) x (axis wanted)
+            # sin(angle) axis of the remaining rotation: half the sum of (present axis) x (target axis)
             error = (
                 px - ox,
                 py - oy,
@@ -272,7 +272,7 @@ class Kinematics:
             )
             size = max(map(abs, error))
             if size < TOLERANCE:
-                # The sine is small for half a turn too; then the axes point against each other.
+                # The sine is also small at half a turn, where the axes are opposite.
                 aligned = ax * tx + bx * ux + cx * vx > 0 and ay * ty + by * uy + cy * vy > 0
                 return q if aligned and max(map(abs, q.tolist())) <= JOINT_RANGE else None
             if size > 0.3:
@@ -287,25 +287,25 @@ class Kinematics:
 
 
 class SingularityGuard:
-    """Judges joints by their distance to a singularity; spares its computation while the last result suffices."""
+    """Checks the distance of joints from a singularity; skips its computation while the last result suffices."""
 
     def __init__(self, kinematics: Kinematics) -> None:
         self._kinematics = kinematics
         self._last_check: tuple[FloatArray, float] | None = None  # joints, and their margin to a singularity
 
-    def is_nearer(self, joints: FloatArray, sent: FloatArray) -> bool:
-        """True if `joints` (6,) are too near to a singularity, and nearer than the joints (6,) `sent` last."""
+    def is_nearer(self, joints: FloatArray, sent_joints: FloatArray) -> bool:
+        """True if `joints` (6,) are too near to a singularity, and nearer than the last `sent_joints` (6,)."""
         if self._last_check is not None:
-            joints_then, margin_then = self._last_check
-            if MAX_SINGULAR_VALUE_RATE * float(np.abs(joints - joints_then).sum()) < margin_then:
+            last_joints, last_margin = self._last_check
+            if MAX_SINGULAR_VALUE_RATE * float(np.abs(joints - last_joints).sum()) < last_margin:
                 return False
         distance = self._kinematics.singularity(joints)
-        self._last_check = joints, distance - LEAST_SINGULAR_VALUE
-        return distance < LEAST_SINGULAR_VALUE and distance < self._kinematics.singularity(sent)
+        self._last_check = joints, distance - MIN_SINGULAR_VALUE
+        return distance < MIN_SINGULAR_VALUE and distance < self._kinematics.singularity(sent_joints)
 
 
 def _nearest_turns(q: FloatArray, seed: Sequence[float] | FloatArray) -> FloatArray:
-    """q plus whole turns of each joint: as near to the seed as the range allows."""
+    """q plus full turns of each joint: as near to the seed as the joint range allows."""
     turned = q - 2 * math.pi * np.round((q - np.asarray(seed)) / (2 * math.pi))
     turned = np.where(turned > JOINT_RANGE, turned - 2 * math.pi, turned)
     nearest: FloatArray = np.where(turned < -JOINT_RANGE, turned + 2 * math.pi, turned)

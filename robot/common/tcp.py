@@ -1,8 +1,8 @@
-"""The one place that converts poses, speeds and forces of a UR controller to those of the rig, and back.
+"""Conversion of poses, speeds and forces between a UR controller and the rig; no other module converts them.
 
-A controller speaks of its tool centre point (TCP), in the axes of the base, poses as position and rotation vector; the
-rig speaks of the sensor, in the world. The controller's force is what the surroundings do to the tool, so its sign is
-that of `ArmState.wrench`.
+A controller uses the tool centre point (TCP) in base axes, with poses as position and rotation vector; the rig uses the
+sensor in the world frame. The controller's force is the load of the environment on the tool, so it has the sign of
+`ArmState.wrench`.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ class Measured:
 
     stamp: float  # on the controller's own clock [s]
     joints: FloatArray  # (6,) [rad]
-    flange: FloatArray  # base_from_flange (4, 4) by the controller
+    flange: FloatArray  # base_from_flange (4, 4) of the controller
     sensor: FloatArray  # world_from_sensor (4, 4)
     twist: FloatArray  # (6,) of the sensor's origin, world axes [m/s, rad/s]
-    wrench: FloatArray  # (6,) what the object does to the sensor, about its origin, its axes [N, N m]
+    wrench: FloatArray  # (6,) of the object on the sensor, about its origin, sensor axes [N, N m]
 
 
 class ArmFrames:
@@ -47,19 +47,19 @@ class ArmFrames:
     @classmethod
     def of(cls, config: UrArmConfig) -> ArmFrames:
         """The frames of an arm in a rig file."""
-        from tacsim.pose import to_matrix  # SciPy takes half a second to load; the worker of an arm needs none of it
+        from tacsim.pose import to_matrix  # SciPy takes half a second to load; a worker does not need it
 
         fixed = (config.world_from_base, config.flange_from_tool, config.tool_from_sensor)
         return cls(*(to_matrix(frame.pose) for frame in fixed))
 
-    def flange(self, world_from_sensor: FloatArray) -> FloatArray:
-        """base_from_flange (4, 4) that brings the sensor to a pose (4, 4)."""
-        frame: FloatArray = self._base_from_world @ world_from_sensor @ self._sensor_from_flange
-        return frame
+    def flange(self, target: FloatArray) -> FloatArray:
+        """base_from_flange (4, 4) at which the sensor is at `target`, world_from_sensor (4, 4)."""
+        flange: FloatArray = self._base_from_world @ target @ self._sensor_from_flange
+        return flange
 
     def measure(self, package: NDArray[np.void]) -> Measured:
-        """From one package of the controller: a record () with stamp, and joints, tcp_pose, tcp_speed, tcp_force, each
-        (6,)."""
+        """Converts one package of the controller: a record () with stamp, and joints, tcp_pose, tcp_speed, tcp_force,
+        each (6,)."""
         speed, force = package["tcp_speed"], package["tcp_force"]
         base_from_tool = matrix(package["tcp_pose"])
         base_from_sensor = base_from_tool @ self.tool_from_sensor
@@ -76,7 +76,7 @@ class ArmFrames:
 
 
 def pose_of(frame: FloatArray) -> Pose:
-    """A frame (4, 4) as a Pose, without SciPy, which is slow for a single pose."""
+    """Converts a frame (4, 4) to a Pose, without SciPy, which is slow for a single pose."""
     vector = rotation_vector(frame[:3, :3])
     half = 0.5 * math.sqrt(float(vector @ vector))
     factor = 0.5 * (math.sin(half) / half if half > 1e-9 else 1.0)
@@ -84,6 +84,6 @@ def pose_of(frame: FloatArray) -> Pose:
 
 
 def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """np.cross of two vectors, ten times as fast."""
+    """np.cross of two vectors (3,), ten times as fast."""
     (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
     return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])

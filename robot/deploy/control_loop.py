@@ -1,4 +1,4 @@
-"""The control loop: a policy on a rig, step by step, judged by a task and handed to a recorder."""
+"""The control loop: runs a policy on a rig, judges each step by a task and records it."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from tacsim.record.step_info import MAX_DEPTH, MAX_FLOW, MAX_SLOPE, PACKAGES_LOS
 from tacsim.rig import Rig
 from tacsim.tasks import GoalOutOfReach, Task, evaluate_outcome
 
-PARTICLES = 5_000  # of a body go into a recorded step, at most
+MAX_PARTICLES = 5_000  # of a body in a recorded step
 PACKAGES = ("tacsim", "numpy", "taichi", "opencv-contrib-python-headless", "gymnasium")
 
 
 class EpisodeFailed(RuntimeError):
-    """An error, the `__cause__`, ended an episode early. What was done is in `episode`; the arms are stopped."""
+    """An error, the `__cause__`, ended an episode early. `episode` has the steps done; the arms are stopped."""
 
     def __init__(self, message: str, episode: Episode) -> None:
         super().__init__(message)
@@ -36,20 +36,20 @@ class EpisodeFailed(RuntimeError):
 
 
 class RecordingFailed(RuntimeError):
-    """Nothing can be recorded any more, e.g. because the disk is full."""
+    """The recording cannot continue, e.g. because the disk is full."""
 
 
 class StepRecorder(Protocol):
-    """What takes the steps of an episode and keeps them: tacsim.Recorder."""
+    """Protocol of a recorder of steps: tacsim.Recorder."""
 
     @property
     def error(self) -> Exception | None:
-        """What ended the recording early."""
+        """Error that ended the recording early; None without one."""
         ...
 
     @property
     def steps(self) -> Sequence[Step]:
-        """Those that it keeps."""
+        """The recorded steps."""
         ...
 
     def write(self, step: Step) -> bool: ...
@@ -58,13 +58,13 @@ class StepRecorder(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class EpisodeSetup:
-    """What the record says of an episode beyond what rig and task know."""
+    """Data of an episode for its record, beyond those of rig and task."""
 
     policy: str = "policy"
     seed: int = 0
     attachments: Mapping[str, bytes] = field(default_factory=dict)
     canonical: CanonicalGrid = field(default_factory=CanonicalGrid)  # of the rig
-    body: bool = False  # particles of a simulated body go into the record
+    body: bool = False  # record the particles of a simulated body
 
 
 def run_episode(
@@ -79,24 +79,25 @@ def run_episode(
     watch: Callable[[Step, Observation, Truth | None], None] | None = None,
     stop: Callable[[], bool] = lambda: False,
 ) -> Episode:
-    """Resets rig and policy, then runs exactly `steps` control steps; fewer only when a recording is over, `stop` says
-    so, or on Ctrl-C. The episode's step 0 is the state after reset. Where the rig knows the truth of the body, its task
-    judges by that; where all that it takes is felt, `Step.info` has the distance by touch alone (`felt_distance`), too.
-    Of a learned policy it has `training_distance`: above 1 the observation lies outside the range of its training.
+    """Resets rig and policy, then runs exactly `steps` control steps; fewer only at the end of a replayed recording, if
+    `stop` returns True, or on Ctrl-C. Step 0 of the episode is the state after reset. If the rig knows the truth of the
+    body, its task judges by that. If the sensors measure enough, `Step.info` also has the distance estimated from touch
+    alone (`felt_distance`). For a learned policy it has `training_distance`: above 1 the observation is outside the
+    range of its training.
 
-    With a recorder the steps of the episode are those in its file, read when they are asked for: however long it is,
-    it takes no memory. Without one they are kept in memory, with their pictures.
+    With a recorder the steps of the episode are read from its file on access, so a long episode needs no memory.
+    Without one they are stored in memory, with their pictures.
 
     Args:
-        recorder: opens the recording, once the references without contact are there (they are attached).
+        recorder: opens the recording after the reference pictures without contact were taken (they are attached).
         on_step: called after each step, e.g. for a progress bar.
-        watch: the same, with what was observed and what only a simulation knows, e.g. for a viewer.
-        stop: asked before each step.
+        watch: called after each step with the observation and the truth of a simulation, e.g. for a viewer.
+        stop: called before each step.
 
     Raises:
-        IncompatibleRig: the rig lacks what policy or task needs; nothing has moved.
-        GoalOutOfReach: no policy could bring this body to the task's goal; nothing but the reset was done.
-        EpisodeFailed: policy, rig or recorder failed; the arms are stopped, the episode is kept in the exception.
+        IncompatibleRig: the rig lacks something that policy or task needs; nothing has moved.
+        GoalOutOfReach: no policy could bring this body to the task's goal; only the reset was done.
+        EpisodeFailed: policy, rig or recorder failed; the arms are stopped, the exception has the episode.
     """
     if steps < 0:
         raise ValueError(f"steps must be 0 or more, got {steps}")
@@ -106,13 +107,16 @@ def run_episode(
     start = rig.truth()
     if task is not None and start is not None:
         _require_reachable(rig, task, start)
-    rig.packages()  # those of before are not of this episode
-    log, thinking = _Log(rig, task, start, setup, recorder), False
+    rig.packages()  # drops those from before this episode
+    log, is_in_policy = _EpisodeLog(rig, task, start, setup, recorder), False
 
-    def keep(
-        observation: Observation, action: Action | None, sent: Mapping[str, Pose | None], noted: Mapping[str, float]
+    def add_step(
+        observation: Observation,
+        action: Action | None,
+        sent: Mapping[str, Pose | None],
+        policy_info: Mapping[str, float],
     ) -> None:
-        step, truth = log.keep(observation, action, sent, time.perf_counter() - started, noted)
+        step, truth = log.add_step(observation, action, sent, time.perf_counter() - started, policy_info)
         if on_step is not None:
             on_step(step)
         if watch is not None:
@@ -120,23 +124,23 @@ def run_episode(
 
     try:
         policy.reset()
-        keep(observation, None, {}, {})
+        add_step(observation, None, {}, {})
         while log.count <= steps and not stop():
             started = time.perf_counter()
-            thinking = True
+            is_in_policy = True
             action = policy(observation)
-            thinking = False
-            noted = training_info(policy)
+            is_in_policy = False
+            policy_info = training_info(policy)
             observation, sent = rig.step(action)
-            keep(observation, action, sent, noted)
+            add_step(observation, action, sent, policy_info)
     except (EndOfEpisode, KeyboardInterrupt):
         pass
     except (Exception, SystemExit) as failure:  # a policy may call sys.exit
-        done = max(log.count - 1, 0)
-        why = f"{type(failure).__name__}: {failure}"
-        if thinking:
-            why = f"policy '{setup.policy}' raised {why}; the arms hold. Mend it, and try it in simulation"
-        raise EpisodeFailed(f"episode ended after {done} of {steps} steps: {why}", log.episode) from failure
+        steps_done = max(log.count - 1, 0)
+        reason = f"{type(failure).__name__}: {failure}"
+        if is_in_policy:
+            reason = f"policy '{setup.policy}' raised {reason}; the arms hold. Correct it, and test it in simulation"
+        raise EpisodeFailed(f"episode ended after {steps_done} of {steps} steps: {reason}", log.episode) from failure
     finally:
         rig.stop()
         log.flush()
@@ -152,7 +156,7 @@ def _require_reachable(rig: Rig, task: Task, start: Truth) -> None:
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python and of the packages that make the numbers, without importing them."""
+    """Versions of Python and of the packages that affect results, without importing them."""
     found = {"python": platform.python_version()}
     for package in PACKAGES:
         with suppress(metadata.PackageNotFoundError):
@@ -160,7 +164,7 @@ def versions() -> dict[str, str]:
     return found
 
 
-def _meta(rig: Rig, task: Task | None, setup: EpisodeSetup) -> EpisodeMeta:
+def _make_meta(rig: Rig, task: Task | None, setup: EpisodeSetup) -> EpisodeMeta:
     from tacsim.record.images import reference_attachments
 
     return EpisodeMeta(
@@ -177,8 +181,8 @@ def _meta(rig: Rig, task: Task | None, setup: EpisodeSetup) -> EpisodeMeta:
     )
 
 
-def _surfaces(observation: Observation) -> dict[str, float]:
-    """What is known of the gels, each in three numbers."""
+def _surface_extremes(observation: Observation) -> dict[str, float]:
+    """Maximum depth, slope and flow of each gel, as far as observed."""
     found = {}
     for name, touch in observation.tactile.items():
         if touch.height is not None:
@@ -190,8 +194,8 @@ def _surfaces(observation: Observation) -> dict[str, float]:
     return found
 
 
-class _Log:
-    """The steps of a running episode, judged, and kept: in its recording, or else in memory."""
+class _EpisodeLog:
+    """The judged steps of a running episode, stored in its recording, or in memory without one."""
 
     def __init__(
         self,
@@ -201,31 +205,31 @@ class _Log:
         setup: EpisodeSetup,
         recorder: Callable[[EpisodeMeta], StepRecorder] | None,
     ) -> None:
-        meta = _meta(rig, task, setup)
-        self._rig, self._task, self._start, self._body = rig, task, start, setup.body
+        meta = _make_meta(rig, task, setup)
+        self._rig, self._task, self._start, self._has_body = rig, task, start, setup.body
         self._recorder = None if recorder is None else recorder(meta)
-        can_feel = task is not None and not task.touch_needs.missing(rig.spec)
-        self._feel = task.estimator(setup.canonical) if task is not None and can_feel else None
-        self._kept: list[Step] = []
-        self.episode = Episode(meta, self._kept if self._recorder is None else self._recorder.steps)
+        has_tactile_estimate = task is not None and not task.touch_needs.missing(rig.spec)
+        self._tactile_estimator = task.estimator(setup.canonical) if task is not None and has_tactile_estimate else None
+        self._steps: list[Step] = []
+        self.episode = Episode(meta, self._steps if self._recorder is None else self._recorder.steps)
         self.count = 0
 
-    def keep(
+    def add_step(
         self,
         observation: Observation,
         action: Action | None,
         sent: Mapping[str, Pose | None],
         seconds: float,
-        noted: Mapping[str, float],
+        policy_info: Mapping[str, float],
     ) -> tuple[Step, Truth | None]:
-        """The step of what the rig has delivered, which took so many `seconds`; and the truth that judged it. `noted`:
-        numbers of the policy for `Step.info`. Raises RecordingFailed."""
+        """Adds the step of the rig's newest state, which took `seconds` [s]. Returns the step and the truth that judged
+        it. `policy_info`: numbers of the policy for `Step.info`. Raises RecordingFailed."""
         truth = self._rig.truth()
-        step = self._step(truth, observation, action, sent, seconds)
-        step = replace(step, info={**step.info, **noted}) if noted else step
+        step = self._make_step(truth, observation, action, sent, seconds)
+        step = replace(step, info={**step.info, **policy_info}) if policy_info else step
         self.count += 1
         if self._recorder is None:
-            self._kept.append(step)
+            self._steps.append(step)
         elif not self._recorder.write(step):
             self.episode.dropped += 1
             if self._recorder.error is not None:
@@ -233,11 +237,11 @@ class _Log:
         return step, truth
 
     def flush(self) -> None:
-        """Waits until the recording has all that was kept."""
+        """Waits until the recording has written all steps."""
         if self._recorder is not None:
             self._recorder.flush()
 
-    def _step(
+    def _make_step(
         self,
         truth: Truth | None,
         observation: Observation,
@@ -246,11 +250,11 @@ class _Log:
         seconds: float,
     ) -> Step:
         info = {f"contact_signal_{name}": contact_signal(touch) for name, touch in observation.tactile.items()}
-        info |= _surfaces(observation)
+        info |= _surface_extremes(observation)
         info |= self._rig.diagnostics()
         packages = self._rig.packages()
         info |= {f"{PACKAGES_LOST}{name}": float(each.lost) for name, each in packages.items()}
-        distance = None if self._feel is None else self._feel(observation)
+        distance = None if self._tactile_estimator is None else self._tactile_estimator(observation)
         if distance is not None:
             info[TACTILE_DISTANCE] = distance
         outcome = None
@@ -270,10 +274,10 @@ class _Log:
             info=info,
             seconds=seconds,
             packages=packages,
-            body=_thinned(truth.points) if self._body and truth is not None else None,
+            body=_subsample(truth.points) if self._has_body and truth is not None else None,
         )
 
 
-def _thinned(points: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(m, 3) every so many of points (n, 3), PARTICLES at most."""
-    return points[:: -(-len(points) // PARTICLES) or 1].copy()
+def _subsample(points: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Every k-th of the points (n, 3): (m, 3), at most MAX_PARTICLES."""
+    return points[:: -(-len(points) // MAX_PARTICLES) or 1].copy()

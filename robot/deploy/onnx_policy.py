@@ -1,8 +1,8 @@
-"""A learned policy in an ONNX file that says of itself what it sees and what its numbers do.
+"""A learned policy in an ONNX file whose metadata describe its inputs and its action.
 
-The graph takes the arrays that `tacsim.FeatureEncoder` makes, each with a leading axis of 1, and gives `action`, (1, n)
-within [-1, 1]; whatever else a network does to its inputs is inside. Its metadata holds one JSON text
-(`tacsim.models.policy.PolicySpec`). Nothing in such a file is executed but the operators of ONNX.
+The graph takes the arrays of `tacsim.FeatureEncoder`, each with a leading axis of 1, and returns `action`, (1, n)
+within [-1, 1]; all other processing of the inputs is inside the graph. Its metadata hold one JSON text
+(`tacsim.models.policy.PolicySpec`). Only the ONNX operators of the file are executed, no other code.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from robot.deploy.python_policy import PolicyNotFound
-from robot.deploy.training_range import RangeWatch, names_of
+from robot.deploy.training_range import RangeMonitor, number_names
 from tacsim import pose as se3
 from tacsim.gym.features import FeatureEncoder
 from tacsim.interface import Action, Needs, Observation, Pose, RigSpec
@@ -29,83 +29,83 @@ from tacsim.tasks.task import Axis, action_of_vector
 if TYPE_CHECKING:
     from onnxruntime import InferenceSession
 
-MOST_BYTES = 64 * 2**20  # of a file; ours have less than 2 MB
-ASTRAY = 2.0  # steps between where an arm was asked to go and where it is, from which on it is asked anew from there
+MAX_BYTES = 64 * 2**20  # of a file; ours have less than 2 MB
+MAX_LAG_STEPS = 2.0  # between target and pose of an arm; beyond it the next target starts at the pose
 
 
 Goal = float | tuple[float, ...] | None  # of a task [m]
-Shape = tuple[int | None, ...]  # None: whatever it is
+Shape = tuple[int | None, ...]  # None: any size
 
 
 class PolicyFailed(RuntimeError):
-    """A learned policy gave no action."""
+    """A learned policy returned no valid action."""
 
 
 class OnnxPolicy:
     """The policy in `path`, on a rig with this canonical grid.
 
-    An action moves an arm from where it was last asked to go, as in training; from where it stands if a limit has kept
-    it from going there. The same file gives the same action for the same observations on any rig. `watch` says whether
-    the observations of the episode are such as the policy met in training.
+    An action moves an arm from its last target, as in training, or from its pose if a limit has kept it from the
+    target. The same file returns the same action for the same observations on any rig. `range_monitor` compares the
+    observations of the episode with those of training.
 
     Args:
         goal: of the task [m]; None without one.
 
-    Raises PolicyNotFound for a file that is no such policy, IncompatibleRig for one whose maps do not fit the grid.
+    Raises PolicyNotFound if the file is not such a policy, IncompatibleRig if its maps do not fit the grid.
     """
 
     def __init__(self, path: Path, canonical: CanonicalGrid, goal: Goal) -> None:
-        self._session = _session(path)
-        self.spec = _spec(path, self._session)
+        self._session = _open_session(path)
+        self.spec = _read_spec(path, self._session)
         self._name, self._goal = path.name, goal
         self._encoder = FeatureEncoder(self.spec.features, canonical)
         self._axes = tuple(Axis(axis.arm, axis.direction) for axis in self.spec.axes)
         self._targets: dict[str, Pose] = {}
         _require_same_inputs(path, self.spec, self._encoder.inputs, self._session, goal)
-        names = names_of(self.spec, 0 if goal is None else np.size(goal))
+        names = number_names(self.spec, 0 if goal is None else np.size(goal))
         try:
-            self.watch = RangeWatch(self.spec.range, names, self.spec.features.frames)
+            self.range_monitor = RangeMonitor(self.spec.range, names, self.spec.features.frames)
         except ValueError as failure:
             raise PolicyNotFound(f"policy '{path}': {failure}") from None
 
     @staticmethod
     def spec_of(path: Path) -> PolicySpec:
-        """What the file says of itself, without a rig. Raises PolicyNotFound."""
-        return _spec(path, _session(path))
+        """The metadata of the file; needs no rig. Raises PolicyNotFound."""
+        return _read_spec(path, _open_session(path))
 
     @property
     def needs(self) -> Needs:
-        seen = self._encoder.needs
-        arms = seen.arms | {axis.arm for axis in self._axes}
-        return Needs(seen.sensors, arms, height=seen.height, flow=seen.flow)
+        features = self._encoder.needs
+        arms = features.arms | {axis.arm for axis in self._axes}
+        return Needs(features.sensors, arms, height=features.height, flow=features.flow)
 
     def reset(self) -> None:
         self._targets = {}
-        self.watch.reset()
+        self.range_monitor.reset()
 
     def __call__(self, observation: Observation) -> Action:
-        """Raises PolicyFailed when the graph fails, or gives what is no action."""
+        """The action for an observation. Raises PolicyFailed if the graph fails or returns no valid action."""
         first = not self._targets
-        seen = self._encoder.begin(observation, self._goal) if first else self._encoder(observation)
-        self.watch(seen)
+        features = self._encoder.begin(observation, self._goal) if first else self._encoder(observation)
+        self.range_monitor(features)
         for axis in self._axes:
             now = observation.arms[axis.arm].pose
-            if first or se3.pose_distance(self._targets[axis.arm], now)[0] > ASTRAY * self.spec.max_step:
+            if first or se3.pose_distance(self._targets[axis.arm], now)[0] > MAX_LAG_STEPS * self.spec.max_step:
                 self._targets[axis.arm] = now
-        action = action_of_vector(self._infer(seen), self._axes, self.spec.max_step, self._targets)
+        action = action_of_vector(self._infer(features), self._axes, self.spec.max_step, self._targets)
         self._targets = {arm: pose for arm, pose in action.tool.items() if pose is not None}
         return action
 
-    def _infer(self, seen: Mapping[str, NDArray[Any]]) -> NDArray[np.float32]:
-        lost = sorted(key for key, value in seen.items() if not np.isfinite(value).all())
-        if lost:
+    def _infer(self, features: Mapping[str, NDArray[Any]]) -> NDArray[np.float32]:
+        not_finite = sorted(key for key, value in features.items() if not np.isfinite(value).all())
+        if not_finite:
             raise PolicyFailed(
-                f"policy '{self._name}': not all of {', '.join(lost)} is a number; no action is made of that"
+                f"policy '{self._name}': {', '.join(not_finite)} has values that are not finite; no action is computed"
             )
         try:
-            (action,) = self._session.run(["action"], {key: value[None] for key, value in seen.items()})
-        except Exception as failure:  # onnxruntime has no common base of its own
-            raise PolicyFailed(f"policy '{self._name}' fails on this observation: {_words(failure)}") from failure
+            (action,) = self._session.run(["action"], {key: value[None] for key, value in features.items()})
+        except Exception as failure:  # onnxruntime has no common base class
+            raise PolicyFailed(f"policy '{self._name}' fails on this observation: {_first_line(failure)}") from failure
         vector: NDArray[np.float32] = np.asarray(action, np.float32)
         if (
             vector.shape != (1, len(self._axes))
@@ -114,14 +114,14 @@ class OnnxPolicy:
         ):
             raise PolicyFailed(
                 f"policy '{self._name}' gives {vector.tolist()}; an action has {len(self._axes)} finite numbers within "
-                "[-1, 1]: train or export it anew"
+                "[-1, 1]: train or export it again"
             )
         first: NDArray[np.float32] = vector[0]
         return first
 
 
-def misfits(policy: OnnxPolicy, rig: RigSpec, task: Task | None) -> list[str]:
-    """How the rig and the task differ from those that the policy was trained for, beyond its `needs`; each a phrase."""
+def find_mismatches(policy: OnnxPolicy, rig: RigSpec, task: Task | None) -> list[str]:
+    """Differences of rig and task from those of the policy's training, beyond its `needs`; each a phrase."""
     spec, found = policy.spec, []
     if abs(rig.period - spec.period) > 1e-3 * spec.period:
         found.append(f"a control period of {spec.period:g} s, the rig has {rig.period:g} s (period)")
@@ -134,7 +134,7 @@ def misfits(policy: OnnxPolicy, rig: RigSpec, task: Task | None) -> list[str]:
     if task.config.kind != spec.task:
         found.append(f"task '{spec.task}', this is '{task.config.kind}'")
     if tuple(Axis(axis.arm, axis.direction) for axis in spec.axes) != task.axes:
-        found.append(f"actions along {_listed(spec.axes)}, this task has {_listed(task.axes)}")
+        found.append(f"actions along {_list_axes(spec.axes)}, this task has {_list_axes(task.axes)}")
     if spec.max_step > task.config.max_step * (1 + 1e-6):
         found.append(
             f"steps of up to {1e3 * spec.max_step:g} mm, this task allows {1e3 * task.config.max_step:g} mm (max_step)"
@@ -142,11 +142,11 @@ def misfits(policy: OnnxPolicy, rig: RigSpec, task: Task | None) -> list[str]:
     return found
 
 
-def _listed(axes: Any) -> str:
+def _list_axes(axes: Any) -> str:
     return ", ".join(f"{axis.arm} {tuple(axis.direction)}" for axis in axes)
 
 
-def _session(path: Path) -> InferenceSession:
+def _open_session(path: Path) -> InferenceSession:
     try:
         import onnxruntime
     except ModuleNotFoundError:
@@ -155,27 +155,27 @@ def _session(path: Path) -> InferenceSession:
         ) from None
     try:
         size = path.stat().st_size
-        if size > MOST_BYTES:
-            raise PolicyNotFound(f"policy '{path}' has {size / 2**20:,.0f} MiB, at most {MOST_BYTES >> 20} are read")
+        if size > MAX_BYTES:
+            raise PolicyNotFound(f"policy '{path}' has {size / 2**20:,.0f} MiB, the maximum is {MAX_BYTES >> 20} MiB")
         data = path.read_bytes()
     except OSError as failure:
         raise PolicyNotFound(f"policy '{path}' cannot be read: {failure.strerror or failure}") from None
     options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1  # small networks; the other cores simulate
-    options.log_severity_level = 4  # errors are ours to tell
-    # Weights that lie in other files are looked for below a folder that cannot be: the file itself.
+    options.intra_op_num_threads = options.inter_op_num_threads = 1  # small networks; other cores simulate
+    options.log_severity_level = 4  # errors are reported here
+    # Weights in other files are searched in a folder that cannot exist: the file itself.
     options.add_session_config_entry("session.model_external_initializers_file_folder_path", str(path.absolute()))
     try:
         return onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
-    except Exception as failure:  # onnxruntime has no common base of its own
-        raise PolicyNotFound(f"policy '{path}' is no ONNX file that can run here: {_words(failure)}") from None
+    except Exception as failure:  # onnxruntime has no common base class
+        raise PolicyNotFound(f"policy '{path}' is not an ONNX file that can run here: {_first_line(failure)}") from None
 
 
-def _spec(path: Path, session: InferenceSession) -> PolicySpec:
+def _read_spec(path: Path, session: InferenceSession) -> PolicySpec:
     text = session.get_modelmeta().custom_metadata_map.get(METADATA_KEY)
     if text is None:
         raise PolicyNotFound(
-            f"policy '{path}' does not say what it sees: it has no metadata '{METADATA_KEY}', which "
+            f"policy '{path}' does not describe its inputs: it has no metadata '{METADATA_KEY}', which "
             "tacsim export policy writes"
         )
     try:
@@ -190,56 +190,60 @@ def _spec(path: Path, session: InferenceSession) -> PolicySpec:
 
 
 def _require_same_inputs(
-    path: Path, spec: PolicySpec, made: Mapping[str, Numbers], session: InferenceSession, goal: Goal
+    path: Path, spec: PolicySpec, encoder_inputs: Mapping[str, Numbers], session: InferenceSession, goal: Goal
 ) -> None:
-    """The file's inputs are those that this version's encoder makes, number by number; and it gives one action."""
+    """Raises PolicyNotFound unless the inputs equal those of the encoder, number by number, with one action."""
     grid, graph = spec.features.grid, {each.name: each for each in session.get_inputs()}
-    beyond = {"maps": (grid.rows, grid.columns), "flow": (None, None)}  # the markers are the rig's
-    wanted: dict[str, Shape] = {key: (1, len(each.names), *beyond.get(key, ())) for key, each in made.items()}
+    map_shapes = {"maps": (grid.rows, grid.columns), "flow": (None, None)}  # the rig has the markers
+    expected: dict[str, Shape] = {
+        key: (1, len(each.names), *map_shapes.get(key, ())) for key, each in encoder_inputs.items()
+    }
     if spec.features.goal:
-        wanted["goal"] = (1, None if goal is None else np.size(goal))
-    if set(graph) != set(wanted):
+        expected["goal"] = (1, None if goal is None else np.size(goal))
+    if set(graph) != set(expected):
         raise PolicyNotFound(
-            f"policy '{path}': its graph takes {', '.join(sorted(graph))}, its metadata speak of "
-            f"{', '.join(sorted(wanted))}"
+            f"policy '{path}': its graph takes {', '.join(sorted(graph))}, its metadata list "
+            f"{', '.join(sorted(expected))}"
         )
-    for key, shape in wanted.items():
-        if key in made and spec.inputs.get(key) != made[key]:
+    for key, shape in expected.items():
+        if key in encoder_inputs and spec.inputs.get(key) != encoder_inputs[key]:
             raise PolicyNotFound(
-                f"policy '{path}': what it was trained on as '{key}' is not what this version of tacsim makes of the "
-                "same features: train it anew, or use the version that its metadata name"
+                f"policy '{path}': its training had another input '{key}' than this version of tacsim computes from "
+                "the same features: train it again, or use the version in its metadata"
             )
-        if not _fits(graph[key], shape):
+        if not _has_shape(graph[key], shape):
             if key == "goal":
                 raise PolicyNotFound(
-                    f"policy '{path}' was trained for task '{spec.task}', whose goal is {_array(graph[key])}; this "
-                    f"task's is {_floats(shape)}"
+                    f"policy '{path}' was trained for task '{spec.task}', whose goal is "
+                    f"{_describe_array(graph[key])}; the goal of this task is {_describe_shape(shape)}"
                 )
             raise PolicyNotFound(
-                f"policy '{path}': its input '{key}' is {_array(graph[key])}; wanted: {_floats(shape)}"
+                f"policy '{path}': its input '{key}' is {_describe_array(graph[key])}; wanted: {_describe_shape(shape)}"
             )
     outputs = {each.name: each for each in session.get_outputs()}
     action: Shape = (1, len(spec.axes))
-    if "action" not in outputs or not _fits(outputs["action"], action):
-        gives = ", ".join(f"'{name}', {_array(each)}" for name, each in outputs.items())
-        raise PolicyNotFound(f"policy '{path}': it must give 'action', {_floats(action)}; it gives {gives}")
+    if "action" not in outputs or not _has_shape(outputs["action"], action):
+        outputs_found = ", ".join(f"'{name}', {_describe_array(each)}" for name, each in outputs.items())
+        raise PolicyNotFound(
+            f"policy '{path}': it must give 'action', {_describe_shape(action)}; it gives {outputs_found}"
+        )
 
 
-def _fits(found: Any, shape: Shape) -> bool:
-    """An array of the graph has this shape, as far as both tell."""
+def _has_shape(found: Any, shape: Shape) -> bool:
+    """True if an array of the graph has this shape, where both give a size."""
     sides = zip(found.shape, shape, strict=True) if len(found.shape) == len(shape) else [(0, 1)]
-    told = ((side, wanted) for side, wanted in sides if isinstance(side, int) and wanted is not None)
-    return found.type == "tensor(float)" and all(side == wanted for side, wanted in told)
+    known_sides = ((side, expected) for side, expected in sides if isinstance(side, int) and expected is not None)
+    return found.type == "tensor(float)" and all(side == expected for side, expected in known_sides)
 
 
-def _array(found: Any) -> str:
+def _describe_array(found: Any) -> str:
     return f"{found.type} {found.shape}"
 
 
-def _floats(shape: Shape) -> str:
+def _describe_shape(shape: Shape) -> str:
     return f"tensor(float) {' x '.join('n' if side is None else str(side) for side in shape)}"
 
 
-def _words(failure: Exception) -> str:
-    """The first line of what onnxruntime says, fit for a terminal."""
+def _first_line(failure: Exception) -> str:
+    """First line of the message of onnxruntime, printable on a terminal."""
     return printable_line((str(failure).strip().splitlines() or [repr(failure)])[0][:300])

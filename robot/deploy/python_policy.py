@@ -15,15 +15,15 @@ from tacsim.interface import Action, FloatArray, Needs, Observation, Policy, Pos
 from tacsim.record.sources import read_columns
 
 AXES = ("x", "y", "z", "rx", "ry", "rz")  # [m], and a rotation vector [rad]
-MOST_ROWS = 100_000
+MAX_ROWS = 100_000
 
 
 class PolicyNotFound(ValueError):
-    """The name of a policy leads to nothing that acts."""
+    """No policy has this name."""
 
 
 class FunctionPolicy:
-    """A plain function from Observation to Action as a policy that needs nothing and remembers nothing."""
+    """A function from Observation to Action as a policy without needs and without state."""
 
     needs = Needs()
 
@@ -38,8 +38,8 @@ class FunctionPolicy:
 
 
 def policy_of_code(name: str) -> Policy:
-    """The policy at "package.module:attribute": an object with needs, reset and __call__ as tacsim.Policy has them, a
-    class of such objects (made without arguments), or a function from Observation to Action.
+    """The policy at "package.module:attribute": an object with needs, reset and __call__ like tacsim.Policy, a class of
+    such objects (created without arguments), or a function from Observation to Action.
 
     Runs code of that module. Raises PolicyNotFound.
     """
@@ -56,7 +56,7 @@ def _as_policy(found: object, name: str) -> Policy:
             found = found()
         except Exception as failure:
             raise PolicyNotFound(
-                f"policy '{name}': the class cannot be made without arguments: {failure!r}"
+                f"policy '{name}': the class cannot be created without arguments: {failure!r}"
             ) from failure
     if isinstance(found, Policy):
         if not isinstance(found.needs, Needs):
@@ -65,17 +65,17 @@ def _as_policy(found: object, name: str) -> Policy:
     if callable(found):
         return FunctionPolicy(found)
     raise PolicyNotFound(
-        f"policy '{name}' is a {type(found).__name__}: neither a policy nor a function of an Observation"
+        f"policy '{name}' is a {type(found).__name__}: not a policy and not a function of an Observation"
     )
 
 
 class TargetScript:
     """Moves arms through the rows of a table, then holds.
 
-    A column is ARM.AXIS: how far the sensor of that arm shall be from where it was at the first observation, along its
-    own axes there (z out of the gel, towards what it touches). Columns that are not there are 0.
+    A column ARM.AXIS is the displacement of that arm's sensor from its pose at the first observation, along its axes in
+    that pose (z out of the gel, towards the object). Missing columns are 0.
 
-    Raises PolicyNotFound for a file that is no such table.
+    Raises PolicyNotFound if the file is not such a table.
     """
 
     def __init__(self, path: Path) -> None:
@@ -83,7 +83,7 @@ class TargetScript:
             with path.open(newline="", encoding="utf-8-sig") as file:
                 header = [name.strip() for name in next(csv.reader(file), [])]
         except (OSError, UnicodeDecodeError, csv.Error) as failure:
-            raise PolicyNotFound(f"policy '{path}': no readable CSV file: {failure}") from failure
+            raise PolicyNotFound(f"policy '{path}': not a readable CSV file: {failure}") from failure
         split = [tuple(name.rpartition(".")[::2]) for name in header]
         wrong = [name for name, (arm, axis) in zip(header, split, strict=True) if not arm or axis not in AXES]
         if wrong or not header:
@@ -95,8 +95,8 @@ class TargetScript:
             rows = np.array(read_columns(path, header))
         except ValueError as failure:
             raise PolicyNotFound(f"policy '{failure}'") from failure
-        if len(rows) > MOST_ROWS:
-            raise PolicyNotFound(f"policy '{path}': {len(rows)} rows, at most {MOST_ROWS}")
+        if len(rows) > MAX_ROWS:
+            raise PolicyNotFound(f"policy '{path}': {len(rows)} rows, the maximum is {MAX_ROWS}")
         self._offsets: dict[str, FloatArray] = {}
         for column, (arm, axis) in enumerate(split):
             self._offsets.setdefault(arm, np.zeros((len(rows), 6)))[:, AXES.index(axis)] = rows[:, column]

@@ -1,10 +1,10 @@
-"""Whether what a learned policy observes is what it observed in training.
+"""Compares the observations of a learned policy with those of its training.
 
-Of the newest frame of each observation the numbers that the policy sees are taken (of a map or a flow, for each
-channel its mean, least and greatest), with the products of each pair of them: what belongs together, as the gap and
-the depth of the gels, shows in the products. Their distance from the mean of training, whitened by training's
-covariance (Mahalanobis 1936), is compared with a limit that training's own episodes keep: the split conformal quantile
-(Vovk et al. 2005) of each episode's largest distance, in episodes that mean and covariance were not fitted to.
+An observation is reduced to the numbers of its newest frame (of a map or a flow: mean, minimum and maximum of each
+channel) and the products of each pair of them: the products show correlations, such as gap and depth of the gels. Their
+distance from the mean of training, whitened by the covariance of training (Mahalanobis 1936), is compared with a limit
+from episodes of the training: the split conformal quantile (Vovk et al. 2005) of the maximum distance of each episode,
+over episodes that mean and covariance were not fitted to.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from tacsim.interface import FloatArray
 from tacsim.models.policy import PolicySpec, TrainingRange
 from tacsim.models.scene import Scene
 
-MAX_PAIRED = 12  # numbers of which the products count, too
-FALSE_ALARMS = 0.03  # share of training's episodes that may be beyond the limit
-LEAST_DEVIATION = 0.01  # of a number in training: one that varies less counts as if it varied so much [encoded]
-LEAST_VARIANCE = 0.01  # of a direction, beside 1 of a number: smaller ones are noise
-SLACK = 1e-6  # of a scene's number: what rounding leaves [share]
-PHYSICAL = ("gel", "gels", "body", "friction", "gravity")  # parts of a scene that a policy feels
-NOT_FELT = ("density", "seed")  # numbers in them that quasi-static motions do not depend on
-Seen = Mapping[str, NDArray[Any]]
+MAX_NUMBERS_WITH_PRODUCTS = 12  # with more numbers no products are added
+FALSE_ALARMS = 0.03  # fraction of training episodes that may exceed the limit
+MIN_DEVIATION = 0.01  # of a number in training; a smaller one is replaced by it [encoded]
+MIN_VARIANCE = 0.01  # of a direction, relative to 1 of a number; smaller ones are noise
+SLACK = 1e-6  # of a scene's number, for rounding [fraction]
+PHYSICAL = ("gel", "gels", "body", "friction", "gravity")  # parts of a scene that affect observations
+QUASI_STATIC_IRRELEVANT = ("density", "seed")  # numbers without effect on quasi-static motions
+EncodedFeatures = Mapping[str, NDArray[Any]]
 
 
-def numbers_of(seen: Seen, frames: int) -> FloatArray:
-    """(n,) the numbers of the newest of an observation's `frames`, in the order of `names_of`."""
+def extract_numbers(features: EncodedFeatures, frames: int) -> FloatArray:
+    """Numbers (n,) of the newest of an observation's `frames`, in the order of `number_names`."""
     parts = []
-    for key in sorted(seen):
-        values = np.asarray(seen[key], np.float64)
+    for key in sorted(features):
+        values = np.asarray(features[key], np.float64)
         if key != "goal":
             values = values[-(len(values) // frames) :]
         if values.ndim == 1:
@@ -44,48 +44,48 @@ def numbers_of(seen: Seen, frames: int) -> FloatArray:
     return np.concatenate(parts)
 
 
-def names_of(spec: PolicySpec, goals: int) -> list[str]:
-    """Of the numbers of `numbers_of`; `goals`: numbers of the goal."""
+def number_names(spec: PolicySpec, goals: int) -> list[str]:
+    """Names of the numbers of `extract_numbers`. `goals`: count of goal numbers."""
     found: dict[str, list[str]] = {}
     for key, each in spec.inputs.items():
         newest = each.names[-(len(each.names) // spec.features.frames) :]
         if key == "touch":
             found[key] = list(newest)
         else:
-            found[key] = [f"{name} {of}" for name in newest for of in ("mean", "least", "greatest")]
+            found[key] = [f"{name} {of}" for name in newest for of in ("mean", "minimum", "maximum")]
     if spec.features.goal:
         found["goal"] = [f"goal {at}" for at in range(goals)]
     return [name for key in sorted(found) for name in found[key]]
 
 
-def lifted(numbers: FloatArray) -> FloatArray:
-    """(..., m) numbers (..., n), and after them, of up to MAX_PAIRED, the products of each pair."""
+def append_products(numbers: FloatArray) -> FloatArray:
+    """Appends the products of each pair to numbers (..., n), if n <= MAX_NUMBERS_WITH_PRODUCTS: (..., m)."""
     count = numbers.shape[-1]
-    if count > MAX_PAIRED:
+    if count > MAX_NUMBERS_WITH_PRODUCTS:
         return numbers
     first, second = np.triu_indices(count)
     return np.concatenate([numbers, numbers[..., first] * numbers[..., second]], axis=-1)
 
 
-def measured(episodes: Sequence[FloatArray], scenes: Sequence[Scene]) -> TrainingRange:
-    """The range of `episodes`, each (steps, n) numbers as `numbers_of` gives, which were played in `scenes`.
+def fit_training_range(episodes: Sequence[FloatArray], scenes: Sequence[Scene]) -> TrainingRange:
+    """The range of `episodes`, each (steps, n) numbers of `extract_numbers`, played in `scenes`.
 
-    Mean and covariance are those of every other episode; the others give the limit. Raises ValueError for fewer than
-    two episodes.
+    Mean and covariance come from every second episode, the limit from the others. Raises ValueError for fewer than two
+    episodes.
     """
     if len(episodes) < 2:
-        raise ValueError(f"{len(episodes)} episodes say no range: take two at least, better a hundred")
+        raise ValueError(f"{len(episodes)} episodes give no range: use at least two, better a hundred")
     whole = np.concatenate(list(episodes))
-    fitted = lifted(np.concatenate(list(episodes[::2])))
+    fitted = append_products(np.concatenate(list(episodes[::2])))
     centre, own = fitted.mean(axis=0), fitted.std(axis=0)
-    deviation = np.maximum(own, LEAST_DEVIATION)
+    deviation = np.maximum(own, MIN_DEVIATION)
     covariance = np.atleast_2d(np.cov((fitted - centre) / deviation, rowvar=False))
     variance, directions = np.linalg.eigh(covariance + np.diag(1.0 - (own / deviation) ** 2))
-    scale = np.sqrt(np.maximum(variance, LEAST_VARIANCE) * len(variance))
-    axes = (directions / scale) @ directions.T / deviation  # symmetric, so that no choice among equal directions shows
-    largest = np.sort([distances(each, centre, axes).max() for each in episodes[1::2]])
+    scale = np.sqrt(np.maximum(variance, MIN_VARIANCE) * len(variance))
+    axes = (directions / scale) @ directions.T / deviation  # symmetric, so the order of equal directions has no effect
+    largest = np.sort([mahalanobis_distances(each, centre, axes).max() for each in episodes[1::2]])
     at = min(int(np.ceil((len(largest) + 1) * (1 - FALSE_ALARMS))), len(largest)) - 1
-    numbers, words = ranges_of(scenes)
+    numbers, words = scene_ranges(scenes)
     return TrainingRange(
         episodes=len(episodes),
         low=_rounded(whole.min(axis=0)),
@@ -98,9 +98,9 @@ def measured(episodes: Sequence[FloatArray], scenes: Sequence[Scene]) -> Trainin
     )
 
 
-def distances(numbers: FloatArray, centre: FloatArray, axes: FloatArray) -> FloatArray:
-    """(...,) of observations (..., n): root mean square over the whitened directions; about 1 in training."""
-    found: FloatArray = np.linalg.norm((lifted(numbers) - centre) @ axes.T, axis=-1)
+def mahalanobis_distances(numbers: FloatArray, centre: FloatArray, axes: FloatArray) -> FloatArray:
+    """Distances (...,) of observations (..., n): RMS over the whitened directions; about 1 in training."""
+    found: FloatArray = np.linalg.norm((append_products(numbers) - centre) @ axes.T, axis=-1)
     return found
 
 
@@ -108,58 +108,58 @@ def _rounded(values: FloatArray) -> tuple[float, ...]:
     return tuple(float(f"{value:.6g}") for value in values.tolist())
 
 
-class RangeWatch:
-    """Compares what a policy observes in an episode with the range of its training.
+class RangeMonitor:
+    """Compares the observations of an episode with the training range of a policy.
 
     Args:
-        known: None where it is unknown.
-        names: of the numbers of an observation; empty: they are not named.
+        known: the range; None: unknown.
+        names: of the numbers of an observation; empty: without names.
 
-    Raises ValueError for a range of other numbers.
+    Raises ValueError if the range has other numbers.
     """
 
     def __init__(self, known: TrainingRange | None, names: Sequence[str] = (), frames: int = 1) -> None:
         self.known, self._names, self._frames = known, tuple(names), frames
         if known is not None:
-            expected = lifted(np.zeros(len(names))).shape if names else (len(known.centre),)
+            expected = append_products(np.zeros(len(names))).shape if names else (len(known.centre),)
             if (len(known.centre),) != expected or (names and len(known.low) != len(names)):
                 raise ValueError(
-                    f"the training range is of {len(known.low)} numbers ({len(known.centre)} with products), the "
-                    f"policy sees {len(names)}: measure it again with tacsim export policy-range"
+                    f"the training range has {len(known.low)} numbers ({len(known.centre)} with products), the "
+                    f"policy has {len(names)}: measure it again with tacsim export policy-range"
                 )
             self._centre, self._axes = np.array(known.centre), np.array(known.axes)
             self._low, self._high = np.array(known.low), np.array(known.high)
         self.reset()
 
     def reset(self) -> None:
-        """A new episode."""
-        self.largest = 0.0  # distance over its limit, of the episode so far
-        self.now = 0.0  # the same of the last observation
-        self._worst: FloatArray | None = None  # the numbers of the farthest observation
+        """Begins a new episode."""
+        self.largest = 0.0  # maximum of distance / limit in the episode
+        self.latest = 0.0  # distance / limit of the last observation
+        self._worst: FloatArray | None = None  # numbers of the observation with the maximum distance
 
-    def __call__(self, seen: Seen) -> None:
-        """Takes the next observation."""
+    def __call__(self, features: EncodedFeatures) -> None:
+        """Adds the next observation."""
         if self.known is None:
             return
-        numbers = numbers_of(seen, self._frames)
-        self.now = float(distances(numbers, self._centre, self._axes)) / self.known.limit
-        if self.now > self.largest:
-            self.largest, self._worst = self.now, numbers
+        numbers = extract_numbers(features, self._frames)
+        self.latest = float(mahalanobis_distances(numbers, self._centre, self._axes)) / self.known.limit
+        if self.latest > self.largest:
+            self.largest, self._worst = self.latest, numbers
 
     @property
     def is_outside(self) -> bool:
-        """An observation of this episode lies outside the range of training."""
+        """True if an observation of this episode is outside the range of training."""
         return self.largest > 1.0
 
-    def words(self) -> str:
-        """What is outside, for a person; the number of the farthest observation that leaves its own range most."""
-        text = f"it observes what it did not observe in training (distance {self.largest:.1f} times the limit)"
+    def describe_outside(self) -> str:
+        """Text on the farthest observation, with its number that is farthest outside its own range."""
+        text = f"its observations leave the range of its training (distance {self.largest:.1f} times the limit)"
         assert self.known is not None and self._worst is not None
-        width = np.maximum(self._high - self._low, LEAST_DEVIATION)
-        beyond = np.maximum(self._low - self._worst, self._worst - self._high) / width
-        at = int(np.argmax(beyond))
-        if beyond[at] <= 0.0 or at >= len(self._names):
-            return f"{text}: each number is known, their combination is not"
+        width = np.maximum(self._high - self._low, MIN_DEVIATION)
+        excess = np.maximum(self._low - self._worst, self._worst - self._high) / width
+        at = int(np.argmax(excess))
+        if excess[at] <= 0.0 or at >= len(self._names):
+            return f"{text}: each number is within its range, their combination is not"
         return (
             f"{text}: {self._names[at]} is {self._worst[at]:.3g}, in training {self._low[at]:.3g} to "
             f"{self._high[at]:.3g} (encoded)"
@@ -167,8 +167,8 @@ class RangeWatch:
 
 
 def scene_numbers(scene: Scene) -> dict[str, float | str]:
-    """What a policy feels of a scene: each number of its gels, body, friction and gravity [SI], and the body's shape,
-    by its key in the scene's file. What is not given has no key."""
+    """Parameters of a scene that affect observations: each number of its gels, body, friction and gravity [SI], and the
+    shape of the body, by its key in the scene file. A parameter that is not given has no key."""
     found: dict[str, float | str] = {}
 
     def walk(key: str, value: Any) -> None:
@@ -178,7 +178,7 @@ def scene_numbers(scene: Scene) -> dict[str, float | str]:
         elif isinstance(value, Sequence) and not isinstance(value, str):
             for at, each in enumerate(value):
                 walk(f"{key}[{at}]", each)
-        elif key.rpartition(".")[2] in NOT_FELT or isinstance(value, bool):
+        elif key.rpartition(".")[2] in QUASI_STATIC_IRRELEVANT or isinstance(value, bool):
             return
         elif isinstance(value, int | float):
             found[key] = float(value)
@@ -192,8 +192,8 @@ def scene_numbers(scene: Scene) -> dict[str, float | str]:
     return found
 
 
-def ranges_of(scenes: Sequence[Scene]) -> tuple[dict[str, tuple[float, float]], dict[str, tuple[str, ...]]]:
-    """Least and greatest of each number of the `scenes`, and the words (shapes) that are in them."""
+def scene_ranges(scenes: Sequence[Scene]) -> tuple[dict[str, tuple[float, float]], dict[str, tuple[str, ...]]]:
+    """Minimum and maximum of each number of the `scenes`, and their words (shapes)."""
     numbers: dict[str, tuple[float, float]] = {}
     words: dict[str, tuple[str, ...]] = {}
     for scene in scenes:
@@ -206,10 +206,9 @@ def ranges_of(scenes: Sequence[Scene]) -> tuple[dict[str, tuple[float, float]], 
     return numbers, words
 
 
-def outside_of_scenes(known: TrainingRange, scenes: Sequence[Scene]) -> list[str]:
-    """The parameters of simulated `scenes` that training's scenes did not have, each in words; none if all lie
-    within."""
-    here, words = ranges_of(scenes)
+def describe_scenes_outside(known: TrainingRange, scenes: Sequence[Scene]) -> list[str]:
+    """Texts on the parameters of simulated `scenes` outside those of the training scenes; empty if all are within."""
+    here, words = scene_ranges(scenes)
     found = []
     for key, (low, high) in here.items():
         trained = known.scene.get(key)

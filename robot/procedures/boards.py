@@ -29,7 +29,7 @@ from robot.procedures.session import (
     GOLDEN_ANGLE,
     GOLDEN_RATIO,
     PICTURE_TIMEOUT,
-    SETTLE,
+    SETTLING_TIME,
     CannotCalibrate,
     FrameSource,
     OutsideLimits,
@@ -45,11 +45,11 @@ from tacsim.limits import ActionError
 from tacsim.models.hardware import CameraSensorConfig
 from tacsim.models.rig import RigConfig
 
-LARGEST_RESIDUAL = 2.0  # of a board's pose, root mean square [px]
-STILL = 0.003  # of the picture's longer side: a board whose points move less stands still
-HOLD = 0.4  # for so long [s]
-DISTINCT = 0.04  # of the same: two views are the same if their points differ by less, root mean square
-REMIND = 4.0  # between two words on why nothing is taken [s]
+MAX_RESIDUAL = 2.0  # of a board's pose, root mean square [px]
+MAX_STILL_MOTION = 0.003  # of the longer side of the picture: a board whose points move less stands still
+STILL_TIME = 0.4  # minimum time of standing still [s]
+MIN_VIEW_DISTANCE = 0.04  # of the longer side: two views are equal if their points differ by less, root mean square
+REMINDER_INTERVAL = 4.0  # between two reports of a reason [s]
 PROMPTS = (
     "facing the camera, so that it fills the picture",
     "its left side nearer to the camera, by 30 degrees",
@@ -66,17 +66,17 @@ ON_GEL = "lay the board on the gel, print side down, and leave it there"
 
 @dataclass(frozen=True, slots=True)
 class BoardPosePlan:
-    """From where to look."""
+    """Poses of the record."""
 
     board: Board
     lens: Lens
     poses: int = 20
-    tilt: float = math.radians(30.0)  # largest, about each axis [rad]
-    pivot: float = 0.0  # distance of the point that the sensor turns about, before the sensor [m]
+    tilt: float = math.radians(30.0)  # maximum, about each axis [rad]
+    pivot: float = 0.0  # distance of the rotation centre in front of the sensor [m]
 
 
 def schedule(plan: BoardPosePlan) -> list[Rotation]:
-    """Rotations of the sensor, in its own axes: tilts in all directions, and twists both ways. The first is none."""
+    """Rotations of the sensor, in its own axes: tilts in all directions and twists both ways. The first is zero."""
     rotations = [Rotation.identity()]
     for index in range(1, plan.poses):
         share = math.sqrt(index / max(1, plan.poses - 1))
@@ -89,28 +89,28 @@ def schedule(plan: BoardPosePlan) -> list[Rotation]:
 
 @contextmanager
 def open_arm(config: RigConfig, arm: str) -> Iterator[URArm]:
-    """The arm of a rig, and with it those that it must keep out of. Starts the mocks that the file asks for.
+    """Opens an arm of a rig and the other arms of its keep-outs. Starts the mocks of the rig file.
 
-    Raises CannotCalibrate for an arm that is none of hardware, and what connecting raises.
+    Raises CannotCalibrate for an arm that is not hardware, and the errors of connecting.
     """
     hardware_arm(config, arm)
-    apart: dict[str, float] = {}  # [m]
+    distances: dict[str, float] = {}  # [m]
     for rule in config.keep_out:
         if arm in rule.arms:
             other = rule.arms[1 - rule.arms.index(arm)]
-            apart[other] = max(rule.distance, apart.get(other, 0.0))
+            distances[other] = max(rule.distance, distances.get(other, 0.0))
     with ExitStack() as stack:
-        # neither gels nor bodies: only arms
+        # only arms, without gels and bodies
         stack.enter_context(companion_of(config.model_copy(update={"sensors": {}, "scene": None, "task": None})))
         arms = {}
-        for name in (*apart, arm):
-            keep_out = apart if name == arm else {arm: apart[name]}
+        for name in (*distances, arm):
+            keep_out = distances if name == arm else {arm: distances[name]}
             arms[name] = stack.enter_context(URArm(hardware_arm(config, name), name, keep_out=keep_out))
         yield arms[arm]
 
 
 def open_camera(source: str, lens: Lens) -> Camera:
-    """The camera at `source`, at the size of its lens. Raises DeviceError."""
+    """Opens the camera at `source`, with the picture size of its lens. Raises DeviceError."""
     config = CameraSensorConfig(
         driver="camera", source=source, width=lens.width, height=lens.height, max_age=PICTURE_TIMEOUT
     )
@@ -118,10 +118,10 @@ def open_camera(source: str, lens: Lens) -> Camera:
 
 
 def record_board_poses(arm: URArm, camera: FrameSource, plan: BoardPosePlan, session: Session[BoardPose]) -> None:
-    """Looks at the board from all poses of the plan and returns to the first.
+    """Records the board from all poses of the plan and returns to the first.
 
-    Raises CannotCalibrate when the plan turns too little, or the board is not in view at the beginning, before anything
-    has moved; and what the arm or the camera raise: the arm is stopped then.
+    Raises CannotCalibrate, before any motion, if the rotations of the plan are too small or the board is not in view;
+    and the errors of the arm and the camera, after stopping the arm.
     """
     spread = angular_spread(np.stack([rotation.as_matrix() for rotation in schedule(plan)]))
     if spread < MIN_SPREAD:
@@ -135,7 +135,7 @@ def record_board_poses(arm: URArm, camera: FrameSource, plan: BoardPosePlan, ses
     try:
         _find_board(camera, plan)
     except (BadBoard, BadView) as error:
-        raise CannotCalibrate(f"put the arm so that the camera sees the board, then begin: {error}") from error
+        raise CannotCalibrate(f"move the arm until the board is in view of the camera, then begin: {error}") from error
     start = arm.state().pose
     try:
         with session.until_stopped():
@@ -150,17 +150,17 @@ def record_board_poses(arm: URArm, camera: FrameSource, plan: BoardPosePlan, ses
                     session.left_out.append(f"pose {done + 1}: {failure}")
                     continue
                 sensor = se3.compose(base_from_world, arm.state().pose)
-                session.take(BoardPose(se3.compose(sensor, sensor_from_flange), board))
+                session.add_measurement(BoardPose(se3.compose(sensor, sensor_from_flange), board))
             move_to(arm, arm.name, start)
     finally:
         arm.stop()
 
 
 def _find_board(camera: FrameSource, plan: BoardPosePlan) -> Pose:
-    """camera_from_board in a picture exposed after the arm came to rest. Raises BadBoard, BadView."""
-    pose, residual = board_pose(plan.lens, find_board(frame_after(camera, SETTLE).image, plan.board))
-    if residual > LARGEST_RESIDUAL:
-        raise BadView(f"the board does not fit what is seen: {residual:.1f} px, {LARGEST_RESIDUAL:g} at most")
+    """camera_from_board from a picture exposed after the arm came to rest. Raises BadBoard, BadView."""
+    pose, residual = board_pose(plan.lens, find_board(frame_after(camera, SETTLING_TIME).image, plan.board))
+    if residual > MAX_RESIDUAL:
+        raise BadView(f"the board does not fit the picture: residual {residual:.1f} px, maximum {MAX_RESIDUAL:g} px")
     return pose
 
 
@@ -169,14 +169,14 @@ class BoardViewPlan:
     board: Board
     views: int = 12
     on_gel: bool = False  # the board lies on the gel: one view
-    reference: Image | None = None  # native picture without the board, where contrast is low
-    patience: float = 180.0  # for each view [s]
+    reference: Image | None = None  # native picture without the board, for low contrast
+    timeout: float = 180.0  # for each view [s]
 
 
 def record_board_views(camera: FrameSource, plan: BoardViewPlan, session: Session[tuple[str, Image]]) -> None:
-    """Leads a person through the views of `plan`, and takes name and native picture of each.
+    """Guides a person through the views of `plan` and records name and native picture of each.
 
-    Raises CannotCalibrate when no view comes for long, and what the camera raises.
+    Raises CannotCalibrate if no view is found within the timeout, and the errors of the camera.
     """
     earlier: list[Points] = []
     frames = session.frames(camera)
@@ -185,49 +185,51 @@ def record_board_views(camera: FrameSource, plan: BoardViewPlan, session: Sessio
             number = len(earlier) + 1
             session.progress(len(earlier))
             prompt = ON_GEL if plan.on_gel else f"hold the board still, {PROMPTS[len(earlier) % len(PROMPTS)]}"
-            session.say(f"View {number} of {plan.views}: {prompt}.")
+            session.report(f"View {number} of {plan.views}: {prompt}.")
             image, points = _next_view(frames, plan, earlier, session)
             earlier.append(points)
-            session.take((f"view_{number:02d}.png", image))
-            session.say(f"Taken: {len(points.image)} points, {points.spacing:.0f} px apart.")
+            session.add_measurement((f"view_{number:02d}.png", image))
+            session.report(f"Taken: {len(points.image)} points, {points.spacing:.0f} px apart.")
         session.progress(len(earlier))
 
 
 def _next_view(
     frames: Iterator[TactileFrame], plan: BoardViewPlan, earlier: list[Points], session: Session[tuple[str, Image]]
 ) -> tuple[Image, Points]:
-    """A picture of a board that stands still, seen otherwise than in the earlier views; the person is told now and then
-    why there is none. Raises Stopped, CannotCalibrate."""
+    """A picture of a board that stands still and differs from the earlier views. Reports from time to time why no
+    picture is taken. Raises Stopped, CannotCalibrate."""
     frame = next(frames)
     begun = reminded = since = frame.time
-    anchor: Points | None = None  # where the board has stood since
+    anchor: Points | None = None  # first points of the still board
     while True:
         try:
             points = find_board(frame.image, plan.board, plan.reference)
         except BadBoard as missing:
-            why, anchor = str(missing), None
+            reason, anchor = str(missing), None
         else:
             side = max(frame.image.shape[:2])
-            if anchor is None or _point_distance(anchor, points) > STILL * side:
+            if anchor is None or _point_distance(anchor, points) > MAX_STILL_MOTION * side:
                 anchor, since = points, frame.time
-            alike = (k for k, other in enumerate(earlier, 1) if _point_distance(other, points) < DISTINCT * side)
+            alike = (
+                k for k, other in enumerate(earlier, 1) if _point_distance(other, points) < MIN_VIEW_DISTANCE * side
+            )
             same = next(alike, None)
-            if same is None and frame.time - since >= HOLD:
+            if same is None and frame.time - since >= STILL_TIME:
                 return frame.image, points
-            why = "the board moves; hold it still"
+            reason = "the board moves; hold it still"
             if same is not None:
-                why = f"the board is seen as in view {same}; tilt it, or hold it elsewhere"
-        if frame.time - reminded >= REMIND:
-            session.left_out.append(why)
-            session.say(f"Skipped: {why}.")
+                reason = f"the board is seen as in view {same}; tilt it, or hold it elsewhere"
+        if frame.time - reminded >= REMINDER_INTERVAL:
+            session.left_out.append(reason)
+            session.report(f"Skipped: {reason}.")
             reminded = frame.time
-        if frame.time - begun > plan.patience:
-            raise CannotCalibrate(f"given up after {plan.patience:g} s without a view; the last: {why}")
+        if frame.time - begun > plan.timeout:
+            raise CannotCalibrate(f"given up after {plan.timeout:g} s without a view; the last: {reason}")
         frame = next(frames)
 
 
 def _point_distance(one: Points, other: Points) -> float:
-    """How far the points that both have lie apart in the picture, root mean square [px]; infinite without any."""
+    """Root mean square distance of common points in the picture [px]; infinite without a common point."""
     places = {tuple(place): at for place, at in zip(np.round(one.board, 9).tolist(), one.image, strict=True)}
     pairs = [
         (places[tuple(place)], at)
@@ -236,5 +238,5 @@ def _point_distance(one: Points, other: Points) -> float:
     ]
     if not pairs:
         return float("inf")
-    apart: FloatArray = np.array([first - second for first, second in pairs])
-    return float(np.sqrt((apart**2).sum(axis=1).mean()))
+    distances: FloatArray = np.array([first - second for first, second in pairs])
+    return float(np.sqrt((distances**2).sum(axis=1).mean()))

@@ -1,7 +1,7 @@
-"""Presses of a ball by hand before a running camera: the frames from which a sensor's light is calibrated.
+"""Records presses of a ball by hand with a running camera: the frames for the light calibration of a sensor.
 
-Both hands may be at the ball: a press is taken by itself once the picture has changed and then stands still, and the
-next one is asked for once the gel looks untouched again.
+The person may need both hands for the ball, so a press is taken automatically: when the picture has changed and then
+stands still. The next press is requested when the gel looks untouched again.
 """
 
 from __future__ import annotations
@@ -21,159 +21,161 @@ from calibration.markers.lattice import NoLattice
 from robot.procedures.session import CannotCalibrate, FrameSource, Session
 from tacsim.interface import Float32, Image, TactileFrame
 
-CELL = 8  # colour is averaged over so many pixels each way: noise and JPEG go, contacts stay
-MOTION = 4.0  # a cell that changes by more is in motion [grey levels]
-CONTACT = 8.0  # a cell that differs from the reference by more than the usual is touched [grey levels]
-HOLD = 0.5  # a picture that has not moved for so long stands still [s]
-REST = 1.5  # the same for the one without contact, which everything is measured against [s]
-RESTLESS = 5.0  # a press that does not come to rest for so long is worth a word [s]
+CELL_SIZE = 8  # pixels each way over which colour is averaged: removes noise and JPEG errors, keeps contacts
+MAX_STILL_CHANGE = 4.0  # a cell with a larger change is in motion [grey levels]
+MIN_CONTACT_CHANGE = 8.0  # a cell that differs more from the reference is touched [grey levels]
+PRESS_REST_TIME = 0.5  # a picture without motion for this time stands still [s]
+REFERENCE_REST_TIME = 1.5  # the same for the reference without contact [s]
+MAX_MOVING_TIME = 5.0  # after this time without rest the person is reminded [s]
 REFERENCE = "background.png"
-NOISE_FRAMES = 8  # pictures without contact that tell the camera's noise
+NOISE_FRAMES = 8  # pictures without contact, for the noise of the camera
 
 
 @dataclass(frozen=True, slots=True)
 class BallPressPlan:
     ball: float  # radius [px of the metric picture]
     presses: int = 8
-    patience: float = 180.0  # for each step of the person's [s]
-    rectify: Callable[[Image], Image] | None = None  # native picture -> metric one; None: they are the same
+    timeout: float = 180.0  # for each step of the person [s]
+    rectify: Callable[[Image], Image] | None = None  # native picture -> metric picture; None: they are equal
     markers: bool = False  # dots are printed on the gel
 
 
 def record_presses(camera: FrameSource, plan: BallPressPlan, session: Session[tuple[str, Image]]) -> tuple[Image, ...]:
-    """Leads a person through the pictures without contact and the presses of `plan`; takes name and native picture of
-    each press. The pictures without contact are kept first, and returned; the last is the reference.
+    """Guides a person through the pictures without contact and the presses of `plan`; records name and native picture
+    of each press. The pictures without contact are stored first and returned; the last is the reference.
 
-    Raises CannotCalibrate when nothing happens for long or the gel does not become again what it was; BadFrames for a
-    picture without contact that is dark or saturated; what the camera raises.
+    Raises CannotCalibrate if nothing happens within the timeout or the gel does not return to the reference; BadFrames
+    if a picture without contact is dark or saturated; and the errors of the camera.
     """
     untouched: tuple[Image, ...] = ()
-    monitor = _ContactMonitor(camera, plan.patience, session)
+    monitor = _ContactMonitor(camera, plan.timeout, session)
     with session.until_stopped():
-        session.say("Take everything off the gel.")
+        session.report("Take everything off the gel.")
         untouched = monitor.wait_for_rest()
         reference = untouched[-1]
         collection = PressCollection(reference, plan.ball, _marker_eraser(plan, reference))
-        session.keep((REFERENCE, reference))
+        session.store((REFERENCE, reference))
         for number, image in enumerate(untouched[:-1], start=1):
-            session.keep((f"{Path(REFERENCE).stem}_{number}.png", image))
+            session.store((f"{Path(REFERENCE).stem}_{number}.png", image))
         monitor.set_reference(reference)
-        while len(session.taken) < plan.presses:
-            session.progress(len(session.taken))
-            number = len(session.taken) + 1
-            session.say(
+        while len(session.measurements) < plan.presses:
+            session.progress(len(session.measurements))
+            number = len(session.measurements) + 1
+            session.report(
                 f"Press {number} of {plan.presses}: press the ball into the gel, at the {collection.next_place()} of "
                 "the picture, and hold it still."
             )
             image = monitor.wait_for_press()
             try:
                 circle = collection.add_image(image)
-            except BadFrames as why:
-                session.left_out.append(str(why))
-                session.say(f"Not taken: {why}.")
+            except BadFrames as reason:
+                session.left_out.append(str(reason))
+                session.report(f"Not taken: {reason}.")
             else:
-                session.take((f"press_{number:02d}.png", image))
-                session.say(f"Taken: contact at {circle.x:.0f}, {circle.y:.0f} px, radius {circle.radius:.0f} px.")
-            session.say("Lift the ball off the gel.")
+                session.add_measurement((f"press_{number:02d}.png", image))
+                session.report(f"Taken: contact at {circle.x:.0f}, {circle.y:.0f} px, radius {circle.radius:.0f} px.")
+            session.report("Lift the ball off the gel.")
             monitor.wait_for_lift()
-        session.progress(len(session.taken))
+        session.progress(len(session.measurements))
     return untouched
 
 
 def _marker_eraser(plan: BallPressPlan, reference: Image) -> Callable[[Image], Image] | None:
-    """Native picture -> the metric one that presses are judged by, without dots. Raises BadFrames."""
+    """Function from a native picture to the metric picture without dots. Raises BadFrames."""
     if not plan.markers:
         return plan.rectify
     rectify = plan.rectify if plan.rectify is not None else lambda image: image
     try:
         _, radius = find_markers(rectify(reference))
     except NoLattice as nothing:
-        raise BadFrames(f"{nothing}; leave --markers out if none are printed") from None
+        raise BadFrames(f"{nothing}; omit --markers if no dots are printed") from None
     erase = DotEraser(radius)
     return lambda image: erase(rectify(image))
 
 
 class _ContactMonitor:
-    """Waits for what a person does, by the pictures alone. Whatever waits raises Stopped, CannotCalibrate."""
+    """Waits for actions of a person, seen in the pictures. All waits raise Stopped, CannotCalibrate."""
 
-    def __init__(self, camera: FrameSource, patience: float, session: Session[tuple[str, Image]]) -> None:
-        self._frames, self._patience, self._say = session.frames(camera), patience, session.say
-        self._anchor: Float32 | None = None  # the picture that nothing has moved since
-        self._since = 0.0
+    def __init__(self, camera: FrameSource, timeout: float, session: Session[tuple[str, Image]]) -> None:
+        self._frames, self._timeout, self._say = session.frames(camera), timeout, session.report
+        self._anchor: Float32 | None = None  # first picture since the last motion
+        self._still_since = 0.0
         self._reference: Float32 | None = None
 
     def set_reference(self, image: Image) -> None:
-        """Contact is told by the difference from `image`."""
+        """Sets the reference: contact is a difference from `image`."""
         self._reference = _cell_means(image)
 
     def wait_for_rest(self) -> tuple[Image, ...]:
-        """The last pictures, NOISE_FRAMES at most, of a time of REST in which none has moved."""
-        begun = None
+        """The last pictures, at most NOISE_FRAMES, of REFERENCE_REST_TIME without motion."""
+        begin = None
         shown: deque[Image] = deque(maxlen=NOISE_FRAMES)
         while True:
-            frame, still, _ = self._next()
-            begun = frame.time if begun is None else begun
-            if still == 0.0:
+            frame, still_time, _ = self._next_frame()
+            begin = frame.time if begin is None else begin
+            if still_time == 0.0:
                 shown.clear()
             shown.append(frame.image)
-            if still >= REST:
+            if still_time >= REFERENCE_REST_TIME:
                 return tuple(shown)
-            self._give_up(frame.time - begun, "the picture does not come to rest; is something moving before the gel?")
-
-    def wait_for_press(self) -> Image:
-        """A picture of a contact that has not moved for HOLD; the person is told now and then while it moves."""
-        begun = moving = None
-        while True:
-            frame, still, touched = self._next()
-            begun = frame.time if begun is None else begun
-            if touched and still >= HOLD:
-                return frame.image
-            if not touched:
-                moving = None
-                self._give_up(frame.time - begun, "nothing touched the gel (or too lightly to be seen)")
-                continue
-            moving = frame.time if moving is None else moving
-            if frame.time - moving > RESTLESS:
-                self._say("Still moving: hold the ball still.")
-                moving = frame.time
-            self._give_up(frame.time - begun, "the press did not come to rest")
-
-    def wait_for_lift(self) -> None:
-        """Until the gel is as it was without contact."""
-        begun = None
-        while True:
-            frame, still, touched = self._next()
-            begun = frame.time if begun is None else begun
-            if not touched and still >= HOLD:
-                return
-            self._give_up(
-                frame.time - begun,
-                "the gel does not look as it did before the presses. If nothing touches it, the light has changed, or "
-                "something lay on it when the picture without contact was taken: begin again",
+            self._check_timeout(
+                frame.time - begin, "the picture does not come to rest; is something moving in front of the gel?"
             )
 
-    def _next(self) -> tuple[TactileFrame, float, bool]:
-        """The next new frame, how long nothing has moved in it [s], and whether the gel is touched."""
+    def wait_for_press(self) -> Image:
+        """A picture of a contact without motion for PRESS_REST_TIME. Reminds the person while it moves."""
+        begin = moving = None
+        while True:
+            frame, still_time, is_touched = self._next_frame()
+            begin = frame.time if begin is None else begin
+            if is_touched and still_time >= PRESS_REST_TIME:
+                return frame.image
+            if not is_touched:
+                moving = None
+                self._check_timeout(frame.time - begin, "nothing touched the gel (or too lightly to be seen)")
+                continue
+            moving = frame.time if moving is None else moving
+            if frame.time - moving > MAX_MOVING_TIME:
+                self._say("Still moving: hold the ball still.")
+                moving = frame.time
+            self._check_timeout(frame.time - begin, "the press did not come to rest")
+
+    def wait_for_lift(self) -> None:
+        """Waits until the gel looks as it did without contact."""
+        begin = None
+        while True:
+            frame, still_time, is_touched = self._next_frame()
+            begin = frame.time if begin is None else begin
+            if not is_touched and still_time >= PRESS_REST_TIME:
+                return
+            self._check_timeout(
+                frame.time - begin,
+                "the gel does not look as it did before the presses. If nothing touches it, the light has changed, or "
+                "something was on it in the picture without contact: start again",
+            )
+
+    def _next_frame(self) -> tuple[TactileFrame, float, bool]:
+        """The next new frame, the time without motion [s], and whether the gel is touched."""
         frame = next(self._frames)
         cells = _cell_means(frame.image)
-        # against the first of the still ones, not the last: a slow creep is motion too
-        if self._anchor is None or float(np.abs(cells - self._anchor).max()) > MOTION:
-            self._anchor, self._since = cells, frame.time
-        touched = False
+        # compared with the first still picture, not the last: a slow creep is motion too
+        if self._anchor is None or float(np.abs(cells - self._anchor).max()) > MAX_STILL_CHANGE:
+            self._anchor, self._still_since = cells, frame.time
+        is_touched = False
         if self._reference is not None:
             change = cells - self._reference
-            change -= np.median(change, axis=(0, 1))  # a lamp that warms up touches nothing
-            touched = float(np.abs(change).max()) > CONTACT
-        return frame, frame.time - self._since, touched
+            change -= np.median(change, axis=(0, 1))  # so the drift of a lamp is not a contact
+            is_touched = float(np.abs(change).max()) > MIN_CONTACT_CHANGE
+        return frame, frame.time - self._still_since, is_touched
 
-    def _give_up(self, waited: float, why: str) -> None:
-        if waited > self._patience:
-            raise CannotCalibrate(f"given up after {self._patience:g} s: {why}")
+    def _check_timeout(self, waited: float, reason: str) -> None:
+        if waited > self._timeout:
+            raise CannotCalibrate(f"no result within {self._timeout:g} s: {reason}")
 
 
 def _cell_means(image: Image) -> Float32:
     """Means over CELL x CELL pixels, (h, w, 3)."""
     import cv2
 
-    size = (max(1, image.shape[1] // CELL), max(1, image.shape[0] // CELL))
+    size = (max(1, image.shape[1] // CELL_SIZE), max(1, image.shape[0] // CELL_SIZE))
     return np.asarray(cv2.resize(image.astype(np.float32), size, interpolation=cv2.INTER_AREA), dtype=np.float32)

@@ -1,5 +1,5 @@
-"""What the procedures share that lead a person through a calibration: checks of the parts before anything moves,
-motions of an arm, pictures of a camera, and the session that tells, keeps what was taken, and stops."""
+"""Common parts of the procedures that guide a person through a calibration: checks of the rig's parts before any
+motion, motions of an arm, pictures of a camera, and the session with reports, measurements and stop."""
 
 from __future__ import annotations
 
@@ -24,55 +24,55 @@ from tacsim.models.rig import RigConfig
 Measurement = TypeVar("Measurement")
 Part = TypeVar("Part")
 
-POLL = 2e-3  # between two looks at an arm or a camera [s]
-PICTURE_TIMEOUT = 15.0  # longest wait for one [s]
-SETTLE = 0.2  # a picture that counts is exposed so long after the arm came to rest [s]
+POLL_PERIOD = 2e-3  # between two reads of an arm or a camera [s]
+PICTURE_TIMEOUT = 15.0  # for one picture [s]
+SETTLING_TIME = 0.2  # of an arm at rest before the exposure of a picture [s]
 TRAVEL_TIMEOUT = 60.0  # of a motion between two measurements [s]
-AT_TARGET, AT_ROTATION = 20e-6, 2e-4  # as near to a target counts as there [m, rad]
-STANDSTILL = 1e-3  # slower than this is standing still [m/s]
-SHORTENED = 1e-6  # a target that the limits moved by more is not the one of the plan [m, rad]
-GOLDEN_RATIO = 0.618034  # multiples of it, modulo 1, are spread evenly
-GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))  # multiples of it never repeat
+MAX_POSITION_ERROR, MAX_ROTATION_ERROR = 20e-6, 2e-4  # of an arm at its target [m, rad]
+MAX_REST_SPEED = 1e-3  # of an arm at rest [m/s]
+MAX_CLIPPING = 1e-6  # of a target by the limits; with more it is not the one of the plan [m, rad]
+GOLDEN_RATIO = 0.618034  # its multiples modulo 1 are spread evenly
+GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))  # its multiples never repeat
 
 
 class CannotCalibrate(CalibrationError):
-    """These parts cannot be calibrated in this way, or nobody did what was asked for."""
+    """These parts cannot be calibrated in this way, or the person did not do the requested step."""
 
 
 class Stopped(Exception):
-    """Somebody asked for the end."""
+    """The person stopped the procedure."""
 
 
 class OutsideLimits(ValueError):
-    """A pose of the plan lies outside the arm's limits."""
+    """A pose of the plan is outside the arm's limits."""
 
 
 class FrameSource(Protocol):
-    """What is needed of a camera."""
+    """A camera, as the procedures use it."""
 
     def read(self, timeout: float) -> TactileFrame: ...
 
 
 @dataclass(slots=True)
 class Session(Generic[Measurement]):
-    """One procedure under way. A stop, and the end of a recorded source, leave what was taken.
+    """One running procedure. After a stop, or the end of a recorded source, its measurements remain.
 
-    say: is told what the person shall do next, and what became of it, a sentence at a time.
-    progress: is told how many steps of the plan are done.
-    keep: is given each measurement as soon as it is taken.
-    stop: is asked all the time; True ends the procedure.
+    report: called with each instruction and result, one sentence at a time.
+    progress: called with the number of completed steps of the plan.
+    store: called with each measurement, at once.
+    stop: called repeatedly; True ends the procedure.
     """
 
-    say: Callable[[str], None] = lambda words: None
+    report: Callable[[str], None] = lambda words: None
     progress: Callable[[int], None] = lambda done: None
-    keep: Callable[[Measurement], None] = lambda measurement: None
+    store: Callable[[Measurement], None] = lambda measurement: None
     stop: Callable[[], bool] = lambda: False
-    taken: list[Measurement] = field(default_factory=list)
-    left_out: list[str] = field(default_factory=list)  # what was not taken, and why, in order
+    measurements: list[Measurement] = field(default_factory=list)
+    left_out: list[str] = field(default_factory=list)  # reasons of rejected measurements, in order
 
-    def take(self, measurement: Measurement) -> None:
-        self.taken.append(measurement)
-        self.keep(measurement)
+    def add_measurement(self, measurement: Measurement) -> None:
+        self.measurements.append(measurement)
+        self.store(measurement)
 
     def check(self) -> None:
         """Raises Stopped."""
@@ -83,34 +83,34 @@ class Session(Generic[Measurement]):
         return suppress(Stopped, EndOfEpisode)
 
     def frames(self, camera: FrameSource) -> Iterator[TactileFrame]:
-        """New frames, each once. Raises Stopped, and what the camera raises."""
+        """New frames, each once. Raises Stopped and the errors of the camera."""
         index = -1
         while True:
             self.check()
             frame = camera.read(PICTURE_TIMEOUT)
             if frame.index == index:
-                time.sleep(POLL)
+                time.sleep(POLL_PERIOD)
             else:
                 index = frame.index
                 yield frame
 
 
 def hardware_arm(config: RigConfig, arm: str) -> UrArmConfig:
-    """Raises CannotCalibrate where the rig has no such arm."""
-    return _part(config, config.arms, arm, UrArmConfig, "no arm of hardware, real or mock; there are")
+    """The hardware arm of this name. Raises CannotCalibrate if the rig has none."""
+    return _part(config, config.arms, arm, UrArmConfig, "not a hardware arm, real or mock; such arms")
 
 
 def camera_sensor(config: RigConfig, sensor: str) -> CameraSensorConfig:
-    """Raises CannotCalibrate where the rig has no such camera."""
-    return _part(config, config.sensors, sensor, CameraSensorConfig, "no sensor with a camera; cameras")
+    """The camera sensor of this name. Raises CannotCalibrate if the rig has none."""
+    return _part(config, config.sensors, sensor, CameraSensorConfig, "not a sensor with a camera; such sensors")
 
 
 def handheld_camera(config: RigConfig, sensor: str) -> CameraSensorConfig:
-    """A sensor before whose camera a person can hold something. Raises CannotCalibrate."""
+    """A sensor whose camera is real, so that a person can use it. Raises CannotCalibrate."""
     camera = camera_sensor(config, sensor)
     if camera.mock is not None:
         raise CannotCalibrate(
-            f"rig '{config.name}': sensors.{sensor} has a mock camera that a simulation feeds; nobody can press its "
+            f"rig '{config.name}': sensors.{sensor} has a mock camera with simulated pictures; nobody can press its "
             "gel, and its model is known"
         )
     return camera
@@ -124,28 +124,32 @@ def _part(config: RigConfig, parts: Mapping[str, object], name: str, kind: type[
 
 
 def move_to(arm: Arm | URArm, name: str, target: Pose, timeout: float = TRAVEL_TIMEOUT) -> None:
-    """Moves an arm to a pose of its sensor and waits for standstill. Raises OutsideLimits, ActionError for what is out
-    of reach, DeviceError after `timeout` [s] and for what stops an arm."""
+    """Moves an arm to a pose of its sensor and waits for rest. Raises OutsideLimits, ActionError if the pose is out of
+    reach, DeviceError after `timeout` [s] and if the arm stops."""
     if isinstance(arm, CommandedArm):
-        arm.suspend_tactile_guard()  # nothing is observed on the way
+        arm.suspend_tactile_guard()  # no observation during the motion
     deadline = time.monotonic() + timeout
     while True:
         sent = arm.command(target)
-        if sent is not None and max(se3.pose_distance(sent, target)) > SHORTENED:
+        if sent is not None and max(se3.pose_distance(sent, target)) > MAX_CLIPPING:
             arm.stop()
-            raise OutsideLimits("the path leads out of the arm's limits (workspace, planes or keep_out)")
+            raise OutsideLimits("the path leaves the arm's limits (workspace, planes or keep_out)")
         state = arm.state()
         metres, radians = se3.pose_distance(state.pose, target)
-        if metres < AT_TARGET and radians < AT_ROTATION and np.linalg.norm(state.twist[:3]) < STANDSTILL:
+        if (
+            metres < MAX_POSITION_ERROR
+            and radians < MAX_ROTATION_ERROR
+            and np.linalg.norm(state.twist[:3]) < MAX_REST_SPEED
+        ):
             return
         if time.monotonic() > deadline:
-            raise DeviceError(f"arm '{name}' did not come to its target within {timeout:g} s")
-        time.sleep(POLL)
+            raise DeviceError(f"arm '{name}' did not reach its target within {timeout:g} s")
+        time.sleep(POLL_PERIOD)
 
 
 def frame_after(camera: FrameSource, wait: float, timeout: float = PICTURE_TIMEOUT) -> TactileFrame:
     """The first frame exposed at least `wait` [s] from now; each read may take `timeout` [s]."""
     since = time.monotonic() + wait
     while (frame := camera.read(timeout)).time < since:
-        time.sleep(POLL)
+        time.sleep(POLL_PERIOD)
     return frame

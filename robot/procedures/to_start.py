@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from robot.arm.channel import CommandKind
-from robot.arm.controller.rtde import Reading, read_controller
+from robot.arm.controller.rtde import ControllerReading, read_controller
 from robot.arm.start_servo import sensor_path, way_rates
 from robot.arm.status import ArmStatus
 from robot.arm.ur import URArm
@@ -72,7 +72,7 @@ class Way:
         )
 
 
-def find_way(name: str, config: UrArmConfig, reading: Reading, start: Pose) -> Way:
+def find_way(name: str, config: UrArmConfig, reading: ControllerReading, start: Pose) -> Way:
     """The straight way in joint space to the nearest posture that has the sensor at `start`.
 
     Raises NoWay: out of reach, or the sensor would go farther behind a wall (limits.planes) than it is at both ends; in
@@ -133,7 +133,7 @@ class StartArm(URArm):
     may stand outside its workspace, and be opened while it feels more than its limits; then it can be zeroed, and does
     not move before `recover`."""
 
-    _bearable = (ArmStatus.FORCE_LIMIT,)
+    _accepted_faults = (ArmStatus.FORCE_LIMIT,)
 
     def __init__(
         self,
@@ -145,7 +145,7 @@ class StartArm(URArm):
         keep_out: Mapping[str, float] | None = None,
     ) -> None:
         self._begin, self._end = np.array(begin, dtype=np.float64), np.array(end, dtype=np.float64)
-        self._way = self._begin, self._end
+        self._start_path = self._begin, self._end
         super().__init__(config, name, keep_out=keep_out)
 
     def command(self, target: Pose | None, speed: float | None = None) -> Pose | None:
@@ -160,8 +160,8 @@ class StartArm(URArm):
         Raises the error of its status when it cannot.
         """
         with self._lock:
-            self._require_able()
-            self._send(CommandKind.GO_ON, share=share)
+            self._require_ready()
+            self._send_command(CommandKind.CONTINUE_TO_START, fraction=share)
 
     def gone(self) -> float:
         """The share of the path that lies behind the arm."""
@@ -301,8 +301,8 @@ def _move(arm: StartArm, share: float, seconds: float, guide: Guide) -> None:
                 farthest, deadline = gone, now + PATIENCE
             if now > deadline:
                 raise DeviceError(
-                    f"arm '{arm.name}' does not get on, {100 * gone:.0f} % of its way gone; it {arm.explain()}. Is its "
-                    "speed slider low, or the other arm near?"
+                    f"arm '{arm.name}' does not get on, {100 * gone:.0f} % of its way gone; it "
+                    f"{arm.explain()}. Is its speed slider low, or the other arm near?"
                 )
             progress.add(now, gone)
             left = progress.seconds_left(share)

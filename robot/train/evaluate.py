@@ -1,6 +1,6 @@
-"""How good policies are: the same unseen episodes for each, and intervals for what that tells of all others.
+"""Evaluates policies: each in the same held-out episodes, with confidence intervals.
 
-Needs no torch. A policy file is judged as it would run on a rig: by its own encoder, from observations.
+Needs no torch. A policy file is evaluated as it runs on a rig: with its own encoder, from observations.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robot.deploy.policy import (
+    describe_outside,
     has_training_range,
     load_policy,
-    outside_in_words,
     require_fit,
     training_notes,
 )
@@ -28,68 +28,68 @@ from tacsim.models.scene import Scene
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.models.training import Training
 
-TEACHER, RANDOM = "teacher", "random"  # beside what load_policy knows
-UNSEEN = 1_000_000  # added to the seeds of training: other bodies, other episodes
-RESAMPLED = 10_000
-Tell = Callable[[str, int, int], None]
+TEACHER, RANDOM = "teacher", "random"  # besides the policies of load_policy
+HELD_OUT_SEED_OFFSET = 1_000_000  # added to the training seeds: other bodies, other episodes
+BOOTSTRAP_SAMPLES = 10_000
+ReportProgress = Callable[[str, int, int], None]
 Act = Callable[[TacsimEnv], NDArray[np.float32]]
 
 
 @dataclass(frozen=True, slots=True)
 class Interval:
-    """An estimate, and where the truth lies in 95 of 100 cases."""
+    """An estimate with its 95 % confidence interval."""
 
     value: float
     low: float
     high: float
 
 
-class Ended(NamedTuple):
-    """One episode."""
+class EpisodeResult(NamedTuple):
+    """Result of one episode."""
 
     distance: float  # of the body from the goal [m]
     success: bool
-    peak_force: float  # the greatest normal force [N]
-    improvement: float  # share of the distance at the start
-    outside: bool | None = None  # a learned policy observed what it did not observe in training; None: unknown
+    peak_force: float  # maximum normal force [N]
+    improvement: float  # fraction of the distance at the start
+    outside: bool | None = None  # a learned policy left its training range; None: unknown
 
 
 @dataclass(frozen=True, slots=True)
-class Judged:
-    """How the episodes of one policy ended."""
+class EvaluationResult:
+    """Results of the episodes of one policy."""
 
     policy: str
-    episodes: tuple[Ended, ...]
+    episodes: tuple[EpisodeResult, ...]
 
     @property
     def success(self) -> Interval:
-        """Share, by Wilson's interval."""
-        return wilson(sum(each.success for each in self.episodes), len(self.episodes))
+        """Success rate, with Wilson's interval."""
+        return wilson_interval(sum(each.success for each in self.episodes), len(self.episodes))
 
     @property
     def distance(self) -> Interval:
-        """Mean [m], by bootstrap."""
-        return bootstrap(np.array([each.distance for each in self.episodes]))
+        """Mean distance [m], with a bootstrap interval."""
+        return bootstrap_interval(np.array([each.distance for each in self.episodes]))
 
     @property
     def improvement(self) -> Interval:
-        """Mean, by bootstrap."""
-        return bootstrap(np.array([each.improvement for each in self.episodes]))
+        """Mean improvement, with a bootstrap interval."""
+        return bootstrap_interval(np.array([each.improvement for each in self.episodes]))
 
     @property
     def outside(self) -> float | None:
-        """Share of the episodes in which a learned policy left the range of its training; None where it is unknown."""
+        """Fraction of episodes in which a learned policy left its training range; None: unknown."""
         known = [each.outside for each in self.episodes if each.outside is not None]
         return sum(known) / len(known) if known else None
 
     @property
     def peak_force(self) -> tuple[float, float]:
-        """Mean, and what one episode in twenty exceeds [N]."""
+        """Mean and 95th percentile of the peak force [N]."""
         forces = [each.peak_force for each in self.episodes]
         return float(np.mean(forces)), float(np.quantile(forces, 0.95))
 
 
-Say = Callable[[Judged], None]
+ReportResult = Callable[[EvaluationResult], None]
 Warn = Callable[[str], None]
 
 
@@ -98,53 +98,65 @@ def evaluate(
     policies: Sequence[str],
     episodes: int = 200,
     seed: int = 0,
-    tell: Tell = lambda words, done, of: None,
-    say: Say = lambda so_far: None,
+    report_progress: ReportProgress = lambda words, done, of: None,
+    report_result: ReportResult = lambda so_far: None,
     warn: Warn = lambda words: None,
-) -> list[Judged]:
-    """Each policy in the same episodes, of bodies and goals drawn as in training but with other seeds.
+) -> list[EvaluationResult]:
+    """Evaluates each policy in the same episodes, with bodies and goals drawn as in training but by other seeds.
 
-    policies: "teacher" (acts by the truth), "random", and what `load_policy` knows: "scripted", "FILE.onnx" ...
-    say: is told how the episodes so far ended, each time that all environments have played one.
-    warn: is told, once for each learned policy, which scenes are outside its training, or that its range is unknown.
-    Raises PolicyNotFound, IncompatibleRig, and as `make_vector_env`.
+    policies: "teacher" (acts by the truth), "random", and names of `load_policy`: "scripted", "FILE.onnx" ...
+    report_result: called with the results so far, each time that all environments have played an episode.
+    warn: called once for each learned policy with scenes outside its training, or with an unknown range.
+    Raises PolicyNotFound, IncompatibleRig, and the errors of `make_vector_env`.
     """
     config = load_with_task(training.rig, training.task, training.overrides).config
     drawn = training.randomise
     if drawn is not None:
-        drawn = drawn.model_copy(update={"draws": episodes, "seed": UNSEEN + seed})
+        drawn = drawn.model_copy(update={"draws": episodes, "seed": HELD_OUT_SEED_OFFSET + seed})
     number = min(training.environments, episodes)
-    sight = Features(maps=(), touch=("moved",), arms=tuple(config.arms)[:1], goal=False)  # nobody looks at it
+    features = Features(maps=(), touch=("moved",), arms=tuple(config.arms)[:1], goal=False)  # not used by the policies
     envs = make_vector_env(
-        number, training.task, training.rig, training.overrides, randomise=drawn, features=sight, learning=False
+        number, training.task, training.rig, training.overrides, randomise=drawn, features=features, learning=False
     )
     try:
         for name in policies:
-            policy = _fitting(name, envs.members[0], config.canonical)
+            policy = _load_fitting_policy(name, envs.members[0], config.canonical)
             for words in training_notes(policy, name, _scenes(envs.members[0])):
                 warn(words)
-        return [_judge(envs, name, episodes, seed, config.canonical, tell, say) for name in policies]
+        return [
+            _evaluate_policy(envs, name, episodes, seed, config.canonical, report_progress, report_result)
+            for name in policies
+        ]
     finally:
         envs.close()
 
 
-def _judge(
-    envs: TacsimVectorEnv, name: str, episodes: int, seed: int, canonical: CanonicalGrid, tell: Tell, say: Say
-) -> Judged:
-    rows: list[Ended] = []
+def _evaluate_policy(
+    envs: TacsimVectorEnv,
+    name: str,
+    episodes: int,
+    seed: int,
+    canonical: CanonicalGrid,
+    report_progress: ReportProgress,
+    report_result: ReportResult,
+) -> EvaluationResult:
+    rows: list[EpisodeResult] = []
     members = envs.members
     count = len(members)
     for first in range(0, episodes, count):
-        seeds = [UNSEEN + seed + first + i for i in range(count)]
-        for at, env in enumerate(members):  # each draw once: episodes that are alike tell nothing of others
+        seeds = [HELD_OUT_SEED_OFFSET + seed + first + i for i in range(count)]
+        for at, env in enumerate(members):  # each draw once: equal episodes add no information
             env.next_variant = (first + at) % len(env.variants) if env.variants else None
         _, info = envs.reset(seed=list(seeds))
         start = info["distance"]
-        fitting = [_fitting(name, env, canonical) for env in members]
-        actors = [_actor(name, env, policy, each) for env, policy, each in zip(members, fitting, seeds, strict=True)]
-        ends: dict[int, Ended] = {}
+        loaded_policies = [_load_fitting_policy(name, env, canonical) for env in members]
+        actors = [
+            _make_actor(name, env, policy, each)
+            for env, policy, each in zip(members, loaded_policies, seeds, strict=True)
+        ]
+        ends: dict[int, EpisodeResult] = {}
         while len(ends) < count:
-            tell(name, len(rows) + len(ends), episodes)
+            report_progress(name, len(rows) + len(ends), episodes)
             idle = np.zeros(len(members[0].task.axes), np.float32)
             actions = [
                 idle if i in ends else act(env) for i, (act, env) in enumerate(zip(actors, members, strict=True))
@@ -152,36 +164,36 @@ def _judge(
             _, _, terminated, truncated, info = envs.step(np.stack(actions))
             for i in np.flatnonzero(terminated | truncated).tolist():
                 if i not in ends:
-                    ends[i] = Ended(
+                    ends[i] = EpisodeResult(
                         float(info["distance"][i]),
                         bool(info["is_success"][i]),
                         float(info["peak_force"][i]),
                         max(0.0, 1.0 - float(info["distance"][i]) / float(start[i])),
-                        bool(outside_in_words(fitting[i])) if has_training_range(fitting[i]) else None,
+                        bool(describe_outside(loaded_policies[i])) if has_training_range(loaded_policies[i]) else None,
                     )
         rows += [ends[i] for i in range(count)]
-        say(Judged(name, tuple(rows[:episodes])))
-    return Judged(name, tuple(rows[:episodes]))
+        report_result(EvaluationResult(name, tuple(rows[:episodes])))
+    return EvaluationResult(name, tuple(rows[:episodes]))
 
 
 def _scenes(env: TacsimEnv) -> list[Scene]:
-    """All that its episodes may play."""
+    """All scenes of its episodes."""
     return [variant.scene for variant in env.variants] or ([] if env.scene is None else [env.scene])
 
 
-def _actor(name: str, env: TacsimEnv, policy: Policy | None, seed: int) -> Act:
-    """The policy at the start of an episode."""
+def _make_actor(name: str, env: TacsimEnv, policy: Policy | None, seed: int) -> Act:
+    """The policy as a function of the environment, reset for an episode."""
     if name == TEACHER:
         return lambda env: env.expert()
     if name == RANDOM:
-        random = np.random.default_rng([UNSEEN, seed])
+        random = np.random.default_rng([HELD_OUT_SEED_OFFSET, seed])
         return lambda env: random.uniform(-1.0, 1.0, len(env.task.axes)).astype(np.float32)
     assert policy is not None
     policy.reset()
     return lambda env: env.policy_action(policy)
 
 
-def _fitting(name: str, env: TacsimEnv, canonical: CanonicalGrid) -> Policy | None:
+def _load_fitting_policy(name: str, env: TacsimEnv, canonical: CanonicalGrid) -> Policy | None:
     if name in (TEACHER, RANDOM):
         return None
     policy = load_policy(name, env.task, env.rig.spec, canonical)
@@ -189,16 +201,16 @@ def _fitting(name: str, env: TacsimEnv, canonical: CanonicalGrid) -> Policy | No
     return policy
 
 
-def wilson(count: int, total: int) -> Interval:
-    """A share, by Wilson's interval."""
+def wilson_interval(count: int, total: int) -> Interval:
+    """Rate `count` / `total` with Wilson's 95 % interval."""
     from scipy import stats
 
     low, high = stats.binomtest(count, total).proportion_ci(method="wilson")
     return Interval(count / total, float(low), float(high))
 
 
-def bootstrap(values: NDArray[np.float64]) -> Interval:
-    """The mean of (n,) values."""
-    chosen = np.random.default_rng(0).integers(len(values), size=(RESAMPLED, len(values)))
+def bootstrap_interval(values: NDArray[np.float64]) -> Interval:
+    """Mean of values (n,) with a 95 % bootstrap interval."""
+    chosen = np.random.default_rng(0).integers(len(values), size=(BOOTSTRAP_SAMPLES, len(values)))
     low, high = np.quantile(values[chosen].mean(axis=1), [0.025, 0.975])
     return Interval(float(values.mean()), float(low), float(high))

@@ -1,4 +1,4 @@
-"""What a policy observes in the episodes of its training, written into its file. Needs no torch."""
+"""Measures the range of observations of a policy in its training episodes and writes it to its file. Needs no torch."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from robot.common.whole_file import write_whole
 from robot.deploy.onnx_policy import OnnxPolicy
 from robot.deploy.policy import require_fit
-from robot.deploy.training_range import measured, numbers_of
+from robot.deploy.training_range import extract_numbers, fit_training_range
 from robot.open import load_with_task, make_vector_env
 from tacsim.gym.vector import TacsimVectorEnv
 from tacsim.interface import FloatArray
@@ -21,20 +21,20 @@ from tacsim.models.sensor import CanonicalGrid
 from tacsim.models.training import Training
 from tacsim.tasks import make_task
 
-EPISODES_EACH = 4  # that each environment of a training plays, where nobody says how many
-Tell = Callable[[str, int, int], None]
+EPISODES_EACH = 4  # default number of episodes of each environment
+ReportProgress = Callable[[str, int, int], None]
 
 
 def measure_range(
     path: Path,
     training: Training | None = None,
     episodes: int | None = None,
-    tell: Tell = lambda words, done, of: None,
+    report_progress: ReportProgress = lambda words, done, of: None,
 ) -> TrainingRange:
-    """The range of the policy in `path`, as it acts itself in episodes drawn as in `training` (None: as the file says
-    that it was trained); their number is rounded up to whole rounds of all environments.
+    """Measures the range of the policy in `path` while it acts in episodes drawn as in `training` (None: the training
+    in the file's metadata). The number of episodes is rounded up to full rounds of all environments.
 
-    Raises PolicyNotFound, IncompatibleRig, ValueError for a file that does not say how it was trained, and as
+    Raises PolicyNotFound, IncompatibleRig, ValueError if the file does not contain its training, and the errors of
     `make_vector_env`.
     """
     if training is None:
@@ -49,23 +49,23 @@ def measure_range(
         training.overrides,
         randomise=training.randomise,
         features=policies[0].spec.features,
-        learning=False,  # a training file says its preset and its motion
+        learning=False,  # preset and motion are in the training file
     )
     rounds = -(-max(2, episodes or EPISODES_EACH * envs.num_envs) // envs.num_envs)
-    seen: list[FloatArray] = []
+    features: list[FloatArray] = []
     try:
         first = envs.members[0]
         require_fit(first.rig.name, first.rig.spec, policies[0], path.name, first.task)
         for number in range(rounds):
             words = f"observing: round {number + 1} of {rounds}"
-            seen += _round(envs, path, config.canonical, number, partial(tell, words))
-        return measured(seen, _scenes(training, envs))
+            features += _play_round(envs, path, config.canonical, number, partial(report_progress, words))
+        return fit_training_range(features, _scenes(training, envs))
     finally:
         envs.close()
 
 
 def write_range(path: Path, out: Path, found: TrainingRange) -> None:
-    """Writes the policy in `path` to `out` with this range in its metadata."""
+    """Writes the policy in `path` to `out`, with the range `found` in its metadata."""
     import onnx
 
     model = onnx.load(str(path))
@@ -76,14 +76,14 @@ def write_range(path: Path, out: Path, found: TrainingRange) -> None:
 
 
 def _training_of(path: Path) -> Training:
-    told = OnnxPolicy.spec_of(path).trained.get("training")
-    if told is None:
-        raise ValueError(f"policy '{path}' does not say how it was trained: name its training file (--training)")
-    return Training.model_validate(told)
+    training_data = OnnxPolicy.spec_of(path).trained.get("training")
+    if training_data is None:
+        raise ValueError(f"policy '{path}' has no training in its metadata: give its training file (--training)")
+    return Training.model_validate(training_data)
 
 
 def _scenes(training: Training, envs: TacsimVectorEnv) -> list[Scene]:
-    """Those that were drawn, and those at the ends of what can be drawn."""
+    """The drawn scenes and those at the limits of the random draws."""
     drawn = [variant.scene for variant in envs.members[0].variants]
     ends = [] if training.randomise is None else training.randomise.limits()
     for words in [*ends, *([] if drawn else [[]])]:
@@ -93,28 +93,34 @@ def _scenes(training: Training, envs: TacsimVectorEnv) -> list[Scene]:
     return drawn
 
 
-def _round(
-    envs: TacsimVectorEnv, path: Path, canonical: CanonicalGrid, number: int, tell: Callable[[int, int], None]
+def _play_round(
+    envs: TacsimVectorEnv,
+    path: Path,
+    canonical: CanonicalGrid,
+    number: int,
+    report_progress: Callable[[int, int], None],
 ) -> list[FloatArray]:
-    """(steps, n) numbers of one episode of each environment; each draws another body."""
+    """Numbers (steps, n) of one episode of each environment; each draws another body."""
     members, count = envs.members, envs.num_envs
     for at, env in enumerate(members):
         env.next_variant = (number * count + at) % len(env.variants) if env.variants else None
-    seen, _ = envs.reset(seed=[number * count + at for at in range(count)])
+    features, _ = envs.reset(seed=[number * count + at for at in range(count)])
     policies = [OnnxPolicy(path, canonical, env.task.goal) for env in members]
     found: list[list[FloatArray]] = [[] for _ in members]
     over = np.zeros(count, np.bool_)
     idle = np.zeros(envs.single_action_space.shape or (), np.float32)
     steps = members[0].task.config.steps
     while not over.all():
-        tell(len(found[int(np.argmin(over))]), steps)
+        report_progress(len(found[int(np.argmin(over))]), steps)
         actions = []
         for at, (env, policy) in enumerate(zip(members, policies, strict=True)):
             if over[at]:
                 actions.append(idle)
                 continue
-            found[at].append(numbers_of({key: value[at] for key, value in seen.items()}, policy.spec.features.frames))
+            found[at].append(
+                extract_numbers({key: value[at] for key, value in features.items()}, policy.spec.features.frames)
+            )
             actions.append(env.policy_action(policy))
-        seen, _, terminated, truncated, _ = envs.step(np.stack(actions))
+        features, _, terminated, truncated, _ = envs.step(np.stack(actions))
         over |= terminated | truncated
     return [np.array(each) for each in found]

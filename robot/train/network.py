@@ -16,21 +16,22 @@ from torch import Tensor, nn
 from robot.common.whole_file import write_whole
 from tacsim.models.policy import METADATA_KEY, PolicySpec
 
-CLIP = 5.0  # deviations from the mean
+MAX_DEVIATIONS = 5.0  # from the mean; larger ones are clipped
 PICTURES = ("maps", "flow")  # channels first; the other features are plain numbers
-OF_PICTURES = 64  # numbers that a picture is brought to
+PICTURE_FEATURES = 64  # numbers per picture after its layers
 
 Shapes = Mapping[str, tuple[int, ...]]
 OPSET = 17
-MOST_BYTES = 2 * 2**20
-PARITY = 1e-5  # between torch and ONNX
+MAX_BYTES = 2 * 2**20
+MAX_ACTION_DIFFERENCE = 1e-5  # between torch and ONNX [-] [-]
 EXAMPLES = 64
 
 
 class FeatureLayers(nn.Module):
-    """Features (each with a leading batch axis, in the order of `keys`) -> (batch, `size`).
+    """Maps features (each with a leading batch axis, in the order of `keys`) to (batch, `size`).
 
-    Normalisation is inside: each channel of maps and each number less its mean, over its deviation, cut at CLIP.
+    It includes the normalisation: each channel and each number minus its mean, divided by its standard deviation,
+    clipped at MAX_DEVIATIONS.
 
     Args:
         shapes: of the features without the batch axis, by name.
@@ -45,7 +46,7 @@ class FeatureLayers(nn.Module):
             channels = shapes[key][0]
             self.register_buffer(f"mean_{key}", torch.zeros(channels))
             self.register_buffer(f"deviation_{key}", torch.ones(channels))
-            self.size += OF_PICTURES if key in PICTURES else channels
+            self.size += PICTURE_FEATURES if key in PICTURES else channels
 
     def forward(self, *features: Tensor) -> Tensor:
         parts = []
@@ -53,31 +54,31 @@ class FeatureLayers(nn.Module):
             mean, deviation = getattr(self, f"mean_{key}"), getattr(self, f"deviation_{key}")
             if key in PICTURES:
                 mean, deviation = mean[:, None, None], deviation[:, None, None]
-            normal = torch.clamp((value - mean) / deviation, -CLIP, CLIP)
+            normal = torch.clamp((value - mean) / deviation, -MAX_DEVIATIONS, MAX_DEVIATIONS)
             parts.append(self.pictures[key](normal) if key in PICTURES else normal)
         return torch.cat(parts, dim=1)
 
-    def normalise_by(self, seen: Mapping[str, Tensor]) -> None:
-        """Takes mean and deviation from examples (batch, ...); what hardly varies is left at its own size."""
+    def normalise_by(self, examples: Mapping[str, Tensor]) -> None:
+        """Sets mean and deviation from `examples` (batch, ...); deviations below 1e-3 are replaced by 1."""
         for key in self.keys:
             axes = (0, 2, 3) if key in PICTURES else (0,)
-            getattr(self, f"mean_{key}").copy_(seen[key].mean(dim=axes))
-            deviation = seen[key].std(dim=axes, unbiased=False)
+            getattr(self, f"mean_{key}").copy_(examples[key].mean(dim=axes))
+            deviation = examples[key].std(dim=axes, unbiased=False)
             getattr(self, f"deviation_{key}").copy_(
                 torch.where(deviation > 1e-3, deviation, torch.ones_like(deviation))
             )
 
 
 class PolicyNetwork(nn.Module):
-    """Features, in the order of `keys` -> actions (batch, n) within [-1, 1].
+    """Maps features, in the order of `keys`, to actions (batch, n) within [-1, 1].
 
     Args:
-        cut: what is beyond is cut, as PPO does; otherwise a hyperbolic tangent brings everything within.
+        clip: clip to the range, as PPO does; otherwise a hyperbolic tangent maps to it.
     """
 
-    def __init__(self, shapes: Shapes, actions: int, width: int, *, cut: bool = False) -> None:
+    def __init__(self, shapes: Shapes, actions: int, width: int, *, clip: bool = False) -> None:
         super().__init__()
-        self._cut = cut
+        self._clip = clip
         self.layers = FeatureLayers(shapes)
         self.keys = self.layers.keys
         self.head = nn.Sequential(
@@ -86,7 +87,7 @@ class PolicyNetwork(nn.Module):
 
     def forward(self, *features: Tensor) -> Tensor:
         raw: Tensor = self.head(self.layers(*features))
-        return torch.clamp(raw, -1.0, 1.0) if self._cut else torch.tanh(raw)
+        return torch.clamp(raw, -1.0, 1.0) if self._clip else torch.tanh(raw)
 
 
 def _picture_layers(shape: tuple[int, ...]) -> nn.Sequential:
@@ -99,24 +100,22 @@ def _picture_layers(shape: tuple[int, ...]) -> nn.Sequential:
     )  # fmt: skip
     with torch.no_grad():
         size = layers(torch.zeros(1, channels, rows, columns)).shape[1]
-    return nn.Sequential(layers, nn.Linear(size, OF_PICTURES), nn.ReLU())
+    return nn.Sequential(layers, nn.Linear(size, PICTURE_FEATURES), nn.ReLU())
 
 
 class ExportError(RuntimeError):
-    """The file would not do what the network does."""
+    """The file would be too large, or its actions would differ from the network's."""
 
 
 def export(network: PolicyNetwork, spec: PolicySpec, shapes: Shapes, path: Path) -> float:
-    """Writes the file, and returns the greatest difference of its actions from the network's, for random features.
-    Raises ExportError when that is more than PARITY, or the file has more than MOST_BYTES."""
+    """Writes the file and returns the maximum difference of its actions from the network's for random features. Raises
+    ExportError if that exceeds MAX_ACTION_DIFFERENCE or the file exceeds MAX_BYTES."""
     network.eval()
     random = torch.Generator().manual_seed(0)
     examples = [torch.randn((EXAMPLES, *shapes[key]), generator=random) for key in network.keys]
     buffer = io.BytesIO()
     with warnings.catch_warnings():
-        warnings.simplefilter(
-            "ignore", DeprecationWarning
-        )  # of torch's older exporter, whose graphs need no extra package
+        warnings.simplefilter("ignore", DeprecationWarning)  # of torch's older exporter, which needs no extra package
         torch.onnx.export(
             network,
             tuple(example[:1] for example in examples),
@@ -129,22 +128,24 @@ def export(network: PolicyNetwork, spec: PolicySpec, shapes: Shapes, path: Path)
     model = onnx.load_model_from_string(buffer.getvalue())
     onnx.helper.set_model_props(model, {METADATA_KEY: spec.model_dump_json()})
     data = model.SerializeToString()
-    if len(data) > MOST_BYTES:
-        raise ExportError(f"the policy has {len(data) / 2**20:.1f} MiB, at most {MOST_BYTES >> 20} are written")
-    worst = _difference(network, data, examples)
-    if not worst <= PARITY:
-        raise ExportError(f"the file's actions differ by {worst:.2g} from the network's, allowed: {PARITY:g}")
+    if len(data) > MAX_BYTES:
+        raise ExportError(f"the policy has {len(data) / 2**20:.1f} MiB, the maximum is {MAX_BYTES >> 20} MiB")
+    max_difference = _max_action_difference(network, data, examples)
+    if not max_difference <= MAX_ACTION_DIFFERENCE:
+        raise ExportError(
+            f"the file's actions differ by {max_difference:.2g} from the network's, allowed: {MAX_ACTION_DIFFERENCE:g}"
+        )
     write_whole(path, data)
-    return worst
+    return max_difference
 
 
-def _difference(network: PolicyNetwork, data: bytes, examples: list[torch.Tensor]) -> float:
+def _max_action_difference(network: PolicyNetwork, data: bytes, examples: list[torch.Tensor]) -> float:
     session = onnxruntime.InferenceSession(data, providers=["CPUExecutionProvider"])
-    worst = 0.0
+    max_difference = 0.0
     for index in range(EXAMPLES):
         one = [example[index : index + 1] for example in examples]
         with torch.no_grad():
-            wanted = network(*one).numpy()
-        (found,) = session.run(["action"], {key: value.numpy() for key, value in zip(network.keys, one, strict=True)})
-        worst = max(worst, float(np.abs(found - wanted).max()))
-    return worst
+            expected = network(*one).numpy()
+        (actual,) = session.run(["action"], {key: value.numpy() for key, value in zip(network.keys, one, strict=True)})
+        max_difference = max(max_difference, float(np.abs(actual - expected).max()))
+    return max_difference

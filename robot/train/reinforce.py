@@ -1,4 +1,4 @@
-"""PPO and SAC of stable-baselines3, in rounds that each begin with new episodes; so a run that was killed can go on."""
+"""PPO and SAC of stable-baselines3, in rounds that begin with new episodes, so a killed run can continue."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from robot.common.whole_file import write_whole
 from robot.train.network import FeatureLayers, PolicyNetwork
-from robot.train.run_folder import Tell
+from robot.train.run_folder import ReportProgress
 from tacsim.gym.vector import TacsimVectorEnv
 from tacsim.models.training import Training
 
-WARM_UP = 1000  # control steps of random actions before SAC learns
-KEPT = 50_000  # control steps that SAC remembers
+RANDOM_STEPS = 1000  # control steps with random actions before SAC learns
+MEMORY_STEPS = 50_000  # control steps in the replay buffer of SAC
 Arrays = dict[str, NDArray[Any]]
 
 
 class Reinforce:
-    """PPO or SAC in `envs`; `actor` is what of it becomes a policy file. What SAC remembers is kept in `folder`."""
+    """PPO or SAC in `envs`. `actor` is exported as the policy file. SAC stores its replay buffer in `folder`."""
 
     def __init__(self, envs: TacsimVectorEnv, training: Training, actor: PolicyNetwork, folder: Path) -> None:
         settings = training.reinforce
@@ -43,7 +43,7 @@ class Reinforce:
         }
         common: dict[str, Any] = {
             "learning_rate": settings.rate,
-            "batch_size": _batch(self._steps * envs.num_envs, settings.batch),
+            "batch_size": _batch_size(self._steps * envs.num_envs, settings.batch),
             "policy_kwargs": shape,
             "device": "cpu",
             "seed": training.seed,
@@ -52,19 +52,19 @@ class Reinforce:
             self._model: Any = PPO("MultiInputPolicy", self._envs, n_steps=self._steps, **common)
         else:
             self._model = SAC(
-                "MultiInputPolicy", self._envs, learning_starts=WARM_UP, buffer_size=KEPT, train_freq=1,
+                "MultiInputPolicy", self._envs, learning_starts=RANDOM_STEPS, buffer_size=MEMORY_STEPS, train_freq=1,
                 gradient_steps=envs.num_envs // 2 or 1, **common,
             )  # fmt: skip
 
-    def round(self, number: int, tell: Tell) -> dict[str, float]:
-        """Episodes from their start, and what is learned of them."""
+    def round(self, number: int, report_progress: ReportProgress) -> dict[str, float]:
+        """Plays episodes from their start and learns from them."""
         random = np.random.default_rng([self._seed, number])
         model, total = self._model, self._steps * self._envs.num_envs
-        model.set_random_seed(int(random.integers(2**31)))  # NumPy, torch, and the environments' next reset
-        model._last_obs = None  # episodes begin anew
-        watch = _Watch(lambda done: tell(f"round {number + 1} of {self.rounds}", done, total))
+        model.set_random_seed(int(random.integers(2**31)))  # of NumPy, torch, and the next reset of the environments
+        model._last_obs = None  # so episodes start again
+        watch = _EpisodeWatch(lambda done: report_progress(f"round {number + 1} of {self.rounds}", done, total))
         model.learn(total, callback=watch, reset_num_timesteps=False)
-        self._take_actor()
+        self._copy_actor()
         if isinstance(model, SAC):
             write_whole(self._folder / f"memory-{number % 2}.npz", self._write_memory)
         rewards, distances, successes, forces = np.array(watch.ends).T
@@ -82,7 +82,7 @@ class Reinforce:
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """After round n - 1, whose memory lies in the file of that round."""
+        """Restores the state after round n - 1, whose replay buffer is in the file of that round."""
         model, total = self._model, self._steps * self._envs.num_envs
         model.set_parameters(state["model"], device="cpu")
         model.num_timesteps, model._n_updates = int(state["timesteps"]), int(state["updates"])
@@ -90,7 +90,7 @@ class Reinforce:
         if isinstance(model, SAC):
             self._read_memory(self._folder / f"memory-{(model.num_timesteps // total - 1) % 2}.npz")
 
-    def _take_actor(self) -> None:
+    def _copy_actor(self) -> None:
         policy = self._model.policy
         extractor: Any = policy.features_extractor if isinstance(self._model, PPO) else policy.actor.features_extractor
         self.actor.layers.load_state_dict(extractor.layers.state_dict())
@@ -104,7 +104,7 @@ class Reinforce:
     def _write_memory(self, file: Any) -> None:
         memory = self._model.replay_buffer
         count = len(memory.actions) if memory.full else memory.pos
-        arrays: dict[str, NDArray[Any]] = {key: getattr(memory, key)[:count] for key in _OF_MEMORY}
+        arrays: dict[str, NDArray[Any]] = {key: getattr(memory, key)[:count] for key in _MEMORY_ARRAYS}
         for what in ("observations", "next_observations"):
             arrays |= {f"{what}/{key}": value[:count] for key, value in getattr(memory, what).items()}
         np.savez(file, allow_pickle=False, at=np.array([memory.pos, memory.full]), **arrays)
@@ -119,21 +119,21 @@ class Reinforce:
                     (getattr(memory, what)[name] if name else getattr(memory, what))[: len(file[key])] = file[key]
 
 
-def _batch(total: int, most: int) -> int:
-    """The greatest size of equal batches, at least 2: PPO divides by the deviation within each."""
-    return next((size for size in range(min(total, most), 1, -1) if total % size == 0), total)
+def _batch_size(total: int, max_size: int) -> int:
+    """Maximum size of equal batches, at least 2: PPO divides by the deviation within each."""
+    return next((size for size in range(min(total, max_size), 1, -1) if total % size == 0), total)
 
 
-_OF_MEMORY = ("actions", "rewards", "dones", "timeouts")
+_MEMORY_ARRAYS = ("actions", "rewards", "dones", "timeouts")
 
 
-class _Watch(BaseCallback):
-    """Notes how episodes end: sum of rewards, distance [m], success, peak force [N]."""
+class _EpisodeWatch(BaseCallback):
+    """Collects the end of each episode: sum of rewards, distance [m], success, peak force [N]."""
 
-    def __init__(self, tell: Any) -> None:
+    def __init__(self, report_progress: Any) -> None:
         super().__init__()
         self.ends: list[tuple[float, float, float, float]] = []
-        self._tell, self._done = tell, 0
+        self._tell, self._done = report_progress, 0
 
     def _on_step(self) -> bool:
         rewards = self.locals["rewards"]
@@ -148,14 +148,14 @@ class _Watch(BaseCallback):
 
 
 class SharedVecEnv(VecEnv):
-    """Environments that share launches, as stable-baselines3 calls them.
+    """Environments that share kernel launches, as a VecEnv of stable-baselines3.
 
     envs = SharedVecEnv(robot.make_vector_env(16, "squeeze", features={}, autoreset_mode="SameStep",
                                               randomise="squeeze"))
     PPO("MultiInputPolicy", envs, policy_kwargs={"features_extractor_class": FeaturesExtractor}).learn(10_000)
 
-    infos have `terminal_observation`, `TimeLimit.truncated` and `is_success` where an episode ends, and what
-    `TacsimEnv.step` tells besides. Raises ValueError for environments that are not reset in the step in which they end.
+    infos have `terminal_observation`, `TimeLimit.truncated` and `is_success` at the end of an episode, and the other
+    entries of `TacsimEnv.step`. Raises ValueError for environments that are not reset in the step in which they end.
     """
 
     def __init__(self, envs: TacsimVectorEnv) -> None:
@@ -166,32 +166,32 @@ class SharedVecEnv(VecEnv):
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
 
     def reset(self) -> Arrays:
-        # stable-baselines3 hands over seeds and options by `seed` and `set_options`, an entry an environment.
+        # stable-baselines3 passes seeds and options by `seed` and `set_options`, one entry per environment.
         seeds = list(self._seeds)
         if any(self._options):
-            raise ValueError("options of a reset are those of all environments: use the environments themselves")
+            raise ValueError("reset options apply to all environments: set them on the environments themselves")
         seen, infos = self.envs.reset(seed=None if all(seed is None for seed in seeds) else seeds)
-        self.reset_infos = [one(infos, index) for index in range(self.num_envs)]
+        self.reset_infos = [select_environment(infos, index) for index in range(self.num_envs)]
         self._reset_seeds()
         self._reset_options()
-        return copied(seen)
+        return copy_arrays(seen)
 
     def step_async(self, actions: NDArray[np.float32]) -> None:
         self._actions = actions
 
     def step_wait(self) -> tuple[Arrays, NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
-        seen, rewards, terminated, truncated, told = self.envs.step(self._actions)
+        seen, rewards, terminated, truncated, step_info = self.envs.step(self._actions)
         done = terminated | truncated
         infos = []
         for index in range(self.num_envs):
             if done[index]:
-                info = one(told["final_info"], index)
-                info["terminal_observation"] = told["final_obs"][index]
+                info = select_environment(step_info["final_info"], index)
+                info["terminal_observation"] = step_info["final_obs"][index]
                 info["TimeLimit.truncated"] = bool(truncated[index] and not terminated[index])
             else:
-                info = one(told, index)
+                info = select_environment(step_info, index)
             infos.append(info)
-        return copied(seen), rewards.astype(np.float32), done, infos
+        return copy_arrays(seen), rewards.astype(np.float32), done, infos
 
     def close(self) -> None:
         self.envs.close()
@@ -215,7 +215,7 @@ class SharedVecEnv(VecEnv):
 
 
 class FeaturesExtractor(BaseFeaturesExtractor):
-    """Maps through a small CNN, numbers as they are, side by side; normalised as `FeatureLayers` says."""
+    """Features of maps by a small CNN, joined with the numbers; normalised by `FeatureLayers`."""
 
     def __init__(self, observation_space: spaces.Dict) -> None:
         layers = FeatureLayers({key: tuple(box.shape or ()) for key, box in observation_space.items()})
@@ -227,8 +227,8 @@ class FeaturesExtractor(BaseFeaturesExtractor):
         return found
 
 
-def one(infos: Mapping[str, Any], index: int) -> dict[str, Any]:
-    """Of what a vector environment tells, what it tells of one of its environments."""
+def select_environment(infos: Mapping[str, Any], index: int) -> dict[str, Any]:
+    """Entries of one environment in the infos of a vector environment."""
     return {
         key: value[index]
         for key, value in infos.items()
@@ -236,5 +236,5 @@ def one(infos: Mapping[str, Any], index: int) -> dict[str, Any]:
     }
 
 
-def copied(seen: Mapping[str, NDArray[Any]]) -> Arrays:
+def copy_arrays(seen: Mapping[str, NDArray[Any]]) -> Arrays:
     return {key: value.copy() for key, value in seen.items()}

@@ -1,4 +1,4 @@
-"""The folder of a training run: its settings, and the last checkpoint, from which it goes on to the same end."""
+"""The folder of a training run: its settings and its last checkpoint, from which the run continues."""
 
 from __future__ import annotations
 
@@ -18,25 +18,25 @@ from tacsim.models.training import Training
 
 FORMAT = 1  # of run.json and of checkpoints; other versions are refused
 CHECKPOINT = "checkpoint.pt"
-Tell = Callable[[str, int, int], None]  # what is being done, how much of it is done, of how much
+ReportProgress = Callable[[str, int, int], None]  # text, amount done, total amount
 
 
 class RunError(ValueError):
-    """A folder that holds no run which could go on, or be exported."""
+    """A folder without a run that can continue or be exported."""
 
 
 class RunSettings(Config):
-    """run.json: all that a run is a function of."""
+    """run.json: all inputs of a run."""
 
     format: int = FORMAT
-    tacsim: str = ""  # version that began it
+    tacsim: str = ""  # version that started the run
     training: Training
-    spec: PolicySpec  # of the policy that it makes
+    spec: PolicySpec  # of the resulting policy
     shapes: dict[str, tuple[int, ...]] = Field(min_length=1)  # of the features
 
 
 class RunFolder:
-    """One run. Raises RunError for a folder that holds none, or one of another version."""
+    """One run. Raises RunError for a folder without a run, or with one of another version."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -44,15 +44,15 @@ class RunFolder:
         try:
             text = path.read_text(encoding="utf-8")
         except FileNotFoundError:
-            raise RunError(f"{folder} holds no training run: there is no run.json in it") from None
+            raise RunError(f"{folder} is not the folder of a training run: it has no run.json") from None
         except (OSError, UnicodeDecodeError) as failure:
             raise RunError(f"{path} cannot be read: {failure}") from None
         try:
             written = json.loads(text)["format"]
             if written != FORMAT:
                 raise RunError(
-                    f"{path} has format {printable_line(str(written))}, this version of tacsim goes on with {FORMAT}: "
-                    "go on with the version that began the run, or train anew"
+                    f"{path} has format {printable_line(str(written))}, this version of tacsim continues format {FORMAT}: "
+                    "continue with the version that started the run, or start a new training"
                 )
             self.settings = RunSettings.model_validate_json(text)
         except (ValidationError, json.JSONDecodeError, TypeError, KeyError) as failure:
@@ -60,41 +60,41 @@ class RunFolder:
 
     @classmethod
     def make(cls, folder: Path, training: Training, spec: PolicySpec, shapes: Mapping[str, tuple[int, ...]]) -> Self:
-        """A new one. Raises FileExistsError if there is such a folder."""
+        """Creates a new run. Raises FileExistsError if the folder exists."""
         settings = RunSettings(tacsim=version(), training=training, spec=spec, shapes=dict(shapes))
         folder.mkdir(parents=True)
         text = settings.model_dump_json(indent=1)
         write_whole(folder / "run.json", text.encode())
         return cls(folder)
 
-    def keep(self, number: int, state: Mapping[str, Any], curve: list[dict[str, float]]) -> None:
-        """A checkpoint after round `number`, in place of the last one. The curve has a row of figures a round."""
+    def save_checkpoint(self, number: int, state: Mapping[str, Any], curve: list[dict[str, float]]) -> None:
+        """Writes a checkpoint after round `number` over the last one. `curve`: one row of figures per round."""
         import torch
 
         content = {"format": FORMAT, "rounds": number + 1, "state": dict(state), "curve": curve}
         write_whole(self.folder / CHECKPOINT, lambda file: torch.save(content, file))
 
-    def last(self) -> tuple[int, dict[str, Any], list[dict[str, float]]]:
-        """Rounds done, the state after them, and their figures; 0 rounds where none is done. Raises RunError."""
+    def load_checkpoint(self) -> tuple[int, dict[str, Any], list[dict[str, float]]]:
+        """Number of completed rounds, the state after them, and their figures. Raises RunError."""
         import torch
 
         path = self.folder / CHECKPOINT
         if not path.exists():
             return 0, {}, []
         try:
-            found = torch.load(path, weights_only=True)  # tensors and numbers; code in it is refused
+            found = torch.load(path, weights_only=True)  # tensors and numbers only; refuses code
             if found["format"] != FORMAT:
-                raise RunError(f"{path} has format {found['format']}, this version of tacsim goes on with {FORMAT}")
+                raise RunError(f"{path} has format {found['format']}, this version of tacsim continues format {FORMAT}")
             return int(found["rounds"]), dict(found["state"]), list(found["curve"])
         except RunError:
             raise
-        except Exception as failure:  # torch has no common base of what a broken file raises
+        except Exception as failure:  # torch has no common base class for damaged files
             words = printable_line((str(failure).splitlines() or [repr(failure)])[0][:200])
-            raise RunError(f"{path} is no checkpoint of this version: {words}; train anew") from None
+            raise RunError(f"{path} is not a checkpoint of this version: {words}; start a new training") from None
 
 
 def version() -> str:
-    """Of tacsim; empty where it is not installed."""
+    """Version of tacsim; empty if it is not installed."""
     try:
         return metadata.version("tacsim")
     except metadata.PackageNotFoundError:

@@ -1,7 +1,7 @@
-"""A training run: rounds of acting and learning, a checkpoint after each, a policy file at the end.
+"""A training run: rounds of acting and learning, a checkpoint after each round, a policy file at the end.
 
-A round is a function of the settings, its number and the state after the round before; so a run that was killed
-anywhere goes on from its last checkpoint to the same end, bit for bit.
+A round depends only on the settings, its number and the state after the previous round. So a killed run continues from
+its last checkpoint to the same result, bit for bit.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from robot.open import load_with_task, make_vector_env
 from robot.train.dagger import Dagger
 from robot.train.measure_range import measure_range, write_range
 from robot.train.network import PolicyNetwork, export
-from robot.train.run_folder import RunError, RunFolder, Tell, version
+from robot.train.run_folder import ReportProgress, RunError, RunFolder, version
 from tacsim.config import ConfigError
 from tacsim.config.errors import Place, Problem
 from tacsim.geometry.shapes import bounding_size
@@ -42,24 +42,24 @@ Figures = Mapping[str, float]
 
 
 class Learner(Protocol):
-    """Learns in rounds."""
+    """A learning algorithm that works in rounds."""
 
     rounds: int
     actor: PolicyNetwork
 
-    def round(self, number: int, tell: Tell) -> dict[str, float]:
-        """One round; what is to be told of it, `steps` (control steps of all environments) among it."""
+    def round(self, number: int, report_progress: ReportProgress) -> dict[str, float]:
+        """Runs one round. Returns its figures, with `steps`: control steps of all environments."""
         ...
 
     def state(self) -> dict[str, Any]:
-        """All that the next round depends on, as tensors, numbers and texts; `actor` is the state of the actor."""
+        """All inputs of the next round, as tensors, numbers and texts; `actor` is the state of the actor."""
         ...
 
     def restore(self, state: Mapping[str, Any]) -> None: ...
 
 
-def environments(training: Training) -> TacsimVectorEnv:
-    """Those that a policy is trained in. Raises ConfigError, CannotOpen, IncompatibleRig, ValueError."""
+def make_environments(training: Training) -> TacsimVectorEnv:
+    """Creates the environments of a training. Raises ConfigError, CannotOpen, IncompatibleRig, ValueError."""
     return make_vector_env(
         training.environments,
         training.task,
@@ -72,10 +72,10 @@ def environments(training: Training) -> TacsimVectorEnv:
     )
 
 
-def begin(training: Training, folder: Path) -> RunFolder:
-    """Makes the folder of a new run. Raises as `environments`, GoalOutOfReach for a goal that can be drawn and not be
-    reached, and FileExistsError."""
-    envs = environments(training)  # what cannot be made is told before there is a folder
+def begin_run(training: Training, folder: Path) -> RunFolder:
+    """Creates the folder of a new run. Raises the errors of `make_environments`, GoalOutOfReach for a goal that can be
+    drawn but not reached, and FileExistsError."""
+    envs = make_environments(training)  # reports errors before the folder is created
     envs.close()
     config = load_with_task(training.rig, training.task, training.overrides).config
     assert config.task is not None
@@ -95,8 +95,8 @@ def begin(training: Training, folder: Path) -> RunFolder:
 
 
 def _require_playable(training: Training, drawn: list[tuple[TaskConfig, Scene | None, str]]) -> None:
-    """Raises ConfigError for a range with an end that cannot be, GoalOutOfReach for a goal that the body, before
-    anything touches it, has no way to; of what is `drawn`, and of the limits, near which other seeds may draw."""
+    """Raises ConfigError for a range with an invalid limit, GoalOutOfReach for a goal that the undeformed body cannot
+    reach. Checks the draws in `drawn` and the limits, near which other seeds may draw."""
     limits = []
     for words in () if training.randomise is None else training.randomise.limits():
         at = "a limit: " + "; ".join(words)
@@ -106,7 +106,7 @@ def _require_playable(training: Training, drawn: list[tuple[TaskConfig, Scene | 
             raise ConfigError([*error.problems, Problem(Place("randomise"), "", at)]) from None
         assert config.task is not None
         limits.append((config.task, config.scene, at))
-    for task, scene, told in [*drawn, *limits]:
+    for task, scene, reported in [*drawn, *limits]:
         if scene is None or scene.body is None:
             continue
         height = float(bounding_size(scene.body.geometry)[2])
@@ -116,87 +116,87 @@ def _require_playable(training: Training, drawn: list[tuple[TaskConfig, Scene | 
                 Truth(height, np.array([0.0, 0.0, height / 2]), np.zeros((1, 3), np.float32), poses)
             )
         except GoalOutOfReach as error:
-            raise GoalOutOfReach(f"randomise: {told}: {error}") from None
+            raise GoalOutOfReach(f"randomise: {reported}: {error}") from None
 
 
 def train(
     run: RunFolder,
-    tell: Tell = lambda words, done, of: None,
-    say: Callable[[Figures], None] = lambda figures: None,
+    report_progress: ReportProgress = lambda words, done, of: None,
+    report_result: Callable[[Figures], None] = lambda figures: None,
     warn: Callable[[str], None] = lambda words: None,
 ) -> Path:
-    """Goes on with a run to its end, and writes its policy there; returns the file.
+    """Continues a run to its end, writes its policy to its folder and returns the file.
 
-    say: is told the figures of each round: its number `round`, those of the learner, `refused` (draws that could not
-    begin an episode, and were drawn anew), and `seconds`. warn: is told which draws, and why, each once.
-    Raises RunError, BadDraws for too many of those, and OSError for a disk that is full: the last checkpoint is still
-    whole.
+    report_result: called with the figures of each round: its number `round`, those of the learner, `refused` (draws
+    that could not begin an episode and were repeated), and `seconds`. warn: called once for each refused draw.
+    Raises RunError, BadDraws for too many refused draws, and OSError if the disk is full: the last checkpoint remains
+    complete.
     """
-    torch.set_num_threads(1)  # small networks; and sums have one order on any machine
-    done, state, curve = run.last()
-    envs = environments(run.settings.training)
+    torch.set_num_threads(1)  # small networks; sums have the same order on any machine
+    done, state, curve = run.load_checkpoint()
+    envs = make_environments(run.settings.training)
     try:
-        learner = _learner(envs, run)
+        learner = _make_learner(envs, run)
         if done:
-            with _fitting(run):
+            with _checking_fit(run):
                 learner.restore(state)
-        told: set[str] = set()
+        reported: set[str] = set()
         for number in range(done, learner.rounds):
-            began, before = time.perf_counter(), len(_refused(envs))
-            figures = learner.round(number, tell)
-            refused = _refused(envs)
+            began, before = time.perf_counter(), len(_refused_draws(envs))
+            figures = learner.round(number, report_progress)
+            refused = _refused_draws(envs)
             for words in dict.fromkeys(refused):
-                if words not in told:
-                    warn(f"drawn anew: {words}")
-            told.update(refused)
+                if words not in reported:
+                    warn(f"drawn again: {words}")
+            reported.update(refused)
             count = float(len(refused) - before)
             curve.append({"round": number + 1, **figures, "refused": count, "seconds": time.perf_counter() - began})
-            # before the checkpoint: a round that is kept is not told again
+            # before the checkpoint: a completed round is not reported again
             write_whole(run.folder / CURVE, json.dumps(curve, indent=1).encode())
-            run.keep(number, learner.state(), curve)
-            say(curve[-1])
+            run.save_checkpoint(number, learner.state(), curve)
+            report_result(curve[-1])
     finally:
         envs.close()
     path = run.folder / POLICY
-    export_policy(run, path, tell)
+    export_policy(run, path, report_progress)
     return path
 
 
-def _refused(envs: TacsimVectorEnv) -> list[str]:
+def _refused_draws(envs: TacsimVectorEnv) -> list[str]:
     return [words for env in envs.members for words in env.refused]
 
 
-def export_policy(run: RunFolder, path: Path, tell: Tell = lambda words, done, of: None) -> float:
-    """Writes the policy of a run, as far as it has come, with the range of what it observes in training's episodes;
-    returns how far the file's actions are from the network's.
+def export_policy(run: RunFolder, path: Path, report_progress: ReportProgress = lambda words, done, of: None) -> float:
+    """Writes the policy of a run after its last round, with the range of its observations in training episodes. Returns
+    the maximum difference of the file's actions from the network's.
 
     Raises RunError without a checkpoint, ExportError, OSError.
     """
-    done, state, curve = run.last()
+    done, state, curve = run.load_checkpoint()
     if not done:
-        raise RunError(f"{run.folder} has no checkpoint: not one round of its training is done")
+        raise RunError(f"{run.folder} has no checkpoint: no round of its training is complete")
     actor = new_actor(run)
-    with _fitting(run):
+    with _checking_fit(run):
         actor.load_state_dict(state["actor"])
     steps = int(sum(row["steps"] for row in curve))
     trained = {**run.settings.spec.trained, "rounds": done, "steps": steps}
     spec = run.settings.spec.model_copy(update={"trained": trained})
-    worst = export(actor, spec, run.settings.shapes, path)
-    write_range(path, path, measure_range(path, tell=tell))
-    return worst
+    max_difference = export(actor, spec, run.settings.shapes, path)
+    write_range(path, path, measure_range(path, report_progress=report_progress))
+    return max_difference
 
 
 def new_actor(run: RunFolder) -> PolicyNetwork:
-    """The network of a run, before anything is learned."""
+    """The initial network of a run."""
     settings = run.settings
     torch.manual_seed(settings.training.seed)
-    cut = settings.training.algorithm == "ppo"
-    return PolicyNetwork(settings.shapes, len(settings.spec.axes), settings.training.width, cut=cut)
+    clip = settings.training.algorithm == "ppo"
+    return PolicyNetwork(settings.shapes, len(settings.spec.axes), settings.training.width, clip=clip)
 
 
 @contextmanager
-def _fitting(run: RunFolder) -> Iterator[None]:
-    """Raises RunError where what is restored in the block is not of this run's network."""
+def _checking_fit(run: RunFolder) -> Iterator[None]:
+    """Raises RunError if the state restored in the block does not fit the network of this run."""
     try:
         yield
     except (KeyError, RuntimeError, ValueError) as failure:
@@ -204,7 +204,7 @@ def _fitting(run: RunFolder) -> Iterator[None]:
         raise RunError(f"{run.folder}: its checkpoint does not fit its settings: {words}") from None
 
 
-def _learner(envs: TacsimVectorEnv, run: RunFolder) -> Learner:
+def _make_learner(envs: TacsimVectorEnv, run: RunFolder) -> Learner:
     if run.settings.training.algorithm == "dagger":
         return Dagger(envs, run.settings.training, new_actor(run), run.folder)
     from robot.train.reinforce import Reinforce

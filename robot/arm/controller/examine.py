@@ -72,7 +72,7 @@ def _open(host: str, port: int) -> bool:
 
 
 def _controller(name: str, config: UrArmConfig, dashboard: Dashboard) -> Iterator[Check]:
-    version = dashboard.ask("PolyscopeVersion")
+    version = dashboard.request("PolyscopeVersion")
     found = re.search(r"(\d+)\.(\d+)\.\d+", version)
     fit = found is not None and (int(found[1]), int(found[2])) >= MIN_POLYSCOPE
     lowest = ".".join(map(str, MIN_POLYSCOPE))

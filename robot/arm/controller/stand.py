@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from robot.arm.controller.rtde import Reading
+from robot.arm.controller.rtde import ControllerReading
 from robot.common.kinematics import Kinematics, displacement, inverse_frame, matrix, pose, rotation_vector
 from robot.common.tcp import ArmFrames
 from tacsim import pose as se3
@@ -27,7 +27,7 @@ MODEL_LENGTH = 20e-3  # a pose farther than this from that of the model is of an
 class Stand:
     """An arm as it stands."""
 
-    reading: Reading
+    reading: ControllerReading
     flange: FloatArray  # base_from_flange (4, 4)
     tcp: FloatArray  # flange_from_tcp (4, 4) of the controller: with it the pendant shows its poses
     sensor: FloatArray  # world_from_sensor (4, 4)
@@ -35,7 +35,7 @@ class Stand:
     expected_wrench: FloatArray  # (6,) the same once the controller is told of the file's payload
 
 
-def stand(config: UrArmConfig, reading: Reading) -> Stand:
+def stand(config: UrArmConfig, reading: ControllerReading) -> Stand:
     """From what a controller told."""
     frames = ArmFrames.of(config)
     shown = matrix(reading.tcp_pose)

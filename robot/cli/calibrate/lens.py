@@ -117,11 +117,11 @@ def _take_views(
     plan = BoardViewPlan(board, views, on_gel=views == 1, reference=empty)
     frames = folder / "frames"
     with Camera(config, sensor) as source, led("views", views, frames, f"pictures kept in {frames}") as session:
-        session.keep = picture_keeper(frames)
+        session.store = picture_keeper(frames)
         record_board_views(source, plan, session)
-    if len(session.taken) < views:
-        raise CannotCalibrate(f"the source was over after {len(session.taken)} of {views} views")
-    return frames / session.taken[0][0] if plan.on_gel else frames
+    if len(session.measurements) < views:
+        raise CannotCalibrate(f"the source was over after {len(session.measurements)} of {views} views")
+    return frames / session.measurements[0][0] if plan.on_gel else frames
 
 
 def _fit_lens(pictures: Path, board: Board, folder: Path) -> None:

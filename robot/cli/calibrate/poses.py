@@ -106,9 +106,9 @@ def _take_touches(
         _recording(folder / "touches.yaml", "touch", "touches", plan.touches) as (session, write),
         open_rig(opened, confirm=lambda question: True) as running,
     ):
-        session.keep = lambda _: write(touch_file(session.taken, plan.ball_radius))
+        session.store = lambda _: write(touch_file(session.measurements, plan.ball_radius))
         record_ball_touches(running, opened, arm, sensor, plan, session)
-    return touch_file(session.taken, plan.ball_radius)
+    return touch_file(session.measurements, plan.ball_radius)
 
 
 @contextmanager
@@ -244,9 +244,9 @@ def _take_board_poses(
         open_arm(config, arm) as mover,
         open_camera(camera, plan.lens) as source,
     ):
-        session.keep = lambda _: write(board_pose_file(session.taken, fixed=fixed))
+        session.store = lambda _: write(board_pose_file(session.measurements, fixed=fixed))
         record_board_poses(mover, source, plan, session)
-    return board_pose_file(session.taken, fixed=fixed)
+    return board_pose_file(session.measurements, fixed=fixed)
 
 
 def _report_hand_eye(record: BoardPoseFile, noise: Any, folder: Path) -> None:

@@ -342,10 +342,10 @@ def _take_presses(
         confirm_free_gel()
         note = f"frames kept in {frames}; to calibrate from them again: {again}"
         with led("presses", presses, frames, note) as session:
-            session.keep = picture_keeper(frames)
+            session.store = picture_keeper(frames)
             untouched = record_presses(source, plan, session)
-    if not untouched or not session.taken:
+    if not untouched or not session.measurements:
         raise BadFrames("the source was over before a press was taken")
-    taken = tuple(Frame(name, image) for name, image in session.taken)
+    taken = tuple(Frame(name, image) for name, image in session.measurements)
     more = tuple(Frame(f"background_{k}.png", image) for k, image in enumerate(untouched[:-1], start=1))
     return FrameSet(camera, untouched[-1], "background.png", taken, more)

@@ -31,7 +31,7 @@ def led(what: str, total: int, kept: Path, note: str) -> Iterator[Session[Any]]:
     with Interrupt() as interrupt, progress() as bar:
         row = bar.add_task(what, total=total)
         session: Session[Any] = Session(
-            say=lambda words: notes.print(words),
+            report=lambda words: notes.print(words),
             progress=lambda done: bar.update(row, completed=done),
             stop=interrupt,
         )
@@ -41,7 +41,7 @@ def led(what: str, total: int, kept: Path, note: str) -> Iterator[Session[Any]]:
             if kept.exists():
                 notes.print(note)
     if interrupt():
-        complain(f"stopped by a signal; {len(session.taken)} {what} are kept, nothing is calibrated")
+        complain(f"stopped by a signal; {len(session.measurements)} {what} are kept, nothing is calibrated")
         raise typer.Exit(interrupt.exit_code)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from robot.arm import channel
 from robot.arm.channel import HISTORY
-from robot.arm.servo import FAULT_DECELERATION, STALL_PATIENCE
+from robot.arm.servo import FAULT_DECELERATION, MAX_STALL_PERIODS
 from robot.arm.shared_ring import Record
 from robot.arm.status import ArmStatus
 from robot.arm.trajectory import PERIOD
@@ -72,12 +72,12 @@ def go(arm: URArm, target: Pose) -> None:
 
 
 def in_motion(arm: URArm, target: Pose) -> float:
-    """Commands `target` and comes back when the arm is on its way: when it was commanded, monotonic clock [s]."""
+    """Commands `target` and returns when the arm moves: the time of the command, monotonic clock [s]."""
     return _beyond(arm, target, 2e-3)
 
 
 def at_full_speed(arm: URArm, target: Pose) -> float:
-    """Commands `target`; comes back when the arm has gone one and a half times the path that it takes to full speed.
+    """Commands `target`; returns after one and a half times the path that the arm needs to reach full speed.
 
     (Not when a speed is measured: a loop that misses periods on a busy machine does not make up for them.)"""
     return _beyond(arm, target, 0.75 * arm.config.limits.speed**2 / arm.config.limits.acceleration)
@@ -92,7 +92,7 @@ def _beyond(arm: URArm, target: Pose, distance: float) -> float:
         newest = arm._channel.states.latest()
         assert newest is not None
         followed = newest["commands_read"] == arm._channel.commands.count
-        if asked == 0.0 or (followed and newest["status"] == ArmStatus.HOLD):  # its time-out has passed on the way
+        if asked == 0.0 or (followed and newest["status"] == ArmStatus.HOLD):  # its time-out has passed in between
             asked = time.monotonic()
             arm.command(target)
         return float(np.linalg.norm(arm.state().pose.position - start)) > distance
@@ -112,7 +112,7 @@ def heights_in_a_fault(arm: URArm, status: ArmStatus) -> tuple[float, float]:
     """How low the target of an arm that went down may be from this fault on, and how low once it has been led back [m].
 
     By what the worker itself knew, however late it or its packages came: the target stands until a package tells where
-    the arm is, and brakes from there. Where no package does so in time, it goes on standing."""
+    the arm is, and brakes from there. If no package arrives in time, it keeps standing."""
     seen = records(arm)
     found = int(np.argmax(seen["status"] == status))
     assert seen["status"][found] == status and found > 0, "the records do not go back to the fault"
@@ -121,10 +121,10 @@ def heights_in_a_fault(arm: URArm, status: ArmStatus) -> tuple[float, float]:
     led_back = np.flatnonzero((seen["target"] != seen["target"][0]).any(axis=1))
     if not len(led_back):
         rests = seen[seen["resting"] == 1][0]
-        assert rests["cycles"] - seen["cycles"][0] >= STALL_PATIENCE  # not before it has waited
+        assert rests["cycles"] - seen["cycles"][0] >= MAX_STALL_PERIODS  # not before it has waited
         return held, held
     before = seen[: led_back[0]]  # the last of these is of the package from which it brakes
-    assert len(np.unique(before["stamp"])) <= STALL_PATIENCE
+    assert len(np.unique(before["stamp"])) <= MAX_STALL_PERIODS
     speed = float(np.linalg.norm(before["tcp_speed"][-1, :3]))
     return held, float(before["position"][-1, 2]) - speed**2 / (2 * FAULT_DECELERATION)
 

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from robot.arm.channel import STATE, CommandKind, WorkerConfig, command_record
+from robot.arm.channel import STATE, CommandKind, WorkerConfig, make_command_record
 from robot.arm.servo import Servo
 from robot.arm.shared_ring import Record
 from robot.arm.start_servo import StartServo
@@ -71,7 +71,7 @@ class Bench:
 
     def __init__(self, calibration: FloatArray | None = None, **changes: object) -> None:
         config = worker_config(**changes)
-        self.servo = Servo(config) if config.way is None else StartServo(config)
+        self.servo = Servo(config) if config.start_path is None else StartServo(config)
         self.q, self.time, self.number = HOME.copy(), 0.0, 0
         self.calibration = np.eye(4) if calibration is None else calibration  # the true flange, seen from the nominal
         self.record: Record = np.zeros((), STATE)
@@ -95,7 +95,7 @@ class Bench:
     def ask(self, target: Pose | np.ndarray, kind: CommandKind = CommandKind.TARGET, speed: float = math.inf) -> None:
         row = target if isinstance(target, np.ndarray) else np.array([*target.position, *target.quaternion])
         self.number += 1
-        self.servo.on_command(self.number, command_record(self.time, kind, row, speed))
+        self.servo.on_command(self.number, make_command_record(self.time, kind, row, speed))
 
     def run(self, periods: int, force: tuple[float, ...] = (0.0,) * 6) -> None:
         for _ in range(periods):
@@ -147,11 +147,11 @@ class OnController:
     def ask(self, target: Pose, age: float = 0.0) -> None:
         self.number += 1
         row = np.array([*target.position, *target.quaternion])
-        self.servo.on_command(self.number, command_record(self.time - age, CommandKind.TARGET, row))
+        self.servo.on_command(self.number, make_command_record(self.time - age, CommandKind.TARGET, row))
 
     def hold(self) -> None:
         self.number += 1
-        self.servo.on_command(self.number, command_record(self.time, CommandKind.HOLD, np.full(7, np.nan)))
+        self.servo.on_command(self.number, make_command_record(self.time, CommandKind.HOLD, np.full(7, np.nan)))
 
     @property
     def target(self) -> FloatArray:
@@ -164,7 +164,7 @@ class OnController:
         """The newest package that the worker knows is `late` periods old."""
         number = max(0, len(self.packages) - 1 - late)
         known, (scaling, target, speeds) = self.packages[number], self.reports[number]
-        self.servo.on_scaling(scaling)
+        self.servo.on_speed_scaling(scaling)
         self.servo.check_faults(known, self.partners)
         if number != self._number:
             self.servo.check_following(known, target, speeds)

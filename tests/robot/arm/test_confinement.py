@@ -10,9 +10,9 @@ import pytest
 
 NO_MORE = """
 import errno, os, select, socket
-from robot.arm.confinement import last_connections
+from robot.arm.confinement import forbid_later_connections
 server = socket.create_server(("127.0.0.1", 0))
-with last_connections():
+with forbid_later_connections():
     first = socket.create_connection(server.getsockname())
     second = socket.create_connection(server.getsockname())
 def refused(make):
@@ -24,22 +24,22 @@ makers = [socket.socket, os.pipe, select.epoll, lambda: os.dup(0), lambda: os.op
 print(*map(refused, makers))
 first.close()
 print(*map(refused, makers))
-second.sendall(b"x")  # what is open goes on
+second.sendall(b"x")  # open connections still work
 listening = select.poll()
 listening.register(second, select.POLLOUT)
 print(listening.poll(1000) == [(second.fileno(), select.POLLOUT)])
 """
 
 
-def test_after_the_last_connections_nothing_can_be_opened_in_place_of_a_closed_one_either() -> None:
+def test_forbid_later_connections_after_block_opens_no_descriptor() -> None:
     done = subprocess.run([sys.executable, "-c", NO_MORE], capture_output=True, text=True, timeout=60)
     assert (done.stdout, done.stderr) == (f"{' '.join(['True'] * 5)}\n" * 2 + "True\n", "")
 
 
 TOO_LONG = """
 import signal, time
-from robot.arm.confinement import TimeLimit, allow_time_limits
-allow_time_limits()
+from robot.arm.confinement import TimeLimit, enable_time_limits
+enable_time_limits()
 limit = TimeLimit(30.0)
 for _ in range(3):
     with limit:
@@ -53,7 +53,7 @@ WAITS = {"sleeping": "time.sleep(60)", "holding the interpreter": "import ctypes
 
 
 @pytest.mark.parametrize("name", WAITS)
-def test_a_block_that_takes_too_long_ends_the_process_also_where_its_parent_ignores_the_alarm(name: str) -> None:
+def test_time_limit_slow_block_ends_process(name: str) -> None:
     def ignore() -> None:
         signal.signal(signal.SIGALRM, signal.SIG_IGN)
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGALRM})

@@ -1,4 +1,4 @@
-"""A lost link: told from a worker that died of something else, and explained by what the worker measured."""
+"""A lost link: distinguished from other exits of a worker, and explained by the timing that the worker measured."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import time
 import numpy as np
 import pytest
 
-from robot.arm.channel import STATE, WINDOW
-from robot.arm.lost_link import OUTLIVED, died_of_lost_link, explain_lost_link
+from robot.arm.channel import STATE, STATISTICS_PERIODS
+from robot.arm.lost_link import TIME_LIMIT_EXIT_STATUS, describe_lost_link, ended_by_lost_link
 from robot.arm.shared_ring import Record
 from robot.arm.status import ArmStatus, status_of
 from robot.arm.ur import URArm
@@ -31,22 +31,22 @@ def record(age: float, now: float, **fields: float) -> Record:
     return made
 
 
-@pytest.mark.parametrize("end", [0, 3, -signal.SIGSEGV, -signal.SIGABRT, -signal.SIGKILL, OUTLIVED])
+@pytest.mark.parametrize("end", [0, 3, -signal.SIGSEGV, -signal.SIGABRT, -signal.SIGKILL, TIME_LIMIT_EXIT_STATUS])
 @pytest.mark.parametrize("published", [ArmStatus.OK, ArmStatus.LINK_LOST])
 @pytest.mark.parametrize("printed", ["", "Traceback of something else\n", SAID])
-def test_the_first_cause_of_an_end_is_kept(end: int, published: ArmStatus, printed: str) -> None:
-    """Whatever ends the worker: the link was lost first if it published that, or the library reported it."""
+def test_status_history_second_cause_keeps_first(end: int, published: ArmStatus, printed: str) -> None:
+    """For any exit of the worker the link was lost first if the worker published it or the library reported it."""
     newest = record(0.01, time.monotonic(), status=published)
-    first = published == ArmStatus.LINK_LOST or printed == SAID or end == OUTLIVED
+    first = published == ArmStatus.LINK_LOST or printed == SAID or end == TIME_LIMIT_EXIT_STATUS
     expected = ArmStatus.LINK_LOST if first else ArmStatus.WORKER_DEAD
-    assert status_of(newest, end, 1.0, lost=died_of_lost_link(end, printed)) == expected
+    assert status_of(newest, end, 1.0, is_link_lost=ended_by_lost_link(end, printed)) == expected
 
 
-def test_a_punctual_worker_points_at_the_cable() -> None:
-    words = explain_lost_link(record(0.062, 100.0), REAL, None, 100.0)
+def test_describe_lost_link_punctual_worker_names_cable() -> None:
+    words = describe_lost_link(record(0.062, 100.0), REAL, None, 100.0)
     assert words.startswith("its last package is 62 ms old (link_timeout = 50 ms); its worker was punctual (0 of")
     assert words.endswith("check the cable")
-    assert "cable" not in explain_lost_link(record(1.5, 100.0), config(), None, 100.0)  # a mock has none
+    assert "cable" not in describe_lost_link(record(1.5, 100.0), config(), None, 100.0)  # a mock has none
 
 
 @pytest.mark.parametrize(
@@ -59,32 +59,30 @@ def test_a_punctual_worker_points_at_the_cable() -> None:
         ({"late": 3, "longest": 0.004, "cycles": 20}, 0.0, "3 of its last 20 periods"),
     ],
 )
-def test_a_late_worker_names_what_it_measured_and_no_cable(
-    fields: dict[str, float], overdue: float, words: str
-) -> None:
+def test_describe_lost_link_late_worker_names_periods(fields: dict[str, float], overdue: float, words: str) -> None:
     now = 100.0
     newest = record(0.062, now, **fields)
     newest["written"] -= overdue
-    told = explain_lost_link(newest, REAL, None, now)
-    assert words in told and "its worker was late itself" in told and "cable" not in told
+    told = describe_lost_link(newest, REAL, None, now)
+    assert words in told and "its worker itself was late" in told and "cable" not in told
     assert "real-time priority was not given); allow it (`tacsim doctor` says how)" in told
     newest["realtime"] = 1
-    assert "with real-time priority); give this machine less to do" in explain_lost_link(newest, REAL, None, now)
-    assert "`mock: {realtime: true}`" in explain_lost_link(record(0.062, now, late=WINDOW), config(), None, now)
+    assert "with real-time priority); reduce the load of this machine" in describe_lost_link(newest, REAL, None, now)
+    assert "`mock: {realtime: true}`" in describe_lost_link(
+        record(0.062, now, late=STATISTICS_PERIODS), config(), None, now
+    )
 
 
-def test_a_link_that_was_cut_or_blocked_says_so() -> None:
+def test_describe_lost_link_cut_or_blocked_names_cause() -> None:
     newest = record(0.003, 100.0)
-    assert "3 ms old (link_timeout = 50 ms), the connection was closed or reset;" in explain_lost_link(
+    assert "3 ms old (link_timeout = 50 ms), the connection was closed or reset;" in describe_lost_link(
         newest, REAL, 0, 250.0
     )
-    assert "a command took longer than link_timeout" in explain_lost_link(newest, REAL, OUTLIVED, 250.0)
+    assert "a command took longer than link_timeout" in describe_lost_link(newest, REAL, TIME_LIMIT_EXIT_STATUS, 250.0)
 
 
 @pytest.mark.parametrize(("printed", "expected"), [(SAID, ArmStatus.LINK_LOST), ("", ArmStatus.WORKER_DEAD)])
-def test_a_crash_of_the_library_is_a_lost_link_if_it_reported_one(
-    mock: MockUR, printed: str, expected: ArmStatus
-) -> None:
+def test_status_of_library_crash_with_report_is_lost_link(mock: MockUR, printed: str, expected: ArmStatus) -> None:
     with URArm(config(), "left") as arm:
         worker = arm._worker
         assert worker is not None
@@ -97,19 +95,19 @@ def test_a_crash_of_the_library_is_a_lost_link_if_it_reported_one(
         go(arm, moved(arm.state().pose, x=0.005))
 
 
-def test_a_worker_that_ends_after_its_link_was_lost_does_not_change_the_cause(mock: MockUR) -> None:
+def test_status_history_exit_after_lost_link_keeps_cause(mock: MockUR) -> None:
     with URArm(config(link_timeout=0.5), "left") as arm:
         worker = arm._worker
         assert worker is not None
         os.kill(worker.pid, signal.SIGSTOP)
         until(lambda: arm.status() == ArmStatus.LINK_LOST, "lost link")
-        assert "its worker was late itself" in arm.explain() and "cable" not in arm.explain()
+        assert "its worker itself was late" in arm.explain() and "cable" not in arm.explain()
         os.kill(worker.pid, signal.SIGKILL)
         until(lambda: not worker.running, "end of the worker")
         assert arm.status() == arm.status() == ArmStatus.LINK_LOST
 
 
-def test_the_worker_counts_its_late_periods(mock: MockUR) -> None:
+def test_worker_late_periods_are_counted(mock: MockUR) -> None:
     with URArm(config(), "left") as arm:
         worker = arm._worker
         assert worker is not None
@@ -128,7 +126,7 @@ def test_the_worker_counts_its_late_periods(mock: MockUR) -> None:
 
 @pytest.mark.deep
 @pytest.mark.parametrize("ports", [None, [30004]])
-def test_a_reset_is_a_lost_link_every_time(mock: MockUR, ports: list[int] | None) -> None:
+def test_arm_connection_reset_is_lost_link(mock: MockUR, ports: list[int] | None) -> None:
     """In one of 30 resets ur_rtde crashes."""
     for _ in range(30):
         mock.faults.reset()

@@ -10,7 +10,7 @@ import pytest
 
 from robot.arm.channel import STATE
 from robot.arm.lost_link import PackageLog
-from robot.arm.shared_ring import Ring, create
+from robot.arm.shared_ring import Ring, create_segment
 from robot.arm.ur import URArm
 from tests.robot.waiting import until
 
@@ -19,7 +19,7 @@ PERIOD = 2e-3
 
 @pytest.fixture
 def ring() -> Ring:
-    return Ring(create(Ring.size(STATE, 64)).memory, STATE, 64)
+    return Ring(create_segment(Ring.size(STATE, 64)).memory, STATE, 64)
 
 
 def write(ring: Ring, stamp: float, read: float, status: int = 1) -> None:
@@ -28,7 +28,7 @@ def write(ring: Ring, stamp: float, read: float, status: int = 1) -> None:
     ring.write(record)
 
 
-def test_each_package_once_also_where_a_fault_writes_it_again(ring: Ring) -> None:
+def test_package_log_repeated_record_returns_package_once(ring: Ring) -> None:
     write(ring, 99.998, 9.998)  # before the log
     log = PackageLog(ring)
     assert len(log.take().stamp) == 0
@@ -45,7 +45,7 @@ def test_each_package_once_also_where_a_fault_writes_it_again(ring: Ring) -> Non
     assert (first.lost, second.lost, log.take().lost) == (0, 0, 0)
 
 
-def test_what_is_missing_is_counted(ring: Ring) -> None:
+def test_package_log_gap_is_counted(ring: Ring) -> None:
     log = PackageLog(ring)
     for k in (0, 1, 4):  # two never came
         write(ring, 100 + k * PERIOD, 10 + k * PERIOD)
@@ -54,19 +54,19 @@ def test_what_is_missing_is_counted(ring: Ring) -> None:
         write(ring, 100 + k * PERIOD, 10 + k * PERIOD)
     taken = log.take()
     assert len(taken.stamp) + taken.lost == 200 and taken.lost > 100
-    write(ring, 1.0, 11.0)  # the controller was restarted: its clock counts anew
+    write(ring, 1.0, 11.0)  # the controller was restarted: its clock restarts
     assert (log.take().lost, len(log.take().stamp)) == (0, 0)
 
 
-def test_records_without_a_package_are_none(ring: Ring) -> None:
+def test_package_log_record_without_package_is_skipped(ring: Ring) -> None:
     log = PackageLog(ring)
     write(ring, 0.0, 0.0, status=0)  # connecting
     write(ring, 100.0, 10.0)
     assert log.take().stamp.tolist() == [100.0]
 
 
-def test_an_arm_at_rest_tells_all_its_packages(arm: URArm) -> None:
-    """In the order of the controller's own clock, none twice, however often somebody looks; and the gaps are told."""
+def test_package_log_arm_at_rest_returns_all_packages(arm: URArm) -> None:
+    """In the order of the controller's own clock, each once, for any number of calls; gaps are reported."""
     log, parts = arm.package_log(), []
     joints = arm.state().joints
 

@@ -8,15 +8,15 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from robot.arm.channel import CommandKind, Partner, tactile_record
-from robot.arm.servo import FAULT_DECELERATION, ZERO_PATIENCE, Servo
+from robot.arm.channel import CommandKind, Partner, make_tactile_record
+from robot.arm.servo import FAULT_DECELERATION, ZERO_REQUEST_TIMEOUT, Servo
 from robot.arm.status import ArmStatus
 from robot.arm.trajectory import PERIOD
 from tests.robot.arm.servo_bench import Bench, other, shifted, worker_config
 
 
 @pytest.mark.promise(3)
-def test_too_much_force_stops_from_the_measured_pose() -> None:
+def test_servo_excess_force_brakes_from_measured_pose() -> None:
     bench = Bench(action_timeout=60.0)
     bench.ask(shifted(bench.at, 0.0, 0.0, -0.1))
     bench.run(150)
@@ -29,21 +29,21 @@ def test_too_much_force_stops_from_the_measured_pose() -> None:
     after = bench.path()[count:, 2]
     assert bench.servo.status == ArmStatus.FORCE_LIMIT
     assert after.min() >= here - 0.12**2 / (2 * FAULT_DECELERATION) - 1e-6
-    assert bench.servo.resting
+    assert bench.servo.is_at_rest
     bench.ask(shifted(bench.at, 0.0, 0.0, -0.1))
-    bench.run(50)  # the force is gone, the fault is not
+    bench.run(50)  # the force has ended, the fault remains
     assert np.ptp(bench.path()[-40:, 2]) < 1e-9
 
 
 @pytest.mark.promise(3)
-def test_a_force_that_is_no_number_is_too_much() -> None:
+def test_servo_nan_force_is_force_limit() -> None:
     bench = Bench()
     bench.look(force=(math.nan,) * 6)
     bench.servo.check_faults(bench.now, [])
     assert bench.servo.status == ArmStatus.FORCE_LIMIT
 
 
-def test_an_arm_that_is_pushed_out_of_its_box_stops() -> None:
+def test_servo_arm_pushed_outside_region_is_workspace_limit() -> None:
     bench = Bench(action_timeout=60.0, lower=[-0.6, -0.3, 0.43])
     bench.ask(shifted(bench.at, 0.02))
     bench.run(50)
@@ -54,7 +54,7 @@ def test_an_arm_that_is_pushed_out_of_its_box_stops() -> None:
 
 
 @pytest.mark.promise(15)
-def test_another_arm_is_not_come_near_and_parting_is_free() -> None:
+def test_servo_keep_out_stops_approach_and_allows_retreat() -> None:
     bench = Bench(action_timeout=60.0, partners=[Partner(-1, 0.05)])
     start = bench.at
     bench.partners = [other(list(start.position + [0.1, 0.0, 0.0]))]
@@ -69,7 +69,7 @@ def test_another_arm_is_not_come_near_and_parting_is_free() -> None:
 
 
 @pytest.mark.promise(15)
-def test_the_braking_way_of_the_other_arm_counts() -> None:
+def test_servo_keep_out_includes_braking_path_of_other_arm() -> None:
     bench = Bench(action_timeout=60.0, partners=[Partner(-1, 0.05)])
     start = bench.at
     bench.partners = [other(list(start.position + [0.2, 0, 0]), list(start.position + [0.08, 0, 0]))]
@@ -79,7 +79,7 @@ def test_the_braking_way_of_the_other_arm_counts() -> None:
 
 
 @pytest.mark.parametrize("partner", [None, ArmStatus.PROTECTIVE_STOP, ArmStatus.CONNECTING])
-def test_without_a_sound_partner_it_waits_and_a_moving_arm_stops(partner: ArmStatus | None) -> None:
+def test_servo_unhealthy_partner_waits_at_rest_and_stops_in_motion(partner: ArmStatus | None) -> None:
     bench = Bench(action_timeout=60.0, partners=[Partner(-1, 0.05)])
     start = bench.at
     sound = other(list(start.position + [0.3, 0, 0]))
@@ -92,7 +92,7 @@ def test_without_a_sound_partner_it_waits_and_a_moving_arm_stops(partner: ArmSta
     assert bench.sent == []
     bench.partners = [sound]
     bench.run(5)
-    assert bench.servo.status == ArmStatus.HOLD  # what was asked meanwhile is forgotten
+    assert bench.servo.status == ArmStatus.HOLD  # the command sent in between is dropped
     bench.ask(shifted(start, 0.05))
     bench.run(50)
     assert bench.servo.status == ArmStatus.OK
@@ -100,12 +100,12 @@ def test_without_a_sound_partner_it_waits_and_a_moving_arm_stops(partner: ArmSta
     bench.run(1)
     assert bench.servo.status == ArmStatus.PARTNER_STOPPED
     bench.run(100)
-    assert bench.servo.resting
+    assert bench.servo.is_at_rest
 
 
 @pytest.mark.promise(7)
-def test_a_fault_stays_and_only_a_stop_of_the_controller_replaces_it() -> None:
-    """A stop of the controller takes more to recover from, so it must be told; a worse one replaces a lesser one."""
+def test_servo_fault_is_replaced_only_by_controller_stop() -> None:
+    """A stop of the controller needs more to recover from, so it is reported; a worse stop replaces a lesser one."""
     bench = Bench()
     for status, kept in (
         (ArmStatus.FORCE_LIMIT, ArmStatus.FORCE_LIMIT),
@@ -118,11 +118,11 @@ def test_a_fault_stays_and_only_a_stop_of_the_controller_replaces_it() -> None:
         (ArmStatus.EMERGENCY_STOP, ArmStatus.EMERGENCY_STOP),
         (ArmStatus.PROGRAM_STOPPED, ArmStatus.EMERGENCY_STOP),
     ):
-        bench.servo.trip(status)
+        bench.servo.enter_fault(status)
         assert bench.servo.status == kept
 
 
-def test_a_gel_pressed_or_dragged_too_far_stops_the_arm() -> None:
+def test_servo_gel_beyond_limit_is_gel_limit() -> None:
     for shown, stops in (
         ((0.9e-3, 0.4e-3), False),
         ((1.1e-3, 0.0), True),
@@ -132,39 +132,39 @@ def test_a_gel_pressed_or_dragged_too_far_stops_the_arm() -> None:
         bench = Bench(action_timeout=60.0, depth=1e-3, shear=0.5e-3)
         bench.ask(shifted(bench.at, 0.0, 0.0, -0.05))
         bench.run(100)
-        bench.servo.on_tactile(1, tactile_record(bench.time, *shown))
+        bench.servo.on_tactile(1, make_tactile_record(bench.time, *shown))
         here = bench.at.position[2]
         bench.run(100)
         assert (bench.servo.status == ArmStatus.GEL_LIMIT) == stops
         assert (bench.at.position[2] < here - 0.12**2 / (2 * FAULT_DECELERATION) - 1e-4) == (not stops)
 
 
-def test_an_arm_is_not_called_well_before_it_was_looked_at() -> None:
-    """What the first look finds is the first that anybody hears: the worker publishes `status` before it too."""
+def test_servo_status_before_first_check_is_connecting() -> None:
+    """The first published fault is that of the first check: the worker also publishes `status` before it."""
     for changes, found in (({}, ArmStatus.HOLD), ({"lower": [2.0] * 3, "upper": [3.0] * 3}, ArmStatus.WORKSPACE_LIMIT)):
         bench = Bench(**changes)
         assert bench.servo.status == ArmStatus.CONNECTING
-        bench.servo.on_tactile(1, tactile_record(0.0, 0.0, 0.0))
+        bench.servo.on_tactile(1, make_tactile_record(0.0, 0.0, 0.0))
         assert bench.servo.status == ArmStatus.CONNECTING
         bench.servo.check_faults(bench.now, bench.partners)
         assert bench.servo.status == found
 
 
-def test_what_was_shown_to_a_worker_before_is_not_held_against_this_one() -> None:
+def test_servo_tactile_report_of_former_worker_is_ignored() -> None:
     servo = Servo(worker_config(depth=1e-3), tactile_read=7)
-    servo.on_tactile(7, tactile_record(0.0, 2e-3, 0.0))
+    servo.on_tactile(7, make_tactile_record(0.0, 2e-3, 0.0))
     assert not servo.status.is_fault
-    servo.on_tactile(8, tactile_record(math.nan, 2e-3, 0.0))  # nobody looks by now
+    servo.on_tactile(8, make_tactile_record(math.nan, 2e-3, 0.0))  # the guard is off
     assert not servo.status.is_fault
-    servo.on_tactile(9, tactile_record(0.0, 2e-3, 0.0))
+    servo.on_tactile(9, make_tactile_record(0.0, 2e-3, 0.0))
     assert servo.status == ArmStatus.GEL_LIMIT
 
 
-def test_no_action_is_followed_on_an_old_observation() -> None:
+def test_servo_old_observation_holds_until_next_command() -> None:
     bench = Bench(action_timeout=60.0, observation_timeout=0.5)
     bench.ask(shifted(bench.at, 0.02))
     bench.run(20)
-    bench.servo.on_tactile(1, tactile_record(bench.time, math.nan, math.nan))
+    bench.servo.on_tactile(1, make_tactile_record(bench.time, math.nan, math.nan))
     bench.run(200)
     assert bench.servo.status == ArmStatus.OK
     bench.run(100)  # 0.6 s without another picture
@@ -174,8 +174,8 @@ def test_no_action_is_followed_on_an_old_observation() -> None:
     bench.ask(shifted(bench.at, 0.02))
     bench.run(100)
     assert np.abs(bench.at.position - held).max() < 1e-5
-    bench.servo.on_tactile(2, tactile_record(bench.time, math.nan, math.nan))
-    bench.run(100)  # it sees again, and does nothing by itself: what was asked meanwhile was decided without seeing
+    bench.servo.on_tactile(2, make_tactile_record(bench.time, math.nan, math.nan))
+    bench.run(100)  # new pictures alone start no motion: the command in between was decided without pictures
     assert bench.servo.status == ArmStatus.HOLD
     assert np.abs(bench.at.position - held).max() < 1e-5
     bench.ask(shifted(bench.at, 0.02))
@@ -186,9 +186,9 @@ def test_no_action_is_followed_on_an_old_observation() -> None:
 
 @pytest.mark.promise(15)
 @pytest.mark.parametrize("moving", [False, True])
-def test_the_first_cause_is_kept_when_the_other_arm_stops_over_it(moving: bool) -> None:
-    """Two arms that watch each other: one feels too much, the other stops because of that one. Neither changes its
-    mind when it sees the other's fault."""
+def test_servo_first_fault_is_kept_when_partner_stops(moving: bool) -> None:
+    """Two arms of one keep-out: one exceeds its force limit, the other stops because of it. Neither changes its
+    status because of the other's fault."""
     bench = Bench(action_timeout=60.0, partners=[Partner("none", 0.05)])
     away = list(bench.at.position + [0.3, 0, 0])
     bench.partners = [other(away)]
@@ -206,26 +206,26 @@ def test_the_first_cause_is_kept_when_the_other_arm_stops_over_it(moving: bool) 
 DROPS: dict[str, Callable[[Bench], None]] = {
     "a newer target": lambda bench: bench.ask(shifted(bench.at, 0.01)),
     "a stop": lambda bench: bench.ask(bench.at, CommandKind.HOLD),
-    "a fault": lambda bench: bench.servo.trip(ArmStatus.GEL_LIMIT),
-    "a controller's stop": lambda bench: bench.servo.trip(ArmStatus.PROTECTIVE_STOP),
-    "time": lambda bench: bench.run(round(ZERO_PATIENCE / PERIOD) + 1),
+    "a fault": lambda bench: bench.servo.enter_fault(ArmStatus.GEL_LIMIT),
+    "a controller's stop": lambda bench: bench.servo.enter_fault(ArmStatus.PROTECTIVE_STOP),
+    "time": lambda bench: bench.run(round(ZERO_REQUEST_TIMEOUT / PERIOD) + 1),
 }
 
 
 @pytest.mark.parametrize("name", DROPS)
-def test_a_wish_to_zero_the_wrench_is_dropped_by_whatever_comes_between(name: str) -> None:
+def test_servo_zero_request_is_dropped_by_later_event(name: str) -> None:
     bench = Bench()
     bench.ask(bench.at, CommandKind.ZERO_WRENCH)
     DROPS[name](bench)
     for _ in range(500):
         bench.run(1)
-        assert not bench.servo.zero_due(bench.time)
+        assert not bench.servo.take_zero_request(bench.time)
 
 
-def test_the_wrench_is_zeroed_once_also_after_too_much_force() -> None:
+def test_servo_zero_request_after_force_limit_is_taken_once() -> None:
     bench = Bench()
     bench.run(2, force=(0.0, 0.0, 40.0, 0.0, 0.0, 0.0))
     assert bench.servo.status == ArmStatus.FORCE_LIMIT
     bench.ask(bench.at, CommandKind.ZERO_WRENCH)
     bench.run(1, force=(0.0, 0.0, 40.0, 0.0, 0.0, 0.0))
-    assert [bench.servo.zero_due(bench.time) for _ in range(3)] == [True, False, False]
+    assert [bench.servo.take_zero_request(bench.time) for _ in range(3)] == [True, False, False]

@@ -59,7 +59,7 @@ def random_pose(random: np.random.Generator, start: Pose) -> Pose:
     ("speed", "low", "lookahead"),
     [(0.05, 0.0, 0.03), (0.1, 0.0, 0.03), (0.1, 0.1, 0.03), (0.1, 0.5, 0.03), (0.1, 0.0, 0.1)],
 )
-def test_with_the_slider_the_arm_stays_within_its_limits(speed: float, low: float, lookahead: float) -> None:
+def test_servo_changed_slider_keeps_arm_limits(speed: float, low: float, lookahead: float) -> None:
     arm = moving(speed=speed, lookahead=lookahead)
     arm.slider = low
     run(arm, 0.6)
@@ -72,16 +72,16 @@ def test_with_the_slider_the_arm_stays_within_its_limits(speed: float, low: floa
 
 
 @pytest.mark.promise(2)
-def test_without_watching_the_slider_it_would_not(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_servo_ignored_slider_breaks_arm_limits(monkeypatch: pytest.MonkeyPatch) -> None:
     """Guards the test above; and an arm that is slowed without a word does not follow."""
     arm = moving()
-    monkeypatch.setattr(arm.servo, "on_scaling", lambda reported: None)
+    monkeypatch.setattr(arm.servo, "on_speed_scaling", lambda reported: None)
     arm.slider = 0.0
     run(arm, 0.5)
     assert arm.servo.status == ArmStatus.NOT_FOLLOWING
     monkeypatch.setattr(arm.servo, "check_following", lambda *seen: None)
     blind = moving()
-    monkeypatch.setattr(blind.servo, "on_scaling", lambda reported: None)
+    monkeypatch.setattr(blind.servo, "on_speed_scaling", lambda reported: None)
     monkeypatch.setattr(blind.servo, "check_following", lambda *seen: None)
     blind.slider = 0.0
     run(blind, 0.5)
@@ -92,7 +92,7 @@ def test_without_watching_the_slider_it_would_not(monkeypatch: pytest.MonkeyPatc
 
 @pytest.mark.promise(2)
 @pytest.mark.parametrize("low", [0.0, 0.1])
-def test_a_fast_arm_speeds_up_within_its_limits_when_the_slider_rises(low: float) -> None:
+def test_servo_rising_slider_keeps_limits_of_fast_arm(low: float) -> None:
     """Its controller slows it down harder than its limit; what comes afterwards is judged."""
     arm = moving(speed=0.3)
     arm.slider = low
@@ -106,7 +106,7 @@ def test_a_fast_arm_speeds_up_within_its_limits_when_the_slider_rises(low: float
 
 @pytest.mark.promise(2)
 @pytest.mark.parametrize("seed", range(2))
-def test_a_slider_that_never_rests(seed: int) -> None:
+def test_servo_random_slider_keeps_limits(seed: int) -> None:
     """Target and scaling rise together at the worst moments, and the margin of the acceleration is larger."""
     random = np.random.default_rng(seed)
     arm = OnController(**WIDE)
@@ -125,7 +125,7 @@ def test_a_slider_that_never_rests(seed: int) -> None:
     ("speed", "acceleration", "lookahead"),
     [(0.02, 0.1, 0.03), (0.05, 0.5, 0.2), (0.1, 0.5, 0.03), (0.1, 10.0, 0.1), (1.0, 10.0, 0.03), (1.0, 2.0, 0.2)],
 )
-def test_an_arm_that_follows_is_no_fault_whatever_is_asked(speed: float, acceleration: float, lookahead: float) -> None:
+def test_servo_following_arm_has_no_fault(speed: float, acceleration: float, lookahead: float) -> None:
     random = np.random.default_rng(1)
     box = Workspace(lower=(0, 0, 0), upper=(1, 1, 1))
     limits = ArmLimits(workspace=box, speed=speed, acceleration=acceleration)
@@ -144,11 +144,11 @@ def test_an_arm_that_follows_is_no_fault_whatever_is_asked(speed: float, acceler
 
 @pytest.mark.promise(7)
 @pytest.mark.parametrize("speed", [0.02, 0.1])
-def test_an_arm_that_is_held_is_a_fault_and_does_not_move_when_it_is_let_go(speed: float) -> None:
+def test_servo_held_arm_is_not_following_and_stands_after_release(speed: float) -> None:
     arm = moving(speed=speed)
     arm.arm.held = True
     run(arm, 0.5 * arm.servo.config.lookahead + arm.servo.config.following_error / speed + 0.02)
-    assert arm.servo.status == ArmStatus.NOT_FOLLOWING and arm.servo.resting
+    assert arm.servo.status == ArmStatus.NOT_FOLLOWING and arm.servo.is_at_rest
     assert arm.servo.motion is not None
     np.testing.assert_allclose(arm.servo.motion.position, arm.at.position, atol=1e-9)  # held where it is
     run(arm, 0.3)
@@ -160,7 +160,7 @@ def test_an_arm_that_is_held_is_a_fault_and_does_not_move_when_it_is_let_go(spee
 
 
 @pytest.mark.promise(7)
-def test_a_joint_that_lags_is_a_fault() -> None:
+def test_servo_lagging_joint_is_not_following() -> None:
     arm = moving()
     arm.arm.servo_rates[0] = 2.0 / 0.2  # it trails by 0.2 s
     run(arm, 0.3)
@@ -172,7 +172,7 @@ def test_a_joint_that_lags_is_a_fault() -> None:
 
 @pytest.mark.promise(7)
 @pytest.mark.parametrize("acceleration", [0.2, 1.4])
-def test_an_arm_at_rest_that_another_program_moves_is_reported_at_once(acceleration: float) -> None:
+def test_servo_other_program_at_rest_is_reported_within_20_ms(acceleration: float) -> None:
     arm = OnController(**WIDE)
     arm.ask(shifted(arm.at, 0.01))
     run(arm, 1.0)
@@ -187,9 +187,8 @@ def test_an_arm_at_rest_that_another_program_moves_is_reported_at_once(accelerat
 
 @pytest.mark.promise(7)
 @pytest.mark.parametrize("joint", [1, 2])
-def test_an_arm_in_motion_that_another_program_moves_elsewhere_does_not_follow(joint: int) -> None:
-    """Without any sign that the program is another one; and once our own target rests, it is told from an arm that is
-    held."""
+def test_servo_other_program_in_motion_is_not_following(joint: int) -> None:
+    """Without a sign of another program in motion; at rest of our own target it is distinguished from a held arm."""
     arm = moving()
     arm.foreign = speedj(arm.arm, 0.3 * np.eye(6)[joint], 4.0, 1.0)
     run(arm, 0.08)

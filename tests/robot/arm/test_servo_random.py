@@ -1,5 +1,5 @@
 """Random lives of a servo: commands good and bad, old packages, stalls, faults, other arms that come and go, pictures
-that stop, a controller's clock that jumps. Whatever happens, no arm moves that should stand still."""
+that stop, a controller's clock that jumps. In all cases an arm that should stand still does not move."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 
-from robot.arm.channel import CommandKind, Partner, command_record, tactile_record
+from robot.arm.channel import CommandKind, Partner, make_command_record, make_tactile_record
 from robot.arm.servo import Servo
 from robot.arm.status import ArmStatus
 from robot.arm.trajectory import PERIOD
@@ -35,7 +35,7 @@ class Life:
         self.arm = OnController(**self.config)
         self.start = self.arm.at
         self.reports, self.exposed = 0, math.nan
-        self.asked = -math.inf  # time of the newest target that may be followed
+        self.asked = -math.inf  # of the newest target that may be followed
         self.fault: ArmStatus | None = None
         self.moved = 0  # periods in which the target moved
         self.seen: set[ArmStatus] = set()
@@ -54,7 +54,7 @@ class Life:
         arm.force = 40.0 if self.chance(2e-3) else 0.0
         known = arm.packages[-1 - min(len(arm.packages) - 1, int(random.integers(0, 4)))]
         servo, before = arm.servo, arm.servo.motion
-        rested = servo.resting
+        rested = servo.is_at_rest
         servo.check_faults(known, arm.partners)
         self._report(known)
         new = self._command()
@@ -62,7 +62,7 @@ class Life:
         self._judge(before, rested, new, joints)
         arm.run(joints)
         assert float(servo.region.excess(arm.packages[-1].sensor[:3, 3])) < 1e-3
-        if servo.status.is_fault and self.chance(0.1):  # somebody recovers it
+        if servo.status.is_fault and self.chance(0.1):  # a person recovers it
             arm.servo = Servo(servo.config, commands_read=arm.number, tactile_read=self.reports)
             arm.joints, self.fault, self.asked, self.exposed = None, None, -math.inf, math.nan
 
@@ -78,7 +78,7 @@ class Life:
             self.reports += 1
             self.exposed = math.nan if self.chance(0.2) else self.arm.time - float(self.random.uniform(0.0, 0.1))
             depth = 2e-3 if self.chance(0.005) else 0.0
-            self.arm.servo.on_tactile(self.reports, tactile_record(self.exposed, depth, 0.0))
+            self.arm.servo.on_tactile(self.reports, make_tactile_record(self.exposed, depth, 0.0))
 
     def _command(self) -> bool:
         """True for a target that may be followed, were it not for the arm's status."""
@@ -93,7 +93,7 @@ class Life:
             pose[random.integers(7)] = random.choice([math.nan, math.inf, 1e300])
         speed = float(random.choice([math.inf, 0.05, 1e-3, 0.0, -1.0, math.nan], p=[0.75, 0.1, 0.06, 0.03, 0.03, 0.03]))
         age = float(random.choice([0.0, 0.05, 0.09, 0.11, 5.0], p=[0.8, 0.05, 0.05, 0.05, 0.05]))
-        arm.servo.on_command(arm.number, command_record(arm.time - age, CommandKind(int(kind)), pose, speed))
+        arm.servo.on_command(arm.number, make_command_record(arm.time - age, CommandKind(int(kind)), pose, speed))
         stands = arm.servo.status.is_fault or arm.servo.status == ArmStatus.WAITING
         if kind != CommandKind.TARGET or spoilt or not speed > 0.0:
             self.asked = -math.inf
@@ -119,7 +119,7 @@ class Life:
             self.fault = status
             return
         assert self.fault is None
-        # Nothing is followed that is old, or that was asked without being seen.
+        # Old targets, and targets without an observation, are not followed.
         blind = arm.time - self.exposed > OBSERVATION_TIMEOUT
         if blind or status == ArmStatus.WAITING:
             self.asked = -math.inf
@@ -143,7 +143,7 @@ class Life:
 
 @pytest.mark.promise(1, 2, 5)
 @pytest.mark.parametrize("seed", [*range(3), *(pytest.param(seed, marks=pytest.mark.deep) for seed in range(3, 20))])
-def test_whatever_happens_no_arm_moves_that_should_stand(seed: int) -> None:
+def test_servo_random_events_keep_stopped_arm_at_rest(seed: int) -> None:
     life = Life(seed)
     for _ in range(2000):
         life.period()

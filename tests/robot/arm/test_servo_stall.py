@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from robot.arm.channel import Partner
-from robot.arm.servo import STALL_PATIENCE
+from robot.arm.servo import MAX_STALL_PERIODS
 from robot.arm.status import ArmStatus
 from robot.arm.trajectory import PERIOD
-from robot.arm.worker import BLIND
+from robot.arm.worker import MAX_MISSED_PACKAGES
 from robot.common.kinematics import rotation
 from tacsim import pose as se3
 from tests.robot.arm.servo_bench import OnController, shifted
@@ -67,36 +67,34 @@ def shares(arm: OnController) -> tuple[float, float]:
     ("speed", "acceleration", "lookahead", "late"),
     [(0.1, 0.5, 0.03, 1), (0.1, 0.5, 0.03, 3), (0.02, 0.2, 0.03, 0), (0.1, 1.0, 0.1, 1)],
 )
-def test_after_a_stall_the_arm_goes_on_within_its_limits(
-    speed: float, acceleration: float, lookahead: float, late: int
-) -> None:
+def test_servo_after_stall_keeps_limits(speed: float, acceleration: float, lookahead: float, late: int) -> None:
     arm = moving(speed=speed, acceleration=acceleration, lookahead=lookahead)
     for stall, backlog in zip(STALLS, (0, 1, 2, 3, 3), strict=True):
         arm.stall(stall)
         for old in range(backlog):  # packages from before the stall come first
             arm.period(late=stall + old + late)
-        at_full_speed(arm, late)  # it goes on
+        at_full_speed(arm, late)  # it continues
     assert shares(arm)[0] <= 1.01
     assert shares(arm)[1] <= 1.03
 
 
-def test_without_the_restart_it_would_not(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_servo_after_stall_without_restart_breaks_limits(monkeypatch: pytest.MonkeyPatch) -> None:
     """Guards the test above."""
     arm = moving()
-    monkeypatch.setattr(arm.servo, "_waits_for_package", lambda time, measured: False)
+    monkeypatch.setattr(arm.servo, "_is_waiting_for_package", lambda time, measured: False)
     arm.stall(40)
     for _ in range(50):
         arm.period()
     assert shares(arm)[1] > 3.0
 
 
-def test_a_stall_without_news_goes_on_from_rest_after_a_while() -> None:
-    """The controller's clock has jumped back meanwhile: no package seems to be from after the stall."""
+def test_servo_stall_without_package_restarts_from_rest() -> None:
+    """The controller's clock has jumped back in between: no package seems to be newer than the stall."""
     arm = moving()
     arm.jump = -100 * PERIOD
     arm.stall(20)
     target = arm.joints
-    for _ in range(STALL_PATIENCE - 1):
+    for _ in range(MAX_STALL_PERIODS - 1):
         arm.period()
         assert arm.joints is target
     for _ in range(500):
@@ -109,14 +107,14 @@ def way_after_a_fault(speed: float, stalls: tuple[int, ...] = ()) -> tuple[float
     """How far the arm goes after a fault at `speed` [m/s], and its top speed once it has been braked [m/s]."""
     arm = moving(speed=speed, acceleration=3.0)
     begun, count = arm.at.position, len(arm.twists)
-    arm.servo.trip(ArmStatus.FORCE_LIMIT)
+    arm.servo.enter_fault(ArmStatus.FORCE_LIMIT)
     arm.period(late=0)  # it begins to brake
     for length in stalls:
         arm.stall(length)
         arm.period()
     for _ in range(150):
         arm.period()
-    assert arm.servo.resting
+    assert arm.servo.is_at_rest
     assert np.linalg.norm(arm.twists[-1][:3]) < 1e-4
     gone = max(float(np.linalg.norm(package.sensor[:3, 3] - begun)) for package in arm.packages[count:])
     return gone, float(np.linalg.norm(np.array(arm.twists)[count + 15 :, :3], axis=1).max())
@@ -124,7 +122,7 @@ def way_after_a_fault(speed: float, stalls: tuple[int, ...] = ()) -> tuple[float
 
 @pytest.mark.promise(3)
 @pytest.mark.parametrize("speed", [0.05, 0.1, 0.3])
-def test_an_arm_in_a_fault_is_not_drawn_on(speed: float) -> None:
+def test_servo_fault_does_not_pull_arm_on(speed: float) -> None:
     """A target that brakes far ahead of an arm that stands already would make it move again; so would one that went on
     at its old speed after a stall."""
     way, later = way_after_a_fault(speed)
@@ -144,21 +142,21 @@ def way_back(arm: OnController, silent: int, fault: int, backlog: int = 0) -> fl
         if k == fault:
             arm.partners = [None]
         arm.servo.check_faults(old, arm.partners)
-        loop_goes_on = k < BLIND or k >= silent
+        loop_goes_on = k < MAX_MISSED_PACKAGES or k >= silent
         arm.run(arm.servo.step(arm.time, old, arm.partners) if loop_goes_on else None)
     arm.partners = [None]
     for _ in range(300):
         arm.period()
-    assert arm.servo.status == ArmStatus.PARTNER_STOPPED and arm.servo.resting
+    assert arm.servo.status == ArmStatus.PARTNER_STOPPED and arm.servo.is_at_rest
     along = np.array([package.sensor[1, 3] for package in arm.packages[begin:]])
     return float(along.max() - along[-1])
 
 
 @pytest.mark.promise(3)
 @pytest.mark.parametrize(("speed", "lookahead"), [(0.1, 0.03), (0.1, 0.1), (0.3, 0.03)])
-def test_a_fault_found_on_an_old_package_does_not_draw_the_arm_back(speed: float, lookahead: float) -> None:
-    """The arm has gone on since that package: to where it was then is a way back. (An arm that is stopped as hard as it
-    can swings back a little, with fresh packages too.)"""
+def test_servo_fault_on_old_package_does_not_pull_arm_back(speed: float, lookahead: float) -> None:
+    """The arm has gone on since that package: to where it was then would lead back. (An arm that is stopped as hard as
+    it can swings back a little, with fresh packages too.)"""
     changes = {"speed": speed, "lookahead": lookahead, "acceleration": 2.0, "partners": [Partner(-1, 0.05)]}
     usual = way_back(moving(**changes), 0, 0)
     for silent, fault, backlog in (
@@ -174,7 +172,7 @@ def test_a_fault_found_on_an_old_package_does_not_draw_the_arm_back(speed: float
         assert back <= usual + 0.2e-3, (silent, fault, backlog)
 
 
-def test_after_a_fault_without_news_the_arm_is_led_nowhere() -> None:
+def test_servo_fault_without_package_stands() -> None:
     """No package from after the missed periods comes at all."""
     arm = moving(partners=[Partner(-1, 0.05)])
     old = len(arm.packages) - 1
@@ -182,12 +180,12 @@ def test_after_a_fault_without_news_the_arm_is_led_nowhere() -> None:
     assert arm.packages[-1].sensor[1, 3] > arm.packages[old].sensor[1, 3]
 
 
-def test_what_could_not_be_sent_is_taken_back() -> None:
+def test_servo_undo_last_step_restores_state() -> None:
     arm = moving()
     before = arm.servo.motion
     arm.servo.step(arm.time, arm.packages[-1], [])
     assert arm.servo.motion is not before
-    arm.servo.withdraw()
+    arm.servo.undo_last_step()
     assert arm.servo.motion is before
     arm.stall(40)  # it was suspended in between
     for _ in range(300):
@@ -197,7 +195,7 @@ def test_what_could_not_be_sent_is_taken_back() -> None:
 
 @pytest.mark.promise(1, 2)
 @pytest.mark.parametrize("seed", range(3))
-def test_random_ways_with_random_stalls_stay_within_the_limits(seed: int) -> None:
+def test_servo_random_paths_and_stalls_keep_limits(seed: int) -> None:
     random = np.random.default_rng(seed)
     arm = OnController(action_timeout=60.0)
     start = arm.at
@@ -217,9 +215,7 @@ def test_random_ways_with_random_stalls_stay_within_the_limits(seed: int) -> Non
 
 @pytest.mark.promise(5)
 @pytest.mark.parametrize(("speed", "acceleration"), [(0.1, 0.5), (0.02, 0.2), (0.05, 0.5)])
-def test_after_the_last_action_the_arm_goes_no_farther_than_its_time_out_allows(
-    speed: float, acceleration: float
-) -> None:
+def test_arm_after_last_action_stops_within_timeout_distance(speed: float, acceleration: float) -> None:
     """And a policy that keeps its control period, half of the time-out, is not slowed down by that."""
     arm = OnController(
         lower=[-1.0, -1.0, 0.0], upper=[1.0, 1.0, 1.5], speed=speed, acceleration=acceleration, action_timeout=0.2
@@ -243,7 +239,7 @@ def test_after_the_last_action_the_arm_goes_no_farther_than_its_time_out_allows(
 
 @pytest.mark.promise(2)
 @pytest.mark.parametrize("late", [0, 5, 20, 40])
-def test_a_package_from_before_a_short_motion_does_not_move_the_held_target(late: int) -> None:
+def test_servo_package_before_short_motion_keeps_held_target(late: int) -> None:
     """Ten periods towards a goal, then a hold: the target has come to rest 1 mm on while the newest package shows the
     arm at rest where it began. The next goal begins at the target; a step back would be a speed of 0.5 m/s."""
     arm = OnController(action_timeout=60.0, speed=0.5, acceleration=5.0)

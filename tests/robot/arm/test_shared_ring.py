@@ -21,7 +21,7 @@ ROOT = str(Path(shared_ring.__file__).parents[2])
 
 @pytest.fixture
 def segment() -> shared_ring.Segment:
-    return shared_ring.create(shared_ring.Ring.size(RECORD, 8))
+    return shared_ring.create_segment(shared_ring.Ring.size(RECORD, 8))
 
 
 def record(value: float) -> shared_ring.Record:
@@ -42,7 +42,7 @@ def child(code: str, segment: shared_ring.Segment, *arguments: str) -> subproces
     )
 
 
-def test_records_in_order_and_the_past_that_fits(segment: shared_ring.Segment) -> None:
+def test_ring_records_keep_order_and_last_slots(segment: shared_ring.Segment) -> None:
     ring = shared_ring.Ring(segment.memory, RECORD, 8)
     assert ring.latest() is None
     assert len(ring.recent(100)) == 0
@@ -58,7 +58,7 @@ def test_records_in_order_and_the_past_that_fits(segment: shared_ring.Segment) -
 
 
 @pytest.mark.promise(10)
-def test_no_torn_read_in_a_hundred_thousand(segment: shared_ring.Segment) -> None:
+def test_ring_100000_reads_have_no_torn_record(segment: shared_ring.Segment) -> None:
     """Another process writes as fast as it can; every copy here is of one record."""
     writer = child(
         """
@@ -107,10 +107,10 @@ def descriptors() -> list[str]:
 
 
 @pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="looks at open files as Linux shows them")
-def test_it_is_gone_with_the_last_who_holds_it_however_that_one_ended() -> None:
+def test_segment_is_freed_with_last_process() -> None:
     """There is no file: nothing to find for others, nothing to be squatted, nothing that a kill could leave."""
     before = descriptors()
-    segment = shared_ring.create(shared_ring.Ring.size(RECORD, 8))
+    segment = shared_ring.create_segment(shared_ring.Ring.size(RECORD, 8))
     ring = shared_ring.Ring(segment.memory, RECORD, 8)
     ring.write(record(7.0))
     assert all(path.endswith("(deleted)") for path in set(descriptors()) - set(before))
@@ -129,13 +129,13 @@ def test_it_is_gone_with_the_last_who_holds_it_however_that_one_ended() -> None:
     assert descriptors() == before
 
 
-def test_a_child_has_it_also_where_this_program_was_started_without_standard_streams() -> None:
+def test_segment_without_standard_streams_reaches_child() -> None:
     """Else it would get one of their numbers, and the child a pipe by that number."""
     code = """
     import os
     os.closerange(0, 3)
     from robot.arm import shared_ring
-    os._exit(shared_ring.create(64).descriptor)
+    os._exit(shared_ring.create_segment(64).descriptor)
     """
     done = subprocess.run([sys.executable, "-c", textwrap.dedent(code)], env={**os.environ, "PYTHONPATH": ROOT})
     assert done.returncode >= 3

@@ -28,7 +28,7 @@ def away() -> UrArmConfig:
 
 
 def test_an_arm_outside_its_box_goes_to_its_start_and_nowhere_else(mock: MockUR) -> None:
-    with pytest.raises(SafetyViolation, match=r"outside its workspace.*`tacsim start FILE` leads it"):
+    with pytest.raises(SafetyViolation, match=r"outside its workspace.*`tacsim start FILE` moves it"):
         URArm(away(), "left")
     here, before = np.array(mock.faults.state().joints), mock.faults.received().last
     with StartArm(away(), "left", here, here + TURN) as arm:
@@ -51,7 +51,7 @@ def test_an_arm_outside_its_box_goes_to_its_start_and_nowhere_else(mock: MockUR)
 
 def test_an_arm_that_stands_off_its_way_is_refused(mock: MockUR) -> None:
     here = np.array(mock.faults.state().joints) + [0.0, 0.1, 0.0, 0.0, 0.0, 0.0]
-    with pytest.raises(SafetyViolation, match="left its way to the start"):
+    with pytest.raises(SafetyViolation, match="left its path to the start"):
         StartArm(away(), "left", here, here + TURN)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from robot.arm.channel import STATE, CommandKind, Partner, command_record
+from robot.arm.channel import STATE, CommandKind, Partner, make_command_record
 from robot.arm.start_servo import JOINT_SPEED, OFF_WAY, distance_from_way
 from robot.arm.status import ArmStatus
 from robot.arm.trajectory import PERIOD
@@ -16,7 +16,7 @@ END = HOME + [0.3, -0.1, 0.2, 0.0, 0.1, -0.2]
 
 
 def bench(**changes: object) -> Bench:
-    made = Bench(**{**FAR, "way": [HOME.tolist(), END.tolist()], **changes})
+    made = Bench(**{**FAR, "start_path": [HOME.tolist(), END.tolist()], **changes})
     made.run(1)
     return made
 
@@ -25,7 +25,9 @@ def go(made: Bench, share: float, periods: int) -> None:
     """As a driver does, every tenth of a second."""
     for _ in range(periods // 50):
         made.number += 1
-        made.servo.on_command(made.number, command_record(made.time, CommandKind.GO_ON, share=share))
+        made.servo.on_command(
+            made.number, make_command_record(made.time, CommandKind.CONTINUE_TO_START, fraction=share)
+        )
         made.run(50)
 
 
@@ -33,9 +35,9 @@ def test_it_reaches_its_start_straight_and_slowly_from_outside_its_box() -> None
     made = bench()
     assert made.servo.status == ArmStatus.HOLD and not made.sent
     go(made, 0.1, 1000)
-    assert np.abs(made.q - (HOME + 0.1 * (END - HOME))).max() < 1e-4 and made.servo.resting
+    assert np.abs(made.q - (HOME + 0.1 * (END - HOME))).max() < 1e-4 and made.servo.is_at_rest
     go(made, 1.0, 4000)
-    assert np.array_equal(made.sent[-1], END) and made.servo.resting and made.servo.status == ArmStatus.OK
+    assert np.array_equal(made.sent[-1], END) and made.servo.is_at_rest and made.servo.status == ArmStatus.OK
     sent = np.array(made.sent)
     rates = np.diff(sent, axis=0) / PERIOD
     assert np.abs(rates).max() <= JOINT_SPEED
@@ -58,7 +60,7 @@ def test_it_brakes_when_nobody_repeats_the_command() -> None:
     made = bench()
     go(made, 1.0, 500)
     made.run(400)
-    assert made.servo.resting and made.servo.status == ArmStatus.HOLD
+    assert made.servo.is_at_rest and made.servo.status == ArmStatus.HOLD
     stood = made.q.copy()
     made.run(400)
     assert np.abs(made.q - stood).max() < 1e-9 and np.abs(END - stood).max() > 0.1
@@ -70,7 +72,7 @@ def test_hold_brakes_within_the_limits_at_once() -> None:
     before = len(made.sent)
     made.ask(np.zeros(7), CommandKind.HOLD)
     made.run(200)
-    assert made.servo.resting
+    assert made.servo.is_at_rest
     rates = np.linalg.norm(np.diff(np.array(made.sent[before - 1 :]), axis=0), axis=1)
     assert (np.diff(rates) <= 1e-12).all()  # ever slower
 
@@ -99,7 +101,7 @@ def test_an_arm_off_its_way_is_stopped() -> None:
     made.q = made.q + [0.0, 0.0, 0.0, 1.5 * OFF_WAY, 0.0, 0.0]
     made.look()
     made.run(1)
-    assert made.servo.status == ArmStatus.OFF_WAY
+    assert made.servo.status == ArmStatus.OFF_PATH
     made.run(300)
     stood = made.q.copy()
     go(made, 1.0, 300)
@@ -115,7 +117,7 @@ def test_a_force_beyond_its_limit_stops_it() -> None:
     made.run(300)
     stood = made.q.copy()
     go(made, 1.0, 300)
-    assert made.servo.resting and np.abs(made.q - stood).max() < 1e-9
+    assert made.servo.is_at_rest and np.abs(made.q - stood).max() < 1e-9
 
 
 def test_it_waits_for_an_arm_that_lags() -> None:
@@ -123,7 +125,7 @@ def test_it_waits_for_an_arm_that_lags() -> None:
     made = bench()
     for _ in range(40):
         made.number += 1
-        made.servo.on_command(made.number, command_record(made.time, CommandKind.GO_ON, share=1.0))
+        made.servo.on_command(made.number, make_command_record(made.time, CommandKind.CONTINUE_TO_START, fraction=1.0))
         for _ in range(25):
             made.time += PERIOD
             made.servo.check_faults(made.now, [])
@@ -144,7 +146,7 @@ def test_what_was_asked_before_it_waited_is_forgotten() -> None:
         made.partners = [None] if not asked_first else made.partners
         made.run(1)
         made.number += 1
-        made.servo.on_command(made.number, command_record(made.time, CommandKind.GO_ON, share=1.0))
+        made.servo.on_command(made.number, make_command_record(made.time, CommandKind.CONTINUE_TO_START, fraction=1.0))
         made.partners = [None]
         made.servo.check_faults(made.now, made.partners)
         assert made.servo.status == ArmStatus.WAITING
@@ -153,7 +155,7 @@ def test_what_was_asked_before_it_waited_is_forgotten() -> None:
         assert not made.sent and made.servo.status == ArmStatus.HOLD
 
 
-@pytest.mark.parametrize("status", [ArmStatus.PARTNER_STOPPED, ArmStatus.OFF_WAY])
+@pytest.mark.parametrize("status", [ArmStatus.PARTNER_STOPPED, ArmStatus.OFF_PATH])
 def test_a_fault_found_on_an_old_package_does_not_draw_it_back(status: ArmStatus) -> None:
     made = bench(speed=0.1)
     go(made, 1.0, 500)
@@ -162,7 +164,7 @@ def test_a_fault_found_on_an_old_package_does_not_draw_it_back(status: ArmStatus
         made.q = made.q + 0.2 * (made.sent[-1] - made.q)
         made.time += PERIOD
         made.look()
-    made.servo.trip(status)
+    made.servo.enter_fault(status)
     there = made.q.copy()
     for _ in range(3):
         made.time += PERIOD
@@ -170,14 +172,14 @@ def test_a_fault_found_on_an_old_package_does_not_draw_it_back(status: ArmStatus
         assert joints is made.sent[-1]
     made.look()
     made.run(200)
-    assert made.servo.resting and (made.q - there) @ (END - HOME) > -1e-6
+    assert made.servo.is_at_rest and (made.q - there) @ (END - HOME) > -1e-6
 
 
 def test_it_stops_before_the_other_arm() -> None:
     made = bench(partners=[Partner(-1, 0.05)])
     other = np.zeros((), STATE)
     other["status"] = ArmStatus.HOLD
-    ahead = Bench(**{**FAR, "way": [HOME.tolist(), END.tolist()]})
+    ahead = Bench(**{**FAR, "start_path": [HOME.tolist(), END.tolist()]})
     go(ahead, 1.0, 4000)
     other["position"] = other["stopping_point"] = ahead.path()[-1]
     made.partners = [other]

@@ -28,7 +28,7 @@ def states(times: np.ndarray | list[float]) -> list[ArmState]:
     return [state(float(time)) for time in times]
 
 
-def test_between_two_states_all_of_it_is_exact() -> None:
+def test_state_at_between_two_states_interpolates_exactly() -> None:
     made = states(np.arange(0.0, 1.0, 0.02))
     for time in (0.001, 0.5031, 0.9799):
         found, error = state_at(time, made, "left")
@@ -41,13 +41,13 @@ def test_between_two_states_all_of_it_is_exact() -> None:
         assert error == pytest.approx(min(time % 0.02, 0.02 - time % 0.02))
 
 
-def test_at_a_state_it_is_that_state() -> None:
+def test_state_at_time_of_state_returns_it() -> None:
     made = states([0.0, 0.01, 0.02])
     for each in made:
         assert state_at(each.time, made, "left") == (each, 0.0)
 
 
-def test_turns_take_the_shorter_way() -> None:
+def test_state_at_rotation_takes_shorter_path() -> None:
     still = np.zeros(6)
     made = [
         ArmState(Pose(np.zeros(3), np.array(quaternion)), still, still, None, time)
@@ -57,18 +57,18 @@ def test_turns_take_the_shorter_way() -> None:
     np.testing.assert_allclose(turned, [0, 0, 0.1], atol=1e-9)
 
 
-def test_extrapolated_with_its_twist_and_no_further_than_the_reach() -> None:
+def test_state_at_after_newest_extrapolates_to_limit() -> None:
     made = states([0.0, 0.01])
-    found, error = state_at(0.018, made, "left", reach=0.01)
+    found, error = state_at(0.018, made, "left", max_extrapolation=0.01)
     shift, angle = se3.pose_distance(found.pose, state(0.018).pose)
     assert shift < 1e-12 and angle < 1e-7 and error == pytest.approx(0.008)
     with pytest.raises(NotAligned, match=r"10\.5 ms after its newest state, limit 10\.0 ms"):
-        state_at(0.0205, made, "left", reach=0.01)
+        state_at(0.0205, made, "left", max_extrapolation=0.01)
     with pytest.raises(NotAligned):
         state_at(float("nan"), made, "left")
 
 
-def test_refuses_what_it_cannot_know() -> None:
+def test_state_at_unknown_time_raises() -> None:
     with pytest.raises(NotAligned, match="no state yet"):
         state_at(0.0, [], "left")
     made = states([1.0, 1.01, 1.2])
@@ -80,7 +80,7 @@ def test_refuses_what_it_cannot_know() -> None:
 
 
 @pytest.mark.promise(10)
-def test_injected_latencies_leave_less_than_a_millisecond_of_motion() -> None:
+def test_state_at_injected_latency_error_below_one_millisecond() -> None:
     """Promise 10: camera 125 ms late, arm 10 ms late, both jittering; times of arrival minus latency find the pose."""
     rng = np.random.default_rng(0)
     table = {"camera": 0.125, "arm": 0.010}

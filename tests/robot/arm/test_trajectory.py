@@ -1,4 +1,4 @@
-"""Each pose that is sent obeys the limits exactly; the end is met, from any motion, and walls hold."""
+"""Each sent pose keeps the limits exactly; the target is reached from any motion, and walls hold."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from hypothesis import strategies as st
 from robot.arm.trajectory import (
     PERIOD,
     MotionState,
-    braking,
-    landing_speed,
-    resting,
+    find_stopping_point,
+    max_landing_speed,
+    motion_at_rest,
+    step_braking,
+    step_towards,
     stopping_distance,
-    stopping_point,
-    towards,
 )
 from robot.common.kinematics import rotation, rotation_vector
 from tacsim.limits import box_region
@@ -36,7 +36,7 @@ rates = st.builds(
 
 
 def stays_inside(limits: SimpleNamespace) -> Callable[[MotionState], bool]:
-    return lambda motion: bool(BOX.excess(stopping_point(motion, limits.acceleration)) <= 1e-9)
+    return lambda motion: bool(BOX.excess(find_stopping_point(motion, limits.acceleration)) <= 1e-9)
 
 
 def check_step(before: MotionState, after: MotionState, limits: SimpleNamespace) -> None:
@@ -56,21 +56,21 @@ def drive(
     """Up to `steps` periods towards a target, or until it is reached at rest."""
     path = [motion]
     for _ in range(steps):
-        path.append(towards(path[-1], position, rotation(turn), limits, stays_inside(limits)))
+        path.append(step_towards(path[-1], position, rotation(turn), limits, stays_inside(limits)))
         check_step(path[-2], path[-1], limits)
-        if path[-1].at_rest and (path[-1].position == position).all():
+        if path[-1].is_at_rest and (path[-1].position == position).all():
             break
     return path
 
 
 @settings(deadline=None, max_examples=30)
 @given(inside, inside, turns, rates)
-def test_from_rest_straight_to_the_end_without_overshoot(
+def test_step_towards_from_rest_reaches_target_without_overshoot(
     start: np.ndarray, end: np.ndarray, turn: np.ndarray, limits: SimpleNamespace
 ) -> None:
     quick = SimpleNamespace(**{**vars(limits), "speed": max(limits.speed, 0.05), "turn_rate": 3.0})
-    path = drive(resting(start, np.eye(3)), end, turn, quick, 20_000)
-    assert (path[-1].position == end).all() and path[-1].at_rest
+    path = drive(motion_at_rest(start, np.eye(3)), end, turn, quick, 20_000)
+    assert (path[-1].position == end).all() and path[-1].is_at_rest
     assert np.allclose(path[-1].rotation, rotation(turn), atol=1e-12)
     way = end - start
     length = np.linalg.norm(way)
@@ -88,10 +88,10 @@ def test_from_rest_straight_to_the_end_without_overshoot(
 @pytest.mark.promise(2)
 @settings(deadline=None, max_examples=30)
 @given(inside, st.lists(st.tuples(inside, turns, st.integers(1, 120)), min_size=2, max_size=8), rates)
-def test_targets_that_change_on_the_way_never_lead_outside(
+def test_step_towards_changing_target_stays_inside(
     start: np.ndarray, targets: list[tuple[np.ndarray, np.ndarray, int]], limits: SimpleNamespace
 ) -> None:
-    motion = resting(start, np.eye(3))
+    motion = motion_at_rest(start, np.eye(3))
     for position, turn, steps in targets:
         for each in drive(motion, position, turn, limits, steps)[1:]:
             motion = each
@@ -104,24 +104,24 @@ def test_targets_that_change_on_the_way_never_lead_outside(
         assert (motion.position == position).all()
 
 
-def test_without_the_wall_the_same_motion_would_leave_the_box() -> None:
+def test_step_towards_without_wall_leaves_box() -> None:
     """Guards the test above: a turn at full speed close to a wall bulges out unless it is braked first."""
     limits = SimpleNamespace(speed=0.2, acceleration=0.5, turn_rate=1.0, turn_acceleration=5.0)
     worst = {True: -1.0, False: -1.0}
     for guarded in worst:
-        motion = resting(np.array([0.0, 0.0, 0.0]), np.eye(3))
+        motion = motion_at_rest(np.array([0.0, 0.0, 0.0]), np.eye(3))
         for k in range(2000):
             target = np.array([0.0, 0.0, -0.1]) if k < 280 else np.array([0.1, 0.1, -0.1])
             admissible = stays_inside(limits) if guarded else None
-            motion = towards(motion, target, np.eye(3), limits, admissible)
+            motion = step_towards(motion, target, np.eye(3), limits, admissible)
             worst[guarded] = max(worst[guarded], float(BOX.excess(motion.position)))
     assert worst[True] <= 1e-9
     assert worst[False] > 1e-4
 
 
 @given(st.floats(1e-9, 1.0), st.floats(0.01, 20.0))
-def test_landing_speed_stops_exactly_there(distance: float, acceleration: float) -> None:
-    speed, covered, slowing = landing_speed(distance, acceleration), 0.0, acceleration * PERIOD
+def test_max_landing_speed_stops_exactly_at_distance(distance: float, acceleration: float) -> None:
+    speed, covered, slowing = max_landing_speed(distance, acceleration), 0.0, acceleration * PERIOD
     while speed > 1e-12:
         covered += speed * PERIOD
         speed -= slowing
@@ -131,16 +131,16 @@ def test_landing_speed_stops_exactly_there(distance: float, acceleration: float)
 
 @settings(deadline=None, max_examples=30)
 @given(st.floats(0.0, 1.0), st.floats(0.05, 10.0), st.floats(0.0, 3.0))
-def test_braking_comes_to_rest_where_it_said(speed: float, deceleration: float, spin: float) -> None:
+def test_step_braking_stops_at_stopping_point(speed: float, deceleration: float, spin: float) -> None:
     limits = SimpleNamespace(speed=1.0, acceleration=deceleration, turn_rate=3.0, turn_acceleration=5.0)
     motion = MotionState(np.zeros(3), np.eye(3), np.array([0.0, 0.6, 0.8]) * speed, np.array([spin, 0.0, 0.0]))
-    promised = stopping_point(motion, deceleration)
+    promised = find_stopping_point(motion, deceleration)
     assert stopping_distance(speed, deceleration) <= speed**2 / (2 * deceleration) + 1e-12
     for _ in range(20_000):
-        before, motion = motion, braking(motion, deceleration, 5.0)
+        before, motion = motion, step_braking(motion, deceleration, 5.0)
         check_step(before, motion, limits)
-        assert np.allclose(stopping_point(motion, deceleration), promised, atol=1e-9)
-        if motion.at_rest:
+        assert np.allclose(find_stopping_point(motion, deceleration), promised, atol=1e-9)
+        if motion.is_at_rest:
             break
-    assert motion.at_rest
+    assert motion.is_at_rest
     assert np.allclose(motion.position, promised, atol=1e-9)

@@ -45,7 +45,7 @@ from tests.robot.waiting import until
 
 
 @pytest.mark.promise(3)
-def test_force_limit_stops_in_the_period_of_its_package(mock: MockUR, measuring: bool, figure: Record) -> None:
+def test_arm_force_limit_stops_in_same_period(mock: MockUR, measuring: bool, figure: Record) -> None:
     stiffness, limit, speed = 2000.0, 20.0, 0.05
     with URArm(config(realtime=measuring, limits={"force": limit, "speed": speed}), "left") as arm:
         start, state = arm.state().pose, mock.faults.state()
@@ -79,7 +79,7 @@ def test_force_limit_stops_in_the_period_of_its_package(mock: MockUR, measuring:
         jump = int(np.argmax(np.diff(height)))  # where the target is led back to the arm
         assert (height[jump + 1 :] >= lowest_led_back - 1e-5).all()
         assert felt.max() <= float(np.linalg.norm(first["tcp_force"][:3])) + stiffness * speed * 0.2  # ten times 20 ms
-        with pytest.raises(SafetyViolation, match=r"felt more than limits.force.* of 20 N"):
+        with pytest.raises(SafetyViolation, match=r"exceeded limits.force.* of 20 N"):
             arm.command(start)
         assert mock.faults.state().program  # the controller itself saw nothing wrong
         mock.faults.no_wall()
@@ -88,7 +88,7 @@ def test_force_limit_stops_in_the_period_of_its_package(mock: MockUR, measuring:
         go(arm, start)
 
 
-def test_a_gel_pressed_too_far_stops_the_arm_that_presses_it(mock: MockUR) -> None:
+def test_arm_gel_limit_stops_pressing_arm(mock: MockUR) -> None:
     with URArm(config(limits={"depth": 1e-3, "speed": 0.05}), "left") as arm:
         start = arm.state().pose
         arm.report_tactile(GelReading(time.monotonic(), depth=0.9e-3))
@@ -107,7 +107,7 @@ def test_a_gel_pressed_too_far_stops_the_arm_that_presses_it(mock: MockUR) -> No
         go(arm, start)  # what the last worker was shown is not held against this one
 
 
-def test_an_arm_whose_sensors_are_not_seen_any_more_stands(mock: MockUR) -> None:
+def test_arm_without_new_observation_holds(mock: MockUR) -> None:
     with URArm(config(observation_timeout=0.5), "left") as arm:
         start = arm.state().pose
         far = moved(start, x=0.12)
@@ -119,14 +119,14 @@ def test_an_arm_whose_sensors_are_not_seen_any_more_stands(mock: MockUR) -> None
 
         until(under_way, "motion", pause=0.02)
         until(lambda: arm.status() == ArmStatus.OBSERVATION_STALE, "blind")
-        until(arm.at_rest, "rest")
+        until(arm.is_at_rest, "rest")
         held = arm.state().pose
         assert se3.pose_distance(start, held)[0] < 0.1
-        arm.command(far)  # asked again, but nobody has seen anything since
+        arm.command(far)  # commanded again, without a new observation
         since = mock.faults.received().last
         until(lambda: len(servo_targets(mock.faults.received(since).entries)) > 50, "held targets")
         assert np.ptp(servo_targets(mock.faults.received(since).entries), axis=0).max() < 1e-9
-        arm.report_tactile(None)  # nobody looks by now: the rule ends
+        arm.report_tactile(None)  # the guard is off
         go(arm, far)
 
 
@@ -134,7 +134,7 @@ def test_an_arm_whose_sensors_are_not_seen_any_more_stands(mock: MockUR) -> None
 
 
 @pytest.mark.promise(5)
-def test_without_actions_the_arm_holds_and_goes_on_from_there(mock: MockUR, measuring: bool, figure: Record) -> None:
+def test_arm_without_action_holds_and_continues(mock: MockUR, measuring: bool, figure: Record) -> None:
     timeout = 0.2 if measuring else 0.3
     with URArm(config(realtime=measuring, action_timeout=timeout), "left") as arm:
         start, limits = arm.state().pose, arm.config.limits
@@ -144,9 +144,9 @@ def test_without_actions_the_arm_holds_and_goes_on_from_there(mock: MockUR, meas
         seen = records(arm)
         held_at = seen[(seen["status"] == ArmStatus.HOLD) & (seen["written"] > asked + 0.5 * timeout)][0]["written"]
         figure("hold told after the last action (time-out 200 ms)", 1e3 * float(held_at - asked), "ms", at_most=210)
-        until(arm.at_rest, "rest")
+        until(arm.is_at_rest, "rest")
         held = arm.state().pose
-        assert 2e-3 < se3.pose_distance(start, held)[0] < 0.1  # stopped on the way
+        assert 2e-3 < se3.pose_distance(start, held)[0] < 0.1  # stopped on its path
         since = mock.faults.received().last
         until(lambda: len(servo_targets(mock.faults.received(since).entries)) > 20, "held targets")
         assert np.ptp(servo_targets(mock.faults.received(since).entries), axis=0).max() < 1e-12
@@ -162,9 +162,7 @@ def test_without_actions_the_arm_holds_and_goes_on_from_there(mock: MockUR, meas
 
 
 @pytest.mark.promise(5)
-def test_after_the_last_action_the_arm_goes_no_farther_than_its_time_out_allows(
-    mock: MockUR, measuring: bool, figure: Record
-) -> None:
+def test_arm_after_last_action_stops_within_timeout_distance(mock: MockUR, measuring: bool, figure: Record) -> None:
     """A policy that hangs in full motion, its target far away."""
     timeout = 0.2 if measuring else 0.3
     with URArm(config(realtime=measuring, action_timeout=timeout), "left") as arm:
@@ -178,7 +176,7 @@ def test_after_the_last_action_the_arm_goes_no_farther_than_its_time_out_allows(
         until(under_way, "motion", pause=0.02)
         asked = arm._channel.commands.count
         until(lambda: arm.status() == ArmStatus.HOLD, "hold")
-        until(arm.at_rest, "rest")
+        until(arm.is_at_rest, "rest")
         seen = records(arm)
         last = seen[seen["commands_read"] == asked][0]
         gone = float(np.linalg.norm(arm.state().pose.position - last["position"]))
@@ -193,7 +191,7 @@ def test_after_the_last_action_the_arm_goes_no_farther_than_its_time_out_allows(
 
 
 @pytest.mark.promise(7)
-def test_a_protective_stop_is_told_and_only_recover_ends_it(arm: URArm, mock: MockUR, figure: Record) -> None:
+def test_arm_protective_stop_raises_until_recover(arm: URArm, mock: MockUR, figure: Record) -> None:
     start = arm.state().pose
     at_full_speed(arm, moved(start, x=0.12))
     asked = time.monotonic()
@@ -203,7 +201,7 @@ def test_a_protective_stop_is_told_and_only_recover_ends_it(arm: URArm, mock: Mo
     until(lambda: mock.faults.state().rests, "rest")
     before, mark = mock.faults.state(), mock.faults.received().last
     for _ in range(20):
-        with pytest.raises(ProtectiveStop, match="protective stop; look why, then recover"):
+        with pytest.raises(ProtectiveStop, match="protective stop; find the cause, then recover"):
             arm.command(start)
         time.sleep(0.01)
     assert arm.status() == ArmStatus.PROTECTIVE_STOP
@@ -224,7 +222,7 @@ def test_a_protective_stop_is_told_and_only_recover_ends_it(arm: URArm, mock: Mo
 
 
 @pytest.mark.promise(7)
-def test_a_protective_stop_after_its_worker_died_is_told_before_it_is_unlocked(arm: URArm, mock: MockUR) -> None:
+def test_recover_unreported_protective_stop_raises_before_unlock(arm: URArm, mock: MockUR) -> None:
     assert arm._worker is not None
     os.kill(arm._worker.pid, signal.SIGKILL)
     until(lambda: arm.status() == ArmStatus.WORKER_DEAD, "death")
@@ -237,7 +235,7 @@ def test_a_protective_stop_after_its_worker_died_is_told_before_it_is_unlocked(a
 
 
 @pytest.mark.promise(7)
-def test_an_emergency_stop_waits_for_a_person(arm: URArm, mock: MockUR) -> None:
+def test_recover_emergency_stop_raises_until_released(arm: URArm, mock: MockUR) -> None:
     start = arm.state().pose
     in_motion(arm, moved(start, x=0.1))
     mock.faults.estop()
@@ -258,7 +256,7 @@ def test_an_emergency_stop_waits_for_a_person(arm: URArm, mock: MockUR) -> None:
 
 
 @pytest.mark.promise(7)
-def test_a_program_stopped_from_outside_is_told(arm: URArm, mock: MockUR) -> None:
+def test_arm_program_stopped_outside_raises(arm: URArm, mock: MockUR) -> None:
     from robot.arm.controller.dashboard import Dashboard
 
     in_motion(arm, moved(arm.state().pose, x=0.1))
@@ -272,7 +270,7 @@ def test_a_program_stopped_from_outside_is_told(arm: URArm, mock: MockUR) -> Non
 
 
 @pytest.mark.promise(7)
-def test_connecting_to_a_stopped_arm_says_so(mock: MockUR) -> None:
+def test_connect_stopped_arm_raises(mock: MockUR) -> None:
     mock.faults.protective_stop()
     with pytest.raises(ProtectiveStop, match="arm 'left': protective stop") as caught:
         URArm(config(), "left").close()

@@ -14,7 +14,7 @@ import pytest
 from robot.arm import ur
 from robot.arm.status import ArmStatus
 from robot.arm.ur import URArm
-from robot.arm.worker import BLIND
+from robot.arm.worker import MAX_MISSED_PACKAGES
 from robot.errors import (
     DeviceError,
     DeviceNotConnectedError,
@@ -39,7 +39,7 @@ from tests.robot.waiting import PATIENCE, until
 
 
 @pytest.mark.promise(4)
-def test_a_silent_link_is_lost_and_the_program_that_asks_is_not(mock: MockUR, measuring: bool, figure: Record) -> None:
+def test_arm_silent_link_raises_link_lost_in_time(mock: MockUR, measuring: bool, figure: Record) -> None:
     timeout = 0.05 if measuring else 0.5
     with URArm(config(realtime=measuring, link_timeout=timeout), "left") as arm:
         start = arm.state().pose
@@ -51,9 +51,11 @@ def test_a_silent_link_is_lost_and_the_program_that_asks_is_not(mock: MockUR, me
         figure("silent link told (link_timeout 50 ms)", 1e3 * (told - newest), "ms", at_most=60)
         with pytest.raises(StaleObservationError, match=rf"the link is lost.*link_timeout = {1e3 * timeout:g} ms"):
             arm.state()
-        with pytest.raises(LinkLost, match="does not answer any more"):
+        with pytest.raises(LinkLost, match="does not answer; its controller"):
             arm.command(start)
-        assert len(servo_targets(mock.faults.received(last).entries)) <= 3 * BLIND  # then it sends no more
+        assert (
+            len(servo_targets(mock.faults.received(last).entries)) <= 3 * MAX_MISSED_PACKAGES
+        )  # then it sends no more
         until(lambda: mock.faults.state().rests, "rest by the controller's watchdog")
         figure("processes that did not outlive it", len(arm.history()) <= 5)
         assert len(arm.history()) > 5  # what was known stays known
@@ -61,7 +63,7 @@ def test_a_silent_link_is_lost_and_the_program_that_asks_is_not(mock: MockUR, me
         mark = mock.faults.received().last
         arm.recover()
         time.sleep(0.2)
-        assert len(servo_targets(mock.faults.received(mark).entries)) == 0  # nothing old is asked again
+        assert len(servo_targets(mock.faults.received(mark).entries)) == 0  # no old command is sent again
         go(arm, start)
 
 
@@ -69,8 +71,8 @@ def test_a_silent_link_is_lost_and_the_program_that_asks_is_not(mock: MockUR, me
 @pytest.mark.parametrize(
     ("ports", "reset"), [(None, True), pytest.param([30004], True, marks=pytest.mark.deep), ([30004], False)]
 )
-def test_a_cut_link_is_lost_for_good_until_recover(mock: MockUR, ports: list[int] | None, reset: bool) -> None:
-    """Left alone, ur_rtde connects anew 0.1 s later, starts its program again, and the arm goes on."""
+def test_arm_cut_link_is_lost_until_recover(mock: MockUR, ports: list[int] | None, reset: bool) -> None:
+    """Without the limits ur_rtde reconnects 0.1 s later, starts its program again, and the arm moves on."""
     with URArm(config(link_timeout=0.5), "left") as arm:
         start = arm.state().pose
         in_motion(arm, moved(start, x=0.1))
@@ -88,14 +90,14 @@ def test_a_cut_link_is_lost_for_good_until_recover(mock: MockUR, ports: list[int
         assert programs == sorted(programs, reverse=True) and not last.program  # it ended, and none began
         assert clients <= {30020} | (set() if ports is None else {29999, 30003})
         assert arm.status() == ArmStatus.LINK_LOST  # also where ur_rtde crashes of it
-        with pytest.raises(LinkLost, match="does not answer any more"):
+        with pytest.raises(LinkLost, match="does not answer; its controller"):
             arm.command(start)
         arm.recover()
         go(arm, start)
 
 
 @pytest.mark.parametrize("port", [29999, 30003])
-def test_connections_that_are_not_used_any_more_may_end(mock: MockUR, port: int) -> None:
+def test_arm_unused_connection_may_close(mock: MockUR, port: int) -> None:
     with URArm(config(), "left") as arm:
         start = arm.state().pose
         in_motion(arm, moved(start, x=0.05))
@@ -105,7 +107,7 @@ def test_connections_that_are_not_used_any_more_may_end(mock: MockUR, port: int)
 
 
 @pytest.mark.promise(4, 9)
-def test_a_stopped_controller_is_a_lost_link(mock: MockUR) -> None:
+def test_arm_stopped_controller_is_lost_link(mock: MockUR) -> None:
     with URArm(config(link_timeout=0.5), "left") as arm:
         start = arm.state().pose
         os.kill(mock.pid, signal.SIGSTOP)
@@ -126,7 +128,7 @@ def test_a_stopped_controller_is_a_lost_link(mock: MockUR) -> None:
 
 
 @pytest.mark.promise(4)
-def test_numbers_that_are_none_are_no_package(mock: MockUR) -> None:
+def test_arm_package_with_nan_is_ignored(mock: MockUR) -> None:
     with URArm(config(link_timeout=0.5), "left") as arm:
         in_motion(arm, moved(arm.state().pose, x=0.1))
         mock.faults.nan_state(True)
@@ -138,7 +140,7 @@ def test_numbers_that_are_none_are_no_package(mock: MockUR) -> None:
 
 
 @pytest.mark.parametrize("jump", [100.0, pytest.param(-100.0, marks=pytest.mark.deep)])
-def test_a_clock_that_jumps_loses_nothing(arm: URArm, mock: MockUR, jump: float) -> None:
+def test_arm_clock_jump_keeps_motion(arm: URArm, mock: MockUR, jump: float) -> None:
     start = arm.state().pose
     in_motion(arm, moved(start, x=0.05))
     mock.faults.clock_jump(jump)
@@ -146,7 +148,7 @@ def test_a_clock_that_jumps_loses_nothing(arm: URArm, mock: MockUR, jump: float)
     assert arm.status() == ArmStatus.OK
 
 
-def test_late_and_lost_packages_are_lived_with(arm: URArm, mock: MockUR) -> None:
+def test_arm_late_and_lost_packages_keep_motion(arm: URArm, mock: MockUR) -> None:
     start = arm.state().pose
     mock.faults.drop(0.3, seed=1)
     mock.faults.delay(0.02)
@@ -181,7 +183,7 @@ def gaps() -> Iterator[list[float]]:
 
 @pytest.mark.promise(9)
 @pytest.mark.parametrize("fault", ["silent", "refusing", "black hole", "mute dashboard"])
-def test_connecting_to_nobody_ends_in_time_and_blocks_no_thread(
+def test_connect_without_controller_raises_in_time(
     mock: MockUR, gaps: list[float], fault: str, measuring: bool, figure: Record
 ) -> None:
     faults, host, timeout = mock.faults, HOST, 0.6 if measuring else 1.0
@@ -192,7 +194,7 @@ def test_connecting_to_nobody_ends_in_time_and_blocks_no_thread(
     elif fault == "silent":
         faults.silence(True)
     else:
-        host = OTHER  # nobody listens there
+        host = OTHER  # no server there
     begun = time.monotonic()
     with pytest.raises(DeviceNotConnectedError):
         URArm(config(host, realtime=measuring), "left", timeout=timeout).close()
@@ -206,12 +208,12 @@ def test_connecting_to_nobody_ends_in_time_and_blocks_no_thread(
         assert arm.status() == ArmStatus.HOLD
 
 
-def test_the_wrong_model_does_not_connect(mock: MockUR) -> None:
+def test_connect_wrong_model_raises(mock: MockUR) -> None:
     with pytest.raises(DeviceNotConnectedError, match="arm 'left' is a UR5, but its file says model: ur10e"):
         URArm(config().model_copy(update={"model": "ur10e"}), "left").close()
 
 
-def test_mock_and_real_are_never_mistaken(mock: MockUR, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_connect_mock_as_real_raises(mock: MockUR, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(DeviceNotConnectedError, match="outside this machine"):
         URArm(config("192.0.2.7"), "left").close()
     for host in (HOST, "localhost", "127.0.0.1", "::1"):

@@ -7,7 +7,7 @@ import time
 import numpy as np
 import pytest
 
-from robot.arm.channel import HISTORY, STATE, CommandKind, command_record
+from robot.arm.channel import HISTORY, STATE, CommandKind, make_command_record
 from robot.arm.status import ArmStatus
 from robot.arm.trajectory import PERIOD
 from robot.arm.ur import URArm
@@ -45,7 +45,7 @@ LOOKS = 100_000
 # -- one package, the right frames -----------------------------------------------------------------------------------
 
 
-def test_state_speaks_of_the_sensor_in_the_world(arm: URArm, mock: MockUR) -> None:
+def test_state_pose_is_sensor_in_world(arm: URArm, mock: MockUR) -> None:
     there = mock.faults.state()
     expected = se3.compose(
         arm.config.world_from_base.pose, se3.compose(se3.from_matrix(matrix(there.pose)), TOOL_FROM_SENSOR.pose)
@@ -59,7 +59,7 @@ def test_state_speaks_of_the_sensor_in_the_world(arm: URArm, mock: MockUR) -> No
     assert arm.state().pose.position[2] == pytest.approx(state.pose.position[2] - 0.01, abs=60e-6)
 
 
-def test_wrench_is_what_the_object_does_to_the_sensor(arm: URArm, mock: MockUR) -> None:
+def test_state_wrench_is_load_on_sensor(arm: URArm, mock: MockUR) -> None:
     force, torque = np.array([3.0, -2.0, 12.0]), np.array([0.1, 0.2, -0.05])
     mock.faults.wrench([*force, *torque])
     until(lambda: abs(float(np.linalg.norm(arm.state().wrench[:3])) - np.linalg.norm(force)) < 1e-6, "force")
@@ -73,7 +73,7 @@ def test_wrench_is_what_the_object_does_to_the_sensor(arm: URArm, mock: MockUR) 
     until(lambda: float(np.abs(arm.state().wrench).max()) < 1e-6, "zero wrench")
 
 
-def test_twist_is_the_change_of_the_pose(arm: URArm) -> None:
+def test_state_twist_is_rate_of_pose(arm: URArm) -> None:
     start = arm.state().pose
     turned = se3.compose(moved(start, x=0.05), se3.from_rotation_vector([0, 0, 0], [0.2, 0.0, 0.3]))
     go(arm, turned)
@@ -82,7 +82,7 @@ def test_twist_is_the_change_of_the_pose(arm: URArm) -> None:
     for a, b, c in zip(states, states[1:], states[2:], strict=False):
         if 0.0 < c.time - a.time < 0.1 and float(np.linalg.norm(b.twist[:3])) > 0.02:
             checked += 1
-            # Packages may be skipped or late, so the way is compared by direction, and the speed by its limits.
+            # Packages may be skipped or late, so the path is compared by direction, and the speed by its limits.
             way = se3.pose_difference(a.pose, c.pose)
             assert way[:3] @ b.twist[:3] > 0.9 * np.linalg.norm(way[:3]) * np.linalg.norm(b.twist[:3])
             assert way[3:] @ b.twist[3:] > 0.9 * np.linalg.norm(way[3:]) * np.linalg.norm(b.twist[3:])
@@ -92,7 +92,7 @@ def test_twist_is_the_change_of_the_pose(arm: URArm) -> None:
 
 
 @pytest.mark.promise(10)
-def test_all_fields_of_a_state_are_of_one_instant(arm: URArm) -> None:
+def test_state_fields_are_of_one_package(arm: URArm) -> None:
     """Forward kinematics of the joints is the pose, in motion, in every record the worker ever wrote."""
     start = arm.state().pose
     flange_from_tool = se3.to_matrix(arm.config.flange_from_tool.pose)
@@ -101,7 +101,7 @@ def test_all_fields_of_a_state_are_of_one_instant(arm: URArm) -> None:
     for k in range(12):
         arm.command(moved(start, x=0.03 * (-1) ** k, z=0.02 * (-1) ** (k // 2)))
         time.sleep(0.1)
-        for record in arm._packages(HISTORY):
+        for record in arm._package_records(HISTORY):
             if record["time"] > last:
                 last = float(record["time"])
                 seen += 1
@@ -114,8 +114,8 @@ def test_all_fields_of_a_state_are_of_one_instant(arm: URArm) -> None:
 @pytest.mark.deep
 @pytest.mark.promise(10, 13)
 @pytest.mark.timeout(600)
-def test_a_hundred_thousand_looks_and_none_is_torn(arm: URArm, figure: Record) -> None:
-    """As a policy looks, all the time and in motion: whatever is read is of one package."""
+def test_state_100000_reads_have_no_torn_record(arm: URArm, figure: Record) -> None:
+    """Repeated reads in motion, as by a policy: each result is of one package."""
     start, states = arm.state().pose, arm._channel.states
     seen, times = np.zeros(0, STATE), np.zeros(0)
     while len(seen) < LOOKS or len(np.unique(seen["stamp"])) <= 100:  # a fast machine looks more often at each package
@@ -160,7 +160,7 @@ def hostile(number: int, bad: float, run: int) -> np.ndarray:
     return rows
 
 
-def test_hostile_targets_are_hostile() -> None:
+def test_hostile_targets_leave_limits_without_guard() -> None:
     rows = hostile(10_000, 0.4, 1)
     assert 0.15 < (~np.isfinite(rows).all(axis=1)).mean() < 0.35
     assert (config().limits.region.excess(np.nan_to_num(rows[:, :3])) > 0).mean() > 0.5
@@ -168,12 +168,12 @@ def test_hostile_targets_are_hostile() -> None:
 
 
 def send_hostile(arm: URArm, mock: MockUR, targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Joints (n, 6) that the controller was really sent meanwhile, and the control periods (n,) in which they came."""
+    """Joints (n, 6) that the controller was really sent, and the control periods (n,) in which they arrived."""
     since = mock.faults.received().last
     joints, ticks = [], []
     for k, target in enumerate(targets):
         # Past the guards of the driver: the worker must stand alone.
-        arm._channel.commands.write(command_record(time.monotonic(), CommandKind.TARGET, target))
+        arm._channel.commands.write(make_command_record(time.monotonic(), CommandKind.TARGET, target))
         time.sleep(0.0005)
         if k % 2000 == 1999:
             page = mock.faults.received(since)
@@ -182,11 +182,11 @@ def send_hostile(arm: URArm, mock: MockUR, targets: np.ndarray) -> tuple[np.ndar
             joints.append(servo_targets(page.entries))
             ticks.append(servo_ticks(page.entries))
     arm.stop()
-    until(arm.at_rest, "rest")
+    until(arm.is_at_rest, "rest")
     rest = mock.faults.received(since).entries
     sent = np.concatenate([*joints, servo_targets(rest)])
     record = arm._channel.states.latest()
-    assert record is not None and record["rejected"] > 0 and record["shortened"] > 0
+    assert record is not None and record["rejected"] > 0 and record["clipped"] > 0
     assert len(sent) > len(targets) / 100
     assert np.isfinite(sent).all()
     assert not arm.status().is_fault
@@ -195,7 +195,7 @@ def send_hostile(arm: URArm, mock: MockUR, targets: np.ndarray) -> tuple[np.ndar
 
 
 @pytest.mark.promise(1, 2)
-def test_hostile_targets_leave_no_trace_beyond_the_limits(mock: MockUR, measuring: bool, figure: Record) -> None:
+def test_command_hostile_targets_keep_limits(mock: MockUR, measuring: bool, figure: Record) -> None:
     given = config(realtime=measuring, limits={**SLOPED, "speed": 0.5, "acceleration": 5.0})
     with URArm(given, "left") as arm:
         sent, ticks = send_hostile(arm, mock, hostile(5_000, 0.02, 500) if measuring else hostile(1_000, 0.2, 200))
@@ -210,7 +210,7 @@ def test_hostile_targets_leave_no_trace_beyond_the_limits(mock: MockUR, measurin
 
 @pytest.mark.deep
 @pytest.mark.timeout(900)
-def test_a_hundred_thousand_hostile_targets(mock: MockUR) -> None:
+def test_command_100000_hostile_targets_keep_limits(mock: MockUR) -> None:
     with URArm(config(limits={**SLOPED, "speed": 0.5, "acceleration": 5.0}), "left") as arm:
         sent, ticks = send_hostile(arm, mock, hostile(100_000, 0.4, 1))
         check_path(arm, sent)
@@ -218,7 +218,7 @@ def test_a_hundred_thousand_hostile_targets(mock: MockUR) -> None:
 
 
 @pytest.mark.promise(1)
-def test_the_measured_arm_stays_in_the_box_too(mock: MockUR, measuring: bool, figure: Record) -> None:
+def test_command_hostile_targets_keep_measured_arm_inside(mock: MockUR, measuring: bool, figure: Record) -> None:
     given = config(realtime=measuring, limits={"speed": 1.0, "acceleration": 10.0, "joint_speed": 3.0})
     with URArm(given, "left") as arm:
         start, rng = arm.state().pose, np.random.default_rng(1)
@@ -231,7 +231,7 @@ def test_the_measured_arm_stays_in_the_box_too(mock: MockUR, measuring: bool, fi
         assert not arm.status().is_fault
 
 
-def test_what_is_shortened_is_told(arm: URArm) -> None:
+def test_command_clipped_target_is_returned(arm: URArm) -> None:
     start = arm.state().pose
     beyond = moved(start, z=-1.0)
     sent = arm.command(beyond)
@@ -244,7 +244,7 @@ def test_what_is_shortened_is_told(arm: URArm) -> None:
 
 
 @pytest.mark.promise(2)
-def test_what_is_no_pose_is_refused(arm: URArm) -> None:
+def test_command_invalid_target_raises(arm: URArm) -> None:
     for bad in ("up", 3, [0.0] * 7, np.zeros(7)):
         with pytest.raises(ActionError):
             arm.command(bad)  # type: ignore[arg-type]
@@ -253,16 +253,16 @@ def test_what_is_no_pose_is_refused(arm: URArm) -> None:
     assert arm.status() == ArmStatus.HOLD
 
 
-def test_a_target_out_of_reach_is_refused_and_the_program_lives(mock: MockUR) -> None:
+def test_command_target_out_of_reach_raises_and_program_runs(mock: MockUR) -> None:
     wide = {"workspace": Workspace(lower=(-3.0, -3.0, -1.0), upper=(3.0, 3.0, 3.0))}
     with URArm(config(limits=wide), "left") as arm:
         with pytest.raises(ActionError, match="out of its reach"):
             arm.command(moved(arm.state().pose, z=2.0))
-        # Past the driver's look: the worker stops where the joints, their speed or a singularity say so.
+        # Without the driver's check: the worker stops at limits of joints and joint speed and at singularities.
         far = moved(arm.state().pose, z=2.0)
         since = mock.faults.received().last
         arm._channel.commands.write(
-            command_record(time.monotonic(), CommandKind.TARGET, np.array([*far.position, *far.quaternion]))
+            make_command_record(time.monotonic(), CommandKind.TARGET, np.array([*far.position, *far.quaternion]))
         )
         until(lambda: arm.status() == ArmStatus.OUT_OF_REACH, "out of reach")
         time.sleep(0.5)
@@ -271,17 +271,17 @@ def test_a_target_out_of_reach_is_refused_and_the_program_lives(mock: MockUR) ->
         assert np.abs(np.diff(sent, axis=0)).max() <= arm.config.limits.joint_speed * PERIOD * (1 + 1e-9)
         arm.stop()
         until(lambda: arm.status() == ArmStatus.HOLD and arm.at_rest(), "rest")
-        go(arm, moved(arm.state().pose, z=-0.02))  # no turn, which so near to a singularity may be in the way
+        go(arm, moved(arm.state().pose, z=-0.02))  # no rotation, which may be impossible near a singularity
 
 
 @pytest.mark.promise(1)
-def test_limits_have_no_default_workspace() -> None:
+def test_limits_without_workspace_are_refused() -> None:
     with pytest.raises(ValueError, match="workspace"):
         ArmLimits()  # type: ignore[call-arg]
 
 
 @pytest.mark.promise(1)
-def test_an_arm_outside_its_workspace_does_not_connect(mock: MockUR) -> None:
+def test_connect_outside_workspace_raises(mock: MockUR) -> None:
     elsewhere = {"workspace": Workspace(lower=(2.0, 2.0, 2.0), upper=(3.0, 3.0, 3.0))}
     with pytest.raises(SafetyViolation, match=r"outside its workspace.*mm beyond the workspace's lower"):
         URArm(config(limits=elsewhere), "left").close()
@@ -289,8 +289,8 @@ def test_an_arm_outside_its_workspace_does_not_connect(mock: MockUR) -> None:
 
 
 @pytest.mark.promise(13)
-def test_the_loop_counts_its_periods(arm: URArm, mock: MockUR) -> None:
+def test_timing_counts_periods(arm: URArm, mock: MockUR) -> None:
     until(lambda: arm.timing().cycles > 600, "cycles")
     timing = arm.timing()
-    assert 0.5 * PERIOD < timing.median <= timing.p99 <= timing.longest
+    assert 0.5 * PERIOD < timing.median <= timing.p99 <= timing.max_period
     assert timing.overruns >= 0

@@ -49,7 +49,7 @@ def apart(left: URArm, right: URArm) -> float:
 
 
 @pytest.mark.promise(15)
-def test_two_arms_keep_apart_whoever_moves(pair: Pair, figure: Record) -> None:
+def test_pair_keep_out_holds_for_either_moving_arm(pair: Pair, figure: Record) -> None:
     left, right, _ = pair
     a, b = left.state().pose, right.state().pose
     assert apart(left, right) == pytest.approx(0.06, abs=1e-6)
@@ -68,7 +68,7 @@ def test_two_arms_keep_apart_whoever_moves(pair: Pair, figure: Record) -> None:
 
 
 @pytest.mark.promise(15)
-def test_an_arm_waits_for_the_other_of_its_keep_out(mock: MockUR) -> None:
+def test_pair_arm_waits_for_missing_partner(mock: MockUR) -> None:
     with URArm(config(), "left", keep_out={"right": 0.04}) as arm:
         until(lambda: arm.status() == ArmStatus.WAITING, "waiting")
         with pytest.raises(SafetyViolation, match="other arm of a keep-out is not connected"):
@@ -76,7 +76,7 @@ def test_an_arm_waits_for_the_other_of_its_keep_out(mock: MockUR) -> None:
 
 
 @pytest.mark.promise(15)
-def test_both_arms_stop_when_one_does(pair: Pair, figure: Record) -> None:
+def test_pair_fault_of_one_arm_stops_both(pair: Pair, figure: Record) -> None:
     left, right, other = pair
     a, b = left.state().pose, right.state().pose
     in_motion(left, moved(a, x=-0.1))
@@ -85,7 +85,7 @@ def test_both_arms_stop_when_one_does(pair: Pair, figure: Record) -> None:
     until(lambda: right.status() == ArmStatus.PROTECTIVE_STOP, "protective stop")
     with pytest.raises(SafetyViolation, match=r"stopped because the other arm did.*arm 'right' made a protective stop"):
         left.command(a)
-    until(left.at_rest, "rest")
+    until(left.is_at_rest, "rest")
     # Within two periods of the stop's publication, as the loop of the arm that hears of it counts them.
     told, heard = records(right), records(left)
     stop = told[told["status"] == ArmStatus.PROTECTIVE_STOP][0]["written"]
@@ -99,22 +99,20 @@ def test_both_arms_stop_when_one_does(pair: Pair, figure: Record) -> None:
 
 
 @pytest.mark.promise(15)
-def test_the_arm_that_caused_the_stop_says_so_and_recovering_it_first_brings_both_back(
-    pair: Pair, figure: Record
-) -> None:
+def test_pair_recover_of_faulty_arm_first_restores_both(pair: Pair, figure: Record) -> None:
     left, right, other = pair
     a, b = left.state().pose, right.state().pose
     in_motion(left, moved(a, x=-0.1))
     in_motion(right, moved(b, x=0.1))
     other.faults.wrench([0.0, 0.0, 40.0, 0.0, 0.0, 0.0])
     until(lambda: left.status() == ArmStatus.PARTNER_STOPPED, "the other arm's stop")
-    until(left.at_rest, "rest")
-    until(right.at_rest, "rest")
+    until(left.is_at_rest, "rest")
+    until(right.is_at_rest, "rest")
     stopped = records(right)
     told = set(stopped["status"][stopped["status"] >= ArmStatus.FORCE_LIMIT].tolist())
     figure("causes that were replaced by their consequence", len(told - {ArmStatus.FORCE_LIMIT}))
     assert told == {ArmStatus.FORCE_LIMIT}
-    with pytest.raises(SafetyViolation, match=r"felt more than limits.force.*now 4.* of 30 N"):
+    with pytest.raises(SafetyViolation, match=r"exceeded limits.force.*now 4.* of 30 N"):
         right.recover()  # it is still pressed: it stands in its fault, and says why
     left.recover()
     assert left.status() == ArmStatus.WAITING
@@ -126,22 +124,22 @@ def test_the_arm_that_caused_the_stop_says_so_and_recovering_it_first_brings_bot
 
 
 @pytest.mark.promise(1, 15)
-def test_what_is_wrong_at_connect_refuses_also_beside_another_arm(mock: MockUR) -> None:
-    """The arm before it waits meanwhile, and is neither stopped nor blamed."""
+def test_pair_connect_with_fault_raises(mock: MockUR) -> None:
+    """The other arm waits, without a stop or a fault."""
     elsewhere = {"workspace": Workspace(lower=(2.0, 2.0, 2.0), upper=(3.0, 3.0, 3.0))}
     with MockUR(OTHER, payload=CARRIED) as other, URArm(config(), "left", keep_out={"right": KEEP_OUT}) as left:
         with pytest.raises(SafetyViolation, match=r"arm 'right' is outside its workspace.*mm beyond"):
             URArm(config(OTHER, limits=elsewhere), "right", keep_out={"left": KEEP_OUT}).close()
         other.faults.wrench([0.0, 0.0, 40.0, 0.0, 0.0, 0.0])
-        with pytest.raises(SafetyViolation, match=r"arm 'right' felt more than limits.force.*now 4.* of 30 N"):
+        with pytest.raises(SafetyViolation, match=r"arm 'right' exceeded limits.force.*now 4.* of 30 N"):
             URArm(config(OTHER), "right", keep_out={"left": KEEP_OUT}).close()
         assert left.status() == ArmStatus.WAITING
     assert leftovers() == 0
 
 
 @pytest.mark.promise(15)
-def test_a_dead_partner_stops_the_arm_that_moves(pair: Pair) -> None:
-    """The other one counts as dead after link_timeout, 1 s here; this one is under way for much longer."""
+def test_pair_dead_worker_stops_moving_arm(pair: Pair) -> None:
+    """The other arm counts as dead after link_timeout, 1 s here; this one moves for much longer."""
     left, right, _ = pair
     in_motion(left, moved(left.state().pose, x=-0.14))
     assert right._worker is not None
@@ -166,7 +164,7 @@ print(1e3 * np.percentile(np.diff(beats), 99))
 
 @pytest.mark.deep
 @pytest.mark.promise(13)
-def test_two_arms_that_move_keep_the_rate(pair: Pair, figure: Record) -> None:
+def test_pair_moving_arms_keep_loop_rate(pair: Pair, figure: Record) -> None:
     """And a loop that does nothing, as privileged as a worker: no loop on this machine keeps better time."""
     left, right, _ = pair
     left.command(moved(left.state().pose, x=-0.04, z=0.04))

@@ -51,7 +51,7 @@ from tests.robot.waiting import PATIENCE, alive, until
 
 
 @pytest.mark.promise(6)
-def test_a_killed_worker_is_told_and_replaced(mock: MockUR, measuring: bool, figure: Record) -> None:
+def test_worker_killed_is_reported_and_replaced(mock: MockUR, measuring: bool, figure: Record) -> None:
     with URArm(config(realtime=measuring, watchdog=10.0 if measuring else 1.0), "left") as arm:
         start = arm.state().pose
         at_full_speed(arm, moved(start, x=0.14))
@@ -75,7 +75,7 @@ def test_a_killed_worker_is_told_and_replaced(mock: MockUR, measuring: bool, fig
 
 
 @pytest.mark.promise(6)
-def test_a_stopped_worker_is_a_lost_link_and_can_be_replaced(mock: MockUR) -> None:
+def test_worker_stopped_is_lost_link_and_replaced(mock: MockUR) -> None:
     with URArm(config(link_timeout=0.5), "left") as arm:
         start = arm.state().pose
         assert arm._worker is not None
@@ -90,7 +90,7 @@ import signal, sys, time
 from robot.arm.ur import URArm
 from tacsim.models.hardware import UrArmConfig
 from tests.robot.arm.mocked import at_full_speed, moved
-signal.signal(signal.SIGINT, signal.default_int_handler)  # also where whoever runs the tests ignores it
+signal.signal(signal.SIGINT, signal.default_int_handler)  # also if the test runner ignores it
 arm = URArm(UrArmConfig.model_validate_json(sys.argv[1]), "policy")
 at_full_speed(arm, moved(arm.state().pose, x=0.14))
 print(arm._worker.pid, flush=True)
@@ -100,9 +100,7 @@ time.sleep(60)
 
 @pytest.mark.promise(6, 14)
 @pytest.mark.parametrize("number", [signal.SIGKILL, pytest.param(signal.SIGINT, marks=pytest.mark.deep)])
-def test_a_policy_that_dies_leaves_a_standing_arm_and_nothing_else(
-    mock: MockUR, number: int, measuring: bool, figure: Record
-) -> None:
+def test_driver_killed_leaves_arm_at_rest(mock: MockUR, number: int, measuring: bool, figure: Record) -> None:
     words = [
         sys.executable,
         "-c",
@@ -157,9 +155,9 @@ with Interrupt() as stop:
         (COMMAND, signal.SIGHUP),
     ],
 )
-def test_a_signal_to_every_process_ends_with_a_ramp(mock: MockUR, program: str, number: signal.Signals) -> None:
+def test_worker_signal_brakes_before_exit(mock: MockUR, program: str, number: signal.Signals) -> None:
     """A lost terminal, `kill -- -GROUP`, `systemctl stop`. A command brakes within its limits; the arm of a script that
-    handles nothing, and is gone at once, as after a fault."""
+    handles no signal, and ends at once, as after a fault."""
     given = config()
     words, path = [sys.executable, "-c", program, given.model_dump_json()], str(Path(ur.__file__).parents[2])
     since = mock.faults.received().last
@@ -186,11 +184,11 @@ def test_a_signal_to_every_process_ends_with_a_ramp(mock: MockUR, program: str, 
     assert speed[-1] < 0.05 * given.limits.speed or ended - ticks[-1] > 100
 
 
-def test_a_zeroing_that_failed_does_not_happen_later(mock: MockUR) -> None:
+def test_zero_wrench_failed_is_not_repeated(mock: MockUR) -> None:
     with URArm(config(watchdog=0.2, link_timeout=0.5), "left") as arm:
         assert arm._worker is not None
         os.kill(arm._worker.pid, signal.SIGSTOP)
-        with pytest.raises(DeviceError, match=r"link_timeout|does not answer any more"):
+        with pytest.raises(DeviceError, match=r"link_timeout|does not answer; its controller"):
             arm.zero_wrench()
         mark = mock.faults.received().last
         os.kill(arm._worker.pid, signal.SIGCONT)
@@ -204,7 +202,7 @@ def test_a_zeroing_that_failed_does_not_happen_later(mock: MockUR) -> None:
 
 
 @pytest.mark.promise(8)
-def test_a_second_driver_is_refused_and_the_first_goes_on(arm: URArm, mock: MockUR, figure: Record) -> None:
+def test_connect_second_driver_raises_and_first_continues(arm: URArm, mock: MockUR, figure: Record) -> None:
     start = arm.state().pose
     at_full_speed(arm, moved(start, x=0.1))
     asked = time.monotonic()
@@ -222,7 +220,7 @@ def test_a_second_driver_is_refused_and_the_first_goes_on(arm: URArm, mock: Mock
 
 
 @pytest.mark.promise(8)
-def test_a_field_bus_that_holds_the_registers_is_busy_too(mock: MockUR) -> None:
+def test_connect_registers_in_use_raises_busy(mock: MockUR) -> None:
     mock.faults.claim(["input_int_register_0"])
     with pytest.raises(DeviceBusyError):
         URArm(config(), "left").close()
@@ -238,7 +236,7 @@ def open_files() -> int:
 
 @pytest.mark.promise(14)
 @pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="counts open files as Linux shows them")
-def test_nothing_is_left_after_close(
+def test_close_frees_all_resources(
     mock: MockUR, measuring: bool, figure: Record, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before = open_files()
@@ -269,22 +267,24 @@ def test_nothing_is_left_after_close(
     arm.stop()
 
 
-def test_an_arm_whose_loop_is_slow_says_so(mock: MockUR, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_describe_status_slow_loop_names_period(mock: MockUR, monkeypatch: pytest.MonkeyPatch) -> None:
     with URArm(config(), "left") as arm:
         record = arm._channel.states.latest()
         assert record is not None
         monkeypatch.setattr(arm._channel.states, "latest", lambda: record)
         record["period"] = 1.9 * PERIOD, 9e-3, 9e-3
-        assert arm._explain(ArmStatus.OK) == "arm 'left' follows its target"
+        assert arm._describe_status(ArmStatus.OK) == "arm 'left' follows its target"
         record["period"] = 7e-3, 9e-3, 9e-3
-        assert arm._explain(ArmStatus.OK).endswith("(slowly: its loop takes 7 ms, not 2; the machine is too busy)")
-        assert "slowly" not in arm._explain(ArmStatus.PROTECTIVE_STOP)
+        assert arm._describe_status(ArmStatus.OK).endswith(
+            "(slowly: its loop takes 7 ms, not 2; the machine is too busy)"
+        )
+        assert "slowly" not in arm._describe_status(ArmStatus.PROTECTIVE_STOP)
         monkeypatch.undo()
 
 
 @pytest.mark.promise(14)
 @pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="counts open files as Linux shows them")
-def test_nothing_is_left_of_a_worker_that_died(mock: MockUR) -> None:
+def test_worker_died_frees_all_resources(mock: MockUR) -> None:
     before = open_files()
     arm = URArm(config(), "left")
     in_motion(arm, moved(arm.state().pose, x=0.1))
@@ -304,7 +304,7 @@ def test_nothing_is_left_of_a_worker_that_died(mock: MockUR) -> None:
 
 
 @pytest.mark.promise(14)
-def test_a_wedged_worker_is_killed(mock: MockUR) -> None:
+def test_close_blocked_worker_is_killed(mock: MockUR) -> None:
     arm = URArm(config(), "left")
     assert arm._worker is not None
     worker = arm._worker
@@ -317,17 +317,17 @@ def test_a_wedged_worker_is_killed(mock: MockUR) -> None:
 
 
 @pytest.mark.promise(14)
-def test_close_while_it_connects(mock: MockUR, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_close_during_connect_ends_worker(mock: MockUR, monkeypatch: pytest.MonkeyPatch) -> None:
     """Ctrl-C in the middle of connecting: no worker and no memory stay behind."""
     mock.faults.black_hole(True)
     workers: list[Child] = []
-    true_start = URArm._start
+    true_start = URArm._start_worker
 
     def interrupted(self: URArm) -> None:
         threading.Timer(0.5, lambda: (workers.append(self._worker), os.kill(os.getpid(), signal.SIGINT))).start()  # type: ignore[arg-type,func-returns-value]
         true_start(self)
 
-    monkeypatch.setattr(URArm, "_start", interrupted)
+    monkeypatch.setattr(URArm, "_start_worker", interrupted)
     found = signal.signal(signal.SIGINT, signal.default_int_handler)  # who runs the tests may ignore it
     try:
         with pytest.raises(KeyboardInterrupt):
@@ -338,7 +338,7 @@ def test_close_while_it_connects(mock: MockUR, monkeypatch: pytest.MonkeyPatch) 
     assert leftovers() == 0
 
 
-def test_it_can_be_asked_while_another_thread_closes_it(mock: MockUR, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_state_during_close_in_other_thread_raises_cleanly(mock: MockUR, monkeypatch: pytest.MonkeyPatch) -> None:
     arm = URArm(config(), "left")
     ended, closing = Child.exit_status.fget, iter([arm.close])
 

@@ -52,7 +52,7 @@ def judged(seen: np.ndarray, joints: np.ndarray, ticks: np.ndarray, ahead: int) 
 @pytest.mark.parametrize(
     "stalls", [(0.08,), pytest.param((0.02, 0.03, 0.05, 0.07, 0.09), marks=pytest.mark.deep)], ids=["80 ms", "several"]
 )
-def test_after_a_stall_of_its_worker_the_arm_goes_on_within_its_limits(
+def test_worker_after_stall_keeps_arm_limits(
     mock: MockUR, measuring: bool, figure: Record, tmp_path: Path, stalls: tuple[float, ...]
 ) -> None:
     file = tmp_path / "seen.npy"
@@ -73,7 +73,7 @@ def test_after_a_stall_of_its_worker_the_arm_goes_on_within_its_limits(
             os.kill(arm._worker.pid, signal.SIGCONT)
             time.sleep(0.3)  # until it is at full speed again
         arm.stop()
-        until(arm.at_rest, "rest")
+        until(arm.is_at_rest, "rest")
         sent = mock.faults.received(since)
         left_out = mock.faults.state().overruns - state.overruns  # control periods, by a machine that is too busy
         watching.communicate(timeout=PATIENCE)
@@ -85,7 +85,7 @@ def test_after_a_stall_of_its_worker_the_arm_goes_on_within_its_limits(
     long = np.flatnonzero(np.diff(ticks) >= LONG)
     assert len(long) >= sum(stall >= 2 * LONG * PERIOD for stall in stalls) or left_out > 0
     for k in long[steps[long - 1] > 0.5 * limits.speed * PERIOD]:
-        # The speed is that of the arm; one target may have been on its way when the process was stopped.
+        # The speed is that of the arm; one target may have been in transit when the process was stopped.
         new = steps[k:][steps[k:] > 0.0]
         assert min(new[:2]) < 0.5 * steps[k - 1]
     seen = np.load(file)

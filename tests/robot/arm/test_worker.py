@@ -1,4 +1,4 @@
-"""The worker process by itself: what it loads, and how it ends when nobody wants it."""
+"""The worker process alone: its imports, and its exit without a driver."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from robot.arm import shared_ring, worker
 from robot.arm.channel import Channel, WorkerConfig
 from robot.arm.status import ArmStatus
 from robot.arm.trajectory import PERIOD
-from robot.arm.worker_config import worker_config as config_of
+from robot.arm.worker_config import make_worker_config as config_of
 from robot.mock import MOCK_SERIAL, MockUR
 from tacsim.models.hardware import ArmLimits, MockArmConfig, Placement, UrArmConfig, Workspace
 from tests.robot.arm.mocked import HOST
@@ -52,7 +52,7 @@ def start(config: WorkerConfig, *words: str) -> subprocess.CompletedProcess[str]
     )
 
 
-def test_it_starts_light() -> None:
+def test_worker_import_loads_no_heavy_package() -> None:
     """A new worker has half a second; SciPy or pydantic alone take that long."""
     heavy = {"scipy", "pydantic", "taichi", "cv2", "rtde_control", "rtde_receive"}
     code = (
@@ -64,7 +64,7 @@ def test_it_starts_light() -> None:
     assert done.stdout.split() == []
 
 
-def test_every_variable_is_in_the_librarys_own_table() -> None:
+def test_variables_are_known_to_library() -> None:
     """A name that the library does not know shifts all fields after it, without a word."""
     receive = pytest.importorskip("rtde_receive", reason="ur_rtde has no wheel for this Python")
     library = Path(receive.__file__).read_bytes()
@@ -72,10 +72,10 @@ def test_every_variable_is_in_the_librarys_own_table() -> None:
     assert [name for name in worker.VARIABLES if name.encode() not in library] == []
 
 
-def test_a_failure_is_one_line_of_json_and_the_rest_stays_out_of_it() -> None:
-    segment = shared_ring.create(Channel.SIZE)
+def test_worker_failure_prints_one_json_line() -> None:
+    segment = shared_ring.create_segment(Channel.SIZE)
     done = start(worker_config(segment.descriptor))
-    assert done.returncode == worker.FAILED
+    assert done.returncode == worker.FAILED_EXIT_STATUS
     told = json.loads(done.stdout)
     assert told["kind"] == "DeviceNotConnectedError"
     assert f"no controller at {NOBODY}: port 30004 (RTDE)" in told["error"]
@@ -83,7 +83,7 @@ def test_a_failure_is_one_line_of_json_and_the_rest_stays_out_of_it() -> None:
     assert latest is not None and latest["status"] == ArmStatus.CONNECTING
 
 
-def test_without_memory_to_write_to_it_says_so() -> None:
+def test_worker_without_memory_reports_error() -> None:
     done = subprocess.run(
         [sys.executable, "-m", "robot.arm.worker"],
         input=json.dumps(dataclasses.asdict(worker_config(99))) + "\n",
@@ -92,13 +92,13 @@ def test_without_memory_to_write_to_it_says_so() -> None:
         text=True,
         timeout=60,
     )
-    assert done.returncode == worker.FAILED
+    assert done.returncode == worker.FAILED_EXIT_STATUS
     assert "Bad file descriptor" in json.loads(done.stdout)["error"]
 
 
-def test_a_driver_that_died_while_it_connected_leaves_nothing(mock: MockUR) -> None:
-    """Nobody reads the worker's first message: it ends its program all the same."""
-    segment = shared_ring.create(Channel.SIZE)
+def test_worker_driver_died_during_connect_exits(mock: MockUR) -> None:
+    """The first message of the worker is not read: it still ends its program."""
+    segment = shared_ring.create_segment(Channel.SIZE)
     config = worker_config(segment.descriptor, host=HOST, parent=1)  # not this process
     reader, writer = os.pipe()
     os.close(reader)
@@ -119,13 +119,13 @@ def test_a_driver_that_died_while_it_connected_leaves_nothing(mock: MockUR) -> N
 UNSEEN = "from robot.arm import worker; worker.Dashboard.require_identity = lambda *_: None; worker.main()"
 
 
-def test_an_arm_of_another_shape_is_left_as_it_was(mock: MockUR) -> None:
-    """Also where its dashboard does not say what it is."""
-    segment, before = shared_ring.create(Channel.SIZE), mock.faults.state().payload
+def test_worker_wrong_model_keeps_controller_settings(mock: MockUR) -> None:
+    """Also if the dashboard does not report the model."""
+    segment, before = shared_ring.create_segment(Channel.SIZE), mock.faults.state().payload
     given = worker_config(segment.descriptor, host=HOST, model="ur10e", mass=2.0, tcp=[0.0, 0.0, 0.1, 0.0, 0.0, 0.0])
     done = start(given, "-c", UNSEEN)
-    assert done.returncode == worker.FAILED
-    assert re.search(r"its tool is \d+ mm and .* from where a ur10e would have it; check model", done.stdout)
+    assert done.returncode == worker.FAILED_EXIT_STATUS
+    assert re.search(r"its tool is \d+ mm and .* from the pose of a ur10e at these joints; check model", done.stdout)
     asked = {entry.values.get("input_int_register_0") for entry in mock.faults.received().entries}
     assert asked & {*CHANGES} == set()
     assert mock.faults.state().payload == before
@@ -138,7 +138,7 @@ class Packages:
     LATE = 50  # packages
 
     def __init__(self) -> None:
-        self.now, self.told = 0, 0  # packages measured so far, and before the payload was told
+        self.now, self.told = 0, 0  # packages so far, and before the payload was set
 
     def getTimestamp(self) -> float:
         return max(0, self.now - self.LATE) * PERIOD
@@ -158,21 +158,21 @@ class Packages:
         return lambda: 0 if name in ("getRuntimeState", "getSafetyStatusBits") else [0.0] * 6
 
 
-def test_what_is_felt_once_connected_is_felt_with_the_payload(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_worker_first_wrench_uses_payload(monkeypatch: pytest.MonkeyPatch) -> None:
     """Packages that were measured before arrive after the controller's word that it has taken it."""
-    segment, packages = shared_ring.create(Channel.SIZE), Packages()
+    segment, packages = shared_ring.create_segment(Channel.SIZE), Packages()
     made = worker.Worker(worker_config(os.dup(segment.descriptor)))  # which closes its own
     monkeypatch.setattr(worker.time, "sleep", packages.sleep)
     made.receive = packages
     packages.now = packages.told = 500
-    made._read()
+    made._read_package()
     assert made.record["tcp_force"][2] < -9.0
-    made._await_change()
+    made._wait_for_settings()
     assert made.record["tcp_force"][2] == 0.0
 
 
-def test_a_pinned_serial_number_tells_one_robot_from_another(mock: MockUR) -> None:
-    segment = shared_ring.create(Channel.SIZE)
+def test_worker_wrong_serial_number_is_refused(mock: MockUR) -> None:
+    segment = shared_ring.create_segment(Channel.SIZE)
     done = start(worker_config(segment.descriptor, host=HOST, serial="20225500001"))
     assert f"has the serial number {MOCK_SERIAL}, but the file of arm 'left' says serial: 20225500001" in done.stdout
     assert not mock.faults.received().entries

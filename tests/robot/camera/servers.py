@@ -1,4 +1,4 @@
-"""HTTP servers that send whatever a test says, and cameras of 64 x 48 px."""
+"""HTTP servers that send what a test defines, and cameras of 64 x 48 px."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ Talk = Callable[[socket.socket], None]
 
 
 class Server:
-    """Answers each client in a thread with whatever `talk` sends."""
+    """Answers each client in a thread with the bytes that `talk` sends."""
 
     def __init__(self) -> None:
         self._listening = socket.create_server((HOST, 0))

@@ -14,7 +14,7 @@ from contextlib import suppress
 import numpy as np
 import pytest
 
-from robot.camera.camera import BACK_OFF, Camera, StaleFrame
+from robot.camera.camera import REOPEN_DELAY_RANGE, Camera, StaleFrame
 from robot.camera.picture import WrongSource
 from robot.common import stamp
 from robot.errors import DeviceNotConnectedError, StaleObservationError
@@ -46,7 +46,7 @@ def mock(served: MockCamera) -> Iterator[MockCamera]:
     until(lambda: served.state().clients == 0)
 
 
-def test_delivers_the_picture_without_its_strip(mock: MockCamera) -> None:
+def test_read_returns_picture_without_strip(mock: MockCamera) -> None:
     picture = grey(120)
     picture[:, :160] = (200, 100, 50)
     number = mock.push(picture)
@@ -60,7 +60,7 @@ def test_delivers_the_picture_without_its_strip(mock: MockCamera) -> None:
         frame.image[0] = 0
 
 
-def test_status_and_times(mock: MockCamera, patient: None) -> None:
+def test_status_reports_rate_and_times(mock: MockCamera, patient: None) -> None:
     with Camera(stamped(mock), "left") as camera:
         first = camera.read(WAIT)
         until(lambda: camera.status.frames > 20 and 3 < (camera.status.fps or 0.0) < 45)
@@ -72,7 +72,7 @@ def test_status_and_times(mock: MockCamera, patient: None) -> None:
 
 
 @pytest.mark.promise(11)
-def test_between_two_exposures_the_same_frame_comes_again_with_the_same_index() -> None:
+def test_read_between_exposures_returns_same_index() -> None:
     with (
         MockCamera(host=HOST, fps=0.2) as mock,
         Camera(stamped(mock, fps=0.2, max_age=60.0), "left", connect_timeout=WAIT) as camera,
@@ -81,7 +81,7 @@ def test_between_two_exposures_the_same_frame_comes_again_with_the_same_index() 
         assert one is two
 
 
-def test_lock_step(mock: MockCamera) -> None:
+def test_wait_for_returns_requested_picture(mock: MockCamera) -> None:
     with Camera(stamped(mock), "left") as camera:
         for value in (10, 60, 110, 160, 210):
             number = mock.push(grey(value))
@@ -93,7 +93,7 @@ def test_lock_step(mock: MockCamera) -> None:
 
 
 @pytest.mark.promise(11)
-def test_a_consumer_that_pauses_gets_the_newest_frame(mock: MockCamera, figure: Record) -> None:
+def test_read_after_pause_returns_newest_frame(mock: MockCamera, figure: Record) -> None:
     """Counted in frames: at most two periods behind, most of the time, however long it has paused. A busy machine may
     need more pauses for that; a queue would be twelve frames behind after each."""
     behind: list[int] = []
@@ -113,7 +113,7 @@ def test_a_consumer_that_pauses_gets_the_newest_frame(mock: MockCamera, figure: 
     figure("age of a frame after a pause (two frame periods)", age, "ms", at_most=2000 / 30)
 
 
-def test_lost_frames_are_gaps_in_the_index(mock: MockCamera) -> None:
+def test_index_lost_frames_are_gaps(mock: MockCamera) -> None:
     with Camera(stamped(mock), "left") as camera:
         first, start = camera.read(WAIT), camera.stamp
         before = mock.state().dropped
@@ -126,7 +126,7 @@ def test_lost_frames_are_gaps_in_the_index(mock: MockCamera) -> None:
     assert abs((last.index - first.index) - (mark.frame - start.frame)) <= 2  # a frame may come between two lines here
 
 
-def test_a_delay_is_seen_as_age(mock: MockCamera) -> None:
+def test_status_delay_increases_age(mock: MockCamera) -> None:
     mock.delay(0.3)
     with Camera(stamped(mock), "left") as camera:
         until(lambda: camera.status.frames > 12)
@@ -134,7 +134,7 @@ def test_a_delay_is_seen_as_age(mock: MockCamera) -> None:
 
 
 @pytest.mark.promise(4)
-def test_frames_beyond_the_age_limit_are_refused(mock: MockCamera) -> None:
+def test_read_frame_beyond_max_age_raises(mock: MockCamera) -> None:
     with Camera(stamped(mock, max_age=0.25), "left") as camera:
         camera.read(WAIT)
         mock.delay(0.4)
@@ -148,7 +148,7 @@ def test_frames_beyond_the_age_limit_are_refused(mock: MockCamera) -> None:
 
 
 def wrong_frames(camera: Camera, seconds: float, max_age: float) -> int:
-    """How many frames delivered meanwhile were older than `max_age` [s], or passed as new without a newer exposure."""
+    """Number of delivered frames that were older than `max_age` [s], or passed as new without a newer exposure."""
     wrong, seen, end = 0, camera.read(WAIT), time.monotonic() + seconds
     while time.monotonic() < end:
         asked = time.monotonic()
@@ -162,7 +162,7 @@ def wrong_frames(camera: Camera, seconds: float, max_age: float) -> int:
 
 
 @pytest.mark.promise(11)
-def test_a_stall_is_a_timeout_then_a_new_opening(mock: MockCamera, figure: Record) -> None:
+def test_camera_stall_raises_and_reopens(mock: MockCamera, figure: Record) -> None:
     with Camera(stamped(mock, max_age=0.2), "left") as camera:
         before = camera.read(WAIT)
         mock.stall(True)
@@ -177,7 +177,7 @@ def test_a_stall_is_a_timeout_then_a_new_opening(mock: MockCamera, figure: Recor
         assert newer(camera, before).time > before.time
 
 
-def test_cut_clients_come_back(mock: MockCamera, patient: None) -> None:
+def test_camera_cut_connection_reopens(mock: MockCamera, patient: None) -> None:
     with Camera(stamped(mock), "left") as camera:
         before = camera.read(WAIT)
         assert mock.disconnect() == 1
@@ -187,7 +187,7 @@ def test_cut_clients_come_back(mock: MockCamera, patient: None) -> None:
 
 
 @pytest.mark.promise(11)
-def test_a_camera_that_is_killed_and_started_again(figure: Record) -> None:
+def test_camera_restarted_source_reopens(figure: Record) -> None:
     with MockCamera(host=HOST) as mock, Camera(stamped(mock, max_age=0.2), "left") as camera:
         before = camera.read(WAIT)
         os.kill(mock.pid, signal.SIGKILL)
@@ -201,20 +201,20 @@ def test_a_camera_that_is_killed_and_started_again(figure: Record) -> None:
             after = newer(camera, before)
             figure("frames again after the camera serves again", time.monotonic() - begun, "s", at_most=1)
             assert again.state().clients == 1
-    # The numbers of the stamps began anew, above or below the last; the interruption counts by time: 0.5 s at least.
+    # The numbers of the stamps restarted, above or below the last; the interruption counts by time: 0.5 s at least.
     assert after.index - before.index >= 10
     assert camera.status.dropped >= 9
-    assert BACK_OFF[1] < 1.0  # promise 11: reopened within a second of its return
+    assert REOPEN_DELAY_RANGE[1] < 1.0  # promise 11: reopened within a second of its return
 
 
-def test_a_source_that_refuses_for_a_while(mock: MockCamera) -> None:
+def test_camera_refused_connection_reopens_later(mock: MockCamera) -> None:
     mock.refuse(True)
     threading.Timer(0.5, mock.refuse, (False,)).start()
     with Camera(stamped(mock), "left", connect_timeout=WAIT) as camera:
         assert camera.read(WAIT).index >= 0
 
 
-def test_damaged_pictures_are_counted_and_never_delivered(mock: MockCamera, patient: None) -> None:
+def test_camera_damaged_picture_is_counted_not_delivered(mock: MockCamera, patient: None) -> None:
     mock.push(grey(200))
     with Camera(stamped(mock, max_age=0.2), "left") as camera:
         before = camera.read(WAIT)
@@ -230,7 +230,7 @@ def test_damaged_pictures_are_counted_and_never_delivered(mock: MockCamera, pati
         assert after.index - before.index > 10
 
 
-def test_another_size_is_refused_until_it_is_right_again(mock: MockCamera) -> None:
+def test_camera_wrong_size_raises_until_corrected(mock: MockCamera) -> None:
     with Camera(stamped(mock), "left") as camera:
         before = camera.read(WAIT)
         mock.resize(160, 120)
@@ -239,7 +239,7 @@ def test_another_size_is_refused_until_it_is_right_again(mock: MockCamera) -> No
             try:
                 camera.read(0.05)
             except WrongSource as error:
-                return "frames are 160 x 152 px, expected are 320 x 256" in str(error)
+                return "frames are 160 x 152 px, expected 320 x 256" in str(error)
             return False
 
         until(refused)
@@ -254,9 +254,9 @@ def test_another_size_is_refused_until_it_is_right_again(mock: MockCamera) -> No
         until(mended)
 
 
-def test_a_stamped_source_needs_stamps() -> None:
+def test_camera_missing_stamps_raise() -> None:
     with MockCamera(host=HOST, height=256, stamped=False) as mock:
-        with pytest.raises(DeviceNotConnectedError, match="without a readable stamp"):
+        with pytest.raises(DeviceNotConnectedError, match="has no readable stamp"):
             Camera(config(mock.url, stamped=True), "left", connect_timeout=2.0)
         with Camera(config(mock.url, height=256, latency=0.05), "left") as camera:
             frame = camera.read(WAIT)
@@ -266,7 +266,7 @@ def test_a_stamped_source_needs_stamps() -> None:
                 camera.wait_for(1, 1.0)
 
 
-def test_a_stamp_of_another_clock_is_refused(mock: MockCamera, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_camera_stamp_of_other_clock_raises(mock: MockCamera, monkeypatch: pytest.MonkeyPatch) -> None:
     split = stamp.split
 
     def shifted(image: np.ndarray) -> tuple[np.ndarray, stamp.Stamp | None]:
@@ -278,14 +278,14 @@ def test_a_stamp_of_another_clock_is_refused(mock: MockCamera, monkeypatch: pyte
         Camera(stamped(mock), "left")
 
 
-def test_nobody_there() -> None:
+def test_open_without_server_raises() -> None:
     begin = time.monotonic()
     with pytest.raises(DeviceNotConnectedError, match=r"no picture from http://.* within 1 s.*[Rr]efused"):
         Camera(config(f"http://{HOST}:9/"), "left", connect_timeout=1.0)
     assert time.monotonic() - begin < WAIT
 
 
-def test_close_is_idempotent_and_final(mock: MockCamera) -> None:
+def test_close_twice_then_read_raises(mock: MockCamera) -> None:
     camera = Camera(stamped(mock), "left")
     camera.close()
     camera.close()
@@ -294,7 +294,7 @@ def test_close_is_idempotent_and_final(mock: MockCamera) -> None:
     until(lambda: mock.state().clients == 0)
 
 
-def test_close_wakes_who_waits(mock: MockCamera) -> None:
+def test_close_wakes_waiting_reader(mock: MockCamera) -> None:
     camera = Camera(stamped(mock), "left")
     caught: list[Exception] = []
 
@@ -312,7 +312,7 @@ def test_close_wakes_who_waits(mock: MockCamera) -> None:
     assert len(caught) == 1
 
 
-def test_a_program_may_end_without_closing(mock: MockCamera) -> None:
+def test_program_without_close_exits_cleanly(mock: MockCamera) -> None:
     code = (
         "from robot.camera.camera import Camera; from tacsim.models.hardware import CameraSensorConfig\n"
         f"config = CameraSensorConfig(driver='camera', source={mock.url!r}, width=320, height=240, stamped=True)\n"
@@ -323,7 +323,7 @@ def test_a_program_may_end_without_closing(mock: MockCamera) -> None:
 
 
 @pytest.mark.promise(14)
-def test_many_openings_leave_nothing(mock: MockCamera) -> None:
+def test_camera_many_openings_free_resources(mock: MockCamera) -> None:
     for _ in range(10):
         with Camera(stamped(mock), "left") as camera:
             camera.read(WAIT)

@@ -33,7 +33,7 @@ from tests.robot.waiting import until
         ("/nowhere/at/all", "no such file or folder"),
     ],
 )
-def test_sources_that_nobody_reads(source: str, text: str) -> None:
+def test_source_kind_unsupported_source_raises(source: str, text: str) -> None:
     with pytest.raises(WrongSource, match=text):
         Camera(config(source), "left")
 
@@ -41,15 +41,15 @@ def test_sources_that_nobody_reads(source: str, text: str) -> None:
 @pytest.mark.parametrize(
     "source", ["http://", "http://host:99999/", "http://user:secret@127.0.0.1/", "http://127.0.0.1/a b", "http://[::1/"]
 )
-def test_addresses_that_are_none(source: str) -> None:
+def test_open_invalid_address_raises(source: str) -> None:
     with pytest.raises(WrongSource, match="address"):
         Camera(config(source), "left")
 
 
-def test_what_only_uvc_can_set_is_refused_elsewhere() -> None:
-    with pytest.raises(WrongSource, match="exposure and white_balance are set through UVC only"):
+def test_source_kind_uvc_settings_elsewhere_raise() -> None:
+    with pytest.raises(WrongSource, match="exposure and white_balance can be set for UVC cameras only"):
         source_kind(config("http://127.0.0.1/", exposure=100.0), "left")
-    with pytest.raises(WrongSource, match="UVC only"):
+    with pytest.raises(WrongSource, match="UVC cameras only"):
         source_kind(config("/tmp", white_balance=4000.0), "left")
 
 
@@ -57,7 +57,7 @@ def test_what_only_uvc_can_set_is_refused_elsewhere() -> None:
 
 
 class FakeCapture:
-    """Stands for cv2.VideoCapture: takes settings, except those it is told to keep."""
+    """Replaces cv2.VideoCapture: accepts settings, except those in its list of fixed ones."""
 
     keeps: dict[int, float] = {}
     opened = True
@@ -131,7 +131,7 @@ def uvc(monkeypatch: pytest.MonkeyPatch) -> type[FakeCapture]:
 DEVICE = "/dev/null"  # any path in /dev that is there
 
 
-def test_uvc_sets_the_format_before_the_size_and_keeps_exposure(uvc: type[FakeCapture]) -> None:
+def test_uvc_settings_set_format_before_size(uvc: type[FakeCapture]) -> None:
     import cv2
 
     with Camera(config(DEVICE, exposure=150.0, white_balance=4500.0), "left") as camera:
@@ -145,7 +145,7 @@ def test_uvc_sets_the_format_before_the_size_and_keeps_exposure(uvc: type[FakeCa
     assert uvc.made[0].released
 
 
-def test_uvc_takes_the_jpeg_as_the_camera_sent_it(uvc: type[FakeCapture], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_uvc_jpeg_is_decoded_strictly(uvc: type[FakeCapture], monkeypatch: pytest.MonkeyPatch) -> None:
     """Half of them lost the end: OpenCV would decode them with a grey lower half."""
     whole = [encoded(seen(100, number)) for number in range(100)]
     monkeypatch.setattr(uvc, "jpeg", lambda n: whole[n % 100] if n % 2 else whole[n % 100][:800] + b"\xff\xd9")
@@ -155,8 +155,8 @@ def test_uvc_takes_the_jpeg_as_the_camera_sent_it(uvc: type[FakeCapture], monkey
         assert camera.status.reopened == 0
 
 
-def test_uvc_that_has_frozen(uvc: type[FakeCapture], monkeypatch: pytest.MonkeyPatch) -> None:
-    """The driver stamps each buffer anew; in low light it may give each picture twice, which is no loss."""
+def test_uvc_frozen_camera_raises_stale_frame(uvc: type[FakeCapture], monkeypatch: pytest.MonkeyPatch) -> None:
+    """The driver stamps each buffer; in low light it may give each picture twice, which is not a loss."""
     pictures = [encoded(seen(100, number)) for number in range(100)]
     monkeypatch.setattr(uvc, "jpeg", lambda n: pictures[n // 2 % 100])
     with Camera(config(DEVICE, max_age=0.2, fps=200.0), "left") as camera:
@@ -169,7 +169,7 @@ def test_uvc_that_has_frozen(uvc: type[FakeCapture], monkeypatch: pytest.MonkeyP
             camera.read(0.0)
 
 
-def test_uvc_leaves_alone_what_was_not_asked_for(uvc: type[FakeCapture]) -> None:
+def test_uvc_unset_settings_are_not_changed(uvc: type[FakeCapture]) -> None:
     import cv2
 
     capture = UvcCapture(config(DEVICE), "left")
@@ -190,7 +190,7 @@ def test_uvc_leaves_alone_what_was_not_asked_for(uvc: type[FakeCapture]) -> None
         ("CAP_PROP_WB_TEMPERATURE", float("nan"), "white_balance"),
     ],
 )
-def test_uvc_refuses_what_reads_back_otherwise(
+def test_uvc_setting_with_other_readback_raises(
     uvc: type[FakeCapture], monkeypatch: pytest.MonkeyPatch, setting: str, value: float, text: str
 ) -> None:
     import cv2
@@ -202,7 +202,7 @@ def test_uvc_refuses_what_reads_back_otherwise(
 
 
 @pytest.mark.parametrize("age", [None, -5.0, 1e6])
-def test_uvc_stamps_of_another_clock_are_not_used(
+def test_uvc_stamp_of_other_clock_uses_arrival(
     uvc: type[FakeCapture], monkeypatch: pytest.MonkeyPatch, age: float | None
 ) -> None:
     monkeypatch.setattr(uvc, "stamp", age)
@@ -211,9 +211,7 @@ def test_uvc_stamps_of_another_clock_are_not_used(
         assert camera.status.clock == "arrival"
 
 
-def test_uvc_reopens_after_a_stall_and_after_unplugging(
-    uvc: type[FakeCapture], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_uvc_stall_or_disconnection_reopens(uvc: type[FakeCapture], monkeypatch: pytest.MonkeyPatch) -> None:
     with Camera(config(DEVICE, max_age=0.2), "left") as camera:
         camera.read(20.0)
         monkeypatch.setattr(uvc, "ready", False)
@@ -224,27 +222,27 @@ def test_uvc_reopens_after_a_stall_and_after_unplugging(
         monkeypatch.setattr(uvc, "image", None)
         while camera.status.reopened < 3:
             time.sleep(0.005)
-        assert camera.status.error is not None and "unplugged" in camera.status.error
+        assert camera.status.error is not None and "disconnected" in camera.status.error
         monkeypatch.setattr(uvc, "image", np.zeros((48, 64, 3), dtype=np.uint8))
         camera.read(20.0)
     assert len(uvc.made) >= 4 and all(made.released for made in uvc.made)
 
 
-def test_uvc_frames_of_another_size_are_refused(uvc: type[FakeCapture], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_uvc_wrong_size_raises(uvc: type[FakeCapture], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(uvc, "image", np.zeros((60, 64, 3), dtype=np.uint8))
-    with pytest.raises(WrongSource, match="frames are 64 x 60 px, expected are 64 x 48"):
+    with pytest.raises(WrongSource, match="frames are 64 x 60 px, expected 64 x 48"):
         Camera(config(DEVICE), "left")
 
 
-def test_uvc_that_cannot_be_opened(uvc: type[FakeCapture], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_uvc_not_openable_raises(uvc: type[FakeCapture], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(uvc, "opened", False)
-    with pytest.raises(DeviceNotConnectedError, match="another program holds it"):
+    with pytest.raises(DeviceNotConnectedError, match="another program uses it"):
         Camera(config(DEVICE), "left", connect_timeout=0.5)
-    with pytest.raises(DeviceNotConnectedError, match="is it plugged in"):
+    with pytest.raises(DeviceNotConnectedError, match="is it connected"):
         Camera(config("/dev/v4l/by-id/usb-none-video-index0"), "left", connect_timeout=0.5)
 
 
-def test_one_function_chooses_the_source(server: Server, uvc: type[FakeCapture], tmp_path: object) -> None:
+def test_open_capture_source_selects_kind(server: Server, uvc: type[FakeCapture], tmp_path: object) -> None:
     server.talk = says(STREAM)
     Image.fromarray(np.zeros((48, 64, 3), np.uint8)).save(f"{tmp_path}/a.png")
     for source, kind in ((server.url, MjpegCapture), (DEVICE, UvcCapture), (str(tmp_path), PlayedCapture)):

@@ -23,15 +23,15 @@ SCAN = WHOLE.index(b"\xff\xda") + 14  # where the header ends
 HALF = (SCAN + len(WHOLE)) // 2
 
 
-def test_a_whole_picture_passes() -> None:
+def test_decode_jpeg_complete_picture_passes() -> None:
     assert decode_jpeg(WHOLE, SIZE, "here").shape == (240, 320, 3)
 
 
 @pytest.mark.parametrize(
     ("data", "why"),
     [
-        (b"", "no JPEG"),
-        (b"no picture", "no JPEG"),
+        (b"", "not a JPEG"),
+        (b"no picture", "not a JPEG"),
         (WHOLE[:HALF], "Premature end"),
         (WHOLE[:-2], "Premature end"),
         (WHOLE[:HALF] + END, "premature end"),
@@ -41,13 +41,13 @@ def test_a_whole_picture_passes() -> None:
     ],
     ids=["nothing", "no picture", "cut", "no end marker", "cut, with end marker", "zeros", "hole", "more than padding"],
 )
-def test_damage_is_seen(data: bytes, why: str) -> None:
+def test_decode_jpeg_damage_raises(data: bytes, why: str) -> None:
     with pytest.raises(DamagedFrame, match=f"here: a damaged picture .*({why})"):
         decode_jpeg(data, SIZE, "here")
 
 
 @pytest.mark.promise(11)
-def test_no_lost_packet_passes(figure: Record) -> None:
+def test_decode_jpeg_lost_packet_raises(figure: Record) -> None:
     """A USB packet or a TCP segment that is missing from the middle."""
     rng, passed = np.random.default_rng(0), 0
     for size in (188, 512, 944, 1448, 3060):
@@ -61,7 +61,7 @@ def test_no_lost_packet_passes(figure: Record) -> None:
     assert passed == 0
 
 
-def test_flipped_bytes_are_mostly_seen() -> None:
+def test_decode_jpeg_flipped_bytes_mostly_raise() -> None:
     """A flipped byte that gives another valid picture cannot be seen by any decoder; the more are flipped, the fewer
     pass."""
     rng = np.random.default_rng(0)
@@ -79,7 +79,7 @@ def test_flipped_bytes_are_mostly_seen() -> None:
     assert passed[1] <= 90 and passed[20] <= 20
 
 
-def test_no_bytes_are_an_error_of_another_kind() -> None:
+def test_decode_jpeg_random_bytes_raise_damaged_frame() -> None:
     rng = np.random.default_rng(1)
     for _ in range(300):
         data = bytearray(WHOLE[: rng.integers(len(WHOLE))] if rng.random() < 0.3 else WHOLE)
@@ -89,20 +89,20 @@ def test_no_bytes_are_an_error_of_another_kind() -> None:
             assert decode_jpeg(bytes(data), SIZE, "here").shape == (*SIZE, 3)
 
 
-def test_what_cameras_add_is_no_damage() -> None:
+def test_decode_jpeg_padding_passes() -> None:
     """Some pad each picture with a few bytes, before the end or after it."""
     whole = decode_jpeg(WHOLE, SIZE, "here")
     for data in (WHOLE + bytes(500), WHOLE[:-2] + bytes(9) + END):
         np.testing.assert_array_equal(decode_jpeg(data, SIZE, "here"), whole)
 
 
-def test_another_size_is_another_source() -> None:
-    with pytest.raises(WrongSource, match="frames are 320 x 240 px, expected are 64 x 48"):
+def test_decode_jpeg_wrong_size_raises_wrong_source() -> None:
+    with pytest.raises(WrongSource, match="frames are 320 x 240 px, expected 64 x 48"):
         decode_jpeg(WHOLE, (48, 64), "here")
 
 
 @pytest.mark.promise(11)
-def test_damaged_pictures_are_dropped_counted_and_told(
+def test_camera_damaged_pictures_are_dropped_and_reported(
     server: Server, figure: Record, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(mjpeg, "READ_TIMEOUT", 2 * WAIT)
@@ -129,7 +129,7 @@ def test_damaged_pictures_are_dropped_counted_and_told(
 
 
 @pytest.mark.parametrize("fault", ["cut", "flip"])
-def test_a_mock_camera_that_sends_damaged_pictures(fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_mock_camera_damaged_pictures_are_counted(fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mjpeg, "READ_TIMEOUT", 2 * WAIT)
     with MockCamera(host=HOST) as mock, Camera(stamped(mock), "left", connect_timeout=WAIT) as camera:
         getattr(mock, fault)(True if fault == "cut" else 500)

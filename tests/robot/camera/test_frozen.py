@@ -1,4 +1,4 @@
-"""A camera that sends the same picture for ever has frozen, whatever its frame rate says."""
+"""A camera that sends the same picture forever has frozen, at any frame rate."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def covered(number: int) -> np.ndarray:
 
 
 @pytest.mark.promise(11)
-def test_a_frozen_picture_is_no_new_one_and_is_told(server: Server, figure: Record) -> None:
+def test_camera_frozen_picture_is_reported_as_stale(server: Server, figure: Record) -> None:
     frozen = threading.Event()
 
     def picture(number: int) -> bytes:
@@ -65,7 +65,7 @@ def test_a_frozen_picture_is_no_new_one_and_is_told(server: Server, figure: Reco
 
 
 @pytest.mark.parametrize("kind", ["with a clock", "covered"])
-def test_what_differs_by_next_to_nothing_is_the_same_picture(server: Server, kind: str) -> None:
+def test_camera_nearly_equal_picture_counts_as_repeat(server: Server, kind: str) -> None:
     still = np.tile(seen(100, 7, (60, 64)), (8, 10, 1))
 
     def picture(number: int) -> bytes:
@@ -78,7 +78,7 @@ def test_what_differs_by_next_to_nothing_is_the_same_picture(server: Server, kin
         assert camera.status.frames == 1 and camera.status.repeated > 1
 
 
-def test_repeats_for_a_while_are_passed_over(server: Server) -> None:
+def test_camera_short_repeats_are_skipped(server: Server) -> None:
     """As of a server whose sensor is slower, or of a driver in low light: only each third frame is new."""
     server.talk = films(server, lambda number: encoded(seen(100, number // 3)), every=0.003)
     with Camera(config(server.url, max_age=10.0), "left", connect_timeout=WAIT) as camera:
@@ -88,7 +88,7 @@ def test_repeats_for_a_while_are_passed_over(server: Server) -> None:
     assert frame.index >= status.frames - 1
 
 
-def test_a_frozen_camera_that_is_reopened_is_still_frozen(server: Server) -> None:
+def test_camera_frozen_after_reopening_stays_stale(server: Server) -> None:
     same = encoded(seen(100, 7))
 
     def three(number: int) -> bytes:
@@ -104,7 +104,7 @@ def test_a_frozen_camera_that_is_reopened_is_still_frozen(server: Server) -> Non
             camera.read(0.0)
 
 
-def test_a_source_that_may_repeat_itself_says_so(server: Server) -> None:
+def test_camera_repeats_true_accepts_equal_pictures(server: Server) -> None:
     same = encoded(seen(100, 7))
     server.talk = films(server, lambda number: same)
     with Camera(config(server.url, repeats=True), "left", connect_timeout=WAIT) as camera:
@@ -112,7 +112,7 @@ def test_a_source_that_may_repeat_itself_says_so(server: Server) -> None:
         assert camera.status.repeated == 0
 
 
-def test_pictures_of_a_folder_may_be_alike(tmp_path: Path) -> None:
+def test_camera_folder_accepts_equal_pictures(tmp_path: Path) -> None:
     for number in range(4):
         Image.fromarray(seen(100, 7)).save(tmp_path / f"{number}.png")
     with Camera(config(tmp_path.as_posix(), fps=100.0), "left", connect_timeout=WAIT) as camera:
@@ -120,7 +120,7 @@ def test_pictures_of_a_folder_may_be_alike(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("stamped", [True, False])
-def test_a_mock_camera_that_freezes(stamped: bool) -> None:
+def test_mock_camera_frozen_raises_stale_frame(stamped: bool) -> None:
     with (
         MockCamera(host=HOST, stamped=stamped) as mock,
         Camera(mock_config(mock.url, stamped=stamped, max_age=0.3), "left", connect_timeout=WAIT) as camera,

@@ -70,13 +70,13 @@ def gel(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Gel]:
 def rig(gel: Gel) -> Iterator[Rig]:
     gel.camera.brightness(1.0)
     gel.show(flat())
-    time.sleep(0.1)  # so that no picture of the test before is on its way
+    time.sleep(0.1)  # so no picture of the previous test is in transit
     with open_rig(gel.path) as opened:
         yield opened
 
 
 def seen(rig: Rig, wanted) -> Observation:  # type: ignore[no-untyped-def]
-    """The first observation that is as wanted; the picture is some frames on its way."""
+    """The first observation for which `wanted` is true; a picture takes some frames to arrive."""
     deadline = time.monotonic() + PATIENCE
     while True:
         observation, _ = rig.step(Action())
@@ -85,7 +85,7 @@ def seen(rig: Rig, wanted) -> Observation:  # type: ignore[no-untyped-def]
         assert time.monotonic() < deadline, "not seen"
 
 
-def test_flow_is_promised_and_delivered(gel: Gel, rig: Rig) -> None:
+def test_marked_camera_spec_promises_flow(gel: Gel, rig: Rig) -> None:
     spec = rig.spec.sensors["finger"]
     assert spec.flow and spec.height
     first = rig.reset().tactile["finger"]
@@ -110,7 +110,7 @@ def test_flow_is_promised_and_delivered(gel: Gel, rig: Rig) -> None:
     assert np.abs(back.flow).max() < 20e-6
 
 
-def test_light_that_fades_is_recorded_and_reported(gel: Gel, rig: Rig, tmp_path: Path) -> None:
+def test_marked_camera_fading_light_is_recorded(gel: Gel, rig: Rig, tmp_path: Path) -> None:
     gel.show(flat())
     recorders: list[Recorder] = []
 
@@ -132,7 +132,7 @@ def test_light_that_fades_is_recorded_and_reported(gel: Gel, rig: Rig, tmp_path:
     assert any(cell.startswith("finger: stale reference in") for cell in shown)
 
 
-def test_dots_that_the_model_lacks_or_alone_has_are_refused(gel: Gel) -> None:
+def test_marked_camera_dots_unlike_model_raise(gel: Gel) -> None:
     gel.camera.brightness(1.0)
     gel.show(flat())
     time.sleep(0.1)

@@ -1,4 +1,4 @@
-"""Streams over HTTP: servers of many kinds, and those that lie, drip or say nothing."""
+"""Streams over HTTP: many kinds of servers, also wrong, slow and silent ones."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ STREAMS |= {
 
 
 @pytest.mark.parametrize("name", STREAMS)
-def test_streams_of_many_kinds_of_servers(server: Server, name: str) -> None:
+def test_mjpeg_server_variants_are_read(server: Server, name: str) -> None:
     server.talk = says(*STREAMS[name])
     stream = MjpegCapture(config(server.url), "left")
     try:
@@ -105,15 +105,15 @@ LIES = {
     "no boundary": (OK + b"Content-Type: multipart/x-mixed-replace\r\n\r\n", "without boundary"),
     "too long a line": (OK + b"X: " + b"a" * 100_000 + b"\r\n\r\n", "no HTTP answer"),
     "a huge length": (STREAM + part(b"", b"Content-Length: 99999999999"), "a picture of 99999999999 bytes"),
-    "a huge picture": (STREAM + part(huge(), length(huge())), "frames are 60000 x 60000 px, expected are 64 x 48"),
+    "a huge picture": (STREAM + part(huge(), length(huge())), "frames are 60000 x 60000 px, expected 64 x 48"),
     "a long line in a part": (STREAM + b"--here\r\n" + b"a" * 10_000, "a line of more than 8192 bytes"),
     "a long header of a part": (STREAM + b"--here\r\n" + b"X: 1\r\n" * 100, "a part with more than 64 header lines"),
-    "another size": (STREAM + part(jpeg(shape=(96, 64))), "frames are 64 x 96 px, expected are 64 x 48"),
+    "another size": (STREAM + part(jpeg(shape=(96, 64))), "frames are 64 x 96 px, expected 64 x 48"),
 }
 
 
 @pytest.mark.parametrize("name", LIES)
-def test_servers_that_are_no_camera_are_refused_at_once(server: Server, name: str) -> None:
+def test_mjpeg_wrong_server_raises_wrong_source(server: Server, name: str) -> None:
     sent, text = LIES[name]
     server.talk = forever(server, sent + b"\r\n--here\r\n", b"", every=60.0)
     begin = time.monotonic()
@@ -131,7 +131,7 @@ def test_servers_that_are_no_camera_are_refused_at_once(server: Server, name: st
         (STREAM + b"--here\r\n\r\n", b"x" * 1000, "no end of the picture"),
     ],
 )
-def test_servers_without_an_end_are_refused(server: Server, first: bytes, again: bytes, text: str) -> None:
+def test_mjpeg_endless_header_raises_wrong_source(server: Server, first: bytes, again: bytes, text: str) -> None:
     server.talk = forever(server, first, again)
     with pytest.raises(WrongSource, match=text):
         Camera(config(server.url), "left", connect_timeout=60.0)
@@ -148,7 +148,7 @@ DRIPS = {
 }
 
 
-def test_servers_that_drip_or_say_nothing() -> None:
+def test_mjpeg_slow_or_silent_server_times_out() -> None:
     """One byte now and then keeps a plain socket's time-out from passing; the deadline passes all the same. Side by
     side, because each takes its two seconds."""
 
@@ -170,8 +170,8 @@ def test_servers_that_drip_or_say_nothing() -> None:
 
 
 @pytest.mark.promise(9)
-def test_a_black_hole(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A listener whose queue is full drops what knocks: nobody answers, nobody refuses."""
+def test_mjpeg_unanswered_connection_times_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A listener with a full queue drops connections: no answer, no refusal."""
     with socket.socket() as hole:
         hole.bind((HOST, 0))
         hole.listen(0)
@@ -189,7 +189,7 @@ def test_a_black_hole(monkeypatch: pytest.MonkeyPatch) -> None:
                 filler.close()
 
 
-def test_pictures_that_are_none_are_passed_over(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_mjpeg_invalid_pictures_are_skipped(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mjpeg, "READ_TIMEOUT", 60.0)  # a busy machine is no stall
     broken = [b"no picture", b"", WHOLE[:100], WHOLE[: len(WHOLE) // 2], WHOLE[:-20] + bytes(20)]
     server.talk = forever(server, STREAM + b"".join(part(data, length(data)) for data in broken[:4]), part(WHOLE), 0.02)
@@ -199,7 +199,7 @@ def test_pictures_that_are_none_are_passed_over(server: Server, monkeypatch: pyt
 
 
 @pytest.mark.promise(11)
-def test_a_frame_that_is_sent_again_is_no_new_one(server: Server) -> None:
+def test_mjpeg_repeated_frame_keeps_index(server: Server) -> None:
     """Some servers greet a new client with the last frame they have: after a stall it is old news."""
     mark = stamp.Stamp(frame=7, image=0, clock=time.monotonic_ns() // 1000)
     image = stamp.draw(np.full((48, 64, 3), 100, dtype=np.uint8), mark)

@@ -43,17 +43,17 @@ def read_all(camera: Camera, end: type[Exception], text: str) -> dict[int, Tacti
         return seen
 
 
-def test_a_folder_is_played_once(tmp_path: Path) -> None:
+def test_played_folder_ends_after_last_picture(tmp_path: Path) -> None:
     write_pictures(tmp_path, 12)
     with played(tmp_path) as camera:
-        seen = read_all(camera, EndOfEpisode, "is over")
+        seen = read_all(camera, EndOfEpisode, "no more pictures")
     assert set(seen) <= set(range(12)) and len(seen) > 3
     assert all((frame.image == 10 * index).all() for index, frame in seen.items())
     times = [seen[index].time for index in sorted(seen)]
     assert times[-1] - times[0] > 0.05 * (max(seen) - min(seen) - 1) - 1e-3  # the first may have come late
 
 
-def test_a_video_is_played_once(tmp_path: Path) -> None:
+def test_played_video_ends_after_last_picture(tmp_path: Path) -> None:
     import cv2
 
     path = tmp_path / "v.avi"
@@ -64,7 +64,7 @@ def test_a_video_is_played_once(tmp_path: Path) -> None:
     with played(path, fps=1.0) as camera:
         image = camera.read(WAIT).image
         assert image[0, 0, 0] == 0 and image[0, 0, 2] % 10 <= 1  # BGR in the file, RGB here
-        read_all(camera, EndOfEpisode, "is over")
+        read_all(camera, EndOfEpisode, "no more pictures")
     assert camera.status.frames == 8
     data = path.read_bytes()
     path.write_bytes(data[: len(data) // 100])
@@ -72,7 +72,7 @@ def test_a_video_is_played_once(tmp_path: Path) -> None:
         played(path)
 
 
-def test_a_slow_folder_closes_at_once(tmp_path: Path) -> None:
+def test_played_slow_folder_closes_quickly(tmp_path: Path) -> None:
     write_pictures(tmp_path, 2)
     camera = played(tmp_path, fps=0.001)
     begin = time.monotonic()
@@ -80,11 +80,11 @@ def test_a_slow_folder_closes_at_once(tmp_path: Path) -> None:
     assert time.monotonic() - begin < WAIT  # the next picture is due in a quarter of an hour
 
 
-def test_folders_that_are_no_source(tmp_path: Path) -> None:
+def test_played_invalid_folder_raises(tmp_path: Path) -> None:
     with pytest.raises(WrongSource, match="no pictures in this folder"):
         played(tmp_path)
     paths = write_pictures(tmp_path, 3)
-    with pytest.raises(WrongSource, match="frames are 32 x 24 px, expected are 64 x 48"):
+    with pytest.raises(WrongSource, match="frames are 32 x 24 px, expected 64 x 48"):
         played(tmp_path, width=64, height=48)
     paths[1].write_bytes(b"no picture")
     with pytest.raises(WrongSource, match=r"1\.png"):
@@ -98,7 +98,7 @@ def test_folders_that_are_no_source(tmp_path: Path) -> None:
         played(paths[1])
 
 
-def test_a_picture_that_breaks_off_ends_the_folder(tmp_path: Path) -> None:
+def test_played_damaged_picture_ends_folder(tmp_path: Path) -> None:
     paths = write_pictures(tmp_path, 3)
     rng = np.random.default_rng(0)
     Image.fromarray(rng.integers(0, 256, (24, 32, 3), dtype=np.uint8)).save(paths[1])

@@ -53,7 +53,7 @@ def test_a_dry_run_on_a_copy_of_the_one_arm_file(one_arm: Lab, folder: Path, tmp
         (["--set", "arms.arm.limits.depth=1 mm"], r"limits\.depth: sensor 'finger' does not measure it"),
         (
             ["--set", "arms.arm.simulator=false", "--set", "arms.arm.watchdog=10"],
-            "is a real one, but its host .* is this machine.*simulator: true",
+            "is a real arm, but its host .* is this machine.*simulator: true",
         ),
         (["--set", "arms.arm.host=192.0.2.1"], r"simulator: true.*host 192\.0\.2\.1 is outside this machine"),
         (["--set", "arms.arm.mock={}"], "either a maker's simulator .* or our mock"),

@@ -43,7 +43,7 @@ def random_joints(seed: int, count: int) -> FloatArray:
     return np.random.default_rng(seed).uniform(-JOINT_RANGE, JOINT_RANGE, (count, 6))
 
 
-def test_models_are_those_of_the_rig_file() -> None:
+def test_models_match_rig_file_models() -> None:
     assert set(MODELS) == set(get_args(Model))
 
 
@@ -56,14 +56,14 @@ def test_models_are_those_of_the_rig_file() -> None:
         ("ur10e", (-1.18425, -0.2907, 0.06085)),
     ],
 )
-def test_flange_with_all_joints_zero(model: Model, position: tuple[float, ...]) -> None:
+def test_forward_zero_joints_gives_known_flange(model: Model, position: tuple[float, ...]) -> None:
     frame = Kinematics(model).forward([0.0] * 6)
     np.testing.assert_allclose(frame[:3, 3], position, atol=1e-12)
     np.testing.assert_allclose(frame[:3, :3], [[1, 0, 0], [0, 0, -1], [0, 1, 0]], atol=1e-12)
 
 
 @every_model
-def test_forward_is_the_product_of_the_dh_matrices(model: Model) -> None:
+def test_forward_equals_product_of_dh_matrices(model: Model) -> None:
     arm = Kinematics(model)
     for q in random_joints(1, 200):
         np.testing.assert_allclose(arm.forward(q), multiplied_out(model, q), atol=1e-13)
@@ -71,7 +71,7 @@ def test_forward_is_the_product_of_the_dh_matrices(model: Model) -> None:
 
 
 @every_model
-def test_jacobian_is_the_derivative(model: Model) -> None:
+def test_jacobian_equals_numerical_derivative(model: Model) -> None:
     arm, h = Kinematics(model), 1e-6
     for q in random_joints(2, 30):
         columns = [
@@ -81,7 +81,7 @@ def test_jacobian_is_the_derivative(model: Model) -> None:
 
 
 @every_model
-def test_inverse_from_far_and_from_near(model: Model) -> None:
+def test_inverse_near_and_far_seed_reach_target(model: Model) -> None:
     arm, generator = Kinematics(model), np.random.default_rng(3)
     for q in random_joints(4, 300):
         target = arm.forward(q, TOOL)
@@ -97,7 +97,7 @@ def test_inverse_from_far_and_from_near(model: Model) -> None:
 
 
 @every_model
-def test_all_solutions_are_solutions_and_differ(model: Model) -> None:
+def test_solutions_reach_target_and_differ(model: Model) -> None:
     arm = Kinematics(model)
     q = np.array([0.3, -1.2, 1.4, -1.1, -1.3, 0.4])
     found = arm.solutions(arm.forward(q), q)
@@ -108,7 +108,7 @@ def test_all_solutions_are_solutions_and_differ(model: Model) -> None:
     assert min(gaps) > 0.01
 
 
-def test_inverse_takes_the_solution_nearest_to_the_seed() -> None:
+def test_inverse_returns_solution_nearest_to_seed() -> None:
     arm = Kinematics("ur5e")
     q = np.array([0.3, -1.2, 1.4, -1.1, -1.3, 0.4])
     for wanted in arm.solutions(arm.forward(q), q):
@@ -117,7 +117,7 @@ def test_inverse_takes_the_solution_nearest_to_the_seed() -> None:
         np.testing.assert_allclose(found, wanted, atol=1e-8)
 
 
-def test_inverse_refuses_what_is_out_of_reach_or_no_number() -> None:
+def test_inverse_out_of_reach_or_nan_returns_none() -> None:
     arm, seed = Kinematics("ur5e"), np.array([0, -1.5, 1.5, -1.5, -1.5, 0])
     assert arm.inverse(matrix([5.0, 0, 0, 0, 0, 0]), seed) is None
     assert arm.inverse(matrix([0.05, 0, 0.3, math.pi, 0, 0]), seed) is None  # the wrist inside the shoulder's cylinder
@@ -125,7 +125,7 @@ def test_inverse_refuses_what_is_out_of_reach_or_no_number() -> None:
     assert arm.inverse(arm.forward(seed), np.full(6, np.nan)) is None
 
 
-def test_inverse_keeps_joints_in_their_range() -> None:
+def test_inverse_joints_stay_in_range() -> None:
     arm = Kinematics("ur5e")
     end = np.array([JOINT_RANGE - 1e-3, -1.5, 1.5, -1.5, -1.5, 0])
     beyond = end + [2e-3, 0, 0, 0, 0, 0]
@@ -134,14 +134,14 @@ def test_inverse_keeps_joints_in_their_range() -> None:
     np.testing.assert_allclose(arm.forward(found), arm.forward(beyond), atol=1e-9)
 
 
-def test_singularity_vanishes_in_singular_poses_only() -> None:
+def test_singularity_is_zero_only_in_singular_poses() -> None:
     arm = Kinematics("ur5e")
     assert arm.singularity([0.2, -1.2, 1.4, -1.1, -1.5, 0.4]) > 0.1
     assert arm.singularity([0.2, -1.2, 0.0, -1.1, -1.5, 0.4]) < 1e-9  # elbow stretched
     assert arm.singularity([0.2, -1.2, 1.4, -1.1, 0.0, 0.4]) < 1e-9  # axes 4 and 6 parallel
 
 
-def test_rotation_vector_to_half_a_turn_and_back() -> None:
+def test_rotation_vector_round_trip_up_to_half_turn() -> None:
     generator = np.random.default_rng(5)
     for index in range(3000):
         axis = generator.normal(size=3)
@@ -152,7 +152,7 @@ def test_rotation_vector_to_half_a_turn_and_back() -> None:
         np.testing.assert_allclose(Rotation.from_rotvec(vector).as_matrix(), turn, atol=1e-14)
 
 
-def test_poses_and_frames_there_and_back() -> None:
+def test_pose_matrix_round_trip_is_equal() -> None:
     given = np.array([0.1, -0.2, 0.3, 0.4, -0.5, 0.6])
     np.testing.assert_allclose(pose(matrix(given)), given, atol=1e-15)
     np.testing.assert_allclose(inverse_frame(TOOL) @ TOOL, np.eye(4), atol=1e-15)

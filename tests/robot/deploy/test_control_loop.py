@@ -1,4 +1,4 @@
-"""The control loop: exactly so many steps, all of them kept, whatever happens; and policies by name."""
+"""The control loop: the requested number of steps, all of them stored in every case; and policies by name."""
 
 from __future__ import annotations
 
@@ -134,7 +134,7 @@ class Recorder:
         return True
 
 
-def test_exactly_so_many_steps_after_the_reset() -> None:
+def test_run_episode_has_requested_steps_after_reset() -> None:
     hand = Hand()
     episode = run_episode(make_rig(hand), FunctionPolicy(lift), TASK, 4)
     assert [step.index for step in episode.steps] == [0, 1, 2, 3, 4]
@@ -156,7 +156,7 @@ def test_exactly_so_many_steps_after_the_reset() -> None:
     assert run_episode(make_rig(Hand()), FunctionPolicy(lift), TASK, 0).steps[-1].index == 0
 
 
-def test_a_recording_that_can_go_on_no_more_ends_the_episode_with_the_arms_stopped() -> None:
+def test_run_episode_failed_recording_stops_arms() -> None:
     class FullDisk(Recorder):
         def write(self, step: Step) -> bool:
             if len(self.steps) == 2:
@@ -172,7 +172,7 @@ def test_a_recording_that_can_go_on_no_more_ends_the_episode_with_the_arms_stopp
     assert hand.stops > 0
 
 
-def test_every_step_goes_to_the_recorder_with_meta_and_references() -> None:
+def test_run_episode_records_steps_meta_and_references() -> None:
     recorders: list[Recorder] = []
 
     def open_recorder(meta: EpisodeMeta) -> Recorder:
@@ -203,8 +203,8 @@ def test_every_step_goes_to_the_recorder_with_meta_and_references() -> None:
     assert {"python", "numpy"} <= set(meta.versions)
 
 
-def test_a_recorded_episode_keeps_no_picture_in_memory(tmp_path: Path) -> None:
-    """Of 200 steps only those that still wait for the disk may be there; each is read again when it is asked for."""
+def test_run_episode_with_recorder_keeps_no_picture_in_memory(tmp_path: Path) -> None:
+    """Of 200 steps only those that still wait for the disk may be there; each is read again on access."""
     pictures: list[weakref.ref[Any]] = []
     most = 0
 
@@ -230,7 +230,7 @@ def test_a_recorded_episode_keeps_no_picture_in_memory(tmp_path: Path) -> None:
     assert episode.steps[-1].frames["lower"].image.max() == episode.steps[-1].index
 
 
-def test_a_recording_tells_the_date_and_keeps_exact_times(tmp_path: Path) -> None:
+def test_run_episode_recording_has_date_and_exact_times(tmp_path: Path) -> None:
     before = time.time_ns()
     with ExitStack() as stack:
         run_episode(
@@ -255,13 +255,13 @@ def test_a_recording_tells_the_date_and_keeps_exact_times(tmp_path: Path) -> Non
             assert before <= message.publish_time <= after + 3 * 10**8
 
 
-def test_a_rig_without_truth_is_not_judged() -> None:
+def test_run_episode_without_truth_is_not_judged() -> None:
     episode = run_episode(make_rig(Hand(), truth=False), FunctionPolicy(lift), None, 2)
     assert all(step.reward is None and step.distance is None for step in episode.steps)
     assert "body_height" not in episode.steps[0].info
 
 
-def test_needs_are_checked_before_anything_moves() -> None:
+def test_run_episode_missing_needs_raise_before_motion() -> None:
     hand = Hand()
     with pytest.raises(IncompatibleRig, match=r"task 'squeeze' .judged by touch.*lacks sensor 'upper'; surface h"):
         run_episode(make_rig(hand, truth=False), FunctionPolicy(lift), TASK, 2)
@@ -270,19 +270,19 @@ def test_needs_are_checked_before_anything_moves() -> None:
     assert hand.resets == 0
 
 
-def test_a_recording_ends_the_episode_cleanly() -> None:
+def test_run_episode_end_of_replay_ends_cleanly() -> None:
     episode = run_episode(make_rig(Hand(frames=3)), FunctionPolicy(lift), TASK, 100)
     assert [step.index for step in episode.steps] == [0, 1, 2]
 
 
-def test_the_stop_flag_ends_the_episode_after_the_step() -> None:
+def test_run_episode_stop_ends_after_step() -> None:
     hand = Hand()
     episode = run_episode(make_rig(hand), FunctionPolicy(lift), TASK, 100, stop=lambda: hand.ticks >= 2)
     assert len(episode.steps) == 3
     assert hand.stops > 0
 
 
-def test_ctrl_c_keeps_what_was_done() -> None:
+def test_run_episode_ctrl_c_keeps_steps() -> None:
     hand = Hand()
 
     def act(observation: Observation) -> Action:
@@ -294,7 +294,7 @@ def test_ctrl_c_keeps_what_was_done() -> None:
     assert hand.stops > 0
 
 
-def test_a_policy_that_raises_stops_the_arms_and_keeps_the_episode() -> None:
+def test_run_episode_policy_error_stops_arms_and_keeps_steps() -> None:
     hand = Hand()
 
     def act(observation: Observation) -> Action:
@@ -311,7 +311,7 @@ def test_a_policy_that_raises_stops_the_arms_and_keeps_the_episode() -> None:
     assert hand.stops > 0
 
 
-def test_a_policy_that_ends_python_ends_the_episode() -> None:
+def test_run_episode_policy_exit_ends_episode() -> None:
     def act(observation: Observation) -> Action:
         sys.exit(7)
 
@@ -319,7 +319,7 @@ def test_a_policy_that_ends_python_ends_the_episode() -> None:
         run_episode(make_rig(Hand()), FunctionPolicy(act), TASK, 5)
 
 
-def test_negative_steps_are_refused() -> None:
+def test_run_episode_negative_steps_raise() -> None:
     with pytest.raises(ValueError, match="-1"):
         run_episode(make_rig(Hand()), FunctionPolicy(lift), TASK, -1)
 
@@ -360,7 +360,7 @@ def load(name: str, task: Any = TASK) -> Any:
 
 
 @pytest.mark.usefixtures("module")
-def test_policies_by_name() -> None:
+def test_load_policy_known_names_return_policies() -> None:
     assert isinstance(load("scripted"), ScriptedSqueeze)
     assert isinstance(load("grip"), Grip)
     assert load("my_policies:hold").needs == Needs()
@@ -382,19 +382,19 @@ def test_policies_by_name() -> None:
         ("my_policies:", "must have the form"),
         ("no_policies:hold", "no module 'no_policies'"),
         ("my_policies:absent", "'my_policies' has no 'absent'"),
-        ("my_policies:number", "is a int: neither a policy nor a function"),
-        ("my_policies:Demanding", "cannot be made without arguments"),
+        ("my_policies:number", "is a int: not a policy and not a function"),
+        ("my_policies:Demanding", "cannot be created without arguments"),
         ("broken_policies:hold", "itself imports 'no_such_package', which is missing"),
         ("failing_policies:hold", "importing 'failing_policies' failed: ZeroDivisionError"),
         ("ending_policies:hold", r"importing 'ending_policies' failed: SystemExit\(3\)"),
         ("my_policies:Needless", "its needs must be a tacsim.Needs, got NoneType"),
     ],
 )
-def test_a_name_that_leads_nowhere_says_why(name: str, message: str) -> None:
+def test_load_policy_unknown_name_raises_with_reason(name: str, message: str) -> None:
     with pytest.raises(PolicyNotFound, match=message):
         load(name)
 
 
-def test_scripted_needs_a_task() -> None:
+def test_load_policy_scripted_without_task_raises() -> None:
     with pytest.raises(PolicyNotFound, match="this rig has none"):
         load("scripted", task=None)

@@ -14,7 +14,7 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from robot.deploy.control_loop import EpisodeFailed, EpisodeSetup, run_episode
-from robot.deploy.onnx_policy import MOST_BYTES, OnnxPolicy
+from robot.deploy.onnx_policy import MAX_BYTES, OnnxPolicy
 from robot.deploy.policy import PolicyNotFound, load_policy, require_fit
 from robot.open import open_rig
 from tacsim.gym.features import FeatureEncoder
@@ -81,7 +81,7 @@ def read(path: Path) -> OnnxPolicy:
 
 
 @pytest.mark.parametrize(("sight", "channels"), [("height", 4), ("picture", 12)])
-def test_it_does_on_a_rig_what_it_did_in_the_environment(sight: Any, channels: int, write: Callable[..., Path]) -> None:
+def test_onnx_policy_on_rig_acts_as_in_environment(sight: Any, channels: int, write: Callable[..., Path]) -> None:
     """The same actions to the last bit, and so the same motion."""
     features = FEATURES.model_copy(update={"maps": (sight,)})
     said = {"features": features, "inputs": FeatureEncoder(features, GRID).inputs}
@@ -106,17 +106,17 @@ def test_it_does_on_a_rig_what_it_did_in_the_environment(sight: Any, channels: i
         assert abs(moved[2]) > 1e-5
 
 
-def test_what_it_needs_of_a_rig(write: Callable[..., Path]) -> None:
+def test_onnx_policy_needs_follow_features(write: Callable[..., Path]) -> None:
     both = frozenset({"lower", "upper"})
     assert read(write()).needs == Needs(both, both, height=True)
 
 
-def test_an_arm_that_a_limit_held_back_is_asked_from_where_it_stands(write: Callable[..., Path]) -> None:
+def test_onnx_policy_held_back_arm_targets_from_its_pose(write: Callable[..., Path]) -> None:
     policy = read(write(metadata=spec(max_step=0.1e-3)))
     env = make(features=FEATURES, variants=())
     env.reset(seed=1)
     observation = env.rig.observe()
-    asked = [policy(observation).tool["lower"] for _ in range(6)]  # it never gets there
+    asked = [policy(observation).tool["lower"] for _ in range(6)]  # it never reaches the target
     start = observation.arms["lower"].pose.position[2]
     away = [abs(float(pose.position[2] - start)) for pose in asked if pose is not None]
     assert len(away) == 6 and max(away) <= 3 * 0.1e-3
@@ -138,7 +138,7 @@ TASK = make_task(SqueezeConfig(kind="squeeze", goal=2e-3))
         ({"max_step": 0.5e-3}, r"steps of up to 0.5 mm, this task allows 0.2 mm \(max_step\)"),
     ],
 )
-def test_a_rig_that_it_does_not_fit_is_refused_with_the_difference(
+def test_require_fit_other_rig_raises_with_difference(
     changed: dict[str, Any], words: str, write: Callable[..., Path]
 ) -> None:
     with open_rig("sim", task="squeeze", overrides=SMALL) as rig:
@@ -147,7 +147,7 @@ def test_a_rig_that_it_does_not_fit_is_refused_with_the_difference(
             require_fit(rig.name, rig.spec, policy, "learned", TASK)
 
 
-def test_another_grid_and_no_task_are_refused(write: Callable[..., Path]) -> None:
+def test_load_policy_other_grid_or_no_task_raises(write: Callable[..., Path]) -> None:
     path = write()
     with pytest.raises(IncompatibleRig, match="cannot be put together"):
         OnnxPolicy(path, GRID.model_copy(update={"pitch": 0.3e-3}), 2e-3)
@@ -228,14 +228,14 @@ def action_of_texts(_: Path) -> tuple[onnx.ModelProto, Mapping[str, Any]]:
 @pytest.mark.parametrize(
     ("wrong", "words"),
     [
-        (no_spec, "does not say what it sees: it has no metadata 'tacsim.spec'"),
-        (unknown_operator, "no ONNX file that can run here: .*Levitate"),
-        (external_data, "no ONNX file that can run here: .*[Ee]xternal"),
-        (external_data_here, "no ONNX file that can run here: .*[Ee]xternal"),
+        (no_spec, "does not describe its inputs: it has no metadata 'tacsim.spec'"),
+        (unknown_operator, "not an ONNX file that can run here: .*Levitate"),
+        (external_data, "not an ONNX file that can run here: .*[Ee]xternal"),
+        (external_data_here, "not an ONNX file that can run here: .*[Ee]xternal"),
         (other_version, "metadata 'tacsim.spec' cannot be read: version: Input should be 1"),
         (no_json, "cannot be read: period"),
-        (other_inputs, "its graph takes goal, maps, touch, its metadata speak of maps, touch"),
-        (other_scale, "trained on as 'touch' is not what this version"),
+        (other_inputs, "its graph takes goal, maps, touch, its metadata list maps, touch"),
+        (other_scale, "its training had another input 'touch' than this version"),
         (misshapen_input, r"its input 'maps' is tensor.float. \[1, 3, 4, 4\]; wanted: .* 1 x 4 x 4 x 4"),
         (other_rows, r"its input 'maps' is tensor.float. \[1, 4, 7, 4\]; wanted: .* 1 x 4 x 4 x 4"),
         (many_at_once, r"its input 'maps' is tensor.float. \[3, 4, 4, 4\]; wanted: .* 1 x 4 x 4 x 4"),
@@ -243,7 +243,7 @@ def action_of_texts(_: Path) -> tuple[onnx.ModelProto, Mapping[str, Any]]:
         (action_of_texts, "it must give 'action', tensor.float. 1 x 2; it gives .*string"),
     ],
 )
-def test_a_file_that_is_no_policy_says_why(
+def test_onnx_policy_invalid_file_raises_with_reason(
     wrong: Any, words: str, write: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -252,28 +252,28 @@ def test_a_file_that_is_no_policy_says_why(
     assert "\n" not in str(caught.value)
 
 
-def test_the_goal_of_another_task_is_called_so(write: Callable[..., Path]) -> None:
+def test_onnx_policy_goal_of_other_task_is_named(write: Callable[..., Path]) -> None:
     with pytest.raises(PolicyNotFound, match=r"was trained for task 'squeeze', whose goal is .* 1 x 2"):
         OnnxPolicy(write(), GRID, (1e-3, 2e-3))
 
 
-def test_files_that_cannot_be_read(tmp_path: Path) -> None:
+def test_onnx_policy_unreadable_file_raises(tmp_path: Path) -> None:
     path = tmp_path / "policy.onnx"
     with pytest.raises(PolicyNotFound, match="cannot be read: No such file"):
         read(path)
     for content in (b"", b"\x00" * 100, graph().SerializeToString()[:200]):
         path.write_bytes(content)
-        with pytest.raises(PolicyNotFound, match=r"no ONNX file that can run here|does not say what it sees"):
+        with pytest.raises(PolicyNotFound, match=r"not an ONNX file that can run here|does not describe its inputs"):
             read(path)
     with path.open("wb") as file:
         file.truncate(2**30)
-    with pytest.raises(PolicyNotFound, match=rf"has 1,024 MiB, at most {MOST_BYTES >> 20} are read"):
+    with pytest.raises(PolicyNotFound, match=rf"has 1,024 MiB, the maximum is {MAX_BYTES >> 20} MiB"):
         read(path)
     with pytest.raises(PolicyNotFound, match="cannot be read"):
         read(tmp_path)  # a folder
 
 
-def test_without_onnxruntime_it_says_what_to_install(
+def test_onnx_policy_without_onnxruntime_names_package(
     write: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(__import__("sys").modules, "onnxruntime", None)
@@ -282,9 +282,7 @@ def test_without_onnxruntime_it_says_what_to_install(
 
 
 @pytest.mark.parametrize(("last", "words"), [("Acosh", "gives .*nan"), ("Exp", r"gives .*within \[-1, 1\]")])
-def test_what_is_no_action_ends_the_episode_with_the_arms_stopped(
-    last: str, words: str, write: Callable[..., Path]
-) -> None:
+def test_onnx_policy_invalid_action_stops_arms(last: str, words: str, write: Callable[..., Path]) -> None:
     path = write(graph(last), spec())
     with open_rig("sim", task="squeeze", overrides=SMALL) as rig:
         policy = load_policy(str(path), TASK, rig.spec, GRID)
@@ -295,7 +293,7 @@ def test_what_is_no_action_ends_the_episode_with_the_arms_stopped(
         assert len(failed.value.episode.steps) == 1
 
 
-def test_an_observation_that_is_no_number_makes_no_action(write: Callable[..., Path]) -> None:
+def test_onnx_policy_nan_observation_raises(write: Callable[..., Path]) -> None:
     from dataclasses import replace
 
     policy = read(write())
@@ -304,10 +302,10 @@ def test_an_observation_that_is_no_number_makes_no_action(write: Callable[..., P
     seen = env.rig.observe()
     wrench = np.full(6, np.nan)
     arms = {**seen.arms, "upper": replace(seen.arms["upper"], wrench=wrench)}
-    with pytest.raises(RuntimeError, match="not all of touch is a number"):
+    with pytest.raises(RuntimeError, match="touch has values that are not finite"):
         policy(replace(seen, arms=arms))
 
 
-def test_its_metadata_read_back(write: Callable[..., Path]) -> None:
+def test_onnx_policy_metadata_round_trip_is_equal(write: Callable[..., Path]) -> None:
     made = spec(trained={"seed": 3, "by": "a test"})
     assert json.loads(read(write(metadata=made)).spec.model_dump_json()) == made

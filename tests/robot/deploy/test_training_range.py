@@ -14,7 +14,7 @@ from onnx import helper
 from robot.deploy.control_loop import EpisodeSetup, run_episode
 from robot.deploy.onnx_policy import OnnxPolicy
 from robot.deploy.policy import has_training_range, load_policy, training_notes
-from robot.deploy.training_range import RangeWatch, measured, numbers_of, outside_of_scenes
+from robot.deploy.training_range import RangeMonitor, describe_scenes_outside, extract_numbers, fit_training_range
 from robot.open import open_rig
 from robot.train.evaluate import evaluate
 from robot.train.measure_range import measure_range, write_range
@@ -39,7 +39,7 @@ def pressed(stiffness: float, random: np.random.Generator) -> np.ndarray[Any, An
 
 
 def share_outside(known: Any, episodes: list[np.ndarray[Any, Any]]) -> float:
-    watch, count = RangeWatch(known), 0
+    watch, count = RangeMonitor(known), 0
     for episode in episodes:
         watch.reset()
         for numbers in episode:
@@ -48,10 +48,10 @@ def share_outside(known: Any, episodes: list[np.ndarray[Any, Any]]) -> float:
     return count / len(episodes)
 
 
-def test_a_stiffer_body_is_outside_and_an_unseen_one_within() -> None:
+def test_range_monitor_stiffer_body_is_outside() -> None:
     """3 of 100 episodes of training are beyond the limit, give or take what 100 episodes of calibration leave open."""
     random = np.random.default_rng(3)
-    known = measured([pressed(random.uniform(0.2, 0.8), random) for _ in range(200)], [])
+    known = fit_training_range([pressed(random.uniform(0.2, 0.8), random) for _ in range(200)], [])
     assert share_outside(known, [pressed(random.uniform(0.2, 0.8), random) for _ in range(300)]) <= 0.08
     stiff = [pressed(random.uniform(1.2, 1.6), random) for _ in range(50)]
     assert share_outside(known, stiff) >= 0.95
@@ -61,27 +61,27 @@ def test_a_stiffer_body_is_outside_and_an_unseen_one_within() -> None:
     assert share_outside(known, early) >= 0.6
 
 
-def test_what_is_farthest_beyond_its_own_range_is_named() -> None:
+def test_range_monitor_names_number_farthest_outside() -> None:
     random = np.random.default_rng(4)
-    known = measured([random.uniform(0, 1, (20, 2)) for _ in range(40)], [])
-    watch = RangeWatch(known, ["gap", "depth"])
+    known = fit_training_range([random.uniform(0, 1, (20, 2)) for _ in range(40)], [])
+    watch = RangeMonitor(known, ["gap", "depth"])
     watch({"touch": np.array([0.5, 0.5])})
     assert not watch.is_outside
     watch({"touch": np.array([0.5, 9.0])})
     assert watch.is_outside
-    assert "depth is 9, in training 0" in watch.words()
+    assert "depth is 9, in training 0" in watch.describe_outside()
     watch.reset()
     assert not watch.is_outside
 
 
-def test_of_a_map_mean_least_and_greatest_of_each_channel_count() -> None:
+def test_extract_numbers_map_gives_mean_minimum_maximum() -> None:
     maps = np.arange(8.0).reshape(2, 2, 2)
-    assert numbers_of({"maps": maps, "goal": np.array([7.0])}, 1).tolist() == [7.0, 1.5, 0.0, 3.0, 5.5, 4.0, 7.0]
+    assert extract_numbers({"maps": maps, "goal": np.array([7.0])}, 1).tolist() == [7.0, 1.5, 0.0, 3.0, 5.5, 4.0, 7.0]
 
 
-def test_of_several_frames_the_newest_counts() -> None:
+def test_extract_numbers_uses_newest_frame() -> None:
     seen = {"touch": np.array([1.0, 2.0, 3.0, 4.0]), "goal": np.array([5.0, 6.0])}
-    assert numbers_of(seen, 2).tolist() == [5.0, 6.0, 3.0, 4.0]
+    assert extract_numbers(seen, 2).tolist() == [5.0, 6.0, 3.0, 4.0]
 
 
 def scene(*overrides: str) -> Scene:
@@ -102,13 +102,13 @@ def scene(*overrides: str) -> Scene:
         ("scene.gravity=[0, 0, -9.81]", r"gravity\[2\] is -9.81, in training 0"),
     ],
 )
-def test_the_parameter_of_a_scene_that_is_outside_is_named(override: str, said: str) -> None:
+def test_describe_scenes_outside_names_parameter(override: str, said: str) -> None:
     import re
 
     met = [scene(f"{SCENE}.yield_stress={each}") for each in ("5 kPa", "20 kPa")]
-    known = measured([np.random.default_rng(0).normal(size=(9, 2)) for _ in range(4)], met)
-    assert outside_of_scenes(known, [scene(f"{SCENE}.yield_stress=12 kPa", "scene.preset=learn")]) == []
-    assert any(re.match(said, each) for each in outside_of_scenes(known, [scene(override)]))
+    known = fit_training_range([np.random.default_rng(0).normal(size=(9, 2)) for _ in range(4)], met)
+    assert describe_scenes_outside(known, [scene(f"{SCENE}.yield_stress=12 kPa", "scene.preset=learn")]) == []
+    assert any(re.match(said, each) for each in describe_scenes_outside(known, [scene(override)]))
 
 
 def written(path: Path, **changed: Any) -> Path:
@@ -128,9 +128,9 @@ def ranged(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_its_range_is_measured_in_its_training_and_kept_in_the_file(ranged: Path) -> None:
+def test_measure_range_is_written_to_policy_file(ranged: Path) -> None:
     policy = OnnxPolicy(ranged, GRID, 2e-3)
-    known = policy.watch.known
+    known = policy.range_monitor.known
     assert known is not None
     assert known.episodes == 24
     assert known.scene["body.material.yield_stress"] == pytest.approx((5e3, 20e3))
@@ -140,7 +140,7 @@ def test_its_range_is_measured_in_its_training_and_kept_in_the_file(ranged: Path
     assert "body.material.yield_stress is 70000" in said
 
 
-def test_a_run_tells_each_steps_distance_and_its_summary_says_what_was_left(ranged: Path) -> None:
+def test_run_records_training_distance_and_summary(ranged: Path) -> None:
     shares = {}
     for yield_stress, steps in (("12 kPa", 3), ("400 kPa", 3)):
         overrides = [*SMALL, f"{SCENE}.yield_stress={yield_stress}", "motion=settled"]
@@ -155,7 +155,7 @@ def test_a_run_tells_each_steps_distance_and_its_summary_says_what_was_left(rang
     assert shares["400 kPa"]["steps_outside"] == 3  # a goal that training never had
 
 
-def test_a_policy_without_a_range_is_told_once_and_in_the_summary(tmp_path: Path) -> None:
+def test_run_policy_without_range_is_reported_once(tmp_path: Path) -> None:
     path = written(tmp_path / "bare.onnx")
     assert not has_training_range(OnnxPolicy(path, GRID, 2e-3))
     words = [word for override in SMALL for word in ("--set", override)]
@@ -167,7 +167,7 @@ def test_a_policy_without_a_range_is_told_once_and_in_the_summary(tmp_path: Path
     assert "training range" in result.stdout
 
 
-def test_evaluate_names_what_is_outside_once_and_counts_the_episodes(ranged: Path) -> None:
+def test_evaluate_reports_scenes_outside_and_counts_episodes(ranged: Path) -> None:
     values = {"scene.body.material.yield_stress": {"uniform": ["60 kPa", "80 kPa"]}}
     outside = training(features=FEATURES.model_dump(mode="json"), randomise={"draws": 3, "values": values})
     said: list[str] = []

@@ -153,7 +153,7 @@ def test_a_mock_is_not_taken_for_a_robot(monkeypatch: pytest.MonkeyPatch, file: 
 @pytest.mark.parametrize(
     ("override", "check", "words"),
     [
-        ("sensors.finger.width=100", "finger: camera", "expected are 100 x"),
+        ("sensors.finger.width=100", "finger: camera", "expected 100 x"),
         ("sensors.finger.source=http://127.0.0.1:1/?action=stream", "finger: camera", "no picture"),
         ("arms.left.start.position=[0, 0, 70 mm]", "left: start", "outside the workspace"),
         ("arms.left.world_from_base.position=[-2, 0, 0]", "left: start", "out of reach"),
@@ -195,4 +195,4 @@ def test_the_command_ends_with_1_if_something_must_be_mended(file: Path) -> None
     for overrides, code in (((), 0), (("--set", "sensors.finger.width=100"), 1)):
         done = tacsim("doctor", "--rig", file, *overrides)
         assert done.exit_code == code, done.output
-    assert "expected are 100 x" in done.output
+    assert "expected 100 x" in done.output

@@ -60,7 +60,7 @@ start: {{ approach_speed: 10 mm/s, approach_step: 20 um }}
 """
 
 
-def test_tilts_and_places_lie_round_about() -> None:
+def test_schedule_spreads_tilts_and_positions_evenly() -> None:
     plan = BallTouchPlan(ball_radius=4e-3, touches=24, tilt=0.4, spread=3e-3)
     moves = schedule(plan)
     assert len(moves) == 24
@@ -77,7 +77,7 @@ def test_tilts_and_places_lie_round_about() -> None:
     assert abs(np.corrcoef(np.linalg.norm(tilts, axis=1), np.linalg.norm(places, axis=1))[0, 1]) < 0.6
 
 
-def test_a_file_of_touches_gives_the_lines_for_the_rig_file(tmp_path: Path) -> None:
+def test_touch_file_gives_rig_file_entries(tmp_path: Path) -> None:
     touches, sensor, ball = made_touches(np.random.default_rng(0))
     write_record(tmp_path / "touches.yaml", touch_file(touches, BALL_RADIUS))
     words = ["calibrate", "touch", str(tmp_path / "touches.yaml"), "--arm", "upper", "--out", str(tmp_path / "out")]
@@ -99,7 +99,7 @@ def test_a_file_of_touches_gives_the_lines_for_the_rig_file(tmp_path: Path) -> N
     assert again.exit_code == 2  # nothing is overwritten
 
 
-def test_a_file_is_read_whole_or_not_at_all(tmp_path: Path) -> None:
+def test_touch_file_incomplete_is_refused(tmp_path: Path) -> None:
     """Cut anywhere, it is refused with the line: never fewer touches, never half a number."""
     touches, _, _ = made_touches(np.random.default_rng(0), 8)
     path = write_record(tmp_path / "touches.yaml", touch_file(touches, BALL_RADIUS))
@@ -116,7 +116,7 @@ def test_a_file_is_read_whole_or_not_at_all(tmp_path: Path) -> None:
         path.write_text(text[:end])
         with pytest.raises(ConfigError, match=rf"{path}:\d+: "):
             read_touches(path)
-    path.write_text(text.replace("count: 8\n", ""))  # by hand, nobody counts
+    path.write_text(text.replace("count: 8\n", ""))  # written by hand, without a count
     assert read_touches(path).touches == whole.touches
 
 
@@ -146,9 +146,7 @@ def test_a_file_is_read_whole_or_not_at_all(tmp_path: Path) -> None:
     ],
     ids=["cut between touches", "cut in a touch", "numbers", "not finite", "CSV", "another record", "empty", "binary"],
 )
-def test_a_damaged_or_foreign_file_is_refused_with_the_line(
-    damage: Callable[[str], str], said: str, tmp_path: Path
-) -> None:
+def test_touch_file_invalid_line_is_named(damage: Callable[[str], str], said: str, tmp_path: Path) -> None:
     touches, _, _ = made_touches(np.random.default_rng(0), 8)
     path = write_record(tmp_path / "touches.yaml", touch_file(touches, BALL_RADIUS))
     path.write_text(damage(path.read_text()))
@@ -157,7 +155,7 @@ def test_a_damaged_or_foreign_file_is_refused_with_the_line(
     assert not (tmp_path / "out").exists()
 
 
-def test_what_cannot_be_ends_with_2_and_no_traceback(tmp_path: Path) -> None:
+def test_command_invalid_input_exits_2_without_traceback(tmp_path: Path) -> None:
     touches, _, _ = made_touches(np.random.default_rng(0), 5)
     few = write_record(tmp_path / "few.yaml", touch_file(touches, BALL_RADIUS))
     (tmp_path / "odd.yaml").write_text("ball_radius: 4 mm\ntouches: [{tool: {}, contact: [1 mm, 2 mm], depht: 1 mm}]\n")
@@ -168,7 +166,7 @@ def test_what_cannot_be_ends_with_2_and_no_traceback(tmp_path: Path) -> None:
         ([], "either a file of recorded poses, or --rig"),
         ([str(few), "--rig", "mock"], "either a file of recorded poses, or --rig"),
         (["--rig", "mock"], "--arm, --sensor and --ball-radius"),
-        (["--rig", "sim", "--arm", "upper", "--sensor", "upper", "--ball-radius", "4 mm"], "no arm of hardware"),
+        (["--rig", "sim", "--arm", "upper", "--sensor", "upper", "--ball-radius", "4 mm"], "is not a hardware arm"),
         (
             ["--rig", "mock", "--arm", "upper", "--sensor", "lower", "--ball-radius", "4 mm"],
             "carries no sensor 'lower'",
@@ -181,16 +179,16 @@ def test_what_cannot_be_ends_with_2_and_no_traceback(tmp_path: Path) -> None:
         assert not (tmp_path / "out").exists()
 
 
-def test_a_gel_without_depth_is_refused() -> None:
+def test_without_task_gel_without_depth_raises() -> None:
     config = load_rig("ur5e").config
     bare = {
         name: sensor.model_copy(update={"model": None, "calibration": None}) for name, sensor in config.sensors.items()
     }
-    with pytest.raises(CannotCalibrate, match="cannot tell how deep it is pressed"):
+    with pytest.raises(CannotCalibrate, match="does not measure its depth"):
         without_task(config.model_copy(update={"sensors": bare}), "upper", "upper")
 
 
-def test_a_real_arm_moves_only_after_a_persons_word(tmp_path: Path) -> None:
+def test_command_real_arm_moves_only_after_confirmation(tmp_path: Path) -> None:
     words = ["calibrate", "touch", "--rig", "ur5e", "--arm", "upper", "--sensor", "upper", "--ball-radius", "4 mm"]
     calibrated = ["--set", "sensors.upper.model=ideal", "--set", "sensors.upper.corners=null"]
     done = tacsim(*words, *calibrated, "--out", tmp_path / "out")
@@ -199,7 +197,7 @@ def test_a_real_arm_moves_only_after_a_persons_word(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("left", "taken"), [(0.1e-3, True), (0.25e-3, False)])
-def test_what_still_shows_a_contact_is_no_reference(left: float, taken: bool) -> None:
+def test_touch_reference_with_contact_raises(left: float, taken: bool) -> None:
     """A picture that came late, or what sticks to the gel, would shift the next contact by a twentieth of a mm."""
     here, references = [Pose()], []
     seen = SimpleNamespace(height=np.array([[0.0, left], [0.0, 9.0]]), valid=np.array([[True, True], [True, False]]))
@@ -223,7 +221,7 @@ def test_what_still_shows_a_contact_is_no_reference(left: float, taken: bool) ->
 
 @pytest.mark.deep
 @pytest.mark.skipif(find_spec("rtde_control") is None, reason="ur_rtde has no wheel for this Python and machine")
-def test_a_mock_arm_finds_where_its_sensor_sits(tmp_path: Path) -> None:
+def test_ball_touches_mock_arm_finds_sensor_pose(tmp_path: Path) -> None:
     """And again without the arm, from what was kept."""
     host = mock_host(41)
     nominal = Pose(np.array([0.0, 0.0, 60e-3]))
@@ -255,11 +253,11 @@ def test_a_mock_arm_finds_where_its_sensor_sits(tmp_path: Path) -> None:
     redone = json.loads((tmp_path / "again" / "touch.json").read_text())["tool_from_sensor"]
     np.testing.assert_allclose(redone["position"], found["position"], atol=1e-9)
     np.testing.assert_allclose(redone["rotation"], found["rotation"], atol=1e-9)
-    assert post.deepest < 1.2e-3  # no touch went far beyond the 0.4 mm asked for
+    assert post.deepest < 1.2e-3  # no touch went far beyond the requested 0.4 mm
 
 
 @pytest.mark.parametrize("ends", ["stopped", "fails"])
-def test_what_was_touched_is_kept_whatever_ends_it(ends: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ball_touches_interrupted_keep_measurements(ends: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The arm and its touches are made up; keeping and the end are the command's own."""
     touches, _, _ = made_touches(np.random.default_rng(0), 5)
 
@@ -267,7 +265,7 @@ def test_what_was_touched_is_kept_whatever_ends_it(ends: str, tmp_path: Path, mo
         session: Session[Any] = given[-1]
         for count in range(1, 6):
             session.check()
-            session.take(touches[count - 1])
+            session.add_measurement(touches[count - 1])
             assert len(read_touches(tmp_path / "out" / "touches.yaml").touches) == count  # each at once
         if ends == "fails":
             raise DeviceError("most touches failed")

@@ -54,7 +54,7 @@ def run(*words: object) -> tuple[int, str, str]:
 
 
 @pytest.mark.parametrize("fixed", [False, True])
-def test_a_file_of_poses_tells_where_the_camera_sits(fixed: bool, tmp_path: Path) -> None:
+def test_board_pose_file_gives_camera_pose(fixed: bool, tmp_path: Path) -> None:
     board_poses = made_sights(np.random.default_rng(0), fixed=fixed)
     path = write_record(tmp_path / "poses.yaml", board_pose_file(board_poses, fixed=fixed))
     code, said, err = run(path, "--out", tmp_path / "out")
@@ -68,7 +68,7 @@ def test_a_file_of_poses_tells_where_the_camera_sits(fixed: bool, tmp_path: Path
     assert np.array(report["residuals"]).shape == (30, 2) and all(report["used"])
 
 
-def test_what_cannot_be_ends_with_2(tmp_path: Path) -> None:
+def test_command_invalid_input_exits_2(tmp_path: Path) -> None:
     alike = write_record(
         tmp_path / "alike.yaml", board_pose_file(made_sights(np.random.default_rng(0), 9, 3.0), fixed=False)
     )
@@ -81,7 +81,7 @@ def test_what_cannot_be_ends_with_2(tmp_path: Path) -> None:
         (["--rig", "mock"], "--arm, --camera, --lens and --board"),
         ([*live, "--board", "dots:9x7:2 mm"], "use a ChArUco board"),
         ([*live, "--board", "charuco:9x7:2 mm"], "is no board"),
-        (["--rig", "sim", *live[2:], "--board", "charuco:9x7:3 mm:2.2 mm"], "no arm of hardware"),
+        (["--rig", "sim", *live[2:], "--board", "charuco:9x7:3 mm:2.2 mm"], "is not a hardware arm"),
         (["--rig", "ur5e", *live[2:], "--board", "charuco:9x7:3 mm:2.2 mm"], "nobody confirmed"),
     ):
         code, out, err = run(*words, "--out", tmp_path / "out")
@@ -112,7 +112,7 @@ class Eye(SeenArm):
 
 @pytest.mark.deep
 @pytest.mark.skipif(find_spec("rtde_control") is None, reason="ur_rtde has no wheel for this Python and machine")
-def test_a_mock_arm_finds_where_its_camera_sits(tmp_path: Path) -> None:
+def test_board_poses_mock_arm_finds_camera_pose(tmp_path: Path) -> None:
     host = mock_host(51)
     true = posed(Rotation.from_rotvec(np.radians([3.0, -2.0, 30.0])), [8e-3, -5e-3, 20e-3])
     flange = Pose(np.array([0.45, 0.0, 0.3 - 60e-3]))  # at the start, in the base
@@ -134,7 +134,7 @@ def test_a_mock_arm_finds_where_its_camera_sits(tmp_path: Path) -> None:
     assert len(yaml.safe_load((tmp_path / "out" / "poses.yaml").read_text())["poses"]) == len(report["used"])
 
 
-def test_a_plan_that_would_tell_too_little_is_refused_before_anything_moves() -> None:
+def test_board_poses_small_tilts_raise_before_motion() -> None:
     plan = BoardPosePlan(CHARUCO, LENS, poses=12, tilt=np.radians(15.0))
     with pytest.raises(CannotCalibrate, match=r"with a tilt of 15 degrees and 12 poses .* give a larger --tilt"):
         record_board_poses(None, None, plan, Session())  # type: ignore[arg-type]

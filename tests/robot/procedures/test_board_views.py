@@ -34,7 +34,7 @@ def views(number: int) -> list[np.ndarray]:
 
 
 class Person:
-    """A camera whose clock is a tenth of a second a frame; somebody shows it `moves`, the next one whenever the last
+    """A camera whose clock is a tenth of a second a frame; a person shows it `moves`, the next one whenever the last
     was taken or skipped."""
 
     def __init__(self, moves: list[Move]) -> None:
@@ -56,16 +56,16 @@ class Person:
 
     def led(self, number: int, **options: object) -> tuple[Session[tuple[str, np.ndarray]], dict[str, np.ndarray]]:
         kept: dict[str, np.ndarray] = {}
-        session: Session[tuple[str, np.ndarray]] = Session(say=self.hear, keep=lambda item: kept.update([item]))
+        session: Session[tuple[str, np.ndarray]] = Session(report=self.hear, store=lambda item: kept.update([item]))
         record_board_views(self, BoardViewPlan(DOTS, number, **options), session)  # type: ignore[arg-type]
         return session, kept
 
 
-def test_a_person_is_led_from_view_to_view() -> None:
+def test_board_views_guide_person_through_all_views() -> None:
     person = Person(list(views(3)))
     record, kept = person.led(3)
     assert list(kept) == ["view_01.png", "view_02.png", "view_03.png"] and record.left_out == []
-    for (name, image), shown in zip(record.taken, views(3), strict=True):
+    for (name, image), shown in zip(record.measurements, views(3), strict=True):
         assert kept[name] is image
         np.testing.assert_array_equal(image, shown)
     asked = [words for words in person.said if words.startswith("View")]
@@ -82,35 +82,35 @@ def moving(index: int) -> np.ndarray:
     [
         (EMPTY, r"the board .* is not found; \d+ dots are seen, 63 should be"),
         (np.roll(views(3)[1], 200, axis=1), "is not found|on no plane|further dots"),
-        (views(3)[0], "the board is seen as in view 1; tilt it, or hold it elsewhere"),
+        (views(3)[0], "the board is as in view 1; tilt it, or hold it elsewhere"),
         (moving, "the board moves; hold it still"),
     ],
     ids=["no board", "cut off", "as before", "moving"],
 )
-def test_a_view_that_tells_nothing_is_skipped_with_the_reason(move: Move, why: str) -> None:
+def test_board_views_unusable_view_is_skipped_with_reason(move: Move, why: str) -> None:
     person = Person([views(3)[0], move, views(3)[2]])
     record, kept = person.led(2)
     (skipped,) = record.left_out
     assert re.search(why, skipped) and f"Skipped: {skipped}." in person.said
     assert len(kept) == 2
-    np.testing.assert_array_equal(record.taken[1][1], views(3)[2])
+    np.testing.assert_array_equal(record.measurements[1][1], views(3)[2])
 
 
-def test_the_gel_is_viewed_once_and_against_its_own_picture() -> None:
+def test_board_views_on_gel_takes_one_view_with_reference() -> None:
     faint = np.clip(128 + 0.1 * (views(1)[0].astype(float) - 128), 0, 255).astype(np.uint8)
     person = Person([faint])
     record, _ = person.led(1, on_gel=True, reference=EMPTY)
-    assert len(record.taken) == 1 and person.said[0] == f"View 1 of 1: {ON_GEL}."
+    assert len(record.measurements) == 1 and person.said[0] == f"View 1 of 1: {ON_GEL}."
 
 
-def test_it_ends_when_asked_when_the_source_ends_and_when_nobody_comes() -> None:
+def test_board_views_end_on_stop_source_end_and_timeout() -> None:
     record, kept = Person(list(views(3)[:2])).led(6)
-    assert len(record.taken) == len(kept) == 2
+    assert len(record.measurements) == len(kept) == 2
     with pytest.raises(CannotCalibrate, match=r"after 6 s without a view; the last: the board .* is not found"):
-        Person([EMPTY] * 9).led(1, patience=6.0)
+        Person([EMPTY] * 9).led(1, timeout=6.0)
     never: Session[tuple[str, np.ndarray]] = Session(stop=lambda: True)
     record_board_views(Person([EMPTY]), BoardViewPlan(DOTS, 2), never)
-    assert never.taken == []
+    assert never.measurements == []
 
 
 RIG = """
@@ -138,7 +138,7 @@ def lead(camera: MockCamera, words: list[str], moves: list[np.ndarray]) -> tuple
 
 @pytest.mark.deep
 @pytest.mark.timeout(300)
-def test_the_command_calibrates_the_lens_and_then_the_gel(tmp_path: Path) -> None:
+def test_command_calibrates_lens_then_gel(tmp_path: Path) -> None:
     """One view without a board is skipped; the pictures give the same lens again; then the board lies on the gel."""
     out = tmp_path / "lens"
     moves = list(views(7))
@@ -169,7 +169,7 @@ def test_the_command_calibrates_the_lens_and_then_the_gel(tmp_path: Path) -> Non
     assert read_image(tmp_path / "view" / "rectified.png").shape == (view.geometry.height, view.geometry.width, 3)
 
 
-def test_what_cannot_be_ends_with_2(tmp_path: Path) -> None:
+def test_command_invalid_input_exits_2(tmp_path: Path) -> None:
     rig = tmp_path / "bench.yaml"
     rig.write_text(RIG.format(source="http://127.0.0.1:9/"))
     live = ["--camera", f"{rig}/eye"]
@@ -182,7 +182,7 @@ def test_what_cannot_be_ends_with_2(tmp_path: Path) -> None:
         ([*live, *BOARD, "--views", "4"], "a lens needs 6 views"),
         ([*live, *BOARD, "--reference", str(tmp_path / "small.png")], "it is 640 x 100 px"),
         (["--camera", "eye", *BOARD], "give rig and sensor"),
-        (["--camera", "mock/lower", *BOARD], "has a mock camera that a simulation feeds"),
+        (["--camera", "mock/lower", *BOARD], "has a mock camera with simulated pictures"),
     ):
         done = tacsim("calibrate", "lens", *words, "--out", tmp_path / "out")
         assert done.exit_code == 2, (words, done.output)

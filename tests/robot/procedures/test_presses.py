@@ -39,7 +39,8 @@ PRESSES = [press.image for press in MADE]
 
 
 class Person:
-    """A camera whose clock is a tenth of a second a frame, and somebody who shows it `moves`, one a press asked for."""
+    """A camera whose clock is a tenth of a second a frame, and a person who shows it `moves`, one per requested
+    press."""
 
     def __init__(
         self, moves: list[np.ndarray | Callable[[int], np.ndarray]], *, lifts: bool = True, empty: np.ndarray = EMPTY
@@ -70,7 +71,7 @@ class Person:
 
     def led(self, presses: int = 5, **options: object) -> tuple[Session[tuple[str, np.ndarray]], dict[str, np.ndarray]]:
         kept: dict[str, np.ndarray] = {}
-        session: Session[tuple[str, np.ndarray]] = Session(say=self.hear, keep=lambda item: kept.update([item]))
+        session: Session[tuple[str, np.ndarray]] = Session(report=self.hear, store=lambda item: kept.update([item]))
         self.untouched = record_presses(self, BallPressPlan(BALL_PX, presses, **options), session)  # type: ignore[arg-type]
         return session, kept
 
@@ -78,19 +79,19 @@ class Person:
         return [words for words in self.said if words.startswith("Not taken")]
 
 
-def test_a_person_is_led_from_press_to_press() -> None:
+def test_presses_guide_person_through_all_presses() -> None:
     person = Person(PRESSES[:5])
     record, kept = person.led()
     assert list(kept) == [*UNTOUCHED, *(f"press_0{k}.png" for k in range(1, 6))]
     assert measure_noise(person.untouched).deviation == pytest.approx([1.53] * 3, rel=0.03)
     assert person.refused() == record.left_out == []
-    for (name, image), shown in zip(record.taken, PRESSES, strict=False):
+    for (name, image), shown in zip(record.measurements, PRESSES, strict=False):
         assert kept[name] is image
         assert np.abs(image.astype(int) - shown).mean() < 2.5
     asked = [words for words in person.said if words.startswith("Press ")]
     assert asked[0].startswith("Press 1 of 5: press the ball into the gel, at the middle of the picture")
     places = [re.search(r"at the (.*) of the picture", words)[1] for words in asked]  # type: ignore[index]
-    assert len(set(places)) >= 4  # this person does not go where she is told
+    assert len(set(places)) >= 4  # this person does not follow the positions
     assert person.said[0].startswith("Take everything off")
     assert sum(words.startswith("Lift") for words in person.said) == 5
 
@@ -123,17 +124,17 @@ def glaring() -> np.ndarray:
     ],
     ids=["no ball", "same place", "saturated", "cut off", "two balls"],
 )
-def test_a_press_that_tells_nothing_is_refused_and_asked_for_again(move: np.ndarray, why: str) -> None:
+def test_presses_unusable_press_is_requested_again(move: np.ndarray, why: str) -> None:
     person = Person([PRESSES[0], move, PRESSES[1]])
     record, kept = person.led(2)
-    assert len(record.taken) == 2 and len(kept) == len(UNTOUCHED) + 2
-    assert np.abs(record.taken[1][1].astype(int) - PRESSES[1]).mean() < 2.5
+    assert len(record.measurements) == 2 and len(kept) == len(UNTOUCHED) + 2
+    assert np.abs(record.measurements[1][1].astype(int) - PRESSES[1]).mean() < 2.5
     (said,) = person.refused()
     assert re.search(why, said)
     assert [words[:12] for words in person.said].count("Press 2 of 2") == 2
 
 
-def test_presses_on_a_gel_with_dots_are_judged_without_them() -> None:
+def test_presses_marked_gel_is_judged_without_dots() -> None:
     dots = lattice_points(8, 10, 24.0) + [(COLUMNS - 1) / 2, (ROWS - 1) / 2]
 
     def dotted(image: np.ndarray, by: float) -> np.ndarray:
@@ -141,55 +142,55 @@ def test_presses_on_a_gel_with_dots_are_judged_without_them() -> None:
 
     marked = Person([dotted(PRESSES[0], 2.0)], empty=dotted(EMPTY, 0.0))
     record, _ = marked.led(1, markers=True)
-    assert record.left_out == [] and len(record.taken) == 1
-    with pytest.raises(BadFrames, match="leave --markers out"):
+    assert record.left_out == [] and len(record.measurements) == 1
+    with pytest.raises(BadFrames, match="omit --markers"):
         Person([PRESSES[0]]).led(1, markers=True)
 
 
-def test_a_press_counts_only_once_it_rests() -> None:
+def test_presses_moving_press_waits_for_rest() -> None:
     def sliding(index: int) -> np.ndarray:
         return np.roll(PRESSES[0], 2 * (index % 20), axis=1)
 
     person = Person([sliding])
     record, _ = person.led(1)
     assert any(words.startswith("Still moving") for words in person.said)
-    assert np.abs(record.taken[0][1].astype(int) - PRESSES[0]).mean() < 2.5  # held still, then
+    assert np.abs(record.measurements[0][1].astype(int) - PRESSES[0]).mean() < 2.5  # held still, then
 
 
-def test_a_slow_creep_is_motion_too() -> None:
+def test_presses_slow_creep_is_motion() -> None:
     depths = iter(np.r_[np.linspace(0.2e-3, 0.6e-3, 40), np.full(200, 0.6e-3)])
     person = Person([lambda index: SENSOR.press(float(next(depths)), 130, 100).image])
     record, _ = person.led(1)
     deepest = SENSOR.press(0.6e-3, 130, 100).image
-    assert np.abs(record.taken[0][1].astype(int) - deepest).mean() < 3.5
+    assert np.abs(record.measurements[0][1].astype(int) - deepest).mean() < 3.5
 
 
-def test_what_was_taken_stays_when_it_ends_early() -> None:
+def test_presses_early_end_keeps_measurements() -> None:
     record, kept = Person(PRESSES[:2]).led(5)
-    assert len(record.taken) == 2 and len(kept) == len(UNTOUCHED) + 2
+    assert len(record.measurements) == 2 and len(kept) == len(UNTOUCHED) + 2
 
 
-def test_a_person_who_does_nothing_is_not_waited_for_for_ever() -> None:
+def test_presses_without_action_time_out() -> None:
     with pytest.raises(CannotCalibrate, match="nothing touched the gel"):
-        Person([EMPTY]).led(1, patience=20.0)
+        Person([EMPTY]).led(1, timeout=20.0)
     with pytest.raises(CannotCalibrate, match="does not look as it did before the presses"):
-        Person(PRESSES, lifts=False).led(2, patience=20.0)
+        Person(PRESSES, lifts=False).led(2, timeout=20.0)
 
     person = Person([])
     person._shown = lambda index: np.roll(PRESSES[0], 3 * index, axis=1)
     with pytest.raises(CannotCalibrate, match="does not come to rest"):
-        person.led(1, patience=20.0)
+        person.led(1, timeout=20.0)
 
 
-def test_a_dark_picture_without_contact_is_refused() -> None:
+def test_presses_dark_reference_raises() -> None:
     person = Person([])
     person._shown = np.zeros_like(EMPTY)
     with pytest.raises(BadFrames, match="is dark"):
         person.led(1)
 
 
-def test_only_a_camera_with_a_gel_before_it_can_be_pressed() -> None:
-    with pytest.raises(CannotCalibrate, match="is no sensor with a camera; cameras: none"):
+def test_handheld_camera_without_gel_raises() -> None:
+    with pytest.raises(CannotCalibrate, match="is not a sensor with a camera; such sensors: none"):
         handheld_camera(load_rig("sim").config, "lower")
     with pytest.raises(CannotCalibrate, match="nobody can press its gel"):
         handheld_camera(load_rig("mock").config, "lower")
@@ -269,7 +270,7 @@ def said(source: int) -> Iterator[str]:
 @pytest.mark.deep
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize("answer", [None, "n\ny\n"], ids=["no terminal", "a terminal"])
-def test_the_command_makes_a_bundle_and_keeps_its_frames(answer: str | None, tmp_path: Path) -> None:
+def test_command_writes_bundle_and_frames(answer: str | None, tmp_path: Path) -> None:
     out = tmp_path / "out"
     lengths = ["--ball-radius", f"{BALL * 1e3} mm", "--pixel-pitch", f"{PITCH * 1e3} mm", "--serial", "s1"]
     with bench(tmp_path, 61) as (camera, rig):
@@ -294,8 +295,8 @@ def test_the_command_makes_a_bundle_and_keeps_its_frames(answer: str | None, tmp
 
 @pytest.mark.deep
 @pytest.mark.timeout(300)
-def test_a_camera_that_looks_askew_is_led_through_its_view(tmp_path: Path) -> None:
-    """What the person is told, and the bundle, are of the metric picture; what is kept is the camera's."""
+def test_command_tilted_camera_uses_view(tmp_path: Path) -> None:
+    """Reports and bundle use the metric picture; stored pictures are those of the camera."""
     corners = ((30.0, 22.0), (295.0, 15.0), (285.0, 220.0), (25.0, 225.0))
     edges = np.array([(0, 0), (COLUMNS, 0), (COLUMNS, ROWS), (0, ROWS)], dtype=np.float32) - 0.5
     askew = cv2.getPerspectiveTransform(edges, np.array(corners, dtype=np.float32))
@@ -338,7 +339,7 @@ def test_a_camera_that_looks_askew_is_led_through_its_view(tmp_path: Path) -> No
 
 
 @pytest.mark.timeout(300)
-def test_ctrl_c_keeps_what_was_taken(tmp_path: Path) -> None:
+def test_command_ctrl_c_keeps_measurements(tmp_path: Path) -> None:
     out = tmp_path / "out"
     with bench(tmp_path, 62) as (camera, rig):
         words = ["calibrate", "sensor", "--camera", f"{rig}/finger", "--ball-radius", f"{BALL} m"]
@@ -351,7 +352,7 @@ def test_ctrl_c_keeps_what_was_taken(tmp_path: Path) -> None:
     assert any(f"tacsim calibrate sensor {out / 'frames'}" in line for line in lines)
 
 
-def test_what_cannot_be_ends_with_2(tmp_path: Path) -> None:
+def test_command_invalid_input_exits_2(tmp_path: Path) -> None:
     (tmp_path / "frames").mkdir()
     rig = tmp_path / "bench.yaml"
     rig.write_text(RIG.format(source="http://127.0.0.1:9/", width=COLUMNS, height=ROWS))
@@ -362,7 +363,7 @@ def test_what_cannot_be_ends_with_2(tmp_path: Path) -> None:
         (["--camera", f"{rig}/finger", *pitch], 2, "give the ball's diameter (or its radius, not both)"),
         (["--camera", f"{rig}/finger", *ball], 2, "give --pixel-pitch or --view, or --kind"),
         (["--camera", "finger", *ball, *pitch], 2, "give rig and sensor"),
-        (["--camera", f"{rig}/thumb", *ball, *pitch], 2, "'thumb' is no sensor with a camera; cameras: finger"),
+        (["--camera", f"{rig}/thumb", *ball, *pitch], 2, "'thumb' is not a sensor with a camera; such sensors: finger"),
         (["--camera", "mock/lower", *ball, *pitch], 2, "nobody can press its gel"),
         (["--camera", f"{rig}/finger", *ball, *pitch], 1, "no picture from http://127.0.0.1:9/"),
     ):

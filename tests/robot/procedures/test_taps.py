@@ -1,4 +1,4 @@
-"""Taps that tell how late a camera is: their schedule, what belongs into the rig file, and a delay that is found."""
+"""Taps that measure the latency of a camera: their schedule, the rig file entries, and a measured delay."""
 
 from __future__ import annotations
 
@@ -12,7 +12,15 @@ from calibration.poses.latency import Latency
 from robot.mock import MockCamera, MockState
 from robot.mock.fixtures import mock_host, rig_addresses
 from robot.procedures.session import CannotCalibrate
-from robot.procedures.taps import CONTACT_TIME, LIFTED_TIME, PAUSE, TapPlan, latency_entries, schedule, without_latency
+from robot.procedures.taps import (
+    CONTACT_TIME,
+    LIFTED_TIME,
+    PAUSE_TIME,
+    TapPlan,
+    latency_entries,
+    schedule,
+    without_latency,
+)
 from tacsim.config import load_rig
 from tacsim.models.hardware import UrArmConfig
 from tests.robot.cli.invoked import tacsim
@@ -33,12 +41,12 @@ def latency(seconds: float) -> Latency:
     return Latency(seconds=seconds, uncertainty=1e-3, correlation=0.99, samples=200)
 
 
-def test_taps_come_at_uneven_intervals_with_a_pause_before_and_after() -> None:
+def test_schedule_taps_have_uneven_intervals_and_pauses() -> None:
     travel = 0.1
     moves = schedule(TapPlan(taps=6), travel)
     times, down = [time for time, _ in moves], [each for _, each in moves]
     assert down == [True, False] * 6 + [False]
-    assert times[0] == PAUSE and times[-1] - times[-2] >= PAUSE + travel + LIFTED_TIME[0]
+    assert times[0] == PAUSE_TIME and times[-1] - times[-2] >= PAUSE_TIME + travel + LIFTED_TIME[0]
     pauses = np.diff(times[:-1])
     assert (pauses[::2] >= travel + CONTACT_TIME[0]).all() and (pauses[1::2] >= travel + LIFTED_TIME[0]).all()
     assert np.ptp(np.diff(times[:-1:2])) > 0.1  # regular taps fit several latencies
@@ -56,9 +64,7 @@ def test_taps_come_at_uneven_intervals_with_a_pause_before_and_after() -> None:
         ("device", 0.001, 0.0, {"arms.upper.latency": 0.0}),
     ],
 )
-def test_both_times_shall_be_those_of_the_event(
-    clock: str, seconds: float, known: float, wanted: dict[str, float]
-) -> None:
+def test_latency_entries_align_both_times(clock: str, seconds: float, known: float, wanted: dict[str, float]) -> None:
     found = latency_entries(latency(seconds), clock, "upper", arm_config(known), "upper")  # type: ignore[arg-type]
     assert found == pytest.approx(wanted)
     camera = found.get("sensors.upper.latency", 0.0 if clock != "arrival" else None)
@@ -67,7 +73,7 @@ def test_both_times_shall_be_those_of_the_event(
         assert seconds - camera + found.get("arms.upper.latency", known) == pytest.approx(0.0)
 
 
-def test_what_is_known_already_does_not_hide_what_is_measured() -> None:
+def test_without_latency_sets_known_latencies_to_zero() -> None:
     config = load_rig("mock", overrides=["arms.upper.latency=10 ms", "sensors.upper.latency=50 ms"]).config
     bare = without_latency(config, "upper", "upper")
     assert bare.contact == "hertz"
@@ -78,13 +84,13 @@ def test_what_is_known_already_does_not_hide_what_is_measured() -> None:
 @pytest.mark.parametrize(
     ("rig", "arm", "sensor", "words"),
     [
-        ("sim", "upper", "upper", "'upper' is no arm of hardware, real or mock; there are: none"),
-        ("mock", "third", "upper", "'third' is no arm.*lower, upper"),
-        ("mock", "upper", "third", "'third' is no sensor with a camera.*lower, upper"),
+        ("sim", "upper", "upper", "'upper' is not a hardware arm, real or mock; such arms: none"),
+        ("mock", "third", "upper", "'third' is not a hardware arm.*lower, upper"),
+        ("mock", "upper", "third", "'third' is not a sensor with a camera.*lower, upper"),
         ("mock", "upper", "lower", "carried by lower, not by 'upper'"),
     ],
 )
-def test_parts_that_cannot_tell_are_refused(rig: str, arm: str, sensor: str, words: str) -> None:
+def test_without_latency_unsuitable_parts_raise(rig: str, arm: str, sensor: str, words: str) -> None:
     with pytest.raises(CannotCalibrate, match=words):
         without_latency(load_rig(rig).config, arm, sensor)
     done = tacsim("calibrate", "latency", rig, "--arm", arm, "--sensor", sensor)
@@ -121,7 +127,7 @@ class Hand(SeenArm):
 
 
 @pytest.mark.skipif(find_spec("rtde_control") is None, reason="ur_rtde has no wheel for this Python and machine")
-def test_a_delay_of_the_camera_is_found_and_told(tmp_path: Path) -> None:
+def test_command_camera_delay_is_measured_and_printed(tmp_path: Path) -> None:
     host = mock_host(31)
     with MockCamera(host, width=WIDTH, height=HEIGHT, fps=60.0, stamped=False) as camera:
         (tmp_path / "tapper.yaml").write_text(RIG.format(host=host, source=camera.url))
@@ -139,7 +145,7 @@ def test_a_delay_of_the_camera_is_found_and_told(tmp_path: Path) -> None:
 
 @pytest.mark.deep
 @pytest.mark.skipif(find_spec("rtde_control") is None, reason="ur_rtde has no wheel for this Python and machine")
-def test_the_mock_rig_taps_a_ball_in_closed_form() -> None:
+def test_taps_mock_rig_uses_hertz_contact() -> None:
     addresses = [word for override in rig_addresses() for word in ("--set", override)]
     words = ["calibrate", "latency", "mock", "--arm", "upper", "--sensor", "upper", "--taps", "4", *addresses]
     done = tacsim(*words)

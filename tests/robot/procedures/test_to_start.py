@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from robot.arm.controller.rtde import Reading
+from robot.arm.controller.rtde import ControllerReading
 from robot.common.kinematics import Kinematics, pose
 from robot.common.tcp import ArmFrames
 from robot.procedures.to_start import PROGRESS, Guide, NoWay, Progress, Way, find_way, lead_to_start, require_clear
@@ -34,11 +34,11 @@ def start_of(config: UrArmConfig) -> Pose:
     return config.start.pose
 
 
-def standing(config: UrArmConfig, joints: FloatArray, calibration: FloatArray | None = None) -> Reading:
+def standing(config: UrArmConfig, joints: FloatArray, calibration: FloatArray | None = None) -> ControllerReading:
     """calibration: the true flange, seen from that of the nominal lengths (4, 4)."""
     tcp = se3.to_matrix(config.flange_from_tool.pose)
     flange = KINEMATICS.forward(joints) @ (np.eye(4) if calibration is None else calibration)
-    return Reading(joints, pose(flange @ tcp), np.zeros(6), 1, 0.3, np.zeros(3), pose(tcp), 1.0)
+    return ControllerReading(joints, pose(flange @ tcp), np.zeros(6), 1, 0.3, np.zeros(3), pose(tcp), 1.0)
 
 
 def at_start(config: UrArmConfig) -> FloatArray:

@@ -120,7 +120,7 @@ def test_a_process_held_up_while_it_asks_still_finds_its_moment() -> None:
     ("stop", "error", "words"),
     [
         ("estop", EmergencyStop, "a person must release it"),
-        ("protective_stop", ProtectiveStop, r"made a protective stop; look why, then recover\(\)"),
+        ("protective_stop", ProtectiveStop, r"made a protective stop; find the cause, then recover\(\)"),
     ],
 )
 def test_a_stop_ends_the_episode_keeps_it_and_waits_for_recover(

@@ -28,10 +28,10 @@ MOTIONS = {1, 2, 3, 4, 6, 9, 10, 11, 12, 18, 24, 25, 41, 45, 51, 52, 66}  # of t
     ("override", "words"),
     [
         ("arms.east.host=192.0.2.1", "its host 192.0.2.1 is outside this machine"),
-        ("arms.east.mock=null", "'east' is a real one, but its host .* is this machine"),
+        ("arms.east.mock=null", "'east' is a real arm, but its host .* is this machine"),
         ("arms.east.start=null", "arms.east.start"),
         ("arms.east.start.position=[3, 0, 0]", "out of reach"),
-        ("sensors.east.width=100", "sensor 'east'.*expected are 100 x"),
+        ("sensors.east.width=100", "sensor 'east'.*expected 100 x"),
     ],
 )
 def test_what_makes_no_rig_is_refused_and_leaves_nothing(tmp_path: Path, override: str, words: str) -> None:

@@ -10,28 +10,28 @@ import numpy as np
 import pytest
 
 from robot.deploy.policy import PolicyNotFound
-from robot.train.evaluate import Ended, Interval, Judged, evaluate
+from robot.train.evaluate import EpisodeResult, EvaluationResult, Interval, evaluate
 from tests.robot.cli.invoked import tacsim
 from tests.robot.train.short import training
 
 
-def judged(successes: int, of: int, distances: list[float] | None = None) -> Judged:
+def judged(successes: int, of: int, distances: list[float] | None = None) -> EvaluationResult:
     given = distances or [1e-3] * of
-    return Judged("x", tuple(Ended(given[i], i < successes, float(i), 0.5) for i in range(of)))
+    return EvaluationResult("x", tuple(EpisodeResult(given[i], i < successes, float(i), 0.5) for i in range(of)))
 
 
 def close(found: Interval, *wanted: float) -> None:
     assert (found.value, found.low, found.high) == pytest.approx(wanted, abs=5e-4)
 
 
-def test_the_interval_of_a_share_is_wilsons() -> None:
+def test_wilson_interval_matches_reference() -> None:
     """z = 1.96, by hand: centre (p + z^2/2n) / (1 + z^2/n), half z/(1 + z^2/n) sqrt(p(1-p)/n + z^2/4n^2)."""
     close(judged(8, 10).success, 0.8, 0.4902, 0.9433)
     close(judged(0, 20).success, 0.0, 0.0, 0.1611)
     close(judged(200, 200).success, 1.0, 0.9812, 1.0)
 
 
-def test_the_interval_of_a_mean_is_that_of_a_bell_for_many() -> None:
+def test_bootstrap_interval_many_values_is_normal() -> None:
     """Of 400 draws: mean ± 1.96 deviations / 20, to a few percent of its width."""
     values = np.random.default_rng(1).normal(5.0, 2.0, 400)
     found = judged(0, 400, values.tolist()).distance
@@ -41,11 +41,11 @@ def test_the_interval_of_a_mean_is_that_of_a_bell_for_many() -> None:
     assert found.high == pytest.approx(values.mean() + half, abs=0.1 * half)
 
 
-def test_peaks_are_told_as_mean_and_as_what_one_in_twenty_exceeds() -> None:
+def test_peak_force_is_mean_and_95th_percentile() -> None:
     assert judged(0, 21).peak_force == (10.0, 19.0)  # 0, 1, ... 20 N
 
 
-def test_the_teacher_is_nearer_than_chance_and_every_policy_meets_the_same_episodes() -> None:
+def test_evaluate_teacher_beats_random_in_equal_episodes() -> None:
     settings = training(randomise=None)
     teacher, random, again = evaluate(settings, ["teacher", "random", "teacher"], 5)
     assert len(teacher.episodes) == 5
@@ -57,25 +57,25 @@ def test_the_teacher_is_nearer_than_chance_and_every_policy_meets_the_same_episo
     assert other.episodes != random.episodes
 
 
-def test_drawn_episodes_are_not_those_of_training() -> None:
+def test_evaluate_episodes_differ_from_training() -> None:
     drawn = training()
     ends = {seed: [each.distance for each in evaluate(drawn, ["teacher"], 4, seed)[0].episodes] for seed in (0, 1)}
     assert len(set(ends[0])) > 1
     assert ends[0] != ends[1]
 
 
-def test_no_episode_is_played_twice() -> None:
-    """Else intervals would be told for more episodes than there are: of 200 drawn out of 200 only 132 differed."""
+def test_evaluate_plays_each_episode_once() -> None:
+    """Otherwise intervals would assume too many episodes: of 200 drawn out of 200 only 132 differed."""
     ends = evaluate(training(), ["scripted"], 8)[0].episodes
     assert len({each.distance for each in ends}) == 8
 
 
-def test_a_policy_that_is_not_there_is_named_before_anything_runs() -> None:
+def test_evaluate_missing_policy_raises_before_run() -> None:
     with pytest.raises(PolicyNotFound, match=r"nothing\.onnx"):
         evaluate(training(), ["teacher", "nothing.onnx"], 2)
 
 
-def test_the_command_writes_a_table_and_a_file(tmp_path: Path) -> None:
+def test_evaluate_command_writes_table_and_file(tmp_path: Path) -> None:
     file, found = tmp_path / "short.yaml", tmp_path / "found.json"
     file.write_text(json.dumps(training().model_dump(mode="json", exclude_none=True)), encoding="utf-8")
     words = (
@@ -100,9 +100,9 @@ def test_the_command_writes_a_table_and_a_file(tmp_path: Path) -> None:
     assert "exists already" in tacsim(*words).stderr
 
 
-def test_what_was_played_is_in_the_file_when_it_is_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_evaluate_command_stopped_keeps_results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def stopped(training: Any, policies: Any, episodes: int, seed: int, tell: Any, say: Any, warn: Any) -> None:
-        say(Judged("teacher", (Ended(1e-4, True, 2.0, 0.9),)))
+        say(EvaluationResult("teacher", (EpisodeResult(1e-4, True, 2.0, 0.9),)))
         raise KeyboardInterrupt
 
     monkeypatch.setattr("robot.train.evaluate.evaluate", stopped)

@@ -1,4 +1,4 @@
-"""stable-baselines3 on our environments: its own checks, and what it is told of ends."""
+"""stable-baselines3 on our environments: its own checks, and the infos at the end of episodes."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def envs() -> Iterator[SharedVecEnv]:
     opened.close()
 
 
-def test_of_the_default_observation_it_makes_a_small_policy() -> None:
+def test_extractor_default_observation_is_small() -> None:
     """10.2 million parameters where pictures and maps of 64 x 64 are seen."""
     env = gymnasium.make("tacsim/Squeeze-v0")
     policy = PPO("MultiInputPolicy", env, device="cpu").policy
@@ -45,8 +45,8 @@ def test_of_the_default_observation_it_makes_a_small_policy() -> None:
 
 
 @pytest.mark.parametrize("features", [{**FEATURES, "maps": []}, {**FEATURES, "maps": ["height", "picture"]}, "default"])
-def test_its_checker_finds_nothing_but_maps_that_are_no_pictures(features: Any) -> None:
-    """It takes whatever has three axes for a picture, and wants bytes; of heights they would be too coarse."""
+def test_env_checker_warns_only_about_maps(features: Any) -> None:
+    """It treats arrays with three axes as pictures and expects bytes; for heights bytes are too coarse."""
     env = make(features=features)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -56,7 +56,7 @@ def test_its_checker_finds_nothing_but_maps_that_are_no_pictures(features: Any) 
     assert all("image" in words for words in said)
 
 
-def test_it_tells_what_the_environments_tell(envs: SharedVecEnv) -> None:
+def test_shared_vec_env_returns_infos_of_environments(envs: SharedVecEnv) -> None:
     """The same arrays; at an episode's end (after 3 steps, or 2) its last observation and the next one's first."""
     twin = make_native(3, "SameStep", features=FEATURES)
     envs.seed(5)
@@ -85,7 +85,7 @@ def test_it_tells_what_the_environments_tell(envs: SharedVecEnv) -> None:
     twin.close()
 
 
-def test_an_end_by_a_limit_is_no_time_limit() -> None:
+def test_shared_vec_env_termination_is_not_time_limit() -> None:
     envs = SharedVecEnv(make_native(2, "SameStep", features=FEATURES, variants=[["task.force_limit=51 mN"]]))
     envs.reset()
     _, rewards, done, infos = envs.step(np.tile(np.float32([1.0, -1.0]), (2, 1)))
@@ -96,7 +96,7 @@ def test_an_end_by_a_limit_is_no_time_limit() -> None:
     envs.close()
 
 
-def test_its_tools_work_on_it(envs: SharedVecEnv) -> None:
+def test_shared_vec_env_works_with_sb3_tools(envs: SharedVecEnv) -> None:
     watched: Any = VecMonitor(envs)
     model = PPO(
         "MultiInputPolicy", watched, n_steps=4, batch_size=12, n_epochs=1, seed=1, device="cpu",
@@ -111,11 +111,11 @@ def test_its_tools_work_on_it(envs: SharedVecEnv) -> None:
     assert envs.env_is_wrapped(VecMonitor) == [False] * 3
     watched.seed(3)
     watched.set_options({"variant": 1})
-    with pytest.raises(ValueError, match="options of a reset are those of all environments"):
+    with pytest.raises(ValueError, match="reset options apply to all environments"):
         watched.reset()
 
 
-def test_other_modes_of_reset_are_refused() -> None:
+def test_shared_vec_env_other_autoreset_mode_raises() -> None:
     envs = make_native(2, "NextStep", features=FEATURES)
     with pytest.raises(ValueError, match="needs autoreset_mode 'SameStep', got 'NextStep'"):
         SharedVecEnv(envs)

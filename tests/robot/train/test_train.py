@@ -21,10 +21,10 @@ import onnx  # noqa: E402
 import onnxruntime  # noqa: E402
 
 from robot.deploy.onnx_policy import OnnxPolicy  # noqa: E402
-from robot.train.dagger import LEAST_SPREAD, act  # noqa: E402
-from robot.train.network import CLIP, MOST_BYTES, ExportError, FeatureLayers, PolicyNetwork, export  # noqa: E402  # noqa: E402
+from robot.train.dagger import MIN_SPREAD, infer_actions  # noqa: E402
+from robot.train.network import MAX_BYTES, MAX_DEVIATIONS, ExportError, FeatureLayers, PolicyNetwork, export  # noqa: E402  # noqa: E402
 from robot.train.run_folder import RunError, RunFolder  # noqa: E402
-from robot.train.train import begin, environments, export_policy, new_actor, train  # noqa: E402
+from robot.train.train import begin_run, export_policy, make_environments, new_actor, train  # noqa: E402
 from tacsim.config import ConfigError  # noqa: E402
 from tacsim.control.contact_signal import NoTouch  # noqa: E402
 from tacsim.models.training import Training  # noqa: E402
@@ -49,7 +49,7 @@ def weights(run: RunFolder) -> dict[str, Any]:
         elif isinstance(value, int | float):
             found[at] = value
 
-    walk(run.last()[1], "")
+    walk(run.load_checkpoint()[1], "")
     return found
 
 
@@ -58,52 +58,50 @@ class Killed(Exception):
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
-def test_a_run_that_was_killed_goes_on_to_the_same_end_bit_for_bit(algorithm: str, tmp_path: Path) -> None:
+def test_train_killed_run_continues_bit_for_bit(algorithm: str, tmp_path: Path) -> None:
     settings = training(algorithm=algorithm)
-    whole = begin(settings, tmp_path / "whole")
+    whole = begin_run(settings, tmp_path / "whole")
     train(whole)
 
     def kill_in_round_2(words: str, done: int, of: int) -> None:
         if "round 3" in words and done >= of // 2:
             raise Killed
 
-    cut = begin(settings, tmp_path / "cut")
+    cut = begin_run(settings, tmp_path / "cut")
     with pytest.raises(Killed):
         train(cut, kill_in_round_2)
-    assert cut.last()[0] == 2
+    assert cut.load_checkpoint()[0] == 2
     train(RunFolder(tmp_path / "cut"))
     assert weights(cut) == weights(whole) != {}
     assert (tmp_path / "cut/policy.onnx").read_bytes() == (tmp_path / "whole/policy.onnx").read_bytes()
     assert len(json.loads((tmp_path / "cut/curve.json").read_text())) == 3
 
 
-def test_a_kill_right_after_the_last_checkpoint_leaves_a_whole_curve(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    run, keep = begin(training(dagger={"rounds": 1, "epochs": 1}), tmp_path / "run"), RunFolder.keep
+def test_train_kill_after_last_checkpoint_keeps_curve(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run, keep = begin_run(training(dagger={"rounds": 1, "epochs": 1}), tmp_path / "run"), RunFolder.save_checkpoint
 
     def kept_and_killed(*given: Any) -> None:
         keep(*given)
         raise Killed
 
-    monkeypatch.setattr(RunFolder, "keep", kept_and_killed)
+    monkeypatch.setattr(RunFolder, "save_checkpoint", kept_and_killed)
     with pytest.raises(Killed):
         train(run)
     train(run)
-    assert json.loads((run.folder / "curve.json").read_text()) == run.last()[2] != []
+    assert json.loads((run.folder / "curve.json").read_text()) == run.load_checkpoint()[2] != []
 
 
-def test_other_seeds_learn_something_else(tmp_path: Path) -> None:
+def test_train_other_seed_gives_other_policy(tmp_path: Path) -> None:
     ends = []
     for seed in (0, 1):
-        run = begin(training(seed=seed, dagger={"rounds": 1, "epochs": 1}), tmp_path / str(seed))
+        run = begin_run(training(seed=seed, dagger={"rounds": 1, "epochs": 1}), tmp_path / str(seed))
         train(run)
         ends.append(weights(run))
     assert ends[0] != ends[1]
 
 
-def test_a_process_that_is_killed_leaves_a_run_that_goes_on(tmp_path: Path) -> None:
-    """kill -9 at a time that nobody chose."""
+def test_train_command_killed_process_can_continue(tmp_path: Path) -> None:
+    """kill -9 at an arbitrary time."""
     file = tmp_path / "short.yaml"
     file.write_text(json.dumps(training().model_dump(mode="json", exclude_none=True)), encoding="utf-8")
     command = [*START, "train", str(file), "--out", str(tmp_path / "run")]
@@ -114,14 +112,14 @@ def test_a_process_that_is_killed_leaves_a_run_that_goes_on(tmp_path: Path) -> N
         assert process.wait() in (-signal.SIGKILL, 0), process.stderr and process.stderr.read()
     result = tacsim("train", "--resume", tmp_path / "run")
     assert result.exit_code == 0, result.output
-    whole = begin(training(), tmp_path / "whole")
+    whole = begin_run(training(), tmp_path / "whole")
     train(whole)
     assert weights(RunFolder(tmp_path / "run")) == weights(whole)
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
-def test_a_full_disk_says_so_and_leaves_the_last_checkpoint(tmp_path: Path) -> None:
-    run = begin(training(), tmp_path / "run")
+def test_train_full_disk_raises_and_keeps_checkpoint(tmp_path: Path) -> None:
+    run = begin_run(training(), tmp_path / "run")
 
     def fill_in_round_2(words: str, done: int, of: int) -> None:
         if "round 2" in words and not (run.folder / ".checkpoint.pt.part").exists():
@@ -131,31 +129,31 @@ def test_a_full_disk_says_so_and_leaves_the_last_checkpoint(tmp_path: Path) -> N
         train(run, fill_in_round_2)
     assert failed.value.filename == str(run.folder / "checkpoint.pt")
     assert not (run.folder / ".checkpoint.pt.part").is_symlink()
-    assert run.last()[0] == 1
+    assert run.load_checkpoint()[0] == 1
     train(run)
-    assert run.last()[0] == 3
+    assert run.load_checkpoint()[0] == 3
 
 
 @pytest.mark.parametrize("maps", [(), ("height", "slope")])
-def test_the_file_does_what_the_network_does(maps: tuple[str, ...], tmp_path: Path) -> None:
-    """Normalisation and clipping inside, no other file, metadata: to 1e-5, far outside of what was met too."""
+def test_export_file_acts_like_network(maps: tuple[str, ...], tmp_path: Path) -> None:
+    """Normalisation and clipping inside, no other file, metadata: to 1e-5, also far outside the training data."""
     features = {
         "maps": maps,
         "grid": {"rows": 4, "columns": 4, "pitch": 2e-3},
         "touch": ["depth", "wrench"],
         "frames": 2,
     }
-    run = begin(training(features=features, dagger={"rounds": 1, "epochs": 1}), tmp_path / "run")
+    run = begin_run(training(features=features, dagger={"rounds": 1, "epochs": 1}), tmp_path / "run")
     train(run)
     path = tmp_path / "run/policy.onnx"
     model = onnx.load(path, load_external_data=False)
-    assert path.stat().st_size <= MOST_BYTES
+    assert path.stat().st_size <= MAX_BYTES
     assert not any(tensor.external_data for tensor in model.graph.initializer)
     policy = OnnxPolicy(path, environments_grid(), 2e-3)
     assert policy.spec.trained["training"]["features"]["frames"] == 2
     assert policy.spec.trained["steps"] == 9
     actor, session = new_actor(run), onnxruntime.InferenceSession(path)
-    actor.load_state_dict(run.last()[1]["actor"])
+    actor.load_state_dict(run.load_checkpoint()[1]["actor"])
     random = np.random.default_rng(3)
     for scale in (0.1, 1.0, 30.0):
         seen = {
@@ -174,29 +172,29 @@ def environments_grid() -> Any:
     return CanonicalGrid(rows=8, columns=8, pitch=1e-3, image_scale=1)
 
 
-def test_normalisation_is_by_what_was_met_and_cuts_what_is_far() -> None:
+def test_normalise_by_examples_clips_far_values() -> None:
     layers = FeatureLayers({"touch": (2,), "goal": (1,)})
     assert layers.keys == ("goal", "touch")
     layers.normalise_by({"touch": torch.tensor([[1.0, 5.0], [3.0, 5.0]]), "goal": torch.tensor([[0.7], [0.7]])})
     found = layers(torch.tensor([[0.9]]), torch.tensor([[4.0, 1e9]]))
     # goal and the second number never varied: their own size; the first has mean 2 and deviation 1
-    assert found[0].tolist() == pytest.approx([0.2, 2.0, CLIP])
+    assert found[0].tolist() == pytest.approx([0.2, 2.0, MAX_DEVIATIONS])
 
 
-def test_a_network_that_is_too_large_for_a_file_is_refused(tmp_path: Path) -> None:
-    run = begin(training(), tmp_path / "run")
-    with pytest.raises(ExportError, match="MiB, at most 2 are written"):
+def test_export_large_network_raises(tmp_path: Path) -> None:
+    run = begin_run(training(), tmp_path / "run")
+    with pytest.raises(ExportError, match="MiB, the maximum is 2 MiB"):
         export(PolicyNetwork(run.settings.shapes, 2, 1000), run.settings.spec, run.settings.shapes, tmp_path / "x.onnx")
     assert not (tmp_path / "x.onnx").exists()
 
 
-def test_export_of_a_run_that_has_only_begun(tmp_path: Path) -> None:
-    run = begin(training(), tmp_path / "run")
-    with pytest.raises(RunError, match="not one round of its training is done"):
+def test_export_policy_without_checkpoint_raises(tmp_path: Path) -> None:
+    run = begin_run(training(), tmp_path / "run")
+    with pytest.raises(RunError, match="no round of its training is complete"):
         export_policy(run, tmp_path / "x.onnx")
 
 
-def test_the_command_trains_exports_and_goes_on(tmp_path: Path) -> None:
+def test_train_command_trains_exports_and_continues(tmp_path: Path) -> None:
     file = tmp_path / "short.yaml"
     file.write_text(json.dumps(training().model_dump(mode="json", exclude_none=True)), encoding="utf-8")
     run = tmp_path / "run"
@@ -222,12 +220,12 @@ def test_the_command_trains_exports_and_goes_on(tmp_path: Path) -> None:
         (("squeeze", "--set", "overrides=[scene.presett=learn]"), "did you mean"),
         (("squeeze", "--set", "rig=mock", "--set", "overrides=[]", "--set", "randomise=null"), "not simulated"),
         (("squeeze", "--set", "features.flow=true"), "markers"),
-        (("--resume", "nowhere"), "nowhere holds no training run"),
+        (("--resume", "nowhere"), "nowhere is not the folder of a training run"),
         (("--resume", "nowhere", "--seed", "1"), "leave out all else"),
         (("squeeze", "--resume", "nowhere"), "leave out all else"),
     ],
 )
-def test_what_cannot_be_is_said(
+def test_train_command_invalid_input_is_reported(
     words: tuple[str, ...], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -238,22 +236,20 @@ def test_what_cannot_be_is_said(
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
-def test_a_bad_draw_is_told_counted_and_drawn_anew(
+def test_train_bad_draw_is_reported_and_repeated(
     algorithm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     touch_nothing_slippery(monkeypatch)
     told: list[str] = []
     drawn = {"draws": 12, "values": {"scene.friction.upper": {"choice": [0.4, 0.6]}}}
-    run = begin(training(randomise=drawn, algorithm=algorithm), tmp_path / "run")
+    run = begin_run(training(randomise=drawn, algorithm=algorithm), tmp_path / "run")
     assert train(run, warn=told.append).exists()
-    assert told == ["drawn anew: scene.friction.upper=0.6: nothing there"]
-    assert sum(row["refused"] for row in run.last()[2]) >= 1
+    assert told == ["drawn again: scene.friction.upper=0.6: nothing there"]
+    assert sum(row["refused"] for row in run.load_checkpoint()[2]) >= 1
 
 
-def test_too_many_bad_draws_end_a_training_and_keep_what_was_learned(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    run = begin(training(), tmp_path / "run")
+def test_train_many_bad_draws_raise_and_keep_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = begin_run(training(), tmp_path / "run")
 
     def none(*given: Any) -> Any:
         raise NoTouch("nothing there")
@@ -264,7 +260,7 @@ def test_too_many_bad_draws_end_a_training_and_keep_what_was_learned(
 
     with pytest.raises(BadDraws, match=r"8 draws in a row cannot begin .*nothing there"):
         train(run, then_none)
-    assert run.last()[0] == 1
+    assert run.load_checkpoint()[0] == 1
     assert export_policy(run, tmp_path / "kept.onnx") <= 1e-5
     result = tacsim("train", "--resume", str(run.folder))
     assert result.exit_code == 2 and "nothing there" in result.output, result.output
@@ -283,11 +279,11 @@ def test_too_many_bad_draws_end_a_training_and_keep_what_was_learned(
          ConfigError, r"(?s)friction.upper.*a limit: scene.friction"),
     ],
 )  # fmt: skip
-def test_ranges_whose_ends_cannot_be_are_refused_before_a_training_begins(
+def test_begin_run_invalid_range_limit_raises(
     values: dict[str, Any], error: type[Exception], said: str, tmp_path: Path
 ) -> None:
     with pytest.raises(error, match=said):
-        begin(training(randomise={"draws": 1, "seed": 3, "values": values}), tmp_path / "run")
+        begin_run(training(randomise={"draws": 1, "seed": 3, "values": values}), tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
 
@@ -321,17 +317,17 @@ def misfit(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("spoil", "said"),
     [
-        (other_format, "has format 2, this version of tacsim goes on with 1"),
+        (other_format, "has format 2, this version of tacsim continues format 1"),
         (lambda folder: (folder / "run.json").write_text("{"), "run.json cannot be read"),
-        (cut_off, "is no checkpoint of this version"),
+        (cut_off, "is not a checkpoint of this version"),
         (other_checkpoint, "has format 7"),
-        (code, "is no checkpoint of this version"),
+        (code, "is not a checkpoint of this version"),
         (misfit, "does not fit its settings"),
         (lambda folder: (folder / "round-000.npz").unlink(), "round-000.npz"),
         (lambda folder: (folder / "round-000.npz").write_bytes(b"PK"), "round-000.npz"),
     ],
 )
-def test_a_run_that_cannot_go_on_says_why(spoil: Any, said: str, done: Path, tmp_path: Path) -> None:
+def test_train_invalid_run_raises_with_reason(spoil: Any, said: str, done: Path, tmp_path: Path) -> None:
     import shutil
 
     folder = tmp_path / "run"
@@ -347,18 +343,18 @@ def test_a_run_that_cannot_go_on_says_why(spoil: Any, said: str, done: Path, tmp
     assert not (folder / "ran").exists()
 
 
-def test_a_round_tells_how_far_off_the_student_is_before_it_learns_what_it_met(tmp_path: Path) -> None:
+def test_dagger_round_reports_loss_before_learning(tmp_path: Path) -> None:
     """A student whose steps of learning are nothing: the loss before a round is that of its last network."""
-    run = begin(training(dagger={"rounds": 3, "epochs": 1, "rate": 1e-12}), tmp_path / "run")
+    run = begin_run(training(dagger={"rounds": 3, "epochs": 1, "rate": 1e-12}), tmp_path / "run")
     curve = []
-    train(run, say=lambda figures: curve.append(dict(figures)))
+    train(run, report_result=lambda figures: curve.append(dict(figures)))
     assert "unmet_loss" not in curve[0]  # in the first round the teacher acts
     met = [dict(np.load(run.folder / f"round-{number:03d}.npz")) for number in range(3)]
     actor = new_actor(run)
-    actor.load_state_dict(run.last()[1]["actor"])
+    actor.load_state_dict(run.load_checkpoint()[1]["actor"])
     for number in (1, 2):
         wanted = np.concatenate([each["action"] for each in met[: number + 1]])
-        off = (act(actor, met[number]) - met[number]["action"]) / wanted.std(axis=0).clip(min=LEAST_SPREAD)
+        off = (infer_actions(actor, met[number]) - met[number]["action"]) / wanted.std(axis=0).clip(min=MIN_SPREAD)
         assert curve[number]["unmet_loss"] == pytest.approx(float(np.square(off).mean()), rel=1e-4)
 
 
@@ -366,11 +362,11 @@ def test_a_round_tells_how_far_off_the_student_is_before_it_learns_what_it_met(t
 def done(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of one round."""
     folder: Path = tmp_path_factory.mktemp("done") / "run"
-    train(begin(training(dagger={"rounds": 1, "epochs": 1}), folder))
+    train(begin_run(training(dagger={"rounds": 1, "epochs": 1}), folder))
     return folder
 
 
-def test_nothing_else_loads_torch() -> None:
+def test_torch_is_imported_only_by_train() -> None:
     program = """
 import sys
 import robot.cli, robot.open, robot.deploy.policy, robot.train.evaluate, robot.train.run_folder
@@ -383,8 +379,8 @@ assert not {"torch", "stable_baselines3", "onnx", "onnxruntime"} & set(sys.modul
     assert done.returncode == 0, done.stderr
 
 
-def test_environments_of_a_training_share_launches() -> None:
-    envs = environments(training())
+def test_make_environments_share_launches() -> None:
+    envs = make_environments(training())
     assert envs.num_envs == 3
     assert [member.expert().tolist() for member in envs.members] == [[0.0, 0.0]] * 3  # nothing is running
     envs.reset(seed=1)

@@ -16,7 +16,7 @@ from robot.mock.cell.sim_server import SceneFrame
 from robot.mock.fixtures import rig_addresses
 from robot.open import open_rig
 from robot.train import transfer
-from robot.train.transfer import Played, Side, Study, _loaded, picture, play, summary
+from robot.train.transfer import EpisodeResult, Side, Study, _load_rig, draw_figure, play_study, summarise
 from tacsim.config import load, load_rig
 from tacsim.interface import Action, Observation, Pose
 from tacsim.models.hardware import UrArmConfig
@@ -37,14 +37,14 @@ TWINS = Randomisation.model_validate({"draws": 8, "values": TWIN})
 
 def study(**changed: Any) -> Study:
     whole: dict[str, Any] = {
-        "task": "squeeze", "policies": ("scripted", "grip"), "twins": TWINS, "episodes": 5, "changing": 2, "steps": 2,
-        "overrides": (),
+        "task": "squeeze", "policies": ("scripted", "grip"), "twins": TWINS, "episodes": 5, "episodes_per_twin": 2,
+        "steps": 2, "overrides": (),
     }  # fmt: skip
     return Study(**{**whole, **changed})
 
 
-def test_the_simulation_has_of_a_twin_what_a_person_sees() -> None:
-    twin, simulation = (_loaded(study(), side, 1, 3).config for side in ("twin", "simulation"))
+def test_load_rig_simulation_has_visible_parameters_of_twin() -> None:
+    twin, simulation = (_load_rig(study(), side, 1, 3).config for side in ("twin", "simulation"))
     assert twin.task is not None and simulation.task is not None and twin.scene is not None
     assert simulation.scene is not None and twin.scene.body is not None and simulation.scene.body is not None
     assert twin.task.goal == simulation.task.goal  # type: ignore[attr-defined]
@@ -52,31 +52,31 @@ def test_the_simulation_has_of_a_twin_what_a_person_sees() -> None:
     usual = load_rig("sim", task="squeeze").config.scene
     assert usual is not None and usual.body is not None
     assert simulation.scene.body.material == usual.body.material != twin.scene.body.material
-    same, other = (_loaded(study(), "twin", 1, number).config for number in (3, 2))
+    same, other = (_load_rig(study(), "twin", 1, number).config for number in (3, 2))
     assert same == twin and other.scene is not None
     assert other.scene.body == twin.scene.body and other.task.goal != twin.task.goal  # type: ignore[union-attr]
 
 
-def test_a_learned_policy_is_played_in_the_simulation_that_it_was_trained_in() -> None:
-    twin, own = (_loaded(study(), side, 1, 3, "learned").config for side in transfer.SIDES[::-1])
+def test_load_rig_learned_policy_uses_training_simulation() -> None:
+    twin, own = (_load_rig(study(), side, 1, 3, "learned").config for side in transfer.SIDES[::-1])
     assert own.scene is not None and own.scene.body is not None and own.task is not None and twin.scene is not None
     assert own.scene.preset == "learn" and own.motion == "flowing" and twin.scene.preset == "draft"
     assert own.scene.body.geometry == twin.scene.body.geometry  # type: ignore[union-attr]
     assert own.task.goal == twin.task.goal  # type: ignore[attr-defined, union-attr]
-    other = _loaded(study(), "simulation", 1, 2, "learned").config
+    other = _load_rig(study(), "simulation", 1, 2, "learned").config
     assert other.scene is not None and other.scene.body is not None
     assert other.scene.body.material != own.scene.body.material  # which its training draws
 
 
-def test_the_shipped_twin_fits_both_rigs() -> None:
+def test_load_rig_shipped_twin_fits_both_rigs() -> None:
     for side in transfer.SIDES:
         for number in range(3):
-            config = _loaded(study(twins=load(Randomisation, "squeeze-twin")), side, number, number).config
+            config = _load_rig(study(twins=load(Randomisation, "squeeze-twin")), side, number, number).config
             assert config.scene is not None
             assert config.scene.preset == ("standard" if side == "twin" else "draft")
 
 
-def test_a_mock_has_its_sensor_beside_where_the_file_believes_it() -> None:
+def test_twin_sensor_pose_error_is_applied() -> None:
     arm = load_rig("mock").config.arms["lower"]
     assert isinstance(arm, UrArmConfig) and arm.mock is not None
     error = {"position": (1e-4, 0.0, 0.0)}
@@ -86,7 +86,7 @@ def test_a_mock_has_its_sensor_beside_where_the_file_believes_it() -> None:
     assert moved == pytest.approx(-one.tool_from_sensor[:3, 0] * 1e-4)  # it believes to be further along its own x
 
 
-def test_late_pictures_are_those_of_the_motion_before() -> None:
+def test_twin_late_pictures_show_previous_motion() -> None:
     class Camera:
         def __init__(self) -> None:
             self.shown: list[int] = []
@@ -106,15 +106,15 @@ def test_late_pictures_are_those_of_the_motion_before() -> None:
     assert late.shown == [5, 6]  # the first one is shown until another has become old
 
 
-def fake(study: Study, side: Side, twin: int, left: Sequence[tuple[str, int]]) -> Iterator[Played]:
+def fake(study: Study, side: Side, twin: int, left: Sequence[tuple[str, int]]) -> Iterator[EpisodeResult]:
     for policy, number in left:
-        yield Played(policy, side, number, 1e-4 * (number + (side == "twin")), 1e-4 * number, number < 3, 1.0)
+        yield EpisodeResult(policy, side, number, 1e-4 * (number + (side == "twin")), 1e-4 * number, number < 3, 1.0)
 
 
-def test_a_study_that_is_killed_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(transfer, "_on_twin", fake)
+def test_play_study_killed_continues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(transfer, "_play_on_twin", fake)
     told: list[str] = []
-    whole = play(study(), tmp_path, lambda words, done, of: told.append(f"{done} of {of}, {words}"))
+    whole = play_study(study(), tmp_path, lambda words, done, of: told.append(f"{done} of {of}, {words}"))
     assert told[:2] == [
         "1 of 20, scripted, simulation: 0.000 mm from the goal",
         "2 of 20, scripted, simulation: 0.100 mm from the goal",
@@ -123,53 +123,53 @@ def test_a_study_that_is_killed_goes_on_where_it_was(tmp_path: Path, monkeypatch
     assert [(each.policy, each.side, each.episode) for each in whole] == [
         (policy, side, n) for policy in ("scripted", "grip") for side in ("simulation", "twin") for n in range(5)
     ]
-    path = tmp_path / transfer.ROWS
+    path = tmp_path / transfer.ROWS_FILE
     lines = path.read_text().splitlines()
     assert len(lines) == 20
     path.write_text("\n".join(lines[:7]) + "\n" + lines[7][:30])  # killed while it wrote
     asked: list[tuple[str, int]] = []
 
-    def rest(study: Study, side: Side, twin: int, left: Sequence[tuple[str, int]]) -> Iterator[Played]:
+    def rest(study: Study, side: Side, twin: int, left: Sequence[tuple[str, int]]) -> Iterator[EpisodeResult]:
         asked.extend(left)
         return fake(study, side, twin, left)
 
-    monkeypatch.setattr(transfer, "_on_twin", rest)
-    assert play(study(), tmp_path, lambda *_: None) == whole
+    monkeypatch.setattr(transfer, "_play_on_twin", rest)
+    assert play_study(study(), tmp_path, lambda *_: None) == whole
     assert len(asked) == 13
-    assert play(study(), tmp_path, lambda *_: None) == whole
-    assert len(asked) == 13  # what was mended is whole now
-    more = play(study(policies=("third", "grip")), tmp_path, lambda *_: None)
+    assert play_study(study(), tmp_path, lambda *_: None) == whole
+    assert len(asked) == 13  # the repaired file is complete
+    more = play_study(study(policies=("third", "grip")), tmp_path, lambda *_: None)
     assert [each for each in more if each.policy == "grip"] == whole[10:] and len(more) == 20
     assert len(asked) == 23 and all(policy == "third" for policy, _ in asked[13:])
-    with pytest.raises(ValueError, match="has a study of other settings; name another folder"):
-        play(study(steps=3), tmp_path, lambda *_: None)
+    with pytest.raises(ValueError, match="has a study with other settings; give another folder"):
+        play_study(study(steps=3), tmp_path, lambda *_: None)
 
 
-def test_an_episode_that_is_interrupted_is_no_result(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_play_study_interrupted_episode_is_not_recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted(observation: Observation) -> Action:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(transfer, "load_policy", lambda *_: FunctionPolicy(interrupted))
-    monkeypatch.setattr(transfer, "_loaded", lambda *_: load_rig("sim", overrides=TINY_GELS))
+    monkeypatch.setattr(transfer, "_load_rig", lambda *_: load_rig("sim", overrides=TINY_GELS))
     with pytest.raises(KeyboardInterrupt):
-        play(study(policies=("mine",)), tmp_path, lambda *_: None)
-    assert (tmp_path / transfer.ROWS).read_text() == ""
+        play_study(study(policies=("mine",)), tmp_path, lambda *_: None)
+    assert (tmp_path / transfer.ROWS_FILE).read_text() == ""
 
 
-def test_the_table_says_success_distance_and_how_well_it_is_felt(tmp_path: Path) -> None:
+def test_summarise_gives_success_distance_and_agreement(tmp_path: Path) -> None:
     rows = [row for side in transfer.SIDES for row in fake(study(), side, 0, [("p", n) for n in range(5)])]
-    rows.append(Played("q", "twin", 0, None, None, False, 0.0, "no touch"))
-    one, other, nothing = summary(rows)
+    rows.append(EpisodeResult("q", "twin", 0, None, None, False, 0.0, "no touch"))
+    one, other, nothing = summarise(rows)
     assert (one.side, one.success.value, other.side) == ("simulation", 0.6, "twin")
     assert one.distance is not None and one.distance.value == pytest.approx(2e-4)
     assert other.agreement == pytest.approx(1e-4)
     assert (nothing.distance, nothing.agreement, nothing.failures) == (None, None, 1)
-    picture([one, other, nothing], tmp_path / "transfer.png")
+    draw_figure([one, other, nothing], tmp_path / "transfer.png")
     assert (tmp_path / "transfer.png").stat().st_size > 5000
 
 
 @pytest.mark.deep
-def test_a_twin_is_believed_elsewhere_and_its_pictures_are_late() -> None:
+def test_twin_draws_pose_error_and_latency() -> None:
     words = ["arms.lower.mock.error.position=[0.2 mm, -0.1 mm, 0]", "sensors.upper.mock.delay=1"]
     with open_rig(
         "mock", task="squeeze", overrides=[*SMALL, *TINY, *rig_addresses(), "scene.preset=learn", *words]
@@ -191,7 +191,7 @@ def test_a_twin_is_believed_elsewhere_and_its_pictures_are_late() -> None:
 
 
 @pytest.mark.deep
-def test_the_command_makes_table_picture_and_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_transfer_command_writes_table_figure_and_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "twin.yaml").write_text(json.dumps({"draws": 2, "values": TWIN}))
     sets = [part for word in (*TINY, "scene.preset=learn") for part in ("--set", word)]

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from robot.arm.controller.rtde import Reading, read_controller
+from robot.arm.controller.rtde import ControllerReading, read_controller
 from robot.arm.controller.stand import OFF_FORCE, compare, on_pendant, stand
 from robot.arm.ur import URArm
 from robot.camera.driver import CameraDriver
@@ -104,9 +104,9 @@ def test_the_way_to_the_start_is_that_of_the_pendant(mock: MockUR) -> None:
     assert f"X {1e3 * target[0]:.1f} Y {1e3 * target[1]:.1f} Z {1e3 * target[2]:.1f} mm" in way.found
 
 
-def _with(reading: Reading, **changes: object) -> Reading:
-    facts = {name: getattr(reading, name) for name in Reading.__slots__}
-    return Reading(**{**facts, **changes})
+def _with(reading: ControllerReading, **changes: object) -> ControllerReading:
+    facts = {name: getattr(reading, name) for name in ControllerReading.__slots__}
+    return ControllerReading(**{**facts, **changes})
 
 
 def _at_start(config: UrArmConfig, **changes: object) -> dict[str, Check]:
@@ -115,7 +115,7 @@ def _at_start(config: UrArmConfig, **changes: object) -> dict[str, Check]:
     kinematics, frames = Kinematics(config.model), ArmFrames.of(config)
     flange = frames.flange(se3.to_matrix(config.start.pose))
     tcp = pose(se3.to_matrix(config.flange_from_tool.pose))
-    plain = Reading(
+    plain = ControllerReading(
         joints=kinematics.solutions(flange, np.zeros(6))[0],
         tcp_pose=pose(flange @ matrix(tcp)),
         tcp_force=np.zeros(6),
@@ -208,10 +208,10 @@ def test_sensors_nearer_than_their_keep_out_fail() -> None:
         assert check_keep_out(KeepOut(arms=("left", "right"), distance=distance), poses, "f").state == state
 
 
-def read_plain(config: UrArmConfig) -> Reading:
+def read_plain(config: UrArmConfig) -> ControllerReading:
     flange = Kinematics(config.model).forward(JOINTS)
     tcp = pose(se3.to_matrix(config.flange_from_tool.pose))
-    return Reading(np.array(JOINTS), pose(flange @ matrix(tcp)), np.zeros(6), 1, 0.3, np.zeros(3), tcp, 1.0)
+    return ControllerReading(np.array(JOINTS), pose(flange @ matrix(tcp)), np.zeros(6), 1, 0.3, np.zeros(3), tcp, 1.0)
 
 
 def test_values_that_are_not_numbers_end_in_an_error(mock: MockUR) -> None:

@@ -28,7 +28,8 @@ from benchmarks.truth.limit import (
 from tacsim.geometry.shapes import extent
 from tacsim.interface import FloatArray, Pose
 from tacsim.models.material import GelMaterial
-from tacsim.models.scene import FASTEST_MACH, Box, Cylinder, Gel, Indenter, Scene, Shape, Sphere
+from tacsim.models.scene import Box, Cylinder, Gel, Indenter, Scene, Shape, Sphere
+from tacsim.models.tuning import MAX_MACH
 from tacsim.physics.move import MoveStats
 
 if TYPE_CHECKING:
@@ -69,7 +70,7 @@ def press(scene: Scene, depth: float) -> tuple[PressWorld, MoveStats]:
     return world, stats
 
 
-DEFAULT_MACH = FASTEST_MACH  # the controller's default at nu 0.45, a tenth of the shear wave's speed
+DEFAULT_MACH = MAX_MACH  # the controller's default at nu 0.45, a tenth of the shear wave's speed
 # Half of it; more; and a third of the shear wave's speed, where contact sticks and slips by inertia.
 OTHER_MACHS = (0.015, 0.05, 0.1)
 

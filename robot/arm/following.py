@@ -14,21 +14,23 @@ import numpy as np
 
 from robot.arm.channel import WorkerConfig
 from robot.arm.trajectory import PERIOD
+from robot.arm.tuning import (
+    MAX_FOREIGN_SHIFT,
+    MAX_FOREIGN_SPEED,
+    MAX_PACKAGE_GAP,
+    MAX_REST_SPEED,
+    MAX_REST_TURN_RATE,
+    MODEL_LAG,
+    SCALING_RATE,
+    TARGET_DELAY,
+)
 from robot.common.kinematics import Kinematics
 from robot.common.tcp import ArmFrames, Measured
 from tacsim.interface import FloatArray
 
-# How fast the speed scaling changes [1/s]: Universal Robots' ROS driver lets it rise by 0.01 in each period of 2 ms.
-SCALING_RATE = 5.0
 # Up, the target follows more slowly: an arm that begins to move while the scaling rises speeds up by the rate of
 # both, 1.45 times as much as its target.
 RISE_RATE = SCALING_RATE / 1.5
-SLOWER_LAG = 1.5  # time constant of the model, in that of servoJ
-DELAY = 10e-3  # added to it: target to controller, joints behind their set points, package to worker [s]
-LONGEST = 0.2  # between two packages; a larger step, or one back, is a jump of the controller's clock [s]
-SETTLED = 8.0  # time constants after which servoJ has led the joints to a target that rests
-FOREIGN_SPEED, FOREIGN_SHIFT = 2e-3, 1e-3  # of the controller's own target, where servoJ would let it rest [rad/s, rad]
-RESTING, RESTING_TURN = 1e-3, 10e-3  # an arm slower than this is at rest [m/s, rad/s]
 
 
 class SpeedScaling:
@@ -70,7 +72,7 @@ class FollowingMonitor:
     def update(self, sent: FloatArray | None, stamp: float, scaling: float) -> None:
         """A new package, of the time `stamp` [s]; `sent` (6,): joints of the newest target; None: nothing is sent."""
         passed = stamp - self._stamp
-        passed = passed if 0.0 <= passed <= LONGEST else PERIOD
+        passed = passed if 0.0 <= passed <= MAX_PACKAGE_GAP else PERIOD
         self._stamp = stamp
         if sent is None:
             return
@@ -79,7 +81,7 @@ class FollowingMonitor:
             return
         rests = bool((sent == self._target).all())
         self._rested = self._rested + scaling * passed / self._lookahead if rests else 0.0
-        share = np.exp(-passed / (DELAY + SLOWER_LAG * self._lookahead / max(scaling, 1e-3)))
+        share = np.exp(-passed / (TARGET_DELAY + MODEL_LAG * self._lookahead / max(scaling, 1e-3)))
         self._expected = sent + share * (self._expected - sent)
         self._target = sent
 
@@ -94,15 +96,16 @@ class FollowingMonitor:
     @property
     def has_settled(self) -> bool:
         """True if packages have arrived since servoJ led the joints to a target that rests."""
-        return self._target is not None and self._rested >= SETTLED
+        time_constants = 8.0  # time constants after which servoJ has led the joints to a target that rests
+        return self._target is not None and self._rested >= time_constants
 
     def is_moved_from_rest(self, target: FloatArray, speeds: FloatArray) -> bool:
         """True if the controller's own target (6,) [rad] moves, at speeds (6,) [rad/s], or lies elsewhere, where servoJ
         has come to rest: another program moves it."""
         if self._target is None or not self.has_settled:
             return False
-        moves = float(np.abs(speeds).max()) > FOREIGN_SPEED
-        return moves or float(np.abs(target - self._target).max()) > FOREIGN_SHIFT
+        moves = float(np.abs(speeds).max()) > MAX_FOREIGN_SPEED
+        return moves or float(np.abs(target - self._target).max()) > MAX_FOREIGN_SHIFT
 
 
 def _distance(begin: FloatArray, end: FloatArray) -> float:
@@ -115,4 +118,4 @@ def _distance(begin: FloatArray, end: FloatArray) -> float:
 def is_standing(measured: Measured) -> bool:
     """True if the arm itself does not move."""
     twist = np.abs(measured.twist)
-    return bool(twist[:3].max() <= RESTING and twist[3:].max() <= RESTING_TURN)
+    return bool(twist[:3].max() <= MAX_REST_SPEED and twist[3:].max() <= MAX_REST_TURN_RATE)

@@ -26,8 +26,6 @@ LIBRARY_REPORTS = (  # ur_rtde 1.6.5, after each failure of a connection and bef
     "Could not receive data from robot",
     "Robot closed the connection",
 )
-MAX_LATE_SHARE = 0.02  # of the last periods of a punctual worker
-MAX_LATE_PERIOD = 0.5  # of link_timeout: the longest period of a punctual worker
 
 
 class Verdict:
@@ -61,6 +59,8 @@ def died_of_lost_link(exit_status: int, printed: str) -> bool:
 
 def explain_lost_link(record: Record, config: UrArmConfig, exit_status: int | None, now: float) -> str:
     """What was measured when the link was lost, and what to do; exit_status: of the worker, None while it runs."""
+    max_late_period = 0.5  # of link_timeout: the longest period of a punctual worker
+    max_late_share = 0.02  # of the last periods of a punctual worker
     lost = now if exit_status is None else float(record["written"])
     age, unheard = lost - float(record["time"]), lost - float(record["written"])
     text = f"its last package is {1e3 * age:.0f} ms old (link_timeout = {1e3 * config.link_timeout:g} ms)"
@@ -71,7 +71,7 @@ def explain_lost_link(record: Record, config: UrArmConfig, exit_status: int | No
     late, count = int(record["late"]), max(1, min(int(record["cycles"]), WINDOW))
     longest = max(float(record["longest"]), unheard)
     periods = f"{late} of its last {count} periods of {1e3 * PERIOD:g} ms were late, the longest {1e3 * longest:.0f} ms"
-    if late <= MAX_LATE_SHARE * count and longest <= MAX_LATE_PERIOD * config.link_timeout:
+    if late <= max_late_share * count and longest <= max_late_period * config.link_timeout:
         where = "check the cable" if config.mock is None else "see whether its mock controller still runs"
         return f"{text}; its worker was punctual ({periods}); {where}"
     if bool(record["realtime"]):

@@ -43,6 +43,15 @@ from robot.arm.trajectory import (
     stopping_point,
     towards,
 )
+from robot.arm.tuning import (
+    FAULT_DECELERATION,
+    FAULT_TURN_DECELERATION,
+    MAX_HELD_SHIFT,
+    MAX_HELD_TURN,
+    MAX_OVERSHOOT,
+    MAX_STALL_PERIODS,
+    MAX_ZERO_AGE,
+)
 from robot.common.kinematics import Kinematics, SingularityGuard, inverse_frame, rotation, rotation_vector
 from robot.common.tcp import Measured
 from tacsim.interface import FloatArray
@@ -57,14 +66,8 @@ from tacsim.limits import (
     stopping_position,
 )
 
-FAULT_DECELERATION = 5.0  # minimum deceleration after a fault [m/s^2]
-FAULT_TURN_DECELERATION = 50.0  # the same for rotations [rad/s^2]
-ALLOWED_OVERSHOOT = 0.5e-3  # how far outside its region the arm itself may come to rest; the target never leaves it [m]
-PUSHED_AWAY, PUSHED_AWAY_TURN = 0.2e-3, 2e-3  # an arm farther than this from its held pose was moved [m, rad]
 LOOP_OFFSET = 2 * PERIOD  # between the loops of two arms [s]
-ZERO_PATIENCE = 0.5  # a wish to zero the wrench that is older is dropped [s]
 PACKAGE_DELAY = 3 * PERIOD  # from a change of the arm's speed on the controller to the target that knows of it [s]
-STALL_PATIENCE = 10  # periods that a target stands after missed ones, for a package from after them
 
 
 class Servo:
@@ -153,10 +156,7 @@ class Servo:
         elif self.status in (ArmStatus.CONNECTING, ArmStatus.WAITING):
             self.status = ArmStatus.HOLD
         for partner, other in zip(config.partners, partners, strict=True):
-            if (
-                other is not None
-                and float(np.linalg.norm(here - other["position"])) < partner.distance - ALLOWED_OVERSHOOT
-            ):
+            if other is not None and float(np.linalg.norm(here - other["position"])) < partner.distance - MAX_OVERSHOOT:
                 approach = float(measured.twist[:3] @ (other["position"] - here))
                 if approach > 0.0 and not self.resting:
                     self.trip(ArmStatus.KEEP_OUT)
@@ -164,7 +164,7 @@ class Servo:
     def _check_place(self, measured: Measured) -> None:
         if (
             self.region.excess(stopping_position(measured.sensor[:3, 3], measured.twist[:3], self._hard[0]))
-            > ALLOWED_OVERSHOOT
+            > MAX_OVERSHOOT
         ):
             self.trip(ArmStatus.WORKSPACE_LIMIT)
 
@@ -202,7 +202,7 @@ class Servo:
 
     def zero_due(self, time: float) -> bool:
         """True, once, if the wrench is to be zeroed: the newest command says so, a moment ago, and the target rests."""
-        due = self.resting and time - self._zero_asked <= ZERO_PATIENCE
+        due = self.resting and time - self._zero_asked <= MAX_ZERO_AGE
         if due:
             self._zero_asked = -math.inf
         return due
@@ -284,7 +284,7 @@ class Servo:
             age = 0.5 * PERIOD if tripped else PACKAGE_DELAY  # more than is usual
             fresh = measured.stamp - stamp > max(0.0, time - new - PERIOD - age)
             self._waited += not fresh
-            if not fresh and self._waited < STALL_PATIENCE:
+            if not fresh and self._waited < MAX_STALL_PERIODS:
                 return True
             if tripped:
                 self._reset_after_fault(measured if fresh else None)
@@ -329,7 +329,7 @@ class Servo:
             return False
         away = np.abs(measured.sensor[:3, 3] - held.position).max()
         turned = np.abs(rotation_vector(measured.sensor[:3, :3] @ held.rotation.T)).max()
-        return bool(away > PUSHED_AWAY or turned > PUSHED_AWAY_TURN)
+        return bool(away > MAX_HELD_SHIFT or turned > MAX_HELD_TURN)
 
     def _slow_down(self, measured: Measured) -> FloatArray | None:
         """One period of braking; repeats the last joints where the braking pose has no allowed ones."""

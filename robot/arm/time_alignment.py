@@ -19,16 +19,13 @@ from robot.errors import DeviceError
 from tacsim import pose as se3
 from tacsim.interface import ArmState, FloatArray, Pose
 
-MAX_GAP = 50e-3  # two states further apart say nothing about the time between them [s]
-REACH = 10e-3  # beyond the newest, a state is extrapolated with its twist for at most this time [s]
-
 
 class NotAligned(DeviceError):
     """No state of the arm is near enough to the time that was asked for."""
 
 
 def state_at(
-    time: float, states: Sequence[ArmState], arm: str, max_gap: float = MAX_GAP, reach: float = REACH
+    time: float, states: Sequence[ArmState], arm: str, max_gap: float = 50e-3, reach: float = 10e-3
 ) -> tuple[ArmState, float]:
     """The state at `time` [s]: pose on the straight path (slerp), twist, wrench and joints in proportion. Also the time
     to the nearer of the two states it is made of, 0 at one of them [s].

@@ -48,12 +48,8 @@ from tacsim.interface import Action, ArmState, FloatArray, GelReading, Pose
 from tacsim.limits import ActionError, check_action, clip_to_region
 from tacsim.models.hardware import UrArmConfig
 
-CONNECT_TIMEOUT = 10.0  # of the constructor and of recover [s]
 CLOSE_TIMEOUT = 1.2  # for the worker to brake and end its program; then it is killed [s]
 POLL = 2e-3  # between two looks at the worker's records while waiting [s]
-SLOW = 2.0 * PERIOD  # a loop whose median period is longer makes its arm slow [s]
-PARTNER_PATIENCE = 0.5  # how long a command waits for the state of the other arm of a keep-out [s]
-REST_SPEED, REST_TURN = 1e-3, 10e-3  # an arm slower than this is at rest [m/s, rad/s]
 _open: set[str] = set()  # names of the arms that are open in this process
 _opening = threading.Lock()
 
@@ -82,7 +78,7 @@ class URArm(Closing):
         name: str,
         *,
         keep_out: Mapping[str, float] | None = None,
-        timeout: float = CONNECT_TIMEOUT,
+        timeout: float = 10.0,
     ) -> None:
         check_host(config, name)
         self.name, self.config, self._timeout = name, config, timeout
@@ -147,9 +143,10 @@ class URArm(Closing):
 
     def at_rest(self) -> bool:
         """True if neither the servo target nor the arm itself moves."""
+        max_speed, max_turn_rate = 1e-3, 10e-3  # an arm slower than this is at rest [m/s, rad/s]
         record = self._record()
         twist = self._state(record).twist
-        still = float(np.linalg.norm(twist[:3])) < REST_SPEED and float(np.linalg.norm(twist[3:])) < REST_TURN
+        still = float(np.linalg.norm(twist[:3])) < max_speed and float(np.linalg.norm(twist[3:])) < max_turn_rate
         return bool(record["resting"]) and still
 
     def arrived(self, target: Pose, *, within: float = 50e-6, turn: float = 1e-3) -> bool:
@@ -346,7 +343,8 @@ class URArm(Closing):
 
     def _require_able(self) -> None:
         """Raises the error of a status in which the arm follows no commands."""
-        deadline = time.monotonic() + PARTNER_PATIENCE
+        partner_timeout = 0.5  # how long a command waits for the state of the other arm of a keep-out [s]
+        deadline = time.monotonic() + partner_timeout
         while (status := self.status()) == ArmStatus.WAITING and time.monotonic() < deadline:
             time.sleep(POLL)
         if status.is_fault or status in (ArmStatus.WAITING, ArmStatus.CONNECTING):
@@ -365,6 +363,7 @@ class URArm(Closing):
         return status.error(self._explain(status))
 
     def _explain(self, status: ArmStatus) -> str:
+        slow_period = 2.0 * PERIOD  # a loop whose median period is longer makes its arm slow [s]
         text = f"arm '{self.name}' {status.text}"
         record = None if self._closed else self._channel.states.latest()
         if record is not None and record["stamp"] != 0.0:
@@ -376,7 +375,7 @@ class URArm(Closing):
                 text += f" ({self._region.violated_face(record['position']) or 'it is inside again'})"
             elif status == ArmStatus.PARTNER_STOPPED:
                 text += "".join(f" (arm '{name}' {fault.text})" for name, fault in self._first_faults())
-            elif status < ArmStatus.FORCE_LIMIT and (period := float(record["period"][0])) > SLOW:
+            elif status < ArmStatus.FORCE_LIMIT and (period := float(record["period"][0])) > slow_period:
                 text += f" (slowly: its loop takes {1e3 * period:.0f} ms, not 2; the machine is too busy)"
         worker = self._worker
         if worker is not None and status == ArmStatus.WORKER_DEAD:

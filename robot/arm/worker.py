@@ -38,7 +38,6 @@ from robot.errors import DeviceBusyError, DeviceError, DeviceNotConnectedError
 from tacsim.interface import FloatArray
 
 PORTS = {30004: "RTDE", 30003: "script"}
-PROBE_TIMEOUT = 2.0  # of a TCP connection [s]
 VARIABLES = [  # of one package; a name that the library does not know would shift the others
     "timestamp",
     "actual_q",
@@ -53,28 +52,16 @@ VARIABLES = [  # of one package; a name that the library does not know would shi
     "runtime_state",
     "safety_status_bits",
 ]
-PLAYING = 2  # of runtime_state
-PROTECTIVE_BIT = 1 << 2
-STOP_BITS = 1 << 3 | 1 << 4 | 1 << 5 | 1 << 6 | 1 << 7 | 1 << 8 | 1 << 9  # recovery, safeguard, emergency stops, fault
-MODEL_LENGTH, MODEL_TURN = 20e-3, 0.05  # FK of the named model and the controller's pose agree within [m, rad]
-TAKEN = 0.2  # what is measured so long after a new TCP or payload is by it, on the controller's clock [s]
-SILENT = 5.0  # longest wait for such a package [s]
-CLOSING = 0.6  # longest braking when the driver closes [s]
-PARENTLESS = 0.5  # longest braking when the driver is gone [s]
-CONNECTING = 60.0  # longest time to connect; the driver waits less, but it may be gone [s]
-MARGIN = 10e-3  # a call in the loop takes at most so much longer than link_timeout: the driver tells then [s]
-ZEROING = 2.0  # longest time to zero the force sensor [s]
-ENDING = 3.0  # longest time to end the program; the driver waits less, but it may be gone [s]
-BLIND = 5  # periods without a new package; then nothing is sent
-SUSPENDED = 5e-3  # a target that took this long was held up with its process, and comes too late [s]
-GRACE = 5  # periods in which a package may say why the controller takes no more commands
-FAILED = 3  # exit status; the reason is on stdout, as JSON
+END_TIMEOUT = 3.0  # longest time to end the program; the driver waits less, but it may be gone [s]
+MAX_BLIND_PERIODS = 5  # periods without a new package; then nothing is sent
+FAILED_STATUS = 3  # exit status; the reason is on stdout, as JSON
 
 
 class Worker:
     """One connection, from the first probe to the last servo call."""
 
     def __init__(self, config: WorkerConfig) -> None:
+        margin = 10e-3  # a call in the loop takes at most so much longer than link_timeout: the driver tells then [s]
         self.config = config
         self.frames = config.frames
         self.channel = Channel(Segment(config.segment))
@@ -84,7 +71,7 @@ class Worker:
         servo = Servo if config.way is None else StartServo
         self.servo = servo(config, commands_read=self.channel.commands.count, tactile_read=self.channel.tactile.count)
         self._periods = np.full(WINDOW, PERIOD)
-        self._limit = TimeLimit(config.link_timeout + MARGIN)  # of calls into the library
+        self._limit = TimeLimit(config.link_timeout + margin)  # of calls into the library
         self._driver = Lifeline(config.parent)  # opens a file: not once it is connected
         self._last = 0.0  # when the last period ended
         self._rereads = 0  # of the same package
@@ -98,15 +85,16 @@ class Worker:
     def connect(self) -> None:
         """Raises a DeviceError that says what is wrong. Blocks if the controller falls silent half way: the driver
         kills the process then."""
+        probe_timeout = 2.0  # of a TCP connection [s]
         config = self.config
         for port, what in PORTS.items():
             try:
-                socket.create_connection((config.host, port), PROBE_TIMEOUT).close()
+                socket.create_connection((config.host, port), probe_timeout).close()
             except OSError as failure:
                 raise DeviceNotConnectedError(
                     f"no controller at {config.host}: port {port} ({what}): {failure}; is it on, and the address right?"
                 ) from failure
-        with Dashboard(config.host, PROBE_TIMEOUT) as dashboard:
+        with Dashboard(config.host, probe_timeout) as dashboard:
             dashboard.require_identity(config.name, config.model, config.serial, config.refused_serial)
             dashboard.require_ready(f"arm '{config.name}'")
         try:
@@ -131,7 +119,7 @@ class Worker:
             self._set_up()
         except DeviceError:
             if self._read() or time.monotonic() - float(self.record["time"]) < config.link_timeout:  # it answers
-                with TimeLimit(ENDING), contextlib.suppress(RuntimeError):
+                with TimeLimit(END_TIMEOUT), contextlib.suppress(RuntimeError):
                     self.control.stopScript()
             raise
 
@@ -159,8 +147,11 @@ class Worker:
     def _await_change(self) -> None:
         """Reads until a package is measured after what was set last. The answer to that comes by another connection
         than the packages do: the next of these may be older, and show the weight of a payload untold."""
-        begin, deadline = float(self.record["stamp"]), time.monotonic() + SILENT
-        while not (self._read() and not 0.0 <= float(self.record["stamp"]) - begin < TAKEN):
+        change_timeout = 5.0  # longest wait for such a package [s]
+        # what is measured so long after a new TCP or payload is by it, on the controller's clock [s]
+        settling_time = 0.2
+        begin, deadline = float(self.record["stamp"]), time.monotonic() + change_timeout
+        while not (self._read() and not 0.0 <= float(self.record["stamp"]) - begin < settling_time):
             if time.monotonic() > deadline:
                 raise DeviceNotConnectedError(
                     f"arm '{self.config.name}': no RTDE package arrived that was measured after its payload was set"
@@ -170,6 +161,7 @@ class Worker:
     def _check_model(self, tool: Callable[[], FloatArray], advice: str) -> None:
         """Raises unless the controller's pose agrees with the forward kinematics of the model and of `tool`, which
         gives flange_from_tool (4, 4)."""
+        max_distance, max_angle = 20e-3, 0.05  # FK of the named model and the controller's pose agree within [m, rad]
         kinematics = Kinematics(self.config.model)  # type: ignore[arg-type]  # a Model, from JSON
         found, deadline = "no RTDE package with a pose arrived within 1 s", time.monotonic() + 1.0
         while True:
@@ -177,7 +169,7 @@ class Worker:
                 expected = kinematics.forward(self.record["joints"], tool())
                 difference = displacement(expected, matrix(self.record["tcp_pose"]))
                 shift, turn = float(np.linalg.norm(difference[:3])), float(np.linalg.norm(difference[3:]))
-                if shift <= MODEL_LENGTH and turn <= MODEL_TURN:
+                if shift <= max_distance and turn <= max_angle:
                     return
                 found = (
                     f"its tool is {1e3 * shift:.0f} mm and {turn:.2f} rad from where a {self.config.model} would "
@@ -191,6 +183,9 @@ class Worker:
 
     def run(self, parent: Parent) -> NoReturn:
         """Runs until the driver closes, or driver or connection is gone; tells `parent` of the first status."""
+        grace_periods = 5  # periods in which a package may say why the controller takes no more commands
+        parentless_timeout = 0.5  # longest braking when the driver is gone [s]
+        close_timeout = 0.6  # longest braking when the driver closes [s]
         gc.freeze()  # keeps what is loaded out of collections in the middle of a period
         self._last = time.monotonic()
         deadline = self._last + PERIOD
@@ -203,13 +198,13 @@ class Worker:
             orphan = self._driver.cut()
             now = time.monotonic()
             # Periods count, not time: a process that was suspended reads again first, packages may be waiting.
-            blind = self._rereads > BLIND
+            blind = self._rereads > MAX_BLIND_PERIODS
             if not connected or (blind and now - float(self.record["time"]) > self.config.link_timeout):
                 self._lose_link()
             partners = self._read_partners(now)
             before = self.servo.status
             stopped = self._controller_stop()
-            if stopped is None and self._refused > GRACE:
+            if stopped is None and self._refused > grace_periods:
                 stopped = ArmStatus.PROGRAM_STOPPED
             if stopped is not None:
                 self.servo.trip(stopped)
@@ -226,7 +221,7 @@ class Worker:
                         parent.send({"connected": True})
             self.servo.on_command(*command)
             if ending is None and (orphan or self.servo.close_requested):
-                ending = now + (PARENTLESS if orphan else CLOSING)
+                ending = now + (parentless_timeout if orphan else close_timeout)
                 if orphan:
                     self.servo.trip(ArmStatus.CLOSED)
             if stopped is not None or self.servo.status.is_controller_stop:
@@ -241,12 +236,13 @@ class Worker:
             deadline = self._sleep(deadline)
 
     def _act(self, partners: list[Any]) -> None:
+        max_target_age = 5e-3  # a target that took this long was held up with its process, and comes too late [s]
         if self._refused:  # the next packages say why
             self._refused += 1
             return
         now = time.monotonic()
         joints = self.servo.step(now, self.state, partners)
-        if time.monotonic() - now > SUSPENDED:
+        if time.monotonic() - now > max_target_age:
             joints = self.servo.withdraw()
         config, control = self.config, self.control
         with self._limit, self._lost_link():
@@ -260,9 +256,10 @@ class Worker:
             self._zero_wrench()
 
     def _zero_wrench(self) -> None:
-        self.record["busy_until"] = time.monotonic() + ZEROING
+        zero_timeout = 2.0  # longest time to zero the force sensor [s]
+        self.record["busy_until"] = time.monotonic() + zero_timeout
         self._publish(self.servo.status)
-        with TimeLimit(ZEROING), self._lost_link():
+        with TimeLimit(zero_timeout), self._lost_link():
             if self.control.zeroFtSensor():
                 self.record["zeroed"] += 1
         self.record["busy_until"] = 0.0
@@ -296,12 +293,16 @@ class Worker:
         return True
 
     def _controller_stop(self) -> ArmStatus | None:
+        # recovery, safeguard, emergency stops, fault
+        stop_bits = 1 << 3 | 1 << 4 | 1 << 5 | 1 << 6 | 1 << 7 | 1 << 8 | 1 << 9
+        protective_bit = 1 << 2
+        playing = 2  # of runtime_state
         runtime, bits = int(self.record["runtime_state"]), int(self.record["safety_bits"])
-        if bits & STOP_BITS:
+        if bits & stop_bits:
             return ArmStatus.EMERGENCY_STOP
-        if bits & PROTECTIVE_BIT:
+        if bits & protective_bit:
             return ArmStatus.PROTECTIVE_STOP
-        return None if runtime == PLAYING else ArmStatus.PROGRAM_STOPPED
+        return None if runtime == playing else ArmStatus.PROGRAM_STOPPED
 
     def _read_partners(self, now: float) -> list[Any]:
         """The newest record of each other arm; None where it is missing, too old, or not healthy."""
@@ -359,7 +360,7 @@ class Worker:
 
     def _end_program(self) -> None:
         """Both calls block on the controller; the driver kills a worker that takes too long."""
-        with TimeLimit(ENDING), self._lost_link():
+        with TimeLimit(END_TIMEOUT), self._lost_link():
             if self.servo.motion is not None:
                 self.control.servoStop(10.0)
             self.control.stopScript()
@@ -370,6 +371,7 @@ class Worker:
 
 
 def main() -> NoReturn:
+    connect_timeout = 60.0  # longest time to connect; the driver waits less, but it may be gone [s]
     parent = Parent()  # the library prints
     allow_time_limits()
     config = WorkerConfig.of(parent.receive())
@@ -377,18 +379,18 @@ def main() -> NoReturn:
     try:
         worker = Worker(config)
         worker.record["realtime"] = realtime
-        with TimeLimit(CONNECTING):
+        with TimeLimit(connect_timeout):
             worker.connect()
     except (DeviceError, OSError) as failure:
         kind = type(failure) if isinstance(failure, DeviceError) else DeviceNotConnectedError
         with contextlib.suppress(BrokenPipeError):  # the driver has died
             parent.send({"error": str(failure), "kind": kind.__name__})
-        os._exit(FAILED)
+        os._exit(FAILED_STATUS)
     try:
         worker.run(parent)
     except BaseException:  # not to the interpreter's end, where the library's destructors wait
         traceback.print_exc()
-        os._exit(FAILED)
+        os._exit(FAILED_STATUS)
 
 
 if __name__ == "__main__":

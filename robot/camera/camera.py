@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from robot.camera.capture import Capture, open_capture, source_kind
 from robot.camera.picture import DamagedFrame, Picture, WrongSource
+from robot.camera.tuning import MIN_CHANGED_SHARE
 from robot.common import Closing
 from robot.common import stamp as strip
 from robot.errors import DeviceError, DeviceNotConnectedError, StaleObservationError
@@ -27,12 +28,6 @@ from tacsim.models.hardware import CameraSensorConfig
 
 BACK_OFF = (0.05, 0.8)  # first and longest wait before a source is opened again: back within a second [s]
 CLOSE_TIMEOUT = 5.0  # only a name server that does not answer takes longer than a read or a connection [s]
-MAX_STAMP_AGE = 60.0  # a stamp beyond it is of another machine's clock [s]
-FPS_WINDOW = 60  # frames over which the rate is measured
-# Of the values of a picture. What differs in fewer is the same picture, but for a clock in its corner or hot pixels. In
-# two films of a real gel at least 42 % differ from one frame to the next; a noise of 0.3 grey levels in a JPEG of
-# quality 50 still changes 2.8 %.
-SAME_BELOW = 0.01
 
 ClockSource = Literal["stamp", "device", "arrival"]
 
@@ -72,6 +67,7 @@ class Camera(Closing):
         Raises WrongSource (a DeviceError) when the source is not as configured, DeviceNotConnectedError when no frame
         came.
         """
+        window = 60  # frames over which the rate is measured
         played = source_kind(config, name) in ("folder", "video")
         self._may_repeat = config.repeats or played
         self._config, self._name = config, name
@@ -82,7 +78,7 @@ class Camera(Closing):
         self._frame: TactileFrame | None = None
         self._stamp: strip.Stamp | None = None  # of _frame
         self._clock: ClockSource | None = None
-        self._arrivals: deque[float] = deque(maxlen=FPS_WINDOW)
+        self._arrivals: deque[float] = deque(maxlen=window)
         self._received = self._dropped = self._damaged = self._repeated = self._openings = 0
         self._repeats = 0  # since the last new picture
         self._unread = 0  # damaged since the last whole frame
@@ -241,6 +237,7 @@ class Camera(Closing):
         return capture is None or capture.live
 
     def _accept(self, picture: Picture) -> None:
+        max_stamp_age = 60.0  # a stamp beyond it is of another machine's clock [s]
         image, mark = picture.image, None
         if self._config.stamped:
             image, mark = strip.split(image)
@@ -252,7 +249,7 @@ class Camera(Closing):
         clock: ClockSource
         if mark is not None:
             exposure, clock = mark.clock * 1e-6, "stamp"
-            if not 0.0 <= picture.arrival - exposure <= MAX_STAMP_AGE:
+            if not 0.0 <= picture.arrival - exposure <= max_stamp_age:
                 raise WrongSource(
                     f"sensor '{self._name}': a stamp {picture.arrival - exposure:.3g} s before arrival: the clock of "
                     "another machine. Stamped sources must run on this one"
@@ -281,7 +278,7 @@ class Camera(Closing):
         a new client with what it has."""
         if mark is not None and self._stamp is not None:
             return mark.clock <= self._stamp.clock
-        return not self._may_repeat and bool(np.count_nonzero(image != last.image) < SAME_BELOW * image.size)
+        return not self._may_repeat and bool(np.count_nonzero(image != last.image) < MIN_CHANGED_SHARE * image.size)
 
     def _count_repeat(self, age: float) -> None:
         with self._changed:

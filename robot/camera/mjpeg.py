@@ -24,8 +24,6 @@ from robot.camera.picture import (
 )
 from tacsim.models.hardware import CameraSensorConfig
 
-_MAX_LINE = 8192  # of the header of a part [bytes]
-_MAX_LINES = 64
 _CHUNK = 65536
 
 
@@ -83,6 +81,7 @@ class MjpegCapture:
 
     def _part(self) -> bytes:
         """The bytes of the next picture."""
+        max_lines = 64
         line = self._line()
         skipped = 0
         while not self._ends_part(line):  # the end of the line after a picture; junk before the first
@@ -91,7 +90,7 @@ class MjpegCapture:
                 raise WrongSource(f"{self._what}: no boundary within {skipped} bytes; is that an MJPEG camera?")
             line = self._line()
         length = None
-        for _ in range(_MAX_LINES):
+        for _ in range(max_lines):
             line = self._line()
             if not line:
                 break
@@ -99,9 +98,7 @@ class MjpegCapture:
             if key.strip().lower() == b"content-length" and value.strip().isdigit() and len(value) < 20:
                 length = int(value)
         else:
-            raise WrongSource(
-                f"{self._what}: a part with more than {_MAX_LINES} header lines; is that an MJPEG camera?"
-            )
+            raise WrongSource(f"{self._what}: a part with more than {max_lines} header lines; is that an MJPEG camera?")
         if length is None:
             return self._until_boundary()
         if length > self._limit:
@@ -132,12 +129,13 @@ class MjpegCapture:
         return found
 
     def _line(self) -> bytes:
+        max_line = 8192  # of the header of a part [bytes]
         start = 0
-        while (end := self._buffer.find(b"\n", start)) < 0 and len(self._buffer) <= _MAX_LINE:
+        while (end := self._buffer.find(b"\n", start)) < 0 and len(self._buffer) <= max_line:
             start = len(self._buffer)
             self._receive()
-        if not 0 <= end <= _MAX_LINE:
-            raise WrongSource(f"{self._what}: a line of more than {_MAX_LINE} bytes; is that an MJPEG camera?")
+        if not 0 <= end <= max_line:
+            raise WrongSource(f"{self._what}: a line of more than {max_line} bytes; is that an MJPEG camera?")
         return self._take(end + 1).rstrip(b"\r\n")
 
     def _receive(self) -> None:

@@ -13,7 +13,6 @@ from robot.errors import DeviceError
 from tacsim.models.hardware import CameraSensorConfig
 
 CONNECT_TIMEOUT = 1.0  # to connect and to read the header of the answer [s]
-PADDING = 16  # bytes that a camera may add before a marker: some do, and their pictures are whole
 READ_TIMEOUT = 0.5  # a live source without a complete frame for this time plus three periods is reopened [s]
 
 
@@ -46,6 +45,7 @@ def decode_jpeg(data: bytes, size: tuple[int, int], what: str) -> NDArray[np.uin
     have to guess: a JPEG that is cut, has a hole, or does not end where its picture does. Bytes that were altered into
     another valid picture pass: a JPEG has no check sum, so what sends it must not alter it.
     """
+    padding = 16  # bytes that a camera may add before a marker: some do, and their pictures are whole
     import simplejpeg  # strict about warnings, which Pillow and OpenCV keep to themselves
 
     try:
@@ -58,7 +58,7 @@ def decode_jpeg(data: bytes, size: tuple[int, int], what: str) -> NDArray[np.uin
             picture = simplejpeg.decode_jpeg(data, "RGB")
         except ValueError as warning:
             added = re.search(r"(\d+) extraneous bytes before marker", str(warning))
-            if added is None or int(added[1]) > PADDING:
+            if added is None or int(added[1]) > padding:
                 raise
             picture = simplejpeg.decode_jpeg(data, "RGB", strict=False)
     except ValueError as error:

@@ -23,8 +23,7 @@ if TYPE_CHECKING:
     from tacsim.models.hardware import Model  # pydantic and SciPy: half a second of start-up
 
 JOINT_RANGE = 2 * math.pi  # joints turn from -JOINT_RANGE to +JOINT_RANGE (all e-Series user manuals)
-TOLERANCE = 1e-10  # of the inverse [m, rad]
-LEAST_SINGULAR_VALUE = 0.02  # of the Jacobian, lengths in reaches; below it the arm may only move away
+MIN_SINGULAR_VALUE = 0.02  # of the Jacobian, lengths in reaches; below it the arm may only move away
 # Bound on the change of the least singular value for each radian that a joint turns: each of the six columns has a
 # length of at most sqrt(2) in these units, and turns with the joints before it.
 MAX_SINGULAR_VALUE_RATE = math.sqrt(12.0)
@@ -256,6 +255,7 @@ class Kinematics:
 
     def _newton(self, target: FloatArray, seed: FloatArray, tool: FloatArray | None) -> FloatArray | None:
         """Newton's method from the seed; None unless it converges at once and stays close."""
+        tolerance = 1e-10  # of the inverse [m, rad]
         q, begin = seed, seed.tolist()
         (tx, ty, tz, px), (ux, uy, uz, py), (vx, vy, vz, pz), _ = target.tolist()
         for _ in range(7):
@@ -271,7 +271,7 @@ class Kinematics:
                 0.5 * (ax * ux - bx * tx + ay * uy - by * ty + az * uz - bz * tz),
             )
             size = max(map(abs, error))
-            if size < TOLERANCE:
+            if size < tolerance:
                 # The sine is small for half a turn too; then the axes point against each other.
                 aligned = ax * tx + bx * ux + cx * vx > 0 and ay * ty + by * uy + cy * vy > 0
                 return q if aligned and max(map(abs, q.tolist())) <= JOINT_RANGE else None
@@ -300,8 +300,8 @@ class SingularityGuard:
             if MAX_SINGULAR_VALUE_RATE * float(np.abs(joints - joints_then).sum()) < margin_then:
                 return False
         distance = self._kinematics.singularity(joints)
-        self._last_check = joints, distance - LEAST_SINGULAR_VALUE
-        return distance < LEAST_SINGULAR_VALUE and distance < self._kinematics.singularity(sent)
+        self._last_check = joints, distance - MIN_SINGULAR_VALUE
+        return distance < MIN_SINGULAR_VALUE and distance < self._kinematics.singularity(sent)
 
 
 def _nearest_turns(q: FloatArray, seed: Sequence[float] | FloatArray) -> FloatArray:

@@ -23,7 +23,7 @@ from tacsim.record.step_info import MAX_DEPTH, MAX_FLOW, MAX_SLOPE, PACKAGES_LOS
 from tacsim.rig import Rig
 from tacsim.tasks import GoalOutOfReach, Task, evaluate_outcome
 
-PARTICLES = 5_000  # of a body go into a recorded step, at most
+MAX_PARTICLES = 5_000  # of a body go into a recorded step, at most
 PACKAGES = ("tacsim", "numpy", "taichi", "opencv-contrib-python-headless", "gymnasium")
 
 
@@ -275,5 +275,5 @@ class _Log:
 
 
 def _thinned(points: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(m, 3) every so many of points (n, 3), PARTICLES at most."""
-    return points[:: -(-len(points) // PARTICLES) or 1].copy()
+    """(m, 3) every so many of points (n, 3), MAX_PARTICLES at most."""
+    return points[:: -(-len(points) // MAX_PARTICLES) or 1].copy()

@@ -29,8 +29,7 @@ from tacsim.tasks.task import Axis, action_of_vector
 if TYPE_CHECKING:
     from onnxruntime import InferenceSession
 
-MOST_BYTES = 64 * 2**20  # of a file; ours have less than 2 MB
-ASTRAY = 2.0  # steps between where an arm was asked to go and where it is, from which on it is asked anew from there
+MAX_BYTES = 64 * 2**20  # of a file; ours have less than 2 MB
 
 
 Goal = float | tuple[float, ...] | None  # of a task [m]
@@ -85,12 +84,14 @@ class OnnxPolicy:
 
     def __call__(self, observation: Observation) -> Action:
         """Raises PolicyFailed when the graph fails, or gives what is no action."""
+        # steps between where an arm was asked to go and where it is, from which on it is asked anew from there
+        max_deviation = 2.0
         first = not self._targets
         seen = self._encoder.begin(observation, self._goal) if first else self._encoder(observation)
         self.watch(seen)
         for axis in self._axes:
             now = observation.arms[axis.arm].pose
-            if first or se3.pose_distance(self._targets[axis.arm], now)[0] > ASTRAY * self.spec.max_step:
+            if first or se3.pose_distance(self._targets[axis.arm], now)[0] > max_deviation * self.spec.max_step:
                 self._targets[axis.arm] = now
         action = action_of_vector(self._infer(seen), self._axes, self.spec.max_step, self._targets)
         self._targets = {arm: pose for arm, pose in action.tool.items() if pose is not None}
@@ -155,8 +156,8 @@ def _session(path: Path) -> InferenceSession:
         ) from None
     try:
         size = path.stat().st_size
-        if size > MOST_BYTES:
-            raise PolicyNotFound(f"policy '{path}' has {size / 2**20:,.0f} MiB, at most {MOST_BYTES >> 20} are read")
+        if size > MAX_BYTES:
+            raise PolicyNotFound(f"policy '{path}' has {size / 2**20:,.0f} MiB, at most {MAX_BYTES >> 20} are read")
         data = path.read_bytes()
     except OSError as failure:
         raise PolicyNotFound(f"policy '{path}' cannot be read: {failure.strerror or failure}") from None

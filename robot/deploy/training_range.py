@@ -15,15 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from robot.deploy.tuning import MAX_FALSE_ALARMS, MIN_DEVIATION, MIN_VARIANCE, ROUNDING
 from tacsim.interface import FloatArray
 from tacsim.models.policy import PolicySpec, TrainingRange
 from tacsim.models.scene import Scene
 
-MAX_PAIRED = 12  # numbers of which the products count, too
-FALSE_ALARMS = 0.03  # share of training's episodes that may be beyond the limit
-LEAST_DEVIATION = 0.01  # of a number in training: one that varies less counts as if it varied so much [encoded]
-LEAST_VARIANCE = 0.01  # of a direction, beside 1 of a number: smaller ones are noise
-SLACK = 1e-6  # of a scene's number: what rounding leaves [share]
 PHYSICAL = ("gel", "gels", "body", "friction", "gravity")  # parts of a scene that a policy feels
 NOT_FELT = ("density", "seed")  # numbers in them that quasi-static motions do not depend on
 Seen = Mapping[str, NDArray[Any]]
@@ -60,8 +56,9 @@ def names_of(spec: PolicySpec, goals: int) -> list[str]:
 
 def lifted(numbers: FloatArray) -> FloatArray:
     """(..., m) numbers (..., n), and after them, of up to MAX_PAIRED, the products of each pair."""
+    max_paired = 12  # numbers of which the products count, too
     count = numbers.shape[-1]
-    if count > MAX_PAIRED:
+    if count > max_paired:
         return numbers
     first, second = np.triu_indices(count)
     return np.concatenate([numbers, numbers[..., first] * numbers[..., second]], axis=-1)
@@ -78,13 +75,13 @@ def measured(episodes: Sequence[FloatArray], scenes: Sequence[Scene]) -> Trainin
     whole = np.concatenate(list(episodes))
     fitted = lifted(np.concatenate(list(episodes[::2])))
     centre, own = fitted.mean(axis=0), fitted.std(axis=0)
-    deviation = np.maximum(own, LEAST_DEVIATION)
+    deviation = np.maximum(own, MIN_DEVIATION)
     covariance = np.atleast_2d(np.cov((fitted - centre) / deviation, rowvar=False))
     variance, directions = np.linalg.eigh(covariance + np.diag(1.0 - (own / deviation) ** 2))
-    scale = np.sqrt(np.maximum(variance, LEAST_VARIANCE) * len(variance))
+    scale = np.sqrt(np.maximum(variance, MIN_VARIANCE) * len(variance))
     axes = (directions / scale) @ directions.T / deviation  # symmetric, so that no choice among equal directions shows
     largest = np.sort([distances(each, centre, axes).max() for each in episodes[1::2]])
-    at = min(int(np.ceil((len(largest) + 1) * (1 - FALSE_ALARMS))), len(largest)) - 1
+    at = min(int(np.ceil((len(largest) + 1) * (1 - MAX_FALSE_ALARMS))), len(largest)) - 1
     numbers, words = ranges_of(scenes)
     return TrainingRange(
         episodes=len(episodes),
@@ -155,7 +152,7 @@ class RangeWatch:
         """What is outside, for a person; the number of the farthest observation that leaves its own range most."""
         text = f"it observes what it did not observe in training (distance {self.largest:.1f} times the limit)"
         assert self.known is not None and self._worst is not None
-        width = np.maximum(self._high - self._low, LEAST_DEVIATION)
+        width = np.maximum(self._high - self._low, MIN_DEVIATION)
         beyond = np.maximum(self._low - self._worst, self._worst - self._high) / width
         at = int(np.argmax(beyond))
         if beyond[at] <= 0.0 or at >= len(self._names):
@@ -215,7 +212,7 @@ def outside_of_scenes(known: TrainingRange, scenes: Sequence[Scene]) -> list[str
         trained = known.scene.get(key)
         if trained is None:
             found.append(f"{key} is {_interval(low, high)}, in training it was not given")
-        elif low < trained[0] - SLACK * abs(trained[0]) or high > trained[1] + SLACK * abs(trained[1]):
+        elif low < trained[0] - ROUNDING * abs(trained[0]) or high > trained[1] + ROUNDING * abs(trained[1]):
             found.append(f"{key} is {_interval(low, high)}, in training {_interval(*trained)}")
     for key, given in words.items():
         new = sorted(set(given) - set(known.words.get(key, ())))
@@ -226,4 +223,4 @@ def outside_of_scenes(known: TrainingRange, scenes: Sequence[Scene]) -> list[str
 
 
 def _interval(low: float, high: float) -> str:
-    return f"{low:g}" if high - low <= SLACK * abs(high) else f"{low:g} to {high:g}"
+    return f"{low:g}" if high - low <= ROUNDING * abs(high) else f"{low:g} to {high:g}"

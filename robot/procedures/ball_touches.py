@@ -29,6 +29,7 @@ from robot.procedures.session import (
     hardware_arm,
     move_to,
 )
+from robot.procedures.tuning import MAX_LEFT_OUT, MAX_RELEASED_DEPTH
 from tacsim import pose as se3
 from tacsim.control.contact_signal import NoTouch, approach
 from tacsim.interface import FloatArray, Pose, TactileObservation
@@ -36,12 +37,6 @@ from tacsim.limits import ActionError
 from tacsim.models.rig import RigConfig
 from tacsim.rig import Rig
 
-SLOW_BEFORE = 1e-3  # the approach begins so far before the ball, once its place is known [m]
-BEYOND = 3e-3  # and ends so far beyond where the ball should be [m]
-MOST_LEFT_OUT = 0.5  # of the touches; with more, something is wrong with the set-up
-FRESH = 0.02  # a picture of the approach is exposed at least so long after the last step [s]
-STEP_TIMEOUT = 5.0  # of one step of the approach [s]
-STILL_TOUCHED = 0.5  # of the depth of a touch; what is lifted and pressed so deep yet is not free
 FAILURES = (NoTouch, BadMeasurements, ActionError, OutsideLimits)  # what spoils one touch, and no more
 
 
@@ -92,6 +87,8 @@ def record_ball_touches(
     Raises NoTouch when the first approach meets nothing, DeviceError when most of the others fail, and what the reset,
     the arm or the camera raise; the arm is stopped then.
     """
+    overshoot = 3e-3  # and ends so far beyond where the ball should be [m]
+    slow_distance = 1e-3  # the approach begins so far before the ball, once its place is known [m]
     sensor_from_tool = se3.inverse(hardware_arm(config, arm).tool_from_sensor.pose)
     rig.reset()
     prober = _BallProber(rig, config, arm, sensor, plan)
@@ -110,16 +107,16 @@ def record_ball_touches(
                     touching = Pose(np.mean(centres, axis=0) - centre, tilted.quaternion)
                     lifted, begin = (
                         se3.translated_along_z(touching, -plan.lift),
-                        se3.translated_along_z(touching, -SLOW_BEFORE),
+                        se3.translated_along_z(touching, -slow_distance),
                     )
-                    travel = SLOW_BEFORE + BEYOND
+                    travel = slow_distance + overshoot
                 try:
                     contact, depth, pose = prober.touch(lifted, begin, travel)
                 except FAILURES as failure:
                     if not centres:
                         raise
                     session.left_out.append(f"touch {done + 1}: {failure}")
-                    if len(session.left_out) > MOST_LEFT_OUT * plan.touches:
+                    if len(session.left_out) > MAX_LEFT_OUT * plan.touches:
                         raise DeviceError("most touches failed; the last:\n" + session.left_out[-1]) from failure
                     continue
                 centres.append(se3.transform(pose, np.array([*contact, plan.ball_radius - depth])))
@@ -142,7 +139,7 @@ class _BallProber:
         move_to(self._arm, self._name, lifted)
         try:
             left = self._depth(self._observe(SETTLE))
-            if left > STILL_TOUCHED * self._plan.depth:
+            if left > MAX_RELEASED_DEPTH * self._plan.depth:
                 raise BadMeasurements(
                     f"lifted off the ball, the gel is still pressed by {1e3 * left:.2f} mm, so its picture is no "
                     "reference: does something stick to it, did the light change, is the camera late?"
@@ -160,12 +157,15 @@ class _BallProber:
         """From `begin`, where the arm stands, along the sensor's axis until the gel is pressed deep enough: the touch.
         Raises NoTouch, BadMeasurements."""
 
+        step_timeout = 5.0  # of one step of the approach [s]
+        min_picture_delay = 0.02  # a picture of the approach is exposed at least so long after the last step [s]
+
         def touches() -> bool:
-            return self._depth(self._observe(FRESH)) >= self._plan.depth
+            return self._depth(self._observe(min_picture_delay)) >= self._plan.depth
 
         def advance(distance: float) -> None:
             due = time.monotonic() + self._plan.step / self._speed
-            move_to(self._arm, self._name, se3.translated_along_z(begin, distance), STEP_TIMEOUT)
+            move_to(self._arm, self._name, se3.translated_along_z(begin, distance), step_timeout)
             time.sleep(max(0.0, due - time.monotonic()))
 
         advice = (

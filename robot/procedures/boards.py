@@ -45,11 +45,6 @@ from tacsim.limits import ActionError
 from tacsim.models.hardware import CameraSensorConfig
 from tacsim.models.rig import RigConfig
 
-LARGEST_RESIDUAL = 2.0  # of a board's pose, root mean square [px]
-STILL = 0.003  # of the picture's longer side: a board whose points move less stands still
-HOLD = 0.4  # for so long [s]
-DISTINCT = 0.04  # of the same: two views are the same if their points differ by less, root mean square
-REMIND = 4.0  # between two words on why nothing is taken [s]
 PROMPTS = (
     "facing the camera, so that it fills the picture",
     "its left side nearer to the camera, by 30 degrees",
@@ -158,9 +153,10 @@ def record_board_poses(arm: URArm, camera: FrameSource, plan: BoardPosePlan, ses
 
 def _find_board(camera: FrameSource, plan: BoardPosePlan) -> Pose:
     """camera_from_board in a picture exposed after the arm came to rest. Raises BadBoard, BadView."""
+    max_residual = 2.0  # of a board's pose, root mean square [px]
     pose, residual = board_pose(plan.lens, find_board(frame_after(camera, SETTLE).image, plan.board))
-    if residual > LARGEST_RESIDUAL:
-        raise BadView(f"the board does not fit what is seen: {residual:.1f} px, {LARGEST_RESIDUAL:g} at most")
+    if residual > max_residual:
+        raise BadView(f"the board does not fit what is seen: {residual:.1f} px, {max_residual:g} at most")
     return pose
 
 
@@ -198,6 +194,10 @@ def _next_view(
 ) -> tuple[Image, Points]:
     """A picture of a board that stands still, seen otherwise than in the earlier views; the person is told now and then
     why there is none. Raises Stopped, CannotCalibrate."""
+    reminder_time = 4.0  # between two words on why nothing is taken [s]
+    min_difference = 0.04  # of the same: two views are the same if their points differ by less, root mean square
+    hold_time = 0.4  # for so long [s]
+    max_motion = 0.003  # of the picture's longer side: a board whose points move less stands still
     frame = next(frames)
     begun = reminded = since = frame.time
     anchor: Points | None = None  # where the board has stood since
@@ -208,16 +208,16 @@ def _next_view(
             why, anchor = str(missing), None
         else:
             side = max(frame.image.shape[:2])
-            if anchor is None or _point_distance(anchor, points) > STILL * side:
+            if anchor is None or _point_distance(anchor, points) > max_motion * side:
                 anchor, since = points, frame.time
-            alike = (k for k, other in enumerate(earlier, 1) if _point_distance(other, points) < DISTINCT * side)
+            alike = (k for k, other in enumerate(earlier, 1) if _point_distance(other, points) < min_difference * side)
             same = next(alike, None)
-            if same is None and frame.time - since >= HOLD:
+            if same is None and frame.time - since >= hold_time:
                 return frame.image, points
             why = "the board moves; hold it still"
             if same is not None:
                 why = f"the board is seen as in view {same}; tilt it, or hold it elsewhere"
-        if frame.time - reminded >= REMIND:
+        if frame.time - reminded >= reminder_time:
             session.left_out.append(why)
             session.say(f"Skipped: {why}.")
             reminded = frame.time

@@ -19,14 +19,9 @@ from calibration.markers.dots import DotEraser
 from calibration.markers.flow import find_markers
 from calibration.markers.lattice import NoLattice
 from robot.procedures.session import CannotCalibrate, FrameSource, Session
+from robot.procedures.tuning import HOLD_TIME, MIN_CONTACT_CHANGE, MIN_MOTION
 from tacsim.interface import Float32, Image, TactileFrame
 
-CELL = 8  # colour is averaged over so many pixels each way: noise and JPEG go, contacts stay
-MOTION = 4.0  # a cell that changes by more is in motion [grey levels]
-CONTACT = 8.0  # a cell that differs from the reference by more than the usual is touched [grey levels]
-HOLD = 0.5  # a picture that has not moved for so long stands still [s]
-REST = 1.5  # the same for the one without contact, which everything is measured against [s]
-RESTLESS = 5.0  # a press that does not come to rest for so long is worth a word [s]
 REFERENCE = "background.png"
 NOISE_FRAMES = 8  # pictures without contact that tell the camera's noise
 
@@ -108,6 +103,7 @@ class _ContactMonitor:
 
     def wait_for_rest(self) -> tuple[Image, ...]:
         """The last pictures, NOISE_FRAMES at most, of a time of REST in which none has moved."""
+        rest_time = 1.5  # the same for the one without contact, which everything is measured against [s]
         begun = None
         shown: deque[Image] = deque(maxlen=NOISE_FRAMES)
         while True:
@@ -116,24 +112,25 @@ class _ContactMonitor:
             if still == 0.0:
                 shown.clear()
             shown.append(frame.image)
-            if still >= REST:
+            if still >= rest_time:
                 return tuple(shown)
             self._give_up(frame.time - begun, "the picture does not come to rest; is something moving before the gel?")
 
     def wait_for_press(self) -> Image:
-        """A picture of a contact that has not moved for HOLD; the person is told now and then while it moves."""
+        """A picture of a contact that has not moved for HOLD_TIME; the person is told now and then while it moves."""
+        reminder_time = 5.0  # a press that does not come to rest for so long is worth a word [s]
         begun = moving = None
         while True:
             frame, still, touched = self._next()
             begun = frame.time if begun is None else begun
-            if touched and still >= HOLD:
+            if touched and still >= HOLD_TIME:
                 return frame.image
             if not touched:
                 moving = None
                 self._give_up(frame.time - begun, "nothing touched the gel (or too lightly to be seen)")
                 continue
             moving = frame.time if moving is None else moving
-            if frame.time - moving > RESTLESS:
+            if frame.time - moving > reminder_time:
                 self._say("Still moving: hold the ball still.")
                 moving = frame.time
             self._give_up(frame.time - begun, "the press did not come to rest")
@@ -144,7 +141,7 @@ class _ContactMonitor:
         while True:
             frame, still, touched = self._next()
             begun = frame.time if begun is None else begun
-            if not touched and still >= HOLD:
+            if not touched and still >= HOLD_TIME:
                 return
             self._give_up(
                 frame.time - begun,
@@ -157,13 +154,13 @@ class _ContactMonitor:
         frame = next(self._frames)
         cells = _cell_means(frame.image)
         # against the first of the still ones, not the last: a slow creep is motion too
-        if self._anchor is None or float(np.abs(cells - self._anchor).max()) > MOTION:
+        if self._anchor is None or float(np.abs(cells - self._anchor).max()) > MIN_MOTION:
             self._anchor, self._since = cells, frame.time
         touched = False
         if self._reference is not None:
             change = cells - self._reference
             change -= np.median(change, axis=(0, 1))  # a lamp that warms up touches nothing
-            touched = float(np.abs(change).max()) > CONTACT
+            touched = float(np.abs(change).max()) > MIN_CONTACT_CHANGE
         return frame, frame.time - self._since, touched
 
     def _give_up(self, waited: float, why: str) -> None:
@@ -173,7 +170,8 @@ class _ContactMonitor:
 
 def _cell_means(image: Image) -> Float32:
     """Means over CELL x CELL pixels, (h, w, 3)."""
+    cell_side = 8  # colour is averaged over so many pixels each way: noise and JPEG go, contacts stay
     import cv2
 
-    size = (max(1, image.shape[1] // CELL), max(1, image.shape[0] // CELL))
+    size = (max(1, image.shape[1] // cell_side), max(1, image.shape[0] // cell_side))
     return np.asarray(cv2.resize(image.astype(np.float32), size, interpolation=cv2.INTER_AREA), dtype=np.float32)

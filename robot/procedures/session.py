@@ -27,10 +27,6 @@ Part = TypeVar("Part")
 POLL = 2e-3  # between two looks at an arm or a camera [s]
 PICTURE_TIMEOUT = 15.0  # longest wait for one [s]
 SETTLE = 0.2  # a picture that counts is exposed so long after the arm came to rest [s]
-TRAVEL_TIMEOUT = 60.0  # of a motion between two measurements [s]
-AT_TARGET, AT_ROTATION = 20e-6, 2e-4  # as near to a target counts as there [m, rad]
-STANDSTILL = 1e-3  # slower than this is standing still [m/s]
-SHORTENED = 1e-6  # a target that the limits moved by more is not the one of the plan [m, rad]
 GOLDEN_RATIO = 0.618034  # multiples of it, modulo 1, are spread evenly
 GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))  # multiples of it never repeat
 
@@ -123,20 +119,23 @@ def _part(config: RigConfig, parts: Mapping[str, object], name: str, kind: type[
     return found[name]
 
 
-def move_to(arm: Arm | URArm, name: str, target: Pose, timeout: float = TRAVEL_TIMEOUT) -> None:
+def move_to(arm: Arm | URArm, name: str, target: Pose, timeout: float = 60.0) -> None:
     """Moves an arm to a pose of its sensor and waits for standstill. Raises OutsideLimits, ActionError for what is out
     of reach, DeviceError after `timeout` [s] and for what stops an arm."""
+    max_shift = 1e-6  # a target that the limits moved by more is not the one of the plan [m, rad]
+    max_speed = 1e-3  # slower than this is standing still [m/s]
+    max_distance, max_angle = 20e-6, 2e-4  # as near to a target counts as there [m, rad]
     if isinstance(arm, CommandedArm):
         arm.suspend_tactile_guard()  # nothing is observed on the way
     deadline = time.monotonic() + timeout
     while True:
         sent = arm.command(target)
-        if sent is not None and max(se3.pose_distance(sent, target)) > SHORTENED:
+        if sent is not None and max(se3.pose_distance(sent, target)) > max_shift:
             arm.stop()
             raise OutsideLimits("the path leads out of the arm's limits (workspace, planes or keep_out)")
         state = arm.state()
         metres, radians = se3.pose_distance(state.pose, target)
-        if metres < AT_TARGET and radians < AT_ROTATION and np.linalg.norm(state.twist[:3]) < STANDSTILL:
+        if metres < max_distance and radians < max_angle and np.linalg.norm(state.twist[:3]) < max_speed:
             return
         if time.monotonic() > deadline:
             raise DeviceError(f"arm '{name}' did not come to its target within {timeout:g} s")

@@ -25,7 +25,6 @@ from tacsim.rig import Rig
 PAUSE = 0.8  # without contact, before the first tap and after the last [s]
 CONTACT_TIME = (0.1, 0.4)  # how long it stays below, once there, from shortest to longest [s]
 LIFTED_TIME = (0.2, 0.9)  # and above [s]
-STRIDE = 2  # of the pictures each n-th row and column counts
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,6 +84,7 @@ def record_taps(
 
     A stop ends it early. Raises what the reset, the arm or the camera raise; the arm is stopped then.
     """
+    stride = 2  # of the pictures each n-th row and column counts
     limits = hardware_arm(config, arm).limits
     rig.reset()
     mover, camera = rig.arms[arm], rig.sensors[sensor]
@@ -94,7 +94,7 @@ def record_taps(
     axis = se3.rotation(start).apply([0.0, 0.0, 1.0])
     above, below = se3.translated_along_z(start, -plan.lift), se3.translated_along_z(start, plan.depth)
     travel = (plan.lift + plan.depth) / limits.speed + 2.0 * limits.speed / limits.acceleration
-    reference = rig.references[sensor].image[::STRIDE, ::STRIDE].astype(np.int16)
+    reference = rig.references[sensor].image[::stride, ::stride].astype(np.int16)
     record = TapRecord()
     try:
         _hold(mover, above, travel + PAUSE)
@@ -113,7 +113,7 @@ def record_taps(
             frame = camera.read(1.0)
             if not record.frame_times or frame.time > record.frame_times[-1]:
                 record.frame_times.append(frame.time)
-                record.change.append(float(np.abs(frame.image[::STRIDE, ::STRIDE] - reference).mean()) / 255.0)
+                record.change.append(float(np.abs(frame.image[::stride, ::stride] - reference).mean()) / 255.0)
             time.sleep(POLL)
         _hold(mover, above, travel)
     finally:

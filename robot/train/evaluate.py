@@ -30,7 +30,6 @@ from tacsim.models.training import Training
 
 TEACHER, RANDOM = "teacher", "random"  # beside what load_policy knows
 UNSEEN = 1_000_000  # added to the seeds of training: other bodies, other episodes
-RESAMPLED = 10_000
 Tell = Callable[[str, int, int], None]
 Act = Callable[[TacsimEnv], NDArray[np.float32]]
 
@@ -199,6 +198,7 @@ def wilson(count: int, total: int) -> Interval:
 
 def bootstrap(values: NDArray[np.float64]) -> Interval:
     """The mean of (n,) values."""
-    chosen = np.random.default_rng(0).integers(len(values), size=(RESAMPLED, len(values)))
+    draws = 10_000
+    chosen = np.random.default_rng(0).integers(len(values), size=(draws, len(values)))
     low, high = np.quantile(values[chosen].mean(axis=1), [0.025, 0.975])
     return Interval(float(values.mean()), float(low), float(high))

@@ -21,7 +21,6 @@ from tacsim.models.sensor import CanonicalGrid
 from tacsim.models.training import Training
 from tacsim.tasks import make_task
 
-EPISODES_EACH = 4  # that each environment of a training plays, where nobody says how many
 Tell = Callable[[str, int, int], None]
 
 
@@ -37,6 +36,7 @@ def measure_range(
     Raises PolicyNotFound, IncompatibleRig, ValueError for a file that does not say how it was trained, and as
     `make_vector_env`.
     """
+    episodes_each = 4  # that each environment of a training plays, where nobody says how many
     if training is None:
         training = _training_of(path)
     config = load_with_task(training.rig, training.task, training.overrides).config
@@ -51,7 +51,7 @@ def measure_range(
         features=policies[0].spec.features,
         learning=False,  # a training file says its preset and its motion
     )
-    rounds = -(-max(2, episodes or EPISODES_EACH * envs.num_envs) // envs.num_envs)
+    rounds = -(-max(2, episodes or episodes_each * envs.num_envs) // envs.num_envs)
     seen: list[FloatArray] = []
     try:
         first = envs.members[0]

@@ -21,9 +21,7 @@ PICTURES = ("maps", "flow")  # channels first; the other features are plain numb
 OF_PICTURES = 64  # numbers that a picture is brought to
 
 Shapes = Mapping[str, tuple[int, ...]]
-OPSET = 17
 MOST_BYTES = 2 * 2**20
-PARITY = 1e-5  # between torch and ONNX
 EXAMPLES = 64
 
 
@@ -109,6 +107,8 @@ class ExportError(RuntimeError):
 def export(network: PolicyNetwork, spec: PolicySpec, shapes: Shapes, path: Path) -> float:
     """Writes the file, and returns the greatest difference of its actions from the network's, for random features.
     Raises ExportError when that is more than PARITY, or the file has more than MOST_BYTES."""
+    max_difference = 1e-5  # between torch and ONNX
+    opset = 17
     network.eval()
     random = torch.Generator().manual_seed(0)
     examples = [torch.randn((EXAMPLES, *shapes[key]), generator=random) for key in network.keys]
@@ -123,7 +123,7 @@ def export(network: PolicyNetwork, spec: PolicySpec, shapes: Shapes, path: Path)
             buffer,
             input_names=list(network.keys),
             output_names=["action"],
-            opset_version=OPSET,
+            opset_version=opset,
             dynamo=False,
         )
     model = onnx.load_model_from_string(buffer.getvalue())
@@ -132,8 +132,8 @@ def export(network: PolicyNetwork, spec: PolicySpec, shapes: Shapes, path: Path)
     if len(data) > MOST_BYTES:
         raise ExportError(f"the policy has {len(data) / 2**20:.1f} MiB, at most {MOST_BYTES >> 20} are written")
     worst = _difference(network, data, examples)
-    if not worst <= PARITY:
-        raise ExportError(f"the file's actions differ by {worst:.2g} from the network's, allowed: {PARITY:g}")
+    if not worst <= max_difference:
+        raise ExportError(f"the file's actions differ by {worst:.2g} from the network's, allowed: {max_difference:g}")
     write_whole(path, data)
     return worst
 

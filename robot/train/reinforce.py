@@ -22,8 +22,6 @@ from robot.train.run_folder import Tell
 from tacsim.gym.vector import TacsimVectorEnv
 from tacsim.models.training import Training
 
-WARM_UP = 1000  # control steps of random actions before SAC learns
-KEPT = 50_000  # control steps that SAC remembers
 Arrays = dict[str, NDArray[Any]]
 
 
@@ -31,6 +29,8 @@ class Reinforce:
     """PPO or SAC in `envs`; `actor` is what of it becomes a policy file. What SAC remembers is kept in `folder`."""
 
     def __init__(self, envs: TacsimVectorEnv, training: Training, actor: PolicyNetwork, folder: Path) -> None:
+        replay_steps = 50_000  # control steps that SAC remembers
+        warm_up_steps = 1000  # control steps of random actions before SAC learns
         settings = training.reinforce
         self.rounds, self.actor = settings.rounds, actor
         self._seed, self._folder = training.seed, folder
@@ -52,7 +52,7 @@ class Reinforce:
             self._model: Any = PPO("MultiInputPolicy", self._envs, n_steps=self._steps, **common)
         else:
             self._model = SAC(
-                "MultiInputPolicy", self._envs, learning_starts=WARM_UP, buffer_size=KEPT, train_freq=1,
+                "MultiInputPolicy", self._envs, learning_starts=warm_up_steps, buffer_size=replay_steps, train_freq=1,
                 gradient_steps=envs.num_envs // 2 or 1, **common,
             )  # fmt: skip
 

@@ -37,7 +37,6 @@ SIDES: tuple[Side, ...] = ("simulation", "twin")
 RIGS = {"simulation": "sim", "twin": "mock"}
 SEEN = ("task.", "scene.body.geometry")  # of a twin, by a person
 ROWS = "episodes.jsonl"
-ROOM = 77  # second number of the addresses of mocks in processes of their own
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,10 +125,11 @@ def _side_by_side(study: Study, parts: Parts, workers: int) -> Iterator[Played]:
 
 def _apart(study: Study, side: Side, twin: int, left: Sequence[tuple[str, int]]) -> list[Played]:
     """In a process of its own, whose mocks have addresses of their own."""
+    address = 77  # second number of the addresses of mocks in processes of their own
     words: list[str] = []
     if side == "twin":
         for number, name in enumerate(load_rig(RIGS[side]).config.arms, start=1):
-            host = loopback_host(number, ROOM)
+            host = loopback_host(number, address)
             words += [f"arms.{name}.host={host}", f"sensors.{name}.source=http://{host}:8081/?action=stream"]
     return list(_on_twin(replace(study, overrides=(*study.overrides, *words)), side, twin, left))
 

@@ -11,10 +11,7 @@ from tacsim.geometry.tiles import tiled_distance
 from tacsim.interface import FloatArray, Mask
 from tacsim.models.scene import Body, Mesh, Shape
 
-ITERATIONS = 20  # of mutual repulsion
-REACH = 1.1  # particles nearer than this push each other apart [spacings]; evenly spread ones are ~1.1 apart
-STEP = 0.25  # share of the missing distance by which each of two moves
-MIN_DEPTH = 0.05  # no particle nearer to the surface than this [spacings]
+PUSH_STEP = 0.25  # share of the missing distance by which each of two moves
 
 
 def body_points(body: Body, spacing: float) -> FloatArray:
@@ -33,6 +30,10 @@ def scattered(geometry: Shape, spacing: float, seed: int) -> FloatArray:
     particles closer than 1.1 spacings, and from their mirror images behind the surface, evens them out (as in de Goes
     et al. 2012, Blue noise through optimal transport, but by pair forces) and leaves no direction preferred.
     """
+    min_depth = 0.05  # no particle nearer to the surface than this [spacings]
+    # particles nearer than this push each other apart [spacings]; evenly spread ones are ~1.1 apart
+    push_distance = 1.1
+    iterations = 20  # of mutual repulsion
     random = np.random.default_rng(seed)
     size = extent(geometry)
     layers = np.maximum(np.rint(size / spacing).astype(int), 1)
@@ -40,13 +41,13 @@ def scattered(geometry: Shape, spacing: float, seed: int) -> FloatArray:
     points = ((cells + random.random(cells.shape)) / layers - 0.5) * size
     surface = _surface(geometry, spacing)
     points = points[surface(points)[0] < 0]
-    for _ in range(ITERATIONS):
+    for _ in range(iterations):
         depth, normals = surface(points)
         depth = -depth
-        points = points + _repulsion(points, REACH * spacing)
-        points -= (STEP * np.maximum(REACH * spacing - 2 * depth, 0.0))[:, None] * normals
+        points = points + _repulsion(points, push_distance * spacing)
+        points -= (PUSH_STEP * np.maximum(push_distance * spacing - 2 * depth, 0.0))[:, None] * normals
         depth, normals = surface(points)
-        points -= np.maximum(depth + MIN_DEPTH * spacing, 0.0)[:, None] * normals
+        points -= np.maximum(depth + min_depth * spacing, 0.0)[:, None] * normals
     inside: Mask = distance(geometry, points) < 0  # at sharp edges of a mesh its grid is not exact
     if not inside.any():
         raise no_particle(geometry, spacing)
@@ -70,7 +71,7 @@ def _repulsion(points: FloatArray, reach: float) -> FloatArray:
     pairs = KDTree(points).query_pairs(reach, output_type="ndarray")
     apart = points[pairs[:, 0]] - points[pairs[:, 1]]
     length = np.linalg.norm(apart, axis=1)
-    push = (STEP * (reach - length) / np.maximum(length, 1e-12 * reach))[:, None] * apart
+    push = (PUSH_STEP * (reach - length) / np.maximum(length, 1e-12 * reach))[:, None] * apart
     step = [
         np.bincount(pairs[:, 0], push[:, axis], len(points)) - np.bincount(pairs[:, 1], push[:, axis], len(points))
         for axis in range(3)

@@ -35,7 +35,6 @@ FEWEST_LAYERS = 3  # of particles: one has no height, and two cannot bulge
 MAX_MISFIT = 0.1  # relative error of the size or the volume that the lattice of particles may have
 LEVEL = 1e-5  # sine of an angle below which a direction is level with a face; float32 rotations are 1e-7 off
 SHARP = math.radians(30.0)  # facets of what is drawn round meet at less
-SLIVER = 10e-6  # [m] shorter edges of a file are what its float32 numbers made of a point
 BAND = 2  # grid spacings round a mesh in which the distance is exact
 
 
@@ -292,10 +291,11 @@ def _mesh_extent(geometry: Mesh, content: str) -> tuple[float, ...]:
 @lru_cache(maxsize=64)
 def _sharp(geometry: Mesh, content: str) -> FloatArray:
     """Ends (n, 2, 3) [m] of the edges that stick out where two faces of a mesh meet at more than SHARP."""
+    max_sliver = 10e-6  # [m] shorter edges of a file are what its float32 numbers made of a point
     mesh = centred(geometry, content)
     sharp = mesh.face_adjacency_convex & (mesh.face_adjacency_angles > SHARP)
     ends = np.asarray(mesh.vertices[mesh.face_adjacency_edges[sharp]], np.float64)
-    return np.asarray(ends[np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) > SLIVER])
+    return np.asarray(ends[np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) > max_sliver])
 
 
 def _name(geometry: Shape) -> str:

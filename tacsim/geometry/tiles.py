@@ -27,8 +27,6 @@ TILE = 32  # nodes along an edge
 SURFACES = 64  # meshes remembered in one process, the latest used; most have 1 to 4 MB
 KEPT = 2_000  # tiles in one process, of all meshes, those used last: 260 MB; one grid has 610 at most
 SHARED = 4_000  # tiles in a folder that processes share: 520 MB
-PIECE = 4  # grid spacings: edge of the pieces that the surface is cut into for the search
-PIECES = (4_000, 100_000)  # at least, about at most
 
 # By file, content, spacing and number, so that a tile keeps no mesh in memory; the oldest first. Worlds of several
 # threads come here one after the other (`tacsim.compute.runtime.launching`).
@@ -61,6 +59,8 @@ class TiledDistance:
 
     def __init__(self, geometry: Mesh, content: str, spacing: float) -> None:
         """content: fingerprint of the file. Raises what :func:`tacsim.geometry.mesh.load_mesh` raises."""
+        piece_counts = (4_000, 100_000)  # at least, about at most
+        piece = 4  # grid spacings: edge of the pieces that the surface is cut into for the search
         mesh = centred(geometry, content)
         self.name = geometry.path
         self.spacing = spacing
@@ -68,8 +68,8 @@ class TiledDistance:
         self._faces = np.asarray(mesh.faces, np.int64)  # (m, 3)
         self.half: FloatArray = np.asarray(mesh.extents, np.float64) / 2  # of the bounding box (3,)
         self.origin: FloatArray = -self.half - BAND * spacing
-        fewest, most = PIECES
-        self._surface = make_surface(mesh, int(np.clip(2.3 * mesh.area / (PIECE * spacing) ** 2, fewest, most)))
+        fewest, most = piece_counts
+        self._surface = make_surface(mesh, int(np.clip(2.3 * mesh.area / (piece * spacing) ** 2, fewest, most)))
         self._last = np.ceil((self.half - self.origin) / spacing + BAND).astype(np.int64) // TILE
         self._key = geometry, content, spacing
 

@@ -25,7 +25,7 @@ import pytest
 from robot.arm.status import ArmStatus
 from robot.arm.trajectory import PERIOD
 from robot.arm.ur import URArm
-from robot.arm.worker import BLIND
+from robot.arm.worker import MAX_BLIND_PERIODS
 from robot.mock import FaultClient, MockUR
 from tacsim.interface import Pose
 from tests.promises import Record
@@ -76,7 +76,7 @@ EVENTS = {
     "slider 100, 10, 100 %": Event(slide(0.1, 1.0), ArmStatus.OK),
     # The worker sends BLIND targets before it knows. They all arrive in one period, and each speeds the arm up.
     "controller stalled for 80 ms": Event(
-        lambda faults: faults.tick_overrun(0.08), ArmStatus.OK, runs_out=0.06, margin=BLIND
+        lambda faults: faults.tick_overrun(0.08), ArmStatus.OK, runs_out=0.06, margin=MAX_BLIND_PERIODS
     ),
     "pause, play after 40 ms": Event(lambda faults: pendant(faults, "pause", "play"), ArmStatus.PROGRAM_STOPPED),
     "protective stop": Event(lambda faults: faults.protective_stop(), ArmStatus.PROTECTIVE_STOP),

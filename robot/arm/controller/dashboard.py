@@ -14,7 +14,6 @@ from robot.errors import DeviceError, DeviceNotConnectedError, EmergencyStop, Pr
 
 PORT = 29999
 LONGEST_LINE = 4096
-UNLOCK_PATIENCE = 8.0  # a controller refuses to unlock in the first 5 s after a protective stop [s]
 
 
 class Dashboard(Closing):
@@ -99,7 +98,8 @@ class Dashboard(Closing):
 
     def unlock(self, who: str) -> None:
         """Releases a protective stop. Raises EmergencyStop for any other stop, ProtectiveStop if it cannot be done."""
-        deadline = time.monotonic() + UNLOCK_PATIENCE
+        patience = 8.0  # a controller refuses to unlock in the first 5 s after a protective stop [s]
+        deadline = time.monotonic() + patience
         answer = ""
         while (safety := self.safety()) == "PROTECTIVE_STOP":
             if time.monotonic() > deadline:

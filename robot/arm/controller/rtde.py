@@ -17,7 +17,6 @@ from robot.errors import DeviceNotConnectedError
 from tacsim.interface import FloatArray
 
 PORT = 30004
-RATE = 125.0  # of the packages that are asked for [Hz]; every generation of controllers has it
 SECONDS = 0.3  # how long is read: forces are the mean of it
 HEADER = struct.Struct(">HB")  # size with header, kind
 VERSION, SETUP, START, DATA = b"VOSU"
@@ -118,7 +117,8 @@ def _read(session: _Session) -> Reading:
 
 def _recipe(session: _Session, names: list[str]) -> list[str]:
     """Asks for these outputs; their types. Raises ValueError for one that must be there and is not."""
-    answer = session.ask(SETUP, struct.pack(">d", RATE) + ",".join(names).encode())
+    rate = 125.0  # of the packages that are asked for [Hz]; every generation of controllers has it
+    answer = session.ask(SETUP, struct.pack(">d", rate) + ",".join(names).encode())
     types = answer[1:].decode(errors="replace").split(",")
     if len(types) != len(names):
         raise ValueError(f"{len(names)} values were asked for, {len(types)} are offered")

@@ -20,7 +20,8 @@ from tacsim.compute.runtime import launching, start
 from tacsim.geometry.sampling import body_points
 from tacsim.interface import Pose, Truth
 from tacsim.models.material import BodyMaterial, GelMaterial, lame
-from tacsim.models.scene import FASTEST_MACH, Gel, GelSurface, Scene
+from tacsim.models.scene import Gel, GelSurface, Scene
+from tacsim.models.tuning import MAX_MACH
 from tacsim.physics.body.material import UNREACHABLE_LIMIT
 from tacsim.physics.exec.layout import NUMBERS
 from tacsim.physics.failure.health import Health, LaunchSpan, SimulationDiverged, check_launch, require_room
@@ -269,7 +270,7 @@ class SeedWorld(BaseWorld):
         if len(body):
             low = np.minimum(low, np.maximum(body.min(axis=0), low - side))
             high = np.maximum(high, np.minimum(body.max(axis=0), high + side))
-        margin = GRID_MARGIN * self._dx + 2 * max(self._mach, FASTEST_MACH) * (last - first) * self._dt
+        margin = GRID_MARGIN * self._dx + 2 * max(self._mach, MAX_MACH) * (last - first) * self._dt
         room = [*(low - margin), faces.min()], [*(high + margin), faces.max()]
         require_room(np.array(room[0]), np.array(room[1]), self._dx, where)
         layers = self._fit_layers(faces)

@@ -13,10 +13,10 @@ import numpy as np
 
 from robot.arm import channel
 from robot.arm.channel import HISTORY
-from robot.arm.servo import FAULT_DECELERATION, STALL_PATIENCE
 from robot.arm.shared_ring import Record
 from robot.arm.status import ArmStatus
 from robot.arm.trajectory import PERIOD
+from robot.arm.tuning import FAULT_DECELERATION, MAX_STALL_PERIODS
 from robot.arm.ur import URArm
 from robot.common.kinematics import Kinematics
 from robot.mock import Input, MockState
@@ -121,10 +121,10 @@ def heights_in_a_fault(arm: URArm, status: ArmStatus) -> tuple[float, float]:
     led_back = np.flatnonzero((seen["target"] != seen["target"][0]).any(axis=1))
     if not len(led_back):
         rests = seen[seen["resting"] == 1][0]
-        assert rests["cycles"] - seen["cycles"][0] >= STALL_PATIENCE  # not before it has waited
+        assert rests["cycles"] - seen["cycles"][0] >= MAX_STALL_PERIODS  # not before it has waited
         return held, held
     before = seen[: led_back[0]]  # the last of these is of the package from which it brakes
-    assert len(np.unique(before["stamp"])) <= STALL_PATIENCE
+    assert len(np.unique(before["stamp"])) <= MAX_STALL_PERIODS
     speed = float(np.linalg.norm(before["tcp_speed"][-1, :3]))
     return held, float(before["position"][-1, 2]) - speed**2 / (2 * FAULT_DECELERATION)
 

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from robot.arm.channel import CommandKind, Partner, tactile_record
-from robot.arm.servo import FAULT_DECELERATION, ZERO_PATIENCE, Servo
+from robot.arm.servo import Servo
 from robot.arm.status import ArmStatus
 from robot.arm.trajectory import PERIOD
+from robot.arm.tuning import FAULT_DECELERATION, MAX_ZERO_AGE
 from tests.robot.arm.servo_bench import Bench, other, shifted, worker_config
 
 
@@ -208,7 +209,7 @@ DROPS: dict[str, Callable[[Bench], None]] = {
     "a stop": lambda bench: bench.ask(bench.at, CommandKind.HOLD),
     "a fault": lambda bench: bench.servo.trip(ArmStatus.GEL_LIMIT),
     "a controller's stop": lambda bench: bench.servo.trip(ArmStatus.PROTECTIVE_STOP),
-    "time": lambda bench: bench.run(round(ZERO_PATIENCE / PERIOD) + 1),
+    "time": lambda bench: bench.run(round(MAX_ZERO_AGE / PERIOD) + 1),
 }
 
 

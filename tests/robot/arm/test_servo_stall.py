@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from robot.arm.channel import Partner
-from robot.arm.servo import STALL_PATIENCE
 from robot.arm.status import ArmStatus
 from robot.arm.trajectory import PERIOD
-from robot.arm.worker import BLIND
+from robot.arm.tuning import MAX_STALL_PERIODS
+from robot.arm.worker import MAX_BLIND_PERIODS
 from robot.common.kinematics import rotation
 from tacsim import pose as se3
 from tests.robot.arm.servo_bench import OnController, shifted
@@ -96,7 +96,7 @@ def test_a_stall_without_news_goes_on_from_rest_after_a_while() -> None:
     arm.jump = -100 * PERIOD
     arm.stall(20)
     target = arm.joints
-    for _ in range(STALL_PATIENCE - 1):
+    for _ in range(MAX_STALL_PERIODS - 1):
         arm.period()
         assert arm.joints is target
     for _ in range(500):
@@ -144,7 +144,7 @@ def way_back(arm: OnController, silent: int, fault: int, backlog: int = 0) -> fl
         if k == fault:
             arm.partners = [None]
         arm.servo.check_faults(old, arm.partners)
-        loop_goes_on = k < BLIND or k >= silent
+        loop_goes_on = k < MAX_BLIND_PERIODS or k >= silent
         arm.run(arm.servo.step(arm.time, old, arm.partners) if loop_goes_on else None)
     arm.partners = [None]
     for _ in range(300):

@@ -14,7 +14,7 @@ import pytest
 from robot.arm import ur
 from robot.arm.status import ArmStatus
 from robot.arm.ur import URArm
-from robot.arm.worker import BLIND
+from robot.arm.worker import MAX_BLIND_PERIODS
 from robot.errors import (
     DeviceError,
     DeviceNotConnectedError,
@@ -53,7 +53,7 @@ def test_a_silent_link_is_lost_and_the_program_that_asks_is_not(mock: MockUR, me
             arm.state()
         with pytest.raises(LinkLost, match="does not answer any more"):
             arm.command(start)
-        assert len(servo_targets(mock.faults.received(last).entries)) <= 3 * BLIND  # then it sends no more
+        assert len(servo_targets(mock.faults.received(last).entries)) <= 3 * MAX_BLIND_PERIODS  # then it sends no more
         until(lambda: mock.faults.state().rests, "rest by the controller's watchdog")
         figure("processes that did not outlive it", len(arm.history()) <= 5)
         assert len(arm.history()) > 5  # what was known stays known

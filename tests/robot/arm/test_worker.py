@@ -75,7 +75,7 @@ def test_every_variable_is_in_the_librarys_own_table() -> None:
 def test_a_failure_is_one_line_of_json_and_the_rest_stays_out_of_it() -> None:
     segment = shared_ring.create(Channel.SIZE)
     done = start(worker_config(segment.descriptor))
-    assert done.returncode == worker.FAILED
+    assert done.returncode == worker.FAILED_STATUS
     told = json.loads(done.stdout)
     assert told["kind"] == "DeviceNotConnectedError"
     assert f"no controller at {NOBODY}: port 30004 (RTDE)" in told["error"]
@@ -92,7 +92,7 @@ def test_without_memory_to_write_to_it_says_so() -> None:
         text=True,
         timeout=60,
     )
-    assert done.returncode == worker.FAILED
+    assert done.returncode == worker.FAILED_STATUS
     assert "Bad file descriptor" in json.loads(done.stdout)["error"]
 
 
@@ -124,7 +124,7 @@ def test_an_arm_of_another_shape_is_left_as_it_was(mock: MockUR) -> None:
     segment, before = shared_ring.create(Channel.SIZE), mock.faults.state().payload
     given = worker_config(segment.descriptor, host=HOST, model="ur10e", mass=2.0, tcp=[0.0, 0.0, 0.1, 0.0, 0.0, 0.0])
     done = start(given, "-c", UNSEEN)
-    assert done.returncode == worker.FAILED
+    assert done.returncode == worker.FAILED_STATUS
     assert re.search(r"its tool is \d+ mm and .* from where a ur10e would have it; check model", done.stdout)
     asked = {entry.values.get("input_int_register_0") for entry in mock.faults.received().entries}
     assert asked & {*CHANGES} == set()

@@ -46,7 +46,7 @@ def test_run_without_out_makes_a_folder_below_runs(tmp_path: Path) -> None:
 
 
 def test_particles_of_the_body_are_recorded_where_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("robot.deploy.control_loop.PARTICLES", 7)
+    monkeypatch.setattr("robot.deploy.control_loop.MAX_PARTICLES", 7)
     for name, more in (("with", ["--set", "record.body=true"]), ("without", [])):
         result = tacsim("run", "--steps", "1", "--out", name, *TINY, *more)
         assert result.exit_code == 0, result.output

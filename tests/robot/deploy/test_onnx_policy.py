@@ -14,7 +14,7 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from robot.deploy.control_loop import EpisodeFailed, EpisodeSetup, run_episode
-from robot.deploy.onnx_policy import MOST_BYTES, OnnxPolicy
+from robot.deploy.onnx_policy import MAX_BYTES, OnnxPolicy
 from robot.deploy.policy import PolicyNotFound, load_policy, require_fit
 from robot.open import open_rig
 from tacsim.gym.features import FeatureEncoder
@@ -267,7 +267,7 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
             read(path)
     with path.open("wb") as file:
         file.truncate(2**30)
-    with pytest.raises(PolicyNotFound, match=rf"has 1,024 MiB, at most {MOST_BYTES >> 20} are read"):
+    with pytest.raises(PolicyNotFound, match=rf"has 1,024 MiB, at most {MAX_BYTES >> 20} are read"):
         read(path)
     with pytest.raises(PolicyNotFound, match="cannot be read"):
         read(tmp_path)  # a folder

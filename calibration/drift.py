@@ -7,15 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.tuning import CONTACT_BLUR, MAX_UNTOUCHED_CHANGE, MIN_CONTACT_CHANGE, MIN_UNTOUCHED_SHARE
 from tacsim.interface import Float32, Mask
 
-UNTOUCHED_CHANGE = 0.08  # an untouched pixel changes less than this, without drift [-]
-MIN_UNTOUCHED_SHARE = 0.15  # of the view, to measure a drift
 PIXEL_STRIDE = 5  # of the pixels from which it is measured
-# A contact in a picture that should show none: a patch that differs from a known picture ...
-CONTACT_CHANGE = 0.06  # by so much, without drift and noise [-]
-CONTACT_BLUR = 1.5  # [px of the canonical image]
-MIN_CONTACT_AREA = 0.6e-6  # and that is so large: a ball of 8 mm pressed 0.05 mm deep touches as much [m^2]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,7 +61,7 @@ class DriftFinder:
         measured = False
         for _ in range(2):
             rest = np.abs(seen - np.einsum("ni,ic->cn", self._few, weights))
-            untouched = on_gel & (np.maximum(np.maximum(rest[0], rest[1]), rest[2]) < UNTOUCHED_CHANGE)
+            untouched = on_gel & (np.maximum(np.maximum(rest[0], rest[1]), rest[2]) < MAX_UNTOUCHED_CHANGE)
             measured = bool(untouched.mean() >= MIN_UNTOUCHED_SHARE)
             if not measured:
                 break
@@ -112,6 +107,6 @@ def contact_area(change: Float32, ignored: NDArray[np.bool_], pitch: float) -> f
     find.remove(planes, find(planes, ignored))
     planes[:, ignored] = 0.0
     smooth = [cv2.GaussianBlur(plane, (0, 0), CONTACT_BLUR) for plane in planes]
-    strong = (np.abs(smooth).max(axis=0) > CONTACT_CHANGE) & ~ignored
+    strong = (np.abs(smooth).max(axis=0) > MIN_CONTACT_CHANGE) & ~ignored
     _, _, stats, _ = cv2.connectedComponentsWithStats(strong.astype(np.uint8))
     return float(stats[1:, cv2.CC_STAT_AREA].max(initial=0)) * pitch**2

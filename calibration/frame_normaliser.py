@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.drift import MIN_CONTACT_AREA, DriftFinder, contact_area, max_mean_change
+from calibration.drift import DriftFinder, contact_area, max_mean_change
 from calibration.height.surface_finder import SurfaceFinder, canonical_part
 from calibration.lens.rectification import (
     Rectification,
@@ -21,10 +21,6 @@ from calibration.lens.rectification import (
 )
 from calibration.markers.flow import MarkerFlow, require_no_markers
 from calibration.reference import (
-    MAX_COLOUR_CHANGE,
-    MAX_SLOPE_CHANGE,
-    STALE_COLOUR,
-    STALE_SLOPE,
     Reference,
     StaleReference,
     UnusableReference,
@@ -32,12 +28,18 @@ from calibration.reference import (
     is_contact_image_swapped,
     make_reference,
 )
-from tacsim.control.contact_signal import CONTACT_DIFFERENCE, CONTACT_HEIGHT
+from calibration.tuning import (
+    MAX_COLOUR_CHANGE,
+    MAX_DOT_LEVEL,
+    MAX_SLOPE_CHANGE,
+    MIN_CONTACT_AREA,
+    STALE_COLOUR,
+    STALE_SLOPE,
+)
+from tacsim.control.tuning import MIN_CONTACT_DIFFERENCE, MIN_CONTACT_HEIGHT
 from tacsim.interface import SurfaceMap, TactileFrame, TactileObservation
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.optics.grid import canonical_cells
-
-DOT_LEVEL = 0.7  # of the mean: printed dots are darker
 
 
 class NoReference(RuntimeError):
@@ -207,7 +209,7 @@ class FrameNormaliser:
             image=lambda: _encode_image(canonical_part(difference(), self._grid)),
             gradient=surface.gradient,
             height=surface.height,
-            contact=(surface.height > CONTACT_HEIGHT) & self._valid,
+            contact=(surface.height > MIN_CONTACT_HEIGHT) & self._valid,
             valid=self._valid,
             flow=surface.flow,
             time=frame.time,
@@ -228,7 +230,7 @@ class FrameNormaliser:
             image=_encode_image(change),
             gradient=gradient,
             height=height,
-            contact=self._contact_mask(change) if height is None else (height > CONTACT_HEIGHT) & self._valid,
+            contact=self._contact_mask(change) if height is None else (height > MIN_CONTACT_HEIGHT) & self._valid,
             valid=self._valid,
             flow=flow,
             time=frame.time,
@@ -289,7 +291,7 @@ class FrameNormaliser:
 
         cell = _cell_view(change, self._grid).mean(axis=(1, 3), dtype=np.float32)
         calm = cv2.blur(cell, (3, 3))
-        return np.asarray(np.abs(calm).max(axis=2) > CONTACT_DIFFERENCE, dtype=np.bool_) & self._valid
+        return np.asarray(np.abs(calm).max(axis=2) > MIN_CONTACT_DIFFERENCE, dtype=np.bool_) & self._valid
 
     def _update_stale(self, surface: SurfaceMap) -> None:
         shape = (self._grid.rows, self._grid.columns)
@@ -317,7 +319,7 @@ def _dot_mask(relative: NDArray[np.float32]) -> NDArray[np.bool_]:
     """(H, W) pixels of an image (H, W, 3), relative to its mean, that printed dots darken, and those beside."""
     import cv2
 
-    dark = (relative.max(axis=2) < DOT_LEVEL).astype(np.uint8)
+    dark = (relative.max(axis=2) < MAX_DOT_LEVEL).astype(np.uint8)
     return np.asarray(cv2.dilate(dark, np.ones((5, 5), dtype=np.uint8)), dtype=np.bool_)
 
 

@@ -16,7 +16,8 @@ from calibration.drift import contact_area
 from calibration.errors import BadFrames
 from calibration.lens.rectification import metric_rectification, rectification_of_corners, region_mask
 from calibration.lens.view import BadCorners, Corners, GelView
-from calibration.reference import SATURATED, is_contact_image_swapped
+from calibration.reference import is_contact_image_swapped
+from calibration.tuning import MAX_REFERENCE_CHANGE, MIN_CONTACT_SHARE, SATURATED_LEVEL
 from tacsim.interface import Image, SurfaceMap
 from tacsim.models.geometry import PictureRegion
 from tacsim.optics.grid import PixelGrid
@@ -35,11 +36,6 @@ from tacsim.record.sources import (
 
 UNTOUCHED_NAMES = ("background", "reference", "ref", "empty", "no_contact", "bg", "frame0")  # of pictures, best first
 MAX_FRAMES = 500
-MAX_MEMORY = 2 << 30  # of all pictures together [bytes]
-MEDIAN_FRAMES = 5  # so many frames with contacts in different places have the untouched gel as their median
-MAX_SATURATED_SHARE = 0.05  # of a contact
-MIN_CONTACT_SHARE = 0.001  # of a picture, in which two without contact differ as a contact does
-STALE_CHANGE = 4.0  # median change of the gel outside contact that makes a reference stale [grey levels]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -136,15 +132,16 @@ def frame_warnings(
     image: NDArray[np.floating], reference: NDArray[np.floating], contact: NDArray[np.bool_]
 ) -> list[str]:
     """What is wrong with a frame, in words: its picture and reference (H, W, 3) [grey levels], its contact (H, W)."""
+    max_saturated_share = 0.05  # of a contact
     found = []
     if not contact.any():
         found.append("no contact")
     else:
-        saturated = float((image[contact] >= SATURATED).any(axis=1).mean())
-        if saturated > MAX_SATURATED_SHARE:
+        saturated = float((image[contact] >= SATURATED_LEVEL).any(axis=1).mean())
+        if saturated > max_saturated_share:
             found.append(f"saturated: {saturated:.0%} of the contact")
     change = (image - reference)[~contact]
-    if len(change) and (drift := float(np.abs(np.median(change, axis=0)).max())) > STALE_CHANGE:
+    if len(change) and (drift := float(np.abs(np.median(change, axis=0)).max())) > MAX_REFERENCE_CHANGE:
         if is_contact_image_swapped(image.astype(np.float32), reference.astype(np.float32), ~contact):
             return [*found, "red and blue are swapped: the untouched gel is that of the reference in the other order"]
         found.append(f"stale reference: the untouched gel has changed by {drift:.0f} grey levels")
@@ -282,14 +279,15 @@ def _read_images(folder: Path, paths: list[Path], max_frames: int) -> list[Frame
 
 def _read_limited(path: Path, frames: Iterable[Frame], max_frames: int = MAX_FRAMES) -> list[Frame]:
     """All frames; raises BadFrames as soon as they are too many."""
+    max_memory = 2 << 30  # of all pictures together [bytes]
     read: list[Frame] = []
     memory = 0
     for frame in frames:
         read.append(frame)
         memory += frame.image.nbytes
-        if len(read) > max_frames or memory > MAX_MEMORY:
+        if len(read) > max_frames or memory > max_memory:
             raise BadFrames(
-                f"{path} holds more than {max_frames} frames, or {MAX_MEMORY >> 30} GiB of them; give a part of it"
+                f"{path} holds more than {max_frames} frames, or {max_memory >> 30} GiB of them; give a part of it"
             )
     return read
 
@@ -298,6 +296,7 @@ def _make_frame_set(
     path: Path, frames: list[Frame], reference: Path | None, own: Image | None, untouched: tuple[Frame, ...] = ()
 ) -> FrameSet:
     """The reference is the picture that was named, the recording's `own`, or the median."""
+    median_count = 5  # so many frames with contacts in different places have the untouched gel as their median
     if not frames:
         raise BadFrames(f"{path} holds no frame beside the one without contact")
     estimated = reference is None and own is None
@@ -305,13 +304,13 @@ def _make_frame_set(
         picture, source = read_image(reference), reference.name
     elif own is not None:
         picture, source = own, "the recording's own"
-    elif len(frames) >= MEDIAN_FRAMES:
+    elif len(frames) >= median_count:
         picture = np.median(np.stack([frame.image for frame in frames]), axis=0).astype(np.uint8)
         source = f"median of {len(frames)} frames"
     else:
         raise BadFrames(
             f"{path} holds no frame without contact; name one (--reference; of two sources --reference-a, "
-            f"--reference-b), or call it {UNTOUCHED_NAMES[0]}.png. Without, {MEDIAN_FRAMES} frames with contacts in "
+            f"--reference-b), or call it {UNTOUCHED_NAMES[0]}.png. Without, {median_count} frames with contacts in "
             "different places are needed, whose median stands for it"
         )
     other = next((frame for frame in (*frames, *untouched) if frame.image.shape != picture.shape), None)

@@ -12,22 +12,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from calibration.tuning import (
+    MAX_EXCHANGED_RATIO,
+    MAX_SAME_CHANGE,
+    MAX_SATURATED_SHARE,
+    MIN_MEAN_LEVEL,
+    MIN_SWAPPED_CHANGE,
+    SATURATED_LEVEL,
+)
 from tacsim.interface import Float32, Mask
-
-SATURATED = 250.0  # a channel at or above this has lost its signal [grey levels]
-MAX_SATURATED_SHARE = 0.05  # of the gel; ten real sensors show 0 to 0.001
-MIN_MEAN_LEVEL = 8.0  # of each channel over the gel; below, noise and rounding prevail [grey levels]
-# A reference is stale beyond, ...
-STALE_SLOPE = 2.0  # slope of the untouched gel; real sensors: 0.3 to 0.7 [degrees]
-STALE_COLOUR = 0.05  # change of the untouched gel's colour: a lamp's gain scales slopes and may tilt nothing [-]
-# ... and the light is another beyond:
-MAX_SLOPE_CHANGE = 20.0  # [degrees]
-MAX_COLOUR_CHANGE = 0.5  # [-]
-# Red and blue are exchanged
-EXCHANGED_RATIO = 0.5  # if that brings the picture so much nearer to the known one
-MAX_SAME_CHANGE = 0.02  # unless it is this near already, each colour relative to its mean [-]
-MIN_SWAPPED_CHANGE = 0.01  # of each colour relative to its mean, beside another gain: less is no sign of a swap [-]
-BLOCK_SIZE = 8  # side of the blocks that are compared [px]
 
 
 class UnusableReference(ValueError):
@@ -89,7 +82,7 @@ def make_reference(
             f"reference is dark: mean R, G, B over the gel {levels}, at least {MIN_MEAN_LEVEL:g} each; are the "
             "sensor's lights on, and is the exposure right?"
         )
-    saturated = float((gel >= SATURATED).any(axis=1).mean())
+    saturated = float((gel >= SATURATED_LEVEL).any(axis=1).mean())
     if colour and saturated > MAX_SATURATED_SHARE:
         raise UnusableReference(
             f"reference is saturated on {saturated:.1%} of the gel, at most {MAX_SATURATED_SHARE:.0%}: shorten the "
@@ -109,7 +102,7 @@ def is_channel_order_swapped(image: Float32, known: Float32, valid: Mask) -> boo
     one, other = (_block_pattern(picture, valid) for picture in (image, known))
     apart = float(np.sqrt(((one - other) ** 2).mean()))
     exchanged_apart = float(np.sqrt(((one[:, ::-1] - other) ** 2).mean()))
-    return apart > MAX_SAME_CHANGE and exchanged_apart < EXCHANGED_RATIO * apart
+    return apart > MAX_SAME_CHANGE and exchanged_apart < MAX_EXCHANGED_RATIO * apart
 
 
 def is_contact_image_swapped(image: Float32, known: Float32, valid: Mask) -> bool:
@@ -124,14 +117,15 @@ def is_contact_image_swapped(image: Float32, known: Float32, valid: Mask) -> boo
     apart, swapped = (
         float(np.median((np.abs(levels - wanted) / mean).max(axis=1))) for levels in (seen * gain, seen[:, ::-1])
     )
-    return apart > MIN_SWAPPED_CHANGE and swapped < EXCHANGED_RATIO * apart
+    return apart > MIN_SWAPPED_CHANGE and swapped < MAX_EXCHANGED_RATIO * apart
 
 
 def _block_levels(image: Float32, valid: Mask) -> Float32:
     """(n, 3) mean level of each block that lies on the gel."""
+    block_side = 8  # side of the blocks that are compared [px]
     import cv2
 
-    size = (max(valid.shape[1] // BLOCK_SIZE, 1), max(valid.shape[0] // BLOCK_SIZE, 1))
+    size = (max(valid.shape[1] // block_side, 1), max(valid.shape[0] // block_side, 1))
     whole = cv2.resize(valid.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.float32)[whole]
 

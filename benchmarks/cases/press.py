@@ -28,7 +28,8 @@ from benchmarks.truth.limit import (
 from tacsim.geometry.shapes import bounding_size
 from tacsim.interface import FloatArray, Pose
 from tacsim.models.material import GelMaterial
-from tacsim.models.scene import MAX_MACH, Box, Cylinder, Gel, Indenter, Scene, Shape, Sphere
+from tacsim.models.scene import Box, Cylinder, Gel, Indenter, Scene, Shape, Sphere
+from tacsim.models.tuning import MAX_MACH
 from tacsim.physics.move import MoveStats
 
 if TYPE_CHECKING:

@@ -13,15 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.compare.metrics import circle_of_region, contact_region, untouched_change
+from calibration.compare.tuning import MAX_ASPECT_ERROR, MAX_SHIFT, MAX_SHIFT_SCATTER
 from calibration.errors import BadFrames
 from tacsim.interface import Float32, FloatArray
 from tacsim.models.sensor import SensorGeometry
-
-ASPECT_TOLERANCE = 0.02  # relative difference of the aspect ratios of two pictures that are scaled to each other
-MAX_SHIFT = 0.25  # share of the picture; beyond, the pairing is wrong, not the mounting
-MAX_SCATTER = 0.05  # of the pairs' shifts, share of the picture
-ECC_WINDOW = 5  # side of the Gaussian window of the fit [px]
-ECC_STEPS, ECC_TOLERANCE = 200, 1e-4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,7 +74,7 @@ def align_by_size(source: tuple[int, int], shape: tuple[int, int]) -> Alignment:
     if source == shape:
         return Alignment(np.eye(2, 3), shape, source)
     across, down = source[1] / shape[1], source[0] / shape[0]
-    if abs(across / down - 1) > ASPECT_TOLERANCE:
+    if abs(across / down - 1) > MAX_ASPECT_ERROR:
         raise BadFrames(
             f"A is {source[1]} x {source[0]} px, B {shape[1]} x {shape[0]}: no scale makes these the same picture. "
             "Give the sensors' calibrations (--calibration-a, --calibration-b) or the corners of the gel (--corners-a, "
@@ -114,7 +109,7 @@ def find_shift(changes: Iterable[tuple[Float32, Float32]], alignment: Alignment)
     scatter = float(np.median(np.linalg.norm(shifts - middle, axis=1)))
     size = max(alignment.shape)
     words = f"({middle[0]:+.2f}, {middle[1]:+.2f}) px"
-    if scatter > MAX_SCATTER * size:
+    if scatter > MAX_SHIFT_SCATTER * size:
         return alignment.shifted((0.0, 0.0), f"not shifted: the pairs disagree by {scatter:.0f} px; are they pairs?")
     if float(np.linalg.norm(middle)) > MAX_SHIFT * size:
         return alignment.shifted((0.0, 0.0), f"not shifted: {words} is too far; are these pairs?")
@@ -124,6 +119,9 @@ def find_shift(changes: Iterable[tuple[Float32, Float32]], alignment: Alignment)
 
 def _find_image_shift(a: Float32, b: Float32) -> tuple[float, float] | None:
     """x, y from a point of `b` to the same in `a` [px]; None where there is no contact, or no shift to be found."""
+    tolerance = 1e-4
+    max_steps = 200
+    window = 5  # side of the Gaussian window of the fit [px]
     import cv2
 
     patches = [circle_of_region(contact_region(change)) for change in (a, b)]
@@ -132,10 +130,10 @@ def _find_image_shift(a: Float32, b: Float32) -> tuple[float, float] | None:
     template, moved = _change_strength(b), _change_strength(a)
     start = np.eye(2, 3, dtype=np.float32)
     start[:, 2] = patches[0].x - patches[1].x, patches[0].y - patches[1].y
-    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, ECC_STEPS, ECC_TOLERANCE)
+    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, max_steps, tolerance)
     mask = np.ones(moved.shape, dtype=np.uint8)
     try:
-        _, warp = cv2.findTransformECC(template, moved, start, cv2.MOTION_TRANSLATION, criteria, mask, ECC_WINDOW)
+        _, warp = cv2.findTransformECC(template, moved, start, cv2.MOTION_TRANSLATION, criteria, mask, window)
     except cv2.error:  # no convergence: these pictures do not show the same
         return None
     return float(warp[0, 2]), float(warp[1, 2])

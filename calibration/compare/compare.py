@@ -23,12 +23,10 @@ from calibration.compare.surfaces import GRID, SurfaceEstimate, estimate_surface
 from calibration.drift import subtract_drift
 from calibration.errors import BadFrames
 from calibration.frame_set import Frame, FrameSet, find_touched_references
-from tacsim.control.contact_signal import CONTACT_HEIGHT
+from tacsim.control.tuning import MIN_CONTACT_HEIGHT
 from tacsim.interface import FloatArray, Image
 from tacsim.record.numbering import picture_numbers
 
-MAX_SHIFT_PAIRS = 40  # pairs from which the shift is found
-MAX_NOISE_FRAMES = 5  # untouched frames from which the floor is made
 BOOTSTRAP_DRAWS = 2000
 MIN_PAIRS = 3  # for an interval
 
@@ -250,6 +248,7 @@ def _find_alignment(
     *,
     shift: bool,
 ) -> Alignment:
+    max_shift_pairs = 40  # pairs from which the shift is found
     if calibration_a is not None and calibration_b is not None:
         alignment = align_by_geometry(calibration_a.geometry, calibration_b.geometry)
         for side, shape, said in ((a, alignment.source, "A"), (b, alignment.shape, "B")):
@@ -264,8 +263,8 @@ def _find_alignment(
         raise BadFrames("A shows no part of the gel that B shows; are these the right calibrations?")
     if not shift:
         return alignment.shifted((0.0, 0.0), "no shift is sought")
-    chosen = frame_pairs if len(frame_pairs) <= MAX_SHIFT_PAIRS else [
-        frame_pairs[int(k)] for k in np.linspace(0, len(frame_pairs) - 1, MAX_SHIFT_PAIRS)
+    chosen = frame_pairs if len(frame_pairs) <= max_shift_pairs else [
+        frame_pairs[int(k)] for k in np.linspace(0, len(frame_pairs) - 1, max_shift_pairs)
     ]  # fmt: skip
     base_a, base_b = alignment(a.reference), b.reference.astype(np.float32)
     level = b.reference.mean(axis=(0, 1))
@@ -280,7 +279,8 @@ def _noise_floor(
     scorer: Scorer, b: FrameSet, pairs: Sequence[Pair], calibration: Calibration | None
 ) -> tuple[Numbers, list[str]]:
     """What pictures of B without contact score against each other, where the pairs have contact; and a note."""
-    frames = [*b.untouched, *(pair.b for pair in pairs if not pair.region.any())][:MAX_NOISE_FRAMES]
+    max_noise_frames = 5  # untouched frames from which the floor is made
+    frames = [*b.untouched, *(pair.b for pair in pairs if not pair.region.any())][:max_noise_frames]
     touched = [pair for pair in pairs if pair.region.any()]
     if not frames or not touched:
         why = f"{scorer.names[1]} has no second frame without contact" if not frames else "no pair has contact"
@@ -292,7 +292,7 @@ def _noise_floor(
     pressed, _ = estimate_surfaces(b, [pair.b for pair in touched], calibration)
     if found is not None and pressed is not None:
         known = [each for each in pressed if each is not None]
-        regions = [metrics.pressed_region(each.height, CONTACT_HEIGHT) & each.valid for each in known]
+        regions = [metrics.pressed_region(each.height, MIN_CONTACT_HEIGHT) & each.valid for each in known]
         scores = [
             surface_errors(still, undeformed_surface(still), where, each)
             for still in found if still is not None

@@ -24,16 +24,11 @@ from calibration.compare.compare import BOOTSTRAP_DRAWS, Comparison
 from calibration.compare.surfaces import GRID, estimate_surfaces
 from calibration.drift import subtract_drift
 from calibration.errors import BadFrames
-from tacsim.control.contact_signal import CONTACT_HEIGHT
+from tacsim.control.tuning import MIN_CONTACT_HEIGHT
 from tacsim.interface import FloatArray, Image
 
 PATCH_SIDE = 5.2e-3  # where pixels have a known pitch [m]
-PATCH_SIDE_RADII = 3.0  # ... and else [radii of the median contact region]
-PATCH_POINTS = 36  # each way
 MIN_PRESSES = 4
-COMPONENTS = 6  # principal components that the classifier sees
-RIDGE = 1.0
-MAX_FOLDS = 20  # up to so many presses, each is left out alone
 
 VIEWS = ("raw", "difference", "gradient", "height")
 
@@ -160,21 +155,24 @@ def partner_distances(of_a: FloatArray, of_b: FloatArray, order: NDArray[np.intp
 def classifier_scores(of_a: FloatArray, of_b: FloatArray) -> tuple[FloatArray, FloatArray]:
     """(n,) scores of the presses of A and of B, each by a linear classifier that has not seen that press, of neither
     source: ridge regression on -1 and 1 in the first principal components, standardised."""
+    max_folds = 20  # up to so many presses, each is left out alone
+    weight = 1.0
+    component_count = 6  # principal components that the classifier sees
     count = len(of_a)
     rows = np.concatenate([of_a, of_b])
     wanted = np.repeat([-1.0, 1.0], count)
-    fold = np.tile(np.arange(count) % min(count, MAX_FOLDS), 2)
+    fold = np.tile(np.arange(count) % min(count, max_folds), 2)
     scores = np.zeros(2 * count)
-    for number in range(min(count, MAX_FOLDS)):
+    for number in range(min(count, max_folds)):
         held = fold == number
         middle = rows[~held].mean(axis=0)
         away = rows - middle
         # principal components through the products of the few presses, not of their many pixels
         _, vectors = np.linalg.eigh(away[~held] @ away[~held].T)
-        seen = away @ (away[~held].T @ vectors[:, : -COMPONENTS - 1 : -1])
+        seen = away @ (away[~held].T @ vectors[:, : -component_count - 1 : -1])
         spread = seen[~held].std(axis=0)
         seen = np.column_stack([seen / np.where(spread > 0, spread, 1.0), np.ones(len(seen))])
-        square = seen[~held].T @ seen[~held] + RIDGE * np.eye(seen.shape[1])
+        square = seen[~held].T @ seen[~held] + weight * np.eye(seen.shape[1])
         scores[held] = seen[held] @ np.linalg.solve(square, seen[~held].T @ wanted[~held])
     return scores[:count], scores[count:]
 
@@ -227,10 +225,11 @@ def _measure_view(name: str, of_a: FloatArray, of_b: FloatArray, signal: float, 
 
 def _patch_size(calibration: Calibration | None, radii: Sequence[float]) -> tuple[float, str]:
     """Half the side of the patch [px], and how large that is in words."""
+    side_in_radii = 3.0  # ... and else [radii of the median contact region]
     if calibration is not None:
         return PATCH_SIDE / 2 / calibration.geometry.pixel_pitch, f"{PATCH_SIDE * 1e3:g} mm"
-    half = PATCH_SIDE_RADII / 2 * float(np.median(radii))
-    return half, f"{2 * half:.0f} px: {PATCH_SIDE_RADII:g} radii of the usual contact region"
+    half = side_in_radii / 2 * float(np.median(radii))
+    return half, f"{2 * half:.0f} px: {side_in_radii:g} radii of the usual contact region"
 
 
 def _cut_patches(
@@ -286,7 +285,7 @@ def _patch_in_cells(
     if calibration is None:  # both surfaces were recorded
         surfaces = comparison.surfaces(k)
         assert surfaces is not None
-        patch = metrics.circle_of_region(metrics.pressed_region(surfaces[1].height, CONTACT_HEIGHT))
+        patch = metrics.circle_of_region(metrics.pressed_region(surfaces[1].height, MIN_CONTACT_HEIGHT))
         return (patch.x, patch.y, reach) if patch is not None else (GRID.columns / 2, GRID.rows / 2, reach)
     u0, v0 = calibration.geometry.principal
     scale = calibration.geometry.pixel_pitch / GRID.pitch
@@ -295,12 +294,13 @@ def _patch_in_cells(
 
 def _cut_patch(field: NDArray[np.float32], x: float, y: float, half: float) -> FloatArray:
     """(d,) values of a square patch of a field (H, W[, n]) round x, y, as far as `half` each way."""
+    patch_points = 36  # each way
     import cv2
 
-    line = np.linspace(-half, half, PATCH_POINTS)
+    line = np.linspace(-half, half, patch_points)
     u, v = (points.astype(np.float32) for points in np.meshgrid(x + line, y + line))
     picture = np.ascontiguousarray(field, dtype=np.float32)
-    spacing = 2 * half / (PATCH_POINTS - 1)
+    spacing = 2 * half / (patch_points - 1)
     if spacing > 1.0:  # a patch of many pixels: else every few of them would decide
         picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), 0.5 * spacing), dtype=np.float32)
     cut = cv2.remap(picture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -326,7 +326,7 @@ def _mean_gradient_angle(
         assert found is not None  # there is a calibration
         angles += [
             metrics.mean_normal_angle(
-                seen.gradient, other.gradient, metrics.pressed_region(seen.height, CONTACT_HEIGHT) & other.valid
+                seen.gradient, other.gradient, metrics.pressed_region(seen.height, MIN_CONTACT_HEIGHT) & other.valid
             )
             for seen, other in zip(truth, found, strict=True)
             if seen is not None and other is not None

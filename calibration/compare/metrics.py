@@ -12,21 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.compare.tuning import CONTACT_BLUR, MIN_CHANGE, MIN_CHANGE_SHARE, MIN_CHANGE_TO_NOISE, MIN_PATCH_AREA
 from tacsim.interface import FloatArray, Mask
 
 Picture = NDArray[np.uint8] | NDArray[np.floating]
 
 WHITE = 255.0  # grey level
 WINDOW = 7  # side of the window of SSIM [px]
-GRAIN_DEVIATION = 1.0  # what a Gaussian of this deviation takes away is grain [px]
-CONTACT_BLUR = 2.0  # of a change of colour before contact is looked for in it, against noise [px]
-# A smoothed change shows contact beyond the largest of
-MIN_CHANGE = 5.0  # [grey levels]
-MIN_CHANGE_TO_NOISE = 6.0  # times the noise of the picture
-MIN_CHANGE_SHARE = 0.25  # of the strongest change
-MEDIAN_PIXELS = 10000  # enough for a median
-MIN_PATCH = 30  # a smaller patch is dirt [px]
-CLOSING_RADIUS = 3  # radius of gaps in a contact that are closed [px]
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,11 +91,12 @@ def image_correlation(one: Picture, other: Picture, where: Mask | None = None) -
 def grain_deviation(change: Picture, where: Mask) -> float:
     """Standard deviation of what is finer than GRAIN pixels in a change of colour [grey levels]: noise, and texture of
     the skin."""
+    width = 1.0  # what a Gaussian of this deviation takes away is grain [px]
     import cv2
 
     picture = np.asarray(change, dtype=np.float32)
     return math.sqrt(
-        _masked_mean(np.asarray(picture - cv2.GaussianBlur(picture, (0, 0), GRAIN_DEVIATION), np.float64) ** 2, where)
+        _masked_mean(np.asarray(picture - cv2.GaussianBlur(picture, (0, 0), width), np.float64) ** 2, where)
     )
 
 
@@ -143,6 +136,7 @@ def contact_region(change: NDArray[np.floating]) -> Mask:
     strongest change, so it means the same in a bright and in a dim picture; its holes are filled, as the flat middle
     of a press has the colour of the untouched gel.
     """
+    gap = 3  # radius of gaps in a contact that are closed [px]
     import cv2
     from scipy.ndimage import binary_closing, binary_fill_holes, label
 
@@ -153,20 +147,19 @@ def contact_region(change: NDArray[np.floating]) -> Mask:
     noise = 1.4826 * float(np.median(strength[strength <= np.median(strength)]))
     share = MIN_CHANGE_SHARE * float(np.percentile(strength, 99.8))
     found = strength > max(MIN_CHANGE, MIN_CHANGE_TO_NOISE * noise, share)
-    padded = np.pad(found, CLOSING_RADIUS)  # closing erodes what touches the border
-    closed = binary_closing(padded, iterations=CLOSING_RADIUS)[
-        CLOSING_RADIUS:-CLOSING_RADIUS, CLOSING_RADIUS:-CLOSING_RADIUS
-    ]
+    padded = np.pad(found, gap)  # closing erodes what touches the border
+    closed = binary_closing(padded, iterations=gap)[gap:-gap, gap:-gap]
     parts, _ = label(binary_fill_holes(closed | found))
     sizes = np.bincount(parts.ravel())
     sizes[0] = 0
-    return np.asarray(sizes[parts] >= MIN_PATCH)
+    return np.asarray(sizes[parts] >= MIN_PATCH_AREA)
 
 
 def untouched_change(change: NDArray[np.floating]) -> NDArray[np.floating]:
     """(3,) change of colour of the untouched gel: the median over (H, W, 3), then over the half nearest to it."""
+    pixel_count = 10000  # enough for a median
     pixels = change.reshape(-1, change.shape[2])
-    pixels = pixels[:: max(1, len(pixels) // MEDIAN_PIXELS)]
+    pixels = pixels[:: max(1, len(pixels) // pixel_count)]
     level = np.median(pixels, axis=0)
     away = np.abs(pixels - level).max(axis=1)
     return np.asarray(np.median(pixels[away <= np.median(away)], axis=0))

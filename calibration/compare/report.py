@@ -15,13 +15,10 @@ from numpy.typing import NDArray
 
 from calibration.compare.compare import METRICS, Comparison, Metric, Overall
 from calibration.compare.invariance import CHANGES, VIEWS, Report
+from calibration.compare.tuning import MAX_CLOSE_ERROR, MIN_CLOSE_CORRELATION
 from tacsim.interface import Image
 from tacsim.report.report import data_url, finite, render_page
 
-MAX_PAIR_IMAGES = 24  # pairs with pictures, the worst first
-THUMBNAIL = 240  # longer side [px]
-ZOOM_MARGIN = 0.3  # of the contact's width, that a zoomed picture shows round it
-JPEG_QUALITY = 85
 RANKING_METRIC = "contact_mae"
 FORMAT = 1
 
@@ -32,8 +29,6 @@ CONTACT_MASK = (
     "those of a circle that was clicked: they do not compare."
 )
 FILES = ("compare.json", "compare.csv", "compare.html")
-CLOSE_CORRELATION = 0.95  # of the change of colour in contact, from which two sources look alike ...
-CLOSE_SHARE = 0.25  # ... if their error there also is no larger share of what a picture without contact would score
 SIDE_NAMES = {"simulated": "the simulation", "real": "the real sensor"}
 
 
@@ -137,6 +132,8 @@ def _escape_formula(name: str) -> str:
 
 
 def _render_html(comparison: Comparison, report: Report | None) -> str:
+    max_pair_images = 24  # pairs with pictures, the worst first
+
     def worst(k: int) -> float:
         value = comparison.pairs[k].numbers[RANKING_METRIC]
         return -math.inf if math.isnan(value) else value
@@ -155,8 +152,8 @@ def _render_html(comparison: Comparison, report: Report | None) -> str:
         shown=format_metric,
         verdict=describe_against_null,
         number=lambda value, digits=2: "–" if math.isnan(value) else f"{value:.{digits}f}",
-        pairs=[(comparison.pairs[k], _pair_images(comparison, k)) for k in order[:MAX_PAIR_IMAGES]],
-        rest=[comparison.pairs[k] for k in order[MAX_PAIR_IMAGES:]],
+        pairs=[(comparison.pairs[k], _pair_images(comparison, k)) for k in order[:max_pair_images]],
+        rest=[comparison.pairs[k] for k in order[max_pair_images:]],
         nan=math.nan,
     )
 
@@ -191,6 +188,7 @@ def _pair_images(comparison: Comparison, k: int) -> list[tuple[str, str]]:
 def _contact_box(region: NDArray[np.bool_]) -> tuple[slice, slice]:
     """Rows and columns of the largest contact of a region (H, W) and what lies round it; of the whole picture without
     contact."""
+    zoom_margin = 0.3  # of the contact's width, that a zoomed picture shows round it
     from scipy.ndimage import label
 
     parts, _ = label(region)
@@ -199,7 +197,7 @@ def _contact_box(region: NDArray[np.bool_]) -> tuple[slice, slice]:
         return slice(None), slice(None)
     largest = parts == 1 + int(sizes.argmax())
     rows_, columns = (np.flatnonzero(largest.any(axis=axis)) for axis in (1, 0))
-    half = max(8, round((0.5 + ZOOM_MARGIN) * max(np.ptp(rows_), np.ptp(columns))))
+    half = max(8, round((0.5 + zoom_margin) * max(np.ptp(rows_), np.ptp(columns))))
     middles = ((int(one[0]) + int(one[-1])) // 2 for one in (rows_, columns))
     down, across = (slice(max(0, middle - half), middle + half + 1) for middle in middles)
     return down, across
@@ -227,14 +225,16 @@ def _outline_region(picture: Image, region: NDArray[np.bool_]) -> Image:
 
 
 def _data_url(picture: Image) -> str:
+    quality = 85
+    longer_side = 240  # longer side [px]
     import cv2
 
     rows_, columns = picture.shape[:2]
-    scale = THUMBNAIL / max(rows_, columns)
+    scale = longer_side / max(rows_, columns)
     size = (max(1, round(columns * scale)), max(1, round(rows_ * scale)))
     how = cv2.INTER_AREA if scale < 1 else cv2.INTER_NEAREST
     small = cv2.resize(picture, size, interpolation=how)
-    _, data = cv2.imencode(".jpg", small[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    _, data = cv2.imencode(".jpg", small[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
     return data_url(data.tobytes(), "jpeg")
 
 
@@ -255,7 +255,7 @@ def describe_comparison(comparison: Comparison) -> str:
         start = f"Too few pairs to judge how much {a} and {b} look alike in contact"
     elif not error.beats_null:
         start = f"In contact {a} looks no more like {b} than a picture without contact does"
-    elif alike >= CLOSE_CORRELATION and error.mean <= CLOSE_SHARE * error.null:
+    elif alike >= MIN_CLOSE_CORRELATION and error.mean <= MAX_CLOSE_ERROR * error.null:
         start = f"In contact {a} looks like {b}"
     else:
         start = f"In contact {a} resembles {b}, but is not close to it"

@@ -10,15 +10,13 @@ import numpy as np
 from calibration.compare import metrics
 from calibration.compare.alignment import Alignment
 from calibration.compare.surfaces import GRID, SurfaceEstimate, undeformed_surface
+from calibration.compare.tuning import MIN_SWAPPED_GAIN
 from calibration.drift import subtract_drift
 from calibration.frame_set import Frame, FrameSet, frame_warnings
-from tacsim.control.contact_signal import CONTACT_HEIGHT
+from tacsim.control.tuning import MIN_CONTACT_HEIGHT
 from tacsim.interface import Mask
 
 Numbers = dict[str, float]
-
-GRAIN_MARGIN = 5  # of a contact's border, whose edge would pass for grain [px]
-SWAPPED_GAIN = 0.2  # of the correlation, by red and blue exchanged, that makes them look swapped
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,10 +93,11 @@ class Scorer:
 
     def _grain_deviations(self, change: metrics.Picture, region: Mask) -> Numbers:
         """How grainy a change of colour is, beside a contact `region` and in it, border left out [grey levels]."""
+        grain_margin = 5  # of a contact's border, whose edge would pass for grain [px]
         from scipy.ndimage import binary_dilation, binary_erosion
 
-        beside = self._covered & ~binary_dilation(region, iterations=GRAIN_MARGIN)
-        inside = binary_erosion(region, iterations=GRAIN_MARGIN)
+        beside = self._covered & ~binary_dilation(region, iterations=grain_margin)
+        inside = binary_erosion(region, iterations=grain_margin)
         return {
             "grain": metrics.grain_deviation(change, beside),
             "contact_grain": metrics.grain_deviation(change, inside),
@@ -107,7 +106,7 @@ class Scorer:
     def _score_surfaces(self, a: SurfaceEstimate, b: SurfaceEstimate, other_surface: SurfaceEstimate) -> Numbers:
         """Of A's surface against B's, where B or `other_surface` is pressed."""
         pressed_a, pressed_b, of_shown = (
-            metrics.pressed_region(t.height, CONTACT_HEIGHT) for t in (a, b, other_surface)
+            metrics.pressed_region(t.height, MIN_CONTACT_HEIGHT) for t in (a, b, other_surface)
         )
         pressed = _contact_regions(pressed_a, pressed_b)
         no_flow = a.flow is None or b.flow is None or a.flow.shape != b.flow.shape
@@ -121,7 +120,7 @@ class Scorer:
     def swap_warning(self) -> list[str]:
         """A warning if the pairs agree better with red and blue exchanged."""
         plain, swapped = (float(np.mean(values)) if values else 0.0 for values in (self._plain, self._swapped))
-        if swapped > 0.5 and swapped > plain + SWAPPED_GAIN:
+        if swapped > 0.5 and swapped > plain + MIN_SWAPPED_GAIN:
             return [
                 f"red and blue look swapped in {' or '.join(self.names)}: exchanged they correlate by {swapped:.2f}, "
                 f"as they are by {plain:.2f}; OpenCV's pictures are BGR"
@@ -136,7 +135,7 @@ def surface_errors(a: SurfaceEstimate, b: SurfaceEstimate, where: Mask, pressed:
     return {
         "gradient_angle": metrics.mean_normal_angle(a.gradient, b.gradient, where),
         "height_rmse": error,
-        "height_share": error / deepest if deepest > CONTACT_HEIGHT else math.nan,
+        "height_share": error / deepest if deepest > MIN_CONTACT_HEIGHT else math.nan,
     }
 
 

@@ -12,17 +12,12 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.height.tuning import COLOUR_NOISE, MAX_COLOUR_DISTANCE, MAX_TABLE_SLOPE, SLOPE_PRIOR
 from tacsim.interface import Float32
 from tacsim.models.sensor import Lighting, SensorModel
 from tacsim.optics.render import phong_shading, untouched_image
 
-MAX_SLOPE = 1.5  # along each axis [-]
-SLOPE_STEP = 0.02  # between the slopes at which the light is evaluated [-]
 TABLE_CELLS = 48  # along each colour
-COLOUR_NOISE = 0.02  # standard deviation of the relative change of colour: a camera's noise [-]
-SLOPE_PRIOR = 0.5  # standard deviation of slopes: where colours do not decide, the smaller slope is likelier [-]
-MAX_COLOUR_DISTANCE = 0.2  # between a colour and the nearest that the light can make; beyond, no slope has it [-]
-TABLE_MARGIN = 0.08  # of the table beyond the colours of its light [-]
 
 
 class GradientModel(Protocol):
@@ -67,8 +62,8 @@ class ColourTable:
             part *= colour
             slope += part
         steep = np.abs(slope)
-        beyond |= np.maximum(steep[0], steep[1]) > MAX_SLOPE
-        np.clip(slope, -MAX_SLOPE, MAX_SLOPE, out=slope)
+        beyond |= np.maximum(steep[0], steep[1]) > MAX_TABLE_SLOPE
+        np.clip(slope, -MAX_TABLE_SLOPE, MAX_TABLE_SLOPE, out=slope)
         beyond |= self.off_gamut.take(flat).reshape(shape)
         return np.moveaxis(slope, 0, -1), beyond
 
@@ -88,11 +83,13 @@ def table_of_lighting(lighting: Lighting, background: tuple[float, float, float]
     Where the light does not tell slopes apart (a flank turned away from all lights but one), the smallest one wins.
     Raises ValueError for a light that cannot be inverted: its colour does not change with the slope along both axes.
     """
+    colour_margin = 0.08  # of the table beyond the colours of its light [-]
+    slope_step = 0.02  # between the slopes at which the light is evaluated [-]
     base = np.array(background, dtype=np.float32)
     if not (base > 0).all():
         raise ValueError(f"lighting: the untouched gel is black in a channel {background}; no change is relative to it")
-    steps = round(MAX_SLOPE / SLOPE_STEP)
-    line = (np.arange(-steps, steps + 1) * SLOPE_STEP).astype(np.float32)
+    steps = round(MAX_TABLE_SLOPE / slope_step)
+    line = (np.arange(-steps, steps + 1) * slope_step).astype(np.float32)
     slopes = np.stack(np.meshgrid(line, line), axis=-1)
     flat = phong_shading(np.zeros((1, 1, 2), dtype=np.float32), lighting)
 
@@ -101,17 +98,17 @@ def table_of_lighting(lighting: Lighting, background: tuple[float, float, float]
         return relative
 
     colours = colours_at(slopes)
-    shifts = np.eye(2, dtype=np.float32) * np.float32(SLOPE_STEP / 2)
+    shifts = np.eye(2, dtype=np.float32) * np.float32(slope_step / 2)
     by_slope = (
-        np.stack([colours_at(slopes + shift) - colours_at(slopes - shift) for shift in shifts], axis=-1) / SLOPE_STEP
+        np.stack([colours_at(slopes + shift) - colours_at(slopes - shift) for shift in shifts], axis=-1) / slope_step
     )
     if float(np.linalg.svd(by_slope[steps, steps], compute_uv=False)[1]) < COLOUR_NOISE / SLOPE_PRIOR:
         raise ValueError(
             "lighting: the colour of the gel does not tell its slope along both axes, so no height can be found; "
             "it needs lights from at least two sides, in different colours"
         )
-    low = colours.min(axis=(0, 1)) - TABLE_MARGIN
-    scale = TABLE_CELLS / (colours.max(axis=(0, 1)) + TABLE_MARGIN - low)
+    low = colours.min(axis=(0, 1)) - colour_margin
+    scale = TABLE_CELLS / (colours.max(axis=(0, 1)) + colour_margin - low)
     lines = ((np.arange(TABLE_CELLS) + 0.5)[:, None] / scale + low).T
     middles = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 3)
     nearest, off_gamut = _most_likely_slope(colours.reshape(-1, 3), slopes.reshape(-1, 2), middles)

@@ -7,8 +7,6 @@ import numpy as np
 from tacsim.interface import Float32, Mask
 from tacsim.models.photometric import DarknessModel
 
-SMOOTHING_DEVIATION = 1.0  # standard deviation of the Gaussian that takes off noise [px]
-
 
 class DarknessSlopes:
     """The inverse of a darkness model on pictures of one shape: the table gives the depth beyond a share of that round
@@ -16,10 +14,11 @@ class DarknessSlopes:
 
     def __init__(self, model: DarknessModel, shape: tuple[int, int], pitch: float) -> None:
         """`shape`: rows, columns; `pitch`: distance of two pixels, in the model's unit."""
+        smoothing_width = 1.0  # standard deviation of the Gaussian that takes off noise [px]
         waves = [np.pi * np.arange(count) / count for count in shape]
         square = waves[0][:, None] ** 2 + waves[1][None, :] ** 2  # [1 / px^2]
         round_it = model.share * np.exp(-square / 2 * (model.reach / pitch) ** 2)
-        self._filter = (np.exp(-square / 2 * SMOOTHING_DEVIATION**2) / (1.0 - round_it)).astype(np.float32)
+        self._filter = (np.exp(-square / 2 * smoothing_width**2) / (1.0 - round_it)).astype(np.float32)
         self._depths = np.array(model.depths) / pitch
         self._darkness = -np.array(model.changes).mean(axis=1)
 

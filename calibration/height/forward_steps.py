@@ -18,18 +18,9 @@ from collections.abc import Callable
 import numpy as np
 
 from calibration.height.integration import slopes_of
-from calibration.height.slope_polynomial import MAX_EXTRAPOLATION
+from calibration.height.tuning import MAX_CERTAIN_ERROR, MAX_EXTRAPOLATION, MIN_CONTACT_CHANGE, PRIOR_WEIGHT
 from tacsim.interface import Float32, Mask
 from tacsim.models.photometric import PhotometricLight, PhotometricModel, horizon_slope
-
-STEPS = 3
-PRIOR_WEIGHT = 0.4  # (error of colour that is usual / error of slope that is usual)^2
-MAX_CERTAIN_ERROR = 0.2  # error of colour from which on a channel counts little [-]
-MIN_CONTACT_CHANGE = (
-    0.1  # relative change of colour, below which a pixel keeps the inverse's slope: little to gain there
-)
-SLOPE_DELTA = 0.02  # step of finite differences of colour by slope [-]
-PIXELS_PER_ROW = 256  # pixels that are evaluated at a time
 
 
 class ForwardSteps:
@@ -53,15 +44,15 @@ class ForwardSteps:
     ) -> Float32:
         """The better height (H, W) for relative changes (3, H, W); pixels that are `hidden` (H, W) tell nothing.
         `integrate`: slopes (H, W, 2) -> height, in the unit of `pitch`."""
+        step_count = 3
+        chunk = 256  # pixels that are evaluated at a time
         seen = np.flatnonzero((np.abs(change).max(axis=0) > MIN_CONTACT_CHANGE) & ~hidden)
         if not len(seen):
             return height
-        rows = np.resize(
-            seen, (-(-len(seen) // PIXELS_PER_ROW), PIXELS_PER_ROW)
-        )  # the last row is filled up with pixels of the first
+        rows = np.resize(seen, (-(-len(seen) // chunk), chunk))  # the last row is filled up with pixels of the first
         colour = [plane.ravel()[rows] for plane in change]
         place = self._u[rows], self._v[rows]
-        for _ in range(STEPS):
+        for _ in range(step_count):
             slopes = np.stack(slopes_of(height, self._pitch), axis=-1)
             flat = slopes.reshape(-1, 2)
             relative = height * self._scale
@@ -78,10 +69,11 @@ class ForwardSteps:
         shadow_change: Float32 | None,
     ) -> Float32:
         """(..., 2) slopes after a Gauss-Newton step from those of the surface, at places u, v, height."""
-        steps = np.float32(SLOPE_DELTA) * np.array([[0, 0], [1, 0], [0, 1]], dtype=np.float32)
+        slope_step = 0.02  # step of finite differences of colour by slope [-]
+        steps = np.float32(slope_step) * np.array([[0, 0], [1, 0], [0, 1]], dtype=np.float32)
         slopes = slope + steps.reshape(3, *(1,) * (slope.ndim - 1), 2)
         here, at_x, at_y = self._light.change(slopes, *(np.broadcast_to(each, slopes.shape[:-1]) for each in place))[0]
-        by_x, by_y = (at_x - here) / np.float32(SLOPE_DELTA), (at_y - here) / np.float32(SLOPE_DELTA)
+        by_x, by_y = (at_x - here) / np.float32(slope_step), (at_y - here) / np.float32(slope_step)
         if shadow_change is not None:
             here = here + shadow_change
         xx = yy = np.full_like(colour[0], PRIOR_WEIGHT)

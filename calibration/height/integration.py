@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from calibration.height.tuning import RIM_WIDTH
 from tacsim.interface import Float32
-
-RIM_WIDTH = 0.5e-3  # width of the band along the border of the view that counts as untouched [m]
 
 
 class Integrator:

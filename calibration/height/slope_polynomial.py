@@ -13,14 +13,13 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
+from calibration.height.tuning import MAX_EXTRAPOLATION
 from tacsim.interface import Float32, FloatArray, Mask
 from tacsim.models.quantity import Config
 
 DEGREE = 3
 TERMS = 56
 COLOUR_SCALE = 2.4  # brings changes of colour to about -2..2, the size of x and y
-MAX_EXTRAPOLATION = 1.1  # slopes reach up to this times the steepest calibrated one
-RIDGE = 1e-6  # ridge weight per pixel
 
 Weight = Annotated[float, Field(allow_inf_nan=False)]
 
@@ -94,13 +93,14 @@ def fit_inverse(sets: Sequence[tuple[FloatArray, FloatArray]], *, with_position:
     """(TERMS, 2) weights from normal equations, one pair (TERMS, TERMS), (TERMS, 2) a press; without `with_position`
     those of all terms in x and y are 0. Those without colour always are: no change is no slope, wherever it is. The
     ridge grows with the number of pixels, which the first diagonal element counts."""
+    ridge_weight = 1e-6  # ridge weight per pixel
     use = np.array(
         [i for i, (colour, axes) in enumerate(_polynomial_terms()) if colour and (with_position or not axes)]
     )
     square = sum((s[np.ix_(use, use)] for s, _ in sets), np.zeros((len(use), len(use))))
     right = sum((r[use] for _, r in sets), np.zeros((len(use), 2)))
     weights = np.zeros((TERMS, 2))
-    weights[use] = np.linalg.solve(square + RIDGE * square[0, 0] * np.eye(len(use)), right)
+    weights[use] = np.linalg.solve(square + ridge_weight * square[0, 0] * np.eye(len(use)), right)
     return weights
 
 

@@ -18,15 +18,11 @@ from calibration.drift import PIXEL_STRIDE, DriftFinder, max_mean_change
 from calibration.height.colour_table import GradientModel
 from calibration.height.forward_steps import ForwardSteps
 from calibration.height.integration import Integrator, slopes_of
+from calibration.height.tuning import MAX_INK_LEVEL
 from calibration.lens.rectification import visible_box
 from tacsim.interface import Float32, Mask
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.optics.grid import PixelGrid, canonical_image
-
-MAX_INK_LEVEL = 0.6  # a printed dot is darker in all channels, relative to the mean of the gel [-]
-DOT_RIM = 1  # width of the blurred edge of a dot [px]
-FILL_WIDTH = 1.5  # slopes under a dot are the mean of those around, weighted by a Gaussian of this deviation [px]
-COLOUR_STEP = 0.02  # of the finite differences of slope by colour [-]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -165,30 +161,33 @@ def canonical_part(picture: NDArray[Any], grid: CanonicalGrid) -> NDArray[Any]:
 
 def _ink_mask(relative: Float32) -> Mask:
     """(H, W) where an image (3, H, W) relative to the mean of the gel shows a printed dot."""
+    dot_rim = 1  # width of the blurred edge of a dot [px]
     import cv2
 
     dark = (np.maximum(np.maximum(relative[0], relative[1]), relative[2]) < MAX_INK_LEVEL).view(np.uint8)
-    side = 2 * DOT_RIM + 1
+    side = 2 * dot_rim + 1
     return np.asarray(cv2.dilate(dark, np.ones((side, side), dtype=np.uint8))).view(np.bool_)
 
 
 def _slope_response(slopes: GradientModel, shape: tuple[int, int]) -> Float32:
     """(n, 2, 3) derivative of the slope by colour, at every STRIDE-th row and column."""
+    colour_step = 0.02  # of the finite differences of slope by colour [-]
     answers = []
     for channel in range(3):
         change = np.zeros((*shape, 3), dtype=np.float32)
-        change[..., channel] = COLOUR_STEP
+        change[..., channel] = colour_step
         up, down = slopes(change)[0], slopes(-change)[0]
-        answers.append(((up - down) / (2 * COLOUR_STEP))[::PIXEL_STRIDE, ::PIXEL_STRIDE].reshape(-1, 2))
+        answers.append(((up - down) / (2 * colour_step))[::PIXEL_STRIDE, ::PIXEL_STRIDE].reshape(-1, 2))
     return np.stack(answers, axis=-1)
 
 
 def _fill_hidden(slopes: tuple[Float32, Float32], hidden: Mask) -> None:
     """Sets planes of slopes (H, W) in the hidden pixels to a weighted mean of those around."""
+    fill_width = 1.5  # slopes under a dot are the mean of those around, weighted by a Gaussian of this deviation [px]
     import cv2
 
     known = (~hidden).astype(np.float32)
-    total = np.maximum(cv2.GaussianBlur(known, (0, 0), FILL_WIDTH), np.float32(1e-6))
+    total = np.maximum(cv2.GaussianBlur(known, (0, 0), fill_width), np.float32(1e-6))
     for slope in slopes:
-        around = cv2.GaussianBlur(slope * known, (0, 0), FILL_WIDTH)
+        around = cv2.GaussianBlur(slope * known, (0, 0), fill_width)
         np.copyto(slope, around / total, where=hidden)

@@ -13,15 +13,9 @@ from typing import Any
 import numpy as np
 
 from calibration.errors import CalibrationError
+from calibration.lens.tuning import MAX_OUTER_DOT_SHARE, MAX_SAME_POINT_DISTANCE, MIN_DOT_CONTRAST
 from tacsim.interface import FloatArray, Image
 from tacsim.models.quantity import parse_quantity
-
-DOT_BLURS = (2.0, 3.0, 5.0, 8.0, 12.0)  # standard deviations of the blurs that are tried, for dots of any size [px]
-MAX_POINTS = 100  # along a board
-MIN_CORNERS = 6  # of a ChArUco board
-MAX_OUTER_DOT_SHARE = 0.5  # share of a border with further dots beyond it: more, and the board is larger than said
-MIN_CONTRAST = 0.4  # of a dot's pixels, share of its maximum
-MAX_SAME_POINT_DISTANCE = 0.35  # distance of two points at the same place [distance of neighbours]
 
 
 class BadBoard(CalibrationError):
@@ -54,6 +48,7 @@ class Points:
 
 def parse_board(text: str) -> Board:
     """`dots:COLUMNSxROWS:PITCH` or `charuco:COLUMNSxROWS:SQUARE:MARKER[:DICTIONARY]`. Raises BadBoard."""
+    max_points = 100  # along a board
     parts = [part.strip() for part in text.split(":")]
     size = re.fullmatch(r"(\d+)\s*x\s*(\d+)", parts[1]) if len(parts) > 1 else None
     lengths = parts[2:4] if parts[0] == "charuco" else parts[2:3]
@@ -64,8 +59,8 @@ def parse_board(text: str) -> Board:
             "charuco:COLUMNSxROWS:SQUARE:MARKER[:DICTIONARY], such as 'charuco:8x6:3 mm:2.2 mm:DICT_4X4_50'"
         )
     columns, rows = int(size[1]), int(size[2])
-    if not (3 <= columns <= MAX_POINTS and 3 <= rows <= MAX_POINTS):
-        raise BadBoard(f"'{text}': {columns} x {rows}; allowed: 3 to {MAX_POINTS} each way")
+    if not (3 <= columns <= max_points and 3 <= rows <= max_points):
+        raise BadBoard(f"'{text}': {columns} x {rows}; allowed: 3 to {max_points} each way")
     try:
         metres = [parse_quantity(length, "length") for length in lengths]
     except ValueError as error:
@@ -90,13 +85,14 @@ def find_board(image: Image, board: Board, reference: Image | None = None) -> Po
 
 
 def _find_dots(image: Image, board: Board, reference: Image | None) -> Points:
+    blurs = (2.0, 3.0, 5.0, 8.0, 12.0)  # standard deviations of the blurs that are tried, for dots of any size [px]
     import cv2
 
     grey = image.mean(axis=2, dtype=np.float32)
     if reference is not None:
         grey -= reference.mean(axis=2, dtype=np.float32)
     most = 0
-    for scale in DOT_BLURS:
+    for scale in blurs:
         around = cv2.GaussianBlur(grey, (0, 0), 3.0 * scale)
         contrast = np.asarray(around - cv2.GaussianBlur(grey, (0, 0), scale), dtype=np.float64)
         found = _find_dot_lattice(contrast, board)
@@ -191,7 +187,7 @@ def _refine_centres(contrast: FloatArray, lattice: FloatArray) -> FloatArray:
             patch = cv2.getRectSubPix(
                 contrast.astype(np.float32), (2 * side + 1, 2 * side + 1), (float(place[0]), float(place[1]))
             )
-            weight = np.maximum(np.asarray(patch, dtype=np.float64) - MIN_CONTRAST * float(patch.max()), 0.0)
+            weight = np.maximum(np.asarray(patch, dtype=np.float64) - MIN_DOT_CONTRAST * float(patch.max()), 0.0)
             rows, columns = np.mgrid[-side : side + 1, -side : side + 1]
             move = np.array([(weight * columns).sum(), (weight * rows).sum()]) / max(float(weight.sum()), 1e-12)
             place = place + move
@@ -215,6 +211,7 @@ def _charuco_board(board: Board) -> Any:
 
 
 def _find_charuco(image: Image, board: Board) -> Points:
+    min_corners = 6  # of a ChArUco board
     import cv2
 
     printed = _charuco_board(board)
@@ -222,11 +219,11 @@ def _find_charuco(image: Image, board: Board) -> Points:
     found: Any = cv2.aruco.CharucoDetector(printed).detectBoard(grey)
     corners, names, _, markers = found  # each None where nothing is seen
     count = 0 if names is None else len(names)
-    if count < MIN_CORNERS:
+    if count < min_corners:
         seen = 0 if markers is None else len(markers)
         raise BadBoard(
             f"the board ({board}, {board.dictionary}) is not found: {count} of its corners and {seen} markers are "
-            f"seen, {MIN_CORNERS} corners are needed. Is it this board, and in focus?"
+            f"seen, {min_corners} corners are needed. Is it this board, and in focus?"
         )
     every = np.asarray(printed.getChessboardCorners(), dtype=np.float64)[:, :2]
     order = np.ravel(names)

@@ -19,9 +19,6 @@ from tacsim.models.geometry import PictureRegion
 from tacsim.models.sensor import SensorGeometry
 from tacsim.optics.grid import PixelGrid, image_grid
 
-MIN_REGION = 0.02  # of a picture, that a region must enclose
-MAX_LOOKUPS_PER_SIDE = 16  # look-ups along each side of one canonical pixel
-
 
 @dataclass(frozen=True, eq=False)
 class Rectification:
@@ -91,6 +88,7 @@ class Rectification:
 def region_mask(region: PictureRegion, image_shape: tuple[int, int]) -> NDArray[np.bool_]:
     """(rows, columns) pixels inside a polygon. Raises BadCorners for one that encloses hardly any pixel, or that
     reaches beyond the picture."""
+    min_region = 0.02  # of a picture, that a region must enclose
     import cv2
 
     rows, columns = image_shape
@@ -99,7 +97,7 @@ def region_mask(region: PictureRegion, image_shape: tuple[int, int]) -> NDArray[
             raise BadCorners(f"region: its corner {u:g},{v:g} lies beyond the picture of {columns} x {rows} px")
     shown = np.zeros(image_shape, dtype=np.uint8)
     cv2.fillPoly(shown, [np.rint(np.array(region, dtype=np.float64)).astype(np.int32)], 1)
-    if np.count_nonzero(shown) < MIN_REGION * shown.size:
+    if np.count_nonzero(shown) < min_region * shown.size:
         raise BadCorners(
             f"region {region!r} encloses {np.count_nonzero(shown)} of the picture's {columns} x {rows} px; give its "
             "corners one after the other [px, u to the right, v down]"
@@ -193,9 +191,10 @@ def _lookups_per_side(pixels: NDArray[np.float64]) -> int:
 
 
 def _limit_lookups(factor: int) -> int:
-    if factor > MAX_LOOKUPS_PER_SIDE:
+    max_lookups_per_side = 16  # look-ups along each side of one canonical pixel
+    if factor > max_lookups_per_side:
         raise ValueError(
-            f"the native image has {factor} pixels along one canonical pixel, at most {MAX_LOOKUPS_PER_SIDE} are "
+            f"the native image has {factor} pixels along one canonical pixel, at most {max_lookups_per_side} are "
             "averaged; "
             "check the gel's size and the canonical pitch [m]"
         )

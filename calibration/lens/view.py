@@ -15,6 +15,7 @@ import numpy as np
 
 from calibration.errors import CalibrationError
 from calibration.lens.board import Points
+from calibration.lens.tuning import MAX_FOCAL_DEVIATION, MAX_PLANE_MISFIT, MAX_RESIDUAL, MIN_REDUCTION
 from tacsim import pose as se3
 from tacsim.interface import FloatArray, Pose
 from tacsim.models.geometry import GelView as GelView
@@ -22,16 +23,8 @@ from tacsim.models.geometry import Lens as Lens
 from tacsim.models.geometry import Pair, ray_slopes
 
 MIN_PICTURES = 6  # for a lens
-MAX_RESIDUAL = 1.5  # of a lens, root mean square [px]
-MAX_FOCAL_DEVIATION = 0.03  # relative standard deviation of the focal length
 MIN_TILT = np.radians(8.0)  # of the board between pictures, root mean square [rad]
-MAX_MISFIT = 0.06  # of a plane: root mean square over the distance of neighbouring points
-MIN_POINTS = 6  # of a plane
 
-# A light is calibrated at no finer pixels than these: four a cell of the canonical grid, and so many in all
-CALIBRATED_PITCH = 0.25e-3 / 4  # [m]
-CALIBRATED_PIXELS = 160_000
-MIN_REDUCTION = 1.5  # factor of the pixel pitch, below which pictures are taken as they are
 
 Corners = tuple[Pair, Pair, Pair, Pair]
 
@@ -146,8 +139,9 @@ def fit_view(
 
     Raises BadView.
     """
-    if len(points.board) < MIN_POINTS:
-        raise BadView(f"{len(points.board)} points determine no plane; at least {MIN_POINTS} are needed")
+    min_points = 6  # of a plane
+    if len(points.board) < min_points:
+        raise BadView(f"{len(points.board)} points determine no plane; at least {min_points} are needed")
     rows, columns = image_shape
     if lens is not None and (lens.height, lens.width) != image_shape:
         raise BadView(
@@ -162,10 +156,10 @@ def fit_view(
         lens, perspective = _fit_distortion(local, points.image, image_shape)
     missed = lens.project(ray_slopes(perspective, local)) - points.image
     residual = float(np.sqrt((missed**2).sum(axis=1).mean()))
-    if not residual <= MAX_MISFIT * points.spacing:
+    if not residual <= MAX_PLANE_MISFIT * points.spacing:
         raise BadView(
             f"the points lie on no plane that this camera could see: {residual:.2f} px root mean square, where "
-            f"neighbours are {points.spacing:.0f} px apart ({MAX_MISFIT:.0%} at most). Is the board flat on the "
+            f"neighbours are {points.spacing:.0f} px apart ({MAX_PLANE_MISFIT:.0%} at most). Is the board flat on the "
             "gel, and its number of rows and columns right?"
         )
     back: FloatArray = np.asarray(np.linalg.inv(perspective), dtype=np.float64)
@@ -240,9 +234,13 @@ def calibrated_view(view: GelView | None, pitch: float, image_shape: tuple[int, 
     """The view by which pictures of `image_shape` (rows, columns) are calibrated, and its pixel pitch [m]: the given
     ones, or coarser ones for a camera that sees finer than the canonical grid. Then a picture that was metric by itself
     (no view, `pitch` [m]) gets a view, which keeps the size of native pictures."""
+    max_pixels = 160_000
+    # A light is calibrated at no finer pixels than these: four a cell of the canonical grid, and so many in all
+    # [m]
+    finest_pitch = 0.25e-3 / 4
     rows, columns = image_shape
     size = (columns * pitch, rows * pitch) if view is None else view.size
-    needed = max(CALIBRATED_PITCH, math.sqrt(size[0] * size[1] / CALIBRATED_PIXELS))
+    needed = max(finest_pitch, math.sqrt(size[0] * size[1] / max_pixels))
     if needed < MIN_REDUCTION * pitch:
         return view, pitch
     if view is None:

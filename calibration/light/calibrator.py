@@ -26,12 +26,10 @@ from calibration.height.slope_polynomial import (
 )
 from calibration.light.checks.consistency import find_blurred_presses, find_inconsistent_presses, find_reference_contact
 from calibration.light.circle import NoCircle
-from calibration.light.darkness import MAX_DARKNESS_RESIDUAL, find_dark_press, fit_darkness, is_direction_free
+from calibration.light.darkness import find_dark_press, fit_darkness, is_direction_free
 from calibration.light.dent import dent_gradient, dent_height, max_dent_slope
 from calibration.light.fit import LightFit, PressPrediction, compare_with_prediction, normal_angle
 from calibration.light.labels import (
-    BLUR,
-    INVERSE_BLUR,
     contact_and_skirt,
     counted_pixels,
     deepest_dent,
@@ -42,19 +40,26 @@ from calibration.light.labels import (
     inverse_model,
     label_slopes,
 )
-from calibration.light.photometry import (
-    FEW_PRESSES,
-    SLOPE_TERMS,
-    ModelSize,
-    NormalEquations,
-    choose_size,
-    solve_weights,
-)
+from calibration.light.photometry import SLOPE_TERMS, ModelSize, NormalEquations, choose_size, solve_weights
 from calibration.light.press import BallPress, Window, find_press, gaussian_blur, mean_reference_colour
 from calibration.light.press_shapes import find_other_balls, fit_stretch
 from calibration.light.refinement import RefinedGeometry, refine_geometry
 from calibration.light.shadows import DentShade, find_lamps
-from calibration.reference import STALE_COLOUR, is_channel_order_swapped
+from calibration.light.tuning import (
+    FORWARD_BLUR,
+    INVERSE_BLUR,
+    MAX_DARKNESS_RESIDUAL,
+    MAX_FEW_PRESSES,
+    MAX_GOOD_RESIDUAL,
+    MAX_NORMAL_ERROR,
+    MAX_RESIDUAL_RATIO,
+    MAX_RESIDUAL_SHARE,
+    MIN_SHADOW_RESIDUAL,
+    MIN_SPREAD,
+    SHADED_PIXELS,
+)
+from calibration.reference import is_channel_order_swapped
+from calibration.tuning import STALE_COLOUR
 from tacsim.interface import FloatArray, Image
 from tacsim.models.photometric import (
     DEPTH_TERMS,
@@ -64,19 +69,9 @@ from tacsim.models.photometric import (
 )
 from tacsim.optics.render import darken_by_depth
 
-REFINEMENT_PIXELS = 2500  # of each press, about
-MIN_SHADOW_RESIDUAL = 0.02  # share of the change of colour: where slopes leave no more, shadows are not looked for
-REFINEMENT_ROUNDS = 2  # of refining circles and lamps in turn
 SATURATED_ROUNDS = 2  # of telling which saturated pixels are predicted too dark
-SHADED_PIXELS = 1000  # the same with cast shadows, which have nine times the terms
-# A press is left out if the fitted dent leaves more of its change of colour unexplained than the smaller of
-MAX_RESIDUAL_SHARE = 0.5  # share of the change
-MAX_RESIDUAL_RATIO = 5.0  # times the median press's share, with three presses or more; at least MAX_GOOD_RESIDUAL
-MAX_GOOD_RESIDUAL = 0.05  # share of the change: a press that is explained so well always stays
 ORDER_FRAMES = 9  # frames whose median tells the order of colours, at most
-MIN_SPREAD = 0.2  # share of the picture that presses spread over; else nothing is known of the rest
 NO_DIRECTION = "this light tells no direction: all flanks of a dent change alike"
-MAX_NORMAL_ERROR = 8.0  # errors of a press's normals that deserve a warning [degrees]
 
 
 class NoDirection(BadFrames):
@@ -316,7 +311,8 @@ def _fit_shadows(
 ) -> tuple[list[BallPress], RefinedGeometry, DentShade | None]:
     """Where cast shadows are seen: their lamps, and the circles refined with them, which else grow towards the shade
     and take it for skirt. Else what was given, and None."""
-    if len(presses) <= FEW_PRESSES or np.mean(refined.residual_shares) < MIN_SHADOW_RESIDUAL:
+    round_count = 2  # of refining circles and lamps in turn
+    if len(presses) <= MAX_FEW_PRESSES or np.mean(refined.residual_shares) < MIN_SHADOW_RESIDUAL:
         return presses, refined, None
     windows, circles = [_press_window(press, SHADED_PIXELS) for press in presses], refined.circles
     shade = find_lamps(windows, circles, refined.thickness, ball, presses[0].shape)
@@ -327,7 +323,7 @@ def _fit_shadows(
     ]
     if not choose_size(sets).shadows:
         return presses, refined, None
-    for _ in range(REFINEMENT_ROUNDS):  # circles tell where the lamps stand, and the lamps where the circles are
+    for _ in range(round_count):  # circles tell where the lamps stand, and the lamps where the circles are
         refined = refine_geometry(windows, refined.circles, ball, shade, (ball / refined.thickness,))
         shade = find_lamps(windows, refined.circles, refined.thickness, ball, presses[0].shape)
     return [replace(p, circle=c) for p, c in zip(presses, refined.circles, strict=True)], refined, shade
@@ -364,13 +360,13 @@ def _poorly_predicted(predictions: Sequence[PressPrediction]) -> list[str]:
     ]
 
 
-def _press_window(press: BallPress, pixels: int = REFINEMENT_PIXELS) -> Window:
+def _press_window(press: BallPress, pixels: int = 2500) -> Window:
     """Pixels of contact and skirt, thinned out to about so many."""
     v, u = np.nonzero(contact_and_skirt(press))
     thin = max(1, round(np.sqrt(len(u) / pixels)))
     keep = (u % thin == 0) & (v % thin == 0) & press.lit[v, u].all(axis=1)
     u, v = u[keep], v[keep]
-    return Window(u.astype(np.float64), v.astype(np.float64), gaussian_blur(press.change, BLUR)[v, u])
+    return Window(u.astype(np.float64), v.astype(np.float64), gaussian_blur(press.change, FORWARD_BLUR)[v, u])
 
 
 def _predict_press(
@@ -391,7 +387,7 @@ def _predict_press(
     predicted = light.astype(np.float64)
     if forward.shadows is not None:
         predicted += extra_terms[..., DEPTH_TERMS + SLOPE_TERMS :] @ np.array(forward.shadows.weights)
-    predicted = gaussian_blur(predicted, BLUR) * mean
+    predicted = gaussian_blur(predicted, FORWARD_BLUR) * mean
     seen = gaussian_blur(press.change, INVERSE_BLUR).astype(np.float32)
     slopes, _ = PolynomialSlopes(inverse, *(2 * place.astype(np.float64) for place in places))(seen)
     integrate, nothing = Integrator(press.shape, 1.0), np.zeros(press.shape, dtype=np.bool_)

@@ -16,14 +16,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.light.dent import MAX_RIM_RATIO, dent_slope
+from calibration.light.dent import dent_slope
+from calibration.light.tuning import MAX_CONTACT_RATIO, MAX_RIM_RATIO, MIN_CIRCLE_RADIUS, MIN_EXPLAINED_SHARE
 from tacsim.interface import FloatArray
-
-BLUR = 1.5  # of images and of the fitted dent, against noise [px]
-WINDOW_RATIO = 2.0  # half side of what the fit looks at [half widths of the bright patch]
-MIN_RADIUS = 4.0  # of a circle that differs from noise [px]
-MIN_EXPLAINED_SHARE = 0.7  # share of the difference that a ball's dent must explain
-MAX_CONTACT_RATIO = 0.98  # contact radius over the largest that a ball can have, from which a larger ball is tried
 
 
 class NoCircle(ValueError):
@@ -45,6 +40,7 @@ def find_contact_circle(image: NDArray[np.uint8], reference: NDArray[np.uint8], 
 
     Raises ValueError when the two images differ in size, NoCircle when no ball's contact is seen.
     """
+    window_half_side = 2.0  # half side of what the fit looks at [half widths of the bright patch]
     if image.shape != reference.shape:
         raise ValueError(
             f"the image is {image.shape[1]} x {image.shape[0]} px, the one without contact "
@@ -53,12 +49,12 @@ def find_contact_circle(image: NDArray[np.uint8], reference: NDArray[np.uint8], 
     difference = _blur_image(image.astype(np.float64) - reference)
     difference -= np.median(difference, axis=(0, 1))
     x, y, size = _brightest_patch(difference)
-    window = round(WINDOW_RATIO * size) + 6
+    window = round(window_half_side * size) + 6
     columns = np.arange(max(round(x) - window, 0), min(round(x) + window + 1, image.shape[1]))
     rows = np.arange(max(round(y) - window, 0), min(round(y) + window + 1, image.shape[0]))
     observed = np.ascontiguousarray(difference[np.ix_(rows, columns)].reshape(-1, 3).T)
     circle = _fit_circle(observed, columns, rows, (x, y, size), ball_radius)
-    if circle.explained_share >= MIN_EXPLAINED_SHARE and circle.radius >= MIN_RADIUS:
+    if circle.explained_share >= MIN_EXPLAINED_SHARE and circle.radius >= MIN_CIRCLE_RADIUS:
         return circle
     if circle.radius > MAX_CONTACT_RATIO * MAX_RIM_RATIO * ball_radius:
         larger = _fit_circle(observed, columns, rows, (x, y, size), 2 * ball_radius)
@@ -87,7 +83,7 @@ def _fit_circle(
     largest = MAX_RIM_RATIO * ball
 
     def residual_share(guess: FloatArray) -> float:
-        if not MIN_RADIUS / 2 < guess[2] < largest:
+        if not MIN_CIRCLE_RADIUS / 2 < guess[2] < largest:
             return 2.0
         return _residual_share(observed, power, columns - guess[0], rows - guess[1], float(guess[2]), ball)
 
@@ -102,10 +98,11 @@ def _fit_circle(
 
 
 def _blur_image(image: FloatArray) -> FloatArray:
+    blur = 1.5  # of images and of the fitted dent, against noise [px]
     import cv2
 
-    side = 2 * round(4 * BLUR) + 1
-    return np.asarray(cv2.GaussianBlur(image, (side, side), BLUR, borderType=cv2.BORDER_REFLECT), dtype=np.float64)
+    side = 2 * round(4 * blur) + 1
+    return np.asarray(cv2.GaussianBlur(image, (side, side), blur, borderType=cv2.BORDER_REFLECT), dtype=np.float64)
 
 
 def _brightest_patch(difference: FloatArray) -> tuple[float, float, float]:

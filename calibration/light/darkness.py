@@ -17,28 +17,26 @@ import numpy as np
 
 from calibration.errors import BadFrames
 from calibration.light.circle import Circle, NoCircle
-from calibration.light.dent import MAX_RADIUS_RATIO, MAX_RIM_RATIO, ContactCircle, depth_profile
-from calibration.light.photometry import FEW_PRESSES
+from calibration.light.dent import ContactCircle, depth_profile
 from calibration.light.press import BallPress, gaussian_blur, make_press, mean_reference_colour
-from calibration.light.refinement import FIRST_THINNESS, MAX_ALTERNATIVE_COST, MAX_GROUPS, THINNESS_BOUNDS
+from calibration.light.refinement import MAX_GROUPS
+from calibration.light.tuning import (
+    DARKNESS_BLUR,
+    FIRST_THINNESS,
+    MAX_ALTERNATIVE_COST,
+    MAX_DARKNESS_RESIDUAL,
+    MAX_FEW_PRESSES,
+    MAX_RADIUS_RATIO,
+    MAX_RIM_RATIO,
+    MAX_UNIFORM_SHARE,
+    MIN_DARK_CONTRAST,
+    PRESS_RADIUS,
+    THINNESS_BOUNDS,
+)
 from tacsim.interface import FloatArray, Image
 from tacsim.models.photometric import DarknessModel
 
-MAX_UNIFORM_SHARE = (
-    0.6  # share of the power of a press's change that is the same all round, above which no direction is told
-)
-FLANK_RADIUS = 2.5  # up to where it is looked at [contact radii]: a flank's neighbours are there, too
-BLUR = 2.0  # through which the darkness of presses is looked at [px]
-MIN_CONTRAST = 0.03  # relative change of colour in the middle of a contact
-EDGE_RATIO = 1.3  # contact radius over the radius where a press is half as dark as in its middle, about
-PRESS_RADIUS = 3.0  # a press changes the gel up to here [contact radii]
-PIXELS = 1200  # of each press, about
-STEP = 1 / 30  # of radii [ball radii]
-START = (0.3, 0.4)  # share, reach [ball radii] that the search starts from
 BOUNDS = ((0.0, 0.05), (0.8, 1.5))  # of share, reach
-KNOTS = 24  # of the table
-MIN_SLOPE_RATIO = 0.01  # least slope of the table, over its mean
-MAX_DARKNESS_RESIDUAL = 0.1  # share of darkness that is no function of a dent's depth, at most; 0.003 on real frames
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,22 +53,24 @@ class DarknessFit:
 
 def rough_contact(change: FloatArray) -> ContactCircle:
     """Where a change of colour (H, W, 3) is strongest. Raises NoCircle."""
+    edge_ratio = 1.3  # contact radius over the radius where a press is half as dark as in its middle, about
     import cv2
 
-    strength = np.abs(gaussian_blur(change, BLUR)).mean(axis=2)
+    strength = np.abs(gaussian_blur(change, DARKNESS_BLUR)).mean(axis=2)
     peak = float(strength.max())
-    if not peak > MIN_CONTRAST:
+    if not peak > MIN_DARK_CONTRAST:
         raise NoCircle(f"no ball's contact is seen: colours change by {peak:.1%} at most")
     _, patches = cv2.connectedComponents((strength > peak / 2).astype(np.uint8))
     numbers = np.asarray(patches, dtype=np.intp)
     inside = numbers == numbers.ravel()[strength.argmax()]
     v, u = np.nonzero(inside)
-    return ContactCircle(float(u.mean()), float(v.mean()), EDGE_RATIO * float(np.sqrt(len(u) / np.pi)))
+    return ContactCircle(float(u.mean()), float(v.mean()), edge_ratio * float(np.sqrt(len(u) / np.pi)))
 
 
 def is_direction_free(changes: Iterable[FloatArray]) -> bool:
     """True where most changes of colour (H, W, 3) are the same all round their contacts, in each channel: what is
     strongest may be one flank alone, which in its own colour is round too, and not in the others."""
+    looked_at = 2.5  # up to where it is looked at [contact radii]: a flank's neighbours are there, too
     shares = []
     for raw in changes:
         change = raw - np.median(raw, axis=(0, 1))
@@ -80,10 +80,10 @@ def is_direction_free(changes: Iterable[FloatArray]) -> bool:
             continue
         v, u = np.mgrid[: change.shape[0], : change.shape[1]]
         distance = np.hypot(u - circle.x, v - circle.y)
-        near = distance < FLANK_RADIUS * circle.radius
+        near = distance < looked_at * circle.radius
         rings = (distance[near] * (12 / circle.radius)).astype(np.intp)
         count = np.maximum(np.bincount(rings), 1)
-        observed = gaussian_blur(change, BLUR)[near]
+        observed = gaussian_blur(change, DARKNESS_BLUR)[near]
         means = np.stack([np.bincount(rings, channel) / count for channel in observed.T])
         shares.append(float(((count * means**2).sum(axis=1) / np.maximum((observed**2).sum(axis=0), 1e-300)).min()))
     return bool(shares) and float(np.median(shares)) > MAX_UNIFORM_SHARE
@@ -166,8 +166,9 @@ class _Problem:
         self._features = functools.lru_cache(maxsize=8 * len(presses) + 8)(self._new_features)
 
     def start(self, thinness: float) -> FloatArray:
+        first_guess = (0.3, 0.4)  # share, reach [ball radii] that the search starts from
         circles = [number for p in self.presses for number in (p.circle.x, p.circle.y, p.circle.radius)]
-        return np.array([*circles, thinness, *START])
+        return np.array([*circles, thinness, *first_guess])
 
     def refined(self, start: FloatArray) -> tuple[FloatArray, float]:
         """The least near `start`, and its cost."""
@@ -219,7 +220,7 @@ class _Problem:
     def _new_features(self, i: int, at: tuple[float, ...]) -> FloatArray:
         deep = self.local_depth(i, np.array([*([0.0] * 3 * i), *at])) / self._ball
         above, below = np.maximum(deep, 0.0), np.minimum(deep, 0.0)
-        return np.stack([above, below, above**2][: 3 if len(self.presses) > FEW_PRESSES else 2], axis=-1)
+        return np.stack([above, below, above**2][: 3 if len(self.presses) > MAX_FEW_PRESSES else 2], axis=-1)
 
     def _residual(self, at: FloatArray) -> FloatArray:
         shared = tuple(map(float, at[-3:]))
@@ -237,16 +238,18 @@ def _log_ratio(one: FloatArray, other: FloatArray, *, signed: bool = False) -> f
 
 
 def _press_window(press: BallPress) -> _Window:
+    pixels_of_press = 1200  # of each press, about
     v, u = np.nonzero((press.distance() < PRESS_RADIUS * press.circle.radius) & press.lit.all(axis=2))
-    thin = max(1, round(np.sqrt(len(u) / PIXELS)))
+    thin = max(1, round(np.sqrt(len(u) / pixels_of_press)))
     keep = (u % thin == 0) & (v % thin == 0)
     u, v = u[keep], v[keep]
-    return _Window(u.astype(np.float64), v.astype(np.float64), gaussian_blur(press.change, BLUR)[v, u])
+    return _Window(u.astype(np.float64), v.astype(np.float64), gaussian_blur(press.change, DARKNESS_BLUR)[v, u])
 
 
 @functools.cache
 def _profile_radii() -> FloatArray:
-    return np.arange(0.0, MAX_RADIUS_RATIO, STEP)
+    radius_step = 1 / 30  # of radii [ball radii]
+    return np.arange(0.0, MAX_RADIUS_RATIO, radius_step)
 
 
 @functools.lru_cache(maxsize=64)
@@ -272,12 +275,14 @@ def _leave_one_out(parts: Sequence[FloatArray], i: int) -> list[FloatArray]:
 def _fit_table(depths: Sequence[FloatArray], observed: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
     """Knots (k,) and changes (k, 3) that fall from each to the next and are 0 at depth 0: the least squares of changes
     `observed` (n, 3) at `depths` (n,) by non-negative steps. Raises BadFrames where nothing falls."""
+    min_slope = 0.01  # least slope of the table, over its mean
+    knot_count = 24  # of the table
     from scipy.optimize import nnls
 
     deep, change = np.concatenate(depths), np.concatenate(observed)
     lowest, highest = min(float(deep.min()), -1e-3 * float(deep.max())), float(deep.max())
-    below = max(2, round(KNOTS * -lowest / (highest - lowest)))
-    knots = np.concatenate([np.linspace(lowest, 0.0, below + 1), np.linspace(0.0, highest, KNOTS + 1)[1:]])
+    below = max(2, round(knot_count * -lowest / (highest - lowest)))
+    knots = np.concatenate([np.linspace(lowest, 0.0, below + 1), np.linspace(0.0, highest, knot_count + 1)[1:]])
     low, high = knots[:-1], knots[1:]
     ramps = np.clip((deep[:, None] - low) / (high - low), 0.0, 1.0) - (low < 0)  # 0 at depth 0
     square, right = ramps.T @ ramps, ramps.T @ change
@@ -286,7 +291,7 @@ def _fit_table(depths: Sequence[FloatArray], observed: Sequence[FloatArray]) -> 
     total = steps.sum(axis=0)
     if not (total > 0).all():
         raise BadFrames("how dark it is does not grow with the depth")
-    steps = np.maximum(steps, MIN_SLOPE_RATIO * total * ((high - low) / (highest - lowest))[:, None])
+    steps = np.maximum(steps, min_slope * total * ((high - low) / (highest - lowest))[:, None])
     changes = -np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
     return knots, changes - changes[below]
 

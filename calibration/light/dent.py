@@ -19,13 +19,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from calibration.light.tuning import MAX_RADIUS_RATIO
 from tacsim.interface import FloatArray
-
-MAX_RIM_RATIO = 0.98  # contact radius over ball radius; the slope is infinite at 1
-POISSON = 0.48  # of silicone; between 0.45 and 0.495 the slope changes by 2 % of that at the circle
-MAX_RADIUS_RATIO = 6.0  # up to which a dent is followed [ball radii]
-RADIUS_STEP = 0.25  # of the radii at which a blurred slope is found [px]
-DEPTH_STEP = 1.0  # of those at which the depth is found [px]
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,9 +62,10 @@ def layer_slope(distance: FloatArray, thinness: float) -> FloatArray:
 def _layer_quadrature() -> tuple[FloatArray, FloatArray]:
     """Numbers of waves over one thickness, and how much less than a half-space a layer answers, times the weights of
     Gauss's quadrature."""
+    nu = 0.48  # of silicone; between 0.45 and 0.495 the slope changes by 2 % of that at the circle
     x, weights = np.polynomial.legendre.leggauss(48)
-    q, soft = 5.0 * (x + 1), 3 - 4 * POISSON  # beyond 10 the difference is 1e-7
-    answer = (soft * np.sinh(2 * q) - 2 * q) / (soft * np.cosh(2 * q) + 2 * q * q + 5 - 12 * POISSON + 8 * POISSON**2)
+    q, soft = 5.0 * (x + 1), 3 - 4 * nu  # beyond 10 the difference is 1e-7
+    answer = (soft * np.sinh(2 * q) - 2 * q) / (soft * np.cosh(2 * q) + 2 * q * q + 5 - 12 * nu + 8 * nu**2)
     return q, 5.0 * weights * (1 - answer)
 
 
@@ -97,15 +93,16 @@ def dent_gradient(
 
     Raises ValueError for a circle as large as the ball.
     """
+    radius_step = 0.25  # of the radii at which a blurred slope is found [px]
     dx, dy = u - circle.x, v - circle.y
     r = np.hypot(dx, dy)
     if blur == 0:
         slope = dent_slope(r, circle.radius, ball, thickness)
     else:
-        reach = np.arange(0.0, float(r.max(initial=0.0)) + 4 * blur + 2 * RADIUS_STEP, RADIUS_STEP)
+        reach = np.arange(0.0, float(r.max(initial=0.0)) + 4 * blur + 2 * radius_step, radius_step)
         profile = dent_slope(reach, circle.radius, ball, thickness)
-        side = round(4 * blur / RADIUS_STEP)
-        kernel = np.exp(-((np.arange(-side, side + 1) * RADIUS_STEP / blur) ** 2) / 2)
+        side = round(4 * blur / radius_step)
+        kernel = np.exp(-((np.arange(-side, side + 1) * radius_step / blur) ** 2) / 2)
         odd = np.concatenate([-profile[side:0:-1], profile])  # to the other side of the axis it slopes the other way
         slope = np.interp(r, reach[: len(reach) - side], np.convolve(odd, kernel / kernel.sum(), mode="valid"))
     steepness = slope / np.maximum(r, 1e-9)
@@ -122,7 +119,8 @@ def depth_profile(radii: FloatArray, contact: float, ball: float, thickness: flo
 @functools.lru_cache(maxsize=64)
 def cached_profile(contact: float, ball: float, thickness: float) -> tuple[FloatArray, FloatArray]:
     """Radii up to FAR ball radii and the depth of a dent there [px]; for everybody, not to be written to."""
-    radii = np.arange(0.0, MAX_RADIUS_RATIO * ball, DEPTH_STEP)
+    depth_step = 1.0  # of those at which the depth is found [px]
+    radii = np.arange(0.0, MAX_RADIUS_RATIO * ball, depth_step)
     return radii, depth_profile(radii, contact, ball, thickness)
 
 

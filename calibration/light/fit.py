@@ -13,8 +13,9 @@ from calibration.height.slope_polynomial import InverseModel
 from calibration.lens.view import GelView
 from calibration.light.dent import ContactCircle
 from calibration.light.photometry import ModelSize
-from calibration.light.press import UNTOUCHED_RADIUS, BallPress
+from calibration.light.press import BallPress
 from calibration.light.press_shapes import Stretch
+from calibration.light.tuning import UNTOUCHED_RADIUS
 from tacsim.interface import Float32, FloatArray, Image
 from tacsim.models.photometric import DarknessModel, PhotometricModel
 from tacsim.models.sensor import CameraNoise, Markers, SensorGeometry

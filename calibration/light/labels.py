@@ -10,9 +10,7 @@ import numpy as np
 from calibration.height.slope_polynomial import InverseModel, fit_inverse, inverse_features, normal_of_slope
 from calibration.light.dent import cached_profile, dent_gradient, dent_height
 from calibration.light.photometry import (
-    FEW_PRESSES,
     MAX_SIZE,
-    SLOPE_SCALE,
     ModelSize,
     NormalEquations,
     normal_equations,
@@ -20,9 +18,19 @@ from calibration.light.photometry import (
     solve_weights,
     terms_of,
 )
-from calibration.light.press import SKIRT_RADIUS, UNTOUCHED_RADIUS, BallPress, gaussian_blur
-from calibration.light.refinement import RIM_BLUR, RefinedGeometry
+from calibration.light.press import BallPress, gaussian_blur
+from calibration.light.refinement import RefinedGeometry
 from calibration.light.shadows import DentShade
+from calibration.light.tuning import (
+    DEEP_SLOPE_SCALE,
+    FORWARD_BLUR,
+    INVERSE_BLUR,
+    MAX_FEW_PRESSES,
+    RIM_BLUR,
+    RIM_MARGIN,
+    SKIRT_RADIUS,
+    UNTOUCHED_RADIUS,
+)
 from tacsim.interface import FloatArray, Mask
 from tacsim.models.photometric import (
     CastShadows,
@@ -34,10 +42,6 @@ from tacsim.models.photometric import (
 )
 
 Rows = tuple[tuple[float, float, float], ...]  # weights of R, G, B, a row a term
-
-BLUR = 0.8  # of the camera, and of what the forward model is fitted to [px]
-INVERSE_BLUR = 1.2  # of what the inverse is fitted to [px]
-RIM_MARGIN = 5.0  # that contact and skirt reach further, whatever the radius [px]
 
 
 def label_slopes(press: BallPress, refined: RefinedGeometry, ball: float) -> FloatArray:
@@ -60,7 +64,7 @@ def extra_forward_terms(
     height = dent_height(u, v, press.circle, refined.thickness, ball)
     places = np.meshgrid(*image_axes(press.shape[1], press.shape[0]))
     terms = depth_terms(height, deepest_dent(refined, ball), *places)
-    slopes = SLOPE_SCALE * terms[0] * normal_terms(gradient, MAX_SIZE[0])
+    slopes = DEEP_SLOPE_SCALE * terms[0] * normal_terms(gradient, MAX_SIZE[0])
     deep = np.ascontiguousarray(np.moveaxis(np.concatenate([terms, slopes]), 0, -1), dtype=np.float64)
     if shade is None:
         return deep
@@ -85,7 +89,7 @@ def forward_equations(
 ) -> NormalEquations:
     """`counted` (H, W, 3): what takes part; None: what is not saturated."""
     near = contact_and_skirt(press)
-    change = gaussian_blur(press.change, BLUR)[near]
+    change = gaussian_blur(press.change, FORWARD_BLUR)[near]
     lit = press.lit if counted is None else counted
     return normal_equations(gradient[near], *_image_places(near), change, lit[near], extra_terms[near])
 
@@ -99,7 +103,7 @@ def counted_pixels(
     where = contact_and_skirt(press) & ~press.lit.all(axis=2)
     light = photometric_features(gradient[where], *_image_places(where), *MAX_SIZE)
     said = np.concatenate([light, extra_terms[where]], axis=1)[:, terms_of(size)] @ weights
-    seen = gaussian_blur(press.change, BLUR)[where]
+    seen = gaussian_blur(press.change, FORWARD_BLUR)[where]
     counted[where] |= (seen > 0) & (said < seen)
     return counted
 
@@ -132,7 +136,7 @@ def forward_model(
     if shade is not None and size.shadows:
         shadows = CastShadows(lamps=shade.lamps, weights=weights[dark:])
     return PhotometricModel(
-        degree=size.degree, position=size.position, weights=weights[:light], steepest=steepest, blur=BLUR,
+        degree=size.degree, position=size.position, weights=weights[:light], steepest=steepest, blur=FORWARD_BLUR,
         shadows=shadows, depth=_depth_colour(deepest, weights[light:slopes], weights[slopes:dark]),
     )  # fmt: skip
 
@@ -140,10 +144,10 @@ def forward_model(
 def _depth_colour(deepest: float, weights: Rows, slopes: Rows) -> DepthColour | None:
     if not weights:
         return None
-    unscaled = tuple((SLOPE_SCALE * r, SLOPE_SCALE * g, SLOPE_SCALE * b) for r, g, b in slopes)
+    unscaled = tuple((DEEP_SLOPE_SCALE * r, DEEP_SLOPE_SCALE * g, DEEP_SLOPE_SCALE * b) for r, g, b in slopes)
     return DepthColour(deepest=deepest, weights=weights, slopes=unscaled)
 
 
 def inverse_model(sets: Sequence[tuple[FloatArray, FloatArray]], steepest: float) -> InverseModel:
-    weights = fit_inverse(sets, with_position=len(sets) > FEW_PRESSES)
+    weights = fit_inverse(sets, with_position=len(sets) > MAX_FEW_PRESSES)
     return InverseModel(weights=tuple((float(x), float(y)) for x, y in weights), steepest=steepest)

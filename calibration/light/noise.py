@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.drift import DriftFinder
-from calibration.light.press import UNTOUCHED_RADIUS, BallPress, mean_reference_colour
-from calibration.reference import SATURATED
+from calibration.light.press import BallPress, mean_reference_colour
+from calibration.light.tuning import UNTOUCHED_RADIUS
+from calibration.tuning import SATURATED_LEVEL
 from tacsim.interface import FloatArray, Image
 from tacsim.models.sensor import CameraNoise
 from tacsim.optics.ink import fine_part
@@ -20,11 +21,8 @@ Entry = TypeVar("Entry", bound=np.generic)
 
 TILE = 32  # side of the tiles; what is wider is drift, not noise [px]
 MAX_DARK_LEVEL = 2  # a channel at or below this has lost its noise [grey levels]
-MIN_TILES = 4
 SKIN_NEAR = (1.25, 2.2)  # where the skin has moved, and the light changes little [contact radii]
 SKIN_FAR = (4.0, 8.0)  # where it has hardly, in about the same light
-MIN_SKIN_PIXELS = 1000  # of either part of a press
-MIN_SKIN_PRESSES = 4
 MIN_SKIN_SHARE = 0.2  # a smaller one is not told from none; 0.07 at most is found on three real sensors without any
 MIN_STANDARD_ERRORS = 3.0  # standard errors over presses that the share must be from none
 
@@ -70,10 +68,11 @@ def measure_press_noise(presses: Sequence[BallPress], reference: Image) -> Camer
 
 def _noise_of_tiles(tiles: FloatArray) -> CameraNoise:
     """Of tiles (n, h, w, 3) of differences of two pictures. Raises NoiseUnknown."""
-    if len(tiles) < MIN_TILES:
+    min_tiles = 4
+    if len(tiles) < min_tiles:
         raise NoiseUnknown(
             f"only {len(tiles)} parts of {TILE} x {TILE} px are untouched and neither black nor saturated in all "
-            f"pictures; {MIN_TILES} are needed"
+            f"pictures; {min_tiles} are needed"
         )
     size = tiles.shape[1] * tiles.shape[2]
     square = np.einsum("nyxc,nyxd->ncd", tiles, tiles) / (2 * (size - 1))  # 2: both pictures are noisy
@@ -100,7 +99,7 @@ def _difference_tiles(one: Image, other: Image) -> FloatArray:
     """(n, h, w, 3) the difference of two pictures tile by tile, drift and mean removed, where neither is black or
     saturated."""
     most, least = np.maximum(one, other).max(axis=2), np.minimum(one, other).min(axis=2)
-    lost = np.asarray((most >= SATURATED) | (least <= MAX_DARK_LEVEL))
+    lost = np.asarray((most >= SATURATED_LEVEL) | (least <= MAX_DARK_LEVEL))
     level = np.maximum(one.mean(axis=(0, 1)), 1.0)
     change = other.astype(np.float32) - one
     planes = np.ascontiguousarray(np.moveaxis(change / level.astype(np.float32), -1, 0), dtype=np.float32)
@@ -143,6 +142,8 @@ def measure_skin(presses: Sequence[BallPress], reference: NDArray[np.uint8], pix
 
     It is low rather than high: skin that has moved by less than its grain counts as what stands still.
     """
+    min_presses = 4
+    min_pixels = 1000  # of either part of a press
     mean = reference.mean(axis=(0, 1))
     grain = fine_part(reference.astype(np.float32), pixel_pitch)
     shares = []
@@ -150,10 +151,10 @@ def measure_skin(presses: Sequence[BallPress], reference: NDArray[np.uint8], pix
         change = fine_part((press.change * mean).astype(np.float32), pixel_pitch)
         lit, distance = press.lit.all(axis=2), press.distance() / press.circle.radius
         parts = [lit & (distance > least) & (distance < most) for least, most in (SKIN_FAR, SKIN_NEAR)]
-        if min(int(part.sum()) for part in parts) >= MIN_SKIN_PIXELS:
+        if min(int(part.sum()) for part in parts) >= min_pixels:
             far, near = (1.0 + float((change[part] * grain[part]).sum() / (grain[part] ** 2).sum()) for part in parts)
             shares.append(far - max(near, 0.0))
-    if len(shares) < MIN_SKIN_PRESSES:
+    if len(shares) < min_presses:
         return None
     share, error = float(np.median(shares)), float(np.std(shares, ddof=1)) / len(shares) ** 0.5
     return min(share, 1.0) if share > max(MIN_SKIN_SHARE, MIN_STANDARD_ERRORS * error) else None

@@ -14,23 +14,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.light.tuning import (
+    MAX_FEW_PRESSES,
+    MIN_DEPTH_IMPROVEMENT,
+    MIN_SHADOW_IMPROVEMENT,
+    MIN_SIZE_IMPROVEMENT,
+    MIN_SLOPES_IMPROVEMENT,
+)
 from tacsim.interface import FloatArray
 from tacsim.models.photometric import DEPTH_TERMS, normal_terms, position_terms, term_count
 
 MAX_SIZE = (5, 2)  # degree in the normal, degree in the place
-SIZES = ((1, 0), (3, 0), (5, 0), (1, 1), (3, 1), (5, 1), (1, 2), (3, 2), (5, 2))  # degree in the normal, in the place
 RIDGES = (1e-6, 1e-5, 1e-4, 1e-3)  # times the mean of the diagonal of the normal equations
-FEW_PRESSES = 3  # up to this number they cover too little of the image for light that varies over it
-FEW_RIDGE = 1e-3
 CHUNK_PIXELS = 16384  # pixels that are summed at a time: fewer wake the threads of BLAS too often, more leave the cache
-MIN_IMPROVEMENT = 0.98  # factor of the left-out error that a larger model must reach
-SHADOW_IMPROVEMENT = 0.93  # the same of a model with cast shadows
-DEPTH_IMPROVEMENT = 0.99  # the same of one that knows the depth, which is known with few terms
-SLOPES_IMPROVEMENT = 0.995  # and of one to which slopes look otherwise at depth
 SLOPE_TERMS = term_count(MAX_SIZE[0], 0)
-# By so much the terms of slopes at depth are smaller than others: the ridge holds them back ten times as strongly. Of
-# all slopes and depths a ball shows few together.
-SLOPE_SCALE = 0.1**0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,33 +198,36 @@ def left_out_error(presses: Sequence[NormalEquations], ridge: float) -> float:
 
 
 def choose_size(presses: Sequence[NormalEquations]) -> ModelSize:
-    """Up to FEW_PRESSES a cubic that is the same everywhere. With more, the smallest model to which no larger one
+    """Up to MAX_FEW_PRESSES a cubic that is the same everywhere. With more, the smallest model to which no larger one
     is clearly better at predicting left-out presses, each with its best ridge. Cast shadows, where they are among the
     terms, are taken if they make it better by far; depth if they are, if it makes it better; then slopes at depth."""
-    if len(presses) <= FEW_PRESSES:
-        return ModelSize(3, 0, FEW_RIDGE)
+    ridge_of_few_presses = 1e-3
+    if len(presses) <= MAX_FEW_PRESSES:
+        return ModelSize(3, 0, ridge_of_few_presses)
     error, size = _best_size(presses, 0)
     extra_terms = len(presses[0].right) - term_count(*MAX_SIZE)
     shadows = max(extra_terms - DEPTH_TERMS - SLOPE_TERMS, 0)
     if shadows:
         other_error, other = _best_size(presses, shadows)
-        if other_error < SHADOW_IMPROVEMENT * error:
+        if other_error < MIN_SHADOW_IMPROVEMENT * error:
             error, size = other_error, other
     if not extra_terms:
         return size
     deep_error, deep = _best_ridge(presses, replace(size, depth=DEPTH_TERMS))
     other_error, other = _best_ridge(presses, replace(deep, slopes=term_count(size.degree, 0)))
-    if other_error < SLOPES_IMPROVEMENT * min(deep_error, DEPTH_IMPROVEMENT * error):
+    if other_error < MIN_SLOPES_IMPROVEMENT * min(deep_error, MIN_DEPTH_IMPROVEMENT * error):
         return other
-    return deep if deep_error < DEPTH_IMPROVEMENT * error else size
+    return deep if deep_error < MIN_DEPTH_IMPROVEMENT * error else size
 
 
 def _best_size(presses: Sequence[NormalEquations], shadows: int) -> tuple[float, ModelSize]:
     """The left-out error of the best size with so many terms of shadows, and that size."""
+    # degree in the normal, in the place
+    sizes = ((1, 0), (3, 0), (5, 0), (1, 1), (3, 1), (5, 1), (1, 2), (3, 2), (5, 2))
     best: tuple[float, ModelSize] | None = None
-    for degree, position in sorted(SIZES, key=lambda size: term_count(*size)):
+    for degree, position in sorted(sizes, key=lambda size: term_count(*size)):
         error, size = _best_ridge(presses, ModelSize(degree, position, RIDGES[0], shadows=shadows))
-        if best is None or error < MIN_IMPROVEMENT * best[0]:
+        if best is None or error < MIN_SIZE_IMPROVEMENT * best[0]:
             best = (error, size)
     assert best is not None
     return best

@@ -8,17 +8,20 @@ import numpy as np
 
 from calibration.errors import BadFrames
 from calibration.light.circle import find_contact_circle
-from calibration.light.dent import MAX_RIM_RATIO, ContactCircle
-from calibration.reference import SATURATED, UnusableReference, make_reference
+from calibration.light.dent import ContactCircle
+from calibration.light.tuning import (
+    MAX_RIM_RATIO,
+    MAX_SATURATED_CONTACT,
+    MIN_SECOND_AREA,
+    MIN_SECOND_CONTACT,
+    MIN_UNTOUCHED_SHARE,
+    SKIRT_RADIUS,
+    UNTOUCHED_RADIUS,
+)
+from calibration.reference import UnusableReference, make_reference
+from calibration.tuning import SATURATED_LEVEL
 from tacsim.interface import FloatArray, Image, Mask
 from tacsim.models.photometric import image_axes
-
-SKIRT_RADIUS = 2.3  # contact and skirt reach this far [contact radii]
-UNTOUCHED_RADIUS = 3.0  # beyond, the gel is untouched [contact radii]
-MIN_UNTOUCHED_SHARE = 0.15  # of the picture, for a drift that varies over it
-MAX_SATURATED_SHARE = 0.4  # of the contact
-SECOND_CONTACT = 0.7  # strength of a second patch, over that of the contact, that makes it a contact too ...
-SECOND_AREA = 0.3  # ... if it also is so large, over the contact's patch: specks of dirt or glare are smaller
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,11 +88,11 @@ def make_press(
         raise BadFrames("the middle of the contact lies outside the picture")
     v, u = np.mgrid[:height, :width].astype(np.float64)
     distance = np.hypot(u - circle.x, v - circle.y)
-    lit = (image < SATURATED) & (reference < SATURATED)
+    lit = (image < SATURATED_LEVEL) & (reference < SATURATED_LEVEL)
     drift = _fit_drift(raw, (distance > reach * circle.radius) & lit.all(axis=2))
     contact = distance < circle.radius
     saturated = 1.0 - float(lit[contact].all(axis=1).mean()) if contact.any() else 1.0
-    if saturated > MAX_SATURATED_SHARE:
+    if saturated > MAX_SATURATED_CONTACT:
         raise BadFrames(f"{saturated:.0%} of the contact is saturated: shorten the exposure or press less")
     change = (raw - drift) / mean
     strength = np.abs(gaussian_blur(change, 3.0)).max(axis=2)
@@ -97,8 +100,8 @@ def make_press(
         np.where(part, strength, 0.0)
         for part in (distance < 1.5 * circle.radius, distance > UNTOUCHED_RADIUS * circle.radius)
     )
-    strong = SECOND_CONTACT * float(near.max())
-    if _patch_area(far, strong) > SECOND_AREA * _patch_area(near, strong):
+    strong = MIN_SECOND_CONTACT * float(near.max())
+    if _patch_area(far, strong) > MIN_SECOND_AREA * _patch_area(near, strong):
         raise BadFrames(
             "there is a second contact in the picture, or one in the picture without contact; press one ball at a time"
         )

@@ -12,9 +12,9 @@ from calibration.light.circle import NoCircle
 from calibration.light.darkness import find_dark_press, is_direction_free
 from calibration.light.dent import ContactCircle
 from calibration.light.press import find_press, mean_reference_colour
+from calibration.light.tuning import MIN_SEPARATION
 from tacsim.interface import Image
 
-MIN_SEPARATION = 0.5  # of two presses' centres [larger contact radius]
 THIRDS = ("left", "middle", "right"), ("top", "middle", "bottom")
 
 

@@ -12,20 +12,24 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.light.dent import MAX_RIM_RATIO, ContactCircle, dent_gradient, dent_height
-from calibration.light.photometry import FEW_PRESSES, photometric_features
+from calibration.light.dent import ContactCircle, dent_gradient, dent_height
+from calibration.light.photometry import photometric_features
 from calibration.light.press import Window
-from calibration.light.refinement import RIM_BLUR, THINNESS_BOUNDS
+from calibration.light.tuning import (
+    MAX_FEW_PRESSES,
+    MAX_RIM_RATIO,
+    MIN_BALL_GAP,
+    MIN_GAP_DEVIATIONS,
+    RIM_BLUR,
+    SCALE_PRIOR,
+    THINNESS_BOUNDS,
+)
 from tacsim.interface import FloatArray
 
 DEGREE, RIDGE = 3, 1e-4  # of the light that is eliminated
 MAX_STEPS, MIN_GAIN = 12, 1e-4
-SCALE_PRIOR = 1.0  # holds the mean logarithm of the balls' radii at 0: the light explains any common factor
 PRESS_STEPS = np.array([0.05, 0.05, -0.05, 0.005, 0.05])  # of differences: x, y, radius [px], log ball, blur [px]
 COMMON_STEPS = np.array([0.05, 0.003, 0.003])  # of the thinness and of both parts of the stretch
-BLUR_BOUNDS = (0.3, 12.0)  # [px]
-MIN_BALL_GAP = 0.1  # between two groups of balls, logarithm of their radii; one ball shows 0.05 under uneven light
-GAP_DEVIATIONS = 4.0  # and so many standard deviations within the groups
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +58,7 @@ def fit_stretch(
     windows: Sequence[Window], circles: Sequence[ContactCircle], thickness: float, ball: float, shape: tuple[int, int]
 ) -> Stretch:
     """The ratio of axes that contacts have in common; `ball`: its radius, `thickness` of the gel [px]."""
-    position = 1 if len(windows) > FEW_PRESSES else 0
+    position = 1 if len(windows) > MAX_FEW_PRESSES else 0
     free = ((0, 1, 2, 4), (0, 1, 2))
 
     def parts(chosen: slice) -> FloatArray:
@@ -62,7 +66,7 @@ def fit_stretch(
         return np.asarray(common[1:], dtype=np.float64)
 
     found, spread = parts(slice(None)), float("nan")
-    if len(windows) > FEW_PRESSES:
+    if len(windows) > MAX_FEW_PRESSES:
         one, other = (parts(slice(start, None, 2)) for start in (0, 1))
         spread = float(np.hypot(*(one - other)))  # half the difference; a ratio is twice the logarithm
     # the fit squeezes a picture until contacts are round, so the picture is stretched by its inverse
@@ -75,7 +79,7 @@ def find_other_balls(
 ) -> tuple[tuple[int, ...], float]:
     """Which presses, the smaller part of them, are of a ball of another radius than the rest, and how large it is over
     that of the rest. Under one light the slopes of a press tell it; no press where one ball explains all."""
-    if len(windows) <= FEW_PRESSES:
+    if len(windows) <= MAX_FEW_PRESSES:
         return (), 1.0
     free = ((0, 1, 2, 3, 4), (0, 1, 2))
     balls = _minimise(windows, circles, ball / thickness, ball, shape, 0, free).presses[:, 3]
@@ -84,7 +88,7 @@ def find_other_balls(
     cut = int(np.argmax(gaps)) + 1
     low, high = balls[order[:cut]], balls[order[cut:]]
     within = np.sqrt((((low - low.mean()) ** 2).sum() + ((high - high.mean()) ** 2).sum()) / (len(balls) - 2))
-    if gaps[cut - 1] < max(MIN_BALL_GAP, GAP_DEVIATIONS * within):
+    if gaps[cut - 1] < max(MIN_BALL_GAP, MIN_GAP_DEVIATIONS * within):
         return (), 1.0
     ratio = float(np.exp(low.mean() - high.mean()))
     few, ratio = (order[:cut], ratio) if cut <= len(balls) / 2 else (order[cut:], 1 / ratio)
@@ -129,11 +133,12 @@ def _minimise(
 def _step_fit(
     fit: _Fit, free: tuple[tuple[int, ...], tuple[int, ...]], by: FloatArray, common_by: FloatArray, ball: float
 ) -> _Fit:
+    blur_bounds = (0.3, 12.0)  # [px]
     presses, common = fit.presses.copy(), fit.common.copy()
     presses[:, free[0]] += by
     common[list(free[1])] += common_by
     presses[:, 3] = np.clip(presses[:, 3], -1.2, 1.2)
-    presses[:, 4] = np.clip(presses[:, 4], *BLUR_BOUNDS)
+    presses[:, 4] = np.clip(presses[:, 4], *blur_bounds)
     presses[:, 2] = np.clip(presses[:, 2], 1.0, MAX_RIM_RATIO * ball * np.exp(presses[:, 3]))
     common[0] = np.clip(common[0], *THINNESS_BOUNDS)
     common[1:] = np.clip(common[1:], -0.5, 0.5)

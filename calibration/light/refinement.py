@@ -13,22 +13,13 @@ from typing import Self
 
 import numpy as np
 
-from calibration.light.dent import MAX_RIM_RATIO, ContactCircle, dent_gradient, dent_height
+from calibration.light.dent import ContactCircle, dent_gradient, dent_height
 from calibration.light.photometry import photometric_features
 from calibration.light.press import Window
 from calibration.light.shadows import DentShade
+from calibration.light.tuning import FIRST_THINNESS, MAX_ALTERNATIVE_COST, MAX_RIM_RATIO, RIM_BLUR, THINNESS_BOUNDS
 from tacsim.interface import FloatArray
 
-DEGREE = 3  # of the light during refinement; without shadows the same everywhere on the gel
-RIDGE = 1e-4
-RIM_BLUR = 1.0  # of camera and smoothing together, through which the rim of a contact is seen [px]
-MAX_STEPS = 25
-MIN_GAIN = 1e-4  # relative gain of a step, below which the refinement ends
-DELTA = 0.05  # step of finite differences [px]; of the gel's thinness [-]
-# Thinness of the gel: the ball's radius over the gel's thickness
-FIRST_THINNESS = (0.1, 1.0)  # the refinement starts from a thick gel and from a thin one
-THINNESS_BOUNDS = (0.02, 3.0)
-MAX_ALTERNATIVE_COST = 1.2  # times the least cost, up to which what the other start leads to is a solution too
 MAX_GROUPS = 8  # that are left out in turn to tell the uncertainty of radii
 
 
@@ -84,8 +75,10 @@ def refine_geometry(
 
 def _minimise(state: _Problem) -> _Problem:
     """From `state` to the least cost near it, by Levenberg and Marquardt's steps."""
+    min_gain = 1e-4  # relative gain of a step, below which the refinement ends
+    max_steps = 25
     damping = 1e-2
-    for _ in range(MAX_STEPS):
+    for _ in range(max_steps):
         gradient, curvature = state.normal_equations()
         for _ in range(8):
             step = np.linalg.solve(curvature + damping * np.diag(np.diag(curvature) + 1e-12), -gradient)
@@ -97,7 +90,7 @@ def _minimise(state: _Problem) -> _Problem:
             break
         gain = 1.0 - trial.cost / state.cost
         state, damping = trial, damping / 3
-        if gain < MIN_GAIN:
+        if gain < min_gain:
             break
     return state
 
@@ -129,12 +122,13 @@ class _Problem:
         return _Problem(windows, circles, self.thinness, self.ball, self.shade)
 
     def solved(self) -> Self:
+        ridge = 1e-4
         self._terms = [self._features(i, self.circles[i], self.thinness) for i in range(len(self.windows))]
         square = sum((t.T @ t for t in self._terms), np.zeros((self._terms[0].shape[1],) * 2))
         right = sum(
             (t.T @ w.change for t, w in zip(self._terms, self.windows, strict=True)), np.zeros((len(square), 3))
         )
-        self._square = square + RIDGE * np.trace(square) / len(square) * np.eye(len(square))
+        self._square = square + ridge * np.trace(square) / len(square) * np.eye(len(square))
         self._weights = np.asarray(np.linalg.solve(self._square, right), dtype=np.float64)
         self._residuals = [w.change - t @ self._weights for t, w in zip(self._terms, self.windows, strict=True)]
         self.cost = sum(self.part_costs())
@@ -146,20 +140,21 @@ class _Problem:
     def normal_equations(self) -> tuple[FloatArray, FloatArray]:
         """Gradient and Gauss-Newton curvature of half the cost by (x, y, radius) of each circle, then the thinness of
         the gel. What the light can explain is projected out."""
+        delta = 0.05  # step of finite differences [px]; of the gel's thinness [-]
         count = 3 * len(self.circles) + 1
         gradient, curvature = np.zeros(count), np.zeros((count, count))
         onto = np.zeros((3, count, len(self._square)))  # by channel: what the weights of the light could explain
         for i, circle in enumerate(self.circles):
             moved = [
-                self._features(i, replace(circle, x=circle.x + DELTA), self.thinness),
-                self._features(i, replace(circle, y=circle.y + DELTA), self.thinness),
-                self._features(i, replace(circle, radius=circle.radius - DELTA), self.thinness),
-                self._features(i, circle, self.thinness + DELTA),
+                self._features(i, replace(circle, x=circle.x + delta), self.thinness),
+                self._features(i, replace(circle, y=circle.y + delta), self.thinness),
+                self._features(i, replace(circle, radius=circle.radius - delta), self.thinness),
+                self._features(i, circle, self.thinness + delta),
             ]
             signs = (1, 1, -1, 1)
             # of the residual: (4, n, 3)
             slopes = np.stack(
-                [-(m - self._terms[i]) @ self._weights * (s / DELTA) for m, s in zip(moved, signs, strict=True)]
+                [-(m - self._terms[i]) @ self._weights * (s / delta) for m, s in zip(moved, signs, strict=True)]
             )
             at = np.array([3 * i, 3 * i + 1, 3 * i + 2, count - 1])
             gradient[at] += np.einsum("pnc,nc->p", slopes, self._residuals[i])
@@ -180,12 +175,13 @@ class _Problem:
         return _Problem(self.windows, circles, thinness, self.ball, self.shade)
 
     def _features(self, i: int, circle: ContactCircle, thinness: float) -> FloatArray:
+        degree = 3  # of the light during refinement; without shadows the same everywhere on the gel
         window = self.windows[i]
         thickness = self.ball / thinness
         gradient = dent_gradient(window.u, window.v, circle, thickness, self.ball, RIM_BLUR)
         # colour that goes with the depth would else be explained by circles that are too large, and beside the contact
         depth = dent_height(window.u, window.v, circle, thickness, self.ball)[:, None] / self.ball
         if self.shade is None:
-            return np.concatenate([photometric_features(gradient, window.u, window.v, DEGREE, 0), depth], axis=1)
+            return np.concatenate([photometric_features(gradient, window.u, window.v, degree, 0), depth], axis=1)
         dark = self.shade.terms(window.u, window.v, circle, thickness, self.ball)
         return np.concatenate([self.shade.light(gradient, window.u, window.v), depth, dark], axis=1)

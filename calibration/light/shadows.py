@@ -13,12 +13,7 @@ from calibration.light.press import Window
 from tacsim.interface import FloatArray
 from tacsim.models.photometric import Floats, horizon_slope, shadow_terms
 
-DEGREE, POSITION = 3, 2  # of the light beside which shadows are sought
 RIDGE = 1e-4
-PIXELS_PER_PRESS = 600  # of each press, about, that tell where lamps stand
-DISTANCES = (0.35, 0.7, 1.3, 4.0)  # of lamps from the middle of the picture at which the search starts [widths]
-DIRECTIONS = 10
-SEARCH_STEPS = 30
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,8 +45,9 @@ class DentShade:
 
     def light(self, gradient: FloatArray, u: FloatArray, v: FloatArray) -> FloatArray:
         """(n, terms) of the light beside shadows, for slopes (n, 2)."""
+        degree, place_degree = 3, 2  # of the light beside which shadows are sought
         x, y = self._places(u, v)
-        return photometric_features(gradient, x, y * (self.shape[1] / self.shape[0]), DEGREE, POSITION)
+        return photometric_features(gradient, x, y * (self.shape[1] / self.shape[0]), degree, place_degree)
 
     def _places(self, u: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray]:
         rows, columns = self.shape
@@ -69,6 +65,10 @@ def find_lamps(
     must darken: a shade that brightens is the lit flank of a lamp on the other side. `thickness` of the gel, `ball`
     radius [px].
     """
+    max_steps = 30
+    direction_count = 10
+    # of lamps from the middle of the picture at which the search starts [widths]
+    first_distances = (0.35, 0.7, 1.3, 4.0)
     from scipy.optimize import minimize
 
     thin = [_downsample_window(window) for window in windows]
@@ -92,20 +92,21 @@ def find_lamps(
         weights = np.linalg.solve(square + RIDGE * np.trace(square) / len(square) * np.eye(len(square)), right)
         return -float(weights @ right) if float(weights[len(own) :] @ dark.sum(axis=0)) < 0 else 0.0
 
-    turns = np.arange(DIRECTIONS) * 2 * np.pi / DIRECTIONS
-    places = [far * np.array([np.cos(turn), np.sin(turn)]) for far in DISTANCES for turn in turns]
+    turns = np.arange(direction_count) * 2 * np.pi / direction_count
+    places = [far * np.array([np.cos(turn), np.sin(turn)]) for far in first_distances for turn in turns]
     lamps = []
     for channel in range(3):
         first = min(places, key=lambda place: unexplained(place, channel))
         size = 0.25 * float(np.hypot(*first)) + 0.02
         found = minimize(
             unexplained, first, args=(channel,), method="Nelder-Mead",
-            options={"maxiter": SEARCH_STEPS, "initial_simplex": first + np.array([[0, 0], [size, 0], [0, size]])},
+            options={"maxiter": max_steps, "initial_simplex": first + np.array([[0, 0], [size, 0], [0, size]])},
         )  # fmt: skip
         lamps.append((float(found.x[0]), float(found.x[1])))
     return DentShade(tuple(lamps), shape)
 
 
 def _downsample_window(window: Window) -> Window:
-    keep = slice(None, None, max(1, len(window.u) // PIXELS_PER_PRESS))
+    pixels_of_press = 600  # of each press, about, that tell where lamps stand
+    keep = slice(None, None, max(1, len(window.u) // pixels_of_press))
     return Window(window.u[keep], window.v[keep], window.change[keep])

@@ -6,16 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from calibration.markers.tuning import DARKNESS_LEVELS
 from tacsim.interface import Float32, FloatArray, Image
-from tacsim.optics.ink import MIN_RADIUS as MIN_RADIUS
 from tacsim.optics.ink import DotEraser as DotEraser
 from tacsim.optics.ink import dot_filters, local_darkness
-
-# A dot is darker than its surroundings by at least this share of their light; the higher levels part it from others
-MIN_DARKNESS = (0.2, 0.35, 0.5)
-MIN_FILLED = 0.4  # share of its bounding box that a dot fills
-MIN_AREA, MAX_AREA = 0.2, 7.0  # of a dot, half hidden or painted over [areas of a disc]
-MAX_ELONGATION = 2.0  # length over breadth
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,7 +42,7 @@ class DotFinder:
         """The dots of a picture (H, W, 3) or of one channel of it (H, W)."""
         dark = local_darkness(image, self._side, self._blur)
         found = []
-        for level in MIN_DARKNESS:
+        for level in DARKNESS_LEVELS:
             dots, rest = self._find_blobs(dark, level)
             found.append(dots)
             if rest is None:
@@ -58,6 +52,9 @@ class DotFinder:
 
     def _find_blobs(self, dark: Float32, level: float) -> tuple[Dots, Float32 | None]:
         """The dots among the blobs beyond `level`, and what is left in blobs too large or long to be one."""
+        max_elongation = 2.0  # length over breadth
+        min_area, max_area = 0.2, 7.0  # of a dot, half hidden or painted over [areas of a disc]
+        min_filled = 0.4  # share of its bounding box that a dot fills
         import cv2
 
         mask = (dark > level).astype(np.uint8)
@@ -65,11 +62,11 @@ class DotFinder:
         count, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=4, ltype=kind)
         area = stats[:, cv2.CC_STAT_AREA]
         width, height = stats[:, cv2.CC_STAT_WIDTH], stats[:, cv2.CC_STAT_HEIGHT]
-        large = area > MIN_AREA * self._area
-        compact = (area < MAX_AREA * self._area) & (
-            np.maximum(width, height) < MAX_ELONGATION * np.minimum(width, height)
+        large = area > min_area * self._area
+        compact = (area < max_area * self._area) & (
+            np.maximum(width, height) < max_elongation * np.minimum(width, height)
         )
-        compact &= area > MIN_FILLED * width * height
+        compact &= area > min_filled * width * height
         large[0] = False  # what is no blob
         good = large & compact
         where = np.flatnonzero(mask)

@@ -22,7 +22,7 @@ from calibration.lens.rectification import (
     visible_box,
 )
 from calibration.lens.view import GelView
-from calibration.markers.dots import MIN_RADIUS, DotFinder
+from calibration.markers.dots import DotFinder
 from calibration.markers.lattice import (
     Lattice,
     NoLattice,
@@ -32,18 +32,13 @@ from calibration.markers.lattice import (
     median_pitch,
 )
 from calibration.markers.tracker import DotTracker
+from calibration.markers.tuning import MAX_EXTRA_SHARE, MAX_MISSING, MIN_PRESENT_SHARE, MIN_VISIBLE_SHARE
 from calibration.reference import UnusableReference
 from tacsim.interface import Float32, FloatArray, Image, Mask
 from tacsim.models.geometry import PictureRegion
 from tacsim.models.sensor import CanonicalGrid, Markers, SensorGeometry
 from tacsim.optics.grid import PixelGrid, canonical_image
-
-DOT_RADIUS = 2.5  # on the grid on which dots are sought [px]
-MAX_MISSING = 0.3  # share of the dots in view that a reference may lack
-MAX_EXTRA_SHARE = 0.1  # dots beyond the lattice's rows and columns [number of its dots]
-PINHOLE_ITERATIONS = 4
-MIN_PRESENT_SHARE = 0.75  # share of its dots that an unknown lattice must show
-MIN_VISIBLE_SHARE = 0.25  # share of the dots that must be seen for a flow
+from tacsim.optics.tuning import MIN_RADIUS
 
 
 class NoMarkers(UnusableReference):
@@ -183,11 +178,12 @@ class MarkerFlow:
 
     def _undo_pinhole(self, apparent: FloatArray, height: Float32, grid: PixelGrid) -> FloatArray:
         """Where dots are (..., 2) that the pinhole shows at `apparent`: what is pressed towards it looks larger."""
+        iterations = 4
         import cv2
 
         assert self._distance is not None
         nothing, at = np.empty(0, dtype=np.float32), apparent
-        for _ in range(PINHOLE_ITERATIONS):  # the height is that where the dot is, not where it appears
+        for _ in range(iterations):  # the height is that where the dot is, not where it appears
             pixel = ((at - (grid.x0, grid.y0)) / grid.pitch).astype(np.float32)
             deep = cv2.remap(height, pixel, nothing, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
             at = apparent * (1.0 - np.asarray(deep, dtype=np.float64) / self._distance)[..., None]
@@ -196,7 +192,8 @@ class MarkerFlow:
 
 def marker_grid(markers: Markers, gel_size: tuple[float, float]) -> PixelGrid:
     """All of the gel (x, y [m]), so fine that a dot's radius is DOT_RADIUS pixels."""
-    pitch = markers.radius / DOT_RADIUS
+    dot_radius = 2.5  # on the grid on which dots are sought [px]
+    pitch = markers.radius / dot_radius
     columns, rows = (max(2, math.ceil(length / pitch)) for length in gel_size)
     return PixelGrid(rows, columns, pitch, -(columns - 1) / 2 * pitch, -(rows - 1) / 2 * pitch)
 

@@ -9,15 +9,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.markers.tuning import MAX_PITCH_ERROR, MAX_STEP_ERROR, MIN_ROW_SHARE
 from tacsim.interface import FloatArray, Mask
 
 if TYPE_CHECKING:
     from scipy.spatial import KDTree
-
-
-MAX_STEP_ERROR = 0.3  # of a neighbour, from one step along the lattice [pitches]
-MIN_ROW_SHARE = 0.5  # dots of a row or column of the lattice [number of dots of the fullest one]
-MAX_PITCH_ERROR = 0.25  # of the distance of regular neighbours [pitches]
 
 
 class NoLattice(ValueError):

@@ -14,39 +14,24 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.markers.tuning import (
+    EXTRAPOLATION_RADIUS,
+    MATCH_RADIUS,
+    MAX_DIRT_GAIN,
+    MAX_JUMP,
+    MAX_STRETCH,
+    MAX_STRETCH_TRACKED,
+    MIN_DIRT_MISFIT,
+    MIN_DIRT_MISFIT_RATIO,
+    MIN_JUMP_SHARE,
+    NEIGHBOUR_RADIUS,
+    OUTLIER_MISFIT,
+    OUTLIER_MISFIT_RATIO,
+    STRICT_MATCH_RADIUS,
+)
 from tacsim.interface import FloatArray, Mask
 
 Index = NDArray[np.intp]
-
-NEIGHBOUR_RADIUS = 1.6  # dots this near at rest are neighbours: the diagonal of a square is one [pitches]
-# A dot is matched with a point this near to its place [pitches]
-MATCH_RADIUS = 0.45  # where the place is predicted
-STRICT_MATCH_RADIUS = 0.25  # where others are going to rely on it
-# Change of displacement across an edge, at most [pitches]
-MAX_STRETCH = 0.4  # within a part that other dots are matched from
-MAX_STRETCH_TRACKED = 0.75  # where each dot was followed from frame to frame
-# Extrapolation of displacement: an affine map through known dots, weighted by exp(-(distance / range)^2)
-EXTRAPOLATION_NEIGHBOURS = 20  # nearest dots that take part
-EXTRAPOLATION_RANGE = 1.0  # [pitches]
-EXTRAPOLATION_RADIUS = 0.45  # a dot is at most this far from its extrapolated place [pitches]
-AFFINE_RIDGE = 0.02  # where few dots are known, the map is their mean
-MIN_KNOWN_NEIGHBOURS = 2  # of a dot that is looked for by extrapolation
-MAX_PREDICTED_FRAMES = 3  # a velocity says nothing of frames beyond
-# Jumps of the whole lattice
-JUMP_SHARE = 0.04  # of dots and of points that are unmatched: more make a jump likely
-MAX_JUMP = 2.6  # [pitches]
-JUMP_SEEDS = 3  # dots in the middle, each of whose surrounding points proposes a jump
-JUMP_CANDIDATES = 4  # of the proposed jumps, how many are tried
-# A speck of dirt taken for a dot
-DIRT_MISFIT = 0.1  # distance from the extrapolated place that is suspicious [pitches]
-DIRT_MISFIT_RATIO = 4.0  # ... if it is also so many times the median
-DIRT_GAIN = 0.25  # another point is the dot if its distance is less than this share
-
-# A dot that moves alone: two dots in one, or glare on it
-OUTLIER_MISFIT = 0.15  # distance from the extrapolated place [pitches]
-OUTLIER_MISFIT_RATIO = 2.5  # ... if it is also so many times that of each of its neighbours
-
-TINY = 1e-9  # keeps the map of a dot without any neighbour solvable
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,6 +53,10 @@ class DotTracker:
     def __init__(self, rest: FloatArray, pitch: float, in_view: Callable[[FloatArray], Mask] | None = None) -> None:
         """`rest`: (n, 2) the dots at rest; `pitch`: usual distance of neighbours; `in_view`: whether a dot at places
         (..., 2) would be seen; None: everywhere. Raises ValueError for fewer than 4 dots, or one without neighbours."""
+        weight_range = 1.0  # [pitches]
+        # Extrapolation of displacement: an affine map through known dots, weighted by exp(-(distance / range)^2)
+        # nearest dots that take part
+        neighbour_count = 20
         from scipy.spatial import KDTree
 
         if len(rest) < 4:
@@ -81,10 +70,10 @@ class DotTracker:
         self._linked[self._first, self._second] = self._linked[self._second, self._first] = 1.0
         if not self._linked.any(axis=1).all():
             raise ValueError(f"no lattice: some dots have no neighbour within {NEIGHBOUR_RADIUS * pitch:.3g}")
-        near = min(EXTRAPOLATION_NEIGHBOURS, count - 1)
+        near = min(neighbour_count, count - 1)
         away, index = KDTree(rest).query(rest, k=near + 1)
         self._nearest = np.asarray(index, dtype=np.intp)[:, 1:]  # without the dot itself
-        self._weight = np.exp(-((np.asarray(away)[:, 1:] / (EXTRAPOLATION_RANGE * pitch)) ** 2))
+        self._weight = np.exp(-((np.asarray(away)[:, 1:] / (weight_range * pitch)) ** 2))
         arm = (rest[self._nearest] - rest[:, None, :]) / pitch
         self._terms = np.concatenate([np.ones((count, near, 1)), arm], axis=2)
         self.reset()
@@ -97,7 +86,8 @@ class DotTracker:
     def __call__(self, points: FloatArray, ahead: int = 1) -> Tracked:
         """The dots among `points` (k, 2), `ahead` frames after the last ones (0: the same frame again). The velocity is
         dropped for a frame before the last one, or far ahead."""
-        predicted = 0 <= ahead <= MAX_PREDICTED_FRAMES
+        max_predicted_frames = 3  # a velocity says nothing of frames beyond
+        predicted = 0 <= ahead <= max_predicted_frames
         expected = self._rest + self._displacement + (ahead * self._velocity if predicted else 0.0)
         partner = self._match_points(expected, points)
         coherent = self._coherent_part(partner, points, MAX_STRETCH)
@@ -149,7 +139,7 @@ class DotTracker:
                 return best
         found.append(self._grow_match(self._rest, points))
         best = max(found, key=lambda partner: self._match_score(partner, points))
-        if self._match_score(best, points)[0] < (1.0 - JUMP_SHARE) * len(
+        if self._match_score(best, points)[0] < (1.0 - MIN_JUMP_SHARE) * len(
             best
         ):  # else all the rest is dirt and drop-outs
             last = self._rest + self._displacement
@@ -179,11 +169,12 @@ class DotTracker:
 
     def _extend_match(self, partner: Index, points: FloatArray) -> Index:
         """`partner`, and those found by extrapolation, outwards from the dots that have one."""
+        min_known = 2  # of a dot that is looked for by extrapolation
         partner = partner.copy()
         refused = np.zeros(len(partner), dtype=np.bool_)
         for _ in range(len(partner)):
             known = partner >= 0
-            requested = np.flatnonzero(~known & (self._linked @ known >= MIN_KNOWN_NEIGHBOURS) & ~refused)
+            requested = np.flatnonzero(~known & (self._linked @ known >= min_known) & ~refused)
             free = np.setdiff1d(np.arange(len(points)), partner[known])
             if not (len(requested) and len(free)):
                 break
@@ -214,7 +205,7 @@ class DotTracker:
             return partner
         moved = np.where(known[:, None], points[partner] - self._rest, 0.0)
         misfit = np.linalg.norm(self._extrapolate(np.arange(len(partner)), known, moved) - moved, axis=1)
-        limit = max(DIRT_MISFIT * self._pitch, DIRT_MISFIT_RATIO * float(np.median(misfit[known])))
+        limit = max(MIN_DIRT_MISFIT * self._pitch, MIN_DIRT_MISFIT_RATIO * float(np.median(misfit[known])))
         suspects = np.flatnonzero(known & (misfit > limit))
         if not len(suspects):
             return partner
@@ -226,7 +217,7 @@ class DotTracker:
         found = self._match_points(there, points[free], STRICT_MATCH_RADIUS)
         other = free[found]
         away = [np.linalg.norm(points[p] - there, axis=1) for p in (other, partner[suspects])]
-        better = (found >= 0) & (away[0] < DIRT_GAIN * away[1])
+        better = (found >= 0) & (away[0] < MAX_DIRT_GAIN * away[1])
         cleaned[suspects] = np.where(better, other, partner[suspects])
         once = np.bincount(cleaned[cleaned >= 0], minlength=len(points)).max() <= 1
         return cleaned if once else partner
@@ -239,16 +230,18 @@ class DotTracker:
             return partner
         moved = np.where(known[:, None], points[partner] - self._rest, 0.0)
         misfit = np.linalg.norm(self._extrapolate(np.arange(len(partner)), known, moved) - moved, axis=1)
-        limit = max(OUTLIER_MISFIT * self._pitch, DIRT_MISFIT_RATIO * float(np.median(misfit[known])))
+        limit = max(OUTLIER_MISFIT * self._pitch, MIN_DIRT_MISFIT_RATIO * float(np.median(misfit[known])))
         around = (self._linked * np.where(known, misfit, 0.0)).max(axis=1)
         return np.where(known & (misfit > np.maximum(limit, OUTLIER_MISFIT_RATIO * around)), -1, partner)
 
     def _extrapolate(self, requested: Index, known: Mask, moved: FloatArray) -> FloatArray:
         """(k, 2) displacement of the dots `requested`, by an affine map through that (n, 2) of the `known` ones
         near."""
+        tiny = 1e-9  # keeps the map of a dot without any neighbour solvable
+        ridge = 0.02  # where few dots are known, the map is their mean
         nearest, terms = self._nearest[requested], self._terms[requested]
         weighted = (terms * (self._weight[requested] * known[nearest])[..., None]).transpose(0, 2, 1)
-        square = weighted @ terms + AFFINE_RIDGE * np.diag([TINY, 1.0, 1.0])
+        square = weighted @ terms + ridge * np.diag([tiny, 1.0, 1.0])
         right = weighted @ np.where(known[:, None], moved, 0.0)[nearest]
         moved_there: FloatArray = np.linalg.solve(square, right)[:, 0]
         return moved_there
@@ -295,13 +288,15 @@ class DotTracker:
     def _may_have_jumped(self, partner: Index, points: FloatArray) -> bool:
         """Both dots and points are unmatched, as if they belonged together."""
         lost, spare = int((partner < 0).sum()), len(points) - int((partner >= 0).sum())
-        return min(lost, spare) > max(1.0, JUMP_SHARE * len(partner))
+        return min(lost, spare) > max(1.0, MIN_JUMP_SHARE * len(partner))
 
     def _propose_jumps(self, points: FloatArray, start: FloatArray) -> list[FloatArray]:
         """Shifts (2,) of the whole lattice that bring most dots near a point or out of view, the best first."""
+        max_candidates = 4  # of the proposed jumps, how many are tried
+        jump_seeds = 3  # dots in the middle, each of whose surrounding points proposes a jump
         from scipy.spatial import KDTree
 
-        middle = np.argsort(((self._rest - self._rest.mean(axis=0)) ** 2).sum(axis=1))[:JUMP_SEEDS]
+        middle = np.argsort(((self._rest - self._rest.mean(axis=0)) ** 2).sum(axis=1))[:jump_seeds]
         shifts = (points[None, :, :] - start[middle][:, None, :]).reshape(-1, 2)
         length = np.linalg.norm(shifts, axis=1)
         shifts = shifts[(length < MAX_JUMP * self._pitch) & (length > STRICT_MATCH_RADIUS * self._pitch)]
@@ -314,6 +309,6 @@ class DotTracker:
         for shift in shifts[np.argsort(-explained, kind="stable")]:
             if all(float(np.linalg.norm(shift - other)) > STRICT_MATCH_RADIUS * self._pitch for other in chosen):
                 chosen.append(shift)
-            if len(chosen) == JUMP_CANDIDATES:
+            if len(chosen) == max_candidates:
                 break
         return chosen

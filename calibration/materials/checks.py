@@ -16,10 +16,8 @@ import numpy as np
 from scipy.stats import chi2, norm
 
 from calibration.materials.fit import Fit, Signals
+from calibration.materials.tuning import MAX_PROBABILITY, MAX_SIZE_ERROR
 from tacsim.interface import FloatArray
-
-MAX_PROBABILITY = 1e-3  # a finding that chance alone would bring more seldom counts
-MAX_SIZE_ERROR = 0.05  # of an indenter: moves the stiffness by 3 to 4 %
 
 
 @dataclass(frozen=True, slots=True)

@@ -28,21 +28,20 @@ from calibration.materials.fit import (
     fit_start_values,
     start_values,
 )
+from calibration.materials.tuning import (
+    COARSE_SIMULATION_ERROR,
+    MAX_IDENTIFIED_HALF_INTERVAL,
+    MAX_START_HALF_INTERVAL,
+    MAX_STEP,
+    MIN_GAIN,
+    MIN_STEP_DEVIATIONS,
+    PARAMETER_DIFFERENCE,
+    PLACE_STEP,
+)
 from tacsim.interface import FloatArray
 
-PARAMETER_DIFFERENCE = 0.08  # step of a free number for its column of the Jacobian; simulations are exact to some 1e-3
-PLACE_DIFFERENCE = 0.02e-3  # the same of places [m]
-MAX_STEP = 0.7  # a step changes no free number by more: a factor of two
-MAX_STEPS, MAX_SECANT_STEPS, MAX_FINE_STEPS = 12, 2, 4
-MIN_GAIN = 0.2  # of the sum of squares: the noise alone gives it a standard deviation of more than one
 MIN_GAIN_SHARE = 0.01  # of the sum of squares, where a coarse mesh keeps it large
-MIN_STEP_DEVIATIONS = 0.3  # of their standard deviations, likewise
 MIN_STEP = 0.01  # of the free numbers, likewise where all is told well
-MAX_IDENTIFIED_HALF_INTERVAL = (
-    0.6  # an interval of a free number that reaches farther each way tells nothing: a factor of 1.8
-)
-MAX_START_HALF_INTERVAL = 5.0  # an interval that reaches so far at the start: there is no use in looking for it
-COARSE_ERROR = 0.05  # of a coarse simulation, where no fine one says better: share of the signal
 SETTLING_ERROR = 0.01  # of any simulation: what its settling leaves, in each number and, again, in a whole press
 
 
@@ -79,11 +78,11 @@ class _Fitter:
         """One batch: the point itself, each free number changed a little, and all places at once."""
         steps = np.where(point.free + PARAMETER_DIFFERENCE > self.high, -PARAMETER_DIFFERENCE, PARAMETER_DIFFERENCE)
         points = [point, *(replace(point, free=point.free + step) for step in np.diag(steps))]
-        points.append(replace(point, places=point.places + PLACE_DIFFERENCE))
+        points.append(replace(point, places=point.places + PLACE_STEP))
         found = self.run(predict, points)
         base = found[0]
         columns = [(found[1 + k] - base) / step for k, step in enumerate(steps)]
-        by_place = (found[-1] - base) / PLACE_DIFFERENCE
+        by_place = (found[-1] - base) / PLACE_STEP
         columns += [np.where(self.signals.press == p, by_place, 0.0) for p in range(self.signals.presses)]
         return _State(point, zeros, base, np.column_stack([*columns, self.zero_columns]))
 
@@ -94,7 +93,7 @@ class _Fitter:
         p, system = len(self.held), before.system.copy()
         step = np.concatenate([point.free - before.point.free, point.places - before.point.places])
         missed = predicted - before.predicted - system[:, : len(step)] @ step
-        scale = np.append(np.ones(p), PLACE_DIFFERENCE / PARAMETER_DIFFERENCE)
+        scale = np.append(np.ones(p), PLACE_STEP / PARAMETER_DIFFERENCE)
         for press in range(self.signals.presses):
             rows, columns = np.flatnonzero(self.signals.press == press), [*range(p), p + press]
             scaled = step[columns] / scale
@@ -184,7 +183,7 @@ def estimate_materials(
     signals: Signals,
     parameters: Sequence[Parameter],
     priors: Priors,
-    coarse_error: float = COARSE_ERROR,
+    coarse_error: float = COARSE_SIMULATION_ERROR,
     on_step: Callable[[str], None] = lambda words: None,
 ) -> Fit:
     """Fits the parameters to the signals.
@@ -195,6 +194,7 @@ def estimate_materials(
     Parameters whose interval would reach farther than a factor of 1.8 each way are held at their start, the least told
     first (`Fit.untold`). Raises NotIdentified when nothing is told, CannotSimulate when no smaller step helps.
     """
+    max_fine_steps = 2
     fitter = _Fitter(signals, parameters, priors)
     begin = Point(fit_start_values(parameters), np.zeros(signals.presses))
     on_step("first run")
@@ -209,7 +209,7 @@ def estimate_materials(
         on_step("next mesh")
         found = fitter.linearise(level, state.point, state.zeros)
         state = _restore_unidentified(fitter, level, found)
-        max_steps = MAX_SECANT_STEPS if state is found else 2 * MAX_SECANT_STEPS
+        max_steps = max_fine_steps if state is found else 2 * max_fine_steps
         state = fitter.after_full_step(_fit_coarse(fitter, level, state, coarse_error / 2, on_step, max_steps))
     while fitter.hold(state, fitter.reach(state), MAX_IDENTIFIED_HALF_INTERVAL):
         state = fitter.after_full_step(state)
@@ -243,7 +243,7 @@ def _fit_coarse(
     state: _State,
     error: float,
     on_step: Callable[[str], None],
-    max_steps: int = MAX_STEPS,
+    max_steps: int = 12,
     secant: bool = False,
 ) -> _State:
     """Damped steps by the simulation `predict`, off by a share of about `error`, `max_steps` of them. secant: one run
@@ -276,9 +276,10 @@ def _fit_coarse(
 
 def _refine_fit(fitter: _Fitter, state: _State, fine: Predict | None, on_step: Callable[[str], None]) -> Fit:
     """Goes on with the differences between a finer simulation and the coarse one, and ends with the intervals."""
+    max_steps = 4
     p = len(fitter.held)
     begun, coarse = state.point.free, state.predicted
-    for count in range(0 if fine is None else MAX_FINE_STEPS):
+    for count in range(0 if fine is None else max_steps):
         assert fine is not None
         on_step(f"finer mesh, run {count + 1}")
         exact = fitter.run(fine, [state.point])[0]

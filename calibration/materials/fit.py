@@ -14,8 +14,6 @@ from scipy.stats import t as student
 from tacsim.interface import FloatArray
 
 MESH_ERROR_SHARE = 0.5  # standard deviation of what is left of the mesh's error, over what the finer mesh changed
-HELD = 0.5  # standard deviation of a free number that is held where it was, as far as the others' intervals go
-UNKNOWN = 100.0  # standard deviation of a free number of which nothing is known
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,13 +191,14 @@ class Fit:
 
 
 def covariance_of(
-    system: FloatArray, sigma: FloatArray, priors: FloatArray, held: NDArray[np.bool_], spread: float = HELD
+    system: FloatArray, sigma: FloatArray, priors: FloatArray, held: NDArray[np.bool_], spread: float = 0.5
 ) -> FloatArray:
     """(n, n) of all unknowns, from the system (m, n), whose last columns have `priors`. Parameters that are held have
     no variance themselves; `spread` is what they may be off, as far as the others go."""
+    unknown_deviation = 100.0  # standard deviation of a free number of which nothing is known
     p, n = len(held), system.shape[1]
     free = np.concatenate([~held, np.ones(n - p, np.bool_)])
-    known = np.concatenate([np.full(p, UNKNOWN), priors])[free]
+    known = np.concatenate([np.full(p, unknown_deviation), priors])[free]
     rows = system / sigma[:, None]
     scaled = rows[:, free] * known  # by what is known beforehand: then the information is never singular
     found = np.zeros((n, n))

@@ -17,8 +17,6 @@ Quantity = Literal["force", "dent", "width", "slip"]
 QUANTITY: dict[str, Quantity] = {
     "fx": "force", "fy": "force", "fz": "force", "dent": "dent", "width": "width", "slip_x": "slip", "slip_y": "slip",
 }  # fmt: skip
-ROTATION_LEVER = 5e-3  # about half a gel: from its middle to its edge [m]
-MAX_STILL_MOTION = 1e-6  # parts that move less are in the same place [m]
 MIN_CORNER_COSINE = np.cos(np.radians(20.0))  # of the directions of two steps: beyond, a path turns
 
 
@@ -36,9 +34,8 @@ class Press:
     @property
     def places(self) -> FloatArray:
         """(n, 6 k) where the k parts are, and how far they have turned: rotation vectors times ARM [m]."""
-        turned = [
-            [ROTATION_LEVER * pose_difference(poses[0], pose)[3:] for pose in poses] for poses in self.poses.values()
-        ]
+        lever = 5e-3  # about half a gel: from its middle to its edge [m]
+        turned = [[lever * pose_difference(poses[0], pose)[3:] for pose in poses] for poses in self.poses.values()]
         return np.hstack([*([pose.position for pose in poses] for poses in self.poses.values()), *turned])
 
     def at(self, moments: Sequence[int]) -> Press:
@@ -65,8 +62,9 @@ class Noise:
 
 def merge_repeated_readings(press: Press) -> Press:
     """Readings taken in one place become their mean."""
+    same_place = 1e-6  # parts that move less are in the same place [m]
     places = press.places
-    moved = np.abs(np.diff(places, axis=0)).max(axis=1) > MAX_STILL_MOTION
+    moved = np.abs(np.diff(places, axis=0)).max(axis=1) > same_place
     group = np.concatenate([[0], np.cumsum(moved)])
     first = [int(np.flatnonzero(group == k)[0]) for k in range(group[-1] + 1)]
     result = press.at(first)

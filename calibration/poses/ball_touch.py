@@ -16,15 +16,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calibration.poses.robust_fit import BadMeasurements, RobustFit, angular_spread, perturb_pose, robust_fit
+from calibration.poses.tuning import MAX_CAP_MISFIT, MIN_CONTACT_SPREAD, MIN_TOUCHES
 from tacsim import pose as se3
 from tacsim.interface import FloatArray, Mask, Pose
 
-MIN_TOUCHES = 6  # touches: 18 equations for 9 numbers
 MIN_SPREAD = np.radians(5.0)  # of the tilts, see angular_spread [rad]
-MIN_CONTACT_SPREAD = 0.5e-3  # of the contacts over the gel, in the direction in which they vary least [m]
-CAP = 0.5  # share of the deepest point beyond which the gel lies on the ball (Hertz)
-MIN_CELLS = 12  # of a cap
-MAX_MISFIT = 0.15  # root mean square of a cap's residuals, over its depth
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,6 +142,8 @@ def locate_ball(height: FloatArray, valid: Mask, pitch: float, ball_radius: floa
     Fits a ball of `ball_radius` to the cap deeper than half of the deepest point, where the gel lies on the ball (by
     Hertz the contact circle is half as deep). Raises BadMeasurements where no ball is seen.
     """
+    min_cells = 12  # of a cap
+    cap_share = 0.5  # share of the deepest point beyond which the gel lies on the ball (Hertz)
     from scipy.ndimage import label
 
     rows, columns = height.shape
@@ -154,10 +152,10 @@ def locate_ball(height: FloatArray, valid: Mask, pitch: float, ball_radius: floa
     deepest = float(height[valid].max()) if valid.any() else 0.0
     if not deepest > 0.0:
         raise BadMeasurements("nothing is pressed into the gel")
-    patches, _ = label((height > CAP * deepest) & valid)
+    patches, _ = label((height > cap_share * deepest) & valid)
     cap = patches == patches[np.unravel_index(np.where(valid, height, -np.inf).argmax(), height.shape)]
-    if cap.sum() < MIN_CELLS:
-        raise BadMeasurements(f"the contact covers {int(cap.sum())} cells, {MIN_CELLS} are needed; press deeper")
+    if cap.sum() < min_cells:
+        raise BadMeasurements(f"the contact covers {int(cap.sum())} cells, {min_cells} are needed; press deeper")
     inner = valid.copy()
     inner[[0, -1], :] = inner[:, [0, -1]] = False
     if (cap & ~inner).any():
@@ -174,9 +172,9 @@ def locate_ball(height: FloatArray, valid: Mask, pitch: float, ball_radius: floa
         jacobian = np.stack([dx / root, dy / root, np.ones_like(root)], axis=1)
         found = found + np.linalg.lstsq(jacobian, residual, rcond=None)[0]
     misfit = float(np.sqrt((residual**2).mean())) / deepest
-    if not misfit < MAX_MISFIT:
+    if not misfit < MAX_CAP_MISFIT:
         raise BadMeasurements(
             f"what is pressed is no ball of {1e3 * ball_radius:.3g} mm: it fits only to {misfit:.0%} of its depth "
-            f"({MAX_MISFIT:.0%} at most)"
+            f"({MAX_CAP_MISFIT:.0%} at most)"
         )
     return (float(found[0]), float(found[1])), float(found[2])

@@ -22,13 +22,11 @@ from calibration.poses.robust_fit import (
     perturb_pose,
     robust_fit,
 )
+from calibration.poses.tuning import MIN_POSES
 from tacsim import pose as se3
 from tacsim.interface import FloatArray, Pose
 
-MIN_POSES = 6  # poses: 36 equations for 12 numbers
 MIN_SPREAD = np.radians(15.0)  # of the flange, see angular_spread [rad]
-SUBSETS, SUBSET_SIZE = 12, 5  # starts from a few poses each, so that one bad pose does not spoil them all
-REWEIGHTINGS = 2  # times that the weights are computed anew
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +70,7 @@ def fit_hand_eye(poses: Sequence[BoardPose], *, fixed: bool = False, noise: Hand
 
     Raises BadMeasurements.
     """
+    reweightings = 2  # times that the weights are computed anew
     noise = HandEyeNoise() if noise is None else noise
     if len(poses) < MIN_POSES:
         raise BadMeasurements(f"{len(poses)} poses are too few; at least {MIN_POSES} are needed, 15 to 30 are good")
@@ -86,7 +85,7 @@ def fit_hand_eye(poses: Sequence[BoardPose], *, fixed: bool = False, noise: Hand
     # arm_i camera board_i = mount, always the same
     arm = np.asarray(inv(flange) if fixed else flange, dtype=np.float64)
     camera, mount = _closed_form_start(arm, board)
-    for _ in range(1 + REWEIGHTINGS):
+    for _ in range(1 + reweightings):
         camera, mount, fit = _solve_poses(arm, board, camera, mount, noise, fixed=fixed)
     predicted = inv(camera) @ inv(arm) @ mount
     turn = Rotation.from_matrix(predicted[:, :3, :3] @ np.swapaxes(board[:, :3, :3], 1, 2)).magnitude()
@@ -148,10 +147,11 @@ def _cross_matrices(vectors: FloatArray) -> FloatArray:
 
 def _closed_form_start(arm: FloatArray, board: FloatArray) -> tuple[FloatArray, FloatArray]:
     """The closed form's camera and mount from all poses or a subset, whichever the poses agree with most."""
+    subset_count, subset_size = 12, 5  # starts from a few poses each, so that one bad pose does not spoil them all
     random = np.random.default_rng(0)
     count = len(arm)
     chosen = [np.arange(count)]
-    chosen += [random.choice(count, min(SUBSET_SIZE, count), replace=False) for _ in range(SUBSETS)]
+    chosen += [random.choice(count, min(subset_size, count), replace=False) for _ in range(subset_count)]
     candidates = []
     for some in chosen:
         if angular_spread(arm[some, :3, :3]) < MIN_SPREAD / 2:

@@ -16,15 +16,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import isotonic_regression, minimize_scalar
 
+from calibration.poses.tuning import MAX_SECOND_PEAK, MIN_CORRELATION, MIN_SAMPLES, PEAK_HALF_WIDTH
 from tacsim.interface import FloatArray
 
-MIN_CORRELATION = 0.7  # below it the two signals are not of one motion
-MAX_SECOND_PEAK = 0.85  # height of a second peak over the best one; higher, and the latency is ambiguous
-MIN_SAMPLES = 30  # pictures whose whole search range the arm's record covers
-JACKKNIFE_BLOCKS = 8
 COARSE_STEP = 1e-3  # of the coarse search [s]
-PEAK_HALF_WIDTH = 40e-3  # reach of the fine search; peaks beyond are others [s]
-ITERATIONS = 5  # of fitting the response and the shift in turn
 
 
 class NoLatency(ValueError):
@@ -55,6 +50,7 @@ def estimate_latency(
     latency [s]. Raises NoLatency when the signals do not correlate, or fit several latencies, ValueError for arrays
     that are no signals.
     """
+    blocks = 8
     arm_times, arm = _check_signal(depth_times, depth, "depth")
     times, observed = _check_signal(touch_times, touch, "touch")
     low, high = search
@@ -75,9 +71,9 @@ def estimate_latency(
 
     fit = partial(_fit_shift, float(shifts[best]), arm_times, arm)
     shift, likeness = fit(times, observed)
-    parts = np.array_split(np.arange(len(times)), JACKKNIFE_BLOCKS)
+    parts = np.array_split(np.arange(len(times)), blocks)
     without = np.array([fit(np.delete(times, gone), np.delete(observed, gone))[0] for gone in parts])
-    spread = (JACKKNIFE_BLOCKS - 1) / JACKKNIFE_BLOCKS * float(((without - without.mean()) ** 2).sum())
+    spread = (blocks - 1) / blocks * float(((without - without.mean()) ** 2).sum())
     return Latency(seconds=shift, uncertainty=float(np.sqrt(spread)), correlation=likeness, samples=len(times))
 
 
@@ -85,8 +81,9 @@ def _fit_shift(
     shift: float, arm_times: FloatArray, arm: FloatArray, times: FloatArray, observed: FloatArray
 ) -> tuple[float, float]:
     """Response and shift in turn, from the coarse `shift` on: the shift [s], and the correlation there."""
+    iterations = 5  # of fitting the response and the shift in turn
     likeness = 0.0
-    for _ in range(ITERATIONS):
+    for _ in range(iterations):
         response = _fit_response(np.interp(times - shift, arm_times, arm), observed)
         expected = np.interp(arm, *response)  # the touch that a camera without latency would show
         found = minimize_scalar(

@@ -15,13 +15,8 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from calibration.errors import CalibrationError
+from calibration.poses.tuning import MAX_OUTLIERS, MAX_SCATTER, OUTLIER_DISTANCE
 from tacsim.interface import FloatArray, Mask
-
-OUTLIER_DISTANCE = 5.0  # of an outlier: norm of its residuals [standard deviations]
-MAX_OUTLIERS = 0.25  # share of the measurements
-MAX_STARTS = 4  # the most promising starts are fitted
-MAX_ROUNDS = 4  # of leaving outliers out and fitting again
-MAX_SCATTER = 3.0  # over what the noise allows; beyond, something other than noise is wrong
 
 Residuals = Callable[[FloatArray], FloatArray]
 
@@ -49,16 +44,19 @@ def robust_fit(residuals: Residuals, starts: Sequence[FloatArray], what: str) ->
     Raises BadMeasurements.
     """
 
+    max_rounds = 4  # of leaving outliers out and fitting again
+    max_starts = 4  # the most promising starts are fitted
+
     def flat(parameters: FloatArray) -> FloatArray:
         return residuals(parameters).ravel()
 
     # Cauchy's loss hardly pulls from afar; the soft L1 loss leads near.
-    promising = sorted(starts, key=lambda start: float(np.abs(flat(start)).sum()))[:MAX_STARTS]
+    promising = sorted(starts, key=lambda start: float(np.abs(flat(start)).sum()))[:max_starts]
     rough = [least_squares(flat, start, loss="soft_l1", x_scale="jac", ftol=1e-3, max_nfev=30) for start in promising]
     best = min(rough, key=lambda fit: float(fit.cost))
     found = least_squares(flat, best.x, loss="cauchy", x_scale="jac", max_nfev=60).x
     used = np.ones(len(residuals(found)), dtype=np.bool_)
-    for _ in range(MAX_ROUNDS):
+    for _ in range(max_rounds):
         apart = np.sqrt((residuals(found) ** 2).sum(axis=1))
         # noise may be larger than stated: outliers are far from the others, too
         usual = max(1.0, float(np.median(apart)) / np.sqrt(residuals(found).shape[1]))

@@ -236,6 +236,6 @@ class _Task:
 
 def _reach(half: float) -> str:
     """Half an interval of a free number, in words."""
-    from calibration.materials.estimate import MAX_IDENTIFIED_HALF_INTERVAL
+    from calibration.materials.tuning import MAX_IDENTIFIED_HALF_INTERVAL
 
     return f"± {100 * half:.2g} %" if half < MAX_IDENTIFIED_HALF_INTERVAL else "nothing"

@@ -51,8 +51,8 @@ class RunFolder:
             written = json.loads(text)["format"]
             if written != FORMAT:
                 raise RunError(
-                    f"{path} has format {printable_line(str(written))}, this version of tacsim continues format {FORMAT}: "
-                    "continue with the version that started the run, or start a new training"
+                    f"{path} has format {printable_line(str(written))}, this version of tacsim continues format "
+                    f"{FORMAT}: continue with the version that started the run, or start a new training"
                 )
             self.settings = RunSettings.model_validate_json(text)
         except (ValidationError, json.JSONDecodeError, TypeError, KeyError) as failure:

@@ -18,7 +18,6 @@ from tacsim.config.errors import Place, did_you_mean
 FILE, REFERENCE = "calibration.yaml", "reference.png"
 FORMAT = 8  # that is written and read
 OWN = "sensors"  # folder of sensors of one's own, beside the file that names them or in the current folder
-MAX_FILE_SIZE, MAX_PICTURE_SIZE = 1_000_000, 1 << 26  # [bytes] of the YAML, and of the picture
 AGAIN = "make it again with `tacsim calibrate sensor`"
 
 
@@ -60,10 +59,11 @@ def read_files(path: Path) -> tuple[Path, dict[str, Any], bytes]:
 
     Raises NoBundle: files that are missing, too large or no files, another format, damage, changed content.
     """
+    max_file_size, max_picture_size = 1_000_000, 1 << 26  # [bytes] of the YAML, and of the picture
     file = path
     try:
         file = path / FILE if path.is_dir() else path
-        for part, most in ((file, MAX_FILE_SIZE), (file.with_name(REFERENCE), MAX_PICTURE_SIZE)):
+        for part, most in ((file, max_file_size), (file.with_name(REFERENCE), max_picture_size)):
             about = part.stat()
             if not stat.S_ISREG(about.st_mode):  # a pipe would be waited for
                 raise NoBundle(f"{part} is no file: a calibration is a folder with {FILE} and {REFERENCE}")

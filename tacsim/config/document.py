@@ -20,10 +20,7 @@ import yaml
 from tacsim.config.errors import Place, Problem
 from tacsim.models.text import printable_line
 
-MAX_BYTES = 1_000_000
-MAX_DEPTH = 32
 MAX_NODES = 20_000  # of one load, referenced files included
-_MAX_DIGITS = 64  # of a whole number
 
 _FLOAT = re.compile(
     r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?$|[-+]?\.(?:inf|Inf|INF)$|\.(?:nan|NaN|NAN)$"
@@ -94,6 +91,7 @@ class _Loader(yaml.SafeLoader):
         self.depth = 0
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        max_depth = 32
         event = self.peek_event()  # type: ignore[no-untyped-call]
         self.room -= 1
         self.depth += 1
@@ -102,8 +100,8 @@ class _Loader(yaml.SafeLoader):
             problem = "anchors (&) and aliases (*) are not allowed; write the value out, or refer to a file by its name"
         elif getattr(event, "tag", None) is not None:
             problem = f"tags are not allowed ({event.tag}); leave it out"
-        elif self.depth > MAX_DEPTH:
-            problem = f"nested too deeply; at most {MAX_DEPTH} levels are allowed"
+        elif self.depth > max_depth:
+            problem = f"nested too deeply; at most {max_depth} levels are allowed"
         elif self.room < 0:
             problem = f"too many values; at most {MAX_NODES} are allowed, referenced files included"
         if problem is not None:
@@ -136,6 +134,7 @@ def read_text(path: Path, refuse: Callable[[str], None], state: LoadState) -> st
 
     `refuse` reports a problem of the file itself, at the place that refers to it.
     """
+    max_bytes = 1_000_000
     try:
         mode = path.stat()
         if not stat.S_ISREG(mode.st_mode):
@@ -143,12 +142,12 @@ def read_text(path: Path, refuse: Callable[[str], None], state: LoadState) -> st
             refuse(f"'{shown(path)}' {what}; give a YAML file")
             return None
         size = mode.st_size
-        if size <= MAX_BYTES:
+        if size <= max_bytes:
             with path.open("rb") as file:
-                content = file.read(MAX_BYTES + 1)
+                content = file.read(max_bytes + 1)
             size = len(content)  # it may have grown
-        if size > MAX_BYTES:
-            refuse(f"'{shown(path)}' has {size / 1e6:.1f} MB; at most {MAX_BYTES / 1e6:.0f} MB is allowed")
+        if size > max_bytes:
+            refuse(f"'{shown(path)}' has {size / 1e6:.1f} MB; at most {max_bytes / 1e6:.0f} MB is allowed")
             return None
         state.sources.append(path)
         return content.decode("utf-8-sig")
@@ -257,11 +256,12 @@ def _entries(node: yaml.MappingNode, origin: _Origin, path: tuple[str, ...]) -> 
 
 def _scalar(tag: str, text: str) -> tuple[bool | int | float | str | None, str]:
     """Value of a scalar, and its problem (empty: none)."""
+    max_digits = 64  # of a whole number
     if tag == "null":
         return None, ""
     if tag == "bool":
         return text.lower() == "true", ""
-    if tag == "int" and len(text) <= _MAX_DIGITS:
+    if tag == "int" and len(text) <= max_digits:
         return int(text), ""
     if tag in ("int", "float"):
         number = float(text.lower().replace(".inf", "inf").replace(".nan", "nan"))

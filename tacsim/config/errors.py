@@ -8,8 +8,6 @@ from dataclasses import dataclass
 
 from tacsim.models.text import printable_line
 
-_SHOWN = 30  # a broken file can have thousands of problems
-
 
 @dataclass(frozen=True, slots=True)
 class Place:
@@ -38,13 +36,14 @@ class ConfigError(ValueError):
     """The configuration cannot be used. ``str(error)`` is the complete message: lines ``file:line: key: what``."""
 
     def __init__(self, problems: Sequence[Problem]) -> None:
+        max_shown = 30  # a broken file can have thousands of problems
         sources = list(dict.fromkeys(problem.place.source for problem in problems))
         self.problems = tuple(
             sorted(dict.fromkeys(problems), key=lambda p: (sources.index(p.place.source), p.place.line or 0))
         )
-        lines = [str(problem) for problem in self.problems[:_SHOWN]]
-        if len(self.problems) > _SHOWN:
-            lines.append(f"... and {len(self.problems) - _SHOWN} more problems")
+        lines = [str(problem) for problem in self.problems[:max_shown]]
+        if len(self.problems) > max_shown:
+            lines.append(f"... and {len(self.problems) - max_shown} more problems")
         super().__init__("\n".join(lines))
 
 

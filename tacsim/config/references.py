@@ -19,8 +19,6 @@ from tacsim.config.kinds import Kind, NotFound, kind_of, resolve
 from tacsim.models.quantity import Quantity
 
 FAR = ("arms", "keep_out", "start")  # parts of a rig where metres can be meant
-TOO_LONG = 0.1  # for anything else that `--set` gives as a bare number [m]
-_MAX_CHAIN = 16  # files that refer to each other in a row
 
 
 def expand(node: Node, annotation: Any, state: LoadState, key: str = "", chain: tuple[Path, ...] = ()) -> Node:
@@ -72,6 +70,7 @@ def read_file(
     chain: tuple[Path, ...] = (),
 ) -> Node:
     """The expanded content of a file. `refuse` reports that it cannot be read, at the place that refers to it."""
+    max_chain = 16  # files that refer to each other in a row
     broken = Node(None, Place(shown(path), 1), path.parent, broken=True)
     path = path.absolute()  # not resolved: messages name the file as the person did
     kind = kind_of(models(annotation))
@@ -91,8 +90,8 @@ def read_file(
     if resolved in chain:
         circle = " -> ".join(shown(step) for step in (*chain[chain.index(resolved) :], resolved))
         refuse(f"the references form a circle: {circle}; break it in one of them")
-    elif len(chain) >= _MAX_CHAIN:
-        refuse(f"more than {_MAX_CHAIN} files refer to each other in a row; shorten the chain")
+    elif len(chain) >= max_chain:
+        refuse(f"more than {max_chain} files refer to each other in a row; shorten the chain")
     elif state.nodes <= MAX_NODES:  # else reported already; every further file would report it again
         text = read_text(path, refuse, state)
     if text is None:
@@ -198,12 +197,13 @@ def _put(node: Node, annotation: Any, override: Override, depth: int, state: Loa
 
 def _require_unit(annotation: Any, override: Override, state: LoadState) -> None:
     """Reports lengths without a unit that cannot be metres: of gels, bodies and sensors; an arm reaches so far."""
+    max_bare_length = 0.1  # for anything else that `--set` gives as a bare number [m]
     if override.path[0] in FAR or not _is_length(annotation):
         return
     values = override.value.value if isinstance(override.value.value, list) else [override.value]
     for node in values:
         number = node.value
-        if isinstance(number, int | float) and not isinstance(number, bool) and abs(number) >= TOO_LONG:
+        if isinstance(number, int | float) and not isinstance(number, bool) and abs(number) >= max_bare_length:
             what = f"{number} without a unit would be {number:g} m; say '{number:g} mm' or the like"
             state.report(override.value.place, ".".join(override.path), what)
 

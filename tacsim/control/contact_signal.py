@@ -8,9 +8,6 @@ import numpy as np
 
 from tacsim.interface import Mask, TactileObservation
 
-CONTACT_HEIGHT = 20e-6  # deeper than this counts as contact: ten times the usual gel texture of 2 um [m]
-CONTACT_DIFFERENCE = 0.10  # relative change of colour that counts as contact; camera noise is 0.02 to 0.03 [-]
-
 
 def contact_signal(observation: TactileObservation) -> float:
     """Mean of |I - I0| / mean(I0) over valid pixels and channels [-]: 0 without contact, grows with the press.

@@ -13,16 +13,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from tacsim import pose as se3
+from tacsim.control.tuning import LOAD_TOLERANCE, MAX_TRAVEL
 from tacsim.interface import Action, ArmState, FloatArray, Pose
 from tacsim.limits import LimitExceeded
 from tacsim.models.rig import TaskConfig
-
-TOLERANCE = 0.01  # of the load: an error within it is left alone, so an arm at its load rests
-PROBE_SHARE = 0.1  # of the longest correction: the length of one while no stiffness is known
-# Largest change of stiffness a period, as forces are noisy; smaller towards soft, where corrections are longer
-MAX_STIFFENING, MAX_SOFTENING = 2.0, 1.25
-MIN_DISPLACEMENT = 1e-6  # a shorter displacement gives no stiffness [m]
-MAX_TRAVEL = 5e-3  # farthest from where the arm began along z; beyond, the load counts as out of reach [m]
 
 
 @dataclass
@@ -86,20 +80,26 @@ class LoadController:
     def _update_stiffness(self, axis: _AxisState, displacement: float, force: float) -> None:
         """The stiffness from the last displacement along z [m] and the force after it [N]; a force that fell as the
         sensor pressed came from elsewhere (the body slid, tipped or yielded) and teaches nothing."""
+        # Largest change of stiffness a period, as forces are noisy; smaller towards soft, where corrections are longer
+        down = 1.25
+        # Largest change of stiffness a period, as forces are noisy; smaller towards soft, where corrections are longer
+        up = 2.0
+        min_displacement = 1e-6  # a shorter displacement gives no stiffness [m]
         change = force - axis.before[1]
-        if abs(displacement) < MIN_DISPLACEMENT or not change / displacement > 0:
+        if abs(displacement) < min_displacement or not change / displacement > 0:
             return
         found = change / displacement
         known = axis.stiffness
-        axis.stiffness = found if known is None else min(max(found, known / MAX_SOFTENING), known * MAX_STIFFENING)
+        axis.stiffness = found if known is None else min(max(found, known / down), known * up)
 
     def _next_correction(self, axis: _AxisState, load: float, force: float) -> float:
         """The next correction, positive towards the object [m]."""
+        probe_share = 0.1  # of the longest correction: the length of one while no stiffness is known
         error = load - force
-        if abs(error) <= TOLERANCE * load:
+        if abs(error) <= LOAD_TOLERANCE * load:
             return 0.0
         if axis.stiffness is None:
-            return math.copysign(PROBE_SHARE * self._max_correction, error)
+            return math.copysign(probe_share * self._max_correction, error)
         return max(-self._max_correction, min(self._max_correction, error / axis.stiffness))
 
 

@@ -25,10 +25,6 @@ IntArray = NDArray[np.int64]
 Axes = tuple[FloatArray, FloatArray, FloatArray]
 
 MAX_BYTES = 64 * 2**20
-MAX_TRIANGLES = 500_000
-SIZES = (1e-5, 1.0)  # smallest and largest edge of the bounding box [m]
-_HEADER, _RECORD = 84, 50  # bytes of a binary STL: header with the count, one triangle
-_RESOLUTION = 1e-7  # of float32, the number format of STL: what is thinner, relative to the mesh, has no area
 _CHUNK = 500_000  # rows worked on at once, for memory
 _REPAIR = (
     "repair it (for example Blender's 3D-Print Toolbox 'Make Manifold', or Meshmixer 'Inspector') and export again"
@@ -80,11 +76,12 @@ def _read_stl(path: Path) -> bytes:
 
 
 def _decode_stl(data: bytes, path: Path) -> Trimesh:
+    max_triangles = 500_000
     count = _count_triangles(data, path)
     if count == 0:
         raise ValueError(f"{path}: the mesh is empty (no triangles); export it again")
-    if count > MAX_TRIANGLES:
-        raise ValueError(f"{path}: {count:,} triangles, the limit is {MAX_TRIANGLES:,}; decimate the mesh")
+    if count > max_triangles:
+        raise ValueError(f"{path}: {count:,} triangles, the limit is {max_triangles:,}; decimate the mesh")
     import trimesh
 
     try:
@@ -113,8 +110,9 @@ def _silence_trimesh() -> Iterator[None]:
 
 def _count_triangles(data: bytes, path: Path) -> int:
     """Triangles of an STL file, from its structure alone. Binary files may begin with "solid": the length decides."""
-    stated = int.from_bytes(data[80:_HEADER], "little") if len(data) >= _HEADER else None
-    if stated is not None and len(data) == _HEADER + _RECORD * stated:
+    header_size, record_size = 84, 50  # bytes of a binary STL: header with the count, one triangle
+    stated = int.from_bytes(data[80:header_size], "little") if len(data) >= header_size else None
+    if stated is not None and len(data) == header_size + record_size * stated:
         return stated
     lower = data.lower()
     if lower.lstrip().startswith(b"solid") and b"\0" not in data:
@@ -128,7 +126,7 @@ def _count_triangles(data: bytes, path: Path) -> int:
         raise ValueError(
             f"{path}: is no STL (neither a binary header nor 'solid' at the start); export the mesh as .stl"
         )
-    expected = _HEADER + _RECORD * stated
+    expected = header_size + record_size * stated
     raise ValueError(
         f"{path}: binary STL of {stated:,} triangles should have {expected:,} bytes but has {len(data):,} "
         f"({'truncated' if len(data) < expected else 'too long'}); export or copy the mesh again"
@@ -137,11 +135,13 @@ def _count_triangles(data: bytes, path: Path) -> int:
 
 def _require_closed(mesh: Trimesh, scale: float, path: Path) -> None:
     """Merges the corners that STL repeats, then refuses what has no well-defined inside. Coordinates in file units."""
+    resolution = 1e-7  # of float32, the number format of STL: what is thinner, relative to the mesh, has no area
+    sizes = (1e-5, 1.0)  # smallest and largest edge of the bounding box [m]
     if not np.isfinite(mesh.vertices).all():
         bad = int((~np.isfinite(mesh.vertices).all(axis=1)).sum())
         raise ValueError(f"{path}: {bad} corners are not finite (NaN or infinite); {_REPAIR}")
     size = np.ptp(mesh.vertices, axis=0)
-    smallest, largest = SIZES
+    smallest, largest = sizes
     if size.min() * scale < smallest or size.max() * scale > largest:
         raise ValueError(
             f"{path}: the mesh measures {' x '.join(f'{s * scale:.3g}' for s in size)} m at scale {scale:g} m per file "
@@ -158,10 +158,10 @@ def _require_closed(mesh: Trimesh, scale: float, path: Path) -> None:
         raise ValueError(f"{path}: neighbouring triangles face opposite ways; recalculate the normals, or {_REPAIR}")
     edges = np.diff(mesh.triangles[:, [0, 1, 2, 0]], axis=1)
     height = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) / np.linalg.norm(edges, axis=2).max(axis=1)
-    degenerate = int((height < _RESOLUTION * size.max()).sum())
+    degenerate = int((height < resolution * size.max()).sum())
     if degenerate:
         raise ValueError(f"{path}: {degenerate} triangles are degenerate (three corners on a line); {_REPAIR}")
-    if abs(mesh.volume) < _RESOLUTION * size.prod():
+    if abs(mesh.volume) < resolution * size.prod():
         raise ValueError(f"{path}: the mesh encloses no volume; model a solid and export again")
 
 

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from trimesh import Trimesh
 
 AXIS_TOLERANCE = math.radians(1.0)  # a direction within it of an axis is called by that axis
-LEVEL_SHARE = 1e-4  # of the height: corners within it of the lowest are level with it
 SIDES = {"-z": (0.0, 0.0), "+z": (math.pi, 0.0), "+x": (0.0, math.pi / 2), "-x": (0.0, -math.pi / 2),
          "+y": (-math.pi / 2, 0.0), "-y": (math.pi / 2, 0.0)}  # fmt: skip
 # ^ by the side that is to press: roll and pitch of the indenter [rad]
@@ -35,12 +34,13 @@ class PressingSide:
 
 def find_pressing_side(indenter: Indenter) -> PressingSide:
     """Of an indenter as its scene turns it. Raises what :func:`tacsim.geometry.mesh.load_mesh` raises."""
+    level_share = 1e-4  # of the height: corners within it of the lowest are level with it
     pose = Pose(quaternion=indenter.turn)
     down = rotate(inverse(pose), [0.0, 0.0, -1.0])
     mesh = surface_mesh(indenter.geometry)
     vertices = np.asarray(mesh.vertices, np.float64) @ rotation_matrix(pose).T
     height = float(np.ptp(vertices[:, 2]))
-    low = vertices[:, 2] <= vertices[:, 2].min() + LEVEL_SHARE * height
+    low = vertices[:, 2] <= vertices[:, 2].min() + level_share * height
     part = vertices[low]
     size = np.sort(np.ptp(part[:, :2], axis=0))[::-1] * 1e3
     flat = bool(low[np.asarray(mesh.faces)].all(axis=1).any())
@@ -48,7 +48,7 @@ def find_pressing_side(indenter: Indenter) -> PressingSide:
         words = "a ball"
     elif flat:
         words = f"a flat face of {size[0]:.3g} x {size[1]:.3g} mm"
-    elif len(part) > 1 and np.hypot(*size) > 1e3 * LEVEL_SHARE * height:
+    elif len(part) > 1 and np.hypot(*size) > 1e3 * level_share * height:
         words = f"an edge {np.hypot(*size):.3g} mm long"
     else:
         words = "a point"

@@ -46,8 +46,6 @@ BOUNDS = {
     "joints": 4 * math.pi,  # [rad]
 }
 
-MAX_FEATURE = 100.0  # the same of features, which are numbers of order 1: a height of 100 mm, a force of 1 kN
-
 
 def flatten_observation(observation: Observation, start: Mapping[str, Pose]) -> FlatObservation:
     """The observation as a flat dict of fresh arrays; `start` holds each arm's pose at reset."""
@@ -118,6 +116,7 @@ def space_of_rig(config: RigConfig) -> spaces.Space[FlatObservation]:
 
 def space_of_features(encoder: FeatureEncoder, config: RigConfig) -> spaces.Space[FlatObservation]:
     """Of what `encoder` makes of this rig, whose task has a goal."""
+    max_feature = 100.0  # the same of features, which are numbers of order 1: a height of 100 mm, a force of 1 kN
     features = encoder.features
     numbers = {key: len(each.names) for key, each in encoder.inputs.items()}
     shapes: dict[str, tuple[int, ...]] = {}
@@ -134,7 +133,7 @@ def space_of_features(encoder: FeatureEncoder, config: RigConfig) -> spaces.Spac
         assert config.task is not None
         shapes["goal"] = np.atleast_1d(make_task(config.task).goal).shape
     space: spaces.Space[Any] = spaces.Dict(
-        {key: spaces.Box(-MAX_FEATURE, MAX_FEATURE, shape, np.float32) for key, shape in shapes.items()}
+        {key: spaces.Box(-max_feature, max_feature, shape, np.float32) for key, shape in shapes.items()}
     )
     return space
 

@@ -25,7 +25,6 @@ from tacsim.tasks.task import Effort, Task, action_of_vector, evaluate_outcome, 
 
 Result = tuple[encode.FlatObservation, float, bool, bool, dict[str, Any]]  # of a step
 RESET_ERRORS = (GoalOutOfReach, NoTouch, SimulationDiverged)  # with this draw
-MAX_REJECTED_DRAWS = 8  # draws in a row
 
 
 def copy_reset_options(options: Mapping[str, Any] | None) -> dict[str, Any]:
@@ -137,12 +136,13 @@ class TacsimEnv(gymnasium.Env[encode.FlatObservation, Float32]):
         others, for what cannot change between episodes, for a goal that no policy can reach (GoalOutOfReach), and for
         too many bad draws (BadDraws).
         """
+        max_refused = 8  # draws in a row
         super().reset(seed=seed)
         chosen, refused = copy_reset_options(options), list[str]()
         while not self._try_begin_episode(chosen, refused):
-            if len(refused) == MAX_REJECTED_DRAWS:
+            if len(refused) == max_refused:
                 raise BadDraws(
-                    f"{MAX_REJECTED_DRAWS} draws in a row cannot begin an episode, the last with {refused[-1]}; narrow "
+                    f"{max_refused} draws in a row cannot begin an episode, the last with {refused[-1]}; narrow "
                     "the distributions"
                 )
         info = self._evaluate_state()[1]

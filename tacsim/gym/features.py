@@ -68,7 +68,6 @@ PARTS: dict[str, dict[str, str]] = {
     "stepped": {f"stepped_{axis}": "stepped" for axis in "xyz"},
     "between": {f"between_{axis}": "between" for axis in "xyz"},
 }
-MAX_MAP_CELLS = 16  # along a side of a map that nobody chose
 _IDENTITY_COLUMNS = np.array([1.0, 0.0, 0.0, 0.0, 1.0, 0.0])
 _SENSOR_QUANTITIES = ("area", "depth", "centroid", "shear")
 
@@ -77,9 +76,10 @@ def default_features(canonical: CanonicalGrid, sensors: Sequence[str], arms: Seq
     """What an environment shows where its user names no features: the heights of all sensors, and what is felt, as
     numbers of order 1. The map has at most 16 x 16 cells, each of whole cells of the canonical grid; a grid
     that cannot be divided so has no map."""
+    max_map_cells = 16  # along a side of a map that nobody chose
     position: Quantity = "between" if len(arms) > 1 else "moved"
     finer = (canonical.rows, canonical.columns)
-    every = -(-max(finer) // MAX_MAP_CELLS)
+    every = -(-max(finer) // max_map_cells)
     if every % 2 == 0 and any(have % 2 for have in finer):
         every += 1  # margins must be equal on both sides: an even number of cells is left over
     rows, columns = (have // every - (have % every) % 2 for have in finer)

@@ -67,7 +67,6 @@ SHADOW_SLOPES = (0.1, 0.3, 0.75)  # horizons at which it begins to get dark [-]
 SHADOW_WIDTH = 1.5
 SHADOW_STEPS = tuple(0.012 * 1.3**k for k in range(14))  # from 1/80 to a third of the picture
 SHADOW_PLACES = 3  # position terms: 1, u, v
-LAMP_DISTANCE = 1e-3  # closer to a lamp, its direction is not defined
 
 
 class CastShadows(Config):
@@ -102,8 +101,9 @@ def horizon_slope(
     height: Callable[[Floats, Floats], Floats], x: Floats, y: Floats, lamp: tuple[float, float]
 ) -> Floats:
     """(...,) steepest way up towards the lamp from places x, y (...,), at least 0; `height` of places."""
+    min_distance = 1e-3  # closer to a lamp, its direction is not defined
     to_x, to_y = lamp[0] - x, lamp[1] - y
-    distance = np.sqrt(to_x * to_x + to_y * to_y) + x.dtype.type(LAMP_DISTANCE)
+    distance = np.sqrt(to_x * to_x + to_y * to_y) + x.dtype.type(min_distance)
     to_x, to_y = to_x / distance, to_y / distance
     here = height(x, y)
     steepest = np.zeros_like(here)

@@ -26,7 +26,6 @@ _BOUNDS = {"gt": "exclusiveMinimum", "ge": "minimum", "lt": "exclusiveMaximum", 
 # No two neighbours of these patterns take the same character: matching takes linear time.
 _NUMBER = r"[-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?"
 _QUANTITY = re.compile(rf"({_NUMBER})\s*([^\s0-9.]\S*)?")
-MAX_TEXT = 100  # characters of a quantity
 
 
 def list_units(kind: str) -> str:
@@ -62,10 +61,11 @@ def parse_quantity(value: Any, kind: str, *, bare: bool = True) -> float:
 
 def _parse_text(text: str, kind: str, allowed: str) -> tuple[float, bool]:
     """SI value, and whether it had a unit."""
+    max_characters = 100  # characters of a quantity
     units = UNITS[kind]
-    if len(text) > MAX_TEXT:
+    if len(text) > max_characters:
         raise ValueError(
-            f"the {kind} {text[:20]!r}... has {len(text)} characters, at most {MAX_TEXT} are read; {allowed}"
+            f"the {kind} {text[:20]!r}... has {len(text)} characters, at most {max_characters} are read; {allowed}"
         )
     match = _QUANTITY.fullmatch(text.strip())
     if match is None:

@@ -12,6 +12,20 @@ from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, mod
 from tacsim.interface import Float32, FloatArray
 from tacsim.models.material import BodyMaterial, GelMaterial, elastic_constants, shear_impedance
 from tacsim.models.quantity import Acceleration, Angle, Config, Length
+from tacsim.models.tuning import (
+    DEFAULT_TOLERANCE,
+    FLOW_MACH,
+    GEL_STRESS_SHARE,
+    LIGHT_FLOW_GAIN,
+    LIGHT_SPEED_GAIN,
+    MACH_BY_SHEAR,
+    MACH_BY_STRESS,
+    MAX_ELEMENTS,
+    MAX_GEL_STRESS_SHARE,
+    MAX_MACH,
+    MIN_EDGE_RADIUS,
+    MIN_MACH,
+)
 
 Edge = Annotated[Length, Field(ge=1e-5, le=10.0)]  # of a body or an indenter [m]
 Size3 = tuple[Annotated[Length, Field(gt=0)], Annotated[Length, Field(gt=0)], Annotated[Length, Field(gt=0)]]
@@ -28,22 +42,6 @@ PRESETS: dict[Preset, tuple[float, float]] = {
 PRESET_FORCE_ERROR: dict[Preset, tuple[float, float]] = {
     "learn": (0.031, 0.108), "draft": (0.005, 0.041), "standard": (-0.006, 0.021),
 }  # fmt: skip
-# Peak Mach number of motions between states of rest at DEFAULT_TOLERANCE, in proportion to a smaller tolerance: what
-# the yield stress allows over the stress that the motion costs, within bounds; where nothing yields, a share of the
-# speed of the gel's shear wave (docs/decisions/0002).
-MACH_BY_STRESS, MIN_MACH, MAX_MACH, DEFAULT_TOLERANCE = 3.7, 0.001, 0.03, 1e-2
-# What the gel's motion adds to that stress: the impedance of its shear wave, and at most the body's own, times these
-GEL_STRESS, MAX_GEL_STRESS = 2.5, 2.0
-MACH_BY_SHEAR = 0.1
-LIGHT_SPEED_FACTOR = (
-    1.25  # so much faster may sensors go whose gels and body answer as if they were lighter: no indenter, no seed
-)
-FLOW_MACH, LIGHT_FLOW_FACTOR = (
-    0.02,
-    1.5,
-)  # mean of motions that flow into one another; so much faster where they are lighter
-MIN_EDGE_RATIO = 0.5  # element sizes: an edge that is less round catches on the mesh
-MAX_CELLS = 5_000_000  # elements of one gel, or its particles in the seed's scheme; a standard gel has 12,800
 
 
 class Gel(Config):
@@ -172,7 +170,7 @@ class Indenter(Config):
             return 0.0
         if self.edge_radius is not None:
             return self.edge_radius
-        return min(MIN_EDGE_RATIO * element, _min_side(self.geometry) / 4)
+        return min(MIN_EDGE_RADIUS * element, _min_side(self.geometry) / 4)
 
 
 def _min_side(geometry: Box | Cylinder) -> float:
@@ -241,10 +239,10 @@ class Scene(Config):
         )
         edge = min(edge, size[2] / 2)  # a thin gel is resolved finer than its preset
         cells, of = math.prod(side / edge for side in size), f" of sensor '{sensor}'" if sensor in self.gels else ""
-        if cells > MAX_CELLS:
+        if cells > MAX_ELEMENTS:
             raise ValueError(
                 f"a gel{of} of {' x '.join(f'{side:g}' for side in size)} m has {cells:.3g} cells at "
-                f"{name} {edge:g} m, the limit is {MAX_CELLS:,}; choose a larger {name} or a smaller gel"
+                f"{name} {edge:g} m, the limit is {MAX_ELEMENTS:,}; choose a larger {name} or a smaller gel"
             )
         given = self.element_size if own.element_size is None else own.element_size
         if given is not None and given > size[2] / 2 * (1 + 1e-9):
@@ -278,7 +276,7 @@ class Scene(Config):
         mu, lam = elastic_constants(self.body.material)
         body = lam + 2 * mu
         gel = max(shear_impedance(self.gel_of(name).material) for name in self.sensors)
-        stress = body + min(GEL_STRESS * gel, MAX_GEL_STRESS * body)
+        stress = body + min(GEL_STRESS_SHARE * gel, MAX_GEL_STRESS_SHARE * body)
         return MACH_BY_STRESS * 2 * mu * self.body.material.elastic_limit / stress
 
     @property
@@ -309,7 +307,7 @@ class Scene(Config):
     @property
     def max_mach(self) -> float:
         """The most that this is for a body that yields, at any tolerance."""
-        return min(self._mach_by_stress, MAX_MACH * (LIGHT_SPEED_FACTOR if self.physics == "hybrid" else 1.0))
+        return min(self._mach_by_stress, MAX_MACH * (LIGHT_SPEED_GAIN if self.physics == "hybrid" else 1.0))
 
     @property
     def preset_error(self) -> str:
@@ -325,7 +323,7 @@ class Scene(Config):
         """Mean speed of motions that flow into one another, over the wave speed; slower on short paths."""
         if self.settling.flow_mach is not None:
             return self.settling.flow_mach
-        return FLOW_MACH if self.body is None else LIGHT_FLOW_FACTOR * FLOW_MACH
+        return FLOW_MACH if self.body is None else LIGHT_FLOW_GAIN * FLOW_MACH
 
     @property
     def spacing(self) -> float:

@@ -10,20 +10,16 @@ from __future__ import annotations
 import numpy as np
 
 from tacsim.interface import Float32, Image
+from tacsim.optics.tuning import DOT_BLUR, MAX_DOT_RADIUS, MIN_EDGE_DARKNESS, MIN_RADIUS
 
-EDGE_DARKNESS = 0.15  # of the blurred edge of a dot: the share of its light that is missing
-MAX_RADIUS = 2.5  # of what may be a dot [radii]
-BLUR = 0.35  # of the picture [radii]
-MIN_RADIUS = 1.2  # of a dot that can be found [px]
 GRAIN_BLUR = 0.25e-3  # standard deviation of the blur that leaves light alone [m]
-MIN_LIGHT = 1.0  # least light that skin is told from [grey levels]
 
 
 def dot_filters(radius: float) -> tuple[int, float]:
     """Side of the closing and deviation of the blur for dots of a radius [px]. Raises ValueError."""
     if not radius >= MIN_RADIUS:
         raise ValueError(f"dots of radius {radius:.2g} px cannot be found, at least {MIN_RADIUS:g} px are needed")
-    return 2 * int(np.ceil(MAX_RADIUS * radius)) + 1, BLUR * radius
+    return 2 * int(np.ceil(MAX_DOT_RADIUS * radius)) + 1, DOT_BLUR * radius
 
 
 def local_darkness(image: Image, side: int, blur: float) -> Float32:
@@ -51,7 +47,7 @@ class DotEraser:
         """The picture (H, W, 3) without its dots."""
         import cv2
 
-        inked = (local_darkness(image, self._side, self._blur) > EDGE_DARKNESS).astype(np.uint8)
+        inked = (local_darkness(image, self._side, self._blur) > MIN_EDGE_DARKNESS).astype(np.uint8)
         wider = cv2.dilate(inked, np.ones((3, 3), dtype=np.uint8))
         return np.asarray(cv2.inpaint(image, wider, 3.0, cv2.INPAINT_TELEA), dtype=np.uint8)
 
@@ -76,6 +72,7 @@ def fine_part(picture: Float32, pixel_pitch: float) -> Float32:
 def separate_skin(picture: Float32, share: float, pixel_pitch: float) -> tuple[Float32, Float32]:
     """The picture (H, W, 3) of an untouched gel without its skin, which is `share` of its fine part, and (H, W, 3) the
     share of light that the skin lets through, about 1: the product is the picture."""
+    min_light = 1.0  # least light that skin is told from [grey levels]
     bare = picture - np.float32(share) * fine_part(picture, pixel_pitch)
-    clean = np.maximum(bare, np.float32(MIN_LIGHT)).astype(np.float32)
+    clean = np.maximum(bare, np.float32(min_light)).astype(np.float32)
     return clean, (picture / clean).astype(np.float32)

@@ -8,8 +8,7 @@ from tacsim.interface import Float32, FloatArray, Mask
 from tacsim.models.scene import GelSurface
 from tacsim.models.sensor import Markers, SensorGeometry
 from tacsim.optics.spline import displacement_and_jacobian
-
-INK_TRANSMISSION = 0.06  # fraction of the light that a dot lets through [-]
+from tacsim.optics.tuning import INK_TRANSMISSION
 
 
 def rest_positions(markers: Markers) -> FloatArray:

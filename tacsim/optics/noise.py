@@ -19,7 +19,6 @@ from tacsim.models.sensor import CameraNoise, SensorModel
 
 NOISE_FIELDS = 4  # of noise, drawn once for a sensor
 FIELD_SHIFTS = 64  # of a field, in rows and in columns
-BISECTION_STEPS = 20  # of the interval in which a field's scale is sought
 
 
 class NoiseSource:
@@ -86,8 +85,9 @@ def _correlate_rows(field: Float32, correlation: float) -> None:
 
 def _scale_and_round(field: Float32, deviation: float) -> Float32:
     """The normal numbers, scaled so that `deviation` is their standard deviation after rounding."""
+    halvings = 20  # of the interval in which a field's scale is sought
     low, high = 0.0, deviation + 1.0
-    for _ in range(BISECTION_STEPS):
+    for _ in range(halvings):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if np.rint(np.float32(middle) * field).std() < deviation else (low, middle)
     return np.asarray(np.clip(np.rint(np.float32(high) * field), -127, 127), dtype=np.float32)

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 
 FORMATS = ("PNG", "JPEG", "BMP")
 MAX_SIDE = 4096  # [px] of a picture, each way
-ORIENTATION = 0x0112  # EXIF tag
 TRANSPOSED = range(5, 9)  # values of that tag that exchange rows and columns
 MODES = ("RGB", "RGBA", "L", "LA", "P")  # of Pillow, with up to 8 bits a channel
 # First bytes of formats that cameras write and that are not read here: they may hold 16 bits or floats.
@@ -48,10 +47,11 @@ def open_picture(source: Path | io.BytesIO, what: str, formats: tuple[str, ...] 
 
 def upright_size(picture: Image) -> tuple[int, int]:
     """(rows, columns) of an opened picture after its EXIF orientation is applied, from its header alone."""
+    orientation_tag = 0x0112  # EXIF tag
     from PIL import Image
 
     # not PngImageFile.getexif, which decodes the whole picture to look behind it
-    transposed = Image.Image.getexif(picture).get(ORIENTATION) in TRANSPOSED
+    transposed = Image.Image.getexif(picture).get(orientation_tag) in TRANSPOSED
     return (picture.width, picture.height) if transposed else (picture.height, picture.width)
 
 

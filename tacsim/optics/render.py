@@ -32,21 +32,11 @@ from tacsim.optics.markers import marker_transmission, require_dots_on_gel
 from tacsim.optics.picture_file import BadPicture, open_picture, upright_rgb, upright_size
 from tacsim.optics.spline import line_matrices
 from tacsim.optics.surface import SurfaceTable, bilinear_lookup, block_centres, interpolate_blocks
+from tacsim.optics.tuning import LIGHT_TABLE_POINTS, MAX_SLOPE, TEXTURE_PITCH
 
-# Lattice of the gel's texture [m]. At this pitch its slopes have the spread (0.023 for 2 um) of Gomes' white noise on
-# 54 um pixels, but they belong to the gel: an image of another size shows the same texture.
-TEXTURE_PITCH = 0.12e-3
 WHITE = np.float32(255.0)
-MAX_SLOPE = 2.0  # largest slope in the table of light
-LIGHT_TABLE_POINTS = 256  # of that table, from slope 0 to STEEPEST
-BLUR_REACH = 2.5  # standard deviations that a camera's blur reaches: with OpenCV's 4 it is 0.01 grey levels another
-INTERPOLATION_VARIANCE = 1.0 / 6.0  # mean of f (1 - f), the variance of linear interpolation at f between two values
-MIN_SAMPLED_VARIANCE = 0.3  # a wider normal distribution keeps its variance to 5 % where it is sampled
 MAX_PROJECTION_ERROR = 0.5  # [px] that a pixel put on the gel and back may be off
-MIN_TABLE_PIXELS = 128 * 128  # of a picture that is worth a table
 MAX_TABLE_ERROR = 0.5  # largest error of the table [grey levels]; narrower highlights are computed without it
-SHADOW_STRIDE = 2  # every so many points of the table along each side: shadows have soft edges
-MAX_BLUR = 6.0  # standard deviation of a Gaussian [px] beyond which it is evaluated on a coarser picture
 
 
 class Renderer:
@@ -60,6 +50,7 @@ class Renderer:
 
     def __init__(self, model: SensorModel, gel_size: tuple[float, float]) -> None:
         """`gel_size`: x, y [m]."""
+        min_pixels = 128 * 128  # of a picture that is worth a table
         self.model = model
         self._grid = image_grid(model.geometry)
         self._view = None if model.view is None else _view_map(model.view)
@@ -68,7 +59,7 @@ class Renderer:
         self._clipped_share = 0.0
         self._light: PhotometricLight | None = None
         self._lights: Float32 | None = None  # the table of Phong lights, once it is asked for
-        self._tabulated = self._grid.rows * self._grid.columns < MIN_TABLE_PIXELS  # nothing is left to tabulate
+        self._tabulated = self._grid.rows * self._grid.columns < min_pixels  # nothing is left to tabulate
         untouched = WHITE * untouched_image(model.lighting, self._grid.shape)
         # Of the image without the lights
         calibrated = model.photometric or model.darkness
@@ -201,13 +192,16 @@ class Renderer:
 def _blur_blocks(colours: Float32, blur: float, block: int) -> Float32:
     """Colours (rows, columns, 3) of blocks of `block` x `block` pixels, such that the picture they are spread to is
     blurred by a normal distribution of standard deviation `blur` [px]."""
+    min_sampled_width = 0.3  # a wider normal distribution keeps its variance to 5 % where it is sampled
+    interpolated_variance = 1.0 / 6.0  # mean of f (1 - f), the variance of linear interpolation at f between two values
+    reach = 2.5  # standard deviations that a camera's blur reaches: with OpenCV's 4 it is 0.01 grey levels another
     import cv2
 
     # what is linear between values has the curvature of one that is blurred by this much [blocks^2]
-    variance = (blur / block) ** 2 - (INTERPOLATION_VARIANCE if block > 1 else 0.0)
-    if variance > MIN_SAMPLED_VARIANCE:
+    variance = (blur / block) ** 2 - (interpolated_variance if block > 1 else 0.0)
+    if variance > min_sampled_width:
         deviation = math.sqrt(variance)
-        side = 2 * math.ceil(BLUR_REACH * deviation) + 1
+        side = 2 * math.ceil(reach * deviation) + 1
         return np.asarray(cv2.GaussianBlur(colours, (side, side), deviation), dtype=np.float32)
     if variance == 0.0:
         return colours
@@ -332,7 +326,8 @@ def shadow_colours(light: PhotometricLight, shadows: CastShadows, table: Surface
     The path to a lamp is followed over the surface as if it had moved only up and down: sideways motion is small beside
     the length of a shadow.
     """
-    x, y = (each[::SHADOW_STRIDE, ::SHADOW_STRIDE] for each in table.deformed_coordinates())
+    stride = 2  # every so many points of the table along each side: shadows have soft edges
+    x, y = (each[::stride, ::stride] for each in table.deformed_coordinates())
     u, v = image.image_coordinates(x, y)
     width, flat = np.float32(image.columns * image.pitch), np.float32(image.rows / image.columns)
     # from places in picture widths, which start in the middle of the picture, to metres
@@ -343,7 +338,7 @@ def shadow_colours(light: PhotometricLight, shadows: CastShadows, table: Surface
         return table.interpolate_at_rest(height, start_x + width * x, start_y + width * y) / width
 
     horizons = [horizon_slope(height_at, u, v * flat, lamp) for lamp in shadows.lamps]
-    rows, columns = (np.arange(n, dtype=np.float32) / SHADOW_STRIDE for n in table.fields.shape[:2])
+    rows, columns = (np.arange(n, dtype=np.float32) / stride for n in table.fields.shape[:2])
     return bilinear_lookup(light.shadow_change(horizons, u, v), np.stack(np.meshgrid(columns, rows), axis=-1))
 
 
@@ -358,9 +353,10 @@ def darken_by_depth(model: DarknessModel, height: Float32, pitch: float) -> tupl
 
 def _local_mean(height: Float32, deviation: float) -> Float32:
     """(H, W) Gaussian mean; the picture goes on as its mirror image."""
+    max_blur = 6.0  # standard deviation of a Gaussian [px] beyond which it is evaluated on a coarser picture
     import cv2
 
-    coarser = max(1, int(deviation / MAX_BLUR))
+    coarser = max(1, int(deviation / max_blur))
     if coarser == 1:
         return np.asarray(cv2.GaussianBlur(height, (0, 0), deviation, borderType=cv2.BORDER_REFLECT), np.float32)
     rows, columns = height.shape

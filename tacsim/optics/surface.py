@@ -31,16 +31,9 @@ from tacsim.models.sensor import CanonicalGrid, Markers
 from tacsim.optics.grid import PixelGrid, canonical_cells
 from tacsim.optics.markers import marker_flow
 from tacsim.optics.spline import displacement_and_jacobian, refine_spline
+from tacsim.optics.tuning import MAX_LAST_STEP, MAX_POINTS_PER_SPACING, SURFACE_TABLE_PITCH
 
-# The table is this fine or finer [m], but has no more than so many points for each lattice spacing. Height errs by 0.2
-# um rms by it, 2 um on steep flanks; on a lattice of 2 mm, whose gel is far less exact, by 1 um rms, 10 um.
-TABLE_PITCH, MAX_POINTS_PER_SPACING = 0.125e-3, 8
-FIXED_POINT_STEPS = 20
-NEWTON_STEPS = 40
-MAX_LAST_STEP = 1.0 / 64.0  # largest last step [table points]: half of what OpenCV's remap resolves
-TRIANGLE_MARGIN = 1e-9  # share of a triangle by which a point may lie outside: no gap between neighbours
 MIN_JACOBIAN = 0.1  # det J of a sheet that is seen edge-on; its slope is as that of one this narrow in the picture
-OUTSIDE = -1e3  # column and row of what lies beside the gel
 
 
 class SurfaceFolded(ValueError):
@@ -171,11 +164,12 @@ class SurfaceTable:
 
     def _material_points(self, grid: PixelGrid) -> Float32:
         """(rows, columns, 2) material points [table points] under the image points of `grid`: X <- x - u(X)."""
+        max_steps = 20
         import cv2
 
         seen = _table_coordinates(self._surface.origin, self.pitch, grid)
         last, points = seen, seen - bilinear_lookup(self._lateral, seen)
-        for _ in range(FIXED_POINT_STEPS - 1):
+        for _ in range(max_steps - 1):
             # not cv2.norm of both: a signal that raises in it, such as Ctrl-C, ends the process (OpenCV 4.13)
             if cv2.norm(cv2.absdiff(points, last), cv2.NORM_INF) <= MAX_LAST_STEP:
                 return points
@@ -212,10 +206,11 @@ def material_points(surface: GelSurface, points: NDArray[np.float64]) -> NDArray
     Exact to 1 nm and slow; :func:`sample_surface` is fast on a grid. Raises SurfaceFolded where there is none, or
     several: of those :class:`SurfaceTable` finds the one that is seen.
     """
+    max_steps = 40
     found = np.array(points, dtype=np.float64)
     displacement, _ = displacement_and_jacobian(surface, found)
     found = points - displacement[:, :2]
-    for _ in range(NEWTON_STEPS):
+    for _ in range(max_steps):
         displacement, jacobian = displacement_and_jacobian(surface, found)
         residual = found + displacement[:, :2] - points
         if float(np.abs(residual).max(initial=0.0)) < 1e-9:
@@ -289,7 +284,9 @@ def _cached_table(
 def _points_per_spacing(surface: GelSurface) -> int:
     """Table points for each lattice spacing: even, so that every kink of the gradient lies on one."""
     return max(
-        4, 2 * math.ceil(surface.spacing / (2 * max(TABLE_PITCH, surface.spacing / MAX_POINTS_PER_SPACING)) - 1e-9)
+        4,
+        2
+        * math.ceil(surface.spacing / (2 * max(SURFACE_TABLE_PITCH, surface.spacing / MAX_POINTS_PER_SPACING)) - 1e-9),
     )
 
 
@@ -350,7 +347,8 @@ def visible_table_points(
 
     Returns (H, W, 2) column and row in the table, and (H, W) False where no sheet faces the camera.
     """
-    found = np.full((shape[0] * shape[1], 2), OUTSIDE, dtype=np.float32)
+    outside = -1e3  # column and row of what lies beside the gel
+    found = np.full((shape[0] * shape[1], 2), outside, dtype=np.float32)
     deepest = np.full(len(found), -np.inf)
     for row in range(len(places) - 1):
         pixels, points, depth = _covered_points(places[row : row + 2], height[row : row + 2], shape)
@@ -368,16 +366,15 @@ def _covered_points(
 ) -> tuple[NDArray[np.intp], FloatArray, FloatArray]:
     """Image points (n,) under triangles between two rows of a table (2, columns, ...) that face the camera, one entry a
     triangle: their table points (n, 2) from the first row on, and heights (n,)."""
+    margin = 1e-9  # share of a triangle by which a point may lie outside: no gap between neighbours
     corners = np.indices(height.shape, dtype=np.float64)[::-1].transpose(1, 2, 0)  # column, row
     each = np.dstack([places, corners, height])  # place, table point, height: (2, columns, 5)
     a, b, c, d = each[0, :-1], each[0, 1:], each[1, :-1], each[1, 1:]
     triangles = np.stack([np.concatenate([a, d]), np.concatenate([b, c]), np.concatenate([c, b])], axis=1)
     start, sides = triangles[:, 0, :2], triangles[:, 1:, :2] - triangles[:, :1, :2]
     area = sides[:, 0, 0] * sides[:, 1, 1] - sides[:, 0, 1] * sides[:, 1, 0]
-    first = np.maximum(np.ceil(triangles[:, :, :2].min(axis=1) - TRIANGLE_MARGIN), 0).astype(np.intp)
-    last = np.minimum(np.floor(triangles[:, :, :2].max(axis=1) + TRIANGLE_MARGIN), (shape[1] - 1, shape[0] - 1)).astype(
-        np.intp
-    )
+    first = np.maximum(np.ceil(triangles[:, :, :2].min(axis=1) - margin), 0).astype(np.intp)
+    last = np.minimum(np.floor(triangles[:, :, :2].max(axis=1) + margin), (shape[1] - 1, shape[0] - 1)).astype(np.intp)
     wide, high = np.maximum(last - first + 1, 0).T
     number = np.where(area > 0, wide * high, 0)  # of the image points in each box
 
@@ -387,7 +384,7 @@ def _covered_points(
     by_u, by_v = u - start[owner, 0], v - start[owner, 1]
     (one, two), area = sides[owner].transpose(1, 2, 0), area[owner]
     share = np.stack([by_u * two[1] - by_v * two[0], by_v * one[0] - by_u * one[1]], axis=1) / area[:, None]
-    inside = (share >= -TRIANGLE_MARGIN).all(axis=1) & (share.sum(axis=1) <= 1.0 + TRIANGLE_MARGIN)
+    inside = (share >= -margin).all(axis=1) & (share.sum(axis=1) <= 1.0 + margin)
     owner, share = owner[inside], share[inside]
     values = triangles[:, 0, 2:][owner]
     for corner in (1, 2):

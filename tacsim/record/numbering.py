@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 from tacsim.record.episode import EpisodeError
 
-MAX_NAMED = 8  # numbers in an error
 DIGITS = re.compile(r"[0-9]+")
 
 
@@ -119,5 +118,6 @@ def _unmatched(
 
 
 def _named(numbers: Sequence[int]) -> str:
-    more = f" and {len(numbers) - MAX_NAMED} more" if len(numbers) > MAX_NAMED else ""
-    return ", ".join(map(str, numbers[:MAX_NAMED])) + more
+    max_named = 8  # numbers in an error
+    more = f" and {len(numbers) - max_named} more" if len(numbers) > max_named else ""
+    return ", ".join(map(str, numbers[:max_named])) + more

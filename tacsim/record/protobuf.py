@@ -16,7 +16,7 @@ from google.protobuf.descriptor_pb2 import FileDescriptorProto
 from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
 
-MOST_JOINTS = 7  # that an arm's message has room for
+MAX_JOINTS = 7  # that an arm's message has room for
 
 _NUMBERS = {
     "double": Field.TYPE_DOUBLE,
@@ -26,7 +26,7 @@ _NUMBERS = {
 }
 # Fields in their order, which gives them their numbers on the wire: new ones go to the end.
 _MESSAGES: dict[str, dict[str, str]] = {
-    "Joints": {f"joint_{number + 1}": "optional double" for number in range(MOST_JOINTS)},
+    "Joints": {f"joint_{number + 1}": "optional double" for number in range(MAX_JOINTS)},
     "Arm": {
         "time": "optional double",  # rig clock [s]; always there
         "linear": "foxglove.Vector3",  # velocity of the sensor, world axes [m/s]
@@ -129,7 +129,7 @@ PACKAGE_FIELDS = (*_PACKAGE_NUMBERS, *_PACKAGE_JOINTS, *_PACKAGE_VECTORS)
 
 
 def arm_message(time: float, twist: Sequence[float], wrench: Sequence[float], joints: Sequence[float] | None) -> Any:
-    """An Arm. Raises ValueError for more than MOST_JOINTS joints."""
+    """An Arm. Raises ValueError for more than MAX_JOINTS joints."""
     made = Arm(time=time)
     _put_six(made, TWIST, twist)
     _put_six(made, WRENCH, wrench)
@@ -140,7 +140,7 @@ def arm_message(time: float, twist: Sequence[float], wrench: Sequence[float], jo
 
 
 def package_message(row: Mapping[str, Any]) -> Any:
-    """An ArmPackage of a package's fields. Raises ValueError for more than MOST_JOINTS joints."""
+    """An ArmPackage of a package's fields. Raises ValueError for more than MAX_JOINTS joints."""
     made = ArmPackage(**{name: row[name] for name in _PACKAGE_NUMBERS})
     for name, pair in _PACKAGE_VECTORS.items():
         _put_six(made, pair, row[name])
@@ -187,7 +187,7 @@ def _put_six(message: Any, pair: tuple[str, str], values: Sequence[float]) -> No
 
 
 def _put_joints(joints: Any, values: Sequence[float]) -> None:
-    if len(values) > MOST_JOINTS:
-        raise ValueError(f"an arm of {len(values)} joints; episodes have room for {MOST_JOINTS}")
+    if len(values) > MAX_JOINTS:
+        raise ValueError(f"an arm of {len(values)} joints; episodes have room for {MAX_JOINTS}")
     for number, value in enumerate(values):
         setattr(joints, f"joint_{number + 1}", value)

@@ -24,8 +24,6 @@ from mcap.writer import MCAP0_MAGIC
 
 from tacsim.record.episode import EpisodeError
 
-MAX_RECORD = 256 << 20  # [bytes]
-MAX_TOPICS = 20  # named in an error
 _HEAD = struct.Struct("<BQ")  # opcode, length
 _FOOTER = _HEAD.size + 20  # bytes of the last record
 _PARSERS: dict[int, Callable[[ReadDataStream], McapRecord]] = {
@@ -59,6 +57,7 @@ def check_magic(file: BinaryIO, what: str) -> None:
 
 def foreign_file(file: BinaryIO, what: str) -> EpisodeError:
     """The error for an MCAP file of another program: what it is, which topics it has, and what to do."""
+    max_topics = 20  # named in an error
     size = file.seek(0, io.SEEK_END)
     file.seek(len(MCAP0_MAGIC))
     profile = ""
@@ -68,8 +67,8 @@ def foreign_file(file: BinaryIO, what: str) -> EpisodeError:
     kind = {"ros1": "a ROS 1 bag", "ros2": "a ROS 2 bag"}.get(profile, "a recording of another program")
     topics = listed_topics(file)
     there = sorted(f"{topic} ({schema})" if schema else topic for topic, schema in topics.items())
-    more = f" and {len(there) - MAX_TOPICS} more" if len(there) > MAX_TOPICS else ""
-    has = ", ".join(there[:MAX_TOPICS]) + more if there else "not listed (the file was cut off before its index)"
+    more = f" and {len(there) - max_topics} more" if len(there) > max_topics else ""
+    has = ", ".join(there[:max_topics]) + more if there else "not listed (the file was cut off before its index)"
     return EpisodeError(
         f"{what}: {kind} in MCAP, no episode of tacsim, whose topics are not read. Its topics: {has}. Export the "
         "camera's pictures to a folder of 8-bit PNG files, or to a video, and forces to a CSV file with a row a "
@@ -124,6 +123,7 @@ def read_records(file: BinaryIO, size: int, what: str) -> Iterator[tuple[int, Mc
 
 def _records(stream: BinaryIO, size: int) -> Iterator[tuple[int, McapRecord]]:
     """Parsed records of the next `size` bytes, each with its place."""
+    max_bytes = 256 << 20  # [bytes]
     left = size
     while left >= _HEAD.size:
         place = stream.tell()
@@ -132,7 +132,7 @@ def _records(stream: BinaryIO, size: int) -> Iterator[tuple[int, McapRecord]]:
             raise _BadRecord
         opcode, length = _HEAD.unpack(head)
         left -= _HEAD.size + length
-        if left < 0 or length > MAX_RECORD or opcode not in Opcode.__members__.values():
+        if left < 0 or length > max_bytes or opcode not in Opcode.__members__.values():
             raise _BadRecord
         body = stream.read(length)
         if len(body) < length:

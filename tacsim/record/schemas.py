@@ -28,9 +28,7 @@ from tacsim.record.episode import EpisodeError, EpisodeMeta
 
 FORMAT = "2"  # of the file; raised when an old reader would misread a new file
 MAX_ATTACHMENT = 64 << 20  # [bytes]
-MAX_PARTS = 64  # sensors, and arms, of an episode
 MAX_FILES = 1000  # attachments, and versions
-MAX_FILE_NAME = 300  # characters of the name of an attachment
 META, CLOSE = "tacsim.episode", "tacsim.close"  # metadata records at the start and at the end
 STEP_TOPIC, BODY_TOPIC = "/step", "/body"
 
@@ -106,8 +104,10 @@ def decode_meta(record: Mapping[str, str], what: str) -> tuple[EpisodeMeta, tupl
 
 def _check_parts(meta: EpisodeMeta, attachments: tuple[str, ...]) -> None:
     """Raises ValueError for more parts, or longer names, than a report can show."""
-    if max(len(meta.spec.sensors), len(meta.spec.arms)) > MAX_PARTS:
-        raise ValueError(f"more than {MAX_PARTS} sensors or arms")
+    max_file_name = 300  # characters of the name of an attachment
+    max_parts = 64  # sensors, and arms, of an episode
+    if max(len(meta.spec.sensors), len(meta.spec.arms)) > max_parts:
+        raise ValueError(f"more than {max_parts} sensors or arms")
     if max(len(attachments), len(meta.versions)) > MAX_FILES:
         raise ValueError(f"more than {MAX_FILES} attachments or versions")
     for name in meta.spec.sensors:
@@ -115,7 +115,7 @@ def _check_parts(meta: EpisodeMeta, attachments: tuple[str, ...]) -> None:
     for name in meta.spec.arms:
         check_name(name, "arm")
     for name in attachments:
-        check_name(name, "attachment", MAX_FILE_NAME)
+        check_name(name, "attachment", max_file_name)
 
 
 def _checksum(values: Mapping[str, str]) -> str:

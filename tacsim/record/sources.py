@@ -21,8 +21,6 @@ from tacsim.record.reader import EpisodeFile
 EPISODES = (".mcap",)
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp")
 OTHER_PICTURES = (".tif", ".tiff", ".webp", ".gif", ".exr", ".hdr", ".pgm", ".ppm", ".pnm", ".npy", ".raw", ".jp2")
-MAX_CSV = 64 << 20  # [bytes]
-MAX_HEADER = 1 << 16  # [characters]
 NUMBER_COLUMNS = ("frame", "index")  # of a table: the numbers of its rows
 SEPARATORS = ",;\t"
 VIDEOS = (".avi", ".mp4", ".mkv", ".mov", ".m4v", ".webm", ".mpg", ".mpeg")
@@ -217,11 +215,13 @@ def read_table(path: Path, names: list[str]) -> tuple[list[tuple[float, ...]], t
     Raises EpisodeError for a file that is missing or too large, a missing column, a value that is not a finite number,
     and numbers of rows that are not whole and rising.
     """
+    max_header = 1 << 16  # [characters]
+    max_bytes = 64 << 20  # [bytes]
     try:
-        if path.stat().st_size > MAX_CSV:
-            raise EpisodeError(f"{path}: {path.stat().st_size} bytes; at most {MAX_CSV} are read")
+        if path.stat().st_size > max_bytes:
+            raise EpisodeError(f"{path}: {path.stat().st_size} bytes; at most {max_bytes} are read")
         with path.open(newline="", encoding="utf-8-sig") as file:
-            head = file.readline(MAX_HEADER)
+            head = file.readline(max_header)
             file.seek(0)
             separator = max(SEPARATORS, key=head.count)
             return _rows(csv.DictReader(file, delimiter=separator, skipinitialspace=True), path, names)

@@ -20,8 +20,6 @@ from tacsim.record.messages import encode_step
 from tacsim.record.reader import Place, RecordedSteps
 from tacsim.record.schemas import CLOSE, FORMAT, MAX_ATTACHMENT, META, encode_meta, sealed
 
-_ONE_CHUNK = 1 << 40  # [bytes] a chunk ends with its step, never by size
-
 
 class Recorder:
     """Writes an episode. The control loop hands over steps and never waits: another thread encodes and writes them.
@@ -187,7 +185,8 @@ def open_new(path: Path) -> BinaryIO:
 
 def _start(file: BinaryIO, meta: EpisodeMeta) -> Writer:
     # Uncompressed: the pictures are PNG already, and a reader needs no defence against decompression bombs.
-    writer = Writer(file, chunk_size=_ONE_CHUNK, compression=CompressionType.NONE)
+    one_chunk = 1 << 40  # [bytes] a chunk ends with its step, never by size
+    writer = Writer(file, chunk_size=one_chunk, compression=CompressionType.NONE)
     writer.start(library=f"tacsim episode {FORMAT}")
     writer.add_metadata(META, encode_meta(meta))
     start = 0 if meta.started is None else max(round(meta.started.timestamp() * 1e9), 0)

@@ -27,7 +27,6 @@ from tacsim.record.step_info import (
 from tacsim.report.series import Series
 
 PICTURES = {"lost": PICTURES_LOST, "damaged": PICTURES_DAMAGED, "shown again": PICTURES_REPEATED}
-MUCH_BEYOND, FEW_KEPT = 0.01, 0.8  # a warning is given above, and below
 
 
 def timing(series: Series) -> dict[str, Any] | None:
@@ -149,6 +148,7 @@ def trust(series: Series) -> dict[str, dict[str, Any]] | None:
 
 def trust_rows(stats: dict[str, dict[str, Any]]) -> list[tuple[str, str]]:
     """Warnings for a person; none where all is well."""
+    max_beyond, min_kept = 0.01, 0.8  # a warning is given above, and below
     warnings = []
     for name, worst in stats.items():
         if worst["stale"]:
@@ -157,11 +157,11 @@ def trust_rows(stats: dict[str, dict[str, Any]]) -> list[tuple[str, str]]:
                 f"{name}: stale reference in {worst['stale']} of {worst['steps']} observations{most}; the light "
                 "has drifted, slopes are less sure: reset for a fresh one, and let the sensor warm up"
             )
-        if worst["beyond"] is not None and worst["beyond"] > MUCH_BEYOND:
+        if worst["beyond"] is not None and worst["beyond"] > max_beyond:
             warnings.append(
                 f"{name}: up to {worst['beyond']:.0%} of the picture beyond the calibrated slopes, height too low "
                 "there; calibrate with a deeper press or a smaller ball"
             )
-        if worst["kept"] is not None and worst["kept"] < FEW_KEPT:
+        if worst["kept"] is not None and worst["kept"] < min_kept:
             warnings.append(f"{name}: only {worst['kept']:.0%} of the markers seen at worst; flow is less sure")
     return [("look at this", warning) for warning in warnings]

@@ -26,7 +26,6 @@ GOAL = "#1f8a4c"
 COLOURS = ("#2a6db5", "#cf5b17", "#7a4fb0", "#b0891f", "#1b8f8f", "#a8325e")  # told apart by most colour-blind people
 THUMBNAIL = 320  # [px]
 MAX_GOAL = 9  # numbers of a goal that are shown
-TALLEST = 3.0  # height of a row of pictures, over the width of one
 Draw = Callable[[Axes, Series], None]
 DPI, WIDTH, COLUMNS = 100, 14.0, 6  # dots an inch, page width [inches], images in a row of the overview
 
@@ -243,8 +242,9 @@ def plots(series: Series) -> Figure:
 
 def overview(strips: Sequence[tuple[str, Sequence[Picture]]], series: Series, title: str, subtitle: str) -> Figure:
     """The whole episode on one page: named rows of pictures, at most COLUMNS each, and the plots below."""
+    max_height = 3.0  # height of a row of pictures, over the width of one
     shapes = [pictures[0].image.shape for _, pictures in strips]
-    tall = [min(rows / columns, TALLEST) * WIDTH * 0.93 / COLUMNS + 0.22 for rows, columns, _ in shapes]
+    tall = [min(rows / columns, max_height) * WIDTH * 0.93 / COLUMNS + 0.22 for rows, columns, _ in shapes]
     below, head = 3.1 * _rows(series), 0.95
     height = head + sum(tall) + below
     figure = canvas(WIDTH, height)

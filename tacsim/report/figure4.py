@@ -19,8 +19,7 @@ from tacsim.report.figure import GOAL, INK, QUIET, canvas, goal_text, plain, sav
 PHYSICS = {"seed": "the seed's scheme: one shared particle grid", "hybrid": "ours: two elastic gels, particle body"}
 CLAY = ("#c8623a", "#e29a6b")
 GEL, BACKING = "#bfe0d2", "#5d6b75"
-CELL, GAP, CUT, SECTION = 1.8, 0.06, 1.45, 6.25  # column, gap, height of the cut and of a task's section [inches]
-STRIPE = 2e-3  # thickness of the layers that the body is painted in [m]
+CELL = 1.8  # width of a column [inches]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,10 +56,11 @@ class Trial:
 
 def figure4(results: Mapping[str, Mapping[str, Trial]], path: Path) -> None:
     """Draws `results` (task -> physics -> trial) and writes them to `path` as PNG. Raises OSError."""
+    section_height = 6.25  # of a task [inches]
     schemes = [name for name in PHYSICS if any(name in trials for trials in results.values())]
     columns = max(len(trial.moments) for trials in results.values() for trial in trials.values())
     wide = columns * CELL + 0.5
-    page = Page(0.75 + len(schemes) * wide, 0.8 + SECTION * len(results))
+    page = Page(0.75 + len(schemes) * wide, 0.8 + section_height * len(results))
     page.write(0.25, 0.35, "Squeezing and repositioning plasticine", fontsize=16, weight="bold", color=INK)
     for column, name in enumerate(schemes):
         left = 0.75 + column * wide
@@ -69,7 +69,7 @@ def figure4(results: Mapping[str, Mapping[str, Trial]], path: Path) -> None:
             if name in trials:
                 rewards = [value for trial in trials.values() for value in trial.reward]
                 limits = (min(rewards), max(*rewards, 0.0))
-                _draw_trial(page, (left, 0.8 + row * SECTION), task, trials[name], limits, named=column == 0)
+                _draw_trial(page, (left, 0.8 + row * section_height), task, trials[name], limits, named=column == 0)
     save(page.figure, path)
 
 
@@ -92,23 +92,24 @@ def _draw_trial(
     page: Page, corner: tuple[float, float], task: str, trial: Trial, limits: tuple[float, float], named: bool
 ) -> None:
     """One section of the page: the reward, and a column for each moment with the body and both images."""
+    gap, cut_height = 0.06, 1.45  # between columns; of the cut [inches]
     left, top = corner
-    curve = page.axes(left, top + 0.4, len(trial.moments) * CELL - GAP, 1.05)
+    curve = page.axes(left, top + 0.4, len(trial.moments) * CELL - gap, 1.05)
     _draw_curve(curve, task, trial, limits, named)
-    wide = CELL - GAP
+    wide = CELL - gap
     for column, moment in enumerate(trial.moments):
         x, y = left + column * CELL, top + 1.95
         at_goal = moment.step == trial.step[trial.peak]
-        body = page.axes(x, y, wide, CUT)
+        body = page.axes(x, y, wide, cut_height)
         _draw_cut(body, trial, moment)
         words = f"step {moment.step}{' · closest' if at_goal else ''} · {moment.force:.2f} N"
         body.set_title(words, fontsize=9, color=GOAL if at_goal else INK, pad=4)
-        y += CUT + 0.1
+        y += cut_height + 0.1
         for name in ("upper", "lower"):
             tall = wide * moment.images[name].shape[0] / moment.images[name].shape[1]
             axes = page.axes(x, y, wide, tall)
             show_image(axes, moment.images[name])
-            y += tall + GAP
+            y += tall + gap
             if named and column == 0:
                 axes.set_ylabel(f"{name} sensor", fontsize=9, color=INK)
                 body.set_ylabel("middle of the body", fontsize=9, color=INK)
@@ -148,9 +149,10 @@ def _draw_cut(axes: Axes, trial: Trial, moment: Moment) -> None:
 
 def _draw_body(axes: Axes, trial: Trial, moment: Moment) -> None:
     """The particles that were in the middle slice at the start, painted in layers by where they were then."""
+    stripe = 2e-3  # thickness of the layers that the body is painted in [m]
     start = trial.moments[0].points
     middle = np.abs(start[:, 1] - start[:, 1].mean()) <= 0.75 * trial.spacing
-    layer = ((start[middle, 2] - start[:, 2].min()) / STRIPE).astype(int) % 2
+    layer = ((start[middle, 2] - start[:, 2].min()) / stripe).astype(int) % 2
     size = np.full(int(middle.sum()), 1.6 * trial.spacing * 1e3)
     body = EllipseCollection(
         size,

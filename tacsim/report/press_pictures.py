@@ -16,12 +16,7 @@ from tacsim.optics.grid import PixelGrid
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-WIDTH, MARGIN, TEXT = 440, 48, 14  # of one section, round it, of a letter [px]
-SUPERSAMPLED = 2  # pixels drawn for one that is shown
-INDENTER, GEL, SURFACE, BACKING = (90, 100, 120), (196, 224, 236), (0, 96, 140), (150, 150, 150)
-TALLEST = 0.8  # widths of a section: what stands higher is cut off
-MAP_WIDTH, MAP_MARGIN, BAR, MAP_TEXT = 800, 60, 20, 16  # of the whole, round the map, of the scale, of a letter [px]
-TICKS = 5
+WIDTH = 440  # of one section, round it, of a letter [px]
 TITLE = "height into the gel [mm]; contact outlined"
 
 
@@ -34,20 +29,21 @@ def write_side_picture(
     pose: of the indenter in the sensor's frame; height: (H, W) of the gel's surface under each pixel of `grid` [m].
     Raises OSError.
     """
+    margin, text_size = 48, 14  # of one section, round it, of a letter [px]
     from PIL import Image as images
     from PIL import ImageDraw, ImageFont
 
     drawn = [_section(shape, pose, axis, lowest, height, grid, gel) for axis in (0, 1)]
     tall = max(each.height for each in drawn)
-    picture = images.new("RGB", (2 * WIDTH + 3 * MARGIN, tall + 2 * MARGIN), "white")
+    picture = images.new("RGB", (2 * WIDTH + 3 * margin, tall + 2 * margin), "white")
     pen = ImageDraw.Draw(picture, "RGB")
-    pen.font = ImageFont.load_default(TEXT)
-    pen.text((picture.width / 2, MARGIN / 2), title, "black", anchor="mm")
+    pen.font = ImageFont.load_default(text_size)
+    pen.text((picture.width / 2, margin / 2), title, "black", anchor="mm")
     for k, (each, along, across) in enumerate(zip(drawn, "xy", "yx", strict=True)):
-        left, below = MARGIN + k * (WIDTH + MARGIN), MARGIN + tall
+        left, below = margin + k * (WIDTH + margin), margin + tall
         picture.paste(each, (left, below - each.height))
         words = f"section along {along} at {across} = {lowest[1 - k] * 1e3:.2f} mm; gel {gel.size[k] * 1e3:.3g} mm wide"
-        pen.text((left + WIDTH / 2, below + MARGIN / 2), words, "black", anchor="mm")
+        pen.text((left + WIDTH / 2, below + margin / 2), words, "black", anchor="mm")
     picture.save(path, compress_level=4)
 
 
@@ -55,31 +51,37 @@ def _section(
     shape: Shape, pose: Pose, axis: int, lowest: FloatArray, height: Float32, grid: PixelGrid, gel: Gel
 ) -> Image:
     """The section along `axis`; to scale, z up."""
+    backing_colour = (150, 150, 150)
+    surface_colour = (0, 96, 140)
+    gel_colour = (196, 224, 236)
+    indenter_colour = (90, 100, 120)
+    max_height = 0.8  # widths of a section: what stands higher is cut off
+    supersampled = 2  # pixels drawn for one that is shown
     from PIL import Image as images
     from PIL import ImageDraw
 
     lines = section_lines(shape, pose, 1 - axis, float(lowest[1 - axis]))[:, :, [axis, 2]]
     wide = max(1.1 * gel.size[axis], min(2.2 * float(np.abs(lines[..., 0]).max(initial=0.0)), 2 * gel.size[axis]))
-    scale = SUPERSAMPLED * WIDTH / wide  # [px/m]
-    top = min(float(lines[..., 1].max(initial=0.0)) + 0.05 * wide, TALLEST * wide)
+    scale = supersampled * WIDTH / wide  # [px/m]
+    top = min(float(lines[..., 1].max(initial=0.0)) + 0.05 * wide, max_height * wide)
     bottom = -gel.size[2] - 0.04 * wide
 
     def pixels(points: FloatArray) -> list[tuple[float, float]]:
         return [((x + wide / 2) * scale, (top - z) * scale) for x, z in points]
 
-    picture = images.new("RGB", (SUPERSAMPLED * WIDTH, round((top - bottom) * scale)), "white")
+    picture = images.new("RGB", (supersampled * WIDTH, round((top - bottom) * scale)), "white")
     pen = ImageDraw.Draw(picture)
     half, back = gel.size[axis] / 2, -gel.size[2]
     surface = _surface(axis, lowest, height, grid)
     outline = np.array([[-half, 0.0], *surface, [half, 0.0], [half, back], [-half, back]])
-    pen.polygon(pixels(outline), fill=GEL)
-    pen.rectangle([*pixels(np.array([[-half, back]]))[0], *pixels(np.array([[half, bottom]]))[0]], fill=BACKING)
+    pen.polygon(pixels(outline), fill=gel_colour)
+    pen.rectangle([*pixels(np.array([[-half, back]]))[0], *pixels(np.array([[half, bottom]]))[0]], fill=backing_colour)
     for column in range(picture.width):  # between the first crossing and the second, the third and the fourth, ...
         x = (column + 0.5) / scale - wide / 2
         for low, high in _crossings(lines, x):
-            pen.line([(column, (top - high) * scale), (column, (top - low) * scale)], fill=INDENTER)
-    pen.line(pixels(outline[: len(surface) + 2]), fill=SURFACE, width=2 * SUPERSAMPLED)
-    return picture.resize((WIDTH, picture.height // SUPERSAMPLED), images.Resampling.LANCZOS)
+            pen.line([(column, (top - high) * scale), (column, (top - low) * scale)], fill=indenter_colour)
+    pen.line(pixels(outline[: len(surface) + 2]), fill=surface_colour, width=2 * supersampled)
+    return picture.resize((WIDTH, picture.height // supersampled), images.Resampling.LANCZOS)
 
 
 def _crossings(lines: FloatArray, x: float) -> FloatArray:
@@ -101,17 +103,20 @@ def _surface(axis: int, lowest: FloatArray, height: Float32, grid: PixelGrid) ->
 
 def write_height_picture(path: Path, height: Float32, contact: Mask, pitch: float) -> None:
     """A PNG of `height` (H, W) [m], with the border of `contact` (H, W); `pitch`: of its pixels [m]. Raises OSError."""
+    picture_width, margin, text_size = 800, 60, 16  # of the whole, round the map, of the scale, of a letter [px]
+    tick_count = 5
+    bar_width = 20  # of the whole, round the map, of the scale, of a letter [px]
     import cv2
     from PIL import Image as images
     from PIL import ImageDraw, ImageFont
 
     rows, columns = height.shape
-    wide = MAP_WIDTH - 3 * MAP_MARGIN - BAR
+    wide = picture_width - 3 * margin - bar_width
     high = round(wide * rows / columns)
     low, top = float(height.min()), float(height.max())
     levels = np.rint((height - low) * (255 / max(top - low, 1e-12))).astype(np.uint8)
     large = cv2.resize(levels, (wide, high), interpolation=cv2.INTER_LINEAR)
-    scale = np.repeat(np.linspace(255, 0, high).astype(np.uint8)[:, None], BAR, axis=1)
+    scale = np.repeat(np.linspace(255, 0, high).astype(np.uint8)[:, None], bar_width, axis=1)
     colours, bar = (cv2.applyColorMap(each, cv2.COLORMAP_VIRIDIS)[..., ::-1] for each in (large, scale))
     colours = np.ascontiguousarray(colours)
     touching = cv2.resize(contact.astype(np.uint8), (wide, high), interpolation=cv2.INTER_NEAREST)
@@ -119,18 +124,18 @@ def write_height_picture(path: Path, height: Float32, contact: Mask, pitch: floa
     if not contact.all():
         cv2.drawContours(colours, borders, -1, (255, 255, 255), 1, cv2.LINE_AA)
 
-    picture = images.new("RGB", (MAP_WIDTH, high + 2 * MAP_MARGIN), "white")
-    picture.paste(images.fromarray(colours), (MAP_MARGIN, MAP_MARGIN))
-    left = MAP_MARGIN + wide + MAP_MARGIN // 2
-    picture.paste(images.fromarray(np.ascontiguousarray(bar)), (left, MAP_MARGIN))
+    picture = images.new("RGB", (picture_width, high + 2 * margin), "white")
+    picture.paste(images.fromarray(colours), (margin, margin))
+    left = margin + wide + margin // 2
+    picture.paste(images.fromarray(np.ascontiguousarray(bar)), (left, margin))
     pen = ImageDraw.Draw(picture, "RGB")
-    pen.font = ImageFont.load_default(MAP_TEXT)
-    pen.text((MAP_MARGIN + wide / 2, MAP_MARGIN / 2), TITLE, "black", anchor="mm")
+    pen.font = ImageFont.load_default(text_size)
+    pen.text((margin + wide / 2, margin / 2), TITLE, "black", anchor="mm")
     half = columns * pitch * 5e2, rows * pitch * 5e2  # [mm]
-    for share in np.linspace(0.0, 1.0, TICKS):
-        x, y = MAP_MARGIN + share * wide, MAP_MARGIN + share * high
-        pen.text((x, MAP_MARGIN + high + MAP_MARGIN / 4), f"{(2 * share - 1) * half[0]:.3g}", "black", anchor="mm")
-        pen.text((MAP_MARGIN - 8, y), f"{(2 * share - 1) * half[1]:.3g}", "black", anchor="rm")
-        pen.text((left + BAR + 8, y), f"{(top - share * (top - low)) * 1e3:.3f}", "black", anchor="lm")
-    pen.text((MAP_MARGIN + wide / 2, 1.65 * MAP_MARGIN + high), "x [mm]; y downwards", "black", anchor="mm")
+    for share in np.linspace(0.0, 1.0, tick_count):
+        x, y = margin + share * wide, margin + share * high
+        pen.text((x, margin + high + margin / 4), f"{(2 * share - 1) * half[0]:.3g}", "black", anchor="mm")
+        pen.text((margin - 8, y), f"{(2 * share - 1) * half[1]:.3g}", "black", anchor="rm")
+        pen.text((left + bar_width + 8, y), f"{(top - share * (top - low)) * 1e3:.3f}", "black", anchor="lm")
+    pen.text((margin + wide / 2, 1.65 * margin + high), "x [mm]; y downwards", "black", anchor="mm")
     picture.save(path, compress_level=4)

@@ -24,7 +24,6 @@ from tacsim.record.step_info import (
     TRAINING_KNOWN,
 )
 
-LARGEST = 1e15  # what a recording says beyond that, infinite or not a number, counts as unknown
 _OWN = ("time", "seconds", "reward", "distance")
 
 
@@ -146,7 +145,8 @@ class _Columns:
 
 
 def _is_known(value: float) -> bool:
-    return abs(value) <= LARGEST  # False for what is not a number
+    max_known = 1e15  # what a recording says beyond that, infinite or not a number, counts as unknown
+    return abs(value) <= max_known  # False for what is not a number
 
 
 def upper_first(names: Iterable[str]) -> list[str]:

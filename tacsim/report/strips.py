@@ -19,8 +19,6 @@ Find = Callable[[str, TactileFrame], Known | None]
 Rgb = NDArray[np.uint8]
 
 MAP_SIDE = 256  # of a map's picture, about [px]
-SLOPE_COLOURS = 127.0  # grey levels for the steepest slope
-LONGEST_ARROW = 0.9  # of a flow, over the distance of two arrows
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,8 +83,9 @@ def _height(height: NDArray[np.float32], deepest: float) -> Rgb:
 
 
 def _slope(gradient: NDArray[np.float32], steepest: float) -> Rgb:
+    levels = 127.0  # grey levels for the steepest slope
     colours = np.full((*gradient.shape[:2], 3), 128.0)
-    colours[..., :2] += SLOPE_COLOURS * gradient / max(steepest, 1e-9)
+    colours[..., :2] += levels * gradient / max(steepest, 1e-9)
     return _enlarged(np.clip(np.rint(colours), 0, 255).astype(np.uint8))
 
 
@@ -97,11 +96,12 @@ def _enlarged(image: Rgb) -> Rgb:
 
 def _flow(flow: NDArray[np.float32], longest: float) -> Rgb:
     """Arrows on an even lattice, all in one scale."""
+    max_arrow = 0.9  # of a flow, over the distance of two arrows
     rows, columns, _ = flow.shape
     apart = MAP_SIDE / max(rows, columns)
     image = Image.new("RGB", (round(columns * apart), round(rows * apart)), "white")
     pen = ImageDraw.Draw(image)
-    scale = LONGEST_ARROW * apart / max(longest, 1e-9)
+    scale = max_arrow * apart / max(longest, 1e-9)
     for (row, column), (x, y) in zip(np.ndindex(rows, columns), flow.reshape(-1, 2).tolist(), strict=True):
         u, v = (column + 0.5) * apart, (row + 0.5) * apart
         pen.line((u, v, u + scale * x, v + scale * y), fill="#2a6db5", width=2)

@@ -15,8 +15,6 @@ from tacsim.models.rig import WrenchNoise
 from tacsim.physics.world import World
 from tacsim.sim.clock import Delayed, SimClock
 
-MINUTE = 60.0  # [s]
-
 
 class WrenchNoiseSource:
     """What an arm's force sensor adds to the wrench: noise of each reading, and a zero that wanders.
@@ -37,13 +35,14 @@ class WrenchNoiseSource:
 
     def __call__(self, index: int, period: float, episode: int) -> FloatArray:
         """(6,) in period `index` from 0, each of `period` [s]; force [N], then torque [N m]."""
+        minute = 60.0  # [s]
         if episode != self._episode or index < self._index:
             self._begin(episode)
         while self._index < index:
             self._index += 1
             self._zero = self._zero + self._step
             self._reading, self._step = self._generator.standard_normal((2, 6))
-        zero = self._drift * np.sqrt(period / MINUTE) * self._zero
+        zero = self._drift * np.sqrt(period / minute) * self._zero
         noise: FloatArray = self._deviation * (self._reading + zero)
         return noise
 

@@ -15,13 +15,7 @@ from tacsim.physics.world import World
 from tacsim.sim.clock import SimClock
 from tacsim.sim.scene_world import SceneWorld, StatePool
 from tacsim.sim.sensor import SimSensor
-
-CLEARANCE = 0.05e-3  # gap that an approach begins at [m]
-FIRST_TOUCH = 0.01e-3  # its first step, beyond that gap: flat bodies then press with about 0.05 N [m]
-MAX_STEP = 0.1e-3  # its longest [m]
-TOUCH_TOLERANCE = 0.2  # the touch force may be exceeded by this fraction
-MAX_MOVES = 80  # of one approach
-MIN_STEP = 1e-8  # an approach that needs finer steps has met something that never gives a gentle force [m]
+from tacsim.sim.tuning import APPROACH_GAP, FIRST_TOUCH_STEP, MAX_STEP, TOUCH_TOLERANCE
 
 
 class SimReset:
@@ -87,16 +81,18 @@ def approach_force(world: World, touch_force: float) -> MoveStats | None:
     touch_force * (1 + TOUCH_TOLERANCE) is undone by restoring the world, so that the body keeps no trace of it, and its
     end bounds the steps that follow. Returns how the last move went, None if there was none. Raises NoTouch.
     """
+    max_moves = 80  # of one approach
+    min_step = 1e-8  # an approach that needs finer steps has met something that never gives a gentle force [m]
     max_force = touch_force * (1 + TOUCH_TOLERANCE)
     begins, stats = _close_gaps(world, max_force), None
     here, bound = 0.0, math.inf  # travelled by each sensor; where the force is too large [m]
     tried = [(here, _min_force(world))]  # (distance, force) of every state tried
     step = 0.0
-    for _ in range(MAX_MOVES):
+    for _ in range(max_moves):
         if tried[-1][0] == here and tried[-1][1] >= touch_force:
             return stats
         step = _next_distance(tried, here, bound, touch_force * (1 + TOUCH_TOLERANCE / 2), begins) - here
-        if step < MIN_STEP:
+        if step < min_step:
             break
         before = world.snapshot()
         stats = _advance_sensors(world, dict.fromkeys(world.sensors, step))
@@ -122,7 +118,7 @@ def _next_distance(
     farthest = min(bound, here + MAX_STEP)
     contacts = [(distance, force) for distance, force in tried if force > 0][-2:]
     if not contacts:
-        return farthest if begins is None or here > 0.0 else min(farthest, begins + FIRST_TOUCH)
+        return farthest if begins is None or here > 0.0 else min(farthest, begins + FIRST_TOUCH_STEP)
     if len(contacts) == 1 and begins is not None and contacts[0][0] > begins:
         contacts.insert(0, (begins, 0.0))
     x, force = contacts[-1]
@@ -135,7 +131,7 @@ def _next_distance(
 
 
 def _close_gaps(world: World, max_force: float) -> float | None:
-    """Puts each sensor at CLEARANCE before the body's nearest particle, if there is a body and a gap.
+    """Puts each sensor at APPROACH_GAP before the body's nearest particle, if there is a body and a gap.
 
     Returns how far from there contact begins [m], None where that is not known. Undone if the force exceeds
     `max_force` [N]: on a shared grid, contact begins at a distance.
@@ -143,7 +139,7 @@ def _close_gaps(world: World, max_force: float) -> float | None:
     truth = world.truth()
     if truth is None:
         return None
-    gaps = {name: _gap_to_body(truth, world.pose(name)) - CLEARANCE for name in world.sensors}
+    gaps = {name: _gap_to_body(truth, world.pose(name)) - APPROACH_GAP for name in world.sensors}
     desired = {name: gap for name, gap in gaps.items() if gap > 0}
     if not desired:
         return None
@@ -152,7 +148,7 @@ def _close_gaps(world: World, max_force: float) -> float | None:
     if _min_force(world) > max_force:
         world.restore(before)
         return None
-    return CLEARANCE if len(desired) == len(gaps) else None
+    return APPROACH_GAP if len(desired) == len(gaps) else None
 
 
 def _gap_to_body(truth: Truth, sensor: Pose) -> float:

@@ -9,9 +9,7 @@ import numpy as np
 from tacsim import pose as se3
 from tacsim.control.contact_signal import contact_signal
 from tacsim.interface import Action, Needs, Observation, Pose, RigSpec
-
-TARGET = 0.05  # contact signal of a firm grip: five times what camera noise of 2 % gives [-]
-CLOSE = 0.1e-3  # motion of each sensor in a control period [m]
+from tacsim.tasks.tuning import CLOSING_STEP, FIRM_GRIP_SIGNAL
 
 
 class Grip:
@@ -26,7 +24,7 @@ class Grip:
         step: motion of each sensor in a control period [m].
     """
 
-    def __init__(self, spec: RigSpec, target: float = TARGET, step: float = CLOSE) -> None:
+    def __init__(self, spec: RigSpec, target: float = FIRM_GRIP_SIGNAL, step: float = CLOSING_STEP) -> None:
         if not target > 0 or not step > 0:
             raise ValueError(f"grip: target and step must be positive, got target {target}, step {step} m")
         self._carriers: Mapping[str, str | None] = {name: sensor.arm for name, sensor in spec.sensors.items()}

@@ -25,18 +25,7 @@ from tacsim.tasks.solids import (
 )
 from tacsim.tasks.squeeze import BOTH, estimated_height
 from tacsim.tasks.task import Axis, Estimator, GoalOutOfReach, Task
-
-MAX_PRESSURE_SHARE = (
-    0.9  # most pressure of the teacher, over the yield stress: clay that is pressed harder is flattened
-)
-CLOSING_STEPS = 30.0  # of the teacher: it takes so large a part of the height that is left in each control step
-ARRIVAL_SHARE = 0.2  # of max_step: so near to where it goes, the scripted policy turns
-STROKE_TARGETS = (1.0, -1.0, 0.0)  # of a stroke: to one side, to the other, to the middle
-GOLDEN_ANGLE = np.pi * (3.0 - 5.0**0.5)  # no two strokes of a ball's go one way
-REMEMBERED = 60  # touches; what was felt before has been kneaded since
-POINTS = 150  # kept of a touch
-CELLS = 1500  # of the box round the shape
-FAINT = 0.05  # of the greatest depth: less is the gel's own slope, or noise
+from tacsim.tasks.tuning import ARRIVAL_SHARE, CLOSING_STEPS, MAX_PRESSURE_SHARE, MAX_TOUCHES, MIN_TOUCH_DEPTH
 
 
 @dataclass(frozen=True)
@@ -182,12 +171,13 @@ class ScriptedKnead:
     def _lateral_step(self, now: FloatArray) -> FloatArray:
         """(2,) step of the upper sensor, `now` so far beside where it began [m]: to one side, to the other, and through
         the middle again. It goes on as the sensor moves, not by a clock: who learns from it sees that, too."""
+        aims = (1.0, -1.0, 0.0)  # of a stroke: to one side, to the other, to the middle
         longest = self._task.config.max_step
         moved, self._before = now - self._before, now
         along = float(moved @ self._stroke_direction())
         part = 1 if along < -ARRIVAL_SHARE * longest else 2 if float(now @ self._stroke_direction()) < 0 else 0
         while (
-            float(np.linalg.norm(left := STROKE_TARGETS[part] * self._reach * self._stroke_direction() - now))
+            float(np.linalg.norm(left := aims[part] * self._reach * self._stroke_direction() - now))
             < ARRIVAL_SHARE * longest
         ):
             part = (part + 1) % 3
@@ -196,7 +186,8 @@ class ScriptedKnead:
 
     def _stroke_direction(self) -> FloatArray:
         """(2,) where the first half of this stroke goes, unit vector."""
-        turn = 0.5 * np.pi if self._task.config.shape == "rod" else GOLDEN_ANGLE * self._strokes
+        golden_angle = np.pi * (3.0 - 5.0**0.5)  # no two strokes of a ball's go one way
+        turn = 0.5 * np.pi if self._task.config.shape == "rod" else golden_angle * self._strokes
         return np.array([np.cos(turn), np.sin(turn)])
 
 
@@ -220,12 +211,13 @@ class TactileShape:
 
     def __init__(self, volume: float, canonical: CanonicalGrid) -> None:
         self._volume, self._cells = volume, canonical_cells(canonical).points()
-        self._touches: deque[FloatArray] = deque(maxlen=REMEMBERED)  # (n, 3) each, body axes, from its middle [m]
+        self._touches: deque[FloatArray] = deque(maxlen=MAX_TOUCHES)  # (n, 3) each, body axes, from its middle [m]
         self._world_from_body = np.eye(3)
         self._before: FloatArray | None = None  # (2,) from the lower sensor to the upper, at the last touch [m]
 
     def add_observation(self, observation: Observation) -> None:
         """The next observation. Raises ValueError for a sensor without height."""
+        max_points = 150  # kept of a touch
         below, above = (self._contact_points(observation.tactile[n], observation.arms[n]) for n in ("lower", "upper"))
         if not len(below) or not len(above):
             self._before = None  # where it turns to now cannot be felt
@@ -242,10 +234,11 @@ class TactileShape:
             touch -= np.outer(beyond - np.clip(beyond, -height / 2, height / 2), up)
         middle = np.array([*(below.mean(axis=0) + above.mean(axis=0))[:2], bottom + top]) / 2
         felt = np.concatenate([below, above]) - middle
-        self._touches.append(felt[:: len(felt) // POINTS + 1] @ self._world_from_body)
+        self._touches.append(felt[:: len(felt) // max_points + 1] @ self._world_from_body)
 
     def points(self) -> FloatArray | None:
         """(n, 3) that fill the shape, world axes, from their mean [m]; None where not enough has been felt."""
+        cell_count = 1500  # of the box round the shape
         from scipy.spatial import ConvexHull, QhullError
 
         if not self._touches:
@@ -256,7 +249,7 @@ class TactileShape:
         except QhullError:
             return None
         least, size = felt.min(axis=0), np.ptp(felt, axis=0)
-        spacing = (size.prod() / CELLS) ** (1 / 3)
+        spacing = (size.prod() / cell_count) ** (1 / 3)
         axes = [np.arange(spacing / 2, length, spacing) for length in size]
         cells = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3) + least
         inside = (cells @ hull.equations[:, :3].T + hull.equations[:, 3] <= 0.0).all(axis=1)
@@ -272,7 +265,7 @@ class TactileShape:
         if touch.height is None:
             raise ValueError("the shape of a body is felt by the gel's height, and this sensor delivers none")
         deepest = float(touch.height.max(where=touch.valid, initial=0.0))
-        there = touch.contact & (touch.height > FAINT * deepest)
+        there = touch.contact & (touch.height > MIN_TOUCH_DEPTH * deepest)
         return se3.transform(arm.pose, np.column_stack([self._cells[there], -touch.height[there]]))
 
     def _rotate_body(self, way: FloatArray, below: FloatArray, above: FloatArray, height: float) -> None:

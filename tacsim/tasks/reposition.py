@@ -12,9 +12,7 @@ from tacsim.interface import Action, ArmState, FloatArray, Needs, Observation, P
 from tacsim.models.rig import RepositionConfig
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.tasks.task import Axis, Estimator, GoalOutOfReach, Task
-
-REACHED = 0.02e-3  # the scripted policy holds when its estimate is this close to the goal [m]
-MIN_FORCE = 0.01  # a smaller normal force counts as no contact [N]
+from tacsim.tasks.tuning import ARRIVAL_DISTANCE, MIN_FORCE
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +95,7 @@ class ScriptedReposition:
         if self._start is None:
             self._start = position
         left = self._goal - (position - self._start)
-        self._reached = self._reached or float(np.linalg.norm(left)) <= REACHED
+        self._reached = self._reached or float(np.linalg.norm(left)) <= ARRIVAL_DISTANCE
         if self._reached and not self._through:
             return Action({"upper": None})
         direction = self._goal if self._reached else left

@@ -18,7 +18,6 @@ from tacsim.interface import FloatArray
 from tacsim.models.scene import Cylinder, Sphere
 
 SAMPLE_POINTS = 500  # of the earth mover's distance
-ROD_CELLS = 12  # particles of a target across its diameter
 
 
 @dataclass(frozen=True)
@@ -51,7 +50,8 @@ class Solid:
     @cached_property
     def points(self) -> FloatArray:
         """Points (n, 3) that fill it evenly, world axes, from its middle [m]."""
-        spacing = 2.0 * self.geometry.radius / ROD_CELLS
+        cells_across = 12  # particles of a target across its diameter
+        spacing = 2.0 * self.geometry.radius / cells_across
         points: FloatArray = shapes.lattice_particles(self.geometry, spacing)[:, [2, 1, 0]]
         return points
 

@@ -10,10 +10,9 @@ from tacsim.interface import Action, FloatArray, Needs, Observation, Policy, Pos
 from tacsim.models.rig import SqueezeConfig
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.tasks.task import Axis, Estimator, GoalOutOfReach, Task
+from tacsim.tasks.tuning import ARRIVAL_HEIGHT_ERROR, MIN_BODY_SHARE
 
 BOTH = frozenset({"lower", "upper"})
-MIN_BODY_SHARE = 0.1  # of the sensors' way that a body is taken to give
-REACHED = 0.01e-3  # the scripted policy holds when its estimate is this close to the goal [m]
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +83,7 @@ class ScriptedSqueeze:
 
     def __call__(self, observation: Observation) -> Action:
         above = estimated_height(observation) - self._goal
-        self._reached = self._reached or above <= REACHED
+        self._reached = self._reached or above <= ARRIVAL_HEIGHT_ERROR
         if self._reached and not self._through:
             return Action({"lower": None, "upper": None})
         step = self._rate if self._reached else min(self._rate, above / 2)

@@ -17,14 +17,8 @@ from calibration.normaliser import (
     normaliser_for_pictures,
     normaliser_for_simulation,
 )
-from calibration.reference import (
-    MAX_COLOUR_CHANGE,
-    MAX_SLOPE_CHANGE,
-    STALE_SLOPE,
-    StaleReference,
-    UnusableReference,
-    is_channel_order_swapped,
-)
+from calibration.reference import StaleReference, UnusableReference, is_channel_order_swapped
+from calibration.tuning import MAX_COLOUR_CHANGE, MAX_SLOPE_CHANGE, STALE_SLOPE
 from tacsim.interface import TactileFrame, TactileObservation
 from tacsim.models.hardware import CameraSensorConfig
 from tacsim.models.sensor import CanonicalGrid, SensorModel

@@ -18,12 +18,11 @@ from benchmarks.cases.real.balls import BallSet
 from benchmarks.cases.real.labels import BadData
 from calibration.errors import BadFrames
 from calibration.light.calibrator import calibrate_light
-from calibration.light.dent import MAX_RIM_RATIO, ContactCircle, dent_gradient, dent_height
+from calibration.light.dent import ContactCircle, dent_gradient, dent_height
 from calibration.light.fit import LightFit
-from calibration.light.labels import BLUR
 from calibration.light.press import BallPress, gaussian_blur, make_press, mean_reference_colour
-from calibration.light.refinement import RIM_BLUR
 from calibration.light.shadows import DentShade
+from calibration.light.tuning import FORWARD_BLUR, MAX_RIM_RATIO, RIM_BLUR
 from tacsim.models.photometric import PhotometricLight, image_grid_places
 
 FOLDS = 5
@@ -78,7 +77,7 @@ def _error(press: BallPress, inside: ContactCircle, fit: LightFit, ball: float) 
         dark = shade.terms(u.ravel(), v.ravel(), press.circle, fit.thickness, ball)
         change += (dark @ np.array(fit.forward.shadows.weights)).reshape(change.shape)
     still = fit.reference + press.drift
-    drawn = np.clip(still + gaussian_blur(change, BLUR) * mean, 0.0, 255.0) - still
+    drawn = np.clip(still + gaussian_blur(change, FORWARD_BLUR) * mean, 0.0, 255.0) - still
     where = replace(press, circle=inside).distance() < inside.radius
     return float(np.abs(drawn - press.change * mean)[where].mean())
 

@@ -7,45 +7,42 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from calibration.light.checks.tuning import (
+    CONTACT_BLUR,
+    MAX_LINK_RATIO,
+    MIN_COMMON_CONTACT,
+    MIN_EXPLAINED_SHARE,
+    MIN_FINE_POWER_RATIO,
+)
 from calibration.light.circle import NoCircle, find_contact_circle
 from calibration.light.dent import dent_gradient
 from calibration.light.photometry import photometric_features
-from calibration.light.press import SKIRT_RADIUS, BallPress, Window, gaussian_blur
-from calibration.light.refinement import RIM_BLUR
+from calibration.light.press import BallPress, Window, gaussian_blur
+from calibration.light.tuning import RIM_BLUR, SKIRT_RADIUS
 from tacsim.interface import FloatArray, Image, Mask
 
-FIRST_THICKNESS = 1e4  # of a gel that is taken to be thick [ball radii]
-RIDGE = 1e-3
 # Two presses are of one sensor if the light of each explains the other up to the larger of these shares of its power
 MAX_LINK = 0.2
-MAX_LINK_RATIO = 4.0  # times the median link; a DIGIT, whose lamps stand low, shows 2.4
-MIN_GROUPED = 4  # presses: fewer do not show which one is wrong
-FINE_DEVIATION = 1.0  # detail finer than this Gaussian is compared [px]
-MIN_FINE_POWER_RATIO = (
-    0.5  # least power of fine detail and noise, over the median of the others; real sensors show 0.9 and more
-)
-CONTACT_BLUR = 3.0  # [px]
 # Strength of a contact in a picture without contact, over that of the presses
 MIN_REFERENCE_CONTACT = 0.2  # where two such pictures differ
-MIN_COMMON_CONTACT = 0.3  # where the presses differ from it; far shadows of a DIGIT's presses show 0.26
-MIN_EXPLAINED_SHARE = (
-    0.8  # share of it that a ball's dent must explain; drift and glare at the border have other shapes
-)
 
 
 def find_inconsistent_presses(presses: Sequence[BallPress], windows: Sequence[Window], ball: float) -> list[int]:
     """The presses that those of the largest group do not predict: each press alone gives a light, and two presses
     belong together if the lights of both explain both. `ball`: its radius [px]."""
-    if len(presses) < MIN_GROUPED:
+    min_grouped = 4  # presses: fewer do not show which one is wrong
+    ridge = 1e-3
+    thick = 1e4  # of a gel that is taken to be thick [ball radii]
+    if len(presses) < min_grouped:
         return []
     sets = []
     for press, window in zip(presses, windows, strict=True):
-        gradient = dent_gradient(window.u, window.v, press.circle, FIRST_THICKNESS * ball, ball, RIM_BLUR)
+        gradient = dent_gradient(window.u, window.v, press.circle, thick * ball, ball, RIM_BLUR)
         terms = photometric_features(gradient, window.u, window.v, 3, 0)
         sets.append((terms.T @ terms, terms.T @ window.change, float((window.change**2).sum())))
     unexplained = np.zeros((len(sets), len(sets)))
     for i, (square, right, _) in enumerate(sets):
-        regular = square + RIDGE * np.trace(square) / len(square) * np.eye(len(square))
+        regular = square + ridge * np.trace(square) / len(square) * np.eye(len(square))
         light = np.linalg.solve(regular, right)
         for j, (other, wanted, power) in enumerate(sets):
             unexplained[i, j] = 1 - (2 * (light * wanted).sum() - (light * (other @ light)).sum()) / max(power, 1e-300)
@@ -68,7 +65,8 @@ def _outside_largest_group(link_costs: FloatArray) -> list[int]:
 
 def fine_power(picture: FloatArray, where: Mask) -> float:
     """Power of fine detail and noise of a picture (H, W, 3) [grey levels] at the pixels `where` (H, W)."""
-    return float(((picture - gaussian_blur(picture, FINE_DEVIATION))[where] ** 2).mean())
+    fine_width = 1.0  # detail finer than this Gaussian is compared [px]
+    return float(((picture - gaussian_blur(picture, fine_width))[where] ** 2).mean())
 
 
 def find_blurred_presses(presses: Sequence[BallPress], reference: Image, mean: FloatArray) -> list[tuple[int, float]]:

@@ -11,8 +11,6 @@ from calibration.light.fit import LightFit
 from tacsim.report.report import data_url, render_page
 
 FILE = "verdict.html"
-MAX_PRESSES = 8  # drawn, the worst first
-HALF_SIDE = 2.0  # of what is drawn [contact radii]
 
 
 def write_page(
@@ -38,15 +36,17 @@ def write_page(
 def draw_residuals(fit: LightFit, path: Path) -> None:
     """Writes a PNG: of each press the change of colour as it was seen, as it is predicted by the others, and the
     error, all in one scale. Raises ValueError for a fit of one press, which is predicted by none; OSError."""
+    half_side = 2.0  # of what is drawn [contact radii]
+    max_drawn = 8  # drawn, the worst first
     from matplotlib.figure import Figure
 
-    predictions = sorted(fit.predictions, key=lambda press: -press.error)[:MAX_PRESSES]
+    predictions = sorted(fit.predictions, key=lambda press: -press.error)[:max_drawn]
     if not predictions:
         raise ValueError("a calibration from one press leaves none out: there is nothing to draw")
     figure = Figure(figsize=(6.4, 1.9 * len(predictions)), layout="constrained")
     axes = figure.subplots(len(predictions), 3, squeeze=False)
     for row, press in zip(axes, predictions, strict=True):
-        reach = HALF_SIDE * press.circle.radius
+        reach = half_side * press.circle.radius
         rows = slice(max(0, round(press.circle.y - reach)), round(press.circle.y + reach) + 1)
         columns = slice(max(0, round(press.circle.x - reach)), round(press.circle.x + reach) + 1)
         seen, predicted = press.real[rows, columns], press.predicted[rows, columns]

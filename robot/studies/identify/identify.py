@@ -10,9 +10,10 @@ from typing import Literal
 import numpy as np
 
 from calibration.materials.checks import Finding, find_contradictions, indenter_size_error
-from calibration.materials.estimate import COARSE_ERROR, estimate_materials
+from calibration.materials.estimate import estimate_materials
 from calibration.materials.fit import Fit, Parameter, Point, Priors, Signals
 from calibration.materials.presses import Noise, Press, downsample_press, merge_repeated_readings, signals_of
+from calibration.materials.tuning import COARSE_SIMULATION_ERROR
 from robot.studies.identify.recordings import Recordings
 from robot.studies.identify.simulation import Simulation, coarser, scene_with
 from tacsim.interface import FloatArray
@@ -117,7 +118,7 @@ def identify(
     signals = signals_of(taken, noise)
     start = scene_with(scene, {each.name: each.start for each in parameters})
     exact = Simulation(start, parameters, taken, recordings.seen, on_run)
-    error = COARSE_ERROR
+    error = COARSE_SIMULATION_ERROR
     levels = [replace(exact, scene=coarser(start)), exact]
     coarse = levels[0].scene
     layers = [2 * coarse.element_size_of(name) <= scene.gel_of(name).size[2] / 2 for name in scene.sensors]

@@ -21,8 +21,6 @@ from importlib import import_module
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
-INT32_LIMIT = 2**31
-
 # All but the matrix product, which is Taichi's own
 OPERATORS: dict[type[ast.operator], Callable[[Any, Any], Any]] = {
     ast.Add: operator.add,
@@ -119,6 +117,7 @@ def _replace_collection(lang: Any) -> None:
 
 def _replace_values(lang: Any) -> None:
     """Fewer type tests where values are wrapped: most are numbers or made by Taichi's core."""
+    int32_limit = 2**31
     expr, impl = lang.expr, lang.impl
     core, wrapped = expr._ti_core, expr.Expr
     integer, real, debug_info = core.make_const_expr_int, core.make_const_expr_fp, core.DebugInfo
@@ -126,7 +125,7 @@ def _replace_values(lang: Any) -> None:
 
     def constant(value: Any) -> Any:
         """Taichi's constant; None unless `value` is a plain number."""
-        if type(value) is int and -INT32_LIMIT <= value < INT32_LIMIT:
+        if type(value) is int and -int32_limit <= value < int32_limit:
             return integer(get_runtime().default_ip, value)
         return real(get_runtime().default_fp, value) if type(value) is float else None
 

@@ -11,8 +11,6 @@ from typing import Any
 from tacsim.compute.runtime import ti
 from tacsim.compute.taichi_patches import are_enabled
 
-FUNCTIONS_PER_BATCH = 64  # created at once; the squeeze has 11
-
 
 def compiled_separately(function: Callable[..., Any]) -> Any:
     """Decorator of a function of kernels. Without patches it is `ti.func`.
@@ -70,12 +68,13 @@ def _create_functions() -> Iterator[Any]:
     A kernel's cache key lists its functions by address; so it lists them in the order in which the kernel calls them,
     in every process. One kernel of a process may be an exception: the one whose functions are of two batches.
     """
+    functions_per_batch = 64  # created at once; the squeeze has 11
     core = ti.lang.kernel_impl._ti_core
     program = ti.lang.impl.get_runtime().prog
     number = 0
     while True:
-        keys = [core.FunctionKey("compiled_separately", number + n, 0) for n in range(FUNCTIONS_PER_BATCH)]
-        number += FUNCTIONS_PER_BATCH
+        keys = [core.FunctionKey("compiled_separately", number + n, 0) for n in range(functions_per_batch)]
+        number += functions_per_batch
         yield from sorted(map(program.create_function, keys), key=_address)
 
 

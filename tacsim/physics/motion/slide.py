@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tacsim.models.scene import MIN_EDGE_RATIO
+from tacsim.models.tuning import MIN_EDGE_RADIUS
 from tacsim.physics.motion.tuning import (
     DEEP_WITH_EDGES,
     DEEP_WITHOUT_EDGES,
@@ -88,7 +88,7 @@ class Slide:
             return "contact slips by inertia at that speed; leave out settling.mach, or lower it"
         if self.depth <= 0.0:  # it is lifted off
             return ""
-        catching, slid = MIN_EDGE_RATIO * element, (self.before + self.length) / (1 + ROUNDING)
+        catching, slid = MIN_EDGE_RADIUS * element, (self.before + self.length) / (1 + ROUNDING)
         if self.edge_radius < catching * (1 - 1e-9) and slid > MAX_CAUGHT_SLIDE * element:
             return (
                 f"an edge sharper than {catching:g} mm catches on the mesh as it is slid; for a drag to rely on, give "

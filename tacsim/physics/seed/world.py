@@ -20,7 +20,8 @@ from tacsim.compute.runtime import launching, start
 from tacsim.geometry.sampling import body_points
 from tacsim.interface import Pose, Truth
 from tacsim.models.material import BodyMaterial, GelMaterial, elastic_constants
-from tacsim.models.scene import MAX_MACH, Gel, GelSurface, Scene
+from tacsim.models.scene import Gel, GelSurface, Scene
+from tacsim.models.tuning import MAX_MACH
 from tacsim.physics.body.material import UNREACHABLE_LIMIT
 from tacsim.physics.exec.layout import NUMBERS
 from tacsim.physics.failure.health import Health, LaunchSpan, SimulationDiverged, check_launch, require_room

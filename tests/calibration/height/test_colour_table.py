@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from calibration.height.colour_table import MAX_SLOPE, table_of_lighting, table_of_model
+from calibration.height.colour_table import table_of_lighting, table_of_model
+from calibration.height.tuning import MAX_TABLE_SLOPE
 from tacsim.models.sensor import Light, Lighting, SensorModel
 from tacsim.optics.render import phong_shading
 
@@ -68,7 +69,7 @@ def test_colours_beyond_the_light_are_clipped_and_flagged() -> None:
     found, beyond = table_of_model(SensorModel())(change)
     assert beyond.tolist() == [[True, True, False]]
     assert np.isfinite(found).all()
-    assert np.abs(found).max() <= MAX_SLOPE
+    assert np.abs(found).max() <= MAX_TABLE_SLOPE
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 from robot.open import open_rig
 from tacsim import pose as se3
 from tacsim.config import ConfigError, load_rig
-from tacsim.control.load_controller import MAX_TRAVEL, TOLERANCE, LoadController, load_controller
+from tacsim.control.load_controller import LoadController, load_controller
+from tacsim.control.tuning import LOAD_TOLERANCE, MAX_TRAVEL
 from tacsim.interface import Action, ArmState, Pose
 from tacsim.limits import LimitExceeded
 from tacsim.models.rig import RepositionConfig, SqueezeConfig
@@ -59,7 +60,7 @@ def test_a_load_is_reached_and_then_rests(stiffness: float, load: float) -> None
     way = abs(load - 1.0) / stiffness
     for _ in range(6 + int(way / LONGEST)):
         wall.period(held, None)
-    assert wall.force == pytest.approx(load, rel=TOLERANCE)
+    assert wall.force == pytest.approx(load, rel=LOAD_TOLERANCE)
     rests = wall.pose
     wall.period(held, None)
     assert np.array_equal(wall.pose.position, rests.position)
@@ -73,7 +74,7 @@ def test_only_the_way_along_z_of_the_sensor_is_replaced() -> None:
         wall.period(held, Pose(wall.start.position + count * 0.1e-3 * x - 0.4e-3 * z, turned.as_quat()))
         moved = se3.relative_pose(wall.start, wall.pose).position
         assert moved[:2] == pytest.approx([count * 0.1e-3, 0.0], abs=1e-12)
-    assert wall.force == pytest.approx(LOAD, rel=TOLERANCE)
+    assert wall.force == pytest.approx(LOAD, rel=LOAD_TOLERANCE)
 
 
 def test_no_correction_is_longer_than_allowed() -> None:
@@ -103,7 +104,7 @@ def test_what_limits_shorten_is_not_wound_up() -> None:
         wall.period(held, None)
         depths.append(wall.depth)
     assert max(depths) <= (LOAD - 1.0) / STIFFNESS * 1.5
-    assert wall.force == pytest.approx(LOAD, rel=TOLERANCE)
+    assert wall.force == pytest.approx(LOAD, rel=LOAD_TOLERANCE)
 
 
 def test_an_arm_with_nothing_to_press_stops_and_says_so() -> None:
@@ -163,7 +164,7 @@ def test_a_rig_holds_the_load_whatever_the_policy_asks_along_z(open_springs: Cal
         asked = Pose(before.pose.position + [count * 0.1e-3, 0.0, 1e-3], before.pose.quaternion)
         observation, sent = rig.step(Action({"upper": asked}))
     arm = observation.arms["upper"]
-    assert -arm.wrench[2] == pytest.approx(2.0, rel=TOLERANCE)
+    assert -arm.wrench[2] == pytest.approx(2.0, rel=LOAD_TOLERANCE)
     assert arm.pose.position[:2] == pytest.approx(before.pose.position[:2] + [0.7e-3, 0.0], abs=1e-9)
     assert sent["upper"] is not None and sent["upper"].position[2] == arm.pose.position[2]
     rig.step(Action())  # an arm that the policy holds goes on holding its load

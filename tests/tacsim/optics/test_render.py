@@ -9,16 +9,9 @@ from pydantic import ValidationError
 from tacsim.models.sensor import Light, Lighting, SensorGeometry, SensorModel
 from tacsim.optics import render
 from tacsim.optics.grid import PixelGrid, image_grid
-from tacsim.optics.render import (
-    MAX_SLOPE,
-    Renderer,
-    light_at,
-    light_table,
-    phong_shading,
-    texture_gradient,
-    unlit_image,
-)
+from tacsim.optics.render import Renderer, light_at, light_table, phong_shading, texture_gradient, unlit_image
 from tacsim.optics.surface import SurfaceTable, sample_surface
+from tacsim.optics.tuning import MAX_SLOPE
 from tests.tacsim.optics.surfaces import dent, flat
 
 GEL = (20e-3, 20e-3)

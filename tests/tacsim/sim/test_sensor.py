@@ -14,9 +14,10 @@ from tacsim.models.hardware import ArmLimits, Workspace
 from tacsim.physics.move import MoveStats
 from tacsim.sim.arm import SimArm
 from tacsim.sim.clock import SimClock
-from tacsim.sim.reset import TOUCH_TOLERANCE, SimReset, approach_force
+from tacsim.sim.reset import SimReset, approach_force
 from tacsim.sim.scene_world import SceneWorld, StatePool
 from tacsim.sim.sensor import SimSensor
+from tacsim.sim.tuning import TOUCH_TOLERANCE
 
 
 def shifted(pose: Pose, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Pose:

@@ -181,8 +181,8 @@ def lattice_particles(geometry: Shape, spacing: float) -> FloatArray:
     misfit = len(found) / estimate - 1
     if isinstance(geometry, Mesh) and abs(misfit) > MAX_MISFIT:
         raise ValueError(
-            f"{_shape_name(geometry)}: particles at a spacing of {millimetres(spacing)} miss its volume by {misfit:+.0%} "
-            f"(limit {MAX_MISFIT:.0%}); parts are thinner than the spacing: use a smaller one"
+            f"{_shape_name(geometry)}: particles at a spacing of {millimetres(spacing)} miss its volume by "
+            f"{misfit:+.0%} (limit {MAX_MISFIT:.0%}); parts are thinner than the spacing: use a smaller one"
         )
     return found
 

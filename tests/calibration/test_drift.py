@@ -194,7 +194,9 @@ def test_the_drift_is_a_quadratic_through_what_is_calm() -> None:
     finder = DriftFinder((120, 160))
     drift = finder(planes, hidden)
     assert drift.measured
-    np.testing.assert_allclose(finder.at(drift), true[:, ::PIXEL_STRIDE, ::PIXEL_STRIDE].reshape(3, -1).T, atol=2e-4)
+    np.testing.assert_allclose(
+        finder.drift_at_stride(drift), true[:, ::PIXEL_STRIDE, ::PIXEL_STRIDE].reshape(3, -1).T, atol=2e-4
+    )
     finder.remove(planes, drift)
     assert np.abs(planes[:, ~hidden & ~touched]).max() < 2e-4
     assert not finder(planes, np.ones_like(hidden)).measured
@@ -288,10 +290,10 @@ def test_a_part_of_a_view_has_the_drift_of_the_whole() -> None:
     weights = np.random.default_rng(0).normal(0, 0.1, (6, 3)).astype(np.float32)
     finder, drift = DriftFinder((120, 160)), Drift(weights, measured=True)
     finder.remove(planes, drift)
-    np.testing.assert_allclose(finder.select_presses(drift, (0, 0), (120, 160)), -np.moveaxis(planes, 0, -1), atol=1e-6)
+    np.testing.assert_allclose(finder.drift_on_part(drift, (0, 0), (120, 160)), -np.moveaxis(planes, 0, -1), atol=1e-6)
     np.testing.assert_allclose(
-        finder.select_presses(drift, (11, 23), (60, 70)), -np.moveaxis(planes, 0, -1)[11:71, 23:93], atol=1e-6
+        finder.drift_on_part(drift, (11, 23), (60, 70)), -np.moveaxis(planes, 0, -1)[11:71, 23:93], atol=1e-6
     )
     np.testing.assert_allclose(
-        finder.select_presses(drift, (-4, -6), (120, 160))[4:, 6:], -np.moveaxis(planes, 0, -1)[:116, :154], atol=1e-6
+        finder.drift_on_part(drift, (-4, -6), (120, 160))[4:, 6:], -np.moveaxis(planes, 0, -1)[:116, :154], atol=1e-6
     )

@@ -114,7 +114,7 @@ def test_a_camera_finds_flow_by_the_pitch_of_its_dots_within_a_region() -> None:
     with pytest.raises(ValueError, match="no lattice of dark dots"):
         normalise.take_reference(TactileFrame(np.full((*SHAPE, 3), 100, dtype=np.uint8), time=0.0, index=0))
     normalise.take_reference(TactileFrame(shown(render(flat()), 1), time=0.0, index=1))
-    assert normalise.shown == pytest.approx((COLUMNS * 0.065e-3, ROWS * 0.065e-3), rel=0.01)
+    assert normalise.visible_size == pytest.approx((COLUMNS * 0.065e-3, ROWS * 0.065e-3), rel=0.01)
     slid = dent((0.5e-3, 0.4e-3), 0.4e-3, (0.3e-3, -0.1e-3))
     seen = normalise(TactileFrame(shown(render(slid), 2), time=0.1, index=2), now=0.2)
     assert seen.flow is not None

@@ -71,7 +71,7 @@ def errors(model: SensorModel, story: list[GelSurface], sent: Callable[[np.ndarr
         assert seen.flow.dtype == np.float32
         assert model.markers is not None
         found.append(np.linalg.norm(seen.flow - marker_flow(surface, model.markers), axis=2))
-        assert normalise.visible_share == 1.0
+        assert normalise.visible_marker_share == 1.0
     return np.array(found)
 
 
@@ -267,9 +267,9 @@ def test_dots_that_vanish_all_at_once_are_an_error_and_not_a_flow() -> None:
     normalise(frame(shown, 1), now=0.0)
     with pytest.raises(TooFewMarkers, match="0 of 99 markers are seen"):
         normalise(frame(np.zeros_like(shown), 2), now=0.0)
-    assert normalise.visible_share == 0.0
+    assert normalise.visible_marker_share == 0.0
     normalise(frame(shown, 3), now=0.0)  # the light is on again
-    assert normalise.visible_share == 1.0
+    assert normalise.visible_marker_share == 1.0
 
 
 def test_dots_that_the_image_cannot_show_are_refused() -> None:
@@ -285,7 +285,7 @@ def test_who_finds_flow_says_so() -> None:
     assert isinstance(plain, FrameNormaliser)
     assert not plain.finds_flow
     assert plain.visible_markers is None
-    assert plain.visible_share == 1.0
+    assert plain.visible_marker_share == 1.0
 
 
 @pytest.mark.parametrize(("radius", "pitch", "angle"), [(4.0, 24.0, 0.0), (2.5, 13.0, 0.2), (8.0, 40.0, -0.3)])

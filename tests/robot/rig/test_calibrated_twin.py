@@ -303,7 +303,7 @@ def test_the_dots_of_a_bundle_move_with_the_gel(dotted: Path) -> None:
         seen = normalise(TactileFrame(render(surface), time=0.1, index=number), now=0.1)
         true = surface_map(surface, GRID, markers)
         assert seen.flow is not None and true.flow is not None and seen.height is not None
-        assert normalise.visible_share == 1.0 and np.abs(true.flow).max() > 0.8 * max(slide)
+        assert normalise.visible_marker_share == 1.0 and np.abs(true.flow).max() > 0.8 * max(slide)
         assert np.sqrt(((seen.flow - true.flow) ** 2).mean()) < 0.1 * PITCH
         assert seen.height.max() == pytest.approx(true.height.max(), rel=0.1)
         assert np.abs(render(surface).astype(float) - sensor(surface)).mean() < 1.5  # a dot is 80 grey levels dark

@@ -201,7 +201,7 @@ def test_markers_are_measured_when_asked_for_and_noticed_when_not(tmp_path: Path
     normalise.take_reference(TactileFrame(image=reference, time=0.0, index=0))
     pressed = dotted(sensor, sensor.press(0.5e-3, 130, 100).image)
     seen = normalise(TactileFrame(image=pressed, time=0.1, index=1), 0.1)
-    assert seen.flow is not None and np.median(np.abs(seen.flow)) < 10e-6 and normalise.visible_share > 0.9
+    assert seen.flow is not None and np.median(np.abs(seen.flow)) < 10e-6 and normalise.visible_marker_share > 0.9
     assert seen.height is not None and 0.35e-3 < float(seen.height.max()) < 0.65e-3
 
     ran = tacsim(*words, "--out", tmp_path / "plain")

@@ -182,7 +182,7 @@ def send_hostile(arm: URArm, mock: MockUR, targets: np.ndarray) -> tuple[np.ndar
             joints.append(servo_targets(page.entries))
             ticks.append(servo_ticks(page.entries))
     arm.stop()
-    until(arm.is_at_rest, "rest")
+    until(arm.at_rest, "rest")
     rest = mock.faults.received(since).entries
     sent = np.concatenate([*joints, servo_targets(rest)])
     record = arm._channel.states.latest()

@@ -218,7 +218,7 @@ def _next_view(
                 return frame.image, points
             reason = "the board moves; hold it still"
             if same is not None:
-                reason = f"the board is seen as in view {same}; tilt it, or hold it elsewhere"
+                reason = f"the board is as in view {same}; tilt it, or hold it elsewhere"
         if frame.time - reminded >= REMINDER_INTERVAL:
             session.left_out.append(reason)
             session.report(f"Skipped: {reason}.")

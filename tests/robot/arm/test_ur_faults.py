@@ -119,7 +119,7 @@ def test_arm_without_new_observation_holds(mock: MockUR) -> None:
 
         until(under_way, "motion", pause=0.02)
         until(lambda: arm.status() == ArmStatus.OBSERVATION_STALE, "blind")
-        until(arm.is_at_rest, "rest")
+        until(arm.at_rest, "rest")
         held = arm.state().pose
         assert se3.pose_distance(start, held)[0] < 0.1
         arm.command(far)  # commanded again, without a new observation
@@ -144,7 +144,7 @@ def test_arm_without_action_holds_and_continues(mock: MockUR, measuring: bool, f
         seen = records(arm)
         held_at = seen[(seen["status"] == ArmStatus.HOLD) & (seen["written"] > asked + 0.5 * timeout)][0]["written"]
         figure("hold told after the last action (time-out 200 ms)", 1e3 * float(held_at - asked), "ms", at_most=210)
-        until(arm.is_at_rest, "rest")
+        until(arm.at_rest, "rest")
         held = arm.state().pose
         assert 2e-3 < se3.pose_distance(start, held)[0] < 0.1  # stopped on its path
         since = mock.faults.received().last
@@ -176,7 +176,7 @@ def test_arm_after_last_action_stops_within_timeout_distance(mock: MockUR, measu
         until(under_way, "motion", pause=0.02)
         asked = arm._channel.commands.count
         until(lambda: arm.status() == ArmStatus.HOLD, "hold")
-        until(arm.is_at_rest, "rest")
+        until(arm.at_rest, "rest")
         seen = records(arm)
         last = seen[seen["commands_read"] == asked][0]
         gone = float(np.linalg.norm(arm.state().pose.position - last["position"]))

@@ -182,7 +182,7 @@ def send_hostile(arm: URArm, mock: MockUR, targets: np.ndarray) -> tuple[np.ndar
             joints.append(servo_targets(page.entries))
             ticks.append(servo_ticks(page.entries))
     arm.stop()
-    until(arm.is_at_rest, "rest")
+    until(arm.at_rest, "rest")
     rest = mock.faults.received(since).entries
     sent = np.concatenate([*joints, servo_targets(rest)])
     record = arm._channel.states.latest()
@@ -256,7 +256,7 @@ def test_command_invalid_target_raises(arm: URArm) -> None:
 def test_command_target_out_of_reach_raises_and_program_runs(mock: MockUR) -> None:
     wide = {"workspace": Workspace(lower=(-3.0, -3.0, -1.0), upper=(3.0, 3.0, 3.0))}
     with URArm(config(limits=wide), "left") as arm:
-        with pytest.raises(ActionError, match="out of its reach"):
+        with pytest.raises(ActionError, match="out of reach"):
             arm.command(moved(arm.state().pose, z=2.0))
         # Without the driver's check: the worker stops at limits of joints and joint speed and at singularities.
         far = moved(arm.state().pose, z=2.0)

@@ -83,9 +83,9 @@ def test_pair_fault_of_one_arm_stops_both(pair: Pair, figure: Record) -> None:
     other.faults.protective_stop()
     until(lambda: left.status() == ArmStatus.PARTNER_STOPPED, "the other arm's stop")
     until(lambda: right.status() == ArmStatus.PROTECTIVE_STOP, "protective stop")
-    with pytest.raises(SafetyViolation, match=r"stopped because the other arm did.*arm 'right' made a protective stop"):
+    with pytest.raises(SafetyViolation, match=r"stopped because the other arm stopped.*arm 'right' made a protective stop"):
         left.command(a)
-    until(left.is_at_rest, "rest")
+    until(left.at_rest, "rest")
     # Within two periods of the stop's publication, as the loop of the arm that hears of it counts them.
     told, heard = records(right), records(left)
     stop = told[told["status"] == ArmStatus.PROTECTIVE_STOP][0]["written"]
@@ -106,8 +106,8 @@ def test_pair_recover_of_faulty_arm_first_restores_both(pair: Pair, figure: Reco
     in_motion(right, moved(b, x=0.1))
     other.faults.wrench([0.0, 0.0, 40.0, 0.0, 0.0, 0.0])
     until(lambda: left.status() == ArmStatus.PARTNER_STOPPED, "the other arm's stop")
-    until(left.is_at_rest, "rest")
-    until(right.is_at_rest, "rest")
+    until(left.at_rest, "rest")
+    until(right.at_rest, "rest")
     stopped = records(right)
     told = set(stopped["status"][stopped["status"] >= ArmStatus.FORCE_LIMIT].tolist())
     figure("causes that were replaced by their consequence", len(told - {ArmStatus.FORCE_LIMIT}))

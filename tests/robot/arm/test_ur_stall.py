@@ -73,7 +73,7 @@ def test_worker_after_stall_keeps_arm_limits(
             os.kill(arm._worker.pid, signal.SIGCONT)
             time.sleep(0.3)  # until it is at full speed again
         arm.stop()
-        until(arm.is_at_rest, "rest")
+        until(arm.at_rest, "rest")
         sent = mock.faults.received(since)
         left_out = mock.faults.state().overruns - state.overruns  # control periods, by a machine that is too busy
         watching.communicate(timeout=PATIENCE)

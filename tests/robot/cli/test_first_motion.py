@@ -48,7 +48,7 @@ def test_a_dry_run_on_a_copy_of_the_one_arm_file(one_arm: Lab, folder: Path, tmp
     ("words", "said"),
     [
         (["--task", "squeeze"], r"task 'squeeze'.*lacks arm 'lower'; arm 'upper'.*--set task=null"),
-        (["--policy", "mine:NeedsHeight"], r"lacks surface height.*Take --policy grip, which needs pictures alone"),
+        (["--policy", "mine:NeedsHeight"], r"lacks surface height.*Use --policy grip, which needs only pictures"),
         (["--policy", "nothing"], "no policy 'nothing'"),
         (["--set", "arms.arm.limits.depth=1 mm"], r"limits\.depth: sensor 'finger' does not measure it"),
         (

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from tacsim.models.hardware import Model  # pydantic and SciPy: half a second of start-up
 
 JOINT_RANGE = 2 * math.pi  # joints turn from -JOINT_RANGE to +JOINT_RANGE (all e-Series user manuals)
-MIN_SINGULAR_VALUE = 0.02  # of the Jacobian, lengths in reaches; below it the arm may only move away
 # Bound on the change of the least singular value for each radian that a joint turns: each of the six columns has a
 # length of at most sqrt(2) in these units, and turns with the joints before it.
 MAX_SINGULAR_VALUE_RATE = math.sqrt(12.0)
@@ -295,13 +294,14 @@ class SingularityGuard:
 
     def is_nearer(self, joints: FloatArray, sent: FloatArray) -> bool:
         """True if `joints` (6,) are too near to a singularity, and nearer than the joints (6,) `sent` last."""
+        min_value = 0.02  # of the Jacobian, lengths in reaches; below it the arm may only move away
         if self._last_check is not None:
             joints_then, margin_then = self._last_check
             if MAX_SINGULAR_VALUE_RATE * float(np.abs(joints - joints_then).sum()) < margin_then:
                 return False
         distance = self._kinematics.singularity(joints)
-        self._last_check = joints, distance - MIN_SINGULAR_VALUE
-        return distance < MIN_SINGULAR_VALUE and distance < self._kinematics.singularity(sent)
+        self._last_check = joints, distance - min_value
+        return distance < min_value and distance < self._kinematics.singularity(sent)
 
 
 def _nearest_turns(q: FloatArray, seed: Sequence[float] | FloatArray) -> FloatArray:

@@ -36,8 +36,6 @@ from calibration.light.tuning import (
 from tacsim.interface import FloatArray, Image
 from tacsim.models.photometric import DarknessModel
 
-BOUNDS = ((0.0, 0.05), (0.8, 1.5))  # of share, reach
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DarknessFit:
@@ -172,6 +170,7 @@ class _Problem:
 
     def refined(self, start: FloatArray) -> tuple[FloatArray, float]:
         """The least near `start`, and its cost."""
+        bounds = ((0.0, 0.05), (0.8, 1.5))  # of share, reach
         from scipy.optimize import least_squares
 
         low, high = [], []
@@ -179,7 +178,7 @@ class _Problem:
             side = 0.3 * press.circle.radius
             low += [press.circle.x - side, press.circle.y - side, 0.05 * self._ball]
             high += [press.circle.x + side, press.circle.y + side, MAX_RIM_RATIO * self._ball]
-        low, high = [*low, THINNESS_BOUNDS[0], *BOUNDS[0]], [*high, THINNESS_BOUNDS[1], *BOUNDS[1]]
+        low, high = [*low, THINNESS_BOUNDS[0], *bounds[0]], [*high, THINNESS_BOUNDS[1], *bounds[1]]
         start = np.clip(start, np.array(low) + 1e-6, np.array(high) - 1e-6)
         scale = np.array([1.0, 1.0, 1.0] * len(self.presses) + [0.3, 0.1, 0.1])
         found = least_squares(

@@ -13,8 +13,6 @@ from calibration.light.press import Window
 from tacsim.interface import FloatArray
 from tacsim.models.photometric import Floats, horizon_slope, shadow_terms
 
-RIDGE = 1e-4
-
 
 @dataclass(frozen=True, slots=True)
 class DentShade:
@@ -65,6 +63,7 @@ def find_lamps(
     must darken: a shade that brightens is the lit flank of a lamp on the other side. `thickness` of the gel, `ball`
     radius [px].
     """
+    ridge = 1e-4
     max_steps = 30
     direction_count = 10
     # of lamps from the middle of the picture at which the search starts [widths]
@@ -89,7 +88,7 @@ def find_lamps(
         across = lit.T @ dark
         square = np.block([[own, across], [across.T, dark.T @ dark]])
         right = np.concatenate([lit, dark], axis=1).T @ changes[:, channel]
-        weights = np.linalg.solve(square + RIDGE * np.trace(square) / len(square) * np.eye(len(square)), right)
+        weights = np.linalg.solve(square + ridge * np.trace(square) / len(square) * np.eye(len(square)), right)
         return -float(weights @ right) if float(weights[len(own) :] @ dark.sum(axis=0)) < 0 else 0.0
 
     turns = np.arange(direction_count) * 2 * np.pi / direction_count

@@ -295,13 +295,14 @@ class SingularityGuard:
 
     def is_nearer(self, joints: FloatArray, sent_joints: FloatArray) -> bool:
         """True if `joints` (6,) are too near to a singularity, and nearer than the last `sent_joints` (6,)."""
+        min_value = 0.02  # of the Jacobian, lengths in reaches; below it the arm may only move away
         if self._last_check is not None:
             last_joints, last_margin = self._last_check
             if MAX_SINGULAR_VALUE_RATE * float(np.abs(joints - last_joints).sum()) < last_margin:
                 return False
         distance = self._kinematics.singularity(joints)
-        self._last_check = joints, distance - MIN_SINGULAR_VALUE
-        return distance < MIN_SINGULAR_VALUE and distance < self._kinematics.singularity(sent_joints)
+        self._last_check = joints, distance - min_value
+        return distance < min_value and distance < self._kinematics.singularity(sent_joints)
 
 
 def _nearest_turns(q: FloatArray, seed: Sequence[float] | FloatArray) -> FloatArray:

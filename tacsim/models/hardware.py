@@ -23,7 +23,6 @@ Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=MAX_NAME)]
 Vector = tuple[Length, Length, Length]
 Corner = tuple[float, float]
 
-MIN_WATCHDOG_RATE = 10.0  # of a real arm [Hz]
 POLYSCOPE = r"[0-9]{1,9}(\.[0-9]{1,9}){1,3}"  # a version of it
 
 
@@ -268,10 +267,11 @@ class UrArmConfig(ArmConfig):
 
     @model_validator(mode="after")
     def _real_arms_have_a_watchdog(self) -> Self:
-        if self.mock is None and not self.simulator and self.watchdog < MIN_WATCHDOG_RATE:
+        min_rate = 10.0  # of a real arm [Hz]
+        if self.mock is None and not self.simulator and self.watchdog < min_rate:
             raise ValueError(
                 f"watchdog {self.watchdog:g} Hz: a real arm would go on for {1 / self.watchdog:.2g} s after its driver "
-                f"died; at least {MIN_WATCHDOG_RATE:g} Hz (only a mock or a simulator may be slower)"
+                f"died; at least {min_rate:g} Hz (only a mock or a simulator may be slower)"
             )
         return self
 

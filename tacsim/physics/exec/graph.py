@@ -6,8 +6,6 @@ from typing import Any
 
 from tacsim.compute.runtime import ti
 
-ROUNDS_PER_CALL = 20  # substeps of most launches
-
 
 class Graph:
     """Kernels, one after the other, as often as wanted."""
@@ -20,7 +18,8 @@ class Graph:
 
     def run(self, arguments: Mapping[str, Any], rounds: int = 1) -> None:
         """arguments: arrays of the device and whole numbers, by the names of the kernels' parameters."""
-        for each, times in ((ROUNDS_PER_CALL, rounds // ROUNDS_PER_CALL), (1, rounds % ROUNDS_PER_CALL)):
+        per_call = 20  # substeps of most launches
+        for each, times in ((per_call, rounds // per_call), (1, rounds % per_call)):
             for _ in range(times):
                 if each not in self._compiled:
                     self._compiled[each] = self._compile(each)

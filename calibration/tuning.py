@@ -32,4 +32,6 @@ MAX_COLOUR_CHANGE = 0.5  # [-]
 # Red and blue are exchanged
 MAX_EXCHANGED_RATIO = 0.5  # if that brings the picture so much nearer to the known one
 MAX_SAME_CHANGE = 0.02  # unless it is this near already, each colour relative to its mean [-]
-MIN_SWAPPED_CHANGE = 0.01  # of each colour relative to its mean, beside another gain: less is no sign of a swap [-]
+MIN_SWAPPED_CHANGE = (
+    0.01  # of each colour relative to its mean, in addition to another gain: less is no sign of a swap [-]
+)

@@ -15,5 +15,5 @@ MAX_STEP = 0.7  # a step changes no free number by more: a factor of two
 MIN_GAIN = 0.2  # of the sum of squares: the noise alone gives it a standard deviation of more than one
 MIN_STEP_DEVIATIONS = 0.3  # of their standard deviations, likewise
 MAX_IDENTIFIED_HALF_INTERVAL = 0.6
-MAX_START_HALF_INTERVAL = 5.0  # an interval that reaches so far at the start: there is no use in looking for it
+MAX_START_HALF_INTERVAL = 5.0  # a wider interval at the start: the number cannot be identified
 COARSE_SIMULATION_ERROR = 0.05  # of a coarse simulation, where no fine one says better: share of the signal

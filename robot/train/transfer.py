@@ -112,7 +112,7 @@ Parts = Mapping[tuple[Side, int], Sequence[tuple[str, int]]]  # by side and twin
 
 def _play_in_turn(study: Study, parts: Parts) -> Iterator[EpisodeResult]:
     for (side, twin), remaining in parts.items():
-        yield from _play_on_twin(study, side, twin, remaining)
+        yield from _play_on_hidden_rig(study, side, twin, remaining)
 
 
 def _play_in_parallel(study: Study, parts: Parts, workers: int) -> Iterator[EpisodeResult]:
@@ -133,7 +133,7 @@ def _play_in_process(study: Study, side: Side, twin: int, remaining: Sequence[tu
         for number, name in enumerate(load_rig(RIGS[side]).config.arms, start=1):
             host = loopback_host(number, ADDRESS_BLOCK)
             overrides += [f"arms.{name}.host={host}", f"sensors.{name}.source=http://{host}:8081/?action=stream"]
-    return list(_play_on_twin(replace(study, overrides=(*study.overrides, *overrides)), side, twin, remaining))
+    return list(_play_on_hidden_rig(replace(study, overrides=(*study.overrides, *overrides)), side, twin, remaining))
 
 
 def _describe_result(results: EpisodeResult) -> str:
@@ -161,7 +161,9 @@ def _json_line(results: EpisodeResult) -> str:
     return json.dumps(asdict(results)) + "\n"
 
 
-def _play_on_twin(study: Study, side: Side, twin: int, remaining: Sequence[tuple[str, int]]) -> Iterator[EpisodeResult]:
+def _play_on_hidden_rig(
+    study: Study, side: Side, twin: int, remaining: Sequence[tuple[str, int]]
+) -> Iterator[EpisodeResult]:
     """Uses one rig for all episodes on a twin; in simulation one per episode, because each policy has its own."""
     groups = [remaining] if side == "twin" else [[each] for each in remaining]
     for group in groups:

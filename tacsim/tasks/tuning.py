@@ -5,7 +5,7 @@ tests/tacsim/tasks.
 """
 
 # knead.py
-MAX_TOUCHES = 60  # [touches] what was felt before has been kneaded since
+MAX_TOUCHES = 60  # [touches] earlier touches show a shape that kneading has changed
 MIN_TOUCH_DEPTH = 0.05  # of the greatest depth: less is the gel's own slope, or noise
 MAX_PRESSURE_SHARE = 0.9
 CLOSING_STEPS = 30.0  # of the teacher: it takes so large a part of the height that is left in each control step

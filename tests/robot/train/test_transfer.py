@@ -112,7 +112,7 @@ def fake(study: Study, side: Side, twin: int, left: Sequence[tuple[str, int]]) -
 
 
 def test_play_study_killed_continues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(transfer, "_play_on_twin", fake)
+    monkeypatch.setattr(transfer, "_play_on_hidden_rig", fake)
     told: list[str] = []
     whole = play_study(study(), tmp_path, lambda words, done, of: told.append(f"{done} of {of}, {words}"))
     assert told[:2] == [
@@ -133,7 +133,7 @@ def test_play_study_killed_continues(tmp_path: Path, monkeypatch: pytest.MonkeyP
         asked.extend(left)
         return fake(study, side, twin, left)
 
-    monkeypatch.setattr(transfer, "_play_on_twin", rest)
+    monkeypatch.setattr(transfer, "_play_on_hidden_rig", rest)
     assert play_study(study(), tmp_path, lambda *_: None) == whole
     assert len(asked) == 13
     assert play_study(study(), tmp_path, lambda *_: None) == whole

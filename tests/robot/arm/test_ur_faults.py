@@ -261,7 +261,7 @@ def test_arm_program_stopped_outside_raises(arm: URArm, mock: MockUR) -> None:
 
     in_motion(arm, moved(arm.state().pose, x=0.1))
     with Dashboard(HOST) as dashboard:
-        dashboard.ask("stop")
+        dashboard.request("stop")
     until(lambda: arm.status() == ArmStatus.PROGRAM_STOPPED, "stopped program")
     with pytest.raises(ProtectiveStop, match="no running program"):
         arm.command(arm.state().pose)

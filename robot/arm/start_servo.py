@@ -13,6 +13,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -25,7 +26,9 @@ from robot.arm.trajectory import PERIOD, MotionState, motion_at_rest, reduce_spe
 from robot.common.kinematics import Kinematics, inverse_frame, rotation_vector
 from robot.common.tcp import ArmFrames, Measured
 from tacsim.interface import FloatArray
-from tacsim.models.hardware import ArmLimits
+
+if TYPE_CHECKING:
+    from tacsim.models.hardware import ArmLimits  # pydantic: a worker starts without it
 
 JOINT_SPEED, JOINT_ACCELERATION = 0.1, 0.5  # of the fastest joint, at most [rad/s, rad/s^2]
 OFF_WAY = 20e-3  # an arm with a joint farther than this from the way has left it [rad]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, cast
 
+from robot.arm.tuning import BRAKING_REACTION_TIME
 from tacsim.interface import HardwareArm, Pose
 from tacsim.models.driver import ArmDriver, ArmExamination
 from tacsim.models.hardware import UrArmConfig
@@ -11,8 +12,6 @@ from tacsim.models.hardware import UrArmConfig
 if TYPE_CHECKING:
     from robot.arm.lost_link import PackageLog
     from robot.arm.ur import URArm
-
-REACTION = 0.05  # from a picture that shows a touch to an arm that brakes [s]
 
 
 class UrDriver(ArmDriver[UrArmConfig]):
@@ -34,7 +33,7 @@ class UrDriver(ArmDriver[UrArmConfig]):
         return URArm(self.config, self.name, keep_out=self.keep_out)
 
     def worst_latency(self) -> float:
-        return REACTION
+        return BRAKING_REACTION_TIME
 
     def examine(self, start: Pose | None, file: str) -> ArmExamination:
         from robot.arm.controller.examine import examine

@@ -14,24 +14,23 @@ import numpy as np
 
 from robot.arm.channel import WorkerConfig
 from robot.arm.trajectory import PERIOD
+from robot.arm.tuning import (
+    MAX_PACKAGE_GAP,
+    MAX_REST_SPEED,
+    MAX_REST_TURN_RATE,
+    OTHER_PROGRAM_SHIFT,
+    OTHER_PROGRAM_SPEED,
+    SCALING_RATE,
+    SLOW_LAG_RATIO,
+    TARGET_DELAY,
+)
 from robot.common.kinematics import Kinematics
 from robot.common.tcp import ArmFrames, Measured
 from tacsim.interface import FloatArray
 
-# Rate of change of the speed scaling [1/s]: Universal Robots' ROS driver raises it by 0.01 in each period of 2 ms.
-SCALING_RATE = 5.0
 # The target follows a rising scaling more slowly: an arm that starts while the scaling rises accelerates by both,
 # 1.45 times as much as its target.
 RISE_RATE = SCALING_RATE / 1.5
-SLOW_LAG_RATIO = 1.5  # time constant of the model divided by that of servoJ
-MAX_DELAY = 10e-3  # added to it: target to controller, joints behind their setpoints, package to worker [s]
-MAX_PACKAGE_GAP = 0.2  # between two packages; a larger or negative step is a jump of the controller's clock [s]
-SETTLING_TIME_CONSTANTS = 8.0  # time constants after which servoJ has moved the joints to a target at rest
-OTHER_PROGRAM_SPEED, OTHER_PROGRAM_SHIFT = (
-    2e-3,
-    1e-3,
-)  # of the controller's own target while ours is at rest [rad/s, rad]
-MAX_REST_SPEED, MAX_REST_TURN_RATE = 1e-3, 10e-3  # a slower arm is at rest [m/s, rad/s]
 
 
 class SpeedScaling:
@@ -84,7 +83,7 @@ class FollowingMonitor:
         self._rest_time_constants = (
             self._rest_time_constants + scaling * elapsed / self._lookahead if is_resting else 0.0
         )
-        share = np.exp(-elapsed / (MAX_DELAY + SLOW_LAG_RATIO * self._lookahead / max(scaling, 1e-3)))
+        share = np.exp(-elapsed / (TARGET_DELAY + SLOW_LAG_RATIO * self._lookahead / max(scaling, 1e-3)))
         self._expected_joints = sent_joints + share * (self._expected_joints - sent_joints)
         self._sent_joints = sent_joints
 
@@ -99,7 +98,8 @@ class FollowingMonitor:
     @property
     def has_settled(self) -> bool:
         """True if packages have arrived since servoJ moved the joints to a target at rest."""
-        return self._sent_joints is not None and self._rest_time_constants >= SETTLING_TIME_CONSTANTS
+        time_constants = 8.0  # time constants after which servoJ has moved the joints to a target at rest
+        return self._sent_joints is not None and self._rest_time_constants >= time_constants
 
     def is_moved_from_rest(self, target_joints: FloatArray, target_speeds: FloatArray) -> bool:
         """True if the controller's own target (6,) [rad] moves, with speeds (6,) [rad/s], or differs from ours although

@@ -26,8 +26,6 @@ LOST_LINK_REPORTS = (  # by ur_rtde 1.6.5, after each failure of a connection an
     "Could not receive data from robot",
     "Robot closed the connection",
 )
-MAX_LATE_SHARE = 0.02  # fraction of late periods of a punctual worker
-MAX_LATE_PERIOD = 0.5  # longest period of a punctual worker, as a fraction of link_timeout
 
 
 class StatusHistory:
@@ -63,6 +61,8 @@ def ended_by_lost_link(exit_status: int, printed: str) -> bool:
 
 def describe_lost_link(record: Record, config: UrArmConfig, exit_status: int | None, now: float) -> str:
     """Measured timing at the loss of the link, and what to do. `exit_status` of the worker: None while it runs."""
+    max_late_period = 0.5  # longest period of a punctual worker, as a fraction of link_timeout
+    max_late_share = 0.02  # fraction of late periods of a punctual worker
     is_lost = now if exit_status is None else float(record["written"])
     age, record_age = is_lost - float(record["time"]), is_lost - float(record["written"])
     text = f"its last package is {1e3 * age:.0f} ms old (link_timeout = {1e3 * config.link_timeout:g} ms)"
@@ -73,7 +73,7 @@ def describe_lost_link(record: Record, config: UrArmConfig, exit_status: int | N
     late, count = int(record["late"]), max(1, min(int(record["cycles"]), STATISTICS_PERIODS))
     longest = max(float(record["longest"]), record_age)
     periods = f"{late} of its last {count} periods of {1e3 * PERIOD:g} ms were late, the longest {1e3 * longest:.0f} ms"
-    if late <= MAX_LATE_SHARE * count and longest <= MAX_LATE_PERIOD * config.link_timeout:
+    if late <= max_late_share * count and longest <= max_late_period * config.link_timeout:
         where = "check the cable" if config.mock is None else "see whether its mock controller still runs"
         return f"{text}; its worker was punctual ({periods}); {where}"
     if bool(record["realtime"]):

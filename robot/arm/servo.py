@@ -42,6 +42,15 @@ from robot.arm.trajectory import (
     step_braking,
     step_towards,
 )
+from robot.arm.tuning import (
+    FAULT_DECELERATION,
+    FAULT_TURN_DECELERATION,
+    MAX_HELD_DISPLACEMENT,
+    MAX_HELD_ROTATION,
+    MAX_OVERSHOOT,
+    MAX_STALL_PERIODS,
+    ZERO_REQUEST_TIMEOUT,
+)
 from robot.common.kinematics import Kinematics, SingularityGuard, inverse_frame, rotation, rotation_vector
 from robot.common.tcp import Measured
 from tacsim.interface import FloatArray
@@ -56,14 +65,8 @@ from tacsim.limits import (
     stopping_position,
 )
 
-FAULT_DECELERATION = 5.0  # minimum deceleration after a fault [m/s^2]
-FAULT_TURN_DECELERATION = 50.0  # the same for rotations [rad/s^2]
-MAX_OVERSHOOT = 0.5e-3  # the arm itself may stop this far outside its region; the target never leaves it [m]
-MAX_HELD_DISPLACEMENT, MAX_HELD_ROTATION = 0.2e-3, 2e-3  # beyond it an arm was pushed off its held pose [m, rad]
 MAX_LOOP_OFFSET = 2 * PERIOD  # between the loops of two arms [s]
-ZERO_REQUEST_TIMEOUT = 0.5  # an older request to zero the wrench is dropped [s]
 PACKAGE_DELAY = 3 * PERIOD  # from a change of the arm's speed until its package reaches the servo [s]
-MAX_STALL_PERIODS = 10  # periods that the target waits, after missed periods, for a newer package
 
 
 class Servo:

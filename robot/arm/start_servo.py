@@ -1,7 +1,7 @@
 """The servo of an arm that is led to its start: straight in joint space, slowly, and nowhere else.
 
 An arm that stands outside its workspace follows no ordinary command. Here the region is replaced by the way: the
-measured joints must be on it, within OFF_WAY. Targets are refused; CommandKind.CONTINUE_TO_START moves the arm along
+measured joints must be on it, within OFF_PATH. Targets are refused; CommandKind.CONTINUE_TO_START moves the arm along
 the way, up to a share of it, and must be repeated within `action_timeout` as any command. Limits of force, the
 keep-out, the partners, the link, the stops of the controller and the driver's death are guarded as ever, by the same
 code.
@@ -23,18 +23,13 @@ from robot.arm.servo import Servo
 from robot.arm.shared_ring import Record
 from robot.arm.status import ArmStatus
 from robot.arm.trajectory import PERIOD, MotionState, motion_at_rest, reduce_speed, step_velocity, stopping_distance
+from robot.arm.tuning import JOINT_ACCELERATION, JOINT_SPEED, OFF_PATH
 from robot.common.kinematics import Kinematics, inverse_frame, rotation_vector
 from robot.common.tcp import ArmFrames, Measured
 from tacsim.interface import FloatArray
 
 if TYPE_CHECKING:
     from tacsim.models.hardware import ArmLimits  # pydantic: a worker starts without it
-
-JOINT_SPEED, JOINT_ACCELERATION = 0.1, 0.5  # of the fastest joint, at most [rad/s, rad/s^2]
-OFF_WAY = 20e-3  # an arm with a joint farther than this from the way has left it [rad]
-LAG = 15e-3  # the target waits for an arm that is farther behind, such as one slowed down on its pendant [rad]
-SAMPLES = 100  # points of a way at which speeds are judged
-MARGIN = 0.95  # of the speeds there: they differ between the samples
 
 
 def sensor_path(kinematics: Kinematics, frames: ArmFrames, joints: FloatArray) -> FloatArray:
@@ -48,7 +43,9 @@ def way_rates(
 ) -> tuple[float, float]:
     """Top speed [rad/s] and acceleration [rad/s^2] of the joint vector along the straight way from `begin` to `end`
     (6,), such that neither a joint nor the sensor ever exceeds its limits."""
-    joints = begin + np.linspace(0.0, 1.0, SAMPLES)[:, None] * (end - begin)
+    speed_margin = 0.95  # of the speeds there: they differ between the samples
+    sample_count = 100  # points of a way at which speeds are judged
+    joints = begin + np.linspace(0.0, 1.0, sample_count)[:, None] * (end - begin)
     step = float(np.linalg.norm(joints[1] - joints[0]))
     if step < 1e-9:
         return JOINT_SPEED, JOINT_ACCELERATION
@@ -57,8 +54,8 @@ def way_rates(
     turns = [np.linalg.norm(rotation_vector(b[:3, :3] @ a[:3, :3].T)) for a, b in pairwise(path)]
     turn, joint = float(max(turns)) / step + 1e-9, float(np.abs(joints[1] - joints[0]).max()) / step
     return (
-        MARGIN * min(min(JOINT_SPEED, limits.joint_speed) / joint, limits.speed / shift, limits.turn_rate / turn),
-        MARGIN * min(JOINT_ACCELERATION / joint, limits.acceleration / shift, limits.turn_acceleration / turn),
+        speed_margin * min(min(JOINT_SPEED, limits.joint_speed) / joint, limits.speed / shift, limits.turn_rate / turn),
+        speed_margin * min(JOINT_ACCELERATION / joint, limits.acceleration / shift, limits.turn_acceleration / turn),
     )
 
 
@@ -94,7 +91,7 @@ class StartServo(Servo):
         self._stop = np.zeros(3)  # where the sensor would come to rest if the target braked now [m]
 
     def _check_position(self, measured: Measured) -> None:
-        if distance_from_way(measured.joints, self._begin, self._end) > OFF_WAY:
+        if distance_from_way(measured.joints, self._begin, self._end) > OFF_PATH:
             self.enter_fault(ArmStatus.OFF_PATH)
 
     def check_faults(self, measured: Measured, partners: Sequence[Record | None]) -> None:
@@ -115,6 +112,8 @@ class StartServo(Servo):
 
     def step(self, time: float, measured: Measured, partners: Sequence[Record | None]) -> FloatArray | None:
         """The joints (6,) to send in this period; None: send nothing, the controller holds."""
+        # the target waits for an arm that is farther behind, such as one slowed down on its pendant [rad]
+        max_lag = 15e-3
         if self.status.is_fault:
             return super().step(time, measured, partners)
         self._previous_step = self.motion, self._sent_joints, self._fault_braking
@@ -134,7 +133,7 @@ class StartServo(Servo):
                 return None if self._sent_joints is None else self._sent_joints
             self._start_at(measured)
             assert self._sent_joints is not None
-        if goes and float(np.abs(measured.joints - self._sent_joints).max()) < LAG:
+        if goes and float(np.abs(measured.joints - self._sent_joints).max()) < max_lag:
             assert self._share is not None
             goal = self._begin + self._share * (self._end - self._begin)
             top = self._scaling.speed(self._top, self._acceleration)

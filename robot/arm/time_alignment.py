@@ -19,9 +19,6 @@ from robot.errors import DeviceError
 from tacsim import pose as se3
 from tacsim.interface import ArmState, FloatArray, Pose
 
-MAX_GAP = 50e-3  # no interpolation between two states further apart [s]
-MAX_EXTRAPOLATION = 10e-3  # after the newest state, with its twist [s]
-
 
 class NotAligned(DeviceError):
     """No state of the arm is near enough to the requested time."""
@@ -31,8 +28,8 @@ def state_at(
     time: float,
     states: Sequence[ArmState],
     arm: str,
-    max_gap: float = MAX_GAP,
-    max_extrapolation: float = MAX_EXTRAPOLATION,
+    max_gap: float = 50e-3,
+    max_extrapolation: float = 10e-3,
 ) -> tuple[ArmState, float]:
     """The state at `time` [s], interpolated: pose on the straight path (slerp); twist, wrench and joints linearly.
     Also the time distance to the nearer of the two states, 0 at one of them [s].

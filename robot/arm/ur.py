@@ -48,12 +48,8 @@ from tacsim.interface import Action, ArmState, FloatArray, GelReading, Pose
 from tacsim.limits import ActionError, check_action, clip_to_region
 from tacsim.models.hardware import UrArmConfig
 
-CONNECT_TIMEOUT = 10.0  # of the constructor and of recover [s]
 CLOSE_TIMEOUT = 1.2  # for the worker to brake and end its program; then it is killed [s]
 POLL_PERIOD = 2e-3  # between two reads of the worker's records while waiting [s]
-MAX_MEDIAN_PERIOD = 2.0 * PERIOD  # of the loop; a longer one makes the arm slow [s]
-PARTNER_TIMEOUT = 0.5  # of a command, for the state of the other arm of a keep-out [s]
-MAX_REST_SPEED, MAX_REST_TURN_RATE = 1e-3, 10e-3  # a slower arm is at rest [m/s, rad/s]
 _open_arms: set[str] = set()  # names of the arms that are open in this process
 _open_arms_lock = threading.Lock()
 
@@ -84,7 +80,7 @@ class URArm(Closing):
         name: str,
         *,
         keep_out: Mapping[str, float] | None = None,
-        timeout: float = CONNECT_TIMEOUT,
+        timeout: float = 10.0,
     ) -> None:
         check_host(config, name)
         self.name, self.config, self._timeout = name, config, timeout
@@ -148,10 +144,11 @@ class URArm(Closing):
 
     def at_rest(self) -> bool:
         """True if the servo target and the arm are at rest."""
+        max_speed, max_turn_rate = 1e-3, 10e-3  # a slower arm is at rest [m/s, rad/s]
         record = self._fresh_record()
         twist = self._state_from(record).twist
         speed, turn_rate = float(np.linalg.norm(twist[:3])), float(np.linalg.norm(twist[3:]))
-        return bool(record["resting"]) and speed < MAX_REST_SPEED and turn_rate < MAX_REST_TURN_RATE
+        return bool(record["resting"]) and speed < max_speed and turn_rate < max_turn_rate
 
     def arrived(self, target: Pose, *, within: float = 50e-6, turn: float = 1e-3) -> bool:
         """True if the arm stands still `within` [m] and `turn` [rad] of `target`."""
@@ -348,7 +345,8 @@ class URArm(Closing):
 
     def _require_ready(self) -> None:
         """Raises the error of a status in which the arm cannot follow commands."""
-        deadline = time.monotonic() + PARTNER_TIMEOUT
+        partner_timeout = 0.5  # of a command, for the state of the other arm of a keep-out [s]
+        deadline = time.monotonic() + partner_timeout
         while (status := self.status()) == ArmStatus.WAITING and time.monotonic() < deadline:
             time.sleep(POLL_PERIOD)
         if status.is_fault or status in (ArmStatus.WAITING, ArmStatus.CONNECTING):
@@ -367,6 +365,7 @@ class URArm(Closing):
         return status.error(self._describe_status(status))
 
     def _describe_status(self, status: ArmStatus) -> str:
+        slow_period = 2.0 * PERIOD  # of the loop; a longer one makes the arm slow [s]
         text = f"arm '{self.name}' {status.text}"
         record = None if self._closed else self._channel.states.latest()
         if record is not None and record["stamp"] != 0.0:
@@ -378,7 +377,7 @@ class URArm(Closing):
                 text += f" ({self._region.violated_face(record['position']) or 'it is inside again'})"
             elif status == ArmStatus.PARTNER_STOPPED:
                 text += "".join(f" (arm '{name}' {fault.text})" for name, fault in self._partner_faults())
-            elif status < ArmStatus.FORCE_LIMIT and (period := float(record["period"][0])) > MAX_MEDIAN_PERIOD:
+            elif status < ArmStatus.FORCE_LIMIT and (period := float(record["period"][0])) > slow_period:
                 text += f" (slowly: its loop takes {1e3 * period:.0f} ms, not 2; the machine is too busy)"
         worker = self._worker
         if worker is not None and status == ArmStatus.WORKER_DEAD:

@@ -38,7 +38,6 @@ from robot.errors import DeviceBusyError, DeviceError, DeviceNotConnectedError
 from tacsim.interface import FloatArray
 
 PORTS = {30004: "RTDE", 30003: "script"}
-PROBE_TIMEOUT = 2.0  # of a TCP connection [s]
 VARIABLES = [  # of one package; an unknown name would shift the others
     "timestamp",
     "actual_q",
@@ -53,21 +52,8 @@ VARIABLES = [  # of one package; an unknown name would shift the others
     "runtime_state",
     "safety_status_bits",
 ]
-PLAYING = 2  # of runtime_state
-PROTECTIVE_BIT = 1 << 2
-STOP_BITS = 1 << 3 | 1 << 4 | 1 << 5 | 1 << 6 | 1 << 7 | 1 << 8 | 1 << 9  # recovery, safeguard, emergency stops, fault
-MAX_MODEL_SHIFT, MAX_MODEL_TURN = 20e-3, 0.05  # FK of the named model and the controller's pose agree within [m, rad]
-SETTING_DELAY = 0.2  # after it, on the controller's clock, packages use a new TCP or payload [s]
-MAX_PACKAGE_WAIT = 5.0  # for such a package [s]
-MAX_CLOSING_TIME = 0.6  # of braking when the driver closes [s]
-MAX_BRAKING_WITHOUT_PARENT = 0.5  # of braking when the driver has ended [s]
-MAX_CONNECTING_TIME = 60.0  # the driver waits less, but it may have ended [s]
-CALL_MARGIN = 10e-3  # a call in the loop may exceed link_timeout by this; the driver reports it [s]
-MAX_ZEROING_TIME = 2.0  # of the force sensor [s]
 MAX_ENDING_TIME = 3.0  # of the program; the driver waits less, but it may have ended [s]
 MAX_MISSED_PACKAGES = 5  # periods without a new package; beyond it nothing is sent
-MAX_TARGET_DELAY = 5e-3  # of computing; a later target comes from a suspended process and is not sent [s]
-REPORT_PERIODS = 5  # periods in which a package may report why the controller refuses commands
 FAILED_EXIT_STATUS = 3  # the reason is on stdout, as JSON
 
 
@@ -75,6 +61,7 @@ class Worker:
     """One connection, from the first probe to the last servo call."""
 
     def __init__(self, config: WorkerConfig) -> None:
+        margin = 10e-3  # a call in the loop may exceed link_timeout by this; the driver reports it [s]
         self.config = config
         self.frames = config.frames
         self.channel = Channel(Segment(config.segment))
@@ -84,7 +71,7 @@ class Worker:
         servo = Servo if config.start_path is None else StartServo
         self.servo = servo(config, commands_read=self.channel.commands.count, tactile_read=self.channel.tactile.count)
         self._periods = np.full(STATISTICS_PERIODS, PERIOD)
-        self._call_limit = TimeLimit(config.link_timeout + CALL_MARGIN)  # for calls into the library
+        self._call_limit = TimeLimit(config.link_timeout + margin)  # for calls into the library
         self._driver = Lifeline(config.parent)  # opens a file, which is impossible after connecting
         self._last_period_end = 0.0  # [s]
         self._rereads = 0  # reads of the same package
@@ -102,15 +89,16 @@ class Worker:
     def connect(self) -> None:
         """Connects to the controller. Raises a DeviceError with the cause. Blocks if the controller stops answering;
         the driver then kills the process."""
+        probe_timeout = 2.0  # of a TCP connection [s]
         config = self.config
         for port, what in PORTS.items():
             try:
-                socket.create_connection((config.host, port), PROBE_TIMEOUT).close()
+                socket.create_connection((config.host, port), probe_timeout).close()
             except OSError as failure:
                 raise DeviceNotConnectedError(
                     f"no controller at {config.host}: port {port} ({what}): {failure}; is it on, is the address right?"
                 ) from failure
-        with Dashboard(config.host, PROBE_TIMEOUT) as dashboard:
+        with Dashboard(config.host, probe_timeout) as dashboard:
             dashboard.require_identity(config.name, config.model, config.serial, config.refused_serial)
             dashboard.require_ready(f"arm '{config.name}'")
         try:
@@ -164,8 +152,10 @@ class Worker:
     def _wait_for_settings(self) -> None:
         """Reads until a package is measured after the last setting. The answer to a setting and the packages come by
         different connections: the next package may be older, with forces for the former payload."""
-        begin, deadline = float(self.record["stamp"]), time.monotonic() + MAX_PACKAGE_WAIT
-        while not (self._read_package() and not 0.0 <= float(self.record["stamp"]) - begin < SETTING_DELAY):
+        change_timeout = 5.0  # for such a package [s]
+        settling_time = 0.2  # after it, on the controller's clock, packages use a new TCP or payload [s]
+        begin, deadline = float(self.record["stamp"]), time.monotonic() + change_timeout
+        while not (self._read_package() and not 0.0 <= float(self.record["stamp"]) - begin < settling_time):
             if time.monotonic() > deadline:
                 raise DeviceNotConnectedError(
                     f"arm '{self.config.name}': no RTDE package arrived that was measured after its payload was set"
@@ -175,6 +165,7 @@ class Worker:
     def _check_model(self, tool: Callable[[], FloatArray], advice: str) -> None:
         """Raises unless the controller's pose agrees with the forward kinematics of the model and of `tool`, which
         gives flange_from_tool (4, 4)."""
+        max_distance, max_angle = 20e-3, 0.05  # FK of the named model and the controller's pose agree within [m, rad]
         kinematics = Kinematics(self.config.model)  # type: ignore[arg-type]  # a Model, from JSON
         found, deadline = "no RTDE package with a pose arrived within 1 s", time.monotonic() + 1.0
         while True:
@@ -182,7 +173,7 @@ class Worker:
                 expected = kinematics.forward(self.record["joints"], tool())
                 difference = displacement(expected, matrix(self.record["tcp_pose"]))
                 shift, turn = float(np.linalg.norm(difference[:3])), float(np.linalg.norm(difference[3:]))
-                if shift <= MAX_MODEL_SHIFT and turn <= MAX_MODEL_TURN:
+                if shift <= max_distance and turn <= max_angle:
                     return
                 found = (
                     f"its tool is {1e3 * shift:.0f} mm and {turn:.2f} rad from the pose of a {self.config.model} at "
@@ -196,6 +187,9 @@ class Worker:
 
     def run(self, parent: Parent) -> NoReturn:
         """Runs until the driver closes or ends, or the connection is lost; reports the first status to `parent`."""
+        report_periods = 5  # periods in which a package may report why the controller refuses commands
+        parentless_timeout = 0.5  # of braking when the driver has ended [s]
+        close_timeout = 0.6  # of braking when the driver closes [s]
         gc.freeze()  # a collection in a period does not scan the loaded modules
         self._last_period_end = time.monotonic()
         deadline = self._last_period_end + PERIOD
@@ -214,7 +208,7 @@ class Worker:
             partners = self._read_partners(now)
             status_before = self.servo.status
             stop_status = self._controller_stop()
-            if stop_status is None and self._refused_periods > REPORT_PERIODS:
+            if stop_status is None and self._refused_periods > report_periods:
                 stop_status = ArmStatus.PROGRAM_STOPPED
             if stop_status is not None:
                 self.servo.enter_fault(stop_status)
@@ -231,7 +225,7 @@ class Worker:
                         parent.send({"connected": True})
             self.servo.on_command(*command)
             if exit_deadline is None and (is_orphan or self.servo.close_requested):
-                exit_deadline = now + (MAX_BRAKING_WITHOUT_PARENT if is_orphan else MAX_CLOSING_TIME)
+                exit_deadline = now + (parentless_timeout if is_orphan else close_timeout)
                 if is_orphan:
                     self.servo.enter_fault(ArmStatus.CLOSED)
             if stop_status is not None or self.servo.status.is_controller_stop:
@@ -246,12 +240,13 @@ class Worker:
             deadline = self._sleep_until(deadline)
 
     def _send_step(self, partners: list[Any]) -> None:
+        max_target_age = 5e-3  # of computing; a later target comes from a suspended process and is not sent [s]
         if self._refused_periods:  # the next packages report why
             self._refused_periods += 1
             return
         now = time.monotonic()
         joints = self.servo.step(now, self.state, partners)
-        if time.monotonic() - now > MAX_TARGET_DELAY:
+        if time.monotonic() - now > max_target_age:
             joints = self.servo.undo_last_step()
         config, control = self.config, self.control
         with self._call_limit, self._ending_on_lost_link():
@@ -265,9 +260,10 @@ class Worker:
             self._zero_wrench()
 
     def _zero_wrench(self) -> None:
-        self.record["busy_until"] = time.monotonic() + MAX_ZEROING_TIME
+        zero_timeout = 2.0  # of the force sensor [s]
+        self.record["busy_until"] = time.monotonic() + zero_timeout
         self._publish(self.servo.status)
-        with TimeLimit(MAX_ZEROING_TIME), self._ending_on_lost_link():
+        with TimeLimit(zero_timeout), self._ending_on_lost_link():
             if self.control.zeroFtSensor():
                 self.record["zeroed"] += 1
         self.record["busy_until"] = 0.0
@@ -302,12 +298,16 @@ class Worker:
         return True
 
     def _controller_stop(self) -> ArmStatus | None:
+        # recovery, safeguard, emergency stops, fault
+        stop_bits = 1 << 3 | 1 << 4 | 1 << 5 | 1 << 6 | 1 << 7 | 1 << 8 | 1 << 9
+        protective_bit = 1 << 2
+        playing = 2  # of runtime_state
         runtime, bits = int(self.record["runtime_state"]), int(self.record["safety_bits"])
-        if bits & STOP_BITS:
+        if bits & stop_bits:
             return ArmStatus.EMERGENCY_STOP
-        if bits & PROTECTIVE_BIT:
+        if bits & protective_bit:
             return ArmStatus.PROTECTIVE_STOP
-        return None if runtime == PLAYING else ArmStatus.PROGRAM_STOPPED
+        return None if runtime == playing else ArmStatus.PROGRAM_STOPPED
 
     def _read_partners(self, now: float) -> list[Any]:
         """The newest record of each other arm; None where it is missing, too old, or not healthy."""
@@ -373,6 +373,7 @@ class Worker:
 
 
 def main() -> NoReturn:
+    connect_timeout = 60.0  # the driver waits less, but it may have ended [s]
     parent = Parent()  # the library prints
     enable_time_limits()
     config = WorkerConfig.from_dict(parent.receive())
@@ -380,7 +381,7 @@ def main() -> NoReturn:
     try:
         worker = Worker(config)
         worker.record["realtime"] = realtime
-        with TimeLimit(MAX_CONNECTING_TIME):
+        with TimeLimit(connect_timeout):
             worker.connect()
     except (DeviceError, OSError) as failure:
         kind = type(failure) if isinstance(failure, DeviceError) else DeviceNotConnectedError

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from robot.camera.capture import Capture, open_capture, source_kind
 from robot.camera.picture import DamagedFrame, Picture, WrongSource
+from robot.camera.tuning import MAX_SAME_IMAGE_CHANGE
 from robot.common import Closing
 from robot.common import stamp as strip
 from robot.errors import DeviceError, DeviceNotConnectedError, StaleObservationError
@@ -28,12 +29,6 @@ from tacsim.models.hardware import CameraSensorConfig
 
 REOPEN_DELAY_RANGE = (0.05, 0.8)  # first and longest delay before a source is opened again [s]
 CLOSE_TIMEOUT = 5.0  # longer than a read or a connection; only a silent name server takes longer [s]
-MAX_STAMP_AGE = 60.0  # an older stamp is from the clock of another machine [s]
-FPS_WINDOW = 60  # frames, for the measured rate
-# Fraction of the values of a picture. With fewer changed values it is the same picture, except for a clock in its
-# corner or hot pixels. In two films of a real gel at least 42 % differ between frames; a noise of 0.3 grey levels in a
-# JPEG of quality 50 still changes 2.8 %.
-MAX_SAME_IMAGE_CHANGE = 0.01
 
 ClockSource = Literal["stamp", "device", "arrival"]
 
@@ -75,6 +70,7 @@ class Camera(Closing):
         Raises WrongSource (a DeviceError) if the source is not as configured, DeviceNotConnectedError if no frame
         arrives.
         """
+        window = 60  # frames, for the measured rate
         played = source_kind(config, name) in ("folder", "video")
         self._can_repeat = config.repeats or played
         self._config, self._name = config, name
@@ -85,7 +81,7 @@ class Camera(Closing):
         self._frame: TactileFrame | None = None
         self._stamp: strip.Stamp | None = None  # of _frame
         self._clock: ClockSource | None = None
-        self._arrivals: deque[float] = deque(maxlen=FPS_WINDOW)
+        self._arrivals: deque[float] = deque(maxlen=window)
         self._received = self._dropped = self._damaged = self._repeated = self._openings = 0
         self._repeated_since_frame = 0  # since the last new picture
         self._damaged_since_frame = 0  # since the last complete frame
@@ -246,6 +242,7 @@ class Camera(Closing):
         return capture is None or capture.live
 
     def _accept_picture(self, picture: Picture) -> None:
+        max_stamp_age = 60.0  # an older stamp is from the clock of another machine [s]
         image, stamp = picture.image, None
         if self._config.stamped:
             image, stamp = strip.split(image)
@@ -257,7 +254,7 @@ class Camera(Closing):
         clock: ClockSource
         if stamp is not None:
             exposure, clock = stamp.clock * 1e-6, "stamp"
-            if not 0.0 <= picture.arrival - exposure <= MAX_STAMP_AGE:
+            if not 0.0 <= picture.arrival - exposure <= max_stamp_age:
                 raise WrongSource(
                     f"sensor '{self._name}': a stamp is {picture.arrival - exposure:.3g} s before arrival: the clock "
                     "of another machine. Stamped sources must run on this machine"

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 MIN_LATENCY = 0.05  # of a camera whose file says 0, as far as an approach may trust it [s]
 CHECK_TIMEOUT = 3.0  # of connecting to a camera that is checked [s]
 CHECK_TIME = 1.0  # for which it is then read [s]
-MIN_FRAME_RATE = 0.8  # share of the rate asked for; a slower camera is a warning
 
 
 class CameraDriver(SensorDriver[CameraSensorConfig]):
@@ -68,6 +67,7 @@ class CameraDriver(SensorDriver[CameraSensorConfig]):
         return max(self.config.latency, MIN_LATENCY) + 1.0 / self.config.fps
 
     def checks(self) -> Iterable[Check]:
+        min_frame_rate = 0.8  # share of the rate asked for; a slower camera is a warning
         from robot.camera.camera import Camera
 
         config, label = self.config, f"{self.name}: camera"
@@ -84,7 +84,7 @@ class CameraDriver(SensorDriver[CameraSensorConfig]):
         )
         if status.error is not None and age > config.max_age:
             return [Check(label, "fail", words, status.error)]
-        if fps < MIN_FRAME_RATE * config.fps or status.damaged > 1:  # the first after opening is often damaged
+        if fps < min_frame_rate * config.fps or status.damaged > 1:  # the first after opening is often damaged
             return [
                 Check(label, "warn", words, f"{config.fps:g} frames/s were asked for: exposure, USB hub, or cable?")
             ]

@@ -24,8 +24,6 @@ from robot.camera.picture import (
 )
 from tacsim.models.hardware import CameraSensorConfig
 
-_MAX_LINE = 8192  # of the header of a part [bytes]
-_MAX_LINES = 64
 _CHUNK = 65536
 
 
@@ -85,6 +83,7 @@ class MjpegCapture:
 
     def _read_part(self) -> bytes:
         """The bytes of the next picture."""
+        max_lines = 64
         line = self._read_line()
         skipped = 0
         while not self._is_boundary(line):  # the line end after a picture, or data before the first
@@ -93,7 +92,7 @@ class MjpegCapture:
                 raise WrongSource(f"{self._description}: no boundary within {skipped} bytes; is it an MJPEG camera?")
             line = self._read_line()
         length = None
-        for _ in range(_MAX_LINES):
+        for _ in range(max_lines):
             line = self._read_line()
             if not line:
                 break
@@ -102,7 +101,7 @@ class MjpegCapture:
                 length = int(value)
         else:
             raise WrongSource(
-                f"{self._description}: a part with more than {_MAX_LINES} header lines; is it an MJPEG camera?"
+                f"{self._description}: a part with more than {max_lines} header lines; is it an MJPEG camera?"
             )
         if length is None:
             return self._read_until_boundary()
@@ -134,12 +133,13 @@ class MjpegCapture:
         return found
 
     def _read_line(self) -> bytes:
+        max_line = 8192  # of the header of a part [bytes]
         start = 0
-        while (end := self._buffer.find(b"\n", start)) < 0 and len(self._buffer) <= _MAX_LINE:
+        while (end := self._buffer.find(b"\n", start)) < 0 and len(self._buffer) <= max_line:
             start = len(self._buffer)
             self._receive()
-        if not 0 <= end <= _MAX_LINE:
-            raise WrongSource(f"{self._description}: a line of more than {_MAX_LINE} bytes; is it an MJPEG camera?")
+        if not 0 <= end <= max_line:
+            raise WrongSource(f"{self._description}: a line of more than {max_line} bytes; is it an MJPEG camera?")
         return self._take_bytes(end + 1).rstrip(b"\r\n")
 
     def _receive(self) -> None:

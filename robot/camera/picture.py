@@ -13,7 +13,6 @@ from robot.errors import DeviceError
 from tacsim.models.hardware import CameraSensorConfig
 
 CONNECT_TIMEOUT = 1.0  # to connect and to read the header of the answer [s]
-MAX_PADDING = 16  # bytes before a marker; some cameras add them to complete pictures
 READ_TIMEOUT = 0.5  # plus three periods: a live source without a complete frame is reopened [s]
 
 
@@ -46,6 +45,7 @@ def decode_jpeg(data: bytes, size: tuple[int, int], description: str) -> NDArray
     is cut, has a gap, or does not end where its picture ends. Bytes that changed into another valid picture pass: a
     JPEG has no check sum.
     """
+    padding = 16  # bytes before a marker; some cameras add them to complete pictures
     import simplejpeg  # reports warnings, which Pillow and OpenCV hide
 
     try:
@@ -58,7 +58,7 @@ def decode_jpeg(data: bytes, size: tuple[int, int], description: str) -> NDArray
             picture = simplejpeg.decode_jpeg(data, "RGB")
         except ValueError as warning:
             added = re.search(r"(\d+) extraneous bytes before marker", str(warning))
-            if added is None or int(added[1]) > MAX_PADDING:
+            if added is None or int(added[1]) > padding:
                 raise
             picture = simplejpeg.decode_jpeg(data, "RGB", strict=False)
     except ValueError as error:

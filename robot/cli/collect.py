@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
 collect = typer.Typer(no_args_is_help=True, help="Make sets of presses or of episodes, many at once.")
 
-QUIET = 10.0  # without a terminal, how far it is is told so often [s]
 NUMBER = re.compile(r"\s*[-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?\s*")
 
 Count = Annotated[int, typer.Option(min=1, max=10_000_000, help="How many; more than before makes a set longer.")]
@@ -198,6 +197,7 @@ def _run(
     job: PressJob | EpisodeJob, out: Path, files: dict[str, bytes], command: str, workers: int | None, ray: str | None
 ) -> None:
     """Makes the set, shows how far it is, and says how it went."""
+    quiet_time = 10.0  # without a terminal, how far it is is told so often [s]
     import time
 
     from robot.collect.collect import collect as make
@@ -213,7 +213,7 @@ def _run(
             there = done
             bar.say(job.settings.kind)
             bar.count(done, total)
-            if not notes.is_terminal and (done == total or time.perf_counter() - said > QUIET):
+            if not notes.is_terminal and (done == total or time.perf_counter() - said > quiet_time):
                 said = time.perf_counter()
                 notes.print(f"{done} of {total}")
 

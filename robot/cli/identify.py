@@ -18,9 +18,6 @@ if TYPE_CHECKING:
     from tacsim.interface import Pose
     from tacsim.models.scene import Scene
 
-UR_NOISE, OTHER_NOISE = 1.0, 0.02  # [N]
-SIZE_TOLD = 0.1  # of an indenter, as a share: a standard deviation beyond tells nothing that a calliper does not
-OUTLOOK = (1.0, 0.1, 0.01)  # force sensors that the result is looked at with [N]
 
 identify = typer.Typer(no_args_is_help=True, help="What a gel or a body is made of, from recorded presses.")
 
@@ -156,6 +153,7 @@ class _Task:
             notes.print(words)
 
     def run(self, sources: list[Path], indenter: Pose | None = None, balls: Mapping[str, float] | None = None) -> None:
+        ur_noise, other_noise = 1.0, 0.02  # [N]
         options = self.options
         if options.motions is not None:
             self._write_motions(options.motions)
@@ -176,7 +174,7 @@ class _Task:
             presses = read_all(recordings, find_recordings(sources), bar.count)
             force = options.force_noise
             if force is None:
-                force = UR_NOISE if recordings.from_ur else OTHER_NOISE
+                force = ur_noise if recordings.from_ur else other_noise
                 notes.print(f"force noise taken as {force:g} N; give your sensor's by --force-noise")
             noise = Noise(force=force)
             zero = 10 * force if options.zero_error is None else options.zero_error
@@ -189,6 +187,9 @@ class _Task:
         self._tell(found, folder, noise)
 
     def _tell(self, found: Identified, folder: Path, noise: Noise) -> None:
+        force_noises = (1.0, 0.1, 0.01)  # force sensors that the result is looked at with [N]
+        # of an indenter, as a share: a standard deviation beyond tells nothing that a calliper does not
+        max_size_deviation = 0.1
         from robot.studies.identify.identify import outlook
         from robot.studies.identify.motions import WHAT_TELLS, WORDS
         from robot.studies.identify.results import told, write
@@ -197,7 +198,7 @@ class _Task:
             files = write(folder, found)
         title = f"{self.kind.capitalize()}, {len(found.presses)} recordings, {found.fit.runs} simulated"
         show_table(title, ("", "value", "95 %"), told(found), left={0})
-        looks = {sensor: outlook(found, sensor) for sensor in dict.fromkeys((noise.force, *OUTLOOK))}
+        looks = {sensor: outlook(found, sensor) for sensor in dict.fromkeys((noise.force, *force_noises))}
         rows = [(each.name, *(_reach(look[each.name]) for look in looks.values())) for each in found.fit.identified]
         show_table("With another force sensor, 95 %", ("noise", *(f"{one:g} N" for one in looks)), rows, left={0})
         for each in found.fit.unidentified:
@@ -206,7 +207,7 @@ class _Task:
                 f"{each.name} is not told by these recordings and stays as it was; '{motion}' would tell it: "
                 f"{WORDS[motion]} (tacsim identify {self.kind} --motions FOLDER writes it)"
             )
-        if found.size_error is not None and found.size_error > SIZE_TOLD:
+        if found.size_error is not None and found.size_error > max_size_deviation:
             warn(
                 f"these recordings tell of the size of the indenter {_reach(2 * found.size_error)}: a wrong one would "
                 "not be noticed; measure it, or record heights (a calibrated sensor)"

@@ -21,9 +21,6 @@ if TYPE_CHECKING:
     from rich.progress import Progress
     from rich.status import Status
 
-QUIET = 1.0  # [s] what takes longer says how far it is
-NARROWEST = 60  # columns: in fewer a table loses its values; the terminal breaks its lines instead
-
 
 class SafeConsole(Console):
     """A console that shows control characters instead of obeying them. What a command prints may hold names and texts
@@ -31,8 +28,9 @@ class SafeConsole(Console):
 
     @property
     def options(self) -> ConsoleOptions:
+        min_columns = 60  # columns: in fewer a table loses its values; the terminal breaks its lines instead
         found = super().options
-        return found.update_width(max(found.max_width, NARROWEST))
+        return found.update_width(max(found.max_width, min_columns))
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterator[Segment]:
         for segment in super().render(renderable, options):
@@ -179,6 +177,7 @@ def busy(words: str) -> Iterator[Callable[[str], None]]:
 def measuring(say: Callable[[str], None], after: str) -> Iterator[None]:
     """In the block it is said how far the measuring of a mesh is that takes longer than QUIET: on a terminal by `say`,
     which then says `after`, else once, as a line."""
+    quiet_time = 1.0  # [s] what takes longer says how far it is
     from tacsim.geometry.tiles import report_tiles
 
     began: dict[str, float] = {}
@@ -187,7 +186,7 @@ def measuring(say: Callable[[str], None], after: str) -> Iterator[None]:
     def tell(path: str, done: int, total: int) -> None:
         if done == 0:
             began[path] = time.monotonic()
-        elif time.monotonic() - began[path] > QUIET:
+        elif time.monotonic() - began[path] > quiet_time:
             words = f"measuring the distances from {printable_line(path)}: {done} of {total} parts"
             say(words)
             if not notes.is_terminal and path not in told:

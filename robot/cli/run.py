@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 STARTING = "starting (the first run compiles the kernels, up to half a minute)"
 OPENING = "opening the rig"
 NO_END = 1_000_000  # steps of a replay: its recording ends it
-WITHOUT_TASK = 40  # steps where neither a task nor a recording has an end
 
 
 def run(
@@ -70,6 +69,7 @@ def run(
 
     Example: tacsim run sim --task squeeze --steps 30 --out runs/first
     """
+    default_steps = 40  # steps where neither a task nor a recording has an end
     from robot.open import load_with_task
 
     if save_view is not None and save_view.suffix != ".rrd":
@@ -83,7 +83,7 @@ def run(
         require_person(loaded.config)
     folder = new_directory(out, loaded.config.name if own_task is None else own_task.kind)
     if steps is None:
-        endless = NO_END if loaded.config.clock == "replay" else WITHOUT_TASK
+        endless = NO_END if loaded.config.clock == "replay" else default_steps
         steps = endless if own_task is None else own_task.steps
     name = policy if policy is not None else ("grip" if own_task is None else "scripted")
     with Interrupt() as interrupt:

@@ -16,9 +16,6 @@ from robot.collect.workers import AHEAD, CollectFailed, Stop, Stopped, piece_or_
 from robot.common.whole_file import write_whole
 from robot.deploy.control_loop import versions
 
-PATIENCE = 5.0  # for a cluster to answer [s]
-LOOK = 0.5  # for pieces that are done, and for a wish to stop [s]
-
 
 def on_cluster(
     address: str, job: Job, files: Mapping[str, bytes], numbers: Sequence[int], stop: Stop
@@ -31,6 +28,7 @@ def on_cluster(
     of this machine alone; `require_cluster` has found somebody there. files: what the workers need, by place. Raises
     SetError, CollectFailed, Stopped.
     """
+    poll_interval = 0.5  # for pieces that are done, and for a wish to stop [s]
     import ray
 
     try:
@@ -47,7 +45,7 @@ def on_cluster(
             most = AHEAD * max(1, int(ray.cluster_resources().get("CPU", 1)))
             while waiting and len(running) < most:
                 running.append(make.remote(kit, waiting.popleft()))
-            done, running = ray.wait(running, timeout=LOOK)
+            done, running = ray.wait(running, timeout=poll_interval)
             for each in done:
                 yield result_of(ray.get(each))
     except ray.exceptions.RayError as failure:
@@ -61,12 +59,13 @@ def on_cluster(
 
 def require_cluster(address: str) -> None:
     """Raises SetError without Ray, and where nobody listens at HOST:PORT: Ray itself would try for a minute."""
+    timeout = 5.0  # for a cluster to answer [s]
     if util.find_spec("ray") is None:
         raise SetError("--ray needs ray, which is not installed: pip install 'tacsim[cluster]'")
     host, colon, port = address.removeprefix("ray://").rpartition(":")
     if colon and port.isdecimal():
         try:
-            socket.create_connection((host, int(port)), PATIENCE).close()
+            socket.create_connection((host, int(port)), timeout).close()
         except (OSError, OverflowError) as failure:
             raise SetError(f"--ray {address}: no Ray cluster answers there: {failure}") from None
 

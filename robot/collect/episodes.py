@@ -28,7 +28,6 @@ from tacsim.tasks import GoalOutOfReach, Task, make_task
 from tacsim.tasks.task import action_of_vector
 
 RANDOM = "random"
-STEPS = 40  # of an episode without a task
 
 
 class EpisodeSet(Config):
@@ -104,6 +103,7 @@ class EpisodeWorker:
         return Piece(number, data, failures, int(data is not None), seconds.by_part)
 
     def _played(self, number: int) -> bytes:
+        default_steps = 40  # of an episode without a task
         settings, loaded = self._settings, self._settings.loaded(number)
         seed = settings.seed + number
         with tempfile.TemporaryDirectory(prefix="tacsim-collect-") as folder, ExitStack() as stack:
@@ -122,7 +122,7 @@ class EpisodeWorker:
             def wait(step: Step) -> None:
                 recorders[0].flush()  # a simulation may be faster than the disk, and no step shall be dropped
 
-            steps = settings.steps or (STEPS if task is None else task.config.steps)
+            steps = settings.steps or (default_steps if task is None else task.config.steps)
             episode = run_episode(rig, policy, task, steps, setup=setup, recorder=record, on_step=wait)
             recorders[0].close()
             if recorders[0].error is not None:

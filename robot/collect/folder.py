@@ -17,7 +17,6 @@ from robot.deploy.control_loop import versions
 from tacsim.models.text import printable_line
 
 FORMAT = 2
-SHOWN = 6  # differences between two commands that are told
 ABOUT, FAILURES, CARD = "collect.json", "failures.jsonl", "README.md"
 
 
@@ -140,11 +139,12 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _require_same(path: Path, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+    max_shown = 6  # differences between two commands that are told
     old, new = (_leaves(json.loads(_text({**about["settings"], "files": about["files"]}))) for about in (before, now))
     wrong = [f"{key} is {_short(old.get(key))} there and {_short(new.get(key))} here" for key in {**old, **new}
              if old.get(key) != new.get(key)]  # fmt: skip
-    if len(wrong) > SHOWN:
-        wrong[SHOWN:] = [f"{len(wrong) - SHOWN} more differ"]
+    if len(wrong) > max_shown:
+        wrong[max_shown:] = [f"{len(wrong) - max_shown} more differ"]
     if now["count"] < before["count"]:
         wrong.append(f"it has {before['count']} already begun, {now['count']} are asked for")
     versions = (about["versions"].get("tacsim") for about in (before, now))

@@ -31,9 +31,6 @@ from tacsim.optics.render import Renderer
 from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.record.images import encode_png
 
-GOLDEN = 0.618034  # its multiples, without their whole parts, lie evenly in 0 to 1 however many there are
-FLOW_PITCH = 1e-3  # of the points whose flow is told of a sensor without dots [m]
-
 Range = Annotated[tuple[float, float], Field(description="least and greatest, all between equally likely")]
 
 
@@ -74,11 +71,12 @@ class PressSet(Config):
     @property
     def lattice(self) -> Markers:
         """The points whose flow is told: the sensor's dots, or every millimetre of its picture."""
+        flow_pitch = 1e-3  # of the points whose flow is told of a sensor without dots [m]
         if self.sensor.markers is not None:
             return self.sensor.markers
         grid = image_grid(self.sensor.geometry)
-        rows, columns = (int(side * grid.pitch / FLOW_PITCH - 0.5) for side in grid.shape)
-        return Markers(rows=max(1, min(rows, 100)), columns=max(1, min(columns, 100)), pitch=FLOW_PITCH)
+        rows, columns = (int(side * grid.pitch / flow_pitch - 0.5) for side in grid.shape)
+        return Markers(rows=max(1, min(rows, 100)), columns=max(1, min(columns, 100)), pitch=flow_pitch)
 
     @property
     def columns(self) -> dict[str, Feature]:
@@ -169,12 +167,13 @@ class PressWorker:
 
         Files begin with different objects, so that workers who begin together do not all compute the distances of one.
         """
+        golden_ratio = 0.618034  # its multiples, without their whole parts, lie evenly in 0 to 1 however many there are
         rows: dict[int, Row] = {}
         failures: dict[int, str] = {}
         seconds = Seconds()
         numbers = self._job.numbers(number)
         among = len(self._set.objects)
-        first = (int(GOLDEN * number % 1 * among) - numbers[0]) % among % len(numbers)
+        first = (int(golden_ratio * number % 1 * among) - numbers[0]) % among % len(numbers)
         for index in (*numbers[first:], *numbers[:first]):
             try:
                 rows[index] = self._row(index, seconds)

@@ -13,7 +13,6 @@ from tacsim.models.scene import Box, Cylinder, Sphere
 if TYPE_CHECKING:
     from trimesh import Trimesh
 
-SIDES = 64  # corners of a circle
 
 CLOSED_FORMS: dict[str, Sphere | Cylinder | Box] = {
     "ball-3": Sphere(radius=3e-3),
@@ -28,21 +27,22 @@ CLOSED_FORMS: dict[str, Sphere | Cylinder | Box] = {
 
 def meshes() -> dict[str, Trimesh]:
     """By name [mm]. What is pressed is their lower side."""
+    sides = 64  # corners of a circle
     from trimesh import creation, transformations
 
     lying = transformations.rotation_matrix(np.pi / 2, [0, 1, 0])  # type: ignore[no-untyped-call]
     made: dict[str, Callable[[], Trimesh]] = {
-        "cone": lambda: _lofted(_polygon(SIDES, 3.0), [(0.25, 0.0), (0.3, 0.1), (1.0, 3.0), (1.0, 4.0)]),
+        "cone": lambda: _lofted(_polygon(sides, 3.0), [(0.25, 0.0), (0.3, 0.1), (1.0, 3.0), (1.0, 4.0)]),
         "pyramid": lambda: _lofted(_polygon(4, 3.5), [(0.25, 0.0), (0.3, 0.12), (1.0, 3.0), (1.0, 4.0)]),
         "hexagon": lambda: _prism(_polygon(6, 3.0)),
         "triangle": lambda: _prism(_polygon(3, 3.5)),
         "star": lambda: _prism(_star(5, 4.0, 1.8)),
         "gear": lambda: _prism(_gear(8, 3.8, 2.8)),
         "cross": lambda: _prism(_cross(3.5, 1.0)),
-        "egg": lambda: _lofted(_polygon(SIDES, 1.0) * [2.2, 3.2], _round(2.0)),
+        "egg": lambda: _lofted(_polygon(sides, 1.0) * [2.2, 3.2], _round(2.0)),
         "roof": lambda: _roof(8.0, 4.0, 3.0, 0.4),
         "capsule": lambda: creation.capsule(4.0, 1.6, [32, 32], transform=lying),
-        "torus": lambda: creation.torus(3.0, 1.0, SIDES, 32),
+        "torus": lambda: creation.torus(3.0, 1.0, sides, 32),
         "bars": lambda: _joined([_moved(_prism(_rectangle(0.6, 3.5)), x, 0.0) for x in (-2.4, 0.0, 2.4)]),
         "dots": lambda: _joined(
             [_moved(creation.icosphere(3, 1.1), x, y) for x in (-1.6, 1.6) for y in (-1.6, 1.6)]

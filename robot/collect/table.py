@@ -35,7 +35,6 @@ WORDS = {
     "folded": "whether the gel folds over itself; picture and height show the sheet that the camera sees",
     "settled": "whether all motions came to rest within the scene's tolerance",
 }
-ROWS_IN_GROUP = 25  # read at once by who wants one row: some 10 MB
 
 
 def press_columns(objects: Sequence[str], geometry: SensorGeometry, lattice: Markers) -> dict[str, Feature]:
@@ -66,6 +65,7 @@ def press_columns(objects: Sequence[str], geometry: SensorGeometry, lattice: Mar
 
 def parquet_bytes(columns: Mapping[str, Feature], rows: Sequence[Row]) -> bytes:
     """A file of these rows. Numbers are as they are, pictures PNG: nothing is lost."""
+    rows_in_group = 25  # read at once by who wants one row: some 10 MB
     from pyarrow import parquet
 
     values = {name: _column(feature, [row[name] for row in rows]) for name, feature in columns.items()}
@@ -75,7 +75,7 @@ def parquet_bytes(columns: Mapping[str, Feature], rows: Sequence[Row]) -> bytes:
     parquet.write_table(
         table,
         buffer,
-        row_group_size=ROWS_IN_GROUP,
+        row_group_size=rows_in_group,
         compression="zstd",
         use_dictionary=False,  # measured numbers repeat nowhere
         column_encoding=dict.fromkeys(maps, "BYTE_STREAM_SPLIT"),  # bytes of one rank side by side: less by a third

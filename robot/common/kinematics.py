@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from tacsim.models.hardware import Model  # pydantic and SciPy: half a second of start-up
 
 JOINT_RANGE = 2 * math.pi  # joints turn from -JOINT_RANGE to +JOINT_RANGE (all e-Series user manuals)
-TOLERANCE = 1e-10  # of the inverse [m, rad]
 MIN_SINGULAR_VALUE = 0.02  # of the Jacobian, lengths divided by the reach; below it the arm may only move away
 # Bound on the change of the minimum singular value per radian of joint motion: each of the six columns has a length of
 # at most sqrt(2) in these units, and rotates with the joints before it.
@@ -256,6 +255,7 @@ class Kinematics:
 
     def _newton(self, target: FloatArray, seed: FloatArray, tool: FloatArray | None) -> FloatArray | None:
         """Newton's method from the seed; None if it does not converge in a few steps or leaves the seed."""
+        tolerance = 1e-10  # of the inverse [m, rad]
         q, begin = seed, seed.tolist()
         (tx, ty, tz, px), (ux, uy, uz, py), (vx, vy, vz, pz), _ = target.tolist()
         for _ in range(7):
@@ -271,7 +271,7 @@ class Kinematics:
                 0.5 * (ax * ux - bx * tx + ay * uy - by * ty + az * uz - bz * tz),
             )
             size = max(map(abs, error))
-            if size < TOLERANCE:
+            if size < tolerance:
                 # The sine is also small at half a turn, where the axes are opposite.
                 aligned = ax * tx + bx * ux + cx * vx > 0 and ay * ty + by * uy + cy * vy > 0
                 return q if aligned and max(map(abs, q.tolist())) <= JOINT_RANGE else None

@@ -44,10 +44,7 @@ LARGEST = 256 * 2**20  # of an array [bytes]
 LONGEST = 2**20  # of a line [bytes]
 PATIENCE = 1.0  # for a child that is asked to end; then it is killed [s]
 PARENT = "TACSIM_PARENT"  # variable of a child: the process id of its parent, which may be gone before it looks
-PARENT_CHECK = 0.2  # a child looks so often whether its parent is there [s]
-EXITING = 0x4  # of a process's flags in Linux: PF_EXITING
 ENDING = {getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)}
-LAST_LINES = 5  # of a dead child's standard error, in errors
 
 Given = ParamSpec("Given")
 Result = TypeVar("Result")
@@ -223,8 +220,9 @@ class Child(Closing):
         return failure
 
     def _failure(self, what: str) -> DeviceError:
+        line_count = 5  # of a dead child's standard error, in errors
         text = f"{self._name} (process {self.pid}) {what}; {self._advice}"
-        return self._error(text + "".join(f"\n  {line}" for line in self._last_lines(LAST_LINES)))
+        return self._error(text + "".join(f"\n  {line}" for line in self._last_lines(line_count)))
 
     def _end(self) -> str:
         """How the process ended."""
@@ -288,6 +286,7 @@ class Lifeline:
 
     def cut(self) -> bool:
         """Whether the parent is gone or about to be. Takes 8 us."""
+        exiting_flag = 0x4  # of a process's flags in Linux: PF_EXITING
         if os.getppid() != self._parent:
             return True
         if self._status is None:
@@ -297,16 +296,17 @@ class Lifeline:
         except ProcessLookupError:
             return True
         flags = told[told.rindex(b")") :].split()[7]  # the name before may hold anything
-        return bool(int(flags) & EXITING)
+        return bool(int(flags) & exiting_flag)
 
 
 def end_with_parent(parent: int) -> None:
     """From now on this process ends soon after its parent (process id), whatever it does."""
+    check_interval = 0.2  # a child looks so often whether its parent is there [s]
     lifeline = Lifeline(parent)
 
     def watch() -> None:
         while not lifeline.cut():
-            time.sleep(PARENT_CHECK)
+            time.sleep(check_interval)
         os._exit(1)
 
     threading.Thread(target=watch, name="parent", daemon=True).start()

@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from onnxruntime import InferenceSession
 
 MAX_BYTES = 64 * 2**20  # of a file; ours have less than 2 MB
-MAX_LAG_STEPS = 2.0  # between target and pose of an arm; beyond it the next target starts at the pose
 
 
 Goal = float | tuple[float, ...] | None  # of a task [m]
@@ -85,12 +84,13 @@ class OnnxPolicy:
 
     def __call__(self, observation: Observation) -> Action:
         """The action for an observation. Raises PolicyFailed if the graph fails or returns no valid action."""
+        max_deviation = 2.0  # between target and pose of an arm; beyond it the next target starts at the pose
         first = not self._targets
         features = self._encoder.begin(observation, self._goal) if first else self._encoder(observation)
         self.range_monitor(features)
         for axis in self._axes:
             now = observation.arms[axis.arm].pose
-            if first or se3.pose_distance(self._targets[axis.arm], now)[0] > MAX_LAG_STEPS * self.spec.max_step:
+            if first or se3.pose_distance(self._targets[axis.arm], now)[0] > max_deviation * self.spec.max_step:
                 self._targets[axis.arm] = now
         action = action_of_vector(self._infer(features), self._axes, self.spec.max_step, self._targets)
         self._targets = {arm: pose for arm, pose in action.tool.items() if pose is not None}

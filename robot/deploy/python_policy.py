@@ -15,7 +15,6 @@ from tacsim.interface import Action, FloatArray, Needs, Observation, Policy, Pos
 from tacsim.record.sources import read_columns
 
 AXES = ("x", "y", "z", "rx", "ry", "rz")  # [m], and a rotation vector [rad]
-MAX_ROWS = 100_000
 
 
 class PolicyNotFound(ValueError):
@@ -79,6 +78,7 @@ class TargetScript:
     """
 
     def __init__(self, path: Path) -> None:
+        max_rows = 100_000
         try:
             with path.open(newline="", encoding="utf-8-sig") as file:
                 header = [name.strip() for name in next(csv.reader(file), [])]
@@ -95,8 +95,8 @@ class TargetScript:
             rows = np.array(read_columns(path, header))
         except ValueError as failure:
             raise PolicyNotFound(f"policy '{failure}'") from failure
-        if len(rows) > MAX_ROWS:
-            raise PolicyNotFound(f"policy '{path}': {len(rows)} rows, the maximum is {MAX_ROWS}")
+        if len(rows) > max_rows:
+            raise PolicyNotFound(f"policy '{path}': {len(rows)} rows, the maximum is {max_rows}")
         self._offsets: dict[str, FloatArray] = {}
         for column, (arm, axis) in enumerate(split):
             self._offsets.setdefault(arm, np.zeros((len(rows), 6)))[:, AXES.index(axis)] = rows[:, column]

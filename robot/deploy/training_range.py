@@ -15,15 +15,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from robot.deploy.tuning import MAX_FALSE_ALARMS, ROUNDING
 from tacsim.interface import FloatArray
 from tacsim.models.policy import PolicySpec, TrainingRange
 from tacsim.models.scene import Scene
 
-MAX_NUMBERS_WITH_PRODUCTS = 12  # with more numbers no products are added
-FALSE_ALARMS = 0.03  # fraction of training episodes that may exceed the limit
 MIN_DEVIATION = 0.01  # of a number in training; a smaller one is replaced by it [encoded]
 MIN_VARIANCE = 0.01  # of a direction, relative to 1 of a number; smaller ones are noise
-SLACK = 1e-6  # of a scene's number, for rounding [fraction]
 PHYSICAL = ("gel", "gels", "body", "friction", "gravity")  # parts of a scene that affect observations
 QUASI_STATIC_IRRELEVANT = ("density", "seed")  # numbers without effect on quasi-static motions
 EncodedFeatures = Mapping[str, NDArray[Any]]
@@ -60,8 +58,9 @@ def number_names(spec: PolicySpec, goals: int) -> list[str]:
 
 def append_products(numbers: FloatArray) -> FloatArray:
     """Appends the products of each pair to numbers (..., n), if n <= MAX_NUMBERS_WITH_PRODUCTS: (..., m)."""
+    max_numbers_with_products = 12  # with more numbers no products are added
     count = numbers.shape[-1]
-    if count > MAX_NUMBERS_WITH_PRODUCTS:
+    if count > max_numbers_with_products:
         return numbers
     first, second = np.triu_indices(count)
     return np.concatenate([numbers, numbers[..., first] * numbers[..., second]], axis=-1)
@@ -84,7 +83,7 @@ def fit_training_range(episodes: Sequence[FloatArray], scenes: Sequence[Scene]) 
     scale = np.sqrt(np.maximum(variance, MIN_VARIANCE) * len(variance))
     axes = (directions / scale) @ directions.T / deviation  # symmetric, so the order of equal directions has no effect
     largest = np.sort([mahalanobis_distances(each, centre, axes).max() for each in episodes[1::2]])
-    at = min(int(np.ceil((len(largest) + 1) * (1 - FALSE_ALARMS))), len(largest)) - 1
+    at = min(int(np.ceil((len(largest) + 1) * (1 - MAX_FALSE_ALARMS))), len(largest)) - 1
     numbers, words = scene_ranges(scenes)
     return TrainingRange(
         episodes=len(episodes),
@@ -214,7 +213,7 @@ def describe_scenes_outside(known: TrainingRange, scenes: Sequence[Scene]) -> li
         trained = known.scene.get(key)
         if trained is None:
             found.append(f"{key} is {_interval(low, high)}, in training it was not given")
-        elif low < trained[0] - SLACK * abs(trained[0]) or high > trained[1] + SLACK * abs(trained[1]):
+        elif low < trained[0] - ROUNDING * abs(trained[0]) or high > trained[1] + ROUNDING * abs(trained[1]):
             found.append(f"{key} is {_interval(low, high)}, in training {_interval(*trained)}")
     for key, given in words.items():
         new = sorted(set(given) - set(known.words.get(key, ())))
@@ -225,4 +224,4 @@ def describe_scenes_outside(known: TrainingRange, scenes: Sequence[Scene]) -> li
 
 
 def _interval(low: float, high: float) -> str:
-    return f"{low:g}" if high - low <= SLACK * abs(high) else f"{low:g} to {high:g}"
+    return f"{low:g}" if high - low <= ROUNDING * abs(high) else f"{low:g} to {high:g}"

@@ -23,9 +23,6 @@ VERSION = "v3.0"
 CHUNK = 1000  # files in a folder
 FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 VIDEO = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
-FILE_SIZE = 100  # [MB] at which a file is followed by another
-VIDEO_SIZE = 200  # the same of videos [MB]
-EPISODES_AT_ONCE = 100  # rows that meta/episodes gathers into one row group
 COUNTERS = {name: Feature("int64", (1,), None) for name in ("frame_index", "episode_index", "index", "task_index")}
 OWN = {"timestamp": Feature("float32", (1,), None), **COUNTERS}  # columns that every data set has
 
@@ -49,8 +46,8 @@ class DataSet:
         robot: str,
         features: Mapping[str, Feature],
         *,
-        file_size: float = FILE_SIZE,
-        video_size: float = VIDEO_SIZE,
+        file_size: float = 100,
+        video_size: float = 200,
         video: bool = False,
     ) -> None:
         self._folder, self._fps, self._robot = folder, fps, robot
@@ -70,6 +67,7 @@ class DataSet:
 
     def add(self, columns: Mapping[str, Column], images: Mapping[str, Statistics], task: str) -> None:
         """One episode: its columns, and the statistics of its pictures by column."""
+        max_buffered = 100  # rows that meta/episodes gathers into one row group
         count = len(next(iter(columns.values())))
         if task not in self._tasks:
             self._tasks.append(task)
@@ -104,7 +102,7 @@ class DataSet:
         )
         self._statistics.append(statistics)
         self._episodes, self._frames = self._episodes + 1, self._frames + count
-        if len(self._rows) == EPISODES_AT_ONCE:
+        if len(self._rows) == max_buffered:
             self._write_rows()
 
     def close(self) -> None:

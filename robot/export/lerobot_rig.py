@@ -33,11 +33,8 @@ from tacsim.rig import Rig
 
 Values = dict[str, float | NDArray[np.uint8]]
 
-SAME_RATE = 1e-3  # share by which a rate may differ from that of the rig
-LOOKS, HURRIED = 10, 0.75  # so many looks in a row, each after less than this share of a period, are another rate
+LOOKS = 10  # so many looks in a row, each after less than this share of a period, are another rate
 
-FIRST = 5.0  # longest wait for the picture without contact [s]
-POLL = 2e-3  # between two looks for a new picture [s]
 
 log = logging.getLogger(__name__)
 
@@ -53,8 +50,9 @@ def ask_at_terminal(question: str) -> bool:
 
 def require_rate(config: RigConfig, fps: float) -> None:
     """Raises IncompatibleRig where LeRobot would go by another period than the rig."""
+    max_rate_error = 1e-3  # share by which a rate may differ from that of the rig
     rate = 1.0 / config.period
-    if not abs(fps - rate) <= SAME_RATE * rate:
+    if not abs(fps - rate) <= max_rate_error * rate:
         raise IncompatibleRig(
             f"rig '{config.name}' has a control period of {1e3 * config.period:g} ms, which is fps={rate:g}, not "
             f"{fps:g}; give LeRobot that rate, or the rig another period (period={1e3 / fps:.4g} ms)"
@@ -179,9 +177,10 @@ class LeRobotRig:
 
     def _watch_rate(self) -> None:
         """Says it once when LeRobot goes faster than the rig; that it goes slower may be the machine's fault."""
+        min_period_share = 0.75  # so many looks in a row, each after less than this share of a period, are another rate
         self._looks.append(time.monotonic())
         longest = float(np.diff(self._looks).max()) if len(self._looks) > LOOKS else math.inf
-        if longest < HURRIED * self.config.period:
+        if longest < min_period_share * self.config.period:
             self._looks = deque([math.inf], maxlen=1)
             log.warning(
                 "LeRobot looks every %.0f ms, but the control period of rig '%s' is %g ms: what is recorded has wrong "
@@ -230,11 +229,12 @@ class TactileCamera:
 
         Raises DeviceError, and RuntimeError when it is connected already.
         """
+        picture_timeout = 5.0  # longest wait for the picture without contact [s]
         if self._camera is not None:
             raise RuntimeError(f"sensor '{self.name}' is connected already")
         with ExitStack() as stack:
             camera = stack.enter_context(Camera(self._config, self.name))
-            self._normaliser.take_reference(camera.read(FIRST))
+            self._normaliser.take_reference(camera.read(picture_timeout))
             stack.pop_all()
         self._camera, self._seen = camera, -1
 
@@ -247,11 +247,12 @@ class TactileCamera:
 
     def read_new(self, timeout: float) -> NDArray[np.uint8]:
         """One that was not read before. Raises as `read`."""
+        poll_interval = 2e-3  # between two looks for a new picture [s]
         camera, deadline = self._opened(), time.monotonic() + timeout
         while camera.read(max(0.0, deadline - time.monotonic())).index == self._seen:
             if time.monotonic() >= deadline:
                 raise StaleFrame(f"sensor '{self.name}': no new picture within {timeout:.3g} s")
-            time.sleep(POLL)
+            time.sleep(poll_interval)
         return self.read(timeout)
 
     def age(self) -> float:

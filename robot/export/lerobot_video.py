@@ -17,8 +17,6 @@ from tacsim.record.images import decode_image
 ENCODER, CODEC, PIXELS = "libx264", "h264", "yuv444p"
 QUALITY = 10  # crf: 0 is best; LeRobot's own default, AV1 yuv420p at 30, errs by 4.6 grey levels
 KEY_FRAMES = 2  # every so many frames, as LeRobot does: it loads single frames
-GREY = 128  # of a canonical picture where nothing changed
-CONTACT = 10  # grey levels; what differs more from GREY is taken for contact
 
 
 class VideoFailed(RuntimeError):
@@ -50,8 +48,10 @@ class VideoError:
 
     def add(self, picture: NDArray[np.uint8], decoded: NDArray[np.uint8]) -> None:
         """Both (H, W, 3)."""
-        error, signal = (each.astype(np.int64) - other for each, other in ((decoded, picture), (picture, GREY)))
-        contact = np.abs(signal) > CONTACT
+        min_change = 10  # grey levels; what differs more from GREY is taken for contact
+        grey = 128  # of a canonical picture where nothing changed
+        error, signal = (each.astype(np.int64) - other for each, other in ((decoded, picture), (picture, grey)))
+        contact = np.abs(signal) > min_change
         self._squares += [(error**2).sum(), (error[contact] ** 2).sum(), (signal[contact] ** 2).sum()]
         self._counts += np.array([error.size, contact.sum()])
         self._most = max(self._most, int(np.abs(error).max()))

@@ -40,9 +40,7 @@ if TYPE_CHECKING:
     import rerun.blueprint as rrb
 
 AXES = {"x": (220, 60, 60), "y": (60, 180, 60), "z": (70, 110, 240)}
-MOST_DEPTH = 1e-3  # [m] drawn in the last colour
 COLOURS = np.array([(70, 70, 90), (60, 120, 190), (90, 200, 130), (250, 230, 60)], np.float64)  # by depth
-FORCE_LENGTH = 1e-3  # [m] of an arrow for each newton
 ARROW = 0.1e-3  # radius [m]
 
 
@@ -95,10 +93,11 @@ class EpisodeLog:
         self._recording.set_time("time", duration=time - self._begin)
 
     def _arm(self, name: str, state: ArmState) -> None:
+        metres_per_newton = 1e-3  # [m] of an arrow for each newton
         import rerun as rr
 
         self._place(f"world/{name}", state.pose)
-        force = [FORCE_LENGTH * state.wrench[:3]]
+        force = [metres_per_newton * state.wrench[:3]]
         arrow = rr.Arrows3D(vectors=force, origins=[(0, 0, 0)], radii=[3 * ARROW], colors=[(250, 140, 30)])
         self._recording.log(f"world/{name}/force", arrow)
         for kind, values in (("force", state.wrench[:3]), ("torque", state.wrench[3:])):
@@ -214,7 +213,8 @@ def _triangles(valid: NDArray[np.bool_]) -> NDArray[np.uint32]:
 
 def _colours(height: NDArray[np.float64]) -> NDArray[np.uint8]:
     """(n, 3) by depth, from 0 to MOST_DEPTH."""
-    share = np.clip(height / MOST_DEPTH, 0.0, 1.0) * (len(COLOURS) - 1)
+    max_depth = 1e-3  # [m] drawn in the last colour
+    share = np.clip(height / max_depth, 0.0, 1.0) * (len(COLOURS) - 1)
     channels = [np.interp(share, np.arange(len(COLOURS)), COLOURS[:, channel]) for channel in range(3)]
     found: NDArray[np.uint8] = np.stack(channels, axis=1).astype(np.uint8)
     return found

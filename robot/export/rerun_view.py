@@ -40,8 +40,6 @@ if TYPE_CHECKING:
 
 APPLICATION = "tacsim"
 WAITING = 2  # steps that wait to be handed over; a longer queue would show the past
-MAX_START = 60.0  # longest wait for the viewer [s]
-MAX_END = 20.0  # longest wait for the last steps [s]
 
 Shown = tuple[Step, Observation, Truth | None]
 Log = Callable[[Step, Observation, Truth | None], None]
@@ -104,17 +102,19 @@ class LiveView(Closing):
 
     def close(self) -> None:
         """Waits for what was handed over, at most MAX_END for each part. A second call does nothing."""
+        end_timeout = 20.0  # longest wait for the last steps [s]
         with contextlib.suppress(queue.Full):
-            self._line.put(None, timeout=MAX_END)
-        self._thread.join(MAX_END)
-        self._process.join(MAX_END)
+            self._line.put(None, timeout=end_timeout)
+        self._thread.join(end_timeout)
+        self._process.join(end_timeout)
         if self._process.is_alive():
             self._process.kill()
         self._pipe.close()
 
     def _await_start(self) -> None:
-        if not self._pipe.poll(MAX_START):
-            raise RuntimeError(f"the viewer did not begin within {MAX_START:g} s")
+        start_timeout = 60.0  # longest wait for the viewer [s]
+        if not self._pipe.poll(start_timeout):
+            raise RuntimeError(f"the viewer did not begin within {start_timeout:g} s")
         try:
             failure = self._pipe.recv()
         except EOFError:

@@ -30,8 +30,6 @@ from robot.mock.ur.wire.controller import Controller, ControllerConfig
 if TYPE_CHECKING:
     from tacsim.models.hardware import Model
 
-CATCH_UP = 5  # control periods that may be made up for in a row; more are left out and counted
-
 
 def serve(configs: Sequence[ControllerConfig], fault_port: int, *, with_parent: bool) -> None:
     """Runs controllers until the input ends (`with_parent`) or SIGTERM or SIGINT comes. Raises OSError for ports."""
@@ -63,6 +61,7 @@ def _loop(
     ended: list[str],
     parent: int | None,
 ) -> None:
+    max_periods = 5  # control periods that may be made up for in a row; more are left out and counted
     deadline = time.perf_counter() + PERIOD
     while not ended:
         # What has arrived is served before the tick, also after a pause: fresh commands before the watchdog.
@@ -73,10 +72,10 @@ def _loop(
         if late < 0:
             continue
         behind = int(late / PERIOD)
-        if behind > CATCH_UP:
+        if behind > max_periods:
             for controller in controllers:
-                controller.overruns += behind - CATCH_UP
-            deadline += (behind - CATCH_UP) * PERIOD
+                controller.overruns += behind - max_periods
+            deadline += (behind - max_periods) * PERIOD
         deadline += PERIOD
         for controller in controllers:
             controller.tick()

@@ -14,12 +14,11 @@ from robot.common.loopback import loopback_host
 from robot.mock.camera.camera import MockCamera
 from robot.mock.ur.handle import MockUR
 
-ROOM = 31  # second number of the addresses
-
 
 def mock_host(number: int) -> str:
     """A loopback address of this process's own, number 1 to 254."""
-    return loopback_host(number, ROOM)
+    room = 31  # second number of the addresses
+    return loopback_host(number, room)
 
 
 def rig_addresses() -> list[str]:

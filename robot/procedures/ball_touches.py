@@ -37,11 +37,7 @@ from tacsim.limits import ActionError
 from tacsim.models.rig import RigConfig
 from tacsim.rig import Rig
 
-APPROACH_DISTANCE = 1e-3  # between start of the approach and ball, once the ball position is known [m]
-APPROACH_MARGIN = 3e-3  # of the approach beyond the expected ball position [m]
 MAX_LEFT_OUT_SHARE = 0.5  # of the touches; more indicates a fault of the set-up
-MIN_EXPOSURE_DELAY = 0.02  # of a picture of the approach, after the last step [s]
-STEP_TIMEOUT = 5.0  # of one step of the approach [s]
 MAX_FREE_DEPTH_SHARE = 0.5  # of the depth of a touch; a lifted gel with more is not free
 TOUCH_ERRORS = (NoTouch, BadMeasurements, ActionError, OutsideLimits)  # these end one touch only
 
@@ -93,6 +89,8 @@ def record_ball_touches(
     Raises NoTouch if the first approach finds no contact, DeviceError if most of the others fail, and the errors of the
     reset, the arm and the camera; the arm is stopped in each case.
     """
+    overshoot = 3e-3  # of the approach beyond the expected ball position [m]
+    slow_distance = 1e-3  # between start of the approach and ball, once the ball position is known [m]
     sensor_from_tool = se3.inverse(hardware_arm(config, arm).tool_from_sensor.pose)
     rig.reset()
     prober = _BallProber(rig, config, arm, sensor, plan)
@@ -111,9 +109,9 @@ def record_ball_touches(
                     touching = Pose(np.mean(centres, axis=0) - centre, tilted.quaternion)
                     lifted, begin = (
                         se3.translated_along_z(touching, -plan.lift),
-                        se3.translated_along_z(touching, -APPROACH_DISTANCE),
+                        se3.translated_along_z(touching, -slow_distance),
                     )
-                    travel = APPROACH_DISTANCE + APPROACH_MARGIN
+                    travel = slow_distance + overshoot
                 try:
                     contact, depth, pose = prober.touch(lifted, begin, travel)
                 except TOUCH_ERRORS as failure:
@@ -161,12 +159,15 @@ class _BallProber:
         """Moves from `begin`, the present pose, along the sensor's axis until the depth of a touch is reached. Returns
         the touch. Raises NoTouch, BadMeasurements."""
 
+        step_timeout = 5.0  # of one step of the approach [s]
+        min_picture_delay = 0.02  # of a picture of the approach, after the last step [s]
+
         def touches() -> bool:
-            return self._depth(self._observe(MIN_EXPOSURE_DELAY)) >= self._plan.depth
+            return self._depth(self._observe(min_picture_delay)) >= self._plan.depth
 
         def advance(distance: float) -> None:
             due = time.monotonic() + self._plan.step / self._speed
-            move_to(self._arm, self._name, se3.translated_along_z(begin, distance), STEP_TIMEOUT)
+            move_to(self._arm, self._name, se3.translated_along_z(begin, distance), step_timeout)
             time.sleep(max(0.0, due - time.monotonic()))
 
         advice = (

@@ -19,14 +19,9 @@ from calibration.markers.dots import DotEraser
 from calibration.markers.flow import find_markers
 from calibration.markers.lattice import NoLattice
 from robot.procedures.session import CannotCalibrate, FrameSource, Session
+from robot.procedures.tuning import MAX_STILL_CHANGE, MIN_CONTACT_CHANGE, PRESS_REST_TIME
 from tacsim.interface import Float32, Image, TactileFrame
 
-CELL_SIZE = 8  # pixels each way over which colour is averaged: removes noise and JPEG errors, keeps contacts
-MAX_STILL_CHANGE = 4.0  # a cell with a larger change is in motion [grey levels]
-MIN_CONTACT_CHANGE = 8.0  # a cell that differs more from the reference is touched [grey levels]
-PRESS_REST_TIME = 0.5  # a picture without motion for this time stands still [s]
-REFERENCE_REST_TIME = 1.5  # the same for the reference without contact [s]
-MAX_MOVING_TIME = 5.0  # after this time without rest the person is reminded [s]
 REFERENCE = "background.png"
 NOISE_FRAMES = 8  # pictures without contact, for the noise of the camera
 
@@ -108,6 +103,7 @@ class _ContactMonitor:
 
     def wait_for_rest(self) -> tuple[Image, ...]:
         """The last pictures, at most NOISE_FRAMES, of REFERENCE_REST_TIME without motion."""
+        rest_time = 1.5  # the same for the reference without contact [s]
         begin = None
         shown: deque[Image] = deque(maxlen=NOISE_FRAMES)
         while True:
@@ -116,7 +112,7 @@ class _ContactMonitor:
             if still_time == 0.0:
                 shown.clear()
             shown.append(frame.image)
-            if still_time >= REFERENCE_REST_TIME:
+            if still_time >= rest_time:
                 return tuple(shown)
             self._check_timeout(
                 frame.time - begin, "the picture does not come to rest; is something moving in front of the gel?"
@@ -124,6 +120,7 @@ class _ContactMonitor:
 
     def wait_for_press(self) -> Image:
         """A picture of a contact without motion for PRESS_REST_TIME. Reminds the person while it moves."""
+        reminder_time = 5.0  # after this time without rest the person is reminded [s]
         begin = moving = None
         while True:
             frame, still_time, is_touched = self._next_frame()
@@ -135,7 +132,7 @@ class _ContactMonitor:
                 self._check_timeout(frame.time - begin, "nothing touched the gel (or too lightly to be seen)")
                 continue
             moving = frame.time if moving is None else moving
-            if frame.time - moving > MAX_MOVING_TIME:
+            if frame.time - moving > reminder_time:
                 self._say("Still moving: hold the ball still.")
                 moving = frame.time
             self._check_timeout(frame.time - begin, "the press did not come to rest")
@@ -175,7 +172,8 @@ class _ContactMonitor:
 
 def _cell_means(image: Image) -> Float32:
     """Means over CELL x CELL pixels, (h, w, 3)."""
+    cell_side = 8  # pixels each way over which colour is averaged: removes noise and JPEG errors, keeps contacts
     import cv2
 
-    size = (max(1, image.shape[1] // CELL_SIZE), max(1, image.shape[0] // CELL_SIZE))
+    size = (max(1, image.shape[1] // cell_side), max(1, image.shape[0] // cell_side))
     return np.asarray(cv2.resize(image.astype(np.float32), size, interpolation=cv2.INTER_AREA), dtype=np.float32)

@@ -27,10 +27,6 @@ Part = TypeVar("Part")
 POLL_PERIOD = 2e-3  # between two reads of an arm or a camera [s]
 PICTURE_TIMEOUT = 15.0  # for one picture [s]
 SETTLING_TIME = 0.2  # of an arm at rest before the exposure of a picture [s]
-TRAVEL_TIMEOUT = 60.0  # of a motion between two measurements [s]
-MAX_POSITION_ERROR, MAX_ROTATION_ERROR = 20e-6, 2e-4  # of an arm at its target [m, rad]
-MAX_REST_SPEED = 1e-3  # of an arm at rest [m/s]
-MAX_CLIPPING = 1e-6  # of a target by the limits; with more it is not the one of the plan [m, rad]
 GOLDEN_RATIO = 0.618034  # its multiples modulo 1 are spread evenly
 GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))  # its multiples never repeat
 
@@ -123,24 +119,23 @@ def _part(config: RigConfig, parts: Mapping[str, object], name: str, kind: type[
     return found[name]
 
 
-def move_to(arm: Arm | URArm, name: str, target: Pose, timeout: float = TRAVEL_TIMEOUT) -> None:
+def move_to(arm: Arm | URArm, name: str, target: Pose, timeout: float = 60.0) -> None:
     """Moves an arm to a pose of its sensor and waits for rest. Raises OutsideLimits, ActionError if the pose is out of
     reach, DeviceError after `timeout` [s] and if the arm stops."""
+    max_shift = 1e-6  # of a target by the limits; with more it is not the one of the plan [m, rad]
+    max_speed = 1e-3  # of an arm at rest [m/s]
+    max_distance, max_angle = 20e-6, 2e-4  # of an arm at its target [m, rad]
     if isinstance(arm, CommandedArm):
         arm.suspend_tactile_guard()  # no observation during the motion
     deadline = time.monotonic() + timeout
     while True:
         sent = arm.command(target)
-        if sent is not None and max(se3.pose_distance(sent, target)) > MAX_CLIPPING:
+        if sent is not None and max(se3.pose_distance(sent, target)) > max_shift:
             arm.stop()
             raise OutsideLimits("the path leaves the arm's limits (workspace, planes or keep_out)")
         state = arm.state()
         metres, radians = se3.pose_distance(state.pose, target)
-        if (
-            metres < MAX_POSITION_ERROR
-            and radians < MAX_ROTATION_ERROR
-            and np.linalg.norm(state.twist[:3]) < MAX_REST_SPEED
-        ):
+        if metres < max_distance and radians < max_angle and np.linalg.norm(state.twist[:3]) < max_speed:
             return
         if time.monotonic() > deadline:
             raise DeviceError(f"arm '{name}' did not reach its target within {timeout:g} s")

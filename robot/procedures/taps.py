@@ -25,7 +25,6 @@ from tacsim.rig import Rig
 PAUSE_TIME = 0.8  # without contact, before the first and after the last tap [s]
 CONTACT_TIME = (0.1, 0.4)  # in contact after arrival, minimum and maximum [s]
 LIFTED_TIME = (0.2, 0.9)  # lifted after arrival, minimum and maximum [s]
-PIXEL_STRIDE = 2  # only every n-th row and column of a picture is used
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,6 +84,7 @@ def record_taps(
 
     `stop` ends it early. Raises the errors of the reset, the arm and the camera, after stopping the arm.
     """
+    stride = 2  # only every n-th row and column of a picture is used
     limits = hardware_arm(config, arm).limits
     rig.reset()
     tapping_arm, camera = rig.arms[arm], rig.sensors[sensor]
@@ -94,7 +94,7 @@ def record_taps(
     axis = se3.rotation(start).apply([0.0, 0.0, 1.0])
     above, below = se3.translated_along_z(start, -plan.lift), se3.translated_along_z(start, plan.depth)
     travel = (plan.lift + plan.depth) / limits.speed + 2.0 * limits.speed / limits.acceleration
-    reference = rig.references[sensor].image[::PIXEL_STRIDE, ::PIXEL_STRIDE].astype(np.int16)
+    reference = rig.references[sensor].image[::stride, ::stride].astype(np.int16)
     record = TapRecord()
     try:
         _hold_target(tapping_arm, above, travel + PAUSE_TIME)
@@ -113,9 +113,7 @@ def record_taps(
             frame = camera.read(1.0)
             if not record.frame_times or frame.time > record.frame_times[-1]:
                 record.frame_times.append(frame.time)
-                record.change.append(
-                    float(np.abs(frame.image[::PIXEL_STRIDE, ::PIXEL_STRIDE] - reference).mean()) / 255.0
-                )
+                record.change.append(float(np.abs(frame.image[::stride, ::stride] - reference).mean()) / 255.0)
             time.sleep(POLL_PERIOD)
         _hold_target(tapping_arm, above, travel)
     finally:

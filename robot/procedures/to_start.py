@@ -25,20 +25,10 @@ from tacsim.limits import Region
 from tacsim.models.hardware import UrArmConfig, parts_of
 from tacsim.models.rig import RigConfig
 
-SAMPLE = 5e-3  # between two points of a way at which it is checked [rad of the joint that turns most]
-SAG = 10e-3  # below both ends and the workspace, where the file has no walls, and so no table [m]
 NEAR_LINE = 0.5e-3  # nearer to a wall by no more than that is not nearer [m]
-KEEP_OUT_MARGIN = 10e-3  # beyond the keep-out distance, between a way and the other sensors [m]
-AT_START = 1e-3  # an arm whose joints are all this near to the start's stands there [rad]
 JOINTS = ("base", "shoulder", "elbow", "wrist 1", "wrist 2", "wrist 3")  # as on the pendant
 THERE = 3e-3  # a joint this near to where it shall be is there [rad]
-OFF_FORCE = 1.0  # a sensor that feels more at rest is to be zeroed [N]
-TRIAL = 0.1  # share of a way that is gone first, and at most so many radians of the fastest joint
-TRIAL_TURN = 0.05
-REPEAT = 10e-3  # between two commands on a way [s]
-PATIENCE = 10.0  # longest time without getting on [s]
 PROGRESS = 10.0  # the time that is left is estimated from the progress in the last so many seconds
-BRAKING = 2.0  # longest time to come to rest [s]
 
 
 class NoWay(DeviceError):
@@ -57,7 +47,8 @@ class Way:
     @property
     def is_there(self) -> bool:
         """True if the arm stands at its start."""
-        return float(np.abs(self.end - self.begin).max()) < AT_START
+        max_joint_error = 1e-3  # an arm whose joints are all this near to the start's stands there [rad]
+        return float(np.abs(self.end - self.begin).max()) < max_joint_error
 
     def describe(self) -> str:
         """What a person should know who watches it."""
@@ -78,6 +69,8 @@ def find_way(name: str, config: UrArmConfig, reading: ControllerReading, start: 
     Raises NoWay: out of reach, or the sensor would go farther behind a wall (limits.planes) than it is at both ends; in
     a file without walls, lower than both ends and the workspace.
     """
+    max_sag = 10e-3  # below both ends and the workspace, where the file has no walls, and so no table [m]
+    sample_distance = 5e-3  # between two points of a way at which it is checked [rad of the joint that turns most]
     kinematics, frames, begin = Kinematics(config.model), ArmFrames.of(config), reading.joints
     goal = frames.flange(se3.to_matrix(start))
     if reading.tcp is not None:  # a real arm's own lengths, as far as they show here
@@ -87,7 +80,7 @@ def find_way(name: str, config: UrArmConfig, reading: ControllerReading, start: 
     if not postures:
         raise NoWay(f"arm '{name}': its start is out of reach; correct start, world_from_base, or the mount")
     end = min(postures, key=lambda q: float(np.abs(q - begin).max()))
-    steps = max(2, int(np.abs(end - begin).max() / SAMPLE))
+    steps = max(2, int(np.abs(end - begin).max() / sample_distance))
     joints = begin + np.linspace(0.0, 1.0, steps + 1)[:, None] * (end - begin)
     path = sensor_path(kinematics, frames, joints)[:, :3, 3]
     region = config.limits.region
@@ -103,7 +96,7 @@ def find_way(name: str, config: UrArmConfig, reading: ControllerReading, start: 
             )
     else:
         sunk = min(path[0, 2], path[-1, 2], config.limits.workspace.lower[2]) - float(path[:, 2].min())
-        if sunk > SAG:
+        if sunk > max_sag:
             raise NoWay(
                 f"arm '{name}': on the straight way of the joints its sensor would sink {1e3 * sunk:.0f} mm below "
                 "where it stands, its start and its workspace; give the table as a plane (limits.planes), or jog it "
@@ -115,8 +108,9 @@ def find_way(name: str, config: UrArmConfig, reading: ControllerReading, start: 
 
 def require_clear(name: str, way: Way, others: Mapping[str, FloatArray], distances: Mapping[str, float]) -> None:
     """Raises NoWay where the sensor would come too near to those of other arms, at (3,) [m] in the world."""
+    keep_out_margin = 10e-3  # beyond the keep-out distance, between a way and the other sensors [m]
     for other, place in others.items():
-        gaps, least = np.linalg.norm(way.path - place, axis=1), distances.get(other, 0.0) + KEEP_OUT_MARGIN
+        gaps, least = np.linalg.norm(way.path - place, axis=1), distances.get(other, 0.0) + keep_out_margin
         if gaps.min() < min(least, gaps[0] - NEAR_LINE, gaps[-1] - NEAR_LINE):
             raise NoWay(
                 f"arm '{name}': on its way its sensor would come within {1e3 * gaps.min():.0f} mm of that of arm "
@@ -232,9 +226,10 @@ def lead_to_start(config: RigConfig, starts: Mapping[str, Pose], guide: Guide) -
 
 def _zero(arm: StartArm, guide: Guide) -> None:
     """Offers to zero the force sensor of an arm at rest."""
+    max_force = 1.0  # a sensor that feels more at rest is to be zeroed [N]
     force = float(np.linalg.norm(arm.state().wrench[:3]))
     too_much = arm.status() == ArmStatus.FORCE_LIMIT
-    if force <= OFF_FORCE and not too_much:
+    if force <= max_force and not too_much:
         return
     question = f"Arm '{arm.name}' feels {force:.1f} N at rest. Does its sensor touch nothing, and shall it be zeroed?"
     if guide.ask(question):
@@ -248,12 +243,14 @@ def _zero(arm: StartArm, guide: Guide) -> None:
 
 
 def _lead(arm: StartArm, way: Way, guide: Guide) -> None:
+    max_trial_turn = 0.05
+    trial_share = 0.1  # share of a way that is gone first, and at most so many radians of the fastest joint
     if way.is_there:
         guide.tell(f"Arm '{arm.name}' stands at its start.")
         return
     if arm.status() == ArmStatus.FORCE_LIMIT:
         return
-    trial = min(TRIAL, TRIAL_TURN / float(np.abs(way.end - way.begin).max()))
+    trial = min(trial_share, max_trial_turn / float(np.abs(way.end - way.begin).max()))
     guide.tell(f"Arm '{arm.name}': {way.describe()}.")
     guide.tell("Only the sensors' places and the forces are watched. Has the whole arm room, elbow and cables too?")
     for share, question in (
@@ -290,7 +287,10 @@ class Progress:
 
 def _move(arm: StartArm, share: float, seconds: float, guide: Guide) -> None:
     """Goes on until this share of the way. Whatever ends it brakes the arm."""
-    farthest, deadline, progress = -1.0, time.monotonic() + PATIENCE, Progress(seconds)
+    braking_timeout = 2.0  # longest time to come to rest [s]
+    stall_timeout = 10.0  # longest time without getting on [s]
+    command_interval = 10e-3  # between two commands on a way [s]
+    farthest, deadline, progress = -1.0, time.monotonic() + stall_timeout, Progress(seconds)
     try:
         while not arm.has_gone(share):
             if guide.stop():
@@ -298,7 +298,7 @@ def _move(arm: StartArm, share: float, seconds: float, guide: Guide) -> None:
             arm.go_on(share)
             gone, now = arm.gone(), time.monotonic()
             if gone > farthest + 1e-3:
-                farthest, deadline = gone, now + PATIENCE
+                farthest, deadline = gone, now + stall_timeout
             if now > deadline:
                 raise DeviceError(
                     f"arm '{arm.name}' does not get on, {100 * gone:.0f} % of its way gone; it "
@@ -308,11 +308,11 @@ def _move(arm: StartArm, share: float, seconds: float, guide: Guide) -> None:
             left = progress.seconds_left(share)
             estimate = f"about {left:.0f} s left" if math.isfinite(left) else "no progress"
             guide.show(f"arm '{arm.name}': {100 * max(0.0, gone):.0f} % of the way, {estimate} (Ctrl-C brakes)")
-            time.sleep(REPEAT)
+            time.sleep(command_interval)
     except BaseException:
         arm.stop()
-        until = time.monotonic() + BRAKING
+        until = time.monotonic() + braking_timeout
         while time.monotonic() < until and not arm.status().is_fault and not arm.at_rest():
-            time.sleep(REPEAT)
+            time.sleep(command_interval)
         raise
     arm.stop()

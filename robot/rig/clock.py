@@ -12,7 +12,6 @@ from robot.rig.commanded_arm import CommandedArm, wait_for_arrival
 from tacsim.interface import TactileFrame, TactileSource
 from tacsim.models.driver import Companion
 
-ARRIVE = 10.0  # longest motion of a control period in lock step [s]
 SETTLED = 10e-3  # a force given to a mock controller is in its packages after this time [s]
 
 
@@ -93,7 +92,8 @@ class LockStep(_MonotonicClock):
 
     def tick(self) -> None:
         """Raises DeviceError: an arm does not arrive or is stopped, the cell fails, a picture does not come."""
-        wait_for_arrival(self._arms, ARRIVE)
+        arrival_timeout = 10.0  # longest motion of a control period in lock step [s]
+        wait_for_arrival(self._arms, arrival_timeout)
         self.wait_for_data()
 
     def wait_for_data(self) -> None:

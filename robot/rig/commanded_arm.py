@@ -10,10 +10,6 @@ from tacsim import pose as se3
 from tacsim.interface import ArmState, HardwareArm, Pose
 from tacsim.limits import ActionError
 
-NEAR, TURN = 2e-6, 2e-5  # an arm this near to its target has arrived [m, rad]
-POLL = 4e-3  # between two looks at moving arms [s]
-SHORTENED = 1e-7  # a target that was changed by more counts as shortened [m, rad]
-
 
 class CommandedArm:
     """Implements tacsim.interface.Arm; the target it was sent last is what the clock waits for.
@@ -32,6 +28,7 @@ class CommandedArm:
 
     def command(self, target: Pose | None) -> Pose | None:
         """In a dry run nothing is sent, and None says so."""
+        max_shift = 1e-7  # a target that was changed by more counts as shortened [m, rad]
         if self._dry_run:
             return None
         try:
@@ -39,7 +36,7 @@ class CommandedArm:
         except ActionError:
             self.limits_hit += 1
             raise
-        self.limits_hit += target is not None and sent is not None and max(se3.pose_distance(target, sent)) > SHORTENED
+        self.limits_hit += target is not None and sent is not None and max(se3.pose_distance(target, sent)) > max_shift
         return sent
 
     def send(self, target: Pose | None, speed: float | None = None) -> Pose | None:
@@ -57,9 +54,10 @@ class CommandedArm:
 
     def at_target(self) -> bool:
         """True once the arm rests at its target; without one, once it rests."""
+        max_distance, max_angle = 2e-6, 2e-5  # an arm this near to its target has arrived [m, rad]
         if self.target is None:
             return self.driver.at_rest()
-        return self.driver.arrived(self.target, within=NEAR, turn=TURN)
+        return self.driver.arrived(self.target, within=max_distance, turn=max_angle)
 
     def suspend_tactile_guard(self) -> None:
         """For motions that no observation decides: depth, shear and the age of observations are not guarded until the
@@ -80,6 +78,7 @@ class CommandedArm:
 
 def wait_for_arrival(arms: Mapping[str, CommandedArm], timeout: float) -> None:
     """Waits until all arms rest at their targets. Raises DeviceError after `timeout` [s], and what stops an arm."""
+    poll_interval = 4e-3  # between two looks at moving arms [s]
     deadline = time.monotonic() + timeout
     while moving := [name for name, arm in arms.items() if not arm.advance()]:
         if time.monotonic() > deadline:
@@ -87,4 +86,4 @@ def wait_for_arrival(arms: Mapping[str, CommandedArm], timeout: float) -> None:
             raise DeviceError(
                 f"arm '{name}' did not come to its target within {timeout:g} s: {arms[name].driver.explain()}"
             )
-        time.sleep(POLL)
+        time.sleep(poll_interval)

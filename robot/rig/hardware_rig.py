@@ -25,7 +25,6 @@ from tacsim.rig import Rig
 Confirm = Callable[[str], bool]
 SensorDrivers = Mapping[str, SensorDriver[Any]]
 ArmDrivers = Mapping[str, ArmDriver[Any]]
-MISSED = 2.5  # an approach waits when no picture came for so many periods of its camera
 QUESTION = "Is the body in its place before the sensor, and everybody out of reach of the arm?"
 
 
@@ -175,6 +174,7 @@ def _touch_sense(
 ) -> TouchSense | None:
     """How touch is felt: by the picture if `touch_signal` is given, else by force. None where neither is given, or no
     arm carries a sensor."""
+    missed_periods = 2.5  # an approach waits when no picture came for so many periods of its camera
     carriers = {sensor.arm: arms[sensor.arm] for sensor in config.sensors.values() if sensor.arm is not None}
     if not carriers:
         return None
@@ -183,7 +183,7 @@ def _touch_sense(
             _positive(driver.sample_rate(), driver, f"sensors.{name}", "a sample rate", "Hz")
             for name, driver in sensor_drivers(config).items()
         ]
-        patience = MISSED / min(rates)
+        patience = missed_periods / min(rates)
         return PictureTouch(sensors, normalisers, monitor, config.start.touch_signal, patience)
     force = None if config.task is None else config.task.touch_force
     return None if force is None else ForceTouch(carriers, force)

@@ -22,9 +22,7 @@ from tacsim.models.hardware import ResetConfig
 
 RETREAT = 5e-3  # along the sensor's own axis, before anything else [m]
 TRAVEL = 60.0  # longest motion to the start [s]
-STEP = 5.0  # longest step of an approach [s]
 LOOK = 5e-3  # between two looks of an approach in motion [s]
-FARTHER = 0.1e-3  # an approach goes on while its arms come so much farther within TRAVEL [m]
 AT_END = 0.5  # an approach that has come to its end has met nothing when nothing is told for so long [s]
 PICTURE = 15.0  # longest wait for one that shows the gels at rest [s]
 PAUSE = 0.3  # a shaken arm comes to rest before its force is zeroed [s]
@@ -123,6 +121,7 @@ class HardwareReset:
     def _approach(self, sense: TouchSense) -> None:
         """All arms along their sensors' axes at the approach speed, each until a gel of its own touches. Where no new
         pictures or packages come, they wait."""
+        min_progress = 0.1e-3  # an approach goes on while its arms come so much farther within TRAVEL [m]
         speed, longest = self._config.approach_speed, self._config.approach_distance
         going = {name: self._arms[name] for name in sense.look(guarded=True).pressed}
         ends = {name: se3.translated_along_z(self._begun[name], longest) for name in going}
@@ -142,7 +141,7 @@ class HardwareReset:
                 for name, arm in going.items():
                     gone[name] = se3.pose_distance(arm.state().pose, self._begun[name])[0]
                 self._tell(f"approach: {1e3 * max(gone.values()):.1f} mm of at most {1e3 * longest:g} mm")
-                if sum(gone.values()) > counted + FARTHER:
+                if sum(gone.values()) > counted + min_progress:
                     counted, farther = sum(gone.values()), now
                 if waiting or not all(arm.at_target() for arm in going.values()):
                     before_end = now
@@ -160,6 +159,7 @@ class HardwareReset:
 
     def _approach_by_steps(self, sense: TouchSense) -> None:
         """The same where a simulation has to follow each step before it can be felt."""
+        step_timeout = 5.0  # longest step of an approach [s]
         going = set(sense.look(guarded=False).pressed)
 
         def touches() -> bool:
@@ -168,7 +168,7 @@ class HardwareReset:
             return not going
 
         def advance(distance: float) -> None:
-            self._go({name: se3.translated_along_z(self._begun[name], distance) for name in going}, STEP)
+            self._go({name: se3.translated_along_z(self._begun[name], distance) for name in going}, step_timeout)
             self._clock.wait_for_data()
 
         approach(touches, advance, self._config.approach_step, self._config.approach_distance, ADVICE)

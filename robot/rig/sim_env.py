@@ -21,8 +21,6 @@ from tacsim.models.sensor import Lighting
 from tacsim.sim.scene_world import StatePool, require_same_gels
 from tacsim.tasks import make_task
 
-MOST_ENVIRONMENTS = 10_000  # beyond any machine's memory
-
 Episodes = Sequence[tuple[RigConfig, str]]  # rigs, and what makes each of them in words
 
 
@@ -40,9 +38,10 @@ def open_vector_env(
     features: Features | None,
 ) -> TacsimVectorEnv:
     """`number` of these environments in one batch. Raises CannotOpen, ValueError."""
+    max_environments = 10_000  # beyond any machine's memory
     config, variants = episodes[0][0], _variants(episodes)
-    if number not in range(1, MOST_ENVIRONMENTS + 1):
-        raise ValueError(f"a vector environment has 1 to {MOST_ENVIRONMENTS:,} environments, got {number!r}")
+    if number not in range(1, max_environments + 1):
+        raise ValueError(f"a vector environment has 1 to {max_environments:,} environments, got {number!r}")
     modes = [mode.value for mode in AutoresetMode]
     if autoreset_mode not in (*AutoresetMode, *modes):
         raise ValueError(f"autoreset_mode must be one of {', '.join(modes)}, got {autoreset_mode!r}")

@@ -14,16 +14,13 @@ from typing import Any
 import numpy as np
 
 from robot.common.process import ProcessPool, outside_working_folder, shielded
+from robot.studies.tuning import FINE_STEP_SHARE, MIN_REWARD_FALL, PEAK_PLACE
 from tacsim.config import load_rig
 from tacsim.interface import Action, Observation, Pose, TactileFrame, Truth
 from tacsim.models.rig import RigConfig
 from tacsim.report.figure4 import Moment, Trial
 from tacsim.tasks import Task, evaluate_outcome, make_task
 
-MIN_FALL = 5.0  # both ends of a reward curve must lie more than this many times the distance allowed below its peak
-PEAK_AT = 0.7  # a trial goes on beyond the goal until its peak lies at this share of its curve
-FINE_STEP = 0.25  # share of a step that is taken near the goal, so that the peak is not stepped over
-MIN_IMAGE_CHANGE = 1.0  # mean difference from the image without contact that contact must make [grey levels]
 WHOLE_GEL = ("canonical.rows=80", "canonical.columns=80")  # heights from edge to edge of the gel, for the cut
 # The seed's scheme creeps: in reposition it takes some 1600 substeps after each motion until it counts as settled, ours
 # some 100. It gets a fixed time instead, faster than it settles; its body lags behind, the shape of its curve stays.
@@ -138,7 +135,7 @@ def run_trial(task: str, physics: str, on_step: Callable[[], None] = lambda: Non
             on_step()
             if _is_beyond_goal(distances, planned.tolerance) or step == planned.steps:
                 break
-            share = FINE_STEP if _is_near_goal(distances, planned.tolerance) else 1.0
+            share = FINE_STEP_SHARE if _is_near_goal(distances, planned.tolerance) else 1.0
             longest = share * config.task.max_step / 2  # half of max_step is the policy's own rate
             observation, _ = rig.step(_limited(policy(observation), observation, longest))
     return _trial(config, goal, distances, differences, moments)
@@ -147,7 +144,7 @@ def run_trial(task: str, physics: str, on_step: Callable[[], None] = lambda: Non
 def _is_beyond_goal(distances: list[float], tolerance: float) -> bool:
     """True when the peak lies early enough in the curve, and the curve has fallen far enough after it."""
     peak, last = int(np.argmin(distances)), len(distances) - 1
-    return peak <= PEAK_AT * last and distances[-1] - distances[peak] > 1.2 * MIN_FALL * tolerance
+    return peak <= PEAK_PLACE * last and distances[-1] - distances[peak] > 1.2 * MIN_REWARD_FALL * tolerance
 
 
 def _is_near_goal(distances: list[float], tolerance: float) -> bool:
@@ -232,17 +229,18 @@ def as_json(results: Mapping[str, Mapping[str, Trial]]) -> dict[str, Any]:
 
 def shortcomings(task: str, trial: Trial) -> list[str]:
     """What a curve lacks, in words: it must rise to a peak at the goal, then fall. Empty when it does."""
+    min_image_change = 1.0  # mean difference from the image without contact that contact must make [grey levels]
     allowed = EXPERIMENTS[task].tolerance
     peak, distance = trial.peak, trial.distance
     found = []
     if not distance[peak] <= allowed:
         found.append(f"closest distance {distance[peak] * 1e3:.3f} mm, at most {allowed * 1e3:.2f} mm is wanted")
     for name, end in (("start", distance[0]), ("end", distance[-1])):
-        if not end - distance[peak] > MIN_FALL * allowed:
+        if not end - distance[peak] > MIN_REWARD_FALL * allowed:
             found.append(
-                f"at the {name} the distance is {end * 1e3:.3f} mm, not more than {MIN_FALL:g} x "
+                f"at the {name} the distance is {end * 1e3:.3f} mm, not more than {MIN_REWARD_FALL:g} x "
                 f"{allowed * 1e3:.2f} mm worse than at the peak"
             )
-    if not max(trial.image_difference) > MIN_IMAGE_CHANGE:
+    if not max(trial.image_difference) > min_image_change:
         found.append(f"contact changes the images by at most {max(trial.image_difference):.2f} grey levels")
     return found

@@ -16,6 +16,7 @@ from calibration.errors import BadFrames
 from calibration.frame_set import Frame, FrameSet
 from calibration.light.circle import Circle, NoCircle, find_contact_circle
 from calibration.light.darkness import dark_circle
+from robot.studies.tuning import MAX_DEPTH_SHARE, MIN_DEPTH_MATCH, RADIUS_TOLERANCE
 from tacsim.interface import Image, Pose, SurfaceMap
 from tacsim.models.scene import GelSurface, Scene, Sphere
 from tacsim.models.sensor import CanonicalGrid, SensorModel
@@ -32,10 +33,6 @@ CircleFinder = Callable[[Image, Image, float], Circle]
 # rim: its slope is up to a tenth of the rim's too steep 1.2 contact radii from the middle, and a classifier sees that
 # (docs/measurements/light-and-shadows.md).
 ELEMENT = 0.25e-3
-RADIUS_TOLERANCE = 0.25  # the contact is as wide as the real one when its radius differs by no more [px]
-MAX_ATTEMPTS = 6  # presses that look for the depth
-MAX_DEPTH = 0.7  # of the gel's thickness; from 0.75 the elements under the ball are crushed, at any preset
-CLOSE = 0.97  # of the deepest press, and of a contact's radius: then it is as good as that
 MAX_STEP = 1.3  # from one attempt's depth to the next, as a factor
 
 
@@ -105,7 +102,7 @@ class _PressedGel:
         self.ball, self._sensor, self._grid, self._find = ball, sensor, grid, find
         self._world: World = make_world(scene)
         self._thickness = scene.gel.size[2]
-        self._deepest = MAX_DEPTH * self._thickness
+        self._deepest = MAX_DEPTH_SHARE * self._thickness
         self._last: tuple[float, float] | None = None  # contact radius [px] and depth [m] of the press before
         self._render = Renderer(sensor, scene.gel.size[:2])
         self.untouched = self._seen(*sensor.geometry.principal)
@@ -113,13 +110,14 @@ class _PressedGel:
     def press(self, circle: Circle) -> tuple[Image, SurfaceMap, str]:
         """Picture and surface of a press with this contact circle [px]; and a word if it did not come out. Raises
         CannotPress, SimulationDiverged."""
+        max_attempts = 6  # presses that look for the depth
         pitch, place = self._sensor.geometry.pixel_pitch, np.array([circle.x, circle.y])
         contact = circle.radius * pitch
         self._require_room(contact, self.ball - np.sqrt(max(self.ball**2 - contact**2, 0.0)))
         hertz = contact**2 / self.ball
         depth = min(hertz if self._last is None else _deeper(*self._last, circle.radius), self._deepest)
         tried: list[tuple[float, float]] = []
-        for _ in range(MAX_ATTEMPTS):
+        for _ in range(max_attempts):
             settled = self._press_to(depth)
             image, surface = self._seen(*place)
             try:
@@ -134,8 +132,8 @@ class _PressedGel:
                 return *self._seen(*place), "" if settled else "not settled; raise settling.max_substeps"
             tried.append((radius, depth))
             wanted = _next_depth(tried, circle.radius)
-            if wanted > self._deepest and depth > CLOSE * self._deepest:
-                if radius < CLOSE * circle.radius:
+            if wanted > self._deepest and depth > MIN_DEPTH_MATCH * self._deepest:
+                if radius < MIN_DEPTH_MATCH * circle.radius:
                     self._require_room(contact, wanted)
                 break
             depth = min(wanted, self._deepest)

@@ -28,14 +28,10 @@ from tacsim.physics.worlds.press import PressWorld
 from tacsim.physics.worlds.tuning import INITIAL_GAP, MESH_GRID_SPACING, SAFE_PATH_SHARE
 from tacsim.report.press_pictures import write_height_picture, write_side_picture
 
-QUARTER_TURN = math.pi / 2  # a twist is cut into pieces of at most this: each motion takes the shorter rotation [rad]
 MAX_TWIST = math.radians(3600.0)
-MAX_SLIDE = 3.0  # widths of the gel: beyond, it has left the gel
 # Share of the depth that the gel's contact points may leave unfelt. Balls of 1 mm and more, cylinders, boxes and stars
 # leave 11 % at most; wedges of 60 to 45 degrees 12 to 25 %, and press 10 to 25 % too little. More is refused.
 UNFELT = 0.125
-MAX_TRIALS = 3  # of a depth that is possible
-NEAR = 0.2  # elements: a surface point farther from the indenter is not pressed
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,11 +114,12 @@ def press(scene: Scene, sensor: SensorModel, motion: PressMotion, render: Render
 def deepest_possible(scene: Scene, motion: PressMotion, failure: SimulationDiverged) -> float | None:
     """A depth [m] that this press reaches, found by pressing again less deep than where it failed; None where the
     failure was no matter of depth, or MAX_TRIALS found none."""
+    max_trials = 3  # of a depth that is possible
     if failure.depth is None or not failure.retry:
         return None
     depth = min(failure.depth, motion.depth)
     with dumps_in(None):
-        for _ in range(MAX_TRIALS):
+        for _ in range(max_trials):
             depth = _rounded_down(SAFE_PATH_SHARE * depth)
             world = PressWorld(scene)
             pose = world.pose("indenter")
@@ -143,11 +140,12 @@ def _rounded_down(depth: float) -> float:
 
 def require_reachable(gel: Gel, motion: PressMotion) -> None:
     """Raises ValueError for a depth that is not within the gel, or a slide or twist beyond its limit."""
-    thickness, farthest, slide = gel.size[2], MAX_SLIDE * max(gel.size[:2]), math.hypot(*motion.slide)
+    max_slide = 3.0  # widths of the gel: beyond, it has left the gel
+    thickness, farthest, slide = gel.size[2], max_slide * max(gel.size[:2]), math.hypot(*motion.slide)
     if not 0 < motion.depth < thickness:
         raise ValueError(f"depth is {motion.depth:.4g} m; it must be above 0 and below the gel's {thickness:.4g} m")
     if not slide <= farthest:
-        raise ValueError(f"slide is {slide:.4g} m long; at most {MAX_SLIDE:g} widths of the gel, {farthest:.4g} m")
+        raise ValueError(f"slide is {slide:.4g} m long; at most {max_slide:g} widths of the gel, {farthest:.4g} m")
     if not abs(motion.twist) <= MAX_TWIST:
         most = math.degrees(MAX_TWIST)
         raise ValueError(f"twist is {math.degrees(motion.twist):.4g} deg; at most {most:g} deg either way")
@@ -155,11 +153,13 @@ def require_reachable(gel: Gel, motion: PressMotion) -> None:
 
 def _targets(start: Pose, height: float, motion: PressMotion) -> list[Pose]:
     """Poses of the indenter, in order; height: of its origin, pressed [m]."""
+    # a twist is cut into pieces of at most this: each motion takes the shorter rotation [rad]
+    quarter_turn = math.pi / 2
     down = np.array([start.position[0], start.position[1], height])
     targets = [Pose(down, start.quaternion)]
     if any(motion.slide):
         targets.append(Pose(down + np.append(motion.slide, 0.0), start.quaternion))
-    pieces = math.ceil(abs(motion.twist) / QUARTER_TURN)
+    pieces = math.ceil(abs(motion.twist) / quarter_turn)
     for piece in range(1, pieces + 1):
         turn = se3.from_rotation_vector(np.zeros(3), [0.0, 0.0, motion.twist * piece / pieces])
         targets.append(Pose(targets[-1].position, se3.compose(turn, start).quaternion))
@@ -168,8 +168,9 @@ def _targets(start: Pose, height: float, motion: PressMotion) -> list[Pose]:
 
 def _contact(world: PressWorld, scene: Scene, seen: SurfaceSample, sensor: SensorModel) -> NDArray[np.bool_]:
     """(H, W) True where the indenter presses on the surface seen by a pixel."""
+    contact_distance = 0.2  # elements: a surface point farther from the indenter is not pressed
     assert scene.indenter is not None
-    grid, margin = image_grid(sensor.geometry), NEAR * scene.effective_element_size
+    grid, margin = image_grid(sensor.geometry), contact_distance * scene.effective_element_size
     from_sensor = se3.relative_pose(world.pose("indenter"), world.pose("lower"))
     half = bounding_size(scene.indenter.geometry) / 2 + margin
     corners = se3.transform(se3.inverse(from_sensor), half * (2.0 * np.indices((2, 2, 2)).reshape(3, -1).T - 1.0))

@@ -30,7 +30,6 @@ from tacsim.models.training import Training
 
 TEACHER, RANDOM = "teacher", "random"  # besides the policies of load_policy
 HELD_OUT_SEED_OFFSET = 1_000_000  # added to the training seeds: other bodies, other episodes
-BOOTSTRAP_SAMPLES = 10_000
 ReportProgress = Callable[[str, int, int], None]
 Act = Callable[[TacsimEnv], NDArray[np.float32]]
 
@@ -211,6 +210,7 @@ def wilson_interval(count: int, total: int) -> Interval:
 
 def bootstrap_interval(values: NDArray[np.float64]) -> Interval:
     """Mean of values (n,) with a 95 % bootstrap interval."""
-    chosen = np.random.default_rng(0).integers(len(values), size=(BOOTSTRAP_SAMPLES, len(values)))
+    draws = 10_000
+    chosen = np.random.default_rng(0).integers(len(values), size=(draws, len(values)))
     low, high = np.quantile(values[chosen].mean(axis=1), [0.025, 0.975])
     return Interval(float(values.mean()), float(low), float(high))

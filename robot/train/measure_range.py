@@ -21,7 +21,6 @@ from tacsim.models.sensor import CanonicalGrid
 from tacsim.models.training import Training
 from tacsim.tasks import make_task
 
-EPISODES_EACH = 4  # default number of episodes of each environment
 ReportProgress = Callable[[str, int, int], None]
 
 
@@ -37,6 +36,7 @@ def measure_range(
     Raises PolicyNotFound, IncompatibleRig, ValueError if the file does not contain its training, and the errors of
     `make_vector_env`.
     """
+    episodes_each = 4  # default number of episodes of each environment
     if training is None:
         training = _training_of(path)
     config = load_with_task(training.rig, training.task, training.overrides).config
@@ -51,7 +51,7 @@ def measure_range(
         features=policies[0].spec.features,
         learning=False,  # preset and motion are in the training file
     )
-    rounds = -(-max(2, episodes or EPISODES_EACH * envs.num_envs) // envs.num_envs)
+    rounds = -(-max(2, episodes or episodes_each * envs.num_envs) // envs.num_envs)
     features: list[FloatArray] = []
     try:
         first = envs.members[0]

@@ -21,9 +21,7 @@ PICTURES = ("maps", "flow")  # channels first; the other features are plain numb
 PICTURE_FEATURES = 64  # numbers per picture after its layers
 
 Shapes = Mapping[str, tuple[int, ...]]
-OPSET = 17
 MAX_BYTES = 2 * 2**20
-MAX_ACTION_DIFFERENCE = 1e-5  # between torch and ONNX [-] [-]
 EXAMPLES = 64
 
 
@@ -110,6 +108,8 @@ class ExportError(RuntimeError):
 def export(network: PolicyNetwork, spec: PolicySpec, shapes: Shapes, path: Path) -> float:
     """Writes the file and returns the maximum difference of its actions from the network's for random features. Raises
     ExportError if that exceeds MAX_ACTION_DIFFERENCE or the file exceeds MAX_BYTES."""
+    max_action_difference = 1e-5  # between torch and ONNX [-] [-]
+    opset = 17
     network.eval()
     random = torch.Generator().manual_seed(0)
     examples = [torch.randn((EXAMPLES, *shapes[key]), generator=random) for key in network.keys]
@@ -122,7 +122,7 @@ def export(network: PolicyNetwork, spec: PolicySpec, shapes: Shapes, path: Path)
             buffer,
             input_names=list(network.keys),
             output_names=["action"],
-            opset_version=OPSET,
+            opset_version=opset,
             dynamo=False,
         )
     model = onnx.load_model_from_string(buffer.getvalue())
@@ -131,9 +131,9 @@ def export(network: PolicyNetwork, spec: PolicySpec, shapes: Shapes, path: Path)
     if len(data) > MAX_BYTES:
         raise ExportError(f"the policy has {len(data) / 2**20:.1f} MiB, the maximum is {MAX_BYTES >> 20} MiB")
     max_difference = _max_action_difference(network, data, examples)
-    if not max_difference <= MAX_ACTION_DIFFERENCE:
+    if not max_difference <= max_action_difference:
         raise ExportError(
-            f"the file's actions differ by {max_difference:.2g} from the network's, allowed: {MAX_ACTION_DIFFERENCE:g}"
+            f"the file's actions differ by {max_difference:.2g} from the network's, allowed: {max_action_difference:g}"
         )
     write_whole(path, data)
     return max_difference

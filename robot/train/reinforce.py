@@ -22,8 +22,6 @@ from robot.train.run_folder import ReportProgress
 from tacsim.gym.vector import TacsimVectorEnv
 from tacsim.models.training import Training
 
-RANDOM_STEPS = 1000  # control steps with random actions before SAC learns
-MEMORY_STEPS = 50_000  # control steps in the replay buffer of SAC
 Arrays = dict[str, NDArray[Any]]
 
 
@@ -31,6 +29,8 @@ class Reinforce:
     """PPO or SAC in `envs`. `actor` is exported as the policy file. SAC stores its replay buffer in `folder`."""
 
     def __init__(self, envs: TacsimVectorEnv, training: Training, actor: PolicyNetwork, folder: Path) -> None:
+        replay_steps = 50_000  # control steps in the replay buffer of SAC
+        warm_up_steps = 1000  # control steps with random actions before SAC learns
         settings = training.reinforce
         self.rounds, self.actor = settings.rounds, actor
         self._seed, self._folder = training.seed, folder
@@ -52,7 +52,7 @@ class Reinforce:
             self._model: Any = PPO("MultiInputPolicy", self._envs, n_steps=self._steps, **common)
         else:
             self._model = SAC(
-                "MultiInputPolicy", self._envs, learning_starts=RANDOM_STEPS, buffer_size=MEMORY_STEPS, train_freq=1,
+                "MultiInputPolicy", self._envs, learning_starts=warm_up_steps, buffer_size=replay_steps, train_freq=1,
                 gradient_steps=envs.num_envs // 2 or 1, **common,
             )  # fmt: skip
 

@@ -37,7 +37,6 @@ SIDES: tuple[Side, ...] = ("simulation", "twin")
 RIGS = {"simulation": "sim", "twin": "mock"}
 KNOWN_KEYS = ("task.", "scene.body.geometry")  # of a twin, visible to a person
 ROWS_FILE = "episodes.jsonl"
-ADDRESS_BLOCK = 77  # second number of mock addresses in parallel processes
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,10 +127,11 @@ def _play_in_parallel(study: Study, parts: Parts, workers: int) -> Iterator[Epis
 
 def _play_in_process(study: Study, side: Side, twin: int, remaining: Sequence[tuple[str, int]]) -> list[EpisodeResult]:
     """Plays in a separate process, whose mocks have separate addresses."""
+    address = 77  # second number of mock addresses in parallel processes
     overrides: list[str] = []
     if side == "twin":
         for number, name in enumerate(load_rig(RIGS[side]).config.arms, start=1):
-            host = loopback_host(number, ADDRESS_BLOCK)
+            host = loopback_host(number, address)
             overrides += [f"arms.{name}.host={host}", f"sensors.{name}.source=http://{host}:8081/?action=stream"]
     return list(_play_on_hidden_rig(replace(study, overrides=(*study.overrides, *overrides)), side, twin, remaining))
 

@@ -11,10 +11,7 @@ from tacsim.geometry.tiles import cached_tiled_distance
 from tacsim.interface import FloatArray, Mask
 from tacsim.models.scene import Body, Mesh, Shape
 
-REPULSION_STEPS = 20  # of mutual repulsion
-REPULSION_RANGE = 1.1  # particles nearer than this push each other apart [spacings]; evenly spread ones are ~1.1 apart
 REPULSION_SHARE = 0.25  # share of the missing distance by which each of two moves
-MIN_DEPTH = 0.05  # no particle nearer to the surface than this [spacings]
 
 
 def body_points(body: Body, spacing: float) -> FloatArray:
@@ -33,6 +30,10 @@ def blue_noise_points(geometry: Shape, spacing: float, seed: int) -> FloatArray:
     particles closer than 1.1 spacings, and from their mirror images behind the surface, evens them out (as in de Goes
     et al. 2012, Blue noise through optimal transport, but by pair forces) and leaves no direction preferred.
     """
+    min_depth = 0.05  # no particle nearer to the surface than this [spacings]
+    # particles nearer than this push each other apart [spacings]; evenly spread ones are ~1.1 apart
+    repulsion_range = 1.1
+    repulsion_steps = 20  # of mutual repulsion
     random = np.random.default_rng(seed)
     size = bounding_size(geometry)
     layers = np.maximum(np.rint(size / spacing).astype(int), 1)
@@ -40,13 +41,13 @@ def blue_noise_points(geometry: Shape, spacing: float, seed: int) -> FloatArray:
     points = ((cells + random.random(cells.shape)) / layers - 0.5) * size
     surface = _distance_function(geometry, spacing)
     points = points[surface(points)[0] < 0]
-    for _ in range(REPULSION_STEPS):
+    for _ in range(repulsion_steps):
         depth, normals = surface(points)
         depth = -depth
-        points = points + _repulsion_steps(points, REPULSION_RANGE * spacing)
-        points -= (REPULSION_SHARE * np.maximum(REPULSION_RANGE * spacing - 2 * depth, 0.0))[:, None] * normals
+        points = points + _repulsion_steps(points, repulsion_range * spacing)
+        points -= (REPULSION_SHARE * np.maximum(repulsion_range * spacing - 2 * depth, 0.0))[:, None] * normals
         depth, normals = surface(points)
-        points -= np.maximum(depth + MIN_DEPTH * spacing, 0.0)[:, None] * normals
+        points -= np.maximum(depth + min_depth * spacing, 0.0)[:, None] * normals
     inside: Mask = shape_distance(geometry, points) < 0  # at sharp edges of a mesh its grid is not exact
     if not inside.any():
         raise no_particle_error(geometry, spacing)

@@ -35,7 +35,6 @@ MIN_LAYERS = 3  # of particles: one has no height, and two cannot bulge
 MAX_MISFIT = 0.1  # relative error of the size or the volume that the lattice of particles may have
 LEVEL_SINE = 1e-5  # sine of an angle below which a direction is level with a face; float32 rotations are 1e-7 off
 MIN_EDGE_ANGLE = math.radians(30.0)  # facets of what is drawn round meet at less
-MIN_EDGE_LENGTH = 10e-6  # [m] shorter edges of a file are what its float32 numbers made of a point
 EXACT_BAND = 2  # grid spacings round a mesh in which the distance is exact
 
 
@@ -298,10 +297,11 @@ def _mesh_extent(geometry: Mesh, content: str) -> tuple[float, ...]:
 @lru_cache(maxsize=64)
 def _sharp_edges(geometry: Mesh, content: str) -> FloatArray:
     """Ends (n, 2, 3) [m] of the edges that stick out where two faces of a mesh meet at more than SHARP."""
+    min_edge_length = 10e-6  # [m] shorter edges of a file are what its float32 numbers made of a point
     mesh = centred_mesh(geometry, content)
     sharp = mesh.face_adjacency_convex & (mesh.face_adjacency_angles > MIN_EDGE_ANGLE)
     ends = np.asarray(mesh.vertices[mesh.face_adjacency_edges[sharp]], np.float64)
-    return np.asarray(ends[np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) > MIN_EDGE_LENGTH])
+    return np.asarray(ends[np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) > min_edge_length])
 
 
 def _shape_name(geometry: Shape) -> str:

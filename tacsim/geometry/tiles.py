@@ -27,8 +27,6 @@ TILE_NODES = 32  # nodes along an edge
 MAX_SURFACES = 64  # meshes remembered in one process, the latest used; most have 1 to 4 MB
 MAX_TILES = 2_000  # tiles in one process, of all meshes, those used last: 260 MB; one grid has 610 at most
 MAX_SHARED_TILES = 4_000  # tiles in a folder that processes share: 520 MB
-PIECE_SIZE = 4  # grid spacings: edge of the pieces that the surface is cut into for the search
-PIECE_COUNT_RANGE = (4_000, 100_000)  # at least, about at most
 
 # By file, content, spacing and number, so that a tile keeps no mesh in memory; the oldest first. Worlds of several
 # threads come here one after the other (`tacsim.compute.runtime.launching`).
@@ -61,6 +59,8 @@ class TiledDistance:
 
     def __init__(self, geometry: Mesh, content: str, spacing: float) -> None:
         """content: fingerprint of the file. Raises what :func:`tacsim.geometry.mesh.load_mesh` raises."""
+        piece_count_range = (4_000, 100_000)  # at least, about at most
+        piece_size = 4  # grid spacings: edge of the pieces that the surface is cut into for the search
         mesh = centred_mesh(geometry, content)
         self.name = geometry.path
         self.spacing = spacing
@@ -68,8 +68,8 @@ class TiledDistance:
         self._faces = np.asarray(mesh.faces, np.int64)  # (m, 3)
         self.half: FloatArray = np.asarray(mesh.extents, np.float64) / 2  # of the bounding box (3,)
         self.origin: FloatArray = -self.half - EXACT_BAND * spacing
-        fewest, most = PIECE_COUNT_RANGE
-        self._surface = make_surface(mesh, int(np.clip(2.3 * mesh.area / (PIECE_SIZE * spacing) ** 2, fewest, most)))
+        fewest, most = piece_count_range
+        self._surface = make_surface(mesh, int(np.clip(2.3 * mesh.area / (piece_size * spacing) ** 2, fewest, most)))
         self._last = np.ceil((self.half - self.origin) / spacing + EXACT_BAND).astype(np.int64) // TILE_NODES
         self._key = geometry, content, spacing
 

@@ -39,9 +39,6 @@ class SensorGeometry(Config):
         return ((self.width - 1) / 2.0, (self.height - 1) / 2.0) if self.centre is None else self.centre
 
 
-PROJECTION_CHUNK = 1 << 16  # points at a time: OpenCV makes the Jacobian along, 240 bytes a point
-
-
 class Lens(Config):
     """A pinhole with distortion (Brown's model, as OpenCV has it)."""
 
@@ -59,11 +56,12 @@ class Lens(Config):
 
     def project(self, directions: FloatArray) -> FloatArray:
         """(n, 2) pixels of lines of sight (n, 2), each as x/z, y/z."""
+        projection_chunk = 1 << 16  # points at a time: OpenCV makes the Jacobian along, 240 bytes a point
         import cv2
 
         found = np.empty((len(directions), 2))
-        for start in range(0, len(directions), PROJECTION_CHUNK):
-            part = slice(start, start + PROJECTION_CHUNK)
+        for start in range(0, len(directions), projection_chunk):
+            part = slice(start, start + projection_chunk)
             ahead = np.concatenate([directions[part], np.ones((len(directions[part]), 1))], axis=1)
             pixels, _ = cv2.projectPoints(ahead, np.zeros(3), np.zeros(3), self.matrix, np.array(self.distortion))
             found[part] = pixels.reshape(-1, 2)

@@ -16,7 +16,6 @@ from tacsim.models.quantity import Config
 Number = float | str  # bare, or a text with its unit ("5 mm")
 Entry = Number | tuple[Number, ...]  # of a list each element is drawn by itself
 _NUMBER = re.compile(r"\s*([-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?)\s*([^\s0-9.]\S*)?\s*")
-_MAX_DRAWS = 1000  # draws of a normal until one is within its bounds
 
 
 class Distribution(Config):
@@ -125,6 +124,7 @@ def _require_drawable(elements: tuple[tuple[float, ...], str], kind: str) -> Non
 
 
 def _draw_elements(elements: tuple[tuple[float, ...], str], kind: Distribution, random: np.random.Generator) -> str:
+    max_draws = 1000  # draws of a normal until one is within its bounds
     numbers, unit = elements
     least, greatest = numbers[-2:]
     if kind.log_uniform is not None:
@@ -133,7 +133,7 @@ def _draw_elements(elements: tuple[tuple[float, ...], str], kind: Distribution, 
         value = random.uniform(least, greatest)
     else:
         mean, deviation = numbers[:2]
-        tries = random.normal(mean, deviation, _MAX_DRAWS)
+        tries = random.normal(mean, deviation, max_draws)
         inside = tries[(tries >= least) & (tries <= greatest)]
         # Bounds that are this narrow cut a piece out of the bell that is flat.
         value = float(inside[0]) if len(inside) else random.uniform(least, greatest)

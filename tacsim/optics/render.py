@@ -36,7 +36,6 @@ from tacsim.optics.tuning import LIGHT_TABLE_POINTS, MAX_SLOPE, TEXTURE_PITCH
 
 WHITE = np.float32(255.0)
 MAX_PROJECTION_ERROR = 0.5  # [px] that a pixel put on the gel and back may be off
-MAX_TABLE_ERROR = 0.5  # largest error of the table [grey levels]; narrower highlights are computed without it
 
 
 class Renderer:
@@ -254,6 +253,8 @@ def light_table(lighting: Lighting) -> Float32 | None:
     """(n, n, 3) light at slopes from -STEEPEST to STEEPEST, rows by y; 255 is white. None for highlights so narrow that
     light between the points is more than MAX_TABLE_ERROR off."""
 
+    max_table_error = 0.5  # largest error of the table [grey levels]; narrower highlights are computed without it
+
     def light(first: float, number: int) -> Float32:
         along = ((first + np.arange(number)) * (MAX_SLOPE / LIGHT_TABLE_POINTS)).astype(np.float32)
         return phong_shading(np.stack(np.meshgrid(along, along), axis=-1), lighting, white=255.0)
@@ -261,7 +262,7 @@ def light_table(lighting: Lighting) -> Float32 | None:
     table = light(-LIGHT_TABLE_POINTS, 2 * LIGHT_TABLE_POINTS + 1)
     middles = light(0.5 - LIGHT_TABLE_POINTS, 2 * LIGHT_TABLE_POINTS)
     between = (table[1:, 1:] + table[:-1, 1:] + table[1:, :-1] + table[:-1, :-1]) / 4
-    if not float(np.abs(between - middles).max()) <= MAX_TABLE_ERROR:
+    if not float(np.abs(between - middles).max()) <= max_table_error:
         return None
     table.flags.writeable = False
     return table

@@ -15,7 +15,6 @@ from tacsim.physics.move import MoveStats
 from tacsim.physics.world import World, make_world
 
 State = Mapping[str, NDArray[Any]]
-MAX_BYTES = 256_000_000  # of kept states
 
 
 class SceneWorld:
@@ -106,7 +105,7 @@ class StatePool:
     """States that motions from a known start ended in, so that the same motion need not be computed again. A state is a
     function of its key alone, so results do not depend on what is kept: the states used last, MAX_BYTES of them."""
 
-    def __init__(self, max_bytes: int = MAX_BYTES) -> None:
+    def __init__(self, max_bytes: int = 256_000_000) -> None:
         self._max_bytes, self._bytes = max_bytes, 0
         self._states: OrderedDict[object, tuple[State, MoveStats | None]] = OrderedDict()
 

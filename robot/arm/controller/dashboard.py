@@ -13,8 +13,6 @@ from robot.common import Closing
 from robot.errors import DeviceError, DeviceNotConnectedError, EmergencyStop, ProtectiveStop
 
 PORT = 29999
-MAX_LINE = 4096
-UNLOCK_TIMEOUT = 8.0  # a controller refuses to unlock in the first 5 s after a protective stop [s]
 
 
 class Dashboard(Closing):
@@ -43,12 +41,13 @@ class Dashboard(Closing):
         return self._read_line(request)
 
     def _read_line(self, request: str) -> str:
+        max_line = 4096
         while b"\n" not in self._buffer:
             try:
-                part = self._socket.recv(MAX_LINE)
+                part = self._socket.recv(max_line)
             except OSError as failure:
                 raise self._no_answer_error(request, failure) from failure
-            if not part or len(self._buffer) > MAX_LINE:
+            if not part or len(self._buffer) > max_line:
                 raise self._no_answer_error(request, "closed" if not part else "an endless line")
             self._buffer += part
         line, self._buffer = self._buffer.split(b"\n", 1)
@@ -103,7 +102,8 @@ class Dashboard(Closing):
 
     def unlock(self, requester: str) -> None:
         """Releases a protective stop. Raises EmergencyStop for any other stop, ProtectiveStop if the release fails."""
-        deadline = time.monotonic() + UNLOCK_TIMEOUT
+        unlock_timeout = 8.0  # a controller refuses to unlock in the first 5 s after a protective stop [s]
+        deadline = time.monotonic() + unlock_timeout
         answer = ""
         while (safety := self.safety()) == "PROTECTIVE_STOP":
             if time.monotonic() > deadline:

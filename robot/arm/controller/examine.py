@@ -28,7 +28,6 @@ from tacsim.models.hardware import UrArmConfig
 
 PORTS = {DASHBOARD: "dashboard", 30003: "script", RTDE: "RTDE"}
 TIMEOUT = 2.0  # of each connection [s]
-MIN_POLYSCOPE = (5, 6)  # the first version that tells whether it is in remote control
 
 
 def examine(name: str, config: UrArmConfig, start: Pose | None, file: str) -> ArmExamination:
@@ -72,10 +71,11 @@ def _open(host: str, port: int) -> bool:
 
 
 def _controller(name: str, config: UrArmConfig, dashboard: Dashboard) -> Iterator[Check]:
+    min_polyscope = (5, 6)  # the first version that tells whether it is in remote control
     version = dashboard.request("PolyscopeVersion")
     found = re.search(r"(\d+)\.(\d+)\.\d+", version)
-    fit = found is not None and (int(found[1]), int(found[2])) >= MIN_POLYSCOPE
-    lowest = ".".join(map(str, MIN_POLYSCOPE))
+    fit = found is not None and (int(found[1]), int(found[2])) >= min_polyscope
+    lowest = ".".join(map(str, min_polyscope))
     advice = "" if fit else f"update PolyScope to {lowest} or later: older ones cannot be asked for remote control"
     yield Check(f"{name}: PolyScope", "ok" if fit else "warn", version, advice)
     model, serial = dashboard.model(), dashboard.serial()

@@ -17,7 +17,6 @@ from robot.errors import DeviceNotConnectedError
 from tacsim.interface import FloatArray
 
 PORT = 30004
-PACKAGE_RATE = 125.0  # requested rate [Hz]; every generation of controllers supports it
 AVERAGING_TIME = 0.3  # forces are means over this time [s]
 HEADER = struct.Struct(">HB")  # size with header, kind
 VERSION, SETUP, START, DATA = b"VOSU"
@@ -118,7 +117,8 @@ def _read_outputs(session: _Session) -> ControllerReading:
 
 def _request_outputs(session: _Session, names: list[str]) -> list[str]:
     """Requests these outputs and returns their types. Raises ValueError if a required one is missing."""
-    answer = session.ask(SETUP, struct.pack(">d", PACKAGE_RATE) + ",".join(names).encode())
+    package_rate = 125.0  # requested rate [Hz]; every generation of controllers supports it
+    answer = session.ask(SETUP, struct.pack(">d", package_rate) + ",".join(names).encode())
     types = answer[1:].decode(errors="replace").split(",")
     if len(types) != len(names):
         raise ValueError(f"{len(names)} values were requested, {len(types)} are offered")

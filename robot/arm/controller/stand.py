@@ -16,11 +16,7 @@ from tacsim.limits import ROUNDING
 from tacsim.models.driver import Check, State
 from tacsim.models.hardware import UrArmConfig
 
-GRAVITY = 9.82  # [m/s^2]
 OFF_FORCE = 1.0  # a sensor that feels more at rest is zeroed before an episode [N]
-SAME_MASS, SAME_CENTRE = 0.05, 10e-3  # payloads this near to each other are the same [kg, m]
-SAME_PLACE, SAME_TURN = 0.5e-3, 5e-3  # TCPs this near to each other are the same [m, rad]
-MODEL_LENGTH = 20e-3  # a pose farther than this from that of the model is of another model [m]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,6 +33,7 @@ class Stand:
 
 def stand(config: UrArmConfig, reading: ControllerReading) -> Stand:
     """From what a controller told."""
+    gravity = 9.82  # [m/s^2]
     frames = ArmFrames.of(config)
     shown = matrix(reading.tcp_pose)
     if reading.tcp is None:  # an old controller: by the nominal lengths of the model, to a millimetre or so
@@ -53,7 +50,7 @@ def stand(config: UrArmConfig, reading: ControllerReading) -> Stand:
             (-reading.payload, reading.payload_centre),
         ):
             lever = flange[:3, :3] @ np.array(centre) + flange[:3, 3] - shown[:3, 3]
-            weight += mass * GRAVITY * np.concatenate([up, np.cross(lever, up)])
+            weight += mass * gravity * np.concatenate([up, np.cross(lever, up)])
     base_from_sensor = inverse_frame(frames.world_from_base) @ sensor
 
     def at_sensor(wrench: FloatArray) -> FloatArray:
@@ -85,8 +82,9 @@ def compare(name: str, config: UrArmConfig, now: Stand, start: Pose | None, file
 
 def _model(name: str, config: UrArmConfig, now: Stand) -> Check | None:
     """A failed check where joints and pose do not belong to the model of the file."""
+    limit = 20e-3  # a pose farther than this from that of the model is of another model [m]
     found = displacement(Kinematics(config.model).forward(now.reading.joints), now.flange)
-    if now.reading.tcp is None or float(np.linalg.norm(found[:3])) < MODEL_LENGTH:
+    if now.reading.tcp is None or float(np.linalg.norm(found[:3])) < limit:
         return None
     far = f"its flange is {1e3 * float(np.linalg.norm(found[:3])):.0f} mm from where a {config.model} would have it"
     return Check(f"{name}: pose", "fail", far, "correct model in the rig file")
@@ -136,24 +134,26 @@ def _force(name: str, config: UrArmConfig, now: Stand, file: str) -> Check:
 
 
 def _payload(name: str, config: UrArmConfig, now: Stand) -> Check:
+    max_mass_error, max_centre_error = 0.05, 10e-3  # payloads this near to each other are the same [kg, m]
     label, told, reading = f"{name}: payload", config.payload, now.reading
     wanted = f"{told.mass:g} kg at {_mm(np.array(told.centre))} mm"
     if reading.payload is None or reading.payload_centre is None:
         return Check(label, "ok", f"not told by this controller; connecting sets the file's, {wanted}")
     found = f"{reading.payload:.3g} kg at {_mm(reading.payload_centre)} mm"
     away = float(np.linalg.norm(reading.payload_centre - np.array(told.centre)))
-    if abs(reading.payload - told.mass) <= SAME_MASS and (told.mass <= SAME_MASS or away <= SAME_CENTRE):
+    if abs(reading.payload - told.mass) <= max_mass_error and (told.mass <= max_mass_error or away <= max_centre_error):
         return Check(label, "ok", found)
     advice = "connecting sets the file's; which of the two was weighed? A wrong one is felt as a force"
     return _own(config, Check(label, "warn", f"the controller has {found}, the file says {wanted}", advice))
 
 
 def _tcp(name: str, config: UrArmConfig, now: Stand) -> Check:
+    max_distance, max_angle = 0.5e-3, 5e-3  # TCPs this near to each other are the same [m, rad]
     label, wanted = f"{name}: TCP", se3.to_matrix(config.flange_from_tool.pose)
     if now.reading.tcp is None:
         return Check(label, "ok", f"not told by this controller; connecting sets the file's, {_shown(pose(wanted))}")
     shift, turn = np.linalg.norm(displacement(wanted, now.tcp).reshape(2, 3), axis=1)
-    if shift <= SAME_PLACE and turn <= SAME_TURN:
+    if shift <= max_distance and turn <= max_angle:
         return Check(label, "ok", _shown(pose(now.tcp)))
     found = f"the controller has {_shown(pose(now.tcp))}, the file says {_shown(pose(wanted))}"
     advice = "connecting sets the file's; until then the pendant's poses are those of its own TCP, here too"

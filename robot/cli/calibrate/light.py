@@ -19,15 +19,15 @@ if TYPE_CHECKING:
     from tacsim.models.geometry import PictureRegion
     from tacsim.models.sensor import CameraNoise, Markers
 
-MAX_PRESSES = 200  # 5 to 8 are enough
 UNKNOWN = "unknown"  # serial number of a sensor that nobody named
 FRAMES = "frames"  # folder in a bundle of the pictures that a camera took for it
 
 
 def read_presses(frames: Path, reference: Path | None) -> FrameSet:
+    max_presses = 200  # 5 to 8 are enough
     with busy("loading"):
         from calibration.frame_set import read_folder
-    read = read_folder(frames, reference, MAX_PRESSES)
+    read = read_folder(frames, reference, max_presses)
     if read.estimated:
         notes.print("no picture without contact: the median of all presses stands for it")
     return read

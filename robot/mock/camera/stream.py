@@ -27,7 +27,6 @@ from robot.mock.camera.camera import Faults
 BOUNDARY = "boundarydonotcross"
 MAX_CLIENTS = 16
 SHIFTS = 32  # of the noise, in rows and in columns: it is drawn once
-MAX_DELAYED = 1024  # frames that wait for the delay to pass; beyond it the oldest is lost
 SEND_TIMEOUT = 5.0  # a client that takes nothing for so long is cut [s]
 
 
@@ -35,13 +34,14 @@ class FrameSource:
     """Exposes pictures at `fps`, and a pushed one at once; holds the newest JPEG for the clients."""
 
     def __init__(self, width: int, height: int, fps: float, quality: int, stamped: bool, noise: int) -> None:
+        max_delayed = 1024  # frames that wait for the delay to pass; beyond it the oldest is lost
         self.width, self.height = width, height
         self._period, self._quality, self._stamped = 1.0 / fps, quality, stamped
         self._changed = threading.Condition()  # guards all that follows
         self._faults = Faults()
         self._picture: NDArray[np.uint8] | None = None  # the one pushed last
         self._fresh = False  # it was not exposed yet
-        self._delayed: deque[tuple[float, int, bytes]] = deque(maxlen=MAX_DELAYED)  # when to send, number, JPEG
+        self._delayed: deque[tuple[float, int, bytes]] = deque(maxlen=max_delayed)  # when to send, number, JPEG
         self._newest: tuple[int, bytes] = (0, b"")  # how many were sent so far; JPEG
         self._number = 0  # of the newest
         self._exposed = b""  # the newest JPEG, undamaged

@@ -30,9 +30,6 @@ from tacsim.pose import pose_distance
 if TYPE_CHECKING:
     from tacsim.physics.world import World
 
-NICENESS = 19
-SAME = 1e-7  # a sensor that moved less has not moved [m, and rad over 0.1]
-
 
 class CellModel(Protocol):
     """What is in the cell: simulated (WorldCell), or in closed form (HertzCell)."""
@@ -69,10 +66,11 @@ class WorldCell:
         self.move(poses)
 
     def move(self, poses: Mapping[str, Pose]) -> None:
+        same_place = 1e-7  # a sensor that moved less has not moved [m, and rad over 0.1]
         targets = {}
         for name, pose in poses.items():
             metres, radians = pose_distance(self.world.pose(name), pose)
-            if max(metres, 0.1 * radians) > SAME:
+            if max(metres, 0.1 * radians) > same_place:
                 targets[name] = pose
         if targets:
             self.stats = {key: float(value) for key, value in asdict(self.world.move(targets)).items()}
@@ -111,11 +109,12 @@ class Server:
         return self._scene_frame(cell, time.perf_counter() - began)
 
     def _open(self, request: Mapping[str, Any]) -> None:
+        niceness = 19
         scene = Scene.model_validate_json(json.dumps(request["scene"]))
         models = {name: SensorModel.model_validate_json(json.dumps(model)) for name, model in request["models"].items()}
         kind: Callable[..., CellModel] = HertzCell if request["contact"] == "hertz" else WorldCell
         if kind is WorldCell:
-            os.nice(NICENESS)
+            os.nice(niceness)
         self._cell = kind(scene, models, CanonicalGrid.model_validate(request["grid"]))
         self._rendered = list(models)
 

@@ -32,7 +32,6 @@ from tacsim.models.hardware import CameraSensorConfig, MockCameraConfig, UrArmCo
 from tacsim.models.rig import RigConfig
 from tacsim.models.sensor import SensorModel
 
-POSTURE = (0.0, -1.5, 1.5, -1.5, -1.5, 0.0)  # seed of the joints at power-on: elbow up [rad]
 FREE_RUN = 5e-3  # shortest time between two steps while running free [s]
 
 
@@ -104,11 +103,12 @@ class MockCell(Closing):
     def _initial_joints(self, name: str, arm: UrArmConfig) -> Sequence[float]:
         """Joints at power-on [rad]: by the rig file, else such that the sensor is at its start; of all postures the one
         farthest from a singularity."""
+        posture = (0.0, -1.5, 1.5, -1.5, -1.5, 0.0)  # seed of the joints at power-on: elbow up [rad]
         if arm.mock is not None and arm.mock.joints is not None:
             return arm.mock.joints
         kinematics = Kinematics(arm.model)
         start = self.start_poses[name]
-        postures = kinematics.solutions(self._frames[name].flange(se3.to_matrix(start)), np.array(POSTURE))
+        postures = kinematics.solutions(self._frames[name].flange(se3.to_matrix(start)), np.array(posture))
         if not postures:
             raise DeviceError(
                 f"arms.{name}: its start {np.round(start.position, 4).tolist()} m is out of reach of a "

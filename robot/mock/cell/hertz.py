@@ -29,7 +29,6 @@ from tacsim.optics.surface import surface_map
 
 RADIUS = 4e-3  # of the balls [m]
 GAP = 0.2e-3  # between gel and ball at the beginning: two balls, one on the other, between two gels [m]
-SPACING = 0.25e-3  # of the nodes on which the surface is given [m]
 GRAIN = 10e-6  # places that are nearer than this to each other show one picture [m]
 KEPT = 512  # pictures that are not drawn again
 
@@ -111,7 +110,8 @@ def _contact(sensor: Pose, ball: FloatArray) -> tuple[float, float, float]:
 
 def dent(size: tuple[float, float], depth: float, x: float, y: float) -> GelSurface:
     """The surface of a gel of `size` (x, y) [m] into which a ball of RADIUS is pressed by `depth` at x, y [m]."""
-    counts = [round(length / SPACING) + 1 for length in size]
+    spacing = 0.25e-3  # of the nodes on which the surface is given [m]
+    counts = [round(length / spacing) + 1 for length in size]
     axes = [np.linspace(-length / 2, length / 2, count) for length, count in zip(size, counts, strict=True)]
     r = np.hypot(*np.meshgrid(axes[0] - x, axes[1] - y, indexing="ij"))
     displacement = np.zeros((*counts, 3), np.float32)
@@ -120,4 +120,4 @@ def dent(size: tuple[float, float], depth: float, x: float, y: float) -> GelSurf
         far = np.maximum(r, a)
         outside = ((2 * a**2 - far**2) * np.arcsin(a / far) + a * np.sqrt(far**2 - a**2)) / (np.pi * RADIUS)
         displacement[..., 2] = -np.where(r < a, depth - r**2 / (2 * RADIUS), outside)
-    return GelSurface(displacement, SPACING, (-size[0] / 2, -size[1] / 2))
+    return GelSurface(displacement, spacing, (-size[0] / 2, -size[1] / 2))

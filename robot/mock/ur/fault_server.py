@@ -24,9 +24,6 @@ from robot.mock.ur.wire.fields import INPUTS
 from tacsim.interface import FloatArray
 
 PAGE = 500  # input packages in one reply
-MAX_REQUEST = 1 << 16  # bytes
-MAX_CLIENTS = 64  # more are closed at once
-MAX_DELAY = 60.0  # of a slow line [s]
 
 
 class FaultServer:
@@ -55,10 +52,11 @@ class FaultServer:
                 self._serve(client)
 
     def _accept(self) -> None:
+        max_clients = 64  # more are closed at once
         client = accept(self._listener, self.port)
         if client is None:
             return
-        if len(self._clients) >= MAX_CLIENTS:
+        if len(self._clients) >= max_clients:
             client.close()
             return
         self._clients.add(client)
@@ -72,11 +70,12 @@ class FaultServer:
 
     def _serve(self, client: Connection) -> None:
         """Answers one request; nothing more is read from a client that has sent others."""
+        max_request = 1 << 16  # bytes
         alive = client in self._behind or client.read()
         line = next(lines(client.received), None)
         if line is not None:
             client.send(json.dumps(self.answer(line)).encode() + b"\n")
-        if not alive or (line is None and len(client.received) > MAX_REQUEST):
+        if not alive or (line is None and len(client.received) > max_request):
             self._drop(client)
         else:
             (self._behind.add if b"\n" in client.received else self._behind.discard)(client)
@@ -166,7 +165,8 @@ def _drop(controller: Controller, probability: float, seed: int) -> None:
 
 
 def _delay(controller: Controller, seconds: float) -> None:
-    controller.faults.delay = _number(seconds, "delay", 0.0, MAX_DELAY)
+    max_delay = 60.0  # of a slow line [s]
+    controller.faults.delay = _number(seconds, "delay", 0.0, max_delay)
 
 
 def _claim(controller: Controller, names: list[str]) -> None:

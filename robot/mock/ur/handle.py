@@ -20,9 +20,6 @@ if TYPE_CHECKING:
     from tacsim.models.hardware import Model  # pydantic and SciPy: half a second of start-up
 
 
-DYING = 0.2  # between the end of a process's connections and its own [s]
-
-
 class MockError(DeviceError):
     """A mock controller did not start."""
 
@@ -72,8 +69,9 @@ class MockArms(Child):
 
     def _last_words(self) -> str:
         """Why the process has ended, to be added to an error; nothing while it runs."""
+        dying_time = 0.2  # between the end of a process's connections and its own [s]
         with contextlib.suppress(subprocess.TimeoutExpired):
-            self._process.wait(DYING)
+            self._process.wait(dying_time)
         try:
             self.check()
         except MockError as error:

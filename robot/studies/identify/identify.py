@@ -16,6 +16,7 @@ from calibration.materials.presses import Noise, Press, downsample_press, merge_
 from calibration.materials.tuning import COARSE_SIMULATION_ERROR
 from robot.studies.identify.recordings import Recordings
 from robot.studies.identify.simulation import Simulation, coarser, scene_with
+from robot.studies.identify.tuning import FIRST_FRICTION, FIRST_YIELD
 from tacsim.interface import FloatArray
 from tacsim.models.material import elastic_constants
 from tacsim.models.scene import Scene
@@ -26,11 +27,6 @@ UNWEIGHED = (
 )
 MOMENTS = 16  # of a press, that are simulated
 FACTOR = 30.0  # how far stiffness and yield may be from where the fit begins
-LEAST_FRICTION, MOST_FRICTION = 0.01, 5.0
-SLIPPING = 0.25  # friction at which a body slips on a gel: that tells friction, while the force of a body that sticks
-# does not depend on it
-MOST_POISSON = 0.499
-YIELD_SHARE = 0.06  # of a body that the scene thinks elastic: where the fit begins, over its stiffness
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,23 +51,22 @@ class Identified:
 
 def parameters_of(kind: Kind, scene: Scene) -> tuple[Parameter, ...]:
     """All that can be asked, beginning at what the scene says."""
+    max_nu, lowest, highest = 0.499, 0.01, 5.0  # of the Poisson ratio; of the friction
     if kind == "gel":
         assert scene.indenter is not None
         gel = scene.gel.material
         nu, mu = min(gel.poisson_ratio, 0.49), min(max(scene.indenter.friction, 0.1), 1.0)
         return (
             _around("youngs_modulus", gel.youngs_modulus),
-            Parameter("poisson_ratio", nu, 0.0, MOST_POISSON, "volume"),
-            Parameter("friction", mu, LEAST_FRICTION, MOST_FRICTION),
+            Parameter("poisson_ratio", nu, 0.0, max_nu, "volume"),
+            Parameter("friction", mu, lowest, highest),
         )
     assert scene.body is not None
     material = scene.body.material
     limit, (shear, _) = material.elastic_limit, elastic_constants(material)
-    strength = math.sqrt(1.5) * 2 * shear * limit if math.isfinite(limit) else YIELD_SHARE * material.youngs_modulus
+    strength = math.sqrt(1.5) * 2 * shear * limit if math.isfinite(limit) else FIRST_YIELD * material.youngs_modulus
     frictions = (
-        Parameter(
-            f"friction_{name}", min(max(mu, 0.1), 1.0), LEAST_FRICTION, MOST_FRICTION, begin=min(max(mu, 0.1), SLIPPING)
-        )
+        Parameter(f"friction_{name}", min(max(mu, 0.1), 1.0), lowest, highest, begin=min(max(mu, 0.1), FIRST_FRICTION))
         for name, mu in scene.friction.items()
     )
     return (

@@ -8,16 +8,24 @@ import math
 from collections.abc import Sequence
 from itertools import pairwise
 
+from robot.studies.identify.tuning import (
+    BODY_SLIDE_SHARE,
+    BODY_STEP,
+    PRESS_DEPTH,
+    SLIDE,
+    SLIDE_DEPTH,
+    SLIDE_SQUEEZE_SHARE,
+    SQUEEZE_SHARE,
+    STEP,
+    TILT_BACK,
+    TILT_DEPTH,
+    TILT_RELEASE,
+    TILT_SLIDE,
+)
 from tacsim.geometry.shapes import bounding_size
 from tacsim.models.scene import Scene
 
-PRESS_DEPTH, SLIDE_DEPTH = 0.25, 0.2  # of the gel's thickness
-SLIDE, STEP = 2.0e-3, 0.1e-3  # how far a gel is slid, and in what steps it is pressed [m]
-SQUEEZED, HELD = 0.4, 0.12  # of the body's height: how far it is closed, to squeeze it and to slide on it
-BODY_STEP, BODY_SLIDE = 0.04, 0.5  # of its height: a step, a slide
 TILT = math.radians(16.0)  # gels whose angles of friction differ by less than this both slip
-TILTED, EASED = 0.16, 0.06  # of the body's height: how far a tilted gel is pressed in, and goes back before it slides
-THERE, BEYOND = 0.3, 0.2  # of its height: how far a tilted gel is slid along the other's face, and on the way back
 REST = 3  # periods before the touch and after it, clear of everything: they tell the zero of the force
 CLEAR = 0.3e-3  # how far a gel goes back from where it touched [m]
 TURN = math.radians(2.0)  # how far a gel is turned in a step
@@ -70,7 +78,7 @@ def _slid(depth: float) -> list[Row]:
 
 
 def _squeezed(height: float) -> list[Row]:
-    step, closed = BODY_STEP * height, SQUEEZED * height
+    step, closed = BODY_STEP * height, SQUEEZE_SHARE * height
     half = closed / 2
     legs = [(-CLEAR, half), (half, half - 2 * step), (half - 2 * step, closed), (closed, closed - 5 * step)]
     path = [row for a, b in legs for row in _line((0, a, 0), (0, b, 0), step)]
@@ -79,7 +87,7 @@ def _squeezed(height: float) -> list[Row]:
 
 
 def _dragged(height: float) -> list[Row]:
-    far, deep, step = BODY_SLIDE * height, HELD * height, BODY_STEP * height
+    far, deep, step = BODY_SLIDE_SHARE * height, SLIDE_SQUEEZE_SHARE * height, BODY_STEP * height
     path = _line((0, -CLEAR, 0), (0, deep, 0), step) + _line((0, deep, 0), (far, deep, 0), 2 * step)
     path += _line((far, deep, 0), (0, deep, 0), 2 * step) + _line((0, deep, 0), (0, -CLEAR, 0), 2 * step)
     return [*[(0.0, -CLEAR, 0.0)] * REST, *path, *[(0.0, -CLEAR, 0.0)] * REST]
@@ -89,10 +97,10 @@ def _tilted(height: float, width: float) -> list[Row]:
     """Lifted before it is tilted: an edge that turns into the body throws it off the other gel. Eased before it slides:
     a body pressed as far as it yields shears under the gel instead of slipping."""
     lift = CLEAR + width / 2 * math.sin(TILT)  # until an edge touches
-    eased, step = (TILTED - EASED) * height, BODY_STEP * height
+    eased, step = (TILT_DEPTH - TILT_RELEASE) * height, BODY_STEP * height
     turns = [
-        (0.0, -lift, TILT), (0.0, TILTED * height, TILT), (0.0, eased, TILT), (THERE * height, eased, TILT),
-        (-BEYOND * height, eased + (THERE + BEYOND) * height * math.tan(TILT), TILT),  # along its own face
+        (0.0, -lift, TILT), (0.0, TILT_DEPTH * height, TILT), (0.0, eased, TILT), (TILT_SLIDE * height, eased, TILT),
+        (-TILT_BACK * height, eased + (TILT_SLIDE + TILT_BACK) * height * math.tan(TILT), TILT),  # along its own face
     ]  # fmt: skip
     path = [row for a, b in pairwise(turns) for row in _line(a, b, 1.5 * step if b[0] else step)]
     end = (turns[-1][0], -lift, TILT)

@@ -27,8 +27,6 @@ from tacsim.record.sources import read_columns
 
 TABLE, EPISODE = ".csv", ".mcap"
 FORCES = ("fx", "fy", "fz")
-FEWEST = 3  # moments of a press
-SHALLOWEST = 0.2e-3  # dent whose width can be told from noise and mesh [m]
 
 
 class BadRecording(CalibrationError):
@@ -59,9 +57,10 @@ class Recordings:
 
     def read(self, path: Path) -> Press:
         """Raises BadRecording, EpisodeError."""
+        min_moments = 3  # moments of a press
         press = self._table(path) if path.suffix.lower() == TABLE else self._episode(path)
-        if len(press.time) < FEWEST:
-            raise BadRecording(f"{path}: {len(press.time)} moments; a press needs at least {FEWEST}")
+        if len(press.time) < min_moments:
+            raise BadRecording(f"{path}: {len(press.time)} moments; a press needs at least {min_moments}")
         if not any(name.rpartition(".")[2] in FORCES for name in press.readings):
             raise BadRecording(
                 f"{path}: no forces; give a recording with an arm that feels them, or columns fx, fy, fz"
@@ -177,6 +176,7 @@ class Recordings:
         self.seen[role] = Seen(grid, markers, touch.valid)
 
     def _felt(self, role: str, sensor: str, arm: str | None, now: Observation) -> dict[str, float]:
+        min_depth = 0.2e-3  # dent whose width can be told from noise and mesh [m]
         felt = {}
         if arm is not None and arm in now.arms:
             wrench = now.arms[arm].wrench
@@ -189,7 +189,7 @@ class Recordings:
             felt |= shape_signals(role, touch.height, flow, touch.valid, self.seen[role].grid.pitch)
             if self.scene.indenter is None:  # the width tells an indenter; of a body it hangs on mesh and edges
                 felt.pop(f"{role}.width", None)
-            elif touch.height is not None and np.abs(touch.height[touch.valid]).max(initial=0.0) < SHALLOWEST:
+            elif touch.height is not None and np.abs(touch.height[touch.valid]).max(initial=0.0) < min_depth:
                 felt[f"{role}.width"] = math.nan
         return felt
 

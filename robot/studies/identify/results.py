@@ -23,7 +23,6 @@ from tacsim.report.figure import COLOURS, INK, QUIET, canvas, plain, save
 
 UNITS = {"youngs_modulus": ("kPa", 1e-3), "yield_stress": ("kPa", 1e-3), "hardening_modulus": ("kPa", 1e-3)}
 FORMAT = 1
-MOST_DRAWN = 6  # presses; a column each
 
 
 def in_words(parameter: Parameter, value: float) -> str:
@@ -127,7 +126,8 @@ def _scene_text(identified: Identified) -> str:
 def draw(identified: Identified, table: Sequence[tuple[str, str, str]], path: Path) -> None:
     """Writes a picture: for each press its normal force against depth, its sideways force against the way sideways, and
     what is left of all signals over its standard deviation; on top what was found."""
-    shown = identified.presses[:MOST_DRAWN]
+    max_drawn = 6  # presses; a column each
+    shown = identified.presses[:max_drawn]
     figure = canvas(max(3.4 * len(shown), 9.0), 9.5)
     lines = [f"{name.replace('_', ' ')}   {value}   (95 %: {interval})" for name, value, interval in table]
     lines += [f"{each.name.replace('_', ' ')}   not told" for each in identified.fit.unidentified]

@@ -22,9 +22,6 @@ from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.physics.worlds.batch import Batch
 
 Job = tuple[tuple[float, ...], float, float, int]  # values of the parameters, place [m], size, index of the press
-AT_ONCE = 16  # presses in one batch
-COUNTS = 0.25  # of the deepest point: what is as deep counts as a dent's width
-SIZE_DIFFERENCE = 0.1  # step of the logarithm of the indenter's size
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,11 +49,12 @@ class Simulation:
 
     def __call__(self, points: Sequence[Point]) -> list[FloatArray]:
         """(m,) signals at each point, in the order of `signals_of`. Raises CannotSimulate."""
+        batch_size = 16  # presses in one batch
         keys = [[self._key(point, index) for index in range(len(self.presses))] for point in points]
         jobs = list(dict.fromkeys(key for each in keys for key in each))
         ran: dict[Job, FloatArray] = {}
-        for begin in range(0, len(jobs), AT_ONCE):
-            part = jobs[begin : begin + AT_ONCE]
+        for begin in range(0, len(jobs), batch_size):
+            part = jobs[begin : begin + batch_size]
             self.on_run(begin, len(jobs))
             ran |= zip(part, self._run(part), strict=True)
         self.on_run(len(jobs), len(jobs))
@@ -74,8 +72,9 @@ class Simulation:
 
     def by_size(self, point: Point) -> FloatArray:
         """(m,) derivative of the signals by the logarithm of the indenter's size. Raises CannotSimulate."""
-        base, larger = self([point, replace(point, size=SIZE_DIFFERENCE)])
-        found: FloatArray = (larger - base) / SIZE_DIFFERENCE
+        size_step = 0.1  # step of the logarithm of the indenter's size
+        base, larger = self([point, replace(point, size=size_step)])
+        found: FloatArray = (larger - base) / size_step
         return found
 
     @property
@@ -171,11 +170,12 @@ def shape_signals(
 
     The width hardly depends on the material; it goes with the root of a ball's radius.
     """
+    contact_share = 0.25  # of the deepest point: what is as deep counts as a dent's width
     found = {}
     if height is not None:
         square = height[valid].astype(np.float64) ** 2
         found[f"{sensor}.dent"] = float(np.sqrt(np.mean(square)))
-        deep = square[square > COUNTS**2 * square.max()]
+        deep = square[square > contact_share**2 * square.max()]
         share = float(deep.sum() ** 2 / (deep**2).sum()) if len(deep) else 0.0
         found[f"{sensor}.width"] = pitch * math.sqrt(share / math.pi)
     if flow is not None:

@@ -13,10 +13,10 @@ import numpy as np
 
 from robot.arm import channel
 from robot.arm.channel import HISTORY
-from robot.arm.servo import FAULT_DECELERATION, MAX_STALL_PERIODS
 from robot.arm.shared_ring import Record
 from robot.arm.status import ArmStatus
 from robot.arm.trajectory import PERIOD
+from robot.arm.tuning import FAULT_DECELERATION, MAX_STALL_PERIODS
 from robot.arm.ur import URArm
 from robot.common.kinematics import Kinematics
 from robot.mock import Input, MockState

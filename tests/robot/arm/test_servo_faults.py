@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from robot.arm.channel import CommandKind, Partner, make_tactile_record
-from robot.arm.servo import FAULT_DECELERATION, ZERO_REQUEST_TIMEOUT, Servo
+from robot.arm.servo import Servo
 from robot.arm.status import ArmStatus
 from robot.arm.trajectory import PERIOD
+from robot.arm.tuning import FAULT_DECELERATION, ZERO_REQUEST_TIMEOUT
 from tests.robot.arm.servo_bench import Bench, other, shifted, worker_config
 
 

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from robot.arm.channel import Partner
-from robot.arm.servo import MAX_STALL_PERIODS
 from robot.arm.status import ArmStatus
 from robot.arm.trajectory import PERIOD
+from robot.arm.tuning import MAX_STALL_PERIODS
 from robot.arm.worker import MAX_MISSED_PACKAGES
 from robot.common.kinematics import rotation
 from tacsim import pose as se3

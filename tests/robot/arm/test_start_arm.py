@@ -7,9 +7,10 @@ import time
 import numpy as np
 import pytest
 
-from robot.arm.start_servo import JOINT_SPEED, distance_from_way
+from robot.arm.start_servo import distance_from_way
 from robot.arm.status import ArmStatus
 from robot.arm.trajectory import PERIOD
+from robot.arm.tuning import JOINT_SPEED
 from robot.arm.ur import URArm
 from robot.errors import DeviceError, SafetyViolation
 from robot.mock import MockUR

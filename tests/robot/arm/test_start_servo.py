@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from robot.arm.channel import STATE, CommandKind, Partner, make_command_record
-from robot.arm.start_servo import JOINT_SPEED, OFF_WAY, distance_from_way
+from robot.arm.start_servo import distance_from_way
 from robot.arm.status import ArmStatus
 from robot.arm.trajectory import PERIOD
+from robot.arm.tuning import JOINT_SPEED, OFF_PATH
 from tests.robot.arm.servo_bench import HOME, Bench, other, shifted
 
 FAR = {"lower": [1.0, 1.0, 1.0], "upper": [1.1, 1.1, 1.1]}  # a box in which the arm does not stand
@@ -98,7 +99,7 @@ def test_a_share_that_is_none_moves_nothing(share: float) -> None:
 def test_an_arm_off_its_way_is_stopped() -> None:
     made = bench()
     go(made, 1.0, 300)
-    made.q = made.q + [0.0, 0.0, 0.0, 1.5 * OFF_WAY, 0.0, 0.0]
+    made.q = made.q + [0.0, 0.0, 0.0, 1.5 * OFF_PATH, 0.0, 0.0]
     made.look()
     made.run(1)
     assert made.servo.status == ArmStatus.OFF_PATH
@@ -131,7 +132,7 @@ def test_it_waits_for_an_arm_that_lags() -> None:
             made.servo.check_faults(made.now, [])
             joints = made.servo.step(made.time, made.now, [])
             assert joints is not None
-            assert np.abs(joints - made.q).max() < 1.5 * OFF_WAY
+            assert np.abs(joints - made.q).max() < 1.5 * OFF_PATH
             made.q = made.q + np.clip(joints - made.q, -1e-5, 1e-5)  # 5 mrad/s
             made.look()
     assert not made.servo.status.is_fault and made.q[0] - HOME[0] > 1e-3

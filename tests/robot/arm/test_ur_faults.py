@@ -9,9 +9,9 @@ import time
 import numpy as np
 import pytest
 
-from robot.arm.servo import FAULT_DECELERATION
 from robot.arm.status import ArmStatus
 from robot.arm.trajectory import PERIOD
+from robot.arm.tuning import FAULT_DECELERATION
 from robot.arm.ur import URArm
 from robot.errors import (
     DeviceError,

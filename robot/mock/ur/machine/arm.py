@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from tacsim.models.hardware import Model  # pydantic and SciPy: half a second of start-up
 
 PERIOD = 0.002  # one control period [s]
-SERVO_RATE = 500.0  # of the joint servos [rad/s]
 JOINT_ACCELERATION = 40.0  # top acceleration in servo motion [rad/s^2]
 COAST = 8.0  # deceleration of the leading joint when nothing commands the arm [rad/s^2]
 BRAKE = 20.0  # the same in a protective or emergency stop [rad/s^2]
@@ -46,6 +45,7 @@ class Arm:
     """Joints (6,) [rad], their speeds [rad/s], and what follows from them. All poses and twists in base axes."""
 
     def __init__(self, model: Model = "ur5e", joints: Sequence[float] = HOME) -> None:
+        servo_rate = 500.0  # of the joint servos [rad/s]
         self.kinematics = Kinematics(model)
         self.tool = np.eye(4)  # flange_from_tcp
         self.target_q = np.array(joints, dtype=np.float64)
@@ -57,7 +57,7 @@ class Arm:
         self.set_q, self.set_qd = self.target_q.copy(), np.zeros(6)
         self.q, self.qd = self.target_q.copy(), np.zeros(6)
         self.scale = 1.0  # speed scaling now, 0 to 1
-        self.servo_rates = np.full(6, SERVO_RATE)  # of each joint; a fault may make one slow
+        self.servo_rates = np.full(6, servo_rate)  # of each joint; a fault may make one slow
         self.held = False  # the tool is held: the joints stand, whatever their servos want
         self.waypoint: FloatArray | None = None  # (4, 4) where the present move ends
         self.history: deque[FloatArray] = deque([self.q] * HISTORY, maxlen=HISTORY)

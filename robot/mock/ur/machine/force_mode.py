@@ -20,8 +20,6 @@ from tacsim.interface import FloatArray
 MASS = np.repeat([2.0, 0.04], 3)  # [kg, kg m^2]
 FULL_DAMPING = np.repeat([12e3, 240.0], 3)  # [N/(m/s), N m/(rad/s)]
 ACCELERATION = np.repeat([5.0, 50.0], 3)  # top [m/s^2, rad/s^2]
-POINT_DISTANCE = 0.01  # least distance of TCP and task frame in type 1 [m] (UR5e user manual, force mode "Point")
-MOVES = 1e-6  # a TCP faster than this moves, in type 3 [m/s]
 
 
 @dataclass
@@ -59,11 +57,14 @@ class ForceMode:
         return _turned(self.turn, rigid) + scale * self.twist
 
     def _orient(self, arm: Arm) -> None:
+        min_speed = 1e-6  # a TCP faster than this moves, in type 3 [m/s]
+        # least distance of TCP and task frame in type 1 [m] (UR5e user manual, force mode "Point")
+        point_distance = 0.01
         turn = self.frame[:3, :3]
         if self.kind == 1:
             towards = self.frame[:3, 3] - arm.frame[:3, 3]
             distance = float(np.linalg.norm(towards))
-            if distance < POINT_DISTANCE:
+            if distance < point_distance:
                 near = f"the TCP is {1e3 * distance:.1f} mm from the point, at least 10 mm are needed"
                 raise ProgramError(f"force_mode of type 1: {near}")
             self.turn = _least_turn(turn[:, 1], towards / distance) @ turn
@@ -72,7 +73,7 @@ class ForceMode:
         else:
             x, y = turn[:, :2].T @ arm.target_twist[:3]  # of the program: giving way is no motion
             speed = float(np.hypot(x, y))
-            if speed > MOVES:
+            if speed > min_speed:
                 c, s = x / speed, y / speed
                 self.turn = turn @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 

@@ -29,7 +29,6 @@ from robot.mock.ur.machine.user_script import CompileError
 from tacsim.interface import FloatArray
 
 POWER_UP = 50  # periods from power on to idle
-RELEASE = 50  # periods from idle to running
 SLIDER_RATE = 5.0  # how fast the speed scaling follows the slider [1/s]
 
 
@@ -154,9 +153,10 @@ class Machine(MachineState):
 
     def release_brakes(self) -> None:
         """From idle to running; powers on first where needed."""
+        release_periods = 50  # periods from idle to running
         if self.safety is Safety.ROBOT_EMERGENCY_STOP or self.mode is Mode.RUNNING:
             return
-        wait = RELEASE + (0 if self.mode is Mode.IDLE else POWER_UP)
+        wait = release_periods + (0 if self.mode is Mode.IDLE else POWER_UP)
         self.mode = Mode.IDLE if self.mode is Mode.IDLE else Mode.POWER_ON
         self._changing = (self.ticks + wait, Mode.RUNNING)
 

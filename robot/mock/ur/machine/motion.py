@@ -27,7 +27,6 @@ from tacsim.interface import FloatArray
 
 FREEDRIVE_DAMPING = 200.0  # [N/(m/s)]
 FREEDRIVE_TURN_DAMPING = 20.0  # [N m/(rad/s)]
-FREEDRIVE_ACCELERATION = 2.0  # [m/s^2, rad/s^2]
 
 
 def between(a: FloatArray, b: FloatArray, s: float) -> FloatArray:
@@ -250,11 +249,12 @@ def servoc(arm: Arm, goal: FloatArray, acceleration: float, speed: float) -> Mot
 def comply(arm: Arm, frame: FloatArray, free: Sequence[float], push: FloatArray, limits: FloatArray) -> None:
     """One control period of compliance: the free axes of `frame` move at `push` (base axes, as a twist), at most
     `limits`; the others hold still."""
+    max_acceleration = 2.0  # [m/s^2, rad/s^2]
     turn = frame[:3, :3]
     local = np.concatenate([turn.T @ push[:3], turn.T @ push[3:]])
     local = np.where(np.asarray(free) != 0, np.clip(local, -limits, limits), 0.0)
     wanted = np.concatenate([turn @ local[:3], turn @ local[3:]])
-    twist, _ = _ramp(arm.target_twist, arm.scale * wanted, FREEDRIVE_ACCELERATION, joint=False)
+    twist, _ = _ramp(arm.target_twist, arm.scale * wanted, max_acceleration, joint=False)
     arm.drive(arm.joint_speeds_of(twist))
 
 

@@ -22,9 +22,7 @@ from robot.mock.ur.machine.registry import command
 from tacsim.interface import FloatArray
 
 CONTACT_FOUND = 254  # the script gives it itself
-CONTACT_FORCE, CONTACT_ONSET = 5.0, 1.0  # a contact is felt from the one, and began at the other [N]
 
-LINES = 16  # of a path that are read in one control period
 _MOVE = re.compile(r"(movej|movel|movep)\((p?)\[([^\]]*)\],\s*a=([^,]+),\s*v=([^,]+)(?:,\s*r=([^,)]+))?\)")
 _PROGRESS = re.compile(r"signal_async_progress\((\d{1,9})\)")
 
@@ -62,11 +60,12 @@ def _numbers(texts: Sequence[str | None], count: int) -> FloatArray:
 
 def _path(p: Program) -> MotionSteps:
     """The path in the text. Blended waypoints are one motion; their progress is signalled when it begins."""
+    max_lines = 16  # of a path that are read in one control period
     lines = map(str.strip, p.text.partition("# inject move path\n")[2].splitlines())
     block = takewhile(lambda line: not line.startswith("end"), lines)
     waiting: list[Waypoint] = []
     for number, line in enumerate(filter(None, block), 1):
-        if number % LINES == 0:
+        if number % max_lines == 0:
             yield
         if progress := _PROGRESS.fullmatch(line):
             p.signal(int(progress.group(1)))
@@ -219,17 +218,18 @@ def jog_stop(p: Program) -> MotionSteps | None:
 
 def _steps_since_contact(p: Program, direction: FloatArray) -> int:
     """tool_contact(): periods since the contact against `direction` (3,) began; 0 without contact."""
+    contact_force, onset_force = 5.0, 1.0  # a contact is felt from the one, and began at the other [N]
     size = float(np.linalg.norm(direction[:3]))
 
     def against(force: FloatArray) -> float:
         return float(np.linalg.norm(force[:3])) if size == 0 else -float(force[:3] @ direction[:3]) / size
 
     history = p.machine.load.history
-    if not history or against(history[-1]) < CONTACT_FORCE:
+    if not history or against(history[-1]) < contact_force:
         return 0
     steps = 0
     for felt in reversed(history):
-        if against(felt) < CONTACT_ONSET:
+        if against(felt) < onset_force:
             break
         steps += 1
     return steps

@@ -16,7 +16,6 @@ from tacsim.interface import FloatArray
 CONTROL_SCRIPT = "rtde_control"
 READY, DONE = 1, 2  # answers in output_int_register_0
 LARGEST = 1e6  # of a number in a command; what a controller takes is not known, and no arm needs more [SI]
-LAST_OFFSET = 24  # of the registers: ur_rtde uses the 24 of each kind that begin at 0, or at 24
 _ENDED = object()
 
 
@@ -78,10 +77,11 @@ class Program:
         self.machine.out_int[index + self.int_offset] = value
 
     def _offset(self, kind: str) -> int:
+        last_offset = 24  # of the registers: ur_rtde uses the 24 of each kind that begin at 0, or at 24
         found = re.search(rf"reg_offset_{kind} = # {kind} register offset\s*(\d+)", self.text)
         offset = found.group(1) if found else "0"
-        if len(offset) > 9 or int(offset) > LAST_OFFSET:
-            raise ProgramError(f"{kind} register offset {offset[:9]}: at most {LAST_OFFSET}")
+        if len(offset) > 9 or int(offset) > last_offset:
+            raise ProgramError(f"{kind} register offset {offset[:9]}: at most {last_offset}")
         return int(offset)
 
     # -- threads -----------------------------------------------------------------------------------------------------

@@ -13,8 +13,6 @@ from robot.mock.ur.machine.program import CONTROL_SCRIPT, DONE, READY, Program
 from robot.mock.ur.machine.registry import COMMANDS
 from robot.mock.ur.machine.state import MachineState
 
-STOP_SCRIPT = 255  # the command that ends the script
-
 
 def make_program(machine: MachineState, text: str) -> Program:
     """The program of a text, ready for its first step. Raises ProgramError where it cannot be compiled."""
@@ -25,6 +23,7 @@ def make_program(machine: MachineState, text: str) -> Program:
 
 def _control_loop(program: Program) -> MotionSteps:
     """The loop of the control script: one command of the client after the other."""
+    stop_script = 255  # the command that ends the script
     program.signal(-1)
     program.answer_integer(READY, 0)
     executing = False
@@ -40,7 +39,7 @@ def _control_loop(program: Program) -> MotionSteps:
             executing = False
             program.answer_integer(READY, 0)
         elif not executing:
-            if command == STOP_SCRIPT:
+            if command == stop_script:
                 return
             yield from work
             program.answer_integer(DONE, 0)

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from tacsim.models.hardware import Model  # pydantic and SciPy: half a second of start-up
 
 REGISTERS = 48  # of each kind and direction
-LINE = 500  # longest text of the log
-UNLOCK_DELAY = 0.0  # least time from a protective stop to its unlocking [s]; real robots want 5 s
 
 
 class Outputs:
@@ -75,6 +73,7 @@ class MachineState:
         version: Version = VERSION,
         tool: Mass = NOTHING,  # hangs on the flange
     ) -> None:
+        unlock_delay = 0.0  # least time from a protective stop to its unlocking [s]; real robots want 5 s
         self.version = version
         self.arm, self.load, self.outputs = Arm(model, joints), Load(tool), Outputs()
         self.load.update(self.arm)
@@ -94,7 +93,7 @@ class MachineState:
         self.control_offset = 0  # of the registers of the last control script
         self.stop_reason = ""  # why the last program ended
         self.stopped_at = -math.inf  # time of the last protective stop [s]
-        self.unlock_delay = UNLOCK_DELAY
+        self.unlock_delay = unlock_delay
         self.clock_offset = 0.0  # of the timestamp that is sent [s]
         self.work_time = 0.0  # what the last control period took to compute [s]
         self.log: deque[tuple[float, str]] = deque(maxlen=200)
@@ -112,7 +111,8 @@ class MachineState:
         return self.arm.rests and self.freedrive is None and self.force_mode is None
 
     def write_log(self, text: str) -> None:
-        self.log.append((self.time, printable_line(text[:LINE])))
+        max_line = 500  # longest text of the log
+        self.log.append((self.time, printable_line(text[:max_line])))
 
     def stop(self, reason: str) -> None:
         """Ends the program; the arm coasts to rest."""

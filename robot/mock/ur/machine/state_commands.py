@@ -13,9 +13,6 @@ from robot.mock.ur.machine.program import Program
 from robot.mock.ur.machine.registry import command
 from tacsim.interface import FloatArray
 
-STEEPEST = 100.0  # of set_gravity [m/s^2]
-NEAR_SINGULAR, SINGULAR = 0.05, 0.02  # of Kinematics.singularity, for get_freedrive_status
-
 # -- settings --------------------------------------------------------------------------------------------------------
 
 
@@ -48,8 +45,9 @@ def tool(p: Program) -> None:
 
 @command(59)
 def gravity(p: Program) -> None:
+    max_gravity = 100.0  # of set_gravity [m/s^2]
     towards = p.doubles(0, 3)
-    if np.abs(towards).max() > STEEPEST:
+    if np.abs(towards).max() > max_gravity:
         raise ProgramError(f"set_gravity: {towards.tolist()} m/s^2")
     p.machine.load.gravity = towards
 
@@ -97,8 +95,9 @@ def _reaches(p: Program, seed: FloatArray) -> bool:
 
 
 def _singular(p: Program) -> int:
+    near_singular, fully_singular = 0.05, 0.02  # of Kinematics.singularity, for get_freedrive_status
     measure = p.arm.kinematics.singularity(p.arm.q)
-    return (measure < NEAR_SINGULAR) + (measure < SINGULAR)
+    return (measure < near_singular) + (measure < fully_singular)
 
 
 def _query(

@@ -26,9 +26,6 @@ from robot.mock.ur.machine.load import Mass
 from robot.mock.ur.machine.program import LARGEST, Program
 from tacsim.interface import FloatArray
 
-LONGEST_LINE = 1000  # characters
-MOST_CALLS = 5000  # of one program
-BURST = 16  # calls that take no time, in one control period
 CALLS: dict[str, Callable[..., MotionSteps | None]] = {}
 _SUMS: dict[type, Callable[[float, float], float]] = {ast.Add: operator.add, ast.Sub: operator.sub}
 
@@ -50,13 +47,15 @@ class Pose(tuple[float, ...]):
 
 def compiled(text: str) -> list[tuple[str, list[Any], dict[str, Any]]]:
     """The calls of a program: name and arguments. Raises CompileError with the first line that is no such call."""
+    max_calls = 5000  # of one program
+    max_line = 1000  # characters
     found = []
     for number, line in enumerate(text.strip().splitlines(), start=1):
         words = line.partition("#")[0].strip()
         if not words or words == "end" or re.fullmatch(r"def\s+\w+\s*\(\s*\)\s*:", words):
             continue
         try:
-            if len(words) > LONGEST_LINE:
+            if len(words) > max_line:
                 raise ValueError
             call = ast.parse(words, mode="eval").body
             if not isinstance(call, ast.Call) or not isinstance(call.func, ast.Name):
@@ -65,8 +64,8 @@ def compiled(text: str) -> list[tuple[str, list[Any], dict[str, Any]]]:
                 raise CompileError(f"compile_error_name_not_found:{call.func.id}", line, number)
             named = {each.arg or "": _value(each.value) for each in call.keywords}
             found.append((call.func.id, [_value(each) for each in call.args], named))
-            if len(found) > MOST_CALLS:
-                raise CompileError(f"compile_error: more than {MOST_CALLS} calls", line, number)
+            if len(found) > max_calls:
+                raise CompileError(f"compile_error: more than {max_calls} calls", line, number)
         except (SyntaxError, ValueError, TypeError, OverflowError, RecursionError, MemoryError):
             raise CompileError(f"syntax_error_on_line:{number}", line, number) from None
     return found
@@ -74,11 +73,12 @@ def compiled(text: str) -> list[tuple[str, list[Any], dict[str, Any]]]:
 
 def run(program: Program) -> MotionSteps:
     """Does what the program says; raises ProgramError at once where it cannot be compiled."""
+    max_burst = 16  # calls that take no time, in one control period
     calls = compiled(program.text)
 
     def steps() -> MotionSteps:
         for number, (name, arguments, named) in enumerate(calls, start=1):
-            if number % BURST == 0:
+            if number % max_burst == 0:
                 yield
             try:
                 yield from CALLS[name](program, *arguments, **named) or ()

@@ -8,13 +8,13 @@ from collections.abc import Sequence
 Version = tuple[int, int, int, int]  # major, minor, bugfix, build
 
 VERSION: Version = (5, 11, 0, 108150)
-LARGEST_NUMBER = 2**32 - 1  # the RTDE tells each as a uint32
 
 
 def check_version(numbers: Sequence[float]) -> Version:
     """Four whole numbers that the RTDE can tell. Raises ValueError."""
-    if len(numbers) != 4 or not all(0 <= number <= LARGEST_NUMBER and number == int(number) for number in numbers):
-        raise ValueError(f"a version is four whole numbers from 0 to {LARGEST_NUMBER}, got {list(numbers)}")
+    max_number = 2**32 - 1  # the RTDE tells each as a uint32
+    if len(numbers) != 4 or not all(0 <= number <= max_number and number == int(number) for number in numbers):
+        raise ValueError(f"a version is four whole numbers from 0 to {max_number}, got {list(numbers)}")
     major, minor, bugfix, build = map(int, numbers)
     return major, minor, bugfix, build
 

@@ -5,11 +5,6 @@ from __future__ import annotations
 import socket
 from collections import deque
 
-RECEIVE = 1 << 16  # bytes read at a time
-SEND_BUFFER = 1 << 16  # of the system: a slow reader gets packages that are old, but not seconds old [bytes]
-BACKLOG = 1 << 20  # replies that a client does not fetch, before it is cut [bytes]
-LATE = 1 << 26  # what a slow line may hold, before its client is cut [bytes]
-
 
 class Connection:
     """A non-blocking socket with buffers.
@@ -19,6 +14,7 @@ class Connection:
     """
 
     def __init__(self, sock: socket.socket, port: int) -> None:
+        send_buffer = 1 << 16  # of the system: a slow reader gets packages that are old, but not seconds old [bytes]
         self.socket, self.port = sock, port
         self.received = bytearray()
         self.searched = 0  # bytes of it, from the front, that hold no end of a program
@@ -29,12 +25,13 @@ class Connection:
         self._half = b""  # what is left of a package that is sent in two parts
         sock.setblocking(False)
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, send_buffer)
 
     def read(self) -> bool:
         """Takes what has arrived; False when the client is gone."""
+        chunk = 1 << 16  # bytes read at a time
         try:
-            data = self.socket.recv(RECEIVE)
+            data = self.socket.recv(chunk)
         except BlockingIOError:
             return True
         except OSError:
@@ -52,12 +49,14 @@ class Connection:
 
     def flush(self, now: float) -> bool:
         """Sends what is due; False when the client is gone or has let too much pile up."""
+        max_late = 1 << 26  # what a slow line may hold, before its client is cut [bytes]
+        max_backlog = 1 << 20  # replies that a client does not fetch, before it is cut [bytes]
         self._push(b"", False, False)
         while self._late and self._late[0][0] <= now:
             _, data, droppable, halved = self._late.popleft()
             self._late_size -= len(data)
             self._push(data, droppable, halved)
-        return self._drain() and len(self._waiting) <= BACKLOG and self._late_size <= LATE
+        return self._drain() and len(self._waiting) <= max_backlog and self._late_size <= max_late
 
     def close(self, *, reset: bool = False) -> None:
         """Ends the connection: with FIN, or with RST."""

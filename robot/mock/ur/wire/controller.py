@@ -35,12 +35,10 @@ RTDE, DASHBOARD, REALTIME = 30004, 29999, 30003
 SCRIPTS = (*primary.PORTS, REALTIME)
 PORTS = (RTDE, DASHBOARD, *SCRIPTS)
 MAX_CLIENTS = 256  # of one controller; more are closed at once
-MAX_PROGRAM, MAX_LINE = 1 << 20, 1 << 16  # a longer program or dashboard line cuts its client [bytes]
 BURST = 16  # packages or lines of one client that are served in one go; the others wait, and nothing more is read
 # From the end of a program to the begin of one that is uploaded instead [periods]. A controller has to stop the one and
 # to compile the other, and is STOPPED meanwhile; how long a real one is, is not published.
 START_DELAY = 5
-BOOT_AGAIN = 500  # control periods after which a restarted controller tries again to open its ports
 _PROGRAM_END = re.compile(rb"^end[ \t\r]*$", re.M)
 
 
@@ -153,6 +151,7 @@ class Controller:
     # -- one control period ------------------------------------------------------------------------------------------
 
     def tick(self) -> None:
+        restart_periods = 500  # control periods after which a restarted controller tries again to open its ports
         begun = time.perf_counter()
         self.ticks += 1
         if self._boot_at is not None:
@@ -162,8 +161,8 @@ class Controller:
             try:
                 self.listen()
             except OSError as error:  # somebody else has taken a port meanwhile
-                self.machine.write_log(f"{error.strerror}; tried again in {BOOT_AGAIN * PERIOD:g} s")
-                self._boot_at = self.ticks + BOOT_AGAIN
+                self.machine.write_log(f"{error.strerror}; tried again in {restart_periods * PERIOD:g} s")
+                self._boot_at = self.ticks + restart_periods
                 return
         self.machine.tick()
         if not self.faults.black_hole:
@@ -299,6 +298,7 @@ class Controller:
         return served == BURST
 
     def _serve_dashboard(self, client: Connection) -> bool:
+        max_line = 1 << 16  # a longer program or dashboard line cuts its client [bytes]
         for line in islice(lines(client.received), BURST):
             request = line.decode("utf-8", errors="replace").strip()
             if self.faults.dashboard_mute:
@@ -310,17 +310,18 @@ class Controller:
             reply = dashboard.answer(self.machine, request, self.config.serial, remote=self.faults.remote_control)
             client.send(reply.encode() + b"\n", due=self._due())
         behind = b"\n" in client.received
-        if not behind and len(client.received) > MAX_LINE:
-            raise BadPackage(f"a dashboard line of more than {MAX_LINE} bytes")
+        if not behind and len(client.received) > max_line:
+            raise BadPackage(f"a dashboard line of more than {max_line} bytes")
         return behind
 
     def _serve_script(self, client: Connection) -> bool:
         """A program begins with `def` or `sec` and ends with an `end` that is not indented; one of them is run."""
+        max_program = 1 << 20  # a longer program or dashboard line cuts its client [bytes]
         found = _PROGRAM_END.search(client.received, client.searched)
         if found is None:
             client.searched = max(0, client.received.rfind(b"\n"))
-            if len(client.received) > MAX_PROGRAM:
-                raise BadPackage(f"a program of more than {MAX_PROGRAM} bytes")
+            if len(client.received) > max_program:
+                raise BadPackage(f"a program of more than {max_program} bytes")
             return False
         program = client.received[: found.end()].decode("utf-8", errors="replace")
         del client.received[: found.end()]

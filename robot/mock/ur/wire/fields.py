@@ -66,7 +66,6 @@ def _register(array: str, index: int) -> Callable[[Machine], Values]:
 
 JOINT_MODES = {Mode.RUNNING: 253, Mode.IDLE: 255}  # running, idle; any other: POWERED_OFF
 POWERED_OFF = 239
-VOLTS = 48.0  # of all that is powered
 
 
 def _constant(*values: float) -> Callable[[Machine], Values]:
@@ -75,8 +74,10 @@ def _constant(*values: float) -> Callable[[Machine], Values]:
 
 
 def _powered(count: int) -> Callable[[Machine], Values]:
+    volts = 48.0  # of all that is powered
+
     def read(machine: Machine) -> Values:
-        value = 0.0 if machine.mode is Mode.POWER_OFF else VOLTS
+        value = 0.0 if machine.mode is Mode.POWER_OFF else volts
         return (value,) * count if count > 1 else value
 
     return read

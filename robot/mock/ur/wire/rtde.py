@@ -17,7 +17,6 @@ from robot.mock.ur.wire.fields import FORMATS, INPUTS, OUTPUTS, Output, Value
 HEADER = struct.Struct(">HB")
 PROTOCOL, VERSION, MESSAGE, DATA = ord("V"), ord("v"), ord("M"), ord("U")
 OUTPUT_RECIPE, INPUT_RECIPE, START, PAUSE = ord("O"), ord("I"), ord("S"), ord("P")
-MAX_RECIPES = 255
 MAX_NAMES = 2048  # of one recipe (manual of PolyScope X 10.10, chapter RTDE, which does not say what follows) [bytes]
 
 
@@ -143,10 +142,11 @@ class Session:
         return b"\1" + ",".join(types).encode()
 
     def _ask_inputs(self, payload: bytes) -> bytes:
+        max_recipes = 255
         names, names_in_use = self._names(payload), self.names_in_use(self)
         types = ["IN_USE" if name in names_in_use else INPUTS.get(name, "NOT_FOUND") for name in names]
         number = len(self.recipes) + 1
-        if not names or not all(kind in FORMATS for kind in types) or number > MAX_RECIPES:
+        if not names or not all(kind in FORMATS for kind in types) or number > max_recipes:
             self.machine().write_log(f"RTDE: input recipe refused: {','.join(types)[:200]}")
             return b"\0" + ",".join(types).encode()
         layout = struct.Struct(">" + "".join(FORMATS[kind] for kind in types))

@@ -17,7 +17,7 @@ SQUEEZE_SHARE, SLIDE_SQUEEZE_SHARE = 0.4, 0.12
 BODY_SLIDE_SHARE = 0.5  # of its height: a step, a slide
 # of the body's height: how far a tilted gel is pressed in, and goes back before it slides
 TILT_DEPTH, TILT_RELEASE = 0.16, 0.06
-# of its height: how far a tilted gel is slid along the other's face, and on the way back
+# of its height: how far a tilted gel is slid along the other's face, and during the motion back
 TILT_SLIDE, TILT_BACK = 0.3, 0.2
 SLIDE, STEP = 2.0e-3, 0.1e-3  # how far a gel is slid, and in what steps it is pressed [m]
 BODY_STEP = 0.04  # of its height: a step, a slide

@@ -145,7 +145,7 @@ def _render_html(comparison: Comparison, report: Report | None) -> str:
         Path(__file__).with_name("comparison.html.jinja"),
         comparison=comparison,
         report=report,
-        describe_comparison=describe_comparison(comparison),
+        judgement=describe_comparison(comparison),
         mask=CONTACT_MASK,
         rows=known,
         columns=columns,

@@ -15,7 +15,7 @@ from calibration.light.tuning import UNTOUCHED_RADIUS
 from calibration.tuning import SATURATED_LEVEL
 from tacsim.interface import FloatArray, Image
 from tacsim.models.sensor import CameraNoise
-from tacsim.optics.ink import fine_part
+from tacsim.optics.ink import high_pass
 
 Entry = TypeVar("Entry", bound=np.generic)
 
@@ -145,10 +145,10 @@ def measure_skin(presses: Sequence[BallPress], reference: NDArray[np.uint8], pix
     min_presses = 4
     min_pixels = 1000  # of either part of a press
     mean = reference.mean(axis=(0, 1))
-    grain = fine_part(reference.astype(np.float32), pixel_pitch)
+    grain = high_pass(reference.astype(np.float32), pixel_pitch)
     shares = []
     for press in presses:
-        change = fine_part((press.change * mean).astype(np.float32), pixel_pitch)
+        change = high_pass((press.change * mean).astype(np.float32), pixel_pitch)
         lit, distance = press.lit.all(axis=2), press.distance() / press.circle.radius
         parts = [lit & (distance > least) & (distance < most) for least, most in (SKIN_FAR, SKIN_NEAR)]
         if min(int(part.sum()) for part in parts) >= min_pixels:

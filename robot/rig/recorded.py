@@ -99,7 +99,7 @@ class RecordedSurfaces:
                     found.take_reference(TactileFrame(untouched, time=0.0, index=0))
                     self._normalisers[name] = found
                     self.notes += _distrusted(sensor, name)
-                    shown: tuple[float, float] | None = getattr(found, "shown", None)
+                    shown: tuple[float, float] | None = getattr(found, "visible_size", None)
                     if shown is not None and sensor.sensor_model is None:
                         self.notes += _middle_alone(name, shown, rig.canonical)
                 elif not meta.spec.sensors[name].height:

@@ -61,7 +61,7 @@ def separate_ink(picture: Image, radius: float) -> tuple[Image, Float32]:
     return clean, np.asarray(share, dtype=np.float32)
 
 
-def fine_part(picture: Float32, pixel_pitch: float) -> Float32:
+def high_pass(picture: Float32, pixel_pitch: float) -> Float32:
     """(H, W, 3) what of a picture is finer than light; `pixel_pitch` [m]."""
     import cv2
 
@@ -73,6 +73,6 @@ def separate_skin(picture: Float32, share: float, pixel_pitch: float) -> tuple[F
     """The picture (H, W, 3) of an untouched gel without its skin, which is `share` of its fine part, and (H, W, 3) the
     share of light that the skin lets through, about 1: the product is the picture."""
     min_light = 1.0  # least light that skin is told from [grey levels]
-    bare = picture - np.float32(share) * fine_part(picture, pixel_pitch)
+    bare = picture - np.float32(share) * high_pass(picture, pixel_pitch)
     clean = np.maximum(bare, np.float32(min_light)).astype(np.float32)
     return clean, (picture / clean).astype(np.float32)

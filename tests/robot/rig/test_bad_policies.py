@@ -95,7 +95,7 @@ def test_the_arms_hold_and_the_error_says_what_was_wrong(
         run_episode(shared.rig, GoingWrong(wrong), None, 9, setup=EpisodeSetup("mine"))
     assert "ended after 3 of 9 steps" in str(failed.value)
     if "policy 'mine'" in words:
-        assert "the arms hold" in str(failed.value) and "try it in simulation" in str(failed.value)
+        assert "the arms hold" in str(failed.value) and "test it in simulation" in str(failed.value)
     assert len(failed.value.episode.steps) == 4
     rests(shared)
     shared.rig.reset()  # nothing else is in the way of the next episode
@@ -127,7 +127,7 @@ def test_a_network_without_an_answer_moves_nothing(shared: Opened, tmp_path: Pat
     helper.set_model_props(model, {"tacsim.spec": told.model_dump_json()})
     onnx.save(model, tmp_path / "nothing.onnx")
     policy = OnnxPolicy(tmp_path / "nothing.onnx", CanonicalGrid(), None)
-    with pytest.raises(EpisodeFailed, match=r"an action has 1 finite numbers .* train or export it anew") as failed:
+    with pytest.raises(EpisodeFailed, match=r"an action has 1 finite numbers .* train or export it again") as failed:
         run_episode(shared.rig, policy, None, 9, setup=EpisodeSetup("nothing.onnx"))
     assert len(failed.value.episode.steps) == 1
     rests(shared)

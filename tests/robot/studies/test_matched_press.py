@@ -197,7 +197,7 @@ def test_both_contacts_are_in_one_place_however_light_pulls_a_circle(
         circle = find_contact_circle(image, reference, ball)
         return replace(circle, x=circle.x + pull[0], y=circle.y + pull[1])
 
-    monkeypatch.setattr(matched_press, "contact_circle", pulled)
+    monkeypatch.setattr(matched_press, "find_contact_circle", pulled)
     sensor, grid = sensor_of(), CanonicalGrid()
     made, _ = match_presses(frames, scene_of("8 mm"), sensor, grid)
     for frame, place in zip(made.frames[:2], PLACES, strict=True):

@@ -43,7 +43,7 @@ def test_it_shows_a_few_numbers_of_order_one_and_how_exact_the_forces_are(
         assert sum(value.size for value in seen.values()) < 600
         largest = max(largest, *(float(np.abs(value).max()) for value in seen.values()))
         assert (info["preset"], info["preset_error"]) == ("learn", "force +3 to +11 %")
-        seen, _, _, _, info = env.step(env.action_space.sample_distance())
+        seen, _, _, _, info = env.step(env.action_space.sample())
         assert info["hold"] == 0  # motions flow: nothing is held until it rests
     assert 0.1 < largest < 10.0
     assert not rendered

@@ -40,7 +40,7 @@ def test_no_picture_is_rendered_that_nobody_looks_at(
     env.reset(seed=1)
     render = Renderer.__call__
     monkeypatch.setattr(Renderer, "__call__", lambda *given: (rendered.append(0), render(*given))[1])
-    env.step(env.action_space.sample_distance())
+    env.step(env.action_space.sample())
     assert len(rendered) == pictures
     env.close()
 

@@ -10,11 +10,10 @@ import pytest
 from tacsim.models.scene import GelSurface
 from tacsim.models.sensor import Markers, SensorGeometry, SensorModel
 from tacsim.optics import surface as surfaces
-from tacsim.optics.fold import visible_table_points
 from tacsim.optics.grid import PixelGrid, image_grid
 from tacsim.optics.markers import marker_transmission, rest_positions
 from tacsim.optics.render import Renderer
-from tacsim.optics.surface import SurfaceTable, sample_surface
+from tacsim.optics.surface import SurfaceTable, sample_surface, visible_table_points
 from tests.tacsim.optics.surfaces import dent, make_surface
 
 MM = 1e-3

@@ -7,8 +7,8 @@ from pydantic import ValidationError
 
 from tacsim.models.scene import GelSurface
 from tacsim.models.sensor import Lighting, Markers, SensorGeometry, SensorModel
+from tacsim.optics.ink import high_pass, separate_skin
 from tacsim.optics.render import Renderer
-from tacsim.optics.skin import high_pass, separate_skin
 from tests.tacsim.optics.surfaces import flat, make_surface
 
 GEL, PITCH = (20e-3, 16e-3), 0.08e-3

@@ -10,8 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from tacsim.interface import Action, Pose
 from tacsim.limits import ActionError
-from tacsim.tasks.action import action_of_vector, vector_of_action
-from tacsim.tasks.task import Axis
+from tacsim.tasks.task import Axis, action_of_vector, vector_of_action
 
 AXES = (Axis("lower", (0.0, 0.0, 1.0)), Axis("upper", (1.0, 0.0, 0.0)), Axis("upper", (0.0, 1.0, 0.0)))
 POSES = {

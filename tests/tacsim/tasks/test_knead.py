@@ -17,8 +17,8 @@ from tacsim.models.material import BodyMaterial
 from tacsim.models.rig import KneadConfig
 from tacsim.models.scene import Body, Box, Indenter, Scene
 from tacsim.tasks import evaluate_outcome, make_task
-from tacsim.tasks.action import action_of_vector
 from tacsim.tasks.knead import Knead, ScriptedKnead
+from tacsim.tasks.task import action_of_vector
 
 QUICK = [
     "scene.preset=learn",

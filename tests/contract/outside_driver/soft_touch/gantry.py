@@ -53,9 +53,9 @@ class Gantry:
         """Where it is, and whether it rests."""
         paths = [path for path in self._paths if path[0] <= moment] or self._paths[:1]
         begun, origin, target, speed = paths[-1]
-        length = se3.distance(origin, target)[0]
+        length = se3.pose_distance(origin, target)[0]
         share = min(1.0, max(0.0, (moment - begun) * speed / max(length, 1e-12)))
-        return se3.interpolate(origin, target, share), share == 1.0
+        return se3.interpolate_pose(origin, target, share), share == 1.0
 
     def depth_at(self, moment: float) -> float:
         """How deep the table presses the gel [m]."""
@@ -85,7 +85,7 @@ class Gantry:
         return self.pose_at(time.monotonic())[1]
 
     def arrived(self, target: Pose, *, within: float, turn: float) -> bool:
-        return self.at_rest() and se3.distance(self.state().pose, target)[0] <= within
+        return self.at_rest() and se3.pose_distance(self.state().pose, target)[0] <= within
 
     def zero_wrench(self) -> None:
         self._zero += float(self.state().wrench[2])

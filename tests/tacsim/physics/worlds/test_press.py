@@ -224,11 +224,11 @@ def test_a_second_world_of_a_mesh_reads_the_file_but_computes_nothing_anew(
         real = getattr(tiles, name)
         monkeypatch.setattr(tiles, name, lambda *given: (computed.append(name), real(*given))[1])
 
-    count("centred")
+    count("centred_mesh")
     count("signed_distance_on_grid")
     first = world(write(3.0))
     move(first, (0, 0, -0.4e-3))
-    assert computed.count("centred") == 1 and 1 <= computed.count("signed_distance_on_grid") <= 9
+    assert computed.count("centred_mesh") == 1 and 1 <= computed.count("signed_distance_on_grid") <= 9
     computed.clear()
     second = world(write(3.0))
     move(second, (0, 0, -0.4e-3))
@@ -236,7 +236,7 @@ def test_a_second_world_of_a_mesh_reads_the_file_but_computes_nothing_anew(
     assert first.wrench("lower")[2] < -0.01 and first.wrench("lower").tobytes() == second.wrench("lower").tobytes()
     third = world(write(2.0))
     move(third, (0, 0, -0.4e-3))
-    assert computed.count("centred") == 1
+    assert computed.count("centred_mesh") == 1
     assert third.pose("indenter").position[2] == pytest.approx(1.7e-3, rel=0.01)
 
 

@@ -295,7 +295,7 @@ def test_drift_of_the_light_is_no_contact(good: FrameSet, real: FrameSet) -> Non
 
 
 def test_no_shift_is_sought_where_a_is_made_in_the_pixels_of_b(good: FrameSet, real: FrameSet) -> None:
-    placed = replace(changed(good, lambda image: shifted(image, 3.0, 0.0), "all"), placed=True)
+    placed = replace(changed(good, lambda image: shifted(image, 3.0, 0.0), "all"), same_pixels=True)
     assert compare_frames(placed, real).alignment.shift == (0.0, 0.0)
     asked = compare_frames(placed, real, options=Options(shift=True))
     assert asked.alignment.shift == pytest.approx((3.0, 0.0), abs=0.1)
@@ -303,7 +303,7 @@ def test_no_shift_is_sought_where_a_is_made_in_the_pixels_of_b(good: FrameSet, r
 
 def test_what_could_not_be_made_is_left_out_and_said(good: FrameSet, real: FrameSet) -> None:
     words = "press_1.png: not pressed: too deep"
-    part = replace(good, frames=(good.frames[0], *good.frames[2:]), placed=True, simulated=True, notes=(words,))
+    part = replace(good, frames=(good.frames[0], *good.frames[2:]), same_pixels=True, simulated=True, notes=(words,))
     result = compare_frames(part, real)
     assert [pair.b.name for pair in result.pairs] == [frame.name for frame in part.frames]
     assert words in result.notes

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from tacsim.models.hardware import Model  # pydantic and SciPy: half a second of start-up
 
 JOINT_RANGE = 2 * math.pi  # joints turn from -JOINT_RANGE to +JOINT_RANGE (all e-Series user manuals)
-MIN_SINGULAR_VALUE = 0.02  # of the Jacobian, lengths divided by the reach; below it the arm may only move away
 # Bound on the change of the minimum singular value per radian of joint motion: each of the six columns has a length of
 # at most sqrt(2) in these units, and rotates with the joints before it.
 MAX_SINGULAR_VALUE_RATE = math.sqrt(12.0)

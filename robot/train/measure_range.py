@@ -20,6 +20,7 @@ from tacsim.models.scene import Scene
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.models.training import Training
 from tacsim.tasks import make_task
+from tacsim.tasks.task import BadDraws
 
 ReportProgress = Callable[[str, int, int], None]
 
@@ -104,7 +105,13 @@ def _play_round(
     members, count = envs.members, envs.num_envs
     for at, env in enumerate(members):
         env.next_variant = (number * count + at) % len(env.variants) if env.variants else None
-    features, _ = envs.reset(seed=[number * count + at for at in range(count)])
+    seeds = [number * count + at for at in range(count)]
+    try:
+        features, _ = envs.reset(seed=seeds)
+    except BadDraws:  # a variant that cannot begin, as in training: others are drawn
+        for env in members:
+            env.next_variant = None
+        features, _ = envs.reset(seed=seeds)
     policies = [OnnxPolicy(path, canonical, env.task.goal) for env in members]
     found: list[list[FloatArray]] = [[] for _ in members]
     over = np.zeros(count, np.bool_)

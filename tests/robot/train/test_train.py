@@ -261,7 +261,9 @@ def test_train_many_bad_draws_raise_and_keep_checkpoint(tmp_path: Path, monkeypa
     with pytest.raises(BadDraws, match=r"8 draws in a row cannot begin .*nothing there"):
         train(run, then_none)
     assert run.load_checkpoint()[0] == 1
+    monkeypatch.undo()
     assert export_policy(run, tmp_path / "kept.onnx") <= 1e-5
+    monkeypatch.setattr("tacsim.sim.reset.SimReset.touch", none)
     result = tacsim("train", "--resume", str(run.folder))
     assert result.exit_code == 2 and "nothing there" in result.output, result.output
     assert f"tacsim export policy {run.folder}" in result.output.replace("\n", "")

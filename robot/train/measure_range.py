@@ -105,7 +105,7 @@ def _play_round(
     members, count = envs.members, envs.num_envs
     for at, env in enumerate(members):
         env.next_variant = (number * count + at) % len(env.variants) if env.variants else None
-    seeds = [number * count + at for at in range(count)]
+    seeds: list[int | None] = [number * count + at for at in range(count)]
     try:
         features, _ = envs.reset(seed=seeds)
     except BadDraws:  # a variant that cannot begin, as in training: others are drawn

@@ -98,8 +98,8 @@ def find_dark_press(name: str, image: Image, reference: Image, mean: FloatArray,
 
 def dark_circle(image: Image, reference: Image, ball: float) -> Circle:
     """Finds the contact of a ball of radius `ball` [px] in `image` (H, W, 3), as a calibration from this press alone
-    would: :func:`calibration.light.circle.contact_circle` for a light that tells no direction. `reference` (H, W, 3) is
-    the same without contact.
+    would: :func:`calibration.light.circle.find_contact_circle` for a light that tells no direction. `reference`
+    (H, W, 3) is the same without contact.
 
     Raises BadFrames for a reference that is dark or saturated, NoCircle when no ball's contact is seen.
     """
@@ -303,5 +303,5 @@ def _make_model(table: tuple[FloatArray, FloatArray], share: float, reach: float
 
 def _residual_share(depth: FloatArray, observed: FloatArray, table: tuple[FloatArray, FloatArray]) -> float:
     knots, changes = table
-    told = np.stack([np.interp(depth, knots, channel) for channel in changes.T], axis=-1)
-    return float(((told - observed) ** 2).sum() / max(float((observed**2).sum()), 1e-300))
+    predicted = np.stack([np.interp(depth, knots, channel) for channel in changes.T], axis=-1)
+    return float(((predicted - observed) ** 2).sum() / max(float((observed**2).sum()), 1e-300))

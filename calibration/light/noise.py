@@ -23,7 +23,8 @@ TILE = 32  # side of the tiles; what is wider is drift, not noise [px]
 MAX_DARK_LEVEL = 2  # a channel at or below this has lost its noise [grey levels]
 SKIN_NEAR = (1.25, 2.2)  # where the skin has moved, and the light changes little [contact radii]
 SKIN_FAR = (4.0, 8.0)  # where it has hardly, in about the same light
-MIN_SKIN_SHARE = 0.2  # a smaller one is not told from none; 0.07 at most is found on three real sensors without any
+# A smaller one cannot be distinguished from none: three real sensors without skin have at most 0.07.
+MIN_SKIN_SHARE = 0.2
 MIN_STANDARD_ERRORS = 3.0  # standard errors over presses that the share must be from none
 
 

@@ -41,7 +41,7 @@ from calibration.materials.tuning import (
 from tacsim.interface import FloatArray
 
 MIN_GAIN_SHARE = 0.01  # of the sum of squares, where a coarse mesh keeps it large
-MIN_STEP = 0.01  # of the free numbers, likewise where all is told well
+MIN_STEP = 0.01  # of the free numbers, likewise where all are identified
 SETTLING_ERROR = 0.01  # of any simulation: what its settling leaves, in each number and, again, in a whole press
 
 
@@ -189,10 +189,11 @@ def estimate_materials(
     """Fits the parameters to the signals.
 
     levels: the simulation on meshes from coarse to fine. The coarsest, off by a share of about `coarse_error`, finds
-    the way; the last but one gives the Jacobian; the finest puts it right. on_step: told what is being done.
+    a start; the last but one gives the Jacobian; the finest corrects the result. on_step: receives the present step.
 
-    Parameters whose interval would reach farther than a factor of 1.8 each way are held at their start, the least told
-    first (`Fit.untold`). Raises NotIdentified when nothing is told, CannotSimulate when no smaller step helps.
+    A parameter whose interval would exceed a factor of 1.8 in either direction is held at its start, the one with the
+    widest interval first (`Fit.unidentified`). Raises NotIdentified if no parameter can be identified, CannotSimulate
+    if no smaller step helps.
     """
     max_fine_steps = 2
     fitter = _Fitter(signals, parameters, priors)

@@ -395,7 +395,5 @@ class Servo:
         max_length, max_angle = (rate * self.config.action_timeout for rate in (limits.speed, limits.turn_rate))
         fraction = min(inside_fraction, max_length / max(path_length, max_length), max_angle / max(angle, max_angle))
         if fraction < 1.0:
-            self._allowed_target = (
-                start.position + fraction * (target_position - start.position),
-                rotation(fraction * turn) @ start.rotation,
-            )
+            position = start.position + fraction * (target_position - start.position)
+            self._allowed_target = position, rotation(fraction * turn) @ start.rotation

@@ -57,7 +57,7 @@ class VideoError:
         self._most = max(self._most, int(np.abs(error).max()))
 
     def told(self) -> dict[str, float | int]:
-        """In contact: of numbers that differ from grey by more than `CONTACT`; 0 where there are none."""
+        """In contact: of numbers that differ from grey by more than 10 grey levels; 0 where there are none."""
         total, contact = (max(int(count), 1) for count in self._counts)
         rms = np.sqrt(self._squares / [total, contact, contact]).round(4).tolist()
         return {"rms": rms[0], "rms_in_contact": rms[1], "signal_in_contact": rms[2], "most": self._most}

@@ -77,7 +77,7 @@ class KnownScale:
 
 
 def evaluate_calibration(fit: LightFit, scale: KnownScale, *, dots: bool = False) -> Verdict:
-    """All findings, the worst first. `dots` are seen on the gel, and were not told."""
+    """All findings, the worst first. `dots`: the pictures show dots that no option names."""
     found = [*_check_presses(fit), *_check_images(fit), *_check_shape(fit), *_check_scale(fit, scale)]
     found += [Finding("do not trust", *_split_warning(doubt)) for doubt in fit.image_warnings]
     if dots:  # a rig refuses such a bundle
@@ -232,19 +232,19 @@ def _check_scale(fit: LightFit, scale: KnownScale) -> Iterable[Finding]:
 
 
 def _check_thickness(fit: LightFit, scale: KnownScale, widest: float) -> Iterable[Finding]:
-    told = scale.gel_thickness
-    assert told is not None
+    configured = scale.gel_thickness
+    assert configured is not None
     depth = widest**2 * scale.ball_radius
     yield from _exceed_limits(
-        MAX_DEPTH_RATIO, depth / told,
-        f"the deepest press is {depth * 1e3:.1f} mm deep in a gel of {told * 1e3:.1f} mm",
+        MAX_DEPTH_RATIO, depth / configured,
+        f"the deepest press is {depth * 1e3:.1f} mm deep in a gel of {configured * 1e3:.1f} mm",
         "measure ball and pitch; press less deep",
     )  # fmt: skip
     by_slopes = fit.thickness * scale.pixel_pitch
-    if by_slopes < told / MAX_THICKNESS_RATIO:
+    if by_slopes < configured / MAX_THICKNESS_RATIO:
         yield Finding(
-            "usable", f"round the contacts the gel moves like one of {by_slopes * 1e3:.1f} mm, it is told to have "
-            f"{told * 1e3:.1f} mm", "is the pixel pitch right?",
+            "usable", f"near the contacts the gel moves like one of {by_slopes * 1e3:.1f} mm, its given thickness "
+            f"is {configured * 1e3:.1f} mm", "is the pixel pitch right?",
         )  # fmt: skip
 
 

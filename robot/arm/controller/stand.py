@@ -32,7 +32,7 @@ class Stand:
 
 
 def stand(config: UrArmConfig, reading: ControllerReading) -> Stand:
-    """From what a controller told."""
+    """From what a controller configured."""
     gravity = 9.82  # [m/s^2]
     frames = ArmFrames.of(config)
     shown = matrix(reading.tcp_pose)
@@ -135,13 +135,14 @@ def _force(name: str, config: UrArmConfig, now: Stand, file: str) -> Check:
 
 def _payload(name: str, config: UrArmConfig, now: Stand) -> Check:
     max_mass_error, max_centre_error = 0.05, 10e-3  # payloads this near to each other are the same [kg, m]
-    label, told, reading = f"{name}: payload", config.payload, now.reading
-    wanted = f"{told.mass:g} kg at {_mm(np.array(told.centre))} mm"
+    label, configured, reading = f"{name}: payload", config.payload, now.reading
+    wanted = f"{configured.mass:g} kg at {_mm(np.array(configured.centre))} mm"
     if reading.payload is None or reading.payload_centre is None:
-        return Check(label, "ok", f"not told by this controller; connecting sets the file's, {wanted}")
+        return Check(label, "ok", f"not reported by this controller; connecting sets the file's, {wanted}")
     found = f"{reading.payload:.3g} kg at {_mm(reading.payload_centre)} mm"
-    away = float(np.linalg.norm(reading.payload_centre - np.array(told.centre)))
-    if abs(reading.payload - told.mass) <= max_mass_error and (told.mass <= max_mass_error or away <= max_centre_error):
+    away = float(np.linalg.norm(reading.payload_centre - np.array(configured.centre)))
+    is_centre_equal = configured.mass <= max_mass_error or away <= max_centre_error
+    if abs(reading.payload - configured.mass) <= max_mass_error and is_centre_equal:
         return Check(label, "ok", found)
     advice = "connecting sets the file's; which of the two was weighed? A wrong one is felt as a force"
     return _own(config, Check(label, "warn", f"the controller has {found}, the file says {wanted}", advice))
@@ -151,7 +152,9 @@ def _tcp(name: str, config: UrArmConfig, now: Stand) -> Check:
     max_distance, max_angle = 0.5e-3, 5e-3  # TCPs this near to each other are the same [m, rad]
     label, wanted = f"{name}: TCP", se3.to_matrix(config.flange_from_tool.pose)
     if now.reading.tcp is None:
-        return Check(label, "ok", f"not told by this controller; connecting sets the file's, {_shown(pose(wanted))}")
+        return Check(
+            label, "ok", f"not reported by this controller; connecting sets the file's, {_shown(pose(wanted))}"
+        )
     shift, turn = np.linalg.norm(displacement(wanted, now.tcp).reshape(2, 3), axis=1)
     if shift <= max_distance and turn <= max_angle:
         return Check(label, "ok", _shown(pose(now.tcp)))
@@ -163,10 +166,12 @@ def _tcp(name: str, config: UrArmConfig, now: Stand) -> Check:
 def _slider(name: str, now: Stand) -> Check:
     label, slider = f"{name}: speed slider", now.reading.speed_slider
     if slider is None:
-        return Check(label, "ok", "not told by this controller")
+        return Check(label, "ok", "not reported by this controller")
     if slider > 0.995:
         return Check(label, "ok", "100 %")
-    advice = "motions go slower than asked for, and an arm that lags is told as late: set it to 100 % on the pendant"
+    advice = (
+        "motions are slower than commanded, and an arm that lags is reported as late: set it to 100 % on the pendant"
+    )
     return Check(label, "warn", f"{100 * slider:.0f} %", advice)
 
 

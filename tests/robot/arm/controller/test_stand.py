@@ -137,7 +137,7 @@ def test_what_an_old_controller_does_not_tell_is_said() -> None:
     unknown = {"payload": None, "payload_centre": None, "tcp": None, "speed_slider": None}
     found = _at_start(shipped(), **unknown)
     assert {check.state for check in found.values()} == {"ok"}
-    assert all("not told" in found[name].found for name in ("payload", "TCP", "speed slider"))
+    assert all("not reported" in found[name].found for name in ("payload", "TCP", "speed slider"))
 
 
 @pytest.mark.parametrize(("newtons", "state"), [(0.9, "ok"), (1.5, "warn"), (19.0, "warn"), (20.5, "fail")])

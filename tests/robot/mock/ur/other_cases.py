@@ -169,7 +169,7 @@ def io_outputs(robot: Robot) -> None:
     robot.until(lambda: receive.getStandardAnalogOutput0() == 2.5)
     robot.until(lambda: abs(receive.getStandardAnalogOutput1() - 0.012) < 1e-12)
     assert io.setSpeedSlider(0.5)
-    robot.until(lambda: abs(receive.getSpeedScaling() - 0.5) < 1e-9)
+    robot.until(lambda: abs(receive.getSpeedScalingCombined() - 0.5) < 1e-9)
     start = time.monotonic()
     begun = receive.getTimestamp()
     assert robot.control.moveL(robot.shifted(0, 0, -0.1), 0.1, 1.0)

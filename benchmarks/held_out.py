@@ -1,8 +1,9 @@
 """What calibrations know of presses that took no part, sensor by sensor: `python -m benchmarks.held_out DIR`.
 
-DIR holds the public frames that `references/balls.yaml` names. Prints the table of docs/calibrate.md, a minute a set;
-`--only NAME` measures one. `--spread 50` prints another: how far contact radii differ between calibrations by random
-subsets of the presses, a quarter of an hour a set. `--clicked` prints that of docs/compare.md, in both masks.
+DIR holds the public frames that `references/balls.yaml` names. Prints the first table of
+docs/measurements/calibration.md, a minute a set; `--only NAME` measures one set. `--spread 50` prints the second: how
+far contact radii differ between calibrations by random subsets of the presses, a quarter of an hour a set. `--clicked`
+prints the table of both masks in docs/measurements/comparison.md.
 """
 
 from __future__ import annotations

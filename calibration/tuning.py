@@ -1,7 +1,7 @@
 """Tuned constants of the normaliser, the reference image and drift.
 
-Each entry: what it is, its unit, and what it was measured on where it was. Sources: docs/calibrate.md, and the tests in
-tests/calibration.
+Each entry: what it is, its unit, and what it was measured on where it was.
+Sources: docs/measurements/calibration.md, and the tests in tests/calibration.
 """
 
 # drift.py

@@ -1,7 +1,7 @@
 """Tuned constants of the comparison of two sources of frames.
 
-Each entry: what it is, its unit, and what it was measured on where it was. Sources: docs/compare.md, and the tests in
-tests/calibration/compare.
+Each entry: what it is, its unit, and what it was measured on where it was.
+Sources: docs/measurements/comparison.md, and the tests in tests/calibration/compare.
 """
 
 # alignment.py

@@ -1,7 +1,7 @@
 """Tuned constants of the way from a picture to a height.
 
-Each entry: what it is, its unit, and what it was measured on where it was. Sources: docs/calibrate.md,
-docs/benchmarks.md, and the tests in tests/calibration/height.
+Each entry: what it is, its unit, and what it was measured on where it was.
+Sources: docs/measurements/calibration.md, docs/benchmarks.md, and the tests in tests/calibration/height.
 """
 
 # colour_table.py

@@ -1,7 +1,7 @@
 """Tuned constants of the calibration of lenses and views.
 
-Each entry: what it is, its unit, and what it was measured on where it was. Sources: docs/calibrate.md, and the tests in
-tests/calibration/lens.
+Each entry: what it is, its unit, and what it was measured on where it was.
+Sources: docs/measurements/calibration.md, and the tests in tests/calibration/lens.
 """
 
 # board.py

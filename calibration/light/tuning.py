@@ -1,7 +1,7 @@
 """Tuned constants of the calibration of a sensor's light.
 
-Each entry: what it is, its unit, and what it was measured on where it was. Sources: docs/calibrate.md,
-docs/benchmarks.md, and the tests in tests/calibration/light.
+Each entry: what it is, its unit, and what it was measured on where it was.
+Sources: docs/measurements/calibration.md, docs/benchmarks.md, and the tests in tests/calibration/light.
 """
 
 # calibrator.py

@@ -1,7 +1,7 @@
 """Tuned constants of the fits of poses and latencies.
 
-Each entry: what it is, its unit, and what it was measured on where it was. Sources: docs/calibrate.md, and the tests in
-tests/calibration/poses.
+Each entry: what it is, its unit, and what it was measured on where it was.
+Sources: docs/measurements/calibration.md, and the tests in tests/calibration/poses.
 """
 
 # ball_touch.py

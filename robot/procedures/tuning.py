@@ -1,7 +1,7 @@
 """Tuned constants of what a person is led through at a rig.
 
-Each entry: what it is, its unit, and what it was measured on where it was. Sources: docs/calibrate.md, docs/bringup.md,
-and the tests in tests/robot/procedures.
+Each entry: what it is, its unit, and what it was measured on where it was.
+Sources: docs/calibrate.md, docs/hand-eye.md, and the tests in tests/robot/procedures.
 """
 
 # presses.py

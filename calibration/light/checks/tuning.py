@@ -1,7 +1,7 @@
 """Tuned limits of the checks of a light calibration.
 
-Each entry: what it is, its unit, and what it was measured on where it was. Sources: docs/calibrate.md, and the tests in
-tests/calibration/light/checks.
+Each entry: what it is, its unit, and what it was measured on where it was.
+Sources: docs/measurements/calibration.md, and the tests in tests/calibration/light/checks.
 """
 
 # consistency.py

@@ -1,5 +1,5 @@
-"""From a shipped hardware file to a first motion: every command of README and docs/bringup.md on a copy with only
-hosts and cameras changed, before mocks that pass for real arms."""
+"""From a shipped hardware file to a first motion: every command of the PAGES on a copy with only hosts and
+cameras changed, before mocks that pass for real arms."""
 
 from __future__ import annotations
 
@@ -22,6 +22,8 @@ from tests.robot.cli.terminal import Terminal
 
 if find_spec("rtde_control") is None:
     pytest.skip("ur_rtde has no wheel for this Python and machine", allow_module_level=True)
+
+PAGES = ("README.md", "bringup.md", "hand-eye.md")
 
 pytestmark = pytest.mark.usefixtures("empty_folder")
 
@@ -80,7 +82,7 @@ def test_what_does_not_fit_is_refused_before_anything_is_opened(
 
 def commands() -> list[str]:
     """What the pages tell a person to type once my.yaml is written."""
-    blocks = [block for block in all_blocks() if block.page in ("README.md", "bringup.md") and block.language == "bash"]
+    blocks = [block for block in all_blocks() if block.page in PAGES and block.language == "bash"]
     lines = [line.partition("#")[0].strip() for block in blocks for line in block.code.splitlines()]
     return [line for line in lines if re.match(r"tacsim .*\bmy\.yaml", line)]
 

@@ -80,7 +80,7 @@ def servo(robot: Robot) -> None:
     CONTROL,
     "servoC",
     Verdict.LIBRARY,
-    "moves; the next call, whatever it is, waits 4 s and is False, the one after that works",
+    "moves; the next call of any kind waits 4 s and returns False, the one after it works",
 )
 def servo_circle(robot: Robot) -> None:
     """The library sends it as if nothing were to be waited for, its script answers as if something were."""

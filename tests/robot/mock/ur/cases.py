@@ -36,7 +36,7 @@ class Verdict(Enum):
     """What a call comes to; the value is what the documentation says."""
 
     ROBOT = "as a robot"
-    LIBRARY = "as a robot; the library has its own way"
+    LIBRARY = "as a robot; behaviour of ur_rtde"
     CONSTANT = "constant"
     REFUSED = "refused"
     NOT_THERE = "not there"

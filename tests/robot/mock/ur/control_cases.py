@@ -15,8 +15,8 @@ from robot.mock.ur.machine.arm import HOME
 from tests.robot.mock.ur.arm_cases import CONTROL
 from tests.robot.mock.ur.cases import Robot, Verdict, case
 
-NO_DYNAMICS = "the program ends, as by a run-time error"
-STALE = "returns at once what the registers held before: ask twice"
+NO_DYNAMICS = "the program ends, as after a run-time error"
+STALE = "returns the previous content of the registers: call it twice"
 NEWER = f"{STALE}; from PolyScope 5.23 on"
 
 # -- questions -------------------------------------------------------------------------------------------------------
@@ -48,7 +48,7 @@ def questions(robot: Robot) -> None:
     CONTROL,
     "getForwardKinematics",
     Verdict.LIBRARY,
-    "for a TCP without joints it sends 100 bytes in a recipe of 52, and the answer is wrong: give both, or neither",
+    "with a TCP and no joints it sends 100 bytes for a recipe of 52, and the result is wrong: give both or neither",
 )
 def forward_kinematics(robot: Robot) -> None:
     q, tcp = [angle + 0.1 for angle in HOME], [0, 0, 0.1, 0, 0, 0]
@@ -159,8 +159,8 @@ def own_control_script(robot: Robot) -> None:
     CONTROL,
     "sendCustomScript sendCustomScriptFunction sendCustomScriptFile",
     Verdict.ROBOT,
-    "scripts that are lists of calls (below). Any other, and one that ends by an error, raises RuntimeError at once: a "
-    "robot lets the library wait 600 s for its register, here its script connection is cut (disconnect(), reconnect())",
+    "scripts that are lists of calls (below). Any other script, and one that ends with an error, raises RuntimeError "
+    "at once, because its script connection is cut (disconnect(), reconnect()); with a robot the library waits 600 s",
 )
 def custom_scripts(robot: Robot) -> None:
     control, receive = robot.control, robot.receive
@@ -211,7 +211,7 @@ def dynamics(robot: Robot) -> None:
     CONTROL,
     "ftRtdeInputEnable enableExternalFtSensor setExternalForceTorque",
     Verdict.REFUSED,
-    "enabling ends the program; give wrenches by `faults.wrench`. Unless enabled the values do nothing, as on a robot",
+    "enabling ends the program; use `faults.wrench`. Without enabling, the values have no effect, as on a robot",
 )
 def external_sensor(robot: Robot) -> None:
     control = robot.control

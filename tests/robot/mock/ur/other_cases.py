@@ -109,7 +109,7 @@ def outputs(robot: Robot) -> None:
     "getActualCurrent getTargetCurrent getTargetMoment getJointControlOutput getActualMomentum getActualRobotCurrent "
     "getJointTemperatures getActualDigitalInputBits getDigitalInState getStandardAnalogInput0 getStandardAnalogInput1",
     Verdict.CONSTANT,
-    "nothing is modelled behind them: 0, and 30 degrees",
+    "not modelled: 0, and temperatures of 30 degrees",
 )
 def constants(robot: Robot) -> None:
     receive = robot.receive
@@ -249,7 +249,7 @@ def dashboard_commands(robot: Robot) -> None:
     DASHBOARD,
     "popup closePopup closeSafetyPopup addToLog isProgramSaved shutdown",
     Verdict.CONSTANT,
-    "answered, with nothing behind (`isProgramSaved` is False); after `shutdown` the mock goes on",
+    "answered without effect (`isProgramSaved` is False); after `shutdown` the mock continues",
 )
 def dashboard_answers(robot: Robot) -> None:
     dashboard = robot.dashboard

@@ -18,7 +18,7 @@ from tests.robot.mock.ur.cases import CASES, CLASSES, Verdict
 from tests.robot.mock.wire_client import wire_host
 
 ROOT = Path(__file__).resolve().parents[4]
-PAGE = ROOT / "docs" / "mock.md"
+PAGE = ROOT / "docs" / "mock-calls.md"
 BEGIN, END = "<!-- calls of ur_rtde: written by tests/robot/mock/ur/test_calls.py -->\n", "<!-- end of calls -->"
 LIMIT = 120.0  # of one client process [s]
 QUICK = {"servo", "speeds", "questions", "motion", "load", "dashboard_commands", "dynamics", "refused_connections"}
@@ -60,7 +60,7 @@ def test_the_page_says_what_the_cases_show() -> None:
     _, after = rest.split(END)
     if "WRITE_PAGE" in os.environ:
         PAGE.write_text(f"{before}{BEGIN}{table()}{END}{after}", encoding="utf-8")
-    assert rest == f"{table()}{END}{after}", "WRITE_PAGE=1 pytest this test writes the page anew"
+    assert rest == f"{table()}{END}{after}", "WRITE_PAGE=1 pytest this test writes the page again"
 
 
 @pytest.fixture(scope="module")

@@ -202,7 +202,7 @@ def _run(
 
     from robot.collect.collect import collect as make
     from robot.collect.workers import Stopped
-    from tacsim.compute.threads import cores
+    from tacsim.compute.threads import core_count
 
     begun = said = time.perf_counter()
     there = 0
@@ -218,7 +218,7 @@ def _run(
                 notes.print(f"{done} of {total}")
 
         try:
-            number = workers if workers is not None else cores()
+            number = workers if workers is not None else core_count()
             done = make(job, out, files, command, workers=number, cluster=ray, tell=tell, stop=interrupt)
         except Stopped:
             complain(f"stopped by a signal; {there} of {job.count} are there. The same command goes on")

@@ -168,7 +168,7 @@ class _Task:
             from calibration.materials.presses import Noise
             from robot.studies.identify.identify import identify
             from robot.studies.identify.recordings import Recordings, find_recordings, read_all
-            from tacsim.physics.failure.dump import dumps_in
+            from tacsim.physics.failure.dump import dump_to_folder
         with one_bar("reading") as bar:
             recordings = Recordings(self.scene, indenter, balls)
             presses = read_all(recordings, find_recordings(sources), bar.count)
@@ -178,7 +178,7 @@ class _Task:
                 notes.print(f"force noise taken as {force:g} N; give your sensor's by --force-noise")
             noise = Noise(force=force)
             zero = 10 * force if options.zero_error is None else options.zero_error
-            with dumps_in(folder.with_name(f"{folder.name}-diverged")):
+            with dump_to_folder(folder.with_name(f"{folder.name}-diverged")):
                 found = identify(
                     self.kind, self.scene, recordings, presses, noise, Priors(options.place_error, zero),
                     wanted=self.wanted, most_moments=options.moments, gel_error=self.gel_error,

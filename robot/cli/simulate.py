@@ -86,11 +86,11 @@ def press(
         notes.print(words)
     with busy("pressing (the first run compiles the kernels, up to half a minute)") as say:
         from robot.studies import press as presses
-        from tacsim.physics.failure.dump import dumps_in
+        from tacsim.physics.failure.dump import dump_to_folder
         from tacsim.physics.failure.health import SimulationDiverged
 
         motion = presses.PressMotion(depth, slide, twist)
-        with dumps_in(folder / "diverged"), measuring(say, "pressing"):
+        with dump_to_folder(folder / "diverged"), measuring(say, "pressing"):
             try:
                 pressed = presses.press(scene, model, motion)
             except SimulationDiverged as failure:
@@ -175,13 +175,13 @@ def reproduce(
     schemes = ["seed", "hybrid"] if physics == "both" else [physics]
     with busy("loading"):
         from robot.studies import experiment
-        from tacsim.physics.failure.dump import dumps_in
+        from tacsim.physics.failure.dump import dump_to_folder
         from tacsim.report.figure4 import figure4
 
     # The longest first, so that no processor waits for it at the end.
     wanted = [(task, scheme) for scheme in schemes for task in ("reposition", "squeeze")]
     notes.print("The first run compiles the kernels of each physics, up to a minute.")
-    with Interrupt() as interrupt, dumps_in(folder / "diverged"), progress() as bar:
+    with Interrupt() as interrupt, dump_to_folder(folder / "diverged"), progress() as bar:
         rows = {trial: bar.add_task(", ".join(trial), total=None) for trial in wanted}
         try:
             found = experiment.run_trials(wanted, lambda *trial: bar.advance(rows[trial]), interrupt)
@@ -225,9 +225,9 @@ def debug(
     """
     with busy("reading"):
         from robot.studies import dump_view
-        from tacsim.physics.failure.dump import read
+        from tacsim.physics.failure.dump import read_dump
 
-        found = read(dump)
+        found = read_dump(dump)
         world = dump_view.open_world(found)
     results.print(found.info.message)
     results.print(", ".join(f"{name} {version}" for name, version in found.info.versions.items()))

@@ -15,7 +15,7 @@ from tacsim.geometry.shapes import shape_distance
 from tacsim.interface import Pose
 from tacsim.models.scene import Scene
 from tacsim.physics.failure.diagnosis import corner_volumes, element_volumes, particle_volumes
-from tacsim.physics.failure.dump import MOMENTS, Dump, DumpError, dumps_in
+from tacsim.physics.failure.dump import MOMENTS, Dump, DumpError, dump_to_folder
 from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.physics.snapshot import State, gel_arrays
 from tacsim.physics.world import World, make_world
@@ -46,7 +46,7 @@ def replay(dump: Dump, world: World) -> tuple[SimulationDiverged | None, str]:
     """
     try:
         command = dump.command
-        with dumps_in(None):
+        with dump_to_folder(None):
             stats = world.move(command.targets, command.loads, command.duration, flow=command.flow)
     except SimulationDiverged as failure:
         same = str(failure) == dump.info.message

@@ -99,8 +99,8 @@ def three(
 ) -> subprocess.CompletedProcess[str]:
     """A process that compiles a kernel and prints the three it gives, then does `more`. places: what says in its
     environment where kernels are kept; before: what it does once Taichi is imported."""
-    code = "from tacsim.compute.runtime import start, ti\n@ti.kernel\ndef three() -> ti.i32: return 3\n"
-    (folder / "small.py").write_text(f"{code}{before}start()\nprint(three())\n{more}")
+    code = "from tacsim.compute.runtime import start_taichi, ti\n@ti.kernel\ndef three() -> ti.i32: return 3\n"
+    (folder / "small.py").write_text(f"{code}{before}start_taichi()\nprint(three())\n{more}")
     elsewhere = ("HOME", "XDG_CACHE_HOME", "TI_OFFLINE_CACHE_FILE_PATH")
     environment = {name: value for name, value in os.environ.items() if name not in elsewhere} | places
     environment |= {"PYTHONPATH": os.pathsep.join(sys.path), "TACSIM_DEVICE": "cpu"}

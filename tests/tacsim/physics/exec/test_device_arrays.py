@@ -15,6 +15,7 @@ def test_a_device_without_room_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(device_arrays.ti, "ndarray", no_room)
     with pytest.raises(
-        MemoryError, match=r"no room on the device for 'nodes', an array of \(70, 3\).*OUT_OF_MEMORY.*a coarser preset"
+        MemoryError,
+        match=r"no memory on the device for 'nodes', an array of \(70, 3\).*OUT_OF_MEMORY.*a coarser preset",
     ):
         device_arrays.DeviceArrays().allocate("nodes", device_arrays.ti.f32, (70, 3))

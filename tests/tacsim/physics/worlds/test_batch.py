@@ -191,14 +191,16 @@ def test_a_state_broken_before_is_told_in_its_place(fresh: Batch) -> None:
 
 @pytest.mark.cpu
 def test_a_body_far_away_enlarges_no_array_but_the_grid(fresh: Batch) -> None:
-    arrays = fresh._state.particles.rows, fresh._state.contact_history, fresh._state.gels.alike.nodes
+    arrays = fresh._state.particles.rows, fresh._state.contact_history, fresh._state.gels.common_group.nodes
     nodes = fresh._state.particles.masses.shape[2]
     for place in ("position", "reference"):
         fresh.worlds[0].arrays()[place][-1] += [0.0, 60.0, 0.0]
     stats = fresh.move([STAY, closed(fresh.worlds[1], 0.4e-3), None])[1]
     assert fresh._state.particles.masses.shape[2] > nodes
     assert all(a is b for a, b in zip(
-        arrays, (fresh._state.particles.rows, fresh._state.contact_history, fresh._state.gels.alike.nodes), strict=True
+        arrays,
+        (fresh._state.particles.rows, fresh._state.contact_history, fresh._state.gels.common_group.nodes),
+        strict=True,
     ))  # fmt: skip
     alone = HybridWorld(SCENES[1])
     assert alone.move(closed(alone, 0.4e-3)) == stats
@@ -223,7 +225,7 @@ def out_of_room(ends: Sequence[Any], batch: Batch, before: list[dict[str, bytes]
 def test_one_that_needs_more_grid_than_its_share_is_told_alone() -> None:
     """Its grid would be allowed in a world of its own; of four, in four copies, kernels could not count the nodes."""
     batch = Batch(SCENES[:1] * 4)
-    most = batch._state.particles.most
+    most = batch._state.particles.max_grid_nodes
     assert most < MAX_GRID_NODES and 4 * COPIES * 4 * most <= MAX_NUMBERS
     way = (most ** (1 / 3) - 9) * 2 * SCENES[0].spacing * 1e3  # [mm]; body and borders are another 17 cells
     for place in ("position", "reference"):
@@ -249,7 +251,7 @@ def test_one_for_whose_grid_there_is_no_memory_is_told_alone(monkeypatch: pytest
         batch.worlds[2].arrays()[place][-1] += [0.0, 400.0, 0.0]
     before = [state(world) for world in batch.worlds]
     failure = out_of_room(batch.move([closed(world, 0.3e-3) for world in batch.worlds]), batch, before, 2)
-    assert "no memory for the grid round the particles (Unable to allocate)" in str(failure)
+    assert "no memory for the grid around the particles (Unable to allocate)" in str(failure)
     grid = batch._state.particles
     assert grid.masses.shape[2] == grid.velocities.shape[1]
 

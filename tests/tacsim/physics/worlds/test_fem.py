@@ -206,7 +206,7 @@ def test_a_step_that_diverges_is_taken_back_with_its_speed_and_dumped(
         world.move(nearer(world, 7e-3), flow=True)
     assert {name: a.tobytes() for name, a in world.snapshot().items()} == before
     assert failure.value.dump is not None
-    found = dump.read(failure.value.dump)
+    found = dump.read_dump(failure.value.dump)
     assert found.command.flow
     again, outcome = replay(found, open_world(found))
     assert again is not None and again.cause == failure.value.cause

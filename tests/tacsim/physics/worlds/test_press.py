@@ -202,7 +202,7 @@ def test_the_grids_of_all_environments_together_are_bounded(tmp_path: Path) -> N
     state = world(brick(tmp_path, (2, 2, 2))[1], preset="draft")._state
     counts = state.counts.copy()
     laid = state._values = np.broadcast_to(np.float32(0), (1, 2**29, 1, 1))  # without memory
-    with pytest.raises(MemoryError, match="kernels count to"):
+    with pytest.raises(MemoryError, match="the limit of kernels is"):
         state.cover(0, np.zeros(3), np.ones(3))
     assert state._values is laid and np.array_equal(state.counts, counts)
 

@@ -280,7 +280,7 @@ def test_many_small_slides_that_come_as_far_have_not_settled_either() -> None:
     w = pressed_ball(1.1, "draft")
     for settled in (True, True, True, False):
         stats = w.move({"indenter": Pose(w.pose("indenter").position + [0.6e-3, 0, 0])})
-        assert stats.settled == settled and bool(w.unfollowed) != settled
+        assert stats.settled == settled and bool(w.unsettled_reason) != settled
     other = PressWorld(w.scene)
     other.restore(w.snapshot())
     assert not other.move({"indenter": Pose(w.pose("indenter").position + [0.1e-3, 0, 0])}).settled
@@ -394,6 +394,6 @@ def test_a_failed_attempt_leaves_nothing_behind() -> None:
     before, wanted = w.snapshot(), slide(w, 0.1e-3)
     w.restore(before)
     gels = w._state._gels
-    gels.alike.f[...] = float("nan")
+    gels.common_group.f[...] = float("nan")
     gels._corners[gels._corners != 0.0] = float("nan")
     assert slide(w, 0.1e-3) == wanted

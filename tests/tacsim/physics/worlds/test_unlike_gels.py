@@ -158,5 +158,5 @@ def test_gels_that_meet_are_refused_by_the_thinner_one() -> None:
     beside = moved(world, "upper", [7.8e-3, 0.0, 0.0])
     world.place(beside)
     down = moved(world, "upper", [0.0, 0.0, -3.9e-3])
-    with pytest.raises(SimulationDiverged, match=r"the gels lie .* mm inside one another.*limit 0\.5 mm"):
+    with pytest.raises(SimulationDiverged, match=r"the gels overlap by .* mm.*limit 0\.5 mm"):
         world.move(down)

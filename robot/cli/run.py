@@ -249,7 +249,7 @@ def _report(episode: Episode, folder: Path, files: Sequence[Path]) -> None:
     import json
 
     from robot.rig.recorded import RecordedSurfaces
-    from tacsim.report.report import end_table, write_report
+    from tacsim.report.report import summary_table, write_report
 
     with busy("writing the report"), writing(folder):
         surfaces = RecordedSurfaces(episode.meta)
@@ -258,4 +258,4 @@ def _report(episode: Episode, folder: Path, files: Sequence[Path]) -> None:
     for words in surfaces.notes:
         notes.print(words)
     listed = [paths["report.html"], paths["report.png"], *files, paths["summary.json"]]
-    results.print(end_table(stats, listed))
+    results.print(summary_table(stats, listed))

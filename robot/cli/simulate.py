@@ -71,7 +71,7 @@ def press(
     Example: tacsim press sphere --radius '3 mm' --depth '0.4 mm' --slide '1 mm, 0'
     """
     from tacsim.config import load_scene, load_sensor
-    from tacsim.config.gel import fit_gel, gel_sizes_given
+    from tacsim.config.gel import fit_gel, overridden_gel_sizes
 
     folder = new_directory(out, "press")
     given = {name: getattr(shape, name) for name in ("radius", "height", "size", "scale")}
@@ -80,7 +80,7 @@ def press(
         changes.append(f"indenter.edge_radius={shape.edge_radius!r}")
     scene = load_scene("press", [f"preset={preset}", *changes, *(set_ or [])])
     model = load_sensor(sensor).model_copy(update={"view": None})
-    sizes = gel_sizes_given(text.partition("=")[0].split(".") for text in set_ or [])
+    sizes = overridden_gel_sizes(text.partition("=")[0].split(".") for text in set_ or [])
     scene, said = fit_gel(scene, {"lower": model}, given=sizes)
     for words in said:
         notes.print(words)
@@ -176,7 +176,7 @@ def reproduce(
     with busy("loading"):
         from robot.studies import experiment
         from tacsim.physics.failure.dump import dump_to_folder
-        from tacsim.report.figure4 import figure4
+        from tacsim.report.figure4 import draw_figure4
 
     # The longest first, so that no processor waits for it at the end.
     wanted = [(task, scheme) for scheme in schemes for task in ("reposition", "squeeze")]
@@ -192,7 +192,7 @@ def reproduce(
     picture, table = folder / "fig4.png", folder / "fig4.json"
     with writing(folder, new=True), busy("drawing"):
         table.write_text(json.dumps(experiment.as_json(trials), indent=1, allow_nan=False) + "\n", encoding="utf-8")
-        figure4(trials, picture)
+        draw_figure4(trials, picture)
     say_files(picture, table)
     if _judge(trials):
         raise typer.Exit(1)

@@ -76,7 +76,7 @@ def test_gels_are_as_large_as_their_own_sensors(folder: Path) -> None:
     assert [said.config.scene.gel_of(name).size[:2] for name in ("lower", "upper")] == [
         pytest.approx((20e-3, 15e-3)), (10e-3, 10e-3)
     ]  # fmt: skip
-    assert "gel 10 x 10 mm, as said on the command line" in " ".join(said.notes)
+    assert "gel 10 x 10 mm, as given on the command line" in " ".join(said.notes)
     assert load_rig(write("said.yaml", said.text)).config == said.config
     both = load_rig("sim", overrides=[*models, "scene.gel.size=[10 mm, 10 mm, 4 mm]"]).config.scene
     assert both is not None and both.gel_of("lower").size == both.gel_of("upper").size == (10e-3, 10e-3, 4e-3)

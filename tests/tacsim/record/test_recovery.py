@@ -20,7 +20,7 @@ from tacsim.record.episode import Episode, EpisodeError, EpisodeMeta, Step
 from tacsim.record.messages import Encoded, decode_step, encode_step
 from tacsim.record.protobuf import Scalar
 from tacsim.record.reader import read_episode
-from tacsim.record.schemas import META, encode_meta, sealed
+from tacsim.record.schemas import META, add_checksum, encode_meta
 from tacsim.record.writer import Recorder
 
 
@@ -199,7 +199,7 @@ def test_other_formats_and_compressed_chunks_are_named(tmp_path: Path, meta: Epi
             stock = Writer(file, compression=CompressionType.NONE)
             stock.start()
             changed = {key: value for key, value in config.items() if key != "crc32"} | {"format": other}
-            stock.add_metadata(META, sealed(changed))
+            stock.add_metadata(META, add_checksum(changed))
             stock.finish()
         with pytest.raises(EpisodeError, match=f"episode format '{other}', but this tacsim reads 2"):
             read_episode(tmp_path / "other.mcap")

@@ -73,7 +73,7 @@ def read_files(path: Path) -> tuple[Path, dict[str, Any], bytes]:
         png = file.with_name(REFERENCE).read_bytes()
     except FileNotFoundError as missing:
         raise NoBundle(
-            f"{missing.filename} is missing: a calibration is a folder with {FILE} and {REFERENCE}"
+            f"{missing.filename} is not there: a calibration is a folder with {FILE} and {REFERENCE}"
             f"{_suggest_bundle(path)}"
         ) from None
     except (OSError, UnicodeDecodeError) as failure:

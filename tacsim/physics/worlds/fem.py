@@ -244,7 +244,7 @@ class FemWorld(BaseWorld):
 
     @property
     def _waves(self) -> tuple[float, ...]:
-        """Speeds of the gels' pressure waves; one of them is 1."""
+        """Speeds of the gels' pressure waves, in kernel units."""
         entries = self._inertia.params
         return tuple(
             math.sqrt(gel.density / entries.get(GEL_DENSITY + g, gel.density)) for g, gel in enumerate(self._gels)

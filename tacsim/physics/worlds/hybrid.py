@@ -112,7 +112,10 @@ class HybridWorld(FemWorld):
             params[HOUSING + g] = -1.0 if gel.housing is None else gel.housing * MM
         self._state.params[index, list(params)] = list(params.values())
         self._inertias = HybridInertia(scene, self._gels, self._body, self._body_force)
-        self._scaled, self._true = self._inertias.scaled(height * MM, yields=self.yields), self._inertias.true()
+        self._scaled, self._true = (
+            self._inertias.scaled_inertia(height * MM, yields=self.yields),
+            self._inertias.true_inertia(),
+        )
         self._use_inertia(self._scaled)
 
     # ---------------------------------------------------------------- inertia

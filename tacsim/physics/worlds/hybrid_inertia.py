@@ -59,7 +59,7 @@ class HybridInertia:
     body: BodyParams
     body_force: np.ndarray  # (3,) weight of the body [N/mm^3]
 
-    def scaled(self, height: float, *, yields: bool) -> Inertia:
+    def scaled_inertia(self, height: float, *, yields: bool) -> Inertia:
         """Inertia of quasi-static motions; height: of the body [mm]."""
         step = BODY_COURANT * min(self.body.cell, *(gel.spacing for gel in self.gels))
         damping = {
@@ -93,7 +93,7 @@ class HybridInertia:
         rates = [zeta * share / gel.thickness for share, gel in zip(shares, self.gels, strict=True)]
         return {GEL_DAMPING + g: rate for g, rate in enumerate(rates)}
 
-    def true(self) -> Inertia:
+    def true_inertia(self) -> Inertia:
         """Inertia of motions in real time: the fastest pressure wave of the gels has speed 1."""
         assert self.scene.body is not None
         materials = [self.scene.gel_of(name).material for name in self.scene.sensors]

@@ -67,7 +67,7 @@ BodyArrays = ti.types.argpack(
 
 
 @ti.func
-def row(drive: ti.template(), env: ti.template(), it, g, r):
+def drive_row(drive: ti.template(), env: ti.template(), it, g, r):
     return vec3([drive[env.index, it, g, r, c] for c in range(3)])
 
 
@@ -78,8 +78,10 @@ def three_rows(particles: ti.template(), at, stride):
 
 
 @ti.func
-def rotation(drive: ti.template(), env: ti.template(), it, g):
-    return ti.Matrix.rows([row(drive, env, it, g, 0), row(drive, env, it, g, 1), row(drive, env, it, g, 2)])
+def drive_rotation(drive: ti.template(), env: ti.template(), it, g):
+    return ti.Matrix.rows(
+        [drive_row(drive, env, it, g, 0), drive_row(drive, env, it, g, 1), drive_row(drive, env, it, g, 2)]
+    )
 
 
 @ti.func
@@ -121,22 +123,22 @@ def grid_update(env: ti.template(), part, it, drive: ti.template(), body: ti.tem
     force0, force1 = part_sum(env, layout.FORCE), part_sum(env, layout.FORCE + 6)
     mass, particles = env.param(layout.BODY_MASS), env.count(layout.PARTICLES)
     push = mass * particles * weight  # total force on the body: weight and contact
-    push -= rotation(drive, env, it, 0) @ force0
-    push -= rotation(drive, env, it, 1) @ force1
+    push -= drive_rotation(drive, env, it, 0) @ force0
+    push -= drive_rotation(drive, env, it, 1) @ force1
     touches0, touches1 = force0.norm_sqr() > 0.0, force1.norm_sqr() > 0.0
     mean = part_sum(env, layout.VELOCITY_SUM) / particles
     boost = ((env.param(layout.RIGID_MASS_SCALE) - 1.0) * dt / (mass * particles)) * push
-    p0, p1 = row(drive, env, it, 0, 3), row(drive, env, it, 1, 3)
+    p0, p1 = drive_row(drive, env, it, 0, 3), drive_row(drive, env, it, 1, 3)
     centre = env.param3(layout.CENTRE)
-    torque = -moment_about(centre, p0, rotation(drive, env, it, 0), force0, part_sum(env, layout.FORCE + 3))
-    torque -= moment_about(centre, p1, rotation(drive, env, it, 1), force1, part_sum(env, layout.FORCE + 9))
+    torque = -moment_about(centre, p0, drive_rotation(drive, env, it, 0), force0, part_sum(env, layout.FORCE + 3))
+    torque -= moment_about(centre, p1, drive_rotation(drive, env, it, 1), force1, part_sum(env, layout.FORCE + 9))
     turn = (
         (ROTATION_BOOST * (env.param(layout.RIGID_MASS_SCALE) - 1.0) * dt)
         * symmetric(env, layout.INVERSE_INERTIA)
         @ torque
     )
-    v0, v1 = row(drive, env, it, 0, 4), row(drive, env, it, 1, 4)
-    w0, w1 = row(drive, env, it, 0, 5), row(drive, env, it, 1, 5)
+    v0, v1 = drive_row(drive, env, it, 0, 4), drive_row(drive, env, it, 1, 4)
+    w0, w1 = drive_row(drive, env, it, 0, 5), drive_row(drive, env, it, 1, 5)
     axis = p1 - p0
     length2 = axis.norm_sqr() + 1e-12
     share = ti.select(touches0 and touches1, 1.0, 0.0)  # 1: interpolate between the sensors; 0: one sensor
@@ -189,8 +191,12 @@ def gel_contact(
 
     highest: `max_surface_height` of that gel.
     """
-    rotate = rotation(drive, env, it, g)
-    origin, velocity, spin = row(drive, env, it, g, 3), row(drive, env, it, g, 4), row(drive, env, it, g, 5)
+    rotate = drive_rotation(drive, env, it, g)
+    origin, velocity, spin = (
+        drive_row(drive, env, it, g, 3),
+        drive_row(drive, env, it, g, 4),
+        drive_row(drive, env, it, g, 5),
+    )
     back = rotate.transpose()
     outward = vec3(rotate[0, 2], rotate[1, 2], rotate[2, 2])  # the sensor's z axis
     spacing = 0.5 * env.param(layout.BODY_CELL)

@@ -130,7 +130,7 @@ class PressWorld(FemWorld):
         )
 
     def reach(self) -> np.ndarray:
-        """Distance from the indenter at which the stored pressure is 0 [m], at the surface's nodes (nx + 1, ny + 1)."""
+        """Distance from the indenter up to which contact pressure acts [m], at the surface's nodes (nx + 1, ny + 1)."""
         stiffness = float(self._state.params[self._index, STIFFNESS])
         return np.asarray(
             self._state.gels.common_group.surface_pressure[self._index, 0] / (RIM_STIFFNESS * stiffness * MM)

@@ -233,12 +233,12 @@ def store_entries(dtype: Any) -> Any:
     array = ti.types.ndarray(dtype=dtype, ndim=3)
 
     @ti.kernel
-    def keep(first: ti.i32, last: ti.i32, resting: ti.i32, counts: Counts, source: array, target: array):
+    def store(first: ti.i32, last: ti.i32, resting: ti.i32, counts: Counts, source: array, target: array):
         for e, i, j in ti.ndrange((first, last), source.shape[1], source.shape[2]):
             if resting or counts[e, layout.STEPS] > 0:
                 target[e, i, j] = source[e, i, j]
 
-    return keep
+    return store
 
 
 @ti.kernel

@@ -19,7 +19,8 @@ GEL_ZETA, BODY_ZETA = 0.8, 0.6
 GEL_ZETA_HELD, BODY_ZETA_HELD = 1.6, 1.2
 YIELDING_ZETA_HELD = 0.3  # of a held body that yields: more damping would delay its creep
 GEL_ZETA_DRAGGED, BODY_ZETA_DRAGGED = 1.6, 1.2  # while a body is dragged: without it oscillations change the end state
-GEL_ZETA_FLOWING, BODY_ZETA_FLOWING = 1.2, 0.3  # in flowing motions: body damping raises forces, gel oscillations yield
+# In flowing motions: damping of the body raises forces, and oscillations of the gel make clay yield
+GEL_ZETA_FLOWING, BODY_ZETA_FLOWING = 1.2, 0.3
 # [pressure wave speed] of a gel's shear wave (nu 0.48): below it zeta is reduced in proportion. With full damping, a
 # gel of nu 0.499 crept until clay yielded: 28 % low at `learn`, now 0.8 %.
 FULL_DAMPING_SHEAR_SPEED = 0.196

@@ -90,7 +90,7 @@ def nothing(arrays: dict[str, np.ndarray]) -> None:
         (Health(1.0, 3, 1.0, 0.0, 0, 0.0), "left the grid (3 particle substeps)"),
         (
             Health(1.0, 0, 1.0, 0.0, 0, 0.0, 1.2),
-            "1.2 of what the pressure wave takes through the most squeezed element or grid cell (limit 1)",
+            "1.2 of the pressure wave's time through the most compressed element or grid cell (limit 1)",
         ),
     ],
 )

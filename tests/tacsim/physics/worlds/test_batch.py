@@ -285,7 +285,7 @@ def test_one_whose_mesh_needs_too_much_is_told_alone(
     ]
     failure, stats = batch.move(down[:2])
     assert isinstance(failure, SimulationDiverged) and failure.refine == 1  # no smaller step would help
-    assert words in str(failure) and "of a smaller batch have more room" in str(failure)
+    assert words in str(failure) and "in a smaller batch each world has more memory" in str(failure)
     assert state(batch.worlds[0]) == before
     assert np.array_equal(batch._state.counts[0], counts[0]) and np.array_equal(batch._state.params[0], params[0])
     assert stats == alone.move(down[2])

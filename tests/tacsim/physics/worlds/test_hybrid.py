@@ -168,7 +168,7 @@ def test_a_body_without_yield_answers_like_one_that_never_reaches_it() -> None:
     for material in (BodyMaterial(), BodyMaterial(yield_stress=1e12)):
         w = world(CUBE.model_copy(update={"material": material}))
         w.yields = True  # else the first is driven faster, and damped more while it is held
-        w._scaled = w._inertias.scaled(5.0, yields=True)
+        w._scaled = w._inertias.scaled_inertia(5.0, yields=True)
         w._use_inertia(w._scaled)
         squeeze(w, 1.0e-3)
         states.append(w.snapshot())

@@ -309,7 +309,7 @@ def test_what_is_dumped_is_read_back(data: object) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_schema_is_complete_and_knows_references(kind: str) -> None:
+def test_schema_is_complete_with_references(kind: str) -> None:
     schema = json_schema(kind)
     references = [found["enum"] for found in walk(schema) if isinstance(found.get("enum"), list)]
     assert shipped_names(kind) in references

@@ -11,7 +11,7 @@ from tacsim.models.scene import Scene
 from tests.tacsim.config.files import write
 
 
-def test_a_sensor_has_a_gel_of_its_own_where_the_scene_says_so(folder: Path) -> None:
+def test_sensor_has_separate_gel_if_scene_gives_one(folder: Path) -> None:
     text = """
 extends: squeeze
 gel: {material: {youngs_modulus: 0.2 MPa}}

@@ -151,7 +151,7 @@ def test_a_damaged_attachment_costs_itself_alone(whole: Path, tmp_path: Path) ->
     assert dict(episode.meta.attachments) == {"a.yaml": b"a: 1"} and len(episode.steps) == STEPS
 
 
-def test_what_is_whole_or_nothing_says_so(whole: Path, tmp_path: Path) -> None:
+def test_recover_reports_intact_and_empty_files(whole: Path, tmp_path: Path) -> None:
     found = recover_recording(whole, whole)
     assert found.is_whole and found.steps == STEPS
     for data, words in (

@@ -308,7 +308,7 @@ def test_hidden_files_are_skipped(folder: Path) -> None:
     assert len(list_pictures(folder)) == 4
 
 
-def test_what_a_folder_without_pictures_holds_is_said(tmp_path: Path) -> None:
+def test_folder_without_pictures_reports_other_files(tmp_path: Path) -> None:
     (tmp_path / "a.tiff").write_bytes(b"II*\0")
     with pytest.raises(EpisodeError, match=r"but 1 like a\.tiff; save them as PNG with 8 bits"):
         list_pictures(tmp_path)

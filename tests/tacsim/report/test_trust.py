@@ -43,7 +43,7 @@ FINE = {"stale_left_2": 0.0, "drift_left_2": 0.01, "background_left_2": 0.4, "be
 BAD = {"stale_left_2": 1.0, "drift_left_2": 0.12, "background_left_2": 4.25, "beyond_left_2": 0.06, "kept_left_2": 0.5}
 
 
-def test_the_worst_of_an_episode_is_said() -> None:
+def test_worst_values_of_episode_are_reported() -> None:
     config = told(episode(FINE, BAD, FINE))
     assert config == {
         "left_2": {"stale": 1, "steps": 3, "drift": 0.12, "background": 4.25, "beyond": 0.06, "kept": 0.5}
@@ -55,7 +55,7 @@ def test_the_worst_of_an_episode_is_said() -> None:
     assert "only 50% of the markers" in words[2]
 
 
-def test_nothing_is_said_where_all_is_well_or_nothing_is_told() -> None:
+def test_no_warning_without_faults_or_without_diagnostics() -> None:
     config = told(episode(FINE, FINE))
     assert config is not None and sensor_warnings(config) == []
     assert told(episode({}, {})) is None and told(episode()) is None

@@ -192,7 +192,7 @@ def test_convection_is_f_b_f_transposed() -> None:
 
 @some
 @given(seed=SEEDS, size=st.floats(1e-3, 0.3), step=st.floats(1e-3, 0.1))
-def test_convection_does_not_feel_how_space_is_turned(seed: int, size: float, step: float) -> None:
+def test_transport_of_strain_is_invariant_under_rotation(seed: int, size: float, step: float) -> None:
     """Objective: after f <- q f, b turns by q, however far; and a step of mere rotation strains nothing."""
     start_taichi()
     rng, q = np.random.default_rng(seed), Rotation.random(rng=seed + 1).as_matrix()

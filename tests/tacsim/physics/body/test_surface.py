@@ -43,7 +43,7 @@ def test_outer_particles_know_the_surface(geometry: Box | Sphere, sampling: str)
         assert np.mean(off < 1e-9) > 0.75
 
 
-def test_a_mesh_knows_its_surface_like_the_shape_it_describes(tmp_path: Path) -> None:
+def test_mesh_has_same_tangent_planes_as_its_shape(tmp_path: Path) -> None:
     trimesh.creation.box((10, 10, 6)).export(tmp_path / "box.stl")
     points = body_points(Body(geometry=CUBE, sampling="random"), SPACING)
     of_mesh = tangent_planes(Mesh(path=str(tmp_path / "box.stl")), points, SPACING)

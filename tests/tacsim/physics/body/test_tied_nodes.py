@@ -78,7 +78,7 @@ def test_leaders_in_a_plane_give_their_mean_across_it() -> None:
     assert share @ (2.0 + x - 3.0 * y) == pytest.approx(2.0 + 4.0 - 3.0 * 4.0, abs=1e-6)
 
 
-def test_a_node_that_its_followers_leave_no_mass_follows_too() -> None:
+def test_full_node_left_without_mass_is_tied() -> None:
     """Shares of leaders beyond the nearest are negative: nine light nodes take more from one that is hardly heavy."""
     masses = np.zeros((11, 9, 9))
     masses[3, 4, 4], masses[4, 4, 4] = MAX_TIED_NODE_MASS, 8.0
@@ -145,7 +145,7 @@ def test_momentum_and_angular_momentum_stay(shape: str) -> None:
     assert np.abs(velocity[light]).max() > 1e-3
 
 
-def test_links_outlive_launches_and_are_found_anew_where_a_grid_is_laid() -> None:
+def test_links_are_kept_between_launches_and_found_again_for_new_grid() -> None:
     points = points_of(SHAPES["cylinder"], "lattice")
     state = BodyState([points, points])
     params, counts = np.zeros((2, layout.PARAMS), np.float32), np.zeros((2, layout.COUNTS), np.int32)

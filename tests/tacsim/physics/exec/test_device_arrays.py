@@ -9,7 +9,7 @@ import pytest
 from tacsim.physics.exec import device_arrays
 
 
-def test_a_device_without_room_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_device_without_memory_raises_memory_error(monkeypatch: pytest.MonkeyPatch) -> None:
     def no_room(*_: Any) -> None:
         raise RuntimeError("[cuda_driver.h:operator()@92]\nCUDA_ERROR_OUT_OF_MEMORY: out of memory")
 

@@ -94,7 +94,7 @@ def nothing(arrays: dict[str, np.ndarray]) -> None:
         ),
     ],
 )
-def test_what_the_kernels_saw_is_check_launch(seen: Health, words: str) -> None:
+def test_check_launch_reports_results_of_kernels(seen: Health, words: str) -> None:
     with pytest.raises(SimulationDiverged) as caught:
         Particles().launch(nothing, seen)
     assert words in caught.value.cause and "lower at (0.000, 0.000, 1.000) mm" in caught.value.where
@@ -109,7 +109,7 @@ def test_the_cause_names_array_index_and_how_many() -> None:
         Particles().launch(lambda a: a["velocity"].__setitem__((slice(2, 4), 1), np.nan))
 
 
-def test_a_gel_node_that_races_and_a_crushed_particle_are_seen() -> None:
+def test_fast_gel_node_and_crushed_particle_are_detected() -> None:
     world = Particles()
     world.state["gel_velocity"] = np.zeros((1, 2, 2, 2, 3), np.float32)
     with pytest.raises(SimulationDiverged, match=r"gel node moves at 0\.6 of the wave speed"):
@@ -192,7 +192,7 @@ def test_an_interrupted_motion_is_taken_back(error: type[BaseException]) -> None
     assert world.state["position"].max() == 1.0
 
 
-def test_a_broken_state_is_told_before_anything_moves() -> None:
+def test_state_with_nan_is_refused_before_motion() -> None:
     world = Particles()
     world.state["position"][3, 0] = np.nan
     with pytest.raises(
@@ -236,7 +236,7 @@ def test_volumes_are_those_of_the_determinant() -> None:
     assert diagnosis.particle_volumes({"strain": six}) == pytest.approx(np.abs(np.linalg.det(f)), rel=1e-9)
 
 
-def test_a_span_says_where_the_frames_are() -> None:
+def test_launch_span_text_contains_frame_positions() -> None:
     path = Path([Pose()], [Pose(np.array([0, 0, 2e-3]))], substeps=40, dt=0.4)
     assert str(path.span(["lower"], 0, 20)) == (
         "in substeps 0 to 20 of 40 of the motion, lower at (0.000, 0.000, 1.000) mm"
@@ -288,7 +288,7 @@ def test_the_step_is_measured_against_the_most_squeezed_element(gradient: np.nda
         assert exact - 1e-4 <= courant <= MAX_COURANT
 
 
-def test_the_most_squeezed_element_is_the_shortest_one_whatever_its_volume() -> None:
+def test_most_compressed_element_is_shortest_at_any_volume() -> None:
     rest = np.stack(np.meshgrid(*[np.arange(5)] * 3, indexing="ij"), axis=-1)
     flat, small = (rest * (np.array(stretch) - 1.0) for stretch in ((0.3, 2.0, 2.0), (0.6, 0.6, 0.6)))
     for displacement, gel in (([flat, small], "lower"), ([small, flat], "upper")):
@@ -298,7 +298,7 @@ def test_the_most_squeezed_element_is_the_shortest_one_whatever_its_volume() -> 
         )
 
 
-def test_a_step_that_squeezed_elements_do_not_bear_is_halved(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unstable_step_for_compressed_elements_is_halved(monkeypatch: pytest.MonkeyPatch) -> None:
     """Though nothing blows up, as is seen without the limit."""
     monkeypatch.setattr(press, "PRESS_COURANT", 0.8)
     world = PressWorld(BALL.model_copy(update={"settling": Settling(mach=0.1)}))
@@ -316,7 +316,7 @@ def test_a_step_that_squeezed_elements_do_not_bear_is_halved(monkeypatch: pytest
     assert last.retries == 1 and last.time_step == pytest.approx(0.4e-3) and 0.4 < last.courant < MAX_COURANT
 
 
-def test_a_motion_tells_by_which_numbers_it_went() -> None:
+def test_motion_reports_step_damping_and_courant_number() -> None:
     world = PressWorld(BALL)
     pose = world.pose("indenter")
     stats = world.move({"indenter": Pose(pose.position - [0, 0, 0.5e-3])})

@@ -250,7 +250,7 @@ def test_the_law_is_objective_isotropic_and_balances_moments(seed: int, size: fl
 
 @settings(max_examples=10, deadline=None)
 @given(seed=SEEDS, size=SIZES)
-def test_work_is_the_change_of_the_stored_energy_whatever_the_way(seed: int, size: float) -> None:
+def test_work_equals_change_of_stored_energy_on_any_path(seed: int, size: float) -> None:
     """W = mu/2 (|F|^2 - 3 - 2 ln J) + lambda/2 ln^2 J, straight and by a detour, each leg by Gauss-Legendre."""
     params = gel_params(GEL, 1e-3)
     rest, end, detour = np.eye(3), *(pure_stretch(seed + other, size) for other in (0, 1))
@@ -328,7 +328,7 @@ def test_hourglass_modes_are_resisted_and_linear_fields_are_not() -> None:
     assert (f[..., 0] * pattern).sum() < -1e-4  # work against the checkerboard
 
 
-def test_inversion_is_seen() -> None:
+def test_inverted_element_is_detected() -> None:
     u = np.zeros(nodes().shape)
     u[3:5, 3:5, 4, 2] = -1.2  # the top of one cell pushed through its bottom
     _, smallest = run(u)

@@ -63,7 +63,7 @@ def creeping(share: float, after: float) -> ForceReading:
 
 
 @pytest.mark.parametrize("before", [1, 40])
-def test_of_a_creep_with_the_logarithm_of_time_is_told_what_is_to_come(before: int) -> None:
+def test_remaining_creep_of_logarithmic_creep_is_estimated(before: int) -> None:
     """Whenever it began: the motion alone would have it 10 readings older than the hold."""
     held = [creeping(0.01, before + n) for n in range(1, 41)]
     lost = 0.01 * np.log1p(FORECAST_READINGS / (before + 40))
@@ -110,7 +110,7 @@ def test_a_launch_gives_several_readings_where_it_can() -> None:
 
 
 @pytest.mark.parametrize("creeps", [True, False])
-def test_what_creeps_with_the_logarithm_of_time_is_not_settled_before_its_time(creeps: bool) -> None:
+def test_logarithmic_creep_settles_only_below_tolerance(creeps: bool) -> None:
     """Each change is within the tolerance from the start, and so is what a geometric rest of them would be."""
     path = replace(Path([Pose()], [Pose()], 0, 0.4), is_creeping=creeps)
     times = iter(range(8, 1000))

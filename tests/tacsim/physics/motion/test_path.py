@@ -115,7 +115,7 @@ def flow(to: float, before: float) -> NDArray[np.float64]:
 
 
 @pytest.mark.parametrize("to", [0.05, 0.2, 1.0])
-def test_a_step_that_flows_hardly_goes_beyond_its_target_whatever_comes_next(to: float) -> None:
+def test_flowing_step_has_small_overshoot_for_any_next_step(to: float) -> None:
     """Clay keeps what goes beyond. A cubic from mean speed to mean speed, told to stay, went a seventh beyond."""
     onward = flow(to, before=0.0)
     assert onward.max() <= to + 1e-6 and (np.diff(onward) >= 0).all()

@@ -15,7 +15,7 @@ from tacsim.physics.motion.slide import Slide, growth_share, release_share, spee
         ([0.0, 0.0, -1e-3], 0.0),
     ],
 )  # fmt: skip
-def test_what_is_pressed_in_on_its_way_grows(by: list[float], grows: float) -> None:
+def test_indentation_during_slide_gives_growth_share(by: list[float], grows: float) -> None:
     assert growth_share(np.array(by)) == pytest.approx(grows)
 
 
@@ -31,7 +31,7 @@ def test_what_is_pressed_in_on_its_way_grows(by: list[float], grows: float) -> N
         ([1e-3, 0.0, 0.0], [0.0, 0.0, 0.0], 0.0),  # nothing is touched
     ],
 )
-def test_a_way_across_the_drag_turns_it(by: list[float], force: list[float], turns: float) -> None:
+def test_slide_across_drag_gives_turn_share(by: list[float], force: list[float], turns: float) -> None:
     assert turn_share(np.array(by), np.array(force), 0.6) == pytest.approx(turns)
 
 
@@ -117,7 +117,7 @@ def slide(**changes: float) -> Slide:
         ({"length": 1.9, "friction": 1.1, "depth": 0.7}, "1.6 mm.*friction above 1"),
     ],
 )
-def test_which_slides_are_not_followed(changes: dict[str, float], words: str) -> None:
+def test_slide_beyond_limits_gives_reason(changes: dict[str, float], words: str) -> None:
     """Elements of 1 mm, a gel 4 mm thick."""
     said = slide(**changes).unsettled_reason(1.0, 4.0)
     assert bool(said) == bool(words)

@@ -115,7 +115,7 @@ def test_return_mapping_is_that_of_a_float64_svd() -> None:
 
 @some
 @given(seed=SEEDS, size=SIZES, limit=LIMITS)
-def test_the_body_does_not_feel_how_space_is_turned(seed: int, size: float, limit: float) -> None:
+def test_body_law_is_invariant_under_rotation(seed: int, size: float, limit: float) -> None:
     """Objective: F -> Q F turns the stress, and the elastic F with it."""
     f, q = random_f(20, size, seed), turn(seed)
     elastic, tau = mapped(f, clay(limit))
@@ -174,7 +174,7 @@ def test_a_body_that_never_yields_runs_no_return_mapping() -> None:
 
 
 @pytest.mark.parametrize("size", [1e-3, 0.1, 0.2, 0.3, 1.0])
-def test_a_body_that_never_yields_answers_like_one_that_never_reaches_it(size: float) -> None:
+def test_unyielding_body_equals_body_below_its_yield_stress(size: float) -> None:
     f = random_f(500, size, 0)
     elastic, tau = mapped(f, BodyMaterial())
     same, truth = mapped(f, HARDLY)

@@ -140,7 +140,7 @@ def test_one_that_is_replaced_is_a_new_world_to_the_bit() -> None:
         batch.replace(0, Scene(body=None, indenter=Indenter(), gel=GEL))
 
 
-def test_nobody_moves(fresh: Batch) -> None:
+def test_batch_without_targets_changes_nothing(fresh: Batch) -> None:
     before = [state(world) for world in fresh.worlds]
     assert fresh.move([None] * 3) == [None] * 3
     assert [state(world) for world in fresh.worlds] == before
@@ -182,7 +182,7 @@ def test_one_that_diverges_is_taken_back_while_others_go_on(
         assert state(fresh.worlds[1]) == before
 
 
-def test_a_state_broken_before_is_told_in_its_place(fresh: Batch) -> None:
+def test_state_with_nan_fails_in_its_environment_only(fresh: Batch) -> None:
     fresh.worlds[2].arrays()["position"][0] = np.nan
     ends = fresh.move([closed(fresh.worlds[0], 0.3e-3), None, STAY])
     assert isinstance(ends[0], MoveStats)
@@ -222,7 +222,7 @@ def out_of_room(ends: Sequence[Any], batch: Batch, before: list[dict[str, bytes]
 
 
 @pytest.mark.cpu
-def test_one_that_needs_more_grid_than_its_share_is_told_alone() -> None:
+def test_grid_above_share_fails_in_its_environment_only() -> None:
     """Its grid would be allowed in a world of its own; of four, in four copies, kernels could not count the nodes."""
     batch = Batch(SCENES[:1] * 4)
     most = batch._state.particles.max_grid_nodes
@@ -237,7 +237,7 @@ def test_one_that_needs_more_grid_than_its_share_is_told_alone() -> None:
 
 
 @pytest.mark.cpu
-def test_one_for_whose_grid_there_is_no_memory_is_told_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_grid_without_memory_fails_in_its_environment_only(monkeypatch: pytest.MonkeyPatch) -> None:
     batch = Batch(SCENES[:1] * 4)
     zeros = plasticine.aligned_zeros
 
@@ -258,7 +258,7 @@ def test_one_for_whose_grid_there_is_no_memory_is_told_alone(monkeypatch: pytest
 
 @pytest.mark.cpu
 @pytest.mark.parametrize("lacks", ["nodes", "memory"])
-def test_one_whose_mesh_needs_too_much_is_told_alone(
+def test_mesh_without_memory_fails_in_its_environment_only(
     lacks: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     import trimesh
@@ -292,7 +292,7 @@ def test_one_whose_mesh_needs_too_much_is_told_alone(
     assert_same([batch.worlds[1]], [alone])
 
 
-def test_loads_are_held_each_its_own_and_one_out_of_reach_is_told(fresh: Batch) -> None:
+def test_loads_are_held_per_environment_and_unreachable_one_is_reported(fresh: Batch) -> None:
     fresh.move([closed(world, 0.3e-3) for world in fresh.worlds])
     before = state(fresh.worlds[2])
     ends = fresh.move([STAY, None, STAY], [{"upper": 0.05}, None, {"upper": 1e6}])
@@ -302,7 +302,7 @@ def test_loads_are_held_each_its_own_and_one_out_of_reach_is_told(fresh: Batch) 
     assert state(fresh.worlds[2]) == before
 
 
-def test_an_interruption_takes_back_who_is_on_the_way(fresh: Batch, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_interruption_restores_moving_worlds(fresh: Batch, monkeypatch: pytest.MonkeyPatch) -> None:
     before = [state(world) for world in fresh.worlds]
     launches, advance = 0, type(fresh._state).advance
 

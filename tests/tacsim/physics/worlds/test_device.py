@@ -206,7 +206,7 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], dict
 
 @pytest.mark.deep
 @pytest.mark.timeout(3 * SECONDS)
-def test_both_go_the_same_way(pair: tuple[dict[str, Any], dict[str, Any]]) -> None:
+def test_device_and_cpu_follow_same_motion(pair: tuple[dict[str, Any], dict[str, Any]]) -> None:
     cpu, there = pair
     assert cpu.keys() == there.keys()
     for name in ("press", "interrupted", "mesh", "one", "other", "unlike"):
@@ -253,7 +253,7 @@ def test_environments_of_a_batch_return_the_same(pair: tuple[dict[str, Any], dic
 
 @pytest.mark.deep
 @pytest.mark.timeout(3 * SECONDS)
-def test_what_is_unphysical_is_seen(pair: tuple[dict[str, Any], dict[str, Any]]) -> None:
+def test_unphysical_state_is_detected_on_device(pair: tuple[dict[str, Any], dict[str, Any]]) -> None:
     for found in pair:
         assert str(found["race.words"]).startswith("a particle moves at")
         assert str(found["invert.words"]).startswith("a gel element is inverted or crushed")
@@ -284,7 +284,7 @@ print(arrays.upload("state", host, ti.f32).to_numpy()[1, 2])
 """
 
 
-def test_only_what_has_changed_is_sent() -> None:
+def test_only_changed_arrays_are_sent_to_device() -> None:
     done = subprocess.run([sys.executable, "-c", SENT], capture_output=True, text=True, timeout=SECONDS, check=True)
     words = done.stdout.split("\n")
     assert words[:4] == ["1.0", "1.0", "3.0", "(4, 3)"]  # by version

@@ -200,7 +200,7 @@ def everything() -> dict[str, Any]:
     }
 
 
-def test_neighbours_are_kept_together() -> None:
+def test_consecutive_environments_are_stored_together() -> None:
     assert runs_of([]) == []
     assert runs_of([0, 1, 2, 5, 7, 8]) == [(0, 3), (5, 6), (7, 9)]
 
@@ -259,7 +259,7 @@ def test_state_stays_on_the_device_until_somebody_asks_for_it(found: Any) -> Non
 
 @pytest.mark.deep
 @pytest.mark.timeout(2 * SECONDS)
-def test_a_motion_that_fails_returns_to_what_was_kept_on_the_device(found: Any) -> None:
+def test_failed_motion_restores_state_stored_on_device(found: Any) -> None:
     failed = found["failed"]
     assert failed["same"] is True and failed["substeps"] > 0
     assert {"gel_displacement", "position"} <= set(failed["differ"])

@@ -261,7 +261,7 @@ def test_what_is_lifted_in_steps_after_a_slide_keeps_its_drag() -> None:
         assert abs(force[0] / force[2]) / 0.5 == pytest.approx(drag, abs=0.02)
 
 
-def test_an_edge_that_catches_is_told_after_a_slide_to_and_fro() -> None:
+def test_catching_edge_is_reported_after_reversed_slide() -> None:
     """It never comes far from where it touched, but each slide moves the points that hang on it."""
     w = world(Box(size=(5e-3, 5e-3, 4e-3)), 0.6, 1e-2, preset="draft", gel=Gel(), edge_radius=0.0)
     move(w, (0, 0, -0.4e-3))

@@ -230,7 +230,7 @@ def test_the_tasks_scene_is_the_rigs_unless_it_has_its_own(folder: Path) -> None
     assert scene_of("task.scene.preset=standard").preset == "standard"
     write("own.yaml", "extends: sim\nscene: press")
     assert scene_of(rig="own.yaml", task="reposition") == load_scene("press")
-    with pytest.raises(ConfigError, match=r"--set task.scene.preset=draft: task.scene.preset: .* say scene.preset"):
+    with pytest.raises(ConfigError, match=r"--set task.scene.preset=draft: task.scene.preset: .* write scene.preset"):
         scene_of("task.scene.preset=draft", rig="own.yaml")
 
 

@@ -18,7 +18,7 @@ from typing import Annotated
 import typer
 
 from robot.studies.identify.motions import motions
-from tacsim.config import load, load_scene
+from tacsim.config import load_model, load_scene
 from tacsim.models.material import BodyMaterial, GelMaterial
 from tacsim.models.randomisation import Randomisation
 from tacsim.models.training import Training
@@ -84,13 +84,13 @@ def found(folder: Path) -> list[str]:
     friction = load_scene(str(folder / "my-body/scene.yaml")).friction
     return [
         f"scene.gel.material={gel(folder)}",
-        f"scene.body.material={typed(load(BodyMaterial, folder / 'my-body/material.yaml'))}",
+        f"scene.body.material={typed(load_model(BodyMaterial, folder / 'my-body/material.yaml'))}",
         *(f"scene.friction.{name}={mu:.9g}" for name, mu in friction.items()),
     ]
 
 
 def gel(folder: Path) -> str:
-    return typed(load(GelMaterial, folder / "my-gel/material.yaml"))
+    return typed(load_model(GelMaterial, folder / "my-gel/material.yaml"))
 
 
 def typed(material: GelMaterial | BodyMaterial) -> str:
@@ -100,7 +100,7 @@ def typed(material: GelMaterial | BodyMaterial) -> str:
 
 def training(sight: str, materials: str, folder: Path) -> Training:
     """The shipped training; where materials are not drawn, with those of the scene or of `folder`."""
-    whole = load(Training, SIGHTS[sight], [f"dagger.rounds={ROUNDS}"])
+    whole = load_model(Training, SIGHTS[sight], [f"dagger.rounds={ROUNDS}"])
     if materials == "drawn":
         return whole
     assert whole.randomise is not None
@@ -132,7 +132,7 @@ def train(folder: Path, cells: Sequence[tuple[str, str]]) -> None:
 
 def play(folder: Path, episodes: int, every: int, preset: str, workers: int) -> None:
     """Needs the extra `policy`."""
-    twins = load(Randomisation, "squeeze-twin")
+    twins = load_model(Randomisation, "squeeze-twin")
     hidden: dict[str, object] = {key: {"choice": [value]} for key, value in HIDDEN.items()}
     hidden |= {"scene.preset": {"choice": [preset]}, "task.goal": {"uniform": GOALS}}
     drawn = {"draws": episodes, "values": {**twins.model_dump(mode="json", exclude_none=True)["values"], **hidden}}

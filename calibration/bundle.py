@@ -16,13 +16,13 @@ from pydantic import Field, model_validator
 from calibration.errors import CalibrationError
 from calibration.height.slope_polynomial import InverseModel
 from calibration.lens.view import GelView
-from tacsim.config import ConfigError, load, load_sensor
+from tacsim.config import ConfigError, load_model, load_sensor
 from tacsim.config.bundle import (
-    AGAIN,
     FILE,
     REFERENCE,
+    REPLACE_ADVICE,
     NoBundle,
-    digest,
+    bundle_digest,
     find_bundle,
     read_files,
     require_unchanged,
@@ -110,7 +110,7 @@ class Calibration(Config):
 
     def digest(self) -> str:
         """What `checksum` must be."""
-        return digest(self.model_dump(mode="json"))
+        return bundle_digest(self.model_dump(mode="json"))
 
 
 def write_bundle(folder: Path, calibration: Calibration, reference: Image) -> Path:
@@ -132,9 +132,9 @@ def read_bundle(path: Path, serial: str | None = None) -> tuple[Calibration, Ima
     try:
         file, content, png = read_files(find_bundle(path))
         try:
-            calibration = load(Calibration, file)
+            calibration = load_model(Calibration, file)
         except ConfigError as error:
-            raise BadBundle(f"{file} is damaged; {AGAIN}.\n{error}") from None
+            raise BadBundle(f"{file} is damaged; {REPLACE_ADVICE}.\n{error}") from None
         require_unchanged(file, content, png)
     except NoBundle as why:
         raise BadBundle(str(why)) from None

@@ -29,8 +29,8 @@ from tacsim.record.sources import (
     episode_frames,
     episode_meta,
     list_pictures,
-    only_or_named,
-    unknown_source,
+    select_name,
+    unknown_source_error,
     video_images,
 )
 
@@ -83,7 +83,7 @@ def read_frame_set(path: Path, reference: Path | None = None, sensor: str = "") 
     try:
         if path.is_file() and path.suffix.lower() in EPISODES:
             meta = episode_meta(path)
-            name = only_or_named(list(meta.spec.sensors), sensor, path, "sensor")
+            name = select_name(list(meta.spec.sensors), sensor, path, "sensor")
             recorded = (frame for frame, _ in episode_frames(path, name))
             frames = _read_limited(
                 path, (Frame(f"step {k}", each.image, each.surface) for k, each in enumerate(recorded))
@@ -92,7 +92,7 @@ def read_frame_set(path: Path, reference: Path | None = None, sensor: str = "") 
         if path.is_file() and path.suffix.lower() in VIDEOS:
             frames = _read_limited(path, (Frame(f"frame {k}", image) for k, image in enumerate(video_images(path))))
             return _make_frame_set(path, frames, reference, None)
-        raise unknown_source(path)
+        raise unknown_source_error(path)
     except EpisodeError as error:
         raise BadFrames(str(error)) from None
 

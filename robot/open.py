@@ -13,10 +13,10 @@ from robot.common.code import attribute
 from robot.rig import RIG_ATTACHMENT as RIG_ATTACHMENT
 from robot.rig import CannotOpen as CannotOpen
 from robot.rig.parts import check_parts, sensor_drivers
-from tacsim.config import ConfigError, LoadedRig, load, load_rig
+from tacsim.config import ConfigError, LoadedRig, load_model, load_rig
 from tacsim.config.errors import Place, Problem
 from tacsim.config.kinds import is_name
-from tacsim.config.load import texts
+from tacsim.config.load import require_texts
 from tacsim.interface import RigSpec
 from tacsim.models.policy import Features
 from tacsim.models.randomisation import Randomisation
@@ -211,7 +211,7 @@ def _drawn(variants: Sequence[Sequence[str]], randomise: Randomised) -> Sequence
     if variants:
         raise ValueError("give variants, or a randomisation that draws them, not both")
     if isinstance(randomise, (str, Path)):
-        return load(Randomisation, randomise).draw_overrides()
+        return load_model(Randomisation, randomise).draw_overrides()
     return _made_of(Randomisation, randomise, "randomise").draw_overrides()
 
 
@@ -257,13 +257,13 @@ def _rigs_of_episodes(
 ) -> list[tuple[RigConfig, str]]:
     """The rig without a variant, then with each, and the variant in words."""
     found: list[tuple[RigConfig, str]] = []
-    given = texts(overrides)
+    given = require_texts(overrides)
     shipped = isinstance(rig, str) and is_name(rig)
     if learning and shipped and load_with_task(rig, task, given).config.clock == "sim":
         given = [*LEARNING, *given]
     for more in ((), *variants):
         try:
-            config = load_with_task(rig, task, [*given, *texts(more)]).config
+            config = load_with_task(rig, task, [*given, *require_texts(more)]).config
         except ConfigError as error:
             if not more:
                 raise

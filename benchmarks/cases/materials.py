@@ -151,7 +151,7 @@ def oedometer(element: float, repeat: int) -> list[Measurement]:
         return gel
 
     timing, gel = timed(run, repeat)
-    reached = 1 + float(gel.state.alike.u[0, 0, :, :, -1, 2].mean()) / config.thickness
+    reached = 1 + float(gel.state.common_group.u[0, 0, :, :, -1, 2].mean()) / config.thickness
     stress = config.mu * (reached - 1 / reached) + config.lam * math.log(reached) / reached
     pressure = float(gel.backing[2]) / (config.elements[0] * config.elements[1] * config.spacing**2)
     error = abs(abs(pressure / stress) - 1) * 100
@@ -162,10 +162,10 @@ def oedometer(element: float, repeat: int) -> list[Measurement]:
 def simple_shear(repeat: int) -> list[Measurement]:
     """64,000 material points sheared by 0.5: tau_xy = sigma_y / sqrt 2 (Frobenius norm of the yield stress)."""
     from benchmarks.truth.blocks import shear_points
-    from tacsim.compute.runtime import start
+    from tacsim.compute.runtime import start_taichi
     from tacsim.physics.body.plasticine import body_params
 
-    start()
+    start_taichi()
     config = body_params(CLAY, 0.25e-3)
     steps, increment, points = 250, 2e-3, 64_000
 
@@ -210,7 +210,7 @@ def gel_wave(element: float, repeat: int) -> list[Measurement]:
 
         def run(axis: int = axis, free: FreeAxes = free, count: int = count) -> FloatArray:
             gel = GelBlock(config, dt, 0.0)
-            velocity = gel.state.alike.v[0, 0, ..., axis]
+            velocity = gel.state.common_group.v[0, 0, ..., axis]
             velocity[:] = 1e-3 * shape
             signal = np.empty(count)
             for step in range(count):
@@ -298,7 +298,7 @@ def momentum(repeat: int) -> list[Measurement]:
         return body
 
     timing, body = timed(run, 1, warm=partial(run, 1))
-    before, after = (momenta(b.x(), b.v(), b.spin(), config.cell) for b in (initial().state, body.state))
+    before, after = (momenta(b.x(), b.v(), b.spin_matrices(), config.cell) for b in (initial().state, body.state))
     linear, angular = (float(np.linalg.norm(b - a) / scale) for a, b, scale in zip(
         before[:2], after[:2], before[2:], strict=True))  # fmt: skip
     return [

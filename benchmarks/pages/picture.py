@@ -35,15 +35,15 @@ def draw(rows: Sequence[Row], path: Path) -> None:
 
     Raises OSError.
     """
-    from tacsim.report.figure import canvas, plain, save
+    from tacsim.report.figure import new_figure, save_figure, style_axes
 
     panels = [(panel, _points(rows, *panel[:2])) for panel in PANELS]
     shown = [(panel, points) for panel, points in panels if points] or [(PANELS[0], [])]
     methods = list(dict.fromkeys(row.method for _, points in shown for row in points))
-    figure = canvas(4.6 * len(shown), 3.8)
+    figure = new_figure(4.6 * len(shown), 3.8)
     figure.set_layout_engine("constrained")
     for index, ((_, _, title, unit), points) in enumerate(shown):
-        axes = plain(figure.add_subplot(1, len(shown), index + 1), title, "seconds (wall)", unit)
+        axes = style_axes(figure.add_subplot(1, len(shown), index + 1), title, "seconds (wall)", unit)
         axes.set(xscale="log", yscale="log")
         if not points:
             continue
@@ -59,7 +59,7 @@ def draw(rows: Sequence[Row], path: Path) -> None:
                 words, (row.seconds, row.error), (-5 if left else 5, -4 if below else 4), textcoords="offset points",
                 ha="right" if left else "left", va="top" if below else "bottom", fontsize=7, color=colour,
             )  # fmt: skip
-    save(figure, path)
+    save_figure(figure, path)
 
 
 def _close_above(place: Sequence[float], other: Sequence[float]) -> bool:
@@ -85,7 +85,7 @@ def draw_radii(rows: Sequence[Row], path: Path) -> bool:
 
     Raises OSError.
     """
-    from tacsim.report.figure import canvas, plain, save
+    from tacsim.report.figure import new_figure, save_figure, style_axes
 
     found = [row for row in rows if row.group == "real" and "thickness_mm" in row.figures]
     if not found:
@@ -93,11 +93,11 @@ def draw_radii(rows: Sequence[Row], path: Path) -> bool:
     thickness = found[0].figures["thickness_mm"]
     found = [row for row in found if row.figures["thickness_mm"] == thickness]
     balls = sorted({row.figures["ball_radius_mm"] for row in found})
-    figure = canvas(4.8 * len(balls), 4.2)
+    figure = new_figure(4.8 * len(balls), 4.2)
     figure.set_layout_engine("constrained")
     for index, ball in enumerate(balls):
         words = f"Ball R {ball:g} mm, gel {thickness:g} mm thick"
-        axes = plain(figure.add_subplot(1, len(balls), index + 1), words, "depth [mm]", "contact radius [px]")
+        axes = style_axes(figure.add_subplot(1, len(balls), index + 1), words, "depth [mm]", "contact radius [px]")
         here = [row for row in found if row.figures["ball_radius_mm"] == ball]
         for name, label, colour, style in CURVES:
             axes.plot(*_against_depth(here, name), style, color=colour, label=label, linewidth=1.2)
@@ -113,7 +113,7 @@ def draw_radii(rows: Sequence[Row], path: Path) -> bool:
         axes.set_ylim(bottom=0)
         if index == 0:
             axes.legend(fontsize=7, frameon=False, loc="lower right")
-    save(figure, path)
+    save_figure(figure, path)
     return True
 
 

@@ -3,8 +3,8 @@ conditions of a closed form. Units as in the physics: mm, N, MPa, wave speed 1."
 
 import numpy as np
 
-from tacsim.compute.runtime import start, ti
-from tacsim.physics.body.material import convect, hencky_return, mat3, vec6
+from tacsim.compute.runtime import start_taichi, ti
+from tacsim.physics.body.material import hencky_return, mat3, transport_strain, vec6
 from tacsim.physics.body.plasticine import BodyParams, BodyState
 from tacsim.physics.body.transfers import (
     Body,
@@ -17,7 +17,16 @@ from tacsim.physics.body.transfers import (
 from tacsim.physics.exec import layout
 from tacsim.physics.exec.environment import Counts, Environment, Floats, Params, Partial
 from tacsim.physics.exec.lanes import LANES, NODES, PARTS, share_start, strip, vec3
-from tacsim.physics.exec.team import CHUNK, Sync, first_in_chunk, next_piece, one_if, own_part, piece_done, run_team
+from tacsim.physics.exec.team import (
+    CHUNK,
+    Sync,
+    claim_work,
+    first_in_chunk,
+    first_own_part,
+    one_if,
+    report_work_done,
+    run_team,
+)
 from tacsim.physics.gel.gel import GelParams, GelState
 from tacsim.physics.gel.kernels import Gels, Lattice, first_node, gel_advance, gel_forces, gel_of
 from tacsim.physics.gel.tuning import MIN_VOLUME_RATIO
@@ -40,8 +49,8 @@ def body_substeps(
             env = ti.static(Environment(0, params, counts, partial))
             body = ti.static(Body(particles, masses, velocities))
             rows, plane = env.count(layout.GRID), env.count(layout.GRID + 1) * (env.count(layout.GRID + 2) // NODES)
-            stages, own = 2 * steps.shape[1] + 1, own_part(task, team)
-            piece = next_piece(sync, 0, own, stages)
+            stages, own = 2 * steps.shape[1] + 1, first_own_part(task, team)
+            piece = claim_work(sync, 0, own, stages)
             while piece < stages * PARTS:
                 stage, part = piece // PARTS, piece % PARTS
                 for _gather in range(one_if(stage % 2 == 0 and stage > 0)):
@@ -60,8 +69,8 @@ def body_substeps(
                                     moved[4 * n + 1] = keep_y * q[4 * n + 1] / q[4 * n + 3]
                                     moved[4 * n + 2] = keep_z * q[4 * n + 2] / q[4 * n + 3]
                             velocities[at] = moved
-                piece_done(sync, 0)
-                piece = next_piece(sync, 0, own, stages)
+                report_work_done(sync, 0)
+                piece = claim_work(sync, 0, own, stages)
 
 
 @ti.kernel
@@ -103,7 +112,7 @@ def shear_points(
     """Material points in simple shear: n increments of d(v_x)/dy, each followed by the return mapping."""
     for p in range(e.shape[0]):
         for _ in range(n):
-            moved = convect(e[p], mat3([[0.0, step, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]]))
+            moved = transport_strain(e[p], mat3([[0.0, step, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]]))
             elastic, new_flow, stress = hencky_return(moved, flow[p], mu, bulk, limit, hardening)
             e[p] = elastic
             flow[p] = new_flow
@@ -114,7 +123,7 @@ class Block:
     """What a body or a gel on its own shares with its kernel. Use one of the two below."""
 
     def __init__(self, params: dict[int, float], dt: float) -> None:
-        start(cpu_only="a single block of a material (tacsim bench materials)")
+        start_taichi(cpu_only="a single block of a material (tacsim bench materials)")
         self.params = np.zeros((1, layout.PARAMS), np.float32)
         self.params[0, list(params)] = list(params.values())
         self.params[0, layout.STEP] = dt
@@ -134,7 +143,7 @@ class BodyBlock(Block):
     def fit(self, margin: float) -> None:
         """Lays the grid round the particles where they are now, with a margin [mm] of at least a cell."""
         self.state.move_reference(0)
-        self.state.fit(0, self.cell, margin, self.params, self.counts)
+        self.state.fit_grid(0, self.cell, margin, self.params, self.counts)
 
     def advance(self, substeps: int, keep: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> None:
         """keep: 0 forbids motion along an axis, 1 allows it. Raises RuntimeError if a particle left the grid."""

@@ -15,7 +15,7 @@ from benchmarks.truth.mls_mpm import (
     grid_to_particles,
     particles_to_grid,
 )
-from tacsim.compute.runtime import start, ti
+from tacsim.compute.runtime import start_taichi, ti
 
 Force = ti.types.ndarray(dtype=ti.f32, ndim=1)
 
@@ -91,7 +91,7 @@ def compress(side: float, spacing: float) -> tuple[Cube, float, int]:
 
 def yield_plateau(side: float, spacing: float, repeat: int) -> list[Measurement]:
     """Side and spacing [mm]."""
-    start()
+    start_taichi()
     timing, (cube, force, substeps) = timed(partial(compress, side, spacing), repeat, lambda: _first(side, spacing))
     stress = uniaxial_stress(force, (side * 1e-3) ** 3, (cube.high - cube.low) * 1e-3)
     assert CLAY.yield_stress is not None

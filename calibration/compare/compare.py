@@ -25,7 +25,7 @@ from calibration.errors import BadFrames
 from calibration.frame_set import Frame, FrameSet, find_touched_references
 from tacsim.control.tuning import MIN_CONTACT_HEIGHT
 from tacsim.interface import FloatArray, Image
-from tacsim.record.numbering import picture_numbers
+from tacsim.record.numbering import numbers_in_names
 
 BOOTSTRAP_DRAWS = 2000
 MIN_PAIRS = 3  # for an interval
@@ -216,7 +216,7 @@ def _describe_unpaired(a: FrameSet, b: FrameSet) -> str:
     names = [[Path(frame.name) for frame in each.frames] for each in (a, b)]
     if not all(name.suffix for each in names for name in each):
         return ""
-    found = [picture_numbers([name.stem for name in each]) for each in names]
+    found = [numbers_in_names([name.stem for name in each]) for each in names]
     first, second = ({number for number in each or () if number is not None} for each in found)
     unnumbered = any(each is None or None in each for each in found)
     if unnumbered or first == second or not first & second:

@@ -17,7 +17,7 @@ from calibration.compare.compare import METRICS, Comparison, Metric, Overall
 from calibration.compare.invariance import CHANGES, VIEWS, Report
 from calibration.compare.tuning import MAX_CLOSE_ERROR, MIN_CLOSE_CORRELATION
 from tacsim.interface import Image
-from tacsim.report.report import data_url, finite, render_page
+from tacsim.report.report import data_url, json_number, render_page
 
 RANKING_METRIC = "contact_mae"
 FORMAT = 1
@@ -66,8 +66,8 @@ def comparison_as_json(comparison: Comparison, report: Report | None = None) -> 
                 "a": pair.a.name,
                 "b": pair.b.name,
                 "flags": list(pair.flags),
-                "numbers": {key: finite(value) for key, value in pair.numbers.items()},
-                "null": {key: finite(value) for key, value in pair.null.items()},
+                "numbers": {key: json_number(value) for key, value in pair.numbers.items()},
+                "null": {key: json_number(value) for key, value in pair.null.items()},
             }
             for pair in comparison.pairs
         ],
@@ -77,9 +77,9 @@ def comparison_as_json(comparison: Comparison, report: Report | None = None) -> 
             "presses": report.presses,
             "patch": report.patch,
             "views": {view.view: _known_fields(view, leave="view") for view in report.views},
-            "gradient_angle": finite(report.angle),
+            "gradient_angle": json_number(report.angle),
             "drift": {
-                drift.change.key: {"fresh": finite(drift.fresh), "stale": finite(drift.stale)}
+                drift.change.key: {"fresh": json_number(drift.fresh), "stale": json_number(drift.stale)}
                 for drift in report.drifts
             },
             "notes": list(report.notes),
@@ -122,7 +122,7 @@ def _write_csv(path: Path, comparison: Comparison) -> None:
         writer.writerow(["a", "b", *keys, *(f"null_{key}" for key in keys), "flags"])
         for pair in comparison.pairs:
             numbers = [*(pair.numbers.get(key) for key in keys), *(pair.null.get(key) for key in keys)]
-            cells = ["" if (value := finite(number)) is None else repr(value) for number in numbers]
+            cells = ["" if (value := json_number(number)) is None else repr(value) for number in numbers]
             writer.writerow([_escape_formula(pair.a.name), _escape_formula(pair.b.name), *cells, "; ".join(pair.flags)])
 
 
@@ -242,7 +242,7 @@ def _known_fields(record: Any, leave: str = "") -> dict[str, Any]:
     """The fields of a flat record, NaN and infinity as None."""
     fields: Iterable[str] = record.__slots__
     values = ((name, getattr(record, name)) for name in fields if name != leave)
-    return {name: finite(value) if isinstance(value, float) else value for name, value in values}
+    return {name: json_number(value) if isinstance(value, float) else value for name, value in values}
 
 
 def describe_comparison(comparison: Comparison) -> str:

@@ -18,7 +18,7 @@ from pydantic_core import PydanticCustomError
 
 from calibration.poses.ball_touch import BallTouch
 from calibration.poses.hand_eye import BoardPose
-from tacsim.config import load
+from tacsim.config import load_model
 from tacsim.interface import FloatArray, Pose
 from tacsim.models.hardware import Placement
 from tacsim.models.quantity import Config, Length
@@ -83,12 +83,12 @@ class BoardPoseFile(Config):
 
 def read_touches(path: Path) -> TouchFile:
     """Raises tacsim.config.ConfigError."""
-    return load(TouchFile, path)
+    return load_model(TouchFile, path)
 
 
 def read_board_poses(path: Path) -> BoardPoseFile:
     """Raises tacsim.config.ConfigError."""
-    return load(BoardPoseFile, path)
+    return load_model(BoardPoseFile, path)
 
 
 def touch_file(touches: Sequence[BallTouch], ball_radius: float) -> TouchFile:

@@ -112,4 +112,4 @@ class PackageLog:
             gaps = np.diff(records["stamp"], prepend=self._last_stamp)[0 if np.isfinite(self._last_stamp) else 1 :]
             is_lost = int(np.maximum(np.round(gaps / PERIOD) - 1.0, 0.0).sum())  # a restarted controller counts from 0
             self._last_time, self._last_stamp = float(records["time"][-1]), float(records["stamp"][-1])
-        return ArmPackages.of(records, is_lost)
+        return ArmPackages.from_columns(records, is_lost)

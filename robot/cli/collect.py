@@ -118,13 +118,13 @@ def press(
         from robot.collect.objects import find_objects
         from robot.collect.presses import PressJob, PressSet
         from tacsim.config import load_scene, load_sensor
-        from tacsim.config.gel import fit_gel, gel_sizes_given
+        from tacsim.config.gel import fit_gel, overridden_gel_sizes
         from tacsim.geometry.pressing_side import find_pressing_side
 
         known, files = find_objects(objects, scale)
         model = load_sensor(sensor).model_copy(update={"view": None})
         scene = load_scene("press", [f"preset={preset}", *(set_ or [])])
-        own = gel_sizes_given(text.partition("=")[0].split(".") for text in set_ or [])
+        own = overridden_gel_sizes(text.partition("=")[0].split(".") for text in set_ or [])
         scene, said = fit_gel(scene, {"lower": model}, given=own)
         background = model.lighting.background
         if isinstance(background, str):
@@ -180,10 +180,10 @@ def episodes(
     ]  # fmt: skip
     with busy("loading"):
         from robot.collect.episodes import EpisodeJob, EpisodeSet
-        from tacsim.config import load
+        from tacsim.config import load_model
         from tacsim.models.randomisation import Randomisation
 
-        drawn = None if randomise is None else load(Randomisation, randomise)
+        drawn = None if randomise is None else load_model(Randomisation, randomise)
         settings = _checked(
             EpisodeSet, rig=rig, task=task, overrides=tuple(set_ or ()), policy=policy, steps=steps, seed=seed,
             randomise=drawn,
@@ -202,7 +202,7 @@ def _run(
 
     from robot.collect.collect import collect as make
     from robot.collect.workers import Stopped
-    from tacsim.compute.threads import cores
+    from tacsim.compute.threads import core_count
 
     begun = said = time.perf_counter()
     there = 0
@@ -218,7 +218,7 @@ def _run(
                 notes.print(f"{done} of {total}")
 
         try:
-            number = workers if workers is not None else cores()
+            number = workers if workers is not None else core_count()
             done = make(job, out, files, command, workers=number, cluster=ray, tell=tell, stop=interrupt)
         except Stopped:
             complain(f"stopped by a signal; {there} of {job.count} are there. The same command goes on")

@@ -129,9 +129,9 @@ def _read(path: Path, reference: Path | None, sensor: str, bundle: Calibration |
 
 def _is_scene(a: str) -> bool:
     """True for the name of a shipped scene that is no file or folder here, and for a .yaml file."""
-    from tacsim.config import names
+    from tacsim.config import shipped_names
 
-    return a.lower().endswith((".yaml", ".yml")) or (not Path(a).exists() and a in names("scene"))
+    return a.lower().endswith((".yaml", ".yml")) or (not Path(a).exists() and a in shipped_names("scene"))
 
 
 def _simulate_presses(name: str, truth: FrameSet, bundle: Path | None, overrides: list[str]) -> FrameSet:
@@ -140,7 +140,7 @@ def _simulate_presses(name: str, truth: FrameSet, bundle: Path | None, overrides
     from calibration.errors import BadFrames
     from robot.studies.matched_press import ELEMENT
     from tacsim.config import load_scene
-    from tacsim.config.gel import fit_gel, gel_sizes_given
+    from tacsim.config.gel import fit_gel, overridden_gel_sizes
     from tacsim.models.scene import Sphere
     from tacsim.models.sensor import CanonicalGrid
 
@@ -154,7 +154,7 @@ def _simulate_presses(name: str, truth: FrameSet, bundle: Path | None, overrides
     if scene.element_size is None and not any(text.startswith("preset=") for text in overrides):
         # two layers are the least that a gel may have
         scene = load_scene(name, [*settings, f"element_size={min(ELEMENT, scene.gel.size[2] / 2)} m"])
-    given = gel_sizes_given(text.partition("=")[0].split(".") for text in overrides)
+    given = overridden_gel_sizes(text.partition("=")[0].split(".") for text in overrides)
     scene, said = fit_gel(scene, {"of B": sensor}, given=given)
     if scene.indenter is not None and isinstance(ball := scene.indenter.geometry, Sphere):
         words = ", as in the calibration; for another --set 'indenter.geometry.radius=3 mm'" if own else ""

@@ -139,7 +139,7 @@ class _Task:
 
     def __init__(self, kind: Kind, scene: str, options: Fitting, gel_error: float = 0.0) -> None:
         from tacsim.config import load_scene
-        from tacsim.config.load import say_side
+        from tacsim.config.load import describe_mesh_side
 
         self.kind, self.options, self.gel_error = kind, options, gel_error
         self.wanted = [] if options.fit is None else [name.strip() for name in options.fit.split(",")]
@@ -149,7 +149,7 @@ class _Task:
             raise typer.BadParameter(f"scene '{self.scene.name}' has not {needs}", param_hint="--scene")
         if self.scene.physics == "seed":
             raise typer.BadParameter("physics 'seed' cannot be identified; use 'hybrid'", param_hint="--set")
-        for words in say_side(self.scene):
+        for words in describe_mesh_side(self.scene):
             notes.print(words)
 
     def run(self, sources: list[Path], indenter: Pose | None = None, balls: Mapping[str, float] | None = None) -> None:
@@ -168,7 +168,7 @@ class _Task:
             from calibration.materials.presses import Noise
             from robot.studies.identify.identify import identify
             from robot.studies.identify.recordings import Recordings, find_recordings, read_all
-            from tacsim.physics.failure.dump import dumps_in
+            from tacsim.physics.failure.dump import dump_to_folder
         with one_bar("reading") as bar:
             recordings = Recordings(self.scene, indenter, balls)
             presses = read_all(recordings, find_recordings(sources), bar.count)
@@ -178,7 +178,7 @@ class _Task:
                 notes.print(f"force noise taken as {force:g} N; give your sensor's by --force-noise")
             noise = Noise(force=force)
             zero = 10 * force if options.zero_error is None else options.zero_error
-            with dumps_in(folder.with_name(f"{folder.name}-diverged")):
+            with dump_to_folder(folder.with_name(f"{folder.name}-diverged")):
                 found = identify(
                     self.kind, self.scene, recordings, presses, noise, Priors(options.place_error, zero),
                     wanted=self.wanted, most_moments=options.moments, gel_error=self.gel_error,

@@ -67,10 +67,10 @@ def train(
     else:
         if task is None:
             raise typer.BadParameter("name a task (squeeze, reposition, knead), or a run that goes on (--resume)")
-        from tacsim.config import load
+        from tacsim.config import load_model
         from tacsim.models.training import Training
 
-        training = load(Training, task, own)
+        training = load_model(Training, task, own)
         folder = new_directory(out, f"train-{training.task}")
         with busy("loading"):
             from robot.train.train import begin_run
@@ -150,10 +150,10 @@ def policy_range(
     if set_ and training is None:
         raise typer.BadParameter("--set changes a training file: name it with --training", param_hint="--set")
     from robot.train.measure_range import measure_range, write_range
-    from tacsim.config import load
+    from tacsim.config import load_model
     from tacsim.models.training import Training
 
-    settings = None if training is None else load(Training, training, set_ or [])
+    settings = None if training is None else load_model(Training, training, set_ or [])
     with one_bar("starting") as bar:
         found = measure_range(policy, settings, episodes, bar.report)
     write_range(policy, out, found)
@@ -193,10 +193,10 @@ def evaluate(
     """
     require_writable(json_, "--json", new=True)
     from robot.train.evaluate import evaluate as judge_all
-    from tacsim.config import load
+    from tacsim.config import load_model
     from tacsim.models.training import Training
 
-    training = load(Training, task, set_ or [])
+    training = load_model(Training, task, set_ or [])
     played: dict[str, EvaluationResult] = {}
     with one_bar("starting") as bar:
 
@@ -278,10 +278,10 @@ def transfer(
     from dataclasses import asdict
 
     from robot.train.transfer import Study, draw_figure, play_study, summarise
-    from tacsim.config import load
+    from tacsim.config import load_model
     from tacsim.models.randomisation import Randomisation
 
-    twins = load(Randomisation, f"{task}-twin" if twin is None else twin)
+    twins = load_model(Randomisation, f"{task}-twin" if twin is None else twin)
     policies = tuple(policy or ("learned", "scripted"))
     study = Study(task, policies, twins, episodes, every, steps, tuple(set_ or ()))
     with writing(out):

@@ -123,10 +123,10 @@ def recover(
     """
     new = file.with_name(f"{file.stem}.recovered.mcap") if out is None else out
     with busy("recovering"):
-        from tacsim.record.recover import recover as recover_file
+        from tacsim.record.recover import recover_recording as recover_file
 
         found = recover_file(file, new)
-    if found.whole:
+    if found.is_whole:
         results.print(f"{file} is whole: {found.steps} steps, its end and its index; nothing to recover")
         return
     lost = [] if found.finished else ["the end: the recording was cut off, or its index is damaged"]
@@ -135,7 +135,7 @@ def recover(
     for words in [
         *lost[:20],
         *([f"... and {len(lost) - 20} more parts"] if len(lost) > 20 else []),
-        *found.lacking[:20],
+        *found.missing[:20],
     ]:
         results.print(f"  {words}")
     say_files(new)

@@ -112,7 +112,7 @@ def _run(
         from robot.deploy.control_loop import EpisodeSetup
         from robot.deploy.policy import load_policy, require_fit, training_notes
         from robot.open import open_rig
-        from tacsim.physics.failure.dump import dumps_in
+        from tacsim.physics.failure.dump import dump_to_folder
         from tacsim.record.writer import Recorder
         from tacsim.tasks import make_task
     begun = STARTING if loaded.config.scene is not None else OPENING
@@ -134,7 +134,7 @@ def _run(
             warn(words)
 
     with (
-        dumps_in(folder / "diverged"),
+        dump_to_folder(folder / "diverged"),
         one_bar(begun) as bar,
         measuring(bar.say, begun),
         open_rig(loaded, confirm=ask, dry_run=dry_run, check=fit, tell=bar.say) as rig,
@@ -249,7 +249,7 @@ def _report(episode: Episode, folder: Path, files: Sequence[Path]) -> None:
     import json
 
     from robot.rig.recorded import RecordedSurfaces
-    from tacsim.report.report import end_table, write_report
+    from tacsim.report.report import summary_table, write_report
 
     with busy("writing the report"), writing(folder):
         surfaces = RecordedSurfaces(episode.meta)
@@ -258,4 +258,4 @@ def _report(episode: Episode, folder: Path, files: Sequence[Path]) -> None:
     for words in surfaces.notes:
         notes.print(words)
     listed = [paths["report.html"], paths["report.png"], *files, paths["summary.json"]]
-    results.print(end_table(stats, listed))
+    results.print(summary_table(stats, listed))

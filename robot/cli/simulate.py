@@ -71,7 +71,7 @@ def press(
     Example: tacsim press sphere --radius '3 mm' --depth '0.4 mm' --slide '1 mm, 0'
     """
     from tacsim.config import load_scene, load_sensor
-    from tacsim.config.gel import fit_gel, gel_sizes_given
+    from tacsim.config.gel import fit_gel, overridden_gel_sizes
 
     folder = new_directory(out, "press")
     given = {name: getattr(shape, name) for name in ("radius", "height", "size", "scale")}
@@ -80,17 +80,17 @@ def press(
         changes.append(f"indenter.edge_radius={shape.edge_radius!r}")
     scene = load_scene("press", [f"preset={preset}", *changes, *(set_ or [])])
     model = load_sensor(sensor).model_copy(update={"view": None})
-    sizes = gel_sizes_given(text.partition("=")[0].split(".") for text in set_ or [])
+    sizes = overridden_gel_sizes(text.partition("=")[0].split(".") for text in set_ or [])
     scene, said = fit_gel(scene, {"lower": model}, given=sizes)
     for words in said:
         notes.print(words)
     with busy("pressing (the first run compiles the kernels, up to half a minute)") as say:
         from robot.studies import press as presses
-        from tacsim.physics.failure.dump import dumps_in
+        from tacsim.physics.failure.dump import dump_to_folder
         from tacsim.physics.failure.health import SimulationDiverged
 
         motion = presses.PressMotion(depth, slide, twist)
-        with dumps_in(folder / "diverged"), measuring(say, "pressing"):
+        with dump_to_folder(folder / "diverged"), measuring(say, "pressing"):
             try:
                 pressed = presses.press(scene, model, motion)
             except SimulationDiverged as failure:
@@ -175,13 +175,13 @@ def reproduce(
     schemes = ["seed", "hybrid"] if physics == "both" else [physics]
     with busy("loading"):
         from robot.studies import experiment
-        from tacsim.physics.failure.dump import dumps_in
-        from tacsim.report.figure4 import figure4
+        from tacsim.physics.failure.dump import dump_to_folder
+        from tacsim.report.figure4 import draw_figure4
 
     # The longest first, so that no processor waits for it at the end.
     wanted = [(task, scheme) for scheme in schemes for task in ("reposition", "squeeze")]
     notes.print("The first run compiles the kernels of each physics, up to a minute.")
-    with Interrupt() as interrupt, dumps_in(folder / "diverged"), progress() as bar:
+    with Interrupt() as interrupt, dump_to_folder(folder / "diverged"), progress() as bar:
         rows = {trial: bar.add_task(", ".join(trial), total=None) for trial in wanted}
         try:
             found = experiment.run_trials(wanted, lambda *trial: bar.advance(rows[trial]), interrupt)
@@ -192,7 +192,7 @@ def reproduce(
     picture, table = folder / "fig4.png", folder / "fig4.json"
     with writing(folder, new=True), busy("drawing"):
         table.write_text(json.dumps(experiment.as_json(trials), indent=1, allow_nan=False) + "\n", encoding="utf-8")
-        figure4(trials, picture)
+        draw_figure4(trials, picture)
     say_files(picture, table)
     if _judge(trials):
         raise typer.Exit(1)
@@ -225,9 +225,9 @@ def debug(
     """
     with busy("reading"):
         from robot.studies import dump_view
-        from tacsim.physics.failure.dump import read
+        from tacsim.physics.failure.dump import read_dump
 
-        found = read(dump)
+        found = read_dump(dump)
         world = dump_view.open_world(found)
     results.print(found.info.message)
     results.print(", ".join(f"{name} {version}" for name, version in found.info.versions.items()))

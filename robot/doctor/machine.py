@@ -130,13 +130,13 @@ def taichi() -> list[Check]:
     if sys.platform == "linux" and platform.machine() == "aarch64":
         advice = "simulate on another machine; hardware and replay work here"
         return [Check("taichi", "warn", "no Taichi wheel exists for linux aarch64", advice)]
-    from tacsim.compute.runtime import DEVICE, KERNELS, available, start, ti
+    from tacsim.compute.runtime import DEVICE, KERNELS, is_available, start_taichi, ti
     from tacsim.compute.taichi_patches import are_enabled
 
-    if not available(DEVICE):
+    if not is_available(DEVICE):
         advice = "unset TACSIM_DEVICE to compute on the processor, or install the device's driver"
         return [Check("taichi", "fail", f"TACSIM_DEVICE is '{DEVICE}', which is not there", advice)]
-    arch = start()
+    arch = start_taichi()
     version = ".".join(str(part) for part in ti.__version__)
     patches = "" if are_enabled() else ", without patches (docs/taichi-patches.md)"
     return [Check("taichi", "ok", f"{version}, arch {arch}{patches}"), kernel_cache(KERNELS)]
@@ -144,10 +144,10 @@ def taichi() -> list[Check]:
 
 def kernel_cache(folder: Path) -> Check:
     """The folder of compiled kernels: without it every start compiles for tens of seconds."""
-    from tacsim.compute.runtime import TO_KEEP, is_writable
+    from tacsim.compute.runtime import CACHE_ADVICE, is_writable
 
     if not is_writable(folder):
-        return Check("kernel cache", "warn", f"{folder} is not writable", TO_KEEP)
+        return Check("kernel cache", "warn", f"{folder} is not writable", CACHE_ADVICE)
     size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
     return Check("kernel cache", "ok", f"{folder}, {size / 1e6:.1f} MB" + ("" if size else " (first run compiles)"))
 

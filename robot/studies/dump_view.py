@@ -15,11 +15,11 @@ from tacsim.geometry.shapes import shape_distance
 from tacsim.interface import Pose
 from tacsim.models.scene import Scene
 from tacsim.physics.failure.diagnosis import corner_volumes, element_volumes, particle_volumes
-from tacsim.physics.failure.dump import MOMENTS, Dump, DumpError, dumps_in
+from tacsim.physics.failure.dump import MOMENTS, Dump, DumpError, dump_to_folder
 from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.physics.snapshot import State, gel_arrays
 from tacsim.physics.world import World, make_world
-from tacsim.report.figure import COLOURS, INK, canvas, plain, save
+from tacsim.report.figure import COLOURS, INK, new_figure, save_figure, style_axes
 
 TITLES = {"before": "before the motion", "good": "last good", "failed": "failed"}
 
@@ -46,7 +46,7 @@ def replay(dump: Dump, world: World) -> tuple[SimulationDiverged | None, str]:
     """
     try:
         command = dump.command
-        with dumps_in(None):
+        with dump_to_folder(None):
             stats = world.move(command.targets, command.loads, command.duration, flow=command.flow)
     except SimulationDiverged as failure:
         same = str(failure) == dump.info.message
@@ -93,14 +93,14 @@ def _range(values: NDArray[Any]) -> str:
 def draw(dump: Dump, path: Path) -> None:
     """Writes a picture: a cut through body and gels in the world's x-z plane, at every moment that the dump holds."""
     moments = [moment for moment in MOMENTS if dump.states[moment]]
-    figure, scene = canvas(5.2 * len(moments), 4.6), dump.info.scene
+    figure, scene = new_figure(5.2 * len(moments), 4.6), dump.info.scene
     figure.suptitle(dump.info.message[:200].replace("$", r"\$"), fontsize=9, color=INK, x=0.01, ha="left")
     sizes = [scene.gel_of(name).size for name in scene.sensors]
     depth, width = max(size[2] for size in sizes) * 1.1e3, max(size[0] for size in sizes) * 0.6e3
     heights = [float(pose.position[2]) * 1e3 for pose in dump.poses("before").values()]
     for column, moment in enumerate(moments):
         poses = dump.poses(moment)
-        axes = plain(figure.add_subplot(1, len(moments), column + 1), TITLES[moment], "x [mm]", "z [mm]")
+        axes = style_axes(figure.add_subplot(1, len(moments), column + 1), TITLES[moment], "x [mm]", "z [mm]")
         _draw_gels(axes, dump.states[moment], scene, poses)
         _draw_particles(axes, dump.states[moment], scene)
         _draw_indenter(axes, scene, poses)
@@ -108,7 +108,7 @@ def draw(dump: Dump, path: Path) -> None:
         axes.set(xlim=(middle - width, middle + width), ylim=(min(heights) - depth, max(heights) + depth))
         axes.set_aspect("equal")
     figure.tight_layout(rect=(0.0, 0.02, 1.0, 0.94))
-    save(figure, path)
+    save_figure(figure, path)
 
 
 def _draw_gels(axes: Axes, state: State, scene: Scene, poses: Mapping[str, Pose]) -> None:

@@ -21,7 +21,7 @@ from tacsim.models.sensor import SensorModel
 from tacsim.optics.grid import image_grid
 from tacsim.optics.render import Renderer
 from tacsim.optics.surface import SurfaceSample, SurfaceTable, sample_surface
-from tacsim.physics.failure.dump import dumps_in
+from tacsim.physics.failure.dump import dump_to_folder
 from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.physics.move import MoveStats
 from tacsim.physics.worlds.press import PressWorld
@@ -76,7 +76,7 @@ def press(scene: Scene, sensor: SensorModel, motion: PressMotion, render: Render
     world = PressWorld(scene)
     start = world.pose("indenter")
     turn = start.quaternion if motion.turn is None else motion.turn
-    below = world.below(turn)
+    below = world.lowest_point_depth(turn)
     if any(motion.at) or motion.turn is not None:
         world.place({"indenter": Pose(np.array([*motion.at, below + INITIAL_GAP]), turn)})
     targets = _targets(world.pose("indenter"), below - motion.depth, motion)
@@ -84,7 +84,7 @@ def press(scene: Scene, sensor: SensorModel, motion: PressMotion, render: Render
     try:
         for target in targets:
             moves.append(world.move({"indenter": target}))
-            unfollowed = world.unfollowed or unfollowed
+            unfollowed = world.unsettled_reason or unfollowed
     except SimulationDiverged as error:
         if error.poses:
             came = below - float(se3.relative_pose(error.poses["lower"], error.poses["indenter"]).position[2])
@@ -102,7 +102,7 @@ def press(scene: Scene, sensor: SensorModel, motion: PressMotion, render: Render
         contact=contact,
         wrench=world.wrench("lower"),
         contact_radius=math.sqrt(area / math.pi),
-        unfelt=world.unfelt,
+        unfelt=world.missed_depth_share,
         moves=tuple(moves),
         unfollowed=unfollowed,
         surface=surface,
@@ -118,12 +118,12 @@ def deepest_possible(scene: Scene, motion: PressMotion, failure: SimulationDiver
     if failure.depth is None or not failure.retry:
         return None
     depth = min(failure.depth, motion.depth)
-    with dumps_in(None):
+    with dump_to_folder(None):
         for _ in range(max_trials):
             depth = _rounded_down(SAFE_PATH_SHARE * depth)
             world = PressWorld(scene)
             pose = world.pose("indenter")
-            below = world.below(pose.quaternion)
+            below = world.lowest_point_depth(pose.quaternion)
             try:
                 world.move({"indenter": Pose(np.array([*pose.position[:2], below - depth]), pose.quaternion)})
             except SimulationDiverged:

@@ -1,4 +1,4 @@
-"""How many threads this process may use, and several calls at once on them."""
+"""Number of threads that this process may use, and parallel calls on them."""
 
 from __future__ import annotations
 
@@ -12,34 +12,34 @@ from typing import TypeVar
 Result = TypeVar("Result")
 
 
-def cores() -> int:
+def core_count() -> int:
     """Processors that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def threads() -> int:
-    """Threads that may compute at the same time: one a core, at most TACSIM_THREADS. Raises ValueError if that is no
-    whole number from 1 on."""
-    wanted = os.environ.get("TACSIM_THREADS", str(cores()))
+def thread_count() -> int:
+    """Number of threads that may compute at the same time: one for each core, at most TACSIM_THREADS. Raises ValueError
+    if that is no integer from 1."""
+    wanted = os.environ.get("TACSIM_THREADS", str(core_count()))
     if not wanted.isdecimal() or int(wanted) < 1:
         raise ValueError(f"TACSIM_THREADS must be a whole number from 1 on, found '{wanted}'")
-    return min(int(wanted), cores())
+    return min(int(wanted), core_count())
 
 
 def map_serial(calls: Sequence[Callable[[], Result]]) -> list[Result]:
-    """What the calls return; the first that fails is the last that is called."""
+    """Results of the calls; after the first failure, the rest is not called."""
     return [call() for call in calls]
 
 
 def map_parallel(calls: Sequence[Callable[[], Result]]) -> list[Result]:
-    """What the calls return, as many at once as there are threads, this one among them: for long calculations that
-    release the interpreter's lock. None of them may call this itself: it could wait for its own thread for ever. When
-    some fail, all are done before the first failure, in their order, is raised; an interruption leaves out what has
-    not begun."""
-    count = min(threads(), len(calls))
+    """Results of the calls, on as many threads as may compute at the same time, with this one: for long calculations
+    that release the interpreter's lock. A call must not use this function itself: it could wait for its own thread. If
+    some calls fail, all are run before the first failure, in their order, is raised; after an interruption, calls that
+    have not begun are left out."""
+    count = min(thread_count(), len(calls))
     if count < 2:
         return map_serial(calls)
-    waiting = deque(range(len(calls)))  # threads take the next one from it
+    waiting = deque(range(len(calls)))  # each thread takes the next one
     found: dict[int, Result] = {}
     failures: dict[int, Exception] = {}
 
@@ -57,7 +57,7 @@ def map_parallel(calls: Sequence[Callable[[], Result]]) -> list[Result]:
                 waiting.clear()
                 raise
 
-    pool = _pool(os.getpid())
+    pool = _thread_pool(os.getpid())
     others = [pool.submit(work) for _ in range(count - 1)]
     try:
         work()
@@ -71,6 +71,6 @@ def map_parallel(calls: Sequence[Callable[[], Result]]) -> list[Result]:
 
 
 @lru_cache(maxsize=1)
-def _pool(process: int) -> ThreadPoolExecutor:
-    """Of this process: a forked one has the pool, and none of its threads."""
-    return ThreadPoolExecutor(max(1, threads() - 1), thread_name_prefix="tacsim")
+def _thread_pool(process: int) -> ThreadPoolExecutor:
+    """Pool of this process: a forked process has a copy of the pool without its threads."""
+    return ThreadPoolExecutor(max(1, thread_count() - 1), thread_name_prefix="tacsim")

@@ -9,9 +9,9 @@ from tacsim.config.errors import ConfigError as ConfigError
 from tacsim.config.kinds import KINDS as KINDS
 from tacsim.config.kinds import config_root as config_root
 from tacsim.config.kinds import json_schema as json_schema
-from tacsim.config.kinds import names as names
+from tacsim.config.kinds import shipped_names as shipped_names
 from tacsim.config.load import LoadedRig as LoadedRig
-from tacsim.config.load import load as load
+from tacsim.config.load import load_model as load_model
 from tacsim.config.load import load_rig as load_rig
 from tacsim.config.load import load_scene as load_scene
 from tacsim.config.load import load_sensor as load_sensor

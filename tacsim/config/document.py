@@ -1,4 +1,4 @@
-"""YAML text -> a tree of nodes that know their line. Nothing is executed, and sizes are checked first.
+"""YAML text -> a tree of nodes with their lines. Nothing is executed, and sizes are checked first.
 
 A subset of YAML: numbers, booleans and null as in YAML 1.2 (so ``1e5`` is a number, ``no`` and ``12:30`` are
 texts); no anchors, aliases, merge keys, tags or duplicate keys; at most 1 MB, 32 levels and 20,000 values.
@@ -20,7 +20,7 @@ import yaml
 from tacsim.config.errors import Place, Problem
 from tacsim.models.text import printable_line
 
-MAX_NODES = 20_000  # of one load, referenced files included
+MAX_NODES = 20_000  # of one load, with referenced files
 
 _FLOAT = re.compile(
     r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?$|[-+]?\.(?:inf|Inf|INF)$|\.(?:nan|NaN|NAN)$"
@@ -39,9 +39,9 @@ class Node:
 
     value: bool | int | float | str | dict[str, Node] | list[Node] | None
     place: Place  # of the key, if it has one
-    folder: Path  # where relative references in this node start
+    folder: Path  # base of relative references in this node
     text: str = ""  # a scalar as it was written
-    broken: bool = False  # its problem is reported already: no further one is
+    broken: bool = False  # its problem has been reported; no further problem is reported
 
     @property
     def items(self) -> dict[str, Node]:
@@ -77,7 +77,7 @@ class LoadState:
 
 
 class _Forbidden(yaml.MarkedYAMLError):
-    """YAML that is valid, but not allowed in a configuration."""
+    """Valid YAML that is not allowed in a configuration."""
 
 
 class _Loader(yaml.SafeLoader):
@@ -87,13 +87,13 @@ class _Loader(yaml.SafeLoader):
 
     def __init__(self, text: str, room: int) -> None:
         super().__init__(text)
-        self.room = room
+        self.remaining_values = room
         self.depth = 0
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
         max_depth = 32
         event = self.peek_event()  # type: ignore[no-untyped-call]
-        self.room -= 1
+        self.remaining_values -= 1
         self.depth += 1
         problem = None
         if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None) is not None:
@@ -102,7 +102,7 @@ class _Loader(yaml.SafeLoader):
             problem = f"tags are not allowed ({event.tag}); leave it out"
         elif self.depth > max_depth:
             problem = f"nested too deeply; at most {max_depth} levels are allowed"
-        elif self.room < 0:
+        elif self.remaining_values < 0:
             problem = f"too many values; at most {MAX_NODES} are allowed, referenced files included"
         if problem is not None:
             raise _Forbidden(problem=problem, problem_mark=event.start_mark)
@@ -123,7 +123,7 @@ for _tag, _pattern, _first in _RESOLVERS:
     _Dumper.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", _pattern, list(_first))
 
 
-def dump(data: Any) -> str:
+def dump_yaml(data: Any) -> str:
     """Plain data (mappings, lists, scalars) as YAML that :func:`parse_text` reads back to the same."""
     text: str = yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=100)
     return text
@@ -139,7 +139,7 @@ def read_text(path: Path, refuse: Callable[[str], None], state: LoadState) -> st
         mode = path.stat()
         if not stat.S_ISREG(mode.st_mode):
             what = "is a folder" if stat.S_ISDIR(mode.st_mode) else "is no regular file"
-            refuse(f"'{shown(path)}' {what}; give a YAML file")
+            refuse(f"'{display_path(path)}' {what}; give a YAML file")
             return None
         size = mode.st_size
         if size <= max_bytes:
@@ -147,24 +147,24 @@ def read_text(path: Path, refuse: Callable[[str], None], state: LoadState) -> st
                 content = file.read(max_bytes + 1)
             size = len(content)  # it may have grown
         if size > max_bytes:
-            refuse(f"'{shown(path)}' has {size / 1e6:.1f} MB; at most {max_bytes / 1e6:.0f} MB is allowed")
+            refuse(f"'{display_path(path)}' has {size / 1e6:.1f} MB; at most {max_bytes / 1e6:.0f} MB is allowed")
             return None
         state.sources.append(path)
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = content.count(b"\n", 0, error.start) + 1
         what = f"byte 0x{content[error.start]:02x} is not UTF-8; save the file as UTF-8 text"
-        state.report(Place(shown(path), line), "", what)
+        state.report(Place(display_path(path), line), "", what)
     except FileNotFoundError:
-        refuse(f"there is no file '{shown(path)}'")
+        refuse(f"there is no file '{display_path(path)}'")
     except (OSError, ValueError) as error:
         what = getattr(error, "strerror", None) or str(error)
-        refuse(f"cannot read '{shown(path)}': {what}")
+        refuse(f"cannot read '{display_path(path)}': {what}")
     return None
 
 
-def shown(path: Path) -> str:
-    """`path` for a message: relative to the current folder if it is below it."""
+def display_path(path: Path) -> str:
+    """`path` for a message: relative to the current folder if it is inside."""
     try:
         return str(path.relative_to(Path.cwd()))
     except (ValueError, OSError):
@@ -194,17 +194,20 @@ def parse_text(text: str, source: str, folder: Path, state: LoadState, place: Pl
             what = "not valid YAML: " + ", ".join(part for part in (error.context, error.problem) if part)
         state.report(place or Place(source, mark.line + 1 if mark else 1), "", what)
         return broken
-    except (ValueError, OverflowError) as error:  # PyYAML's own, for \U escapes and %YAML versions that are too large
+    except (
+        ValueError,
+        OverflowError,
+    ) as error:  # raised by PyYAML for \U escapes and %YAML versions that are too large
         line = loader.line + 1 if loader is not None else 1
         state.report(place or Place(source, line), "", f"not valid YAML: {error}")
         return broken
     finally:
         if loader is not None:
-            state.nodes = MAX_NODES - loader.room
+            state.nodes = MAX_NODES - loader.remaining_values
             loader.dispose()
     if root is None:
         return Node(None, start, folder)
-    return _convert(root, _Origin(source, folder, place, state), (), None)
+    return _convert_node(root, _Origin(source, folder, place, state), (), None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,22 +221,27 @@ class _Origin:
         return self.place or Place(self.source, node.start_mark.line + 1)
 
 
-def _convert(node: yaml.Node, origin: _Origin, path: tuple[str, ...], key_place: Place | None) -> Node:
+def _convert_node(node: yaml.Node, origin: _Origin, path: tuple[str, ...], key_place: Place | None) -> Node:
     place = key_place or origin.at(node)
     if isinstance(node, yaml.MappingNode):
-        entries = {key: _convert(child, origin, (*path, key), at) for key, child, at in _entries(node, origin, path)}
+        entries = {
+            key: _convert_node(child, origin, (*path, key), at)
+            for key, child, at in _mapping_entries(node, origin, path)
+        }
         return Node(entries, place, origin.folder)
     if isinstance(node, yaml.SequenceNode):
-        items = [_convert(child, origin, (*path, str(i)), None) for i, child in enumerate(node.value)]
+        items = [_convert_node(child, origin, (*path, str(i)), None) for i, child in enumerate(node.value)]
         return Node(items, place, origin.folder)
     text = str(node.value)
-    value, problem = _scalar(node.tag.rpartition(":")[2], text)
+    value, problem = _parse_scalar(node.tag.rpartition(":")[2], text)
     if problem:
         origin.state.report(place, ".".join(path), problem)
     return Node(None if problem else value, place, origin.folder, text=text, broken=bool(problem))
 
 
-def _entries(node: yaml.MappingNode, origin: _Origin, path: tuple[str, ...]) -> Iterator[tuple[str, yaml.Node, Place]]:
+def _mapping_entries(
+    node: yaml.MappingNode, origin: _Origin, path: tuple[str, ...]
+) -> Iterator[tuple[str, yaml.Node, Place]]:
     """Key, value and place of each valid entry; the others are reported."""
     first: dict[str, Place] = {}
     for key_node, child in node.value:
@@ -245,16 +253,16 @@ def _entries(node: yaml.MappingNode, origin: _Origin, path: tuple[str, ...]) -> 
         dotted = ".".join((*path, key))
         if key == "<<":
             origin.state.report(place, dotted, "merge keys are not allowed; use 'extends: NAME' instead")
-        elif _scalar("str", key)[1]:
+        elif _parse_scalar("str", key)[1]:
             origin.state.report(place, ".".join(path), f"the key {key!a} is no Unicode text")
         elif key in first:
-            origin.state.report(place, dotted, f"the key is there twice, first at {first[key]}; keep one")
+            origin.state.report(place, dotted, f"the key occurs twice, first at {first[key]}; keep one")
         else:
             first[key] = place
             yield key, child, place
 
 
-def _scalar(tag: str, text: str) -> tuple[bool | int | float | str | None, str]:
+def _parse_scalar(tag: str, text: str) -> tuple[bool | int | float | str | None, str]:
     """Value of a scalar, and its problem (empty: none)."""
     max_digits = 64  # of a whole number
     if tag == "null":
@@ -275,27 +283,27 @@ def _scalar(tag: str, text: str) -> tuple[bool | int | float | str | None, str]:
     return text, ""
 
 
-def as_json(node: Node) -> str:
+def node_as_json(node: Node) -> str:
     """The tree as JSON. Whole floats become integers, so that ``1e5`` is a valid count."""
-    return json.dumps(plain(node, integers=True))
+    return json.dumps(plain_data(node, integers=True))
 
 
-def plain(node: Node, *, integers: bool = False) -> Any:
+def plain_data(node: Node, *, integers: bool = False) -> Any:
     """The tree as plain data, as it was written; with `integers`, whole floats become integers."""
     value = node.value
     if isinstance(value, dict):
-        return {key: plain(child, integers=integers) for key, child in value.items()}
+        return {key: plain_data(child, integers=integers) for key, child in value.items()}
     if isinstance(value, list):
-        return [plain(child, integers=integers) for child in value]
+        return [plain_data(child, integers=integers) for child in value]
     if integers and isinstance(value, float) and value.is_integer() and abs(value) < 2**53:
         return int(value)
     return value
 
 
-def from_plain(data: Any, place: Place, folder: Path) -> Node:
+def node_of_data(data: Any, place: Place, folder: Path) -> Node:
     """A tree of plain data (a model's defaults), as if written at `place`."""
     if isinstance(data, dict):
-        return Node({str(key): from_plain(value, place, folder) for key, value in data.items()}, place, folder)
+        return Node({str(key): node_of_data(value, place, folder) for key, value in data.items()}, place, folder)
     if isinstance(data, list):
-        return Node([from_plain(value, place, folder) for value in data], place, folder)
+        return Node([node_of_data(value, place, folder) for value in data], place, folder)
     return Node(data, place, folder, text=str(data))

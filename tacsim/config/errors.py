@@ -47,7 +47,7 @@ class ConfigError(ValueError):
         super().__init__("\n".join(lines))
 
 
-def did_you_mean(word: str, allowed: Iterable[str]) -> str:
+def suggest_word(word: str, allowed: Iterable[str]) -> str:
     """ "; did you mean 'x'?" when one of `allowed` is close to `word`, else an empty text."""
     if len(word) > 100:  # comparison takes quadratic time, and no allowed word is that long
         return ""
@@ -56,6 +56,6 @@ def did_you_mean(word: str, allowed: Iterable[str]) -> str:
     return f"; did you mean '{by_lower[close[0]]}'?" if close else ""
 
 
-def join(key: str, name: str | int) -> str:
+def join_keys(key: str, name: str | int) -> str:
     """Dotted key of an entry."""
     return f"{key}.{name}" if key else str(name)

@@ -1,4 +1,4 @@
-"""The gel of a simulated scene, where a calibrated sensor says how large it is."""
+"""The gel size of a simulated scene, from a calibrated sensor."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from tacsim.models.sensor import SensorModel
 from tacsim.models.text import millimetres
 
 
-def with_gels_of_sensors(
+def fit_gels_to_sensors(
     config: RigConfig, load_sensor: Callable[[Path], SensorModel], *, given: Collection[str] = ()
 ) -> tuple[RigConfig, list[str]]:
-    """The rig with gels as large as its simulated sensors' own, and that in words.
+    """The rig with the gel sizes of its simulated sensors, and notes about them.
 
-    load_sensor: reads the model of a mock camera that is given a calibration. given: see `fit_gel`; models of sensors
-    whose gel size was given then say none. Raises ConfigError.
+    load_sensor: reads the model of a mock camera with a calibration. given: see `fit_gel`; the gel size is removed from
+    the models of sensors for which it was given. Raises ConfigError.
     """
     if config.scene is None:
         return config, []
@@ -30,7 +30,7 @@ def with_gels_of_sensors(
             models[name] = model
     scene, notes = fit_gel(config.scene, models, given=given)
     update: dict[str, object] = {"scene": scene}
-    fixed = _sensors_given(config.scene, models, given)
+    fixed = _overridden_sensors(config.scene, models, given)
     if fixed:
         update["sensors"] = {
             name: sensor.without_gel_size() if name in fixed else sensor for name, sensor in config.sensors.items()
@@ -41,23 +41,23 @@ def with_gels_of_sensors(
 def fit_gel(
     scene: Scene, models: Mapping[str, SensorModel], *, given: Collection[str] = ()
 ) -> tuple[Scene, list[str]]:  # fmt: skip
-    """The scene with each gel as large along x, y as its sensor's model says (`gel_size`), in whole elements, and that
-    in words, with what calibrations say against themselves. Where all that is known is one size, it is that of `gel`,
-    so of both sensors, unless the scene gives one a size of its own. Sizes that were `given` on the command line stay:
-    "gel", or the names of sensors. Raises ConfigError for a gel that the scene cannot mesh."""
+    """The scene with the gel sizes along x, y of the sensors' models (`gel_size`), in whole elements, and notes about
+    them, with the cautions of calibrations. If the models give one size only, `gel` has it, and so both sensors, unless
+    the scene gives a sensor another size. Sizes that were `given` on the command line stay: "gel", or the names of
+    sensors. Raises ConfigError for a gel that the scene cannot mesh."""
     notes = [f"sensor {name}: {model.name}: {model.caution}" for name, model in models.items() if model.caution]
     sizes = {name: model.gel_size for name, model in models.items() if model.gel_size is not None}
-    said = {
+    origins = {
         name: f"{millimetres(*size)} by the calibration of {models[name].name} (sensor {name})"
         for name, size in sizes.items()
     }
-    fixed = _sensors_given(scene, models, given)
-    kept = {name: words for name, words in said.items() if name in fixed}
-    for size in dict.fromkeys(millimetres(*scene.gel_of(name).size[:2]) for name in kept):
-        of = [words for name, words in kept.items() if millimetres(*scene.gel_of(name).size[:2]) == size]
-        notes.insert(0, f"gel {size}, as said on the command line; {'; '.join(of)}")
+    fixed = _overridden_sensors(scene, models, given)
+    fixed_origins = {name: words for name, words in origins.items() if name in fixed}
+    for size in dict.fromkeys(millimetres(*scene.gel_of(name).size[:2]) for name in fixed_origins):
+        of = [words for name, words in fixed_origins.items() if millimetres(*scene.gel_of(name).size[:2]) == size]
+        notes.insert(0, f"gel {size}, as given on the command line; {'; '.join(of)}")
     wanted = {
-        name: _whole_elements(size, scene.fitted_element_size(name))
+        name: _round_to_elements(size, scene.fitted_element_size(name))
         for name, size in sizes.items()
         if name not in fixed
     }
@@ -67,21 +67,21 @@ def fit_gel(
     shared = len(set(wanted.values())) == 1 and not own and not fixed
     groups = [list(wanted)] if shared else [[name] for name in wanted]
     for names in reversed(groups):
-        name, shown = names[0], "; ".join(said[name] for name in names)
+        name, origin_text = names[0], "; ".join(origins[name] for name in names)
         x, y = wanted[name]
         thickness, element = scene.gel_of(name).size[2], scene.fitted_element_size(name)
-        scene = _with_size(scene, "gel" if shared else f"gels.{name}", (x, y, thickness), shown)
+        scene = _set_gel_size(scene, "gel" if shared else f"gels.{name}", (x, y, thickness), origin_text)
         words = f"gel {millimetres(x, y)} in whole elements of {element * 1e3:.3g} mm, {thickness * 1e3:.3g} mm thick"
-        notes.insert(0, f"{words}: {shown}; the thickness is the scene's")
+        notes.insert(0, f"{words}: {origin_text}; the thickness is the scene's")
     return scene, notes
 
 
-def _whole_elements(size: tuple[float, float], element: float) -> tuple[float, float]:
+def _round_to_elements(size: tuple[float, float], element: float) -> tuple[float, float]:
     x, y = (max(2, round(side / element)) * element for side in size)
     return x, y
 
 
-def _with_size(scene: Scene, key: str, size: tuple[float, ...], why: str) -> Scene:
+def _set_gel_size(scene: Scene, key: str, size: tuple[float, ...], reason: str) -> Scene:
     """The scene with this size of `gel`, or of `gels.NAME`. Raises ConfigError."""
     whole = scene.model_dump()
     part, *names = key.split(".")
@@ -91,11 +91,11 @@ def _with_size(scene: Scene, key: str, size: tuple[float, ...], why: str) -> Sce
         return Scene.model_validate(whole)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]["msg"].removeprefix("Value error, ")
-        raise ConfigError([Problem(Place(f"scene.{key}.size"), "", f"{why}: {first}")]) from None
+        raise ConfigError([Problem(Place(f"scene.{key}.size"), "", f"{reason}: {first}")]) from None
 
 
-def gel_sizes_given(paths: Iterable[Iterable[str]]) -> frozenset[str]:
-    """What overrides of these paths give a gel size: "gel", or sensors."""
+def overridden_gel_sizes(paths: Iterable[Iterable[str]]) -> frozenset[str]:
+    """The gels whose size is in overrides with these paths: "gel", or names of sensors."""
     found: set[str] = set()
     for path in paths:
         match [key for key in path if key not in ("task", "scene")]:
@@ -106,7 +106,7 @@ def gel_sizes_given(paths: Iterable[Iterable[str]]) -> frozenset[str]:
     return frozenset(found)
 
 
-def _sensors_given(scene: Scene, names: Iterable[str], given: Collection[str]) -> frozenset[str]:
-    """Those of the sensors `names` whose gels have a size that was given."""
+def _overridden_sensors(scene: Scene, names: Iterable[str], given: Collection[str]) -> frozenset[str]:
+    """The sensors among `names` whose gel size was given."""
     own = {name for name, each in scene.gels.items() if each.size is not None}
     return frozenset(name for name in names if name in given or ("gel" in given and name not in own))

@@ -1,4 +1,4 @@
-"""The kinds of configuration files: their folders, the path a name refers to, and their JSON schema for editors."""
+"""The kinds of configuration files: their folders, the files of names, and their JSON schema for editors."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from pydantic import BaseModel, TypeAdapter
 from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 from pydantic_core import core_schema
 
-from tacsim.config.bundle import FILE, OWN, is_bundle, own_names
-from tacsim.config.errors import did_you_mean
+from tacsim.config.bundle import FILE, SENSORS_FOLDER, is_bundle, user_sensor_names
+from tacsim.config.errors import suggest_word
 from tacsim.models.material import BodyMaterial, GelMaterial
 from tacsim.models.randomisation import Randomisation
 from tacsim.models.rig import TASKS, RigConfig, rig_model, task_annotation
@@ -31,8 +31,8 @@ class Kind:
 
     name: str
     folder: str
-    models: Sequence[type[BaseModel]]  # of a task: those that are known at present
-    annotate: Callable[[], Any]  # what a file holds
+    models: Sequence[type[BaseModel]]  # of a task: those that are registered at present
+    annotate: Callable[[], Any]  # type of a file's content
 
 
 KINDS = {
@@ -50,7 +50,7 @@ KINDS = {
 
 
 class NotFound(ValueError):
-    """A reference to no file; the text says why, and lists the files that exist."""
+    """A reference without a file; the text gives the reason and lists the files that exist."""
 
 
 @cache
@@ -66,7 +66,7 @@ def config_root() -> Path:
     raise FileNotFoundError(f"no configuration at {package / '_configs'}; install tacsim again")
 
 
-def names(kind: str) -> list[str]:
+def shipped_names(kind: str) -> list[str]:
     """Sorted names of the shipped files of a kind (a key of KINDS). Raises KeyError on another."""
     return sorted(path.stem for path in (config_root() / KINDS[kind].folder).glob("*.yaml"))
 
@@ -88,11 +88,11 @@ def shipped_file(kind: Kind, name: str) -> Path:
     path = config_root() / kind.folder / f"{name}.yaml"
     if path.is_file():
         return path
-    known = names(kind.name)
-    raise NotFound(f"no {kind.name} '{name}'; allowed: {', '.join(known) or '(none)'}{did_you_mean(name, known)}")
+    known = shipped_names(kind.name)
+    raise NotFound(f"no {kind.name} '{name}'; allowed: {', '.join(known) or '(none)'}{suggest_word(name, known)}")
 
 
-def resolve(kind: Kind, reference: str, folder: Path) -> Path:
+def resolve_reference(kind: Kind, reference: str, folder: Path) -> Path:
     """The file that `reference`, written in a file of `folder`, refers to. Raises NotFound.
 
     A name refers to a shipped file of that kind. A path ends in .yaml and must be, symbolic links followed, below
@@ -106,7 +106,7 @@ def resolve(kind: Kind, reference: str, folder: Path) -> Path:
     if is_name(reference):
         return shipped_file(kind, reference)
     if not reference.endswith((".yaml", ".yml")) or "\0" in reference:
-        known = ", ".join(names(kind.name))
+        known = ", ".join(shipped_names(kind.name))
         raise NotFound(f"{reference!r} is no {kind.name}; allowed: a name ({known}), or a path ending in .yaml")
     try:
         path = (folder / reference).resolve()
@@ -118,12 +118,12 @@ def resolve(kind: Kind, reference: str, folder: Path) -> Path:
 
 
 def _sensor_file(kind: Kind, reference: str, folder: Path) -> Path:
-    """Of a name or a bundle's path: the one sensor that it can mean. Raises NotFound for none, and for two."""
+    """The only sensor with this name or bundle path. Raises NotFound for none, and for two."""
     places = [folder / reference / FILE]
     if is_name(reference):
         places.append(config_root() / kind.folder / f"{reference}.yaml")
     if Path(reference).name == reference:
-        places += [folder / OWN / reference / FILE, folder / OWN / f"{reference}.yaml"]
+        places += [folder / SENSORS_FOLDER / reference / FILE, folder / SENSORS_FOLDER / f"{reference}.yaml"]
     try:
         found = list({path.resolve(): path for path in places if path.is_file()}.values())
     except (OSError, RuntimeError) as error:  # a loop of symbolic links
@@ -131,18 +131,18 @@ def _sensor_file(kind: Kind, reference: str, folder: Path) -> Path:
     if len(found) == 1:
         return found[0]
     if found:
-        raise NotFound(f"'{reference}' may be {' or '.join(map(str, found))}; write the path of the one that is meant")
+        raise NotFound(f"'{reference}' may be {' or '.join(map(str, found))}; write the path of one of them")
     if (folder / reference).is_dir():
         raise NotFound(f"'{reference}' is a folder without {FILE}, so it is no calibrated sensor")
-    known = [*names(kind.name), *own_names(folder)]
+    known = [*shipped_names(kind.name), *user_sensor_names(folder)]
     raise NotFound(
         f"no sensor '{reference}'; allowed: {', '.join(known)}, a path ending in .yaml, or that of a calibrated sensor "
-        f"(a folder with {FILE}){did_you_mean(reference, [*known, *_bundles(folder, reference)])}"
+        f"(a folder with {FILE}){suggest_word(reference, [*known, *_bundle_paths(folder, reference)])}"
     )
 
 
-def _bundles(folder: Path, reference: str) -> list[str]:
-    """Paths of the bundles beside the one that is missing, as they would be written."""
+def _bundle_paths(folder: Path, reference: str) -> list[str]:
+    """Paths of the bundles in the folder of a missing one, as references."""
     parent = Path(reference).parent
     try:
         return [str(parent / path.name) for path in (folder / parent).iterdir() if is_bundle(path)]
@@ -168,7 +168,7 @@ def json_schema(kind: str = "rig") -> dict[str, Any]:
 
 
 class _Generator(GenerateJsonSchema):
-    """Adds what the loader accepts besides a mapping: the name of a file, and ``extends``."""
+    """Adds the other forms that the loader accepts: the name of a file, and ``extends``."""
 
     def model_schema(self, schema: core_schema.ModelSchema) -> JsonSchemaValue:
         mapping = super().model_schema(schema)
@@ -177,11 +177,13 @@ class _Generator(GenerateJsonSchema):
             return mapping
         reference: dict[str, Any] = {
             "description": f"name of a {kind.name}, or path of a .yaml file below this folder",
-            "anyOf": [{"enum": names(kind.name)}, {"type": "string", "pattern": r"\.ya?ml$"}],
+            "anyOf": [{"enum": shipped_names(kind.name)}, {"type": "string", "pattern": r"\.ya?ml$"}],
         }
         if kind.name == "sensor":
-            reference["description"] += f", or of a calibrated sensor (a folder with {FILE}; by name from {OWN}/)"
-            reference["anyOf"] = [{"enum": names(kind.name)}, {"type": "string", "minLength": 1}]
+            reference["description"] += (
+                f", or of a calibrated sensor (a folder with {FILE}; by name from {SENSORS_FOLDER}/)"
+            )
+            reference["anyOf"] = [{"enum": shipped_names(kind.name)}, {"type": "string", "minLength": 1}]
         mapping["properties"]["extends"] = {
             **reference,
             "description": f"{reference['description']}, to change a few keys of",

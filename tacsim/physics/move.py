@@ -1,4 +1,4 @@
-"""What one motion of a world is asked for, and how it went."""
+"""Command and result of one motion of a world."""
 
 from __future__ import annotations
 
@@ -23,38 +23,38 @@ def warn_of_few_layers() -> None:
 
 @dataclass(frozen=True, slots=True)
 class MoveStats:
-    """How one motion went."""
+    """Result of one motion."""
 
     substeps: int  # explicit substeps of motion and hold together
-    hold: int  # of which hold
-    residual: float  # largest relative force imbalance or change at the end, or change still to come [-]
-    # residual <= the scene's tolerance; and of an indenter with friction: slid as it can be followed
-    # (tacsim.physics.motion.slide), of a body: moved no faster than it bears
+    hold: int  # substeps of the hold
+    residual: float  # largest relative force imbalance, force change at the end, or expected further change [-]
+    # residual <= the scene's tolerance. In addition, for an indenter with friction: the slide is within the limits of
+    # tacsim.physics.motion.slide; for a body: the speed is within its limits
     settled: bool
     overlap: float  # deepest overlap of body (or indenter) and gel surface in the last substep [m]
-    # times a guard changed the physics (particles set aside, gaps capped), found gels in one another, or tension in a
-    # body grow beyond what it can bear (tacsim.physics.worlds.hybrid)
+    # number of times that a guard changed the physics (particles removed, overlaps limited), or found that gels
+    # overlap or that the tension in a body grew above its limit (tacsim.physics.worlds.hybrid)
     guard_hits: int
-    retries: int = 0  # times the motion was started again with half the time step
+    retries: int = 0  # number of times that the motion was started again with half the time step
     load_error: float = 0.0  # largest |force - load| of the sensors that hold a load [N]
     time_step: float = 0.0  # of the last substep, as the distance that the gel's pressure wave travels in it [m]
     damping: float = 0.0  # of the gel in the last substep: its rate times the wave's time through the gel [-]
-    gel_overlap: float = 0.0  # deepest overlap of the two gels with one another at the end, which they do not feel [m]
-    courant: float = 0.0  # largest time step / time of the wave through the most squeezed element or grid cell [-]
-    # least and largest elastic volume ratio of the body's particles at the end [-]; a body led to and fro keeps them
+    gel_overlap: float = 0.0  # deepest overlap of the two gels at the end; no contact force acts between gels [m]
+    courant: float = 0.0  # largest time step / time of the wave through the most compressed element or grid cell [-]
+    # smallest and largest elastic volume ratio of the body's particles at the end [-]
     smallest_volume: float = 1.0
     largest_volume: float = 1.0
-    # layers of particles over the body's mean height at the end (0: no body); whether they are fewer than MIN_LAYERS
+    # layers of particles over the body's mean height at the end (0: no body); whether there are fewer than MIN_LAYERS
     particle_layers: float = 0.0
     few_layers: bool = False
-    # share of the force between the sensors that the hold took from a body that yields, of what is left [-]: the stress
-    # that the speed itself cost
+    # decrease of the force between the sensors during the hold of a body that yields, over the force at the end [-]:
+    # stress that is caused by the speed of the motion
     force_loss: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class MoveCommand:
-    """What one motion of a world is asked for; see `World.move`."""
+    """Arguments of one motion; see `World.move`."""
 
     targets: Mapping[str, Pose]
     loads: Mapping[str, float] = field(default_factory=dict)

@@ -1,4 +1,4 @@
-"""The state of a world as named arrays: copies of it, and how they are put back."""
+"""The state of a world as named arrays: how it is copied and restored."""
 
 from __future__ import annotations
 
@@ -15,47 +15,47 @@ SENSORS = ("lower", "upper")  # gels by index
 
 
 def gel_suffixes(groups: int) -> tuple[str, ...]:
-    """What follows the name of an array of gels: nothing where one array (gels, ...) holds all of them, which are then
-    cut alike; else each has an array (1, ...) of its own."""
+    """Suffixes of the names of gel arrays: none where one array (gels, ...) holds all gels, which then have equal
+    meshes; otherwise each gel has its own array (1, ...)."""
     return ("",) if groups == 1 else tuple(f"_{sensor}" for sensor in SENSORS)
 
 
 def gel_arrays(state: State, name: str) -> dict[int, NDArray[Any]]:
-    """The arrays of gels in a state that are called `name`, by the index of the first gel in each."""
+    """The gel arrays called `name` in a state, by the index of the first gel in each."""
     found = {0: state[name]} if name in state else {}
     return found | {g: state[f"{name}_{s}"] for g, s in enumerate(SENSORS) if f"{name}_{s}" in state}
 
 
-class Kept(Mapping[str, NDArray[Any]]):
-    """A state that is fetched when somebody looks into it."""
+class LazyState(Mapping[str, NDArray[Any]]):
+    """A state that is fetched at the first access."""
 
     def __init__(self, fetch: Callable[[], State]) -> None:
         self._fetch = fetch
         self._state: State | None = None
 
-    def _whole(self) -> State:
+    def _fetch_once(self) -> State:
         if self._state is None:
             self._state = self._fetch()
         return self._state
 
     def __getitem__(self, name: str) -> NDArray[Any]:
-        return self._whole()[name]
+        return self._fetch_once()[name]
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._whole())
+        return iter(self._fetch_once())
 
     def __len__(self) -> int:
-        return len(self._whole())
+        return len(self._fetch_once())
 
 
-def copies(arrays: State) -> dict[str, NDArray[Any]]:
-    """Copies in the same memory layout: particles' numbers are rows."""
+def copy_arrays(arrays: State) -> dict[str, NDArray[Any]]:
+    """Copies in the same memory layout: rows of particles stay rows."""
     return {name: a.copy(order="K") for name, a in arrays.items()}
 
 
 def snapshot_of(arrays: State, poses: Mapping[str, Pose]) -> dict[str, NDArray[Any]]:
-    """A snapshot: copies of a world's arrays, and the poses of its driven frames."""
-    state = copies(arrays)
+    """A snapshot: copies of a world's arrays and the poses of its driven frames."""
+    state = copy_arrays(arrays)
     state["poses"] = np.array([[*p.position, *p.quaternion] for p in poses.values()])
     return state
 
@@ -63,8 +63,8 @@ def snapshot_of(arrays: State, poses: Mapping[str, Pose]) -> dict[str, NDArray[A
 def restore_arrays(arrays: State, frames: Sequence[str], state: State, finite: Sequence[str] = ()) -> dict[str, Pose]:
     """Copies a snapshot into a world's arrays; returns the poses.
 
-    finite: names of arrays from which no motion can begin unless they are finite. Raises ValueError for a snapshot that
-    does not fit; then nothing is changed.
+    finite: names of arrays that must be finite. Raises ValueError for a snapshot that does not fit; nothing is changed
+    then.
     """
     found = {name: np.asarray(state[name]) for name in (*arrays, "poses") if name in state}
     for name, wanted in {**arrays, "poses": np.empty((len(frames), 7))}.items():

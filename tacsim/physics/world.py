@@ -1,4 +1,4 @@
-"""What a simulated world is, whatever scheme moves it, and how worlds are made from scenes."""
+"""The interface of a simulated world, the same for all schemes, and how worlds are made from scenes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tacsim.physics.move import MoveStats
 
 
 class World(Protocol):
-    """Gels, and what they touch. Sensors are driven; everything else follows. SI units, world frame.
+    """Gels and what they touch. Sensors are driven; everything else moves by the physics. SI units, world frame.
 
     At construction the gels are undeformed and touch nothing: `lower` at the identity pose, `upper` half-turned about x
     above the body with a clear gap, `indenter` (in a scene with one) clear of the gel.
@@ -27,7 +27,7 @@ class World(Protocol):
         ...
 
     def place(self, poses: Mapping[str, Pose]) -> None:
-        """Puts the named frames elsewhere at once, at rest: for a world in which nothing touches, here or there."""
+        """Puts the named frames at other poses at once, at rest. Nothing may touch before or after."""
         ...
 
     def move(
@@ -37,27 +37,27 @@ class World(Protocol):
         """Drives the named frames to their targets along a ramped straight path, then holds until settled. Rotations
         take the shorter direction: more than half a turn needs several motions.
 
-        loads: normal force [N, positive = pressed] of sensors that hold it by moving along their own z axis; across it,
-        and in orientation, they follow their target (or stay). Afterwards `pose` says where they are. Raises
-        LoadNotReached (tacsim.physics.motion.load), with the world as it was, for a load out of reach.
+        loads: normal force [N, positive = pressed] of sensors that hold it by moving along their own z axis. Along x
+        and y, and in orientation, these sensors follow their target (or stay). Afterwards `pose` returns where they
+        are. Raises LoadNotReached (tacsim.physics.motion.load) for a load out of reach; the world is then unchanged.
 
-        duration [s]: makes the motion dynamic (tacsim.physics.motion.inertia): it takes exactly this long, with the
-        materials' true densities and undamped, and is not held at its end. What still moves then keeps its velocity in
-        a next motion with a duration, and is stopped by one without. Raises ValueError for one that is too short.
+        duration [s]: makes the motion dynamic (tacsim.physics.motion.inertia). It takes exactly this time, with the
+        materials' true densities and without damping, and there is no hold at its end. Velocities at its end are kept
+        by a next motion with a duration, and set to zero by one without. Raises ValueError for one that is too short.
 
-        flow: frames pass their targets without stopping and nothing is held; the next such motion continues from there.
-        For many small steps in a row, each in a third of the time and within some percent of the force at rest
-        (docs/physics.md). Frames without a target come to a stop. With nothing to do and nothing moving it holds until
-        settled, like every other motion, which first brings to rest what flows.
+        flow: frames pass their targets without stopping and without a hold; the next such motion continues from there.
+        Use it for many small steps: each takes a third of the time, with forces within some percent of those at rest
+        (docs/physics.md). Frames without a target stop. Without a target or a velocity the motion is a hold until
+        settled. A motion without `flow` first stops frames that still flow.
 
         Raises SimulationDiverged (tacsim.physics.failure.health) when no step size gives a finite state; KeyError or
-        ValueError for a command that makes no sense, before anything moves: loads, duration and flow exclude one
-        another, and physics 'seed' knows neither duration nor flow; RuntimeError while another motion is running.
+        ValueError, before anything moves, for a command that is not valid: loads, duration and flow exclude each
+        other, and physics 'seed' supports neither duration nor flow; RuntimeError while another motion is running.
         """
         ...
 
     def wrench(self, name: str) -> NDArray[np.float64]:
-        """(6,) what the object does to the sensor, about the sensor origin, sensor axes [N, N m]."""
+        """(6,) force and moment of the object on the sensor, about the sensor's origin, sensor axes [N, N m]."""
         ...
 
     def surface(self, name: str) -> GelSurface: ...
@@ -70,12 +70,12 @@ class World(Protocol):
         ...
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Raises ValueError, with nothing changed, if `state` is no snapshot of such a world."""
+        """Raises ValueError if `state` is no snapshot of such a world; the world is then unchanged."""
         ...
 
 
 def make_world(scene: Scene) -> World:
-    """The world of a scene, by the scheme that its `physics` names."""
+    """The world of a scene, by the scheme named in `physics`."""
     return SCHEMES[scene.physics](scene)
 
 
@@ -87,7 +87,7 @@ def _seed_world(scene: Scene) -> World:
 
 
 def _hybrid_world(scene: Scene) -> World:
-    """Elastic gels of finite elements: one that an indenter presses, or two round a body."""
+    """Elastic gels of finite elements: one under an indenter, or two around a body."""
     if scene.indenter is not None:
         from tacsim.physics.worlds.press import PressWorld
 

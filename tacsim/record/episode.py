@@ -1,4 +1,4 @@
-"""An episode: what the recorder writes, the reader gives back, and the report shows."""
+"""An episode: written by the recorder, returned by the reader, shown by the report."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ _VECTORS = ("joints", "joint_speeds", "tcp_pose", "tcp_speed", "tcp_force")
 
 
 class EpisodeError(ValueError):
-    """A recording that is missing, damaged, of another kind, or beyond the limits of size."""
+    """A recording that is missing, damaged, of another kind, or larger than the limits."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ArmPackages:
-    """What an arm's controller sent during a control step: a row for each package, oldest first, as it came (base axes,
-    not those of the sensor)."""
+    """Packages of an arm's controller during a control step: a row for each package, oldest first, unchanged (base
+    axes, not sensor axes)."""
 
     time: FloatArray  # (n,) when it was read, rig clock [s]
     stamp: FloatArray  # (n,) time on the controller's own clock [s]
@@ -34,11 +34,11 @@ class ArmPackages:
     tcp_force: FloatArray  # (n, 6) [N, N m]
     runtime_state: NDArray[np.int64]  # (n,) of the controller's program: 1 stopped, 2 playing, 4 paused
     safety_bits: NDArray[np.int64]  # (n,) safety_status_bits of the controller
-    status: NDArray[np.int64]  # (n,) what the driver made of it: robot.ArmStatus
+    status: NDArray[np.int64]  # (n,) status by the driver: robot.ArmStatus
     lost: int = 0  # packages missing among these, or between these and those of the step before
 
     @classmethod
-    def of(cls, columns: Mapping[str, Any] | NDArray[np.void], lost: int = 0) -> Self:
+    def from_columns(cls, columns: Mapping[str, Any] | NDArray[np.void], lost: int = 0) -> Self:
         """From sequences with the names of the fields, or a structured array."""
         arrays: dict[str, Any] = {name: np.array(columns[name], np.float64) for name in ("time", "stamp")}
         arrays |= {name: np.array(columns[name], np.float64).reshape(-1, 6) for name in _VECTORS}
@@ -46,11 +46,11 @@ class ArmPackages:
         return cls(**arrays, lost=lost)
 
 
-class Recorded(Mapping[str, T], Generic[T]):
-    """Parts of a recorded step by name: each is decoded when it is asked for, and not kept.
+class LazyRecords(Mapping[str, T], Generic[T]):
+    """Parts of a recorded step by name: each is decoded at each access, and not stored.
 
-    known: by name, what the record says without decoding: exposure of a frame [s], number of an arm's packages lost.
-    Raises EpisodeError, when a part is asked for, if it cannot be decoded.
+    known: by name, a value that needs no decoding: exposure of a frame [s], number of lost packages of an arm. An
+    access raises EpisodeError if the part cannot be decoded.
     """
 
     def __init__(self, known: Mapping[str, float], decode: Callable[[str], T]) -> None:
@@ -76,26 +76,26 @@ class Step:
     time: float  # of the observation, rig clock [s]
     frames: Mapping[str, TactileFrame]  # native, by sensor
     arms: Mapping[str, ArmState]
-    action: Action | None = None  # asked
-    sent: Mapping[str, Pose | None] = field(default_factory=dict)  # executed, by arm
+    action: Action | None = None  # as requested
+    sent: Mapping[str, Pose | None] = field(default_factory=dict)  # as executed, by arm
     reward: float | None = None
     distance: float | None = None  # from the goal [m]
     info: Mapping[str, float] = field(default_factory=dict)  # e.g. body_height, contact_signal_upper, residual
     seconds: float = 0.0  # wall time of the step [s]
-    packages: Mapping[str, ArmPackages] = field(default_factory=dict)  # by arm, where the rig file asks for them
-    body: NDArray[np.float32] | None = None  # (n, 3) particles of a simulated body, where it does; world [m]
+    packages: Mapping[str, ArmPackages] = field(default_factory=dict)  # by arm, if the rig file requests them
+    body: NDArray[np.float32] | None = None  # (n, 3) particles of a simulated body, if requested; world [m]
 
     @property
     def exposed(self) -> Mapping[str, float]:
-        """When each frame was exposed [s]; decodes none."""
-        if isinstance(self.frames, Recorded):
+        """Time of exposure of each frame [s]; decodes none."""
+        if isinstance(self.frames, LazyRecords):
             return self.frames.known
         return {name: frame.time for name, frame in self.frames.items()}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EpisodeMeta:
-    """What holds for the whole episode."""
+    """Data of the whole episode."""
 
     rig: str
     task: str | None
@@ -105,15 +105,15 @@ class EpisodeMeta:
     versions: Mapping[str, str]
     attachments: Mapping[str, bytes] = field(default_factory=dict)  # name -> content: rig.yaml, calibration bundles
     goal: float | tuple[float, ...] | None = None
-    started: datetime | None = None  # with its time zone
+    started: datetime | None = None  # with time zone
     wall_offset: int = 0  # wall clock minus the rig's clock, measured at the start [ns]
 
 
 @dataclass(slots=True, eq=False)
 class Episode:
-    """The steps of an episode: in memory, or in its recording, from where each is read when it is asked for."""
+    """The steps of an episode: in memory, or in its recording, from which each is read at each access."""
 
     meta: EpisodeMeta
     steps: Sequence[Step] = field(default_factory=list)
-    complete: bool = True  # False: the recorder was killed; the steps flushed until then are here
-    dropped: int = 0  # steps that the recorder had to drop
+    complete: bool = True  # False: the recorder was killed; these are the steps written before
+    dropped: int = 0  # steps that the recorder dropped

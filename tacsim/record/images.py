@@ -1,4 +1,5 @@
-"""Pictures in and out of files: lossless PNG for the recorder; PNG, JPEG and BMP in, sizes checked before decoding."""
+"""Reads and writes pictures: lossless PNG for the recorder; reads PNG, JPEG and BMP, and checks sizes before
+decoding."""
 
 from __future__ import annotations
 
@@ -46,12 +47,12 @@ def encode_png(image: NDArray[np.uint8]) -> bytes:
 def decode_image(
     data: bytes, what: str, formats: tuple[str, ...] = FORMATS, size: tuple[int, int] | None = None
 ) -> NDArray[np.uint8]:
-    """(H, W, 3) uint8 RGB picture of an encoded one with 8 bits a channel, turned as its EXIF orientation says.
+    """(H, W, 3) uint8 RGB picture from an encoded one with 8 bits a channel, rotated by its EXIF orientation.
 
-    Raises EpisodeError that names `what`, for unreadable data, and, before decoding them, for pictures beyond MAX_SIDE,
-    for those with more than 8 bits a channel, and for those that have not the rows and columns of `size`.
+    Raises EpisodeError that names `what`, for unreadable data, and, before decoding, for pictures larger than MAX_SIDE,
+    with more than 8 bits a channel, or with other rows and columns than `size`.
     """
-    with _opened(io.BytesIO(data), what, formats) as picture:
+    with _open_image(io.BytesIO(data), what, formats) as picture:
         rows, columns = upright_size(picture)
         if size is not None and (rows, columns) != size:
             found = f"{columns} x {rows} pixels"
@@ -60,7 +61,7 @@ def decode_image(
 
 
 @contextmanager
-def _opened(source: Path | io.BytesIO, what: str, formats: tuple[str, ...]) -> Iterator[Image]:
+def _open_image(source: Path | io.BytesIO, what: str, formats: tuple[str, ...]) -> Iterator[Image]:
     """See `open_picture`. Raises EpisodeError."""
     try:
         with open_picture(source, what, formats) as picture:
@@ -82,9 +83,9 @@ def read_image(path: Path) -> NDArray[np.uint8]:
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """(rows, columns) of a picture file as `read_image` gives it, from its header alone. Raises EpisodeError that names
+    """(rows, columns) of a picture file as returned by `read_image`, from its header. Raises EpisodeError that names
     the file."""
-    with _opened(path, str(path), FORMATS) as picture:
+    with _open_image(path, str(path), FORMATS) as picture:
         return upright_size(picture)
 
 

@@ -1,4 +1,4 @@
-"""A control step <-> the messages that hold it. Lossless: what is decoded equals what was encoded bit for bit."""
+"""A control step <-> its messages. Lossless: a decoded step equals the encoded one bit for bit."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from google.protobuf.timestamp_pb2 import Timestamp
 
 from tacsim.interface import Action, ArmState, Float32, Pose, SurfaceMap, TactileFrame
 from tacsim.models.text import printable_line
-from tacsim.record.episode import ArmPackages, EpisodeError, Recorded, Step
+from tacsim.record.episode import ArmPackages, EpisodeError, LazyRecords, Step
 from tacsim.record.images import decode_image, encode_png
 from tacsim.record.protobuf import (
     PACKAGE_FIELDS,
@@ -33,14 +33,14 @@ from tacsim.record.protobuf import (
     joints_of,
     package_message,
     package_row,
-    parse,
-    put_pose,
-    six,
+    parse_message,
+    set_pose,
+    vectors_of,
 )
 from tacsim.record.protobuf import Step as StepMessage
 from tacsim.record.schemas import BODY_TOPIC, STEP_TOPIC
 
-Messages = Mapping[str, Sequence[bytes]]  # of one step, by topic; only of packages there are several
+Messages = Mapping[str, Sequence[bytes]]  # of one step, by topic; only packages have several
 
 WORLD = "world"  # the frame of all poses
 _FLOAT = np.dtype("<f4")
@@ -54,14 +54,14 @@ class Encoded:
 
     topic: str
     schema: type[Message]
-    log_time: int  # where viewers put it: at its step, or a package at its own time; wall clock [ns]
-    time: int  # when its content was true, wall clock [ns]
+    log_time: int  # time in viewers: of its step, for a package its own; wall clock [ns]
+    time: int  # time of its content, wall clock [ns]
     data: bytes
 
 
 @dataclass(frozen=True, slots=True)
 class _Clock:
-    """Rig times as the wall clock's."""
+    """Converts rig times to wall clock times."""
 
     step: int  # rig time of the step [ns]
     offset: int  # wall clock minus rig clock [ns]
@@ -83,8 +83,8 @@ def nanoseconds(seconds: float) -> int:
 
 
 def encode_step(step: Step, pitch: float, wall_offset: int = 0) -> list[Encoded]:
-    """All messages of a step, the one that makes it complete last. `pitch` of the surface grid is for viewers [m];
-    `wall_offset`: wall clock minus rig clock [ns].
+    """All messages of a step; the last one completes it. `pitch` of the surface grid is for viewers [m]; `wall_offset`:
+    wall clock minus rig clock [ns].
 
     Raises ValueError for arrays of the wrong type or shape and for a step at a negative time.
     """
@@ -108,37 +108,37 @@ def encode_step(step: Step, pitch: float, wall_offset: int = 0) -> list[Encoded]
 def decode_step(
     data: bytes, messages: Messages, what: str = "a recording", sizes: dict[str, tuple[int, int]] | None = None
 ) -> Step:
-    """The step of a /step message and the other messages of that step by topic. Its frames are decoded when they are
-    asked for. Raises EpisodeError.
+    """The step from a /step message and the other messages of that step by topic. Its frames are decoded at access.
+    Raises EpisodeError.
 
     Args:
-        what: is named by the errors of its frames.
-        sizes: rows and columns of the pictures by sensor, those of the first that is decoded: others are refused.
+        what: name of the recording in errors of its frames.
+        sizes: rows and columns of the pictures by sensor, set by the first decoded one: others are refused.
     """
     try:
-        record = parse(StepMessage, data)
-        info = {key: parse(Scalar, _last(messages, f"{STEP_TOPIC}/{key}")).value for key in record.info}
+        record = parse_message(StepMessage, data)
+        info = {key: parse_message(Scalar, _last_message(messages, f"{STEP_TOPIC}/{key}")).value for key in record.info}
         frames = {frame.sensor: frame for frame in record.frames}
         for frame in frames.values():
             for topic in _frame_topics(frame):
-                _last(messages, topic)
+                _last_message(messages, topic)
         packages = {each.arm: each for each in record.packages}
         return Step(
             index=record.index,
             time=record.time,
-            frames=Recorded(
+            frames=LazyRecords(
                 {name: frame.time for name, frame in frames.items()},
                 partial(_decode_frame, frames, messages, what, {} if sizes is None else sizes),
             ),
             arms={name: _decode_arm(name, messages) for name in record.arms},
-            action=Action(_poses(record.asked)) if record.acted else None,
-            sent=_poses(record.sent),
+            action=Action(_decode_poses(record.asked)) if record.acted else None,
+            sent=_decode_poses(record.sent),
             reward=record.reward if record.HasField("reward") else None,
             distance=record.distance if record.HasField("distance") else None,
             info=info,
             seconds=record.seconds,
-            body=_decode_points(_last(messages, BODY_TOPIC)) if record.body else None,
-            packages=Recorded(
+            body=_decode_points(_last_message(messages, BODY_TOPIC)) if record.body else None,
+            packages=LazyRecords(
                 {name: each.lost for name, each in packages.items()},
                 partial(_decode_packages, packages, messages, what),
             ),
@@ -159,7 +159,7 @@ def _step_message(step: Step) -> Any:
         for name, pose in poses.items():
             target = targets.add(arm=name)
             if pose is not None:
-                put_pose(target, pose.position.tolist(), pose.quaternion.tolist())
+                set_pose(target, pose.position.tolist(), pose.quaternion.tolist())
     for name, frame in step.frames.items():
         surface = frame.surface
         flow = surface is not None and surface.flow is not None
@@ -172,10 +172,10 @@ def _step_message(step: Step) -> Any:
     return made
 
 
-def _last(messages: Messages, topic: str) -> bytes:
+def _last_message(messages: Messages, topic: str) -> bytes:
     found = messages.get(topic)
     if not found:
-        raise EpisodeError(f"a step names the message '{printable_line(topic, 200)}', which is not there")
+        raise EpisodeError(f"a step names the message '{printable_line(topic, 200)}', which is missing")
     return found[-1]
 
 
@@ -188,21 +188,21 @@ def _encode_frame(name: str, frame: TactileFrame, pitch: float, clock: _Clock) -
         return
     surface = frame.surface
     width = pitch * surface.height.shape[-1]  # [m] of the whole map
-    cells = _join(name, _SURFACE_FIELDS, surface.height[..., None], surface.gradient)
+    cells = _join_arrays(name, _SURFACE_FIELDS, surface.height[..., None], surface.gradient)
     yield Encoded(f"/{name}/surface", Grid, clock.now, time, _encode_grid(name, stamp, cells, _SURFACE_FIELDS, width))
     rows, columns = surface.height.shape
     height = RawImage(timestamp=stamp, frame_id=name, width=columns, height=rows, encoding="32FC1", step=4 * columns)
     height.data = (1e3 * surface.height).astype(_FLOAT).tobytes()
     yield Encoded(f"/{name}/height", RawImage, clock.now, time, height.SerializeToString())
     if surface.flow is not None:
-        cells = _join(name, _FLOW_FIELDS, surface.flow)
+        cells = _join_arrays(name, _FLOW_FIELDS, surface.flow)
         yield Encoded(f"/{name}/flow", Grid, clock.now, time, _encode_grid(name, stamp, cells, _FLOW_FIELDS, width))
 
 
 def _frame_topics(record: Any) -> list[str]:
-    """The topics of the messages that a frame is made of."""
-    there = {"image": True, "surface": record.surface, "flow": record.surface and record.flow}
-    return [f"/{record.sensor}/{part}" for part, is_there in there.items() if is_there]
+    """The topics of a frame's messages."""
+    present = {"image": True, "surface": record.surface, "flow": record.surface and record.flow}
+    return [f"/{record.sensor}/{part}" for part, is_there in present.items() if is_there]
 
 
 def _decode_frame(
@@ -214,11 +214,11 @@ def _decode_frame(
 ) -> TactileFrame:
     record = records[name]
     try:
-        image = CompressedImage.FromString(_last(messages, f"/{name}/image"))
+        image = CompressedImage.FromString(_last_message(messages, f"/{name}/image"))
         surface = None
         if record.surface:
-            cells = _decode_grid(_last(messages, f"/{name}/surface"), _SURFACE_FIELDS)
-            flow = _decode_grid(_last(messages, f"/{name}/flow"), _FLOW_FIELDS) if record.flow else None
+            cells = _decode_grid(_last_message(messages, f"/{name}/surface"), _SURFACE_FIELDS)
+            flow = _decode_grid(_last_message(messages, f"/{name}/flow"), _FLOW_FIELDS) if record.flow else None
             surface = SurfaceMap(height=cells[..., 0].copy(), gradient=cells[..., 1:].copy(), flow=flow)
         pixels = decode_image(image.data, f"/{name}/image", formats=("PNG",), size=sizes.get(name))
     except (EpisodeError, DecodeError, ValueError) as failure:
@@ -227,7 +227,7 @@ def _decode_frame(
     return TactileFrame(image=pixels, time=record.time, index=record.index, surface=surface)
 
 
-def _join(name: str, fields: tuple[str, ...], *arrays: Float32) -> Float32:
+def _join_arrays(name: str, fields: tuple[str, ...], *arrays: Float32) -> Float32:
     """(h, w, fields) float32 from arrays that share (h, w). Raises ValueError for any other type or shape."""
     shapes = ", ".join(f"{array.shape} {array.dtype}" for array in arrays)
     rows_columns = {array.shape[:2] for array in arrays}
@@ -290,7 +290,7 @@ def _encode_arm(name: str, arm: ArmState, clock: _Clock) -> Iterator[Encoded]:
     time = clock(arm.time)
     stamp = _timestamp(time)
     pose = PoseInFrame(timestamp=stamp, frame_id=WORLD)
-    put_pose(pose, arm.pose.position.tolist(), arm.pose.quaternion.tolist())
+    set_pose(pose, arm.pose.position.tolist(), arm.pose.quaternion.tolist())
     yield Encoded(f"/{name}/pose", PoseInFrame, clock.now, time, pose.SerializeToString())
     transform = FrameTransform(timestamp=stamp, parent_frame_id=WORLD, child_frame_id=name)
     transform.translation.x, transform.translation.y, transform.translation.z = arm.pose.position.tolist()
@@ -302,12 +302,12 @@ def _encode_arm(name: str, arm: ArmState, clock: _Clock) -> Iterator[Encoded]:
 
 
 def _decode_arm(name: str, messages: Messages) -> ArmState:
-    pose = PoseInFrame.FromString(_last(messages, f"/{name}/pose")).pose
-    arm = parse(Arm, _last(messages, f"/{name}/arm"))
+    pose = PoseInFrame.FromString(_last_message(messages, f"/{name}/pose")).pose
+    arm = parse_message(Arm, _last_message(messages, f"/{name}/arm"))
     return ArmState(
-        pose=_pose(pose),
-        twist=np.array(six(arm, TWIST)),
-        wrench=np.array(six(arm, WRENCH)),
+        pose=_decode_pose(pose),
+        twist=np.array(vectors_of(arm, TWIST)),
+        wrench=np.array(vectors_of(arm, WRENCH)),
         joints=np.array(joints_of(arm.joints)) if arm.HasField("joints") else None,
         time=arm.time,
     )
@@ -322,21 +322,21 @@ def _encode_packages(name: str, packages: ArmPackages, clock: _Clock) -> Iterato
 
 
 def _decode_packages(records: Mapping[str, Any], messages: Messages, what: str, name: str) -> ArmPackages:
-    there, told = messages.get(f"/{name}/packages", ()), records[name]
-    if len(there) != told.count:
-        raise EpisodeError(f"{what}: it names {told.count} packages of arm '{name}', but {len(there)} are there")
+    present, record = messages.get(f"/{name}/packages", ()), records[name]
+    if len(present) != record.count:
+        raise EpisodeError(f"{what}: it names {record.count} packages of arm '{name}', but has {len(present)}")
     try:
-        rows = [package_row(parse(ArmPackage, data)) for data in there]
-        return ArmPackages.of({field: [row[field] for row in rows] for field in PACKAGE_FIELDS}, told.lost)
+        rows = [package_row(parse_message(ArmPackage, data)) for data in present]
+        return ArmPackages.from_columns({field: [row[field] for row in rows] for field in PACKAGE_FIELDS}, record.lost)
     except (DecodeError, ValueError) as failure:
         raise EpisodeError(f"{what}: a package of arm '{name}' cannot be decoded: {failure}") from failure
 
 
-def _poses(targets: Any) -> dict[str, Pose | None]:
-    return {target.arm: _pose(target.pose) if target.HasField("pose") else None for target in targets}
+def _decode_poses(targets: Any) -> dict[str, Pose | None]:
+    return {target.arm: _decode_pose(target.pose) if target.HasField("pose") else None for target in targets}
 
 
-def _pose(pose: Any) -> Pose:
+def _decode_pose(pose: Any) -> Pose:
     place, turn = pose.position, pose.orientation
     return Pose(np.array([place.x, place.y, place.z]), np.array([turn.x, turn.y, turn.z, turn.w]))
 

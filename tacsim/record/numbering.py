@@ -1,4 +1,4 @@
-"""Which frame of one recording belongs to which row of another: by their numbers where both have some."""
+"""Matches frames of one recording to rows of another, by their numbers if both have numbers."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ class Numbering:
     source: str  # for errors
     count: int
     numbers: tuple[int | None, ...] | None  # one for each; None: not numbered
-    reference: int | None = None  # which of them is the picture without contact that the rig file names
+    reference: int | None = None  # position of the picture without contact that the rig file names
 
 
-def picture_numbers(stems: Sequence[str]) -> tuple[int | None, ...] | None:
-    """The number in each picture's name: that part of the digits by which the names differ. Of several (a counter and
-    a time stamp) it is the one that counts most densely. A name of another pattern has None. None where names have no
-    such number, or one of them twice."""
+def numbers_in_names(stems: Sequence[str]) -> tuple[int | None, ...] | None:
+    """The number in each picture's name: the group of digits in which the names differ; of several groups (a counter
+    and a time stamp), the one with the smallest range. None for a name with another pattern. None as a whole if names
+    have no such number, or two have the same."""
     patterns = [DIGITS.sub("#", stem.lower()) for stem in stems]
     pattern, frequency = Counter(patterns).most_common(1)[0]
     if frequency <= len(stems) / 2 or "#" not in pattern:
@@ -43,10 +43,11 @@ def picture_numbers(stems: Sequence[str]) -> tuple[int | None, ...] | None:
 
 
 def match_numbers(sensors: Mapping[str, Numbering], arms: Mapping[str, Numbering]) -> dict[str, list[int]]:
-    """Which items of each source belong to the ticks of one clock, by name; sources whose items all count are left out.
+    """Positions of the items of each source, by name, in the order of the clock's ticks; empty for a single source.
 
-    Numbered sources go by their numbers: every frame of a sensor must be in every other source; rows of an arm without
-    a picture are left out. Where one of them is not numbered, all must have the same count. Raises EpisodeError.
+    Numbered sources are matched by numbers: each frame of a sensor must have a partner in all other sources; rows of an
+    arm without a picture are left out. If one source is not numbered, all must have the same count. Raises
+    EpisodeError.
     """
     together = {**sensors, **arms}
     if len(together) < 2:
@@ -55,27 +56,27 @@ def match_numbers(sensors: Mapping[str, Numbering], arms: Mapping[str, Numbering
     if any(each.numbers is None for each in together.values()):
         _require_counts([(together[name], len(items)) for name, items in kept.items()])
         return kept
-    numbered = {name: _by_number(together[name], items) for name, items in kept.items()}
+    numbered = {name: _places_by_number(together[name], items) for name, items in kept.items()}
     first = next(iter(sensors))
     wanted = list(numbered[first])
     for name in together:
-        lacking = [number for number in wanted if number not in numbered[name]]
+        missing = [number for number in wanted if number not in numbered[name]]
         more = [] if name in arms else [number for number in numbered[name] if number not in numbered[first]]
-        if lacking or more:
-            raise _unmatched(together[first], together[name], lacking, more, list(numbered[name]))
+        if missing or more:
+            raise _unmatched_error(together[first], together[name], missing, more, list(numbered[name]))
     return {name: [numbers[number] for number in wanted] for name, numbers in numbered.items()}
 
 
 def _without_reference(of: Numbering) -> list[int]:
-    """Places of all items, without a reference whose name has no number like the others'."""
+    """Positions of all items, without a reference picture that has no number."""
     skipped = of.reference if of.numbers is not None and of.reference is not None else None
     if skipped is not None and of.numbers is not None and of.numbers[skipped] is not None:
-        skipped = None  # one of the series, such as its first picture
+        skipped = None  # part of the series, such as its first picture
     return [place for place in range(of.count) if place != skipped]
 
 
-def _by_number(of: Numbering, items: Sequence[int]) -> dict[int, int]:
-    """Place of each item by its number. Raises EpisodeError for an item without."""
+def _places_by_number(of: Numbering, items: Sequence[int]) -> dict[int, int]:
+    """Position of each item by its number. Raises EpisodeError for an item without a number."""
     assert of.numbers is not None
     found = {number: place for place in items if (number := of.numbers[place]) is not None}
     if len(found) < len(items):
@@ -90,34 +91,34 @@ def _require_counts(found: Sequence[tuple[Numbering, int]]) -> None:
     counts = {count for _, count in found}
     if len(counts) == 1:
         return
-    words = [f"{of.source} has {count}{_gaps(of)}" for of, count in found]
+    words = [f"{of.source} has {count}{_describe_gaps(of)}" for of, count in found]
     raise EpisodeError(
         f"not the same number of frames and rows: {'; '.join(words)}. Which belong together is not known; give each "
         "picture a number in its name and the table a column `frame` with these numbers, or make the counts equal"
     )
 
 
-def _gaps(of: Numbering) -> str:
-    """Numbers that are missing between the first and the last, in words."""
-    there = {number for number in of.numbers or () if number is not None}
-    if not there or max(there) - min(there) >= 2 * len(there):  # every tenth frame, or time stamps
+def _describe_gaps(of: Numbering) -> str:
+    """Text with the numbers that are missing between the first and the last."""
+    present = {number for number in of.numbers or () if number is not None}
+    if not present or max(present) - min(present) >= 2 * len(present):  # every tenth frame, or time stamps
         return ""
-    missing = [number for number in range(min(there), max(there)) if number not in there]
-    return f" (missing in its numbers: {_named(missing)})" if missing else ""
+    missing = [number for number in range(min(present), max(present)) if number not in present]
+    return f" (missing in its numbers: {_list_numbers(missing)})" if missing else ""
 
 
-def _unmatched(
-    first: Numbering, other: Numbering, lacking: Sequence[int], more: Sequence[int], there: Sequence[int]
+def _unmatched_error(
+    first: Numbering, other: Numbering, missing: Sequence[int], more: Sequence[int], present: Sequence[int]
 ) -> EpisodeError:
-    parts = [f"{first.source} has number {_named(lacking)}, which {other.source} lacks"] if lacking else []
-    parts += [f"{other.source} has number {_named(more)}, which {first.source} lacks"] if more else []
+    parts = [f"{first.source} has number {_list_numbers(missing)}, which {other.source} lacks"] if missing else []
+    parts += [f"{other.source} has number {_list_numbers(more)}, which {first.source} lacks"] if more else []
     return EpisodeError(
-        f"{'; '.join(parts)} (its numbers go from {min(there)} to {max(there)}). Frames and rows belong together by "
-        "number: give both the same numbers, or leave out what has no partner"
+        f"{'; '.join(parts)} (its numbers go from {min(present)} to {max(present)}). Frames and rows belong together "
+        "by number: give both the same numbers, or leave out what has no partner"
     )
 
 
-def _named(numbers: Sequence[int]) -> str:
+def _list_numbers(numbers: Sequence[int]) -> str:
     max_named = 8  # numbers in an error
     more = f" and {len(numbers) - max_named} more" if len(numbers) > max_named else ""
     return ", ".join(map(str, numbers[:max_named])) + more

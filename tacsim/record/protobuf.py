@@ -1,7 +1,7 @@
-"""The protobuf messages of an episode that are tacsim's own.
+"""tacsim's protobuf messages of an episode.
 
-Each number that somebody may want to plot is a field of its own in nested messages: viewers (Foxglove, Rerun) plot
-those, but no maps, and lists only in part.
+Each number that users may plot is a separate field of nested messages: viewers (Foxglove, Rerun) plot these, but no
+maps, and lists only in part.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from google.protobuf.descriptor_pb2 import FileDescriptorProto
 from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
 
-MAX_JOINTS = 7  # that an arm's message has room for
+MAX_JOINTS = 7  # in an arm's message
 
 _NUMBERS = {
     "double": Field.TYPE_DOUBLE,
@@ -24,20 +24,20 @@ _NUMBERS = {
     "bool": Field.TYPE_BOOL,
     "string": Field.TYPE_STRING,
 }
-# Fields in their order, which gives them their numbers on the wire: new ones go to the end.
+# The order of fields defines their numbers on the wire: add new ones at the end.
 _MESSAGES: dict[str, dict[str, str]] = {
     "Joints": {f"joint_{number + 1}": "optional double" for number in range(MAX_JOINTS)},
     "Arm": {
-        "time": "optional double",  # rig clock [s]; always there
+        "time": "optional double",  # rig clock [s]; always set
         "linear": "foxglove.Vector3",  # velocity of the sensor, world axes [m/s]
         "angular": "foxglove.Vector3",  # [rad/s]
-        "force": "foxglove.Vector3",  # what the object does to the sensor, sensor axes [N]
+        "force": "foxglove.Vector3",  # force of the object on the sensor, sensor axes [N]
         "torque": "foxglove.Vector3",  # about the sensor's origin [N m]
         "joints": "tacsim.Joints",  # [rad]; absent: not known
     },
-    # One package of an arm's controller, as it came: base axes, not those of the sensor.
+    # One package of an arm's controller, unchanged: base axes, not sensor axes.
     "ArmPackage": {
-        "time": "optional double",  # when it was read, rig clock [s]; always there
+        "time": "optional double",  # when it was read, rig clock [s]; always set
         "stamp": "double",  # time on the controller's own clock [s]
         "joints": "tacsim.Joints",  # [rad]
         "joint_speeds": "tacsim.Joints",  # [rad/s]
@@ -49,9 +49,9 @@ _MESSAGES: dict[str, dict[str, str]] = {
         "tcp_torque": "foxglove.Vector3",  # [N m]
         "runtime_state": "int64",  # of the controller's program: 1 stopped, 2 playing, 4 paused
         "safety_bits": "int64",  # safety_status_bits of the controller
-        "status": "int64",  # what the driver made of it: robot.ArmStatus
+        "status": "int64",  # status by the driver: robot.ArmStatus
     },
-    "Scalar": {"value": "optional double"},  # always there
+    "Scalar": {"value": "optional double"},  # always set
     "Target": {"arm": "string", "pose": "foxglove.Pose"},  # world_from_sensor [m]; no pose: the arm holds
     "Frame": {
         "sensor": "string",
@@ -66,14 +66,14 @@ _MESSAGES: dict[str, dict[str, str]] = {
         "lost": "int64",  # packages of the controller that are missing among and before them
     },
     "Step": {
-        "index": "optional int64",  # always there
+        "index": "optional int64",  # always set
         "time": "double",  # rig clock [s]
         "seconds": "double",  # wall time of the step [s]
         "reward": "optional double",
         "distance": "optional double",  # [m]
-        "acted": "bool",  # there was an action
+        "acted": "bool",  # the step has an action
         "asked": "repeated tacsim.Target",  # the action
-        "sent": "repeated tacsim.Target",  # what was executed of it
+        "sent": "repeated tacsim.Target",  # the executed part of the action
         "frames": "repeated tacsim.Frame",
         "arms": "repeated string",
         "info": "repeated string",  # each is a Scalar /step/{name}
@@ -83,11 +83,11 @@ _MESSAGES: dict[str, dict[str, str]] = {
 }
 
 
-def _classes() -> dict[str, Any]:
+def _make_classes() -> dict[str, Any]:
     file = FileDescriptorProto(name="tacsim/episode.proto", package="tacsim", syntax="proto3")
-    pool = DescriptorPool()  # of our own: names cannot clash with those of another library
+    pool = DescriptorPool()  # a separate one: names cannot clash with those of another library
     for known in (Vector3, Pose):
-        _add(pool, known.DESCRIPTOR.file)
+        _add_file(pool, known.DESCRIPTOR.file)
         file.dependency.append(known.DESCRIPTOR.file.name)
     for name, fields in _MESSAGES.items():
         message = file.message_type.add(name=name)
@@ -107,13 +107,13 @@ def _classes() -> dict[str, Any]:
     return {name: GetMessageClass(pool.FindMessageTypeByName(f"tacsim.{name}")) for name in _MESSAGES}
 
 
-def _add(pool: DescriptorPool, file: Any) -> None:
+def _add_file(pool: DescriptorPool, file: Any) -> None:
     for needed in file.dependencies:
-        _add(pool, needed)
+        _add_file(pool, needed)
     pool.AddSerializedFile(file.serialized_pb)
 
 
-_made = _classes()
+_made = _make_classes()
 Arm, ArmPackage, Scalar, Step = (_made[name] for name in ("Arm", "ArmPackage", "Scalar", "Step"))
 
 # Two vectors of a message hold six numbers.
@@ -131,11 +131,11 @@ PACKAGE_FIELDS = (*_PACKAGE_NUMBERS, *_PACKAGE_JOINTS, *_PACKAGE_VECTORS)
 def arm_message(time: float, twist: Sequence[float], wrench: Sequence[float], joints: Sequence[float] | None) -> Any:
     """An Arm. Raises ValueError for more than MAX_JOINTS joints."""
     made = Arm(time=time)
-    _put_six(made, TWIST, twist)
-    _put_six(made, WRENCH, wrench)
+    _set_vectors(made, TWIST, twist)
+    _set_vectors(made, WRENCH, wrench)
     if joints is not None:
         made.joints.SetInParent()
-        _put_joints(made.joints, joints)
+        _set_joints(made.joints, joints)
     return made
 
 
@@ -143,50 +143,50 @@ def package_message(row: Mapping[str, Any]) -> Any:
     """An ArmPackage of a package's fields. Raises ValueError for more than MAX_JOINTS joints."""
     made = ArmPackage(**{name: row[name] for name in _PACKAGE_NUMBERS})
     for name, pair in _PACKAGE_VECTORS.items():
-        _put_six(made, pair, row[name])
+        _set_vectors(made, pair, row[name])
     for name in _PACKAGE_JOINTS:
-        _put_joints(getattr(made, name), row[name])
+        _set_joints(getattr(made, name), row[name])
     return made
 
 
 def package_row(package: Any) -> dict[str, Any]:
     """The fields of a package."""
     row = {name: getattr(package, name) for name in _PACKAGE_NUMBERS}
-    row |= {name: six(package, pair) for name, pair in _PACKAGE_VECTORS.items()}
+    row |= {name: vectors_of(package, pair) for name, pair in _PACKAGE_VECTORS.items()}
     return row | {name: joints_of(getattr(package, name)) for name in _PACKAGE_JOINTS}
 
 
-def parse(kind: Any, data: bytes) -> Any:
-    """A message of class `kind`. Raises ValueError where its first field is not there: any few bytes would do else."""
+def parse_message(kind: Any, data: bytes) -> Any:
+    """A message of class `kind`. Raises ValueError if its first field is missing, since protobuf accepts other data."""
     made, first = kind.FromString(data), kind.DESCRIPTOR.fields[0].name
     if not made.HasField(first):
         raise ValueError(f"a message {kind.DESCRIPTOR.name} without its {first}")
     return made
 
 
-def put_pose(message: Any, position: Sequence[float], quaternion: Sequence[float]) -> None:
-    """Position [m] and quaternion (x, y, z, w) into `message.pose`."""
+def set_pose(message: Any, position: Sequence[float], quaternion: Sequence[float]) -> None:
+    """Writes position [m] and quaternion (x, y, z, w) into `message.pose`."""
     pose = message.pose
     pose.position.x, pose.position.y, pose.position.z = position
     pose.orientation.x, pose.orientation.y, pose.orientation.z, pose.orientation.w = quaternion
 
 
-def six(message: Any, pair: tuple[str, str]) -> list[float]:
-    """Six numbers of two vectors of a message."""
+def vectors_of(message: Any, pair: tuple[str, str]) -> list[float]:
+    """The six numbers of two vectors of a message."""
     return [getattr(getattr(message, name), axis) for name in pair for axis in "xyz"]
 
 
 def joints_of(joints: Any) -> list[float]:
-    """The joints that are there, in order."""
+    """The joints that are set, in order."""
     return [value for _, value in joints.ListFields()]
 
 
-def _put_six(message: Any, pair: tuple[str, str], values: Sequence[float]) -> None:
+def _set_vectors(message: Any, pair: tuple[str, str], values: Sequence[float]) -> None:
     for number, value in enumerate(values):
         setattr(getattr(message, pair[number // 3]), "xyz"[number % 3], value)
 
 
-def _put_joints(joints: Any, values: Sequence[float]) -> None:
+def _set_joints(joints: Any, values: Sequence[float]) -> None:
     if len(values) > MAX_JOINTS:
         raise ValueError(f"an arm of {len(values)} joints; episodes have room for {MAX_JOINTS}")
     for number, value in enumerate(values):

@@ -1,4 +1,4 @@
-"""Reads episodes, finished or cut off. Their steps are read from the file when they are asked for."""
+"""Reads episodes, finished or cut off. Steps are read from the file at access."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from mcap.records import Attachment, Channel, Footer, Header, Message, Metadata
 
 from tacsim.record.episode import Episode, EpisodeError, EpisodeMeta, Step
 from tacsim.record.messages import Messages, decode_step
-from tacsim.record.records import check_magic, foreign_file, listed_topics, read_records
-from tacsim.record.schemas import CLOSE, META, STEP_TOPIC, decode_meta, unsealed
+from tacsim.record.records import check_magic, foreign_file_error, listed_topics, read_records
+from tacsim.record.schemas import CLOSE, META, STEP_TOPIC, decode_meta, verify_checksum
 
 
 class Place(NamedTuple):
-    """Where a step begins in a file."""
+    """The beginning of a step in a file."""
 
-    offset: int  # of the outermost record that holds its beginning [bytes]
-    skip: int = 0  # records in there that belong to earlier steps
+    offset: int  # of the outermost record with the beginning [bytes]
+    skip: int = 0  # records in that record that belong to earlier steps
 
 
 def read_episode(path: Path | str) -> Episode:
-    """An episode from its file, which has to stay there: each step is read, and each picture decoded, when it is asked
-    for. A file that is cut off or damaged gives the steps before that, and `complete` is False.
+    """An episode from its file, which must stay in its place: steps are read, and pictures decoded, at access. A file
+    that is cut off or damaged gives the steps before the damage, and `complete` is False.
 
-    Raises EpisodeError when there is no such file, or it is no episode; a picture may raise it when it is asked for.
+    Raises EpisodeError if there is no such file, or it is no episode; an access to a picture may raise it, too.
     """
     with EpisodeFile(path) as file:
         for _ in file.steps():
@@ -44,14 +44,14 @@ def iter_steps(path: Path | str) -> Iterator[Step]:
 
 
 class RecordedSteps(Sequence[Step]):
-    """The steps in an episode's file. One that is asked for is read, and not kept.
+    """The steps in an episode's file. A step is read at each access, and not stored.
 
     Args:
         path: of the file.
-        places: where its steps begin; may grow while the file does.
+        places: beginnings of its steps; may grow with the file.
         topics: of its channels, by their numbers in the file.
 
-    Raises EpisodeError, when a step is asked for, if the file is gone or has changed.
+    An access raises EpisodeError if the file is missing or has changed.
     """
 
     def __init__(self, path: Path, places: Sequence[Place], topics: Mapping[int, str]) -> None:
@@ -69,22 +69,22 @@ class RecordedSteps(Sequence[Step]):
         if isinstance(index, slice):
             return [self[k] for k in range(*index.indices(len(self)))]
         number = range(len(self))[index]  # IndexError, and counting from the end
-        place, gathered = self._places[number], _Gathered(dict(self._topics))
+        place, gathered = self._places[number], _StepMessages(dict(self._topics))
         with open_file(self._path) as file:
             file.seek(place.offset)
             records = read_records(file, self._path.stat().st_size, str(self._path))
             for _, record in islice(records, place.skip, None):
                 if (message := gathered.add(record)) is not None:
-                    return _decode(message.data, gathered.messages, self._sizes, self._path, number)
-        raise EpisodeError(f"{self._path}: step number {number} is not there any more; the file has changed")
+                    return _decode_record(message.data, gathered.messages, self._sizes, self._path, number)
+        raise EpisodeError(f"{self._path}: step number {number} is missing; the file has changed")
 
 
 class EpisodeFile:
-    """An open episode file: the metadata at once, the steps one by one. Raises EpisodeError."""
+    """An open episode file: metadata are read when it is opened, steps one by one. Raises EpisodeError."""
 
     def __init__(self, path: Path | str) -> None:
         self.path = Path(path)
-        self.complete = False  # after the last step: the file has its footer and all steps it claims
+        self.complete = False  # after the last step: whether the file has its footer and all its steps
         self.dropped = 0  # after the last step
         self.places: list[Place] = []  # of the steps so far
         self.topics: dict[int, str] = {}
@@ -96,7 +96,7 @@ class EpisodeFile:
         except EpisodeError:
             with self._file:
                 if (topics := listed_topics(self._file)) and STEP_TOPIC not in topics:
-                    raise foreign_file(self._file, str(self.path)) from None
+                    raise foreign_file_error(self._file, str(self.path)) from None
             raise
         except BaseException:
             self._file.close()
@@ -124,12 +124,12 @@ class EpisodeFile:
         """The steps in order, up to the end of the file or the first damage."""
         sizes: dict[str, tuple[int, int]] = {}
         closing: dict[str, int] | None = None
-        gathered, begin, last, inside = _Gathered(self.topics), None, -1, 0
+        gathered, begin, last, inside = _StepMessages(self.topics), None, -1, 0
         for offset, record in self._records:
             last, inside = offset, inside + 1 if offset == last else 0
             begin = begin or Place(offset, inside)
             if isinstance(record, Metadata) and record.name == CLOSE:
-                closing = closing_account(record)
+                closing = closing_counts(record)
             elif isinstance(record, Footer) and closing is not None:
                 self.complete = closing["steps"] == len(self.places) and not closing["cut"]
                 self.dropped = closing["dropped"]
@@ -139,10 +139,10 @@ class EpisodeFile:
                 number = len(self.places)
                 if message.sequence != number % 2**32:  # a damaged record hid a step
                     return
-                step = _decode(message.data, gathered.messages, sizes, self.path, number)
+                step = _decode_record(message.data, gathered.messages, sizes, self.path, number)
                 self.places.append(begin)
                 yield step
-                gathered, begin = _Gathered(self.topics), None
+                gathered, begin = _StepMessages(self.topics), None
 
     def close(self) -> None:
         self._file.close()
@@ -154,7 +154,7 @@ class EpisodeFile:
         self.close()
 
 
-class _Gathered:
+class _StepMessages:
     """The messages of one step."""
 
     def __init__(self, topics: dict[int, str]) -> None:
@@ -162,7 +162,7 @@ class _Gathered:
         self.messages: dict[str, list[bytes]] = defaultdict(list)
 
     def add(self, record: object) -> Message | None:
-        """Takes a record; returns the message that makes the step complete."""
+        """Adds a record; returns the message that completes the step."""
         if isinstance(record, Channel):
             self.topics.setdefault(record.id, record.topic)  # a repetition, in the summary, may be damaged
         elif isinstance(record, Message):
@@ -173,7 +173,7 @@ class _Gathered:
         return None
 
 
-def _decode(data: bytes, messages: Messages, sizes: dict[str, tuple[int, int]], path: Path, number: int) -> Step:
+def _decode_record(data: bytes, messages: Messages, sizes: dict[str, tuple[int, int]], path: Path, number: int) -> Step:
     try:
         return decode_step(data, messages, f"{path}: step number {number}", sizes)
     except EpisodeError as failure:
@@ -190,10 +190,10 @@ def open_file(path: Path) -> BinaryIO:
         raise EpisodeError(f"{path}: cannot be opened: {failure.strerror}") from failure
 
 
-def closing_account(record: Metadata) -> dict[str, int] | None:
-    """Numbers of the closing record; None when it is damaged."""
+def closing_counts(record: Metadata) -> dict[str, int] | None:
+    """Numbers in the closing record; None if it is damaged."""
     try:
-        values = unsealed(record.metadata, CLOSE)
+        values = verify_checksum(record.metadata, CLOSE)
         return {key: int(values.get(key, "0") if key == "cut" else values[key]) for key in ("steps", "dropped", "cut")}
     except (EpisodeError, KeyError, ValueError):
         return None

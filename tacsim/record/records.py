@@ -1,7 +1,7 @@
 """The records of an MCAP file in file order, finished or cut off.
 
-The readers of the `mcap` package need a finished file and trust the lengths in it. Here each length is checked
-against the size of the file before anything is read; `mcap` parses the records themselves.
+The readers of the `mcap` package need a finished file and do not check the lengths in it. This module compares each
+length with the size of the file before it reads; `mcap` parses the records.
 Format: https://mcap.dev/spec
 """
 
@@ -42,8 +42,8 @@ class _BadRecord(Exception):
 
 
 def check_magic(file: BinaryIO, what: str) -> None:
-    """Raises EpisodeError for a file that does not begin as MCAP files do, and for one with the profile of another
-    program, such as a ROS 2 bag: tacsim's own have none."""
+    """Raises EpisodeError for a file that does not begin like an MCAP file, and for one with the profile of another
+    program, such as a ROS 2 bag: tacsim's files have no profile."""
     if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
         raise EpisodeError(f"{what}: not an MCAP file (it does not begin with the MCAP magic bytes)")
     size = file.seek(0, io.SEEK_END)
@@ -51,12 +51,12 @@ def check_magic(file: BinaryIO, what: str) -> None:
     with contextlib.suppress(_BadRecord):
         _, first = next(_records(file, size - file.tell()), (0, None))
         if isinstance(first, Header) and first.profile:
-            raise foreign_file(file, what)
+            raise foreign_file_error(file, what)
     file.seek(len(MCAP0_MAGIC))
 
 
-def foreign_file(file: BinaryIO, what: str) -> EpisodeError:
-    """The error for an MCAP file of another program: what it is, which topics it has, and what to do."""
+def foreign_file_error(file: BinaryIO, what: str) -> EpisodeError:
+    """The error for an MCAP file of another program: its kind, its topics, and advice."""
     max_topics = 20  # named in an error
     size = file.seek(0, io.SEEK_END)
     file.seek(len(MCAP0_MAGIC))
@@ -66,9 +66,9 @@ def foreign_file(file: BinaryIO, what: str) -> EpisodeError:
         profile = first.profile if isinstance(first, Header) else ""
     kind = {"ros1": "a ROS 1 bag", "ros2": "a ROS 2 bag"}.get(profile, "a recording of another program")
     topics = listed_topics(file)
-    there = sorted(f"{topic} ({schema})" if schema else topic for topic, schema in topics.items())
-    more = f" and {len(there) - max_topics} more" if len(there) > max_topics else ""
-    has = ", ".join(there[:max_topics]) + more if there else "not listed (the file was cut off before its index)"
+    listed = sorted(f"{topic} ({schema})" if schema else topic for topic, schema in topics.items())
+    more = f" and {len(listed) - max_topics} more" if len(listed) > max_topics else ""
+    has = ", ".join(listed[:max_topics]) + more if listed else "not listed (the file was cut off before its index)"
     return EpisodeError(
         f"{what}: {kind} in MCAP, no episode of tacsim, whose topics are not read. Its topics: {has}. Export the "
         "camera's pictures to a folder of 8-bit PNG files, or to a video, and forces to a CSV file with a row a "
@@ -77,8 +77,8 @@ def foreign_file(file: BinaryIO, what: str) -> EpisodeError:
 
 
 def listed_topics(file: BinaryIO) -> dict[str, str]:
-    """Topics of a finished file and the names of their schemas, from its index, which is never compressed; empty where
-    there is none."""
+    """Topics of a finished file and the names of their schemas, from its index, which is never compressed; empty
+    without an index."""
     size = file.seek(0, io.SEEK_END)
     end = size - len(MCAP0_MAGIC) - _FOOTER
     if end < len(MCAP0_MAGIC):
@@ -100,8 +100,8 @@ def listed_topics(file: BinaryIO) -> dict[str, str]:
 
 
 def read_records(file: BinaryIO, size: int, what: str) -> Iterator[tuple[int, McapRecord]]:
-    """Records from where `file` stands to its end at `size` [bytes], chunks unpacked, without indexes and statistics;
-    each with the place of the outermost record that holds it.
+    """Records from the present position of `file` to its end at `size` [bytes], with the contents of chunks, without
+    indexes and statistics; each with the position of the outermost record around it.
 
     Ends without an exception at the first record that is cut off or damaged. The last record is a Footer only if the
     file was finished. Raises EpisodeError for compressed chunks.
@@ -122,7 +122,7 @@ def read_records(file: BinaryIO, size: int, what: str) -> Iterator[tuple[int, Mc
 
 
 def _records(stream: BinaryIO, size: int) -> Iterator[tuple[int, McapRecord]]:
-    """Parsed records of the next `size` bytes, each with its place."""
+    """Parsed records of the next `size` bytes, each with its position."""
     max_bytes = 256 << 20  # [bytes]
     left = size
     while left >= _HEAD.size:
@@ -145,7 +145,7 @@ def _records(stream: BinaryIO, size: int) -> Iterator[tuple[int, McapRecord]]:
 
 
 def _parse(opcode: int, body: bytes) -> McapRecord | None:
-    """The record; None for kinds that episodes do not need. No read reaches beyond `body`."""
+    """The record; None for kinds that episodes do not use. Nothing is read after the end of `body`."""
     stream = ReadDataStream(io.BytesIO(body))
     try:
         if opcode == Opcode.MESSAGE:
@@ -160,7 +160,7 @@ def _parse(opcode: int, body: bytes) -> McapRecord | None:
 
 
 def open_chunk(chunk: Chunk, what: str) -> Iterator[tuple[int, McapRecord]]:
-    """The records in a chunk. Raises EpisodeError for a compressed one; ends the readable part where it is damaged."""
+    """The records in a chunk. Raises EpisodeError for a compressed chunk, _BadRecord for a damaged one."""
     if chunk.compression in ("zstd", "lz4"):
         raise EpisodeError(f"{what}: compressed chunks ({chunk.compression}); run 'mcap decompress' on it first")
     if chunk.compression or zlib.crc32(chunk.data) != chunk.uncompressed_crc:
@@ -172,13 +172,13 @@ def open_chunk(chunk: Chunk, what: str) -> Iterator[tuple[int, McapRecord]]:
 _CHUNK = re.compile(rb"\x06.{4}\0{4}.{16}.{4}\0{4}.{4}\0{4}.{4}\0{4}", re.DOTALL)
 
 
-class Survivors:
-    """What is whole in a file that was cut off or damaged: after damage the next whole chunk is looked for.
+class IntactRecords:
+    """The intact records of a file that was cut off or damaged: after damage, it searches for the next intact chunk.
 
-    Iterates over the records of each chunk together, and of what lies between chunks each by itself. After that
-    `damaged` holds the beginning and end of what was left out [bytes], `doubtful` the definitions of topics in damaged
-    chunks, and `footer` is the last record of a file that was finished with an index. Raises EpisodeError for
-    compressed chunks.
+    Iterates over lists of records: all records of a chunk, or a single record between chunks. After the iteration
+    `damaged` has begin and end of each part that was left out [bytes], `doubtful` the definitions of topics in damaged
+    chunks, and `footer` the last record of a file that was finished with an index. Raises EpisodeError for compressed
+    chunks.
     """
 
     def __init__(self, file: BinaryIO, size: int, what: str) -> None:
@@ -196,21 +196,21 @@ class Survivors:
                     for _, record in _records(self._file, self._size - place):
                         end = self._file.tell()
                         if isinstance(record, Footer):
-                            self._take_footer(record)
+                            self._keep_footer(record)
                             return
-                        yield self._open(record) if isinstance(record, Chunk) else [record]
+                        yield self._open_chunk_records(record) if isinstance(record, Chunk) else [record]
                         place = end
                     return
                 except _BadRecord:
                     found = _CHUNK.search(memory, place + 1)
                     after = self._size if found is None else found.start()
-                    if self.damaged and self.damaged[-1][1] == place:  # what was found is no chunk either
+                    if self.damaged and self.damaged[-1][1] == place:  # the match is no intact chunk either
                         self.damaged[-1] = (self.damaged[-1][0], after)
                     else:
                         self.damaged.append((place, after))
                     place = after
 
-    def _open(self, chunk: Chunk) -> list[McapRecord]:
+    def _open_chunk_records(self, chunk: Chunk) -> list[McapRecord]:
         try:
             return [record for _, record in open_chunk(chunk, self._what)]
         except _BadRecord:
@@ -220,8 +220,8 @@ class Survivors:
                         self.doubtful.append(record)
             raise
 
-    def _take_footer(self, footer: Footer) -> None:
-        """Keeps the footer if the file ends with it, and the index that it tells of is there and whole."""
+    def _keep_footer(self, footer: Footer) -> None:
+        """Stores the footer if the file ends with it, and its index is complete and intact."""
         end = self._file.tell()
         if footer.summary_start == 0 or self._file.read(len(MCAP0_MAGIC) + 1) != MCAP0_MAGIC:
             return

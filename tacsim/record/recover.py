@@ -14,36 +14,36 @@ from mcap.records import Attachment, Channel, McapRecord, Message, Metadata, Sch
 from mcap.writer import CompressionType, Writer
 
 from tacsim.record.episode import EpisodeError
-from tacsim.record.reader import closing_account, open_file
-from tacsim.record.records import Survivors, check_magic
-from tacsim.record.schemas import CLOSE, META, STEP_TOPIC, decode_meta, sealed, unsealed
+from tacsim.record.reader import closing_counts, open_file
+from tacsim.record.records import IntactRecords, check_magic
+from tacsim.record.schemas import CLOSE, META, STEP_TOPIC, add_checksum, decode_meta, verify_checksum
 
 
 @dataclass(slots=True)
 class Recovery:
-    """What was found in a recording."""
+    """Result of the recovery of a recording."""
 
-    steps: int  # that are whole, and in the new file
+    steps: int  # complete steps, which are in the new file
     finished: bool  # it has its end and its index
-    damaged: list[tuple[int, int]]  # beginning and end of what cannot be read [bytes]
-    lacking: list[str] = field(default_factory=list)  # what else is lost, in words
+    damaged: list[tuple[int, int]]  # begin and end of each part that cannot be read [bytes]
+    missing: list[str] = field(default_factory=list)  # texts that name other missing parts
 
     @property
-    def whole(self) -> bool:
-        return self.finished and not self.damaged and not self.lacking
+    def is_whole(self) -> bool:
+        return self.finished and not self.damaged and not self.missing
 
 
-def recover(path: Path, target: Path) -> Recovery:
-    """Writes the whole steps of `path`, and everything else of it that is whole, to the new file `target`, which is
-    there only once it is finished. Contents and times stay as they are; `path` is only read. Where it is whole itself,
-    nothing is written.
+def recover_recording(path: Path, target: Path) -> Recovery:
+    """Writes the complete steps of `path`, and all other intact parts, to the new file `target`, which exists only
+    after it is finished. Contents and times do not change; `path` is only read. If `path` is intact, nothing is
+    written.
 
-    Raises EpisodeError for what is no MCAP file or has nothing that could be recovered, FileExistsError, and OSError
-    when `target` cannot be written.
+    Raises EpisodeError for a file that is no MCAP file or has nothing to recover, FileExistsError, and OSError if
+    `target` cannot be written.
     """
     definitions: list[McapRecord] = []
-    found = _copy(path, _Copy(None), definitions)
-    if found.whole:
+    found = _copy_records(path, _Copy(None), definitions)
+    if found.is_whole:
         return found
     if target.exists():
         raise FileExistsError(errno.EEXIST, "File exists", str(target))
@@ -53,8 +53,8 @@ def recover(path: Path, target: Path) -> Recovery:
         part = Path(name)
         with os.fdopen(handle, "wb") as file:
             copy = _Copy(Writer(file, chunk_size=1 << 40, compression=CompressionType.NONE))
-            copy.take(definitions)
-            _copy(path, copy, [])
+            copy.copy_records(definitions)
+            _copy_records(path, copy, [])
             copy.finish()
             file.flush()
             os.fsync(file.fileno())
@@ -67,29 +67,29 @@ def recover(path: Path, target: Path) -> Recovery:
         if isinstance(failure, OSError):
             failure.filename = str(target)
         raise
-    found.steps, found.lacking = copy.steps, copy.lacking()
+    found.steps, found.missing = copy.steps, copy.missing_parts()
     return found
 
 
-def _copy(path: Path, copy: _Copy, definitions: list[McapRecord]) -> Recovery:
-    """Hands what is whole to `copy`, and gathers definitions of topics: first those of whole parts."""
+def _copy_records(path: Path, copy: _Copy, definitions: list[McapRecord]) -> Recovery:
+    """Passes intact records to `copy`, and collects definitions of topics, those of intact parts first."""
     with open_file(path) as file:
         size = path.stat().st_size
         if size == 0:
             raise EpisodeError(f"{path}: is empty; nothing was recorded, so nothing can be recovered")
         check_magic(file, str(path))
-        survivors = Survivors(file, size, str(path))
-        for records in survivors:
-            copy.take(records)
+        intact = IntactRecords(file, size, str(path))
+        for records in intact:
+            copy.copy_records(records)
             definitions += [record for record in records if isinstance(record, Schema | Channel)]
-    definitions += survivors.doubtful
+    definitions += intact.doubtful
     if copy.meta is None and not definitions:
         raise EpisodeError(f"{path}: nothing in it can be recovered, neither metadata nor a whole step")
-    return Recovery(copy.steps, survivors.footer is not None, survivors.damaged, copy.lacking())
+    return Recovery(copy.steps, intact.footer is not None, intact.damaged, copy.missing_parts())
 
 
 class _Copy:
-    """Takes records, and writes them to a new file; without a writer it only looks."""
+    """Copies records to a new file; without a writer it only counts."""
 
     def __init__(self, writer: Writer | None) -> None:
         self.steps = 0
@@ -104,8 +104,8 @@ class _Copy:
         self._begun = False
         self._unknown = 0  # steps with channels whose definition is lost
 
-    def take(self, records: list[McapRecord]) -> None:
-        """The records of one chunk, or a record by itself."""
+    def copy_records(self, records: list[McapRecord]) -> None:
+        """Copies the records of one chunk, or a single record."""
         messages = []
         for record in records:
             if isinstance(record, Schema):
@@ -117,21 +117,21 @@ class _Copy:
             elif isinstance(record, Metadata) and record.name == META:
                 self.meta = self.meta or record
             elif isinstance(record, Metadata) and record.name == CLOSE:
-                self._closing = closing_account(record)
+                self._closing = closing_counts(record)
             elif isinstance(record, Message):
                 messages.append(record)
         if all(message.channel_id in self._channels for message in messages):
             for message in messages:
-                self._take_message(message, self._channels[message.channel_id])
-        else:  # half a step is none
+                self._copy_message(message, self._channels[message.channel_id])
+        else:  # an incomplete step is left out
             self._unknown += 1
 
-    def _take_message(self, message: Message, channel: Channel) -> None:
+    def _copy_message(self, message: Message, channel: Channel) -> None:
         ends_step = channel.topic == STEP_TOPIC
         if self._writer is not None:
             self._begin(self._writer)
             number = self._channel(self._writer, channel)
-            # Steps are numbered on, else readers would take what was lost between them for the end.
+            # Steps get consecutive numbers: for readers, a missing number is the end.
             sequence = message.sequence if self.meta is None else self.steps % 2**32
             self._writer.add_message(number, message.log_time, message.data, message.publish_time, sequence)
             if ends_step:
@@ -139,7 +139,7 @@ class _Copy:
         self.steps += ends_step
 
     def _begin(self, writer: Writer) -> None:
-        """Before the first message: the metadata, with those attachments that are there."""
+        """Writes the metadata and the present attachments, before the first message."""
         if self._begun:
             return
         self._begun = True
@@ -147,8 +147,8 @@ class _Copy:
         if self.meta is not None:
             values = self.meta.metadata
             with contextlib.suppress(EpisodeError):
-                there = [name for name in self._named_attachments() if name in self._attachments]
-                values = sealed({**unsealed(values, META), "attachments": json.dumps(there)})
+                present = [name for name in self._named_attachments() if name in self._attachments]
+                values = add_checksum({**verify_checksum(values, META), "attachments": json.dumps(present)})
             writer.add_metadata(META, values)
         for each in self._attachments.values():
             writer.add_attachment(each.create_time, each.log_time, each.name, each.media_type, each.data)
@@ -170,8 +170,8 @@ class _Copy:
             )
         return self._new_channels[channel.id]
 
-    def lacking(self) -> list[str]:
-        """What is lost besides damaged parts, in words."""
+    def missing_parts(self) -> list[str]:
+        """Texts that name missing parts, in addition to damaged ones."""
         words = []
         try:
             missing = [name for name in self._named_attachments() if name not in self._attachments]
@@ -190,5 +190,5 @@ class _Copy:
         if self.meta is not None:
             dropped = 0 if self._closing is None else self._closing["dropped"]
             account = {"steps": str(self.steps), "dropped": str(dropped)}
-            self._writer.add_metadata(CLOSE, sealed({**account, "cut": "1"}))
+            self._writer.add_metadata(CLOSE, add_checksum({**account, "cut": "1"}))
         self._writer.finish()  # type: ignore[no-untyped-call]

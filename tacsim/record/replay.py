@@ -1,6 +1,6 @@
 """Recorded sensors and arms as parts of a rig. Frame k of every source belongs to tick k of one clock.
 
-Times are those of the replay's clock: a picture that was exposed 20 ms before its step is 20 ms old in the replay.
+Times are on the replay's clock: a picture that was exposed 20 ms before its step is 20 ms old in the replay.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from tacsim.interface import ArmState, EndOfEpisode, Image, Pose, SensorSpec, Ta
 from tacsim.models.rig import ReplayArmConfig, ReplaySensorConfig
 from tacsim.record.episode import EpisodeError
 from tacsim.record.images import read_image, reference_image
-from tacsim.record.numbering import Numbering, match_numbers, picture_numbers
+from tacsim.record.numbering import Numbering, match_numbers, numbers_in_names
 from tacsim.record.sources import (
     EPISODES,
     VIDEOS,
@@ -25,9 +25,9 @@ from tacsim.record.sources import (
     finger_states,
     folder_images,
     list_pictures,
-    only_or_named,
     read_table,
-    unknown_source,
+    select_name,
+    unknown_source_error,
     video_images,
     video_length,
     video_rate,
@@ -35,7 +35,9 @@ from tacsim.record.sources import (
 
 
 class ReplayClock:
-    """One recorded frame for each tick. `period`: time between two frames [s]; `index`: number of the frame, from 0."""
+    """Clock with one recorded frame a tick. `period`: time between two frames [s]; `index`: number of the frame, from
+    0.
+    """
 
     def __init__(self, period: float) -> None:
         if not period > 0.0:
@@ -50,7 +52,7 @@ class ReplayClock:
         self.index += 1
 
     def rewind(self) -> None:
-        """Back to the first frame."""
+        """Goes back to the first frame."""
         self.index = 0
 
 
@@ -58,18 +60,18 @@ class ReplaySensor:
     """Recorded frames as a TactileSource.
 
     The source is an episode (the sensor of this name, or its only one), a folder of pictures of one size, or a video.
-    `spec` has height and flow if the recorded frames have them; robot.open adds what the normaliser finds in pictures.
+    `spec` has height and flow if the recorded frames have them; robot.open adds the outputs of the normaliser.
 
-    Raises EpisodeError when the source is missing, empty, unreadable, too large, or has no such sensor.
+    Raises EpisodeError if the source is missing, empty, unreadable, too large, or has no such sensor.
     """
 
     def __init__(self, config: ReplaySensorConfig, name: str, clock: ReplayClock) -> None:
         self._config, self._name, self._clock = config, name, clock
-        self._path = _source(config.source, f"sensors.{name}")
+        self._path = _require_source(config.source, f"sensors.{name}")
         self._reference = None if config.reference is None else read_image(Path(config.reference))
         self._pictures: list[Path] | None = None  # of a folder
-        self._frames = Cursor(self._open(), str(self._path))
-        self._first, _ = _first(self._frames, self._path)
+        self._frames = Cursor(self._frame_starter(), str(self._path))
+        self._first, _ = _first_item(self._frames, self._path)
         rows, columns, _ = self._first.image.shape
         if self._reference is not None and self._reference.shape[:2] != (rows, columns):
             self.close()
@@ -82,8 +84,9 @@ class ReplaySensor:
         self.spec = SensorSpec(image_shape=(rows, columns), height=surface is not None, flow=flow, arm=config.arm)
 
     def read(self, timeout: float) -> TactileFrame:
-        """The frame of this tick, at once. Raises EndOfEpisode after the last, EpisodeError for an unreadable one."""
-        frame, age = self._frames.at(self._clock.index)
+        """The frame of this tick, without waiting. Raises EndOfEpisode after the last, EpisodeError for an unreadable
+        one."""
+        frame, age = self._frames.seek(self._clock.index)
         if frame.image.shape[:2] != self.spec.image_shape:
             raise EpisodeError(
                 f"{self._path}: frame {self._clock.index} has {frame.image.shape[:2]} rows and columns, "
@@ -92,47 +95,48 @@ class ReplaySensor:
         return replace(frame, time=self._clock.now() - age)
 
     def reference(self) -> TactileFrame:
-        """A frame without contact: the `reference` of the rig file, else that of the episode, else the first frame."""
+        """A frame without contact: the `reference` of the rig file, or that of the episode, or the first frame."""
         if self._reference is None:
             return replace(self._first, time=self._clock.now())
         return TactileFrame(image=self._reference, time=self._clock.now(), index=self._first.index)
 
     def numbering(self, expected: int | None) -> Numbering | None:
-        """Of its frames; None of an episode, whose steps are complete and numbered from 0. expected: how many other
-        sources have, None if no source beside this has a count. Raises EpisodeError."""
+        """Numbers of its frames; None for an episode, whose steps are complete and numbered from 0. expected: count of
+        the other sources, None if none has a count. Raises EpisodeError."""
         if self._pictures is not None:
             given = None if self._config.reference is None else Path(self._config.reference).resolve()
             places = [k for k, path in enumerate(self._pictures) if path.resolve() == given]
-            numbers = picture_numbers([path.stem for path in self._pictures])
+            numbers = numbers_in_names([path.stem for path in self._pictures])
             return Numbering(str(self._path), len(self._pictures), numbers, places[0] if places else None)
         if self._path.suffix.lower() in EPISODES:
             return None
         count = video_length(self._path, -1 if expected is None else expected)
         return Numbering(str(self._path), count, tuple(range(count)))
 
-    def keep(self, places: Sequence[int]) -> None:
-        """From now on only the pictures at these places of the folder are its frames."""
+    def select_places(self, places: Sequence[int]) -> None:
+        """Uses only the pictures at these positions of the folder as frames."""
         if self._pictures is None or list(places) == list(range(len(self._pictures))):
             return
         self._frames.close()
         self._pictures = [self._pictures[place] for place in places]
-        self._first, _ = _first(self._frames, self._path)
+        self._first, _ = _first_item(self._frames, self._path)
 
     def close(self) -> None:
         self._frames.close()
 
-    def _open(self) -> Callable[[], Iterator[tuple[TactileFrame, float]]]:
-        """A function that starts the frames, each with its age at its step [s]; 0 for pictures and videos."""
+    def _frame_starter(self) -> Callable[[], Iterator[tuple[TactileFrame, float]]]:
+        """A function that starts an iterator of frames, each with its age at its step [s]; 0 for pictures and
+        videos."""
         path = self._path
         if path.is_dir():
             self._pictures = list_pictures(path)
-            return lambda: _number(folder_images(self._pictures or []))
+            return lambda: _number_images(folder_images(self._pictures or []))
         if path.suffix.lower() in VIDEOS and path.is_file():
-            return lambda: _number(video_images(path))
+            return lambda: _number_images(video_images(path))
         if path.suffix.lower() not in EPISODES or not path.is_file():
-            raise unknown_source(path)
+            raise unknown_source_error(path)
         meta = episode_meta(path)
-        sensor = only_or_named(list(meta.spec.sensors), self._name, path, "sensor")
+        sensor = select_name(list(meta.spec.sensors), self._name, path, "sensor")
         if self._reference is None:
             self._reference = reference_image(meta.attachments, sensor)
         return lambda: ((frame, time - frame.time) for frame, time in episode_frames(path, sensor))
@@ -143,40 +147,40 @@ class ReplayArm:
 
     The source is an episode (the arm of this name, or its only one), or the CSV file of a parallel gripper with one row
     for each frame (frames and signs: :func:`tacsim.record.sources.finger_states`). The arm called "lower" is the lower
-    finger, any other the upper one.
+    finger, all others are the upper one.
 
-    Raises EpisodeError when the source is missing, empty, unreadable, or has no such arm or column.
+    Raises EpisodeError if the source is missing, empty, unreadable, or has no such arm or column.
     """
 
     def __init__(self, config: ReplayArmConfig, name: str, clock: ReplayClock) -> None:
         self._config, self._name, self._clock = config, name, clock
-        self._path = _source(config.source, f"arms.{name}")
+        self._path = _require_source(config.source, f"arms.{name}")
         self._rows: list[ArmState] | None = None  # of a table
-        self._numbers: tuple[int, ...] | None = None  # of those
-        self._states = Cursor(self._open(), str(self._path))
-        _first(self._states, self._path)
+        self._numbers: tuple[int, ...] | None = None  # of its rows
+        self._states = Cursor(self._state_starter(), str(self._path))
+        _first_item(self._states, self._path)
 
     def state(self, at: float | None = None) -> ArmState:
         """The state of this tick. Raises EndOfEpisode after the last."""
-        state, age = self._states.at(self._clock.index)
+        state, age = self._states.seek(self._clock.index)
         return replace(state, time=self._clock.now() - age)
 
     def command(self, target: Pose | None) -> Pose | None:
-        """Executes nothing, so it returns None."""
+        """Executes nothing and returns None."""
         return None
 
     def stop(self) -> None:
-        """Nothing moves."""
+        """Has no effect: nothing moves."""
 
     def recover(self) -> None:
-        """Nothing to recover from."""
+        """Has no effect: there are no faults."""
 
     def numbering(self) -> Numbering | None:
-        """Of a table's rows; None of an episode, whose steps are complete and numbered from 0."""
+        """Numbers of a table's rows; None for an episode, whose steps are complete and numbered from 0."""
         return None if self._rows is None else Numbering(str(self._path), len(self._rows), self._numbers)
 
-    def keep(self, places: Sequence[int]) -> None:
-        """From now on only the table's rows at these places are its states."""
+    def select_places(self, places: Sequence[int]) -> None:
+        """Uses only the table's rows at these positions as states."""
         if self._rows is not None:
             self._states.close()
             self._rows = [replace(self._rows[place], time=k * self._clock.period) for k, place in enumerate(places)]
@@ -184,11 +188,11 @@ class ReplayArm:
     def close(self) -> None:
         self._states.close()
 
-    def _open(self) -> Callable[[], Iterator[tuple[ArmState, float]]]:
-        """A function that starts the states, each with its age at its step [s]."""
+    def _state_starter(self) -> Callable[[], Iterator[tuple[ArmState, float]]]:
+        """A function that starts an iterator of states, each with its age at its step [s]."""
         path = self._path
         if path.suffix.lower() in EPISODES and path.is_file():
-            arm = only_or_named(list(episode_meta(path).spec.arms), self._name, path, "arm")
+            arm = select_name(list(episode_meta(path).spec.arms), self._name, path, "arm")
             return lambda: ((state, time - state.time) for state, time in episode_states(path, arm))
         if not path.is_file():
             raise EpisodeError(f"{path}: no such file")
@@ -202,8 +206,8 @@ class ReplayArm:
 
 
 def match_sources(sensors: Mapping[str, ReplaySensor], arms: Mapping[str, ReplayArm]) -> None:
-    """Frames and rows that belong together are those of one tick from now on. Pictures and rows go by their numbers
-    where all have some. Raises EpisodeError where it is not known which belong together."""
+    """Selects frames and rows so that those of one tick belong together, by their numbers if all have numbers. Raises
+    EpisodeError if the relation is not known."""
     of_arms = {name: found for name, arm in arms.items() if (found := arm.numbering()) is not None}
     if len(sensors) + len(of_arms) < 2:
         return
@@ -212,34 +216,34 @@ def match_sources(sensors: Mapping[str, ReplaySensor], arms: Mapping[str, Replay
     if not of_sensors:
         return
     for name, places in match_numbers(of_sensors, of_arms).items():
-        (sensors[name] if name in of_sensors else arms[name]).keep(places)
+        (sensors[name] if name in of_sensors else arms[name]).select_places(places)
 
 
 def recorded_period(config: ReplaySensorConfig, name: str) -> float:
-    """Time between two frames of a recording [s], by which the rig's period is set. Raises EpisodeError.
+    """Time between two frames of a recording [s], which sets the rig's period. Raises EpisodeError.
 
-    Episodes and most videos contain it; otherwise `fps` of the rig file holds.
+    Episodes and most videos contain it; otherwise it is taken from `fps` of the rig file.
     """
-    path = _source(config.source, f"sensors.{name}")
+    path = _require_source(config.source, f"sensors.{name}")
     if path.suffix.lower() in EPISODES:
         return episode_meta(path).spec.period
     rate = video_rate(path) if path.suffix.lower() in VIDEOS and path.is_file() else None
     return 1.0 / (config.fps if rate is None else rate)
 
 
-def _first(cursor: Cursor[T], path: Path) -> T:
+def _first_item(cursor: Cursor[T], path: Path) -> T:
     try:
-        return cursor.at(0)
+        return cursor.seek(0)
     except EndOfEpisode:
         raise EpisodeError(f"{path}: a recording without frames") from None
 
 
-def _number(images: Iterator[Image]) -> Iterator[tuple[TactileFrame, float]]:
+def _number_images(images: Iterator[Image]) -> Iterator[tuple[TactileFrame, float]]:
     for index, image in enumerate(images):
         yield TactileFrame(image=image, time=0.0, index=index), 0.0
 
 
-def _source(source: str | None, key: str) -> Path:
+def _require_source(source: str | None, key: str) -> Path:
     if source is None:
         raise EpisodeError(f"{key}.source: no recording given; name one with --set {key}.source=PATH")
     return Path(source)

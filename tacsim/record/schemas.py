@@ -1,16 +1,16 @@
-"""What an episode file holds: its topics, and its metadata. All messages are protobuf.
+"""Content of an episode file: its topics and its metadata. All messages are protobuf.
 
 Topics: /{sensor}/image foxglove.CompressedImage (PNG), /{sensor}/surface and /{sensor}/flow foxglove.Grid (float32),
 /{sensor}/height foxglove.RawImage (the same height once more, float32 [mm], for viewers that draw no grid),
 /{arm}/pose foxglove.PoseInFrame, /{arm}/transform foxglove.FrameTransform (the same pose as a tree of frames),
-/{arm}/arm tacsim.Arm; if asked for /{arm}/packages tacsim.ArmPackage (each package of the controller) and /body
+/{arm}/arm tacsim.Arm; if requested, /{arm}/packages tacsim.ArmPackage (each package of the controller) and /body
 foxglove.PointCloud (particles of a simulated body, float32 [m]); /step/{name} tacsim.Scalar (each number of the step's
-info), and last in a step /step tacsim.Step, which names the others.
+info), and at the end of a step /step tacsim.Step, which names the others.
 
-Clocks: every `time` in tacsim's messages is the rig's own clock [s], exact; a rig of hardware counts its computer's
-monotonic clock. Times of MCAP and of Foxglove's messages are the wall clock [ns since 1970, UTC]: the rig's clock plus
-`wall_offset` of the metadata, which is measured once at the start; setting the wall clock meanwhile changes nothing.
-log_time: of the step (of a package its own); publish_time and `timestamp`: of exposure or measurement.
+Clocks: each `time` in tacsim's messages is on the rig's clock [s], exact; a rig of hardware uses its computer's
+monotonic clock. Times of MCAP and of Foxglove's messages are on the wall clock [ns since 1970, UTC]: the rig's clock
+plus `wall_offset` of the metadata, which is measured once at the start; later changes of the wall clock have no effect.
+log_time: of the step (for a package, its own time); publish_time and `timestamp`: of exposure or measurement.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from tacsim.interface import RigSpec
 from tacsim.models.text import check_name, printable_line
 from tacsim.record.episode import EpisodeError, EpisodeMeta
 
-FORMAT = "2"  # of the file; raised when an old reader would misread a new file
+FORMAT = "2"  # of the file; increased when an old reader would misread a new file
 MAX_ATTACHMENT = 64 << 20  # [bytes]
 MAX_FILES = 1000  # attachments, and versions
 META, CLOSE = "tacsim.episode", "tacsim.close"  # metadata records at the start and at the end
@@ -40,13 +40,13 @@ _GOAL: TypeAdapter[float | tuple[float, ...] | None] = TypeAdapter(
 )
 
 
-def sealed(values: Mapping[str, str]) -> dict[str, str]:
-    """`values` with a checksum added: an MCAP metadata record has none of its own."""
+def add_checksum(values: Mapping[str, str]) -> dict[str, str]:
+    """`values` with a checksum, since an MCAP metadata record has none."""
     return {**values, "crc32": _checksum(values)}
 
 
-def unsealed(values: Mapping[str, str], what: str) -> dict[str, str]:
-    """The values without their checksum. Raises EpisodeError when it is wrong."""
+def verify_checksum(values: Mapping[str, str], what: str) -> dict[str, str]:
+    """The values without their checksum. Raises EpisodeError if it is wrong."""
     bare = {key: value for key, value in values.items() if key != "crc32"}
     if values.get("crc32") != _checksum(bare):
         raise EpisodeError(f"{what}: its metadata are damaged (checksum)")
@@ -54,8 +54,8 @@ def unsealed(values: Mapping[str, str], what: str) -> dict[str, str]:
 
 
 def encode_meta(meta: EpisodeMeta) -> dict[str, str]:
-    """The metadata record of an episode, with the names of its attachments, which are records of their own. Raises
-    ValueError for what `decode_meta` would refuse: too many parts, or a name that is too long."""
+    """The metadata record of an episode, with the names of its attachments, which are separate records. Raises
+    ValueError for metadata that `decode_meta` would refuse: too many parts, or a name that is too long."""
     _check_parts(meta, tuple(meta.attachments))
     values = {
         "format": FORMAT,
@@ -72,12 +72,12 @@ def encode_meta(meta: EpisodeMeta) -> dict[str, str]:
         values["task"] = meta.task
     if meta.started is not None:
         values |= {"started": meta.started.isoformat(), "time_zone": meta.started.tzname() or ""}
-    return sealed(values)
+    return add_checksum(values)
 
 
 def decode_meta(record: Mapping[str, str], what: str) -> tuple[EpisodeMeta, tuple[str, ...]]:
     """The metadata of an episode without its attachments, and their names. Raises EpisodeError."""
-    values = unsealed(record, what)
+    values = verify_checksum(record, what)
     if values.get("format") != FORMAT:
         raise EpisodeError(f"{what}: episode format '{values.get('format')}', but this tacsim reads {FORMAT}")
     try:
@@ -103,7 +103,7 @@ def decode_meta(record: Mapping[str, str], what: str) -> tuple[EpisodeMeta, tupl
 
 
 def _check_parts(meta: EpisodeMeta, attachments: tuple[str, ...]) -> None:
-    """Raises ValueError for more parts, or longer names, than a report can show."""
+    """Raises ValueError for more parts, or longer names, than a report supports."""
     max_file_name = 300  # characters of the name of an attachment
     max_parts = 64  # sensors, and arms, of an episode
     if max(len(meta.spec.sensors), len(meta.spec.arms)) > max_parts:

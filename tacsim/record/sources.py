@@ -21,7 +21,7 @@ from tacsim.record.reader import EpisodeFile
 EPISODES = (".mcap",)
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp")
 OTHER_PICTURES = (".tif", ".tiff", ".webp", ".gif", ".exr", ".hdr", ".pgm", ".ppm", ".pnm", ".npy", ".raw", ".jp2")
-NUMBER_COLUMNS = ("frame", "index")  # of a table: the numbers of its rows
+NUMBER_COLUMNS = ("frame", "index")  # columns of a table with the numbers of its rows
 SEPARATORS = ",;\t"
 VIDEOS = (".avi", ".mp4", ".mkv", ".mov", ".m4v", ".webm", ".mpg", ".mpeg")
 
@@ -32,7 +32,7 @@ T = TypeVar("T")
 
 
 class Cursor(Generic[T]):
-    """Random access to a recording that can only be read forwards: a smaller number starts it again."""
+    """Random access to a recording that can only be read forwards: a smaller number reads it again from the start."""
 
     def __init__(self, start: Callable[[], Iterator[T]], what: str) -> None:
         self._start, self._what = start, what
@@ -40,8 +40,10 @@ class Cursor(Generic[T]):
         self._next = 0  # number of the next item
         self._current: T | None = None
 
-    def at(self, number: int) -> T:
-        """Raises EndOfEpisode when the recording is shorter, EpisodeError when it cannot be read."""
+    def seek(self, number: int) -> T:
+        """The item with this number. Raises EndOfEpisode if the recording is shorter, EpisodeError if it cannot be
+        read.
+        """
         if self._items is None or number < self._next - 1:
             self.close()
             self._items = self._start()
@@ -51,14 +53,14 @@ class Cursor(Generic[T]):
             except StopIteration:
                 raise EndOfEpisode(f"{self._what} has {self._next} frames") from None
             except Exception:
-                self.close()  # otherwise the generator that raised would look finished
+                self.close()  # otherwise the generator that raised would seem finished
                 raise
             self._next += 1
         assert self._current is not None
         return self._current
 
     def close(self) -> None:
-        """Closes the recording; `at` opens it again."""
+        """Closes the recording; `seek` opens it again."""
         close = getattr(self._items, "close", None)
         if close is not None:  # a generator: runs its `finally`
             close()
@@ -89,8 +91,8 @@ def episode_states(path: Path, arm: str) -> Iterator[tuple[ArmState, float]]:
             yield step.arms[arm], step.time
 
 
-def only_or_named(names: list[str], name: str, path: Path, kind: str) -> str:
-    """`name` if the recording has it, else its only one. Raises EpisodeError that lists the names."""
+def select_name(names: list[str], name: str, path: Path, kind: str) -> str:
+    """`name` if the recording has it, otherwise its only name. Raises EpisodeError that lists the names."""
     if name in names:
         return name
     if len(names) == 1:
@@ -100,10 +102,10 @@ def only_or_named(names: list[str], name: str, path: Path, kind: str) -> str:
 
 
 def visible_files(folder: Path, endings: Collection[str]) -> list[Path]:
-    """Files of a folder with one of these endings, "2.png" before "10.png". Hidden files are left out: a Mac leaves
-    "._2.png" beside "2.png" where a disk is not its own."""
+    """Files of a folder with one of these endings, "2.png" before "10.png". Hidden files are left out: macOS writes
+    "._2.png" next to "2.png" on disks with other file systems."""
     found = (path for path in folder.iterdir() if path.suffix.lower() in endings and not path.name.startswith("."))
-    return sorted(found, key=_natural)
+    return sorted(found, key=_natural_order)
 
 
 def list_pictures(folder: Path) -> list[Path]:
@@ -111,7 +113,7 @@ def list_pictures(folder: Path) -> list[Path]:
     channel, or several sizes."""
     paths = visible_files(folder, PICTURES)
     if not paths:
-        raise EpisodeError(f"{folder}: no pictures in this folder ({', '.join(PICTURES)}){_instead(folder)}")
+        raise EpisodeError(f"{folder}: no pictures in this folder ({', '.join(PICTURES)}){_suggest_files(folder)}")
     rows, columns = image_size(paths[0])
     for path in paths[1:]:
         if (other := image_size(path)) != (rows, columns):
@@ -122,8 +124,8 @@ def list_pictures(folder: Path) -> list[Path]:
     return paths
 
 
-def _instead(folder: Path) -> str:
-    """What a folder without pictures holds that could be meant, in words."""
+def _suggest_files(folder: Path) -> str:
+    """Text with other files of a folder without pictures, which may explain the error."""
     if (bags := visible_files(folder, EPISODES)) and (folder / "metadata.yaml").is_file():
         return f"; it is the folder of a ROS 2 bag ({bags[0].name}), whose topics are not read: export its pictures"
     if other := visible_files(folder, OTHER_PICTURES):
@@ -137,20 +139,20 @@ def folder_images(paths: list[Path]) -> Iterator[Image]:
 
 
 def video_rate(path: Path) -> float | None:
-    """Frames per second of a video; None when it does not contain that. Raises EpisodeError."""
+    """Frames per second of a video; None if the file does not contain it. Raises EpisodeError."""
     import cv2
 
-    with _opened_video(path) as capture:
+    with _open_video(path) as capture:
         rate = capture.get(cv2.CAP_PROP_FPS)
     return rate if math.isfinite(rate) and 0 < rate <= 1000 else None
 
 
 def video_length(path: Path, expected: int) -> int:
-    """Frames of a video: as its file states, or counted one by one where that is not the number `expected`, for some
-    files state it wrongly. Raises EpisodeError."""
+    """Number of frames of a video, from its file; if that differs from `expected`, frames are counted, since some files
+    have a wrong number. Raises EpisodeError."""
     import cv2
 
-    with _opened_video(path) as capture:
+    with _open_video(path) as capture:
         if capture.get(cv2.CAP_PROP_FRAME_COUNT) == expected:
             return expected
         count = 0
@@ -163,37 +165,40 @@ def video_images(path: Path) -> Iterator[Image]:
     """(H, W, 3) RGB pictures of a video, decoded one by one. Raises EpisodeError, also for a video without frames."""
     import cv2
 
-    with _opened_video(path) as capture:
-        there, image = capture.read()
-        if not there:
+    with _open_video(path) as capture:
+        is_read, image = capture.read()
+        if not is_read:
             raise EpisodeError(f"{path}: a video without frames")
-        while there:
+        while is_read:
             yield np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
-            there, image = capture.read()
+            is_read, image = capture.read()
 
 
 @contextmanager
-def _opened_video(path: Path) -> Iterator[cv2.VideoCapture]:
+def _open_video(path: Path) -> Iterator[cv2.VideoCapture]:
     import cv2
 
-    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)  # other backends may take a name for a device or a pipeline
+    # other backends may interpret a name as a device or a pipeline
+    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     try:
         if not capture.isOpened():
             raise EpisodeError(f"{path}: no readable video, or one without frames")
         columns, rows = capture.get(cv2.CAP_PROP_FRAME_WIDTH), capture.get(cv2.CAP_PROP_FRAME_HEIGHT)
         if not (0 < columns <= MAX_SIDE and 0 < rows <= MAX_SIDE):
-            raise EpisodeError(f"{path}: {columns:.0f} x {rows:.0f} pixels; at most {MAX_SIDE} are allowed each way")
+            raise EpisodeError(
+                f"{path}: {columns:.0f} x {rows:.0f} pixels; at most {MAX_SIDE} are allowed along each axis"
+            )
         yield capture
     finally:
         capture.release()
 
 
-def _natural(path: Path) -> list[str | int]:
+def _natural_order(path: Path) -> list[str | int]:
     parts = re.split(r"([0-9]+)", path.name.lower())
     return [int(part) if number % 2 else part for number, part in enumerate(parts)]
 
 
-def unknown_source(path: Path) -> EpisodeError:
+def unknown_source_error(path: Path) -> EpisodeError:
     """The error for a path that is no recording."""
     if not path.exists():
         return EpisodeError(f"{path}: no such file or folder")
@@ -209,11 +214,11 @@ def read_columns(path: Path, names: list[str]) -> list[tuple[float, ...]]:
 
 
 def read_table(path: Path, names: list[str]) -> tuple[list[tuple[float, ...]], tuple[int, ...] | None]:
-    """The named columns of a CSV file with a header, one tuple for each row, and the rows' numbers: those in a column
-    called one of NUMBER_COLUMNS; None without one. Columns are separated by comma, semicolon or tab.
+    """The named columns of a CSV file with a header, one tuple for each row, and the numbers of the rows, from a column
+    of NUMBER_COLUMNS; None without such a column. Columns are separated by comma, semicolon or tab.
 
     Raises EpisodeError for a file that is missing or too large, a missing column, a value that is not a finite number,
-    and numbers of rows that are not whole and rising.
+    and numbers of rows that are not integers in increasing order.
     """
     max_header = 1 << 16  # [characters]
     max_bytes = 64 << 20  # [bytes]
@@ -224,12 +229,12 @@ def read_table(path: Path, names: list[str]) -> tuple[list[tuple[float, ...]], t
             head = file.readline(max_header)
             file.seek(0)
             separator = max(SEPARATORS, key=head.count)
-            return _rows(csv.DictReader(file, delimiter=separator, skipinitialspace=True), path, names)
+            return _parse_rows(csv.DictReader(file, delimiter=separator, skipinitialspace=True), path, names)
     except (OSError, UnicodeDecodeError, csv.Error) as failure:
         raise EpisodeError(f"{path}: no readable CSV file: {failure}") from failure
 
 
-def _rows(
+def _parse_rows(
     reader: csv.DictReader[str], path: Path, names: list[str]
 ) -> tuple[list[tuple[float, ...]], tuple[int, ...] | None]:
     header = [column.strip() for column in reader.fieldnames or []]
@@ -241,9 +246,9 @@ def _rows(
     numbers: list[int] = []
     counter = next((column for column in header if column.lower() in NUMBER_COLUMNS), None)
     for row in reader:
-        rows.append(tuple(_number(row[name], path, reader.line_num, name) for name in names))
+        rows.append(tuple(_parse_number(row[name], path, reader.line_num, name) for name in names))
         if counter is not None:
-            value = _number(row[counter], path, reader.line_num, counter)
+            value = _parse_number(row[counter], path, reader.line_num, counter)
             if value != int(value) or value <= (numbers[-1] if numbers else -1):
                 raise EpisodeError(
                     f"{path}:{reader.line_num}: {counter} {row[counter]} in row {len(rows) - 1}; each row needs a "
@@ -255,7 +260,7 @@ def _rows(
     return rows, None if counter is None else tuple(numbers)
 
 
-def _number(text: str | None, path: Path, line: int, column: str) -> float:
+def _parse_number(text: str | None, path: Path, line: int, column: str) -> float:
     try:
         value = float(text or "")
     except ValueError:
@@ -268,13 +273,13 @@ def _number(text: str | None, path: Path, line: int, column: str) -> float:
 def finger_states(
     rows: list[tuple[float, ...]], period: float, lower: bool, numbers: Sequence[int] | None = None
 ) -> list[ArmState]:
-    """Arm states of one finger of a parallel gripper from (force [N],) or (force [N], opening [m]) a row.
+    """Arm states of one finger of a parallel gripper from rows (force [N],) or (force [N], opening [m]).
 
-    World is the gripper: origin midway between the fingers, z along the closing direction. The fingers close evenly:
-    the upper one sits at z = +opening / 2 and faces down, the lower one at -opening / 2 and faces up. Without an
-    opening the pose stays at the origin. A pressing force pushes the sensor back into its mount: wrench Fz = -force;
-    the other five components were not measured and are 0. Twist: difference to the row before over `period` [s], and
-    over as many of them as the rows' `numbers` are apart.
+    The world frame is the gripper: origin midway between the fingers, z along the closing direction. Both fingers close
+    by the same distance: the upper one is at z = +opening / 2 and faces down, the lower one at -opening / 2 and faces
+    up. Without an opening the pose stays at the origin. A pressing force acts on the sensor towards its mount: wrench
+    Fz = -force; the other five components were not measured and are 0. Twist: difference to the row before, over
+    `period` [s] times the difference of the rows' `numbers`.
     """
     side = -1.0 if lower else 1.0
     quaternion = np.array([0.0, 0.0, 0.0, 1.0] if lower else [1.0, 0.0, 0.0, 0.0])  # half a turn about x

@@ -1,4 +1,4 @@
-"""The recorder: writes control steps to an MCAP file as they happen, on a thread of its own."""
+"""The recorder: writes control steps to an MCAP file during an episode, in a separate thread."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from mcap_protobuf.schema import register_schema
 from tacsim.record.episode import EpisodeMeta, Step
 from tacsim.record.messages import encode_step
 from tacsim.record.reader import Place, RecordedSteps
-from tacsim.record.schemas import CLOSE, FORMAT, MAX_ATTACHMENT, META, encode_meta, sealed
+from tacsim.record.schemas import CLOSE, FORMAT, MAX_ATTACHMENT, META, add_checksum, encode_meta
 
 
 class Recorder:
-    """Writes an episode. The control loop hands over steps and never waits: another thread encodes and writes them.
+    """Writes an episode. The control loop passes steps and never waits: another thread encodes and writes them.
 
-    Each step is one chunk, flushed to the operating system, and stays readable when the process is killed. Metadata and
-    attachments are written first. When the disk fills up, or a step cannot be encoded, the recording ends; the reason
-    is in `error`, and the steps written before stay readable.
+    Each step is one chunk, flushed to the operating system, and stays readable if the process is killed. Metadata and
+    attachments are written first. If the disk is full, or a step cannot be encoded, the recording ends; the reason is
+    in `error`, and the steps written before stay readable.
 
     The arrays of a step must not change after `write`: they are encoded later.
 
     Args:
         path: of the new file.
         meta: of the episode, with its attachments.
-        capacity: steps that may wait; beyond it whole steps are dropped and counted.
+        capacity: largest number of waiting steps; with more, complete steps are dropped and counted.
         pitch: of the canonical grid [m]; viewers draw the surface maps with it.
 
     Raises:
@@ -51,7 +51,7 @@ class Recorder:
         self.path = Path(path)
         self._pitch = pitch
         self._queue: queue.Queue[Step | None] = queue.Queue(capacity)
-        self._change = threading.Condition()  # guards the four below
+        self._change = threading.Condition()  # guards the next four
         self._accepted = self._handled = self._dropped = self._written = 0
         self._error: Exception | None = None
         self._closed = False
@@ -60,41 +60,43 @@ class Recorder:
         self._offset = meta.wall_offset
         self._places: list[Place] = []
         self._topics: dict[int, str] = {}
-        self._file = open_new(self.path)
+        self._file = open_new_file(self.path)
         try:
-            self._writer = _start(self._file, meta)
-        except BaseException:  # nothing of use is in the file yet
+            self._writer = _start_file(self._file, meta)
+        except BaseException:  # the file has no step yet
             with contextlib.suppress(OSError):
                 self._file.close()
             self.path.unlink(missing_ok=True)
             raise
-        self._thread = threading.Thread(target=self._run, name=f"recorder {self.path.name}", daemon=True)
+        self._thread = threading.Thread(target=self._write_queue, name=f"recorder {self.path.name}", daemon=True)
         self._thread.start()
 
     @property
     def written(self) -> int:
-        """Steps that are in the file, flushed."""
+        """Number of steps in the file, flushed."""
         with self._change:
             return self._written
 
     @property
     def steps(self) -> Sequence[Step]:
-        """The steps in the file, read from there when they are asked for."""
+        """The steps in the file, read from it at access."""
         return RecordedSteps(self.path, self._places, self._topics)
 
     @property
     def dropped(self) -> int:
-        """Steps that are not in the file: the queue was full, or the recording had ended with an error."""
+        """Number of steps that are not in the file: the queue was full, or the recording had ended with an error."""
         with self._change:
             return self._dropped
 
     @property
     def error(self) -> Exception | None:
-        """What ended the recording early: OSError from the disk, ValueError from a step that cannot be encoded."""
+        """The error that ended the recording: OSError from the disk, ValueError from a step that cannot be encoded."""
         return self._error
 
     def write(self, step: Step) -> bool:
-        """Hands over a step, never blocks. False: it was dropped (see `error`). Raises ValueError when closed."""
+        """Passes a step to the writer without blocking. False: it was dropped (see `error`). Raises ValueError if
+        closed.
+        """
         if self._closed:
             raise ValueError(f"the recorder of '{self.path}' is closed")
         with self._change:
@@ -109,21 +111,21 @@ class Recorder:
             return True
 
     def flush(self, timeout: float = 10.0) -> bool:
-        """Waits until all steps handed over are in the file (or dropped); False when `timeout` [s] was too short."""
+        """Waits until all accepted steps are in the file (or dropped); False if `timeout` [s] was too short."""
         with self._change:
             goal = self._accepted
             return self._change.wait_for(lambda: self._handled >= goal, timeout)
 
     def close(self) -> None:
-        """Writes what is waiting, finishes the file and closes it. Errors of the disk are in `error`."""
+        """Writes waiting steps, finishes the file and closes it. Errors of the disk are in `error`."""
         if self._closed:
             return
         self._closed = True
-        self._queue.put(None)  # waits for room; the thread always makes some
+        self._queue.put(None)  # waits until the thread has taken a step
         self._thread.join()
         try:
-            if not isinstance(self._error, OSError):  # else the file is broken off and has to stay so
-                self._finish()
+            if not isinstance(self._error, OSError):  # otherwise the file is cut off, and must not look complete
+                self._finish_file()
             self._file.close()
         except OSError as failure:
             self._error = self._error or failure
@@ -136,11 +138,11 @@ class Recorder:
     def __exit__(self, *exception: object) -> None:
         self.close()
 
-    def _run(self) -> None:
+    def _write_queue(self) -> None:
         while (step := self._queue.get()) is not None:
             try:
                 if self._error is None:
-                    self._append(step)
+                    self._append_step(step)
             except Exception as failure:  # recording must not end the control loop
                 self._error = failure
             with self._change:
@@ -151,17 +153,17 @@ class Recorder:
                 self._handled += 1
                 self._change.notify_all()
 
-    def _append(self, step: Step) -> None:
-        messages = encode_step(step, self._pitch, self._offset)  # all of it, before any of it is in the file
+    def _append_step(self, step: Step) -> None:
+        messages = encode_step(step, self._pitch, self._offset)  # all messages, before one of them is written
         place = Place(self._file.tell())
         for message in messages:
-            channel = self._channel(message.topic, message.schema)
-            # `written` shows a missing step.
+            channel = self._register_channel(message.topic, message.schema)
+            # the number of written steps: readers detect a missing step by it
             self._writer.add_message(channel, message.log_time, message.data, message.time, sequence=self._written)
-        _flush(self._writer)
+        _flush_file(self._writer)
         self._places.append(place)
 
-    def _channel(self, topic: str, schema: type[Message]) -> int:
+    def _register_channel(self, topic: str, schema: type[Message]) -> int:
         if topic not in self._channels:
             if schema not in self._schemas:
                 self._schemas[schema] = register_schema(self._writer, schema)
@@ -170,21 +172,21 @@ class Recorder:
             self._topics[number] = topic
         return self._channels[topic]
 
-    def _finish(self) -> None:
+    def _finish_file(self) -> None:
         account = {"steps": str(self._written), "dropped": str(self._dropped)}
         if self._error is not None:
             account["error"] = str(self._error)
-        self._writer.add_metadata(CLOSE, sealed(account))
+        self._writer.add_metadata(CLOSE, add_checksum(account))
         self._writer.finish()  # type: ignore[no-untyped-call]
 
 
-def open_new(path: Path) -> BinaryIO:
+def open_new_file(path: Path) -> BinaryIO:
     """A new file for writing. Raises FileExistsError, OSError."""
     return path.open("xb")
 
 
-def _start(file: BinaryIO, meta: EpisodeMeta) -> Writer:
-    # Uncompressed: the pictures are PNG already, and a reader needs no defence against decompression bombs.
+def _start_file(file: BinaryIO, meta: EpisodeMeta) -> Writer:
+    # Uncompressed: the pictures are PNG already, and a reader needs no limit against decompression bombs.
     one_chunk = 1 << 40  # [bytes] a chunk ends with its step, never by size
     writer = Writer(file, chunk_size=one_chunk, compression=CompressionType.NONE)
     writer.start(library=f"tacsim episode {FORMAT}")
@@ -193,10 +195,10 @@ def _start(file: BinaryIO, meta: EpisodeMeta) -> Writer:
     for name, content in meta.attachments.items():
         media = mimetypes.guess_type(name)[0] or "application/octet-stream"
         writer.add_attachment(create_time=start, log_time=start, name=name, media_type=media, data=content)
-    _flush(writer)
+    _flush_file(writer)
     return writer
 
 
-def _flush(writer: Writer) -> None:
-    """The chunk in progress goes to the file, the file to the operating system."""
+def _flush_file(writer: Writer) -> None:
+    """Writes the present chunk to the file, and the file to the operating system."""
     writer.flush()  # type: ignore[no-untyped-call]

@@ -1,5 +1,5 @@
-"""What the diagnostics in an episode say: the timing on live hardware (period, age of pictures, alignment, limits that
-were hit), and by its normalisers how trustworthy the observations are."""
+"""Diagnostics of an episode: timing on live hardware (period, age of pictures, alignment, limits), and reliability of
+the observations from its normalisers."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from tacsim.record.step_info import (
     COLOUR_DRIFT,
     COLOURS_OUT_OF_RANGE,
     LIMITS_HIT,
-    MARKERS_SEEN,
     PACKAGES_LOST,
     PICTURES_DAMAGED,
     PICTURES_LOST,
@@ -23,55 +22,57 @@ from tacsim.record.step_info import (
     STALE_REFERENCE,
     TRAINING_DISTANCE,
     TRAINING_KNOWN,
+    VISIBLE_MARKERS,
 )
 from tacsim.report.series import Series
 
 PICTURES = {"lost": PICTURES_LOST, "damaged": PICTURES_DAMAGED, "shown again": PICTURES_REPEATED}
 
 
-def timing(series: Series) -> dict[str, Any] | None:
-    """Median, 99th percentile and largest of the period and each picture's age [s]; time from each arm's state to the
-    nearest package [s]; how often limits shortened or refused a target of each arm; packages of each arm that are
-    missing where they are recorded; frames of each camera that were lost, damaged, or showed a picture again; simulated
-    time over wall time.
+def timing_statistics(series: Series) -> dict[str, Any] | None:
+    """Median, 99th percentile and largest value of the period and of each picture's age [s]; time from each arm's state
+    to the nearest package [s]; number of targets of each arm that limits shortened or refused; number of missing
+    packages of each arm, if they are recorded; number of frames of each camera that were lost, damaged, or repeated;
+    simulated time over wall time.
 
     None for an episode that was not live.
     """
     done = series.after_reset()
-    arms = done.named(ALIGNMENT)
+    arms = done.with_prefix(ALIGNMENT)
     if len(done) < 2 or not arms:
         return None
     periods = np.diff(done.time)
-    median = _spread(periods)["median"]
+    median = _percentiles(periods)["median"]
     return {
-        "period": _spread(periods),
+        "period": _percentiles(periods),
         "asked_period": done.meta.spec.period,
-        "age": {name: _spread(done.time - exposed) for name, exposed in done.exposed.items()},
-        "alignment": {name: _spread(values) for name, values in arms.items()},
-        "limits_hit": {name: _newest(done.info.get(LIMITS_HIT + name)) for name in arms},
-        "packages_lost": {name: int(np.nansum(values)) for name, values in done.named(PACKAGES_LOST).items()},
+        "age": {name: _percentiles(done.time - exposed) for name, exposed in done.exposed.items()},
+        "alignment": {name: _percentiles(values) for name, values in arms.items()},
+        "limits_hit": {name: _last_known(done.info.get(LIMITS_HIT + name)) for name in arms},
+        "packages_lost": {name: int(np.nansum(values)) for name, values in done.with_prefix(PACKAGES_LOST).items()},
         "pictures": {
-            word: {name: _newest(values) for name, values in done.named(key).items()} for word, key in PICTURES.items()
+            word: {name: _last_known(values) for name, values in done.with_prefix(key).items()}
+            for word, key in PICTURES.items()
         },
         "real_time_factor": done.meta.spec.period / median if median > 0.0 else 0.0,
     }
 
 
-def _newest(counted: FloatArray | None) -> int:
-    """The last of numbers that are counted on."""
+def _last_known(counted: FloatArray | None) -> int:
+    """The last known value of a counter."""
     if counted is None or not np.isfinite(counted).any():
         return 0
     return int(counted[np.isfinite(counted)][-1])
 
 
-def _spread(values: FloatArray) -> dict[str, float]:
+def _percentiles(values: FloatArray) -> dict[str, float]:
     known = values[np.isfinite(values)]
     median, p99, largest = (float(value) for value in np.percentile(known if len(known) else [0.0], [50, 99, 100]))
     return {"median": median, "p99": p99, "max": largest}
 
 
 def timing_rows(stats: dict[str, Any]) -> list[tuple[str, str]]:
-    """:func:`timing` as rows of a table."""
+    """:func:`timing_statistics` as rows of a table."""
     period = stats["period"]
     ages = "; ".join(
         f"{name} {1e3 * age['median']:.0f} (at most {1e3 * age['max']:.0f}) ms" for name, age in stats["age"].items()
@@ -95,9 +96,9 @@ def timing_rows(stats: dict[str, Any]) -> list[tuple[str, str]]:
     return rows
 
 
-def training_range(series: Series) -> dict[str, Any] | None:
-    """Whether what a learned policy observed lies in the range of its training: `known`, `largest` distance over the
-    limit, and the number of `steps_outside`. None for a policy that is not learned."""
+def training_range_statistics(series: Series) -> dict[str, Any] | None:
+    """Distance of a learned policy's observations from its training range: `known`, `largest` distance over the limit,
+    and number of `steps_outside`. None for a policy that is not learned."""
     distance = series.info.get(TRAINING_DISTANCE, np.array([]))
     distance = distance[np.isfinite(distance)]
     if len(distance):
@@ -108,7 +109,7 @@ def training_range(series: Series) -> dict[str, Any] | None:
 
 
 def training_rows(stats: dict[str, Any]) -> list[tuple[str, str]]:
-    """:func:`training_range` as rows of a table."""
+    """:func:`training_range_statistics` as rows of a table."""
     if not stats["known"]:
         return [("training range", "unknown: the policy does not say what it observed in training")]
     if not stats["steps_outside"]:
@@ -119,12 +120,12 @@ def training_rows(stats: dict[str, Any]) -> list[tuple[str, str]]:
     return [("training range", f"{words}; the policy has not learned what to do there")]
 
 
-def trust(series: Series) -> dict[str, dict[str, Any]] | None:
-    """By sensor: the number of steps with a stale reference, and the worst of the other values (None where unknown).
+def sensor_diagnostics(series: Series) -> dict[str, dict[str, Any]] | None:
+    """By sensor: the number of steps with a stale reference, and the worst of the other values (None if unknown).
 
-    None for an episode whose sensors know their surface by themselves.
+    None for an episode whose sensors give their surface directly.
     """
-    stale = series.named(STALE_REFERENCE)
+    stale = series.with_prefix(STALE_REFERENCE)
     if not stale:
         return None
 
@@ -135,20 +136,20 @@ def trust(series: Series) -> dict[str, dict[str, Any]] | None:
 
     return {
         name: {
-            "stale": int(np.count_nonzero(np.nan_to_num(told))),
-            "steps": int(np.count_nonzero(~np.isnan(told))),
+            "stale": int(np.count_nonzero(np.nan_to_num(flags))),
+            "steps": int(np.count_nonzero(~np.isnan(flags))),
             "drift": worst(COLOUR_DRIFT + name, np.max),
             "background": worst(BACKGROUND_SLOPE + name, np.max),
             "beyond": worst(COLOURS_OUT_OF_RANGE + name, np.max),
-            "kept": worst(MARKERS_SEEN + name, np.min),
+            "kept": worst(VISIBLE_MARKERS + name, np.min),
         }
-        for name, told in stale.items()
+        for name, flags in stale.items()
     }
 
 
-def trust_rows(stats: dict[str, dict[str, Any]]) -> list[tuple[str, str]]:
-    """Warnings for a person; none where all is well."""
-    max_beyond, min_kept = 0.01, 0.8  # a warning is given above, and below
+def sensor_warnings(stats: dict[str, dict[str, Any]]) -> list[tuple[str, str]]:
+    """Warnings for the user; empty if there are none."""
+    max_beyond, min_visible = 0.01, 0.8  # limits of the warnings
     warnings = []
     for name, worst in stats.items():
         if worst["stale"]:
@@ -162,6 +163,6 @@ def trust_rows(stats: dict[str, dict[str, Any]]) -> list[tuple[str, str]]:
                 f"{name}: up to {worst['beyond']:.0%} of the picture beyond the calibrated slopes, height too low "
                 "there; calibrate with a deeper press or a smaller ball"
             )
-        if worst["kept"] is not None and worst["kept"] < min_kept:
+        if worst["kept"] is not None and worst["kept"] < min_visible:
             warnings.append(f"{name}: only {worst['kept']:.0%} of the markers seen at worst; flow is less sure")
     return [("look at this", warning) for warning in warnings]

@@ -1,4 +1,4 @@
-"""The seed paper's Figure 4, drawn from our own runs: reward, what both sensors see, and the deforming body."""
+"""The seed paper's Figure 4 from tacsim's runs: reward, pictures of both sensors, and the deforming body."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from matplotlib.ticker import MaxNLocator
 
 from tacsim.interface import Float32, FloatArray, Image, Pose
 from tacsim.pose import transform
-from tacsim.report.figure import GOAL, INK, QUIET, canvas, goal_text, plain, save, show_image
+from tacsim.report.figure import GOAL, INK, MUTED, goal_text, new_figure, save_figure, show_image, style_axes
 
 PHYSICS = {"seed": "the seed's scheme: one shared particle grid", "hybrid": "ours: two elastic gels, particle body"}
 CLAY = ("#c8623a", "#e29a6b")
@@ -24,7 +24,7 @@ CELL = 1.8  # width of a column [inches]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Moment:
-    """One control step as the figure shows it."""
+    """One control step of the figure."""
 
     step: int
     images: Mapping[str, Image]  # (H, W, 3) RGB, by sensor
@@ -36,7 +36,7 @@ class Moment:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trial:
-    """One task run through its goal and beyond by one physics."""
+    """One task, run past its goal with one physics scheme."""
 
     step: list[int]
     reward: list[float]
@@ -54,7 +54,7 @@ class Trial:
         return int(np.argmax(self.reward))
 
 
-def figure4(results: Mapping[str, Mapping[str, Trial]], path: Path) -> None:
+def draw_figure4(results: Mapping[str, Mapping[str, Trial]], path: Path) -> None:
     """Draws `results` (task -> physics -> trial) and writes them to `path` as PNG. Raises OSError."""
     section_height = 6.25  # of a task [inches]
     schemes = [name for name in PHYSICS if any(name in trials for trials in results.values())]
@@ -64,21 +64,21 @@ def figure4(results: Mapping[str, Mapping[str, Trial]], path: Path) -> None:
     page.write(0.25, 0.35, "Squeezing and repositioning plasticine", fontsize=16, weight="bold", color=INK)
     for column, name in enumerate(schemes):
         left = 0.75 + column * wide
-        page.write(left, 0.66, PHYSICS[name], fontsize=12, color=QUIET)
+        page.write(left, 0.66, PHYSICS[name], fontsize=12, color=MUTED)
         for row, (task, trials) in enumerate(results.items()):
             if name in trials:
                 rewards = [value for trial in trials.values() for value in trial.reward]
                 limits = (min(rewards), max(*rewards, 0.0))
                 _draw_trial(page, (left, 0.8 + row * section_height), task, trials[name], limits, named=column == 0)
-    save(page.figure, path)
+    save_figure(page.figure, path)
 
 
 class Page:
-    """A figure on which things are placed in inches from the upper left corner."""
+    """A figure with positions in inches from the upper left corner."""
 
     def __init__(self, width: float, height: float) -> None:
         self.width, self.height = width, height
-        self.figure = canvas(width, height)
+        self.figure = new_figure(width, height)
 
     def axes(self, left: float, top: float, wide: float, tall: float) -> Axes:
         place = (left / self.width, 1 - (top + tall) / self.height, wide / self.width, tall / self.height)
@@ -117,7 +117,7 @@ def _draw_trial(
 
 def _draw_curve(axes: Axes, task: str, trial: Trial, limits: tuple[float, float], label: bool) -> None:
     best = trial.distance[trial.peak] * 1e3
-    plain(axes, f"{task} to {goal_text(trial.goal)}   (closest: {best:.3f} mm)", "", "reward [-]" if label else "")
+    style_axes(axes, f"{task} to {goal_text(trial.goal)}   (closest: {best:.3f} mm)", "", "reward [-]" if label else "")
     axes.axhline(0.0, color=GOAL, linestyle="--", linewidth=1)
     for moment in trial.moments:
         axes.axvline(moment.step, color="#c9ced3", linewidth=1)
@@ -148,8 +148,8 @@ def _draw_cut(axes: Axes, trial: Trial, moment: Moment) -> None:
 
 
 def _draw_body(axes: Axes, trial: Trial, moment: Moment) -> None:
-    """The particles that were in the middle slice at the start, painted in layers by where they were then."""
-    stripe = 2e-3  # thickness of the layers that the body is painted in [m]
+    """The particles that were in the middle slice at the start, with colours by layers of their start positions."""
+    stripe = 2e-3  # thickness of the coloured layers [m]
     start = trial.moments[0].points
     middle = np.abs(start[:, 1] - start[:, 1].mean()) <= 0.75 * trial.spacing
     layer = ((start[middle, 2] - start[:, 2].min()) / stripe).astype(int) % 2
@@ -168,7 +168,8 @@ def _draw_body(axes: Axes, trial: Trial, moment: Moment) -> None:
 
 
 def _gel_profile(height: Float32, pitch: float, pose: Pose, plane: float) -> FloatArray:
-    """(w, 3) gel surface in world where it meets the plane y = `plane`, from one edge of the gel to the other."""
+    """(w, 3) section of the gel surface with the plane y = `plane`, world frame, from one edge of the gel to the
+    other."""
     rows, columns = height.shape
     y, x = np.mgrid[:rows, :columns].astype(np.float64)
     x, y = (x - (columns - 1) / 2) * pitch, (y - (rows - 1) / 2) * pitch
@@ -180,7 +181,7 @@ def _gel_profile(height: Float32, pitch: float, pose: Pose, plane: float) -> Flo
 
 
 def _frame_cut(axes: Axes, trial: Trial) -> None:
-    """The same window for every moment of a trial, so that motion shows."""
+    """Sets the same window for every moment of a trial, so that motion is visible."""
     positions = np.array([pose.position for moment in trial.moments for pose in moment.poses.values()]) * 1e3
     half, thickness = trial.gel_size[0] / 2 * 1e3, trial.gel_size[2] * 1e3
     low, high = positions.min(axis=0), positions.max(axis=0)

@@ -1,5 +1,5 @@
-"""The pictures of a press: an indenter cut through where it is lowest, which shows the side that presses, and the map
-of heights. By Pillow and OpenCV, which a press needs anyway: importing matplotlib takes longer than the press."""
+"""Pictures of a press: sections of the indenter through its lowest point, which show the pressing side, and the height
+map. They use Pillow and OpenCV, which a press needs anyway: the import of matplotlib takes longer than the press."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tacsim.optics.grid import PixelGrid
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-WIDTH = 440  # of one section, round it, of a letter [px]
+WIDTH = 440  # of one section [px]
 TITLE = "height into the gel [mm]; contact outlined"
 
 
@@ -29,11 +29,11 @@ def write_side_picture(
     pose: of the indenter in the sensor's frame; height: (H, W) of the gel's surface under each pixel of `grid` [m].
     Raises OSError.
     """
-    margin, text_size = 48, 14  # of one section, round it, of a letter [px]
+    margin, text_size = 48, 14  # around a section, of a letter [px]
     from PIL import Image as images
     from PIL import ImageDraw, ImageFont
 
-    drawn = [_section(shape, pose, axis, lowest, height, grid, gel) for axis in (0, 1)]
+    drawn = [_draw_section(shape, pose, axis, lowest, height, grid, gel) for axis in (0, 1)]
     tall = max(each.height for each in drawn)
     picture = images.new("RGB", (2 * WIDTH + 3 * margin, tall + 2 * margin), "white")
     pen = ImageDraw.Draw(picture, "RGB")
@@ -47,16 +47,16 @@ def write_side_picture(
     picture.save(path, compress_level=4)
 
 
-def _section(
+def _draw_section(
     shape: Shape, pose: Pose, axis: int, lowest: FloatArray, height: Float32, grid: PixelGrid, gel: Gel
 ) -> Image:
-    """The section along `axis`; to scale, z up."""
+    """Draws the section along `axis`; to scale, z up."""
     backing_colour = (150, 150, 150)
     surface_colour = (0, 96, 140)
     gel_colour = (196, 224, 236)
     indenter_colour = (90, 100, 120)
-    max_height = 0.8  # widths of a section: what stands higher is cut off
-    supersampled = 2  # pixels drawn for one that is shown
+    max_height = 0.8  # widths of a section: higher parts are cut off
+    supersampled = 2  # drawn pixels for one pixel of the result, along each axis
     from PIL import Image as images
     from PIL import ImageDraw
 
@@ -72,7 +72,7 @@ def _section(
     picture = images.new("RGB", (supersampled * WIDTH, round((top - bottom) * scale)), "white")
     pen = ImageDraw.Draw(picture)
     half, back = gel.size[axis] / 2, -gel.size[2]
-    surface = _surface(axis, lowest, height, grid)
+    surface = _surface_points(axis, lowest, height, grid)
     outline = np.array([[-half, 0.0], *surface, [half, 0.0], [half, back], [-half, back]])
     pen.polygon(pixels(outline), fill=gel_colour)
     pen.rectangle([*pixels(np.array([[-half, back]]))[0], *pixels(np.array([[half, bottom]]))[0]], fill=backing_colour)
@@ -85,7 +85,7 @@ def _section(
 
 
 def _crossings(lines: FloatArray, x: float) -> FloatArray:
-    """(n, 2) lower and upper ends of what lies inside at `x`; lines: (m, 2, 2) of a closed outline, x and z [m]."""
+    """(n, 2) lower and upper ends of the inside at `x`; lines: (m, 2, 2) of a closed outline, x and z [m]."""
     start, end = lines[:, 0], lines[:, 1]
     across = (start[:, 0] <= x) != (end[:, 0] <= x)
     start, end = start[across], end[across]
@@ -93,8 +93,8 @@ def _crossings(lines: FloatArray, x: float) -> FloatArray:
     return z[: len(z) // 2 * 2].reshape(-1, 2)
 
 
-def _surface(axis: int, lowest: FloatArray, height: Float32, grid: PixelGrid) -> list[tuple[float, float]]:
-    """Points of the gel's surface in the section: place along it, z [m]."""
+def _surface_points(axis: int, lowest: FloatArray, height: Float32, grid: PixelGrid) -> list[tuple[float, float]]:
+    """Points of the gel's surface in the section: position along it, z [m]."""
     across = int(np.argmin(np.abs((grid.y if axis == 0 else grid.x) - lowest[1 - axis])))
     along = grid.x if axis == 0 else grid.y
     values = height[across] if axis == 0 else height[:, across]
@@ -103,9 +103,9 @@ def _surface(axis: int, lowest: FloatArray, height: Float32, grid: PixelGrid) ->
 
 def write_height_picture(path: Path, height: Float32, contact: Mask, pitch: float) -> None:
     """A PNG of `height` (H, W) [m], with the border of `contact` (H, W); `pitch`: of its pixels [m]. Raises OSError."""
-    picture_width, margin, text_size = 800, 60, 16  # of the whole, round the map, of the scale, of a letter [px]
+    picture_width, margin, text_size = 800, 60, 16  # of the whole picture, around the map, of a letter [px]
     tick_count = 5
-    bar_width = 20  # of the whole, round the map, of the scale, of a letter [px]
+    bar_width = 20  # of the colour scale [px]
     import cv2
     from PIL import Image as images
     from PIL import ImageDraw, ImageFont

@@ -1,4 +1,4 @@
-"""Report of an episode: `summary.json`, `report.png`, and `report.html` (one file, nothing from outside)."""
+"""Report of an episode: `summary.json`, `report.png`, and `report.html` (one file, without external parts)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,14 @@ import numpy as np
 from tacsim.interface import FloatArray, SurfaceMap, TactileFrame, TactileObservation
 from tacsim.record.episode import Episode
 from tacsim.record.step_info import SETTLED
-from tacsim.report.diagnostics import timing, timing_rows, training_range, training_rows, trust, trust_rows
+from tacsim.report.diagnostics import (
+    sensor_diagnostics,
+    sensor_warnings,
+    timing_rows,
+    timing_statistics,
+    training_range_statistics,
+    training_rows,
+)
 from tacsim.report.series import Series
 
 if TYPE_CHECKING:
@@ -22,8 +29,8 @@ if TYPE_CHECKING:
 
     from tacsim.report.strips import Strip
 
-FILMSTRIP = 12  # frames a sensor in report.html
-# Of the gels: key in the summary, words, and unit of a person
+FRAMES_PER_SENSOR = 12  # frames a sensor in report.html
+# Of the gels: key in the summary, label, and displayed unit
 SURFACE = (
     ("deepest", "deepest", 1e3, " mm"),
     ("steepest", "steepest slope", 1.0, ""),
@@ -31,13 +38,13 @@ SURFACE = (
 )
 
 
-def summary(series: Series, *, complete: bool = True, dropped: int = 0) -> dict[str, Any]:
+def summarise(series: Series, *, complete: bool = True, dropped: int = 0) -> dict[str, Any]:
     """An episode in numbers, as JSON; lists have one entry for each control step (none for the state after reset).
 
-    `reward` [-], `distance` [m], `felt_distance` (the same by touch alone [m]), `force` (arm -> |Fz| [N]), `seconds`
+    `reward` [-], `distance` [m], `felt_distance` (the tactile estimate [m]), `force` (arm -> |Fz| [N]), `seconds`
     [s], `contact_signal` (sensor -> list), `deepest` point and longest `flow` of a gel (sensor -> list [m]), its
     `steepest` slope (sensor -> list), `correlation` (sensor -> r between contact signal and force), `timing`
-    (tacsim.report.diagnostics; null unless the rig is live), `trust` (the same; null if sensors know their surface),
+    (tacsim.report.diagnostics; null unless the rig is live), `trust` (the same; null if sensors give their surface),
     `training_range` (the same; null for a policy that is not learned),
     `started` (ISO date and time with its zone).
     Unknown and infinite values are null.
@@ -46,32 +53,32 @@ def summary(series: Series, *, complete: bool = True, dropped: int = 0) -> dict[
 
     meta, done = series.meta, series.after_reset()
     settled = done.info.get(SETTLED)
-    force = {name: _numbers(values) for name, values in done.force.items()}
+    force = {name: _json_numbers(values) for name, values in done.force.items()}
     present = {name: ~np.isnan(values) for name, values in done.force.items()}
     return {
         "rig": meta.rig,
         "task": meta.task,
         "policy": meta.policy,
         "seed": meta.seed,
-        "goal": [finite(each) for each in meta.goal] if isinstance(meta.goal, tuple) else finite(meta.goal),
+        "goal": [json_number(each) for each in meta.goal] if isinstance(meta.goal, tuple) else json_number(meta.goal),
         "started": None if meta.started is None else meta.started.isoformat(timespec="milliseconds"),
         "steps": len(done),
         "step": done.index.tolist(),
-        "reward": _numbers(done.reward),
-        "distance": _numbers(done.distance),
-        "felt_distance": _numbers(done.felt),
+        "reward": _json_numbers(done.reward),
+        "distance": _json_numbers(done.distance),
+        "felt_distance": _json_numbers(done.tactile_distance),
         "force": [{name: force[name][at] for name in force if present[name][at]} for at in range(len(done))],
-        "contact_signal": {name: _numbers(values) for name, values in done.signals.items()},
-        "deepest": {name: _numbers(values) for name, values in done.deepest.items()},
-        "steepest": {name: _numbers(values) for name, values in done.steepest.items()},
-        "flow": {name: _numbers(values) for name, values in done.flow.items()},
+        "contact_signal": {name: _json_numbers(values) for name, values in done.signals.items()},
+        "deepest": {name: _json_numbers(values) for name, values in done.max_depth.items()},
+        "steepest": {name: _json_numbers(values) for name, values in done.max_slope.items()},
+        "flow": {name: _json_numbers(values) for name, values in done.max_flow.items()},
         "correlation": {name: pair[2] for name, pair in signal_against_force(series).items()},
-        "seconds_per_step": finite(np.median(done.seconds)) if len(done) else None,
-        "seconds": _numbers(done.seconds),
+        "seconds_per_step": json_number(np.median(done.seconds)) if len(done) else None,
+        "seconds": _json_numbers(done.seconds),
         "settled": None if settled is None else int(np.count_nonzero(np.nan_to_num(settled))),
-        "timing": timing(series),
-        "trust": trust(series),
-        "training_range": training_range(series),
+        "timing": timing_statistics(series),
+        "trust": sensor_diagnostics(series),
+        "training_range": training_range_statistics(series),
         "complete": complete,
         "dropped": dropped,
         "versions": dict(meta.versions),
@@ -84,64 +91,69 @@ def write_report(
     find: Callable[[str, TactileFrame], SurfaceMap | TactileObservation | None] = lambda sensor, frame: frame.surface,
 ) -> dict[str, Path]:
     """Writes `summary.json`, `report.png` and `report.html` into `directory`; returns their paths by name. The steps of
-    a recording are read one by one, so that an episode of any length takes little memory.
+    a recording are read one by one, so that a long episode takes little memory.
 
-    find: the surface of a sensor's gel in a frame, where it is known; by default only what the frame itself says.
+    find: returns the surface of a sensor's gel in a frame, if known; by default the surface in the frame.
 
-    Raises OSError when the directory can't be written, ValueError for an episode without steps, EpisodeError for a
+    Raises OSError if the directory cannot be written, ValueError for an episode without steps, EpisodeError for a
     recording that cannot be read.
     """
     from tacsim.report import figure
-    from tacsim.report.strips import strips
+    from tacsim.report.strips import sensor_strips
 
     if not len(episode.steps):
         raise ValueError("the episode has no steps, there is nothing to report; record at least the state after reset")
-    series = Series.of(episode)
-    stats = summary(series, complete=episode.complete, dropped=episode.dropped)
-    rows = strips(episode, series, FILMSTRIP, find)
+    series = Series.from_episode(episode)
+    stats = summarise(series, complete=episode.complete, dropped=episode.dropped)
+    rows = sensor_strips(episode, series, FRAMES_PER_SENSOR, find)
     paths = {name: directory / name for name in ("summary.json", "report.png", "report.html")}
     directory.mkdir(parents=True, exist_ok=True)
-    subtitle = " · ".join(f"{key}: {value}" for key, value in _headline(stats, series))
-    few = [(row.label, [row.pictures[k] for k in figure.moments(len(row.pictures), figure.COLUMNS)]) for row in rows]
+    subtitle = " · ".join(f"{key}: {value}" for key, value in _headline_rows(stats, series))
+    shown_rows = [
+        (row.label, [row.pictures[k] for k in figure.select_positions(len(row.pictures), figure.COLUMNS)])
+        for row in rows
+    ]
     try:
         paths["summary.json"].write_text(json.dumps(stats, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-        figure.save(figure.overview(few, series, _title(stats), subtitle), paths["report.png"])
-        paths["report.html"].write_text(_html(series, stats, rows), encoding="utf-8")
-    except OSError:  # a full disk, say: no half of a report looks like one
+        figure.save_figure(
+            figure.draw_overview(shown_rows, series, _report_title(stats), subtitle), paths["report.png"]
+        )
+        paths["report.html"].write_text(_render_html(series, stats, rows), encoding="utf-8")
+    except OSError:  # such as a full disk: an incomplete report is removed
         for path in paths.values():
             path.unlink(missing_ok=True)
         raise
     return paths
 
 
-def end_table(stats: Mapping[str, Any], paths: Iterable[Path]) -> Table:
-    """The summary of a run for the terminal. `stats` are those of :func:`summary`."""
+def summary_table(stats: Mapping[str, Any], paths: Iterable[Path]) -> Table:
+    """The summary of a run for the terminal. `stats` are those of :func:`summarise`."""
     from rich.table import Table
     from rich.text import Text
 
-    table = Table(title=Text(_title(stats)), show_header=False, title_justify="left", min_width=60)
+    table = Table(title=Text(_report_title(stats)), show_header=False, title_justify="left", min_width=60)
     table.add_column(style="dim", no_wrap=True)
     table.add_column(overflow="fold")
-    for name, value in _results(stats):
+    for name, value in _result_rows(stats):
         table.add_row(name, Text(value))
     for number, path in enumerate(paths):
         table.add_row("files" if number == 0 else "", Text(str(path)))
     return table
 
 
-def _results(stats: Mapping[str, Any]) -> list[tuple[str, str]]:
-    best, felt = (_least(stats, key) for key in ("distance", "felt_distance"))
+def _result_rows(stats: Mapping[str, Any]) -> list[tuple[str, str]]:
+    best, tactile = (_describe_min(stats, key) for key in ("distance", "felt_distance"))
     rewards = [value for value in stats["reward"] if value is not None]
     rows_of_force = zip(stats["step"], stats["force"], strict=True)
     forces = [(value, arm, k) for k, row in rows_of_force for arm, value in row.items() if value is not None]
     peak = max(forces, key=lambda row: row[0], default=None)  # of equal ones the first
     rows = [
         ("steps", f"{stats['steps']}" + ("" if stats["complete"] else " (recording incomplete)")),
-        *_of_task(
+        *_task_rows(
             stats,
             [
                 ("best distance", best),
-                ("best distance, felt", felt),
+                ("best distance, tactile", tactile),
                 ("final reward", f"{rewards[-1]:.3f}" if rewards else "–"),
             ],
         ),
@@ -157,19 +169,19 @@ def _results(stats: Mapping[str, Any]) -> list[tuple[str, str]]:
     if stats["training_range"] is not None:
         rows += training_rows(stats["training_range"])
     if stats["trust"] is not None:
-        rows += trust_rows(stats["trust"])
+        rows += sensor_warnings(stats["trust"])
     if stats["dropped"]:
         rows.append(("dropped", f"{stats['dropped']} steps were not recorded"))
     return rows
 
 
-def _of_task(stats: Mapping[str, Any], rows: list[tuple[str, str]]) -> list[tuple[str, str]]:
-    """Rows that only an episode with a task has."""
+def _task_rows(stats: Mapping[str, Any], rows: list[tuple[str, str]]) -> list[tuple[str, str]]:
+    """`rows` for an episode with a task, otherwise none."""
     return [] if stats["task"] is None else rows
 
 
 def _surface_rows(stats: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """The greatest height, slope and flow of each gel that are known."""
+    """The largest known height, slope and flow of each gel."""
     found = []
     for key, words, scale, unit in SURFACE:
         parts = [
@@ -182,7 +194,7 @@ def _surface_rows(stats: Mapping[str, Any]) -> list[tuple[str, str]]:
     return found
 
 
-def _least(stats: Mapping[str, Any], key: str) -> str:
+def _describe_min(stats: Mapping[str, Any], key: str) -> str:
     known = [(value, k) for k, value in zip(stats["step"], stats[key], strict=True) if value is not None]
     return f"{1e3 * min(known)[0]:.3f} mm at step {min(known)[1]}" if known else "–"
 
@@ -198,61 +210,61 @@ def _signal_text(stats: Mapping[str, Any]) -> str:
     return "; ".join(parts) or "–"
 
 
-def _title(stats: Mapping[str, Any]) -> str:
+def _report_title(stats: Mapping[str, Any]) -> str:
     return f"{stats['task'] or 'episode'} on rig {stats['rig']}"
 
 
-def _headline(stats: Mapping[str, Any], series: Series) -> list[tuple[str, str]]:
+def _headline_rows(stats: Mapping[str, Any], series: Series) -> list[tuple[str, str]]:
     from tacsim.report.figure import goal_text
 
     lines = [
         ("policy", str(stats["policy"])),
         ("seed", str(stats["seed"])),
         ("steps", str(stats["steps"])),
-        *_of_task(stats, [("goal", goal_text(series.meta.goal))]),
+        *_task_rows(stats, [("goal", goal_text(series.meta.goal))]),
     ]
     started = stats["started"]
     return lines if started is None else [*lines, ("started", f"{started[:10]} {started[11:19]} {started[23:]}")]
 
 
-def finite(value: float | None) -> float | None:
-    """The number for a JSON file: None where it is not known or infinite."""
+def json_number(value: float | None) -> float | None:
+    """The number for a JSON file: None if it is unknown or infinite."""
     return None if value is None or not math.isfinite(value) else float(value)
 
 
-def _numbers(values: FloatArray) -> list[float | None]:
-    return [finite(value) for value in values.tolist()]
+def _json_numbers(values: FloatArray) -> list[float | None]:
+    return [json_number(value) for value in values.tolist()]
 
 
 def data_url(content: bytes, kind: str = "png") -> str:
-    """A picture of this kind, to stand in a page."""
+    """A picture of this kind as a data URL for a page."""
     return f"data:image/{kind};base64," + base64.b64encode(content).decode("ascii")
 
 
 def render_page(template: Path, **values: Any) -> str:
-    """The HTML page that a Jinja template makes of these values; texts are escaped."""
+    """The HTML page of a Jinja template with these values; texts are escaped."""
     from jinja2 import Environment, StrictUndefined
 
     page = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     return page.from_string(template.read_text(encoding="utf-8")).render(**values)
 
 
-def _html(series: Series, stats: Mapping[str, Any], strips: Sequence[Strip]) -> str:
+def _render_html(series: Series, stats: Mapping[str, Any], strips: Sequence[Strip]) -> str:
     from tacsim.report import figure
 
     return render_page(
         Path(__file__).with_name("report.html.jinja"),
-        title=_title(stats),
-        about=[("rig", stats["rig"]), *_of_task(stats, [("task", stats["task"])]), *_headline(stats, series)],
-        results=_results(stats),
+        title=_report_title(stats),
+        about=[("rig", stats["rig"]), *_task_rows(stats, [("task", stats["task"])]), *_headline_rows(stats, series)],
+        results=_result_rows(stats),
         versions=sorted(stats["versions"].items()),
         strips=[
             {
                 "title": strip.title,
                 "note": strip.note,
-                "frames": [(picture.index, data_url(figure.png(picture.image))) for picture in strip.pictures],
+                "frames": [(picture.index, data_url(figure.encode_image(picture.image))) for picture in strip.pictures],
             }
             for strip in strips
         ],
-        plots=data_url(figure.png_of(figure.plots(series))),
+        plots=data_url(figure.encode_figure(figure.draw_plots(series))),
     )

@@ -1,4 +1,4 @@
-"""An episode as numbers over its steps, gathered in one pass: the pictures stay in the recording."""
+"""An episode as numbers over its steps, read in one pass: the pictures stay in the recording."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tacsim.record.step_info import (
     TRAINING_KNOWN,
 )
 
-_OWN = ("time", "seconds", "reward", "distance")
+_STEP_FIELDS = ("time", "seconds", "reward", "distance")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,13 +37,13 @@ class Series:
     seconds: FloatArray  # wall time of the step [s]
     reward: FloatArray
     distance: FloatArray  # [m]
-    force: dict[str, FloatArray]  # |Fz| by arm: how hard object and sensor press on each other [N]
+    force: dict[str, FloatArray]  # |Fz| by arm: normal force between object and sensor [N]
     exposed: dict[str, FloatArray]  # exposure by sensor, rig clock [s]
     info: dict[str, FloatArray]  # Step.info by key
 
     @classmethod
-    def of(cls, episode: Episode) -> Self:
-        """The numbers that a report shows, of the arms and sensors that the episode's metadata name."""
+    def from_episode(cls, episode: Episode) -> Self:
+        """The numbers for a report, of the arms and sensors in the episode's metadata."""
         count, spec = len(episode.steps), episode.meta.spec
         shown = {
             SETTLED,
@@ -54,7 +54,7 @@ class Series:
         }
         shown |= {key + name for key in SENSOR_KEYS for name in spec.sensors}
         index = np.zeros(count, np.int64)
-        own = {name: np.full(count, np.nan) for name in _OWN}
+        own = {name: np.full(count, np.nan) for name in _STEP_FIELDS}
         force, exposed, info = (_Columns(count, names) for names in (spec.arms, spec.sensors, shown))
         for at, step in enumerate(episode.steps):
             index[at] = step.index
@@ -62,16 +62,16 @@ class Series:
                 value = getattr(step, name)
                 if value is not None and _is_known(value):
                     column[at] = value
-            force.put(at, {name: abs(float(state.wrench[2])) for name, state in step.arms.items()})
-            exposed.put(at, step.exposed)
-            info.put(at, step.info)
+            force.set_row(at, {name: abs(float(state.wrench[2])) for name, state in step.arms.items()})
+            exposed.set_row(at, step.exposed)
+            info.set_row(at, step.info)
         return cls(meta=episode.meta, index=index, force=force.found, exposed=exposed.found, info=info.found, **own)
 
     def __len__(self) -> int:
         return len(self.index)
 
     def after_reset(self) -> Series:
-        """The control steps alone, without the state after reset."""
+        """The control steps, without the state after reset."""
         done = self.index > 0
 
         def part(group: dict[str, FloatArray]) -> dict[str, FloatArray]:
@@ -91,52 +91,52 @@ class Series:
 
     @property
     def sensors(self) -> list[str]:
-        """Sensors with pictures, top to bottom as they stand on the bench: `upper` first, then by name."""
-        return upper_first(self.exposed)
+        """Sensors with pictures, from top to bottom: `upper` first, then by name."""
+        return sort_upper_first(self.exposed)
 
     @property
-    def felt(self) -> FloatArray:
-        """The distance from the goal by touch alone [m]."""
+    def tactile_distance(self) -> FloatArray:
+        """The tactile estimate of the distance from the goal [m]."""
         return self.info.get(TACTILE_DISTANCE, np.full(len(self), np.nan))
 
     @property
     def signals(self) -> dict[str, FloatArray]:
         """The contact signal of every sensor that has one."""
-        return self.named(CONTACT_SIGNAL)
+        return self.with_prefix(CONTACT_SIGNAL)
 
     @property
-    def deepest(self) -> dict[str, FloatArray]:
-        """The deepest point of every gel whose height is known [m]."""
-        return self.named(MAX_DEPTH)
+    def max_depth(self) -> dict[str, FloatArray]:
+        """The largest height of every gel whose height is known [m]."""
+        return self.with_prefix(MAX_DEPTH)
 
     @property
-    def steepest(self) -> dict[str, FloatArray]:
-        """The steepest slope of every gel whose height is known [-]."""
-        return self.named(MAX_SLOPE)
+    def max_slope(self) -> dict[str, FloatArray]:
+        """The largest slope of every gel whose height is known [-]."""
+        return self.with_prefix(MAX_SLOPE)
 
     @property
-    def flow(self) -> dict[str, FloatArray]:
-        """The longest displacement of a marker, of every gel whose flow is known [m]."""
-        return self.named(MAX_FLOW)
+    def max_flow(self) -> dict[str, FloatArray]:
+        """The largest displacement of a marker, of every gel whose flow is known [m]."""
+        return self.with_prefix(MAX_FLOW)
 
-    def named(self, prefix: str) -> dict[str, FloatArray]:
-        """Columns of `info` whose keys begin so, by the rest of the key."""
+    def with_prefix(self, prefix: str) -> dict[str, FloatArray]:
+        """Columns of `info` whose keys begin with `prefix`, by the rest of the key."""
         keys = sorted(key for key in self.info if key.startswith(prefix))
         return {key.removeprefix(prefix): self.info[key] for key in keys}
 
-    def seen(self, sensor: str) -> list[int]:
+    def steps_with_image(self, sensor: str) -> list[int]:
         """The positions of the steps that have a picture of this sensor."""
         return [int(at) for at in np.flatnonzero(~np.isnan(self.exposed[sensor]))]
 
 
 class _Columns:
-    """Columns of numbers that come step by step, under some of the `names`."""
+    """Columns of numbers, filled step by step, for some of the `names`."""
 
     def __init__(self, count: int, names: Collection[str]) -> None:
         self.found: dict[str, FloatArray] = {}
         self._count, self._names = count, set(names)
 
-    def put(self, at: int, row: Mapping[str, float]) -> None:
+    def set_row(self, at: int, row: Mapping[str, float]) -> None:
         for name in self._names & row.keys():
             if _is_known(row[name]):
                 if name not in self.found:
@@ -145,10 +145,10 @@ class _Columns:
 
 
 def _is_known(value: float) -> bool:
-    max_known = 1e15  # what a recording says beyond that, infinite or not a number, counts as unknown
-    return abs(value) <= max_known  # False for what is not a number
+    max_known = 1e15  # larger values, infinity and NaN in a recording count as unknown
+    return abs(value) <= max_known  # False for NaN
 
 
-def upper_first(names: Iterable[str]) -> list[str]:
-    """Names as they are shown: `upper` first, then by the alphabet."""
+def sort_upper_first(names: Iterable[str]) -> list[str]:
+    """Names in the order of display: `upper` first, then alphabetical."""
     return sorted(names, key=lambda name: (name != "upper", name))

@@ -1,4 +1,4 @@
-"""What each sensor saw over an episode: its pictures, and under them height, slope and flow where they are known."""
+"""Strips of each sensor over an episode: its pictures, and height, slope and flow if they are known."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from PIL import Image, ImageDraw
 
 from tacsim.interface import SurfaceMap, TactileFrame, TactileObservation
 from tacsim.record.episode import Episode
-from tacsim.report.figure import THUMBNAIL, Picture, moments, shrunk
+from tacsim.report.figure import THUMBNAIL, Picture, select_positions, shrink_image
 from tacsim.report.series import Series
 
-Known = SurfaceMap | TactileObservation  # what either has of height, gradient and flow
+Known = SurfaceMap | TactileObservation  # both have height, gradient and flow
 Find = Callable[[str, TactileFrame], Known | None]
 Rgb = NDArray[np.uint8]
 
-MAP_SIDE = 256  # of a map's picture, about [px]
+MAP_PIXELS = 256  # of a map's picture, about [px]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,79 +31,79 @@ class Strip:
     pictures: Sequence[Picture]
 
 
-def strips(episode: Episode, series: Series, wanted: int, find: Find) -> list[Strip]:
-    """Of every sensor, at most `wanted` moments spread over the episode; one picture is decoded at a time."""
+def sensor_strips(episode: Episode, series: Series, max_count: int, find: Find) -> list[Strip]:
+    """Strips of every sensor with at most `max_count` steps over the episode; one picture is decoded at a time."""
     found: list[Strip] = []
     for sensor in series.sensors:
-        seen = series.seen(sensor)
+        positions = series.steps_with_image(sensor)
         pictures: list[Picture] = []
         surfaces: list[tuple[int, Known]] = []
-        for k in moments(len(seen), wanted):
-            step = episode.steps[seen[k]]
+        for k in select_positions(len(positions), max_count):
+            step = episode.steps[positions[k]]
             frame = step.frames[sensor]
-            pictures.append(Picture(step.index, shrunk(frame.image, THUMBNAIL)))
+            pictures.append(Picture(step.index, shrink_image(frame.image, THUMBNAIL)))
             surface = find(sensor, frame)
             if surface is not None:
                 surfaces.append((step.index, surface))
-        found.append(Strip(sensor, f"Sensor {sensor}", f"{len(pictures)} of {len(seen)} frames", pictures))
+        found.append(Strip(sensor, f"Sensor {sensor}", f"{len(pictures)} of {len(positions)} frames", pictures))
         if surfaces:
-            found += _maps(sensor, surfaces)
+            found += _map_strips(sensor, surfaces)
     return found
 
 
-def _maps(sensor: str, surfaces: Sequence[tuple[int, Known]]) -> list[Strip]:
-    """Height, slope and flow, each in one scale for all moments."""
+def _map_strips(sensor: str, surfaces: Sequence[tuple[int, Known]]) -> list[Strip]:
+    """Strips of height, slope and flow, each with one scale for all steps."""
     made = []
     heights = [(index, surface.height) for index, surface in surfaces if surface.height is not None]
     if heights:
         deepest = max(float(height.max()) for _, height in heights)
         words = f"into the gel, dark 0, bright {deepest * 1e3:.3g} mm"
-        pictures = [Picture(index, _height(height, deepest)) for index, height in heights]
+        pictures = [Picture(index, _height_image(height, deepest)) for index, height in heights]
         made.append(Strip(f"{sensor}: height", f"{sensor}: height", words, pictures))
     slopes = [(index, surface.gradient) for index, surface in surfaces if surface.gradient is not None]
     if slopes:
         steepest = max(float(np.abs(slope).max()) for _, slope in slopes)
         words = f"grey 0; red the more, the deeper the gel goes to the right, green downwards; up to {steepest:.2g}"
-        pictures = [Picture(index, _slope(slope, steepest)) for index, slope in slopes]
+        pictures = [Picture(index, _slope_image(slope, steepest)) for index, slope in slopes]
         made.append(Strip(f"{sensor}: slope", f"{sensor}: slope", words, pictures))
     flows = [(index, surface.flow) for index, surface in surfaces if surface.flow is not None]
     if flows:
         longest = max(float(np.linalg.norm(flow, axis=2).max()) for _, flow in flows)
         words = f"of the gel's surface sideways, an arrow a marker; the longest is {longest * 1e3:.3g} mm"
-        pictures = [Picture(index, _flow(flow, longest)) for index, flow in flows]
+        pictures = [Picture(index, _flow_image(flow, longest)) for index, flow in flows]
         made.append(Strip(f"{sensor}: flow", f"{sensor}: flow", words, pictures))
     return made
 
 
-def _height(height: NDArray[np.float32], deepest: float) -> Rgb:
+def _height_image(height: NDArray[np.float32], deepest: float) -> Rgb:
     import cv2
 
     levels = np.clip(255 * height / max(deepest, 1e-9), 0, 255).astype(np.uint8)
-    return _enlarged(np.asarray(cv2.applyColorMap(levels, cv2.COLORMAP_VIRIDIS)[..., ::-1], dtype=np.uint8))
+    return _enlarge_image(np.asarray(cv2.applyColorMap(levels, cv2.COLORMAP_VIRIDIS)[..., ::-1], dtype=np.uint8))
 
 
-def _slope(gradient: NDArray[np.float32], steepest: float) -> Rgb:
+def _slope_image(gradient: NDArray[np.float32], steepest: float) -> Rgb:
     levels = 127.0  # grey levels for the steepest slope
     colours = np.full((*gradient.shape[:2], 3), 128.0)
     colours[..., :2] += levels * gradient / max(steepest, 1e-9)
-    return _enlarged(np.clip(np.rint(colours), 0, 255).astype(np.uint8))
+    return _enlarge_image(np.clip(np.rint(colours), 0, 255).astype(np.uint8))
 
 
-def _enlarged(image: Rgb) -> Rgb:
-    factor = max(1, MAP_SIDE // max(image.shape[:2]))
+def _enlarge_image(image: Rgb) -> Rgb:
+    factor = max(1, MAP_PIXELS // max(image.shape[:2]))
     return image.repeat(factor, axis=0).repeat(factor, axis=1)
 
 
-def _flow(flow: NDArray[np.float32], longest: float) -> Rgb:
-    """Arrows on an even lattice, all in one scale."""
+def _flow_image(flow: NDArray[np.float32], longest: float) -> Rgb:
+    """Arrows on a regular lattice, all with one scale."""
     max_arrow = 0.9  # of a flow, over the distance of two arrows
     rows, columns, _ = flow.shape
-    apart = MAP_SIDE / max(rows, columns)
-    image = Image.new("RGB", (round(columns * apart), round(rows * apart)), "white")
+    spacing = MAP_PIXELS / max(rows, columns)
+    image = Image.new("RGB", (round(columns * spacing), round(rows * spacing)), "white")
     pen = ImageDraw.Draw(image)
-    scale = max_arrow * apart / max(longest, 1e-9)
+    scale = max_arrow * spacing / max(longest, 1e-9)
     for (row, column), (x, y) in zip(np.ndindex(rows, columns), flow.reshape(-1, 2).tolist(), strict=True):
-        u, v = (column + 0.5) * apart, (row + 0.5) * apart
+        u, v = (column + 0.5) * spacing, (row + 0.5) * spacing
         pen.line((u, v, u + scale * x, v + scale * y), fill="#2a6db5", width=2)
         pen.ellipse((u - 2, v - 2, u + 2, v + 2), fill="#22262b")
     return np.asarray(image, dtype=np.uint8)

@@ -12,7 +12,7 @@ from PIL import Image
 from benchmarks.cases.real.films import CASE, OWN, SHIPPED, Films, marker_film, read_films
 from benchmarks.cases.real.labels import BadData
 from benchmarks.cases.registry import description, select_cases
-from tacsim.config import load
+from tacsim.config import load_model
 from tests.calibration.dotted import draw, lattice_points
 
 LABELS = """
@@ -79,4 +79,4 @@ def test_labels_that_name_what_is_not_there_say_so(film: Path) -> None:
         read_films(film)
     (film / OWN).unlink()
     assert read_films(film) == {}  # the public film is not there, and nobody said it were
-    assert load(Films, SHIPPED).films[0].dots == 128
+    assert load_model(Films, SHIPPED).films[0].dots == 128

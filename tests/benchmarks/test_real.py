@@ -15,7 +15,7 @@ from benchmarks.cases.real.labels import OWN, SHIPPED, BadData, PressLabels, rea
 from benchmarks.cases.registry import select_cases
 from benchmarks.harness.runner import measure
 from benchmarks.pages.picture import draw_radii
-from tacsim.config import ConfigError, load
+from tacsim.config import ConfigError, load_model
 from tests.robot.cli.invoked import tacsim
 
 Folder = tuple[Path, float]
@@ -56,14 +56,14 @@ def test_other_thicknesses_are_long_rows(folder_of_frames: Folder) -> None:
 
 
 def test_the_shipped_labels_are_those_of_the_public_set() -> None:
-    labels = load(PressLabels, SHIPPED)
+    labels = load_model(PressLabels, SHIPPED)
     assert [press.radius_px for press in labels.presses] == [12.5, 20.0, 25.5, 30.5, 18.5, 28.0, 35.5, 42.0]
     assert labels.balls == pytest.approx([2.92e-3, 4.925e-3])
     assert labels.pixel_pitch == pytest.approx(5.92593e-5)
 
 
 def test_a_folder_without_labels_of_its_own_is_searched_for_the_public_frames(tmp_path: Path) -> None:
-    assert read_labels(tmp_path) == load(PressLabels, SHIPPED)
+    assert read_labels(tmp_path) == load_model(PressLabels, SHIPPED)
     with pytest.raises(BadData, match=r"no frame of 'THUsight.*sphere_0\.25_real\.png"):
         read_frames(tmp_path, read_labels(tmp_path))
 

@@ -20,7 +20,7 @@ from calibration.height.slope_polynomial import TERMS, InverseModel
 from calibration.lens.rectification import metric_rectification
 from calibration.lens.view import GelView, pinhole_lens, view_of_corners
 from calibration.normaliser import normaliser_for_calibration, normaliser_for_camera
-from tacsim.config.bundle import digest
+from tacsim.config.bundle import bundle_digest
 from tacsim.interface import TactileFrame
 from tacsim.models.hardware import CameraSensorConfig
 from tacsim.models.photometric import CastShadows, PhotometricModel
@@ -240,6 +240,6 @@ def test_shadows_are_kept_and_are_none_in_bundles_that_lack_the_field(tmp_path: 
     assert read_sensor_model(tmp_path).photometric.shadows == shadows
     content = yaml.safe_load(path.read_text())
     del content["forward"]["shadows"]  # as older versions wrote it
-    content["checksum"] = digest(content)
+    content["checksum"] = bundle_digest(content)
     path.write_text(yaml.safe_dump(content))
     assert read_bundle(tmp_path)[0].forward.shadows is None

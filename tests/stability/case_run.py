@@ -66,7 +66,7 @@ def run(name: str, physics: str) -> Outcome:
     with ExitStack() as stack:
         for target, value in case.patch.items():
             module, _, attribute = target.partition(".")
-            if attribute == "copies":
+            if attribute == "copy_arrays":
                 value = poisoned(attribute, value)
             stack.enter_context(mock.patch.object(modules[module], attribute, value))
         try:

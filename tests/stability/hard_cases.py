@@ -98,7 +98,7 @@ def cone() -> Mesh:
 
 
 def with_nan(times: int) -> dict[str, Any]:
-    return {"fem.copies": times, "seed.copies": times}
+    return {"fem.copy_arrays": times, "seed.copy_arrays": times}
 
 
 SHORT = {"hybrid_inertia.BODY_COURANT": 0.3, "press.PRESS_COURANT": 0.3, "seed.COURANT": 0.3}

@@ -74,10 +74,10 @@ class BallSets(Config):
 
 def read_sets(folder: Path) -> tuple[BallSet, ...]:
     """The sets that hold for `folder`. Raises ConfigError for labels with mistakes."""
-    from tacsim.config import load
+    from tacsim.config import load_model
 
     own = folder / OWN
-    return load(BallSets, own if own.is_file() else SHIPPED).sets
+    return load_model(BallSets, own if own.is_file() else SHIPPED).sets
 
 
 def is_there(folder: Path, of: BallSet) -> bool:

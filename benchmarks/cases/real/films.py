@@ -52,10 +52,10 @@ class Films(Config):
 def read_films(folder: Path) -> dict[Film, Path]:
     """The films that lie below `folder`, by its own labels or the shipped ones. Raises ConfigError for labels with
     mistakes, BadData for a film that its own labels name and that is not there."""
-    from tacsim.config import load
+    from tacsim.config import load_model
 
     own = folder / OWN
-    labels = load(Films, own if own.is_file() else SHIPPED)
+    labels = load_model(Films, own if own.is_file() else SHIPPED)
     found = {}
     for film in labels.films:
         path = find(folder, film.frames) or (folder if folder.name in film.frames else None)

@@ -72,12 +72,12 @@ class PressLabels(Config):
 
 def read_labels(folder: Path) -> PressLabels:
     """The labels that hold for `folder`. Raises BadData without such a folder, ConfigError for labels with mistakes."""
-    from tacsim.config import load
+    from tacsim.config import load_model
 
     if not folder.is_dir():
         raise BadData(f"{folder} is no folder; name the folder that holds the real frames")
     own = folder / OWN
-    return load(PressLabels, own if own.is_file() else SHIPPED)
+    return load_model(PressLabels, own if own.is_file() else SHIPPED)
 
 
 def find_frames(folder: Path, labels: PressLabels) -> dict[PressLabel, Path]:

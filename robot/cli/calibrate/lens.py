@@ -69,10 +69,10 @@ def lens(
         raise typer.BadParameter("give either pictures, or --camera to take them now")
     from calibration.lens.board import parse_board
     from calibration.lens.view import Lens
-    from tacsim.config import load
+    from tacsim.config import load_model
 
     folder = new_directory(out, "lens")
-    known = None if lens_file is None else load(Lens, lens_file)
+    known = None if lens_file is None else load_model(Lens, lens_file)
     if (board is None) == (corners is None):
         raise typer.BadParameter("give either --board or --corners")
     if corners is not None:

@@ -216,14 +216,14 @@ def hand_eye(
     from calibration.lens.board import parse_board
     from calibration.lens.view import Lens
     from robot.procedures.boards import BoardPosePlan
-    from tacsim.config import load
+    from tacsim.config import load_model
 
     if not (rig and arm and camera and lens and board):
         raise typer.BadParameter("with --rig, give --arm, --camera, --lens and --board")
     described = parse_board(board)
     if described.kind == "dots":
         raise CalibrationError("a lattice of dots looks the same from two sides: use a ChArUco board for hand-eye")
-    plan = BoardPosePlan(described, load(Lens, lens), motion.number, motion.tilt, motion.pivot)
+    plan = BoardPosePlan(described, load_model(Lens, lens), motion.number, motion.tilt, motion.pivot)
     _report_hand_eye(_take_board_poses(rig, arm, camera, plan, set_ or [], folder, fixed=fixed), noise, folder)
 
 

@@ -221,13 +221,13 @@ def _asked(given: Description, out: Path | None) -> _Asked:
         serial = out.name
     folder = new_directory(Path("sensors") / serial if out is None and serial != UNKNOWN else out, "calibration")
     from calibration.lens.view import GelView
-    from tacsim.config import load
+    from tacsim.config import load_model
 
     return _Asked(
         ball=(given.ball_radius or 0.0) + (given.ball_diameter or 0.0) / 2,  # one of them is None
         profile=profile,
         pitch=given.pixel_pitch,
-        view=None if given.view is None else load(GelView, given.view),
+        view=None if given.view is None else load_model(GelView, given.view),
         size=given.size,
         region=None if given.region is None else _region(given.region),
         depths=tuple(_known_depth(text) for text in given.known_depth or ()),

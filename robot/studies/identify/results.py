@@ -19,7 +19,7 @@ from robot.studies.identify.identify import Identified
 from robot.studies.identify.motions import WHAT_TELLS
 from tacsim.interface import FloatArray
 from tacsim.models.text import printable_line
-from tacsim.report.figure import COLOURS, INK, QUIET, canvas, plain, save
+from tacsim.report.figure import COLOURS, INK, MUTED, new_figure, save_figure, style_axes
 
 UNITS = {"youngs_modulus": ("kPa", 1e-3), "yield_stress": ("kPa", 1e-3), "hardening_modulus": ("kPa", 1e-3)}
 FORMAT = 1
@@ -128,7 +128,7 @@ def draw(identified: Identified, table: Sequence[tuple[str, str, str]], path: Pa
     what is left of all signals over its standard deviation; on top what was found."""
     max_drawn = 6  # presses; a column each
     shown = identified.presses[:max_drawn]
-    figure = canvas(max(3.4 * len(shown), 9.0), 9.5)
+    figure = new_figure(max(3.4 * len(shown), 9.0), 9.5)
     lines = [f"{name.replace('_', ' ')}   {value}   (95 %: {interval})" for name, value, interval in table]
     lines += [f"{each.name.replace('_', ' ')}   not told" for each in identified.fit.unidentified]
     lines += [f"NOT TO BE USED: {each.text}"[:150] for each in identified.findings]
@@ -143,7 +143,7 @@ def draw(identified: Identified, table: Sequence[tuple[str, str, str]], path: Pa
         _forces(identified, column, rows[1], aside, ("fx", "fy"), "sideways [mm]", "")
         _residuals(identified, column, rows[2])
     figure.tight_layout(rect=(0.0, 0.0, 1.0, 0.99 - 0.016 * (len(lines) + 1)))
-    save(figure, path)
+    save_figure(figure, path)
 
 
 def _depth(press: Press) -> FloatArray:
@@ -178,7 +178,7 @@ def _forces(
     identified: Identified, press: int, axes: Axes, along: FloatArray, names: Sequence[str], label: str, title: str
 ) -> None:
     signals, fit = identified.signals, identified.fit
-    plain(axes, title.replace("$", r"\$")[:32], label, "force [N]")
+    style_axes(axes, title.replace("$", r"\$")[:32], label, "force [N]")
     count = 0
     for index, channel in enumerate(signals.channels):
         rows = (signals.press == press) & (signals.channel == index)
@@ -196,8 +196,8 @@ def _forces(
 
 def _residuals(identified: Identified, press: int, axes: Axes) -> None:
     signals, fit = identified.signals, identified.fit
-    plain(axes, "", "moment", "measured - fitted [sd]")
-    axes.axhspan(-2, 2, color=QUIET, alpha=0.12, linewidth=0)
+    style_axes(axes, "", "moment", "measured - fitted [sd]")
+    axes.axhspan(-2, 2, color=MUTED, alpha=0.12, linewidth=0)
     for index, channel in enumerate(signals.channels):
         rows = (signals.press == press) & (signals.channel == index)
         if rows.any():

@@ -39,7 +39,7 @@ OPERATORS: dict[type[ast.operator], Callable[[Any, Any], Any]] = {
 
 
 @contextmanager
-def light_import() -> Iterator[None]:
+def import_without_optional_modules() -> Iterator[None]:
     """Context of the import of Taichi.
 
     Each decorator of Taichi's own functions searches all loaded modules for the caller's, and does not need it: the
@@ -105,8 +105,8 @@ def _replace_reading(lang: Any) -> None:
         _inside_class=lambda _: _inside_class,
         getsourcefile=cache,
         getsourcelines=lambda read: cache(lambda function: function_source(function) or read(function)),
-        ast=lambda _: SimpleNamespace(**{**vars(ast), "parse": _parse}),
-        textwrap=lambda _: SimpleNamespace(**{**vars(textwrap), "fill": _filled, "dedent": cache(textwrap.dedent)}),
+        ast=lambda _: SimpleNamespace(**{**vars(ast), "parse": _parse_function}),
+        textwrap=lambda _: SimpleNamespace(**{**vars(textwrap), "fill": _fill_line, "dedent": cache(textwrap.dedent)}),
     )
 
 
@@ -129,7 +129,7 @@ def _replace_values(lang: Any) -> None:
             return integer(get_runtime().default_ip, value)
         return real(get_runtime().default_fp, value) if type(value) is float else None
 
-    def wrap(slowly: Callable[..., None]) -> Callable[..., None]:
+    def wrap(original: Callable[..., None]) -> Callable[..., None]:
         def init(self: Any, *values: Any, dbg_info: Any = None, dtype: Any = None) -> None:
             value: Any = values[0] if len(values) == 1 else None
             if type(value) is wrapped and value.ptr_type_checked:
@@ -137,7 +137,7 @@ def _replace_values(lang: Any) -> None:
                 return
             found = value if type(value) is inner else constant(value) if dtype is None else None
             if found is None:
-                slowly(self, *values, dbg_info=dbg_info, dtype=dtype)
+                original(self, *values, dbg_info=dbg_info, dtype=dtype)
                 return
             self.ptr, self.dbg_info = found, dbg_info
             if dbg_info:
@@ -147,29 +147,29 @@ def _replace_values(lang: Any) -> None:
 
         return init
 
-    def flatten(slowly: Callable[[Any], list[Any]]) -> Callable[[Any], list[Any]]:
+    def flatten(original: Callable[[Any], list[Any]]) -> Callable[[Any], list[Any]]:
         def get_flattened_ptrs(value: Any) -> list[Any]:
             if type(value) is wrapped and value.ptr_type_checked:
                 return [value.ptr]
-            return [wrapped(value).ptr] if type(value) is int else slowly(value)
+            return [wrapped(value).ptr] if type(value) is int else original(value)
 
         return get_flattened_ptrs
 
-    def declare(slowly: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    def declare(original: Callable[[Any], Any]) -> Callable[[Any], Any]:
         def expr_init(value: Any) -> Any:
             if type(value) is not wrapped:
-                return slowly(value)
+                return original(value)
             runtime = get_runtime()
             place = debug_info(runtime.get_current_src_info())
             return wrapped(runtime.compiling_callable.ast_builder().expr_var(value.ptr, place))
 
         return expr_init
 
-    def validate(slowly: Callable[[Any, Any], None]) -> Callable[[Any, Any], None]:
+    def validate(original: Callable[[Any, Any], None]) -> Callable[[Any, Any], None]:
         def validate_subscript_index(value: Any, index: Any) -> None:
             each = index if type(index) is tuple else (index,)
             if not all(type(i) is wrapped or (type(i) is int and i >= 0) for i in each):
-                slowly(value, index)
+                original(value, index)
 
         return validate_subscript_index
 
@@ -182,17 +182,17 @@ def _replace_name_lookup(lang: Any) -> None:
     """Faster lookup of names, and short source locations in error messages."""
     context, matrix, absent = lang.ast.ast_transformer_utils.ASTTransformerContext, lang.matrix.Matrix, object()
 
-    def look_up(slowly: Callable[[Any, str], Any]) -> Callable[[Any, str], Any]:
+    def lookup(original: Callable[[Any, str], Any]) -> Callable[[Any, str], Any]:
         def get_var_by_name(self: Any, name: str) -> Any:
             for scope in reversed(self.local_scopes):
                 if name in scope:
                     return scope[name]
             value = self.global_vars.get(name, absent)
-            return slowly(self, name) if value is absent or isinstance(value, matrix) else value
+            return original(self, name) if value is absent or isinstance(value, matrix) else value
 
         return get_var_by_name
 
-    _replace(context, get_pos_info=lambda _: _location, get_var_by_name=look_up)
+    _replace(context, get_pos_info=lambda _: _describe_location, get_var_by_name=lookup)
 
 
 def _replace_nodes(lang: Any) -> None:
@@ -210,11 +210,11 @@ def _replace_nodes(lang: Any) -> None:
 
         return staticmethod(build_Name)
 
-    def operation(slowly: Callable[[Any, Any], Any]) -> Any:
+    def operation(original: Callable[[Any, Any], Any]) -> Any:
         def build_BinOp(context: Any, node: Any) -> Any:
             act = OPERATORS.get(type(node.op))
             if act is None:
-                return slowly(context, node)
+                return original(context, node)
             module.build_stmt(context, node.left)
             module.build_stmt(context, node.right)
             try:
@@ -225,24 +225,24 @@ def _replace_nodes(lang: Any) -> None:
 
         return staticmethod(build_BinOp)
 
-    def builtin(slowly: Callable[..., bool]) -> Any:
+    def builtin(original: Callable[..., bool]) -> Any:
         def build_call_if_is_builtin(context: Any, node: Any, args: Any, keywords: Any) -> bool:
-            return id(node.func.ptr) in builtins and slowly(context, node, args, keywords)
+            return id(node.func.ptr) in builtins and original(context, node, args, keywords)
 
         return staticmethod(build_call_if_is_builtin)
 
-    def decorator(slowly: Callable[[Any, Any], str]) -> Any:
+    def decorator(original: Callable[[Any, Any], str]) -> Any:
         def get_decorator(context: Any, node: Any) -> str:
             called = node.func if isinstance(node, ast.Call) else None
             if isinstance(called, ast.Attribute) and isinstance(called.value, ast.Name):
                 home = context.global_vars.get(called.value.id)
                 if not isinstance(home, dict):
                     return decorators.get(id(getattr(home, called.attr, None)), "")
-            return slowly(context, node)
+            return original(context, node)
 
         return staticmethod(get_decorator)
 
-    _replace(module, ChainMap=lambda _: _merged)  # of a call's keywords, which are rare
+    _replace(module, ChainMap=lambda _: _merge_maps)  # of a call's keywords, which are rare
     _replace(
         transformer,
         build_Name=name,
@@ -255,10 +255,10 @@ def _replace_nodes(lang: Any) -> None:
         for kind in vars(ast).values()
         if isinstance(kind, type) and not issubclass(kind, ast.stmt) and hasattr(transformer, f"build_{kind.__name__}")
     }
-    _replace(transformer, __call__=lambda build: _by_statement(build, methods))
+    _replace(transformer, __call__=lambda build: _locate_statement(build, methods))
 
 
-def _by_statement(
+def _locate_statement(
     build: Callable[[Any, Any, Any], Any], methods: dict[type, Callable[[Any, Any], Any]]
 ) -> Callable[[Any, Any, Any], Any]:
     """Builder.__call__, which records the location of a node, for statements only: a node inside has its statement's.
@@ -273,7 +273,7 @@ def _by_statement(
     return build_node
 
 
-def _merged(*maps: dict[str, Any]) -> dict[str, Any]:
+def _merge_maps(*maps: dict[str, Any]) -> dict[str, Any]:
     return {key: value for each in reversed(maps) for key, value in each.items()}
 
 
@@ -294,7 +294,7 @@ def function_source(function: Any) -> tuple[list[str], int] | None:
             continue
         if _indentation(line) <= _indentation(lines[0]):
             with suppress(SyntaxError):
-                _parsed(textwrap.dedent("\n".join(map(_filled, lines[:end]))))
+                _parse_cached(textwrap.dedent("\n".join(map(_fill_line, lines[:end]))))
                 return lines[:end], code.co_firstlineno
         end = number + 1
     return None
@@ -304,26 +304,26 @@ def _indentation(line: str) -> int:
     return len(line) - len(line.lstrip())
 
 
-def _filled(line: str, **_: int) -> str:
+def _fill_line(line: str, **_: int) -> str:
     """`textwrap.fill` of a line that is not too long."""
     return line.expandtabs(4).rstrip()
 
 
-def _parse(text: str) -> ast.Module:
+def _parse_function(text: str) -> ast.Module:
     """The syntax tree of a function, parsed once. Taichi removes the arguments of a kernel from it; they are put
     back."""
-    tree, arguments = _parsed(text)
+    tree, arguments = _parse_cached(text)
     tree.body[0].args.args = list(arguments)  # type: ignore[attr-defined]
     return tree
 
 
 @cache
-def _parsed(text: str) -> tuple[ast.Module, tuple[ast.arg, ...]]:
+def _parse_cached(text: str) -> tuple[ast.Module, tuple[ast.arg, ...]]:
     tree = ast.parse(text)
     return tree, tuple(tree.body[0].args.args)  # type: ignore[attr-defined]
 
 
-def _location(context: Any, node: Any) -> str:
+def _describe_location(context: Any, node: Any) -> str:
     """Location of a node of a kernel's syntax tree, for error messages."""
     line, source = node.lineno + context.lineno_offset, context.src[node.lineno - 1]
     return f'File "{context.file}", line {line}, in {context.func.func.__name__}:\n{source}\n'

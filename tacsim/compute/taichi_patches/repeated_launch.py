@@ -26,12 +26,12 @@ class _Compiled(NamedTuple):
 _compiled: dict[Any, _Compiled] = {}  # by kernel
 
 
-def launch(kernel: Any, *arguments: Argument) -> None:
+def launch_kernel(kernel: Any, *arguments: Argument) -> None:
     """Does what `kernel(*arguments)` does; each argument has the same type in every launch."""
     if not are_enabled() or kernel not in _compiled:
         kernel(*_with_packs(kernel, arguments))
         if are_enabled():
-            _compiled[kernel] = _describe(kernel)
+            _compiled[kernel] = _describe_kernel(kernel)
         return
     compiled, program, packs, slots = _compiled[kernel]
     context = compiled.make_launch_context()
@@ -61,7 +61,7 @@ def _with_packs(kernel: Any, arguments: Sequence[Argument]) -> Sequence[Argument
     ]
 
 
-def _describe(kernel: Any) -> _Compiled:
+def _describe_kernel(kernel: Any) -> _Compiled:
     (compiled,) = kernel._primal.compiled_kernels.values()
     program = kernel._primal.runtime.prog
     packs, slots = [], []
@@ -70,14 +70,14 @@ def _describe(kernel: Any) -> _Compiled:
         kind = argument.annotation
         if isinstance(kind, ti.lang.argpack.ArgPackType):
             packs.append((index, program.create_argpack(kind.dtype)))
-            slots += [(behind + n, _role(member)) for n, member in enumerate(kind.members.values())]
+            slots += [(behind + n, _argument_role(member)) for n, member in enumerate(kind.members.values())]
             behind += len(kind.members)
         else:
-            slots.append((index, _role(kind)))
+            slots.append((index, _argument_role(kind)))
     return _Compiled(compiled, program, packs, slots)
 
 
-def _role(kind: Any) -> int:
+def _argument_role(kind: Any) -> int:
     if hasattr(kind, "dtype"):  # an array
         return getattr(kind.dtype, "ndim", 0)
     return FLOAT if str(kind) in ("f32", "f64") else INTEGER

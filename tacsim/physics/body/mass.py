@@ -1,9 +1,9 @@
-"""Selective mass scaling of the body, on its grid: what the grid resolves answers as if six times lighter.
+"""Selective mass scaling of the body on its grid: motions that the grid resolves have a sixth of the inertia.
 
-The change of a node's velocity in a substep, a, becomes OWN a + FILTERED (4 S - 1)^2 a, S the mean over the cells round
-a node, each of which has the mean of its nodes by mass; as the gel's accelerations do (tacsim.physics.gel.mass). A
-node keeps its velocity from substep to substep and from launch to launch; the first substep on a grid that is laid
-anew has none to compare with, and is not filtered. Why: docs/decisions/0002.
+The change a of a node's velocity in a substep becomes OWN_WEIGHT a + FILTERED_WEIGHT (4 S - 1)^2 a. S is the mean over
+the cells around a node; each cell has the mass-weighted mean of its nodes. The gel's accelerations are filtered in the
+same way (tacsim.physics.gel.mass). Nodes keep their velocities between substeps and launches. The first substep on a
+new grid has no earlier velocities and is not filtered. Why: docs/decisions/0002.
 """
 
 from tacsim.compute.runtime import ti
@@ -11,8 +11,8 @@ from tacsim.physics.body.transfers import has_velocities, node_sum
 from tacsim.physics.exec import layout
 from tacsim.physics.exec.lanes import NODES, ON_DEVICE, bounded, part_range, vec3
 
-# In `changes` (environments, 3, nodes, 4): change of a node's momentum, and its mass; mean change of velocity of the
-# cell that a node begins; the first again, after the filter's first pass
+# In `changes` (environments, 3, nodes, 4): momentum change and mass of a node; mean velocity change of the cell whose
+# first node it is; momentum change and mass after the first pass of the filter
 CHANGE, CELL, SECOND = range(3)
 
 
@@ -23,7 +23,7 @@ def changes_at(env: ti.template(), which, node):
 
 @ti.func
 def box_of_part(env: ti.template(), part):
-    """First node of a part's share of the grid, and the one after its last, along x, y, z; on a device it has one."""
+    """First node of a part and the one after its last, along x, y, z; on a device a part is one node."""
     nx, ny, nz = env.count(layout.GRID), env.count(layout.GRID + 1), env.count(layout.GRID + 2)
     low, high = ti.Vector([0, 0, 0]), ti.Vector([0, ny, nz])
     if ti.static(ON_DEVICE):
@@ -36,7 +36,7 @@ def box_of_part(env: ti.template(), part):
 
 @ti.func
 def grid_changes(env: ti.template(), part, body: ti.template()):
-    """Changes of momentum in this substep, and masses, of this part's nodes."""
+    """Momentum changes in this substep and masses of this part's nodes."""
     dt, weight = env.param(layout.STEP), env.param3(layout.GRAVITY)
     ny, nz = env.count(layout.GRID + 1), env.count(layout.GRID + 2)
     to = changes_at(env, CHANGE, 0)
@@ -54,7 +54,7 @@ def grid_changes(env: ti.template(), part, body: ti.template()):
 
 @ti.func
 def cell_means(env: ti.template(), part, which, body: ti.template()):
-    """Mean change of velocity of the cells that this part's nodes begin, from the changes of momentum at `which`."""
+    """Mean velocity change of the cells whose first nodes are this part's, from the momentum changes at `which`."""
     nx, ny, nz = env.count(layout.GRID), env.count(layout.GRID + 1), env.count(layout.GRID + 2)
     source, to, line, plane = changes_at(env, which, 0), changes_at(env, CELL, 0), 4 * nz, 4 * nz * ny
     low, high = box_of_part(env, part)
@@ -78,7 +78,7 @@ def cell_means(env: ti.template(), part, which, body: ti.template()):
 
 @ti.func
 def mean_of_cells(env: ti.template(), body: ti.template(), i, j, k):
-    """Of the eight cells round a node that is not at the border of the grid."""
+    """Mean of the eight cells around a node that is not at the border of the grid."""
     ny, nz = env.count(layout.GRID + 1), env.count(layout.GRID + 2)
     total, s = vec3(0.0), bounded(changes_at(env, CELL, (i * ny + j) * nz + k), 1)
     for p, q, r in ti.static(ti.ndrange(2, 2, 2)):
@@ -89,8 +89,8 @@ def mean_of_cells(env: ti.template(), body: ti.template(), i, j, k):
 
 @ti.func
 def second_changes(env: ti.template(), part, body: ti.template()):
-    """4 S - 1 of the changes of this part's nodes; 0 at the border, where what stood there in a grid of another shape
-    would count as mass."""
+    """(4 S - 1) applied to the changes of this part's nodes. The mean is 0 at the border, where the array may hold
+    values of an earlier grid of another shape."""
     nx, ny, nz = env.count(layout.GRID), env.count(layout.GRID + 1), env.count(layout.GRID + 2)
     low, high = box_of_part(env, part)
     for i in range(low[0], high[0]):
@@ -108,15 +108,15 @@ def second_changes(env: ti.template(), part, body: ti.template()):
 
 @ti.func
 def filtered_change(env: ti.template(), body: ti.template(), it, i, j, k):
-    """Change of velocity of a node in this substep, and its mass."""
+    """Velocity change of a node in this substep, and its mass."""
     ny, nz = env.count(layout.GRID + 1), env.count(layout.GRID + 2)
     node = (i * ny + j) * nz + k
     s, t = bounded(changes_at(env, CHANGE, node), 1), bounded(changes_at(env, SECOND, node), 1)
     mass, change = body.changes[s + 3], vec3(0.0)
-    if mass != 0.0:  # one that is not a number must show
+    if mass != 0.0:  # true of NaN, which must not be hidden
         change = vec3([body.changes[s + c] for c in range(3)]) / mass
         if has_velocities(env, it) and i > 0 and j > 0 and k > 0:
             second = vec3([body.changes[t + c] for c in range(3)]) / mass
-            change *= env.param(layout.OWN)
-            change += env.param(layout.FILTERED) * (4.0 * mean_of_cells(env, body, i, j, k) - second)
+            change *= env.param(layout.OWN_WEIGHT)
+            change += env.param(layout.FILTERED_WEIGHT) * (4.0 * mean_of_cells(env, body, i, j, k) - second)
     return change, mass

@@ -1,7 +1,7 @@
 """The plasticine's law inside kernels: Hencky elasticity with von Mises return mapping.
 
 Symmetric 3x3 matrices are stored as 6 numbers (xx, yy, zz, xy, xz, yz). Polynomials of one symmetric matrix commute
-and stay symmetric, so products of them need 6 numbers only: no SVD, no eigenvalues, no branch near equal ones.
+and are symmetric, so their products have 6 numbers: no SVD, no eigenvalues, no branch near equal eigenvalues.
 The same laws in float64 NumPy: benchmarks/truth/laws.py.
 """
 
@@ -20,12 +20,12 @@ UNREACHABLE_LIMIT = 1e9  # elastic limit of a body that never yields: it runs no
 
 
 @ti.func
-def full(s):
+def full_matrix(s):
     return mat3([[s[0], s[3], s[4]], [s[3], s[1], s[5]], [s[4], s[5], s[2]]])
 
 
 @ti.func
-def product(a, b):
+def symmetric_product(a, b):
     """a b of two commuting symmetric matrices."""
     return vec6(
         a[0] * b[0] + a[3] * b[3] + a[4] * b[4],
@@ -44,7 +44,7 @@ def plus_identity(s, c):
 
 
 @ti.func
-def minors(s):
+def second_invariant(s):
     """Sum of the principal 2x2 minors (second invariant)."""
     return s[0] * s[1] - s[3] * s[3] + s[0] * s[2] - s[4] * s[4] + s[1] * s[2] - s[5] * s[5]
 
@@ -64,13 +64,13 @@ def inverse(s):
 
 
 @ti.func
-def square(s):
+def squared_norm(s):
     return s[0] * s[0] + s[1] * s[1] + s[2] * s[2] + 2.0 * (s[3] * s[3] + s[4] * s[4] + s[5] * s[5])
 
 
 @ti.func
-def frobenius(s):
-    return ti.sqrt(square(s))
+def frobenius_norm(s):
+    return ti.sqrt(squared_norm(s))
 
 
 @ti.func
@@ -118,8 +118,8 @@ def log_pade(a):
     The quotient N(a) / D(a) of two cubics is itself a quadratic c0 + c1 a + c2 a^2, since a^3 = I1 a^2 - I2 a + I3
     (Cayley-Hamilton): three scalar equations in place of two matrix products and an inverse.
     """
-    a2 = product(a, a)
-    i1, i2, i3 = a[0] + a[1] + a[2], minors(a), determinant(a)
+    a2 = symmetric_product(a, a)
+    i1, i2, i3 = a[0] + a[1] + a[2], second_invariant(a), determinant(a)
     n = vec3(11.0 * i3, 60.0 - 11.0 * i2, 60.0 + 11.0 * i1)  # 60 a + 60 a^2 + 11 a^3 by powers 0, 1, 2
     d0 = vec3(60.0 + 3.0 * i3, 90.0 - 3.0 * i2, 36.0 + 3.0 * i1)  # 60 + 90 a + 36 a^2 + 3 a^3
     d1 = vec3(d0[2] * i3, d0[0] - d0[2] * i2, d0[1] + d0[2] * i1)  # the same times a
@@ -144,9 +144,9 @@ def logarithm(a):
     """log(I + a). Large strain (|a| > 0.5) falls back on log(I + a) = 2^n log((I + a)^(1/2^n)), n <= 3."""
     scale = 1.0
     root = a
-    if frobenius(a) > MAX_LOG_ARGUMENT:
+    if frobenius_norm(a) > MAX_LOG_ARGUMENT:
         for _ in range(3):
-            if frobenius(root) > MAX_LOG_ARGUMENT:
+            if frobenius_norm(root) > MAX_LOG_ARGUMENT:
                 root = square_root(root)
                 scale *= 2.0
     return scale * log_pade(root)
@@ -155,8 +155,8 @@ def logarithm(a):
 @ti.func
 def exponential_series(x):
     """exp(x) - I for tr x = 0 by its Taylor series to 4th order, error below |x|^5 / 120."""
-    i2, i3 = minors(x), determinant(x)  # x^3 = -i2 x + i3, since tr x = 0
-    return plus_identity((1.0 - i2 / 6.0 + i3 / 24.0) * x + (0.5 - i2 / 24.0) * product(x, x), i3 / 6.0)
+    i2, i3 = second_invariant(x), determinant(x)  # x^3 = -i2 x + i3, since tr x = 0
+    return plus_identity((1.0 - i2 / 6.0 + i3 / 24.0) * x + (0.5 - i2 / 24.0) * symmetric_product(x, x), i3 / 6.0)
 
 
 @ti.func
@@ -173,7 +173,7 @@ def exponential_minus_identity(x, norm):
             halvings += 1
     y = exponential_series((small / norm) * x)
     for _ in range(halvings):
-        y = 2.0 * y + product(y, y)
+        y = 2.0 * y + symmetric_product(y, y)
     return y
 
 
@@ -185,14 +185,15 @@ def volume_preserving(e, shrink):
 
 @ti.func
 def elastic_after_return(growth, shrink):
-    """e of growth + I, of which only the part that preserves volume counts, at the volume J = shrink^(-3/2)."""
-    excess = growth[0] + growth[1] + growth[2] + minors(growth) + determinant(growth)  # det - 1 of the cut series
+    """e of the volume-preserving part of growth + I, at the volume J = shrink^(-3/2)."""
+    # det - 1 of the truncated series
+    excess = growth[0] + growth[1] + growth[2] + second_invariant(growth) + determinant(growth)
     volume = (1.0 - excess / 3.0) / shrink
     return plus_identity(growth * volume, volume - 1.0)
 
 
 @ti.func
-def third_root(z):
+def inverse_cube_root_term(z):
     """t with (1 - t) / (1 + t) = (1 + x)^(-1/3) for |x| up to 0.4, where z = x / (2 + x): tanh(artanh(z) / 3) by its
     series."""
     q = z * z
@@ -203,36 +204,36 @@ def third_root(z):
 
 @ti.func
 def small_strain(e):
-    """log J, dev(eps) and J^(2/3) of b_e = I + e, for elastic strain up to some 0.2, without a branch: lanes can do it
-    side by side.
+    """log J, dev(eps) and J^(2/3) of b_e = I + e, for elastic strain up to about 0.2. It has no branch, so lanes are
+    computed together.
 
-    Returns also 1 where the strain is larger (and all else is wrong), else 0.
+    Also returns 1 where the strain is larger and the other results are not valid, else 0.
     """
-    x = e[0] + e[1] + e[2] + minors(e) + determinant(e)  # det(I + e) - 1
+    x = e[0] + e[1] + e[2] + second_invariant(e) + determinant(e)  # det(I + e) - 1
     z = x / (2.0 + x)
-    t = third_root(z)
+    t = inverse_cube_root_term(z)
     shape = volume_preserving(e, (1.0 - t) / (1.0 + t))
     strain = 0.5 * log_pade(shape)
     strain = plus_identity(strain, -(strain[0] + strain[1] + strain[2]) / 3.0)  # dev(eps)
-    large = ti.select(ti.abs(x) > MAX_LOG1P_ARGUMENT, 1, 0) | ti.select(square(shape) > MAX_LOG_ARGUMENT**2, 1, 0)
+    large = ti.select(ti.abs(x) > MAX_LOG1P_ARGUMENT, 1, 0) | ti.select(squared_norm(shape) > MAX_LOG_ARGUMENT**2, 1, 0)
     return 0.5 * log1p_series(z), strain, (1.0 + t) / (1.0 - t), large
 
 
 @ti.func
 def stress_small_strain(e, mu, bulk):
-    """Kirchhoff stress of a body that never yields, and 1 where `small_strain` is wrong, else 0."""
+    """Kirchhoff stress of a body that never yields, and 1 where `small_strain` is not valid, else 0."""
     log_j, strain, _, large = small_strain(e)
     return plus_identity(2.0 * mu * strain, bulk * log_j), large
 
 
 @ti.func
 def return_small_strain(e, plastic_strain, mu, bulk, yield_strain, hardening):
-    """Return mapping (see `hencky_return`) for elastic strain up to some 0.2, without a branch: see `small_strain`.
+    """Return mapping (see `hencky_return`) for elastic strain up to about 0.2, without a branch: see `small_strain`.
 
-    Returns also 1 where the strain is larger (and all else is wrong), else 0.
+    Also returns 1 where the strain is larger and the other results are not valid, else 0.
     """
     log_j, strain, grow, large = small_strain(e)
-    strain2, i2, i3 = product(strain, strain), minors(strain), determinant(strain)
+    strain2, i2, i3 = symmetric_product(strain, strain), second_invariant(strain), determinant(strain)
     norm = ti.sqrt(strain2[0] + strain2[1] + strain2[2])
     yield_limit, hardening_factor = yield_strain + hardening * plastic_strain, 1.0 / (1.0 + SQRT_2_3 * hardening)
     remaining = 1.0 - hardening_factor * ti.max(0.0, 1.0 - yield_limit / ti.max(norm, 1e-12))  # share of the strain
@@ -253,11 +254,11 @@ def return_small_strain(e, plastic_strain, mu, bulk, yield_strain, hardening):
 @ti.func
 def return_any_strain(e, plastic_strain, mu, bulk, yield_strain, hardening):
     """Return mapping (see `hencky_return`) for any strain."""
-    log_j = 0.5 * log1p(e[0] + e[1] + e[2] + minors(e) + determinant(e))  # det(I + e) - 1
+    log_j = 0.5 * log1p(e[0] + e[1] + e[2] + second_invariant(e) + determinant(e))  # det(I + e) - 1
     shrink = ti.exp(-2.0 / 3.0 * log_j)
     strain = 0.5 * logarithm(volume_preserving(e, shrink))
     strain = plus_identity(strain, -(strain[0] + strain[1] + strain[2]) / 3.0)  # dev(eps)
-    norm = frobenius(strain)
+    norm = frobenius_norm(strain)
     elastic = e
     yield_limit = yield_strain + hardening * plastic_strain
     new_plastic_strain = plastic_strain
@@ -273,12 +274,12 @@ def return_any_strain(e, plastic_strain, mu, bulk, yield_strain, hardening):
 def hencky_return(e, plastic_strain, mu, bulk, yield_strain, hardening):
     """Hencky elasticity with von Mises return mapping (seed paper, eq. 1 and 2), on e = b_e - I.
 
-    For tests and benchmarks: `grid_to_particles` calls the two halves lane by lane.
+    For tests and benchmarks: `particles_to_grid` calls the two parts separately.
 
-    e: trial elastic left Cauchy-Green strain minus identity; plastic_strain: equivalent, so far; yield_strain:
-    sigma_y / (2 mu), Frobenius norm, to which linear isotropic hardening (Simo & Hughes 1998, box 3.1) adds hardening *
-    plastic_strain. Returns the elastic e after the return, the new plastic strain, and the Kirchhoff stress
-    tau = 2 mu dev(eps) + K ln(J) I.
+    e: trial elastic left Cauchy-Green strain minus identity; plastic_strain: equivalent, before this step;
+    yield_strain: sigma_y / (2 mu), Frobenius norm; linear isotropic hardening (Simo & Hughes 1998, box 3.1) adds
+    hardening * plastic_strain to it. Returns the elastic e after the return, the new plastic strain, and the Kirchhoff
+    stress tau = 2 mu dev(eps) + K ln(J) I.
     """
     elastic, new_plastic_strain, tau, large = return_small_strain(e, plastic_strain, mu, bulk, yield_strain, hardening)
     if large != 0:
@@ -287,9 +288,9 @@ def hencky_return(e, plastic_strain, mu, bulk, yield_strain, hardening):
 
 
 @ti.func
-def convect(e, d):
-    """e of f b f^T, with f = I + d and b = I + e, without forming I (keeps small strains exact in f32)."""
-    m = d + d @ full(e)
+def transport_strain(e, d):
+    """e of f b f^T, with f = I + d and b = I + e. I is not added, so small strains stay exact in f32."""
+    m = d + d @ full_matrix(e)
     t = m + m.transpose() + m @ d.transpose()
     return e + vec6(t[0, 0], t[1, 1], t[2, 2], t[0, 1], t[0, 2], t[1, 2])
 
@@ -310,7 +311,7 @@ def inverse_of(h):
 
 
 @ti.func
-def green(h):
+def green_strain(h):
     """F^T F - I of F = I + h, which a rotation does not change."""
     g = h + h.transpose() + h.transpose() @ h
     return vec6(g[0, 0], g[1, 1], g[2, 2], g[0, 1], g[0, 2], g[1, 2])

@@ -1,4 +1,4 @@
-"""Elastoplastic body: what its particles know, and the grid round them. Its kernels: tacsim/physics/body/transfers.py.
+"""Elastoplastic body: state of its particles, and their grid. Its kernels: tacsim/physics/body/transfers.py.
 
 Elastic state e = b_e - I per particle. Inside: mm, N, MPa; density scaled so that the P-wave speed is 1.
 """
@@ -10,11 +10,20 @@ from dataclasses import dataclass
 import numpy as np
 
 from tacsim.models.material import BodyMaterial, elastic_constants
-from tacsim.physics.body.followers import Links, links, node_masses
 from tacsim.physics.body.material import UNREACHABLE_LIMIT
+from tacsim.physics.body.tied_nodes import Links, node_masses, tied_node_links
 from tacsim.physics.body.tuning import STENCIL_REACH
 from tacsim.physics.exec import layout
-from tacsim.physics.exec.lanes import CACHE_LINE, COPIES, LANES, MAX_NUMBERS, NODES, PARTS, aligned_zeros, padded
+from tacsim.physics.exec.lanes import (
+    CACHE_LINE,
+    COPIES,
+    LANES,
+    MAX_NUMBERS,
+    NODES,
+    PARTS,
+    aligned_zeros,
+    round_up_to_lanes,
+)
 from tacsim.physics.units import MM, MPA
 
 
@@ -62,8 +71,8 @@ def body_params(material: BodyMaterial, spacing: float, volume: float | None = N
 
 
 @dataclass(frozen=True)
-class Laid:
-    """Where a body's particles lie on their grid, which they do for many launches, and what follows from it."""
+class GridLayout:
+    """Reference positions of a body's particles on their grid, which stay for many launches, and sums of them."""
 
     rows: np.ndarray  # (3, n) [mm]
     extents: np.ndarray  # of `BodyState.extents`
@@ -73,17 +82,17 @@ class Laid:
 
 
 class BodyState:
-    """Particles of all environments and the grid they move on, laid out for the kernels: whole lanes and cache lines.
+    """Particles of all environments and their grids, arranged for the kernels in whole lanes and cache lines.
 
-    rows: (E, PARTICLE_ROWS, W) one number of all particles a row (tacsim.physics.exec.layout), zeros behind the last
-    particle; masses: (E, COPIES, strips, 4 NODES) momentum and mass of NODES neighbours along z, one copy a part;
+    rows: (E, PARTICLE_ROWS, W), each row one quantity of all particles (tacsim.physics.exec.layout), zeros after the
+    last particle; masses: (E, COPIES, strips, 4 NODES) momentum and mass of NODES neighbours along z, one copy a part;
     velocities: (E, strips, 4 NODES); changes: (E, 3, strips, 4 NODES), of tacsim.physics.body.mass; ends: (E, 2, 2, n)
-    and shares (E, 2, n) of light nodes, see tacsim.physics.body.followers.
+    and shares (E, 2, n) of tied nodes, see tacsim.physics.body.tied_nodes.
     Lines of the grid have an even number of nodes where NODES is 2.
     """
 
     def __init__(self, points: Sequence[np.ndarray], planes: Sequence[np.ndarray] | None = None) -> None:
-        """points, planes: of each environment, (n, 3) [mm], [1/mm]; without planes no particle knows a surface."""
+        """points, planes: of each environment, (n, 3) [mm], [1/mm]; without planes all of them are zero."""
         self.counts = [len(p) for p in points]
         self.rows = aligned_zeros(len(points), layout.PARTICLE_ROWS, row_length(max(self.counts)))
         for index, p in enumerate(points):
@@ -95,19 +104,19 @@ class BodyState:
         self.changes = aligned_zeros(len(points), 3, 1, 4 * NODES)
         self.ends = np.zeros((len(points), 2, 2, 1), np.int32)
         self.shares = np.zeros((len(points), 2, 1), np.float32)
-        self._laid: dict[int, Laid] = {}
-        self._linked: dict[int, tuple[Laid, tuple[int, int, int], Links]] = {}  # and how the grid was laid then
-        self._grid: dict[int, tuple[int, int, int]] = {}  # nodes of the grids whose velocities outlive a launch
+        self._laid: dict[int, GridLayout] = {}
+        self._linked: dict[int, tuple[GridLayout, tuple[int, int, int], Links]] = {}  # and the grid's shape then
+        self._grid: dict[int, tuple[int, int, int]] = {}  # shapes of the grids whose velocities are kept after a launch
 
     def place(self, environment: int, points: np.ndarray, planes: np.ndarray) -> None:
-        """Another body in one environment, at rest, see __init__. Rows of all grow if this one has more particles."""
+        """Puts another body into one environment, at rest, see __init__. All rows grow if it has more particles."""
         count, room = len(points), self.rows.shape[2]
         if row_length(count) > room:
             rows = aligned_zeros(*self.rows.shape[:2], row_length(count))
             rows[..., :room] = self.rows
             self.rows = rows
         self.counts[environment] = count
-        self.forget_grid(environment)
+        self.drop_grid_velocities(environment)
         self.rows[environment] = 0.0
         self.x(environment)[...], self.plane(environment)[...] = points, planes
         self.reference(environment)[...] = points
@@ -115,8 +124,8 @@ class BodyState:
     def _rows(self, environment: int, first: int, count: int) -> np.ndarray:
         return self.rows[environment, first : first + count, : self.counts[environment]]
 
-    def whole(self, environment: int) -> np.ndarray:
-        """All that its particles know (PARTICLE_ROWS, n), a view."""
+    def particle_rows(self, environment: int) -> np.ndarray:
+        """All quantities of its particles (PARTICLE_ROWS, n), a view."""
         return self._rows(environment, 0, layout.PARTICLE_ROWS)
 
     def x(self, environment: int = 0) -> np.ndarray:
@@ -132,16 +141,16 @@ class BodyState:
         return self._rows(environment, layout.VELOCITY, 3).T
 
     def c(self, environment: int = 0) -> np.ndarray:
-        """Affine velocities over the places on the grid, (n, 3, 3), a view."""
+        """Affine velocities over the reference positions, (n, 3, 3), a view."""
         columns: np.ndarray = self.rows[environment, layout.AFFINE : layout.AFFINE + 9].reshape(3, 3, -1)
         return columns[..., : self.counts[environment]].T
 
     def reference(self, environment: int = 0) -> np.ndarray:
-        """Places on the grid [mm], (n, 3), a view."""
+        """Reference positions on the grid [mm], (n, 3), a view."""
         return self._rows(environment, layout.REFERENCE, 3).T
 
     def gradient(self, environment: int = 0) -> np.ndarray:
-        """Displacement gradients H since they were there, (n, 3, 3), a view."""
+        """Displacement gradients H since the reference, (n, 3, 3), a view."""
         columns: np.ndarray = self.rows[environment, layout.GRADIENT : layout.GRADIENT + 9].reshape(3, 3, -1)
         return columns[..., : self.counts[environment]].T
 
@@ -159,82 +168,82 @@ class BodyState:
         return self._rows(environment, layout.PLASTIC_STRAIN, 1).reshape(-1)
 
     @property
-    def most(self) -> int:
-        """Grid nodes that each environment may have: its share of what kernels can count, in all copies."""
+    def max_grid_nodes(self) -> int:
+        """Grid nodes that each environment may have: its share of the largest index of kernels, in all copies."""
         return MAX_NUMBERS // (4 * COPIES * len(self.rows))
 
-    def spin(self, environment: int = 0) -> np.ndarray:
+    def spin_matrices(self, environment: int = 0) -> np.ndarray:
         """C F^T, (n, 3, 3): its skew part is that of the angular momentum, over mass dx^2/4."""
         spin: np.ndarray = self.c(environment) @ self.deformation(environment).swapaxes(1, 2)
         return spin
 
     def move_reference(self, environment: int) -> None:
-        """Moves the grid's reference to where the particles are now: there they are on the grid, undeformed.
+        """Makes the particles' present positions the reference on the grid, in which they are undeformed.
 
-        What strains of the affine velocity is C F^-1; what spins keeps the angular momentum, mass dx^2/4 skew(C F^T).
+        The symmetric part of the affine velocity becomes that of C F^-1; the skew part conserves the angular momentum,
+        mass dx^2/4 skew(C F^T).
         """
         c, f = self.c(environment), self.deformation(environment)
         in_space = c @ np.linalg.inv(f)
-        more = (self.spin(environment) - in_space) / 2
+        more = (self.spin_matrices(environment) - in_space) / 2
         c[...] = in_space + more - more.swapaxes(1, 2)
         self.reference(environment)[...] = self.x(environment)
         self.gradient(environment)[...] = 0.0
-        self.forget_grid(environment)
+        self.drop_grid_velocities(environment)
 
     def grid_velocity(self, environment: int, shape: tuple[int, int, int] | None = None) -> np.ndarray:
-        """Of the nodes of its grid, (nx, ny, nz, 3), a view; of no nodes where particles alone know how they move, as
-        before the first launch and where the grid is laid anew. shape: as from `grid_kept`, if not the present one."""
-        nx, ny, nz = self.grid_kept(environment) if shape is None else shape
+        """Velocities of the grid's nodes, (nx, ny, nz, 3), a view; empty where only particles have velocities: before
+        the first launch, and on a new grid. shape: of `stored_grid_shape`, if not the present one."""
+        nx, ny, nz = self.stored_grid_shape(environment) if shape is None else shape
         strips: np.ndarray = self.velocities[environment, : nx * ny * nz // NODES]
         return strips.reshape(nx, ny, nz, 4)[:, :, : max(nz - NODES + 1, 0), :3]
 
-    def keep_grid(self, environment: int, counts: np.ndarray, velocities: np.ndarray | None = None) -> None:
-        """From now on the nodes of its grid, as it is laid, have the velocities that stand there, or these."""
+    def set_grid_velocities(self, environment: int, counts: np.ndarray, velocities: np.ndarray | None = None) -> None:
+        """Marks the velocities of the present grid's nodes as valid; `velocities` replaces them."""
         nx, ny, nz = counts[environment, layout.GRID : layout.GRID + 3].tolist()
         self._grid[environment] = (nx, ny, nz)
         if velocities is not None:
             self.velocities[environment] = 0.0
             self.grid_velocity(environment)[...] = velocities
 
-    def forget_grid(self, environment: int) -> None:
-        """From now on its particles alone know how they move."""
+    def drop_grid_velocities(self, environment: int) -> None:
+        """Marks the velocities of the grid's nodes as not valid: only the particles' velocities count."""
         self._grid.pop(environment, None)
 
-    def grid_kept(self, environment: int) -> tuple[int, int, int]:
-        """How many nodes, with padding, the grid has whose nodes have velocities; zeros if there is none."""
+    def stored_grid_shape(self, environment: int) -> tuple[int, int, int]:
+        """Node counts, with padding, of the grid whose nodes have velocities; zeros if there is none."""
         return self._grid.get(environment, (0, 0, 0))
 
-    def laid(self, environment: int) -> Laid:
-        """How its particles lie on the grid; worked out anew only if a place is another one than at the last call."""
+    def grid_layout(self, environment: int) -> GridLayout:
+        """Reference positions of its particles; computed again only if a position has changed since the last call."""
         rows, known = self._rows(environment, layout.REFERENCE, 3), self._laid.get(environment)
         if known is None or not np.array_equal(known.rows, rows):
             x = self.reference(environment)
             centre = centre_of(x)
             arms = (x - centre).T
-            known = Laid(rows.copy(), extents_of(x), centre, arms, arms @ arms.T)
+            known = GridLayout(rows.copy(), extents_of(x), centre, arms, arms @ arms.T)
             self._laid[environment] = known
         return known
 
     def extents(self, environment: int) -> np.ndarray:
-        """Lowest and highest places on the grid of each part's particles [mm], (COPIES, 2, 3); of a part without any,
-        infinity and minus infinity."""
-        return self.laid(environment).extents
+        """Lowest and highest reference positions of each part's particles [mm], (COPIES, 2, 3); infinity and minus
+        infinity for a part without particles."""
+        return self.grid_layout(environment).extents
 
-    def fit(
+    def fit_grid(
         self, environment: int, cell: float, margin: float, params: np.ndarray, counts: np.ndarray,
         extents: np.ndarray | None = None,
     ) -> None:  # fmt: skip
-        """Lays the grid of one environment round its particles' places on it, so no index is ever clamped.
+        """Fits the grid of one environment to its particles' reference positions, so that all indices are valid.
 
-        margin [mm]: how far from them a node at its border is, at least; extents: those of `extents`, if they are
-        known. Writes origin, node counts and the parts' slabs of node planes into `params` and `counts`
-        (tacsim.physics.exec.layout).
+        margin [mm]: smallest distance of border nodes from the particles; extents: of `extents`, if known. Writes
+        origin, node counts and the parts' slabs of node planes into `params` and `counts` (tacsim.physics.exec.layout).
 
-        The memory of all environments grows if this one needs more; of what stands in it only velocities outlive a
-        substep. Raises MemoryError, with that memory as it was, where there is none.
+        The memory of all environments grows if this one needs more; only velocities are kept between substeps. Raises
+        MemoryError, with the old memory unchanged, where there is not enough.
         """
         extents = self.extents(environment) if extents is None else extents
-        origin, shape = fit_grid(*bounds_of(extents), cell, margin)
+        origin, shape = grid_around(*bounds_of_parts(extents), cell, margin)
         params[environment, layout.ORIGIN : layout.ORIGIN + 3] = origin
         counts[environment, layout.GRID : layout.GRID + 3] = shape
         counts[environment, layout.PARTICLES] = self.counts[environment]
@@ -244,28 +253,28 @@ class BodyState:
                 low = max(math.ceil((lowest - float(origin[0])) / cell - STENCIL_REACH), 0)
                 high = min(math.floor((highest - float(origin[0])) / cell + STENCIL_REACH) + 1, shape[0])
             counts[environment, layout.SLAB + 2 * part : layout.SLAB + 2 * part + 2] = low, high
-        # three planes for what particles off the grid would add
+        # three more planes, which take what particles off the grid add
         strips = (shape[0] + 3) * shape[1] * shape[2] // NODES
         if self.masses.shape[2] < strips:
-            # a body that spreads asks for more again and again
-            room = max(strips, min(strips * 5 // 4, self.most // NODES))
+            # with reserve, since a body that spreads needs more nodes again and again
+            room = max(strips, min(strips * 5 // 4, self.max_grid_nodes // NODES))
             masses = aligned_zeros(*self.masses.shape[:2], room, 4 * NODES)
             velocities = aligned_zeros(len(masses), room, 4 * NODES)
             changes = aligned_zeros(len(masses), 3, room, 4 * NODES)
             velocities[:, : self.velocities.shape[1]] = self.velocities
             self.masses, self.velocities, self.changes = masses, velocities, changes
-        counts[environment, layout.GRID_MOVES] = self._grid.get(environment) == shape
-        self._link(environment, origin, cell, shape, counts)
+        counts[environment, layout.GRID_HAS_VELOCITIES] = self._grid.get(environment) == shape
+        self._tie_nodes(environment, origin, cell, shape, counts)
         counts[:, layout.STRIDE], counts[:, layout.CAPACITY] = self.rows.shape[2], self.masses.shape[2]
 
-    def _link(
+    def _tie_nodes(
         self, environment: int, origin: np.ndarray, cell: float, shape: tuple[int, int, int], counts: np.ndarray
     ) -> None:  # fmt: skip
-        """Finds light nodes and their leaders, which stay for as long as the particles' places on the grid do."""
-        laid, known = self.laid(environment), self._linked.get(environment)
-        if known is None or known[0] is not laid or known[1] != shape:
-            found = links(node_masses(self.reference(environment), origin, cell, shape))
-            known = self._linked[environment] = laid, shape, found
+        """Finds tied nodes and their full nodes; they stay until the particles' reference positions change."""
+        current, known = self.grid_layout(environment), self._linked.get(environment)
+        if known is None or known[0] is not current or known[1] != shape:
+            found = tied_node_links(node_masses(self.reference(environment), origin, cell, shape))
+            known = self._linked[environment] = current, shape, found
             number = found.shares.shape[1]
             if number > self.shares.shape[2]:
                 more = (0, number * 5 // 4 - self.shares.shape[2])
@@ -273,40 +282,40 @@ class BodyState:
                 self.shares = np.pad(self.shares, ((0, 0), (0, 0), more))
             self.ends[environment, ..., :number], self.shares[environment, :, :number] = found.ends, found.shares
         counts[:, layout.LINKS] = self.shares.shape[2]
-        for first, parts in zip((layout.PUSHES, layout.MOVES), known[2].parts, strict=True):
+        for first, parts in zip((layout.IMPULSE_LINKS, layout.VELOCITY_LINKS), known[2].parts, strict=True):
             counts[environment, first : first + PARTS + 1] = parts
 
     def links(self) -> tuple[np.ndarray, np.ndarray]:
-        """What kernels whose light nodes follow take besides `arguments`."""
+        """Arguments of kernels with tied nodes, in addition to `arguments`."""
         return self.ends.reshape(-1), self.shares.reshape(-1)
 
     def arguments(self) -> tuple[np.ndarray, ...]:
-        """What every kernel with a body takes, in this order."""
+        """Arguments of every kernel with a body, in this order."""
         return self.rows.reshape(-1), self.masses.reshape(-1, 4 * NODES), self.velocities.reshape(-1, 4 * NODES)
 
 
 def row_length(particles: int) -> int:
-    """Room for so many particles in a row: whole cache lines and odd many, so that rows do not compete for places in
-    the cache, which holds few lines whose addresses differ by a power of two."""
+    """Length of a row of so many particles: an odd number of whole cache lines, so that rows do not displace each other
+    in the cache, which holds few lines whose addresses differ by a power of two."""
     return (-(-particles // CACHE_LINE) | 1) * CACHE_LINE
 
 
 def first_particle(part: int, particles: int) -> int:
-    """Where a part of the particles begins: at a block of lanes (tacsim.physics.body.transfers.block_range)."""
-    return min(padded(particles) // LANES * part // COPIES * LANES, particles)
+    """First particle of a part: the first of a block of lanes (tacsim.physics.body.transfers.block_range)."""
+    return min(round_up_to_lanes(particles) // LANES * part // COPIES * LANES, particles)
 
 
 def extents_of(x: np.ndarray) -> np.ndarray:
-    """See `BodyState.extents`; x: places of all particles (n, 3)."""
+    """See `BodyState.extents`; x: positions of all particles (n, 3)."""
     found = np.empty((COPIES, 2, 3), np.float32)
     for part in range(COPIES):
         own = x[first_particle(part, len(x)) : first_particle(part + 1, len(x))]
-        found[part] = bounds(own) if len(own) else ([[np.inf] * 3, [-np.inf] * 3])
+        found[part] = bounds_of_points(own) if len(own) else ([[np.inf] * 3, [-np.inf] * 3])
     return found
 
 
-def bounds(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest coordinates (3,) of points (n, 3). By columns: NumPy is ten times slower along such a row."""
+def bounds_of_points(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest coordinates (3,) of points (n, 3). By columns, which is ten times faster in NumPy."""
     columns = [x[:, d] for d in range(x.shape[1])]
     return np.array([c.min() for c in columns]), np.array([c.max() for c in columns])
 
@@ -317,19 +326,19 @@ def centre_of(x: np.ndarray) -> np.ndarray:
     return centre
 
 
-def bounds_of(extents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def bounds_of_parts(extents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Lowest and highest coordinates (3,) over all parts, (COPIES, 2, 3)."""
     return extents[:, 0].min(axis=0), extents[:, 1].max(axis=0)
 
 
-def fit_grid(
-    least: np.ndarray, most: np.ndarray, cell: float, margin: float
+def grid_around(
+    low: np.ndarray, high: np.ndarray, cell: float, margin: float
 ) -> tuple[np.ndarray, tuple[int, int, int]]:
-    """Origin and node counts of a grid round particles from `least` to `most` (3,) [mm]; whole strips along z.
+    """Origin and node counts of a grid around particles from `low` to `high` (3,) [mm]; whole strips along z.
 
-    The middle of the body is a node: what is symmetric about it stays so. margin: at least a cell.
+    The middle of the body is a node, which keeps symmetric bodies symmetric. margin: at least a cell.
     """
-    middle, reach = (least + most) / 2, np.ceil(((most - least) / 2 + margin) / cell).astype(int)
+    middle, reach = (low + high) / 2, np.ceil(((high - low) / 2 + margin) / cell).astype(int)
     counts = 2 * reach + 1
     return (middle - reach * cell).astype(np.float32), (
         int(counts[0]),

@@ -1,10 +1,10 @@
-"""The body's surface as its particles know it: each one near it carries the tangent plane of the true surface.
+"""The body's surface as tangent planes: each particle near the surface stores the plane of the true surface.
 
-Particles stand for volume; where the surface is they do not say. If each touched at the same distance, the print would
-show how deep below the surface each happens to lie: the steps of a lattice in a curved body, an orange peel of random
-particles. So each carries m = n / r, n the outward normal of the nearest surface and r the distance from it. A plane
-that moves with the material goes as F^-T, m' = -C^T m (convection of a covector), so 1 / |m| stays the distance of the
-deformed surface, however the layer in between was squeezed thin. Lengths in any one unit, m in its inverse.
+Particles sample the volume, not the surface. If all particles touched at the same distance, the dent would show how
+deep below the surface each one lies: steps of the lattice in a curved body, noise with random particles. Therefore each
+particle stores m = n / r, with the outward normal n of the nearest surface and its distance r. A plane that moves with
+the material is transformed by F^-T, m' = -C^T m, so 1 / |m| stays the distance of the deformed surface, even if the
+layer between is compressed. Lengths in any one unit, m in its inverse.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ FloatArray = NDArray[np.floating]
 
 
 def tangent_planes(geometry: Shape, points: NDArray[np.float64], spacing: float) -> NDArray[np.float64]:
-    """Planes m (n, 3) [1/m] of body particles at `points` (n, 3) [m], the shape's own frame; zero deep inside.
+    """Planes m (n, 3) [1/m] of body particles at `points` (n, 3) [m], frame of the shape; zero deep inside.
 
-    Where several faces are equally near (the edge of a box), n is their mean direction.
-    Raises what :func:`tacsim.geometry.shapes.shape_distance` raises.
+    Where several faces have the same distance (at an edge of a box), n is their mean direction.
+    Raises the errors of :func:`tacsim.geometry.shapes.shape_distance`.
     """
     depth = -shape_distance(geometry, points)
     outer = np.flatnonzero(depth <= SURFACE_DEPTH * spacing)
@@ -34,6 +34,6 @@ def tangent_planes(geometry: Shape, points: NDArray[np.float64], spacing: float)
 
 
 def surface_points(x: FloatArray, planes: FloatArray) -> FloatArray:
-    """The point of the surface nearest to each particle (n, 3), x + m / |m|^2; the particle itself deep inside."""
+    """Nearest point of the surface for each particle (n, 3), x + m / |m|^2; deep inside the particle itself."""
     square = np.einsum("ni,ni->n", planes, planes)[:, None]
     return x + np.where(square > 0, planes / np.where(square > 0, square, 1.0), 0.0)

@@ -7,11 +7,12 @@ from tacsim.physics.exec import layout
 from tacsim.physics.exec.lanes import vec3
 
 SPHERE, CYLINDER, BOX, GRID = range(4)
-UNKNOWN_DISTANCE = 1e9  # distance where none is known
+UNKNOWN_DISTANCE = 1e9  # outside of the distance grid
 
 
 class DistanceGrid(NamedTuple):
-    """Distances of one environment's mesh inside a kernel: `values` has `nodes` of them, from number `first` on."""
+    """Distance grid of one environment's mesh inside a kernel: `values` has `nodes` values, the first is node
+    `first`."""
 
     values: Any
     first: Any
@@ -22,7 +23,7 @@ class DistanceGrid(NamedTuple):
 
 @ti.func
 def corner_distance(d, sign):
-    """Distance and gradient of the region where all of d <= 0; sign: direction of each axis."""
+    """Distance and gradient of the region in which all of d <= 0; sign: direction of each axis."""
     outside = ti.max(d, 0.0)
     length = outside.norm()
     n = vec3(0.0)
@@ -59,8 +60,8 @@ def box_distance(size, y):
 def signed_distance(env: ti.template(), kind, size, y, grid: ti.template()):
     """Distance from the indenter's surface (negative inside) and its outward normal, at y in the indenter's frame.
 
-    size: half extents of a box; radius, -, half height of a cylinder; radius of a sphere; of a mesh half extents of
-    its bounding box. The world lays as much of a mesh's grid as can touch (`PressState.cover`).
+    size: half extents of a box; radius, -, half height of a cylinder; radius of a sphere; half extents of the bounding
+    box of a mesh. The grid of a mesh covers the part that can touch (`PressState.cover`).
     """
     phi, n = UNKNOWN_DISTANCE, vec3(0.0, 0.0, 1.0)
     rounding = env.param(layout.EDGE_RADIUS)

@@ -1,15 +1,15 @@
 """A rigid indenter on the gel surface: contact by area-weighted quadrature on the surface.
 
-Each surface cell carries 3 x 3 points of equal area. Normal pressure is what the surface's nodes carry (a multiplier
-that remembers; augmented Lagrangian, Simo & Laursen 1992) plus what a point adds to it by the overlap there: the gel
-gives way between nodes as a half-space does, though the mesh cannot. Friction remembers where on the indenter a point
-sticks. Everything else is in the sensor frame [mm, MPa]. Why: docs/physics.md.
+Each surface cell has 3 x 3 points of equal area. The normal pressure is the pressure stored at the surface's nodes (a
+multiplier; augmented Lagrangian, Simo & Laursen 1992) plus a penalty of the overlap at the point, which stands for the
+compliance of a half-space between the nodes. Friction stores the point of the indenter to which a point sticks. All
+else is in the sensor frame [mm, MPa]. Why: docs/physics.md.
 """
 
 from typing import Any, NamedTuple
 
 from tacsim.compute.runtime import ti
-from tacsim.physics.contact.contact import friction, surface_node
+from tacsim.physics.contact.contact import coulomb_friction, surface_node
 from tacsim.physics.contact.distance import GRID, DistanceGrid, box_distance, signed_distance
 from tacsim.physics.contact.tuning import (
     CONTACT_DAMPING,
@@ -22,7 +22,7 @@ from tacsim.physics.contact.tuning import (
     SURFACE_SMOOTHING,
 )
 from tacsim.physics.exec import layout
-from tacsim.physics.exec.environment import record_most, record_sum
+from tacsim.physics.exec.environment import record_max, record_sum
 from tacsim.physics.exec.lanes import (
     COPIES,
     LANES,
@@ -50,7 +50,7 @@ SPLINE_SMOOTHING = 0.125  # of the quadratic B-spline over the same nodes
 
 
 class Indenter(NamedTuple):
-    """The indenters of all environments inside a kernel: memory of the quadrature points, distances from a mesh."""
+    """The indenters of all environments inside a kernel: memory of the quadrature points, and mesh distances."""
 
     anchor: Any
     pressure: Any
@@ -58,7 +58,7 @@ class Indenter(NamedTuple):
 
 
 class Shape(NamedTuple):
-    """One environment's indenter inside a kernel: what it is, and how it moves in the sensor frame."""
+    """One environment's indenter inside a kernel: its shape, and its motion in the sensor frame."""
 
     kind: Any
     size: Any
@@ -70,9 +70,9 @@ class Shape(NamedTuple):
 
 
 def point_weights() -> tuple[tuple[float, ...], ...]:
-    """Of the two nodes before and the two after a cell's middle, at each point along it: right for whatever is linear,
-    and for a parabola but for SURFACE_SMOOTHING, which is the same at all points."""
-    first = 0.5 / POINTS  # distance from the nearest node; the middle one has two
+    """Weights of the two nodes before and the two after a cell's middle, at each point along the cell. They are exact
+    for linear functions; for a parabola, the error is SURFACE_SMOOTHING at all points."""
+    first = 0.5 / POINTS  # distance from the nearest node; the middle point has two
     spread = first**2 + 2 * SURFACE_SMOOTHING
     near, far = (spread - first) / 2, (spread + first) / 2
     edge = (SURFACE_SMOOTHING - SPLINE_SMOOTHING) / 2
@@ -85,7 +85,7 @@ WEIGHTS_OF_NODES = tuple(zip(*POINT_WEIGHTS, strict=True))  # of the three point
 
 @ti.func
 def weights_of(point):
-    """Of the four nodes round a cell along one axis, for its point number `point`."""
+    """Weights of the four nodes around a cell along one axis, for its point number `point`."""
     w = vec4([ti.static(POINT_WEIGHTS[0][c]) for c in range(4)])
     if point > 0:
         w = vec4([ti.static(POINT_WEIGHTS[1][c]) for c in range(4)])
@@ -95,8 +95,8 @@ def weights_of(point):
 
 
 @ti.func
-def by_weights(values: ti.template(), weights: ti.template()):
-    """Sum of `values` by weights that are known when a kernel is compiled: those of 0 cost nothing."""
+def weighted_sum(values: ti.template(), weights: ti.template()):
+    """Sum of `values` with weights that are known when a kernel is compiled; terms with weight 0 are left out."""
     total = 0.0
     for k in ti.static(range(len(weights))):
         if ti.static(weights[k] != 0.0):
@@ -106,7 +106,7 @@ def by_weights(values: ti.template(), weights: ti.template()):
 
 @ti.func
 def patch_sum(gel: ti.template(), row, i, j, wx, wy):
-    """Sum of a surface quantity over the 4 x 4 nodes round cell (i, j); row: the quantity's first."""
+    """Sum of a surface quantity over the 4 x 4 nodes around cell (i, j); row: first row of the quantity."""
     total = vec4(0.0)
     for p, q in ti.static(ti.ndrange(4, 4)):
         at = surface_at(gel, row + i + p, j + q)
@@ -116,9 +116,9 @@ def patch_sum(gel: ti.template(), row, i, j, wx, wy):
 
 @ti.func
 def patch_sums(gel: ti.template(), i, j, points: ti.template()):
-    """The same at all points of a cell, of both quantities, into `points` (2 x 9, 4): along one axis, then the other.
+    """The same sums at all points of a cell and of both quantities, into `points` (2 x 9, 4), axis by axis.
 
-    Each node is read once. A loop over its four numbers, as in `surface_sum`.
+    Each node is read once. The loop runs over its four numbers, as in `surface_sum`.
     """
     for quantity in range(2):
         for c in range(4):
@@ -127,35 +127,36 @@ def patch_sums(gel: ti.template(), i, j, points: ti.template()):
                 for p in range(4)
             ]
             for y in ti.static(range(POINTS)):
-                line = [by_weights(nodes[p], ti.static(POINT_WEIGHTS[y])) for p in range(4)]
+                line = [weighted_sum(nodes[p], ti.static(POINT_WEIGHTS[y])) for p in range(4)]
                 for x in ti.static(range(POINTS)):
-                    value = by_weights(line, ti.static(POINT_WEIGHTS[x]))
+                    value = weighted_sum(line, ti.static(POINT_WEIGHTS[x]))
                     points[POINTS * (POINTS * quantity + x) + y, c] = value
 
 
 @ti.func
-def hand_on(gel: ti.template(), forces, i, j, pushes: ti.template()):
-    """Adds what the points of cell (i, j) push, `pushes` (9, 4), to its 4 x 4 nodes: the other way round."""
+def scatter_to_nodes(gel: ti.template(), forces, i, j, pushes: ti.template()):
+    """Adds the forces `pushes` (9, 4) at the points of cell (i, j) to its 4 x 4 nodes: the transpose of
+    `patch_sums`."""
     nodes = filled(0.0, 16, 4)
     for c in range(4):
         at = [[pushes[POINTS * x + y, c] for y in range(POINTS)] for x in range(POINTS)]
         for q in ti.static(range(4)):
-            line = [by_weights(at[x], ti.static(WEIGHTS_OF_NODES[q])) for x in range(POINTS)]
+            line = [weighted_sum(at[x], ti.static(WEIGHTS_OF_NODES[q])) for x in range(POINTS)]
             for p in ti.static(range(4)):
-                nodes[4 * p + q, c] = by_weights(line, ti.static(WEIGHTS_OF_NODES[p]))
+                nodes[4 * p + q, c] = weighted_sum(line, ti.static(WEIGHTS_OF_NODES[p]))
     for p, q in ti.static(ti.ndrange(4, 4)):
         node = surface_node(gel, i + p - 1, j + q - 1)
         add_four(gel.contact_force, forces + 4 * node, vec4([nodes[4 * p + q, c] for c in range(4)]))
 
 
 @ti.func
-def carry(env: ti.template(), part, gel: ti.template()):
-    """Nodes take over a share of the pressure on them: this part's; on a device a part is one node."""
+def update_node_pressure(env: ti.template(), part, gel: ti.template()):
+    """Moves the stored pressure of this part's nodes towards the present pressure; on a device a part is one node."""
     row = gel.ny + 1
     count, h = (gel.nx + 1) * row, env.param(layout.GEL_SPACING)
     blocks = (count + LANES - 1) // LANES
     first, last = part_range(blocks, part)
-    least = MIN_PRESSURE * env.param(layout.GEL_MU)
+    min_pressure = MIN_PRESSURE * env.param(layout.GEL_MU)
     i, j = first * LANES // row, first * LANES % row
     for node in range(first * LANES, ti.min(last * LANES, count)):
         total = 0.0
@@ -169,10 +170,10 @@ def carry(env: ti.template(), part, gel: ti.template()):
                 area *= 0.5
             if j == 0 or j == gel.ny:
                 area *= 0.5
-            # what hardly presses any more is let go of, not halved for ever
-            rate = env.param(layout.MEMORY)
+            # a pressure below the limit becomes 0; it would only be halved again and again
+            rate = env.param(layout.MEMORY_SHARE)
             new = old + rate * (total / area - old)
-            gel.surface[at] = ti.select(total == 0.0 and (new < least or rate == 0.0), 0.0, new)
+            gel.surface[at] = ti.select(total == 0.0 and (new < min_pressure or rate == 0.0), 0.0, new)
         j += 1
         if j == row:
             i, j = i + 1, 0
@@ -180,7 +181,7 @@ def carry(env: ti.template(), part, gel: ti.template()):
 
 @ti.func
 def shape_of(env: ti.template(), it, drive: ti.template(), indenter: ti.template()):
-    """The group of what says where the indenter is; drive: its pose and velocity in the sensor frame."""
+    """The indenter's shape and motion; drive: its pose and velocity in the sensor frame."""
     kind, size = env.count(layout.KIND), env.param3(layout.SHAPE)
     nodes = ti.Vector([env.count(layout.SHAPE_NODES + d) for d in range(3)])
     first = ti.Vector([env.count(layout.SHAPE_FIRST + d) for d in range(3)])
@@ -193,10 +194,10 @@ def shape_of(env: ti.template(), it, drive: ti.template(), indenter: ti.template
 
 @ti.func
 def clearance(env: ti.template(), gel: ti.template(), i, j, shape: ti.template()):
-    """How much farther than MAX_TOUCH_DISTANCE all points of cell (i, j) are from the indenter, at least [mm].
+    """Lower bound of the distance of the points of cell (i, j) from the indenter, minus MAX_TOUCH_DISTANCE [mm].
 
-    Nine points a cell, few of them near the indenter: its distance from the cell's middle decides; of a mesh, whose
-    distances are true only near it, that of its bounding box. A distance grows no faster than the path.
+    The bound uses the distance of the cell's middle, since most cells are far from the indenter; for a mesh, whose
+    distances are valid only near it, the distance from its bounding box.
     """
     h = env.param(layout.GEL_SPACING)
     middle = vec3(0.0)
@@ -210,7 +211,7 @@ def clearance(env: ti.template(), gel: ti.template(), i, j, shape: ti.template()
         far, _ = box_distance(shape.size, y)
     else:
         far, _ = signed_distance(env, shape.kind, shape.size, y, shape.grid)
-    # how far its points can lie from its middle
+    # largest distance of a point from the middle
     reach = 0.0
     for p, q in ti.static(ti.ndrange(2, 2)):
         node = surface_at(gel, i + p + 1, j + q + 1)
@@ -220,22 +221,23 @@ def clearance(env: ti.template(), gel: ti.template(), i, j, shape: ti.template()
 
 
 @ti.func
-def forget(env: ti.template(), indenter: ti.template(), i, j):
-    """What contact remembers of the quadrature point (i, j)."""
+def clear_contact_memory(env: ti.template(), indenter: ti.template(), i, j):
+    """Sets the contact memory of the quadrature point (i, j) to zero."""
     indenter.anchor[env.index, i, j] = vec3(0.0)
     indenter.pressure[env.index, i, j] = 0.0
 
 
 @ti.func
 def point_push(env: ti.template(), gel: ti.template(), indenter: ti.template(), shape: ti.template(), i, j, x, us, vs):
-    """What the indenter does to the gel at the quadrature point (i, j), which is at x: whether it touches, force and
+    """Contact of the indenter with the gel at the quadrature point (i, j), which is at x: whether it touches, force and
     pressure times area as a vector of four [N], overlap [mm].
 
-    us: its displacement, and behind it the pressure that the nodes carry; vs: its velocity.
+    us: displacement of the point and the stored pressure of the nodes; vs: velocity of the point.
     """
     h, k_n, dt = env.param(layout.GEL_SPACING), env.param(layout.STIFFNESS), env.param(layout.STEP)
     area = h * h / (POINTS * POINTS)
-    follow = ti.min(dt * env.param(layout.LIMIT_FOLLOWS), 1.0)  # at once, slides would flutter (Prakash & Clifton 1993)
+    # without this delay, slides oscillate (Prakash & Clifton 1993)
+    relaxation = ti.min(dt * env.param(layout.LIMIT_RELAXATION_RATE), 1.0)
     c_n = CONTACT_DAMPING * env.param(layout.GEL_DENSITY) * h / (2.0 * dt)
     y = shape.rotate.transpose() @ (x - shape.centre)
     phi, n_local = signed_distance(env, shape.kind, shape.size, y, shape.grid)
@@ -255,21 +257,21 @@ def point_push(env: ti.template(), gel: ti.template(), indenter: ti.template(), 
             anchor = indenter.anchor[env.index, i, j] if memory > 0.0 else y
             slip = anchor - y
             slip -= slip.dot(n_local) * n_local
-            memory += follow * (rest - memory)
+            memory += relaxation * (rest - memory)
             limit = env.param(layout.FRICTION) * memory
-            ft, left = friction(shape.rotate @ slip, sliding, limit, INDENTER_TANGENTIAL_STIFFNESS * k_n, c_n)
+            ft, left = coulomb_friction(shape.rotate @ slip, sliding, limit, INDENTER_TANGENTIAL_STIFFNESS * k_n, c_n)
             indenter.anchor[env.index, i, j] = anchor - (1.0 - left) * slip
             indenter.pressure[env.index, i, j] = memory
             force = area * (normal * n - ft)
             push = vec4(force[0], force[1], force[2], area * rest)
     if not touching:
-        forget(env, indenter, i, j)
+        clear_contact_memory(env, indenter, i, j)
     return touching, push, -phi
 
 
 @ti.func
-def indent(env: ti.template(), part, it, drive: ti.template(), gel: ti.template(), indenter: ti.template()):
-    """Contact of the indenter with this part's cells of the gel. Notes its force and moment on the sensor, sensor axes.
+def apply_indenter(env: ti.template(), part, it, drive: ti.template(), gel: ti.template(), indenter: ti.template()):
+    """Contact of the indenter with this part's cells of the gel. Records force and moment on the sensor, sensor axes.
 
     drive: pose and velocity of the indenter in the sensor frame.
     """
@@ -278,7 +280,7 @@ def indent(env: ti.template(), part, it, drive: ti.template(), gel: ti.template(
     total, moment, deepest = vec3(0.0), vec3(0.0), 0.0
     forces = contact_force_start(gel, copy_of(part))
     first_cell, last_cell, low, high = 0, 0, 0, ny
-    points = filled(0.0, 2 * POINTS * POINTS, 4)  # of one cell: what its points feel, and what they push
+    points = filled(0.0, 2 * POINTS * POINTS, 4)  # of one cell: values at its points, and forces of its points
     pushes = filled(0.0, POINTS * POINTS, 4)
     if ti.static(ON_DEVICE):
         first_cell, low = part // ny, part % ny
@@ -291,7 +293,7 @@ def indent(env: ti.template(), part, it, drive: ti.template(), gel: ti.template(
             if spare > 0.0:
                 if spare < MAX_SUBSTEP_TRAVEL * h:
                     for p, q in ti.static(ti.ndrange(POINTS, POINTS)):
-                        forget(env, indenter, cell_i * POINTS + p, cell_j * POINTS + q)
+                        clear_contact_memory(env, indenter, cell_i * POINTS + p, cell_j * POINTS + q)
             else:
                 if ti.static(not ON_DEVICE):
                     patch_sums(gel, cell_i, cell_j, points)
@@ -324,10 +326,10 @@ def indent(env: ti.template(), part, it, drive: ti.template(), gel: ti.template(
                             add_four(gel.contact_force, forces + 4 * node, (wx[p] * wy[q]) * push)
                 if ti.static(not ON_DEVICE):
                     for _ in range(one_if(pushed)):
-                        hand_on(gel, forces, cell_i, cell_j, pushes)
+                        scatter_to_nodes(gel, forces, cell_i, cell_j, pushes)
     slot = slot_of(part)
     if ti.static(ON_DEVICE):
-        record_most(env, slot, layout.OVERLAP, deepest)
+        record_max(env, slot, layout.OVERLAP, deepest)
     else:
         env.partial[env.index, part, layout.OVERLAP] = deepest
     for d in ti.static(range(3)):

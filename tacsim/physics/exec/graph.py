@@ -1,4 +1,4 @@
-"""Kernels that follow one another in one call: Python's share of a call is longer than a GPU's of a small kernel."""
+"""Several kernels in one call: the overhead of a call in Python is larger than a GPU's time for a small kernel."""
 
 import inspect
 from collections.abc import Mapping
@@ -8,16 +8,16 @@ from tacsim.compute.runtime import ti
 
 
 class Graph:
-    """Kernels, one after the other, as often as wanted."""
+    """A sequence of kernels that is run a number of times."""
 
     def __init__(self, *kernels: Any) -> None:
-        """kernels: each alone, or with other names for its parameters."""
+        """kernels: each as a kernel, or as a pair with a map of its parameters to other names."""
         self._kernels = [kernel if isinstance(kernel, tuple) else (kernel, {}) for kernel in kernels]
         self._names: set[str] = set()  # of all parameters
         self._compiled: dict[int, Any] = {}  # by the number of rounds in a call
 
     def run(self, arguments: Mapping[str, Any], rounds: int = 1) -> None:
-        """arguments: arrays of the device and whole numbers, by the names of the kernels' parameters."""
+        """arguments: arrays of the device and integers, by the names of the kernels' parameters."""
         per_call = 20  # substeps of most launches
         for each, times in ((per_call, rounds // per_call), (1, rounds % per_call)):
             for _ in range(times):

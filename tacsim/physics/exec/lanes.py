@@ -1,15 +1,15 @@
-"""Eight of everything at once: how kernels are laid out so that the CPU works on whole vectors.
+"""Vector lanes: how kernels are arranged so that the CPU works on eight neighbours at the same time.
 
-Taichi's loops are scalar; LLVM merges eight equal scalar operations into one vector operation only if it finds them
-side by side, starting from stores to neighbouring addresses that it has seen before. Hence arrays keep one number of
-eight neighbours (particles, elements, nodes; `lanes`) side by side, and `overwrite` stores so that LLVM recognises it.
+Taichi's loops are scalar; LLVM merges eight equal scalar operations into one vector operation only if they are adjacent
+and end in stores to adjacent addresses that were loaded before. Therefore arrays store one quantity of eight neighbours
+(particles, elements, nodes; `lanes`) contiguously, and `overwrite` marks stores so that LLVM recognises them.
 
-Work is cut into PARTS, whatever the number of threads: every part scatters into copies of its own, which are summed in
-a fixed order. Hence no atomics on the CPU, and the same bits with any number of threads.
+Work is divided into PARTS, independent of the number of threads: each part scatters into its own copy, and copies are
+summed in a fixed order. So the CPU needs no atomics, and results have the same bits with any number of threads.
 
-On a device (a GPU) the same functions run with one lane, and a part is a single thing, a particle or a node with a
-thread of its own; there is one copy, and what is scattered is added atomically. The switch is ON_DEVICE, known when a
-kernel is compiled.
+On a device (a GPU) the same functions run with one lane, and a part is one particle or node with its own thread; there
+is one copy, and scattered values are added atomically. The switch is ON_DEVICE, which is known when a kernel is
+compiled.
 """
 
 import math
@@ -23,8 +23,8 @@ from tacsim.compute.runtime import DEVICE, ti
 
 
 def registers_of_four() -> bool:
-    """Whether kernels get vector registers of four floats, not of eight: on ARM, and on AMD's CPUs after Zen 4, which
-    LLVM 15, by which Taichi 1.7 compiles, does not know and takes for one with SSE2 (docs/decisions/0007)."""
+    """Whether kernels have vector registers of four floats instead of eight: on ARM, and on AMD's CPUs after Zen 4.
+    LLVM 15, the compiler of Taichi 1.7, does not support these and compiles for SSE2 (docs/decisions/0007)."""
     if platform.machine().lower() in ("arm64", "aarch64"):
         return True
     try:
@@ -36,13 +36,13 @@ def registers_of_four() -> bool:
 
 
 ON_DEVICE = DEVICE != "cpu"
-LANES = 1 if ON_DEVICE else 8  # floats in a vector register of AVX2; a GPU's threads are its lanes
-PARTS = 4  # of an environment's work on the CPU; of its sums everywhere
+LANES = 1 if ON_DEVICE else 8  # floats in a vector register of AVX2; on a GPU the threads are the lanes
+PARTS = 4  # of an environment's work on the CPU; of its sums on all devices
 CACHE_LINE = 16  # floats
-MAX_NUMBERS = 2**30  # numbers in an array that kernels take
-COPIES = 1 if ON_DEVICE else PARTS  # of what is scattered into
+MAX_NUMBERS = 2**30  # largest number of values in an array of kernels
+COPIES = 1 if ON_DEVICE else PARTS  # of arrays that parts scatter into
 
-# Neighbours along a line of the body's grid in one vector register: a strip
+# Neighbours along a line of the body's grid that share one vector register: a strip
 NODES = 1 if ON_DEVICE or registers_of_four() else 2
 
 vec2 = ti.types.vector(2, ti.f32)
@@ -53,20 +53,20 @@ lanes = ti.types.vector(LANES, ti.f32)  # one number of LANES neighbours
 strip = ti.types.vector(4 * NODES, ti.f32)  # four numbers of each of NODES neighbours
 
 
-def padded(n: int) -> int:
+def round_up_to_lanes(n: int) -> int:
     """n rounded up to whole lanes."""
     return -(-n // LANES) * LANES
 
 
 def aligned_zeros(*shape: int) -> np.ndarray:
-    """float32 zeros that begin at a cache line, so that no vector register's worth of them lies across two.
+    """float32 zeros that begin at a cache line, so that no vector crosses two cache lines.
 
-    Raises MemoryError for more than kernels can count (see `bounded`): 4 GB.
+    Raises MemoryError for more than MAX_NUMBERS values, the limit of kernels (see `bounded`): 4 GB.
     """
     count = math.prod(shape)
     if count > MAX_NUMBERS:
         raise MemoryError(
-            f"an array of {count:,} numbers, kernels count to {MAX_NUMBERS:,}: use a coarser "
+            f"an array of {count:,} numbers, the limit of kernels is {MAX_NUMBERS:,}: use a coarser "
             f"preset, or fewer worlds a batch"
         )
     memory = np.zeros(count + CACHE_LINE, np.float32)
@@ -76,15 +76,15 @@ def aligned_zeros(*shape: int) -> np.ndarray:
 
 @ti.func
 def filled(value, rows: ti.template(), columns: ti.template()):
-    """A matrix (rows, columns) full of one number. In place of Matrix.zero, whose every zero is a constant of its own:
-    Taichi compiles for as long as there are constants, squared (docs/decisions/0017)."""
+    """A matrix (rows, columns) with one value. Replaces Matrix.zero, in which each zero is a separate constant:
+    Taichi's time to compile grows with the square of the number of constants (docs/decisions/0017)."""
     return ti.Matrix(ti.static([[value] * columns] * rows))
 
 
 @ti.func
 def overwrite(zero, old, new):
-    """Returns `new`. `old` is used in name only (`zero` is 0, which the compiler cannot know): LLVM makes vectors of a
-    value stored over the one just read."""
+    """Returns `new`. `old` has no effect (`zero` is 0, which the compiler does not know): LLVM merges stores to
+    addresses that have just been read."""
     if ti.static(ON_DEVICE):
         return new
     else:
@@ -92,15 +92,15 @@ def overwrite(zero, old, new):
 
 
 @ti.func
-def opaque(zero, index):
-    """Returns `index`. The compiler would take a sum of several indices apart, and see no neighbours behind it."""
+def hide_from_compiler(zero, index):
+    """Returns `index`. Otherwise the compiler would split a sum of indices and not find neighbours."""
     return index | zero
 
 
 @ti.func
 def bounded(index, width: ti.template()):
-    """Returns `index`, of things of `width` numbers. Since it is neither negative nor large, the compiler sees which
-    numbers behind it are neighbours."""
+    """Returns `index` of an item with `width` numbers. It tells the compiler that the index is neither negative nor
+    large, so that the compiler finds neighbours."""
     if ti.static(ON_DEVICE):
         return index
     else:
@@ -109,7 +109,7 @@ def bounded(index, width: ti.template()):
 
 @ti.func
 def load_lanes(array: ti.template(), at):
-    """LANES neighbours, from any place on."""
+    """LANES neighbours from index `at`."""
     start = bounded(at, 1)
     return lanes([array[start + lane] for lane in range(LANES)])
 
@@ -124,8 +124,8 @@ def store_lanes(array: ti.template(), at, values, zero):
 
 @ti.func
 def load_rows(particles: ti.template(), at, stride, first: ti.template(), count: ti.template(), rows: ti.template()):
-    """Rows first, ... of a block of LANES particles, `count` of them. In short loops: LLVM cuts a longer one across the
-    rows, and gathers."""
+    """Loads `count` rows of a block of LANES particles, beginning with row `first`. In short loops: LLVM would split a
+    longer one across the rows and gather."""
     for begin in ti.static(range(0, count, 6)):
         for r in range(begin, min(begin + 6, count)):
             start = bounded(at + (first + r) * stride, 1)
@@ -146,52 +146,52 @@ def store_rows(
 
 
 @ti.func
-def three(rows: ti.template(), row: ti.template(), lane):
+def read_three(rows: ti.template(), row: ti.template(), lane):
     return vec3(rows[row, lane], rows[row + 1, lane], rows[row + 2, lane])
 
 
 @ti.func
-def four(rows: ti.template(), row: ti.template(), lane, spare):
-    """Four numbers of one lane. The write between them keeps LLVM from making a gather of them; spare: a row's number
-    that the compiler does not know."""
+def read_four(rows: ti.template(), row: ti.template(), lane, spare):
+    """Four numbers of one lane. The write between the reads prevents LLVM from gathering; spare: number of a row, not
+    known to the compiler."""
     first = vec2(rows[row, lane], rows[row + 1, lane])
     rows[spare, lane] = first[0]
     return vec4(first[0], first[1], rows[row + 2, lane], rows[row + 3, lane])
 
 
 @ti.func
-def put(rows: ti.template(), row: ti.template(), lane, values: ti.template()):
+def write_rows(rows: ti.template(), row: ti.template(), lane, values: ti.template()):
     for d in ti.static(range(values.n)):
         rows[row + d, lane] = values[d]
 
 
 @ti.func
-def smallest_lane(rows: ti.template(), row: ti.template()):
+def min_over_lanes(rows: ti.template(), row: ti.template()):
     """Smallest number of a row of lanes."""
-    least = rows[row, 0]
+    smallest = rows[row, 0]
     for lane in ti.static(range(1, LANES)):
-        least = ti.min(least, rows[row, lane])
-    return least
+        smallest = ti.min(smallest, rows[row, lane])
+    return smallest
 
 
 @ti.func
-def largest_lane(rows: ti.template(), row: ti.template()):
+def max_over_lanes(rows: ti.template(), row: ti.template()):
     """Largest number of a row of lanes."""
-    most = rows[row, 0]
+    largest = rows[row, 0]
     for lane in ti.static(range(1, LANES)):
-        most = ti.max(most, rows[row, lane])
-    return most
+        largest = ti.max(largest, rows[row, lane])
+    return largest
 
 
 @ti.func
 def share_start(count, part, parts):
-    """Where share `part` of `count` things begins; it ends where the next begins."""
+    """First of `count` items in part number `part` of `parts`; a part ends where the next begins."""
     return count * part // parts
 
 
 @ti.func
 def part_range(count, part):
-    """First of `count` things that a part does, and the one after its last; on a device a part is one thing."""
+    """First of `count` items of a part, and the one after its last; on a device a part is one item."""
     if ti.static(ON_DEVICE):
         return part, part + 1
     else:
@@ -200,7 +200,7 @@ def part_range(count, part):
 
 @ti.func
 def slot_of(part):
-    """Where in `partial` a part notes its sums."""
+    """Index in `partial` at which a part records its sums."""
     if ti.static(ON_DEVICE):
         return part % PARTS
     else:
@@ -209,7 +209,7 @@ def slot_of(part):
 
 @ti.func
 def copy_of(part):
-    """Which copy a part scatters into."""
+    """Number of the copy that a part scatters into."""
     if ti.static(ON_DEVICE):
         return 0
     else:
@@ -218,7 +218,7 @@ def copy_of(part):
 
 @ti.func
 def add_to(array: ti.template(), at: ti.template(), value: ti.template()):
-    """Adds to one entry of what a part scatters into."""
+    """Adds to one entry of an array that a part scatters into."""
     if ti.static(ON_DEVICE):
         ti.atomic_add(array[at], value)
     else:
@@ -227,7 +227,7 @@ def add_to(array: ti.template(), at: ti.template(), value: ti.template()):
 
 @ti.func
 def add_four(array: ti.template(), at, value):
-    """Adds to four neighbours of what a part scatters into."""
+    """Adds to four neighbouring entries of an array that a part scatters into."""
     if ti.static(ON_DEVICE):
         for c in ti.static(range(4)):
             ti.atomic_add(array[at + c], value[c])

@@ -1,10 +1,10 @@
-"""Threads of one environment: how a launch is spread over them.
+"""Threads of one environment: how the work of a launch is distributed.
 
-A launch runs many substeps, since starting one costs as much as a draft substep. A substep is a few stages, and each
-stage PARTS pieces of work, one of each part. The threads of a team take them one after the other, each first those of
-its own parts, whose arrays are in its core's cache. A stage begins when the one before is done. Nobody waits for a
-thread that another program keeps from running, unless it has a piece in hand; and who has waited for long leaves the
-rest of the launch to the others (docs/decisions/0007). Whoever does a piece, its bits are the same.
+A launch runs many substeps, since the start of a launch takes as long as a substep at preset draft. A substep has a few
+stages; each stage has PARTS pieces of work, one for each part. The threads of a team claim pieces, first those of their
+own parts, whose arrays are in the core's cache. A stage begins when the previous one is done. Threads wait for a thread
+that the operating system has suspended only if it has claimed a piece. A thread that has waited for long leaves the
+rest of the launch to the others (docs/decisions/0007). The results do not depend on which thread does a piece.
 """
 
 from collections.abc import Sequence
@@ -13,26 +13,26 @@ from typing import Any
 import numpy as np
 
 from tacsim.compute.runtime import launching, ti
-from tacsim.compute.taichi_patches.repeated_launch import launch
-from tacsim.compute.threads import threads
+from tacsim.compute.taichi_patches.repeated_launch import launch_kernel
+from tacsim.compute.threads import thread_count
 from tacsim.physics.exec.lanes import PARTS
 
-CHUNK = 512  # Taichi runs loops of up to 512 iterations on one thread: every member gets a chunk, and does its first
-PATIENCE = 8_000  # polls of a stage that is not done, after which a member leaves: some 0.5 ms
+CHUNK = 512  # iterations of a loop that Taichi runs on one thread: each thread gets a chunk and executes its first one
+MAX_POLLS = 8_000  # of a stage that is not done; then a thread leaves, after about 0.5 ms
 
-# Columns of `sync`, a row (one cache line) for each environment that has substeps to do
-ENVIRONMENT, DONE, CLAIMED = range(3)  # its index; pieces of work so far; stages taken of part 0, 1, ...
+# Columns of `sync`; it has a row (one cache line) for each environment with substeps in the launch
+ENVIRONMENT, DONE, CLAIMED = range(3)  # index; pieces done; stages claimed of part 0, 1, ...
 
 Sync = ti.types.ndarray(dtype=ti.i32, ndim=2)
 
 
 @ti.func
-def next_piece(sync: ti.template(), turn, own, stages):
-    """Number of the next piece of work, stage PARTS + part, which the caller must do and report by `piece_done`; stages
-    PARTS if there is none left for this member.
+def claim_work(sync: ti.template(), turn, own, stages):
+    """Number of the next piece of work, stage * PARTS + part, which the caller must do and report by
+    `report_work_done`; stages * PARTS if there is none left for this thread.
 
-    turn: row of `sync`; own: the first of the member's own parts; stages: how many there are. A member that leaves has
-    nothing in hand, so somebody else has what it waited for, and does the rest.
+    turn: row of `sync`; own: first of the thread's own parts; stages: their number. A thread that leaves has no claimed
+    piece: another thread has claimed the piece that it waited for, and does the rest.
     """
     piece, polls = -1, 0
     while piece < 0:
@@ -43,25 +43,25 @@ def next_piece(sync: ti.template(), turn, own, stages):
             part = (own + n) % PARTS
             if piece < 0 and ti.atomic_add(sync[turn, CLAIMED + part], 0) == stage:
                 before = ti.atomic_max(sync[turn, CLAIMED + part], stage + 1)
-                if before == stage:  # nobody was faster
+                if before == stage:  # no other thread has claimed it
                     piece = stage * PARTS + part
         polls += 1
-        if piece < 0 and polls > PATIENCE:
+        if piece < 0 and polls > MAX_POLLS:
             piece = stages * PARTS
     return piece
 
 
 @ti.func
-def piece_done(sync: ti.template(), turn):
+def report_work_done(sync: ti.template(), turn):
     ti.atomic_add(sync[turn, DONE], 1)
 
 
-# Loops that run once or not at all, in place of branches: inside a branch the compiler does not merge lanes.
+# Loops with one iteration or none replace branches: inside a branch the compiler does not merge lanes.
 
 
 @ti.func
 def first_in_chunk(task):
-    """How often the work of `task` is done: once for the first of each chunk, else never."""
+    """1 for the first task of each chunk, else 0."""
     return 1 - ti.min(task % CHUNK, 1)
 
 
@@ -71,23 +71,23 @@ def one_if(condition):
 
 
 @ti.func
-def own_part(task, team):
-    """The first of the parts that a member does before others."""
+def first_own_part(task, team):
+    """First of a thread's own parts, which it claims before others."""
     return task // CHUNK % team * PARTS // team % PARTS
 
 
 def team_size(environments: int) -> int:
-    """Threads for each environment of a launch: those that there are (TACSIM_THREADS bounds them), shared out."""
-    return max(1, min(threads() // environments, PARTS))
+    """Threads for each environment of a launch: all threads (TACSIM_THREADS limits them) over the environments."""
+    return max(1, min(thread_count() // environments, PARTS))
 
 
 @launching()
 def run_team(kernel: Any, drive: np.ndarray, *arguments: Any, active: Sequence[int] = (0,)) -> None:
     """Launches `kernel(team, drive, *arguments, sync)`; a tuple of arrays is the argument for an argument pack.
 
-    drive: (environments, substeps, ...); active: those that have substeps to do. Only they take turns: Taichi cuts a
-    longer loop into as many equal pieces as there are threads, whether there is work in a piece or not.
+    drive: (environments, substeps, ...); active: environments with substeps. The loop runs over these only: Taichi
+    divides a longer loop into equal pieces for all threads, also where a piece has no work.
     """
     sync = np.zeros((len(active), 16), np.int32)
     sync[:, ENVIRONMENT] = active
-    launch(kernel, team_size(len(active)), drive, *arguments, sync)
+    launch_kernel(kernel, team_size(len(active)), drive, *arguments, sync)

@@ -1,8 +1,8 @@
-"""What is wrong in a state: volume ratios, speeds and numbers that are not finite, and where they are worst.
+"""Diagnosis of a state: volume ratios, speeds and numbers that are not finite, and the place of the worst value.
 
-A state holds the arrays of a world by name, in kernel units [mm, wave speed 1]. All worlds name alike what they have
-alike: `gel_displacement` and `gel_velocity` of gel lattices (tacsim.physics.snapshot.gel_arrays), `position` and
-`velocity` of particles, and their `strain` b_e - I or `deformation_gradient`.
+A state holds the arrays of a world by name, in kernel units [mm, wave speed 1]. All worlds use the same names:
+`gel_displacement` and `gel_velocity` of gel lattices (tacsim.physics.snapshot.gel_arrays), `position` and `velocity` of
+particles, and their `strain` b_e - I or `deformation_gradient`.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ Size = tuple[float, float, float]
 Quantity = Literal["corner", "element length", "node speed", "particle speed", "particle volume", "not finite"]
 
 
-def not_finite(state: State) -> str | None:
-    """The first entry that is not finite, in words, and how many of its array are not; None when all are finite."""
+def describe_non_finite(state: State) -> str | None:
+    """Text with the first entry that is not finite, and how many of its array are not; None when all are finite."""
     for name, a in state.items():
         if np.isfinite(a).all():
             continue
@@ -44,15 +44,15 @@ def particle_volumes(state: State) -> Floats | None:
 
 
 def volume_range(strain: NDArray[np.float32]) -> tuple[float, float]:
-    """Least and largest elastic volume ratio of particles, of their strains (n, 6) in single precision, which takes a
+    """Smallest and largest elastic volume ratio of particles with strains (n, 6), in single precision, which takes a
     quarter of the time of `particle_volumes`; NaN where b_e is not positive."""
     squared = _squared_volumes(strain.T)
     with np.errstate(invalid="ignore"):
         return float(np.sqrt(squared.min())), float(np.sqrt(squared.max()))
 
 
-def clearly_uncrushed(state: State, limit: float) -> bool:
-    """Whether all elastic volume ratios are above twice `limit`. False where strains are not known."""
+def volumes_exceed_twice(state: State, limit: float) -> bool:
+    """Whether all elastic volume ratios are above twice `limit`. False for a state without strains."""
     return "strain" in state and volume_range(state["strain"])[0] > 2.0 * limit
 
 
@@ -76,7 +76,7 @@ def element_volumes(u: NDArray[Any], thickness: float) -> Floats:
 def corner_volumes(u: NDArray[Any], thickness: float) -> Floats:
     """(gels, nx, ny, nz) smallest volume ratio at the 8 corners of the elements; arguments as above.
 
-    The volume ratio at an element's centre, where its stress is computed, misses one that is turned over at a corner.
+    The volume ratio at an element's centre, where its stress is computed, does not show an inversion at a corner.
     """
     along = _edge_gradients(u, thickness)
     for axis, edge in enumerate(along):
@@ -92,32 +92,32 @@ def corner_volumes(u: NDArray[Any], thickness: float) -> Floats:
 
 
 def element_lengths(u: NDArray[Any], thickness: float) -> Floats:
-    """(gels, nx, ny, nz) length of the elements, the least of those along x, y and z of the lattice through their
-    centres [mm]; arguments as above."""
+    """(gels, nx, ny, nz) smallest of the lengths of an element along x, y and z of the lattice, through its centre
+    [mm]; arguments as above."""
     h = thickness / (u.shape[3] - 1)
     lengths: Floats = h * np.sqrt((_element_edges(u, thickness) ** 2).sum(axis=1)).min(axis=0)
     return lengths
 
 
-def nearly_at_rest(u: NDArray[Any], thickness: float) -> bool:
+def has_small_gradients(u: NDArray[Any], thickness: float) -> bool:
     """Whether all displacement gradients along the edges are below 1/3: I + such a gradient is diagonally dominant, so
-    no corner is turned over. Spares the price of `corner_volumes`; arguments as above.
+    no corner is inverted. Faster than `corner_volumes`; arguments as above.
     """
-    most = max(float(np.abs(np.diff(u, axis=axis)).max()) for axis in (1, 2, 3))
-    return bool(most < thickness / (u.shape[3] - 1) / 3.0)
+    largest = max(float(np.abs(np.diff(u, axis=axis)).max()) for axis in (1, 2, 3))
+    return bool(largest < thickness / (u.shape[3] - 1) / 3.0)
 
 
 def _edge_gradients(displacement: NDArray[Any], thickness: float) -> list[Floats]:
-    """Displacement gradients along the x, y and z edges of the gels' lattices: three (3, gels, nx, ny, nz), each one
-    shorter along its own axis."""
+    """Displacement gradients along the x, y and z edges of the gels' lattices: three (3, gels, nx, ny, nz), each with
+    one entry less along its own axis."""
     u = np.moveaxis(displacement, -1, 0).astype(np.float64)
     h = thickness / (u.shape[-1] - 1)
     return [np.diff(u, axis=axis) / h for axis in (2, 3, 4)]
 
 
 def _element_edges(u: NDArray[Any], thickness: float) -> Floats:
-    """(3, 3, gels, nx, ny, nz) mean edges of the elements over their length at rest, which are the columns of the
-    deformation gradients at their centres."""
+    """(3, 3, gels, nx, ny, nz) mean edges of the elements over their length at rest: the columns of the deformation
+    gradients at their centres."""
     columns = _edge_gradients(u, thickness)
     for axis, column in enumerate(columns):
         for other in {0, 1, 2} - {axis}:
@@ -128,43 +128,43 @@ def _element_edges(u: NDArray[Any], thickness: float) -> Floats:
 
 
 def _determinant(a: Floats, b: Floats, c: Floats) -> Floats:
-    """Of matrices with the columns (or rows) a, b, c, each (3, ...)."""
+    """Determinants of matrices with the columns (or rows) a, b, c, each (3, ...)."""
     return np.asarray(
         a[0] * (b[1] * c[2] - b[2] * c[1]) - a[1] * (b[0] * c[2] - b[2] * c[0]) + a[2] * (b[0] * c[1] - b[1] * c[0])
     )
 
 
-def place_of_worst(quantity: Quantity, good: State, failed: State, gels: Sequence[Size]) -> str:
-    """Which particle or gel node has the worst of `quantity` in `failed`, in words; "" where there is no such thing. Of
-    `good`, the last physical state, where what was wrong has spread over half of `failed`: there it began.
+def describe_worst_place(quantity: Quantity, good: State, failed: State, gels: Sequence[Size]) -> str:
+    """Text that names the particle or gel node with the worst value of `quantity` in `failed`; "" if there is none. If
+    more than half of the values in `failed` are not finite, the worst value in `good`, the last physical state.
 
     Positions are those in `good`; `gels`: size of each gel [m].
     """
-    values, first = _badness(quantity, failed, gels)
+    values, first = _severity(quantity, failed, gels)
     if values is not None and quantity != "not finite" and np.isfinite(values).mean() < 0.5:
-        values, first = _badness(quantity, good, gels)
+        values, first = _severity(quantity, good, gels)
     if values is None:
         return ""
-    flat = int(np.argmax(_worst_first(values)))
+    flat = int(np.argmax(_replace_non_finite(values)))
     index = [int(i) for i in np.unravel_index(flat, values.shape)]
     if values.ndim >= 4:
         gel = first + index[0]
         cells = np.array(gel_arrays(failed, "gel_displacement")[first].shape[1:4]) - 1
         at = (np.array(index[1:4]) / cells - [0.5, 0.5, 1.0]) * np.array(gels[gel]) * 1e3
-        return f"node {index[1:4]} of the {SENSORS[gel]} gel, {millimetres(at)} mm at rest in its sensor frame"
+        return f"node {index[1:4]} of the {SENSORS[gel]} gel, {format_millimetres(at)} mm at rest in its sensor frame"
     if "position" in good and values.ndim and len(values) == len(good["position"]):
-        return f"particle {index[0]}, {millimetres(good['position'][index[0]])} mm in the world"
+        return f"particle {index[0]}, {format_millimetres(good['position'][index[0]])} mm in the world"
     return ""
 
 
-def _worst_first(values: NDArray[Any]) -> NDArray[Any]:
-    """What is not finite is the worst."""
+def _replace_non_finite(values: NDArray[Any]) -> NDArray[Any]:
+    """The values with infinity in place of those that are not finite."""
     return np.where(np.isfinite(values), values, np.inf)
 
 
-def _badness(quantity: Quantity, failed: State, gels: Sequence[Size]) -> tuple[NDArray[Any] | None, int]:
-    """By node or element of the gels, or by particle: the larger, the worse; and the index of the first gel in it.
-    `gels`: size of each gel [m]."""
+def _severity(quantity: Quantity, failed: State, gels: Sequence[Size]) -> tuple[NDArray[Any] | None, int]:
+    """Severity of each node or element of the gels, or of each particle, where larger is worse; and the index of the
+    first gel in it. `gels`: size of each gel [m]."""
     found: list[tuple[NDArray[Any], int]] = []
     displacements = gel_arrays(failed, "gel_displacement")
     if quantity == "not finite":
@@ -184,8 +184,8 @@ def _badness(quantity: Quantity, failed: State, gels: Sequence[Size]) -> tuple[N
         found = [(np.abs(failed["velocity"]), 0)]
     if not found:
         return None, 0
-    return max(found, key=lambda each: float(_worst_first(each[0]).max()))
+    return max(found, key=lambda each: float(_replace_non_finite(each[0]).max()))
 
 
-def millimetres(vector: NDArray[Any]) -> str:
+def format_millimetres(vector: NDArray[Any]) -> str:
     return "(" + ", ".join(f"{float(x):.3f}" for x in vector) + ")"

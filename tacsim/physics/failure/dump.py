@@ -1,4 +1,4 @@
-"""Dumps of diverged motions: what is needed to look into one, and to run it again (`tacsim debug`).
+"""Dumps of diverged motions: data to inspect a motion and to run it again (`tacsim debug`).
 
 A dump is a folder: `dump.json` (scene, poses, command, message, versions) and `state.npz`, whose arrays are named
 `before.*` (before the motion), `good.*` and `failed.*` (at the start and end of the launch that failed). The STL file
@@ -30,7 +30,7 @@ from tacsim.physics.failure.tuning import MAX_DUMPS
 from tacsim.physics.move import MoveCommand
 from tacsim.physics.snapshot import State
 
-FOLDER = "TACSIM_DUMPS"  # environment variable: where dumps are written; none are without it, or where it is empty
+FOLDER = "TACSIM_DUMPS"  # environment variable: where dumps are written; without it, or if it is empty, none are
 MOMENTS = ("before", "good", "failed")
 MESH = "shape.stl"
 
@@ -39,7 +39,7 @@ Poses = Mapping[str, Pose]
 
 
 class DumpError(ValueError):
-    """A folder that holds no dump, or a damaged one."""
+    """A folder without a dump, or with a damaged one."""
 
 
 class DumpInfo(Config):
@@ -69,17 +69,17 @@ class Dump:
     def command(self) -> MoveCommand:
         """The motion."""
         info = self.info
-        return MoveCommand(_poses(info.targets), info.loads, info.duration, info.flow)
+        return MoveCommand(_poses_of_numbers(info.targets), info.loads, info.duration, info.flow)
 
     def poses(self, moment: str) -> dict[str, Pose]:
         """Of the driven frames; at "good" those of the end of its launch, a few substeps later."""
-        return _poses(self.info.poses if moment == "before" else self.info.failed_poses or self.info.poses)
+        return _poses_of_numbers(self.info.poses if moment == "before" else self.info.failed_poses or self.info.poses)
 
 
 @contextmanager
-def dumps_in(folder: Path | None) -> Iterator[None]:
-    """Diverged motions are dumped below `folder`, or below the one that TACSIM_DUMPS names already, here and in
-    processes started meanwhile. None: nothing is dumped."""
+def dump_to_folder(folder: Path | None) -> Iterator[None]:
+    """Context in which diverged motions are dumped below `folder`, or below the folder in TACSIM_DUMPS if it is set, in
+    this process and in those that it starts. None: no dumps."""
     given = os.environ.get(FOLDER)
     os.environ[FOLDER] = "" if folder is None else given or str(folder)
     try:
@@ -90,13 +90,11 @@ def dumps_in(folder: Path | None) -> Iterator[None]:
             os.environ[FOLDER] = given
 
 
-def write_if_asked(
-    scene: Scene, poses: Poses, command: MoveCommand, before: State, failure: SimulationDiverged
-) -> None:
-    """Writes a dump into a new folder below the one that TACSIM_DUMPS names, and notes it in `failure`.
+def write_dump(scene: Scene, poses: Poses, command: MoveCommand, before: State, failure: SimulationDiverged) -> None:
+    """Writes a dump into a new folder below the one in TACSIM_DUMPS, if it is set, and records the folder in `failure`.
 
-    poses: of the driven frames before the motion; before: the state then. A dump that cannot be written whole leaves
-    nothing and does not hide the failure, which then says why there is none.
+    poses: of the driven frames before the motion; before: the state then. If the dump cannot be written, its folder is
+    removed and `failure` states the reason.
     """
     parent = os.environ.get(FOLDER)
     if parent is None:
@@ -106,7 +104,7 @@ def write_if_asked(
     try:
         folder = _new_folder(Path(parent))
         try:
-            _write(folder, scene, poses, command, before, failure)
+            _write_files(folder, scene, poses, command, before, failure)
         except BaseException:
             shutil.rmtree(folder, ignore_errors=True)
             raise
@@ -127,14 +125,14 @@ def _new_folder(parent: Path) -> Path:
     raise DumpError(f"it holds {MAX_DUMPS} dumps, which is the limit; remove some")
 
 
-def _write(
+def _write_files(
     folder: Path, scene: Scene, poses: Poses, command: MoveCommand, before: State, failure: SimulationDiverged
 ) -> None:
-    scene, mesh = _with_mesh(scene, MESH)
+    scene, mesh = _replace_mesh_path(scene, MESH)
     if mesh is not None:
         shutil.copyfile(mesh, folder / MESH)
     arrays = {
-        f"{moment}.{name}": np.asarray(a, order="C")  # copies of particles lie as the kernels have them
+        f"{moment}.{name}": np.asarray(a, order="C")  # copies of particles have the kernels' memory layout
         for moment, state in zip(MOMENTS, (before, failure.good, failure.failed), strict=True)
         for name, a in state.items()
     }
@@ -142,28 +140,29 @@ def _write(
     info = DumpInfo(
         message=str(failure),
         scene=scene,
-        poses=_numbers(poses),
-        targets=_numbers(command.targets),
+        poses=_pose_numbers(poses),
+        targets=_pose_numbers(command.targets),
         loads=dict(command.loads),
         duration=command.duration,
         flow=command.flow,
-        failed_poses=_numbers(failure.poses),
+        failed_poses=_pose_numbers(failure.poses),
         health={} if failure.health is None else {k: f"{v:.9g}" for k, v in asdict(failure.health).items()},
         versions={d.name: d.version for d in metadata.distributions() if d.name in ("tacsim", "numpy", "taichi")},
     )
-    (folder / "dump.json").write_text(info.model_dump_json(indent=1) + "\n", encoding="utf-8")  # last: now it is whole
+    # last: then the dump is complete
+    (folder / "dump.json").write_text(info.model_dump_json(indent=1) + "\n", encoding="utf-8")
 
 
-def _numbers(poses: Poses) -> dict[str, PoseNumbers]:
+def _pose_numbers(poses: Poses) -> dict[str, PoseNumbers]:
     return {name: (*pose.position.tolist(), *pose.quaternion.tolist()) for name, pose in poses.items()}
 
 
-def _poses(numbers: Mapping[str, PoseNumbers]) -> dict[str, Pose]:
+def _poses_of_numbers(numbers: Mapping[str, PoseNumbers]) -> dict[str, Pose]:
     return {name: Pose(np.array(v[:3]), np.array(v[3:])) for name, v in numbers.items()}
 
 
-def _with_mesh(scene: Scene, path: str) -> tuple[Scene, str | None]:
-    """The scene with the path of its STL file changed to `path`, and the path it had; None if it has no such file."""
+def _replace_mesh_path(scene: Scene, path: str) -> tuple[Scene, str | None]:
+    """The scene with `path` as the path of its STL file, and the old path; None if it has no such file."""
     part = "body" if scene.indenter is None else "indenter"
     owner = scene.body if scene.indenter is None else scene.indenter
     if owner is None or not isinstance(owner.geometry, Mesh):
@@ -172,7 +171,7 @@ def _with_mesh(scene: Scene, path: str) -> tuple[Scene, str | None]:
     return scene.model_copy(update={part: owner.model_copy(update={"geometry": geometry})}), owner.geometry.path
 
 
-def read(folder: Path) -> Dump:
+def read_dump(folder: Path) -> Dump:
     """Reads the dump in `folder` (or the folder of the dump.json named). Raises DumpError, FileNotFoundError."""
     folder = folder.parent if folder.name == "dump.json" else folder
     described, arrays = folder / "dump.json", folder / "state.npz"
@@ -192,5 +191,5 @@ def read(folder: Path) -> Dump:
                 states[moment][name] = archive[key]
     except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise DumpError(f"{arrays} is missing or damaged: {error}") from None
-    scene, _ = _with_mesh(info.scene, str(folder / MESH))
+    scene, _ = _replace_mesh_path(info.scene, str(folder / MESH))
     return Dump(info.model_copy(update={"scene": scene}), states)

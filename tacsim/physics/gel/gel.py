@@ -1,8 +1,8 @@
-"""Elastic gel layer: total-Lagrangian trilinear hexahedra in the sensor's own frame, bonded to a rigid backing.
+"""Elastic gel layer: total-Lagrangian trilinear hexahedra in the sensor's frame, bonded to a rigid backing.
 
 The lattice index k = 0 is the backing, k = nz the free surface (z = 0 of the sensor frame). The sensor may move in the
-world; its gel does not notice. Its kernels: tacsim/physics/gel/kernels.py. Inside: mm, N, MPa; density scaled so that
-the P-wave speed is 1.
+world; this has no effect on the gel's equations. Its kernels: tacsim/physics/gel/kernels.py. Units: mm, N, MPa; density
+scaled so that the P-wave speed is 1.
 """
 
 import math
@@ -14,7 +14,7 @@ import numpy as np
 
 from tacsim.models.material import elastic_constants
 from tacsim.models.scene import Gel, GelSurface
-from tacsim.physics.exec.lanes import COPIES, LANES, ON_DEVICE, PARTS, aligned_zeros, padded
+from tacsim.physics.exec.lanes import COPIES, LANES, ON_DEVICE, PARTS, aligned_zeros, round_up_to_lanes
 from tacsim.physics.exec.layout import (
     ELEMENTS,
     GEL_CORNERS,
@@ -65,7 +65,7 @@ class GelParams:
 def gel_params(gel: Gel, element: float) -> GelParams:
     """Fits cubic elements of about `element` [m] into the gel, two of them or more along each axis.
 
-    Raises ValueError if its sides do not fit one cube, or are narrower than two.
+    Raises ValueError if its sides are no multiples of the cube, or have fewer than two cubes.
     """
     layers = max(2, round(gel.size[2] / element))
     spacing = gel.size[2] / layers
@@ -77,17 +77,17 @@ def gel_params(gel: Gel, element: float) -> GelParams:
             )
     nx, ny = (round(side / spacing) for side in gel.size[:2])
     if min(nx, ny) < 2:
-        most = min(gel.size[:2]) / 2
+        max_size = min(gel.size[:2]) / 2
         raise ValueError(
-            f"gel size {gel.size} m makes {nx} x {ny} x {layers} elements of {spacing * 1e3:.4g} mm; its surface is a "
-            f"spline and needs two along each axis: choose an element_size of at most {most * 1e3:.4g} mm"
+            f"gel size {gel.size} m gives {nx} x {ny} x {layers} elements of {spacing * 1e3:.4g} mm; the spline of its "
+            f"surface needs two along each axis: choose an element_size of at most {max_size * 1e3:.4g} mm"
         )
     mu, lam = elastic_constants(gel.material)
     return GelParams((nx, ny, layers), spacing * MM, mu * MPA, lam * MPA)
 
 
 def common_lattices(worlds: Sequence[Sequence[GelParams]]) -> Sequence[GelParams]:
-    """What environments share: the lattice of each of their gels. Raises ValueError where two environments differ."""
+    """The lattice of each gel, which all environments share. Raises ValueError where two environments differ."""
     first = worlds[0]
     for index, gels in enumerate(worlds):
         for name, gel, other in zip(SENSORS, gels, first, strict=False):
@@ -106,13 +106,13 @@ def _lattice_words(gel: GelParams) -> str:
 
 
 class GelGroup:
-    """Views of the gels of all environments that are cut alike, all of an environment or one.
+    """Views of gels of all environments that have equal lattices: all gels of an environment, or one.
 
-    nodes: (E, gels, QUANTITIES, 3, nz + 1, P) displacement, velocity, force, and what their accelerations pass through
-    (tacsim/physics/gel/mass.py); axis; layer; the nodes of a layer as one row, node (i, j) at i (ny + 1) + j, zeros
-    behind the last. One run of equal operations then covers a whole layer.
+    nodes: (E, gels, QUANTITIES, 3, nz + 1, P) displacement, velocity, force, and the stages of the filter of
+    accelerations (tacsim/physics/gel/mass.py); axis; layer; the nodes of a layer as one row, node (i, j) at
+    i (ny + 1) + j, zeros after the last. So a loop of equal operations covers a whole layer.
     surface: (E, gels, 2, nx + 3, ny + 3, 4) displacement and velocity of the surface, its rim repeated once outside;
-    behind a displacement the pressure that the node carries [MPa], under an indenter.
+    after a displacement, the stored pressure of the node under an indenter [MPa].
     contact_force: (E, gels, COPIES, P, 4) on the surface nodes, one copy a part; zeros between substeps.
     u, v, f: displacement [mm], velocity, and force in the last substep [N], (E, gels, nx + 1, ny + 1, nz + 1, 3).
     """
@@ -131,25 +131,25 @@ class GelGroup:
         return lattice.transpose(0, 1, 4, 5, 3, 2)
 
     @property
-    def carried(self) -> np.ndarray:
-        """Pressure that the surface nodes carry [MPa], (E, gels, nx + 1, ny + 1), a view."""
+    def surface_pressure(self) -> np.ndarray:
+        """Stored pressure of the surface nodes [MPa], (E, gels, nx + 1, ny + 1), a view."""
         return self.surface[:, :, 0, 1:-1, 1:-1, 3]
 
-    def shortest(self, environment: int) -> float:
-        """The shortest edge of an element [mm], each along its direction at rest, so one that has turned seems shorter
-        than it is; NaN if a displacement is."""
+    def min_edge_length(self, environment: int) -> float:
+        """Shortest edge of an element [mm], each measured along its direction at rest: a lower bound for rotated edges;
+        NaN if a displacement is NaN."""
         nx1, ny1 = self._shape
         flat = self.nodes[environment, :, 0, :, :, : nx1 * ny1]
         u = flat.reshape(*flat.shape[:-1], nx1, ny1)  # gel, axis, layer, i, j
         edges = u[:, 0, :, 1:] - u[:, 0, :, :-1], u[:, 1, ..., 1:] - u[:, 1, ..., :-1], u[:, 2, 1:] - u[:, 2, :-1]
         return self.params.spacing + min(float(edge.min()) for edge in edges)
 
-    def quiet(self, environment: int, fastest: float) -> bool:
-        """Whether all displacements and velocities are finite, and no component of a velocity beyond `fastest`."""
+    def is_slow_and_finite(self, environment: int, max_speed: float) -> bool:
+        """Whether all displacements and velocities are finite and no velocity component is above `max_speed`."""
         moving = self.nodes[environment, :, :2]
-        return bool(np.isfinite(moving).all()) and bool(np.abs(moving[:, 1]).max() <= fastest)
+        return bool(np.isfinite(moving).all()) and bool(np.abs(moving[:, 1]).max() <= max_speed)
 
-    def refresh(self) -> None:
+    def copy_surface(self) -> None:
         """See GelState."""
         nx1, ny1 = self._shape
         self.nodes[..., nx1 * ny1 :] = 0.0
@@ -162,28 +162,28 @@ class GelGroup:
 
 
 class GelState:
-    """Nodes of all gels of all environments, laid out for the kernels: each array has one environment after the other,
-    in it one gel after the other, each as it is cut. Kernels are told where each begins (`write_layout`).
+    """Nodes of all gels of all environments, arranged for the kernels: each array has all environments, one after the
+    other, and in each its gels with their own shapes. `write_layout` gives the kernels the index of each.
 
-    gels: in an environment. groups: views of those that are cut alike.
+    gels: of an environment. groups: views of gels with equal lattices.
     corners: for each environment, gel and part of it (2, 24, W) forces of the elements of two layers on their corners:
     corner, axis. On a device, which works on all layers at once, for each environment and gel (nz, 24, W).
     lattice: for each group (LATTICE_ROWS, P) 1 at the first node of an element, else 0; 1 / share of a node's mass, 0
     where there is no node; weights of its neighbours before and after it along x, and along y, in a mean over the
-    elements round it.
+    elements around it.
     """
 
     def __init__(self, gels: Sequence[GelParams], environments: int) -> None:
         self.gels, first = tuple(gels), gels[0]
         alike = all((gel.elements, gel.spacing) == (first.elements, first.spacing) for gel in gels)
         grouped = [(first, len(gels))] if alike else [(gel, 1) for gel in gels]
-        # Elements and nodes meet at offsets 0, 1, row and row + 1, so kernels read that far beyond both ends.
-        self.margin = padded(max(gel.elements[1] for gel in gels) + 2)
-        self._nodes, nodes, node_starts = _lay_out(_node_shape, grouped, environments, self.margin)
-        self._surface, surfaces, surface_starts = _lay_out(_surface_shape, grouped, environments)
-        self._forces, forces, force_starts = _lay_out(_force_shape, grouped, environments)
+        # The nodes of an element have offsets 0, 1, row and row + 1: kernels read so far beyond both ends.
+        self.margin = round_up_to_lanes(max(gel.elements[1] for gel in gels) + 2)
+        self._nodes, nodes, node_starts = _allocate(_node_shape, grouped, environments, self.margin)
+        self._surface, surfaces, surface_starts = _allocate(_surface_shape, grouped, environments)
+        self._forces, forces, force_starts = _allocate(_force_shape, grouped, environments)
         corner_shape = partial(_corner_shape, PARTS // len(gels))
-        self._corners, _, corner_starts = _lay_out(corner_shape, grouped, environments, self.margin)
+        self._corners, _, corner_starts = _allocate(corner_shape, grouped, environments, self.margin)
         self.groups = tuple(
             GelGroup(params, *views) for (params, _), *views in zip(grouped, nodes, surfaces, forces, strict=True)
         )
@@ -197,66 +197,67 @@ class GelState:
         }  # fmt: skip
 
     def write_layout(self, counts: np.ndarray) -> None:
-        """Writes into the environments' counts (E, COUNTS) how gels are cut, and where each begins in the arrays."""
+        """Writes the lattice of each gel and its first indices in the arrays into the counts (E, COUNTS)."""
         for g, gel in enumerate(self.gels):
             counts[:, ELEMENTS + 3 * g : ELEMENTS + 3 * g + 3] = gel.elements
             for entry, starts in self._starts.items():
                 counts[:, entry + g] = starts[g]
 
     @property
-    def alike(self) -> GelGroup:
-        """All gels of an environment, which are cut alike."""
+    def common_group(self) -> GelGroup:
+        """The only group, for gels with equal lattices."""
         (group,) = self.groups
         return group
 
     @property
     def columns(self) -> int:
-        """Of nodes of all gels of an environment."""
+        """Number of node columns of all gels of an environment."""
         return sum((gel.elements[0] + 1) * (gel.elements[1] + 1) for gel in self.gels)
 
     def arrays(self, environment: int) -> dict[str, np.ndarray]:
-        """Views of what a motion changes, by name (see tacsim.physics.snapshot.gel_suffixes)."""
+        """Views of the arrays that a motion changes, by name (see tacsim.physics.snapshot.gel_suffixes)."""
         names = gel_suffixes(len(self.groups))
         views = {f"gel_displacement{name}": each.u[environment] for name, each in zip(names, self.groups, strict=True)}
         return views | {
             f"gel_velocity{name}": each.v[environment] for name, each in zip(names, self.groups, strict=True)
         }
 
-    def tops(self, environment: int) -> list[np.ndarray]:
+    def surface_displacements(self, environment: int) -> list[np.ndarray]:
         """Displacements of an environment's gel surfaces [mm], each (nx + 1, ny + 1, 3)."""
         return [top for group in self.groups for top in group.u[environment, :, :, :, -1]]
 
-    def shortest(self, environment: int) -> list[float]:
-        """Of each group, see `GelGroup.shortest`."""
-        return [group.shortest(environment) for group in self.groups]
+    def min_edge_length(self, environment: int) -> list[float]:
+        """`GelGroup.min_edge_length` of each group."""
+        return [group.min_edge_length(environment) for group in self.groups]
 
     def clear(self, environment: int, *, velocity_only: bool = False) -> None:
-        """Stops all nodes, and lays them back to rest unless `velocity_only`."""
+        """Sets all velocities to zero, and all displacements unless `velocity_only`."""
         for group in self.groups:
             group.v[environment] = 0.0
             if not velocity_only:
                 group.u[environment] = 0.0
 
-    def quiet(self, environment: int, fastest: float) -> bool:
-        """See `GelGroup.quiet`."""
-        return all(group.quiet(environment, fastest) for group in self.groups)
+    def is_slow_and_finite(self, environment: int, max_speed: float) -> bool:
+        """See `GelGroup.is_slow_and_finite`."""
+        return all(group.is_slow_and_finite(environment, max_speed) for group in self.groups)
 
-    def refresh(self) -> None:
-        """Copies the nodes' top layer to `surface`, and its rim outside: before a launch, since all may be written.
+    def copy_surface(self) -> None:
+        """Copies the nodes' top layer and its rim to `surface`. Called before a launch, since users may write to
+        `nodes`.
 
-        Writes zeros behind the last node: what stands there takes part in sums with weight 0, so it must be finite.
+        Writes zeros after the last node: these entries are in sums with weight 0, so they must be finite.
         """
         for group in self.groups:
-            group.refresh()
+            group.copy_surface()
 
     def arguments(self) -> tuple[np.ndarray, ...]:
-        """What every kernel with gels takes, in this order: nodes and corners with the margins round them."""
+        """Arguments of every kernel with gels, in this order: nodes and corners with their margins."""
         return self._nodes, self._surface, self._forces, self._corners, self._lattice
 
 
 def _node_shape(gel: GelParams) -> tuple[int, ...]:
     nx, ny, nz = gel.elements
-    return QUANTITIES, 3, nz + 1, padded((nx + 1) * (ny + 1))
+    return QUANTITIES, 3, nz + 1, round_up_to_lanes((nx + 1) * (ny + 1))
 
 
 def _surface_shape(gel: GelParams) -> tuple[int, ...]:
@@ -266,22 +267,22 @@ def _surface_shape(gel: GelParams) -> tuple[int, ...]:
 
 def _force_shape(gel: GelParams) -> tuple[int, ...]:
     nx, ny, _ = gel.elements
-    return COPIES, padded((nx + 1) * (ny + 1)), 4
+    return COPIES, round_up_to_lanes((nx + 1) * (ny + 1)), 4
 
 
 def _corner_shape(pieces: int, gel: GelParams) -> tuple[int, ...]:
     """pieces: parts that share a gel."""
     nx, ny, nz = gel.elements
-    blocks, halo = padded((nx + 1) * (ny + 1)) // LANES, padded(ny + 2) // LANES
+    blocks, halo = round_up_to_lanes((nx + 1) * (ny + 1)) // LANES, round_up_to_lanes(ny + 2) // LANES
     return (nz, 24, blocks + halo) if ON_DEVICE else (pieces, 2, 24, (-(-blocks // pieces) + halo) * LANES)
 
 
-def _lay_out(
+def _allocate(
     shape_of: Callable[[GelParams], tuple[int, ...]], grouped: Sequence[tuple[GelParams, int]], environments: int,
     margin: int = 0,
 ) -> tuple[np.ndarray, list[np.ndarray], list[np.ndarray]]:  # fmt: skip
-    """Zeros for an array of each gel of each environment: the whole memory, with `margin` more numbers before and
-    behind; a view of each group (environments, gels, *shape); where each gel begins, (environments,)."""
+    """Zeros for an array of each gel of each environment: the whole memory, with `margin` more numbers before and after
+    it; a view of each group (environments, gels, *shape); first index of each gel, (environments,)."""
     shapes = [shape_of(params) for params, _ in grouped]
     each = sum(number * math.prod(shape) for (_, number), shape in zip(grouped, shapes, strict=True))
     memory = aligned_zeros(environments * each + 2 * margin)
@@ -299,7 +300,7 @@ def _lattice_rows(gel: GelParams) -> np.ndarray:
     """(LATTICE_ROWS, P) of GelState.lattice."""
     nx, ny, _ = gel.elements
     nodes, row = (nx + 1) * (ny + 1), ny + 1
-    lattice = np.zeros((LATTICE_ROWS, padded(nodes)), np.float32)
+    lattice = np.zeros((LATTICE_ROWS, round_up_to_lanes(nodes)), np.float32)
     whole = np.zeros((nx + 1, row), np.float32)
     whole[:-1, :-1] = 1.0
     share = np.full((nx + 1, row), 1.0, np.float32)
@@ -316,6 +317,6 @@ def _lattice_rows(gel: GelParams) -> np.ndarray:
 
 
 def gel_surface(params: GelParams, top: np.ndarray) -> GelSurface:
-    """top: displacement of the surface's nodes (nx + 1, ny + 1, 3) [mm]."""
+    """The surface with node displacements `top` (nx + 1, ny + 1, 3) [mm]."""
     half = params.half
     return GelSurface(np.ascontiguousarray(top / np.float32(MM)), params.spacing / MM, (-half[0] / MM, -half[1] / MM))

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 from tacsim.compute.runtime import ti
 from tacsim.physics.exec import layout
-from tacsim.physics.exec.environment import Floats, record_least, record_sum
+from tacsim.physics.exec.environment import Floats, record_min, record_sum
 from tacsim.physics.exec.lanes import (
     COPIES,
     LANES,
@@ -13,16 +13,16 @@ from tacsim.physics.exec.lanes import (
     PARTS,
     bounded,
     filled,
+    hide_from_compiler,
     lanes,
     load_lanes,
-    opaque,
+    min_over_lanes,
     overwrite,
     share_start,
-    smallest_lane,
     store_lanes,
     vec4,
 )
-from tacsim.physics.gel.element import ROWS, SMALLEST, element_block
+from tacsim.physics.gel.element import MIN_VOLUME_ROW, ROWS, element_block
 
 Lattice = ti.types.ndarray(dtype=lanes, ndim=1)
 
@@ -42,7 +42,7 @@ class Gels(NamedTuple):
 
 
 class Gel(NamedTuple):
-    """One gel of an environment inside a kernel: the arrays, how it is cut, and where it begins in them."""
+    """One gel of an environment inside a kernel: the arrays, its lattice, and its first indices in the arrays."""
 
     nodes: Any
     surface: Any
@@ -81,25 +81,25 @@ def columns_of(gel: ti.template()):
 
 @ti.func
 def surface_at(gel: ti.template(), row, column):
-    """Where the four numbers of a node stand in `surface`; velocities begin in row nx + 3."""
+    """Index of the four numbers of a node in `surface`; velocities begin in row nx + 3."""
     return bounded(gel.surface_start + 4 * (row * (gel.ny + 3) + column), 1)
 
 
 @ti.func
 def contact_force_start(gel: ti.template(), copy):
-    """Where a gel's forces on its nodes begin in a copy of `contact_force`."""
+    """First index of a gel's nodal forces in a copy of `contact_force`."""
     return gel.force_start + copy * 4 * LANES * columns_of(gel)
 
 
 @ti.func
 def first_node(env: ti.template(), gel: ti.template()):
-    """Where the displacements of a gel begin in `nodes`."""
+    """First index of a gel's displacements in `nodes`."""
     return env.count(layout.GEL_NODES + gel.index)
 
 
 @ti.func
 def lattice_at(gel: ti.template(), row, block):
-    """Where a block of a row stands in `lattice`."""
+    """Index of a block of a row in `lattice`."""
     return gel.lattice_start + row * columns_of(gel) + block
 
 
@@ -107,7 +107,7 @@ def lattice_at(gel: ti.template(), row, block):
 def node_block(gel: ti.template(), to, i, j, below, above, row, zero):
     """Internal force on LANES nodes along one axis, from the elements above them, at i in `corners`, and below, at j.
 
-    to: where the force stands in `nodes`; below, above: 1 or 0, whether there are any; row: as for `element_block`.
+    to: index of the force in `nodes`; below, above: 1 if there are such elements, else 0; row: see `element_block`.
     """
     under, over = lanes(0.0), lanes(0.0)
     for p, q in ti.static(ti.ndrange(2, 2)):  # of the element that has these nodes as its corners p, q
@@ -132,7 +132,7 @@ def gel_forces(env: ti.template(), part, gels: ti.template()):
     u, corners = first_node(env, gel), env.count(layout.GEL_CORNERS + gel.index)
     rows = filled(0.0, ROWS, LANES)
     for lane in range(LANES):
-        rows[SMALLEST, lane] = 1e9
+        rows[MIN_VOLUME_ROW, lane] = 1e9
     for k in range(layers + 1):
         here = corners + (2 * piece + k % 2) * 24 * row + (halo - first) * LANES
         before = corners + (2 * piece + (k + 1) % 2) * 24 * row + (halo - first) * LANES
@@ -147,13 +147,13 @@ def gel_forces(env: ti.template(), part, gels: ti.template()):
             for d in range(3):
                 to = u + (6 + d) * axis + k * layer + block * LANES
                 node_block(gel, to, i + d * row, j + d * row, below, above, row, zero)
-    record_least(env, part, layout.SMALLEST_VOLUME, smallest_lane(rows, SMALLEST))
+    record_min(env, part, layout.SMALLEST_VOLUME, min_over_lanes(rows, MIN_VOLUME_ROW))
 
 
 @ti.func
 def add_contact_forces(env: ti.template(), gel: ti.template(), first, last, forces, axis, zero):
-    """Adds the contact forces of all parts to those on a gel's surface nodes, `first` to `last` by blocks, and leaves
-    zeros for the next substep. forces: where those along x begin, `axis` the distance to those along y and z."""
+    """Adds the contact forces of all parts to the forces on a gel's surface nodes, blocks `first` to `last`, and sets
+    them to zero for the next substep. forces: first index of forces along x; `axis`: index step to those along y, z."""
     push = filled(0.0, 4 * LANES, 1)
     turned = filled(0.0, 4, LANES)
     for block in range(first, last):
@@ -178,7 +178,7 @@ def add_contact_forces(env: ti.template(), gel: ti.template(), first, last, forc
 
 @ti.func
 def gel_of_part(env: ti.template(), gels: ti.template(), part):
-    """Number of a part's gel. On a device a part is one column, of gel 0 or behind those of gel 0."""
+    """Number of a part's gel. On a device a part is one column; those of gel 1 come after those of gel 0."""
     if ti.static(not ON_DEVICE):
         return part // (PARTS // gels.number)
     elif ti.static(gels.number == 1):
@@ -189,7 +189,7 @@ def gel_of_part(env: ti.template(), gels: ti.template(), part):
 
 @ti.func
 def nodes_of_part(env: ti.template(), gels: ti.template(), gel: ti.template(), part):
-    """Where a part notes its sums, and its columns of nodes in its gel: first block, and the one after the last."""
+    """Index at which a part records its sums; its node columns in its gel: first block, and the one after the last."""
     pieces = PARTS // gels.number
     blocks = columns_of(gel)
     slot, piece = part, part % pieces
@@ -204,7 +204,7 @@ def nodes_of_part(env: ti.template(), gels: ti.template(), gel: ti.template(), p
 
 @ti.func
 def gel_totals(env: ti.template(), part, gels: ti.template()):
-    """Whole forces on this part's nodes of its gel, contact included. Their force on the backing is noted."""
+    """Total forces on this part's nodes of its gel, with contact. Records the force on the backing."""
     gel = ti.static(gel_of(env, gels, gel_of_part(env, gels, part)))
     zero, layers, blocks = env.count(layout.ZERO), gel.layers, columns_of(gel)
     slot, first, last = nodes_of_part(env, gels, gel, part)
@@ -230,8 +230,8 @@ def gel_totals(env: ti.template(), part, gels: ti.template()):
 
 @ti.func
 def gel_advance(env: ti.template(), part, gels: ti.template()):
-    """Symplectic Euler with lumped masses on this part's nodes of its gel, and their surface. Damps the old velocity
-    only, so that force readings stay exact."""
+    """Symplectic Euler step with lumped masses for this part's nodes of its gel; writes their surface. Only the old
+    velocity is damped, so that force readings stay exact."""
     gel_totals(env, part, gels)
     gel = ti.static(gel_of(env, gels, gel_of_part(env, gels, part)))
     zero, dt, layers, blocks = env.count(layout.ZERO), env.param(layout.STEP), gel.layers, columns_of(gel)
@@ -245,7 +245,7 @@ def gel_advance(env: ti.template(), part, gels: ti.template()):
     for k in range(1, layers + 1):
         scale = ti.select(k == layers, 2.0 * rate, rate)
         for block in range(first, last):
-            share = gels.lattice[opaque(zero, lattice_at(gel, 1, block))] * scale
+            share = gels.lattice[hide_from_compiler(zero, lattice_at(gel, 1, block))] * scale
             for d in range(3):
                 x = u + d * axis + k * layer + block * LANES
                 v, f = x + 3 * axis, x + 6 * axis
@@ -253,12 +253,12 @@ def gel_advance(env: ti.template(), part, gels: ti.template()):
                 place = load_lanes(gels.nodes, x) + dt * speed
                 store_lanes(gels.nodes, v, speed, zero)
                 store_lanes(gels.nodes, x, place, zero)
-    lay_surface(env, part, gels)
+    write_surface(env, part, gels)
 
 
 @ti.func
-def lay_surface(env: ti.template(), part, gels: ti.template()):
-    """This part's nodes of the top layer, displacement and velocity, to `surface`, and its rim outside."""
+def write_surface(env: ti.template(), part, gels: ti.template()):
+    """Copies displacement and velocity of this part's nodes of the top layer to `surface`, with the rim outside."""
     gel = ti.static(gel_of(env, gels, gel_of_part(env, gels, part)))
     zero, nx, ny, layers = env.count(layout.ZERO), gel.nx, gel.ny, gel.layers
     row, count = ny + 1, (nx + 1) * (ny + 1)

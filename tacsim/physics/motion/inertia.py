@@ -1,10 +1,10 @@
-"""How a scene answers to forces: as fast as can be (scaled densities, damped), or as it truly would (in real time).
+"""Inertia of a scene: scaled densities with damping (quasi-static motions), or true densities (real time).
 
-Quasi-static motions only want the state of rest, so each material gets the density at which its pressure wave travels
-at speed 1, and is damped. A motion of given duration is dynamic: densities are the materials' own, nothing is damped
-but by plastic flow, friction and the contact's dashpots, and contact has no memory, which would create energy. Kernel
-units stay mm and MPa; the gel's pressure wave keeps speed 1, so a kernel time of 1 mm is the time that this wave truly
-needs for 1 mm.
+Quasi-static motions need the state at rest only. Each material has the density with which its pressure wave has speed
+1, and is damped. A motion with a duration is dynamic: materials have their true densities, energy is dissipated only by
+plastic flow, friction and the contact's dashpots, and contact has no memory, since memory would create energy. Kernel
+units stay mm and MPa; the gel's pressure wave has speed 1, so a kernel time of 1 mm is the true time of this wave for 1
+mm.
 """
 
 from __future__ import annotations
@@ -23,25 +23,26 @@ from tacsim.physics.units import MM, MPA
 
 @dataclass(frozen=True)
 class Inertia:
-    """The entries of the array `params` (tacsim.physics.exec.layout) that say how a scene answers to forces, and its
-    time scale."""
+    """Entries of the array `params` (tacsim.physics.exec.layout) with masses, damping and stiffness, and the time
+    scale.
+    """
 
     params: Mapping[int, float]
     step: float  # nominal substep [mm]
     second: float = math.nan  # kernel time of one second [mm]; quasi-static motions have no real time
-    held: Mapping[int, float] = field(default_factory=dict)  # entries that differ while nothing is driven
-    flowing: Mapping[int, float] = field(default_factory=dict)  # in motions that flow into one another
-    dragging: Mapping[int, float] = field(default_factory=dict)  # and in those that drag a body along
+    held: Mapping[int, float] = field(default_factory=dict)  # entries that differ in holds
+    flowing: Mapping[int, float] = field(default_factory=dict)  # in motions that pass their targets
+    dragging: Mapping[int, float] = field(default_factory=dict)  # in motions that drag a body along the gels
 
     def entries(self, launch: Launch | None = None) -> dict[int, float]:
-        """The entries for a launch; None: of one that drives something."""
+        """The entries for a launch; None: for a driven launch."""
         if launch is None:
             return dict(self.params)
-        if launch.held:
+        if launch.is_held:
             return {**self.params, **self.held}
-        if launch.flowing:
+        if launch.is_flowing:
             return {**self.params, **self.flowing}
-        return {**self.params, **(self.dragging if launch.path.dragging else {})}
+        return {**self.params, **(self.dragging if launch.path.is_drag else {})}
 
     @property
     def real_time(self) -> bool:
@@ -49,7 +50,7 @@ class Inertia:
 
 
 def kernel_second(gel: GelParams, density: float) -> float:
-    """Kernel time of one second [mm]: how far the pressure wave of a gel of `density` [kg/m^3] truly travels."""
+    """Kernel time of one second [mm]: the distance of the pressure wave in a gel with `density` [kg/m^3]."""
     return math.sqrt(gel.density / MPA / density) * MM
 
 
@@ -59,7 +60,7 @@ def kernel_density(density: float, second: float) -> float:
 
 
 def plan_real_time(start: Sequence[Pose], end: Sequence[Pose], duration: float, inertia: Inertia, lever: float) -> Path:
-    """The path of a dynamic motion; `lever` [mm]: see `of_fastest_point`.
+    """The path of a dynamic motion; `lever` [mm]: see `fastest_point_motion`.
 
     Raises ValueError for a duration [s] that is not positive, has too many substeps or less than one, or in which a
     frame would come near the speed of the gel's own waves.
@@ -70,8 +71,8 @@ def plan_real_time(start: Sequence[Pose], end: Sequence[Pose], duration: float, 
     if not ROUNDING <= duration / substep <= MAX_SUBSTEPS:
         raise ValueError(
             f"duration is {duration:.3g} s; at substeps of {substep:.3g} s (of the materials) it must lie"
-            f" between {ROUNDING * substep:.3g} and {MAX_SUBSTEPS * substep:.3g} s: is it in seconds? if so, make "
-            f"several motions of it"
+            f" between {ROUNDING * substep:.3g} and {MAX_SUBSTEPS * substep:.3g} s: is it in seconds? if so, divide it "
+            f"into several motions"
         )
     kernel_time, wave = duration * inertia.second, inertia.second / MM
     peak = PEAK_SLOPE * path_length(start, end, lever) / kernel_time

@@ -1,9 +1,9 @@
-"""Motion at a constant normal load: a sensor follows its target but along its own z axis, where its force is held.
+"""Motion at a constant normal load: a sensor follows its target, but moves along its own z axis to hold its force.
 
-The path is cut into pieces, each a settled motion. What of it brings the sensor nearer to the other frame along z is
-left out once they touch, and on each piece the sensor goes along its z by what the force is off; at the end it goes
-along its z alone until the force is right. Corrections are small: one that lets go of a contact, or presses what slips,
-changes its drag.
+The path is divided into pieces; each is a settled motion. After contact, the part of a piece that changes the distance
+to the other frame along z is left out, and the sensor moves along z by a correction from the force error. At the end of
+the path it moves along z only, until the force is within the tolerance. Corrections are small: a larger one could open
+a contact, or press a contact that slips, which changes its drag.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ from tacsim.physics.move import MoveStats
 
 
 class LoadNotReached(RuntimeError):
-    """A load that a sensor's travel along its z axis does not bring about. The world is as it was before the motion."""
+    """A load that a sensor does not reach by moving along its z axis. The world is in its state before the motion."""
 
 
 class LoadableWorld(Protocol):
-    """What a motion at constant load needs of a world."""
+    """Interface of a world that a motion at constant load needs."""
 
     scene: Scene
 
@@ -49,7 +49,7 @@ class LoadableWorld(Protocol):
 
 
 def require_loads(loads: Mapping[str, float], sensors: Sequence[str]) -> None:
-    """Raises KeyError for what is no sensor, ValueError for a load that is negative or not finite."""
+    """Raises KeyError for a name that is no sensor, ValueError for a load that is negative or not finite."""
     for name, load in loads.items():
         if name not in sensors:
             raise KeyError(f"no sensor '{name}' to hold a load; this world has {', '.join(sensors)}")
@@ -59,27 +59,28 @@ def require_loads(loads: Mapping[str, float], sensors: Sequence[str]) -> None:
 
 @dataclass
 class _NormalAxis:
-    """One sensor's z: the load wanted [N], travel from the target along z [m], and how stiff the contact is."""
+    """State of one sensor's z axis: requested load [N], travel from the target along z [m], stiffness of the
+    contact."""
 
     wanted: float
     tolerance: float  # [N]
     travel: float = 0.0
-    stiffness: float = 0.0  # [N/m] as last measured; 0: never
+    stiffness: float = 0.0  # [N/m] as last measured; 0: not measured yet
     retreat: float = math.inf  # last travel away from the contact [m]
 
-    def measure(self, travelled: float, gained: float) -> None:
-        """Takes the stiffness from a correction without a slide: how far [m], and what force that brought [N]."""
-        if travelled * gained > 0.0:
-            self.stiffness = gained / travelled
+    def measure(self, travelled: float, force_change: float) -> None:
+        """Computes the stiffness from a correction without a slide: travel [m] and force change [N]."""
+        if travelled * force_change > 0.0:
+            self.stiffness = force_change / travelled
 
     def correct(self, force: float, thickness: float) -> None:
-        """Travels towards the load; force: of the settled state that it starts from."""
+        """Changes the travel towards the load; force: of the settled state before the correction."""
         longest, error = MAX_LOAD_CORRECTION * thickness, self.wanted - force
         stiffness = self.stiffness or force / (INITIAL_LOAD_TRAVEL * thickness)
         step = math.copysign(longest, error) if abs(error) >= stiffness * longest else error / stiffness
-        if self.wanted == 0.0:  # a force fades towards nothing ever more slowly: go on until they part
+        if self.wanted == 0.0:  # a decreasing force does not reach 0 by its stiffness: move until the contact opens
             step = min(step, -longest / 4)
-        elif force == 0.0:  # not there yet; or it went too far, and then back by halves, for a stiffness knows no gap
+        elif force == 0.0:  # not in contact; if it has retreated too far, half of that: the stiffness gives no gap
             self.retreat = max(self.retreat / 2, longest / 64)
             step = min(longest, self.retreat)
         if step < 0.0:
@@ -87,14 +88,13 @@ class _NormalAxis:
         self.travel += step
 
 
-def keep_loads(
+def move_at_constant_load(
     world: LoadableWorld, start: Mapping[str, Pose], end: dict[str, Pose], loads: Mapping[str, float], refine: int, *,
-    balanced: bool, most: int = 1,
+    balanced: bool, max_readings: int = 1,
 ) -> Motion:  # fmt: skip
-    """From `start` to `end` with `loads` [N] held; `end` (the same frames, in order) becomes where the motion ended.
+    """Moves from `start` to `end` with `loads` [N] held; `end` (the same frames, in order) is set to the final poses.
 
-    Before they touch, sensors go straight to their targets. most: readings that a launch can give. Raises
-    LoadNotReached.
+    Before contact, sensors move straight to their targets. max_readings: of one launch. Raises LoadNotReached.
     """
     scene, targets = world.scene, dict(end)
     gels = {name: scene.gel_of(name) for name in scene.sensors}
@@ -111,43 +111,43 @@ def keep_loads(
         return {name: se3.interpolate_pose(start[name], target, share) for name, target in targets.items()}
 
     def gap(name: str, poses: Mapping[str, Pose]) -> float:
-        """Of a sensor's origin and that of the other frame, along the sensor's z [m]."""
+        """Distance from a sensor's origin to that of the other frame, along the sensor's z [m]."""
         (other,) = poses.keys() - {name}
         return float((poses[other].position - poses[name].position) @ se3.rotation(poses[name]).as_matrix()[:, 2])
 
     def settle_at(share: float) -> Generator[Launch, Sequence[ForceReading], None]:
-        """At `share` of the path, each loaded sensor off it by its travel."""
+        """Moves to `share` of the path, with each loaded sensor displaced by its travel, and settles."""
         poses = on_path(share)
         for name, axis in axes.items():
             z = se3.rotation(poses[name]).as_matrix()[:, 2]
             poses[name] = Pose(poses[name].position + axis.travel * z, poses[name].quaternion)
         path = replace(world.plan(list(end.values()), list(poses.values())), refine=refine)
-        done.append((yield from move_and_settle(path, scene.settling, balanced=balanced, most=most)))
+        done.append((yield from move_and_settle(path, scene.settling, balanced=balanced, max_readings=max_readings)))
         end.update(poses)
 
     def correct_at(share: float, slack: float = 0.0) -> Generator[Launch, Sequence[ForceReading], float]:
-        """The largest error [N] that is left; slack: share of the load that is near enough."""
+        """Corrects the loads; returns the largest remaining error [N]; slack: tolerance as a share of the load."""
         for _ in range(MAX_LOAD_CORRECTIONS):
             errors = {name: abs(axis.wanted - force(name)) for name, axis in axes.items()}
             wrong = [n for n, axis in axes.items() if not errors[n] <= max(axis.tolerance, slack * axis.wanted)]
             if not wrong:
                 return max(errors.values())
             before = {name: (axes[name].travel, force(name)) for name in wrong}
-            for name, (_, felt) in before.items():
-                axes[name].correct(felt, thickness[name])
+            for name, (_, force_before) in before.items():
+                axes[name].correct(force_before, thickness[name])
             beyond = [name for name in wrong if abs(axes[name].travel) > MAX_LOAD_TRAVEL * thickness[name]]
             if beyond:
                 wrong = beyond
                 break
             yield from settle_at(share)
-            for name, (travel, felt) in before.items():
-                axes[name].measure(axes[name].travel - travel, force(name) - felt)
+            for name, (travel, force_before) in before.items():
+                axes[name].measure(axes[name].travel - travel, force(name) - force_before)
         name = wrong[0]
         limit = 1e3 * MAX_LOAD_TRAVEL * thickness[name]
         raise LoadNotReached(
             f"'{name}' does not reach a load of {axes[name].wanted:g} N: {force(name):.3g} N after "
             f"{1e3 * axes[name].travel:+.3g} mm along its z axis from its target (limit {limit:.3g} mm); "
-            f"bring its target nearer to contact, or ask for another load"
+            f"move its target closer to contact, or request another load"
         )
 
     world.plan(list(start.values()), list(targets.values()))  # raises ValueError for a path that is far too long

@@ -1,9 +1,9 @@
-"""Where driven frames go, and how fast: ramps from rest to rest, and steps that flow into one another.
+"""Paths of driven frames over time: ramps from rest to rest, and steps that pass their targets.
 
-What falsifies a path-dependent state is the inertia and damping of a motion: they write plastic strain into the body.
-What the start writes, the rest of the path mostly undoes; what the stop writes stays. Hence every ramp starts and ends
-with zero velocity and zero acceleration, sets off in the time that the gel's wave needs, and slows down over all the
-rest (docs/decisions/0002-quasi-static-controller.md).
+Inertia and damping of a motion cause errors in a path-dependent state: they add plastic strain to the body. Strain that
+is added at the start is mostly undone by the rest of the path; strain that is added at the stop stays. Therefore each
+ramp starts and ends with zero velocity and zero acceleration, accelerates within the time of the gel's wave, and
+decelerates over the rest (docs/decisions/0002-quasi-static-controller.md).
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from tacsim import pose as se3
 from tacsim.interface import Pose
 from tacsim.physics.failure.health import LaunchSpan
 from tacsim.physics.motion.tuning import (
+    BLEND_VELOCITY,
     FLOW_RISE_TIME,
     MAX_SUBSTEPS,
     MIN_FLOW_TIME,
     MIN_RAMP_TIME,
-    PASSING_VELOCITY,
     READING_INTERVAL,
     ROUNDING,
     SHORT_PATH,
@@ -32,13 +32,14 @@ from tacsim.physics.motion.tuning import (
 from tacsim.physics.units import MM
 
 PEAK_SLOPE = 1.875  # of the ramp, over its mean
-PEAK_BRAKING = 2.89  # of a ramp that rises quickly: its largest deceleration times the square of its time, over its way
+PEAK_BRAKING = 2.89  # of a ramp with a short rise: largest deceleration times the square of its time, over its length
 
 
 def ramp(t: NDArray[np.float64], rise: float = 0.5) -> NDArray[np.float64]:
     """0 -> 1 with zero first and second derivative at both ends; the velocity rises until t = `rise`, then falls.
 
-    Each side is half of the quintic of minimum jerk (Flash & Hogan 1985), stretched in time; rise = 0.5 is that itself.
+    Each side is half of the quintic of minimum jerk (Flash & Hogan 1985), stretched in time; rise = 0.5 is that
+    quintic.
     """
 
     def half(x: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -49,14 +50,14 @@ def ramp(t: NDArray[np.float64], rise: float = 0.5) -> NDArray[np.float64]:
     return np.where(t < rise, PEAK_SLOPE * rise * half(up), 1.0 - PEAK_SLOPE * (1.0 - rise) * half(down))
 
 
-def lingering(rise: float, slower: float, last: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Times and shares of the way of a `ramp` whose end takes longer: `slower` times as long over the `last` share of
-    the way, from twice that on ever slower. The times go from 0 to how many times as long all of it takes."""
-    knot_count = 2001  # of the numbers that a path whose end takes longer is interpolated between
+def slow_end_ramp(rise: float, slowdown: float, end_share: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Times and path shares of a `ramp` with a slow end: `slowdown` times slower over the last `end_share` of the path,
+    with a transition over the same length before it. The last time is the factor for the whole duration."""
+    knot_count = 2001  # of the interpolation
     knots = np.linspace(0.0, 1.0, knot_count)
     shares = ramp(knots, rise)
-    near = np.clip(2.0 - (1.0 - shares) / last, 0.0, 1.0)
-    longer = 1.0 + (slower - 1.0) * near**2 * (3.0 - 2.0 * near)
+    near = np.clip(2.0 - (1.0 - shares) / end_share, 0.0, 1.0)
+    longer = 1.0 + (slowdown - 1.0) * near**2 * (3.0 - 2.0 * near)
     return np.append(0.0, np.cumsum((longer[1:] + longer[:-1]) / 2.0)) / (knot_count - 1), shares
 
 
@@ -64,20 +65,20 @@ def lingering(rise: float, slower: float, last: float) -> tuple[NDArray[np.float
 class Path:
     """Driven frames move from `start` to `end` in `substeps` nominal substeps of `dt` [mm, wave speed 1].
 
-    Each nominal substep is cut into `refine` real ones; all counts of substeps are nominal. interval: substeps of the
-    hold at its end between two readings of the forces. rise: share of the time in which the velocity rises, of `ramp`.
-    lingers: how many times slower its end is, and over which last share of the way, of a path from rest to rest.
+    Each nominal substep is divided into `refine` real ones; all counts of substeps are nominal. interval: substeps
+    between two readings of the forces in a hold. rise: share of the time in which the velocity increases, of `ramp`.
+    slow_end: for a path from rest to rest, slowdown of its end and the last share of the path with it.
 
-    unfollowed: why it does not end as a slow one, and what to do; empty where it does.
-    creeps: what it moves yields, and creeps on when it has ended.
-    max_force_loss: how much of its force the hold may take, if it shall end as a slow one: see
+    unsettled_reason: why it does not end in the state of a slow motion, and advice; empty where it does.
+    is_creeping: the moved body yields, and creeps after the motion.
+    max_force_loss: largest decrease of force in the hold with which the end counts as that of a slow motion: see
     `tacsim.physics.motion.controller.force_loss`.
-    growing: how far it presses an indenter in while it slides it: see `tacsim.physics.motion.slide.growth`.
-    turning: how much of an indenter's drag lies across the way that it is slid: see `tacsim.physics.motion.slide.turn`.
-    dragging: it drags a body along the gels, which may slip.
+    growth_share: indentation during a slide of an indenter: see `tacsim.physics.motion.slide.growth_share`.
+    turn_share: share of an indenter's drag across its slide: see `tacsim.physics.motion.slide.turn_share`.
+    is_drag: it drags a body along the gels, which may slip.
 
     rates: velocities at start and end, each (frames, 6), linear and angular, world axes [-, rad/mm], of a path that is
-    not from rest to rest. The one turns into the other within `rise`, and a ramp does the rest of the way.
+    not from rest to rest. The velocity changes from the first to the second within `rise`; a ramp covers the rest.
     """
 
     start: Sequence[Pose]
@@ -87,13 +88,13 @@ class Path:
     refine: int = 1
     interval: int = 20
     rise: float = 0.5
-    lingers: tuple[float, float] | None = None
-    unfollowed: str = ""
-    creeps: bool = False
+    slow_end: tuple[float, float] | None = None
+    unsettled_reason: str = ""
+    is_creeping: bool = False
     max_force_loss: float = math.inf
-    growing: float = 0.0
-    turning: float = 0.0
-    dragging: bool = False
+    growth_share: float = 0.0
+    turn_share: float = 0.0
+    is_drag: bool = False
     rates: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
 
     @property
@@ -102,8 +103,8 @@ class Path:
         return self.dt / self.refine
 
     def peak_mach(self, lever: float) -> float:
-        """Of its fastest point, of a path from rest to rest, at most; lever: see `of_fastest_point`."""
-        longer = 1.0 if self.lingers is None else float(lingering(self.rise, *self.lingers)[0][-1])
+        """Largest Mach number of the fastest point, for a path from rest to rest; lever: see `fastest_point_motion`."""
+        longer = 1.0 if self.slow_end is None else float(slow_end_ramp(self.rise, *self.slow_end)[0][-1])
         return PEAK_SLOPE * longer * path_length(self.start, self.end, lever) / (max(self.substeps, 1) * self.dt)
 
     def drive(self, first: int, last: int) -> NDArray[np.float32]:
@@ -121,7 +122,7 @@ class Path:
         out[:, :, 3] += moved[1:, :, :3]
         out[:, :, 4] = np.diff(moved[..., :3], axis=0) / self.step
         for index in np.flatnonzero(moved[..., 3:].any(axis=(0, 2))).tolist():
-            from scipy.spatial.transform import Rotation  # slow to import, and most motions turn nothing
+            from scipy.spatial.transform import Rotation  # slow to import, and most motions have no rotation
 
             turned = Rotation.from_rotvec(moved[:, index, 3:]) * Rotation.from_quat(self.start[index].quaternion)
             out[:, index, :3] = turned[1:].as_matrix()
@@ -129,7 +130,7 @@ class Path:
         return np.ascontiguousarray(out, np.float32)
 
     def _displacements(self, knots: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(n, frames, 6) from the start: [mm], rotation vector [rad], at shares `knots` (n,) of the time."""
+        """(n, frames, 6) from the start: [mm], rotation vector [rad], at shares `knots` (n,) of the duration."""
         t = np.clip(knots, 0.0, 1.0)[:, None, None]
         whole = displacements_between(self.start, self.end)
         if self.rates is None:
@@ -142,14 +143,14 @@ class Path:
         return moved
 
     def _progress(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Shares of the way at shares `t` of the time, of a path from rest to rest."""
-        if self.lingers is None:
+        """Path shares at shares `t` of the duration, for a path from rest to rest."""
+        if self.slow_end is None:
             return ramp(t, self.rise)
-        times, shares = lingering(self.rise, *self.lingers)
+        times, shares = slow_end_ramp(self.rise, *self.slow_end)
         return np.asarray(np.interp(t * times[-1], times, shares))
 
     def span(self, names: Iterable[str], first: int, last: int) -> LaunchSpan:
-        """Substeps first..last in words, and where the frames called `names` are at their end."""
+        """Text for substeps first..last, and the poses of the frames called `names` at their end."""
         if not self.substeps:
             return LaunchSpan("in the hold after the motion", dict(zip(names, self.start, strict=True)))
         words = f"in substeps {first} to {last} of {self.substeps} of the motion"
@@ -166,7 +167,7 @@ class Path:
 
 @lru_cache(maxsize=64)
 def _matrix(*quaternion: float) -> NDArray[np.float64]:
-    """Rotation matrix (3, 3) of a frame that does not turn: most never do."""
+    """Rotation matrix (3, 3); cached, since most frames do not rotate."""
     return se3.rotation_matrix(Pose(quaternion=np.array(quaternion)))
 
 
@@ -174,7 +175,7 @@ def displacement_between(a: Pose, b: Pose) -> NDArray[np.float64]:
     """(6,) from a to b: [mm], rotation vector [rad], world axes."""
     displacement = np.zeros(6)
     displacement[:3] = (b.position - a.position) * MM
-    if not np.array_equal(a.quaternion, b.quaternion):  # most motions turn nothing, and that is seen at once
+    if not np.array_equal(a.quaternion, b.quaternion):  # most motions have no rotation
         from scipy.spatial.transform import Rotation
 
         displacement[3:] = (Rotation.from_quat(b.quaternion) * Rotation.from_quat(a.quaternion).inv()).as_rotvec()
@@ -186,38 +187,39 @@ def displacements_between(start: Sequence[Pose], end: Sequence[Pose]) -> NDArray
     return np.array([displacement_between(a, b) for a, b in zip(start, end, strict=True)])
 
 
-def of_fastest_point(vectors: NDArray[np.float64], lever: float) -> float:
-    """Displacements or rates (frames, 6), linear and angular, to that of the fastest point; `lever` [mm]: from a
-    frame's origin to the gel's rim."""
+def fastest_point_motion(vectors: NDArray[np.float64], lever: float) -> float:
+    """Displacement or speed of the fastest point, from displacements or rates (frames, 6), linear and angular; `lever`
+    [mm]: distance from a frame's origin to the gel's rim."""
     linear, angular = (np.linalg.norm(part, axis=1) for part in np.split(vectors, 2, axis=1))
     return float((linear + lever * angular).max())
 
 
 def path_length(start: Sequence[Pose], end: Sequence[Pose], lever: float) -> float:
-    """Of the fastest point [mm]; lever: see `of_fastest_point`."""
-    return of_fastest_point(displacements_between(start, end), lever)
+    """Displacement of the fastest point [mm]; lever: see `fastest_point_motion`."""
+    return fastest_point_motion(displacements_between(start, end), lever)
 
 
-def path_along(start: Sequence[Pose], end: Sequence[Pose], lever: float) -> float:
-    """What of it goes along the surface of the first frame, a sensor, turns included [mm]."""
+def tangential_path_length(start: Sequence[Pose], end: Sequence[Pose], lever: float) -> float:
+    """The same along the surface of the first frame, a sensor, with rotations [mm]."""
     displacements = displacements_between(start, end)
     normal = se3.rotation_matrix(start[0])[:, 2]
     displacements[:, :3] -= np.outer(displacements[:, :3] @ normal, normal)
-    return of_fastest_point(displacements, lever)
+    return fastest_point_motion(displacements, lever)
 
 
-def plan(
+def plan_path(
     start: Sequence[Pose], end: Sequence[Pose], mach: float, dt: float, lever: float, thickness: float, *,
-    remembered: float = 0.0, short: float = SHORT_PATH, slower: float = 1.0, last: float = 0.0, shortest: float = 0.0,
+    memory_length: float = 0.0, short_length: float = SHORT_PATH, end_slowdown: float = 1.0, end_length: float = 0.0,
+    min_time: float = 0.0,
 ) -> Path:  # fmt: skip
-    """A path whose fastest point moves at peak Mach `mach`; it lasts no less than MIN_RAMP_TIME gel thicknesses [mm],
-    since a shorter jolt mostly makes the gel ring, and reaches its full speed within half of that.
+    """A path whose fastest point has the peak Mach number `mach`. It takes at least MIN_RAMP_TIME gel thicknesses [mm],
+    since a shorter motion mostly excites oscillations of the gel, and accelerates within half of that time.
 
-    remembered: length of the path [mm] whose stop leaves a trace: all of it in a body that yields; in friction what
-    of it goes along the surface, where the stop finds the gel. The trace grows with how hard the path brakes, so
-    those shorter than `short` gel thicknesses go slower: with the root of their length, the same braking for all.
-    slower: than that, how many times, the `last` [mm] of it is; see `lingering`.
-    shortest: time [mm, wave speed 1] that it lasts at least.
+    memory_length: length [mm] whose stop changes the final state: the whole path for a body that yields; with friction
+    the part along the surface. The change grows with the deceleration. Therefore paths shorter than `short_length` gel
+    thicknesses are slower, with a speed proportional to the root of their length: the same deceleration for all.
+    end_slowdown: factor by which the last `end_length` [mm] is slower; see `slow_end_ramp`.
+    min_time: smallest duration [mm, wave speed 1].
 
     Raises ValueError for a path that takes more than MAX_SUBSTEPS.
     """
@@ -225,35 +227,36 @@ def plan(
     length = path_length(start, end, lever)
     if length == 0:
         return Path(start, end, 0, dt, interval=interval)
-    braked = math.sqrt(remembered * max(remembered, short * thickness))
-    lasting = max(PEAK_SLOPE * max(length, braked) / mach, MIN_RAMP_TIME * thickness, shortest)
-    rise, lingers = MIN_RAMP_TIME * thickness / 2 / lasting, None
-    if slower > 1.0:
-        lingers = slower, last / length
-        lasting *= float(lingering(rise, *lingers)[0][-1])
-    substeps = _substeps(lasting / dt, length, mach)
-    return Path(start, end, substeps, dt, interval=interval, rise=rise, lingers=lingers)
+    braked = math.sqrt(memory_length * max(memory_length, short_length * thickness))
+    duration = max(PEAK_SLOPE * max(length, braked) / mach, MIN_RAMP_TIME * thickness, min_time)
+    rise, lingers = MIN_RAMP_TIME * thickness / 2 / duration, None
+    if end_slowdown > 1.0:
+        lingers = end_slowdown, end_length / length
+        duration *= float(slow_end_ramp(rise, *lingers)[0][-1])
+    substeps = _substeps(duration / dt, length, mach)
+    return Path(start, end, substeps, dt, interval=interval, rise=rise, slow_end=lingers)
 
 
 def plan_flow(
     start: Sequence[Pose], end: Sequence[Pose], rates: NDArray[np.float64], mach: float, dt: float, lever: float,
     thickness: float,
 ) -> Path:  # fmt: skip
-    """The path of a step that flows: from `start`, left at `rates` (frames, 6), to `end`, passed at PASSING_VELOCITY
-    times its mean. That is Mach `mach`; slower with the root of the length where it is less than SHORT_PATH gel
-    thicknesses [mm], as in `plan`. With no displacement and at rest it has no substeps. Raises as `plan` does."""
+    """The path of a flowing step from `start`, with velocities `rates` (frames, 6), to `end`, which it passes at
+    BLEND_VELOCITY times its mean velocity. The mean has Mach number `mach`, and less for paths shorter than SHORT_PATH
+    gel thicknesses [mm], as in `plan_path`. Without displacement and velocity it has no substeps. Raises ValueError
+    like `plan_path`."""
     displacements = displacements_between(start, end)
     interval = math.ceil(READING_INTERVAL * thickness / dt)
     if not (displacements.any() or rates.any()):
         return Path(start, end, 0, dt, interval=interval)
-    length = of_fastest_point(displacements, lever)
+    length = fastest_point_motion(displacements, lever)
     braked = math.sqrt(length * max(length, SHORT_PATH * thickness))
     substeps = _substeps(max(braked / mach, MIN_FLOW_TIME * thickness) / dt - ROUNDING, length, mach)
-    lasting = substeps * dt
-    rise = min(FLOW_RISE_TIME * thickness / lasting, 0.5)
+    duration = substeps * dt
+    rise = min(FLOW_RISE_TIME * thickness / duration, 0.5)
     return Path(
         start, end, substeps, dt, interval=interval, rise=rise,
-        rates=(rates, PASSING_VELOCITY * displacements / lasting),
+        rates=(rates, BLEND_VELOCITY * displacements / duration),
     )  # fmt: skip
 
 
@@ -262,13 +265,13 @@ def _substeps(count: float, length: float, mach: float) -> int:
     if not count <= MAX_SUBSTEPS:
         raise ValueError(
             f"a path of {length / MM:.3g} m at Mach {mach:.3g} would take {count:.2g} substeps (limit "
-            f"{MAX_SUBSTEPS:,}); are the targets in metres? if so, go there in several motions, or faster"
+            f"{MAX_SUBSTEPS:,}); are the targets in metres? if so, use several motions, or a higher speed"
         )
     return math.ceil(count)
 
 
 def resolve_targets(poses: Mapping[str, Pose], targets: Mapping[str, Pose]) -> dict[str, Pose]:
-    """Where every driven frame ends. Raises KeyError for a frame that is not driven."""
+    """Target of every driven frame. Raises KeyError for a frame that is not driven."""
     unknown = [str(name) for name in targets if name not in poses]
     if unknown:
         raise KeyError(f"no driven frame {', '.join(unknown)}; this world drives {', '.join(poses)}")

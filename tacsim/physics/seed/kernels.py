@@ -10,7 +10,7 @@ All particles lie in one array: lower gel, upper gel, body. Loops are serial and
 from typing import Any, NamedTuple
 
 from tacsim.compute.runtime import ti
-from tacsim.physics.body.material import UNREACHABLE_LIMIT, full, stress_small_strain, vec6
+from tacsim.physics.body.material import UNREACHABLE_LIMIT, full_matrix, stress_small_strain, vec6
 
 f32 = ti.f32
 Vec3 = ti.types.vector(3, f32)
@@ -53,14 +53,14 @@ class Step:
     reach: f32  # a gel and a body closer than this touch
     gel_damping: f32  # rate [1/mm]
     body_damping: f32  # along z
-    sway_damping: f32  # of the body, along x and y
+    lateral_damping: f32  # of the body, along x and y
     cells: ti.i32  # node layers between the two backing planes
     gels: ti.i32  # particles of one gel
 
 
 class Particles(NamedTuple):
-    """All particles inside a kernel (docs/decisions/0012): their positions, velocities, APIC matrices, deformation
-    gradients, Kirchhoff stresses, and whether each has left the grid."""
+    """All particles inside a kernel (docs/decisions/0012): positions, velocities, APIC matrices, deformation gradients,
+    Kirchhoff stresses, and flags of those that have left the grid."""
 
     x: Any
     v: Any
@@ -71,7 +71,7 @@ class Particles(NamedTuple):
 
 
 class Grid(NamedTuple):
-    """The grid inside a kernel, and where it lies in this substep."""
+    """The grid inside a kernel, and its place in this substep."""
 
     nodes: Any
     origin: Any
@@ -79,53 +79,54 @@ class Grid(NamedTuple):
 
 
 @ti.func
-def row(drive: ti.template(), n, sensor, r):
+def drive_row(drive: ti.template(), n, sensor, r):
     return Vec3(drive[n, sensor, r, 0], drive[n, sensor, r, 1], drive[n, sensor, r, 2])
 
 
 @ti.func
-def face(drive: ti.template(), n, sensor, dt):
-    """Sensor origin (the gel's rest surface) at the start of substep n; the drive table holds its end."""
-    return row(drive, n, sensor, 3) - dt * row(drive, n, sensor, 4)
+def surface_origin(drive: ti.template(), n, sensor, dt):
+    """Sensor origin (the gel's rest surface) at the start of substep n; the drive table has the end."""
+    return drive_row(drive, n, sensor, 3) - dt * drive_row(drive, n, sensor, 4)
 
 
 @ti.func
 def driven_velocity(drive: ti.template(), n, sensor, at, dt):
-    """Velocity of a sensor's rigid frame at `at`; the chord of its turn (series in the small angle) keeps radii."""
-    r = at - face(drive, n, sensor, dt)
+    """Velocity of a sensor's rigid frame at `at`, from the chord of its rotation (series in the small angle), which
+    keeps radii."""
+    r = at - surface_origin(drive, n, sensor, dt)
     spin = drive[n, sensor, 5, 2]
     angle = spin * dt
     along, inward = spin * (1.0 - angle * angle / 6.0), 0.5 * spin * angle
-    return row(drive, n, sensor, 4) + Vec3(-along * r[1] - inward * r[0], along * r[0] - inward * r[1], 0.0)
+    return drive_row(drive, n, sensor, 4) + Vec3(-along * r[1] - inward * r[0], along * r[0] - inward * r[1], 0.0)
 
 
 @ti.func
-def vertical(drive: ti.template(), n, step):
-    """Origin and spacing of the grid in z: both backing planes lie on node planes, so no gel can slip.
+def vertical_grid(drive: ti.template(), n, step):
+    """Origin and spacing of the grid in z: both backing planes lie on node planes, so gels do not slip on them.
 
-    A backing plane that moves through the nodes of a fixed grid lets its gel slip by up to a cell.
+    With a backing plane that moves through the nodes of a fixed grid, the gel could slip by up to a cell.
     """
-    low = face(drive, n, 0, step.dt)[2] - step.thickness
-    high = face(drive, n, 1, step.dt)[2] + step.thickness
+    low = surface_origin(drive, n, 0, step.dt)[2] - step.thickness
+    high = surface_origin(drive, n, 1, step.dt)[2] + step.thickness
     spacing = (high - low) / step.cells
     return low - PAD * spacing, spacing
 
 
 @ti.func
-def weights(fx):
+def spline_weights(fx):
     """Quadratic B-spline weights of the three nodes, one row a node."""
     return ti.Matrix.rows([0.5 * (1.5 - fx) ** 2, 0.75 - (fx - 1.0) ** 2, 0.5 * (fx - 0.5) ** 2])
 
 
 @ti.func
-def inside(X, nodes: ti.template()):
+def is_inside_grid(X, nodes: ti.template()):
     """Whether the stencil of a particle at grid coordinates X lies in the grid; False for NaN."""
     ok = X[0] > 0.5 and X[1] > 0.5 and X[2] > 0.5
     return ok and X[0] < nodes.shape[0] - 1.5 and X[1] < nodes.shape[1] - 1.5 and X[2] < nodes.shape[2] - 1.5
 
 
 @ti.func
-def turn(a, b):
+def column_rotation(a, b):
     """Cosine and sine of the Jacobi rotation that makes two columns orthogonal."""
     gap, dot = b.dot(b) - a.dot(a), 2.0 * a.dot(b)
     t = dot / (ti.abs(gap) + ti.sqrt(gap * gap + dot * dot) + 1e-30)
@@ -139,18 +140,18 @@ def left_singular(F):
     """U and S of F = U S V^T by one-sided Jacobi rotations of the columns (Hestenes 1958); S positive, unsorted."""
     b0, b1, b2 = Vec3(F[0, 0], F[1, 0], F[2, 0]), Vec3(F[0, 1], F[1, 1], F[2, 1]), Vec3(F[0, 2], F[1, 2], F[2, 2])
     for _ in ti.static(range(SWEEPS)):
-        c, s = turn(b0, b1)
+        c, s = column_rotation(b0, b1)
         b0, b1 = c * b0 - s * b1, s * b0 + c * b1
-        c, s = turn(b0, b2)
+        c, s = column_rotation(b0, b2)
         b0, b2 = c * b0 - s * b2, s * b0 + c * b2
-        c, s = turn(b1, b2)
+        c, s = column_rotation(b1, b2)
         b1, b2 = c * b1 - s * b2, s * b1 + c * b2
     S = Vec3(b0.norm(), b1.norm(), b2.norm())
     return ti.Matrix.cols([b0 / S[0], b1 / S[1], b2 / S[2]]), S
 
 
 @ti.func
-def principal(U, values):
+def from_principal_values(U, values):
     """U diag(values) U^T."""
     scaled = U
     for a, b in ti.static(ti.ndrange(3, 3)):
@@ -173,9 +174,9 @@ def return_mapping(F, solid):
     elastic = F
     if dg > 0.0:
         flow = (dg / norm) * dev
-        elastic = principal(U, ti.exp(-flow)) @ F  # V^T = S^-1 U^T F, so V itself is not needed
+        elastic = from_principal_values(U, ti.exp(-flow)) @ F  # V^T = S^-1 U^T F, so V itself is not needed
         e -= flow
-    return elastic, principal(U, 2.0 * solid.mu * e + 3.0 * solid.lam * mean)
+    return elastic, from_principal_values(U, 2.0 * solid.mu * e + 3.0 * solid.lam * mean)
 
 
 @ti.func
@@ -190,14 +191,14 @@ def finger_strain(F):
 
 @ti.func
 def body_law(F, solid):
-    """Elastic F and Kirchhoff stress of the body; one that never yields needs no return, and up to a strain of some 0.2
-    no singular values either (tacsim.physics.body.material)."""
+    """Elastic F and Kirchhoff stress of the body. A body that never yields needs no return mapping, and up to a strain
+    of about 0.2 no singular values (tacsim.physics.body.material)."""
     elastic = F
     tau = Mat3(0.0)
     large = 1
     if solid.limit >= UNREACHABLE_LIMIT:
         near, large = stress_small_strain(finger_strain(F), solid.mu, solid.lam + 2.0 / 3.0 * solid.mu)
-        tau = full(near)
+        tau = full_matrix(near)
     if large != 0:
         elastic, tau = return_mapping(F, solid)
     return elastic, tau
@@ -215,17 +216,17 @@ def neo_hookean(F, solid):
 
 @ti.func
 def particle_to_grid(particles: ti.template(), grid: ti.template(), step, gel, body, health: ti.template()):
-    """Scatters momentum, mass and the impulse of stress; sets aside (and so counts) particles outside the grid."""
+    """Scatters momentum, mass and the impulse of stress; flags particles outside the grid, which are left out."""
     for p in range(particles.x.shape[0]):
         X = ti.cast((particles.x[p] - grid.origin) / grid.spacing, f32)
-        if particles.aside[p] == 0 and not inside(X, grid.nodes):
+        if particles.aside[p] == 0 and not is_inside_grid(X, grid.nodes):
             particles.aside[p] = 1
             if p < 2 * step.gels:
                 health[1] += 1.0
         if particles.aside[p] == 0:
             base = ti.floor(X - 0.5, ti.i32)
             fx = X - base
-            w = weights(fx)
+            w = spline_weights(fx)
             mass, volume = gel.mass, gel.volume
             if p >= 2 * step.gels:
                 mass, volume = body.mass, body.volume
@@ -247,9 +248,10 @@ def particle_to_grid(particles: ti.template(), grid: ti.template(), step, gel, b
 
 @ti.func
 def update_grid(grid: ti.template(), drive: ti.template(), n, step, backing: ti.template()):
-    """Momentum -> velocity; nodes on and behind a backing plane move with their sensor and give it their momentum.
+    """Momentum -> velocity; nodes on and behind a backing plane move with their sensor and transfer their momentum to
+    it.
 
-    `backing` = force and torque on each sensor, about its origin, world axes.
+    `backing`: force and torque on each sensor, about its origin, world axes.
     """
     for s, a in ti.ndrange(2, 6):
         backing[s, a] = 0.0
@@ -262,7 +264,7 @@ def update_grid(grid: ti.template(), drive: ti.template(), n, step, backing: ti.
                 at = grid.origin + grid.spacing * Vec3(i, j, k)
                 driven = driven_velocity(drive, n, s, at, step.dt)
                 force = (q[3] / step.dt) * (u - driven)
-                torque = (at - face(drive, n, s, step.dt)).cross(force)
+                torque = (at - surface_origin(drive, n, s, step.dt)).cross(force)
                 for a in ti.static(range(3)):
                     backing[s, a] += force[a]
                     backing[s, a + 3] += torque[a]
@@ -278,7 +280,7 @@ def grid_to_particle(particles: ti.template(), grid: ti.template(), step, gel, b
             X = ti.cast((particles.x[p] - grid.origin) / grid.spacing, f32)
             base = ti.floor(X - 0.5, ti.i32)
             fx = X - base
-            w = weights(fx)
+            w = spline_weights(fx)
             velocity = Vec3(0.0)
             gradient = Mat3(0.0)
             for i, j in ti.static(ti.ndrange(3, 3)):
@@ -315,14 +317,14 @@ def grid_to_particle(particles: ti.template(), grid: ti.template(), step, gel, b
 
 @ti.func
 def body_reference(drive: ti.template(), n, z, motion: ti.template(), step):
-    """Velocity that the body would have at height z if it followed the sensors without inertia; damping pulls to it.
+    """Velocity of a body without inertia at height z; damping acts relative to it.
 
-    `motion` = mean velocity (3), lowest and highest z of the body one substep ago. Between two touching gels: along z
-    linear from one sensor to the other, laterally its own mean; on one gel: with that sensor; on none: at rest.
+    `motion`: mean velocity (3), lowest and highest z of the body one substep ago. Between two touching gels: along z
+    linear from one sensor to the other, laterally the body's mean; on one gel: that sensor's velocity; on none: zero.
     """
-    low, high = face(drive, n, 0, step.dt)[2], face(drive, n, 1, step.dt)[2]
+    low, high = surface_origin(drive, n, 0, step.dt)[2], surface_origin(drive, n, 1, step.dt)[2]
     on_low, on_high = motion[3] - low < step.reach, high - motion[4] < step.reach
-    v_low, v_high = row(drive, n, 0, 4), row(drive, n, 1, 4)
+    v_low, v_high = drive_row(drive, n, 0, 4), drive_row(drive, n, 1, 4)
     velocity = Vec3(0.0)
     if on_low and on_high:
         share = ti.min(ti.max((z - low) / (high - low), 0.0), 1.0)
@@ -341,9 +343,9 @@ def advection(
     particles: ti.template(), drive: ti.template(), n, step, gel, motion: ti.template(), momentum: ti.template(),
     gain: ti.template(),
 ):  # fmt: skip
-    """Moves the particles, then damps their velocity (afterwards: damping must not scale the forces).
+    """Moves the particles, then damps their velocity (after the forces are measured).
 
-    `gain` = momentum that each gel gained in this substep before damping, per time: contact minus backing force.
+    `gain`: momentum change of each gel in this substep before damping, per time: contact minus backing force.
     """
     mean, lowest, highest, count = Vec3(0.0), 1e30, -1e30, 0
     for s in range(2):
@@ -367,7 +369,7 @@ def advection(
             count += 1
             lowest, highest = ti.min(lowest, at[2]), ti.max(highest, at[2])
             excess = particles.v[p] - body_reference(drive, n, at[2], motion, step)
-            rate = Vec3(step.sway_damping, step.sway_damping, step.body_damping)
+            rate = Vec3(step.lateral_damping, step.lateral_damping, step.body_damping)
             particles.v[p] = particles.v[p] - step.dt * rate * excess
     if count > 0:
         for a in ti.static(range(3)):
@@ -380,10 +382,10 @@ def advance(
     x: Positions, v: Vectors, C: Matrices, F: Matrices, stress: Matrices, aside: Flags, nodes: GridNodes, drive: Drive,
     motion: Scalars, momentum: Table, gain: Table, backing: Table, health: Scalars, gel: Solid, body: Solid, step: Step,
 ):  # fmt: skip
-    """Many substeps of the whole scene in one launch, one a row of `drive`."""
+    """Many substeps of the whole scene in one launch, one for each row of `drive`."""
     ti.loop_config(serialize=True)
     for n in range(drive.shape[0]):
-        z0, dz = vertical(drive, n, step)
+        z0, dz = vertical_grid(drive, n, step)
         particles = ti.static(Particles(x, v, C, F, stress, aside))
         origin, spacing = Vec3(step.x0, step.y0, z0), Vec3(step.dx, step.dx, dz)
         grid = ti.static(Grid(nodes, origin, spacing))

@@ -11,8 +11,8 @@ CONTACT_REACH = 1.5  # [cells] gap at which contact through the grid begins
 # along z, near critical for the bounce between the gels, and across z, where the gels are softer
 GEL_ZETA, BODY_ZETA, BODY_ZETA_ACROSS = 1.0, 0.8, 0.12
 READING_INTERVAL = 20  # [substeps] of the hold between two readings of the forces
-MIN_SUBSTEPS = 60  # of a motion: a start in fewer is a blow, which leaves false plastic strain
-GRID_OVERHANG = 1.0  # [gel widths] of the grid beyond the gels' rim; a particle farther out is set aside
+MIN_SUBSTEPS = 60  # of a motion: a start in fewer substeps is an impact, which adds wrong plastic strain
+GRID_OVERHANG = 1.0  # [gel widths] of the grid beyond the gels' rim; a particle farther out is left out
 MIN_CELL_HEIGHT = 0.72  # [lateral spacing] of the grid, down to which the number of layers is kept
-GRID_MARGIN = 3  # [cells] of grid round the particles
-MAX_TILT = 1e-3  # [rad] tilt up to here is ignored, beyond it is refused
+GRID_MARGIN = 3  # [cells] of grid around the particles
+MAX_TILT = 1e-3  # [rad] a smaller tilt is neglected, a larger one is refused

@@ -1,7 +1,7 @@
-"""Many worlds in one launch of kernels, each at its own phase of its own motion.
+"""Many worlds in one launch of kernels, each in another phase of its motion.
 
-Threads of one world synchronise twice a substep; in a batch each environment has a thread to itself. Every environment
-ends as it would alone, to the bit.
+Threads of one world synchronise twice a substep; in a batch each environment has its own thread. Each environment ends
+with the same bits as a single world.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ Result = MoveStats | SimulationDiverged | LoadNotReached | None
 class Batch(NotCopyable):
     """Worlds of several scenes, all with bodies or all with indenters, whose gels share one lattice.
 
-    All else is each scene's own: materials, friction, body or indenter, number of particles, settling. Each of `worlds`
-    can also move alone, be read and be restored like any other world, and no other changes.
+    All else may differ: materials, friction, body or indenter, number of particles, settling. Each of `worlds` can also
+    be moved, read and restored like a single world, without effect on the others.
     """
 
     _instead = "Batch(scenes) and restore each world's snapshot()"
 
     def __init__(self, scenes: Sequence[Scene]) -> None:
-        """Raises ValueError for scenes that cannot share a launch, and says which."""
+        """Raises ValueError for scenes that cannot share a launch; the message names them."""
         _require_one_kind(scenes)
         self._state: HybridState | PressState
         self.worlds: tuple[HybridWorld | PressWorld, ...]
@@ -47,7 +47,7 @@ class Batch(NotCopyable):
             self.worlds = tuple(PressWorld(scene, press, index) for index, scene in enumerate(scenes))
 
     def replace(self, index: int, scene: Scene) -> None:
-        """Makes one environment a new world of another scene; the world that it was must not be used any more.
+        """Makes one environment a new world of another scene; its old world must not be used after that.
 
         Raises ValueError for a scene that cannot share a launch with the others, or has an indenter.
         """
@@ -66,15 +66,15 @@ class Batch(NotCopyable):
         *,
         flow: bool = False,
     ) -> list[Result]:
-        """`World.move` of every environment at once; None in `targets`: this one rests, and nothing of it changes.
-        `duration` and `flow` hold for all motions.
+        """`World.move` of all environments together; None in `targets`: this environment rests and does not change.
+        `duration` and `flow` apply to all motions.
 
-        Returns the outcome of each: the error of a motion that fails is not raised but returned, with that world as it
-        was before. Retries of one do not delay the others.
+        Returns the result of each. The error of a motion that fails is returned, not raised, and its world is restored.
+        Retries of one environment do not delay the others.
 
-        Raises ValueError for a wrong number of targets or loads, or a load of an environment that rests; what
-        `World.move` raises for a command that makes no sense, before anything moves. On an interruption, worlds that
-        are still moving are restored.
+        Raises ValueError for a wrong number of targets or loads, or a load of an environment that rests; the errors of
+        `World.move` for a command that is not valid, before anything moves. On an interruption, worlds that are still
+        moving are restored.
         """
         if loads is None:
             loads = [None] * len(self.worlds)
@@ -94,7 +94,7 @@ class Batch(NotCopyable):
         wanted: dict[int, Launch] = {}
 
         def resume(index: int, step: Callable[[], Launch]) -> None:
-            """Runs one motion up to the next launch that it wants, or to its end."""
+            """Runs one motion to its next launch, or to its end."""
             wanted.pop(index, None)
             try:
                 wanted[index] = step()
@@ -124,7 +124,7 @@ class Batch(NotCopyable):
 
     @launching()
     def _advance(self, wanted: Mapping[int, Launch]) -> dict[int, list[ForceReading] | SimulationDiverged]:
-        """One launch for all environments that want one; an environment that fails does not touch the others."""
+        """One launch for all environments with a request; an environment that fails has no effect on the others."""
         results: dict[int, list[ForceReading] | SimulationDiverged] = {}
         ready = {}
         for index, launch in wanted.items():
@@ -148,16 +148,17 @@ def _require_one_kind(scenes: Sequence[Scene]) -> None:
     seeds = [index for index, scene in enumerate(scenes) if scene.physics == "seed"]
     if seeds:
         raise ValueError(
-            f"{_named(seeds)}: physics 'seed' does not run in a batch; use physics 'hybrid', or a world each"
+            f"{_list_environments(seeds)}: physics 'seed' does not run in a batch; use physics 'hybrid', or single "
+            "worlds"
         )
     pressed = [index for index, scene in enumerate(scenes) if scene.indenter is not None]
     if pressed and len(pressed) < len(scenes):
         others = [index for index in range(len(scenes)) if index not in pressed]
         raise ValueError(
-            f"a batch holds bodies or indenters, not both: {_named(pressed)} with an indenter, {_named(others)} with a "
-            f"body; make a batch of each"
+            f"a batch holds bodies or indenters, not both: {_list_environments(pressed)} with an indenter, "
+            f"{_list_environments(others)} with a body; make a batch of each"
         )
 
 
-def _named(indices: Sequence[int]) -> str:
+def _list_environments(indices: Sequence[int]) -> str:
     return f"environment{'s' if len(indices) > 1 else ''} {', '.join(map(str, indices))}"

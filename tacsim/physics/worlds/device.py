@@ -1,22 +1,30 @@
-"""The same physics on a device (a GPU): one thread a particle, element or node, one kernel a substep.
+"""The same physics on a device (a GPU): one thread for each particle, element or node, one kernel for each substep.
 
-Threads of a device cannot meet inside a loop, so each phase of a substep is a loop of its own, and the host counts the
-substeps. What happens to one particle or node stands in the functions that the CPU's kernels call too; here are only
-the loops round them. Sums are atomic, so their order, and the last bits, differ from run to run.
+Threads of a device cannot synchronise inside a loop, so each phase of a substep is a separate loop, and the host counts
+the substeps. The functions for single particles and nodes are those of the CPU's kernels; this module has the loops.
+Sums are atomic, so their order and the last bits differ from run to run.
 
-Where its arrays are: tacsim.physics.worlds.device_state.
+Its arrays: tacsim.physics.worlds.device_state.
 """
 
 from tacsim.compute.runtime import ti
-from tacsim.physics.body.follow import Ends, follow, push_leaders
 from tacsim.physics.body.mass import CHANGE, SECOND, cell_means, grid_changes, second_changes
+from tacsim.physics.body.tied_node_kernels import Ends, set_tied_velocities, transfer_impulses
 from tacsim.physics.body.transfers import Body, Strips, grid_to_particles, particles_to_grid
-from tacsim.physics.contact.indenter import POINTS, Anchor, Indenter, Pressure, Values, carry, indent
+from tacsim.physics.contact.indenter import (
+    POINTS,
+    Anchor,
+    Indenter,
+    Pressure,
+    Values,
+    apply_indenter,
+    update_node_pressure,
+)
 from tacsim.physics.exec import layout
-from tacsim.physics.exec.environment import Counts, Environment, Floats, Params, Partial, record_least
+from tacsim.physics.exec.environment import Counts, Environment, Floats, Params, Partial, record_min
 from tacsim.physics.exec.graph import Graph
-from tacsim.physics.exec.lanes import LANES, PARTS, smallest_lane, strip
-from tacsim.physics.gel.element import ROWS, SMALLEST, element_block
+from tacsim.physics.exec.lanes import LANES, PARTS, min_over_lanes, strip
+from tacsim.physics.gel.element import MIN_VOLUME_ROW, ROWS, element_block
 from tacsim.physics.gel.kernels import (
     Gels,
     Lattice,
@@ -29,12 +37,19 @@ from tacsim.physics.gel.kernels import (
     nodes_of_part,
     surface_at,
 )
-from tacsim.physics.gel.mass import gel_advance_filtered, gel_even, gel_means
-from tacsim.physics.worlds.hybrid_kernels import ContactHistories, Drive, Records, gel_contact, grid_update, keep_record
+from tacsim.physics.gel.mass import gel_advance_filtered, gel_filter_first_pass, gel_means
+from tacsim.physics.worlds.hybrid_kernels import (
+    ContactHistories,
+    Drive,
+    Records,
+    gel_contact,
+    grid_update,
+    store_record,
+)
 from tacsim.physics.worlds.survey import BLOCKS
 from tacsim.physics.worlds.survey_kernels import Sums
 
-# (2,) number of this substep, for all loops but the last, which counts it on; the same for the last.
+# (2,) number of this substep, for all loops but the last, which increments it; the same for the last.
 Clock = ti.types.ndarray(dtype=ti.i32, ndim=1)
 # (environments, gels, 2) height of the highest surface node [mm], at least 0, in even substeps and in odd ones.
 Ceiling = ti.types.ndarray(dtype=ti.f32, ndim=3)
@@ -53,7 +68,7 @@ def grid_nodes(env: ti.template()):
 
 @ti.func
 def clear_sums(env: ti.template(), slot):
-    """What parts add up anew each substep, but for the particles' velocities, which outlive it."""
+    """Sets the sums of a substep to zero, without the sum of the particles' velocities, which is kept."""
     env.partial[env.index, slot, layout.OVERLAP] = 0.0
     for n in range(12):
         env.partial[env.index, slot, layout.FORCE + n] = 0.0
@@ -64,8 +79,8 @@ def clear_sums(env: ti.template(), slot):
 
 
 @ti.func
-def element(env: ti.template(), gels: ti.template(), k, n):
-    """Forces of the element that begins at node column n, in layer k, on its corners."""
+def element_forces(env: ti.template(), gels: ti.template(), k, n):
+    """Corner forces of the element whose first node is in column n and layer k."""
     gel = ti.static(gel_of(env, gels, gel_of_part(env, gels, n)))
     _slot, block, _last = nodes_of_part(env, gels, gel, n)
     if k < gel.layers:
@@ -74,13 +89,13 @@ def element(env: ti.template(), gels: ti.template(), k, n):
         u = first_node(env, gel) + k * blocks + block
         to = env.count(layout.GEL_CORNERS + gel.index) + k * 24 * row + gel.ny + 2 + block
         rows = ti.Matrix.zero(ti.f32, ROWS, LANES)
-        rows[SMALLEST, 0] = 1e9
+        rows[MIN_VOLUME_ROW, 0] = 1e9
         element_block(env, gel, block, u, axis, blocks, to, row, rows)
-        record_least(env, block % PARTS, layout.SMALLEST_VOLUME, smallest_lane(rows, SMALLEST))
+        record_min(env, block % PARTS, layout.SMALLEST_VOLUME, min_over_lanes(rows, MIN_VOLUME_ROW))
 
 
 @ti.func
-def column(env: ti.template(), gels: ti.template(), n):
+def column_forces(env: ti.template(), gels: ti.template(), n):
     """Elements' forces on node column n, from its backing to its surface."""
     gel = ti.static(gel_of(env, gels, gel_of_part(env, gels, n)))
     _slot, block, _last = nodes_of_part(env, gels, gel, n)
@@ -106,7 +121,7 @@ def press_substep(
     for e, k, n in ti.ndrange(counts.shape[0], layers, columns):
         env = ti.static(Environment(e, params, counts, partial))
         if is_active(env, clock):
-            element(env, ti.static(Gels(nodes, surface, contact_force, corners, lattice, 1)), k, n)
+            element_forces(env, ti.static(Gels(nodes, surface, contact_force, corners, lattice, 1)), k, n)
             if k == 0 and n < PARTS:
                 clear_sums(env, n)
         if e + k + n == 0:
@@ -115,7 +130,7 @@ def press_substep(
         env = ti.static(Environment(e, params, counts, partial))
         if is_active(env, clock):
             gels = ti.static(Gels(nodes, surface, contact_force, corners, lattice, 1))
-            indent(
+            apply_indenter(
                 env,
                 cell,
                 clock[0],
@@ -127,16 +142,17 @@ def press_substep(
         env = ti.static(Environment(e, params, counts, partial))
         if clock[1] < counts[e, layout.STEPS]:
             gels = ti.static(Gels(nodes, surface, contact_force, corners, lattice, 1))
-            carry(env, n, ti.static(gel_of(env, gels, 0)))
-            column(env, gels, n)
+            update_node_pressure(env, n, ti.static(gel_of(env, gels, 0)))
+            column_forces(env, gels, n)
             gel_advance(env, n, gels)
         if e + n == 0:
             clock[0] += 1
 
 
-# One kernel may have local arrays in one of its loops only: Taichi 1.7 mixes up the constants of several (IR broken:
-# MatrixPtrStmt cannot have operand ConstStmt). So the substep of a body is three. A loop's length, if it is computed
-# where the loop begins, is a launch of its own on a device: hence all lengths at the beginning of a kernel.
+# A kernel may have local arrays in one of its loops only: Taichi 1.7 confuses the constants of several loops (IR
+# broken: MatrixPtrStmt cannot have operand ConstStmt). So the substep of a body has three kernels. A loop length that
+# is computed at the loop is a separate launch on a device: therefore all lengths are computed at the beginning of a
+# kernel.
 
 
 @ti.kernel
@@ -145,12 +161,11 @@ def elements_of_hybrid(
     params: Params, counts: Counts, partial: Partial, ceiling: Ceiling, layers: ti.i32, columns: ti.i32,
 ):  # fmt: skip
     """First third of a substep of every environment's two gels and body
-    (`tacsim.physics.worlds.hybrid_kernels.substeps`): elements pull at their corners; what is summed starts from
-    zero."""
+    (`tacsim.physics.worlds.hybrid_kernels.substeps`): corner forces of the elements; sums are set to zero."""
     for e, k, n in ti.ndrange(counts.shape[0], layers, columns):
         env = ti.static(Environment(e, params, counts, partial))
         if is_active(env, clock):
-            element(env, ti.static(Gels(nodes, None, None, corners, lattice, 2)), k, n)
+            element_forces(env, ti.static(Gels(nodes, None, None, corners, lattice, 2)), k, n)
             if k == 0 and n < PARTS:
                 clear_sums(env, n)
             if k == 0 and n < 2:
@@ -165,18 +180,17 @@ def scatter_of_hybrid(
     nodes: Floats, surface: Floats, contact_force: Floats, corners: Floats, lattice: Lattice,
     particles: Floats, masses: Strips, velocities: Strips, changes: Floats, ends: Ends, shares: Floats,
     histories: ContactHistories, params: Params, counts: Counts, partial: Partial, ceiling: Ceiling,
-    columns: ti.i32, most_particles: ti.i32, most_nodes: ti.i32, most_links: ti.i32,
+    columns: ti.i32, max_particles: ti.i32, max_nodes: ti.i32, max_links: ti.i32,
 ):  # fmt: skip
-    """Second third: contact, particles to the grid, motion of the gels' and the grid's nodes, whose masses are zero
-    again afterwards.
+    """Second third: contact, particles to the grid, motion of the gels' and the grid's nodes; sets grid masses to zero.
 
-    columns: of nodes of both gels; most_particles, most_nodes, most_links: of the largest body and grid.
+    columns: of nodes of both gels; max_particles, max_nodes, max_links: of the largest body and grid.
     """
-    most = columns + most_nodes
-    all_particles, all_nodes = counts.shape[0] * most_particles, counts.shape[0] * most_nodes
-    all_columns_and_nodes, all_links = counts.shape[0] * most, counts.shape[0] * most_links
+    columns_and_nodes = columns + max_nodes
+    all_particles, all_nodes = counts.shape[0] * max_particles, counts.shape[0] * max_nodes
+    all_columns_and_nodes, all_links = counts.shape[0] * columns_and_nodes, counts.shape[0] * max_links
     for i in range(all_particles):
-        e, p = i // most_particles, i % most_particles
+        e, p = i // max_particles, i % max_particles
         env = ti.static(Environment(e, params, counts, partial))
         if is_active(env, clock) and p < env.count(layout.PARTICLES):
             gels = ti.static(Gels(nodes, surface, contact_force, corners, lattice, 2))
@@ -185,31 +199,31 @@ def scatter_of_hybrid(
                 gel_contact(env, p, g, clock[0], drive, body, histories, gels, ceiling[e, g, clock[0] % 2])
             particles_to_grid(env, p, clock[0], body)
     for i in range(all_columns_and_nodes):
-        e, n = i // most, i % most
+        e, n = i // columns_and_nodes, i % columns_and_nodes
         env = ti.static(Environment(e, params, counts, partial))
         if is_active(env, clock):
             if n < columns:
                 gels = ti.static(Gels(nodes, surface, contact_force, corners, lattice, 2))
-                column(env, gels, n)
+                column_forces(env, gels, n)
                 gel_means(env, n, gels)
             elif n - columns < grid_nodes(env):
                 body = ti.static(Body(particles, masses, velocities, changes))
                 grid_changes(env, n - columns, body)
     for i in range(all_links):
-        e, n = i // most_links, i % most_links
+        e, n = i // max_links, i % max_links
         env = ti.static(Environment(e, params, counts, partial))
-        if is_active(env, clock) and n < env.count(layout.PUSHES + PARTS):
-            push_leaders(env, n, ti.static(Body(particles, masses, velocities, changes, ends, shares)))
+        if is_active(env, clock) and n < env.count(layout.IMPULSE_LINKS + PARTS):
+            transfer_impulses(env, n, ti.static(Body(particles, masses, velocities, changes, ends, shares)))
     for i in range(all_columns_and_nodes):
-        e, n = i // most, i % most
+        e, n = i // columns_and_nodes, i % columns_and_nodes
         env = ti.static(Environment(e, params, counts, partial))
         if is_active(env, clock):
             if n < columns:
-                gel_even(env, n, ti.static(Gels(nodes, surface, contact_force, corners, lattice, 2)))
+                gel_filter_first_pass(env, n, ti.static(Gels(nodes, surface, contact_force, corners, lattice, 2)))
             elif n - columns < grid_nodes(env):
                 cell_means(env, n - columns, CHANGE, ti.static(Body(particles, masses, velocities, changes)))
     for i in range(all_columns_and_nodes):
-        e, n = i // most, i % most
+        e, n = i // columns_and_nodes, i % columns_and_nodes
         env = ti.static(Environment(e, params, counts, partial))
         if is_active(env, clock):
             if n < columns:
@@ -224,39 +238,39 @@ def scatter_of_hybrid(
             elif n - columns < grid_nodes(env):
                 second_changes(env, n - columns, ti.static(Body(particles, masses, velocities, changes)))
     for i in range(all_nodes):
-        e, node = i // most_nodes, i % most_nodes
+        e, node = i // max_nodes, i % max_nodes
         env = ti.static(Environment(e, params, counts, partial))
         if is_active(env, clock) and node < grid_nodes(env):
             cell_means(env, node, SECOND, ti.static(Body(particles, masses, velocities, changes)))
     for i in range(all_nodes):
-        e, node = i // most_nodes, i % most_nodes
+        e, node = i // max_nodes, i % max_nodes
         env = ti.static(Environment(e, params, counts, partial))
         if is_active(env, clock) and node < grid_nodes(env):
             grid_update(env, node, clock[0], drive, ti.static(Body(particles, masses, velocities, changes)))
             masses[e * env.count(layout.CAPACITY) + node] = strip(0.0)
     for i in range(all_links):
-        e, n = i // most_links, i % most_links
+        e, n = i // max_links, i % max_links
         env = ti.static(Environment(e, params, counts, partial))
-        if is_active(env, clock) and n < env.count(layout.PUSHES + PARTS):
-            follow(env, n, ti.static(Body(particles, masses, velocities, changes, ends, shares)))
+        if is_active(env, clock) and n < env.count(layout.IMPULSE_LINKS + PARTS):
+            set_tied_velocities(env, n, ti.static(Body(particles, masses, velocities, changes, ends, shares)))
 
 
 @ti.kernel
 def gather_of_hybrid(
     clock: Clock, particles: Floats, masses: Strips, velocities: Strips,
-    params: Params, counts: Counts, partial: Partial, records: Records, sums: Sums, most_particles: ti.i32,
+    params: Params, counts: Counts, partial: Partial, records: Records, sums: Sums, max_particles: ti.i32,
 ):  # fmt: skip
-    """Last third: the grid back to the particles, and the sum of their velocities, block by block: an atomic addition a
-    particle would queue for a few addresses, and in another order each time."""
-    slots, all_particles = counts.shape[0] * PARTS, counts.shape[0] * most_particles
+    """Last third: grid to particles, and the sum of their velocities, block by block: atomic additions of single
+    particles would wait for a few addresses, with another order each time."""
+    slots, all_particles = counts.shape[0] * PARTS, counts.shape[0] * max_particles
     blocks, sums_of_slots = counts.shape[0] * 3 * BLOCKS, counts.shape[0] * PARTS * 3
     for i in range(slots):
         e, slot = i // PARTS, i % PARTS
         env = ti.static(Environment(e, params, counts, partial))
         if is_active(env, clock):
-            keep_record(env, slot, clock[0], records)
+            store_record(env, slot, clock[0], records)
     for i in range(all_particles):
-        e, p = i // most_particles, i % most_particles
+        e, p = i // max_particles, i % max_particles
         env = ti.static(Environment(e, params, counts, partial))
         if is_active(env, clock) and p < env.count(layout.PARTICLES):
             grid_to_particles(env, p, ti.static(Body(particles, masses, velocities)))

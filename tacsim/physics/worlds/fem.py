@@ -1,4 +1,4 @@
-"""What worlds with finite-element gels share, two gels round a body and an indenter on one: motions and inertia."""
+"""Base of worlds with finite-element gels (two gels around a body, an indenter on one gel): motions and inertia."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from tacsim.compute.runtime import launching
 from tacsim.interface import Pose
 from tacsim.models.scene import GelSurface
-from tacsim.physics.exec.layout import FORCE, GEL_DAMPING, GEL_DENSITY, MEMORY, STEP, STEPS
+from tacsim.physics.exec.layout import FORCE, GEL_DAMPING, GEL_DENSITY, MEMORY_SHARE, STEP, STEPS
 from tacsim.physics.failure.diagnosis import element_lengths
 from tacsim.physics.failure.tuning import MAX_COURANT
 from tacsim.physics.gel.gel import GelParams, GelState, gel_surface
@@ -29,14 +29,14 @@ from tacsim.physics.motion.controller import (
     move_real_time,
 )
 from tacsim.physics.motion.inertia import Inertia, plan_real_time
-from tacsim.physics.motion.load import keep_loads, require_loads
+from tacsim.physics.motion.load import move_at_constant_load, require_loads
 from tacsim.physics.motion.path import (
     Path,
     plan_flow,
     resolve_targets,
 )
 from tacsim.physics.move import MoveCommand, MoveStats
-from tacsim.physics.snapshot import Kept, State, copies, gel_arrays, restore_arrays, snapshot_of
+from tacsim.physics.snapshot import LazyState, State, copy_arrays, gel_arrays, restore_arrays, snapshot_of
 from tacsim.physics.units import MM
 from tacsim.physics.worlds.base import BaseWorld
 from tacsim.physics.worlds.tuning import REST_TOLERANCE
@@ -47,9 +47,9 @@ if TYPE_CHECKING:  # a device's kernels
 
 
 class FemState(ABC):
-    """Arrays of several environments (HybridState, PressState). Those on a device come back when they are asked for."""
+    """Arrays of several environments (HybridState, PressState). Arrays of a device are downloaded when requested."""
 
-    device: DeviceState | None = None  # where they are computed, if that is not the CPU
+    device: DeviceState | None = None  # the device that computes, if it is not the CPU
     params: NDArray[np.float32]
     partial: NDArray[np.float32]
     _gels: GelState
@@ -58,18 +58,20 @@ class FemState(ABC):
     def advance(self, drives: Mapping[int, NDArray[np.float32]]) -> None:
         """One launch; drives: (n, frames, 6, 3) of the environments that move, each with its own n."""
 
-    def _bring_back(self) -> None:
+    def _copy_to_host(self) -> None:
         if self.device is not None:
-            self.device.bring_back()
+            self.device.copy_to_host()
 
     @property
     def gels(self) -> GelState:
-        self._bring_back()
+        self._copy_to_host()
         return self._gels
 
-    def tops(self, index: int) -> list[NDArray[np.float32]]:
-        """See GelState.tops."""
-        return self._gels.tops(index) if self.device is None else self.device.tops(index)
+    def surface_displacements(self, index: int) -> list[NDArray[np.float32]]:
+        """See `GelState.surface_displacements`."""
+        return (
+            self._gels.surface_displacements(index) if self.device is None else self.device.surface_displacements(index)
+        )
 
 
 def stack_drives(drives: Mapping[int, NDArray[np.float32]], counts: NDArray[np.int32]) -> NDArray[np.float32]:
@@ -85,25 +87,25 @@ def stack_drives(drives: Mapping[int, NDArray[np.float32]], counts: NDArray[np.i
 
 
 class FemWorld(BaseWorld):
-    """One environment of a FemState, whose gels are layers of finite elements in their sensors' frames."""
+    """One environment of a FemState. Its gels are layers of finite elements in their sensors' frames."""
 
     balanced: ClassVar[bool]  # contact forces on all gels add up to the weight of a free body
-    yields: bool  # what is pressed yields: it keeps what a hurried motion does to it
+    yields: bool  # the pressed body yields, so a fast motion changes its final state
     max_force_loss = math.inf  # of `Path`
-    unfollowed = ""  # why the last motion has not settled, whatever its residual, and what to do
+    unsettled_reason = ""  # why the last motion has not settled, independent of its residual, and advice
 
     _state: FemState
     _index: int
     _gels: tuple[GelParams, ...]  # by index
-    _rates: NDArray[np.float64]  # (frames, 6) velocities at which a flowing motion has left them [-, rad/mm]
+    _rates: NDArray[np.float64]  # (frames, 6) velocities at the end of a flowing motion [-, rad/mm]
     _scaled: Inertia  # of quasi-static motions
     _true: Inertia  # of motions in real time
     _inertia: Inertia  # of the last motion
 
-    # ---------------------------------------------------- what a world adds
+    # ---------------------------------------------------- for subclasses
 
     def _scalars(self) -> dict[str, NDArray[Any]]:
-        """What a snapshot holds besides arrays: how the last motion has left this world."""
+        """Additional entries of a snapshot: velocities and inertia after the last motion."""
         return {"rates": self._rates, "true_inertia": np.array(float(self._inertia.real_time))}
 
     @abstractmethod
@@ -112,7 +114,7 @@ class FemWorld(BaseWorld):
 
     @property
     def _readings(self) -> int:
-        """How many a launch can give."""
+        """Largest number of readings in a launch."""
         return 1
 
     @abstractmethod
@@ -126,33 +128,33 @@ class FemWorld(BaseWorld):
     # ------------------------------------------------------------------ state
 
     def snapshot(self) -> dict[str, NDArray[Any]]:
-        return snapshot_of({**self.arrays(), **self._grid(self._grid_kept()), **self._scalars()}, self._poses)
+        return snapshot_of({**self.arrays(), **self._grid(self._stored_grid_shape()), **self._scalars()}, self._poses)
 
-    def _grid_kept(self) -> tuple[int, int, int]:
-        """The grid that a snapshot holds, see `BodyState.grid_kept`."""
+    def _stored_grid_shape(self) -> tuple[int, int, int]:
+        """Shape of the grid in a snapshot, see `BodyState.stored_grid_shape`."""
         return 0, 0, 0
 
     def _grid(self, shape: tuple[int, int, int]) -> dict[str, NDArray[Any]]:
-        """What a snapshot holds of that."""
+        """Entries of a snapshot for that grid."""
         return {}
 
-    def _lay(self, state: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-        """Room for the same of a state that is to be restored."""
+    def _allocate_grid(self, state: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+        """Arrays for the same entries of a state that is to be restored."""
         return {}
 
-    def _take_up(self, grid: Mapping[str, NDArray[Any]]) -> None:
-        """Goes on with a grid that has been restored."""
+    def _restore_grid(self, grid: Mapping[str, NDArray[Any]]) -> None:
+        """Fits the grid of a restored state and sets its velocities."""
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
         """See World."""
-        numbers, grid = self._scalars(), self._lay(state)
+        numbers, grid = self._scalars(), self._allocate_grid(state)
         arrays = {**self.arrays(), **grid, **numbers}
         self._poses = restore_arrays(arrays, list(self._poses), state, finite=list(numbers))
-        self._take_up(grid)
+        self._restore_grid(grid)
         self._use_inertia(self._true if numbers["true_inertia"] else self._scaled)
 
     def place(self, poses: Mapping[str, Pose]) -> None:
-        """See World. A gel goes along as it is, in its sensor's frame."""
+        """See World. The gels move with their sensors' frames."""
         self._poses = resolve_targets(self._poses, poses)
         self._rates[...] = 0.0
 
@@ -166,36 +168,36 @@ class FemWorld(BaseWorld):
 
     def surface(self, name: str) -> GelSurface:
         index = self._sensor(name)
-        return gel_surface(self._gels[index], self._state.tops(self._index)[index])
+        return gel_surface(self._gels[index], self._state.surface_displacements(self._index)[index])
 
     def _survey(self) -> Survey | None:
         device = self._state.device
         return None if device is None else device.survey(self._index)
 
-    def _keep(self) -> State:
+    def _snapshot_before_motion(self) -> State:
         device = self._state.device
         if device is None:
             return self.snapshot()
-        device.keep(self._index)
+        device.store_state(self._index)
         sums = {"sums": self._state.partial[self._index]}
-        return self._kept(device, "motion", snapshot_of({**sums, **self._scalars()}, self._poses))
+        return self._state_before(device, "motion", snapshot_of({**sums, **self._scalars()}, self._poses))
 
     def _before_launch(self) -> State:
         device = self._state.device
         if device is None:
-            return copies(self.arrays())
-        return self._kept(device, "launch", copies({"sums": self._state.partial[self._index]}))
+            return copy_arrays(self.arrays())
+        return self._state_before(device, "launch", copy_arrays({"sums": self._state.partial[self._index]}))
 
-    def _kept(self, device: DeviceState, moment: str, also: State) -> State:
-        """This world's arrays as the device has kept them before the last "motion" or "launch", and `also`."""
+    def _state_before(self, device: DeviceState, moment: str, extra: State) -> State:
+        """This world's arrays as the device has stored them before the last "motion" or "launch", and `extra`."""
 
-        shape = self._grid_kept()
+        shape = self._stored_grid_shape()
 
         def fetch() -> State:
-            with device.as_kept(moment):
-                return {**copies({**self.arrays(), **self._grid(shape)}), **also}
+            with device.with_state_before(moment):
+                return {**copy_arrays({**self.arrays(), **self._grid(shape)}), **extra}
 
-        return Kept(fetch)
+        return LazyState(fetch)
 
     # ---------------------------------------------------------------- inertia
 
@@ -204,26 +206,27 @@ class FemWorld(BaseWorld):
         self._write_inertia()
 
     def _write_inertia(self, launch: Launch | None = None) -> None:
-        """Into `params`, as it is in `launch`."""
+        """Writes the entries for `launch` into `params`."""
         entries = self._inertia.entries(launch)
         self._state.params[self._index, list(entries)] = list(entries.values())
 
     def _switch_inertia(self, inertia: Inertia) -> None:
-        """Another inertia has another time scale, in which velocities have no meaning: what moves is stopped."""
+        """Changes the inertia and sets all velocities to zero, since another inertia has another time scale."""
         if inertia is not self._inertia:
             self._stop()
             self._use_inertia(inertia)
 
     def _courant(self) -> float:
-        """The time step over the time of the pressure wave through the most squeezed gel element [-].
+        """The time step over the time of the pressure wave through the most compressed gel element [-].
 
-        Edges along their directions at rest are cheap to measure; elements are measured only if those are too short.
+        Edges along their directions at rest are computed first, which is fast; elements only if such an edge is too
+        short.
         """
         step = float(self._state.params[self._index, STEP])
         with np.errstate(all="ignore"):  # check_launch reports what is not finite
-            seen, waves = self._survey(), self._waves
-            lengths = list(seen.shortest) if seen else self._state.gels.shortest(self._index)
-            if len(lengths) < len(waves):  # gels that are cut alike were measured together
+            survey, waves = self._survey(), self._waves
+            lengths = list(survey.min_edge_length) if survey else self._state.gels.min_edge_length(self._index)
+            if len(lengths) < len(waves):  # gels with equal lattices were measured together
                 waves = (max(waves),)
             if any(length * MAX_COURANT < step * wave for length, wave in zip(lengths, waves, strict=True)):
                 lengths, waves = self._measured_lengths(), self._waves
@@ -231,17 +234,17 @@ class FemWorld(BaseWorld):
         return max(step * wave / max(length, finest) for length, wave in zip(lengths, waves, strict=True))
 
     def _measured_lengths(self) -> list[float]:
-        """Of each gel the length of its most squeezed element [mm]."""
+        """Length of the most compressed element of each gel [mm]."""
         arrays = gel_arrays(self.arrays(), "gel_displacement").items()
         return [float(gel.min()) for g, u in arrays for gel in element_lengths(u, self._gels[g].thickness)]
 
     def _damping(self) -> float:
-        """Of the gels in the last launch: their rate times the wave's time through them [-]."""
+        """Damping of the gels in the last launch: rate times the wave's time through the gel [-]."""
         return float(self._state.params[self._index, GEL_DAMPING]) * self._gels[0].thickness
 
     @property
     def _waves(self) -> tuple[float, ...]:
-        """Speeds of the gels' pressure waves, over that which is 1."""
+        """Speeds of the gels' pressure waves, in kernel units."""
         entries = self._inertia.params
         return tuple(
             math.sqrt(gel.density / entries.get(GEL_DENSITY + g, gel.density)) for g, gel in enumerate(self._gels)
@@ -249,12 +252,12 @@ class FemWorld(BaseWorld):
 
     @property
     def _thickness(self) -> float:
-        """Of the thickest gel, in whose time motions are planned: it is the last to follow [mm]."""
+        """Thickness of the thickest gel, which has the longest wave time: motions are planned for it [mm]."""
         return max(gel.thickness for gel in self._gels)
 
     @property
     def _lever(self) -> float:
-        """From a sensor's origin to the rim of the widest gel [mm]."""
+        """Distance from a sensor's origin to the rim of the widest gel [mm]."""
         return max(max(gel.half) for gel in self._gels)
 
     # ----------------------------------------------------------------- motion
@@ -263,64 +266,68 @@ class FemWorld(BaseWorld):
         end = resolve_targets(self._poses, command.targets)
         require_loads(command.loads, self.sensors)
         begin, goals, settling = dict(self._poses), dict(end), self.scene.settling
-        balanced, most, self.unfollowed = self.balanced, self._readings, ""
+        balanced, max_readings, self.unsettled_reason = self.balanced, self._readings, ""
         a, b = list(begin.values()), list(end.values())
-        path = None  # of a dynamic motion; others are planned anew for each attempt
+        path = None  # of a dynamic motion; others are planned again for each attempt
         if command.duration is not None:
             path = plan_real_time(a, b, command.duration, self._true, self._lever)
         elif not command.flow:
             self.plan(a, b)  # raises ValueError for a path that is far too long, before a stop
-        flowing = self._plan_flow(a, b if command.flow else a)  # or to where the frames are: a stop
+        flowing = self._plan_flow(a, b if command.flow else a)  # or to the present poses: a stop
 
         def from_rest(refine: int) -> Motion:
             if path is not None:
-                rest = Path(a, a, 0, self._scaled.step, refine, flowing.interval, creeps=self.yields)
-                held = yield from self._rest(rest)
+                rest = Path(a, a, 0, self._scaled.step, refine, flowing.interval, is_creeping=self.yields)
+                held = yield from self._hold_at_rest(rest)
                 self._switch_inertia(self._true)
                 stats = yield from move_real_time(replace(path, refine=refine), settling, balanced=balanced)
                 return replace(stats, substeps=held + stats.substeps, hold=held)
             self._switch_inertia(self._scaled)
             if command.loads:
                 end.update(goals)
-                return (yield from keep_loads(self, begin, end, command.loads, refine, balanced=balanced, most=most))
+                return (
+                    yield from move_at_constant_load(
+                        self, begin, end, command.loads, refine, balanced=balanced, max_readings=max_readings
+                    )
+                )
             quasi_static = replace(self.plan(a, b), refine=refine)
-            return (yield from move_and_settle(quasi_static, settling, balanced=balanced, most=most))
+            return (yield from move_and_settle(quasi_static, settling, balanced=balanced, max_readings=max_readings))
 
         def attempt(refine: int) -> Motion:
             flow = replace(flowing, refine=refine)
             if command.flow:
                 self._switch_inertia(self._scaled)
-                return move_flowing(flow, settling, balanced=balanced, most=most)
+                return move_flowing(flow, settling, balanced=balanced, max_readings=max_readings)
             return come_to_rest(flow, from_rest(refine)) if self._rates.any() else from_rest(refine)
 
-        stats = yield from self._retried(command, attempt)
+        stats = yield from self._retry_smaller_steps(command, attempt)
         if stats.force_loss > self.max_force_loss:
             slower = "settling.tolerance" if settling.mach is None else "settling.mach"
-            self.unfollowed = (
-                f"the speed itself made the body yield: the hold took {stats.force_loss:.1%} of the force (limit "
-                f"{self.max_force_loss:.1%}); go there from the state before with a smaller {slower}"
+            self.unsettled_reason = (
+                f"the speed of the motion made the body yield: the force fell by {stats.force_loss:.1%} in the hold "
+                f"(limit {self.max_force_loss:.1%}); restore the state before and move with a smaller {slower}"
             )
         self._poses = end
         self._rates[...] = flowing.rates[1] if command.flow and flowing.rates is not None else 0.0
-        return self._judged(stats)
+        return self._complete_stats(stats)
 
-    def _judged(self, stats: MoveStats) -> MoveStats:
-        """`stats` of a motion with what else is known of its end."""
+    def _complete_stats(self, stats: MoveStats) -> MoveStats:
+        """Adds results of the final state to `stats`."""
         return stats
 
-    def _rest(self, path: Path) -> Generator[Launch, Sequence[ForceReading], int]:
-        """The hold before a first motion in real time, and its substeps; none if nothing touches a gel.
+    def _hold_at_rest(self, path: Path) -> Generator[Launch, Sequence[ForceReading], int]:
+        """Hold before a first motion in real time; returns its substeps, 0 if nothing touches a gel.
 
-        In real time no damping takes away what the last hold has left, and contact is a spring without a memory. So the
-        scene comes to rest on these springs first.
+        In real time there is no damping of the velocities that the last hold has left, and contact is a spring without
+        memory. Therefore the scene first comes to rest on these springs.
         """
         forces = self._state.partial[self._index, :, FORCE : FORCE + 6 * len(self.sensors)]
         if self._inertia is not self._scaled or not forces.any():
             return 0
         settling = self.scene.settling
         tight = settling.model_copy(update={"tolerance": min(settling.tolerance, REST_TOLERANCE)})
-        self._use_inertia(replace(self._scaled, params={**self._scaled.params, MEMORY: 0.0}))
-        stats = yield from move_and_settle(path, tight, balanced=self.balanced, most=self._readings)
+        self._use_inertia(replace(self._scaled, params={**self._scaled.params, MEMORY_SHARE: 0.0}))
+        stats = yield from move_and_settle(path, tight, balanced=self.balanced, max_readings=self._readings)
         return stats.substeps
 
     @abstractmethod
@@ -330,9 +337,9 @@ class FemWorld(BaseWorld):
     def _plan_flow(self, start: Sequence[Pose], end: Sequence[Pose]) -> Path:
         mach, step = self.scene.flow_mach, self._scaled.step
         path = plan_flow(start, end, self._rates.copy(), mach, step, self._lever, self._thickness)
-        return replace(path, creeps=self.yields)
+        return replace(path, is_creeping=self.yields)
 
-    @launching()  # around all of it: worlds of a batch share arrays, among them those that say which take part
+    @launching()  # for the whole call: worlds of a batch share arrays, also the numbers of substeps
     def _advance(self, launch: Launch) -> list[ForceReading]:
         prepared = self.prepare(launch)
         self._state.advance({self._index: prepared.drive})

@@ -1,4 +1,4 @@
-"""How two gels and the body between them answer to forces: masses, damping, contact stiffness, and the substep."""
+"""Inertia of two gels and the body between them: masses, damping, contact stiffness, and the substep."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from tacsim.physics.contact.tuning import FORCE_MEMORY_RATE
 from tacsim.physics.exec.layout import (
     BODY_DAMPING,
     BODY_MASS,
-    FILTERED,
+    FILTERED_WEIGHT,
     GEL_DAMPING,
     GEL_DENSITY,
     GRAVITY,
-    MEMORY,
-    OWN,
+    MEMORY_SHARE,
+    OWN_WEIGHT,
     RIGID_MASS_SCALE,
     STIFFNESS,
 )
@@ -41,12 +41,13 @@ from tacsim.physics.worlds.tuning import (
     YIELDING_ZETA_HELD,
 )
 
-# How nodes answer to forces: by their own acceleration, and by that filtered by (4 S - 1)^2, S the mean over the cells
-# round them. What the mesh resolves, S = 1, is six times as light; the shortest waves, S = 0, are as heavy as they are.
-TRUE_INERTIA = {OWN: 1.0, FILTERED: 0.0}
-SELECTIVE_INERTIA = {OWN: 1 / 3, FILTERED: 2 / 3}
-LIGHTER_GEL = SELECTIVE_INERTIA[OWN] + 9.0 * SELECTIVE_INERTIA[FILTERED]  # what the mesh resolves
-FILTERED_RIGID = LIGHTER_GEL - 1.0  # lighter by this are rigid motions
+# Acceleration of a node: weight of its own, and of the one filtered by (4 S - 1)^2, S the mean over the cells around
+# it. Motions that the mesh resolves, S = 1, have a sixth of the inertia; the shortest waves, S = 0, have all.
+TRUE_INERTIA = {OWN_WEIGHT: 1.0, FILTERED_WEIGHT: 0.0}
+SELECTIVE_INERTIA = {OWN_WEIGHT: 1 / 3, FILTERED_WEIGHT: 2 / 3}
+# Factor by which the inertia is reduced for motions that the mesh resolves
+LIGHTER_GEL = SELECTIVE_INERTIA[OWN_WEIGHT] + 9.0 * SELECTIVE_INERTIA[FILTERED_WEIGHT]
+FILTERED_RIGID = LIGHTER_GEL - 1.0  # part of that factor from the filter, for rigid motions
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,12 +59,12 @@ class HybridInertia:
     body: BodyParams
     body_force: np.ndarray  # (3,) weight of the body [N/mm^3]
 
-    def scaled(self, height: float, *, yields: bool) -> Inertia:
-        """Of quasi-static motions; height: of the body [mm]."""
+    def scaled_inertia(self, height: float, *, yields: bool) -> Inertia:
+        """Inertia of quasi-static motions; height: of the body [mm]."""
         step = BODY_COURANT * min(self.body.cell, *(gel.spacing for gel in self.gels))
         damping = {
             **self._gel_damping(GEL_ZETA), BODY_DAMPING: BODY_ZETA / self._thickness,
-            # The body's slowest mode is its rigid translation between two soft gels: there it counts as lighter by
+            # The body's slowest mode is its rigid translation between two soft gels: for it, the inertia is divided by
             # the number of particle layers.
             RIGID_MASS_SCALE: max(1.0, height / self.body.spacing - FILTERED_RIGID),
         }  # fmt: skip
@@ -72,23 +73,28 @@ class HybridInertia:
             BODY_DAMPING: (YIELDING_ZETA_HELD if yields else BODY_ZETA_HELD) / self._thickness,
         }
         densities = [gel.density for gel in self.gels]
-        masses = {**self._masses(densities, self.body.density, step), **SELECTIVE_INERTIA, MEMORY: FORCE_MEMORY_RATE}
+        masses = {
+            **self._masses(densities, self.body.density, step),
+            **SELECTIVE_INERTIA,
+            MEMORY_SHARE: FORCE_MEMORY_RATE,
+        }
         for g in range(len(self.gels)):
-            # the filter makes a body lighter, so its particles bear less: between stiff gels they shook, untold
-            bearable = MAX_PARTICLE_STIFFNESS * masses[BODY_MASS] / step**2
-            masses[STIFFNESS + g] = COLLECTIVE_STIFFNESS * min(masses[STIFFNESS + g], bearable)
+            # the filter reduces the inertia, so the stable stiffness is smaller: between stiff gels particles
+            # oscillated
+            max_stiffness = MAX_PARTICLE_STIFFNESS * masses[BODY_MASS] / step**2
+            masses[STIFFNESS + g] = COLLECTIVE_STIFFNESS * min(masses[STIFFNESS + g], max_stiffness)
         flowing = {**self._gel_damping(GEL_ZETA_FLOWING), BODY_DAMPING: BODY_ZETA_FLOWING / self._thickness}
         dragging = {**self._gel_damping(GEL_ZETA_DRAGGED), BODY_DAMPING: BODY_ZETA_DRAGGED / self._thickness}
         return Inertia({**masses, **damping}, step, held=held, flowing=flowing, dragging=dragging)
 
     def _gel_damping(self, zeta: float) -> dict[int, float]:
-        """Each gel by its own thickness and shear wave: rate = zeta c / thickness, less where that wave is slow."""
+        """Damping of each gel: rate = zeta c / thickness, less where its shear wave is slow."""
         shares = [min(1.0, math.sqrt(gel.mu / gel.density) / FULL_DAMPING_SHEAR_SPEED) for gel in self.gels]
         rates = [zeta * share / gel.thickness for share, gel in zip(shares, self.gels, strict=True)]
         return {GEL_DAMPING + g: rate for g, rate in enumerate(rates)}
 
-    def true(self) -> Inertia:
-        """Of motions in real time: the pressure wave of the gel in which it is fastest has speed 1."""
+    def true_inertia(self) -> Inertia:
+        """Inertia of motions in real time: the fastest pressure wave of the gels has speed 1."""
         assert self.scene.body is not None
         materials = [self.scene.gel_of(name).material for name in self.scene.sensors]
         seconds = [kernel_second(gel, each.density) for gel, each in zip(self.gels, materials, strict=True)]
@@ -98,7 +104,7 @@ class HybridInertia:
         wave = math.sqrt(self.body.density / density)  # the body's pressure wave
         times = [gel.spacing * second / own for gel, own in zip(self.gels, seconds, strict=True)]
         step = BODY_COURANT * min(self.body.cell / wave, *times)
-        undamped = {**self._gel_damping(0.0), BODY_DAMPING: 0.0, RIGID_MASS_SCALE: 1.0, MEMORY: 0.0}
+        undamped = {**self._gel_damping(0.0), BODY_DAMPING: 0.0, RIGID_MASS_SCALE: 1.0, MEMORY_SHARE: 0.0}
         return Inertia({**self._masses(densities, density, step), **TRUE_INERTIA, **undamped}, step, second)
 
     def _masses(self, gels: Sequence[float], body: float, step: float) -> dict[int, float]:
@@ -107,7 +113,7 @@ class HybridInertia:
         gravity = self.body_force / body  # [1/mm]
         entries = {BODY_MASS: particle, GRAVITY: gravity[0], GRAVITY + 1: gravity[1], GRAVITY + 2: gravity[2]}
         for g, (density, gel) in enumerate(zip(gels, self.gels, strict=True)):
-            # penalty of one particle against its share of a gel node: stable whichever of the two is lighter
+            # penalty of one particle against its share of a gel node: stable for all ratios of their masses
             share = density * gel.spacing * self.body.spacing**2 / 2
             reduced = 1.0 / (1.0 / particle + 1.0 / share)
             entries |= {GEL_DENSITY + g: density, STIFFNESS + g: reduced / step**2}
@@ -115,5 +121,5 @@ class HybridInertia:
 
     @property
     def _thickness(self) -> float:
-        """Of the thickest gel [mm]."""
+        """Thickness of the thickest gel [mm]."""
         return max(gel.thickness for gel in self.gels)

@@ -1,9 +1,9 @@
-"""Kernels of two gels round a plasticine body: contact, transfers and motion, many substeps in one launch."""
+"""Kernels of two gels and a plasticine body: contact, transfers and motion, many substeps in one launch."""
 
 from tacsim.compute.runtime import ti
 from tacsim.compute.taichi_patches.separate_functions import compiled_separately
-from tacsim.physics.body.follow import Ends, follow, push_leaders
 from tacsim.physics.body.mass import CHANGE, SECOND, cell_means, filtered_change, grid_changes, second_changes
+from tacsim.physics.body.tied_node_kernels import Ends, set_tied_velocities, transfer_impulses
 from tacsim.physics.body.transfers import (
     Body,
     Strips,
@@ -13,7 +13,7 @@ from tacsim.physics.body.transfers import (
     has_velocities,
     particles_to_grid,
 )
-from tacsim.physics.contact.contact import ContactHistory, contact_ceiling, particle_contact, support_radius
+from tacsim.physics.contact.contact import ContactHistory, max_surface_height, particle_contact, support_radius
 from tacsim.physics.exec import layout
 from tacsim.physics.exec.environment import (
     Counts,
@@ -33,17 +33,26 @@ from tacsim.physics.exec.lanes import (
     filled,
     ivec3,
     load_rows,
+    min_over_lanes,
     part_range,
+    read_three,
     slot_of,
-    smallest_lane,
     strip,
-    three,
     vec2,
     vec3,
 )
-from tacsim.physics.exec.team import CHUNK, ENVIRONMENT, Sync, first_in_chunk, next_piece, one_if, own_part, piece_done
+from tacsim.physics.exec.team import (
+    CHUNK,
+    ENVIRONMENT,
+    Sync,
+    claim_work,
+    first_in_chunk,
+    first_own_part,
+    one_if,
+    report_work_done,
+)
 from tacsim.physics.gel.kernels import GelArrays, Gels, Lattice, contact_force_start, gel_forces, gel_of
-from tacsim.physics.gel.mass import gel_advance_filtered, gel_even, gel_means
+from tacsim.physics.gel.mass import gel_advance_filtered, gel_filter_first_pass, gel_means
 from tacsim.physics.worlds.tuning import ROTATION_BOOST
 
 Drive = ti.types.ndarray(dtype=ti.f32, ndim=5)
@@ -51,26 +60,28 @@ Records = ti.types.ndarray(dtype=ti.f32, ndim=4)
 STAGES = 7  # of a substep
 
 ContactHistories = ti.types.ndarray(dtype=ContactHistory, ndim=3)
-# `BodyState.arguments`, `changes` and `links`, as kernels take them
+# Argument pack of `BodyState.arguments`, `changes` and `links`
 BodyArrays = ti.types.argpack(
     particles=Floats, masses=Strips, velocities=Strips, changes=Floats, ends=Ends, shares=Floats
 )
 
 
 @ti.func
-def row(drive: ti.template(), env: ti.template(), it, g, r):
+def drive_row(drive: ti.template(), env: ti.template(), it, g, r):
     return vec3([drive[env.index, it, g, r, c] for c in range(3)])
 
 
 @ti.func
 def three_rows(particles: ti.template(), at, stride):
-    """Three rows of one particle, from that at `at` on."""
+    """Three rows of one particle, from index `at`."""
     return vec3(particles[at], particles[at + stride], particles[at + 2 * stride])
 
 
 @ti.func
-def rotation(drive: ti.template(), env: ti.template(), it, g):
-    return ti.Matrix.rows([row(drive, env, it, g, 0), row(drive, env, it, g, 1), row(drive, env, it, g, 2)])
+def drive_rotation(drive: ti.template(), env: ti.template(), it, g):
+    return ti.Matrix.rows(
+        [drive_row(drive, env, it, g, 0), drive_row(drive, env, it, g, 1), drive_row(drive, env, it, g, 2)]
+    )
 
 
 @ti.func
@@ -84,27 +95,27 @@ def part_sum(env: ti.template(), first):
 
 @ti.func
 def moment_about(centre, origin, rotate, force, moment):
-    """Of a force and a moment about a sensor's `origin`, both in its axes: the moment about `centre`, world axes."""
+    """Moment about `centre`, world axes, of a force and a moment about a sensor's `origin`, both in sensor axes."""
     return rotate @ moment + (origin - centre).cross(rotate @ force)
 
 
 @ti.func
 def symmetric(env: ti.template(), first):
-    """A symmetric matrix of six numbers: xx, yy, zz, xy, xz, yz."""
+    """A symmetric matrix from six numbers: xx, yy, zz, xy, xz, yz."""
     xx, yy, zz, xy, xz, yz = [env.param(first + c) for c in range(6)]
     return ti.Matrix([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
 
 @ti.func
 def grid_update(env: ti.template(), part, it, drive: ti.template(), body: ti.template()):
-    """Momentum to velocity; damps towards the affine motion that the two sensors impose, not towards rest.
+    """Computes node velocities from momenta; damps towards the affine motion that the two sensors impose.
 
-    A boost is added to every velocity: selective mass scaling of the slowest modes, the rigid motions of a body that
-    hangs between two soft gels. Inertia is artificial here anyway; the resting state does not depend on it.
+    A boost is added to each velocity: selective mass scaling of the slowest modes, the rigid motions of a body between
+    two soft gels. The inertia is artificial; the state at rest does not depend on it.
 
-    Only a sensor that touches the body imposes anything; a body without contact is damped towards rest. Across the
-    sensors' axis it is the body's own mean velocity while anything is driven: a body that rides on one
-    sensor must not be dragged back by the other.
+    Only a sensor that touches the body imposes a motion; a body without contact is damped towards rest. Normal to the
+    sensors' axis, while a sensor moves, the target velocity is the body's mean velocity: a body on one sensor must not
+    be dragged by the other.
     """
     dt, cell, damping = env.param(layout.STEP), env.param(layout.BODY_CELL), env.param(layout.BODY_DAMPING)
     origin = env.param3(layout.ORIGIN)
@@ -112,31 +123,31 @@ def grid_update(env: ti.template(), part, it, drive: ti.template(), body: ti.tem
     force0, force1 = part_sum(env, layout.FORCE), part_sum(env, layout.FORCE + 6)
     mass, particles = env.param(layout.BODY_MASS), env.count(layout.PARTICLES)
     push = mass * particles * weight  # total force on the body: weight and contact
-    push -= rotation(drive, env, it, 0) @ force0
-    push -= rotation(drive, env, it, 1) @ force1
+    push -= drive_rotation(drive, env, it, 0) @ force0
+    push -= drive_rotation(drive, env, it, 1) @ force1
     touches0, touches1 = force0.norm_sqr() > 0.0, force1.norm_sqr() > 0.0
     mean = part_sum(env, layout.VELOCITY_SUM) / particles
     boost = ((env.param(layout.RIGID_MASS_SCALE) - 1.0) * dt / (mass * particles)) * push
-    p0, p1 = row(drive, env, it, 0, 3), row(drive, env, it, 1, 3)
+    p0, p1 = drive_row(drive, env, it, 0, 3), drive_row(drive, env, it, 1, 3)
     centre = env.param3(layout.CENTRE)
-    torque = -moment_about(centre, p0, rotation(drive, env, it, 0), force0, part_sum(env, layout.FORCE + 3))
-    torque -= moment_about(centre, p1, rotation(drive, env, it, 1), force1, part_sum(env, layout.FORCE + 9))
+    torque = -moment_about(centre, p0, drive_rotation(drive, env, it, 0), force0, part_sum(env, layout.FORCE + 3))
+    torque -= moment_about(centre, p1, drive_rotation(drive, env, it, 1), force1, part_sum(env, layout.FORCE + 9))
     turn = (
         (ROTATION_BOOST * (env.param(layout.RIGID_MASS_SCALE) - 1.0) * dt)
         * symmetric(env, layout.INVERSE_INERTIA)
         @ torque
     )
-    v0, v1 = row(drive, env, it, 0, 4), row(drive, env, it, 1, 4)
-    w0, w1 = row(drive, env, it, 0, 5), row(drive, env, it, 1, 5)
+    v0, v1 = drive_row(drive, env, it, 0, 4), drive_row(drive, env, it, 1, 4)
+    w0, w1 = drive_row(drive, env, it, 0, 5), drive_row(drive, env, it, 1, 5)
     axis = p1 - p0
     length2 = axis.norm_sqr() + 1e-12
-    share = ti.select(touches0 and touches1, 1.0, 0.0)  # of the distance from one sensor to the other that counts
+    share = ti.select(touches0 and touches1, 1.0, 0.0)  # 1: interpolate between the sensors; 0: one sensor
     only_upper = ti.select(touches1 and not touches0, 1.0, 0.0)
     held = ti.select(touches0 or touches1, 1.0, 0.0)
     driven = held * (v0.norm_sqr() + v1.norm_sqr() + w0.norm_sqr() + w1.norm_sqr()) > 0.0
     mean_across = mean - axis * (mean.dot(axis) / length2)
     reference_centre = env.param3(layout.REFERENCE_CENTRE)
-    carried = ti.Matrix([[env.param(layout.CARRIED + 3 * i + j) for j in range(3)] for i in range(3)])
+    carried = ti.Matrix([[env.param(layout.MEAN_GRADIENT + 3 * i + j) for j in range(3)] for i in range(3)])
     nx, ny, nz = env.count(layout.GRID), env.count(layout.GRID + 1), env.count(layout.GRID + 2)
     base = env.index * env.count(layout.CAPACITY)
     nz = nz // NODES  # strips
@@ -156,7 +167,7 @@ def grid_update(env: ti.template(), part, it, drive: ti.template(), body: ti.tem
                 moved = strip(0.0)
                 for n in ti.static(range(NODES)):
                     change, m = filtered_change(env, body, it, i, j, k * NODES + n)
-                    if m != 0.0:  # a mass that is not a number must show
+                    if m != 0.0:  # true of NaN, which must not be hidden
                         arm = origin + cell * vec3(i, j, k * NODES + n) - reference_centre
                         x = centre + arm + carried @ arm
                         velocity = vec3(old[4 * n], old[4 * n + 1], old[4 * n + 2]) + change
@@ -176,42 +187,46 @@ def gel_contact(
     env: ti.template(), part, g, it, drive: ti.template(), body: ti.template(), histories: ti.template(),
     gels: ti.template(), highest,
 ):  # fmt: skip
-    """Contact of this part's particles with gel g. Notes force and moment of the body on the sensor, sensor axes.
+    """Contact of this part's particles with gel g. Records force and moment of the body on the sensor, sensor axes.
 
-    highest: contact_ceiling of that gel.
+    highest: `max_surface_height` of that gel.
     """
-    rotate = rotation(drive, env, it, g)
-    origin, velocity, spin = row(drive, env, it, g, 3), row(drive, env, it, g, 4), row(drive, env, it, g, 5)
+    rotate = drive_rotation(drive, env, it, g)
+    origin, velocity, spin = (
+        drive_row(drive, env, it, g, 3),
+        drive_row(drive, env, it, g, 4),
+        drive_row(drive, env, it, g, 5),
+    )
     back = rotate.transpose()
     outward = vec3(rotate[0, 2], rotate[1, 2], rotate[2, 2])  # the sensor's z axis
     spacing = 0.5 * env.param(layout.BODY_CELL)
     rate = env.param(layout.STEP) / env.param(layout.BODY_MASS)
-    real_time = env.param(layout.MEMORY) == 0.0
-    stiffened = ti.select(it == 0, env.param(layout.SPRINGS + g) - 1.0, 0.0)
+    real_time = env.param(layout.MEMORY_SHARE) == 0.0
+    stiffened = ti.select(it == 0, env.param(layout.STIFFNESS_RATIO + g) - 1.0, 0.0)
     total, moment, on_housing = vec3(0.0), vec3(0.0), vec3(0.0)
     stride = env.count(layout.STRIDE)
     gel = ti.static(gel_of(env, gels, g))
     forces = contact_force_start(gel, copy_of(part))
     first, last = block_range(env, part)
-    place = filled(0.0, 4, LANES)  # of a block's particles; how far they are away
+    place = filled(0.0, 4, LANES)  # of a block's particles; their distance from the gel
     for block in range(first, last):
         start = env.index * layout.PARTICLE_ROWS * stride + block * LANES
         load_rows(body.particles, start, stride, layout.POSITION, 3, place)
         for lane in range(LANES):
-            place[3, lane] = outward.dot(three(place, 0, lane) - origin) - highest
-        # most of the body is far away: one dot product decides, for a whole block
-        near = ti.select(smallest_lane(place, 3) < 2.5 * spacing, LANES, 0)
+            place[3, lane] = outward.dot(read_three(place, 0, lane) - origin) - highest
+        # most of the body is far away: one dot product for each particle of a block
+        near = ti.select(min_over_lanes(place, 3) < 2.5 * spacing, LANES, 0)
         for lane in range(ti.min(near, env.count(layout.PARTICLES) - block * LANES)):
             at, p, away = start + lane, block * LANES + lane, place[3, lane]
-            arm = three(place, 0, lane) - origin
+            arm = read_three(place, 0, lane) - origin
             radius = spacing  # at most
             if away < 2.5 * spacing:
                 radius = support_radius(three_rows(body.particles, at + layout.PLANE * stride, stride), spacing)
-                # A radius that follows the strain does work that no force takes from the body. Where nothing is damped
-                # that would drive waves, so a particle keeps the radius with which it came to the gel.
+                # A radius that changes with the strain does work without a force on the body. Without damping this
+                # would excite waves, so a particle keeps the radius of its first contact.
                 if real_time and histories[env.index, g, p][6] > 0.0:
                     radius = histories[env.index, g, p][6]
-            # one radius to touch, half a spacing for what the contact's memory still bridges
+            # one radius for contact, half a spacing for the contact's memory
             if away < radius + 0.5 * spacing:
                 local = back @ arm
                 moving = three_rows(body.particles, at + layout.VELOCITY * stride, stride)
@@ -228,7 +243,7 @@ def gel_contact(
                     moment -= local.cross(force)
                     if housed:
                         on_housing -= force
-            elif away < 2.5 * spacing:  # nothing passes this margin in one substep, so what is beyond has forgotten
+            elif away < 2.5 * spacing:  # no particle crosses this margin in one substep: farther ones have no memory
                 histories[env.index, g, p] = ContactHistory(0.0)
     slot = slot_of(part)
     for d in ti.static(range(3)):
@@ -238,18 +253,18 @@ def gel_contact(
 
 
 @ti.func
-def keep_record(env: ti.template(), part, it, records: ti.template()):
-    """At the end of substep `it`, if it is one of those after which the part's numbers are wanted."""
-    every = env.count(layout.EVERY)
+def store_record(env: ti.template(), part, it, records: ti.template()):
+    """Copies the part's numbers at the end of substep `it`, if a record is due."""
+    every = env.count(layout.RECORD_INTERVAL)
     record = (it + 1) // every - 1
     for _wanted in range(one_if((it + 1) % every == 0 and record < layout.RECORDS)):
         for number in range(layout.NUMBERS):
             records[env.index, record, part, number] = env.partial[env.index, part, number]
 
 
-# Nearly all work is compiled separately from the kernel. Particles to grid is not: it is so large that LLVM does not
-# inline it, reads after each store where its arrays are, and merges no lanes. Arrays that a function does not use are
-# None, since Taichi passes a separate function its arrays one by one.
+# Nearly all functions are compiled separately from the kernel. `particles_to_grid` is not: it is so large that LLVM
+# does not inline it, loads the addresses of its arrays after each store, and merges no lanes. Arrays that a function
+# does not use are None, since Taichi passes arrays to a separate function one by one.
 
 
 @compiled_separately
@@ -258,7 +273,7 @@ def on_gels(
     nodes: Floats, surface: Floats, contact_force: Floats, corners: Floats, lattice: Lattice,
     params: Params, counts: Counts, partial: Partial,
 ):  # fmt: skip
-    """Does work(env, part, gels)."""
+    """Calls work(env, part, gels)."""
     env = ti.static(Environment(index, params, counts, partial))
     work(env, part, ti.static(Gels(nodes, surface, contact_force, corners, lattice, 2)))
 
@@ -269,7 +284,7 @@ def on_body(
     particles: Floats, masses: Strips, velocities: Strips, changes: Floats,
     params: Params, counts: Counts, partial: Partial,
 ):  # fmt: skip
-    """Does work(env, part, body)."""
+    """Calls work(env, part, body)."""
     env = ti.static(Environment(index, params, counts, partial))
     work(env, part, ti.static(Body(particles, masses, velocities, changes)))
 
@@ -280,19 +295,19 @@ def on_links(
     masses: Strips, velocities: Strips, changes: Floats, ends: Ends, shares: Floats,
     params: Params, counts: Counts, partial: Partial,
 ):  # fmt: skip
-    """Does work(env, part, body) with the links between light nodes and their leaders."""
+    """Calls work(env, part, body) with the links between tied nodes and full nodes."""
     env = ti.static(Environment(index, params, counts, partial))
     work(env, part, ti.static(Body(None, masses, velocities, changes, ends, shares)))
 
 
 @compiled_separately
-def contacts(
+def particle_contacts(
     place: ivec3, highest: vec2, drive: Drive, surface: Floats, contact_force: Floats, particles: Floats,
     histories: ContactHistories, params: Params, counts: Counts, partial: Partial,
 ):  # fmt: skip
     """Contact of a part's particles with both gels.
 
-    place: environment, part, substep; highest: contact_ceiling of each gel.
+    place: environment, part, substep; highest: `max_surface_height` of each gel.
     """
     index, part, it = place[0], place[1], place[2]
     env = ti.static(Environment(index, params, counts, partial))
@@ -308,7 +323,7 @@ def grid_motion(
     index: ti.i32, part: ti.i32, it: ti.i32, drive: Drive, velocities: Strips, changes: Floats,
     params: Params, counts: Counts, partial: Partial,
 ):  # fmt: skip
-    """Does `grid_update`."""
+    """Calls `grid_update`."""
     env = ti.static(Environment(index, params, counts, partial))
     grid_update(env, part, it, drive, ti.static(Body(None, None, velocities, changes)))
 
@@ -320,9 +335,9 @@ def substeps(
 ):  # fmt: skip
     """Explicit substeps of every environment's scene in one launch, `team` threads an environment.
 
-    Stages of a substep: what is scattered must be whole before it is summed, the sums whole before each pass of the
-    filters reads its neighbours', what moves before it leads, and what follows before it is gathered. A part is
-    gathered in the stage in which it is scattered again.
+    Stages of a substep: scattered values are complete before they are summed, sums before each pass of the filters
+    reads those of neighbours, velocities of full nodes before those of tied nodes, and these before they are gathered.
+    A part is gathered in the stage in which it is scattered again.
     """
     for task in range(sync.shape[0] * team * CHUNK):
         for _ in range(first_in_chunk(task)):
@@ -338,21 +353,21 @@ def substeps(
             of_links = ti.static((body_arrays.ends, body_arrays.shares))
             body = ti.static(Body(body_arrays.particles, *of_grid, *of_links))
             steps = env.count(layout.STEPS)
-            stages, own = STAGES * steps + 1, own_part(task, team)
+            stages, own = STAGES * steps + 1, first_own_part(task, team)
             highest, known = vec2(0.0), -1  # of the two gels, in this stage
-            piece = next_piece(sync, turn, own, stages)
+            piece = claim_work(sync, turn, own, stages)
             while piece < stages * PARTS:
                 stage, part = piece // PARTS, piece % PARTS
                 it, scatters = stage // STAGES, stage % STAGES == 0
                 for _new in range(one_if(scatters and stage != known)):
                     known = stage
                     for g in ti.static(range(2)):
-                        highest[g] = contact_ceiling(ti.static(gel_of(env, gels, g)))
+                        highest[g] = max_surface_height(ti.static(gel_of(env, gels, g)))
                 for _gather in range(one_if(scatters and it > 0)):
                     on_body(grid_to_particles, index, part, body.particles, *of_grid, *shared)
                 for _scatter in range(one_if(scatters and it < steps)):
                     place = ivec3(index, part, it)
-                    contacts(
+                    particle_contacts(
                         place, highest, drive, gels.surface, gels.contact_force, body.particles, histories, *shared
                     )
                     clear_masses(env, part, body)
@@ -361,9 +376,9 @@ def substeps(
                 for _totals in range(one_if(stage % STAGES == 1)):
                     on_gels(gel_means, index, part, *of_gels, *shared)
                     on_body(grid_changes, index, part, body.particles, *of_grid, *shared)
-                    on_links(push_leaders, index, part, *of_grid, *of_links, *shared)
+                    on_links(transfer_impulses, index, part, *of_grid, *of_links, *shared)
                 for _even in range(one_if(stage % STAGES == 2)):
-                    on_gels(gel_even, index, part, *of_gels, *shared)
+                    on_gels(gel_filter_first_pass, index, part, *of_gels, *shared)
                 for _cells in range(one_if(stage % STAGES == 2 or stage % STAGES == 4)):
                     cell_means(env, part, ti.select(stage % STAGES == 2, CHANGE, SECOND), body)
                 for _motion in range(one_if(stage % STAGES == 3)):
@@ -372,8 +387,8 @@ def substeps(
                 for _motion in range(one_if(stage % STAGES == 5)):
                     grid_motion(index, part, it, drive, body.velocities, body.changes, *shared)
                 for _light in range(one_if(stage % STAGES == 6)):
-                    on_links(follow, index, part, *of_grid, *of_links, *shared)
+                    on_links(set_tied_velocities, index, part, *of_grid, *of_links, *shared)
                 for _end in range(one_if(stage % STAGES == STAGES - 1)):
-                    keep_record(env, part, it, records)
-                piece_done(sync, turn)
-                piece = next_piece(sync, turn, own, stages)
+                    store_record(env, part, it, records)
+                report_work_done(sync, turn)
+                piece = claim_work(sync, turn, own, stages)

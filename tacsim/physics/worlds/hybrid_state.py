@@ -1,4 +1,4 @@
-"""Arrays of two gels round a plasticine body, of several environments."""
+"""Arrays of two gels and a plasticine body, of several environments."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tacsim.compute.runtime import start
+from tacsim.compute.runtime import start_taichi
 from tacsim.geometry.sampling import body_points
 from tacsim.geometry.shapes import bounding_size, enclosed_volume
 from tacsim.models.scene import Scene
@@ -38,15 +38,15 @@ class HybridState(FemState):
     device: DeviceHybrid | None = None
 
     def __init__(self, scenes: Sequence[Scene]) -> None:
-        """Raises ValueError for gels that are not cut alike."""
-        start()
+        """Raises ValueError for gels with different lattices."""
+        start_taichi()
         self.gel = [_gels_of(scene) for scene in scenes]
         self._gels = GelState(common_lattices(self.gel), len(scenes))
         placed = [_body_at_start(scene) for scene in scenes]
         self.body = [body for body, _, _ in placed]
         self.heights = [float(points[:, 2].std()) for _, points, _ in placed]  # of the particles, standard deviation
         self._particles = BodyState([points for _, points, _ in placed], [planes for _, _, planes in placed])
-        # of the contact law [mm]
+        # memory of the contact law [mm]
         self._contact_history = np.zeros((len(scenes), 2, max(self._particles.counts), ContactHistory.n), np.float32)
         self.params = np.zeros((len(scenes), PARAMS), np.float32)
         self.counts = np.zeros((len(scenes), COUNTS), np.int32)
@@ -63,55 +63,56 @@ class HybridState(FemState):
 
     @property
     def particle_counts(self) -> Sequence[int]:
-        """Particles of each environment; nothing is brought back from a device for them."""
+        """Number of particles of each environment; no download from a device."""
         return self._particles.counts
 
     @property
     def particles(self) -> BodyState:
-        self._bring_back()
+        self._copy_to_host()
         return self._particles
 
     @property
     def contact_history(self) -> np.ndarray:
-        self._bring_back()
+        self._copy_to_host()
         return self._contact_history
 
     def extents(self, index: int) -> np.ndarray:
-        """See `BodyState.extents`; what follows is likewise of one environment, wherever its arrays are."""
+        """See `BodyState.extents`. This and the next methods are for one environment, on the CPU or a device."""
         return self._particles.extents(index) if self.device is None else self.device.survey(index).extents
 
-    def fit(self, index: int, cell: float, extents: np.ndarray) -> None:
-        """Lays its grid. Raises MemoryError."""
-        # a node at its border has no mass: the cells round each that has are all there (tacsim.physics.body.mass)
+    def fit_grid(self, index: int, cell: float, extents: np.ndarray) -> None:
+        """Fits its grid. Raises MemoryError."""
+        # nodes at the border have no mass: all nodes with mass have eight cells (tacsim.physics.body.mass)
         room = len(self._particles.velocities[0])
-        self._particles.fit(index, cell, STENCIL_REACH * cell, self.params, self.counts, extents)
+        self._particles.fit_grid(index, cell, STENCIL_REACH * cell, self.params, self.counts, extents)
         if self.device is not None and len(self._particles.velocities[0]) > room:
-            self.device.bring_back()  # what has just grown is sent again
+            self.device.copy_to_host()  # arrays that have grown are sent again
 
-    def grid_kept(self, index: int) -> tuple[int, int, int]:
-        """See `BodyState.grid_kept`."""
-        return self._particles.grid_kept(index)
+    def stored_grid_shape(self, index: int) -> tuple[int, int, int]:
+        """See `BodyState.stored_grid_shape`."""
+        return self._particles.stored_grid_shape(index)
 
     def moments(self, index: int) -> Moments:
         return moments_of(self._particles, index) if self.device is None else self.device.moments(index)
 
     def centre(self, index: int) -> np.ndarray:
-        """Of the particles (3,) [mm]."""
+        """Mean position of the particles (3,) [mm]."""
         return centre_of(self._particles.x(index)) if self.device is None else self.device.moments(index).centre
 
-    def outside(self, index: int) -> tuple[np.ndarray, np.ndarray]:
+    def positions_and_planes(self, index: int) -> tuple[np.ndarray, np.ndarray]:
         """Positions [mm] and tangent planes [1/mm] of the particles, (n, 3) both."""
         if self.device is not None:
-            return self.device.outside(index)
+            return self.device.positions_and_planes(index)
         return self._particles.x(index), self._particles.plane(index)
 
     @property
-    def most_nodes(self) -> int:
-        """Of a grid, see `BodyState.most`."""
-        return self._particles.most
+    def max_nodes(self) -> int:
+        """See `BodyState.max_grid_nodes`."""
+        return self._particles.max_grid_nodes
 
     def place(self, index: int, scene: Scene) -> None:
-        """One environment as it is at the construction of another scene. Raises ValueError for gels cut otherwise."""
+        """Puts the initial state of another scene into one environment. Raises ValueError for gels with other
+        lattices."""
         gels = _gels_of(scene)
         common_lattices([*self.gel, gels])
         body, points, planes = _body_at_start(scene)
@@ -130,7 +131,7 @@ class HybridState(FemState):
         if self.device is not None:
             self.device.run(drive)
         else:
-            self._gels.refresh()
+            self._gels.copy_surface()
             body = self._particles
             run_team(
                 substeps, drive, self._gels.arguments(),
@@ -138,7 +139,7 @@ class HybridState(FemState):
                 (self.params, self.counts, self.partial), self.records, active=list(drives),
             )  # fmt: skip
         for index in drives:
-            self._particles.keep_grid(index, self.counts)
+            self._particles.set_grid_velocities(index, self.counts)
 
 
 def _gels_of(scene: Scene) -> tuple[GelParams, ...]:
@@ -146,7 +147,7 @@ def _gels_of(scene: Scene) -> tuple[GelParams, ...]:
 
 
 def _body_at_start(scene: Scene) -> tuple[BodyParams, np.ndarray, np.ndarray]:
-    """A scene's body: parameters, particles at construction (n, 3) [mm], their tangent planes (n, 3) [1/mm]."""
+    """A scene's body: parameters, initial particle positions (n, 3) [mm], their tangent planes (n, 3) [1/mm]."""
     assert scene.body is not None
     height = float(bounding_size(scene.body.geometry)[2])
     points = body_points(scene.body, scene.spacing)

@@ -17,8 +17,8 @@ from tacsim.physics.exec.layout import (
     FORCE,
     FRICTION,
     GEL_DAMPING,
-    LIMIT_FOLLOWS,
-    MEMORY,
+    LIMIT_RELAXATION_RATE,
+    MEMORY_SHARE,
     STEP,
     STIFFNESS,
 )  # fmt: skip
@@ -26,8 +26,8 @@ from tacsim.physics.failure.health import Health, SimulationDiverged, check_laun
 from tacsim.physics.gel.gel import GelParams
 from tacsim.physics.motion.controller import ForceReading, Integration, Launch, PreparedLaunch, force_floor
 from tacsim.physics.motion.inertia import Inertia, kernel_second
-from tacsim.physics.motion.path import Path, path_along, path_length, plan
-from tacsim.physics.motion.slide import Slide, growth, pace, slower_walls, turn
+from tacsim.physics.motion.path import Path, path_length, plan_path, tangential_path_length
+from tacsim.physics.motion.slide import Slide, growth_share, speed_share, turn_share, wall_slowdown
 from tacsim.physics.motion.tuning import SHORT_SLIDE, SLOWED_WALL_LENGTH
 from tacsim.physics.units import MM, MPA
 from tacsim.physics.worlds.fem import FemWorld
@@ -47,19 +47,19 @@ from tacsim.physics.worlds.tuning import (
 )
 from tacsim.pose import inverse, relative_pose, rotate
 
-TOO_MUCH = "cut off parts of mesh and gel that cannot touch; worlds of a smaller batch have more room each"
+MESH_ADVICE = "cut off parts of mesh and gel that cannot touch; in a smaller batch each world has more memory"
 
 
 def contact_stiffness(gel: GelParams, step: float) -> float:
-    """Of a contact point [MPa/mm]: that of a half-space to the shortest wave of pressure that the points can carry, but
-    no more than the mass of the surface's nodes allows in a `step` [mm]."""
+    """Stiffness of a contact point [MPa/mm]: that of a half-space for the shortest pressure wave on the points, limited
+    by the mass of the surface's nodes for a time `step` [mm]."""
     mu, lam = gel.mu, gel.lam
     half_space = (2 * math.pi * POINTS / gel.spacing) * 2 * mu * (lam + mu) / (lam + 2 * mu)  # k E / (2 (1 - nu^2))
     return min(half_space, gel.density * gel.spacing / (2 * step**2))
 
 
-def sharpened(nodes: np.ndarray, share: float) -> np.ndarray:
-    """(nx, ny, 3) less `share` of their second differences along either axis; beyond the rim they repeat."""
+def subtract_second_differences(nodes: np.ndarray, share: float) -> np.ndarray:
+    """(nx, ny, 3) minus `share` of their second differences along both axes; values at the rim are repeated outside."""
     out = np.asarray(nodes, np.float64)
     for axis in (0, 1):
         padded = np.pad(out, [(int(d == axis),) * 2 for d in range(3)], mode="edge")
@@ -86,10 +86,10 @@ class PressWorld(FemWorld):
     sensors = ("lower",)
     balanced = False
     yields = False
-    unfelt = 0.0  # share of the indenter's depth in the untouched gel that no contact point feels, when last at rest
+    missed_depth_share = 0.0  # share of the indenter's depth that no contact point reaches, in the last state at rest
 
     def __init__(self, scene: Scene, state: PressState | None = None, index: int = 0) -> None:
-        """The environment of scene number `index` in a `state` of several; or one alone in a state of its own."""
+        """The environment of scene number `index` in a `state` of several; without `state`, a single environment."""
         assert scene.indenter is not None
         self.scene = scene
         self._state: PressState = PressState([scene]) if state is None else state
@@ -97,11 +97,11 @@ class PressWorld(FemWorld):
         self._gel = self._state.gel[index]
         self._gels = (self._gel,)
         step = PRESS_COURANT * self._gel.spacing
-        self._shear = math.sqrt(self._gel.mu / self._gel.density)  # speed of its shear wave, over that of pressure
+        self._shear = math.sqrt(self._gel.mu / self._gel.density)  # speed of its shear wave, over its pressure wave's
         zeta = min(PRESS_ZETA, PRESS_ZETA_BY_SHEAR * self._shear)
-        self._scaled = Inertia({GEL_DAMPING: zeta / self._gel.thickness, MEMORY: FORCE_MEMORY_RATE}, step)
+        self._scaled = Inertia({GEL_DAMPING: zeta / self._gel.thickness, MEMORY_SHARE: FORCE_MEMORY_RATE}, step)
         self._true = Inertia(
-            {GEL_DAMPING: 0.0, MEMORY: 0.0}, step, kernel_second(self._gel, scene.gel.material.density)
+            {GEL_DAMPING: 0.0, MEMORY_SHARE: 0.0}, step, kernel_second(self._gel, scene.gel.material.density)
         )
         self._floor = force_floor(scene.gel.material.youngs_modulus * MPA, self._gel.thickness)
         params = {
@@ -111,31 +111,37 @@ class PressWorld(FemWorld):
         self._state.params[index, list(params)] = list(params.values())
         self._use_inertia(self._scaled)
         self._rates = np.zeros((2, 6))
-        # where the indenter was over the gel when it last did not touch it, and how far it has been slid since [mm]
+        # x, y of the indenter at the last state without contact, and length of all slides since then [mm]
         self._touched = np.zeros(3)
         self._edges = edge_points(scene.indenter.geometry, scene.effective_element_size)
         turned = scene.indenter.turn
-        above = self.below(turned) + INITIAL_GAP
+        above = self.lowest_point_depth(turned) + INITIAL_GAP
         self._poses = {"lower": Pose(), "indenter": Pose(np.array([0.0, 0.0, above]), turned)}
 
     def _stop(self) -> None:
         self._state.gels.clear(self._index, velocity_only=True)
 
     def surface(self, name: str) -> GelSurface:
-        """The surface that its contact points lie on, which smooths the nodes less than their spline does."""
+        """The surface of the contact points, which is smoothed less than the spline of the nodes."""
         of_nodes = super().surface(name)
-        return replace(of_nodes, displacement=sharpened(of_nodes.displacement, SPLINE_SMOOTHING - SURFACE_SMOOTHING))
+        return replace(
+            of_nodes,
+            displacement=subtract_second_differences(of_nodes.displacement, SPLINE_SMOOTHING - SURFACE_SMOOTHING),
+        )
 
     def reach(self) -> np.ndarray:
-        """How far from the indenter the surface is still pressed [m], at its nodes (nx + 1, ny + 1)."""
+        """Distance from the indenter up to which contact pressure acts [m], at the surface's nodes (nx + 1, ny + 1)."""
         stiffness = float(self._state.params[self._index, STIFFNESS])
-        return np.asarray(self._state.gels.alike.carried[self._index, 0] / (RIM_STIFFNESS * stiffness * MM))
+        return np.asarray(
+            self._state.gels.common_group.surface_pressure[self._index, 0] / (RIM_STIFFNESS * stiffness * MM)
+        )
 
     def arrays(self) -> dict[str, np.ndarray]:
         state, i = self._state, self._index
         return {
             **state.gels.arrays(i), "anchor": state.anchor[i],
-            "pressure": state.pressure[i], "carried": state.gels.alike.carried[i, 0], "sums": state.partial[i],
+            "pressure": state.pressure[i], "carried": state.gels.common_group.surface_pressure[i, 0],
+            "sums": state.partial[i],
         }  # fmt: skip
 
     def truth(self) -> None:
@@ -145,55 +151,58 @@ class PressWorld(FemWorld):
         return {**super()._scalars(), "touched": self._touched}
 
     def plan(self, start: Sequence[Pose], end: Sequence[Pose]) -> Path:
-        """The path between two poses of sensor and indenter, at the scene's speed; slower where the drag turns, or
-        grows because the indenter is pressed in, and at its end where walls with much friction slide."""
+        """The path between two poses of sensor and indenter, at the scene's speed. It is slower where the drag changes
+        its direction, or increases by indentation, and at its end where steep sides slide with high friction."""
         gel, lever, indenter, mach = self._gel, max(self._gel.half), self.scene.indenter, self.scene.peak_mach
         assert indenter is not None
-        growing, turning, slower, walls, depth, self.unfollowed = 0.0, 0.0, 1.0, False, 0.0, ""
+        growing, turning, slower, walls, depth, self.unsettled_reason = 0.0, 0.0, 1.0, False, 0.0, ""
         at = relative_pose(*end)
-        way = (at.position - relative_pose(*start).position) * MM
+        displacement = (at.position - relative_pose(*start).position) * MM
         longest = path_length(start, end, lever)
-        faster = max(1.0, float(np.linalg.norm(way)) / longest) if longest > 0.0 else 1.0  # if they go opposite ways
+        # above 1 for opposite directions
+        faster = max(1.0, float(np.linalg.norm(displacement)) / longest) if longest > 0.0 else 1.0
         if indenter.friction > 0.0:
             force = self.wrench("lower")[:3]
-            growing, turning = growth(way), turn(way, force, indenter.friction)
-            depth = (self.below(at.quaternion) - float(at.position[2])) * MM
+            growing, turning = growth_share(displacement), turn_share(displacement, force, indenter.friction)
+            depth = (self.lowest_point_depth(at.quaternion) - float(at.position[2])) * MM
             walls = self._edges_touch(at, MAX_BULGE * depth)
-            mach *= pace(way, force, indenter.friction)
-            slower = slower_walls(way, indenter.friction, gel.spacing / gel.thickness) if walls else 1.0
-        path = plan(
+            mach *= speed_share(displacement, force, indenter.friction)
+            slower = wall_slowdown(displacement, indenter.friction, gel.spacing / gel.thickness) if walls else 1.0
+        path = plan_path(
             start, end, mach / faster, self._scaled.step, lever, gel.thickness,
-            remembered=path_along(start, end, lever),
-            short=SHORT_SLIDE + (SHORT_INDENTING_SLIDE - SHORT_SLIDE) * growing,
-            slower=slower, last=SLOWED_WALL_LENGTH * gel.spacing,
+            memory_length=tangential_path_length(start, end, lever),
+            short_length=SHORT_SLIDE + (SHORT_INDENTING_SLIDE - SHORT_SLIDE) * growing,
+            end_slowdown=slower, end_length=SLOWED_WALL_LENGTH * gel.spacing,
         )  # fmt: skip
         if indenter.friction > 0.0:
             slide = Slide(
-                length=math.hypot(way[0], way[1]),
-                before=float(self._touched[2]),
-                away=float(np.linalg.norm(at.position[:2] * MM - self._touched[:2])),
+                length=math.hypot(displacement[0], displacement[1]),
+                earlier_length=float(self._touched[2]),
+                end_distance=float(np.linalg.norm(at.position[:2] * MM - self._touched[:2])),
                 depth=depth,
                 shear_mach=faster * path.peak_mach(lever) / self._shear,
                 friction=indenter.friction,
                 edge_radius=MM * edge_radius(indenter, self.scene.effective_element_size) if walls else math.inf,
             )
-            self.unfollowed = slide.unfollowed(min(self.scene.effective_element_size * MM, gel.spacing), gel.thickness)
-        return replace(path, growing=growing, turning=turning, unfollowed=self.unfollowed)
+            self.unsettled_reason = slide.unsettled_reason(
+                min(self.scene.effective_element_size * MM, gel.spacing), gel.thickness
+            )
+        return replace(path, growth_share=growing, turn_share=turning, unsettled_reason=self.unsettled_reason)
 
     def _edges_touch(self, at: Pose, bulge: float) -> bool:
-        """Whether edges of the indenter, `at` this pose in the gel's frame, reach the gel; bulge: how far that rises
-        round it [mm]. Those at the back of an indenter do not, nor those of one that is wider than the gel."""
+        """Whether edges of the indenter, `at` this pose in the gel's frame, reach the gel; bulge: height of the gel
+        around it [mm]. Edges at the back of an indenter and outside of the gel do not."""
         points = (rotate(at, self._edges) + at.position) * MM
         return bool((np.all(np.abs(points[:, :2]) <= self._gel.half, axis=1) & (points[:, 2] <= bulge)).any())
 
     def place(self, poses: Mapping[str, Pose]) -> None:
-        """See World. Where the indenter is then, it has come to the gel."""
+        """See World. The new position of the indenter counts as the point of first contact."""
         super().place(poses)
         self._touched[:] = [*relative_pose(*self._poses.values()).position[:2] * MM, 0.0]
 
-    def below(self, turn: np.ndarray) -> float:
-        """How far the indenter's lowest point is below its origin, the centre of its bounding box, if that is turned by
-        the quaternion `turn` (4,) [m]."""
+    def lowest_point_depth(self, turn: np.ndarray) -> float:
+        """Depth of the indenter's lowest point below its origin, the centre of its bounding box, with the orientation
+        `turn` (4,), a quaternion [m]."""
         assert self.scene.indenter is not None
         mesh = self._state.meshes[self._index]
         if mesh is not None and turn[:2].any():
@@ -204,34 +213,35 @@ class PressWorld(FemWorld):
         )
 
     def prepare(self, launch: Launch) -> PreparedLaunch:
-        """Sets this environment's parameters. Raises SimulationDiverged where too much of a mesh could be touched."""
+        """Sets this environment's parameters. Raises SimulationDiverged where the gel could touch too much of a
+        mesh."""
         path, where = launch.path, partial(launch.span, tuple(self._poses))
         both = path.drive(launch.first, launch.last)
         drive = relative_drive(both[:, 0], both[:, 1])
         try:
             self._cover(drive)
         except ValueError as error:
-            raise SimulationDiverged(str(error), where(), TOO_MUCH, retry=False) from None
+            raise SimulationDiverged(str(error), where(), MESH_ADVICE, retry=False) from None
         except MemoryError as error:
             cause = f"no memory for the distances from the indenter's mesh ({error})"
-            raise SimulationDiverged(cause, where(), TOO_MUCH, retry=False) from None
+            raise SimulationDiverged(cause, where(), MESH_ADVICE, retry=False) from None
         before = self._before_launch()
         self._state.params[self._index, STEP] = path.step
-        self._state.params[self._index, LIMIT_FOLLOWS] = self._follows(launch) / self._gel.thickness
-        damped = 1.0 if launch.held else 1.0 - path.turning * (1.0 - TURNING_ZETA_SHARE)
+        self._state.params[self._index, LIMIT_RELAXATION_RATE] = self._limit_relaxation(launch) / self._gel.thickness
+        damped = 1.0 if launch.is_held else 1.0 - path.turn_share * (1.0 - TURNING_ZETA_SHARE)
         self._state.params[self._index, GEL_DAMPING] = damped * self._inertia.params[GEL_DAMPING]
         Health.clear(self._state.partial[self._index])
         return PreparedLaunch(launch, where, drive, before)
 
-    def _follows(self, launch: Launch) -> float:
-        """In how many parts of the time of a wave through the gel the limit of friction follows the pressure."""
+    def _limit_relaxation(self, launch: Launch) -> float:
+        """Rate at which the friction limit follows the pressure, times the time of a wave through the gel."""
         indenter = self.scene.indenter
         assert indenter is not None
         steady = FLUTTER_FRICTION / min(max(indenter.friction, FLUTTER_FRICTION / MAX_LIMIT_RATE), FLUTTER_FRICTION)
-        return steady if launch.held else steady + launch.path.growing * (MAX_LIMIT_RATE - steady)
+        return steady if launch.is_held else steady + launch.path.growth_share * (MAX_LIMIT_RATE - steady)
 
     def _cover(self, drive: np.ndarray) -> None:
-        """Fills in a mesh's distances wherever the gel's surface may touch it in this launch."""
+        """Computes a mesh's distances where the gel's surface may touch it in this launch."""
         mesh = self._state.meshes[self._index]
         if mesh is None:
             return
@@ -243,8 +253,8 @@ class PressWorld(FemWorld):
             self._state.cover(self._index, near.min(axis=0) - margin, near.max(axis=0) + margin)
 
     def _surface_nodes(self) -> np.ndarray:
-        """Where the nodes of the gel's surface are (n, 3) [mm], sensor frame."""
-        top = self._state.tops(self._index)[0].astype(np.float64)
+        """Positions of the nodes of the gel's surface (n, 3) [mm], sensor frame."""
+        top = self._state.surface_displacements(self._index)[0].astype(np.float64)
         axes = (self._gel.spacing * (np.arange(n) - (n - 1) / 2) for n in top.shape[:2])
         top[..., :2] += np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
         return np.asarray(top.reshape(-1, 3))
@@ -252,32 +262,32 @@ class PressWorld(FemWorld):
     def outcome(self, prepared: PreparedLaunch) -> list[ForceReading]:
         """The forces after the launch. Raises SimulationDiverged if its state is unphysical."""
         partial = self._state.partial[self._index]
-        seen = self._survey()
-        health = Health.read(partial, self._courant(), sound=seen is not None and seen.sound)
+        survey = self._survey()
+        health = Health.read(partial, self._courant(), sound=survey is not None and survey.is_healthy)
         check_launch(self.arrays, prepared.before, health, prepared.where)
         sums = partial.astype(np.float64).sum(axis=0)
         force, moment = sums[None, FORCE : FORCE + 3], sums[None, FORCE + 3 : FORCE + 6]
         backing = sums[None, BACKING : BACKING + 3]
-        # here, not in `plan`, which flowing motions do not ask
+        # here, not in `plan`, which flowing motions do not call
         if not force.any():
             self._touched[:] = [*prepared.drive[-1, 0, 3, :2], 0.0]
         else:
             self._touched[2] += np.linalg.norm(prepared.drive[:, 0, 4, :2], axis=1).sum() * prepared.launch.path.step
-        if prepared.launch.held or (not force.any() and prepared.launch.last == prepared.launch.path.substeps):
-            self._require_seen(prepared, health.overlap)
+        if prepared.launch.is_held or (not force.any() and prepared.launch.last == prepared.launch.path.substeps):
+            self._require_contact_resolution(prepared, health.overlap)
         reading = ForceReading(
             force, backing, self._floor, health.overlap, health.capped, moment / max(self._gel.half),
             integration=Integration(prepared.launch.path.step, self._damping(), health.courant),
         )  # fmt: skip
         return [reading]
 
-    def _require_seen(self, prepared: PreparedLaunch, overlap: float) -> None:
-        """Raises SimulationDiverged if the indenter's lowest point over the gel has come into it between its contact
-        points, the deepest of which has an `overlap` with it [mm]."""
+    def _require_contact_resolution(self, prepared: PreparedLaunch, overlap: float) -> None:
+        """Raises SimulationDiverged if the indenter's lowest point is in the gel between the contact points, the
+        deepest of which has this `overlap` [mm]."""
         assert self.scene.indenter is not None
         rows, spacing = prepared.drive[-1, 0].astype(np.float64), self._gel.spacing
         down = rows[:3].T @ [0.0, 0.0, -1.0]
-        half, self.unfelt = np.array(self._gel.half) - spacing, 0.0  # not at the gel's rim
+        half, self.missed_depth_share = np.array(self._gel.half) - spacing, 0.0  # not at the gel's rim
         mesh, geometry = self._state.meshes[self._index], self.scene.indenter.geometry
         if isinstance(geometry, Mesh):
             assert mesh is not None
@@ -301,8 +311,8 @@ class PressWorld(FemWorld):
         nodes = self._surface_nodes()
         near = np.abs(nodes[:, :2] - tip[:2]).max(axis=1) < 2 * spacing
         depth = float(nodes[near, 2].min(initial=np.inf) - tip[2])
-        self.unfelt = max(depth - overlap, 0.0) / -float(tip[2]) if tip[2] < 0.0 else 0.0
-        # where points do touch, deeper by no more than a quarter of its way into the untouched gel
+        self.missed_depth_share = max(depth - overlap, 0.0) / -float(tip[2]) if tip[2] < 0.0 else 0.0
+        # where points touch, the difference may be a quarter of the depth in the undeformed gel
         if depth - overlap > max(MAX_DIP * spacing / POINTS, 0.0 if overlap == 0.0 else -tip[2] / 4):
             cause = f"the indenter is {depth:.3g} mm deep in the gel and touches no contact point of it"
             if overlap > 0.0:
@@ -311,8 +321,8 @@ class PressWorld(FemWorld):
                 )
             finer = self._gel.thickness / (2 * self._gel.elements[2])
             advice = (
-                f"these lie {spacing / POINTS:.3g} mm apart (element_size / {POINTS}), and its tip or edge passes "
-                f"between them: use a smaller element_size, such as {finer:.4g} mm"
+                f"these lie {spacing / POINTS:.3g} mm apart (element_size / {POINTS}), and its tip or edge is between "
+                f"them: use a smaller element_size, such as {finer:.4g} mm"
             )
             before = prepared.before
             raise SimulationDiverged(cause, prepared.where(), advice, retry=False, good=before, failed=self.arrays())

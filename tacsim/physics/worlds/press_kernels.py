@@ -1,7 +1,7 @@
 """Kernel of a rigid indenter on one gel."""
 
 from tacsim.compute.runtime import ti
-from tacsim.physics.contact.indenter import Indenter, IndenterArrays, carry, indent
+from tacsim.physics.contact.indenter import Indenter, IndenterArrays, apply_indenter, update_node_pressure
 from tacsim.physics.exec import layout
 from tacsim.physics.exec.environment import Environment, EnvironmentArrays
 from tacsim.physics.exec.lanes import PARTS
@@ -9,11 +9,11 @@ from tacsim.physics.exec.team import (
     CHUNK,
     ENVIRONMENT,
     Sync,
+    claim_work,
     first_in_chunk,
-    next_piece,
+    first_own_part,
     one_if,
-    own_part,
-    piece_done,
+    report_work_done,
 )
 from tacsim.physics.gel.kernels import GelArrays, Gels, gel_advance, gel_forces, gel_of
 from tacsim.physics.worlds.hybrid_kernels import Drive
@@ -42,15 +42,16 @@ def substeps(
             )
             gel = ti.static(gel_of(env, gels, 0))
             indenter = ti.static(Indenter(indenter_arrays.anchor, indenter_arrays.pressure, indenter_arrays.values))
-            stages, own = 2 * env.count(layout.STEPS), own_part(task, team)  # two a substep: forces, then motion
-            piece = next_piece(sync, turn, own, stages)
+            # two stages a substep: forces, then motion
+            stages, own = 2 * env.count(layout.STEPS), first_own_part(task, team)
+            piece = claim_work(sync, turn, own, stages)
             while piece < stages * PARTS:
                 stage, part = piece // PARTS, piece % PARTS
                 for _forces in range(one_if(stage % 2 == 0)):
-                    indent(env, part, stage // 2, drive, gel, indenter)
+                    apply_indenter(env, part, stage // 2, drive, gel, indenter)
                     gel_forces(env, part, gels)
                 for _motion in range(one_if(stage % 2 == 1)):
-                    carry(env, part, gel)
+                    update_node_pressure(env, part, gel)
                     gel_advance(env, part, gels)
-                piece_done(sync, turn)
-                piece = next_piece(sync, turn, own, stages)
+                report_work_done(sync, turn)
+                piece = claim_work(sync, turn, own, stages)

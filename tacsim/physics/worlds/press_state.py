@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from tacsim.compute.runtime import start
+from tacsim.compute.runtime import start_taichi
 from tacsim.geometry.shapes import MAX_NODES, rotated_bounding_size
 from tacsim.geometry.tiles import TILE_NODES, TiledDistance, cached_tiled_distance
 from tacsim.models.scene import Box, Cylinder, Indenter, Scene, Shape, Sphere
@@ -45,21 +45,21 @@ class PressState(FemState):
     """
 
     def __init__(self, scenes: Sequence[Scene]) -> None:
-        """Raises ValueError for gels that are not cut alike, and an indenter too fine for them."""
-        start()
+        """Raises ValueError for gels with different lattices, and for an indenter that is too narrow for them."""
+        start_taichi()
         self.gel = [gel_params(scene.gel, scene.effective_element_size) for scene in scenes]
         self._gels = GelState(common_lattices([(gel,) for gel in self.gel]), len(scenes))
         nx, ny, _ = self.gel[0].elements
         self._anchor = np.zeros((len(scenes), nx * POINTS, ny * POINTS, 3), np.float32)
-        self._pressure = np.zeros(self._anchor.shape[:3], np.float32)  # of the contact points, as remembered [MPa]
+        self._pressure = np.zeros(self._anchor.shape[:3], np.float32)  # stored pressure of the contact points [MPa]
         self.params = np.zeros((len(scenes), PARAMS), np.float32)
         self.counts = np.zeros((len(scenes), COUNTS), np.int32)
         self._gels.write_layout(self.counts)
         self.partial = np.zeros((len(scenes), PARTS, NUMBERS), np.float32)
         self._values = np.zeros((len(scenes), 2, 2, 2), np.float32)
-        self._covered = 0  # how often they have changed: a device keeps its copy of them until they do
+        self._covered = 0  # number of changes of the values; a device copies them only after a change
         self.meshes = [self._set_shape(index, scene) for index, scene in enumerate(scenes)]
-        self._tiles: dict[int, tuple[np.ndarray, np.ndarray]] = {}  # first and end of those filled in
+        self._tiles: dict[int, tuple[np.ndarray, np.ndarray]] = {}  # first and end of the computed tiles
         if ON_DEVICE:
             from tacsim.physics.worlds.device_state import DevicePress
 
@@ -70,16 +70,16 @@ class PressState(FemState):
 
     @property
     def anchor(self) -> np.ndarray:
-        self._bring_back()
+        self._copy_to_host()
         return self._anchor
 
     @property
     def pressure(self) -> np.ndarray:
-        self._bring_back()
+        self._copy_to_host()
         return self._pressure
 
     def _set_shape(self, index: int, scene: Scene) -> TiledDistance | None:
-        """Writes one environment's indenter into params and counts; returns the distances of a mesh."""
+        """Writes one environment's indenter into params and counts; returns the distances of its mesh."""
         assert scene.indenter is not None
         _require_resolved(scene.indenter, self.gel[index])
         kind, size, mesh = _shape_params(scene.indenter.geometry)
@@ -91,10 +91,10 @@ class PressState(FemState):
         return mesh
 
     def cover(self, index: int, low: np.ndarray, high: np.ndarray) -> None:
-        """Fills in the distances of an environment's mesh between two corners (3,) [mm], axes of the mesh.
+        """Computes the distances of an environment's mesh between two corners (3,) [mm], axes of the mesh.
 
-        The memory of all environments grows if this one needs more. Raises ValueError for more nodes than one may have,
-        MemoryError where there is no memory for them; nothing has changed then.
+        The memory of all environments grows if this one needs more. Raises ValueError for more nodes than the limit,
+        MemoryError where there is no memory for them; nothing is changed then.
         """
         mesh = self.meshes[index]
         assert mesh is not None
@@ -127,7 +127,7 @@ class PressState(FemState):
         if self.device is not None:
             self.device.run(drive)
             return
-        self._gels.refresh()
+        self._gels.copy_surface()
         run_team(
             substeps, drive, self._gels.arguments(), (self._anchor, self._pressure, self._values),
             (self.params, self.counts, self.partial), active=list(drives),
@@ -135,7 +135,7 @@ class PressState(FemState):
 
 
 def _require_resolved(indenter: Indenter, gel: GelParams) -> None:
-    """Raises ValueError for an indenter that fits between the points at which the gel's surface feels it."""
+    """Raises ValueError for an indenter that fits between the contact points of the gel's surface."""
     geometry = indenter.geometry
     size = rotated_bounding_size(geometry, indenter.model_copy(update={"yaw": 0.0}).turn)  # no width depends on the yaw
     narrow, spacing = float(size[:2].min()) * MM, gel.spacing / POINTS

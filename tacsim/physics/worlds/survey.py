@@ -1,5 +1,5 @@
-"""What kernels find in a state on a device (survey_kernels.py), so that nobody need bring its arrays back to look at
-them."""
+"""Results of kernels that inspect a state on a device (survey_kernels.py), so that its arrays are not copied to the
+host."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ BLOCKS = 256  # of a body's particles, for their sums
 
 # The numbers of one environment: float32
 _numbers = Layout()
-NOT_FINITE = _numbers.place()  # how many entries are not
+NOT_FINITE = _numbers.place()  # number of such entries
 NODE_SPEED = _numbers.place()  # largest component
-SHORTEST = _numbers.place(2)  # shortest edge of an element of gel 0, gel 1, less its length at rest [mm]
+MIN_EDGE = _numbers.place(2)  # shortest edge of an element of gel 0, gel 1, minus its length at rest [mm]
 CORNER = _numbers.place()  # smallest volume ratio at the elements' corners
 TOP = _numbers.place(8)  # surface displacements of gel 0, gel 1: largest |x|, |y|, lowest z, highest z [mm]
-SQUARED_VOLUME, LARGEST_SQUARED_VOLUME = _numbers.place(), _numbers.place()  # least and largest det b_e of a particle
-LOW, HIGH = _numbers.place(3), _numbers.place(3)  # of the particles' places on the grid: x, y, z [mm]
-# Sums over the particles, of r their place on the grid less `base`, d = x - place, x their place in space less `base`:
-# d, r, x x^T and r r^T (xx, yy, zz, xy, xz, yz), d r^T (row by row)
+SQUARED_VOLUME, LARGEST_SQUARED_VOLUME = _numbers.place(), _numbers.place()  # smallest, largest det b_e of a particle
+LOW, HIGH = _numbers.place(3), _numbers.place(3)  # of the particles' reference positions: x, y, z [mm]
+# Sums over the particles of d, r, x x^T and r r^T (xx, yy, zz, xy, xz, yz), d r^T (row by row): r reference position
+# minus `base`, x position minus `base`, d = x - r
 SUMS = _numbers.size
 _sums = Layout()
 MOVED, REFERENCE = _sums.place(3), _sums.place(3)
@@ -39,22 +39,26 @@ NUMBERS = SUMS + MOMENTS
 
 @dataclass(frozen=True)
 class Survey:
-    """Of one environment's state."""
+    """Results for one environment's state."""
 
-    finite: bool  # all its numbers are
-    sound: bool  # and no gel node is too fast, no particle crushed: see `tacsim.physics.failure.health`
-    shortest: tuple[float, ...]  # edge of an element of each gel, along its direction at rest [mm]
+    finite: bool  # all its numbers are finite
+    is_healthy: (
+        bool  # in addition, no gel node is too fast and no particle is crushed: see `tacsim.physics.failure.health`
+    )
+    min_edge_length: tuple[float, ...]  # of each gel, measured along the direction at rest [mm]
     smallest_corner: float  # volume ratio
-    tops: NDArray[np.float32]  # (gels, 4) largest |x|, |y|, lowest and highest z of the surfaces' displacements [mm]
-    extents: NDArray[np.float32]  # (1, 2, 3) lowest and highest places of the particles on their grid [mm]
+    surface_bounds: NDArray[
+        np.float32
+    ]  # (gels, 4) largest |x|, |y|, lowest and highest z of the surfaces' displacements [mm]
+    extents: NDArray[np.float32]  # (1, 2, 3) lowest and highest reference positions of the particles [mm]
     moments: Moments | None = None  # of a body
-    volumes: tuple[float, float] = (1.0, 1.0)  # least and largest elastic volume ratio of its particles
+    volumes: tuple[float, float] = (1.0, 1.0)  # smallest and largest elastic volume ratio of its particles
 
 
 def survey_of(
     numbers: NDArray[np.float32], spacings: Sequence[float], particles: int = 0, base: Any = 0.0
 ) -> Survey:  # fmt: skip
-    """Of an environment's numbers (NUMBERS,) as the kernels leave them; spacings: of its gels' nodes [mm]."""
+    """The survey from an environment's numbers (NUMBERS,) of the kernels; spacings: of its gels' nodes [mm]."""
     finite = not numbers[NOT_FINITE]
     sound = bool(
         finite and numbers[NODE_SPEED] <= MAX_SPEED and numbers[SQUARED_VOLUME] > (2.0 * MIN_VOLUME_RATIO) ** 2
@@ -64,7 +68,7 @@ def survey_of(
         volumes = np.ones(2, np.float32)
     least, largest = (float(volume) for volume in np.sqrt(volumes))
     return Survey(
-        finite, sound, tuple(h + float(numbers[SHORTEST + g]) for g, h in enumerate(spacings)),
+        finite, sound, tuple(h + float(numbers[MIN_EDGE + g]) for g, h in enumerate(spacings)),
         float(numbers[CORNER]), numbers[TOP : TOP + 8].reshape(2, 4), numbers[LOW : LOW + 6].reshape(1, 2, 3),
         _moments(numbers[SUMS:].astype(np.float64), particles, np.asarray(base, np.float64)) if particles else None,
         (least, largest),

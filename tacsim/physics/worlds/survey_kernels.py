@@ -1,4 +1,4 @@
-"""Kernels that look at states on a device, or keep them there."""
+"""Kernels that inspect states on a device, and that store copies of them there."""
 
 from typing import Any
 
@@ -15,6 +15,7 @@ from tacsim.physics.worlds.survey import (
     HIGH,
     LARGEST_SQUARED_VOLUME,
     LOW,
+    MIN_EDGE,
     MOMENTS,
     MOVED,
     MOVED_REFERENCE,
@@ -24,7 +25,6 @@ from tacsim.physics.worlds.survey import (
     REFERENCE,
     REFERENCE_SECOND,
     SECOND,
-    SHORTEST,
     SQUARED_VOLUME,
     SUMS,
     TOP,
@@ -34,25 +34,25 @@ Sums = ti.types.ndarray(dtype=ti.f32, ndim=3)  # (environments, numbers, BLOCKS)
 
 
 @ti.func
-def is_bad(value):
-    """1 for a number that is not finite. By its bits: compilers may take it that there is none."""
+def is_not_finite(value):
+    """1 for a number that is not finite. It tests the bits, since compilers may assume finite numbers."""
     return ti.select((ti.bit_cast(value, ti.i32) & 0x7F800000) == 0x7F800000, 1, 0)
 
 
 @ti.func
-def note_least(found: ti.template(), e, number, value):
-    if value < found[e, number]:  # others wait for who writes
+def note_min(found: ti.template(), e, number, value):
+    if value < found[e, number]:  # a write would block other threads
         ti.atomic_min(found[e, number], value)
 
 
 @ti.func
-def note_most(found: ti.template(), e, number, value):
+def note_max(found: ti.template(), e, number, value):
     if value > found[e, number]:
         ti.atomic_max(found[e, number], value)
 
 
 @ti.func
-def note_bad(found: ti.template(), e, count):
+def count_non_finite(found: ti.template(), e, count):
     if count > 0:
         ti.atomic_add(found[e, NOT_FINITE], float(count))
 
@@ -66,7 +66,7 @@ def node_vector(nodes: ti.template(), at, axis):
 def begin_survey(found: Params):
     for e, n in ti.ndrange(found.shape[0], NUMBERS):
         least = n >= LOW and n < HIGH
-        for number in ti.static((SHORTEST, SHORTEST + 1, CORNER, SQUARED_VOLUME)):
+        for number in ti.static((MIN_EDGE, MIN_EDGE + 1, CORNER, SQUARED_VOLUME)):
             least = least or n == number
         most = (n >= HIGH and n < SUMS) or n == LARGEST_SQUARED_VOLUME
         for g in ti.static(range(2)):
@@ -80,8 +80,8 @@ def survey_gels(
     found: Params, nodes: Floats, surface: Floats, params: Params, counts: Counts, layers: ti.i32, columns: ti.i32,
     gels: ti.i32,
 ):  # fmt: skip
-    """layers: of the thickest gel; columns: of nodes of all `gels` of an environment. A node's element is the one that
-    it begins."""
+    """layers: of the thickest gel; columns: of nodes of all `gels` of an environment. A node's element is the one whose
+    first node it is."""
     for e, k, column in ti.ndrange(counts.shape[0], layers + 1, columns):
         first = (counts[e, layout.ELEMENTS] + 1) * (counts[e, layout.ELEMENTS + 1] + 1)  # columns of gel 0
         g = ti.select(gels > 1 and column >= first, 1, 0)
@@ -94,23 +94,23 @@ def survey_gels(
             i, j = n // row, n % row
             bad = 0
             for d in range(6):  # displacement, velocity
-                bad += is_bad(nodes[at + d * axis])
-            note_bad(found, e, bad)
+                bad += is_not_finite(nodes[at + d * axis])
+            count_non_finite(found, e, bad)
             u, v = node_vector(nodes, at, axis), node_vector(nodes, at + 3 * axis, axis)
-            note_most(found, e, NODE_SPEED, ti.abs(v).max())
+            note_max(found, e, NODE_SPEED, ti.abs(v).max())
             if i < nx:
-                note_least(found, e, SHORTEST + g, nodes[at + row] - u[0])
+                note_min(found, e, MIN_EDGE + g, nodes[at + row] - u[0])
             if j < ny:
-                note_least(found, e, SHORTEST + g, nodes[at + axis + 1] - u[1])
+                note_min(found, e, MIN_EDGE + g, nodes[at + axis + 1] - u[1])
             if k < nz:
-                note_least(found, e, SHORTEST + g, nodes[at + 2 * axis + layer] - u[2])
+                note_min(found, e, MIN_EDGE + g, nodes[at + 2 * axis + layer] - u[2])
             else:
                 carried = counts[e, layout.GEL_SURFACE + g] + 4 * ((i + 1) * (ny + 3) + j + 1) + 3
-                note_bad(found, e, is_bad(surface[carried]))
+                count_non_finite(found, e, is_not_finite(surface[carried]))
                 for d in ti.static(range(2)):
-                    note_most(found, e, TOP + 4 * g + d, ti.abs(u[d]))
-                note_least(found, e, TOP + 4 * g + 2, u[2])
-                note_most(found, e, TOP + 4 * g + 3, u[2])
+                    note_max(found, e, TOP + 4 * g + d, ti.abs(u[d]))
+                note_min(found, e, TOP + 4 * g + 2, u[2])
+                note_max(found, e, TOP + 4 * g + 3, u[2])
             if i < nx and j < ny and k < nz:
                 h = params[e, layout.GEL_SPACING + g]
                 p = [
@@ -123,14 +123,14 @@ def survey_gels(
                     y = p[a][1][c] - p[a][0][c] + vec3(0.0, h, 0.0)
                     z = p[a][b][1] - p[a][b][0] + vec3(0.0, 0.0, h)
                     least = ti.min(least, x.dot(y.cross(z)))
-                note_least(found, e, CORNER, least / (h * h * h))
+                note_min(found, e, CORNER, least / (h * h * h))
 
 
 @ti.kernel
 def survey_particles(
     found: Params, sums: Sums, particles: Floats, params: Params, counts: Counts
 ):  # fmt: skip
-    """Block by block; `sum_blocks` adds them up. The base is layout.REFERENCE_CENTRE."""
+    """Sums of each block; `sum_blocks` adds the blocks. The base is layout.REFERENCE_CENTRE."""
     for e, block in ti.ndrange(counts.shape[0], BLOCKS):
         stride, count = counts[e, layout.STRIDE], counts[e, layout.PARTICLES]
         base = vec3([params[e, layout.REFERENCE_CENTRE + d] for d in range(3)])
@@ -140,7 +140,7 @@ def survey_particles(
         for n in range((count - block + BLOCKS - 1) // BLOCKS):
             at = e * layout.PARTICLE_ROWS * stride + n * BLOCKS + block  # neighbouring threads read neighbours
             for r in range(layout.PARTICLE_ROWS):
-                bad += is_bad(particles[at + r * stride])
+                bad += is_not_finite(particles[at + r * stride])
             place = node_vector(particles, at + layout.REFERENCE * stride, stride)
             d = node_vector(particles, at + layout.POSITION * stride, stride) - place
             low, high = ti.min(low, place), ti.max(high, place)
@@ -159,12 +159,12 @@ def survey_particles(
             middle = vec3(other[0], diagonal[1], other[2])
             squared = first.dot(middle.cross(vec3(other[1], other[2], diagonal[2])))
             volume, largest = ti.min(volume, squared), ti.max(largest, squared)
-        note_bad(found, e, bad)
-        note_least(found, e, SQUARED_VOLUME, volume)
-        note_most(found, e, LARGEST_SQUARED_VOLUME, largest)
+        count_non_finite(found, e, bad)
+        note_min(found, e, SQUARED_VOLUME, volume)
+        note_max(found, e, LARGEST_SQUARED_VOLUME, largest)
         for c in ti.static(range(3)):
-            note_least(found, e, LOW + c, low[c])
-            note_most(found, e, HIGH + c, high[c])
+            note_min(found, e, LOW + c, low[c])
+            note_max(found, e, HIGH + c, high[c])
             sums[e, MOVED + c, block] = moved[c]
             sums[e, REFERENCE + c, block] = reference[c]
             sums[e, SECOND + c, block] = square[c]
@@ -184,8 +184,8 @@ def sum_blocks(found: Params, sums: Sums):
         found[e, SUMS + n] = total
 
 
-def entries_of(dtype: Any) -> Any:
-    """A kernel that looks for what is not finite in an array (environments, _, _) of vectors or numbers."""
+def survey_of_entries(dtype: Any) -> Any:
+    """A kernel that counts values that are not finite in an array (environments, _, _) of vectors or numbers."""
     array = ti.types.ndarray(dtype=dtype, ndim=3)
     width = getattr(dtype, "n", 0)
 
@@ -194,51 +194,56 @@ def entries_of(dtype: Any) -> Any:
         for e, i, j in ti.ndrange(entries.shape[0], entries.shape[1], entries.shape[2]):
             bad = 0
             if ti.static(width == 0):
-                bad = is_bad(entries[e, i, j])
+                bad = is_not_finite(entries[e, i, j])
             else:
                 for c in ti.static(range(width)):
-                    bad += is_bad(entries[e, i, j][c])
-            note_bad(found, e, bad)
+                    bad += is_not_finite(entries[e, i, j][c])
+            count_non_finite(found, e, bad)
 
     return survey_entries
 
 
 press_survey = Graph(
-    begin_survey, survey_gels, (entries_of(vec3), {"entries": "anchor"}), (entries_of(ti.f32), {"entries": "pressure"}),
+    begin_survey, survey_gels, (survey_of_entries(vec3), {"entries": "anchor"}),
+    (survey_of_entries(ti.f32), {"entries": "pressure"}),
 )  # fmt: skip
 hybrid_survey = Graph(
-    begin_survey, survey_gels, survey_particles, sum_blocks, (entries_of(ContactHistory), {"entries": "histories"})
+    begin_survey,
+    survey_gels,
+    survey_particles,
+    sum_blocks,
+    (survey_of_entries(ContactHistory), {"entries": "histories"}),
 )
 
 
 @ti.kernel
-def keep_floats(
+def store_floats(
     first: ti.i32, last: ti.i32, resting: ti.i32, counts: Counts, source: Floats, target: Floats, margin: ti.i32
 ):  # fmt: skip
-    """Copies environments `first` up to `last`: those that move, with `resting` all. margin: numbers before those of
-    the first of all environments, and behind those of the last."""
+    """Copies environments `first` up to `last`: those that move; with `resting`, all. margin: numbers before those of
+    the first environment and after those of the last."""
     each = (source.shape[0] - 2 * margin) // counts.shape[0]
     for e, n in ti.ndrange((first, last), each):
         if resting or counts[e, layout.STEPS] > 0:
             target[margin + e * each + n] = source[margin + e * each + n]
 
 
-def keep_entries(dtype: Any) -> Any:
-    """The same of arrays (environments, _, _) of vectors or numbers."""
+def store_entries(dtype: Any) -> Any:
+    """The same for arrays (environments, _, _) of vectors or numbers."""
     array = ti.types.ndarray(dtype=dtype, ndim=3)
 
     @ti.kernel
-    def keep(first: ti.i32, last: ti.i32, resting: ti.i32, counts: Counts, source: array, target: array):
+    def store(first: ti.i32, last: ti.i32, resting: ti.i32, counts: Counts, source: array, target: array):
         for e, i, j in ti.ndrange((first, last), source.shape[1], source.shape[2]):
             if resting or counts[e, layout.STEPS] > 0:
                 target[e, i, j] = source[e, i, j]
 
-    return keep
+    return store
 
 
 @ti.kernel
-def keep_strips(first: ti.i32, last: ti.i32, resting: ti.i32, counts: Counts, source: Strips, target: Strips):
-    """The same of nodes of grids."""
+def store_strips(first: ti.i32, last: ti.i32, resting: ti.i32, counts: Counts, source: Strips, target: Strips):
+    """The same for nodes of grids."""
     nodes = source.shape[0] // counts.shape[0]
     for e, n in ti.ndrange((first, last), nodes):
         if resting or counts[e, layout.STEPS] > 0:
@@ -246,19 +251,26 @@ def keep_strips(first: ti.i32, last: ti.i32, resting: ti.i32, counts: Counts, so
 
 
 @ti.kernel
-def take_outer(particles: Floats, outer: Sums):
-    """The rows of the particles' tangent planes and positions."""
+def copy_outer_rows(particles: Floats, outer: Sums):
+    """Copies the rows of the particles' tangent planes and positions."""
     for e, r, p in ti.ndrange(outer.shape[0], outer.shape[1], outer.shape[2]):
         outer[e, r, p] = particles[(e * layout.PARTICLE_ROWS + r) * outer.shape[2] + p]
 
 
-def _named(name: str, **more: str) -> dict[str, str]:
-    return {"source": name, "target": f"kept_{name}", **more}
+def _source_and_target(name: str, **more: str) -> dict[str, str]:
+    return {"source": name, "target": f"stored_{name}", **more}
 
 
-keep_gels = (keep_floats, _named("nodes")), (keep_floats, _named("surface", margin="no_margin"))
-keep_press = Graph(*keep_gels, (keep_entries(vec3), _named("anchor")), (keep_entries(ti.f32), _named("pressure")))
-keep_hybrid = Graph(
-    *keep_gels, (keep_floats, _named("particles", margin="no_margin")),
-    (keep_strips, _named("velocities")), (keep_entries(ContactHistory), _named("histories")),
+store_gels = (
+    (store_floats, _source_and_target("nodes")),
+    (store_floats, _source_and_target("surface", margin="no_margin")),
+)
+store_press = Graph(
+    *store_gels,
+    (store_entries(vec3), _source_and_target("anchor")),
+    (store_entries(ti.f32), _source_and_target("pressure")),
+)
+store_hybrid = Graph(
+    *store_gels, (store_floats, _source_and_target("particles", margin="no_margin")),
+    (store_strips, _source_and_target("velocities")), (store_entries(ContactHistory), _source_and_target("histories")),
 )  # fmt: skip

@@ -23,8 +23,8 @@ from tacsim.optics.render import Renderer
 from tacsim.optics.surface import surface_map
 from tacsim.record.reader import read_episode
 from tacsim.record.writer import Recorder
-from tacsim.report.diagnostics import trust
-from tacsim.report.report import end_table, summary
+from tacsim.report.diagnostics import sensor_diagnostics
+from tacsim.report.report import summarise, summary_table
 from tacsim.report.series import Series
 from tacsim.rig import Rig
 from tacsim.tasks.grip import Grip
@@ -124,11 +124,11 @@ def test_marked_camera_fading_light_is_recorded(gel: Gel, rig: Rig, tmp_path: Pa
         recorder=lambda meta: recorders.append(Recorder(tmp_path / "e.mcap", meta)) or recorders[0],  # type: ignore[func-returns-value]
     )  # fmt: skip
     recorders[0].close()
-    told = trust(Series.of(read_episode(tmp_path / "e.mcap")))
-    assert told is not None and told == trust(Series.of(episode))
+    told = sensor_diagnostics(Series.from_episode(read_episode(tmp_path / "e.mcap")))
+    assert told is not None and told == sensor_diagnostics(Series.from_episode(episode))
     assert 1 <= told["finger"]["stale"] < told["finger"]["steps"] == 7
     assert told["finger"]["drift"] == pytest.approx(0.2, abs=0.03)
-    shown = [str(cell) for cell in end_table(summary(Series.of(episode)), []).columns[1].cells]
+    shown = [str(cell) for cell in summary_table(summarise(Series.from_episode(episode)), []).columns[1].cells]
     assert any(cell.startswith("finger: stale reference in") for cell in shown)
 
 

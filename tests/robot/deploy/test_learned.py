@@ -9,7 +9,7 @@ import pytest
 from robot.deploy.control_loop import EpisodeSetup, run_episode
 from robot.deploy.policy import PolicyNotFound, describe_outside, load_policy, require_fit, training_notes
 from robot.open import open_rig
-from tacsim.config import config_root, load, load_rig
+from tacsim.config import config_root, load_model, load_rig
 from tacsim.models.training import Training
 from tacsim.tasks import make_task
 
@@ -20,7 +20,7 @@ MIN_IMPROVEMENT = {"squeeze": 0.95, "reposition": 0.95, "knead": 0.1}  # fractio
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
 def test_shipped_policy_solves_its_task(path: Path) -> None:
     """On the task's own body and goal, in the physics that it was trained in."""
-    training = load(Training, path.stem)
+    training = load_model(Training, path.stem)
     loaded = load_rig(training.rig, task=training.task, overrides=training.overrides)
     assert loaded.config.task is not None
     task = make_task(loaded.config.task)
@@ -37,7 +37,7 @@ def test_shipped_policy_solves_its_task(path: Path) -> None:
 @pytest.mark.parametrize(("yield_stress", "outside"), [("20 kPa", False), ("70 kPa", True)])
 def test_shipped_squeeze_stiff_body_is_outside_training(yield_stress: str, outside: bool) -> None:
     """By its observations, and by the parameter of the scene."""
-    training = load(Training, "squeeze")
+    training = load_model(Training, "squeeze")
     overrides = [*training.overrides, f"scene.body.material.yield_stress={yield_stress}"]
     loaded = load_rig(training.rig, task=training.task, overrides=overrides)
     assert loaded.config.task is not None and loaded.config.scene is not None

@@ -21,7 +21,7 @@ from robot.train.measure_range import measure_range, write_range
 from tacsim.config import load_rig
 from tacsim.models.rig import SqueezeConfig
 from tacsim.models.scene import Scene
-from tacsim.report.report import summary
+from tacsim.report.report import summarise
 from tacsim.report.series import Series
 from tacsim.tasks import make_task
 from tests.robot.cli.invoked import tacsim
@@ -149,7 +149,7 @@ def test_run_records_training_distance_and_summary(ranged: Path) -> None:
             policy = load_policy(str(ranged), task, rig.spec, GRID)
             episode = run_episode(rig, policy, task, steps, setup=EpisodeSetup(seed=1))
         assert all("training_distance" in step.info for step in episode.steps[1:])
-        shares[yield_stress] = summary(Series.of(episode))["training_range"]
+        shares[yield_stress] = summarise(Series.from_episode(episode))["training_range"]
     assert shares["12 kPa"]["known"] is True
     assert shares["400 kPa"]["largest"] > 1.0
     assert shares["400 kPa"]["steps_outside"] == 3  # a goal that training never had

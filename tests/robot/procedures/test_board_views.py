@@ -17,7 +17,7 @@ from robot.mock import MockCamera
 from robot.mock.fixtures import mock_host
 from robot.procedures.boards import ON_GEL, PROMPTS, BoardViewPlan, record_board_views
 from robot.procedures.session import CannotCalibrate, Session
-from tacsim.config import load
+from tacsim.config import load_model
 from tacsim.interface import EndOfEpisode, TactileFrame
 from tacsim.record.images import encode_png, read_image
 from tests.calibration.boards import DOTS, LENS, facing, photograph, tilted
@@ -149,13 +149,13 @@ def test_command_calibrates_lens_then_gel(tmp_path: Path) -> None:
         code, lines = lead(camera, [*words, "--views", "7", "--out", str(out)], [*moves[:3], EMPTY, *moves[3:]])
         assert code == 0, lines
         assert len([line for line in lines if re.search("Skipped: the board .* is not found", line)]) >= 1
-        lens = load(Lens, out / "lens.yaml")
+        lens = load_model(Lens, out / "lens.yaml")
         np.testing.assert_allclose(lens.focal, LENS.focal, rtol=0.02)
         assert sorted(path.name for path in (out / "frames").iterdir()) == [f"view_0{k}.png" for k in range(1, 8)]
         again = ["calibrate", "lens", str(out / "frames"), *BOARD, "--out", str(tmp_path / "again")]
         done = tacsim(*again)
         assert done.exit_code == 0, done.output
-        found = load(Lens, tmp_path / "again" / "lens.yaml")
+        found = load_model(Lens, tmp_path / "again" / "lens.yaml")
         # OpenCV adds up in threads: the last digits differ from run to run.
         np.testing.assert_allclose([*found.focal, *found.centre], [*lens.focal, *lens.centre], rtol=1e-6)
         np.testing.assert_allclose(found.distortion, lens.distortion, atol=1e-6)
@@ -164,7 +164,7 @@ def test_command_calibrates_lens_then_gel(tmp_path: Path) -> None:
         camera.push(EMPTY)
         code, lines = lead(camera, [*words, "--out", str(tmp_path / "view")], [flat])
         assert code == 0, lines
-    view = load(GelView, tmp_path / "view" / "view.yaml")
+    view = load_model(GelView, tmp_path / "view" / "view.yaml")
     assert view.size == pytest.approx((18e-3, 14e-3)) and view.lens == lens
     assert read_image(tmp_path / "view" / "rectified.png").shape == (view.geometry.height, view.geometry.width, 3)
 

@@ -216,7 +216,7 @@ def test_the_gel_is_the_sensors_own_in_whole_elements(finger: Path) -> None:
     assert fine is not None and fine.gel.size == pytest.approx((15.5e-3, 12.5e-3, 4e-3))
     said = load_rig("sim", overrides=["sensors.lower.model=finger", "scene.gel.size=[20 mm, 20 mm, 4 mm]"])
     assert said.config.scene is not None and said.config.scene.gel.size == (20e-3, 20e-3, 4e-3)
-    assert "as said on the command line" in said.notes[0]
+    assert "as given on the command line" in said.notes[0]
     assert not load_rig("sim").notes
 
 

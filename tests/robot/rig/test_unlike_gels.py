@@ -17,7 +17,7 @@ from robot.studies.identify.simulation import coarser
 from tacsim.config import load_rig, load_scene
 from tacsim.interface import Action, Pose
 from tacsim.models.sensor import SensorModel
-from tacsim.physics.failure.dump import read
+from tacsim.physics.failure.dump import read_dump
 from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.physics.world import make_world
 from tests.robot.cli.invoked import tacsim
@@ -115,7 +115,7 @@ def test_a_dump_holds_both_gels(rig_file: Path, monkeypatch: pytest.MonkeyPatch)
     world.restore(broken)
     with pytest.raises(SimulationDiverged):
         world.move({})
-    dump = read(rig_file.parent / "dumps" / "00")
+    dump = read_dump(rig_file.parent / "dumps" / "00")
     found = table(dump)
     assert found["gel_velocity_upper"]["before"].startswith("none  (")
     assert found["gel_velocity_lower"]["before"] == "0 to 0"

@@ -15,7 +15,7 @@ from tacsim.interface import Pose
 from tacsim.models.material import BodyMaterial
 from tacsim.models.scene import Body, Box, Gel, Indenter, Scene, Settling, Sphere
 from tacsim.physics.failure import health
-from tacsim.physics.failure.dump import DumpError, dumps_in, read
+from tacsim.physics.failure.dump import DumpError, dump_to_folder, read_dump
 from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.physics.world import make_world
 from tests.robot.cli.invoked import tacsim
@@ -35,7 +35,7 @@ def diverge(scene: Scene, folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path
     frame = "upper" if scene.indenter is None else "indenter"
     pose = world.pose(frame)
     monkeypatch.setattr(health, "MAX_SPEED", 0.005)
-    with dumps_in(folder), pytest.raises(SimulationDiverged):
+    with dump_to_folder(folder), pytest.raises(SimulationDiverged):
         world.move({frame: Pose(pose.position - [0, 0, 0.5e-3], pose.quaternion)})
     return folder / "00"
 
@@ -66,16 +66,16 @@ def test_a_motion_at_constant_load_is_replayed_with_its_load(
     world = make_world(SCENES[physics])
     loads = {world.sensors[-1]: 0.3}
     monkeypatch.setattr(health, "MAX_SPEED", 1e-4)
-    with dumps_in(tmp_path), pytest.raises(SimulationDiverged):
+    with dump_to_folder(tmp_path), pytest.raises(SimulationDiverged):
         world.move({}, loads)
-    dump = read(tmp_path / "00")
+    dump = read_dump(tmp_path / "00")
     assert dump.info.loads == loads and dump.command.targets == {}
     failure, outcome = dump_view.replay(dump, dump_view.open_world(dump))
     assert failure is not None and outcome == "diverges again, exactly as recorded, to the last bit"
 
 
 def test_the_table_tells_what_is_wrong(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    dump = read(diverge(SCENES["hybrid"], tmp_path, monkeypatch))
+    dump = read_dump(diverge(SCENES["hybrid"], tmp_path, monkeypatch))
     dump.states["failed"]["velocity"][:3] = np.nan
     dump.states["failed"]["gel_displacement"][...] = 0.0
     gel = dump.states["failed"]["gel_displacement"][0, 2, 2]
@@ -100,11 +100,11 @@ def test_arrays_of_another_scene_are_refused(tmp_path: Path, monkeypatch: pytest
         result = changed(**scene)
         assert result.exit_code == 2 and "is it of this scene?" in result.output
     (place / "dump.json").write_text(json.dumps(info))
-    dump = read(place)
+    dump = read_dump(place)
     dump.states["before"]["poses"][0, 3:] = 0.0
     with pytest.raises(DumpError, match=r"does not fit .*'lower': Pose\.quaternion"):
         dump_view.open_world(dump)
-    dump = read(place)
+    dump = read_dump(place)
     dump.states["before"]["rates"][:] = np.inf
     with pytest.raises(DumpError, match="'rates' is not finite"):
         dump_view.open_world(dump)

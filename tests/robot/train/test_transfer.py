@@ -17,7 +17,7 @@ from robot.mock.fixtures import rig_addresses
 from robot.open import open_rig
 from robot.train import transfer
 from robot.train.transfer import EpisodeResult, Side, Study, _load_rig, draw_figure, play_study, summarise
-from tacsim.config import load, load_rig
+from tacsim.config import load_model, load_rig
 from tacsim.interface import Action, Observation, Pose
 from tacsim.models.hardware import UrArmConfig
 from tacsim.models.randomisation import Randomisation
@@ -71,7 +71,7 @@ def test_load_rig_learned_policy_uses_training_simulation() -> None:
 def test_load_rig_shipped_twin_fits_both_rigs() -> None:
     for side in transfer.SIDES:
         for number in range(3):
-            config = _load_rig(study(twins=load(Randomisation, "squeeze-twin")), side, number, number).config
+            config = _load_rig(study(twins=load_model(Randomisation, "squeeze-twin")), side, number, number).config
             assert config.scene is not None
             assert config.scene.preset == ("standard" if side == "twin" else "draft")
 

@@ -99,8 +99,8 @@ def three(
 ) -> subprocess.CompletedProcess[str]:
     """A process that compiles a kernel and prints the three it gives, then does `more`. places: what says in its
     environment where kernels are kept; before: what it does once Taichi is imported."""
-    code = "from tacsim.compute.runtime import start, ti\n@ti.kernel\ndef three() -> ti.i32: return 3\n"
-    (folder / "small.py").write_text(f"{code}{before}start()\nprint(three())\n{more}")
+    code = "from tacsim.compute.runtime import start_taichi, ti\n@ti.kernel\ndef three() -> ti.i32: return 3\n"
+    (folder / "small.py").write_text(f"{code}{before}start_taichi()\nprint(three())\n{more}")
     elsewhere = ("HOME", "XDG_CACHE_HOME", "TI_OFFLINE_CACHE_FILE_PATH")
     environment = {name: value for name, value in os.environ.items() if name not in elsewhere} | places
     environment |= {"PYTHONPATH": os.pathsep.join(sys.path), "TACSIM_DEVICE": "cpu"}
@@ -109,7 +109,7 @@ def three(
 
 
 @pytest.mark.parametrize("cache", [None, "file/cache"], ids=["no HOME", "not writable"])
-def test_it_runs_to_the_end_where_no_kernels_can_be_kept(tmp_path: Path, cache: str | None) -> None:
+def test_process_ends_normally_without_writable_cache(tmp_path: Path, cache: str | None) -> None:
     """Taichi ends the process without a home directory, and crashes at its end without a cache: a service's, say."""
     (tmp_path / "file").touch()
     told = "import warnings\nwarnings.simplefilter('default')\n"
@@ -118,7 +118,7 @@ def test_it_runs_to_the_end_where_no_kernels_can_be_kept(tmp_path: Path, cache: 
     assert ("compiled kernels cannot be kept" in done.stderr) == (cache is not None)
 
 
-def test_compiled_kernels_are_kept_whatever_still_refers_to_taichi_at_the_end(tmp_path: Path) -> None:
+def test_compiled_kernels_are_cached_with_references_to_taichi_at_end(tmp_path: Path) -> None:
     referring = "import ctypes\nctypes.pythonapi.Py_IncRef(ctypes.py_object(ti.lang.impl.get_runtime().prog))\n"
     places = {"TI_OFFLINE_CACHE_FILE_PATH": str(tmp_path / "cache")}
     done = three(tmp_path, places, referring + 'raise ValueError("an end by an error")')
@@ -132,7 +132,7 @@ def test_compiled_kernels_are_kept_whatever_still_refers_to_taichi_at_the_end(tm
     [(61.0, False), (-3600.0, False), (0.0, True)],
     ids=["of a killed process", "of a wrong clock", "held"],
 )
-def test_only_a_lock_that_nobody_holds_is_broken(tmp_path: Path, age: float, left: bool) -> None:
+def test_only_stale_lock_is_removed(tmp_path: Path, age: float, left: bool) -> None:
     """Taichi locks what it keeps for milliseconds, and neither reads nor keeps kernels while the lock is there."""
     lock = tmp_path / "cache" / "ticache.lock"
     lock.parent.mkdir()
@@ -145,7 +145,7 @@ def test_only_a_lock_that_nobody_holds_is_broken(tmp_path: Path, age: float, lef
 
 
 @pytest.mark.parametrize("size", [None, 0, 700], ids=["lost", "empty", "cut"])
-def test_a_kept_kernel_whose_file_is_damaged_is_kept_anew(tmp_path: Path, size: int | None) -> None:
+def test_damaged_cached_kernel_is_compiled_again(tmp_path: Path, size: int | None) -> None:
     """By itself Taichi compiles it in every process and never writes what its list says is there."""
     places = {"TI_OFFLINE_CACHE_FILE_PATH": str(tmp_path / "cache")}
     three(tmp_path, places)
@@ -165,7 +165,7 @@ def test_a_kept_kernel_whose_file_is_damaged_is_kept_anew(tmp_path: Path, size: 
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems do not hold a process to the limit")
-def test_too_little_address_space_is_told(tmp_path: Path) -> None:
+def test_small_address_space_raises_error_with_advice(tmp_path: Path) -> None:
     """Half a gigabyte more than it has taken so far, which grows with the cores."""
     limit = """
 import resource

@@ -19,9 +19,9 @@ from tacsim.compute.threads import map_parallel, map_serial
 @pytest.fixture(params=["1", "2", "4"])
 def allowed(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> int:
     """Number of threads that may be used."""
-    monkeypatch.setattr(threads, "cores", lambda: 4)
+    monkeypatch.setattr(threads, "core_count", lambda: 4)
     monkeypatch.setenv("TACSIM_THREADS", request.param)
-    monkeypatch.setattr(threads, "_pool", threads._pool.__wrapped__)
+    monkeypatch.setattr(threads, "_thread_pool", threads._thread_pool.__wrapped__)
     return int(request.param)
 
 
@@ -75,14 +75,14 @@ def test_the_first_failure_is_raised_when_all_are_done(allowed: int) -> None:
 def test_a_wrong_number_of_threads_is_refused(wanted: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TACSIM_THREADS", wanted)
     with pytest.raises(ValueError, match="TACSIM_THREADS must be a whole number"):
-        threads.threads()
+        threads.thread_count()
 
 
 FORKED = """
 import multiprocessing
 from functools import partial
 from tacsim.compute import threads
-threads.cores = lambda: 2
+threads.core_count = lambda: 2
 def work():
     assert threads.map_parallel([partial(abs, -1), partial(abs, -2)]) == [1, 2]
 work()

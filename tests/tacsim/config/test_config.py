@@ -12,8 +12,18 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tacsim.config import KINDS, ConfigError, config_root, json_schema, load, load_rig, load_scene, load_sensor, names
-from tacsim.config.document import LoadState, _Loader, as_json, dump, parse_text
+from tacsim.config import (
+    KINDS,
+    ConfigError,
+    config_root,
+    json_schema,
+    load_model,
+    load_rig,
+    load_scene,
+    load_sensor,
+    shipped_names,
+)
+from tacsim.config.document import LoadState, _Loader, dump_yaml, node_as_json, parse_text
 from tacsim.config.load import load_task
 from tacsim.models.hardware import UrArmConfig
 from tacsim.models.material import BodyMaterial, GelMaterial
@@ -24,8 +34,8 @@ from tests.tacsim.config.files import write
 # Shipped files
 
 
-@pytest.mark.parametrize("rig", names("rig"))
-@pytest.mark.parametrize("task", [None, *names("task")])
+@pytest.mark.parametrize("rig", shipped_names("rig"))
+@pytest.mark.parametrize("task", [None, *shipped_names("task")])
 def test_every_shipped_rig_loads_with_every_task_and_its_text_loads_back(
     rig: str, task: str | None, folder: Path
 ) -> None:
@@ -36,12 +46,12 @@ def test_every_shipped_rig_loads_with_every_task_and_its_text_loads_back(
     assert again.sources == (folder / "resolved.yaml",)
 
 
-@pytest.mark.parametrize("name", names("scene"))
+@pytest.mark.parametrize("name", shipped_names("scene"))
 def test_every_shipped_scene_loads(name: str) -> None:
     assert load_scene(name).name == name
 
 
-@pytest.mark.parametrize("name", names("sensor"))
+@pytest.mark.parametrize("name", shipped_names("sensor"))
 def test_every_shipped_sensor_loads(name: str) -> None:
     assert load_sensor(name).name == name
 
@@ -56,18 +66,18 @@ def test_geometries_like_known_sensors_name_their_public_source(name: str) -> No
     assert all(10.0 < side < 30.0 for side in shown)  # a finger's gel [mm]
 
 
-@pytest.mark.parametrize("name", names("material"))
+@pytest.mark.parametrize("name", shipped_names("material"))
 def test_every_shipped_material_loads_and_names_its_source(name: str) -> None:
-    source = load(GelMaterial, name).source if name == "silicone" else load(BodyMaterial, name).source
+    source = load_model(GelMaterial, name).source if name == "silicone" else load_model(BodyMaterial, name).source
     assert "guess" in source.lower()
 
 
 def test_values_of_the_shipped_files() -> None:
-    clay = load(BodyMaterial, "modelling-clay")
+    clay = load_model(BodyMaterial, "modelling-clay")
     assert (clay.youngs_modulus, clay.poisson_ratio, clay.yield_stress) == (0.5e6, 0.45, 30e3)
     assert clay.elastic_limit == pytest.approx(0.071, abs=5e-4)
-    assert load(BodyMaterial, "seed").elastic_limit == 0.024
-    gel = load(GelMaterial, "silicone")
+    assert load_model(BodyMaterial, "seed").elastic_limit == 0.024
+    gel = load_model(GelMaterial, "silicone")
     assert (gel.youngs_modulus, gel.poisson_ratio) == (0.145e6, 0.48)
     assert load_scene("squeeze").body is not None
     assert load_scene("reposition").friction == {"lower": 0.3, "upper": 1.0}
@@ -120,7 +130,7 @@ def test_extends_merges_mappings_and_replaces_everything_else(folder: Path) -> N
     assert scene.friction == {"lower": 0.6, "upper": 1.0}
     assert scene.body is not None
     assert scene.body.geometry == Sphere()  # the box's size went with the box
-    assert scene.body.material == load(
+    assert scene.body.material == load_model(
         BodyMaterial, "dough"
     )  # a reference replaces, clay's numbers do not shine through
 
@@ -201,7 +211,7 @@ def test_values_are_yaml(override: str, value: object) -> None:
 @pytest.mark.parametrize(
     ("override", "said"),
     [
-        ("scene.body.geometry.size=[1 mm, 2e-3, 3]", "'3 mm' or the like"),
+        ("scene.body.geometry.size=[1 mm, 2e-3, 3]", "write a unit, such as '3 mm'"),
         ("scene.body.geometry.size.1=4", "would be 4 m"),
         ("scene.gel.housing=0.5", "would be 0.5 m"),
         ("sensors.upper.model.geometry.pixel_pitch=0.2", "would be 0.2 m"),
@@ -220,7 +230,7 @@ def test_the_tasks_scene_is_the_rigs_unless_it_has_its_own(folder: Path) -> None
     assert scene_of("task.scene.preset=standard").preset == "standard"
     write("own.yaml", "extends: sim\nscene: press")
     assert scene_of(rig="own.yaml", task="reposition") == load_scene("press")
-    with pytest.raises(ConfigError, match=r"--set task.scene.preset=draft: task.scene.preset: .* say scene.preset"):
+    with pytest.raises(ConfigError, match=r"--set task.scene.preset=draft: task.scene.preset: .* write scene.preset"):
         scene_of("task.scene.preset=draft", rig="own.yaml")
 
 
@@ -263,7 +273,7 @@ def test_overriding_the_tag_changes_the_variant() -> None:
 def test_numbers_are_numbers(text: str) -> None:
     node = parse_text(f"a: {text}", "x", Path(), LoadState())
     assert node.items["a"].value == 1e5
-    assert as_json(node) == '{"a": 100000}'
+    assert node_as_json(node) == '{"a": 100000}'
 
 
 @pytest.mark.parametrize("text", ["no", "on", "y", "12:30", "2024-01-01", "0x10", "1_000", "1e", ".", "e5", "'1e5'"])
@@ -290,7 +300,7 @@ def test_what_is_dumped_is_read_back(data: object) -> None:
         return [values(child) for child in node.value] if isinstance(node.value, list) else node.value
 
     state = LoadState()
-    back = values(parse_text(dump({"data": data}), "x", Path(), state))
+    back = values(parse_text(dump_yaml({"data": data}), "x", Path(), state))
     assert state.problems == []
     assert back == {"data": data}
 
@@ -299,10 +309,10 @@ def test_what_is_dumped_is_read_back(data: object) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_schema_is_complete_and_knows_references(kind: str) -> None:
+def test_schema_is_complete_with_references(kind: str) -> None:
     schema = json_schema(kind)
     references = [found["enum"] for found in walk(schema) if isinstance(found.get("enum"), list)]
-    assert names(kind) in references
+    assert shipped_names(kind) in references
     for found in walk(schema):
         if "$ref" in found:
             assert found["$ref"].removeprefix("#/$defs/") in schema["$defs"]
@@ -312,7 +322,7 @@ def test_schema_is_complete_and_knows_references(kind: str) -> None:
 def test_schema_offers_every_key_of_the_shipped_rigs() -> None:
     mapping = json_schema("rig")["anyOf"][1]
     assert mapping["additionalProperties"] is False
-    for name in names("rig"):
+    for name in shipped_names("rig"):
         shipped = yaml.load((config_root() / f"rigs/{name}.yaml").read_text(), Loader=yaml.SafeLoader)
         assert set(shipped) <= set(mapping["properties"])
     number, text = mapping["properties"]["period"]["anyOf"]
@@ -333,7 +343,7 @@ def walk(schema):
 def test_the_loader_is_a_safe_one() -> None:
     assert issubclass(_Loader, yaml.SafeLoader)
     with pytest.raises(KeyError):
-        names("robot")
+        shipped_names("robot")
 
 
 def test_overrides_do_not_loosen_the_limits_of_a_real_arm() -> None:

@@ -11,7 +11,7 @@ from tacsim.models.scene import Scene
 from tests.tacsim.config.files import write
 
 
-def test_a_sensor_has_a_gel_of_its_own_where_the_scene_says_so(folder: Path) -> None:
+def test_sensor_has_separate_gel_if_scene_gives_one(folder: Path) -> None:
     text = """
 extends: squeeze
 gel: {material: {youngs_modulus: 0.2 MPa}}
@@ -76,7 +76,7 @@ def test_gels_are_as_large_as_their_own_sensors(folder: Path) -> None:
     assert [said.config.scene.gel_of(name).size[:2] for name in ("lower", "upper")] == [
         pytest.approx((20e-3, 15e-3)), (10e-3, 10e-3)
     ]  # fmt: skip
-    assert "gel 10 x 10 mm, as said on the command line" in " ".join(said.notes)
+    assert "gel 10 x 10 mm, as given on the command line" in " ".join(said.notes)
     assert load_rig(write("said.yaml", said.text)).config == said.config
     both = load_rig("sim", overrides=[*models, "scene.gel.size=[10 mm, 10 mm, 4 mm]"]).config.scene
     assert both is not None and both.gel_of("lower").size == both.gel_of("upper").size == (10e-3, 10e-3, 4e-3)

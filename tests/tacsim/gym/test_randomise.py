@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tacsim.config import ConfigError, load_rig, names
-from tacsim.config.load import load
+from tacsim.config import ConfigError, load_rig, shipped_names
+from tacsim.config.load import load_model
 from tacsim.models.randomisation import Randomisation
 from tacsim.tasks import BadDraws, GoalOutOfReach
 from tests.tacsim.gym.small import assert_equal, make, make_native, touch_nothing_slippery
@@ -59,9 +59,9 @@ def test_what_cannot_be_is_refused_with_its_key_before_anything_is_simulated() -
         make(variants=(), randomise="squeez")
 
 
-@pytest.mark.parametrize("name", names("randomisation"))
+@pytest.mark.parametrize("name", shipped_names("randomisation"))
 def test_every_shipped_one_fits_its_task(name: str) -> None:
-    found = load(Randomisation, name)
+    found = load_model(Randomisation, name)
     for overrides in found.draw_overrides()[:3]:
         rig = "mock" if name.endswith("-twin") else "sim"
         task = name.removesuffix("-twin")

@@ -33,7 +33,7 @@ def random_packages(rng: np.random.Generator, count: int, time: float) -> ArmPac
     times = {name: time - 2e-3 * rng.random(count) for name in ("time", "stamp")}
     vectors = ("joints", "joint_speeds", "tcp_pose", "tcp_speed", "tcp_force")
     whole = {name: rng.integers(0, 99, count) for name in ("runtime_state", "safety_bits", "status")}
-    return ArmPackages.of(times | {name: rng.normal(size=(count, 6)) for name in vectors} | whole, lost=count)
+    return ArmPackages.from_columns(times | {name: rng.normal(size=(count, 6)) for name in vectors} | whole, lost=count)
 
 
 def random_step(

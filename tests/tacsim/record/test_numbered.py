@@ -64,7 +64,7 @@ def test_pictures_and_rows_belong_together_by_number(
     assert found == [(int(re.findall(r"\d+", name)[-1]),) * 2 for name in names]
 
 
-def test_a_reference_beside_numbered_pictures_is_no_frame_of_the_table(tmp_path: Path) -> None:
+def test_unnumbered_reference_picture_is_no_frame_of_table(tmp_path: Path) -> None:
     pictures = numbered(tmp_path, ["0.png", "1.png", "3.png"])
     (pictures / "background.png").write_bytes(encode_png(picture(0)))
     table = tables(tmp_path, [0, 1, 2, 3])

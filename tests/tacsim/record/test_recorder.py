@@ -120,7 +120,7 @@ def test_a_full_disk_ends_the_recording_cleanly(
 ) -> None:
     disk = FullDisk(str(tmp_path / "e.mcap"), "xb")
     disk.room = 10**9
-    monkeypatch.setattr(writer, "open_new", lambda path: io.BufferedWriter(disk))
+    monkeypatch.setattr(writer, "open_new_file", lambda path: io.BufferedWriter(disk))
     recorder = Recorder(tmp_path / "e.mcap", meta)
     for k in range(3):
         recorder.write(make_step(k))
@@ -145,7 +145,7 @@ def test_a_disk_that_fills_while_closing(
 ) -> None:
     disk = FullDisk(str(tmp_path / "e.mcap"), "xb")
     disk.room = 10**9
-    monkeypatch.setattr(writer, "open_new", lambda path: io.BufferedWriter(disk))
+    monkeypatch.setattr(writer, "open_new_file", lambda path: io.BufferedWriter(disk))
     with Recorder(tmp_path / "e.mcap", meta) as recorder:
         recorder.write(make_step(0))
         assert recorder.flush()
@@ -159,7 +159,7 @@ def test_a_disk_that_fills_while_closing(
 def test_a_disk_that_is_full_from_the_start_leaves_nothing(
     tmp_path: Path, meta: EpisodeMeta, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(writer, "open_new", lambda path: io.BufferedWriter(FullDisk(str(path), "xb")))
+    monkeypatch.setattr(writer, "open_new_file", lambda path: io.BufferedWriter(FullDisk(str(path), "xb")))
     with pytest.raises(OSError, match="No space left"):
         Recorder(tmp_path / "e.mcap", meta)
     assert list(tmp_path.iterdir()) == []

@@ -15,7 +15,7 @@ from mcap.writer import MCAP0_MAGIC
 from tacsim.record import recover as module
 from tacsim.record.episode import EpisodeError, EpisodeMeta, Step
 from tacsim.record.reader import read_episode
-from tacsim.record.recover import Recovery, recover
+from tacsim.record.recover import Recovery, recover_recording
 from tacsim.record.writer import Recorder
 
 STEPS = 5
@@ -59,7 +59,7 @@ def recovered(data: bytes, folder: Path) -> tuple[Recovery, Path] | None:
     target = folder / "y.mcap"
     target.unlink(missing_ok=True)
     try:
-        found = recover(folder / "x.mcap", target)
+        found = recover_recording(folder / "x.mcap", target)
     except EpisodeError:
         assert not target.exists()
         return None
@@ -77,16 +77,16 @@ def test_a_cut_anywhere_keeps_every_whole_step(whole: Path, tmp_path: Path) -> N
         if made is None:
             continue
         found, target = made
-        assert not found.whole and not found.finished
+        assert not found.is_whole and not found.finished
         kept = official(target)
         assert [content(each) for each in kept.values()] == [content(steps[k]) for k in range(found.steps)]
         episode = read_episode(target)
         assert len(episode.steps) == found.steps and not episode.complete
         (tmp_path / "x.mcap").write_bytes(data[:length])
-        if not any("attachment" in words for words in found.lacking):
+        if not any("attachment" in words for words in found.missing):
             assert len(read_episode(tmp_path / "x.mcap").steps) == found.steps
-        again = recover(target, tmp_path / "z.mcap")
-        assert again.whole and again.steps == found.steps and not (tmp_path / "z.mcap").exists()
+        again = recover_recording(target, tmp_path / "z.mcap")
+        assert again.is_whole and again.steps == found.steps and not (tmp_path / "z.mcap").exists()
         counts.append(found.steps)
     assert counts == sorted(counts) and set(counts) == set(range(STEPS + 1))
 
@@ -102,13 +102,13 @@ def test_changed_bytes_cost_their_own_step_alone(whole: Path, tmp_path: Path) ->
         made = recovered(bytes(damaged), tmp_path)
         assert made is not None
         found, target = made
-        if found.whole:  # in an index of one chunk, which has no checksum and which nobody needs
+        if found.is_whole:  # in an index of one chunk, which has no checksum and which nobody needs
             assert found.steps == STEPS and not target.exists()
             continue
         kept = [repr(content(each)) for each in official(target).values()]
         assert set(kept) <= all_steps and len(kept) == len(set(kept)) == found.steps
         counts.append(found.steps)
-        if not any("metadata" in words for words in found.lacking):
+        if not any("metadata" in words for words in found.missing):
             assert len(read_episode(target).steps) == found.steps
     assert set(counts) == {STEPS - 1, STEPS}  # the definitions of topics stand in the first step, and in the index
 
@@ -123,7 +123,7 @@ def test_the_first_step_defines_the_topics(whole: Path, tmp_path: Path) -> None:
         damaged[cut.index(word) - 2] ^= 0xFF  # of the topic: the size of its name
         made = recovered(bytes(damaged), tmp_path)
         assert made is not None and made[0].steps == steps
-        assert any("topics" in words for words in made[0].lacking) == (steps == 0)
+        assert any("topics" in words for words in made[0].missing) == (steps == 0)
 
 
 def test_garbage_in_the_middle_leaves_the_steps_around_it(whole: Path, tmp_path: Path) -> None:
@@ -137,7 +137,7 @@ def test_garbage_in_the_middle_leaves_the_steps_around_it(whole: Path, tmp_path:
     ):
         made = recovered(damaged, tmp_path)
         assert made is not None and made[0].steps >= STEPS - 2
-        assert not made[0].whole
+        assert not made[0].is_whole
         steps = read_episode(made[1]).steps
         assert [step.index for step in steps] == sorted({step.index for step in steps}) and steps[0].index == 0
 
@@ -146,14 +146,14 @@ def test_a_damaged_attachment_costs_itself_alone(whole: Path, tmp_path: Path) ->
     made = recovered(whole.read_bytes().replace(b"b: 2", b"b: 3", 1), tmp_path)
     assert made is not None
     found, target = made
-    assert found.lacking == ["the attachment 'b.yaml'"]
+    assert found.missing == ["the attachment 'b.yaml'"]
     episode = read_episode(target)
     assert dict(episode.meta.attachments) == {"a.yaml": b"a: 1"} and len(episode.steps) == STEPS
 
 
-def test_what_is_whole_or_nothing_says_so(whole: Path, tmp_path: Path) -> None:
-    found = recover(whole, whole)
-    assert found.whole and found.steps == STEPS
+def test_recover_reports_intact_and_empty_files(whole: Path, tmp_path: Path) -> None:
+    found = recover_recording(whole, whole)
+    assert found.is_whole and found.steps == STEPS
     for data, words in (
         (b"", "is empty"),
         (b"hello world", "not an MCAP file"),
@@ -162,9 +162,9 @@ def test_what_is_whole_or_nothing_says_so(whole: Path, tmp_path: Path) -> None:
     ):
         (tmp_path / "x.mcap").write_bytes(data)
         with pytest.raises(EpisodeError, match=words):
-            recover(tmp_path / "x.mcap", tmp_path / "y.mcap")
+            recover_recording(tmp_path / "x.mcap", tmp_path / "y.mcap")
     with pytest.raises(EpisodeError, match="no such file"):
-        recover(tmp_path / "none.mcap", tmp_path / "y.mcap")
+        recover_recording(tmp_path / "none.mcap", tmp_path / "y.mcap")
 
 
 def test_nothing_is_overwritten_and_nothing_half_is_left(
@@ -173,9 +173,9 @@ def test_nothing_is_overwritten_and_nothing_half_is_left(
     before = whole.read_bytes()[:-100]
     whole.write_bytes(before)
     with pytest.raises(FileExistsError):
-        recover(whole, whole)
+        recover_recording(whole, whole)
     with pytest.raises(OSError) as caught:
-        recover(whole, tmp_path / "none" / "y.mcap")
+        recover_recording(whole, tmp_path / "none" / "y.mcap")
     assert "none" in str(caught.value.filename)
 
     def full(descriptor: int) -> None:
@@ -183,6 +183,6 @@ def test_nothing_is_overwritten_and_nothing_half_is_left(
 
     monkeypatch.setattr(module.os, "fsync", full)
     with pytest.raises(OSError, match="No space left") as caught:
-        recover(whole, tmp_path / "y.mcap")
+        recover_recording(whole, tmp_path / "y.mcap")
     assert caught.value.filename == str(tmp_path / "y.mcap")
     assert [path.name for path in tmp_path.iterdir()] == ["whole.mcap"] and whole.read_bytes() == before

@@ -20,7 +20,7 @@ from tacsim.record.episode import Episode, EpisodeError, EpisodeMeta, Step
 from tacsim.record.messages import Encoded, decode_step, encode_step
 from tacsim.record.protobuf import Scalar
 from tacsim.record.reader import read_episode
-from tacsim.record.schemas import META, encode_meta, sealed
+from tacsim.record.schemas import META, add_checksum, encode_meta
 from tacsim.record.writer import Recorder
 
 
@@ -132,7 +132,7 @@ def test_a_step_lost_in_the_middle_ends_the_episode(small: Path, tmp_path: Path)
     assert not episode.complete
 
 
-def test_a_changed_digit_of_a_message_is_seen(small: Path, tmp_path: Path) -> None:
+def test_changed_byte_of_message_is_detected(small: Path, tmp_path: Path) -> None:
     """It would still be a valid message: only the checksum of its chunk tells."""
     data = bytearray(small.read_bytes())
     residual = Scalar(value=read_episode(small).steps[1].info["residual"]).SerializeToString()
@@ -169,7 +169,7 @@ def test_a_lying_length_allocates_nothing(small: Path, tmp_path: Path, opcode: i
         tracemalloc.stop()
 
 
-def test_what_is_no_episode_says_so(tmp_path: Path, meta: EpisodeMeta) -> None:
+def test_file_that_is_no_episode_is_refused_with_reason(tmp_path: Path, meta: EpisodeMeta) -> None:
     with pytest.raises(EpisodeError, match="no such file"):
         read_episode(tmp_path / "missing.mcap")
     with pytest.raises(EpisodeError, match="is no file"):
@@ -199,7 +199,7 @@ def test_other_formats_and_compressed_chunks_are_named(tmp_path: Path, meta: Epi
             stock = Writer(file, compression=CompressionType.NONE)
             stock.start()
             changed = {key: value for key, value in config.items() if key != "crc32"} | {"format": other}
-            stock.add_metadata(META, sealed(changed))
+            stock.add_metadata(META, add_checksum(changed))
             stock.finish()
         with pytest.raises(EpisodeError, match=f"episode format '{other}', but this tacsim reads 2"):
             read_episode(tmp_path / "other.mcap")
@@ -207,7 +207,7 @@ def test_other_formats_and_compressed_chunks_are_named(tmp_path: Path, meta: Epi
 
 @pytest.mark.parametrize("compression", [CompressionType.NONE, CompressionType.ZSTD, CompressionType.LZ4])
 @pytest.mark.parametrize("profile", ["ros2", ""])
-def test_a_recording_of_another_program_is_told_with_its_topics(
+def test_recording_of_another_program_is_reported_with_its_topics(
     tmp_path: Path, compression: CompressionType, profile: str
 ) -> None:
     path = tmp_path / "bag_0.mcap"

@@ -16,7 +16,7 @@ from tacsim.interface import Arm, Clock, EndOfEpisode, Pose, TactileFrame, Tacti
 from tacsim.record.episode import EpisodeError, EpisodeMeta, Step
 from tacsim.record.images import encode_png, reference_attachments
 from tacsim.record.replay import ReplayArm, ReplayClock, ReplaySensor, recorded_period
-from tacsim.record.sources import list_pictures, only_or_named
+from tacsim.record.sources import list_pictures, select_name
 from tacsim.record.writer import Recorder
 from tests.tacsim.record.replayed import arm_facts, picture, sensor_facts
 
@@ -86,7 +86,7 @@ def test_names_that_an_episode_has_not(episode: Path) -> None:
     with pytest.raises(EpisodeError, match=r"no sensor 'left'; the recording has: lower, upper, side"):
         ReplaySensor(sensor_facts(episode), "left", ReplayClock(0.1))
     with pytest.raises(EpisodeError, match=r"which sensor\? Name one; the recording has: lower, upper, side"):
-        only_or_named(["lower", "upper", "side"], "", Path("a.mcap"), "sensor")
+        select_name(["lower", "upper", "side"], "", Path("a.mcap"), "sensor")
     with pytest.raises(EpisodeError, match=r"no arm 'left'; the recording has: lower, upper"):
         ReplayArm(arm_facts(episode), "left", ReplayClock(0.1))
 
@@ -308,7 +308,7 @@ def test_hidden_files_are_skipped(folder: Path) -> None:
     assert len(list_pictures(folder)) == 4
 
 
-def test_what_a_folder_without_pictures_holds_is_said(tmp_path: Path) -> None:
+def test_folder_without_pictures_reports_other_files(tmp_path: Path) -> None:
     (tmp_path / "a.tiff").write_bytes(b"II*\0")
     with pytest.raises(EpisodeError, match=r"but 1 like a\.tiff; save them as PNG with 8 bits"):
         list_pictures(tmp_path)

@@ -125,7 +125,7 @@ def test_stock_reader_finds_order_types_and_content(
         assert [a.name for a in reader.iter_attachments()] == list(meta.attachments)
 
 
-def test_viewers_find_every_number_in_a_field_of_its_own(
+def test_each_number_is_a_separate_field_for_viewers(
     tmp_path: Path, meta: EpisodeMeta, make_step: Callable[..., Step]
 ) -> None:
     """As a viewer decodes them: by the schemas in the file, without tacsim."""
@@ -192,7 +192,7 @@ def test_references_travel_as_attachments(tmp_path: Path, meta: EpisodeMeta) -> 
     assert reference_image(read, "upper") is None
 
 
-def test_a_picture_is_decoded_when_it_is_asked_for_and_not_kept(
+def test_picture_is_decoded_at_access_and_not_stored(
     tmp_path: Path, meta: EpisodeMeta, make_step: Callable[..., Step], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     record(tmp_path / "e.mcap", meta, [make_step(k) for k in range(5)])
@@ -214,7 +214,7 @@ def test_a_picture_is_decoded_when_it_is_asked_for_and_not_kept(
     assert frame() is None
 
 
-def test_packages_of_an_arm_come_back_and_stand_at_their_own_times(
+def test_packages_of_arm_are_restored_with_their_times(
     tmp_path: Path, meta: EpisodeMeta, make_step: Callable[..., Step]
 ) -> None:
     steps = [make_step(k, packages=True) for k in range(4)]  # 0, 3, 6, 9 packages
@@ -242,7 +242,7 @@ def test_a_step_is_read_by_its_number(tmp_path: Path, meta: EpisodeMeta, make_st
         steps[0]
 
 
-def test_a_step_is_read_by_its_number_from_a_file_that_others_have_packed_anew(
+def test_step_is_read_by_number_from_repacked_file(
     tmp_path: Path, meta: EpisodeMeta, make_step: Callable[..., Step]
 ) -> None:
     """Tools that copy MCAP files make chunks of their own: many steps in one, or none at all."""

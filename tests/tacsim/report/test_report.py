@@ -20,8 +20,8 @@ from rich.console import Console
 from tacsim.interface import Action, ArmState, Pose, RigSpec, SensorSpec, TactileFrame
 from tacsim.record.episode import Episode, EpisodeMeta, Step
 from tacsim.report import figure
-from tacsim.report.figure4 import Moment, Trial, figure4
-from tacsim.report.report import end_table, summary, write_report
+from tacsim.report.figure4 import Moment, Trial, draw_figure4
+from tacsim.report.report import summarise, summary_table, write_report
 from tacsim.report.series import Series
 
 STEPS = 8
@@ -43,7 +43,7 @@ def made_up(
 
 
 def numbers(episode: Episode) -> dict[str, Any]:
-    return summary(Series.of(episode), complete=episode.complete, dropped=episode.dropped)
+    return summarise(Series.from_episode(episode), complete=episode.complete, dropped=episode.dropped)
 
 
 def _step(k: int, sensors: tuple[str, ...], arms: bool, reward: bool, width: int) -> Step:
@@ -138,7 +138,7 @@ def test_correlation_is_undefined_when_nothing_changes() -> None:
     episode = made_up()
     episode.steps = [replace(step, info={"contact_signal_upper": 0.5}) for step in episode.steps]
     assert numbers(episode)["correlation"] == {"upper": None}
-    assert figure.signal_against_force(Series.of(episode))["upper"][2] is None
+    assert figure.signal_against_force(Series.from_episode(episode))["upper"][2] is None
 
 
 def test_report_of_two_sensors(tmp_path: Path) -> None:
@@ -202,7 +202,7 @@ def test_half_of_a_report_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     def full(figure: object, path: Path) -> None:
         raise OSError(28, "No space left on device", str(path))
 
-    monkeypatch.setattr("tacsim.report.figure.save", full)
+    monkeypatch.setattr("tacsim.report.figure.save_figure", full)
     with pytest.raises(OSError, match="No space left"):
         write_report(made_up(), tmp_path)
     assert not list(tmp_path.iterdir())
@@ -224,14 +224,19 @@ def test_of_equal_steps_the_first_is_named() -> None:
     text = shown(episode)
     assert "0.100 mm at step 5" in text
     assert "2.50 N (upper, step 5)" in text or "2.50 N (lower, step 5)" in text
-    dots = [line for axes in figure.plots(Series.of(episode)).axes for line in axes.lines if line.get_marker() == "o"]
+    dots = [
+        line
+        for axes in figure.draw_plots(Series.from_episode(episode)).axes
+        for line in axes.lines
+        if line.get_marker() == "o"
+    ]
     assert [list(line.get_xdata()) for line in dots] == [[5], [5]]  # of reward and of distance
 
 
 def test_a_character_that_the_font_lacks_is_no_warning(tmp_path: Path) -> None:
-    drawing = figure.canvas(2.0, 1.0)
+    drawing = figure.new_figure(2.0, 1.0)
     drawing.text(0.1, 0.5, "\N{COLLISION SYMBOL}")
-    figure.save(drawing, tmp_path / "a.png")  # warnings are errors in tests
+    figure.save_figure(drawing, tmp_path / "a.png")  # warnings are errors in tests
     assert (tmp_path / "a.png").stat().st_size > 0
 
 
@@ -240,7 +245,7 @@ def test_a_nearly_constant_force_is_not_cut_off() -> None:
     wrench = np.array([0.0, 0.0, -1.0, 0.0, 0.0, 0.0])
     arms = {"upper": ArmState(Pose(), np.zeros(6), wrench, None, 0.0)}
     episode.steps = [replace(step, arms=arms) for step in episode.steps]
-    (force,) = (axes for axes in figure.plots(Series.of(episode)).axes if axes.get_ylabel() == "N")
+    (force,) = (axes for axes in figure.draw_plots(Series.from_episode(episode)).axes if axes.get_ylabel() == "N")
     assert force.get_ylim()[0] == 0.0
     assert force.get_ylim()[1] > 1.1
 
@@ -248,7 +253,7 @@ def test_a_nearly_constant_force_is_not_cut_off() -> None:
 def shown(episode: Episode) -> str:
     """The table at the end of a run as text."""
     console = Console(file=StringIO(), width=140)
-    console.print(end_table(numbers(episode), [Path("report.html")]))
+    console.print(summary_table(numbers(episode), [Path("report.html")]))
     return console.file.getvalue()  # type: ignore[attr-defined]
 
 
@@ -256,16 +261,16 @@ def test_thumbnails_are_averaged_not_cropped(tmp_path: Path) -> None:
     image = np.zeros((100, 700, 3), np.uint8)
     image[:, ::2] = 200
     path = tmp_path / "thumbnail.png"
-    path.write_bytes(figure.png(figure.shrunk(image, 320)))
+    path.write_bytes(figure.encode_image(figure.shrink_image(image, 320)))
     small = imread(path)
     assert small.shape[:2] == (33, 233)
     assert abs(float(small[..., 0].mean()) * 255 - 100) < 2
 
 
 def test_moments_are_spread_and_hold_both_ends() -> None:
-    assert figure.moments(41, 6) == [0, 8, 16, 24, 32, 40]
-    assert figure.moments(3, 12) == [0, 1, 2]
-    assert figure.moments(0, 6) == []
+    assert figure.select_positions(41, 6) == [0, 8, 16, 24, 32, 40]
+    assert figure.select_positions(3, 12) == [0, 1, 2]
+    assert figure.select_positions(0, 6) == []
 
 
 def test_figure4_shows_body_gels_and_images(tmp_path: Path) -> None:
@@ -296,5 +301,5 @@ def figure4_picture(folder: Path, shift: float) -> NDArray[np.float32]:
     distance = [-value * 1e-3 for value in reward]
     trial = Trial(list(range(5)), reward, distance, distance, 7e-3, moments, 0.25e-3, (20e-3, 20e-3, 4e-3), 1e-3)
     path = folder / f"fig4-{shift}.png"
-    figure4({"squeeze": {"hybrid": trial}}, path)
+    draw_figure4({"squeeze": {"hybrid": trial}}, path)
     return imread(path)  # type: ignore[no-any-return]

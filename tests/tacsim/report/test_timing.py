@@ -10,7 +10,7 @@ import pytest
 
 from tacsim.interface import RigSpec, SensorSpec, TactileFrame
 from tacsim.record.episode import Episode, EpisodeMeta, Step
-from tacsim.report.diagnostics import timing, timing_rows
+from tacsim.report.diagnostics import timing_rows, timing_statistics
 from tacsim.report.series import Series
 
 FRAMES = {"pictures_lost_lower": 0.0, "pictures_damaged_lower": 3.0}
@@ -33,7 +33,7 @@ def episode(times: list[float], age: float = 0.03, live: bool = True) -> Episode
 
 
 def told(given: Episode) -> dict[str, Any] | None:
-    return timing(Series.of(given))
+    return timing_statistics(Series.from_episode(given))
 
 
 def test_period_age_alignment_and_limits() -> None:

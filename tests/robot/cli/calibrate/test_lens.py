@@ -12,7 +12,7 @@ import yaml
 
 from calibration.bundle import read_bundle, write_bundle
 from calibration.lens.view import GelView, Lens
-from tacsim.config import load, load_rig
+from tacsim.config import load_model, load_rig
 from tacsim.record.images import encode_png, read_image
 from tests.calibration.boards import DOTS, LENS, facing, photograph, tilted
 from tests.calibration.presses import BALL, COLUMNS, PITCH, ROWS, HiddenSensor
@@ -41,14 +41,14 @@ def test_a_folder_gives_the_lens_and_a_picture_the_view(pictures: Path, tmp_path
     code, said, _ = run("lens", pictures, *BOARD, "--out", tmp_path / "lens")
     assert code == 0, said
     assert "left out: empty.png: the board" in said and "residual" in said
-    lens = load(Lens, tmp_path / "lens" / "lens.yaml")
+    lens = load_model(Lens, tmp_path / "lens" / "lens.yaml")
     np.testing.assert_allclose(lens.focal, LENS.focal, rtol=0.02)
     (tmp_path / "gel.png").write_bytes(encode_png(photograph(DOTS, facing(DOTS, [0.1, -0.1, 0.0], 0.032))))
     known = ["--lens", tmp_path / "lens" / "lens.yaml", "--size", "18 mm, 14 mm"]
     code, said, _ = run("lens", tmp_path / "gel.png", *BOARD, *known, "--out", tmp_path / "view")
     assert code == 0, said
     assert "px, 0.0" in said  # residual in px and mm
-    view = load(GelView, tmp_path / "view" / "view.yaml")
+    view = load_model(GelView, tmp_path / "view" / "view.yaml")
     assert view.size == pytest.approx((18e-3, 14e-3)) and view.lens == lens
     shape = (view.geometry.height, view.geometry.width, 3)
     assert read_image(tmp_path / "view" / "rectified.png").shape == shape
@@ -74,7 +74,7 @@ def test_a_sensor_seen_askew_is_calibrated_through_its_view(tmp_path: Path) -> N
     code, _, err = run("sensor", frames, *ball, *seen, "--out", tmp_path / "bundle")
     assert code == 4, err  # four corners and a size say how large a pixel is, and nothing checks it
     calibration, reference = read_bundle(tmp_path / "bundle")
-    assert calibration.view == load(GelView, tmp_path / "view" / "view.yaml")
+    assert calibration.view == load_model(GelView, tmp_path / "view" / "view.yaml")
     assert calibration.geometry == calibration.view.geometry
     assert reference.shape == (calibration.geometry.height, calibration.geometry.width, 3)
     # The perspective is gone: contacts are round and as large as the ball's depth makes them.

@@ -18,8 +18,8 @@ KERNELS = """
 import sys
 import numpy as np
 if sys.argv[1] == "ours":
-    from tacsim.compute.runtime import start, ti
-    start()
+    from tacsim.compute.runtime import start_taichi, ti
+    start_taichi()
 else:
     import taichi as ti
     ti.init(arch=ti.cpu, default_fp=ti.f32, offline_cache=True, cfg_optimization=False)

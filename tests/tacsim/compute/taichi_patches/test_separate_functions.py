@@ -13,9 +13,9 @@ pytestmark = pytest.mark.cpu
 KERNEL = """
 import random
 import numpy as np
-from tacsim.compute.runtime import start, ti
+from tacsim.compute.runtime import start_taichi, ti
 from tacsim.compute.taichi_patches.separate_functions import compiled_separately
-start()
+start_taichi()
 garbage = [bytearray(random.randrange(600, 3000)) for _ in range(20000)]  # and holes in it, where functions come to lie
 for n in random.sample(range(20000), 10000):
     garbage[n] = None

@@ -17,10 +17,10 @@ import warnings
 from importlib import metadata
 import numpy as np
 INSTALLED
-from tacsim.compute.runtime import start, ti
-from tacsim.compute.taichi_patches.repeated_launch import launch
+from tacsim.compute.runtime import start_taichi, ti
+from tacsim.compute.taichi_patches.repeated_launch import launch_kernel
 from tacsim.compute.taichi_patches.separate_functions import compiled_separately
-start()
+start_taichi()
 Floats = ti.types.ndarray(dtype=ti.f32, ndim=1)
 Pair = ti.types.argpack(a=Floats, b=Floats)
 
@@ -36,7 +36,7 @@ def add_roots(times: ti.i32, pair: Pair):
 
 a, b = np.arange(5, dtype=np.float32), np.ones(5, np.float32)
 for times in (1, 2, 3):
-    launch(add_roots, times, (a, b))
+    launch_kernel(add_roots, times, (a, b))
 WORLD
 print(ti.lang.kernel_impl._inside_class.__module__, b.tobytes().hex(), bits)
 """

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from benchmarks.truth import mls_mpm
-from tacsim.compute.runtime import start, ti
+from tacsim.compute.runtime import start_taichi, ti
 from tacsim.geometry.sampling import body_points
 from tacsim.models.material import BodyMaterial
 from tacsim.models.scene import Body as BodyModel
@@ -76,7 +76,7 @@ def minus_identity(f: np.ndarray) -> np.ndarray:
 @pytest.fixture(scope="module")
 def stages() -> Stages:
     """What both have after each stage of one substep."""
-    start()
+    start_taichi()
     spacing = 0.5e-3
     own = body_params(CLAY, spacing)
     dx, dt = own.cell, 0.4 * own.cell
@@ -93,7 +93,7 @@ def stages() -> Stages:
     for name, value in {**own.params(), layout.STEP: dt, layout.RIGID_MASS_SCALE: 1.0}.items():
         params[0, name] = value
     params[0, layout.GRAVITY : layout.GRAVITY + 3] = GRAVITY
-    state.fit(0, dx, 2 * dx, params, counts)
+    state.fit_grid(0, dx, 2 * dx, params, counts)
     trial = (np.eye(3) + dt * c) @ f  # the product keeps what the paper forms at the start of the next substep
     state.v()[:], state.c()[:], state.e()[:] = v, c, minus_identity(trial)
     arrays, numbers = state.arguments(), (params, counts, partial)

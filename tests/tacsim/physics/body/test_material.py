@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from benchmarks.truth import laws
-from tacsim.compute.runtime import start, ti
+from tacsim.compute.runtime import start_taichi, ti
 from tacsim.models.material import BodyMaterial, elastic_constants
 from tacsim.physics.body import material
 from tacsim.physics.body.plasticine import BodyParams, body_params
@@ -34,7 +34,7 @@ def return_all(e: Strains, flow: Scalars, tau: Strains, mu: ti.f32, bulk: ti.f32
 @ti.kernel
 def convect_all(e: Strains, d: Matrices):
     for p in range(e.shape[0]):
-        e[p] = material.convect(e[p], d[p])
+        e[p] = material.transport_strain(e[p], d[p])
 
 
 @ti.kernel
@@ -44,7 +44,7 @@ def log_all(x: Scalars, y: Scalars):
 
 
 def test_lanes_have_a_logarithm_to_float32s_digits():
-    start()
+    start_taichi()
     x = np.float32(np.concatenate([np.geomspace(0.05, 30.0, 20_000), 1.0 + np.linspace(-1e-3, 1e-3, 2_001)]))
     found, exact = np.zeros_like(x), np.log(x.astype(float))
     log_all(x, found)
@@ -77,7 +77,7 @@ def returned(
     b: np.ndarray, flow: np.ndarray, limit: float, hardening: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Elastic b, equivalent plastic strain and stress after one return."""
-    start()
+    start_taichi()
     e = np.ascontiguousarray(six(b - np.eye(3)), np.float32)
     flow = np.array(flow, np.float32)
     tau = np.zeros_like(e)
@@ -88,7 +88,7 @@ def returned(
 def drive(params: BodyParams, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Stress (n, 3, 3) and equivalent plastic strain (n,) of one material point after each of the increments d of
     deformation (n, 3, 3)."""
-    start()
+    start_taichi()
     e, flow, tau = np.zeros((1, 6), np.float32), np.zeros(1, np.float32), np.zeros((1, 6), np.float32)
     stresses, flows = [], []
     for d in steps.astype(np.float32):
@@ -183,7 +183,7 @@ def deviator(m: np.ndarray) -> np.ndarray:
 
 
 def test_convection_is_f_b_f_transposed() -> None:
-    start()
+    start_taichi()
     rng = np.random.default_rng(3)
     f = np.eye(3) + rng.uniform(-0.05, 0.05, (200, 3, 3))
     b = random_b(200, 0.1)
@@ -192,9 +192,9 @@ def test_convection_is_f_b_f_transposed() -> None:
 
 @some
 @given(seed=SEEDS, size=st.floats(1e-3, 0.3), step=st.floats(1e-3, 0.1))
-def test_convection_does_not_feel_how_space_is_turned(seed: int, size: float, step: float) -> None:
+def test_transport_of_strain_is_invariant_under_rotation(seed: int, size: float, step: float) -> None:
     """Objective: after f <- q f, b turns by q, however far; and a step of mere rotation strains nothing."""
-    start()
+    start_taichi()
     rng, q = np.random.default_rng(seed), Rotation.random(rng=seed + 1).as_matrix()
     b, f = random_b(20, size, seed), np.eye(3) + rng.uniform(-step, step, (20, 3, 3))
     assert np.abs(convected(b, q @ f) - q @ convected(b, f) @ q.T).max() < 5e-6

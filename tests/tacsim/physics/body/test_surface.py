@@ -7,14 +7,14 @@ import pytest
 import trimesh
 
 from benchmarks.truth.roughness import print_roughness
-from tacsim.compute.runtime import start, ti
+from tacsim.compute.runtime import start_taichi, ti
 from tacsim.geometry.sampling import body_points
 from tacsim.geometry.shapes import enclosed_volume, shape_distance
 from tacsim.interface import Pose
 from tacsim.models.material import BodyMaterial
 from tacsim.models.scene import Body, Box, Mesh, Scene, Sphere
 from tacsim.physics.body.surface import surface_points, tangent_planes
-from tacsim.physics.body.transfers import moved_plane
+from tacsim.physics.body.transfers import transport_plane
 from tacsim.physics.exec.lanes import vec3
 from tacsim.physics.worlds.hybrid import HybridWorld
 from tacsim.physics.worlds.tuning import INITIAL_GAP
@@ -43,7 +43,7 @@ def test_outer_particles_know_the_surface(geometry: Box | Sphere, sampling: str)
         assert np.mean(off < 1e-9) > 0.75
 
 
-def test_a_mesh_knows_its_surface_like_the_shape_it_describes(tmp_path: Path) -> None:
+def test_mesh_has_same_tangent_planes_as_its_shape(tmp_path: Path) -> None:
     trimesh.creation.box((10, 10, 6)).export(tmp_path / "box.stl")
     points = body_points(Body(geometry=CUBE, sampling="random"), SPACING)
     of_mesh = tangent_planes(Mesh(path=str(tmp_path / "box.stl")), points, SPACING)
@@ -59,13 +59,13 @@ def flow(n: ti.i32, planes: Points, columns: Points, dt: ti.f32):
     ti.loop_config(serialize=True)
     for _ in range(n):
         for p in range(planes.shape[0]):
-            planes[p] = moved_plane(planes[p], dt * ti.Matrix.cols([columns[0], columns[1], columns[2]]))
+            planes[p] = transport_plane(planes[p], dt * ti.Matrix.cols([columns[0], columns[1], columns[2]]))
 
 
 def test_planes_go_with_the_material() -> None:
     """Feet moved by F must lie on the moved planes, m' = F^-T m, to rounding. What a substep turns too much adds up: a
     ball of clay rolled 200 times lost 7 % of its force by it."""
-    start()
+    start_taichi()
     rng = np.random.default_rng(0)
     rate = rng.normal(scale=0.3, size=(3, 3))
     steps = 50

@@ -134,10 +134,10 @@ def test_the_grid_ends_where_nothing_has_mass(count: int) -> None:
 def test_what_is_known_of_the_places_on_the_grid_follows_them() -> None:
     """Whoever has moved one: a launch asks anew."""
     body = block(body_params(ELASTIC_BODY, 0.5e-3), 0.5e-3).state
-    before = body.laid(0)
-    assert body.laid(0) is before
+    before = body.grid_layout(0)
+    assert body.grid_layout(0) is before
     body.reference(0)[3] += [1.0, 0.0, -2.0]
     assert not np.array_equal(body.extents(0), before.extents)
     np.testing.assert_allclose(
-        body.laid(0).centre - before.centre, np.array([1.0, 0.0, -2.0]) / len(body.x(0)), atol=1e-6
+        body.grid_layout(0).centre - before.centre, np.array([1.0, 0.0, -2.0]) / len(body.x(0)), atol=1e-6
     )

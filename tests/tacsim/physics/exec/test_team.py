@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from tacsim.compute.runtime import start, ti
-from tacsim.compute.threads import cores
+from tacsim.compute.runtime import start_taichi, ti
+from tacsim.compute.threads import core_count
 from tacsim.interface import Pose
 from tacsim.models.scene import Gel, Indenter, Scene, Sphere
 from tacsim.physics.exec import team
@@ -26,7 +26,7 @@ def down(world: PressWorld) -> dict[str, Pose]:
     return {"indenter": Pose(world.pose("indenter").position - [0.0, 0.0, 0.3e-3])}
 
 
-@pytest.mark.skipif(cores() < 2, reason="one processor: no team to compare")
+@pytest.mark.skipif(core_count() < 2, reason="one processor: no team to compare")
 def test_any_team_gives_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
     states = []
     for size in (1, 2):
@@ -63,7 +63,7 @@ def test_one_of_three_moves_with_any_team(moving: int, size: int, monkeypatch: p
 def test_the_next_piece(taken: list[int], done: int, own: int, expected: int) -> None:
     sync, found = np.zeros((1, 16), np.int32), np.zeros(1, np.int32)
     sync[0, team.CLAIMED : team.CLAIMED + PARTS], sync[0, team.DONE] = taken, done
-    start()
+    start_taichi()
     ask(sync, found, own)
     assert found[0] == expected
     assert sync[0, team.CLAIMED : team.CLAIMED + PARTS].sum() == sum(taken) + (expected < 2 * PARTS)
@@ -73,11 +73,11 @@ def test_the_next_piece(taken: list[int], done: int, own: int, expected: int) ->
 def ask(sync: team.Sync, found: Found, own: ti.i32):
     ti.loop_config(serialize=True)
     for n in range(1):
-        found[n] = team.next_piece(sync, n, own, 2)
+        found[n] = team.claim_work(sync, n, own, 2)
 
 
 def test_teams_fit_the_threads(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tacsim.compute.threads.cores", lambda: 4)
+    monkeypatch.setattr("tacsim.compute.threads.core_count", lambda: 4)
     monkeypatch.delenv("TACSIM_THREADS", raising=False)
     assert [team.team_size(n) for n in (1, 2, 3, 8)] == [4, 2, 1, 1]
     monkeypatch.setenv("TACSIM_THREADS", "1")

@@ -16,7 +16,7 @@ import pytest
 from tacsim.interface import Pose
 from tacsim.models.scene import Gel, Indenter, Mesh, Scene, Settling, Sphere
 from tacsim.physics.failure import dump
-from tacsim.physics.failure.dump import DumpError, dumps_in, read
+from tacsim.physics.failure.dump import DumpError, dump_to_folder, read_dump
 from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.physics.failure.tuning import MAX_DUMPS
 from tacsim.physics.worlds.press import PressWorld
@@ -41,7 +41,7 @@ def press_through(world: PressWorld) -> SimulationDiverged:
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A dump of an indenter driven through a gel."""
     folder = tmp_path_factory.mktemp("dumps") / "diverged"
-    with dumps_in(folder):
+    with dump_to_folder(folder):
         failure = press_through(PressWorld(SCENE))
     assert failure.dump == folder / "00"
     assert str(failure).endswith(f"tacsim debug {folder / '00'}")
@@ -71,7 +71,7 @@ def test_a_dump_that_cannot_be_written_whole_leaves_nothing(tmp_path: Path, monk
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(np, "savez_compressed", full)
-    with dumps_in(tmp_path):
+    with dump_to_folder(tmp_path):
         failure = press_through(PressWorld(SCENE))
     assert failure.dump is None and "No space left on device" in str(failure)
     assert list(tmp_path.iterdir()) == []
@@ -79,20 +79,20 @@ def test_a_dump_that_cannot_be_written_whole_leaves_nothing(tmp_path: Path, monk
 
 def test_the_environment_goes_before_the_folder_of_a_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(dump.FOLDER, str(tmp_path / "mine"))
-    with dumps_in(tmp_path / "theirs"):
+    with dump_to_folder(tmp_path / "theirs"):
         assert os.environ[dump.FOLDER] == str(tmp_path / "mine")
-        with dumps_in(None):
+        with dump_to_folder(None):
             assert os.environ[dump.FOLDER] == ""
     assert os.environ[dump.FOLDER] == str(tmp_path / "mine")
     monkeypatch.delenv(dump.FOLDER)
-    with dumps_in(tmp_path / "theirs"):
+    with dump_to_folder(tmp_path / "theirs"):
         assert os.environ[dump.FOLDER] == str(tmp_path / "theirs")
     assert dump.FOLDER not in os.environ
 
 
 @pytest.mark.cpu
 def test_it_holds_all_that_a_replay_needs(made: Path) -> None:
-    found = read(made)
+    found = read_dump(made)
     assert found.info.scene == SCENE
     assert found.command.targets["indenter"].position == pytest.approx([0, 0, 3.1e-3 - TOO_DEEP])
     assert found.poses("before")["indenter"].position == pytest.approx([0, 0, 3.1e-3])
@@ -114,21 +114,21 @@ def test_an_stl_file_comes_along(tmp_path: Path) -> None:
     path = tmp_path / "ball.stl"
     path.write_bytes(trimesh.creation.icosphere(subdivisions=2, radius=3.0).export(file_type="stl"))
     scene = SCENE.model_copy(update={"indenter": Indenter(geometry=Mesh(path=str(path)))})
-    with dumps_in(tmp_path / "out"):
+    with dump_to_folder(tmp_path / "out"):
         press_through(PressWorld(scene))
     path.unlink()
-    found = read(tmp_path / "out" / "00")
+    found = read_dump(tmp_path / "out" / "00")
     assert found.info.scene.indenter is not None
     geometry = found.info.scene.indenter.geometry
     assert isinstance(geometry, Mesh) and Path(geometry.path) == tmp_path / "out" / "00" / "shape.stl"
     assert press_through(PressWorld(found.info.scene)).cause in found.info.message
     edit(tmp_path / "out" / "00", lambda d: d["scene"]["indenter"]["geometry"].update(path="/etc/hosts"))
-    assert read(tmp_path / "out" / "00").info.scene == found.info.scene  # a dump names no file but its own
+    assert read_dump(tmp_path / "out" / "00").info.scene == found.info.scene  # a dump names no file but its own
 
 
 def test_dumps_are_numbered_and_few(tmp_path: Path) -> None:
     world = PressWorld(SCENE)
-    with dumps_in(tmp_path):
+    with dump_to_folder(tmp_path):
         assert [press_through(world).dump for _ in range(2)] == [tmp_path / "00", tmp_path / "01"]
         for number in range(2, MAX_DUMPS):
             (tmp_path / f"{number:02d}").mkdir()
@@ -138,7 +138,7 @@ def test_dumps_are_numbered_and_few(tmp_path: Path) -> None:
 
 def test_a_folder_that_cannot_be_written_does_not_hide_the_failure(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with dumps_in(tmp_path / "file" / "below"):
+    with dump_to_folder(tmp_path / "file" / "below"):
         failure = press_through(PressWorld(SCENE))
     assert "gel" in failure.cause and "no dump could be written" in str(failure)
 
@@ -161,7 +161,7 @@ def edit(place: Path, change: Any) -> None:
 def test_facts_that_are_wrong_are_named(copied: Path, change: Any, words: str) -> None:
     edit(copied, change)
     with pytest.raises(DumpError, match=words):
-        read(copied)
+        read_dump(copied)
 
 
 def rewrite(place: Path, name: str, data: bytes) -> None:
@@ -182,7 +182,7 @@ def test_arrays_that_cannot_be_read_are_refused(copied: Path) -> None:
 
     def refused(words: str) -> None:
         with pytest.raises(DumpError, match=words):
-            read(copied)
+            read_dump(copied)
         (copied / "state.npz").write_bytes(sound)
 
     rewrite(copied, "before.objects.npy", npy(np.array([{"a": 1}], dtype=object), allow_pickle=True))
@@ -195,13 +195,13 @@ def test_arrays_that_cannot_be_read_are_refused(copied: Path) -> None:
     refused("damaged")
     (copied / "state.npz").unlink()
     with pytest.raises(DumpError, match="missing or damaged"):
-        read(copied)
+        read_dump(copied)
     with pytest.raises(FileNotFoundError, match=r"no dump\.json"):
-        read(copied / "nowhere")
+        read_dump(copied / "nowhere")
 
 
 def test_a_process_started_meanwhile_dumps_to_the_same_folder(tmp_path: Path) -> None:
-    with dumps_in(tmp_path):
+    with dump_to_folder(tmp_path):
         code = "import os; print(os.environ['TACSIM_DUMPS'])"
         said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=30, check=True)
     assert said.stdout.strip() == str(tmp_path)

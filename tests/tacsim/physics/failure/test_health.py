@@ -13,12 +13,12 @@ from scipy.spatial.transform import Rotation
 from tacsim.interface import Pose
 from tacsim.models.scene import Gel, Indenter, Scene, Settling, Sphere
 from tacsim.physics.failure import diagnosis, health
-from tacsim.physics.failure.health import Health, LaunchSpan, SimulationDiverged, check_launch, require_room
+from tacsim.physics.failure.health import Health, LaunchSpan, SimulationDiverged, check_launch, require_grid_memory
 from tacsim.physics.failure.tuning import MAX_COURANT
-from tacsim.physics.motion.controller import ForceReading, Launch, Motion, run
+from tacsim.physics.motion.controller import ForceReading, Launch, Motion, run_motion
 from tacsim.physics.motion.path import Path
 from tacsim.physics.move import MoveCommand, MoveStats
-from tacsim.physics.snapshot import copies
+from tacsim.physics.snapshot import copy_arrays
 from tacsim.physics.worlds import press
 from tacsim.physics.worlds.base import BaseWorld
 from tacsim.physics.worlds.press import PressWorld
@@ -48,7 +48,7 @@ class Particles(BaseWorld):
         self.state = {"position": np.ones((4, 3), np.float32), "velocity": np.zeros((4, 3), np.float32)}
 
     def _run_command(self, command: MoveCommand) -> Motion:
-        return self._retried(command, one_launch)
+        return self._retry_smaller_steps(command, one_launch)
 
     def _advance(self, launch: Launch) -> list[ForceReading]:
         raise AssertionError("the test advances it")
@@ -64,7 +64,7 @@ class Particles(BaseWorld):
             a[...] = state[name]
 
     def launch(self, change: Callable[[dict[str, np.ndarray]], Any], seen: Health = WELL) -> Health:
-        good = copies(self.state)
+        good = copy_arrays(self.state)
         change(self.state)
         return check_launch(self.arrays, good, seen, lambda: HERE)
 
@@ -90,11 +90,11 @@ def nothing(arrays: dict[str, np.ndarray]) -> None:
         (Health(1.0, 3, 1.0, 0.0, 0, 0.0), "left the grid (3 particle substeps)"),
         (
             Health(1.0, 0, 1.0, 0.0, 0, 0.0, 1.2),
-            "1.2 of what the pressure wave takes through the most squeezed element or grid cell (limit 1)",
+            "1.2 of the pressure wave's time through the most compressed element or grid cell (limit 1)",
         ),
     ],
 )
-def test_what_the_kernels_saw_is_check_launch(seen: Health, words: str) -> None:
+def test_check_launch_reports_results_of_kernels(seen: Health, words: str) -> None:
     with pytest.raises(SimulationDiverged) as caught:
         Particles().launch(nothing, seen)
     assert words in caught.value.cause and "lower at (0.000, 0.000, 1.000) mm" in caught.value.where
@@ -109,7 +109,7 @@ def test_the_cause_names_array_index_and_how_many() -> None:
         Particles().launch(lambda a: a["velocity"].__setitem__((slice(2, 4), 1), np.nan))
 
 
-def test_a_gel_node_that_races_and_a_crushed_particle_are_seen() -> None:
+def test_fast_gel_node_and_crushed_particle_are_detected() -> None:
     world = Particles()
     world.state["gel_velocity"] = np.zeros((1, 2, 2, 2, 3), np.float32)
     with pytest.raises(SimulationDiverged, match=r"gel node moves at 0\.6 of the wave speed"):
@@ -124,10 +124,10 @@ def test_what_has_spread_over_a_gel_is_placed_where_it_began() -> None:
     good = {"gel_displacement": np.zeros((1, 3, 3, 2, 3)), "gel_velocity": np.zeros((1, 3, 3, 2, 3))}
     good["gel_velocity"][0, 1, 1, 1, 2] = -0.4
     failed = {name: np.full_like(array, np.nan) for name, array in good.items()}
-    place = diagnosis.place_of_worst("node speed", good, failed, [(4e-3, 4e-3, 2e-3)])
+    place = diagnosis.describe_worst_place("node speed", good, failed, [(4e-3, 4e-3, 2e-3)])
     assert place.startswith("node [1, 1, 1] of the lower gel, (0.000, 0.000, 0.000) mm")
     failed["gel_velocity"][...], failed["gel_velocity"][0, 2, 0, 0, 1] = 0.1, 3.0
-    assert "node [2, 0, 0]" in diagnosis.place_of_worst("node speed", good, failed, [(4e-3, 4e-3, 2e-3)])
+    assert "node [2, 0, 0]" in diagnosis.describe_worst_place("node speed", good, failed, [(4e-3, 4e-3, 2e-3)])
 
 
 def test_a_motion_starts_again_from_the_state_before_it() -> None:
@@ -139,7 +139,7 @@ def test_a_motion_starts_again_from_the_state_before_it() -> None:
         world.launch(set_to("velocity", (0, 0), 0.0 if launch.path.refine == 2 else np.nan))
         return [REST]
 
-    stats = run(world.motion(MoveCommand({})), advance)
+    stats = run_motion(world.motion(MoveCommand({})), advance)
     assert seen == [(1, 1.0), (2, 1.0)]
     assert stats.retries == 1 and world.state["position"][0, 0] == 2.0
 
@@ -155,7 +155,7 @@ def test_a_motion_that_never_succeeds_leaves_the_world_as_it_was() -> None:
         return [REST]
 
     with pytest.raises(SimulationDiverged) as caught:
-        run(world.motion(MoveCommand({})), advance)
+        run_motion(world.motion(MoveCommand({})), advance)
     assert steps == [2**retry for retry in range(MAX_RETRIES + 1)]
     assert all(world.state[name].tobytes() == before[name].tobytes() for name in before)
     text = str(caught.value)
@@ -188,25 +188,25 @@ def test_an_interrupted_motion_is_taken_back(error: type[BaseException]) -> None
         raise error
 
     with pytest.raises(error):
-        run(world.motion(MoveCommand({})), advance)
+        run_motion(world.motion(MoveCommand({})), advance)
     assert world.state["position"].max() == 1.0
 
 
-def test_a_broken_state_is_told_before_anything_moves() -> None:
+def test_state_with_nan_is_refused_before_motion() -> None:
     world = Particles()
     world.state["position"][3, 0] = np.nan
     with pytest.raises(
         SimulationDiverged, match=r"position\[3, 0\] is nan.*before the motion began.*restore a snapshot"
     ):
-        run(world.motion(MoveCommand({})), lambda path, first, last: pytest.fail("it moved"))
+        run_motion(world.motion(MoveCommand({})), lambda path, first, last: pytest.fail("it moved"))
 
 
 def test_a_grid_without_end_is_refused() -> None:
-    require_room(np.zeros(3), np.full(3, 100.0), 1.0, lambda: HERE)
+    require_grid_memory(np.zeros(3), np.full(3, 100.0), 1.0, lambda: HERE)
     with pytest.raises(SimulationDiverged, match="spread over 1000 x 1000 x 1000 mm"):
-        require_room(np.zeros(3), np.full(3, 1000.0), 1.0, lambda: HERE)
+        require_grid_memory(np.zeros(3), np.full(3, 1000.0), 1.0, lambda: HERE)
     with pytest.raises(SimulationDiverged):
-        require_room(np.zeros(3), np.array([1.0, 1.0, 1e38], np.float32), 1e-3, lambda: HERE)
+        require_grid_memory(np.zeros(3), np.array([1.0, 1.0, 1e38], np.float32), 1e-3, lambda: HERE)
 
 
 def test_volumes_are_those_of_the_determinant() -> None:
@@ -225,8 +225,8 @@ def test_volumes_are_those_of_the_determinant() -> None:
             for a, b, c in np.ndindex(2, 2, 2)
         )
         assert corners[gel, i, j, k] == pytest.approx(least, rel=1e-6, abs=1e-9)
-    assert not diagnosis.nearly_at_rest(u, 2.0)
-    assert diagnosis.nearly_at_rest(0.1 * h * np.sign(u), 2.0)
+    assert not diagnosis.has_small_gradients(u, 2.0)
+    assert diagnosis.has_small_gradients(0.1 * h * np.sign(u), 2.0)
 
     f = np.eye(3) + rng.normal(0, 0.2, (50, 3, 3))
     volumes = diagnosis.particle_volumes({"deformation_gradient": f})
@@ -236,7 +236,7 @@ def test_volumes_are_those_of_the_determinant() -> None:
     assert diagnosis.particle_volumes({"strain": six}) == pytest.approx(np.abs(np.linalg.det(f)), rel=1e-9)
 
 
-def test_a_span_says_where_the_frames_are() -> None:
+def test_launch_span_text_contains_frame_positions() -> None:
     path = Path([Pose()], [Pose(np.array([0, 0, 2e-3]))], substeps=40, dt=0.4)
     assert str(path.span(["lower"], 0, 20)) == (
         "in substeps 0 to 20 of 40 of the motion, lower at (0.000, 0.000, 1.000) mm"
@@ -288,15 +288,17 @@ def test_the_step_is_measured_against_the_most_squeezed_element(gradient: np.nda
         assert exact - 1e-4 <= courant <= MAX_COURANT
 
 
-def test_the_most_squeezed_element_is_the_shortest_one_whatever_its_volume() -> None:
+def test_most_compressed_element_is_shortest_at_any_volume() -> None:
     rest = np.stack(np.meshgrid(*[np.arange(5)] * 3, indexing="ij"), axis=-1)
     flat, small = (rest * (np.array(stretch) - 1.0) for stretch in ((0.3, 2.0, 2.0), (0.6, 0.6, 0.6)))
     for displacement, gel in (([flat, small], "lower"), ([small, flat], "upper")):
         state = {"gel_displacement": np.array(displacement)}
-        assert f"of the {gel} gel" in diagnosis.place_of_worst("element length", state, state, [(4e-3, 4e-3, 4e-3)] * 2)
+        assert f"of the {gel} gel" in diagnosis.describe_worst_place(
+            "element length", state, state, [(4e-3, 4e-3, 4e-3)] * 2
+        )
 
 
-def test_a_step_that_squeezed_elements_do_not_bear_is_halved(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unstable_step_for_compressed_elements_is_halved(monkeypatch: pytest.MonkeyPatch) -> None:
     """Though nothing blows up, as is seen without the limit."""
     monkeypatch.setattr(press, "PRESS_COURANT", 0.8)
     world = PressWorld(BALL.model_copy(update={"settling": Settling(mach=0.1)}))
@@ -314,7 +316,7 @@ def test_a_step_that_squeezed_elements_do_not_bear_is_halved(monkeypatch: pytest
     assert last.retries == 1 and last.time_step == pytest.approx(0.4e-3) and 0.4 < last.courant < MAX_COURANT
 
 
-def test_a_motion_tells_by_which_numbers_it_went() -> None:
+def test_motion_reports_step_damping_and_courant_number() -> None:
     world = PressWorld(BALL)
     pose = world.pose("indenter")
     stats = world.move({"indenter": Pose(pose.position - [0, 0, 0.5e-3])})

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tacsim import pose as se3
-from tacsim.physics.body.followers import following, node_masses
-from tacsim.physics.body.plasticine import bounds, fit_grid
+from tacsim.physics.body.plasticine import bounds_of_points, grid_around
+from tacsim.physics.body.tied_nodes import node_masses, tie_light_nodes
 from tacsim.physics.body.tuning import STENCIL_REACH
-from tacsim.physics.contact.contact import ON_GEL
+from tacsim.physics.contact.contact import ANCHOR_ON_GEL
 from tacsim.physics.contact.tuning import PARTICLE_TANGENTIAL_STIFFNESS
 from tacsim.physics.exec import layout
 from tacsim.physics.gel.tuning import HOURGLASS_STIFFNESS
@@ -54,9 +54,9 @@ def of_body(state: Mapping[str, Array], params: Array) -> float:
     cell, v = params[layout.BODY_CELL], state["grid_velocity"].astype(float)
     if v.size == 0:
         return float(elastic)
-    origin, shape = fit_grid(*bounds(state["reference"]), cell, STENCIL_REACH * cell)
+    origin, shape = grid_around(*bounds_of_points(state["reference"]), cell, STENCIL_REACH * cell)
     mass = node_masses(state["reference"], origin, cell, shape)
-    follower, leader, share = following(mass)
+    follower, leader, share = tie_light_nodes(mass)
     whole = mass.ravel().copy()
     np.add.at(whole, leader, share * mass.ravel()[follower])
     whole[follower] = 0
@@ -76,7 +76,7 @@ def of_contact(world: HybridWorld, state: Mapping[str, Array], params: Array, g:
     """Of the springs between particles and gel g [N mm], normal and tangential."""
     pose, h = world.pose(world.sensors[g]), params[layout.GEL_SPACING]
     history = state["contact"][g].astype(float)
-    on = history[:, 2] == ON_GEL
+    on = history[:, 2] == ANCHOR_ON_GEL
     history = history[on]
     x = ((state["position"].astype(float) - 1e3 * pose.position) @ se3.rotation_matrix(pose))[on]
     u = state["gel_displacement"][g][:, :, -1].astype(float)

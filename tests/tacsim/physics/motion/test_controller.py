@@ -10,11 +10,11 @@ from tacsim.models.scene import Settling
 from tacsim.physics.motion.controller import (
     ForceReading,
     Launch,
-    creep_to_come,
     move_and_settle,
+    remaining_body_creep,
+    remaining_contact_creep,
     residual,
-    run,
-    still_to_come,
+    run_motion,
 )
 from tacsim.physics.motion.path import Path
 from tacsim.physics.motion.tuning import FORECAST_READINGS
@@ -42,7 +42,7 @@ def test_what_creeps_is_held_until_little_is_left_of_it() -> None:
     while 20 times as much is still to come."""
     drags = (0.5 + 0.1 * 0.95**n for n in range(1000))
     path = Path([Pose()], [Pose()], 0, 0.4)
-    stats = run(
+    stats = run_motion(
         move_and_settle(path, Settling(max_substeps=100_000), balanced=False),
         lambda launch: [reading(next(drags))],
     )
@@ -53,8 +53,8 @@ def test_what_creeps_is_held_until_little_is_left_of_it() -> None:
 
 
 def test_what_swings_or_stands_has_nothing_still_to_come() -> None:
-    assert still_to_come(reading(0.5), reading(0.51), reading(0.505)) == 0.0
-    assert still_to_come(reading(0.5), reading(0.5), reading(0.5)) == 0.0
+    assert remaining_contact_creep(reading(0.5), reading(0.51), reading(0.505)) == 0.0
+    assert remaining_contact_creep(reading(0.5), reading(0.5), reading(0.5)) == 0.0
 
 
 def creeping(share: float, after: float) -> ForceReading:
@@ -63,26 +63,26 @@ def creeping(share: float, after: float) -> ForceReading:
 
 
 @pytest.mark.parametrize("before", [1, 40])
-def test_of_a_creep_with_the_logarithm_of_time_is_told_what_is_to_come(before: int) -> None:
+def test_remaining_creep_of_logarithmic_creep_is_estimated(before: int) -> None:
     """Whenever it began: the motion alone would have it 10 readings older than the hold."""
     held = [creeping(0.01, before + n) for n in range(1, 41)]
     lost = 0.01 * np.log1p(FORECAST_READINGS / (before + 40))
-    told = creep_to_come(held, 40 + (10 if before > 10 else 1))
+    told = remaining_body_creep(held, 40 + (10 if before > 10 else 1))
     assert 0.95 * lost < told < 1.25 * lost
 
 
 def test_a_creep_that_turns_is_as_old_as_the_motion() -> None:
     held = [reading(0.5 + 0.01 * change) for change in (0, 1, 0)]
-    assert creep_to_come(held, 20.0) == pytest.approx(0.01 * 20 * np.log1p(FORECAST_READINGS / 20))
+    assert remaining_body_creep(held, 20.0) == pytest.approx(0.01 * 20 * np.log1p(FORECAST_READINGS / 20))
 
 
 def test_a_body_that_swings_between_two_gels_does_not_creep() -> None:
     """What one gel feels more, the other feels less."""
     forces = [np.array([[0.0, 0.0, -1.0 + swing], [0.0, 0.0, 1.0 + swing]]) for swing in (0.0, 0.01, 0.015)]
     held = [ForceReading(force, force, 0.1, 0.0, 0) for force in forces]
-    assert creep_to_come(held, 20.0) == pytest.approx(0.0, abs=1e-12)
+    assert remaining_body_creep(held, 20.0) == pytest.approx(0.0, abs=1e-12)
     squeezed = [replace(each, contact=each.contact * [[1.0], [0.0]]) for each in held]
-    assert creep_to_come(squeezed, 20.0) > 0.01
+    assert remaining_body_creep(squeezed, 20.0) > 0.01
 
 
 def test_a_launch_gives_several_readings_where_it_can() -> None:
@@ -96,8 +96,10 @@ def test_a_launch_gives_several_readings_where_it_can() -> None:
             assert launch.last == launch.readings * launch.path.interval
             return [creeping(0.02, next(times)) for _ in range(launch.readings)]
 
-        path = replace(Path([Pose()], [Pose()], 0, 0.4, interval=4), creeps=True)
-        stats = run(move_and_settle(path, Settling(max_substeps=100_000), balanced=False, most=most), advance)
+        path = replace(Path([Pose()], [Pose()], 0, 0.4, interval=4), is_creeping=True)
+        stats = run_motion(
+            move_and_settle(path, Settling(max_substeps=100_000), balanced=False, max_readings=most), advance
+        )
         assert stats.settled and stats.hold == 4 * sum(asked)
         return stats.hold, asked
 
@@ -108,11 +110,11 @@ def test_a_launch_gives_several_readings_where_it_can() -> None:
 
 
 @pytest.mark.parametrize("creeps", [True, False])
-def test_what_creeps_with_the_logarithm_of_time_is_not_settled_before_its_time(creeps: bool) -> None:
+def test_logarithmic_creep_settles_only_below_tolerance(creeps: bool) -> None:
     """Each change is within the tolerance from the start, and so is what a geometric rest of them would be."""
-    path = replace(Path([Pose()], [Pose()], 0, 0.4), creeps=creeps)
+    path = replace(Path([Pose()], [Pose()], 0, 0.4), is_creeping=creeps)
     times = iter(range(8, 1000))
-    stats = run(
+    stats = run_motion(
         move_and_settle(path, Settling(max_substeps=100_000), balanced=False),
         lambda launch: [creeping(0.01, next(times))],
     )

@@ -75,7 +75,7 @@ def test_the_period_of_a_gel_converges_at_second_order_in_element_and_step() -> 
     assert errors[0] < 0.01
 
 
-def test_a_body_bounces_off_a_gel_with_the_momentum_that_the_gel_felt() -> None:
+def test_bounced_body_has_momentum_measured_by_gel() -> None:
     """Thrown at the lower gel, an elastic cube comes back; what it gained is the impulse of the contact force, and in
     the air it loses none of it."""
     world = HybridWorld(Scene(body=CUBE, gel=GEL))

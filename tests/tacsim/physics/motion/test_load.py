@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from tacsim.interface import Pose
 from tacsim.models.material import BodyMaterial
 from tacsim.models.scene import Body, Box, Cylinder, Gel, Indenter, Scene, Sphere
-from tacsim.physics.motion.controller import ForceReading, run
-from tacsim.physics.motion.load import LoadNotReached, keep_loads
-from tacsim.physics.motion.path import Path, plan
+from tacsim.physics.motion.controller import ForceReading, run_motion
+from tacsim.physics.motion.load import LoadNotReached, move_at_constant_load
+from tacsim.physics.motion.path import Path, plan_path
 from tacsim.physics.motion.tuning import MIN_FORCE_SHARE
 from tacsim.physics.world import World, make_world
 from tacsim.physics.worlds.press import PressWorld
@@ -150,7 +150,7 @@ def test_a_load_on_a_sharp_edge_that_is_slid_has_not_settled() -> None:
     assert world.move({}, loads={"lower": 0.7}).settled
     assert world.move(by(world, "indenter", (0.4e-3, 0.0, 0.0)), loads={"lower": 0.7}).settled
     assert not world.move(by(world, "indenter", (0.4e-3, 0.0, 0.0)), loads={"lower": 0.7}).settled
-    assert "catches" in world.unfollowed
+    assert "catches" in world.unsettled_reason
 
 
 def test_a_load_out_of_reach_is_an_error_and_nothing_has_moved() -> None:
@@ -185,11 +185,11 @@ def test_the_sensor_that_went_too_far_is_named() -> None:
             return np.array([0.0, 0.0, -force, 0.0, 0.0, 0.0])
 
         def plan(self, start: Sequence[Pose], goal: Sequence[Pose]) -> Path:
-            return plan(start, goal, 0.03, 0.4, 10.0, 4.0)
+            return plan_path(start, goal, 0.03, 0.4, 10.0, 4.0)
 
-    motion = keep_loads(Stuck(), dict(end), end, {"lower": 0.4, "upper": 0.3}, 1, balanced=False)
+    motion = move_at_constant_load(Stuck(), dict(end), end, {"lower": 0.4, "upper": 0.3}, 1, balanced=False)
     with pytest.raises(LoadNotReached, match=r"'upper' does not reach a load of 0\.3 N: 0 N after \+2\.5 mm"):
-        run(motion, lambda launch: [rest])
+        run_motion(motion, lambda launch: [rest])
 
 
 def test_a_path_that_would_take_for_ever_is_refused_with_a_load_too() -> None:

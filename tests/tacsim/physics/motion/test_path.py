@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from tacsim.interface import Pose
-from tacsim.physics.motion.path import PEAK_SLOPE, Path, plan, plan_flow, ramp
+from tacsim.physics.motion.path import PEAK_SLOPE, Path, plan_flow, plan_path, ramp
 from tacsim.physics.motion.tuning import MAX_SUBSTEPS
 
 
@@ -33,7 +33,7 @@ def test_a_ramp_that_rises_as_long_as_it_falls_is_that_of_minimum_jerk() -> None
 def test_path_never_exceeds_its_mach_number_and_ends_on_target() -> None:
     start = Pose()
     end = Pose(np.array([0.3e-3, -0.2e-3, 1e-3]), Rotation.from_rotvec([0, 0, 0.2]).as_quat())
-    path = plan([start], [end], mach=0.05, dt=0.4, lever=10.0, thickness=4.0)
+    path = plan_path([start], [end], mach=0.05, dt=0.4, lever=10.0, thickness=4.0)
     drive = path.drive(0, path.substeps).astype(float)
     rim = np.linalg.norm(drive[:, 0, 4], axis=1) + 10.0 * np.linalg.norm(drive[:, 0, 5], axis=1)
     assert rim.max() <= 0.05 * 1.001
@@ -47,8 +47,8 @@ def test_short_ways_of_what_yields_brake_no_harder_than_long_ones() -> None:
 
     def braking(millimetres: float, yields: bool) -> float:
         end = Pose(np.array([0, 0, millimetres * 1e-3]))
-        path = plan(
-            [Pose()], [end], mach=0.05, dt=0.01, lever=10.0, thickness=4.0, remembered=millimetres if yields else 0.0
+        path = plan_path(
+            [Pose()], [end], mach=0.05, dt=0.01, lever=10.0, thickness=4.0, memory_length=millimetres if yields else 0.0
         )
         speed = path.drive(0, path.substeps)[:, 0, 4, 2].astype(float)
         assert speed.max() <= 0.05 * 1.001
@@ -64,8 +64,8 @@ def test_short_ways_of_what_yields_brake_no_harder_than_long_ones() -> None:
 def test_a_path_that_lingers_ends_as_if_it_were_driven_more_slowly(by: float) -> None:
     """Three times as slowly over the last 0.25 mm, from 0.5 mm on ever more so, and before that as it was."""
     start, end = [Pose()], [Pose(np.array([by * 1e-3, 0.0, 0.0]))]
-    usual = plan(start, end, mach=0.02, dt=0.02, lever=10.0, thickness=4.0)
-    path = plan(start, end, mach=0.02, dt=0.02, lever=10.0, thickness=4.0, slower=3.0, last=0.25)
+    usual = plan_path(start, end, mach=0.02, dt=0.02, lever=10.0, thickness=4.0)
+    path = plan_path(start, end, mach=0.02, dt=0.02, lever=10.0, thickness=4.0, end_slowdown=3.0, end_length=0.25)
 
     def drive(of: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Where it is, and how fast."""
@@ -85,21 +85,21 @@ def test_a_path_that_lingers_ends_as_if_it_were_driven_more_slowly(by: float) ->
 
 
 def test_refining_cuts_the_same_path_finer() -> None:
-    path = plan([Pose()], [Pose(np.array([0, 0, 1e-3]))], mach=0.05, dt=0.4, lever=10.0, thickness=4.0)
+    path = plan_path([Pose()], [Pose(np.array([0, 0, 1e-3]))], mach=0.05, dt=0.4, lever=10.0, thickness=4.0)
     coarse, fine = path.drive(5, 9), replace(path, refine=4).drive(5, 9)
     assert len(fine) == 16
     assert fine[3::4, 0, 3] == pytest.approx(coarse[:, 0, 3], abs=1e-6)
 
 
 def test_no_motion_needs_no_substeps() -> None:
-    assert plan([Pose()], [Pose()], mach=0.05, dt=0.4, lever=10.0, thickness=4.0).substeps == 0
+    assert plan_path([Pose()], [Pose()], mach=0.05, dt=0.4, lever=10.0, thickness=4.0).substeps == 0
 
 
 def test_the_shortest_motion_lets_the_gel_follow() -> None:
     """It takes twice as long as the gel's wave needs through it, however short its path."""
-    short = plan([Pose()], [Pose(np.array([0, 0, 1e-6]))], mach=0.05, dt=0.4, lever=10.0, thickness=4.0)
+    short = plan_path([Pose()], [Pose(np.array([0, 0, 1e-6]))], mach=0.05, dt=0.4, lever=10.0, thickness=4.0)
     assert short.substeps == 20
-    far = plan([Pose()], [Pose(np.array([0, 0, 1e-3]))], mach=0.05, dt=0.4, lever=10.0, thickness=4.0)
+    far = plan_path([Pose()], [Pose(np.array([0, 0, 1e-3]))], mach=0.05, dt=0.4, lever=10.0, thickness=4.0)
     assert far.substeps == 94
     assert short.rise == 0.5 and far.rise * far.substeps * far.dt == pytest.approx(4.0, rel=0.01)
 
@@ -115,7 +115,7 @@ def flow(to: float, before: float) -> NDArray[np.float64]:
 
 
 @pytest.mark.parametrize("to", [0.05, 0.2, 1.0])
-def test_a_step_that_flows_hardly_goes_beyond_its_target_whatever_comes_next(to: float) -> None:
+def test_flowing_step_has_small_overshoot_for_any_next_step(to: float) -> None:
     """Clay keeps what goes beyond. A cubic from mean speed to mean speed, told to stay, went a seventh beyond."""
     onward = flow(to, before=0.0)
     assert onward.max() <= to + 1e-6 and (np.diff(onward) >= 0).all()
@@ -131,8 +131,8 @@ def test_a_path_that_would_take_for_ever_is_refused() -> None:
     far = [Pose(np.array([0, 0, 500.0]))]
     words = r"500 m at Mach 0\.03 would take 7\.8e\+07 substeps \(limit 1,000,000\); are the targets in metres\?"
     with pytest.raises(ValueError, match=words):
-        plan([Pose()], far, mach=0.03, dt=0.4, lever=10.0, thickness=4.0)
+        plan_path([Pose()], far, mach=0.03, dt=0.4, lever=10.0, thickness=4.0)
     with pytest.raises(ValueError, match=r"500 m at Mach 0\.01 would take 1\.2e\+08 substeps"):
         plan_flow([Pose()], far, np.zeros((1, 6)), mach=0.01, dt=0.4, lever=10.0, thickness=4.0)
-    slow = plan([Pose()], [Pose(np.array([0, 0, 50e-3]))], mach=0.001, dt=0.125, lever=10.0, thickness=4.0)
+    slow = plan_path([Pose()], [Pose(np.array([0, 0, 50e-3]))], mach=0.001, dt=0.125, lever=10.0, thickness=4.0)
     assert 0.7 * MAX_SUBSTEPS < slow.substeps < MAX_SUBSTEPS

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from tacsim.physics.motion.slide import Slide, growth, pace, release, slower_walls, turn
+from tacsim.physics.motion.slide import Slide, growth_share, release_share, speed_share, turn_share, wall_slowdown
 
 
 @pytest.mark.parametrize(
@@ -15,8 +15,8 @@ from tacsim.physics.motion.slide import Slide, growth, pace, release, slower_wal
         ([0.0, 0.0, -1e-3], 0.0),
     ],
 )  # fmt: skip
-def test_what_is_pressed_in_on_its_way_grows(by: list[float], grows: float) -> None:
-    assert growth(np.array(by)) == pytest.approx(grows)
+def test_indentation_during_slide_gives_growth_share(by: list[float], grows: float) -> None:
+    assert growth_share(np.array(by)) == pytest.approx(grows)
 
 
 @pytest.mark.parametrize(
@@ -31,8 +31,8 @@ def test_what_is_pressed_in_on_its_way_grows(by: list[float], grows: float) -> N
         ([1e-3, 0.0, 0.0], [0.0, 0.0, 0.0], 0.0),  # nothing is touched
     ],
 )
-def test_a_way_across_the_drag_turns_it(by: list[float], force: list[float], turns: float) -> None:
-    assert turn(np.array(by), np.array(force), 0.6) == pytest.approx(turns)
+def test_slide_across_drag_gives_turn_share(by: list[float], force: list[float], turns: float) -> None:
+    assert turn_share(np.array(by), np.array(force), 0.6) == pytest.approx(turns)
 
 
 @pytest.mark.parametrize(
@@ -48,7 +48,7 @@ def test_a_way_across_the_drag_turns_it(by: list[float], force: list[float], tur
     ],
 )
 def test_what_is_lifted_with_its_drag_is_released(by: list[float], force: list[float], released: float) -> None:
-    assert release(np.array(by), np.array(force), 0.6) == pytest.approx(released)
+    assert release_share(np.array(by), np.array(force), 0.6) == pytest.approx(released)
 
 
 @pytest.mark.parametrize(
@@ -62,7 +62,7 @@ def test_what_is_lifted_with_its_drag_is_released(by: list[float], force: list[f
     ],
 )
 def test_pace(by: list[float], force: list[float], friction: float, share: float) -> None:
-    assert pace(np.array(by), np.array(force), friction) == pytest.approx(share)
+    assert speed_share(np.array(by), np.array(force), friction) == pytest.approx(share)
 
 
 @pytest.mark.parametrize(
@@ -78,14 +78,14 @@ def test_pace(by: list[float], force: list[float], friction: float, share: float
     ],
 )
 def test_walls_with_much_friction_end_a_slide_more_slowly(by: list[float], friction: float, slower: float) -> None:
-    assert slower_walls(np.array(by), friction, 1 / 9) == pytest.approx(slower)
+    assert wall_slowdown(np.array(by), friction, 1 / 9) == pytest.approx(slower)
 
 
 def slide(**changes: float) -> Slide:
     usual = {
         "length": 1.0,
-        "before": 0.0,
-        "away": 1.0,
+        "earlier_length": 0.0,
+        "end_distance": 1.0,
         "depth": 0.5,
         "shear_mach": 0.1,
         "friction": 0.6,
@@ -102,24 +102,24 @@ def slide(**changes: float) -> Slide:
         ({"edge_radius": 0.4}, "sharper than 0.5 mm catches"),
         ({"edge_radius": 0.4, "length": 0.5}, ""),
         (
-            {"edge_radius": 0.4, "length": 0.1, "before": 0.5},
+            {"edge_radius": 0.4, "length": 0.1, "earlier_length": 0.5},
             "sharper than 0.5 mm catches",
         ),  # one of several short ones
         ({"edge_radius": 0.4, "length": 0.0, "depth": 2.0, "friction": 2.0}, ""),
         ({"length": 2.1, "friction": 1.1, "depth": 0.0}, ""),  # lifted
         ({"length": 2.1}, ""),
-        ({"length": 2.1, "depth": 0.7}, "2 mm.*friction of 0.6 under what is deeper than 0.6 mm"),
-        ({"length": 0.1, "away": 2.1, "depth": 0.7}, "friction of 0.6"),  # one of many small ones
+        ({"length": 2.1, "depth": 0.7}, "2 mm.*friction of 0.6 and a depth of more than 0.6 mm"),
+        ({"length": 0.1, "end_distance": 2.1, "depth": 0.7}, "friction of 0.6"),  # one of many small ones
         ({"length": 2.1, "depth": 0.7, "edge_radius": math.inf}, ""),
-        ({"length": 2.1, "depth": 1.1, "edge_radius": math.inf}, "deeper than 1 mm"),
+        ({"length": 2.1, "depth": 1.1, "edge_radius": math.inf}, "a depth of more than 1 mm"),
         ({"length": 2.1, "friction": 1.1}, "friction above 1"),
         ({"length": 1.9, "friction": 1.1}, ""),
         ({"length": 1.9, "friction": 1.1, "depth": 0.7}, "1.6 mm.*friction above 1"),
     ],
 )
-def test_which_slides_are_not_followed(changes: dict[str, float], words: str) -> None:
+def test_slide_beyond_limits_gives_reason(changes: dict[str, float], words: str) -> None:
     """Elements of 1 mm, a gel 4 mm thick."""
-    said = slide(**changes).unfollowed(1.0, 4.0)
+    said = slide(**changes).unsettled_reason(1.0, 4.0)
     assert bool(said) == bool(words)
     if words:
         with pytest.raises(AssertionError, match=words):

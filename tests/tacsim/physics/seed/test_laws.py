@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from benchmarks.truth import laws
-from tacsim.compute.runtime import start, ti
+from tacsim.compute.runtime import start_taichi, ti
 from tacsim.models.material import BodyMaterial, GelMaterial
 from tacsim.physics.seed import kernels
 from tacsim.physics.seed.kernels import Matrices, Solid
-from tacsim.physics.seed.world import solid
+from tacsim.physics.seed.world import solid_of_material
 
 pytestmark = pytest.mark.cpu
 
@@ -57,17 +57,17 @@ def turn(seed: int) -> np.ndarray:
 
 def mapped(trial: np.ndarray, material: BodyMaterial) -> tuple[np.ndarray, np.ndarray]:
     """Elastic F and Kirchhoff stress [MPa]."""
-    start()
+    start_taichi()
     f, tau = trial.astype(np.float32), np.zeros(trial.shape, np.float32)
-    map_back(f, tau, solid(material, 1.0))
+    map_back(f, tau, solid_of_material(material, 1.0))
     return f.astype(float), tau.astype(float)
 
 
 def pressed(f: np.ndarray) -> np.ndarray:
     """Stress of the gel [MPa]."""
-    start()
+    start_taichi()
     tau = np.zeros(f.shape, np.float32)
-    gel_stress(f.astype(np.float32), tau, solid(GelMaterial(), 1.0))
+    gel_stress(f.astype(np.float32), tau, solid_of_material(GelMaterial(), 1.0))
     return tau.astype(float)
 
 
@@ -87,11 +87,11 @@ def size_of(tau: np.ndarray) -> float:
 
 
 def test_return_mapping_is_that_of_a_float64_svd() -> None:
-    start()
+    start_taichi()
     rng, n = np.random.default_rng(0), 2000
     u, v = (Rotation.random(n, random_state=seed_).as_matrix() for seed_ in (1, 2))
     trial = (u * np.exp(rng.normal(size=(n, 1, 3)) * rng.choice([1e-3, 0.02, 0.1, 0.4], (n, 1, 1)))) @ v
-    law = solid(CLAY, 1.0)
+    law = solid_of_material(CLAY, 1.0)
     f, tau = trial.astype(np.float32), np.zeros((n, 3, 3), np.float32)
     map_back(f, tau, law)
 
@@ -115,7 +115,7 @@ def test_return_mapping_is_that_of_a_float64_svd() -> None:
 
 @some
 @given(seed=SEEDS, size=SIZES, limit=LIMITS)
-def test_the_body_does_not_feel_how_space_is_turned(seed: int, size: float, limit: float) -> None:
+def test_body_law_is_invariant_under_rotation(seed: int, size: float, limit: float) -> None:
     """Objective: F -> Q F turns the stress, and the elastic F with it."""
     f, q = random_f(20, size, seed), turn(seed)
     elastic, tau = mapped(f, clay(limit))
@@ -145,7 +145,7 @@ def test_the_return_lands_on_the_yield_surface_keeps_volume_and_dissipates(
     """|dev tau| = 2 mu limit where it yields; tau : d = |dev tau| times the flow, never negative."""
     f = random_f(20, size, seed)
     elastic, tau = mapped(f, clay(limit))
-    mu = solid(CLAY, 1.0).mu
+    mu = solid_of_material(CLAY, 1.0).mu
     before, norm = strain(f), np.linalg.norm(deviator(strain(f)), axis=(1, 2))
     resolution = 3e-6  # of float32, of a strain
     yields, rests = norm > limit + 2 * resolution, norm < limit - 2 * resolution
@@ -162,7 +162,7 @@ def test_the_return_lands_on_the_yield_surface_keeps_volume_and_dissipates(
 def test_a_body_that_never_yields_runs_no_return_mapping() -> None:
     """Without singular values, whose logarithm has lost them, stresses of tiny strains keep their digits."""
     f = np.eye(3) + np.random.default_rng(0).uniform(-1e-5, 1e-5, (200, 3, 3))
-    never, law = BodyMaterial(), solid(BodyMaterial(), 1.0)
+    never, law = BodyMaterial(), solid_of_material(BodyMaterial(), 1.0)
     held = f.astype(np.float32).astype(float)
     e = strain(held)
     truth = 2 * law.mu * e + law.lam * np.trace(e, axis1=1, axis2=2)[:, None, None] * np.eye(3)
@@ -174,7 +174,7 @@ def test_a_body_that_never_yields_runs_no_return_mapping() -> None:
 
 
 @pytest.mark.parametrize("size", [1e-3, 0.1, 0.2, 0.3, 1.0])
-def test_a_body_that_never_yields_answers_like_one_that_never_reaches_it(size: float) -> None:
+def test_unyielding_body_equals_body_below_its_yield_stress(size: float) -> None:
     f = random_f(500, size, 0)
     elastic, tau = mapped(f, BodyMaterial())
     same, truth = mapped(f, HARDLY)
@@ -186,7 +186,7 @@ def test_a_body_that_never_yields_answers_like_one_that_never_reaches_it(size: f
 @given(seed=SEEDS, size=SIZES)
 def test_the_gel_is_neo_hookean_objective_and_isotropic(seed: int, size: float) -> None:
     """tau = P F^T with the first Piola-Kirchhoff stress of the other world's gel."""
-    f, q, law = random_f(20, size, seed), turn(seed), solid(GelMaterial(), 1.0)
+    f, q, law = random_f(20, size, seed), turn(seed), solid_of_material(GelMaterial(), 1.0)
     tau = pressed(f)
     truth = laws.neo_hookean(f, law.mu, law.lam) @ f.swapaxes(1, 2)
     tolerance = 2e-5 * size_of(truth)
@@ -197,7 +197,7 @@ def test_the_gel_is_neo_hookean_objective_and_isotropic(seed: int, size: float) 
 
 def test_the_gel_has_an_energy() -> None:
     """P = dW/dF of W = mu/2 (|F|^2 - 3) - mu ln J + lambda/2 (ln J)^2: work on a closed way comes back."""
-    law, step = solid(GelMaterial(), 1.0), 1e-6
+    law, step = solid_of_material(GelMaterial(), 1.0), 1e-6
     f = random_f(20, 0.2, 1)
     ways = np.random.default_rng(2).normal(size=f.shape)
 

@@ -97,7 +97,7 @@ def test_it_does_not_matter_which_sensor_moves():
     assert np.ptp(forces) < 0.05 * abs(np.mean(forces))
 
 
-def test_a_squeezed_body_bears_its_uniaxial_yield_stress(pressed):
+def test_squeezed_body_reaches_uniaxial_yield_stress(pressed):
     area = 4e-3**3 / pressed.truth().height  # plastic flow keeps the volume
     # a coarse grid bears too little: 0.77, 0.87, 0.96 of the plateau at cells of 1, 0.5, 0.25 mm
     assert 0.7 < -pressed.wrench("lower")[2] / area / CLAY.yield_stress < 1.0

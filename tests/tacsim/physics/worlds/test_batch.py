@@ -140,7 +140,7 @@ def test_one_that_is_replaced_is_a_new_world_to_the_bit() -> None:
         batch.replace(0, Scene(body=None, indenter=Indenter(), gel=GEL))
 
 
-def test_nobody_moves(fresh: Batch) -> None:
+def test_batch_without_targets_changes_nothing(fresh: Batch) -> None:
     before = [state(world) for world in fresh.worlds]
     assert fresh.move([None] * 3) == [None] * 3
     assert [state(world) for world in fresh.worlds] == before
@@ -182,7 +182,7 @@ def test_one_that_diverges_is_taken_back_while_others_go_on(
         assert state(fresh.worlds[1]) == before
 
 
-def test_a_state_broken_before_is_told_in_its_place(fresh: Batch) -> None:
+def test_state_with_nan_fails_in_its_environment_only(fresh: Batch) -> None:
     fresh.worlds[2].arrays()["position"][0] = np.nan
     ends = fresh.move([closed(fresh.worlds[0], 0.3e-3), None, STAY])
     assert isinstance(ends[0], MoveStats)
@@ -191,14 +191,16 @@ def test_a_state_broken_before_is_told_in_its_place(fresh: Batch) -> None:
 
 @pytest.mark.cpu
 def test_a_body_far_away_enlarges_no_array_but_the_grid(fresh: Batch) -> None:
-    arrays = fresh._state.particles.rows, fresh._state.contact_history, fresh._state.gels.alike.nodes
+    arrays = fresh._state.particles.rows, fresh._state.contact_history, fresh._state.gels.common_group.nodes
     nodes = fresh._state.particles.masses.shape[2]
     for place in ("position", "reference"):
         fresh.worlds[0].arrays()[place][-1] += [0.0, 60.0, 0.0]
     stats = fresh.move([STAY, closed(fresh.worlds[1], 0.4e-3), None])[1]
     assert fresh._state.particles.masses.shape[2] > nodes
     assert all(a is b for a, b in zip(
-        arrays, (fresh._state.particles.rows, fresh._state.contact_history, fresh._state.gels.alike.nodes), strict=True
+        arrays,
+        (fresh._state.particles.rows, fresh._state.contact_history, fresh._state.gels.common_group.nodes),
+        strict=True,
     ))  # fmt: skip
     alone = HybridWorld(SCENES[1])
     assert alone.move(closed(alone, 0.4e-3)) == stats
@@ -220,10 +222,10 @@ def out_of_room(ends: Sequence[Any], batch: Batch, before: list[dict[str, bytes]
 
 
 @pytest.mark.cpu
-def test_one_that_needs_more_grid_than_its_share_is_told_alone() -> None:
+def test_grid_above_share_fails_in_its_environment_only() -> None:
     """Its grid would be allowed in a world of its own; of four, in four copies, kernels could not count the nodes."""
     batch = Batch(SCENES[:1] * 4)
-    most = batch._state.particles.most
+    most = batch._state.particles.max_grid_nodes
     assert most < MAX_GRID_NODES and 4 * COPIES * 4 * most <= MAX_NUMBERS
     way = (most ** (1 / 3) - 9) * 2 * SCENES[0].spacing * 1e3  # [mm]; body and borders are another 17 cells
     for place in ("position", "reference"):
@@ -235,7 +237,7 @@ def test_one_that_needs_more_grid_than_its_share_is_told_alone() -> None:
 
 
 @pytest.mark.cpu
-def test_one_for_whose_grid_there_is_no_memory_is_told_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_grid_without_memory_fails_in_its_environment_only(monkeypatch: pytest.MonkeyPatch) -> None:
     batch = Batch(SCENES[:1] * 4)
     zeros = plasticine.aligned_zeros
 
@@ -249,14 +251,14 @@ def test_one_for_whose_grid_there_is_no_memory_is_told_alone(monkeypatch: pytest
         batch.worlds[2].arrays()[place][-1] += [0.0, 400.0, 0.0]
     before = [state(world) for world in batch.worlds]
     failure = out_of_room(batch.move([closed(world, 0.3e-3) for world in batch.worlds]), batch, before, 2)
-    assert "no memory for the grid round the particles (Unable to allocate)" in str(failure)
+    assert "no memory for the grid around the particles (Unable to allocate)" in str(failure)
     grid = batch._state.particles
     assert grid.masses.shape[2] == grid.velocities.shape[1]
 
 
 @pytest.mark.cpu
 @pytest.mark.parametrize("lacks", ["nodes", "memory"])
-def test_one_whose_mesh_needs_too_much_is_told_alone(
+def test_mesh_without_memory_fails_in_its_environment_only(
     lacks: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     import trimesh
@@ -283,14 +285,14 @@ def test_one_whose_mesh_needs_too_much_is_told_alone(
     ]
     failure, stats = batch.move(down[:2])
     assert isinstance(failure, SimulationDiverged) and failure.refine == 1  # no smaller step would help
-    assert words in str(failure) and "of a smaller batch have more room" in str(failure)
+    assert words in str(failure) and "in a smaller batch each world has more memory" in str(failure)
     assert state(batch.worlds[0]) == before
     assert np.array_equal(batch._state.counts[0], counts[0]) and np.array_equal(batch._state.params[0], params[0])
     assert stats == alone.move(down[2])
     assert_same([batch.worlds[1]], [alone])
 
 
-def test_loads_are_held_each_its_own_and_one_out_of_reach_is_told(fresh: Batch) -> None:
+def test_loads_are_held_per_environment_and_unreachable_one_is_reported(fresh: Batch) -> None:
     fresh.move([closed(world, 0.3e-3) for world in fresh.worlds])
     before = state(fresh.worlds[2])
     ends = fresh.move([STAY, None, STAY], [{"upper": 0.05}, None, {"upper": 1e6}])
@@ -300,7 +302,7 @@ def test_loads_are_held_each_its_own_and_one_out_of_reach_is_told(fresh: Batch) 
     assert state(fresh.worlds[2]) == before
 
 
-def test_an_interruption_takes_back_who_is_on_the_way(fresh: Batch, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_interruption_restores_moving_worlds(fresh: Batch, monkeypatch: pytest.MonkeyPatch) -> None:
     before = [state(world) for world in fresh.worlds]
     launches, advance = 0, type(fresh._state).advance
 

@@ -62,7 +62,7 @@ def test_flowing_to_and_fro_writes_nothing_into_the_body(along: tuple[float, flo
     assert after.min() > 0.96 and after.max() < 1.02
 
 
-def test_a_body_under_more_tension_than_it_can_bear_is_told() -> None:
+def test_tension_above_limit_counts_as_guard_hit() -> None:
     """Nothing pulls at a squeezed body: volume ratios far above 1 are strains that no node of the grid feels, as here,
     where neighbours differ in turn."""
     world = HybridWorld(Scene(body=CUBE))
@@ -97,7 +97,7 @@ def test_tension_that_a_squeeze_has_left_is_not_counted_again() -> None:
     assert opened.guard_hits == 0 and opened.largest_volume > 1.01
 
 
-def test_fewer_layers_of_particles_than_forces_need_are_told_once(caplog: pytest.LogCaptureFixture) -> None:
+def test_too_few_particle_layers_are_reported_once(caplog: pytest.LogCaptureFixture) -> None:
     """Over the mean height at the end, which is below that of the corners that stand up between soft gels."""
     warn_of_few_layers.cache_clear()
     body = Body(geometry=Box(size=(7e-3, 7e-3, 7e-3)), material=BodyMaterial(yield_stress=5e3))

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tacsim.compute.runtime import available
+from tacsim.compute.runtime import is_available
 from tacsim.interface import Pose
 from tacsim.models.material import BodyMaterial
 from tacsim.models.scene import Body, Box, Gel, Indenter, Mesh, Scene, Shape, Sphere
@@ -101,7 +101,7 @@ def all_outcomes(folder: Path) -> dict[str, Any]:
     interrupted.move(closer(interrupted, 0.05e-3))
     here = interrupted.snapshot()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(DeviceArrays, "look", lambda self, name: (_ for _ in ()).throw(KeyboardInterrupt))
+        patch.setattr(DeviceArrays, "download_copy", lambda self, name: (_ for _ in ()).throw(KeyboardInterrupt))
         with contextlib.suppress(KeyboardInterrupt):
             interrupted.move(closer(interrupted, 0.1e-3))  # on a device its launch ends, and is never brought back
     interrupted.restore(here)
@@ -128,7 +128,7 @@ def all_outcomes(folder: Path) -> dict[str, Any]:
     for name, array, entry, value in (("race", "velocity", (-1, 2), 20.0), ("invert", "gel_displacement", last, -6.0)):
         before = first.snapshot()
         first.arrays()[array][entry] += value
-        first._state.particles.forget_grid(0)  # so that what particles know counts
+        first._state.particles.drop_grid_velocities(0)  # so that what particles know counts
         here = list(first._poses.values())
         prepared = first.prepare(Launch(first.plan(here, here), 0, 1))
         first._state.advance({0: prepared.drive})
@@ -183,11 +183,11 @@ def run(device: str, out: Path) -> dict[str, Any]:
 def device_here() -> str:
     """CUDA or Vulkan, if Taichi really works there: a driver alone does not make a device. Else the processor."""
     code = (
-        "from tacsim.compute.runtime import start, ti; start(); "
+        "from tacsim.compute.runtime import start_taichi, ti; start_taichi(); "
         "a = ti.ndarray(ti.f32, 4); a.fill(2.0); print(a.to_numpy())"
     )
     for device in ("cuda", "vulkan"):
-        if available(device):
+        if is_available(device):
             done = subprocess.run(
                 [sys.executable, "-c", code], env={**os.environ, "TACSIM_DEVICE": device}, capture_output=True,
                 text=True, timeout=SECONDS, check=False,
@@ -206,7 +206,7 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], dict
 
 @pytest.mark.deep
 @pytest.mark.timeout(3 * SECONDS)
-def test_both_go_the_same_way(pair: tuple[dict[str, Any], dict[str, Any]]) -> None:
+def test_device_and_cpu_follow_same_motion(pair: tuple[dict[str, Any], dict[str, Any]]) -> None:
     cpu, there = pair
     assert cpu.keys() == there.keys()
     for name in ("press", "interrupted", "mesh", "one", "other", "unlike"):
@@ -253,7 +253,7 @@ def test_environments_of_a_batch_return_the_same(pair: tuple[dict[str, Any], dic
 
 @pytest.mark.deep
 @pytest.mark.timeout(3 * SECONDS)
-def test_what_is_unphysical_is_seen(pair: tuple[dict[str, Any], dict[str, Any]]) -> None:
+def test_unphysical_state_is_detected_on_device(pair: tuple[dict[str, Any], dict[str, Any]]) -> None:
     for found in pair:
         assert str(found["race.words"]).startswith("a particle moves at")
         assert str(found["invert.words"]).startswith("a gel element is inverted or crushed")
@@ -261,9 +261,9 @@ def test_what_is_unphysical_is_seen(pair: tuple[dict[str, Any], dict[str, Any]])
 
 SENT = """
 import numpy as np
-from tacsim.compute.runtime import start, ti
+from tacsim.compute.runtime import start_taichi, ti
 from tacsim.physics.exec.device_arrays import DeviceArrays
-start()
+start_taichi()
 arrays, host = DeviceArrays(), np.ones((2, 3), np.float32)
 for version in (0, 0, 1):
     print(arrays.upload_if_changed("values", host, ti.f32, version).to_numpy().max())
@@ -279,12 +279,12 @@ host[0, 0] = np.nan
 print(np.isnan(arrays.upload("state", host, ti.f32).to_numpy()).sum())
 there.fill(9.0)
 print(arrays.upload("state", host, ti.f32).to_numpy().max())
-arrays.forget("state")
+arrays.invalidate("state")
 print(arrays.upload("state", host, ti.f32).to_numpy()[1, 2])
 """
 
 
-def test_only_what_has_changed_is_sent() -> None:
+def test_only_changed_arrays_are_sent_to_device() -> None:
     done = subprocess.run([sys.executable, "-c", SENT], capture_output=True, text=True, timeout=SECONDS, check=True)
     words = done.stdout.split("\n")
     assert words[:4] == ["1.0", "1.0", "3.0", "(4, 3)"]  # by version
@@ -305,7 +305,7 @@ WORLD = (
         ("vulkan", WORLD.format("seed"), "RuntimeError: physics 'seed' runs on the CPU only"),
         pytest.param(
             "cuda", WORLD.format("hybrid"), "RuntimeError: TACSIM_DEVICE is 'cuda', but Taichi finds no such device",
-            marks=pytest.mark.skipif(available("cuda"), reason="there is a CUDA device"),
+            marks=pytest.mark.skipif(is_available("cuda"), reason="there is a CUDA device"),
         ),
     ],
 )  # fmt: skip

@@ -19,7 +19,7 @@ from tacsim.interface import Pose
 from tacsim.models.material import BodyMaterial
 from tacsim.models.scene import Body, Box, Gel, Indenter, Scene, Sphere
 from tacsim.physics.body.moments import moments_of
-from tacsim.physics.contact.gel_overlap import box_round
+from tacsim.physics.contact.gel_overlap import displacement_bounds
 from tacsim.physics.failure import diagnosis
 from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.physics.motion.tuning import SUBSTEPS_PER_LAUNCH
@@ -82,21 +82,21 @@ def compared(world: FemWorld) -> dict[str, float]:
     gels, index = world._state.gels, world._index
     displacements = gel_arrays(world.arrays(), "gel_displacement").items()
     corners = [diagnosis.corner_volumes(u, world._gels[g].thickness).min() for g, u in displacements]
-    shortest, tops = gels.shortest(index), gels.tops(index)
-    seen_shortest = seen.shortest if len(shortest) == len(tops) else [min(seen.shortest)]
+    shortest, tops = gels.min_edge_length(index), gels.surface_displacements(index)
+    seen_shortest = seen.min_edge_length if len(shortest) == len(tops) else [min(seen.min_edge_length)]
     found = {
         "shortest": largest(seen_shortest, shortest),
         "corner": largest(seen.smallest_corner, min(corners)),
-        "tops": largest(seen.tops[: len(world.sensors)], [box_round(top) for top in tops]),
-        "surface": max(largest(*pair) for pair in zip(world._state.tops(index), tops, strict=True)),
+        "tops": largest(seen.surface_bounds[: len(world.sensors)], [displacement_bounds(top) for top in tops]),
+        "surface": max(largest(*pair) for pair in zip(world._state.surface_displacements(index), tops, strict=True)),
     }
     if isinstance(world._state, HybridState):
         particles, seen_moments = world._state.particles, seen.moments
         moments = moments_of(particles, index)
         found["extents"] = largest(seen.extents, particles.extents(index))
-        for name in ("centre", "reference_centre", "second", "reference_second", "moved"):
+        for name in ("centre", "reference_centre", "second", "reference_second", "cross_moments"):
             found[name] = largest(getattr(seen_moments, name), getattr(moments, name))
-        x, planes = world._state.outside(index)
+        x, planes = world._state.positions_and_planes(index)
         found["outside"] = max(largest(x, particles.x(index)), largest(planes, particles.plane(index)))
     return found
 
@@ -107,7 +107,7 @@ def verdicts(world: FemWorld) -> dict[str, tuple[bool, bool]]:
     def verdict() -> tuple[bool, bool]:
         seen = world._survey()
         assert seen is not None
-        return seen.finite, seen.sound
+        return seen.finite, seen.is_healthy
 
     before, found = world.snapshot(), {"well": verdict()}
     for name in world.arrays():
@@ -136,9 +136,9 @@ def copied(world: FemWorld) -> dict[str, Any]:
     found: dict[str, Any] = {}
 
     def spend(name: str, work: Any) -> Any:
-        before = device.arrays.sent, device.arrays.brought
+        before = device.arrays.sent_bytes, device.arrays.received_bytes
         result = work()
-        found[name] = device.arrays.sent - before[0], device.arrays.brought - before[1]
+        found[name] = device.arrays.sent_bytes - before[0], device.arrays.received_bytes - before[1]
         return result
 
     spend("first", lambda: world.move(closer(world, 0.2e-3)))
@@ -200,7 +200,7 @@ def everything() -> dict[str, Any]:
     }
 
 
-def test_neighbours_are_kept_together() -> None:
+def test_consecutive_environments_are_stored_together() -> None:
     assert runs_of([]) == []
     assert runs_of([0, 1, 2, 5, 7, 8]) == [(0, 3), (5, 6), (7, 9)]
 
@@ -259,7 +259,7 @@ def test_state_stays_on_the_device_until_somebody_asks_for_it(found: Any) -> Non
 
 @pytest.mark.deep
 @pytest.mark.timeout(2 * SECONDS)
-def test_a_motion_that_fails_returns_to_what_was_kept_on_the_device(found: Any) -> None:
+def test_failed_motion_restores_state_stored_on_device(found: Any) -> None:
     failed = found["failed"]
     assert failed["same"] is True and failed["substeps"] > 0
     assert {"gel_displacement", "position"} <= set(failed["differ"])

@@ -98,7 +98,7 @@ def test_a_blade_that_sinks_between_the_contact_points_in_part_is_an_error(tmp_p
 
 
 @pytest.mark.parametrize("long", [11.0, 30.0])
-def test_a_blade_that_ends_at_the_gels_rim_or_beside_it_is_an_error_too(long: float, tmp_path: Path) -> None:
+def test_blade_at_or_outside_gel_rim_is_error(long: float, tmp_path: Path) -> None:
     """A wedge of 33 degrees, 1 mm deep: elements of 1 mm give 55 % of its force with elements of 0.25 mm."""
     import trimesh
 
@@ -119,7 +119,7 @@ def test_what_is_flat_and_wider_than_the_gel_is_none(size: tuple[float, float, f
     deep(Mesh(path=str(tmp_path / "bar.stl")), "draft", Rotation.identity(), 1e-3)
 
 
-def test_a_turned_knife_of_which_the_gel_feels_less_than_three_quarters_is_an_error() -> None:
+def test_rotated_knife_with_less_than_three_quarters_depth_at_contact_points_is_error() -> None:
     """Across the mesh, 1.5 mm deep, its force is 0.34 N; with elements of 0.25 mm it is 0.58 N."""
     w = world(Box(size=(0.3e-3, 6e-3, 5e-3)), preset="standard", gel=Gel(size=(12e-3, 12e-3, 4e-3)), tolerance=1e-2)
     turn = Rotation.from_euler("z", 30, degrees=True).as_quat()

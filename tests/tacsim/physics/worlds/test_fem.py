@@ -113,7 +113,7 @@ def test_random_steps_that_flow_end_near_their_slow_limit() -> None:
     assert np.sqrt(np.mean(off**2)) < 0.025
 
 
-def test_what_flows_comes_to_rest_once_nothing_is_asked_any_more() -> None:
+def test_flowing_motion_comes_to_rest_without_further_targets() -> None:
     world, settled = PressWorld(BALL), PressWorld(BALL)
     for _ in range(5):
         world.move(nearer(world), flow=True)
@@ -144,7 +144,7 @@ def test_other_motions_first_bring_it_to_rest() -> None:
         assert not world.snapshot()["rates"].any()
 
 
-def test_a_way_without_end_is_refused_before_what_flows_is_stopped() -> None:
+def test_too_long_path_is_refused_before_flow_is_stopped() -> None:
     """Else a batch would be on its way by then, and all of it be lost."""
     batch = Batch([BALL, BALL])
     first, second = batch.worlds
@@ -157,7 +157,7 @@ def test_a_way_without_end_is_refused_before_what_flows_is_stopped() -> None:
 
 
 @pytest.mark.cpu
-def test_a_snapshot_on_the_way_goes_on_to_the_same_bits() -> None:
+def test_restored_flowing_snapshot_continues_with_same_bits() -> None:
     world = squeezed()
     for _ in range(2):
         world.move(nearer(world), flow=True)
@@ -206,7 +206,7 @@ def test_a_step_that_diverges_is_taken_back_with_its_speed_and_dumped(
         world.move(nearer(world, 7e-3), flow=True)
     assert {name: a.tobytes() for name, a in world.snapshot().items()} == before
     assert failure.value.dump is not None
-    found = dump.read(failure.value.dump)
+    found = dump.read_dump(failure.value.dump)
     assert found.command.flow
     again, outcome = replay(found, open_world(found))
     assert again is not None and again.cause == failure.value.cause

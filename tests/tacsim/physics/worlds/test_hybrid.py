@@ -135,7 +135,7 @@ def test_a_twisted_body_turns_as_far_as_in_the_slow_limit_and_soon_rests() -> No
     assert angle == pytest.approx(7.3, rel=0.06)
 
 
-def test_a_twist_rests_only_once_both_sensors_feel_the_same_torque() -> None:
+def test_twist_settles_when_both_sensors_have_same_torque() -> None:
     w = world()
     squeeze(w, 1.0e-3)
     turned = Rotation.from_rotvec([0, 0, np.radians(15)]) * Rotation.from_quat(w.pose("upper").quaternion)
@@ -162,13 +162,13 @@ def test_squeezing_is_symmetric(squeezed: HybridWorld) -> None:
     assert np.abs(truth.position[:2]).max() < 1e-6
 
 
-def test_a_body_without_yield_answers_like_one_that_never_reaches_it() -> None:
+def test_body_without_yield_equals_body_below_its_yield_stress() -> None:
     """The first runs no return mapping, the second does."""
     states, forces = [], []
     for material in (BodyMaterial(), BodyMaterial(yield_stress=1e12)):
         w = world(CUBE.model_copy(update={"material": material}))
         w.yields = True  # else the first is driven faster, and damped more while it is held
-        w._scaled = w._inertias.scaled(5.0, yields=True)
+        w._scaled = w._inertias.scaled_inertia(5.0, yields=True)
         w._use_inertia(w._scaled)
         squeeze(w, 1.0e-3)
         states.append(w.snapshot())
@@ -363,7 +363,7 @@ def beside_the_gel(w: HybridWorld, name: str) -> np.ndarray:
     return (local[:, 2] - radius)[(np.abs(local[:, :2]) > 5.0).any(axis=1)]
 
 
-def test_beside_a_gel_its_housing_carries_the_body() -> None:
+def test_housing_supports_body_outside_gel() -> None:
     housed, free = over_the_rim(0.1e-3), over_the_rim(None)
     forces = housing_forces(housed)
     assert (forces > 0.05 * -housed.wrench("lower")[2]).all() and not housing_forces(free).any()
@@ -373,7 +373,7 @@ def test_beside_a_gel_its_housing_carries_the_body() -> None:
         assert -housed.wrench(name)[2] > 1.2 * -free.wrench(name)[2]
 
 
-def test_gels_in_one_another_are_told_and_too_deep_refused() -> None:
+def test_gel_overlap_is_reported_and_refused_above_limit() -> None:
     """They do not feel each other. Here they meet round a body thinner than what they give."""
     w = world(Body(geometry=Box(size=(2e-3, 2e-3, 1.5e-3)), material=CLAY))
     squeeze(w, 0.4e-3)
@@ -385,7 +385,7 @@ def test_gels_in_one_another_are_told_and_too_deep_refused() -> None:
     assert met.settled and 0.09e-3 < met.gel_overlap < 0.2e-3 and met.guard_hits > 0
     w.restore(before)
     with pytest.raises(
-        SimulationDiverged, match=r"gels lie 1\.[01]\d* mm inside one another.*further apart"
+        SimulationDiverged, match=r"gels overlap by 1\.[01]\d* mm; there is no contact.*further apart"
     ) as refused:
         w.move(shift(w, "upper", (0, 0, -gap - 1.6e-3)))
     assert refused.value.refine == 1  # no smaller step would help

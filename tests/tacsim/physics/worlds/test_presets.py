@@ -18,7 +18,7 @@ FORCES, HEIGHTS = (2.054, 2.799, 3.137), (9.548e-3, 8.729e-3, 7.789e-3)  # [N], 
 
 
 @pytest.mark.parametrize(("preset", "most"), [("learn", 0.20), ("draft", 0.06)])
-def test_a_squeezed_cylinder_is_as_near_as_the_preset_says(preset: str, most: float) -> None:
+def test_squeezed_cylinder_is_within_error_of_preset(preset: str, most: float) -> None:
     shape = "body.geometry={shape: cylinder, radius: 5 mm, height: 10 mm}"
     world = make_world(load_scene("squeeze", [f"preset={preset}", shape]))
     for by, force, height in zip(CLOSED, FORCES, HEIGHTS, strict=True):

@@ -261,7 +261,7 @@ def test_what_is_lifted_in_steps_after_a_slide_keeps_its_drag() -> None:
         assert abs(force[0] / force[2]) / 0.5 == pytest.approx(drag, abs=0.02)
 
 
-def test_an_edge_that_catches_is_told_after_a_slide_to_and_fro() -> None:
+def test_catching_edge_is_reported_after_reversed_slide() -> None:
     """It never comes far from where it touched, but each slide moves the points that hang on it."""
     w = world(Box(size=(5e-3, 5e-3, 4e-3)), 0.6, 1e-2, preset="draft", gel=Gel(), edge_radius=0.0)
     move(w, (0, 0, -0.4e-3))
@@ -280,7 +280,7 @@ def test_many_small_slides_that_come_as_far_have_not_settled_either() -> None:
     w = pressed_ball(1.1, "draft")
     for settled in (True, True, True, False):
         stats = w.move({"indenter": Pose(w.pose("indenter").position + [0.6e-3, 0, 0])})
-        assert stats.settled == settled and bool(w.unfollowed) != settled
+        assert stats.settled == settled and bool(w.unsettled_reason) != settled
     other = PressWorld(w.scene)
     other.restore(w.snapshot())
     assert not other.move({"indenter": Pose(w.pose("indenter").position + [0.1e-3, 0, 0])}).settled
@@ -394,6 +394,6 @@ def test_a_failed_attempt_leaves_nothing_behind() -> None:
     before, wanted = w.snapshot(), slide(w, 0.1e-3)
     w.restore(before)
     gels = w._state._gels
-    gels.alike.f[...] = float("nan")
+    gels.common_group.f[...] = float("nan")
     gels._corners[gels._corners != 0.0] = float("nan")
     assert slide(w, 0.1e-3) == wanted

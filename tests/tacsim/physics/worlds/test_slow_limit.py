@@ -82,7 +82,7 @@ def test_a_body_that_is_dragged_too_fast_for_its_friction_is_not_settled() -> No
     assert close(w, TOUCHED).settled
     stats = drag(w, 1.0, 0.0)
     assert not stats.settled and stats.residual <= w.scene.settling.tolerance
-    assert "slips by its inertia" in w.unfollowed
+    assert "slips by its inertia" in w.unsettled_reason
 
 
 @pytest.mark.parametrize("nu", [0.495, 0.499])
@@ -114,10 +114,10 @@ def test_what_the_motion_itself_has_made_yield_is_not_settled_and_goes_slower_by
     begin = w.snapshot()
     stats: Any = close(w, 5.0)
     assert not stats.settled and stats.residual <= w.scene.settling.tolerance and stats.force_loss > 0.05
-    assert "smaller settling.tolerance" in w.unfollowed
+    assert "smaller settling.tolerance" in w.unsettled_reason
     slow, exact = (world("learn", **settling) for settling in (SLOW, {"tolerance": 2e-3}))
     for each in (slow, exact):
         each.restore(begin)
-        assert close(each, 5.0).settled and not each.unfollowed
+        assert close(each, 5.0).settled and not each.unsettled_reason
     assert normal_force(exact) == pytest.approx(normal_force(slow), rel=0.02)
     assert normal_force(w) < 0.95 * normal_force(slow)

@@ -37,7 +37,7 @@ def force(world: World, name: str) -> float:
 
 
 @pytest.mark.parametrize(("material", "rounding"), [({"youngs_modulus": 1e6}, 2e-4), (CLAY, 1e-3)])
-def test_swapped_gels_feel_the_mirrored_scene(material: dict[str, float], rounding: float) -> None:
+def test_swapped_gels_give_mirrored_forces(material: dict[str, float], rounding: float) -> None:
     """The scene turned by half a turn about x has the other gel below.
 
     `rounding`: difference of surfaces, of the largest displacement. A command that differs by one unit of float32
@@ -60,7 +60,7 @@ def test_swapped_gels_feel_the_mirrored_scene(material: dict[str, float], roundi
 
 
 @pytest.mark.parametrize("name", ["lower", "upper"])
-def test_in_real_time_each_gel_shakes_at_its_own_quarter_wave(name: str) -> None:
+def test_gels_oscillate_at_quarter_wave_frequency_in_real_time(name: str) -> None:
     """Of a wide layer bonded at its back: period 4 H / c_s, by its own thickness, modulus and density."""
     gels = {
         "lower": {"size": [36e-3, 36e-3, 4e-3], "material": {"poisson_ratio": 0.3, "density": 1200.0}},
@@ -84,7 +84,7 @@ def test_in_real_time_each_gel_shakes_at_its_own_quarter_wave(name: str) -> None
     assert top[top.shape[0] // 2, top.shape[1] // 2] == pytest.approx(-amplitude, rel=0.03)
 
 
-def test_a_stiff_and_a_soft_gel_are_dented_as_their_moduli_say() -> None:
+def test_dents_of_stiff_and_soft_gel_scale_with_moduli() -> None:
     """In series under a nearly rigid body: one force, and four times the dent in what is a fourth as stiff."""
     stiff = {"material": {"youngs_modulus": 0.58e6}}
     body = {"geometry": {"shape": "box", "size": [4e-3, 4e-3, 3e-3]}, "material": {"youngs_modulus": 50e6}}
@@ -101,7 +101,7 @@ def test_a_stiff_and_a_soft_gel_are_dented_as_their_moduli_say() -> None:
     assert force(alike, "lower") == pytest.approx(force(world, "lower"), rel=0.02)
 
 
-def test_equal_gels_keep_their_bits_however_they_are_given() -> None:
+def test_equal_gels_give_same_bits_for_both_configurations() -> None:
     gel = {"size": [8e-3, 8e-3, 2e-3], "housing": 0.2e-3, "material": {"youngs_modulus": 0.2e6}}
     scenes = [
         scene({}, gel=gel),
@@ -144,7 +144,7 @@ def test_a_load_is_held_by_either_gel() -> None:
         assert force(world, name) == pytest.approx(load, rel=0.011)
 
 
-def test_what_is_wrong_is_placed_in_its_own_gel() -> None:
+def test_fault_is_located_in_its_gel() -> None:
     world = make_world(scene({"lower": THICK, "upper": THIN}))
     arrays = world.arrays()  # type: ignore[attr-defined]
     arrays["gel_displacement_upper"][0, 3, 4, -1, 2] = np.nan
@@ -158,5 +158,5 @@ def test_gels_that_meet_are_refused_by_the_thinner_one() -> None:
     beside = moved(world, "upper", [7.8e-3, 0.0, 0.0])
     world.place(beside)
     down = moved(world, "upper", [0.0, 0.0, -3.9e-3])
-    with pytest.raises(SimulationDiverged, match=r"the gels lie .* mm inside one another.*limit 0\.5 mm"):
+    with pytest.raises(SimulationDiverged, match=r"the gels overlap by .* mm.*limit 0\.5 mm"):
         world.move(down)

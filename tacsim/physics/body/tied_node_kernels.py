@@ -1,4 +1,4 @@
-"""Light nodes of the body's grid push their leaders and follow them (tacsim.physics.body.followers)."""
+"""Kernels of tied grid nodes: they give impulses to full nodes and take their velocity (see `tied_nodes`)."""
 
 from tacsim.compute.runtime import ti
 from tacsim.physics.body.mass import CHANGE, changes_at
@@ -8,17 +8,17 @@ from tacsim.physics.exec.lanes import NODES, ON_DEVICE, bounded, strip, vec4
 
 Ends = ti.types.ndarray(dtype=ti.i32, ndim=1)  # `Links.ends` of all environments
 
-PUSHES, MOVES = range(2)  # the two tables of `Links`
-GETS, GIVES = range(2)  # the two rows of each
+IMPULSE_TABLE, VELOCITY_TABLE = range(2)  # the two tables of `Links`
+RECEIVER_ROW, GIVER_ROW = range(2)  # the two rows of each
 
 
 @ti.func
 def links_of_part(env: ti.template(), table: ti.template(), part):
-    """First of the pairs of a table that a part does, and the one after its last; on a device a part is one pair."""
+    """First pair of a part in a table, and the one after its last; on a device a part is one pair."""
     if ti.static(ON_DEVICE):
         return part, part + 1
     else:
-        first = ti.static(layout.PUSHES if table == PUSHES else layout.MOVES)
+        first = ti.static(layout.IMPULSE_LINKS if table == IMPULSE_TABLE else layout.VELOCITY_LINKS)
         return env.count(first + part), env.count(first + part + 1)
 
 
@@ -35,7 +35,7 @@ def share_of(env: ti.template(), body: ti.template(), table: ti.template(), n):
 
 @ti.func
 def node_of(numbers, node):
-    """Four numbers of one node, of those of its strip."""
+    """The four numbers of one node of a strip."""
     found = vec4([numbers[c] for c in range(4)])
     for n in ti.static(range(1, NODES)):
         if node % NODES == n:
@@ -45,7 +45,7 @@ def node_of(numbers, node):
 
 @ti.func
 def in_strip(numbers, node):
-    """Four numbers of one node in a strip that has zeros elsewhere."""
+    """A strip with the four numbers of one node and zeros elsewhere."""
     found = strip(0.0)
     for n in ti.static(range(NODES)):
         if node % NODES == n:
@@ -55,24 +55,24 @@ def in_strip(numbers, node):
 
 
 @ti.func
-def push_leaders(env: ti.template(), part, body: ti.template()):
-    """After `grid_changes`: changes of momentum, and masses, of light nodes go to this part's nodes that lead them;
-    this part's light nodes have none any more."""
+def transfer_impulses(env: ti.template(), part, body: ti.template()):
+    """After `grid_changes`: adds the momentum changes and masses of tied nodes to the full nodes of this part, and sets
+    those of this part's tied nodes to zero."""
     dt, weight = env.param(layout.STEP), env.param3(layout.GRAVITY)
     plane = env.count(layout.GRID + 1) * env.count(layout.GRID + 2)
-    first, last = links_of_part(env, MOVES, part)
+    first, last = links_of_part(env, VELOCITY_TABLE, part)
     for n in range(first, last):
-        s = changes_at(env, CHANGE, end_of(env, body, MOVES, GETS, n))
+        s = changes_at(env, CHANGE, end_of(env, body, VELOCITY_TABLE, RECEIVER_ROW, n))
         for c in ti.static(range(4)):
             body.changes[s + c] = 0.0
-    first, last = links_of_part(env, PUSHES, part)
+    first, last = links_of_part(env, IMPULSE_TABLE, part)
     for n in range(first, last):
-        light = end_of(env, body, PUSHES, GIVES, n)
+        light = end_of(env, body, IMPULSE_TABLE, GIVER_ROW, n)
         q = node_of(node_sum(env, light // plane, light // NODES, body), light)
         for d in ti.static(range(3)):
             q[d] += q[3] * dt * weight[d]
-        q *= share_of(env, body, PUSHES, n)
-        s = bounded(changes_at(env, CHANGE, end_of(env, body, PUSHES, GETS, n)), 1)
+        q *= share_of(env, body, IMPULSE_TABLE, n)
+        s = bounded(changes_at(env, CHANGE, end_of(env, body, IMPULSE_TABLE, RECEIVER_ROW, n)), 1)
         for c in ti.static(range(4)):
             if ti.static(ON_DEVICE):
                 ti.atomic_add(body.changes[s + c], q[c])
@@ -81,13 +81,16 @@ def push_leaders(env: ti.template(), part, body: ti.template()):
 
 
 @ti.func
-def follow(env: ti.template(), part, body: ti.template()):
-    """After `grid_update`, which leaves light nodes at rest: they get the velocities that their leaders have."""
+def set_tied_velocities(env: ti.template(), part, body: ti.template()):
+    """After `grid_update`, which leaves tied nodes at rest: gives them the velocities of their full nodes."""
     base = env.index * env.count(layout.CAPACITY)
-    first, last = links_of_part(env, MOVES, part)
+    first, last = links_of_part(env, VELOCITY_TABLE, part)
     for n in range(first, last):
-        light, heavy = end_of(env, body, MOVES, GETS, n), end_of(env, body, MOVES, GIVES, n)
-        velocity = share_of(env, body, MOVES, n) * node_of(body.velocities[base + heavy // NODES], heavy)
+        light, full = (
+            end_of(env, body, VELOCITY_TABLE, RECEIVER_ROW, n),
+            end_of(env, body, VELOCITY_TABLE, GIVER_ROW, n),
+        )
+        velocity = share_of(env, body, VELOCITY_TABLE, n) * node_of(body.velocities[base + full // NODES], full)
         at = base + light // NODES
         if ti.static(ON_DEVICE):
             ti.atomic_add(body.velocities[at], in_strip(velocity, light))

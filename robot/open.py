@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from robot.common.code import CodeNotFound as CodeNotFound
-from robot.common.code import attribute
+from robot.common.code import load_attribute
 from robot.rig import RIG_ATTACHMENT as RIG_ATTACHMENT
 from robot.rig import CannotOpen as CannotOpen
 from robot.rig.parts import check_parts, sensor_drivers
@@ -46,7 +46,7 @@ def load_with_task(rig: str | Path, task: str | TaskConfig | None = None, overri
     """
     if isinstance(task, str) and ":" in task:
         try:
-            found = attribute(task)
+            found = load_attribute(task)
         except CodeNotFound as failure:
             raise CodeNotFound(f"task {failure}") from failure
         task = _task_of(found, task)
@@ -72,7 +72,7 @@ def open_rig(
     confirm: Callable[[str], bool] | None = None,
     dry_run: bool = False,
     check: Callable[[RigSpec], None] | None = None,
-    tell: Callable[[str], None] = lambda words: None,
+    report: Callable[[str], None] = lambda words: None,
 ) -> Rig:
     """Opens a rig by its name ("sim", "mock", "ur5e", "replay"), the path of its file, or a loaded configuration.
 
@@ -103,7 +103,7 @@ def open_rig(
     if config.clock == "wall":  # each kind loads what it needs and no more
         from robot.rig.hardware_rig import open_hardware
 
-        return open_hardware(config, confirm, dry_run=dry_run, check=check, tell=tell)
+        return open_hardware(config, confirm, dry_run=dry_run, check=check, report=report)
     if config.clock == "sim":
         from robot.rig.sim_rig import open_sim
 

@@ -14,7 +14,7 @@ import pytest
 from matplotlib.image import imread
 from scipy.spatial.transform import Rotation
 
-from robot.cli.errors import explain
+from robot.cli.errors import describe_error
 from robot.cli.output import writing
 from robot.studies.press import PressMotion, _targets
 from tacsim.config import ConfigError
@@ -141,13 +141,13 @@ def test_an_existing_folder_is_refused_and_left_alone(words: tuple[str, ...], tm
 
 
 def test_exit_codes_of_errors() -> None:
-    assert explain(ConfigError([]))[1] == 2
-    assert explain(EpisodeError("x.mcap: is no episode")) == ("x.mcap: is no episode", 2)
-    assert explain(IncompatibleRig("it lacks truth"))[1] == 2
-    assert explain(PermissionError(13, "Permission denied", "out")) == ("out: Permission denied", 2)
-    assert explain(OSError(28, "No space left on device", "out")) == ("out: No space left on device", 1)
-    assert "--debug" in explain(KeyError("slip"))[0]
-    assert "no room" in explain(ExceptionGroup("two", [OSError("no room"), EpisodeError("bad")]))[0]
+    assert describe_error(ConfigError([]))[1] == 2
+    assert describe_error(EpisodeError("x.mcap: is no episode")) == ("x.mcap: is no episode", 2)
+    assert describe_error(IncompatibleRig("it lacks truth"))[1] == 2
+    assert describe_error(PermissionError(13, "Permission denied", "out")) == ("out: Permission denied", 2)
+    assert describe_error(OSError(28, "No space left on device", "out")) == ("out: No space left on device", 1)
+    assert "--debug" in describe_error(KeyError("slip"))[0]
+    assert "no room" in describe_error(ExceptionGroup("two", [OSError("no room"), EpisodeError("bad")]))[0]
 
 
 def test_a_working_folder_that_is_gone_is_named() -> None:
@@ -212,7 +212,9 @@ def test_the_side_of_a_mesh_that_presses_is_said_shown_and_chosen(tmp_path: Path
 
 def test_a_press_too_deep_says_first_what_is_possible(tmp_path: Path) -> None:
     deep = tacsim("press", "sphere", "--depth", "3.9 mm", "--preset", "draft", "--out", "deep")
-    said = re.search(r"error: the gel cannot take 3\.9 mm of this indenter; ([\d.]+) mm is possible", deep.stderr)
+    said = re.search(
+        r"error: a depth of 3\.9 mm is not possible with this indenter; ([\d.]+) mm is possible", deep.stderr
+    )
     assert deep.exit_code == 1 and said is not None
     again = tacsim("press", "sphere", "--depth", f"{said[1]} mm", "--preset", "draft", "--out", "again")
     assert again.exit_code == 0
@@ -233,10 +235,10 @@ def test_press_slides_and_twists_against_friction(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (("sphere", "--size", "1 mm, 1 mm, 1 mm"), "--size: 'sphere' has none; it has --radius"),
-        (("cylinder", "--scale", "0.01"), "--scale: 'cylinder' has none; it has --radius and --height"),
-        (("box", "--radius", "3 mm"), "--radius: 'box' has none; it has --size"),
-        (("part.stl", "--height", "3 mm"), "--height: 'part.stl' has none; it has --scale"),
+        (("sphere", "--size", "1 mm, 1 mm, 1 mm"), "--size: 'sphere' does not have it; it has --radius"),
+        (("cylinder", "--scale", "0.01"), "--scale: 'cylinder' does not have it; it has --radius and --height"),
+        (("box", "--radius", "3 mm"), "--radius: 'box' does not have it; it has --size"),
+        (("part.stl", "--height", "3 mm"), "--height: 'part.stl' does not have it; it has --scale"),
     ],
 )
 def test_a_size_of_another_indenter_is_refused(words: tuple[str, ...], said: str) -> None:
@@ -295,4 +297,4 @@ def test_a_press_that_diverges_leaves_what_debug_reads(tmp_path: Path) -> None:
 def test_a_full_disk_is_named(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="No space") as caught, writing(tmp_path):
         raise OSError(28, "No space left on device")
-    assert explain(caught.value) == (f"{tmp_path}: No space left on device", 1)
+    assert describe_error(caught.value) == (f"{tmp_path}: No space left on device", 1)

@@ -79,13 +79,13 @@ def test_a_blank_fails_a_limit_that_a_whole_picture_would_let_through(real: Fram
 @pytest.mark.parametrize(
     ("limit", "words"),
     [
-        ("magic=3", "'magic' is no figure; there are: mae, psnr"),
+        ("magic=3", "'magic' is not a figure; allowed: mae, psnr"),
         ("contact_mae", "'contact_mae'"),
         ("contact_mae=low", "'contact_mae=low'"),
         ("contact_mae=nan", "is not METRIC=VALUE"),
         ("height_rmse=3 s", "'height_rmse=3 s'"),
-        ("gradient_angle=3", "not known of these frames: gradient_angle"),
-        ("rho_gradient=1", "not known of these frames: rho_gradient"),
+        ("gradient_angle=3", "not measured in these frames: gradient_angle"),
+        ("rho_gradient=1", "not measured in these frames: rho_gradient"),
     ],
 )
 def test_limits_that_mean_nothing_are_refused(limit: str, words: str) -> None:

@@ -135,7 +135,7 @@ def test_who_wants_to_stop_is_heard_at_once(one_arm: Lab, folder: Path, moment: 
             screen.wait_for(moment)
         screen.type(key)
         assert screen.end() == code, screen.picture
-        assert screen.shows("nobody answered" if key == "\x04" else "stopped by SIGINT")
+        assert screen.shows("no answer to the question" if key == "\x04" else "stopped by SIGINT")
     state = one_arm.faults["arm"].state()
     assert state.rests and one_arm.depth("arm", state.pose) < 0.0
     assert not (folder / "never").exists()
@@ -150,4 +150,4 @@ def test_the_question_before_presses_by_hand_stays_on_the_screen(one_arm: Lab, f
         screen.wait_for("Take everything off the gel first.")
         screen.until(lambda: screen.text.count("[Y/n]:") == 2, "the question once more")
         screen.type("\x04")
-        assert screen.end() == 1 and screen.shows("nobody answered")
+        assert screen.end() == 1 and screen.shows("no answer to the question")

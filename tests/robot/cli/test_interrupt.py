@@ -85,7 +85,7 @@ def test_what_nohup_started_goes_on() -> None:
 LOST = """
 import sys, time
 from pathlib import Path
-from robot.cli.errors import complain
+from robot.cli.errors import print_error
 from robot.cli.terminal import Interrupt
 from robot.cli.output import progress, results
 with Interrupt() as interrupt, progress() as bar:
@@ -97,7 +97,7 @@ with Interrupt() as interrupt, progress() as bar:
     bar.update(row, completed=1)
 Path(sys.argv[1]).write_text("saved")
 results.print("the report")
-complain("stopped by a signal")
+print_error("stopped by a signal")
 sys.exit(interrupt.exit_code)
 """
 

@@ -55,11 +55,11 @@ def test_its_own_colours_and_cursor_stay() -> None:
 
 
 def test_errors_and_checks_are_shown_the_same_way(capsys: pytest.CaptureFixture[str]) -> None:
-    errors.complain(EVIL)
+    errors.print_error(EVIL)
     check(capsys.readouterr().err)
     print_checks([Check("serial", "warn", EVIL, "do this")])
     check(capsys.readouterr().out)
-    message, _ = errors.explain(FileNotFoundError(2, "No such file", "x\ny" + EVIL))
+    message, _ = errors.describe_error(FileNotFoundError(2, "No such file", "x\ny" + EVIL))
     check(message)
     assert "\n" not in message
 

@@ -113,7 +113,7 @@ def test_a_signal_in_this_process_ends_the_episode_and_saves_it(
     (tmp_path / "ending.py").write_text(text)
     result = tacsim("run", "--policy", "ending:act", "--steps", "9", "--out", "r", *TINY)
     assert result.exit_code == 143, result.output
-    assert "stopped by a signal before the last step; what was done is saved" in result.stderr
+    assert "stopped by a signal before the last step; all finished steps are saved" in result.stderr
     assert len(read_episode(tmp_path / "r" / "episode.mcap").steps) == 2
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from robot.common.whole_file import put_new, whole_folder
+from robot.common.whole_file import move_to_new_path, whole_folder
 
 
 def test_a_folder_comes_with_all_or_not_at_all(tmp_path: Path) -> None:
@@ -48,9 +48,9 @@ def test_a_file_takes_no_name_that_is_taken(links: bool, tmp_path: Path, monkeyp
     for text in ("first", "second"):
         (tmp_path / "part").write_text(text)
         if text == "first":
-            put_new(tmp_path / "part", tmp_path / "file")
+            move_to_new_path(tmp_path / "part", tmp_path / "file")
             assert not (tmp_path / "part").exists()
         else:
             with pytest.raises(FileExistsError):
-                put_new(tmp_path / "part", tmp_path / "file")
+                move_to_new_path(tmp_path / "part", tmp_path / "file")
     assert (tmp_path / "file").read_text() == "first"

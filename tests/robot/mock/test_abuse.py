@@ -19,7 +19,7 @@ from robot.mock.ur.wire import inputs
 from robot.mock.ur.wire.connection import Connection
 from robot.mock.ur.wire.controller import Controller
 from robot.mock.ur.wire.inputs import Inputs
-from robot.mock.ur.wire.rtde import MAX_NAMES, InputRecipe, package
+from robot.mock.ur.wire.rtde import MAX_NAMES, InputRecipe, make_package
 from tests.robot.mock.innocent import Innocent
 from tests.robot.mock.wire_client import TIMEOUT, ControlClient, RtdeClient, wire_host
 from tests.robot.waiting import until
@@ -55,7 +55,7 @@ def stopped(faults: FaultClient) -> str:
 def test_a_command_without_all_its_numbers_ends_the_program(arms: MockArms) -> None:
     """As moveJ([0, 0, 0]) does: its client would wait for minutes."""
     with ControlClient(arms.hosts[0]) as client:
-        client.socket.sendall(package(85, struct.pack(">Bi", 1, MOVE_J) + bytes(24)))
+        client.socket.sendall(make_package(85, struct.pack(">Bi", 1, MOVE_J) + bytes(24)))
         client.wait(lambda state: state["runtime_state"] == (1,))
     assert "command 1 of a wrong length" in stopped(arms.fault_clients[0])
 
@@ -103,7 +103,7 @@ def test_a_flood_of_small_packages_starves_nobody(arms: MockArms) -> None:
     with RtdeClient(arms.hosts[0]) as client:
         client.inputs("input_int_register_30")
         since = arms.fault_clients[0].received().last
-        flood = package(85, struct.pack(">Bi", 1, 7)) * 1000
+        flood = make_package(85, struct.pack(">Bi", 1, 7)) * 1000
         for _ in range(5):
             client.socket.sendall(flood)
         begun = arms.fault_clients[0].state().tick
@@ -130,7 +130,7 @@ def test_newlines_are_searched_once() -> None:
 
 
 def test_inputs_are_kept_within_a_bound_and_what_is_lost_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(inputs, "KEPT", 1000 * (inputs.OVERHEAD + 4))
+    monkeypatch.setattr(inputs, "MAX_STORED_BYTES", 1000 * (inputs.PACKAGE_OVERHEAD + 4))
     kept, recipe = Inputs(), InputRecipe(("input_int_register_5",), struct.Struct(">i"), (1,))
     for value in range(1, 5001):
         kept.add(value, recipe, struct.pack(">i", value))

@@ -85,6 +85,6 @@ def test_what_cannot_be_done_is_said_and_the_cell_goes_on(sim_server: SimServer)
 def test_a_killed_process_is_told_and_closing_stays_harmless(sim_server: SimServer) -> None:
     """The last test of this process."""
     os.kill(sim_server.pid, signal.SIGKILL)
-    with pytest.raises(SimServerError, match=rf"process {sim_server.pid}.*open the rig anew"):
+    with pytest.raises(SimServerError, match=rf"process {sim_server.pid}.*open the rig again"):
         sim_server.move(sim_server.initial)
     sim_server.close()

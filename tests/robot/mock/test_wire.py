@@ -15,7 +15,7 @@ from robot.mock import MOCK_SERIAL, FaultClient, MockUR
 from robot.mock.ur.machine.arm import HOME
 from robot.mock.ur.wire.controller import MAX_CLIENTS, PORTS
 from robot.mock.ur.wire.fields import INPUTS, OUTPUTS
-from robot.mock.ur.wire.rtde import BadPackage, package, packages
+from robot.mock.ur.wire.rtde import BadPackage, make_package, take_packages
 from tests.robot.mock.wire_client import TIMEOUT, ControlClient, RtdeClient, control_script, dashboard
 from tests.robot.waiting import until
 
@@ -38,15 +38,15 @@ def answers(mock: MockUR) -> bool:
 
 
 def test_packages_are_taken_whole_from_any_pieces() -> None:
-    stream = package(86, b"\0\2") + package(118, b"") + package(85, bytes(range(200)))
+    stream = make_package(86, b"\0\2") + make_package(118, b"") + make_package(85, bytes(range(200)))
     for cut in range(len(stream)):
         buffer = bytearray(stream[:cut])
-        found = list(packages(buffer))
+        found = list(take_packages(buffer))
         buffer += stream[cut:]
-        found += list(packages(buffer))
+        found += list(take_packages(buffer))
         assert [kind for kind, _ in found] == [86, 118, 85] and not buffer
     with pytest.raises(BadPackage, match="less than its header"):
-        list(packages(bytearray(b"\0\1\0")))
+        list(take_packages(bytearray(b"\0\1\0")))
 
 
 def test_protocol_and_version(mock: MockUR) -> None:
@@ -141,7 +141,7 @@ def test_packages_of_wrong_size_or_recipe_are_ignored(mock: MockUR) -> None:
         client.inputs("input_int_register_5")
         since = mock.faults.received().last
         for payload in (b"\1\0\0", b"\7" + bytes(4), b"", b"\1\0\0\0\2too long"):
-            client.socket.sendall(package(85, payload))
+            client.socket.sendall(make_package(85, payload))
         client.send(1, 3)
         until(lambda: mock.faults.state().packages_received == since + 2, "the good ones")
         entries = mock.faults.received(since).entries

@@ -15,7 +15,7 @@ from calibration.bundle import read_bundle, read_sensor_model, write_bundle
 from calibration.frame_normaliser import FrameNormaliser
 from calibration.lens.view import view_of_corners
 from calibration.normaliser import normaliser_for_calibration, normaliser_for_camera, normaliser_for_simulation
-from robot.mock.cell.cell import _models
+from robot.mock.cell.cell import _sensor_models
 from tacsim.config import ConfigError, load_rig, load_sensor
 from tacsim.interface import TactileFrame
 from tacsim.models.hardware import CameraSensorConfig
@@ -355,7 +355,7 @@ def test_a_mock_camera_with_a_calibration_shows_its_twin(finger: Path) -> None:
     upper = ["model=null", "calibration=finger", "width=240", "height=190"]
     loaded = load_rig("mock", overrides=[f"sensors.upper.{each}" for each in upper])
     assert loaded.config.scene is not None and loaded.config.scene.gel.size[:2] == pytest.approx((16e-3, 12e-3))
-    assert _models(loaded.config)["upper"] == read_sensor_model(finger)
+    assert _sensor_models(loaded.config)["upper"] == read_sensor_model(finger)
     camera = loaded.config.sensors["upper"]
     assert isinstance(camera, CameraSensorConfig)
     assert normaliser_for_camera(camera, loaded.config.scene.gel.size[:2], GRID).finds_height

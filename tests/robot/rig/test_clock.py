@@ -128,7 +128,9 @@ def test_an_arm_without_target_is_only_waited_for(time: Time) -> None:
 def test_an_arm_that_does_not_arrive_is_named(time: Time) -> None:
     arms = {"left": commanded(StubArm(0), Pose()), "right": commanded(StubArm(10**9), Pose())}
     before = time.now
-    with pytest.raises(DeviceError, match=r"arm 'right' did not come .* within 2 s: arm 'right' follows its target"):
+    with pytest.raises(
+        DeviceError, match=r"arm 'right' did not reach its target within 2 s: arm 'right' follows its target"
+    ):
         wait_for_arrival(arms, timeout=2.0)
     assert time.now - before == pytest.approx(2.0, abs=0.02)
 
@@ -153,7 +155,7 @@ def test_lock_step_waits_for_arms_then_forces_then_just_those_pictures(time: Tim
     arm = StubArm(4)
     clock = LockStep(PERIOD, {"left": commanded(arm, Pose())}, {"finger": StubCamera()}, Cell())  # type: ignore[dict-item, arg-type]
     clock.tick()
-    assert log == [("step", 4, clocks.SETTLED), ("picture", 17)]
+    assert log == [("step", 4, clocks.FORCE_DELAY), ("picture", 17)]
     assert clock.period == PERIOD and clock.diagnostics() == {}
 
 
@@ -174,8 +176,8 @@ def test_catching_up_needs_a_step_that_began_afterwards_and_tells_of_a_failure()
     timers = [threading.Timer(0.05 * k, step) for k in (1, 2)]
     for timer in timers:
         timer.start()
-    cell.catch_up()
+    cell.wait_for_fresh_step()
     assert cell._steps == 7
     cell._failure = RuntimeError("no more")
     with pytest.raises(DeviceError, match="no more"):
-        cell.catch_up()
+        cell.wait_for_fresh_step()

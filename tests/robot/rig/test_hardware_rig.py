@@ -203,7 +203,7 @@ def test_without_a_yes_nothing_approaches(shared: Opened) -> None:
     before = reset._confirm  # type: ignore[attr-defined]
     reset._confirm = lambda: bool(asked.append(time.monotonic()))  # type: ignore[attr-defined]
     try:
-        with pytest.raises(NotConfirmed, match="nothing approaches"):
+        with pytest.raises(NotConfirmed, match="no arm approaches"):
             shared.rig.reset()
     finally:
         reset._confirm = before  # type: ignore[attr-defined]

@@ -90,6 +90,6 @@ def test_a_killed_simulator_ends_the_episode(simulated: Opened) -> None:
     sim_server = simulated.cell._sim_server
     assert sim_server is not None
     failed = failing(simulated.rig, lambda: os.kill(sim_server.pid, signal.SIGKILL))
-    assert "simulated cell" in str(failed) and "open the rig anew" in str(failed)
+    assert "simulated cell" in str(failed) and "open the rig again" in str(failed)
     assert len(failed.episode.steps) >= 3
     until(lambda: all(faults.state().rests for faults in simulated.cell.faults.values()), "rest")

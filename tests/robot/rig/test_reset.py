@@ -12,7 +12,7 @@ import pytest
 from robot.errors import DeviceError, EmergencyStop
 from robot.rig import reset as resets
 from robot.rig.commanded_arm import CommandedArm
-from robot.rig.reset import RETREAT, HardwareReset, NotConfirmed
+from robot.rig.reset import RETREAT_DISTANCE, HardwareReset, NotConfirmed
 from robot.rig.touch import Touch
 from tacsim import pose as se3
 from tacsim.control.contact_signal import NoTouch
@@ -93,7 +93,7 @@ class Scene:
     log: list[object] = field(default_factory=list)
     told: list[str] = field(default_factory=list)
     real_time = False
-    patience = 0.1
+    data_timeout = 0.1
 
     def __post_init__(self) -> None:
         self.lower, self.upper = StubArm("lower", LOWER, self.log), StubArm("upper", UPPER, self.log)
@@ -105,10 +105,10 @@ class Scene:
             start={"lower": LOWER, "upper": UPPER},
             clock=self,
             config=PARAMS,
-            touch_sense=None if self.touch_at is None else self,
+            touch_sensing=None if self.touch_at is None else self,
             confirm=self.confirm,
             placement=self.placement,
-            tell=self.told.append,
+            report=self.told.append,
         )
 
     def wait_for_data(self) -> None:
@@ -121,7 +121,7 @@ class Scene:
         self.log.append("asked")
         return self.yes
 
-    def look(self, *, guarded: bool) -> Touch:
+    def measure_touch(self, *, guarded: bool) -> Touch:
         assert self.touch_at is not None and not guarded
         gone = float(self.lower.pose.position[2] - LOWER.position[2])
         return Touch({"lower": gone / self.touch_at, "upper": gone / self.touch_at}, 0.0)
@@ -144,8 +144,8 @@ def test_it_retreats_along_its_own_axis_then_goes_to_the_start() -> None:
     scene.reset.clear(0)
     assert scene.lower.told is scene.upper.told is None  # until it sees anew, nothing is decided by what it saw
     back = dict(scene.motions()[:2])
-    assert back["lower"].position == pytest.approx([5e-3, 0, -RETREAT])
-    assert back["upper"].position == pytest.approx([5e-3, 0, 10e-3 + RETREAT])  # it faces down
+    assert back["lower"].position == pytest.approx([5e-3, 0, -RETREAT_DISTANCE])
+    assert back["upper"].position == pytest.approx([5e-3, 0, 10e-3 + RETREAT_DISTANCE])  # it faces down
     there = dict(scene.motions()[2:])
     assert se3.pose_distance(there["lower"], LOWER)[0] == se3.pose_distance(there["upper"], UPPER)[0] == 0.0
 
@@ -165,10 +165,10 @@ def test_a_reference_is_exposed_after_the_arms_came_to_rest() -> None:
 
 
 def test_a_camera_that_shows_nothing_new_ends_the_reset(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(resets, "PICTURE", 0.0)
+    monkeypatch.setattr(resets, "FRAME_TIMEOUT", 0.0)
     scene = Scene()
     scene.sensor.late = 10**9
-    with pytest.raises(TimeoutError, match="sensor 'finger': no picture since the arms came to rest"):
+    with pytest.raises(TimeoutError, match="sensor 'finger': no image since the arms came to rest"):
         scene.reset.clear(0)
 
 
@@ -204,7 +204,7 @@ def test_without_a_yes_nothing_moves() -> None:
     scene = Scene(touch_at=1e-3, yes=False)
     scene.reset.clear(0)
     before = len(scene.motions())
-    with pytest.raises(NotConfirmed, match="nothing approaches"):
+    with pytest.raises(NotConfirmed, match="no arm approaches"):
         scene.reset.touch()
     assert len(scene.motions()) == before and "restart" not in scene.log
 
@@ -245,7 +245,7 @@ class Moving(Scene):
     silent = False
     looks = 0
 
-    def look(self, *, guarded: bool) -> Touch:
+    def measure_touch(self, *, guarded: bool) -> Touch:
         assert guarded
         self.looks += 1
         assert self.looks < 200
@@ -272,15 +272,15 @@ def test_in_motion_each_arm_stops_when_its_own_gel_touches(moving: Moving) -> No
 
 def test_without_new_pictures_nothing_moves(moving: Moving, monkeypatch: pytest.MonkeyPatch) -> None:
     moving.silent = True
-    monkeypatch.setattr(resets, "TRAVEL", 0.0)  # gives up at once
-    with pytest.raises(DeviceError, match="came no farther for 0 s: no new pictures"):
+    monkeypatch.setattr(resets, "MOVE_TIMEOUT", 0.0)  # gives up at once
+    with pytest.raises(DeviceError, match="made no progress for 0 s: no new images"):
         moving.reset.touch()
     assert moving.lower.pose.position == pytest.approx(LOWER.position)
     assert ("lower", "stop") in moving.log and ("upper", "stop") in moving.log
 
 
 def test_a_slow_approach_goes_on_while_it_comes_farther(moving: Moving, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(resets, "TRAVEL", 0.0)  # less than the whole takes
+    monkeypatch.setattr(resets, "MOVE_TIMEOUT", 0.0)  # less than the whole takes
     moving.reset.touch()
     assert moving.log[-1] == "restart"
 
@@ -296,7 +296,7 @@ def test_whatever_ends_an_approach_in_motion_stops_the_arms(moving: Moving, monk
     with pytest.raises(KeyError):
         moving.reset.touch()
     moving.walls["upper"] = 1.0
-    monkeypatch.setattr(moving.reset, "_tell", lambda words: 1 / 0)
+    monkeypatch.setattr(moving.reset, "_report", lambda words: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         moving.reset.touch()
     assert moving.log[-2:] == [("lower", "stop"), ("upper", "stop")]
@@ -304,7 +304,7 @@ def test_whatever_ends_an_approach_in_motion_stops_the_arms(moving: Moving, monk
 
 def test_in_motion_no_touch_goes_back_to_the_start(moving: Moving, monkeypatch: pytest.MonkeyPatch) -> None:
     moving.walls = {"lower": 1.0, "upper": 1.0}
-    monkeypatch.setattr(resets, "AT_END", 0.0)
+    monkeypatch.setattr(resets, "END_TIMEOUT", 0.0)
     with pytest.raises(NoTouch, match=r"no touch after an approach of 10 mm.*back at their start"):
         moving.reset.touch()
     assert moving.lower.pose.position == pytest.approx(LOWER.position)

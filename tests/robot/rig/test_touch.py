@@ -55,13 +55,13 @@ class Opened:
 def opened(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Opened]:
     file = copy_of("ur5e-one", tmp_path_factory.mktemp("rig"), 65)
     told: list[str] = []
-    with Lab(file) as lab, open_rig(file, confirm=lambda question: True, tell=told.append) as rig:
+    with Lab(file) as lab, open_rig(file, confirm=lambda question: True, report=told.append) as rig:
         yield Opened(lab, rig, told)
 
 
 @pytest.mark.deep
 def test_the_approach_goes_at_its_speed_and_stops_on_contact(opened: Opened, monkeypatch: pytest.MonkeyPatch) -> None:
-    states, tell = opened.arm.driver._channel.states, opened.rig._reset._tell  # type: ignore[attr-defined]
+    states, tell = opened.arm.driver._channel.states, opened.rig._reset._report  # type: ignore[attr-defined]
     looks: list[Record] = []
 
     def look(words: str) -> None:
@@ -69,7 +69,7 @@ def test_the_approach_goes_at_its_speed_and_stops_on_contact(opened: Opened, mon
             looks.append(states.recent(HISTORY))
         tell(words)
 
-    monkeypatch.setattr(opened.rig._reset, "_tell", look)
+    monkeypatch.setattr(opened.rig._reset, "_report", look)
     opened.rig.reset()
     depth = opened.depth
     # By the periods of the arm's own loop: neither a busy machine nor a controller that misses ticks on it changes how
@@ -100,7 +100,7 @@ def test_an_approach_waits_when_no_pictures_come_and_ends_when_none_do(
             camera.stall(True)
             places.append(opened.depth)
 
-    monkeypatch.setattr(opened.rig._reset, "_tell", stall)
+    monkeypatch.setattr(opened.rig._reset, "_report", stall)
     try:
         with pytest.raises(StaleFrame):
             opened.rig.reset()
@@ -141,4 +141,4 @@ def test_a_signal_that_is_no_number_is_not_hidden_by_the_other_sensor(monkeypatc
     sensor = SimpleNamespace(spec=SimpleNamespace(arm="arm"), read=lambda timeout: frame)
     sensors = dict.fromkeys("abc", cast(TactileSource, sensor))
     sense = touch.PictureTouch(sensors, dict.fromkeys("abc", lambda *_: None), lambda seen: None, 1.0, 0.1)  # type: ignore[arg-type]
-    assert math.isnan(sense.look(guarded=False).pressed["arm"])
+    assert math.isnan(sense.measure_touch(guarded=False).pressed["arm"])

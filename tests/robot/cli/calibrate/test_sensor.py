@@ -39,7 +39,7 @@ def test_the_command_writes_a_bundle_and_a_picture(folder: Path, tmp_path: Path)
     assert calibration.geometry.pixel_pitch == pytest.approx(PITCH)
     assert (out / "residuals.png").stat().st_size > 10_000
     assert "press_3.png" in ran.output
-    assert calibration.noise is not None and "noise, from beside the contacts: R, G, B" in ran.output
+    assert calibration.noise is not None and "noise, from around the contacts: R, G, B" in ran.output
     assert "nothing checks the lengths" in ran.stderr and "verdict: unverified scale" in ran.output
     known = ("--size", SIZE, "--depth", "press_2.png=0.65 mm")
     sure = tacsim("calibrate", "sensor", folder, *lengths, *known, "--out", tmp_path / "sure")
@@ -119,7 +119,10 @@ def test_the_command_ends_in_a_verdict(folder: Path, tmp_path: Path) -> None:
         (("--ball-diameter", "6 mm", "--pixel-pitch", "0.06 mm", "--serial", "my finger"), "'my finger' is no serial"),
         (("--ball-diameter", "6 mm", "--pixel-pitch", "0.06 mm", "--region", "9,9 900,9 9,90"), "900,9"),
         (("--ball-diameter", "6 mm", "--pixel-pitch", "0.06 mm", "--marker-pitch", "1 mm"), "give --markers, too"),
-        (("--ball-diameter", "6 mm", "--pixel-pitch", "0.06 mm", "--set", "foo.bar=1"), "it changes a camera's rig"),
+        (
+            ("--ball-diameter", "6 mm", "--pixel-pitch", "0.06 mm", "--set", "foo.bar=1"),
+            "it changes the rig of a camera",
+        ),
     ],
 )
 def test_the_command_refuses_lengths_that_may_be_wrong(folder: Path, words: tuple[str, ...], said: str) -> None:

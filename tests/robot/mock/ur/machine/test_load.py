@@ -25,7 +25,7 @@ def attitudes(bench: Bench) -> Iterator[FloatArray]:
         bench.call(1, [*(home + turn), 1.0, 2.0])
         bench.until(lambda: bench.arm.rests)
         bench.tick()
-        yield bench.machine.load.felt
+        yield bench.machine.load.zeroed_wrench
 
 
 def weight(bench: Bench, mass: float) -> FloatArray:
@@ -55,10 +55,10 @@ def test_a_payload_told_after_zeroing_shows_until_the_next_zeroing(bench: Bench)
     bench.machine.load.hidden = Mass(0.5, CENTRE)
     bench.tick()
     bench.call(8)
-    np.testing.assert_allclose(bench.machine.load.felt, 0, atol=1e-9)
+    np.testing.assert_allclose(bench.machine.load.zeroed_wrench, 0, atol=1e-9)
     bench.call(17, [0.5, *CENTRE])
     bench.tick()
-    np.testing.assert_allclose(bench.machine.load.felt, -weight(bench, 0.5), atol=1e-9)
+    np.testing.assert_allclose(bench.machine.load.zeroed_wrench, -weight(bench, 0.5), atol=1e-9)
     bench.call(8)
     for felt in attitudes(bench):
         np.testing.assert_allclose(felt, 0, atol=1e-9)
@@ -71,7 +71,7 @@ def test_gravity_told_wrong_takes_off_a_weight_in_the_wrong_direction(bench: Ben
     bench.call(59, [0, GRAVITY * math.sin(tilt), GRAVITY * math.cos(tilt)])
     bench.tick()
     wanted = 0.5 * GRAVITY * np.array([0, math.sin(tilt), math.cos(tilt) - 1.0])
-    np.testing.assert_allclose(bench.machine.load.felt[:3], wanted, atol=1e-9)
+    np.testing.assert_allclose(bench.machine.load.zeroed_wrench[:3], wanted, atol=1e-9)
 
 
 def test_the_raw_wrench_knows_of_no_payload_and_no_zero(bench: Bench) -> None:

@@ -257,10 +257,10 @@ def test_commands_of_newer_controllers_do_nothing_on_older_ones() -> None:
 
 def test_payload_is_read_back_and_a_zero_centre_keeps_the_old(bench: Bench) -> None:
     bench.call(65, [1.2, 0, 0, 0.05, 1, 2, 3, 4, 5, 6])
-    assert bench.machine.load.told == Mass(1.2, (0, 0, 0.05))
+    assert bench.machine.load.configured_payload == Mass(1.2, (0, 0, 0.05))
     assert bench.machine.load.inertia.tolist() == [1, 2, 3, 4, 5, 6]
     bench.call(17, [0.7, 0, 0, 0])
-    assert bench.machine.load.told == Mass(0.7, (0, 0, 0.05))
+    assert bench.machine.load.configured_payload == Mass(0.7, (0, 0, 0.05))
 
 
 def test_what_is_no_program_disturbs_nobody(bench: Bench) -> None:

@@ -86,15 +86,15 @@ def test_wall_pushes_up_and_zeroing_takes_it_off(bench: Bench) -> None:
     bench.machine.load.wall = Wall(z - 0.01, 1000.0)
     bench.call(3, [*bench.shifted(0, 0, -0.02), 0.1, 0.5])
     bench.tick(100)
-    np.testing.assert_allclose(bench.machine.load.felt, [0, 0, 10, 0, 0, 0], atol=1e-6)
+    np.testing.assert_allclose(bench.machine.load.zeroed_wrench, [0, 0, 10, 0, 0, 0], atol=1e-6)
     bench.machine.load.wrench = np.array([1.0, 2, 3, 0.1, 0.2, 0.3])
     bench.tick()
-    np.testing.assert_allclose(bench.machine.load.felt, [1, 2, 13, 0.1, 0.2, 0.3], atol=1e-6)
+    np.testing.assert_allclose(bench.machine.load.zeroed_wrench, [1, 2, 13, 0.1, 0.2, 0.3], atol=1e-6)
     bench.call(8)
-    np.testing.assert_allclose(bench.machine.load.felt, 0, atol=1e-9)
+    np.testing.assert_allclose(bench.machine.load.zeroed_wrench, 0, atol=1e-9)
     bench.machine.load.wrench = np.zeros(6)
     bench.tick()
-    np.testing.assert_allclose(bench.machine.load.felt, [-1, -2, -3, -0.1, -0.2, -0.3], atol=1e-6)
+    np.testing.assert_allclose(bench.machine.load.zeroed_wrench, [-1, -2, -3, -0.1, -0.2, -0.3], atol=1e-6)
 
 
 def test_too_much_force_is_a_protective_stop(bench: Bench) -> None:
@@ -109,17 +109,17 @@ def test_hidden_payload_weighs_and_turns_with_the_tool(bench: Bench) -> None:
     bench.tick()
     weight = 2.0 * GRAVITY
     arm_of_force = bench.arm.frame[:3, 1] * 0.1
-    np.testing.assert_allclose(bench.machine.load.felt[:3], [0, 0, -weight], atol=1e-9)
-    np.testing.assert_allclose(bench.machine.load.felt[3:], np.cross(arm_of_force, [0, 0, -weight]), atol=1e-9)
+    np.testing.assert_allclose(bench.machine.load.zeroed_wrench[:3], [0, 0, -weight], atol=1e-9)
+    np.testing.assert_allclose(bench.machine.load.zeroed_wrench[3:], np.cross(arm_of_force, [0, 0, -weight]), atol=1e-9)
     bench.call(1, [*(bench.arm.target_q + [0.3, 0.2, -0.4, 0.6, -0.3, 0.8]), 1.0, 1.0])
     bench.until(lambda: bench.arm.rests)
     bench.call(8)  # zeroed in this attitude, felt again in another
-    np.testing.assert_allclose(bench.machine.load.felt, 0, atol=1e-9)
+    np.testing.assert_allclose(bench.machine.load.zeroed_wrench, 0, atol=1e-9)
     axis = bench.arm.kinematics.jacobian(bench.arm.q)[3:, 4]
     sideways = math.sqrt(1 - axis[2] ** 2)  # the part of gravity across the axis of the next turn
     bench.call(1, [*(bench.arm.target_q + [0, 0, 0, 0, 0.5, 0]), 1.0, 1.0])
     bench.until(lambda: bench.arm.rests)
-    assert np.linalg.norm(bench.machine.load.felt[:3]) == pytest.approx(
+    assert np.linalg.norm(bench.machine.load.zeroed_wrench[:3]) == pytest.approx(
         2 * weight * sideways * math.sin(0.25), rel=1e-6
     )
 

@@ -22,19 +22,19 @@ def test_a_folder_comes_with_all_or_not_at_all(tmp_path: Path) -> None:
 
 
 def test_a_folder_that_somebody_makes_meanwhile_stays_as_it_is(tmp_path: Path) -> None:
-    with pytest.raises(FileExistsError) as told, whole_folder(tmp_path / "set"):
+    with pytest.raises(FileExistsError) as raised, whole_folder(tmp_path / "set"):
         (tmp_path / "set" / "theirs").mkdir(parents=True)
-    assert told.value.filename == str(tmp_path / "set")
+    assert raised.value.filename == str(tmp_path / "set")
     assert [str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")] == ["set", "set/theirs"]
 
 
 def test_an_error_names_the_folder_that_was_asked_for(tmp_path: Path) -> None:
-    with pytest.raises(OSError, match="No space") as told, whole_folder(tmp_path / "set") as place:
+    with pytest.raises(OSError, match="No space") as raised, whole_folder(tmp_path / "set") as place:
         raise OSError(errno.ENOSPC, "No space left on device", str(place / "one"))
-    assert told.value.filename == str(tmp_path / "set")
-    with pytest.raises(OSError, match="No such file") as told, whole_folder(tmp_path / "set"):
+    assert raised.value.filename == str(tmp_path / "set")
+    with pytest.raises(OSError, match="No such file") as raised, whole_folder(tmp_path / "set"):
         (tmp_path / "nowhere").read_text()
-    assert told.value.filename == str(tmp_path / "nowhere")
+    assert raised.value.filename == str(tmp_path / "nowhere")
 
 
 @pytest.mark.parametrize("links", [True, False])

@@ -19,7 +19,7 @@ PERIOD = 0.1  # [s]
 
 
 class Time:
-    """Passes only when somebody sleeps, or works."""
+    """Passes only in sleep, or in work."""
 
     def __init__(self) -> None:
         self.now = 100.0

@@ -137,7 +137,7 @@ def test_a_stop_ends_the_episode_keeps_it_and_waits_for_recover(
             upper.command(None)
         until(lambda: _refuses(lower, SafetyViolation), "the other arm's stop")
         with pytest.raises(DeviceError):
-            shared.rig.reset()  # nothing begins anew by itself
+            shared.rig.reset()  # nothing starts again by itself
         if stop == "estop":
             with pytest.raises(EmergencyStop, match="must release it"):
                 upper.recover()  # type: ignore[attr-defined]
@@ -176,13 +176,13 @@ def test_a_camera_that_shows_nothing_new_ends_the_episode(shared: Opened, fault:
     assert "sensor 'right'" in str(failed) and "ms old, limit 1000 ms" in str(failed) and why in str(failed)
     assert len(failed.episode.steps) >= 3
     if why:
-        told = shared.rig.diagnostics()
-        assert told["pictures_repeated_right" if fault == "freeze" else "pictures_damaged_right"] > 0
+        diagnostics = shared.rig.diagnostics()
+        assert diagnostics["pictures_repeated_right" if fault == "freeze" else "pictures_damaged_right"] > 0
     shared.rig.reset()
 
 
 def test_ctrl_c_in_a_reset_leaves_arms_that_rest(shared: Opened, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nobody goes on asking them; the next reset begins anew."""
+    """No request follows; the next reset starts again."""
     waited = robot.rig.reset.wait_for_arrival
 
     def interrupted(arms: Mapping[str, CommandedArm], timeout: float) -> None:

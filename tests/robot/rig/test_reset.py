@@ -29,10 +29,10 @@ class StubArm:
     def __init__(self, name: str, pose: Pose, log: list[object]) -> None:
         self.name, self.pose, self._log = name, pose, log
         self.stopped = False
-        self.told: object = "what was seen last"
+        self.reported: object = "the last tactile values"
 
     def report_tactile(self, shown: object) -> None:
-        self.told = shown
+        self.reported = shown
 
     def state(self, at: float | None = None) -> ArmState:
         return ArmState(self.pose, np.zeros(6), np.zeros(6), np.zeros(6), 0.0)
@@ -91,7 +91,7 @@ class Scene:
     arms: bool = True
     placement: float = 0.0
     log: list[object] = field(default_factory=list)
-    told: list[str] = field(default_factory=list)
+    reports: list[str] = field(default_factory=list)
     real_time = False
     data_timeout = 0.1
 
@@ -108,7 +108,7 @@ class Scene:
             touch_sensing=None if self.touch_at is None else self,
             confirm=self.confirm,
             placement=self.placement,
-            report=self.told.append,
+            report=self.reports.append,
         )
 
     def wait_for_data(self) -> None:
@@ -142,7 +142,7 @@ def test_it_retreats_along_its_own_axis_then_goes_to_the_start() -> None:
         Pose(np.array([5e-3, 0, 10e-3]), UPPER.quaternion),
     )
     scene.reset.clear(0)
-    assert scene.lower.told is scene.upper.told is None  # until it sees anew, nothing is decided by what it saw
+    assert scene.lower.reported is scene.upper.reported is None  # old tactile values are not used
     back = dict(scene.motions()[:2])
     assert back["lower"].position == pytest.approx([5e-3, 0, -RETREAT_DISTANCE])
     assert back["upper"].position == pytest.approx([5e-3, 0, 10e-3 + RETREAT_DISTANCE])  # it faces down
@@ -232,7 +232,7 @@ def test_a_dry_run_moves_nothing_and_still_asks_and_observes() -> None:
     scene = Scene(arms=False, touch_at=1.0)
     scene.reset.clear(0)
     scene.reset.touch()
-    assert scene.told == []
+    assert scene.reports == []
     assert scene.motions() == [] and ("lower", "zero") not in scene.log
     assert scene.log == ["wait", "reference", "asked", "wait", "restart"]
 
@@ -309,5 +309,5 @@ def test_in_motion_no_touch_goes_back_to_the_start(moving: Moving, monkeypatch: 
         moving.reset.touch()
     assert moving.lower.pose.position == pytest.approx(LOWER.position)
     assert moving.upper.pose.position == pytest.approx(UPPER.position)
-    assert moving.lower.told is None  # the way back is not guarded by what was seen before
-    assert moving.told[-1] == "back to the start" and "approach: 10.0 mm of at most 10 mm" in moving.told
+    assert moving.lower.reported is None  # old tactile values do not guard the motion back
+    assert moving.reports[-1] == "back to the start" and "approach: 10.0 mm of at most 10 mm" in moving.reports

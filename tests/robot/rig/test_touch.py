@@ -38,7 +38,7 @@ LATEST = 0.75  # no picture for 2.5 periods of 0.1 s, no action for 0.2 s: then 
 class Opened:
     lab: Lab
     rig: Rig
-    told: list[str] = field(default_factory=list)
+    reports: list[str] = field(default_factory=list)
 
     @property
     def arm(self) -> CommandedArm:
@@ -54,9 +54,9 @@ class Opened:
 @pytest.fixture(scope="module")
 def opened(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Opened]:
     file = copy_of("ur5e-one", tmp_path_factory.mktemp("rig"), 65)
-    told: list[str] = []
-    with Lab(file) as lab, open_rig(file, confirm=lambda question: True, report=told.append) as rig:
-        yield Opened(lab, rig, told)
+    reports: list[str] = []
+    with Lab(file) as lab, open_rig(file, confirm=lambda question: True, report=reports.append) as rig:
+        yield Opened(lab, rig, reports)
 
 
 @pytest.mark.deep
@@ -84,7 +84,7 @@ def test_the_approach_goes_at_its_speed_and_stops_on_contact(opened: Opened, mon
     assert speeds.max() <= SPEED * 1.001
     assert (speeds > 0.999 * SPEED).mean() > 0.2  # it waits only where no pictures come: more often on a busy machine
     assert 0.0 < depth < SPEED * LATEST
-    assert any("mm of at most 40 mm" in words for words in opened.told)
+    assert any("mm of at most 40 mm" in words for words in opened.reports)
 
 
 @pytest.mark.deep

@@ -60,7 +60,7 @@ def test_the_page_says_what_the_cases_show() -> None:
     _, after = rest.split(END)
     if "WRITE_PAGE" in os.environ:
         PAGE.write_text(f"{before}{BEGIN}{table()}{END}{after}", encoding="utf-8")
-    assert rest == f"{table()}{END}{after}", "WRITE_PAGE=1 pytest this test writes the page anew"
+    assert rest == f"{table()}{END}{after}", "WRITE_PAGE=1 pytest this test writes the page again"
 
 
 @pytest.fixture(scope="module")

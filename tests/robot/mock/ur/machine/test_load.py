@@ -1,4 +1,4 @@
-"""What the arm feels of a payload that it carries, was told of, or zeroed away: against statics by hand."""
+"""The measured force of a payload that is carried, configured, or zeroed: against statics by hand."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_a_load_told_with_its_centre_is_not_felt_and_an_untold_one_is(bench: Ben
     bench.call(command, [0.5, *CENTRE])
     for felt in attitudes(bench):
         np.testing.assert_allclose(felt, 0, atol=1e-9)
-    bench.call(command, [0.7, *CENTRE])  # told too much: as if something pulled it up
+    bench.call(command, [0.7, *CENTRE])  # a payload that is too heavy: as if something pulled it up
     for felt in attitudes(bench):
         np.testing.assert_allclose(felt, -weight(bench, 0.2), atol=1e-9)
 
@@ -110,8 +110,8 @@ def test_a_mock_carries_what_it_was_started_with() -> None:
                 untold = client.wait(lambda state: True)
                 assert untold["actual_TCP_force"][2] == pytest.approx(-0.4 * GRAVITY)
                 client.call(17, [0.4, *CENTRE])
-                told = client.wait(lambda state: abs(state["actual_TCP_force"][2]) < 1e-9)
-                np.testing.assert_allclose(told["actual_TCP_force"], 0, atol=1e-9)
+                state_without_force = client.wait(lambda state: abs(state["actual_TCP_force"][2]) < 1e-9)
+                np.testing.assert_allclose(state_without_force["actual_TCP_force"], 0, atol=1e-9)
             carrier.faults.reset()
     with pytest.raises(MockError, match="payload"):
         MockUR(wire_host(30), payload=(0.4, math.nan, 0, 0))

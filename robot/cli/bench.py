@@ -16,7 +16,7 @@ Group = Literal["all", "press", "squeeze", "materials", "scenes", "oracles", "re
 
 
 def bench(
-    group: Annotated[Group, typer.Argument(help="Which cases; all: all but robot.")] = "all",
+    group: Annotated[Group, typer.Argument(help="Cases; all: all except robot.")] = "all",
     json_: Annotated[
         Path | None,
         typer.Option(

@@ -317,5 +317,5 @@ def _show_transfer(rows: list[SummaryRow], episodes: int) -> None:
         )
         for row in rows
     ]
-    columns = ("policy", "", "success [%]", "distance [mm]", "felt - true, rms [mm]", "errors")
+    columns = ("policy", "", "success [%]", "distance [mm]", "tactile - true, rms [mm]", "errors")
     show_table(f"{episodes} episodes each, 95 % intervals", columns, shown, left={0, 1})

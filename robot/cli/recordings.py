@@ -69,7 +69,7 @@ def lerobot(
     out: Annotated[Path, typer.Option(metavar="DIR", help="New folder of the data set.")],
     task: Annotated[
         str | None,
-        typer.Option(metavar="TEXT", help="The task in words.", show_default="from each episode's task and goal"),
+        typer.Option(metavar="TEXT", help="Description of the task.", show_default="from each episode's task and goal"),
     ] = None,
     maps: Annotated[
         bool, typer.Option("--maps/--no-maps", help="With heights, gradients and flow; without, it loads faster.")

@@ -32,19 +32,19 @@ AXES = ("roll", "pitch", "yaw")
 class IndenterShape(OptionGroup):
     """Options that describe the indenter and its orientation."""
 
-    radius: Annotated[Any, length_option("Of a sphere or cylinder; 4 mm if left out.")] = None
-    height: Annotated[Any, length_option("Of a cylinder; 5 mm if left out.")] = None
+    radius: Annotated[Any, length_option("Of a sphere or cylinder; 4 mm by default.")] = None
+    height: Annotated[Any, length_option("Of a cylinder; 5 mm by default.")] = None
     size: Annotated[
         Any,
-        typer.Option(parser=quantities_parser("length", 3), metavar="X,Y,Z", help="Of a box; 5, 5, 5 mm if left out."),
+        typer.Option(parser=quantities_parser("length", 3), metavar="X,Y,Z", help="Of a box; 5, 5, 5 mm by default."),
     ] = None
-    edge_radius: Annotated[Any, length_option("Of a box's or cylinder's edges; half an element if left out.")] = None
+    edge_radius: Annotated[Any, length_option("Of a box's or cylinder's edges; half an element by default.")] = None
     scale: Annotated[
-        float | None, typer.Option(help="Metres per unit of the .stl file; 0.001 if left out.", show_default=False)
+        float | None, typer.Option(help="Metres per unit of the .stl file; 0.001 by default.", show_default=False)
     ] = None
     down: Annotated[
         Literal["-z", "+z", "-x", "+x", "-y", "+y"] | None,
-        typer.Option(help="Side of the indenter, in its own axes, that presses; -z if left out.", show_default=False),
+        typer.Option(help="Side of the indenter, in its own axes, that presses; -z by default.", show_default=False),
     ] = None
     rotation: Annotated[
         Any,

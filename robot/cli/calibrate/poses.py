@@ -104,7 +104,7 @@ def _take_touches(
 
     config = load_rig(rig, overrides=overrides).config
     opened = without_task(config, arm, sensor)
-    confirm_motion(config, f"Does the ball stand fixed and free below the start of arm '{arm}', and may the arm move?")
+    confirm_motion(config, f"Is the ball fixed and free below the start of arm '{arm}', and may the arm move?")
     with (
         _recorded_session(folder / "touches.yaml", "touch", "touches", plan.touches) as (session, write),
         open_rig(opened, confirm=lambda question: True) as running,

@@ -158,5 +158,5 @@ class MockCamera(Child):
 
 def _require_within(value: float, low: float, high: float, what: str) -> float:
     if not low <= value <= high:  # also NaN
-        raise ValueError(f"mock camera, {what}: must lie within {low:g} and {high:g}, got {value}")
+        raise ValueError(f"mock camera, {what}: must be within {low:g} and {high:g}, got {value}")
     return value

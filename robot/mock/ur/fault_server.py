@@ -102,7 +102,7 @@ def _six_numbers(values: list[float]) -> FloatArray:
 
 def _require_number(value: float, name: str, low: float = -MAX_NUMBER, high: float = MAX_NUMBER) -> float:
     if not low <= value <= high:  # also refuses NaN
-        raise ValueError(f"{name} must lie within {low:g} and {high:g}, got {value}")
+        raise ValueError(f"{name} must be within {low:g} and {high:g}, got {value}")
     return float(value)
 
 
@@ -161,7 +161,7 @@ def _force_limit(controller: Controller, newtons: float) -> None:
 
 def _drop(controller: Controller, probability: float, seed: int) -> None:
     if not 0 <= probability <= 1:
-        raise ValueError(f"probability must lie within 0 and 1, got {probability}")
+        raise ValueError(f"probability must be within 0 and 1, got {probability}")
     controller.faults.drop, controller.faults.random = float(probability), np.random.default_rng(seed)
 
 

@@ -247,7 +247,7 @@ def test_faults_beyond_reason_are_refused(camera: MockCamera) -> None:
         lambda: camera.brightness(-1.0),
         lambda: camera.flip(-1),
     ):
-        with pytest.raises(ValueError, match="must lie within"):
+        with pytest.raises(ValueError, match="must be within"):
             ask()
 
 
@@ -264,7 +264,7 @@ def test_faults_beyond_reason_are_refused(camera: MockCamera) -> None:
     ],
 )
 def test_options_beyond_reason_are_refused(options: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match="must lie within"):
+    with pytest.raises(ValueError, match="must be within"):
         MockCamera(host=HOST, **options)  # type: ignore[arg-type]
 
 

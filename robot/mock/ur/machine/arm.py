@@ -52,7 +52,7 @@ class Arm:
         if self.target_q.shape != (6,) or not np.isfinite(self.target_q).all():
             raise ValueError(f"joints must be 6 finite angles [rad], got {list(joints)}")
         if float(np.abs(self.target_q).max()) > JOINT_RANGE:
-            raise ValueError(f"joints must lie within +-2 pi rad, got {list(joints)}")
+            raise ValueError(f"joints must be within +-2 pi rad, got {list(joints)}")
         self.target_qd, self.target_qdd = np.zeros(6), np.zeros(6)
         self.set_q, self.set_qd = self.target_q.copy(), np.zeros(6)
         self.q, self.qd = self.target_q.copy(), np.zeros(6)

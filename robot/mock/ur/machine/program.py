@@ -43,7 +43,7 @@ class Program:
     def step(self) -> None:
         """Runs the main program, then its threads. Raises ProgramError if the program ends with an error."""
         if not _advance(self.main):
-            self.machine.stop("stopped by its client" if self.name == CONTROL_SCRIPT else "it has come to its end")
+            self.machine.stop("stopped by its client" if self.name == CONTROL_SCRIPT else "it has ended")
             return
         for name, thread in list(self.threads.items()):
             if self.threads.get(name) is thread and not _advance(thread):

@@ -78,7 +78,7 @@ def freedrive_end(p: Program) -> None:
 
 @command(31, needs="protective_stop()")
 def protective_stop(p: Program) -> None:
-    p.machine.protective_stop("asked for by the program")
+    p.machine.protective_stop("requested by the program")
 
 
 @command(56, 57)

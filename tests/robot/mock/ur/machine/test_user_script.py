@@ -49,7 +49,7 @@ def test_calls_are_done_in_their_order(bench: Bench) -> None:
     assert bench.machine.outputs.digital == 1 << 17 and bench.arm.tool[2, 3] == 0.1
     assert bench.machine.load.configured_payload == Mass(0.5, (0, 0, 0.05))
     assert bench.machine.out_double[13] == -2.5 and bench.machine.out_int[12] == 2
-    assert any("done: 3" in text for _, text in bench.machine.log) and "come to its end" in bench.machine.stop_reason
+    assert any("done: 3" in text for _, text in bench.machine.log) and "it has ended" in bench.machine.stop_reason
 
 
 @pytest.mark.parametrize(

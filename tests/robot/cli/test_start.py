@@ -32,7 +32,7 @@ def fast(file: Path) -> Path:
 
 
 @pytest.mark.deep
-def test_arms_are_led_to_their_start_and_a_dry_run_follows(tmp_path: Path) -> None:
+def test_start_moves_arms_to_start_then_dry_run(tmp_path: Path) -> None:
     file = fast(copy_of("ur5e-one", tmp_path, 66))
     with Lab(file, offset=AWAY) as lab:
         lab.faults["arm"].wrench([0.0, OFFSET, 0.0, 0.0, 0.0, 0.0])
@@ -60,7 +60,7 @@ def test_arms_are_led_to_their_start_and_a_dry_run_follows(tmp_path: Path) -> No
 
 
 @pytest.mark.deep
-def test_ctrl_c_brakes_an_arm_on_its_way_and_a_no_moves_nothing(tmp_path: Path) -> None:
+def test_start_ctrl_c_brakes_arm_and_no_moves_nothing(tmp_path: Path) -> None:
     file = fast(copy_of("ur5e-one", tmp_path, 66))
     with Lab(file, offset=AWAY) as lab:
         faults, here = lab.faults["arm"], lab.faults["arm"].state().joints
@@ -84,7 +84,7 @@ def test_ctrl_c_brakes_an_arm_on_its_way_and_a_no_moves_nothing(tmp_path: Path) 
         assert state.rests and not state.program and not np.allclose(state.joints, here, atol=1e-3)
 
 
-def test_without_a_terminal_nothing_is_led(tmp_path: Path) -> None:
+def test_start_without_terminal_moves_nothing(tmp_path: Path) -> None:
     result = tacsim("start", str(copy_of("ur5e-one", tmp_path, 66)))
     assert result.exit_code == 2 and "run this from a terminal" in " ".join(result.stderr.split())
     result = tacsim("start", "sim")
@@ -92,7 +92,7 @@ def test_without_a_terminal_nothing_is_led(tmp_path: Path) -> None:
 
 
 @pytest.mark.deep
-def test_an_arm_whose_assistant_is_killed_comes_to_rest(tmp_path: Path) -> None:
+def test_start_killed_process_brings_arm_to_rest(tmp_path: Path) -> None:
     file = fast(copy_of("ur5e-one", tmp_path, 66))
     with Lab(file, offset=AWAY) as lab:
         faults, here = lab.faults["arm"], np.array(lab.faults["arm"].state().joints)
@@ -107,7 +107,7 @@ def test_an_arm_whose_assistant_is_killed_comes_to_rest(tmp_path: Path) -> None:
         assert 0.04 < gone < 0.12  # of 0.157 rad
 
 
-def test_a_no_to_zeroing_leaves_an_arm_that_feels_too_much(tmp_path: Path) -> None:
+def test_start_without_zeroing_keeps_force_fault(tmp_path: Path) -> None:
     file = fast(copy_of("ur5e-one", tmp_path, 66))
     with Lab(file, offset=AWAY) as lab:
         lab.faults["arm"].wrench([0.0, OFFSET, 0.0, 0.0, 0.0, 0.0])

@@ -31,7 +31,7 @@ def message(said: dict[str, object], arrays: dict[str, np.ndarray] | None = None
     return pipe.getvalue()
 
 
-def test_a_message_comes_back_as_it_was() -> None:
+def test_message_round_trip_is_equal() -> None:
     arrays = {
         "image": np.arange(24, dtype=np.uint8).reshape(2, 4, 3),
         "turned": np.arange(6.0).reshape(2, 3).T,  # not contiguous
@@ -49,7 +49,7 @@ def test_a_message_comes_back_as_it_was() -> None:
     assert read_message(pipe) is None
 
 
-def test_a_message_that_is_cut_off_is_the_end_wherever_it_is_cut() -> None:
+def test_read_message_truncated_input_returns_none() -> None:
     whole = message({"do": "move"}, {"a": np.ones(5)})
     assert all(read_message(io.BytesIO(whole[:length])) is None for length in range(len(whole)))
     assert read_message(io.BytesIO(whole)) is not None
@@ -69,7 +69,7 @@ def test_a_message_that_is_cut_off_is_the_end_wherever_it_is_cut() -> None:
         b" " * process.MAX_LINE,
     ],
 )
-def test_what_is_no_message_is_a_value_error(line: bytes) -> None:
+def test_read_message_invalid_input_raises_value_error(line: bytes) -> None:
     with pytest.raises(ValueError):
         read_message(io.BytesIO(line + b"\n" + bytes(16)))
 
@@ -100,7 +100,7 @@ def child(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Ch
     return start
 
 
-def test_a_child_answers_until_it_is_closed_and_leaves_nothing(child: Callable[[str], Child]) -> None:
+def test_child_answers_until_close_and_leaves_no_process(child: Callable[[str], Child]) -> None:
     with child("print('words that are no message')") as running:
         assert running.receive(PATIENCE) == ({"ready": True}, {})
         answer, arrays = running.request({"x": 1}, {"a": np.arange(3)}, timeout=PATIENCE)
@@ -122,7 +122,7 @@ def test_a_child_answers_until_it_is_closed_and_leaves_nothing(child: Callable[[
         ("parent._answers.close(); time.sleep(600)", "has ended, exit status None"),  # closed its end, but lives on
     ],
 )
-def test_what_goes_wrong_there_is_an_error_here(child: Callable[[str], Child], act: str, words: str) -> None:
+def test_child_failure_raises_error_in_parent(child: Callable[[str], Child], act: str, words: str) -> None:
     with child(act) as running:
         running.receive(PATIENCE)
         with pytest.raises(DeviceError, match=words):
@@ -145,9 +145,7 @@ act()
     ("act", "words"),
     [("os._exit(7)", "exit status 7: two"), ("os.kill(os.getpid(), signal.SIGSEGV)", "killed by SIGSEGV: two")],
 )
-def test_the_last_words_of_a_child_are_how_it_ended_and_its_last_line(
-    child: Callable[..., Child], act: str, words: str
-) -> None:
+def test_exit_report_contains_status_and_last_line(child: Callable[..., Child], act: str, words: str) -> None:
     with child(act, LAST) as running:
         running.receive(PATIENCE)
         until(lambda: not running.running, "end of the child")
@@ -157,14 +155,14 @@ def test_the_last_words_of_a_child_are_how_it_ended_and_its_last_line(
     assert running.exit_report == ""
 
 
-def test_a_child_that_does_not_start_is_an_error_with_its_reason(child: Callable[..., Child]) -> None:
+def test_child_that_does_not_start_raises_error_with_reason(child: Callable[..., Child]) -> None:
     why = r"(?s)exit status 1.*No module named 'no_such_module'"
     with child(stand_in="import no_such_module") as running, pytest.raises(DeviceError, match=why):
         running.receive(PATIENCE)
 
 
 @pytest.mark.parametrize("size", [0, 2**20])  # more than a pipe holds: the request itself is stuck
-def test_a_child_that_is_silent_is_ended(child: Callable[[str], Child], size: int) -> None:
+def test_silent_child_is_killed(child: Callable[[str], Child], size: int) -> None:
     with child("pass") as running:
         running.receive(PATIENCE)
         os.kill(running.pid, signal.SIGSTOP)
@@ -173,7 +171,7 @@ def test_a_child_that_is_silent_is_ended(child: Callable[[str], Child], size: in
         assert not alive(running.pid)
 
 
-def test_a_stopped_child_is_closed_by_force(child: Callable[[str], Child]) -> None:
+def test_stopped_child_is_killed_by_close(child: Callable[[str], Child]) -> None:
     running = child("pass")
     running.receive(PATIENCE)
     os.kill(running.pid, signal.SIGSTOP)
@@ -181,7 +179,7 @@ def test_a_stopped_child_is_closed_by_force(child: Callable[[str], Child]) -> No
     assert not alive(running.pid)
 
 
-def test_after_ctrl_c_no_old_answer_is_taken_for_a_new_one(child: Callable[[str], Child]) -> None:
+def test_interrupted_request_answer_is_not_reused(child: Callable[[str], Child]) -> None:
     with child("os.kill(os.getppid(), signal.SIGINT); time.sleep(1)") as running:
         running.receive(PATIENCE)
         with pytest.raises(KeyboardInterrupt):
@@ -190,7 +188,7 @@ def test_after_ctrl_c_no_old_answer_is_taken_for_a_new_one(child: Callable[[str]
             running.request({"new": True}, timeout=PATIENCE)
 
 
-def test_it_may_be_closed_while_another_thread_waits_for_an_answer(child: Callable[[str], Child]) -> None:
+def test_close_during_request_of_other_thread_succeeds(child: Callable[[str], Child]) -> None:
     running = child("time.sleep(600)")
     running.receive(PATIENCE)
     failures: list[str] = []
@@ -217,7 +215,7 @@ def test_it_may_be_closed_while_another_thread_waits_for_an_answer(child: Callab
 
 
 @pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGTERM, signal.SIGINT])
-def test_a_signal_to_all_leaves_the_child_to_its_parent(child: Callable[..., Child], number: signal.Signals) -> None:
+def test_signal_to_process_group_reaches_parent_only(child: Callable[..., Child], number: signal.Signals) -> None:
     """A lost terminal, `systemctl stop`, Ctrl-C; also before the child has come to set anything up."""
     early = f"import os, time\nos.kill(os.getpid(), {int(number)})\ntime.sleep(0.05)\n"
     with child(stand_in=early + STAND_IN.replace("act()", "pass")) as running:
@@ -246,7 +244,7 @@ time.sleep(600)
     ("end", "state"),
     [(signal.SIGKILL, "waits"), (signal.SIGTERM, "waits"), (signal.SIGHUP, "busy"), (signal.SIGKILL, "forked")],
 )
-def test_a_child_dies_with_its_parent(tmp_path: Path, end: signal.Signals, state: str) -> None:
+def test_child_ends_with_its_parent(tmp_path: Path, end: signal.Signals, state: str) -> None:
     late = STAND_IN.replace("parent.serve", "time.sleep(0.2)\nparent.serve")  # by then its parent is gone
     (tmp_path / "stand_in.py").write_text(late.replace("act()", "time.sleep(600)"))
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])}
@@ -264,7 +262,7 @@ def test_a_child_dies_with_its_parent(tmp_path: Path, end: signal.Signals, state
                 os.kill(copy, signal.SIGKILL)
 
 
-def test_a_killed_parent_is_noticed_before_its_children_get_another(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_parent_monitor_detects_exiting_parent_early(monkeypatch: pytest.MonkeyPatch) -> None:
     with subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"]) as parent:
         monkeypatch.setattr(os, "getppid", lambda: parent.pid)  # as long as nobody has waited for it
         monitor = process.ParentMonitor(parent.pid)
@@ -275,7 +273,7 @@ def test_a_killed_parent_is_noticed_before_its_children_get_another(monkeypatch:
     assert monitor.is_parent_gone()
 
 
-def test_without_proc_the_childs_parent_tells(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_parent_monitor_without_proc_uses_parent_id(monkeypatch: pytest.MonkeyPatch) -> None:
     monitor = process.ParentMonitor(2**22 + 1)  # beyond the largest process id
     assert monitor.is_parent_gone()
     monkeypatch.setattr(os, "getppid", lambda: 2**22 + 1)

@@ -19,19 +19,19 @@ ASK = (
 )
 
 
-def test_what_is_allowed_is_what_is_granted() -> None:
+def test_realtime_allowed_equals_granted() -> None:
     answer = subprocess.run([sys.executable, "-c", ASK], capture_output=True, text=True, timeout=60, check=True).stdout
     allowed = realtime.is_realtime_allowed()
     assert answer.split() == [str(allowed), str(allowed), str(realtime.WORKER if allowed else 0)]
 
 
-def test_asking_whether_it_is_allowed_changes_nothing() -> None:
+def test_realtime_check_keeps_priority() -> None:
     before = os.sched_getscheduler(0), os.sched_getparam(0).sched_priority
     realtime.is_realtime_allowed()
     assert (os.sched_getscheduler(0), os.sched_getparam(0).sched_priority) == before
 
 
-def test_a_refusal_is_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_realtime_refusal_returns_false(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object) -> None:
         raise PermissionError(1, "Operation not permitted")
 

@@ -11,7 +11,7 @@ import pytest
 from robot.common.whole_file import move_to_new_path, whole_folder
 
 
-def test_a_folder_comes_with_all_or_not_at_all(tmp_path: Path) -> None:
+def test_whole_folder_is_complete_or_absent(tmp_path: Path) -> None:
     with whole_folder(tmp_path / "new" / "set") as place:
         (place / "one").write_text("1")
         assert not (tmp_path / "new").exists()
@@ -21,14 +21,14 @@ def test_a_folder_comes_with_all_or_not_at_all(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["new"]
 
 
-def test_a_folder_that_somebody_makes_meanwhile_stays_as_it_is(tmp_path: Path) -> None:
+def test_whole_folder_made_by_other_process_is_kept(tmp_path: Path) -> None:
     with pytest.raises(FileExistsError) as raised, whole_folder(tmp_path / "set"):
         (tmp_path / "set" / "theirs").mkdir(parents=True)
     assert raised.value.filename == str(tmp_path / "set")
     assert [str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")] == ["set", "set/theirs"]
 
 
-def test_an_error_names_the_folder_that_was_asked_for(tmp_path: Path) -> None:
+def test_whole_folder_error_names_requested_folder(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="No space") as raised, whole_folder(tmp_path / "set") as place:
         raise OSError(errno.ENOSPC, "No space left on device", str(place / "one"))
     assert raised.value.filename == str(tmp_path / "set")
@@ -38,7 +38,9 @@ def test_an_error_names_the_folder_that_was_asked_for(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("links", [True, False])
-def test_a_file_takes_no_name_that_is_taken(links: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_move_to_new_path_existing_file_is_refused(
+    links: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     if not links:
 
         def refuse(*places: Path) -> None:

@@ -177,13 +177,13 @@ def survives(arms: MockArms, seed: int, steps: int, ports: dict[int, Callable[[r
     assert "Traceback" not in errors, errors[-5000:]
 
 
-def test_abuse(arms: MockArms) -> None:
+def test_random_messages_leave_mock_working(arms: MockArms) -> None:
     survives(arms, 0, 40, WIRE)
     survives(arms, 0, 20, {arms.fault_clients[0].port: door})
 
 
 @pytest.mark.deep
 @pytest.mark.parametrize("seed", [10, 11])
-def test_long_abuse(arms: MockArms, seed: int) -> None:
+def test_many_random_messages_leave_mock_working(arms: MockArms, seed: int) -> None:
     survives(arms, seed, 200, WIRE)
     survives(arms, seed, 100, {arms.fault_clients[0].port: door, **WIRE})

@@ -31,7 +31,7 @@ def pressed(depth: float, x: float = 0.0) -> dict[str, Pose]:
     return {name: se3.compose(pose, ahead) for name, pose in START.items()}
 
 
-def test_force_is_that_of_hertz_and_pushes_the_sensor_back(cell: HertzCell) -> None:
+def test_hertz_cell_force_equals_closed_form(cell: HertzCell) -> None:
     material = cell._gels["lower"].material
     modulus = material.youngs_modulus / (1 - material.poisson_ratio**2)
     cell.move(pressed(0.4e-3, x=1e-3))
@@ -42,7 +42,7 @@ def test_force_is_that_of_hertz_and_pushes_the_sensor_back(cell: HertzCell) -> N
     assert not cell.wrench("upper").any()
 
 
-def test_the_dent_is_that_of_hertz() -> None:
+def test_hertz_cell_dent_equals_closed_form() -> None:
     depth, size = 0.5e-3, (16e-3, 16e-3)
     surface = surface_map(dent(size, depth, 1e-3, -0.5e-3), grid=CanonicalGrid(), markers=None)
     grid = CanonicalGrid()
@@ -56,7 +56,7 @@ def test_the_dent_is_that_of_hertz() -> None:
     assert surface.height[far] == pytest.approx(point[far], rel=0.03)
 
 
-def test_pictures_change_where_the_ball_touches_and_only_there(cell: HertzCell) -> None:
+def test_hertz_cell_image_changes_only_at_contact(cell: HertzCell) -> None:
 
     def picture(depth: float, x: float) -> np.ndarray:
         cell.move(pressed(depth, x))
@@ -71,12 +71,12 @@ def test_pictures_change_where_the_ball_touches_and_only_there(cell: HertzCell) 
     assert middle > len(columns) / 2 + 10
 
 
-def test_a_ball_does_not_go_through_the_gel(cell: HertzCell) -> None:
+def test_hertz_cell_ball_through_gel_is_refused(cell: HertzCell) -> None:
     with pytest.raises(ValueError, match=r"sensor 'lower' is pressed 4\.00 mm into a ball, its gel is 4 mm thick"):
         cell.move(pressed(4e-3))
 
 
-def test_its_process_says_what_is_wrong() -> None:
+def test_hertz_cell_process_reports_errors() -> None:
     scene = load_rig("mock").config.scene
     assert scene is not None
     with pytest.raises(SimServerError, match="has no sensor 'left'; it has lower, upper"):
@@ -89,7 +89,7 @@ def test_its_process_says_what_is_wrong() -> None:
         assert scene_frame.truth is None
 
 
-def test_a_camera_with_noise_shows_another_picture_each_time_and_the_same_surface(cell: HertzCell) -> None:
+def test_hertz_cell_noise_changes_image_not_surface(cell: HertzCell) -> None:
     scene = load_rig("mock").config.scene
     assert scene is not None
     noisy = SensorModel(noise=CameraNoise(deviation=(2, 2, 2)))

@@ -88,9 +88,7 @@ def rests(rig: Opened) -> None:
         (lambda seen: Action({"right": np.zeros(7)}), r"ActionError: .* must be a tacsim.Pose or None"),  # type: ignore[dict-item]
     ],
 )
-def test_the_arms_hold_and_the_error_says_what_was_wrong(
-    shared: Opened, wrong: Callable[[Observation], Any], words: str
-) -> None:
+def test_bad_policy_holds_arms_and_names_error(shared: Opened, wrong: Callable[[Observation], Any], words: str) -> None:
     with pytest.raises(EpisodeFailed, match=words) as failed:
         run_episode(shared.rig, GoingWrong(wrong), None, 9, setup=EpisodeSetup("mine"))
     assert "ended after 3 of 9 steps" in str(failed.value)
@@ -101,7 +99,7 @@ def test_the_arms_hold_and_the_error_says_what_was_wrong(
     shared.rig.reset()  # nothing else is in the way of the next episode
 
 
-def test_a_network_without_an_answer_moves_nothing(shared: Opened, tmp_path: Path) -> None:
+def test_policy_with_nan_output_moves_no_arm(shared: Opened, tmp_path: Path) -> None:
     """It gives 0 / 0 from the first step on."""
     features = Features(sensors=(), arms=("left", "right"), maps=(), touch=("wrench",), goal=False)
     spec = PolicySpec(
@@ -133,7 +131,7 @@ def test_a_network_without_an_answer_moves_nothing(shared: Opened, tmp_path: Pat
     rests(shared)
 
 
-def test_a_policy_that_thinks_too_long_lets_the_arm_rest_and_goes_on_from_there(tmp_path: Path) -> None:
+def test_slow_policy_holds_arm_then_continues(tmp_path: Path) -> None:
     with opened(bare_file(tmp_path, first=43), action_timeout=0.3) as rig:
         arm = rig.rig.arms["east"]
         explanations: list[str] = []

@@ -135,7 +135,7 @@ def no_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(resets.time, "sleep", lambda seconds: None)
 
 
-def test_it_retreats_along_its_own_axis_then_goes_to_the_start() -> None:
+def test_reset_retreats_along_axis_then_moves_to_start() -> None:
     scene = Scene()
     scene.lower.pose, scene.upper.pose = (
         Pose(np.array([5e-3, 0, 0])),
@@ -150,13 +150,13 @@ def test_it_retreats_along_its_own_axis_then_goes_to_the_start() -> None:
     assert se3.pose_distance(there["lower"], LOWER)[0] == se3.pose_distance(there["upper"], UPPER)[0] == 0.0
 
 
-def test_forces_are_zeroed_when_what_is_felt_is_of_now_and_references_come_last() -> None:
+def test_reset_zeroes_present_force_then_reads_references() -> None:
     scene = Scene()
     scene.reset.clear(0)
     assert scene.log[4:] == ["wait", ("lower", "zero"), ("upper", "zero"), "wait", "reference"]
 
 
-def test_a_reference_is_exposed_after_the_arms_came_to_rest() -> None:
+def test_reset_reference_is_exposed_at_rest() -> None:
     """A camera that was held up still has one of before; at that time an arm may not even have been connected."""
     scene, before = Scene(), time.monotonic()
     scene.sensor.late = 3
@@ -164,7 +164,7 @@ def test_a_reference_is_exposed_after_the_arms_came_to_rest() -> None:
     assert scene.log[-5:] == ["wait", *["reference"] * 4]
 
 
-def test_a_camera_that_shows_nothing_new_ends_the_reset(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_reset_without_new_image_raises_timeout(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(resets, "FRAME_TIMEOUT", 0.0)
     scene = Scene()
     scene.sensor.late = 10**9
@@ -172,7 +172,7 @@ def test_a_camera_that_shows_nothing_new_ends_the_reset(monkeypatch: pytest.Monk
         scene.reset.clear(0)
 
 
-def test_the_start_aside_is_of_the_seed_within_bounds_and_the_same_for_all_arms() -> None:
+def test_reset_placement_depends_on_seed_and_is_equal_for_arms() -> None:
     found = []
     for seed in (3, 3, 4):
         scene = Scene(placement=2e-3)
@@ -186,7 +186,7 @@ def test_the_start_aside_is_of_the_seed_within_bounds_and_the_same_for_all_arms(
     assert np.array_equal(found[0], found[1]) and not np.array_equal(found[0], found[2])
 
 
-def test_both_approach_by_steps_until_they_feel_enough() -> None:
+def test_approach_by_steps_ends_at_touch_of_each_arm() -> None:
     scene = Scene(touch_at=3.5e-3)
     scene.reset.clear(0)
     before = len(scene.motions())
@@ -200,7 +200,7 @@ def test_both_approach_by_steps_until_they_feel_enough() -> None:
     assert scene.log.index("asked") < scene.log.index(steps[0])
 
 
-def test_without_a_yes_nothing_moves() -> None:
+def test_touch_without_confirmation_moves_no_arm() -> None:
     scene = Scene(touch_at=1e-3, yes=False)
     scene.reset.clear(0)
     before = len(scene.motions())
@@ -209,7 +209,7 @@ def test_without_a_yes_nothing_moves() -> None:
     assert len(scene.motions()) == before and "restart" not in scene.log
 
 
-def test_no_touch_goes_back_to_the_start() -> None:
+def test_approach_by_steps_without_touch_returns_to_start() -> None:
     scene = Scene(touch_at=1.0)
     scene.reset.clear(0)
     with pytest.raises(NoTouch, match=r"no touch after an approach of 1[01] mm.*back at their start"):
@@ -220,7 +220,7 @@ def test_no_touch_goes_back_to_the_start() -> None:
     assert 8e-3 < farthest - LOWER.position[2] <= PARAMS.approach_distance + 1e-9  # never beyond
 
 
-def test_an_arm_that_is_stopped_ends_it() -> None:
+def test_reset_with_stopped_arm_raises() -> None:
     scene = Scene(touch_at=1.0)
     scene.upper.stopped = True
     with pytest.raises(EmergencyStop):
@@ -228,7 +228,7 @@ def test_an_arm_that_is_stopped_ends_it() -> None:
     assert "reference" not in scene.log
 
 
-def test_a_dry_run_moves_nothing_and_still_asks_and_observes() -> None:
+def test_reset_in_dry_run_asks_and_observes_without_motion() -> None:
     scene = Scene(arms=False, touch_at=1.0)
     scene.reset.clear(0)
     scene.reset.touch()
@@ -263,14 +263,14 @@ def moving() -> Moving:
     return scene
 
 
-def test_in_motion_each_arm_stops_when_its_own_gel_touches(moving: Moving) -> None:
+def test_approach_stops_each_arm_at_its_touch(moving: Moving) -> None:
     moving.reset.touch()
     assert moving.lower.pose.position[2] - LOWER.position[2] == pytest.approx(2e-3)
     assert UPPER.position[2] - moving.upper.pose.position[2] == pytest.approx(5e-3)
     assert moving.log[-1] == "restart"
 
 
-def test_without_new_pictures_nothing_moves(moving: Moving, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_approach_without_new_images_waits(moving: Moving, monkeypatch: pytest.MonkeyPatch) -> None:
     moving.silent = True
     monkeypatch.setattr(resets, "MOVE_TIMEOUT", 0.0)  # gives up at once
     with pytest.raises(DeviceError, match="made no progress for 0 s: no new images"):
@@ -279,19 +279,19 @@ def test_without_new_pictures_nothing_moves(moving: Moving, monkeypatch: pytest.
     assert ("lower", "stop") in moving.log and ("upper", "stop") in moving.log
 
 
-def test_a_slow_approach_goes_on_while_it_comes_farther(moving: Moving, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_slow_approach_continues_while_it_progresses(moving: Moving, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(resets, "MOVE_TIMEOUT", 0.0)  # less than the whole takes
     moving.reset.touch()
     assert moving.log[-1] == "restart"
 
 
-def test_what_cannot_be_known_counts_as_touch(moving: Moving) -> None:
+def test_approach_nan_signal_counts_as_touch(moving: Moving) -> None:
     moving.walls["lower"] = math.nan
     moving.reset.touch()
     assert moving.lower.pose.position == pytest.approx(LOWER.position)
 
 
-def test_whatever_ends_an_approach_in_motion_stops_the_arms(moving: Moving, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_approach_error_stops_arms(moving: Moving, monkeypatch: pytest.MonkeyPatch) -> None:
     del moving.walls["upper"]
     with pytest.raises(KeyError):
         moving.reset.touch()
@@ -302,7 +302,7 @@ def test_whatever_ends_an_approach_in_motion_stops_the_arms(moving: Moving, monk
     assert moving.log[-2:] == [("lower", "stop"), ("upper", "stop")]
 
 
-def test_in_motion_no_touch_goes_back_to_the_start(moving: Moving, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_approach_without_touch_returns_to_start(moving: Moving, monkeypatch: pytest.MonkeyPatch) -> None:
     moving.walls = {"lower": 1.0, "upper": 1.0}
     monkeypatch.setattr(resets, "END_TIMEOUT", 0.0)
     with pytest.raises(NoTouch, match=r"no touch after an approach of 10 mm.*back at their start"):

@@ -24,8 +24,8 @@ from benchmarks.harness.schema import GROUPS, Report
 from benchmarks.pages.page import COLUMNS, cells, setting, write_page
 from benchmarks.pages.picture import PICTURE, draw
 from benchmarks.pages.reliability import ROOT, write_reliability
-from robot.cli.errors import complain
-from robot.cli.output import busy, notes, progress, results, say_files
+from robot.cli.errors import print_error
+from robot.cli.output import busy, notes, print_files, progress, results
 from robot.cli.terminal import Interrupt
 
 
@@ -123,11 +123,11 @@ def _run_promises(marked: str, repeat: int, file: Path, interrupt: Interrupt, *o
             if interrupt():
                 tests.terminate()
                 tests.wait()
-                complain("stopped by a signal; nothing is written")
+                print_error("stopped by a signal; nothing is written")
                 raise typer.Exit(interrupt.exit_code)
             time.sleep(0.1)
     if not file.is_file():
-        complain(f"the tests of the promises ended with exit code {tests.returncode} before any of them ran")
+        print_error(f"the tests of the promises ended with exit code {tests.returncode} before any of them ran")
         raise typer.Exit(1)
     return _read(file)
 
@@ -149,9 +149,9 @@ def show(reports: Sequence[Report]) -> None:
             notes.print(f"not measured: {lack.case}: {lack.cause}")
         failed = [failure for failure in report.failures if failure.cause != NOT_MEASURED]
         for failure in failed:
-            complain(f"{failure.case}, {failure.method}, {failure.resolution}: {failure.cause}")
+            print_error(f"{failure.case}, {failure.method}, {failure.resolution}: {failure.cause}")
         if left := len(report.failures) - len(failed):
-            complain(f"stopped by a signal: {left} cases were not measured")
+            print_error(f"stopped by a signal: {left} cases were not measured")
 
 
 def write(reports: Sequence[Report], json: Path | None, docs: Path | None) -> None:
@@ -170,4 +170,4 @@ def write(reports: Sequence[Report], json: Path | None, docs: Path | None) -> No
         if docs is not None:
             written += write_page(report, docs, devices) if physics else []
             written += [write_reliability(report, docs)] if "robot" in report.metadata.groups else []
-    say_files(*written)
+    print_files(*written)

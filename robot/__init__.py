@@ -1,7 +1,7 @@
-"""Rigs of every kind opened, run and recorded: real arms and cameras, mocks of them, simulations, recordings.
+"""Opens, runs and records rigs of all kinds: real arms and cameras, mocks of them, simulations, recordings.
 
 The names below are public: ``from robot import open_rig, make_env, load_policy``; mock devices are in `robot.mock`. A
-module is imported when a name of it is asked for. The paths of modules are private and may change from one version to
+module is imported when one of its names is used. The paths of modules are private and may change from one version to
 the next.
 """
 
@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 
 
 def _require_own_packages() -> None:
-    """Raises ImportError where a file or folder of the same name would be imported in place of one of our packages: a
-    script's own folder stands before the installed packages on Python's path."""
+    """Raises ImportError if a file or folder of the same name would be imported instead of a package of tacsim: the
+    folder of a script comes before the installed packages on Python's path."""
     here = Path(__file__).resolve().parent.parent
     for package in ("tacsim", "calibration"):
         spec = find_spec(package)

@@ -1,7 +1,8 @@
-"""What can go wrong between this program and its devices. Every text says what, where, and what to do.
+"""Errors of devices. Every text says what failed, where, and what to do.
 
-Errors of one device name it in their text. Those that stop an arm (:class:`ProtectiveStop`, :class:`EmergencyStop`,
-:class:`SafetyViolation`, :class:`LinkLost`) are never answered by carrying on: a person, or `recover`, comes first.
+Errors of one device name it in their text. After an error that stops an arm (:class:`ProtectiveStop`,
+:class:`EmergencyStop`, :class:`SafetyViolation`, :class:`LinkLost`), no motion continues before the operator or
+`recover` has cleared it.
 """
 
 from __future__ import annotations
@@ -10,35 +11,35 @@ from tacsim.limits import LimitExceeded
 
 
 class DeviceError(RuntimeError):
-    """A device did not do what was asked of it. Base of all errors here."""
+    """A device did not do what was requested. Base class of all errors here."""
 
 
 class DeviceNotConnectedError(DeviceError):
-    """The device was asked for something while it is not open, or it could not be reached."""
+    """A request to a device that is not open, or that cannot be reached."""
 
 
 class DeviceAlreadyConnectedError(DeviceError):
-    """The device was opened a second time without being closed."""
+    """The device was opened a second time without being closed first."""
 
 
 class DeviceBusyError(DeviceError):
-    """Somebody else holds the device: another process, or the teach pendant."""
+    """The device is in use by another process, or by the teach pendant."""
 
 
 class StaleObservationError(DeviceError):
-    """What the device delivers is older than its limit: nothing may be decided by it."""
+    """Data of the device are older than their limit, so no decision may use them."""
 
 
 class SafetyViolation(DeviceError, LimitExceeded):
-    """A limit of the rig (force, workspace, keep-out, depth, shear) was broken or would have been; the arm stopped."""
+    """A limit of the rig (force, workspace, keep-out, depth, shear) was or would be exceeded; the arm stopped."""
 
 
 class ProtectiveStop(DeviceError):
-    """The controller stopped the arm by itself (a collision, a singularity, a limit). `recover` may unlock it."""
+    """The controller stopped the arm (a collision, a singularity, a limit). `recover` may unlock it."""
 
 
 class EmergencyStop(DeviceError):
-    """An emergency stop or a safeguard is engaged. A person must release it; nothing here does."""
+    """An emergency stop or a safeguard is engaged. The operator must release it; this program cannot."""
 
 
 class LinkLost(DeviceError):

@@ -16,7 +16,7 @@ from tacsim.rig import Rig
 
 @pytest.fixture
 def mock_rig() -> Iterator[Callable[..., Rig]]:
-    """Opens the whole mock cell: `mock_rig("task=reposition", ...)` takes overrides of configs/rigs/mock.yaml."""
+    """Opens the complete mock cell: `mock_rig("task=reposition", ...)` takes overrides of configs/rigs/mock.yaml."""
     with ExitStack() as stack:
 
         def opened(*overrides: str, rig: str = "mock", task: str | None = None) -> Rig:

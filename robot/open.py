@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from robot.common.code import CodeNotFound as CodeNotFound
-from robot.common.code import attribute
+from robot.common.code import load_attribute
 from robot.rig import RIG_ATTACHMENT as RIG_ATTACHMENT
 from robot.rig import CannotOpen as CannotOpen
 from robot.rig.parts import check_parts, sensor_drivers
@@ -30,23 +30,23 @@ if TYPE_CHECKING:
     from tacsim.gym.vector import TacsimVectorEnv
 
 Model = TypeVar("Model", bound=BaseModel)
-Seen = Features | Mapping[str, Any] | Literal["default"] | None
-Randomised = Randomisation | Mapping[str, Any] | str | Path | None
+FeatureSettings = Features | Mapping[str, Any] | Literal["default"] | None
+RandomiseSettings = Randomisation | Mapping[str, Any] | str | Path | None
 
-# What an environment of a simulated rig begins with; its own overrides come after.
+# First overrides of an environment of a simulated rig; user overrides follow.
 LEARNING = ("scene.preset=learn", "motion=flowing")
 
 
 def load_with_task(rig: str | Path, task: str | TaskConfig | None = None, overrides: Sequence[str] = ()) -> LoadedRig:
-    """`load_rig`, where the task may also be one of a person's own, "package.module:attribute": its configuration, or
-    the class of that, which has a default for everything.
+    """`load_rig`, whose task may also be user-defined, "package.module:attribute": the configuration of a task, or its
+    class, which must have defaults for all fields.
 
-    Runs code of that module, so name only modules you trust. Raises ConfigError, and CodeNotFound for a name that leads
-    to no task.
+    Runs code of that module, so name only modules that you trust. Raises ConfigError, and CodeNotFound for a name that
+    refers to no task.
     """
     if isinstance(task, str) and ":" in task:
         try:
-            found = attribute(task)
+            found = load_attribute(task)
         except CodeNotFound as failure:
             raise CodeNotFound(f"task {failure}") from failure
         task = _task_of(found, task)
@@ -58,7 +58,7 @@ def _task_of(found: object, name: str) -> TaskConfig:
         try:
             found = found.model_validate({})
         except ValueError as failure:
-            raise CodeNotFound(f"task '{name}': not all of it has a default: {failure}") from failure
+            raise CodeNotFound(f"task '{name}': not all its fields have a default: {failure}") from failure
     if not isinstance(found, TaskConfig):
         raise CodeNotFound(f"task '{name}' is a {type(found).__name__}, not the configuration of a task")
     return found
@@ -72,7 +72,7 @@ def open_rig(
     confirm: Callable[[str], bool] | None = None,
     dry_run: bool = False,
     check: Callable[[RigSpec], None] | None = None,
-    tell: Callable[[str], None] = lambda words: None,
+    report: Callable[[str], None] = lambda words: None,
 ) -> Rig:
     """Opens a rig by its name ("sim", "mock", "ur5e", "replay"), the path of its file, or a loaded configuration.
 
@@ -80,10 +80,10 @@ def open_rig(
 
     Args:
         task, overrides: as for `load_with_task`; not for a configuration that is loaded already.
-        confirm: asks a person a question and returns the answer; real arms approach nothing without a yes.
-        dry_run: a rig of hardware does everything but move.
-        check: is told what the rig delivers, before anything of its hardware is opened; raises to refuse it.
-        tell: is told, again and again, what the arms of hardware are doing at a reset, in a few words.
+        confirm: asks the operator a question and returns the answer; real arms approach only after True.
+        dry_run: a rig of hardware does everything except motion.
+        check: gets the specification of the rig before any hardware is opened; raises to refuse it.
+        report: gets a short text about what the arms of hardware are doing in a reset, repeatedly.
 
     Raises:
         ConfigError: the file is wrong.
@@ -100,10 +100,10 @@ def open_rig(
     check_parts(config)
     if dry_run and config.clock != "wall":
         raise CannotOpen(f"rig '{config.name}': a dry run is for hardware; this rig moves no real or mock arm")
-    if config.clock == "wall":  # each kind loads what it needs and no more
+    if config.clock == "wall":  # each kind imports only what it needs
         from robot.rig.hardware_rig import open_hardware
 
-        return open_hardware(config, confirm, dry_run=dry_run, check=check, tell=tell)
+        return open_hardware(config, confirm, dry_run=dry_run, check=check, report=report)
     if config.clock == "sim":
         from robot.rig.sim_rig import open_sim
 
@@ -122,9 +122,9 @@ def open_rig(
 
 
 def rig_spec(config: RigConfig) -> RigSpec:
-    """What the rig will deliver, before anything of it is opened; of a replay its recording is read.
+    """The specification of the rig, before any device is opened; for a replay its recording is read.
 
-    Raises what open_rig raises for a wrong file, a calibration and a recording.
+    Raises the errors of open_rig for a wrong file, a calibration and a recording.
     """
     check_parts(config)
     if config.clock == "wall":
@@ -147,34 +147,34 @@ def make_env(
     overrides: Sequence[str] = (),
     render_mode: str | None = None,
     variants: Sequence[Sequence[str]] = (),
-    randomise: Randomised = None,
-    features: Seen = "default",
+    randomise: RandomiseSettings = None,
+    features: FeatureSettings = "default",
     learning: bool = True,
 ) -> TacsimEnv:
-    """The Gymnasium environment of a task on a rig; entry point of "tacsim.gym:tacsim/Squeeze-v0" and its sisters.
+    """The Gymnasium environment of a task on a rig; entry point of "tacsim.gym:tacsim/Squeeze-v0" and the other tasks.
 
     variants: overrides of scene and task, on top of `overrides`; each reset draws one of them from its seed. The state
     of first contact of each is computed once. The world of a simulated rig is made at the first reset.
-    randomise: draws the variants (`tacsim.Randomisation`, what it is made of, or the name or path of its file).
-    features: what of its observations a policy learns from (`tacsim.Features`, or what it is made of). "default":
-    heights and touch features of order 1 (`default_features`). None: the whole observation, pictures included, in SI
+    randomise: draws the variants (`tacsim.Randomisation`, a mapping of its fields, or the name or path of its file).
+    features: the observations from which a policy learns (`tacsim.Features`, or a mapping of its fields). "default":
+    heights and touch features of order 1 (`default_features`). None: the complete observation, including images, in SI
     units.
-    learning: the shipped simulated rig has preset `learn` and motion `flowing` (LEARNING), unless `overrides` say
-    otherwise. False, and for a rig file of one's own: as the files say.
+    learning: the shipped simulated rig has preset `learn` and motion `flowing` (LEARNING), unless `overrides` change
+    them. False, and for a user-defined rig file: as in the files.
 
-    Raises what open_rig raises, IncompatibleRig for features that the rig does not have, and ValueError for variants
-    that change what must stay (`TacsimEnv.reset`).
+    Raises the errors of open_rig, IncompatibleRig for features that the rig does not have, and ValueError for variants
+    that change fixed settings (`TacsimEnv.reset`).
     """
-    episodes = _rigs_of_episodes(task, rig, overrides, _drawn(variants, randomise), learning)
+    episodes = _rigs_of_episodes(task, rig, overrides, _draw_variants(variants, randomise), learning)
     first = episodes[0][0]
-    seen = _features(features, first)
+    features_of_rig = _resolve_features(features, first)
     if first.clock == "sim":
         from robot.rig.sim_env import open_env
 
-        return open_env(episodes, render_mode, seen)
+        return open_env(episodes, render_mode, features_of_rig)
     if len(episodes) > 1:
         raise CannotOpen(f"rig '{first.name}' is not simulated, so it has no variants")
-    return _env_of_hardware(first, render_mode, seen)
+    return _env_of_hardware(first, render_mode, features_of_rig)
 
 
 def make_vector_env(
@@ -185,25 +185,25 @@ def make_vector_env(
     render_mode: str | None = None,
     variants: Sequence[Sequence[str]] = (),
     autoreset_mode: str | AutoresetMode = "NextStep",
-    randomise: Randomised = None,
-    features: Seen = "default",
+    randomise: RandomiseSettings = None,
+    features: FeatureSettings = "default",
     learning: bool = True,
 ) -> TacsimVectorEnv:
-    """`num_envs` of these environments, whose simulations share launches: what ``gymnasium.make_vec`` makes.
+    """`num_envs` of these environments, whose simulations share launches, as for ``gymnasium.make_vec``.
 
-    Raises as `make_env`, and CannotOpen for a rig that is not simulated, or by physics 'seed'.
+    Raises the errors of `make_env`, and CannotOpen for a rig that is not simulated, or with physics 'seed'.
     """
-    episodes = _rigs_of_episodes(task, rig, overrides, _drawn(variants, randomise), learning)
+    episodes = _rigs_of_episodes(task, rig, overrides, _draw_variants(variants, randomise), learning)
     if episodes[0][0].clock != "sim":
         raise CannotOpen(
             f"rig '{episodes[0][0].name}' is not simulated: only simulations run many at once; use robot.make_env"
         )
     from robot.rig.sim_env import open_vector_env
 
-    return open_vector_env(episodes, num_envs, render_mode, autoreset_mode, _features(features, episodes[0][0]))
+    return open_vector_env(episodes, num_envs, render_mode, autoreset_mode, _resolve_features(features, episodes[0][0]))
 
 
-def _drawn(variants: Sequence[Sequence[str]], randomise: Randomised) -> Sequence[Sequence[str]]:
+def _draw_variants(variants: Sequence[Sequence[str]], randomise: RandomiseSettings) -> Sequence[Sequence[str]]:
     if not isinstance(variants, Sequence):
         raise TypeError(f"variants are a list of lists of overrides, [['task.goal=6 mm']]; {variants!r} was given")
     if randomise is None:
@@ -212,19 +212,19 @@ def _drawn(variants: Sequence[Sequence[str]], randomise: Randomised) -> Sequence
         raise ValueError("give variants, or a randomisation that draws them, not both")
     if isinstance(randomise, (str, Path)):
         return load_model(Randomisation, randomise).draw_overrides()
-    return _made_of(Randomisation, randomise, "randomise").draw_overrides()
+    return _validate_argument(Randomisation, randomise, "randomise").draw_overrides()
 
 
-def _features(given: Seen, config: RigConfig) -> Features | None:
+def _resolve_features(given: FeatureSettings, config: RigConfig) -> Features | None:
     if isinstance(given, str) and given == "default":
         from tacsim.gym.features import default_features
 
         return default_features(config.canonical, tuple(config.sensors), tuple(config.arms))
-    return None if given is None else _made_of(Features, given, "features")
+    return None if given is None else _validate_argument(Features, given, "features")
 
 
-def _made_of(model: type[Model], given: Model | Mapping[str, Any], argument: str) -> Model:
-    """The model that an `argument` of a call is, or is made of. Raises ConfigError."""
+def _validate_argument(model: type[Model], given: Model | Mapping[str, Any], argument: str) -> Model:
+    """The model that an `argument` of a call is, or that its fields give. Raises ConfigError."""
     try:
         return given if isinstance(given, model) else model.model_validate(given)
     except ValidationError as error:
@@ -233,7 +233,7 @@ def _made_of(model: type[Model], given: Model | Mapping[str, Any], argument: str
 
 
 def _env_of_hardware(config: RigConfig, render_mode: str | None, features: Features | None) -> TacsimEnv:
-    """Of a rig that tells the truth of its body without being a simulation of ours, if there is one."""
+    """The environment of a rig of hardware, which may have ground truth of its body from a mock."""
     from tacsim.gym.env import TacsimEnv
     from tacsim.gym.features import FeatureEncoder
     from tacsim.tasks import make_task
@@ -255,7 +255,7 @@ def _rigs_of_episodes(
     variants: Sequence[Sequence[str]],
     learning: bool,
 ) -> list[tuple[RigConfig, str]]:
-    """The rig without a variant, then with each, and the variant in words."""
+    """The rig without a variant, then with each variant; each with the overrides of the variant as text."""
     found: list[tuple[RigConfig, str]] = []
     given = require_texts(overrides)
     shipped = isinstance(rig, str) and is_name(rig)
@@ -277,7 +277,7 @@ def _rigs_of_episodes(
 
 
 def check_sensors(config: RigConfig) -> None:
-    """Raises what opening the rig would raise about its sensors of hardware: CannotOpen,
+    """Raises the errors that opening the rig would raise about its sensors of hardware: CannotOpen,
     calibration.errors.CalibrationError."""
     check_parts(config)
     if config.clock == "wall":

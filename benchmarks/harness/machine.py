@@ -14,7 +14,7 @@ from pathlib import Path
 
 from benchmarks.harness.cache import fingerprint
 from benchmarks.harness.schema import Device, Group, Machine, Metadata
-from robot.common.realtime import allowed
+from robot.common.realtime import is_realtime_allowed
 
 PACKAGES = ("tacsim", "taichi", "numpy", "scipy")  # whose versions are told
 CODE = ("tacsim", "robot", "calibration")
@@ -80,7 +80,7 @@ def _machine(load_before: list[float] | None) -> Machine:
         system=system,
         load_before=load_before,
         load_after=_load(),
-        realtime=allowed(),
+        realtime=is_realtime_allowed(),
         device=_device(),
     )
 

@@ -18,7 +18,7 @@ from typing import Any
 from benchmarks.harness.machine import Run
 from benchmarks.harness.measure import Measurement, forget_peak_memory, peak_memory
 from benchmarks.harness.schema import Failure, Group, Missing, Report, Row
-from robot.common.process import end_with_parent, outside_working_folder
+from robot.common.process import end_with_parent, without_working_folder
 
 EXIT = 10.0  # [s] a process may take to end after its last word
 
@@ -112,7 +112,7 @@ class _Worker:
         context = multiprocessing.get_context("spawn")  # Taichi does not survive a fork
         self._here, there = context.Pipe(duplex=False)
         self._process = context.Process(target=_work, args=(list(cases), repeat, there), daemon=True)
-        with outside_working_folder():
+        with without_working_folder():
             self._process.start()
         there.close()
 

@@ -270,7 +270,7 @@ class URArm(Closing):
         )
         deadline = time.monotonic() + self._timeout
         try:
-            self._worker.ask(asdict(self._worker_config), timeout=self._timeout)
+            self._worker.request(asdict(self._worker_config), timeout=self._timeout)
         except DeviceNotConnectedError as failure:
             if time.monotonic() < deadline:
                 raise
@@ -381,7 +381,7 @@ class URArm(Closing):
                 text += f" (slowly: its loop takes {1e3 * period:.0f} ms, not 2; the machine is too busy)"
         worker = self._worker
         if worker is not None and status == ArmStatus.WORKER_DEAD:
-            text += f" ({worker.last_words})"
+            text += f" ({worker.exit_report})"
         elif record is not None and status == ArmStatus.LINK_LOST:
             text += f" ({self._describe_lost_link(record)})"
         return text

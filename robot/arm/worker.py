@@ -32,8 +32,8 @@ from robot.arm.start_servo import StartServo
 from robot.arm.status import ArmStatus, is_healthy
 from robot.arm.trajectory import PERIOD
 from robot.common.kinematics import Kinematics, displacement, matrix
-from robot.common.process import Lifeline, Parent
-from robot.common.realtime import WORKER, ask_for_realtime
+from robot.common.process import Parent, ParentMonitor
+from robot.common.realtime import WORKER, request_realtime
 from robot.errors import DeviceBusyError, DeviceError, DeviceNotConnectedError
 from tacsim.interface import FloatArray
 
@@ -72,7 +72,7 @@ class Worker:
         self.servo = servo(config, commands_read=self.channel.commands.count, tactile_read=self.channel.tactile.count)
         self._periods = np.full(STATISTICS_PERIODS, PERIOD)
         self._call_limit = TimeLimit(config.link_timeout + margin)  # for calls into the library
-        self._driver = Lifeline(config.parent)  # opens a file, which is impossible after connecting
+        self._driver = ParentMonitor(config.parent)  # opens a file, which is impossible after connecting
         self._last_period_end = 0.0  # [s]
         self._rereads = 0  # reads of the same package
         self._refused_periods = 0  # since the controller refused a command; 0: not refused
@@ -199,7 +199,7 @@ class Worker:
                 self._rereads = 0 if self._read_package() else self._rereads + 1
                 connected = self.receive.isConnected() and self.control.isConnected()
             self._publish(self.servo.status)
-            is_orphan = self._driver.cut()
+            is_orphan = self._driver.is_parent_gone()
             now = time.monotonic()
             # Counts periods, not time: after a suspension, packages may be waiting to be read.
             is_blind = self._rereads > MAX_MISSED_PACKAGES
@@ -377,7 +377,7 @@ def main() -> NoReturn:
     parent = Parent()  # the library prints
     enable_time_limits()
     config = WorkerConfig.from_dict(parent.receive())
-    realtime = config.realtime and ask_for_realtime(WORKER)  # before the library starts its threads
+    realtime = config.realtime and request_realtime(WORKER)  # before the library starts its threads
     try:
         worker = Worker(config)
         worker.record["realtime"] = realtime

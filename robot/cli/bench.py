@@ -1,4 +1,4 @@
-"""`tacsim bench`: time, error and memory, from one run. The programme itself is the checkout's folder `benchmarks`."""
+"""`tacsim bench`: time, error and memory of one run. The benchmarks are in the folder `benchmarks` of the checkout."""
 
 from __future__ import annotations
 
@@ -9,24 +9,24 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from robot.cli.errors import UNUSABLE, complain
+from robot.cli.errors import EXIT_USAGE, print_error
 from robot.cli.output import busy, notes, require_writable
 
 Group = Literal["all", "press", "squeeze", "materials", "scenes", "oracles", "real", "robot"]
 
 
 def bench(
-    group: Annotated[Group, typer.Argument(help="Which cases; all: all but robot.")] = "all",
+    group: Annotated[Group, typer.Argument(help="Cases; all: all except robot.")] = "all",
     json_: Annotated[
         Path | None,
         typer.Option(
-            "--json", metavar="FILE", help="Write the report here, and speed_vs_error.png beside it (not for robot)."
+            "--json", metavar="FILE", help="Write the report here, and speed_vs_error.png next to it (not for robot)."
         ),
     ] = None,
     baselines: Annotated[bool, typer.Option("--baselines", help="Also other methods: many minutes.")] = False,
     long: Annotated[
         bool,
-        typer.Option("--long", help="Also our long rows (fine meshes, 100,000 substeps of rest): many minutes."),
+        typer.Option("--long", help="Also long cases (fine meshes, 100,000 substeps at rest): many minutes."),
     ] = False,
     data: Annotated[
         Path | None,
@@ -38,7 +38,7 @@ def bench(
             min=1,
             max=1000,
             show_default="5; robot without --long: 1",
-            help="Timed repetitions; a case stops at 1 s of them (not robot).",
+            help="Timed repetitions; a case stops after 1 s of them (not robot).",
         ),
     ] = None,
     docs: Annotated[
@@ -54,19 +54,19 @@ def bench(
         ),
     ] = None,
     renew: Annotated[
-        bool, typer.Option("--renew", help="First compute the limit of the ball's press anew: half an hour.")
+        bool, typer.Option("--renew", help="First compute the limit of the ball's press again: half an hour.")
     ] = False,
 ) -> None:
-    """Measure how fast, how exact and how large: every row is time, error and peak memory of one run.
+    """Measure speed, accuracy and memory: every row is time, error and peak memory of one run.
 
-    Compiling is not timed. Exit code 1 if a case failed. Stopped by a signal, it shows what it has measured and writes
-    it to --json, but no pages.
+    Compilation is not timed. Exit code 1 if a case failed. After a signal the command shows what it has measured and
+    writes it to --json, but no pages.
 
-    Group `real` needs --data; `all` leaves it out without. Group `robot` measures what is promised of arms and cameras,
-    on mock hardware; it wants an idle machine, so `all` leaves it out.
+    Group `real` needs --data; without it `all` omits the group. Group `robot` measures the guarantees of arms and
+    cameras on mock hardware; it needs an idle machine, so `all` omits it.
 
-    With TACSIM_DEVICE=cuda the cases run on a GPU, without those that need the CPU. Such a report comes on the page
-    beside one of the CPU: --from CPU.json --from GPU.json --docs docs.
+    With TACSIM_DEVICE=cuda the cases run on a GPU, without those that need the CPU. The page shows such a report next
+    to one of the CPU: --from CPU.json --from GPU.json --docs docs.
 
     Example: tacsim bench press --json press.json
     """
@@ -97,17 +97,19 @@ def bench(
 
 
 def require_checkout(what: str) -> None:
-    """Makes the folder `benchmarks` of the checkout importable, before any other of that name. Raises Exit where there
-    is no checkout: a wheel does not carry the benchmarks."""
+    """Makes the folder `benchmarks` of the checkout importable, before any other of that name. Raises Exit without a
+    checkout: a wheel does not contain the benchmarks."""
     root = Path(__file__).resolve().parents[2]
     if not ((root / "benchmarks" / "command.py").is_file() and (root / "pyproject.toml").is_file()):
-        complain(f"{what} needs a checkout of tacsim, with its folder benchmarks/: clone it and run `pip install -e .`")
-        raise typer.Exit(UNUSABLE)
+        print_error(
+            f"{what} needs a checkout of tacsim, with its folder benchmarks/: clone it and run `pip install -e .`"
+        )
+        raise typer.Exit(EXIT_USAGE)
     if sys.path[0] != str(root):
         sys.path.insert(0, str(root))
 
 
 def from_checkout(module: str) -> Any:
-    """A module of the folder `benchmarks`, after `require_checkout`. It is found by its name, as a plug-in is: the
+    """A module of the folder `benchmarks`, after `require_checkout`. It is imported by name, like a plug-in: the
     benchmarks import this package, which therefore does not import them."""
     return import_module(module)

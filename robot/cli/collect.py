@@ -10,8 +10,16 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import typer
 
-from robot.cli.errors import FAILED, complain
-from robot.cli.options import OptionGroup, Overrides, Preset, SensorModel, grouped, quantity, require_packages
+from robot.cli.errors import EXIT_FAILED, print_error
+from robot.cli.options import (
+    OptionGroup,
+    Overrides,
+    Preset,
+    SensorModel,
+    quantity_parser,
+    require_packages,
+    with_option_groups,
+)
 from robot.cli.output import busy, notes, one_bar, results
 from robot.cli.terminal import Interrupt
 
@@ -24,64 +32,65 @@ collect = typer.Typer(no_args_is_help=True, help="Make sets of presses or of epi
 
 NUMBER = re.compile(r"\s*[-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?\s*")
 
-Count = Annotated[int, typer.Option(min=1, max=10_000_000, help="How many; more than before makes a set longer.")]
+Count = Annotated[int, typer.Option(min=1, max=10_000_000, help="Number; more than before extends a set.")]
 OutSet = Annotated[
-    Path, typer.Option("--out", metavar="DIR", help="Folder of the set; one that was begun by this command goes on.")
+    Path,
+    typer.Option("--out", metavar="DIR", help="Folder of the set; a set that this command has started is continued."),
 ]
 Seed = Annotated[int, typer.Option(min=0, help="Same seed, same set.")]
 Workers = Annotated[
-    int | None, typer.Option(min=1, max=1024, help="Processes on this machine.", show_default="one a core")
+    int | None, typer.Option(min=1, max=1024, help="Processes on this machine.", show_default="one per core")
 ]
 Ray = Annotated[
     str | None,
-    typer.Option(
-        "--ray", metavar="ADDRESS", help="Make it on a Ray cluster: HOST:PORT, auto, or local (extra cluster)."
-    ),
+    typer.Option("--ray", metavar="ADDRESS", help="Use a Ray cluster: HOST:PORT, auto, or local (extra cluster)."),
 ]
 
 
-class Between(NamedTuple):
-    """Least and greatest, and how a person said it."""
+class Range(NamedTuple):
+    """Minimum and maximum [SI], and the text of the option."""
 
     low: float
     high: float
     text: str
 
 
-def between(kind: str) -> Callable[[str], Between]:
+def range_parser(kind: str) -> Callable[[str], Range]:
     """Parser of an option that is one length or angle, or a range of them: "0.1..1.0mm"."""
 
-    def parse(text: str) -> Between:
+    def parse(text: str) -> Range:
         first, dots, second = str(text).partition("..")
         if not dots:
             second = first
         elif NUMBER.fullmatch(first):
             first += NUMBER.sub("", second, count=1)
-        low, high = (quantity(kind)(part.strip()) for part in (first, second))
+        low, high = (quantity_parser(kind)(part.strip()) for part in (first, second))
         if low > high:
-            raise typer.BadParameter(f"'{text}' goes from the larger to the smaller; say {second}..{first}")
-        return Between(low, high, text)
+            raise typer.BadParameter(f"'{text}' goes from the larger to the smaller value; write {second}..{first}")
+        return Range(low, high, text)
 
     return parse
 
 
-def range_of(kind: str, help_: str) -> Any:
-    return typer.Option(parser=between(kind), metavar="RANGE", help=help_)
+def range_option(kind: str, help_: str) -> Any:
+    return typer.Option(parser=range_parser(kind), metavar="RANGE", help=help_)
 
 
 class PressRanges(OptionGroup):
     """Options whose values are drawn for each press."""
 
-    depth: Annotated[Any, range_of("length", "How deep below the untouched gel.")] = "0.1..1.0mm"
+    depth: Annotated[Any, range_option("length", "Depth below the surface of the untouched gel.")] = "0.1..1.0mm"
     pose: Annotated[
-        Literal["random", "centred"], typer.Option(help="random: anywhere in the picture, turned any way.")
+        Literal["random", "centred"], typer.Option(help="random: at any position in the image, with any rotation.")
     ] = "random"
-    tilt: Annotated[Any, range_of("angle", "Off the vertical, any way; of random poses.")] = "0..5deg"
-    shear: Annotated[Any, range_of("length", "Then sideways, any way.")] = "0"
-    twist: Annotated[Any, range_of("angle", "Then about the vertical.")] = "0"
+    tilt: Annotated[Any, range_option("angle", "Angle to the vertical in random directions; of random poses.")] = (
+        "0..5deg"
+    )
+    shear: Annotated[Any, range_option("length", "Then slide in a random direction.")] = "0"
+    twist: Annotated[Any, range_option("angle", "Then rotate about the vertical.")] = "0"
 
 
-@grouped
+@with_option_groups
 def press(
     out: OutSet,
     *,
@@ -98,10 +107,10 @@ def press(
     ray: Ray = None,
     set_: Overrides = None,
 ) -> None:
-    """Press objects on a gel, each elsewhere: pictures with heights, forces, contact, flow and poses, in parquet files.
+    """Press objects on a gel at random poses: images with heights, forces, contact, flow and poses, in parquet files.
 
-    Loads by `datasets.load_dataset("DIR")`; DIR/README.md says what is in it. Killed anywhere, the same command goes
-    on. --set changes the scene (tacsim schema scene). Needs the extra 'export'.
+    Load it with `datasets.load_dataset("DIR")`; DIR/README.md describes it. After an interruption, the same command
+    continues. --set changes the scene (tacsim schema scene). Needs the extra 'export'.
 
     Example: tacsim collect press --depth 0.1..1.0mm --count 500 --out presses
     """
@@ -132,7 +141,7 @@ def press(
             files = {**files, place: Path(background).read_bytes()}
             light = model.lighting.model_copy(update={"background": place})
             model = model.model_copy(update={"lighting": light})
-        settings = _checked(
+        settings = _validate(
             PressSet, seed=seed, objects=known, scene=scene, sensor=model,
             depth=drawn.depth[:2], pose=drawn.pose, tilt=drawn.tilt[:2] if drawn.pose == "random" else (0.0, 0.0),
             shear=drawn.shear[:2], twist=drawn.twist[:2],
@@ -142,8 +151,8 @@ def press(
         said = [*said, f"pressing side of each mesh: {name}; --set indenter.roll and indenter.pitch choose another"]
     for words in said:
         notes.print(words)
-    command = _command("press", given)
-    _run(PressJob(settings, count), out, files, command, workers, ray)
+    command = _command_line("press", given)
+    _make_set(PressJob(settings, count), out, files, command, workers, ray)
 
 
 def episodes(
@@ -157,19 +166,19 @@ def episodes(
     ] = None,
     count: Count = 10,
     steps: Annotated[
-        int | None, typer.Option(min=1, max=1_000_000, help="Of each.", show_default="the task's; else 40")
+        int | None, typer.Option(min=1, max=1_000_000, help="Of each episode.", show_default="the task's; else 40")
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of the first; each has one more than the one before.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Of the first episode; each next one adds 1.")] = 0,
     randomise: Annotated[
-        str | None, typer.Option(help="What differs from episode to episode: squeeze, reposition, or a path.")
+        str | None, typer.Option(help="Randomisation of the episodes: squeeze, reposition, or a path.")
     ] = None,
     workers: Workers = None,
     ray: Ray = None,
     set_: Overrides = None,
 ) -> None:
-    """Play episodes on a simulated rig: DIR/episode-00000.mcap and so on, for tacsim export lerobot DIR.
+    """Run episodes on a simulated rig: DIR/episode-00000.mcap and so on, for tacsim export lerobot DIR.
 
-    Killed anywhere, the same command goes on.
+    After an interruption, the same command continues.
 
     Example: tacsim collect episodes sim --task squeeze --randomise squeeze --count 20 --out episodes
     """
@@ -184,20 +193,20 @@ def episodes(
         from tacsim.models.randomisation import Randomisation
 
         drawn = None if randomise is None else load_model(Randomisation, randomise)
-        settings = _checked(
+        settings = _validate(
             EpisodeSet, rig=rig, task=task, overrides=tuple(set_ or ()), policy=policy, steps=steps, seed=seed,
             randomise=drawn,
         )  # fmt: skip
         job = EpisodeJob(settings, count)
         job.check()
-    _run(job, out, {}, _command(f"episodes {shlex.quote(rig)}", given), workers, ray)
+    _make_set(job, out, {}, _command_line(f"episodes {shlex.quote(rig)}", given), workers, ray)
 
 
-def _run(
+def _make_set(
     job: PressJob | EpisodeJob, out: Path, files: dict[str, bytes], command: str, workers: int | None, ray: str | None
 ) -> None:
-    """Makes the set, shows how far it is, and says how it went."""
-    quiet_time = 10.0  # without a terminal, how far it is is told so often [s]
+    """Makes the set, and shows its progress and a summary."""
+    report_interval = 10.0  # between two lines of progress without a terminal [s]
     import time
 
     from robot.collect.collect import collect as make
@@ -205,45 +214,47 @@ def _run(
     from tacsim.compute.threads import core_count
 
     begun = said = time.perf_counter()
-    there = 0
+    done_count = 0
     with Interrupt() as interrupt, one_bar("starting (the first run compiles the kernels)") as bar:
 
-        def tell(done: int, total: int) -> None:
-            nonlocal there, said
-            there = done
-            bar.say(job.settings.kind)
-            bar.count(done, total)
-            if not notes.is_terminal and (done == total or time.perf_counter() - said > quiet_time):
+        def report_progress(done: int, total: int) -> None:
+            nonlocal done_count, said
+            done_count = done
+            bar.set_text(job.settings.kind)
+            bar.set_progress(done, total)
+            if not notes.is_terminal and (done == total or time.perf_counter() - said > report_interval):
                 said = time.perf_counter()
                 notes.print(f"{done} of {total}")
 
         try:
             number = workers if workers is not None else core_count()
-            done = make(job, out, files, command, workers=number, cluster=ray, tell=tell, stop=interrupt)
+            done = make(job, out, files, command, workers=number, cluster=ray, tell=report_progress, stop=interrupt)
         except Stopped:
-            complain(f"stopped by a signal; {there} of {job.count} are there. The same command goes on")
+            print_error(
+                f"stopped by a signal; {done_count} of {job.count} are finished. Run the same command again to continue"
+            )
             raise typer.Exit(interrupt.exit_code) from None
-    _say(done, job.count, time.perf_counter() - begun, out)
+    _print_summary(done, job.count, time.perf_counter() - begun, out)
     if len(done.failures) == job.count:
-        complain(f"all failed; the first: {done.failures[min(done.failures)]}")
-        raise typer.Exit(FAILED)
+        print_error(f"all failed; the first error: {done.failures[min(done.failures)]}")
+        raise typer.Exit(EXIT_FAILED)
 
 
-def _say(done: Collected, count: int, seconds: float, out: Path) -> None:
+def _print_summary(done: Collected, count: int, seconds: float, out: Path) -> None:
     if done.made:
         spent = sum(done.seconds.values())
         parts = ", ".join(f"{name} {100 * part / spent:.0f} %" for name, part in done.seconds.most_common())
         results.print(
-            f"{done.made} made in {seconds:.1f} s by {len(done.workers)}: {done.made / seconds:.2f} a second; "
+            f"{done.made} made in {seconds:.1f} s by {len(done.workers)}: {done.made / seconds:.2f} per second; "
             f"of their time {parts}; {done.bytes / 2**20:.1f} MiB written in {done.writing:.1f} s"
         )
     if done.failures:
-        notes.print(f"{len(done.failures)} of {count} failed; why is in {out / 'failures.jsonl'}")
+        notes.print(f"{len(done.failures)} of {count} failed; the reasons are in {out / 'failures.jsonl'}")
     results.print(str(out))
 
 
-def _checked(model: Any, **values: Any) -> Any:
-    """A model of these values. Raises SetError in the words of what it refuses."""
+def _validate(model: Any, **values: Any) -> Any:
+    """A model of these values. Raises SetError with the first message of the validation."""
     from pydantic import ValidationError
 
     from robot.collect.job import SetError
@@ -256,7 +267,7 @@ def _checked(model: Any, **values: Any) -> Any:
         raise SetError(f"{where}: {first['msg']}".removeprefix(": ").replace("Value error, ", "")) from None
 
 
-def _command(what: str, given: Sequence[tuple[str, str | None, str | None]]) -> str:
-    """The command that makes this set, without options that have their defaults."""
+def _command_line(what: str, given: Sequence[tuple[str, str | None, str | None]]) -> str:
+    """The command that makes this set, without options at their defaults."""
     words = [shlex.join((option, value)) for option, value, default in given if value is not None and value != default]
     return " ".join(["tacsim collect", what, *words])

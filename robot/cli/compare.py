@@ -1,4 +1,4 @@
-"""`tacsim compare`: how alike two sources of tactile frames are."""
+"""`tacsim compare`: the similarity of two sources of tactile frames."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from robot.cli.errors import complain
-from robot.cli.options import OptionGroup, Out, Overrides, grouped
-from robot.cli.output import busy, counted, new_directory, notes, results, say_files, show_table, warn, writing
+from robot.cli.errors import print_error
+from robot.cli.options import OptionGroup, Out, Overrides, with_option_groups
+from robot.cli.output import busy, counted, new_directory, notes, print_files, results, show_table, warn, writing
 
 if TYPE_CHECKING:
     from calibration.bundle import Calibration
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from calibration.frame_set import FrameSet
 
 Corners = tuple[tuple[float, float], tuple[float, float], tuple[float, float], tuple[float, float]]
-LENGTHS = ("height_rmse", "surface_radius", "surface_centroid", "marker_error")  # figures that may carry a unit
+LENGTHS = ("height_rmse", "surface_radius", "surface_centroid", "marker_error")  # figures that may have a unit
 Pair = Literal["auto", "name", "order"]
 Limit = tuple[str, float, bool]  # name, value, True: above it is a failure
 
@@ -45,10 +45,10 @@ class Sources(OptionGroup):
     sensor_b: Annotated[str, typer.Option(help="The same for B.")] = ""
 
 
-@grouped
+@with_option_groups
 def compare(
     a: Annotated[str, typer.Argument(metavar="A", help="Folder of pictures, video, episode, or scene with a ball.")],
-    b: Annotated[Path, typer.Argument(metavar="B", help="Folder, video or episode that is taken for the truth.")],
+    b: Annotated[Path, typer.Argument(metavar="B", help="Folder, video or episode that counts as ground truth.")],
     *,
     sources: Sources,
     pair: Annotated[Pair, typer.Option(help="auto: by name where all names are the same, else in order.")] = "auto",
@@ -57,7 +57,8 @@ def compare(
         typer.Option("--shift/--no-shift", help="Find the shift between A and B.", show_default="unless A is a scene"),
     ] = None,
     invariance: Annotated[
-        bool, typer.Option("--invariance", help="Also: can a policy tell A from B? (rho, AUC, drift of the light)")
+        bool,
+        typer.Option("--invariance", help="Also: can a policy distinguish A from B? (rho, AUC, drift of the light)"),
     ] = False,
     fail_above: Annotated[
         list[str] | None, typer.Option(metavar="METRIC=VALUE", help="Exit code 1 if above; may be repeated.")
@@ -68,11 +69,11 @@ def compare(
     set_: Overrides = None,
     out: Out = None,
 ) -> None:
-    """Compare frames of A with frames of B, each number beside what no contact and mere noise would score.
+    """Compare frames of A with frames of B; each figure is shown with its values for no contact and for noise alone.
 
     Writes compare.json, compare.csv and compare.html. A may be a scene with a ball (press): then the ball is pressed in
-    the simulator where B's frames show a contact, and seen through B's calibration; --set changes that scene, whose gel
-    has elements of 0.25 mm unless element_size or preset is set.
+    the simulator where B's frames show a contact, and rendered with B's calibration; --set changes that scene, whose
+    gel has elements of 0.25 mm unless element_size or preset is set.
 
     Example: tacsim compare sim real --calibration-b bundle --fail-above contact_mae=8
     """
@@ -84,11 +85,11 @@ def compare(
         from calibration.compare.invariance import measure_invariance
         from calibration.compare.report import comparison_figures, write_comparison
         from calibration.errors import BadFrames
-    limits = [*_limits(fail_above, "--fail-above"), *_limits(fail_below, "--fail-below")]
+    limits = [*_parse_limits(fail_above, "--fail-above"), *_parse_limits(fail_below, "--fail-below")]
     bundles = [
         None if path is None else read_bundle(path)[0] for path in (sources.calibration_a, sources.calibration_b)
     ]
-    truth = _read(b, sources.reference_b, sources.sensor_b, bundles[1])
+    truth = _read_frames(b, sources.reference_b, sources.sensor_b, bundles[1])
     if _is_scene(a):
         if sources.corners_a or sources.corners_b or sources.reference_a or sources.sensor_a:
             raise BadFrames(f"A is the scene '{a}': it has no corners, reference or sensor, and B must be calibrated")
@@ -96,8 +97,8 @@ def compare(
     else:
         if set_:
             raise BadFrames(f"--set changes a scene, but A is no scene: {a}")
-        made = _read(Path(a), sources.reference_a, sources.sensor_a, bundles[0])
-    # from here on all pictures are metric where a calibration says how
+        made = _read_frames(Path(a), sources.reference_a, sources.sensor_a, bundles[0])
+    # from here on all images with a calibration are metric
     bundles = [None if each is None else each.model_copy(update={"view": None}) for each in bundles]
     made, truth = _rectify_corners(made, truth, (sources.corners_a, sources.corners_b), bundles)
     with counted("comparing") as on_step:
@@ -110,16 +111,16 @@ def compare(
     beyond = _beyond_limits(limits, values)
     with writing(folder, new=True), busy("writing"):
         written = write_comparison(folder, result, report)
-    _show(result, report)
-    say_files(*written)
+    _print_comparison(result, report)
+    print_files(*written)
     for words in beyond:
-        complain(words)
+        print_error(words)
     if beyond:
         raise typer.Exit(1)
 
 
-def _read(path: Path, reference: Path | None, sensor: str, bundle: Calibration | None) -> FrameSet:
-    """The frames, through lens and perspective of their calibration where that has a view."""
+def _read_frames(path: Path, reference: Path | None, sensor: str, bundle: Calibration | None) -> FrameSet:
+    """Reads frames, and rectifies them if their calibration has a view."""
     from calibration.frame_set import read_frame_set, rectified_by_view
 
     with busy(f"reading {path}"):
@@ -128,14 +129,14 @@ def _read(path: Path, reference: Path | None, sensor: str, bundle: Calibration |
 
 
 def _is_scene(a: str) -> bool:
-    """True for the name of a shipped scene that is no file or folder here, and for a .yaml file."""
+    """True for the name of a shipped scene that is not a file or folder here, and for a .yaml file."""
     from tacsim.config import shipped_names
 
     return a.lower().endswith((".yaml", ".yml")) or (not Path(a).exists() and a in shipped_names("scene"))
 
 
 def _simulate_presses(name: str, truth: FrameSet, bundle: Path | None, overrides: list[str]) -> FrameSet:
-    """A's frames by the simulator."""
+    """Simulates A's frames."""
     from calibration.bundle import read_bundle, read_sensor_model
     from calibration.errors import BadFrames
     from robot.studies.matched_press import ELEMENT
@@ -145,14 +146,14 @@ def _simulate_presses(name: str, truth: FrameSet, bundle: Path | None, overrides
     from tacsim.models.sensor import CanonicalGrid
 
     if bundle is None:
-        raise BadFrames("a scene is seen through the light of B: give B's calibration (--calibration-b)")
+        raise BadFrames("a scene is rendered with the light of B: give B's calibration (--calibration-b)")
     settings, sensor = ["preset=standard", *overrides], read_sensor_model(bundle)
     own = name == "press" and not any(text.startswith("indenter.geometry") for text in overrides)
     if own:
         settings.append(f"indenter.geometry.radius={read_bundle(bundle)[0].provenance.ball_radius} m")
     scene = load_scene(name, settings)
     if scene.element_size is None and not any(text.startswith("preset=") for text in overrides):
-        # two layers are the least that a gel may have
+        # a gel needs at least two layers
         scene = load_scene(name, [*settings, f"element_size={min(ELEMENT, scene.gel.size[2] / 2)} m"])
     given = overridden_gel_sizes(text.partition("=")[0].split(".") for text in overrides)
     scene, said = fit_gel(scene, {"of B": sensor}, given=given)
@@ -173,22 +174,22 @@ def _simulate_presses(name: str, truth: FrameSet, bundle: Path | None, overrides
 def _rectify_corners(
     a: FrameSet, b: FrameSet, texts: tuple[str | None, str | None], bundles: list[Calibration | None]
 ) -> tuple[FrameSet, FrameSet]:
-    """Both sides seen straight on, where the corners of the gel are given: B's size counts."""
+    """Rectifies the sides whose corners of the gel are given, to B's size."""
     from calibration.errors import BadFrames
     from calibration.frame_set import rectified_by_corners, rectified_shape
 
-    corners = [None if text is None else _corners(text) for text in texts]
+    corners = [None if text is None else _parse_corners(text) for text in texts]
     for side, given, bundle in zip("ab", corners, bundles, strict=True):
         if given is not None and bundle is not None:
             raise BadFrames(
-                f"--corners-{side} and --calibration-{side}: a calibration knows where the gel lies; give one"
+                f"--corners-{side} and --calibration-{side}: a calibration contains the position of the gel; give one"
             )
     shape = b.shape if corners[1] is None else rectified_shape(corners[1])
     straight_b = b if corners[1] is None else rectified_by_corners(b, corners[1], shape)
     return (a if corners[0] is None else rectified_by_corners(a, corners[0], shape)), straight_b
 
 
-def _corners(text: str) -> Corners:
+def _parse_corners(text: str) -> Corners:
     try:
         points = [tuple(float(number) for number in point.split(",")) for point in text.split()]
     except ValueError:
@@ -201,7 +202,7 @@ def _corners(text: str) -> Corners:
     return tuple(points)  # type: ignore[return-value]
 
 
-def _limits(texts: list[str] | None, option: str) -> list[Limit]:
+def _parse_limits(texts: list[str] | None, option: str) -> list[Limit]:
     """Parsed METRIC=VALUE. A length may carry its unit."""
     from calibration.compare.report import figure_names
     from tacsim.models.quantity import parse_quantity
@@ -211,7 +212,7 @@ def _limits(texts: list[str] | None, option: str) -> list[Limit]:
         name, equals, value = text.partition("=")
         if name not in figure_names():
             raise typer.BadParameter(
-                f"'{name}' is no figure; there are: {', '.join(figure_names())}", param_hint=option
+                f"'{name}' is not a figure; allowed: {', '.join(figure_names())}", param_hint=option
             )
         try:
             number = parse_quantity(value.strip(), "length") if name in LENGTHS else float(value)
@@ -224,12 +225,12 @@ def _limits(texts: list[str] | None, option: str) -> list[Limit]:
 
 
 def _beyond_limits(limits: list[Limit], values: dict[str, float]) -> list[str]:
-    """In words, which figures are beyond their limits. A limit of a figure that could not be measured must not pass:
-    raises BadParameter."""
+    """Messages about figures beyond their limits. Raises BadParameter for a limit of a figure that could not be
+    measured."""
     unknown = [name for name, _, _ in limits if values[name] != values[name]]
     if unknown:
         raise typer.BadParameter(
-            f"not known of these frames: {', '.join(unknown)}. Surfaces need the calibrations of both sides (or "
+            f"not measured in these frames: {', '.join(unknown)}. Surfaces need the calibrations of both sides (or "
             "recordings of simulations), rho, auc and drift need --invariance",
             param_hint="--fail-above, --fail-below",
         )
@@ -240,7 +241,7 @@ def _beyond_limits(limits: list[Limit], values: dict[str, float]) -> list[str]:
     ]
 
 
-def _show(result: Comparison, report: Report | None) -> None:
+def _print_comparison(result: Comparison, report: Report | None) -> None:
     from calibration.compare.report import (
         describe_against_null,
         describe_comparison,
@@ -263,7 +264,7 @@ def _show(result: Comparison, report: Report | None) -> None:
         f"{len(result.pairs)} pair{'s' * (len(result.pairs) != 1)}", columns, overall_rows, left={0, 1}, width=width
     )
     if report is not None:
-        _show_invariance(report, width)
+        _print_invariance(report, width)
     notes.print(result.alignment.description)
     for words in result.notes:
         warn(words)
@@ -274,7 +275,7 @@ def _show(result: Comparison, report: Report | None) -> None:
         notes.print(f"... and {len(flagged) - 10} more flagged pairs, in the files")
 
 
-def _show_invariance(report: Report, width: int | None) -> None:
+def _print_invariance(report: Report, width: int | None) -> None:
     views = (
         (
             view.view, f"{view.rho:.2f}", f"{view.rho_low:.2f} to {view.rho_high:.2f}",

@@ -1,4 +1,4 @@
-"""`tacsim schema`, `doctor` and `start`: what a file may say, whether machine and rig are fit, arms to their start."""
+"""`tacsim schema`, `doctor` and `start`: schemas of files, checks of machine and rig, motion of arms to their start."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from robot.cli.bench import from_checkout, require_checkout
-from robot.cli.errors import complain
+from robot.cli.errors import print_error
 from robot.cli.options import HardwareRig, Overrides
 from robot.cli.output import SafeConsole, busy, notes
-from robot.cli.terminal import Interrupt, ask, has_person
+from robot.cli.terminal import Interrupt, ask_operator, has_operator
 
 if TYPE_CHECKING:
     from tacsim.models.driver import Check
@@ -43,14 +43,14 @@ def schema(
 def doctor(
     rig: Annotated[
         str | None,
-        typer.Option("--rig", metavar="FILE", help="Look at this rig instead: arms, what they feel, cameras, limits."),
+        typer.Option("--rig", metavar="FILE", help="Check this rig instead: arms, their forces, cameras, limits."),
     ] = None,
     set_: Overrides = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the checks as JSON.")] = False,
 ) -> None:
-    """Check Python, packages, OpenCV, Taichi and the machine, or a rig; exit code 1 if something must be mended.
+    """Check Python, packages, OpenCV, Taichi and the machine, or a rig; exit code 1 if something must be repaired.
 
-    Nothing moves: arms are asked, not commanded.
+    Nothing moves: the command reads the state of arms and sends no motion.
 
     Example: tacsim doctor --rig ur5e
     """
@@ -65,7 +65,7 @@ def doctor(
         from robot.open import check_sensors
         from tacsim.config import load_rig
 
-        with busy("looking at the rig"):
+        with busy("checking the rig"):
             config = load_rig(rig, overrides=set_ or []).config
             check_sensors(config)
             checks = examine_rig(config, rig)
@@ -94,10 +94,10 @@ def start(
     rig: HardwareRig,
     set_: Overrides = None,
 ) -> None:
-    """Lead the arms of a rig to where an episode begins, from wherever they stand.
+    """Move the arms of a rig from their present position to the start of an episode.
 
-    Shows where each arm stands, offers to zero its force sensor, and moves it, one after the other, slowly and straight
-    in joint space. Nothing happens without a yes at the terminal; Ctrl-C brakes.
+    Shows the position of each arm, offers to zero its force sensor, and moves the arms one after the other, slowly and
+    on a straight line in joint space. Every step needs your confirmation at the terminal; Ctrl-C brakes.
 
     Example: tacsim start my.yaml
     """
@@ -112,10 +112,10 @@ def start(
         config = load_rig(rig, overrides=set_ or []).config
     arms = parts_of(config.arms, UrArmConfig)
     if not arms:
-        raise CannotOpen(f"rig '{config.name}' has no UR arm: there is nothing to lead to its start")
-    if not has_person():
+        raise CannotOpen(f"rig '{config.name}' has no UR arm: there is nothing to move to its start")
+    if not has_operator():
         raise CannotOpen(
-            f"rig '{config.name}': no arm is led to its start without somebody who says yes; run this from a terminal"
+            f"rig '{config.name}': no arm moves to its start without a confirmation; run this from a terminal"
         )
     with Interrupt() as interrupt, companion_of(config) as companion:
         of_mocks = {} if companion is None else companion.start_poses
@@ -126,16 +126,16 @@ def start(
         try:
             with busy("connecting") as show:
                 guide = Guide(
-                    lambda question: ask(f"Rig '{config.name}': {question}"),
+                    lambda question: ask_operator(f"Rig '{config.name}': {question}"),
                     lambda words: notes.print(words),
                     show,
                     interrupt,
                 )
                 away = lead_to_start(config, starts, guide)
         except Halted as halted:
-            complain(str(halted))
+            print_error(str(halted))
             raise typer.Exit(interrupt.exit_code or 1) from None
     if any(distance > 5e-3 for distance in away.values()) or not away:
-        complain("not every arm stands at its start")
+        print_error("not every arm is at its start")
         raise typer.Exit(1)
-    notes.print(f"All arms stand at their starts. Next: tacsim run {rig} --dry-run")
+    notes.print(f"All arms are at their starts. Next: tacsim run {rig} --dry-run")

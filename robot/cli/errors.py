@@ -1,4 +1,4 @@
-"""How the command line says that something went wrong: a message and an exit code, no traceback."""
+"""Errors on the command line: a message and an exit code, no traceback."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from typer.core import TyperGroup
 from robot.cli.output import SafeConsole
 from tacsim.models.text import printable_line
 
-OURS = {"tacsim", "calibration", "robot"}
-UNUSABLE, FAILED, INTERRUPTED = 2, 1, 130  # exit codes: bad configuration or usage, failure, Ctrl-C
-# What was named cannot be read or written there, whatever is done
-NO_PLACE = (FileExistsError, FileNotFoundError, IsADirectoryError, NotADirectoryError, PermissionError)
-UNTRUSTED = 3  # all was done, but the result is not to be trusted
-UNVERIFIED = 4  # all was done, and nothing checks the lengths that the result is measured in
+OWN_PACKAGES = {"tacsim", "calibration", "robot"}
+EXIT_USAGE, EXIT_FAILED, EXIT_INTERRUPTED = 2, 1, 130  # exit codes: bad configuration or usage, failure, Ctrl-C
+# The named path cannot be read or written
+PATH_ERRORS = (FileExistsError, FileNotFoundError, IsADirectoryError, NotADirectoryError, PermissionError)
+EXIT_UNTRUSTED = 3  # the command finished, but its result must not be trusted
+EXIT_UNVERIFIED = 4  # the command finished, but no measurement checks the length scale of its result
 
 
 class Guarded(TyperGroup):
-    """The group of all commands: turns exceptions into messages, unless `--debug` stands somewhere on the line."""
+    """The group of all commands: converts exceptions to messages, unless the command line contains `--debug`."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         own = args[: args.index("--")] if "--" in args else args
@@ -33,50 +33,50 @@ class Guarded(TyperGroup):
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt:
-            complain("interrupted")
-            raise typer.Exit(INTERRUPTED) from None
+            print_error("interrupted")
+            raise typer.Exit(EXIT_INTERRUPTED) from None
         except Exception as error:
-            of_typer = isinstance(error, typer.Abort) or hasattr(error, "exit_code")  # it handles its own
+            of_typer = isinstance(error, typer.Abort) or hasattr(error, "exit_code")  # typer handles these
             if of_typer or ctx.meta["tacsim.debug"]:
                 raise
-            message, code = explain(error)
-            complain(message)
+            message, code = describe_error(error)
+            print_error(message)
             raise typer.Exit(code) from None
 
 
-def explain(error: Exception) -> tuple[str, int]:
-    """What to tell a person about `error`, and the exit code."""
-    if _refused(error):
-        return str(error), UNUSABLE
+def describe_error(error: Exception) -> tuple[str, int]:
+    """The message for the user about `error`, and the exit code."""
+    if _is_user_error(error):
+        return str(error), EXIT_USAGE
     if isinstance(error, ExceptionGroup):
-        parts = [explain(part) for part in error.exceptions if isinstance(part, Exception)]
-        return "\n".join([error.message, *(message for message, _ in parts)]), FAILED
+        parts = [describe_error(part) for part in error.exceptions if isinstance(part, Exception)]
+        return "\n".join([error.message, *(message for message, _ in parts)]), EXIT_FAILED
     if isinstance(error, FileNotFoundError) and not _has_working_directory():
-        return "the working directory no longer exists; change to another folder", UNUSABLE
+        return "the working directory no longer exists; change to another folder", EXIT_USAGE
     if isinstance(error, OSError):
-        code = UNUSABLE if isinstance(error, NO_PLACE) else FAILED
+        code = EXIT_USAGE if isinstance(error, PATH_ERRORS) else EXIT_FAILED
         named = isinstance(error.filename, str | bytes | os.PathLike)
         where = f"{printable_line(os.fsdecode(error.filename))}: " if named else ""
         why = error.strerror or str(error) or type(error).__name__
         if isinstance(error, FileExistsError):
-            why = "exists already; nothing is overwritten, name another"
+            why = "exists already; nothing is overwritten, give another path"
         return f"{where}{why}", code
-    if _ours(type(error).__module__):
-        return str(error) or type(error).__name__, FAILED
-    return f"unexpected {type(error).__name__}: {error}\nRun again with --debug for the traceback.", FAILED
+    if _is_own_module(type(error).__module__):
+        return str(error) or type(error).__name__, EXIT_FAILED
+    return f"unexpected {type(error).__name__}: {error}\nRun again with --debug for the traceback.", EXIT_FAILED
 
 
-def _refused(error: Exception) -> bool:
-    """True for what our own code says of a value, a file or a device that it was given: a ValueError, ours or raised by
-    us, a FileNotFoundError in words, and a RuntimeError of the one module that starts Taichi."""
+def _is_user_error(error: Exception) -> bool:
+    """True for an error about a value, a file or a device that the user gave: a ValueError that is defined or raised in
+    our packages, a FileNotFoundError with a text, and a RuntimeError of the module that starts Taichi."""
     trace = error.__traceback__
     while trace is not None and trace.tb_next is not None:
         trace = trace.tb_next
     module = str(trace.tb_frame.f_globals.get("__name__", "") if trace is not None else "")
     if isinstance(error, ValueError):
-        return _ours(type(error).__module__) or (type(error) is ValueError and _ours(module))
+        return _is_own_module(type(error).__module__) or (type(error) is ValueError and _is_own_module(module))
     if isinstance(error, FileNotFoundError):
-        return error.errno is None and _ours(module)
+        return error.errno is None and _is_own_module(module)
     return type(error) is RuntimeError and module == "tacsim.compute.runtime"
 
 
@@ -88,10 +88,10 @@ def _has_working_directory() -> bool:
     return True
 
 
-def _ours(module: str) -> bool:
-    return module.partition(".")[0] in OURS
+def _is_own_module(module: str) -> bool:
+    return module.partition(".")[0] in OWN_PACKAGES
 
 
-def complain(message: str) -> None:
+def print_error(message: str) -> None:
     """Prints an error message on stderr."""
     SafeConsole(stderr=True, soft_wrap=True, highlight=False).print(Text("error: ", style="bold red") + Text(message))

@@ -1,4 +1,4 @@
-"""`tacsim identify …`: what a gel or a body is made of, from recorded presses or squeezes."""
+"""`tacsim identify …`: the material of a gel or a body, from recorded presses or squeezes."""
 
 from __future__ import annotations
 
@@ -8,9 +8,17 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from robot.cli.errors import UNUSABLE, complain
-from robot.cli.options import OptionGroup, Out, Overrides, grouped, length, quantities, quantity
-from robot.cli.output import busy, new_directory, notes, one_bar, results, say_files, show_table, warn, writing
+from robot.cli.errors import EXIT_USAGE, print_error
+from robot.cli.options import (
+    OptionGroup,
+    Out,
+    Overrides,
+    length_option,
+    quantities_parser,
+    quantity_parser,
+    with_option_groups,
+)
+from robot.cli.output import busy, new_directory, notes, one_bar, print_files, results, show_table, warn, writing
 
 if TYPE_CHECKING:
     from calibration.materials.presses import Noise
@@ -19,7 +27,7 @@ if TYPE_CHECKING:
     from tacsim.models.scene import Scene
 
 
-identify = typer.Typer(no_args_is_help=True, help="What a gel or a body is made of, from recorded presses.")
+identify = typer.Typer(no_args_is_help=True, help="Identify the material of a gel or a body from recorded presses.")
 
 Recorded = Annotated[
     list[Path] | None,
@@ -33,53 +41,53 @@ Balls = Annotated[
         "--ball", metavar="NAME=RADIUS", show_default="the scene's", help="The ball of one recording; may be repeated."
     ),
 ]
-FORCE = quantity("force", 1e-6, 1e3)
+FORCE_PARSER = quantity_parser("force", 1e-6, 1e3)
 
 
 class Fitting(OptionGroup):
-    """The options that both commands have."""
+    """The options of both commands."""
 
-    fit: Annotated[str | None, typer.Option(metavar="NAMES", help="Only these, with commas between.")] = None
+    fit: Annotated[str | None, typer.Option(metavar="NAMES", help="Only these parameters, separated by commas.")] = None
     force_noise: Annotated[
         Any,
         typer.Option(
-            parser=FORCE, metavar="FORCE", help="Standard deviation of a reading of force.",
+            parser=FORCE_PARSER, metavar="FORCE", help="Standard deviation of a reading of force.",
             show_default="1 N recorded by a UR's own, else 0.02 N",
         ),
     ] = None  # fmt: skip
     zero_error: Annotated[
         Any,
         typer.Option(
-            parser=FORCE, metavar="FORCE", help="How far the zero of the force may be off.",
+            parser=FORCE_PARSER, metavar="FORCE", help="Error of the zero of the force.",
             show_default="ten times the noise",
         ),
     ] = None  # fmt: skip
-    place_error: Annotated[Any, length("How far the place of the contact may be off along the press.", 1e-9, 1e-2)] = (
+    place_error: Annotated[Any, length_option("Error of the contact's position along the press.", 1e-9, 1e-2)] = (
         "0.02 mm"
     )
     preset: Annotated[Literal["learn", "draft", "standard"], typer.Option(help="Resolution of the finest mesh.")] = (
         "standard"
     )
-    moments: Annotated[int, typer.Option(min=4, max=1000, help="Of a press, that are simulated.")] = 16
+    moments: Annotated[int, typer.Option(min=4, max=1000, help="Number of simulated moments of a press.")] = 16
     motions: Annotated[
         Path | None,
         typer.Option(
-            help="Only write motions that tell all, for `tacsim run RIG --policy FILE.csv`, into this new folder."
+            help="Only write motions that identify all parameters, for `tacsim run RIG --policy FILE.csv`, here."
         ),
     ] = None
     set_: Overrides = None
     out: Out = None
 
 
-@grouped
+@with_option_groups
 def gel(
     presses: Recorded = None,
-    scene: Annotated[str, typer.Option(help="What was pressed: a scene with an indenter.")] = "press",
+    scene: Annotated[str, typer.Option(help="The scene that was pressed, with an indenter.")] = "press",
     indenter: Annotated[
         Any,
         typer.Option(
-            parser=quantities("length", 3), metavar="X,Y,Z",
-            help="Where the centre of the indenter lies in the rig's world.", show_default="where the scene puts it",
+            parser=quantities_parser("length", 3), metavar="X,Y,Z",
+            help="Position of the indenter's centre in the rig's world.", show_default="as in the scene",
         ),
     ] = None,
     ball: Balls = None,
@@ -88,8 +96,9 @@ def gel(
 ) -> None:  # fmt: skip
     """A gel's stiffness, Poisson's ratio and friction: material.yaml, scene.yaml, identified.json, identified.png.
 
-    The presses are simulated again until forces (and heights and flow, where recorded) agree. What they do not tell is
-    named, with the motion that would tell it. A table's z is the height of the indenter's lowest point above the gel.
+    The presses are simulated until forces (and heights and flow, if recorded) agree. The command names parameters that
+    they do not identify, with a motion that would identify them. A table's z is the height of the indenter's lowest
+    point above the gel.
 
     Example: tacsim identify gel runs/presses --force-noise '10 mN' --out runs/my-gel
     """
@@ -100,42 +109,42 @@ def gel(
         from tacsim.interface import Pose
 
         where = Pose(np.array(indenter))
-    _Task("gel", scene, options).run(presses or [], where, _balls(ball or []))
+    _IdentifyCommand("gel", scene, options).run(presses or [], where, _parse_balls(ball or []))
 
 
-@grouped
+@with_option_groups
 def body(
     squeezes: Recorded = None,
-    scene: Annotated[str, typer.Option(help="What was squeezed: a scene with a body.")] = "squeeze",
+    scene: Annotated[str, typer.Option(help="The scene that was squeezed, with a body.")] = "squeeze",
     gel_error: Annotated[
-        float, typer.Option(min=0.0, max=1.0, help="Standard deviation of the gels' stiffness, as a share of it.")
+        float, typer.Option(min=0.0, max=1.0, help="Relative standard deviation of the gels' stiffness.")
     ] = 0.0,
     *,
     options: Fitting,
 ) -> None:
-    """A body's stiffness, yield, hardening and friction to each gel: the same files as of a gel.
+    """A body's stiffness, yield stress, hardening and friction to each gel: the same files as for a gel.
 
     Each recording begins with a fresh body of the scene's shape; name the gel's material by --set gel.material=FILE. A
     table's z is the gap between the two gels.
 
     Example: tacsim identify body runs/squeezes --set gel.material=runs/my-gel/material.yaml --out runs/my-clay
     """
-    _Task("body", scene, options, gel_error).run(squeezes or [])
+    _IdentifyCommand("body", scene, options, gel_error).run(squeezes or [])
 
 
-def _balls(given: list[str]) -> dict[str, float]:
+def _parse_balls(given: list[str]) -> dict[str, float]:
     """Radius of the ball [m] by the name of its recording."""
-    found, radius = {}, quantity("length", 1e-4, 0.1)
+    found, radius = {}, quantity_parser("length", 1e-4, 0.1)
     for text in given:
         name, equals, value = text.rpartition("=")
         if not equals or not name:
-            raise typer.BadParameter(f"'{text}' is no NAME=RADIUS, such as press-2='6 mm'", param_hint="--ball")
+            raise typer.BadParameter(f"'{text}' is not NAME=RADIUS, such as press-2='6 mm'", param_hint="--ball")
         found[name] = radius(value)
     return found
 
 
-class _Task:
-    """What both commands do."""
+class _IdentifyCommand:
+    """The work of both commands."""
 
     def __init__(self, kind: Kind, scene: str, options: Fitting, gel_error: float = 0.0) -> None:
         from tacsim.config import load_scene
@@ -171,7 +180,7 @@ class _Task:
             from tacsim.physics.failure.dump import dump_to_folder
         with one_bar("reading") as bar:
             recordings = Recordings(self.scene, indenter, balls)
-            presses = read_all(recordings, find_recordings(sources), bar.count)
+            presses = read_all(recordings, find_recordings(sources), bar.set_progress)
             force = options.force_noise
             if force is None:
                 force = ur_noise if recordings.from_ur else other_noise
@@ -182,13 +191,13 @@ class _Task:
                 found = identify(
                     self.kind, self.scene, recordings, presses, noise, Priors(options.place_error, zero),
                     wanted=self.wanted, most_moments=options.moments, gel_error=self.gel_error,
-                    on_step=bar.say, on_run=bar.count,
+                    on_step=bar.set_text, on_run=bar.set_progress,
                 )  # fmt: skip
-        self._tell(found, folder, noise)
+        self._report_results(found, folder, noise)
 
-    def _tell(self, found: Identified, folder: Path, noise: Noise) -> None:
-        force_noises = (1.0, 0.1, 0.01)  # force sensors that the result is looked at with [N]
-        # of an indenter, as a share: a standard deviation beyond tells nothing that a calliper does not
+    def _report_results(self, found: Identified, folder: Path, noise: Noise) -> None:
+        force_noises = (1.0, 0.1, 0.01)  # of force sensors for which the intervals are predicted [N]
+        # relative, of an indenter: a calliper is more accurate than a larger standard deviation
         max_size_deviation = 0.1
         from robot.studies.identify.identify import outlook
         from robot.studies.identify.motions import WHAT_TELLS, WORDS
@@ -199,28 +208,31 @@ class _Task:
         title = f"{self.kind.capitalize()}, {len(found.presses)} recordings, {found.fit.runs} simulated"
         show_table(title, ("", "value", "95 %"), told(found), left={0})
         looks = {sensor: outlook(found, sensor) for sensor in dict.fromkeys((noise.force, *force_noises))}
-        rows = [(each.name, *(_reach(look[each.name]) for look in looks.values())) for each in found.fit.identified]
+        rows = [
+            (each.name, *(_half_interval_text(look[each.name]) for look in looks.values()))
+            for each in found.fit.identified
+        ]
         show_table("With another force sensor, 95 %", ("noise", *(f"{one:g} N" for one in looks)), rows, left={0})
         for each in found.fit.unidentified:
             motion = WHAT_TELLS[self.kind][each.name]
             warn(
-                f"{each.name} is not told by these recordings and stays as it was; '{motion}' would tell it: "
+                f"{each.name} is not identified by these recordings and keeps its value; '{motion}' would identify it: "
                 f"{WORDS[motion]} (tacsim identify {self.kind} --motions FOLDER writes it)"
             )
         if found.size_error is not None and found.size_error > max_size_deviation:
             warn(
-                f"these recordings tell of the size of the indenter {_reach(2 * found.size_error)}: a wrong one would "
-                "not be noticed; measure it, or record heights (a calibrated sensor)"
+                f"interval of the indenter's size from the recordings: {_half_interval_text(2 * found.size_error)}; a "
+                "wrong size would not be detected: measure it, or record heights (a calibrated sensor)"
             )
-        say_files(*files)
+        print_files(*files)
         for finding in found.findings:
-            complain(finding.text)
+            print_error(finding.text)
         if found.findings:
-            complain(f"no material is written: {folder / 'identified.png'} shows why")
-            raise typer.Exit(UNUSABLE)
+            print_error(f"no material is written: {folder / 'identified.png'} shows why")
+            raise typer.Exit(EXIT_USAGE)
         if self.wanted and (missing := [each.name for each in found.fit.unidentified]):
-            complain(f"asked for and not told: {', '.join(missing)}")
-            raise typer.Exit(UNUSABLE)
+            print_error(f"requested and not identified: {', '.join(missing)}")
+            raise typer.Exit(EXIT_USAGE)
 
     def _write_motions(self, folder: Path) -> None:
         from robot.studies.identify.motions import motions
@@ -235,8 +247,8 @@ class _Task:
                 results.print(f"tacsim run {rig} --policy {path} --steps {steps} --out runs/{name}")
 
 
-def _reach(half: float) -> str:
-    """Half an interval of a free number, in words."""
+def _half_interval_text(half: float) -> str:
+    """Text of half an interval of a free parameter."""
     from calibration.materials.tuning import MAX_IDENTIFIED_HALF_INTERVAL
 
     return f"± {100 * half:.2g} %" if half < MAX_IDENTIFIED_HALF_INTERVAL else "nothing"

@@ -14,9 +14,9 @@ from robot.cli.output import (
     new_directory,
     notes,
     one_bar,
+    print_files,
     require_writable,
     results,
-    say_files,
     show_table,
     warn,
     writing,
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from robot.train.run_folder import RunFolder
     from robot.train.transfer import SummaryRow
 
-TRAINING = ("torch", "stable_baselines3", "onnx", "onnxruntime")  # what the extra `train` brings
+TRAINING = ("torch", "stable_baselines3", "onnx", "onnxruntime")  # packages of the extra `train`
 export = typer.Typer(no_args_is_help=True, help="Write policies and recordings as files for others.")
 
 
@@ -37,18 +37,18 @@ def train(
     ] = None,
     algorithm: Annotated[
         str | None,
-        typer.Option(help="dagger (a teacher shows), ppo or sac (from the reward alone).", show_default="the file's"),
+        typer.Option(help="dagger (from a teacher), ppo or sac (from the reward).", show_default="the file's"),
     ] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Same seed, same policy.", show_default="the file's")] = None,
     resume: Annotated[
-        Path | None, typer.Option(help="The folder of a run that was stopped: it goes on to the same end.")
+        Path | None, typer.Option(help="The folder of a run that was stopped: it is continued to the same result.")
     ] = None,
     set_: Overrides = None,
     out: Out = None,
 ) -> None:
     """Train a policy in simulation, and write it as a file for `tacsim run RIG --policy FILE`.
 
-    A checkpoint is kept after each round; whatever ends the run, `--resume` goes on. Needs the extra `train`.
+    A checkpoint is written after each round; `--resume` continues a run that was stopped. Needs the extra `train`.
 
     Example: tacsim train squeeze --out runs/squeeze-0
     """
@@ -57,7 +57,7 @@ def train(
     if resume is not None:
         if task is not None or own or out is not None:
             raise typer.BadParameter(
-                f"a run goes on with its own settings ({resume / 'run.json'}): leave out all else, or begin a new run",
+                f"a run keeps its settings ({resume / 'run.json'}): omit other options, or start a new run",
                 param_hint="--resume",
             )
         with busy("loading"):
@@ -66,7 +66,7 @@ def train(
             run = RunFolder(resume)
     else:
         if task is None:
-            raise typer.BadParameter("name a task (squeeze, reposition, knead), or a run that goes on (--resume)")
+            raise typer.BadParameter("name a task (squeeze, reposition, knead), or a run to continue (--resume)")
         from tacsim.config import load_model
         from tacsim.models.training import Training
 
@@ -79,22 +79,22 @@ def train(
     from tacsim.tasks.task import BadDraws
 
     try:
-        path = _train(run)
+        path = _run_training(run)
     except BadDraws:
         if run.load_checkpoint()[0]:
-            notes.print(f"What was learned is kept. Make a file of it: tacsim export policy {run.folder}")
+            notes.print(f"The last checkpoint is kept. Write it as a file: tacsim export policy {run.folder}")
         raise
     except (KeyboardInterrupt, OSError):
-        notes.print(f"What was learned is kept. Go on: tacsim train --resume {run.folder}")
+        notes.print(f"The last checkpoint is kept. Continue: tacsim train --resume {run.folder}")
         raise
-    say_files(path, run.folder / "curve.json")
+    print_files(path, run.folder / "curve.json")
     notes.print(f"Next: tacsim evaluate {task or run.settings.training.task} --policy {path} --policy scripted")
 
 
-def _train(run: RunFolder) -> Path:
-    from robot.train.train import train as go_on
+def _run_training(run: RunFolder) -> Path:
+    from robot.train.train import train as continue_training
 
-    def say(figures: Mapping[str, float]) -> None:
+    def print_result(figures: Mapping[str, float]) -> None:
         results.print(
             f"round {figures['round']:.0f}: {1e3 * figures['distance']:.3f} mm from the goal, success "
             f"{100 * figures['success']:.0f} %, {figures['peak_force']:.1f} N at most, "
@@ -103,16 +103,16 @@ def _train(run: RunFolder) -> Path:
         )
 
     with one_bar("starting") as bar:
-        return go_on(run, bar.report, say, warn)
+        return continue_training(run, bar.report, print_result, warn)
 
 
 def policy(
     run: Annotated[Path, typer.Argument(help="The folder of a training run, finished or not.")],
     out: Annotated[Path, typer.Option("--out", help="The file to be written, FILE.onnx; it must not exist.")],
 ) -> None:
-    """Write the policy of a training run as one ONNX file, which says of itself what it sees and does.
+    """Write the policy of a training run as one ONNX file, which contains a description of its inputs and outputs.
 
-    Needs the extra `train`; who runs the file needs the extra `policy` alone.
+    Needs the extra `train`; to run the file, the extra `policy` is sufficient.
 
     Example: tacsim export policy runs/squeeze-0 --out squeeze.onnx
     """
@@ -131,16 +131,16 @@ def policy_range(
     out: Annotated[Path, typer.Option("--out", help="The file to be written, FILE.onnx; it must not exist.")],
     training: Annotated[
         str | None,
-        typer.Option(help="Name or path of the training file.", show_default="as the policy says that it was trained"),
+        typer.Option(help="Name or path of the training file.", show_default="as recorded in the policy"),
     ] = None,
     episodes: Annotated[
-        int | None, typer.Option(min=2, max=10_000, help="To be played.", show_default="4 of each environment")
+        int | None, typer.Option(min=2, max=10_000, help="Number of episodes.", show_default="4 of each environment")
     ] = None,
     set_: Overrides = None,
 ) -> None:
-    """Write a policy again, with the range of what it observes in episodes of its training.
+    """Write a policy again, with the range of its observations in episodes of its training.
 
-    The policy acts itself in episodes drawn as the training file says. `tacsim run` and `tacsim evaluate` then say when
+    The policy acts in episodes drawn as in the training file. `tacsim run` and `tacsim evaluate` then report when
     observations leave that range, and which parameters of a simulated scene do. Needs onnx (extra `train`).
 
     Example: tacsim export policy-range mine.onnx --training squeeze --out mine-with-range.onnx
@@ -172,27 +172,28 @@ def evaluate(
     policy: Annotated[
         list[str] | None,
         typer.Option(
-            help="teacher (by the truth), random, scripted, learned (the shipped one), FILE.onnx; may be repeated.",
+            help="teacher (uses the truth), random, scripted, learned (the shipped one), FILE.onnx; may be repeated.",
             show_default="teacher, scripted, random",
         ),
     ] = None,
     episodes: Annotated[int, typer.Option(min=2, max=10_000, help="Of each policy.")] = 200,
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same episodes.")] = 0,
     json_: Annotated[
-        Path | None, typer.Option("--json", help="Write how each episode ended, while it goes on.", show_default=False)
+        Path | None,
+        typer.Option("--json", help="Write the result of each episode, during the evaluation.", show_default=False),
     ] = None,
     set_: Overrides = None,
 ) -> None:
-    """Compare policies in the same episodes, whose bodies and goals no training has met.
+    """Compare policies in the same episodes, with bodies and goals that do not occur in training.
 
     Success with Wilson's interval, distance and improvement (share of the distance at the start) with a bootstrap's,
-    all of 95 %; the peak of the normal force as mean and as what one episode in twenty exceeds; the share of episodes
-    in which a learned policy observed what it did not observe in its training.
+    all of 95 %; the peak of the normal force as mean and 95 % quantile; the share of episodes in which observations of
+    a learned policy left its training range.
 
     Example: tacsim evaluate squeeze --policy learned --policy scripted --episodes 50
     """
     require_writable(json_, "--json", new=True)
-    from robot.train.evaluate import evaluate as judge_all
+    from robot.train.evaluate import evaluate as evaluate_policies
     from tacsim.config import load_model
     from tacsim.models.training import Training
 
@@ -200,44 +201,46 @@ def evaluate(
     played: dict[str, EvaluationResult] = {}
     with one_bar("starting") as bar:
 
-        def say(so_far: EvaluationResult) -> None:
+        def print_result(so_far: EvaluationResult) -> None:
             played[so_far.policy] = so_far
             if json_ is not None:
-                _write(json_, played.values())
+                _write_results(json_, played.values())
             done, success = len(so_far.episodes), _interval_text(so_far.success, 100, 0)
             notes.print(f"{so_far.policy}: {done} of {episodes} episodes, success {success} %")
 
-        judged = judge_all(training, policy or ["teacher", "scripted", "random"], episodes, seed, bar.report, say, warn)
-    _show_judged(judged)
+        evaluation_results = evaluate_policies(
+            training, policy or ["teacher", "scripted", "random"], episodes, seed, bar.report, print_result, warn
+        )
+    _show_evaluation(evaluation_results)
 
 
-def _write(path: Path, judged: Iterable[EvaluationResult]) -> None:
+def _write_results(path: Path, evaluation_results: Iterable[EvaluationResult]) -> None:
     import json
 
     from robot.common.whole_file import write_whole
 
-    ends = {each.policy: [end._asdict() for end in each.episodes] for each in judged}
+    ends = {each.policy: [end._asdict() for end in each.episodes] for each in evaluation_results}
     write_whole(path, (json.dumps(ends, indent=1) + "\n").encode())
 
 
-def _show_judged(judged: list[EvaluationResult]) -> None:
-    names, rows = [Path(each.policy).name for each in judged], []
+def _show_evaluation(evaluation_results: list[EvaluationResult]) -> None:
+    names, rows = [Path(each.policy).name for each in evaluation_results], []
     if len(set(names)) < len(names):
-        names = [each.policy for each in judged]
-    for name, each in zip(names, judged, strict=True):
-        mean, most = each.peak_force
+        names = [each.policy for each in evaluation_results]
+    for name, each in zip(names, evaluation_results, strict=True):
+        mean, quantile = each.peak_force
         rows.append(
             (
                 name,
                 _interval_text(each.success, 100, 0),
                 _interval_text(each.distance, 1e3, 3),
                 _interval_text(each.improvement, 100, 0),
-                f"{mean:.1f}, {most:.1f}",
+                f"{mean:.1f}, {quantile:.1f}",
                 "–" if each.outside is None else f"{100 * each.outside:.0f}",
             )
         )
     columns = ("policy", "success [%]", "distance [mm]", "improvement [%]", "peak force [N]", "outside training [%]")
-    show_table(f"{len(judged[0].episodes)} unseen episodes, 95 % intervals", columns, rows, left={0})
+    show_table(f"{len(evaluation_results[0].episodes)} unseen episodes, 95 % intervals", columns, rows, left={0})
 
 
 def _interval_text(interval: Interval, scale: float, digits: int) -> str:
@@ -258,19 +261,19 @@ def transfer(
         typer.Option(help="Randomisation that draws the hidden twins: a name or path.", show_default="TASK-twin"),
     ] = None,
     episodes: Annotated[int, typer.Option(min=2, max=10_000, help="Of each policy on each side.")] = 20,
-    every: Annotated[int, typer.Option(min=1, max=10_000, help="Another twin every so many episodes.")] = 5,
+    every: Annotated[int, typer.Option(min=1, max=10_000, help="Number of episodes with the same hidden twin.")] = 5,
     steps: Annotated[
         int | None, typer.Option(min=1, help="Control steps of an episode.", show_default="the task's")
     ] = None,
-    workers: Annotated[int, typer.Option(min=1, max=64, help="Rigs side by side, each in a process of its own.")] = 1,
-    out: Annotated[Path, typer.Option(help="Folder; one that was begun goes on.")] = Path("runs/transfer"),
+    workers: Annotated[int, typer.Option(min=1, max=64, help="Parallel rigs, each in a separate process.")] = 1,
+    out: Annotated[Path, typer.Option(help="Folder; a study in it is continued.")] = Path("runs/transfer"),
     set_: Overrides = None,
 ) -> None:
-    """Compare what policies reach in simulation and, over the real wire, on mock hardware whose hidden twin differs.
+    """Compare results of policies in simulation and on mock hardware, with the real protocols and another hidden twin.
 
-    Each episode is played on both sides; the simulation has of the twin only the goal and the body's size. Killed
-    anywhere, the same command goes on, with further policies too. Writes transfer.json, transfer.png and how each
-    episode ended.
+    Each episode runs on both sides; the simulation knows only the goal and the body's size of the twin. After an
+    interruption, the same command continues, also with more policies. Writes transfer.json, transfer.png and the
+    result of each episode.
 
     Example: tacsim transfer squeeze --policy learned --policy scripted --episodes 20
     """
@@ -314,5 +317,5 @@ def _show_transfer(rows: list[SummaryRow], episodes: int) -> None:
         )
         for row in rows
     ]
-    columns = ("policy", "", "success [%]", "distance [mm]", "felt - true, rms [mm]", "errors")
+    columns = ("policy", "", "success [%]", "distance [mm]", "tactile - true, rms [mm]", "errors")
     show_table(f"{episodes} episodes each, 95 % intervals", columns, shown, left={0, 1})

@@ -1,4 +1,4 @@
-"""`tacsim mock`: mock hardware on loopback, to try a driver against without any robot."""
+"""`tacsim mock`: mock hardware on loopback, to test a driver without a robot."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from robot.cli.terminal import Interrupt
 if TYPE_CHECKING:
     from robot.mock import FaultClient
 
-Log = list[tuple[float, str]]  # time of the robot [s], and what happened
+Log = list[tuple[float, str]]  # time of the robot [s], and message
 
 
 def mock(
@@ -29,11 +29,11 @@ def mock(
     ] = 0,
     camera_port: Annotated[int, typer.Option(min=1, max=65535, help="Port of every camera.")] = 8081,
     version: Annotated[
-        str | None, typer.Option("--version", help="Of PolyScope, which the arms claim.", show_default="5.11")
+        str | None, typer.Option("--version", help="Of PolyScope, as reported by the arms.", show_default="5.11")
     ] = None,
     payload: Annotated[
         str | None,
-        typer.Option(help="What hangs on each flange: kg, or kg,x,y,z with its centre \\[m].", show_default="nothing"),
+        typer.Option(help="Load on each flange: kg, or kg,x,y,z with its centre \\[m].", show_default="nothing"),
     ] = None,
     allow_network: Annotated[
         bool, typer.Option("--allow-network", help="Allow addresses that other machines reach.")
@@ -41,9 +41,9 @@ def mock(
 ) -> None:
     """Run mock UR controllers and cameras until Ctrl-C: RTDE, script and dashboard ports, MJPEG over HTTP.
 
-    Arms move, feel and stop like an arm, but know no dynamics. Any UR client can connect. Cameras send 320 x 240 px,
-    30 times a second, with a strip below that holds number and clock of the frame; nothing is in front of them. For
-    arms and cameras with simulated gels, open the rig `mock`. What happens to an arm is printed.
+    Arms move, measure forces and stop like real arms, but without dynamics. Any UR client can connect. Cameras send
+    images of 320 x 240 px, 30 times a second, with a strip below that contains number and clock of the frame; they have
+    no gel. For arms and cameras with simulated gels, open the rig `mock`. The command prints the events of each arm.
 
     Example: tacsim mock --arms 2 --cameras 2
     """
@@ -91,18 +91,18 @@ def mock(
                 device.check()
                 if isinstance(device, MockArms):
                     for faults in device.fault_clients:
-                        logs[faults.host] = _print_new(faults, logs.get(faults.host, []))
+                        logs[faults.host] = _print_new_lines(faults, logs.get(faults.host, []))
             time.sleep(0.1)
         raise typer.Exit(interrupt.exit_code)
 
 
-def _print_new(faults: FaultClient, printed: Log) -> Log:
-    """Prints what the log of an arm has more than `printed`, which is its last state; returns the log."""
+def _print_new_lines(faults: FaultClient, printed: Log) -> Log:
+    """Prints the lines of an arm's log that are not in `printed`, its last state; returns the log."""
     from robot.mock import FaultError
 
     try:
         log = faults.log()
-    except FaultError:  # its mock ends: the next check says why
+    except FaultError:  # its mock ends: the next check reports the reason
         return printed
     last = printed[-1] if printed else None
     for at, text in log[log.index(last) + 1 if last in log else 0 :]:

@@ -1,4 +1,4 @@
-"""Options that several commands have, and how a quantity on the command line is read."""
+"""Options of several commands, and parsers of quantities on the command line."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ HardwareRig = Annotated[str, typer.Argument(help="A rig of hardware (ur5e, ur5e-
 TrainingFile = Annotated[str, typer.Argument(help="squeeze, reposition, knead, or the path of a training file.")]
 
 
-def quantity(kind: str, low: float = -math.inf, high: float = math.inf) -> Callable[[str], float]:
-    """Parser of an option that is a length, an angle ..., `low` to `high` in SI units. A length but 0 needs its unit: a
-    person who leaves it out means millimetres as often as metres."""
+def quantity_parser(kind: str, low: float = -math.inf, high: float = math.inf) -> Callable[[str], float]:
+    """Parser of an option that is a length, an angle ..., `low` to `high` in SI units. A length other than 0 needs its
+    unit: a number without one could mean millimetres or metres."""
 
     def parse(text: str) -> float:
         from tacsim.models.quantity import parse_quantity as parse_quantity
@@ -45,37 +45,37 @@ def quantity(kind: str, low: float = -math.inf, high: float = math.inf) -> Calla
     return parse
 
 
-def quantities(kind: str, count: int) -> Callable[[str], tuple[float, ...]]:
-    """Parser of an option that is `count` lengths, angles ... with commas between."""
+def quantities_parser(kind: str, count: int) -> Callable[[str], tuple[float, ...]]:
+    """Parser of an option that is `count` lengths, angles ..., separated by commas."""
 
     def parse(text: str) -> tuple[float, ...]:
         parts = text.split(",")
         if len(parts) != count:
-            raise typer.BadParameter(f"'{text}' has {len(parts)} values, {count} are needed, with commas between")
-        return tuple(quantity(kind)(part.strip()) for part in parts)
+            raise typer.BadParameter(f"'{text}' has {len(parts)} values, {count} are needed, separated by commas")
+        return tuple(quantity_parser(kind)(part.strip()) for part in parts)
 
     return parse
 
 
-def length(help_: str, low: float = -math.inf, high: float = math.inf) -> Any:
+def length_option(help_: str, low: float = -math.inf, high: float = math.inf) -> Any:
     """An option that is a length, `low` to `high` [m]."""
-    return typer.Option(parser=quantity("length", low, high), metavar="LENGTH", help=help_)
+    return typer.Option(parser=quantity_parser("length", low, high), metavar="LENGTH", help=help_)
 
 
 class OptionGroup:
-    """Options of one or several commands, as annotated attributes with defaults; see `grouped`."""
+    """Options of one or several commands, as annotated attributes with defaults; see `with_option_groups`."""
 
     def __init__(self, **values: Any) -> None:
         self.__dict__.update(values)
 
 
-def grouped(command: Callable[..., None]) -> Callable[..., None]:
-    """A command some of whose parameters are groups: their attributes become options of the command, in their place."""
+def with_option_groups(command: Callable[..., None]) -> Callable[..., None]:
+    """Makes a command whose OptionGroup parameters are replaced by their attributes, as options of the command."""
     return _GroupedCommand(command)
 
 
 class _GroupedCommand:
-    """Its signature is read for the command that is called only: for all commands that would take 10 ms."""
+    """Reads the signature only when it is needed: reading those of all commands would take 10 ms."""
 
     def __init__(self, command: Callable[..., None]) -> None:
         self._command = command
@@ -114,13 +114,13 @@ class _GroupedCommand:
         return inspect.Signature(found)
 
 
-def angle(help_: str, low: float = -math.inf, high: float = math.inf) -> Any:
+def angle_option(help_: str, low: float = -math.inf, high: float = math.inf) -> Any:
     """An option that is an angle, `low` to `high` [rad]."""
-    return typer.Option(parser=quantity("angle", low, high), metavar="ANGLE", help=help_)
+    return typer.Option(parser=quantity_parser("angle", low, high), metavar="ANGLE", help=help_)
 
 
 def require_packages(command: str, extra: str, *modules: str) -> None:
-    """Raises CannotOpen, with what to install, unless all modules are installed."""
+    """Raises CannotOpen, with the extra to install, unless all modules are installed."""
     from importlib.util import find_spec
 
     from robot.open import CannotOpen

@@ -1,4 +1,4 @@
-"""Where a command writes, and how it shows that it is at work."""
+"""Output of commands: folders, files, messages, progress and tables."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ if TYPE_CHECKING:
 
 
 class SafeConsole(Console):
-    """A console that shows control characters instead of obeying them. What a command prints may hold names and texts
-    of files, recordings and devices, which must not move the cursor, change colours or turn the writing round."""
+    """A console that prints control characters as text. Names and texts from files, recordings and devices must not
+    move the cursor, change colours or reverse the writing direction."""
 
     @property
     def options(self) -> ConsoleOptions:
-        min_columns = 60  # columns: in fewer a table loses its values; the terminal breaks its lines instead
+        min_columns = 60  # with fewer, a table would lose values; the terminal breaks its lines instead
         found = super().options
         return found.update_width(max(found.max_width, min_columns))
 
@@ -37,13 +37,15 @@ class SafeConsole(Console):
             yield segment if segment.control else segment._replace(text=escape_text(segment.text, kept="\n\t"))
 
 
-results = SafeConsole(markup=False, emoji=False, highlight=False, soft_wrap=True)  # stdout: what the command found
-notes = SafeConsole(stderr=True, markup=False, emoji=False, highlight=False, soft_wrap=True)  # stderr: what it is doing
+results = SafeConsole(markup=False, emoji=False, highlight=False, soft_wrap=True)  # stdout: results
+notes = SafeConsole(
+    stderr=True, markup=False, emoji=False, highlight=False, soft_wrap=True
+)  # stderr: progress and notes
 
 
 def new_directory(out: Path | None, what: str) -> Path:
-    """The folder to be made for the results of `what`. Raises typer.BadParameter if there is one already, or none can
-    be made there: better now than after the work."""
+    """The new folder for the results of `what`. Raises typer.BadParameter before the work starts if it exists or cannot
+    be made."""
     folder = Path("runs") / f"{datetime.now():%Y%m%d-%H%M%S}-{what}" if out is None else out
     if folder.exists():
         raise typer.BadParameter(
@@ -64,8 +66,7 @@ def new_directory(out: Path | None, what: str) -> Path:
 
 
 def require_writable(file: Path | None, option: str, *, new: bool = False) -> None:
-    """Raises typer.BadParameter for a file that cannot be written, or with `new` is there: better now than after the
-    work."""
+    """Raises typer.BadParameter before the work starts for a file that cannot be written, or that exists if `new`."""
     if file is None:
         return
     there = next(place for place in (file, *file.absolute().parents) if place.exists())
@@ -77,8 +78,8 @@ def require_writable(file: Path | None, option: str, *, new: bool = False) -> No
 
 @contextmanager
 def writing(folder: Path, *, new: bool = False) -> Iterator[Path]:
-    """Makes `folder` where it is missing; `new`: raises FileExistsError when someone else just made it. An OSError in
-    the block that names no file names it: a disk that fills up in the middle of a write says nothing of where."""
+    """Makes `folder` if it is missing. `new`: raises FileExistsError if another process has made it. An OSError in the
+    block without a file name gets the name of the folder: the error of a full disk names no file."""
     try:
         folder.mkdir(parents=True, exist_ok=not new)
         yield folder
@@ -88,33 +89,33 @@ def writing(folder: Path, *, new: bool = False) -> Iterator[Path]:
         raise
 
 
-_shown: list[Progress | Status] = []  # what is drawn again and again on the terminal
+_drawn_displays: list[Progress | Status] = []  # progress displays on the terminal
 
 
 @contextmanager
-def _drawn(shown: Progress | Status) -> Iterator[None]:
-    _shown.append(shown)
+def _register_display(display: Progress | Status) -> Iterator[None]:
+    _drawn_displays.append(display)
     try:
         yield
     finally:
-        _shown.remove(shown)
+        _drawn_displays.remove(display)
 
 
 @contextmanager
-def paused() -> Iterator[None]:
-    """Nothing is drawn meanwhile: what a person shall read stays on the screen."""
-    for shown in _shown:
-        shown.stop()
+def pause_displays() -> Iterator[None]:
+    """Stops progress displays in the block, so that a text for the operator stays on the screen."""
+    for display in _drawn_displays:
+        display.stop()
     try:
         yield
     finally:
-        for shown in _shown:
-            shown.start()
+        for display in _drawn_displays:
+            display.start()
 
 
 @contextmanager
 def progress() -> Iterator[Progress]:
-    """A progress bar on stderr; on no terminal it is silent."""
+    """A progress bar on stderr; without a terminal it prints nothing."""
     from rich import progress as rich
 
     columns = (
@@ -124,7 +125,10 @@ def progress() -> Iterator[Progress]:
         rich.TimeElapsedColumn(),
         rich.TimeRemainingColumn(),
     )
-    with rich.Progress(*columns, console=notes, transient=True, disable=not notes.is_terminal) as bar, _drawn(bar):
+    with (
+        rich.Progress(*columns, console=notes, transient=True, disable=not notes.is_terminal) as bar,
+        _register_display(bar),
+    ):
         yield bar
 
 
@@ -134,18 +138,18 @@ class Bar:
     def __init__(self, bar: Progress, words: str) -> None:
         self._bar, self._row = bar, bar.add_task(words, total=None)
 
-    def say(self, words: str) -> None:
-        """What is being done."""
+    def set_text(self, words: str) -> None:
+        """Sets the description of the present work."""
         self._bar.update(self._row, description=escape_text(words))
 
-    def count(self, done: int, total: int | None) -> None:
-        """How many steps are done, and of how many; None: nobody knows."""
+    def set_progress(self, done: int, total: int | None) -> None:
+        """Sets the number of finished steps and of all steps; None if that number is unknown."""
         self._bar.update(self._row, completed=done, total=total)
 
     def report(self, words: str, done: int, total: int) -> None:
-        """Both."""
-        self.say(words)
-        self.count(done, total)
+        """Sets description and progress."""
+        self.set_text(words)
+        self.set_progress(done, total)
 
 
 @contextmanager
@@ -157,16 +161,16 @@ def one_bar(words: str) -> Iterator[Bar]:
 
 @contextmanager
 def counted(words: str) -> Iterator[Callable[[int, int], None]]:
-    """A progress bar, as what takes (steps done, steps in all)."""
+    """A progress bar, as a callback that takes the number of finished steps and of all steps."""
     with one_bar(words) as bar:
-        yield bar.count
+        yield bar.set_progress
 
 
 @contextmanager
 def busy(words: str) -> Iterator[Callable[[str], None]]:
-    """Says what takes long; on a terminal with a spinner, which can be given other words, else as one line."""
+    """Reports slow work: on a terminal by a spinner, whose text the yielded function changes; otherwise by one line."""
     if notes.is_terminal:
-        with notes.status(words) as status, _drawn(status):
+        with notes.status(words) as status, _register_display(status):
             yield lambda now: status.update(escape_text(now))
     else:
         notes.print(words)
@@ -174,39 +178,39 @@ def busy(words: str) -> Iterator[Callable[[str], None]]:
 
 
 @contextmanager
-def measuring(say: Callable[[str], None], after: str) -> Iterator[None]:
-    """In the block it is said how far the measuring of a mesh is that takes longer than QUIET: on a terminal by `say`,
-    which then says `after`, else once, as a line."""
-    quiet_time = 1.0  # [s] what takes longer says how far it is
+def report_mesh_measuring(report: Callable[[str], None], after: str) -> Iterator[None]:
+    """Reports progress in the block if measuring the distances of a mesh takes longer than 1 s: on a terminal by
+    `report`, which gets the text `after` at the end; otherwise once, as a line."""
+    progress_delay = 1.0  # from the start until progress is reported [s]
     from tacsim.geometry.tiles import report_tiles
 
     began: dict[str, float] = {}
-    told: set[str] = set()
+    printed: set[str] = set()
 
-    def tell(path: str, done: int, total: int) -> None:
+    def report_tile(path: str, done: int, total: int) -> None:
         if done == 0:
             began[path] = time.monotonic()
-        elif time.monotonic() - began[path] > quiet_time:
+        elif time.monotonic() - began[path] > progress_delay:
             words = f"measuring the distances from {printable_line(path)}: {done} of {total} parts"
-            say(words)
-            if not notes.is_terminal and path not in told:
+            report(words)
+            if not notes.is_terminal and path not in printed:
                 notes.print(words)
-            told.add(path)
+            printed.add(path)
             if done == total - 1:
-                say(after)
+                report(after)
 
-    with report_tiles(tell):
+    with report_tiles(report_tile):
         yield
 
 
-def say_files(*paths: Path) -> None:
-    """Prints paths, one a line."""
+def print_files(*paths: Path) -> None:
+    """Prints paths, one per line."""
     for path in paths:
         results.print(printable_line(str(path)))
 
 
 def warn(words: str) -> None:
-    """What a person should look at before trusting the result."""
+    """Prints a warning that the user must check before trusting the result."""
     notes.print(f"look at this: {words}")
 
 
@@ -217,8 +221,8 @@ def show_table(
     left: Collection[int] = (),
     width: int | None = None,
 ) -> None:
-    """Prints a table on stdout; columns are flush right, except those with a number in `left`. Brackets are shown as
-    they are: they hold units."""
+    """Prints a table on stdout; columns are right-aligned, except those with a number in `left`. Brackets, which
+    contain units, are printed unchanged."""
     from rich.table import Table
 
     table = Table(box=None, padding=(0, 1), title=Text(title), title_justify="left")

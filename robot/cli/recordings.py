@@ -8,14 +8,14 @@ from typing import Annotated
 import typer
 
 from robot.cli.options import Out, Overrides
-from robot.cli.output import busy, counted, new_directory, notes, results, say_files
+from robot.cli.output import busy, counted, new_directory, notes, print_files, results
 from robot.cli.run import run
 
 
 def view(
     episode: Annotated[
         str,
-        typer.Argument(metavar="EPISODE|RIG", help="An episode.mcap, cut off or not; or a rig, looked at live."),
+        typer.Argument(metavar="EPISODE|RIG", help="An episode.mcap, complete or cut off; or a rig, shown live."),
     ],
     save: Annotated[
         Path | None, typer.Option(metavar="FILE.rrd", help="Write a file for the viewer instead of starting one.")
@@ -27,9 +27,9 @@ def view(
     set_: Overrides = None,
     out: Out = None,
 ) -> None:
-    """Look at an episode or a rig in Rerun: gels, flow and forces in space, pictures, plots, on one time line.
+    """Show an episode or a rig in Rerun: gels, flow and forces in space, images, plots, on one time line.
 
-    A rig of hardware is only looked at (tacsim run --dry-run), a simulated one runs its task (tacsim run). Needs the
+    A rig of hardware is only observed (tacsim run --dry-run), a simulated one runs its task (tacsim run). Needs the
     extra 'viz'; without it, `tacsim replay` makes a report.
 
     Example: tacsim view runs/first/episode.mcap
@@ -40,20 +40,20 @@ def view(
     if path.is_dir():
         raise typer.BadParameter(f"{path} is a folder; name the episode.mcap in it", param_hint="EPISODE|RIG")
     if path.suffix != ".mcap" and not (path.is_file() and path.suffix != ".yaml"):
-        _live(episode, save, task, steps, set_, out)
+        _view_live(episode, save, task, steps, set_, out)
         return
     for name, given in (("--task", task), ("--steps", steps), ("--set", set_), ("--out", out)):
         if given:
-            raise typer.BadParameter(f"{episode} is a recording; this is for rigs", param_hint=name)
+            raise typer.BadParameter(f"{episode} is a recording; this option is for rigs", param_hint=name)
     with busy("loading"):
         from robot.export.rerun_view import view_episode
     with counted("reading") as on_step:
         view_episode(path, save, on_step)
     if save is not None:
-        say_files(save)
+        print_files(save)
 
 
-def _live(
+def _view_live(
     rig: str, save: Path | None, task: str | None, steps: int | None, set_: list[str] | None, out: Path | None
 ) -> None:
     from robot.open import load_with_task
@@ -69,19 +69,19 @@ def lerobot(
     out: Annotated[Path, typer.Option(metavar="DIR", help="New folder of the data set.")],
     task: Annotated[
         str | None,
-        typer.Option(metavar="TEXT", help="The task in words.", show_default="made of each episode's task and goal"),
+        typer.Option(metavar="TEXT", help="Description of the task.", show_default="from each episode's task and goal"),
     ] = None,
     maps: Annotated[
         bool, typer.Option("--maps/--no-maps", help="With heights, gradients and flow; without, it loads faster.")
     ] = True,
-    cut: Annotated[bool, typer.Option("--cut", help="Take recordings that were cut off, up to there.")] = False,
+    cut: Annotated[bool, typer.Option("--cut", help="Include recordings that were cut off.")] = False,
     video: Annotated[
-        bool, typer.Option("--video", help="Pictures as H.264 video: a sixth of the room, about 1 grey level off.")
+        bool, typer.Option("--video", help="Images as H.264 video: a sixth of the size, error about 1 grey level.")
     ] = False,
 ) -> None:
     """Make a LeRobot data set (v3.0) of recorded episodes; for lerobot-train, Hugging Face datasets, pandas.
 
-    Pictures are PNG inside the files, without loss. Needs the extra 'export'; with --video the extra 'video'.
+    Images are stored without loss, as PNG inside the files. Needs the extra 'export'; with --video the extra 'video'.
 
     Example: tacsim export lerobot runs/*/episode.mcap --out data/squeeze
     """
@@ -90,13 +90,13 @@ def lerobot(
         from robot.export.lerobot import export_lerobot
 
     with counted("exporting") as on_step:
-        export_lerobot(_recordings(episodes), folder, task=task, maps=maps, cut=cut, video=video, on_step=on_step)
+        export_lerobot(_find_recordings(episodes), folder, task=task, maps=maps, cut=cut, video=video, on_step=on_step)
     notes.print(f'Load it: LeRobotDataset("{folder.name}", root="{folder}")')
-    say_files(folder)
+    print_files(folder)
 
 
-def _recordings(given: list[Path]) -> list[Path]:
-    """The files, and those in the folders by name. Raises typer.BadParameter for a folder without any."""
+def _find_recordings(given: list[Path]) -> list[Path]:
+    """The given files, and those in the given folders by name. Raises typer.BadParameter for a folder without files."""
     found: list[Path] = []
     for path in given:
         inside = [path]
@@ -111,13 +111,13 @@ def _recordings(given: list[Path]) -> list[Path]:
 def recover(
     file: Annotated[Path, typer.Argument(help="A recording that was cut off or damaged; it is only read.")],
     out: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="The new file.", show_default="FILE.recovered.mcap beside it")
+        Path | None, typer.Option(metavar="FILE", help="The new file.", show_default="FILE.recovered.mcap next to it")
     ] = None,
 ) -> None:
     """Make a finished MCAP file of a recording that was cut off (killed, power, full disk) or damaged.
 
     tacsim reads recordings that were cut off as they are; other tools (Foxglove, mcap) need the end of the file with
-    its index. Every whole step is kept; what is lost is said.
+    its index. Every complete step is kept; lost parts are listed.
 
     Example: tacsim recover runs/first/episode.mcap
     """
@@ -127,7 +127,7 @@ def recover(
 
         found = recover_file(file, new)
     if found.is_whole:
-        results.print(f"{file} is whole: {found.steps} steps, its end and its index; nothing to recover")
+        results.print(f"{file} is complete: {found.steps} steps, its end and its index; nothing to recover")
         return
     lost = [] if found.finished else ["the end: the recording was cut off, or its index is damaged"]
     lost += [f"bytes {begin} to {end}: a step that was not finished, or is damaged" for begin, end in found.damaged]
@@ -138,4 +138,4 @@ def recover(
         *found.missing[:20],
     ]:
         results.print(f"  {words}")
-    say_files(new)
+    print_files(new)

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from robot.cli.errors import FAILED, complain
+from robot.cli.errors import EXIT_FAILED, print_error
 from robot.cli.options import Out, Overrides
-from robot.cli.output import Bar, busy, measuring, new_directory, notes, one_bar, results, warn, writing
-from robot.cli.terminal import Interrupt, ask, require_person
+from robot.cli.output import Bar, busy, new_directory, notes, one_bar, report_mesh_measuring, results, warn, writing
+from robot.cli.terminal import Interrupt, ask_operator, require_operator
 
 if TYPE_CHECKING:
     from robot.deploy.control_loop import EpisodeSetup
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 STARTING = "starting (the first run compiles the kernels, up to half a minute)"
 OPENING = "opening the rig"
-NO_END = 1_000_000  # steps of a replay: its recording ends it
+MAX_REPLAY_STEPS = 1_000_000  # of a replay, which ends with its recording
 
 
 def run(
@@ -49,51 +49,53 @@ def run(
         ),
     ] = None,
     steps: Annotated[
-        int | None, typer.Option(min=0, help="Exactly so many control steps.", show_default="the task's; else 40")
+        int | None, typer.Option(min=0, help="Number of control steps.", show_default="the task's; else 40")
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same episode.")] = 0,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Hardware: connect, look, time and record, but send no motion.")
+        bool,
+        typer.Option("--dry-run", help="Hardware: connect, observe, measure periods and record, but send no motion."),
     ] = False,
-    view: Annotated[bool, typer.Option("--view", help="Look at it live in Rerun (extra 'viz').")] = False,
+    view: Annotated[bool, typer.Option("--view", help="Show it live in Rerun (extra 'viz').")] = False,
     save_view: Annotated[
         Path | None,
-        typer.Option("--save-view", metavar="FILE.rrd", help="Write a file for Rerun's viewer while it runs."),
+        typer.Option("--save-view", metavar="FILE.rrd", help="Write a file for Rerun's viewer during the run."),
     ] = None,
     set_: Overrides = None,
     out: Out = None,
 ) -> None:
     """Run one episode: a policy on a rig. Records it and writes a report.
 
-    Ctrl-C, SIGTERM or a lost terminal ends the episode after the step under way; what was done is saved and reported.
+    Ctrl-C, SIGTERM or a lost terminal ends the episode after the present step; all finished steps are saved and
+    reported.
 
     Example: tacsim run sim --task squeeze --steps 30 --out runs/first
     """
-    default_steps = 40  # steps where neither a task nor a recording has an end
+    default_steps = 40  # number of steps without a task and without a recording
     from robot.open import load_with_task
 
     if save_view is not None and save_view.suffix != ".rrd":
         raise typer.BadParameter(f"{save_view} must end in .rrd, as the viewer's files do", param_hint="--save-view")
-    sys.path.append(str(Path.cwd()))  # --policy mine:act finds mine.py here, as `python -m` would; after all else
+    sys.path.append(str(Path.cwd()))  # --policy mine:act finds mine.py here, as with `python -m`; last on the path
     loaded = load_with_task(rig, task, set_ or [])
     for words in loaded.notes:
         notes.print(words)
     own_task = loaded.config.task
     if not dry_run:
-        require_person(loaded.config)
+        require_operator(loaded.config)
     folder = new_directory(out, loaded.config.name if own_task is None else own_task.kind)
     if steps is None:
-        endless = NO_END if loaded.config.clock == "replay" else default_steps
+        endless = MAX_REPLAY_STEPS if loaded.config.clock == "replay" else default_steps
         steps = endless if own_task is None else own_task.steps
     name = policy if policy is not None else ("grip" if own_task is None else "scripted")
     with Interrupt() as interrupt:
         views = [None] * view + [save_view] * (save_view is not None)
         failed = _run(loaded, name, steps, seed, folder, interrupt, dry_run, views)
         if interrupt():
-            complain("stopped by a signal before the last step; what was done is saved")
+            print_error("stopped by a signal before the last step; all finished steps are saved")
             raise typer.Exit(interrupt.exit_code)
     if failed:
-        raise typer.Exit(FAILED)
+        raise typer.Exit(EXIT_FAILED)
 
 
 def _run(
@@ -106,8 +108,8 @@ def _run(
     dry_run: bool,
     views: Sequence[Path | None],
 ) -> bool:
-    """Runs and reports the episode; True when it or its recording failed. The folder is made when the episode starts: a
-    run that cannot start leaves none."""
+    """Runs and reports the episode; returns True if it or its recording failed. The folder is made when the episode
+    starts, so a run that cannot start leaves none."""
     with busy("loading"):
         from robot.deploy.control_loop import EpisodeSetup
         from robot.deploy.policy import load_policy, require_fit, training_notes
@@ -136,8 +138,8 @@ def _run(
     with (
         dump_to_folder(folder / "diverged"),
         one_bar(begun) as bar,
-        measuring(bar.say, begun),
-        open_rig(loaded, confirm=ask, dry_run=dry_run, check=fit, tell=bar.say) as rig,
+        report_mesh_measuring(bar.set_text, begun),
+        open_rig(loaded, confirm=ask_operator, dry_run=dry_run, check=fit, report=bar.set_text) as rig,
         ExitStack() as stack,
     ):
 
@@ -148,23 +150,23 @@ def _run(
                 recorder = stack.enter_context(file)
             return recorder
 
-        watched = _views(rig.spec, loaded, views, stack)
-        episode, failure = _drive(rig, fitting[0], task, steps, setup, record, interrupt, bar, watched)
+        watched = _open_views(rig.spec, loaded, views, stack)
+        episode, failure = _run_steps(rig, fitting[0], task, steps, setup, record, interrupt, bar, watched)
     lost = ""
     if recorder is not None and (recorder.error or recorder.dropped):
         why = recorder.error or "the disk was too slow"
         lost = f"{recorder.path} holds {recorder.written} of {recorder.written + recorder.dropped} steps: {why}"
     for problem in filter(None, (failure, lost)):
-        complain(problem)
+        print_error(problem)
     if recorder is None or not episode.steps:
         return True
     episode.dropped = recorder.dropped
-    _report(episode, folder, [folder / "episode.mcap"])
+    _write_report(episode, folder, [folder / "episode.mcap"])
     return bool(failure or lost)
 
 
-def _views(spec: RigSpec, loaded: LoadedRig, files: Sequence[Path | None], stack: ExitStack) -> list[LiveView]:
-    """A viewer for None, a file for each path; closed with the stack, which says what they did not show."""
+def _open_views(spec: RigSpec, loaded: LoadedRig, files: Sequence[Path | None], stack: ExitStack) -> list[LiveView]:
+    """Opens a viewer for None, a file for each path. The stack closes them and reports steps that they did not show."""
     if not files:
         return []
     from robot.export.rerun_view import LiveView
@@ -174,7 +176,7 @@ def _views(spec: RigSpec, loaded: LoadedRig, files: Sequence[Path | None], stack
         if view.ended:
             notes.print(f"{name} ended before the episode did")
         elif view.left_out:
-            notes.print(f"{name} left {view.left_out} steps out, which came too fast for it")
+            notes.print(f"{name} omitted {view.left_out} steps, because it was too slow")
 
     views = []
     for file in files:
@@ -183,7 +185,7 @@ def _views(spec: RigSpec, loaded: LoadedRig, files: Sequence[Path | None], stack
     return views
 
 
-def _drive(
+def _run_steps(
     rig: Rig,
     policy: Policy,
     task: Task | None,
@@ -194,24 +196,24 @@ def _drive(
     bar: Bar,
     views: Sequence[LiveView],
 ) -> tuple[Episode, str]:
-    """The episode, shown by the bar, and what ended it too early ("" when nothing did)."""
+    """Runs the episode with a progress bar; returns it and the error that ended it early ("" without an error)."""
     from robot.deploy.control_loop import EpisodeFailed, run_episode
     from robot.deploy.policy import describe_outside
     from tacsim.record.step_info import TRAINING_DISTANCE
 
-    told = False
+    is_reported = False
 
     def show(step: Step) -> None:
-        nonlocal told
-        if not told and step.info.get(TRAINING_DISTANCE, 0.0) > 1.0:
-            told = True
+        nonlocal is_reported
+        if not is_reported and step.info.get(TRAINING_DISTANCE, 0.0) > 1.0:
+            is_reported = True
             warn(f"step {step.index}: policy '{setup.policy}': {describe_outside(policy)}")
-        bar.say(task.config.kind if task else rig.name)
-        bar.count(step.index, None if steps == NO_END else steps)
+        bar.set_text(task.config.kind if task else rig.name)
+        bar.set_progress(step.index, None if steps == MAX_REPLAY_STEPS else steps)
 
-    def watch(*seen: Any) -> None:
+    def watch(*observed: Any) -> None:
         for each in views:
-            each(*seen)
+            each(*observed)
 
     try:
         episode = run_episode(
@@ -223,10 +225,10 @@ def _drive(
 
 
 def replay(
-    file: Annotated[Path, typer.Argument(help="An episode.mcap; a recording that was cut off will do.")],
+    file: Annotated[Path, typer.Argument(help="An episode.mcap, complete or cut off.")],
     out: Out = None,
 ) -> None:
-    """Show a recorded episode again: its report, made anew. Nothing is executed.
+    """Write the report of a recorded episode again. Nothing is executed.
 
     Example: tacsim replay runs/first/episode.mcap
     """
@@ -241,11 +243,11 @@ def replay(
     if not episode.steps:
         raise EpisodeError(f"{file}: no step can be read, there is nothing to show")
     folder.mkdir(parents=True)
-    _report(episode, folder, [])
+    _write_report(episode, folder, [])
 
 
-def _report(episode: Episode, folder: Path, files: Sequence[Path]) -> None:
-    """Writes the report and ends with the table."""
+def _write_report(episode: Episode, folder: Path, files: Sequence[Path]) -> None:
+    """Writes the report and prints its table."""
     import json
 
     from robot.rig.recorded import RecordedSurfaces

@@ -1,4 +1,4 @@
-"""`tacsim press`, `reproduce` and `debug`: simulation without a policy's episode."""
+"""`tacsim press`, `reproduce` and `debug`: simulations without a policy."""
 
 from __future__ import annotations
 
@@ -8,9 +8,19 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from robot.cli.errors import FAILED, complain
-from robot.cli.options import OptionGroup, Out, Overrides, Preset, SensorModel, angle, grouped, length, quantities
-from robot.cli.output import busy, measuring, new_directory, notes, progress, results, say_files, writing
+from robot.cli.errors import EXIT_FAILED, print_error
+from robot.cli.options import (
+    OptionGroup,
+    Out,
+    Overrides,
+    Preset,
+    SensorModel,
+    angle_option,
+    length_option,
+    quantities_parser,
+    with_option_groups,
+)
+from robot.cli.output import busy, new_directory, notes, print_files, progress, report_mesh_measuring, results, writing
 from robot.cli.terminal import Interrupt
 
 if TYPE_CHECKING:
@@ -20,41 +30,41 @@ AXES = ("roll", "pitch", "yaw")
 
 
 class IndenterShape(OptionGroup):
-    """Options that describe the indenter and how it is turned."""
+    """Options that describe the indenter and its orientation."""
 
-    radius: Annotated[Any, length("Of a sphere or cylinder; 4 mm if left out.")] = None
-    height: Annotated[Any, length("Of a cylinder; 5 mm if left out.")] = None
+    radius: Annotated[Any, length_option("Of a sphere or cylinder; 4 mm by default.")] = None
+    height: Annotated[Any, length_option("Of a cylinder; 5 mm by default.")] = None
     size: Annotated[
         Any,
-        typer.Option(parser=quantities("length", 3), metavar="X,Y,Z", help="Of a box; 5, 5, 5 mm if left out."),
+        typer.Option(parser=quantities_parser("length", 3), metavar="X,Y,Z", help="Of a box; 5, 5, 5 mm by default."),
     ] = None
-    edge_radius: Annotated[Any, length("Of a box's or cylinder's edges; half an element if left out.")] = None
+    edge_radius: Annotated[Any, length_option("Of a box's or cylinder's edges; half an element by default.")] = None
     scale: Annotated[
-        float | None, typer.Option(help="Metres per unit of the .stl file; 0.001 if left out.", show_default=False)
+        float | None, typer.Option(help="Metres per unit of the .stl file; 0.001 by default.", show_default=False)
     ] = None
     down: Annotated[
         Literal["-z", "+z", "-x", "+x", "-y", "+y"] | None,
-        typer.Option(help="Side of the indenter, in its own axes, that presses; -z if left out.", show_default=False),
+        typer.Option(help="Side of the indenter, in its own axes, that presses; -z by default.", show_default=False),
     ] = None
     rotation: Annotated[
         Any,
         typer.Option(
-            parser=quantities("angle", 3),
+            parser=quantities_parser("angle", 3),
             metavar="ROLL,PITCH,YAW",
-            help="Turn it about the world's x, then y, then z, in place of --down.",
+            help="Rotate it about the world's x, then y, then z, instead of --down.",
         ),
     ] = None
 
 
-@grouped
+@with_option_groups
 def press(
     indenter: Annotated[str, typer.Argument(help="sphere, cylinder, box, or the path of an .stl file.")],
     *,
-    depth: Annotated[Any, length("How deep below the untouched gel.")] = "0.5 mm",
+    depth: Annotated[Any, length_option("Depth below the surface of the untouched gel.")] = "0.5 mm",
     slide: Annotated[
-        Any, typer.Option(parser=quantities("length", 2), metavar="X,Y", help="Then slide by this much.")
+        Any, typer.Option(parser=quantities_parser("length", 2), metavar="X,Y", help="Then slide by this distance.")
     ] = "0,0",
-    twist: Annotated[Any, angle("Then turn about the vertical.")] = "0",
+    twist: Annotated[Any, angle_option("Then rotate about the vertical.")] = "0",
     shape: IndenterShape,
     preset: Preset = "standard",
     sensor: SensorModel = "ideal",
@@ -66,7 +76,7 @@ def press(
 
     --set changes the scene, for example --set indenter.friction=0.3 (see tacsim schema scene).
 
-    A calibrated sensor brings its own gel size, picture and light; rgb.png is its metric picture.
+    A calibrated sensor defines gel size, image and light; rgb.png is its metric image.
 
     Example: tacsim press sphere --radius '3 mm' --depth '0.4 mm' --slide '1 mm, 0'
     """
@@ -75,7 +85,7 @@ def press(
 
     folder = new_directory(out, "press")
     given = {name: getattr(shape, name) for name in ("radius", "height", "size", "scale")}
-    changes = [_geometry(indenter, given), *_orientation(shape.down, shape.rotation)]
+    changes = [_geometry_override(indenter, given), *_orientation_overrides(shape.down, shape.rotation)]
     if shape.edge_radius is not None:
         changes.append(f"indenter.edge_radius={shape.edge_radius!r}")
     scene = load_scene("press", [f"preset={preset}", *changes, *(set_ or [])])
@@ -90,15 +100,15 @@ def press(
         from tacsim.physics.failure.health import SimulationDiverged
 
         motion = presses.PressMotion(depth, slide, twist)
-        with dump_to_folder(folder / "diverged"), measuring(say, "pressing"):
+        with dump_to_folder(folder / "diverged"), report_mesh_measuring(say, "pressing"):
             try:
                 pressed = presses.press(scene, model, motion)
             except SimulationDiverged as failure:
-                say("it failed; looking for a depth that is possible")
+                say("it failed; searching for a possible depth")
                 if (possible := presses.deepest_possible(scene, motion, failure)) is not None:
                     failure.possible = (
-                        f"the gel cannot take {motion.depth * 1e3:g} mm of this indenter; {possible * 1e3:g} mm is "
-                        f"possible, tried with --depth '{possible * 1e3:g} mm'"
+                        f"a depth of {motion.depth * 1e3:g} mm is not possible with this indenter; "
+                        f"{possible * 1e3:g} mm is possible, as tested: --depth '{possible * 1e3:g} mm'"
                     )
                 raise
     config = presses.press_report(scene, motion, pressed, model)
@@ -109,24 +119,25 @@ def press(
     results.print(f"contact radius   {config['contact_radius'] * 1e3:.3f} mm")
     results.print(f"deepest          {config['deepest'] * 1e3:.3f} mm")
     if config["edge_radius"] is not None:
-        asked = config["indenter"]["edge_radius"]
-        words = " (what the mesh carries; --edge-radius '0 mm' for sharp edges)" if asked is None else ""
-        results.print(f"edge radius      {config['edge_radius'] * 1e3:.3f} mm{' (sharp)' if asked == 0 else words}")
+        requested = config["indenter"]["edge_radius"]
+        words = " (smallest for this mesh; --edge-radius '0 mm' for sharp edges)" if requested is None else ""
+        results.print(f"edge radius      {config['edge_radius'] * 1e3:.3f} mm{' (sharp)' if requested == 0 else words}")
     if config["unfelt"] > presses.UNFELT:
         notes.print(
-            f"warning: the gel feels {1 - config['unfelt']:.0%} of the depth: a tip or edge is too narrow for elements "
-            f"of {config['element_size'] * 1e3:g} mm, the force too small (a wedge's by 10 to 25 %); lower element_size"
+            f"warning: the gel is pressed by {1 - config['unfelt']:.0%} of the depth: a tip or edge is too narrow for "
+            f"elements of {config['element_size'] * 1e3:g} mm, the force too small (a wedge's by 10 to 25 %); lower "
+            "element_size"
         )
     if config["folded"]:
-        notes.print("note: the gel folds over itself; picture and height show the sheet that the camera sees")
+        notes.print("note: the gel folds over itself; image and height show the layer that the camera sees")
     if not config["settled"]:
         held = "not held" if config["residual"] is None else f"relative residual {config['residual']:.2g}"
         notes.print(f"warning: not settled, {config['unfollowed'] or f'{held}; raise settling.max_substeps'}")
-    say_files(*sorted(folder.iterdir()))
+    print_files(*sorted(folder.iterdir()))
 
 
-def _orientation(down: str | None, rotation: tuple[float, ...] | None) -> list[str]:
-    """The overrides that turn an indenter. Raises typer.BadParameter for both ways at once."""
+def _orientation_overrides(down: str | None, rotation: tuple[float, ...] | None) -> list[str]:
+    """The overrides that rotate an indenter. Raises typer.BadParameter if both options are given."""
     from tacsim.geometry.pressing_side import SIDES
 
     if down is not None and rotation is not None:
@@ -135,9 +146,9 @@ def _orientation(down: str | None, rotation: tuple[float, ...] | None) -> list[s
     return [] if angles is None else [f"indenter.{axis}={angle!r}" for axis, angle in zip(AXES, angles, strict=False)]
 
 
-def _geometry(indenter: str, given: dict[str, Any]) -> str:
-    """The override that puts an indenter into a scene. Raises typer.BadParameter for a name that is none, and for what
-    is `given` of another."""
+def _geometry_override(indenter: str, given: dict[str, Any]) -> str:
+    """The override that puts an indenter into a scene. Raises typer.BadParameter for an unknown shape, and for a
+    `given` value that the shape does not have."""
     usual: dict[str, dict[str, Any]] = {
         "sphere": {"radius": 4e-3},
         "cylinder": {"radius": 4e-3, "height": 5e-3},
@@ -145,13 +156,13 @@ def _geometry(indenter: str, given: dict[str, Any]) -> str:
     }
     mesh = {"path": str(Path(indenter).absolute()), "scale": 1e-3}
     if indenter not in usual and not indenter.lower().endswith(".stl"):
-        words = f"'{indenter}' is no indenter; allowed: sphere, cylinder, box, or the path of an .stl file"
+        words = f"'{indenter}' is not an indenter; allowed: sphere, cylinder, box, or the path of an .stl file"
         raise typer.BadParameter(words, param_hint="INDENTER")
     described = usual.get(indenter, mesh)
     for name, value in given.items():
         if value is not None and name not in described:
             has = " and ".join(f"--{own}" for own in described if own != "path")
-            words = f"'{indenter}' has none; it has {has}"
+            words = f"'{indenter}' does not have it; it has {has}"
             raise typer.BadParameter(words, param_hint=f"--{name}")
     own = {name: value for name, value in given.items() if value is not None}
     shape = indenter if indenter in usual else "stl"
@@ -160,13 +171,13 @@ def _geometry(indenter: str, given: dict[str, Any]) -> str:
 
 def reproduce(
     physics: Annotated[
-        Literal["both", "hybrid", "seed"], typer.Option(help="The seed's scheme, ours (hybrid), or both.")
+        Literal["both", "hybrid", "seed"], typer.Option(help="The seed's scheme, that of tacsim (hybrid), or both.")
     ] = "both",
     out: Out = None,
 ) -> None:
-    """Repeat the seed paper's experiment: fig4.png and fig4.json; exit code 1 if its result does not come out.
+    """Repeat the seed paper's experiment: fig4.png and fig4.json; exit code 1 if its result is not reproduced.
 
-    Squeeze and reposition are driven through their goal and beyond. The reward must rise to a peak at the goal
+    Squeeze and reposition move through their goal and beyond. The reward must rise to a peak at the goal
     (closest distance at most 0.05 mm and 0.1 mm), then fall by more than five times that.
 
     Example: tacsim reproduce --physics hybrid --out fig4
@@ -178,7 +189,7 @@ def reproduce(
         from tacsim.physics.failure.dump import dump_to_folder
         from tacsim.report.figure4 import draw_figure4
 
-    # The longest first, so that no processor waits for it at the end.
+    # The longest trials first, so that no processor is idle at the end.
     wanted = [(task, scheme) for scheme in schemes for task in ("reposition", "squeeze")]
     notes.print("The first run compiles the kernels of each physics, up to a minute.")
     with Interrupt() as interrupt, dump_to_folder(folder / "diverged"), progress() as bar:
@@ -186,20 +197,20 @@ def reproduce(
         try:
             found = experiment.run_trials(wanted, lambda *trial: bar.advance(rows[trial]), interrupt)
         except experiment.TrialsStopped:
-            complain("stopped by a signal; nothing is written")
+            print_error("stopped by a signal; nothing is written")
             raise typer.Exit(interrupt.exit_code) from None
     trials = {task: {scheme: found[task, scheme] for scheme in schemes} for task in experiment.EXPERIMENTS}
     picture, table = folder / "fig4.png", folder / "fig4.json"
     with writing(folder, new=True), busy("drawing"):
         table.write_text(json.dumps(experiment.as_json(trials), indent=1, allow_nan=False) + "\n", encoding="utf-8")
         draw_figure4(trials, picture)
-    say_files(picture, table)
-    if _judge(trials):
+    print_files(picture, table)
+    if _report_trials(trials):
         raise typer.Exit(1)
 
 
-def _judge(trials: dict[str, dict[str, Trial]]) -> bool:
-    """Prints a line a trial; True when any of them failed."""
+def _report_trials(trials: dict[str, dict[str, Trial]]) -> bool:
+    """Prints one line per trial; returns True if one of them failed."""
     from robot.studies.experiment import shortcomings
 
     failed = False
@@ -216,7 +227,7 @@ def debug(
     dump: Annotated[Path, typer.Argument(help="Folder of a dump, named in the error: OUT/diverged/00.")],
     again: Annotated[bool, typer.Option("--replay/--no-replay", help="Run the motion again.")] = True,
 ) -> None:
-    """Look into a diverged simulation: a table, a cut through body and gels (debug.png), and the motion run again.
+    """Inspect a diverged simulation: a table, a section through body and gels (debug.png), and a replay of the motion.
 
     Exit code 1 if it diverges again. Dumps are written by tacsim run and reproduce below their --out folder, and by any
     simulation into the folder that the environment variable TACSIM_DUMPS names.
@@ -242,6 +253,6 @@ def debug(
         with busy("running the motion again"):
             failure, outcome = dump_view.replay(found, world)
         results.print(f"replay    {outcome}")
-    say_files(picture)
+    print_files(picture)
     if failure is not None:
-        raise typer.Exit(FAILED)
+        raise typer.Exit(EXIT_FAILED)

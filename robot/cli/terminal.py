@@ -1,4 +1,4 @@
-"""A person at the terminal: questions, and Ctrl-C, SIGTERM or a lost terminal (SIGHUP) as a request to stop."""
+"""The operator at the terminal: questions, and Ctrl-C, SIGTERM or a lost terminal (SIGHUP) as a request to stop."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, Self
 
 import typer
 
-from robot.cli.errors import complain
-from robot.cli.output import paused
+from robot.cli.errors import print_error
+from robot.cli.output import pause_displays
 from tacsim.models.text import escape_text
 
 if TYPE_CHECKING:
@@ -23,41 +23,42 @@ SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if 
 
 
 class Interrupt:
-    """While open, a signal stops the command. Open it in the main thread.
+    """In its block, a signal stops the command. Open it in the main thread.
 
-    Before anybody has asked whether to stop, the first signal raises KeyboardInterrupt: nothing that takes long, or
-    moves, goes on. From the first question on it is only noted, and who asks again ends in order what is under way. A
-    second signal raises KeyboardInterrupt in any case. One that leaves this block becomes the command's exit.
+    Before the first call of this object, the first signal raises KeyboardInterrupt, which ends slow work and motions at
+    once. After the first call, the signal is only stored: the next call returns True, and the caller ends its work in
+    order. A second signal always raises KeyboardInterrupt. A KeyboardInterrupt that leaves the block becomes the exit
+    of the command.
     """
 
     def __init__(self) -> None:
         self._signal: int | None = None
-        self._asked = False
+        self._was_called = False
         self._before: dict[int, Any] = {}
 
     def __call__(self) -> bool:
         """True once a signal has come: the stop flag of the control loop."""
-        self._asked = True
+        self._was_called = True
         return self._signal is not None
 
     @property
     def exit_code(self) -> int:
-        """128 + signal, as shells have it; 0 without a signal."""
+        """128 + signal, as in shells; 0 without a signal."""
         return 0 if self._signal is None else 128 + self._signal
 
-    def _note(self, number: int, frame: FrameType | None) -> None:
+    def _handle_signal(self, number: int, frame: FrameType | None) -> None:
         first = self._signal is None
         if first:
             self._signal = number
-            _silence_lost_terminal()
-        if not (first and self._asked):
+            _redirect_lost_terminal()
+        if not (first and self._was_called):
             raise KeyboardInterrupt
 
     def __enter__(self) -> Self:
         for number in SIGNALS:
             before = signal.getsignal(number)
-            if number in (signal.SIGINT, signal.SIGTERM) or before != signal.SIG_IGN:  # `nohup` means to go on
-                self._before[number] = signal.signal(number, self._note)
+            if number in (signal.SIGINT, signal.SIGTERM) or before != signal.SIG_IGN:  # `nohup` ignores SIGHUP
+                self._before[number] = signal.signal(number, self._handle_signal)
         return self
 
     def __exit__(
@@ -66,13 +67,13 @@ class Interrupt:
         for number, handler in self._before.items():
             signal.signal(number, handler)
         if self._signal is not None and isinstance(error, KeyboardInterrupt | typer.Abort):
-            complain(f"stopped by {signal.Signals(self._signal).name}")
+            print_error(f"stopped by {signal.Signals(self._signal).name}")
             raise typer.Exit(self.exit_code) from None
 
 
-def _silence_lost_terminal() -> None:
-    """Where the terminal is gone, printing would fail each time, and with it what is still to be done: it goes nowhere
-    from now on."""
+def _redirect_lost_terminal() -> None:
+    """Redirects output to os.devnull if the terminal is gone: otherwise printing would fail, and end the remaining
+    work."""
     for stream in (1, 2):
         try:
             os.write(stream, b"")
@@ -82,21 +83,23 @@ def _silence_lost_terminal() -> None:
 
 
 class NoAnswer(RuntimeError):
-    """Somebody was asked, and the input ended."""
+    """The input ended before the operator answered a question."""
 
 
-def has_person() -> bool:
-    """Whether questions can be read and answered: both go by the terminal."""
-    return all(stream is not None and stream.isatty() for stream in (sys.stdin, sys.stderr))  # None: it was closed
+def has_operator() -> bool:
+    """True if the operator can read and answer questions: input and error output are a terminal."""
+    return all(
+        stream is not None and stream.isatty() for stream in (sys.stdin, sys.stderr)
+    )  # None: the stream is closed
 
 
-def ask(question: str, *, default: bool = False) -> bool:
-    """A person's word, at a terminal; without one there is nobody to give it: False.
+def ask_operator(question: str, *, default: bool = False) -> bool:
+    """Asks the operator at the terminal; returns False without a terminal.
 
-    Nothing is drawn over the question, and what was typed before it could be read is no answer to it. Raises
-    KeyboardInterrupt at a signal, NoAnswer at the end of the input (Ctrl-D).
+    Progress displays are paused, and text that was typed before the question is discarded. Raises KeyboardInterrupt at
+    a signal, NoAnswer at the end of the input (Ctrl-D).
     """
-    if not has_person():
+    if not has_operator():
         return False
     signals: list[int] = []
 
@@ -106,38 +109,38 @@ def ask(question: str, *, default: bool = False) -> bool:
         raise KeyboardInterrupt
 
     before = {number: handler for number in SIGNALS if callable(handler := signal.getsignal(number))}
-    with paused():
+    with pause_displays():
         try:
             for number in before:
                 signal.signal(number, end)
-            _forget_typed()
+            _discard_typed_input()
             return typer.confirm(escape_text(question), default=default, err=True)
         except typer.Abort:
             if signals:
                 raise KeyboardInterrupt from None
-            raise NoAnswer(f"nobody answered: {question}") from None
+            raise NoAnswer(f"no answer to the question: {question}") from None
         finally:
             for number, handler in before.items():
                 signal.signal(number, handler)
 
 
-def require_person(config: RigConfig) -> None:
-    """Raises CannotOpen, before anything moves, where a real arm would move and nobody could confirm it."""
+def require_operator(config: RigConfig) -> None:
+    """Raises CannotOpen, before any motion, if a real arm would move and there is no terminal to confirm it."""
     from robot.open import CannotOpen
 
-    if has_real_arm(config) and not has_person():
+    if has_real_arm(config) and not has_operator():
         raise CannotOpen(
-            f"rig '{config.name}': a real arm approaches nothing before somebody has confirmed it; run this from a "
-            "terminal, with neither input nor error output led elsewhere"
+            f"rig '{config.name}': a real arm approaches only after the operator has confirmed; run this from a "
+            "terminal, without redirecting input or error output"
         )
 
 
 def has_real_arm(config: RigConfig) -> bool:
-    """Whether an arm of the rig is no mock; a maker's simulator counts as real."""
+    """True if an arm of the rig is not a mock; a manufacturer's simulator counts as real."""
     return any(arm.is_real for arm in config.arms.values())
 
 
-def _forget_typed() -> None:
+def _discard_typed_input() -> None:
     with suppress(ImportError):  # Windows has no termios
         import termios
 

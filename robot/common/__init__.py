@@ -1,11 +1,11 @@
-"""What drivers and mocks must both know, so that neither imports the other."""
+"""Names that drivers and mocks share, so that neither imports the other."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from typing import Self
 
-MOCK_SERIAL = "00000000001"  # of mock controllers; no real arm has it, so a driver can tell
+MOCK_SERIAL = "00000000001"  # of mock controllers; no real arm has this number, so a driver recognises a mock
 
 
 class Closing(ABC):

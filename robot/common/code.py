@@ -1,4 +1,4 @@
-"""A person's own Python code, named as "package.module:attribute"."""
+"""Python code of the user, named as "package.module:attribute"."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ PACKAGES = ("tacsim", "calibration", "robot")
 
 
 class CodeNotFound(ValueError):
-    """A name leads to no code."""
+    """A name refers to no code."""
 
 
-def attribute(name: str) -> object:
-    """What "package.module:attribute" names. Runs code of that module. Raises CodeNotFound."""
+def load_attribute(name: str) -> object:
+    """Imports "package.module:attribute", which runs code of that module. Raises CodeNotFound."""
     module_name, _, path = name.partition(":")
     if not path or not all(part.isidentifier() for part in [*module_name.split("."), *path.split(".")]):
         raise CodeNotFound(f"'{name}' must have the form 'package.module:attribute'")
@@ -23,25 +23,25 @@ def attribute(name: str) -> object:
     except ModuleNotFoundError as failure:
         missing = failure.name or ""
         if not missing or not (module_name + ".").startswith(missing + "."):
-            why = f"module '{module_name}' itself imports '{missing}', which is missing{_namesake(missing)}"
+            why = f"module '{module_name}' itself imports '{missing}', which is missing"
         else:
-            why = f"no module '{missing}'; is its folder on PYTHONPATH?{_namesake(missing)}"
-        raise CodeNotFound(f"'{name}': {why}") from failure
+            why = f"no module '{missing}'; is its folder on PYTHONPATH?"
+        raise CodeNotFound(f"'{name}': {why}{_describe_shadowing_file(missing)}") from failure
     except (Exception, SystemExit) as failure:  # a script may end Python when it is imported
-        why = f"importing '{module_name}' failed: {failure!r}{_namesake(str(failure))}"
+        why = f"importing '{module_name}' failed: {failure!r}{_describe_shadowing_file(str(failure))}"
         raise CodeNotFound(f"'{name}': {why}") from failure
     for part in path.split("."):
         if not hasattr(found, part):
-            raise CodeNotFound(f"'{name}': '{module_name}' has no '{path}'{_namesake(module_name)}")
+            raise CodeNotFound(f"'{name}': '{module_name}' has no '{path}'{_describe_shadowing_file(module_name)}")
         found = getattr(found, part)
     return found
 
 
-def _namesake(words: str) -> str:
-    """What to add to an error that speaks of one of our packages: a file in the working folder has the same name."""
-    ours = Path(__file__).resolve().parents[2]
+def _describe_shadowing_file(message: str) -> str:
+    """Text for an error `message` that names a package of tacsim, if a file in the working folder has the same name."""
+    root = Path(__file__).resolve().parents[2]
     for package in PACKAGES:
         for path in (Path(package).absolute(), Path(f"{package}.py").absolute()):
-            if re.search(rf"\b{package}\b", words) and path.exists() and path.resolve() != ours / package:
+            if re.search(rf"\b{package}\b", message) and path.exists() and path.resolve() != root / package:
                 return f". '{package}' is a package of tacsim, {path} is not imported: rename it"
     return ""

@@ -1,4 +1,4 @@
-"""Addresses of this machine alone: mocks live on them, and nothing else does."""
+"""Loopback addresses: only this machine reaches them. Mocks listen on them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import os
 
 
 def is_loopback(host: str) -> bool:
-    """True for 127.x.y.z, ::1 and localhost; any other name may lead anywhere."""
+    """True for 127.x.y.z, ::1 and localhost; False for any other name, which may resolve to any machine."""
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
@@ -19,10 +19,10 @@ def require_loopback(host: str, what: str, *, allow_network: bool) -> None:
     if not (allow_network or is_loopback(host)):
         raise ValueError(
             f"{what}: {host} is not a loopback address, so the whole network could take the mock for a real device; "
-            "use 127.x.y.z, or ask for it with --allow-network (allow_network=True)"
+            "use 127.x.y.z, or allow it with --allow-network (allow_network=True)"
         )
 
 
 def loopback_host(number: int, room: int) -> str:
-    """An address of this process's own, `number` and `room` 1 to 254: processes side by side do not meet."""
+    """A loopback address for this process only, `number` and `room` 1 to 254: parallel processes do not collide."""
     return f"127.{room}.{os.getpid() % 250 + 1}.{number}"

@@ -1,15 +1,15 @@
 """Child processes of this program (`python -m MODULE`), and the messages between them and their parent.
 
-A message is one line of JSON. Arrays go behind it as bytes: the key "arrays" of the line gives name, type and shape of
-each. A message with the key "error" says why the child could not do what it was asked; with "kind", a class of
-robot.errors, it is the whole text of that error.
+A message is one line of JSON. Arrays follow it as bytes: the key "arrays" of the line gives name, type and shape of
+each. A message with the key "error" gives the reason why the child could not handle a request; with "kind", a class of
+robot.errors, it is the complete text of that error.
 
-A child ends when its standard input does or its parent is gone, so that it never outlives that one. Signals that end a
-program (Ctrl-C, SIGTERM, a lost terminal) are for the parent alone, which ends its children in order. The same holds of
-the processes of a ProcessPool.
+A child ends when its standard input ends or its parent is gone, so it never outlives the parent. Only the parent gets
+the signals that end a program (Ctrl-C, SIGTERM, a lost terminal); it ends its children in order. The processes of a
+ProcessPool behave in the same way.
 
-Children are not started by multiprocessing: its spawn runs the main module of the user's program again, so that a
-script without `if __name__ == "__main__"` could open no arm.
+Children are not started by multiprocessing: its spawn runs the main module of the user's program again, so a script
+without `if __name__ == "__main__"` could not open an arm.
 """
 
 from __future__ import annotations
@@ -38,27 +38,28 @@ from robot.common import Closing
 from robot.errors import DeviceError, DeviceNotConnectedError
 
 Arrays = Mapping[str, NDArray[Any]]
-Message = tuple[dict[str, Any], Arrays]  # what is said, and the arrays with it
+Message = tuple[dict[str, Any], Arrays]  # the JSON object, and its arrays
 
-LARGEST = 256 * 2**20  # of an array [bytes]
-LONGEST = 2**20  # of a line [bytes]
-PATIENCE = 1.0  # for a child that is asked to end; then it is killed [s]
-PARENT = "TACSIM_PARENT"  # variable of a child: the process id of its parent, which may be gone before it looks
-ENDING = {getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)}
+MAX_ARRAY = 256 * 2**20  # of an array [bytes]
+MAX_LINE = 2**20  # of a line [bytes]
+END_TIMEOUT = 1.0  # from a request to end until a child is killed [s]
+PARENT = "TACSIM_PARENT"  # environment variable of a child: its parent's process id at the start
+END_SIGNALS = {getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)}
 
 Given = ParamSpec("Given")
 Result = TypeVar("Result")
 
 
 @contextlib.contextmanager
-def shielded() -> Iterator[None]:
-    """Processes that this thread starts meanwhile never get the signals that end a program: whoever starts them, must
-    end them. (What a thread blocks its children inherit, from their first moment; ignoring would be for all threads.)
+def blocking_signals() -> Iterator[None]:
+    """Processes that this thread starts in the block never get the signals that end a program: the code that starts
+    them must end them. (Children inherit the blocked signals of a thread when they start; ignoring a signal would
+    affect all threads.)
     """
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, END_SIGNALS)
     try:
         yield
     finally:
@@ -69,14 +70,14 @@ class Child(Closing):
     """A process `python -m module`; base of the handles of mocks. A context manager; several threads may use it.
 
     Args:
-        name: what it is, in errors.
-        error: the class of every error.
-        advice: what to do when it has ended, in errors.
-        environment: added to the parent's.
-        ready_timeout: waits so long [s] for the child's first message, which is then in `ready`; None does not wait.
-            Raises `error` as `receive` does, with the process ended.
-        first_request: what is sent before that.
-        descriptors: of this process, that the child has too, by the same numbers.
+        name: of the process, in errors.
+        error: the class of all errors that are raised.
+        advice: what to do after the process has ended, in errors.
+        environment: variables in addition to the parent's.
+        ready_timeout: time to wait for the child's first message [s], which is then in `ready`; None: do not wait.
+            Raises `error` as `receive` does, and ends the process.
+        first_request: is sent before that message is read.
+        descriptors: file descriptors of this process that the child inherits, with the same numbers.
     """
 
     def __init__(
@@ -96,10 +97,10 @@ class Child(Closing):
         self._lock = threading.RLock()
         self._closed = False
         root = str(Path(__file__).resolve().parents[2])
-        # An empty entry would be the working folder, whose socket.py or random.py nobody wants to be executed.
+        # An empty entry is the working folder, whose socket.py or random.py would be executed.
         path = os.pathsep.join(filter(None, [root, *os.environ.get("PYTHONPATH", "").split(os.pathsep)]))
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115  # closed with the process
-        with shielded():
+        with blocking_signals():
             self._process = subprocess.Popen(
                 [sys.executable, "-P", "-m", module, *arguments],
                 stdin=subprocess.PIPE,
@@ -120,7 +121,7 @@ class Child(Closing):
 
     @property
     def exit_status(self) -> int | None:
-        """Of the process; None while it runs."""
+        """Exit status of the process; None while it runs."""
         return self._process.poll()
 
     @property
@@ -129,16 +130,16 @@ class Child(Closing):
         return self.exit_status is None
 
     @property
-    def last_words(self) -> str:
-        """How the process ended, and the last line of its standard error: "killed by SIGSEGV: ..."; "" while it runs or
-        when it was closed."""
+    def exit_report(self) -> str:
+        """How the process ended, and the last line of its standard error: "killed by SIGSEGV: ..."; "" while it runs
+        and after `close`."""
         if self._closed or self.running:
             return ""
-        return ": ".join([self._end(), *self._last_lines(1)])
+        return ": ".join([self._describe_end(), *self._last_lines(1)])
 
     @property
     def printed(self) -> str:
-        """Its standard error until now; nothing of one that is closed."""
+        """Standard error of the process until now; empty after `close`."""
         with contextlib.suppress(ValueError):  # it is closed
             self._errors.seek(0)
             return self._errors.read().decode(errors="replace")
@@ -147,29 +148,32 @@ class Child(Closing):
     def check(self) -> None:
         """Raises `error` if the process has ended."""
         if not self.running:
-            raise self._failure(f"has ended, {self._end()}")
+            raise self._make_error(f"has ended, {self._describe_end()}")
 
     def receive(self, timeout: float) -> Message:
-        """The child's next message; its first one says that it is ready. Raises `error`: it says that it cannot, it has
-        ended, or it says nothing within `timeout` [s] (then it is killed)."""
+        """The child's next message; its first message reports that it is ready.
+
+        Raises `error` if the child reports an error, has ended, or sends nothing within `timeout` [s] (then it is
+        killed).
+        """
         return self._exchange(None, {}, timeout)
 
-    def ask(self, request: dict[str, Any], arrays: Arrays | None = None, *, timeout: float) -> Message:
+    def request(self, request: dict[str, Any], arrays: Arrays | None = None, *, timeout: float) -> Message:
         """Sends a request and returns the answer. Raises `error` as `receive` does."""
         return self._exchange(request, arrays or {}, timeout)
 
-    def close(self, patience: float = PATIENCE) -> None:
-        """Ends the process, by force after `patience` [s]; a second call does nothing."""
-        if not self._lock.acquire(timeout=patience):  # another thread waits for an answer
+    def close(self, timeout: float = END_TIMEOUT) -> None:
+        """Ends the process, by force after `timeout` [s]; a second call does nothing."""
+        if not self._lock.acquire(timeout=timeout):  # another thread waits for an answer
             self._process.kill()
             self._lock.acquire()
         try:
             for pipe in (self._process.stdin, self._process.stdout):
                 assert pipe is not None
-                with contextlib.suppress(OSError):  # the process has gone first
+                with contextlib.suppress(OSError):  # the process has ended already
                     pipe.close()
             try:
-                self._process.wait(patience)
+                self._process.wait(timeout)
             except subprocess.TimeoutExpired:
                 self._process.kill()
                 self._process.wait()
@@ -196,13 +200,13 @@ class Child(Closing):
                     raise EOFError
             except (OSError, EOFError) as failure:
                 with contextlib.suppress(subprocess.TimeoutExpired):
-                    self._process.wait(PATIENCE)
+                    self._process.wait(END_TIMEOUT)
                 late = time.monotonic() >= deadline
-                told = f"gave no answer within {timeout:g} s" if late else f"has ended, {self._end()}"
-                raise self._ended(told) from failure
+                reason = f"gave no answer within {timeout:g} s" if late else f"has ended, {self._describe_end()}"
+                raise self._end_with_error(reason) from failure
             except ValueError as failure:
-                raise self._ended(f"sent what is no message: {failure}") from failure
-            except BaseException:  # Ctrl-C: its answer must not be taken for that of the next request
+                raise self._end_with_error(f"sent an invalid message: {failure}") from failure
+            except BaseException:  # Ctrl-C: a late answer must not be read as the answer to the next request
                 self.close(0.0)
                 raise
             finally:
@@ -213,18 +217,18 @@ class Child(Closing):
             raise self._error(f"{self._name}: {answer[0]['error']}")
         return answer
 
-    def _ended(self, what: str) -> DeviceError:
-        """Ends the process; returns the error to raise."""
-        failure = self._failure(what)
+    def _end_with_error(self, what: str) -> DeviceError:
+        """Ends the process and returns the error to raise."""
+        failure = self._make_error(what)
         self.close(0.0)
         return failure
 
-    def _failure(self, what: str) -> DeviceError:
-        line_count = 5  # of a dead child's standard error, in errors
+    def _make_error(self, what: str) -> DeviceError:
+        line_count = 5  # lines of an ended child's standard error, in errors
         text = f"{self._name} (process {self.pid}) {what}; {self._advice}"
         return self._error(text + "".join(f"\n  {line}" for line in self._last_lines(line_count)))
 
-    def _end(self) -> str:
+    def _describe_end(self) -> str:
         """How the process ended."""
         status = self._process.returncode
         return (
@@ -234,12 +238,13 @@ class Child(Closing):
         )
 
     def _last_lines(self, number: int) -> list[str]:
-        """Of its standard error, at most `number`."""
+        """The last lines of its standard error, at most `number`."""
         return self.printed.strip().splitlines()[-number:]
 
 
 class Parent:
-    """The other end, inside a child: messages go to standard output, and whatever else is printed to standard error."""
+    """The parent, as seen by a child: messages go to standard output; everything else that is printed goes to standard
+    error."""
 
     def __init__(self) -> None:
         self._answers = os.fdopen(os.dup(1), "wb")
@@ -256,10 +261,11 @@ class Parent:
         write_message(self._answers, message, arrays)
 
     def serve(self, answer: Callable[[dict[str, Any], Arrays], Message]) -> None:
-        """Answers requests until standard input ends. Whatever `answer` raises goes to the parent as an error.
+        """Answers requests until standard input ends. An exception of `answer` is sent to the parent as an error.
 
-        When the parent is gone, the process ends also in the middle of an answer, or where a copy of the parent (a fork
-        of it) still holds the other end of standard input."""
+        When the parent is gone, the process ends, also during an answer, and also if a fork of the parent keeps the
+        other end of standard input open.
+        """
         end_with_parent(int(os.environ[PARENT]))
         while True:
             try:
@@ -271,41 +277,41 @@ class Parent:
                 self.send({"error": f"{type(failure).__name__}: {failure}"})
 
 
-class Lifeline:
-    """Tells a child whether its parent (process id) lives.
+class ParentMonitor:
+    """Checks in a child whether its parent (process id) still runs.
 
-    A killed process first gives its memory back, which takes 50 ms of a gigabyte and four times as long on a busy
-    machine, and only then its children get another parent. Linux tells of it from the beginning: proc_pid_stat(5).
+    A killed process first releases its memory, which takes 50 ms per gigabyte and four times as long on a busy machine.
+    Only then do its children get another parent. Linux shows earlier that it exits: proc_pid_stat(5).
     """
 
     def __init__(self, parent: int) -> None:
         self._parent = parent
         self._status: int | None = None
-        with contextlib.suppress(OSError):  # no /proc: then by the child's parent alone
+        with contextlib.suppress(OSError):  # no /proc: only the child's parent is checked
             self._status = os.open(f"/proc/{parent}/stat", os.O_RDONLY)
 
-    def cut(self) -> bool:
-        """Whether the parent is gone or about to be. Takes 8 us."""
+    def is_parent_gone(self) -> bool:
+        """True if the parent has ended or is exiting. Takes 8 us."""
         exiting_flag = 0x4  # of a process's flags in Linux: PF_EXITING
         if os.getppid() != self._parent:
             return True
         if self._status is None:
             return False
         try:
-            told = os.pread(self._status, 1024, 0)
+            fields = os.pread(self._status, 1024, 0)
         except ProcessLookupError:
             return True
-        flags = told[told.rindex(b")") :].split()[7]  # the name before may hold anything
+        flags = fields[fields.rindex(b")") :].split()[7]  # the name before it may contain any character
         return bool(int(flags) & exiting_flag)
 
 
 def end_with_parent(parent: int) -> None:
-    """From now on this process ends soon after its parent (process id), whatever it does."""
-    check_interval = 0.2  # a child looks so often whether its parent is there [s]
-    lifeline = Lifeline(parent)
+    """Makes this process end at most 0.2 s after its parent (process id)."""
+    check_interval = 0.2  # between two checks of the parent [s]
+    monitor = ParentMonitor(parent)
 
     def watch() -> None:
-        while not lifeline.cut():
+        while not monitor.is_parent_gone():
             time.sleep(check_interval)
         os._exit(1)
 
@@ -313,9 +319,9 @@ def end_with_parent(parent: int) -> None:
 
 
 @contextlib.contextmanager
-def outside_working_folder() -> Iterator[None]:
-    """Python processes that are started meanwhile do not execute a random.py or socket.py of the working folder: those
-    of multiprocessing have it before everything else on their path until they have that of their parent."""
+def without_working_folder() -> Iterator[None]:
+    """Python processes that are started in the block do not execute a random.py or socket.py of the working folder.
+    Processes of multiprocessing search that folder first until they get the path of their parent."""
     before = os.environ.get("PYTHONSAFEPATH")
     os.environ["PYTHONSAFEPATH"] = "1"
     try:
@@ -337,10 +343,10 @@ def write_message(pipe: IO[bytes], message: dict[str, Any], arrays: Arrays | Non
 
 
 def read_message(pipe: IO[bytes]) -> Message | None:
-    """The next message; None at the end of the pipe, also in the middle of a message. Raises ValueError for what is no
+    """The next message; None at the end of the pipe, also within a message. Raises ValueError for bytes that are no
     message."""
-    line = pipe.readline(LONGEST)
-    if not line.endswith(b"\n") and len(line) < LONGEST:
+    line = pipe.readline(MAX_LINE)
+    if not line.endswith(b"\n") and len(line) < MAX_LINE:
         return None
     message = json.loads(line)
     if not isinstance(message, dict):
@@ -352,8 +358,8 @@ def read_message(pipe: IO[bytes]) -> Message | None:
         except TypeError as failure:
             raise ValueError(str(failure)) from failure
         size = int(np.prod(shape)) * dtype.itemsize
-        if not 0 <= size <= LARGEST:
-            raise ValueError(f"array '{name}' of {size} bytes; the limit is {LARGEST}")
+        if not 0 <= size <= MAX_ARRAY:
+            raise ValueError(f"array '{name}' of {size} bytes; the limit is {MAX_ARRAY}")
         data = pipe.read(size)
         if len(data) < size:
             return None
@@ -362,19 +368,19 @@ def read_message(pipe: IO[bytes]) -> Message | None:
 
 
 class ProcessPool(ProcessPoolExecutor):
-    """A ProcessPoolExecutor whose processes end with this one, however that ends (kill -9), and at once where its block
-    is left by an exception. Signals that end a program are for this process alone.
+    """A ProcessPoolExecutor whose processes end when this process ends (also by kill -9), and at once if an exception
+    leaves its block. Only this process gets the signals that end a program.
 
-    begin, given: called in each process before its first piece.
+    begin, given: function and arguments, called in each process before its first task.
     """
 
     def __init__(self, processes: int, begin: Callable[..., object] | None = None, given: tuple[Any, ...] = ()) -> None:
         context = multiprocessing.get_context("spawn")  # Taichi does not survive a fork
-        super().__init__(processes, context, _begin, (os.getpid(), begin, given))
+        super().__init__(processes, context, _start_process, (os.getpid(), begin, given))
 
     def submit(self, work: Callable[Given, Result], /, *args: Given.args, **more: Given.kwargs) -> Future[Result]:
-        """As ProcessPoolExecutor.submit, which starts processes when there is work for them."""
-        with outside_working_folder(), shielded():
+        """As ProcessPoolExecutor.submit, which starts processes when there are tasks for them."""
+        with without_working_folder(), blocking_signals():
             return super().submit(work, *args, **more)
 
     def __exit__(
@@ -382,11 +388,11 @@ class ProcessPool(ProcessPoolExecutor):
     ) -> bool | None:
         if kind is not None:
             for process in multiprocessing.active_children():
-                process.kill()  # signals that could be caught never reach it (`shielded`)
+                process.kill()  # it does not get other signals (`blocking_signals`)
         return super().__exit__(kind, error, trace)
 
 
-def _begin(parent: int, begin: Callable[..., object] | None, given: tuple[Any, ...]) -> None:
+def _start_process(parent: int, begin: Callable[..., object] | None, given: tuple[Any, ...]) -> None:
     end_with_parent(parent)
     if begin is not None:
         begin(*given)

@@ -7,11 +7,11 @@ import os
 WORKER, CONTROLLER = 10, 11  # priorities: a mock controller, which stands in for hardware, comes before its worker
 
 
-def ask_for_realtime(priority: int) -> bool:
-    """Makes this process a real-time one (SCHED_RR), so that no ordinary process can keep it waiting; the threads that
-    it starts later are too. False where the system has no such thing, or does not allow it: then it runs as any other.
+def request_realtime(priority: int) -> bool:
+    """Gives this process, and threads that it starts later, real-time priority (SCHED_RR): no ordinary process delays
+    it. Returns False, without any change, where the system has no such priority or does not allow it.
 
-    On Linux it is allowed for root, with CAP_SYS_NICE, or by `rtprio` in /etc/security/limits.conf.
+    Linux allows it for root, with CAP_SYS_NICE, or by `rtprio` in /etc/security/limits.conf.
     """
     if not hasattr(os, "sched_setscheduler"):
         return False
@@ -22,12 +22,12 @@ def ask_for_realtime(priority: int) -> bool:
     return True
 
 
-def allowed() -> bool:
-    """True if a process may become a real-time one here; this process is left as it is."""
+def is_realtime_allowed() -> bool:
+    """True if a process may have real-time priority here; the priority of this process does not change."""
     if not hasattr(os, "sched_setscheduler"):
         return False
     policy, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
-    granted = ask_for_realtime(WORKER)
+    granted = request_realtime(WORKER)
     if granted:
         os.sched_setscheduler(0, policy, parameters)
     return granted

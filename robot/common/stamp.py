@@ -1,8 +1,8 @@
-"""The stamp of tacsim's mock camera: a strip of black and white blocks below the picture of the gel.
+"""The stamp of tacsim's mock camera: a strip of black and white blocks below the image of the gel.
 
-It carries the number of the frame, the number of the picture it shows, and the clock at exposure, so that age and drops
-are measured end to end instead of believed. Blocks of 4 x 8 pixels survive JPEG with halved colour (4:2:0) down to
-quality 50; a check sum tells a strip from any other picture, and from one that was damaged on the way.
+It contains the frame number, the image number, and the clock at exposure, so that latency and lost frames are measured
+end to end. Blocks of 4 x 8 pixels stay readable in JPEG with colour at half resolution (4:2:0) down to quality 50. A
+check sum distinguishes a strip from other images and from a damaged strip.
 """
 
 from __future__ import annotations
@@ -22,23 +22,23 @@ BITS = 8 * (_FIELDS.size + _CHECK.size)
 
 @dataclass(frozen=True, slots=True)
 class Stamp:
-    """What the strip says about its frame."""
+    """Contents of the strip of one frame."""
 
-    frame: int  # number of the frame, counted by one; a gap is a lost frame
-    image: int  # number of the last pushed picture, 0 before the first
+    frame: int  # number of the frame; each frame adds 1, a gap is a lost frame
+    image: int  # number of the last pushed image, 0 before the first
     clock: int  # monotonic clock of the camera's machine at exposure [us]
 
 
 def strip_rows(width: int) -> int:
-    """Rows that the strip adds to pictures of `width` columns [px]. Raises ValueError below the width of a block."""
+    """Rows that the strip adds to images of `width` columns [px]. Raises ValueError below the width of a block."""
     if width < BLOCK[1]:
         raise ValueError(f"a stamp needs pictures at least {BLOCK[1]} px wide, got {width}")
     return -(-BITS // (width // BLOCK[1])) * BLOCK[0]
 
 
 def draw(image: NDArray[np.uint8], stamp: Stamp) -> NDArray[np.uint8]:
-    """(H, W, 3) picture -> (H + strip_rows(W), W, 3), the strip below it. Raises ValueError for numbers that do not fit
-    (frame and image wrap nowhere: 32 bits; clock: 64 bits)."""
+    """Image (H, W, 3) -> (H + strip_rows(W), W, 3), with the strip below it. Raises ValueError for numbers that do not
+    fit (frame and image: 32 bits without wrapping; clock: 64 bits)."""
     try:
         fields = _FIELDS.pack(stamp.frame, stamp.image, stamp.clock)
     except struct.error as error:
@@ -54,7 +54,7 @@ def draw(image: NDArray[np.uint8], stamp: Stamp) -> NDArray[np.uint8]:
 
 
 def read(image: NDArray[np.uint8]) -> Stamp | None:
-    """The stamp of a picture (H + strip_rows(W), W, 3); None where there is none, or a damaged one."""
+    """The stamp of an image (H + strip_rows(W), W, 3); None without a stamp or with a damaged one."""
     width = image.shape[1]
     if width < BLOCK[1] or image.shape[0] < strip_rows(width):
         return None
@@ -69,5 +69,5 @@ def read(image: NDArray[np.uint8]) -> Stamp | None:
 
 
 def split(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], Stamp | None]:
-    """The picture without its strip (a view), and what the strip says."""
+    """The image without its strip (a view), and the contents of the strip."""
     return image[: image.shape[0] - strip_rows(image.shape[1])], read(image)

@@ -1,4 +1,4 @@
-"""A file, or a folder, that is whole or not there, whenever the process ends."""
+"""Files and folders that are either complete or absent, whenever the process ends."""
 
 from __future__ import annotations
 
@@ -13,8 +13,10 @@ from typing import IO, Any
 
 
 def write_whole(path: Path, content: bytes | Callable[[IO[bytes]], Any]) -> None:
-    """Writes `content`, or what it writes into an open file, beside `path`, and puts it there once the disk has it.
-    Makes the folder. Raises OSError that names the file."""
+    """Writes a file next to `path` and moves it to `path` once it is on the disk. Makes the folder.
+
+    content: bytes, or a function that writes into an open file. Raises OSError that names the file.
+    """
     part = path.with_name(f".{path.name}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -28,7 +30,7 @@ def write_whole(path: Path, content: bytes | Callable[[IO[bytes]], Any]) -> None
         part.replace(path)
     except BaseException as failure:
         part.unlink(missing_ok=True)
-        # torch turns a full disk into a RuntimeError of its own
+        # torch raises RuntimeError for a full disk
         if not isinstance(failure, OSError | RuntimeError):
             raise
         why = failure.strerror if isinstance(failure, OSError) else str(failure).splitlines()[0]
@@ -38,8 +40,8 @@ def write_whole(path: Path, content: bytes | Callable[[IO[bytes]], Any]) -> None
 
 @contextmanager
 def whole_folder(path: Path) -> Iterator[Path]:
-    """Gives a folder to write into, which becomes the new folder `path` at the end of the block, or is gone. Raises
-    FileExistsError if somebody else has made it meanwhile, OSError that names `path`."""
+    """Yields a temporary folder, which becomes the new folder `path` at the end of the block. It is deleted if the
+    block raises. Raises FileExistsError if `path` was made by another process, OSError that names `path`."""
     home = next(place for place in path.absolute().parents if place.is_dir())
     part: Path | None = None
     try:
@@ -47,7 +49,7 @@ def whole_folder(path: Path) -> Iterator[Path]:
         yield part
         part.chmod(0o755)
         path.parent.mkdir(parents=True, exist_ok=True)
-        part.rename(path)  # onto an empty folder, or nothing: onto another it fails
+        part.rename(path)  # fails if `path` is a folder with files
     except BaseException as failure:
         if part is not None:
             shutil.rmtree(part, ignore_errors=True)
@@ -55,18 +57,20 @@ def whole_folder(path: Path) -> Iterator[Path]:
             raise
         if failure.errno in (errno.EEXIST, errno.ENOTEMPTY):
             raise FileExistsError(errno.EEXIST, "File exists", str(path)) from None
-        if failure.filename is None or str(failure.filename).startswith(str(part)):  # a full disk does not say where
+        if failure.filename is None or str(failure.filename).startswith(
+            str(part)
+        ):  # the error of a full disk names no file
             failure.filename, failure.filename2 = str(path), None
         raise
 
 
-def put_new(part: Path, path: Path) -> None:
-    """Gives a finished file its name. Raises FileExistsError if there is one of that name already, OSError."""
+def move_to_new_path(part: Path, path: Path) -> None:
+    """Moves the finished file `part` to `path`. Raises FileExistsError if `path` exists, OSError."""
     try:
         os.link(part, path)
     except FileExistsError:
         raise FileExistsError(errno.EEXIST, "File exists", str(path)) from None
-    except OSError:  # no such links on this disk
+    except OSError:  # this file system has no hard links
         if path.exists():
             raise FileExistsError(errno.EEXIST, "File exists", str(path)) from None
         part.rename(path)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from robot.common.code import CodeNotFound, attribute
+from robot.common.code import CodeNotFound, load_attribute
 from tacsim import pose as se3
 from tacsim.interface import Action, FloatArray, Needs, Observation, Policy, Pose
 from tacsim.record.sources import read_columns
@@ -43,7 +43,7 @@ def policy_of_code(name: str) -> Policy:
     Runs code of that module. Raises PolicyNotFound.
     """
     try:
-        found = attribute(name)
+        found = load_attribute(name)
     except CodeNotFound as failure:
         raise PolicyNotFound(f"policy {failure}") from failure
     return _as_policy(found, name)

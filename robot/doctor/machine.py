@@ -173,9 +173,9 @@ def processors() -> list[Check]:
 
 def realtime() -> list[Check]:
     """Whether the processes that talk to arms may run before all others."""
-    from robot.common.realtime import allowed
+    from robot.common.realtime import is_realtime_allowed
 
-    if allowed():
+    if is_realtime_allowed():
         return [Check("real-time priority", "ok", "allowed")]
     advice = (
         "only arms need it: their 2 ms loop then waits for other programs. Allow it by `USER - rtprio 20` in "

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from robot.export.lerobot_mapping import IMAGE, STATE, LeRobotMapping, Row, task_in_words
 from robot.export.lerobot_rig import picture_shape
-from robot.open import Randomised, load_with_task, make_env
+from robot.open import RandomiseSettings, load_with_task, make_env
 from tacsim.interface import Action, Needs, Observation
 from tacsim.limits import ActionError
 from tacsim.models.rig import TaskConfig
@@ -37,7 +37,7 @@ class LeRobotEnv(gymnasium.Env[dict[str, Any], NDArray[np.floating[Any]]]):
         rig: str | Path = "sim",
         overrides: Sequence[str] = (),
         render_mode: str | None = None,
-        randomise: Randomised = None,
+        randomise: RandomiseSettings = None,
     ) -> None:
         canonical = load_with_task(rig, task, overrides).config.canonical
         # as the rig's file says: the data sets that a policy learned from were recorded so

@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 
 from calibration.bundle import read_bundle
 from robot.common import Closing
-from robot.common.process import shielded
-from robot.common.whole_file import put_new
+from robot.common.process import blocking_signals
+from robot.common.whole_file import move_to_new_path
 from robot.export.rerun_log import EpisodeLog, blueprint
 from robot.rig.recorded import observe_episode
 from tacsim.interface import Observation, RigSpec, Truth
@@ -78,7 +78,7 @@ class LiveView(Closing):
         context = multiprocessing.get_context("spawn")
         self._pipe, other = context.Pipe()
         self._process = context.Process(target=_show, args=(other, spec, config, file), name="view", daemon=True)
-        with shielded():
+        with blocking_signals():
             self._process.start()
         other.close()
         self._thread = threading.Thread(target=self._hand_over, name="view", daemon=True)
@@ -205,7 +205,7 @@ def _file(recording: rr.RecordingStream, file: Path) -> Iterator[Callable[[], No
                 recording.disconnect()
                 copy.join()
             copy.check()
-        put_new(partial, file)
+        move_to_new_path(partial, file)
     except BaseException:
         partial.unlink(missing_ok=True)
         raise

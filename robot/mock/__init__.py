@@ -1,4 +1,4 @@
-"""Mock hardware that speaks the real wire: UR controllers and cameras on loopback, each in a process of its own.
+"""Mock hardware with the real protocols: UR controllers and cameras on loopback, each in a separate process.
 
 with MockUR("127.0.0.2") as mock:
     ...  # connect ur_rtde to mock.host

@@ -1,7 +1,7 @@
 """The process of mock controllers: `python -m robot.mock 127.0.0.2 127.0.0.3`.
 
-One loop serves all hosts of a process, with absolute deadlines 2 ms apart. With --with-parent it ends when its standard
-input ends or its parent is gone, so that no mock outlives who started it.
+One loop serves all hosts of a process, with absolute deadlines every 2 ms. With --with-parent it ends when its standard
+input ends or its parent is gone, so no mock outlives the program that started it.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, cast
 from robot.common import MOCK_SERIAL
 from robot.common.kinematics import MODELS
 from robot.common.process import write_message
-from robot.common.realtime import CONTROLLER, ask_for_realtime
+from robot.common.realtime import CONTROLLER, request_realtime
 from robot.mock.ur.fault_client import FAULT_PORT
 from robot.mock.ur.fault_server import FaultServer
 from robot.mock.ur.handle import check_hosts
@@ -61,12 +61,12 @@ def _loop(
     ended: list[str],
     parent: int | None,
 ) -> None:
-    max_periods = 5  # control periods that may be made up for in a row; more are left out and counted
+    max_periods = 5  # late control periods that are run one after another; more are skipped and counted
     deadline = time.perf_counter() + PERIOD
     while not ended:
-        # What has arrived is served before the tick, also after a pause: fresh commands before the watchdog.
+        # Messages that have arrived are served before the tick, also after a pause: new commands before the watchdog.
         for key, _ in selector.select(max(0.0, deadline - time.perf_counter())):
-            if _registered(selector, key):
+            if _is_registered(selector, key):
                 key.data()
         late = time.perf_counter() - deadline
         if late < 0:
@@ -85,17 +85,17 @@ def _loop(
             return
 
 
-def _for_each(given: list[str], hosts: Sequence[str], what: str) -> list[str]:
-    if len(given) not in (1, len(hosts)):
-        raise ValueError(f"{len(given)} {what} for {len(hosts)} hosts; give one for all, or one each")
-    return given if len(given) == len(hosts) else given * len(hosts)
+def _one_for_each_host(options: list[str], hosts: Sequence[str], what: str) -> list[str]:
+    if len(options) not in (1, len(hosts)):
+        raise ValueError(f"{len(options)} {what} for {len(hosts)} hosts; give one for all, or one each")
+    return options if len(options) == len(hosts) else options * len(hosts)
 
 
-def _registered(selector: selectors.BaseSelector, key: selectors.SelectorKey) -> bool:
-    """False for a connection that was closed by what was served before it in the same round."""
+def _is_registered(selector: selectors.BaseSelector, key: selectors.SelectorKey) -> bool:
+    """False for a connection that an earlier message of the same round has closed."""
     try:
         return key.fileobj in selector.get_map()
-    except ValueError:  # a closed socket has no number any more
+    except ValueError:  # a closed socket has no descriptor
         return False
 
 
@@ -112,27 +112,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--serial", default=MOCK_SERIAL)
     parser.add_argument("--allow-network", action="store_true")
     parser.add_argument("--with-parent", action="store_true", help="end when standard input ends")
-    parser.add_argument("--realtime", action="store_true", help="ask for real-time priority, to measure timing")
-    given = parser.parse_args(arguments)
-    if given.realtime:
-        ask_for_realtime(CONTROLLER)
+    parser.add_argument("--realtime", action="store_true", help="request real-time priority, to measure timing")
+    options = parser.parse_args(arguments)
+    if options.realtime:
+        request_realtime(CONTROLLER)
     try:
-        check_hosts(given.hosts, given.allow_network)
-        models = _for_each(given.model or ["ur5e"], given.hosts, "models")
+        check_hosts(options.hosts, options.allow_network)
+        models = _one_for_each_host(options.model or ["ur5e"], options.hosts, "models")
         postures = [
             tuple(float(angle) for angle in text.split(","))
-            for text in _for_each(given.joints or [",".join(map(repr, HOME))], given.hosts, "postures")
+            for text in _one_for_each_host(options.joints or [",".join(map(repr, HOME))], options.hosts, "postures")
         ]
         tools = [
             Mass.of([float(number) for number in text.split(",")])
-            for text in _for_each(given.payload or ["0,0,0,0"], given.hosts, "payloads")
+            for text in _one_for_each_host(options.payload or ["0,0,0,0"], options.hosts, "payloads")
         ]
-        versions = map(parse_version, _for_each(given.version or [version_text(VERSION)], given.hosts, "versions"))
+        versions = map(
+            parse_version, _one_for_each_host(options.version or [version_text(VERSION)], options.hosts, "versions")
+        )
         config = [
-            ControllerConfig(host, cast("Model", model), joints, version, given.serial, tool)
-            for host, model, joints, version, tool in zip(given.hosts, models, postures, versions, tools, strict=True)
+            ControllerConfig(host, cast("Model", model), joints, version, options.serial, tool)
+            for host, model, joints, version, tool in zip(options.hosts, models, postures, versions, tools, strict=True)
         ]
-        serve(config, given.fault_port, with_parent=given.with_parent)
+        serve(config, options.fault_port, with_parent=options.with_parent)
     except (OSError, ValueError) as error:
         message = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
         write_message(sys.stdout.buffer, {"error": message})

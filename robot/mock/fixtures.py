@@ -1,7 +1,7 @@
-"""pytest fixtures of mock devices. Users take them, with that of a whole rig, from `robot.fixtures`.
+"""pytest fixtures of mock devices. Users import them, together with that of a complete rig, from `robot.fixtures`.
 
-Each test process has loopback addresses of its own (127.0.0.0/8; on macOS they must be made first: ifconfig lo0 alias),
-so tests may run side by side.
+Each test process has its own loopback addresses (127.0.0.0/8; on macOS they must be made first: ifconfig lo0 alias), so
+tests may run in parallel.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from robot.mock.ur.handle import MockUR
 
 
 def mock_host(number: int) -> str:
-    """A loopback address of this process's own, number 1 to 254."""
+    """A loopback address for this process only, number 1 to 254."""
     room = 31  # second number of the addresses
     return loopback_host(number, room)
 
 
 def rig_addresses() -> list[str]:
-    """Overrides that give the rig `mock` addresses of this process's own."""
+    """Overrides that give the rig `mock` addresses for this process only."""
     return [
         override
         for number, name in enumerate(("lower", "upper"), start=11)
@@ -35,13 +35,13 @@ def rig_addresses() -> list[str]:
 
 @pytest.fixture
 def mock_ur() -> Iterator[MockUR]:
-    """One mock UR5e controller: connect to `mock_ur.host`, break it by `mock_ur.faults`."""
+    """One mock UR5e controller: connect to `mock_ur.host`, inject faults by `mock_ur.faults`."""
     with MockUR(mock_host(1)) as running:
         yield running
 
 
 @pytest.fixture
 def mock_camera() -> Iterator[MockCamera]:
-    """One mock camera of 320 x 240 px with stamps: read `mock_camera.url`, feed it by `mock_camera.push`."""
+    """One mock camera of 320 x 240 px with stamps: read `mock_camera.url`, set its image by `mock_camera.push`."""
     with MockCamera(mock_host(2)) as running:
         yield running

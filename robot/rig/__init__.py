@@ -4,4 +4,4 @@ RIG_ATTACHMENT = "rig.yaml"  # of an episode: the resolved rig file it was recor
 
 
 class CannotOpen(ValueError):
-    """A rig file that is sound in itself describes no rig that can be opened."""
+    """A valid rig file describes a rig that cannot be opened."""

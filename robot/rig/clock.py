@@ -12,7 +12,7 @@ from robot.rig.commanded_arm import CommandedArm, wait_for_arrival
 from tacsim.interface import TactileFrame, TactileSource
 from tacsim.models.driver import Companion
 
-SETTLED = 10e-3  # a force given to a mock controller is in its packages after this time [s]
+FORCE_DELAY = 10e-3  # from setting a force of a mock controller until its packages contain it [s]
 
 
 class _MonotonicClock:
@@ -24,15 +24,17 @@ class _MonotonicClock:
 
 
 class WallClock(_MonotonicClock):
-    """Ticks at a fixed rate. Missed periods are skipped, and counted.
+    """Ticks at a fixed rate. Missed periods are skipped and counted.
 
-    catch_up: waits until the simulation of a mock cell, if there is one, has followed the arms.
-    real_time: pictures and forces come as things happen; a simulation may be slower.
+    wait_for_fresh_step: waits until the simulation of a mock cell, if there is one, has followed the arms.
+    real_time: images and forces arrive in real time; a simulation may be slower.
     """
 
-    def __init__(self, period: float, catch_up: Callable[[], None] | None = None, *, real_time: bool = True) -> None:
+    def __init__(
+        self, period: float, wait_for_fresh_step: Callable[[], None] | None = None, *, real_time: bool = True
+    ) -> None:
         super().__init__(period)
-        self._catch_up, self.real_time = catch_up, real_time
+        self._wait_for_fresh_step, self.real_time = wait_for_fresh_step, real_time
         self._deadline: float | None = None
         self.periods: list[float] = []  # of the last ticks [s]
         self.late = 0
@@ -51,13 +53,13 @@ class WallClock(_MonotonicClock):
         self._last = beat
 
     def wait_for_data(self) -> None:
-        """Waits until packages and pictures of what just happened have arrived: one period, at least 0.1 s."""
-        if self._catch_up is not None:
-            self._catch_up()
+        """Waits until packages and images of the present poses have arrived: one period, at least 0.1 s."""
+        if self._wait_for_fresh_step is not None:
+            self._wait_for_fresh_step()
         time.sleep(max(0.1, self.period))
 
     def restart(self) -> None:
-        """The next tick ends one period from then."""
+        """The next tick ends one period after its call."""
         self._deadline = self._last = None
 
     def diagnostics(self) -> dict[str, float]:
@@ -68,13 +70,13 @@ class WallClock(_MonotonicClock):
 
 
 class NumberedSource(Protocol):
-    """A sensor whose pictures carry the numbers that a companion gives them."""
+    """A sensor whose images carry the numbers that a companion assigns."""
 
     def wait_for(self, image_number: int, timeout: float) -> TactileFrame: ...
 
 
 class LockStep(_MonotonicClock):
-    """A period ends when the arms rest at their targets and the cell has drawn the pictures of just that pose."""
+    """A period ends when the arms rest at their targets and the cell has rendered the images of that pose."""
 
     real_time = False
 
@@ -85,24 +87,24 @@ class LockStep(_MonotonicClock):
         sensors: Mapping[str, TactileSource],
         companion: Companion,
     ) -> None:
-        """sensors: those whose pictures the companion makes; each is a NumberedSource."""
+        """sensors: those whose images the companion renders; each is a NumberedSource."""
         super().__init__(period)
         self._arms, self._companion = arms, companion
         self._sensors = {name: cast(NumberedSource, sensor) for name, sensor in sensors.items()}
 
     def tick(self) -> None:
-        """Raises DeviceError: an arm does not arrive or is stopped, the cell fails, a picture does not come."""
+        """Raises DeviceError if an arm does not arrive or is stopped, the cell fails, or an image does not arrive."""
         arrival_timeout = 10.0  # longest motion of a control period in lock step [s]
         wait_for_arrival(self._arms, arrival_timeout)
         self.wait_for_data()
 
     def wait_for_data(self) -> None:
-        """Lets the cell follow, and waits until forces and pictures have arrived over the wire."""
-        for name, number in self._companion.step(pause=SETTLED).items():
+        """Moves the cell to the poses of the arms, and waits until forces and images have arrived over the wire."""
+        for name, number in self._companion.step(pause=FORCE_DELAY).items():
             self._sensors[name].wait_for(number, timeout=5.0)
 
     def restart(self) -> None:
-        """Nothing runs between ticks."""
+        """Does nothing: nothing runs between ticks."""
 
     def diagnostics(self) -> dict[str, float]:
         return {}

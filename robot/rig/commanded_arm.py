@@ -1,4 +1,4 @@
-"""An arm of hardware as a rig has it: it remembers where it was sent, and counts the limits that it hit."""
+"""An arm of hardware in a rig: stores its last target and counts limited targets."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from tacsim.limits import ActionError
 
 
 class CommandedArm:
-    """Implements tacsim.interface.Arm; the target it was sent last is what the clock waits for.
+    """Implements tacsim.interface.Arm. The clock waits until the arm reaches the last target that was sent.
 
-    dry_run: no motion is ever sent.
+    dry_run: no motion is sent.
     """
 
     def __init__(self, driver: HardwareArm, *, dry_run: bool = False) -> None:
@@ -23,12 +23,12 @@ class CommandedArm:
         self.limits_hit = 0  # targets that were shortened or refused
 
     def state(self, at: float | None = None) -> ArmState:
-        """Raises DeviceError for a moment that no state covers."""
+        """Raises DeviceError for a time without a recorded state."""
         return self.driver.state(at)
 
     def command(self, target: Pose | None) -> Pose | None:
-        """In a dry run nothing is sent, and None says so."""
-        max_shift = 1e-7  # a target that was changed by more counts as shortened [m, rad]
+        """Returns the target that was sent; None in a dry run, in which nothing is sent."""
+        max_shift = 1e-7  # a target that changes by more counts as shortened [m, rad]
         if self._dry_run:
             return None
         try:
@@ -40,12 +40,12 @@ class CommandedArm:
         return sent
 
     def send(self, target: Pose | None, speed: float | None = None) -> Pose | None:
-        """`command` for motions of a reset, which count no limits, at most at `speed` [m/s]."""
+        """`command` for motions of a reset, at most at `speed` [m/s]; limited targets are not counted."""
         self.target = self.driver.command(target, speed)
         return self.target
 
     def advance(self) -> bool:
-        """Repeats the last command, so that it does not time out; True once the arm rests at its target."""
+        """Repeats the last command before it times out; returns True once the arm rests at its target."""
         if self.at_target():
             return True
         if self.target is not None:
@@ -53,15 +53,15 @@ class CommandedArm:
         return False
 
     def at_target(self) -> bool:
-        """True once the arm rests at its target; without one, once it rests."""
-        max_distance, max_angle = 2e-6, 2e-5  # an arm this near to its target has arrived [m, rad]
+        """True once the arm rests at its target, or rests and has no target."""
+        max_distance, max_angle = 2e-6, 2e-5  # deviation from the target of an arm that has arrived [m, rad]
         if self.target is None:
             return self.driver.at_rest()
         return self.driver.arrived(self.target, within=max_distance, turn=max_angle)
 
     def suspend_tactile_guard(self) -> None:
-        """For motions that no observation decides: depth, shear and the age of observations are not guarded until the
-        next observation is made."""
+        """For motions that do not depend on observations: depth, shear and the age of observations are not checked
+        until the next observation."""
         self.driver.report_tactile(None)
 
     def stop(self) -> None:
@@ -77,13 +77,13 @@ class CommandedArm:
 
 
 def wait_for_arrival(arms: Mapping[str, CommandedArm], timeout: float) -> None:
-    """Waits until all arms rest at their targets. Raises DeviceError after `timeout` [s], and what stops an arm."""
-    poll_interval = 4e-3  # between two looks at moving arms [s]
+    """Waits until all arms rest at their targets. Raises DeviceError after `timeout` [s] and if an arm stops."""
+    poll_interval = 4e-3  # between two checks of moving arms [s]
     deadline = time.monotonic() + timeout
     while moving := [name for name, arm in arms.items() if not arm.advance()]:
         if time.monotonic() > deadline:
             name = moving[0]
             raise DeviceError(
-                f"arm '{name}' did not come to its target within {timeout:g} s: {arms[name].driver.explain()}"
+                f"arm '{name}' did not reach its target within {timeout:g} s: {arms[name].driver.explain()}"
             )
         time.sleep(poll_interval)

@@ -1,4 +1,4 @@
-"""Rigs that go by the wall clock: arms and sensors of hardware, real or mock, and simulated sensors on them."""
+"""Rigs with the wall clock: arms and sensors of hardware, real or mock, and simulated sensors on them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from robot.rig.clock import LockStep, WallClock
 from robot.rig.commanded_arm import CommandedArm
 from robot.rig.parts import arm_drivers, companion_class, sensor_drivers, start_companion
 from robot.rig.reset import HardwareReset
-from robot.rig.touch import ForceTouch, PictureTouch, TouchSense
+from robot.rig.touch import ForceTouch, PictureTouch, TouchSensing
 from tacsim.control.gel_monitor import GelMonitor
 from tacsim.control.load_controller import load_controller
 from tacsim.interface import Normaliser, Pose, RigSpec, SensorSpec, TactileSource
@@ -25,7 +25,7 @@ from tacsim.rig import Rig
 Confirm = Callable[[str], bool]
 SensorDrivers = Mapping[str, SensorDriver[Any]]
 ArmDrivers = Mapping[str, ArmDriver[Any]]
-QUESTION = "Is the body in its place before the sensor, and everybody out of reach of the arm?"
+CONFIRMATION_QUESTION = "Is the body in its place in front of the sensor, and is everyone out of reach of the arm?"
 
 
 def open_hardware(
@@ -34,25 +34,25 @@ def open_hardware(
     *,
     dry_run: bool = False,
     check: Callable[[RigSpec], None] | None = None,
-    tell: Callable[[str], None] = lambda words: None,
+    report: Callable[[str], None] = lambda words: None,
 ) -> Rig:
-    """Opens a rig of hardware. Starts the mocks that its file asks for. Connects; moves nothing.
+    """Opens a rig of hardware: starts the mocks of its file and connects. Nothing moves.
 
-    confirm: asks a person before anything approaches the body; not needed where all arms are mocks.
+    confirm: asks the operator before an arm approaches the body; not needed if all arms are mocks.
     dry_run: connects, observes and records, but sends no motion, neither in a reset nor in a step.
-    check: is told what the rig delivers before anything is opened; raises to refuse it.
-    tell: is told, again and again, what the arms are doing at a reset.
+    check: gets the specification of the rig before any device is opened; raises to refuse it.
+    report: gets a short text about what the arms are doing in a reset, repeatedly.
 
-    Raises DeviceError for what cannot be opened, calibration.errors.CalibrationError for a calibration,
-    ValueError for a rig that makes no sense.
+    Raises DeviceError for a device that cannot be opened, calibration.errors.CalibrationError for a calibration,
+    ValueError for a rig with contradicting settings.
     """
     is_real = any(arm.is_real for arm in config.arms.values())
-    # first: a wrong calibration, host or limit, and what lacks, are known before anything is connected
+    # first: a wrong calibration, host or limit, or a missing setting, is reported before any device is connected
     sensor_kinds, arm_kinds = sensor_drivers(config), arm_drivers(config)
     normalisers = {name: driver.normaliser() for name, driver in sensor_kinds.items()}
-    spec = _spec(config, sensor_kinds, normalisers)
-    _gel_monitor(config, spec.sensors, {})
-    _require_gentle_approach(config, sensor_kinds, arm_kinds)
+    spec = _make_spec(config, sensor_kinds, normalisers)
+    _make_gel_monitor(config, spec.sensors, {})
+    _require_safe_approach_speed(config, sensor_kinds, arm_kinds)
     _require_keep_outs(config, arm_kinds)
     for driver in arm_kinds.values():
         driver.require()
@@ -70,8 +70,8 @@ def open_hardware(
             name: stack.enter_context(closing(CommandedArm(driver.open(), dry_run=dry_run)))
             for name, driver in arm_kinds.items()
         }
-        clock = _clock(config, companion, arms, sensors, is_real=is_real)
-        monitor = _gel_monitor(config, spec.sensors, arms)
+        clock = _make_clock(config, companion, arms, sensors, is_real=is_real)
+        monitor = _make_gel_monitor(config, spec.sensors, arms)
         task = config.task
         reset = HardwareReset(
             arms={} if dry_run else arms,
@@ -79,10 +79,10 @@ def open_hardware(
             start=_start_poses(config, companion),
             clock=clock,
             config=config.start,
-            touch_sense=None if dry_run else _touch_sense(config, arms, sensors, normalisers, monitor),
-            confirm=_confirmation(config, companion, confirm, is_real=is_real and not dry_run),
+            touch_sensing=None if dry_run else _make_touch_sensing(config, arms, sensors, normalisers, monitor),
+            confirm=_make_confirmation(config, companion, confirm, is_real=is_real and not dry_run),
             placement=0.0 if task is None else task.placement,
-            tell=tell,
+            report=report,
         )
 
         packages = arm_kinds if config.record.arm_packages else {}
@@ -97,7 +97,7 @@ def open_hardware(
             normalisers=normalisers,
             reset=reset,
             truth=companion.truth if companion is not None and spec.truth else None,
-            diagnostics=lambda: _diagnostics(companion, clock, arms, sensor_kinds, sensors),
+            diagnostics=lambda: _collect_diagnostics(companion, clock, arms, sensor_kinds, sensors),
             packages=lambda: {name: log.take() for name, log in logs.items()},
             on_close=None if companion is None else companion.close,
             on_tactile=monitor,
@@ -108,19 +108,19 @@ def open_hardware(
 
 
 def hardware_spec(config: RigConfig) -> RigSpec:
-    """What a rig of hardware will deliver; nothing is opened. Raises CalibrationError, ValueError."""
+    """The specification of a rig of hardware; no device is opened. Raises CalibrationError, ValueError."""
     drivers = sensor_drivers(config)
-    return _spec(config, drivers, {name: driver.normaliser() for name, driver in drivers.items()})
+    return _make_spec(config, drivers, {name: driver.normaliser() for name, driver in drivers.items()})
 
 
-def _spec(config: RigConfig, drivers: SensorDrivers, normalisers: Mapping[str, Normaliser]) -> RigSpec:
+def _make_spec(config: RigConfig, drivers: SensorDrivers, normalisers: Mapping[str, Normaliser]) -> RigSpec:
     sensors = {name: driver.spec(normalisers[name]) for name, driver in drivers.items()}
     companion = companion_class(config)
-    truth = companion is not None and companion.will_know_truth(config)
+    truth = companion is not None and companion.has_simulated_body(config)
     return RigSpec(sensors, tuple(config.arms), truth, config.period)
 
 
-def _clock(
+def _make_clock(
     config: RigConfig,
     companion: Companion | None,
     arms: Mapping[str, CommandedArm],
@@ -128,16 +128,16 @@ def _clock(
     *,
     is_real: bool,
 ) -> LockStep | WallClock:
-    """In lock step where everything waits for us: no real arm, and gels simulated here."""
+    """A lock-step clock if all devices can wait (no real arm, simulated gels), otherwise the wall clock."""
     if companion is None or not companion.is_simulated:
         return WallClock(config.period)
     if config.lock_step and not is_real:
         return LockStep(config.period, arms, {name: sensors[name] for name in companion.picture_sources}, companion)
     companion.run_free()
-    return WallClock(config.period, companion.catch_up, real_time=config.contact == "hertz")
+    return WallClock(config.period, companion.wait_for_fresh_step, real_time=config.contact == "hertz")
 
 
-def _diagnostics(
+def _collect_diagnostics(
     companion: Companion | None,
     clock: LockStep | WallClock,
     arms: Mapping[str, CommandedArm],
@@ -160,66 +160,68 @@ def _start_poses(config: RigConfig, companion: Companion | None) -> dict[str, Po
         elif name not in starts:
             raise DeviceError(
                 f"arms.{name}.start is missing: give the sensor's world pose at the start of an episode, "
-                "some cm clear of everything"
+                "some cm away from any object"
             )
     return starts
 
 
-def _touch_sense(
+def _make_touch_sensing(
     config: RigConfig,
     arms: Mapping[str, CommandedArm],
     sensors: Mapping[str, TactileSource],
     normalisers: Mapping[str, Normaliser],
     monitor: GelMonitor,
-) -> TouchSense | None:
-    """How touch is felt: by the picture if `touch_signal` is given, else by force. None where neither is given, or no
-    arm carries a sensor."""
-    missed_periods = 2.5  # an approach waits when no picture came for so many periods of its camera
+) -> TouchSensing | None:
+    """Measures touch in images if `touch_signal` is given, otherwise by force. None if neither is given, or no arm
+    carries a sensor."""
+    missed_periods = 2.5  # an approach waits if no image arrived within so many periods of its camera
     carriers = {sensor.arm: arms[sensor.arm] for sensor in config.sensors.values() if sensor.arm is not None}
     if not carriers:
         return None
     if config.start.touch_signal is not None:
         rates = [
-            _positive(driver.sample_rate(), driver, f"sensors.{name}", "a sample rate", "Hz")
+            _require_positive(driver.sample_rate(), driver, f"sensors.{name}", "a sample rate", "Hz")
             for name, driver in sensor_drivers(config).items()
         ]
-        patience = missed_periods / min(rates)
-        return PictureTouch(sensors, normalisers, monitor, config.start.touch_signal, patience)
+        data_timeout = missed_periods / min(rates)
+        return PictureTouch(sensors, normalisers, monitor, config.start.touch_signal, data_timeout)
     force = None if config.task is None else config.task.touch_force
     return None if force is None else ForceTouch(carriers, force)
 
 
-def _require_gentle_approach(config: RigConfig, sensors: SensorDrivers, arms: ArmDrivers) -> None:
-    """Raises ValueError where a gel would be pressed beyond its limit before its picture could show the touch."""
+def _require_safe_approach_speed(config: RigConfig, sensors: SensorDrivers, arms: ArmDrivers) -> None:
+    """Raises ValueError if a gel could be pressed beyond its limit before its image shows the touch."""
     if config.start.touch_signal is None:
         return
     for name, driver in sensors.items():
         arm = driver.config.arm
-        if arm is None or (depth := _limits(config, arm).depth) is None:
+        if arm is None or (depth := _stop_limits_of(config, arm).depth) is None:
             continue
-        late = _positive(driver.worst_latency(), driver, f"sensors.{name}", "a worst latency", "s")
-        late += _positive(arms[arm].worst_latency(), arms[arm], f"arms.{arm}", "a worst latency", "s")
+        delay = _require_positive(driver.worst_latency(), driver, f"sensors.{name}", "a worst latency", "s")
+        delay += _require_positive(arms[arm].worst_latency(), arms[arm], f"arms.{arm}", "a worst latency", "s")
         speed = config.start.approach_speed
-        if speed * late > depth:
+        if speed * delay > depth:
             raise ValueError(
-                f"rig '{config.name}': start.approach_speed {1e3 * speed:g} mm/s is too fast: the picture of sensor "
-                f"'{name}' shows a touch {1e3 * late:.0f} ms late, with its gel {1e3 * speed * late:.2g} mm deep, "
-                f"and limits.depth of arm '{arm}' is {1e3 * depth:g} mm. At most {1e3 * depth / late:.2g} mm/s"
+                f"rig '{config.name}': start.approach_speed {1e3 * speed:g} mm/s is too fast: the image of sensor "
+                f"'{name}' shows a touch {1e3 * delay:.0f} ms late, with its gel {1e3 * speed * delay:.2g} mm deep, "
+                f"and limits.depth of arm '{arm}' is {1e3 * depth:g} mm. At most {1e3 * depth / delay:.2g} mm/s"
             )
 
 
-def _positive(stated: float, driver: SensorDriver[Any] | ArmDriver[Any], key: str, what: str, unit: str) -> float:
-    """What a driver states. Raises ValueError for a value that cannot be."""
-    if not (math.isfinite(stated) and stated > 0.0):
+def _require_positive(
+    value: float, driver: SensorDriver[Any] | ArmDriver[Any], key: str, what: str, unit: str
+) -> float:
+    """`value`, as stated by a driver. Raises ValueError unless it is finite and positive."""
+    if not (math.isfinite(value) and value > 0.0):
         raise ValueError(
-            f"{key}: the driver '{driver.config.driver}' states {what} of {stated} {unit}; it must be finite and above "
+            f"{key}: the driver '{driver.config.driver}' states {what} of {value} {unit}; it must be finite and above "
             "0, or an approach could press a gel too deep"
         )
-    return stated
+    return value
 
 
 def _require_keep_outs(config: RigConfig, arms: ArmDrivers) -> None:
-    """Raises ValueError for two arms that nothing keeps apart."""
+    """Raises ValueError for two arms whose drivers do not keep them apart."""
     for rule in config.keep_out:
         first, second = (arms[name] for name in rule.arms)
         if not (first.keeps_distances and type(first) is type(second)):
@@ -230,21 +232,23 @@ def _require_keep_outs(config: RigConfig, arms: ArmDrivers) -> None:
             )
 
 
-def _limits(config: RigConfig, name: str) -> ArmLimits:
-    """Raises ValueError for an arm without limits: nothing would guard it."""
+def _stop_limits_of(config: RigConfig, name: str) -> ArmLimits:
+    """Raises ValueError for an arm without limits: no driver could stop it."""
     arm = config.arms[name]
     if arm.stop_limits is None:
         raise ValueError(
             f"rig '{config.name}': arms.{name} has the driver '{arm.driver}', whose configuration has no `limits`: "
-            "nothing says where the arm must stop. Give it `limits: ArmLimits`"
+            "no value says where the arm must stop. Give it `limits: ArmLimits`"
         )
     return arm.stop_limits
 
 
-def _gel_monitor(config: RigConfig, sensors: Mapping[str, SensorSpec], arms: Mapping[str, CommandedArm]) -> GelMonitor:
-    """Reports to the arms what their gels show, and guards the gels. Raises DeviceError for a limit that cannot be
-    guarded because its sensor delivers no height or flow."""
-    limits = {name: _limits(config, name) for name in config.arms}
+def _make_gel_monitor(
+    config: RigConfig, sensors: Mapping[str, SensorSpec], arms: Mapping[str, CommandedArm]
+) -> GelMonitor:
+    """Reports tactile values to the arms, and checks the limits of the gels. Raises DeviceError for a limit that cannot
+    be checked because its sensor delivers no height or flow."""
+    limits = {name: _stop_limits_of(config, name) for name in config.arms}
     report = {name: arm.driver.report_tactile for name, arm in arms.items()}
     try:
         return GelMonitor(sensors, limits, report, SafetyViolation)
@@ -252,17 +256,19 @@ def _gel_monitor(config: RigConfig, sensors: Mapping[str, SensorSpec], arms: Map
         raise DeviceError(str(failure)) from None
 
 
-def _confirmation(
+def _make_confirmation(
     config: RigConfig, companion: Companion | None, confirm: Confirm | None, *, is_real: bool
 ) -> Callable[[], bool]:
-    def ask() -> bool:
+    def confirm_placement() -> bool:
         if is_real:
             question = (
-                QUESTION if len(config.arms) == 1 else QUESTION.replace("sensor", "sensors").replace("arm", "arms")
+                CONFIRMATION_QUESTION
+                if len(config.arms) == 1
+                else CONFIRMATION_QUESTION.replace("sensor", "sensors").replace("arm", "arms")
             )
             return confirm is not None and confirm(f"Rig '{config.name}': {question}")
         if companion is not None:
             companion.place()
         return True
 
-    return ask
+    return confirm_placement

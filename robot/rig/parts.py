@@ -27,12 +27,12 @@ def sensor_of(config: RigConfig, name: str) -> SensorPart[Any]:
 
 
 def sensor_drivers(config: RigConfig) -> dict[str, SensorDriver[Any]]:
-    """By name, of a rig that goes by the wall clock (`check_parts`)."""
+    """Drivers by sensor name, of a rig with the wall clock (see `check_parts`)."""
     return {name: cast(SensorDriver[Any], sensor_of(config, name)) for name in config.sensors}
 
 
 def arm_drivers(config: RigConfig) -> dict[str, ArmDriver[Any]]:
-    """By name, of a rig that goes by the wall clock (`check_parts`)."""
+    """Drivers by arm name, of a rig with the wall clock (see `check_parts`)."""
     return {
         name: cast(ArmDriver[Any], arm_part(arm, name, config.keep_out_distances(name)))
         for name, arm in config.arms.items()
@@ -40,7 +40,7 @@ def arm_drivers(config: RigConfig) -> dict[str, ArmDriver[Any]]:
 
 
 def check_parts(config: RigConfig) -> None:
-    """All parts of a rig go by its clock, and every sensor is one that can be opened. Raises CannotOpen."""
+    """Checks that all parts of a rig support its clock, and that each sensor can be opened. Raises CannotOpen."""
     sensors = {name: sensor_of(config, name) for name in config.sensors}
     arms = {name: arm_part(arm, name) for name, arm in config.arms.items()}
     for kind, parts in (("arm", arms), ("sensor", sensors)):
@@ -49,7 +49,7 @@ def check_parts(config: RigConfig) -> None:
                 continue
             able = [each for each, other in installed_drivers().usable[kind].items() if config.clock in other.clocks]
             raise CannotOpen(
-                f"rig '{config.name}': {kind}s.{name} has driver '{part.config.driver}', which cannot go by clock "
+                f"rig '{config.name}': {kind}s.{name} has driver '{part.config.driver}', which does not support clock "
                 f"'{config.clock}'; give it driver '{' or '.join(sorted(able))}', or change the clock"
             )
     for sensor in sensors.values():
@@ -60,9 +60,9 @@ def check_parts(config: RigConfig) -> None:
 
 
 def companion_class(config: RigConfig) -> Any:
-    """The class of the companion that the mocks of a rig need; None where all devices run by themselves.
+    """The class of the companion that the mocks of a rig need; None if no device needs one.
 
-    Raises CannotOpen where two different ones are asked for.
+    Raises CannotOpen if the mocks need different companions.
     """
     drivers: list[Any] = [*sensor_drivers(config).values(), *arm_drivers(config).values()]
     names = sorted({driver.companion for driver in drivers if driver.companion is not None})
@@ -74,7 +74,7 @@ def companion_class(config: RigConfig) -> Any:
 
 
 def start_companion(config: RigConfig) -> Companion | None:
-    """The companion of a rig's mocks; None where all devices run by themselves. Raises DeviceError."""
+    """Starts the companion of a rig's mocks; None if no device needs one. Raises DeviceError."""
     made = companion_class(config)
     companion: Companion | None = None if made is None else made(config)
     return companion
@@ -82,7 +82,7 @@ def start_companion(config: RigConfig) -> Companion | None:
 
 @contextmanager
 def companion_of(config: RigConfig) -> Iterator[Companion | None]:
-    """The same for a while: it is closed at the end."""
+    """Starts the companion and closes it at the end of the block."""
     companion = start_companion(config)
     try:
         yield companion

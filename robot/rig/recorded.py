@@ -1,4 +1,4 @@
-"""A recorded episode as its policy saw it: its native frames normalised anew, as the rig did that recorded it."""
+"""Observations of a recorded episode: its native frames, normalised again as in the rig that recorded it."""
 
 from __future__ import annotations
 
@@ -30,28 +30,28 @@ from tacsim.record.reader import read_episode
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ObservedEpisode:
-    """The recording at `path`, and how to see it."""
+    """The recording at `path`, and the rig to normalise it with."""
 
     path: Path
     episode: Episode
-    rig: RigConfig | None  # that recorded it, where it is known
+    rig: RigConfig | None  # with which it was recorded; None if unknown
 
     @property
     def canonical(self) -> CanonicalGrid:
         return CanonicalGrid() if self.rig is None else self.rig.canonical
 
     def steps(self) -> Iterator[tuple[Step, Observation]]:
-        """Each step and what was observed after it, one at a time in memory.
+        """Yields each step with the observation after it; one step is in memory at a time.
 
-        Raises EpisodeError for a step that lacks a frame or an arm, or cannot be read; ValueError and
-        calibration.errors.CalibrationError where a frame cannot be normalised.
+        Raises EpisodeError for a step that lacks a frame or an arm or cannot be read; ValueError and
+        calibration.errors.CalibrationError for a frame that cannot be normalised.
         """
         spec = self.episode.meta.spec
         normalisers: dict[str, Normaliser] = {}
         for step in self.episode.steps:
             lacking = [*(set(spec.sensors) - set(step.frames)), *(set(spec.arms) - set(step.arms))]
             if lacking:
-                raise EpisodeError(f"{self.path}: step {step.index} has nothing of '{sorted(lacking)[0]}'")
+                raise EpisodeError(f"{self.path}: step {step.index} has no data of '{sorted(lacking)[0]}'")
             frames = {name: step.frames[name] for name in spec.sensors}
             if not normalisers:
                 normalisers = {name: self._normaliser(name, frame) for name, frame in frames.items()}
@@ -59,25 +59,25 @@ class ObservedEpisode:
             yield step, Observation(tactile, {name: step.arms[name] for name in spec.arms}, step.time)
 
     def _normaliser(self, name: str, first: TactileFrame) -> Normaliser:
-        """With the episode's picture without contact as its reference; without one, the first frame."""
+        """With the episode's reference image, or else with the first frame as reference."""
         config = ReplaySensorConfig(driver="replay", source=str(self.path))
         with error_context(f"{self.path}: sensor '{name}'"):
             reference = reference_image(self.episode.meta.attachments, name)
             untouched = first if reference is None else TactileFrame(reference, time=first.time, index=first.index)
-            found = sensor_part(config, name, self.canonical).normaliser(untouched.image)
-            found.take_reference(untouched)
-        return found
+            normaliser = sensor_part(config, name, self.canonical).normaliser(untouched.image)
+            normaliser.take_reference(untouched)
+        return normaliser
 
 
 class RecordedSurfaces:
-    """The surfaces of an episode's gels, called with sensor and frame: as the frame says, or found in its picture by
-    what the rig of the episode knows of the sensor; None where nothing finds them.
+    """Surfaces of an episode's gels, called with sensor and frame: the frame's own surface, or one that the sensor's
+    normaliser in the episode's rig estimates from the image; None if neither exists.
 
-    Frames of a sensor may be left out, not go back. `notes`: in words, what a sensor lacks.
+    Frames of a sensor may be skipped, but not go back in time. `notes`: texts about what a sensor lacks.
     """
 
     def __init__(self, meta: EpisodeMeta) -> None:
-        """Raises EpisodeError for a reference that cannot be read. A rig file that cannot is noted."""
+        """Raises EpisodeError for a reference image that cannot be read. An unreadable rig file is noted in `notes`."""
         self._normalisers: dict[str, Normaliser] = {}
         self.notes: list[str] = []
         try:
@@ -94,16 +94,16 @@ class RecordedSurfaces:
             if untouched is None or sensor.is_simulated or name not in meta.spec.sensors:
                 continue
             try:
-                found = sensor_of(rig, name).normaliser(untouched)
-                if found.finds_height or found.finds_flow:
-                    found.take_reference(TactileFrame(untouched, time=0.0, index=0))
-                    self._normalisers[name] = found
-                    self.notes += _distrusted(sensor, name)
-                    shown: tuple[float, float] | None = getattr(found, "visible_size", None)
-                    if shown is not None and sensor.sensor_model is None:
-                        self.notes += _middle_alone(name, shown, rig.canonical)
+                normaliser = sensor_of(rig, name).normaliser(untouched)
+                if normaliser.finds_height or normaliser.finds_flow:
+                    normaliser.take_reference(TactileFrame(untouched, time=0.0, index=0))
+                    self._normalisers[name] = normaliser
+                    self.notes += _describe_untrusted_calibration(sensor, name)
+                    visible_size: tuple[float, float] | None = getattr(normaliser, "visible_size", None)
+                    if visible_size is not None and sensor.sensor_model is None:
+                        self.notes += _describe_partial_maps(name, visible_size, rig.canonical)
                 elif not meta.spec.sensors[name].height:
-                    self.notes += _dots_in(untouched, name)
+                    self.notes += _describe_printed_dots(untouched, name)
             except (CalibrationError, ValueError) as why:
                 self.notes.append(f"sensor {name}: no height is shown: {why}")
 
@@ -113,52 +113,52 @@ class RecordedSurfaces:
             return frame.surface
         try:
             return normalise(frame, frame.time)
-        except (StaleReference, TooFewMarkers, ValueError):  # the steps say so
+        except (StaleReference, TooFewMarkers, ValueError):  # the steps report it
             return None
 
 
-def _distrusted(sensor: SensorConfig, name: str) -> list[str]:
-    """A word on a calibration that says of itself that it is not to be trusted."""
+def _describe_untrusted_calibration(sensor: SensorConfig, name: str) -> list[str]:
+    """A note about a calibration whose own verdict is not to trust it."""
     path = sensor.bundle
     if path is None or not read_sensor_model(Path(path)).caution:
         return []
     return [
-        f"sensor {name}: the verdict on {path} is 'do not trust', so neither are its heights; see verdict.html there"
+        f"sensor {name}: the verdict on {path} is 'do not trust', so do not trust its heights; see verdict.html there"
     ]
 
 
-def _middle_alone(name: str, shown: tuple[float, float], grid: CanonicalGrid) -> list[str]:
-    """A note on maps that are smaller than the gel `shown` in the picture (x, y) [m]."""
+def _describe_partial_maps(name: str, visible_size: tuple[float, float], grid: CanonicalGrid) -> list[str]:
+    """A note about maps that are smaller than the visible part `visible_size` of the gel (x, y) [m]."""
     maps = grid.columns * grid.pitch, grid.rows * grid.pitch
     more = [
         f"--set canonical.{key}={2 * math.ceil(there / grid.pitch / 2 - 1e-6)}"
-        for key, there, mapped in zip(("columns", "rows"), shown, maps, strict=True)
+        for key, there, mapped in zip(("columns", "rows"), visible_size, maps, strict=True)
         if there > mapped + grid.pitch
     ]
     if not more:
         return []
     middle, whole = (
         " x ".join(f"{length * 1e3:.3g}" for length in size)
-        for size in ((min(maps[0], shown[0]), min(maps[1], shown[1])), shown)
+        for size in ((min(maps[0], visible_size[0]), min(maps[1], visible_size[1])), visible_size)
     )
     words = f"maps show the middle {middle} mm of {whole} mm of gel; for all of it: tacsim run ... {' '.join(more)}"
     return [f"sensor {name}: {words}"]
 
 
-def _dots_in(untouched: NDArray[np.uint8], sensor: str) -> list[str]:
-    """A word on printed dots that nobody has told of."""
+def _describe_printed_dots(untouched: NDArray[np.uint8], sensor: str) -> list[str]:
+    """A note about printed dots, if the image shows dots and the rig file gives no marker pitch."""
     try:
         lattice, _ = find_markers(untouched)
     except NoLattice:
         return []
     rows, columns = lattice.present.shape
     return [
-        f"sensor {sensor} shows {rows} x {columns} dark dots: say how far they are apart, "
-        f"--set 'sensors.{sensor}.marker_pitch=1.5 mm', and the gel's flow is found by them; for height calibrate the "
-        "sensor, with --markers"
+        f"sensor {sensor} shows {rows} x {columns} dark dots: give their distance, "
+        f"--set 'sensors.{sensor}.marker_pitch=1.5 mm', and tactile flow is measured by them; for height calibrate the "
+        "sensor with --markers"
     ]
 
 
 def observe_episode(path: Path) -> ObservedEpisode:
-    """The episode in a file, seen on the canonical grid that it was recorded with. Raises EpisodeError, ConfigError."""
+    """The episode in a file, on the canonical grid with which it was recorded. Raises EpisodeError, ConfigError."""
     return ObservedEpisode(path, read_episode(path), recorded_rig(path))

@@ -23,7 +23,7 @@ class ReplaySensorPart(SensorPart[ReplaySensorConfig]):
             raise ValueError(f"{key}: no recording given; name one with --set {key}=PATH")
 
     def normaliser(self, untouched: NDArray[np.uint8] | None = None) -> Normaliser:
-        """By what the rig file says of the picture; without by what an episode says of its own sensor."""
+        """From the settings of the rig file, or else from the rig with which the episode was recorded."""
         from robot.rig.parts import sensor_of
         from robot.rig.replay_rig import recorded_rig
 
@@ -32,7 +32,7 @@ class ReplaySensorPart(SensorPart[ReplaySensorConfig]):
         if original is None or self.name not in original.sensors:
             return self._of_file(untouched)
         part = sensor_of(original.model_copy(update={"canonical": self.grid}), self.name)
-        if original.clock == "replay":  # a recording of a recording: no further, they may name each other
+        if original.clock == "replay":  # a recording of a recording: stop here, since they may refer to each other
             return cast(ReplaySensorPart, part)._of_file(untouched)
         return part.normaliser(untouched)
 
@@ -40,7 +40,7 @@ class ReplaySensorPart(SensorPart[ReplaySensorConfig]):
         from calibration.normaliser import normaliser_for_recording
 
         if untouched is None:
-            raise ValueError(f"sensors.{self.name}: a recording is normalised with its picture without contact")
+            raise ValueError(f"sensors.{self.name}: a recording is normalised with its reference image")
         return normaliser_for_recording(self.config, untouched.shape[:2], self.grid, untouched)
 
 

@@ -1,4 +1,4 @@
-"""Recorded rigs: episodes, folders of pictures and videos."""
+"""Recorded rigs: episodes, folders of images and videos."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tacsim.rig import Rig
 
 
 class ReplayReset:
-    """The reset of a recorded rig: goes back to the first frame; nothing moves."""
+    """The reset of a recorded rig: returns to the first frame; nothing moves."""
 
     def __init__(self, clock: ReplayClock, sensors: Mapping[str, ReplaySensor]) -> None:
         self._clock, self._sensors = clock, sensors
@@ -32,14 +32,16 @@ class ReplayReset:
         return {name: sensor.reference() for name, sensor in self._sensors.items()}
 
     def touch(self) -> None:
-        """A recording is as it is."""
+        """Does nothing: a recording does not change."""
 
 
 def open_replay(config: RigConfig) -> Rig:
     """Recorded sensors and arms. The control period is that of the recording. Raises CannotOpen, EpisodeError."""
-    there = {name: arm for name, arm in parts_of(config.arms, ReplayArmConfig).items() if arm.source is not None}
+    recorded_arms = {
+        name: arm for name, arm in parts_of(config.arms, ReplayArmConfig).items() if arm.source is not None
+    }
     recorded = {
-        name: sensor if sensor.arm in there else sensor.model_copy(update={"arm": None})
+        name: sensor if sensor.arm in recorded_arms else sensor.model_copy(update={"arm": None})
         for name, sensor in parts_of(config.sensors, ReplaySensorConfig).items()
     }
     clock = ReplayClock(_common_period(config.name, recorded))
@@ -51,11 +53,11 @@ def open_replay(config: RigConfig) -> Rig:
             stack.callback(source.close)
             with error_context(f"sensors.{name}"):
                 normaliser = sensor_part(sensor, name, config.canonical).normaliser(source.reference().image)
-            if not source.spec.height:  # what the frames don't carry, and the normaliser finds in them
+            if not source.spec.height:  # the frames contain no surface: the normaliser estimates it
                 source.spec = replace(source.spec, height=normaliser.finds_height, flow=normaliser.finds_flow)
             normalisers[name] = normaliser
         arms: dict[str, ReplayArm] = {}
-        for name, arm in there.items():
+        for name, arm in recorded_arms.items():
             arms[name] = ReplayArm(arm, name, clock)
             stack.callback(arms[name].close)
         match_sources(sensors, arms)
@@ -76,25 +78,25 @@ def _common_period(rig: str, sensors: Mapping[str, ReplaySensorConfig]) -> float
     shortest, longest = min(periods, key=periods.__getitem__), max(periods, key=periods.__getitem__)
     if periods[longest] > periods[shortest] * 1.01:
         raise CannotOpen(
-            f"rig '{rig}': recordings go frame by frame, but sensors.{shortest} has one every "
-            f"{periods[shortest]:.4g} s and sensors.{longest} every {periods[longest]:.4g} s; give two of one rate"
+            f"rig '{rig}': recordings are replayed frame by frame, but sensors.{shortest} has one every "
+            f"{periods[shortest]:.4g} s and sensors.{longest} every {periods[longest]:.4g} s; use one rate"
         )
     return periods[shortest]
 
 
 def recorded_rig(source: Path) -> RigConfig | None:
-    """The rig that an episode was recorded with; None where it is not known."""
+    """The rig that an episode was recorded with; None if it is unknown."""
     if source.suffix.lower() not in EPISODES:
         return None
     return rig_of(episode_meta(source))
 
 
 def rig_of(meta: EpisodeMeta) -> RigConfig | None:
-    """The rig that an episode with this description was recorded with; None where it is not known."""
+    """The rig that an episode with this description was recorded with; None if it is unknown."""
     text = meta.attachments.get(RIG_ATTACHMENT)
     if text is None:
         return None
-    with tempfile.TemporaryDirectory() as folder:  # an empty folder: the text can refer to nothing beside it
+    with tempfile.TemporaryDirectory() as folder:  # an empty folder: the text cannot refer to other files
         path = Path(folder) / RIG_ATTACHMENT
         path.write_bytes(text)
         return load_rig(path).config

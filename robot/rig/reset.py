@@ -1,7 +1,7 @@
-"""The reset of a rig of hardware: retreat, references, a person's confirmation, and a slow approach until touch.
+"""The reset of a rig of hardware: retreat, reference images, the operator's confirmation, a slow approach until touch.
 
-Only `Rig.reset` starts it, and nothing approaches before somebody has confirmed that the body lies where it should (on
-a mock rig the companion of its mocks puts it there).
+Only `Rig.reset` starts it. No arm approaches before the operator has confirmed that the body is in its place (on a mock
+rig, the companion of the mocks places it).
 """
 
 from __future__ import annotations
@@ -14,26 +14,26 @@ import numpy as np
 
 from robot.errors import DeviceError
 from robot.rig.commanded_arm import CommandedArm, wait_for_arrival
-from robot.rig.touch import TouchSense
+from robot.rig.touch import TouchSensing
 from tacsim import pose as se3
 from tacsim.control.contact_signal import NoTouch, approach
 from tacsim.interface import Pose, TactileFrame, TactileSource
 from tacsim.models.hardware import ResetConfig
 
-RETREAT = 5e-3  # along the sensor's own axis, before anything else [m]
-TRAVEL = 60.0  # longest motion to the start [s]
-LOOK = 5e-3  # between two looks of an approach in motion [s]
-AT_END = 0.5  # an approach that has come to its end has met nothing when nothing is told for so long [s]
-PICTURE = 15.0  # longest wait for one that shows the gels at rest [s]
-PAUSE = 0.3  # a shaken arm comes to rest before its force is zeroed [s]
-ADVICE = (
-    "is the body before the sensors? The arms are back at their start (start.approach_distance in the rig file bounds "
-    "the approach)"
+RETREAT_DISTANCE = 5e-3  # first motion of a reset, along the sensor's own axis [m]
+MOVE_TIMEOUT = 60.0  # of a motion to the start [s]
+POLL_INTERVAL = 5e-3  # between two measurements of an approach [s]
+END_TIMEOUT = 0.5  # an approach at its end has not touched if no touch is reported within this time [s]
+FRAME_TIMEOUT = 15.0  # for an image that shows the gels at rest [s]
+SETTLING_TIME = 0.3  # an arm comes to rest before its force is zeroed [s]
+NO_TOUCH_ADVICE = (
+    "is the body in front of the sensors? The arms are back at their start (start.approach_distance in the rig file "
+    "limits the approach)"
 )
 
 
 class NotConfirmed(RuntimeError):
-    """Nobody confirmed that the body is in its place; the arms stand at their start."""
+    """The operator did not confirm that the body is in its place. The arms are at their start."""
 
 
 class ResetClock(Protocol):
@@ -41,7 +41,7 @@ class ResetClock(Protocol):
 
     @property
     def real_time(self) -> bool:
-        """Pictures and forces come as things happen; otherwise a simulation follows the arms as fast as it can."""
+        """True if images and forces arrive in real time; otherwise a simulation follows the arms as fast as it can."""
         ...
 
     def wait_for_data(self) -> None: ...
@@ -53,13 +53,13 @@ class HardwareReset:
 
     Args:
         arms, sensors: of the rig, by name.
-        start: world_from_sensor of each arm, clear of everything.
+        start: world_from_sensor of each arm, without contact.
         clock: of the rig.
         config: of the approach.
-        touch_sense: what ends the approach; None: no approach. An arm that it does not know stays at its start.
-        confirm: asks a person, True to go on; on a mock rig it puts the body in its place.
-        placement: the arms start at most this far aside in world x and y, drawn from the seed [m].
-        tell: is told what the arms are doing, again and again, in a few words.
+        touch_sensing: ends the approach; None: no approach. An arm that it does not measure stays at its start.
+        confirm: asks the operator, True to continue; on a mock rig it puts the body in its place.
+        placement: maximum shift of the start in world x and y, drawn from the seed [m].
+        report: gets a short text about what the arms are doing, repeatedly.
     """
 
     def __init__(
@@ -70,122 +70,131 @@ class HardwareReset:
         start: Mapping[str, Pose],
         clock: ResetClock,
         config: ResetConfig,
-        touch_sense: TouchSense | None,
+        touch_sensing: TouchSensing | None,
         confirm: Callable[[], bool],
         placement: float = 0.0,
-        tell: Callable[[str], None] = lambda words: None,
+        report: Callable[[str], None] = lambda words: None,
     ) -> None:
         self._arms, self._sensors, self._start, self._clock = arms, sensors, start, clock
-        self._config, self._touch_sense, self._confirm, self._placement = config, touch_sense, confirm, placement
-        self._tell = tell
-        self._begun: dict[str, Pose] = dict(start)
+        self._config, self._touch_sensing, self._confirm, self._placement = config, touch_sensing, confirm, placement
+        self._report = report
+        self._approach_start: dict[str, Pose] = dict(start)
 
     def clear(self, seed: int) -> Mapping[str, TactileFrame]:
-        """Raises DeviceError when an arm is stopped, or does not get there; TimeoutError without a picture of then."""
+        """Raises DeviceError if an arm is stopped or does not arrive, TimeoutError without a new image."""
         for arm in self._arms.values():
             arm.suspend_tactile_guard()
         offset = self._placement * np.random.default_rng(seed).uniform(-1.0, 1.0, size=2)
         shift = np.append(offset, 0.0)
-        self._begun = {name: Pose(pose.position + shift, pose.quaternion) for name, pose in self._start.items()}
+        self._approach_start = {
+            name: Pose(pose.position + shift, pose.quaternion) for name, pose in self._start.items()
+        }
         if self._arms:
-            self._tell("to the start")
-        self._go({name: se3.translated_along_z(arm.state().pose, -RETREAT) for name, arm in self._arms.items()}, TRAVEL)
-        self._go(self._begun, TRAVEL)
+            self._report("to the start")
+        self._move_arms(
+            {name: se3.translated_along_z(arm.state().pose, -RETREAT_DISTANCE) for name, arm in self._arms.items()},
+            MOVE_TIMEOUT,
+        )
+        self._move_arms(self._approach_start, MOVE_TIMEOUT)
         if self._arms:
-            time.sleep(PAUSE)
-            self._clock.wait_for_data()  # the force to be zeroed is that of now, not of before the retreat
+            time.sleep(SETTLING_TIME)
+            self._clock.wait_for_data()  # the force to be zeroed is the present one, not that before the retreat
         rested = time.monotonic()
         for arm in self._arms.values():
             arm.driver.zero_wrench()
         self._clock.wait_for_data()
-        return {name: _exposed_after(rested, name, sensor) for name, sensor in self._sensors.items()}
+        return {name: _read_exposed_after(rested, name, sensor) for name, sensor in self._sensors.items()}
 
     def touch(self) -> None:
         """Raises NotConfirmed, and NoTouch with the arms back at their start."""
         if not self._confirm():
-            raise NotConfirmed("nobody confirmed that the body is in its place; nothing approaches it")
+            raise NotConfirmed("the operator did not confirm that the body is in its place; no arm approaches it")
         self._clock.wait_for_data()
-        if self._touch_sense is not None and self._arms:
-            go = self._approach if self._clock.real_time else self._approach_by_steps
+        if self._touch_sensing is not None and self._arms:
+            move_to_touch = self._approach if self._clock.real_time else self._approach_by_steps
             try:
-                go(self._touch_sense)
+                move_to_touch(self._touch_sensing)
             except NoTouch:
                 for arm in self._arms.values():
                     arm.suspend_tactile_guard()
-                self._tell("back to the start")
-                self._go(self._begun, TRAVEL)
+                self._report("back to the start")
+                self._move_arms(self._approach_start, MOVE_TIMEOUT)
                 raise
-            self._tell("touching")
+            self._report("touching")
         self._clock.restart()
 
-    def _approach(self, sense: TouchSense) -> None:
-        """All arms along their sensors' axes at the approach speed, each until a gel of its own touches. Where no new
-        pictures or packages come, they wait."""
-        min_progress = 0.1e-3  # an approach goes on while its arms come so much farther within TRAVEL [m]
-        speed, longest = self._config.approach_speed, self._config.approach_distance
-        going = {name: self._arms[name] for name in sense.look(guarded=True).pressed}
-        ends = {name: se3.translated_along_z(self._begun[name], longest) for name in going}
-        gone = dict.fromkeys(going, 0.0)
-        before_end = farther = time.monotonic()
-        counted = 0.0  # of the arms' ways together, when they were last seen to come farther [m]
+    def _approach(self, sensing: TouchSensing) -> None:
+        """Moves all arms along their sensors' axes at the approach speed, each until one of its gels touches. The arms
+        wait while no new images or packages arrive."""
+        min_progress = 0.1e-3  # an approach ends with an error if its arms progress less within MOVE_TIMEOUT [m]
+        speed, max_distance = self._config.approach_speed, self._config.approach_distance
+        moving = {name: self._arms[name] for name in sensing.measure_touch(guarded=True).pressed}
+        ends = {name: se3.translated_along_z(self._approach_start[name], max_distance) for name in moving}
+        travelled = dict.fromkeys(moving, 0.0)
+        last_moving = last_progress = time.monotonic()
+        counted_distance = 0.0  # sum over the arms, at the last progress [m]
         try:
-            while going:
-                touch = sense.look(guarded=True)
+            while moving:
+                touch = sensing.measure_touch(guarded=True)
                 now = time.monotonic()
-                waiting = now - touch.news > sense.patience
-                for name in list(going):
+                waiting = now - touch.latest_data_time > sensing.data_timeout
+                for name in list(moving):
                     if touch.pressed[name] < 1.0:
-                        going[name].send(None if waiting else ends[name], speed)
+                        moving[name].send(None if waiting else ends[name], speed)
                     else:  # NaN, too
-                        going.pop(name).send(None)
-                for name, arm in going.items():
-                    gone[name] = se3.pose_distance(arm.state().pose, self._begun[name])[0]
-                self._tell(f"approach: {1e3 * max(gone.values()):.1f} mm of at most {1e3 * longest:g} mm")
-                if sum(gone.values()) > counted + min_progress:
-                    counted, farther = sum(gone.values()), now
-                if waiting or not all(arm.at_target() for arm in going.values()):
-                    before_end = now
-                elif going and now - before_end > AT_END:
-                    raise NoTouch(f"no touch after an approach of {1e3 * max(gone.values()):.3g} mm; {ADVICE}")
-                if going and now - farther > TRAVEL:  # not after a time in all: a busy machine makes an arm slow
-                    why = "no new pictures or packages come" if waiting else next(iter(going.values())).driver.explain()
-                    raise DeviceError(f"the approach came no farther for {TRAVEL:g} s: {why}")
-                time.sleep(LOOK)
+                        moving.pop(name).send(None)
+                for name, arm in moving.items():
+                    travelled[name] = se3.pose_distance(arm.state().pose, self._approach_start[name])[0]
+                distance = max(travelled.values())
+                self._report(f"approach: {1e3 * distance:.1f} mm of at most {1e3 * max_distance:g} mm")
+                if sum(travelled.values()) > counted_distance + min_progress:
+                    counted_distance, last_progress = sum(travelled.values()), now
+                if waiting or not all(arm.at_target() for arm in moving.values()):
+                    last_moving = now
+                elif moving and now - last_moving > END_TIMEOUT:
+                    raise NoTouch(f"no touch after an approach of {1e3 * distance:.3g} mm; {NO_TOUCH_ADVICE}")
+                if moving and now - last_progress > MOVE_TIMEOUT:  # no limit in total: a busy machine slows the arms
+                    stopped = next(iter(moving.values()))
+                    why = "no new images or packages arrive" if waiting else stopped.driver.explain()
+                    raise DeviceError(f"the approach made no progress for {MOVE_TIMEOUT:g} s: {why}")
+                time.sleep(POLL_INTERVAL)
         except BaseException:
             for arm in self._arms.values():
                 arm.stop()
             raise
-        wait_for_arrival(self._arms, TRAVEL)
+        wait_for_arrival(self._arms, MOVE_TIMEOUT)
 
-    def _approach_by_steps(self, sense: TouchSense) -> None:
-        """The same where a simulation has to follow each step before it can be felt."""
-        step_timeout = 5.0  # longest step of an approach [s]
-        going = set(sense.look(guarded=False).pressed)
+    def _approach_by_steps(self, sensing: TouchSensing) -> None:
+        """The same, with a simulation that follows each step before its touch can be measured."""
+        step_timeout = 5.0  # of a step of an approach [s]
+        moving = set(sensing.measure_touch(guarded=False).pressed)
 
         def touches() -> bool:
-            pressed = sense.look(guarded=False).pressed
-            going.difference_update([name for name in going if not pressed[name] < 1.0])
-            return not going
+            pressed = sensing.measure_touch(guarded=False).pressed
+            moving.difference_update([name for name in moving if not pressed[name] < 1.0])
+            return not moving
 
         def advance(distance: float) -> None:
-            self._go({name: se3.translated_along_z(self._begun[name], distance) for name in going}, step_timeout)
+            self._move_arms(
+                {name: se3.translated_along_z(self._approach_start[name], distance) for name in moving}, step_timeout
+            )
             self._clock.wait_for_data()
 
-        approach(touches, advance, self._config.approach_step, self._config.approach_distance, ADVICE)
+        approach(touches, advance, self._config.approach_step, self._config.approach_distance, NO_TOUCH_ADVICE)
 
-    def _go(self, targets: Mapping[str, Pose], timeout: float) -> None:
-        """Arms without a target stay."""
+    def _move_arms(self, targets: Mapping[str, Pose], timeout: float) -> None:
+        """Moves arms to their targets; arms without a target stay."""
         for name, arm in self._arms.items():  # none in a dry run
             arm.send(targets.get(name))
         wait_for_arrival(self._arms, timeout)
 
 
-def _exposed_after(since: float, name: str, sensor: TactileSource) -> TactileFrame:
-    """The first frame exposed after `since` [s]: a camera that was held up still has one of a moving arm, or of before
-    the arm was connected. Raises TimeoutError."""
-    deadline = time.monotonic() + PICTURE
+def _read_exposed_after(since: float, name: str, sensor: TactileSource) -> TactileFrame:
+    """The first frame exposed after `since` [s]: the newest frame of a delayed camera may show a moving arm, or be
+    older than the connection to the arm. Raises TimeoutError."""
+    deadline = time.monotonic() + FRAME_TIMEOUT
     while (frame := sensor.read(1.0)).time < since:
         if time.monotonic() > deadline:
-            raise TimeoutError(f"sensor '{name}': no picture since the arms came to rest, {PICTURE:g} s ago")
-        time.sleep(LOOK)
+            raise TimeoutError(f"sensor '{name}': no image since the arms came to rest, {FRAME_TIMEOUT:g} s ago")
+        time.sleep(POLL_INTERVAL)
     return frame

@@ -1,5 +1,5 @@
-"""The driver `sim`: simulated arms and sensors. The rig that simulates makes them (sim_rig.py); on hardware a mock
-cell simulates the sensor at its arm's pose."""
+"""The driver `sim`: simulated arms and sensors. A simulated rig makes them (sim_rig.py). On hardware, a mock cell
+simulates the sensor at its arm's pose."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tacsim.interface import Normaliser, SensorSpec, TactileSource
 from tacsim.models.driver import ArmPart, Check, Companion, SensorDriver
 from tacsim.models.rig import SimArmConfig, SimSensorConfig
 
-SAMPLE_RATE = 10.0  # of a sensor that is simulated on hardware, at least [Hz]
+SAMPLE_RATE = 10.0  # minimum of a sensor that is simulated on hardware [Hz]
 
 
 class SimSensorDriver(SensorDriver[SimSensorConfig]):

@@ -21,13 +21,13 @@ from tacsim.models.sensor import Lighting
 from tacsim.sim.scene_world import StatePool, require_same_gels
 from tacsim.tasks import make_task
 
-Episodes = Sequence[tuple[RigConfig, str]]  # rigs, and what makes each of them in words
+Episodes = Sequence[tuple[RigConfig, str]]  # rigs, each with a description
 
 
 def open_env(episodes: Episodes, render_mode: str | None, features: Features | None) -> TacsimEnv:
     """An environment of the first of `episodes`; the others are its variants. Raises CannotOpen, ValueError."""
     config = episodes[0][0]
-    return _env(simulate(config), config, _variants(episodes), render_mode, features)
+    return _make_env(simulate(config), config, _make_variants(episodes), render_mode, features)
 
 
 def open_vector_env(
@@ -38,8 +38,8 @@ def open_vector_env(
     features: Features | None,
 ) -> TacsimVectorEnv:
     """`number` of these environments in one batch. Raises CannotOpen, ValueError."""
-    max_environments = 10_000  # beyond any machine's memory
-    config, variants = episodes[0][0], _variants(episodes)
+    max_environments = 10_000  # more exceed the memory of any machine
+    config, variants = episodes[0][0], _make_variants(episodes)
     if number not in range(1, max_environments + 1):
         raise ValueError(f"a vector environment has 1 to {max_environments:,} environments, got {number!r}")
     modes = [mode.value for mode in AutoresetMode]
@@ -54,11 +54,11 @@ def open_vector_env(
     members = []
     for index in range(int(number)):
         simulation = simulate(config, partial(batch.world, index), pool, parallel=False)
-        members.append(Member(_env(simulation, config, variants, render_mode, features), simulation.clock))
+        members.append(Member(_make_env(simulation, config, variants, render_mode, features), simulation.clock))
     return TacsimVectorEnv(members, batch, autoreset_mode)
 
 
-def _env(
+def _make_env(
     simulation: Simulation,
     config: RigConfig,
     variants: Sequence[Variant],
@@ -76,16 +76,16 @@ def _env(
         encoder=encoder,
         variants=variants,
         scene_world=simulation.scene_world,
-        apply_variation=lambda worn: simulation.apply_variation(config if worn is None else worn),
+        apply_variation=lambda variant: simulation.apply_variation(config if variant is None else variant),
     )
 
 
-def _variants(episodes: Episodes) -> list[Variant]:
-    """All but the first. Raises ValueError for one that changes what an environment cannot change at a reset."""
+def _make_variants(episodes: Episodes) -> list[Variant]:
+    """All episodes but the first. Raises ValueError for one that changes settings that a reset cannot change."""
     first, variants = episodes[0][0], []
-    kept = _unchanging(first)
+    fixed = _fixed_settings(first)
     for number, (config, words) in enumerate(episodes[1:]):
-        if _unchanging(config) != kept:
+        if _fixed_settings(config) != fixed:
             raise ValueError(
                 f"variant {number} may change nothing but scene, task, light, texture, noise and delay of the sensors, "
                 "error, noise and delay of the arms; make another environment for it"
@@ -98,19 +98,19 @@ def _variants(episodes: Episodes) -> list[Variant]:
         except ValueError as error:
             raise ValueError(f"variant {number}: {error}") from None
         variants.append(Variant(config.task, config.scene, config, words))
-    if all(_worn(config) == _worn(first) for config, _ in episodes):
+    if all(_variation_of(config) == _variation_of(first) for config, _ in episodes):
         variants = [replace(variant, rig=None) for variant in variants]  # nothing to change at a reset
     return variants
 
 
-def _worn(config: RigConfig) -> tuple[object, object]:
-    """What `Simulation.wear` takes of a rig."""
+def _variation_of(config: RigConfig) -> tuple[object, object]:
+    """The settings of a rig that `Simulation.apply_variation` uses."""
     return config.sensors, config.arms
 
 
-def _unchanging(config: RigConfig) -> RigConfig:
-    """What of a rig is the same in all episodes of an environment; the rest is left out."""
-    look = {
+def _fixed_settings(config: RigConfig) -> RigConfig:
+    """The settings of a rig that are the same in all episodes of an environment; others are replaced by defaults."""
+    neutral_appearance = {
         "lighting": Lighting(),
         "photometric": None,
         "darkness": None,
@@ -123,7 +123,9 @@ def _unchanging(config: RigConfig) -> RigConfig:
     sensors: dict[str, SensorConfig] = {}
     arms: dict[str, ArmConfig] = {}
     for name, sensor in parts_of(config.sensors, SimSensorConfig).items():
-        sensors[name] = sensor.model_copy(update={"model": sensor.model.model_copy(update=look), "delay": 0})
+        sensors[name] = sensor.model_copy(
+            update={"model": sensor.model.model_copy(update=neutral_appearance), "delay": 0}
+        )
     for name, arm in config.arms.items():
         arms[name] = arm.model_copy(update={"error": Placement(), "noise": WrenchNoise(), "delay": 0})
     return config.model_copy(update={"scene": None, "task": None, "sensors": sensors, "arms": arms})

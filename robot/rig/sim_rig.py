@@ -30,7 +30,7 @@ from tacsim.sim.sensor import SimSensor
 
 @dataclass(frozen=True, slots=True)
 class Simulation:
-    """A simulated rig, and the parts of it that who simulates needs."""
+    """A simulated rig, and its parts that vector environments need."""
 
     rig: Rig
     clock: SimClock
@@ -39,16 +39,18 @@ class Simulation:
     arms: Mapping[str, SimArm]
 
     def apply_variation(self, config: RigConfig) -> None:
-        """From the next episode on light, texture, noise and delay of the sensors, and error, noise and delay of the
-        arms, are those of `config`; all else is that of the rig they were made with."""
+        """Takes light, texture, noise and delay of the sensors, and error, noise and delay of the arms from `config`,
+        from the next episode on. Everything else does not change."""
         for name, sensor in parts_of(config.sensors, SimSensorConfig).items():
-            self.sensors[name].apply_variation(*_pictures(sensor.model, name, self.scene_world.scene), sensor.delay)
+            self.sensors[name].apply_variation(
+                *_renderer_and_noise(sensor.model, name, self.scene_world.scene), sensor.delay
+            )
         for name, arm in parts_of(config.arms, SimArmConfig).items():
-            self.arms[name].set_measurement_errors(_error(arm), arm.delay, wrench_noise_source(arm.noise, name))
+            self.arms[name].set_measurement_errors(_pose_error(arm), arm.delay, wrench_noise_source(arm.noise, name))
 
 
 def open_sim(config: RigConfig) -> Rig:
-    """One world seen as sensors, arms and a clock. Raises CannotOpen."""
+    """A rig of sensors, arms and a clock in one simulated world. Raises CannotOpen."""
     simulation = simulate(config)
     simulation.scene_world.world()
     return simulation.rig
@@ -63,8 +65,8 @@ def simulate(
 ) -> Simulation:
     """A simulated rig whose world is made when it is first needed.
 
-    make: a new world of a scene, `make_world` by default. pool: of touched states, to share them between rigs.
-    parallel: its sensors are read on threads of their own, if there are some; not where whole rigs are.
+    make: makes a new world of a scene, `make_world` by default. pool: states after touch, shared between rigs.
+    parallel: sensors are read on several threads, if the machine has them; False where rigs run in parallel.
     Raises CannotOpen.
     """
     scene = config.scene
@@ -72,23 +74,25 @@ def simulate(
         raise CannotOpen(f"rig '{config.name}' simulates, but has no scene; give scene, or a task (which has one)")
     if config.motion != "settled" and scene.physics == "seed":
         raise CannotOpen(
-            f"rig '{config.name}': physics 'seed' settles every motion, so it can't go by motion '{config.motion}'; "
+            f"rig '{config.name}': physics 'seed' settles every motion, so motion '{config.motion}' is not possible; "
             "use physics 'hybrid', or motion 'settled'"
         )
     frames = _frame_of_arm(config, scene)
     models = parts_of(config.sensors, SimSensorConfig)
     world = SceneWorld(scene, make_world if make is None else make)
     clock = SimClock(world, config.period, config.motion)
-    sensors = {name: _sim_sensor(world, clock, name, sensor, config) for name, sensor in models.items()}
+    sensors = {name: _make_sensor(world, clock, name, sensor, config) for name, sensor in models.items()}
     arms: dict[str, SimArm] = {}
     for name, arm in parts_of(config.arms, SimArmConfig).items():
         limits = arm.limits
         speed = arm.speed if limits is None else min(arm.speed, limits.speed)
         turn_rate = arm.turn_rate if limits is None else min(arm.turn_rate, limits.turn_rate)
-        apart = [(frames[other], distance) for other, distance in config.keep_out_distances(name).items()]
-        longest, turn = speed * config.period, turn_rate * config.period
+        keep_out = [(frames[other], distance) for other, distance in config.keep_out_distances(name).items()]
+        max_shift, max_turn = speed * config.period, turn_rate * config.period
         noise = wrench_noise_source(arm.noise, name)
-        arms[name] = SimArm(world, clock, frames[name], longest, turn, limits, apart, _error(arm), arm.delay, noise)
+        arms[name] = SimArm(
+            world, clock, frames[name], max_shift, max_turn, limits, keep_out, _pose_error(arm), arm.delay, noise
+        )
     task = config.task
     touch_force, placement = (None, 0.0) if task is None else (task.touch_force, task.placement)
     rig = Rig(
@@ -104,17 +108,17 @@ def simulate(
         truth=None if scene.body is None else world.truth,
         diagnostics=clock.diagnostics,
         read_all=map_parallel if parallel else map_serial,
-        on_tactile=_gel_monitor(config, sensors),
+        on_tactile=_make_gel_monitor(config, sensors),
         load_control=load_controller(config.task),
     )
     return Simulation(rig, clock, world, sensors, arms)
 
 
-def _error(arm: SimArmConfig) -> Pose | None:
+def _pose_error(arm: SimArmConfig) -> Pose | None:
     return None if arm.error == Placement() else arm.error.pose
 
 
-def _gel_monitor(config: RigConfig, sensors: Mapping[str, SimSensor]) -> GelMonitor | None:
+def _make_gel_monitor(config: RigConfig, sensors: Mapping[str, SimSensor]) -> GelMonitor | None:
     limits = {name: arm.stop_limits for name, arm in config.arms.items() if arm.stop_limits is not None}
     try:
         return GelMonitor({name: sensor.spec for name, sensor in sensors.items()}, limits, {}) if limits else None
@@ -124,10 +128,10 @@ def _gel_monitor(config: RigConfig, sensors: Mapping[str, SimSensor]) -> GelMoni
 
 def _frame_of_arm(config: RigConfig, scene: Scene) -> dict[str, str]:
     """Which frame of the world each arm moves: the sensor it carries, or the indenter."""
-    there = ", ".join(scene.sensors)
+    known = ", ".join(scene.sensors)
     for name in config.sensors:
         if name not in scene.sensors:
-            raise CannotOpen(f"rig '{config.name}': scene '{scene.name}' has no sensor '{name}'; it has {there}")
+            raise CannotOpen(f"rig '{config.name}': scene '{scene.name}' has no sensor '{name}'; it has {known}")
     frames = {sensor.arm: name for name, sensor in config.sensors.items() if sensor.arm is not None}
     if scene.indenter is not None:
         frames.setdefault("indenter", "indenter")
@@ -143,14 +147,14 @@ def _frame_of_arm(config: RigConfig, scene: Scene) -> dict[str, str]:
     return frames
 
 
-def _sim_sensor(world: World, clock: SimClock, name: str, config: SimSensorConfig, rig: RigConfig) -> SimSensor:
+def _make_sensor(world: World, clock: SimClock, name: str, config: SimSensorConfig, rig: RigConfig) -> SimSensor:
     assert rig.scene is not None
     model = config.model
     spec = SensorSpec(model.image_shape, height=True, flow=model.markers is not None, arm=config.arm)
     sample = partial(surface_map, grid=rig.canonical, markers=model.markers)
-    render, noise = _pictures(model, name, rig.scene)
+    render, noise = _renderer_and_noise(model, name, rig.scene)
     return SimSensor(world, clock, name, spec, render, sample, noise, config.delay)
 
 
-def _pictures(model: SensorModel, name: str, scene: Scene) -> tuple[Renderer, NoiseSource | None]:
+def _renderer_and_noise(model: SensorModel, name: str, scene: Scene) -> tuple[Renderer, NoiseSource | None]:
     return Renderer(model, scene.gel_of(name).size[:2]), noise_source(model, name)

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from robot.common.process import ProcessPool, outside_working_folder, shielded
+from robot.common.process import ProcessPool, blocking_signals, without_working_folder
 from robot.studies.tuning import FINE_STEP_SHARE, MIN_REWARD_FALL, PEAK_PLACE
 from tacsim.config import load_rig
 from tacsim.interface import Action, Observation, Pose, TactileFrame, Truth
@@ -63,7 +63,7 @@ def run_trials(
     """
     context = multiprocessing.get_context("spawn")  # Taichi does not survive a fork
     workers = min(len(wanted), os.cpu_count() or 1)
-    with outside_working_folder(), shielded():  # starts the process that removes its semaphores in the end
+    with without_working_folder(), blocking_signals():  # starts the process that removes its semaphores in the end
         steps: multiprocessing.Queue[tuple[str, str]] = context.Queue()
     with ProcessPool(workers, _start_worker, (steps,)) as pool:
         stop()  # once asked, a signal waits for its answer: it breaks no process off that is being started

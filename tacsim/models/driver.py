@@ -80,7 +80,7 @@ class Companion(Protocol):
         """It follows the arms by itself from now on."""
         ...
 
-    def catch_up(self) -> None:
+    def wait_for_fresh_step(self) -> None:
         """While it runs freely: waits for a whole step that begins from now on."""
         ...
 
@@ -89,7 +89,7 @@ class Companion(Protocol):
     def close(self) -> None: ...
 
     @staticmethod
-    def will_know_truth(config: Any) -> bool:
+    def has_simulated_body(config: Any) -> bool:
         """Whether the companion of a rig (RigConfig) has a simulated body."""
         ...
 

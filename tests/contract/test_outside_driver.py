@@ -105,7 +105,7 @@ def test_an_approach_that_is_too_fast_for_an_outside_sensor_is_refused(site: Pat
     rig = str(write_rig(tmp_path, speed="20 mm/s", depth="0.5 mm"))
     done = python(site, tmp_path, *COMMAND, "run", rig, "--policy", "grip", "--out", "out")
     assert done.returncode == 2, said(done)
-    words = "20 mm/s is too fast: the picture of sensor 'tip' shows a touch 60 ms late, with its gel 1.2 mm deep, and "
+    words = "20 mm/s is too fast: the image of sensor 'tip' shows a touch 60 ms late, with its gel 1.2 mm deep, and "
     assert words + "limits.depth of arm 'hand' is 0.5 mm. At most 8.3 mm/s" in said(done)
     assert not (tmp_path / "out").exists()
 

@@ -82,7 +82,7 @@ def test_the_schema_knows_it() -> None:
         ("stretch:Stretch", "task 'stretch:Stretch' is a .*, not the configuration of a task"),
         ("stretch:Nothing", "task 'stretch:Nothing': 'stretch' has no 'Nothing'"),
         ("nowhere:Task", "task 'nowhere:Task': no module 'nowhere'"),
-        ("tacsim:TaskConfig", "not all of it has a default"),
+        ("tacsim:TaskConfig", "not all its fields have a default"),
     ],
 )
 def test_what_is_no_task_is_refused(name: str, words: str) -> None:

@@ -117,7 +117,7 @@ def test_pictures_alone_are_a_rig_without_arms(tmp_path: Path) -> None:
         (
             "name: r\nclock: replay\nscene: squeeze\narms: {lower: {driver: sim}}\n"
             "sensors: {lower: {driver: sim, arm: lower}}\n",
-            "arms.lower has driver 'sim', which cannot go by clock 'replay'",
+            "arms.lower has driver 'sim', which does not support clock 'replay'",
         ),
         (
             "name: r\nclock: sim\nscene: squeeze\narms: {left: {driver: sim}}\n"

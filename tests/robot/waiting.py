@@ -1,4 +1,4 @@
-"""What tests of things that run beside them share: patience, and whether a process still lives."""
+"""Helpers for tests of other processes: waiting, and a check whether a process runs."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-PATIENCE = 60.0  # for anything that has to happen [s]
+PATIENCE = 60.0  # for an event [s]
 
 
 def until(

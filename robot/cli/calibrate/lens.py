@@ -1,4 +1,4 @@
-"""`tacsim calibrate lens`: a camera's lens, or where the gel lies in its picture, from pictures of a board."""
+"""`tacsim calibrate lens`: a camera's lens, or the position of the gel in its image, from pictures of a board."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from robot.cli.calibrate.session import led, named_camera, picture_keeper
-from robot.cli.options import Out, Overrides, quantities
-from robot.cli.output import busy, new_directory, progress, results, say_files, show_table, writing
+from robot.cli.calibrate.session import guided_session, image_writer, named_camera
+from robot.cli.options import Out, Overrides, quantities_parser
+from robot.cli.output import busy, new_directory, print_files, progress, results, show_table, writing
 
 if TYPE_CHECKING:
     import numpy as np
@@ -38,18 +38,22 @@ def lens(
         Path | None, typer.Option(help="The same picture without the board, where contrast is low.")
     ] = None,
     lens_file: Annotated[
-        Path | None, typer.Option("--lens", help="lens.yaml of the same camera; else distortion is fitted along.")
+        Path | None, typer.Option("--lens", help="lens.yaml of the same camera; without it distortion is fitted, too.")
     ] = None,
     camera: Annotated[
         str | None,
         typer.Option(metavar="RIG/SENSOR", help="Take the pictures now, with this camera of a rig; no arm moves."),
     ] = None,
     views: Annotated[
-        int, typer.Option(min=1, max=PICTURES, help="How many, with --camera; 1: of the board on the gel, its view.")
+        int,
+        typer.Option(
+            min=1, max=PICTURES, help="Number, with --camera; 1: the board lies on the gel, which gives the view."
+        ),
     ] = 12,
     centre: Annotated[str | None, typer.Option(help="u,v of the sensor's axis \\[px]; default: the middle.")] = None,
     size: Annotated[
-        Any, typer.Option(parser=quantities("length", 2), metavar="LENGTH,LENGTH", help="Width, height of the gel.")
+        Any,
+        typer.Option(parser=quantities_parser("length", 2), metavar="LENGTH,LENGTH", help="Width, height of the gel."),
     ] = None,
     set_: Overrides = None,
     out: Out = None,
@@ -60,8 +64,8 @@ def lens(
     picture of a board that lies on the gel gives view.yaml and rectified.png: where each point of the gel is seen, for
     `tacsim calibrate sensor --view`.
 
-    With --camera it leads you through it: view after view, each taken once the board is found and held still. The
-    pictures are kept in frames/ beside the result; Ctrl-C keeps what was taken.
+    With --camera the command guides you: it takes each picture once the board is found and does not move. The pictures
+    are stored in frames/ next to the result; Ctrl-C keeps the pictures taken so far.
 
     Example: tacsim calibrate lens board.png --board "dots:9x7:2.5 mm" --reference empty.png
     """
@@ -77,8 +81,10 @@ def lens(
         raise typer.BadParameter("give either --board or --corners")
     if corners is not None:
         if frames is None:
-            raise typer.BadParameter("corners are read off a picture: give it, or a --board", param_hint="--corners")
-        _view_from_corners(frames, _numbers(corners, 8, "--corners"), size, folder)
+            raise typer.BadParameter(
+                "corners are positions in a picture: give the picture, or a --board", param_hint="--corners"
+            )
+        _view_from_corners(frames, _parse_numbers(corners, 8, "--corners"), size, folder)
         return
     assert board is not None
     described = parse_board(board)
@@ -88,15 +94,15 @@ def lens(
     if frames.is_dir():
         _fit_lens(frames, described, folder)
         return
-    axis = None if centre is None else _numbers(centre, 2, "--centre")
+    axis = None if centre is None else _parse_numbers(centre, 2, "--centre")
     _fit_view(frames, described, reference, known, None if axis is None else (axis[0], axis[1]), size, folder)
 
 
 def _take_views(
     camera: str, overrides: list[str], folder: Path, board: Board, views: int, reference: Path | None
 ) -> Path:
-    """Pictures taken now: the folder that keeps them, or the only one. A signal ends the command; what was taken is
-    kept then, too. Raises CannotCalibrate, DeviceError."""
+    """Takes pictures now; returns their folder, or the path of a single one. A signal ends the command; pictures that
+    were taken stay. Raises CannotCalibrate, DeviceError."""
     from calibration.lens.view import MIN_PICTURES
     from robot.camera.camera import Camera
     from robot.procedures.boards import BoardViewPlan, record_board_views
@@ -116,11 +122,14 @@ def _take_views(
         )
     plan = BoardViewPlan(board, views, on_gel=views == 1, reference=empty)
     frames = folder / "frames"
-    with Camera(config, sensor) as source, led("views", views, frames, f"pictures kept in {frames}") as session:
-        session.store = picture_keeper(frames)
+    with (
+        Camera(config, sensor) as source,
+        guided_session("views", views, frames, f"pictures stored in {frames}") as session,
+    ):
+        session.store = image_writer(frames)
         record_board_views(source, plan, session)
     if len(session.measurements) < views:
-        raise CannotCalibrate(f"the source was over after {len(session.measurements)} of {views} views")
+        raise CannotCalibrate(f"the source ended after {len(session.measurements)} of {views} views")
     return frames / session.measurements[0][0] if plan.on_gel else frames
 
 
@@ -137,7 +146,7 @@ def _fit_lens(pictures: Path, board: Board, folder: Path) -> None:
     missing: list[str] = []
     sizes: dict[tuple[int, ...], str] = {}
     with progress() as bar:
-        for path in bar.track(paths, description="looking for the board"):
+        for path in bar.track(paths, description="searching for the board"):
             image = _read_picture(path)
             sizes.setdefault(image.shape[:2], path.name)
             try:
@@ -145,8 +154,8 @@ def _fit_lens(pictures: Path, board: Board, folder: Path) -> None:
             except BadBoard as error:
                 missing.append(f"{path.name}: {error}")
     if len(sizes) > 1:
-        told = ", ".join(f"{name} is {shape[1]} x {shape[0]} px" for shape, name in sizes.items())
-        raise BadView(f"the pictures differ in size ({told}); take all at one setting of the camera")
+        described_sizes = ", ".join(f"{name} is {shape[1]} x {shape[0]} px" for shape, name in sizes.items())
+        raise BadView(f"the pictures differ in size ({described_sizes}); take all at one setting of the camera")
     if not found:
         raise BadBoard("\n".join(missing[:5]))
     rows, columns = next(iter(sizes))
@@ -160,7 +169,7 @@ def _fit_lens(pictures: Path, board: Board, folder: Path) -> None:
         f"{lens_.centre[1]:.1f} px; residual {lens_.residual:.2f} px"
     )
     with writing(folder):
-        say_files(_write(folder / "lens.yaml", lens_))
+        print_files(_write_yaml(folder / "lens.yaml", lens_))
 
 
 def _fit_view(
@@ -176,7 +185,7 @@ def _fit_view(
     from calibration.lens.view import fit_view
 
     image = _read_picture(picture)
-    with busy("looking for the board"):
+    with busy("searching for the board"):
         points = find_board(image, board, None if reference is None else _read_picture(reference))
         view = fit_view(points, image.shape[:2], known, centre, size, str(board))
     _report_view(view, image, folder)
@@ -207,7 +216,7 @@ def _report_view(view: GelView, image: NDArray[np.uint8], folder: Path) -> None:
     )
     with writing(folder):
         (folder / "rectified.png").write_bytes(encode_png(np.rint(metric_rectification(view)(image)).astype(np.uint8)))
-        say_files(_write(folder / "view.yaml", view), folder / "rectified.png")
+        print_files(_write_yaml(folder / "view.yaml", view), folder / "rectified.png")
 
 
 def _read_picture(path: Path) -> NDArray[np.uint8]:
@@ -222,7 +231,7 @@ def _read_picture(path: Path) -> NDArray[np.uint8]:
         raise CalibrationError(str(error)) from None
 
 
-def _write(path: Path, config: Lens | GelView) -> Path:
+def _write_yaml(path: Path, config: Lens | GelView) -> Path:
     import yaml
 
     text = yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False, default_flow_style=None, width=120)
@@ -230,11 +239,11 @@ def _write(path: Path, config: Lens | GelView) -> Path:
     return path
 
 
-def _numbers(text: str, count: int, option: str) -> list[float]:
+def _parse_numbers(text: str, count: int, option: str) -> list[float]:
     try:
         values = [float(part) for part in text.replace(" ", ",").split(",") if part]
     except ValueError:
         values = []
     if len(values) != count:
-        raise typer.BadParameter(f"'{text}'; {count} numbers are needed, with commas between", param_hint=option)
+        raise typer.BadParameter(f"'{text}'; {count} numbers are needed, separated by commas", param_hint=option)
     return values

@@ -1,4 +1,4 @@
-"""From presses of a ball to the fit of a sensor's light, its bundle and the page of its verdict."""
+"""Fit of a sensor's light from presses of a ball, its bundle, and the page of its verdict."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from robot.cli.errors import UNTRUSTED, UNVERIFIED
-from robot.cli.output import busy, notes, results, say_files, show_table, warn, writing
+from robot.cli.errors import EXIT_UNTRUSTED, EXIT_UNVERIFIED
+from robot.cli.output import busy, notes, print_files, results, show_table, warn, writing
 
 if TYPE_CHECKING:
     from calibration.frame_set import FrameSet
@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from tacsim.models.geometry import PictureRegion
     from tacsim.models.sensor import CameraNoise, Markers
 
-UNKNOWN = "unknown"  # serial number of a sensor that nobody named
-FRAMES = "frames"  # folder in a bundle of the pictures that a camera took for it
+UNKNOWN = "unknown"  # serial number of a sensor without a given name
+FRAMES = "frames"  # folder in a bundle with its camera images
 
 
 def read_presses(frames: Path, reference: Path | None) -> FrameSet:
@@ -29,12 +29,12 @@ def read_presses(frames: Path, reference: Path | None) -> FrameSet:
         from calibration.frame_set import read_folder
     read = read_folder(frames, reference, max_presses)
     if read.estimated:
-        notes.print("no picture without contact: the median of all presses stands for it")
+        notes.print("no picture without contact: the median of all presses is used")
     return read
 
 
-def straighten(read: FrameSet, region: PictureRegion | None, view: GelView | None) -> FrameSet:
-    """Native pictures as they are calibrated: even beyond the region, and metric."""
+def rectify_frames(read: FrameSet, region: PictureRegion | None, view: GelView | None) -> FrameSet:
+    """Prepares native images for calibration: uniform outside the region, and metric."""
     from calibration.frame_set import rectified_by_view, restrict_to_region
 
     if region is not None:
@@ -43,7 +43,7 @@ def straighten(read: FrameSet, region: PictureRegion | None, view: GelView | Non
 
 
 def fit_light(read: FrameSet, ball: float, dot: float | None) -> LightFit:
-    """`ball`, `dot`: radii [px]. Exits with UNTRUSTED where the light tells nothing."""
+    """`ball`, `dot`: radii [px]. Exits with EXIT_UNTRUSTED if slopes do not change the light."""
     with busy("loading"):
         from calibration.light.calibrator import NoDirection, calibrate_light
         from calibration.markers.dots import DotEraser
@@ -59,11 +59,11 @@ def fit_light(read: FrameSet, ball: float, dot: float | None) -> LightFit:
         grey = f"; {GREY}: give the camera's own, in colour" if is_grey(read.reference) else ""
         notes.print(f"{why}{grey}")
         results.print("verdict: do not trust; no bundle is written")
-        raise typer.Exit(UNTRUSTED) from None
+        raise typer.Exit(EXIT_UNTRUSTED) from None
 
 
 def find_lattice(read: FrameSet, pitch: float) -> Markers:
-    """The lattice of dots in the picture without contact."""
+    """The lattice of dots in the reference image."""
     from calibration.markers.flow import find_markers
     from calibration.markers.lattice import NoLattice
     from tacsim.models.sensor import Markers
@@ -91,21 +91,23 @@ def write_calibration(
     view: GelView | None,
     region: PictureRegion | None,
 ) -> None:
-    """Shows the calibration, writes its bundle and the page of its verdict; exits with UNTRUSTED or UNVERIFIED where it
-    must."""
+    """Prints the calibration, writes its bundle and the page of its verdict. Exits with EXIT_UNTRUSTED or
+    EXIT_UNVERIFIED according to the verdict."""
     from calibration.bundle import write_bundle
     from calibration.light.checks import page
     from calibration.light.checks.page import draw_residuals
     from calibration.light.checks.verdict import evaluate_calibration
     from calibration.light.noise import measure_skin
 
-    verdict = evaluate_calibration(fit, scale, dots=found is None and _shows_dots(fit))
-    _show(fit, scale.pixel_pitch, found)
+    verdict = evaluate_calibration(fit, scale, dots=found is None and _has_dots(fit))
+    _print_fit(fit, scale.pixel_pitch, found)
     if profile.directed is not None and profile.directed == (fit.darkness is not None):
-        told = "tells direction" if profile.directed else "tells none"
-        warn(f"the light of a {profile.title} {told}, that of these pictures does not do so: is --kind right?")
-    noise = _noise(read, fit)
-    # of pictures with dots it is not asked: dots that were painted over leave other grain behind
+        claim = "depends" if profile.directed else "does not depend"
+        warn(
+            f"the light of a {profile.title} {claim} on the slopes' direction, unlike these pictures: is --kind right?"
+        )
+    noise = _measure_noise(read, fit)
+    # not measured with dots: erased dots leave another grain
     skin = measure_skin(fit.presses, fit.reference, scale.pixel_pitch) if found is None else None
     bundle = fit.to_calibration(
         serial, scale.ball_radius, scale.pixel_pitch, view=view, markers=found, noise=noise, skin=skin
@@ -115,7 +117,7 @@ def write_calibration(
     bundle = bundle.model_copy(update={"provenance": provenance, "region": region})
     facts = [f"{profile.title}: {profile.source}; {profile.light}"]
     if found is not None:
-        facts.append(_lattice(found))
+        facts.append(_describe_lattice(found))
     if noise is not None:
         facts.append(f"camera's noise {', '.join(f'{value:.2f}' for value in noise.deviation)} grey levels (R, G, B)")
     if skin is not None:
@@ -134,21 +136,21 @@ def write_calibration(
         todo = f" Next: {finding.todo}" if finding.todo else ""
         notes.print(f"{finding.word}: {finding.what}.{todo}")
     results.print(f"verdict: {verdict.word}")
-    say_files(*written)
+    print_files(*written)
     if verdict.word == "do not trust":
-        raise typer.Exit(UNTRUSTED)
+        raise typer.Exit(EXIT_UNTRUSTED)
     if verdict.word == "unverified scale":
-        raise typer.Exit(UNVERIFIED)
+        raise typer.Exit(EXIT_UNVERIFIED)
 
 
 def _title(serial: str, folder: Path, profile: SensorProfile) -> str:
-    """Of a page: the sensor's name, and what it is where that is known."""
+    """Title of the page: the sensor's name, and its kind if known."""
     name = folder.name if serial == UNKNOWN else serial
     return name if profile.directed is None else f"{name}, {profile.title}"
 
 
-def _noise(read: FrameSet, fit: LightFit) -> CameraNoise | None:
-    """The camera's noise, measured and printed: of more pictures without contact, or else beside the contacts."""
+def _measure_noise(read: FrameSet, fit: LightFit) -> CameraNoise | None:
+    """Measures and prints the camera's noise: from more reference images, or else around the contacts."""
     from calibration.light.noise import NoiseUnknown, measure_noise, measure_press_noise
 
     still = len(read.untouched_images)
@@ -159,14 +161,14 @@ def _noise(read: FrameSet, fit: LightFit) -> CameraNoise | None:
         return None
     spread = ", ".join(f"{value:.2f}" for value in noise.deviation)
     notes.print(
-        f"camera's noise, from {f'{still} pictures without contact' if still > 1 else 'beside the contacts'}: R, G, B "
+        f"camera's noise, from {f'{still} pictures without contact' if still > 1 else 'around the contacts'}: R, G, B "
         f"{spread} grey levels; "
         f"correlation of neighbours {noise.neighbours[0]:.2f} along x, {noise.neighbours[1]:.2f} along y"
     )
     return noise
 
 
-def _shows_dots(fit: LightFit) -> bool:
+def _has_dots(fit: LightFit) -> bool:
     from calibration.markers.flow import require_no_markers
     from calibration.reference import UnusableReference
 
@@ -177,7 +179,7 @@ def _shows_dots(fit: LightFit) -> bool:
     return False
 
 
-def _show(fit: LightFit, pitch: float, found: Markers | None) -> None:
+def _print_fit(fit: LightFit, pitch: float, found: Markers | None) -> None:
     if fit.predictions:
         rows = (
             (
@@ -190,28 +192,29 @@ def _show(fit: LightFit, pitch: float, found: Markers | None) -> None:
         show_table("Each press predicted by all the others", columns, rows, left={0})
     if fit.darkness is not None:
         results.print(
-            f"this light tells no direction: darkness tells depth, up to {fit.darkness.depths[-1] * pitch * 1e3:.2f} "
-            f"mm beyond {fit.darkness.share:.0%} of the mean depth round it"
+            "this light does not depend on the direction of slopes: darkness gives depth, up to "
+            f"{fit.darkness.depths[-1] * pitch * 1e3:.2f} mm beyond {fit.darkness.share:.0%} of the mean "
+            "depth around it"
         )
     elif fit.size is not None and fit.forward is not None:
         results.print(
-            f"model: degree {fit.size.degree} in the normal, {fit.size.position} in the place; calibrated up to a "
+            f"model: degree {fit.size.degree} in the normal, {fit.size.position} in the position; calibrated up to a "
             f"slope of {fit.forward.steepest:.2f}"
         )
     if fit.predictions:
         results.print(
             f"contact radii ± {fit.radius_uncertainty:.1%}; gel {fit.thickness * pitch * 1e3:.1f} mm thick by the "
-            "slopes round the contacts"
+            "slopes around the contacts"
         )
     if fit.stretch is not None:
         results.print(f"ratio of the axes of contacts: {fit.stretch}")
     for name, why in fit.left_out:
         notes.print(f"left out: {name}: {why}")
     if found is not None:
-        notes.print(_lattice(found))
+        notes.print(_describe_lattice(found))
 
 
-def _lattice(found: Markers) -> str:
+def _describe_lattice(found: Markers) -> str:
     return (
         f"markers: {found.rows} x {found.columns}, {found.pitch * 1e3:.3g} mm apart, radius {found.radius * 1e3:.2g} mm"
     )

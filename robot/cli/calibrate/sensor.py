@@ -1,4 +1,4 @@
-"""`tacsim calibrate`: from frames to the calibration of a sensor."""
+"""`tacsim calibrate`: the calibration of a sensor from frames."""
 
 from __future__ import annotations
 
@@ -17,11 +17,19 @@ from robot.cli.calibrate.light import (
     find_lattice,
     fit_light,
     read_presses,
-    straighten,
+    rectify_frames,
     write_calibration,
 )
-from robot.cli.calibrate.session import confirm_free_gel, led, named_camera, picture_keeper
-from robot.cli.options import OptionGroup, Out, Overrides, grouped, length, quantities, quantity
+from robot.cli.calibrate.session import confirm_free_gel, guided_session, image_writer, named_camera
+from robot.cli.options import (
+    OptionGroup,
+    Out,
+    Overrides,
+    length_option,
+    quantities_parser,
+    quantity_parser,
+    with_option_groups,
+)
 from robot.cli.output import new_directory, notes, warn
 
 if TYPE_CHECKING:
@@ -31,33 +39,33 @@ if TYPE_CHECKING:
     from tacsim.models.geometry import PictureRegion
     from tacsim.models.hardware import CameraSensorConfig
 
-calibrate = typer.Typer(no_args_is_help=True, help="Calibrate what stands behind a rig.")
+calibrate = typer.Typer(no_args_is_help=True, help="Calibrate sensors, cameras and arms of a rig.")
 
 
 @calibrate.callback()
 def _group() -> None:
-    """Calibrate what stands behind a rig."""
+    """Calibrate sensors, cameras and arms of a rig."""
 
 
 class Description(OptionGroup):
     """Options that describe ball, pictures and gel."""
 
-    ball_diameter: Annotated[Any, length('Of the ball, as a calliper shows it, for example "5.84 mm".', 1e-4, 0.1)] = (
-        None
-    )
-    ball_radius: Annotated[Any, length("Half of that, in its place.", 5e-5, 0.05)] = None
+    ball_diameter: Annotated[
+        Any, length_option('Of the ball, measured with a calliper, for example "5.84 mm".', 1e-4, 0.1)
+    ] = None
+    ball_radius: Annotated[Any, length_option("Half of the diameter, instead of it.", 5e-5, 0.05)] = None
     kind: Annotated[
         str | None,
         typer.Option(
             "--kind",
             metavar="KIND",
-            help="mini, mini-markers, r1.5, digit, 9dtact or other: what is known of it beforehand, such as which part "
-            "of the picture shows the gel, a first pixel pitch, dots.",
+            help="mini, mini-markers, r1.5, digit, 9dtact or other: gives published properties, such as the part "
+            "of the picture that shows the gel, an approximate pixel pitch, dots.",
         ),
     ] = None
     pixel_pitch: Annotated[
         Any,
-        length("Distance of two pixels on the gel; or give --view, or --kind.", 1e-7, 1e-2),
+        length_option("Distance of two pixels on the gel; or give --view, or --kind.", 1e-7, 1e-2),
     ] = None
     view: Annotated[
         Path | None,
@@ -66,39 +74,39 @@ class Description(OptionGroup):
     size: Annotated[
         Any,
         typer.Option(
-            parser=quantities("length", 2),
+            parser=quantities_parser("length", 2),
             metavar="LENGTH,LENGTH",
-            help="Width, height of the gel that the picture shows, by a ruler: they check the pitch.",
+            help="Width, height of the gel in the picture, measured with a ruler: they check the pitch.",
         ),
     ] = None
     region: Annotated[
         str | None,
         typer.Option(
             metavar="U,V U,V U,V ...",
-            help="Corners of the polygon of the picture that shows gel \\[px]; beyond it nothing counts.",
+            help="Corners of the polygon in the picture that shows the gel \\[px]; pixels outside are ignored.",
         ),
     ] = None
     serial: Annotated[
-        str, typer.Option(help="Serial number or name of the sensor; without --out, its folder is sensors/ and this.")
+        str, typer.Option(help="Serial number or name of the sensor; without --out, its folder is sensors/SERIAL.")
     ] = UNKNOWN
     known_depth: Annotated[
         list[str] | None,
         typer.Option(
             "--depth",
             metavar="FRAME=LENGTH",
-            help="A press of known depth, which checks pitch and ball; may be repeated.",
+            help="A press of known depth, which checks pixel pitch and ball; may be repeated.",
         ),
     ] = None
     markers: Annotated[bool, typer.Option("--markers", help="Dots are printed on the gel.")] = False
     marker_pitch: Annotated[
-        Any, length("How far printed dots are apart, by a ruler: it checks the pixel pitch.", 1e-4, 1e-2)
+        Any, length_option("Distance of printed dots, measured with a ruler: it checks the pixel pitch.", 1e-4, 1e-2)
     ] = None
 
 
 @calibrate.command(
     epilog='Example: [bold]tacsim calibrate sensor frames --ball-diameter "5.84 mm" --pixel-pitch "0.0593 mm"[/]'
 )
-@grouped
+@with_option_groups
 def sensor(
     frames: Annotated[
         Path | None, typer.Argument(help="Folder of pictures of a ball's presses, 5 to 8 or more; or give --camera.")
@@ -109,69 +117,76 @@ def sensor(
         str | None,
         typer.Option(
             metavar="RIG/SENSOR",
-            help="Press now, before this camera of a rig, or one at /dev/... or http://...; no arm is connected.",
+            help="Press now, in front of this camera of a rig, or one at /dev/... or http://...; no arm is connected.",
         ),
     ] = None,
-    presses: Annotated[int, typer.Option(min=1, max=100, help="How many; with --camera.")] = 8,
+    presses: Annotated[int, typer.Option(min=1, max=100, help="Number, with --camera.")] = 8,
     reference: Annotated[
         Path | None,
         typer.Option(
-            help="The picture without contact; the camera's noise is told by more of them, background_1.png and so on "
-            "beside it.",
+            help="The picture without contact; more of them (background_1.png and so on, next to it) give the camera's "
+            "noise.",
             show_default="background.png or the like in FRAMES",
         ),
     ] = None,
     set_: Overrides = None,
     out: Out = None,
 ) -> None:
-    """Calibrate a sensor's light from presses of a ball: colour of every slope, and slope of every colour.
+    """Calibrate a sensor's light from presses of a ball: colour as a function of slope, and slope of colour.
 
-    Contact circles are found by themselves. Writes calibration.yaml, reference.png and residuals.png, prints how well
-    each press is predicted by the others, and ends in a verdict, verdict.html: good, usable, unverified scale (exit
-    code 4: nothing checks ball and pixel pitch) or do not trust (exit code 3), with reasons and what to do next.
+    Contact circles are found automatically. Writes calibration.yaml, reference.png and residuals.png, prints the error
+    of each press predicted from the others, and a verdict (verdict.html): good, usable, unverified scale (exit code 4:
+    nothing checks ball and pixel pitch) or do not trust (exit code 3), with reasons and the next steps.
 
-    With --camera it leads you through it: the gel without contact, then press after press, each judged at once. The
-    pictures are kept in frames/ beside the bundle, to calibrate from them again; Ctrl-C keeps what was taken.
+    With --camera the command guides you: first the gel without contact, then press after press, each checked at once.
+    The pictures are stored in frames/ next to the bundle, to calibrate from them again; Ctrl-C keeps them.
     """
     if (frames is None) == (camera is None):
         raise typer.BadParameter("give either a folder of frames, or --camera to press now")
     if camera is None and set_:
-        raise typer.BadParameter("it changes a camera's rig; a folder has none", param_hint="--set")
+        raise typer.BadParameter("it changes the rig of a camera; a folder has no rig", param_hint="--set")
     if camera is not None and reference is not None:
         raise typer.BadParameter("with --camera it is taken first, of the free gel", param_hint="--reference")
-    asked = _asked(described, out)
-    _calibrate(asked, frames, reference, camera, set_ or [], presses)
+    options = _check_options(described, out)
+    _calibrate(options, frames, reference, camera, set_ or [], presses)
 
 
 def _calibrate(
-    asked: _Asked, frames: Path | None, reference: Path | None, camera: str | None, overrides: list[str], presses: int
+    options: _SensorOptions,
+    frames: Path | None,
+    reference: Path | None,
+    camera: str | None,
+    overrides: list[str],
+    presses: int,
 ) -> None:
-    """From the pictures of a folder, or of so many presses before a camera, to the bundle and its verdict."""
+    """Calibrates from the images of a folder, or from `presses` in front of a camera; writes bundle and verdict."""
     if camera is not None:
-        config, name = named_camera(camera, overrides, asked.profile.native)
-        seen, pitch = _calibrated(asked, (config.height, config.width))
-        read = _take_presses(camera, config, name, asked, presses, seen, pitch)
+        config, name = named_camera(camera, overrides, options.profile.native)
+        seen, pitch = _calibrated_view(options, (config.height, config.width))
+        read = _take_presses(camera, config, name, options, presses, seen, pitch)
     else:
         assert frames is not None
         read = read_presses(frames, reference)
-        _require_frames(asked.depths, [frame.name for frame in read.frames])
-        seen, pitch = _calibrated(asked, read.shape)
-    read = straighten(read, asked.region, seen)
-    found = find_lattice(read, pitch) if asked.markers else None
-    fit = fit_light(read, asked.ball / pitch, None if found is None else found.radius / pitch)
+        _require_frames(options.depths, [frame.name for frame in read.frames])
+        seen, pitch = _calibrated_view(options, read.shape)
+    read = rectify_frames(read, options.region, seen)
+    found = find_lattice(read, pitch) if options.markers else None
+    fit = fit_light(read, options.ball / pitch, None if found is None else found.radius / pitch)
     from calibration.light.checks.verdict import KnownScale
 
-    published = asked.pitch is None and asked.view is None and asked.size is None
-    dots = None if found is None or asked.marker_pitch is None else (found.pitch, asked.marker_pitch)
-    scale = KnownScale(pitch, asked.ball, asked.gel_size, asked.profile.gel_thickness, asked.depths, published, dots)
+    published = options.pitch is None and options.view is None and options.size is None
+    dots = None if found is None or options.marker_pitch is None else (found.pitch, options.marker_pitch)
+    scale = KnownScale(
+        pitch, options.ball, options.gel_size, options.profile.gel_thickness, options.depths, published, dots
+    )
     write_calibration(
-        asked.folder, fit, read, asked.serial, scale, found, asked.profile, view=seen, region=asked.region
+        options.folder, fit, read, options.serial, scale, found, options.profile, view=seen, region=options.region
     )
 
 
 @dataclass(frozen=True, slots=True)
-class _Asked:
-    """What the command line says of sensor and ball."""
+class _SensorOptions:
+    """The checked options about sensor and ball."""
 
     ball: float  # its radius [m]
     profile: SensorProfile
@@ -187,13 +202,13 @@ class _Asked:
 
     @property
     def gel_size(self) -> tuple[float, float] | None:
-        """What is known of the gel that the picture shows: as told, of its kind, or of the view that was measured."""
-        measured = self.view is not None and self.view.board != "four corners"  # else the size is all that is known
+        """Size of the gel in the image: as given, of its kind, or of a measured view; None if unknown."""
+        measured = self.view is not None and self.view.board != "four corners"  # otherwise only the size is known
         return self.size or self.profile.gel_size or (self.view.size if self.view and measured else None)
 
 
-def _asked(given: Description, out: Path | None) -> _Asked:
-    """Checked, before anything slow is loaded; the folder is made."""
+def _check_options(given: Description, out: Path | None) -> _SensorOptions:
+    """Checks the options before slow imports; the results' folder is checked, too."""
     from calibration.bundle import SERIAL
     from calibration.profiles import PROFILES
 
@@ -208,7 +223,7 @@ def _asked(given: Description, out: Path | None) -> _Asked:
     if given.pixel_pitch is None and given.view is None and profile.gel_size is None:
         raise typer.BadParameter("give --pixel-pitch or --view, or --kind with a pitch that is known beforehand")
     if given.marker_pitch is not None and not (given.markers or profile.markers):
-        what = "it says how far printed dots are apart: give --markers, too"
+        what = "it is the distance of printed dots: give --markers, too"
         raise typer.BadParameter(what, param_hint="--marker-pitch")
     if given.size is not None and min(given.size) <= 0:
         raise typer.BadParameter("both lengths must be above 0", param_hint="--size")
@@ -223,14 +238,14 @@ def _asked(given: Description, out: Path | None) -> _Asked:
     from calibration.lens.view import GelView
     from tacsim.config import load_model
 
-    return _Asked(
+    return _SensorOptions(
         ball=(given.ball_radius or 0.0) + (given.ball_diameter or 0.0) / 2,  # one of them is None
         profile=profile,
         pitch=given.pixel_pitch,
         view=None if given.view is None else load_model(GelView, given.view),
         size=given.size,
-        region=None if given.region is None else _region(given.region),
-        depths=tuple(_known_depth(text) for text in given.known_depth or ()),
+        region=None if given.region is None else _parse_region(given.region),
+        depths=tuple(_parse_known_depth(text) for text in given.known_depth or ()),
         markers=given.markers or profile.markers,
         marker_pitch=given.marker_pitch,
         serial=serial,
@@ -238,7 +253,7 @@ def _asked(given: Description, out: Path | None) -> _Asked:
     )
 
 
-def _region(text: str) -> PictureRegion:
+def _parse_region(text: str) -> PictureRegion:
     try:
         points = [tuple(float(number) for number in point.split(",")) for point in text.split()]
     except ValueError:
@@ -251,63 +266,62 @@ def _region(text: str) -> PictureRegion:
     return tuple((u, v) for u, v in points)
 
 
-def _known_depth(text: str) -> tuple[str, float]:
+def _parse_known_depth(text: str) -> tuple[str, float]:
     name, equals, depth = text.rpartition("=")
     if not equals:
         raise typer.BadParameter(f"'{text}'; give FRAME=LENGTH, such as 'press_3.png=0.5 mm'", param_hint="--depth")
-    value = quantity("length", 1e-6, 1e-2)(depth)
+    value = quantity_parser("length", 1e-6, 1e-2)(depth)
     return name, value
 
 
 def _require_frames(depths: tuple[tuple[str, float], ...], names: list[str]) -> None:
-    """Raises BadParameter for the depth of a press that is not there: it would check nothing."""
+    """Raises BadParameter for the depth of a press that does not exist."""
     for name, _ in depths:
         if name not in names:
             raise typer.BadParameter(f"no frame '{name}'; there are {', '.join(names)}", param_hint="--depth")
 
 
-def _calibrated(asked: _Asked, shape: tuple[int, int]) -> tuple[GelView | None, float]:
-    """The view and the pixel pitch [m] of the pictures that are calibrated, from native ones of `shape` (rows,
-    columns)."""
+def _calibrated_view(options: _SensorOptions, shape: tuple[int, int]) -> tuple[GelView | None, float]:
+    """The view and the pixel pitch [m] of the calibrated images, for native images of `shape` (rows, columns)."""
     from calibration.lens.view import calibrated_view
 
-    seen, pitch = _geometry(asked, shape)
+    seen, pitch = _pixel_geometry(options, shape)
     view, coarse = calibrated_view(seen, pitch, shape)
     if coarse != pitch:
         notes.print(f"calibrated at {coarse * 1e3:.3g} mm a pixel: the pictures have {pitch * 1e3:.3g} mm")
     return view, coarse
 
 
-def _geometry(asked: _Asked, shape: tuple[int, int]) -> tuple[GelView | None, float]:
-    """The view that was given, or that of the region, or the profile's crop of its sensor's native pictures of `shape`
-    (rows, columns); and the distance of two pixels on the gel [m]. That of the profile is said to be a first one."""
+def _pixel_geometry(options: _SensorOptions, shape: tuple[int, int]) -> tuple[GelView | None, float]:
+    """The given view, or that of the region, or of the profile's crop of native images of `shape` (rows, columns); and
+    the distance of two pixels on the gel [m]. Warns if the distance is the published one of the profile."""
     from calibration.lens.view import view_of_corners
 
-    if asked.view is not None:
-        return asked.view, asked.view.pixel_pitch
-    corners = asked.profile.corners(shape) if asked.pitch is None else None
-    if asked.region is not None:
-        corners = _box(asked.region, shape)
-    size, columns = asked.profile.gel_size, shape[1]
+    if options.view is not None:
+        return options.view, options.view.pixel_pitch
+    corners = options.profile.corners(shape) if options.pitch is None else None
+    if options.region is not None:
+        corners = _bounding_corners(options.region, shape)
+    size, columns = options.profile.gel_size, shape[1]
     if corners is not None:
         wide, high = corners[2][0] - corners[0][0], corners[2][1] - corners[0][1]
-        size = (wide * asked.pitch, high * asked.pitch) if asked.pitch is not None else size
-    if asked.pitch is None:
+        size = (wide * options.pitch, high * options.pitch) if options.pitch is not None else size
+    if options.pitch is None:
         assert size is not None
         view = None if corners is None else view_of_corners(corners, size, shape)
         found = size[0] / columns if view is None else view.pixel_pitch
-        profile = asked.profile
+        profile = options.profile
         warn(f"{found * 1e3:.4g} mm a pixel, as published of a {profile.title} ({profile.source}); measure yours")
         return view, found
     if corners is None:
-        return None, asked.pitch
+        return None, options.pitch
     assert size is not None
     view = view_of_corners(corners, size, shape)
     return view, view.pixel_pitch
 
 
-def _box(region: PictureRegion, shape: tuple[int, int]) -> Corners:
-    """Corners of the pixels round a polygon, in a picture of `shape` (rows, columns)."""
+def _bounding_corners(region: PictureRegion, shape: tuple[int, int]) -> Corners:
+    """Corners of the bounding box of a polygon, in an image of `shape` (rows, columns)."""
     u, v = zip(*region, strict=True)
     left, right = max(min(u), 0.0) - 0.5, min(max(u), shape[1] - 1.0) + 0.5
     top, bottom = max(min(v), 0.0) - 0.5, min(max(v), shape[0] - 1.0) + 0.5
@@ -318,14 +332,14 @@ def _take_presses(
     camera: str,
     config: CameraSensorConfig,
     sensor: str,
-    asked: _Asked,
+    options: _SensorOptions,
     presses: int,
     view: GelView | None,
     pitch: float,
 ) -> FrameSet:
-    """Frames taken now, native, and kept in frames/ of the folder. camera: its name.
+    """Takes native frames now, and stores them in frames/ of the folder. camera: its name.
 
-    A signal ends the command; what was taken is kept then, too. Raises CannotCalibrate, BadFrames, DeviceError.
+    A signal ends the command; frames that were taken stay. Raises CannotCalibrate, BadFrames, DeviceError.
     """
     from calibration.errors import BadFrames
     from calibration.frame_set import Frame, FrameSet, metric_image_map, require_view_size
@@ -335,17 +349,17 @@ def _take_presses(
     if view is not None:
         require_view_size((config.height, config.width), view)
     rectify = None if view is None else metric_image_map(view)
-    plan = BallPressPlan(asked.ball / pitch, presses, rectify=rectify, markers=asked.markers)
-    frames = asked.folder / FRAMES
-    again = f"tacsim calibrate sensor {shlex.quote(str(frames))} --serial {shlex.quote(asked.serial)} ..."
+    plan = BallPressPlan(options.ball / pitch, presses, rectify=rectify, markers=options.markers)
+    frames = options.folder / FRAMES
+    again = f"tacsim calibrate sensor {shlex.quote(str(frames))} --serial {shlex.quote(options.serial)} ..."
     with Camera(config, sensor) as source:
         confirm_free_gel()
-        note = f"frames kept in {frames}; to calibrate from them again: {again}"
-        with led("presses", presses, frames, note) as session:
-            session.store = picture_keeper(frames)
+        note = f"frames stored in {frames}; to calibrate from them again: {again}"
+        with guided_session("presses", presses, frames, note) as session:
+            session.store = image_writer(frames)
             untouched = record_presses(source, plan, session)
     if not untouched or not session.measurements:
-        raise BadFrames("the source was over before a press was taken")
+        raise BadFrames("the source ended before a press was taken")
     taken = tuple(Frame(name, image) for name, image in session.measurements)
     more = tuple(Frame(f"background_{k}.png", image) for k, image in enumerate(untouched[:-1], start=1))
     return FrameSet(camera, untouched[-1], "background.png", taken, more)

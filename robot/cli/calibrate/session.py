@@ -1,4 +1,4 @@
-"""A procedure at the terminal: what a person is told and asked, where pictures and records are kept, how it ends."""
+"""A calibration procedure at the terminal: messages, questions, stored images and records, and its end."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from robot.cli.errors import complain
+from robot.cli.errors import print_error
 from robot.cli.output import notes, progress, writing
-from robot.cli.terminal import Interrupt, ask, has_person, has_real_arm
+from robot.cli.terminal import Interrupt, ask_operator, has_operator, has_real_arm
 
 if TYPE_CHECKING:
     import numpy as np
@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 
 
 @contextmanager
-def led(what: str, total: int, kept: Path, note: str) -> Iterator[Session[Any]]:
-    """A session whose words and progress go to stderr. At the end, a failure included, `note` says where what was
-    taken lies, if it was `kept`. A signal ends the command: its exit is raised at the end of the block."""
+def guided_session(what: str, total: int, stored: Path, note: str) -> Iterator[Session[Any]]:
+    """A session whose messages and progress go to stderr. At the end, also after an error, `note` is printed if the
+    path `stored` exists. A signal ends the command: its exit is raised at the end of the block."""
     from robot.procedures.session import Session
 
     with Interrupt() as interrupt, progress() as bar:
@@ -38,33 +38,34 @@ def led(what: str, total: int, kept: Path, note: str) -> Iterator[Session[Any]]:
         try:
             yield session
         finally:
-            if kept.exists():
+            if stored.exists():
                 notes.print(note)
     if interrupt():
-        complain(f"stopped by a signal; {len(session.measurements)} {what} are kept, nothing is calibrated")
+        print_error(f"stopped by a signal; {len(session.measurements)} {what} are kept, nothing is calibrated")
         raise typer.Exit(interrupt.exit_code)
 
 
 def confirm_motion(config: RigConfig, question: str) -> None:
-    """Asks a person, where an arm is no mock. Raises CannotOpen."""
+    """Asks the operator if an arm is not a mock. Raises CannotOpen without a confirmation."""
     from robot.open import CannotOpen
 
-    if has_real_arm(config) and not ask(f"Rig '{config.name}': {question}"):
-        raise CannotOpen("nobody confirmed (at a terminal); nothing was moved")
+    if has_real_arm(config) and not ask_operator(f"Rig '{config.name}': {question}"):
+        raise CannotOpen("the operator did not confirm (at a terminal); nothing was moved")
 
 
 def confirm_free_gel() -> None:
-    """Without a terminal nobody is asked: the gel counts as free once its picture rests."""
-    if has_person():
-        while not ask("Is nothing touching the gel?", default=True):
+    """Asks until the operator confirms that the gel is free. Without a terminal, the gel counts as free once its image
+    does not change."""
+    if has_operator():
+        while not ask_operator("Is nothing touching the gel?", default=True):
             notes.print("Take everything off the gel first.")
 
 
 def named_camera(
     camera: str, overrides: list[str], size: tuple[int, int] = (640, 480)
 ) -> tuple[CameraSensorConfig, str]:
-    """The sensor RIG/SENSOR, or the camera at a device or address, whose pictures are of `size` (width, height [px]);
-    and its name. Raises CannotCalibrate where nobody can be before its camera."""
+    """The sensor RIG/SENSOR, or the camera at a device or address with images of `size` (width, height [px]); and its
+    name. Raises CannotCalibrate if its gel cannot be reached by hand."""
     if camera.startswith(("/dev/", "http://", "https://")):
         from tacsim.models.hardware import CameraSensorConfig
 
@@ -81,12 +82,12 @@ def named_camera(
     return handheld_camera(load_rig(rig, overrides=overrides).config, sensor), sensor
 
 
-def picture_keeper(folder: Path) -> Callable[[tuple[str, NDArray[np.uint8]]], None]:
-    """What writes named pictures into `folder`, which the first one makes."""
+def image_writer(folder: Path) -> Callable[[tuple[str, NDArray[np.uint8]]], None]:
+    """A function that writes named images into `folder`, and makes the folder for the first one."""
     from tacsim.record.images import encode_png
 
-    def keep(picture: tuple[str, NDArray[np.uint8]]) -> None:
+    def write_image(picture: tuple[str, NDArray[np.uint8]]) -> None:
         with writing(folder):
             (folder / picture[0]).write_bytes(encode_png(picture[1]))
 
-    return keep
+    return write_image

@@ -1,4 +1,4 @@
-"""The process of a mock camera: `python -m robot.mock.camera`. It serves pictures until its standard input ends."""
+"""The process of a mock camera: `python -m robot.mock.camera`. It serves images until its standard input ends."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from robot.mock.camera.stream import FrameSource, Listener
 
 
 def main() -> int:
-    """Entry point of the process. The first message it gets is what to serve (robot.mock.camera.camera); the first it
-    sends is its port, or why it cannot serve."""
+    """Entry point of the process. The first message that it gets describes the camera (robot.mock.camera.camera). The
+    first message that it sends contains its port, or the reason why it cannot serve."""
     parent = Parent()
-    asked = parent.receive()
+    request = parent.receive()
     try:
-        source = FrameSource(**asked["source"])
-        listener = Listener(asked["host"], asked["port"], source)
+        source = FrameSource(**request["source"])
+        listener = Listener(request["host"], request["port"], source)
     except OSError as error:
-        parent.send({"error": f"cannot serve at {asked['host']}:{asked['port']}: {error}"})
+        parent.send({"error": f"cannot serve at {request['host']}:{request['port']}: {error}"})
         return 2
     threading.Thread(target=source.run, name="exposure", daemon=True).start()
     parent.send({"port": listener.port})

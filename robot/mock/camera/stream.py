@@ -1,7 +1,7 @@
-"""The mock camera's inside: pictures become frames, frames go to clients as mjpg-streamer sends them.
+"""Server of the mock camera: makes frames from images, and sends frames to clients like mjpg-streamer.
 
-One thread exposes and encodes; each client has a thread that sends it the newest frame and nothing older, so a slow
-client loses frames instead of filling memory. Standard library and Pillow only.
+One thread exposes and encodes. Each client has a thread that sends only the newest frame, so a slow client loses frames
+and does not fill the memory. Standard library and Pillow only.
 """
 
 from __future__ import annotations
@@ -26,35 +26,35 @@ from robot.mock.camera.camera import Faults
 
 BOUNDARY = "boundarydonotcross"
 MAX_CLIENTS = 16
-SHIFTS = 32  # of the noise, in rows and in columns: it is drawn once
-SEND_TIMEOUT = 5.0  # a client that takes nothing for so long is cut [s]
+SHIFTS = 32  # of the noise image, in rows and in columns: it is drawn once
+SEND_TIMEOUT = 5.0  # a client that reads nothing for this time is disconnected [s]
 
 
 class FrameSource:
-    """Exposes pictures at `fps`, and a pushed one at once; holds the newest JPEG for the clients."""
+    """Exposes images at `fps`, and a pushed image at once; stores the newest JPEG for the clients."""
 
     def __init__(self, width: int, height: int, fps: float, quality: int, stamped: bool, noise: int) -> None:
-        max_delayed = 1024  # frames that wait for the delay to pass; beyond it the oldest is lost
+        max_delayed = 1024  # frames that wait for their delay; of more the oldest is lost
         self.width, self.height = width, height
         self._period, self._quality, self._stamped = 1.0 / fps, quality, stamped
-        self._changed = threading.Condition()  # guards all that follows
+        self._changed = threading.Condition()  # protects all attributes below
         self._faults = Faults()
-        self._picture: NDArray[np.uint8] | None = None  # the one pushed last
-        self._fresh = False  # it was not exposed yet
+        self._picture: NDArray[np.uint8] | None = None  # the last pushed image
+        self._fresh = False  # True until it is exposed
         self._delayed: deque[tuple[float, int, bytes]] = deque(maxlen=max_delayed)  # when to send, number, JPEG
-        self._newest: tuple[int, bytes] = (0, b"")  # how many were sent so far; JPEG
+        self._newest: tuple[int, bytes] = (0, b"")  # number of frames sent so far; JPEG
         self._number = 0  # of the newest
         self._exposed = b""  # the newest JPEG, undamaged
         self._closed = False
         self._random = random.Random(0)
-        self._noise: NDArray[np.int16] | None = None  # larger than a picture; each frame gets another part of it
+        self._noise: NDArray[np.int16] | None = None  # larger than an image; each frame gets another part of it
         if noise:
             size = (height + SHIFTS, width + SHIFTS, 3)
             self._noise = np.random.default_rng(0).integers(-noise, noise + 1, size, dtype=np.int16)
         self.counts = {"frames": 0, "images": 0, "dropped": 0, "sent": 0, "skipped": 0}
 
     def push(self, picture: NDArray[np.uint8]) -> int:
-        """Makes (H, W, 3) RGB the picture from now on; returns its number, which the stamps of its frames carry."""
+        """Sets the image (H, W, 3) RGB; returns its number, which the stamps of its frames contain."""
         with self._changed:
             self._picture, self._fresh = picture, True
             self.counts["images"] += 1
@@ -82,8 +82,8 @@ class FrameSource:
             self._changed.notify_all()
 
     def newer(self, than: int) -> tuple[int, bytes] | None:
-        """The newest frame, once it is newer than number `than` of those that were sent: its number among them, and its
-        JPEG; None when the camera is closed. Counts what a client that asks late has missed."""
+        """Waits for a frame that is newer than number `than`; returns its number among the sent frames, and its JPEG;
+        None when the camera is closed. Counts the frames that a slow client has missed."""
         with self._changed:
             self._changed.wait_for(lambda: self._closed or self._newest[0] > than)
             if self._closed:
@@ -99,8 +99,8 @@ class FrameSource:
             return self._newest
 
     def run(self) -> None:
-        """Exposes until `close`. A pushed picture does not wait for the next tick, which comes one period later: a rig
-        in lock-step waits for just this picture, and up to a period a step would be lost for nothing."""
+        """Exposes until `close`. A pushed image does not wait for the next tick, which follows one period later: a rig
+        in lock step waits for this image, and would lose up to one period in each step."""
         tick = time.monotonic()
         while True:
             with self._changed:
@@ -109,7 +109,7 @@ class FrameSource:
                     self._send_delayed(now)
                     if not self._faults.stall and (self._fresh or now >= tick):
                         break
-                    self._changed.wait(self._until(tick, now))
+                    self._changed.wait(self._time_to_next(tick, now))
                 if self._closed:
                     return
                 tick = now + self._period if self._fresh else max(tick + self._period, now)
@@ -119,13 +119,13 @@ class FrameSource:
                 number = self.counts["frames"]
             jpeg = self._expose(picture, stamp.Stamp(number, image, time.monotonic_ns() // 1000), faults)
             with self._changed:
-                # one that was under way when a stall began would come after it, as if it were of then
+                # a frame that was exposed before a stall must not be sent after it
                 if self._faults.stall or (faults.drop > 0.0 and self._random.random() < faults.drop):
                     self.counts["dropped"] += 1
                     continue
                 self._delayed.append((now + faults.delay, number, jpeg))
 
-    def _until(self, tick: float, now: float) -> float | None:
+    def _time_to_next(self, tick: float, now: float) -> float | None:
         """How long there is nothing to do [s]; None: until `_changed` is notified."""
         due = [] if self._faults.stall else [tick]
         if self._delayed:
@@ -135,7 +135,7 @@ class FrameSource:
     def _send_delayed(self, now: float) -> None:
         while self._delayed and self._delayed[0][0] <= now:
             _, number, jpeg = self._delayed.popleft()
-            if number > self._number:  # a shorter delay lets later frames pass
+            if number > self._number:  # with a shorter delay, later frames overtake earlier ones
                 self._number, self._newest = number, (self._newest[0] + 1, jpeg)
                 self._changed.notify_all()
 
@@ -146,7 +146,7 @@ class FrameSource:
 
     def _encode(self, picture: NDArray[np.uint8] | None, mark: stamp.Stamp, faults: Faults) -> bytes:
         if picture is None:
-            picture = test_picture(self.width, self.height, mark.frame)
+            picture = moving_disc_picture(self.width, self.height, mark.frame)
         if self._noise is not None:
             down, right = self._random.randrange(SHIFTS), self._random.randrange(SHIFTS)
             noise = self._noise[down : down + self.height, right : right + self.width]
@@ -174,15 +174,14 @@ class FrameSource:
 
 
 def encode_jpeg(picture: NDArray[np.uint8], quality: int) -> bytes:
-    """(H, W, 3) RGB -> JPEG with colour at half resolution (4:2:0), as cameras send it."""
+    """(H, W, 3) RGB -> JPEG with colour at half resolution (4:2:0), as in cameras."""
     data = io.BytesIO()
     Image.fromarray(picture).save(data, "JPEG", quality=quality, subsampling=2)
     return data.getvalue()
 
 
-def test_picture(width: int, height: int, number: int) -> NDArray[np.uint8]:
-    """(H, W, 3) what the camera sees before the first push: a grey gel, and a dark disc that goes round, once in 120
-    frames."""
+def moving_disc_picture(width: int, height: int, number: int) -> NDArray[np.uint8]:
+    """Image (H, W, 3) before the first push: a grey gel with a dark disc that moves on a circle, once in 120 frames."""
     angle = 2.0 * np.pi * (number % 120) / 120
     x = np.arange(width) - width * (0.5 + 0.25 * np.cos(angle))
     y = np.arange(height) - height * (0.5 + 0.25 * np.sin(angle))
@@ -191,7 +190,7 @@ def test_picture(width: int, height: int, number: int) -> NDArray[np.uint8]:
 
 
 class Listener:
-    """The camera's port: hands the frames of a source to HTTP clients."""
+    """The camera's port: sends the frames of a source to HTTP clients."""
 
     def __init__(self, host: str, port: int, source: FrameSource) -> None:
         self.source = source
@@ -203,14 +202,14 @@ class Listener:
         self.listen()
 
     def listen(self) -> None:
-        """Takes clients from now on. Raises OSError when the port is taken."""
+        """Opens the port. Raises OSError if it is taken."""
         if self._server is None:
             self._server = _Server((self._host, self.port), self)
-            self.port = self._server.server_address[1]  # given by the system where 0 was asked for; then kept
+            self.port = self._server.server_address[1]  # chosen by the system for port 0; then kept
             threading.Thread(target=self._server.serve_forever, args=(0.02,), name="listener", daemon=True).start()
 
     def refuse(self) -> None:
-        """Closes the port; clients that are there stay."""
+        """Closes the port; connected clients stay."""
         if self._server is not None:
             self._server.shutdown()
             self._server.server_close()
@@ -221,7 +220,7 @@ class Listener:
             return len(self._clients)
 
     def disconnect(self) -> int:
-        """Cuts all clients; returns how many there were."""
+        """Disconnects all clients; returns their number."""
         with self._lock:
             for client in self._clients:
                 with contextlib.suppress(OSError):
@@ -229,7 +228,7 @@ class Listener:
             return len(self._clients)
 
     def enter(self, client: socket.socket) -> bool:
-        """Counts a client; False when there are MAX_CLIENTS already."""
+        """Adds a client; False if there are MAX_CLIENTS already."""
         with self._lock:
             if len(self._clients) >= MAX_CLIENTS:
                 return False
@@ -267,7 +266,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_error(404, "use /?action=stream or /?action=snapshot")
             return
         if not self.server.listener.enter(self.connection):
-            self.send_error(503, f"{MAX_CLIENTS} clients are there already")
+            self.send_error(503, f"{MAX_CLIENTS} clients are connected already")
             return
         try:
             action()
@@ -275,9 +274,9 @@ class _Handler(BaseHTTPRequestHandler):
             self.server.listener.leave(self.connection)
 
     def _stream(self) -> None:
-        # A small buffer: what lies in it is old when a slow client gets to it.
+        # A small buffer: its contents are old when a slow client reads them.
         self.connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 65536)
-        last = self.server.listener.source.newest[0]  # what is over is not sent; what comes after the header is
+        last = self.server.listener.source.newest[0]  # older frames are not sent
         self._head(f"multipart/x-mixed-replace;boundary={BOUNDARY}")
         self.wfile.write(f"--{BOUNDARY}\r\n".encode())
         while (frame := self.server.listener.source.newer(last)) is not None:

@@ -1,6 +1,6 @@
 """The process of a simulated cell (`python -m robot.mock.cell`, started by robot.mock.cell.sim_server).
 
-It runs at low priority and on one thread, so that the control loops on the same machine keep their time.
+It runs at low priority on one thread, so that the control loops on the same machine keep their periods.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 
 class CellModel(Protocol):
-    """What is in the cell: simulated (WorldCell), or in closed form (HertzCell)."""
+    """The contents of the cell: simulated (WorldCell), or in closed form (HertzCell)."""
 
     @property
     def stats(self) -> Mapping[str, float]: ...
@@ -66,7 +66,7 @@ class WorldCell:
         self.move(poses)
 
     def move(self, poses: Mapping[str, Pose]) -> None:
-        same_place = 1e-7  # a sensor that moved less has not moved [m, and rad over 0.1]
+        same_place = 1e-7  # a smaller motion of a sensor is not simulated [m, and rad over 0.1]
         targets = {}
         for name, pose in poses.items():
             metres, radians = pose_distance(self.world.pose(name), pose)
@@ -90,7 +90,7 @@ class WorldCell:
 
 
 class Server:
-    """Opens the cell that the first request names, and moves its sensors by the others."""
+    """Opens the cell that the first request describes, and moves its sensors by later requests."""
 
     def __init__(self) -> None:
         self._cell: CellModel | None = None

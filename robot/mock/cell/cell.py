@@ -1,7 +1,7 @@
-"""A whole mock cell: controllers, cameras, and the simulated gels and body that the arms hold and the cameras see.
+"""A complete mock cell: controllers, cameras, and the simulated gels and body in front of them.
 
-Poses of the mock arms go to the simulator, contact forces come back into the arms and tactile pictures into the
-cameras. Where nothing is simulated (a rig without scene), the controllers stand alone.
+The simulator gets the poses of the mock arms; the arms get contact forces, and the cameras tactile images. In a rig
+without a scene nothing is simulated, and only the controllers run.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ from tacsim.models.hardware import CameraSensorConfig, MockCameraConfig, UrArmCo
 from tacsim.models.rig import RigConfig
 from tacsim.models.sensor import SensorModel
 
-FREE_RUN = 5e-3  # shortest time between two steps while running free [s]
+MIN_STEP_INTERVAL = 5e-3  # between two steps in `run_free` [s]
 
 
 class MockCell(Closing):
-    """Starts the mocks that a rig file asks for. A context manager; `close` ends every process.
+    """Starts the mocks of a rig file. A context manager; `close` ends every process.
 
     Attributes:
         faults: fault client of each controller, by arm.
@@ -49,7 +49,7 @@ class MockCell(Closing):
         self._config = config
         self._arms = {name: arm for name, arm in parts_of(config.arms, UrArmConfig).items() if arm.mock is not None}
         cameras = _mock_cameras(config)
-        self._frames = {name: _true_frames(arm) for name, arm in self._arms.items()}
+        self._frames = {name: _actual_frames(arm) for name, arm in self._arms.items()}
         self._sensor_on: dict[str, str] = {}  # by arm: the sensor on it
         for name, sensor in config.sensors.items():
             if sensor.arm in self._arms:
@@ -59,21 +59,21 @@ class MockCell(Closing):
         self._sim_server: SimServer | None = None
         self._delays = {name: mock.delay for name, (_, mock) in cameras.items()}
         self._scene_frame: SceneFrame | None = None
-        self._pushed: dict[str, tuple[NDArray[np.uint8], int]] = {}  # by camera: its picture, and the number of that
-        self._late: dict[str, deque[NDArray[np.uint8]]] = {}  # by camera: the last pictures, oldest first
-        self._lock = threading.Lock()  # of what follows from a step
+        self._pushed: dict[str, tuple[NDArray[np.uint8], int]] = {}  # by camera: its image, and the number of the image
+        self._late: dict[str, deque[NDArray[np.uint8]]] = {}  # by camera: the last images, oldest first
+        self._lock = threading.Lock()  # held while results of a step are distributed
         self._stop = threading.Event()
-        self._follower: threading.Thread | None = None  # while running free
-        self._failure: Exception | None = None  # of that thread
-        self._steps = 0  # of that thread
+        self._follower: threading.Thread | None = None  # thread of `run_free`
+        self._failure: Exception | None = None  # error of that thread
+        self._steps = 0  # steps of that thread
         with ExitStack() as stack:
-            models = _models(config)
+            models = _sensor_models(config)
             if config.scene is not None and models:
                 self._sim_server = stack.enter_context(
                     SimServer(config.scene, models, config.canonical, config.contact)
                 )
             for name, (camera, mock) in cameras.items():
-                self.cameras[name] = stack.enter_context(_camera(name, camera, mock))
+                self.cameras[name] = stack.enter_context(_start_camera(name, camera, mock))
             self.start_poses = {name: self._start_pose(name, arm) for name, arm in self._arms.items()}
             if self._arms:
                 controllers = MockArms(
@@ -81,7 +81,7 @@ class MockCell(Closing):
                     model=[arm.model for arm in self._arms.values()],
                     joints=[self._initial_joints(name, arm) for name, arm in self._arms.items()],
                     payload=[(arm.payload.mass, *arm.payload.centre) for arm in self._arms.values()],
-                    version=[_version(arm) for arm in self._arms.values()],
+                    version=[_polyscope_version(arm) for arm in self._arms.values()],
                     realtime=any(arm.mock is not None and arm.mock.realtime for arm in self._arms.values()),
                 )
                 self._controllers = stack.enter_context(controllers)
@@ -89,19 +89,19 @@ class MockCell(Closing):
             self._mocks = stack.pop_all()
 
     def _start_pose(self, name: str, arm: UrArmConfig) -> Pose:
-        """By the rig file; else where the scene has the arm's sensor at its beginning."""
+        """From the rig file, or else the initial pose of the arm's sensor in the scene."""
         if arm.start is not None:
             return arm.start.pose
         initial = {} if self._sim_server is None else self._sim_server.initial
         if self._sensor_on.get(name) not in initial:
             raise DeviceError(
-                f"arms.{name}.start is missing, and no scene says it: give the sensor's world pose at the start of an "
-                "episode"
+                f"arms.{name}.start is missing, and no scene defines it: give the sensor's world pose at the start of "
+                "an episode"
             )
         return initial[self._sensor_on[name]]
 
     def _initial_joints(self, name: str, arm: UrArmConfig) -> Sequence[float]:
-        """Joints at power-on [rad]: by the rig file, else such that the sensor is at its start; of all postures the one
+        """Joints at power-on [rad]: from the rig file, or else the posture with the sensor at its start that is
         farthest from a singularity."""
         posture = (0.0, -1.5, 1.5, -1.5, -1.5, 0.0)  # seed of the joints at power-on: elbow up [rad]
         if arm.mock is not None and arm.mock.joints is not None:
@@ -131,14 +131,14 @@ class MockCell(Closing):
         return CellSensor(self, name, spec)
 
     @staticmethod
-    def will_know_truth(config: RigConfig) -> bool:
-        """Whether the cell of a rig file has a simulated body."""
+    def has_simulated_body(config: RigConfig) -> bool:
+        """True if the cell of a rig file has a simulated body."""
         body = None if config.scene is None else config.scene.body
-        return body is not None and config.contact == "simulated" and bool(_models(config))
+        return body is not None and config.contact == "simulated" and bool(_sensor_models(config))
 
     @property
     def scene_frame(self) -> SceneFrame | None:
-        """The scene after the last step; None before the first. Raises DeviceError if no more steps follow."""
+        """The scene after the last step; None before the first. Raises DeviceError if the steps have ended."""
         self.check()
         return self._scene_frame
 
@@ -146,13 +146,13 @@ class MockCell(Closing):
         return None if self._scene_frame is None else self._scene_frame.truth
 
     def diagnostics(self) -> Mapping[str, float]:
-        """How the last simulated motion went, and how long it took [s]."""
+        """Statistics of the last simulated motion, and its duration [s]."""
         if self._scene_frame is None:
             return {}
         return {**self._scene_frame.stats, "twin_seconds": self._scene_frame.seconds}
 
     def poses(self) -> dict[str, Pose]:
-        """world_from_sensor of the sensor that each mock arm carries, as the controllers have it."""
+        """world_from_sensor of the sensor on each mock arm, from the poses of the controllers."""
         found = {}
         for arm, sensor in self._sensor_on.items():
             frames, tool = self._frames[arm], matrix(np.array(self.faults[arm].state().pose))
@@ -160,17 +160,17 @@ class MockCell(Closing):
         return found
 
     def place(self) -> None:
-        """Puts a fresh body between the sensors, as a person does at a real rig. Raises SimServerError."""
+        """Puts a fresh body between the sensors, as the operator does at a real rig. Raises SimServerError."""
         if self._sim_server is not None:
             with self._lock:
                 self._late.clear()
                 self._distribute(self._sim_server.place(self.poses()))
 
     def step(self, pause: float = 0.0) -> Mapping[str, int]:
-        """Moves the simulated sensors to where the arms are: forces go into the controllers and, after a `pause` [s],
-        pictures into the cameras.
+        """Moves the simulated sensors to the poses of the arms. Sends forces to the controllers and, after a `pause`
+        [s], images to the cameras.
 
-        Returns the number of each camera's newest picture. Raises SimServerError.
+        Returns the number of each camera's newest image. Raises SimServerError.
         """
         if self._sim_server is None:
             return {}
@@ -183,7 +183,7 @@ class MockCell(Closing):
             if sensor in scene_frame.wrenches:
                 self.faults[arm].wrench(self._at_tool(arm, scene_frame.wrenches[sensor]).tolist())
         time.sleep(pause)
-        for name, camera in self.cameras.items():  # which go on showing their last picture
+        for name, camera in self.cameras.items():  # cameras repeat their last image
             late = self._late.setdefault(name, deque(maxlen=1 + self._delays[name]))
             late.append(scene_frame.images[name])
             picture = late[0]
@@ -192,7 +192,7 @@ class MockCell(Closing):
         return {name: number for name, (_, number) in self._pushed.items()}
 
     def _at_tool(self, arm: str, wrench: FloatArray) -> FloatArray:
-        """A wrench (6,) about the sensor, in its axes, as the controller has it: about the TCP, in the base's axes."""
+        """Converts a wrench (6,) about the sensor in its axes to the controller's: about the TCP, in base axes."""
         at_tool = se3.transform_wrench(se3.from_matrix(self._frames[arm].tool_from_sensor), wrench)
         turn = matrix(np.array(self.faults[arm].state().pose))[:3, :3]
         return np.concatenate([turn @ at_tool[:3], turn @ at_tool[3:]])
@@ -200,30 +200,30 @@ class MockCell(Closing):
     # ---------------------------------------------------------- running free
 
     def run_free(self) -> None:
-        """The simulation follows the arms in a thread from now on, as fast as it can."""
+        """Starts a thread that moves the simulation to the poses of the arms, as fast as it can."""
         if self._sim_server is not None and self._follower is None:
-            self._follower = threading.Thread(target=self._follow, name="mock cell", daemon=True)
+            self._follower = threading.Thread(target=self._follow_arms, name="mock cell", daemon=True)
             self._follower.start()
 
-    def catch_up(self) -> None:
-        """While running free: waits for a whole step that begins from now on. An approach that did not wait would go on
-        while the simulator is still busy with the first touch.
+    def wait_for_fresh_step(self) -> None:
+        """After `run_free`: waits for a complete step that begins after this call. Otherwise an approach would continue
+        while the simulator still computes the first touch.
 
-        Raises DeviceError if no more steps follow.
+        Raises DeviceError if the steps have ended.
         """
-        wanted = self._steps + 2  # the step under way may have begun before
+        wanted = self._steps + 2  # the present step may have begun before this call
         while self._steps < wanted:
             self.check()
-            time.sleep(FREE_RUN)
+            time.sleep(MIN_STEP_INTERVAL)
 
     def check(self) -> None:
-        """Raises DeviceError if the thread that follows the arms has failed."""
+        """Raises DeviceError if the thread of `run_free` has failed."""
         if self._failure is not None:
             raise DeviceError(f"the simulation of the mock cell stopped: {self._failure}") from self._failure
 
-    def _follow(self) -> None:
+    def _follow_arms(self) -> None:
         try:
-            while not self._stop.wait(FREE_RUN):
+            while not self._stop.wait(MIN_STEP_INTERVAL):
                 self.step()
                 self._steps += 1
         except Exception as failure:
@@ -235,19 +235,19 @@ class MockCell(Closing):
         self._stop.set()
         if self._follower is not None:
             self._follower.join(5.0)
-        self._mocks.close()  # each is closed even when another fails
+        self._mocks.close()  # closes each mock even if another one fails
 
 
-def _true_frames(arm: UrArmConfig) -> ArmFrames:
-    """Where the mock has its sensor: not quite where the arm's file believes it to be, if it has an error."""
-    believed = ArmFrames.of(arm)
+def _actual_frames(arm: UrArmConfig) -> ArmFrames:
+    """Frames of the mock arm: with an `error` in its file, the sensor is not at the configured pose."""
+    configured = ArmFrames.of(arm)
     assert arm.mock is not None
-    sensor = believed.tool_from_sensor @ np.linalg.inv(se3.to_matrix(arm.mock.error.pose))
-    return ArmFrames(believed.world_from_base, believed.flange_from_tool, sensor)
+    sensor = configured.tool_from_sensor @ np.linalg.inv(se3.to_matrix(arm.mock.error.pose))
+    return ArmFrames(configured.world_from_base, configured.flange_from_tool, sensor)
 
 
-def _models(config: RigConfig) -> dict[str, SensorModel]:
-    """Of the sensors that are simulated: before a mock camera, or read without one."""
+def _sensor_models(config: RigConfig) -> dict[str, SensorModel]:
+    """Models of the simulated sensors: with a mock camera, or read without a camera."""
     models = {name: sensor.rendered_model(load_sensor) for name, sensor in config.sensors.items()}
     return {name: model for name, model in models.items() if model is not None}
 
@@ -257,12 +257,12 @@ def _mock_cameras(config: RigConfig) -> dict[str, tuple[CameraSensorConfig, Mock
     return {name: (camera, camera.mock) for name, camera in cameras.items() if camera.mock is not None}
 
 
-def _version(arm: UrArmConfig) -> Version:
+def _polyscope_version(arm: UrArmConfig) -> Version:
     text = arm.mock.version if arm.mock is not None else None
     return VERSION if text is None else parse_version(text)
 
 
-def _camera(name: str, config: CameraSensorConfig, mock: MockCameraConfig) -> MockCamera:
+def _start_camera(name: str, config: CameraSensorConfig, mock: MockCameraConfig) -> MockCamera:
     url = urlsplit(config.source)
     if url.scheme != "http" or url.hostname is None or url.port is None:
         raise DeviceError(
@@ -274,13 +274,13 @@ def _camera(name: str, config: CameraSensorConfig, mock: MockCameraConfig) -> Mo
 
 
 class CellSensor:
-    """A simulated sensor on a real or mock arm, without a camera: the mock cell's gel at the arm's measured pose."""
+    """A simulated sensor on a real or mock arm, without a camera: its gel is at the arm's measured pose."""
 
     def __init__(self, cell: MockCell, name: str, spec: SensorSpec) -> None:
         self._cell, self._name, self.spec = cell, name, spec
 
     def read(self, timeout: float) -> TactileFrame:
-        """The picture of the newest simulated state. Raises TimeoutError when there is none within `timeout` [s]."""
+        """The image of the newest simulated state. Raises TimeoutError if there is none within `timeout` [s]."""
         deadline = time.monotonic() + timeout
         while (frame := self._cell.scene_frame) is None:
             if time.monotonic() > deadline:
@@ -290,4 +290,4 @@ class CellSensor:
         return TactileFrame(frame.images[name], time=frame.time, index=frame.index, surface=frame.surfaces[name])
 
     def close(self) -> None:
-        """The rig closes the cell."""
+        """Does nothing: the rig closes the cell."""

@@ -1,7 +1,7 @@
-"""The simulated cell's process, seen from outside: sensor poses go in, tactile images and contact forces come out.
+"""Handle of the simulated cell's process: it takes sensor poses and returns tactile images and contact forces.
 
-Materials are rate independent, so only the path of the poses counts, not how long a simulated motion takes. The process
-(`robot/mock/cell/__main__.py`) knows nothing of arms and cameras; robot.mock.cell.cell joins them.
+Materials are rate independent, so results depend on the path of the poses, not on the duration of a simulated motion.
+The process (`robot/mock/cell/__main__.py`) does not use arms and cameras; robot.mock.cell.cell connects them.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from tacsim.models.scene import Scene
     from tacsim.models.sensor import CanonicalGrid, SensorModel
 
-PATIENCE = 600.0  # for one answer: a first motion compiles, a hard one takes many substeps [s]
+ANSWER_TIMEOUT = 600.0  # of one request: a first motion compiles, a difficult one takes many substeps [s]
 
 
 class SimServerError(DeviceError):
@@ -41,15 +41,15 @@ class SceneFrame:
     wrenches: Mapping[str, FloatArray]  # (6,) on each sensor, about its origin, its axes [N, N m]
     truth: Truth | None  # of the body
     stats: Mapping[str, float]  # how the simulated motion went (tacsim.physics.world.MoveStats)
-    seconds: float  # that it took
+    seconds: float  # duration of the simulated motion [s]
 
 
 class SimServer(Child):
-    """Starts the process for a scene and talks to it.
+    """Starts the process for a scene and sends requests to it.
 
     Args:
-        models: what is rendered of each sensor.
-        grid: on which surfaces are sampled.
+        models: of the sensors that are rendered, by name.
+        grid: canonical grid on which surfaces are sampled.
         contact: the scene's gels and body, or a ball before each gel in closed form (robot.mock.cell.hertz).
     """
 
@@ -70,25 +70,25 @@ class SimServer(Child):
             "robot.mock.cell",
             name="simulated cell",
             error=SimServerError,
-            advice="open the rig anew",
+            advice="open the rig again",
             environment={"TACSIM_THREADS": os.environ.get("TACSIM_THREADS", "1")},
-            ready_timeout=PATIENCE,
+            ready_timeout=ANSWER_TIMEOUT,
             first_request={"do": "open", "contact": contact, **opened},
         )
         poses = self.ready["poses"]
         self.initial = {name: pose_of(numbers) for name, numbers in poses.items()}  # of the sensors
 
     def place(self, poses: Mapping[str, Pose]) -> SceneFrame:
-        """Puts a fresh body into the cell, with the sensors at `poses`, clear of it. Raises SimServerError."""
+        """Puts a fresh body into the cell, with the sensors at `poses`, without contact. Raises SimServerError."""
         return self._move("place", poses)
 
     def move(self, poses: Mapping[str, Pose]) -> SceneFrame:
-        """Drives the sensors to `poses`. Raises SimServerError when the motion diverges, with the scene as before."""
+        """Moves the sensors to `poses`. Raises SimServerError if the motion diverges; the scene stays as before."""
         return self._move("move", poses)
 
     def _move(self, what: str, poses: Mapping[str, Pose]) -> SceneFrame:
         request = {"do": what, "poses": {name: numbers_of(pose) for name, pose in poses.items()}}
-        answer, arrays = self.ask(request, timeout=PATIENCE)
+        answer, arrays = self.request(request, timeout=ANSWER_TIMEOUT)
         self._index += 1
         return SceneFrame(
             index=self._index,

@@ -1,4 +1,4 @@
-"""Client of a mock controller's fault server: breaks the mock, pushes on its tool, and tells its state."""
+"""Client of a mock controller's fault server: injects faults and forces, and reads the state of the mock."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class MockState:
     """A mock controller between two control periods. SI units; UR poses (position, rotation vector), base axes."""
 
     tick: int  # control periods since the process began
-    time: float  # of the robot, from its power-on [s]
+    time: float  # of the robot, since its power-on [s]
     joints: tuple[float, ...]  # (6,) actual
     joint_speeds: tuple[float, ...]
     target_joints: tuple[float, ...]
@@ -33,11 +33,11 @@ class MockState:
     program: bool  # a program runs, or is paused
     safety: str  # NORMAL, PROTECTIVE_STOP, ...
     mode: str  # RUNNING, POWER_OFF, ...
-    stop_reason: str  # why the last program ended; "" if none has
-    payload: float  # as the controller was told [kg]
+    stop_reason: str  # why the last program ended; "" if none has ended
+    payload: float  # as configured in the controller [kg]
     watchdog: bool  # a client has set the RTDE watchdog
     tick_rate: float  # [1/s]
-    overruns: int  # control periods that were left out because the machine was too slow
+    overruns: int  # control periods that were skipped because the machine was too slow
     packages_sent: int  # to all clients
     packages_dropped: int
     packages_received: int  # input packages
@@ -55,7 +55,8 @@ class Input:
 
 @dataclass(frozen=True)
 class Inputs:
-    """Packages in their order. `last` goes into the next question; `lost` were forgotten before it was asked."""
+    """Packages in order of arrival. `last`: number for the next request. `lost`: number of packages that were dropped
+    before this request."""
 
     entries: tuple[Input, ...]
     last: int
@@ -63,21 +64,22 @@ class Inputs:
 
 
 class FaultClient:
-    """Breaks one mock and tells its state. Every call has a time-out and raises FaultError; threads may share one."""
+    """Injects faults into one mock and reads its state. Every call has a time-out and raises FaultError; threads may
+    share a client."""
 
     def __init__(self, host: str, port: int = FAULT_PORT, timeout: float = TIMEOUT) -> None:
         self.host, self.port, self.timeout = host, port, timeout
-        self.last_words: Callable[[], str] = str  # why the mock has ended; set by the handle of its process
+        self.exit_report: Callable[[], str] = str  # how the mock has ended; set by the handle of its process
         self._lock = threading.Lock()
         self._socket: socket.socket | None = None
         self._received = b""
 
     def close(self) -> None:
-        """Ends the connection; the next call makes a new one."""
+        """Ends the connection; the next call connects again."""
         with self._lock:
             self._hang_up()
 
-    # -- looking -----------------------------------------------------------------------------------------------------
+    # -- state -------------------------------------------------------------------------------------------------------
 
     def state(self) -> MockState:
         found: dict[str, Any] = self._ask("state")
@@ -114,23 +116,23 @@ class FaultClient:
         self._ask("estop")
 
     def release(self) -> None:
-        """Pulls the emergency stop out again. The arm is without power: power on, release brakes."""
+        """Releases the emergency stop. The arm has no power: power on, release brakes."""
         self._ask("release")
 
     def safeguard_stop(self, on: bool = True) -> None:
-        """Opens or closes the safety gate: the program pauses, and goes on."""
+        """Opens or closes the safety gate: the program pauses or continues."""
         self._ask("safeguard_stop", on=on)
 
     def recover(self) -> None:
-        """All that a person would do after any stop, at once. No program runs afterwards."""
+        """Does all that the operator does after a stop, at once. No program runs afterwards."""
         self._ask("recover")
 
     def power_cycle(self, seconds: float = 0.2) -> None:
-        """Off, and on again after so long; then the robot waits without power, where it stood."""
+        """Switches the controller off, and on again after this time; then the arm has no power, at its last joints."""
         self._ask("power_cycle", seconds=seconds)
 
     def unlock_delay(self, seconds: float) -> None:
-        """How long after a protective stop it cannot be unlocked; real robots want 5 s, the mock 0."""
+        """Time after a protective stop in which it cannot be unlocked; real robots need 5 s, the mock 0."""
         self._ask("unlock_delay", seconds=seconds)
 
     # -- the line ----------------------------------------------------------------------------------------------------
@@ -140,11 +142,11 @@ class FaultClient:
         self._ask("silence", on=on)
 
     def cut(self, ports: Iterable[int] | None = None, reset: bool = False) -> int:
-        """Closes connections to these ports (None: all but fault clients'), with FIN or RST; returns how many."""
+        """Closes connections to these ports (None: all except fault clients), with FIN or RST; returns their number."""
         return int(self._ask("cut", ports=None if ports is None else list(ports), reset=reset))
 
     def delay(self, seconds: float) -> None:
-        """Everything is sent so much later."""
+        """Delays everything that is sent."""
         self._ask("delay", seconds=seconds)
 
     def drop(self, probability: float, seed: int = 0) -> None:
@@ -152,11 +154,11 @@ class FaultClient:
         self._ask("drop", probability=probability, seed=seed)
 
     def refuse(self, on: bool = True) -> None:
-        """Connections are refused; those that stand remain."""
+        """Refuses new connections; existing ones stay."""
         self._ask("refuse", on=on)
 
     def black_hole(self, on: bool = True) -> None:
-        """Connections are taken, and nothing is ever answered."""
+        """Accepts connections and answers nothing."""
         self._ask("black_hole", on=on)
 
     def partial_packages(self, on: bool = True) -> None:
@@ -164,21 +166,21 @@ class FaultClient:
         self._ask("partial_packages", on=on)
 
     def nan_state(self, on: bool = True) -> None:
-        """All that is measured (actual_...) is not a number."""
+        """All measured values (actual_...) are NaN."""
         self._ask("nan_state", on=on)
 
     def clock_jump(self, seconds: float) -> None:
-        """The controller's timestamp jumps, once; also backwards."""
+        """Shifts the controller's timestamp once, forwards or backwards."""
         self._ask("clock_jump", seconds=seconds)
 
     def tick_overrun(self, seconds: float) -> None:
-        """The controller stands still for so long, once."""
+        """Stops the controller for this time, once."""
         self._ask("tick_overrun", limit=seconds + self.timeout, seconds=seconds)
 
     # -- the controller ----------------------------------------------------------------------------------------------
 
     def remote_control(self, on: bool) -> None:
-        """Local control refuses programs."""
+        """False: the controller is in local control and refuses programs."""
         self._ask("remote_control", on=on)
 
     def dashboard_mute(self, on: bool = True) -> None:
@@ -186,11 +188,11 @@ class FaultClient:
         self._ask("dashboard_mute", on=on)
 
     def claim(self, names: Iterable[str]) -> None:
-        """These inputs are in use by a field bus; an empty list frees all."""
+        """Reserves these inputs for a field bus; an empty list releases all."""
         self._ask("claim", names=list(names))
 
     def version(self, major: int, minor: int, bugfix: int = 0, build: int = 0) -> None:
-        """The software that the controller claims to run."""
+        """Sets the software version that the controller reports."""
         self._ask("version", version=[major, minor, bugfix, build])
 
     def slider(self, fraction: float) -> None:
@@ -198,38 +200,39 @@ class FaultClient:
         self._ask("slider", fraction=fraction)
 
     def hold(self, on: bool = True) -> None:
-        """Somebody holds the arm: it stands, whatever its program asks; let go, it follows its servos again."""
+        """Holds the arm: it does not move, whatever its program commands. After release it follows its servos again."""
         self._ask("hold", on=on)
 
     def joint_lag(self, joint: int, seconds: float) -> None:
-        """Joint 0 to 5 trails a steady motion by so much; 4 ms at power-on."""
+        """Sets the time by which joint 0 to 5 lags behind a steady motion; 4 ms at power-on."""
         self._ask("joint_lag", joint=joint, seconds=seconds)
 
     # -- the load ----------------------------------------------------------------------------------------------------
 
     def wrench(self, wrench: Sequence[float]) -> None:
-        """What pushes on the tool (6,) [N, N m]: about the TCP, base axes; adds to wall and payload."""
+        """Sets an external wrench on the tool (6,) [N, N m], about the TCP, base axes; adds to wall and payload."""
         self._ask("wrench", wrench=[float(value) for value in wrench])
 
     def wall(self, z: float, stiffness: float) -> None:
-        """A spring table at height z [m], base axes: pushes the TCP up by stiffness [N/m] times its depth."""
+        """Adds an elastic table at height z [m], base axes: it pushes the TCP up by stiffness [N/m] times its depth."""
         self._ask("wall", z=z, stiffness=stiffness)
 
     def no_wall(self) -> None:
         self._ask("no_wall")
 
     def force_limit(self, newtons: float) -> None:
-        """|force| beyond which the controller makes a protective stop; 250 N at power-on."""
+        """Sets the |force| beyond which the controller makes a protective stop; 250 N at power-on."""
         self._ask("force_limit", newtons=newtons)
 
     def payload_mismatch(self, mass: float, centre: Sequence[float] = (0.0, 0.0, 0.0)) -> None:
-        """Hangs a mass [kg] on the flange, its centre in flange axes [m]: felt until the controller is told of it."""
+        """Adds a mass [kg] on the flange, its centre in flange axes [m]. The measured force contains its weight until
+        `set_payload` includes it."""
         self._ask("payload_mismatch", mass=mass, centre=[float(value) for value in centre])
 
     # ----------------------------------------------------------------------------------------------------------------
 
     def reset(self) -> None:
-        """As at power-on: clients are cut, faults gone, the arm where it began. Ticks and counts go on."""
+        """Restores the state at power-on: no clients, no faults, initial joints. Ticks and counts continue."""
         self._ask("reset")
 
     def _ask(self, action: str, *, limit: float | None = None, **arguments: Any) -> Any:
@@ -239,7 +242,7 @@ class FaultClient:
             except (OSError, ValueError) as error:
                 self._hang_up()
                 reason = "no answer in time" if isinstance(error, TimeoutError) else str(error)
-                raise FaultError(f"mock {self.host}:{self.port}, {action}: {reason}{self.last_words()}") from error
+                raise FaultError(f"mock {self.host}:{self.port}, {action}: {reason}{self.exit_report()}") from error
         if not answer["ok"]:
             raise FaultError(f"mock {self.host}:{self.port}, {action}: {answer['error']}")
         return answer["result"]

@@ -1,7 +1,8 @@
-"""The fault server of a mock controller: one JSON object a line in, one out (client: `robot.mock.ur.fault_client`).
+"""The fault server of a mock controller: one JSON object per line for request and reply (client:
+`robot.mock.ur.fault_client`).
 
 A request is {"do": name, ...arguments}; the reply {"ok": true, "result": ...} or {"ok": false, "error": text}. It is
-no part of any real protocol, and its port stays open whatever happens to the others.
+not part of a real protocol, and its port stays open when the others are closed.
 """
 
 from __future__ import annotations
@@ -16,10 +17,10 @@ from typing import Any
 import numpy as np
 
 from robot.mock.ur.machine.load import Mass, Wall
-from robot.mock.ur.machine.program import LARGEST
+from robot.mock.ur.machine.program import MAX_NUMBER
 from robot.mock.ur.machine.version import check_version
 from robot.mock.ur.wire.connection import Connection
-from robot.mock.ur.wire.controller import PORTS, Controller, accept, lines, open_port
+from robot.mock.ur.wire.controller import PORTS, Controller, accept_client, open_port, take_lines
 from robot.mock.ur.wire.fields import INPUTS
 from tacsim.interface import FloatArray
 
@@ -32,7 +33,7 @@ class FaultServer:
     def __init__(self, controller: Controller, selector: selectors.BaseSelector, port: int) -> None:
         self._controller, self._selector = controller, selector
         self._clients: set[Connection] = set()
-        self._behind: set[Connection] = set()  # which sent more than one request
+        self._behind: set[Connection] = set()  # clients that sent more than one request
         self._listener = open_port(controller.config.host, port)
         self.port = port
         selector.register(self._listener, selectors.EVENT_READ, self._accept)
@@ -44,7 +45,7 @@ class FaultServer:
         self._listener.close()
 
     def flush(self) -> None:
-        """Sends what did not fit before."""
+        """Sends data that did not fit into the socket before."""
         for client in list(self._clients):
             if not client.flush(0.0):
                 self._drop(client)
@@ -53,7 +54,7 @@ class FaultServer:
 
     def _accept(self) -> None:
         max_clients = 64  # more are closed at once
-        client = accept(self._listener, self.port)
+        client = accept_client(self._listener, self.port)
         if client is None:
             return
         if len(self._clients) >= max_clients:
@@ -69,10 +70,10 @@ class FaultServer:
         client.close()
 
     def _serve(self, client: Connection) -> None:
-        """Answers one request; nothing more is read from a client that has sent others."""
+        """Answers one request. No more data are read from a client whose requests still wait."""
         max_request = 1 << 16  # bytes
         alive = client in self._behind or client.read()
-        line = next(lines(client.received), None)
+        line = next(take_lines(client.received), None)
         if line is not None:
             client.send(json.dumps(self.answer(line)).encode() + b"\n")
         if not alive or (line is None and len(client.received) > max_request):
@@ -81,27 +82,27 @@ class FaultServer:
             (self._behind.add if b"\n" in client.received else self._behind.discard)(client)
 
     def answer(self, line: bytes) -> dict[str, Any]:
-        """What a request brings about, or why not."""
+        """Runs a request; returns its result, or the reason of its failure."""
         try:
             request = json.loads(line)
             action = ACTIONS.get(request.pop("do"))
             if action is None:
                 return {"ok": False, "error": f"no such action; allowed: {', '.join(sorted(ACTIONS))}"}
             return {"ok": True, "result": action(self._controller, **request)}
-        except Exception as error:  # whatever is asked, the arms go on
+        except Exception as error:  # an invalid request must not stop the arms
             return {"ok": False, "error": f"{type(error).__name__}: {error}"}
 
 
-def _six(values: list[float]) -> FloatArray:
+def _six_numbers(values: list[float]) -> FloatArray:
     array = np.array(values, dtype=np.float64)
-    if array.shape != (6,) or not float(np.abs(array).max()) <= LARGEST:
-        raise ValueError(f"need 6 finite numbers of at most {LARGEST:g}, got {values}")
+    if array.shape != (6,) or not float(np.abs(array).max()) <= MAX_NUMBER:
+        raise ValueError(f"need 6 finite numbers of at most {MAX_NUMBER:g}, got {values}")
     return array
 
 
-def _number(value: float, name: str, least: float = -LARGEST, most: float = LARGEST) -> float:
-    if not least <= value <= most:  # not a number is none either
-        raise ValueError(f"{name} must lie within {least:g} and {most:g}, got {value}")
+def _require_number(value: float, name: str, low: float = -MAX_NUMBER, high: float = MAX_NUMBER) -> float:
+    if not low <= value <= high:  # also refuses NaN
+        raise ValueError(f"{name} must be within {low:g} and {high:g}, got {value}")
     return float(value)
 
 
@@ -115,13 +116,13 @@ def _state(controller: Controller) -> dict[str, Any]:
         "target_joints": arm.target_q.tolist(),
         "pose": arm.pose.tolist(),
         "tcp_speed": arm.twist.tolist(),
-        "wrench": machine.load.felt.tolist(),
+        "wrench": machine.load.zeroed_wrench.tolist(),
         "rests": arm.rests,
         "program": machine.program is not None,
         "safety": machine.safety.name,
         "mode": machine.mode.name,
         "stop_reason": machine.stop_reason,
-        "payload": machine.load.told.mass,
+        "payload": machine.load.configured_payload.mass,
         "watchdog": machine.watchdog is not None,
         "tick_rate": controller.tick_rate,
         "overruns": controller.overruns,
@@ -134,16 +135,16 @@ def _state(controller: Controller) -> dict[str, Any]:
 
 def _received(controller: Controller, since: int) -> dict[str, Any]:
     entries, lost = controller.inputs.after(since, PAGE)
-    told = [(entry.number, entry.tick, entry.values) for entry in entries]
-    return {"entries": told, "lost": lost, "last": controller.inputs.arrived}
+    rows = [(entry.number, entry.tick, entry.values) for entry in entries]
+    return {"entries": rows, "lost": lost, "last": controller.inputs.arrived}
 
 
 def _wrench(controller: Controller, wrench: list[float]) -> None:
-    controller.machine.load.wrench = _six(wrench)
+    controller.machine.load.wrench = _six_numbers(wrench)
 
 
 def _wall(controller: Controller, z: float, stiffness: float) -> None:
-    controller.machine.load.wall = Wall(_number(z, "z"), _number(stiffness, "stiffness", 0.0, 1e9))
+    controller.machine.load.wall = Wall(_require_number(z, "z"), _require_number(stiffness, "stiffness", 0.0, 1e9))
 
 
 def _no_wall(controller: Controller) -> None:
@@ -155,18 +156,18 @@ def _payload_mismatch(controller: Controller, mass: float, centre: list[float]) 
 
 
 def _force_limit(controller: Controller, newtons: float) -> None:
-    controller.machine.load.force_limit = _number(newtons, "force limit", 0.0)
+    controller.machine.load.force_limit = _require_number(newtons, "force limit", 0.0)
 
 
 def _drop(controller: Controller, probability: float, seed: int) -> None:
     if not 0 <= probability <= 1:
-        raise ValueError(f"probability must lie within 0 and 1, got {probability}")
-    controller.faults.drop, controller.faults.chance = float(probability), np.random.default_rng(seed)
+        raise ValueError(f"probability must be within 0 and 1, got {probability}")
+    controller.faults.drop, controller.faults.random = float(probability), np.random.default_rng(seed)
 
 
 def _delay(controller: Controller, seconds: float) -> None:
-    max_delay = 60.0  # of a slow line [s]
-    controller.faults.delay = _number(seconds, "delay", 0.0, max_delay)
+    max_delay = 60.0  # of a slow connection [s]
+    controller.faults.delay = _require_number(seconds, "delay", 0.0, max_delay)
 
 
 def _claim(controller: Controller, names: list[str]) -> None:
@@ -181,19 +182,19 @@ def _version(controller: Controller, version: list[int]) -> None:
 
 
 def _clock_jump(controller: Controller, seconds: float) -> None:
-    controller.machine.clock_offset += _number(seconds, "seconds")
+    controller.machine.clock_offset += _require_number(seconds, "seconds")
 
 
 def _tick_overrun(controller: Controller, seconds: float) -> None:
-    time.sleep(_number(seconds, "seconds", 0.0, 30.0))  # the whole controller stands still, as asked
+    time.sleep(_require_number(seconds, "seconds", 0.0, 30.0))  # stops the whole controller, as requested
 
 
 def _unlock_delay(controller: Controller, seconds: float) -> None:
-    controller.machine.unlock_delay = _number(seconds, "unlock delay", 0.0)
+    controller.machine.unlock_delay = _require_number(seconds, "unlock delay", 0.0)
 
 
 def _slider(controller: Controller, fraction: float) -> None:
-    controller.machine.set_slider(_number(fraction, "speed slider", 0.0, 1.0))
+    controller.machine.set_slider(_require_number(fraction, "speed slider", 0.0, 1.0))
 
 
 def _hold(controller: Controller, on: bool) -> None:
@@ -203,10 +204,10 @@ def _hold(controller: Controller, on: bool) -> None:
 def _joint_lag(controller: Controller, joint: int, seconds: float) -> None:
     if joint not in range(6):
         raise ValueError(f"joint must be one of 0 to 5, got {joint}")
-    controller.machine.arm.servo_rates[joint] = 2.0 / _number(seconds, "lag", 1e-3, 60.0)
+    controller.machine.arm.servo_rates[joint] = 2.0 / _require_number(seconds, "lag", 1e-3, 60.0)
 
 
-def _switch(name: str) -> Callable[[Controller, bool], None]:
+def _fault_switch(name: str) -> Callable[[Controller, bool], None]:
     def switch(controller: Controller, on: bool) -> None:
         setattr(controller.faults, name, bool(on))
 
@@ -223,12 +224,12 @@ ACTIONS: dict[str, Callable[..., Any]] = {
     "release": lambda controller: controller.machine.release_emergency_stop(),
     "safeguard_stop": lambda controller, on: controller.machine.safeguard_stop(bool(on)),
     "recover": lambda controller: controller.machine.recover(),
-    "power_cycle": lambda controller, seconds: controller.power_cycle(_number(seconds, "seconds", 0.0)),
-    "silence": _switch("silence"),
-    "partial_packages": _switch("partial"),
-    "nan_state": _switch("nan"),
-    "remote_control": _switch("remote_control"),
-    "dashboard_mute": _switch("dashboard_mute"),
+    "power_cycle": lambda controller, seconds: controller.power_cycle(_require_number(seconds, "seconds", 0.0)),
+    "silence": _fault_switch("silence"),
+    "partial_packages": _fault_switch("partial"),
+    "nan_state": _fault_switch("nan"),
+    "remote_control": _fault_switch("remote_control"),
+    "dashboard_mute": _fault_switch("dashboard_mute"),
     "black_hole": lambda controller, on: controller.black_hole(bool(on)),
     "cut": lambda controller, ports, reset: controller.cut(PORTS if ports is None else ports, reset=reset),
     "refuse": lambda controller, on: controller.refuse() if on else controller.listen(),

@@ -1,4 +1,4 @@
-"""Handles of mock controllers, for those who start them: each is a process of its own (`robot/mock/__main__.py`)."""
+"""Handles of mock controllers. Each handle starts a separate process (`robot/mock/__main__.py`)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from robot.common import MOCK_SERIAL
 from robot.common.loopback import require_loopback
-from robot.common.process import PATIENCE, Child
+from robot.common.process import END_TIMEOUT, Child
 from robot.errors import DeviceError
 from robot.mock.ur.fault_client import FAULT_PORT, FaultClient
 from robot.mock.ur.machine.version import VERSION, Version, check_version, version_text
@@ -25,12 +25,15 @@ class MockError(DeviceError):
 
 
 class MockArms(Child):
-    """Mock controllers in one process of their own, one for each host; a context manager.
+    """Mock controllers in one separate process, one for each host; a context manager.
 
-    model: one for all, or one each; joints: where they begin [rad], (6,) or (arms, 6); payload: what hangs on their
-    flanges, mass [kg] and centre of gravity in flange axes [m], (4,) or (arms, 4); version: of PolyScope, which they
-    claim, four numbers or four each. Raises MockError when they are not ready in time, for example because a port is in
-    use, ValueError for hosts that are not loopback addresses and for versions that are none.
+    model: one for all, or one for each arm.
+    joints: initial joints [rad], (6,) or (arms, 6).
+    payload: mass [kg] and centre of gravity in flange axes [m] of the load on the flange, (4,) or (arms, 4).
+    version: of PolyScope that the controllers report, four numbers, or four for each arm.
+
+    Raises MockError if they are not ready in time, for example because a port is in use; ValueError for hosts that are
+    not loopback addresses and for invalid versions.
     """
 
     def __init__(
@@ -65,27 +68,27 @@ class MockArms(Child):
         name = f"mock controller on {', '.join(hosts)}"
         super().__init__("robot.mock", arguments, name=name, error=MockError, ready_timeout=ready_timeout)
         for faults in self.fault_clients:
-            faults.last_words = self._last_words
+            faults.exit_report = self._exit_report
 
-    def _last_words(self) -> str:
-        """Why the process has ended, to be added to an error; nothing while it runs."""
-        dying_time = 0.2  # between the end of a process's connections and its own [s]
+    def _exit_report(self) -> str:
+        """Text for an error about how the process ended; empty while it runs."""
+        exit_delay = 0.2  # a process ends this time after its connections at the latest [s]
         with contextlib.suppress(subprocess.TimeoutExpired):
-            self._process.wait(dying_time)
+            self._process.wait(exit_delay)
         try:
             self.check()
         except MockError as error:
             return f"; {error}"
         return ""
 
-    def close(self, patience: float = PATIENCE) -> None:
+    def close(self, timeout: float = END_TIMEOUT) -> None:
         for faults in self.fault_clients:
             faults.close()
-        super().close(patience)
+        super().close(timeout)
 
 
 class MockUR(MockArms):
-    """One mock controller in a process of its own; `options` are those of MockArms."""
+    """One mock controller in a separate process; `options` are those of MockArms."""
 
     def __init__(self, host: str = "127.0.0.2", **options: Any) -> None:
         super().__init__([host], **options)

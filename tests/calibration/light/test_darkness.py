@@ -170,7 +170,7 @@ def run(folder: Path, sensor: DarkSensor, *words: str) -> tuple[int, str]:
 
 def test_the_command_says_which_light_it_found_and_what_was_expected(tmp_path: Path) -> None:
     code, output = run(tmp_path, DarkSensor(7, 0.4), "--kind", "digit", "--serial", "finger")
-    assert code in (0, 3) and "this light tells no direction: darkness tells depth" in output
+    assert code in (0, 3) and "this light does not depend on the direction of slopes: darkness gives depth" in output
     assert "is --kind right?" in output
     assert read_bundle(tmp_path / "out")[0].darkness is not None
     page = (tmp_path / "out" / "verdict.html").read_text(encoding="utf-8")

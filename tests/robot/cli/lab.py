@@ -49,11 +49,11 @@ def copy_of(rig: str, folder: Path, first: int) -> Path:
 class Lab:
     """While open, the hardware that the rig file `file` names. Each body lies `ahead` [m] before its gel's start.
 
-    beside: where the sensors stand at first, off their starts, in their own axes (3,) [m].
+    offset: initial positions of the sensors relative to their starts, in their own axes (3,) [m].
     """
 
     def __init__(
-        self, file: Path, ahead: float = 4e-3, beside: tuple[float, float, float] = (2e-3, -1e-3, -3e-3)
+        self, file: Path, ahead: float = 4e-3, offset: tuple[float, float, float] = (2e-3, -1e-3, -3e-3)
     ) -> None:
         self.config = load_rig(file).config
         arms = {name: arm for name, arm in self.config.arms.items() if isinstance(arm, UrArmConfig)}
@@ -64,7 +64,7 @@ class Lab:
         with ExitStack() as stack:
             controllers = MockArms(
                 [arm.host for arm in arms.values()],
-                joints=[self._joints(name, se3.compose(self.starts[name], Pose(np.array(beside)))) for name in arms],
+                joints=[self._joints(name, se3.compose(self.starts[name], Pose(np.array(offset)))) for name in arms],
                 payload=[(arm.payload.mass, *arm.payload.centre) for arm in arms.values()],
                 serial=SERIAL,
                 realtime=True,  # as a controller: it shares no priority with what a busy machine does

@@ -20,7 +20,7 @@ from tests.robot.cli.invoked import environment
 
 CONTROLLING = "import fcntl, termios; fcntl.ioctl(0, termios.TIOCSCTTY, 0)\n"  # Ctrl-C typed there reaches the process
 COMMAND = "from robot.cli import main; main()"
-PATIENCE = 90.0  # for anything that has to happen [s]
+PATIENCE = 90.0  # for an event [s]
 
 
 class Terminal:
@@ -47,7 +47,7 @@ class Terminal:
         while True:
             try:
                 data = os.read(self._own, 65536)
-            except OSError:  # nobody holds the other end any more
+            except OSError:  # the other end is closed
                 return
             with self._lock:
                 self._stream.feed(data)

@@ -14,7 +14,7 @@ import pytest
 from matplotlib.image import imread
 from scipy.spatial.transform import Rotation
 
-from robot.cli.errors import explain
+from robot.cli.errors import describe_error
 from robot.cli.output import writing
 from robot.studies.press import PressMotion, _targets
 from tacsim.config import ConfigError
@@ -27,13 +27,13 @@ COMMANDS = ("run", "press", "reproduce", "replay", "schema", "doctor", "debug", 
 
 
 @pytest.mark.parametrize("command", [*COMMANDS, "train", "evaluate", "export policy"])
-def test_every_command_explains_itself_with_an_example(command: str) -> None:
+def test_help_of_each_command_has_example(command: str) -> None:
     result = tacsim(*command.split(), "--help")
     assert result.exit_code == 0
     assert f"Example: tacsim {command}" in result.stdout
 
 
-def test_help_lists_all_commands_and_loads_nothing_heavy() -> None:
+def test_help_lists_commands_without_heavy_imports() -> None:
     result = tacsim("--help")
     assert all(command in result.stdout for command in COMMANDS)
     code = "import sys, robot.cli; print(' '.join(sys.modules))"
@@ -43,7 +43,7 @@ def test_help_lists_all_commands_and_loads_nothing_heavy() -> None:
 
 
 @pytest.mark.parametrize(("said", "threads"), [(None, "1"), ("3", "3")])
-def test_the_command_multiplies_small_matrices_on_one_thread(said: str | None, threads: str) -> None:
+def test_command_sets_one_blas_thread(said: str | None, threads: str) -> None:
     """A busy machine's threads wait for one another, spinning: a calibration took three times the processor time."""
     code = (
         "import os, sys; sys.argv = ['tacsim', '--version']; from robot.cli import main\n"
@@ -56,7 +56,7 @@ def test_the_command_multiplies_small_matrices_on_one_thread(said: str | None, t
     assert f"threads {threads}" in ran.stdout
 
 
-def test_a_command_prepares_itself_alone_and_a_wrong_one_is_told_of_all() -> None:
+def test_command_prepares_only_itself_and_lists_all_if_unknown() -> None:
     code = "import sys; from robot import cli\ntry: cli.main()\nfinally: print(len(cli.app.registered_commands))"
     alone, wrong = (
         subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, env=environment())
@@ -66,7 +66,7 @@ def test_a_command_prepares_itself_alone_and_a_wrong_one_is_told_of_all() -> Non
     assert wrong.returncode == 2 and "'schema'" in wrong.stderr and int(wrong.stdout) > 10
 
 
-def test_version() -> None:
+def test_version_option_prints_version() -> None:
     result = tacsim("--version")
     assert result.exit_code == 0
     assert result.stdout.startswith("tacsim")
@@ -105,7 +105,7 @@ def test_version() -> None:
         (("run", "--out", "/dev/null/x"), "/dev/null/x cannot be made (Not a directory)"),
     ],
 )
-def test_wrong_words_end_with_2_and_write_nothing(words: tuple[str, ...], said: str, tmp_path: Path) -> None:
+def test_wrong_arguments_exit_with_2_and_write_nothing(words: tuple[str, ...], said: str, tmp_path: Path) -> None:
     result = tacsim(*words)
     assert result.exit_code == 2
     assert said in result.stderr
@@ -120,9 +120,7 @@ def test_wrong_words_end_with_2_and_write_nothing(words: tuple[str, ...], said: 
         (("replay", "missing.mcap"), "missing.mcap"),
     ],
 )
-def test_a_recording_that_is_missing_ends_with_2_and_writes_nothing(
-    words: tuple[str, ...], said: str, tmp_path: Path
-) -> None:
+def test_missing_recording_exits_with_2_and_writes_nothing(words: tuple[str, ...], said: str, tmp_path: Path) -> None:
     result = tacsim(*words)
     assert result.exit_code == 2, result.output
     assert said in result.stderr
@@ -131,7 +129,7 @@ def test_a_recording_that_is_missing_ends_with_2_and_writes_nothing(
 
 
 @pytest.mark.parametrize("words", [("run",), ("press", "sphere"), ("reproduce",), ("replay", "x.mcap")])
-def test_an_existing_folder_is_refused_and_left_alone(words: tuple[str, ...], tmp_path: Path) -> None:
+def test_existing_folder_is_refused_and_kept(words: tuple[str, ...], tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "notes.txt").write_text("keep")
     result = tacsim(*words, "--out", "mine")
@@ -140,17 +138,17 @@ def test_an_existing_folder_is_refused_and_left_alone(words: tuple[str, ...], tm
     assert [path.name for path in (tmp_path / "mine").iterdir()] == ["notes.txt"]
 
 
-def test_exit_codes_of_errors() -> None:
-    assert explain(ConfigError([]))[1] == 2
-    assert explain(EpisodeError("x.mcap: is no episode")) == ("x.mcap: is no episode", 2)
-    assert explain(IncompatibleRig("it lacks truth"))[1] == 2
-    assert explain(PermissionError(13, "Permission denied", "out")) == ("out: Permission denied", 2)
-    assert explain(OSError(28, "No space left on device", "out")) == ("out: No space left on device", 1)
-    assert "--debug" in explain(KeyError("slip"))[0]
-    assert "no room" in explain(ExceptionGroup("two", [OSError("no room"), EpisodeError("bad")]))[0]
+def test_describe_error_returns_exit_codes() -> None:
+    assert describe_error(ConfigError([]))[1] == 2
+    assert describe_error(EpisodeError("x.mcap: is no episode")) == ("x.mcap: is no episode", 2)
+    assert describe_error(IncompatibleRig("it lacks truth"))[1] == 2
+    assert describe_error(PermissionError(13, "Permission denied", "out")) == ("out: Permission denied", 2)
+    assert describe_error(OSError(28, "No space left on device", "out")) == ("out: No space left on device", 1)
+    assert "--debug" in describe_error(KeyError("slip"))[0]
+    assert "no room" in describe_error(ExceptionGroup("two", [OSError("no room"), EpisodeError("bad")]))[0]
 
 
-def test_a_working_folder_that_is_gone_is_named() -> None:
+def test_missing_working_folder_is_reported() -> None:
     code = (
         "import os, tempfile; os.chdir(tempfile.mkdtemp()); os.rmdir(os.getcwd()); from robot.cli import main; main()"
     )
@@ -163,18 +161,18 @@ def test_a_working_folder_that_is_gone_is_named() -> None:
 
 
 @pytest.mark.parametrize("words", [("--debug", "replay", "missing.mcap"), ("replay", "missing.mcap", "--debug")])
-def test_debug_shows_the_traceback_wherever_it_stands(words: tuple[str, ...]) -> None:
+def test_debug_option_anywhere_shows_traceback(words: tuple[str, ...]) -> None:
     assert isinstance(tacsim(*words).exception, EpisodeError)
 
 
-def test_schema_is_json_and_doctor_too() -> None:
+def test_schema_and_doctor_print_json() -> None:
     assert json.loads(tacsim("schema", "scene").stdout)["title"] == "tacsim scene"
     result = tacsim("doctor", "--json")
     report = json.loads(result.stdout)
     assert result.exit_code == (0 if report["ok"] else 1)
 
 
-def test_press_measures_a_ball(tmp_path: Path) -> None:
+def test_press_of_ball_measures_force_and_radius(tmp_path: Path) -> None:
     result = tacsim("press", "sphere", "--radius", "3 mm", "--depth", "0.5 mm", "--preset", "draft", "--out", "p")
     assert result.exit_code == 0, result.output
     config = json.loads((tmp_path / "p" / "press.json").read_text())
@@ -189,7 +187,7 @@ def test_press_measures_a_ball(tmp_path: Path) -> None:
     assert imread(tmp_path / "p" / "height.png").shape[1] == 800
 
 
-def test_the_side_of_a_mesh_that_presses_is_said_shown_and_chosen(tmp_path: Path) -> None:
+def test_press_reports_and_selects_pressing_side(tmp_path: Path) -> None:
     import trimesh
 
     trimesh.creation.box((3.0, 4.0, 6.0)).export(tmp_path / "bar.stl")
@@ -210,15 +208,17 @@ def test_the_side_of_a_mesh_that_presses_is_said_shown_and_chosen(tmp_path: Path
     assert both.exit_code == 2 and "give --down or --rotation, not both" in " ".join(both.stderr.split())
 
 
-def test_a_press_too_deep_says_first_what_is_possible(tmp_path: Path) -> None:
+def test_press_too_deep_reports_possible_depth(tmp_path: Path) -> None:
     deep = tacsim("press", "sphere", "--depth", "3.9 mm", "--preset", "draft", "--out", "deep")
-    said = re.search(r"error: the gel cannot take 3\.9 mm of this indenter; ([\d.]+) mm is possible", deep.stderr)
+    said = re.search(
+        r"error: a depth of 3\.9 mm is not possible with this indenter; ([\d.]+) mm is possible", deep.stderr
+    )
     assert deep.exit_code == 1 and said is not None
     again = tacsim("press", "sphere", "--depth", f"{said[1]} mm", "--preset", "draft", "--out", "again")
     assert again.exit_code == 0
 
 
-def test_press_slides_and_twists_against_friction(tmp_path: Path) -> None:
+def test_press_slide_and_twist_give_friction(tmp_path: Path) -> None:
     box = ("press", "box", "--size", "4 mm, 3 mm, 5 mm", "--depth", "0.4 mm", "--preset", "draft")
     assert tacsim(*box, "--slide", "0.5 mm, 0", "--twist", "5 deg", "--out", "slid").exit_code == 0
     slid = json.loads((tmp_path / "slid" / "press.json").read_text())
@@ -233,19 +233,19 @@ def test_press_slides_and_twists_against_friction(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (("sphere", "--size", "1 mm, 1 mm, 1 mm"), "--size: 'sphere' has none; it has --radius"),
-        (("cylinder", "--scale", "0.01"), "--scale: 'cylinder' has none; it has --radius and --height"),
-        (("box", "--radius", "3 mm"), "--radius: 'box' has none; it has --size"),
-        (("part.stl", "--height", "3 mm"), "--height: 'part.stl' has none; it has --scale"),
+        (("sphere", "--size", "1 mm, 1 mm, 1 mm"), "--size: 'sphere' does not have it; it has --radius"),
+        (("cylinder", "--scale", "0.01"), "--scale: 'cylinder' does not have it; it has --radius and --height"),
+        (("box", "--radius", "3 mm"), "--radius: 'box' does not have it; it has --size"),
+        (("part.stl", "--height", "3 mm"), "--height: 'part.stl' does not have it; it has --scale"),
     ],
 )
-def test_a_size_of_another_indenter_is_refused(words: tuple[str, ...], said: str) -> None:
+def test_press_size_of_other_indenter_is_refused(words: tuple[str, ...], said: str) -> None:
     result = tacsim("press", *words)
     assert result.exit_code == 2 and said in " ".join(result.stderr.split())
 
 
 @pytest.mark.parametrize(("name", "content", "said"), [("e", b"", "is empty"), ("t", bytes(84) + b"x", "should have")])
-def test_a_broken_mesh_file_ends_with_2(name: str, content: bytes, said: str, tmp_path: Path) -> None:
+def test_press_broken_mesh_exits_with_2(name: str, content: bytes, said: str, tmp_path: Path) -> None:
     (tmp_path / f"{name}.stl").write_bytes(content)
     result = tacsim("press", f"{name}.stl")
     assert result.exit_code == 2 and said in result.stderr
@@ -261,14 +261,14 @@ def test_a_broken_mesh_file_ends_with_2(name: str, content: bytes, said: str, tm
         ("TACSIM_TAICHI_PATCHES", "off", "TACSIM_TAICHI_PATCHES must be 0 (off) or 1 (on)"),
     ],
 )
-def test_a_machine_that_is_not_there_ends_with_2(variable: str, value: str, said: str, tmp_path: Path) -> None:
+def test_invalid_machine_setting_exits_with_2(variable: str, value: str, said: str, tmp_path: Path) -> None:
     words = (*START, "press", "sphere", "--preset", "draft")
     result = subprocess.run(words, env={**environment(), variable: value}, capture_output=True, text=True)
     assert result.returncode == 2 and said in result.stderr and "unexpected" not in result.stderr
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_twist_beyond_half_a_turn_goes_on_the_same_way() -> None:
+def test_press_twist_beyond_half_turn_keeps_direction() -> None:
     start, motion = Pose(np.array([0.0, 0.0, 5e-3])), PressMotion(twist=np.radians(-270.0))
     targets = _targets(start, 4e-3, motion)
     turns = [Rotation.from_quat(target.quaternion) for target in targets]
@@ -276,7 +276,7 @@ def test_a_twist_beyond_half_a_turn_goes_on_the_same_way() -> None:
     assert np.allclose(steps, [[0, 0, -90.0]] * 3)
 
 
-def test_a_press_that_is_not_held_says_so(tmp_path: Path) -> None:
+def test_press_without_hold_reports_it(tmp_path: Path) -> None:
     hasty = ("--preset", "draft", "--set", "settling.max_substeps=0", "--set", "gel.size=[8 mm, 8 mm, 4 mm]")
     result = tacsim("press", "sphere", "--radius", "2 mm", "--depth", "0.2 mm", "--out", "p", *hasty)
     assert result.exit_code == 0, result.output
@@ -285,14 +285,14 @@ def test_a_press_that_is_not_held_says_so(tmp_path: Path) -> None:
     assert "not settled, not held" in result.stderr
 
 
-def test_a_press_that_diverges_leaves_what_debug_reads(tmp_path: Path) -> None:
+def test_diverged_press_leaves_dump(tmp_path: Path) -> None:
     result = tacsim("press", "box", "--size", "5 mm, 5 mm, 5 mm", "--depth", "3.9 mm", "--preset=draft", "--out=p")
     assert result.exit_code == 1
     assert "tacsim debug p/diverged/00" in " ".join(result.output.split())
     assert (tmp_path / "p" / "diverged" / "00" / "state.npz").is_file()
 
 
-def test_a_full_disk_is_named(tmp_path: Path) -> None:
+def test_full_disk_error_names_folder(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="No space") as caught, writing(tmp_path):
         raise OSError(28, "No space left on device")
-    assert explain(caught.value) == (f"{tmp_path}: No space left on device", 1)
+    assert describe_error(caught.value) == (f"{tmp_path}: No space left on device", 1)

@@ -46,7 +46,7 @@ def compared(*words: object) -> Result:
     return tacsim("compare", *words)
 
 
-def test_it_writes_its_files_and_a_table() -> None:
+def test_compare_writes_files_and_table() -> None:
     result = compared("sim", "real", "--out", "out")
     assert result.exit_code == 0, result.output
     assert sorted(path.name for path in Path("out").iterdir()) == ["compare.csv", "compare.html", "compare.json"]
@@ -57,7 +57,7 @@ def test_it_writes_its_files_and_a_table() -> None:
     assert compared("sim", "real", "--out", "out").exit_code == 2  # nothing is overwritten
 
 
-def test_limits_decide_the_exit_code() -> None:
+def test_compare_limits_set_exit_code() -> None:
     kept = tacsim(
         "compare", "sim", "real", "--fail-above", "contact_mae=5", "--fail-below", "contact_ncc=0.9", "--out", "kept"
     )
@@ -70,7 +70,7 @@ def test_limits_decide_the_exit_code() -> None:
     assert below.exit_code == 1 and "below 0.9999" in told(below.output)
 
 
-def test_a_blank_fails_a_limit_that_a_whole_picture_would_let_through(real: FrameSet) -> None:
+def test_compare_blank_image_fails_limit(real: FrameSet) -> None:
     save(blank(real), Path("blank"))
     assert compared("blank", "real", "--fail-below", "ssim=0.8", "--out", "a").exit_code == 0
     assert compared("blank", "real", "--fail-below", "contact_ncc=0.5", "--out", "b").exit_code == 1
@@ -79,16 +79,16 @@ def test_a_blank_fails_a_limit_that_a_whole_picture_would_let_through(real: Fram
 @pytest.mark.parametrize(
     ("limit", "words"),
     [
-        ("magic=3", "'magic' is no figure; there are: mae, psnr"),
+        ("magic=3", "'magic' is not a figure; allowed: mae, psnr"),
         ("contact_mae", "'contact_mae'"),
         ("contact_mae=low", "'contact_mae=low'"),
         ("contact_mae=nan", "is not METRIC=VALUE"),
         ("height_rmse=3 s", "'height_rmse=3 s'"),
-        ("gradient_angle=3", "not known of these frames: gradient_angle"),
-        ("rho_gradient=1", "not known of these frames: rho_gradient"),
+        ("gradient_angle=3", "not measured in these frames: gradient_angle"),
+        ("rho_gradient=1", "not measured in these frames: rho_gradient"),
     ],
 )
-def test_limits_that_mean_nothing_are_refused(limit: str, words: str) -> None:
+def test_compare_invalid_limits_are_refused(limit: str, words: str) -> None:
     result = compared("sim", "real", "--fail-above", limit, "--out", "out")
     assert result.exit_code == 2
     assert words in told(result.output)
@@ -109,7 +109,7 @@ def test_limits_that_mean_nothing_are_refused(limit: str, words: str) -> None:
         (("press", "real", "--sensor-a", "x"), "A is the scene 'press'"),
     ],
 )
-def test_what_cannot_be_compared_is_said_without_a_traceback(words: tuple[str, ...], message: str) -> None:
+def test_compare_invalid_input_is_reported(words: tuple[str, ...], message: str) -> None:
     result = compared(*words, "--out", "out")
     assert result.exit_code == 2
     assert message in told(result.output)
@@ -117,7 +117,7 @@ def test_what_cannot_be_compared_is_said_without_a_traceback(words: tuple[str, .
     assert not Path("out").exists()
 
 
-def test_counts_that_differ_and_the_way_out(real: FrameSet) -> None:
+def test_compare_different_counts_need_pair_name(real: FrameSet) -> None:
     Path("sim/press_4.png").unlink()
     refused = compared("sim", "real", "--out", "out")
     assert refused.exit_code == 2 and "--pair name" in told(refused.output)
@@ -125,14 +125,14 @@ def test_counts_that_differ_and_the_way_out(real: FrameSet) -> None:
     assert named.exit_code == 0 and "no partner of their name" in told(named.output)
 
 
-def test_warnings_reach_the_person(good: FrameSet, real: FrameSet) -> None:
+def test_compare_prints_warnings(good: FrameSet, real: FrameSet) -> None:
     save(changed(good, lambda image: np.ascontiguousarray(image[..., ::-1]), "all"), Path("bgr"))
     assert "red and blue look swapped" in told(compared("bgr", "real", "--out", "a").output)
     save(blank(real), Path("blank"))
     assert "A: no contact" in told(compared("blank", "real", "--out", "b").output)
 
 
-def test_calibrations_bring_surfaces_and_invariance() -> None:
+def test_compare_with_calibrations_adds_surfaces_and_invariance() -> None:
     calibration, reference = calibrated(HiddenSensor(3))
     Path("bundle").mkdir()
     write_bundle(Path("bundle"), calibration, reference)
@@ -153,7 +153,7 @@ def test_calibrations_bring_surfaces_and_invariance() -> None:
     assert "small is 260 x 100 px, the calibration of A is of 260 x 200" in told(wrong.output)
 
 
-def test_an_episode_is_a_side_with_its_surfaces(real: FrameSet) -> None:
+def test_compare_episode_uses_its_surfaces(real: FrameSet) -> None:
     surface = SurfaceMap(
         height=np.full((64, 64), 1e-4, dtype=np.float32), gradient=np.zeros((64, 64, 2), dtype=np.float32), flow=None
     )

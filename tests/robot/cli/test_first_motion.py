@@ -40,7 +40,7 @@ def one_arm(folder: Path) -> Iterator[Lab]:
         yield lab
 
 
-def test_a_dry_run_on_a_copy_of_the_one_arm_file(one_arm: Lab, folder: Path, tmp_path: Path) -> None:
+def test_dry_run_on_one_arm_file_records_episode(one_arm: Lab, folder: Path, tmp_path: Path) -> None:
     result = tacsim("run", folder / "my.yaml", "--dry-run", "--steps", "2", "--out", "dry")
     assert result.exit_code == 0, result.output
     assert (tmp_path / "dry" / "report.html").exists()
@@ -61,7 +61,7 @@ def test_a_dry_run_on_a_copy_of_the_one_arm_file(one_arm: Lab, folder: Path, tmp
         (["--set", "arms.arm.mock={}"], "either a maker's simulator .* or our mock"),
     ],
 )
-def test_what_does_not_fit_is_refused_before_anything_is_opened(
+def test_unsuitable_run_is_refused_before_opening(
     tmp_path: Path, words: list[str], said: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def opened(*_: object, **__: object) -> None:
@@ -99,7 +99,7 @@ def follow(command: str, folder: Path) -> tuple[int, str]:
         return screen.end(), screen.picture
 
 
-def test_the_pages_lead_through_every_step() -> None:
+def test_pages_contain_each_step() -> None:
     told = " ".join(commands())
     for step in ("doctor --rig", "--dry-run", "--policy grip", "calibrate latency", "calibrate touch"):
         assert step in told
@@ -107,7 +107,7 @@ def test_the_pages_lead_through_every_step() -> None:
 
 @pytest.mark.deep
 @pytest.mark.parametrize("command", commands())
-def test_every_command_of_the_pages_runs_on_the_one_arm_file(one_arm: Lab, folder: Path, command: str) -> None:
+def test_commands_of_pages_run_on_one_arm_file(one_arm: Lab, folder: Path, command: str) -> None:
     code, shown = follow(command, folder)
     if "calibrate touch" in command:  # as the page says, of a sensor whose light is calibrated
         assert code == 2 and "calibrate its light first" in shown, shown
@@ -116,7 +116,7 @@ def test_every_command_of_the_pages_runs_on_the_one_arm_file(one_arm: Lab, folde
 
 
 @pytest.mark.deep
-def test_a_first_episode_on_a_copy_of_the_two_arm_file(tmp_path: Path) -> None:
+def test_first_episode_on_two_arm_file_touches(tmp_path: Path) -> None:
     with Lab(copy_of("ur5e", tmp_path, 63)) as lab:
         code, shown = follow("tacsim run my.yaml --steps 3 --out first", tmp_path)
         assert code == 0, shown
@@ -128,7 +128,7 @@ def test_a_first_episode_on_a_copy_of_the_two_arm_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("moment", "key", "code"), [("[y/N]:", "\x03", 130), ("[y/N]:", "\x04", 1), ("mm of", "\x03", 130)]
 )
-def test_who_wants_to_stop_is_heard_at_once(one_arm: Lab, folder: Path, moment: str, key: str, code: int) -> None:
+def test_stop_request_at_question_ends_command(one_arm: Lab, folder: Path, moment: str, key: str, code: int) -> None:
     """At the question, and on the approach: the arm rests, nothing was touched."""
     with Terminal("run", "my.yaml", "--out", "never", folder=folder) as screen:
         screen.wait_for("[y/N]:")
@@ -137,14 +137,14 @@ def test_who_wants_to_stop_is_heard_at_once(one_arm: Lab, folder: Path, moment: 
             screen.wait_for(moment)
         screen.type(key)
         assert screen.end() == code, screen.picture
-        assert screen.shows("nobody answered" if key == "\x04" else "stopped by SIGINT")
+        assert screen.shows("no answer to the question" if key == "\x04" else "stopped by SIGINT")
     state = one_arm.faults["arm"].state()
     assert state.rests and one_arm.depth("arm", state.pose) < 0.0
     assert not (folder / "never").exists()
 
 
 @pytest.mark.deep
-def test_the_question_before_presses_by_hand_stays_on_the_screen(one_arm: Lab, folder: Path) -> None:
+def test_question_before_manual_presses_stays_on_screen(one_arm: Lab, folder: Path) -> None:
     words = ("calibrate", "sensor", "--camera", "my.yaml/finger", "--ball-radius", "4 mm", "--pixel-pitch", "0.03 mm")
     with Terminal(*words, folder=folder, columns=40) as screen:
         screen.wait_for("Is nothing touching the gel? [Y/n]:")
@@ -152,4 +152,4 @@ def test_the_question_before_presses_by_hand_stays_on_the_screen(one_arm: Lab, f
         screen.wait_for("Take everything off the gel first.")
         screen.until(lambda: screen.text.count("[Y/n]:") == 2, "the question once more")
         screen.type("\x04")
-        assert screen.end() == 1 and screen.shows("nobody answered")
+        assert screen.end() == 1 and screen.shows("no answer to the question")

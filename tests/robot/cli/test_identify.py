@@ -21,11 +21,11 @@ from tests.robot.cli.invoked import START, environment, tacsim
         (("body", "gone", "--set", "physics=seed"), "cannot be identified"),
         (("gel", "a.csv", "--fit", "colour"), "'colour' is nothing that can be identified of a gel; allowed: youngs"),
         (("gel", "gone", "--force-noise", "0 N"), "allowed: 1e-06 to 1000"),
-        (("gel", "gone", "--ball", "6 mm"), "'6 mm' is no NAME=RADIUS"),
+        (("gel", "gone", "--ball", "6 mm"), "'6 mm' is not NAME=RADIUS"),
         (("gel", "a.csv", "--ball", "b=6 mm"), "no recording 'b' that a ball belongs to; there are a"),
     ],
 )
-def test_what_cannot_be_is_said(
+def test_identify_invalid_input_is_reported(
     words: tuple[str, ...], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -35,7 +35,7 @@ def test_what_cannot_be_is_said(
     assert [path.name for path in tmp_path.iterdir()] == ["a.csv"]
 
 
-def test_motions_are_written_with_the_commands_that_run_them(tmp_path: Path) -> None:
+def test_identify_motions_prints_run_commands(tmp_path: Path) -> None:
     result = tacsim("identify", "body", "--motions", tmp_path / "m")
     assert result.exit_code == 0 and "tacsim run sim --policy" in result.output
     assert sorted(path.name for path in (tmp_path / "m").iterdir()) == ["slide.csv", "squeeze.csv", "tilt.csv"]
@@ -43,7 +43,7 @@ def test_motions_are_written_with_the_commands_that_run_them(tmp_path: Path) -> 
 
 
 @pytest.mark.deep
-def test_a_gel_whose_truth_another_process_knows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_identify_gel_recovers_hidden_truth(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The twin has another mesh. A flat punch taken for its ball is noticed."""
     monkeypatch.chdir(tmp_path)
     truth = {"youngs_modulus": 0.19e6, "friction": 0.42}

@@ -37,7 +37,7 @@ def exit_of(act: Callable[[Interrupt], object]) -> int:
 
 
 @pytest.mark.parametrize("number", NUMBERS)
-def test_before_anybody_asks_a_signal_ends_the_command_at_once(
+def test_signal_before_first_poll_ends_command_at_once(
     number: signal.Signals, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Opening a rig, the reset with its approach, a question to a person: nothing there looks at the flag."""
@@ -48,7 +48,7 @@ def test_before_anybody_asks_a_signal_ends_the_command_at_once(
 
 
 @pytest.mark.parametrize("number", NUMBERS)
-def test_who_asks_ends_in_order_unless_a_second_signal_comes(number: signal.Signals) -> None:
+def test_polled_signal_ends_in_order_and_second_at_once(number: signal.Signals) -> None:
     with Interrupt() as interrupt:
         assert not interrupt() and interrupt.exit_code == 0
         os.kill(os.getpid(), number)
@@ -62,7 +62,7 @@ def test_who_asks_ends_in_order_unless_a_second_signal_comes(number: signal.Sign
     assert exit_of(twice) == 128 + number
 
 
-def test_a_question_that_is_broken_off_is_a_signal_too() -> None:
+def test_aborted_question_counts_as_signal() -> None:
     def asked(_: Interrupt) -> None:
         try:
             os.kill(os.getpid(), signal.SIGINT)
@@ -72,7 +72,7 @@ def test_a_question_that_is_broken_off_is_a_signal_too() -> None:
     assert exit_of(asked) == 130
 
 
-def test_what_nohup_started_goes_on() -> None:
+def test_nohup_process_ignores_hangup() -> None:
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         with Interrupt() as interrupt:
@@ -85,7 +85,7 @@ def test_what_nohup_started_goes_on() -> None:
 LOST = """
 import sys, time
 from pathlib import Path
-from robot.cli.errors import complain
+from robot.cli.errors import print_error
 from robot.cli.terminal import Interrupt
 from robot.cli.output import progress, results
 with Interrupt() as interrupt, progress() as bar:
@@ -97,12 +97,12 @@ with Interrupt() as interrupt, progress() as bar:
     bar.update(row, completed=1)
 Path(sys.argv[1]).write_text("saved")
 results.print("the report")
-complain("stopped by a signal")
+print_error("stopped by a signal")
 sys.exit(interrupt.exit_code)
 """
 
 
-def test_a_lost_terminal_does_not_keep_it_from_saving(tmp_path: Path) -> None:
+def test_lost_terminal_does_not_prevent_saving(tmp_path: Path) -> None:
     """Each print to such a terminal is an OSError."""
     master, slave = pty.openpty()
     words = [sys.executable, "-c", LOST, str(tmp_path / "report")]

@@ -11,7 +11,7 @@ from tests.robot.cli.invoked import tacsim
 
 
 @pytest.mark.parametrize("words", [("train", "squeeze"), ("export", "policy", "runs/x", "--out", "x.onnx")])
-def test_without_the_extra_the_error_names_it(words: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_train_without_extra_names_it(words: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
     there = importlib.util.find_spec
 
     def find(name: str, *rest: Any) -> Any:

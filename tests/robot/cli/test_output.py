@@ -35,7 +35,7 @@ def check(shown: str) -> None:
     assert "\\x1b[2J" in shown
 
 
-def test_a_console_shows_what_it_is_given_and_obeys_nothing() -> None:
+def test_console_prints_control_characters_as_text() -> None:
     table = Table(title=Text(EVIL))
     table.add_row(EVIL, Text(EVIL))
     for what in (EVIL, Text(EVIL), table):
@@ -44,7 +44,7 @@ def test_a_console_shows_what_it_is_given_and_obeys_nothing() -> None:
         check(console.file.getvalue())  # type: ignore[attr-defined]
 
 
-def test_its_own_colours_and_cursor_stay() -> None:
+def test_console_keeps_own_colours_and_cursor() -> None:
     there = {"TERM": "xterm", "COLUMNS": "100"}
     console = SafeConsole(file=io.StringIO(), force_terminal=True, _environ=there)
     with Progress(TextColumn("{task.description}", markup=False), console=console) as bar:
@@ -54,17 +54,17 @@ def test_its_own_colours_and_cursor_stay() -> None:
     assert "\\x1b[2J" in shown and "\x1b[2J" not in shown and "\u202e" not in shown
 
 
-def test_errors_and_checks_are_shown_the_same_way(capsys: pytest.CaptureFixture[str]) -> None:
-    errors.complain(EVIL)
+def test_errors_and_checks_print_control_characters_as_text(capsys: pytest.CaptureFixture[str]) -> None:
+    errors.print_error(EVIL)
     check(capsys.readouterr().err)
     print_checks([Check("serial", "warn", EVIL, "do this")])
     check(capsys.readouterr().out)
-    message, _ = errors.explain(FileNotFoundError(2, "No such file", "x\ny" + EVIL))
+    message, _ = errors.describe_error(FileNotFoundError(2, "No such file", "x\ny" + EVIL))
     check(message)
     assert "\n" not in message
 
 
-def test_names_in_a_recording_are_shown_not_obeyed(tmp_path: Path) -> None:
+def test_names_in_recording_are_printed_as_text(tmp_path: Path) -> None:
     spec = RigSpec({"lower": SensorSpec((8, 8), False, False, None)}, (), truth=False, period=0.1)
     meta = EpisodeMeta("rig\nerror: all is lost" + EVIL, None, EVIL, 0, spec, {EVIL: EVIL})
     frames = {"lower": TactileFrame(np.zeros((8, 8, 3), np.uint8), time=0.0, index=0)}
@@ -78,7 +78,7 @@ def test_names_in_a_recording_are_shown_not_obeyed(tmp_path: Path) -> None:
     check(page)
 
 
-def test_a_sensor_in_a_recording_has_a_name(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sensor_name_with_control_characters_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     name = "x\x1b[2J"
     spec = RigSpec({name: SensorSpec((8, 8), False, False, None)}, (), truth=False, period=0.1)
     meta = EpisodeMeta("r", None, "p", 0, spec, {})
@@ -93,7 +93,7 @@ def test_a_sensor_in_a_recording_has_a_name(monkeypatch: pytest.MonkeyPatch) -> 
     check(result.stderr)
 
 
-def test_a_table_says_its_units(capsys: pytest.CaptureFixture[str]) -> None:
+def test_table_prints_units_in_brackets(capsys: pytest.CaptureFixture[str]) -> None:
     show_table("of [N]", ("frame", "radius [mm]", "of [grey levels]"), [("a [1].png", "1.5", "40")])
     shown = capsys.readouterr().out
     assert all(words in shown for words in ("of [N]", "radius [mm]", "of [grey levels]", "a [1].png")), shown
@@ -107,7 +107,7 @@ def _options(command: Any, name: str) -> Iterator[tuple[str, str]]:
         yield from _options(each, f"{name} {word}")
 
 
-def test_the_help_of_every_option_says_its_units() -> None:
+def test_help_of_each_option_prints_units() -> None:
     """Brackets are markup there: a unit in them would not be shown."""
     lost = [
         name
@@ -118,7 +118,7 @@ def test_the_help_of_every_option_says_its_units() -> None:
 
 
 @pytest.mark.parametrize("columns", [1, 20])
-def test_a_narrow_terminal_loses_nothing(columns: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_narrow_terminal_prints_complete_table(columns: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", str(columns))
     table = Table(show_header=False, min_width=60)
     table.add_row("peak force |Fz|", "0.59 N (upper, step 1)")
@@ -127,7 +127,7 @@ def test_a_narrow_terminal_loses_nothing(columns: int, monkeypatch: pytest.Monke
     assert "0.59 N (upper, step 1)" in shown.getvalue()
 
 
-def test_a_file_that_cannot_be_written_is_refused_before_the_work(tmp_path: Path) -> None:
+def test_require_writable_refuses_before_work(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     require_writable(tmp_path / "new" / "file", "--json", new=True)
     require_writable(tmp_path / "file", "--json")

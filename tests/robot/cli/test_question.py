@@ -11,17 +11,17 @@ from pathlib import Path
 
 import pytest
 
-from robot.cli.terminal import ask
+from robot.cli.terminal import ask_operator
 from tests.robot.cli.invoked import environment, tacsim
 from tests.robot.cli.lab import copy_of
 from tests.robot.cli.terminal import Terminal
 
-QUESTION = "Is the body in its place before the sensor, and everybody out of reach of the arm?"
+QUESTION = "Is the body in its place in front of the sensor, and is everyone out of reach of the arm?"
 ASKING = f"""
 import time
 from pathlib import Path
 from robot.cli.output import busy, notes, progress
-from robot.cli.terminal import ask
+from robot.cli.terminal import ask_operator
 from robot.cli.terminal import Interrupt
 def wait(moment):
     while not Path(moment).exists():
@@ -29,7 +29,7 @@ def wait(moment):
 def asked(moment):
     notes.print("on the way")
     wait(moment)
-    notes.print("SAID " + str(ask({QUESTION!r})))
+    notes.print("SAID " + str(ask_operator({QUESTION!r})))
 with Interrupt() as interrupt:
     with progress() as bar:
         row = bar.add_task("starting slowly", total=12)
@@ -51,7 +51,7 @@ def stays(screen: Terminal, words: str) -> None:
 
 
 @pytest.mark.parametrize("columns", [100, pytest.param(30, marks=pytest.mark.deep)])
-def test_a_question_stays_on_the_screen_and_the_bar_goes_on_after_it(tmp_path: Path, columns: int) -> None:
+def test_question_stays_on_screen_and_bar_continues(tmp_path: Path, columns: int) -> None:
     with Terminal(program=ASKING, folder=tmp_path, columns=columns) as screen:
         screen.wait_for("starting")
         (tmp_path / "started").touch()
@@ -70,10 +70,10 @@ def test_a_question_stays_on_the_screen_and_the_bar_goes_on_after_it(tmp_path: P
 
 @pytest.mark.parametrize(
     ("typed", "said"),
-    [("\x03", "stopped by SIGINT"), ("\x04", "nobody answered"), ("what?\n\n", "SAID False")],
+    [("\x03", "stopped by SIGINT"), ("\x04", "no answer to the question"), ("what?\n\n", "SAID False")],
     ids=["Ctrl-C", "end of input", "nonsense, then Enter"],
 )
-def test_what_is_no_yes_ends_the_question(tmp_path: Path, typed: str, said: str) -> None:
+def test_question_without_yes_is_not_confirmed(tmp_path: Path, typed: str, said: str) -> None:
     (tmp_path / "started").touch()
     with Terminal(program=ASKING, folder=tmp_path) as screen:
         screen.wait_for(f"{QUESTION} [y/N]:")
@@ -83,7 +83,7 @@ def test_what_is_no_yes_ends_the_question(tmp_path: Path, typed: str, said: str)
         screen.wait_for(said)
 
 
-def test_a_yes_typed_before_the_question_is_no_answer(tmp_path: Path) -> None:
+def test_text_typed_before_question_is_discarded(tmp_path: Path) -> None:
     with Terminal(program=ASKING, folder=tmp_path) as screen:
         screen.wait_for("on the way")
         screen.type("y\n")
@@ -96,16 +96,16 @@ def test_a_yes_typed_before_the_question_is_no_answer(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "words", [["run"], ["calibrate", "latency", "--arm", "arm", "--sensor", "finger"]], ids=["run", "latency"]
 )
-def test_without_a_terminal_no_real_arm_moves(tmp_path: Path, words: list[str]) -> None:
+def test_run_without_terminal_refuses_real_arm(tmp_path: Path, words: list[str]) -> None:
     file = copy_of("ur5e-one", tmp_path, 61)
     result = tacsim(*words, str(file))
     assert result.exit_code == 2, result.output
     assert "run this from a terminal" in " ".join(result.stderr.split())
 
 
-def test_a_question_that_nobody_could_read_is_not_asked(tmp_path: Path) -> None:
+def test_question_without_readable_output_is_not_asked(tmp_path: Path) -> None:
     """The input is a terminal, what is asked would go into a file."""
-    program = "from robot.cli.terminal import ask\nprint(ask('Yes?'))"
+    program = "from robot.cli.terminal import ask_operator\nprint(ask_operator('Yes?'))"
     outer, inner = os.openpty()
     done = subprocess.run(
         [sys.executable, "-c", program], stdin=inner, capture_output=True, text=True, timeout=60, env=environment()
@@ -115,12 +115,12 @@ def test_a_question_that_nobody_could_read_is_not_asked(tmp_path: Path) -> None:
     assert done.stdout == "False\n", done
 
 
-def test_a_program_without_standard_input_has_nobody_to_ask(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_question_without_standard_input_returns_false(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "stdin", None)  # started by `<&-`, or by a service
-    assert not ask("Is anybody there?")
+    assert not ask_operator("Is anybody there?")
 
 
-def test_a_calibration_asks_before_it_opens_anything(tmp_path: Path) -> None:
+def test_calibration_asks_before_opening_devices(tmp_path: Path) -> None:
     """Nothing answers at the file's addresses."""
     text = copy_of("ur5e-one", tmp_path, 61).read_text().replace("model: null", "model: ideal")
     text = re.sub(r"corners: .*", "", text).replace("width: 640", "width: 320").replace("height: 480", "height: 240")
@@ -129,4 +129,4 @@ def test_a_calibration_asks_before_it_opens_anything(tmp_path: Path) -> None:
     with Terminal(*words, folder=tmp_path, columns=40) as screen:
         screen.wait_for("may the arm move? [y/N]:")
         screen.type("n\n")
-        assert screen.end() == 2 and screen.shows("nobody confirmed")
+        assert screen.end() == 2 and screen.shows("the operator did not confirm")

@@ -33,7 +33,7 @@ def cut(tmp_path: Path) -> Path:
     return tmp_path / "cut.mcap"
 
 
-def test_a_cut_recording_is_recovered_and_said(cut: Path, tmp_path: Path) -> None:
+def test_recover_cut_recording_reports_losses(cut: Path, tmp_path: Path) -> None:
     before = cut.read_bytes()
     result = tacsim("recover", "cut.mcap")
     assert result.exit_code == 0, result.output
@@ -51,7 +51,7 @@ def test_a_cut_recording_is_recovered_and_said(cut: Path, tmp_path: Path) -> Non
     assert "its rig file does not fit this tacsim (clock: is missing" in " ".join(shown.stderr.split())
 
 
-def test_what_is_no_recording_says_so(tmp_path: Path) -> None:
+def test_recover_invalid_file_is_reported(tmp_path: Path) -> None:
     (tmp_path / "empty.mcap").touch()
     (tmp_path / "text.mcap").write_text("hello")
     for name, words in (("empty", "is empty"), ("text", "not an MCAP file"), ("none", "no such file")):
@@ -60,7 +60,7 @@ def test_what_is_no_recording_says_so(tmp_path: Path) -> None:
     assert len(list(tmp_path.iterdir())) == 2
 
 
-def test_a_full_disk_leaves_nothing_half(cut: Path, tmp_path: Path) -> None:
+def test_recover_on_full_disk_leaves_no_file(cut: Path, tmp_path: Path) -> None:
     half = cut.stat().st_size // 2
     process = subprocess.run(
         [*START, "recover", "cut.mcap"],

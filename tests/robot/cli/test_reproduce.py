@@ -41,7 +41,7 @@ def made_up(distance: list[float]) -> Trial:
     )
 
 
-def test_a_curve_is_the_seeds_only_if_it_rises_to_the_goal_and_falls() -> None:
+def test_reproduce_accepts_only_curve_with_peak_at_goal() -> None:
     good = made_up([3.0, 1.5, 0.04, 1.0, 2.0])
     assert shortcomings("squeeze", good) == []
     assert "closest" in shortcomings("squeeze", made_up([3.0, 1.5, 0.06, 1.0, 2.0]))[0]
@@ -54,7 +54,7 @@ def test_a_curve_is_the_seeds_only_if_it_rises_to_the_goal_and_falls() -> None:
     assert shortcomings("squeeze", made_up([float("nan")] * 5))  # nothing is no success
 
 
-def test_what_the_reproduction_tells() -> None:
+def test_reproduce_prints_result_per_trial() -> None:
     assert key_steps(26, 15) == [0, 7, 15, 20, 25]
     assert key_steps(3, 2) == [0, 1, 2]
     config = as_json({"squeeze": {"seed": made_up([1.0, 0.0, 1.0])}})
@@ -65,7 +65,7 @@ def test_what_the_reproduction_tells() -> None:
 
 
 @pytest.mark.deep
-def test_a_trial_that_fails_in_its_own_process_says_why() -> None:
+def test_failed_trial_reports_its_error() -> None:
     with pytest.raises(TrialFailed, match=r"squeeze by physics 'magic' failed: KeyError"):
         run_trials([("squeeze", "magic")])
 
@@ -76,7 +76,7 @@ def test_a_trial_that_fails_in_its_own_process_says_why() -> None:
     ("number", "to_group", "code"),
     [(signal.SIGTERM, False, 143), (signal.SIGHUP, True, 129), (signal.SIGKILL, False, -signal.SIGKILL)],
 )
-def test_a_signal_ends_the_reproduction_and_its_processes(
+def test_signal_ends_reproduce_and_its_processes(
     tmp_path: Path, number: signal.Signals, to_group: bool, code: int
 ) -> None:
     words = [*START, "reproduce", "--out", "f"]
@@ -107,7 +107,7 @@ def _wait_for_children(process: subprocess.Popen[str]) -> list[int]:
 
 @pytest.mark.deep
 @pytest.mark.timeout(600)
-def test_the_seeds_experiment_comes_out(tmp_path: Path) -> None:
+def test_reproduce_seed_experiment_succeeds(tmp_path: Path) -> None:
     result = tacsim("reproduce", "--out", "f")
     assert result.exit_code == 0, result.output
     config = json.loads((tmp_path / "f" / "fig4.json").read_text())

@@ -17,7 +17,7 @@ from tests.robot.cli.invoked import START, TINY, environment, tacsim
 pytestmark = pytest.mark.usefixtures("empty_folder")
 
 
-def test_run_makes_exactly_its_steps_and_replay_shows_them_again(tmp_path: Path) -> None:
+def test_run_records_given_steps_and_replay_shows_them(tmp_path: Path) -> None:
     result = tacsim("run", "--steps", "3", "--seed", "5", "--out", "r", *TINY)
     assert result.exit_code == 0, result.output
     names = ("report.html", "report.png", "episode.mcap", "summary.json")
@@ -37,7 +37,7 @@ def test_run_makes_exactly_its_steps_and_replay_shows_them_again(tmp_path: Path)
     assert again["force"] == config["force"]
 
 
-def test_run_without_out_makes_a_folder_below_runs(tmp_path: Path) -> None:
+def test_run_without_out_makes_folder_in_runs(tmp_path: Path) -> None:
     result = tacsim("run", "--steps", "0", "--task", "reposition", *TINY)
     assert result.exit_code == 0, result.output
     (folder,) = (tmp_path / "runs").iterdir()
@@ -45,7 +45,7 @@ def test_run_without_out_makes_a_folder_below_runs(tmp_path: Path) -> None:
     assert f"runs/{folder.name}/report.html" in result.stdout
 
 
-def test_particles_of_the_body_are_recorded_where_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_run_records_requested_particles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("robot.deploy.control_loop.MAX_PARTICLES", 7)
     for name, more in (("with", ["--set", "record.body=true"]), ("without", [])):
         result = tacsim("run", "--steps", "1", "--out", name, *TINY, *more)
@@ -59,7 +59,7 @@ def test_particles_of_the_body_are_recorded_where_asked_for(tmp_path: Path, monk
         assert refused.exit_code == 2 and "only a simulated rig with a body" in refused.stderr.replace("\n", " ")
 
 
-def test_an_error_of_the_policy_keeps_what_was_done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_policy_error_keeps_finished_steps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "here.py").write_text("def act(observation):\n    raise RuntimeError('no idea')\n")
     result = tacsim("run", "--policy", "here:act", "--steps", "3", "--out", "r", *TINY)
     assert result.exit_code == 1
@@ -68,7 +68,7 @@ def test_an_error_of_the_policy_keeps_what_was_done(tmp_path: Path, monkeypatch:
     assert len(read_episode(tmp_path / "r" / "episode.mcap").steps) == 1
 
 
-def test_an_episode_without_steps_ends_with_its_own_error_alone(tmp_path: Path) -> None:
+def test_episode_without_steps_prints_only_its_error(tmp_path: Path) -> None:
     text = "class Act:\n    needs = Needs()\n    def reset(self): raise OSError('no gripper')\n"
     text += "    def __call__(self, observation): return None\n"
     (tmp_path / "unready.py").write_text("from tacsim.interface import Needs\n" + text)
@@ -84,7 +84,7 @@ def test_an_episode_without_steps_ends_with_its_own_error_alone(tmp_path: Path) 
 
 @pytest.mark.deep
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
-def test_a_signal_ends_the_episode_and_saves_it(tmp_path: Path, number: signal.Signals, code: int) -> None:
+def test_signal_ends_episode_and_saves_it(tmp_path: Path, number: signal.Signals, code: int) -> None:
     words = ("run", "--steps", "100000", "--task", "reposition", "--out", "r", *TINY)
     process = subprocess.Popen(
         [*START, *words], env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -105,15 +105,13 @@ def test_a_signal_ends_the_episode_and_saves_it(tmp_path: Path, number: signal.S
     assert "Traceback" not in errors
 
 
-def test_a_signal_in_this_process_ends_the_episode_and_saves_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_signal_in_process_ends_episode_and_saves_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     text = "import os, signal\nfrom tacsim.interface import Action\n"
     text += "def act(observation):\n    os.kill(os.getpid(), signal.SIGTERM)\n    return Action({})\n"
     (tmp_path / "ending.py").write_text(text)
     result = tacsim("run", "--policy", "ending:act", "--steps", "9", "--out", "r", *TINY)
     assert result.exit_code == 143, result.output
-    assert "stopped by a signal before the last step; what was done is saved" in result.stderr
+    assert "stopped by a signal before the last step; all finished steps are saved" in result.stderr
     assert len(read_episode(tmp_path / "r" / "episode.mcap").steps) == 2
 
 

@@ -32,9 +32,9 @@ def fast(file: Path) -> Path:
 
 
 @pytest.mark.deep
-def test_arms_are_led_to_their_start_and_a_dry_run_follows(tmp_path: Path) -> None:
+def test_start_moves_arms_to_start_then_dry_run(tmp_path: Path) -> None:
     file = fast(copy_of("ur5e-one", tmp_path, 66))
-    with Lab(file, beside=AWAY) as lab:
+    with Lab(file, offset=AWAY) as lab:
         lab.faults["arm"].wrench([0.0, OFFSET, 0.0, 0.0, 0.0, 0.0])
         refused = tacsim("run", str(file), "--dry-run", "--steps", "2", "--out", "dry")
         assert refused.exit_code == 1, refused.output
@@ -60,9 +60,9 @@ def test_arms_are_led_to_their_start_and_a_dry_run_follows(tmp_path: Path) -> No
 
 
 @pytest.mark.deep
-def test_ctrl_c_brakes_an_arm_on_its_way_and_a_no_moves_nothing(tmp_path: Path) -> None:
+def test_start_ctrl_c_brakes_arm_and_no_moves_nothing(tmp_path: Path) -> None:
     file = fast(copy_of("ur5e-one", tmp_path, 66))
-    with Lab(file, beside=AWAY) as lab:
+    with Lab(file, offset=AWAY) as lab:
         faults, here = lab.faults["arm"], lab.faults["arm"].state().joints
         with Terminal("start", str(file), folder=tmp_path, lines=80) as terminal:
             terminal.wait_for("Connect")
@@ -84,7 +84,7 @@ def test_ctrl_c_brakes_an_arm_on_its_way_and_a_no_moves_nothing(tmp_path: Path) 
         assert state.rests and not state.program and not np.allclose(state.joints, here, atol=1e-3)
 
 
-def test_without_a_terminal_nothing_is_led(tmp_path: Path) -> None:
+def test_start_without_terminal_moves_nothing(tmp_path: Path) -> None:
     result = tacsim("start", str(copy_of("ur5e-one", tmp_path, 66)))
     assert result.exit_code == 2 and "run this from a terminal" in " ".join(result.stderr.split())
     result = tacsim("start", "sim")
@@ -92,9 +92,9 @@ def test_without_a_terminal_nothing_is_led(tmp_path: Path) -> None:
 
 
 @pytest.mark.deep
-def test_an_arm_whose_assistant_is_killed_comes_to_rest(tmp_path: Path) -> None:
+def test_start_killed_process_brings_arm_to_rest(tmp_path: Path) -> None:
     file = fast(copy_of("ur5e-one", tmp_path, 66))
-    with Lab(file, beside=AWAY) as lab:
+    with Lab(file, offset=AWAY) as lab:
         faults, here = lab.faults["arm"], np.array(lab.faults["arm"].state().joints)
         with Terminal("start", str(file), folder=tmp_path, lines=80) as terminal:
             for question in ("Connect", "of this way (Ctrl-C brakes it)?", "shall it go on to its start"):
@@ -107,9 +107,9 @@ def test_an_arm_whose_assistant_is_killed_comes_to_rest(tmp_path: Path) -> None:
         assert 0.04 < gone < 0.12  # of 0.157 rad
 
 
-def test_a_no_to_zeroing_leaves_an_arm_that_feels_too_much(tmp_path: Path) -> None:
+def test_start_without_zeroing_keeps_force_fault(tmp_path: Path) -> None:
     file = fast(copy_of("ur5e-one", tmp_path, 66))
-    with Lab(file, beside=AWAY) as lab:
+    with Lab(file, offset=AWAY) as lab:
         lab.faults["arm"].wrench([0.0, OFFSET, 0.0, 0.0, 0.0, 0.0])
         here, said = lab.faults["arm"].state().joints, list[str]()
         away = lead_to_start(lab.config, lab.starts, Guide(lambda question: "Connect" in question, said.append))

@@ -31,22 +31,22 @@ def tree(command: Any) -> dict[str, Any]:
 
 # The default depends on what is compared now: none of a scene, whose pictures are made in B's pixels
 CHANGED = {("tacsim compare", "--shift")}
-# What is left out is as before; told apart from what is given, a size of another indenter can be refused
+# Defaults are None, so that a size of another indenter can be refused; the result is as before
 CHANGED |= {("tacsim press", option) for option in ("--radius", "--height", "--size", "--scale")}
 
 
 @pytest.mark.deep
-def test_every_command_and_option_of_the_first_release_is_there() -> None:
-    """Made anew by running this file with the code to compare with on PYTHONPATH."""
+def test_commands_and_options_of_first_release_exist() -> None:
+    """Made again by running this file with the code to compare with on PYTHONPATH."""
     before = json.loads(FIXTURE.read_text(encoding="utf-8"))
     now = json.loads(json.dumps(tree(typer.main.get_command(app))))
     missing: list[str] = []
 
     def compare(old: dict[str, Any], new: dict[str, Any], name: str) -> None:
         missing.extend(
-            f"{name}: {key}: {told} -> {new['parameters'].get(key)}"
-            for key, told in old["parameters"].items()
-            if new["parameters"].get(key) != told and (name, key) not in CHANGED
+            f"{name}: {key}: {before_value} -> {new['parameters'].get(key)}"
+            for key, before_value in old["parameters"].items()
+            if new["parameters"].get(key) != before_value and (name, key) not in CHANGED
         )
         for key, each in old["commands"].items():
             if key in new["commands"]:

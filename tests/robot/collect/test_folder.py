@@ -223,7 +223,7 @@ def test_a_signal_ends_the_workers_and_says_how_to_go_on(tmp_path: Path) -> None
     process.send_signal(signal.SIGTERM)
     _, said = process.communicate(timeout=20)
     assert process.returncode == 128 + signal.SIGTERM
-    assert "0 of 1000 are there. The same command goes on" in said
+    assert "0 of 1000 are finished. Run the same command again to continue" in said
     _wait_for(lambda: not any(Path(f"/proc/{child}").exists() for child in children))
 
 

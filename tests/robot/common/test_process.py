@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from robot.common import process
-from robot.common.process import LARGEST, Child, read_message, write_message
+from robot.common.process import MAX_ARRAY, Child, read_message, write_message
 from robot.errors import DeviceError
 from tests.robot.waiting import PATIENCE, alive, until
 
@@ -31,7 +31,7 @@ def message(said: dict[str, object], arrays: dict[str, np.ndarray] | None = None
     return pipe.getvalue()
 
 
-def test_a_message_comes_back_as_it_was() -> None:
+def test_message_round_trip_is_equal() -> None:
     arrays = {
         "image": np.arange(24, dtype=np.uint8).reshape(2, 4, 3),
         "turned": np.arange(6.0).reshape(2, 3).T,  # not contiguous
@@ -49,7 +49,7 @@ def test_a_message_comes_back_as_it_was() -> None:
     assert read_message(pipe) is None
 
 
-def test_a_message_that_is_cut_off_is_the_end_wherever_it_is_cut() -> None:
+def test_read_message_truncated_input_returns_none() -> None:
     whole = message({"do": "move"}, {"a": np.ones(5)})
     assert all(read_message(io.BytesIO(whole[:length])) is None for length in range(len(whole)))
     assert read_message(io.BytesIO(whole)) is not None
@@ -58,7 +58,7 @@ def test_a_message_that_is_cut_off_is_the_end_wherever_it_is_cut() -> None:
 @pytest.mark.parametrize(
     "line",
     [
-        b'{"arrays": [["a", "|u1", [%d]]]}' % (LARGEST + 1),  # nothing of that size is read
+        b'{"arrays": [["a", "|u1", [%d]]]}' % (MAX_ARRAY + 1),  # nothing of that size is read
         b'{"arrays": [["a", "|u1", [-1]]]}',
         b'{"arrays": [["a", "no such type", [2]]]}',
         b'{"arrays": [["a", "|O", [1]]]}',
@@ -66,10 +66,10 @@ def test_a_message_that_is_cut_off_is_the_end_wherever_it_is_cut() -> None:
         b"\xff\xfe",
         b"[1, 2",
         b"[1, 2]",
-        b" " * process.LONGEST,
+        b" " * process.MAX_LINE,
     ],
 )
-def test_what_is_no_message_is_a_value_error(line: bytes) -> None:
+def test_read_message_invalid_input_raises_value_error(line: bytes) -> None:
     with pytest.raises(ValueError):
         read_message(io.BytesIO(line + b"\n" + bytes(16)))
 
@@ -100,17 +100,17 @@ def child(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Ch
     return start
 
 
-def test_a_child_answers_until_it_is_closed_and_leaves_nothing(child: Callable[[str], Child]) -> None:
+def test_child_answers_until_close_and_leaves_no_process(child: Callable[[str], Child]) -> None:
     with child("print('words that are no message')") as running:
         assert running.receive(PATIENCE) == ({"ready": True}, {})
-        answer, arrays = running.ask({"x": 1}, {"a": np.arange(3)}, timeout=PATIENCE)
+        answer, arrays = running.request({"x": 1}, {"a": np.arange(3)}, timeout=PATIENCE)
         assert answer == {"echo": {"x": 1}} and arrays["a"].tolist() == [0, 1, 2]
         assert os.getsid(running.pid) != os.getsid(0)  # Ctrl-C in a terminal does not reach it
         running.check()
     assert not running.running and not alive(running.pid)
     running.close()
     with pytest.raises(DeviceError, match="stand-in is closed; start another"):
-        running.ask({}, timeout=PATIENCE)
+        running.request({}, timeout=PATIENCE)
 
 
 @pytest.mark.parametrize(
@@ -118,15 +118,15 @@ def test_a_child_answers_until_it_is_closed_and_leaves_nothing(child: Callable[[
     [
         ("raise ValueError('so and so')", "^stand-in: ValueError: so and so$"),
         ("print('last words', flush=True); os._exit(7)", "(?s)has ended, exit status 7; start another.*last words"),
-        ("parent._answers.write(b'x' * 8 + b'\\n'); parent._answers.flush()", "sent what is no message"),
+        ("parent._answers.write(b'x' * 8 + b'\\n'); parent._answers.flush()", "sent an invalid message"),
         ("parent._answers.close(); time.sleep(600)", "has ended, exit status None"),  # closed its end, but lives on
     ],
 )
-def test_what_goes_wrong_there_is_an_error_here(child: Callable[[str], Child], act: str, words: str) -> None:
+def test_child_failure_raises_error_in_parent(child: Callable[[str], Child], act: str, words: str) -> None:
     with child(act) as running:
         running.receive(PATIENCE)
         with pytest.raises(DeviceError, match=words):
-            running.ask({}, timeout=PATIENCE)
+            running.request({}, timeout=PATIENCE)
     assert not alive(running.pid)
 
 
@@ -145,35 +145,33 @@ act()
     ("act", "words"),
     [("os._exit(7)", "exit status 7: two"), ("os.kill(os.getpid(), signal.SIGSEGV)", "killed by SIGSEGV: two")],
 )
-def test_the_last_words_of_a_child_are_how_it_ended_and_its_last_line(
-    child: Callable[..., Child], act: str, words: str
-) -> None:
+def test_exit_report_contains_status_and_last_line(child: Callable[..., Child], act: str, words: str) -> None:
     with child(act, LAST) as running:
         running.receive(PATIENCE)
         until(lambda: not running.running, "end of the child")
-        assert running.last_words == words
+        assert running.exit_report == words
         with pytest.raises(DeviceError, match=f"has ended, {words.partition(':')[0]}; start another"):
             running.check()
-    assert running.last_words == ""
+    assert running.exit_report == ""
 
 
-def test_a_child_that_does_not_start_is_an_error_with_its_reason(child: Callable[..., Child]) -> None:
+def test_child_that_does_not_start_raises_error_with_reason(child: Callable[..., Child]) -> None:
     why = r"(?s)exit status 1.*No module named 'no_such_module'"
     with child(stand_in="import no_such_module") as running, pytest.raises(DeviceError, match=why):
         running.receive(PATIENCE)
 
 
 @pytest.mark.parametrize("size", [0, 2**20])  # more than a pipe holds: the request itself is stuck
-def test_a_child_that_is_silent_is_ended(child: Callable[[str], Child], size: int) -> None:
+def test_silent_child_is_killed(child: Callable[[str], Child], size: int) -> None:
     with child("pass") as running:
         running.receive(PATIENCE)
         os.kill(running.pid, signal.SIGSTOP)
         with pytest.raises(DeviceError, match=r"gave no answer within 0\.2 s"):
-            running.ask({}, {"a": np.zeros(size)}, timeout=0.2)
+            running.request({}, {"a": np.zeros(size)}, timeout=0.2)
         assert not alive(running.pid)
 
 
-def test_a_stopped_child_is_closed_by_force(child: Callable[[str], Child]) -> None:
+def test_stopped_child_is_killed_by_close(child: Callable[[str], Child]) -> None:
     running = child("pass")
     running.receive(PATIENCE)
     os.kill(running.pid, signal.SIGSTOP)
@@ -181,23 +179,23 @@ def test_a_stopped_child_is_closed_by_force(child: Callable[[str], Child]) -> No
     assert not alive(running.pid)
 
 
-def test_after_ctrl_c_no_old_answer_is_taken_for_a_new_one(child: Callable[[str], Child]) -> None:
+def test_interrupted_request_answer_is_not_reused(child: Callable[[str], Child]) -> None:
     with child("os.kill(os.getppid(), signal.SIGINT); time.sleep(1)") as running:
         running.receive(PATIENCE)
         with pytest.raises(KeyboardInterrupt):
-            running.ask({"old": True}, timeout=PATIENCE)
+            running.request({"old": True}, timeout=PATIENCE)
         with pytest.raises(DeviceError, match="is closed"):
-            running.ask({"new": True}, timeout=PATIENCE)
+            running.request({"new": True}, timeout=PATIENCE)
 
 
-def test_it_may_be_closed_while_another_thread_waits_for_an_answer(child: Callable[[str], Child]) -> None:
+def test_close_during_request_of_other_thread_succeeds(child: Callable[[str], Child]) -> None:
     running = child("time.sleep(600)")
     running.receive(PATIENCE)
     failures: list[str] = []
 
     def ask() -> None:
         try:
-            running.ask({}, timeout=PATIENCE)
+            running.request({}, timeout=PATIENCE)
         except DeviceError as failure:
             failures.append(str(failure))
 
@@ -217,13 +215,13 @@ def test_it_may_be_closed_while_another_thread_waits_for_an_answer(child: Callab
 
 
 @pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGTERM, signal.SIGINT])
-def test_a_signal_to_all_leaves_the_child_to_its_parent(child: Callable[..., Child], number: signal.Signals) -> None:
+def test_signal_to_process_group_reaches_parent_only(child: Callable[..., Child], number: signal.Signals) -> None:
     """A lost terminal, `systemctl stop`, Ctrl-C; also before the child has come to set anything up."""
     early = f"import os, time\nos.kill(os.getpid(), {int(number)})\ntime.sleep(0.05)\n"
     with child(stand_in=early + STAND_IN.replace("act()", "pass")) as running:
         assert running.receive(PATIENCE)[0] == {"ready": True}
         os.kill(running.pid, number)
-        assert running.ask({"x": 1}, timeout=PATIENCE)[0] == {"echo": {"x": 1}}
+        assert running.request({"x": 1}, timeout=PATIENCE)[0] == {"echo": {"x": 1}}
     assert running.exit_status == 0
     assert signal.pthread_sigmask(signal.SIG_BLOCK, []) == set()  # here they come as before
 
@@ -246,7 +244,7 @@ time.sleep(600)
     ("end", "state"),
     [(signal.SIGKILL, "waits"), (signal.SIGTERM, "waits"), (signal.SIGHUP, "busy"), (signal.SIGKILL, "forked")],
 )
-def test_a_child_dies_with_its_parent(tmp_path: Path, end: signal.Signals, state: str) -> None:
+def test_child_ends_with_its_parent(tmp_path: Path, end: signal.Signals, state: str) -> None:
     late = STAND_IN.replace("parent.serve", "time.sleep(0.2)\nparent.serve")  # by then its parent is gone
     (tmp_path / "stand_in.py").write_text(late.replace("act()", "time.sleep(600)"))
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])}
@@ -264,19 +262,19 @@ def test_a_child_dies_with_its_parent(tmp_path: Path, end: signal.Signals, state
                 os.kill(copy, signal.SIGKILL)
 
 
-def test_a_killed_parent_is_noticed_before_its_children_get_another(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_parent_monitor_detects_exiting_parent_early(monkeypatch: pytest.MonkeyPatch) -> None:
     with subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"]) as parent:
         monkeypatch.setattr(os, "getppid", lambda: parent.pid)  # as long as nobody has waited for it
-        lifeline = process.Lifeline(parent.pid)
-        assert not lifeline.cut()
+        monitor = process.ParentMonitor(parent.pid)
+        assert not monitor.is_parent_gone()
         parent.kill()
-        until(lifeline.cut, "its end")
+        until(monitor.is_parent_gone, "its end")
         assert parent.returncode is None  # it has an entry still, as while it gives its memory back
-    assert lifeline.cut()
+    assert monitor.is_parent_gone()
 
 
-def test_without_proc_the_childs_parent_tells(monkeypatch: pytest.MonkeyPatch) -> None:
-    lifeline = process.Lifeline(2**22 + 1)  # beyond the largest process id
-    assert lifeline.cut()
+def test_parent_monitor_without_proc_uses_parent_id(monkeypatch: pytest.MonkeyPatch) -> None:
+    monitor = process.ParentMonitor(2**22 + 1)  # beyond the largest process id
+    assert monitor.is_parent_gone()
     monkeypatch.setattr(os, "getppid", lambda: 2**22 + 1)
-    assert not lifeline.cut()
+    assert not monitor.is_parent_gone()

@@ -38,7 +38,7 @@ def running(pid: int) -> bool:
 
 @needs_proc
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
-def test_they_end_with_the_process_that_wants_them(number: signal.Signals, tmp_path: Path) -> None:
+def test_pool_processes_end_with_their_parent(number: signal.Signals, tmp_path: Path) -> None:
     script = tmp_path / "alone.py"
     script.write_text(LEFT_ALONE)
     with subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE, text=True) as process:
@@ -53,7 +53,7 @@ def test_they_end_with_the_process_that_wants_them(number: signal.Signals, tmp_p
 
 
 @needs_proc
-def test_they_end_at_once_where_an_error_leaves_the_block() -> None:
+def test_pool_processes_end_at_once_after_error() -> None:
     begun: list[tuple[int, Future[None]]] = []
 
     def leave() -> None:
@@ -68,7 +68,7 @@ def test_they_end_at_once_where_an_error_leaves_the_block() -> None:
 
 
 @needs_proc
-def test_signals_that_end_a_program_are_not_for_them() -> None:
+def test_pool_processes_get_no_end_signals() -> None:
     with ProcessPool(1) as pool:
         worker = pool.submit(os.getpid).result()
         for number in (signal.SIGINT, signal.SIGTERM):
@@ -76,7 +76,7 @@ def test_signals_that_end_a_program_are_not_for_them() -> None:
         assert pool.submit(os.getpid).result() == worker
 
 
-def test_a_module_of_the_working_folder_is_not_executed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pool_does_not_execute_module_of_working_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "random.py").write_text("raise SystemExit('not to be run')")
     monkeypatch.chdir(tmp_path)
     with ProcessPool(1) as pool:

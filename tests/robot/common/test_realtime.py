@@ -13,30 +13,30 @@ from robot.common import realtime
 pytestmark = pytest.mark.skipif(not hasattr(os, "sched_setscheduler"), reason="this system has no such thing")
 
 ASK = (
-    "import os\nfrom robot.common.realtime import ask_for_realtime, WORKER\n"
-    "granted = ask_for_realtime(WORKER)\n"
+    "import os\nfrom robot.common.realtime import request_realtime, WORKER\n"
+    "granted = request_realtime(WORKER)\n"
     "print(granted, os.sched_getscheduler(0) == os.SCHED_RR, os.sched_getparam(0).sched_priority)"
 )
 
 
-def test_what_is_allowed_is_what_is_granted() -> None:
+def test_realtime_allowed_equals_granted() -> None:
     answer = subprocess.run([sys.executable, "-c", ASK], capture_output=True, text=True, timeout=60, check=True).stdout
-    allowed = realtime.allowed()
+    allowed = realtime.is_realtime_allowed()
     assert answer.split() == [str(allowed), str(allowed), str(realtime.WORKER if allowed else 0)]
 
 
-def test_asking_whether_it_is_allowed_changes_nothing() -> None:
+def test_realtime_check_keeps_priority() -> None:
     before = os.sched_getscheduler(0), os.sched_getparam(0).sched_priority
-    realtime.allowed()
+    realtime.is_realtime_allowed()
     assert (os.sched_getscheduler(0), os.sched_getparam(0).sched_priority) == before
 
 
-def test_a_refusal_is_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_realtime_refusal_returns_false(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object) -> None:
         raise PermissionError(1, "Operation not permitted")
 
     monkeypatch.setattr(os, "sched_setscheduler", refuse)
-    assert not realtime.ask_for_realtime(realtime.WORKER)
+    assert not realtime.request_realtime(realtime.WORKER)
     monkeypatch.delattr(os, "sched_setscheduler")
-    assert not realtime.ask_for_realtime(realtime.WORKER)
-    assert not realtime.allowed()
+    assert not realtime.request_realtime(realtime.WORKER)
+    assert not realtime.is_realtime_allowed()

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from robot.common.whole_file import put_new, whole_folder
+from robot.common.whole_file import move_to_new_path, whole_folder
 
 
-def test_a_folder_comes_with_all_or_not_at_all(tmp_path: Path) -> None:
+def test_whole_folder_is_complete_or_absent(tmp_path: Path) -> None:
     with whole_folder(tmp_path / "new" / "set") as place:
         (place / "one").write_text("1")
         assert not (tmp_path / "new").exists()
@@ -21,24 +21,26 @@ def test_a_folder_comes_with_all_or_not_at_all(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["new"]
 
 
-def test_a_folder_that_somebody_makes_meanwhile_stays_as_it_is(tmp_path: Path) -> None:
-    with pytest.raises(FileExistsError) as told, whole_folder(tmp_path / "set"):
+def test_whole_folder_made_by_other_process_is_kept(tmp_path: Path) -> None:
+    with pytest.raises(FileExistsError) as raised, whole_folder(tmp_path / "set"):
         (tmp_path / "set" / "theirs").mkdir(parents=True)
-    assert told.value.filename == str(tmp_path / "set")
+    assert raised.value.filename == str(tmp_path / "set")
     assert [str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")] == ["set", "set/theirs"]
 
 
-def test_an_error_names_the_folder_that_was_asked_for(tmp_path: Path) -> None:
-    with pytest.raises(OSError, match="No space") as told, whole_folder(tmp_path / "set") as place:
+def test_whole_folder_error_names_requested_folder(tmp_path: Path) -> None:
+    with pytest.raises(OSError, match="No space") as raised, whole_folder(tmp_path / "set") as place:
         raise OSError(errno.ENOSPC, "No space left on device", str(place / "one"))
-    assert told.value.filename == str(tmp_path / "set")
-    with pytest.raises(OSError, match="No such file") as told, whole_folder(tmp_path / "set"):
+    assert raised.value.filename == str(tmp_path / "set")
+    with pytest.raises(OSError, match="No such file") as raised, whole_folder(tmp_path / "set"):
         (tmp_path / "nowhere").read_text()
-    assert told.value.filename == str(tmp_path / "nowhere")
+    assert raised.value.filename == str(tmp_path / "nowhere")
 
 
 @pytest.mark.parametrize("links", [True, False])
-def test_a_file_takes_no_name_that_is_taken(links: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_move_to_new_path_existing_file_is_refused(
+    links: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     if not links:
 
         def refuse(*places: Path) -> None:
@@ -48,9 +50,9 @@ def test_a_file_takes_no_name_that_is_taken(links: bool, tmp_path: Path, monkeyp
     for text in ("first", "second"):
         (tmp_path / "part").write_text(text)
         if text == "first":
-            put_new(tmp_path / "part", tmp_path / "file")
+            move_to_new_path(tmp_path / "part", tmp_path / "file")
             assert not (tmp_path / "part").exists()
         else:
             with pytest.raises(FileExistsError):
-                put_new(tmp_path / "part", tmp_path / "file")
+                move_to_new_path(tmp_path / "part", tmp_path / "file")
     assert (tmp_path / "file").read_text() == "first"

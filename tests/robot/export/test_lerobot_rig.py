@@ -27,7 +27,7 @@ PATIENT = {"link_timeout": 20.0, "watchdog": 0.05, "action_timeout": 5.0, "obser
 
 @pytest.fixture(autouse=True)
 def _no_pause(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(robot.rig.reset, "PAUSE", 0.02)
+    monkeypatch.setattr(robot.rig.reset, "SETTLING_TIME", 0.02)
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""A client that does nothing wrong, beside those that do."""
+"""A client without errors, next to clients with errors."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ from robot.mock.ur.wire import inputs
 from robot.mock.ur.wire.connection import Connection
 from robot.mock.ur.wire.controller import Controller
 from robot.mock.ur.wire.inputs import Inputs
-from robot.mock.ur.wire.rtde import MAX_NAMES, InputRecipe, package
+from robot.mock.ur.wire.rtde import MAX_NAMES, InputRecipe, make_package
 from tests.robot.mock.innocent import Innocent
 from tests.robot.mock.wire_client import TIMEOUT, ControlClient, RtdeClient, wire_host
 from tests.robot.waiting import until
@@ -52,16 +52,16 @@ def stopped(faults: FaultClient) -> str:
     return faults.state().stop_reason
 
 
-def test_a_command_without_all_its_numbers_ends_the_program(arms: MockArms) -> None:
+def test_short_command_ends_program(arms: MockArms) -> None:
     """As moveJ([0, 0, 0]) does: its client would wait for minutes."""
     with ControlClient(arms.hosts[0]) as client:
-        client.socket.sendall(package(85, struct.pack(">Bi", 1, MOVE_J) + bytes(24)))
+        client.socket.sendall(make_package(85, struct.pack(">Bi", 1, MOVE_J) + bytes(24)))
         client.wait(lambda state: state["runtime_state"] == (1,))
     assert "command 1 of a wrong length" in stopped(arms.fault_clients[0])
 
 
 @pytest.mark.parametrize("names", [["actual_q"] * 1366, ["a"] * 30_000])
-def test_recipes_that_are_too_long_are_refused(arms: MockArms, names: list[str]) -> None:
+def test_too_long_recipe_is_refused(arms: MockArms, names: list[str]) -> None:
     with RtdeClient(arms.hosts[0]) as client:
         assert client.outputs(*names)[0] == 0
         assert client.inputs(*names)[0] == 0
@@ -88,7 +88,7 @@ def test_recipes_that_are_too_long_are_refused(arms: MockArms, names: list[str])
         '{"do": "claim", "names": [[]]}',
     ],
 )
-def test_the_fault_server_refuses_what_would_break_it(arms: MockArms, request_: str) -> None:
+def test_fault_server_refuses_invalid_values(arms: MockArms, request_: str) -> None:
     with socket.create_connection((arms.hosts[0], 30020), TIMEOUT) as line, line.makefile("rw") as file:
         file.write(request_ + "\n")
         file.flush()
@@ -98,12 +98,12 @@ def test_the_fault_server_refuses_what_would_break_it(arms: MockArms, request_: 
         assert struct.unpack(">4I", client.ask(118))[0] == 5
 
 
-def test_a_flood_of_small_packages_starves_nobody(arms: MockArms) -> None:
+def test_flood_of_packages_does_not_delay_others(arms: MockArms) -> None:
     """Its client is served a burst at a time; all of it in the end."""
     with RtdeClient(arms.hosts[0]) as client:
         client.inputs("input_int_register_30")
         since = arms.fault_clients[0].received().last
-        flood = package(85, struct.pack(">Bi", 1, 7)) * 1000
+        flood = make_package(85, struct.pack(">Bi", 1, 7)) * 1000
         for _ in range(5):
             client.socket.sendall(flood)
         begun = arms.fault_clients[0].state().tick
@@ -111,7 +111,7 @@ def test_a_flood_of_small_packages_starves_nobody(arms: MockArms) -> None:
         assert arms.fault_clients[0].state().tick > begun
 
 
-def test_newlines_are_searched_once() -> None:
+def test_program_end_is_searched_once() -> None:
     """A megabyte that waits for its end makes a byte more no dearer than the first."""
     client = SimpleNamespace(received=bytearray(), searched=0)
     serve: Callable[[object, object], bool] = Controller._serve_script
@@ -129,8 +129,8 @@ def test_newlines_are_searched_once() -> None:
     assert costs[1] < 20 * costs[0] + 1e-4  # it was fifty milliseconds
 
 
-def test_inputs_are_kept_within_a_bound_and_what_is_lost_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(inputs, "KEPT", 1000 * (inputs.OVERHEAD + 4))
+def test_stored_inputs_are_limited_and_losses_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(inputs, "MAX_STORED_BYTES", 1000 * (inputs.PACKAGE_OVERHEAD + 4))
     kept, recipe = Inputs(), InputRecipe(("input_int_register_5",), struct.Struct(">i"), (1,))
     for value in range(1, 5001):
         kept.add(value, recipe, struct.pack(">i", value))
@@ -145,7 +145,7 @@ def test_inputs_are_kept_within_a_bound_and_what_is_lost_is_told(monkeypatch: py
     assert kept.after(5000, 10)[0][0].number == 5001
 
 
-def test_many_requests_in_one_go_are_all_answered(arms: MockArms) -> None:
+def test_many_requests_in_one_package_are_answered(arms: MockArms) -> None:
     with socket.create_connection((arms.hosts[0], 30020), TIMEOUT) as line, line.makefile("rw") as file:
         file.write('{"do": "state"}\n' * 50)
         file.flush()
@@ -157,7 +157,7 @@ def test_many_requests_in_one_go_are_all_answered(arms: MockArms) -> None:
         assert [file.readline().strip() for _ in range(50)] == ["Program running: false"] * 50
 
 
-def test_a_slow_line_holds_only_so_much() -> None:
+def test_slow_connection_buffer_is_limited() -> None:
     with socket.create_server(("127.0.0.1", 0)) as listener, socket.create_connection(listener.getsockname()):
         client = Connection(listener.accept()[0], 30004)
         for _ in range(70):
@@ -166,7 +166,7 @@ def test_a_slow_line_holds_only_so_much() -> None:
         client.close()
 
 
-def test_the_fault_client_tells_why_its_mock_has_ended() -> None:
+def test_fault_client_reports_how_mock_ended() -> None:
     with MockArms([wire_host(92)]) as mock:
         mock.fault_clients[0].state()
         os.kill(mock.pid, signal.SIGKILL)

@@ -46,7 +46,7 @@ def camera(shared: MockCamera) -> Iterator[MockCamera]:
     until(lambda: shared.state().clients == 0)
 
 
-def test_streams_as_mjpg_streamer_does(camera: MockCamera) -> None:
+def test_stream_matches_mjpg_streamer(camera: MockCamera) -> None:
     with Client(camera) as client:
         assert client.head[0].endswith("200 OK")
         assert "Content-Type: multipart/x-mixed-replace;boundary=boundarydonotcross" in client.head
@@ -59,14 +59,14 @@ def test_streams_as_mjpg_streamer_does(camera: MockCamera) -> None:
     assert camera.url == f"http://{HOST}:{camera.port}/?action=stream"
 
 
-def test_snapshot_and_other_paths(camera: MockCamera) -> None:
+def test_snapshot_path_returns_jpeg_and_others_404(camera: MockCamera) -> None:
     until(lambda: camera.state().frames > 1)
     status, kind, data = get(camera, "/?action=snapshot")
     assert (status, kind) == (200, "image/jpeg") and Image.open(io.BytesIO(data)).size == (320, 256)
     assert get(camera, "/nothing")[0] == 404
 
 
-def test_a_pushed_picture_is_shown_under_its_number(camera: MockCamera) -> None:
+def test_pushed_image_has_its_number_in_stamp(camera: MockCamera) -> None:
     with Client(camera) as client:
         for value in (10, 200, 90):
             number = camera.push(np.full((240, 320, 3), (value, 20, 30), dtype=np.uint8))
@@ -78,7 +78,7 @@ def test_a_pushed_picture_is_shown_under_its_number(camera: MockCamera) -> None:
     assert camera.state().images == number
 
 
-def test_a_pushed_picture_does_not_wait_for_the_next_tick() -> None:
+def test_pushed_image_is_sent_at_once() -> None:
     with MockCamera(host=HOST, fps=0.1) as camera, Client(camera) as client:
         clocks = []
         for value in range(5):
@@ -89,14 +89,14 @@ def test_a_pushed_picture_does_not_wait_for_the_next_tick() -> None:
     assert clocks[-1] - clocks[0] < 20e6  # by ticks it would be 40 s
 
 
-def test_keeps_its_rate(camera: MockCamera) -> None:
+def test_camera_keeps_frame_rate(camera: MockCamera) -> None:
     with Client(camera) as client:
         marks = [client.frame()[1] for _ in range(60)]
     rate = 1e6 * (marks[-1].frame - marks[0].frame) / (marks[-1].clock - marks[0].clock)
     assert 2.0 < rate < 1.1 * FPS  # a loaded machine may be slower, none is faster
 
 
-def test_without_stamp() -> None:
+def test_camera_without_stamp_sends_plain_image() -> None:
     with MockCamera(host=HOST, width=64, height=48, stamped=False, quality=100, noise=0) as camera:
         camera.push(np.full((48, 64, 3), 77, dtype=np.uint8))
         with Client(camera) as client:
@@ -105,7 +105,7 @@ def test_without_stamp() -> None:
     assert image.shape == (48, 64, 3) and np.abs(image.astype(int) - 77).max() <= 1
 
 
-def test_clients_do_not_disturb_each_other(camera: MockCamera) -> None:
+def test_camera_clients_are_independent(camera: MockCamera) -> None:
     with Client(camera) as slow, Client(camera) as quick:
         first = slow.frame()[1].frame
         for _ in range(120):
@@ -114,7 +114,7 @@ def test_clients_do_not_disturb_each_other(camera: MockCamera) -> None:
         assert slow.frame()[1].frame > first
 
 
-def test_a_slow_client_loses_frames_instead_of_filling_memory() -> None:
+def test_slow_camera_client_loses_frames() -> None:
     noise = np.random.default_rng(0).integers(0, 256, (768, 1024, 3), dtype=np.uint8)
     with MockCamera(host=HOST, width=1024, height=768, fps=60, quality=100) as camera, Client(camera):
         camera.push(noise)
@@ -130,7 +130,7 @@ def test_a_slow_client_loses_frames_instead_of_filling_memory() -> None:
         assert sent() <= stuck + 1  # one frame hangs in the socket; no other was handed out
 
 
-def test_an_unstamped_camera_has_noise_as_a_real_one() -> None:
+def test_camera_without_stamp_has_noise() -> None:
     with MockCamera(host=HOST, width=64, height=48, stamped=False) as camera:
         camera.push(np.full((48, 64, 3), 77, dtype=np.uint8))
         with Client(camera) as client:
@@ -139,7 +139,7 @@ def test_an_unstamped_camera_has_noise_as_a_real_one() -> None:
     assert (one != two).mean() > 0.1 and np.abs(one - 77).max() < 12
 
 
-def test_after_a_stall_nothing_comes_that_was_exposed_before_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_after_stall_no_older_frame_is_sent(monkeypatch: pytest.MonkeyPatch) -> None:
     """Neither what waits for its delay nor what is just being encoded: without stamps it would count as of now."""
     source = FrameSource(32, 24, fps=0.5, quality=90, stamped=False, noise=0)
     exposing, goes_on = threading.Event(), threading.Event()
@@ -176,7 +176,7 @@ def test_after_a_stall_nothing_comes_that_was_exposed_before_it(monkeypatch: pyt
         thread.join()
 
 
-def test_resize_and_brightness(camera: MockCamera) -> None:
+def test_resize_and_brightness_change_image(camera: MockCamera) -> None:
     camera.push(np.full((240, 320, 3), 100, dtype=np.uint8))
     with Client(camera) as client:
         camera.resize(160, 120)
@@ -188,7 +188,7 @@ def test_resize_and_brightness(camera: MockCamera) -> None:
         assert camera.state().size is None
 
 
-def test_refuse_closes_the_port_and_opens_it_again(camera: MockCamera) -> None:
+def test_refuse_closes_and_reopens_port(camera: MockCamera) -> None:
     with Client(camera) as client:
         client.frame()
         camera.refuse(True)
@@ -201,7 +201,7 @@ def test_refuse_closes_the_port_and_opens_it_again(camera: MockCamera) -> None:
         client.frame()
 
 
-def test_too_many_clients_are_told_so(camera: MockCamera) -> None:
+def test_too_many_camera_clients_get_503(camera: MockCamera) -> None:
     clients = [Client(camera) for _ in range(16)]
     try:
         until(lambda: camera.state().clients == 16)
@@ -211,7 +211,7 @@ def test_too_many_clients_are_told_so(camera: MockCamera) -> None:
             client.close()
 
 
-def test_pushes_of_several_threads_keep_their_numbers(camera: MockCamera) -> None:
+def test_pushes_of_threads_keep_their_numbers(camera: MockCamera) -> None:
     numbers: list[int] = []
 
     def push() -> None:
@@ -231,14 +231,14 @@ def test_pushes_of_several_threads_keep_their_numbers(camera: MockCamera) -> Non
     [np.zeros((240, 321, 3), np.uint8), np.zeros((240, 320), np.uint8), np.zeros((0, 0, 3), np.uint8)]
     + [np.zeros((240, 320, 3), np.float32)],
 )
-def test_pushes_of_another_shape_are_refused(camera: MockCamera, image: np.ndarray) -> None:
+def test_push_of_other_shape_is_refused(camera: MockCamera, image: np.ndarray) -> None:
     pushed = camera.state().images
     with pytest.raises(ValueError, match=r"push needs \(240, 320, 3\) uint8"):
         camera.push(image)
     assert camera.state().images == pushed
 
 
-def test_faults_beyond_reason_are_refused(camera: MockCamera) -> None:
+def test_camera_invalid_faults_are_refused(camera: MockCamera) -> None:
     for ask in (
         lambda: camera.drop(1.5),
         lambda: camera.drop(float("nan")),
@@ -247,7 +247,7 @@ def test_faults_beyond_reason_are_refused(camera: MockCamera) -> None:
         lambda: camera.brightness(-1.0),
         lambda: camera.flip(-1),
     ):
-        with pytest.raises(ValueError, match="must lie within"):
+        with pytest.raises(ValueError, match="must be within"):
             ask()
 
 
@@ -263,23 +263,23 @@ def test_faults_beyond_reason_are_refused(camera: MockCamera) -> None:
         {"noise": 50},
     ],
 )
-def test_options_beyond_reason_are_refused(options: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match="must lie within"):
+def test_camera_invalid_options_are_refused(options: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match="must be within"):
         MockCamera(host=HOST, **options)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "192.168.0.5", "camera.example", ""])
-def test_serves_loopback_only(host: str) -> None:
+def test_camera_refuses_network_address(host: str) -> None:
     with pytest.raises(ValueError, match="not a loopback address"):
         MockCamera(host=host)
 
 
-def test_a_port_that_is_taken_is_said(camera: MockCamera) -> None:
+def test_camera_port_in_use_raises(camera: MockCamera) -> None:
     with pytest.raises(DeviceError, match="cannot serve"):
         MockCamera(host=HOST, port=camera.port)
 
 
-def test_close_is_idempotent_and_leaves_nothing() -> None:
+def test_camera_close_twice_leaves_no_process() -> None:
     camera = MockCamera(host=HOST)
     with Client(camera):
         camera.close()
@@ -289,14 +289,14 @@ def test_close_is_idempotent_and_leaves_nothing() -> None:
         camera.push(np.zeros((240, 320, 3), dtype=np.uint8))
 
 
-def test_a_killed_process_is_said() -> None:
+def test_killed_camera_process_is_reported() -> None:
     with MockCamera(host=HOST) as camera:
         os.kill(camera.pid, signal.SIGKILL)
         with pytest.raises(DeviceNotConnectedError, match="has ended, killed by SIGKILL"):
             camera.push(np.zeros((240, 320, 3), dtype=np.uint8))
 
 
-def test_a_process_that_does_not_answer_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_silent_camera_process_is_killed(monkeypatch: pytest.MonkeyPatch) -> None:
     with MockCamera(host=HOST) as camera:
         monkeypatch.setattr("robot.mock.camera.camera.ANSWER_TIMEOUT", 0.5)  # not before: to start takes longer
         os.kill(camera.pid, signal.SIGSTOP)
@@ -304,7 +304,7 @@ def test_a_process_that_does_not_answer_is_ended(monkeypatch: pytest.MonkeyPatch
             camera.push(np.zeros((240, 320, 3), dtype=np.uint8))
 
 
-def test_ends_with_its_parent() -> None:
+def test_camera_ends_with_its_parent() -> None:
     code = (
         "import time; from robot.mock.camera.camera import MockCamera\n"
         f"camera = MockCamera(host={HOST!r}); print(camera.pid, flush=True); time.sleep(100)"
@@ -317,7 +317,7 @@ def test_ends_with_its_parent() -> None:
     until(lambda: not alive(pid))
 
 
-def test_a_command_that_is_none_is_refused(camera: MockCamera) -> None:
+def test_camera_unknown_command_is_refused(camera: MockCamera) -> None:
     with pytest.raises(DeviceNotConnectedError, match="no command 'fly'"):
         camera._ask("fly")
     assert camera.state().frames >= 0

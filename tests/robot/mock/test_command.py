@@ -14,7 +14,7 @@ from tests.robot.cli.invoked import START, tacsim
 from tests.robot.mock.wire_client import TIMEOUT, dashboard, wire_host
 
 
-def test_it_serves_until_ctrl_c() -> None:
+def test_mock_command_serves_until_ctrl_c() -> None:
     hosts = [wire_host(40), wire_host(41)]
     options = [word for host in hosts for word in ("--host", host)]
     options += ["--model", "ur3e", "--version", "5.23.1", "--payload", "0.5,0,0,0.03"]
@@ -34,7 +34,7 @@ def test_it_serves_until_ctrl_c() -> None:
         assert process.wait(TIMEOUT) == 128 + signal.SIGINT
 
 
-def test_cameras_stand_at_the_arms_addresses() -> None:
+def test_mock_command_cameras_use_arm_addresses() -> None:
     host = wire_host(42)
     options = ["--host", host, "--cameras", "1", "--camera-port", "8090"]
     process = subprocess.Popen([*START, "mock", *options], stdout=subprocess.PIPE, text=True)
@@ -65,6 +65,6 @@ def test_cameras_stand_at_the_arms_addresses() -> None:
         (["--arms", "0", "--cameras", "1", "--camera-port", "70000"], "--camera-port", 2),
     ],
 )
-def test_what_it_refuses(options: list[str], words: str, code: int) -> None:
+def test_mock_command_invalid_options_are_refused(options: list[str], words: str, code: int) -> None:
     done = tacsim("mock", *options)
     assert done.exit_code == code and words in done.stderr and "Traceback" not in done.stderr

@@ -38,7 +38,7 @@ def moving(mock: MockUR, speed: float = 0.05) -> ControlClient:
     return client
 
 
-def test_state_tells_what_the_wire_tells(mock: MockUR, faults: FaultClient) -> None:
+def test_fault_client_state_equals_rtde_state(mock: MockUR, faults: FaultClient) -> None:
     with streaming(mock, "actual_q", "actual_TCP_pose") as client:
         state, package = faults.state(), client.receive()
         assert state.joints == pytest.approx(package["actual_q"], abs=1e-12)
@@ -54,7 +54,9 @@ def test_state_tells_what_the_wire_tells(mock: MockUR, faults: FaultClient) -> N
         (FaultClient.estop, "ROBOT_EMERGENCY_STOP", 0b10011 << 6),
     ],
 )
-def test_stops(mock: MockUR, faults: FaultClient, press: Callable[[FaultClient], None], safety: str, bits: int) -> None:
+def test_stop_ends_program_and_sets_safety_bits(
+    mock: MockUR, faults: FaultClient, press: Callable[[FaultClient], None], safety: str, bits: int
+) -> None:
     with moving(mock) as client, streaming(mock, "safety_status_bits", "runtime_state") as watch:
         press(faults)
         state = faults.state()
@@ -69,7 +71,7 @@ def test_stops(mock: MockUR, faults: FaultClient, press: Callable[[FaultClient],
         client.upload(control_script())
 
 
-def test_protective_stop_through_the_dashboard(mock: MockUR, faults: FaultClient) -> None:
+def test_dashboard_unlocks_protective_stop(mock: MockUR, faults: FaultClient) -> None:
     faults.unlock_delay(3600)
     faults.protective_stop()
     assert "Cannot unlock" in dashboard(mock.host, "unlock protective stop")[0]
@@ -78,14 +80,14 @@ def test_protective_stop_through_the_dashboard(mock: MockUR, faults: FaultClient
     assert faults.state().safety == "NORMAL"
 
 
-def test_release_leaves_the_arm_without_power(mock: MockUR, faults: FaultClient) -> None:
+def test_release_leaves_arm_without_power(mock: MockUR, faults: FaultClient) -> None:
     faults.estop()
     until(lambda: faults.state().mode == "POWER_OFF", "power off")
     faults.release()
     assert (faults.state().safety, faults.state().mode) == ("NORMAL", "POWER_OFF")
 
 
-def test_safeguard_stop_and_on_again(mock: MockUR, faults: FaultClient) -> None:
+def test_safeguard_stop_pauses_and_continues(mock: MockUR, faults: FaultClient) -> None:
     with moving(mock) as client:
         faults.safeguard_stop(True)
         client.wait(lambda state: state["runtime_state"][0] == 4)
@@ -93,7 +95,7 @@ def test_safeguard_stop_and_on_again(mock: MockUR, faults: FaultClient) -> None:
         until(lambda: faults.state().tcp_speed[2] < -0.049, "it moves again")
 
 
-def test_power_cycle(mock: MockUR, faults: FaultClient) -> None:
+def test_power_cycle_restarts_without_power(mock: MockUR, faults: FaultClient) -> None:
     with moving(mock) as client:
         faults.power_cycle(1.0)
         with pytest.raises(OSError):
@@ -114,7 +116,7 @@ def dashboard_answers(mock: MockUR) -> bool:
         return False
 
 
-def test_silence_stops_the_stream_only(mock: MockUR, faults: FaultClient) -> None:
+def test_silence_stops_only_data_stream(mock: MockUR, faults: FaultClient) -> None:
     with streaming(mock) as client:
         client.receive()
         faults.silence()
@@ -132,7 +134,7 @@ def test_silence_stops_the_stream_only(mock: MockUR, faults: FaultClient) -> Non
 
 
 @pytest.mark.parametrize("reset", [False, True])
-def test_cut(mock: MockUR, faults: FaultClient, reset: bool) -> None:
+def test_cut_closes_connections(mock: MockUR, faults: FaultClient, reset: bool) -> None:
     with streaming(mock) as client, socket.create_connection((mock.host, 29999), TIMEOUT) as other:
         until(lambda: len(faults.state().clients) == 2, "two clients")
         assert faults.cut([30004], reset=reset) == 1
@@ -142,7 +144,7 @@ def test_cut(mock: MockUR, faults: FaultClient, reset: bool) -> None:
         assert faults.cut() == 1
 
 
-def test_refuse(mock: MockUR, faults: FaultClient) -> None:
+def test_refuse_rejects_new_connections(mock: MockUR, faults: FaultClient) -> None:
     with streaming(mock) as client:
         faults.refuse()
         for port in PORTS:
@@ -154,7 +156,7 @@ def test_refuse(mock: MockUR, faults: FaultClient) -> None:
             other.receive()
 
 
-def test_black_hole(mock: MockUR, faults: FaultClient) -> None:
+def test_black_hole_stops_answers(mock: MockUR, faults: FaultClient) -> None:
     with streaming(mock) as client:
         client.receive()
         faults.black_hole()
@@ -170,13 +172,13 @@ def test_black_hole(mock: MockUR, faults: FaultClient) -> None:
         client.receive()
 
 
-def test_a_black_hole_ends_as_quietly_as_any_mock() -> None:
+def test_black_hole_mock_closes_without_error() -> None:
     with MockUR(wire_host(8)) as mock:
         mock.faults.black_hole(True)
     assert mock.exit_status == 0
 
 
-def test_delay_is_at_least_what_was_asked(mock: MockUR, faults: FaultClient) -> None:
+def test_delay_is_at_least_requested(mock: MockUR, faults: FaultClient) -> None:
     faults.delay(0.1)
     begun = time.monotonic()
     assert dashboard(mock.host, "running") == ["Program running: false"]
@@ -186,7 +188,7 @@ def test_delay_is_at_least_what_was_asked(mock: MockUR, faults: FaultClient) -> 
         np.testing.assert_allclose(steps, 0.002, atol=1e-9)
 
 
-def test_drop_is_seeded_and_drops_its_share(mock: MockUR, faults: FaultClient) -> None:
+def test_drop_is_seeded_and_has_its_probability(mock: MockUR, faults: FaultClient) -> None:
     with streaming(mock) as client:
         faults.drop(0.5, seed=3)
         begun = faults.state()
@@ -201,7 +203,7 @@ def test_drop_is_seeded_and_drops_its_share(mock: MockUR, faults: FaultClient) -
         faults.drop(1.5)
 
 
-def test_partial_packages_are_still_whole(mock: MockUR, faults: FaultClient) -> None:
+def test_partial_packages_arrive_complete(mock: MockUR, faults: FaultClient) -> None:
     faults.partial_packages()
     with streaming(mock, "actual_q") as client:
         steps = np.diff([client.receive()["timestamp"][0] for _ in range(100)])
@@ -210,7 +212,7 @@ def test_partial_packages_are_still_whole(mock: MockUR, faults: FaultClient) -> 
     np.testing.assert_allclose(steps, 0.002, atol=1e-9)
 
 
-def test_nan_state(mock: MockUR, faults: FaultClient) -> None:
+def test_nan_state_makes_measured_values_nan(mock: MockUR, faults: FaultClient) -> None:
     with streaming(mock, "actual_q", "target_q", "actual_tool_accelerometer") as client:
         faults.nan_state()
         state = client.receive()
@@ -220,7 +222,7 @@ def test_nan_state(mock: MockUR, faults: FaultClient) -> None:
         assert math.isfinite(state["timestamp"][0])
 
 
-def test_clock_jump(mock: MockUR, faults: FaultClient) -> None:
+def test_clock_jump_shifts_timestamp(mock: MockUR, faults: FaultClient) -> None:
     with streaming(mock) as client:
         for jump in (3.0, -5.0):
             before = client.receive()["timestamp"][0]
@@ -233,7 +235,7 @@ def test_clock_jump(mock: MockUR, faults: FaultClient) -> None:
             assert steps[-1] == pytest.approx(jump + 0.002, abs=1e-9)
 
 
-def test_tick_overrun_is_counted_and_not_made_up_for(mock: MockUR, faults: FaultClient) -> None:
+def test_tick_overrun_is_counted_and_skipped(mock: MockUR, faults: FaultClient) -> None:
     begun = time.monotonic()
     before = faults.state()
     faults.tick_overrun(0.3)
@@ -244,7 +246,7 @@ def test_tick_overrun_is_counted_and_not_made_up_for(mock: MockUR, faults: Fault
     assert after.tick - before.tick < periods - left_out + 20  # a few are made up for
 
 
-def test_remote_control_off(mock: MockUR, faults: FaultClient) -> None:
+def test_local_control_refuses_programs(mock: MockUR, faults: FaultClient) -> None:
     faults.remote_control(False)
     assert dashboard(mock.host, "is in remote control") == ["false"]
     with socket.create_connection((mock.host, 30002), TIMEOUT) as line:
@@ -253,7 +255,7 @@ def test_remote_control_off(mock: MockUR, faults: FaultClient) -> None:
     assert not faults.state().program
 
 
-def test_dashboard_mute(mock: MockUR, faults: FaultClient) -> None:
+def test_muted_dashboard_does_not_answer(mock: MockUR, faults: FaultClient) -> None:
     faults.dashboard_mute()
     with socket.create_connection((mock.host, 29999), 0.1) as line:
         line.sendall(b"running\n")
@@ -265,7 +267,7 @@ def test_dashboard_mute(mock: MockUR, faults: FaultClient) -> None:
         assert line.recv(100) == b"Program running: false\n"
 
 
-def test_claim(mock: MockUR, faults: FaultClient) -> None:
+def test_claimed_inputs_are_in_use(mock: MockUR, faults: FaultClient) -> None:
     faults.claim(["input_int_register_0"])
     with RtdeClient(mock.host) as client:
         assert client.inputs("input_int_register_0") == (0, ["IN_USE"])
@@ -275,14 +277,14 @@ def test_claim(mock: MockUR, faults: FaultClient) -> None:
         faults.claim(["nonsense"])
 
 
-def test_version(mock: MockUR, faults: FaultClient) -> None:
+def test_version_option_prints_version(mock: MockUR, faults: FaultClient) -> None:
     faults.version(3, 9, 1)
     assert dashboard(mock.host, "PolyscopeVersion")[0].startswith("URSoftware 3.9.1.0")
     with RtdeClient(mock.host) as client:
         assert client.outputs("timestamp", "payload") == (0, ["DOUBLE", "NOT_FOUND"])
 
 
-def test_wrench_wall_and_force_limit(mock: MockUR, faults: FaultClient) -> None:
+def test_wrench_wall_and_force_limit_change_force(mock: MockUR, faults: FaultClient) -> None:
     faults.wrench([1, 2, 3, 0.1, 0.2, 0.3])
     with streaming(mock, "actual_TCP_force", "ft_raw_wrench") as client:
         state = client.receive()
@@ -305,13 +307,13 @@ def test_wrench_wall_and_force_limit(mock: MockUR, faults: FaultClient) -> None:
         faults.wrench([1, 2])
 
 
-def test_payload_mismatch(mock: MockUR, faults: FaultClient) -> None:
+def test_payload_mismatch_changes_force(mock: MockUR, faults: FaultClient) -> None:
     faults.payload_mismatch(1.0, (0, 0, 0.1))
     until(lambda: faults.state().wrench[2] < 0, "it weighs")
     assert faults.state().wrench[2] == pytest.approx(-9.82)
 
 
-def test_reset_makes_it_as_new(mock: MockUR, faults: FaultClient) -> None:
+def test_fault_reset_restores_power_on_state(mock: MockUR, faults: FaultClient) -> None:
     begun = faults.state()
     with moving(mock) as client:
         faults.silence()
@@ -327,6 +329,6 @@ def test_reset_makes_it_as_new(mock: MockUR, faults: FaultClient) -> None:
         other.receive()
 
 
-def test_calls_to_a_mock_that_is_not_there() -> None:
+def test_fault_client_without_mock_raises() -> None:
     with pytest.raises(FaultError, match=r"127\.21\..*:30020, state: .*refused"):
         FaultClient(wire_host(200)).state()

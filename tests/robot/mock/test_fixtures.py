@@ -21,17 +21,17 @@ from tacsim.config import load_rig
 from tacsim.models.hardware import CameraSensorConfig
 
 
-def test_the_controller_is_there_and_can_be_broken(mock_ur):
+def test_mock_ur_fixture_accepts_faults(mock_ur):
     assert mock_ur.faults.state().mode == "RUNNING"
     mock_ur.faults.protective_stop()
     assert mock_ur.faults.state().safety == "PROTECTIVE_STOP"
 
 
-def test_it_is_whole_again_in_the_next_test(mock_ur):
+def test_mock_ur_fixture_is_new_in_next_test(mock_ur):
     assert mock_ur.faults.state().safety == "NORMAL"
 
 
-def test_the_camera_shows_what_is_pushed(mock_camera):
+def test_mock_camera_fixture_shows_pushed_image(mock_camera):
     mock_camera.push(np.full((240, 320, 3), 77, np.uint8))
     config = CameraSensorConfig(
         driver="camera", source=mock_camera.url, width=320, height=240, stamped=True, max_age=10
@@ -40,13 +40,13 @@ def test_the_camera_shows_what_is_pushed(mock_camera):
         assert abs(int(camera.wait_for(1, 10.0).image.mean()) - 77) < 3
 
 
-def test_the_rig_opens_with_overrides(mock_rig, tmp_path):
+def test_mock_rig_fixture_takes_overrides(mock_rig, tmp_path):
     with pytest.raises(Exception, match="no_such_key"):
         mock_rig("no_such_key=1")
 """
 
 
-def test_it_works_as_a_plugin_of_somebody_elses_tests(tmp_path: Path) -> None:
+def test_fixtures_work_as_plugin_of_other_tests(tmp_path: Path) -> None:
     (tmp_path / "conftest.py").write_text('pytest_plugins = ["robot.fixtures"]\n')
     (tmp_path / "test_theirs.py").write_text(THEIRS)
     done = subprocess.run(
@@ -61,7 +61,7 @@ def test_it_works_as_a_plugin_of_somebody_elses_tests(tmp_path: Path) -> None:
     assert done.returncode == 0 and "Warning" not in done.stderr, done.stderr
 
 
-def test_addresses_are_of_loopback_and_of_this_process() -> None:
+def test_fixture_addresses_are_loopback_of_process() -> None:
     config = load_rig("mock", overrides=rig_addresses()).config
     hosts = [arm.host for arm in config.arms.values()]  # type: ignore[union-attr]
     assert len(set(hosts)) == 2
@@ -71,7 +71,7 @@ def test_addresses_are_of_loopback_and_of_this_process() -> None:
 
 
 @pytest.mark.parametrize("number", [1, 254])
-def test_two_processes_have_addresses_of_their_own(number: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fixture_addresses_differ_between_processes(number: int, monkeypatch: pytest.MonkeyPatch) -> None:
     own = mock_host(number)
     other = os.getpid() + 1
     monkeypatch.setattr(os, "getpid", lambda: other)

@@ -16,7 +16,17 @@ from robot.mock import MockArms
 from robot.mock.ur.fault_server import ACTIONS
 from robot.mock.ur.wire.controller import DASHBOARD, RTDE, SCRIPTS
 from robot.mock.ur.wire.fields import FORMATS, INPUTS, OUTPUTS
-from robot.mock.ur.wire.rtde import DATA, INPUT_RECIPE, MESSAGE, OUTPUT_RECIPE, PAUSE, PROTOCOL, START, VERSION, package
+from robot.mock.ur.wire.rtde import (
+    DATA,
+    INPUT_RECIPE,
+    MESSAGE,
+    OUTPUT_RECIPE,
+    PAUSE,
+    PROTOCOL,
+    START,
+    VERSION,
+    make_package,
+)
 from tests.robot.mock.innocent import Innocent
 from tests.robot.mock.wire_client import TIMEOUT, ControlClient, control_script, wire_host
 from tests.robot.waiting import until
@@ -61,7 +71,7 @@ def rtde(chance: random.Random) -> bytes:
                 value = chance.choice((chance.randrange(72), 255)) if "int" in name else chance.choice(NUMBERS)
                 payload += struct.pack(">" + FORMATS[INPUTS[name]], value)
             payload = payload[: chance.choice((len(payload), len(payload), chance.randrange(len(payload))))]
-        sent += package(kind, payload)
+        sent += make_package(kind, payload)
     return sent if chance.random() < 0.9 else sent[: chance.randrange(len(sent))]
 
 
@@ -167,13 +177,13 @@ def survives(arms: MockArms, seed: int, steps: int, ports: dict[int, Callable[[r
     assert "Traceback" not in errors, errors[-5000:]
 
 
-def test_abuse(arms: MockArms) -> None:
+def test_random_messages_leave_mock_working(arms: MockArms) -> None:
     survives(arms, 0, 40, WIRE)
     survives(arms, 0, 20, {arms.fault_clients[0].port: door})
 
 
 @pytest.mark.deep
 @pytest.mark.parametrize("seed", [10, 11])
-def test_long_abuse(arms: MockArms, seed: int) -> None:
+def test_many_random_messages_leave_mock_working(arms: MockArms, seed: int) -> None:
     survives(arms, seed, 200, WIRE)
     survives(arms, seed, 100, {arms.fault_clients[0].port: door, **WIRE})

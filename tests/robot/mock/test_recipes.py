@@ -43,7 +43,7 @@ target_base_acceleration:VECTOR6D target_base_wrench:VECTOR6D"""
 
 
 @pytest.mark.parametrize("recipe", [RECORD, OTHERS], ids=["record", "others"])
-def test_the_recipes_of_the_makers_own_clients_are_known(mock: MockUR, recipe: str) -> None:
+def test_recipes_of_ur_clients_are_accepted(mock: MockUR, recipe: str) -> None:
     """record_configuration.xml of RTDE_Python_Client_Library, which refuses a controller that answers other types; the
     other fields of it and of Universal_Robots_Client_Library."""
     expected = dict(each.split(":") for each in recipe.split())
@@ -56,7 +56,7 @@ def test_the_recipes_of_the_makers_own_clients_are_known(mock: MockUR, recipe: s
     assert all(math.isfinite(value) for values in state.values() for value in values)
 
 
-def test_fields_that_a_newer_controller_has(mock: MockUR) -> None:
+def test_fields_of_newer_controllers_need_their_version(mock: MockUR) -> None:
     names = ("actual_robot_energy_consumed", "actual_robot_braking_energy_dissipated")
     for version, types in (((5, 22), ["NOT_FOUND"] * 2), ((5, 23), ["DOUBLE"] * 2), ((10, 10), ["NOT_FOUND"] * 2)):
         mock.faults.version(*version)
@@ -64,7 +64,7 @@ def test_fields_that_a_newer_controller_has(mock: MockUR) -> None:
             assert client.protocol() and client.outputs(*names)[1] == types
 
 
-def test_the_recipe_of_the_ros_driver_is_known(mock: MockUR) -> None:
+def test_recipe_of_ros_driver_is_accepted(mock: MockUR) -> None:
     """ur_robot_driver/resources/rtde_output_recipe.txt of the ROS 2 driver."""
     with RtdeClient(mock.host) as client:
         client.protocol()
@@ -74,7 +74,7 @@ def test_the_recipe_of_the_ros_driver_is_known(mock: MockUR) -> None:
     assert state["tool_mode"] == (253,) and state["analog_io_types"] == (0,)
 
 
-def test_bit_registers_and_elbow(mock: MockUR) -> None:
+def test_bit_registers_and_elbow_have_values(mock: MockUR) -> None:
     inputs = [f"input_bit_register{which}" for which in ("s0_to_31", "s32_to_63", "_64", "_127")]
     with RtdeClient(mock.host) as client:
         client.protocol()

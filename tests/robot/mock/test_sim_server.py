@@ -59,7 +59,7 @@ def touching(sim_server: SimServer) -> float:
     return 0.5 * (sim_server.initial["upper"].position[2] - sim_server.initial["lower"].position[2] - 4e-3)
 
 
-def test_it_answers_with_pictures_surfaces_forces_and_truth(sim_server: SimServer, config: RigConfig) -> None:
+def test_sim_server_returns_images_surfaces_forces_and_truth(sim_server: SimServer, config: RigConfig) -> None:
     clear = sim_server.place(sim_server.initial)
     assert set(clear.images) == set(clear.surfaces) == set(clear.wrenches) == {"lower", "upper"}
     assert clear.images["upper"].shape == (30, 40, 3)
@@ -75,16 +75,16 @@ def test_it_answers_with_pictures_surfaces_forces_and_truth(sim_server: SimServe
     assert fresh.truth is not None and fresh.truth.height == pytest.approx(clear.truth.height)
 
 
-def test_what_cannot_be_done_is_said_and_the_cell_goes_on(sim_server: SimServer) -> None:
+def test_sim_server_refused_motion_keeps_cell_running(sim_server: SimServer) -> None:
     sim_server.place(sim_server.initial)
     with pytest.raises(SimServerError, match=r"simulated cell: .*third"):
         sim_server.move({**sim_server.initial, "third": Pose()})
     assert np.isfinite(sim_server.place(sim_server.initial).wrenches["upper"]).all()
 
 
-def test_a_killed_process_is_told_and_closing_stays_harmless(sim_server: SimServer) -> None:
+def test_killed_sim_server_is_reported_and_closes(sim_server: SimServer) -> None:
     """The last test of this process."""
     os.kill(sim_server.pid, signal.SIGKILL)
-    with pytest.raises(SimServerError, match=rf"process {sim_server.pid}.*open the rig anew"):
+    with pytest.raises(SimServerError, match=rf"process {sim_server.pid}.*open the rig again"):
         sim_server.move(sim_server.initial)
     sim_server.close()

@@ -28,7 +28,7 @@ def exists(pid: int) -> bool:
     return True
 
 
-def test_close_leaves_nothing_and_may_be_repeated() -> None:
+def test_mock_ur_close_twice_leaves_no_process() -> None:
     mock = MockUR(wire_host(10))
     assert mock.running and mock.faults.state().tick >= 0
     mock.close()
@@ -40,14 +40,14 @@ def test_close_leaves_nothing_and_may_be_repeated() -> None:
         pass  # the ports are free again at once
 
 
-def test_options_arrive() -> None:
+def test_mock_ur_options_are_applied() -> None:
     joints = [0.1, -1.2, 1.3, -1.4, -1.5, 0.6]
     with MockUR(wire_host(11), model="ur3e", joints=joints, fault_port=30555) as mock:
         assert mock.faults.port == 30555
         assert mock.faults.state().joints == pytest.approx(joints)
 
 
-def test_two_arms_in_one_process_do_not_touch() -> None:
+def test_mock_arms_in_one_process_are_independent() -> None:
     hosts = [wire_host(12), wire_host(13)]
     versions = [(5, 11, 0, 0), (5, 23, 1, 0)]
     with MockArms(hosts, version=versions) as arms, ControlClient(hosts[0]) as client:
@@ -60,7 +60,7 @@ def test_two_arms_in_one_process_do_not_touch() -> None:
         assert arms.fault_clients[1].state().rests and arms.fault_clients[1].state().safety == "PROTECTIVE_STOP"
 
 
-def test_a_rig_file_says_the_version() -> None:
+def test_rig_file_sets_mock_version() -> None:
     place = [f"arms.{name}.host={wire_host(21 + number)}" for number, name in enumerate(("lower", "upper"))]
     place += [
         "arms.lower.start.position=[0, 0, 0]",
@@ -75,7 +75,7 @@ def test_a_rig_file_says_the_version() -> None:
             load_rig("mock", overrides=[f"arms.lower.mock.version={wrong}"])
 
 
-def test_a_port_in_use_is_named() -> None:
+def test_mock_ur_port_in_use_is_named() -> None:
     host = wire_host(14)
     with MockUR(host) as first:
         with pytest.raises(MockError, match=rf"cannot listen on {host}:\d+: .*in use"):
@@ -93,12 +93,12 @@ def test_a_port_in_use_is_named() -> None:
         (["127.0.0.9", "127.0.0.9"], "different hosts"),
     ],
 )
-def test_addresses_that_are_refused(hosts: list[str], words: str) -> None:
+def test_mock_ur_invalid_addresses_are_refused(hosts: list[str], words: str) -> None:
     with pytest.raises(ValueError, match=words):
         MockArms(hosts)
 
 
-def test_joints_that_are_refused() -> None:
+def test_mock_ur_invalid_joints_are_refused() -> None:
     with pytest.raises(MockError, match=r"within \+-2 pi"):
         MockUR(wire_host(15), joints=[7, 0, 0, 0, 0, 0])
     with pytest.raises(MockError, match="6 finite"):
@@ -109,7 +109,7 @@ def test_joints_that_are_refused() -> None:
 
 
 @pytest.mark.parametrize("end", [signal.SIGKILL, pytest.param(signal.SIGTERM, marks=pytest.mark.deep)])
-def test_it_dies_with_its_parent(end: signal.Signals) -> None:
+def test_mock_ur_ends_with_its_parent(end: signal.Signals) -> None:
     code = (
         "import sys, time; from robot.mock import MockUR\n"
         f"mock = MockUR({wire_host(16)!r}); print(mock.pid, flush=True); time.sleep(600)"
@@ -124,7 +124,7 @@ def test_it_dies_with_its_parent(end: signal.Signals) -> None:
         until(lambda: not exists(pid), "the mock is gone")
 
 
-def test_a_stopped_process_is_ended_too() -> None:
+def test_stopped_mock_ur_process_is_killed() -> None:
     with MockUR(wire_host(17)) as mock:
         mock.faults.timeout = 0.2
         os.kill(mock.pid, signal.SIGSTOP)
@@ -133,7 +133,7 @@ def test_a_stopped_process_is_ended_too() -> None:
     assert not exists(mock.pid)
 
 
-def test_it_goes_on_after_a_pause_of_its_process() -> None:
+def test_mock_ur_continues_after_pause_of_process() -> None:
     with MockUR(wire_host(18)) as mock:
         before = mock.faults.state()
         os.kill(mock.pid, signal.SIGSTOP)
@@ -144,7 +144,7 @@ def test_it_goes_on_after_a_pause_of_its_process() -> None:
         until(lambda: mock.faults.state().tick > after.tick + 100, "it ticks")
 
 
-def test_without_a_parent_it_runs_until_it_is_told() -> None:
+def test_mock_process_without_parent_runs_until_signal() -> None:
     command = [sys.executable, "-m", "robot.mock", wire_host(19)]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stdin=subprocess.DEVNULL, text=True)
     assert process.stdout is not None
@@ -154,7 +154,7 @@ def test_without_a_parent_it_runs_until_it_is_told() -> None:
         assert process.wait(TIMEOUT) == 0
 
 
-def test_a_client_killed_in_motion_with_and_without_watchdog() -> None:
+def test_client_killed_in_motion_stops_only_with_watchdog() -> None:
     """Without the watchdog the arm goes on for ever, as a real one does; with it, the program ends."""
     with MockUR(wire_host(20)) as mock:
         for watchdog in (False, True):

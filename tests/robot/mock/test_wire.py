@@ -15,7 +15,7 @@ from robot.mock import MOCK_SERIAL, FaultClient, MockUR
 from robot.mock.ur.machine.arm import HOME
 from robot.mock.ur.wire.controller import MAX_CLIENTS, PORTS
 from robot.mock.ur.wire.fields import INPUTS, OUTPUTS
-from robot.mock.ur.wire.rtde import BadPackage, package, packages
+from robot.mock.ur.wire.rtde import BadPackage, make_package, take_packages
 from tests.robot.mock.wire_client import TIMEOUT, ControlClient, RtdeClient, control_script, dashboard
 from tests.robot.waiting import until
 
@@ -37,26 +37,26 @@ def answers(mock: MockUR) -> bool:
 # -- framing ---------------------------------------------------------------------------------------------------------
 
 
-def test_packages_are_taken_whole_from_any_pieces() -> None:
-    stream = package(86, b"\0\2") + package(118, b"") + package(85, bytes(range(200)))
+def test_take_packages_from_any_pieces_is_complete() -> None:
+    stream = make_package(86, b"\0\2") + make_package(118, b"") + make_package(85, bytes(range(200)))
     for cut in range(len(stream)):
         buffer = bytearray(stream[:cut])
-        found = list(packages(buffer))
+        found = list(take_packages(buffer))
         buffer += stream[cut:]
-        found += list(packages(buffer))
+        found += list(take_packages(buffer))
         assert [kind for kind, _ in found] == [86, 118, 85] and not buffer
     with pytest.raises(BadPackage, match="less than its header"):
-        list(packages(bytearray(b"\0\1\0")))
+        list(take_packages(bytearray(b"\0\1\0")))
 
 
-def test_protocol_and_version(mock: MockUR) -> None:
+def test_rtde_protocol_and_version_are_answered(mock: MockUR) -> None:
     with RtdeClient(mock.host) as client:
         assert client.ask(86, struct.pack(">H", 2)) == b"\1"
         assert client.ask(86, struct.pack(">H", 1)) == b"\0"
         assert struct.unpack(">4I", client.ask(118)) == (5, 11, 0, 108150)
 
 
-def test_output_recipe_types_and_unknown_names(mock: MockUR) -> None:
+def test_output_recipe_returns_types_and_not_found(mock: MockUR) -> None:
     with RtdeClient(mock.host) as client:
         assert client.outputs("timestamp", "actual_q", "runtime_state") == (1, ["DOUBLE", "VECTOR6D", "UINT32"])
         assert client.outputs("timestamp", "nonsense") == (0, ["DOUBLE", "NOT_FOUND"])
@@ -67,7 +67,7 @@ def test_output_recipe_types_and_unknown_names(mock: MockUR) -> None:
         assert client.inputs("input_int_register_0", "nonsense") == (0, ["INT32", "NOT_FOUND"])
 
 
-def test_every_field_is_packed_and_finite(mock: MockUR) -> None:
+def test_each_output_field_is_packed_and_finite(mock: MockUR) -> None:
     mock.faults.version(5, 25)
     state: dict[str, tuple[float, ...]] = {}
     for first in range(0, len(OUTPUTS), 60):  # so many names fit into a recipe
@@ -80,7 +80,7 @@ def test_every_field_is_packed_and_finite(mock: MockUR) -> None:
     np.testing.assert_allclose(matrix(state["actual_TCP_pose"]), Kinematics("ur5e").forward(HOME), atol=1e-9)
 
 
-def test_no_data_before_start_and_none_after_pause(mock: MockUR) -> None:
+def test_stream_runs_only_between_start_and_pause(mock: MockUR) -> None:
     with RtdeClient(mock.host) as client:
         client.outputs("timestamp")
         sent = mock.faults.state().packages_sent
@@ -94,7 +94,7 @@ def test_no_data_before_start_and_none_after_pause(mock: MockUR) -> None:
         assert mock.faults.state().packages_sent == sent
 
 
-def test_the_stream_is_in_order_without_gaps_and_at_its_frequency(mock: MockUR) -> None:
+def test_stream_is_ordered_complete_and_at_frequency(mock: MockUR) -> None:
     for frequency, step, count in ((500.0, 0.002, 12), (125.0, 0.008, 12), (10.0, 0.1, 4)):
         with RtdeClient(mock.host) as client:
             streaming(client, "timestamp", frequency=frequency)
@@ -102,7 +102,7 @@ def test_the_stream_is_in_order_without_gaps_and_at_its_frequency(mock: MockUR) 
         np.testing.assert_allclose(np.diff(times), step, atol=1e-9)
 
 
-def test_start_without_a_recipe_is_refused(mock: MockUR) -> None:
+def test_start_without_recipe_is_refused(mock: MockUR) -> None:
     with RtdeClient(mock.host) as client:
         assert not client.start()
 
@@ -110,7 +110,7 @@ def test_start_without_a_recipe_is_refused(mock: MockUR) -> None:
 # -- input registers -------------------------------------------------------------------------------------------------
 
 
-def test_inputs_have_one_owner_until_it_goes(mock: MockUR) -> None:
+def test_inputs_have_one_owner_until_disconnect(mock: MockUR) -> None:
     with RtdeClient(mock.host) as first, RtdeClient(mock.host) as second:
         assert first.inputs("input_int_register_0", "input_double_register_3") == (1, ["INT32", "DOUBLE"])
         assert first.inputs("input_int_register_0") == (2, ["INT32"])  # one's own, again
@@ -121,7 +121,7 @@ def test_inputs_have_one_owner_until_it_goes(mock: MockUR) -> None:
         assert second.inputs("input_int_register_0")[0] == 2
 
 
-def test_inputs_are_kept_and_told_by_the_fault_server(mock: MockUR) -> None:
+def test_fault_server_returns_stored_inputs(mock: MockUR) -> None:
     since = mock.faults.received().last
     with RtdeClient(mock.host) as client:
         client.inputs("input_int_register_5", "input_double_register_7")
@@ -136,12 +136,12 @@ def test_inputs_are_kept_and_told_by_the_fault_server(mock: MockUR) -> None:
     assert mock.faults.received(found.last).entries == ()
 
 
-def test_packages_of_wrong_size_or_recipe_are_ignored(mock: MockUR) -> None:
+def test_input_package_of_wrong_size_or_recipe_is_ignored(mock: MockUR) -> None:
     with RtdeClient(mock.host) as client:
         client.inputs("input_int_register_5")
         since = mock.faults.received().last
         for payload in (b"\1\0\0", b"\7" + bytes(4), b"", b"\1\0\0\0\2too long"):
-            client.socket.sendall(package(85, payload))
+            client.socket.sendall(make_package(85, payload))
         client.send(1, 3)
         until(lambda: mock.faults.state().packages_received == since + 2, "the good ones")
         entries = mock.faults.received(since).entries
@@ -150,7 +150,7 @@ def test_packages_of_wrong_size_or_recipe_are_ignored(mock: MockUR) -> None:
     assert len([text for text in texts if "ignored" in text]) == 3 and any("cut: 12 bytes" in text for text in texts)
 
 
-def test_outputs_of_the_controller_are_set_by_mask(mock: MockUR) -> None:
+def test_controller_outputs_are_set_by_mask(mock: MockUR) -> None:
     with RtdeClient(mock.host) as client:
         streaming(client, "actual_digital_output_bits", "standard_analog_output0", "standard_analog_output1")
         for kind in ("standard", "configurable", "tool"):
@@ -166,7 +166,7 @@ def test_outputs_of_the_controller_are_set_by_mask(mock: MockUR) -> None:
     assert state["standard_analog_output0"] == pytest.approx((0.012,))  # half of 4-20 mA
 
 
-def test_input_names_are_the_protocols_own() -> None:
+def test_input_names_equal_protocol() -> None:
     assert {"speed_slider_mask", "speed_slider_fraction", "external_force_torque"} <= set(INPUTS)
     assert sum(name.startswith("input_double_register_") for name in INPUTS) == 48
 
@@ -174,7 +174,7 @@ def test_input_names_are_the_protocols_own() -> None:
 # -- programs and dashboard ------------------------------------------------------------------------------------------
 
 
-def test_a_program_moves_the_arm(mock: MockUR) -> None:
+def test_uploaded_program_moves_arm(mock: MockUR) -> None:
     with ControlClient(mock.host) as client:
         goal = list(client.receive()["actual_TCP_pose"])
         goal[2] -= 0.05
@@ -185,7 +185,7 @@ def test_a_program_moves_the_arm(mock: MockUR) -> None:
         assert found is not None and [found[f"output_double_register_{i}"] for i in range(6)] == [(0.0,)] * 6
 
 
-def test_upper_range_registers(mock: MockUR) -> None:
+def test_upper_registers_control_program(mock: MockUR) -> None:
     with ControlClient(mock.host) as first, RtdeClient(mock.host) as second:
         streaming(second, "runtime_state", *(f"output_int_register_{i}" for i in (24, 25)))
         second.inputs("input_int_register_24", *(f"input_double_register_{24 + i}" for i in range(6)))
@@ -200,7 +200,7 @@ def test_upper_range_registers(mock: MockUR) -> None:
         first.wait(lambda state: state["runtime_state"] == (2,))  # older packages wait in its socket
 
 
-def test_a_program_in_small_pieces_and_two_in_one(mock: MockUR) -> None:
+def test_programs_in_pieces_or_together_are_run(mock: MockUR) -> None:
     text = control_script().encode()
     with socket.create_connection((mock.host, 30002), TIMEOUT) as line:
         for start in range(0, len(text), 100):
@@ -211,7 +211,7 @@ def test_a_program_in_small_pieces_and_two_in_one(mock: MockUR) -> None:
         until(lambda: any("'second' started" in t for _, t in mock.faults.log()), "the second of two starts")
 
 
-def test_dashboard(mock: MockUR) -> None:
+def test_dashboard_answers_requests(mock: MockUR) -> None:
     found = dashboard(
         mock.host,
         *("PolyscopeVersion", "get serial number", "is in remote control", "robotmode", "safetystatus", "running"),
@@ -227,7 +227,7 @@ def test_dashboard(mock: MockUR) -> None:
     assert MOCK_SERIAL.isdigit()
 
 
-def test_dashboard_power(mock: MockUR) -> None:
+def test_dashboard_switches_power(mock: MockUR) -> None:
     assert dashboard(mock.host, "power off", "robotmode") == ["Powering off", "Robotmode: POWER_OFF"]
     dashboard(mock.host, "power on")
     until(lambda: mock.faults.state().mode == "IDLE", "idle")
@@ -235,7 +235,7 @@ def test_dashboard_power(mock: MockUR) -> None:
     until(lambda: mock.faults.state().mode == "RUNNING", "running")
 
 
-def test_dashboard_pauses_and_plays(mock: MockUR) -> None:
+def test_dashboard_pauses_and_continues_program(mock: MockUR) -> None:
     with ControlClient(mock.host) as client:
         goal = list(client.receive()["actual_TCP_pose"])
         goal[2] -= 0.05
@@ -250,7 +250,7 @@ def test_dashboard_pauses_and_plays(mock: MockUR) -> None:
 # -- abuse -----------------------------------------------------------------------------------------------------------
 
 
-def test_truncated_package_then_silence_and_oversize_package(mock: MockUR) -> None:
+def test_truncated_or_oversized_package_keeps_mock_working(mock: MockUR) -> None:
     with RtdeClient(mock.host) as half, RtdeClient(mock.host) as big:
         half.socket.sendall(struct.pack(">HB", 500, 85) + b"\1\2\3")
         big.socket.sendall(struct.pack(">HB", 65535, 90) + bytes(65532))
@@ -259,7 +259,7 @@ def test_truncated_package_then_silence_and_oversize_package(mock: MockUR) -> No
         assert mock.faults.state().clients.count(30004) == 2
 
 
-def test_a_package_shorter_than_its_header_cuts_the_line(mock: MockUR) -> None:
+def test_package_shorter_than_header_closes_connection(mock: MockUR) -> None:
     with RtdeClient(mock.host) as client:
         client.socket.sendall(b"\0\1\0")
         with pytest.raises(ConnectionError):
@@ -267,7 +267,7 @@ def test_a_package_shorter_than_its_header_cuts_the_line(mock: MockUR) -> None:
 
 
 @pytest.mark.parametrize(("port", "filling"), [(29999, b"x"), (30002, b"def long():\n")])
-def test_endless_lines_and_programs_are_cut(mock: MockUR, port: int, filling: bytes) -> None:
+def test_endless_line_or_program_closes_connection(mock: MockUR, port: int, filling: bytes) -> None:
     def send(line: socket.socket) -> None:
         for _ in range(100):
             line.sendall(filling * (100_000 // len(filling)))
@@ -278,7 +278,7 @@ def test_endless_lines_and_programs_are_cut(mock: MockUR, port: int, filling: by
     assert answers(mock)
 
 
-def test_slow_reader_loses_whole_packages_only(mock: MockUR) -> None:
+def test_slow_reader_loses_only_complete_packages(mock: MockUR) -> None:
     before = mock.faults.state().packages_dropped
     with RtdeClient(mock.host) as slow, RtdeClient(mock.host) as quick:
         slow.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 65536)
@@ -295,7 +295,7 @@ def test_slow_reader_loses_whole_packages_only(mock: MockUR) -> None:
         quick.receive()
 
 
-def test_a_hundred_connections_and_too_many(mock: MockUR) -> None:
+def test_many_connections_are_served_and_excess_closed(mock: MockUR) -> None:
     lines = [socket.create_connection((mock.host, PORTS[i % len(PORTS)]), TIMEOUT) for i in range(100)]
     try:
         until(lambda: len(mock.faults.state().clients) == 100, "100 clients")
@@ -310,7 +310,7 @@ def test_a_hundred_connections_and_too_many(mock: MockUR) -> None:
     assert answers(mock)
 
 
-def test_half_open_lines(mock: MockUR) -> None:
+def test_half_closed_connection_is_dropped(mock: MockUR) -> None:
     """A client that ends its half of the line is gone; one that resets it, too."""
     with RtdeClient(mock.host) as client:
         streaming(client, "timestamp").receive()
@@ -322,7 +322,7 @@ def test_half_open_lines(mock: MockUR) -> None:
     until(lambda: not mock.faults.state().clients, "gone")
 
 
-def test_the_fault_server_refuses_nonsense(faults: FaultClient, mock: MockUR) -> None:
+def test_fault_server_refuses_invalid_requests(faults: FaultClient, mock: MockUR) -> None:
     with socket.create_connection((mock.host, 30020), TIMEOUT) as line, line.makefile("rw") as file:
         for request in ("nonsense", "[]", "{}", '{"do": "fly"}', '{"do": "drop"}', '{"do": "wall", "z": 0, "k": 1}'):
             file.write(request + "\n")

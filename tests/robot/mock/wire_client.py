@@ -12,7 +12,7 @@ from robot.common.loopback import loopback_host
 from robot.mock.ur.machine.registry import COMMANDS
 from robot.mock.ur.wire.controller import DASHBOARD, RTDE, SCRIPTS
 from robot.mock.ur.wire.fields import FORMATS, INPUTS
-from robot.mock.ur.wire.rtde import DATA, INPUT_RECIPE, OUTPUT_RECIPE, PAUSE, PROTOCOL, START, package
+from robot.mock.ur.wire.rtde import DATA, INPUT_RECIPE, OUTPUT_RECIPE, PAUSE, PROTOCOL, START, make_package
 
 TIMEOUT = 60.0  # of whatever a test waits for [s]
 
@@ -77,7 +77,7 @@ class RtdeClient:
 
     def ask(self, kind: int, payload: bytes = b"") -> bytes:
         """Sends a package and returns the payload of the next one of its type."""
-        self.socket.sendall(package(kind, payload))
+        self.socket.sendall(make_package(kind, payload))
         while True:
             found, answer = self.package()
             if found == kind:
@@ -107,7 +107,7 @@ class RtdeClient:
     def send(self, recipe: int, *values: float) -> None:
         """One input package."""
         layout = ">B" + "".join(FORMATS[INPUTS[name]] for name in self._inputs[recipe])
-        self.socket.sendall(package(DATA, struct.pack(layout, recipe, *values)))
+        self.socket.sendall(make_package(DATA, struct.pack(layout, recipe, *values)))
 
     def receive(self) -> dict[str, tuple[float, ...]]:
         """The next data package of the stream: values by name, each a tuple."""

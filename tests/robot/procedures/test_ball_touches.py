@@ -193,7 +193,7 @@ def test_command_real_arm_moves_only_after_confirmation(tmp_path: Path) -> None:
     calibrated = ["--set", "sensors.upper.model=ideal", "--set", "sensors.upper.corners=null"]
     done = tacsim(*words, *calibrated, "--out", tmp_path / "out")
     assert done.exit_code == 2
-    assert "nobody confirmed (at a terminal); nothing was moved" in done.stderr
+    assert "the operator did not confirm (at a terminal); nothing was moved" in done.stderr
 
 
 @pytest.mark.parametrize(("left", "taken"), [(0.1e-3, True), (0.25e-3, False)])

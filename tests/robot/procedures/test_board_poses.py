@@ -82,7 +82,7 @@ def test_command_invalid_input_exits_2(tmp_path: Path) -> None:
         ([*live, "--board", "dots:9x7:2 mm"], "use a ChArUco board"),
         ([*live, "--board", "charuco:9x7:2 mm"], "is no board"),
         (["--rig", "sim", *live[2:], "--board", "charuco:9x7:3 mm:2.2 mm"], "is not a hardware arm"),
-        (["--rig", "ur5e", *live[2:], "--board", "charuco:9x7:3 mm:2.2 mm"], "nobody confirmed"),
+        (["--rig", "ur5e", *live[2:], "--board", "charuco:9x7:3 mm:2.2 mm"], "the operator did not confirm"),
     ):
         code, out, err = run(*words, "--out", tmp_path / "out")
         assert code == 2 and said in err, (words, code, out, err)

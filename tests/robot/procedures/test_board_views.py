@@ -178,7 +178,7 @@ def test_command_invalid_input_exits_2(tmp_path: Path) -> None:
         (BOARD, "either pictures, or --camera"),
         ([str(tmp_path), *live, *BOARD], "either pictures, or --camera"),
         (live, "either --board or --corners"),
-        ([*live, "--corners", "0,0,9,0,9,9,0,9"], "corners are read off a picture"),
+        ([*live, "--corners", "0,0,9,0,9,9,0,9"], "corners are positions in a picture"),
         ([*live, *BOARD, "--views", "4"], "a lens needs 6 views"),
         ([*live, *BOARD, "--reference", str(tmp_path / "small.png")], "it is 640 x 100 px"),
         (["--camera", "eye", *BOARD], "give rig and sensor"),

@@ -141,7 +141,7 @@ needs_arms = pytest.mark.skipif(find_spec("rtde_control") is None, reason="ur_rt
 @pytest.mark.deep
 def test_two_arms_are_led_one_after_the_other(tmp_path: Path) -> None:
     file = fast(copy_of("ur5e", tmp_path, 86))
-    with Lab(file, beside=AWAY) as lab:
+    with Lab(file, offset=AWAY) as lab:
         config = load_rig(file).config
         said: list[str] = []
         moved: list[set[str]] = []

@@ -72,7 +72,7 @@ GREY = np.full((60, 80, 3), 120, np.uint8)
 
 
 class Opened:
-    """A rig, the cell behind it, and the cameras that stand beside the cell."""
+    """A rig, the cell behind it, and the cameras next to the cell."""
 
     def __init__(self, rig: Rig, cell: MockCell, cameras: dict[str, MockCamera]) -> None:
         self.rig, self.cell, self.cameras = rig, cell, cameras
@@ -138,7 +138,7 @@ def opened(
 
 def bare_file(folder: Path, first: int = 41) -> Path:
     """Two arms and cameras at addresses of this process, from number `first` on. Those of the shared rig are called
-    left and right; others, which may be open beside it, west and east."""
+    left and right; others, which may be open at the same time, west and east."""
     left, right = ("left", "right") if first == 41 else ("west", "east")
     text = (
         BARE.replace("LEFT", left)

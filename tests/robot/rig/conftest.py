@@ -13,5 +13,5 @@ import robot.rig.reset
 def no_pause() -> Iterator[None]:
     """Mock arms do not shake: nothing has to come to rest before their forces are zeroed."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(robot.rig.reset, "PAUSE", 0.02)
+        patch.setattr(robot.rig.reset, "SETTLING_TIME", 0.02)
         yield

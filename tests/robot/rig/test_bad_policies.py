@@ -88,9 +88,7 @@ def rests(rig: Opened) -> None:
         (lambda seen: Action({"right": np.zeros(7)}), r"ActionError: .* must be a tacsim.Pose or None"),  # type: ignore[dict-item]
     ],
 )
-def test_the_arms_hold_and_the_error_says_what_was_wrong(
-    shared: Opened, wrong: Callable[[Observation], Any], words: str
-) -> None:
+def test_bad_policy_holds_arms_and_names_error(shared: Opened, wrong: Callable[[Observation], Any], words: str) -> None:
     with pytest.raises(EpisodeFailed, match=words) as failed:
         run_episode(shared.rig, GoingWrong(wrong), None, 9, setup=EpisodeSetup("mine"))
     assert "ended after 3 of 9 steps" in str(failed.value)
@@ -101,10 +99,10 @@ def test_the_arms_hold_and_the_error_says_what_was_wrong(
     shared.rig.reset()  # nothing else is in the way of the next episode
 
 
-def test_a_network_without_an_answer_moves_nothing(shared: Opened, tmp_path: Path) -> None:
+def test_policy_with_nan_output_moves_no_arm(shared: Opened, tmp_path: Path) -> None:
     """It gives 0 / 0 from the first step on."""
     features = Features(sensors=(), arms=("left", "right"), maps=(), touch=("wrench",), goal=False)
-    told = PolicySpec(
+    spec = PolicySpec(
         task="squeeze",
         period=0.05,
         features=features,
@@ -124,7 +122,7 @@ def test_a_network_without_an_answer_moves_nothing(shared: Opened, tmp_path: Pat
         [numpy_helper.from_array(np.zeros((12, 1), np.float32), "weights")],
     )
     model = helper.make_model(made, opset_imports=[helper.make_opsetid("", 18)], ir_version=9)
-    helper.set_model_props(model, {"tacsim.spec": told.model_dump_json()})
+    helper.set_model_props(model, {"tacsim.spec": spec.model_dump_json()})
     onnx.save(model, tmp_path / "nothing.onnx")
     policy = OnnxPolicy(tmp_path / "nothing.onnx", CanonicalGrid(), None)
     with pytest.raises(EpisodeFailed, match=r"an action has 1 finite numbers .* train or export it again") as failed:
@@ -133,21 +131,21 @@ def test_a_network_without_an_answer_moves_nothing(shared: Opened, tmp_path: Pat
     rests(shared)
 
 
-def test_a_policy_that_thinks_too_long_lets_the_arm_rest_and_goes_on_from_there(tmp_path: Path) -> None:
+def test_slow_policy_holds_arm_then_continues(tmp_path: Path) -> None:
     with opened(bare_file(tmp_path, first=43), action_timeout=0.3) as rig:
         arm = rig.rig.arms["east"]
-        told: list[str] = []
+        explanations: list[str] = []
 
         def think(observation: Observation) -> Action:
-            if not told:
+            if not explanations:
                 until(lambda: arm.driver.status() == ArmStatus.HOLD, "the arm holds")  # type: ignore[attr-defined]
-                told.append(arm.driver.explain())  # type: ignore[attr-defined]
+                explanations.append(arm.driver.explain())  # type: ignore[attr-defined]
                 rests(rig)
             now = arm.state().pose
             return Action({"east": Pose(now.position + [0.0, 0.0, STEP], now.quaternion)})
 
         episode = run_episode(rig.rig, GoingWrong(think, "east"), None, 6, setup=EpisodeSetup("slow"))
         assert len(episode.steps) == 7
-        assert "no fresh action" in told[0]
+        assert "no fresh action" in explanations[0]
         heights = [step.arms["east"].pose.position[2] for step in episode.steps]
         assert 0 < heights[-1] - heights[0] < 6.5 * STEP

@@ -15,7 +15,7 @@ from calibration.bundle import read_bundle, read_sensor_model, write_bundle
 from calibration.frame_normaliser import FrameNormaliser
 from calibration.lens.view import view_of_corners
 from calibration.normaliser import normaliser_for_calibration, normaliser_for_camera, normaliser_for_simulation
-from robot.mock.cell.cell import _models
+from robot.mock.cell.cell import _sensor_models
 from tacsim.config import ConfigError, load_rig, load_sensor
 from tacsim.interface import TactileFrame
 from tacsim.models.hardware import CameraSensorConfig
@@ -103,7 +103,7 @@ def finds(bundle: Path) -> tuple[Callable[[GelSurface], np.ndarray], FrameNormal
     return render, normalise
 
 
-def test_the_circle_closes(finger: Path) -> None:
+def test_heights_in_simulated_images_equal_rendered_heights(finger: Path) -> None:
     """Heights found in the twin's pictures are those that it rendered, in places and depths that no press had. The
     bounds are those of the calibration itself: 3.0 to 3.6 % of the depth, root mean square in contact, and 4 % at its
     deepest, were measured."""
@@ -120,7 +120,7 @@ def test_the_circle_closes(finger: Path) -> None:
         assert np.abs(found.gradient - true.gradient)[pressed].mean() < 0.01  # of slopes up to 0.5
 
 
-def test_the_twin_looks_like_the_sensor_itself(finger: Path) -> None:
+def test_calibrated_simulation_image_matches_sensor(finger: Path) -> None:
     """On a dent that the calibration has not seen: 1.5 grey levels off in contact, where it changes by 23."""
     twin, sensor = Renderer(load_sensor("finger"), GEL), Renderer(hidden(), GEL)
     surface, flat = dent(0.5e-3, 1.5e-3, 1e-3), dent(0.0, 0.0, 0.0)
@@ -131,7 +131,7 @@ def test_the_twin_looks_like_the_sensor_itself(finger: Path) -> None:
 
 
 @pytest.mark.parametrize("said", ["finger", "sensors/finger", "sensors/finger/calibration.yaml", "mine.yaml"])
-def test_a_name_and_every_path_mean_the_same_model(finger: Path, lab: Path, said: str) -> None:
+def test_sensor_name_and_paths_load_same_model(finger: Path, lab: Path, said: str) -> None:
     (lab / "mine.yaml").write_text("extends: finger\n", encoding="utf-8")
     model = load_sensor(said)
     assert model == read_sensor_model(finger) == read_sensor_model(Path("finger"))
@@ -141,7 +141,7 @@ def test_a_name_and_every_path_mean_the_same_model(finger: Path, lab: Path, said
     assert in_rig.model == model  # type: ignore[union-attr]
 
 
-def test_a_name_may_have_a_space(finger: Path, lab: Path) -> None:
+def test_sensor_name_with_space_is_loaded(finger: Path, lab: Path) -> None:
     (lab / "sensors" / "my finger").symlink_to(finger)
     try:
         assert load_sensor("my finger") == load_sensor("finger")
@@ -150,7 +150,7 @@ def test_a_name_may_have_a_space(finger: Path, lab: Path) -> None:
         (lab / "sensors" / "my finger").unlink()
 
 
-def test_a_rig_file_finds_the_sensors_beside_it(finger: Path, lab: Path, tmp_path: Path, monkeypatch) -> None:
+def test_rig_file_finds_sensors_in_its_folder(finger: Path, lab: Path, tmp_path: Path, monkeypatch) -> None:
     rig = lab / "rig.yaml"
     rig.write_text("extends: sim\nsensors: {upper: {driver: sim, arm: upper, model: finger}}\n", encoding="utf-8")
     monkeypatch.chdir(tmp_path)
@@ -162,7 +162,7 @@ def test_a_rig_file_finds_the_sensors_beside_it(finger: Path, lab: Path, tmp_pat
     assert load_rig(replay).config.sensors["finger"].calibration == str(finger)  # type: ignore[union-attr]
 
 
-def test_what_means_no_model_is_refused_with_a_hint(finger: Path, lab: Path) -> None:
+def test_unknown_sensor_model_is_refused_with_hint(finger: Path, lab: Path) -> None:
     def refused(said: str) -> str:
         with pytest.raises(ConfigError) as error:
             load_rig("sim", overrides=[f"sensors.lower.model={said}"])
@@ -189,7 +189,7 @@ def test_what_means_no_model_is_refused_with_a_hint(finger: Path, lab: Path) -> 
     ],
     ids=["half", "newer", "changed", "empty"],
 )
-def test_a_bundle_that_is_not_whole_is_no_model(finger: Path, tmp_path: Path, spoil, words: str) -> None:
+def test_incomplete_bundle_is_refused(finger: Path, tmp_path: Path, spoil, words: str) -> None:
     broken = tmp_path / "broken"
     broken.mkdir()
     (broken / "reference.png").write_bytes((finger / "reference.png").read_bytes())
@@ -205,7 +205,7 @@ def test_a_bundle_that_is_not_whole_is_no_model(finger: Path, tmp_path: Path, sp
     assert "did you mean" not in str(missing.value)
 
 
-def test_the_gel_is_the_sensors_own_in_whole_elements(finger: Path) -> None:
+def test_gel_has_sensor_size_in_whole_elements(finger: Path) -> None:
     loaded = load_rig("sim", overrides=["sensors.lower.model=finger"])
     scene = loaded.config.scene
     assert scene is not None and scene.gel.size == pytest.approx((16e-3, 12e-3, 4e-3))  # 15.6 x 12.35 mm
@@ -220,7 +220,7 @@ def test_the_gel_is_the_sensors_own_in_whole_elements(finger: Path) -> None:
     assert not load_rig("sim").notes
 
 
-def test_a_calibration_that_is_not_to_be_trusted_says_so_wherever_it_stands(finger: Path) -> None:
+def test_untrusted_calibration_is_reported_everywhere(finger: Path) -> None:
     calibration, untouched = read_bundle(finger)
     assert not read_sensor_model(finger).caution
     origin = calibration.provenance.model_copy(update={"warnings": ("verdict: do not trust; 2 presses",)})
@@ -235,14 +235,14 @@ def test_a_calibration_that_is_not_to_be_trusted_says_so_wherever_it_stands(fing
     assert done.exit_code == 0 and "do not trust; 2 presses" in " ".join(done.output.split())
 
 
-def test_what_is_recorded_of_a_rig_means_the_same_again(finger: Path, tmp_path: Path) -> None:
+def test_recorded_rig_file_loads_same_rig(finger: Path, tmp_path: Path) -> None:
     for more in ([], ["scene.gel.size=[20 mm, 20 mm, 4 mm]"]):
         loaded = load_rig("sim", overrides=["sensors.lower.model=finger", *more])
         (tmp_path / "recorded.yaml").write_text(loaded.text, encoding="utf-8")
         assert load_rig(tmp_path / "recorded.yaml").config == loaded.config
 
 
-def test_a_press_with_a_bundle_has_its_picture_and_gel(finger: Path, tmp_path: Path) -> None:
+def test_press_with_bundle_uses_its_image_and_gel(finger: Path, tmp_path: Path) -> None:
     small = ("--preset", "learn", "--radius", "4 mm", "--depth", "0.4 mm")
     done = tacsim("press", "sphere", *small, "--sensor", "finger", "--out", tmp_path / "pressed")
     assert done.exit_code == 0, done.output
@@ -253,7 +253,7 @@ def test_a_press_with_a_bundle_has_its_picture_and_gel(finger: Path, tmp_path: P
     assert np.abs(picture - untouched)[:10].max() <= 6 and np.abs(picture - untouched)[85:105].max() > 15
 
 
-def test_rigs_and_environments_take_it(finger: Path) -> None:
+def test_bundle_works_in_rig_and_environment(finger: Path) -> None:
     from robot.open import make_env, open_rig
     from tacsim.config import load_rig as load
 
@@ -284,7 +284,7 @@ def dotted(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return calibrate(tmp_path_factory.mktemp("dotted"), hidden(crooked()), "--markers", presses=3)
 
 
-def test_the_dots_of_a_bundle_lie_where_they_are_printed(dotted: Path) -> None:
+def test_bundle_dots_are_at_printed_positions(dotted: Path) -> None:
     markers = load_sensor(dotted).markers
     assert markers is not None and markers.in_background and markers.places is not None
     assert np.abs(np.array(markers.places) - np.array(crooked().places)).max() < 0.1 * PITCH
@@ -292,7 +292,7 @@ def test_the_dots_of_a_bundle_lie_where_they_are_printed(dotted: Path) -> None:
     np.testing.assert_array_equal(Renderer(load_sensor(dotted), GEL)(dent(0.0, 0.0, 0.0)), untouched)
 
 
-def test_the_dots_of_a_bundle_move_with_the_gel(dotted: Path) -> None:
+def test_bundle_dots_move_with_gel(dotted: Path) -> None:
     """As the hidden sensor's do: the flow found in the twin's pictures is that of the surface to a tenth of a pixel
     (root mean square), and no dot stays behind."""
     render, normalise = finds(dotted)
@@ -309,7 +309,7 @@ def test_the_dots_of_a_bundle_move_with_the_gel(dotted: Path) -> None:
         assert np.abs(render(surface).astype(float) - sensor(surface)).mean() < 1.5  # a dot is 80 grey levels dark
 
 
-def test_the_skin_of_a_bundle_moves_with_the_gel(tmp_path: Path) -> None:
+def test_bundle_skin_moves_with_gel(tmp_path: Path) -> None:
     """Grain that presses have dragged along is found to be skin, and the twin's is dragged as the sensor's own."""
     light = np.array([110.0, 105.0, 100.0]) + np.random.default_rng(1).normal(0, 5, (190, 240, 1))
     Image.fromarray(np.rint(light).astype(np.uint8)).save(tmp_path / "gel.png")
@@ -325,7 +325,7 @@ def test_the_skin_of_a_bundle_moves_with_the_gel(tmp_path: Path) -> None:
     assert off < 0.6 * left
 
 
-def test_the_twin_of_an_askew_camera_delivers_its_picture(finger: Path, tmp_path: Path) -> None:
+def test_oblique_camera_simulation_delivers_native_image(finger: Path, tmp_path: Path) -> None:
     """Through a view: what the normaliser finds in the camera's own picture is what it finds in the metric one."""
     calibration, untouched = read_bundle(finger)
     corners = ((35.0, 25.0), (295.0, 18.0), (285.0, 222.0), (28.0, 228.0))
@@ -350,12 +350,12 @@ def test_the_twin_of_an_askew_camera_delivers_its_picture(finger: Path, tmp_path
     assert np.abs(seen.image.astype(int) - metric.image).mean() < 1.0
 
 
-def test_a_mock_camera_with_a_calibration_shows_its_twin(finger: Path) -> None:
+def test_mock_camera_with_calibration_shows_simulated_image(finger: Path) -> None:
     """One line more than the real camera's entry: the same driver finds heights in the twin's pictures."""
     upper = ["model=null", "calibration=finger", "width=240", "height=190"]
     loaded = load_rig("mock", overrides=[f"sensors.upper.{each}" for each in upper])
     assert loaded.config.scene is not None and loaded.config.scene.gel.size[:2] == pytest.approx((16e-3, 12e-3))
-    assert _models(loaded.config)["upper"] == read_sensor_model(finger)
+    assert _sensor_models(loaded.config)["upper"] == read_sensor_model(finger)
     camera = loaded.config.sensors["upper"]
     assert isinstance(camera, CameraSensorConfig)
     assert normaliser_for_camera(camera, loaded.config.scene.gel.size[:2], GRID).finds_height

@@ -19,7 +19,7 @@ PERIOD = 0.1  # [s]
 
 
 class Time:
-    """Passes only when somebody sleeps, or works."""
+    """Passes only in sleep, or in work."""
 
     def __init__(self) -> None:
         self.now = 100.0
@@ -69,7 +69,7 @@ def commanded(arm: StubArm, target: Pose | None = None) -> CommandedArm:
     return made
 
 
-def test_ticks_end_a_period_apart_whatever_the_work_between_takes(time: Time) -> None:
+def test_wall_clock_ticks_keep_period(time: Time) -> None:
     clock = WallClock(PERIOD)
     ends = []
     for work in (0.0, 0.03, 0.09, 0.05):
@@ -81,7 +81,7 @@ def test_ticks_end_a_period_apart_whatever_the_work_between_takes(time: Time) ->
     assert clock.late == 0
 
 
-def test_a_period_that_is_missed_is_counted_and_not_made_up_for(time: Time) -> None:
+def test_wall_clock_missed_period_is_counted_and_skipped(time: Time) -> None:
     clock = WallClock(PERIOD)
     clock.tick()
     time.now += 0.35
@@ -93,7 +93,7 @@ def test_a_period_that_is_missed_is_counted_and_not_made_up_for(time: Time) -> N
     assert clock.diagnostics()["period_max"] == pytest.approx(0.45)
 
 
-def test_after_a_reset_the_time_it_took_counts_for_nothing(time: Time) -> None:
+def test_wall_clock_restart_ignores_reset_time(time: Time) -> None:
     clock = WallClock(PERIOD)
     clock.tick()
     time.now += 30.0
@@ -104,14 +104,14 @@ def test_after_a_reset_the_time_it_took_counts_for_nothing(time: Time) -> None:
     assert clock.late == 0 and clock.periods == []
 
 
-def test_waiting_for_data_takes_a_tenth_of_a_second_at_least(time: Time) -> None:
+def test_wall_clock_waits_at_least_100_ms_for_data(time: Time) -> None:
     for period, wanted in ((0.02, 0.1), (0.5, 0.5)):
         before = time.now
         WallClock(period).wait_for_data()
         assert time.now - before == pytest.approx(wanted)
 
 
-def test_a_command_is_repeated_until_its_arm_is_there(time: Time) -> None:
+def test_wait_for_arrival_repeats_command_until_arrival(time: Time) -> None:
     arms = {"left": StubArm(3), "right": StubArm(7)}
     target = Pose(np.array([1.0, 2.0, 3.0]))
     wait_for_arrival({name: commanded(arm, target) for name, arm in arms.items()}, timeout=1.0)
@@ -119,26 +119,28 @@ def test_a_command_is_repeated_until_its_arm_is_there(time: Time) -> None:
     assert all(sent is target for arm in arms.values() for sent in arm.commands)
 
 
-def test_an_arm_without_target_is_only_waited_for(time: Time) -> None:
+def test_wait_for_arrival_without_target_sends_nothing(time: Time) -> None:
     arm = StubArm()
     wait_for_arrival({"left": commanded(arm)}, timeout=1.0)
     assert arm.commands == []
 
 
-def test_an_arm_that_does_not_arrive_is_named(time: Time) -> None:
+def test_wait_for_arrival_timeout_names_arm(time: Time) -> None:
     arms = {"left": commanded(StubArm(0), Pose()), "right": commanded(StubArm(10**9), Pose())}
     before = time.now
-    with pytest.raises(DeviceError, match=r"arm 'right' did not come .* within 2 s: arm 'right' follows its target"):
+    with pytest.raises(
+        DeviceError, match=r"arm 'right' did not reach its target within 2 s: arm 'right' follows its target"
+    ):
         wait_for_arrival(arms, timeout=2.0)
     assert time.now - before == pytest.approx(2.0, abs=0.02)
 
 
-def test_what_stops_an_arm_is_what_is_raised(time: Time) -> None:
+def test_wait_for_arrival_raises_stop_of_arm(time: Time) -> None:
     with pytest.raises(ProtectiveStop):
         wait_for_arrival({"left": commanded(StubArm(error=ProtectiveStop("stopped")), Pose())}, timeout=2.0)
 
 
-def test_lock_step_waits_for_arms_then_forces_then_just_those_pictures(time: Time) -> None:
+def test_lock_step_waits_for_arms_then_forces_then_images(time: Time) -> None:
     log: list[object] = []
 
     class Cell:
@@ -153,18 +155,18 @@ def test_lock_step_waits_for_arms_then_forces_then_just_those_pictures(time: Tim
     arm = StubArm(4)
     clock = LockStep(PERIOD, {"left": commanded(arm, Pose())}, {"finger": StubCamera()}, Cell())  # type: ignore[dict-item, arg-type]
     clock.tick()
-    assert log == [("step", 4, clocks.SETTLED), ("picture", 17)]
+    assert log == [("step", 4, clocks.FORCE_DELAY), ("picture", 17)]
     assert clock.period == PERIOD and clock.diagnostics() == {}
 
 
-def test_waiting_for_data_waits_for_the_simulator_first() -> None:
+def test_wall_clock_waits_for_simulator_first() -> None:
     """Else an approach would go on while the simulator is busy with the first touch."""
     seen: list[str] = []
     WallClock(PERIOD, lambda: seen.append("caught up")).wait_for_data()
     assert seen == ["caught up"]
 
 
-def test_catching_up_needs_a_step_that_began_afterwards_and_tells_of_a_failure() -> None:
+def test_wait_for_fresh_step_needs_later_step_and_raises_failure() -> None:
     cell = object.__new__(MockCell)
     cell._steps, cell._failure = 5, None
 
@@ -174,8 +176,8 @@ def test_catching_up_needs_a_step_that_began_afterwards_and_tells_of_a_failure()
     timers = [threading.Timer(0.05 * k, step) for k in (1, 2)]
     for timer in timers:
         timer.start()
-    cell.catch_up()
+    cell.wait_for_fresh_step()
     assert cell._steps == 7
     cell._failure = RuntimeError("no more")
     with pytest.raises(DeviceError, match="no more"):
-        cell.catch_up()
+        cell.wait_for_fresh_step()

@@ -41,7 +41,7 @@ def bare(shared: Opened) -> Opened:
     return shared
 
 
-def test_an_arm_goes_where_the_step_says(bare: Opened) -> None:
+def test_rig_step_moves_arm_to_target(bare: Opened) -> None:
     observation = bare.rig.observe()
     start = observation.arms["right"].pose
     target = Pose(start.position + [1e-3, 0.0, 0.0], start.quaternion)
@@ -56,7 +56,7 @@ def test_an_arm_goes_where_the_step_says(bare: Opened) -> None:
     assert observation.arms["left"].pose.position == pytest.approx([0, 0, 0], abs=50e-6)
 
 
-def test_arms_never_come_nearer_than_the_keep_out(bare: Opened) -> None:
+def test_rig_arms_keep_their_distance(bare: Opened) -> None:
     """Both are asked to meet in the middle."""
     arms = bare.rig.observe().arms
     middle = np.array([0.0, 0.0, 15e-3])
@@ -74,7 +74,7 @@ def test_arms_never_come_nearer_than_the_keep_out(bare: Opened) -> None:
     assert gaps[-1] < 29e-3  # they did go as far as they may
 
 
-def test_arms_are_told_what_is_seen_from_the_first_observation_on(bare: Opened) -> None:
+def test_rig_reports_tactile_values_from_first_observation(bare: Opened) -> None:
     channels = [arm.driver._channel for arm in bare.rig.arms.values()]  # type: ignore[attr-defined]
     observation, _ = bare.rig.step(Action())
     oldest = min(touch.time for touch in observation.tactile.values())
@@ -86,7 +86,7 @@ def test_arms_are_told_what_is_seen_from_the_first_observation_on(bare: Opened) 
 
 
 @pytest.mark.parametrize(("link_timeout", "lost"), [(2.0, False), (0.05, True)])
-def test_a_gap_between_packages_is_a_lost_link_only_beyond_its_time_out(link_timeout: float, lost: bool) -> None:
+def test_package_gap_beyond_timeout_is_lost_link(link_timeout: float, lost: bool) -> None:
     now = time.monotonic()
     zero = np.zeros(6)
     states = [
@@ -102,7 +102,7 @@ def test_a_gap_between_packages_is_a_lost_link_only_beyond_its_time_out(link_tim
         assert gap == pytest.approx(0.1)
 
 
-def test_a_process_held_up_while_it_asks_still_finds_its_moment() -> None:
+def test_delayed_process_still_reads_state_at_time() -> None:
     """More packages come between the count of those that reach back to a moment and the copy of them."""
     now, zero = time.monotonic(), np.zeros(6)
     kept = [
@@ -123,7 +123,7 @@ def test_a_process_held_up_while_it_asks_still_finds_its_moment() -> None:
         ("protective_stop", ProtectiveStop, r"made a protective stop; find the cause, then recover\(\)"),
     ],
 )
-def test_a_stop_ends_the_episode_keeps_it_and_waits_for_recover(
+def test_stop_ends_episode_keeps_recording_and_needs_recover(
     shared: Opened, stop: str, error: type[DeviceError], words: str
 ) -> None:
     upper, lower = shared.rig.arms["right"], shared.rig.arms["left"]
@@ -137,7 +137,7 @@ def test_a_stop_ends_the_episode_keeps_it_and_waits_for_recover(
             upper.command(None)
         until(lambda: _refuses(lower, SafetyViolation), "the other arm's stop")
         with pytest.raises(DeviceError):
-            shared.rig.reset()  # nothing begins anew by itself
+            shared.rig.reset()  # nothing starts again by itself
         if stop == "estop":
             with pytest.raises(EmergencyStop, match="must release it"):
                 upper.recover()  # type: ignore[attr-defined]
@@ -165,7 +165,7 @@ def _refuses(arm: object, error: type[DeviceError]) -> bool:
         pytest.param("cut", "a damaged picture", marks=pytest.mark.deep),
     ],
 )
-def test_a_camera_that_shows_nothing_new_ends_the_episode(shared: Opened, fault: str, why: str) -> None:
+def test_frozen_or_damaged_camera_ends_episode(shared: Opened, fault: str, why: str) -> None:
     camera = shared.cameras["right"]
     set_fault = getattr(camera, fault)
     try:
@@ -176,13 +176,13 @@ def test_a_camera_that_shows_nothing_new_ends_the_episode(shared: Opened, fault:
     assert "sensor 'right'" in str(failed) and "ms old, limit 1000 ms" in str(failed) and why in str(failed)
     assert len(failed.episode.steps) >= 3
     if why:
-        told = shared.rig.diagnostics()
-        assert told["pictures_repeated_right" if fault == "freeze" else "pictures_damaged_right"] > 0
+        diagnostics = shared.rig.diagnostics()
+        assert diagnostics["pictures_repeated_right" if fault == "freeze" else "pictures_damaged_right"] > 0
     shared.rig.reset()
 
 
-def test_ctrl_c_in_a_reset_leaves_arms_that_rest(shared: Opened, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nobody goes on asking them; the next reset begins anew."""
+def test_ctrl_c_in_reset_leaves_arms_at_rest(shared: Opened, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No request follows; the next reset starts again."""
     waited = robot.rig.reset.wait_for_arrival
 
     def interrupted(arms: Mapping[str, CommandedArm], timeout: float) -> None:
@@ -197,13 +197,13 @@ def test_ctrl_c_in_a_reset_leaves_arms_that_rest(shared: Opened, monkeypatch: py
     shared.rig.reset()
 
 
-def test_without_a_yes_nothing_approaches(shared: Opened) -> None:
+def test_reset_without_confirmation_does_not_approach(shared: Opened) -> None:
     reset = shared.rig._reset
     asked: list[float] = []
     before = reset._confirm  # type: ignore[attr-defined]
     reset._confirm = lambda: bool(asked.append(time.monotonic()))  # type: ignore[attr-defined]
     try:
-        with pytest.raises(NotConfirmed, match="nothing approaches"):
+        with pytest.raises(NotConfirmed, match="no arm approaches"):
             shared.rig.reset()
     finally:
         reset._confirm = before  # type: ignore[attr-defined]
@@ -211,7 +211,7 @@ def test_without_a_yes_nothing_approaches(shared: Opened) -> None:
     assert shared.rig.observe().arms["right"].pose.position == pytest.approx([0, 0, 30e-3], abs=50e-6)
 
 
-def test_a_second_rig_at_the_same_addresses_is_refused(shared: Opened, tmp_path: Path) -> None:
+def test_second_rig_at_same_addresses_is_refused(shared: Opened, tmp_path: Path) -> None:
     with pytest.raises(DeviceError, match="in use"):
         open_rig(bare_file(tmp_path))
     shared.rig.reset()  # the first one goes on

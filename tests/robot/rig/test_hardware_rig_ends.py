@@ -34,7 +34,7 @@ MOTIONS = {1, 2, 3, 4, 6, 9, 10, 11, 12, 18, 24, 25, 41, 45, 51, 52, 66}  # of t
         ("sensors.east.width=100", "sensor 'east'.*expected 100 x"),
     ],
 )
-def test_what_makes_no_rig_is_refused_and_leaves_nothing(tmp_path: Path, override: str, words: str) -> None:
+def test_invalid_rig_is_refused_and_leaves_no_process(tmp_path: Path, override: str, words: str) -> None:
     overrides = [override, *["arms.east.watchdog=10"] * override.endswith("mock=null")]
     file = bare_file(tmp_path, first=61)
     with cameras_of(load_rig(file).config):
@@ -44,7 +44,7 @@ def test_what_makes_no_rig_is_refused_and_leaves_nothing(tmp_path: Path, overrid
         until(lambda: belongings() == before, "what was started is gone")
 
 
-def test_a_dry_run_sends_no_motion(tmp_path: Path) -> None:
+def test_dry_run_sends_no_motion(tmp_path: Path) -> None:
     with opened(bare_file(tmp_path, first=51), dry_run=True) as dry:
         observation = dry.rig.reset()
         pose = observation.arms["east"].pose
@@ -60,7 +60,7 @@ def test_a_dry_run_sends_no_motion(tmp_path: Path) -> None:
 
 
 @needs_proc
-def test_closing_leaves_nothing_and_may_be_done_twice(tmp_path: Path) -> None:
+def test_rig_close_twice_leaves_no_process(tmp_path: Path) -> None:
     file = bare_file(tmp_path, first=53)
     with cameras_of(load_rig(file).config):
         before = belongings()
@@ -94,7 +94,7 @@ def one_killed(folder: Path, first: int, victim: Callable[[Opened], int]) -> Epi
     ],
     ids=["controllers", "worker", "camera"],
 )
-def test_a_part_that_is_killed_ends_the_episode_in_clear_words(
+def test_killed_process_ends_episode_with_message(
     tmp_path: Path, victim: Callable[[Opened], int], errors: tuple[type[Exception], ...], words: str
 ) -> None:
     before = belongings()

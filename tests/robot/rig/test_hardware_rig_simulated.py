@@ -40,7 +40,7 @@ def simulated(loaded: Opened, monkeypatch: pytest.MonkeyPatch) -> Opened:
     return loaded
 
 
-def test_arms_of_a_mock_rig_hold_the_loads_of_their_task(loaded: Opened) -> None:
+def test_mock_rig_arms_hold_task_loads(loaded: Opened) -> None:
     start = loaded.rig.reset().arms["upper"].pose
     for count in range(1, 7):
         asked = Pose(start.position + [count * 0.05e-3, 0.0, 0.0], start.quaternion)
@@ -50,7 +50,7 @@ def test_arms_of_a_mock_rig_hold_the_loads_of_their_task(loaded: Opened) -> None
     assert arm.pose.position[0] - start.position[0] == pytest.approx(0.3e-3, abs=10e-6)
 
 
-def test_a_mock_rig_begins_in_gentle_touch_and_knows_the_truth(simulated: Opened) -> None:
+def test_mock_rig_reset_ends_in_touch_with_truth(simulated: Opened) -> None:
     rig = simulated.rig
     observation = rig.reset()
     forces = [-arm.wrench[2] for arm in observation.arms.values()]
@@ -71,7 +71,7 @@ def test_a_mock_rig_begins_in_gentle_touch_and_knows_the_truth(simulated: Opened
         assert observation.arms[name].pose.position == pytest.approx(pose.position, abs=5e-6)
 
 
-def test_no_touch_on_all_the_way_ends_at_the_start(simulated: Opened) -> None:
+def test_mock_rig_approach_without_touch_returns_to_start(simulated: Opened) -> None:
     reset = simulated.rig._reset
     config = reset._config  # type: ignore[attr-defined]
     reset._config = config.model_copy(update={"approach_distance": 0.1e-3})  # type: ignore[attr-defined]
@@ -85,11 +85,11 @@ def test_no_touch_on_all_the_way_ends_at_the_start(simulated: Opened) -> None:
 
 
 @pytest.mark.deep
-def test_a_killed_simulator_ends_the_episode(simulated: Opened) -> None:
+def test_killed_simulator_ends_episode(simulated: Opened) -> None:
     """The last test of this rig."""
     sim_server = simulated.cell._sim_server
     assert sim_server is not None
     failed = failing(simulated.rig, lambda: os.kill(sim_server.pid, signal.SIGKILL))
-    assert "simulated cell" in str(failed) and "open the rig anew" in str(failed)
+    assert "simulated cell" in str(failed) and "open the rig again" in str(failed)
     assert len(failed.episode.steps) >= 3
     until(lambda: all(faults.state().rests for faults in simulated.cell.faults.values()), "rest")

@@ -36,7 +36,7 @@ print("mocks:", [name for name in sys.modules if name.startswith("robot.mock")])
 """
 
 
-def test_a_rig_without_mocks_imports_none(tmp_path: Path) -> None:
+def test_rig_without_mocks_imports_no_mock(tmp_path: Path) -> None:
     """Up to the arm that does not answer, and in `tacsim doctor`."""
     done = subprocess.run(
         [sys.executable, "-c", REAL],
@@ -51,13 +51,13 @@ def test_a_rig_without_mocks_imports_none(tmp_path: Path) -> None:
     assert "mocks: []" in done.stdout
 
 
-def test_a_keep_out_that_a_driver_does_not_keep_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_keep_out_unsupported_by_driver_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(UrDriver, "keeps_distances", False)
     with pytest.raises(ValueError, match="keep_out of lower and upper: their drivers, 'ur' and 'ur', do not keep"):
         open_rig("mock")
 
 
-def test_mocks_that_need_different_companions_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_mocks_with_different_companions_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(UrDriver, "companion", property(lambda driver: "elsewhere:Cell"))
     with pytest.raises(CannotOpen, match=r"different companions, elsewhere:Cell and robot\.mock"):
         companion_class(load_rig("mock").config)

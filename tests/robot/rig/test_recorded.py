@@ -16,7 +16,7 @@ from tacsim.record.images import reference_attachments
 from tacsim.record.writer import Recorder
 
 
-def test_a_cameras_pictures_are_seen_by_its_own_model(tmp_path: Path) -> None:
+def test_recorded_camera_images_use_their_own_model(tmp_path: Path) -> None:
     """Heights and all, as on the rig; before, a recording of hardware was seen as a whole picture, without heights."""
     loaded = load_rig("mock")
     camera = loaded.config.sensors["upper"]

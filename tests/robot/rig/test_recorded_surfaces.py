@@ -41,20 +41,20 @@ def report(tmp_path: Path, frames: Path, *more: str) -> tuple[str, dict, str]:
     return done.output, summary, (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
 
 
-def test_flow_is_found_by_the_distance_of_the_dots_alone(tmp_path: Path) -> None:
+def test_recording_with_marker_pitch_gives_flow(tmp_path: Path) -> None:
     output, summary, page = report(tmp_path, record(tmp_path / "frames", MARKERS), "marker_pitch=1.9 mm")
     true = [np.linalg.norm(marker_flow(dent((0.5e-3, 0.4e-3), 0.4e-3, s), MARKERS), axis=2).max() for s in SLIDES]
     assert summary["flow"]["finger"] == pytest.approx(true, abs=0.2 * 0.065e-3)  # a fifth of a pixel
     assert "finger: flow" in page and "finger: height" not in page and "dark dots" not in output
 
 
-def test_a_replay_says_that_it_sees_dots(tmp_path: Path) -> None:
+def test_replay_reports_printed_dots(tmp_path: Path) -> None:
     output, summary, _ = report(tmp_path, record(tmp_path / "frames", MARKERS))
     assert "sensor finger shows 5 x 7 dark dots" in output and "sensors.finger.marker_pitch=" in output
     assert summary["flow"] == {}
 
 
-def test_without_dots_a_pitch_is_refused(tmp_path: Path) -> None:
+def test_marker_pitch_without_dots_is_refused(tmp_path: Path) -> None:
     frames = record(tmp_path / "frames", None)
     done = tacsim(
         "run", "replay", "--set", f"sensors.finger.source={frames}", "--set", "sensors.finger.marker_pitch=2 mm"
@@ -62,7 +62,7 @@ def test_without_dots_a_pitch_is_refused(tmp_path: Path) -> None:
     assert done.exit_code == 2 and "sensors.finger" in done.output and "no lattice of dark dots" in done.output
 
 
-def test_a_replay_with_a_bundle_shows_its_heights_and_no_task(tmp_path: Path) -> None:
+def test_replay_with_bundle_shows_height_without_task(tmp_path: Path) -> None:
     frames = tmp_path / "frames"
     frames.mkdir()
     for name, source in (("0.png", "reference.png"), ("1.png", "press.png")):
@@ -79,7 +79,7 @@ def test_a_replay_with_a_bundle_shows_its_heights_and_no_task(tmp_path: Path) ->
     assert again.exit_code == 0 and "finger: height" in (tmp_path / "again" / "report.html").read_text(encoding="utf-8")
 
 
-def test_a_replay_says_that_its_maps_show_the_middle_alone_and_how_to_see_all(tmp_path: Path) -> None:
+def test_replay_reports_partial_maps_and_overrides(tmp_path: Path) -> None:
     """The picture shows 31.2 x 24.7 mm by its dots, the map is 16 x 16 mm."""
     said = "sensor finger: maps show the middle 16 x 16 mm of 31.2 x 24.7 mm of gel; for all of it: tacsim run ..."
     all_of_it = ("--set canonical.columns=126", "--set canonical.rows=100")
@@ -93,7 +93,7 @@ def test_a_replay_says_that_its_maps_show_the_middle_alone_and_how_to_see_all(tm
     assert whole.exit_code == 0 and "the middle" not in whole.output
 
 
-def test_a_bundle_tells_how_much_its_maps_leave_out(tmp_path: Path) -> None:
+def test_replay_with_bundle_reports_partial_maps(tmp_path: Path) -> None:
     """Of 20.8 x 16 mm the map leaves out the left and right, or nothing where a region shows no more than 16 x 16."""
     frames = tmp_path / "frames"
     frames.mkdir()
@@ -111,7 +111,7 @@ def test_a_bundle_tells_how_much_its_maps_leave_out(tmp_path: Path) -> None:
     assert "the middle" not in output
 
 
-def test_a_replay_with_a_bundle_that_is_not_to_be_trusted_says_so(tmp_path: Path) -> None:
+def test_replay_with_untrusted_bundle_reports_it(tmp_path: Path) -> None:
     frames = tmp_path / "frames"
     frames.mkdir()
     for name, source in (("0.png", "reference.png"), ("1.png", "press.png")):

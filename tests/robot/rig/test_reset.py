@@ -12,7 +12,7 @@ import pytest
 from robot.errors import DeviceError, EmergencyStop
 from robot.rig import reset as resets
 from robot.rig.commanded_arm import CommandedArm
-from robot.rig.reset import RETREAT, HardwareReset, NotConfirmed
+from robot.rig.reset import RETREAT_DISTANCE, HardwareReset, NotConfirmed
 from robot.rig.touch import Touch
 from tacsim import pose as se3
 from tacsim.control.contact_signal import NoTouch
@@ -29,10 +29,10 @@ class StubArm:
     def __init__(self, name: str, pose: Pose, log: list[object]) -> None:
         self.name, self.pose, self._log = name, pose, log
         self.stopped = False
-        self.told: object = "what was seen last"
+        self.reported: object = "the last tactile values"
 
     def report_tactile(self, shown: object) -> None:
-        self.told = shown
+        self.reported = shown
 
     def state(self, at: float | None = None) -> ArmState:
         return ArmState(self.pose, np.zeros(6), np.zeros(6), np.zeros(6), 0.0)
@@ -91,9 +91,9 @@ class Scene:
     arms: bool = True
     placement: float = 0.0
     log: list[object] = field(default_factory=list)
-    told: list[str] = field(default_factory=list)
+    reports: list[str] = field(default_factory=list)
     real_time = False
-    patience = 0.1
+    data_timeout = 0.1
 
     def __post_init__(self) -> None:
         self.lower, self.upper = StubArm("lower", LOWER, self.log), StubArm("upper", UPPER, self.log)
@@ -105,10 +105,10 @@ class Scene:
             start={"lower": LOWER, "upper": UPPER},
             clock=self,
             config=PARAMS,
-            touch_sense=None if self.touch_at is None else self,
+            touch_sensing=None if self.touch_at is None else self,
             confirm=self.confirm,
             placement=self.placement,
-            tell=self.told.append,
+            report=self.reports.append,
         )
 
     def wait_for_data(self) -> None:
@@ -121,7 +121,7 @@ class Scene:
         self.log.append("asked")
         return self.yes
 
-    def look(self, *, guarded: bool) -> Touch:
+    def measure_touch(self, *, guarded: bool) -> Touch:
         assert self.touch_at is not None and not guarded
         gone = float(self.lower.pose.position[2] - LOWER.position[2])
         return Touch({"lower": gone / self.touch_at, "upper": gone / self.touch_at}, 0.0)
@@ -135,28 +135,28 @@ def no_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(resets.time, "sleep", lambda seconds: None)
 
 
-def test_it_retreats_along_its_own_axis_then_goes_to_the_start() -> None:
+def test_reset_retreats_along_axis_then_moves_to_start() -> None:
     scene = Scene()
     scene.lower.pose, scene.upper.pose = (
         Pose(np.array([5e-3, 0, 0])),
         Pose(np.array([5e-3, 0, 10e-3]), UPPER.quaternion),
     )
     scene.reset.clear(0)
-    assert scene.lower.told is scene.upper.told is None  # until it sees anew, nothing is decided by what it saw
+    assert scene.lower.reported is scene.upper.reported is None  # old tactile values are not used
     back = dict(scene.motions()[:2])
-    assert back["lower"].position == pytest.approx([5e-3, 0, -RETREAT])
-    assert back["upper"].position == pytest.approx([5e-3, 0, 10e-3 + RETREAT])  # it faces down
+    assert back["lower"].position == pytest.approx([5e-3, 0, -RETREAT_DISTANCE])
+    assert back["upper"].position == pytest.approx([5e-3, 0, 10e-3 + RETREAT_DISTANCE])  # it faces down
     there = dict(scene.motions()[2:])
     assert se3.pose_distance(there["lower"], LOWER)[0] == se3.pose_distance(there["upper"], UPPER)[0] == 0.0
 
 
-def test_forces_are_zeroed_when_what_is_felt_is_of_now_and_references_come_last() -> None:
+def test_reset_zeroes_present_force_then_reads_references() -> None:
     scene = Scene()
     scene.reset.clear(0)
     assert scene.log[4:] == ["wait", ("lower", "zero"), ("upper", "zero"), "wait", "reference"]
 
 
-def test_a_reference_is_exposed_after_the_arms_came_to_rest() -> None:
+def test_reset_reference_is_exposed_at_rest() -> None:
     """A camera that was held up still has one of before; at that time an arm may not even have been connected."""
     scene, before = Scene(), time.monotonic()
     scene.sensor.late = 3
@@ -164,15 +164,15 @@ def test_a_reference_is_exposed_after_the_arms_came_to_rest() -> None:
     assert scene.log[-5:] == ["wait", *["reference"] * 4]
 
 
-def test_a_camera_that_shows_nothing_new_ends_the_reset(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(resets, "PICTURE", 0.0)
+def test_reset_without_new_image_raises_timeout(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(resets, "FRAME_TIMEOUT", 0.0)
     scene = Scene()
     scene.sensor.late = 10**9
-    with pytest.raises(TimeoutError, match="sensor 'finger': no picture since the arms came to rest"):
+    with pytest.raises(TimeoutError, match="sensor 'finger': no image since the arms came to rest"):
         scene.reset.clear(0)
 
 
-def test_the_start_aside_is_of_the_seed_within_bounds_and_the_same_for_all_arms() -> None:
+def test_reset_placement_depends_on_seed_and_is_equal_for_arms() -> None:
     found = []
     for seed in (3, 3, 4):
         scene = Scene(placement=2e-3)
@@ -186,7 +186,7 @@ def test_the_start_aside_is_of_the_seed_within_bounds_and_the_same_for_all_arms(
     assert np.array_equal(found[0], found[1]) and not np.array_equal(found[0], found[2])
 
 
-def test_both_approach_by_steps_until_they_feel_enough() -> None:
+def test_approach_by_steps_ends_at_touch_of_each_arm() -> None:
     scene = Scene(touch_at=3.5e-3)
     scene.reset.clear(0)
     before = len(scene.motions())
@@ -200,16 +200,16 @@ def test_both_approach_by_steps_until_they_feel_enough() -> None:
     assert scene.log.index("asked") < scene.log.index(steps[0])
 
 
-def test_without_a_yes_nothing_moves() -> None:
+def test_touch_without_confirmation_moves_no_arm() -> None:
     scene = Scene(touch_at=1e-3, yes=False)
     scene.reset.clear(0)
     before = len(scene.motions())
-    with pytest.raises(NotConfirmed, match="nothing approaches"):
+    with pytest.raises(NotConfirmed, match="no arm approaches"):
         scene.reset.touch()
     assert len(scene.motions()) == before and "restart" not in scene.log
 
 
-def test_no_touch_goes_back_to_the_start() -> None:
+def test_approach_by_steps_without_touch_returns_to_start() -> None:
     scene = Scene(touch_at=1.0)
     scene.reset.clear(0)
     with pytest.raises(NoTouch, match=r"no touch after an approach of 1[01] mm.*back at their start"):
@@ -220,7 +220,7 @@ def test_no_touch_goes_back_to_the_start() -> None:
     assert 8e-3 < farthest - LOWER.position[2] <= PARAMS.approach_distance + 1e-9  # never beyond
 
 
-def test_an_arm_that_is_stopped_ends_it() -> None:
+def test_reset_with_stopped_arm_raises() -> None:
     scene = Scene(touch_at=1.0)
     scene.upper.stopped = True
     with pytest.raises(EmergencyStop):
@@ -228,11 +228,11 @@ def test_an_arm_that_is_stopped_ends_it() -> None:
     assert "reference" not in scene.log
 
 
-def test_a_dry_run_moves_nothing_and_still_asks_and_observes() -> None:
+def test_reset_in_dry_run_asks_and_observes_without_motion() -> None:
     scene = Scene(arms=False, touch_at=1.0)
     scene.reset.clear(0)
     scene.reset.touch()
-    assert scene.told == []
+    assert scene.reports == []
     assert scene.motions() == [] and ("lower", "zero") not in scene.log
     assert scene.log == ["wait", "reference", "asked", "wait", "restart"]
 
@@ -245,7 +245,7 @@ class Moving(Scene):
     silent = False
     looks = 0
 
-    def look(self, *, guarded: bool) -> Touch:
+    def measure_touch(self, *, guarded: bool) -> Touch:
         assert guarded
         self.looks += 1
         assert self.looks < 200
@@ -263,51 +263,51 @@ def moving() -> Moving:
     return scene
 
 
-def test_in_motion_each_arm_stops_when_its_own_gel_touches(moving: Moving) -> None:
+def test_approach_stops_each_arm_at_its_touch(moving: Moving) -> None:
     moving.reset.touch()
     assert moving.lower.pose.position[2] - LOWER.position[2] == pytest.approx(2e-3)
     assert UPPER.position[2] - moving.upper.pose.position[2] == pytest.approx(5e-3)
     assert moving.log[-1] == "restart"
 
 
-def test_without_new_pictures_nothing_moves(moving: Moving, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_approach_without_new_images_waits(moving: Moving, monkeypatch: pytest.MonkeyPatch) -> None:
     moving.silent = True
-    monkeypatch.setattr(resets, "TRAVEL", 0.0)  # gives up at once
-    with pytest.raises(DeviceError, match="came no farther for 0 s: no new pictures"):
+    monkeypatch.setattr(resets, "MOVE_TIMEOUT", 0.0)  # gives up at once
+    with pytest.raises(DeviceError, match="made no progress for 0 s: no new images"):
         moving.reset.touch()
     assert moving.lower.pose.position == pytest.approx(LOWER.position)
     assert ("lower", "stop") in moving.log and ("upper", "stop") in moving.log
 
 
-def test_a_slow_approach_goes_on_while_it_comes_farther(moving: Moving, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(resets, "TRAVEL", 0.0)  # less than the whole takes
+def test_slow_approach_continues_while_it_progresses(moving: Moving, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(resets, "MOVE_TIMEOUT", 0.0)  # less than the whole takes
     moving.reset.touch()
     assert moving.log[-1] == "restart"
 
 
-def test_what_cannot_be_known_counts_as_touch(moving: Moving) -> None:
+def test_approach_nan_signal_counts_as_touch(moving: Moving) -> None:
     moving.walls["lower"] = math.nan
     moving.reset.touch()
     assert moving.lower.pose.position == pytest.approx(LOWER.position)
 
 
-def test_whatever_ends_an_approach_in_motion_stops_the_arms(moving: Moving, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_approach_error_stops_arms(moving: Moving, monkeypatch: pytest.MonkeyPatch) -> None:
     del moving.walls["upper"]
     with pytest.raises(KeyError):
         moving.reset.touch()
     moving.walls["upper"] = 1.0
-    monkeypatch.setattr(moving.reset, "_tell", lambda words: 1 / 0)
+    monkeypatch.setattr(moving.reset, "_report", lambda words: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         moving.reset.touch()
     assert moving.log[-2:] == [("lower", "stop"), ("upper", "stop")]
 
 
-def test_in_motion_no_touch_goes_back_to_the_start(moving: Moving, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_approach_without_touch_returns_to_start(moving: Moving, monkeypatch: pytest.MonkeyPatch) -> None:
     moving.walls = {"lower": 1.0, "upper": 1.0}
-    monkeypatch.setattr(resets, "AT_END", 0.0)
+    monkeypatch.setattr(resets, "END_TIMEOUT", 0.0)
     with pytest.raises(NoTouch, match=r"no touch after an approach of 10 mm.*back at their start"):
         moving.reset.touch()
     assert moving.lower.pose.position == pytest.approx(LOWER.position)
     assert moving.upper.pose.position == pytest.approx(UPPER.position)
-    assert moving.lower.told is None  # the way back is not guarded by what was seen before
-    assert moving.told[-1] == "back to the start" and "approach: 10.0 mm of at most 10 mm" in moving.told
+    assert moving.lower.reported is None  # old tactile values do not guard the motion back
+    assert moving.reports[-1] == "back to the start" and "approach: 10.0 mm of at most 10 mm" in moving.reports

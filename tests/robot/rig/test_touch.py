@@ -38,7 +38,7 @@ LATEST = 0.75  # no picture for 2.5 periods of 0.1 s, no action for 0.2 s: then 
 class Opened:
     lab: Lab
     rig: Rig
-    told: list[str] = field(default_factory=list)
+    reports: list[str] = field(default_factory=list)
 
     @property
     def arm(self) -> CommandedArm:
@@ -54,14 +54,14 @@ class Opened:
 @pytest.fixture(scope="module")
 def opened(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Opened]:
     file = copy_of("ur5e-one", tmp_path_factory.mktemp("rig"), 65)
-    told: list[str] = []
-    with Lab(file) as lab, open_rig(file, confirm=lambda question: True, tell=told.append) as rig:
-        yield Opened(lab, rig, told)
+    reports: list[str] = []
+    with Lab(file) as lab, open_rig(file, confirm=lambda question: True, report=reports.append) as rig:
+        yield Opened(lab, rig, reports)
 
 
 @pytest.mark.deep
-def test_the_approach_goes_at_its_speed_and_stops_on_contact(opened: Opened, monkeypatch: pytest.MonkeyPatch) -> None:
-    states, tell = opened.arm.driver._channel.states, opened.rig._reset._tell  # type: ignore[attr-defined]
+def test_approach_keeps_its_speed_and_stops_at_contact(opened: Opened, monkeypatch: pytest.MonkeyPatch) -> None:
+    states, tell = opened.arm.driver._channel.states, opened.rig._reset._report  # type: ignore[attr-defined]
     looks: list[Record] = []
 
     def look(words: str) -> None:
@@ -69,7 +69,7 @@ def test_the_approach_goes_at_its_speed_and_stops_on_contact(opened: Opened, mon
             looks.append(states.recent(HISTORY))
         tell(words)
 
-    monkeypatch.setattr(opened.rig._reset, "_tell", look)
+    monkeypatch.setattr(opened.rig._reset, "_report", look)
     opened.rig.reset()
     depth = opened.depth
     # By the periods of the arm's own loop: neither a busy machine nor a controller that misses ticks on it changes how
@@ -84,13 +84,11 @@ def test_the_approach_goes_at_its_speed_and_stops_on_contact(opened: Opened, mon
     assert speeds.max() <= SPEED * 1.001
     assert (speeds > 0.999 * SPEED).mean() > 0.2  # it waits only where no pictures come: more often on a busy machine
     assert 0.0 < depth < SPEED * LATEST
-    assert any("mm of at most 40 mm" in words for words in opened.told)
+    assert any("mm of at most 40 mm" in words for words in opened.reports)
 
 
 @pytest.mark.deep
-def test_an_approach_waits_when_no_pictures_come_and_ends_when_none_do(
-    opened: Opened, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_approach_without_images_waits_then_fails(opened: Opened, monkeypatch: pytest.MonkeyPatch) -> None:
     """The camera falls silent a millimetre on, three before the touch."""
     camera, faults = opened.lab.cameras["finger"], opened.lab.faults["arm"]
     places: list[float] = []
@@ -100,7 +98,7 @@ def test_an_approach_waits_when_no_pictures_come_and_ends_when_none_do(
             camera.stall(True)
             places.append(opened.depth)
 
-    monkeypatch.setattr(opened.rig._reset, "_tell", stall)
+    monkeypatch.setattr(opened.rig._reset, "_report", stall)
     try:
         with pytest.raises(StaleFrame):
             opened.rig.reset()
@@ -110,7 +108,7 @@ def test_an_approach_waits_when_no_pictures_come_and_ends_when_none_do(
     assert opened.depth < places[0] + SPEED * LATEST < 0.0
 
 
-def test_a_speed_that_would_press_a_gel_too_deep_is_refused_in_words(tmp_path: Path) -> None:
+def test_too_fast_approach_speed_is_refused(tmp_path: Path) -> None:
     """Before anything is opened: nothing answers at these addresses."""
     file = copy_of("ur5e", tmp_path, 67)
     text = file.read_text().replace("approach_speed: 2 mm/s", "approach_speed: 20 mm/s")
@@ -123,7 +121,7 @@ def test_a_speed_that_would_press_a_gel_too_deep_is_refused_in_words(tmp_path: P
 
 
 @pytest.mark.parametrize("stated", [math.nan, math.inf, 0.0, -0.1])
-def test_a_latency_that_is_no_time_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stated: float) -> None:
+def test_invalid_latency_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stated: float) -> None:
     """One that is not stated at all is refused when the rig file is read: tests/contract/test_outside_driver.py."""
     file = copy_of("ur5e", tmp_path, 67)
     text = file.read_text().replace("depth: null", "depth: 1 mm").replace("model: null", "model: ideal")
@@ -134,11 +132,11 @@ def test_a_latency_that_is_no_time_is_refused(tmp_path: Path, monkeypatch: pytes
         open_rig(file)
 
 
-def test_a_signal_that_is_no_number_is_not_hidden_by_the_other_sensor(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nan_contact_signal_is_not_hidden_by_other_sensor(monkeypatch: pytest.MonkeyPatch) -> None:
     signals = iter([0.5, math.nan, 0.2])
     monkeypatch.setattr(touch, "contact_signal", lambda seen: next(signals))
     frame = SimpleNamespace(index=1, time=0.0)
     sensor = SimpleNamespace(spec=SimpleNamespace(arm="arm"), read=lambda timeout: frame)
     sensors = dict.fromkeys("abc", cast(TactileSource, sensor))
     sense = touch.PictureTouch(sensors, dict.fromkeys("abc", lambda *_: None), lambda seen: None, 1.0, 0.1)  # type: ignore[arg-type]
-    assert math.isnan(sense.look(guarded=False).pressed["arm"])
+    assert math.isnan(sense.measure_touch(guarded=False).pressed["arm"])

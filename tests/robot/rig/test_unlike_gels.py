@@ -57,7 +57,7 @@ def extent(valid: np.ndarray) -> tuple[int, int]:
     return int(valid.any(axis=0).sum()), int(valid.any(axis=1).sum())
 
 
-def test_a_rig_of_a_gelsight_mini_and_a_digit_runs_records_and_replays(rig_file: Path) -> None:
+def test_rig_with_two_gel_types_runs_records_and_replays(rig_file: Path) -> None:
     done = tacsim("run", rig_file, "--steps", "3", "--out", rig_file.parent / "run")
     assert done.exit_code == 0, done.output
     (episode,) = (rig_file.parent / "run").glob("*.mcap")
@@ -89,7 +89,7 @@ def moved(pose: Pose, z: float) -> Pose:
     return Pose(pose.position + [0.0, 0.0, z], pose.quaternion)
 
 
-def test_the_process_of_a_mock_cell_has_both_gels(rig_file: Path) -> None:
+def test_mock_cell_process_has_both_gels(rig_file: Path) -> None:
     config = load_rig(rig_file).config
     models: dict[str, SensorModel] = {name: sensor.model for name, sensor in config.sensors.items()}  # type: ignore[union-attr, misc]
     assert config.scene is not None
@@ -104,7 +104,7 @@ def test_the_process_of_a_mock_cell_has_both_gels(rig_file: Path) -> None:
         ball.move({"upper": moved(ball.poses()["upper"], -2e-3)})
 
 
-def test_a_dump_holds_both_gels(rig_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_dump_contains_both_gels(rig_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TACSIM_DUMPS", str(rig_file.parent / "dumps"))
     scene = load_rig(rig_file).config.scene
     assert scene is not None
@@ -127,7 +127,7 @@ def test_a_dump_holds_both_gels(rig_file: Path, monkeypatch: pytest.MonkeyPatch)
     assert (rig_file.parent / "dump.png").stat().st_size > 10_000
 
 
-def test_identification_coarsens_both_gels() -> None:
+def test_identification_coarsens_both_gel_meshes() -> None:
     gels = "gels={upper: {size: [20 mm, 20 mm, 2 mm], element_size: 0.25 mm}, lower: {material: {density: 900}}}"
     scene = coarser(load_scene("squeeze", [gels, "preset=standard"]))
     assert (scene.element_size_of("lower"), scene.element_size_of("upper")) == (1e-3, 0.5e-3)

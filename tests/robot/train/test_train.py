@@ -221,8 +221,8 @@ def test_train_command_trains_exports_and_continues(tmp_path: Path) -> None:
         (("squeeze", "--set", "rig=mock", "--set", "overrides=[]", "--set", "randomise=null"), "not simulated"),
         (("squeeze", "--set", "features.flow=true"), "markers"),
         (("--resume", "nowhere"), "nowhere is not the folder of a training run"),
-        (("--resume", "nowhere", "--seed", "1"), "leave out all else"),
-        (("squeeze", "--resume", "nowhere"), "leave out all else"),
+        (("--resume", "nowhere", "--seed", "1"), "omit other options"),
+        (("squeeze", "--resume", "nowhere"), "omit other options"),
     ],
 )
 def test_train_command_invalid_input_is_reported(

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from robot.deploy.python_policy import FunctionPolicy
-from robot.mock.cell.cell import MockCell, _true_frames
+from robot.mock.cell.cell import MockCell, _actual_frames
 from robot.mock.cell.sim_server import SceneFrame
 from robot.mock.fixtures import rig_addresses
 from robot.open import open_rig
@@ -81,7 +81,7 @@ def test_twin_sensor_pose_error_is_applied() -> None:
     assert isinstance(arm, UrArmConfig) and arm.mock is not None
     error = {"position": (1e-4, 0.0, 0.0)}
     shifted = UrArmConfig.model_validate(arm.model_dump() | {"mock": {"error": error}})
-    one, other = _true_frames(arm), _true_frames(shifted)
+    one, other = _actual_frames(arm), _actual_frames(shifted)
     moved = other.tool_from_sensor[:3, 3] - one.tool_from_sensor[:3, 3]
     assert moved == pytest.approx(-one.tool_from_sensor[:3, 0] * 1e-4)  # it believes to be further along its own x
 

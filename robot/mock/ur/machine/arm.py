@@ -1,9 +1,9 @@
-"""The arm of the mock: where its joints are wanted, where they are, and what lies between.
+"""The arm of the mock: target joints, set point, and actual joints.
 
-The target is what the program's motion asks for. The set point is where the joint servos shall be: the target, or in
-force mode what giving way makes of it. The actual joints follow it as a critically damped servo of second order does.
-With SERVO_RATE = 500 rad/s they trail a steady motion by 4 ms and settle within about 20 ms; real arms are in this
-order, and their true dynamics are not modelled (no masses, no friction, no flexibility).
+The program's motion gives the target. The set point of the joint servos is the target, changed by compliance in force
+mode. The actual joints follow the set point like a critically damped servo of second order. With a servo rate of
+500 rad/s they lag behind a steady motion by 4 ms and settle within about 20 ms. Real arms have similar values; their
+dynamics are not modelled (no masses, friction or flexibility).
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ if TYPE_CHECKING:
     from tacsim.models.hardware import Model  # pydantic and SciPy: half a second of start-up
 
 PERIOD = 0.002  # one control period [s]
-JOINT_ACCELERATION = 40.0  # top acceleration in servo motion [rad/s^2]
-COAST = 8.0  # deceleration of the leading joint when nothing commands the arm [rad/s^2]
-BRAKE = 20.0  # the same in a protective or emergency stop [rad/s^2]
+JOINT_ACCELERATION = 40.0  # maximum in servo motion [rad/s^2]
+COAST_DECELERATION = 8.0  # of the leading joint without a command [rad/s^2]
+BRAKE_DECELERATION = 20.0  # of the leading joint in a protective or emergency stop [rad/s^2]
 HOME = (0.0, -math.pi / 2, math.pi / 2, -math.pi / 2, -math.pi / 2, 0.0)  # tool down, in front of the base
-HISTORY = 2500  # periods of joint positions that are kept
-REST = 1e-9  # joint speed below which the arm rests [rad/s]
-TOP = 1.001  # of the joints' top speeds, beyond which a motion is refused; the rest is rounding
+HISTORY_LENGTH = 2500  # stored control periods of joint positions
+MAX_REST_SPEED = 1e-9  # of a joint of an arm at rest [rad/s]
+MAX_SPEED_RATIO = 1.001  # of a joint's maximum speed; a faster motion is refused (the excess allows for rounding)
 
 MotionSteps = Iterator[None]  # a motion as a generator: one `yield` is one control period
 
@@ -38,11 +38,11 @@ class ProgramError(Exception):
 
 
 class TooFast(ProgramError):
-    """A motion asks for more than a joint's top speed: on the controller a protective stop."""
+    """A motion exceeds a joint's maximum speed: on the controller a protective stop."""
 
 
 class Arm:
-    """Joints (6,) [rad], their speeds [rad/s], and what follows from them. All poses and twists in base axes."""
+    """Joints (6,) [rad], their speeds [rad/s], and the resulting frames. All poses and twists are in base axes."""
 
     def __init__(self, model: Model = "ur5e", joints: Sequence[float] = HOME) -> None:
         servo_rate = 500.0  # of the joint servos [rad/s]
@@ -52,15 +52,15 @@ class Arm:
         if self.target_q.shape != (6,) or not np.isfinite(self.target_q).all():
             raise ValueError(f"joints must be 6 finite angles [rad], got {list(joints)}")
         if float(np.abs(self.target_q).max()) > JOINT_RANGE:
-            raise ValueError(f"joints must lie within +-2 pi rad, got {list(joints)}")
+            raise ValueError(f"joints must be within +-2 pi rad, got {list(joints)}")
         self.target_qd, self.target_qdd = np.zeros(6), np.zeros(6)
         self.set_q, self.set_qd = self.target_q.copy(), np.zeros(6)
         self.q, self.qd = self.target_q.copy(), np.zeros(6)
-        self.scale = 1.0  # speed scaling now, 0 to 1
-        self.servo_rates = np.full(6, servo_rate)  # of each joint; a fault may make one slow
-        self.held = False  # the tool is held: the joints stand, whatever their servos want
-        self.waypoint: FloatArray | None = None  # (4, 4) where the present move ends
-        self.history: deque[FloatArray] = deque([self.q] * HISTORY, maxlen=HISTORY)
+        self.scale = 1.0  # present speed scaling, 0 to 1
+        self.servo_rates = np.full(6, servo_rate)  # of each joint [rad/s]; a fault may reduce one
+        self.held = False  # the tool is held: the joints do not move, whatever their servos command
+        self.waypoint: FloatArray | None = None  # (4, 4) at the end of the present move
+        self.history: deque[FloatArray] = deque([self.q] * HISTORY_LENGTH, maxlen=HISTORY_LENGTH)
         self._next: FloatArray | None = None
         self.acceleration, self.target_acceleration = np.zeros(6), np.zeros(6)  # of the TCP, over the last period
         self.update()
@@ -68,9 +68,9 @@ class Arm:
     # -- commands of a motion: at most one a control period ----------------------------------------------------------
 
     def follow(self, q: FloatArray) -> None:
-        """Asks for joints q at the end of this control period."""
+        """Commands joints q at the end of this control period."""
         speeds = np.abs(q - self.target_q) / PERIOD
-        fast = ~(speeds <= TOP * self.kinematics.joint_speeds)  # not a number is none either
+        fast = ~(speeds <= MAX_SPEED_RATIO * self.kinematics.joint_speeds)  # also refuses NaN
         if fast.any():
             joint = int(np.argmax(fast))
             raise TooFast(f"joint {joint + 1} at {speeds[joint]:.2f} rad/s, too fast")
@@ -79,11 +79,11 @@ class Arm:
         self._next = q
 
     def drive(self, qd: FloatArray) -> None:
-        """Asks for joint speeds qd [rad/s] during this control period."""
+        """Commands joint speeds qd [rad/s] during this control period."""
         self.follow(self.target_q + qd * PERIOD)
 
     def solve(self, frame: FloatArray, seed: FloatArray | None = None) -> FloatArray:
-        """Joints for a frame of the TCP; ProgramError where the arm does not reach."""
+        """Joints for a frame of the TCP. Raises ProgramError if it is out of reach."""
         q = self.kinematics.inverse(frame, self.target_q if seed is None else seed, self.tool)
         if q is None:
             where = ", ".join(f"{value:.4g}" for value in frame[:3, 3])
@@ -91,7 +91,7 @@ class Arm:
         return q
 
     def joint_speeds_of(self, twist: FloatArray) -> FloatArray:
-        """Joint speeds that give the TCP this twist; ProgramError in a singular pose."""
+        """Joint speeds that give the TCP this twist. Raises ProgramError in a singular pose."""
         try:
             speeds = np.linalg.solve(self.jacobian, twist)
         except np.linalg.LinAlgError:
@@ -102,12 +102,17 @@ class Arm:
 
     @property
     def commanded(self) -> bool:
-        """True once a motion has asked for something in this control period."""
+        """True once a motion has commanded joints in this control period."""
         return self._next is not None
 
-    def advance(self, deceleration: float = COAST, give_way: Callable[[FloatArray], FloatArray] | None = None) -> bool:
-        """Ends the control period; an arm without a command is braked. give_way: in force mode, the program's twist
-        to that of the set point. Returns False where the set point is out of reach, and holds it."""
+    def advance(
+        self, deceleration: float = COAST_DECELERATION, compliance: Callable[[FloatArray], FloatArray] | None = None
+    ) -> bool:
+        """Ends the control period; an arm without a command is braked.
+
+        compliance: in force mode, converts the program's twist to that of the set point. Returns False if the set point
+        is out of reach, and holds it.
+        """
         wanted, before, begin, frame = self._next, self.target_qd, self.set_q, self.target_frame
         twist, target_twist = self.twist, self.target_twist
         self._next = None
@@ -115,13 +120,13 @@ class Arm:
             self.target_qd = (wanted - self.target_q) / PERIOD
             self.target_q = wanted
         elif before.any():
-            self.target_qd = slowed(before, deceleration)
+            self.target_qd = brake_speeds(before, deceleration)
             self.target_q = self.target_q + self.target_qd * PERIOD
         self.target_qdd = (self.target_qd - before) / PERIOD
         self._update_target()
         reached: FloatArray | None = self.target_q
-        if give_way is not None:
-            step = PERIOD * give_way(displacement(frame, self.target_frame) / PERIOD)
+        if compliance is not None:
+            step = PERIOD * compliance(displacement(frame, self.target_frame) / PERIOD)
             goal = self.kinematics.forward(begin, self.tool)
             goal[:3, :3], goal[:3, 3] = rotation(step[3:]) @ goal[:3, :3], goal[:3, 3] + step[:3]
             reached = self.kinematics.inverse(goal, begin, self.tool)
@@ -135,19 +140,19 @@ class Arm:
         return reached is not None
 
     def settle(self) -> None:
-        """Force mode has ended: the program goes on from the set point."""
+        """Sets the target to the set point: the program continues from there after force mode."""
         self.target_q, self.target_qd = self.set_q, self.set_qd
         self._update_target()
 
     def halt(self) -> None:
-        """Brakes have closed: speeds are zero, and the target is where the arm is."""
+        """Closes the brakes: speeds are zero, and the target is at the actual joints."""
         self.target_q, self.target_qd, self.target_qdd = self.q.copy(), np.zeros(6), np.zeros(6)
         self.set_q, self.set_qd, self.qd = self.target_q, np.zeros(6), np.zeros(6)
         self._next = None
         self.update()
 
     def update(self) -> None:
-        """Renews frames, Jacobian and twists after the joints or the tool have changed."""
+        """Computes frames, Jacobian and twists again after the joints or the tool have changed."""
         self._update_target()
         self._update_actual()
 
@@ -166,8 +171,8 @@ class Arm:
 
     @property
     def rests(self) -> bool:
-        """True when neither target, set point nor actual joints move."""
-        return not self.target_qd.any() and not self.set_qd.any() and float(np.abs(self.qd).max()) < REST
+        """True if target, set point and actual joints do not move."""
+        return not self.target_qd.any() and not self.set_qd.any() and float(np.abs(self.qd).max()) < MAX_REST_SPEED
 
     def _servo(self, before: FloatArray) -> None:
         """One period of q'' = w^2 (set - q) - 2 w q', solved exactly for a set point in steady motion."""
@@ -180,11 +185,11 @@ class Arm:
         drift, decay = (rate + rates * error) * PERIOD, np.exp(-rates * PERIOD)
         error, rate = (error + drift) * decay, (rate - rates * drift) * decay
         self.q, self.qd = self.set_q - trail + error, rate + speed
-        if not speed.any() and float(np.abs(rate).max()) < REST and float(np.abs(error).max()) < 1e-12:
-            self.q, self.qd = self.set_q.copy(), np.zeros(6)  # the tail of the exponential has no meaning
+        if not speed.any() and float(np.abs(rate).max()) < MAX_REST_SPEED and float(np.abs(error).max()) < 1e-12:
+            self.q, self.qd = self.set_q.copy(), np.zeros(6)  # ends the exponential decay
 
 
-def slowed(speeds: FloatArray, deceleration: float) -> FloatArray:
+def brake_speeds(speeds: FloatArray, deceleration: float) -> FloatArray:
     """Speeds after one period of braking: the largest falls by `deceleration`, the others in proportion."""
     fastest = float(np.abs(speeds).max())
     left = fastest - deceleration * PERIOD

@@ -1,9 +1,9 @@
-"""The robot behind the sockets: arm, load, power, safety, registers, inputs and outputs, and the running program.
+"""The robot without its sockets: arm, load, power, safety, registers, inputs and outputs, and the running program.
 
-No sockets and no clock here: `tick` is one control period. So the whole behaviour can be tested in simulated time.
+`tick` is one control period. This module uses no sockets and no clock, so tests run it in simulated time.
 
-Transitions that take a real robot seconds take POWER_UP and RELEASE periods. A protective stop ends the program (a real
-controller may only pause it).
+Changes of power and brakes take 50 control periods each; a real robot needs seconds. A protective stop ends the program
+(a real controller may only pause it).
 """
 
 from __future__ import annotations
@@ -17,10 +17,19 @@ from functools import partial
 import numpy as np
 
 from robot.common.kinematics import JOINT_RANGE
-from robot.mock.ur.machine.arm import BRAKE, COAST, HOME, PERIOD, TOP, Arm, ProgramError, TooFast
+from robot.mock.ur.machine.arm import (
+    BRAKE_DECELERATION,
+    COAST_DECELERATION,
+    HOME,
+    MAX_SPEED_RATIO,
+    PERIOD,
+    Arm,
+    ProgramError,
+    TooFast,
+)
 from robot.mock.ur.machine.load import Load, at_flange
 from robot.mock.ur.machine.modes import SAFETY_BITS, Mode, Runtime, Safety
-from robot.mock.ur.machine.motion import FREEDRIVE_DAMPING, FREEDRIVE_TURN_DAMPING, comply
+from robot.mock.ur.machine.motion import FREEDRIVE_DAMPING, FREEDRIVE_TURN_DAMPING, move_with_compliance
 from robot.mock.ur.machine.program import CONTROL_SCRIPT, DONE
 from robot.mock.ur.machine.registry import COMMANDS
 from robot.mock.ur.machine.script import make_program
@@ -29,15 +38,15 @@ from robot.mock.ur.machine.user_script import CompileError
 from tacsim.interface import FloatArray
 
 POWER_UP = 50  # periods from power on to idle
-SLIDER_RATE = 5.0  # how fast the speed scaling follows the slider [1/s]
+SLIDER_RATE = 5.0  # maximum rate of change of the speed scaling [1/s]
 
 
 class Machine(MachineState):
-    """One robot in time."""
+    """A robot whose state changes with each control period."""
 
     @property
     def operational(self) -> bool:
-        """True when a program may run."""
+        """True if a program may run."""
         return self.mode is Mode.RUNNING and self.safety in (Safety.NORMAL, Safety.REDUCED)
 
     @property
@@ -50,8 +59,8 @@ class Machine(MachineState):
 
     @property
     def limiter(self) -> float:
-        """speed_scaling: "of the trajectory limiter" (RTDE guide). Times target_speed_fraction, which is the slider, it
-        is the speed scaling now (UR's ROS driver multiplies the two)."""
+        """speed_scaling: "of the trajectory limiter" (RTDE guide). Multiplied by target_speed_fraction, the slider, it
+        is the present speed scaling (UR's ROS driver multiplies the two)."""
         return min(1.0, self.arm.scale / self.slider) if self.slider > 0.0 else 0.0
 
     @property
@@ -66,19 +75,19 @@ class Machine(MachineState):
 
     @property
     def raw_wrench(self) -> FloatArray:
-        """Load on the flange in its axes, with the weight of the payload and no zero taken off (6,) [N, N m]."""
+        """Wrench (6,) on the flange in its axes, with the weight of the payload and without zeroing [N, N m]."""
         return at_flange(self.load.measured, self.arm)
 
     # -- program -----------------------------------------------------------------------------------------------------
 
     def start(self, text: str, delay: int = 0) -> bool:
-        """Runs an uploaded program instead of the present one, which ends `delay` periods before; False where the robot
-        is in no state to."""
+        """Replaces the present program by an uploaded one, which starts `delay` control periods later. Returns False if
+        the robot cannot run programs in its present state."""
         if not self.operational:
             self.write_log(f"program refused: robot {self.mode.name}, safety {self.safety.name}")
             return False
         if re.search(r"^[ \t]*def\s", text, re.M) is None:
-            self.write_log(f"not run: {text[:60]!r}... is no program, or a secondary one")
+            self.write_log(f"not run: {text[:60]!r}... is not a program, or a secondary one")
             return False
         replaces = self.program is not None
         self.stop("replaced by another program")
@@ -102,7 +111,7 @@ class Machine(MachineState):
             self.write_log(f"program '{self.program.name}' started")
 
     def end_wait(self) -> None:
-        """Writes what ur_rtde waits for while a program of its user runs, in the register where it looks."""
+        """Writes DONE into the register that ur_rtde polls while a user's program runs."""
         self.out_int[self.control_offset] = DONE
 
     # -- safety and power --------------------------------------------------------------------------------------------
@@ -113,7 +122,7 @@ class Machine(MachineState):
         self.stop("emergency stop")
 
     def safeguard_stop(self, on: bool) -> None:
-        """Pauses a running program; it goes on when the gate is closed again."""
+        """Pauses a running program; it continues when the gate is closed again."""
         if on and self.operational:
             self.safety, self.paused = Safety.SAFEGUARD_STOP, True
             self.write_log("safeguard stop")
@@ -121,16 +130,16 @@ class Machine(MachineState):
             self.safety, self.paused = Safety.NORMAL, False
 
     def fail(self, error: Exception) -> None:
-        """The arm cannot be computed any more: a safety fault. It stands unloaded where it could last be computed."""
+        """Sets a safety fault after an error of the mock. The arm rests without load at its last valid joints."""
         traceback.print_exc()
         self.stop(f"error of the mock: {type(error).__name__}: {error}")
         self.safety, self.stop_reason = Safety.FAULT, f"fault, error of the mock: {type(error).__name__}: {error}"
         self.write_log(self.stop_reason)
-        sound = (q for q in reversed(self.arm.history) if float(np.abs(q).max()) <= JOINT_RANGE)
-        self.arm, self.load = Arm(self.arm.kinematics.model, next(sound, np.array(HOME)).tolist()), Load(self.load.tool)
+        valid = (q for q in reversed(self.arm.history) if float(np.abs(q).max()) <= JOINT_RANGE)
+        self.arm, self.load = Arm(self.arm.kinematics.model, next(valid, np.array(HOME)).tolist()), Load(self.load.tool)
 
     def unlock(self) -> bool:
-        """Ends a protective stop; False where it is too early."""
+        """Ends a protective stop; returns False if it is too early."""
         if self.safety is Safety.PROTECTIVE_STOP:
             if self.time - self.stopped_at < self.unlock_delay:
                 return False
@@ -138,7 +147,7 @@ class Machine(MachineState):
         return True
 
     def release_emergency_stop(self) -> None:
-        """The button is pulled out again. The arm stays without power."""
+        """Releases the emergency stop. The arm stays without power."""
         if self.safety is Safety.ROBOT_EMERGENCY_STOP:
             self.safety, self.mode, self._changing = Safety.NORMAL, Mode.POWER_OFF, None
 
@@ -152,7 +161,7 @@ class Machine(MachineState):
             self.mode, self._changing = Mode.POWER_ON, (self.ticks + POWER_UP, Mode.IDLE)
 
     def release_brakes(self) -> None:
-        """From idle to running; powers on first where needed."""
+        """Changes from idle to running; switches the power on first if it is off."""
         release_periods = 50  # periods from idle to running
         if self.safety is Safety.ROBOT_EMERGENCY_STOP or self.mode is Mode.RUNNING:
             return
@@ -161,13 +170,13 @@ class Machine(MachineState):
         self._changing = (self.ticks + wait, Mode.RUNNING)
 
     def recover(self) -> None:
-        """All that a person would do after a stop, at once: release, unlock, power, brakes."""
+        """Does all that the operator does after a stop, at once: release, unlock, power, brakes."""
         self.safety, self.mode, self._changing, self.paused = Safety.NORMAL, Mode.RUNNING, None, False
 
     # -- one control period ------------------------------------------------------------------------------------------
 
     def tick(self) -> None:
-        """Watchdog, program, motion, forces, safety: in this order. Raises nothing."""
+        """Runs watchdog, program, motion, forces and safety, in this order. Raises nothing."""
         self.ticks += 1
         try:
             self._tick()
@@ -185,14 +194,16 @@ class Machine(MachineState):
         if self.program is not None and not (self.paused and self.arm.scale == 0.0):
             self._guarded(self.program.step)
         if self.freedrive is not None and not self.arm.commanded:
-            self._guarded(self._follow_hand)
+            self._guarded(self._apply_freedrive)
         if self.force_mode is not None:
-            self._guarded(partial(self.force_mode.update, self.arm, self.load.felt))
-        give_way = None if self.force_mode is None else partial(self.force_mode.mix, scale=self.arm.scale)
-        if not self.arm.advance(COAST if self.safety in (Safety.NORMAL, Safety.REDUCED) else BRAKE, give_way):
-            self.stop("force_mode: the arm cannot give way any further")
+            self._guarded(partial(self.force_mode.update, self.arm, self.load.zeroed_wrench))
+        compliance = None if self.force_mode is None else partial(self.force_mode.mix, scale=self.arm.scale)
+        if not self.arm.advance(
+            COAST_DECELERATION if self.safety in (Safety.NORMAL, Safety.REDUCED) else BRAKE_DECELERATION, compliance
+        ):
+            self.stop("force_mode: the compliant motion is out of reach")
         self.load.update(self.arm)
-        self.load.history.append(self.load.felt)
+        self.load.history.append(self.load.zeroed_wrench)
         self._check_limits()
 
     def _guarded(self, work: Callable[[], object]) -> None:
@@ -204,15 +215,15 @@ class Machine(MachineState):
             users = self.program is not None and self.program.name != CONTROL_SCRIPT
             self.stop(str(error))
             self.script_errors.append(ScriptError(f"runtime_error:{error}", users=users))
-        except Exception as error:  # what the mock did not foresee is the end of this program, not of the other arms
+        except Exception as error:  # an unexpected error ends this program, not the other arms
             traceback.print_exc()
             self.stop(f"error of the mock: {type(error).__name__}: {error}")
 
-    def _follow_hand(self) -> None:
+    def _apply_freedrive(self) -> None:
         assert self.freedrive is not None
         damping = np.repeat([FREEDRIVE_DAMPING, FREEDRIVE_TURN_DAMPING], 3)
         frame, free = self.freedrive
-        comply(self.arm, frame, free, self.load.unexplained / damping, np.array([0.25] * 3 + [1.0] * 3))
+        move_with_compliance(self.arm, frame, free, self.load.unexplained / damping, np.array([0.25] * 3 + [1.0] * 3))
 
     def _power(self) -> None:
         if self._changing is not None and self.ticks >= self._changing[0]:
@@ -227,33 +238,35 @@ class Machine(MachineState):
             self.arm.scale = wanted
 
     def _check_limits(self) -> None:
-        """Makes a protective stop beyond the robot's own limits: force, joint speed, joint range."""
+        """Makes a protective stop if a limit of the robot is exceeded: force, joint speed, joint range."""
         if self.safety not in (Safety.NORMAL, Safety.REDUCED):
             return
         arm = self.arm
         force = math.sqrt(sum(value * value for value in self.load.unexplained[:3].tolist()))
         if force > self.load.force_limit:
             self.protective_stop(f"force of {force:.0f} N, limit {self.load.force_limit:g} N")
-        fast = np.abs(arm.set_qd) > TOP * arm.kinematics.joint_speeds  # in force mode
+        fast = np.abs(arm.set_qd) > MAX_SPEED_RATIO * arm.kinematics.joint_speeds  # in force mode
         if fast.any():
             joint = int(np.argmax(fast))
             self.protective_stop(f"joint {joint + 1} at {abs(arm.set_qd[joint]):.2f} rad/s, too fast")
-        beyond = (np.abs(arm.set_q) > JOINT_RANGE) & (arm.set_q * arm.set_qd > 0)  # the way back is free
+        beyond = (np.abs(arm.set_q) > JOINT_RANGE) & (
+            arm.set_q * arm.set_qd > 0
+        )  # motion back into the range is allowed
         if beyond.any():
             self.protective_stop(f"joint {int(np.argmax(beyond)) + 1} at the end of its range")
 
-    # -- what comes in -----------------------------------------------------------------------------------------------
+    # -- input -------------------------------------------------------------------------------------------------------
 
     def on_int_register(self, register: int) -> None:
-        """An input_int_register was written: the watchdog starts anew if it is its own."""
+        """Handles a write to an input_int_register: restarts the watchdog if it is the watchdog's register."""
         if self.watchdog is not None and register == self.watchdog[0]:
             self.watchdog_reset = self.ticks
 
-    def on_short_command(self, name: str, number: int, told: str) -> None:
-        """A command arrived without all of its numbers: the program ends if that is the register it reads."""
+    def on_short_command(self, name: str, number: int, description: str) -> None:
+        """Handles a command that arrived without all its numbers: ends the program if it reads that register."""
         program = self.program
         if program is not None and name == f"input_int_register_{program.int_offset}" and number in COMMANDS:
-            self.stop(f"command {number} of a wrong length, such as moveJ with three angles: {told}")
+            self.stop(f"command {number} of a wrong length, such as moveJ with three angles: {description}")
 
     def set_slider(self, fraction: float) -> None:
         if 0.0 <= fraction <= 1.0:

@@ -1,6 +1,6 @@
-"""Commands of ur_rtde's control script that move the arm, or feel for a contact.
+"""Commands of ur_rtde's control script that move the arm or detect a contact.
 
-Whatever has no sound model ends the program with a line in the log, as a run-time error does on a controller: direct
+Commands without a valid model end the program with a line in the log, like a run-time error on a controller: direct
 torque, mass matrix, Coriolis torques, external force sensors.
 """
 
@@ -17,11 +17,11 @@ from robot.mock.ur.machine import motion
 from robot.mock.ur.machine.arm import PERIOD, MotionSteps, ProgramError
 from robot.mock.ur.machine.force_mode import ForceMode
 from robot.mock.ur.machine.motion import Waypoint
-from robot.mock.ur.machine.program import LARGEST, Program
+from robot.mock.ur.machine.program import MAX_NUMBER, Program
 from robot.mock.ur.machine.registry import command
 from tacsim.interface import FloatArray
 
-CONTACT_FOUND = 254  # the script gives it itself
+CONTACT_FOUND = 254  # the script sets it itself
 
 _MOVE = re.compile(r"(movej|movel|movep)\((p?)\[([^\]]*)\],\s*a=([^,]+),\s*v=([^,]+)(?:,\s*r=([^,)]+))?\)")
 _PROGRESS = re.compile(r"signal_async_progress\((\d{1,9})\)")
@@ -30,7 +30,7 @@ _PROGRESS = re.compile(r"signal_async_progress\((\d{1,9})\)")
 
 
 def _move(number: int, motion_of: Callable[[Program], MotionSteps]) -> None:
-    """Enters a move: the script waits for its end, unless the client wants it asynchronous."""
+    """Registers a move: the script waits for its end, unless the client requests it to be asynchronous."""
 
     @command(number)
     def move(p: Program) -> MotionSteps:
@@ -42,25 +42,25 @@ def _move(number: int, motion_of: Callable[[Program], MotionSteps]) -> None:
             yield from steps
 
 
-def _forward(p: Program, q: FloatArray) -> FloatArray:
+def _frame_at(p: Program, q: FloatArray) -> FloatArray:
     """The frame of the TCP (4, 4) at joints q."""
     return p.arm.kinematics.forward(q, p.arm.tool)
 
 
-def _numbers(texts: Sequence[str | None], count: int) -> FloatArray:
-    """Of a line of a path; what is left out is 0."""
+def _parse_numbers(texts: Sequence[str | None], count: int) -> FloatArray:
+    """Numbers of a line of a path; missing numbers are 0."""
     try:
         values = np.array([float(text or 0) for text in texts])
     except ValueError:
         values = np.array([])
-    if len(values) != count or not float(np.abs(values).max()) <= LARGEST:
+    if len(values) != count or not float(np.abs(values).max()) <= MAX_NUMBER:
         raise ProgramError(f"path: a waypoint needs six numbers, a, v and r, got {texts}"[:200])
     return values
 
 
-def _path(p: Program) -> MotionSteps:
-    """The path in the text. Blended waypoints are one motion; their progress is signalled when it begins."""
-    max_lines = 16  # of a path that are read in one control period
+def _follow_path(p: Program) -> MotionSteps:
+    """Moves along the path in the text. Blended waypoints are one motion; progress is signalled at its start."""
+    max_lines = 16  # lines of a path that are read in one control period
     lines = map(str.strip, p.text.partition("# inject move path\n")[2].splitlines())
     block = takewhile(lambda line: not line.startswith("end"), lines)
     waiting: list[Waypoint] = []
@@ -74,13 +74,13 @@ def _path(p: Program) -> MotionSteps:
         if move is None:
             raise ProgramError(f"path: the mock does not know '{line[:80]}'")
         kind, is_pose, numbers, *rest = move.groups()
-        target, (acceleration, speed, blend) = _numbers(numbers.split(","), 6), _numbers(rest, 3)
+        target, (acceleration, speed, blend) = _parse_numbers(numbers.split(","), 6), _parse_numbers(rest, 3)
         if kind == "movej":
             yield from motion.path(p.arm, waiting)
             waiting = []
             yield from motion.movej(p.arm, p.arm.solve(matrix(target)) if is_pose else target, acceleration, speed)
             continue
-        frame = matrix(target) if is_pose else _forward(p, target)
+        frame = matrix(target) if is_pose else _frame_at(p, target)
         waiting.append(Waypoint(frame, acceleration, speed, blend))
         if blend <= 0:
             yield from motion.path(p.arm, waiting)
@@ -91,13 +91,13 @@ def _path(p: Program) -> MotionSteps:
 _move(1, lambda p: motion.movej(p.arm, p.doubles(0), p.double(7), p.double(6)))
 _move(2, lambda p: motion.movej(p.arm, p.arm.solve(p.frame(0)), p.double(7), p.double(6)))
 _move(3, lambda p: motion.movel(p.arm, p.frame(0), p.double(7), p.double(6)))
-_move(4, lambda p: motion.movel(p.arm, _forward(p, p.doubles(0)), p.double(7), p.double(6)))
-_move(45, _path)
+_move(4, lambda p: motion.movel(p.arm, _frame_at(p, p.doubles(0)), p.double(7), p.double(6)))
+_move(45, _follow_path)
 
 
 @command(33, 34)
 def stop(p: Program) -> MotionSteps:
-    """stopL and stopJ. As in the script: stopj until a first asynchronous stop, stopl ever after."""
+    """stopL and stopJ. As in the script: stopj before the first asynchronous stop, stopl after it."""
     if not p.kill("stop"):
         p.kill("move")
     if p.integer(1) == 1:
@@ -117,9 +117,9 @@ def servoj(p: Program) -> None:
 
 @command(24, every_cycle=True)
 def servol(p: Program) -> None:
-    asked = tuple(p.doubles(0).tolist())
-    if p.servo_target is None or p.servo_target[0] != asked:
-        p.servo_target = asked, p.arm.solve(p.frame(0))
+    requested = tuple(p.doubles(0).tolist())
+    if p.servo_target is None or p.servo_target[0] != requested:
+        p.servo_target = requested, p.arm.solve(p.frame(0))
     _servo(p, p.servo_target[1])
 
 
@@ -180,17 +180,17 @@ def force_end(p: Program) -> MotionSteps:
 
 @command(20, needs="force_mode_set_damping(")
 def force_damping(p: Program) -> None:
-    p.force_damping = _within(p.double(0), 1.0, "force_mode_set_damping")
+    p.force_damping = _require_within(p.double(0), 1.0, "force_mode_set_damping")
 
 
 @command(21, needs="force_mode_set_gain_scaling(")
 def force_gain(p: Program) -> None:
-    p.force_gain = _within(p.double(0), 2.0, "force_mode_set_gain_scaling")
+    p.force_gain = _require_within(p.double(0), 2.0, "force_mode_set_gain_scaling")
 
 
-def _within(value: float, most: float, call: str) -> float:
-    if not 0 <= value <= most:
-        raise ProgramError(f"{call}: {value:g} is not within 0 and {most:g}")
+def _require_within(value: float, high: float, call: str) -> float:
+    if not 0 <= value <= high:
+        raise ProgramError(f"{call}: {value:g} is not within 0 and {high:g}")
     return value
 
 
@@ -217,8 +217,8 @@ def jog_stop(p: Program) -> MotionSteps | None:
 
 
 def _steps_since_contact(p: Program, direction: FloatArray) -> int:
-    """tool_contact(): periods since the contact against `direction` (3,) began; 0 without contact."""
-    contact_force, onset_force = 5.0, 1.0  # a contact is felt from the one, and began at the other [N]
+    """tool_contact(): control periods since the contact against `direction` (3,) began; 0 without contact."""
+    contact_force, onset_force = 5.0, 1.0  # a contact is detected above the first force, and began at the second [N]
     size = float(np.linalg.norm(direction[:3]))
 
     def against(force: FloatArray) -> float:
@@ -228,8 +228,8 @@ def _steps_since_contact(p: Program, direction: FloatArray) -> int:
     if not history or against(history[-1]) < contact_force:
         return 0
     steps = 0
-    for felt in reversed(history):
-        if against(felt) < onset_force:
+    for force in reversed(history):
+        if against(force) < onset_force:
             break
         steps += 1
     return steps
@@ -238,7 +238,7 @@ def _steps_since_contact(p: Program, direction: FloatArray) -> int:
 def _past_joints(p: Program, steps: int) -> FloatArray:
     history = p.arm.history
     if not 0 <= steps < len(history):
-        raise ProgramError(f"joint positions {steps} steps ago are not kept, only {len(history)}")
+        raise ProgramError(f"joint positions {steps} steps ago are not stored, only {len(history)}")
     return history[-1 - steps]
 
 
@@ -255,7 +255,7 @@ def joint_history(p: Program) -> None:
 def _return_to_contact(p: Program, steps: int) -> MotionSteps:
     q = _past_joints(p, steps)
     yield from motion.stopl(p.arm, 3.0)
-    yield from motion.movel(p.arm, _forward(p, q), 1.2, 0.25)
+    yield from motion.movel(p.arm, _frame_at(p, q), 1.2, 0.25)
 
 
 @command(51, needs="tool_contact(")

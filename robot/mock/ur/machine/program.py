@@ -1,4 +1,4 @@
-"""A program that runs on the robot: its text, its registers, and the threads that it has started."""
+"""A program that runs on the robot: its text, its registers, and its threads."""
 
 from __future__ import annotations
 
@@ -15,38 +15,38 @@ from tacsim.interface import FloatArray
 
 CONTROL_SCRIPT = "rtde_control"
 READY, DONE = 1, 2  # answers in output_int_register_0
-LARGEST = 1e6  # of a number in a command; what a controller takes is not known, and no arm needs more [SI]
+MAX_NUMBER = 1e6  # maximum of a number in a command; the limit of a controller is unknown, and no arm needs more [SI]
 _ENDED = object()
 
 
 class Program:
-    """One program. `step` is one control period. `main` is given to it by `script.make_program`."""
+    """One program. `step` is one control period. `script.make_program` sets `main`."""
 
     def __init__(self, machine: MachineState, text: str) -> None:
         self.machine: MachineState = machine
         self.arm: Arm = machine.arm
-        self.text = _of_version(text, machine.version)
+        self.text = _filter_by_version(text, machine.version)
         named = re.search(r"^[ \t]*(def|sec)[ \t]+(\w+)", self.text, re.M)
         self.kind, self.name = named.groups() if named else ("", "?")
         self.int_offset, self.float_offset = (self._offset(kind) for kind in ("int", "float"))
         self.threads: dict[str, MotionSteps] = {}
-        self.calls: dict[str, Callable[[], MotionSteps]] = {}  # what a repeating thread does next
-        self.stops_linear = False  # whether stopJ and stopL are stopl: see motion_commands.stop
-        self.speeds_linear = True  # whether the last speed command was speedl
-        self.force_gain, self.force_damping = 0.5, 0.025  # the script begins with these
-        self.internal = 0  # a command that the script gives itself
+        self.calls: dict[str, Callable[[], MotionSteps]] = {}  # next motion of a repeating thread
+        self.stops_linear = False  # True if stopJ and stopL run stopl: see motion_commands.stop
+        self.speeds_linear = True  # True if the last speed command was speedl
+        self.force_gain, self.force_damping = 0.5, 0.025  # initial values of the script
+        self.internal = 0  # a command that the script sets itself
         self.contact_steps = 0
-        self.servo_target: tuple[tuple[float, ...], FloatArray] | None = None  # pose asked for, its joints
-        self._writes = self._operation = 0  # of the asynchronous word
-        self.main: MotionSteps = iter(())  # what it does, in addition to its threads
+        self.servo_target: tuple[tuple[float, ...], FloatArray] | None = None  # commanded pose, its joints
+        self._writes = self._operation = 0  # counters of the asynchronous word
+        self.main: MotionSteps = iter(())  # main motion, in addition to the threads
 
     def step(self) -> None:
-        """Main program, then its threads. Raises ProgramError where the program ends with an error."""
-        if not _go_on(self.main):
-            self.machine.stop("stopped by its client" if self.name == CONTROL_SCRIPT else "it has come to its end")
+        """Runs the main program, then its threads. Raises ProgramError if the program ends with an error."""
+        if not _advance(self.main):
+            self.machine.stop("stopped by its client" if self.name == CONTROL_SCRIPT else "it has ended")
             return
         for name, thread in list(self.threads.items()):
-            if self.threads.get(name) is thread and not _go_on(thread):
+            if self.threads.get(name) is thread and not _advance(thread):
                 self.threads.pop(name, None)
 
     # -- registers ---------------------------------------------------------------------------------------------------
@@ -55,11 +55,11 @@ class Program:
         return float(self.doubles(index, 1)[0])
 
     def doubles(self, first: int, count: int = 6) -> FloatArray:
-        """Numbers of a command (count,). Raises ProgramError for any that no arm could follow."""
+        """Numbers of a command (count,). Raises ProgramError for a number that is not finite or too large."""
         begin = first + self.float_offset
         values = np.array(self.machine.in_double[begin : begin + count])
-        if not float(np.abs(values).max()) <= LARGEST:
-            raise ProgramError(f"command with a number that is not finite, or beyond {LARGEST:g}: {values.tolist()}")
+        if not float(np.abs(values).max()) <= MAX_NUMBER:
+            raise ProgramError(f"command with a number that is not finite, or beyond {MAX_NUMBER:g}: {values.tolist()}")
         return values
 
     def frame(self, first: int) -> FloatArray:
@@ -87,7 +87,7 @@ class Program:
     # -- threads -----------------------------------------------------------------------------------------------------
 
     def run(self, name: str, work: MotionSteps, *, tracked: bool = False) -> None:
-        """Starts a thread. `tracked`: its progress is in the asynchronous word."""
+        """Starts a thread. `tracked`: the asynchronous word contains its progress."""
 
         def tracking() -> MotionSteps:
             self.signal(0)
@@ -97,7 +97,7 @@ class Program:
         self.threads[name] = tracking() if tracked else work
 
     def repeat(self, name: str, call: Callable[[], MotionSteps]) -> None:
-        """What the thread does for ever from its next round on; starts it where it does not run."""
+        """Makes the thread repeat `call` from its next round on; starts the thread if it does not run."""
 
         def rounds() -> MotionSteps:
             while True:
@@ -108,7 +108,7 @@ class Program:
             self.run(name, rounds())
 
     def kill(self, name: str) -> bool:
-        """Ends a thread; False where it does not run."""
+        """Ends a thread; returns False if it does not run."""
         killed = self.threads.pop(name, None) is not None
         if killed and name in ("move", "stop"):
             self.signal(-1)
@@ -116,7 +116,7 @@ class Program:
         return killed
 
     def signal(self, progress: int) -> None:
-        """The asynchronous word: 0 begins an operation, more is its progress, -1 its end."""
+        """Writes the asynchronous word: 0 starts an operation, larger numbers are its progress, -1 its end."""
         self._writes = (self._writes + 1) % 128
         if progress == 0:
             self._operation = (self._operation + 1) % 128
@@ -124,20 +124,20 @@ class Program:
         self.answer_integer(word | (min(progress, 32767) | 1 << 15 if progress >= 0 else 0), 2)
 
 
-def _go_on(work: MotionSteps) -> bool:
-    """One control period of `work`; False when it has ended."""
+def _advance(work: MotionSteps) -> bool:
+    """Runs one control period of `work`; returns False when it has ended."""
     return next(work, _ENDED) is not _ENDED
 
 
-def _of_version(text: str, version: tuple[int, ...]) -> str:
-    """The text without lines for newer controllers. `$5.10|3.15 line` needs 5.10, or 3.15 of that major version."""
+def _filter_by_version(text: str, version: tuple[int, ...]) -> str:
+    """Removes lines for newer controllers. `$5.10|3.15 line` needs version 5.10, or 3.15 for major version 3."""
 
     @cache
     def has(needed: str) -> bool:
-        leasts = (tuple(int(number) for number in least.split(".") if number) for least in needed.split("|"))
-        return any(least[:1] == version[:1] and version >= least for least in leasts)
+        minima = (tuple(int(number) for number in minimum.split(".") if number) for minimum in needed.split("|"))
+        return any(minimum[:1] == version[:1] and version >= minimum for minimum in minima)
 
-    def kept(line: re.Match[str]) -> str:
+    def select_line(line: re.Match[str]) -> str:
         return line[2] if has(line[1]) else ""
 
-    return re.sub(r"^[ \t]*\$([\d.|]{1,99})(.*)", kept, text, flags=re.M)
+    return re.sub(r"^[ \t]*\$([\d.|]{1,99})(.*)", select_line, text, flags=re.M)

@@ -14,15 +14,15 @@ Work = Callable[[Program], MotionSteps | None]
 @dataclass(frozen=True)
 class Command:
     work: Work
-    needs: str  # a call that older controllers lack: where the script's text is without it, the command does nothing
-    every_cycle: bool  # done again in every cycle of the script; any other once, until the client writes 0
+    needs: str  # a call that older controllers lack: if the script's text does not contain it, the command does nothing
+    every_cycle: bool  # True: run in every cycle of the script; False: once, until the client writes 0
 
 
 COMMANDS: dict[int, Command] = {}
 
 
 def command(*numbers: int, needs: str = "", every_cycle: bool = False) -> Callable[[Work], Work]:
-    """Enters a function into COMMANDS. Its result is a motion that the script waits for, or None."""
+    """Registers a function in COMMANDS. Its result is a motion for which the script waits, or None."""
 
     def enter(work: Work) -> Work:
         COMMANDS.update(dict.fromkeys(numbers, Command(work, needs, every_cycle)))

@@ -1,6 +1,6 @@
-"""What the robot behind the sockets is at one moment, and how its program ends.
+"""The state of the robot at one time, and how its program ends.
 
-Programs and their commands change it; `machine.py` lets time pass in it.
+Programs and their commands change it; `machine.py` computes one control period.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 from robot.mock.ur.machine.arm import HOME, PERIOD, Arm
 from robot.mock.ur.machine.force_mode import ForceMode
-from robot.mock.ur.machine.load import NOTHING, Load, Mass
+from robot.mock.ur.machine.load import NO_MASS, Load, Mass
 from robot.mock.ur.machine.modes import Mode, Safety
 from robot.mock.ur.machine.version import VERSION, Version
 from tacsim.interface import FloatArray
@@ -38,42 +38,42 @@ class Outputs:
         return self.analog_is_voltage[0] << 2 | self.analog_is_voltage[1] << 3
 
     def analog_value(self, index: int) -> float:
-        """Of a standard analog output: [V] of 0-10 V, or [A] of 4-20 mA."""
+        """Value of a standard analog output: 0-10 V [V], or 4-20 mA [A]."""
         part = self.analog[index]
         return 10.0 * part if self.analog_is_voltage[index] else 0.004 + 0.016 * part
 
 
 class ScriptError(NamedTuple):
-    """Why a program was not begun, or has ended by an error; where in it, from 1 (0: not known)."""
+    """The error that prevented or ended a program, and its line and column, from 1 (0: unknown)."""
 
     text: str
     line: int = 0
     column: int = 0
-    users: bool = True  # a program of a user, not ur_rtde's control script
+    users: bool = True  # True for a program of a user, False for ur_rtde's control script
 
 
 class RunningProgram(Protocol):
-    """What the machine asks of the program that it runs (`program.py`)."""
+    """The interface of a program that the machine runs (`program.py`)."""
 
     name: str
-    int_offset: int  # of its integer registers
+    int_offset: int  # of the integer registers of the program
 
     def step(self) -> None:
-        """One control period. Raises ProgramError where the program ends with an error."""
+        """Runs one control period. Raises ProgramError if the program ends with an error."""
         ...
 
 
 class MachineState:
-    """One robot at one moment. `log` keeps the last lines of what happened, each with its time [s]."""
+    """One robot at one time. `log` contains the last messages, each with its time [s]."""
 
     def __init__(
         self,
         model: Model = "ur5e",
         joints: Sequence[float] = HOME,
         version: Version = VERSION,
-        tool: Mass = NOTHING,  # hangs on the flange
+        tool: Mass = NO_MASS,  # on the flange
     ) -> None:
-        unlock_delay = 0.0  # least time from a protective stop to its unlocking [s]; real robots want 5 s
+        unlock_delay = 0.0  # minimum time from a protective stop to its unlocking [s]; real robots need 5 s
         self.version = version
         self.arm, self.load, self.outputs = Arm(model, joints), Load(tool), Outputs()
         self.load.update(self.arm)
@@ -87,18 +87,18 @@ class MachineState:
         self.paused = False
         self.freedrive: tuple[FloatArray, tuple[int, ...]] | None = None  # frame and free axes
         self.force_mode: ForceMode | None = None
-        self.watchdog: tuple[int, float] | None = None  # input_int_register, longest silence [s]
+        self.watchdog: tuple[int, float] | None = None  # input_int_register, maximum time between writes [s]
         self.watchdog_reset = 0  # tick at which its register was last written
-        self.script_errors: deque[ScriptError] = deque(maxlen=20)  # not yet reported to those who listen
+        self.script_errors: deque[ScriptError] = deque(maxlen=20)  # not yet sent to clients
         self.control_offset = 0  # of the registers of the last control script
         self.stop_reason = ""  # why the last program ended
         self.stopped_at = -math.inf  # time of the last protective stop [s]
         self.unlock_delay = unlock_delay
-        self.clock_offset = 0.0  # of the timestamp that is sent [s]
-        self.work_time = 0.0  # what the last control period took to compute [s]
+        self.clock_offset = 0.0  # of the timestamp in packages [s]
+        self.work_time = 0.0  # computation time of the last control period [s]
         self.log: deque[tuple[float, str]] = deque(maxlen=200)
-        self._changing: tuple[int, Mode] | None = None  # tick at which the mode changes
-        self._starting: tuple[int, RunningProgram] | None = None  # tick at which a program begins that replaces another
+        self._changing: tuple[int, Mode] | None = None  # tick of the next change of mode
+        self._starting: tuple[int, RunningProgram] | None = None  # tick at which a program starts that replaces another
 
     @property
     def time(self) -> float:
@@ -111,7 +111,7 @@ class MachineState:
         return self.arm.rests and self.freedrive is None and self.force_mode is None
 
     def write_log(self, text: str) -> None:
-        max_line = 500  # longest text of the log
+        max_line = 500  # of a text of the log [characters]
         self.log.append((self.time, printable_line(text[:max_line])))
 
     def stop(self, reason: str) -> None:

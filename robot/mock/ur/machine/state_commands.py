@@ -1,4 +1,4 @@
-"""Commands of ur_rtde's control script that set or ask something; none of them moves the arm."""
+"""Commands of ur_rtde's control script that set or read values; none of them moves the arm."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from robot.common.kinematics import pose
 from robot.mock.ur.machine.arm import PERIOD, ProgramError
-from robot.mock.ur.machine.load import HEAVIEST, Mass
+from robot.mock.ur.machine.load import MAX_PAYLOAD, Mass
 from robot.mock.ur.machine.program import Program
 from robot.mock.ur.machine.registry import command
 from tacsim.interface import FloatArray
@@ -23,11 +23,11 @@ def zero_sensor(p: Program) -> None:
 
 @command(17)
 def payload(p: Program) -> None:
-    """A centre of gravity that is all zero keeps the one before: the script has it so."""
+    """A centre of gravity of zeros keeps the previous one, as in the script."""
     mass, centre, load = p.double(0), p.doubles(1, 3), p.machine.load
-    if not (0 <= mass <= HEAVIEST and np.abs(centre).max() <= HEAVIEST):
+    if not (0 <= mass <= MAX_PAYLOAD and np.abs(centre).max() <= MAX_PAYLOAD):
         raise ProgramError(f"set_payload: mass {mass:g} kg, centre {centre.tolist()} m")
-    load.told = Mass.of([mass, *(centre if centre.any() else load.told.centre)])
+    load.configured_payload = Mass.of([mass, *(centre if centre.any() else load.configured_payload.centre)])
 
 
 @command(65, needs="set_target_payload(")
@@ -78,7 +78,7 @@ def freedrive_end(p: Program) -> None:
 
 @command(31, needs="protective_stop()")
 def protective_stop(p: Program) -> None:
-    p.machine.protective_stop("asked for by the program")
+    p.machine.protective_stop("requested by the program")
 
 
 @command(56, 57)
@@ -90,11 +90,11 @@ def external_sensor(p: Program) -> None:
 # -- queries ---------------------------------------------------------------------------------------------------------
 
 
-def _reaches(p: Program, seed: FloatArray) -> bool:
+def _has_solution(p: Program, seed: FloatArray) -> bool:
     return p.arm.kinematics.inverse(p.frame(0), seed, p.arm.tool) is not None
 
 
-def _singular(p: Program) -> int:
+def _freedrive_status(p: Program) -> int:
     near_singular, fully_singular = 0.05, 0.02  # of Kinematics.singularity, for get_freedrive_status
     measure = p.arm.kinematics.singularity(p.arm.q)
     return (measure < near_singular) + (measure < fully_singular)
@@ -103,7 +103,7 @@ def _singular(p: Program) -> int:
 def _query(
     *numbers: int, read: Callable[[Program], FloatArray | int], needs: str = "", every_cycle: bool = False
 ) -> None:
-    """Enters a command that answers with what `read` returns: numbers, or one integer."""
+    """Registers a command that answers with the result of `read`: numbers, or one integer."""
 
     @command(*numbers, needs=needs, every_cycle=every_cycle)
     def work(p: Program) -> None:
@@ -113,9 +113,9 @@ def _query(
 
 _query(46, read=lambda p: p.arm.solve(p.frame(0)))
 _query(30, read=lambda p: p.arm.solve(p.frame(0), p.doubles(6)))
-_query(36, read=lambda p: _reaches(p, p.arm.target_q))
-_query(60, read=lambda p: _reaches(p, p.arm.target_q), needs="get_inverse_kin_has_solution(")
-_query(61, read=lambda p: _reaches(p, p.doubles(6)), needs="get_inverse_kin_has_solution(")
+_query(36, read=lambda p: _has_solution(p, p.arm.target_q))
+_query(60, read=lambda p: _has_solution(p, p.arm.target_q), needs="get_inverse_kin_has_solution(")
+_query(61, read=lambda p: _has_solution(p, p.doubles(6)), needs="get_inverse_kin_has_solution(")
 _query(37, read=lambda p: bool(np.abs(p.doubles(0)).max() <= 2 * np.pi))
 _query(39, read=lambda p: pose(p.frame(0) @ p.frame(6)))
 _query(44, read=lambda p: pose(p.arm.kinematics.forward(p.doubles(0), p.frame(6))))
@@ -128,14 +128,14 @@ _query(
     needs="get_target_waypoint(",
 )
 _query(47, read=lambda p: p.machine.steady)
-_query(54, read=_singular, needs="get_freedrive_status(")
+_query(54, read=_freedrive_status, needs="get_freedrive_status(")
 _query(26, read=lambda p: np.array([PERIOD]), needs="get_steptime(", every_cycle=True)
 _query(69, read=lambda p: p.arm.target_qdd, needs="get_target_joint_accelerations(", every_cycle=True)
 
 
 @command(38, every_cycle=True)
 def torques(p: Program) -> None:
-    """What the joints bear of the load on the tool, less the payload told of [N m]."""
+    """Joint torques from the load on the tool, without the configured payload [N m]."""
     p.answer(-p.arm.kinematics.jacobian(p.arm.q, p.arm.tool).T @ p.machine.load.unexplained)
 
 

@@ -1,4 +1,4 @@
-"""The version of PolyScope that a mock claims."""
+"""The version of PolyScope that a mock reports."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ VERSION: Version = (5, 11, 0, 108150)
 
 
 def check_version(numbers: Sequence[float]) -> Version:
-    """Four whole numbers that the RTDE can tell. Raises ValueError."""
-    max_number = 2**32 - 1  # the RTDE tells each as a uint32
+    """Checks that a version is four integers that the RTDE can send. Raises ValueError."""
+    max_number = 2**32 - 1  # the RTDE sends each as a uint32
     if len(numbers) != 4 or not all(0 <= number <= max_number and number == int(number) for number in numbers):
         raise ValueError(f"a version is four whole numbers from 0 to {max_number}, got {list(numbers)}")
     major, minor, bugfix, build = map(int, numbers)
@@ -20,12 +20,12 @@ def check_version(numbers: Sequence[float]) -> Version:
 
 
 def version_text(version: Version) -> str:
-    """Such as 5.11.0.108150."""
+    """Text such as 5.11.0.108150."""
     return ".".join(map(str, version))
 
 
 def parse_version(text: str) -> Version:
-    """From "5.11", "5.11.0" or "5.11.0.108150"; what is left out is 0. Raises ValueError."""
+    """Parses "5.11", "5.11.0" or "5.11.0.108150"; missing numbers are 0. Raises ValueError."""
     if re.fullmatch(r"\d{1,10}(\.\d{1,10}){1,3}", text, re.ASCII) is None:
         raise ValueError(f"a version of PolyScope is like 5.11 or 5.11.0.108150, got '{text[:40]}'")
     numbers = [int(number) for number in text.split(".")]

@@ -1,4 +1,4 @@
-"""One client of the mock: what it has sent and is not yet read, what is still to be sent to it."""
+"""The connection to one client of the mock, with its receive and send buffers."""
 
 from __future__ import annotations
 
@@ -9,26 +9,30 @@ from collections import deque
 class Connection:
     """A non-blocking socket with buffers.
 
-    Replies wait until the client takes them. Stream packages are dropped, whole, while anything waits: a slow reader
-    loses packages, but never sees half of one.
+    Replies wait until the client reads them. While data wait, stream packages are dropped: a slow client loses
+    packages, but never gets a part of one.
     """
 
     def __init__(self, sock: socket.socket, port: int) -> None:
-        send_buffer = 1 << 16  # of the system: a slow reader gets packages that are old, but not seconds old [bytes]
+        send_buffer = (
+            1 << 16
+        )  # of the operating system; small, so that packages for a slow client are less than seconds old [bytes]
         self.socket, self.port = sock, port
         self.received = bytearray()
-        self.searched = 0  # bytes of it, from the front, that hold no end of a program
+        self.searched = 0  # bytes at its front without the end of a program
         self.sent = self.dropped = 0  # stream packages
         self._late_size = 0
-        self._late: deque[tuple[float, bytes, bool, bool]] = deque()  # (due, bytes, droppable, halved): a slow line
+        self._late: deque[tuple[float, bytes, bool, bool]] = (
+            deque()
+        )  # (due, bytes, droppable, halved) of a slow connection
         self._waiting = bytearray()
-        self._half = b""  # what is left of a package that is sent in two parts
+        self._half = b""  # second part of a package that is sent in two parts
         sock.setblocking(False)
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, send_buffer)
 
     def read(self) -> bool:
-        """Takes what has arrived; False when the client is gone."""
+        """Reads data that have arrived; returns False when the client is gone."""
         chunk = 1 << 16  # bytes read at a time
         try:
             data = self.socket.recv(chunk)
@@ -40,7 +44,7 @@ class Connection:
         return bool(data)
 
     def send(self, data: bytes, *, droppable: bool = False, due: float = 0.0, halved: bool = False) -> None:
-        """Sends now, or at the time `due` [s]: see `flush`. `halved`: the second half comes with the next flush."""
+        """Sends now, or at the time `due` [s]: see `flush`. `halved`: the second half is sent at the next flush."""
         if due > 0.0 or self._late:
             self._late.append((due, data, droppable, halved))
             self._late_size += len(data)
@@ -48,9 +52,9 @@ class Connection:
         self._push(data, droppable, halved)
 
     def flush(self, now: float) -> bool:
-        """Sends what is due; False when the client is gone or has let too much pile up."""
-        max_late = 1 << 26  # what a slow line may hold, before its client is cut [bytes]
-        max_backlog = 1 << 20  # replies that a client does not fetch, before it is cut [bytes]
+        """Sends data that are due; returns False if the client is gone or its buffers are too large."""
+        max_late = 1 << 26  # delayed data, before the client is disconnected [bytes]
+        max_backlog = 1 << 20  # replies that a client does not read, before it is disconnected [bytes]
         self._push(b"", False, False)
         while self._late and self._late[0][0] <= now:
             _, data, droppable, halved = self._late.popleft()
@@ -59,7 +63,7 @@ class Connection:
         return self._drain() and len(self._waiting) <= max_backlog and self._late_size <= max_late
 
     def close(self, *, reset: bool = False) -> None:
-        """Ends the connection: with FIN, or with RST."""
+        """Ends the connection with FIN, or with RST if `reset`."""
         if reset:
             self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\1\0\0\0\0\0\0\0")  # on, 0 s
         self.socket.close()

@@ -19,14 +19,14 @@ import numpy as np
 from robot.common import MOCK_SERIAL
 from robot.common.kinematics import JOINT_RANGE
 from robot.mock.ur.machine.arm import HOME, PERIOD
-from robot.mock.ur.machine.load import NOTHING, Mass
+from robot.mock.ur.machine.load import NO_MASS, Mass
 from robot.mock.ur.machine.machine import Machine
 from robot.mock.ur.machine.version import VERSION, Version
 from robot.mock.ur.wire import dashboard, primary
 from robot.mock.ur.wire.connection import Connection
-from robot.mock.ur.wire.fields import apply
+from robot.mock.ur.wire.fields import apply_inputs
 from robot.mock.ur.wire.inputs import Inputs
-from robot.mock.ur.wire.rtde import BadPackage, InputRecipe, Session, packages
+from robot.mock.ur.wire.rtde import BadPackage, InputRecipe, Session, take_packages
 
 if TYPE_CHECKING:
     from tacsim.models.hardware import Model  # pydantic and SciPy: half a second of start-up
@@ -34,40 +34,40 @@ if TYPE_CHECKING:
 RTDE, DASHBOARD, REALTIME = 30004, 29999, 30003
 SCRIPTS = (*primary.PORTS, REALTIME)
 PORTS = (RTDE, DASHBOARD, *SCRIPTS)
-MAX_CLIENTS = 256  # of one controller; more are closed at once
-BURST = 16  # packages or lines of one client that are served in one go; the others wait, and nothing more is read
-# From the end of a program to the begin of one that is uploaded instead [periods]. A controller has to stop the one and
-# to compile the other, and is STOPPED meanwhile; how long a real one is, is not published.
+MAX_CLIENTS = 256  # of one controller; further ones are closed at once
+BURST = 16  # packages or lines of one client served at once; others wait, and no more data are read
+# From the end of a program to the start of the program that replaces it [control periods]. A controller stops one,
+# compiles the other, and is STOPPED in between; the duration on a real one is not published.
 START_DELAY = 5
 _PROGRAM_END = re.compile(rb"^end[ \t\r]*$", re.M)
 
 
 @dataclass(frozen=True)
 class ControllerConfig:
-    """What a controller is like at power-on."""
+    """Configuration of a controller at power-on."""
 
     host: str
     model: Model = "ur5e"
     joints: tuple[float, ...] = HOME
     version: Version = VERSION
     serial: str = MOCK_SERIAL
-    tool: Mass = NOTHING  # hangs on the flange
+    tool: Mass = NO_MASS  # on the flange
 
 
 @dataclass
 class Faults:
-    """What is wrong at present. The defaults: nothing."""
+    """The present faults; by default none."""
 
-    silence: bool = False  # no data packages; everything else answers
-    black_hole: bool = False  # nothing is read, nothing answered; connections open
+    silence: bool = False  # no data packages; all other requests are answered
+    black_hole: bool = False  # no reading and no answers; connections stay open
     dashboard_mute: bool = False
     partial: bool = False  # data packages arrive in two halves, a period apart
-    nan: bool = False  # what is measured is not a number
+    nan: bool = False  # measured values are NaN
     remote_control: bool = True
-    delay: float = 0.0  # of everything sent [s]
+    delay: float = 0.0  # of all data that are sent [s]
     drop: float = 0.0  # probability for each data package
-    chance: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))
-    claimed: set[str] = field(default_factory=set)  # input names that a field bus holds
+    random: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))
+    claimed: set[str] = field(default_factory=set)  # input names that a field bus uses
 
 
 class Controller:
@@ -81,11 +81,15 @@ class Controller:
         self.sent = self.dropped = 0  # data packages
         self.inputs = Inputs()
         self.clients: dict[Connection, Session | None] = {}
-        self._behind: set[Connection] = set()  # clients that sent more than was served so far
-        self._author: Connection | None = None  # who sent the last program
+        self._behind: set[Connection] = set()  # clients whose requests still wait
+        self._author: Connection | None = None  # client that sent the last program
         self._listeners: list[socket.socket] = []
         self._boot_at: int | None = None  # tick at which a power cycle ends
-        self._rate = (time.monotonic(), 0, 0.0)  # begun, ticks then, rate of the span before
+        self._rate = (
+            time.monotonic(),
+            0,
+            0.0,
+        )  # start of the interval, ticks at its start, rate of the previous interval
         self.listen()
 
     # -- life --------------------------------------------------------------------------------------------------------
@@ -104,7 +108,7 @@ class Controller:
             self._watch(listener, partial(self._accept, listener, port))
 
     def refuse(self) -> None:
-        """Closes the ports; who is connected stays."""
+        """Closes the ports; connected clients stay."""
         for listener in self._listeners:
             self._ignore(listener)
             listener.close()
@@ -115,7 +119,7 @@ class Controller:
         self.refuse()
 
     def reset(self) -> None:
-        """As at power-on: no clients, no faults, joints where they began. Ticks and counts go on."""
+        """Restores the state at power-on: no clients, no faults, initial joints. Ticks and counts continue."""
         self.cut(PORTS, reset=True)
         self.black_hole(False)
         self._boot_at = None
@@ -125,7 +129,7 @@ class Controller:
         self.listen()
 
     def power_cycle(self, seconds: float) -> None:
-        """Off and on again: clients are cut, ports closed for so long, then the robot is there without power."""
+        """Switches off and on again: disconnects clients, closes ports for this time, then the arm has no power."""
         self.cut(PORTS, reset=True)
         self.refuse()
         joints = np.clip(self.machine.arm.q, -JOINT_RANGE, JOINT_RANGE).tolist()
@@ -134,14 +138,14 @@ class Controller:
         self._boot_at = self.ticks + max(1, round(seconds / PERIOD))
 
     def cut(self, ports: Sequence[int], *, reset: bool) -> int:
-        """Closes the connections to these ports; returns how many."""
+        """Closes the connections to these ports; returns their number."""
         chosen = [client for client in self.clients if client.port in ports]
         for client in chosen:
             self._drop(client, reset=reset)
         return len(chosen)
 
     def black_hole(self, on: bool) -> None:
-        """Stops reading all sockets, which stay open, or begins again."""
+        """Stops reading all sockets, which stay open, or starts again."""
         self.faults.black_hole = on
         for client in self.clients:
             self._watch(client.socket, partial(self._serve, client))
@@ -151,7 +155,7 @@ class Controller:
     # -- one control period ------------------------------------------------------------------------------------------
 
     def tick(self) -> None:
-        restart_periods = 500  # control periods after which a restarted controller tries again to open its ports
+        restart_periods = 500  # control periods until a restarted controller tries again to open its ports
         begun = time.perf_counter()
         self.ticks += 1
         if self._boot_at is not None:
@@ -160,13 +164,13 @@ class Controller:
             self._boot_at = None
             try:
                 self.listen()
-            except OSError as error:  # somebody else has taken a port meanwhile
+            except OSError as error:  # another process has taken a port
                 self.machine.write_log(f"{error.strerror}; tried again in {restart_periods * PERIOD:g} s")
                 self._boot_at = self.ticks + restart_periods
                 return
         self.machine.tick()
         if not self.faults.black_hole:
-            self._tell_script_errors()
+            self._report_script_errors()
             for client in list(self._behind):
                 self._serve(client)
             self._publish()
@@ -177,7 +181,7 @@ class Controller:
 
     @property
     def tick_rate(self) -> float:
-        """Control periods a second, over the last 500 of them [1/s]; 0 before that."""
+        """Control periods per second, over the last 500 of them [1/s]; 0 before that."""
         return self._rate[2]
 
     def _publish(self) -> None:
@@ -190,7 +194,7 @@ class Controller:
                 recipe = session.output
                 if self.ticks % recipe.every or self.faults.silence:
                     continue
-                if self.faults.drop > 0 and self.faults.chance.random() < self.faults.drop:
+                if self.faults.drop > 0 and self.faults.random.random() < self.faults.drop:
                     self.dropped += 1
                     continue
                 try:
@@ -202,9 +206,9 @@ class Controller:
                 else:
                     self._stream(client, data)
 
-    def _tell_script_errors(self) -> None:
-        """Reports on the ports where a controller does. ur_rtde does not read there: it waits 600 s for its register,
-        and sends its control script again. Its connection is cut, so that this call raises now."""
+    def _report_script_errors(self) -> None:
+        """Reports errors on the same ports as a controller. ur_rtde does not read them: it waits 600 s for its
+        register, then sends its control script again. Its connection is closed, so that its call raises now."""
         while self.machine.script_errors:
             error = self.machine.script_errors.popleft()
             data = primary.runtime_exception(self.machine.time, error)
@@ -227,17 +231,17 @@ class Controller:
     # -- sockets -----------------------------------------------------------------------------------------------------
 
     def _watch(self, sock: socket.socket, work: Callable[[], None]) -> None:
-        """What arrives at the socket is worked on from now on, unless it falls into a black hole."""
+        """Registers `work` for data that arrive at the socket, unless the fault black_hole is set."""
         self._ignore(sock)
         if not self.faults.black_hole:
             self._selector.register(sock, selectors.EVENT_READ, work)
 
     def _ignore(self, sock: socket.socket) -> None:
-        with suppress(KeyError):  # it is ignored already
+        with suppress(KeyError):  # it is not registered
             self._selector.unregister(sock)
 
     def _accept(self, listener: socket.socket, port: int) -> None:
-        client = accept(listener, port)
+        client = accept_client(listener, port)
         if client is None:
             return
         if len(self.clients) >= MAX_CLIENTS:
@@ -260,14 +264,14 @@ class Controller:
             client.close(reset=reset)
 
     def _cut(self, client: Connection, error: Exception) -> None:
-        """Ends the connection of a client that cannot be served; the others go on."""
+        """Ends the connection of a client that cannot be served; the others continue."""
         if not isinstance(error, BadPackage):
             traceback.print_exc()
         self.machine.write_log(f"port {client.port}: client cut: {type(error).__name__}: {error}")
         self._drop(client)
 
     def _serve(self, client: Connection) -> None:
-        """Reads, and serves a burst of what has come. Nothing more is read from a client that is behind."""
+        """Reads data and serves a burst of requests. No more data are read from a client whose requests still wait."""
         if client not in self.clients:
             return
         alive = client in self._behind or client.read()
@@ -290,7 +294,7 @@ class Controller:
         session = self.clients[client]
         assert session is not None
         served = 0
-        for kind, payload in islice(packages(client.received), BURST):
+        for kind, payload in islice(take_packages(client.received), BURST):
             reply = session.handle(kind, payload)
             if reply is not None:
                 client.send(reply, due=self._due())
@@ -298,8 +302,8 @@ class Controller:
         return served == BURST
 
     def _serve_dashboard(self, client: Connection) -> bool:
-        max_line = 1 << 16  # a longer program or dashboard line cuts its client [bytes]
-        for line in islice(lines(client.received), BURST):
+        max_line = 1 << 16  # of a dashboard line; then the client is disconnected [bytes]
+        for line in islice(take_lines(client.received), BURST):
             request = line.decode("utf-8", errors="replace").strip()
             if self.faults.dashboard_mute:
                 continue
@@ -315,8 +319,8 @@ class Controller:
         return behind
 
     def _serve_script(self, client: Connection) -> bool:
-        """A program begins with `def` or `sec` and ends with an `end` that is not indented; one of them is run."""
-        max_program = 1 << 20  # a longer program or dashboard line cuts its client [bytes]
+        """Runs one program: it begins with `def` or `sec` and ends with an `end` that is not indented."""
+        max_program = 1 << 20  # of a program; then the client is disconnected [bytes]
         found = _PROGRAM_END.search(client.received, client.searched)
         if found is None:
             client.searched = max(0, client.received.rfind(b"\n"))
@@ -335,25 +339,27 @@ class Controller:
 
     # -- input registers ---------------------------------------------------------------------------------------------
 
-    def _names_in_use(self, asking: Session) -> set[str]:
-        others = (session.claims for session in self.clients.values() if session is not None and session is not asking)
+    def _names_in_use(self, requester: Session) -> set[str]:
+        others = (
+            session.claims for session in self.clients.values() if session is not None and session is not requester
+        )
         return self.faults.claimed.union(*others)
 
     def _write(self, recipe: InputRecipe, payload: bytes) -> None:
         self.inputs.add(self.ticks, recipe, payload)
-        apply(self.machine, recipe.unpack(payload))
+        apply_inputs(self.machine, recipe.unpack(payload))
 
 
-def lines(buffer: bytearray) -> Iterator[bytes]:
-    """Takes whole lines from the front of the buffer, without their ends."""
+def take_lines(buffer: bytearray) -> Iterator[bytes]:
+    """Removes complete lines from the front of the buffer and yields them without line ends."""
     while (end := buffer.find(b"\n")) >= 0:
         line = bytes(buffer[:end])
         del buffer[: end + 1]
         yield line
 
 
-def accept(listener: socket.socket, port: int) -> Connection | None:
-    """A client that waits at the port; None for one that is gone again."""
+def accept_client(listener: socket.socket, port: int) -> Connection | None:
+    """The connection of a client that waits at the port; None if it is gone."""
     try:
         sock, _ = listener.accept()
     except OSError:

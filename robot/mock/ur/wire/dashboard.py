@@ -1,4 +1,4 @@
-"""The dashboard server: a line of text in, a line of text out (Dashboard Server e-Series, Universal Robots)."""
+"""The dashboard server: one line of text per request and reply (Dashboard Server e-Series, Universal Robots)."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from robot.mock.ur.machine.machine import Machine
 from robot.mock.ur.machine.modes import Runtime, Safety
 
 GREETING = "Connected: Universal Robots Dashboard Server"
-_ROBOT = {"ur3e": "UR3", "ur5e": "UR5", "ur10e": "UR10"}  # `get robot model` leaves the e out
+_ROBOT = {"ur3e": "UR3", "ur5e": "UR5", "ur10e": "UR10"}  # `get robot model` omits the e
 
 
 def answer(machine: Machine, line: str, serial: str, *, remote: bool) -> str:
-    """The reply to one request."""
+    """The reply to one request line."""
     words = line.strip()
     request = words.lower()
-    asked = _QUESTIONS.get(request)
-    if asked is not None:
-        return asked(machine, serial, remote)
+    read_answer = _QUESTIONS.get(request)
+    if read_answer is not None:
+        return read_answer(machine, serial, remote)
     if request in _COMMANDS:
         act, reply = _COMMANDS[request]
         act(machine)
@@ -25,7 +25,7 @@ def answer(machine: Machine, line: str, serial: str, *, remote: bool) -> str:
     if request in _ATTEMPTS:
         return _ATTEMPTS[request](machine)
     if request.startswith("load "):
-        # Nothing could run it: the mock runs ur_rtde's control script alone.
+        # The mock cannot run it: it runs only programs that clients send.
         return f"File not found: {words[5:]}"
     if request.startswith(("popup ", "addtolog ", "setuserrole ", "set operational mode ")):
         machine.write_log(f"dashboard: {words}")
@@ -87,7 +87,7 @@ def _restart_safety(machine: Machine) -> None:
         machine.safety = Safety.NORMAL
 
 
-_COMMANDS: dict[str, tuple[Callable[[Machine], object], str]] = {  # what is done, and the reply
+_COMMANDS: dict[str, tuple[Callable[[Machine], object], str]] = {  # action and reply
     "power on": (Machine.power_on, "Powering on"),
     "power off": (Machine.power_off, "Powering off"),
     "brake release": (Machine.release_brakes, "Brake releasing"),
@@ -96,4 +96,4 @@ _COMMANDS: dict[str, tuple[Callable[[Machine], object], str]] = {  # what is don
     "close popup": (lambda machine: None, "closing popup"),
     "close safety popup": (lambda machine: None, "closing safety popup"),
 }
-_ATTEMPTS = {"pause": _pause, "play": _play, "unlock protective stop": _unlock}  # whose reply depends on success
+_ATTEMPTS = {"pause": _pause, "play": _play, "unlock protective stop": _unlock}  # their replies depend on success

@@ -1,11 +1,10 @@
-"""The fields of the RTDE: names, types, and where their values come from (Real-Time Data Exchange guide, Universal
-Robots, and the recipes of its own clients for Python and C++, all of whose fields are here).
+"""The fields of the RTDE: names, types, and sources of their values (Real-Time Data Exchange guide, Universal Robots,
+and the recipes of its clients for Python and C++, all of whose fields are here).
 
-Real: everything about joints, TCP, elbow, forces on the tool, modes, registers, in- and outputs, payload. Constant, as
-a controller at rest would report them, because nothing is modelled behind them: temperatures, voltages, currents,
-moments, momentum, energy, wrenches from currents, ratios of position deviation and collision, encoders, Euromap 67,
-inputs, what is plugged into the tool, accelerometer (the arm at rest). A field without `since` is known to every
-version, also where the guide does not say when it was introduced.
+Computed: joints, TCP, elbow, forces on the tool, modes, registers, inputs and outputs, payload. Not modelled, and
+constant like in a controller at rest: temperatures, voltages, currents, moments, momentum, energy, wrenches from
+currents, ratios of position deviation and collision, encoders, Euromap 67, inputs, devices at the tool, accelerometer.
+Every version has a field without `since`, also if the guide does not give the version that introduced it.
 """
 
 from __future__ import annotations
@@ -50,10 +49,10 @@ class Output:
 
     def known(self, version: tuple[int, ...]) -> bool:
         """True for a controller of this version."""
-        same = [least for least in self.since if least[0] == version[0]]
+        same = [minimum for minimum in self.since if minimum[0] == version[0]]
         if same:
-            return any(version >= least for least in same)
-        return version[0] > max((least[0] for least in self.since), default=0)
+            return any(version >= minimum for minimum in same)
+        return version[0] > max((minimum[0] for minimum in self.since), default=0)
 
 
 def _register(array: str, index: int) -> Callable[[Machine], Values]:
@@ -74,7 +73,7 @@ def _constant(*values: float) -> Callable[[Machine], Values]:
 
 
 def _powered(count: int) -> Callable[[Machine], Values]:
-    volts = 48.0  # of all that is powered
+    volts = 48.0  # of all powered devices [V]
 
     def read(machine: Machine) -> Values:
         value = 0.0 if machine.mode is Mode.POWER_OFF else volts
@@ -118,7 +117,7 @@ OUTPUTS: dict[str, Output] = {
     "joint_control_output": Output("VECTOR6D", _constant(*[0.0] * 6)),
     "actual_TCP_pose": Output("VECTOR6D", lambda m: m.arm.pose.tolist()),
     "actual_TCP_speed": Output("VECTOR6D", lambda m: m.arm.twist.tolist()),
-    "actual_TCP_force": Output("VECTOR6D", lambda m: m.load.felt.tolist()),
+    "actual_TCP_force": Output("VECTOR6D", lambda m: m.load.zeroed_wrench.tolist()),
     "target_TCP_pose": Output("VECTOR6D", lambda m: pose(m.arm.target_frame).tolist()),
     "target_TCP_speed": Output("VECTOR6D", lambda m: m.arm.target_twist.tolist()),
     "actual_TCP_acceleration": Output("VECTOR6D", lambda m: m.arm.acceleration.tolist()),
@@ -148,7 +147,7 @@ OUTPUTS: dict[str, Output] = {
     "runtime_state": Output("UINT32", lambda m: int(m.runtime)),
     "elbow_position": Output("VECTOR3D", _elbow, since=((3, 5), (5, 0))),
     "elbow_velocity": Output("VECTOR3D", _elbow_velocity, since=((3, 5), (5, 0))),
-    "tcp_force_scalar": Output("DOUBLE", lambda m: math.hypot(*m.load.felt[:3].tolist())),
+    "tcp_force_scalar": Output("DOUBLE", lambda m: math.hypot(*m.load.zeroed_wrench[:3].tolist())),
     "joint_position_deviation_ratio": Output("DOUBLE", _constant(0.0)),
     "collision_detection_ratio": Output("DOUBLE", _constant(0.0)),
     "time_scale_source": Output("INT32", _constant(0)),
@@ -181,8 +180,8 @@ OUTPUTS: dict[str, Output] = {
     "target_gravity": Output("VECTOR3D", lambda m: m.load.gravity.tolist()),
     "target_base_acceleration": Output("VECTOR6D", _constant(*[0.0] * 6)),
     "target_base_wrench": Output("VECTOR6D", _constant(*[0.0] * 6)),
-    "payload": Output("DOUBLE", lambda m: m.load.told.mass, since=((3, 11), (5, 5, 1))),
-    "payload_cog": Output("VECTOR3D", lambda m: m.load.told.centre, since=((3, 11), (5, 5, 1))),
+    "payload": Output("DOUBLE", lambda m: m.load.configured_payload.mass, since=((3, 11), (5, 5, 1))),
+    "payload_cog": Output("VECTOR3D", lambda m: m.load.configured_payload.centre, since=((3, 11), (5, 5, 1))),
     "payload_inertia": Output("VECTOR6D", lambda m: m.load.inertia.tolist(), since=((3, 15), (5, 11))),
     "tcp_offset": Output("VECTOR6D", lambda m: pose(m.arm.tool).tolist(), since=((5, 3),)),
     "script_control_line": Output("UINT32", _constant(0), since=((3, 14), (5, 9))),
@@ -214,10 +213,10 @@ INPUTS: dict[str, str] = {
     **{f"input_int_register_{i}": "INT32" for i in range(REGISTERS)},
     **{f"input_double_register_{i}": "DOUBLE" for i in range(REGISTERS)},
 }
-_DIGITAL = {"standard": (0, 8), "configurable": (8, 8), "tool": (16, 2)}  # first bit, how many
+_DIGITAL = {"standard": (0, 8), "configurable": (8, 8), "tool": (16, 2)}  # first bit, number of bits
 
 
-def apply(machine: Machine, given: dict[str, Value | tuple[Value, ...]]) -> None:
+def apply_inputs(machine: Machine, given: dict[str, Value | tuple[Value, ...]]) -> None:
     """Writes the values of one input package into the machine."""
     for name, value in given.items():
         kind, _, index = name.rpartition("_")

@@ -1,5 +1,5 @@
-"""What the primary and secondary interface (30001, 30002) send: of all their messages the exceptions of scripts alone
-(Universal Robots, client interfaces)."""
+"""Messages of the primary and secondary interface (30001, 30002): only the exceptions of scripts (Universal Robots,
+client interfaces)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _HEAD = struct.Struct(">iBQBBii")  # size, type, time [us], source, kind, line a
 
 
 def runtime_exception(time: float, error: ScriptError) -> bytes:
-    """A package that says why a program has ended, or was not begun; time: since power-on [s]."""
+    """A package with the error that ended or prevented a program; time: since power-on [s]."""
     words = error.text.encode()
     head = ROBOT_MESSAGE, round(1e6 * time), CONTROLLER, RUNTIME_EXCEPTION, error.line, error.column
     return _HEAD.pack(_HEAD.size + len(words), *head) + words

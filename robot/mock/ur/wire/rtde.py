@@ -17,20 +17,20 @@ from robot.mock.ur.wire.fields import FORMATS, INPUTS, OUTPUTS, Output, Value
 HEADER = struct.Struct(">HB")
 PROTOCOL, VERSION, MESSAGE, DATA = ord("V"), ord("v"), ord("M"), ord("U")
 OUTPUT_RECIPE, INPUT_RECIPE, START, PAUSE = ord("O"), ord("I"), ord("S"), ord("P")
-MAX_NAMES = 2048  # of one recipe (manual of PolyScope X 10.10, chapter RTDE, which does not say what follows) [bytes]
+MAX_NAMES = 2048  # of one recipe (manual of PolyScope X 10.10, chapter RTDE, which does not give the reaction) [bytes]
 
 
 class BadPackage(ValueError):
-    """Bytes that are no package: the connection cannot be understood any more."""
+    """Bytes that are not a package: the rest of the connection cannot be parsed."""
 
 
-def package(kind: int, payload: bytes) -> bytes:
+def make_package(kind: int, payload: bytes) -> bytes:
     """A package on the wire."""
     return HEADER.pack(len(payload) + HEADER.size, kind) + payload
 
 
-def packages(buffer: bytearray) -> Iterator[tuple[int, bytes]]:
-    """Takes all whole packages (type, payload) from the front of the buffer. Raises BadPackage."""
+def take_packages(buffer: bytearray) -> Iterator[tuple[int, bytes]]:
+    """Removes complete packages from the front of the buffer and yields (type, payload). Raises BadPackage."""
     while len(buffer) >= HEADER.size:
         size, kind = HEADER.unpack_from(buffer)
         if size < HEADER.size:
@@ -70,7 +70,7 @@ class OutputRecipe:
     every: int  # control periods between two packages
 
     def pack(self, machine: Machine, *, nan: bool) -> bytes:
-        """One data package. `nan`: what is measured is not a number."""
+        """One data package. `nan`: measured values are NaN."""
         flat: list[Value] = []
         for name, output in zip(self.names, self.fields, strict=True):
             value = output.read(machine)
@@ -85,9 +85,9 @@ class OutputRecipe:
 
 @dataclass
 class Session:
-    """What one client of the port has set up.
+    """The settings of one client of the port.
 
-    `names_in_use` gives the input names that others hold; `write` takes the payload of an input package.
+    `names_in_use` returns the input names that other clients use; `write` handles the payload of an input package.
     """
 
     machine: Callable[[], Machine]
@@ -99,17 +99,17 @@ class Session:
 
     @property
     def claims(self) -> set[str]:
-        """Input names that this client holds."""
+        """Input names that this client uses."""
         return {name for recipe in self.recipes.values() for name in recipe.names}
 
     def handle(self, kind: int, payload: bytes) -> bytes | None:
-        """The reply to a package, if it has one."""
+        """The reply to a package; None if it has none."""
         handler = _HANDLERS.get(kind)
         if handler is None:
             self.machine().write_log(f"RTDE: package of unknown type {kind} ignored")
             return None
         reply = handler(self, payload)
-        return None if reply is None else package(kind, reply)
+        return None if reply is None else make_package(kind, reply)
 
     def _protocol(self, payload: bytes) -> bytes:
         return bytes([payload == b"\0\2"])
@@ -155,7 +155,7 @@ class Session:
         return bytes([number]) + ",".join(types).encode()
 
     def _names(self, payload: bytes) -> list[str]:
-        """Names of a list with commas, in which a last comma is no name; none of a list that is too long."""
+        """Names of a comma-separated list, which may end in a comma; none of a list that is too long."""
         if len(payload) > MAX_NAMES:
             self.machine().write_log(f"RTDE: recipe of {len(payload)} bytes of names, at most {MAX_NAMES}")
             return []
@@ -166,16 +166,18 @@ class Session:
         if recipe is None:
             self.machine().write_log(f"RTDE: data for an unknown recipe ignored: {payload[:1].hex() or 'none'}")
         else:
-            # What a controller does with a wrong size is not known. Too much is read as far as the recipe goes (ur_rtde
-            # 1.6.5 sends command 44 so), too little is ignored (command 55); but a command that the program knows, and
-            # that is not whole (moveJ of three numbers), ends it, so that its client does not wait in vain.
+            # The reaction of a controller to a wrong size is unknown. Surplus bytes are ignored (ur_rtde 1.6.5 sends
+            # command 44 with them), short packages too (command 55). A short package with a command that the program
+            # knows (moveJ with three numbers) ends the program, so that its client does not wait without success.
             given, size = len(payload) - 1, recipe.layout.size
             if given != size:
                 done = "ignored" if given < size else "cut"
-                told = f"data package {done}: {given} bytes, recipe {payload[0]} has {size}"
-                self.machine().write_log(f"RTDE: {told}")
+                description = f"data package {done}: {given} bytes, recipe {payload[0]} has {size}"
+                self.machine().write_log(f"RTDE: {description}")
                 if 4 <= given < size:
-                    self.machine().on_short_command(recipe.names[0], struct.unpack_from(">i", payload, 1)[0], told)
+                    self.machine().on_short_command(
+                        recipe.names[0], struct.unpack_from(">i", payload, 1)[0], description
+                    )
             if given >= size:
                 self.write(recipe, payload[1 : 1 + size])
 

@@ -37,7 +37,7 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_a_folder_gives_the_lens_and_a_picture_the_view(pictures: Path, tmp_path: Path) -> None:
+def test_calibrate_lens_folder_gives_lens_and_image_gives_view(pictures: Path, tmp_path: Path) -> None:
     code, said, _ = run("lens", pictures, *BOARD, "--out", tmp_path / "lens")
     assert code == 0, said
     assert "left out: empty.png: the board" in said and "residual" in said
@@ -54,7 +54,7 @@ def test_a_folder_gives_the_lens_and_a_picture_the_view(pictures: Path, tmp_path
     assert read_image(tmp_path / "view" / "rectified.png").shape == shape
 
 
-def test_a_sensor_seen_askew_is_calibrated_through_its_view(tmp_path: Path) -> None:
+def test_calibrate_sensor_with_oblique_view_succeeds(tmp_path: Path) -> None:
     made = HiddenSensor(3)
     corners = np.array([(30.0, 22.0), (295.0, 15.0), (285.0, 220.0), (25.0, 225.0)], dtype=np.float32)
     edges = np.array([(0, 0), (COLUMNS, 0), (COLUMNS, ROWS), (0, ROWS)], dtype=np.float32) - 0.5
@@ -103,7 +103,7 @@ def test_a_sensor_seen_askew_is_calibrated_through_its_view(tmp_path: Path) -> N
     assert code == 2 and "the view was calibrated on 320 x 240 px" in err
 
 
-def test_what_cannot_be_ends_with_2(pictures: Path, tmp_path: Path) -> None:
+def test_calibrate_lens_invalid_input_exits_with_2(pictures: Path, tmp_path: Path) -> None:
     (tmp_path / "one").mkdir()
     (tmp_path / "one" / "a.png").write_bytes((pictures / "0.png").read_bytes())
     (tmp_path / "mixed").mkdir()
@@ -145,7 +145,7 @@ def doctor(rig: Path) -> tuple[int, str]:
     return done.exit_code, told(done.output)
 
 
-def test_a_bundles_path_starts_from_the_rig_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bundle_path_is_relative_to_rig_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "lab" / "gs").mkdir(parents=True)
     write_bundle(tmp_path / "lab" / "gs", calibration(), PICTURE)
     rig = tmp_path / "lab" / "rig.yaml"
@@ -170,7 +170,7 @@ def test_a_bundles_path_starts_from_the_rig_file(tmp_path: Path, monkeypatch: py
         ("model: ideal", "sensors.gel delivers 320 x 120 px .*model 'ideal' shows 320 x 240"),
     ],
 )
-def test_a_wrong_calibration_is_told_with_exit_code_2(camera: str, words: str, tmp_path: Path) -> None:
+def test_wrong_calibration_exits_with_2(camera: str, words: str, tmp_path: Path) -> None:
     import re
 
     (tmp_path / "gs").mkdir()

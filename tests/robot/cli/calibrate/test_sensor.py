@@ -29,7 +29,7 @@ def folder(tmp_path: Path) -> Path:
     return write_presses(tmp_path / "frames")
 
 
-def test_the_command_writes_a_bundle_and_a_picture(folder: Path, tmp_path: Path) -> None:
+def test_calibrate_sensor_writes_bundle_and_image(folder: Path, tmp_path: Path) -> None:
     lengths = ["--ball-radius", f"{BALL * 1e3} mm", "--pixel-pitch", f"{PITCH * 1e3} mm"]
     out = tmp_path / "out"
     ran = tacsim("calibrate", "sensor", folder, *lengths, "--serial", "s1", "--out", out)
@@ -39,7 +39,7 @@ def test_the_command_writes_a_bundle_and_a_picture(folder: Path, tmp_path: Path)
     assert calibration.geometry.pixel_pitch == pytest.approx(PITCH)
     assert (out / "residuals.png").stat().st_size > 10_000
     assert "press_3.png" in ran.output
-    assert calibration.noise is not None and "noise, from beside the contacts: R, G, B" in ran.output
+    assert calibration.noise is not None and "noise, from around the contacts: R, G, B" in ran.output
     assert "nothing checks the lengths" in ran.stderr and "verdict: unverified scale" in ran.output
     known = ("--size", SIZE, "--depth", "press_2.png=0.65 mm")
     sure = tacsim("calibrate", "sensor", folder, *lengths, *known, "--out", tmp_path / "sure")
@@ -55,7 +55,7 @@ def test_the_command_writes_a_bundle_and_a_picture(folder: Path, tmp_path: Path)
     assert "Traceback" not in nothing.output
 
 
-def test_a_folder_that_appears_meanwhile_is_left_alone(
+def test_calibrate_sensor_keeps_folder_made_by_other_process(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Two at once into one folder: the second writes nothing."""
@@ -76,7 +76,7 @@ def test_a_folder_that_appears_meanwhile_is_left_alone(
     assert (out / "calibration.yaml").read_text(encoding="utf-8") == "another's"
 
 
-def test_grey_pictures_are_told_as_such(folder: Path, tmp_path: Path) -> None:
+def test_calibrate_sensor_grey_images_are_reported(folder: Path, tmp_path: Path) -> None:
     """Of coloured light they keep too little: neither direction nor depth."""
     for path in folder.glob("*.png"):
         save_picture(path, np.repeat(np.asarray(Image.open(path).convert("L"))[..., None], 3, axis=2))
@@ -85,7 +85,7 @@ def test_grey_pictures_are_told_as_such(folder: Path, tmp_path: Path) -> None:
     assert ran.exit_code == 3 and "the pictures are grey" in ran.output
 
 
-def test_the_command_ends_in_a_verdict(folder: Path, tmp_path: Path) -> None:
+def test_calibrate_sensor_prints_verdict(folder: Path, tmp_path: Path) -> None:
     """Two presses are not enough: the exit code is 3, the bundle and the page say why."""
     for number in (2, 3, 4):
         (folder / f"press_{number}.png").unlink()
@@ -119,22 +119,25 @@ def test_the_command_ends_in_a_verdict(folder: Path, tmp_path: Path) -> None:
         (("--ball-diameter", "6 mm", "--pixel-pitch", "0.06 mm", "--serial", "my finger"), "'my finger' is no serial"),
         (("--ball-diameter", "6 mm", "--pixel-pitch", "0.06 mm", "--region", "9,9 900,9 9,90"), "900,9"),
         (("--ball-diameter", "6 mm", "--pixel-pitch", "0.06 mm", "--marker-pitch", "1 mm"), "give --markers, too"),
-        (("--ball-diameter", "6 mm", "--pixel-pitch", "0.06 mm", "--set", "foo.bar=1"), "it changes a camera's rig"),
+        (
+            ("--ball-diameter", "6 mm", "--pixel-pitch", "0.06 mm", "--set", "foo.bar=1"),
+            "it changes the rig of a camera",
+        ),
     ],
 )
-def test_the_command_refuses_lengths_that_may_be_wrong(folder: Path, words: tuple[str, ...], said: str) -> None:
+def test_calibrate_sensor_ambiguous_options_are_refused(folder: Path, words: tuple[str, ...], said: str) -> None:
     ran = tacsim("calibrate", "sensor", folder, *words, COLUMNS="300")
     assert ran.exit_code == 2
     assert said in ran.output
 
 
-def test_a_camera_takes_its_own_reference() -> None:
+def test_calibrate_sensor_camera_with_reference_is_refused() -> None:
     words = ("--camera", "http://127.0.0.1:9/", "--reference", "free.png", "--ball-diameter", "6 mm", "--kind", "mini")
     ran = tacsim("calibrate", "sensor", *words, COLUMNS="300")
     assert ran.exit_code == 2 and "taken first" in ran.output
 
 
-def test_the_command_measures_the_cameras_noise(folder: Path, tmp_path: Path) -> None:
+def test_calibrate_sensor_measures_camera_noise(folder: Path, tmp_path: Path) -> None:
     again = HiddenSensor(2)  # the same untouched gel, whose light drifts
     for number in (1, 2, 3):
         image = again.photograph(np.zeros((200, 260, 2)), drift=2.0 * number)
@@ -182,7 +185,7 @@ def dotted(sensor: HiddenSensor, image: np.ndarray) -> np.ndarray:
     return np.clip(np.rint(image * ink), 0, 255).astype(np.uint8)
 
 
-def test_markers_are_measured_when_asked_for_and_noticed_when_not(tmp_path: Path) -> None:
+def test_calibrate_sensor_measures_or_reports_markers(tmp_path: Path) -> None:
     sensor, home = HiddenSensor(2), tmp_path / "frames"
     home.mkdir()
     for i, press in enumerate(sensor.presses(5)):
@@ -214,7 +217,7 @@ def test_markers_are_measured_when_asked_for_and_noticed_when_not(tmp_path: Path
     assert not (tmp_path / "none").exists()
 
 
-def test_fine_pictures_are_calibrated_no_finer_than_they_are_used(folder: Path, tmp_path: Path) -> None:
+def test_calibrate_sensor_fine_images_use_coarser_pitch(folder: Path, tmp_path: Path) -> None:
     """Eight times as many pixels each way: the same heights, and native pictures are what the bundle is for."""
     import cv2
 

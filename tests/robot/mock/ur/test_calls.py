@@ -48,13 +48,13 @@ def table() -> str:
 
 
 @pytest.mark.parametrize("of", CLASSES)
-def test_no_public_call_is_forgotten(of: str) -> None:
+def test_each_public_call_has_a_case(of: str) -> None:
     named = [name for each in CASES.values() if each.of == of for name in each.methods]
     assert len(named) == len(set(named))
     assert public_methods(of) ^ set(named) == set()
 
 
-def test_the_page_says_what_the_cases_show() -> None:
+def test_page_equals_table_of_cases() -> None:
     page = PAGE.read_text(encoding="utf-8")
     before, rest = page.split(BEGIN)
     _, after = rest.split(END)

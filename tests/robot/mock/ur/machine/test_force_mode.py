@@ -39,7 +39,7 @@ def set_response(bench: Bench, gain: float = GAIN, damping: float = DAMPING) -> 
     bench.call(21, [gain])
 
 
-def test_free_tool_speeds_up_as_a_damped_mass(bench: Bench) -> None:
+def test_force_mode_free_tool_accelerates_like_damped_mass(bench: Bench) -> None:
     set_response(bench, damping=1e-3)
     begin(bench, (5, 0, 0), (1, 0, 0, 0, 0, 0))
     damping = 1e-3 * FULL_DAMPING[0]
@@ -53,7 +53,7 @@ def test_free_tool_speeds_up_as_a_damped_mass(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize(("damping", "left"), [(0.0, 1.0), (1.0, 0.0)])
-def test_damping_says_how_a_pushed_tool_goes_on(bench: Bench, damping: float, left: float) -> None:
+def test_force_mode_damping_sets_coasting(bench: Bench, damping: float, left: float) -> None:
     set_response(bench, damping=0.0)
     begin(bench, (0, 0, 0), (1, 1, 1, 0, 0, 0))
     bench.machine.load.wrench[:2] = [3.0, 4.0]
@@ -68,13 +68,13 @@ def test_damping_says_how_a_pushed_tool_goes_on(bench: Bench, damping: float, le
     np.testing.assert_allclose(bench.arm.twist[:2], left * speed, atol=1e-3)
 
 
-def test_speed_of_giving_way_is_limited(bench: Bench) -> None:
+def test_force_mode_compliant_speed_is_limited(bench: Bench) -> None:
     begin(bench, (0, 0, -200), limits=(1, 1, 0.03, 1, 1, 1))
     bench.tick(300)
     np.testing.assert_allclose(bench.arm.twist, [0, 0, -0.03, 0, 0, 0], atol=1e-6)
 
 
-def test_soft_spring_is_pressed_as_its_differential_equation_has_it(bench: Bench) -> None:
+def test_force_mode_on_spring_follows_differential_equation(bench: Bench) -> None:
     stiffness, force = 200.0, 10.0
     top = float(bench.arm.frame[2, 3])
     bench.machine.load.wall = Wall(top, stiffness)
@@ -85,16 +85,16 @@ def test_soft_spring_is_pressed_as_its_differential_equation_has_it(bench: Bench
         bench.tick(500)
         time = bench.machine.ticks * PERIOD
         share = (roots[1] * np.exp(roots[0] * time) - roots[0] * np.exp(roots[1] * time)) / (roots[0] - roots[1])
-        assert bench.machine.load.felt[2] == pytest.approx(force * (1 + share), rel=0.01)
+        assert bench.machine.load.zeroed_wrench[2] == pytest.approx(force * (1 + share), rel=0.01)
 
 
 @pytest.mark.parametrize("stiffness", [1e3, 10e3, 50e3])
-def test_presses_with_the_force_asked_for(bench: Bench, stiffness: float) -> None:
+def test_force_mode_reaches_desired_force(bench: Bench, stiffness: float) -> None:
     start = bench.arm.target_frame.copy()
     bench.machine.load.wall = Wall(float(start[2, 3]) - 0.005, stiffness)
     begin(bench, (0, 0, -10), limits=(0.1, 0.1, 0.05, 1, 1, 1))
     bench.tick(3000)
-    assert bench.machine.load.felt[2] == pytest.approx(10.0, abs=0.01)
+    assert bench.machine.load.zeroed_wrench[2] == pytest.approx(10.0, abs=0.01)
     moved = displacement(start, bench.arm.frame)
     np.testing.assert_allclose(np.delete(moved, 2), 0, atol=1e-7)
     assert not bench.machine.steady
@@ -103,7 +103,7 @@ def test_presses_with_the_force_asked_for(bench: Bench, stiffness: float) -> Non
     np.testing.assert_allclose(displacement(bench.arm.target_frame, bench.arm.frame), 0, atol=1e-9)
 
 
-def test_a_torque_turns_the_tool_about_its_tcp(bench: Bench) -> None:
+def test_force_mode_torque_rotates_tool_about_tcp(bench: Bench) -> None:
     bench.call(29, [0, 0, 0.1, 0, 0, 0])
     start = bench.arm.frame.copy()
     begin(bench, (0, 0, 0, 0, 0, 0.3), (0, 0, 0, 0, 0, 1))
@@ -123,7 +123,7 @@ MOTIONS = {
 
 
 @pytest.mark.parametrize("motion", MOTIONS)
-def test_other_axes_follow_the_motion_and_the_force_stays(bench: Bench, motion: str) -> None:
+def test_force_mode_other_axes_follow_motion_at_constant_force(bench: Bench, motion: str) -> None:
     """Sideways along a table, while it is pressed with 10 N."""
     start = bench.arm.target_frame.copy()
     bench.machine.load.wall = Wall(float(start[2, 3]), 10e3)
@@ -135,7 +135,7 @@ def test_other_axes_follow_the_motion_and_the_force_stays(bench: Bench, motion: 
     forces, off = [], []
     for _ in range(900):
         bench.tick()
-        forces.append(bench.machine.load.felt[2])
+        forces.append(bench.machine.load.zeroed_wrench[2])
         step = displacement(bench.arm.target_frame, bench.arm.kinematics.forward(bench.arm.set_q, bench.arm.tool))
         off.append(np.abs(np.delete(step, 2)).max())
     assert bench.machine.program is not None, bench.machine.stop_reason
@@ -148,7 +148,7 @@ def test_other_axes_follow_the_motion_and_the_force_stays(bench: Bench, motion: 
     assert bench.arm.frame[2, 3] == pytest.approx(start[2, 3] - 1e-3, abs=1e-5)
 
 
-def test_motion_along_a_compliant_axis_is_not_followed(bench: Bench) -> None:
+def test_force_mode_ignores_motion_along_compliant_axis(bench: Bench) -> None:
     z = float(bench.arm.frame[2, 3])
     begin(bench, (0, 0, 0))
     bench.write(3, [*bench.shifted(0.05, 0, -0.05), 0.1, 0.5], [1])
@@ -156,7 +156,7 @@ def test_motion_along_a_compliant_axis_is_not_followed(bench: Bench) -> None:
     assert bench.arm.frame[2, 3] == pytest.approx(z, abs=1e-6)
 
 
-def test_type_1_presses_towards_a_point(bench: Bench) -> None:
+def test_force_mode_type_1_presses_towards_point(bench: Bench) -> None:
     """y of the task frame points from the TCP to the point, wherever the TCP is."""
     point = bench.arm.frame[:3, 3] + [0.2, 0.1, -0.1]
     begin(bench, (0, 10, 0), (0, 1, 0, 0, 0, 0), kind=1, frame=[*point, 0.3, -0.2, 0.5])
@@ -176,7 +176,7 @@ def test_type_1_presses_towards_a_point(bench: Bench) -> None:
     assert "10 mm" in bench.machine.stop_reason and bench.machine.force_mode is None
 
 
-def test_type_3_presses_sideways_of_the_motion(bench: Bench) -> None:
+def test_force_mode_type_3_presses_across_motion(bench: Bench) -> None:
     """x of the task frame is the TCP's motion in the frame's x-y plane; standing still from the beginning nothing gives
     way, standing still again the frame stays (UR5e user manual, force mode "Motion")."""
     frame = [0, 0, 0, 0, 0, 0.7]
@@ -197,7 +197,7 @@ def test_type_3_presses_sideways_of_the_motion(bench: Bench) -> None:
     np.testing.assert_allclose(bench.arm.twist[:3], sideways * across, atol=2e-4)
 
 
-def test_pause_holds_a_tool_that_gives_way_and_play_lets_it_go_on(bench: Bench) -> None:
+def test_force_mode_pause_holds_and_play_continues(bench: Bench) -> None:
     begin(bench, (0, 0, -10))
     bench.tick(100)
     bench.machine.safeguard_stop(True)
@@ -211,7 +211,7 @@ def test_pause_holds_a_tool_that_gives_way_and_play_lets_it_go_on(bench: Bench) 
 
 
 @pytest.mark.parametrize("end", ["protective stop", "program"])
-def test_whatever_ends_the_program_ends_force_mode(bench: Bench, end: str) -> None:
+def test_force_mode_ends_with_program(bench: Bench, end: str) -> None:
     begin(bench, (0, 0, -100))
     bench.write(10, [0.1, 0, 0, 0, 0, 0, 0.5, 0.0])
     bench.tick(200)
@@ -228,11 +228,11 @@ def test_whatever_ends_the_program_ends_force_mode(bench: Bench, end: str) -> No
     np.testing.assert_allclose(bench.arm.q, rest, atol=1e-9)
 
 
-def test_giving_way_to_the_end_of_the_reach_ends_the_program_and_not_the_mock(bench: Bench) -> None:
+def test_force_mode_out_of_reach_ends_program_only(bench: Bench) -> None:
     begin(bench, (-100, 0, 0), (1, 0, 0, 0, 0, 0))
     bench.until(lambda: bench.machine.program is None)
     bench.until(lambda: bench.arm.rests)
-    assert "give way" in bench.machine.stop_reason or bench.machine.safety is Safety.PROTECTIVE_STOP
+    assert "out of reach" in bench.machine.stop_reason or bench.machine.safety is Safety.PROTECTIVE_STOP
 
 
 @pytest.mark.parametrize(
@@ -245,7 +245,7 @@ def test_giving_way_to_the_end_of_the_reach_ends_the_program_and_not_the_mock(be
         ([*[0.0] * 17, math.nan], [2, *Z]),
     ],
 )
-def test_what_makes_no_sense_ends_the_program(bench: Bench, doubles: list[float], integers: list[int]) -> None:
+def test_force_mode_invalid_arguments_end_program(bench: Bench, doubles: list[float], integers: list[int]) -> None:
     bench.write(6, doubles, integers)
     bench.tick(2)
     assert bench.machine.program is None and bench.machine.force_mode is None

@@ -1,4 +1,4 @@
-"""What the arm feels of a payload that it carries, was told of, or zeroed away: against statics by hand."""
+"""The measured force of a payload that is carried, configured, or zeroed: against statics by hand."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def attitudes(bench: Bench) -> Iterator[FloatArray]:
         bench.call(1, [*(home + turn), 1.0, 2.0])
         bench.until(lambda: bench.arm.rests)
         bench.tick()
-        yield bench.machine.load.felt
+        yield bench.machine.load.zeroed_wrench
 
 
 def weight(bench: Bench, mass: float) -> FloatArray:
@@ -37,7 +37,7 @@ def weight(bench: Bench, mass: float) -> FloatArray:
 
 
 @pytest.mark.parametrize("command", [17, 65])
-def test_a_load_told_with_its_centre_is_not_felt_and_an_untold_one_is(bench: Bench, command: int) -> None:
+def test_configured_payload_is_compensated_and_other_is_not(bench: Bench, command: int) -> None:
     bench.call(29, [0.01, 0.02, 0.15, 0.4, 0, 0])  # a TCP far from the flange
     bench.machine.load.hidden = Mass(0.5, CENTRE)
     for felt in attitudes(bench):
@@ -46,35 +46,35 @@ def test_a_load_told_with_its_centre_is_not_felt_and_an_untold_one_is(bench: Ben
     bench.call(command, [0.5, *CENTRE])
     for felt in attitudes(bench):
         np.testing.assert_allclose(felt, 0, atol=1e-9)
-    bench.call(command, [0.7, *CENTRE])  # told too much: as if something pulled it up
+    bench.call(command, [0.7, *CENTRE])  # a payload that is too heavy: as if something pulled it up
     for felt in attitudes(bench):
         np.testing.assert_allclose(felt, -weight(bench, 0.2), atol=1e-9)
 
 
-def test_a_payload_told_after_zeroing_shows_until_the_next_zeroing(bench: Bench) -> None:
+def test_payload_set_after_zeroing_shows_until_next_zeroing(bench: Bench) -> None:
     bench.machine.load.hidden = Mass(0.5, CENTRE)
     bench.tick()
     bench.call(8)
-    np.testing.assert_allclose(bench.machine.load.felt, 0, atol=1e-9)
+    np.testing.assert_allclose(bench.machine.load.zeroed_wrench, 0, atol=1e-9)
     bench.call(17, [0.5, *CENTRE])
     bench.tick()
-    np.testing.assert_allclose(bench.machine.load.felt, -weight(bench, 0.5), atol=1e-9)
+    np.testing.assert_allclose(bench.machine.load.zeroed_wrench, -weight(bench, 0.5), atol=1e-9)
     bench.call(8)
     for felt in attitudes(bench):
         np.testing.assert_allclose(felt, 0, atol=1e-9)
 
 
-def test_gravity_told_wrong_takes_off_a_weight_in_the_wrong_direction(bench: Bench) -> None:
+def test_wrong_gravity_subtracts_weight_in_wrong_direction(bench: Bench) -> None:
     bench.machine.load.hidden = Mass(0.5)
     bench.call(17, [0.5, 0, 0, 0])
     tilt = 0.3
     bench.call(59, [0, GRAVITY * math.sin(tilt), GRAVITY * math.cos(tilt)])
     bench.tick()
     wanted = 0.5 * GRAVITY * np.array([0, math.sin(tilt), math.cos(tilt) - 1.0])
-    np.testing.assert_allclose(bench.machine.load.felt[:3], wanted, atol=1e-9)
+    np.testing.assert_allclose(bench.machine.load.zeroed_wrench[:3], wanted, atol=1e-9)
 
 
-def test_the_raw_wrench_knows_of_no_payload_and_no_zero(bench: Bench) -> None:
+def test_raw_wrench_ignores_payload_and_zeroing(bench: Bench) -> None:
     bench.machine.load.hidden = Mass(0.5)
     bench.call(17, [0.5, *CENTRE])
     bench.call(8)
@@ -83,7 +83,7 @@ def test_the_raw_wrench_knows_of_no_payload_and_no_zero(bench: Bench) -> None:
     np.testing.assert_allclose(bench.machine.raw_wrench, [*down, 0, 0, 0], atol=1e-9)
 
 
-def test_an_arm_with_a_wrong_payload_drifts_in_freedrive_and_with_the_right_one_stands(bench: Bench) -> None:
+def test_freedrive_drifts_only_with_wrong_payload(bench: Bench) -> None:
     bench.machine.load.hidden = Mass(0.5)
     bench.call(17, [0.5, 0, 0, 1e-9])
     bench.call(52, [0] * 6, [1, 1, 1, 0, 0, 0])
@@ -98,20 +98,20 @@ def test_an_arm_with_a_wrong_payload_drifts_in_freedrive_and_with_the_right_one_
 
 
 @pytest.mark.parametrize("numbers", [(1, 2, 3), (1, 2, 3, math.nan), (1e300, 0, 0, 1e300), (math.inf, 0, 0, 0)])
-def test_what_is_no_payload(numbers: tuple[float, ...]) -> None:
+def test_invalid_payload_is_refused(numbers: tuple[float, ...]) -> None:
     with pytest.raises(ValueError, match="a payload is"):
         Mass.of(numbers)
 
 
-def test_a_mock_carries_what_it_was_started_with() -> None:
+def test_mock_measures_its_initial_payload() -> None:
     with MockUR(wire_host(30), payload=(0.4, *CENTRE)) as carrier:
         for _ in range(2):
             with ControlClient(carrier.host) as client:
                 untold = client.wait(lambda state: True)
                 assert untold["actual_TCP_force"][2] == pytest.approx(-0.4 * GRAVITY)
                 client.call(17, [0.4, *CENTRE])
-                told = client.wait(lambda state: abs(state["actual_TCP_force"][2]) < 1e-9)
-                np.testing.assert_allclose(told["actual_TCP_force"], 0, atol=1e-9)
+                state_without_force = client.wait(lambda state: abs(state["actual_TCP_force"][2]) < 1e-9)
+                np.testing.assert_allclose(state_without_force["actual_TCP_force"], 0, atol=1e-9)
             carrier.faults.reset()
     with pytest.raises(MockError, match="payload"):
         MockUR(wire_host(30), payload=(0.4, math.nan, 0, 0))

@@ -19,7 +19,7 @@ from tests.robot.mock.wire_client import control_script
 
 
 @pytest.mark.parametrize(("length", "speed", "acceleration"), [(0.1, 0.25, 1.2), (0.02, 0.25, 1.2), (0.15, 0.05, 0.5)])
-def test_movel_takes_the_time_of_its_trapezoid(bench: Bench, length: float, speed: float, acceleration: float) -> None:
+def test_movel_duration_equals_trapezoid(bench: Bench, length: float, speed: float, acceleration: float) -> None:
     goal = bench.shifted(0, 0, -length)
     ticks = bench.call(3, [*goal, speed, acceleration])
     reaches_speed = length > speed**2 / acceleration
@@ -29,7 +29,7 @@ def test_movel_takes_the_time_of_its_trapezoid(bench: Bench, length: float, spee
     np.testing.assert_allclose(displacement(bench.arm.frame, matrix(goal)), 0, atol=1e-9)
 
 
-def test_movel_stays_on_its_line_and_below_its_speed(bench: Bench) -> None:
+def test_movel_keeps_line_and_speed_limit(bench: Bench) -> None:
     start = bench.arm.target_frame[:3, 3].copy()
     bench.write(3, [*bench.shifted(0.06, 0.08, 0), 0.1, 0.5])
     fastest = steepest = before = 0.0
@@ -45,7 +45,7 @@ def test_movel_stays_on_its_line_and_below_its_speed(bench: Bench) -> None:
     assert path_length @ [0.6, 0.8, 0.0] == pytest.approx(0.1, abs=1e-9)
 
 
-def test_movej_takes_the_time_of_its_leading_joint(bench: Bench) -> None:
+def test_movej_duration_equals_leading_joint(bench: Bench) -> None:
     goal = bench.arm.target_q + [0.5, -0.1, 0.2, 0, 0, 0.3]
     ticks = bench.call(1, [*goal, 1.05, 1.4])
     theory = 2 * math.sqrt(0.5 / 1.4)
@@ -54,7 +54,7 @@ def test_movej_takes_the_time_of_its_leading_joint(bench: Bench) -> None:
     np.testing.assert_allclose(bench.arm.q, goal, atol=1e-12)
 
 
-def test_actual_trails_target_and_both_speeds_agree(bench: Bench) -> None:
+def test_actual_joints_lag_target_at_equal_speed(bench: Bench) -> None:
     bench.write(10, [0, 0, -0.05, 0, 0, 0.1, 0.5, 0.0])
     bench.tick(300)
     lag = (bench.arm.target_frame[2, 3] - bench.arm.frame[2, 3]) / -0.05
@@ -65,7 +65,7 @@ def test_actual_trails_target_and_both_speeds_agree(bench: Bench) -> None:
     np.testing.assert_allclose(displacement(before, bench.arm.frame) / PERIOD, bench.arm.twist, atol=1e-4)
 
 
-def test_accelerations_of_the_tcp_are_the_change_of_its_speeds(bench: Bench) -> None:
+def test_tcp_acceleration_equals_change_of_speed(bench: Bench) -> None:
     bench.call(10, [0.1, 0, 0, 0, 0, 0, 0.5, 0])
     read = {name: OUTPUTS[name].read for name in ("actual_TCP_speed", "actual_TCP_acceleration")}
     target = {name: OUTPUTS[name].read for name in ("target_TCP_speed", "target_TCP_acceleration")}
@@ -78,7 +78,7 @@ def test_accelerations_of_the_tcp_are_the_change_of_its_speeds(bench: Bench) -> 
         assert change[0] > 0.1
 
 
-def test_elbow_velocity_is_that_of_its_position(bench: Bench) -> None:
+def test_elbow_velocity_equals_change_of_position(bench: Bench) -> None:
     bench.write(9, [0.3, -0.2, 0.4, 0, 0, 0, 5.0, 0.0])
     bench.tick(300)
     before = np.array(OUTPUTS["elbow_position"].read(bench.machine))
@@ -88,7 +88,7 @@ def test_elbow_velocity_is_that_of_its_position(bench: Bench) -> None:
     assert np.linalg.norm(moved) > 1e-4
 
 
-def test_speed_ramps_at_its_acceleration_and_goes_on_for_ever(bench: Bench) -> None:
+def test_speed_command_ramps_and_continues(bench: Bench) -> None:
     bench.write(10, [0.02, 0, 0, 0, 0, 0, 0.1, 0.05])  # a time of 50 ms does not end it
     bench.tick(50)
     assert bench.arm.target_twist[0] == pytest.approx(0.01, rel=1e-3)
@@ -98,7 +98,7 @@ def test_speed_ramps_at_its_acceleration_and_goes_on_for_ever(bench: Bench) -> N
     assert ticks * PERIOD == pytest.approx(0.2, abs=3 * PERIOD)
 
 
-def test_servo_has_its_lag_and_does_not_overshoot(bench: Bench) -> None:
+def test_servoj_has_its_lag_without_overshoot(bench: Bench) -> None:
     start, lookahead = bench.arm.target_q.copy(), 0.1
     goal = start + [0.01, 0, 0, 0, 0, 0]
     bench.write(11, [*goal, 0, 0, 0.002, lookahead, 300])
@@ -111,7 +111,7 @@ def test_servo_has_its_lag_and_does_not_overshoot(bench: Bench) -> None:
     np.testing.assert_allclose(bench.arm.q, goal, atol=1e-5)
 
 
-def test_servo_to_a_far_target_respects_joint_speed_and_acceleration(bench: Bench) -> None:
+def test_servoj_far_target_keeps_joint_limits(bench: Bench) -> None:
     goal = bench.arm.target_q + [2.0, 0, 0, 0, 0, 0]
     bench.write(11, [*goal, 0, 0, 0.002, 0.03, 300])
     for _ in range(1000):
@@ -123,7 +123,7 @@ def test_servo_to_a_far_target_respects_joint_speed_and_acceleration(bench: Benc
     np.testing.assert_allclose(bench.arm.q, goal, atol=1e-5)
 
 
-def test_speed_slider_reaches_servoj(bench: Bench) -> None:
+def test_servoj_follows_speed_slider(bench: Bench) -> None:
     """At half the slider its time runs at half the speed: twice the lag behind a steady motion, half the top speed."""
     bench.machine.set_slider(0.5)
     bench.tick(200)
@@ -148,14 +148,14 @@ def test_speed_slider_reaches_servoj(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize("command", [11, 24])
-def test_servo_with_nan_ends_the_program(bench: Bench, command: int) -> None:
+def test_servoj_nan_ends_program(bench: Bench, command: int) -> None:
     bench.write(command, [math.nan, 0, 0, 0, 0, 0, 0, 0, 0.002, 0.1, 300])
     bench.tick(2)
     assert bench.machine.program is None and "finite" in bench.machine.stop_reason
     assert np.isfinite(bench.arm.q).all()
 
 
-def test_unreachable_servo_target_ends_the_program_and_a_question_does_not(bench: Bench) -> None:
+def test_unreachable_servo_target_ends_program_but_query_does_not(bench: Bench) -> None:
     bench.call(60, [5, 0, 0, 0, 0, 0])
     assert bench.integer == 0 and bench.machine.program is not None
     bench.call(36, DOWN)
@@ -165,14 +165,14 @@ def test_unreachable_servo_target_ends_the_program_and_a_question_does_not(bench
     assert bench.machine.program is None and "no solution" in bench.machine.stop_reason
 
 
-def test_two_motions_at_once_end_the_program(bench: Bench) -> None:
+def test_two_motions_at_once_end_program(bench: Bench) -> None:
     bench.call(10, [0.01, 0, 0, 0, 0, 0, 0.5, 0])
     bench.write(3, [*bench.shifted(0, 0, -0.05), 0.1, 0.5])
     bench.tick(5)
     assert bench.machine.program is None and "another thread" in bench.machine.stop_reason
 
 
-def test_path_with_blend_does_not_stop_and_without_does() -> None:
+def test_path_stops_only_without_blend() -> None:
     speeds = {}
     for blend in (0.0, 0.02):
         home = pose(Machine().arm.frame)
@@ -214,7 +214,7 @@ def test_asynchronous_word_counts_operations(bench: Bench) -> None:
     assert not bench.arm.target_qd.any()
 
 
-def test_speed_slider_halves_the_speed(bench: Bench) -> None:
+def test_speed_slider_scales_speed(bench: Bench) -> None:
     bench.machine.set_slider(0.5)
     bench.tick(200)
     ticks = bench.call(3, [*bench.shifted(0, 0, -0.1), 0.25, 1.2])
@@ -236,14 +236,14 @@ def test_speed_slider_halves_the_speed(bench: Bench) -> None:
         (29, [math.inf, 0, 0, 0, 0, 0], [], "finite"),
     ],
 )
-def test_what_is_not_modelled_or_wrong_ends_the_program(
+def test_unmodelled_or_invalid_command_ends_program(
     bench: Bench, command: int, doubles: list[float], integers: list[int], words: str
 ) -> None:
     bench.call(command, doubles, integers)
     assert bench.machine.program is None and words in bench.machine.stop_reason
 
 
-def test_commands_of_newer_controllers_do_nothing_on_older_ones() -> None:
+def test_commands_of_newer_controllers_have_no_effect_on_older() -> None:
     old = control_script().replace("get_jacobian(", "")
     bench = Bench(old)
     bench.call(70)
@@ -255,15 +255,15 @@ def test_commands_of_newer_controllers_do_nothing_on_older_ones() -> None:
     assert not any(bench.machine.out_double)
 
 
-def test_payload_is_read_back_and_a_zero_centre_keeps_the_old(bench: Bench) -> None:
+def test_payload_zero_centre_keeps_previous(bench: Bench) -> None:
     bench.call(65, [1.2, 0, 0, 0.05, 1, 2, 3, 4, 5, 6])
-    assert bench.machine.load.told == Mass(1.2, (0, 0, 0.05))
+    assert bench.machine.load.configured_payload == Mass(1.2, (0, 0, 0.05))
     assert bench.machine.load.inertia.tolist() == [1, 2, 3, 4, 5, 6]
     bench.call(17, [0.7, 0, 0, 0])
-    assert bench.machine.load.told == Mass(0.7, (0, 0, 0.05))
+    assert bench.machine.load.configured_payload == Mass(0.7, (0, 0, 0.05))
 
 
-def test_what_is_no_program_disturbs_nobody(bench: Bench) -> None:
+def test_invalid_program_keeps_running_program(bench: Bench) -> None:
     assert not bench.machine.start("garbage\nend\n")
     assert not bench.machine.start("sec hello():\n  textmsg(1)\nend\n")
     assert bench.machine.program is not None

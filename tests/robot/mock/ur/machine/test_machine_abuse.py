@@ -46,9 +46,7 @@ def usable(machine: Machine) -> None:
         (51, [*DOWN, 0, 0, 0, 0, 0, 1e300, 1e300], []),  # moveUntilContact
     ],
 )
-def test_numbers_beyond_all_measure_stop_the_program(
-    bench: Bench, command: int, doubles: list[float], integers: list[int]
-) -> None:
+def test_too_large_numbers_end_program(bench: Bench, command: int, doubles: list[float], integers: list[int]) -> None:
     bench.call(command, doubles, integers)
     bench.tick(50)
     assert bench.machine.program is None and "Error" not in bench.machine.stop_reason
@@ -65,7 +63,7 @@ def test_numbers_beyond_all_measure_stop_the_program(
         (10, [1e5] * 6 + [1e5, 0]),
     ],
 )
-def test_a_motion_beyond_the_joints_speed_is_not_begun(bench: Bench, command: int, doubles: list[float]) -> None:
+def test_motion_beyond_joint_speed_is_not_started(bench: Bench, command: int, doubles: list[float]) -> None:
     begun, top = bench.arm.q.copy(), bench.arm.kinematics.joint_speeds
     bench.call(command, doubles)
     for _ in range(100):
@@ -76,7 +74,7 @@ def test_a_motion_beyond_the_joints_speed_is_not_begun(bench: Bench, command: in
     usable(bench.machine)
 
 
-def test_an_arm_at_the_end_of_its_range_can_be_driven_back(bench: Bench) -> None:
+def test_arm_at_end_of_range_can_move_back(bench: Bench) -> None:
     begun = bench.arm.q.copy()
     bench.call(9, [0, 0, 0, 0, 0, 3.0, 10.0, 0])
     bench.until(lambda: bench.machine.safety is Safety.PROTECTIVE_STOP and bench.arm.rests)
@@ -100,7 +98,7 @@ def test_an_arm_at_the_end_of_its_range_can_be_driven_back(bench: Bench) -> None
         ("movec(p[0,0,0,0,0,0])", "does not know"),
     ],
 )
-def test_paths_that_are_none(line: str, words: str) -> None:
+def test_invalid_paths_end_program(line: str, words: str) -> None:
     bench = Bench(control_script(path=[line]))
     bench.call(45, [], [0])
     assert bench.machine.program is None and words in bench.machine.stop_reason
@@ -109,7 +107,7 @@ def test_paths_that_are_none(line: str, words: str) -> None:
 
 
 @pytest.mark.parametrize("offset", ["25", "47", "9999", "9" * 5000])
-def test_register_offsets_beyond_the_registers(offset: str) -> None:
+def test_too_large_register_offset_is_refused(offset: str) -> None:
     machine = Machine()
     text = control_script().replace("register offset\n0", f"register offset\n{offset}")
     assert not machine.start(text)
@@ -129,7 +127,7 @@ def test_register_offsets_beyond_the_registers(offset: str) -> None:
     ],
     ids=["blank", "dollars", "paths", "version", "calls", "blank lines"],
 )
-def test_programs_that_are_long_or_odd_take_no_time_to_speak_of(text: str) -> None:
+def test_long_or_odd_programs_are_parsed_fast(text: str) -> None:
     """Without a bound these took minutes or raised; pytest's time-out of a test ends it then."""
     machine = Machine()
     machine.start(text)
@@ -140,7 +138,7 @@ def test_programs_that_are_long_or_odd_take_no_time_to_speak_of(text: str) -> No
     usable(machine)
 
 
-def test_an_error_of_the_mock_itself_stops_its_program(bench: Bench, capfd: pytest.CaptureFixture[str]) -> None:
+def test_mock_error_ends_program(bench: Bench, capfd: pytest.CaptureFixture[str]) -> None:
     def broken() -> None:
         raise ZeroDivisionError("of the test")
 
@@ -152,7 +150,7 @@ def test_an_error_of_the_mock_itself_stops_its_program(bench: Bench, capfd: pyte
     usable(bench.machine)
 
 
-def test_an_arm_that_cannot_be_computed_any_more_is_in_fault(bench: Bench) -> None:
+def test_uncomputable_arm_is_in_fault(bench: Bench) -> None:
     begun = bench.arm.q.copy()
     bench.arm.q = np.full(6, math.inf)
     bench.tick()

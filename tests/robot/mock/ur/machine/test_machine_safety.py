@@ -15,7 +15,7 @@ from tests.robot.mock.machine_bench import Bench
 from tests.robot.mock.wire_client import control_script
 
 
-def test_watchdog_stops_a_silent_client_only(bench: Bench) -> None:
+def test_watchdog_stops_only_silent_client(bench: Bench) -> None:
     bench.call(35, [10.0])
     bench.call(10, [0, 0, -0.02, 0, 0, 0, 0.5, 0])
     for _ in range(20):
@@ -28,7 +28,7 @@ def test_watchdog_stops_a_silent_client_only(bench: Bench) -> None:
     bench.until(lambda: bench.arm.rests, limit=0.2)
 
 
-def test_protective_stop_brakes_and_needs_unlocking(bench: Bench) -> None:
+def test_protective_stop_brakes_and_needs_unlock(bench: Bench) -> None:
     bench.call(10, [0, 0, -0.2, 0, 0, 0, 1.0, 0])
     bench.tick(200)
     bench.machine.protective_stop("test")
@@ -38,7 +38,7 @@ def test_protective_stop_brakes_and_needs_unlocking(bench: Bench) -> None:
     assert bench.machine.unlock() and bench.machine.start(control_script())
 
 
-def test_unlocking_can_be_made_to_wait(bench: Bench) -> None:
+def test_unlock_delay_refuses_early_unlock(bench: Bench) -> None:
     bench.machine.unlock_delay = 5.0
     bench.machine.protective_stop("test")
     assert not bench.machine.unlock()
@@ -46,7 +46,7 @@ def test_unlocking_can_be_made_to_wait(bench: Bench) -> None:
     assert bench.machine.unlock()
 
 
-def test_emergency_stop_takes_the_power_and_returning_takes_steps(bench: Bench) -> None:
+def test_emergency_stop_removes_power_until_restart(bench: Bench) -> None:
     machine = bench.machine
     bench.call(10, [0, 0, -0.2, 0, 0, 0, 1.0, 0])
     bench.tick(200)
@@ -65,7 +65,7 @@ def test_emergency_stop_takes_the_power_and_returning_takes_steps(bench: Bench) 
     assert machine.start(control_script())
 
 
-def test_safeguard_stop_pauses_and_the_motion_goes_on(bench: Bench) -> None:
+def test_safeguard_stop_pauses_and_motion_continues(bench: Bench) -> None:
     goal = bench.shifted(0, 0, -0.1)
     bench.write(3, [*goal, 0.1, 0.5])
     bench.tick(200)
@@ -81,50 +81,50 @@ def test_safeguard_stop_pauses_and_the_motion_goes_on(bench: Bench) -> None:
     np.testing.assert_allclose(displacement(bench.arm.target_frame, matrix(goal)), 0, atol=1e-8)
 
 
-def test_wall_pushes_up_and_zeroing_takes_it_off(bench: Bench) -> None:
+def test_wall_force_is_removed_by_zeroing(bench: Bench) -> None:
     z = float(bench.arm.frame[2, 3])
     bench.machine.load.wall = Wall(z - 0.01, 1000.0)
     bench.call(3, [*bench.shifted(0, 0, -0.02), 0.1, 0.5])
     bench.tick(100)
-    np.testing.assert_allclose(bench.machine.load.felt, [0, 0, 10, 0, 0, 0], atol=1e-6)
+    np.testing.assert_allclose(bench.machine.load.zeroed_wrench, [0, 0, 10, 0, 0, 0], atol=1e-6)
     bench.machine.load.wrench = np.array([1.0, 2, 3, 0.1, 0.2, 0.3])
     bench.tick()
-    np.testing.assert_allclose(bench.machine.load.felt, [1, 2, 13, 0.1, 0.2, 0.3], atol=1e-6)
+    np.testing.assert_allclose(bench.machine.load.zeroed_wrench, [1, 2, 13, 0.1, 0.2, 0.3], atol=1e-6)
     bench.call(8)
-    np.testing.assert_allclose(bench.machine.load.felt, 0, atol=1e-9)
+    np.testing.assert_allclose(bench.machine.load.zeroed_wrench, 0, atol=1e-9)
     bench.machine.load.wrench = np.zeros(6)
     bench.tick()
-    np.testing.assert_allclose(bench.machine.load.felt, [-1, -2, -3, -0.1, -0.2, -0.3], atol=1e-6)
+    np.testing.assert_allclose(bench.machine.load.zeroed_wrench, [-1, -2, -3, -0.1, -0.2, -0.3], atol=1e-6)
 
 
-def test_too_much_force_is_a_protective_stop(bench: Bench) -> None:
+def test_force_beyond_limit_is_protective_stop(bench: Bench) -> None:
     bench.machine.load.wall = Wall(float(bench.arm.frame[2, 3]), 20e3)
     bench.call(3, [*bench.shifted(0, 0, -0.05), 0.05, 0.5])
     assert bench.machine.safety is Safety.PROTECTIVE_STOP and "force" in bench.machine.stop_reason
     assert 250 < bench.machine.load.unexplained[2] < 262  # stopped at once, not after a way
 
 
-def test_hidden_payload_weighs_and_turns_with_the_tool(bench: Bench) -> None:
+def test_hidden_payload_rotates_with_tool(bench: Bench) -> None:
     bench.machine.load.hidden = Mass(2.0, (0.0, 0.1, 0.0))
     bench.tick()
     weight = 2.0 * GRAVITY
     arm_of_force = bench.arm.frame[:3, 1] * 0.1
-    np.testing.assert_allclose(bench.machine.load.felt[:3], [0, 0, -weight], atol=1e-9)
-    np.testing.assert_allclose(bench.machine.load.felt[3:], np.cross(arm_of_force, [0, 0, -weight]), atol=1e-9)
+    np.testing.assert_allclose(bench.machine.load.zeroed_wrench[:3], [0, 0, -weight], atol=1e-9)
+    np.testing.assert_allclose(bench.machine.load.zeroed_wrench[3:], np.cross(arm_of_force, [0, 0, -weight]), atol=1e-9)
     bench.call(1, [*(bench.arm.target_q + [0.3, 0.2, -0.4, 0.6, -0.3, 0.8]), 1.0, 1.0])
     bench.until(lambda: bench.arm.rests)
     bench.call(8)  # zeroed in this attitude, felt again in another
-    np.testing.assert_allclose(bench.machine.load.felt, 0, atol=1e-9)
+    np.testing.assert_allclose(bench.machine.load.zeroed_wrench, 0, atol=1e-9)
     axis = bench.arm.kinematics.jacobian(bench.arm.q)[3:, 4]
     sideways = math.sqrt(1 - axis[2] ** 2)  # the part of gravity across the axis of the next turn
     bench.call(1, [*(bench.arm.target_q + [0, 0, 0, 0, 0.5, 0]), 1.0, 1.0])
     bench.until(lambda: bench.arm.rests)
-    assert np.linalg.norm(bench.machine.load.felt[:3]) == pytest.approx(
+    assert np.linalg.norm(bench.machine.load.zeroed_wrench[:3]) == pytest.approx(
         2 * weight * sideways * math.sin(0.25), rel=1e-6
     )
 
 
-def test_contact_is_found_and_the_arm_returns_to_it(bench: Bench) -> None:
+def test_contact_is_detected_and_arm_returns(bench: Bench) -> None:
     top = float(bench.arm.frame[2, 3]) - 0.02
     bench.machine.load.wall = Wall(top, 5000.0)
     bench.call(51, [0, 0, -0.05, 0, 0, 0, 0, 0, -1, 0, 0, 0, 0.5])
@@ -133,7 +133,7 @@ def test_contact_is_found_and_the_arm_returns_to_it(bench: Bench) -> None:
     assert bench.arm.frame[2, 3] == pytest.approx(top - 0.2e-3, abs=0.15e-3)
 
 
-def test_freedrive_gives_way_along_its_free_axes_only(bench: Bench) -> None:
+def test_freedrive_moves_only_along_free_axes(bench: Bench) -> None:
     start = bench.arm.frame[:3, 3].copy()
     bench.call(52, [0] * 6, [1, 0, 1, 0, 0, 0])
     assert bench.machine.status_bits & 4

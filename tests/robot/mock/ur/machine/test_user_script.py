@@ -24,7 +24,7 @@ def program(*lines: str) -> str:
     return "\n".join(["def mine():", *(f"\t{line}" for line in lines), "end", ""])
 
 
-def test_calls_are_done_in_their_order(bench: Bench) -> None:
+def test_user_script_calls_run_in_order(bench: Bench) -> None:
     joints = [angle + 0.1 for angle in HOME]
     begun = bench.machine.ticks
     assert bench.machine.start(
@@ -47,9 +47,9 @@ def test_calls_are_done_in_their_order(bench: Bench) -> None:
     assert took == pytest.approx(2 * math.sqrt(0.1 / 1.4) + 0.5, abs=5 * PERIOD)
     np.testing.assert_allclose(bench.arm.target_q, joints, atol=1e-12)
     assert bench.machine.outputs.digital == 1 << 17 and bench.arm.tool[2, 3] == 0.1
-    assert bench.machine.load.told == Mass(0.5, (0, 0, 0.05))
+    assert bench.machine.load.configured_payload == Mass(0.5, (0, 0, 0.05))
     assert bench.machine.out_double[13] == -2.5 and bench.machine.out_int[12] == 2
-    assert any("done: 3" in text for _, text in bench.machine.log) and "come to its end" in bench.machine.stop_reason
+    assert any("done: 3" in text for _, text in bench.machine.log) and "it has ended" in bench.machine.stop_reason
 
 
 @pytest.mark.parametrize(
@@ -69,7 +69,7 @@ def test_calls_are_done_in_their_order(bench: Bench) -> None:
         "\0",
     ],
 )
-def test_a_line_that_is_no_such_call_is_refused_before_anything_is_done(bench: Bench, line: str) -> None:
+def test_user_script_invalid_line_is_refused_before_start(bench: Bench, line: str) -> None:
     bench.call(10, [0.05, 0, 0, 0, 0, 0, 0.5, 0])
     assert not bench.machine.start(program("set_tool_digital_out(0, True)", line))
     assert bench.machine.program is None and "line 3;" in bench.machine.stop_reason
@@ -95,13 +95,13 @@ def test_a_line_that_is_no_such_call_is_refused_before_anything_is_done(bench: B
         "movel(p[-0.4,-0.2,0.3,0,3.14,0], a=0)",
     ],
 )
-def test_numbers_that_make_no_sense_end_the_program(bench: Bench, line: str) -> None:
+def test_user_script_invalid_numbers_end_program(bench: Bench, line: str) -> None:
     assert bench.machine.start(program(line))
     bench.until(lambda: bench.machine.program is None)
     assert bench.machine.script_errors[-1].text.startswith("runtime_error:") and bench.machine.script_errors[-1].users
 
 
-def test_who_listens_to_the_primary_interface_is_told(mock: MockUR) -> None:
+def test_primary_interface_reports_script_error(mock: MockUR) -> None:
     with create_connection((mock.host, 30001), TIMEOUT) as listener, create_connection((mock.host, 30003)) as line:
         listener.settimeout(TIMEOUT)
         mock.faults.state()  # both are accepted
@@ -131,9 +131,7 @@ print(control.isSteady())
 
 @pytest.mark.parametrize("body", ["x = 1", "while True:\n\tsync()\nend", "if 1 > 0:\n\tsync()\nend", "movej([0,0])"])
 @pytest.mark.parametrize("call", ["sendCustomScript", "sendCustomScriptFunction", "sendCustomScriptFile"])
-def test_ur_rtde_does_not_wait_for_a_program_that_ends_by_an_error(
-    mock: MockUR, tmp_path: Path, call: str, body: str
-) -> None:
+def test_ur_rtde_does_not_wait_for_failed_program(mock: MockUR, tmp_path: Path, call: str, body: str) -> None:
     """A controller leaves it waiting for 600 s. Here the call raises, and a new connection works."""
     pytest.importorskip("rtde_control")
     given = [program(*body.splitlines())]
@@ -148,7 +146,7 @@ def test_ur_rtde_does_not_wait_for_a_program_that_ends_by_an_error(
     assert done.stdout.startswith("RuntimeError: write: ") and done.stdout.endswith("\nTrue\n"), done
 
 
-def test_a_client_that_reads_reports_is_not_cut(mock: MockUR) -> None:
+def test_client_that_reads_reports_stays_connected(mock: MockUR) -> None:
     with create_connection((mock.host, 30002), TIMEOUT) as line:
         for name in ("first_thing", "second_thing"):
             line.sendall(program(f"{name}()").encode())

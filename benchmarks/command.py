@@ -85,7 +85,7 @@ def measure(group: str, repeat: int | None, *, baselines: bool, long: bool, data
         row = bar.add_task("starting", total=len(cases))
         begun = 0
 
-        def say(case: Case) -> None:
+        def report_case(case: Case) -> None:
             nonlocal begun
             words = f"{case.name}, {case.method}, {case.resolution}"
             bar.update(row, completed=begun, description=words)
@@ -93,7 +93,7 @@ def measure(group: str, repeat: int | None, *, baselines: bool, long: bool, data
                 notes.print(f"{begun + 1}/{len(cases)} {words}")
             begun += 1
 
-        report = run_cases(cases, repeat or 5, baselines=baselines, long=long, on_start=say, stop=interrupt)
+        report = run_cases(cases, repeat or 5, baselines=baselines, long=long, on_start=report_case, stop=interrupt)
     return report, interrupt.exit_code
 
 

@@ -41,7 +41,7 @@ TIMES = 9  # that a picture is normalised for its time
 DARK, DARK_BALL, DARK_SCALE = "9dtact_sensor_*", 4e-3, "camera_calibration_position_scale.npy"
 DARK_BEFORE = "-1.4 to 2.2 mm"  # heights that were found of a dent of 2.2 mm
 SUBSETS = (5, 8, 15)  # presses
-ANOTHER = 0.05  # of a radius: so far off is another solution, not the same one less exactly
+MAX_RADIUS_ERROR = 0.05  # of a radius: so far off is another solution, not the same one less exactly
 
 
 def rows_of(folder: Path, of: BallSet) -> list[str]:
@@ -102,7 +102,7 @@ class Subset:
     """A calibration by some of the presses of a set."""
 
     scale: float  # of its contact radii, against those of the same presses by all: mean logarithm of their ratio
-    said: float  # standard deviation of that scale, as it tells by itself
+    estimated_deviation: float  # standard deviation of that scale, as it tells by itself
     shadows: bool  # it found some
 
 
@@ -140,8 +140,8 @@ def spread_row(folder: Path, of: BallSet, presses: int, count: int) -> str:
         f"{scales.mean():+.1%}",
         f"{scales.std(ddof=1):.1%}",
         f"{scales[np.argmax(np.abs(scales))]:+.1%}",
-        f"{np.mean(np.abs(scales) > ANOTHER):.0%}",
-        f"{np.median([subset.said for subset in subsets]):.1%}",
+        f"{np.mean(np.abs(scales) > MAX_RADIUS_ERROR):.0%}",
+        f"{np.median([subset.estimated_deviation for subset in subsets]):.1%}",
         f"{np.mean([subset.shadows for subset in subsets]):.0%}",
     )
 
@@ -166,12 +166,21 @@ def main(
     clicked: Annotated[bool, typer.Option(help="Contact MAE in circles that a person clicked, too.")] = False,
 ) -> None:
     """Prints the table of what is known of left-out presses, or of how far contact radii differ between subsets."""
-    there = [of for of in balls.read_sets(folder) if only in of.name and balls.is_there(folder, of)]
+    available = [of for of in balls.read_sets(folder) if only in of.name and balls.has_frames(folder, of)]
     if spread:
-        heads = "sensor", "in a subset", "subsets", "radii, mean", "sd", "worst", f"beyond {ANOTHER:.0%}", "said ±"
+        heads = (
+            "sensor",
+            "in a subset",
+            "subsets",
+            "radii, mean",
+            "sd",
+            "worst",
+            f"beyond {MAX_RADIUS_ERROR:.0%}",
+            "said ±",
+        )
         typer.echo(row(*heads, "with shadows"))
         typer.echo(row(*["---"] * 9))
-        for of in there:
+        for of in available:
             for size in presses:
                 if size < len(balls.read_balls(folder, of)[1]):
                     typer.echo(spread_row(folder, of, size, spread))
@@ -179,13 +188,13 @@ def main(
     if clicked:
         typer.echo(row("set", "within 1.5 refined radii", "inside the clicked circle (presses)"))
         typer.echo(row(*["---"] * 3))
-        for of in there:
+        for of in available:
             if has_circles(of):
                 typer.echo(clicked_row(folder, of))
         return
     typer.echo(row("sensor", "held-out figure", "before", "now", "CPU: calibration, a picture"))
     typer.echo(row(*["---"] * 5))
-    for of in there:
+    for of in available:
         typer.echo("\n".join(rows_of(folder, of)))
     for home in sorted(folder.rglob(DARK)):
         if only in "9DTact":

@@ -33,7 +33,7 @@ from calibration.materials.tuning import MAX_IDENTIFIED_HALF_INTERVAL
 from robot.studies.identify.identify import MOMENTS, Identified, Kind, identify, parameters_of
 from robot.studies.identify.motions import motions
 from robot.studies.identify.recordings import Recordings, find_recordings, read_all
-from robot.studies.identify.simulation import Seen, Simulation
+from robot.studies.identify.simulation import SensorView, Simulation
 from tacsim import pose as se3
 from tacsim.config import load_scene
 from tacsim.interface import FloatArray, Pose
@@ -163,8 +163,8 @@ def measured(kind: Kind, number: int, folder: Path, draws: int, force_noise: flo
     recordings, began = Recordings(scene), time.perf_counter()
     presses = read_all(recordings, paths)
     random = np.random.default_rng(number)
-    spoilt = [_spoilt(press, force_noise, random) for press in presses]
-    found = identify(kind, scene, recordings, spoilt, noise, priors)
+    disturbed = [_add_errors(press, force_noise, random) for press in presses]
+    found = identify(kind, scene, recordings, disturbed, noise, priors)
     seconds = time.perf_counter() - began
     clean = signals_of([downsample_press(merge_repeated_readings(press), MOMENTS) for press in presses], noise).values
     force = found.signals.force[found.signals.channel]
@@ -194,8 +194,8 @@ def main(
     """Prints a line of the table for each truth; `docs` writes the table."""
     if kind == "poisson":
         for balls, heights, one in product(((4.0,), (8.0,), (2.0, 8.0), (4.0, 8.0)), (False, True), (0.02, 0.005)):
-            felt = "forces and heights" if heights else "forces"
-            typer.echo(f"| {' and '.join(f'{each:g}' for each in balls)} mm | {felt} | {one} N | "
+            channels = "forces and heights" if heights else "forces"
+            typer.echo(f"| {' and '.join(f'{each:g}' for each in balls)} mm | {channels} | {one} N | "
                        f"{poisson(one, heights, balls)} |")  # fmt: skip
         return
     if kind == "friction":
@@ -232,7 +232,7 @@ def forces_alone(found: Identified) -> Identified:
     )  # fmt: skip
 
 
-def _spoilt(press: Press, noise: float, random: np.random.Generator) -> Press:
+def _add_errors(press: Press, noise: float, random: np.random.Generator) -> Press:
     """With noise, and with zeros of the force that are off."""
     return replace(
         press,
@@ -257,18 +257,18 @@ def row(
     again = [redrawn(found, clean, k, priors) for k in range(draws)]
     for each in fit.identified:
         one, value, true = each.name, fit.value(each.name), truth[each.name]
-        ends = [fit.interval(one) for fit, _ in again if one in {told.name for told in fit.identified}]
+        ends = [fit.interval(one) for fit, _ in again if one in {parameter.name for parameter in fit.identified}]
         held = sum(low <= true <= high for low, high in ends)
         parameters[one] = (value / true - 1, *(end / true - 1 for end in fit.interval(one)), held, len(ends))
 
-    def noticed_in(drawn: tuple[Fit, Signals]) -> bool:
+    def is_detected(drawn: tuple[Fit, Signals]) -> bool:
         return bool(find_contradictions(replace(drawn[0], sigma=found.checked.sigma), drawn[1], names, found.by_size))
 
-    noticed = {"nothing wrong": sum(map(noticed_in, again))}
+    detections = {"nothing wrong": sum(map(is_detected, again))}
     for what, change in _faults(found).items():
-        noticed[what] = sum(noticed_in(redrawn(found, clean + change, k, priors)) for k in range(draws))
+        detections[what] = sum(is_detected(redrawn(found, clean + change, k, priors)) for k in range(draws))
     return Row(
-        name, len(names), fit.runs, seconds, parameters, [each.kind for each in found.findings], noticed, draws
+        name, len(names), fit.runs, seconds, parameters, [each.kind for each in found.findings], detections, draws
     )  # fmt: skip
 
 
@@ -282,10 +282,10 @@ def line(row: Row) -> str:
         off, low, high, held, of = found
         miss = "" if low <= 0 <= high else ", MISSES"
         cells.append(f"{words} {100 * off:+.1f} % ({100 * low:+.0f} to {100 * high:+.0f}{miss}; {held:g} of {of:g})")
-    noticed = ", ".join(f"{what} {count}" for what, count in row.noticed.items())
+    detections = ", ".join(f"{what} {count}" for what, count in row.noticed.items())
     seconds = "" if row.seconds is None else f"{row.seconds:.0f} s"
     return (f"| {row.name} | {row.recordings} | {row.simulated} | {seconds} | {'; '.join(cells)} | "
-            f"{', '.join(row.against) or 'nothing'} | {noticed} of {row.draws} |")  # fmt: skip
+            f"{', '.join(row.against) or 'nothing'} | {detections} of {row.draws} |")  # fmt: skip
 
 
 def poisson(force_noise: float, heights: bool, balls: tuple[float, ...]) -> str:
@@ -300,8 +300,8 @@ def poisson(force_noise: float, heights: bool, balls: tuple[float, ...]) -> str:
         readings = {f"lower.{name}": np.where(depths > 0.2e-3, 0.0, np.nan if name == "width" else 0.0)
                     for name in names}  # fmt: skip
         presses.append(Press("press", poses, readings, depths * 0, np.ones(len(depths), np.int64), radius * 1e-3))
-    seen = {"lower": Seen(CanonicalGrid(), None, np.ones((64, 64), np.bool_))}
-    simulation = Simulation(scene, tuple(parameters), tuple(presses), seen)
+    views = {"lower": SensorView(CanonicalGrid(), None, np.ones((64, 64), np.bool_))}
+    simulation = Simulation(scene, tuple(parameters), tuple(presses), views)
     [values] = simulation([Point(start_values(parameters), np.zeros(len(balls)))])
     signals = replace(signals_of(presses, Noise(force_noise)), values=values)
     fit = estimate_materials([simulation], signals, parameters, Priors(PLACE, 10 * force_noise), SETTLING_ERROR)
@@ -344,8 +344,8 @@ def friction(motion: str, sensors: tuple[float, ...] = (0.02, 0.2, 1.0)) -> list
             cells.append(
                 " / ".join("no" if half > MAX_IDENTIFIED_HALF_INTERVAL else f"{100 * half:.0f} %" for half in halves)
             )
-        apart = np.degrees(abs(np.arctan(lower) - np.arctan(upper_one)))
-        lines.append(f"| {motion} | {lower:g} / {upper_one:g} | {apart:.0f} | {' | '.join(cells)} |")
+        angle = np.degrees(abs(np.arctan(lower) - np.arctan(upper_one)))
+        lines.append(f"| {motion} | {lower:g} / {upper_one:g} | {angle:.0f} | {' | '.join(cells)} |")
     return lines
 
 

@@ -16,7 +16,7 @@ from tacsim.interface import FloatArray, Pose
 from tacsim.models.scene import Body, Box, Cylinder, Scene, Shape, Sphere
 from tacsim.physics.world import World, make_world
 
-EARLY = 20  # cycles after which a body should have shaken down
+SHAKEDOWN_CYCLES = 20  # cycles after which a body should have shaken down
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Cycle:
 
     geometry: Shape
     squeezed: float  # of both sensors together, from touch [m]
-    way: tuple[float, float, float]
+    displacement: tuple[float, float, float]
     pieces: int = 3  # motions of each way, where they flow
 
 
@@ -49,9 +49,9 @@ def _row(preset: str, what: str, cycle: Cycle, count: int, flow: bool) -> Measur
     assert truth is not None
     close(world, float(world.pose("upper").position[2]) - truth.height)
     close(world, cycle.squeezed)
-    piece = np.array(cycle.way) / (cycle.pieces if flow else 1)
+    piece = np.array(cycle.displacement) / (cycle.pieces if flow else 1)
 
-    def lead() -> tuple[list[float], list[tuple[float, float]], int]:
+    def move_sensors() -> tuple[list[float], list[tuple[float, float]], int]:
         forces, volumes, substeps = [], [], 0
         for _ in range(count):
             for sign in (1.0, -1.0):
@@ -63,14 +63,14 @@ def _row(preset: str, what: str, cycle: Cycle, count: int, flow: bool) -> Measur
             volumes.append((stats.smallest_volume, stats.largest_volume))
         return forces, volumes, substeps
 
-    timing, (forces, volumes, substeps) = timed(lead, 1, warm=lambda: None)
-    early = forces[min(EARLY, count) - 1]
+    timing, (forces, volumes, substeps) = timed(move_sensors, 1, warm=lambda: None)
+    early = forces[min(SHAKEDOWN_CYCLES, count) - 1]
     return Measurement(
         timing, abs(forces[-1] / forces[0] - 1) * 100, "% of the first cycle's force", "a body that has shaken down",
         f"{what}, {count} cycles, {'flowing' if flow else 'settled'}", substeps,
         {"since_early_percent": (forces[-1] / early - 1) * 100, "first_newton": forces[0],
          "smallest_volume": min(least for least, _ in volumes), "largest_volume": max(most for _, most in volumes)},
-        f"{(early / forces[0] - 1) * 100:+.1f} % in the first {min(EARLY, count)}",
+        f"{(early / forces[0] - 1) * 100:+.1f} % in the first {min(SHAKEDOWN_CYCLES, count)}",
     )  # fmt: skip
 
 

@@ -6,7 +6,7 @@ from functools import partial
 
 import numpy as np
 
-from benchmarks.cases.oracles import FINE, RESOLUTIONS, beside
+from benchmarks.cases.oracles import FINE, RESOLUTIONS, comparison_row
 from benchmarks.cases.squeeze import close, normal_forces
 from benchmarks.harness.measure import Measurement, once
 from benchmarks.harness.runner import Case
@@ -29,8 +29,8 @@ def squeezed(resolution: str, repeat: int) -> list[Measurement]:
         body = world.truth()
         assert body is not None
         what, note = f"cylinder squeezed by {by:g} mm", _note(settled)
-        rows.append(beside(timing, f"{what}: force", "n", _force(world), force, note))
-        rows.append(beside(timing, f"{what}: height", "mm", body.height * 1e3, height, note))
+        rows.append(comparison_row(timing, f"{what}: force", "n", _force(world), force, note))
+        rows.append(comparison_row(timing, f"{what}: height", "mm", body.height * 1e3, height, note))
     return rows
 
 
@@ -42,7 +42,7 @@ def cycled(resolution: str, repeat: int) -> list[Measurement]:
         timing, settled = once(partial(_close, world, HIGH))
         if number in CYCLES:
             what = f"cylinder led from 2.0 to 2.3 mm, time {number}: force"
-            rows.append(beside(timing, what, "n", _force(world), truth.CYCLED, _note(settled), _volumes(world)))
+            rows.append(comparison_row(timing, what, "n", _force(world), truth.CYCLED, _note(settled), _volumes(world)))
     return rows
 
 
@@ -51,15 +51,15 @@ def flowing_cycles(resolution: str, repeat: int) -> list[Measurement]:
     far an elastic volume ratio is from one."""
     world, rows, second = _world(resolution), [], 0.0
     _close(world, HIGH)
-    way = np.linspace(HIGH, LOW, STEPS + 1)[1:]
+    path = np.linspace(HIGH, LOW, STEPS + 1)[1:]
 
-    def lead(times: int) -> None:
-        for by in [*way, *way[-2::-1], HIGH] * times:
+    def move_sensors(times: int) -> None:
+        for by in [*path, *path[-2::-1], HIGH] * times:
             _close(world, by, flow=True)
 
     done = 0
     for number in FLOWING:
-        timing, _ = once(partial(lead, number - done))
+        timing, _ = once(partial(move_sensors, number - done))
         done, force, volumes = number, _force(world), _volumes(world)
         second = second or force
         what, figures = f"{number} cycles", {"force_n": force, **volumes}

@@ -23,7 +23,7 @@ NUMBER = 16  # environments of a batch
 STEPS = 6  # of all, each timed
 WARM = 2  # before those
 ROUNDS = 10  # resets of each environment
-FELT = {"maps": ("height",), "touch": ("wrench",)}  # features of who looks at no picture
+TOUCH_FEATURES = {"maps": ("height",), "touch": ("wrench",)}  # features of who looks at no picture
 SMALL = ("width=160", "height=120", "pixel_pitch=0.125 mm")
 
 
@@ -45,10 +45,12 @@ def random_actions(preset: str, motion: str, repeat: int) -> list[Measurement]:
     """Sixteen squeezes in one batch under random actions: heights and forces; at learn also with two pictures of
     160 x 120, and where motion flows their resets, each with a material, a size and a goal drawn from eight."""
     words = f"{motion}, heights and forces"
-    rows = _random_actions(preset, [f"motion={motion}"], words, resets=False, features=FELT)
+    rows = _random_actions(preset, [f"motion={motion}"], words, resets=False, features=TOUCH_FEATURES)
     if preset == "learn":
-        look = f"{motion}, two pictures of 160 x 120"
-        rows += _random_actions(preset, [f"motion={motion}", *pictures(SMALL)], look, resets=motion == "flowing")
+        picture_words = f"{motion}, two pictures of 160 x 120"
+        rows += _random_actions(
+            preset, [f"motion={motion}", *pictures(SMALL)], picture_words, resets=motion == "flowing"
+        )
     return rows
 
 
@@ -73,8 +75,8 @@ def _random_actions(
     alone.reset(seed=1)
     difference = 0.0
     for action in actions[:WARM]:
-        felt, felt_alone = (flats[forces] for flats in (many.step(action)[0], alone.step(action[0])[0]))
-        difference = max(difference, newtons * float(np.abs(felt[0] - felt_alone).max()))
+        forces_of_batch, forces_alone = (flats[forces] for flats in (many.step(action)[0], alone.step(action[0])[0]))
+        difference = max(difference, newtons * float(np.abs(forces_of_batch[0] - forces_alone).max()))
     each = [once(partial(many.step, action))[0] for action in actions[WARM:]]
     timing = Timing(tuple(step.samples[0] for step in each), sum(step.processor for step in each) / STEPS)
     share = sum(timing.samples) / STEPS / NUMBER  # of one environment in a step: of the mean, for random steps differ

@@ -142,11 +142,11 @@ def flat_punch(element: float, repeat: int) -> list[Measurement]:
     return [_force_row(timing, world, stats, truth, f"depth {depth * 1e3:g} mm, nu {nu:g}")]
 
 
-def renew(say: Callable[[str], None]) -> Limit:
+def renew(report_progress: Callable[[str], None]) -> Limit:
     """Computes the limit anew and writes it to FOLDER: three meshes, the finest takes many minutes."""
     profiles, forces, substeps = [], [], []
     for element in ELEMENTS:
-        say(f"sphere_press: h = {element * 1e3:g} mm")
+        report_progress(f"sphere_press: h = {element * 1e3:g} mm")
         world, stats = press(press_scene(Sphere(radius=RADIUS), element, tolerance=1e-4), DEPTH)
         if not stats.settled:
             raise RuntimeError(f"the press at h = {element} m did not settle: residual {stats.residual:.2g}")

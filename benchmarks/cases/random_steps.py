@@ -16,7 +16,8 @@ from benchmarks.harness.runner import Case
 from tacsim.interface import FloatArray, Pose
 from tacsim.physics.world import World, make_world
 
-START, ACTIONS, LARGEST = 1.5e-3, 20, 0.2e-3  # squeezed so far from touch; steps; of one sensor, as in the squeeze task
+# first squeeze from touch [m]; number of steps; largest motion of one sensor [m], that of the squeeze task
+START, ACTIONS, MAX_STEP = 1.5e-3, 20, 0.2e-3
 FLOW_MACHS = {"draft": (0.5, 1.0, 2.0)}  # times the default, which alone is measured elsewhere
 
 
@@ -33,7 +34,7 @@ def random_steps(preset: str, repeat: int) -> list[Measurement]:
 
 
 def _steps() -> FloatArray:
-    return np.random.default_rng(0).uniform(-LARGEST, LARGEST, (ACTIONS, 2))
+    return np.random.default_rng(0).uniform(-MAX_STEP, MAX_STEP, (ACTIONS, 2))
 
 
 def _slow(preset: str) -> tuple[Mapping[str, NDArray[Any]], FloatArray]:
@@ -47,7 +48,7 @@ def _slow(preset: str) -> tuple[Mapping[str, NDArray[Any]], FloatArray]:
     def compute() -> list[float]:
         return [_force(world, step, flow=False) for step in _steps()]
 
-    question = f"{scene.model_dump_json()} {START} {ACTIONS} {LARGEST}"
+    question = f"{scene.model_dump_json()} {START} {ACTIONS} {MAX_STEP}"
     return begin, np.array(cached(f"random-steps-{preset}", question, compute))
 
 
@@ -72,22 +73,23 @@ def _row(
 
     def run() -> tuple[FloatArray, float, int]:
         world.restore(begin)
-        forces, apart, substeps = [], 0.0, 0
+        forces, max_difference, substeps = [], 0.0, 0
         for step in steps:
             substeps += _move(world, step, flow=flow)
-            felt = normal_forces(world)
-            forces.append(float(felt.mean()))
-            apart = max(apart, float(np.ptp(felt) / felt.mean() * 100))
-        return np.array(forces), apart, substeps
+            sensor_forces = normal_forces(world)
+            forces.append(float(sensor_forces.mean()))
+            max_difference = max(max_difference, float(np.ptp(sensor_forces) / sensor_forces.mean() * 100))
+        return np.array(forces), max_difference, substeps
 
     # kernels are warm after the slow limit's start
-    timing, (forces, apart, substeps) = timed(run, 1, warm=lambda: None)
+    timing, (forces, max_difference, substeps) = timed(run, 1, warm=lambda: None)
     errors = np.abs(forces - truth) / truth.mean() * 100
     each = Timing(tuple(sample / ACTIONS for sample in timing.samples), timing.processor / ACTIONS)
     return Measurement(
         each, float(np.sqrt(np.mean(errors**2))), "% of the mean force, rms", "the same poses, settled at Mach 0.003",
         what, round(substeps / ACTIONS),
-        {"worst_percent": float(errors.max()), "first_step_percent": float(errors[0]), "sensors_apart_percent": apart},
+        {"worst_percent": float(errors.max()), "first_step_percent": float(errors[0]),
+         "sensors_apart_percent": max_difference},
         "a step: its seconds and substeps",
     )  # fmt: skip
 

@@ -87,15 +87,15 @@ def slid_in(preset: str, repeat: int) -> list[Measurement]:
     """Pressed in while they slide, in one oblique motion from above the gel: drag over normal force."""
     settled = {"mach": SLIDE_SLOW[preset], "tolerance": 1e-3, "max_substeps": 500}
     rows = []
-    for shape, friction, way in (
+    for shape, friction, displacement in (
         (Sphere(radius=6e-3), 0.8, (0.6e-3, 0.0, -0.3e-3)),
         (Sphere(radius=3e-3), 1.5, (1.5e-3, 0.0, -0.8e-3)),
         (Cylinder(radius=2.5e-3, height=5e-3), 0.6, (1e-3, 0.0, -0.4e-3)),
         (Box(size=(4e-3, 4e-3, 4e-3)), 0.8, (1e-3, 1e-3, -0.5e-3)),
     ):
         indenter = Indenter(geometry=shape, friction=friction)
-        timing, (found, stats) = timed(partial(_drag_in, preset, indenter, way), 1, warm=lambda: None)
-        truth, _ = _drag_in(preset, indenter, way, **settled)
+        timing, (found, stats) = timed(partial(_drag_in, preset, indenter, displacement), 1, warm=lambda: None)
+        truth, _ = _drag_in(preset, indenter, displacement, **settled)
         what = f"the same mesh at Mach {SLIDE_SLOW[preset]:g}"
         rows.append(_drag_row(timing, found, stats, truth, what, f"{shape.shape}, friction {friction:g}"))
     return rows
@@ -130,15 +130,15 @@ def _turned(preset: str, indenter: Indenter, **settling: float) -> tuple[FloatAr
     """Drag along x and y over normal force after both legs."""
     scene = {"body": None, "preset": preset, "indenter": indenter, "settling": settling}
     world, _ = press(Scene.model_validate(scene), 0.5e-3)
-    for way in ([0.0, 1.3e-3, 0.0], [0.7e-3, 0.0, 0.0]):
+    for displacement in ([0.0, 1.3e-3, 0.0], [0.7e-3, 0.0, 0.0]):
         pose = world.pose("indenter")
-        stats = world.move({"indenter": Pose(pose.position + way, pose.quaternion)})
+        stats = world.move({"indenter": Pose(pose.position + displacement, pose.quaternion)})
     force = world.wrench("lower")
     return force[:2] / -force[2], stats
 
 
 def _drag_in(
-    preset: str, indenter: Indenter, way: tuple[float, float, float], **settling: float
+    preset: str, indenter: Indenter, displacement: tuple[float, float, float], **settling: float
 ) -> tuple[float, MoveStats]:
     """Drag over normal force after one motion by so much from where the indenter touches [m]."""
     from tacsim.physics.worlds.press import PressWorld
@@ -147,7 +147,7 @@ def _drag_in(
     scene = {"body": None, "preset": preset, "indenter": indenter, "settling": settling}
     world = PressWorld(Scene.model_validate(scene))
     pose = world.pose("indenter")
-    target = pose.position + way - [0.0, 0.0, INITIAL_GAP]
+    target = pose.position + displacement - [0.0, 0.0, INITIAL_GAP]
     stats = world.move({"indenter": Pose(target, pose.quaternion)})
     force = world.wrench("lower")
     return float(np.hypot(force[0], force[1]) / -force[2]), stats

@@ -34,10 +34,12 @@ def shipped_bodies(preset: str, repeat: int) -> list[Measurement]:
     rows = []
     for material in MATERIALS:
         truth = _slow(f"bodies-{material}-{preset}", partial(_squeezed, material, preset))
-        world, least = _touched(_scene(preset, f"body.material={material}")), UNLOADED * max(truth)
+        world, min_force = _touched(_scene(preset, f"body.material={material}")), UNLOADED * max(truth)
         for (state, by), true in zip(_steps(), truth, strict=True):
             timing, stats = once(partial(close, world, by))
-            rows.append(_row(timing, float(normal_forces(world).mean()), true, least, f"{material}, {state}", stats))
+            rows.append(
+                _row(timing, float(normal_forces(world).mean()), true, min_force, f"{material}, {state}", stats)
+            )
     return rows
 
 
@@ -111,8 +113,8 @@ def _slow(name: str, compute: Any) -> list[float]:
     return cached(f"slow-limit-{name}", f"{SLOW} {STATES} {DRAGGED} {DRAG} {DRAGS}", compute)
 
 
-def _row(timing: Any, found: float, true: float, least: float, what: str, stats: MoveStats) -> Measurement:
-    error = abs(found - true) / max(true, least) * 100
+def _row(timing: Any, found: float, true: float, min_force: float, what: str, stats: MoveStats) -> Measurement:
+    error = abs(found - true) / max(true, min_force) * 100
     figures = {"found_n": found, "truth_n": true, "settled_error": error if stats.settled else 0.0}
     note = "" if stats.settled else f"not settled: the hold took {stats.force_loss:.1%} of the force"
     return Measurement(timing, error, "%", "the same mesh at Mach 0.002", what, stats.substeps, figures, note)

@@ -275,7 +275,7 @@ def _rough_row(preset: str, sampling: Literal["lattice", "random"], by: float, r
     )  # fmt: skip
 
 
-ASLANT = (0.6e-3, 0.0, -0.4e-3)  # of the upper sensor; the lower one goes the other way [m]
+OBLIQUE_DISPLACEMENT = (0.6e-3, 0.0, -0.4e-3)  # of the upper sensor; the lower one goes the other way [m]
 KNEADED = {
     "clay": BodyMaterial(youngs_modulus=0.5e6, poisson_ratio=0.45, yield_stress=20e3),
     "elastic": BodyMaterial(youngs_modulus=0.5e6),
@@ -286,24 +286,27 @@ def closed_aslant(preset: Preset, repeat: int) -> list[Measurement]:
     """A cube of 6 x 6 x 5 mm that is closed on and sheared in one motion from touch: the force along the gels."""
     rows = []
     for name, material in KNEADED.items():
-        timing, (found, stats) = timed(partial(_aslant, preset, material), 1, warm=lambda: None)
-        truth, _ = _aslant(preset, material, mach=0.002, tolerance=1e-3, max_substeps=2000)
+        timing, (found, stats) = timed(partial(_close_obliquely, preset, material), 1, warm=lambda: None)
+        truth, _ = _close_obliquely(preset, material, mach=0.002, tolerance=1e-3, max_substeps=2000)
         figures, note = {"found_n": found, "truth_n": truth}, "" if stats.settled else "not settled"
         error = abs(found / truth - 1) * 100
         rows.append(Measurement(timing, error, "%", "the same mesh at Mach 0.002", name, stats.substeps, figures, note))
     return rows
 
 
-def _aslant(preset: Preset, material: BodyMaterial, **settling: float) -> tuple[float, MoveStats]:
+def _close_obliquely(preset: Preset, material: BodyMaterial, **settling: float) -> tuple[float, MoveStats]:
     body = Body(geometry=Box(size=(6e-3, 6e-3, 5e-3)), material=material)
     friction = {"lower": 0.4, "upper": 0.4}
     world = make_world(Scene(body=body, preset=preset, friction=friction, settling=Settling(**settling)))
     truth = world.truth()
     assert truth is not None
     close(world, float(world.pose("upper").position[2]) - truth.height)
-    ways = {"upper": np.array(ASLANT), "lower": -np.array(ASLANT)}
+    displacements = {"upper": np.array(OBLIQUE_DISPLACEMENT), "lower": -np.array(OBLIQUE_DISPLACEMENT)}
     stats = world.move(
-        {name: Pose(world.pose(name).position + way, world.pose(name).quaternion) for name, way in ways.items()}
+        {
+            name: Pose(world.pose(name).position + displacement, world.pose(name).quaternion)
+            for name, displacement in displacements.items()
+        }
     )
     return float(np.hypot(*world.wrench("upper")[:2])), stats
 

@@ -84,7 +84,7 @@ def step_cost(timing: Timing, substeps: int, count: int, what: str) -> dict[str,
     return {f"wall_per_{what}_substep_ns": timing.median * each, f"cpu_per_{what}_substep_ns": timing.processor * each}
 
 
-def forget_peak_memory() -> None:
+def reset_peak_memory() -> None:
     """Lets `peak_memory` count from what this process holds now. Only Linux can; elsewhere it counts on."""
     references = Path("/proc/self/clear_refs")
     if references.exists():

@@ -16,11 +16,11 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from benchmarks.harness.machine import Run
-from benchmarks.harness.measure import Measurement, forget_peak_memory, peak_memory
+from benchmarks.harness.measure import Measurement, peak_memory, reset_peak_memory
 from benchmarks.harness.schema import Failure, Group, Missing, Report, Row
 from robot.common.process import end_with_parent, outside_working_folder
 
-EXIT = 10.0  # [s] a process may take to end after its last word
+EXIT_TIMEOUT = 10.0  # [s] a process may take to end after its last word
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,9 +48,9 @@ class Case:
         return self.cpu or self.method != "tacsim"
 
 
-def missing_case(name: str, why: str, resolution: str = "") -> Case:
+def missing_case(name: str, reason: str, resolution: str = "") -> Case:
     """A case of ours with real frames that cannot be measured here, and why."""
-    return Case("real", name, "tacsim", resolution, _raise_missing, missing=why)
+    return Case("real", name, "tacsim", resolution, _raise_missing, missing=reason)
 
 
 def _raise_missing(repeat: int) -> list[Measurement]:
@@ -125,7 +125,7 @@ class _Worker:
             found: list[Row] | str = self._here.recv()
             return found
         except EOFError:
-            self._process.join(EXIT)
+            self._process.join(EXIT_TIMEOUT)
             return NOT_MEASURED if stop() else None  # the signal was for all processes
 
     @property
@@ -169,7 +169,7 @@ def _work(cases: Sequence[Case], repeat: int, report: Connection) -> None:
     end_with_parent(parent.pid)
     for case in cases:
         gc.collect()
-        forget_peak_memory()
+        reset_peak_memory()
         try:
             report.send(measure(case, repeat))
         except Exception as error:  # whatever it is, the other cases go on, and the report names it

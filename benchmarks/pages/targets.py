@@ -75,7 +75,7 @@ class Target(_Frozen):
         over = self.over(rows)
         return None if over is None or over == 0 else value / over
 
-    def judge(self, value: float | None) -> Verdict:
+    def evaluate(self, value: float | None) -> Verdict:
         """What a value means. The limit itself is within it."""
         if value is None:
             return "not measured"
@@ -91,7 +91,7 @@ class Target(_Frozen):
 
     def cells(self, value: float | None) -> list[str]:
         """A line of the table, as text."""
-        verdict = self.judge(value)
+        verdict = self.evaluate(value)
         shown = "" if value is None else f"{value:.3g} {self.unit}".strip()
         words = f"**{verdict}**" if verdict == "missed" else verdict
         why = {"missed": self.remark, "not measured": self.elsewhere}.get(verdict)

@@ -34,7 +34,7 @@ BALLS = {
     (8.0, 0.1): (0.02952, 0.966), (8.0, 0.3): (0.1959, 1.792),
     (8.0, 0.5): (0.5038, 2.368), (8.0, 1.0): (1.9461, 3.557),
 }  # fmt: skip
-RUBBED_BALL = {1.0: 1.004, 1.5: 2.258, 2.0: 4.190, 2.5: 7.011}  # R 4 mm, friction 0.6; depth [mm]: force [N]
+BALL_WITH_FRICTION = {1.0: 1.004, 1.5: 2.258, 2.0: 4.190, 2.5: 7.011}  # R 4 mm, friction 0.6; depth [mm]: force [N]
 PUNCHES = {2.0: 0.1412, 3.0: 0.2889}  # radius [mm]: force [N], 0.1 mm deep
 TWISTS = {2.0: 1.010, 3.0: 1.030}  # radius [mm]: moment over 16/3 G a^3 and angle
 # (depth [mm], friction): drag over normal force of a ball R 4 mm

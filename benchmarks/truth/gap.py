@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 MM = 1e3  # m -> mm, of a snapshot's lengths
 CELL = 2.0  # of the patch, in particle spacings
-LEAST_COSINE = 0.7  # least cosine between a particle's plane and the gel's surface
+MIN_COSINE = 0.7  # least cosine between a particle's plane and the gel's surface
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +55,7 @@ def _of_sensor(world: World, name: str, index: int, spacing: float) -> Gaps:
     feet = transform(to_sensor, surface_points(x[outer], planes[outer]) / MM)
     normal = rotate(to_sensor, planes[outer])
     at, distance, upwards = _from_gel(world.surface(name), feet)
-    towards_gel = -(normal * upwards).sum(axis=1) > LEAST_COSINE * np.linalg.norm(normal, axis=1)
+    towards_gel = -(normal * upwards).sum(axis=1) > MIN_COSINE * np.linalg.norm(normal, axis=1)
     cell = np.floor(at / (CELL * spacing)).astype(int)
     cell -= cell.min(axis=0) - 1
     patch = np.zeros(cell.max(axis=0) + 2, dtype=bool)

@@ -32,10 +32,10 @@ VOLUME = (DX / 2) ** 2  # as published; cancels, for the same factor is in the m
 FROZEN = 3  # layers
 SPEED = -200.0
 GAP = 1.0  # between indenter and gel at the start
-KEPT = 2.0  # of the indenter, upwards from its tip
+CAP_HEIGHT = 2.0  # of the indenter, upwards from its tip
 POINTS_PER_AREA = 60.0  # on the indenter's surface [1/mm^2]: 2,211 points on their ball's cap
 MARGIN = 2.0  # of grid round the gel
-LONGEST = 400  # substeps; the published runs end after 96 to 173
+MAX_SUBSTEPS = 400  # substeps; the published runs end after 96 to 173
 
 
 @ti.kernel
@@ -91,8 +91,8 @@ def grid_to_particle(
 def ball_cap() -> np.ndarray:
     """Points spread evenly (Fibonacci) on the kept cap of the ball, tip at the origin [mm]."""
     radius = RADIUS * 1e3
-    count = round(POINTS_PER_AREA * 2 * math.pi * radius * KEPT)
-    z = (np.arange(count) + 0.5) / count * KEPT
+    count = round(POINTS_PER_AREA * 2 * math.pi * radius * CAP_HEIGHT)
+    z = (np.arange(count) + 0.5) / count * CAP_HEIGHT
     angle = np.arange(count) * math.pi * (3 - math.sqrt(5))
     across = np.sqrt(radius**2 - (radius - z) ** 2)
     return np.stack([across * np.cos(angle), across * np.sin(angle), z], axis=-1)
@@ -112,7 +112,7 @@ class TacchiPress:
         self.v[self.gel :, 2] = SPEED
         self.c = np.zeros((len(self.x), 3, 3), np.float32)
         self.f = np.tile(np.eye(3, dtype=np.float32), (len(self.x), 1, 1))
-        size = [side + 2 * MARGIN, side + 2 * MARGIN, self.top + GAP + KEPT + 4 * DX]
+        size = [side + 2 * MARGIN, side + 2 * MARGIN, self.top + GAP + CAP_HEIGHT + 4 * DX]
         nodes = [math.ceil(length / DX) for length in size]
         self.momentum = np.zeros((*nodes, 3), np.float32)
         self.mass = np.zeros(nodes, np.float32)
@@ -129,7 +129,7 @@ class TacchiPress:
         grid_to_particle(self.gel, frozen, self.x, self.v, self.c, self.momentum, self.mass, DX, DT)
 
     @property
-    def sunk(self) -> float:
+    def penetration(self) -> float:
         """How deep the lowest particle of the top layer lies below the untouched surface [mm]."""
         return self.top - float(self.x[: self.gel, 2][self.surface].min())
 
@@ -137,11 +137,11 @@ class TacchiPress:
 def run() -> tuple[TacchiPress, int]:
     """Presses until the top layer has sunk by 1 mm. Raises RuntimeError if it never does."""
     press = TacchiPress()
-    for step in range(1, LONGEST + 1):
+    for step in range(1, MAX_SUBSTEPS + 1):
         press.substep()
-        if press.sunk >= DEPTH * 1e3:
+        if press.penetration >= DEPTH * 1e3:
             return press, step
-    raise RuntimeError(f"the gel has sunk by {press.sunk:.3f} mm only after {LONGEST} substeps")
+    raise RuntimeError(f"the gel has sunk by {press.penetration:.3f} mm only after {MAX_SUBSTEPS} substeps")
 
 
 def sphere_press(repeat: int) -> list[Measurement]:

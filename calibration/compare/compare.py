@@ -89,7 +89,7 @@ class Overall:
     null: float
     floor: float
     better: float  # share of the pairs that are better than their null
-    beats_null: bool | None  # surely so, over all pairs; None: too few pairs
+    outperforms_null: bool | None  # surely so, over all pairs; None: too few pairs
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -323,7 +323,7 @@ def _summarise_metric(metric: Metric, pairs: Sequence[Pair], floor: float) -> Ov
         null=_known_mean(nulls),
         floor=floor,
         better=float((gain > 0).mean()) if gain.size else math.nan,
-        beats_null=None if math.isnan(surely) else surely > 0,
+        outperforms_null=None if math.isnan(surely) else surely > 0,
     )
 
 

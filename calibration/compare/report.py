@@ -110,9 +110,9 @@ def format_metric(value: float, metric: Metric) -> str:
 
 def describe_against_null(overall: Overall) -> str:
     """Against the null, in a word."""
-    if overall.beats_null is None:
+    if overall.outperforms_null is None:
         return "–"
-    return "better" if overall.beats_null else "not better"
+    return "better" if overall.outperforms_null else "not better"
 
 
 def _write_csv(path: Path, comparison: Comparison) -> None:
@@ -251,9 +251,9 @@ def describe_comparison(comparison: Comparison) -> str:
     error, alike = comparison.overall["contact_mae"], comparison.overall["contact_ncc"].mean
     if math.isnan(error.mean):
         return "No pair shows contact, so nothing can be judged."
-    if error.beats_null is None:
+    if error.outperforms_null is None:
         start = f"Too few pairs to judge how much {a} and {b} look alike in contact"
-    elif not error.beats_null:
+    elif not error.outperforms_null:
         start = f"In contact {a} looks no more like {b} than a picture without contact does"
     elif alike >= MIN_CLOSE_CORRELATION and error.mean <= MAX_CLOSE_ERROR * error.null:
         start = f"In contact {a} looks like {b}"

@@ -111,7 +111,7 @@ def table_of_lighting(lighting: Lighting, background: tuple[float, float, float]
     scale = TABLE_CELLS / (colours.max(axis=(0, 1)) + colour_margin - low)
     lines = ((np.arange(TABLE_CELLS) + 0.5)[:, None] / scale + low).T
     middles = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 3)
-    nearest, off_gamut = _most_likely_slope(colours.reshape(-1, 3), slopes.reshape(-1, 2), middles)
+    nearest, off_gamut = _maximum_likelihood_slope(colours.reshape(-1, 3), slopes.reshape(-1, 2), middles)
     jacobian = by_slope.reshape(-1, 3, 2)[nearest].astype(np.float64)
     transposed = jacobian.transpose(0, 2, 1)
     matrix = np.linalg.solve(
@@ -122,7 +122,7 @@ def table_of_lighting(lighting: Lighting, background: tuple[float, float, float]
     return ColourTable(low.astype(np.float32), scale.astype(np.float32), maps, off_gamut)
 
 
-def _most_likely_slope(
+def _maximum_likelihood_slope(
     colours: Float32, slopes: Float32, middles: Float32
 ) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
     """For each cell (n, 3) the index of the most likely of the slopes (m, 2) with colours (m, 3): near in colour (in

@@ -275,7 +275,7 @@ def marker_flow(
     markers: Markers | None,
     geometry: SensorGeometry,
     gel_size: tuple[float, float],
-    seen: GelView | None = None,
+    view: GelView | None = None,
     region: PictureRegion | None = None,
 ) -> MarkerFlow | None:
     """The flow of known dots; None without. `seen`: the gel through lens and perspective; None: the picture is metric
@@ -283,7 +283,7 @@ def marker_flow(
     if markers is None:
         return None
     fine = marker_grid(markers, gel_size)
-    rectify = rectification_of_geometry(geometry, gel_size, fine) if seen is None else rectification_of_view(seen, fine)
+    rectify = rectification_of_geometry(geometry, gel_size, fine) if view is None else rectification_of_view(view, fine)
     return MarkerFlow(markers, rectify.within(region), fine, geometry.camera_distance)
 
 

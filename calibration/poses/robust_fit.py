@@ -66,7 +66,7 @@ def robust_fit(residuals: Residuals, starts: Sequence[FloatArray], what: str) ->
                 f"{int((~keep).sum())} of {len(keep)} {what} disagree with the others: is what should be fixed "
                 "really fixed, do the poses belong to the pictures, and are lengths in metres?"
             )
-        fit, before = _fit_least_squares(residuals, found, keep), used
+        fit, before = _minimise_residuals(residuals, found, keep), used
         found, used = fit.x, keep
         if (used == before).all():
             break
@@ -94,7 +94,7 @@ def robust_fit(residuals: Residuals, starts: Sequence[FloatArray], what: str) ->
     )
 
 
-def _fit_least_squares(residuals: Residuals, start: FloatArray, keep: Mask) -> Any:
+def _minimise_residuals(residuals: Residuals, start: FloatArray, keep: Mask) -> Any:
     def flat(parameters: FloatArray) -> FloatArray:
         return residuals(parameters)[keep].ravel()
 

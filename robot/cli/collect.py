@@ -219,7 +219,7 @@ def _run(
 
         try:
             number = workers if workers is not None else cores()
-            done = make(job, out, files, command, workers=number, cluster=ray, tell=tell, stop=interrupt)
+            done = make(job, out, files, command, workers=number, cluster=ray, report_progress=tell, stop=interrupt)
         except Stopped:
             complain(f"stopped by a signal; {there} of {job.count} are there. The same command goes on")
             raise typer.Exit(interrupt.exit_code) from None
@@ -235,7 +235,7 @@ def _say(done: Collected, count: int, seconds: float, out: Path) -> None:
         parts = ", ".join(f"{name} {100 * part / spent:.0f} %" for name, part in done.seconds.most_common())
         results.print(
             f"{done.made} made in {seconds:.1f} s by {len(done.workers)}: {done.made / seconds:.2f} a second; "
-            f"of their time {parts}; {done.bytes / 2**20:.1f} MiB written in {done.writing:.1f} s"
+            f"of their time {parts}; {done.bytes / 2**20:.1f} MiB written in {done.writing_seconds:.1f} s"
         )
     if done.failures:
         notes.print(f"{len(done.failures)} of {count} failed; why is in {out / 'failures.jsonl'}")

@@ -112,7 +112,7 @@ def press(
         asked = config["indenter"]["edge_radius"]
         words = " (what the mesh carries; --edge-radius '0 mm' for sharp edges)" if asked is None else ""
         results.print(f"edge radius      {config['edge_radius'] * 1e3:.3f} mm{' (sharp)' if asked == 0 else words}")
-    if config["unfelt"] > presses.UNFELT:
+    if config["unfelt"] > presses.MAX_MISSED_DEPTH_SHARE:
         notes.print(
             f"warning: the gel feels {1 - config['unfelt']:.0%} of the depth: a tip or edge is too narrow for elements "
             f"of {config['element_size'] * 1e3:g} mm, the force too small (a wedge's by 10 to 25 %); lower element_size"

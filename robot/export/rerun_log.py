@@ -1,15 +1,15 @@
-"""What an episode is in Rerun: its entities, and how they are laid out on the screen.
+"""The entities of an episode in Rerun, and their layout on the screen.
 
 | entity                              | what                                                                   |
 |-------------------------------------|------------------------------------------------------------------------|
 | `/world/{sensor}/gel`               | surface at the sensor's pose, coloured by height                       |
 | `/world/{sensor}/flow`              | displacement of its markers                                            |
 | `/world/{arm}`                      | pose of the sensor that the arm carries                                |
-| `/world/{arm}/force`                | what the object does to it, 1 mm a newton                              |
-| `/world/body`                       | particles of the plasticine; live, or where they were recorded         |
-| `/world/asked/{arm}`                | where the arm was asked to be                                          |
-| `/camera/{sensor}`                  | the picture as it came                                                 |
-| `/canonical/{sensor}`               | the picture as a policy sees it                                        |
+| `/world/{arm}/force`                | force of the object on it, 1 mm per newton                             |
+| `/world/body`                       | particles of the plasticine; live, or if they were recorded            |
+| `/world/asked/{arm}`                | target of the arm                                                      |
+| `/camera/{sensor}`                  | the camera image                                                       |
+| `/canonical/{sensor}`               | the canonical picture, input of a policy                               |
 | `/force`, `/torque`, `/joints`      | numbers of the arms [N, N m, rad]                                      |
 | `/task/reward`, `/task/distance`    | of the step [-, mm]                                                    |
 | `/limits/{arm}`                     | targets shortened or refused so far                                    |
@@ -45,9 +45,9 @@ ARROW = 0.1e-3  # radius [m]
 
 
 class EpisodeLog:
-    """Writes the steps of an episode into a recording of Rerun, each as it comes.
+    """Writes the steps of an episode into a Rerun recording.
 
-    lattices: by sensor, where its markers rest (m, n, 2), sensor frame [m]; without, no flow is drawn.
+    lattices: rest positions of the markers (m, n, 2) by sensor, sensor frame [m]; without them no flow is drawn.
     """
 
     def __init__(
@@ -64,7 +64,7 @@ class EpisodeLog:
         self._meshed: set[str] = set()
 
     def step(self, step: Step, observation: Observation, truth: Truth | None = None) -> None:
-        """All that is known of one step."""
+        """Logs all data of one step."""
         import rerun as rr
 
         if self._begin is None:
@@ -77,9 +77,9 @@ class EpisodeLog:
         for name, touch in observation.tactile.items():
             self._sensor(name, touch, observation.arms)
             self._picture(f"camera/{name}", step.frames[name].image)
-        for name, asked in ({} if step.action is None else step.action.tool).items():
-            if asked is not None:
-                self._points(f"world/asked/{name}", asked)
+        for name, target in ({} if step.action is None else step.action.tool).items():
+            if target is not None:
+                self._points(f"world/asked/{name}", target)
         particles = step.body if truth is None else truth.points
         if particles is not None:
             grains = rr.Points3D(particles, radii=[ARROW / 2], colors=[(200, 150, 110)])
@@ -93,7 +93,7 @@ class EpisodeLog:
         self._recording.set_time("time", duration=time - self._begin)
 
     def _arm(self, name: str, state: ArmState) -> None:
-        metres_per_newton = 1e-3  # [m] of an arrow for each newton
+        metres_per_newton = 1e-3  # length of an arrow [m/N]
         import rerun as rr
 
         self._place(f"world/{name}", state.pose)
@@ -141,7 +141,7 @@ class EpisodeLog:
             self._number(f"diagnostics/{name}" if limit == name else f"limits/{limit}", value)
 
     def _statuses(self, name: str, packages: ArmPackages) -> None:
-        """Changes alone, at their own times."""
+        """Logs each change of the status at its own time."""
         import rerun as rr
 
         for time, status in zip(packages.time.tolist(), packages.status.tolist(), strict=True):
@@ -212,8 +212,8 @@ def _triangles(valid: NDArray[np.bool_]) -> NDArray[np.uint32]:
 
 
 def _colours(height: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """(n, 3) by depth, from 0 to MOST_DEPTH."""
-    max_depth = 1e-3  # [m] drawn in the last colour
+    """(n, 3) colours by depth, from 0 to `max_depth`."""
+    max_depth = 1e-3  # drawn in the last colour [m]
     share = np.clip(height / max_depth, 0.0, 1.0) * (len(COLOURS) - 1)
     channels = [np.interp(share, np.arange(len(COLOURS)), COLOURS[:, channel]) for channel in range(3)]
     found: NDArray[np.uint8] = np.stack(channels, axis=1).astype(np.uint8)

@@ -21,7 +21,7 @@ from tacsim.models.rig import RigConfig
 from tacsim.report.figure4 import Moment, Trial
 from tacsim.tasks import Task, evaluate_outcome, make_task
 
-WHOLE_GEL = ("canonical.rows=80", "canonical.columns=80")  # heights from edge to edge of the gel, for the cut
+WHOLE_GEL_OVERRIDES = ("canonical.rows=80", "canonical.columns=80")  # heights from edge to edge of the gel, for the cut
 # The seed's scheme creeps: in reposition it takes some 1600 substeps after each motion until it counts as settled, ours
 # some 100. It gets a fixed time instead, faster than it settles; its body lags behind, the shape of its curve stays.
 SETTLING_OVERRIDES = {"seed": ("scene.settling.mach=0.15", "scene.settling.max_substeps=60"), "hybrid": ()}
@@ -67,7 +67,7 @@ def run_trials(
         steps: multiprocessing.Queue[tuple[str, str]] = context.Queue()
     with ProcessPool(workers, _start_worker, (steps,)) as pool:
         stop()  # once asked, a signal waits for its answer: it breaks no process off that is being started
-        running = {trial: pool.submit(_work, *trial) for trial in wanted}
+        running = {trial: pool.submit(_run_in_worker, *trial) for trial in wanted}
         while not all(future.done() for future in running.values()):
             if stop():
                 raise TrialsStopped("stopped before all trials were done")
@@ -95,7 +95,7 @@ def _start_worker(steps: multiprocessing.Queue[tuple[str, str]]) -> None:
     _steps = steps
 
 
-def _work(task: str, physics: str) -> Trial | str:
+def _run_in_worker(task: str, physics: str) -> Trial | str:
     """The trial, or its error as text: not every exception can be sent to another process."""
     try:
         return run_trial(task, physics, lambda: _steps.put((task, physics)) if _steps is not None else None)
@@ -113,7 +113,7 @@ def run_trial(task: str, physics: str, on_step: Callable[[], None] = lambda: Non
     from robot.open import open_rig
 
     planned = EXPERIMENTS[task]
-    overrides = [f"scene.physics={physics}", *SETTLING_OVERRIDES[physics], *planned.overrides, *WHOLE_GEL]
+    overrides = [f"scene.physics={physics}", *SETTLING_OVERRIDES[physics], *planned.overrides, *WHOLE_GEL_OVERRIDES]
     config = load_rig("sim", task=task, overrides=overrides).config
     assert config.task is not None
     goal = make_task(config.task)
@@ -137,7 +137,7 @@ def run_trial(task: str, physics: str, on_step: Callable[[], None] = lambda: Non
                 break
             share = FINE_STEP_SHARE if _is_near_goal(distances, planned.tolerance) else 1.0
             longest = share * config.task.max_step / 2  # half of max_step is the policy's own rate
-            observation, _ = rig.step(_limited(policy(observation), observation, longest))
+            observation, _ = rig.step(_limit_motion(policy(observation), observation, longest))
     return _trial(config, goal, distances, differences, moments)
 
 
@@ -153,7 +153,7 @@ def _is_near_goal(distances: list[float], tolerance: float) -> bool:
     return min(distances) > tolerance / 2 and distances[-1] < 1.2 * longest
 
 
-def _limited(action: Action, observation: Observation, longest: float) -> Action:
+def _limit_motion(action: Action, observation: Observation, longest: float) -> Action:
     """The same motion, in which no arm moves farther than `longest` [m]. Orientations are those of the action."""
     tool: dict[str, Pose | None] = {}
     for arm, target in action.tool.items():

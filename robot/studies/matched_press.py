@@ -64,7 +64,7 @@ def match_presses(
     ball = scene.indenter.geometry.radius
     # slopes make the colour of most lights; one that tells no direction shows a contact by how dark it is
     find = find_contact_circle if sensor.darkness is None else dark_circle
-    circles, notes = _circles(real, find, ball / sensor.geometry.pixel_pitch)
+    circles, notes = _find_circles(real, find, ball / sensor.geometry.pixel_pitch)
     gel = _PressedGel(scene, ball, sensor, grid, find)
     done: dict[str, Frame] = {}
     not_made: set[str] = set()
@@ -105,7 +105,7 @@ class _PressedGel:
         self._deepest = MAX_DEPTH_SHARE * self._thickness
         self._last: tuple[float, float] | None = None  # contact radius [px] and depth [m] of the press before
         self._render = Renderer(sensor, scene.gel.size[:2])
-        self.untouched = self._seen(*sensor.geometry.principal)
+        self.untouched = self._render_at(*sensor.geometry.principal)
 
     def press(self, circle: Circle) -> tuple[Image, SurfaceMap, str]:
         """Picture and surface of a press with this contact circle [px]; and a word if it did not come out. Raises
@@ -115,11 +115,11 @@ class _PressedGel:
         contact = circle.radius * pitch
         self._require_room(contact, self.ball - np.sqrt(max(self.ball**2 - contact**2, 0.0)))
         hertz = contact**2 / self.ball
-        depth = min(hertz if self._last is None else _deeper(*self._last, circle.radius), self._deepest)
+        depth = min(hertz if self._last is None else _hertz_depth(*self._last, circle.radius), self._deepest)
         tried: list[tuple[float, float]] = []
         for _ in range(max_attempts):
             settled = self._press_to(depth)
-            image, surface = self._seen(*place)
+            image, surface = self._render_at(*place)
             try:
                 found = self._find(image, self.untouched[0], self.ball / pitch)
             except NoCircle as error:
@@ -129,7 +129,7 @@ class _PressedGel:
             radius = found.radius
             self._last = radius, depth
             if abs(radius - circle.radius) <= RADIUS_TOLERANCE:
-                return *self._seen(*place), "" if settled else "not settled; raise settling.max_substeps"
+                return *self._render_at(*place), "" if settled else "not settled; raise settling.max_substeps"
             tried.append((radius, depth))
             wanted = _next_depth(tried, circle.radius)
             if wanted > self._deepest and depth > MIN_DEPTH_MATCH * self._deepest:
@@ -138,7 +138,7 @@ class _PressedGel:
                 break
             depth = min(wanted, self._deepest)
         words = f"{abs(radius - circle.radius):.1f} px {'wider' if radius > circle.radius else 'narrower'}"
-        return *self._seen(*place), f"the contact is {words} than the real one"
+        return *self._render_at(*place), f"the contact is {words} than the real one"
 
     def _require_room(self, contact: float, depth: float) -> None:
         """Raises CannotPress where a contact radius [m] needs a `depth` [m] beyond what is possible."""
@@ -155,20 +155,20 @@ class _PressedGel:
         target = Pose(np.array([*pose.position[:2], self.ball - depth]), pose.quaternion)
         return self._world.move({"indenter": target}).settled
 
-    def _seen(self, x: float, y: float) -> tuple[Image, SurfaceMap]:
+    def _render_at(self, x: float, y: float) -> tuple[Image, SurfaceMap]:
         """Picture and surface with the middle of the gel at x, y [px]."""
-        at = placed(self._world.surface("lower"), x, y, self._sensor)
+        at = place_surface(self._world.surface("lower"), x, y, self._sensor)
         return self._render(at), surface_map(at, self._grid, self._sensor.markers)
 
 
-def placed(surface: GelSurface, x: float, y: float, sensor: SensorModel) -> GelSurface:
+def place_surface(surface: GelSurface, x: float, y: float, sensor: SensorModel) -> GelSurface:
     """The surface with the middle of its gel at the pixel x, y."""
     (u0, v0), pitch = sensor.geometry.principal, sensor.geometry.pixel_pitch
     x0, y0 = surface.origin
     return replace(surface, origin=(x0 + (x - u0) * pitch, y0 + (y - v0) * pitch))
 
 
-def _deeper(radius: float, depth: float, wanted: float) -> float:
+def _hertz_depth(radius: float, depth: float, wanted: float) -> float:
     """The depth at which Hertz's contact radius grows from `radius` to `wanted`, MAX_STEP at most."""
     return depth * float(np.clip((wanted / radius) ** 2, 1 / MAX_STEP, MAX_STEP))
 
@@ -181,10 +181,10 @@ def _next_depth(tried: list[tuple[float, float]], wanted: float) -> float:
         growth = (near[1] - others[0][1]) / (near[0] ** 2 - others[0][0] ** 2)
         found = near[1] + (wanted**2 - near[0] ** 2) * growth
         return float(np.clip(found, near[1] / MAX_STEP, near[1] * MAX_STEP))
-    return _deeper(*near, wanted)
+    return _hertz_depth(*near, wanted)
 
 
-def _circles(real: FrameSet, find: CircleFinder, ball: float) -> tuple[dict[str, Circle], list[str]]:
+def _find_circles(real: FrameSet, find: CircleFinder, ball: float) -> tuple[dict[str, Circle], list[str]]:
     """Contact circles by the frame's name, and where none was found. Raises BadFrames when there is none at all."""
     found: dict[str, Circle] = {}
     notes = []

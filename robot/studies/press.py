@@ -31,7 +31,7 @@ from tacsim.report.press_pictures import write_height_picture, write_side_pictur
 MAX_TWIST = math.radians(3600.0)
 # Share of the depth that the gel's contact points may leave unfelt. Balls of 1 mm and more, cylinders, boxes and stars
 # leave 11 % at most; wedges of 60 to 45 degrees 12 to 25 %, and press 10 to 25 % too little. More is refused.
-UNFELT = 0.125
+MAX_MISSED_DEPTH_SHARE = 0.125
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,9 +54,9 @@ class PressResult:
     contact: NDArray[np.bool_]  # (H, W) pixels where gel and indenter touch
     wrench: FloatArray  # (6,) what the indenter does to the sensor, sensor axes [N, N m]
     contact_radius: float  # of the circle with the area of contact [m]
-    unfelt: float  # share of the depth of its lowest point that no contact point of the gel feels
+    missed_depth_share: float  # share of the depth of its lowest point that no contact point of the gel feels
     moves: tuple[MoveStats, ...]
-    unfollowed: str  # why one of them has not settled, whatever its residual, and what to do
+    unsettled_reason: str  # why one of them has not settled, whatever its residual, and what to do
     surface: GelSurface
     folded: bool  # it folds over itself somewhere: picture and height show the sheet that the camera sees
     pose: Pose  # of the indenter in the sensor's frame: the centre of its bounding box
@@ -80,31 +80,31 @@ def press(scene: Scene, sensor: SensorModel, motion: PressMotion, render: Render
     if any(motion.at) or motion.turn is not None:
         world.place({"indenter": Pose(np.array([*motion.at, below + INITIAL_GAP]), turn)})
     targets = _targets(world.pose("indenter"), below - motion.depth, motion)
-    moves, unfollowed = [], ""
+    moves, unsettled_reason = [], ""
     try:
         for target in targets:
             moves.append(world.move({"indenter": target}))
-            unfollowed = world.unfollowed or unfollowed
+            unsettled_reason = world.unfollowed or unsettled_reason
     except SimulationDiverged as error:
         if error.poses:
-            came = below - float(se3.relative_pose(error.poses["lower"], error.poses["indenter"]).position[2])
-            error.advice += f"; it had come {came * 1e3:.3g} mm deep, of {motion.depth * 1e3:.3g} mm"
+            reached_depth = below - float(se3.relative_pose(error.poses["lower"], error.poses["indenter"]).position[2])
+            error.advice += f"; it had come {reached_depth * 1e3:.3g} mm deep, of {motion.depth * 1e3:.3g} mm"
             if not moves:  # it was the depth; a shift from where the indenter waits says less
-                error.depth, error.possible = came, ""
+                error.depth, error.possible = reached_depth, ""
         raise
     surface = world.surface("lower")
-    seen = sample_surface(surface, image_grid(sensor.geometry))
-    contact = _contact(world, scene, seen, sensor)
+    sample = sample_surface(surface, image_grid(sensor.geometry))
+    contact = _contact(world, scene, sample, sensor)
     area = float(contact.sum()) * sensor.geometry.pixel_pitch**2
     return PressResult(
         image=(render or Renderer(sensor, scene.gel.size[:2]))(surface),
-        height=seen.height,
+        height=sample.height,
         contact=contact,
         wrench=world.wrench("lower"),
         contact_radius=math.sqrt(area / math.pi),
-        unfelt=world.unfelt,
+        missed_depth_share=world.unfelt,
         moves=tuple(moves),
-        unfollowed=unfollowed,
+        unsettled_reason=unsettled_reason,
         surface=surface,
         folded=SurfaceTable(surface).folded,
         pose=se3.relative_pose(world.pose("lower"), world.pose("indenter")),
@@ -120,7 +120,7 @@ def deepest_possible(scene: Scene, motion: PressMotion, failure: SimulationDiver
     depth = min(failure.depth, motion.depth)
     with dumps_in(None):
         for _ in range(max_trials):
-            depth = _rounded_down(SAFE_PATH_SHARE * depth)
+            depth = _round_down(SAFE_PATH_SHARE * depth)
             world = PressWorld(scene)
             pose = world.pose("indenter")
             below = world.below(pose.quaternion)
@@ -132,7 +132,7 @@ def deepest_possible(scene: Scene, motion: PressMotion, failure: SimulationDiver
     return None
 
 
-def _rounded_down(depth: float) -> float:
+def _round_down(depth: float) -> float:
     """To two digits [m], as it is printed."""
     unit = 10.0 ** (math.floor(math.log10(depth)) - 1)
     return math.floor(depth / unit) * unit
@@ -166,7 +166,7 @@ def _targets(start: Pose, height: float, motion: PressMotion) -> list[Pose]:
     return targets
 
 
-def _contact(world: PressWorld, scene: Scene, seen: SurfaceSample, sensor: SensorModel) -> NDArray[np.bool_]:
+def _contact(world: PressWorld, scene: Scene, sample: SurfaceSample, sensor: SensorModel) -> NDArray[np.bool_]:
     """(H, W) True where the indenter presses on the surface seen by a pixel."""
     contact_distance = 0.2  # elements: a surface point farther from the indenter is not pressed
     assert scene.indenter is not None
@@ -178,18 +178,20 @@ def _contact(world: PressWorld, scene: Scene, seen: SurfaceSample, sensor: Senso
         slice(*np.searchsorted(places, (corners[:, axis].min(), corners[:, axis].max())))
         for places, axis in ((grid.y, 1), (grid.x, 0))
     )
-    gel = np.concatenate([grid.points()[rows, columns], -seen.height[rows, columns, None].astype(np.float64)], axis=-1)
-    valid = seen.valid[rows, columns]
+    gel = np.concatenate(
+        [grid.points()[rows, columns], -sample.height[rows, columns, None].astype(np.float64)], axis=-1
+    )
+    valid = sample.valid[rows, columns]
     at = se3.transform(from_sensor, gel.reshape(-1, 3))
     near = (np.abs(at) <= half).all(axis=1) & valid.ravel()
-    gaps = np.full(seen.valid.shape, np.inf)
+    gaps = np.full(sample.valid.shape, np.inf)
     if near.any():
         inner = np.full(len(at), np.inf)
         inner[near] = _gaps(scene.indenter, at[near], scene.effective_element_size)
         gaps[rows, columns] = inner.reshape(valid.shape)
     table = SurfaceTable(world.surface("lower"))
     reach, _ = table.sample_on_grid(table.spline_values(world.reach().astype(np.float32)), grid)
-    return _filled(gaps < reach.reshape(gaps.shape), int(scene.effective_element_size / sensor.geometry.pixel_pitch))
+    return _fill_gaps(gaps < reach.reshape(gaps.shape), int(scene.effective_element_size / sensor.geometry.pixel_pitch))
 
 
 def _gaps(indenter: Indenter, points: FloatArray, element: float) -> FloatArray:
@@ -200,7 +202,7 @@ def _gaps(indenter: Indenter, points: FloatArray, element: float) -> FloatArray:
     return cached_tiled_distance(geometry, MESH_GRID_SPACING).sample_distance(points)[0]
 
 
-def _filled(mask: NDArray[np.bool_], width: int) -> NDArray[np.bool_]:
+def _fill_gaps(mask: NDArray[np.bool_], width: int) -> NDArray[np.bool_]:
     """(H, W) `mask` with the gaps that are narrower than `width` pixels filled; what is convex stays as it is.
 
     Behind a pressed edge the surface swings back within an element, by 10 µm from a face at elements of 0.5 mm: no
@@ -235,9 +237,9 @@ def press_report(scene: Scene, motion: PressMotion, pressed: PressResult, sensor
         "contact_radius": pressed.contact_radius,
         "deepest": float(pressed.height.max()),
         "pixel_pitch": sensor.geometry.pixel_pitch,
-        "unfelt": pressed.unfelt,
+        "unfelt": pressed.missed_depth_share,
         "folded": pressed.folded,
-        "unfollowed": pressed.unfollowed or None,
+        "unfollowed": pressed.unsettled_reason or None,
         "settled": all(move.settled for move in pressed.moves),
         "residual": residual if math.isfinite(residual) else None,
         "substeps": sum(move.substeps for move in pressed.moves),

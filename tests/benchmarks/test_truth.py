@@ -111,7 +111,7 @@ def test_tacchi_has_the_published_numbers() -> None:
     centre = [12.0, 12.0, start.top + 1.0 + 4.0]
     assert np.linalg.norm(ball - centre, axis=1) == pytest.approx(4.0, abs=1e-4)
     assert 0.9e-3 < ball[:, 2].min() - start.top - 1.0 + 1e-3 < 2e-3  # the tip hangs 1 mm above the gel
-    assert start.sunk == 0.0
+    assert start.penetration == 0.0
 
 
 def test_a_press_is_measured_as_a_user_gets_it() -> None:

@@ -30,7 +30,7 @@ CASE = "ball_presses"
 OWN = "balls.yaml"
 SHIPPED = Path(__file__).parents[2] / "references" / OWN
 MIN_PRESSES = 3  # presses
-LARGEST = 1 << 30  # [bytes] of an archive
+MAX_ARCHIVE_BYTES = 1 << 30  # [bytes] of an archive
 
 Frames = tuple[tuple[str, Image], ...]
 
@@ -80,7 +80,7 @@ def read_sets(folder: Path) -> tuple[BallSet, ...]:
     return load(BallSets, own if own.is_file() else SHIPPED).sets
 
 
-def is_there(folder: Path, of: BallSet) -> bool:
+def has_frames(folder: Path, of: BallSet) -> bool:
     """True where `folder` holds frames of the set."""
     return any(next(folder.rglob(pattern), None) is not None for pattern in of.frames or of.archive)
 
@@ -146,13 +146,13 @@ def ball_presses(folder: Path, of: BallSet, repeat: int) -> list[Measurement]:
 def cases(folder: Path) -> tuple[Case, ...]:
     """A case a set, all but the first long; one whose frames are not there says so. Raises ConfigError."""
     sets = read_sets(folder)
-    there = [of for of in sets if is_there(folder, of)]
+    available = [of for of in sets if has_frames(folder, of)]
     return tuple(
         Case(
             "real", CASE, "tacsim", f"{of.pixel_pitch * 1e3:.3g} mm a pixel", partial(ball_presses, folder, of),
             cpu=True,
-            long=of in there[1:],
-            missing="" if of in there else f"{of.name}: no {of.wanted} below {folder}",
+            long=of in available[1:],
+            missing="" if of in available else f"{of.name}: no {of.wanted} below {folder}",
         )
         for of in sets
     )  # fmt: skip
@@ -208,8 +208,8 @@ def _of_archive(folder: Path, of: BallSet) -> tuple[Image, Frames]:
     if path is None:
         raise BadData(f"{folder} and the folders below it hold no {of.wanted}")
     try:
-        if path.stat().st_size > LARGEST:
-            raise BadData(f"{path} is larger than {LARGEST >> 30} GiB")
+        if path.stat().st_size > MAX_ARCHIVE_BYTES:
+            raise BadData(f"{path} is larger than {MAX_ARCHIVE_BYTES >> 30} GiB")
         with np.load(path, allow_pickle=False) as archive:
             images, reference = archive["images"], archive["background"]
     except (OSError, ValueError, KeyError) as error:

@@ -26,9 +26,8 @@ from calibration.light.tuning import FORWARD_BLUR, MAX_RIM_RATIO, RIM_BLUR
 from tacsim.models.photometric import PhotometricLight, image_grid_places
 
 FOLDS = 5
-WIDEST = (
-    0.95 * MAX_RIM_RATIO
-)  # contact radius over ball radius; clicked circles reach into the skirt, some beyond the ball
+# contact radius over ball radius; clicked circles reach into the skirt, some beyond the ball
+MAX_RADIUS_RATIO = 0.95 * MAX_RIM_RATIO
 
 
 def clicked_errors(folder: Path, of: BallSet) -> list[float]:
@@ -60,7 +59,7 @@ def corrected(circle: ContactCircle, fit: LightFit, clicked: Mapping[str, Contac
     pairs = [(press.circle, clicked[press.name]) for press in fit.presses]
     x, y = (float(np.median([getattr(a, axis) - getattr(b, axis) for a, b in pairs])) for axis in "xy")
     scale = float(np.median([found.radius / seen.radius for found, seen in pairs]))
-    return ContactCircle(circle.x + x, circle.y + y, min(circle.radius * scale, WIDEST * ball))
+    return ContactCircle(circle.x + x, circle.y + y, min(circle.radius * scale, MAX_RADIUS_RATIO * ball))
 
 
 def _error(press: BallPress, inside: ContactCircle, fit: LightFit, ball: float) -> float:

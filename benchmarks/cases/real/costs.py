@@ -125,10 +125,10 @@ def normaliser(repeat: int) -> list[Measurement]:
     flat = replace(surface, displacement=np.zeros_like(surface.displacement))
     normalise.take_reference(TactileFrame(render(flat), time=0.0, index=0))
     frame = TactileFrame(render(surface), time=0.0, index=0)
-    timing, seen = timed(partial(normalise, frame, 0.0), max(repeat, MIN_REPETITIONS))
+    timing, observation = timed(partial(normalise, frame, 0.0), max(repeat, MIN_REPETITIONS))
     truth = surface_map(surface, grid, None).height
-    assert seen.height is not None
-    error = float(np.sqrt(np.mean((seen.height - truth)[truth > 0.1 * DEPTH] ** 2))) / DEPTH * 100.0
+    assert observation.height is not None
+    error = float(np.sqrt(np.mean((observation.height - truth)[truth > 0.1 * DEPTH] ** 2))) / DEPTH * 100.0
     return [
         Measurement(
             timing, error, "% of depth", "the height that the simulation knows, rms where it is pressed", "320 x 240",

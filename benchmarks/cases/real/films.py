@@ -31,7 +31,7 @@ OWN = "films.yaml"
 SHIPPED = Path(__file__).parents[2] / "references" / OWN
 STILL = 3.0  # a frame that differs less from the first, in the mean, shows the gel at rest [grey levels]
 REST_FRAMES = 8  # that tell the camera's noise
-MOST_FRAMES = 2000
+MAX_FRAMES = 2000
 
 
 class Film(Config):
@@ -90,7 +90,7 @@ def marker_film(film: Film, path: Path, repeat: int) -> list[Measurement]:
     seen = np.ones(len(rest), dtype=np.bool_)
     always, fewest, out = seen.copy(), len(rest), np.zeros_like(seen)
     resting, at_rest = True, [first]
-    for image in islice(frames, MOST_FRAMES):
+    for image in islice(frames, MAX_FRAMES):
         wall, cpu = perf_counter(), process_time()
         tracked = tracker(find(image).centres)
         samples.append(perf_counter() - wall)

@@ -51,9 +51,9 @@ def invariance(
     by_source: dict[str, list[tuple[Comparison, Calibration | None]]] = {"pictures": [], "surfaces": []}
     for fold in range(FOLDS):
         train = tuple(frame for k, frame in enumerate(frames) if k % FOLDS != fold)
-        both, calibration, taken, said = _fold(of, reference, train, frames[fold::FOLDS], gel_size)
+        both, calibration, taken, fold_notes = _fold(of, reference, train, frames[fold::FOLDS], gel_size)
         wall, cpu, pressed = wall + taken[0], cpu + taken[1], pressed + len(both["pictures"].pairs)
-        notes += said
+        notes += fold_notes
         for source, comparison in both.items():
             by_source[source].append((comparison, calibration))
     timing, note = Timing((wall / pressed,), cpu / pressed), "; ".join(notes)
@@ -141,13 +141,13 @@ def _fold(
     wall, cpu = perf_counter(), process_time()
     with TemporaryDirectory() as place:
         write_bundle(Path(place), calibration, reference)
-        ours, said = match_presses(real, scene, read_sensor_model(Path(place)), GRID)
+        ours, fold_notes = match_presses(real, scene, read_sensor_model(Path(place)), GRID)
     taken = perf_counter() - wall, process_time() - cpu
     both = {
         "pictures": compare_frames(ours, real, calibration, calibration),
         "surfaces": compare_frames(ours, real, None, calibration),
     }
-    return both, calibration, taken, said
+    return both, calibration, taken, fold_notes
 
 
 def cases(folder: Path) -> tuple[Case, ...]:
@@ -157,7 +157,7 @@ def cases(folder: Path) -> tuple[Case, ...]:
     others = tuple(
         Case("real", CASE, "tacsim", f"{other.name}, {resolution}", partial(invariance, folder, other, None), long=True)
         for other in balls.read_sets(folder)
-        if other.name != labels.light and not other.dots and balls.is_there(folder, other)
+        if other.name != labels.light and not other.dots and balls.has_frames(folder, other)
     )
     try:
         of = light_of(folder, labels)

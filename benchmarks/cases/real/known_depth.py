@@ -20,7 +20,7 @@ from benchmarks.cases.real.labels import BadData, PressLabel, PressLabels, read_
 from benchmarks.harness.measure import Measurement, Timing
 from benchmarks.harness.runner import Case
 from calibration.light.circle import Circle, NoCircle, find_contact_circle
-from robot.studies.matched_press import placed
+from robot.studies.matched_press import place_surface
 from tacsim.interface import FloatArray, Image, Mask
 from tacsim.models.scene import GelSurface
 from tacsim.models.sensor import CanonicalGrid
@@ -41,7 +41,7 @@ def light_of(folder: Path, labels: PressLabels) -> BallSet:
     found = next((of for of in balls.read_sets(folder) if of.name == labels.light), None)
     if found is None:
         raise BadData(f"the labels of '{labels.name}' name no ball presses that calibrate its light (light:)")
-    if not balls.is_there(folder, found):
+    if not balls.has_frames(folder, found):
         raise BadData(f"no ball presses to calibrate the light by: no {found.wanted} below {folder}")
     return found
 
@@ -59,11 +59,11 @@ def known_depth(folder: Path, ball: float, repeat: int) -> list[Measurement]:
         real = _circle(press, frames[press], reference, labels)
         wall, cpu = perf_counter(), process_time()
         settled = press_to(world, ball, press.depth).settled
-        image = camera.see(placed(world.surface("lower"), real.x, real.y, camera.model))
+        image = camera.see(place_surface(world.surface("lower"), real.x, real.y, camera.model))
         timing = Timing((perf_counter() - wall,), process_time() - cpu)
         ours = _circle(press, image, reference, labels)  # light pulls it aside, as it does the real one
         x, y = 2 * real.x - ours.x, 2 * real.y - ours.y
-        surface = placed(world.surface("lower"), x, y, camera.model)
+        surface = place_surface(world.surface("lower"), x, y, camera.model)
         image = camera.see(surface)
         cap = float(np.sqrt(2 * ball * press.depth - press.depth**2)) / labels.pixel_pitch
         mask = circle_mask(reference.shape[:2], x, y, REACH * cap)

@@ -38,11 +38,11 @@ if TYPE_CHECKING:
 
 CASE = "punch"
 BOX = 512  # pixels of the periodic square that the layer is solved on
-FINER = 8  # the outline is drawn on so many times as many points
+OUTLINE_SUBSAMPLING = 8  # the outline is drawn on so many times as many points
 RIM = 12  # the mask reaches so far beyond the outline [px]
 FIT_RIM = 20  # ... and that of the fit
 SCALES = (0.88, 0.92, 0.96, 1.0, 1.04)
-NEARER = 0.02  # and the two scales so far from the best
+FINE_SCALE_STEP = 0.02  # and the two scales so far from the best
 STEPS = (4.0, 2.0, 1.0, 0.5)  # of the place [px]
 EDGE_BLUR = 1.0  # by the gel's coating and the optics [px]
 
@@ -58,8 +58,8 @@ class PunchFace:
         """(H, W) pixels more than half covered when its axis is at x, y [px], and up to `rim` pixels from these."""
         import cv2
 
-        drawn = np.zeros((shape[0] * FINER, shape[1] * FINER), dtype=np.uint8)
-        at = (self.points * scale / pitch + [x, y] + 0.5) * FINER - 0.5
+        drawn = np.zeros((shape[0] * OUTLINE_SUBSAMPLING, shape[1] * OUTLINE_SUBSAMPLING), dtype=np.uint8)
+        at = (self.points * scale / pitch + [x, y] + 0.5) * OUTLINE_SUBSAMPLING - 0.5
         for corners in at[self.triangles]:
             cv2.fillConvexPoly(drawn, np.rint(corners * 16).astype(np.int32), 255, shift=4)
         covered = cv2.resize(drawn, shape[::-1], interpolation=cv2.INTER_AREA) > 127
@@ -121,8 +121,8 @@ class PunchRenderer:
         rows, columns, _ = self._still.shape
         v, u = np.mgrid[:rows, :columns].astype(np.float32)
         at = [np.float32(BOX // 2) + axis - np.float32(middle) for axis, middle in ((u, x), (v, y))]
-        seen = np.asarray(cv2.remap(dent, at[0], at[1], cv2.INTER_LINEAR), dtype=np.float32)
-        change, _ = self._light.change(seen[..., :2], *self._places, np.ascontiguousarray(seen[..., 2]))
+        remapped = np.asarray(cv2.remap(dent, at[0], at[1], cv2.INTER_LINEAR), dtype=np.float32)
+        change, _ = self._light.change(remapped[..., :2], *self._places, np.ascontiguousarray(remapped[..., 2]))
         if self._blur > 0:
             change = np.asarray(cv2.GaussianBlur(change, (0, 0), self._blur), dtype=np.float32)
         picture: Image = np.rint(np.clip(self._still + change, 0, 255)).astype(np.uint8)
@@ -175,7 +175,9 @@ def fit_placement(
         return best
 
     best = min((tried(scale) for scale in SCALES), key=lambda one: one.error)
-    return min((best, tried(best.scale - NEARER), tried(best.scale + NEARER)), key=lambda one: one.error)
+    return min(
+        (best, tried(best.scale - FINE_SCALE_STEP), tried(best.scale + FINE_SCALE_STEP)), key=lambda one: one.error
+    )
 
 
 def punch(folder: Path, mesh: str, repeat: int) -> list[Measurement]:

@@ -119,7 +119,7 @@ def _check_images(fit: LightFit) -> Iterable[Finding]:
             "do not trust", f"{GREY}, and one number a pixel cannot tell slopes of two directions",
             "calibrate from the camera's own pictures, in colour",
         )  # fmt: skip
-    if fit.forward is not None and is_undirected(fit.forward):
+    if fit.forward is not None and is_isotropic(fit.forward):
         yield Finding(
             "do not trust", "this light tells no direction: all flanks of a dent change alike",
             "slopes cannot be found in such pictures; only how dark it is tells of depth",
@@ -259,7 +259,7 @@ def is_grey(image: Image) -> bool:
     return bool((image == image[..., :1]).all())
 
 
-def is_undirected(model: PhotometricModel) -> bool:
+def is_isotropic(model: PhotometricModel) -> bool:
     """True where flanks to all sides have nearly one change of colour."""
     turn = np.arange(8) * np.pi / 4
     slopes = 0.6 * model.steepest * np.stack([np.cos(turn), np.sin(turn)], axis=-1)

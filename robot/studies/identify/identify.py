@@ -22,11 +22,10 @@ from tacsim.models.material import elastic_constants
 from tacsim.models.scene import Scene
 
 Kind = Literal["gel", "body"]
-UNWEIGHED = (
-    0.01  # noise by which the width of a dent counts for nothing in a fit: it tells indenters, not materials [m]
-)
+# noise by which the width of a dent counts for nothing in a fit: it tells indenters, not materials [m]
+UNWEIGHTED_NOISE = 0.01
 MOMENTS = 16  # of a press, that are simulated
-FACTOR = 30.0  # how far stiffness and yield may be from where the fit begins
+MAX_FACTOR = 30.0  # how far stiffness and yield may be from where the fit begins
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,7 +56,7 @@ def parameters_of(kind: Kind, scene: Scene) -> tuple[Parameter, ...]:
         gel = scene.gel.material
         nu, mu = min(gel.poisson_ratio, 0.49), min(max(scene.indenter.friction, 0.1), 1.0)
         return (
-            _around("youngs_modulus", gel.youngs_modulus),
+            _parameter_around("youngs_modulus", gel.youngs_modulus),
             Parameter("poisson_ratio", nu, 0.0, max_nu, "volume"),
             Parameter("friction", mu, lowest, highest),
         )
@@ -70,15 +69,15 @@ def parameters_of(kind: Kind, scene: Scene) -> tuple[Parameter, ...]:
         for name, mu in scene.friction.items()
     )
     return (
-        _around("youngs_modulus", material.youngs_modulus),
-        _around("yield_stress", strength),
-        Parameter("hardening_modulus", material.hardening_modulus, 0.0, FACTOR * strength, "linear", strength),
+        _parameter_around("youngs_modulus", material.youngs_modulus),
+        _parameter_around("yield_stress", strength),
+        Parameter("hardening_modulus", material.hardening_modulus, 0.0, MAX_FACTOR * strength, "linear", strength),
         *frictions,
     )
 
 
-def _around(name: str, value: float) -> Parameter:
-    return Parameter(name, value, value / FACTOR, value * FACTOR)
+def _parameter_around(name: str, value: float) -> Parameter:
+    return Parameter(name, value, value / MAX_FACTOR, value * MAX_FACTOR)
 
 
 def identify(
@@ -90,7 +89,7 @@ def identify(
     priors: Priors,
     *,
     wanted: Sequence[str] = (),
-    most_moments: int = MOMENTS,
+    max_moments: int = MOMENTS,
     gel_error: float = 0.0,
     on_step: Callable[[str], None] = lambda words: None,
     on_run: Callable[[int, int], None] = lambda done, total: None,
@@ -109,10 +108,10 @@ def identify(
     if unknown:
         raise ValueError(f"'{unknown[0]}' is nothing that can be identified of a {kind}; allowed: {', '.join(names)}")
     parameters = tuple(each for each in parameters if not wanted or each.name in wanted)
-    taken = tuple(downsample_press(merge_repeated_readings(press), most_moments) for press in presses)
+    taken = tuple(downsample_press(merge_repeated_readings(press), max_moments) for press in presses)
     signals = signals_of(taken, noise)
     start = scene_with(scene, {each.name: each.start for each in parameters})
-    exact = Simulation(start, parameters, taken, recordings.seen, on_run)
+    exact = Simulation(start, parameters, taken, recordings.sensor_views, on_run)
     error = COARSE_SIMULATION_ERROR
     levels = [replace(exact, scene=coarser(start)), exact]
     coarse = levels[0].scene
@@ -122,7 +121,8 @@ def identify(
         error *= 2
     width = np.array([name.endswith(".width") for name in signals.channels])[signals.channel]
     fit = estimate_materials(
-        levels, replace(signals, noise=np.where(width, UNWEIGHED, signals.noise)), parameters, priors, error, on_step
+        levels, replace(signals, noise=np.where(width, UNWEIGHTED_NOISE, signals.noise)), parameters, priors, error,
+        on_step,
     )  # fmt: skip
     if gel_error > 0 and kind == "body":
         fit = _with_gel_error(fit, signals, gel_error)
@@ -133,10 +133,10 @@ def identify(
         by_all = levels[0].by_size(Point(fit.free, fit.nuisances[: len(taken)]))
         balls = np.array([press.ball or 0.0 for press in taken])
         by_size = np.stack([np.where(balls[signals.press] == ball, by_all, 0.0) for ball in np.unique(balls)], axis=1)
-    sigma = np.sqrt(fit.sigma**2 - np.where(width, UNWEIGHED**2 - signals.noise**2, 0.0))
+    sigma = np.sqrt(fit.sigma**2 - np.where(width, UNWEIGHTED_NOISE**2 - signals.noise**2, 0.0))
     checked = replace(fit, sigma=sigma)
-    against = find_contradictions(checked, signals, tuple(press.name for press in taken), by_size)
-    return Identified(kind, found, fit, taken, signals, tuple(against), noise, checked, by_size)
+    contradictions = find_contradictions(checked, signals, tuple(press.name for press in taken), by_size)
+    return Identified(kind, found, fit, taken, signals, tuple(contradictions), noise, checked, by_size)
 
 
 def _with_gel_error(fit: Fit, signals: Signals, error: float) -> Fit:
@@ -156,7 +156,7 @@ def _with_gel_error(fit: Fit, signals: Signals, error: float) -> Fit:
     return replace(fit, covariance=fit.covariance + error**2 * np.outer(shift, shift))
 
 
-def outlook(identified: Identified, force_noise: float) -> dict[str, float]:
+def predict_intervals(identified: Identified, force_noise: float) -> dict[str, float]:
     """Half the 95 % interval of each parameter (of its free number) with another force sensor: without a new run."""
     fit, signals = identified.fit, identified.signals
     force = signals.force[signals.channel]

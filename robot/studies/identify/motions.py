@@ -30,14 +30,14 @@ REST = 3  # periods before the touch and after it, clear of everything: they tel
 CLEAR = 0.3e-3  # how far a gel goes back from where it touched [m]
 TURN = math.radians(2.0)  # how far a gel is turned in a step
 
-WHAT_TELLS = {
+MOTIONS_FOR_PARAMETER = {
     "gel": {"youngs_modulus": "press", "poisson_ratio": "press", "friction": "slide"},
     "body": {
         "youngs_modulus": "squeeze", "yield_stress": "squeeze", "hardening_modulus": "squeeze",
         "friction_upper": "tilt", "friction_lower": "tilt",
     },
 }  # fmt: skip
-WORDS = {
+MOTION_TEXTS = {
     "press": "a ball pressed in by a quarter of the gel's thickness, heights recorded (a calibrated sensor)",
     "slide": "a gel pressed, then slid sideways until it slips",
     "squeeze": "the body closed by two fifths of its height, opened a little on the way, and closed on",
@@ -71,9 +71,9 @@ def _pressed(depth: float) -> list[Row]:
 
 
 def _slid(depth: float) -> list[Row]:
-    there = _line((0, depth, 0), (SLIDE, depth, 0), 2 * STEP)
+    forth = _line((0, depth, 0), (SLIDE, depth, 0), 2 * STEP)
     back = _line((SLIDE, depth, 0), (SLIDE, -CLEAR, 0), 2 * STEP)
-    return [*[(0.0, -CLEAR, 0.0)] * REST, *_line((0, -CLEAR, 0), (0, depth, 0), STEP), *there, *back,
+    return [*[(0.0, -CLEAR, 0.0)] * REST, *_line((0, -CLEAR, 0), (0, depth, 0), STEP), *forth, *back,
             *[(SLIDE, -CLEAR, 0.0)] * REST]  # fmt: skip
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from calibration.errors import CalibrationError
 from calibration.materials.presses import Press
 from robot.rig.replay_rig import open_replay, recorded_rig
-from robot.studies.identify.simulation import Seen, shape_signals
+from robot.studies.identify.simulation import SensorView, shape_signals
 from tacsim import pose as se3
 from tacsim.geometry.shapes import depth_below_centre
 from tacsim.interface import Action, EndOfEpisode, FloatArray, Observation, Pose
@@ -44,16 +44,16 @@ class Recordings:
 
     def __init__(self, scene: Scene, indenter: Pose | None = None, balls: Mapping[str, float] | None = None) -> None:
         self.scene, self._indenter, self._balls = scene, indenter, dict(balls or {})
-        self.seen: dict[str, Seen] = {}
+        self.sensor_views: dict[str, SensorView] = {}
         self.from_ur = False  # at least one was recorded by a UR's own force sensor
         self.scene_sensors = scene.sensors
 
     def require(self, names: Iterable[str]) -> None:
         """Raises BadRecording for a ball that belongs to none of the recordings `names`."""
-        there = list(names)
+        known_names = list(names)
         for name in self._balls:
-            if name not in there:
-                raise BadRecording(f"no recording '{name}' that a ball belongs to; there are {', '.join(there)}")
+            if name not in known_names:
+                raise BadRecording(f"no recording '{name}' that a ball belongs to; there are {', '.join(known_names)}")
 
     def read(self, path: Path) -> Press:
         """Raises BadRecording, EpisodeError."""
@@ -83,9 +83,9 @@ class Recordings:
 
         z: how high the lowest point of the indenter is above the untouched gel, or the gap between the two gels.
         """
-        there = _header(path)
-        forces = [name for name in FORCES if name in there]
-        timed = ["time"] if "time" in there else []
+        columns = _header(path)
+        forces = [name for name in FORCES if name in columns]
+        timed = ["time"] if "time" in columns else []
         rows = np.array(read_columns(path, ["x", "y", "z", *timed, *forces]))
         self._require_metres(path, rows[:, 2])
         time = rows[:, 3] if timed else np.arange(len(rows), dtype=np.float64)
@@ -120,20 +120,21 @@ class Recordings:
         with EpisodeFile(path) as file:
             meta = file.meta
         original = recorded_rig(path)
-        carriers = {name: sensor.arm for name, sensor in meta.spec.sensors.items()}
+        sensor_arms = {name: sensor.arm for name, sensor in meta.spec.sensors.items()}
         config = RigConfig(
             name="recorded",
             clock="replay",
             arms={name: ReplayArmConfig(driver="replay", source=str(path)) for name in meta.spec.arms},
             sensors={
-                name: ReplaySensorConfig(driver="replay", source=str(path), arm=arm) for name, arm in carriers.items()
+                name: ReplaySensorConfig(driver="replay", source=str(path), arm=arm)
+                for name, arm in sensor_arms.items()
             },
             canonical=CanonicalGrid() if original is None else original.canonical,
         )
         self.from_ur |= original is not None and any(
             arm.is_real for arm in parts_of(original.arms, UrArmConfig).values()
         )
-        roles = self._roles(path, list(carriers))
+        roles = self._roles(path, list(sensor_arms))
         with open_replay(config) as rig:
             observations = [rig.reset()]
             while True:
@@ -143,13 +144,13 @@ class Recordings:
                     break
         readings: dict[str, list[float]] = {}
         for role, sensor in roles.items():
-            arm = carriers[sensor]
-            self._see(role, sensor, observations[0], config.canonical, original)
+            arm = sensor_arms[sensor]
+            self._store_sensor_view(role, sensor, observations[0], config.canonical, original)
             for observation in observations:
-                for channel, value in self._felt(role, sensor, arm, observation).items():
+                for channel, value in self._tactile_readings(role, sensor, arm, observation).items():
                     readings.setdefault(channel, []).append(value)
         whole = {key: np.array(values) for key, values in readings.items() if len(values) == len(observations)}
-        poses = self._poses(path, roles, carriers, observations, original)
+        poses = self._poses(path, roles, sensor_arms, observations, original)
         time = np.array([each.time for each in observations])
         return Press(_name(path), poses, whole, time, np.ones(len(time), np.int64))
 
@@ -166,43 +167,45 @@ class Recordings:
             )
         return {name: name for name in wanted}
 
-    def _see(self, role: str, sensor: str, first: Observation, grid: CanonicalGrid, original: RigConfig | None) -> None:
+    def _store_sensor_view(
+        self, role: str, sensor: str, first: Observation, grid: CanonicalGrid, original: RigConfig | None
+    ) -> None:
         touch = first.tactile[sensor]
         if touch.height is None:
             return
         config = None if original is None else original.sensors.get(sensor)
         model = config.sensor_model if config is not None and config.is_simulated else None
         markers: Markers | None = None if model is None else model.markers
-        self.seen[role] = Seen(grid, markers, touch.valid)
+        self.sensor_views[role] = SensorView(grid, markers, touch.valid)
 
-    def _felt(self, role: str, sensor: str, arm: str | None, now: Observation) -> dict[str, float]:
+    def _tactile_readings(self, role: str, sensor: str, arm: str | None, now: Observation) -> dict[str, float]:
         min_depth = 0.2e-3  # dent whose width can be told from noise and mesh [m]
-        felt = {}
+        readings = {}
         if arm is not None and arm in now.arms:
             wrench = now.arms[arm].wrench
-            felt = {f"{role}.{name}": float(wrench[k]) for k, name in enumerate(FORCES)}
+            readings = {f"{role}.{name}": float(wrench[k]) for k, name in enumerate(FORCES)}
         elif "indenter" in now.arms:
-            felt = {f"{role}.{name}": -float(now.arms["indenter"].wrench[k]) for k, name in enumerate(FORCES)}
+            readings = {f"{role}.{name}": -float(now.arms["indenter"].wrench[k]) for k, name in enumerate(FORCES)}
         touch = now.tactile[sensor]
-        if role in self.seen:
-            flow = touch.flow if self.seen[role].markers is not None else None
-            felt |= shape_signals(role, touch.height, flow, touch.valid, self.seen[role].grid.pitch)
+        if role in self.sensor_views:
+            flow = touch.flow if self.sensor_views[role].markers is not None else None
+            readings |= shape_signals(role, touch.height, flow, touch.valid, self.sensor_views[role].grid.pitch)
             if self.scene.indenter is None:  # the width tells an indenter; of a body it hangs on mesh and edges
-                felt.pop(f"{role}.width", None)
+                readings.pop(f"{role}.width", None)
             elif touch.height is not None and np.abs(touch.height[touch.valid]).max(initial=0.0) < min_depth:
-                felt[f"{role}.width"] = math.nan
-        return felt
+                readings[f"{role}.width"] = math.nan
+        return readings
 
     def _poses(
         self,
         path: Path,
         roles: dict[str, str],
-        carriers: dict[str, str | None],
+        sensor_arms: dict[str, str | None],
         observations: Sequence[Observation],
         original: RigConfig | None,
     ) -> dict[str, tuple[Pose, ...]]:
         if self.scene.indenter is None:
-            arms = {role: carriers[sensor] for role, sensor in roles.items()}
+            arms = {role: sensor_arms[sensor] for role, sensor in roles.items()}
             without = [role for role, arm in arms.items() if arm is None]
             if without:
                 raise BadRecording(f"{path}: no arm carried sensor '{without[0]}', so where it was is not known")
@@ -211,7 +214,7 @@ class Recordings:
                 for role, arm in arms.items()
                 if arm is not None
             }
-        arm = carriers[roles["lower"]]
+        arm = sensor_arms[roles["lower"]]
         found = []
         for each in observations:
             sensor = Pose() if arm is None or arm not in each.arms else each.arms[arm].pose

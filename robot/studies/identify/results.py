@@ -16,7 +16,7 @@ from calibration.materials.fit import Parameter
 from calibration.materials.presses import Press
 from robot.common.whole_file import whole_folder
 from robot.studies.identify.identify import Identified
-from robot.studies.identify.motions import WHAT_TELLS
+from robot.studies.identify.motions import MOTIONS_FOR_PARAMETER
 from tacsim.interface import FloatArray
 from tacsim.models.text import printable_line
 from tacsim.report.figure import COLOURS, INK, QUIET, canvas, plain, save
@@ -25,20 +25,20 @@ UNITS = {"youngs_modulus": ("kPa", 1e-3), "yield_stress": ("kPa", 1e-3), "harden
 FORMAT = 1
 
 
-def in_words(parameter: Parameter, value: float) -> str:
+def format_value(parameter: Parameter, value: float) -> str:
     """The value with its unit, for a person."""
     unit, scale = UNITS.get(parameter.name, ("", 1.0))
     return f"{value * scale:.4g} {unit}".strip()
 
 
-def told(identified: Identified) -> list[tuple[str, str, str]]:
+def describe_parameters(identified: Identified) -> list[tuple[str, str, str]]:
     """Name, value and 95 % interval of each parameter, for a person."""
     rows = []
     for each in identified.fit.identified:
         low, high = identified.fit.interval(each.name)
         rows.append((
-            each.name, in_words(each, identified.fit.value(each.name)),
-            f"{in_words(each, low)} to {in_words(each, high)}",
+            each.name, format_value(each, identified.fit.value(each.name)),
+            f"{format_value(each, low)} to {format_value(each, high)}",
         ))  # fmt: skip
     return rows
 
@@ -56,7 +56,7 @@ def write(folder: Path, identified: Identified) -> list[Path]:
     with whole_folder(folder) as made:
         text = json.dumps(as_json(identified), indent=1, allow_nan=False)
         (made / "identified.json").write_text(text + "\n", encoding="utf-8")
-        draw(identified, told(identified), made / "identified.png")
+        draw(identified, describe_parameters(identified), made / "identified.png")
         if not identified.findings:
             (made / "material.yaml").write_text(_material_text(identified), encoding="utf-8")
             (made / "scene.yaml").write_text(_scene_text(identified), encoding="utf-8")
@@ -80,7 +80,7 @@ def as_json(identified: Identified) -> dict[str, Any]:
             for index, each in enumerate(fit.parameters)
             if each in fit.identified
         },
-        "untold": {each.name: WHAT_TELLS[identified.kind][each.name] for each in fit.unidentified},
+        "untold": {each.name: MOTIONS_FOR_PARAMETER[identified.kind][each.name] for each in fit.unidentified},
         "findings": [{"kind": each.kind, "words": each.text} for each in identified.findings],
         "noise": {"force": identified.noise.force, "dent": identified.noise.dent, "slip": identified.noise.slip},
         "presses": [press.name for press in identified.presses],
@@ -127,20 +127,20 @@ def draw(identified: Identified, table: Sequence[tuple[str, str, str]], path: Pa
     """Writes a picture: for each press its normal force against depth, its sideways force against the way sideways, and
     what is left of all signals over its standard deviation; on top what was found."""
     max_drawn = 6  # presses; a column each
-    shown = identified.presses[:max_drawn]
-    figure = canvas(max(3.4 * len(shown), 9.0), 9.5)
+    drawn = identified.presses[:max_drawn]
+    figure = canvas(max(3.4 * len(drawn), 9.0), 9.5)
     lines = [f"{name.replace('_', ' ')}   {value}   (95 %: {interval})" for name, value, interval in table]
     lines += [f"{each.name.replace('_', ' ')}   not told" for each in identified.fit.unidentified]
     lines += [f"NOT TO BE USED: {each.text}"[:150] for each in identified.findings]
-    left = len(identified.presses) - len(shown)
+    left = len(identified.presses) - len(drawn)
     lines += [f"and {left} more presses"] if left else []
     # no suptitle, for which tight_layout would leave room once more
     figure.text(0.02, 0.99, "\n".join(line.replace("$", r"\$") for line in lines), va="top", fontsize=9, color=INK)
-    for column, press in enumerate(shown):
-        rows = [figure.add_subplot(3, len(shown), column + 1 + k * len(shown)) for k in range(3)]
-        depth, aside = _depth(press), _aside(press)
+    for column, press in enumerate(drawn):
+        rows = [figure.add_subplot(3, len(drawn), column + 1 + k * len(drawn)) for k in range(3)]
+        depth, sideways = _depth(press), _sideways(press)
         _forces(identified, column, rows[0], depth, ("fz",), "depth [mm]", press.name)
-        _forces(identified, column, rows[1], aside, ("fx", "fy"), "sideways [mm]", "")
+        _forces(identified, column, rows[1], sideways, ("fx", "fy"), "sideways [mm]", "")
         _residuals(identified, column, rows[2])
     figure.tight_layout(rect=(0.0, 0.0, 1.0, 0.99 - 0.016 * (len(lines) + 1)))
     save(figure, path)
@@ -159,7 +159,7 @@ def _depth(press: Press) -> FloatArray:
     return found
 
 
-def _aside(press: Press) -> FloatArray:
+def _sideways(press: Press) -> FloatArray:
     """How far the parts have gone sideways [mm]."""
     part = "indenter" if "indenter" in press.poses else "upper"
     places = np.array([pose.position[:2] for pose in press.poses[part]])

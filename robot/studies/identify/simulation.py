@@ -25,7 +25,7 @@ Job = tuple[tuple[float, ...], float, float, int]  # values of the parameters, p
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Seen:
+class SensorView:
     """How a sensor's heights and flow were found, so that the simulated ones are found alike."""
 
     grid: CanonicalGrid
@@ -44,7 +44,7 @@ class Simulation:
     scene: Scene
     parameters: tuple[Parameter, ...]
     presses: tuple[Press, ...]
-    seen: Mapping[str, Seen]
+    sensor_views: Mapping[str, SensorView]
     on_run: Callable[[int, int], None] = lambda done, total: None
 
     def __call__(self, points: Sequence[Point]) -> list[FloatArray]:
@@ -119,11 +119,11 @@ class Simulation:
             for member, ended in enumerate(batch.move(targets)):
                 if isinstance(ended, SimulationDiverged):
                     values, *_, index = jobs[member]
-                    told = ", ".join(
+                    parameters = ", ".join(
                         f"{each.name} {value:.4g}" for each, value in zip(self.parameters, values, strict=True)
                     )
                     raise CannotSimulate(
-                        f"{self.presses[index].name}, moment {moment + 1}, with {told}: {ended}"
+                        f"{self.presses[index].name}, moment {moment + 1}, with {parameters}: {ended}"
                     ) from ended
                 if targets[member] is not None:
                     found[member].append(self._signals(batch, member, self.presses[jobs[member][-1]]))
@@ -147,15 +147,15 @@ class Simulation:
     def _signals(self, batch: Batch, member: int, press: Press) -> list[float]:
         """One number for each channel of the press, as the world is now."""
         world = batch.worlds[member]
-        felt: dict[str, float] = {}
+        readings: dict[str, float] = {}
         for sensor in world.sensors:
             wrench = world.wrench(sensor)
-            felt |= {f"{sensor}.{name}": float(wrench[k]) for k, name in enumerate(("fx", "fy", "fz"))}
-            if sensor in self.seen:
-                seen = self.seen[sensor]
-                surface = surface_map(world.surface(sensor), seen.grid, seen.markers)
-                felt |= shape_signals(sensor, surface.height, surface.flow, seen.valid, seen.grid.pitch)
-        return [felt[name] for name in press.readings]
+            readings |= {f"{sensor}.{name}": float(wrench[k]) for k, name in enumerate(("fx", "fy", "fz"))}
+            if sensor in self.sensor_views:
+                view = self.sensor_views[sensor]
+                surface = surface_map(world.surface(sensor), view.grid, view.markers)
+                readings |= shape_signals(sensor, surface.height, surface.flow, view.valid, view.grid.pitch)
+        return [readings[name] for name in press.readings]
 
 
 def shape_signals(

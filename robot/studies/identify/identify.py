@@ -1,4 +1,4 @@
-"""Materials from recorded presses and squeezes: what is asked, how it is fitted, and whether to believe it."""
+"""Materials from recorded presses and squeezes: the parameters, the fit, and checks of the result."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from tacsim.models.material import elastic_constants
 from tacsim.models.scene import Scene
 
 Kind = Literal["gel", "body"]
-# noise by which the width of a dent counts for nothing in a fit: it tells indenters, not materials [m]
+# noise that removes the width of a dent from a fit: width identifies indenters, not materials [m]
 UNWEIGHTED_NOISE = 0.01
-MOMENTS = 16  # of a press, that are simulated
-MAX_FACTOR = 30.0  # how far stiffness and yield may be from where the fit begins
+MOMENTS = 16  # simulated moments of a press
+MAX_FACTOR = 30.0  # between stiffness or yield and the start of the fit
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Identified:
-    """A fit, what it was made from, and what speaks against it."""
+    """A fit, its data, and findings that contradict it."""
 
     kind: Kind
     scene: Scene  # with the materials found
@@ -39,17 +39,17 @@ class Identified:
     signals: Signals
     findings: tuple[Finding, ...]
     noise: Noise
-    checked: Fit  # with the weights by which it was checked: the width of dents, too
+    checked: Fit  # with the weights of the checks, which include the width of dents
     by_size: FloatArray | None = None  # (m, b) derivative of the signals by the logarithm of the size of each indenter
 
     @property
     def size_error(self) -> float | None:
-        """Standard deviation of the size of an indenter by these presses alone, as a share of it."""
+        """Relative standard deviation of the size of an indenter, from these presses alone."""
         return None if self.by_size is None else indenter_size_error(self.checked, self.by_size)
 
 
 def parameters_of(kind: Kind, scene: Scene) -> tuple[Parameter, ...]:
-    """All that can be asked, beginning at what the scene says."""
+    """All parameters of a kind, starting at the values of the scene."""
     max_nu, lowest, highest = 0.499, 0.01, 5.0  # of the Poisson ratio; of the friction
     if kind == "gel":
         assert scene.indenter is not None
@@ -96,17 +96,22 @@ def identify(
 ) -> Identified:
     """Fits the materials of `scene` to the presses.
 
-    wanted: names of parameters; empty: all. most_moments: of a press, that are simulated. gel_error: standard
-    deviation of the gels' stiffness, as a share of it, carried into the body's intervals. The way is found on coarser
-    meshes, and put right on the scene's own.
+    The fit starts on coarser meshes, and ends on the mesh of the scene.
 
-    Raises NotIdentified, ValueError for a name that is none, CannotSimulate.
+    Args:
+        wanted: names of parameters; empty: all.
+        max_moments: simulated moments of a press.
+        gel_error: relative standard deviation of the gels' stiffness; it widens the intervals of a body.
+
+    Raises:
+        NotIdentified, CannotSimulate.
+        ValueError: a name in `wanted` is no parameter.
     """
     parameters = parameters_of(kind, scene)
     names = [each.name for each in parameters]
     unknown = [name for name in wanted if name not in names]
     if unknown:
-        raise ValueError(f"'{unknown[0]}' is nothing that can be identified of a {kind}; allowed: {', '.join(names)}")
+        raise ValueError(f"'{unknown[0]}' is not a parameter of a {kind}; allowed: {', '.join(names)}")
     parameters = tuple(each for each in parameters if not wanted or each.name in wanted)
     taken = tuple(downsample_press(merge_repeated_readings(press), max_moments) for press in presses)
     signals = signals_of(taken, noise)
@@ -116,7 +121,7 @@ def identify(
     levels = [replace(exact, scene=coarser(start)), exact]
     coarse = levels[0].scene
     layers = [2 * coarse.element_size_of(name) <= scene.gel_of(name).size[2] / 2 for name in scene.sensors]
-    if kind == "body" and all(layers):  # else nothing is left of the gel
+    if kind == "body" and all(layers):  # else the gel has too few layers
         levels.insert(0, replace(exact, scene=coarser(coarse)))
         error *= 2
     width = np.array([name.endswith(".width") for name in signals.channels])[signals.channel]
@@ -140,10 +145,10 @@ def identify(
 
 
 def _with_gel_error(fit: Fit, signals: Signals, error: float) -> Fit:
-    """The fit whose intervals know that the gels' stiffness is known to a share `error` only.
+    """The fit with intervals that include the relative error of the gels' stiffness.
 
-    Forces are homogeneous of degree one in all moduli and stresses, heights of degree zero (quasi-statics), so the
-    derivative by the gels' modulus needs no simulation: it is what the body's leave of the force itself.
+    Forces are homogeneous of degree one in all moduli and stresses, heights of degree zero (quasi-statics). So the
+    derivative by the gels' modulus needs no simulation: it is the force minus the derivatives by the body's moduli.
     """
     force = signals.force[signals.channel]
     by_gel = np.where(force, fit.predicted, 0.0)
@@ -157,7 +162,7 @@ def _with_gel_error(fit: Fit, signals: Signals, error: float) -> Fit:
 
 
 def predict_intervals(identified: Identified, force_noise: float) -> dict[str, float]:
-    """Half the 95 % interval of each parameter (of its free number) with another force sensor: without a new run."""
+    """Half the 95 % interval of each parameter (of its free number) at another force noise [N], without simulation."""
     fit, signals = identified.fit, identified.signals
     force = signals.force[signals.channel]
     scale = np.where(force, force_noise / identified.noise.force, 1.0)

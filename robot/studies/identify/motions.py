@@ -1,4 +1,4 @@
-"""Motions that tell what a material is: scripts of targets for `tacsim run RIG --policy FILE.csv`."""
+"""Motions that identify a material: scripts of targets for `tacsim run RIG --policy FILE.csv`."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ from tacsim.geometry.shapes import bounding_size
 from tacsim.models.scene import Scene
 
 TILT = math.radians(16.0)  # gels whose angles of friction differ by less than this both slip
-REST = 3  # periods before the touch and after it, clear of everything: they tell the zero of the force
-CLEAR = 0.3e-3  # how far a gel goes back from where it touched [m]
-TURN = math.radians(2.0)  # how far a gel is turned in a step
+REST = 3  # periods without contact, before and after it: they give the zero of the force
+CLEAR = 0.3e-3  # distance of a gel from the object before and after contact [m]
+TURN = math.radians(2.0)  # rotation of a gel in a step
 
 MOTIONS_FOR_PARAMETER = {
     "gel": {"youngs_modulus": "press", "poisson_ratio": "press", "friction": "slide"},
@@ -38,10 +38,10 @@ MOTIONS_FOR_PARAMETER = {
     },
 }  # fmt: skip
 MOTION_TEXTS = {
-    "press": "a ball pressed in by a quarter of the gel's thickness, heights recorded (a calibrated sensor)",
+    "press": "a ball pressed by a quarter of the gel's thickness, with heights recorded (a calibrated sensor)",
     "slide": "a gel pressed, then slid sideways until it slips",
-    "squeeze": "the body closed by two fifths of its height, opened a little on the way, and closed on",
-    "tilt": "the upper gel tilted by 16 degrees, slid along the lower gel's face and back along its own: there the "
+    "squeeze": "the body squeezed by two fifths of its height, with a short release during the motion",
+    "tilt": "the upper gel tilted by 16 degrees, slid along the lower gel's face and back along its own: forward the "
     "lower gel slips, back the upper one, unless their angles of friction (arctan of the coefficient) differ by more",
 }
 Row = tuple[float, float, float]  # x, z [m], tilt about y [rad], along the axes of the sensor at the start
@@ -94,13 +94,13 @@ def _dragged(height: float) -> list[Row]:
 
 
 def _tilted(height: float, width: float) -> list[Row]:
-    """Lifted before it is tilted: an edge that turns into the body throws it off the other gel. Eased before it slides:
-    a body pressed as far as it yields shears under the gel instead of slipping."""
-    lift = CLEAR + width / 2 * math.sin(TILT)  # until an edge touches
+    """The gel is lifted before the tilt, because an edge that turns into the body pushes it off the other gel. The
+    pressure is reduced before the slide, because a yielding body shears under the gel instead of slipping."""
+    lift = CLEAR + width / 2 * math.sin(TILT)  # until an edge makes contact
     eased, step = (TILT_DEPTH - TILT_RELEASE) * height, BODY_STEP * height
     turns = [
         (0.0, -lift, TILT), (0.0, TILT_DEPTH * height, TILT), (0.0, eased, TILT), (TILT_SLIDE * height, eased, TILT),
-        (-TILT_BACK * height, eased + (TILT_SLIDE + TILT_BACK) * height * math.tan(TILT), TILT),  # along its own face
+        (-TILT_BACK * height, eased + (TILT_SLIDE + TILT_BACK) * height * math.tan(TILT), TILT),  # along its face
     ]  # fmt: skip
     path = [row for a, b in pairwise(turns) for row in _line(a, b, 1.5 * step if b[0] else step)]
     end = (turns[-1][0], -lift, TILT)
@@ -109,7 +109,7 @@ def _tilted(height: float, width: float) -> list[Row]:
 
 
 def _line(a: Sequence[float], b: Sequence[float], step: float) -> list[Row]:
-    """From a to b in even steps, a left out."""
+    """From a to b in equal steps, without a."""
     count = max(1, math.ceil(max(math.dist(a[:2], b[:2]) / step, abs(b[2] - a[2]) / TURN) - 1e-9))
     found = []
     for k in range(1, count + 1):

@@ -30,22 +30,22 @@ FORCES = ("fx", "fy", "fz")
 
 
 class BadRecording(CalibrationError):
-    """A recording that holds no press or squeeze of this scene."""
+    """A recording does not contain a press or squeeze of this scene."""
 
 
 class Recordings:
-    """Presses read for one scene, and how their sensors saw.
+    """Presses read for one scene, and the views of their sensors.
 
     Args:
-        scene: what is thought to have been pressed; nothing of it but shapes is used here.
-        indenter: where its centre lies in the world, for rigs that carry the sensor to it; None: as the scene puts it.
-        balls: radius of the ball that was pressed in, by the name of the recording [m]; others: the scene's indenter.
+        scene: with the shapes that were pressed; its materials are not used here.
+        indenter: pose of its centre in the world, for rigs that move the sensor to it; None: as in the scene.
+        balls: radius of the pressed ball by name of the recording [m]; other recordings use the scene's indenter.
     """
 
     def __init__(self, scene: Scene, indenter: Pose | None = None, balls: Mapping[str, float] | None = None) -> None:
         self.scene, self._indenter, self._balls = scene, indenter, dict(balls or {})
         self.sensor_views: dict[str, SensorView] = {}
-        self.from_ur = False  # at least one was recorded by a UR's own force sensor
+        self.from_ur = False  # at least one was recorded with the force sensor of a UR arm
         self.scene_sensors = scene.sensors
 
     def require(self, names: Iterable[str]) -> None:
@@ -53,17 +53,19 @@ class Recordings:
         known_names = list(names)
         for name in self._balls:
             if name not in known_names:
-                raise BadRecording(f"no recording '{name}' that a ball belongs to; there are {', '.join(known_names)}")
+                raise BadRecording(
+                    f"no recording '{name}' that a ball belongs to; the recordings are {', '.join(known_names)}"
+                )
 
     def read(self, path: Path) -> Press:
         """Raises BadRecording, EpisodeError."""
-        min_moments = 3  # moments of a press
+        min_moments = 3  # of a press
         press = self._table(path) if path.suffix.lower() == TABLE else self._episode(path)
         if len(press.time) < min_moments:
             raise BadRecording(f"{path}: {len(press.time)} moments; a press needs at least {min_moments}")
         if not any(name.rpartition(".")[2] in FORCES for name in press.readings):
             raise BadRecording(
-                f"{path}: no forces; give a recording with an arm that feels them, or columns fx, fy, fz"
+                f"{path}: no forces; give a recording with an arm that measures them, or columns fx, fy, fz"
             )
         return replace(press, ball=self._balls.get(press.name))
 
@@ -79,9 +81,9 @@ class Recordings:
     # ------------------------------------------------------------------ tables
 
     def _table(self, path: Path) -> Press:
-        """A CSV file: x, y, z [m], fx, fy, fz [N] on the sensor `lower`, in its axes, and perhaps time [s].
+        """Reads a CSV file: x, y, z [m], fx, fy, fz [N] on the sensor `lower`, in its axes, and optionally time [s].
 
-        z: how high the lowest point of the indenter is above the untouched gel, or the gap between the two gels.
+        z: height of the lowest point of the indenter above the untouched gel, or the gap between the two gels.
         """
         columns = _header(path)
         forces = [name for name in FORCES if name in columns]
@@ -104,12 +106,12 @@ class Recordings:
         return Press(_name(path), poses, readings, time, np.ones(len(rows), np.int64))
 
     def _require_metres(self, path: Path, z: FloatArray) -> None:
-        """Raises BadRecording for an indenter below the gel, or gels that meet: no press, or no metres."""
+        """Raises BadRecording for an indenter below the gel, or for gels that intersect: probably not in metres."""
         thickness, lowest = self.scene.gel.size[2], float(z.min())
         if self.scene.indenter is not None and lowest <= -thickness:
             raise BadRecording(
-                f"{path}: z goes down to {lowest:g} m, through the gel of {thickness:g} m; give it in metres, 0 where "
-                "the indenter touches the untouched gel"
+                f"{path}: z goes down to {lowest:g} m, through the gel of {thickness:g} m; give it in metres, 0 at the "
+                "first contact of indenter and gel"
             )
         if self.scene.indenter is None and lowest <= 0.0:
             raise BadRecording(f"{path}: z goes down to {lowest:g} m; it is the gap between the gels, in metres")
@@ -179,7 +181,7 @@ class Recordings:
         self.sensor_views[role] = SensorView(grid, markers, touch.valid)
 
     def _tactile_readings(self, role: str, sensor: str, arm: str | None, now: Observation) -> dict[str, float]:
-        min_depth = 0.2e-3  # dent whose width can be told from noise and mesh [m]
+        min_depth = 0.2e-3  # of a dent whose width is above noise and mesh error [m]
         readings = {}
         if arm is not None and arm in now.arms:
             wrench = now.arms[arm].wrench
@@ -190,7 +192,7 @@ class Recordings:
         if role in self.sensor_views:
             flow = touch.flow if self.sensor_views[role].markers is not None else None
             readings |= shape_signals(role, touch.height, flow, touch.valid, self.sensor_views[role].grid.pitch)
-            if self.scene.indenter is None:  # the width tells an indenter; of a body it hangs on mesh and edges
+            if self.scene.indenter is None:  # the width identifies an indenter; for a body it depends on mesh and edges
                 readings.pop(f"{role}.width", None)
             elif touch.height is not None and np.abs(touch.height[touch.valid]).max(initial=0.0) < min_depth:
                 readings[f"{role}.width"] = math.nan
@@ -208,7 +210,7 @@ class Recordings:
             arms = {role: sensor_arms[sensor] for role, sensor in roles.items()}
             without = [role for role, arm in arms.items() if arm is None]
             if without:
-                raise BadRecording(f"{path}: no arm carried sensor '{without[0]}', so where it was is not known")
+                raise BadRecording(f"{path}: sensor '{without[0]}' was on no arm, so its pose is not known")
             return {
                 role: tuple(each.arms[arm].pose for each in observations)
                 for role, arm in arms.items()
@@ -223,13 +225,13 @@ class Recordings:
         return {"indenter": tuple(found)}
 
     def _place(self, path: Path, original: RigConfig | None) -> Pose:
-        """Where an indenter lies that no arm carries."""
+        """Pose of an indenter that is not on an arm."""
         if self._indenter is not None:
             return self._indenter
         if original is None or original.scene is None or original.clock != "sim":
             raise BadRecording(
-                f"{path}: where the indenter lies is not known; give its centre by --indenter X,Y,Z (the world of the "
-                "rig; `tacsim calibrate touch` finds it)"
+                f"{path}: the position of the indenter is not known; give its centre by --indenter X,Y,Z (the world of "
+                "the rig; `tacsim calibrate touch` finds it)"
             )
         assert self.scene.indenter is not None
         height = self._half_height(path) + INITIAL_GAP
@@ -237,7 +239,7 @@ class Recordings:
 
 
 def _name(path: Path) -> str:
-    """Of a recording: of its file, or of the folder of a run."""
+    """Name of a recording: that of its file, or of the folder of a run."""
     return path.parent.name if path.name == f"episode{EPISODE}" else path.stem
 
 
@@ -250,8 +252,10 @@ def _header(path: Path) -> list[str]:
 
 
 def find_recordings(sources: Sequence[Path]) -> list[Path]:
-    """The files that are named, or that lie in the named folders (a run's episode.mcap, *.csv), each once. Raises
-    BadRecording."""
+    """The named files, and those in the named folders (episode.mcap of a run, *.csv), each once.
+
+    Raises BadRecording.
+    """
     found: list[Path] = []
     for source in sources:
         if source.is_dir():
@@ -276,7 +280,7 @@ def find_recordings(sources: Sequence[Path]) -> list[Path]:
 def read_all(
     recordings: Recordings, paths: Sequence[Path], on_file: Callable[[int, int], None] = lambda done, total: None
 ) -> tuple[Press, ...]:
-    """Every press. Raises BadRecording, also for a ball of a recording that is not there; EpisodeError."""
+    """Reads all presses. Raises BadRecording, also for a ball whose recording is missing; EpisodeError."""
     presses = []
     recordings.require(_name(path) for path in paths)
     for index, path in enumerate(paths):

@@ -1,4 +1,4 @@
-"""Recorded motions run again in simulation, with other materials, many at once."""
+"""Repeats recorded motions in simulation with other materials, many at once."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Job = tuple[tuple[float, ...], float, float, int]  # values of the parameters, p
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SensorView:
-    """How a sensor's heights and flow were found, so that the simulated ones are found alike."""
+    """Grid and markers with which a sensor measured height and flow, to compute the simulated ones in the same way."""
 
     grid: CanonicalGrid
     markers: Markers | None
@@ -35,10 +35,11 @@ class SensorView:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Simulation:
-    """The presses by the simulator: what `estimate` calls.
+    """The simulated presses, as a function that `estimate_materials` calls.
 
     Quasi-static forces are proportional to all moduli and stresses together, and the shape depends on their ratios
-    alone. So a gel under a rigid indenter is run at the stiffness of the scene, and its forces are scaled: exactly.
+    alone. So a gel under a rigid indenter is simulated with the stiffness of the scene, and its forces are scaled,
+    which is exact.
     """
 
     scene: Scene
@@ -130,8 +131,8 @@ class Simulation:
         return [np.array(rows).T for rows in found]
 
     def _scene(self, job: Job) -> tuple[Scene, float]:
-        """The scene of a job; how far the centre of its indenter lies higher than recorded: a larger one has its lowest
-        point where that of the stated one was [m]."""
+        """The scene of a job, and the height of its indenter's centre above the recorded one [m], at which the lowest
+        point of an indenter of another size is in the same place."""
         values, _, size, index = job
         named = {each.name: value for each, value in zip(self.parameters, values, strict=True)}
         scene = scene_with(self.scene, named)
@@ -145,7 +146,7 @@ class Simulation:
         return scene.model_copy(update={"indenter": indenter}), higher
 
     def _signals(self, batch: Batch, member: int, press: Press) -> list[float]:
-        """One number for each channel of the press, as the world is now."""
+        """One number for each channel of the press, in the present state of the world."""
         world = batch.worlds[member]
         readings: dict[str, float] = {}
         for sensor in world.sensors:
@@ -165,12 +166,12 @@ def shape_signals(
     valid: NDArray[np.bool_],
     pitch: float,
 ) -> dict[str, float]:
-    """What is fitted of a sensor's height map (points `pitch` apart) and flow, all in metres: the root mean square of
-    the height; the width of the dent, which is the radius of a circle of the area (sum h^2)^2 / sum h^4; the mean flow.
+    """The fitted signals of a sensor's height map (points `pitch` apart) and flow, all in metres: root mean square of
+    the height; width of the dent, which is the radius of a circle of the area (sum h^2)^2 / sum h^4; mean flow.
 
-    The width hardly depends on the material; it goes with the root of a ball's radius.
+    The width hardly depends on the material; it is proportional to the square root of a ball's radius.
     """
-    contact_share = 0.25  # of the deepest point: what is as deep counts as a dent's width
+    contact_share = 0.25  # of the largest depth; deeper points belong to the dent
     found = {}
     if height is not None:
         square = height[valid].astype(np.float64) ** 2
@@ -227,13 +228,13 @@ def scene_with(scene: Scene, values: Mapping[str, float]) -> Scene:
 
 
 def coarser(scene: Scene) -> Scene:
-    """The scene on a mesh twice as coarse, where each gel still has two layers of elements."""
+    """The scene with a mesh twice as coarse, but at least two layers of elements in each gel."""
     layers = {name: scene.gel_of(name).size[2] / 2 for name in scene.sensors}
     gels = {
-        name: own
-        if own.element_size is None
-        else own.model_copy(update={"element_size": min(2 * own.element_size, layers[name])})
-        for name, own in scene.gels.items()
+        name: gel
+        if gel.element_size is None
+        else gel.model_copy(update={"element_size": min(2 * gel.element_size, layers[name])})
+        for name, gel in scene.gels.items()
     }
     own = {name for name, each in gels.items() if each.element_size is not None}
     element = min([2 * scene.effective_element_size, *(layers[name] for name in scene.sensors if name not in own)])

@@ -82,9 +82,9 @@ def test_a_press_that_does_not_fold_the_gel_says_so() -> None:
 
 
 def test_a_press_too_deep_for_the_gel_says_how_deep_it_came() -> None:
-    with pytest.raises(SimulationDiverged, match=r"; it had come (\d\.\d+) mm deep, of 3\.9 mm") as error:
+    with pytest.raises(SimulationDiverged, match=r"; it had reached (\d\.\d+) mm of 3\.9 mm depth") as error:
         pressed("draft", PressMotion(3.9e-3), Sphere(radius=4e-3))
-    came = float(str(error.value).split("; it had come ")[1].split()[0])
+    came = float(str(error.value).split("; it had reached ")[1].split()[0])
     assert 2.0 < came < 3.9
     pressed("draft", PressMotion(0.9 * came * 1e-3), Sphere(radius=4e-3))
 

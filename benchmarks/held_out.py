@@ -1,8 +1,9 @@
-"""What calibrations know of presses that took no part, sensor by sensor: `python -m benchmarks.held_out DIR`.
+"""Errors of calibrations on left-out presses, for each sensor: `python -m benchmarks.held_out DIR`.
 
-DIR holds the public frames that `references/balls.yaml` names. Prints the table of docs/calibrate.md, a minute a set;
-`--only NAME` measures one. `--spread 50` prints another: how far contact radii differ between calibrations by random
-subsets of the presses, a quarter of an hour a set. `--clicked` prints that of docs/compare.md, in both masks.
+DIR holds the public frames that `references/balls.yaml` names. Prints the table of docs/calibrate.md, in a minute for
+each set; `--only NAME` measures one. `--spread 50` prints the spread of contact radii between calibrations by random
+subsets of the presses, in a quarter of an hour for each set. `--clicked` prints the table of docs/compare.md, in both
+masks.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from calibration.normaliser import normaliser_for_calibration
 from tacsim.interface import Image, TactileFrame
 from tacsim.models.sensor import CanonicalGrid
 
-# Contact MAE, correlation, normals before shadows were known and slopes were those of a surface (decision 10)
+# Contact MAE, correlation, normals before the model had shadows and slopes of a surface (decision 10)
 BEFORE = {
     "THUsight": (6.24, 0.988, 3.0),
     "Taxim GelSight": (5.00, 0.983, 8.0),
@@ -36,16 +37,16 @@ BEFORE = {
     "DIGIT": (8.68, 0.965, 10.8),
 }
 KINDS = (("contact MAE [grey levels]", "error", 2), ("correlation", "correlation", 3), ("normals [deg]", "angle", 1))
-TIMES = 9  # that a picture is normalised for its time
-# Sets of one press: nothing can be left out. Their folders; ball radius [m]; row, column, and pixel pitch [mm]
+TIMES = 9  # repetitions to measure the time of a picture
+# Sets of one press, of which none can be left out. Their folders; ball radius [m]; row, column, and pixel pitch [mm]
 DARK, DARK_BALL, DARK_SCALE = "9dtact_sensor_*", 4e-3, "camera_calibration_position_scale.npy"
-DARK_BEFORE = "-1.4 to 2.2 mm"  # heights that were found of a dent of 2.2 mm
+DARK_BEFORE = "-1.4 to 2.2 mm"  # heights found for a dent of 2.2 mm
 SUBSETS = (5, 8, 15)  # presses
-MAX_RADIUS_ERROR = 0.05  # of a radius: so far off is another solution, not the same one less exactly
+MAX_RADIUS_ERROR = 0.05  # relative error of a radius; a larger one means another solution of the fit
 
 
 def rows_of(folder: Path, of: BallSet) -> list[str]:
-    """Of one set, a row a figure. Raises BadData."""
+    """Rows of one set, one for each figure. Raises BadData."""
     fit, _, cpu = balls.calibrated(folder, of)
     reference, frames = balls.read_balls(folder, of)
     picture = picture_time(fit, of, reference, frames[0][1])
@@ -76,7 +77,7 @@ def picture_time(fit: LightFit, of: BallSet, reference: Image, image: Image) -> 
 
 
 def dark_row(home: Path) -> str:
-    """Of the one press of a sensor whose light tells depth by darkness. Raises BadFrames, BadData."""
+    """The row of the one press of a sensor whose light shows depth as darkness. Raises BadFrames, BadData."""
     reference = read_picture(home / "depth_calibration_ref.png")
     begun = process_time()
     pitch = 1e-3 * float(np.ravel(np.load(home / DARK_SCALE, allow_pickle=False))[2])
@@ -85,7 +86,7 @@ def dark_row(home: Path) -> str:
     )
     cpu = process_time() - begun
     if fit.darkness is None:
-        return row("9DTact", "height [mm]", DARK_BEFORE, "its light was taken for one that tells direction", "")
+        return row("9DTact", "height [mm]", DARK_BEFORE, "its light was classified as one with direction", "")
     (press,) = fit.presses
     depth, _ = DarknessSlopes(fit.darkness, press.shape, 1.0).depth(press.change.astype(np.float32))
     v, u = np.mgrid[: press.shape[0], : press.shape[1]].astype(np.float64)
@@ -101,13 +102,13 @@ def dark_row(home: Path) -> str:
 class Subset:
     """A calibration by some of the presses of a set."""
 
-    scale: float  # of its contact radii, against those of the same presses by all: mean logarithm of their ratio
-    estimated_deviation: float  # standard deviation of that scale, as it tells by itself
-    shadows: bool  # it found some
+    scale: float  # of its contact radii, relative to those by all presses: mean logarithm of their ratio
+    estimated_deviation: float  # standard deviation of that scale, estimated by the calibration
+    shadows: bool  # True if it found shadows
 
 
 def subsets_of(folder: Path, of: BallSet, presses: int, count: int) -> list[Subset]:
-    """Calibrations by random subsets; one that is refused is missing. Raises BadData."""
+    """Calibrations by random subsets, without refused ones. Raises BadData."""
     fit, _, _ = balls.calibrated(folder, of)
     radii = {press.name: press.circle.radius for press in fit.presses}
     reference, frames = balls.read_balls(folder, of)
@@ -127,7 +128,7 @@ def subsets_of(folder: Path, of: BallSet, presses: int, count: int) -> list[Subs
 
 
 def spread_row(folder: Path, of: BallSet, presses: int, count: int) -> str:
-    """Of one set and size of subsets. Raises BadData."""
+    """The row of one set and size of subsets. Raises BadData."""
     subsets = subsets_of(folder, of, presses, count)
     fit, _, _ = balls.calibrated(folder, of)
     name, cells = f"{of.name}, {len(fit.presses)} presses", [str(presses), f"{len(subsets)} of {count}"]
@@ -147,7 +148,7 @@ def spread_row(folder: Path, of: BallSet, presses: int, count: int) -> str:
 
 
 def clicked_row(folder: Path, of: BallSet) -> str:
-    """Of one set, contact MAE [grey levels] in both masks. Raises BadData."""
+    """The row of one set: contact MAE [grey levels] in both masks. Raises BadData."""
     fit, _, _ = balls.calibrated(folder, of)
     errors = clicked_errors(folder, of)
     refined = float(np.mean([press.error for press in fit.predictions]))
@@ -161,11 +162,13 @@ def row(*cells: str) -> str:
 def main(
     folder: Path,
     only: Annotated[str, typer.Option(help="Measure this set alone.")] = "",
-    spread: Annotated[int, typer.Option(min=0, help="Calibrate by so many random subsets of each set instead.")] = 0,
-    presses: Annotated[list[int], typer.Option(min=1, help="In a subset.")] = list(SUBSETS),  # noqa: B006
-    clicked: Annotated[bool, typer.Option(help="Contact MAE in circles that a person clicked, too.")] = False,
+    spread: Annotated[
+        int, typer.Option(min=0, help="Number of random subsets of each set to calibrate by instead.")
+    ] = 0,
+    presses: Annotated[list[int], typer.Option(min=1, help="Presses in a subset.")] = list(SUBSETS),  # noqa: B006
+    clicked: Annotated[bool, typer.Option(help="Also contact MAE in circles clicked by hand.")] = False,
 ) -> None:
-    """Prints the table of what is known of left-out presses, or of how far contact radii differ between subsets."""
+    """Prints the table of errors on left-out presses, or of the spread of contact radii between subsets."""
     available = [of for of in balls.read_sets(folder) if only in of.name and balls.has_frames(folder, of)]
     if spread:
         heads = (

@@ -1,5 +1,4 @@
-"""Clay led to and fro, squeezed, sheared and rolled: how much of its force the cycles take, and how its volume ratios
-spread."""
+"""Clay in cycles of squeeze, shear and rolling: the change of its force, and the range of its volume ratios."""
 
 from __future__ import annotations
 
@@ -16,17 +15,17 @@ from tacsim.interface import FloatArray, Pose
 from tacsim.models.scene import Body, Box, Cylinder, Scene, Shape, Sphere
 from tacsim.physics.world import World, make_world
 
-SHAKEDOWN_CYCLES = 20  # cycles after which a body should have shaken down
+SHAKEDOWN_CYCLES = 20  # cycles after which the force should be constant
 
 
 @dataclass(frozen=True)
 class Cycle:
-    """A body squeezed, then led to and fro: the upper sensor by `way` [m], the lower one by as much the other way."""
+    """A body squeezed, then moved in cycles: the upper sensor by `displacement` [m], the lower one by its negative."""
 
     geometry: Shape
-    squeezed: float  # of both sensors together, from touch [m]
+    squeezed: float  # by both sensors together, from first contact [m]
     displacement: tuple[float, float, float]
-    pieces: int = 3  # motions of each way, where they flow
+    pieces: int = 3  # motions in each direction, if they flow
 
 
 CYCLES = {
@@ -37,8 +36,9 @@ CYCLES = {
 
 
 def cycles(preset: str, count: int, flow: bool, repeat: int) -> list[Measurement]:
-    """A body moved to and fro between two gels. Its force at the end of the way there must stay as it was in the first
-    cycle, as in finite elements (2.934, 2.933, 2.933 N of the cylinder), and its elastic volume ratios near 1."""
+    """A body moved in cycles between two gels. Its force at the end of the forward motion must stay equal to that of
+    the first cycle, as in finite elements (2.934, 2.933, 2.933 N for the cylinder), and its elastic volume ratios near
+    1."""
     return [_row(preset, what, cycle, count, flow) for what, cycle in CYCLES.items()]
 
 
@@ -69,13 +69,13 @@ def _row(preset: str, what: str, cycle: Cycle, count: int, flow: bool) -> Measur
         timing, abs(forces[-1] / forces[0] - 1) * 100, "% of the first cycle's force", "a body that has shaken down",
         f"{what}, {count} cycles, {'flowing' if flow else 'settled'}", substeps,
         {"since_early_percent": (forces[-1] / early - 1) * 100, "first_newton": forces[0],
-         "smallest_volume": min(least for least, _ in volumes), "largest_volume": max(most for _, most in volumes)},
+         "smallest_volume": min(small for small, _ in volumes), "largest_volume": max(large for _, large in volumes)},
         f"{(early / forces[0] - 1) * 100:+.1f} % in the first {min(SHAKEDOWN_CYCLES, count)}",
     )  # fmt: skip
 
 
 def _targets(world: World, by: FloatArray) -> dict[str, Pose]:
-    """Of both sensors, led by so much [m], the lower one the other way."""
+    """Targets of both sensors: the upper one moved by `by` [m], the lower one by -`by`."""
     targets = {}
     for name, sign in (("upper", 1.0), ("lower", -1.0)):
         pose = world.pose(name)

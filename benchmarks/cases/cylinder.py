@@ -1,4 +1,4 @@
-"""A clay cylinder between two gels, squeezed and cycled, beside a solver that shares nothing with ours."""
+"""A clay cylinder between two gels, squeezed and cycled, compared with an independent solver."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from tacsim.physics.failure.diagnosis import particle_volumes
 from tacsim.physics.world import World, make_world
 
 HEIGHT = 10.0  # [mm]
-LOW, HIGH = 2.0, 2.3  # closed in turn [mm]
-CYCLES = (1, 2, 5, 10)  # whose force is shown
+LOW, HIGH = 2.0, 2.3  # compressions of a cycle [mm]
+CYCLES = (1, 2, 5, 10)  # with a row for their force
 FLOWING = (2, 200, 700)
-STEPS = 3  # that flow from LOW to HIGH
+STEPS = 3  # flowing motions from LOW to HIGH
 
 
 def squeezed(resolution: str, repeat: int) -> list[Measurement]:
-    """A clay cylinder of 10 x 10 mm between gels, closed by 1, 2 and 3 mm from touch, each settled."""
+    """A clay cylinder of 10 x 10 mm between gels, closed by 1, 2 and 3 mm from first contact, each settled."""
     world, rows = _world(resolution), []
     for by, (force, height) in truth.CYLINDER.items():
         timing, settled = once(partial(_close, world, by))
@@ -47,8 +47,8 @@ def cycled(resolution: str, repeat: int) -> list[Measurement]:
 
 
 def flowing_cycles(resolution: str, repeat: int) -> list[Measurement]:
-    """The cylinder led from 2.0 to 2.3 mm and back in flowing steps of 0.1 mm: what the force at 2.3 mm loses, and how
-    far an elastic volume ratio is from one."""
+    """The cylinder moved from 2.0 to 2.3 mm and back in flowing steps of 0.1 mm: the change of the force at 2.3 mm, and
+    the largest difference of an elastic volume ratio from one."""
     world, rows, second = _world(resolution), [], 0.0
     _close(world, HIGH)
     path = np.linspace(HIGH, LOW, STEPS + 1)[1:]
@@ -79,9 +79,9 @@ def _world(resolution: str) -> World:
 
 
 def _close(world: World, by: float, *, flow: bool = False) -> bool:
-    """Leads the sensors to where they are `by` [mm] nearer to one another than at first touch; whether that settled."""
-    apart = float((world.pose("upper").position - world.pose("lower").position)[2])
-    return close(world, apart - (HEIGHT - by) * 1e-3, flow=flow).settled
+    """Moves the sensors until they are `by` [mm] closer than at first contact; True if that settled."""
+    distance = float((world.pose("upper").position - world.pose("lower").position)[2])
+    return close(world, distance - (HEIGHT - by) * 1e-3, flow=flow).settled
 
 
 def _force(world: World) -> float:

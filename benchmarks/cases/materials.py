@@ -1,4 +1,4 @@
-"""Materials group: laws, elements and transfers against closed forms, and what a substep costs."""
+"""Materials group: laws, elements and transfers against closed forms, and the cost of a substep."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from tacsim.models.material import BodyMaterial, GelMaterial
 from tacsim.models.scene import Body, Box, Gel, Scene
 from tacsim.physics.move import MoveStats
 
-RIGID = GelMaterial(youngs_modulus=100e6, poisson_ratio=0.45)  # gels as plates: they give 1 um
+RIGID = GelMaterial(youngs_modulus=100e6, poisson_ratio=0.45)  # gels as plates: they deform by 1 um
 FreeAxes = tuple[float, float, float]  # by axis: 0 forbids motion, 1 allows it
-HALF_PERIODS = 4  # of a standing wave that are timed
+HALF_PERIODS = 4  # of a standing wave that are measured
 
 
 def yield_scene(side: float, spacing: float, gel_element: float) -> Scene:
@@ -69,7 +69,7 @@ def yield_plateau(side: float, spacing: float, repeat: int) -> list[Measurement]
 
 
 def plasticine_alone(side: float, spacing: float, repeat: int) -> list[Measurement]:
-    """A free cube of clay, drawn apart until it yields: the plasticine's own substep, without gels and contact."""
+    """A free cube of clay, stretched until it yields: the substep of plasticine alone, without gels and contact."""
     from benchmarks.truth.blocks import BodyBlock
     from tacsim.geometry.shapes import lattice_particles
     from tacsim.physics.body.plasticine import body_params
@@ -97,13 +97,13 @@ def plasticine_alone(side: float, spacing: float, repeat: int) -> list[Measureme
 
 def textbook_plateau(side: float, spacing: float, repeat: int) -> list[Measurement]:
     """The same cube by textbook MLS-MPM: SVD, atomics, plates of grid nodes."""
-    from benchmarks.truth.textbook import yield_plateau as by_the_book  # compiles nothing before it is asked for
+    from benchmarks.truth.textbook import yield_plateau as by_the_book  # compiles kernels when it is imported
 
     return by_the_book(side * 1e3, spacing * 1e3, repeat)
 
 
 def gel_step(repeat: int) -> list[Measurement]:
-    """Two standard gels and next to no body: 0.2 mm of motion on a tiny, elastic cube."""
+    """Two standard gels and a very small body: 0.2 mm of motion on a tiny elastic cube."""
     from tacsim.physics.worlds.hybrid import HybridWorld
 
     scene = Scene.model_validate(
@@ -174,7 +174,7 @@ def simple_shear(repeat: int) -> list[Measurement]:
         shear_points(steps, increment, strain, flow, tau, config.mu, config.bulk, config.limit, config.hardening)
         return tau
 
-    timing, tau = timed(run, 1, warm=partial(run, 1))  # seconds that nobody compares
+    timing, tau = timed(run, 1, warm=partial(run, 1))  # these seconds are not compared
     b, flow, exact = np.eye(3), np.zeros(()), np.zeros((3, 3))
     f = np.eye(3)
     f[0, 1] = increment
@@ -224,7 +224,7 @@ def gel_wave(element: float, repeat: int) -> list[Measurement]:
 
 
 def body_wave(spacing: float, repeat: int) -> list[Measurement]:
-    """Standing half wave in a free block, other directions held: frequency c / 2L."""
+    """Standing half wave in a free block, with the other directions fixed: frequency c / 2L."""
     from benchmarks.truth.blocks import BodyBlock
     from tacsim.geometry.shapes import lattice_particles
     from tacsim.physics.body.plasticine import body_params
@@ -250,13 +250,13 @@ def body_wave(spacing: float, repeat: int) -> list[Measurement]:
                 body.advance(1, free)
             return signal
 
-        timing, signal = timed(run, 1, warm=partial(run, 1))  # seconds that nobody compares
+        timing, signal = timed(run, 1, warm=partial(run, 1))  # these seconds are not compared
         rows.append(_wave_row(timing, half_period(signal) * dt, length / speed, f"plasticine, {name}", count))
     return rows
 
 
 def half_period(signal: FloatArray) -> float:
-    """Mean distance of the first zero crossings of a signal [samples]. Raises ValueError when there are too few."""
+    """Mean distance of the first zero crossings of a signal [samples]. Raises ValueError if there are too few."""
     at = np.flatnonzero(np.sign(signal[:-1]) * np.sign(signal[1:]) < 0)
     if len(at) <= HALF_PERIODS:
         raise ValueError(f"the wave crossed zero {len(at)} times, {HALF_PERIODS + 1} are needed: it does not oscillate")

@@ -1,4 +1,4 @@
-"""Rigid indenters beside a solver that shares nothing with ours: balls, punches, twists, slides."""
+"""Rigid indenters compared with an independent solver: balls, punches, twists, slides."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ RESOLUTIONS = ("learn", "draft", "standard", FINE)
 
 
 def balls(resolution: str, repeat: int) -> list[Measurement]:
-    """Balls pressed without friction, and deep with it: force and contact radius, as `tacsim press` gives them."""
+    """Balls pressed without friction, and deep with friction: force and contact radius, as in `tacsim press`."""
     rows = []
     for (radius, depth), (force, contact) in truth.BALLS.items():
         what = f"ball R {radius:g} mm, {depth:g} mm deep"
@@ -37,8 +37,8 @@ def balls(resolution: str, repeat: int) -> list[Measurement]:
 
 
 def punches(resolution: str, repeat: int) -> list[Measurement]:
-    """Flat punches with sharp edges, 0.1 mm deep: force without friction, and the moment of one that sticks and turns
-    by a degree."""
+    """Flat punches with sharp edges, 0.1 mm deep: force without friction, and the moment of a sticking punch that is
+    twisted by a degree."""
     rows, depth, angle = [], 0.1e-3, math.radians(1.0)
     for radius, force in truth.PUNCHES.items():
         shape = Cylinder(radius=radius * 1e-3, height=4e-3)
@@ -69,7 +69,7 @@ def comparison_row(
     timing: Timing, what: str, unit: str, found: float, true: float, note: str = "",
     figures: Mapping[str, float] | None = None,
 ) -> Measurement:  # fmt: skip
-    """A row of the table that pages/oracles.py makes: what we find and what is true, in `unit`."""
+    """A row of the table of pages/oracles.py: the value found and the true one, in `unit`."""
     both = {f"found_{unit}": float(found), f"truth_{unit}": true, **(figures or {})}
     return Measurement(timing, abs(found / true - 1) * 100, "%", truth.WORDS, what, figures=both, note=note)
 
@@ -81,7 +81,7 @@ def _press(
     from tacsim.config import load_sensor
 
     fineness = {"element_size": 0.25e-3} if resolution == FINE else {"preset": resolution}
-    sharp = 0.0 if isinstance(shape, Cylinder) else None  # as those of the solver
+    sharp = 0.0 if isinstance(shape, Cylinder) else None  # as in the solver
     indenter = Indenter(geometry=shape, friction=friction, edge_radius=sharp)
     scene = Scene.model_validate({"body": None, "indenter": indenter, **fineness})
     return once(lambda: press(scene, load_sensor("ideal"), PressMotion(depth, (slide, 0.0), twist)))

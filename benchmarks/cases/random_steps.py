@@ -1,4 +1,4 @@
-"""Random actions of the squeeze: what a step costs and how wrong its force is, settled and flowing."""
+"""Random actions of the squeeze: cost of a step and error of its force, settled and flowing."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from tacsim.physics.world import World, make_world
 
 # first squeeze from touch [m]; number of steps; largest motion of one sensor [m], that of the squeeze task
 START, ACTIONS, MAX_STEP = 1.5e-3, 20, 0.2e-3
-FLOW_MACHS = {"draft": (0.5, 1.0, 2.0)}  # times the default, which alone is measured elsewhere
+FLOW_MACHS = {"draft": (0.5, 1.0, 2.0)}  # times the default; other presets use only the default
 
 
 def random_steps(preset: str, repeat: int) -> list[Measurement]:
-    """Twenty steps in a row, each sensor along its z by up to 0.2 mm either way, at random: force after each against
-    the slow limit through the same poses, as a share of the mean force; settled, and flowing, draft at three speeds."""
+    """Twenty steps in a row, each sensor along its z by a random -0.2 to 0.2 mm: force after each step against the slow
+    limit through the same poses, as a share of the mean force; settled, and flowing, at draft with three speeds."""
     begin, truth = _slow(preset)
     usual = squeeze_scene(preset, "hybrid").flow_mach
     rows = [_row(preset, begin, truth, "settled", flow=False)]
@@ -38,8 +38,8 @@ def _steps() -> FloatArray:
 
 
 def _slow(preset: str) -> tuple[Mapping[str, NDArray[Any]], FloatArray]:
-    """The squeezed state, and the mean force of both sensors [N] after each step, so slow that speed plays no part. The
-    forces take minutes at `standard`; kept."""
+    """The squeezed state, and the mean force of both sensors [N] after each step at a speed without influence. The
+    forces take minutes at `standard`; they are cached."""
     scene = squeeze_scene(preset, "hybrid", **SLOW)
     world = world_in_contact(scene)
     _move(world, np.full(2, START / 2), flow=False)
@@ -53,7 +53,7 @@ def _slow(preset: str) -> tuple[Mapping[str, NDArray[Any]], FloatArray]:
 
 
 def _move(world: World, by: FloatArray, *, flow: bool) -> int:
-    """Both sensors along their z, which points into the body, by so much [m]; returns the substeps."""
+    """Moves both sensors along their z, which points into the body, by `by` [m]; returns the substeps."""
     targets = {}
     for name, sign, length in zip(("lower", "upper"), (1.0, -1.0), by, strict=True):
         pose = world.pose(name)

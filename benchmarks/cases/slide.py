@@ -1,4 +1,4 @@
-"""Press group, slides: an indenter pressed on one gel is dragged over it; against Coulomb's law and slow motions."""
+"""Press group, slides: an indenter pressed on one gel slides over it, against Coulomb's law and slow motions."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ if TYPE_CHECKING:
     from tacsim.physics.worlds.press import PressWorld
 
 
-SLIDE, SLIDES = 0.5e-3, 20  # a plate slides so far at a time [m], and so often at most
-SLIDE_SLOW = {"draft": 0.001, "standard": 0.002}  # Mach number at which speed plays no part
+SLIDE, SLIDES = 0.5e-3, 20  # length of one slide of a plate [m], and maximum number of slides
+SLIDE_SLOW = {"draft": 0.001, "standard": 0.002}  # Mach number at which speed has no influence
 STAYS = 1e-3  # relative change of the force ratio in one slide
 
 
 def sliding_force(element: float, repeat: int) -> list[Measurement]:
-    """A plate wider than the gel slides over it until the ratio of forces stays: then it is the coefficient.
+    """A plate wider than the gel slides over it until the ratio of forces is constant; it then equals the coefficient.
 
-    No edge ploughs, but the gel shears first, and its parts slip one after the other.
+    There is no edge in the contact. First the gel shears, then its parts slip one after the other.
     """
     friction, depth = 0.3, 0.3e-3
     scene = press_scene(Box(size=(50e-3, 30e-3, 4e-3)), element, friction=friction, tolerance=1e-3)
@@ -55,8 +55,8 @@ def sliding_force(element: float, repeat: int) -> list[Measurement]:
 
 
 def slid_ball(preset: str, repeat: int) -> list[Measurement]:
-    """A ball R 4 mm, 0.5 mm deep in the shipped gel, dragged along it by 0.5 mm, so that a part of the contact still
-    sticks: drag over normal force."""
+    """A ball R 4 mm, 0.5 mm deep in the shipped gel, slid by 0.5 mm, so that a part of the contact still sticks: drag
+    over normal force."""
     settled = {"mach": SLIDE_SLOW[preset], "tolerance": 1e-3, "max_substeps": 500}
     rows = []
     for friction in (0.3, 0.6, 1.0, 1.5):
@@ -69,7 +69,7 @@ def slid_ball(preset: str, repeat: int) -> list[Measurement]:
 
 
 def slid_edges(preset: Preset, repeat: int) -> list[Measurement]:
-    """A cylinder R 2 mm and a box of 4 mm, 0.3 mm deep, dragged by 2 mm: sharp, and as round as the mesh carries."""
+    """A cylinder R 2 mm and a box of 4 mm, 0.3 mm deep, slid by 2 mm: sharp, and as round as the mesh resolves."""
     settled = {"mach": SLIDE_SLOW[preset], "tolerance": 1e-3, "max_substeps": 500}
     rows = []
     for shape in (Cylinder(radius=2e-3, height=4e-3), Box(size=(4e-3, 4e-3, 4e-3))):
@@ -84,7 +84,7 @@ def slid_edges(preset: Preset, repeat: int) -> list[Measurement]:
 
 
 def slid_in(preset: str, repeat: int) -> list[Measurement]:
-    """Pressed in while they slide, in one oblique motion from above the gel: drag over normal force."""
+    """Indenters pressed in one oblique motion from above the gel: drag over normal force."""
     settled = {"mach": SLIDE_SLOW[preset], "tolerance": 1e-3, "max_substeps": 500}
     rows = []
     for shape, friction, displacement in (
@@ -102,7 +102,7 @@ def slid_in(preset: str, repeat: int) -> list[Measurement]:
 
 
 def slid_turned(preset: str, repeat: int) -> list[Measurement]:
-    """Dragged by 1.3 mm, 0.5 mm deep, then by 0.7 mm square to that: how far the drag's vector is from a slow one's."""
+    """Slid by 1.3 mm, 0.5 mm deep, then by 0.7 mm at right angles: difference of the drag vector from slow slides."""
     settled = {"mach": SLIDE_SLOW[preset], "tolerance": 1e-3, "max_substeps": 500}
     rows = []
     for shape, friction in (
@@ -140,7 +140,7 @@ def _turned(preset: str, indenter: Indenter, **settling: float) -> tuple[FloatAr
 def _drag_in(
     preset: str, indenter: Indenter, displacement: tuple[float, float, float], **settling: float
 ) -> tuple[float, MoveStats]:
-    """Drag over normal force after one motion by so much from where the indenter touches [m]."""
+    """Drag over normal force after one motion by `displacement` [m] from first contact."""
     from tacsim.physics.worlds.press import PressWorld
     from tacsim.physics.worlds.tuning import INITIAL_GAP
 
@@ -154,7 +154,7 @@ def _drag_in(
 
 
 def _drag(preset: str, indenter: Indenter, deep: float, length: float, **settling: float) -> tuple[float, MoveStats]:
-    """Drag over normal force after a slide of so much, so deep [m]."""
+    """Drag over normal force after a slide of `length`, `deep` in the gel [m]."""
     scene = Scene.model_validate(
         {
             "body": None,

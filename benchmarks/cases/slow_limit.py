@@ -20,17 +20,17 @@ from tacsim.physics.world import World, make_world
 # Dough opened by 0.3 mm still changes by 3 % from Mach 0.004 to 0.002
 SLOW = {"mach": 0.002, "tolerance": 1e-3, "max_substeps": 6000}
 MATERIALS = ("modelling-clay", "soft-clay", "dough", "cold-plasticine", "seed")
-# Both sensors nearer to one another than at touch, one after the other [mm]
+# Displacement of both sensors together from first contact, in sequence [mm]
 STATES = {"closed by 0.5 mm": 0.5, "closed by 1.5 mm": 1.5, "closed by 3 mm": 3.0, "opened to 2.7 mm": 2.7}
-DRAGGED = 0.6  # closed by so much before a drag [mm]
+DRAGGED = 0.6  # displacement before a drag [mm]
 GELS = (0.145, 0.4, 1.0)  # Young's moduli [MPa]
-DRAG, DRAGS = 1e-3, 3  # of the upper sensor along x [m], so many times
-UNLOADED = 0.02  # share of the largest force of a row of states that errors are relative to at least
+DRAG, DRAGS = 1e-3, 3  # of the upper sensor along x [m], and number of drags
+UNLOADED = 0.02  # errors are relative to the force, but at least to this share of the largest force of the states
 
 
 def shipped_bodies(preset: str, repeat: int) -> list[Measurement]:
-    """A cube of each shipped material, closed on by 0.5, 1.5 and 3 mm from touch and opened to 2.7 mm: force after each
-    motion, against the slow limit."""
+    """A cube of each shipped material, closed by 0.5, 1.5 and 3 mm from first contact and opened to 2.7 mm: force after
+    each motion, against the slow limit."""
     rows = []
     for material in MATERIALS:
         truth = _slow(f"bodies-{material}-{preset}", partial(_squeezed, material, preset))
@@ -71,7 +71,7 @@ def _touched(scene: Scene) -> World:
 
 
 def _steps() -> list[tuple[str, float]]:
-    """Each state, and how far the sensors come nearer to reach it [m]."""
+    """Each state, and the displacement of the sensors from the state before [m]."""
     before = [0.0, *STATES.values()]
     return [(state, 1e-3 * (by - last)) for (state, by), last in zip(STATES.items(), before, strict=False)]
 
@@ -109,7 +109,7 @@ def _dragged(modulus: float, preset: str) -> list[float]:
 
 
 def _slow(name: str, compute: Any) -> list[float]:
-    """Forces [N] so slow that speed plays no part. Minutes at `standard`; kept."""
+    """Forces [N] at a speed without influence. They take minutes at `standard`, and are cached."""
     return cached(f"slow-limit-{name}", f"{SLOW} {STATES} {DRAGGED} {DRAG} {DRAGS}", compute)
 
 

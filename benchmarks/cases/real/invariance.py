@@ -1,5 +1,5 @@
-"""Real group: would a policy notice that its frames are simulated? Presses of our gel beside the same presses of a real
-one, each seen through a calibration by other presses.
+"""Real group: can a policy distinguish simulated from real frames? Simulated presses are compared with the same real
+presses, both through a calibration by other presses.
 """
 
 from __future__ import annotations
@@ -29,22 +29,23 @@ if TYPE_CHECKING:
 CASE = "invariance"
 FOLDS = 5
 MIN_PRESSES = 10
-THICKNESS = (2e-3, 8e-3)  # of a gel that its slopes tell [m]
+THICKNESS = (2e-3, 8e-3)  # range of a thickness that is estimated from slopes [m]
 
 
 def invariance(
     folder: Path, of: BallSet, gel_size: tuple[float, float, float] | None, repeat: int
 ) -> list[Measurement]:
-    """Real presses beside the same by our gel, in five folds: distances, a classifier, drift. Seconds: of a press.
+    """Real presses and the same simulated presses, in five folds: distances, a classifier, drift. Seconds: of a press.
 
-    Whole presses are left out, of the calibration and of the classifier. `gel_size`: None: of a gel that is not known,
-    as large as the picture and as thick as the slopes round the contacts say; its variants begin with the set's name.
+    Whole presses are left out, of the calibration and of the classifier. gel_size: None for an unknown gel, which gets
+    the size of the picture and the thickness from the slopes around the contacts; its variants begin with the set's
+    name.
 
-    *pictures*: our surface is found in our picture, as the real one in its own. *surfaces*: our simulation says it.
+    *pictures*: our surface is found in our picture, as the real one in its own. *surfaces*: that of the simulation.
     """
     reference, frames = balls.read_balls(folder, of)
     if len(frames) < MIN_PRESSES:
-        raise BadData(f"{of.name}: {len(frames)} presses; {MIN_PRESSES} are the least that say something")
+        raise BadData(f"{of.name}: {len(frames)} presses; at least {MIN_PRESSES} are needed")
     named = "" if gel_size is not None else f"{of.name}, "
     gel_size = _gel_of(folder, of, reference) if gel_size is None else gel_size
     wall, cpu, pressed, notes = 0.0, 0.0, 0, []
@@ -64,7 +65,7 @@ def invariance(
 
 
 def _gel_of(folder: Path, of: BallSet, reference: Image) -> tuple[float, float, float]:
-    """Size of a gel of which only pictures are known [m]. Raises BadData."""
+    """Estimated size of a gel from its pictures [m]. Raises BadData."""
     fit, _, _ = balls.calibrated(folder, of)
     thickness = float(np.clip(fit.thickness * of.pixel_pitch, *THICKNESS))
     across, down = (round(length * of.pixel_pitch, 3) for length in (reference.shape[1], reference.shape[0]))
@@ -120,8 +121,8 @@ def _rows(
 def _fold(
     of: BallSet, reference: Image, train: Frames, test: Frames, gel_size: tuple[float, float, float]
 ) -> tuple[dict[str, Comparison], Calibration, tuple[float, float], list[str]]:
-    """Left-out presses by our gel, compared with the real ones, by source; the calibration that has not seen them; wall
-    and processor time of pressing; what to look at."""
+    """Simulated left-out presses compared with the real ones, by source; the calibration without them; wall and
+    processor time of the simulation; notes."""
     from calibration.bundle import read_sensor_model, write_bundle
     from calibration.compare.compare import compare_frames
     from calibration.errors import BadFrames
@@ -151,7 +152,7 @@ def _fold(
 
 
 def cases(folder: Path) -> tuple[Case, ...]:
-    """The presses of the sensor whose gel is known, and of every other set with enough of them; says what is missing.
+    """Cases of the sensor with a known gel, and of every other set with enough presses; missing frames are reported.
     Raises ConfigError."""
     labels, resolution = read_labels(folder), f"{FOLDS} folds, h {ELEMENT * 1e3:g} mm"
     others = tuple(

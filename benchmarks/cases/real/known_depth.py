@@ -1,5 +1,5 @@
-"""Real group: balls pressed to a known depth, simulated from that depth alone, and seen through the light of a
-calibration by other presses; pictures and heights against the real ones.
+"""Real group: balls pressed to a known depth, simulated from that depth alone, and rendered with a calibration by other
+presses; pictures and heights against the real ones.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 
 CASE = "known_depth"
 GRID = CanonicalGrid()
-REACH = 1.3  # the mask of a picture reaches this far, in radii of the cap that the rest plane cuts off the ball
-HEIGHT_REACH = 1.5  # heights are compared this far from the middle, in radii of Hertz' contact
+REACH = 1.3  # radius of the mask of a picture, in radii of the cap of the ball below the rest plane
+HEIGHT_REACH = 1.5  # radius in which heights are compared, in radii of the Hertz contact
 
 
 def light_of(folder: Path, labels: PressLabels) -> BallSet:
@@ -47,7 +47,7 @@ def light_of(folder: Path, labels: PressLabels) -> BallSet:
 
 
 def known_depth(folder: Path, ball: float, repeat: int) -> list[Measurement]:
-    """A ball pressed to a real press's depth, in calibrated light: picture and height. Seconds: to press and draw."""
+    """A ball pressed to a real press's depth, in calibrated light: picture and height. Seconds: press and picture."""
     labels = read_labels(folder)
     of = light_of(folder, labels)
     reference, frames = read_frames(folder, labels)
@@ -61,7 +61,7 @@ def known_depth(folder: Path, ball: float, repeat: int) -> list[Measurement]:
         settled = press_to(world, ball, press.depth).settled
         image = camera.see(place_surface(world.surface("lower"), real.x, real.y, camera.model))
         timing = Timing((perf_counter() - wall,), process_time() - cpu)
-        ours = _circle(press, image, reference, labels)  # light pulls it aside, as it does the real one
+        ours = _circle(press, image, reference, labels)  # light shifts it in the same way as the real one
         x, y = 2 * real.x - ours.x, 2 * real.y - ours.y
         surface = place_surface(world.surface("lower"), x, y, camera.model)
         image = camera.see(surface)
@@ -100,7 +100,7 @@ class CalibratedSensor:
         return self._render(surface)
 
     def height(self, image: Image) -> FloatArray:
-        """(h, w) [m] on the canonical grid, as the inverse model finds it."""
+        """(h, w) height [m] on the canonical grid, by the inverse model."""
         from tacsim.interface import TactileFrame
 
         found = self._normalise(TactileFrame(image, time=0.0, index=0), 0.0).height
@@ -109,7 +109,7 @@ class CalibratedSensor:
 
 
 def _circle(press: PressLabel, image: Image, reference: Image, labels: PressLabels) -> Circle:
-    """Where the contact is found. Raises BadData."""
+    """The contact circle in the image. Raises BadData."""
     try:
         return find_contact_circle(image, reference, press.ball_radius / labels.pixel_pitch)
     except NoCircle as error:
@@ -124,7 +124,7 @@ def circle_mask(shape: Iterable[int], x: float, y: float, radius: float) -> Mask
 
 
 def pictures(image: Image, real: Image, reference: Image, mask: Mask) -> dict[str, float]:
-    """How alike two pictures are where `mask`, and what the picture without contact would score."""
+    """Similarity of two pictures inside `mask`, and that of the picture without contact."""
     from calibration.compare import metrics
 
     still = reference.astype(np.float64)
@@ -145,7 +145,7 @@ def _height(
     at: tuple[float, float],
     timing: Timing,
 ) -> Measurement:
-    """Of the surface that the inverse finds in the real frame against the simulated one."""
+    """The row of the surface from the real frame, by the inverse model, against the simulated one."""
     from tacsim.optics.surface import surface_map
 
     (u0, v0), pitch = camera.model.geometry.principal, camera.model.geometry.pixel_pitch
@@ -172,7 +172,7 @@ def _height(
 
 
 def cases(folder: Path) -> tuple[Case, ...]:
-    """A case a ball; one that lacks frames or light says so. Raises ConfigError."""
+    """A case for each ball; balls without frames or light are marked as missing. Raises ConfigError."""
     labels = read_labels(folder)
     try:
         light_of(folder, labels)

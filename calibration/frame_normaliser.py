@@ -75,24 +75,24 @@ class FrameNormaliser:
         self._set_view(rectify, markers)
         self._find_drift = DriftFinder(self._on_image.shape) if drifts and find is None else None
         self._untouched = untouched
-        # Why the reference may show a contact, in words; None: it does not, or there is no picture to compare it with
+        # reason why the reference may show a contact; None: it shows none, or there is no picture to compare it with
         self.reference_doubt: str | None = None
         self._sought = False  # the last observation was found in a picture
-        self.reference: Reference | None = None  # the present one; None before the first
-        # Height and gradient, or flow, are found in pictures of sources that don't know their surface
+        self.reference: Reference | None = None  # the present reference; None before the first
+        # height and gradient, or flow, are found in pictures of sources that do not give their surface
         self.finds_height, self.finds_flow = find is not None, markers is not None or dots is not None
-        # Share of the pixels of the last picture whose colour lies beyond the calibrated slopes: they get the nearest
-        # calibrated slope. 0 where nothing had to be found
+        # share of the pixels of the last picture whose colour is beyond the calibrated slopes: they get the nearest
+        # calibrated slope. 0 if no height had to be found
         self.out_of_range_share = 0.0
-        # Relative change of the untouched gel's colour since the reference [-], in the last picture with enough of it;
-        # and the mean slope [degrees] that this drift looks like. None before such a picture; no slope without height
+        # relative change of the untouched gel's colour since the reference [-], in the last picture with enough of it;
+        # and the mean slope [degrees] that corresponds to this drift. None before such a picture, or without height
         self.drift: float | None = None
         self.drift_slope: float | None = None
 
     def _set_view(self, rectify: Rectification, markers: MarkerFlow | None) -> None:
         grid = self._grid
         shape = (grid.rows * grid.image_scale, grid.columns * grid.image_scale)
-        spare = [there - wanted for there, wanted in zip(rectify.valid.shape, shape, strict=True)]
+        spare = [given - wanted for given, wanted in zip(rectify.valid.shape, shape, strict=True)]
         odd = any(extra % (2 * grid.image_scale) for extra in spare)
         if min(spare) < 0 or odd or (self._find is None and any(spare)):
             raise ValueError(f"rectification gives {rectify.valid.shape} px, the canonical image has {shape}")
@@ -108,9 +108,9 @@ class FrameNormaliser:
         valid, pitch = self._rectify.valid, self._grid.pitch / self._grid.image_scale
         down, across = (side.stop - side.start for side in visible_box(valid))
         x, y = (
-            # what reaches the border of the view goes on beyond it; what ends before is all that a region lets be seen
-            size if (there + 2) * pitch >= min(size, whole * pitch) else there * pitch
-            for size, there, whole in zip(self._rectify.size, (across, down), valid.shape[::-1], strict=True)
+            # a gel that reaches the border of the view continues beyond it; one that ends before is limited by a region
+            size if (visible + 2) * pitch >= min(size, whole * pitch) else visible * pitch
+            for size, visible, whole in zip(self._rectify.size, (across, down), valid.shape[::-1], strict=True)
         )
         return x, y
 
@@ -140,7 +140,7 @@ class FrameNormaliser:
         # is found.
         measured = np.zeros_like(self._rectify.valid)
         canonical_part(measured, self._grid)[...] = self._on_image
-        # Dots are found as well beside glare, in a recording: a live arm stops by the colour of contacts, too.
+        # In a recording, dots are found also next to glare; a live arm stops by the colour of contacts, too.
         colour = self._find is not None or self._markers is None or self._dots is not None
         reference = make_reference(rectified, self._rectify.valid, measured, colour=colour)
         if self._untouched is not None and is_channel_order_swapped(rectified, self._untouched, self._rectify.valid):

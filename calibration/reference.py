@@ -48,7 +48,7 @@ class Reference:
         Raises ValueError for another shape.
         """
         if image.shape != self.image.shape:
-            raise ValueError(f"image is {image.shape}, the reference {self.image.shape}; take a new reference")
+            raise ValueError(f"image is {image.shape}, the reference {self.image.shape}; take a fresh reference")
         change = image - self.image
         change *= self.scale
         return change

@@ -15,7 +15,7 @@ MIN_PRESENT_SHARE = 0.75  # share of its dots that an unknown lattice must show
 MIN_VISIBLE_SHARE = 0.25  # share of the dots that must be seen for a flow
 
 # lattice.py
-MAX_STEP_ERROR = 0.3  # of a neighbour, from one step along the lattice [pitches]
+MAX_STEP_ERROR = 0.3  # of a neighbour from one step along the lattice [pitches]
 MIN_ROW_SHARE = 0.5  # dots of a row or column of the lattice [number of dots of the fullest one]
 MAX_PITCH_ERROR = 0.25  # of the distance of regular neighbours [pitches]
 
@@ -23,7 +23,7 @@ MAX_PITCH_ERROR = 0.25  # of the distance of regular neighbours [pitches]
 NEIGHBOUR_RADIUS = 1.6  # dots this near at rest are neighbours: the diagonal of a square is one [pitches]
 # A dot is matched with a point this near to its place [pitches]
 MATCH_RADIUS = 0.45  # where the place is predicted
-STRICT_MATCH_RADIUS = 0.25  # where others are going to rely on it
+STRICT_MATCH_RADIUS = 0.25  # if other matches will depend on it
 # Change of displacement across an edge, at most [pitches]
 MAX_STRETCH = 0.4  # within a part that other dots are matched from
 MAX_STRETCH_TRACKED = 0.75  # where each dot was followed from frame to frame

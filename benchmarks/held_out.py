@@ -52,7 +52,7 @@ def rows_of(folder: Path, of: BallSet) -> list[str]:
     picture = picture_time(fit, of, reference, frames[0][1])
     presses = fit.predictions
     return [
-        row(
+        table_row(
             f"{of.name}, {len(presses)} presses",
             what,
             f"{BEFORE[of.name][k]:.{digits}f}" if of.name in BEFORE else "",
@@ -86,14 +86,14 @@ def dark_row(home: Path) -> str:
     )
     cpu = process_time() - begun
     if fit.darkness is None:
-        return row("9DTact", "height [mm]", DARK_BEFORE, "its light was classified as one with direction", "")
+        return table_row("9DTact", "height [mm]", DARK_BEFORE, "its light was classified as one with direction", "")
     (press,) = fit.presses
     depth, _ = DarknessSlopes(fit.darkness, press.shape, 1.0).depth(press.change.astype(np.float32))
     v, u = np.mgrid[: press.shape[0], : press.shape[1]].astype(np.float64)
     off = depth - dent_height(u, v, press.circle, fit.thickness, DARK_BALL / pitch)
     off = off[press.distance() < press.circle.radius]
     found = f"{1e3 * pitch * np.sqrt(np.mean(off**2)):.3f} mm rms (on the press itself: the set has one)"
-    return row(
+    return table_row(
         f"9DTact {home.name.removeprefix('9dtact_')}, 1 press", "height in contact", DARK_BEFORE, found, f"{cpu:.1f} s"
     )
 
@@ -133,9 +133,9 @@ def spread_row(folder: Path, of: BallSet, presses: int, count: int) -> str:
     fit, _, _ = balls.calibrated(folder, of)
     name, cells = f"{of.name}, {len(fit.presses)} presses", [str(presses), f"{len(subsets)} of {count}"]
     if len(subsets) < 2:
-        return row(name, *cells, *["-"] * 6)
+        return table_row(name, *cells, *["-"] * 6)
     scales = np.array([subset.scale for subset in subsets])
-    return row(
+    return table_row(
         name,
         *cells,
         f"{scales.mean():+.1%}",
@@ -152,10 +152,12 @@ def clicked_row(folder: Path, of: BallSet) -> str:
     fit, _, _ = balls.calibrated(folder, of)
     errors = clicked_errors(folder, of)
     refined = float(np.mean([press.error for press in fit.predictions]))
-    return row(f"{of.name}, {len(fit.predictions)} presses", f"{refined:.2f}", f"{np.mean(errors):.2f} ({len(errors)})")
+    return table_row(
+        f"{of.name}, {len(fit.predictions)} presses", f"{refined:.2f}", f"{np.mean(errors):.2f} ({len(errors)})"
+    )
 
 
-def row(*cells: str) -> str:
+def table_row(*cells: str) -> str:
     return f"| {' | '.join(cells)} |"
 
 
@@ -181,22 +183,22 @@ def main(
             f"beyond {MAX_RADIUS_ERROR:.0%}",
             "said ±",
         )
-        typer.echo(row(*heads, "with shadows"))
-        typer.echo(row(*["---"] * 9))
+        typer.echo(table_row(*heads, "with shadows"))
+        typer.echo(table_row(*["---"] * 9))
         for of in available:
             for size in presses:
                 if size < len(balls.read_balls(folder, of)[1]):
                     typer.echo(spread_row(folder, of, size, spread))
         return
     if clicked:
-        typer.echo(row("set", "within 1.5 refined radii", "inside the clicked circle (presses)"))
-        typer.echo(row(*["---"] * 3))
+        typer.echo(table_row("set", "within 1.5 refined radii", "inside the clicked circle (presses)"))
+        typer.echo(table_row(*["---"] * 3))
         for of in available:
             if has_circles(of):
                 typer.echo(clicked_row(folder, of))
         return
-    typer.echo(row("sensor", "held-out figure", "before", "now", "CPU: calibration, a picture"))
-    typer.echo(row(*["---"] * 5))
+    typer.echo(table_row("sensor", "held-out figure", "before", "now", "CPU: calibration, a picture"))
+    typer.echo(table_row(*["---"] * 5))
     for of in available:
         typer.echo("\n".join(rows_of(folder, of)))
     for home in sorted(folder.rglob(DARK)):

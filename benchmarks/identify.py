@@ -75,7 +75,7 @@ class Row:
     draws: int
 
 
-def draw(kind: str, seed: int) -> dict[str, float]:
+def draw_truth(kind: str, seed: int) -> dict[str, float]:
     """Random materials within a factor of about 1.5 of those of the scenes."""
     random = np.random.default_rng(seed)
     if kind == "gel":
@@ -95,7 +95,7 @@ def draw(kind: str, seed: int) -> dict[str, float]:
 
 def record(kind: str, seed: int, folder: Path) -> None:
     """Draws a truth, runs the motions, and writes recordings and truth, in a separate process."""
-    truth = draw(kind, seed)
+    truth = draw_truth(kind, seed)
     shutil.rmtree(folder / "runs", ignore_errors=True)  # of an incomplete recording
     scene = load_scene("press" if kind == "gel" else "squeeze")
     sets = [
@@ -172,8 +172,8 @@ def measured(kind: Kind, number: int, folder: Path, draws: int, force_noise: flo
     alone = forces_alone(found)
     alone = replace(alone, fit=refitted(alone, alone.signals.values, priors))
     rows = [
-        row(found, clean, truth, draws, priors, f"{kind} {number}", seconds),
-        row(alone, clean[force], truth, draws, priors, "the same by forces alone", None),
+        make_row(found, clean, truth, draws, priors, f"{kind} {number}", seconds),
+        make_row(alone, clean[force], truth, draws, priors, "the same by forces alone", None),
     ]
     (folder / ROWS).write_text(json.dumps([asdict(each) for each in rows], indent=1), encoding="utf-8")
     return rows
@@ -209,12 +209,12 @@ def main(
             found = [Row(**each) for each in json.loads((own / ROWS).read_text(encoding="utf-8"))]
         else:
             found = measured(what, number, own, draws, force_noise, preset)
-        typer.echo("\n".join(map(line, found)))
+        typer.echo("\n".join(map(table_line, found)))
         rows += found
     if kind == "docs":
         text = PAGE.read_text(encoding="utf-8")
         before, after = text.partition(BEGIN)[0], text.partition(END)[2]
-        table = "\n".join([*HEAD, *map(line, rows)])
+        table = "\n".join([*HEAD, *map(table_line, rows)])
         PAGE.write_text(f"{before}{BEGIN}\n{table}\n{END}{after}", encoding="utf-8")
 
 
@@ -246,7 +246,7 @@ def _is_force(channel: str) -> bool:
     return channel.rpartition(".")[2] in ("fx", "fy", "fz")
 
 
-def row(
+def make_row(
     found: Identified, clean: FloatArray, truth: dict[str, float], draws: int, priors: Priors, name: str,
     seconds: float | None,
 ) -> Row:  # fmt: skip
@@ -271,7 +271,7 @@ def row(
     )  # fmt: skip
 
 
-def line(row: Row) -> str:
+def table_line(row: Row) -> str:
     cells = []
     for name, found in row.parameters.items():
         words = WORDS.get(name, name)

@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from benchmarks.cases.squeeze import close, normal_forces
+from benchmarks.cases.squeeze import close_sensors, normal_forces
 from benchmarks.harness.measure import Measurement, timed
 from benchmarks.harness.runner import Case
 from benchmarks.truth.clay import CLAY
@@ -47,8 +47,8 @@ def _row(preset: str, what: str, cycle: Cycle, count: int, flow: bool) -> Measur
     world = make_world(scene)
     truth = world.truth()
     assert truth is not None
-    close(world, float(world.pose("upper").position[2]) - truth.height)
-    close(world, cycle.squeezed)
+    close_sensors(world, float(world.pose("upper").position[2]) - truth.height)
+    close_sensors(world, cycle.squeezed)
     piece = np.array(cycle.displacement) / (cycle.pieces if flow else 1)
 
     def move_sensors() -> tuple[list[float], list[tuple[float, float]], int]:

@@ -27,7 +27,7 @@ TOUCH_FEATURES = {"maps": ("height",), "touch": ("wrench",)}  # features of a po
 SMALL = ("width=160", "height=120", "pixel_pitch=0.125 mm")
 
 
-def pictures(size: tuple[str, ...]) -> list[str]:
+def picture_overrides(size: tuple[str, ...]) -> list[str]:
     """Overrides of the geometry of both sensors."""
     return [f"sensors.{name}.model.geometry.{what}" for name in ("lower", "upper") for what in size]
 
@@ -49,7 +49,7 @@ def random_actions(preset: str, motion: str, repeat: int) -> list[Measurement]:
     if preset == "learn":
         picture_words = f"{motion}, two pictures of 160 x 120"
         rows += _random_actions(
-            preset, [f"motion={motion}", *pictures(SMALL)], picture_words, resets=motion == "flowing"
+            preset, [f"motion={motion}", *picture_overrides(SMALL)], picture_words, resets=motion == "flowing"
         )
     return rows
 
@@ -104,17 +104,17 @@ def _random_actions(
 def transfer(preset: str, repeat: int) -> list[Measurement]:
     """The loss of a policy from `learn` at other presets: squeezing to 7 mm by a closing distance that is correct at
     learn, and by touch (the scripted policy), which uses heights."""
-    with _open(preset) as rig, _open("learn") as coarse:
+    with _open_rig(preset) as rig, _open_rig("learn") as coarse:
         found = 0.0
         # closing distances of both sensors together that leave the body too high and too low [m]
         low, high = 3e-3, 5e-3
         for _ in range(8):
             found = (low + high) / 2
-            low, high = (found, high) if _closed(coarse, found)[1] > GOAL else (low, found)
+            low, high = (found, high) if _run_episode(coarse, found)[1] > GOAL else (low, found)
         rows = []
         for what, closing in (("a closing distance found at learn", found), ("by touch, as shipped", None)):
-            _, at_learn = _closed(coarse, closing)
-            seconds, height = _closed(rig, closing)
+            _, at_learn = _run_episode(coarse, closing)
+            seconds, height = _run_episode(rig, closing)
             figures = {"reward": -abs(height - GOAL) * 1e3, "reward_at_learn": -abs(at_learn - GOAL) * 1e3}
             error = abs(height - GOAL) * 1e3
             rows.append(
@@ -123,15 +123,15 @@ def transfer(preset: str, repeat: int) -> list[Measurement]:
     return rows
 
 
-def _open(preset: str) -> Rig:
+def _open_rig(preset: str) -> Rig:
     from robot.open import open_rig
 
     return open_rig(
-        "sim", task="squeeze", overrides=[f"scene.preset={preset}", f"task.goal={GOAL} m", *pictures(SMALL)]
+        "sim", task="squeeze", overrides=[f"scene.preset={preset}", f"task.goal={GOAL} m", *picture_overrides(SMALL)]
     )
 
 
-def _closed(rig: Rig, closing: float | None) -> tuple[float, float]:
+def _run_episode(rig: Rig, closing: float | None) -> tuple[float, float]:
     """Duration of an episode [s], and the body's height at its end [m]: closed by `closing`, or by touch."""
     policy = Squeeze(SqueezeConfig(kind="squeeze", goal=GOAL)).scripted()
     observation = rig.reset(0)
@@ -145,14 +145,14 @@ def _closed(rig: Rig, closing: float | None) -> tuple[float, float]:
             action = Action({name: se3.translated_along_z(pose, displacement) for name, pose in start.items()})
         before = observation
         observation, _ = rig.step(action)
-        if all(_same(before.arms[name].pose, arm.pose) for name, arm in observation.arms.items()):
+        if all(_is_same_position(before.arms[name].pose, arm.pose) for name, arm in observation.arms.items()):
             break
     truth = rig.truth()
     assert truth is not None
     return time.perf_counter() - began, truth.height
 
 
-def _same(a: Pose, b: Pose) -> bool:
+def _is_same_position(a: Pose, b: Pose) -> bool:
     return bool(np.array_equal(a.position, b.position))
 
 

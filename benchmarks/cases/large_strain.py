@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 
 from benchmarks.cases.materials import RIGID
-from benchmarks.cases.squeeze import PRESETS, SLOW, TOUCH, close, normal_forces, squeeze_scene, world_in_contact
+from benchmarks.cases.squeeze import PRESETS, SLOW, TOUCH, close_sensors, normal_forces, squeeze_scene, world_in_contact
 from benchmarks.harness.measure import Measurement, timed
 from benchmarks.harness.runner import Case
 from tacsim.interface import Pose, Truth
@@ -50,9 +50,9 @@ def _slab_rows(scene: Scene, shares: Sequence[float], words: str) -> list[Measur
     rows: list[Measurement] = []
     done = 2 * TOUCH
     for share in shares:
-        timing, stats = timed(partial(close, world, share * SIDE - done), 1, warm=lambda: None)
+        timing, stats = timed(partial(close_sensors, world, share * SIDE - done), 1, warm=lambda: None)
         done = share * SIDE
-        height, force = _truth(world).height, float(normal_forces(world).mean())
+        height, force = _ground_truth(world).height, float(normal_forces(world).mean())
         theory = slab_force(scene.body.material.yield_stress, SIDE**3, height)
         figures = {"force_n": force, "slab_n": theory, "ratio": force / theory, "height_mm": height * 1e3,
                    "squeezed_percent": (1 - height / SIDE) * 100}  # fmt: skip
@@ -78,13 +78,13 @@ def slab_force(yield_stress: float, volume: float, height: float) -> float:
 def sheared_rest(preset: str, repeat: int) -> list[Measurement]:
     """A body pressed and sheared, then held for 100,000 substeps: the drift of its centre and of its particles."""
     world = world_in_contact(squeeze_scene(preset))
-    close(world, 0.5e-3)
+    close_sensors(world, 0.5e-3)
     pose = world.pose("upper")
     world.move({"upper": Pose(pose.position + [0.5e-3, 0.0, 0.0], pose.quaternion)})
-    _rest(world, preset, 4000)  # excludes the settling of the body after the shear
-    before, force = _truth(world), normal_forces(world)
-    timing, stats = timed(partial(_rest, world, preset, DRIFT_SUBSTEPS), 1, warm=lambda: None)
-    after = _truth(world)
+    _hold_still(world, preset, 4000)  # excludes the settling of the body after the shear
+    before, force = _ground_truth(world), normal_forces(world)
+    timing, stats = timed(partial(_hold_still, world, preset, DRIFT_SUBSTEPS), 1, warm=lambda: None)
+    after = _ground_truth(world)
     centre = float(np.linalg.norm(after.position - before.position))
     each = np.linalg.norm(after.points.astype(np.float64) - before.points, axis=1)
     change = float(np.abs(normal_forces(world) / force - 1).max())
@@ -96,7 +96,7 @@ def sheared_rest(preset: str, repeat: int) -> list[Measurement]:
     ]
 
 
-def _rest(world: World, preset: str, substeps: int) -> MoveStats:
+def _hold_still(world: World, preset: str, substeps: int) -> MoveStats:
     """Holds the state of `world` for this number of substeps."""
     still = make_world(squeeze_scene(preset, tolerance=UNREACHABLE, max_substeps=substeps))
     still.restore(world.snapshot())
@@ -105,7 +105,7 @@ def _rest(world: World, preset: str, substeps: int) -> MoveStats:
     return stats
 
 
-def _truth(world: World) -> Truth:
+def _ground_truth(world: World) -> Truth:
     truth = world.truth()
     assert truth is not None
     return truth

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.cases.squeeze import close, normal_forces
+from benchmarks.cases.squeeze import close_sensors, normal_forces
 from benchmarks.harness.measure import Measurement, Timing, step_cost, timed
 from benchmarks.harness.runner import Case
 from benchmarks.truth import laws
@@ -45,16 +45,16 @@ def yield_plateau(side: float, spacing: float, repeat: int) -> list[Measurement]
     body = world.truth()
     gap = float(world.pose("upper").position[2]) - body.height
     particles = len(body.points)
-    close(world, gap)
+    close_sensors(world, gap)
     begin = world.snapshot()
 
     def run() -> MoveStats:
         world.restore(begin)
-        return close(world, 0.1 * side)
+        return close_sensors(world, 0.1 * side)
 
     timing, stats = timed(run, repeat, warm=lambda: None)
     strain = world.snapshot()["strain"].astype(np.float64)
-    jacobian = np.sqrt(np.linalg.det(full(strain) + np.eye(3)))
+    jacobian = np.sqrt(np.linalg.det(symmetric_matrices(strain) + np.eye(3)))
     assert CLAY.yield_stress is not None
     # Kirchhoff stress yields: sigma = tau / J
     stress = uniaxial_stress(float(normal_forces(world).mean()), side**3, world.truth().height)
@@ -114,12 +114,12 @@ def gel_step(repeat: int) -> list[Measurement]:
     )
     world = HybridWorld(scene)
     body = world.truth()
-    close(world, float(world.pose("upper").position[2]) - body.height)
+    close_sensors(world, float(world.pose("upper").position[2]) - body.height)
     begin = world.snapshot()
 
     def run() -> MoveStats:
         world.restore(begin)
-        return close(world, 0.2e-3)
+        return close_sensors(world, 0.2e-3)
 
     timing, stats = timed(run, repeat, warm=lambda: None)
     elements = 2 * math.prod(round(side / scene.effective_element_size) for side in scene.gel.size)
@@ -182,7 +182,7 @@ def simple_shear(repeat: int) -> list[Measurement]:
         b, flow, exact = laws.hencky_return(f @ b @ f.T, flow, config.mu, config.bulk, config.limit, config.hardening)
     radius = 2 * config.mu * config.limit  # sigma_y
     closed = radius / math.sqrt(2)
-    off = float(np.abs(full(tau.astype(np.float64)) - exact).max()) / radius * 100
+    off = float(np.abs(symmetric_matrices(tau.astype(np.float64)) - exact).max()) / radius * 100
     error = abs(float(tau[:, 3].mean(dtype=np.float64)) / closed - 1) * 100
     figures = {
         "against_float64_percent": off,
@@ -323,7 +323,7 @@ def momenta(
     return v.sum(axis=0), angular, float(speed.sum()), float((arm * speed).sum())
 
 
-def full(s: FloatArray) -> FloatArray:
+def symmetric_matrices(s: FloatArray) -> FloatArray:
     """(n, 6) as symmetric (n, 3, 3)."""
     return s[:, [0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(-1, 3, 3)
 

@@ -25,14 +25,16 @@ def balls(resolution: str, repeat: int) -> list[Measurement]:
     for (radius, depth), (force, contact) in truth.BALLS.items():
         what = f"ball R {radius:g} mm, {depth:g} mm deep"
         timing, found = _press(resolution, Sphere(radius=radius * 1e-3), 0.0, depth * 1e-3)
-        rows.append(comparison_row(timing, f"{what}: force", "n", _force(found), force, _note(found)))
+        rows.append(comparison_row(timing, f"{what}: force", "n", _normal_force(found), force, _settling_note(found)))
         rows.append(
-            comparison_row(timing, f"{what}: contact radius", "mm", found.contact_radius * 1e3, contact, _note(found))
+            comparison_row(
+                timing, f"{what}: contact radius", "mm", found.contact_radius * 1e3, contact, _settling_note(found)
+            )
         )
     for depth, force in truth.BALL_WITH_FRICTION.items():
         timing, found = _press(resolution, Sphere(radius=4e-3), 0.6, depth * 1e-3)
         what = f"ball R 4 mm, {depth:g} mm deep, friction 0.6: force"
-        rows.append(comparison_row(timing, what, "n", _force(found), force, _note(found)))
+        rows.append(comparison_row(timing, what, "n", _normal_force(found), force, _settling_note(found)))
     return rows
 
 
@@ -44,14 +46,16 @@ def punches(resolution: str, repeat: int) -> list[Measurement]:
         shape = Cylinder(radius=radius * 1e-3, height=4e-3)
         timing, found = _press(resolution, shape, 0.0, depth)
         rows.append(
-            comparison_row(timing, f"flat punch R {radius:g} mm: force", "n", _force(found), force, _note(found))
+            comparison_row(
+                timing, f"flat punch R {radius:g} mm: force", "n", _normal_force(found), force, _settling_note(found)
+            )
         )
     for radius, share in truth.TWISTS.items():
         shape = Cylinder(radius=radius * 1e-3, height=4e-3)
         timing, found = _press(resolution, shape, 5.0, depth, twist=angle)
         moment = share * 16 / 3 * truth.SHEAR_MODULUS * radius**3 * angle  # [N mm]
         what = f"flat punch R {radius:g} mm, twisted by a degree: moment"
-        rows.append(comparison_row(timing, what, "nmm", found.wrench[5] * 1e3, moment, _note(found)))
+        rows.append(comparison_row(timing, what, "nmm", found.wrench[5] * 1e3, moment, _settling_note(found)))
     return rows
 
 
@@ -61,7 +65,9 @@ def slides(resolution: str, repeat: int) -> list[Measurement]:
     for (depth, friction), ratio in truth.SLIDES.items():
         timing, found = _press(resolution, Sphere(radius=4e-3), friction, depth * 1e-3, slide=2e-3)
         what = f"ball slid {depth:g} mm deep, friction {friction:g}: drag over normal force"
-        rows.append(comparison_row(timing, what, "ratio", found.wrench[0] / _force(found), ratio, _note(found)))
+        rows.append(
+            comparison_row(timing, what, "ratio", found.wrench[0] / _normal_force(found), ratio, _settling_note(found))
+        )
     return rows
 
 
@@ -87,11 +93,11 @@ def _press(
     return once(lambda: press(scene, load_sensor("ideal"), PressMotion(depth, (slide, 0.0), twist)))
 
 
-def _force(found: PressResult) -> float:
+def _normal_force(found: PressResult) -> float:
     return -float(found.wrench[2])
 
 
-def _note(found: PressResult) -> str:
+def _settling_note(found: PressResult) -> str:
     return "" if all(move.settled for move in found.moves) else "not settled"
 
 

@@ -75,14 +75,14 @@ DEFAULT_MACH = MAX_MACH  # the controller's default at nu 0.45, a tenth of the s
 OTHER_MACHS = (0.015, 0.05, 0.1)
 
 
-def profile(world: PressWorld) -> FloatArray:
+def world_profile(world: PressWorld) -> FloatArray:
     return surface_profile(world.surface("lower"))
 
 
 def sphere_press(element: float, repeat: int) -> list[Measurement]:
     """Scene to settled surface at the controller's defaults, against the limit of fine meshes."""
     timing, (world, stats) = timed(partial(press, press_scene(Sphere(radius=RADIUS), element), DEPTH), repeat)
-    difference = profile(world) - load_limit().profile
+    difference = world_profile(world) - load_limit().profile
     return [
         Measurement(
             timing, rms(difference) * 1e6, "µm rms", LIMIT, substeps=stats.substeps,
@@ -97,7 +97,7 @@ def quasi_static(repeat: int) -> list[Measurement]:
     ball, element = Sphere(radius=RADIUS), 0.5e-3
     timing, (usual, stats) = timed(partial(press, press_scene(ball, element), DEPTH), repeat)
     reference, _ = press(press_scene(ball, element, mach=0.02, tolerance=1e-5), DEPTH)
-    difference = profile(usual) - profile(reference)
+    difference = world_profile(usual) - world_profile(reference)
     forces = [abs(float(w.wrench("lower")[2])) for w in (usual, reference)]
     rows = [
         Measurement(
@@ -108,7 +108,7 @@ def quasi_static(repeat: int) -> list[Measurement]:
     for mach in OTHER_MACHS:
         scene = press_scene(ball, element, mach=mach)
         timing, (other, stats) = timed(partial(press, scene, DEPTH), 1, warm=lambda: None)
-        difference = profile(other) - profile(usual)
+        difference = world_profile(other) - world_profile(usual)
         rows.append(
             Measurement(
                 timing, _largest(difference), "µm at most", f"the same press at Mach {DEFAULT_MACH:g}, tolerance 1e-2",
@@ -128,7 +128,7 @@ def sphere_force(element: float, repeat: int) -> list[Measurement]:
             # kernels are warm after the first press
             warm = None if not rows else (lambda: None)
             timing, (world, stats) = timed(partial(press, scene, depth), 1, warm)  # sphere_press compares seconds
-            truth = layer(_ball_gap, depth, nu).force
+            truth = solve_layer(_ball_gap, depth, nu).force
             rows.append(_force_row(timing, world, stats, truth, f"depth {depth * 1e3:g} mm, nu {nu:g}"))
     return rows
 
@@ -138,7 +138,7 @@ def flat_punch(element: float, repeat: int) -> list[Measurement]:
     cylinder, depth, nu = Cylinder(radius=3e-3, height=4e-3), 0.1e-3, 0.45
     scene = press_scene(cylinder, element, nu=nu, friction=0.0, tolerance=1e-3)
     timing, (world, stats) = timed(partial(press, scene, depth), repeat)
-    truth = layer(_punch_gap, depth, nu, pixels=768).force
+    truth = solve_layer(_punch_gap, depth, nu, pixels=768).force
     return [_force_row(timing, world, stats, truth, f"depth {depth * 1e3:g} mm, nu {nu:g}")]
 
 
@@ -170,7 +170,7 @@ def renew(report_progress: Callable[[str], None]) -> Limit:
 
 def layer_press(repeat: int) -> list[Measurement]:
     """The independent solver for the deep press: its error results from small strain and no friction."""
-    timing, contact = timed(partial(layer, _ball_gap, DEPTH, 0.45), repeat)
+    timing, contact = timed(partial(solve_layer, _ball_gap, DEPTH, 0.45), repeat)
     n = contact.displacement.shape[0]
     limit = load_limit()
     step = GRID_PITCH / contact.pixel  # both grids have a point at the centre of the contact
@@ -192,7 +192,7 @@ def tacchi_press(repeat: int) -> list[Measurement]:
     return tacchi.sphere_press(repeat)
 
 
-def layer(
+def solve_layer(
     gap_of_radius: Callable[[FloatArray], FloatArray],
     depth: float,
     nu: float,

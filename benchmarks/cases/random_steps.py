@@ -24,7 +24,7 @@ FLOW_MACHS = {"draft": (0.5, 1.0, 2.0)}  # times the default; other presets use 
 def random_steps(preset: str, repeat: int) -> list[Measurement]:
     """Twenty steps in a row, each sensor along its z by a random -0.2 to 0.2 mm: force after each step against the slow
     limit through the same poses, as a share of the mean force; settled, and flowing, at draft with three speeds."""
-    begin, truth = _slow(preset)
+    begin, truth = _slow_forces(preset)
     usual = squeeze_scene(preset, "hybrid").flow_mach
     rows = [_row(preset, begin, truth, "settled", flow=False)]
     for share in FLOW_MACHS.get(preset, (1.0,)):
@@ -33,26 +33,26 @@ def random_steps(preset: str, repeat: int) -> list[Measurement]:
     return rows
 
 
-def _steps() -> FloatArray:
+def _random_motions() -> FloatArray:
     return np.random.default_rng(0).uniform(-MAX_STEP, MAX_STEP, (ACTIONS, 2))
 
 
-def _slow(preset: str) -> tuple[Mapping[str, NDArray[Any]], FloatArray]:
+def _slow_forces(preset: str) -> tuple[Mapping[str, NDArray[Any]], FloatArray]:
     """The squeezed state, and the mean force of both sensors [N] after each step at a speed without influence. The
     forces take minutes at `standard`; they are cached."""
     scene = squeeze_scene(preset, "hybrid", **SLOW)
     world = world_in_contact(scene)
-    _move(world, np.full(2, START / 2), flow=False)
+    _move_sensors(world, np.full(2, START / 2), flow=False)
     begin = world.snapshot()
 
     def compute() -> list[float]:
-        return [_force(world, step, flow=False) for step in _steps()]
+        return [_force_after_motion(world, step, flow=False) for step in _random_motions()]
 
     question = f"{scene.model_dump_json()} {START} {ACTIONS} {MAX_STEP}"
     return begin, np.array(cached(f"random-steps-{preset}", question, compute))
 
 
-def _move(world: World, by: FloatArray, *, flow: bool) -> int:
+def _move_sensors(world: World, by: FloatArray, *, flow: bool) -> int:
     """Moves both sensors along their z, which points into the body, by `by` [m]; returns the substeps."""
     targets = {}
     for name, sign, length in zip(("lower", "upper"), (1.0, -1.0), by, strict=True):
@@ -61,21 +61,21 @@ def _move(world: World, by: FloatArray, *, flow: bool) -> int:
     return world.move(targets, flow=flow).substeps
 
 
-def _force(world: World, by: FloatArray, *, flow: bool) -> float:
-    _move(world, by, flow=flow)
+def _force_after_motion(world: World, by: FloatArray, *, flow: bool) -> float:
+    _move_sensors(world, by, flow=flow)
     return float(normal_forces(world).mean())
 
 
 def _row(
     preset: str, begin: Mapping[str, NDArray[Any]], truth: FloatArray, what: str, *, flow: bool, **settling: float
 ) -> Measurement:
-    world, steps = make_world(squeeze_scene(preset, "hybrid", **settling)), _steps()
+    world, steps = make_world(squeeze_scene(preset, "hybrid", **settling)), _random_motions()
 
     def run() -> tuple[FloatArray, float, int]:
         world.restore(begin)
         forces, max_difference, substeps = [], 0.0, 0
         for step in steps:
-            substeps += _move(world, step, flow=flow)
+            substeps += _move_sensors(world, step, flow=flow)
             sensor_forces = normal_forces(world)
             forces.append(float(sensor_forces.mean()))
             max_difference = max(max_difference, float(np.ptp(sensor_forces) / sensor_forces.mean() * 100))

@@ -17,7 +17,7 @@ from benchmarks.cases.press import press, press_scene
 from benchmarks.cases.squeeze import (
     PRESETS,
     STEP,
-    close,
+    close_sensors,
     closing_targets,
     normal_forces,
     squeeze_scene,
@@ -80,12 +80,12 @@ def body(material: str, repeat: int) -> list[Measurement]:
         soft = BodyMaterial(youngs_modulus=config.youngs_modulus, poisson_ratio=config.poisson_ratio)
         scene = scene.model_copy(update={"body": Body(geometry=scene.body.geometry, material=soft)})
     world = world_in_contact(scene)
-    close(world, 0.5e-3)
+    close_sensors(world, 0.5e-3)
     begin = world.snapshot()
 
     def run() -> MoveStats:
         world.restore(begin)
-        return close(world, CLOSE)
+        return close_sensors(world, CLOSE)
 
     timing, stats = timed(run, repeat, warm=lambda: None)
     rows = [_row(timing, stats, "", timing.median, {"force_n": float(normal_forces(world).mean())})]
@@ -134,7 +134,7 @@ def _made_and_moved(scene: Scene) -> tuple[World, float, float]:
     began = time.perf_counter()
     world = make_world(scene)
     made = time.perf_counter()
-    close(world, 1e-6)
+    close_sensors(world, 1e-6)
     return world, (made - began) * 1e3, (time.perf_counter() - made) * 1e3
 
 
@@ -182,7 +182,7 @@ def batch(count: int, repeat: int) -> list[Measurement]:
     from tacsim.physics.worlds.batch import Batch
 
     begin = world_in_contact(squeeze_scene("draft"))
-    close(begin, 0.5e-3)
+    close_sensors(begin, 0.5e-3)
     scene = squeeze_scene("draft", max_substeps=0)
     alone, many = make_world(scene), Batch([scene] * count)
     for world in (alone, *many.worlds):
@@ -198,7 +198,7 @@ def batch(count: int, repeat: int) -> list[Measurement]:
 
     timing, stats = timed(run, repeat if count < max(ENVIRONMENTS) else 1)  # the largest takes seconds
     for _ in range(len(timing.samples) + 1):  # as often as the batch, with its untimed motion
-        close(alone, STEP)
+        close_sensors(alone, STEP)
     force = float(normal_forces(alone).mean())
     error = max(abs(float(normal_forces(world).mean()) / force - 1) for world in many.worlds) * 100
     each = timing.median * 1e6 / (stats.substeps * count)

@@ -61,8 +61,8 @@ def slid_ball(preset: str, repeat: int) -> list[Measurement]:
     rows = []
     for friction in (0.3, 0.6, 1.0, 1.5):
         ball = Indenter(geometry=Sphere(radius=RADIUS), friction=friction)
-        timing, (found, stats) = timed(partial(_drag, preset, ball, 0.5e-3, SLIDE), 1, warm=lambda: None)
-        truth, _ = _drag(preset, ball, 0.5e-3, SLIDE, **settled)
+        timing, (found, stats) = timed(partial(_drag_after_slide, preset, ball, 0.5e-3, SLIDE), 1, warm=lambda: None)
+        truth, _ = _drag_after_slide(preset, ball, 0.5e-3, SLIDE, **settled)
         what = f"the same mesh at Mach {SLIDE_SLOW[preset]:g}"
         rows.append(_drag_row(timing, found, stats, truth, what, f"0.5 mm, friction {friction:g}"))
     return rows
@@ -75,8 +75,10 @@ def slid_edges(preset: Preset, repeat: int) -> list[Measurement]:
     for shape in (Cylinder(radius=2e-3, height=4e-3), Box(size=(4e-3, 4e-3, 4e-3))):
         for radius, friction in ((r, mu) for r in (0.0, None) for mu in (0.3, 0.6, 1.0, 1.5)):
             edged = Indenter(geometry=shape, friction=friction, edge_radius=radius)
-            timing, (found, stats) = timed(partial(_drag, preset, edged, 0.3e-3, 2e-3), 1, warm=lambda: None)
-            truth, _ = _drag(preset, edged, 0.3e-3, 2e-3, **settled)
+            timing, (found, stats) = timed(
+                partial(_drag_after_slide, preset, edged, 0.3e-3, 2e-3), 1, warm=lambda: None
+            )
+            truth, _ = _drag_after_slide(preset, edged, 0.3e-3, 2e-3, **settled)
             what = f"the same mesh at Mach {SLIDE_SLOW[preset]:g}"
             variant = f"{'round' if radius is None else 'sharp'} {shape.shape}, friction {friction:g}"
             rows.append(_drag_row(timing, found, stats, truth, what, variant))
@@ -94,8 +96,10 @@ def slid_in(preset: str, repeat: int) -> list[Measurement]:
         (Box(size=(4e-3, 4e-3, 4e-3)), 0.8, (1e-3, 1e-3, -0.5e-3)),
     ):
         indenter = Indenter(geometry=shape, friction=friction)
-        timing, (found, stats) = timed(partial(_drag_in, preset, indenter, displacement), 1, warm=lambda: None)
-        truth, _ = _drag_in(preset, indenter, displacement, **settled)
+        timing, (found, stats) = timed(
+            partial(_drag_after_oblique_press, preset, indenter, displacement), 1, warm=lambda: None
+        )
+        truth, _ = _drag_after_oblique_press(preset, indenter, displacement, **settled)
         what = f"the same mesh at Mach {SLIDE_SLOW[preset]:g}"
         rows.append(_drag_row(timing, found, stats, truth, what, f"{shape.shape}, friction {friction:g}"))
     return rows
@@ -112,8 +116,8 @@ def slid_turned(preset: str, repeat: int) -> list[Measurement]:
         (Box(size=(6e-3, 3.2e-3, 4e-3)), 0.4),
     ):
         indenter = Indenter(geometry=shape, friction=friction)
-        timing, (found, stats) = timed(partial(_turned, preset, indenter), 1, warm=lambda: None)
-        truth, _ = _turned(preset, indenter, **settled)
+        timing, (found, stats) = timed(partial(_drag_after_turn, preset, indenter), 1, warm=lambda: None)
+        truth, _ = _drag_after_turn(preset, indenter, **settled)
         off = np.linalg.norm(found - truth) / np.linalg.norm(truth)
         note = "" if stats.settled else "not settled"
         figures = {"x": float(found[0]), "y": float(found[1]), "true_x": float(truth[0]), "true_y": float(truth[1])}
@@ -126,7 +130,7 @@ def slid_turned(preset: str, repeat: int) -> list[Measurement]:
     return rows
 
 
-def _turned(preset: str, indenter: Indenter, **settling: float) -> tuple[FloatArray, MoveStats]:
+def _drag_after_turn(preset: str, indenter: Indenter, **settling: float) -> tuple[FloatArray, MoveStats]:
     """Drag along x and y over normal force after both legs."""
     scene = {"body": None, "preset": preset, "indenter": indenter, "settling": settling}
     world, _ = press(Scene.model_validate(scene), 0.5e-3)
@@ -137,7 +141,7 @@ def _turned(preset: str, indenter: Indenter, **settling: float) -> tuple[FloatAr
     return force[:2] / -force[2], stats
 
 
-def _drag_in(
+def _drag_after_oblique_press(
     preset: str, indenter: Indenter, displacement: tuple[float, float, float], **settling: float
 ) -> tuple[float, MoveStats]:
     """Drag over normal force after one motion by `displacement` [m] from first contact."""
@@ -153,7 +157,9 @@ def _drag_in(
     return float(np.hypot(force[0], force[1]) / -force[2]), stats
 
 
-def _drag(preset: str, indenter: Indenter, deep: float, length: float, **settling: float) -> tuple[float, MoveStats]:
+def _drag_after_slide(
+    preset: str, indenter: Indenter, deep: float, length: float, **settling: float
+) -> tuple[float, MoveStats]:
     """Drag over normal force after a slide of `length`, `deep` in the gel [m]."""
     scene = Scene.model_validate(
         {

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.cases.squeeze import PRESETS, close, normal_forces
+from benchmarks.cases.squeeze import PRESETS, close_sensors, normal_forces
 from benchmarks.harness.cache import cached
 from benchmarks.harness.measure import Measurement, once
 from benchmarks.harness.runner import Case
@@ -33,10 +33,10 @@ def shipped_bodies(preset: str, repeat: int) -> list[Measurement]:
     each motion, against the slow limit."""
     rows = []
     for material in MATERIALS:
-        truth = _slow(f"bodies-{material}-{preset}", partial(_squeezed, material, preset))
+        truth = _slow_forces(f"bodies-{material}-{preset}", partial(_squeezed, material, preset))
         world, min_force = _touched(_scene(preset, f"body.material={material}")), UNLOADED * max(truth)
-        for (state, by), true in zip(_steps(), truth, strict=True):
-            timing, stats = once(partial(close, world, by))
+        for (state, by), true in zip(_motions(), truth, strict=True):
+            timing, stats = once(partial(close_sensors, world, by))
             rows.append(
                 _row(timing, float(normal_forces(world).mean()), true, min_force, f"{material}, {state}", stats)
             )
@@ -48,12 +48,12 @@ def dragged_bodies(preset: str, repeat: int) -> list[Measurement]:
     1 mm three times: force along the lower gel after each, against the slow limit."""
     rows = []
     for modulus in GELS:
-        truth = _slow(f"dragged-{modulus}-{preset}", partial(_dragged, modulus, preset))
+        truth = _slow_forces(f"dragged-{modulus}-{preset}", partial(_dragged, modulus, preset))
         world = _ready_to_drag(modulus, preset)
         for number, true in enumerate(truth, 1):
             timing, stats = once(partial(_drag, world))
             what = f"gels of {modulus:g} MPa, {number} mm"
-            rows.append(_row(timing, _along(world), true, 0.0, what, stats))
+            rows.append(_row(timing, _tangential_force(world), true, 0.0, what, stats))
     return rows
 
 
@@ -66,11 +66,11 @@ def _touched(scene: Scene) -> World:
     world = make_world(scene)
     truth = world.truth()
     assert truth is not None
-    close(world, float(world.pose("upper").position[2]) - truth.height)
+    close_sensors(world, float(world.pose("upper").position[2]) - truth.height)
     return world
 
 
-def _steps() -> list[tuple[str, float]]:
+def _motions() -> list[tuple[str, float]]:
     """Each state, and the displacement of the sensors from the state before [m]."""
     before = [0.0, *STATES.values()]
     return [(state, 1e-3 * (by - last)) for (state, by), last in zip(STATES.items(), before, strict=False)]
@@ -78,8 +78,8 @@ def _steps() -> list[tuple[str, float]]:
 
 def _squeezed(material: str, preset: str) -> list[float]:
     world, forces = _touched(_scene(preset, f"body.material={material}", **SLOW)), []
-    for _, by in _steps():
-        close(world, by)
+    for _, by in _motions():
+        close_sensors(world, by)
         forces.append(float(normal_forces(world).mean()))
     return forces
 
@@ -87,7 +87,7 @@ def _squeezed(material: str, preset: str) -> list[float]:
 def _ready_to_drag(modulus: float, preset: str, **settling: float) -> World:
     overrides = ("friction={lower: 0.3, upper: 1.0}", f"gel.material={{youngs_modulus: {modulus} MPa}}")
     world = _touched(_scene(preset, *overrides, **settling))
-    close(world, 1e-3 * DRAGGED)
+    close_sensors(world, 1e-3 * DRAGGED)
     return world
 
 
@@ -96,7 +96,7 @@ def _drag(world: World) -> MoveStats:
     return world.move({"upper": Pose(pose.position + [DRAG, 0.0, 0.0], pose.quaternion)})
 
 
-def _along(world: World) -> float:
+def _tangential_force(world: World) -> float:
     return float(np.hypot(*world.wrench("lower")[:2]))
 
 
@@ -104,11 +104,11 @@ def _dragged(modulus: float, preset: str) -> list[float]:
     world, forces = _ready_to_drag(modulus, preset, **SLOW), []
     for _ in range(DRAGS):
         _drag(world)
-        forces.append(_along(world))
+        forces.append(_tangential_force(world))
     return forces
 
 
-def _slow(name: str, compute: Any) -> list[float]:
+def _slow_forces(name: str, compute: Any) -> list[float]:
     """Forces [N] at a speed without influence. They take minutes at `standard`, and are cached."""
     return cached(f"slow-limit-{name}", f"{SLOW} {STATES} {DRAGGED} {DRAG} {DRAGS}", compute)
 

@@ -43,7 +43,7 @@ def world_in_contact(scene: Scene) -> World:
     truth = world.truth()
     assert truth is not None
     gap = float(world.pose("upper").position[2]) - truth.height
-    close(world, gap + 2 * TOUCH)
+    close_sensors(world, gap + 2 * TOUCH)
     return world
 
 
@@ -56,7 +56,7 @@ def closing_targets(world: World, by: float) -> dict[str, Pose]:
     return targets
 
 
-def close(world: World, by: float, *, flow: bool = False) -> MoveStats:
+def close_sensors(world: World, by: float, *, flow: bool = False) -> MoveStats:
     """Moves both sensors towards each other, by `by` [m] in total."""
     return world.move(closing_targets(world, by), flow=flow)
 
@@ -72,7 +72,7 @@ def slow_force(preset: str, physics: str = "hybrid") -> float:
 
     def compute() -> list[float]:
         world = world_in_contact(scene)
-        stats = close(world, SQUEEZE)
+        stats = close_sensors(world, SQUEEZE)
         if not stats.settled:
             raise RuntimeError(f"the slow squeeze did not settle: residual {stats.residual:.2g}")
         return [float(normal_forces(world).mean())]
@@ -98,7 +98,7 @@ def _squeezed_again(world: World, repeat: int) -> tuple[Timing, MoveStats]:
 
     def run() -> MoveStats:
         world.restore(begin)
-        return close(world, SQUEEZE)
+        return close_sensors(world, SQUEEZE)
 
     return timed(run, repeat, warm=lambda: None)  # `world_in_contact` has used every kernel already
 
@@ -182,7 +182,7 @@ def _control_step_row(preset: str, physics: str, truth: FloatArray, flow: bool, 
 
     def run() -> MoveStats:
         world.restore(begin)
-        stats = close(world, STEP, flow=flow)
+        stats = close_sensors(world, STEP, flow=flow)
         map_parallel([partial(camera, world.surface(name)) for name in world.sensors])
         return stats
 
@@ -201,14 +201,14 @@ def _control_step_row(preset: str, physics: str, truth: FloatArray, flow: bool, 
 def _squeezed(scene: Scene) -> World:
     """A world squeezed by 1 mm from first contact, at a speed without influence."""
     slow = world_in_contact(squeeze_scene(scene.preset, scene.physics, **{**SLOW, "mach": 0.01}))
-    close(slow, 1e-3)
+    close_sensors(slow, 1e-3)
     world = make_world(scene)
     world.restore(slow.snapshot())
     return world
 
 
 def _force_after_a_step(world: World, flow: bool) -> float:
-    close(world, STEP, flow=flow)
+    close_sensors(world, STEP, flow=flow)
     return float(normal_forces(world).mean())
 
 
@@ -227,7 +227,7 @@ def reposition(preset: str, physics: str, repeat: int) -> list[Measurement]:
     """Pressed 0.5 mm, then the upper sensor moves 3 mm along x: by symmetry the body ends half-way."""
     displacement = 3e-3
     world = world_in_contact(squeeze_scene(preset, physics))
-    close(world, 0.5e-3)
+    close_sensors(world, 0.5e-3)
     begin = world.snapshot()
     centre = world.truth()
     pose = world.pose("upper")
@@ -265,7 +265,7 @@ def _rough_row(preset: str, sampling: Literal["lattice", "random"], by: float, r
 
     def run() -> MoveStats:
         world.restore(begin)
-        return close(world, by)
+        return close_sensors(world, by)
 
     timing, stats = timed(run, 1, warm=lambda: None)  # seconds are compared in `squeeze`
     error = print_roughness(world.surface("lower"))
@@ -300,7 +300,7 @@ def _close_obliquely(preset: Preset, material: BodyMaterial, **settling: float) 
     world = make_world(Scene(body=body, preset=preset, friction=friction, settling=Settling(**settling)))
     truth = world.truth()
     assert truth is not None
-    close(world, float(world.pose("upper").position[2]) - truth.height)
+    close_sensors(world, float(world.pose("upper").position[2]) - truth.height)
     displacements = {"upper": np.array(OBLIQUE_DISPLACEMENT), "lower": -np.array(OBLIQUE_DISPLACEMENT)}
     stats = world.move(
         {

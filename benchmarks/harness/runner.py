@@ -73,7 +73,7 @@ def run_cases(
     measurable = [case for case in cases if not case.missing]
     for together in _by_process(measurable):
         started = time.perf_counter()
-        for case, found in _run(together, repeat, on_start, stop):
+        for case, found in _run_in_process(together, repeat, on_start, stop):
             if isinstance(found, str):
                 failures.append(Failure(**_names(case), cause=found))
             else:
@@ -111,7 +111,7 @@ class _Worker:
     def __init__(self, cases: Sequence[Case], repeat: int) -> None:
         context = multiprocessing.get_context("spawn")  # Taichi does not survive a fork
         self._receiver, sender = context.Pipe(duplex=False)
-        self._process = context.Process(target=_work, args=(list(cases), repeat, sender), daemon=True)
+        self._process = context.Process(target=_run_worker, args=(list(cases), repeat, sender), daemon=True)
         with outside_working_folder():
             self._process.start()
         sender.close()
@@ -138,7 +138,7 @@ class _Worker:
         self._receiver.close()
 
 
-def _run(
+def _run_in_process(
     cases: Sequence[Case], repeat: int, on_start: Callable[[Case], None], stop: Callable[[], bool]
 ) -> Iterator[tuple[Case, list[Row] | str]]:
     """Result of each case; all run in one process until it dies."""
@@ -162,7 +162,7 @@ def _run(
             worker.close()
 
 
-def _work(cases: Sequence[Case], repeat: int, report: Connection) -> None:
+def _run_worker(cases: Sequence[Case], repeat: int, report: Connection) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the main process ends the others
     parent = multiprocessing.parent_process()
     assert parent is not None and parent.pid is not None

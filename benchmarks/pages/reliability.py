@@ -157,14 +157,14 @@ def markdown(report: Report) -> str:
         "Fifteen promises of arms and cameras, as figures that their own tests record. Written by `make reliability`, "
         "or `tacsim bench --from FILE --docs docs`; do not edit.",
         SAFETY,
-        setting(report) + _busy(report),
+        setting(report) + _load_note(report),
         "## Figures",
         table(HEADER, lines([row for row in measured if EVENT not in row.variant])),
         *_events(measured),
         "## How to read and rerun",
-        READING.format(repeat=_times(count)),
+        READING.format(repeat=_format_repetitions(count)),
         "## What a promise says, and which tests check it",
-        "\n".join(_checked(number, tests.get(number, [])) for number in range(1, len(PROMISES) + 1)),
+        "\n".join(_describe_promise(number, tests.get(number, [])) for number in range(1, len(PROMISES) + 1)),
     ]
     if failures:
         parts += ["## Failed", *(f"- {each.case}: {each.cause}" for each in failures)]
@@ -191,15 +191,17 @@ def _events(measured: Sequence[Row]) -> list[str]:
             found.setdefault(event, {})[column] = row
     if not found:
         return []
-    cells = [[event, *(_both(columns.get(name)) for name in EVENTS[1:])] for event, columns in found.items()]
+    cells = [
+        [event, *(_median_and_worst(columns.get(name)) for name in EVENTS[1:])] for event, columns in found.items()
+    ]
     for line, columns in zip(cells, found.values(), strict=True):
         if "goes on" in columns:
             line[1] = "goes on" + ("" if "still after" not in columns else f"; else {line[1]}")
     repeat = max(row.repeats for columns in found.values() for row in columns.values())
-    return ["## A stopped arm stays stopped", WATCHED.format(repeat=_times(repeat)), table(EVENTS, cells)]
+    return ["## A stopped arm stays stopped", WATCHED.format(repeat=_format_repetitions(repeat)), table(EVENTS, cells)]
 
 
-def _both(row: Row | None) -> str:
+def _median_and_worst(row: Row | None) -> str:
     """Median and worst value, or a count."""
     if row is None:
         return ""
@@ -210,7 +212,7 @@ def _both(row: Row | None) -> str:
     return f"{row.error:.{digits}f} / {worst:.{digits}f} {row.error_unit}"
 
 
-def _times(count: int) -> str:
+def _format_repetitions(count: int) -> str:
     return f"{count} repetition{'s' * (count > 1)}"
 
 
@@ -226,10 +228,16 @@ def _cells(row: Row) -> list[str]:
         verdict = "**missed**"
     else:
         verdict = "met" if worst is None or worst <= promised else "met, worst beyond"
-    return [row.variant, _words(row.error, unit), _words(worst, unit), _words(promised, unit), verdict]
+    return [
+        row.variant,
+        _format_value(row.error, unit),
+        _format_value(worst, unit),
+        _format_value(promised, unit),
+        verdict,
+    ]
 
 
-def _words(value: float | None, unit: str) -> str:
+def _format_value(value: float | None, unit: str) -> str:
     return "" if value is None else f"{value:.3g} {unit}".strip()
 
 
@@ -252,7 +260,7 @@ def marked_tests() -> dict[int, list[str]]:
     return found
 
 
-def _checked(number: int, tests: Iterable[str]) -> str:
+def _describe_promise(number: int, tests: Iterable[str]) -> str:
     files: dict[str, list[str]] = {}
     for test in tests:
         file, _, function = test.partition("::")
@@ -262,7 +270,7 @@ def _checked(number: int, tests: Iterable[str]) -> str:
     return f"{number}. **{name}.** {text} {listed}."
 
 
-def _busy(report: Report) -> str:
+def _load_note(report: Report) -> str:
     machine = report.metadata.machine
     priority = ""
     if machine.realtime is not None:

@@ -104,11 +104,11 @@ class LeRobotMapping:
         """Starts an episode: the row of its first observation."""
         self._start = {arm: observation.arms[arm].pose for arm in self._encoder.features.arms}
         self._targets = dict(self._start)
-        return self._row(observation, self._encoder.begin(observation)["touch"])
+        return self._make_row(observation, self._encoder.begin(observation)["touch"])
 
     def encode_observation(self, observation: Observation) -> Row:
         """The row of each later observation."""
-        return self._row(observation, self._encoder(observation)["touch"])
+        return self._make_row(observation, self._encoder(observation)["touch"])
 
     def encode_action(self, action: Action) -> NDArray[np.float32]:
         """(9 arms,) target poses; an arm without a target keeps its last one."""
@@ -144,7 +144,7 @@ class LeRobotMapping:
         names = {STATE: self.state.names, ACTION: self.action.names}.get(key)
         return Feature(value.dtype.name, value.shape, MAP_AXES[: value.ndim] if value.ndim > 1 else names)
 
-    def _row(self, observation: Observation, state: NDArray[Any]) -> Row:
+    def _make_row(self, observation: Observation, state: NDArray[Any]) -> Row:
         row: Row = {STATE: state}
         row |= {IMAGE + name: touch.image for name, touch in observation.tactile.items()}
         for kind, key in MAPS.items() if self._maps else ():
@@ -196,7 +196,7 @@ def arrow_table(features: Mapping[str, Feature], columns: Mapping[str, Column]) 
     """The rows of one row group, with columns in the order of `features`."""
     import pyarrow as pa
 
-    arrays = [_array(feature, columns[name]) for name, feature in features.items()]
+    arrays = [_arrow_array(feature, columns[name]) for name, feature in features.items()]
     info = {"info": {"features": {name: _feature_type(feature) for name, feature in features.items()}}}
     schema = pa.schema(
         [pa.field(name, array.type) for name, array in zip(features, arrays, strict=True)],
@@ -205,7 +205,7 @@ def arrow_table(features: Mapping[str, Feature], columns: Mapping[str, Column]) 
     return pa.Table.from_arrays(arrays, schema=schema)
 
 
-def _array(feature: Feature, column: Column) -> pa.Array:
+def _arrow_array(feature: Feature, column: Column) -> pa.Array:
     import pyarrow as pa
 
     if feature.dtype == "image":

@@ -135,14 +135,14 @@ def run_trial(task: str, physics: str, on_step: Callable[[], None] = lambda: Non
             start = truth if start is None else start
             distances.append(evaluate_outcome(goal, truth, start).distance)
             differences.append(image_difference(rig.frames, rig.references))
-            moments.append(_moment(step, rig.frames, observation, truth))
+            moments.append(_record_moment(step, rig.frames, observation, truth))
             on_step()
             if _is_beyond_goal(distances, planned.tolerance) or step == planned.steps:
                 break
             share = FINE_STEP_SHARE if _is_near_goal(distances, planned.tolerance) else 1.0
             longest = share * config.task.max_step / 2  # the policy itself uses half of max_step
             observation, _ = rig.step(_limit_motion(policy(observation), observation, longest))
-    return _trial(config, goal, distances, differences, moments)
+    return _make_trial(config, goal, distances, differences, moments)
 
 
 def _is_beyond_goal(distances: list[float], tolerance: float) -> bool:
@@ -170,7 +170,7 @@ def _limit_motion(action: Action, observation: Observation, longest: float) -> A
     return Action(tool)
 
 
-def _moment(step: int, frames: Mapping[str, TactileFrame], observation: Observation, truth: Truth) -> Moment:
+def _record_moment(step: int, frames: Mapping[str, TactileFrame], observation: Observation, truth: Truth) -> Moment:
     heights = {name: touch.height for name, touch in observation.tactile.items() if touch.height is not None}
     return Moment(
         step=step,
@@ -182,7 +182,7 @@ def _moment(step: int, frames: Mapping[str, TactileFrame], observation: Observat
     )
 
 
-def _trial(
+def _make_trial(
     config: RigConfig, task: Task, distances: list[float], differences: list[float], moments: list[Moment]
 ) -> Trial:
     assert config.scene is not None

@@ -95,7 +95,7 @@ def press(scene: Scene, sensor: SensorModel, motion: PressMotion, render: Render
         raise
     surface = world.surface("lower")
     sample = sample_surface(surface, image_grid(sensor.geometry))
-    contact = _contact(world, scene, sample, sensor)
+    contact = _contact_mask(world, scene, sample, sensor)
     area = float(contact.sum()) * sensor.geometry.pixel_pitch**2
     return PressResult(
         image=(render or Renderer(sensor, scene.gel.size[:2]))(surface),
@@ -167,7 +167,7 @@ def _targets(start: Pose, height: float, motion: PressMotion) -> list[Pose]:
     return targets
 
 
-def _contact(world: PressWorld, scene: Scene, sample: SurfaceSample, sensor: SensorModel) -> NDArray[np.bool_]:
+def _contact_mask(world: PressWorld, scene: Scene, sample: SurfaceSample, sensor: SensorModel) -> NDArray[np.bool_]:
     """(H, W) True where the indenter presses on the surface at a pixel."""
     contact_distance = 0.2  # in elements; a surface point farther from the indenter is not in contact
     assert scene.indenter is not None
@@ -188,14 +188,14 @@ def _contact(world: PressWorld, scene: Scene, sample: SurfaceSample, sensor: Sen
     gaps = np.full(sample.valid.shape, np.inf)
     if near.any():
         inner = np.full(len(at), np.inf)
-        inner[near] = _gaps(scene.indenter, at[near], scene.effective_element_size)
+        inner[near] = _indenter_distance(scene.indenter, at[near], scene.effective_element_size)
         gaps[rows, columns] = inner.reshape(valid.shape)
     table = SurfaceTable(world.surface("lower"))
     reach, _ = table.sample_on_grid(table.spline_values(world.reach().astype(np.float32)), grid)
     return _fill_gaps(gaps < reach.reshape(gaps.shape), int(scene.effective_element_size / sensor.geometry.pixel_pitch))
 
 
-def _gaps(indenter: Indenter, points: FloatArray, element: float) -> FloatArray:
+def _indenter_distance(indenter: Indenter, points: FloatArray, element: float) -> FloatArray:
     """(n,) distance of points (n, 3) from the indenter, in its frame [m]; for a mesh, that of the physics."""
     geometry = indenter.geometry
     if not isinstance(geometry, Mesh):

@@ -117,8 +117,8 @@ def ball_presses(folder: Path, of: BallSet, repeat: int) -> list[Measurement]:
     predictions, note = fit.predictions, f"{len(fit.left_out)} frames left out" if fit.left_out else ""
     timing = Timing((wall,), cpu)
     figures = {
-        "ncc": _mean(predictions, "correlation"),
-        "null_grey": _mean(predictions, "null_error"),
+        "ncc": _mean_of(predictions, "correlation"),
+        "null_grey": _mean_of(predictions, "null_error"),
         **_interval("grey", [prediction.error for prediction in predictions]),
         "presses": float(len(predictions)),
         "left_out": float(len(fit.left_out)),
@@ -126,17 +126,18 @@ def ball_presses(folder: Path, of: BallSet, repeat: int) -> list[Measurement]:
         "steepest": fit.forward.steepest if fit.forward else 0.0,
     }
     picture = Measurement(
-        timing, _mean(predictions, "error"), "grey", "the real frame where r < 1.5 contact radii, its drift removed; "
+        timing, _mean_of(predictions, "error"), "grey",
+        "the real frame where r < 1.5 contact radii, its drift removed; "
         "light by all other presses, circles and skirt by all", f"{of.name}: picture", None, figures, note,
     )  # fmt: skip
     flat = [float(np.degrees(np.arctan(_usual_slope(prediction, of)))) for prediction in predictions]
     figures = {
         "null_deg": float(np.mean(flat)),
         **_interval("deg", [prediction.angle for prediction in predictions]),
-        "untouched_deg": _mean(predictions, "untouched_angle"),
+        "untouched_deg": _mean_of(predictions, "untouched_angle"),
     }
     normals = Measurement(
-        timing, _mean(predictions, "angle"), "deg", "normals of ball and skirt inside the contact circle",
+        timing, _mean_of(predictions, "angle"), "deg", "normals of ball and skirt inside the contact circle",
         f"{of.name}: normals", None, figures, note,
     )  # fmt: skip
     return [picture, normals]
@@ -157,7 +158,7 @@ def cases(folder: Path) -> tuple[Case, ...]:
     )  # fmt: skip
 
 
-def _mean(predictions: Sequence[PressPrediction], what: str) -> float:
+def _mean_of(predictions: Sequence[PressPrediction], what: str) -> float:
     return float(np.mean([getattr(prediction, what) for prediction in predictions]))
 
 

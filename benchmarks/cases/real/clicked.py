@@ -50,7 +50,7 @@ def clicked_errors(folder: Path, of: BallSet) -> list[float]:
                 press = make_press(name, image, reference, mean_reference_colour(reference), circle)
             except BadFrames:
                 continue
-            found.append(_error(press, clicked[name], fit, ball))
+            found.append(_mask_error(press, clicked[name], fit, ball))
     return found
 
 
@@ -62,7 +62,7 @@ def corrected(circle: ContactCircle, fit: LightFit, clicked: Mapping[str, Contac
     return ContactCircle(circle.x + x, circle.y + y, min(circle.radius * scale, MAX_RADIUS_RATIO * ball))
 
 
-def _error(press: BallPress, inside: ContactCircle, fit: LightFit, ball: float) -> float:
+def _mask_error(press: BallPress, inside: ContactCircle, fit: LightFit, ball: float) -> float:
     assert fit.forward is not None
     rows, columns = press.shape
     mean = mean_reference_colour(fit.reference)

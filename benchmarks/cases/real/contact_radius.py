@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.cases.press import layer, press
+from benchmarks.cases.press import press, solve_layer
 from benchmarks.cases.real.labels import BadData, PressLabels, read_frames, read_labels
 from benchmarks.harness.measure import Measurement, timed
 from benchmarks.harness.runner import Case
@@ -36,7 +36,7 @@ def contact_radius(folder: Path, ball: float, thickness: float, element: float, 
     press(ball_scene((*labels.gel_size, 2e-3), ball, 1e-3), 0.05e-3)  # compiles
     world = make_world(scene)
     camera = RenderedSensor(labels, background)
-    before = camera.see(world)
+    before = camera.render_image(world)
     rows = []
     for at in sorted((p for p in labels.presses if p.ball_radius == ball), key=lambda p: p.depth):
         timing, stats = timed(partial(press_to, world, ball, at.depth), 1, warm=lambda: None)
@@ -52,7 +52,7 @@ def contact_radius(folder: Path, ball: float, thickness: float, element: float, 
         note = "" if stats.settled else "not settled"
         if at in frames:
             real = camera.radius(frames[at], background, ball, f"the real frame of {at.name}")
-            ours = camera.radius(camera.see(world), before, ball, f"our image of {at.name}")
+            ours = camera.radius(camera.render_image(world), before, ball, f"our image of {at.name}")
             figures |= {"real_px": real, "image_px": ours}
             rows.append(
                 Measurement(
@@ -118,7 +118,7 @@ def theories(ball: float, depth: float, thickness: float) -> dict[str, float]:
     def gap(r: FloatArray) -> FloatArray:
         return np.where(r < ball, ball - np.sqrt(np.maximum(ball**2 - r**2, 0.0)), 1.0)
 
-    contact = layer(gap, depth, GelMaterial().poisson_ratio, LAYER_PIXELS, thickness)
+    contact = solve_layer(gap, depth, GelMaterial().poisson_ratio, LAYER_PIXELS, thickness)
     return {
         "cap": float(np.sqrt(2 * ball * depth - depth**2)),
         "hertz": float(np.sqrt(ball * depth)),
@@ -138,7 +138,7 @@ class RenderedSensor:
         self._pitch = labels.pixel_pitch
         self._render = Renderer(SensorModel(geometry=geometry), labels.gel_size)
 
-    def see(self, world: World) -> Image:
+    def render_image(self, world: World) -> Image:
         return self._render(world.surface("lower"))
 
     def radius(self, image: Image, background: Image, ball: float, what: str) -> float:

@@ -75,7 +75,7 @@ def marker_film(film: Film, path: Path, repeat: int) -> list[Measurement]:
     from calibration.markers.lattice import NoLattice, median_pitch
     from calibration.markers.tracker import DotTracker
 
-    frames = _frames(path)
+    frames = _read_film(path)
     first = next(frames, None)
     if first is None:
         raise BadData(f"{path}: a film without frames")
@@ -97,7 +97,7 @@ def marker_film(film: Film, path: Path, repeat: int) -> list[Measurement]:
         processor.append(process_time() - cpu)
         always &= tracked.visible
         fewest = min(fewest, int(tracked.visible.sum()))
-        out |= ~tracked.visible & _cut(rest + tracked.displacement, radius, image)
+        out |= ~tracked.visible & _is_cut(rest + tracked.displacement, radius, image)
         moved = np.where(np.abs(tracked.displacement) > np.abs(moved), tracked.displacement, moved)
         resting = resting and float(np.abs(image.astype(np.float32) - first).mean()) < STILL
         if resting:
@@ -129,14 +129,14 @@ def marker_film(film: Film, path: Path, repeat: int) -> list[Measurement]:
     return [Measurement(timing, max(0.0, lost), "% lost", against, film.name, None, figures, note)]
 
 
-def _cut(places: NDArray[np.float64], radius: float, image: Image) -> NDArray[np.bool_]:
+def _is_cut(places: NDArray[np.float64], radius: float, image: Image) -> NDArray[np.bool_]:
     """(n,) True for dots at `places` (n, 2) that the border of the picture cuts."""
     rows, columns, _ = image.shape
     edge = np.array([columns - 1, rows - 1]) - radius
     return np.asarray(((places < radius) | (places > edge)).any(axis=1))
 
 
-def _frames(path: Path) -> Iterator[Image]:
+def _read_film(path: Path) -> Iterator[Image]:
     from tacsim.record.sources import folder_images, list_pictures, video_images
 
     try:

@@ -47,12 +47,12 @@ def invariance(
     if len(frames) < MIN_PRESSES:
         raise BadData(f"{of.name}: {len(frames)} presses; at least {MIN_PRESSES} are needed")
     named = "" if gel_size is not None else f"{of.name}, "
-    gel_size = _gel_of(folder, of, reference) if gel_size is None else gel_size
+    gel_size = _estimate_gel(folder, of, reference) if gel_size is None else gel_size
     wall, cpu, pressed, notes = 0.0, 0.0, 0, []
     by_source: dict[str, list[tuple[Comparison, Calibration | None]]] = {"pictures": [], "surfaces": []}
     for fold in range(FOLDS):
         train = tuple(frame for k, frame in enumerate(frames) if k % FOLDS != fold)
-        both, calibration, taken, fold_notes = _fold(of, reference, train, frames[fold::FOLDS], gel_size)
+        both, calibration, taken, fold_notes = _compare_fold(of, reference, train, frames[fold::FOLDS], gel_size)
         wall, cpu, pressed = wall + taken[0], cpu + taken[1], pressed + len(both["pictures"].pairs)
         notes += fold_notes
         for source, comparison in both.items():
@@ -64,7 +64,7 @@ def invariance(
     return rows
 
 
-def _gel_of(folder: Path, of: BallSet, reference: Image) -> tuple[float, float, float]:
+def _estimate_gel(folder: Path, of: BallSet, reference: Image) -> tuple[float, float, float]:
     """Estimated size of a gel from its pictures [m]. Raises BadData."""
     fit, _, _ = balls.calibrated(folder, of)
     thickness = float(np.clip(fit.thickness * of.pixel_pitch, *THICKNESS))
@@ -118,7 +118,7 @@ def _rows(
     return rows
 
 
-def _fold(
+def _compare_fold(
     of: BallSet, reference: Image, train: Frames, test: Frames, gel_size: tuple[float, float, float]
 ) -> tuple[dict[str, Comparison], Calibration, tuple[float, float], list[str]]:
     """Simulated left-out presses compared with the real ones, by source; the calibration without them; wall and

@@ -56,18 +56,18 @@ def known_depth(folder: Path, ball: float, repeat: int) -> list[Measurement]:
     camera = CalibratedSensor(of, fit, labels.gel_size, reference)
     rows = []
     for press in sorted((p for p in frames if p.ball_radius == ball), key=lambda p: p.depth):
-        real = _circle(press, frames[press], reference, labels)
+        real = _find_circle(press, frames[press], reference, labels)
         wall, cpu = perf_counter(), process_time()
         settled = press_to(world, ball, press.depth).settled
-        image = camera.see(place_surface(world.surface("lower"), real.x, real.y, camera.model))
+        image = camera.render_image(place_surface(world.surface("lower"), real.x, real.y, camera.model))
         timing = Timing((perf_counter() - wall,), process_time() - cpu)
-        ours = _circle(press, image, reference, labels)  # light shifts it in the same way as the real one
+        ours = _find_circle(press, image, reference, labels)  # light shifts it in the same way as the real one
         x, y = 2 * real.x - ours.x, 2 * real.y - ours.y
         surface = place_surface(world.surface("lower"), x, y, camera.model)
-        image = camera.see(surface)
+        image = camera.render_image(surface)
         cap = float(np.sqrt(2 * ball * press.depth - press.depth**2)) / labels.pixel_pitch
         mask = circle_mask(reference.shape[:2], x, y, REACH * cap)
-        figures = pictures(image, frames[press], reference, mask) | {"depth_mm": press.depth * 1e3}
+        figures = compare_pictures(image, frames[press], reference, mask) | {"depth_mm": press.depth * 1e3}
         note = "" if settled else "not settled"
         rows.append(
             Measurement(
@@ -75,7 +75,7 @@ def known_depth(folder: Path, ball: float, repeat: int) -> list[Measurement]:
                 f"{press.name}: picture", None, figures, note,
             )
         )  # fmt: skip
-        rows.append(_height(camera, surface, frames[press], press, (x, y), timing))
+        rows.append(_height_row(camera, surface, frames[press], press, (x, y), timing))
     return rows
 
 
@@ -96,7 +96,7 @@ class CalibratedSensor:
         self._normalise = normaliser_for_calibration(calibration, GRID)
         self._normalise.take_reference(TactileFrame(reference, time=0.0, index=0))
 
-    def see(self, surface: GelSurface) -> Image:
+    def render_image(self, surface: GelSurface) -> Image:
         return self._render(surface)
 
     def height(self, image: Image) -> FloatArray:
@@ -108,7 +108,7 @@ class CalibratedSensor:
         return found.astype(np.float64)
 
 
-def _circle(press: PressLabel, image: Image, reference: Image, labels: PressLabels) -> Circle:
+def _find_circle(press: PressLabel, image: Image, reference: Image, labels: PressLabels) -> Circle:
     """The contact circle in the image. Raises BadData."""
     try:
         return find_contact_circle(image, reference, press.ball_radius / labels.pixel_pitch)
@@ -123,7 +123,7 @@ def circle_mask(shape: Iterable[int], x: float, y: float, radius: float) -> Mask
     return np.asarray(np.hypot(u - x, v - y) < radius)
 
 
-def pictures(image: Image, real: Image, reference: Image, mask: Mask) -> dict[str, float]:
+def compare_pictures(image: Image, real: Image, reference: Image, mask: Mask) -> dict[str, float]:
     """Similarity of two pictures inside `mask`, and that of the picture without contact."""
     from calibration.compare import metrics
 
@@ -137,7 +137,7 @@ def pictures(image: Image, real: Image, reference: Image, mask: Mask) -> dict[st
     }
 
 
-def _height(
+def _height_row(
     camera: CalibratedSensor,
     surface: GelSurface,
     real: Image,

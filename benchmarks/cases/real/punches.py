@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.cases.real import balls
-from benchmarks.cases.real.known_depth import light_of, pictures
+from benchmarks.cases.real.known_depth import compare_pictures, light_of
 from benchmarks.cases.real.labels import (
     BadData,
     PressLabels,
@@ -204,7 +204,7 @@ def punch(folder: Path, mesh: str, repeat: int) -> list[Measurement]:
         image = draw(draw.dent(face, placed.scale, one.depth), placed.x, placed.y)
         timing = Timing((perf_counter() - wall,), process_time() - cpu)
         mask = face.mask(reference.shape[:2], placed.x, placed.y, labels.pixel_pitch, placed.scale, RIM)
-        figures = pictures(image, found[one][1], reference, mask) | {
+        figures = compare_pictures(image, found[one][1], reference, mask) | {
             "depth_mm": one.depth * 1e3, "scale": placed.scale, "x_px": placed.x, "y_px": placed.y,
         }  # fmt: skip
         rows.append(

@@ -76,17 +76,17 @@ def check_placement(
     place = placement.sensor[:3, 3]
     shown = _format_pose(placement.reading.tcp_pose)
     words = f"sensor at {_millimetres(place)} mm in the world; the pendant (feature Base) shows {shown}"
-    yield _model(name, config, placement) or Check(f"{name}: pose", "ok", words)
-    yield _workspace(name, config, place, file)
+    yield _check_model(name, config, placement) or Check(f"{name}: pose", "ok", words)
+    yield _check_workspace(name, config, place, file)
     if start is not None:
-        yield _start_distance(name, config, placement, start)
-    yield _force(name, config, placement, file)
-    yield _payload(name, config, placement)
-    yield _tcp(name, config, placement)
-    yield _slider(name, placement)
+        yield _check_start(name, config, placement, start)
+    yield _check_force(name, config, placement, file)
+    yield _check_payload(name, config, placement)
+    yield _check_tcp(name, config, placement)
+    yield _check_slider(name, placement)
 
 
-def _model(name: str, config: UrArmConfig, placement: ArmPlacement) -> Check | None:
+def _check_model(name: str, config: UrArmConfig, placement: ArmPlacement) -> Check | None:
     """A failed check if joints and pose do not fit the arm model of the file."""
     limit = 20e-3  # a larger distance from the pose of the model means another model [m]
     found = displacement(Kinematics(config.model).forward(placement.reading.joints), placement.flange)
@@ -96,7 +96,7 @@ def _model(name: str, config: UrArmConfig, placement: ArmPlacement) -> Check | N
     return Check(f"{name}: pose", "fail", far, "correct model in the rig file")
 
 
-def _workspace(name: str, config: UrArmConfig, place: FloatArray, file: str) -> Check:
+def _check_workspace(name: str, config: UrArmConfig, place: FloatArray, file: str) -> Check:
     label, region = f"{name}: workspace", config.limits.region
     beyond = region.normals @ place - region.offsets
     broken = [int(face) for face in np.argsort(-beyond) if beyond[face] > ROUNDING]
@@ -114,7 +114,7 @@ def _workspace(name: str, config: UrArmConfig, place: FloatArray, file: str) -> 
     )
 
 
-def _start_distance(name: str, config: UrArmConfig, placement: ArmPlacement, start: Pose) -> Check:
+def _check_start(name: str, config: UrArmConfig, placement: ArmPlacement, start: Pose) -> Check:
     target, here = pendant_pose(config, placement, start), placement.reading.tcp_pose
     turn = rotation_vector(matrix(target)[:3, :3] @ matrix(here)[:3, :3].T)
     degrees = np.degrees(float(np.linalg.norm(turn)))
@@ -124,7 +124,7 @@ def _start_distance(name: str, config: UrArmConfig, placement: ArmPlacement, sta
     return Check(f"{name}: way to start", "ok", words)
 
 
-def _force(name: str, config: UrArmConfig, placement: ArmPlacement, file: str) -> Check:
+def _check_force(name: str, config: UrArmConfig, placement: ArmPlacement, file: str) -> Check:
     label, limits = f"{name}: force", config.limits
     force, torque = _magnitudes(placement.wrench)
     then, turning = _magnitudes(placement.expected_wrench)
@@ -142,7 +142,7 @@ def _force(name: str, config: UrArmConfig, placement: ArmPlacement, file: str) -
     return Check(label, "ok", words)
 
 
-def _payload(name: str, config: UrArmConfig, placement: ArmPlacement) -> Check:
+def _check_payload(name: str, config: UrArmConfig, placement: ArmPlacement) -> Check:
     max_mass_error, max_centre_error = 0.05, 10e-3  # payloads within these differences are the same [kg, m]
     label, configured, reading = f"{name}: payload", config.payload, placement.reading
     wanted = f"{configured.mass:g} kg at {_millimetres(np.array(configured.centre))} mm"
@@ -157,7 +157,7 @@ def _payload(name: str, config: UrArmConfig, placement: ArmPlacement) -> Check:
     return _accept_for_mock(config, Check(label, "warn", f"the controller has {found}, the file says {wanted}", advice))
 
 
-def _tcp(name: str, config: UrArmConfig, placement: ArmPlacement) -> Check:
+def _check_tcp(name: str, config: UrArmConfig, placement: ArmPlacement) -> Check:
     max_distance, max_angle = 0.5e-3, 5e-3  # TCPs within these differences are the same [m, rad]
     label, wanted = f"{name}: TCP", se3.to_matrix(config.flange_from_tool.pose)
     if placement.reading.tcp is None:
@@ -172,7 +172,7 @@ def _tcp(name: str, config: UrArmConfig, placement: ArmPlacement) -> Check:
     return _accept_for_mock(config, Check(label, "warn", found, advice))
 
 
-def _slider(name: str, placement: ArmPlacement) -> Check:
+def _check_slider(name: str, placement: ArmPlacement) -> Check:
     label, slider = f"{name}: speed slider", placement.reading.speed_slider
     if slider is None:
         return Check(label, "ok", "not reported by this controller")

@@ -38,11 +38,11 @@ def examine(name: str, config: UrArmConfig, start: Pose | None, file: str) -> Ar
         file: name of the rig file, for the commands in the advice.
     """
     placements: list[ArmPlacement] = []
-    checks = list(_checks(name, config, start, file, placements))
+    checks = list(_run_checks(name, config, start, file, placements))
     return ArmExamination(checks, se3.from_matrix(placements[0].sensor) if placements else None)
 
 
-def _checks(
+def _run_checks(
     name: str, config: UrArmConfig, start: Pose | None, file: str, placements: list[ArmPlacement]
 ) -> Iterator[Check]:
     closed = [f"{port} ({what})" for port, what in PORTS.items() if not _is_open(config.host, port)]
@@ -53,7 +53,7 @@ def _checks(
     yield Check(f"{name}: network", "ok", f"{config.host}: ports {', '.join(map(str, PORTS))} answer")
     try:
         with Dashboard(config.host, TIMEOUT) as dashboard:
-            yield from _controller(name, config, dashboard)
+            yield from _check_controller(name, config, dashboard)
     except DeviceError as failure:
         yield Check(f"{name}: dashboard", "fail", str(failure), "restart the controller, and read its log")
     try:
@@ -64,8 +64,8 @@ def _checks(
         placements.append(placement)
         yield Check(f"{name}: RTDE", "ok", "version 2")
         yield from check_placement(name, config, placement, start, file)
-    yield _limits(name, config)
-    yield _start(name, config)
+    yield _describe_limits(name, config)
+    yield _check_start(name, config)
 
 
 def _is_open(host: str, port: int) -> bool:
@@ -76,7 +76,7 @@ def _is_open(host: str, port: int) -> bool:
     return True
 
 
-def _controller(name: str, config: UrArmConfig, dashboard: Dashboard) -> Iterator[Check]:
+def _check_controller(name: str, config: UrArmConfig, dashboard: Dashboard) -> Iterator[Check]:
     min_polyscope = (5, 6)  # the first version that reports remote control
     version = dashboard.request("PolyscopeVersion")
     found = re.search(r"(\d+)\.(\d+)\.\d+", version)
@@ -112,7 +112,7 @@ def _controller(name: str, config: UrArmConfig, dashboard: Dashboard) -> Iterato
         yield Check(f"{name}: ready", "fail", str(failure), "correct it at the pendant, then check again")
 
 
-def _limits(name: str, config: UrArmConfig) -> Check:
+def _describe_limits(name: str, config: UrArmConfig) -> Check:
     limits = config.limits
     size = 1e3 * (np.array(limits.workspace.upper) - limits.workspace.lower)
     words = (
@@ -127,7 +127,7 @@ def _limits(name: str, config: UrArmConfig) -> Check:
     return Check(f"{name}: limits", "ok", words, advice)
 
 
-def _start(name: str, config: UrArmConfig) -> Check:
+def _check_start(name: str, config: UrArmConfig) -> Check:
     """Checks that the start pose is in the workspace and within reach."""
     label = f"{name}: start"
     if config.start is None:

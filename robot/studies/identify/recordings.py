@@ -60,7 +60,7 @@ class Recordings:
     def read(self, path: Path) -> Press:
         """Raises BadRecording, EpisodeError."""
         min_moments = 3  # of a press
-        press = self._table(path) if path.suffix.lower() == TABLE else self._episode(path)
+        press = self._read_table(path) if path.suffix.lower() == TABLE else self._read_episode(path)
         if len(press.time) < min_moments:
             raise BadRecording(f"{path}: {len(press.time)} moments; a press needs at least {min_moments}")
         if not any(name.rpartition(".")[2] in FORCES for name in press.readings):
@@ -76,16 +76,16 @@ class Recordings:
         own = depth_below_centre(
             indenter.geometry, indenter.turn, indenter.effective_edge_radius(self.scene.effective_element_size)
         )
-        return self._balls.get(_name(path), own)
+        return self._balls.get(_recording_name(path), own)
 
     # ------------------------------------------------------------------ tables
 
-    def _table(self, path: Path) -> Press:
+    def _read_table(self, path: Path) -> Press:
         """Reads a CSV file: x, y, z [m], fx, fy, fz [N] on the sensor `lower`, in its axes, and optionally time [s].
 
         z: height of the lowest point of the indenter above the untouched gel, or the gap between the two gels.
         """
-        columns = _header(path)
+        columns = _read_header(path)
         forces = [name for name in FORCES if name in columns]
         timed = ["time"] if "time" in columns else []
         rows = np.array(read_columns(path, ["x", "y", "z", *timed, *forces]))
@@ -103,7 +103,7 @@ class Recordings:
                 "upper": tuple(Pose(row[:3], se3.HALF_TURN_X.quaternion) for row in rows),
             }
         readings = {f"lower.{name}": rows[:, 3 + len(timed) + k] for k, name in enumerate(forces)}
-        return Press(_name(path), poses, readings, time, np.ones(len(rows), np.int64))
+        return Press(_recording_name(path), poses, readings, time, np.ones(len(rows), np.int64))
 
     def _require_metres(self, path: Path, z: FloatArray) -> None:
         """Raises BadRecording for an indenter below the gel, or for gels that intersect: probably not in metres."""
@@ -118,7 +118,7 @@ class Recordings:
 
     # ------------------------------------------------------------------ episodes
 
-    def _episode(self, path: Path) -> Press:
+    def _read_episode(self, path: Path) -> Press:
         with EpisodeFile(path) as file:
             meta = file.meta
         original = recorded_rig(path)
@@ -136,7 +136,7 @@ class Recordings:
         self.from_ur |= original is not None and any(
             arm.is_real for arm in parts_of(original.arms, UrArmConfig).values()
         )
-        roles = self._roles(path, list(sensor_arms))
+        roles = self._assign_sensors(path, list(sensor_arms))
         with open_replay(config) as rig:
             observations = [rig.reset()]
             while True:
@@ -152,11 +152,11 @@ class Recordings:
                 for channel, value in self._tactile_readings(role, sensor, arm, observation).items():
                     readings.setdefault(channel, []).append(value)
         whole = {key: np.array(values) for key, values in readings.items() if len(values) == len(observations)}
-        poses = self._poses(path, roles, sensor_arms, observations, original)
+        poses = self._relative_poses(path, roles, sensor_arms, observations, original)
         time = np.array([each.time for each in observations])
-        return Press(_name(path), poses, whole, time, np.ones(len(time), np.int64))
+        return Press(_recording_name(path), poses, whole, time, np.ones(len(time), np.int64))
 
-    def _roles(self, path: Path, sensors: Sequence[str]) -> dict[str, str]:
+    def _assign_sensors(self, path: Path, sensors: Sequence[str]) -> dict[str, str]:
         """The recorded sensor of each gel of the scene."""
         wanted = self.scene.sensors
         if len(wanted) == 1 and len(sensors) == 1:
@@ -198,7 +198,7 @@ class Recordings:
                 readings[f"{role}.width"] = math.nan
         return readings
 
-    def _poses(
+    def _relative_poses(
         self,
         path: Path,
         roles: dict[str, str],
@@ -220,11 +220,11 @@ class Recordings:
         found = []
         for each in observations:
             sensor = Pose() if arm is None or arm not in each.arms else each.arms[arm].pose
-            indenter = each.arms["indenter"].pose if "indenter" in each.arms else self._place(path, original)
+            indenter = each.arms["indenter"].pose if "indenter" in each.arms else self._indenter_pose(path, original)
             found.append(se3.relative_pose(sensor, indenter))
         return {"indenter": tuple(found)}
 
-    def _place(self, path: Path, original: RigConfig | None) -> Pose:
+    def _indenter_pose(self, path: Path, original: RigConfig | None) -> Pose:
         """Pose of an indenter that is not on an arm."""
         if self._indenter is not None:
             return self._indenter
@@ -238,12 +238,12 @@ class Recordings:
         return Pose(np.array([0.0, 0.0, height]), self.scene.indenter.turn)
 
 
-def _name(path: Path) -> str:
+def _recording_name(path: Path) -> str:
     """Name of a recording: that of its file, or of the folder of a run."""
     return path.parent.name if path.name == f"episode{EPISODE}" else path.stem
 
 
-def _header(path: Path) -> list[str]:
+def _read_header(path: Path) -> list[str]:
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             return [name.strip() for name in next(csv.reader(file), [])]
@@ -282,7 +282,7 @@ def read_all(
 ) -> tuple[Press, ...]:
     """Reads all presses. Raises BadRecording, also for a ball whose recording is missing; EpisodeError."""
     presses = []
-    recordings.require(_name(path) for path in paths)
+    recordings.require(_recording_name(path) for path in paths)
     for index, path in enumerate(paths):
         on_file(index, len(paths))
         presses.append(recordings.read(path))

@@ -51,13 +51,13 @@ class Simulation:
     def __call__(self, points: Sequence[Point]) -> list[FloatArray]:
         """(m,) signals at each point, in the order of `signals_of`. Raises CannotSimulate."""
         batch_size = 16  # presses in one batch
-        keys = [[self._key(point, index) for index in range(len(self.presses))] for point in points]
+        keys = [[self._job_key(point, index) for index in range(len(self.presses))] for point in points]
         jobs = list(dict.fromkeys(key for each in keys for key in each))
         ran: dict[Job, FloatArray] = {}
         for begin in range(0, len(jobs), batch_size):
             part = jobs[begin : begin + batch_size]
             self.on_run(begin, len(jobs))
-            ran |= zip(part, self._run(part), strict=True)
+            ran |= zip(part, self._run_batch(part), strict=True)
         self.on_run(len(jobs), len(jobs))
         result = []
         for point, each in zip(points, keys, strict=True):
@@ -89,15 +89,15 @@ class Simulation:
     def _values(self, point: Point) -> dict[str, float]:
         return {each.name: each.value(float(free)) for each, free in zip(self.parameters, point.free, strict=True)}
 
-    def _key(self, point: Point, index: int) -> Job:
+    def _job_key(self, point: Point, index: int) -> Job:
         values = self._values(point)
         if self._scaled:
             values["youngs_modulus"] = self._stiffness
         return tuple(values[each.name] for each in self.parameters), float(point.places[index]), point.size, index
 
-    def _run(self, jobs: Sequence[Job]) -> list[FloatArray]:
+    def _run_batch(self, jobs: Sequence[Job]) -> list[FloatArray]:
         """(channels, moments) of each job."""
-        scenes = [self._scene(job) for job in jobs]
+        scenes = [self._job_scene(job) for job in jobs]
         batch = Batch([scene for scene, _ in scenes])
         paths = [
             _path(self.presses[index], place - raised)
@@ -127,10 +127,10 @@ class Simulation:
                         f"{self.presses[index].name}, moment {moment + 1}, with {parameters}: {ended}"
                     ) from ended
                 if targets[member] is not None:
-                    found[member].append(self._signals(batch, member, self.presses[jobs[member][-1]]))
+                    found[member].append(self._simulated_signals(batch, member, self.presses[jobs[member][-1]]))
         return [np.array(rows).T for rows in found]
 
-    def _scene(self, job: Job) -> tuple[Scene, float]:
+    def _job_scene(self, job: Job) -> tuple[Scene, float]:
         """The scene of a job, and the height of its indenter's centre above the recorded one [m], at which the lowest
         point of an indenter of another size is in the same place."""
         values, _, size, index = job
@@ -145,7 +145,7 @@ class Simulation:
         higher = depth_below_centre(shape, indenter.turn) - depth_below_centre(stated, indenter.turn)
         return scene.model_copy(update={"indenter": indenter}), higher
 
-    def _signals(self, batch: Batch, member: int, press: Press) -> list[float]:
+    def _simulated_signals(self, batch: Batch, member: int, press: Press) -> list[float]:
         """One number for each channel of the press, in the present state of the world."""
         world = batch.worlds[member]
         readings: dict[str, float] = {}

@@ -270,7 +270,7 @@ def test_the_command_makes_a_set_of_a_folder_of_objects(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        (("--objects", "nothing"), "is no folder; give a folder of STL files, or 'shapes'"),
+        (("--objects", "nothing"), "is not a folder; give a folder of STL files, or 'shapes'"),
         (("--objects", "empty"), "empty holds no STL file"),
         (("--objects", "broken"), "stl: is no STL"),
         (("--depth", "1..0.1mm"), "goes from the larger to the smaller"),

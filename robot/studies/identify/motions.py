@@ -66,14 +66,14 @@ def motions(scene: Scene) -> dict[str, str]:
 
 
 def _press_path(depth: float) -> list[Row]:
-    down = _straight_line((0, -CLEAR, 0), (0, depth, 0), STEP)
+    down = _line_points((0, -CLEAR, 0), (0, depth, 0), STEP)
     return [*[(0.0, -CLEAR, 0.0)] * REST, *down, *down[::-2], *[(0.0, -CLEAR, 0.0)] * REST]
 
 
 def _slide_path(depth: float) -> list[Row]:
-    forth = _straight_line((0, depth, 0), (SLIDE, depth, 0), 2 * STEP)
-    back = _straight_line((SLIDE, depth, 0), (SLIDE, -CLEAR, 0), 2 * STEP)
-    return [*[(0.0, -CLEAR, 0.0)] * REST, *_straight_line((0, -CLEAR, 0), (0, depth, 0), STEP), *forth, *back,
+    forth = _line_points((0, depth, 0), (SLIDE, depth, 0), 2 * STEP)
+    back = _line_points((SLIDE, depth, 0), (SLIDE, -CLEAR, 0), 2 * STEP)
+    return [*[(0.0, -CLEAR, 0.0)] * REST, *_line_points((0, -CLEAR, 0), (0, depth, 0), STEP), *forth, *back,
             *[(SLIDE, -CLEAR, 0.0)] * REST]  # fmt: skip
 
 
@@ -81,17 +81,15 @@ def _squeeze_path(height: float) -> list[Row]:
     step, closed = BODY_STEP * height, SQUEEZE_SHARE * height
     half = closed / 2
     legs = [(-CLEAR, half), (half, half - 2 * step), (half - 2 * step, closed), (closed, closed - 5 * step)]
-    path = [row for a, b in legs for row in _straight_line((0, a, 0), (0, b, 0), step)]
+    path = [row for a, b in legs for row in _line_points((0, a, 0), (0, b, 0), step)]
     end = (0.0, closed - 5 * step, 0.0)
     return [*[(0.0, -CLEAR, 0.0)] * REST, *path, *[end] * REST]
 
 
 def _drag_path(height: float) -> list[Row]:
     far, deep, step = BODY_SLIDE_SHARE * height, SLIDE_SQUEEZE_SHARE * height, BODY_STEP * height
-    path = _straight_line((0, -CLEAR, 0), (0, deep, 0), step) + _straight_line((0, deep, 0), (far, deep, 0), 2 * step)
-    path += _straight_line((far, deep, 0), (0, deep, 0), 2 * step) + _straight_line(
-        (0, deep, 0), (0, -CLEAR, 0), 2 * step
-    )
+    path = _line_points((0, -CLEAR, 0), (0, deep, 0), step) + _line_points((0, deep, 0), (far, deep, 0), 2 * step)
+    path += _line_points((far, deep, 0), (0, deep, 0), 2 * step) + _line_points((0, deep, 0), (0, -CLEAR, 0), 2 * step)
     return [*[(0.0, -CLEAR, 0.0)] * REST, *path, *[(0.0, -CLEAR, 0.0)] * REST]
 
 
@@ -104,13 +102,13 @@ def _tilt_path(height: float, width: float) -> list[Row]:
         (0.0, -lift, TILT), (0.0, TILT_DEPTH * height, TILT), (0.0, eased, TILT), (TILT_SLIDE * height, eased, TILT),
         (-TILT_BACK * height, eased + (TILT_SLIDE + TILT_BACK) * height * math.tan(TILT), TILT),  # along its face
     ]  # fmt: skip
-    path = [row for a, b in pairwise(turns) for row in _straight_line(a, b, 1.5 * step if b[0] else step)]
+    path = [row for a, b in pairwise(turns) for row in _line_points(a, b, 1.5 * step if b[0] else step)]
     end = (turns[-1][0], -lift, TILT)
-    lifted = [*_straight_line((0, 0, 0), (0, -lift, 0), CLEAR), *_straight_line((0, -lift, 0), turns[0], step)]
-    return [*lifted, *[turns[0]] * REST, *path, *_straight_line(turns[-1], end, 2 * step), *[end] * REST]
+    lifted = [*_line_points((0, 0, 0), (0, -lift, 0), CLEAR), *_line_points((0, -lift, 0), turns[0], step)]
+    return [*lifted, *[turns[0]] * REST, *path, *_line_points(turns[-1], end, 2 * step), *[end] * REST]
 
 
-def _straight_line(a: Sequence[float], b: Sequence[float], step: float) -> list[Row]:
+def _line_points(a: Sequence[float], b: Sequence[float], step: float) -> list[Row]:
     """From a to b in equal steps, without a."""
     count = max(1, math.ceil(max(math.dist(a[:2], b[:2]) / step, abs(b[2] - a[2]) / TURN) - 1e-9))
     found = []

@@ -251,7 +251,7 @@ def _offer_zeroing(arm: StartArm, operator: Operator) -> None:
         operator.report(f"Arm '{arm.name}' is zeroed and reports {force:.1f} N.")
     elif too_much:
         operator.report(
-            f"Arm '{arm.name}' feels more than its limits and cannot be moved: see what it touches, or zero it."
+            f"Arm '{arm.name}' exceeds its force limits and cannot be moved: check its contact, or zero it."
         )
 
 

@@ -101,7 +101,7 @@ def normaliser_for_calibration(
     find = SurfaceFinder(slopes, rectify.valid, grid, dots=dots, drifts=True, better=better)
     flow = marker_flow(calibration.markers, geometry, calibration.gel_size, calibration.view, calibration.region)
     known = None
-    if untouched is not None:  # it is metric by itself, whatever the camera's picture is
+    if untouched is not None:  # it is metric, even if the camera's picture is not
         known = rectification_of_geometry(geometry, calibration.gel_size, wide)(untouched)
     return FrameNormaliser(rectify, grid, find, flow, untouched=known)
 

@@ -63,7 +63,7 @@ def draw(rows: Sequence[Row], path: Path) -> None:
 
 
 def _close_above(place: Sequence[float], other: Sequence[float]) -> bool:
-    """Whether words between two places in a panel, from 0 to 1 across it, would lie on one another."""
+    """True if labels at two places in a panel, from 0 to 1 across it, would overlap."""
     return abs(other[0] - place[0]) < 0.3 and 0.0 < other[1] - place[1] < 0.2
 
 

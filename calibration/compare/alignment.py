@@ -26,7 +26,7 @@ class Alignment:
     a_from_b: FloatArray  # (2, 3) affine: x, y in A of x, y in B
     shape: tuple[int, int]  # rows, columns of B
     source: tuple[int, int]  # ... of A
-    shift: tuple[float, float] = (0.0, 0.0)  # the part of it that was found: how far A's contacts lie off B's [px of B]
+    shift: tuple[float, float] = (0.0, 0.0)  # fitted part: displacement of A's contacts from B's [px of B]
     description: str = "pixel for pixel"
 
     @property

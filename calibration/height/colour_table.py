@@ -132,8 +132,8 @@ def _maximum_likelihood_slope(
     from scipy.spatial import KDTree
 
     tree = KDTree(np.concatenate([colours / COLOUR_NOISE, slopes / SLOPE_PRIOR], axis=1))
-    asked = np.concatenate([middles / COLOUR_NOISE, np.zeros((len(middles), 2))], axis=1)
-    distance, index = tree.query(asked, eps=0.1, distance_upper_bound=MAX_COLOUR_DISTANCE / COLOUR_NOISE)
+    query = np.concatenate([middles / COLOUR_NOISE, np.zeros((len(middles), 2))], axis=1)
+    distance, index = tree.query(query, eps=0.1, distance_upper_bound=MAX_COLOUR_DISTANCE / COLOUR_NOISE)
     off_gamut = ~np.isfinite(distance)
     where = distance_transform_edt(
         off_gamut.reshape(TABLE_CELLS, TABLE_CELLS, TABLE_CELLS), return_distances=False, return_indices=True

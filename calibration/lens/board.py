@@ -121,10 +121,10 @@ def _find_dot_lattice(contrast: FloatArray, board: Board) -> tuple[FloatArray, F
     if not strongest > 0.5:  # [grey levels]
         return 0
     shown = np.clip(255.0 * (1.0 - contrast / strongest), 0, 255).astype(np.uint8)
-    asked = cv2.SimpleBlobDetector.Params()
-    asked.filterByCircularity = asked.filterByConvexity = asked.filterByInertia = False
-    asked.minArea, asked.maxArea, asked.minDistBetweenBlobs = 9.0, contrast.size / 40.0, 5.0
-    detector = cv2.SimpleBlobDetector.create(asked)
+    options = cv2.SimpleBlobDetector.Params()
+    options.filterByCircularity = options.filterByConvexity = options.filterByInertia = False
+    options.minArea, options.maxArea, options.minDistBetweenBlobs = 9.0, contrast.size / 40.0, 5.0
+    detector = cv2.SimpleBlobDetector.create(options)
     blobs = np.array([point.pt for point in detector.detect(shown)], dtype=np.float64).reshape(-1, 2)
     if len(blobs) < board.columns * board.rows:
         return len(blobs)

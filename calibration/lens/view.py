@@ -235,7 +235,7 @@ def calibrated_view(view: GelView | None, pitch: float, image_shape: tuple[int, 
     ones, or coarser ones for a camera with a finer resolution than the canonical grid. Then a metric picture (no view,
     `pitch` [m]) gets a view, which keeps the size of native pictures."""
     max_pixels = 160_000
-    # A light is calibrated at no finer pixels than these: four a cell of the canonical grid, and so many in all
+    # A light is calibrated at no finer pixels than these: four a cell of the canonical grid, and this number in total
     # [m]
     finest_pitch = 0.25e-3 / 4
     rows, columns = image_shape

@@ -69,8 +69,8 @@ from tacsim.models.photometric import (
 )
 from tacsim.optics.render import darken_by_depth
 
-SATURATED_ROUNDS = 2  # of telling which saturated pixels are predicted too dark
-ORDER_FRAMES = 9  # frames whose median tells the order of colours, at most
+SATURATED_ROUNDS = 2  # of the search for saturated pixels that are predicted too dark
+ORDER_FRAMES = 9  # maximum number of frames whose median gives the channel order
 NO_DIRECTION = "this light tells no direction: all flanks of a dent change alike"
 
 
@@ -323,7 +323,7 @@ def _fit_shadows(
     ]
     if not choose_size(sets).shadows:
         return presses, refined, None
-    for _ in range(round_count):  # circles tell where the lamps stand, and the lamps where the circles are
+    for _ in range(round_count):  # circles give the lamps, and the lamps give better circles
         refined = refine_geometry(windows, refined.circles, ball, shade, (ball / refined.thickness,))
         shade = find_lamps(windows, refined.circles, refined.thickness, ball, presses[0].shape)
     return [replace(p, circle=c) for p, c in zip(presses, refined.circles, strict=True)], refined, shade

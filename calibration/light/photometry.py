@@ -223,7 +223,7 @@ def choose_size(presses: Sequence[NormalEquations]) -> ModelSize:
 
 
 def _best_size(presses: Sequence[NormalEquations], shadows: int) -> tuple[float, ModelSize]:
-    """The left-out error of the best size with so many terms of shadows, and that size."""
+    """The left-out error of the best size with this number of terms of shadows, and that size."""
     # degree in the normal, in the place
     sizes = ((1, 0), (3, 0), (5, 0), (1, 1), (3, 1), (5, 1), (1, 2), (3, 2), (5, 2))
     best: tuple[float, ModelSize] | None = None

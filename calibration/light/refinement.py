@@ -20,7 +20,7 @@ from calibration.light.shadows import DentShade
 from calibration.light.tuning import FIRST_THINNESS, MAX_ALTERNATIVE_COST, MAX_RIM_RATIO, RIM_BLUR, THINNESS_BOUNDS
 from tacsim.interface import FloatArray
 
-MAX_GROUPS = 8  # that are left out in turn to tell the uncertainty of radii
+MAX_GROUPS = 8  # that are left out in turn to estimate the uncertainty of radii
 
 
 @dataclass(frozen=True, slots=True)

@@ -106,6 +106,6 @@ def find_lamps(
 
 
 def _downsample_window(window: Window) -> Window:
-    pixels_of_press = 600  # of each press, about, that tell where lamps stand
+    pixels_of_press = 600  # of each press, approximately, for the positions of lamps
     keep = slice(None, None, max(1, len(window.u) // pixels_of_press))
     return Window(window.u[keep], window.v[keep], window.change[keep])

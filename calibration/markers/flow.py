@@ -220,7 +220,7 @@ def _native_pixels_per_metre(rectify: Rectification, grid: PixelGrid) -> float:
 def _lookup_map(
     rectify: Rectification, shrink: int, box: tuple[slice, slice]
 ) -> tuple[NDArray[np.int16], NDArray[np.uint16]]:
-    """Where the middle of each pixel in `box` lies in the native image made smaller, in OpenCV's fixed point."""
+    """Positions of the pixel centres in `box` in the reduced native image, in OpenCV's fixed point."""
     import cv2
 
     rows, columns = rectify.valid.shape

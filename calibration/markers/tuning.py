@@ -33,8 +33,8 @@ MIN_JUMP_SHARE = 0.04  # of dots and of points that are unmatched: more make a j
 MAX_JUMP = 2.6  # [pitches]
 # A speck of dirt taken for a dot
 MIN_DIRT_MISFIT = 0.1  # distance from the extrapolated place that is suspicious [pitches]
-MIN_DIRT_MISFIT_RATIO = 4.0  # ... if it is also so many times the median
+MIN_DIRT_MISFIT_RATIO = 4.0  # ... if it also exceeds the median by this factor
 MAX_DIRT_GAIN = 0.25  # another point is the dot if its distance is less than this share
 # A dot that moves alone: two dots in one, or glare on it
 OUTLIER_MISFIT = 0.15  # distance from the extrapolated place [pitches]
-OUTLIER_MISFIT_RATIO = 2.5  # ... if it is also so many times that of each of its neighbours
+OUTLIER_MISFIT_RATIO = 2.5  # ... if it also exceeds that of each of its neighbours by this factor

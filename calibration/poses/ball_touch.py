@@ -141,7 +141,7 @@ def _start_poses(turn: FloatArray, place: FloatArray, contacts: FloatArray) -> l
 def locate_ball(height: FloatArray, valid: Mask, pitch: float, ball_radius: float) -> tuple[tuple[float, float], float]:
     """Contact centre (x, y) [m] and depth [m] of a ball, in a surface `height` (h, w) [m] on the canonical grid.
 
-    Fits a ball of `ball_radius` to the cap deeper than half of the deepest point, where the gel lies on the ball (by
+    Fits a ball of `ball_radius` to the cap deeper than half of the deepest point, where the gel touches the ball (by
     Hertz the contact circle is half as deep). Raises BadMeasurements if the surface shows no ball.
     """
     min_cells = 12  # of a cap

@@ -146,7 +146,7 @@ def run_trial(task: str, physics: str, on_step: Callable[[], None] = lambda: Non
 
 
 def _is_beyond_goal(distances: list[float], tolerance: float) -> bool:
-    """True when the peak lies early enough in the curve, and the curve has fallen far enough after it."""
+    """True if the peak is early enough in the curve, and the curve has fallen far enough after it."""
     peak, last = int(np.argmin(distances)), len(distances) - 1
     return peak <= PEAK_PLACE * last and distances[-1] - distances[peak] > 1.2 * MIN_REWARD_FALL * tolerance
 

@@ -91,8 +91,8 @@ def _recorded_surfaces(frames: Sequence[Frame]) -> tuple[tuple[SurfaceEstimate |
         if frame.surface is None:
             return None, "pictures alone have no height; give the sensor's calibration"
         if frame.surface.height.shape != shape:
-            found = " x ".join(map(str, frame.surface.height.shape))
-            return None, f"the recorded surface has {found} cells, not {shape[0]} x {shape[1]}; give a calibration"
+            cells = " x ".join(map(str, frame.surface.height.shape))
+            return None, f"the recorded surface has {cells} cells, not {shape[0]} x {shape[1]}; give a calibration"
         everywhere = np.ones(shape, dtype=np.bool_)
         found.append(SurfaceEstimate(frame.surface.height, frame.surface.gradient, frame.surface.flow, everywhere))
     return tuple(found), ""

@@ -2,5 +2,5 @@
 
 import os
 
-# As the command has it (robot.cli): on a busy machine several threads of BLAS spin, and processor time is theirs.
+# As in the command (robot.cli): on a busy machine several BLAS threads spin, and use processor time.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

@@ -1,5 +1,5 @@
-"""What `tacsim bench` does: measure or read reports, show them, write files and pages. The options are in
-robot/cli/bench.py."""
+"""The actions of `tacsim bench`: measure or read reports, print them, write files and pages. robot/cli/bench.py has the
+options."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from robot.cli.terminal import Interrupt
 
 
 def read(paths: Sequence[Path]) -> list[Report]:
-    """Reports of earlier runs. Raises BadParameter."""
+    """Reads reports of earlier runs. Raises BadParameter."""
     return [_read(path) for path in paths]
 
 
@@ -44,12 +44,12 @@ def _read(path: Path) -> Report:
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(map(str, first["loc"])) or "the whole file"
-        words = f"{path} is no report of tacsim bench: {place}: {first['msg']} ({error.error_count()} problems)"
+        words = f"{path} is not a report of tacsim bench: {place}: {first['msg']} ({error.error_count()} problems)"
         raise typer.BadParameter(words, param_hint="--from") from None
 
 
 def require_cpu_for_a_page() -> None:
-    """Raises BadParameter on a GPU: the page is the CPU's, with GPUs beside it."""
+    """Raises BadParameter on a GPU: the page needs a report of the CPU, and can add those of GPUs."""
     if backend() != "cpu":
         words = f"TACSIM_DEVICE is '{backend()}', but a page needs the CPU's report too: use --json now, then --from"
         raise typer.BadParameter(words, param_hint="--docs")
@@ -68,12 +68,14 @@ def for_a_page(reports: Sequence[Report], paths: Sequence[Path]) -> list[Report]
 
 
 def measure(group: str, repeat: int | None, *, baselines: bool, long: bool, data: Path | None) -> tuple[Report, int]:
-    """A run of a group, or of all but robot; and the exit code of the signal that stopped it, or 0. Raises
-    BadParameter; Exit when the group robot is stopped."""
+    """Measures a group, or all except robot. Returns the report and the exit code of the signal that stopped it, or 0.
+
+    Raises BadParameter; Exit if the group robot is stopped.
+    """
     if group == "real" and data is None:
         raise typer.BadParameter("the group real needs frames of a real sensor: --data DIR", param_hint="--data")
     if group not in ("real", "all") and data is not None:
-        raise typer.BadParameter(f"the group {group} looks at no real frames", param_hint="--data")
+        raise typer.BadParameter(f"the group {group} uses no real frames", param_hint="--data")
     if group == "robot":
         return _measure_robot(repeat or (5 if long else 1)), 0
     wanted = [name for name in GROUPS if group == name or (group == "all" and name != "robot")]
@@ -85,21 +87,21 @@ def measure(group: str, repeat: int | None, *, baselines: bool, long: bool, data
         row = bar.add_task("starting", total=len(cases))
         begun = 0
 
-        def say(case: Case) -> None:
+        def report_case(case: Case) -> None:
             nonlocal begun
             words = f"{case.name}, {case.method}, {case.resolution}"
             bar.update(row, completed=begun, description=words)
-            if not notes.is_terminal:  # a log has no bar
+            if not notes.is_terminal:  # a log shows no bar
                 notes.print(f"{begun + 1}/{len(cases)} {words}")
             begun += 1
 
-        report = run_cases(cases, repeat or 5, baselines=baselines, long=long, on_start=say, stop=interrupt)
+        report = run_cases(cases, repeat or 5, baselines=baselines, long=long, on_start=report_case, stop=interrupt)
     return report, interrupt.exit_code
 
 
 def _measure_robot(repeat: int) -> Report:
-    """The figures that tests of the promises record (tests/promises.py). Those marked `often` mostly wait, so three of
-    them go on at a time, after the others."""
+    """Runs the tests of the promises, which record figures (tests/promises.py). Those marked `often` mostly wait, so
+    three of them run at a time, after the others."""
     if find_spec("pytest") is None or not (ROOT / "tests").is_dir():
         raise typer.BadParameter("the group robot is measured by tests: pip install -e '.[dev]'", param_hint="GROUP")
     with tempfile.TemporaryDirectory() as folder, Interrupt() as interrupt:
@@ -123,7 +125,7 @@ def _run_promises(marked: str, repeat: int, file: Path, interrupt: Interrupt, *o
             if interrupt():
                 tests.terminate()
                 tests.wait()
-                print_error("stopped by a signal; nothing is written")
+                print_error("stopped by a signal; no file is written")
                 raise typer.Exit(interrupt.exit_code)
             time.sleep(0.1)
     if not file.is_file():
@@ -133,14 +135,14 @@ def _run_promises(marked: str, repeat: int, file: Path, interrupt: Interrupt, *o
 
 
 def show(reports: Sequence[Report]) -> None:
-    """The rows on stdout, what is missing and what failed on stderr."""
+    """Prints the rows to stdout, and missing and failed cases to stderr."""
     for report in reports:
         table = Table(box=None, padding=(0, 1))
         for column in COLUMNS:
             table.add_column(column, justify="left" if column in COLUMNS[:3] else "right", overflow="fold")
         for row in report.results:
             table.add_row(*cells(row))
-        # a file or a pipe has no width; a table folded to 80 columns cannot be read there
+        # a file or a pipe has no width, and a table folded to 80 columns is hard to read
         console = Console(width=None if results.is_terminal else 160, highlight=False)
         if len(reports) > 1:
             console.print(setting(report))
@@ -155,7 +157,7 @@ def show(reports: Sequence[Report]) -> None:
 
 
 def write(reports: Sequence[Report], json: Path | None, docs: Path | None) -> None:
-    """The first report as a file and picture, all of them as pages. Raises OSError."""
+    """Writes the first report as a file and a picture, and all reports as pages. Raises OSError."""
     report, *devices = reports
     physics = report.metadata.groups != ["robot"]
     written: list[Path] = []

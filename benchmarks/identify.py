@@ -1,13 +1,13 @@
 """How well `tacsim identify` finds hidden materials: `python -m benchmarks.identify gel` (body, poisson, friction,
 docs).
 
-Each truth is drawn and simulated in a process of its own, on a mesh that identification does not use, and recorded with
-the motions that `tacsim identify … --motions` writes; its numbers come back in a file that is opened when all is done.
-Then noise, zeros and places are drawn again many times: how often do the intervals hold the truth, how often is a drift
-or a wrong ball noticed, how often something that is not there? No draw needs a simulation: near the estimate the
-simulation is the linear system that the fit ended with, and what is drawn is added to the recordings as they were. A
-gel takes a minute, a body a quarter of an hour. `friction` says which motion tells which friction. `docs` writes the
-table of docs/identify.md, of what was measured in `--folder` before; what lacks it measures.
+A separate process draws each truth, simulates it on a mesh that identification does not use, and records the motions
+that `tacsim identify … --motions` writes. It stores the truth in a file that is read after the fit. Then noise, zeros
+and places are drawn again many times, to count how often the intervals contain the truth, how often a drift or a wrong
+ball is detected, and how often there are false detections. No draw needs a simulation: near the estimate the simulation
+equals the linear system at the end of the fit, and the errors are added to the recordings. A gel takes a minute, a body
+a quarter of an hour. `friction` compares motions for the identification of friction. `docs` writes the table of
+docs/identify.md from the results in `--folder`, and measures missing ones.
 """
 
 from __future__ import annotations
@@ -33,21 +33,22 @@ from calibration.materials.tuning import MAX_IDENTIFIED_HALF_INTERVAL
 from robot.studies.identify.identify import MOMENTS, Identified, Kind, identify, parameters_of
 from robot.studies.identify.motions import motions
 from robot.studies.identify.recordings import Recordings, find_recordings, read_all
-from robot.studies.identify.simulation import Seen, Simulation
+from robot.studies.identify.simulation import SensorView, Simulation
 from tacsim import pose as se3
 from tacsim.config import load_scene
 from tacsim.interface import FloatArray, Pose
 from tacsim.models.scene import Scene
 from tacsim.models.sensor import CanonicalGrid
 
-TRUE_MESH = ("scene.element_size=0.4 mm", "scene.particle_spacing=0.2 mm")  # between those that identification uses
+# between the meshes that identification uses
+TRUE_MESH = ("scene.element_size=0.4 mm", "scene.particle_spacing=0.2 mm")
 RIGS = {"gel": "press", "body": "sim"}
 MOTIONS = {"gel": ("press", "slide"), "body": ("squeeze", "tilt")}
 DRIFTS = {"gel": (0.05, 0.1, 0.2), "body": (0.2, 0.5, 1.0)}  # of the normal force during the first recording [N]
-PAGE, ROWS = Path("docs/measurements/identification.md"), "found.json"  # of all truths; of each, in its folder
+PAGE, ROWS = Path("docs/measurements/identification.md"), "found.json"  # the page of all truths; the file of one truth, in its folder
 BEGIN, END = "<!-- made by python -m benchmarks.identify docs -->", "<!-- end of the table -->"
 HEAD = (
-    "| Truth | Recordings | Simulated | Time | Off the truth (95 %; draws that hold it) | Told against it | Noticed |",
+    "| Truth | Recordings | Simulated | Time | Error (95 %; draws with the truth inside) | Contradictions | Detected |",
     "|---|---|---|---|---|---|---|",
 )
 WORDS = {
@@ -55,7 +56,7 @@ WORDS = {
     "hardening_modulus": "hardening", "friction_lower": "friction below", "friction_upper": "friction above",
 }  # fmt: skip
 FRICTIONS = ((0.15, 0.15), (0.3, 0.3), (0.6, 0.6), (1.0, 1.0), (0.3, 0.6), (0.6, 0.3), (0.2, 0.6))  # below, above
-PLACE, ZERO = 0.02e-3, 0.2  # standard deviations of what the recordings are spoilt with [m, N]
+PLACE, ZERO = 0.02e-3, 0.2  # standard deviations of the errors that are added to the recordings [m, N]
 
 
 @dataclass(frozen=True)
@@ -66,16 +67,16 @@ class Row:
     recordings: int
     simulated: int
     seconds: float | None
-    # By name: how far the estimate and the ends of its interval are off, as shares of the truth; in how many draws of
-    # how many the interval holds it. None: not told.
+    # by name: relative errors of the estimate and of the ends of its interval; number of draws whose interval contains
+    # the truth, and number of draws. None: not identified
     parameters: dict[str, tuple[float, ...] | None]
     against: list[str]
-    noticed: dict[str, int]  # in how many draws something is said, by what is wrong
+    noticed: dict[str, int]  # number of draws with a detection, by error
     draws: int
 
 
-def draw(kind: str, seed: int) -> dict[str, float]:
-    """Materials within a factor of 1.5 or so round those of the scenes."""
+def draw_truth(kind: str, seed: int) -> dict[str, float]:
+    """Random materials within a factor of about 1.5 of those of the scenes."""
     random = np.random.default_rng(seed)
     if kind == "gel":
         return {
@@ -93,9 +94,9 @@ def draw(kind: str, seed: int) -> dict[str, float]:
 
 
 def record(kind: str, seed: int, folder: Path) -> None:
-    """In a process of its own: draws a truth, runs the motions, writes recordings and, apart, the truth."""
-    truth = draw(kind, seed)
-    shutil.rmtree(folder / "runs", ignore_errors=True)  # of a recording that was cut off
+    """Draws a truth, runs the motions, and writes recordings and truth, in a separate process."""
+    truth = draw_truth(kind, seed)
+    shutil.rmtree(folder / "runs", ignore_errors=True)  # of an incomplete recording
     scene = load_scene("press" if kind == "gel" else "squeeze")
     sets = [
         word for text in (*TRUE_MESH, *(f"{key}={value!r}" for key, value in truth.items())) for word in ("--set", text)
@@ -112,7 +113,7 @@ def record(kind: str, seed: int, folder: Path) -> None:
 
 
 def refitted(found: Identified, values: FloatArray, priors: Priors) -> Fit:
-    """The fit to `values` (m,), by the simulation as it is near the estimate: linear."""
+    """The fit to `values` (m,), with the simulation linearised near the estimate."""
     fit, zeros = found.fit, found.signals.zeros()
     p, t = len(fit.free), found.signals.presses
     own = fit.predicted - zeros @ fit.nuisances[t : t + zeros.shape[1]]
@@ -128,8 +129,8 @@ def refitted(found: Identified, values: FloatArray, priors: Priors) -> Fit:
     signals = replace(found.signals, values=values, noise=fit.sigma)
     parameters = [replace(each, start=fit.value(each.name)) for each in fit.parameters]
     again = estimate_materials([predict], signals, parameters, priors, 0.0)
-    kept = replace(again, mesh_shift=fit.mesh_shift, settled_shift=fit.settled_shift, runs=fit.runs)
-    return kept.with_sigma(again.sigma).widen_intervals(values - again.predicted, signals.series)
+    refit = replace(again, mesh_shift=fit.mesh_shift, settled_shift=fit.settled_shift, runs=fit.runs)
+    return refit.with_sigma(again.sigma).widen_intervals(values - again.predicted, signals.series)
 
 
 def redrawn(found: Identified, values: FloatArray, seed: int, priors: Priors) -> tuple[Fit, Signals]:
@@ -142,12 +143,12 @@ def redrawn(found: Identified, values: FloatArray, seed: int, priors: Priors) ->
 
 
 def recordings_of(kind: Kind, number: int, folder: Path) -> tuple[list[Path], dict[str, float]]:
-    """Recordings and truth in `folder`; made by another process, unless they are there."""
+    """Recordings and truth in `folder`; another process makes them if they are missing."""
     if not (folder / "truth.json").exists():
         folder.mkdir(parents=True, exist_ok=True)
-        twin = "import sys, pathlib; from benchmarks.identify import record; record(sys.argv[1], int(sys.argv[2]), "
+        script = "import sys, pathlib; from benchmarks.identify import record; record(sys.argv[1], int(sys.argv[2]), "
         subprocess.run(
-            [sys.executable, "-c", twin + "pathlib.Path(sys.argv[3]))", kind, str(number), str(folder)], check=True
+            [sys.executable, "-c", script + "pathlib.Path(sys.argv[3]))", kind, str(number), str(folder)], check=True
         )
     truth = {}
     for key, value in json.loads((folder / "truth.json").read_text(encoding="utf-8")).items():
@@ -156,46 +157,44 @@ def recordings_of(kind: Kind, number: int, folder: Path) -> tuple[list[Path], di
 
 
 def measured(kind: Kind, number: int, folder: Path, draws: int, force_noise: float, preset: str) -> list[Row]:
-    """Of one truth: by all that was recorded, and by forces alone. Kept in `folder`."""
+    """The rows of one truth: from all recorded data, and from forces alone. Writes them into `folder`."""
     noise, priors = Noise(force_noise), Priors(PLACE, ZERO)
     paths, truth = recordings_of(kind, number, folder)
     scene = load_scene("press" if kind == "gel" else "squeeze", [f"preset={preset}"])
     recordings, began = Recordings(scene), time.perf_counter()
     presses = read_all(recordings, paths)
     random = np.random.default_rng(number)
-    spoilt = [_spoilt(press, force_noise, random) for press in presses]
-    found = identify(kind, scene, recordings, spoilt, noise, priors)
+    disturbed = [_add_errors(press, force_noise, random) for press in presses]
+    found = identify(kind, scene, recordings, disturbed, noise, priors)
     seconds = time.perf_counter() - began
     clean = signals_of([downsample_press(merge_repeated_readings(press), MOMENTS) for press in presses], noise).values
     force = found.signals.force[found.signals.channel]
     alone = forces_alone(found)
     alone = replace(alone, fit=refitted(alone, alone.signals.values, priors))
     rows = [
-        row(found, clean, truth, draws, priors, f"{kind} {number}", seconds),
-        row(alone, clean[force], truth, draws, priors, "the same by forces alone", None),
+        make_row(found, clean, truth, draws, priors, f"{kind} {number}", seconds),
+        make_row(alone, clean[force], truth, draws, priors, "the same by forces alone", None),
     ]
     (folder / ROWS).write_text(json.dumps([asdict(each) for each in rows], indent=1), encoding="utf-8")
     return rows
 
 
 def main(
-    kind: Annotated[
-        str, typer.Argument(help="gel, body, docs; poisson, friction: what which presses tell of it.")
-    ] = "gel",
+    kind: Annotated[str, typer.Argument(help="gel, body, docs; poisson, friction: which motions identify it.")] = "gel",
     truths: Annotated[int, typer.Option(min=1)] = 3,
     draws: Annotated[int, typer.Option(min=1)] = 50,
     seed: int = 0,
     force_noise: Annotated[float, typer.Option(help="[N]")] = 0.02,
     preset: str = "standard",
-    folder: Annotated[Path, typer.Option(help="Of the recordings; those that are there are not made again.")] = Path(
+    folder: Annotated[Path, typer.Option(help="Of the recordings; existing ones are used again.")] = Path(
         "runs/identify"
     ),
 ) -> None:
     """Prints a line of the table for each truth; `docs` writes the table."""
     if kind == "poisson":
         for balls, heights, one in product(((4.0,), (8.0,), (2.0, 8.0), (4.0, 8.0)), (False, True), (0.02, 0.005)):
-            felt = "forces and heights" if heights else "forces"
-            typer.echo(f"| {' and '.join(f'{each:g}' for each in balls)} mm | {felt} | {one} N | "
+            channels = "forces and heights" if heights else "forces"
+            typer.echo(f"| {' and '.join(f'{each:g}' for each in balls)} mm | {channels} | {one} N | "
                        f"{poisson(one, heights, balls)} |")  # fmt: skip
         return
     if kind == "friction":
@@ -210,17 +209,17 @@ def main(
             found = [Row(**each) for each in json.loads((own / ROWS).read_text(encoding="utf-8"))]
         else:
             found = measured(what, number, own, draws, force_noise, preset)
-        typer.echo("\n".join(map(line, found)))
+        typer.echo("\n".join(map(table_line, found)))
         rows += found
     if kind == "docs":
         text = PAGE.read_text(encoding="utf-8")
         before, after = text.partition(BEGIN)[0], text.partition(END)[2]
-        table = "\n".join([*HEAD, *map(line, rows)])
+        table = "\n".join([*HEAD, *map(table_line, rows)])
         PAGE.write_text(f"{before}{BEGIN}\n{table}\n{END}{after}", encoding="utf-8")
 
 
 def forces_alone(found: Identified) -> Identified:
-    """As if no sensor had seen heights and flow, by the system that the fit ended with."""
+    """The result without heights and flow, from the linear system at the end of the fit."""
     signals = found.signals
     rows = signals.force[signals.channel]
     one = {name: getattr(signals, name)[rows] for name in ("values", "noise", "press", "channel", "time")}
@@ -232,8 +231,8 @@ def forces_alone(found: Identified) -> Identified:
     )  # fmt: skip
 
 
-def _spoilt(press: Press, noise: float, random: np.random.Generator) -> Press:
-    """With noise, and with zeros of the force that are off."""
+def _add_errors(press: Press, noise: float, random: np.random.Generator) -> Press:
+    """The press with noise, and with errors of the force zeros."""
     return replace(
         press,
         readings={
@@ -247,45 +246,47 @@ def _is_force(channel: str) -> bool:
     return channel.rpartition(".")[2] in ("fx", "fy", "fz")
 
 
-def row(
+def make_row(
     found: Identified, clean: FloatArray, truth: dict[str, float], draws: int, priors: Priors, name: str,
     seconds: float | None,
 ) -> Row:  # fmt: skip
-    """What was found, beside the truth; clean: (m,) the signals without noise."""
+    """The result compared with the truth. clean: (m,) the signals without noise."""
     fit, names = found.fit, tuple(press.name for press in found.presses)
     parameters: dict[str, tuple[float, ...] | None] = {each.name: None for each in fit.parameters}
     again = [redrawn(found, clean, k, priors) for k in range(draws)]
     for each in fit.identified:
         one, value, true = each.name, fit.value(each.name), truth[each.name]
-        ends = [fit.interval(one) for fit, _ in again if one in {told.name for told in fit.identified}]
-        held = sum(low <= true <= high for low, high in ends)
-        parameters[one] = (value / true - 1, *(end / true - 1 for end in fit.interval(one)), held, len(ends))
+        ends = [fit.interval(one) for fit, _ in again if one in {parameter.name for parameter in fit.identified}]
+        contained = sum(low <= true <= high for low, high in ends)
+        parameters[one] = (value / true - 1, *(end / true - 1 for end in fit.interval(one)), contained, len(ends))
 
-    def noticed_in(drawn: tuple[Fit, Signals]) -> bool:
+    def is_detected(drawn: tuple[Fit, Signals]) -> bool:
         return bool(find_contradictions(replace(drawn[0], sigma=found.checked.sigma), drawn[1], names, found.by_size))
 
-    noticed = {"nothing wrong": sum(map(noticed_in, again))}
+    detections = {"nothing wrong": sum(map(is_detected, again))}
     for what, change in _faults(found).items():
-        noticed[what] = sum(noticed_in(redrawn(found, clean + change, k, priors)) for k in range(draws))
+        detections[what] = sum(is_detected(redrawn(found, clean + change, k, priors)) for k in range(draws))
     return Row(
-        name, len(names), fit.runs, seconds, parameters, [each.kind for each in found.findings], noticed, draws
+        name, len(names), fit.runs, seconds, parameters, [each.kind for each in found.findings], detections, draws
     )  # fmt: skip
 
 
-def line(row: Row) -> str:
+def table_line(row: Row) -> str:
     cells = []
     for name, found in row.parameters.items():
         words = WORDS.get(name, name)
         if found is None:
-            cells.append(f"{words} not told")
+            cells.append(f"{words} not identified")
             continue
-        off, low, high, held, of = found
+        error, low, high, contained, draws = found
         miss = "" if low <= 0 <= high else ", MISSES"
-        cells.append(f"{words} {100 * off:+.1f} % ({100 * low:+.0f} to {100 * high:+.0f}{miss}; {held:g} of {of:g})")
-    noticed = ", ".join(f"{what} {count}" for what, count in row.noticed.items())
+        cells.append(
+            f"{words} {100 * error:+.1f} % ({100 * low:+.0f} to {100 * high:+.0f}{miss}; {contained:g} of {draws:g})"
+        )
+    detections = ", ".join(f"{what} {count}" for what, count in row.noticed.items())
     seconds = "" if row.seconds is None else f"{row.seconds:.0f} s"
     return (f"| {row.name} | {row.recordings} | {row.simulated} | {seconds} | {'; '.join(cells)} | "
-            f"{', '.join(row.against) or 'nothing'} | {noticed} of {row.draws} |")  # fmt: skip
+            f"{', '.join(row.against) or 'nothing'} | {detections} of {row.draws} |")  # fmt: skip
 
 
 def poisson(force_noise: float, heights: bool, balls: tuple[float, ...]) -> str:
@@ -300,18 +301,18 @@ def poisson(force_noise: float, heights: bool, balls: tuple[float, ...]) -> str:
         readings = {f"lower.{name}": np.where(depths > 0.2e-3, 0.0, np.nan if name == "width" else 0.0)
                     for name in names}  # fmt: skip
         presses.append(Press("press", poses, readings, depths * 0, np.ones(len(depths), np.int64), radius * 1e-3))
-    seen = {"lower": Seen(CanonicalGrid(), None, np.ones((64, 64), np.bool_))}
-    simulation = Simulation(scene, tuple(parameters), tuple(presses), seen)
+    views = {"lower": SensorView(CanonicalGrid(), None, np.ones((64, 64), np.bool_))}
+    simulation = Simulation(scene, tuple(parameters), tuple(presses), views)
     [values] = simulation([Point(start_values(parameters), np.zeros(len(balls)))])
     signals = replace(signals_of(presses, Noise(force_noise)), values=values)
     fit = estimate_materials([simulation], signals, parameters, Priors(PLACE, 10 * force_noise), SETTLING_ERROR)
     if any(each.name == "poisson_ratio" for each in fit.unidentified):
-        return "not told"
+        return "not identified"
     return "{:.3f} to {:.3f}".format(*fit.interval("poisson_ratio"))
 
 
 def planned(scene: Scene, motion: str, moments: int) -> Press:
-    """One of the motions of a body, from first touch on, at so many moments, before anything is felt."""
+    """One of the motions of a body from first contact, at a number of moments, with zero readings."""
     touch = Pose(np.array([0.0, 0.0, 10e-3]), se3.HALF_TURN_X.quaternion)
     rows = np.loadtxt(motions(scene)[motion].splitlines(), delimiter=",", skiprows=1)
     upper = [touch, *(se3.compose(touch, se3.from_rotation_vector([x, 0, z], [0, turn, 0])) for x, z, turn in rows)]
@@ -344,13 +345,13 @@ def friction(motion: str, sensors: tuple[float, ...] = (0.02, 0.2, 1.0)) -> list
             cells.append(
                 " / ".join("no" if half > MAX_IDENTIFIED_HALF_INTERVAL else f"{100 * half:.0f} %" for half in halves)
             )
-        apart = np.degrees(abs(np.arctan(lower) - np.arctan(upper_one)))
-        lines.append(f"| {motion} | {lower:g} / {upper_one:g} | {apart:.0f} | {' | '.join(cells)} |")
+        angle = np.degrees(abs(np.arctan(lower) - np.arctan(upper_one)))
+        lines.append(f"| {motion} | {lower:g} / {upper_one:g} | {angle:.0f} | {' | '.join(cells)} |")
     return lines
 
 
 def _faults(found: Identified) -> dict[str, FloatArray]:
-    """What is to be noticed, as a change of the signals (m,)."""
+    """The errors to detect, as changes of the signals (m,)."""
     signals = found.signals
     channel = signals.channels.index("lower.fz")
     rows = (signals.press == 0) & (signals.channel == channel)

@@ -1,7 +1,7 @@
-"""Real tactile sensors brought to the simulator's terms: light, lens, markers, poses, and how well the two agree.
+"""Calibration of real tactile sensors for the simulator: light, lens, markers, poses, and a comparison of both.
 
-The names below are public: ``from calibration import read_bundle, FrameNormaliser``. A module is imported when a name
-of it is asked for. The paths of modules are private and may change from one version to the next.
+The names below are public: ``from calibration import read_bundle, FrameNormaliser``. A module is imported at the first
+access to one of its names. The paths of modules are private and may change from one version to the next.
 """
 
 from __future__ import annotations

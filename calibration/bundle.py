@@ -1,7 +1,7 @@
-"""The calibration of one sensor as a folder: `calibration.yaml`, and the picture without contact beside it.
+"""The calibration of one sensor as a folder: `calibration.yaml` and the picture without contact.
 
-A bundle belongs to one serial number. Reading checks version, checksums and sizes, so a damaged, older or foreign one
-is refused with a word on what to do.
+A bundle belongs to one serial number. Reading checks version, checksums and sizes, and refuses a damaged, older or
+foreign bundle with a message that says what to do.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class BadBundle(CalibrationError):
 
 
 class Residual(Config):
-    """How well one press is predicted by a calibration made without it."""
+    """Error of the prediction of one press by a calibration without it."""
 
     frame: str
     circle: tuple[float, float, float]  # x, y, radius of the contact [px]
@@ -58,38 +58,38 @@ class Residual(Config):
 
 
 class Provenance(Config):
-    """Where a calibration comes from."""
+    """Origin of a calibration."""
 
     made: str  # date and time, ISO 8601
     software: str
     ball_radius: Positive
     frames: tuple[str, ...]
-    left_out: dict[str, str] = {}  # frames that took no part, and why
+    left_out: dict[str, str] = {}  # frames that were not used, with the reasons
     warnings: tuple[str, ...] = ()
 
 
 class Calibration(Config):
-    """All that calibration has found out about one sensor."""
+    """All results of the calibration of one sensor."""
 
     format: Literal[8] = 8
     serial: Annotated[str, Field(pattern=SERIAL)]
-    geometry: SensorGeometry  # of the picture that the models are for: the native one, or with `view` the rectified
+    geometry: SensorGeometry  # of the picture of the models: the native one, or with `view` the rectified one
     gel_size: tuple[Positive, Positive]  # x, y of the gel that the picture shows [m]
     forward: PhotometricModel | None = None  # slope -> colour
     inverse: InverseModel | None = None  # colour -> slope
-    darkness: DarknessModel | None = None  # both, of a light that tells depth and no direction
-    view: GelView | None = None  # where the gel lies in the native picture; None: the native picture is metric
-    region: PictureRegion | None = None  # what of the camera's picture shows gel; None: all of it, or of the view
+    darkness: DarknessModel | None = None  # replaces both for a light that shows depth, but no direction
+    view: GelView | None = None  # pose of the gel in the native picture; None: the native picture is metric
+    region: PictureRegion | None = None  # part of the camera's picture with the gel; None: all of it, or of the view
     markers: Markers | None = None  # None: no dots are printed on the gel
-    noise: CameraNoise | None = None  # of the picture that the models are for; None: not measured
-    # share of the grain without contact that moves with the gel; None: none is known to
+    noise: CameraNoise | None = None  # of the picture of the models; None: not measured
+    # share of the grain without contact that moves with the gel; None: not known
     skin: Annotated[float, Field(gt=0, le=1)] | None = None
     tool_from_sensor: Placement | None = None  # None: not measured
     latency: Annotated[Time, Field(ge=0)] | None = None  # from exposure to arrival; None: not measured [s]
     residuals: tuple[Residual, ...] = ()
     provenance: Provenance
     reference: Digest  # SHA-256 of the picture's bytes
-    checksum: Digest = "0" * 64  # SHA-256 of all the rest
+    checksum: Digest = "0" * 64  # SHA-256 of all other fields
 
     @property
     def image_shape(self) -> tuple[int, int]:
@@ -99,7 +99,7 @@ class Calibration(Config):
     @model_validator(mode="after")
     def _parts_agree(self) -> Self:
         if (self.forward is None) != (self.inverse is None) or (self.forward is None) == (self.darkness is None):
-            raise ValueError("a light is told either by forward and inverse, or by darkness")
+            raise ValueError("a light is given either by forward and inverse, or by darkness")
         pitch = self.geometry.pixel_pitch
         shown = (self.geometry.width * pitch, self.geometry.height * pitch)
         if any(abs(one - other) > pitch for one, other in zip(shown, self.gel_size, strict=True)):
@@ -109,7 +109,7 @@ class Calibration(Config):
         return self
 
     def digest(self) -> str:
-        """What `checksum` must be."""
+        """The correct value of `checksum`."""
         return bundle_digest(self.model_dump(mode="json"))
 
 
@@ -151,7 +151,7 @@ def read_bundle(path: Path, serial: str | None = None) -> tuple[Calibration, Ima
 
 
 def read_sensor_model(path: Path) -> SensorModel:
-    """The simulated twin of a calibrated sensor: geometry, view, untouched picture, light, dots, gel size, and the
+    """The simulation model of a calibrated sensor: geometry, view, untouched picture, light, dots, gel size, and the
     camera's noise if it was measured. Raises BadBundle."""
     try:
         return load_sensor(find_bundle(path))

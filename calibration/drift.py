@@ -1,4 +1,4 @@
-"""Drift of the light since the reference, measured where nothing touches the gel."""
+"""Drift of the light since the reference, measured on the gel without contact."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from calibration.tuning import CONTACT_BLUR, MAX_UNTOUCHED_CHANGE, MIN_CONTACT_CHANGE, MIN_UNTOUCHED_SHARE
 from tacsim.interface import Float32, Mask
 
-PIXEL_STRIDE = 5  # of the pixels from which it is measured
+PIXEL_STRIDE = 5  # of the measured pixels
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -18,7 +18,7 @@ class Drift:
     """One picture's drift, a quadratic in the place."""
 
     weights: Float32  # (6, 3) of 1, u, v, uu, uv, vv with u, v in -1..1 across the view
-    measured: bool  # on enough untouched gel; otherwise it is the median of all
+    measured: bool  # with enough untouched gel; otherwise the drift is the median of all pixels
 
     def scaled(self, factor: Float32) -> Drift:
         """The same in other units: each channel times its `factor` (3,)."""
@@ -26,13 +26,13 @@ class Drift:
 
 
 def max_mean_change(change: Float32) -> float:
-    """Mean over the gel of changes of colour (n, 3), in the channel that changed most [-]."""
+    """Mean change of colour over the gel, of (n, 3), in the channel with the largest change [-]."""
     return float(np.abs(change).mean(axis=0).max())
 
 
 def subtract_drift(change: NDArray[np.floating], level: NDArray[np.floating]) -> Float32:
-    """A change of colour (H, W, 3) [grey levels] since a picture whose mean colour is `level` (3,), its drift taken
-    off; as it is, where too little is untouched to measure one."""
+    """A change of colour (H, W, 3) [grey levels] since a picture with mean colour `level` (3,), without its drift;
+    unchanged if too little of the gel is untouched to measure a drift."""
     scale = np.maximum(np.asarray(level, dtype=np.float32), 1.0)
     planes = np.ascontiguousarray(np.moveaxis(change / scale, -1, 0), dtype=np.float32)
     find = DriftFinder((change.shape[0], change.shape[1]))
@@ -43,8 +43,8 @@ def subtract_drift(change: NDArray[np.floating], level: NDArray[np.floating]) ->
 
 
 class DriftFinder:
-    """Finds the drift in a view of `shape` (H, W): a quadratic in the place through the untouched pixels, fitted
-    twice, the second time to those near the first; the median where too few are untouched."""
+    """Finds the drift in a view of `shape` (H, W): a quadratic in the place, fitted twice to the untouched pixels, the
+    second time only to those near the first fit; or the median if too few pixels are untouched."""
 
     def __init__(self, shape: tuple[int, int]) -> None:
         self._u, self._v = (np.linspace(-1, 1, count, dtype=np.float32) for count in reversed(shape))
@@ -72,14 +72,14 @@ class DriftFinder:
         return Drift(weights, measured)
 
     def remove(self, planes: Float32, drift: Drift) -> None:
-        """Takes the drift off relative changes (3, H, W)."""
+        """Subtracts the drift from relative changes (3, H, W)."""
         for plane, (one, u, v, uu, uv, vv) in zip(planes, drift.weights.T, strict=True):
             plane -= (one + v * self._v + vv * self._v * self._v)[:, None] + (u * self._u + uu * self._u * self._u)
             plane -= (uv * self._v)[:, None] * self._u
 
     def drift_on_part(self, drift: Drift, corner: tuple[int, int], shape: tuple[int, int]) -> Float32:
-        """(h, w, 3) the drift on pixels of `shape` (h, w), of which the first lies at row and column `corner` of the
-        view; they may reach beyond it [-]."""
+        """(h, w, 3) the drift on pixels of `shape` (h, w) [-]. The first pixel is at row and column `corner` of the
+        view; pixels may be outside the view."""
         v, u = (
             (2.0 * (first + np.arange(count)) / (whole.size - 1) - 1.0).astype(np.float32)
             for first, count, whole in zip(corner, shape, (self._v, self._u), strict=True)
@@ -98,8 +98,8 @@ class DriftFinder:
 
 
 def contact_area(change: Float32, ignored: NDArray[np.bool_], pitch: float) -> float:
-    """Area [m^2] of the largest patch in which two pictures without contact differ as a contact does, of their relative
-    change (H, W, 3) on pixels of `pitch` [m]; drift of the light and the pixels `ignored` (H, W) do not count."""
+    """Area [m^2] of the largest patch in which two pictures without contact differ as by a contact, from their relative
+    change (H, W, 3) on pixels of `pitch` [m], without drift of the light and without the pixels `ignored` (H, W)."""
     import cv2
 
     planes = np.ascontiguousarray(np.moveaxis(change, -1, 0), dtype=np.float32)

@@ -1,4 +1,4 @@
-"""The errors of calibration: each says what cannot be used, why, and what to do."""
+"""The errors of calibration. Each message says what cannot be used, the reason, and what to do."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from contextlib import contextmanager
 
 
 class CalibrationError(ValueError):
-    """A calibration, or what one is to be made from, cannot be used."""
+    """A calibration, or its data, cannot be used."""
 
 
 class BadFrames(CalibrationError):
-    """Frames that cannot be calibrated from, or compared."""
+    """Frames cannot be used for a calibration or a comparison."""
 
 
 @contextmanager

@@ -1,6 +1,6 @@
-"""Native frame -> canonical observation, the same for simulated, mock, real and recorded sensors.
+"""Converts a native frame to a canonical observation, in the same way for simulated, mock, real and recorded sensors.
 
-calibration/normaliser.py makes the one of a sensor; calibration/height says how a picture becomes a height.
+calibration/normaliser.py makes the normaliser of a sensor; calibration/height computes a height from a picture.
 """
 
 from __future__ import annotations
@@ -43,14 +43,14 @@ from tacsim.optics.grid import canonical_cells
 
 
 class NoReference(RuntimeError):
-    """A frame was to be normalised before a reference was taken."""
+    """A frame was given before a reference was taken."""
 
 
 class FrameNormaliser:
-    """Rectifies a frame, compares it with the reference, and finds where there is contact.
+    """Rectifies a frame, compares it with the reference, and finds contact.
 
-    Height, gradient and flow are those of the source where it knows them (simulation). Otherwise they are found in the
-    picture: height and gradient by `find`, flow by `markers`; what is not found is None.
+    A simulation gives height, gradient and flow. For other sources they are found in the picture: height and gradient
+    by `find`, flow by `markers`; quantities that cannot be found are None.
     """
 
     def __init__(
@@ -64,33 +64,35 @@ class FrameNormaliser:
         untouched: NDArray[np.float32] | None = None,
         dots: Callable[[NDArray[np.uint8]], tuple[Rectification, MarkerFlow]] | None = None,
     ) -> None:
-        """`rectify` gives the canonical image, or for a `find` its wider view. drifts: the light is real and may
-        drift from its reference; a `find` measures that itself. untouched: what `rectify` gives of the picture without
-        contact that belongs to the calibration. dots: what takes the place of `rectify` and `markers` once it is given
-        the native picture (rows, columns, 3) of the first reference, whose dots say how large the gel is; it raises
-        UnusableReference where there are none."""
+        """Args:
+        rectify: gives the canonical image, or for a `find` its wider view.
+        drifts: the light is real and may drift from its reference; a `find` measures that itself.
+        untouched: the rectified picture without contact of the calibration.
+        dots: returns replacements of `rectify` and `markers` for the native picture (rows, columns, 3) of the first
+            reference, whose dots give the size of the gel; raises UnusableReference without dots.
+        """
         self._grid, self._find, self._dots = grid, find, dots
         self._set_view(rectify, markers)
         self._find_drift = DriftFinder(self._on_image.shape) if drifts and find is None else None
         self._untouched = untouched
-        # Why the reference may show a contact, in words; None: it does not, or there is no picture to compare it with
+        # reason why the reference may show a contact; None: it shows none, or there is no picture to compare it with
         self.reference_doubt: str | None = None
         self._sought = False  # the last observation was found in a picture
-        self.reference: Reference | None = None  # the present one; None before the first
-        # Height and gradient, or flow, are found in pictures of sources that don't know their surface
+        self.reference: Reference | None = None  # the present reference; None before the first
+        # height and gradient, or flow, are found in pictures of sources that do not give their surface
         self.finds_height, self.finds_flow = find is not None, markers is not None or dots is not None
-        # Share of the pixels of the last picture whose colour lies beyond the calibrated slopes: they get the nearest
-        # calibrated slope. 0 where nothing had to be found
+        # share of the pixels of the last picture whose colour is beyond the calibrated slopes: they get the nearest
+        # calibrated slope. 0 if no height had to be found
         self.out_of_range_share = 0.0
-        # Relative change of the untouched gel's colour since the reference [-], in the last picture with enough of it;
-        # and the mean slope [degrees] that this drift looks like. None before such a picture; no slope without height
+        # relative change of the untouched gel's colour since the reference [-], in the last picture with enough of it;
+        # and the mean slope [degrees] that corresponds to this drift. None before such a picture, or without height
         self.drift: float | None = None
         self.drift_slope: float | None = None
 
     def _set_view(self, rectify: Rectification, markers: MarkerFlow | None) -> None:
         grid = self._grid
         shape = (grid.rows * grid.image_scale, grid.columns * grid.image_scale)
-        spare = [there - wanted for there, wanted in zip(rectify.valid.shape, shape, strict=True)]
+        spare = [given - wanted for given, wanted in zip(rectify.valid.shape, shape, strict=True)]
         odd = any(extra % (2 * grid.image_scale) for extra in spare)
         if min(spare) < 0 or odd or (self._find is None and any(spare)):
             raise ValueError(f"rectification gives {rectify.valid.shape} px, the canonical image has {shape}")
@@ -102,35 +104,35 @@ class FrameNormaliser:
 
     @property
     def visible_size(self) -> tuple[float, float]:
-        """x, y of the gel that the native picture shows, within its region [m]: the maps may show the middle alone."""
+        """x, y size of the gel in the native picture, within its region [m]; the maps may show only the centre."""
         valid, pitch = self._rectify.valid, self._grid.pitch / self._grid.image_scale
         down, across = (side.stop - side.start for side in visible_box(valid))
         x, y = (
-            # what reaches the border of the view goes on beyond it; what ends before is all that a region lets be seen
-            size if (there + 2) * pitch >= min(size, whole * pitch) else there * pitch
-            for size, there, whole in zip(self._rectify.size, (across, down), valid.shape[::-1], strict=True)
+            # a gel that reaches the border of the view continues beyond it; one that ends before is limited by a region
+            size if (visible + 2) * pitch >= min(size, whole * pitch) else visible * pitch
+            for size, visible, whole in zip(self._rectify.size, (across, down), valid.shape[::-1], strict=True)
         )
         return x, y
 
     @property
     def stale(self) -> bool:
-        """True when the reference is outdated: take a fresh one as soon as nothing touches."""
+        """True if the reference is outdated: take a new one as soon as there is no contact."""
         return (self.drift or 0.0) > STALE_COLOUR or (self.drift_slope or 0.0) > STALE_SLOPE
 
     @property
     def visible_markers(self) -> NDArray[np.bool_] | None:
-        """(rows, columns) markers that were seen in the last picture in which flow was sought; that of the others is
-        the mean of their neighbours'. None for a sensor whose flow is not found in pictures."""
+        """(rows, columns) True for markers that were visible in the last picture with flow; the flow of the others is
+        the mean of their neighbours. None for a sensor whose flow is not found in pictures."""
         return None if self._markers is None else self._markers.visible
 
     @property
     def visible_marker_share(self) -> float:
-        """Share of the reference's markers seen in that picture. 1 where nothing had to be found."""
+        """Share of the reference's markers that are visible in that picture; 1 if none had to be found."""
         return 1.0 if self._markers is None else self._markers.visible_share
 
     def take_reference(self, frame: TactileFrame) -> None:
-        """Makes `frame`, taken without contact, the reference I0, and its markers' places their rest. Raises
-        UnusableReference (the old one then stays), or ValueError for a frame of another shape."""
+        """Makes `frame`, taken without contact, the reference I0, and the places of its markers their rest positions.
+        Raises UnusableReference (the old reference then stays), or ValueError for a frame of another shape."""
         if self._dots is not None and self._markers is None:
             self._set_view(*self._dots(frame.image))
         rectified = self._rectify(frame.image)
@@ -138,7 +140,7 @@ class FrameNormaliser:
         # is found.
         measured = np.zeros_like(self._rectify.valid)
         canonical_part(measured, self._grid)[...] = self._on_image
-        # Dots are found as well beside glare, in a recording: a live arm stops by the colour of contacts, too.
+        # In a recording, dots are found also next to glare; a live arm stops by the colour of contacts, too.
         colour = self._find is not None or self._markers is None or self._dots is not None
         reference = make_reference(rectified, self._rectify.valid, measured, colour=colour)
         if self._untouched is not None and is_channel_order_swapped(rectified, self._untouched, self._rectify.valid):
@@ -155,14 +157,14 @@ class FrameNormaliser:
         self.drift_slope = self.drift = None
 
     def _warn_of_contact(self, reference: Reference) -> None:
-        """Compares a new reference with the bundle's picture, and warns where it shows a contact."""
+        """Compares a new reference with the bundle's picture, and warns if it shows a contact."""
         self.reference_doubt = None
         if self._untouched is None:
             return
         valid = reference.valid
         known = self._untouched / np.maximum(self._untouched[valid].mean(axis=0), 1.0)
         dark = np.zeros_like(valid)
-        if self._markers is not None:  # printed dots need not lie where they lay
+        if self._markers is not None:  # printed dots may have moved
             dark = _dot_mask(reference.relative) | _dot_mask(known)
         area = contact_area(reference.relative - known, ~valid | dark, self._grid.pitch / self._grid.image_scale)
         if area > MIN_CONTACT_AREA:
@@ -173,9 +175,9 @@ class FrameNormaliser:
             warnings.warn(self.reference_doubt, stacklevel=3)
 
     def diagnostics(self) -> dict[str, float]:
-        """Quality of the last observation, where it was found in a picture, as far as it is known: `beyond`
-        (`out_of_range_share`), `drift`, `background` (`drift_slope`), `visible_share`, `stale` (0 or 1);
-        and `touched_reference` (1) where the reference shows a contact."""
+        """Known quality of the last observation, if it was found in a picture: `beyond` (`out_of_range_share`),
+        `drift`, `background` (`drift_slope`), `visible_share`, `stale` (0 or 1); and `touched_reference` (1) if the
+        reference shows a contact."""
         if not self._sought:
             return {}
         known = {
@@ -192,9 +194,9 @@ class FrameNormaliser:
         """The observation of `frame` at time `now` [s].
 
         The drift of a real light (`drifts`) since the reference, one quadratic over the gel, is removed from image,
-        gradient and height, where enough of the gel is untouched to measure it.
+        gradient and height, if enough of the gel is untouched to measure it.
 
-        Raises NoReference; StaleReference when the light is another; MarkersLost when too few markers are seen;
+        Raises NoReference; StaleReference if the light has changed; MarkersLost if too few markers are visible;
         ValueError for a frame of another shape.
         """
         if self.reference is None:
@@ -220,7 +222,7 @@ class FrameNormaliser:
     def _observation_from_image(
         self, frame: TactileFrame, difference: NDArray[np.float32], now: float
     ) -> TactileObservation:
-        """All of it from the picture; seen: its difference from the reference."""
+        """The observation from the picture; seen: its difference from the reference."""
         change: NDArray[np.float32] = canonical_part(difference, self._grid)
         height, gradient, flow, drift = self._find_surface(frame, difference)
         if drift is not None:
@@ -239,7 +241,7 @@ class FrameNormaliser:
         )
 
     def _find_surface(self, frame: TactileFrame, change: NDArray[np.float32]) -> tuple[NDArray[np.float32] | None, ...]:
-        """Height, gradient and flow, and the drift that is to be taken off the canonical image."""
+        """Height, gradient and flow, and the drift to subtract from the canonical image."""
         height = gradient = flow = removed = None
         self._sought = any(part is not None for part in (self._find, self._markers, self._find_drift))
         if self._find_drift is not None:
@@ -316,7 +318,7 @@ def _encode_image(change: NDArray[np.float32]) -> NDArray[np.uint8]:
 
 
 def _dot_mask(relative: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """(H, W) pixels of an image (H, W, 3), relative to its mean, that printed dots darken, and those beside."""
+    """(H, W) True for pixels of an image (H, W, 3), relative to its mean, in or next to printed dots."""
     import cv2
 
     dark = (relative.max(axis=2) < MAX_DOT_LEVEL).astype(np.uint8)

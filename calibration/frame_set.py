@@ -1,6 +1,6 @@
-"""Frames of one sensor beside what it shows without contact: a folder of pictures, a video, or an episode's sensor.
+"""Frames of one sensor and its picture without contact: from a folder of pictures, a video, or an episode's sensor.
 
-A calibration takes its presses from one, a comparison each of its two sides.
+A calibration uses one frame set, a comparison two.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Frame:
 
     name: str
     image: Image  # (H, W, 3) RGB
-    surface: SurfaceMap | None = None  # known by simulations only
+    surface: SurfaceMap | None = None  # only from simulations
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,13 +53,13 @@ class FrameSet:
 
     name: str
     reference: Image  # (H, W, 3) RGB without contact
-    reference_from: str  # its source in words
+    reference_from: str  # description of its source
     frames: tuple[Frame, ...]
     untouched: tuple[Frame, ...] = ()  # more frames without contact
     estimated: bool = False  # the reference is the median of `frames`
-    simulated: bool = False  # known to be rendered, not photographed
+    simulated: bool = False  # True for rendered frames
     same_pixels: bool = False  # made in the pixels of the frames that it is compared with, under their names
-    notes: tuple[str, ...] = ()  # what there is to know of it, in words
+    notes: tuple[str, ...] = ()  # notes
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -68,7 +68,7 @@ class FrameSet:
 
     @property
     def untouched_images(self) -> tuple[Image, ...]:
-        """All pictures without contact, the reference first; none if it is only estimated."""
+        """All pictures without contact, the reference first; empty if it is only estimated."""
         return () if self.estimated else (self.reference, *(frame.image for frame in self.untouched))
 
 
@@ -131,7 +131,7 @@ def select_untouched(paths: Iterable[Path]) -> list[Path]:
 def frame_warnings(
     image: NDArray[np.floating], reference: NDArray[np.floating], contact: NDArray[np.bool_]
 ) -> list[str]:
-    """What is wrong with a frame, in words: its picture and reference (H, W, 3) [grey levels], its contact (H, W)."""
+    """Errors of a frame, as text, from its picture and reference (H, W, 3) [grey levels], and its contact (H, W)."""
     max_saturated_share = 0.05  # of a contact
     found = []
     if not contact.any():
@@ -149,8 +149,8 @@ def frame_warnings(
 
 
 def find_touched_references(of: FrameSet) -> list[str]:
-    """In words, which of the pictures without contact differ from the reference as a contact does: one of the two shows
-    one. Nothing is found where the reference is the only one."""
+    """Notes on pictures without contact that differ from the reference as by a contact, so that one of the two shows a
+    contact. Empty if the reference is the only one."""
     mean = np.maximum(of.reference.mean(axis=(0, 1)), 1.0).astype(np.float32)
     everywhere = np.zeros(of.shape, dtype=np.bool_)
     found = []
@@ -164,8 +164,8 @@ def find_touched_references(of: FrameSet) -> list[str]:
 
 
 def metric_image_map(view: GelView) -> Callable[[Image], Image]:
-    """Native picture (H, W, 3) -> metric picture of the gel, both uint8. Where the camera sees much finer, its picture
-    is first reduced by a whole factor, as means over areas."""
+    """Native picture (H, W, 3) -> metric picture of the gel, both uint8. If the camera has a much finer resolution, its
+    picture is first reduced by an integer factor, as means over areas."""
     import cv2
 
     pixel = np.array([(0.0, 0.0), (view.pixel_pitch, 0.0), (0.0, view.pixel_pitch)])
@@ -214,8 +214,8 @@ def rectified_by_view(frame_set: FrameSet, view: GelView) -> FrameSet:
 
 
 def restrict_to_region(frame_set: FrameSet, region: PictureRegion) -> FrameSet:
-    """The same where only the polygon `region` [px] counts: beyond it all pictures are even, and none differs from the
-    reference by more than the gel does in the median. Raises BadCorners."""
+    """The same for the polygon `region` [px] only: outside it all pictures are uniform, and none differs from the
+    reference by more than the median difference of the gel. Raises BadCorners."""
     shown = region_mask(region, frame_set.shape)
     reference = frame_set.reference
     level = reference[shown].mean(axis=0)
@@ -230,7 +230,7 @@ def restrict_to_region(frame_set: FrameSet, region: PictureRegion) -> FrameSet:
 
 
 def rectified_by_corners(frame_set: FrameSet, corners: Corners, shape: tuple[int, int]) -> FrameSet:
-    """The same seen straight on: the quadrangle of the gel's corners becomes a picture of `shape` (rows, columns).
+    """The same after rectification: the quadrangle of the gel's corners becomes a picture of `shape` (rows, columns).
 
     Raises BadCorners.
     """
@@ -240,7 +240,7 @@ def rectified_by_corners(frame_set: FrameSet, corners: Corners, shape: tuple[int
     grid = PixelGrid(rows, columns, 1.0, -(columns - 1) / 2, -(rows - 1) / 2)
     rectify = rectification_of_corners(corners, (float(columns), float(rows)), frame_set.shape, grid)
     if not rectify.valid.all():
-        raise BadCorners(f"corners {corners!r} reach beyond the picture; all of the gel must be seen")
+        raise BadCorners(f"corners {corners!r} are outside the picture; all of the gel must be visible")
     return _map_images(frame_set, lambda image: np.asarray(cv2.convertScaleAbs(rectify(image)), dtype=np.uint8))
 
 
@@ -278,7 +278,7 @@ def _read_images(folder: Path, paths: list[Path], max_frames: int) -> list[Frame
 
 
 def _read_limited(path: Path, frames: Iterable[Frame], max_frames: int = MAX_FRAMES) -> list[Frame]:
-    """All frames; raises BadFrames as soon as they are too many."""
+    """All frames. Raises BadFrames as soon as there are too many."""
     max_memory = 2 << 30  # of all pictures together [bytes]
     read: list[Frame] = []
     memory = 0
@@ -296,9 +296,9 @@ def _make_frame_set(
     path: Path, frames: list[Frame], reference: Path | None, own: Image | None, untouched: tuple[Frame, ...] = ()
 ) -> FrameSet:
     """The reference is the picture that was named, the recording's `own`, or the median."""
-    median_count = 5  # so many frames with contacts in different places have the untouched gel as their median
+    median_count = 5  # the median of this number of frames with contacts in different places is the untouched gel
     if not frames:
-        raise BadFrames(f"{path} holds no frame beside the one without contact")
+        raise BadFrames(f"{path} holds no frame except the one without contact")
     estimated = reference is None and own is None
     if reference is not None:
         picture, source = read_image(reference), reference.name
@@ -319,5 +319,5 @@ def _make_frame_set(
             f"{path}: {other.name} is {other.image.shape[1]} x {other.image.shape[0]} px, the picture without contact "
             f"({source}) {picture.shape[1]} x {picture.shape[0]}; all must be of one camera and one setting"
         )
-    simulated = all(frame.surface is not None for frame in frames)  # a camera knows no surface
+    simulated = all(frame.surface is not None for frame in frames)  # a camera measures no surface
     return FrameSet(str(path), picture, source, tuple(frames), untouched, estimated, simulated)

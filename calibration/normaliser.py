@@ -1,4 +1,4 @@
-"""The normaliser of each kind of sensor: `normaliser_for_...`. What it does: calibration/frame_normaliser.py."""
+"""The normaliser of each kind of sensor: `normaliser_for_...`, an instance of calibration/frame_normaliser.py."""
 
 from __future__ import annotations
 
@@ -41,12 +41,12 @@ def normaliser_for_simulation(
 def normaliser_for_pictures(
     model: SensorModel, gel_size: tuple[float, float], grid: CanonicalGrid, region: PictureRegion | None = None
 ) -> FrameNormaliser:
-    """The normaliser of a simulated sensor of which only pictures are at hand: a camera's, or recorded ones. Height and
-    gradient are found by the inverse of the model's own light, flow by its markers. Raises ValueError for a light
-    without inverse, a calibrated one (its inverse is in its bundle), or markers too small for the image."""
+    """The normaliser of a simulated sensor of which only pictures are available, from a camera or a recording. The
+    inverse of the model's light gives height and gradient, its markers give flow. Raises ValueError for a light without
+    inverse, a calibrated one (its inverse is in its bundle), or markers too small for the image."""
     if model.photometric is not None:
         raise ValueError(
-            f"the light of model '{model.name}' is a calibrated one, whose inverse stands in its bundle: give the "
+            f"the light of model '{model.name}' is a calibrated one, whose inverse is in its bundle: give the "
             "camera `calibration: BUNDLE` in place of `model`"
         )
     rectify = _normaliser_of_model(model, gel_size, extended_view(grid, gel_size)).within(region)
@@ -63,7 +63,7 @@ def normaliser_for_pictures(
 
 
 def _normaliser_of_model(model: SensorModel, gel_size: tuple[float, float], grid: PixelGrid) -> Rectification:
-    """From the pictures that a sensor of this model delivers."""
+    """The normaliser for pictures of a sensor of this model."""
     return (
         rectification_of_geometry(model.geometry, gel_size, grid)
         if model.view is None
@@ -74,8 +74,10 @@ def _normaliser_of_model(model: SensorModel, gel_size: tuple[float, float], grid
 def normaliser_for_calibration(
     calibration: Calibration, grid: CanonicalGrid, untouched: Image | None = None
 ) -> FrameNormaliser:
-    """The normaliser of a sensor that was calibrated: geometry and inverse of its light are those of its bundle.
-    untouched: the bundle's (metric) picture, against which the order of colours of each reference is checked."""
+    """The normaliser of a calibrated sensor: geometry and inverse of its light are those of its bundle.
+
+    untouched: the bundle's (metric) picture, which is used to check the channel order of each reference.
+    """
     geometry = calibration.geometry
     wide = extended_view(grid, calibration.gel_size)
     # One look-up from the native picture, whether it is metric by itself or seen through lens and perspective.
@@ -99,7 +101,7 @@ def normaliser_for_calibration(
     find = SurfaceFinder(slopes, rectify.valid, grid, dots=dots, drifts=True, better=better)
     flow = marker_flow(calibration.markers, geometry, calibration.gel_size, calibration.view, calibration.region)
     known = None
-    if untouched is not None:  # it is metric by itself, whatever the camera's picture is
+    if untouched is not None:  # it is metric, even if the camera's picture is not
         known = rectification_of_geometry(geometry, calibration.gel_size, wide)(untouched)
     return FrameNormaliser(rectify, grid, find, flow, untouched=known)
 
@@ -110,8 +112,8 @@ def normaliser_for_recording(
     grid: CanonicalGrid,
     untouched: Image | None = None,
 ) -> FrameNormaliser:
-    """The normaliser of recorded frames of `image_shape` (rows, columns): by the sensor's calibration, by the dots that
-    are seen in its picture without contact (`untouched`) and their distance, or through the four corners of the gel.
+    """The normaliser of recorded frames of `image_shape` (rows, columns), from the sensor's calibration, from the dots
+    in its picture without contact (`untouched`) and their distance, or from the four corners of the gel.
 
     Raises calibration.lens.view.BadCorners, calibration.bundle.BadBundle, calibration.errors.BadFrames.
     """
@@ -126,8 +128,8 @@ def normaliser_for_recording(
 def normaliser_for_dots(
     pitch: float, untouched: Image, grid: CanonicalGrid, region: PictureRegion | None = None
 ) -> FrameNormaliser:
-    """The normaliser of a sensor of which nothing is known but the distance of its printed dots, `pitch` [m], and its
-    picture without contact: flow, no height. The camera looks straight on. Raises BadFrames where no dots are seen."""
+    """The normaliser of a sensor of which only the distance of its printed dots, `pitch` [m], and its picture without
+    contact are known: flow, no height. The camera looks along the gel's normal. Raises BadFrames without dots."""
     try:
         rectify, flow = view_of_dots(pitch, untouched, grid, region)
     except NoMarkers as nothing:
@@ -138,8 +140,8 @@ def normaliser_for_dots(
 def normaliser_for_camera(
     config: CameraSensorConfig, gel_size: tuple[float, float], grid: CanonicalGrid
 ) -> FrameNormaliser:
-    """The normaliser of a sensor that a camera sees: by its calibration, by its model, by the distance of its dots,
-    or through the four corners of the gel. The last two find no height. `gel_size`: x, y of a model's gel [m].
+    """The normaliser of a sensor with a camera, from its calibration, its model, the distance of its dots, or the four
+    corners of the gel. The last two give no height. gel_size: x, y of a model's gel [m].
 
     Raises calibration.bundle.BadBundle, ValueError for a model without inverse,
     calibration.lens.view.BadCorners.
@@ -158,7 +160,7 @@ def normaliser_for_camera(
 
 
 def _of_bundle(path: str, image_shape: tuple[int, int], grid: CanonicalGrid) -> FrameNormaliser:
-    """By the calibration at `path`, for pictures of `image_shape` (rows, columns). Raises BadBundle."""
+    """The normaliser of the calibration at `path`, for pictures of `image_shape` (rows, columns). Raises BadBundle."""
     calibration, untouched = read_bundle(Path(path))
     if calibration.image_shape != image_shape:
         (rows, columns), (high, wide) = image_shape, calibration.image_shape

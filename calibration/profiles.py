@@ -1,7 +1,7 @@
-"""What is known beforehand of sensors that many people have: how much of the picture shows the gel, its size, its dots.
+"""Prior data of common sensors: the part of the picture that shows the gel, its size, its dots.
 
-These are numbers of makers and of published code, not of one's own sensor: they stand in for a pixel pitch that was not
-measured, and against one that was. `source` says where each is from, and which is a guess.
+These numbers are from manufacturers and published code, not from the user's sensor. They replace a pixel pitch that was
+not measured, and check one that was. `source` gives the origin of each number, and names estimates.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ class SensorProfile:
 
     title: str
     source: str  # of the numbers
-    gel_size: tuple[float, float] | None = None  # x, y that the picture shows once cropped [m]; None: not known
+    gel_size: tuple[float, float] | None = None  # x, y size of the cropped picture [m]; None: not known
     gel_thickness: float | None = None  # [m]
     markers: bool = False  # dots are printed on the gel
     native: tuple[int, int] = (640, 480)  # width, height of the camera's own pictures [px]
     crop: float = 0.0  # share of a native picture that does not show the gel, at each border
     light: str = "coloured lights from the side"
-    directed: bool | None = True  # that light tells the direction of a slope; None: not known
+    directed: bool | None = True  # True if the light shows the direction of a slope; None: not known
 
     def corners(self, shape: tuple[int, int]) -> tuple[Pair, Pair, Pair, Pair] | None:
-        """The gel's corners in a picture of so many rows and columns: top left, top right, bottom right, bottom left
-        [px]; None for a picture that is no native one, which is taken to be cropped already."""
+        """The gel's corners in a picture with these rows and columns: top left, top right, bottom right, bottom left
+        [px]; None for a picture that is not a native one, which is assumed to be cropped."""
         rows, columns = shape
         if not self.crop or (columns, rows) != self.native:
             return None

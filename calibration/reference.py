@@ -1,9 +1,10 @@
-"""The reference image I0: what a sensor shows without contact. A fresh one matters more than any formula.
+"""The reference image I0 of a sensor without contact. A recent one has a larger effect than any formula.
 
-A picture alone cannot show that nothing touches: a wide flat contact looks like none, a change of light like a contact.
-So a new reference is taken only where the arms' motion makes it certain: clear of everything at the start of an episode
-(`Rig.reset`), lifted off before each touch of a fixed ball (`tacsim calibrate touch`), or when a person says so.
-Between these moments the untouched gel in each picture shows how far the light has drifted (:mod:`calibration.drift`).
+A picture alone cannot prove that there is no contact: a wide flat contact looks like none, a change of light looks like
+a contact. So a new reference is taken only when the motion of the arms makes it certain: without contact at the start
+of an episode (`Rig.reset`), lifted off before each touch of a fixed ball (`tacsim calibrate touch`), or when the
+operator confirms it. Between these moments the untouched gel in each picture shows the drift of the light
+(:mod:`calibration.drift`).
 """
 
 from __future__ import annotations
@@ -24,11 +25,11 @@ from tacsim.interface import Float32, Mask
 
 
 class UnusableReference(ValueError):
-    """A reference image that cannot be measured against."""
+    """A reference image cannot be used for measurements."""
 
 
 class StaleReference(RuntimeError):
-    """The light has changed so much since the reference that nothing can be measured."""
+    """The light has changed too much since the reference."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,11 +63,10 @@ def make_reference(
 ) -> Reference:
     """Checks a rectified contact-free image (H, W, 3), 0..255, on the gel (`valid`, (H, W)).
 
-    `measured` (H, W): the part of it that is checked, and over which the mean is taken; None: all. `colour`: a surface
-    or a contact is told by changes of its colour, so it must not be saturated.
+    measured: (H, W) the part of the gel that is checked, and over which the mean is taken; None: all. colour: a surface
+    or a contact is identified by changes of its colour, so the gel must not be saturated.
 
-    Raises UnusableReference when the gel is not in the image, too dark or (with `colour`) saturated, or when shapes
-    differ.
+    Raises UnusableReference if the gel is not in the image, too dark or (with `colour`) saturated, or if shapes differ.
     """
     if image.ndim != 3 or image.shape[2] != 3 or image.shape[:2] != valid.shape:
         raise UnusableReference(f"reference is {image.shape}, expected {(*valid.shape, 3)}")
@@ -94,10 +94,10 @@ def make_reference(
 
 
 def is_channel_order_swapped(image: Float32, known: Float32, valid: Mask) -> bool:
-    """True when an image (H, W, 3) is like the `known` one of the same gel only with red and blue exchanged.
+    """True if an image (H, W, 3) is similar to the `known` one of the same gel only with red and blue exchanged.
 
-    What counts is where on the gel each colour is bright, not the lamps' gain or the white balance. False where all
-    colours are equally even.
+    The comparison uses the distribution of each colour over the gel, not the gain of the lamps or the white balance.
+    False if all colours are equally uniform.
     """
     one, other = (_block_pattern(picture, valid) for picture in (image, known))
     apart = float(np.sqrt(((one - other) ** 2).mean()))
@@ -106,9 +106,9 @@ def is_channel_order_swapped(image: Float32, known: Float32, valid: Mask) -> boo
 
 
 def is_contact_image_swapped(image: Float32, known: Float32, valid: Mask) -> bool:
-    """True when most of a picture (H, W, 3), which may show a contact, is the `known` one of the same gel with red and
-    blue swapped, and is not as near to it with another gain of each channel (exposure, white balance). False where all
-    colours are equally even: such a swap looks like a change of the white balance."""
+    """True if most of a picture (H, W, 3), which may show a contact, equals the `known` one of the same gel with red
+    and blue swapped, and fits it less well with another gain of each channel (exposure, white balance). False if all
+    colours are equally uniform: then a swap looks like a change of the white balance."""
     seen, wanted = _block_levels(image, valid), _block_levels(known, valid)
     if not len(wanted):
         return False
@@ -121,7 +121,7 @@ def is_contact_image_swapped(image: Float32, known: Float32, valid: Mask) -> boo
 
 
 def _block_levels(image: Float32, valid: Mask) -> Float32:
-    """(n, 3) mean level of each block that lies on the gel."""
+    """(n, 3) mean level of each block on the gel."""
     block_side = 8  # side of the blocks that are compared [px]
     import cv2
 

@@ -5,18 +5,18 @@ Sources: docs/measurements/calibration.md, and the tests in tests/calibration.
 """
 
 # drift.py
-MAX_UNTOUCHED_CHANGE = 0.08  # an untouched pixel changes less than this, without drift [-]
+MAX_UNTOUCHED_CHANGE = 0.08  # change of an untouched pixel without drift [-]
 MIN_UNTOUCHED_SHARE = 0.15  # of the view, to measure a drift
-# A contact in a picture that should show none: a patch that differs from a known picture ...
-MIN_CONTACT_CHANGE = 0.06  # by so much, without drift and noise [-]
-CONTACT_BLUR = 1.5  # of a change of colour before a contact is looked for in it [px]
-MIN_CONTACT_AREA = 0.6e-6  # and that is so large: a ball of 8 mm pressed 0.05 mm deep touches as much [m^2]
+# A contact in a picture that must show none is a patch that differs from a known picture ...
+MIN_CONTACT_CHANGE = 0.06  # by this amount, without drift and noise [-]
+CONTACT_BLUR = 1.5  # of a change of colour before the search for a contact [px]
+MIN_CONTACT_AREA = 0.6e-6  # and that has this area, the contact of a ball of 8 mm at 0.05 mm depth [m^2]
 
 # frame_normaliser.py
 MAX_DOT_LEVEL = 0.7  # of the mean: printed dots are darker
 
 # frame_set.py
-MIN_CONTACT_SHARE = 0.001  # of a picture, in which two without contact differ as a contact does
+MIN_CONTACT_SHARE = 0.001  # of a picture, in which two without contact differ as by a contact
 MAX_REFERENCE_CHANGE = 4.0  # median change of the gel outside contact that makes a reference stale [grey levels]
 
 # reference.py
@@ -25,13 +25,13 @@ MAX_SATURATED_SHARE = 0.05  # of the gel; ten real sensors show 0 to 0.001
 MIN_MEAN_LEVEL = 8.0  # of each channel over the gel; below, noise and rounding prevail [grey levels]
 # A reference is stale beyond, ...
 STALE_SLOPE = 2.0  # slope of the untouched gel; real sensors: 0.3 to 0.7 [degrees]
-STALE_COLOUR = 0.05  # change of the untouched gel's colour: a lamp's gain scales slopes and may tilt nothing [-]
-# ... and the light is another beyond:
+STALE_COLOUR = 0.05  # change of the untouched gel's colour: the gain of a lamp scales slopes, even without tilt [-]
+# ... and the light has changed beyond:
 MAX_SLOPE_CHANGE = 20.0  # [degrees]
 MAX_COLOUR_CHANGE = 0.5  # [-]
 # Red and blue are exchanged
-MAX_EXCHANGED_RATIO = 0.5  # if that brings the picture so much nearer to the known one
-MAX_SAME_CHANGE = 0.02  # unless it is this near already, each colour relative to its mean [-]
+MAX_EXCHANGED_RATIO = 0.5  # if the swap reduces the difference from the known picture by this factor
+MAX_SAME_CHANGE = 0.02  # unless the difference is this small without it, each colour relative to its mean [-]
 MIN_SWAPPED_CHANGE = (
-    0.01  # of each colour relative to its mean, in addition to another gain: less is no sign of a swap [-]
+    0.01  # of each colour relative to its mean, in addition to another gain; a smaller one does not show a swap [-]
 )

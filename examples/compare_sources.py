@@ -44,9 +44,9 @@ def main() -> None:
         error = compared.overall["contact_mae"]
         print(f"{compared.a.name}: contact MAE {error.mean:.1f} grey levels, null {error.null:.1f}")
 
-    if not good.overall["contact_mae"].beats_null:
+    if not good.overall["contact_mae"].outperforms_null:
         sys.exit("the simulation with the right light is not better than a picture without contact")
-    if blank.overall["contact_mae"].beats_null:
+    if blank.overall["contact_mae"].outperforms_null:
         sys.exit("a simulation that draws no contact counts as better than a picture without contact")
 
 

@@ -1,5 +1,4 @@
-"""Clay led to and fro, squeezed, sheared and rolled: how much of its force the cycles take, and how its volume ratios
-spread."""
+"""Clay in cycles of squeeze, shear and rolling: the change of its force, and the range of its volume ratios."""
 
 from __future__ import annotations
 
@@ -8,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from benchmarks.cases.squeeze import close, normal_forces
+from benchmarks.cases.squeeze import close_sensors, normal_forces
 from benchmarks.harness.measure import Measurement, timed
 from benchmarks.harness.runner import Case
 from benchmarks.truth.clay import CLAY
@@ -16,17 +15,17 @@ from tacsim.interface import FloatArray, Pose
 from tacsim.models.scene import Body, Box, Cylinder, Scene, Shape, Sphere
 from tacsim.physics.world import World, make_world
 
-EARLY = 20  # cycles after which a body should have shaken down
+SHAKEDOWN_CYCLES = 20  # cycles after which the force should be constant
 
 
 @dataclass(frozen=True)
 class Cycle:
-    """A body squeezed, then led to and fro: the upper sensor by `way` [m], the lower one by as much the other way."""
+    """A body squeezed, then moved in cycles: the upper sensor by `displacement` [m], the lower one by its negative."""
 
     geometry: Shape
-    squeezed: float  # of both sensors together, from touch [m]
-    way: tuple[float, float, float]
-    pieces: int = 3  # motions of each way, where they flow
+    squeezed: float  # by both sensors together, from first contact [m]
+    displacement: tuple[float, float, float]
+    pieces: int = 3  # motions in each direction, if they flow
 
 
 CYCLES = {
@@ -37,8 +36,9 @@ CYCLES = {
 
 
 def cycles(preset: str, count: int, flow: bool, repeat: int) -> list[Measurement]:
-    """A body moved to and fro between two gels. Its force at the end of the way there must stay as it was in the first
-    cycle, as in finite elements (2.934, 2.933, 2.933 N of the cylinder), and its elastic volume ratios near 1."""
+    """A body moved in cycles between two gels. Its force at the end of the forward motion must stay equal to that of
+    the first cycle, as in finite elements (2.934, 2.933, 2.933 N for the cylinder), and its elastic volume ratios near
+    1."""
     return [_row(preset, what, cycle, count, flow) for what, cycle in CYCLES.items()]
 
 
@@ -47,11 +47,11 @@ def _row(preset: str, what: str, cycle: Cycle, count: int, flow: bool) -> Measur
     world = make_world(scene)
     truth = world.truth()
     assert truth is not None
-    close(world, float(world.pose("upper").position[2]) - truth.height)
-    close(world, cycle.squeezed)
-    piece = np.array(cycle.way) / (cycle.pieces if flow else 1)
+    close_sensors(world, float(world.pose("upper").position[2]) - truth.height)
+    close_sensors(world, cycle.squeezed)
+    piece = np.array(cycle.displacement) / (cycle.pieces if flow else 1)
 
-    def lead() -> tuple[list[float], list[tuple[float, float]], int]:
+    def move_sensors() -> tuple[list[float], list[tuple[float, float]], int]:
         forces, volumes, substeps = [], [], 0
         for _ in range(count):
             for sign in (1.0, -1.0):
@@ -63,19 +63,19 @@ def _row(preset: str, what: str, cycle: Cycle, count: int, flow: bool) -> Measur
             volumes.append((stats.smallest_volume, stats.largest_volume))
         return forces, volumes, substeps
 
-    timing, (forces, volumes, substeps) = timed(lead, 1, warm=lambda: None)
-    early = forces[min(EARLY, count) - 1]
+    timing, (forces, volumes, substeps) = timed(move_sensors, 1, warm=lambda: None)
+    early = forces[min(SHAKEDOWN_CYCLES, count) - 1]
     return Measurement(
         timing, abs(forces[-1] / forces[0] - 1) * 100, "% of the first cycle's force", "a body that has shaken down",
         f"{what}, {count} cycles, {'flowing' if flow else 'settled'}", substeps,
         {"since_early_percent": (forces[-1] / early - 1) * 100, "first_newton": forces[0],
-         "smallest_volume": min(least for least, _ in volumes), "largest_volume": max(most for _, most in volumes)},
-        f"{(early / forces[0] - 1) * 100:+.1f} % in the first {min(EARLY, count)}",
+         "smallest_volume": min(small for small, _ in volumes), "largest_volume": max(large for _, large in volumes)},
+        f"{(early / forces[0] - 1) * 100:+.1f} % in the first {min(SHAKEDOWN_CYCLES, count)}",
     )  # fmt: skip
 
 
 def _targets(world: World, by: FloatArray) -> dict[str, Pose]:
-    """Of both sensors, led by so much [m], the lower one the other way."""
+    """Targets of both sensors: the upper one moved by `by` [m], the lower one by -`by`."""
     targets = {}
     for name, sign in (("upper", 1.0), ("lower", -1.0)):
         pose = world.pose(name)

@@ -1,5 +1,5 @@
-"""Environments to learn in: steps a second with random actions, what a reset costs, and what a policy found in coarse
-physics loses in fine."""
+"""Environments for learning: steps a second with random actions, the cost of a reset, and the loss of a policy that is
+transferred from coarse to fine physics."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from tacsim.rig import Rig
 from tacsim.tasks import Squeeze
 
 NUMBER = 16  # environments of a batch
-STEPS = 6  # of all, each timed
-WARM = 2  # before those
+STEPS = 6  # timed steps of the batch
+WARM = 2  # untimed steps before those
 ROUNDS = 10  # resets of each environment
-FELT = {"maps": ("height",), "touch": ("wrench",)}  # features of who looks at no picture
+TOUCH_FEATURES = {"maps": ("height",), "touch": ("wrench",)}  # features of a policy without pictures
 SMALL = ("width=160", "height=120", "pixel_pitch=0.125 mm")
 
 
-def pictures(size: tuple[str, ...]) -> list[str]:
-    """Overrides: of both sensors."""
+def picture_overrides(size: tuple[str, ...]) -> list[str]:
+    """Overrides of the geometry of both sensors."""
     return [f"sensors.{name}.model.geometry.{what}" for name in ("lower", "upper") for what in size]
 
 
@@ -42,13 +42,15 @@ CLOSING = 0.2e-3  # of each sensor in a control step [m]
 
 
 def random_actions(preset: str, motion: str, repeat: int) -> list[Measurement]:
-    """Sixteen squeezes in one batch under random actions: heights and forces; at learn also with two pictures of
-    160 x 120, and where motion flows their resets, each with a material, a size and a goal drawn from eight."""
+    """Sixteen squeezes in one batch under random actions, with heights and forces; at learn also with two pictures of
+    160 x 120, and, for flowing motion, their resets, each with a random choice of eight materials, sizes and goals."""
     words = f"{motion}, heights and forces"
-    rows = _random_actions(preset, [f"motion={motion}"], words, resets=False, features=FELT)
+    rows = _random_actions(preset, [f"motion={motion}"], words, resets=False, features=TOUCH_FEATURES)
     if preset == "learn":
-        look = f"{motion}, two pictures of 160 x 120"
-        rows += _random_actions(preset, [f"motion={motion}", *pictures(SMALL)], look, resets=motion == "flowing")
+        picture_words = f"{motion}, two pictures of 160 x 120"
+        rows += _random_actions(
+            preset, [f"motion={motion}", *picture_overrides(SMALL)], picture_words, resets=motion == "flowing"
+        )
     return rows
 
 
@@ -73,11 +75,11 @@ def _random_actions(
     alone.reset(seed=1)
     difference = 0.0
     for action in actions[:WARM]:
-        felt, felt_alone = (flats[forces] for flats in (many.step(action)[0], alone.step(action[0])[0]))
-        difference = max(difference, newtons * float(np.abs(felt[0] - felt_alone).max()))
+        forces_of_batch, forces_alone = (flats[forces] for flats in (many.step(action)[0], alone.step(action[0])[0]))
+        difference = max(difference, newtons * float(np.abs(forces_of_batch[0] - forces_alone).max()))
     each = [once(partial(many.step, action))[0] for action in actions[WARM:]]
     timing = Timing(tuple(step.samples[0] for step in each), sum(step.processor for step in each) / STEPS)
-    share = sum(timing.samples) / STEPS / NUMBER  # of one environment in a step: of the mean, for random steps differ
+    share = sum(timing.samples) / STEPS / NUMBER  # of one environment in a mean step, because random steps differ
     rows = [
         Measurement(
             timing, difference, "N difference", "the first of them alone", f"{words}: a step of {NUMBER}",
@@ -86,13 +88,13 @@ def _random_actions(
     ]  # fmt: skip
     if resets:
         again, _ = once(lambda: [many.reset() for _ in range(ROUNDS - 1)])
-        kept = again.median / (ROUNDS - 1) / NUMBER
-        mean = (first / NUMBER + (ROUNDS - 1) * kept) / ROUNDS
+        later = again.median / (ROUNDS - 1) / NUMBER
+        mean = (first / NUMBER + (ROUNDS - 1) * later) / ROUNDS
         rows.append(
             Measurement(
                 Timing((mean,), again.processor / (ROUNDS - 1) / NUMBER), mean / share, "control steps",
                 "one environment's share of a step", f"{words}: a reset, mean of {ROUNDS} rounds with the first",
-                figures={"kept_ms": kept * 1e3, "first_ms": first / NUMBER * 1e3},
+                figures={"kept_ms": later * 1e3, "first_ms": first / NUMBER * 1e3},
             )
         )  # fmt: skip
     many.close()
@@ -100,18 +102,19 @@ def _random_actions(
 
 
 def transfer(preset: str, repeat: int) -> list[Measurement]:
-    """What a policy found at `learn` loses elsewhere: squeezing to 7 mm by a closing distance that was right at learn,
-    and by touch (the scripted policy), which looks at heights."""
-    with _open(preset) as rig, _open("learn") as coarse:
+    """The loss of a policy from `learn` at other presets: squeezing to 7 mm by a closing distance that is correct at
+    learn, and by touch (the scripted policy), which uses heights."""
+    with _open_rig(preset) as rig, _open_rig("learn") as coarse:
         found = 0.0
-        low, high = 3e-3, 5e-3  # closed, both sensors together, that leave the body too high and too low [m]
+        # closing distances of both sensors together that leave the body too high and too low [m]
+        low, high = 3e-3, 5e-3
         for _ in range(8):
             found = (low + high) / 2
-            low, high = (found, high) if _closed(coarse, found)[1] > GOAL else (low, found)
+            low, high = (found, high) if _run_episode(coarse, found)[1] > GOAL else (low, found)
         rows = []
         for what, closing in (("a closing distance found at learn", found), ("by touch, as shipped", None)):
-            _, at_learn = _closed(coarse, closing)
-            seconds, height = _closed(rig, closing)
+            _, at_learn = _run_episode(coarse, closing)
+            seconds, height = _run_episode(rig, closing)
             figures = {"reward": -abs(height - GOAL) * 1e3, "reward_at_learn": -abs(at_learn - GOAL) * 1e3}
             error = abs(height - GOAL) * 1e3
             rows.append(
@@ -120,36 +123,36 @@ def transfer(preset: str, repeat: int) -> list[Measurement]:
     return rows
 
 
-def _open(preset: str) -> Rig:
+def _open_rig(preset: str) -> Rig:
     from robot.open import open_rig
 
     return open_rig(
-        "sim", task="squeeze", overrides=[f"scene.preset={preset}", f"task.goal={GOAL} m", *pictures(SMALL)]
+        "sim", task="squeeze", overrides=[f"scene.preset={preset}", f"task.goal={GOAL} m", *picture_overrides(SMALL)]
     )
 
 
-def _closed(rig: Rig, closing: float | None) -> tuple[float, float]:
-    """Seconds that an episode takes, and the body's height at its end [m]: closed by `closing`, or by touch."""
+def _run_episode(rig: Rig, closing: float | None) -> tuple[float, float]:
+    """Duration of an episode [s], and the body's height at its end [m]: closed by `closing`, or by touch."""
     policy = Squeeze(SqueezeConfig(kind="squeeze", goal=GOAL)).scripted()
     observation = rig.reset(0)
-    began, gone = time.perf_counter(), 0.0
+    began, displacement = time.perf_counter(), 0.0
     start = {name: arm.pose for name, arm in observation.arms.items()}
     while True:
         if closing is None:
             action = policy(observation)
         else:
-            gone = min(gone + CLOSING, closing / 2)
-            action = Action({name: se3.translated_along_z(pose, gone) for name, pose in start.items()})
+            displacement = min(displacement + CLOSING, closing / 2)
+            action = Action({name: se3.translated_along_z(pose, displacement) for name, pose in start.items()})
         before = observation
         observation, _ = rig.step(action)
-        if all(_same(before.arms[name].pose, arm.pose) for name, arm in observation.arms.items()):
+        if all(_is_same_position(before.arms[name].pose, arm.pose) for name, arm in observation.arms.items()):
             break
     truth = rig.truth()
     assert truth is not None
     return time.perf_counter() - began, truth.height
 
 
-def _same(a: Pose, b: Pose) -> bool:
+def _is_same_position(a: Pose, b: Pose) -> bool:
     return bool(np.array_equal(a.position, b.position))
 
 

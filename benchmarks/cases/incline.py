@@ -1,4 +1,4 @@
-"""Squeeze group: a block that only its weight holds on a tilted gel. Coulomb's law says when it slides."""
+"""Squeeze group: a block on a tilted gel under its weight alone. Coulomb's law gives the angle at which it slides."""
 
 from __future__ import annotations
 
@@ -14,22 +14,23 @@ from tacsim.models.scene import Body, Box, Gel, Scene, Settling
 from tacsim.physics.world import World, make_world
 
 FRICTION = 0.5
-# Ten times the earth's [m/s^2], so that a block just beyond the limit goes far enough to be seen to move; no more, for
-# a heavy block's front edge sinks in, which turns it: at 2,000 m/s^2 (10 kPa) it slides from 0.98 of the friction on.
+# Ten times that of the earth [m/s^2], so that a block just beyond the limit moves a measurable distance; not more,
+# because the front edge of a heavy block sinks in and tilts it: at 2,000 m/s^2 (10 kPa) it slides from 0.98 of the
+# friction on.
 FIELD = 100.0
 BLOCK = Body(geometry=Box(size=(6e-3, 6e-3, 3e-3)), material=BodyMaterial())  # elastic
-LIFT = 0.5e-3  # of the other gel, out of the way [m]
-HALF = 500  # substeps to land and come to rest, and again to watch
-STILL = 1e-6  # a block that moves less while watched sticks [m]
-BRACKET, STEPS = (0.97, 1.03), 4  # tan(tilt) / friction, and how often it is halved
-STEEP = 1.1  # tan(tilt) / friction where the block slides for sure
+LIFT = 0.5e-3  # of the other gel, to remove its contact [m]
+HALF = 500  # substeps to settle, and the same number to measure
+STILL = 1e-6  # a block that moves less in the second half sticks [m]
+BRACKET, STEPS = (0.97, 1.03), 4  # tan(tilt) / friction, and number of bisections
+STEEP = 1.1  # tan(tilt) / friction at which the block slides with certainty
 
 
 def on_incline(slope: float) -> tuple[World, float]:
-    """A block let go on the lower gel, gravity tilted towards x by tan(tilt) = `slope`; HALF substeps twice.
+    """A block released on the lower gel, with gravity tilted towards x by tan(tilt) = `slope`, for HALF substeps twice.
 
-    Returns the world and how far the block went in the second half [m]. What brakes a body towards rest also brakes
-    its slide, so speeds mean nothing here; whether it moves at all, and the ratio of forces, do.
+    Returns the world and the displacement of the block in the second half [m]. The damping of the solver also damps the
+    slide, so its speed has no meaning here; only the fact that the block moves, and the ratio of forces, do.
     """
     tilt = float(np.arctan(slope))
     world = make_world(
@@ -38,7 +39,7 @@ def on_incline(slope: float) -> tuple[World, float]:
             body=BLOCK,
             friction={"lower": FRICTION, "upper": FRICTION},
             gravity=(FIELD * np.sin(tilt), 0.0, -FIELD * np.cos(tilt)),
-            settling=Settling(tolerance=1e-9, max_substeps=HALF),  # never settled: both halves at full length
+            settling=Settling(tolerance=1e-9, max_substeps=HALF),  # never reached: both halves have full length
         )
     )
     upper = world.pose("upper")
@@ -51,9 +52,9 @@ def on_incline(slope: float) -> tuple[World, float]:
 
 
 def stick_limit() -> tuple[float, float]:
-    """tan(tilt) / friction at which the block begins to slide, by bisection: the middle and half the last bracket.
+    """tan(tilt) / friction at which the block begins to slide, by bisection: the centre and half the last bracket.
 
-    Raises RuntimeError when the limit lies outside the bracket.
+    Raises RuntimeError if the limit is outside the bracket.
     """
     low, high = BRACKET
     for end, sticks in ((low, True), (high, False)):
@@ -73,7 +74,7 @@ def force_ratio(world: World) -> float:
 
 
 def incline(repeat: int) -> list[Measurement]:
-    """A block on a tilted gel: the slope at which it begins to slide, and its forces while it slides."""
+    """A block on a tilted gel: the slope at which it begins to slide, and its ratio of forces while it slides."""
     limit, width = stick_limit()
     timing, (world, moved) = timed(partial(on_incline, STEEP * FRICTION), repeat, warm=lambda: None)
     against = f"friction {FRICTION:g}, weight of {FIELD:g} m/s^2"

@@ -1,4 +1,4 @@
-"""Materials group: laws, elements and transfers against closed forms, and what a substep costs."""
+"""Materials group: laws, elements and transfers against closed forms, and the cost of a substep."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.cases.squeeze import close, normal_forces
+from benchmarks.cases.squeeze import close_sensors, normal_forces
 from benchmarks.harness.measure import Measurement, Timing, step_cost, timed
 from benchmarks.harness.runner import Case
 from benchmarks.truth import laws
@@ -19,9 +19,9 @@ from tacsim.models.material import BodyMaterial, GelMaterial
 from tacsim.models.scene import Body, Box, Gel, Scene
 from tacsim.physics.move import MoveStats
 
-RIGID = GelMaterial(youngs_modulus=100e6, poisson_ratio=0.45)  # gels as plates: they give 1 um
+RIGID = GelMaterial(youngs_modulus=100e6, poisson_ratio=0.45)  # gels as plates: they deform by 1 um
 FreeAxes = tuple[float, float, float]  # by axis: 0 forbids motion, 1 allows it
-HALF_PERIODS = 4  # of a standing wave that are timed
+HALF_PERIODS = 4  # of a standing wave that are measured
 
 
 def yield_scene(side: float, spacing: float, gel_element: float) -> Scene:
@@ -45,16 +45,16 @@ def yield_plateau(side: float, spacing: float, repeat: int) -> list[Measurement]
     body = world.truth()
     gap = float(world.pose("upper").position[2]) - body.height
     particles = len(body.points)
-    close(world, gap)
+    close_sensors(world, gap)
     begin = world.snapshot()
 
     def run() -> MoveStats:
         world.restore(begin)
-        return close(world, 0.1 * side)
+        return close_sensors(world, 0.1 * side)
 
     timing, stats = timed(run, repeat, warm=lambda: None)
     strain = world.snapshot()["strain"].astype(np.float64)
-    jacobian = np.sqrt(np.linalg.det(full(strain) + np.eye(3)))
+    jacobian = np.sqrt(np.linalg.det(symmetric_matrices(strain) + np.eye(3)))
     assert CLAY.yield_stress is not None
     # Kirchhoff stress yields: sigma = tau / J
     stress = uniaxial_stress(float(normal_forces(world).mean()), side**3, world.truth().height)
@@ -69,7 +69,7 @@ def yield_plateau(side: float, spacing: float, repeat: int) -> list[Measurement]
 
 
 def plasticine_alone(side: float, spacing: float, repeat: int) -> list[Measurement]:
-    """A free cube of clay, drawn apart until it yields: the plasticine's own substep, without gels and contact."""
+    """A free cube of clay, stretched until it yields: the substep of plasticine alone, without gels and contact."""
     from benchmarks.truth.blocks import BodyBlock
     from tacsim.geometry.shapes import lattice_particles
     from tacsim.physics.body.plasticine import body_params
@@ -97,13 +97,13 @@ def plasticine_alone(side: float, spacing: float, repeat: int) -> list[Measureme
 
 def textbook_plateau(side: float, spacing: float, repeat: int) -> list[Measurement]:
     """The same cube by textbook MLS-MPM: SVD, atomics, plates of grid nodes."""
-    from benchmarks.truth.textbook import yield_plateau as by_the_book  # compiles nothing before it is asked for
+    from benchmarks.truth.textbook import yield_plateau as by_the_book  # compiles kernels when it is imported
 
     return by_the_book(side * 1e3, spacing * 1e3, repeat)
 
 
 def gel_step(repeat: int) -> list[Measurement]:
-    """Two standard gels and next to no body: 0.2 mm of motion on a tiny, elastic cube."""
+    """Two standard gels and a very small body: 0.2 mm of motion on a tiny elastic cube."""
     from tacsim.physics.worlds.hybrid import HybridWorld
 
     scene = Scene.model_validate(
@@ -114,12 +114,12 @@ def gel_step(repeat: int) -> list[Measurement]:
     )
     world = HybridWorld(scene)
     body = world.truth()
-    close(world, float(world.pose("upper").position[2]) - body.height)
+    close_sensors(world, float(world.pose("upper").position[2]) - body.height)
     begin = world.snapshot()
 
     def run() -> MoveStats:
         world.restore(begin)
-        return close(world, 0.2e-3)
+        return close_sensors(world, 0.2e-3)
 
     timing, stats = timed(run, repeat, warm=lambda: None)
     elements = 2 * math.prod(round(side / scene.effective_element_size) for side in scene.gel.size)
@@ -174,7 +174,7 @@ def simple_shear(repeat: int) -> list[Measurement]:
         shear_points(steps, increment, strain, flow, tau, config.mu, config.bulk, config.limit, config.hardening)
         return tau
 
-    timing, tau = timed(run, 1, warm=partial(run, 1))  # seconds that nobody compares
+    timing, tau = timed(run, 1, warm=partial(run, 1))  # these seconds are not compared
     b, flow, exact = np.eye(3), np.zeros(()), np.zeros((3, 3))
     f = np.eye(3)
     f[0, 1] = increment
@@ -182,7 +182,7 @@ def simple_shear(repeat: int) -> list[Measurement]:
         b, flow, exact = laws.hencky_return(f @ b @ f.T, flow, config.mu, config.bulk, config.limit, config.hardening)
     radius = 2 * config.mu * config.limit  # sigma_y
     closed = radius / math.sqrt(2)
-    off = float(np.abs(full(tau.astype(np.float64)) - exact).max()) / radius * 100
+    off = float(np.abs(symmetric_matrices(tau.astype(np.float64)) - exact).max()) / radius * 100
     error = abs(float(tau[:, 3].mean(dtype=np.float64)) / closed - 1) * 100
     figures = {
         "against_float64_percent": off,
@@ -224,7 +224,7 @@ def gel_wave(element: float, repeat: int) -> list[Measurement]:
 
 
 def body_wave(spacing: float, repeat: int) -> list[Measurement]:
-    """Standing half wave in a free block, other directions held: frequency c / 2L."""
+    """Standing half wave in a free block, with the other directions fixed: frequency c / 2L."""
     from benchmarks.truth.blocks import BodyBlock
     from tacsim.geometry.shapes import lattice_particles
     from tacsim.physics.body.plasticine import body_params
@@ -250,13 +250,13 @@ def body_wave(spacing: float, repeat: int) -> list[Measurement]:
                 body.advance(1, free)
             return signal
 
-        timing, signal = timed(run, 1, warm=partial(run, 1))  # seconds that nobody compares
+        timing, signal = timed(run, 1, warm=partial(run, 1))  # these seconds are not compared
         rows.append(_wave_row(timing, half_period(signal) * dt, length / speed, f"plasticine, {name}", count))
     return rows
 
 
 def half_period(signal: FloatArray) -> float:
-    """Mean distance of the first zero crossings of a signal [samples]. Raises ValueError when there are too few."""
+    """Mean distance of the first zero crossings of a signal [samples]. Raises ValueError if there are too few."""
     at = np.flatnonzero(np.sign(signal[:-1]) * np.sign(signal[1:]) < 0)
     if len(at) <= HALF_PERIODS:
         raise ValueError(f"the wave crossed zero {len(at)} times, {HALF_PERIODS + 1} are needed: it does not oscillate")
@@ -323,7 +323,7 @@ def momenta(
     return v.sum(axis=0), angular, float(speed.sum()), float((arm * speed).sum())
 
 
-def full(s: FloatArray) -> FloatArray:
+def symmetric_matrices(s: FloatArray) -> FloatArray:
     """(n, 6) as symmetric (n, 3, 3)."""
     return s[:, [0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(-1, 3, 3)
 

@@ -1,4 +1,4 @@
-"""Rigid indenters beside a solver that shares nothing with ours: balls, punches, twists, slides."""
+"""Rigid indenters compared with an independent solver: balls, punches, twists, slides."""
 
 from __future__ import annotations
 
@@ -20,34 +20,42 @@ RESOLUTIONS = ("learn", "draft", "standard", FINE)
 
 
 def balls(resolution: str, repeat: int) -> list[Measurement]:
-    """Balls pressed without friction, and deep with it: force and contact radius, as `tacsim press` gives them."""
+    """Balls pressed without friction, and deep with friction: force and contact radius, as in `tacsim press`."""
     rows = []
     for (radius, depth), (force, contact) in truth.BALLS.items():
         what = f"ball R {radius:g} mm, {depth:g} mm deep"
         timing, found = _press(resolution, Sphere(radius=radius * 1e-3), 0.0, depth * 1e-3)
-        rows.append(beside(timing, f"{what}: force", "n", _force(found), force, _note(found)))
-        rows.append(beside(timing, f"{what}: contact radius", "mm", found.contact_radius * 1e3, contact, _note(found)))
-    for depth, force in truth.RUBBED_BALL.items():
+        rows.append(comparison_row(timing, f"{what}: force", "n", _normal_force(found), force, _settling_note(found)))
+        rows.append(
+            comparison_row(
+                timing, f"{what}: contact radius", "mm", found.contact_radius * 1e3, contact, _settling_note(found)
+            )
+        )
+    for depth, force in truth.BALL_WITH_FRICTION.items():
         timing, found = _press(resolution, Sphere(radius=4e-3), 0.6, depth * 1e-3)
         what = f"ball R 4 mm, {depth:g} mm deep, friction 0.6: force"
-        rows.append(beside(timing, what, "n", _force(found), force, _note(found)))
+        rows.append(comparison_row(timing, what, "n", _normal_force(found), force, _settling_note(found)))
     return rows
 
 
 def punches(resolution: str, repeat: int) -> list[Measurement]:
-    """Flat punches with sharp edges, 0.1 mm deep: force without friction, and the moment of one that sticks and turns
-    by a degree."""
+    """Flat punches with sharp edges, 0.1 mm deep: force without friction, and the moment of a sticking punch that is
+    twisted by a degree."""
     rows, depth, angle = [], 0.1e-3, math.radians(1.0)
     for radius, force in truth.PUNCHES.items():
         shape = Cylinder(radius=radius * 1e-3, height=4e-3)
         timing, found = _press(resolution, shape, 0.0, depth)
-        rows.append(beside(timing, f"flat punch R {radius:g} mm: force", "n", _force(found), force, _note(found)))
+        rows.append(
+            comparison_row(
+                timing, f"flat punch R {radius:g} mm: force", "n", _normal_force(found), force, _settling_note(found)
+            )
+        )
     for radius, share in truth.TWISTS.items():
         shape = Cylinder(radius=radius * 1e-3, height=4e-3)
         timing, found = _press(resolution, shape, 5.0, depth, twist=angle)
         moment = share * 16 / 3 * truth.SHEAR_MODULUS * radius**3 * angle  # [N mm]
         what = f"flat punch R {radius:g} mm, twisted by a degree: moment"
-        rows.append(beside(timing, what, "nmm", found.wrench[5] * 1e3, moment, _note(found)))
+        rows.append(comparison_row(timing, what, "nmm", found.wrench[5] * 1e3, moment, _settling_note(found)))
     return rows
 
 
@@ -57,15 +65,17 @@ def slides(resolution: str, repeat: int) -> list[Measurement]:
     for (depth, friction), ratio in truth.SLIDES.items():
         timing, found = _press(resolution, Sphere(radius=4e-3), friction, depth * 1e-3, slide=2e-3)
         what = f"ball slid {depth:g} mm deep, friction {friction:g}: drag over normal force"
-        rows.append(beside(timing, what, "ratio", found.wrench[0] / _force(found), ratio, _note(found)))
+        rows.append(
+            comparison_row(timing, what, "ratio", found.wrench[0] / _normal_force(found), ratio, _settling_note(found))
+        )
     return rows
 
 
-def beside(
+def comparison_row(
     timing: Timing, what: str, unit: str, found: float, true: float, note: str = "",
     figures: Mapping[str, float] | None = None,
 ) -> Measurement:  # fmt: skip
-    """A row of the table that pages/oracles.py makes: what we find and what is true, in `unit`."""
+    """A row of the table of pages/oracles.py: the value found and the true one, in `unit`."""
     both = {f"found_{unit}": float(found), f"truth_{unit}": true, **(figures or {})}
     return Measurement(timing, abs(found / true - 1) * 100, "%", truth.WORDS, what, figures=both, note=note)
 
@@ -77,17 +87,17 @@ def _press(
     from tacsim.config import load_sensor
 
     fineness = {"element_size": 0.25e-3} if resolution == FINE else {"preset": resolution}
-    sharp = 0.0 if isinstance(shape, Cylinder) else None  # as those of the solver
+    sharp = 0.0 if isinstance(shape, Cylinder) else None  # as in the solver
     indenter = Indenter(geometry=shape, friction=friction, edge_radius=sharp)
     scene = Scene.model_validate({"body": None, "indenter": indenter, **fineness})
     return once(lambda: press(scene, load_sensor("ideal"), PressMotion(depth, (slide, 0.0), twist)))
 
 
-def _force(found: PressResult) -> float:
+def _normal_force(found: PressResult) -> float:
     return -float(found.wrench[2])
 
 
-def _note(found: PressResult) -> str:
+def _settling_note(found: PressResult) -> str:
     return "" if all(move.settled for move in found.moves) else "not settled"
 
 

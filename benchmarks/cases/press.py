@@ -44,8 +44,8 @@ FORCE_RATIOS = (0.45, 0.49)  # Poisson
 def press_scene(
     geometry: Shape, element: float, *, nu: float = 0.45, friction: float = 0.6, **settling: float
 ) -> Scene:  # fmt: skip
-    """A gel of 20 x 20 x 4 mm, E = 0.145 MPa, under an indenter with sharp edges; the controller's defaults unless said
-    (`settling`), but a hold as long as it takes."""
+    """A gel of 20 x 20 x 4 mm, E = 0.145 MPa, under an indenter with sharp edges, with the controller's defaults except
+    for `settling` and a hold without a limit."""
     sharp = 0.0 if isinstance(geometry, Box | Cylinder) else None
     return Scene.model_validate(
         {
@@ -59,7 +59,7 @@ def press_scene(
 
 
 def press(scene: Scene, depth: float) -> tuple[PressWorld, MoveStats]:
-    """A new world, its indenter's tip driven to `depth` [m] below the undeformed gel."""
+    """A new world with the indenter's tip at `depth` [m] below the undeformed gel."""
     from tacsim.physics.worlds.press import PressWorld
 
     assert scene.indenter is not None
@@ -71,18 +71,18 @@ def press(scene: Scene, depth: float) -> tuple[PressWorld, MoveStats]:
 
 
 DEFAULT_MACH = MAX_MACH  # the controller's default at nu 0.45, a tenth of the shear wave's speed
-# Half of it; more; and a third of the shear wave's speed, where contact sticks and slips by inertia.
+# Half of it; more; and a third of the shear wave's speed, at which inertia affects stick and slip.
 OTHER_MACHS = (0.015, 0.05, 0.1)
 
 
-def profile(world: PressWorld) -> FloatArray:
+def world_profile(world: PressWorld) -> FloatArray:
     return surface_profile(world.surface("lower"))
 
 
 def sphere_press(element: float, repeat: int) -> list[Measurement]:
     """Scene to settled surface at the controller's defaults, against the limit of fine meshes."""
     timing, (world, stats) = timed(partial(press, press_scene(Sphere(radius=RADIUS), element), DEPTH), repeat)
-    difference = profile(world) - load_limit().profile
+    difference = world_profile(world) - load_limit().profile
     return [
         Measurement(
             timing, rms(difference) * 1e6, "µm rms", LIMIT, substeps=stats.substeps,
@@ -93,11 +93,11 @@ def sphere_press(element: float, repeat: int) -> list[Measurement]:
 
 
 def quasi_static(repeat: int) -> list[Measurement]:
-    """The same mesh at the default tolerance against one converged; and at two speeds."""
+    """The same mesh at the default tolerance against a converged one, and at two speeds."""
     ball, element = Sphere(radius=RADIUS), 0.5e-3
     timing, (usual, stats) = timed(partial(press, press_scene(ball, element), DEPTH), repeat)
     reference, _ = press(press_scene(ball, element, mach=0.02, tolerance=1e-5), DEPTH)
-    difference = profile(usual) - profile(reference)
+    difference = world_profile(usual) - world_profile(reference)
     forces = [abs(float(w.wrench("lower")[2])) for w in (usual, reference)]
     rows = [
         Measurement(
@@ -108,7 +108,7 @@ def quasi_static(repeat: int) -> list[Measurement]:
     for mach in OTHER_MACHS:
         scene = press_scene(ball, element, mach=mach)
         timing, (other, stats) = timed(partial(press, scene, DEPTH), 1, warm=lambda: None)
-        difference = profile(other) - profile(usual)
+        difference = world_profile(other) - world_profile(usual)
         rows.append(
             Measurement(
                 timing, _largest(difference), "µm at most", f"the same press at Mach {DEFAULT_MACH:g}, tolerance 1e-2",
@@ -128,7 +128,7 @@ def sphere_force(element: float, repeat: int) -> list[Measurement]:
             # kernels are warm after the first press
             warm = None if not rows else (lambda: None)
             timing, (world, stats) = timed(partial(press, scene, depth), 1, warm)  # sphere_press compares seconds
-            truth = layer(_ball_gap, depth, nu).force
+            truth = solve_layer(_ball_gap, depth, nu).force
             rows.append(_force_row(timing, world, stats, truth, f"depth {depth * 1e3:g} mm, nu {nu:g}"))
     return rows
 
@@ -138,15 +138,15 @@ def flat_punch(element: float, repeat: int) -> list[Measurement]:
     cylinder, depth, nu = Cylinder(radius=3e-3, height=4e-3), 0.1e-3, 0.45
     scene = press_scene(cylinder, element, nu=nu, friction=0.0, tolerance=1e-3)
     timing, (world, stats) = timed(partial(press, scene, depth), repeat)
-    truth = layer(_punch_gap, depth, nu, pixels=768).force
+    truth = solve_layer(_punch_gap, depth, nu, pixels=768).force
     return [_force_row(timing, world, stats, truth, f"depth {depth * 1e3:g} mm, nu {nu:g}")]
 
 
-def renew(say: Callable[[str], None]) -> Limit:
-    """Computes the limit anew and writes it to FOLDER: three meshes, the finest takes many minutes."""
+def renew(report_progress: Callable[[str], None]) -> Limit:
+    """Computes the limit again and writes it to FOLDER: three meshes, the finest takes many minutes."""
     profiles, forces, substeps = [], [], []
     for element in ELEMENTS:
-        say(f"sphere_press: h = {element * 1e3:g} mm")
+        report_progress(f"sphere_press: h = {element * 1e3:g} mm")
         world, stats = press(press_scene(Sphere(radius=RADIUS), element, tolerance=1e-4), DEPTH)
         if not stats.settled:
             raise RuntimeError(f"the press at h = {element} m did not settle: residual {stats.residual:.2g}")
@@ -169,11 +169,11 @@ def renew(say: Callable[[str], None]) -> Limit:
 
 
 def layer_press(repeat: int) -> list[Measurement]:
-    """The independent solver at the deep press: small strain and no friction, hence its error."""
-    timing, contact = timed(partial(layer, _ball_gap, DEPTH, 0.45), repeat)
+    """The independent solver for the deep press: its error results from small strain and no friction."""
+    timing, contact = timed(partial(solve_layer, _ball_gap, DEPTH, 0.45), repeat)
     n = contact.displacement.shape[0]
     limit = load_limit()
-    step = GRID_PITCH / contact.pixel  # both grids have a point in the middle of the contact
+    step = GRID_PITCH / contact.pixel  # both grids have a point at the centre of the contact
     index = n // 2 + np.rint((np.arange(limit.profile.shape[0]) - limit.profile.shape[0] // 2) * step).astype(int)
     difference = -contact.displacement[np.ix_(index, index)] - limit.profile
     return [
@@ -184,15 +184,15 @@ def layer_press(repeat: int) -> list[Measurement]:
 
 def tacchi_press(repeat: int) -> list[Measurement]:
     """The same press at the numbers that Tacchi publishes: particles, sticky contact through the grid, 200 mm/s.
-    Its kernels are its own, since those of `seed` know only two neo-Hookean gels that close round a body, driven by
+    It has its own kernels, because those of `seed` simulate only two neo-Hookean gels that close on a body, driven by
     their backings; transfers (APIC), update of F and contact through the grid are the same.
     """
-    from benchmarks.truth import tacchi  # compiles nothing before it is asked for
+    from benchmarks.truth import tacchi  # compiles kernels when it is imported
 
     return tacchi.sphere_press(repeat)
 
 
-def layer(
+def solve_layer(
     gap_of_radius: Callable[[FloatArray], FloatArray],
     depth: float,
     nu: float,

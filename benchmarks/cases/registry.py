@@ -56,7 +56,7 @@ CASES: tuple[Case, ...] = (
 
 CPU_ONLY = "it runs on the CPU only"
 
-BY_DATA: dict[tuple[str, str], Callable[..., object]] = {  # cases that depend on the user's frames
+BY_DATA: dict[tuple[str, str], Callable[..., object]] = {  # cases that need the user's frames
     ("real", contact_radius.CASE): contact_radius.contact_radius,
     ("real", films.CASE): films.marker_film,
     ("real", balls.CASE): balls.ball_presses,
@@ -72,12 +72,12 @@ BY_DATA: dict[tuple[str, str], Callable[..., object]] = {  # cases that depend o
 def select_cases(
     groups: Iterable[Group], *, baselines: bool, long: bool = False, data: Path | None = None
 ) -> list[Case]:
-    """The cases of `groups` in their order; other methods only with `baselines`, long ones only with `long`.
+    """The cases of `groups` in order; other methods only with `baselines`, long ones only with `long`.
 
-    On a device (TACSIM_DEVICE) other methods, and cases that need the CPU, are named as not measured.
+    On a device (TACSIM_DEVICE), other methods and cases that need the CPU are reported as not measured.
 
-    `data`: folder of the real group's frames; without it that group has no cases. Raises BadData, ConfigError for one
-    that cannot be used.
+    data: folder with the frames of the real group; without it that group has no cases. Raises BadData, ConfigError for
+    a folder that cannot be used.
     """
     wanted = set(groups)
     every = CASES if data is None or "real" not in wanted else (*CASES, *_real_cases(data))
@@ -90,8 +90,10 @@ def select_cases(
 
 
 def _real_cases(data: Path) -> tuple[Case, ...]:
-    """Those of the frames below `data`, and those that need none; what is not there says so. Raises BadData where there
-    is nothing at all, or where labels of the folder's own name what is not there; ConfigError."""
+    """The cases of the frames below `data`, and those without frames; cases without their frames are marked as missing.
+
+    Raises BadData if no frames are found, or if the folder's own labels name missing frames; ConfigError.
+    """
     found = (*films.cases(data), *balls.cases(data)) if data.is_dir() else ()
     try:
         presses = contact_radius.cases(data)
@@ -106,7 +108,7 @@ def _real_cases(data: Path) -> tuple[Case, ...]:
 
 
 def description(group: Group, name: str, method: str) -> str:
-    """What a case does, from the first paragraph of its docstring; empty for a case that is no more."""
+    """Description of a case, from the first paragraph of its docstring; empty for a removed case."""
     if (group, name) in BY_DATA:
         return _first_paragraph(BY_DATA[group, name])
     for case in CASES:

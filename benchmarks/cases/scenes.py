@@ -1,4 +1,4 @@
-"""Scenes group: what a scene costs by what is in it, and how soon a second world is ready."""
+"""Scenes group: cost of a scene by its content, and the time to make a second world."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from benchmarks.cases.press import press, press_scene
 from benchmarks.cases.squeeze import (
     PRESETS,
     STEP,
-    close,
+    close_sensors,
     closing_targets,
     normal_forces,
     squeeze_scene,
@@ -38,7 +38,7 @@ AT_REST = "contact force against force at the backing, and their change"
 
 
 def rigid(shape: Callable[[Path], Shape], repeat: int) -> list[Measurement]:
-    """A rigid indenter pressed 0.3 mm into the draft gel, from the scene on: no particles, no grid."""
+    """A rigid indenter pressed 0.3 mm into the draft gel, including the world from its scene: no particles, no grid."""
     with tempfile.TemporaryDirectory() as folder:
         scene = press_scene(shape(Path(folder)), 1e-3)
         timing, (world, stats) = timed(partial(press, scene, DEPTH), repeat)
@@ -69,7 +69,7 @@ def _mesh(folder: Path) -> Shape:
 
 
 def body(material: str, repeat: int) -> list[Measurement]:
-    """A cube of 10 mm between two draft gels, closed by 0.3 mm in the middle of a squeeze; then also its images."""
+    """A cube of 10 mm between two draft gels, closed by 0.3 mm in the middle of a squeeze; then with its images too."""
     from tacsim.config import load_sensor
     from tacsim.optics.render import Renderer
 
@@ -80,29 +80,29 @@ def body(material: str, repeat: int) -> list[Measurement]:
         soft = BodyMaterial(youngs_modulus=config.youngs_modulus, poisson_ratio=config.poisson_ratio)
         scene = scene.model_copy(update={"body": Body(geometry=scene.body.geometry, material=soft)})
     world = world_in_contact(scene)
-    close(world, 0.5e-3)
+    close_sensors(world, 0.5e-3)
     begin = world.snapshot()
 
     def run() -> MoveStats:
         world.restore(begin)
-        return close(world, CLOSE)
+        return close_sensors(world, CLOSE)
 
     timing, stats = timed(run, repeat, warm=lambda: None)
     rows = [_row(timing, stats, "", timing.median, {"force_n": float(normal_forces(world).mean())})]
     sensor = load_sensor("ideal", ["geometry.width=320", "geometry.height=240"])
     camera = Renderer(sensor, scene.gel.size[:2])
 
-    def look() -> list[object]:
+    def render_images() -> list[object]:
         return [camera(world.surface(name)) for name in world.sensors]
 
-    seen, _ = timed(look, repeat)
-    both = Timing(tuple(timing.median + each for each in seen.samples), timing.processor + seen.processor)
-    rows.append(_row(both, stats, "and two images of 320 x 240", both.median, {"images_ms": seen.median * 1e3}))
+    rendering, _ = timed(render_images, repeat)
+    both = Timing(tuple(timing.median + each for each in rendering.samples), timing.processor + rendering.processor)
+    rows.append(_row(both, stats, "and two images of 320 x 240", both.median, {"images_ms": rendering.median * 1e3}))
     return rows
 
 
 def _row(timing: Timing, stats: MoveStats, variant: str, moving: float, figures: dict[str, float]) -> Measurement:
-    """`moving`: the seconds that are the substeps'."""
+    """moving: duration of the substeps [s]."""
     each = {"wall_per_substep_us": moving * 1e6 / stats.substeps}
     note = "" if stats.settled else "not settled"
     return Measurement(
@@ -111,7 +111,7 @@ def _row(timing: Timing, stats: MoveStats, variant: str, moving: float, figures:
 
 
 def second_world(preset: str, repeat: int) -> list[Measurement]:
-    """A world from its scene, once more in a process that has made and moved one already: nothing compiles anew."""
+    """A second world from a scene, in a process that has made and moved one already: no kernel compiles again."""
     scene = squeeze_scene(preset, mach=0.1, max_substeps=0)
     first, first_ms, first_move_ms = _made_and_moved(scene)
     timing, _ = timed(partial(make_world, scene), repeat, warm=lambda: None)
@@ -130,11 +130,11 @@ def second_world(preset: str, repeat: int) -> list[Measurement]:
 
 
 def _made_and_moved(scene: Scene) -> tuple[World, float, float]:
-    """A world, the time to make it and that of its first motion [ms]."""
+    """A world, the time to make it and the time of its first motion [ms]."""
     began = time.perf_counter()
     world = make_world(scene)
     made = time.perf_counter()
-    close(world, 1e-6)
+    close_sensors(world, 1e-6)
     return world, (made - began) * 1e3, (time.perf_counter() - made) * 1e3
 
 
@@ -151,8 +151,8 @@ print(world.wrench("upper")[2], time.process_time())
 
 
 def first_motion(repeat: int) -> list[Measurement]:
-    """A process that makes the default scene's draft world and closes it by 0.5 mm: where no kernels are kept, then
-    where they are."""
+    """A process that makes the default scene's draft world and closes it by 0.5 mm: without cached kernels, then with
+    them."""
     with tempfile.TemporaryDirectory() as folder:
         environment = {**os.environ, "TI_OFFLINE_CACHE_FILE_PATH": folder}
         command = [sys.executable, "-W", "ignore", "-c", FIRST_MOTION]
@@ -178,11 +178,11 @@ def first_motion(repeat: int) -> list[Measurement]:
 
 
 def batch(count: int, repeat: int) -> list[Measurement]:
-    """Draft squeezes moved by one launch, each closed by 0.1 mm without a hold: what a substep costs each of them."""
+    """Draft squeezes moved by one launch, each closed by 0.1 mm without a hold: cost of a substep for each of them."""
     from tacsim.physics.worlds.batch import Batch
 
     begin = world_in_contact(squeeze_scene("draft"))
-    close(begin, 0.5e-3)
+    close_sensors(begin, 0.5e-3)
     scene = squeeze_scene("draft", max_substeps=0)
     alone, many = make_world(scene), Batch([scene] * count)
     for world in (alone, *many.worlds):
@@ -197,8 +197,8 @@ def batch(count: int, repeat: int) -> list[Measurement]:
         return ends[0]
 
     timing, stats = timed(run, repeat if count < max(ENVIRONMENTS) else 1)  # the largest takes seconds
-    for _ in range(len(timing.samples) + 1):  # as often as the batch, which was moved once untimed
-        close(alone, STEP)
+    for _ in range(len(timing.samples) + 1):  # as often as the batch, with its untimed motion
+        close_sensors(alone, STEP)
     force = float(normal_forces(alone).mean())
     error = max(abs(float(normal_forces(world).mean()) / force - 1) for world in many.worlds) * 100
     each = timing.median * 1e6 / (stats.substeps * count)

@@ -1,4 +1,4 @@
-"""Press group, slides: an indenter pressed on one gel is dragged over it; against Coulomb's law and slow motions."""
+"""Press group, slides: an indenter pressed on one gel slides over it, against Coulomb's law and slow motions."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ if TYPE_CHECKING:
     from tacsim.physics.worlds.press import PressWorld
 
 
-SLIDE, SLIDES = 0.5e-3, 20  # a plate slides so far at a time [m], and so often at most
-SLIDE_SLOW = {"draft": 0.001, "standard": 0.002}  # Mach number at which speed plays no part
+SLIDE, SLIDES = 0.5e-3, 20  # length of one slide of a plate [m], and maximum number of slides
+SLIDE_SLOW = {"draft": 0.001, "standard": 0.002}  # Mach number at which speed has no influence
 STAYS = 1e-3  # relative change of the force ratio in one slide
 
 
 def sliding_force(element: float, repeat: int) -> list[Measurement]:
-    """A plate wider than the gel slides over it until the ratio of forces stays: then it is the coefficient.
+    """A plate wider than the gel slides over it until the ratio of forces is constant; it then equals the coefficient.
 
-    No edge ploughs, but the gel shears first, and its parts slip one after the other.
+    There is no edge in the contact. First the gel shears, then its parts slip one after the other.
     """
     friction, depth = 0.3, 0.3e-3
     scene = press_scene(Box(size=(50e-3, 30e-3, 4e-3)), element, friction=friction, tolerance=1e-3)
@@ -55,28 +55,30 @@ def sliding_force(element: float, repeat: int) -> list[Measurement]:
 
 
 def slid_ball(preset: str, repeat: int) -> list[Measurement]:
-    """A ball R 4 mm, 0.5 mm deep in the shipped gel, dragged along it by 0.5 mm, so that a part of the contact still
-    sticks: drag over normal force."""
+    """A ball R 4 mm, 0.5 mm deep in the shipped gel, slid by 0.5 mm, so that a part of the contact still sticks: drag
+    over normal force."""
     settled = {"mach": SLIDE_SLOW[preset], "tolerance": 1e-3, "max_substeps": 500}
     rows = []
     for friction in (0.3, 0.6, 1.0, 1.5):
         ball = Indenter(geometry=Sphere(radius=RADIUS), friction=friction)
-        timing, (found, stats) = timed(partial(_drag, preset, ball, 0.5e-3, SLIDE), 1, warm=lambda: None)
-        truth, _ = _drag(preset, ball, 0.5e-3, SLIDE, **settled)
+        timing, (found, stats) = timed(partial(_drag_after_slide, preset, ball, 0.5e-3, SLIDE), 1, warm=lambda: None)
+        truth, _ = _drag_after_slide(preset, ball, 0.5e-3, SLIDE, **settled)
         what = f"the same mesh at Mach {SLIDE_SLOW[preset]:g}"
         rows.append(_drag_row(timing, found, stats, truth, what, f"0.5 mm, friction {friction:g}"))
     return rows
 
 
 def slid_edges(preset: Preset, repeat: int) -> list[Measurement]:
-    """A cylinder R 2 mm and a box of 4 mm, 0.3 mm deep, dragged by 2 mm: sharp, and as round as the mesh carries."""
+    """A cylinder R 2 mm and a box of 4 mm, 0.3 mm deep, slid by 2 mm: sharp, and as round as the mesh resolves."""
     settled = {"mach": SLIDE_SLOW[preset], "tolerance": 1e-3, "max_substeps": 500}
     rows = []
     for shape in (Cylinder(radius=2e-3, height=4e-3), Box(size=(4e-3, 4e-3, 4e-3))):
         for radius, friction in ((r, mu) for r in (0.0, None) for mu in (0.3, 0.6, 1.0, 1.5)):
             edged = Indenter(geometry=shape, friction=friction, edge_radius=radius)
-            timing, (found, stats) = timed(partial(_drag, preset, edged, 0.3e-3, 2e-3), 1, warm=lambda: None)
-            truth, _ = _drag(preset, edged, 0.3e-3, 2e-3, **settled)
+            timing, (found, stats) = timed(
+                partial(_drag_after_slide, preset, edged, 0.3e-3, 2e-3), 1, warm=lambda: None
+            )
+            truth, _ = _drag_after_slide(preset, edged, 0.3e-3, 2e-3, **settled)
             what = f"the same mesh at Mach {SLIDE_SLOW[preset]:g}"
             variant = f"{'round' if radius is None else 'sharp'} {shape.shape}, friction {friction:g}"
             rows.append(_drag_row(timing, found, stats, truth, what, variant))
@@ -84,25 +86,27 @@ def slid_edges(preset: Preset, repeat: int) -> list[Measurement]:
 
 
 def slid_in(preset: str, repeat: int) -> list[Measurement]:
-    """Pressed in while they slide, in one oblique motion from above the gel: drag over normal force."""
+    """Indenters pressed in one oblique motion from above the gel: drag over normal force."""
     settled = {"mach": SLIDE_SLOW[preset], "tolerance": 1e-3, "max_substeps": 500}
     rows = []
-    for shape, friction, way in (
+    for shape, friction, displacement in (
         (Sphere(radius=6e-3), 0.8, (0.6e-3, 0.0, -0.3e-3)),
         (Sphere(radius=3e-3), 1.5, (1.5e-3, 0.0, -0.8e-3)),
         (Cylinder(radius=2.5e-3, height=5e-3), 0.6, (1e-3, 0.0, -0.4e-3)),
         (Box(size=(4e-3, 4e-3, 4e-3)), 0.8, (1e-3, 1e-3, -0.5e-3)),
     ):
         indenter = Indenter(geometry=shape, friction=friction)
-        timing, (found, stats) = timed(partial(_drag_in, preset, indenter, way), 1, warm=lambda: None)
-        truth, _ = _drag_in(preset, indenter, way, **settled)
+        timing, (found, stats) = timed(
+            partial(_drag_after_oblique_press, preset, indenter, displacement), 1, warm=lambda: None
+        )
+        truth, _ = _drag_after_oblique_press(preset, indenter, displacement, **settled)
         what = f"the same mesh at Mach {SLIDE_SLOW[preset]:g}"
         rows.append(_drag_row(timing, found, stats, truth, what, f"{shape.shape}, friction {friction:g}"))
     return rows
 
 
 def slid_turned(preset: str, repeat: int) -> list[Measurement]:
-    """Dragged by 1.3 mm, 0.5 mm deep, then by 0.7 mm square to that: how far the drag's vector is from a slow one's."""
+    """Slid by 1.3 mm, 0.5 mm deep, then by 0.7 mm at right angles: difference of the drag vector from slow slides."""
     settled = {"mach": SLIDE_SLOW[preset], "tolerance": 1e-3, "max_substeps": 500}
     rows = []
     for shape, friction in (
@@ -112,8 +116,8 @@ def slid_turned(preset: str, repeat: int) -> list[Measurement]:
         (Box(size=(6e-3, 3.2e-3, 4e-3)), 0.4),
     ):
         indenter = Indenter(geometry=shape, friction=friction)
-        timing, (found, stats) = timed(partial(_turned, preset, indenter), 1, warm=lambda: None)
-        truth, _ = _turned(preset, indenter, **settled)
+        timing, (found, stats) = timed(partial(_drag_after_turn, preset, indenter), 1, warm=lambda: None)
+        truth, _ = _drag_after_turn(preset, indenter, **settled)
         off = np.linalg.norm(found - truth) / np.linalg.norm(truth)
         note = "" if stats.settled else "not settled"
         figures = {"x": float(found[0]), "y": float(found[1]), "true_x": float(truth[0]), "true_y": float(truth[1])}
@@ -126,35 +130,37 @@ def slid_turned(preset: str, repeat: int) -> list[Measurement]:
     return rows
 
 
-def _turned(preset: str, indenter: Indenter, **settling: float) -> tuple[FloatArray, MoveStats]:
+def _drag_after_turn(preset: str, indenter: Indenter, **settling: float) -> tuple[FloatArray, MoveStats]:
     """Drag along x and y over normal force after both legs."""
     scene = {"body": None, "preset": preset, "indenter": indenter, "settling": settling}
     world, _ = press(Scene.model_validate(scene), 0.5e-3)
-    for way in ([0.0, 1.3e-3, 0.0], [0.7e-3, 0.0, 0.0]):
+    for displacement in ([0.0, 1.3e-3, 0.0], [0.7e-3, 0.0, 0.0]):
         pose = world.pose("indenter")
-        stats = world.move({"indenter": Pose(pose.position + way, pose.quaternion)})
+        stats = world.move({"indenter": Pose(pose.position + displacement, pose.quaternion)})
     force = world.wrench("lower")
     return force[:2] / -force[2], stats
 
 
-def _drag_in(
-    preset: str, indenter: Indenter, way: tuple[float, float, float], **settling: float
+def _drag_after_oblique_press(
+    preset: str, indenter: Indenter, displacement: tuple[float, float, float], **settling: float
 ) -> tuple[float, MoveStats]:
-    """Drag over normal force after one motion by so much from where the indenter touches [m]."""
+    """Drag over normal force after one motion by `displacement` [m] from first contact."""
     from tacsim.physics.worlds.press import PressWorld
     from tacsim.physics.worlds.tuning import INITIAL_GAP
 
     scene = {"body": None, "preset": preset, "indenter": indenter, "settling": settling}
     world = PressWorld(Scene.model_validate(scene))
     pose = world.pose("indenter")
-    target = pose.position + way - [0.0, 0.0, INITIAL_GAP]
+    target = pose.position + displacement - [0.0, 0.0, INITIAL_GAP]
     stats = world.move({"indenter": Pose(target, pose.quaternion)})
     force = world.wrench("lower")
     return float(np.hypot(force[0], force[1]) / -force[2]), stats
 
 
-def _drag(preset: str, indenter: Indenter, deep: float, length: float, **settling: float) -> tuple[float, MoveStats]:
-    """Drag over normal force after a slide of so much, so deep [m]."""
+def _drag_after_slide(
+    preset: str, indenter: Indenter, deep: float, length: float, **settling: float
+) -> tuple[float, MoveStats]:
+    """Drag over normal force after a slide of `length`, `deep` in the gel [m]."""
     scene = Scene.model_validate(
         {
             "body": None,

@@ -22,9 +22,9 @@ from tacsim.physics.world import World, make_world
 if TYPE_CHECKING:
     from tacsim.interface import FloatArray
 
-SQUEEZE = 3e-3  # both sensors together, from touching [m]
-STEP, STEPS = 0.1e-3, 20  # both sensors together in a control step [m]; steps in a row
-TOUCH = 0.05e-3  # first indentation of each gel: contact is surely made [m]
+SQUEEZE = 3e-3  # both sensors together, from first contact [m]
+STEP, STEPS = 0.1e-3, 20  # both sensors together in a control step [m]; number of steps
+TOUCH = 0.05e-3  # first indentation of each gel, which makes contact certain [m]
 SLOW = {"mach": 0.003, "tolerance": 1e-3, "max_substeps": 100_000}
 NOT_SETTLED = {"max_substeps": 0}
 
@@ -38,17 +38,17 @@ def squeeze_scene(preset: str, physics: str = "hybrid", **settling: float) -> Sc
 
 
 def world_in_contact(scene: Scene) -> World:
-    """A new world whose gels have just met the body, at rest."""
+    """A new world at rest whose gels just touch the body."""
     world = make_world(scene)
     truth = world.truth()
     assert truth is not None
     gap = float(world.pose("upper").position[2]) - truth.height
-    close(world, gap + 2 * TOUCH)
+    close_sensors(world, gap + 2 * TOUCH)
     return world
 
 
 def closing_targets(world: World, by: float) -> dict[str, Pose]:
-    """Targets of both sensors, nearer to each other by `by` [m] in all."""
+    """Targets of both sensors, closer to each other by `by` [m] in total."""
     targets = {}
     for name, sign in (("lower", 1.0), ("upper", -1.0)):
         pose = world.pose(name)
@@ -56,8 +56,8 @@ def closing_targets(world: World, by: float) -> dict[str, Pose]:
     return targets
 
 
-def close(world: World, by: float, *, flow: bool = False) -> MoveStats:
-    """Moves both sensors towards each other, by `by` [m] in all."""
+def close_sensors(world: World, by: float, *, flow: bool = False) -> MoveStats:
+    """Moves both sensors towards each other, by `by` [m] in total."""
     return world.move(closing_targets(world, by), flow=flow)
 
 
@@ -67,12 +67,12 @@ def normal_forces(world: World) -> FloatArray:
 
 
 def slow_force(preset: str, physics: str = "hybrid") -> float:
-    """Force [N] after a squeeze so slow that speed plays no part, on the same mesh. Minutes at `standard`; kept."""
+    """Force [N] after a squeeze at a speed without influence, on the same mesh. Takes minutes at `standard`; cached."""
     scene = squeeze_scene(preset, physics, **SLOW)
 
     def compute() -> list[float]:
         world = world_in_contact(scene)
-        stats = close(world, SQUEEZE)
+        stats = close_sensors(world, SQUEEZE)
         if not stats.settled:
             raise RuntimeError(f"the slow squeeze did not settle: residual {stats.residual:.2g}")
         return [float(normal_forces(world).mean())]
@@ -81,7 +81,7 @@ def slow_force(preset: str, physics: str = "hybrid") -> float:
 
 
 def squeeze(preset: str, physics: str, repeat: int) -> list[Measurement]:
-    """3 mm from touch: driven only, then settled to 1 %."""
+    """3 mm from first contact: the motion only, then settled to 1 %."""
     truth = slow_force(preset, physics)
     rows = []
     for settling, name in ((NOT_SETTLED, "not settled"), ({}, "settled to 1 %")):
@@ -93,14 +93,14 @@ def squeeze(preset: str, physics: str, repeat: int) -> list[Measurement]:
 
 
 def _squeezed_again(world: World, repeat: int) -> tuple[Timing, MoveStats]:
-    """The 3 mm from where `world` is, timed; it stays where the last of them ends."""
+    """A timed squeeze of 3 mm from the state of `world`, which ends in the state after the last repetition."""
     begin = world.snapshot()
 
     def run() -> MoveStats:
         world.restore(begin)
-        return close(world, SQUEEZE)
+        return close_sensors(world, SQUEEZE)
 
-    return timed(run, repeat, warm=lambda: None)  # `touching` has used every kernel already
+    return timed(run, repeat, warm=lambda: None)  # `world_in_contact` has used every kernel already
 
 
 def _squeeze_rows(world: World, truth: float, variant: str, repeat: int) -> list[Measurement]:
@@ -128,7 +128,7 @@ def _squeeze_rows(world: World, truth: float, variant: str, repeat: int) -> list
             stats.substeps, {"lower_n": float(forces[0]), "upper_n": float(forces[1])}, note,
         )
     )  # fmt: skip
-    if isinstance(world, HybridWorld):  # bodies on one grid have neither
+    if isinstance(world, HybridWorld):  # bodies on one grid have neither overlap nor gap
         between = gaps(world, world.scene.spacing)
         rows.append(
             Measurement(
@@ -146,8 +146,8 @@ def _squeeze_rows(world: World, truth: float, variant: str, repeat: int) -> list
 
 
 def settled_squeeze(preset: str, physics: str, repeat: int) -> list[Measurement]:
-    """3 mm from touch, settled to 1 %: every method against one truth, the slow limit of our `standard` mesh.
-    Our row of this very mesh is judged without its coarseness; the seed's bodies stick where ours rub.
+    """3 mm from first contact, settled to 1 %: every method against one truth, the slow limit of our `standard` mesh.
+    Our row with that mesh has no error of the mesh; the bodies of seed stick where ours have friction.
     """
     truth = slow_force("standard")
     world = world_in_contact(squeeze_scene(preset, physics))
@@ -163,7 +163,7 @@ def settled_squeeze(preset: str, physics: str, repeat: int) -> list[Measurement]
 
 
 def control_step(preset: str, physics: str, repeat: int) -> list[Measurement]:
-    """0.1 mm of motion in the middle of a squeeze, and both images of 320 x 240: settled as by default, and flowing."""
+    """0.1 mm of motion in the middle of a squeeze, and both images of 320 x 240: settled, the default, and flowing."""
     truth = slow_steps(preset, physics)
     kinds = (False, True) if physics == "hybrid" else (False,)
     return [_control_step_row(preset, physics, truth, flow, repeat) for flow in kinds]
@@ -178,11 +178,11 @@ def _control_step_row(preset: str, physics: str, truth: FloatArray, flow: bool, 
     camera = Renderer(sensor, scene.gel.size[:2])
     world = _squeezed(scene)
     forces = [_force_after_a_step(world, flow) for _ in range(STEPS // 2)]
-    begin = world.snapshot()  # under way, if it flows
+    begin = world.snapshot()  # in motion, if it flows
 
     def run() -> MoveStats:
         world.restore(begin)
-        stats = close(world, STEP, flow=flow)
+        stats = close_sensors(world, STEP, flow=flow)
         map_parallel([partial(camera, world.surface(name)) for name in world.sensors])
         return stats
 
@@ -199,21 +199,21 @@ def _control_step_row(preset: str, physics: str, truth: FloatArray, flow: bool, 
 
 
 def _squeezed(scene: Scene) -> World:
-    """By 1 mm from touch, so slowly that the way there adds nothing."""
+    """A world squeezed by 1 mm from first contact, at a speed without influence."""
     slow = world_in_contact(squeeze_scene(scene.preset, scene.physics, **{**SLOW, "mach": 0.01}))
-    close(slow, 1e-3)
+    close_sensors(slow, 1e-3)
     world = make_world(scene)
     world.restore(slow.snapshot())
     return world
 
 
 def _force_after_a_step(world: World, flow: bool) -> float:
-    close(world, STEP, flow=flow)
+    close_sensors(world, STEP, flow=flow)
     return float(normal_forces(world).mean())
 
 
 def slow_steps(preset: str, physics: str) -> FloatArray:
-    """Forces [N] after each of STEPS steps so slow that speed plays no part; kept."""
+    """Forces [N] after each of STEPS steps at a speed without influence; cached."""
     scene = squeeze_scene(preset, physics, **SLOW)
 
     def compute() -> list[float]:
@@ -227,7 +227,7 @@ def reposition(preset: str, physics: str, repeat: int) -> list[Measurement]:
     """Pressed 0.5 mm, then the upper sensor moves 3 mm along x: by symmetry the body ends half-way."""
     displacement = 3e-3
     world = world_in_contact(squeeze_scene(preset, physics))
-    close(world, 0.5e-3)
+    close_sensors(world, 0.5e-3)
     begin = world.snapshot()
     centre = world.truth()
     pose = world.pose("upper")
@@ -247,11 +247,11 @@ def reposition(preset: str, physics: str, repeat: int) -> list[Measurement]:
     ]  # fmt: skip
 
 
-ROUGH = {"draft": (2e-3, 3e-3), "standard": (3e-3,)}  # squeezes whose prints are judged [m]
+ROUGH = {"draft": (2e-3, 3e-3), "standard": (3e-3,)}  # squeezes whose prints are measured [m]
 
 
 def roughness(preset: str, repeat: int) -> list[Measurement]:
-    """What the sampling of the cube prints on the lower gel, above its local form (benchmarks/truth/roughness.py)."""
+    """Roughness that the sampling of the cube prints on the lower gel (benchmarks/truth/roughness.py)."""
     samplings: tuple[Literal["lattice", "random"], ...] = ("lattice", "random")
     return [_rough_row(preset, sampling, by, repeat) for sampling in samplings for by in ROUGH[preset]]
 
@@ -265,7 +265,7 @@ def _rough_row(preset: str, sampling: Literal["lattice", "random"], by: float, r
 
     def run() -> MoveStats:
         world.restore(begin)
-        return close(world, by)
+        return close_sensors(world, by)
 
     timing, stats = timed(run, 1, warm=lambda: None)  # seconds are compared in `squeeze`
     error = print_roughness(world.surface("lower"))
@@ -275,7 +275,7 @@ def _rough_row(preset: str, sampling: Literal["lattice", "random"], by: float, r
     )  # fmt: skip
 
 
-ASLANT = (0.6e-3, 0.0, -0.4e-3)  # of the upper sensor; the lower one goes the other way [m]
+OBLIQUE_DISPLACEMENT = (0.6e-3, 0.0, -0.4e-3)  # of the upper sensor; the lower one moves by its negative [m]
 KNEADED = {
     "clay": BodyMaterial(youngs_modulus=0.5e6, poisson_ratio=0.45, yield_stress=20e3),
     "elastic": BodyMaterial(youngs_modulus=0.5e6),
@@ -283,27 +283,30 @@ KNEADED = {
 
 
 def closed_aslant(preset: Preset, repeat: int) -> list[Measurement]:
-    """A cube of 6 x 6 x 5 mm that is closed on and sheared in one motion from touch: the force along the gels."""
+    """A cube of 6 x 6 x 5 mm, compressed and sheared in one motion from first contact: the force along the gels."""
     rows = []
     for name, material in KNEADED.items():
-        timing, (found, stats) = timed(partial(_aslant, preset, material), 1, warm=lambda: None)
-        truth, _ = _aslant(preset, material, mach=0.002, tolerance=1e-3, max_substeps=2000)
+        timing, (found, stats) = timed(partial(_close_obliquely, preset, material), 1, warm=lambda: None)
+        truth, _ = _close_obliquely(preset, material, mach=0.002, tolerance=1e-3, max_substeps=2000)
         figures, note = {"found_n": found, "truth_n": truth}, "" if stats.settled else "not settled"
         error = abs(found / truth - 1) * 100
         rows.append(Measurement(timing, error, "%", "the same mesh at Mach 0.002", name, stats.substeps, figures, note))
     return rows
 
 
-def _aslant(preset: Preset, material: BodyMaterial, **settling: float) -> tuple[float, MoveStats]:
+def _close_obliquely(preset: Preset, material: BodyMaterial, **settling: float) -> tuple[float, MoveStats]:
     body = Body(geometry=Box(size=(6e-3, 6e-3, 5e-3)), material=material)
     friction = {"lower": 0.4, "upper": 0.4}
     world = make_world(Scene(body=body, preset=preset, friction=friction, settling=Settling(**settling)))
     truth = world.truth()
     assert truth is not None
-    close(world, float(world.pose("upper").position[2]) - truth.height)
-    ways = {"upper": np.array(ASLANT), "lower": -np.array(ASLANT)}
+    close_sensors(world, float(world.pose("upper").position[2]) - truth.height)
+    displacements = {"upper": np.array(OBLIQUE_DISPLACEMENT), "lower": -np.array(OBLIQUE_DISPLACEMENT)}
     stats = world.move(
-        {name: Pose(world.pose(name).position + way, world.pose(name).quaternion) for name, way in ways.items()}
+        {
+            name: Pose(world.pose(name).position + displacement, world.pose(name).quaternion)
+            for name, displacement in displacements.items()
+        }
     )
     return float(np.hypot(*world.wrench("upper")[:2])), stats
 
@@ -325,7 +328,7 @@ def _cases(physics: str, method: str) -> tuple[Case, ...]:
             PRESETS[preset] if physics == "hybrid" else SEED_DRAFT,
             partial(run, preset, physics),
             baseline,
-            # its truth takes minutes, once
+            # its truth takes minutes the first time
             long=preset == "standard" or (run is settled_squeeze and method == "tacsim"),
         )
         for preset, run, baseline in (
@@ -341,7 +344,7 @@ def _cases(physics: str, method: str) -> tuple[Case, ...]:
             ("standard", settled_squeeze, False),
             ("standard", reposition, False),
         )
-        # the seed's scheme at `standard` takes many minutes, and `learn` is not for comparisons
+        # the scheme of seed at `standard` takes many minutes, and `learn` is not used for comparisons
         if method == "tacsim" or preset == "draft"
     )
 

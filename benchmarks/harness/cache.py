@@ -1,4 +1,4 @@
-"""Numbers that are long to compute and belong to one version of the physics: kept in the user's cache folder."""
+"""Cache of numbers that take long to compute and belong to one version of the physics, in the user's cache folder."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from pathlib import Path
 
 
 def cached(name: str, question: str, compute: Callable[[], list[float]]) -> list[float]:
-    """What `compute` gave when `question` was last asked of this version of the physics, else what it gives now.
+    """The cached result of `compute` for `question` and this version of the physics, or a new result.
 
-    A cache that cannot be read or written is no error: the numbers are then computed each time.
+    If the cache cannot be read or written, the numbers are computed each time.
     """
     path = folder() / f"{name}-{_key(question)}.json"
     try:
-        kept = json.loads(path.read_text(encoding="utf-8"))
-        if isinstance(kept, list) and kept and all(isinstance(value, float) for value in kept):
-            return kept
+        stored = json.loads(path.read_text(encoding="utf-8"))
+        if isinstance(stored, list) and stored and all(isinstance(value, float) for value in stored):
+            return stored
     except (OSError, ValueError):
         pass
     numbers = compute()
@@ -44,7 +44,7 @@ def folder() -> Path:
 
 
 def fingerprint(*packages: str) -> str:
-    """Changes with every source file of the packages, by name and content."""
+    """Hash of the names and contents of all source files of the packages."""
     digest = hashlib.sha256()
     for package in packages:
         (folder,) = import_module(package).__path__

@@ -16,12 +16,12 @@ from benchmarks.harness.cache import fingerprint
 from benchmarks.harness.schema import Device, Group, Machine, Metadata
 from robot.common.realtime import is_realtime_allowed
 
-PACKAGES = ("tacsim", "taichi", "numpy", "scipy")  # whose versions are told
+PACKAGES = ("tacsim", "taichi", "numpy", "scipy")  # whose versions are recorded
 CODE = ("tacsim", "robot", "calibration")
 
 
 class Run:
-    """Taken when a run begins; `metadata` when it has ended."""
+    """Data of a run. Make it when the run begins; call `metadata` when it has ended."""
 
     def __init__(self) -> None:
         self._began, self._load = time.perf_counter(), _load()
@@ -86,12 +86,12 @@ def _machine(load_before: list[float] | None) -> Machine:
 
 
 def backend() -> str:
-    """Where the processes of cases compute. As tacsim.compute.runtime reads it, which would import Taichi."""
+    """The device of the processes of cases, as read by tacsim.compute.runtime, without importing Taichi."""
     return os.environ.get("TACSIM_DEVICE") or "cpu"
 
 
 def _device() -> Device | None:
-    """The GPU that cases compute on, None for the CPU; its name as far as a tool tells it."""
+    """The GPU on which cases compute, or None for the CPU; its name if a tool reports it."""
     if backend() == "cpu":
         return None
     if backend() == "cuda":
@@ -99,13 +99,13 @@ def _device() -> Device | None:
             name, memory, driver = _nvidia()
         except (OSError, subprocess.SubprocessError, ValueError, IndexError):
             return Device(backend="cuda")
-        size = round(int(memory) * 2**20 / 1e9, 1) if memory.isdecimal() else None  # None: it shares the host's
+        size = round(int(memory) * 2**20 / 1e9, 1) if memory.isdecimal() else None  # None: shared with the host
         return Device(backend="cuda", name=name, memory_gb=size, driver=driver)
     return Device(backend=backend())
 
 
 def _nvidia() -> list[str]:
-    """Name, memory [MiB] and driver of the first GPU that may be seen, which Taichi takes."""
+    """Name, memory [MiB] and driver of the first visible GPU, which Taichi uses."""
     visible = os.environ.get("CUDA_VISIBLE_DEVICES", "").partition(",")[0]
     words = ["nvidia-smi", "--query-gpu=name,memory.total,driver_version", "--format=csv,noheader,nounits"]
     words += [f"--id={visible}"] if visible else []
@@ -123,7 +123,7 @@ def _cpu() -> str:
 
 
 def _commit() -> tuple[str | None, bool | None]:
-    """Commit of the checkout this file lies in, and whether it has changes; None for an installed package."""
+    """Commit of the checkout of this file, and whether it has changes; None for an installed package."""
     root = Path(__file__).resolve().parents[2]
     if not (root / ".git").exists():
         return None, None

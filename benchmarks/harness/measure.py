@@ -12,9 +12,9 @@ from typing import TypeVar
 import numpy as np
 
 T = TypeVar("T")
-BUDGET = 1.0  # [s] no further repetition once the timed ones took this long ...
-MIN_REPETITIONS = 3  # ... but so many, which a spread needs, ...
-LONG_REPETITION = 5.0  # [s] ... unless one takes so long
+BUDGET = 1.0  # [s] total time of the repetitions, after which there is no other ...
+MIN_REPETITIONS = 3  # ... except that a spread needs this number, ...
+LONG_REPETITION = 5.0  # [s] ... unless one repetition takes this time
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +39,7 @@ class Timing:
 
 @dataclass(frozen=True, slots=True)
 class Measurement:
-    """What a case found: a row of the report without the names of the case."""
+    """Result of a case: a row of the report without the names of the case."""
 
     timing: Timing
     error: float
@@ -52,9 +52,9 @@ class Measurement:
 
 
 def timed(run: Callable[[], T], repeat: int, warm: Callable[[], object] | None = None) -> tuple[Timing, T]:
-    """Times `run` up to `repeat` times, and at least once; returns the times and what the last run gave.
+    """Times `run` up to `repeat` times, and at least once; returns the times and the result of the last run.
 
-    `warm` (`run` itself by default) goes first, untimed: it compiles kernels or loads them from their cache.
+    warm: runs first, without timing, to compile kernels or load them from their cache; default: `run` itself.
     """
     (run if warm is None else warm)()
     samples: list[float] = []
@@ -68,7 +68,7 @@ def timed(run: Callable[[], T], repeat: int, warm: Callable[[], object] | None =
 
 
 def once(run: Callable[[], T]) -> tuple[Timing, T]:
-    """What a single `run` takes, with kernels that may have to be loaded first."""
+    """The time of a single `run`, which may include loading kernels, and its result."""
     wall, cpu = time.perf_counter(), time.process_time()
     result = run()
     return Timing((time.perf_counter() - wall,), time.process_time() - cpu), result
@@ -79,22 +79,22 @@ def _worth_another(samples: Sequence[float]) -> bool:
 
 
 def step_cost(timing: Timing, substeps: int, count: int, what: str) -> dict[str, float]:
-    """Time of a substep [ns] over the number of particles or elements; all else that a substep does is in it."""
+    """Time of a substep [ns] divided by the number of particles or elements; it includes all parts of a substep."""
     each = 1e9 / (substeps * count)
     return {f"wall_per_{what}_substep_ns": timing.median * each, f"cpu_per_{what}_substep_ns": timing.processor * each}
 
 
-def forget_peak_memory() -> None:
-    """Lets `peak_memory` count from what this process holds now. Only Linux can; elsewhere it counts on."""
+def reset_peak_memory() -> None:
+    """Resets `peak_memory` to the present memory of this process. Has no effect on systems other than Linux."""
     references = Path("/proc/self/clear_refs")
     if references.exists():
         references.write_text("5", encoding="ascii")  # proc_pid_clear_refs(5): resets the peak resident set size
 
 
 def peak_memory() -> float:
-    """The most memory this process has held [MB].
+    """The largest memory of this process so far [MB].
 
-    On Linux from /proc: getrusage counts what the parent process held when it started this one.
+    On Linux from /proc, because getrusage includes the memory of the parent process at the start of this one.
     """
     status = Path("/proc/self/status")
     if status.exists():

@@ -1,7 +1,7 @@
-"""Runs cases one after the other, in processes apart from this one, and collects the report.
+"""Runs cases one after the other in separate processes, and collects the report.
 
-Cases that share a process count memory from their own start, with what the kernels before them left behind. A process
-that dies costs one case: those after it go on in a new one.
+The memory of a case that shares a process includes what the kernels of earlier cases still hold. If a process dies, one
+case fails, and the following cases run in a new process.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from benchmarks.harness.machine import Run
-from benchmarks.harness.measure import Measurement, forget_peak_memory, peak_memory
+from benchmarks.harness.measure import Measurement, peak_memory, reset_peak_memory
 from benchmarks.harness.schema import Failure, Group, Missing, Report, Row
 from robot.common.process import end_with_parent, without_working_folder
 
-EXIT = 10.0  # [s] a process may take to end after its last word
+EXIT_TIMEOUT = 10.0  # [s] for a process to end after its last message
 
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """One case, by one method at one resolution. `measure` must be importable by name (or a partial of such)."""
+    """One case, by one method at one resolution. `measure` is a function of a module, or a partial of one."""
 
     group: Group
     name: str
@@ -33,24 +33,24 @@ class Case:
     resolution: str
     measure: Callable[[int], list[Measurement]]  # repetitions -> rows
     baseline: bool = False  # only with --baselines: a method that is not ours
-    long: bool = False  # only with --long: ours, but more than some seconds
-    cpu: bool = False  # ours, but in NumPy or by kernels of the CPU alone
-    missing: str = ""  # why it cannot be measured here: what the user's folder lacks
+    long: bool = False  # only with --long: ours, but takes many seconds
+    cpu: bool = False  # ours, but in NumPy or with kernels for the CPU only
+    missing: str = ""  # reason why it cannot be measured: what the user's folder lacks
 
     @property
     def short(self) -> bool:
-        """Whether it needs neither --baselines nor --long."""
+        """True if it needs neither --baselines nor --long."""
         return not (self.baseline or self.long)
 
     @property
     def needs_cpu(self) -> bool:
-        """Whether it says nothing of a device. Other methods are written for the CPU, or in NumPy."""
+        """True if it cannot measure a device. Other methods are written for the CPU, or in NumPy."""
         return self.cpu or self.method != "tacsim"
 
 
-def missing_case(name: str, why: str, resolution: str = "") -> Case:
-    """A case of ours with real frames that cannot be measured here, and why."""
-    return Case("real", name, "tacsim", resolution, _raise_missing, missing=why)
+def missing_case(name: str, reason: str, resolution: str = "") -> Case:
+    """A case with real frames that cannot be measured, and the reason."""
+    return Case("real", name, "tacsim", resolution, _raise_missing, missing=reason)
 
 
 def _raise_missing(repeat: int) -> list[Measurement]:
@@ -73,7 +73,7 @@ def run_cases(
     measurable = [case for case in cases if not case.missing]
     for together in _by_process(measurable):
         started = time.perf_counter()
-        for case, found in _run(together, repeat, on_start, stop):
+        for case, found in _run_in_process(together, repeat, on_start, stop):
             if isinstance(found, str):
                 failures.append(Failure(**_names(case), cause=found))
             else:
@@ -97,8 +97,8 @@ def _names(case: Case) -> dict[str, Any]:
 
 
 def _by_process(cases: Sequence[Case]) -> list[list[Case]]:
-    """Our own short cases of a group share a process, since loading the kernels takes longer than most of them run;
-    another method gets one of its own, and so does every long case."""
+    """Our short cases of a group share a process, because loading the kernels takes longer than most of them; other
+    methods and long cases have their own."""
     parts: dict[object, list[Case]] = {}
     for case in cases:
         parts.setdefault(case.group if case.short else case, []).append(case)
@@ -106,42 +106,42 @@ def _by_process(cases: Sequence[Case]) -> list[list[Case]]:
 
 
 class _Worker:
-    """A process that runs cases in turn. When it dies, the next is started for those that are left."""
+    """A process that runs cases in turn. If it dies, another one is started for the remaining cases."""
 
     def __init__(self, cases: Sequence[Case], repeat: int) -> None:
         context = multiprocessing.get_context("spawn")  # Taichi does not survive a fork
-        self._here, there = context.Pipe(duplex=False)
-        self._process = context.Process(target=_work, args=(list(cases), repeat, there), daemon=True)
+        self._receiver, sender = context.Pipe(duplex=False)
+        self._process = context.Process(target=_run_worker, args=(list(cases), repeat, sender), daemon=True)
         with without_working_folder():
             self._process.start()
-        there.close()
+        sender.close()
 
     def next(self, stop: Callable[[], bool]) -> list[Row] | str | None:
-        """Rows of the next case, or what went wrong in words; None when the process has died."""
+        """Rows of the next case, or its error as text; None if the process has died."""
         try:
-            while not self._here.poll(0.1):
+            while not self._receiver.poll(0.1):
                 if stop():
                     return NOT_MEASURED
-            found: list[Row] | str = self._here.recv()
+            found: list[Row] | str = self._receiver.recv()
             return found
         except EOFError:
-            self._process.join(EXIT)
-            return NOT_MEASURED if stop() else None  # the signal was for all processes
+            self._process.join(EXIT_TIMEOUT)
+            return NOT_MEASURED if stop() else None  # the signal reached all processes
 
     @property
     def exit_code(self) -> int | None:
         return self._process.exitcode
 
     def close(self) -> None:
-        self._process.kill()  # nothing happens to one that is over
+        self._process.kill()  # without effect on a process that has ended
         self._process.join()
-        self._here.close()
+        self._receiver.close()
 
 
-def _run(
+def _run_in_process(
     cases: Sequence[Case], repeat: int, on_start: Callable[[Case], None], stop: Callable[[], bool]
 ) -> Iterator[tuple[Case, list[Row] | str]]:
-    """What each case came to, all in one process as long as it lives."""
+    """Result of each case; all run in one process until it dies."""
     worker: _Worker | None = None
     try:
         for index, case in enumerate(cases):
@@ -162,17 +162,17 @@ def _run(
             worker.close()
 
 
-def _work(cases: Sequence[Case], repeat: int, report: Connection) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the first one ends the others
+def _run_worker(cases: Sequence[Case], repeat: int, report: Connection) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the main process ends the others
     parent = multiprocessing.parent_process()
     assert parent is not None and parent.pid is not None
     end_with_parent(parent.pid)
     for case in cases:
         gc.collect()
-        forget_peak_memory()
+        reset_peak_memory()
         try:
             report.send(measure(case, repeat))
-        except Exception as error:  # whatever it is, the other cases go on, and the report names it
+        except Exception as error:  # the report names the error, and the other cases continue
             report.send(f"{type(error).__name__}: {error}")
     report.close()
 

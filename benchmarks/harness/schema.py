@@ -1,4 +1,4 @@
-"""What a benchmark says: rows with time, error and memory from one run, and the machine they were measured on."""
+"""Report of benchmarks: rows with time, error and memory from one run, and the machine of the measurement."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, get_args
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
 Group = Literal["press", "squeeze", "materials", "scenes", "oracles", "real", "robot"]
-GROUPS: tuple[Group, ...] = get_args(Group)  # real needs frames that are not shipped; robot is asked for by name
+GROUPS: tuple[Group, ...] = get_args(Group)  # real needs frames that are not shipped; robot must be named
 
 NotNegative = Annotated[FiniteFloat, Field(ge=0)]
 
@@ -23,23 +23,23 @@ class Row(_Frozen):
     group: Group
     case: str
     variant: str = ""  # of the case: a depth, a material
-    method: str  # tacsim; or what it is compared with: seed, textbook, tacchi-settings, layer
+    method: str  # tacsim, or a method for comparison: seed, textbook, tacchi-settings, layer
     resolution: str
-    seconds: NotNegative  # median of the timed repetitions; compiling is not in it
+    seconds: NotNegative  # median of the timed repetitions, without compiling
     spread: NotNegative | None  # interquartile range of the same [s]; None with fewer than three repetitions
-    cpu_seconds: NotNegative  # median processor time, all threads together: what a busy machine leaves unchanged
+    cpu_seconds: NotNegative  # median processor time of all threads; it does not depend on other load
     repeats: Annotated[int, Field(ge=1)]
     error: NotNegative
     error_unit: str
-    against: str  # what the error is measured against
+    against: str  # reference of the error
     peak_mb: Annotated[FiniteFloat, Field(gt=0)]  # of the process that measured this case alone [MB]
     substeps: Annotated[int, Field(ge=0)] | None = None
-    figures: dict[str, FiniteFloat] = {}  # further numbers of the same run, the unit at the end of each name
+    figures: dict[str, FiniteFloat] = {}  # other numbers of the same run, with the unit at the end of each name
     note: str = ""
 
 
 class Failure(_Frozen):
-    """A case that gave no row."""
+    """A case without a row."""
 
     group: Group
     case: str
@@ -49,11 +49,11 @@ class Failure(_Frozen):
 
 
 class Missing(Failure):
-    """A case that could not be measured with what there was, and where that was looked for; not a failure."""
+    """A case that could not be measured with the available data, and the searched folder; not a failure."""
 
 
 class Device(_Frozen):
-    """The GPU that kernels ran on. None: could not be found out."""
+    """The GPU on which kernels ran. None: not known."""
 
     backend: str  # of Taichi: cuda, vulkan, metal
     name: str | None = None
@@ -66,7 +66,7 @@ class Device(_Frozen):
 
 
 class Machine(_Frozen):
-    """Where it was measured. The load averages tell how much else went on."""
+    """The machine of the measurement. The load averages show the load by other programs."""
 
     cpu: str
     cores: Annotated[int, Field(ge=1)]
@@ -80,21 +80,21 @@ class Machine(_Frozen):
 
 class Metadata(_Frozen):
     date: datetime
-    commit: str | None  # of the checkout when the run began; None without one
+    commit: str | None  # of the checkout at the start of the run; None without one
     modified: bool | None  # the checkout had changes that were not committed
-    changed: bool  # the code changed while the run went on: its rows are not all of one version
+    changed: bool  # the code changed during the run: its rows are not all of one version
     versions: dict[str, str]  # Python and packages
     machine: Machine
     groups: list[Group]
     baselines: bool
-    long: bool = False  # long rows of ours were measured too
+    long: bool = False  # our long rows were measured too
     repeat: Annotated[int, Field(ge=1)]
     seconds: NotNegative  # the whole run
-    group_seconds: dict[Group, NotNegative] = {}  # each group's short cases of ours: what it takes without options
+    group_seconds: dict[Group, NotNegative] = {}  # of our short cases of each group: its time without options
 
 
 class Report(_Frozen):
-    """What `tacsim bench --json FILE` writes."""
+    """The content of the file of `tacsim bench --json FILE`."""
 
     schema_version: Literal[1] = 1
     metadata: Metadata

@@ -1,4 +1,4 @@
-"""Ours beside solvers that share nothing with it, a line a case and a column a resolution."""
+"""Our results next to those of independent solvers, a line for each case and a column for each resolution."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ UNITS = {"n": "N", "mm": "mm", "nmm": "N mm", "ratio": ""}  # of figures found_.
 
 
 def lines(rows: Sequence[Row]) -> tuple[list[str], list[list[str]]]:
-    """Header and lines: case, oracle, and at each resolution what we find and how far that is off."""
+    """Header and lines: case, oracle, and for each resolution our result and its error."""
     resolutions = list(dict.fromkeys(row.resolution for row in rows))
     by_case: dict[str, dict[str, Row]] = {}
     for row in rows:
         by_case.setdefault(row.variant, {})[row.resolution] = row
-    shown = [
+    cells = [
         [case, _truth(next(iter(found.values()))), *(_found(found.get(each)) for each in resolutions)]
         for case, found in by_case.items()
     ]
-    return ["case", "oracle", *resolutions], shown
+    return ["case", "oracle", *resolutions], cells
 
 
 def _values(row: Row) -> tuple[float, float, str]:

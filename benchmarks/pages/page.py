@@ -13,50 +13,50 @@ from benchmarks.pages.picture import PICTURE, RADII, draw, draw_radii
 GROUP_WORDS = {
     "press": "Press: a rigid indenter on one gel",
     "squeeze": "Squeeze: plasticine between two gels",
-    "materials": "Materials: laws, elements, transfers, and what a substep costs",
-    "scenes": "Scenes: cost by what is in them",
-    "oracles": "Oracles: ours beside solvers that share nothing with it",
-    "real": "Real: frames of real sensors, and what they cost",
+    "materials": "Materials: laws, elements, transfers, and the cost of a substep",
+    "scenes": "Scenes: cost by their content",
+    "oracles": "Oracles: our results next to those of independent solvers",
+    "real": "Real: frames of real sensors, and their cost",
 }
 COLUMNS = ("case", "method", "resolution", "seconds", "CPU s", "error", "MB", "substeps")
 
 FIGURES = (
-    "What the project must reach and aims for, from the rows below: worst row of its kind, ratios within this run. "
+    "Requirements and aims of the project, from the rows below: the worst row of each kind, ratios within this run. "
     "*missed* is beyond *must*; *not measured* means that this run has no such row."
 )
 READING = (
-    "- **A row** is one thing by one method at one resolution. `tacsim` is ours; `seed`, `textbook`, `tacchi-settings` "
-    "and `layer` are what it is compared with. The error belongs to the same run as the seconds: a fast row with a "
-    "large error is not fast.\n"
+    "- **A row** is one measurement by one method at one resolution. `tacsim` is ours; `seed`, `textbook`, "
+    "`tacchi-settings` and `layer` are methods for comparison. The error belongs to the same run as the seconds: a "
+    "fast row with a large error is not fast.\n"
     "- **Time.** Compare seconds within this page only. On a busy machine compare CPU s, or ratios; rows of one case "
     "ran one after the other.\n"
-    "- **Error** is against what stands under each table: a closed form, a limit of fine meshes, a symmetry, or the "
-    "same mesh driven so slowly that speed plays no part.\n"
-    "- **Rerun** one group with `tacsim bench squeeze --json squeeze.json`; the last of the figures says how long "
-    "that takes (slow limits are kept for the next time). Other methods need `--baselines`, our own long rows (fine "
+    "- **Error** is relative to the reference under each table: a closed form, a limit of fine meshes, a symmetry, or "
+    "the same mesh at a speed without influence.\n"
+    "- **Rerun** one group with `tacsim bench squeeze --json squeeze.json`; the last of the figures gives its "
+    "time (slow limits are cached). Other methods need `--baselines`, our own long rows (fine "
     "meshes, `standard` squeezes, the incline, 100,000 substeps of rest; of real presses punches, invariance and all "
     "but the first set of balls) `--long`; both take "
     "many minutes. This page: `tacsim bench all --baselines --long --json benchmarks/reference.json`, then "
     "`tacsim bench --from benchmarks/reference.json --docs docs`, with `--from "
-    "benchmarks/gpu/report.json` too where there is one. That is of a GPU: `make test-gpu` measures it and "
+    "benchmarks/gpu/report.json` too if it exists. That is the report of a GPU: `make test-gpu` measures it and "
     "writes the page.\n"
     "- **Real frames** are not shipped. `tacsim bench real --data DIR` finds those of the public set named in "
     "`benchmarks/references/presses.yaml` by their names anywhere below DIR; a `presses.yaml` in DIR itself describes "
     "other presses, on any sensor. With `all`, `--data DIR` adds the group to the rest. Rows ending in `image` compare "
     "the circle in the real frame with that in our picture, found by the same fit; rows ending in `pressure` compare "
-    "our contact itself with the radius in the labels. Films of dotted gels under a press are found alike, by "
-    "`films.yaml`: the share of their dots that is followed to the end, how still the dots lie at rest, and the time "
+    "our contact itself with the radius in the labels. Films of dotted gels under a press are found in the same way, "
+    "by `films.yaml`: the share of their dots that is tracked to the end, the jitter of the dots at rest, and the time "
     "of a frame. Presses of a ball are described by `balls.yaml`; `light` in `presses.yaml` names those by which the "
-    "sensor of the known depths is calibrated. *null* beside an error is what no contact at all would score. What "
-    "the folder lacks stands under *Not measured*."
+    "sensor of the known depths is calibrated. *null* next to an error is the error without contact. "
+    "*Not measured* lists the frames that the folder lacks."
 )
 
 
 ON_DEVICE = (
-    "Kernels ran on the device; images are drawn by the processor there too, and MB is the process's own memory. "
-    "*CPU / GPU* is seconds of the same row in the tables above over seconds here: two runs, perhaps on two machines."
+    "Kernels ran on the device; the processor renders the images, and MB is the memory of the process. "
+    "*CPU / GPU* is seconds of the same row in the tables above over seconds here: two runs, possibly on two machines."
 )
-NO_DEVICE = "No GPU has been measured yet: where there is CUDA, `make test-gpu` measures it and adds it to this page."
+NO_DEVICE = "No GPU has been measured yet: with CUDA, `make test-gpu` measures it and adds it to this page."
 
 
 def cells(row: Row) -> list[str]:
@@ -74,7 +74,7 @@ def cells(row: Row) -> list[str]:
 
 
 def costs(row: Row) -> list[str]:
-    """The costs of a substep for each particle or element, as text."""
+    """The cost of a substep for each particle or element, as text."""
     found = []
     for name, value in row.figures.items():
         kind, per, rest = name.partition("_per_")
@@ -98,7 +98,7 @@ def write_page(report: Report, folder: Path, devices: Sequence[Report] = ()) -> 
 
 
 def markdown(report: Report, devices: Sequence[Report] = ()) -> str:
-    """The page of a report of the CPU, and of some of devices. The same reports give the same text."""
+    """The page of a report of the CPU and of reports of devices. The same reports give the same text."""
     parts = [
         "# Benchmarks",
         "Written by `tacsim bench --from FILE --docs docs`; do not edit. Every row is time, error and memory of one "
@@ -116,8 +116,8 @@ def markdown(report: Report, devices: Sequence[Report] = ()) -> str:
     for group, words in GROUP_WORDS.items():
         rows = [row for row in report.results if row.group == group]
         if rows:
-            shown = table(*oracles.lines(rows)) if group == "oracles" else table(COLUMNS, map(cells, rows))
-            parts += [f"## {words}", shown, *_remarks(rows)]
+            text = table(*oracles.lines(rows)) if group == "oracles" else table(COLUMNS, map(cells, rows))
+            parts += [f"## {words}", text, *_remarks(rows)]
         if group == "real" and rows:
             parts.append(f"![Contact radius against depth: real, ours, and simpler theories](images/{RADII})")
     if report.failures:
@@ -135,7 +135,7 @@ def markdown(report: Report, devices: Sequence[Report] = ()) -> str:
 
 
 def slowest_group(report: Report) -> list[str]:
-    """The figure that no row has: what `tacsim bench GROUP` takes, as a line of the table."""
+    """The time of `tacsim bench GROUP`, which is in no row, as a line of the table."""
     seconds = report.metadata.group_seconds
     name = "a group without `--baselines` and `--long`"
     if seconds:
@@ -158,8 +158,8 @@ def _on_device(title: str, reports: Sequence[Report], cpu: Report) -> list[str]:
         if rows:
             lines = ([*cells(row), ratio(row)] for row in rows)
             parts += [f"### {words}", table((*COLUMNS, "CPU / GPU"), lines), *_remarks(rows)]
-    lost = [_failures(report) for report in reports if report.failures]
-    parts += ["### Failed there", *lost] if lost else []
+    failed = [_failures(report) for report in reports if report.failures]
+    parts += ["### Failed there", *failed] if failed else []
     missing = [lack for report in reports for lack in report.missing]
     for cause in dict.fromkeys(lack.cause for lack in missing):
         cases = dict.fromkeys(f"{lack.case}, {lack.method}" for lack in missing if lack.cause == cause)
@@ -173,7 +173,7 @@ def _title(report: Report) -> str:
 
 
 def _identity(row: Row) -> tuple[str, ...]:
-    """What the rows of two runs have in common when they measure the same."""
+    """The key that identifies the same measurement in two runs."""
     return row.group, row.case, row.variant, row.method, row.resolution
 
 
@@ -182,7 +182,7 @@ def _failures(report: Report) -> str:
 
 
 def setting(report: Report) -> str:
-    """Machine, load, date, commit and versions of a run, in a sentence or two."""
+    """Machine, load, date, commit and versions of a run, as text."""
     config = report.metadata
     machine = config.machine
     loads = [load for load in (machine.load_before, machine.load_after) if load is not None]
@@ -194,8 +194,8 @@ def setting(report: Report) -> str:
     if config.changed:
         commit += ", **and the code changed while this ran**: not all rows are of one version"
     return (
-        f"{_hardware(machine)}; {load} (others worked on the machine if it is above the number of cores; compare CPU s "
-        f"then). {config.date:%Y-%m-%d}, {commit}; {versions}."
+        f"{_hardware(machine)}; {load} (if it is above the number of cores, other programs used the machine; then "
+        f"compare CPU s). {config.date:%Y-%m-%d}, {commit}; {versions}."
     )
 
 
@@ -206,11 +206,11 @@ def _hardware(machine: Machine) -> str:
         return host
     memory = f", {device.memory_gb:g} GB" if device.memory_gb is not None else ""
     driver = f", driver {device.driver}" if device.driver is not None else ""
-    return f"{device.title} ({device.backend}{memory}{driver}) beside {host}"
+    return f"{device.title} ({device.backend}{memory}{driver}) next to {host}"
 
 
 def _remarks(rows: Sequence[Row]) -> list[str]:
-    """What each case is, what its error is measured against, notes, costs of substeps."""
+    """Description of each case, reference of its error, notes, and cost of its substeps."""
     lines = []
     for case, method in dict.fromkeys((row.case, row.method) for row in rows):
         same = [row for row in rows if (row.case, row.method) == (case, method)]

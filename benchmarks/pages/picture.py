@@ -10,7 +10,7 @@ from benchmarks.harness.schema import Row
 
 PICTURE = "speed_vs_error.png"
 RADII = "contact_radius.png"
-# what is drawn: case, variant ("" for any), title, unit of the error
+# of each panel: case, variant ("" for any), title, unit of the error
 PANELS = (
     ("sphere_press", "", "Ball R 4 mm, 1 mm deep", "error of the surface [µm rms]"),
     ("settled_squeeze", "", "3 mm squeeze, settled", "force against one slow limit, of standard [%]"),
@@ -31,19 +31,19 @@ DOTS = (
 
 
 def draw(rows: Sequence[Row], path: Path) -> None:
-    """Time against error on logarithmic axes, a panel a case, a colour a method; lower left is better.
+    """Time against error on logarithmic axes, a panel for each case, a colour for each method; lower left is better.
 
     Raises OSError.
     """
     from tacsim.report.figure import new_figure, save_figure, style_axes
 
     panels = [(panel, _points(rows, *panel[:2])) for panel in PANELS]
-    shown = [(panel, points) for panel, points in panels if points] or [(PANELS[0], [])]
-    methods = list(dict.fromkeys(row.method for _, points in shown for row in points))
-    figure = new_figure(4.6 * len(shown), 3.8)
+    drawn = [(panel, points) for panel, points in panels if points] or [(PANELS[0], [])]
+    methods = list(dict.fromkeys(row.method for _, points in drawn for row in points))
+    figure = new_figure(4.6 * len(drawn), 3.8)
     figure.set_layout_engine("constrained")
-    for index, ((_, _, title, unit), points) in enumerate(shown):
-        axes = style_axes(figure.add_subplot(1, len(shown), index + 1), title, "seconds (wall)", unit)
+    for index, ((_, _, title, unit), points) in enumerate(drawn):
+        axes = style_axes(figure.add_subplot(1, len(drawn), index + 1), title, "seconds (wall)", unit)
         axes.set(xscale="log", yscale="log")
         if not points:
             continue
@@ -63,17 +63,17 @@ def draw(rows: Sequence[Row], path: Path) -> None:
 
 
 def _close_above(place: Sequence[float], other: Sequence[float]) -> bool:
-    """Whether words between two places in a panel, from 0 to 1 across it, would lie on one another."""
+    """True if labels at two places in a panel, from 0 to 1 across it, would overlap."""
     return abs(other[0] - place[0]) < 0.3 and 0.0 < other[1] - place[1] < 0.2
 
 
 def _decades(values: Sequence[float]) -> tuple[float, float]:
-    """Whole powers of ten round `values`, so that each axis has at least two numbers on it."""
+    """Powers of ten around `values`, so that each axis has at least two labels."""
     return 10.0 ** math.floor(math.log10(min(values) / 1.2)), 10.0 ** math.ceil(math.log10(max(values) * 1.2))
 
 
 def _points(rows: Iterable[Row], case: str, variant: str) -> list[Row]:
-    """A logarithmic axis shows no zero: such a row is left to the table."""
+    """The rows of a panel, without zeros, which a logarithmic axis cannot show."""
     return [
         row for row in rows
         if row.case == case and (not variant or row.variant == variant) and row.error > 0 and row.seconds > 0
@@ -81,7 +81,7 @@ def _points(rows: Iterable[Row], case: str, variant: str) -> list[Row]:
 
 
 def draw_radii(rows: Sequence[Row], path: Path) -> bool:
-    """Contact radius against depth, a panel a ball, of the first gel in `rows`. False, and no file, without such rows.
+    """Contact radius against depth, a panel for each ball, of the first gel in `rows`. Returns False without such rows.
 
     Raises OSError.
     """
@@ -105,10 +105,10 @@ def draw_radii(rows: Sequence[Row], path: Path) -> bool:
             depth, radius = _against_depth(here, name)
             if depth:
                 axes.plot(depth, radius, marker, color=colour, label=label, markerfacecolor="none", markersize=8)
-        doubt = max(row.figures.get("depth_uncertainty_mm", 0.0) for row in here)
-        if doubt > 0:
+        uncertainty = max(row.figures.get("depth_uncertainty_mm", 0.0) for row in here)
+        if uncertainty > 0:
             depth, radius = _against_depth(here, "real_px")
-            axes.errorbar(depth, radius, xerr=doubt, fmt="none", ecolor="k", elinewidth=0.8, capsize=2)
+            axes.errorbar(depth, radius, xerr=uncertainty, fmt="none", ecolor="k", elinewidth=0.8, capsize=2)
         axes.set_xlim(left=0)
         axes.set_ylim(bottom=0)
         if index == 0:

@@ -1,7 +1,7 @@
-"""docs/reliability.md, from a report with rows of the group robot: the figures that tests record of what is promised.
+"""docs/reliability.md, from a report with rows of the group robot: the figures that tests record for each promise.
 
-A test marked `promise(n)` checks promise n; those that take the fixture `figure` (tests/promises.py) also say how late,
-how far, how often. A row of the report is one figure: its case is the promise's name, its variant the figure's.
+A test marked `promise(n)` checks promise n; tests with the fixture `figure` (tests/promises.py) also record delays,
+distances and counts. A row of the report is one figure: its case is the promise's name, its variant the figure's.
 """
 
 from __future__ import annotations
@@ -20,85 +20,93 @@ from benchmarks.pages.page import setting, table
 PAGE = "reliability.md"
 ROOT = Path(__file__).resolve().parents[2]
 HEADER = ("promise", "figure", "measured", "worst", "promised", "verdict")
-EVENT = " · "  # between an event and a column, in the name of a figure that belongs into the table of events
+EVENT = " · "  # between event and column, in the name of a figure in the table of events
 EVENTS = ("event", "still after", "path", "told after", "moved after standstill", "programs left running")
 WATCHED = (
-    "An arm at 0.1 m/s, and what an RTDE client of its own process saw of it: median / worst of {repeat}. The "
-    "driver is a user's program behind a proxy that breaks its lines; they are whole again after 0.1, 1 or 3 s, or at "
-    "once (held ones: never) in turn. *Still after* is the first standstill (below 1 mm/s) after it, *path* what "
-    "was covered until then. The arm is watched for five seconds more: *moved after standstill* is the farthest it "
-    "was from there. *Goes on* is an event that no motion notices. A hung policy is told by nobody: it looks at "
-    "no status."
+    "An arm at 0.1 m/s, measured by an RTDE client in a separate process: median / worst of {repeat}. The driver runs "
+    "in a user's program behind a proxy that breaks its connections; the proxy restores them after 0.1, 1 or 3 s, or "
+    "at once (held ones: never) in turn. *Still after* is the time to the first standstill (below 1 mm/s) after the "
+    "event, *path* the distance until then. The arm is measured for another five seconds: *moved after standstill* is "
+    "its largest distance from that position. *Goes on* is an event that does not affect the motion. A hung policy "
+    "gets no report, because it reads no status."
 )
-COUNT = "count"  # unit of what must not happen even once
+COUNT = "count"  # unit of events that must never happen
 PROMISES: tuple[tuple[str, str], ...] = (  # promise n is the n-th
-    ("Box", "No target leaves the workspace, whatever is asked; an arm without limits does not connect."),
+    ("Box", "No target leaves the workspace, for any command; an arm without limits does not connect."),
     (
         "Speed",
-        "Speed, acceleration and joint steps of what is sent stay within their limits; so do speed and acceleration of "
-        "the measured arm when its controller slows it down, stalls or stops. What is no pose makes it hold.",
+        "Speed, acceleration and joint steps of the sent targets stay within their limits; so do speed and "
+        "acceleration of the measured arm when its controller slows it down, stalls or stops. An invalid pose makes it "
+        "hold.",
     ),
-    ("Force", "Too much force stops the arm in the period of its package."),
-    ("Stale", "A silent link is told and outlived; a frame beyond its age is refused."),
+    ("Force", "A force above the limit stops the arm in the period of its package."),
+    (
+        "Stale",
+        "A silent connection is reported, and the driver survives it; a frame beyond its maximum age is refused.",
+    ),
     (
         "Late policy",
-        "Without a fresh action the arm holds, says so, and goes on from where it is measured. After its last one it "
-        "goes at most speed x (action_timeout + the servo's lag of some 0.04 s).",
+        "Without a new action the arm holds, reports it, and continues from its measured pose. After the last action "
+        "it moves at most speed x (action_timeout + the servo's lag of about 0.04 s).",
     ),
-    ("Death", "A policy or a worker that is killed leaves a standing arm; another worker is there soon."),
+    ("Death", "If a policy or a worker is killed, the arm stops; soon afterwards another worker can start."),
     (
         "Stops",
-        "A stop is told by its kind and its first cause, and so is an arm that does not follow or that another program "
-        "moves; an arm that has come to rest does not move before recover(), "
-        "whatever failed, no program runs on, and no old command comes again.",
+        "A stop is reported with its kind and its first cause, and so is an arm that does not follow or that another "
+        "program moves; after any failure, an arm at rest does not move before recover(), no program continues, and no "
+        "old command is repeated.",
     ),
-    ("One commander", "A second driver is refused, the first goes on."),
-    ("Connecting", "Connecting to nobody ends with its time-out and holds up no other thread."),
+    ("One commander", "A second driver is refused, the first continues."),
+    ("Connecting", "Connecting without a server ends with a time-out and blocks no other thread."),
     ("One instant", "All fields of a state are of one package; a pose is that of the picture's exposure."),
     (
         "Camera",
-        "The newest frame, never an old one as new; back by itself; a source that is not the one described is refused.",
+        "A read returns the newest frame, never an old one as new; a lost camera is opened again; a source that "
+        "differs from the configuration is refused.",
     ),
     ("One contract", "A policy sees the same keys, types, shapes, units and frames on every kind of rig."),
     ("Rate", "500 periods a second, also with two arms."),
-    ("Shutdown", "Closing ends soon, twice does no harm, and nothing is left; an episode survives a kill."),
-    ("Two arms", "They keep apart whoever moves, and both stop when one does."),
+    (
+        "Shutdown",
+        "Closing ends quickly, may be repeated, and leaves no process or file; an episode is readable after a kill.",
+    ),
+    ("Two arms", "They keep their distance if either moves, and both stop when one does."),
 )
 SAFETY = (
-    "**None of this is a safety function.** What guards here is software on an ordinary computer; it protects the work "
+    "**None of this is a safety function.** These checks are software on an ordinary computer; they protect the work "
     "and the sensors, not people. Safety planes, speed and force limits belong into the safety configuration on the "
-    "pendant, and a risk assessment before anything moves. All figures are of mock controllers and mock cameras on "
-    "loopback: the drivers and the wire are the true ones, brakes, cables and the controller's own delays are not. No "
-    "real arm was measured."
+    "pendant, and a risk assessment must precede any motion. All figures are from mock controllers and mock cameras on "
+    "loopback: drivers and protocols are the real ones; brakes, cables and delays of the controller are not. No real "
+    "arm was measured."
 )
 READING = (
-    "- **Measured** is the median of {repeat}, *worst* the worst of them; what must not happen at all is "
-    "summed over all. The verdict is on the median; *met, worst beyond* says that a repetition was not within it.\n"
-    "- **An idle machine** is meant. Others that work on it are told above by the load; with a load near the number of "
-    "cores or beyond it the times here say more about them than about us. `make test` runs the same tests once, with "
-    "longer time-outs, and judges by positions and the controller's clock, not by how long it took.\n"
+    "- **Measured** is the median of {repeat}, *worst* the worst of them; events that must never happen are summed "
+    "over all. The verdict is on the median; *met, worst beyond* means that a repetition exceeded the promise.\n"
+    "- **An idle machine** is assumed. The load above shows other programs; with a load near or above the number of "
+    "cores, the times depend mostly on them. `make test` runs the same tests once, with longer time-outs, and judges "
+    "by positions and the controller's clock, not by durations.\n"
     "- **Rerun:** `make reliability`, or `tacsim bench robot --long --json benchmarks/reliability.json --docs docs`: "
     "the tests below that record a figure, five times each. `tacsim bench all` leaves this group out. ur_rtde has no "
-    "wheel for Python 3.13; there only the guard and the camera are measured."
+    "wheel for Python 3.13, so there only the limits and the camera are measured."
 )
 
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """What one repetition of a test found."""
+    """Result of one repetition of a test."""
 
     promise: int  # its number
     name: str
     value: float
     unit: str
-    at_most: float | None  # what is promised; None: to compare with
-    test: str  # that recorded it
-    seconds: float  # the test took
+    at_most: float | None  # the promised limit; None: for comparison only
+    test: str  # test that recorded it
+    seconds: float  # duration of the test
     cpu_seconds: float
 
 
 def rows(figures: Iterable[Figure], peak_mb: float) -> list[Row]:
-    """A row for each figure, over its repetitions: the median of what is measured, the sum of what is counted."""
+    """A row for each figure over its repetitions: the median of a measurement, the sum of a count."""
     together: dict[tuple[int, str], list[Figure]] = {}
     for figure in figures:
         together.setdefault((figure.promise, figure.name), []).append(figure)
@@ -149,14 +157,14 @@ def markdown(report: Report) -> str:
         "Fifteen promises of arms and cameras, as figures that their own tests record. Written by `make reliability`, "
         "or `tacsim bench --from FILE --docs docs`; do not edit.",
         SAFETY,
-        setting(report) + _busy(report),
+        setting(report) + _load_note(report),
         "## Figures",
         table(HEADER, lines([row for row in measured if EVENT not in row.variant])),
         *_events(measured),
         "## How to read and rerun",
-        READING.format(repeat=_times(count)),
+        READING.format(repeat=_format_repetitions(count)),
         "## What a promise says, and which tests check it",
-        "\n".join(_checked(number, tests.get(number, [])) for number in range(1, len(PROMISES) + 1)),
+        "\n".join(_describe_promise(number, tests.get(number, [])) for number in range(1, len(PROMISES) + 1)),
     ]
     if failures:
         parts += ["## Failed", *(f"- {each.case}: {each.cause}" for each in failures)]
@@ -164,7 +172,7 @@ def markdown(report: Report) -> str:
 
 
 def lines(measured: Sequence[Row]) -> list[list[str]]:
-    """The table as text, a list of cells a figure."""
+    """The table as text, a list of cells for each figure."""
     found = []
     for number, (promise, _) in enumerate(PROMISES, start=1):
         mine = [row for row in measured if row.case == promise]
@@ -175,7 +183,7 @@ def lines(measured: Sequence[Row]) -> list[list[str]]:
 
 
 def _events(measured: Sequence[Row]) -> list[str]:
-    """The table of events with its heading; nothing where none was measured."""
+    """The table of events with its heading, or an empty list without events."""
     found: dict[str, dict[str, Row]] = {}
     for row in measured:
         event, separator, column = row.variant.partition(EVENT)
@@ -183,16 +191,18 @@ def _events(measured: Sequence[Row]) -> list[str]:
             found.setdefault(event, {})[column] = row
     if not found:
         return []
-    cells = [[event, *(_both(columns.get(name)) for name in EVENTS[1:])] for event, columns in found.items()]
+    cells = [
+        [event, *(_median_and_worst(columns.get(name)) for name in EVENTS[1:])] for event, columns in found.items()
+    ]
     for line, columns in zip(cells, found.values(), strict=True):
         if "goes on" in columns:
             line[1] = "goes on" + ("" if "still after" not in columns else f"; else {line[1]}")
     repeat = max(row.repeats for columns in found.values() for row in columns.values())
-    return ["## A stopped arm stays stopped", WATCHED.format(repeat=_times(repeat)), table(EVENTS, cells)]
+    return ["## A stopped arm stays stopped", WATCHED.format(repeat=_format_repetitions(repeat)), table(EVENTS, cells)]
 
 
-def _both(row: Row | None) -> str:
-    """Median and worst; a count as it is."""
+def _median_and_worst(row: Row | None) -> str:
+    """Median and worst value, or a count."""
     if row is None:
         return ""
     if row.error_unit == COUNT:
@@ -202,7 +212,7 @@ def _both(row: Row | None) -> str:
     return f"{row.error:.{digits}f} / {worst:.{digits}f} {row.error_unit}"
 
 
-def _times(count: int) -> str:
+def _format_repetitions(count: int) -> str:
     return f"{count} repetition{'s' * (count > 1)}"
 
 
@@ -218,10 +228,16 @@ def _cells(row: Row) -> list[str]:
         verdict = "**missed**"
     else:
         verdict = "met" if worst is None or worst <= promised else "met, worst beyond"
-    return [row.variant, _words(row.error, unit), _words(worst, unit), _words(promised, unit), verdict]
+    return [
+        row.variant,
+        _format_value(row.error, unit),
+        _format_value(worst, unit),
+        _format_value(promised, unit),
+        verdict,
+    ]
 
 
-def _words(value: float | None, unit: str) -> str:
+def _format_value(value: float | None, unit: str) -> str:
     return "" if value is None else f"{value:.3g} {unit}".strip()
 
 
@@ -231,7 +247,7 @@ def _of_robot(report: Report) -> list[Row]:
 
 @cache
 def marked_tests() -> dict[int, list[str]]:
-    """Of each promise the tests that are marked with its number, as `tests/path.py::name`, read from the checkout."""
+    """The tests marked with the number of each promise, as `tests/path.py::name`, read from the checkout."""
     found: dict[int, list[str]] = {}
     for path in sorted((ROOT / "tests").rglob("test_*.py")):
         text = path.read_text(encoding="utf-8")
@@ -244,7 +260,7 @@ def marked_tests() -> dict[int, list[str]]:
     return found
 
 
-def _checked(number: int, tests: Iterable[str]) -> str:
+def _describe_promise(number: int, tests: Iterable[str]) -> str:
     files: dict[str, list[str]] = {}
     for test in tests:
         file, _, function = test.partition("::")
@@ -254,7 +270,7 @@ def _checked(number: int, tests: Iterable[str]) -> str:
     return f"{number}. **{name}.** {text} {listed}."
 
 
-def _busy(report: Report) -> str:
+def _load_note(report: Report) -> str:
     machine = report.metadata.machine
     priority = ""
     if machine.realtime is not None:

@@ -1,6 +1,6 @@
-"""What must be reached and is aimed for (targets.yaml), and how each figure follows from the rows of one run.
+"""Requirements and aims (targets.yaml), and the computation of each figure from the rows of one run.
 
-Ratios are taken within a run, never between two: both sides then met the same machine and the same load.
+Ratios are taken within one run only, so that both values have the same machine and the same load.
 """
 
 from __future__ import annotations
@@ -22,21 +22,21 @@ class _Frozen(BaseModel):
 
 
 class Selection(_Frozen):
-    """A number of the rows of a case: the worst (largest), or the mean. Variant and resolution must begin so."""
+    """A number of the rows of a case: the worst (largest), or the mean. `variant` and `resolution` are prefixes."""
 
-    what: str  # a field of the row, else one of its figures
+    what: str  # name of a field of the row or of a figure
     case: str
     variant: str = ""
-    ending: str = ""  # of the variant
+    ending: str = ""  # suffix of the variant
     method: str = "tacsim"
     resolution: str = ""
-    gel: str = ""  # somewhere in the resolution
-    from_depth_mm: float | None = None  # rows of presses at least so deep
+    gel: str = ""  # part of the resolution
+    from_depth_mm: float | None = None  # minimum depth of the presses
     scale: float = 1.0
     mean: bool = False
 
     def __call__(self, rows: Iterable[Row]) -> float | None:
-        """None when the rows do not have it."""
+        """The number, or None without such rows."""
         found = [value for row in rows if self._holds_for(row) and (value := _number(row, self.what)) is not None]
         if not found:
             return None
@@ -55,28 +55,28 @@ class Selection(_Frozen):
 
 
 class Target(_Frozen):
-    """One figure. `must` is required, `aim` is what we would like; either may be missing."""
+    """One figure. `must` is a requirement, `aim` is an aim; either may be missing."""
 
     name: str
     unit: str = ""
     must: float | None = None
     aim: float | None = None
     value: Selection | None = None
-    over: Selection | None = None  # what the value is divided by
+    over: Selection | None = None  # divisor of the value
     at_least: bool = False  # larger is better
-    remark: str = ""  # what to know where it is missed
-    elsewhere: str = ""  # why no row can have it
+    remark: str = ""  # shown if it is missed
+    elsewhere: str = ""  # reason why no row has it
 
     def find(self, rows: Sequence[Row]) -> float | None:
-        """The value in these rows; None when they do not have it."""
+        """The value in these rows, or None without such rows."""
         value = None if self.value is None else self.value(rows)
         if value is None or self.over is None:
             return value
         over = self.over(rows)
         return None if over is None or over == 0 else value / over
 
-    def judge(self, value: float | None) -> Verdict:
-        """What a value means. The limit itself is within it."""
+    def evaluate(self, value: float | None) -> Verdict:
+        """The verdict on a value. A value equal to a limit is within it."""
         if value is None:
             return "not measured"
         reached = [limit is not None and self._within(value, limit) for limit in (self.must, self.aim)]
@@ -91,11 +91,11 @@ class Target(_Frozen):
 
     def cells(self, value: float | None) -> list[str]:
         """A line of the table, as text."""
-        verdict = self.judge(value)
-        shown = "" if value is None else f"{value:.3g} {self.unit}".strip()
+        verdict = self.evaluate(value)
+        text = "" if value is None else f"{value:.3g} {self.unit}".strip()
         words = f"**{verdict}**" if verdict == "missed" else verdict
-        why = {"missed": self.remark, "not measured": self.elsewhere}.get(verdict)
-        return [self.name, shown, *map(self._limit, (self.must, self.aim)), words + (f": {why}" if why else "")]
+        reason = {"missed": self.remark, "not measured": self.elsewhere}.get(verdict)
+        return [self.name, text, *map(self._limit, (self.must, self.aim)), words + (f": {reason}" if reason else "")]
 
     def _limit(self, limit: float | None) -> str:
         return "" if limit is None else f"{'≥' if self.at_least else '≤'} {limit:g}"
@@ -117,5 +117,5 @@ HEADER = ("figure", "measured", "must", "aim", "verdict")
 
 
 def lines(rows: Sequence[Row], targets: Iterable[Target] = TARGETS) -> list[list[str]]:
-    """The table as text, a list of cells a target."""
+    """The table as text, a list of cells for each target."""
     return [target.cells(target.find(rows)) for target in targets]

@@ -1,5 +1,5 @@
-"""Small kernels that drive the product's own laws, transfers and elements directly, where no World has the boundary
-conditions of a closed form. Units as in the physics: mm, N, MPa, wave speed 1."""
+"""Small kernels that run the laws, transfers and elements of tacsim.physics with the boundary conditions of a closed
+form, which no World has. Units as in the physics: mm, N, MPa, wave speed 1."""
 
 import numpy as np
 
@@ -42,8 +42,8 @@ def body_substeps(
     particles: Floats, masses: Strips, velocities: Strips,
     params: Params, counts: Counts, partial: Partial, keep_x: ti.f32, keep_y: ti.f32, keep_z: ti.f32, sync: Sync,
 ):  # fmt: skip
-    """A free body, no damping; `keep` 0 forbids motion along an axis, 1 allows it. Spread over threads as the product's
-    own substeps are (tacsim.physics.worlds.hybrid_kernels)."""
+    """A free body without damping; `keep` 0 forbids motion along an axis, 1 allows it. Threads share the work as in
+    tacsim.physics.worlds.hybrid_kernels."""
     for task in range(team * CHUNK):
         for _ in range(first_in_chunk(task)):
             env = ti.static(Environment(0, params, counts, partial))
@@ -120,7 +120,7 @@ def shear_points(
 
 
 class Block:
-    """What a body or a gel on its own shares with its kernel. Use one of the two below."""
+    """Base of a single body or gel: the arrays that it shares with its kernel."""
 
     def __init__(self, params: dict[int, float], dt: float) -> None:
         start_taichi(cpu_only="a single block of a material (tacsim bench materials)")
@@ -141,7 +141,7 @@ class BodyBlock(Block):
         self.state = BodyState([points])
 
     def fit(self, margin: float) -> None:
-        """Lays the grid round the particles where they are now, with a margin [mm] of at least a cell."""
+        """Fits the grid to the present particles, with a margin [mm] of at least a cell."""
         self.state.move_reference(0)
         self.state.fit_grid(0, self.cell, margin, self.params, self.counts)
 
@@ -150,11 +150,11 @@ class BodyBlock(Block):
         steps = np.zeros((1, substeps), np.int32)
         run_team(body_substeps, steps, *self.state.arguments(), self.params, self.counts, self.partial, *keep)
         if self.partial[0, :, layout.OFF_GRID].any():
-            raise RuntimeError("particles left the grid of a body block: fit it anew, or with a wider margin")
+            raise RuntimeError("particles left the grid of a body block: fit it again, or with a wider margin")
 
 
 class GelBlock(Block):
-    """A gel on its backing that nothing touches; damping rate [1/mm], time step dt [mm]."""
+    """A gel on its backing without contact; damping rate [1/mm], time step dt [mm]."""
 
     def __init__(self, params: GelParams, dt: float, damping: float) -> None:
         super().__init__({**params.params(), layout.GEL_DAMPING: damping}, dt)
@@ -168,7 +168,7 @@ class GelBlock(Block):
         gel_substeps(*self._arguments, *keep, int(speed is not None), speed or 0.0)
         smallest = float(self.partial[0, :, layout.SMALLEST_VOLUME].min())
         if not smallest > MIN_VOLUME_RATIO:
-            raise RuntimeError(f"an element of a gel block shrank to {smallest:.3g} of its volume: drive it less far")
+            raise RuntimeError(f"an element of a gel block shrank to {smallest:.3g} of its volume: reduce its motion")
 
     @property
     def backing(self) -> np.ndarray:

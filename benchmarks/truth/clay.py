@@ -1,4 +1,4 @@
-"""The cube of clay that every method shortens: its material, its time step, and the stress that it must yield at."""
+"""The cube of clay that every method compresses: its material, its time step, and its yield stress."""
 
 from __future__ import annotations
 

@@ -1,10 +1,11 @@
-"""How far body and gel lie from each other where they press on one another: geometry alone, nothing that contact keeps.
+"""Distance between body and gel inside their contact patch, from geometry alone, without stored data of the contact.
 
 The body's surface is that of its outer particles (`tacsim.physics.body.surface`): for each the foot of its tangent
-plane. The gel's is the B-spline that the renderer draws. Their distance is taken along the gel's normal. The patch is
-made of cells of two particle spacings with a particle that bears load; judged are all outer particles that face the gel
-in a cell whose eight neighbours belong to the patch, whether they bear load or not: a hole in the patch counts. In the
-outermost ring planes lie aslant over an edge, and their feet say little of the surface; it is told apart.
+plane. The gel's surface is the B-spline that the renderer draws. The distance is along the gel's normal. The patch
+consists of cells of two particle spacings that contain a loaded particle. The measure includes all outer particles that
+face the gel in a cell whose eight neighbours belong to the patch, loaded or not, so it includes holes in the patch. In
+the outermost ring the planes are oblique at an edge, and their feet do not represent the surface; it is reported
+separately.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 
 MM = 1e3  # m -> mm, of a snapshot's lengths
 CELL = 2.0  # of the patch, in particle spacings
-LEAST_COSINE = 0.7  # least cosine between a particle's plane and the gel's surface
+MIN_COSINE = 0.7  # between the normals of a particle's plane and of the gel's surface
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,12 +35,12 @@ class Gaps:
     """Largest distances of body and gel [m]."""
 
     gap: float  # inside the patch
-    overlap: float  # there, positive
-    rim: float  # of loaded particles in the patch's outermost ring, either way
+    overlap: float  # inside the patch, positive
+    rim: float  # largest |distance| of loaded particles in the patch's outermost ring
 
 
 def gaps(world: World, spacing: float) -> Gaps:
-    """The worst of both sensors; spacing: of the body's particles [m]. Raises ValueError: a patch has no inside."""
+    """The largest values of both sensors. spacing: of the body's particles [m]. Raises ValueError for a small patch."""
     found = [_of_sensor(world, name, index, spacing) for index, name in enumerate(world.sensors)]
     return Gaps(max(f.gap for f in found), max(f.overlap for f in found), max(f.rim for f in found))
 
@@ -50,12 +51,12 @@ def _of_sensor(world: World, name: str, index: int, spacing: float) -> Gaps:
     state = world.snapshot()
     x, planes = (state[key].astype(np.float64) for key in ("position", "planes"))
     outer = (planes != 0).any(axis=1)
-    loaded = state["contact"][index, outer, 3] > 0  # the multiplier, which alone bears load at rest
+    loaded = state["contact"][index, outer, 3] > 0  # the multiplier, which is the whole contact force at rest
     to_sensor = inverse(world.pose(name))
     feet = transform(to_sensor, surface_points(x[outer], planes[outer]) / MM)
     normal = rotate(to_sensor, planes[outer])
     at, distance, upwards = _from_gel(world.surface(name), feet)
-    towards_gel = -(normal * upwards).sum(axis=1) > LEAST_COSINE * np.linalg.norm(normal, axis=1)
+    towards_gel = -(normal * upwards).sum(axis=1) > MIN_COSINE * np.linalg.norm(normal, axis=1)
     cell = np.floor(at / (CELL * spacing)).astype(int)
     cell -= cell.min(axis=0) - 1
     patch = np.zeros(cell.max(axis=0) + 2, dtype=bool)

@@ -1,4 +1,4 @@
-"""The same laws in float64 NumPy, written for clearness: the truth that tests use."""
+"""The same laws in float64 NumPy, written for clarity, as reference for tests."""
 
 from __future__ import annotations
 

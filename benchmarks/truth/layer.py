@@ -1,6 +1,6 @@
 """Frictionless contact of a rigid indenter with a linear-elastic layer on a rigid base, by FFT: an independent oracle.
 
-It shares nothing with the finite elements: small strain, half-space kinematics, a periodic box much wider than the
+It shares no code with the finite elements: small strain, half-space kinematics, a periodic box much wider than the
 contact. Use it to check forces and contact shapes of shallow presses (strain error grows with depth / radius).
 """
 
@@ -14,7 +14,7 @@ from scipy import fft
 
 FloatArray = NDArray[np.float64]
 
-TOLERANCE = 1e-6  # change of the pressure in one iteration, relative, at which it has converged
+TOLERANCE = 1e-6  # relative change of the pressure in one iteration at convergence
 ITERATIONS = 500  # at most
 
 
@@ -53,7 +53,7 @@ def layer_contact(
     """Presses a shape with undeformed `gap` (n, n) [m] (0 at its tip) by `depth` [m] into the layer.
 
     Solves p >= 0, u - (depth - gap) >= 0, p (u - (depth - gap)) = 0 by the conjugate-gradient method of Polonsky and
-    Keer (Wear 231, 1999). Raises RuntimeError when it does not converge.
+    Keer (Wear 231, 1999). Raises RuntimeError if it does not converge.
     """
     n = gap.shape[0]
     wave = 2 * np.pi * fft.fftfreq(n, pixel)

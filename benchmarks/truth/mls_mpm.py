@@ -1,8 +1,8 @@
-"""MLS-MPM as the paper prints it (Hu et al. 2018, "A moving least squares material point method"; APIC: Jiang et al.
-2015): one material, a singular value decomposition for every particle in every substep, sums by atomics. Nothing tuned.
+"""MLS-MPM as in the paper (Hu et al. 2018, "A moving least squares material point method"; APIC: Jiang et al.
+2015): one material, a singular value decomposition for every particle in every substep, sums by atomics, not optimised.
 
-One substep: `clear`, `particles_to_grid`, `grid_update`, `grid_to_particles`. Tests hold the transfers of
-tacsim/physics/body against it stage by stage, benchmarks measure both. Units: mm, N, MPa, wave speed 1.
+One substep: `clear`, `particles_to_grid`, `grid_update`, `grid_to_particles`. Tests compare the transfers
+of tacsim/physics/body with it stage by stage, benchmarks measure both. Units: mm, N, MPa, wave speed 1.
 """
 
 from tacsim.compute.runtime import ti
@@ -18,7 +18,7 @@ GridScalars = ti.types.ndarray(dtype=f32, ndim=3)
 
 @ti.dataclass
 class Material:
-    """Of one particle: Hencky elasticity with von Mises yield."""
+    """Constants of one particle: Hencky elasticity with von Mises yield."""
 
     mass: f32
     volume: f32

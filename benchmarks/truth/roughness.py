@@ -1,8 +1,8 @@
-"""Roughness that the sampling of a body prints on a gel: what is left of the height after its local form is removed.
+"""Roughness that the sampling of a body prints on a gel: the height without its local form.
 
-Definition. Form: the least-squares quadratic of the height in the window of 5 x 5 surface nodes round a node (Savitzky
-and Golay, Anal. Chem. 36, 1627, 1964, in two dimensions); slopes, curvature and cubic terms belong to it in full.
-Residual: height minus form at the middle, divided by the residual's gain for white noise, so that independent noise of
+Definition. Form: the least-squares quadratic of the height in the window of 5 x 5 surface nodes around a node (Savitzky
+and Golay, Anal. Chem. 36, 1627, 1964, in two dimensions); it contains all slopes, curvature and cubic terms.
+Residual: height minus form at the centre, divided by the residual's gain for white noise, so that independent noise of
 deviation s at the nodes gives s. Roughness: its root mean square (Sq of ISO 25178-2) over the inside of the contact,
 those nodes whose window lies in the print. Real form counts only by its fourth order; choose a print much wider than
 five nodes, else its rim is in every window.
@@ -19,8 +19,8 @@ from tacsim.models.scene import GelSurface
 if TYPE_CHECKING:
     from tacsim.interface import FloatArray
 
-HALF = 2  # nodes from the middle of the window to its edge
-SHARE = 0.5  # the print is where the surface lies deeper than this share of its typical depth
+HALF = 2  # nodes from the centre of the window to its edge
+SHARE = 0.5  # the print is deeper than this share of its typical depth
 
 
 def filter_weights() -> FloatArray:
@@ -35,7 +35,7 @@ def filter_weights() -> FloatArray:
 
 
 def inside_print(depth: FloatArray) -> np.ndarray:
-    """Nodes (nx, ny), bool, whose 5 x 5 window lies wholly in the print; holes in it are filled."""
+    """Nodes (nx, ny), bool, whose 5 x 5 window is inside the print; holes in it are filled."""
     from scipy.ndimage import binary_closing, binary_erosion, binary_fill_holes
 
     touched = depth > 0.2 * depth.max()
@@ -50,7 +50,7 @@ def inside_print(depth: FloatArray) -> np.ndarray:
 def print_roughness(surface: GelSurface) -> float:
     """Roughness [m] of the print on a gel's surface, as this module defines it.
 
-    Raises ValueError without a print, or when no window fits into it: press deeper, or use a finer gel.
+    Raises ValueError without a print, or if no window fits into it: press deeper, or use a finer gel.
     """
     from scipy.ndimage import correlate
 

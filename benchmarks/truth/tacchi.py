@@ -1,16 +1,16 @@
-"""A press at the numbers that Tacchi publishes (Chen et al., RA-L 2023, and its repository): the gel as elastic
+"""A press with the numbers that Tacchi publishes (Chen et al., RA-L 2023, and its repository): the gel as elastic
 particles on an MLS-MPM grid, the indenter as kinematic particles, contact through the grid alone.
 
 The kernels are this module's own, since those of tacsim.physics.seed.kernels cannot run these numbers: there two gels,
-neo-Hookean and with a sensor each, close round a body; the grid is stretched so that their backings lie on its nodes;
-everything that moves is driven by those backings, damped, and has a scaled density. Here one gel of another law (fixed
-corotated), its lowest particles frozen, meets particles with a velocity of their own, undamped. The same in both: APIC
+neo-Hookean and with a sensor each, close on a body; the grid is stretched so that their backings are on its nodes;
+all motion is driven by those backings, damped, and has a scaled density. Here one gel of another law (fixed
+corotated), its lowest particles frozen, contacts particles with a given velocity, undamped. The same in both: APIC
 with quadratic B-splines, F <- (I + dt C) F, bodies that stick to each other through the one grid.
 
 The numbers are theirs: units mm and s, rho 1, E 1.45e5, nu 0.45, fixed corotated, dt 1e-4, dx 33/256, gel 101 x 101 x
-21 particles 0.2 mm apart, lowest three layers frozen, indenter at 200 mm/s from 1 mm above the gel, stop when the top
-layer has sunk by 1 mm. One thing is in their favour: the grid ends round the gel instead of filling a cube of 256^3
-nodes. Of the published densities of indenter points we take the middle one, whose contact fits best.
+21 particles 0.2 mm apart, lowest three layers frozen, indenter at 200 mm/s from 1 mm above the gel, stop at a depth of
+the top layer of 1 mm. One difference is in their favour: the grid covers only the gel instead of a cube of 256^3
+nodes. Of the published densities of indenter points we use the middle one, whose contact fits best.
 """
 
 import math
@@ -28,14 +28,14 @@ f32 = ti.f32
 DX, DT = 33.0 / 256.0, 1e-4
 SPACING, COUNT = 0.2, (101, 101, 21)
 MODULUS, POISSON = 1.45e5, 0.45
-VOLUME = (DX / 2) ** 2  # as published; cancels, for the same factor is in the mass
+VOLUME = (DX / 2) ** 2  # as published; it cancels, because the mass has the same factor
 FROZEN = 3  # layers
 SPEED = -200.0
 GAP = 1.0  # between indenter and gel at the start
-KEPT = 2.0  # of the indenter, upwards from its tip
+CAP_HEIGHT = 2.0  # of the ball's cap of particles, from its tip
 POINTS_PER_AREA = 60.0  # on the indenter's surface [1/mm^2]: 2,211 points on their ball's cap
-MARGIN = 2.0  # of grid round the gel
-LONGEST = 400  # substeps; the published runs end after 96 to 173
+MARGIN = 2.0  # of the grid around the gel
+MAX_SUBSTEPS = 400  # the published runs end after 96 to 173
 
 
 @ti.kernel
@@ -89,10 +89,10 @@ def grid_to_particle(
 
 
 def ball_cap() -> np.ndarray:
-    """Points spread evenly (Fibonacci) on the kept cap of the ball, tip at the origin [mm]."""
+    """Points distributed evenly (Fibonacci) on the cap of the ball, tip at the origin [mm]."""
     radius = RADIUS * 1e3
-    count = round(POINTS_PER_AREA * 2 * math.pi * radius * KEPT)
-    z = (np.arange(count) + 0.5) / count * KEPT
+    count = round(POINTS_PER_AREA * 2 * math.pi * radius * CAP_HEIGHT)
+    z = (np.arange(count) + 0.5) / count * CAP_HEIGHT
     angle = np.arange(count) * math.pi * (3 - math.sqrt(5))
     across = np.sqrt(radius**2 - (radius - z) ** 2)
     return np.stack([across * np.cos(angle), across * np.sin(angle), z], axis=-1)
@@ -112,7 +112,7 @@ class TacchiPress:
         self.v[self.gel :, 2] = SPEED
         self.c = np.zeros((len(self.x), 3, 3), np.float32)
         self.f = np.tile(np.eye(3, dtype=np.float32), (len(self.x), 1, 1))
-        size = [side + 2 * MARGIN, side + 2 * MARGIN, self.top + GAP + KEPT + 4 * DX]
+        size = [side + 2 * MARGIN, side + 2 * MARGIN, self.top + GAP + CAP_HEIGHT + 4 * DX]
         nodes = [math.ceil(length / DX) for length in size]
         self.momentum = np.zeros((*nodes, 3), np.float32)
         self.mass = np.zeros(nodes, np.float32)
@@ -129,23 +129,23 @@ class TacchiPress:
         grid_to_particle(self.gel, frozen, self.x, self.v, self.c, self.momentum, self.mass, DX, DT)
 
     @property
-    def sunk(self) -> float:
-        """How deep the lowest particle of the top layer lies below the untouched surface [mm]."""
+    def penetration(self) -> float:
+        """Depth of the lowest particle of the top layer below the undeformed surface [mm]."""
         return self.top - float(self.x[: self.gel, 2][self.surface].min())
 
 
 def run() -> tuple[TacchiPress, int]:
-    """Presses until the top layer has sunk by 1 mm. Raises RuntimeError if it never does."""
+    """Presses until the top layer has a depth of 1 mm. Raises RuntimeError if it does not reach it."""
     press = TacchiPress()
-    for step in range(1, LONGEST + 1):
+    for step in range(1, MAX_SUBSTEPS + 1):
         press.substep()
-        if press.sunk >= DEPTH * 1e3:
+        if press.penetration >= DEPTH * 1e3:
             return press, step
-    raise RuntimeError(f"the gel has sunk by {press.sunk:.3f} mm only after {LONGEST} substeps")
+    raise RuntimeError(f"the top layer has a depth of only {press.penetration:.3f} mm after {MAX_SUBSTEPS} substeps")
 
 
 def sphere_press(repeat: int) -> list[Measurement]:
-    """The surface when the published run stops, against the limit of fine meshes."""
+    """The surface at the end of the published run, against the limit of fine meshes."""
     start_taichi()
     timing, (press, substeps) = timed(run, repeat, lambda: TacchiPress().substep())
     at = press.rest[press.surface]

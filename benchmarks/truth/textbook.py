@@ -1,5 +1,5 @@
-"""MLS-MPM as textbooks print it (benchmarks/truth/mls_mpm.py), on all cores: a cube between two frictionless
-plates, which are planes of grid nodes. Units: mm, N, MPa, wave speed 1."""
+"""MLS-MPM as in textbooks (benchmarks/truth/mls_mpm.py), on all cores: a cube between two frictionless plates, which
+are planes of grid nodes. Units: mm, N, MPa, wave speed 1."""
 
 from functools import partial
 
@@ -20,7 +20,7 @@ from tacsim.compute.runtime import start_taichi, ti
 Force = ti.types.ndarray(dtype=ti.f32, ndim=1)
 
 SHORTENED = 0.1
-MACH = 0.02  # of each plate at most; without damping a faster one rings
+MACH = 0.02  # maximum of each plate; without damping, a faster plate excites oscillations
 HOLD = 400  # substeps after the motion; the force is the mean over the second half of them
 
 
@@ -41,7 +41,7 @@ def update_between_plates(
 
 
 class Cube:
-    """A cube of side [mm] in the middle of a dense grid, its plates touching it."""
+    """A cube of side [mm] at the centre of a dense grid, in contact with its plates."""
 
     def __init__(self, side: float, spacing: float) -> None:
         from tacsim.geometry.shapes import lattice_particles
@@ -68,7 +68,7 @@ class Cube:
         self.low, self.high = room, room + side
 
     def substep(self, speed: float) -> float:
-        """Plates close with `speed` each; returns the mean force on them [N]."""
+        """Both plates move by `speed`; returns the mean force on them [N]."""
         dx, dt = self.dx, self.dt
         clear(self.momentum, self.mass)
         particles_to_grid(self.x, self.v, self.c, self.f, self.momentum, self.mass, dx, dt, self.material)
@@ -79,7 +79,7 @@ class Cube:
 
 
 def compress(side: float, spacing: float) -> tuple[Cube, float, int]:
-    """The cube after it was shortened by 10 %, the force on the plates [N], and the substeps it took."""
+    """The cube after a compression by 10 %, the force on the plates [N], and the number of substeps."""
     cube = Cube(side, spacing)
     moving = round(SHORTENED * side / 2 / (MACH * cube.dt))
     speed = SHORTENED * side / 2 / (moving * cube.dt)
@@ -90,7 +90,7 @@ def compress(side: float, spacing: float) -> tuple[Cube, float, int]:
 
 
 def yield_plateau(side: float, spacing: float, repeat: int) -> list[Measurement]:
-    """Side and spacing [mm]."""
+    """A cube compressed by 10 %; side and spacing [mm]."""
     start_taichi()
     timing, (cube, force, substeps) = timed(partial(compress, side, spacing), repeat, lambda: _first(side, spacing))
     stress = uniaxial_stress(force, (side * 1e-3) ** 3, (cube.high - cube.low) * 1e-3)

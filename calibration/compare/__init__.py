@@ -1,1 +1,1 @@
-"""How alike the frames of two sources are: `compare.compare_frames`, and `invariance` for a policy's view."""
+"""Similarity of the frames of two sources: `compare.compare_frames`, and `invariance` for a policy."""

@@ -1,4 +1,4 @@
-"""A brought into the pixels of B automatically: one scale and one shift for the whole comparison.
+"""Automatic alignment of A with the pixels of B: one scale and one shift for the whole comparison.
 
 A sensor does not move in its housing, and a shift for each pair would hide that contacts are in the wrong place.
 """
@@ -21,12 +21,12 @@ from tacsim.models.sensor import SensorGeometry
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Alignment:
-    """Where the pixels of B lie in the picture of A. Pixel centres are whole numbers, x right, y down."""
+    """Map from the pixels of B to the picture of A. Pixel centres are integers, x right, y down."""
 
     a_from_b: FloatArray  # (2, 3) affine: x, y in A of x, y in B
     shape: tuple[int, int]  # rows, columns of B
     source: tuple[int, int]  # ... of A
-    shift: tuple[float, float] = (0.0, 0.0)  # the part of it that was found: how far A's contacts lie off B's [px of B]
+    shift: tuple[float, float] = (0.0, 0.0)  # fitted part: displacement of A's contacts from B's [px of B]
     description: str = "pixel for pixel"
 
     @property
@@ -40,7 +40,7 @@ class Alignment:
                           & (y <= self.source[0] - 1 + near))  # fmt: skip
 
     def __call__(self, picture: NDArray[Any]) -> Float32:
-        """(rows, columns, 3) what a picture of A, 0..255, shows at the pixels of B; its border where it ends."""
+        """(rows, columns, 3) a picture of A, 0..255, at the pixels of B; outside A its border."""
         import cv2
 
         picture = np.asarray(picture, dtype=np.float32)
@@ -61,7 +61,7 @@ class Alignment:
         return clipped
 
     def shifted(self, shift: tuple[float, float], description: str) -> Alignment:
-        """The same, with A's pictures taken `shift` [px of B] farther on."""
+        """The alignment with A's pictures moved by `shift` [px of B]."""
         moved = np.eye(3)
         moved[:2, 2] = shift
         whole = np.vstack([self.a_from_b, [0.0, 0.0, 1.0]]) @ moved
@@ -98,12 +98,12 @@ def find_shift(changes: Iterable[tuple[Float32, Float32]], alignment: Alignment)
     """`alignment` with the shift that brings the contacts of A onto those of B.
 
     `changes`: of each pair the changes of colour (rows, columns, 3) of A (in the pixels of B) and of B. For each pair
-    with contact in both, the shift is found to a fraction of a pixel from the strength of the change, whatever its
-    colours (enhanced correlation coefficient, Evangelidis and Psarakis 2008); the median of all holds.
+    with contact in both, the shift is found to a fraction of a pixel from the strength of the change, independent of
+    its colours (enhanced correlation coefficient, Evangelidis and Psarakis 2008). The result is the median of all.
     """
     found = [shift for pair in changes if (shift := _find_image_shift(*pair)) is not None]
     if not found:
-        return alignment.shifted((0.0, 0.0), "no pair shows contact on both sides, so no shift was looked for")
+        return alignment.shifted((0.0, 0.0), "no pair shows contact on both sides, so no shift was estimated")
     shifts = np.array(found)
     middle = np.median(shifts, axis=0)
     scatter = float(np.median(np.linalg.norm(shifts - middle, axis=1)))
@@ -118,7 +118,7 @@ def find_shift(changes: Iterable[tuple[Float32, Float32]], alignment: Alignment)
 
 
 def _find_image_shift(a: Float32, b: Float32) -> tuple[float, float] | None:
-    """x, y from a point of `b` to the same in `a` [px]; None where there is no contact, or no shift to be found."""
+    """x, y from a point of `b` to the same in `a` [px]; None without contact, or if no shift is found."""
     tolerance = 1e-4
     max_steps = 200
     window = 5  # side of the Gaussian window of the fit [px]

@@ -1,8 +1,8 @@
-"""How alike the frames of two sensors are: simulated against real, or any two.
+"""Similarity of the frames of two sensors: simulated against real, or any two.
 
-B is taken for the truth. Every number stands beside two others. The *null* is what a picture without contact scores:
-A's reference in A's place. The *floor* is what noise alone scores: a second picture of the untouched gel against the
-first. A simulation is worth something where it is surely better than the null, and perfect where it reaches the floor.
+B is the reference. Each number has two others for comparison. The *null* is the result for a picture without contact,
+A's reference in place of A. The *floor* is the result of noise alone, from two pictures of the untouched gel. A
+simulation is useful if it is significantly better than the null, and perfect if it reaches the floor.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ MIN_PAIRS = 3  # for an interval
 
 
 class Pairing(StrEnum):
-    """Which frame of A belongs to which of B."""
+    """How frames of A are paired with frames of B."""
 
     auto = "auto"  # by name where all names are the same, else in order
     name = "name"  # by name, those that only one side has are left out
@@ -41,7 +41,7 @@ class Pairing(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Metric:
-    """One number a pair."""
+    """One number for each pair."""
 
     key: str
     label: str
@@ -67,7 +67,7 @@ METRICS = (
     Metric("contact_iou", "contact IoU", digits=3, more_is_better=True),
     Metric("contact_radius", "contact radius error", "px"),
     Metric("contact_centroid", "contact centroid error", "px"),
-    Metric("grain", "grain error beside contact", "grey"),
+    Metric("grain", "grain error outside contact", "grey"),
     Metric("contact_grain", "grain error in contact", "grey"),
     Metric("gradient_angle", "gradient angle error", "°"),
     Metric("height_rmse", "height RMSE", "mm", 1e3, 4),
@@ -81,7 +81,7 @@ METRICS = (
 
 @dataclass(frozen=True, slots=True)
 class Overall:
-    """One metric over all pairs. What is not known is NaN."""
+    """One metric over all pairs. Unknown values are NaN."""
 
     mean: float
     low: float  # 95 % interval of the mean, by bootstrap over pairs
@@ -89,7 +89,7 @@ class Overall:
     null: float
     floor: float
     better: float  # share of the pairs that are better than their null
-    beats_null: bool | None  # surely so, over all pairs; None: too few pairs
+    outperforms_null: bool | None  # significantly, over all pairs; None: too few pairs
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -107,7 +107,7 @@ class Comparison:
     surfaces_b: tuple[SurfaceEstimate | None, ...] | None = None
 
     def surfaces(self, k: int) -> tuple[SurfaceEstimate, SurfaceEstimate] | None:
-        """Of pair `k`, of A and B; None where either is not known."""
+        """The surfaces of A and B in pair `k`; None if either is not known."""
         a, b = (None if side is None else side[k] for side in (self.surfaces_a, self.surfaces_b))
         return None if a is None or b is None else (a, b)
 
@@ -118,7 +118,7 @@ class Comparison:
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """How two sides are compared."""
+    """Options of a comparison."""
 
     pairing: Pairing = Pairing.auto
     shift: bool | None = None  # look for the shift between the two; None: unless A is made in the pixels of B
@@ -137,9 +137,9 @@ def compare_frames(
 ) -> Comparison:
     """Compares A with B.
 
-    A calibration says where a side's pixels lie on the gel, and finds height and gradient in its pictures; without one
-    the surfaces that a simulation has recorded count. `on_pair` is given how many pairs are done, and
-    how many there are. Raises BadFrames.
+    A calibration gives the positions of a side's pixels on the gel, and height and gradient from its pictures; without
+    one, the recorded surfaces of a simulation are used. on_pair: is called with the numbers of finished and of all
+    pairs. Raises BadFrames.
     """
     names = side_names(a, b)
     frame_pairs, left = pair_frames(a, b, options.pairing)
@@ -171,19 +171,19 @@ def compare_frames(
     notes += [*left, *of_floor, *scorer.swap_warning()]
     if len(pairs) < MIN_PAIRS:
         words = "pair" if len(pairs) == 1 else "pairs"
-        notes.append(f"{len(pairs)} {words}: too few for intervals; {MIN_PAIRS} are the least")
+        notes.append(f"{len(pairs)} {words}: too few for intervals; at least {MIN_PAIRS} are needed")
     return Comparison(a, b, alignment, tuple(pairs), overall, tuple(notes), names, found_a, found_b)
 
 
 def side_names(a: FrameSet, b: FrameSet) -> tuple[str, str]:
-    """What the two are called: simulated and real where one alone is known to be simulated, else A and B."""
+    """Names of the two sides: simulated and real if exactly one is known to be simulated, else A and B."""
     if a.simulated == b.simulated:
         return "A", "B"
     return ("simulated", "real") if a.simulated else ("real", "simulated")
 
 
 def pair_frames(a: FrameSet, b: FrameSet, pairing: Pairing) -> tuple[list[tuple[Frame, Frame]], list[str]]:
-    """The frames that belong together, and notes on those left out. Raises BadFrames where that is ambiguous."""
+    """The pairs of frames, and notes on frames without a partner. Raises BadFrames if the pairing is ambiguous."""
     named_a, named_b = ({Path(frame.name).stem.lower(): frame for frame in each.frames} for each in (a, b))
     common = [name for name in named_a if name in named_b]
     if a.same_pixels and pairing is Pairing.auto:  # it says itself what it could not make
@@ -211,8 +211,8 @@ def pair_frames(a: FrameSet, b: FrameSet, pairing: Pairing) -> tuple[list[tuple[
 
 
 def _describe_unpaired(a: FrameSet, b: FrameSet) -> str:
-    """Which numbers only one of two folders has in the names of its pictures, in words; empty where both have the same,
-    none in common, or where names are not those of pictures."""
+    """Description of the picture numbers that only one of two folders has; empty if both have the same or no common
+    numbers, or if the names are not numbered."""
     names = [[Path(frame.name) for frame in each.frames] for each in (a, b)]
     if not all(name.suffix for each in names for name in each):
         return ""
@@ -278,7 +278,7 @@ def _find_alignment(
 def _noise_floor(
     scorer: Scorer, b: FrameSet, pairs: Sequence[Pair], calibration: Calibration | None
 ) -> tuple[Numbers, list[str]]:
-    """What pictures of B without contact score against each other, where the pairs have contact; and a note."""
+    """Metrics of pictures of B without contact against each other, in the contact regions of the pairs; and a note."""
     max_noise_frames = 5  # untouched frames from which the floor is made
     frames = [*b.untouched, *(pair.b for pair in pairs if not pair.region.any())][:max_noise_frames]
     touched = [pair for pair in pairs if pair.region.any()]
@@ -323,12 +323,12 @@ def _summarise_metric(metric: Metric, pairs: Sequence[Pair], floor: float) -> Ov
         null=_known_mean(nulls),
         floor=floor,
         better=float((gain > 0).mean()) if gain.size else math.nan,
-        beats_null=None if math.isnan(surely) else surely > 0,
+        outperforms_null=None if math.isnan(surely) else surely > 0,
     )
 
 
 def _known_mean(values: Sequence[float] | FloatArray) -> float:
-    """Mean of what is known; NaN if nothing is. Infinite where one is: the PSNR of equal pictures."""
+    """Mean of the known values; NaN without any. Infinite if one value is, as the PSNR of equal pictures."""
     array = np.asarray(values, dtype=np.float64)
     known = array[~np.isnan(array)]
     return float(known.mean()) if known.size else math.nan

@@ -1,12 +1,12 @@
-"""Can a policy tell that its frames come from another source? Three measures, for any pair of sources.
+"""Three measures of how well a policy can distinguish frames of two sources.
 
 **rho**: the distance of a press to its partner, over the distance of two neighbouring presses of B. Below 1 the change
-of source matters less than the next press. **AUC**: how well a linear classifier tells the sources apart on presses
-that it has not seen; 1/2 is chance. **Drift**: how much worse the gradient becomes when B's light changes, with a fresh
-and with a stale reference.
+of source has a smaller effect than the next press. **AUC**: area under the curve of a linear classifier of the sources
+on left-out presses; 1/2 is chance. **Drift**: increase of the gradient error when B's light changes, with a fresh and
+with a stale reference.
 
-Distances are those of a patch of fixed size round the contact, in four views: the raw picture, its difference to the
-reference without drift of the light (as a policy sees it), gradient, height.
+Distances are those of a patch of fixed size around the contact, in four views: the raw picture, its difference from the
+reference without drift of the light (the input of a policy), gradient, height.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from calibration.errors import BadFrames
 from tacsim.control.tuning import MIN_CONTACT_HEIGHT
 from tacsim.interface import FloatArray, Image
 
-PATCH_SIDE = 5.2e-3  # where pixels have a known pitch [m]
+PATCH_SIDE = 5.2e-3  # if pixels have a known pitch [m]
 MIN_PRESSES = 4
 
 VIEWS = ("raw", "difference", "gradient", "height")
@@ -87,7 +87,7 @@ class Report:
 
     presses: int
     views: tuple[Invariance, ...]
-    patch: str  # its size, in words
+    patch: str  # description of its size
     angle: float  # gradient angle error against A without any change [degrees]; NaN without surfaces
     drifts: tuple[DriftError, ...]
     notes: tuple[str, ...]
@@ -97,8 +97,8 @@ def measure_invariance(
     folds: Sequence[tuple[Comparison, Calibration | None]],
     on_step: Callable[[int, int], None] = lambda done, total: None,
 ) -> Report:
-    """Of finished comparisons, each with B's calibration (needed for drifts): one, or parts of one set of presses, each
-    left out of the calibration that it is seen through. Gradient and height need surfaces on both sides.
+    """Measures of finished comparisons, each with B's calibration (needed for drifts): of one, or of parts of one set
+    of presses, each left out of its calibration. Gradient and height need surfaces on both sides.
 
     Raises BadFrames for fewer than MIN_PRESSES with contact in B.
     """
@@ -113,7 +113,7 @@ def measure_invariance(
     count = sum(map(len, touched))
     if count < MIN_PRESSES:
         raise BadFrames(
-            f"{count} pairs show contact in B; {MIN_PRESSES} are needed to tell how far two presses are apart"
+            f"{count} pairs show contact in B; {MIN_PRESSES} are needed to estimate the distance of two presses"
         )
     radii = [patch.radius for one in touched for patch in one.values()]
     half, words = _patch_size(folds[0][1], radii)
@@ -153,11 +153,11 @@ def partner_distances(of_a: FloatArray, of_b: FloatArray, order: NDArray[np.intp
 
 
 def classifier_scores(of_a: FloatArray, of_b: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """(n,) scores of the presses of A and of B, each by a linear classifier that has not seen that press, of neither
+    """(n,) scores of the presses of A and of B, each by a linear classifier trained without that press in either
     source: ridge regression on -1 and 1 in the first principal components, standardised."""
-    max_folds = 20  # up to so many presses, each is left out alone
+    max_folds = 20  # up to this number of presses, each is left out alone
     weight = 1.0
-    component_count = 6  # principal components that the classifier sees
+    component_count = 6  # principal components of the classifier
     count = len(of_a)
     rows = np.concatenate([of_a, of_b])
     wanted = np.repeat([-1.0, 1.0], count)
@@ -178,18 +178,19 @@ def classifier_scores(of_a: FloatArray, of_b: FloatArray) -> tuple[FloatArray, F
 
 
 def area_under_curve(low: FloatArray, high: FloatArray, weight: FloatArray | None = None) -> FloatArray:
-    """Probability that a score of `high` (n,) is above one of `low` (n,); ties count half (Mann and Whitney). `weight`
-    (..., n): how often each press counts; without, once."""
+    """Probability that a score of `high` (n,) is above one of `low` (n,); ties count half (Mann and Whitney). weight:
+    (..., n) weight of each press; default: 1."""
     above = (high[:, None] > low[None, :]) + 0.5 * (high[:, None] == low[None, :])
     times = np.ones(len(low)) if weight is None else weight
     return np.asarray(((times @ above) * times).sum(axis=-1) / times.sum(axis=-1) ** 2)
 
 
 def auc_interval(low: FloatArray, high: FloatArray, times: FloatArray) -> tuple[float, float]:
-    """95 % interval of :func:`area_under_curve` by bootstrap; `times` (draws, n): how often each press is drawn.
+    """95 % interval of :func:`area_under_curve` by bootstrap. times: (draws, n) number of times each press is drawn.
 
-    A press drawn twice meets its own partner twice as often as the estimate lets it, which moves all draws alike: they
-    are moved back to the estimate. Of scores with known area the interval then holds it in 92 to 97 % of draws.
+    A press that is drawn twice is compared with its own partner twice as often as in the estimate. That shifts all
+    draws equally, so they are shifted back to the estimate. The interval then contains a known area in 92 to 97 % of
+    draws.
     """
     areas = area_under_curve(low, high, times)
     areas = np.clip(areas + area_under_curve(low, high) - areas.mean(), 0.0, 1.0)
@@ -224,7 +225,7 @@ def _measure_view(name: str, of_a: FloatArray, of_b: FloatArray, signal: float, 
 
 
 def _patch_size(calibration: Calibration | None, radii: Sequence[float]) -> tuple[float, str]:
-    """Half the side of the patch [px], and how large that is in words."""
+    """Half the side of the patch [px], and a description of its size."""
     side_in_radii = 3.0  # ... and else [radii of the median contact region]
     if calibration is not None:
         return PATCH_SIDE / 2 / calibration.geometry.pixel_pitch, f"{PATCH_SIDE * 1e3:g} mm"
@@ -238,7 +239,7 @@ def _cut_patches(
     calibration: Calibration | None,
     half: float,
 ) -> dict[str, tuple[FloatArray, FloatArray, FloatArray]]:
-    """Of each view the patches (n, d) of A and of B, and the norms (n,) of B's change."""
+    """The patches (n, d) of A and of B, and the norms (n,) of B's change, for each view."""
     found: dict[str, tuple[list[FloatArray], list[FloatArray], list[float]]] = {view: ([], [], []) for view in VIEWS}
     a0, b0 = comparison.alignment(comparison.a.reference), comparison.b.reference.astype(np.float32)
     level = b0.mean(axis=(0, 1))
@@ -293,8 +294,8 @@ def _patch_in_cells(
 
 
 def _cut_patch(field: NDArray[np.float32], x: float, y: float, half: float) -> FloatArray:
-    """(d,) values of a square patch of a field (H, W[, n]) round x, y, as far as `half` each way."""
-    patch_points = 36  # each way
+    """(d,) values of a square patch of a field (H, W[, n]), up to `half` from x, y along each axis."""
+    patch_points = 36  # along each axis
     import cv2
 
     line = np.linspace(-half, half, patch_points)
@@ -313,8 +314,8 @@ def _mean_gradient_angle(
     change: Change | None,
     of_reference: Change | None,
 ) -> float:
-    """Mean gradient angle error of B's changed frames against A's surfaces, where those are pressed [degrees]; NaN
-    where no surface is found."""
+    """Mean gradient angle error of B's changed frames against A's surfaces in the pressed region [degrees]; NaN without
+    a surface."""
     angles: list[float] = []
     for (comparison, calibration), one in zip(folds, touched, strict=True):
         assert comparison.surfaces_a is not None

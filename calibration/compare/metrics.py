@@ -1,7 +1,7 @@
-"""Numbers that say how alike two tactile pictures, or two surfaces, are. Arrays in, numbers out.
+"""Similarity metrics of two tactile pictures, or of two surfaces. Arrays in, numbers out.
 
-Pictures are (H, W, 3) on the grey scale 0..255; `where` (H, W) limits a number to some pixels, such as those in
-contact. A number that nothing can be said of (no pixel, no contact) is NaN.
+Pictures are (H, W, 3) on the grey scale 0..255; `where` (H, W) limits a metric to some pixels, such as those in
+contact. A metric without data (no pixel, no contact) is NaN.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def similarity_map(one: Picture, other: Picture) -> FloatArray:
 
 
 def structural_similarity(one: Picture, other: Picture, where: Mask | None = None) -> float:
-    """Mean of :func:`similarity_map`, over `where` or over all but the border that half a window reaches."""
+    """Mean of :func:`similarity_map`, over `where` or over all pixels except a border of half a window."""
     similarity = similarity_map(one, other)
     if where is None:
         rim = WINDOW // 2
@@ -89,8 +89,8 @@ def image_correlation(one: Picture, other: Picture, where: Mask | None = None) -
 
 
 def grain_deviation(change: Picture, where: Mask) -> float:
-    """Standard deviation of what is finer than GRAIN pixels in a change of colour [grey levels]: noise, and texture of
-    the skin."""
+    """Standard deviation of the detail finer than GRAIN pixels in a change of colour [grey levels]: noise, and texture
+    of the skin."""
     width = 1.0  # what a Gaussian of this deviation takes away is grain [px]
     import cv2
 
@@ -104,7 +104,7 @@ def mean_normal_angle(one: NDArray[np.floating], other: NDArray[np.floating], wh
     """Mean angle between the surface normals of two fields of slopes (h, w, 2) [degrees]."""
     a, b = (np.asarray(slopes, dtype=np.float64) for slopes in (one, other))
     if a.shape != b.shape or a.ndim != 3 or a.shape[2] != 2:
-        raise ValueError(f"slopes must be (h, w, 2) and alike, got {a.shape} and {b.shape}")
+        raise ValueError(f"slopes must be (h, w, 2) and of equal shape, got {a.shape} and {b.shape}")
     # by the cross product too: the arc cosine alone loses angles below 1e-6
     dot = 1.0 + (a * b).sum(axis=-1)
     cross = np.stack([b[..., 1] - a[..., 1], a[..., 0] - b[..., 0], a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]])
@@ -132,9 +132,9 @@ def end_point_error(one: NDArray[np.floating], other: NDArray[np.floating]) -> f
 def contact_region(change: NDArray[np.floating]) -> Mask:
     """(H, W) where a change of colour (H, W, 3) [grey levels] shows contact.
 
-    What has changed everywhere (drift of the light) is no contact. The region reaches down to a quarter of the
-    strongest change, so it means the same in a bright and in a dim picture; its holes are filled, as the flat middle
-    of a press has the colour of the untouched gel.
+    A change of the whole picture (drift of the light) is no contact. The region extends to a quarter of the strongest
+    change, so it is the same in a bright and in a dim picture; its holes are filled, because the flat centre of a press
+    has the colour of the untouched gel.
     """
     gap = 3  # radius of gaps in a contact that are closed [px]
     import cv2

@@ -1,5 +1,5 @@
-"""A comparison as files: compare.json, compare.csv, and compare.html (one file, nothing from outside); the
-describe_comparison in one sentence."""
+"""A comparison as files: compare.json, compare.csv, and compare.html (one self-contained file); and its summary in one
+sentence."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ SIDE_NAMES = {"simulated": "the simulation", "real": "the real sensor"}
 
 
 def comparison_figures(comparison: Comparison, report: Report | None = None) -> dict[str, float]:
-    """All figures that a threshold may name; NaN where not known. Units as in the JSON file."""
+    """All figures that a threshold may name; NaN if not known. Units as in the JSON file."""
     found = {key: overall.mean for key, overall in comparison.overall.items()}
     for view in report.views if report else ():
         found |= {f"rho_{view.view}": view.rho, f"auc_{view.view}": view.auc, f"auc_low_{view.view}": view.auc_low}
@@ -50,8 +50,8 @@ def figure_names() -> list[str]:
 
 
 def comparison_as_json(comparison: Comparison, report: Report | None = None) -> dict[str, Any]:
-    """Everything as JSON: lengths in m, angles in degrees, contact radius and centroid in pixels of B; what is not
-    known is null."""
+    """The result as JSON: lengths in m, angles in degrees, contact radius and centroid in pixels of B; unknown values
+    are null."""
     return {
         "format": FORMAT,
         "describe_comparison": describe_comparison(comparison),
@@ -98,21 +98,21 @@ def write_comparison(folder: Path, comparison: Comparison, report: Report | None
 
 
 def known_metrics(comparison: Comparison) -> list[tuple[Metric, Overall]]:
-    """The metrics that are known of at least one pair."""
+    """The metrics that are known for at least one pair."""
     found = ((metric, comparison.overall[metric.key]) for metric in METRICS)
     return [(metric, overall) for metric, overall in found if not math.isnan(overall.mean)]
 
 
 def format_metric(value: float, metric: Metric) -> str:
-    """A number in the metric's unit for people; a dash where it is not known."""
+    """A number in the metric's unit as text; a dash if it is not known."""
     return "–" if math.isnan(value) else "∞" if math.isinf(value) else f"{value * metric.scale:.{metric.digits}f}"
 
 
 def describe_against_null(overall: Overall) -> str:
-    """Against the null, in a word."""
-    if overall.beats_null is None:
+    """The comparison with the null, as text."""
+    if overall.outperforms_null is None:
         return "–"
-    return "better" if overall.beats_null else "not better"
+    return "better" if overall.outperforms_null else "not better"
 
 
 def _write_csv(path: Path, comparison: Comparison) -> None:
@@ -127,7 +127,7 @@ def _write_csv(path: Path, comparison: Comparison) -> None:
 
 
 def _escape_formula(name: str) -> str:
-    """A file's name that no spreadsheet takes for a formula."""
+    """A file's name that a spreadsheet does not read as a formula."""
     return f"'{name}" if name[:1] in "=+-@\t\r" else name
 
 
@@ -186,7 +186,7 @@ def _pair_images(comparison: Comparison, k: int) -> list[tuple[str, str]]:
 
 
 def _contact_box(region: NDArray[np.bool_]) -> tuple[slice, slice]:
-    """Rows and columns of the largest contact of a region (H, W) and what lies round it; of the whole picture without
+    """Rows and columns of the largest contact of a region (H, W) with its surroundings; of the whole picture without
     contact."""
     zoom_margin = 0.3  # of the contact's width, that a zoomed picture shows round it
     from scipy.ndimage import label
@@ -246,14 +246,14 @@ def _known_fields(record: Any, leave: str = "") -> dict[str, Any]:
 
 
 def describe_comparison(comparison: Comparison) -> str:
-    """Whether A looks like B in contact, and by how many grey levels and degrees."""
+    """Summary of the similarity of A and B in contact, with differences in grey levels and degrees."""
     a, b = (SIDE_NAMES.get(name, name) for name in comparison.names)
     error, alike = comparison.overall["contact_mae"], comparison.overall["contact_ncc"].mean
     if math.isnan(error.mean):
         return "No pair shows contact, so nothing can be judged."
-    if error.beats_null is None:
+    if error.outperforms_null is None:
         start = f"Too few pairs to judge how much {a} and {b} look alike in contact"
-    elif not error.beats_null:
+    elif not error.outperforms_null:
         start = f"In contact {a} looks no more like {b} than a picture without contact does"
     elif alike >= MIN_CLOSE_CORRELATION and error.mean <= MAX_CLOSE_ERROR * error.null:
         start = f"In contact {a} looks like {b}"

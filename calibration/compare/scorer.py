@@ -40,7 +40,7 @@ class Scorer:
         self._covered = alignment.covered_mask
         self._whole = None if self._covered.all() else self._covered
         self._reference_a = alignment(a.reference)
-        self._plain: list[float] = []  # correlations of the pairs as they are, and with red and blue exchanged
+        self._plain: list[float] = []  # correlations of the pairs without and with red and blue exchanged
         self._swapped: list[float] = []
 
     def score_pair(
@@ -76,7 +76,7 @@ class Scorer:
         return Pair(a, b, numbers, null, tuple(flags), region, metrics.circle_of_region(contact_b))
 
     def score_images(self, one: metrics.Picture, other: metrics.Picture, region: Mask) -> Numbers:
-        """Of two pictures whose contact is `region`."""
+        """Metrics of two pictures with contact in `region`."""
         similarity = metrics.similarity_map(one, other)
         rim = metrics.WINDOW // 2
         inner = np.zeros_like(self._covered)
@@ -92,7 +92,7 @@ class Scorer:
         }
 
     def _grain_deviations(self, change: metrics.Picture, region: Mask) -> Numbers:
-        """How grainy a change of colour is, beside a contact `region` and in it, border left out [grey levels]."""
+        """Grain of a change of colour outside and inside a contact `region`, without its border [grey levels]."""
         grain_margin = 5  # of a contact's border, whose edge would pass for grain [px]
         from scipy.ndimage import binary_dilation, binary_erosion
 
@@ -104,7 +104,7 @@ class Scorer:
         }
 
     def _score_surfaces(self, a: SurfaceEstimate, b: SurfaceEstimate, other_surface: SurfaceEstimate) -> Numbers:
-        """Of A's surface against B's, where B or `other_surface` is pressed."""
+        """Metrics of A's surface against B's, in the pressed region of B or `other_surface`."""
         pressed_a, pressed_b, of_shown = (
             metrics.pressed_region(t.height, MIN_CONTACT_HEIGHT) for t in (a, b, other_surface)
         )

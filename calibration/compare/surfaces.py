@@ -1,4 +1,4 @@
-"""Height, gradient and flow of a side's frames on the canonical grid, wherever they come from."""
+"""Height, gradient and flow of a side's frames on the canonical grid, from any source."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class SurfaceEstimate:
     valid: Mask  # (h, w)
 
     def moved(self, shift: FloatArray) -> SurfaceEstimate:
-        """The surface seen from `shift` (x, y) [cells] farther on. Its flow stays that of the same markers."""
+        """The surface moved by `shift` (x, y) [cells]. Its flow stays that of the same markers."""
         import cv2
 
         if not shift.any():
@@ -50,11 +50,10 @@ def estimate_surfaces(
     frames: Sequence[Frame],
     calibration: Calibration | None,
 ) -> tuple[tuple[SurfaceEstimate | None, ...] | None, str]:
-    """The surfaces of some of the frames; or None, and why not. None also in place of a frame in which nothing can be
-    measured, and which these are.
+    """The surfaces of some of the frames and notes on frames without one, whose entry is None; or None and the reason.
 
-    With a calibration they are found in the pictures, also where a simulation knows them, so that both sources are
-    treated alike. Raises BadFrames for a reference that cannot be used.
+    With a calibration they are found in the pictures, also for a simulation with known surfaces, so that both sources
+    are treated equally. Raises BadFrames for a reference that cannot be used.
     """
     if calibration is None:
         return _recorded_surfaces(frames)
@@ -80,7 +79,7 @@ def estimate_surfaces(
 
 
 def undeformed_surface(like: SurfaceEstimate) -> SurfaceEstimate:
-    """The surface of a gel that nothing touches."""
+    """The surface of a gel without contact."""
     flow = None if like.flow is None else np.zeros_like(like.flow)
     return SurfaceEstimate(np.zeros_like(like.height), np.zeros_like(like.gradient), flow, like.valid)
 
@@ -92,8 +91,8 @@ def _recorded_surfaces(frames: Sequence[Frame]) -> tuple[tuple[SurfaceEstimate |
         if frame.surface is None:
             return None, "pictures alone have no height; give the sensor's calibration"
         if frame.surface.height.shape != shape:
-            lies = " x ".join(map(str, frame.surface.height.shape))
-            return None, f"the recorded surface has {lies} cells, not {shape[0]} x {shape[1]}; give a calibration"
+            cells = " x ".join(map(str, frame.surface.height.shape))
+            return None, f"the recorded surface has {cells} cells, not {shape[0]} x {shape[1]}; give a calibration"
         everywhere = np.ones(shape, dtype=np.bool_)
         found.append(SurfaceEstimate(frame.surface.height, frame.surface.gradient, frame.surface.flow, everywhere))
     return tuple(found), ""

@@ -6,7 +6,7 @@ Sources: docs/measurements/comparison.md, and the tests in tests/calibration/com
 
 # alignment.py
 MAX_ASPECT_ERROR = 0.02  # relative difference of the aspect ratios of two pictures that are scaled to each other
-MAX_SHIFT = 0.25  # share of the picture; beyond, the pairing is wrong, not the mounting
+MAX_SHIFT = 0.25  # share of the picture; a larger shift means a wrong pairing, not a wrong mount
 MAX_SHIFT_SCATTER = 0.05  # of the pairs' shifts, share of the picture
 
 # report.py
@@ -14,7 +14,7 @@ MIN_CLOSE_CORRELATION = 0.95  # of the change of colour in contact, from which t
 MAX_CLOSE_ERROR = 0.25  # ... if their error there also is no larger share of what a picture without contact would score
 
 # metrics.py
-CONTACT_BLUR = 2.0  # of a change of colour before a contact is looked for in it [px]
+CONTACT_BLUR = 2.0  # of a change of colour before the search for a contact [px]
 # A smoothed change shows contact beyond the largest of
 MIN_CHANGE = 5.0  # [grey levels]
 MIN_CHANGE_TO_NOISE = 6.0  # times the noise of the picture

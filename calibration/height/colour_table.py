@@ -24,8 +24,8 @@ class GradientModel(Protocol):
     """Inverse of the light of one sensor, on the pixels of one grid."""
 
     def __call__(self, change: Float32) -> tuple[Float32, NDArray[np.bool_]]:
-        """(H, W, 2) slopes [-] of the relative change of colour (H, W, 3), and (H, W) where that colour lies beyond
-        what the model was made for: there the slope is that of the nearest colour it knows."""
+        """(H, W, 2) slopes [-] of the relative change of colour (H, W, 3), and (H, W) True where that colour is outside
+        the range of the model: there the slope is that of the nearest colour in it."""
         ...
 
 
@@ -69,8 +69,8 @@ class ColourTable:
 
 
 def table_of_model(model: SensorModel) -> ColourTable:
-    """The inverse of a simulated sensor's light, for its mean untouched colour. Raises what :func:`table_of_lighting`
-    raises, and ValueError for a background picture that cannot be read."""
+    """The inverse of a simulated sensor's light, for its mean untouched colour. Raises the errors of
+    :func:`table_of_lighting`, and ValueError for a background picture that cannot be read."""
     untouched = untouched_image(model.lighting, (model.geometry.height, model.geometry.width))
     red, green, blue = untouched.mean(axis=(0, 1), dtype=np.float64)
     return table_of_lighting(model.lighting, (float(red), float(green), float(blue)))
@@ -80,7 +80,7 @@ def table_of_model(model: SensorModel) -> ColourTable:
 def table_of_lighting(lighting: Lighting, background: tuple[float, float, float]) -> ColourTable:
     """Tabulates the inverse of a Phong light whose untouched gel shows the mean colour `background` (1 is white).
 
-    Where the light does not tell slopes apart (a flank turned away from all lights but one), the smallest one wins.
+    If the light does not distinguish slopes (a flank turned away from all lights but one), the smallest one is used.
     Raises ValueError for a light that cannot be inverted: its colour does not change with the slope along both axes.
     """
     colour_margin = 0.08  # of the table beyond the colours of its light [-]
@@ -104,14 +104,14 @@ def table_of_lighting(lighting: Lighting, background: tuple[float, float, float]
     )
     if float(np.linalg.svd(by_slope[steps, steps], compute_uv=False)[1]) < COLOUR_NOISE / SLOPE_PRIOR:
         raise ValueError(
-            "lighting: the colour of the gel does not tell its slope along both axes, so no height can be found; "
+            "lighting: the colour of the gel does not determine its slope along both axes, so no height can be found; "
             "it needs lights from at least two sides, in different colours"
         )
     low = colours.min(axis=(0, 1)) - colour_margin
     scale = TABLE_CELLS / (colours.max(axis=(0, 1)) + colour_margin - low)
     lines = ((np.arange(TABLE_CELLS) + 0.5)[:, None] / scale + low).T
     middles = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 3)
-    nearest, off_gamut = _most_likely_slope(colours.reshape(-1, 3), slopes.reshape(-1, 2), middles)
+    nearest, off_gamut = _maximum_likelihood_slope(colours.reshape(-1, 3), slopes.reshape(-1, 2), middles)
     jacobian = by_slope.reshape(-1, 3, 2)[nearest].astype(np.float64)
     transposed = jacobian.transpose(0, 2, 1)
     matrix = np.linalg.solve(
@@ -122,18 +122,18 @@ def table_of_lighting(lighting: Lighting, background: tuple[float, float, float]
     return ColourTable(low.astype(np.float32), scale.astype(np.float32), maps, off_gamut)
 
 
-def _most_likely_slope(
+def _maximum_likelihood_slope(
     colours: Float32, slopes: Float32, middles: Float32
 ) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
     """For each cell (n, 3) the index of the most likely of the slopes (m, 2) with colours (m, 3): near in colour (in
     units of noise) and small (in units of the prior). Cells beyond MAX_COLOUR_DISTANCE (the mask (n,)) take the
-    slope of their nearest cell within it, as a search for them would last many times longer."""
+    slope of the nearest cell within it, because a search for them would take many times longer."""
     from scipy.ndimage import distance_transform_edt
     from scipy.spatial import KDTree
 
     tree = KDTree(np.concatenate([colours / COLOUR_NOISE, slopes / SLOPE_PRIOR], axis=1))
-    asked = np.concatenate([middles / COLOUR_NOISE, np.zeros((len(middles), 2))], axis=1)
-    distance, index = tree.query(asked, eps=0.1, distance_upper_bound=MAX_COLOUR_DISTANCE / COLOUR_NOISE)
+    query = np.concatenate([middles / COLOUR_NOISE, np.zeros((len(middles), 2))], axis=1)
+    distance, index = tree.query(query, eps=0.1, distance_upper_bound=MAX_COLOUR_DISTANCE / COLOUR_NOISE)
     off_gamut = ~np.isfinite(distance)
     where = distance_transform_edt(
         off_gamut.reshape(TABLE_CELLS, TABLE_CELLS, TABLE_CELLS), return_distances=False, return_indices=True

@@ -1,4 +1,4 @@
-"""Darkness -> slope, for a light that tells depth and no direction (tacsim.models.photometric)."""
+"""Darkness -> slope, for a light that shows depth and no direction (tacsim.models.photometric)."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class DarknessSlopes:
         self._darkness = -np.array(model.changes).mean(axis=1)
 
     def depth(self, change: Float32) -> tuple[Float32, Mask]:
-        """(H, W) depth of relative changes (H, W, 3), and where they lie beyond the table."""
+        """(H, W) depth of relative changes (H, W, 3), and True where they are outside the table."""
         from scipy.fft import dctn, idctn
 
         darkness = -change.mean(axis=2)
@@ -32,7 +32,7 @@ class DarknessSlopes:
         return depth, np.asarray((darkness < self._darkness[0]) | (darkness > self._darkness[-1]))
 
     def __call__(self, change: Float32) -> tuple[Float32, Mask]:
-        """Slopes (H, W, 2) of relative changes (H, W, 3), and where these lie beyond the table."""
+        """Slopes (H, W, 2) of relative changes (H, W, 3), and True where these are outside the table."""
         depth, beyond = self.depth(change)
         by_y, by_x = np.gradient(depth)
         return np.stack([by_x, by_y], axis=-1).astype(np.float32), beyond

@@ -1,14 +1,14 @@
-"""Slopes bettered by the forward model of the light: what a pixel's colour alone cannot tell, its surroundings do.
+"""Improves slopes by the forward model of the light, with data from the surroundings of each pixel.
 
-The inverse of a light takes every pixel for itself. It cannot know that a pixel lies in the shade of another, nor which
-of two slopes of nearly one colour fits a surface. Both are known once there is a surface, so it is sought as
+The inverse of a light treats each pixel separately. It contains no cast shadows, and cannot decide which of two slopes
+with nearly the same colour fits a surface. A surface determines both, so the method computes
 
     min over height h, slopes g of  sum over pixels, channels rho(c - light(g, h) - rest(h)) + STIFFNESS |g - grad h|^2
 
-for the seen change of colour c, of which rest(h) is what cast shadows change: in turn a Gauss-Newton step in
-g, pixel by pixel, and the h whose slopes are nearest to it (Poisson's equation; half-quadratic splitting, Geman and
-Yang 1995). It starts from the inverse's height. rho is Cauchy's: a channel that no slope explains, being saturated or
-dirty, counts little.
+for the observed change of colour c, of which rest(h) is the part of cast shadows. It alternates a Gauss-Newton step in
+g for each pixel, and the h with the nearest slopes (Poisson's equation; half-quadratic splitting, Geman and Yang 1995).
+It starts from the inverse's height. rho is Cauchy's function, so that a channel that no slope explains, because it is
+saturated or dirty, has little weight.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class ForwardSteps:
     def __call__(
         self, change: Float32, height: Float32, hidden: Mask, integrate: Callable[[Float32], Float32]
     ) -> Float32:
-        """The better height (H, W) for relative changes (3, H, W); pixels that are `hidden` (H, W) tell nothing.
+        """The improved height (H, W) for relative changes (3, H, W), without the pixels `hidden` (H, W).
         `integrate`: slopes (H, W, 2) -> height, in the unit of `pitch`."""
         step_count = 3
         chunk = 256  # pixels that are evaluated at a time
@@ -90,8 +90,8 @@ class ForwardSteps:
         return np.asarray(better * least[..., None], dtype=np.float32)
 
     def _shadow_change(self, relative: Float32, place: tuple[Float32, Float32]) -> Float32 | None:
-        """(..., 3) change of colour of pixels at places u, v (...,) by what a surface of this height (H, W) [widths of
-        the picture] hides from the lamps; None: nothing."""
+        """(..., 3) change of colour of pixels at places u, v (...,) by the cast shadows of a surface with this height
+        (H, W) [widths of the picture]; None without shadows."""
         import cv2
 
         if self._model.shadows is None:

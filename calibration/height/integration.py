@@ -55,8 +55,8 @@ class Integrator:
 def slopes_of(height: Float32, pitch: float) -> tuple[Float32, Float32]:
     """Slopes by x and by y (rows, columns) of a height (rows, columns) [m] on pixels `pitch` [m] apart.
 
-    Of a height that :class:`Integrator` made they are the part of its slopes that a surface can have: errors that turn
-    round a place (half the power of errors without order) are gone.
+    For a height from :class:`Integrator` they are the part of its slopes that a surface can have, without rotational
+    errors (half the power of random errors).
     """
     by_y, by_x = np.gradient(height, np.float32(pitch))
     return np.asarray(by_x, dtype=np.float32), np.asarray(by_y, dtype=np.float32)

@@ -48,7 +48,7 @@ class PolynomialSlopes:
         self._maps = {powers: grid.astype(np.float32) for powers, grid in maps.items()}
 
     def __call__(self, change: Float32) -> tuple[Float32, Mask]:
-        """Slopes (H, W, 2) of relative changes (H, W, 3); where they are steeper than calibrated they are clipped."""
+        """Slopes (H, W, 2) of relative changes (H, W, 3); steeper slopes than calibrated are clipped."""
         colours = [np.ascontiguousarray(change[..., channel]) for channel in range(3)]
         products: dict[tuple[int, ...], Float32] = {}
         normal = self._maps[()].copy()  # all zero in fitted models
@@ -91,8 +91,8 @@ def normal_of_slope(gradient: FloatArray) -> FloatArray:
 
 def fit_inverse(sets: Sequence[tuple[FloatArray, FloatArray]], *, with_position: bool) -> FloatArray:
     """(TERMS, 2) weights from normal equations, one pair (TERMS, TERMS), (TERMS, 2) a press; without `with_position`
-    those of all terms in x and y are 0. Those without colour always are: no change is no slope, wherever it is. The
-    ridge grows with the number of pixels, which the first diagonal element counts."""
+    those of all terms in x and y are 0. Those without colour are always 0, because no change means no slope at any
+    place. The ridge is proportional to the number of pixels, which is the first diagonal element."""
     ridge_weight = 1e-6  # ridge weight per pixel
     use = np.array(
         [i for i, (colour, axes) in enumerate(_polynomial_terms()) if colour and (with_position or not axes)]

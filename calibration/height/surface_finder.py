@@ -1,8 +1,8 @@
 """Change of colour over a sensor's view -> height and gradient on the canonical grid.
 
-The view is wider than the canonical image: all of the gel that the camera sees. Slopes are integrated over all of it,
-because its border, farther from the contact, is the best zero. The slopes that are told are those of the height:
-colours alone may tell slopes that no surface has.
+The view is wider than the canonical image: it contains all of the visible gel. Slopes are integrated over all of it,
+because its border, farther from the contact, is the best zero. The returned slopes are those of the height, because
+colours alone may give slopes that no surface has.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class FoundSurface:
     gradient: Float32  # (h, w, 2) of the height [-]
     out_of_range_share: float  # share of the view's pixels whose colour lies beyond the calibrated slopes
     drift: float | None  # mean relative change of the untouched gel's colour [-]; None: too little of it
-    drift_slope: float | None  # mean angle of the slopes that this change would look like [degrees]
+    drift_slope: float | None  # mean angle of the slopes that correspond to this change [degrees]
     removed_drift: Float32 | None  # (H, W, 3) drift taken off the canonical image's change; None: nothing is taken off
 
 
@@ -45,7 +45,7 @@ class SurfaceFinder:
         valid: (H, W) of :func:`extended_view`, as the rectification gives it.
         dots: dots are printed on the gel.
         drifts: the light is real and drifts: the drift, which is measured in any case, is removed.
-        better: what betters the height by the light's forward model, on the same pixels; None: nothing does.
+        better: improves the height by the light's forward model, on the same pixels; None: no improvement.
     """
 
     def __init__(
@@ -93,7 +93,7 @@ class SurfaceFinder:
         if self._dots:
             _fill_hidden((by_x, by_y), hidden)
         if self._any_unseen:
-            by_x[self._unseen] = by_y[self._unseen] = 0.0  # what is not seen is taken as flat
+            by_x[self._unseen] = by_y[self._unseen] = 0.0  # pixels that are not visible count as flat
         height = self._integrate(np.stack([by_x, by_y], axis=-1))
         if self._better is not None:
             height = self._better(planes, height, hidden, self._integrate)
@@ -110,7 +110,7 @@ class SurfaceFinder:
         )
 
     def _mean_angle(self, change: Float32) -> float:
-        """Mean angle [degrees] of the slopes that changes of colour (n, 3) at every STRIDE-th pixel look like."""
+        """Mean angle [degrees] of the slopes that correspond to changes of colour (n, 3) at every STRIDE-th pixel."""
         slope = np.einsum("nsc,nc->ns", self._response, change)
         steepness = np.hypot(slope[:, 0], slope[:, 1])[~self._unseen[::PIXEL_STRIDE, ::PIXEL_STRIDE].ravel()]
         return float(np.degrees(np.arctan(steepness)).mean())
@@ -135,7 +135,7 @@ class SurfaceFinder:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _PreparedReference:
-    """What follows from the reference alone."""
+    """Data computed from the reference alone."""
 
     picture: Float32  # itself
     planes: Float32  # (3, H, W) of the seen box, relative to the mean of the gel without its dots

@@ -1,4 +1,4 @@
-"""Tuned constants of the way from a picture to a height.
+"""Tuned constants of the conversion of a picture to a height.
 
 Each entry: what it is, its unit, and what it was measured on where it was.
 Sources: docs/measurements/calibration.md, docs/benchmarks.md, and the tests in tests/calibration/height.
@@ -12,7 +12,7 @@ MAX_TABLE_SLOPE = 1.5  # along each axis [-]
 
 # forward_steps.py
 PRIOR_WEIGHT = 0.4  # (error of colour that is usual / error of slope that is usual)^2
-MAX_CERTAIN_ERROR = 0.2  # error of colour from which on a channel counts little [-]
+MAX_CERTAIN_ERROR = 0.2  # error of colour above which a channel has little weight [-]
 MIN_CONTACT_CHANGE = 0.1
 
 # integration.py

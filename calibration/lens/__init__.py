@@ -1,1 +1,1 @@
-"""Where points of the gel are seen: lens and view of a camera, found with boards, and its pictures rectified."""
+"""Positions of points of the gel in pictures: lens and view of a camera from boards, and rectification."""

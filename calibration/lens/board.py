@@ -1,6 +1,6 @@
-"""Boards whose points are known, found in pictures: dots in a rectangular lattice, and ChArUco.
+"""Detection of boards with known points in pictures: dots in a rectangular lattice, and ChArUco.
 
-Dots may be printed, or pressed into a gel, and blurred: they are whatever is darker than its surroundings at one of
+Dots may be printed, or pressed into a gel, and blurred: a dot is a spot that is darker than its surroundings at one of
 several scales.
 """
 
@@ -19,12 +19,12 @@ from tacsim.models.quantity import parse_quantity
 
 
 class BadBoard(CalibrationError):
-    """A board is described wrongly, or not found."""
+    """The description of a board is wrong, or the board is not found."""
 
 
 @dataclass(frozen=True, slots=True)
 class Board:
-    """What is printed: `columns` x `rows` dots, or squares of a ChArUco board."""
+    """The pattern: `columns` x `rows` dots, or squares of a ChArUco board."""
 
     kind: str  # "dots" or "charuco"
     columns: int
@@ -39,7 +39,7 @@ class Board:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Points:
-    """Points of a board, and where they are in a picture."""
+    """Points of a board, and their positions in a picture."""
 
     board: FloatArray  # (n, 2) x, y on the board, right-handed with z away from the camera [m]
     image: FloatArray  # (n, 2) u, v [px]
@@ -60,7 +60,7 @@ def parse_board(text: str) -> Board:
         )
     columns, rows = int(size[1]), int(size[2])
     if not (3 <= columns <= max_points and 3 <= rows <= max_points):
-        raise BadBoard(f"'{text}': {columns} x {rows}; allowed: 3 to {max_points} each way")
+        raise BadBoard(f"'{text}': {columns} x {rows}; allowed: 3 to {max_points} along each axis")
     try:
         metres = [parse_quantity(length, "length") for length in lengths]
     except ValueError as error:
@@ -121,10 +121,10 @@ def _find_dot_lattice(contrast: FloatArray, board: Board) -> tuple[FloatArray, F
     if not strongest > 0.5:  # [grey levels]
         return 0
     shown = np.clip(255.0 * (1.0 - contrast / strongest), 0, 255).astype(np.uint8)
-    asked = cv2.SimpleBlobDetector.Params()
-    asked.filterByCircularity = asked.filterByConvexity = asked.filterByInertia = False
-    asked.minArea, asked.maxArea, asked.minDistBetweenBlobs = 9.0, contrast.size / 40.0, 5.0
-    detector = cv2.SimpleBlobDetector.create(asked)
+    options = cv2.SimpleBlobDetector.Params()
+    options.filterByCircularity = options.filterByConvexity = options.filterByInertia = False
+    options.minArea, options.maxArea, options.minDistBetweenBlobs = 9.0, contrast.size / 40.0, 5.0
+    detector = cv2.SimpleBlobDetector.create(options)
     blobs = np.array([point.pt for point in detector.detect(shown)], dtype=np.float64).reshape(-1, 2)
     if len(blobs) < board.columns * board.rows:
         return len(blobs)
@@ -144,7 +144,7 @@ def _find_dot_lattice(contrast: FloatArray, board: Board) -> tuple[FloatArray, F
 
 
 def _is_even(lattice: FloatArray) -> bool:
-    """True if each step from dot to dot is much like the one before: OpenCV may take a dot of the next row."""
+    """True if each step from dot to dot is similar to the one before: OpenCV may use a dot of the next row."""
     for axis in (0, 1):
         steps = np.diff(lattice, axis=axis)
         change = np.linalg.norm(np.diff(steps, axis=axis), axis=-1)
@@ -158,7 +158,7 @@ def _mean_step(lattice: FloatArray, axis: int) -> FloatArray:
 
 
 def _require_complete_lattice(lattice: FloatArray, blobs: FloatArray, board: Board) -> None:
-    """Raises BadBoard where the lattice goes on beyond its border: the board is larger than it was said to be."""
+    """Raises BadBoard if the lattice continues beyond its border: the board is larger than described."""
     for grid in (lattice, lattice[::-1], lattice.swapaxes(0, 1), lattice[:, ::-1].swapaxes(0, 1)):
         beyond = 2.0 * grid[0] - grid[1]
         near = np.linalg.norm(beyond[:, None] - blobs[None], axis=-1).min(axis=1)

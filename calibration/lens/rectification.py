@@ -1,8 +1,8 @@
 """Native image -> the canonical grid: one precomputed map from metric points on the gel to pixels of the camera.
 
-A map is made once for a sensor, from the four corners of the gel in a real image, from the view of a board that lay on
-it (distortion of the lens and perspective in one), or from the geometry of a simulated one; applying it is one look-up.
-Where the camera sees finer than the canonical grid, each canonical pixel is the mean over the area that it covers.
+A map is made once for a sensor, from the four corners of the gel in a real image, from the view of a board on it
+(distortion of the lens and perspective in one), or from the geometry of a simulated one; applying it is one look-up. If
+the resolution of the camera is finer than the canonical grid, each canonical pixel is the mean over its area.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class Rectification:
         return found
 
     def within(self, region: PictureRegion | None) -> Rectification:
-        """The same where only a polygon of the native image shows gel; None: all of it does. Raises BadCorners."""
+        """The map with only a polygon of the native image as gel; None: all of it. Raises BadCorners."""
         if region is None:
             return self
         shown = region_mask(region, self.image_shape)
@@ -86,8 +86,8 @@ class Rectification:
 
 
 def region_mask(region: PictureRegion, image_shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """(rows, columns) pixels inside a polygon. Raises BadCorners for one that encloses hardly any pixel, or that
-    reaches beyond the picture."""
+    """(rows, columns) True for pixels inside a polygon. Raises BadCorners for one with very few pixels, or one that is
+    partly outside the picture."""
     min_region = 0.02  # of a picture, that a region must enclose
     import cv2
 
@@ -116,7 +116,7 @@ def rectification_of_corners(
         image_shape: rows, columns of the native image.
         grid: pixels of the canonical image.
 
-    Raises BadCorners when the corners are out of order, on a line, or far outside the image.
+    Raises BadCorners if the corners are out of order, on a line, or far outside the image.
     """
     import cv2
 
@@ -202,7 +202,7 @@ def _limit_lookups(factor: int) -> int:
 
 
 def visible_box(valid: NDArray[np.bool_]) -> tuple[slice, slice]:
-    """Rows and columns of a view in which gel is seen. Raises ValueError when there are none."""
+    """Rows and columns of a view that show the gel. Raises ValueError if there are none."""
     rows, columns = np.flatnonzero(valid.any(axis=1)), np.flatnonzero(valid.any(axis=0))
     if len(rows) < 2 or len(columns) < 2:
         raise ValueError("the camera sees no gel: check corners, size or geometry of the sensor")

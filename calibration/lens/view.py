@@ -1,8 +1,8 @@
-"""Where points of space and of the gel's plane appear in a camera's picture: lens, and view of the plane.
+"""Projection of points in space and on the gel's plane to a camera's picture: lens, and view of the plane.
 
-A lens is calibrated from several pictures of one board, tilted in many ways. The view of a gel's plane needs one
-picture of a board that lies on it: a perspective through the lens, or if that is unknown with as much radial distortion
-as predicts left-out dots better.
+A lens is calibrated from several pictures of one board at many tilts. The view of a gel's plane needs one picture of a
+board on it: a perspective through the lens, or for an unknown lens with the amount of radial distortion that predicts
+left-out dots best.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ Corners = tuple[Pair, Pair, Pair, Pair]
 
 
 class BadView(CalibrationError):
-    """Pictures of a board determine no lens, or no plane."""
+    """The pictures of a board do not determine a lens or a plane."""
 
 
 class BadCorners(CalibrationError):
-    """The four corners are not those of a rectangle in a picture."""
+    """The four corners are not the picture of a rectangle."""
 
 
 def pinhole_lens(image_shape: tuple[int, int], distortion: Sequence[float] = ()) -> Lens:
-    """A lens of which nothing is known, with the picture's longer side for its focal length. `distortion`: k1, k2, and
-    its centre from the picture's middle, over the longer side."""
+    """An unknown lens, with the picture's longer side as its focal length. distortion: k1, k2, and its centre from the
+    picture's centre, over the longer side."""
     rows, columns = image_shape
     k1, k2, off_x, off_y = (*distortion, 0.0, 0.0, 0.0, 0.0)[:4]
     side = float(max(rows, columns))
@@ -64,7 +64,7 @@ def fit_lens(pictures: Mapping[str, Points], image_shape: tuple[int, int]) -> tu
     rows, columns = image_shape
     on_board = [np.pad(each.board, ((0, 0), (0, 1))).astype(np.float32) for each in pictures.values()]
     seen = [each.image.astype(np.float32).reshape(-1, 1, 2) for each in pictures.values()]
-    # k3 needs more of a fish-eye than these cameras have
+    # k3 is only needed for wider lenses
     answer: Any = cv2.calibrateCameraExtended(
         on_board, seen, (columns, rows), np.eye(3), np.zeros(5), flags=cv2.CALIB_FIX_K3
     )
@@ -130,12 +130,12 @@ def fit_view(
     size: Pair | None = None,
     board: str = "",
 ) -> GelView:
-    """The view of the plane on which a board lies.
+    """The view of the plane of a board.
 
     Args:
-        lens: of the camera; None: radial distortion is fitted along if that pays.
-        centre: pixel (u, v) of the sensor's axis; None: the picture's middle.
-        size: x, y of the gel [m]; None: as far to both sides as the board reaches, plus half a pitch.
+        lens: of the camera; None: radial distortion is also fitted if it improves the prediction.
+        centre: pixel (u, v) of the sensor's axis; None: the picture's centre.
+        size: x, y of the gel [m]; None: the extent of the board, plus half a pitch on each side.
 
     Raises BadView.
     """
@@ -211,7 +211,7 @@ def check_corners(corners: Sequence[tuple[float, float]], image_shape: tuple[int
 
 def view_of_corners(corners: Sequence[Pair], size: Pair, image_shape: tuple[int, int]) -> GelView:
     """The view of a gel of `size` (x, y) [m] by its corners in the picture: top left, top right, bottom right, bottom
-    left [px]. No residual tells whether they are right. Raises BadCorners."""
+    left [px]. There is no residual to check them. Raises BadCorners."""
     check_corners(corners, image_shape)
     lens = pinhole_lens(image_shape)
     x, y = size[0] / 2, size[1] / 2
@@ -231,11 +231,11 @@ def view_of_corners(corners: Sequence[Pair], size: Pair, image_shape: tuple[int,
 
 
 def calibrated_view(view: GelView | None, pitch: float, image_shape: tuple[int, int]) -> tuple[GelView | None, float]:
-    """The view by which pictures of `image_shape` (rows, columns) are calibrated, and its pixel pitch [m]: the given
-    ones, or coarser ones for a camera that sees finer than the canonical grid. Then a picture that was metric by itself
-    (no view, `pitch` [m]) gets a view, which keeps the size of native pictures."""
+    """The view for the calibration of pictures of `image_shape` (rows, columns), and its pixel pitch [m]: the given
+    ones, or coarser ones for a camera with a finer resolution than the canonical grid. Then a metric picture (no view,
+    `pitch` [m]) gets a view, which keeps the size of native pictures."""
     max_pixels = 160_000
-    # A light is calibrated at no finer pixels than these: four a cell of the canonical grid, and so many in all
+    # A light is calibrated at no finer pixels than these: four a cell of the canonical grid, and this number in total
     # [m]
     finest_pitch = 0.25e-3 / 4
     rows, columns = image_shape

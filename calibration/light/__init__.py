@@ -1,1 +1,1 @@
-"""Where the light of a sensor is calibrated, from presses of a ball: `calibrator.calibrate_light`."""
+"""Calibration of the light of a sensor from presses of a ball: `calibrator.calibrate_light`."""

@@ -1,6 +1,6 @@
-"""From a few presses of a ball of known radius to the calibrated light of a sensor.
+"""Calibrates the light of a sensor from a few presses of a ball of known radius.
 
-Finds the contact circles, refines them with the gel's thickness and the light all together, then fits the forward
+Finds the contact circles, refines them together with the gel's thickness and the light, then fits the forward
 model (slope -> colour) and the inverse one (colour -> slope) to the same labels.
 """
 
@@ -69,13 +69,13 @@ from tacsim.models.photometric import (
 )
 from tacsim.optics.render import darken_by_depth
 
-SATURATED_ROUNDS = 2  # of telling which saturated pixels are predicted too dark
-ORDER_FRAMES = 9  # frames whose median tells the order of colours, at most
+SATURATED_ROUNDS = 2  # of the search for saturated pixels that are predicted too dark
+ORDER_FRAMES = 9  # maximum number of frames whose median gives the channel order
 NO_DIRECTION = "this light tells no direction: all flanks of a dent change alike"
 
 
 class NoDirection(BadFrames):
-    """A light tells neither direction nor depth: no model of it can be made."""
+    """A light shows neither direction nor depth: it has no model."""
 
 
 def calibrate_light(
@@ -91,13 +91,13 @@ def calibrate_light(
         reference: (H, W, 3) uint8 RGB without contact.
         frames: names and pictures of presses, same size.
         ball: radius of the ball [px].
-        erase: takes away the dots that are printed on the gel.
-        untouched: more pictures without contact, which are only checked.
+        erase: removes the dots that are printed on the gel.
+        untouched: other pictures without contact, for checks only.
 
-    Which kind of light it is, the pictures tell: if colours change alike all round each contact, it tells no direction,
-    and is calibrated as one that tells depth by darkness.
+    The pictures determine the kind of light: if colours change equally all around each contact, the light shows no
+    direction, and is calibrated as one that shows depth as darkness.
 
-    Raises BadFrames, with what is wrong in every frame, when no press can be used; NoDirection.
+    Raises BadFrames, with the errors of all frames, if no press can be used; NoDirection.
     """
     _require_valid_frames(reference, frames)
     shown = reference
@@ -166,7 +166,7 @@ def calibrate_light(
 def _leave_out_outliers(
     found: list[BallPress], left_out: list[tuple[str, str]], reference: Image, mean: FloatArray, ball: float
 ) -> None:
-    """Blurred pictures, and presses that the light of the others does not explain."""
+    """Notes on blurred pictures, and on presses that the light of the others does not explain."""
     for k, share in reversed(find_blurred_presses(found, reference, mean)):
         why = f"blurred: {share:.0%} of the fine detail of other pictures; press again, held still and in focus"
         left_out.append((found.pop(k).name, why))
@@ -178,7 +178,7 @@ def _leave_out_outliers(
 def _leave_out_other_balls(
     presses: list[BallPress], refined: RefinedGeometry, left_out: list[tuple[str, str]], ball: float
 ) -> tuple[list[BallPress], RefinedGeometry]:
-    """Without the presses of another ball."""
+    """The presses without those of another ball."""
     windows = [_press_window(press, SHADED_PIXELS) for press in presses]
     others, ratio = find_other_balls(windows, refined.circles, refined.thickness, ball, presses[0].shape)
     if not others:
@@ -191,7 +191,7 @@ def _leave_out_other_balls(
 def _forward_equations(
     presses: Sequence[BallPress], labels: Sequence[FloatArray], extra_terms_of_presses: Sequence[FloatArray]
 ) -> tuple[ModelSize, list[NormalEquations]]:
-    """The size of the forward model, and each press's equations, with those of its saturated pixels that are predicted
+    """The size of the forward model, and the equations of each press, which include saturated pixels that are predicted
     too dark."""
     sets = [forward_equations(p, g, b) for p, g, b in zip(presses, labels, extra_terms_of_presses, strict=True)]
     size = choose_size(sets)
@@ -211,7 +211,7 @@ def _join_names(frames: Sequence[tuple[str, Image]]) -> tuple[str, ...]:
 def _calibrate_darkness(
     found: list[BallPress], left_out: list[tuple[str, str]], mean: FloatArray, reference: Image, ball: float
 ) -> LightFit:
-    """The calibration of a light that tells depth and no direction. Raises BadFrames where it does not do that, too."""
+    """The calibration of a light that shows depth and no direction. Raises BadFrames if it shows no depth."""
     if not found:
         raise _no_presses_error(left_out)
     try:
@@ -267,9 +267,9 @@ def _no_presses_error(left_out: Sequence[tuple[str, str]]) -> BadFrames:
 
 
 def _require_valid_frames(reference: Image, frames: Sequence[tuple[str, Image]]) -> None:
-    """Raises BadFrames for none, for other sizes, and for red and blue exchanged."""
+    """Raises BadFrames without frames, for different sizes, and for red and blue exchanged."""
     if not frames:
-        raise BadFrames("no frame of a press; give at least one, better 5 to 8, beside the one without contact")
+        raise BadFrames("no frame of a press; give at least one, better 5 to 8, in addition to the one without contact")
     other = [
         f"{name} ({image.shape[1]} x {image.shape[0]})" for name, image in frames if image.shape != reference.shape
     ]
@@ -289,7 +289,7 @@ def _require_valid_frames(reference: Image, frames: Sequence[tuple[str, Image]])
 def _refine_without_outlier(
     found: list[BallPress], left_out: list[tuple[str, str]], ball: float
 ) -> tuple[list[BallPress], RefinedGeometry]:
-    """Refines all circles, leaves the worst outlier out, and refines again. Raises BadFrames when nothing is left."""
+    """Refines all circles, removes the worst outlier, and refines again. Raises BadFrames if no press is left."""
     while found:
         refined = refine_geometry([_press_window(press) for press in found], [press.circle for press in found], ball)
         limit = MAX_RESIDUAL_SHARE
@@ -309,8 +309,8 @@ def _refine_without_outlier(
 def _fit_shadows(
     presses: list[BallPress], refined: RefinedGeometry, ball: float
 ) -> tuple[list[BallPress], RefinedGeometry, DentShade | None]:
-    """Where cast shadows are seen: their lamps, and the circles refined with them, which else grow towards the shade
-    and take it for skirt. Else what was given, and None."""
+    """The circles refined with cast shadows, and the lamps of these; without shadows the given circles, and None.
+    Without lamps, circles would grow into a shadow, as if it were skirt."""
     round_count = 2  # of refining circles and lamps in turn
     if len(presses) <= MAX_FEW_PRESSES or np.mean(refined.residual_shares) < MIN_SHADOW_RESIDUAL:
         return presses, refined, None
@@ -323,14 +323,14 @@ def _fit_shadows(
     ]
     if not choose_size(sets).shadows:
         return presses, refined, None
-    for _ in range(round_count):  # circles tell where the lamps stand, and the lamps where the circles are
+    for _ in range(round_count):  # circles give the lamps, and the lamps give better circles
         refined = refine_geometry(windows, refined.circles, ball, shade, (ball / refined.thickness,))
         shade = find_lamps(windows, refined.circles, refined.thickness, ball, presses[0].shape)
     return [replace(p, circle=c) for p, c in zip(presses, refined.circles, strict=True)], refined, shade
 
 
 def _warnings(presses: Sequence[BallPress], mean: FloatArray, left_out: int) -> list[str]:
-    """What a person should look at in the frames; calibration.light.checks.verdict judges the figures."""
+    """Notes on frames to check by eye; calibration.light.checks.verdict judges the figures."""
     found = []
     drift = float(np.abs(np.median([(p.drift / mean).mean(axis=(0, 1)) for p in presses], axis=0)).max())
     if drift > STALE_COLOUR:
@@ -349,7 +349,7 @@ def _warnings(presses: Sequence[BallPress], mean: FloatArray, left_out: int) -> 
 
 
 def _poorly_predicted(predictions: Sequence[PressPrediction]) -> list[str]:
-    """Only with three or more: of two presses either may be the bad one."""
+    """A note on presses with bad predictions, from three presses on: of two, either may be the bad one."""
     bad = [prediction for prediction in predictions if prediction.angle > MAX_NORMAL_ERROR]
     if len(predictions) < 3 or not bad:
         return []
@@ -361,7 +361,7 @@ def _poorly_predicted(predictions: Sequence[PressPrediction]) -> list[str]:
 
 
 def _press_window(press: BallPress, pixels: int = 2500) -> Window:
-    """Pixels of contact and skirt, thinned out to about so many."""
+    """Pixels of contact and skirt, reduced to about `count`."""
     v, u = np.nonzero(contact_and_skirt(press))
     thin = max(1, round(np.sqrt(len(u) / pixels)))
     keep = (u % thin == 0) & (v % thin == 0) & press.lit[v, u].all(axis=1)
@@ -378,9 +378,9 @@ def _predict_press(
     mean: FloatArray,
     reference: Image,
 ) -> PressPrediction:
-    """Of a press labelled `gradient` (H, W, 2), `extra_terms` (H, W, terms), by models made without it.
-    Slopes are found as in every picture: from each pixel's colour, then those of a surface that the forward model
-    agrees with."""
+    """The prediction of a press with labels `gradient` (H, W, 2), `extra_terms` (H, W, terms), by models without it.
+    Slopes are found as in every picture: from each pixel's colour, then those of a surface that fits the forward
+    model."""
     places = image_grid_places(*press.shape[::-1])
     height = None if forward.depth is None else (extra_terms[..., 0] * forward.depth.deepest).astype(np.float32)
     light, _ = PhotometricLight(forward).change(gradient.astype(np.float32), *places, height)

@@ -2,11 +2,12 @@
 
 One definition for real and rendered images: the radius of the elastic dent that explains the difference best. The dent
 has a ball inside the circle and Hertz's free surface outside (Johnson, Contact Mechanics, 1985, eq. 3.42a), scaled to
-meet the ball's slope at the circle. How slope becomes colour is not assumed: in each channel a quadratic polynomial of
-both slopes, solved anew for each image by least squares. So no light is calibrated, and nothing is set for a sensor.
+meet the ball's slope at the circle. The relation of slope and colour is not assumed: in each channel it is a
+quadratic polynomial of both slopes, fitted again to each image by least squares. So no light is calibrated, and there
+is no parameter of a sensor.
 
-On a layer 1.7 contact radii thick the surface outside drops faster than Hertz's, and the radius comes out 4 % small; on
-a thicker one by less. So compare radii found in the same way.
+On a layer 1.7 contact radii thick the surface outside drops faster than Hertz's, and the radius is 4 % too small; on a
+thicker one the error is smaller. So compare only radii found by the same method.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ class Circle:
 def find_contact_circle(image: NDArray[np.uint8], reference: NDArray[np.uint8], ball_radius: float) -> Circle:
     """Finds the contact of a ball of known radius [px] in `image` (H, W, 3); `reference` is the same without contact.
 
-    Raises ValueError when the two images differ in size, NoCircle when no ball's contact is seen.
+    Raises ValueError if the two images differ in size, NoCircle if no ball's contact is visible.
     """
     window_half_side = 2.0  # half side of what the fit looks at [half widths of the bright patch]
     if image.shape != reference.shape:
@@ -123,7 +124,7 @@ def _brightest_patch(difference: FloatArray) -> tuple[float, float, float]:
 def _residual_share(
     observed: FloatArray, power: tuple[float, float], dx: FloatArray, dy: FloatArray, contact: float, ball: float
 ) -> float:
-    """Share of the variance of `observed` (3, n) that no polynomial of the dent's slopes explains; `power`: sums of the
+    """Share of the variance of `observed` (3, n) that no polynomial of the dent's slopes explains. power: sums of the
     squares of `observed`, and of its variations."""
     r = np.hypot(dx[None, :], dy[:, None])
     steepness = dent_slope(r, contact, ball) / np.maximum(r, 1e-12)

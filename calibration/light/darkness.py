@@ -1,10 +1,10 @@
-"""Presses of a ball under a light that tells no direction: how dark a pixel is tells of depth, not of slope.
+"""Presses of a ball under a light without direction: the darkness of a pixel depends on depth, not on slope.
 
-Such a light is known by its presses: on each ring round the middle of a contact the change of colour is the same. Then
-circles, the gel's thickness and the two numbers of DarknessModel are found together with a light in proportion
-to depth, by one factor above 0 and one below (variable projection, as in calibration.light.refinement; a quadratic in a
-single press trades against its radius, so it takes several). The table itself is fitted to them last, and is monotone
-by construction. One press is enough for it: what others add is whether it holds for them.
+Presses identify such a light: on each ring around the centre of a contact the change of colour is the same. Circles,
+the gel's thickness and the two numbers of DarknessModel are then fitted together with a light proportional to depth,
+with one factor above 0 and one below (variable projection, as in calibration.light.refinement; in a single press a
+quadratic is not independent of the radius, so it needs several). The table is fitted last, and is monotone by
+construction. One press is enough for it; other presses check it.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from tacsim.models.photometric import DarknessModel
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DarknessFit:
-    """What presses tell of such a light; lengths in pixels."""
+    """The fit of such a light; lengths in pixels."""
 
     presses: tuple[BallPress, ...]  # with their circles refined
     thickness: float  # of the gel
@@ -50,7 +50,7 @@ class DarknessFit:
 
 
 def rough_contact(change: FloatArray) -> ContactCircle:
-    """Where a change of colour (H, W, 3) is strongest. Raises NoCircle."""
+    """Position of the strongest change of colour (H, W, 3). Raises NoCircle."""
     edge_ratio = 1.3  # contact radius over the radius where a press is half as dark as in its middle, about
     import cv2
 
@@ -66,8 +66,8 @@ def rough_contact(change: FloatArray) -> ContactCircle:
 
 
 def is_direction_free(changes: Iterable[FloatArray]) -> bool:
-    """True where most changes of colour (H, W, 3) are the same all round their contacts, in each channel: what is
-    strongest may be one flank alone, which in its own colour is round too, and not in the others."""
+    """True if most changes of colour (H, W, 3) are the same all around their contacts, in each channel: the strongest
+    change may be a single flank, which is round in its own colour, but not in the others."""
     looked_at = 2.5  # up to where it is looked at [contact radii]: a flank's neighbours are there, too
     shares = []
     for raw in changes:
@@ -88,8 +88,8 @@ def is_direction_free(changes: Iterable[FloatArray]) -> bool:
 
 
 def find_dark_press(name: str, image: Image, reference: Image, mean: FloatArray, ball: float) -> BallPress:
-    """One frame's press: its circle, about, and its change of colour without drift; as calibration.light.press says.
-    Raises NoCircle, BadFrames."""
+    """The press of one frame: its approximate circle, and its change of colour without drift, as in
+    calibration.light.press. Raises NoCircle, BadFrames."""
     raw = image.astype(np.float64) - reference
     circle = rough_contact((raw - np.median(raw, axis=(0, 1))) / mean)
     circle = replace(circle, radius=min(circle.radius, 0.9 * MAX_RIM_RATIO * ball))
@@ -98,10 +98,10 @@ def find_dark_press(name: str, image: Image, reference: Image, mean: FloatArray,
 
 def dark_circle(image: Image, reference: Image, ball: float) -> Circle:
     """Finds the contact of a ball of radius `ball` [px] in `image` (H, W, 3), as a calibration from this press alone
-    would: :func:`calibration.light.circle.find_contact_circle` for a light that tells no direction. `reference`
+    would: :func:`calibration.light.circle.find_contact_circle` for a light without direction. `reference`
     (H, W, 3) is the same without contact.
 
-    Raises BadFrames for a reference that is dark or saturated, NoCircle when no ball's contact is seen.
+    Raises BadFrames for a reference that is dark or saturated, NoCircle if no ball's contact is visible.
     """
     mean = mean_reference_colour(reference)
     try:
@@ -119,8 +119,8 @@ def dark_circle(image: Image, reference: Image, ball: float) -> Circle:
 
 
 def fit_darkness(presses: Sequence[BallPress], ball: float) -> DarknessFit:
-    """Circles, thickness and model of presses; `ball`: its radius [px]. Raises BadFrames where darkness tells no
-    depth: nowhere does it grow with it."""
+    """Circles, thickness and model of presses; `ball`: its radius [px]. Raises BadFrames if darkness does not
+    increase with depth."""
     problem = _Problem(presses, ball)
     ends = sorted((problem.refined(problem.start(thinness)) for thinness in FIRST_THINNESS), key=lambda end: end[1])
     best, cost = ends[0]
@@ -147,7 +147,7 @@ def fit_darkness(presses: Sequence[BallPress], ball: float) -> DarknessFit:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Window:
-    """The n pixels of one press that take part."""
+    """The n used pixels of one press."""
 
     u: FloatArray
     v: FloatArray
@@ -169,7 +169,7 @@ class _Problem:
         return np.array([*circles, thinness, *first_guess])
 
     def refined(self, start: FloatArray) -> tuple[FloatArray, float]:
-        """The least near `start`, and its cost."""
+        """The minimum near `start`, and its cost."""
         bounds = ((0.0, 0.05), (0.8, 1.5))  # of share, reach
         from scipy.optimize import least_squares
 
@@ -273,7 +273,7 @@ def _leave_one_out(parts: Sequence[FloatArray], i: int) -> list[FloatArray]:
 
 def _fit_table(depths: Sequence[FloatArray], observed: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
     """Knots (k,) and changes (k, 3) that fall from each to the next and are 0 at depth 0: the least squares of changes
-    `observed` (n, 3) at `depths` (n,) by non-negative steps. Raises BadFrames where nothing falls."""
+    `observed` (n, 3) at `depths` (n,) by non-negative steps. Raises BadFrames if no change falls."""
     min_slope = 0.01  # least slope of the table, over its mean
     knot_count = 24  # of the table
     from scipy.optimize import nnls

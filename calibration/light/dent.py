@@ -1,4 +1,4 @@
-"""The dent that a ball presses into a gel: what a photometric calibration takes for the true surface.
+"""The dent that a ball presses into a gel: the reference surface of a photometric calibration.
 
 Inside the contact circle (radius a) the gel has the ball's slope. Outside it has the slope of an elastic layer, bonded
 to a rigid base, under Hertz's pressure, scaled to meet the ball's slope at the circle:
@@ -7,9 +7,9 @@ to a rigid base, under Hertz's pressure, scaled to meet the ball's slope at the 
     s(r) = a / sqrt(R^2 - a^2) S(r/a) / S(1)      r >= a
 
 On a thick layer S is Hertz's (Johnson, Contact Mechanics, 1985, eq. 3.42a): it falls to 53 % within a tenth of a
-contact radius, and nothing is free in it. A thinner layer lets it fall faster. So the skirt has one number, the layer's
-thickness, and cannot be taken for a part of the contact. (A skirt with a length and a step at the circle, both free,
-can: where light spreads in the gel, the step vanished and the circles came out 15 % small.)
+contact radius, without a free parameter. On a thinner layer it falls faster. So the skirt has one parameter, the
+layer's thickness, and cannot be confused with a part of the contact. (A skirt with two free parameters, a length and a
+step at the circle, can: if light spreads in the gel, the step vanishes and the circles are 15 % too small.)
 """
 
 from __future__ import annotations
@@ -43,8 +43,9 @@ def layer_slope(distance: FloatArray, thinness: float) -> FloatArray:
     layer's thickness, 0 to 3.
 
     Hertz's pressure has the transform (sin k - k cos k) / k^3; a half-space answers by 1/k to a wave of number k, a
-    bonded layer by less, least to waves that are long beside its thickness (Dimitriadis et al., Biophys. J. 82, 2002).
-    Against the pressure that really makes a ball's dent, the error is 1 % of the slope at the circle, up to 1.5.
+    bonded layer by less, and least to waves that are long compared with its thickness (Dimitriadis et al., Biophys. J.
+    82, 2002).
+    Compared with the true pressure of a ball's dent, the error is 1 % of the slope at the circle, up to 1.5.
     """
     from scipy.special import j1
 
@@ -60,8 +61,8 @@ def layer_slope(distance: FloatArray, thinness: float) -> FloatArray:
 
 @functools.cache
 def _layer_quadrature() -> tuple[FloatArray, FloatArray]:
-    """Numbers of waves over one thickness, and how much less than a half-space a layer answers, times the weights of
-    Gauss's quadrature."""
+    """Numbers of waves over one thickness, and the response of a layer minus that of a half-space, times the weights of
+    Gauss quadrature."""
     nu = 0.48  # of silicone; between 0.45 and 0.495 the slope changes by 2 % of that at the circle
     x, weights = np.polynomial.legendre.leggauss(48)
     q, soft = 5.0 * (x + 1), 3 - 4 * nu  # beyond 10 the difference is 1e-7
@@ -89,7 +90,7 @@ def dent_gradient(
     """(..., 2) slopes of the height (into the gel) at pixels u, v (...,); `ball`: its radius, `thickness` of the layer
     [px].
 
-    `blur` [px]: standard deviation of the blur through which the dent is seen, along its radius.
+    blur: [px] standard deviation of the blur of the picture of the dent, along its radius.
 
     Raises ValueError for a circle as large as the ball.
     """
@@ -103,7 +104,9 @@ def dent_gradient(
         profile = dent_slope(reach, circle.radius, ball, thickness)
         side = round(4 * blur / radius_step)
         kernel = np.exp(-((np.arange(-side, side + 1) * radius_step / blur) ** 2) / 2)
-        odd = np.concatenate([-profile[side:0:-1], profile])  # to the other side of the axis it slopes the other way
+        odd = np.concatenate(
+            [-profile[side:0:-1], profile]
+        )  # on the opposite side of the axis the slope has the opposite sign
         slope = np.interp(r, reach[: len(reach) - side], np.convolve(odd, kernel / kernel.sum(), mode="valid"))
     steepness = slope / np.maximum(r, 1e-9)
     return np.stack([-steepness * dx, -steepness * dy], axis=-1)
@@ -118,7 +121,7 @@ def depth_profile(radii: FloatArray, contact: float, ball: float, thickness: flo
 
 @functools.lru_cache(maxsize=64)
 def cached_profile(contact: float, ball: float, thickness: float) -> tuple[FloatArray, FloatArray]:
-    """Radii up to FAR ball radii and the depth of a dent there [px]; for everybody, not to be written to."""
+    """Radii up to FAR ball radii and the depth of a dent there [px]; cached, so do not write to them."""
     depth_step = 1.0  # of those at which the depth is found [px]
     radii = np.arange(0.0, MAX_RADIUS_RATIO * ball, depth_step)
     return radii, depth_profile(radii, contact, ball, thickness)
@@ -131,15 +134,15 @@ def dent_height(u: FloatArray, v: FloatArray, circle: ContactCircle, thickness: 
 
 
 def contact_depth(contact: float, ball: float, thickness: float) -> float:
-    """How deep a ball is in a layer when its contact is as wide as that: Hertz's a^2 / R, less on a thin layer; all in
-    one unit."""
+    """Depth of a ball in a layer at this contact radius: Hertz's a^2 / R, less on a thin layer; all in one unit."""
     from scipy.special import j1
 
     waves, weights = _layer_quadrature()
     waves = waves * (contact / thickness)
     less = 4 / np.pi * weights * (np.sin(waves) - waves * np.cos(waves)) / waves**2 * (contact / thickness)
     inside = np.linspace(0.05, 1.0, 20)
-    slope = inside - j1(np.outer(inside, waves)) @ less  # the ball's is `inside`: the pressure is that much larger
+    # the slope of the ball is `inside`: the pressure is larger by this factor
+    slope = inside - j1(np.outer(inside, waves)) @ less
     pressure = float((inside**3).sum() / (slope * inside**2).sum())
     return contact**2 / ball * pressure * (1 - float((less / waves).sum()))
 

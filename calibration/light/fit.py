@@ -1,4 +1,4 @@
-"""What calibrating a light ends in: its models, how well they predict presses that took no part, and its bundle."""
+"""Result of the calibration of a light: its models, their predictions of left-out presses, and its bundle."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tacsim.models.sensor import CameraNoise, Markers, SensorGeometry
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PressPrediction:
-    """How well one press is predicted by a calibration made without it."""
+    """Error of the prediction of one press by a calibration without it."""
 
     name: str
     circle: ContactCircle
@@ -40,21 +40,21 @@ class PressPrediction:
 class LightFit:
     """A calibrated light."""
 
-    forward: PhotometricModel | None  # None, as the next two: of a light that tells no direction
+    forward: PhotometricModel | None  # None, as the next two, for a light without direction
     inverse: InverseModel | None
     size: ModelSize | None
-    thickness: float  # of the gel, as the skirts of the dents tell it [px]
+    thickness: float  # of the gel, from the skirts of the dents [px]
     radius_uncertainty: float  # of the scale of all contact radii [-]; NaN for a single press
     residual_shares: tuple[float, ...]  # share of each press's change of colour that no dent explains
     predictions: tuple[PressPrediction, ...]
-    left_out: tuple[tuple[str, str], ...]  # frames that took no part, and why
+    left_out: tuple[tuple[str, str], ...]  # frames that were not used, with the reasons
     warnings: tuple[str, ...]
     reference: Image
     presses: tuple[BallPress, ...]
     frames: tuple[str, ...]  # names of all that were given
-    darkness: DarknessModel | None = None  # of a light that tells depth and no direction; lengths in pixels
+    darkness: DarknessModel | None = None  # of a light that shows depth and no direction; lengths in pixels
     stretch: Stretch | None = None  # of contacts, which are round; None: not measured
-    image_warnings: tuple[str, ...] = ()  # why the pictures are not to be trusted, and what to do after a colon
+    image_warnings: tuple[str, ...] = ()  # reasons not to trust the pictures, each with advice after a colon
 
     def to_calibration(
         self,
@@ -107,8 +107,8 @@ class LightFit:
 def compare_with_prediction(
     press: BallPress, predicted: FloatArray, angles: FloatArray, mean: FloatArray, reference: Image
 ) -> PressPrediction:
-    """A press beside what was predicted of it: change of colour (H, W, 3) [grey levels], and how far the normals that
-    were found are off (H, W) [degrees]."""
+    """A press and its prediction: change of colour (H, W, 3) [grey levels], and error of the normals (H, W)
+    [degrees]."""
     distance = press.distance() / press.circle.radius
     untouched_here = np.float64(reference) + press.drift  # what this frame would show without contact
     predicted = np.clip(untouched_here + predicted, 0.0, 255.0) - untouched_here

@@ -1,5 +1,5 @@
-"""What a calibrated light is fitted to: slopes, depths and shadows that a press is taken to have, beside the colours
-that are seen; and the models that follow."""
+"""Labels for the fit of a light: assumed slopes, depths and shadows of a press, with the observed colours; and the
+models that result."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ from tacsim.models.photometric import (
     normal_terms,
 )
 
-Rows = tuple[tuple[float, float, float], ...]  # weights of R, G, B, a row a term
+Rows = tuple[tuple[float, float, float], ...]  # weights of R, G, B, one row for each term
 
 
 def label_slopes(press: BallPress, refined: RefinedGeometry, ball: float) -> FloatArray:
-    """(H, W, 2) slopes that are taken for the true ones."""
+    """(H, W, 2) reference slopes."""
     v, u = np.mgrid[: press.shape[0], : press.shape[1]].astype(np.float64)
     return dent_gradient(u, v, press.circle, refined.thickness, ball, RIM_BLUR)
 
@@ -59,7 +59,7 @@ def deepest_dent(refined: RefinedGeometry, ball: float) -> float:
 def extra_forward_terms(
     press: BallPress, gradient: FloatArray, refined: RefinedGeometry, ball: float, shade: DentShade | None
 ) -> FloatArray:
-    """(H, W, terms) of depth, of slopes (H, W, 2) at depth, and of cast shadows where there are any."""
+    """(H, W, terms) of depth, of slopes (H, W, 2) at depth, and of cast shadows if there are any."""
     v, u = np.mgrid[: press.shape[0], : press.shape[1]].astype(np.float64)
     height = dent_height(u, v, press.circle, refined.thickness, ball)
     places = np.meshgrid(*image_axes(press.shape[1], press.shape[0]))
@@ -87,7 +87,7 @@ def _image_places(mask: Mask) -> tuple[FloatArray, FloatArray]:
 def forward_equations(
     press: BallPress, gradient: FloatArray, extra_terms: FloatArray, counted: Mask | None = None
 ) -> NormalEquations:
-    """`counted` (H, W, 3): what takes part; None: what is not saturated."""
+    """counted: (H, W, 3) used values; None: those that are not saturated."""
     near = contact_and_skirt(press)
     change = gaussian_blur(press.change, FORWARD_BLUR)[near]
     lit = press.lit if counted is None else counted
@@ -97,8 +97,8 @@ def forward_equations(
 def counted_pixels(
     press: BallPress, gradient: FloatArray, extra_terms: FloatArray, weights: FloatArray, size: ModelSize
 ) -> Mask:
-    """(H, W, 3) what is not saturated, and what is where `weights` say less than is seen: a saturated pixel says "at
-    least so bright"."""
+    """(H, W, 3) True for values that are not saturated, and for saturated ones that `weights` predict too dark, because
+    a saturated value is a lower bound."""
     counted = press.lit.copy()
     where = contact_and_skirt(press) & ~press.lit.all(axis=2)
     light = photometric_features(gradient[where], *_image_places(where), *MAX_SIZE)

@@ -1,5 +1,5 @@
-"""Noise of a real camera: what differs between two pictures without contact, or beside the contact of a press; and the
-share of the untouched picture's grain that is on the gel's skin."""
+"""Noise of a real camera: the difference between two pictures without contact, or outside the contact of a press; and
+the share of the untouched picture's grain that is on the gel's skin."""
 
 from __future__ import annotations
 
@@ -21,26 +21,26 @@ Entry = TypeVar("Entry", bound=np.generic)
 
 TILE = 32  # side of the tiles; what is wider is drift, not noise [px]
 MAX_DARK_LEVEL = 2  # a channel at or below this has lost its noise [grey levels]
-SKIN_NEAR = (1.25, 2.2)  # where the skin has moved, and the light changes little [contact radii]
-SKIN_FAR = (4.0, 8.0)  # where it has hardly, in about the same light
+SKIN_NEAR = (1.25, 2.2)  # region in which the skin has moved, and the light changes little [contact radii]
+SKIN_FAR = (4.0, 8.0)  # region in which it has hardly moved, in a similar light
 # A smaller one cannot be distinguished from none: three real sensors without skin have at most 0.07.
 MIN_SKIN_SHARE = 0.2
 MIN_STANDARD_ERRORS = 3.0  # standard errors over presses that the share must be from none
 
 
 class NoiseUnknown(ValueError):
-    """Noise cannot be measured in these pictures: why, and what to do."""
+    """Noise cannot be measured in these pictures. The message gives the reason, and what to do."""
 
 
 def measure_noise(frames: Sequence[Image]) -> CameraNoise:
     """From two or more pictures (H, W, 3) uint8 RGB without contact, of one camera and setting, in the order taken.
 
-    Two pictures far apart in time are subtracted, so that nothing that stands still counts; then a quadratic in the
-    place, the drift of the light, and the mean of each tile are taken off. Spread and correlations are those of the
-    median tile: what happens on less than half of the picture (a touch, a reflection) does not count. Not the median
-    absolute deviation of pixels: in whole grey levels it has steps as large as the noise of a good camera.
+    Two pictures far apart in time are subtracted, which removes constant structure; then a quadratic in the place, the
+    drift of the light, and the mean of each tile are subtracted. Spread and correlations are those of the median tile,
+    so changes on less than half of the picture (a touch, a reflection) have no effect. The median absolute deviation of
+    pixels is not used: for integer grey levels it has steps as large as the noise of a good camera.
 
-    Tiles take a little of the spread of noise that is wide: 1.6 % where neighbours are correlated by 0.7.
+    Tiles reduce the spread of correlated noise slightly: by 1.6 % if neighbours are correlated by 0.7.
     Raises NoiseUnknown.
     """
     if len(frames) < 2:
@@ -55,9 +55,9 @@ def measure_noise(frames: Sequence[Image]) -> CameraNoise:
 
 
 def measure_press_noise(presses: Sequence[BallPress], reference: Image) -> CameraNoise:
-    """The same from presses and the one `reference` (H, W, 3) without contact, where nothing touches: farther than FAR
-    contact radii from the middle. Noise of both is taken to be alike; what has changed between them in small, such as
-    dirt, counts as noise. Raises NoiseUnknown."""
+    """The same from presses and one `reference` (H, W, 3) without contact, outside the contacts: farther than FAR
+    contact radii from the centre. Both are assumed to have equal noise; small changes between them, such as dirt,
+    count as noise. Raises NoiseUnknown."""
     mean = mean_reference_colour(reference)
     dark = (reference <= MAX_DARK_LEVEL).any(axis=2)
     cut = []
@@ -68,7 +68,7 @@ def measure_press_noise(presses: Sequence[BallPress], reference: Image) -> Camer
 
 
 def _noise_of_tiles(tiles: FloatArray) -> CameraNoise:
-    """Of tiles (n, h, w, 3) of differences of two pictures. Raises NoiseUnknown."""
+    """Noise from tiles (n, h, w, 3) of differences of two pictures. Raises NoiseUnknown."""
     min_tiles = 4
     if len(tiles) < min_tiles:
         raise NoiseUnknown(
@@ -97,7 +97,7 @@ def _noise_of_tiles(tiles: FloatArray) -> CameraNoise:
 
 
 def _difference_tiles(one: Image, other: Image) -> FloatArray:
-    """(n, h, w, 3) the difference of two pictures tile by tile, drift and mean removed, where neither is black or
+    """(n, h, w, 3) the difference of two pictures by tiles, without drift and mean, where neither is black or
     saturated."""
     most, least = np.maximum(one, other).max(axis=2), np.minimum(one, other).min(axis=2)
     lost = np.asarray((most >= SATURATED_LEVEL) | (least <= MAX_DARK_LEVEL))
@@ -124,7 +124,7 @@ def _cut_tiles(picture: NDArray[Entry], size: int) -> NDArray[Entry]:
 
 
 def _nearest_correlations(covariance: FloatArray, deviation: FloatArray) -> tuple[float, float, float]:
-    """Correlations R-G, R-B, G-B. Medians of tiles, taken one by one, need not fit together: the nearest that do."""
+    """Correlations R-G, R-B, G-B, of the valid correlation matrix nearest to the medians of the tiles."""
     scale = np.where(deviation > 0, deviation, 1.0)
     correlation = covariance / np.outer(scale, scale)
     np.fill_diagonal(correlation, 1.0)
@@ -135,13 +135,13 @@ def _nearest_correlations(covariance: FloatArray, deviation: FloatArray) -> tupl
 
 
 def measure_skin(presses: Sequence[BallPress], reference: NDArray[np.uint8], pixel_pitch: float) -> float | None:
-    """Share of the fine part of `reference` (H, W, 3) that moves with the gel, 0 to 1; None where the presses do not
-    tell that there is any. `pixel_pitch` [m].
+    """Share of the fine part of `reference` (H, W, 3) that moves with the gel, 0 to 1; None if the presses do not show
+    any. pixel_pitch: [m].
 
-    Grain that stands still, of the camera or of dust on its lens, is seen again everywhere in a press. Skin is seen
-    again far from the contact; near it the gel has moved by a few pixels, and it is not.
+    Fixed grain, of the camera or of dust on its lens, is the same everywhere in a press. Grain of the skin is the same
+    far from the contact, but not near it, because there the gel has moved by a few pixels.
 
-    It is low rather than high: skin that has moved by less than its grain counts as what stands still.
+    The estimate is a lower bound: skin that has moved by less than its grain counts as fixed.
     """
     min_presses = 4
     min_pixels = 1000  # of either part of a press

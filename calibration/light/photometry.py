@@ -1,7 +1,7 @@
-"""Weights of a photometric model from labelled presses, and how well they hold for presses that were left out.
+"""Weights of a photometric model from labelled presses, and their errors on left-out presses.
 
-Every press keeps only its normal equations, so any number of presses, sizes and left-out presses costs one pass over
-the pixels.
+Only the normal equations of each press are stored, so any number of presses, sizes and left-out presses needs one pass
+over the pixels.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ from tacsim.models.photometric import DEPTH_TERMS, normal_terms, position_terms,
 
 MAX_SIZE = (5, 2)  # degree in the normal, degree in the place
 RIDGES = (1e-6, 1e-5, 1e-4, 1e-3)  # times the mean of the diagonal of the normal equations
-CHUNK_PIXELS = 16384  # pixels that are summed at a time: fewer wake the threads of BLAS too often, more leave the cache
+# pixels in one sum: with fewer the threads of BLAS start too often, more do not fit into the cache
+CHUNK_PIXELS = 16384
 SLOPE_TERMS = term_count(MAX_SIZE[0], 0)
 
 
@@ -49,7 +50,7 @@ class ModelSize:
 @dataclass(frozen=True, slots=True, eq=False)
 class NormalEquations:
     """Normal equations of one press for the terms of LARGEST, and after them those of depth, of slopes at depth and of
-    cast shadows. Each channel has its own where pixels are saturated in one and not in another."""
+    cast shadows. Each channel has its own if pixels are saturated in one and not in another."""
 
     square: FloatArray  # (1, terms, terms) of all channels, or (3, terms, terms)
     right: FloatArray  # (terms, 3)
@@ -57,13 +58,13 @@ class NormalEquations:
     count: int  # numbers summed
 
     def __add__(self, other: NormalEquations) -> NormalEquations:
-        """Of the pixels of both."""
+        """The equations of the pixels of both."""
         return NormalEquations(
             self.square + other.square, self.right + other.right, self.power + other.power, self.count + other.count
         )
 
     def __sub__(self, part: NormalEquations) -> NormalEquations:
-        """Without the pixels of a part."""
+        """The equations without the pixels of a part."""
         return NormalEquations(
             self.square - part.square, self.right - part.right, self.power - part.power, self.count - part.count
         )
@@ -155,7 +156,7 @@ def _place_powers(position: int) -> list[tuple[int, ...]]:
 
 @functools.cache
 def _product_indices() -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Where the products of each two terms stand: those of the normal (n, n), and those of the place (m, m)."""
+    """Indices of the products of two terms: of the normal (n, n), and of the place (m, m)."""
 
     def where(powers: list[tuple[int, ...]], products: list[tuple[int, ...]]) -> NDArray[np.intp]:
         return np.array([[products.index(tuple(np.add(one, other))) for other in powers] for one in powers])
@@ -198,9 +199,10 @@ def left_out_error(presses: Sequence[NormalEquations], ridge: float) -> float:
 
 
 def choose_size(presses: Sequence[NormalEquations]) -> ModelSize:
-    """Up to MAX_FEW_PRESSES a cubic that is the same everywhere. With more, the smallest model to which no larger one
-    is clearly better at predicting left-out presses, each with its best ridge. Cast shadows, where they are among the
-    terms, are taken if they make it better by far; depth if they are, if it makes it better; then slopes at depth."""
+    """The size of the model. Up to MAX_FEW_PRESSES: a cubic that is the same everywhere. With more: the smallest model
+    for which no larger one predicts left-out presses clearly better, each with its best ridge. Cast shadows, if they
+    are among the terms, are added if they improve it by a large factor; then depth, and then slopes at depth, if they
+    improve it."""
     ridge_of_few_presses = 1e-3
     if len(presses) <= MAX_FEW_PRESSES:
         return ModelSize(3, 0, ridge_of_few_presses)
@@ -221,7 +223,7 @@ def choose_size(presses: Sequence[NormalEquations]) -> ModelSize:
 
 
 def _best_size(presses: Sequence[NormalEquations], shadows: int) -> tuple[float, ModelSize]:
-    """The left-out error of the best size with so many terms of shadows, and that size."""
+    """The left-out error of the best size with this number of terms of shadows, and that size."""
     # degree in the normal, in the place
     sizes = ((1, 0), (3, 0), (5, 0), (1, 1), (3, 1), (5, 1), (1, 2), (3, 2), (5, 2))
     best: tuple[float, ModelSize] | None = None
@@ -247,7 +249,7 @@ def _select_terms(of: NormalEquations, use: list[int]) -> NormalEquations:
 
 
 def terms_of(size: ModelSize) -> list[int]:
-    """Where the terms of `size` stand among all."""
+    """Indices of the terms of `size` among all terms."""
     normals, all_normals = term_count(size.degree, 0), term_count(MAX_SIZE[0], 0)
     places = term_count(1, size.position) // term_count(1, 0)
     deep = term_count(*MAX_SIZE)

@@ -1,4 +1,4 @@
-"""One press of a ball: its contact circle, about, and how it has changed the colour of the gel."""
+"""One press of a ball: its approximate contact circle, and its change of the gel's colour."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from tacsim.models.photometric import image_axes
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BallPress:
-    """One frame that a calibration is made from."""
+    """One frame of a calibration."""
 
     name: str
     circle: ContactCircle
@@ -40,14 +40,14 @@ class BallPress:
         return (self.lit.shape[0], self.lit.shape[1])
 
     def distance(self) -> FloatArray:
-        """(H, W) from the middle of the contact [px]."""
+        """(H, W) distance from the centre of the contact [px]."""
         v, u = np.mgrid[: self.shape[0], : self.shape[1]]
         return np.asarray(np.hypot(u - self.circle.x, v - self.circle.y), dtype=np.float64)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Window:
-    """The n pixels of one press that take part."""
+    """The n used pixels of one press."""
 
     u: FloatArray  # (n,) columns [px]
     v: FloatArray  # (n,) rows [px]
@@ -64,7 +64,7 @@ def mean_reference_colour(reference: Image) -> FloatArray:
 
 
 def find_press(name: str, image: Image, reference: Image, mean: FloatArray, ball: float) -> BallPress:
-    """Contact circle of one frame, about, and its change of colour without drift.
+    """Approximate contact circle of one frame, and its change of colour without drift.
 
     Args:
         image, reference: (H, W, 3) uint8 RGB with and without contact; `mean` (3,) of the reference.
@@ -80,7 +80,7 @@ def find_press(name: str, image: Image, reference: Image, mean: FloatArray, ball
 def make_press(
     name: str, image: Image, reference: Image, mean: FloatArray, circle: ContactCircle, reach: float = SKIRT_RADIUS
 ) -> BallPress:
-    """The same with a contact that is known, about; `reach`: how far it changes the gel [contact radii]. Raises
+    """The same with an approximately known contact. reach: radius of its effect on the gel [contact radii]. Raises
     BadFrames."""
     raw = image.astype(np.float64) - reference
     height, width = reference.shape[:2]
@@ -109,7 +109,7 @@ def make_press(
 
 
 def _patch_area(strength: FloatArray, strong: float) -> int:
-    """Pixels of the largest patch that is as strong as `strong` somewhere, and half as strong everywhere."""
+    """Pixels of the largest patch that exceeds `strong` somewhere, and half of it everywhere."""
     import cv2
 
     count, patches = cv2.connectedComponents((strength > strong / 2).astype(np.uint8))
@@ -119,8 +119,8 @@ def _patch_area(strength: FloatArray, strong: float) -> int:
 
 
 def _fit_drift(difference: FloatArray, untouched: Mask) -> FloatArray:
-    """(H, W, 3) change between reference and frame where nothing touches: a quadratic in the place, or its median
-    where too little is untouched."""
+    """(H, W, 3) change between reference and frame outside the contact: a quadratic in the place, or the median if too
+    little is untouched."""
     if untouched.mean() < MIN_UNTOUCHED_SHARE:
         level = np.median(difference[untouched], axis=0) if untouched.any() else np.zeros(3)
         return np.broadcast_to(level, difference.shape).copy()

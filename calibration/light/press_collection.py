@@ -1,4 +1,4 @@
-"""Presses of a ball, each judged while a person is still there to press again."""
+"""Presses of a ball, each checked at once, so that the operator can repeat it."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class PressCollection:
         return tuple(self._circles)
 
     def add_image(self, image: Image) -> ContactCircle:
-        """Takes a native picture and returns its contact; raises BadFrames with why it is refused."""
+        """Adds a native picture and returns its contact. Raises BadFrames with the reason if it is refused."""
         seen = self._rectify(image)
         dark = is_direction_free([(seen - np.float64(self._reference)) / self._mean])
         find = find_dark_press if dark else find_press
@@ -60,7 +60,7 @@ class PressCollection:
         return circle
 
     def next_place(self) -> str:
-        """Where to press next: of the nine parts of the picture the one farthest from all presses so far."""
+        """The next place to press: the one of nine parts of the picture that is farthest from all presses so far."""
         height, width = self._reference.shape[:2]
         best, place = -1.0, "middle"
         for row in (1, 0, 2):  # the middle first

@@ -1,6 +1,6 @@
-"""What shape contacts have: ellipses where pixels are not square, and slopes that ask for a ball of their own.
+"""Shapes of contacts: ellipses for pixels that are not square, and slopes that indicate another ball.
 
-The presses are fitted together again, from circles that are refined, with more freedom: one ratio of axes and its
+The presses are fitted together again from their refined circles, with more parameters: one ratio of axes and its
 direction for all, and for each press the blur of its rim and the radius of its ball. The light is eliminated as in
 :mod:`calibration.light.refinement`.
 """
@@ -34,7 +34,7 @@ COMMON_STEPS = np.array([0.05, 0.003, 0.003])  # of the thinness and of both par
 
 @dataclass(frozen=True, slots=True)
 class Stretch:
-    """By how much pictures are wider in one direction than across it."""
+    """Ratio of the axes of contacts, and direction of the longer axis."""
 
     ratio: float  # of the axes of a round contact, 1 or more
     angle: float  # of the longer axis from x towards y [degrees], -90 to 90
@@ -57,7 +57,7 @@ class _Fit:
 def fit_stretch(
     windows: Sequence[Window], circles: Sequence[ContactCircle], thickness: float, ball: float, shape: tuple[int, int]
 ) -> Stretch:
-    """The ratio of axes that contacts have in common; `ball`: its radius, `thickness` of the gel [px]."""
+    """The common ratio of axes of contacts. ball: its radius. thickness: of the gel [px]."""
     position = 1 if len(windows) > MAX_FEW_PRESSES else 0
     free = ((0, 1, 2, 4), (0, 1, 2))
 
@@ -77,8 +77,8 @@ def fit_stretch(
 def find_other_balls(
     windows: Sequence[Window], circles: Sequence[ContactCircle], thickness: float, ball: float, shape: tuple[int, int]
 ) -> tuple[tuple[int, ...], float]:
-    """Which presses, the smaller part of them, are of a ball of another radius than the rest, and how large it is over
-    that of the rest. Under one light the slopes of a press tell it; no press where one ball explains all."""
+    """The presses, a minority, with a ball of another radius than the rest, and the ratio of the radii. Under one light
+    the slopes of a press identify its ball. No press if one ball explains all."""
     if len(windows) <= MAX_FEW_PRESSES:
         return (), 1.0
     free = ((0, 1, 2, 3, 4), (0, 1, 2))
@@ -160,7 +160,7 @@ class _Model:
     def normal_equations(
         self, fit: _Fit, free: tuple[tuple[int, ...], tuple[int, ...]]
     ) -> tuple[FloatArray, FloatArray]:
-        """Gradient and Gauss-Newton curvature of half the cost; what the light can explain is projected out."""
+        """Gradient and Gauss-Newton curvature of half the cost; the part that the light explains is projected out."""
         terms, weights, residuals, square = self._solve_light(fit)
         count, own, common = len(self._windows), free[0], free[1]
         size = len(own) * count + len(common)

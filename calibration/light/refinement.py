@@ -1,8 +1,8 @@
 """Contact circles and the thickness of the gel, refined together with the light that they imply.
 
 The weights of the light are linear given the geometry, so they are eliminated (variable projection, Golub and Pereyra
-1973; Kaufman's approximation): Levenberg-Marquardt steps on three numbers a press and one of the gel lower the
-difference of colour that no light explains. No light is assumed, and circles need not be exact at first.
+1973; Kaufman's approximation): Levenberg-Marquardt steps on three numbers for each press and one of the gel reduce
+the difference of colour that no light explains. No light is assumed, and the first circles may be approximate.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from calibration.light.shadows import DentShade
 from calibration.light.tuning import FIRST_THINNESS, MAX_ALTERNATIVE_COST, MAX_RIM_RATIO, RIM_BLUR, THINNESS_BOUNDS
 from tacsim.interface import FloatArray
 
-MAX_GROUPS = 8  # that are left out in turn to tell the uncertainty of radii
+MAX_GROUPS = 8  # that are left out in turn to estimate the uncertainty of radii
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,14 +28,13 @@ class RefinedGeometry:
     """Geometry of all presses."""
 
     circles: tuple[ContactCircle, ...]
-    thickness: float  # of the gel, as its skirts tell it [px]; above two ball radii it hardly matters
+    thickness: float  # of the gel, from its skirts [px]; above two ball radii it has little effect
     residual_shares: tuple[float, ...]  # share of the power of each press's change of colour
     _ends: tuple[_Problem, ...]  # what each start led to, the best first
 
     def radius_uncertainty(self) -> float:
-        """Standard deviation of the scale of all radii together [-]: by leaving out one group of presses after the
-        other (the jackknife), or what another solution as good says differently, if that is more. NaN for a single
-        press."""
+        """Standard deviation of the scale of all radii together [-]: by leaving out each group of presses (the
+        jackknife), or the difference from another equally good solution, if that is larger. NaN for a single press."""
         best, *others = self._ends
         count = len(best.circles)
         if count < 2:
@@ -58,10 +57,10 @@ def refine_geometry(
     shade: DentShade | None = None,
     thinness: Sequence[float] = FIRST_THINNESS,
 ) -> RefinedGeometry:
-    """Refines the circles; `ball`: radius [px]; `shade`: what dents hide from lamps belongs to the light; `thinness`:
-    where that of the gel starts.
+    """Refines the circles. ball: radius [px]. shade: adds cast shadows of dents to the light. thinness: start value for
+    the gel.
 
-    Fixed windows, so that two states compare: they are cut round `start` and stay.
+    The windows are fixed around `start`, so that the costs of two states can be compared.
     """
     ends = sorted(
         (_minimise(_Problem(windows, tuple(start), first, ball, shade).solved()) for first in thinness),
@@ -74,7 +73,7 @@ def refine_geometry(
 
 
 def _minimise(state: _Problem) -> _Problem:
-    """From `state` to the least cost near it, by Levenberg and Marquardt's steps."""
+    """The state of minimum cost near `state`, by Levenberg-Marquardt steps."""
     min_gain = 1e-4  # relative gain of a step, below which the refinement ends
     max_steps = 25
     damping = 1e-2
@@ -139,7 +138,7 @@ class _Problem:
 
     def normal_equations(self) -> tuple[FloatArray, FloatArray]:
         """Gradient and Gauss-Newton curvature of half the cost by (x, y, radius) of each circle, then the thinness of
-        the gel. What the light can explain is projected out."""
+        the gel. The part that the light explains is projected out."""
         delta = 0.05  # step of finite differences [px]; of the gel's thinness [-]
         count = 3 * len(self.circles) + 1
         gradient, curvature = np.zeros(count), np.zeros((count, count))
@@ -179,7 +178,7 @@ class _Problem:
         window = self.windows[i]
         thickness = self.ball / thinness
         gradient = dent_gradient(window.u, window.v, circle, thickness, self.ball, RIM_BLUR)
-        # colour that goes with the depth would else be explained by circles that are too large, and beside the contact
+        # else larger circles would explain colour that depends on depth, and outside the contact
         depth = dent_height(window.u, window.v, circle, thickness, self.ball)[:, None] / self.ball
         if self.shade is None:
             return np.concatenate([photometric_features(gradient, window.u, window.v, degree, 0), depth], axis=1)

@@ -1,4 +1,4 @@
-"""Cast shadows of ball presses: where lamps stand that throw them, found from the presses themselves."""
+"""Cast shadows of ball presses: positions of their lamps, estimated from the presses."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from tacsim.models.photometric import Floats, horizon_slope, shadow_terms
 
 @dataclass(frozen=True, slots=True)
 class DentShade:
-    """The lamps of a sensor, and its picture: what tells the shade round a ball's dent."""
+    """The lamps of a sensor, and the size of its picture, which determine the shadow around a ball's dent."""
 
-    lamps: tuple[tuple[float, float], ...]  # [widths of the picture], from its middle
+    lamps: tuple[tuple[float, float], ...]  # [widths of the picture], from its centre
     shape: tuple[int, int]  # rows, columns
 
     def terms(self, u: FloatArray, v: FloatArray, circle: ContactCircle, thickness: float, ball: float) -> FloatArray:
@@ -42,8 +42,8 @@ class DentShade:
         return np.ascontiguousarray(shadow_terms(horizons, x, y * (columns / rows)).T, dtype=np.float64)
 
     def light(self, gradient: FloatArray, u: FloatArray, v: FloatArray) -> FloatArray:
-        """(n, terms) of the light beside shadows, for slopes (n, 2)."""
-        degree, place_degree = 3, 2  # of the light beside which shadows are sought
+        """(n, terms) of the light without shadows, for slopes (n, 2)."""
+        degree, place_degree = 3, 2  # of the light without shadows
         x, y = self._places(u, v)
         return photometric_features(gradient, x, y * (self.shape[1] / self.shape[0]), degree, place_degree)
 
@@ -59,9 +59,9 @@ def find_lamps(
     ball: float,
     shape: tuple[int, int],
 ) -> DentShade:
-    """A lamp for each colour: where it stands if its shadows explain most of what the slopes leave of that colour. They
-    must darken: a shade that brightens is the lit flank of a lamp on the other side. `thickness` of the gel, `ball`
-    radius [px].
+    """A lamp for each colour, at the position where its shadows explain most of the residual of that colour after the
+    slopes. Shadows must darken: a brighter region is the lit flank of a lamp on the opposite side. thickness: of the
+    gel, ball: its radius [px].
     """
     ridge = 1e-4
     max_steps = 30
@@ -106,6 +106,6 @@ def find_lamps(
 
 
 def _downsample_window(window: Window) -> Window:
-    pixels_of_press = 600  # of each press, about, that tell where lamps stand
+    pixels_of_press = 600  # of each press, approximately, for the positions of lamps
     keep = slice(None, None, max(1, len(window.u) // pixels_of_press))
     return Window(window.u[keep], window.v[keep], window.change[keep])

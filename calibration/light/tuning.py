@@ -33,7 +33,7 @@ MAX_RADIUS_RATIO = 6.0  # up to which a dent is followed [ball radii]
 # labels.py
 FORWARD_BLUR = 0.8  # of the camera, and of what the forward model is fitted to [px]
 INVERSE_BLUR = 1.2  # of what the inverse is fitted to [px]
-RIM_MARGIN = 5.0  # that contact and skirt reach further, whatever the radius [px]
+RIM_MARGIN = 5.0  # added to contact and skirt for every radius [px]
 
 # photometry.py
 MAX_FEW_PRESSES = 3  # [presses] up to this number they cover too little of the image for light that varies over it
@@ -66,4 +66,4 @@ MAX_ALTERNATIVE_COST = 1.2  # times the least cost, up to which what the other s
 # press_shapes.py
 SCALE_PRIOR = 1.0  # holds the mean logarithm of the balls' radii at 0: the light explains any common factor
 MIN_BALL_GAP = 0.1  # between two groups of balls, logarithm of their radii; one ball shows 0.05 under uneven light
-MIN_GAP_DEVIATIONS = 4.0  # and so many standard deviations within the groups
+MIN_GAP_DEVIATIONS = 4.0  # and in standard deviations within the groups

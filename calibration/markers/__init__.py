@@ -1,1 +1,1 @@
-"""Where pictures become flow: printed dots found, told apart by their lattice, and followed."""
+"""Flow from pictures: detection of printed dots, identification by their lattice, and tracking."""

@@ -1,4 +1,4 @@
-"""Dark dots in a picture: where their centres are, to a fraction of a pixel."""
+"""Detection of dark dots in a picture, with centres to a fraction of a pixel."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ class Dots:
 
     @property
     def radius(self) -> float:
-        """That of a disc with the median area [px]."""
+        """Radius of a disc with the median area [px]."""
         return float(np.sqrt(np.median(self.areas) / np.pi)) if len(self.areas) else 0.0
 
 
 class DotFinder:
     """Finds dots of about one radius [px].
 
-    Darkness is how much a picture falls short of its closing (the brightness round each place), as a share of it:
-    unlike a difference of Gaussians it sees no dot in the shadow side of a step of brightness, as every rim of a
-    contact has one. A centre is the mean of the dot's pixels, each weighted with its darkness beyond its threshold.
+    Darkness is the difference of a picture from its closing (the brightness around each place), as a share of the
+    closing. Unlike a difference of Gaussians it finds no dot on the dark side of a step of brightness, which every rim
+    of a contact has. A centre is the mean of the dot's pixels, weighted with their darkness above the threshold.
     """
 
     def __init__(self, radius: float) -> None:
@@ -51,7 +51,7 @@ class DotFinder:
         return Dots(np.concatenate([d.centres for d in found]), np.concatenate([d.areas for d in found]))
 
     def _find_blobs(self, dark: Float32, level: float) -> tuple[Dots, Float32 | None]:
-        """The dots among the blobs beyond `level`, and what is left in blobs too large or long to be one."""
+        """The dots among the blobs above `level`, and the rest in blobs that are too large or long to be one."""
         max_elongation = 2.0  # length over breadth
         min_area, max_area = 0.2, 7.0  # of a dot, half hidden or painted over [areas of a disc]
         min_filled = 0.4  # share of its bounding box that a dot fills

@@ -1,9 +1,9 @@
-"""Tactile flow from pictures: how far each dot printed on the gel has moved, in metres.
+"""Tactile flow from pictures: displacement of each dot printed on the gel, in metres.
 
-Dots are sought on a metric grid of their own, fine enough for their size whatever the canonical grid is. The reference
-tells which dot is which row and column (:mod:`calibration.markers.lattice`), and where it rests;
-:mod:`calibration.markers.tracker` follows it from there. A dot that is not seen gets the mean of its neighbours'
-motion: flow is finite everywhere, and `visible` tells which of it was measured.
+Dots are detected on a separate metric grid, whose resolution depends on their size, not on the canonical grid. The
+reference gives row and column of each dot (:mod:`calibration.markers.lattice`), and its rest position;
+:mod:`calibration.markers.tracker` tracks it. A dot that is not visible gets the mean motion of its neighbours: flow is
+finite everywhere, and `visible` marks the measured part.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from tacsim.optics.tuning import MIN_RADIUS
 
 
 class NoMarkers(UnusableReference):
-    """The reference does not show the lattice that the sensor should have."""
+    """The reference does not show the lattice of the sensor."""
 
 
 class MissingDots(NoLattice):
@@ -50,7 +50,7 @@ class MissingDots(NoLattice):
 
 
 class TooFewMarkers(RuntimeError):
-    """Too few dots are seen for a flow."""
+    """Too few dots are visible for a flow."""
 
 
 class MarkerFlow:
@@ -59,7 +59,7 @@ class MarkerFlow:
     Args:
         markers: the lattice.
         rectify: gives the pixels of `grid`, see :func:`marker_grid`.
-        distance: from the camera's pinhole to the gel at rest [m]; None: it looks along parallel rays.
+        distance: from the camera's pinhole to the gel at rest [m]; None: parallel rays.
     """
 
     def __init__(
@@ -87,17 +87,17 @@ class MarkerFlow:
 
     @property
     def visible(self) -> Mask:
-        """(rows, columns) dots that the last picture showed; the flow of the others is that of their neighbours."""
+        """(rows, columns) True for dots visible in the last picture; others have the flow of their neighbours."""
         return self._seen
 
     @property
     def visible_share(self) -> float:
-        """Share of the reference's dots that the last picture showed."""
+        """Share of the reference's dots that are visible in the last picture."""
         return float(self._seen.sum() / self._present.sum()) if self._tracker is not None else 0.0
 
     def take_reference(self, image: Image, index: int = 0) -> None:
-        """Takes a native image (rows, columns, 3) without contact as rest, and forgets all motion so far. Raises
-        NoMarkers; what was the reference then stays."""
+        """Takes a native image (rows, columns, 3) without contact as rest, and resets the tracking. Raises NoMarkers;
+        the previous reference then stays."""
         points = self._find_points(image)
         markers = self._markers
         expected = f"a lattice of {markers.rows} x {markers.columns} dots, {markers.pitch * 1e3:g} mm apart"
@@ -128,7 +128,7 @@ class MarkerFlow:
     def __call__(self, image: Image, index: int, height: tuple[Float32, PixelGrid] | None = None) -> Float32:
         """(rows, columns, 2) displacement against the reference along x, y [m] of the native image of frame `index`.
 
-        `height` (h, w) [m] on its grid: how deep the gel is pressed, for a camera whose distance is known.
+        height: (h, w) [m] on its grid, for a camera with a known distance.
         Raises TooFewMarkers; ValueError without a reference, or for an image of another shape.
         """
         if self._tracker is None:
@@ -139,7 +139,7 @@ class MarkerFlow:
         seen[self._present] = tracked.visible
         self._seen = seen
         if tracked.visible_share < MIN_VISIBLE_SHARE:
-            self._tracker.reset()  # so few say nothing of the motion
+            self._tracker.reset()  # too few to determine the motion
             raise TooFewMarkers(
                 f"{tracked.visible.sum()} of {len(tracked.visible)} markers are seen, at least {MIN_VISIBLE_SHARE:.0%} "
                 "are needed "
@@ -170,14 +170,14 @@ class MarkerFlow:
         return found
 
     def _is_in_view(self, points: FloatArray) -> Mask:
-        """(...,) whole dots at `points` (..., 2) [m] lie in the picture and on the gel."""
+        """(...,) True if whole dots at `points` (..., 2) [m] are in the picture and on the gel."""
         column, row = np.rint(np.moveaxis((points - self._origin) / self._pitch, -1, 0)).astype(np.intp)
         rows, columns = self._whole.shape
         inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
         return np.asarray(inside & self._whole[row.clip(0, rows - 1), column.clip(0, columns - 1)])
 
     def _undo_pinhole(self, apparent: FloatArray, height: Float32, grid: PixelGrid) -> FloatArray:
-        """Where dots are (..., 2) that the pinhole shows at `apparent`: what is pressed towards it looks larger."""
+        """Positions (..., 2) of dots that the pinhole shows at `apparent`: pressed towards it, the gel looks larger."""
         iterations = 4
         import cv2
 
@@ -191,7 +191,7 @@ class MarkerFlow:
 
 
 def marker_grid(markers: Markers, gel_size: tuple[float, float]) -> PixelGrid:
-    """All of the gel (x, y [m]), so fine that a dot's radius is DOT_RADIUS pixels."""
+    """A grid of the whole gel (x, y [m]) on which a dot's radius is DOT_RADIUS pixels."""
     dot_radius = 2.5  # on the grid on which dots are sought [px]
     pitch = markers.radius / dot_radius
     columns, rows = (max(2, math.ceil(length / pitch)) for length in gel_size)
@@ -199,7 +199,7 @@ def marker_grid(markers: Markers, gel_size: tuple[float, float]) -> PixelGrid:
 
 
 def _complete_disc_mask(valid: Mask, radius: float) -> Mask:
-    """Places in a mask about which a whole disc of `radius` [px] is valid; the centre of a cut one is not its own."""
+    """True for places in a mask with a whole valid disc of `radius` [px] around them; a cut dot has another centre."""
     import cv2
 
     reach = math.floor(radius)
@@ -209,7 +209,7 @@ def _complete_disc_mask(valid: Mask, radius: float) -> Mask:
 
 
 def _native_pixels_per_metre(rectify: Rectification, grid: PixelGrid) -> float:
-    """Pixels of the native image along a metre of the gel, in its middle, where they are fewest."""
+    """Pixels of the native image per metre of the gel at its centre, along the axis with fewer pixels."""
     row, column = (length * rectify.factor // 2 for length in grid.shape)
     beside = rectify.pixels[row, column - 1] - rectify.pixels[row, column]
     below = rectify.pixels[row - 1, column] - rectify.pixels[row, column]
@@ -220,7 +220,7 @@ def _native_pixels_per_metre(rectify: Rectification, grid: PixelGrid) -> float:
 def _lookup_map(
     rectify: Rectification, shrink: int, box: tuple[slice, slice]
 ) -> tuple[NDArray[np.int16], NDArray[np.uint16]]:
-    """Where the middle of each pixel in `box` lies in the native image made smaller, in OpenCV's fixed point."""
+    """Positions of the pixel centres in `box` in the reduced native image, in OpenCV's fixed point."""
     import cv2
 
     rows, columns = rectify.valid.shape
@@ -231,8 +231,8 @@ def _lookup_map(
 
 
 def find_markers(image: Image) -> tuple[Lattice, float]:
-    """The lattice [px from the middle] in a picture (H, W, 3) without contact of which nothing is known, and the radius
-    of its dots [px]: that radius is sought with which most dots fall into rows and columns. Raises NoLattice."""
+    """The lattice [px from the centre] in an unknown picture (H, W, 3) without contact, and the radius of its dots
+    [px]: the radius with which most dots fall into rows and columns. Raises NoLattice."""
     best: tuple[Lattice, float] | None = None
     rows, columns, _ = image.shape
     radius = MIN_RADIUS
@@ -256,8 +256,8 @@ def find_markers(image: Image) -> tuple[Lattice, float]:
 
 
 def require_no_markers(image: Image) -> None:
-    """Raises UnusableReference when a picture (H, W, 3) without contact shows a lattice of dots: to a sensor that knows
-    of none each would be a dent."""
+    """Raises UnusableReference if a picture (H, W, 3) without contact shows a lattice of dots: without markers in the
+    configuration, each dot would be read as a dent."""
     try:
         lattice, _ = find_markers(image)
     except MissingDots as why:
@@ -275,23 +275,23 @@ def marker_flow(
     markers: Markers | None,
     geometry: SensorGeometry,
     gel_size: tuple[float, float],
-    seen: GelView | None = None,
+    view: GelView | None = None,
     region: PictureRegion | None = None,
 ) -> MarkerFlow | None:
-    """The flow of known dots; None without. `seen`: the gel through lens and perspective; None: the picture is metric
-    by itself. `region`: what of the native picture shows gel; None: all of it."""
+    """The flow of known dots; None without dots. view: of the gel through lens and perspective; None: the picture is
+    metric. region: part of the native picture that shows the gel; None: all of it."""
     if markers is None:
         return None
     fine = marker_grid(markers, gel_size)
-    rectify = rectification_of_geometry(geometry, gel_size, fine) if seen is None else rectification_of_view(seen, fine)
+    rectify = rectification_of_geometry(geometry, gel_size, fine) if view is None else rectification_of_view(view, fine)
     return MarkerFlow(markers, rectify.within(region), fine, geometry.camera_distance)
 
 
 def view_of_dots(
     pitch: float, untouched: NDArray[np.uint8], grid: CanonicalGrid, region: PictureRegion | None = None
 ) -> tuple[Rectification, MarkerFlow]:
-    """Where the gel lies, and its flow, by dots `pitch` [m] apart in a native picture (rows, columns, 3) without
-    contact. The camera looks straight on. Raises NoMarkers where no dots are seen."""
+    """Rectification of the gel, and its flow, from dots `pitch` [m] apart in a native picture (rows, columns, 3)
+    without contact. The camera looks along the gel's normal. Raises NoMarkers without dots."""
     picture = untouched
     if region is not None:
         shown = region_mask(region, untouched.shape[:2])

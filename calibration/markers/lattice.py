@@ -1,4 +1,4 @@
-"""The lattice in scattered points: which row and column each belongs to, and where the missing ones would be."""
+"""The lattice in scattered points: row and column of each point, and positions of missing ones."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ if TYPE_CHECKING:
 
 
 class NoLattice(ValueError):
-    """Points that are not the lattice asked for: what was found instead."""
+    """The points are not the requested lattice. The message describes the points."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Lattice:
-    """Rows along y and columns along x, as nearly as the lattice lies along them."""
+    """A lattice with rows approximately along y and columns along x."""
 
     positions: FloatArray  # (rows, columns, 2); where no point is, the lattice's smooth continuation
     present: Mask  # (rows, columns) a point is there
@@ -30,7 +30,7 @@ class Lattice:
 
     @property
     def pitch(self) -> float:
-        """Usual distance of neighbours."""
+        """Typical distance of neighbours."""
         along = np.linalg.norm(np.diff(self.positions, axis=1), axis=2).ravel()
         down = np.linalg.norm(np.diff(self.positions, axis=0), axis=2).ravel()
         return float(np.median(np.concatenate([along, down])))
@@ -48,11 +48,11 @@ def find_lattice(points: FloatArray, shape: tuple[int, int] | None = None, pitch
     """The square lattice in `points` (n, 2), turned by less than 45 degrees; outliers and gaps may be among them.
 
     Args:
-        points: x, y; the lattice asked for lies as near (0, 0) as its points allow.
-        shape: rows, columns; None: as many as there are.
-        pitch: distance of neighbours; None: the usual one of these points.
+        points: x, y; the requested lattice is as near to (0, 0) as its points allow.
+        shape: rows, columns; None: all.
+        pitch: distance of neighbours; None: the typical one of these points.
 
-    Raises NoLattice when fewer than 2 x 2 points make a lattice.
+    Raises NoLattice if fewer than 2 x 2 points form a lattice.
     """
     if len(points) < 4:
         raise NoLattice(f"{len(points)} dots found, a lattice has at least 4")
@@ -72,8 +72,8 @@ def find_lattice(points: FloatArray, shape: tuple[int, int] | None = None, pitch
 
 
 def _label_points(points: FloatArray, pitch: float) -> dict[int, tuple[int, int]]:
-    """Row and column (from anywhere) of all points that hang together, by the index of the point: grown from its most
-    regular place, each step from its neighbour's own."""
+    """Row and column (with any origin) of all connected points, by the index of the point: grown from the most regular
+    place, with each step predicted from the steps of its neighbour."""
     from scipy.spatial import KDTree
 
     tree = KDTree(points)
@@ -129,8 +129,8 @@ def _find_neighbours(
 
 
 def describe_missing_line(present: Mask, visible: Mask | None = None) -> str | None:
-    """The first row or column of a lattice (rows, columns) without any dot, in words; None: there is none. `visible`:
-    dots that could be seen; a line of fewer than 3 of them is not asked for."""
+    """Description of the first row or column of a lattice (rows, columns) without any dot, or None. visible: dots that
+    are in view; a line with fewer than 3 of them is skipped."""
     shown = np.ones_like(present) if visible is None else visible
     for axis, name in ((1, "row"), (0, "column")):
         empty = np.flatnonzero(~present.any(axis=axis) & (shown.sum(axis=axis) >= 3))
@@ -169,7 +169,7 @@ def _fit_affine(points: FloatArray, at: NDArray[np.intp]) -> FloatArray:
 
 
 def _complete_lattice(positions: FloatArray, present: Mask) -> FloatArray:
-    """`positions` (rows, columns, 2) with what is missing: the affine lattice, bent as the neighbours are."""
+    """`positions` (rows, columns, 2) with missing ones added: the affine lattice plus deviations of the neighbours."""
     if present.all():
         return positions
     at = np.argwhere(np.ones_like(present))
@@ -180,7 +180,7 @@ def _complete_lattice(positions: FloatArray, present: Mask) -> FloatArray:
 
 
 def fill_from_neighbours(values: FloatArray, known: Mask) -> FloatArray:
-    """`values` (rows, columns, n), where not `known` the mean of the nearest neighbours that are, ring by ring."""
+    """`values` (rows, columns, n); where not `known`, the mean of the nearest known neighbours, ring by ring."""
     if known.all() or not known.any():
         return values
     found, done = np.where(known[..., None], values, 0.0), known.copy()

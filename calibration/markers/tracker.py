@@ -1,9 +1,9 @@
-"""Follows dots from picture to picture: which of the dots found now is which of those at rest.
+"""Tracks dots from picture to picture: matches the dots in a frame with those at rest.
 
-A dot is expected where constant velocity takes it. What identifies it is its neighbours at rest: across an edge between
-two neighbours the displacement changes by less than half of their distance. A frame that leaves dots unmatched is
-matched anew from other guesses, and the one that explains most dots wins. Displacements are always against rest, so
-errors do not add up. docs/decisions/0013-marker-tracker.md says what each guess is for and what fails without it.
+A dot is predicted by constant velocity, and identified by its neighbours at rest: across an edge between two neighbours
+the displacement changes by less than half of their distance. A frame with unmatched dots is matched again from other
+guesses, and the match with most dots is used. Displacements are always relative to rest, so errors do not accumulate.
+docs/decisions/0013-marker-tracker.md gives the purpose of each guess, and failures without it.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ Index = NDArray[np.intp]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tracked:
-    """Where the dots are."""
+    """Displacements of the dots."""
 
     displacement: FloatArray  # (n, 2) against rest; the mean of its neighbours' for a dot that is not seen
     visible: Mask  # (n,)
@@ -48,11 +48,12 @@ class Tracked:
 
 
 class DotTracker:
-    """Follows dots, in any unit of length."""
+    """Tracks dots, in any unit of length."""
 
     def __init__(self, rest: FloatArray, pitch: float, in_view: Callable[[FloatArray], Mask] | None = None) -> None:
-        """`rest`: (n, 2) the dots at rest; `pitch`: usual distance of neighbours; `in_view`: whether a dot at places
-        (..., 2) would be seen; None: everywhere. Raises ValueError for fewer than 4 dots, or one without neighbours."""
+        """rest: (n, 2) the dots at rest. pitch: typical distance of neighbours. in_view: returns True where a dot at
+        places (..., 2) is in view; None: everywhere. Raises ValueError for fewer than 4 dots, or one without
+        neighbours."""
         weight_range = 1.0  # [pitches]
         # Extrapolation of displacement: an affine map through known dots, weighted by exp(-(distance / range)^2)
         # nearest dots that take part
@@ -79,7 +80,7 @@ class DotTracker:
         self.reset()
 
     def reset(self) -> None:
-        """Forgets all motion: the next frame is expected at rest."""
+        """Resets the motion: the next frame is expected at rest."""
         self._displacement = np.zeros_like(self._rest)
         self._velocity = np.zeros_like(self._rest)
 
@@ -110,7 +111,7 @@ class DotTracker:
         return Tracked(displacement.copy(), visible)
 
     def _match_points(self, expected: FloatArray, points: FloatArray, radius: float = MATCH_RADIUS) -> Index:
-        """(n,) the point of each dot, -1 where none is near: the least sum of squared distances (Kuhn 1955)."""
+        """(n,) the point of each dot, -1 if none is near: the minimum of the sum of squared distances (Kuhn 1955)."""
         from scipy.optimize import linear_sum_assignment
 
         partner = np.full(len(expected), -1, dtype=np.intp)
@@ -129,7 +130,7 @@ class DotTracker:
         return partner
 
     def _best_match(self, expected: FloatArray, points: FloatArray, predicted: bool) -> Index:
-        """(n,) partners by the guess that explains most dots; of equal ones, by the smoothest."""
+        """(n,) partners by the guess with most matched dots; of equal ones, by the smoothest."""
         found = [self._grow_match(expected, points)]
         if predicted:
             matched = self._match_points(expected, points)
@@ -148,8 +149,8 @@ class DotTracker:
         return best
 
     def _match_score(self, partner: Index, points: FloatArray) -> tuple[int, float]:
-        """How many dots have a partner, or would be out of view if they moved with the others, less the unmatched
-        points; and how little displacement changes across edges."""
+        """Number of dots with a partner, or out of view if they moved with the others, minus the number of unmatched
+        points; and the negative change of displacement across edges."""
         visible = partner >= 0
         if not visible.any():
             return -len(points), 0.0
@@ -160,15 +161,15 @@ class DotTracker:
         return int((visible | out).sum()) - spare, -float(change.mean()) if len(change) else 0.0
 
     def _grow_match(self, guess: FloatArray, points: FloatArray) -> Index:
-        """Partners of the largest coherent part of the dots that are certainly where they are guessed, and of those
-        that are found from there by extrapolation."""
+        """Partners of the largest coherent part of the dots that are close to their guess, and of those found by
+        extrapolation from it."""
         partner = self._match_points(guess, points, STRICT_MATCH_RADIUS)
         partner = self._extend_match(np.where(self._coherent_part(partner, points, MAX_STRETCH), partner, -1), points)
         smooth = self._remove_far_points(partner, points)
         return partner if smooth is partner else self._remove_far_points(self._extend_match(smooth, points), points)
 
     def _extend_match(self, partner: Index, points: FloatArray) -> Index:
-        """`partner`, and those found by extrapolation, outwards from the dots that have one."""
+        """`partner`, and those found by extrapolation from the dots that have one."""
         min_known = 2  # of a dot that is looked for by extrapolation
         partner = partner.copy()
         refused = np.zeros(len(partner), dtype=np.bool_)
@@ -185,7 +186,7 @@ class DotTracker:
         return partner
 
     def _remove_far_points(self, partner: Index, points: FloatArray) -> Index:
-        """`partner` without those far from where the dots around extrapolate to, the worst first."""
+        """`partner` without those far from the extrapolation of the surrounding dots, the worst first."""
         checked = partner
         every = np.arange(len(partner))
         while (checked >= 0).any():
@@ -198,8 +199,8 @@ class DotTracker:
         return checked
 
     def _without_dirt(self, partner: Index, points: FloatArray) -> Index:
-        """`partner`, but where an unmatched point fits far better to the dots around than the matched one, that was a
-        speck of dirt."""
+        """`partner`, with an unmatched point in place of a matched one that was a speck of dirt, if it fits the
+        surrounding dots much better."""
         known = partner >= 0
         if not known.any():
             return partner
@@ -223,8 +224,8 @@ class DotTracker:
         return cleaned if once else partner
 
     def _remove_local_outliers(self, partner: Index, points: FloatArray) -> Index:
-        """`partner` without dots that lie aside from where those around extrapolate to, and whose neighbours hardly
-        do: at the rim of a contact several do."""
+        """`partner` without single dots that are far from the extrapolation of the surrounding ones; at the rim of a
+        contact several dots are, and they stay."""
         known = partner >= 0
         if not known.any():
             return partner
@@ -272,8 +273,8 @@ class DotTracker:
         return np.asarray((part == biggest) & visible)
 
     def _fill_hidden(self, displacement: FloatArray, visible: Mask) -> FloatArray:
-        """`displacement` with the mean of its neighbours' at each dot that is not seen (a discrete Laplace equation);
-        that of the last frame where nothing at all is seen."""
+        """`displacement` with the mean of its neighbours for each dot that is not visible (a discrete Laplace
+        equation), or that of the last frame without any visible dot."""
         lost = ~visible
         if not lost.any():
             return displacement
@@ -286,7 +287,7 @@ class DotTracker:
         return filled
 
     def _may_have_jumped(self, partner: Index, points: FloatArray) -> bool:
-        """Both dots and points are unmatched, as if they belonged together."""
+        """True if both dots and points are unmatched, so that they may belong together."""
         lost, spare = int((partner < 0).sum()), len(points) - int((partner >= 0).sum())
         return min(lost, spare) > max(1.0, MIN_JUMP_SHARE * len(partner))
 

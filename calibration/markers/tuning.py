@@ -15,7 +15,7 @@ MIN_PRESENT_SHARE = 0.75  # share of its dots that an unknown lattice must show
 MIN_VISIBLE_SHARE = 0.25  # share of the dots that must be seen for a flow
 
 # lattice.py
-MAX_STEP_ERROR = 0.3  # of a neighbour, from one step along the lattice [pitches]
+MAX_STEP_ERROR = 0.3  # of a neighbour from one step along the lattice [pitches]
 MIN_ROW_SHARE = 0.5  # dots of a row or column of the lattice [number of dots of the fullest one]
 MAX_PITCH_ERROR = 0.25  # of the distance of regular neighbours [pitches]
 
@@ -23,7 +23,7 @@ MAX_PITCH_ERROR = 0.25  # of the distance of regular neighbours [pitches]
 NEIGHBOUR_RADIUS = 1.6  # dots this near at rest are neighbours: the diagonal of a square is one [pitches]
 # A dot is matched with a point this near to its place [pitches]
 MATCH_RADIUS = 0.45  # where the place is predicted
-STRICT_MATCH_RADIUS = 0.25  # where others are going to rely on it
+STRICT_MATCH_RADIUS = 0.25  # if other matches will depend on it
 # Change of displacement across an edge, at most [pitches]
 MAX_STRETCH = 0.4  # within a part that other dots are matched from
 MAX_STRETCH_TRACKED = 0.75  # where each dot was followed from frame to frame
@@ -33,8 +33,8 @@ MIN_JUMP_SHARE = 0.04  # of dots and of points that are unmatched: more make a j
 MAX_JUMP = 2.6  # [pitches]
 # A speck of dirt taken for a dot
 MIN_DIRT_MISFIT = 0.1  # distance from the extrapolated place that is suspicious [pitches]
-MIN_DIRT_MISFIT_RATIO = 4.0  # ... if it is also so many times the median
+MIN_DIRT_MISFIT_RATIO = 4.0  # ... if it also exceeds the median by this factor
 MAX_DIRT_GAIN = 0.25  # another point is the dot if its distance is less than this share
 # A dot that moves alone: two dots in one, or glare on it
 OUTLIER_MISFIT = 0.15  # distance from the extrapolated place [pitches]
-OUTLIER_MISFIT_RATIO = 2.5  # ... if it is also so many times that of each of its neighbours
+OUTLIER_MISFIT_RATIO = 2.5  # ... if it also exceeds that of each of its neighbours by this factor

@@ -1,1 +1,1 @@
-"""What gels and bodies are made of, from recorded presses and squeezes."""
+"""Materials of gels and bodies, from recorded presses and squeezes."""

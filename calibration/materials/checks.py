@@ -1,7 +1,7 @@
-"""Do the presses follow the model at all? What a fit must not hide: a wrong contact, a zero of the force that drifts.
+"""Checks that the presses follow the model: a fit must not hide a wrong contact, or a zero of the force that drifts.
 
-A zero that is off by a constant is a nuisance and fitted. One that drifts, and forces that no material of this kind
-gives, are told; the fit is then not to be used.
+A constant error of a zero is a nuisance parameter of the fit. A zero that drifts, and forces that no material of this
+kind produces, are findings; the fit must then not be used.
 """
 
 from __future__ import annotations
@@ -22,27 +22,27 @@ from tacsim.interface import FloatArray
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """Something that speaks against the fit."""
+    """An observation that contradicts the fit."""
 
     kind: Literal["misfit", "drift", "size"]
     text: str
-    probability: float  # of the like without a cause
+    probability: float  # without a known cause
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _CandidateCause:
-    """A cause that a fit of materials leaves out: one more linear unknown."""
+    """A cause outside the fit of materials: one additional linear unknown."""
 
     column: FloatArray  # (m,)
     kind: Literal["drift", "size"]
     text: Callable[[float, float], str]  # of its size and twice its standard deviation
-    allowed: float = 0.0  # as large as this it does no harm
+    allowed: float = 0.0  # a smaller size is harmless
 
 
 def find_contradictions(
     fit: Fit, signals: Signals, names: tuple[str, ...], by_size: FloatArray | None = None
 ) -> list[Finding]:
-    """What speaks against the fit; causes first, they explain a misfit too.
+    """The findings that contradict the fit. Causes are first, because they can also explain a misfit.
 
     names: of the presses. by_size: (m, b) derivative of the signals by the logarithm of the size of each indenter.
     """
@@ -54,8 +54,8 @@ def find_contradictions(
 
 
 def indenter_size_error(fit: Fit, by_size: FloatArray) -> float:
-    """Standard deviation of the logarithm of an indenter's size, if the signals alone were to tell it; of several the
-    greatest. by_size: (m, b)."""
+    """Standard deviation of the logarithm of an indenter's size from the signals alone; of several indenters the
+    largest. by_size: (m, b)."""
     return max(_fit_one_more(fit, [column], np.zeros(len(column)))[1] for column in by_size.T)
 
 
@@ -75,40 +75,41 @@ def _drift_candidates(signals: Signals, names: tuple[str, ...]) -> list[_Candida
 
 def _describe_drift(press: str, channel: str, size: float, spread: float) -> str:
     return (
-        f"{press}: the zero of {channel} drifts by {size:+.3g} N from beginning to end (give or take {spread:.2g}); "
+        f"{press}: the zero of {channel} drifts by {size:+.3g} N from beginning to end (± {spread:.2g}); "
         "let the sensor warm up, zero it before each press, and record again"
     )
 
 
 def _describe_size(presses: str, size: float, spread: float) -> str:
     return (
-        f"{presses}: felt and seen is an indenter about {math.exp(size):.2f} times as large as stated (give or take "
+        f"{presses}: forces and heights fit an indenter about {math.exp(size):.2f} times as large as stated (± "
         f"{100 * spread:.0f} %), or of another shape; measure it, and check the pixel pitch of the sensor"
     )
 
 
 def _test_candidates(fit: Fit, signals: Signals, candidates: list[_CandidateCause]) -> list[Finding]:
-    """The suspects that the signals show, each as one more unknown beside all others of the fit."""
+    """The suspects that the signals show, each as one unknown in addition to all others of the fit."""
     found: list[Finding] = []
     residual = (signals.values - fit.predicted) / fit.sigma
-    seen: list[FloatArray] = []  # the columns of those found before: one that is wrong pulls at all others
-    while len(seen) < len(candidates):
-        sizes = [_fit_one_more(fit, [*seen, each.column], residual) for each in candidates]
+    # columns of the causes found before, because one large error also affects all other estimates
+    found_columns: list[FloatArray] = []
+    while len(found_columns) < len(candidates):
+        sizes = [_fit_one_more(fit, [*found_columns, each.column], residual) for each in candidates]
         clear = [
             max(abs(size) - each.allowed, 0.0) / spread for each, (size, spread) in zip(candidates, sizes, strict=True)
         ]
         worst = int(np.argmax(clear))
-        chance = float(2 * norm.sf(clear[worst])) * len(candidates)
-        if chance > MAX_PROBABILITY:
+        probability = float(2 * norm.sf(clear[worst])) * len(candidates)
+        if probability > MAX_PROBABILITY:
             break
-        seen.append(candidates[worst].column)
+        found_columns.append(candidates[worst].column)
         size, spread = sizes[worst]
-        found.append(Finding(candidates[worst].kind, candidates[worst].text(size, 2 * spread), chance))
+        found.append(Finding(candidates[worst].kind, candidates[worst].text(size, 2 * spread), probability))
     return found
 
 
 def _fit_one_more(fit: Fit, columns: list[FloatArray], residual: FloatArray) -> tuple[float, float]:
-    """What the fit gives for the last of these further linear unknowns, and its standard deviation."""
+    """Estimate and standard deviation of the last of these additional linear unknowns."""
     p = len(fit.free)
     rows = np.column_stack([fit.system, *columns]) / fit.sigma[:, None]
     known = np.zeros((len(fit.priors), rows.shape[1]))
@@ -116,9 +117,9 @@ def _fit_one_more(fit: Fit, columns: list[FloatArray], residual: FloatArray) -> 
     whole = np.vstack([rows, known])
     right = np.concatenate([residual, -fit.nuisances / fit.priors])
     triangle = np.asarray(np.linalg.qr(whole, mode="r"))
-    last = abs(float(triangle[-1, -1]))  # what of the column no other column explains
+    last = abs(float(triangle[-1, -1]))  # norm of the part of the column that is independent of the others
     if last < 1e-3 * np.linalg.norm(whole[:, -1]):
-        return 0.0, math.inf  # cannot be told from the others
+        return 0.0, math.inf  # not distinguishable from the others
     solved = np.linalg.lstsq(whole, right, rcond=1e-12)[0]
     return float(solved[-1]), 1.0 / last
 
@@ -127,34 +128,34 @@ def _find_misfits(fit: Fit, signals: Signals, names: tuple[str, ...]) -> list[Fi
     found = []
     residual = (signals.values - fit.predicted) / fit.sigma
     whole = float((residual**2).sum())
-    chance = float(chi2.sf(whole, fit.degrees_of_freedom))
+    probability = float(chi2.sf(whole, fit.degrees_of_freedom))
     worst = _worst_channel(residual, signals, names)
-    if chance < MAX_PROBABILITY:
+    if probability < MAX_PROBABILITY:
         found.append(
             Finding(
                 "misfit",
-                f"no such material gives these signals: off by {math.sqrt(whole / fit.degrees_of_freedom):.1f} times "
-                f"what noise and mesh explain, most of all {worst}; is the indenter or body of that shape and size and "
-                "in that place, are axes and units right, is the noise larger than stated?",
-                chance,
+                f"no such material produces these signals: their error is "
+                f"{math.sqrt(whole / fit.degrees_of_freedom):.1f} times that of noise and mesh, most of all {worst}; "
+                "check shape, size and place of the indenter or body, axes and units, and the stated noise",
+                probability,
             )
         )
         return found
-    chance = _runs_test(residual, signals)
-    if chance < MAX_PROBABILITY and whole > 0.5 * fit.degrees_of_freedom:
+    probability = _runs_test(residual, signals)
+    if probability < MAX_PROBABILITY and whole > 0.5 * fit.degrees_of_freedom:
         found.append(
             Finding(
                 "misfit",
-                f"measured and fitted forces differ in a bow, not at random, most of all {worst}: the contact is not "
-                "what the scene says; look at its shape and size, and at where it begins",
-                chance,
+                f"measured and fitted forces differ systematically, not at random, most of all {worst}: the contact "
+                "differs from the scene; check its shape and size, and where it begins",
+                probability,
             )
         )
     return found
 
 
 def _worst_channel(residual: FloatArray, signals: Signals, names: tuple[str, ...]) -> str:
-    """The press and channel that fit worst, in words."""
+    """Name of the press and channel with the worst fit."""
     sizes = {}
     for p in range(signals.presses):
         for c, channel in enumerate(signals.channels):
@@ -165,7 +166,7 @@ def _worst_channel(residual: FloatArray, signals: Signals, names: tuple[str, ...
 
 
 def _runs_test(residual: FloatArray, signals: Signals) -> float:
-    """Chance of so few runs of equal signs (Wald & Wolfowitz 1940), over all presses and channels in order of time."""
+    """Probability of so few runs of equal signs (Wald & Wolfowitz 1940), over all presses and channels in time."""
     runs = expected = variance = 0.0
     for p in range(signals.presses):
         for c in range(len(signals.channels)):

@@ -1,11 +1,11 @@
-"""Least squares of a simulation against recorded presses: values, intervals, and what the data do not tell.
+"""Least-squares fit of a simulation to recorded presses: values, intervals, and parameters that are not identifiable.
 
-Unknowns are the parameters of the materials, and for each press two nuisances that every rig has: its place is off by a
-little along the closing direction, and so is the zero of its force. These have a standard deviation given beforehand.
+Unknowns are the parameters of the materials, and two nuisance parameters for each press: an error of its place along
+the closing direction, and an error of the zero of its force. Both have a prior standard deviation. The method is
 Gauss-Newton with Levenberg's damping: a whole Jacobian costs one batch of perturbed simulations.
 
-A coarse simulation finds the way; a finer one, run at the estimate, says by how much the coarse one is wrong there
-(space mapping: Bandler et al. 1994). How far that moved the estimate tells what is left of the mesh's error.
+A coarse simulation finds the estimate; a finer one at the estimate gives the error of the coarse one (space mapping:
+Bandler et al. 1994). The change of the estimate by the finer mesh gives the remaining error of the mesh.
 """
 
 from __future__ import annotations
@@ -40,17 +40,17 @@ from calibration.materials.tuning import (
 )
 from tacsim.interface import FloatArray
 
-MIN_GAIN_SHARE = 0.01  # of the sum of squares, where a coarse mesh keeps it large
-MIN_STEP = 0.01  # of the free numbers, likewise where all are identified
-SETTLING_ERROR = 0.01  # of any simulation: what its settling leaves, in each number and, again, in a whole press
+MIN_GAIN_SHARE = 0.01  # of the sum of squares, if the coarse mesh dominates it
+MIN_STEP = 0.01  # of the free numbers, if all are identified
+SETTLING_ERROR = 0.01  # relative error of settling in any simulation, for each number and for each whole press
 
 
 class NotIdentified(CalibrationError):
-    """These presses do not tell what was asked for."""
+    """No requested parameter can be identified from these presses."""
 
 
 class CannotSimulate(CalibrationError):
-    """A press has no simulated counterpart with such materials."""
+    """A press cannot be simulated with these materials."""
 
 
 @dataclass(slots=True, eq=False)
@@ -75,7 +75,7 @@ class _Fitter:
         self.low, self.high = limits[:, 0], limits[:, 1]
 
     def linearise(self, predict: Predict, point: Point, zeros: FloatArray) -> _State:
-        """One batch: the point itself, each free number changed a little, and all places at once."""
+        """Linearises by one batch: the point itself, a small change of each free number, and one of all places."""
         steps = np.where(point.free + PARAMETER_DIFFERENCE > self.high, -PARAMETER_DIFFERENCE, PARAMETER_DIFFERENCE)
         points = [point, *(replace(point, free=point.free + step) for step in np.diag(steps))]
         points.append(replace(point, places=point.places + PLACE_STEP))
@@ -87,8 +87,8 @@ class _Fitter:
         return _State(point, zeros, base, np.column_stack([*columns, self.zero_columns]))
 
     def secant(self, predict: Predict, before: _State, point: Point, zeros: FloatArray) -> _State:
-        """One run: the system of `before` with the least change that explains what the step from there did (Broyden
-        1965), for each press by itself, since no press knows another's place."""
+        """Linearises by one run: the system of `before` with the smallest change that explains the last step (Broyden
+        1965), separately for each press, because the place of a press affects no other press."""
         predicted = self.run(predict, [point])[0]
         p, system = len(self.held), before.system.copy()
         step = np.concatenate([point.free - before.point.free, point.places - before.point.places])
@@ -99,7 +99,7 @@ class _Fitter:
             scaled = step[columns] / scale
             weight = (
                 scaled @ scaled + PARAMETER_DIFFERENCE**2
-            )  # what a smaller step missed is the simulation's own noise
+            )  # the residual after a smaller step is noise of the simulation
             system[np.ix_(rows, columns)] += np.outer(missed[rows], scaled / scale / weight)
         return _State(point, zeros, predicted, system)
 
@@ -119,7 +119,7 @@ class _Fitter:
         return squares + float(((self.nuisances(state) / self.priors) ** 2).sum())
 
     def step(self, state: _State, damping: float) -> FloatArray:
-        """(n,) the damped least-squares step; 0 for parameters that are held."""
+        """(n,) the damped least-squares step; 0 for fixed parameters."""
         p, n = len(self.held), state.system.shape[1]
         rows = state.system / self.sigma[:, None]
         rows[:, :p][:, self.held] = 0.0
@@ -134,7 +134,7 @@ class _Fitter:
         return found
 
     def is_small(self, state: _State, step: FloatArray, limit: float) -> bool:
-        """Whether a step changes no free number by more than `limit`, or than a part of its standard deviation."""
+        """True if a step changes each free number by less than `limit`, or than a part of its standard deviation."""
         p = len(self.held)
         spread = np.sqrt(np.diag(covariance_of(state.system, self.sigma, self.priors, self.held, 0.0))[:p])
         return bool((np.abs(step[:p]) < np.maximum(limit, MIN_STEP_DEVIATIONS * spread)).all())
@@ -146,7 +146,7 @@ class _Fitter:
         return Point(free, state.point.places + step[p : p + t]), state.zeros + step[p + t :]
 
     def after_full_step(self, state: _State) -> _State:
-        """After a whole step, and with what is held back at its start, as the system foresees it."""
+        """The state predicted by the system after a whole step, with fixed parameters at their start."""
         back = np.where(self.held, start_values(self.parameters) - state.point.free, 0.0)
         begun = _State(
             replace(state.point, free=state.point.free + back), state.zeros,
@@ -157,14 +157,14 @@ class _Fitter:
         return _State(point, zeros, state.predicted + state.system[:, : len(change)] @ change, state.system)
 
     def reach(self, state: _State) -> FloatArray:
-        """(p,) half the 95 % intervals of the free numbers, as far as the noise alone goes; 0 for those held."""
+        """(p,) half the 95 % intervals of the free numbers from the noise alone; 0 for fixed ones."""
         sigma = np.hypot(self.signals.noise, SETTLING_ERROR * np.abs(state.predicted))
         covariance = covariance_of(state.system, sigma, self.priors, self.held, 0.0)
         found: FloatArray = 1.96 * np.sqrt(np.diag(covariance))[: len(self.held)]
         return found
 
     def hold(self, state: _State, reach: FloatArray, limit: float) -> bool:
-        """Holds the parameter that is told least, if it is told too little. Raises NotIdentified for the last one."""
+        """Fixes the parameter with the widest interval if that is too wide. Raises NotIdentified for the last one."""
         worst = int(np.argmax(np.where(self.held, 0.0, reach)))
         if reach[worst] <= limit:
             return False
@@ -172,7 +172,7 @@ class _Fitter:
         if self.held.all():
             names = ", ".join(each.name for each in self.parameters)
             raise NotIdentified(
-                f"these recordings tell nothing of {names}: what they would change is lost in the noise; record with a "
+                f"these recordings do not identify {names}: their effect is below the noise; record with a "
                 "better force sensor, press deeper or more often"
             )
         return True
@@ -188,12 +188,17 @@ def estimate_materials(
 ) -> Fit:
     """Fits the parameters to the signals.
 
-    levels: the simulation on meshes from coarse to fine. The coarsest, off by a share of about `coarse_error`, finds
-    a start; the last but one gives the Jacobian; the finest corrects the result. on_step: receives the present step.
+    A parameter whose interval would exceed a factor of 1.8 in either direction is fixed at its start, the one with the
+    widest interval first (`Fit.unidentified`).
 
-    A parameter whose interval would exceed a factor of 1.8 in either direction is held at its start, the one with the
-    widest interval first (`Fit.unidentified`). Raises NotIdentified if no parameter can be identified, CannotSimulate
-    if no smaller step helps.
+    Args:
+        levels: the simulation on meshes from coarse to fine. The coarsest, with a relative error of about
+            `coarse_error`, finds a start; the last but one gives the Jacobian; the finest corrects the result.
+        on_step: receives the name of the present step.
+
+    Raises:
+        NotIdentified: no parameter can be identified.
+        CannotSimulate: also with smaller steps.
     """
     max_fine_steps = 2
     fitter = _Fitter(signals, parameters, priors)
@@ -216,7 +221,7 @@ def estimate_materials(
         state = fitter.after_full_step(state)
     while True:
         fit = _refine_fit(fitter, state, levels[-1] if len(levels) > 1 else None, on_step)
-        plain = fit.with_sigma(fit.sigma)  # signals that scatter more than they should are no lack of them
+        plain = fit.with_sigma(fit.sigma)  # large scatter of the signals does not mean that data are missing
         if not fitter.hold(
             state, np.array([plain.half_interval(each.name) for each in parameters]), MAX_IDENTIFIED_HALF_INTERVAL
         ):
@@ -225,8 +230,8 @@ def estimate_materials(
 
 
 def _restore_unidentified(fitter: _Fitter, predict: Predict, state: _State) -> _State:
-    """The state, with parameters that nothing tells there (friction at which nothing slips) back where they began if
-    that tells them: a step went too far."""
+    """The state, in which parameters that are not identifiable there (friction at which nothing slips) return to their
+    start if that identifies them, because a step was too large."""
     begun, lost = (
         fit_start_values(fitter.parameters),
         ~fitter.held & (fitter.reach(state) > MAX_IDENTIFIED_HALF_INTERVAL),
@@ -247,8 +252,8 @@ def _fit_coarse(
     max_steps: int = 12,
     secant: bool = False,
 ) -> _State:
-    """Damped steps by the simulation `predict`, off by a share of about `error`, `max_steps` of them. secant: one run
-    each, the system brought up to date by what the step found; else linearised anew, a batch each."""
+    """Up to `max_steps` damped steps with the simulation `predict`, whose relative error is about `error`. secant: each
+    step costs one run, whose result updates the system; otherwise each step linearises again with a batch."""
     damping = 1e-3
     for count in range(max_steps):
         fitter.sigma = np.hypot(fitter.signals.noise, error * np.abs(state.predicted))
@@ -262,7 +267,7 @@ def _fit_coarse(
         except CannotSimulate:
             if count + 1 == max_steps:
                 raise
-            damping = max(damping, 1e-3) * 100  # the step went too far
+            damping = max(damping, 1e-3) * 100  # the step was too large
             continue
         gain = fitter.cost(state) - fitter.cost(after)
         if gain > 0:
@@ -276,7 +281,7 @@ def _fit_coarse(
 
 
 def _refine_fit(fitter: _Fitter, state: _State, fine: Predict | None, on_step: Callable[[str], None]) -> Fit:
-    """Goes on with the differences between a finer simulation and the coarse one, and ends with the intervals."""
+    """Corrects the fit by the differences between a finer simulation and the coarse one, and adds the intervals."""
     max_steps = 4
     p = len(fitter.held)
     begun, coarse = state.point.free, state.predicted
@@ -302,8 +307,8 @@ def _refine_fit(fitter: _Fitter, state: _State, fine: Predict | None, on_step: C
     series, residual = fitter.signals.series, fitter.residual(state)
     scatter = float(((residual / fitter.sigma) ** 2).sum() / fit.degrees_of_freedom)
     if fine is not None:
-        # What each series is off may cancel in this sum, and not in that of what is left of it. What creeps still has
-        # one sign in all of it, and so has what the finest mesh is off: it does not average out.
+        # Errors of the series may cancel in this sum, but not in that of their remainders. Remaining creep has the same
+        # sign in all series, and so has the error of the finest mesh: these do not average out.
         apart = np.sqrt((fit.parameter_changes(off, series) ** 2).sum(axis=0))
         fit = replace(
             fit, mesh_shift=np.maximum(np.abs(shift), apart), settled_shift=fit.parameter_changes(settled, series)

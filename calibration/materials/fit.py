@@ -1,4 +1,4 @@
-"""What a fit of materials is made of: its unknowns, where a simulation is run, what was measured, and what came out."""
+"""Data of a fit of materials: its unknowns, the points of simulations, the signals, and the result."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from scipy.stats import t as student
 
 from tacsim.interface import FloatArray
 
-MESH_ERROR_SHARE = 0.5  # standard deviation of what is left of the mesh's error, over what the finer mesh changed
+MESH_ERROR_SHARE = 0.5  # standard deviation of the remaining mesh error, over the change by the finer mesh
 
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
     """One unknown of a material or a contact.
 
-    A fit works in its free number: the logarithm of what is positive (`log`); log(1/2 - nu) of Poisson's ratio, since
-    the bulk modulus of a nearly incompressible gel goes with 1 / (1/2 - nu) (`volume`); the value over `unit` of what
-    may be zero (`linear`).
+    A fit uses its free number: the logarithm of a positive value (`log`); log(1/2 - nu) of Poisson's ratio, because the
+    bulk modulus of a nearly incompressible gel is proportional to 1 / (1/2 - nu) (`volume`); the value over `unit` if
+    it may be zero (`linear`).
     """
 
     name: str
@@ -31,7 +31,7 @@ class Parameter:
     high: float
     kind: Literal["log", "volume", "linear"] = "log"
     unit: float = 1.0
-    begin: float | None = None  # where a fit fit_start_values, if not at the start, where it stays if nothing tells it
+    begin: float | None = None  # first value of a fit, if not `start`, which it keeps if it is not identified
 
     def free(self, value: float) -> float:
         if self.kind == "log":
@@ -45,7 +45,7 @@ class Parameter:
 
     @property
     def bounds(self) -> tuple[float, float]:
-        """Least and greatest free number."""
+        """Minimum and maximum of the free number."""
         ends = sorted((self.free(self.low), self.free(self.high)))
         return ends[0], ends[1]
 
@@ -57,22 +57,22 @@ class Parameter:
 
 
 def start_values(parameters: Sequence[Parameter]) -> FloatArray:
-    """The free numbers at which what is not told stays."""
+    """The free numbers of parameters that are not identified."""
     return np.array([each.free(each.start) for each in parameters])
 
 
 def fit_start_values(parameters: Sequence[Parameter]) -> FloatArray:
-    """The free numbers at which a fit fit_start_values."""
+    """The free numbers at which a fit starts."""
     return np.array([each.free(each.start if each.begin is None else each.begin) for each in parameters])
 
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """Where a simulation is run."""
+    """The unknowns of one simulation."""
 
     free: FloatArray  # (p,) free numbers of the parameters
-    places: FloatArray  # (t,) how much nearer than recorded the parts of each press are [m]
-    size: float = 0.0  # logarithm of how much larger than stated the indenter is, its lowest point where it was
+    places: FloatArray  # (t,) displacement of the parts of each press towards each other, relative to the recording [m]
+    size: float = 0.0  # logarithm of the indenter's size over the stated one, with the same lowest point
 
 
 Predict = Callable[[Sequence[Point]], list[FloatArray]]  # (m,) signals at each point
@@ -80,7 +80,7 @@ Predict = Callable[[Sequence[Point]], list[FloatArray]]  # (m,) signals at each 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Signals:
-    """What was measured in all presses, one number a row."""
+    """The measured signals of all presses, one number for each row."""
 
     values: FloatArray  # (m,) [N, or m]
     noise: FloatArray  # (m,) standard deviation
@@ -88,7 +88,7 @@ class Signals:
     channel: NDArray[np.int64]  # (m,) index into `channels`
     time: FloatArray  # (m,) [s]
     channels: tuple[str, ...]
-    force: NDArray[np.bool_]  # (c,) channels that are forces, whose zero may be off
+    force: NDArray[np.bool_]  # (c,) channels that are forces, whose zero may have an error
 
     @property
     def presses(self) -> int:
@@ -96,7 +96,7 @@ class Signals:
 
     @property
     def series(self) -> NDArray[np.int64]:
-        """(m,) which channel of which press, as one index."""
+        """(m,) index of press and channel."""
         found = np.unique(np.stack([self.press, self.channel]), axis=1, return_inverse=True)[1]
         return np.asarray(found.ravel(), dtype=np.int64)
 
@@ -109,7 +109,7 @@ class Signals:
 
 @dataclass(frozen=True, slots=True)
 class Priors:
-    """How well the nuisances are known beforehand: standard deviations."""
+    """Prior standard deviations of the nuisance parameters."""
 
     place: float  # [m]
     zero: float  # [N]
@@ -117,19 +117,19 @@ class Priors:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fit:
-    """An estimate and what it rests on. n = p + t + z unknowns: parameters, places, zeros."""
+    """An estimate and its linear system. n = p + t + z unknowns: parameters, places, zeros."""
 
     parameters: tuple[Parameter, ...]
-    held: NDArray[np.bool_]  # (p,) those that the data do not tell: they stayed at their start
+    held: NDArray[np.bool_]  # (p,) fixed parameters, not identified by the data: they have their start value
     free: FloatArray  # (p,)
-    covariance: FloatArray  # (p, p) of the free numbers, with what the mesh, and those held, may be off
-    mesh_shift: FloatArray  # (p,) how far the finer mesh moved them, or what it changed press by press
-    settled_shift: FloatArray  # (k, p) by how much each press and channel moves them that is off as a whole
+    covariance: FloatArray  # (p, p) of the free numbers, with the errors of the mesh and of fixed parameters
+    mesh_shift: FloatArray  # (p,) their change by the finer mesh, in total or by press
+    settled_shift: FloatArray  # (k, p) their change by a common error of each press and channel
     predicted: FloatArray  # (m,) with the zeros of the force
-    sigma: FloatArray  # (m,) standard deviations that weighed: noise, and what the simulation is off
+    sigma: FloatArray  # (m,) standard deviations of the weights: noise, and error of the simulation
     system: FloatArray  # (m, n)
     nuisances: FloatArray  # (t + z,)
-    priors: FloatArray  # (t + z,) standard deviations of the nuisances
+    priors: FloatArray  # (t + z,) standard deviations of the nuisance parameters
     runs: int = 0  # simulated presses
 
     @property
@@ -159,28 +159,28 @@ class Fit:
         return self.parameters[index].interval_values(float(self.free[index]), self.half_interval(name))
 
     def with_sigma(self, sigma: FloatArray) -> Fit:
-        """What its intervals were if the signals had these standard deviations."""
+        """The fit with the intervals of other standard deviations of the signals."""
         p = len(self.free)
         spread = covariance_of(self.system, sigma, self.priors, self.held)[:p, :p]
         spread = spread + np.diag((MESH_ERROR_SHARE * self.mesh_shift) ** 2) + self.settled_shift.T @ self.settled_shift
         return replace(self, sigma=sigma, covariance=spread)
 
     def parameter_change(self, change: FloatArray) -> FloatArray:
-        """(p,) how far the free numbers move if the simulation changes by `change` (m,)."""
+        """(p,) change of the free numbers if the simulation changes by `change` (m,)."""
         covariance = covariance_of(self.system, self.sigma, self.priors, self.held, 0.0)
         found: FloatArray = -(covariance @ self.system.T @ (change / self.sigma**2))[: len(self.free)]
         return found
 
     def parameter_changes(self, change: FloatArray, series: NDArray[np.int64]) -> FloatArray:
-        """(k, p) the same for each series' part of the change; `series` (m,): `Signals.series`."""
+        """(k, p) the same for the part of each series in the change. series (m,): `Signals.series`."""
         return np.array(
             [self.parameter_change(np.where(series == each, change, 0.0)) for each in range(series.max() + 1)]
         )
 
     def widen_intervals(self, residual: FloatArray, series: NDArray[np.int64]) -> Fit:
-        """With intervals as wide as the series (m,) pull its numbers apart, where that is more than they knew. What a
-        simulation is off lasts through a series, whose readings are no opinions of their own: the variance is that of
-        clusters (Liang and Zeger, Biometrika 73, 1986). residual: (m,) measured less `predicted`."""
+        """The fit with intervals that include the spread between the series (m,), if that is larger. The error of a
+        simulation is correlated within a series, so the variance is that of clusters (Liang and Zeger, Biometrika 73,
+        1986). residual: (m,) measured minus `predicted`."""
         pulls = self.parameter_changes(residual, series)
         pulled = (pulls**2).sum(axis=0) * len(pulls) / max(1, len(pulls) - 1)
         more = np.maximum(0.0, pulled - np.diag(self.covariance))
@@ -193,14 +193,14 @@ class Fit:
 def covariance_of(
     system: FloatArray, sigma: FloatArray, priors: FloatArray, held: NDArray[np.bool_], spread: float = 0.5
 ) -> FloatArray:
-    """(n, n) of all unknowns, from the system (m, n), whose last columns have `priors`. Parameters that are held have
-    no variance themselves; `spread` is what they may be off, as far as the others go."""
-    unknown_deviation = 100.0  # standard deviation of a free number of which nothing is known
+    """(n, n) covariance of all unknowns, from the system (m, n), whose last columns have `priors`. Fixed parameters
+    have no variance; `spread` is their error for the covariance of the others."""
+    unknown_deviation = 100.0  # standard deviation of a free number without prior knowledge
     p, n = len(held), system.shape[1]
     free = np.concatenate([~held, np.ones(n - p, np.bool_)])
     known = np.concatenate([np.full(p, unknown_deviation), priors])[free]
     rows = system / sigma[:, None]
-    scaled = rows[:, free] * known  # by what is known beforehand: then the information is never singular
+    scaled = rows[:, free] * known  # scaled by the priors, so that the information matrix is not singular
     found = np.zeros((n, n))
     found[np.ix_(free, free)] = np.linalg.inv(scaled.T @ scaled + np.eye(len(known))) * np.outer(known, known)
     for index in np.flatnonzero(held):

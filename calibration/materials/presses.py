@@ -1,4 +1,4 @@
-"""Recorded presses and squeezes: where the parts were, and what was felt and seen there."""
+"""Recorded presses and squeezes: the poses of the parts, and the measured signals."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Quantity = Literal["force", "dent", "width", "slip"]
 QUANTITY: dict[str, Quantity] = {
     "fx": "force", "fy": "force", "fz": "force", "dent": "dent", "width": "width", "slip_x": "slip", "slip_y": "slip",
 }  # fmt: skip
-MIN_CORNER_COSINE = np.cos(np.radians(20.0))  # of the directions of two steps: beyond, a path turns
+MIN_CORNER_COSINE = np.cos(np.radians(20.0))  # of the directions of two steps; the path turns if it is smaller
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -28,13 +28,13 @@ class Press:
     poses: Mapping[str, tuple[Pose, ...]]  # by the part that moves: n poses each
     readings: Mapping[str, FloatArray]  # by channel, such as "lower.fz": (n,) [N, or m], NaN where not measured
     time: FloatArray  # (n,) [s]
-    repeats: NDArray[np.int64]  # (n,) how many readings each is the mean of
-    ball: float | None = None  # radius of the ball that was pressed in, where it is not the scene's indenter [m]
+    repeats: NDArray[np.int64]  # (n,) number of readings in each mean
+    ball: float | None = None  # radius of the pressed ball, if it is not the scene's indenter [m]
 
     @property
     def places(self) -> FloatArray:
-        """(n, 6 k) where the k parts are, and how far they have turned: rotation vectors times ARM [m]."""
-        lever = 5e-3  # about half a gel: from its middle to its edge [m]
+        """(n, 6 k) positions of the k parts, and their rotation vectors times ARM [m]."""
+        lever = 5e-3  # about half a gel: from its centre to its edge [m]
         turned = [[lever * pose_difference(poses[0], pose)[3:] for pose in poses] for poses in self.poses.values()]
         return np.hstack([*([pose.position for pose in poses] for poses in self.poses.values()), *turned])
 
@@ -56,12 +56,12 @@ class Noise:
 
     force: float = 0.02  # [N]
     dent: float = 5e-6  # of the root mean square of a height map [m]
-    width: float = 50e-6  # of the width of a dent: a pixel's pitch that is 2 % off [m]
+    width: float = 50e-6  # of the width of a dent: an error of the pixel pitch by 2 % [m]
     slip: float = 10e-6  # of the mean of a flow [m]
 
 
 def merge_repeated_readings(press: Press) -> Press:
-    """Readings taken in one place become their mean."""
+    """The press with the mean of readings that were taken in one place."""
     same_place = 1e-6  # parts that move less are in the same place [m]
     places = press.places
     moved = np.abs(np.diff(places, axis=0)).max(axis=1) > same_place
@@ -78,7 +78,7 @@ def merge_repeated_readings(press: Press) -> Press:
 
 
 def downsample_press(press: Press, max_moments: int) -> Press:
-    """At most about `max_moments` moments, evenly along the path; its ends and the places where it turns are kept."""
+    """At most about `max_moments` moments, evenly along the path, with its ends and the points where it turns."""
     places = press.places
     count = len(places)
     if count <= max_moments:
@@ -96,7 +96,7 @@ def downsample_press(press: Press, max_moments: int) -> Press:
 
 
 def signals_of(presses: Sequence[Press], noise: Noise) -> Signals:
-    """All that was measured, as the rows of a fit: press by press, channel by channel, moment by moment."""
+    """All measured signals as rows of a fit, in the order of press, channel and moment."""
     channels = tuple(sorted({name for press in presses for name in press.readings}))
     rows: list[tuple[FloatArray, FloatArray, FloatArray, int, int]] = []
     for index, press in enumerate(presses):

@@ -5,15 +5,15 @@ docs/measurements/identification.md, and the tests in tests/calibration/material
 """
 
 # checks.py
-MAX_PROBABILITY = 1e-3  # a finding that chance alone would bring more seldom counts
-MAX_SIZE_ERROR = 0.05  # of an indenter: moves the stiffness by 3 to 4 %
+MAX_PROBABILITY = 1e-3  # a finding counts if it is less probable than this by chance
+MAX_SIZE_ERROR = 0.05  # of an indenter: it changes the stiffness by 3 to 4 %
 
 # estimate.py
-PARAMETER_DIFFERENCE = 0.08  # step of a free number for its column of the Jacobian; simulations are exact to some 1e-3
+PARAMETER_DIFFERENCE = 0.08  # step of a free number for its column of the Jacobian; simulations are exact to about 1e-3
 PLACE_STEP = 0.02e-3  # the same of places [m]
-MAX_STEP = 0.7  # a step changes no free number by more: a factor of two
+MAX_STEP = 0.7  # maximum change of a free number in a step: a factor of two
 MIN_GAIN = 0.2  # of the sum of squares: the noise alone gives it a standard deviation of more than one
 MIN_STEP_DEVIATIONS = 0.3  # of their standard deviations, likewise
 MAX_IDENTIFIED_HALF_INTERVAL = 0.6
 MAX_START_HALF_INTERVAL = 5.0  # a wider interval at the start: the number cannot be identified
-COARSE_SIMULATION_ERROR = 0.05  # of a coarse simulation, where no fine one says better: share of the signal
+COARSE_SIMULATION_ERROR = 0.05  # of a coarse simulation, before a fine one gives its error: share of the signal

@@ -1,1 +1,1 @@
-"""Where sensors and cameras sit on their arms, and how late their pictures arrive."""
+"""Poses of sensors and cameras on their arms, and the latency of their pictures."""

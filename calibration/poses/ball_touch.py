@@ -1,10 +1,10 @@
-"""Where a sensor sits on its arm, from touches of one fixed ball with the sensor tilted in many ways.
+"""Pose of a sensor on its arm, from touches of one fixed ball at many tilts of the sensor.
 
 Unknown are tool_from_sensor and the ball's centre in the world: 9 numbers. Each touch gives the ball's centre in the
-sensor's frame, and the pose of the tool takes it to the world: three equations.
+sensor's frame, and the pose of the tool transforms it to the world: three equations.
 
-A wrong ball radius, or an error that all depths have in common, moves the result along the sensor's z by as much and
-leaves no trace in the residuals.
+An error of the ball radius, or a common error of all depths, moves the result by the same length along the sensor's z,
+and does not affect the residuals.
 """
 
 from __future__ import annotations
@@ -34,22 +34,22 @@ class TouchNoise:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BallTouch:
-    tool: Pose  # world_from_tool; any fixed frame will do for the world
+    tool: Pose  # world_from_tool; the world may be any fixed frame
     contact: tuple[float, float]  # centre of the contact, x, y in the sensor's frame [m]
-    depth: float  # how deep the ball is pressed into the gel [m]
+    depth: float  # of the ball in the gel [m]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TouchFit:
-    """Where the sensor sits and the ball stands, and how uncertain that is."""
+    """Pose of the sensor and position of the ball, with their uncertainty."""
 
     tool_from_sensor: Pose
     ball: FloatArray  # (3,) its centre in the world [m]
     covariance: FloatArray  # (6, 6) of tool_from_sensor: shift [m] and rotation vector [rad], along the tool's axes
     bound: FloatArray  # (6, 6) Cramer-Rao bound of it
-    residuals: FloatArray  # (n, 3) from `ball` to where each touch puts it, along the sensor's axes [m]
-    used: tuple[bool, ...]  # False: disagrees with the others, left out
-    scatter: float  # of the used touches over what the noise allows
+    residuals: FloatArray  # (n, 3) from `ball` to its position by each touch, along the sensor's axes [m]
+    used: tuple[bool, ...]  # False: an outlier, left out
+    scatter: float  # of the used touches over the stated noise
 
     @property
     def deviation(self) -> tuple[float, float]:
@@ -58,7 +58,7 @@ class TouchFit:
 
     @property
     def best_deviation(self) -> tuple[float, float]:
-        """The same by the Cramer-Rao bound: no method does better at the stated noise."""
+        """The same by the Cramer-Rao bound, the minimum of all methods at the stated noise."""
         return deviation(self.bound)
 
 
@@ -76,7 +76,9 @@ def fit_touches(touches: Sequence[BallTouch], ball_radius: float, noise: TouchNo
     """
     noise = TouchNoise() if noise is None else noise
     if len(touches) < MIN_TOUCHES:
-        raise BadMeasurements(f"{len(touches)} touches are too few; at least {MIN_TOUCHES} are needed, 24 are good")
+        raise BadMeasurements(
+            f"{len(touches)} touches are too few; at least {MIN_TOUCHES} are needed, 24 are recommended"
+        )
     turn = np.stack([se3.rotation(touch.tool).as_matrix() for touch in touches])
     place = np.stack([touch.tool.position for touch in touches])
     contacts = np.array([(*touch.contact, ball_radius - touch.depth) for touch in touches])
@@ -118,7 +120,7 @@ def _check_spread(turn: FloatArray, contacts: FloatArray) -> None:
     if spread < MIN_CONTACT_SPREAD:
         raise BadMeasurements(
             f"the contacts lie too near to a point or a line on the gel: they spread by {1e3 * spread:.2f} mm in one "
-            f"direction, {1e3 * MIN_CONTACT_SPREAD:g} mm are needed to tell how the sensor is turned"
+            f"direction, {1e3 * MIN_CONTACT_SPREAD:g} mm are needed to identify the rotation of the sensor"
         )
 
 
@@ -139,11 +141,11 @@ def _start_poses(turn: FloatArray, place: FloatArray, contacts: FloatArray) -> l
 def locate_ball(height: FloatArray, valid: Mask, pitch: float, ball_radius: float) -> tuple[tuple[float, float], float]:
     """Contact centre (x, y) [m] and depth [m] of a ball, in a surface `height` (h, w) [m] on the canonical grid.
 
-    Fits a ball of `ball_radius` to the cap deeper than half of the deepest point, where the gel lies on the ball (by
-    Hertz the contact circle is half as deep). Raises BadMeasurements where no ball is seen.
+    Fits a ball of `ball_radius` to the cap deeper than half of the deepest point, where the gel touches the ball (by
+    Hertz the contact circle is half as deep). Raises BadMeasurements if the surface shows no ball.
     """
     min_cells = 12  # of a cap
-    cap_share = 0.5  # share of the deepest point beyond which the gel lies on the ball (Hertz)
+    cap_share = 0.5  # share of the largest depth beyond which the gel touches the ball (Hertz)
     from scipy.ndimage import label
 
     rows, columns = height.shape
@@ -151,7 +153,7 @@ def locate_ball(height: FloatArray, valid: Mask, pitch: float, ball_radius: floa
     y = (np.arange(rows) - (rows - 1) / 2) * pitch
     deepest = float(height[valid].max()) if valid.any() else 0.0
     if not deepest > 0.0:
-        raise BadMeasurements("nothing is pressed into the gel")
+        raise BadMeasurements("no contact in the gel")
     patches, _ = label((height > cap_share * deepest) & valid)
     cap = patches == patches[np.unravel_index(np.where(valid, height, -np.inf).argmax(), height.shape)]
     if cap.sum() < min_cells:
@@ -159,10 +161,10 @@ def locate_ball(height: FloatArray, valid: Mask, pitch: float, ball_radius: floa
     inner = valid.copy()
     inner[[0, -1], :] = inner[:, [0, -1]] = False
     if (cap & ~inner).any():
-        raise BadMeasurements("the contact reaches the rim of what is seen; press nearer to the middle")
+        raise BadMeasurements("the contact reaches the border of the surface; press nearer to the centre")
     grid_x, grid_y = np.meshgrid(x, y)
     px, py, pz = grid_x[cap], grid_y[cap], height[cap].astype(np.float64)
-    # Gauss-Newton on z = depth - (R - sqrt(R^2 - r^2)), from the middle of the cap
+    # Gauss-Newton on z = depth - (R - sqrt(R^2 - r^2)), from the centre of the cap
     found = np.array([px.mean(), py.mean(), deepest])
     residual = np.zeros(0)
     for _ in range(10):
@@ -174,7 +176,7 @@ def locate_ball(height: FloatArray, valid: Mask, pitch: float, ball_radius: floa
     misfit = float(np.sqrt((residual**2).mean())) / deepest
     if not misfit < MAX_CAP_MISFIT:
         raise BadMeasurements(
-            f"what is pressed is no ball of {1e3 * ball_radius:.3g} mm: it fits only to {misfit:.0%} of its depth "
+            f"the contact is not that of a ball of {1e3 * ball_radius:.3g} mm: the misfit is {misfit:.0%} of the depth "
             f"({MAX_CAP_MISFIT:.0%} at most)"
         )
     return (float(found[0]), float(found[1])), float(found[2])

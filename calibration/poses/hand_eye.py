@@ -1,8 +1,8 @@
-"""Where a camera sits, from pictures of one board while an arm stands in many poses.
+"""Pose of a camera, from pictures of one board at many poses of an arm.
 
-Two cases: the camera rides on the flange and the board is fixed, or the camera is fixed and the board rides. A closed
-form (Park and Martin 1994) starts least squares weighted by the noise of board and robot: an error of the robot's
-rotation moves a far board by its lever arm, which no closed form knows.
+Two cases: the camera is on the flange and the board is fixed, or the camera is fixed and the board is on the flange. A
+closed form (Park and Martin 1994) starts a least-squares fit weighted by the noise of board and robot: an error of the
+robot's rotation moves a distant board by its lever arm, which the closed form does not include.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class HandEyeNoise:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoardPose:
-    """One picture of the board, and where the flange was."""
+    """One picture of the board, and the pose of the flange."""
 
     flange: Pose  # base_from_flange
     board: Pose  # camera_from_board
@@ -49,14 +49,14 @@ class BoardPose:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HandEyeFit:
-    """Where camera and board sit, and how uncertain that is."""
+    """Poses of camera and board, with their uncertainty."""
 
     camera: Pose  # flange_from_camera; of a fixed camera base_from_camera
     board: Pose  # base_from_board; with a fixed camera flange_from_board
     covariance: FloatArray  # (6, 6) of `camera`: shift [m] and rotation vector [rad], axes of the frame it is given in
     residuals: FloatArray  # (n, 2) of each board's pose in the camera: position [m], orientation [rad]
-    used: tuple[bool, ...]  # False: disagrees with the others, left out
-    scatter: float  # of the used poses over what the noise allows
+    used: tuple[bool, ...]  # False: an outlier, left out
+    scatter: float  # of the used poses over the stated noise
     spread: float  # of the flange's rotations, see angular_spread [rad]
 
     @property
@@ -66,14 +66,16 @@ class HandEyeFit:
 
 
 def fit_hand_eye(poses: Sequence[BoardPose], *, fixed: bool = False, noise: HandEyeNoise | None = None) -> HandEyeFit:
-    """Fits the pose of the camera. `fixed`: the camera is fixed, and the board rides on the flange.
+    """Fits the pose of the camera. fixed: the camera is fixed, and the board is on the flange.
 
     Raises BadMeasurements.
     """
-    reweightings = 2  # times that the weights are computed anew
+    reweightings = 2  # computations of the weights
     noise = HandEyeNoise() if noise is None else noise
     if len(poses) < MIN_POSES:
-        raise BadMeasurements(f"{len(poses)} poses are too few; at least {MIN_POSES} are needed, 15 to 30 are good")
+        raise BadMeasurements(
+            f"{len(poses)} poses are too few; at least {MIN_POSES} are needed, 15 to 30 are recommended"
+        )
     flange = np.stack([se3.to_matrix(each.flange) for each in poses])
     board = np.stack([se3.to_matrix(each.board) for each in poses])
     spread = angular_spread(flange[:, :3, :3])
@@ -82,7 +84,7 @@ def fit_hand_eye(poses: Sequence[BoardPose], *, fixed: bool = False, noise: Hand
             f"the flange turns too little: one direction turns by only {np.degrees(spread):.1f} degrees, "
             f"{np.degrees(MIN_SPREAD):.0f} are needed. Turn it about all axes, 30 degrees and more"
         )
-    # arm_i camera board_i = mount, always the same
+    # arm_i camera board_i = mount for all i
     arm = np.asarray(inv(flange) if fixed else flange, dtype=np.float64)
     camera, mount = _closed_form_start(arm, board)
     for _ in range(1 + reweightings):
@@ -146,8 +148,8 @@ def _cross_matrices(vectors: FloatArray) -> FloatArray:
 
 
 def _closed_form_start(arm: FloatArray, board: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The closed form's camera and mount from all poses or a subset, whichever the poses agree with most."""
-    subset_count, subset_size = 12, 5  # starts from a few poses each, so that one bad pose does not spoil them all
+    """Camera and mount by the closed form from all poses and from subsets, the one that fits the poses best."""
+    subset_count, subset_size = 12, 5  # starts from a few poses each, so that one bad pose does not affect all of them
     random = np.random.default_rng(0)
     count = len(arm)
     chosen = [np.arange(count)]
@@ -167,7 +169,7 @@ def _closed_form_start(arm: FloatArray, board: FloatArray) -> tuple[FloatArray, 
 
 
 def _closed_form(arm: FloatArray, board: FloatArray) -> FloatArray:
-    """(4, 4) the X for which arm_i X board_i (each (n, 4, 4)) varies least over all i (Park and Martin 1994)."""
+    """(4, 4) the X with the least variation of arm_i X board_i (each (n, 4, 4)) over all i (Park and Martin 1994)."""
     import cv2
 
     found = np.eye(4)

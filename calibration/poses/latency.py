@@ -1,7 +1,7 @@
-"""How much later a camera's picture arrives than an arm's state, from a few taps on something firm.
+"""Latency of a camera's picture relative to an arm's state, from a few taps on a firm object.
 
-The arm goes down and up; how deep it is, and how much touch the picture shows, are two signals over arrival times. The
-touch is some growing function of the depth, whatever it is: by the rearrangement inequality (Hardy, Littlewood, Polya
+The arm moves down and up; its depth and the contact signal of the picture are two signals over arrival times. The
+contact signal is an unknown increasing function of the depth: by the rearrangement inequality (Hardy, Littlewood, Polya
 1934, section 10.13) the correlation of the two is then greatest at the true shift. That function is fitted (isotonic
 regression) and the shift refined, in turn. Correlations are evaluated at the camera's own, irregular times: only the
 arm's fast signal is interpolated.
@@ -28,12 +28,12 @@ class NoLatency(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Latency:
-    """How much later the second signal arrives than the first."""
+    """Delay of the second signal relative to the first."""
 
     seconds: float  # latency of the camera minus that of the arm [s]
     uncertainty: float  # one standard deviation: jackknife over stretches of the record [s]
     correlation: float  # at the best shift [-]
-    samples: int  # pictures that took part
+    samples: int  # number of pictures used
 
 
 def estimate_latency(
@@ -47,7 +47,7 @@ def estimate_latency(
 
     `depth` grows towards contact, in any unit (of a sensor that presses down: minus z); rates may be irregular. The
     record begins and ends without contact and has three taps or more, at uneven intervals. `search`: bounds of the
-    latency [s]. Raises NoLatency when the signals do not correlate, or fit several latencies, ValueError for arrays
+    latency [s]. Raises NoLatency if the signals do not correlate, or fit several latencies, ValueError for arrays
     that are no signals.
     """
     blocks = 8
@@ -55,7 +55,7 @@ def estimate_latency(
     times, observed = _check_signal(touch_times, touch, "touch")
     low, high = search
     if not low < high:
-        raise ValueError(f"search must be two growing bounds [s], got {search}")
+        raise ValueError(f"search must be two increasing bounds [s], got {search}")
     covered = (times - high >= arm_times[0]) & (times - low <= arm_times[-1])
     times, observed = times[covered], observed[covered]
     if len(times) < MIN_SAMPLES:
@@ -81,11 +81,11 @@ def _fit_shift(
     shift: float, arm_times: FloatArray, arm: FloatArray, times: FloatArray, observed: FloatArray
 ) -> tuple[float, float]:
     """Response and shift in turn, from the coarse `shift` on: the shift [s], and the correlation there."""
-    iterations = 5  # of fitting the response and the shift in turn
+    iterations = 5  # fits of the response and the shift in turn
     likeness = 0.0
     for _ in range(iterations):
         response = _fit_response(np.interp(times - shift, arm_times, arm), observed)
-        expected = np.interp(arm, *response)  # the touch that a camera without latency would show
+        expected = np.interp(arm, *response)  # the contact signal of a camera without latency
         found = minimize_scalar(
             lambda tried, touch=expected: -_correlation(np.interp(times - tried, arm_times, touch), observed),
             bounds=(shift - PEAK_HALF_WIDTH, shift + PEAK_HALF_WIDTH),
@@ -97,7 +97,7 @@ def _fit_shift(
 
 
 def _fit_response(depth: FloatArray, touch: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The growing function of depth that fits the touch best: its abscissae, growing, and its values."""
+    """The increasing function of depth that fits the contact signal best: increasing abscissae, and values."""
     order = np.argsort(depth, kind="stable")
     fitted = np.asarray(isotonic_regression(touch[order]).x, dtype=np.float64)
     abscissae, first = np.unique(depth[order], return_index=True)
@@ -112,14 +112,14 @@ def _check_signal(times: ArrayLike, values: ArrayLike, what: str) -> tuple[Float
     if not (np.isfinite(t).all() and np.isfinite(x).all()):
         raise ValueError(f"{what}: times and values must be finite")
     if not (np.diff(t) > 0.0).all():
-        raise ValueError(f"{what}: times must grow from sample to sample")
+        raise ValueError(f"{what}: times must increase from sample to sample")
     if float(np.ptp(x)) <= 1e-12 * max(1.0, float(np.abs(x).max())):
-        raise NoLatency(f"{what}: the signal never changes; tap so that the gel is touched and left")
+        raise NoLatency(f"{what}: the signal never changes; tap so that contact begins and ends")
     return t, x
 
 
 def _correlation(a: FloatArray, b: FloatArray) -> float:
-    """Pearson's; 0 where one of them is constant."""
+    """Pearson correlation; 0 if one signal is constant."""
     a, b = a - a.mean(), b - b.mean()
     size = float(np.sqrt((a @ a) * (b @ b)))
     return float(a @ b) / size if size > 0.0 else 0.0

@@ -1,4 +1,4 @@
-"""Files of recorded poses, which the frames of a robot are calibrated from, and what is found, as JSON.
+"""Files of recorded poses, from which the frames of a robot are calibrated, and results as JSON.
 
 YAML (or JSON, which is YAML): lengths and angles with units, or in m and rad. A pose is a position and a rotation
 vector, as UR writes it. A recorded file has one entry a line, in braces, and says how many there are, so a file
@@ -28,7 +28,9 @@ Entry = TypeVar("Entry")
 
 MAX_ENTRIES = 1000  # of a file
 
-Count = Annotated[int | None, Field(ge=0, le=MAX_ENTRIES)]  # entries of a whole file; None: written by hand, not given
+Count = Annotated[
+    int | None, Field(ge=0, le=MAX_ENTRIES)
+]  # entries of a complete file; None: not given, written by hand
 
 
 def _require_complete(entries: tuple[Entry, ...], info: ValidationInfo) -> tuple[Entry, ...]:
@@ -73,7 +75,8 @@ class BoardPoseEntry(Config):
 class BoardPoseFile(Config):
     """Poses of one board, seen by one camera."""
 
-    camera: Literal["flange", "fixed"] = "flange"  # rides on the flange before a fixed board, or the other way round
+    # "flange": the camera is on the flange and the board is fixed; "fixed": the board is on the flange
+    camera: Literal["flange", "fixed"] = "flange"
     count: Count = None
     poses: Annotated[tuple[BoardPoseEntry, ...], Field(max_length=MAX_ENTRIES), AfterValidator(_require_complete)]
 
@@ -92,7 +95,7 @@ def read_board_poses(path: Path) -> BoardPoseFile:
 
 
 def touch_file(touches: Sequence[BallTouch], ball_radius: float) -> TouchFile:
-    """What `write_record` shall write of touches."""
+    """The content of a file of touches, for `write_record`."""
     entries = tuple(
         TouchEntry(tool=placement_of_pose(t.tool), contact=t.contact, depth=max(0.0, t.depth)) for t in touches
     )
@@ -100,7 +103,7 @@ def touch_file(touches: Sequence[BallTouch], ball_radius: float) -> TouchFile:
 
 
 def board_pose_file(board_poses: Sequence[BoardPose], *, fixed: bool) -> BoardPoseFile:
-    """What `write_record` shall write of poses of a board."""
+    """The content of a file of board poses, for `write_record`."""
     entries = tuple(
         BoardPoseEntry(flange=placement_of_pose(s.flange), board=placement_of_pose(s.board)) for s in board_poses
     )
@@ -108,7 +111,7 @@ def board_pose_file(board_poses: Sequence[BoardPose], *, fixed: bool) -> BoardPo
 
 
 def write_record(path: Path, record: TouchFile | BoardPoseFile) -> Path:
-    """Writes a file that the functions above read, in the place of one that may be there. Raises OSError."""
+    """Writes a file for the functions above, and replaces an existing one. Raises OSError."""
     lines = []
     for key, value in record.model_dump(mode="json").items():
         if isinstance(value, list):
@@ -116,7 +119,7 @@ def write_record(path: Path, record: TouchFile | BoardPoseFile) -> Path:
             lines += [f"{key}:\n", *(f"- {entry}" for entry in entries)] if entries else [f"{key}: []\n"]
         else:
             lines.append(yaml.safe_dump({key: value}))
-    new = path.with_name(path.name + ".new")  # the old one stays whole until the new one is
+    new = path.with_name(path.name + ".new")  # the old file stays complete until the new one is
     with new.open("w", encoding="utf-8") as file:
         file.write("".join(lines))
         file.flush()

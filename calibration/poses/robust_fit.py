@@ -1,7 +1,7 @@
 """Robust least squares for rigid transforms, from measurements of which some are outliers.
 
-Parameters are poses and points. Each measurement gives a few residuals over their standard deviations. A robust fit
-(Cauchy's loss) finds the outliers; the plain fit that follows leaves them out, so its covariance is the textbook's.
+Parameters are poses and points. Each measurement gives residuals divided by their standard deviations. A robust fit
+(Cauchy's loss) finds the outliers; an ordinary fit without them follows, so its covariance is the standard one.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Residuals = Callable[[FloatArray], FloatArray]
 
 
 class BadMeasurements(CalibrationError):
-    """Measurements that determine no transform: too few, too alike, or contradictory."""
+    """The measurements determine no transform: they are too few, too similar, or contradictory."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,13 +44,13 @@ def robust_fit(residuals: Residuals, starts: Sequence[FloatArray], what: str) ->
     Raises BadMeasurements.
     """
 
-    max_rounds = 4  # of leaving outliers out and fitting again
+    max_rounds = 4  # of removing outliers and fitting again
     max_starts = 4  # the most promising starts are fitted
 
     def flat(parameters: FloatArray) -> FloatArray:
         return residuals(parameters).ravel()
 
-    # Cauchy's loss hardly pulls from afar; the soft L1 loss leads near.
+    # Cauchy's loss has little effect far from the solution; the soft L1 loss leads near it.
     promising = sorted(starts, key=lambda start: float(np.abs(flat(start)).sum()))[:max_starts]
     rough = [least_squares(flat, start, loss="soft_l1", x_scale="jac", ftol=1e-3, max_nfev=30) for start in promising]
     best = min(rough, key=lambda fit: float(fit.cost))
@@ -58,15 +58,15 @@ def robust_fit(residuals: Residuals, starts: Sequence[FloatArray], what: str) ->
     used = np.ones(len(residuals(found)), dtype=np.bool_)
     for _ in range(max_rounds):
         apart = np.sqrt((residuals(found) ** 2).sum(axis=1))
-        # noise may be larger than stated: outliers are far from the others, too
+        # noise may be larger than stated, so outliers must also be far from the others
         usual = max(1.0, float(np.median(apart)) / np.sqrt(residuals(found).shape[1]))
         keep = apart < OUTLIER_DISTANCE * usual
         if keep.sum() < max(1, (1 - MAX_OUTLIERS) * len(keep)):
             raise BadMeasurements(
-                f"{int((~keep).sum())} of {len(keep)} {what} disagree with the others: is what should be fixed "
+                f"{int((~keep).sum())} of {len(keep)} {what} disagree with the others: is the fixed part "
                 "really fixed, do the poses belong to the pictures, and are lengths in metres?"
             )
-        fit, before = _fit_least_squares(residuals, found, keep), used
+        fit, before = _minimise_residuals(residuals, found, keep), used
         found, used = fit.x, keep
         if (used == before).all():
             break
@@ -94,7 +94,7 @@ def robust_fit(residuals: Residuals, starts: Sequence[FloatArray], what: str) ->
     )
 
 
-def _fit_least_squares(residuals: Residuals, start: FloatArray, keep: Mask) -> Any:
+def _minimise_residuals(residuals: Residuals, start: FloatArray, keep: Mask) -> Any:
     def flat(parameters: FloatArray) -> FloatArray:
         return residuals(parameters)[keep].ravel()
 

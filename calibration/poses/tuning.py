@@ -13,12 +13,12 @@ MAX_CAP_MISFIT = 0.15  # root mean square of a cap's residuals, over its depth
 MIN_POSES = 6  # poses: 36 equations for 12 numbers
 
 # latency.py
-MIN_CORRELATION = 0.7  # below it the two signals are not of one motion
-MAX_SECOND_PEAK = 0.85  # height of a second peak over the best one; higher, and the latency is ambiguous
-MIN_SAMPLES = 30  # pictures whose whole search range the arm's record covers
-PEAK_HALF_WIDTH = 40e-3  # reach of the fine search; peaks beyond are others [s]
+MIN_CORRELATION = 0.7  # below it the two signals are not from one motion
+MAX_SECOND_PEAK = 0.85  # height of a second peak over the best one; above it the latency is ambiguous
+MIN_SAMPLES = 30  # pictures whose whole search range is inside the arm's record
+PEAK_HALF_WIDTH = 40e-3  # range of the fine search; peaks outside are other ones [s]
 
 # robust_fit.py
 OUTLIER_DISTANCE = 5.0  # of an outlier: norm of its residuals [standard deviations]
 MAX_OUTLIERS = 0.25  # share of the measurements
-MAX_SCATTER = 3.0  # over what the noise allows; beyond, something other than noise is wrong
+MAX_SCATTER = 3.0  # over the stated noise; above it there is an error other than noise

@@ -1,10 +1,9 @@
-"""The servo of an arm that is led to its start: straight in joint space, slowly, and nowhere else.
+"""The servo that moves an arm to its start on a straight path in joint space, slowly.
 
-An arm that stands outside its workspace follows no ordinary command. Here the region is replaced by the way: the
-measured joints must be on it, within OFF_PATH. Targets are refused; CommandKind.CONTINUE_TO_START moves the arm along
-the way, up to a share of it, and must be repeated within `action_timeout` as any command. Limits of force, the
-keep-out, the partners, the link, the stops of the controller and the driver's death are guarded as ever, by the same
-code.
+An arm outside its workspace follows no ordinary command. This servo replaces the workspace by the path: the measured
+joints must stay on it, within OFF_PATH. It rejects targets. CommandKind.CONTINUE_TO_START moves the arm along the path,
+up to a share of it, and must be repeated within `action_timeout` like any command. The checks of force limits,
+keep-out, partners, link, controller stops and the driver's process are those of the base class.
 """
 
 from __future__ import annotations
@@ -38,13 +37,13 @@ def sensor_path(kinematics: Kinematics, frames: ArmFrames, joints: FloatArray) -
     return np.array([frames.world_from_base @ kinematics.forward(q) @ flange_from_sensor for q in joints])
 
 
-def way_rates(
+def path_rates(
     kinematics: Kinematics, frames: ArmFrames, begin: FloatArray, end: FloatArray, limits: ArmLimits | WorkerConfig
 ) -> tuple[float, float]:
-    """Top speed [rad/s] and acceleration [rad/s^2] of the joint vector along the straight way from `begin` to `end`
-    (6,), such that neither a joint nor the sensor ever exceeds its limits."""
-    speed_margin = 0.95  # of the speeds there: they differ between the samples
-    sample_count = 100  # points of a way at which speeds are judged
+    """Top speed [rad/s] and acceleration [rad/s^2] of the joint vector along the straight path from `begin` to `end`
+    (6,). With them, neither a joint nor the sensor exceeds its limits."""
+    speed_margin = 0.95  # factor on the speeds, which vary between the samples
+    sample_count = 100  # points of the path at which speeds are computed
     joints = begin + np.linspace(0.0, 1.0, sample_count)[:, None] * (end - begin)
     step = float(np.linalg.norm(joints[1] - joints[0]))
     if step < 1e-9:
@@ -59,8 +58,8 @@ def way_rates(
     )
 
 
-def distance_from_way(joints: FloatArray, begin: FloatArray, end: FloatArray) -> float:
-    """How far the joint that is farthest off lies from the straight way [rad]."""
+def distance_from_path(joints: FloatArray, begin: FloatArray, end: FloatArray) -> float:
+    """Largest distance of a joint from the straight path from `begin` to `end` [rad]."""
     along = end - begin
     share = float(np.clip((joints - begin) @ along / max(float(along @ along), 1e-12), 0.0, 1.0))
     return float(np.abs(joints - begin - share * along).max())
@@ -68,39 +67,39 @@ def distance_from_way(joints: FloatArray, begin: FloatArray, end: FloatArray) ->
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Target:
-    """A point of the way, for one period."""
+    """A point of the path, for one period."""
 
     joints: FloatArray  # (6,) [rad]
     rate: FloatArray  # (6,) [rad/s]
     motion: MotionState  # of the sensor
-    stopping_point: FloatArray  # (3,) where the sensor comes to rest if it brakes from then on [m]
+    stopping_point: FloatArray  # (3,) position at which the sensor comes to rest if it brakes from here on [m]
 
 
 class StartServo(Servo):
-    """As its base, for the one way of `config.start_path`."""
+    """The servo for the path of `config.start_path`."""
 
     def __init__(self, config: WorkerConfig, commands_read: int = 0, tactile_read: int = 0) -> None:
         super().__init__(config, commands_read, tactile_read)
         assert config.start_path is not None
         self._begin, self._end = np.array(config.start_path)
-        self._top, self._acceleration = way_rates(self.kinematics, self.frames, self._begin, self._end, config)
+        self._top, self._acceleration = path_rates(self.kinematics, self.frames, self._begin, self._end, config)
         self._flange_from_sensor = self.frames.flange_from_tool @ self.frames.tool_from_sensor
-        self._share: float | None = None  # up to where it may go; None: it stays
+        self._share: float | None = None  # share of the path up to which the arm may move; None: it holds
         self._share_time = 0.0
         self._rate = np.zeros(6)  # of the target [rad/s]
-        self._stop = np.zeros(3)  # where the sensor would come to rest if the target braked now [m]
+        self._stop = np.zeros(3)  # position at which the sensor would come to rest if the target braked now [m]
 
     def _check_position(self, measured: Measured) -> None:
-        if distance_from_way(measured.joints, self._begin, self._end) > OFF_PATH:
+        if distance_from_path(measured.joints, self._begin, self._end) > OFF_PATH:
             self.enter_fault(ArmStatus.OFF_PATH)
 
     def check_faults(self, measured: Measured, partners: Sequence[Record | None]) -> None:
-        if self.status == ArmStatus.WAITING:  # what was asked meanwhile is forgotten
+        if self.status == ArmStatus.WAITING:  # commands of this interval are discarded
             self._share = None
         super().check_faults(measured, partners)
 
     def on_command(self, number: int, command: Record | None) -> None:
-        """A target is rejected: only the way is open."""
+        """Accepts CONTINUE_TO_START only, and rejects a target."""
         if command is None or number == self.commands_read:
             return
         super().on_command(number, command)
@@ -112,37 +111,37 @@ class StartServo(Servo):
 
     def step(self, time: float, measured: Measured, partners: Sequence[Record | None]) -> FloatArray | None:
         """The joints (6,) to send in this period; None: send nothing, the controller holds."""
-        # the target waits for an arm that is farther behind, such as one slowed down on its pendant [rad]
+        # the target waits for an arm that lags more, for example with a low speed slider [rad]
         max_lag = 15e-3
         if self.status.is_fault:
             return super().step(time, measured, partners)
         self._previous_step = self.motion, self._sent_joints, self._fault_braking
         if self._is_waiting_for_package(time, measured):
             return self._sent_joints
-        waits = self.status == ArmStatus.WAITING
-        goes = not waits and self._share is not None and time - self._share_time <= self.config.action_timeout
-        if not waits:
-            self.status = ArmStatus.OK if goes else ArmStatus.HOLD
+        is_waiting = self.status == ArmStatus.WAITING
+        is_moving = not is_waiting and self._share is not None and time - self._share_time <= self.config.action_timeout
+        if not is_waiting:
+            self.status = ArmStatus.OK if is_moving else ArmStatus.HOLD
         if (
             self._sent_joints is None
             or self.motion is None
             or (self.motion.is_at_rest and self._was_pushed(self.motion, measured))
             or (self._scaling.value == 0.0 and is_standing_still(measured))
         ):
-            if not goes:
+            if not is_moving:
                 return None if self._sent_joints is None else self._sent_joints
             self._start_at(measured)
             assert self._sent_joints is not None
-        if goes and float(np.abs(measured.joints - self._sent_joints).max()) < max_lag:
+        if is_moving and float(np.abs(measured.joints - self._sent_joints).max()) < max_lag:
             assert self._share is not None
             goal = self._begin + self._share * (self._end - self._begin)
             top = self._scaling.speed(self._top, self._acceleration)
             rate, moved, arrived = step_velocity(goal - self._sent_joints, self._rate, top, self._acceleration)
-            wanted = self._target(
+            target = self._target(
                 goal if arrived else self._sent_joints + moved, np.zeros(6) if arrived else rate, measured
             )
-            if self._keeps_clear(wanted, partners):
-                return self._follow(wanted)
+            if self._keeps_clear(target, partners):
+                return self._follow(target)
         rate = reduce_speed(self._rate, self._acceleration * PERIOD)
         return self._follow(self._target(self._sent_joints + rate * PERIOD, rate, measured))
 
@@ -155,7 +154,7 @@ class StartServo(Servo):
         self._rate = factor * self._rate
 
     def _slow_after_stall(self, missed: float, twist: FloatArray) -> None:
-        """As its base, in joints: those of the arm run out towards the target by the law of the controller."""
+        """As the base class, in joint space: the joints approach the target by the controller's filter."""
         self._rate = self._rate * math.exp(-missed / self.config.lookahead)
 
     @property
@@ -167,7 +166,7 @@ class StartServo(Servo):
         return self._set_target(target.motion, target.joints)
 
     def _target(self, joints: FloatArray, rate: FloatArray, measured: Measured) -> _Target:
-        """A real arm's own lengths, which the model does not contain, follow from `measured`."""
+        """The target at `joints`. Calibrated lengths of a real arm, which the model lacks, follow from `measured`."""
         model_from_controller = inverse_frame(self.kinematics.forward(measured.joints)) @ measured.flange
 
         def sensor(q: FloatArray) -> FloatArray:
@@ -186,7 +185,7 @@ class StartServo(Servo):
         return _Target(joints, rate, MotionState(here[:3, 3], here[:3, :3], velocity, spin), end[:3, 3])
 
     def _keeps_clear(self, target: _Target, partners: Sequence[Record | None]) -> bool:
-        """True if the arm could still stop clear of the other arms, or moves away from them."""
+        """True if the arm could still stop outside the keep-out of the other arms, or moves away from them."""
         assert self.motion is not None
         before = self._braking_gaps(self.motion, partners, self._stop)
         now = self._braking_gaps(target.motion, partners, target.stopping_point)

@@ -228,7 +228,7 @@ def _make_set(
 
         try:
             number = workers if workers is not None else core_count()
-            done = make(job, out, files, command, workers=number, cluster=ray, tell=report_progress, stop=interrupt)
+            done = make(job, out, files, command, workers=number, cluster=ray, report_progress=report_progress, stop=interrupt)
         except Stopped:
             print_error(
                 f"stopped by a signal; {done_count} of {job.count} are finished. Run the same command again to continue"
@@ -246,7 +246,7 @@ def _print_summary(done: Collected, count: int, seconds: float, out: Path) -> No
         parts = ", ".join(f"{name} {100 * part / spent:.0f} %" for name, part in done.seconds.most_common())
         results.print(
             f"{done.made} made in {seconds:.1f} s by {len(done.workers)}: {done.made / seconds:.2f} per second; "
-            f"of their time {parts}; {done.bytes / 2**20:.1f} MiB written in {done.writing:.1f} s"
+            f"of their time {parts}; {done.bytes / 2**20:.1f} MiB written in {done.writing_seconds:.1f} s"
         )
     if done.failures:
         notes.print(f"{len(done.failures)} of {count} failed; the reasons are in {out / 'failures.jsonl'}")

@@ -104,7 +104,7 @@ def start(
     with busy("looking at the rig"):
         from robot.doctor.rig import examine_arms
         from robot.open import CannotOpen
-        from robot.procedures.to_start import Guide, Halted, lead_to_start
+        from robot.procedures.to_start import Halted, Operator, move_to_start
         from robot.rig.parts import companion_of
         from tacsim.config import load_rig
         from tacsim.models.hardware import UrArmConfig, parts_of
@@ -125,13 +125,13 @@ def start(
         print_checks(checks)
         try:
             with busy("connecting") as show:
-                guide = Guide(
+                operator = Operator(
                     lambda question: ask_operator(f"Rig '{config.name}': {question}"),
                     lambda words: notes.print(words),
                     show,
                     interrupt,
                 )
-                away = lead_to_start(config, starts, guide)
+                away = move_to_start(config, starts, operator)
         except Halted as halted:
             print_error(str(halted))
             raise typer.Exit(interrupt.exit_code or 1) from None

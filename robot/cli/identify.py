@@ -190,7 +190,7 @@ class _IdentifyCommand:
             with dump_to_folder(folder.with_name(f"{folder.name}-diverged")):
                 found = identify(
                     self.kind, self.scene, recordings, presses, noise, Priors(options.place_error, zero),
-                    wanted=self.wanted, most_moments=options.moments, gel_error=self.gel_error,
+                    wanted=self.wanted, max_moments=options.moments, gel_error=self.gel_error,
                     on_step=bar.set_text, on_run=bar.set_progress,
                 )  # fmt: skip
         self._report_results(found, folder, noise)
@@ -199,25 +199,25 @@ class _IdentifyCommand:
         force_noises = (1.0, 0.1, 0.01)  # of force sensors for which the intervals are predicted [N]
         # relative, of an indenter: a calliper is more accurate than a larger standard deviation
         max_size_deviation = 0.1
-        from robot.studies.identify.identify import outlook
-        from robot.studies.identify.motions import WHAT_TELLS, WORDS
-        from robot.studies.identify.results import told, write
+        from robot.studies.identify.identify import predict_intervals
+        from robot.studies.identify.motions import MOTION_TEXTS, MOTIONS_FOR_PARAMETER
+        from robot.studies.identify.results import describe_parameters, write
 
         with busy("drawing"), writing(folder.parent):
             files = write(folder, found)
         title = f"{self.kind.capitalize()}, {len(found.presses)} recordings, {found.fit.runs} simulated"
-        show_table(title, ("", "value", "95 %"), told(found), left={0})
-        looks = {sensor: outlook(found, sensor) for sensor in dict.fromkeys((noise.force, *force_noises))}
+        show_table(title, ("", "value", "95 %"), describe_parameters(found), left={0})
+        looks = {sensor: predict_intervals(found, sensor) for sensor in dict.fromkeys((noise.force, *force_noises))}
         rows = [
             (each.name, *(_half_interval_text(look[each.name]) for look in looks.values()))
             for each in found.fit.identified
         ]
         show_table("With another force sensor, 95 %", ("noise", *(f"{one:g} N" for one in looks)), rows, left={0})
         for each in found.fit.unidentified:
-            motion = WHAT_TELLS[self.kind][each.name]
+            motion = MOTIONS_FOR_PARAMETER[self.kind][each.name]
             warn(
                 f"{each.name} is not identified by these recordings and keeps its value; '{motion}' would identify it: "
-                f"{WORDS[motion]} (tacsim identify {self.kind} --motions FOLDER writes it)"
+                f"{MOTION_TEXTS[motion]} (tacsim identify {self.kind} --motions FOLDER writes it)"
             )
         if found.size_error is not None and found.size_error > max_size_deviation:
             warn(

@@ -122,7 +122,7 @@ def press(
         requested = config["indenter"]["edge_radius"]
         words = " (smallest for this mesh; --edge-radius '0 mm' for sharp edges)" if requested is None else ""
         results.print(f"edge radius      {config['edge_radius'] * 1e3:.3f} mm{' (sharp)' if requested == 0 else words}")
-    if config["unfelt"] > presses.UNFELT:
+    if config["unfelt"] > presses.MAX_MISSED_DEPTH_SHARE:
         notes.print(
             f"warning: the gel is pressed by {1 - config['unfelt']:.0%} of the depth: a tip or edge is too narrow for "
             f"elements of {config['element_size'] * 1e3:g} mm, the force too small (a wedge's by 10 to 25 %); lower "

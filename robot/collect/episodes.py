@@ -1,4 +1,4 @@
-"""A set of episodes on a simulated rig: the same policy, another seed and other draws each time."""
+"""A set of episodes on a simulated rig: one policy; each episode has its own seed and randomisation."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ RANDOM = "random"
 
 
 class EpisodeSet(Config):
-    """All that episodes are a function of, besides their numbers."""
+    """The settings that determine the episodes, together with their numbers."""
 
     kind: Literal["episodes"] = "episodes"
     rig: str
@@ -39,11 +39,11 @@ class EpisodeSet(Config):
     overrides: tuple[str, ...] = ()
     policy: str = "scripted"
     steps: Annotated[int, Field(ge=1)] | None = None  # None: the task's
-    seed: Annotated[int, Field(ge=0)] = 0  # of the first; each has one more than the one before
+    seed: Annotated[int, Field(ge=0)] = 0  # of the first episode; each next one adds 1
     randomise: Randomisation | None = None
 
-    def loaded(self, index: int) -> LoadedRig:
-        """The rig of an episode, with what is drawn for it."""
+    def load_episode_rig(self, index: int) -> LoadedRig:
+        """The rig of an episode with its randomisation."""
         more: list[str] = []
         if self.randomise is not None:
             more = self.randomise.model_copy(update={"draws": index + 1}).draw_overrides()[index]
@@ -71,45 +71,45 @@ class EpisodeJob:
         return EpisodeWorker(self)
 
     def check(self) -> None:
-        """Raises what can be known before anything is simulated: SetError, ConfigError, PolicyNotFound,
+        """Checks the settings before anything is simulated. Raises SetError, ConfigError, PolicyNotFound,
         IncompatibleRig."""
-        loaded = self.settings.loaded(0)
+        loaded = self.settings.load_episode_rig(0)
         if loaded.config.clock != "sim":
             raise SetError(
-                f"rig '{loaded.config.name}' is not simulated, so nobody can play it many times at once; "
-                "record its episodes with tacsim run"
+                f"rig '{loaded.config.name}' is not simulated, so its episodes cannot run in several processes at "
+                "once; record its episodes with tacsim run"
             )
         with open_rig(loaded) as rig:
-            _policy(self.settings, loaded, rig.spec, rig.name, 0)
+            _load_policy_and_task(self.settings, loaded, rig.spec, rig.name, 0)
 
 
 class EpisodeWorker:
-    """Plays one episode after the other."""
+    """Runs one episode after the other."""
 
     def __init__(self, job: EpisodeJob) -> None:
         self._settings = job.settings
 
     def piece(self, number: int) -> Piece:
-        """The recording of an episode. One that fails leaves none."""
+        """The recording of an episode; a failed episode has no recording."""
         seconds = Seconds()
         began = time.perf_counter()
         failures: dict[int, str] = {}
         data = None
         try:
-            data = self._played(number)
+            data = self._record_episode(number)
         except (EpisodeFailed, GoalOutOfReach, SimulationDiverged, ConfigError, CodeNotFound, CannotOpen) as failure:
             failures[number] = f"{type(failure).__name__}: {failure}"
         seconds.add("episode", time.perf_counter() - began)
         return Piece(number, data, failures, int(data is not None), seconds.by_part)
 
-    def _played(self, number: int) -> bytes:
+    def _record_episode(self, number: int) -> bytes:
         default_steps = 40  # of an episode without a task
-        settings, loaded = self._settings, self._settings.loaded(number)
+        settings, loaded = self._settings, self._settings.load_episode_rig(number)
         seed = settings.seed + number
         with tempfile.TemporaryDirectory(prefix="tacsim-collect-") as folder, ExitStack() as stack:
             path = Path(folder) / "episode.mcap"
             rig = stack.enter_context(open_rig(loaded))
-            policy, task = _policy(settings, loaded, rig.spec, rig.name, number)
+            policy, task = _load_policy_and_task(settings, loaded, rig.spec, rig.name, number)
             canonical = loaded.config.canonical
             attached = {"rig.yaml": loaded.text.encode()}
             setup = EpisodeSetup(settings.policy, seed, attached, canonical, loaded.config.record.body)
@@ -120,7 +120,7 @@ class EpisodeWorker:
                 return recorders[0]
 
             def wait(step: Step) -> None:
-                recorders[0].flush()  # a simulation may be faster than the disk, and no step shall be dropped
+                recorders[0].flush()  # a simulation may be faster than the disk, and no step must be dropped
 
             steps = settings.steps or (default_steps if task is None else task.config.steps)
             episode = run_episode(rig, policy, task, steps, setup=setup, recorder=record, on_step=wait)
@@ -128,12 +128,12 @@ class EpisodeWorker:
             if recorders[0].error is not None:
                 raise OSError(f"episode {number} could not be recorded: {recorders[0].error}")
             if len(episode.steps) <= steps:
-                raise KeyboardInterrupt  # which a run takes for its end: that is no result
+                raise KeyboardInterrupt  # `run_episode` ends normally on an interrupt; a partial episode is no result
             return path.read_bytes()
 
 
 class RandomPolicy:
-    """Each free axis of the task moves by up to its largest step, either way, anew at each step."""
+    """Draws, at each step, a motion along each free axis of the task, between minus and plus the largest step."""
 
     needs = Needs()
 
@@ -150,7 +150,7 @@ class RandomPolicy:
         return action_of_vector(vector, self._task.axes, self._task.config.max_step, poses)
 
 
-def _policy(
+def _load_policy_and_task(
     settings: EpisodeSet, loaded: LoadedRig, spec: RigSpec, rig: str, number: int
 ) -> tuple[Policy, Task | None]:
     """The policy of an episode, and its task. Raises SetError, PolicyNotFound, IncompatibleRig."""

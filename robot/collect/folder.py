@@ -1,5 +1,5 @@
-"""The folder of a set: what it is a function of, its files, and what failed. Killed anywhere, it holds whole files of
-whole pieces, and what is missing is known."""
+"""The folder of a set: its settings, its files, and the failures. If the process is killed at any time, all files are
+complete, and the missing pieces are known."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from robot.deploy.control_loop import versions
 from tacsim.models.text import printable_line
 
 FORMAT = 2
-ABOUT, FAILURES, CARD = "collect.json", "failures.jsonl", "README.md"
+SETTINGS_FILE, FAILURES, CARD = "collect.json", "failures.jsonl", "README.md"
 
 
 class SetFolder:
@@ -27,12 +27,12 @@ class SetFolder:
         self.path, self._job = path, job
         self.failures = self._read_failures()
         self._done = {piece for piece in range(job.pieces) if self._is_done(piece)}
-        kept = {index for piece in self._done for index in job.numbers(piece)}
-        self.failures = {index: why for index, why in self.failures.items() if index in kept}
+        finished = {index for piece in self._done for index in job.numbers(piece)}
+        self.failures = {index: reason for index, reason in self.failures.items() if index in finished}
 
     @property
     def missing(self) -> list[int]:
-        """Pieces that nobody has made."""
+        """Pieces that are not made yet."""
         return [piece for piece in range(self._job.pieces) if piece not in self._done]
 
     @property
@@ -42,11 +42,11 @@ class SetFolder:
 
     @property
     def files(self) -> list[Path]:
-        """Those of pieces, in their order."""
+        """The files of the pieces, in order."""
         return [path for piece in sorted(self._done) if (path := self.path / self._job.name(piece)).exists()]
 
-    def put(self, piece: Piece) -> None:
-        """Writes a piece: all of it or nothing. Raises OSError that names the file."""
+    def write_piece(self, piece: Piece) -> None:
+        """Writes a piece completely or not at all. Raises OSError that names the file."""
         if piece.number in self._done:
             return
         if piece.failures:
@@ -69,17 +69,24 @@ class SetFolder:
             rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
             return {int(row["index"]): str(row["reason"]) for row in rows}
         except (ValueError, KeyError, TypeError):
-            raise SetError(f"{path} cannot be read; delete it, and what failed is tried again") from None
+            raise SetError(
+                f"{path} cannot be read; delete it, then repeat the command to try the failed presses again"
+            ) from None
 
 
 @contextmanager
 def open_set(
     path: Path, job: Job, settings: Mapping[str, Any], files: Mapping[str, bytes], command: str
 ) -> Iterator[SetFolder]:
-    """Begins a set, or goes on with it; nobody else can meanwhile.
+    """Starts or continues a set, and locks its folder against other processes until the context ends.
 
-    settings: as JSON, all that the set is a function of but its length. files: what is needed besides, by place in the
-    folder. Raises SetError for a folder with anything else than this set, or that somebody else works on; OSError.
+    Args:
+        settings: as JSON; they determine the set, except for its length.
+        files: that the job also needs, by path in the folder.
+
+    Raises:
+        SetError: the folder holds something else than this set, or another process has locked it.
+        OSError.
     """
     digests = {name: hashlib.sha256(data).hexdigest() for name, data in sorted(files.items())}
     about = {
@@ -91,81 +98,96 @@ def open_set(
         "files": digests,
     }
     if not path.exists() or (path.is_dir() and not any(path.iterdir())):
-        _begin(path, about, files)
-    with _alone(path):
-        before = _read(path)
+        _create_folder(path, about, files)
+    with _lock_folder(path):
+        before = _read_settings(path)
         _require_same(path, before, about)
         _require_whole(path, digests)
         if job.count > before["count"]:
-            _lengthen(path, job, before, about)
+            _extend_set(path, job, before, about)
         for part in path.rglob(".*.part"):
             part.unlink()
         yield SetFolder(path, job)
 
 
-def _begin(path: Path, about: Mapping[str, Any], files: Mapping[str, bytes]) -> None:
-    """All of it, or nothing."""
-    with suppress(FileExistsError), whole_folder(path) as partial:  # whoever was faster began it: seen as it is opened
-        for name, data in {ABOUT: _text(about), **files}.items():
+def _create_folder(path: Path, about: Mapping[str, Any], files: Mapping[str, bytes]) -> None:
+    """Makes the folder with its settings and files, completely or not at all."""
+    # another process may have made it first; the checks after opening compare the settings
+    with suppress(FileExistsError), whole_folder(path) as partial:
+        for name, data in {SETTINGS_FILE: _encode_settings(about), **files}.items():
             write_whole(partial / name, data)
 
 
-def _text(about: Mapping[str, Any]) -> bytes:
+def _encode_settings(about: Mapping[str, Any]) -> bytes:
     return (json.dumps(about, indent=1, allow_nan=False) + "\n").encode()
 
 
 @contextmanager
-def _alone(path: Path) -> Iterator[None]:
-    if not (path / ABOUT).is_file():
-        raise SetError(f"{path} exists and holds no set that was begun (no {ABOUT} in it); name a new folder")
-    with (path / ABOUT).open("rb") as file:
+def _lock_folder(path: Path) -> Iterator[None]:
+    if not (path / SETTINGS_FILE).is_file():
+        raise SetError(f"{path} exists, but holds no set (no {SETTINGS_FILE} in it); name a new folder")
+    with (path / SETTINGS_FILE).open("rb") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
-            raise SetError(f"{path}: another tacsim collect is at work on it; wait for it, or end it") from None
+            raise SetError(f"{path}: another tacsim collect works in this folder; wait for it, or end it") from None
         yield
 
 
-def _read(path: Path) -> dict[str, Any]:
+def _read_settings(path: Path) -> dict[str, Any]:
     try:
-        about: dict[str, Any] = json.loads((path / ABOUT).read_text(encoding="utf-8"))
+        about: dict[str, Any] = json.loads((path / SETTINGS_FILE).read_text(encoding="utf-8"))
         if about["format"] != FORMAT:
-            raise SetError(f"{path} has format {about['format']}, this tacsim goes on with {FORMAT}; name a new folder")
+            raise SetError(
+                f"{path} has format {about['format']}, this tacsim continues format {FORMAT}; name a new folder"
+            )
         return about | {"count": int(about["count"]), "settings": dict(about["settings"])}
     except (ValueError, KeyError, TypeError) as failure:
         if isinstance(failure, SetError):
             raise
-        raise SetError(f"{path / ABOUT} cannot be read: {printable_line(str(failure))}; name a new folder") from None
+        raise SetError(
+            f"{path / SETTINGS_FILE} cannot be read: {printable_line(str(failure))}; name a new folder"
+        ) from None
 
 
 def _require_same(path: Path, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
-    max_shown = 6  # differences between two commands that are told
-    old, new = (_leaves(json.loads(_text({**about["settings"], "files": about["files"]}))) for about in (before, now))
-    wrong = [f"{key} is {_short(old.get(key))} there and {_short(new.get(key))} here" for key in {**old, **new}
-             if old.get(key) != new.get(key)]  # fmt: skip
-    if len(wrong) > max_shown:
-        wrong[max_shown:] = [f"{len(wrong) - max_shown} more differ"]
+    max_listed = 6  # differences between two commands in the message
+    old, new = (
+        _flatten_mapping(json.loads(_encode_settings({**about["settings"], "files": about["files"]})))
+        for about in (before, now)
+    )
+    wrong = [
+        f"{key} is {_format_value(old.get(key))} there and {_format_value(new.get(key))} here"
+        for key in {**old, **new}
+        if old.get(key) != new.get(key)
+    ]
+    if len(wrong) > max_listed:
+        wrong[max_listed:] = [f"{len(wrong) - max_listed} more differ"]
     if now["count"] < before["count"]:
-        wrong.append(f"it has {before['count']} already begun, {now['count']} are asked for")
+        wrong.append(f"its count is {before['count']}, the requested count is {now['count']}")
     versions = (about["versions"].get("tacsim") for about in (before, now))
     first, second = (each or "unknown" for each in versions)
     if first != second:
-        wrong.append(f"it was begun by tacsim {first}, this is {second}")
+        wrong.append(f"it was started by tacsim {first}, this is {second}")
     if wrong:
         raise SetError(
             f"{path} holds a set by another command ({printable_line(str(before['command']))}): {'; '.join(wrong)}. "
-            "Give that command again to go on with it, or name a new folder"
+            "Give that command again to continue the set, or name a new folder"
         )
 
 
-def _leaves(value: Any, at: str = "") -> dict[str, Any]:
-    """What is in nested mappings, by path."""
+def _flatten_mapping(value: Any, at: str = "") -> dict[str, Any]:
+    """The values of nested mappings, by dotted path."""
     if not isinstance(value, dict) or not value:
         return {at: value}
-    return {path: leaf for key, each in value.items() for path, leaf in _leaves(each, f"{at}.{key}".strip(".")).items()}
+    return {
+        path: leaf
+        for key, each in value.items()
+        for path, leaf in _flatten_mapping(each, f"{at}.{key}".strip(".")).items()
+    }
 
 
-def _short(value: Any) -> str:
+def _format_value(value: Any) -> str:
     return printable_line(json.dumps(value), 80)
 
 
@@ -173,15 +195,15 @@ def _require_whole(path: Path, digests: Mapping[str, str]) -> None:
     for name, digest in digests.items():
         file = path / name
         if not file.is_file() or hashlib.sha256(file.read_bytes()).hexdigest() != digest:
-            raise SetError(f"{file} was removed or changed since the set was begun; name a new folder")
+            raise SetError(f"{file} was removed or changed since the set was started; name a new folder")
 
 
-def _lengthen(path: Path, job: Job, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
-    """Drops the last file where it gets more rows, then notes the new length."""
+def _extend_set(path: Path, job: Job, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+    """Deletes the last file if it needs more rows, then writes the new length."""
     last = next((piece for piece in range(job.pieces) if job.numbers(piece)[-1] >= before["count"]), None)
     if last is not None and job.numbers(last)[0] < before["count"]:
         (path / job.name(last)).unlink(missing_ok=True)
-    with (path / ABOUT).open("r+b") as file:  # the same file: it is locked
-        text = _text({**before, "count": now["count"], "command": now["command"]})
+    with (path / SETTINGS_FILE).open("r+b") as file:  # the same file: it is locked
+        text = _encode_settings({**before, "count": now["count"], "command": now["command"]})
         file.write(text)
         file.truncate()

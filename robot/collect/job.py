@@ -1,4 +1,4 @@
-"""What is collected, cut into pieces: each one file of a set, made by anybody, anywhere, to the same bytes."""
+"""A set is divided into pieces. Each piece is one file, with the same bytes whichever process makes it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Protocol
 
 
 class SetError(ValueError):
-    """A set that cannot be begun, or cannot go on."""
+    """A set cannot be started or continued."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -17,11 +17,11 @@ class Piece:
     """One file of a set."""
 
     number: int
-    data: bytes | None  # None: nothing came of it
-    failures: Mapping[int, str]  # why, by the number of the press or episode
+    data: bytes | None  # None: all presses or episodes of the piece failed
+    failures: Mapping[int, str]  # reason, by the number of the press or episode
     made: int  # presses or episodes in it
-    seconds: Mapping[str, float] = field(default_factory=dict)  # what they took, by part
-    worker: str = ""  # who made it
+    seconds: Mapping[str, float] = field(default_factory=dict)  # time spent, by part of the work
+    worker: str = ""  # name of the worker that made it
 
 
 class Worker(Protocol):
@@ -31,27 +31,27 @@ class Worker(Protocol):
 
 
 class Job(Protocol):
-    """A set in the making; may be pickled."""
+    """A set that is being made; can be pickled."""
 
     @property
     def count(self) -> int: ...
     @property
     def pieces(self) -> int: ...
     def name(self, piece: int) -> str:
-        """Of its file, in the set's folder."""
+        """Path of the file of a piece in the set's folder."""
         ...
 
     def numbers(self, piece: int) -> Sequence[int]:
-        """Of the presses or episodes in it."""
+        """Numbers of the presses or episodes in a piece."""
         ...
 
     def worker(self, folder: Path) -> Worker:
-        """folder: the set's, or a copy of the files that it was begun with."""
+        """A worker of this job. folder: that of the set, or one with copies of its input files."""
         ...
 
 
 class Seconds:
-    """Time by what it went into."""
+    """Time by part of the work."""
 
     def __init__(self) -> None:
         self.by_part: dict[str, float] = {}

@@ -1,33 +1,37 @@
-"""What a set presses, by name: the shapes that come with tacsim, or the STL files of a folder."""
+"""The objects of a press set, by name: the shapes that come with tacsim, or the STL files of a folder."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
 
-from robot.collect.shapes import CLOSED_FORMS, meshes
+from robot.collect.shapes import CLOSED_FORMS, make_meshes
 from tacsim.geometry.mesh import load_mesh
 from tacsim.models.scene import Mesh, Shape
 from tacsim.models.text import printable_line
 from tacsim.record.sources import visible_files
 
-SHAPES = "shapes"  # the word for those that come with tacsim
+SHAPES = "shapes"  # the name of those that come with tacsim
 FOLDER = "objects"  # of a set: its STL files
 
 
 def find_objects(source: str, scale: float) -> tuple[dict[str, Shape], dict[str, bytes]]:
-    """Objects by name, in the order of their names, and their STL files; a mesh's path is that in the set's folder.
+    """Objects by name, in the order of their names, and their STL files; paths of meshes are those in the set's folder.
 
-    source: "shapes", or a folder of STL files. scale: metres per unit of those. Raises ValueError for a folder that is
-    none, without STL files, or with broken ones: all of them are named.
+    Args:
+        source: "shapes", or a folder of STL files.
+        scale: metres per unit of the STL files.
+
+    Raises:
+        ValueError: `source` is no folder, has no STL files, or has damaged ones; the message names all of them.
     """
     if source == SHAPES:
-        made: dict[str, Any] = {name: mesh.export(file_type="stl") for name, mesh in meshes().items()}
-        found: dict[str, Shape] = {**CLOSED_FORMS, **{name: _mesh(name, 1e-3) for name in made}}
-        return {name: found[name] for name in sorted(found)}, {_path(name): data for name, data in made.items()}
+        made: dict[str, Any] = {name: mesh.export(file_type="stl") for name, mesh in make_meshes().items()}
+        found: dict[str, Shape] = {**CLOSED_FORMS, **{name: _make_mesh(name, 1e-3) for name in made}}
+        return {name: found[name] for name in sorted(found)}, {_mesh_path(name): data for name, data in made.items()}
     folder = Path(source)
     if not folder.is_dir():
-        raise ValueError(f"--objects {source}: is no folder; give a folder of STL files, or 'shapes'")
+        raise ValueError(f"--objects {source} is not a folder; give a folder of STL files, or 'shapes'")
     paths = sorted(path for path in visible_files(folder, (".stl",)) if path.is_file())
     if not paths:
         raise ValueError(f"{folder} holds no STL file (folders in it are not searched); give another, or 'shapes'")
@@ -47,14 +51,14 @@ def find_objects(source: str, scale: float) -> tuple[dict[str, Shape], dict[str,
     if problems:
         raise ValueError("\n".join(problems))
     return (
-        {path.stem: _mesh(path.stem, scale) for path in paths},
-        {_path(path.stem): path.read_bytes() for path in paths},
+        {path.stem: _make_mesh(path.stem, scale) for path in paths},
+        {_mesh_path(path.stem): path.read_bytes() for path in paths},
     )
 
 
-def _path(name: str) -> str:
+def _mesh_path(name: str) -> str:
     return f"{FOLDER}/{name}.stl"
 
 
-def _mesh(name: str, scale: float) -> Mesh:
-    return Mesh(path=_path(name), scale=scale)
+def _make_mesh(name: str, scale: float) -> Mesh:
+    return Mesh(path=_mesh_path(name), scale=scale)

@@ -1,6 +1,6 @@
-"""A set of presses: what is drawn for each, and the picture and labels that come of it.
+"""A set of presses: the random motion of each, and the picture and labels that result.
 
-Each press is a function of the set's settings and its number alone, so it is of no matter who makes it, or when.
+Each press depends only on the set's settings and on its number, so any process can make it at any time.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ from tacsim.optics.render import Renderer
 from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.record.images import encode_png
 
-Range = Annotated[tuple[float, float], Field(description="least and greatest, all between equally likely")]
+Range = Annotated[tuple[float, float], Field(description="minimum and maximum of a uniform distribution")]
 
 
 class PressSet(Config):
-    """All that presses are a function of, besides their numbers. SI units; paths are those in the set's folder."""
+    """The settings that determine the presses, together with their numbers. SI units; paths in the set's folder."""
 
     kind: Literal["press"] = "press"
     seed: Annotated[int, Field(ge=0)] = 0
@@ -44,9 +44,9 @@ class PressSet(Config):
     sensor: SensorModel
     depth: Range
     pose: Literal["random", "centred"] = "random"
-    tilt: Range = (0.0, 0.0)  # off the vertical, any way [rad]
-    shear: Range = (0.0, 0.0)  # sideways once pressed, any way [m]
-    twist: Range = (0.0, 0.0)  # about the vertical, last [rad]
+    tilt: Range = (0.0, 0.0)  # from the vertical, in a random direction [rad]
+    shear: Range = (0.0, 0.0)  # tangential displacement after the press, in a random direction [m]
+    twist: Range = (0.0, 0.0)  # rotation about the vertical after the shear [rad]
     per_file: Annotated[int, Field(ge=1, le=10_000)] = 50
 
     @model_validator(mode="after")
@@ -54,14 +54,14 @@ class PressSet(Config):
         for name in ("depth", "tilt", "shear", "twist"):
             low, high = getattr(self, name)
             if low > high:
-                raise ValueError(f"{name} goes from {low:g} to {high:g}: say the smaller one first")
+                raise ValueError(f"{name} ranges from {low:g} to {high:g}: give the smaller number first")
         for name in ("tilt", "shear"):
             if getattr(self, name)[0] < 0:
                 raise ValueError(
-                    f"{name} begins at {getattr(self, name)[0]:g}: it goes any way, so give its size alone"
+                    f"{name} starts at {getattr(self, name)[0]:g}: its direction is random, so give a positive size"
                 )
         if self.tilt[1] > math.radians(45.0):
-            raise ValueError(f"tilt goes to {math.degrees(self.tilt[1]):g} deg; at most 45 deg")
+            raise ValueError(f"tilt ranges to {math.degrees(self.tilt[1]):g} deg; at most 45 deg")
         if self.scene.indenter is None:
             raise ValueError(f"scene '{self.scene.name}' has no indenter")
         for depth in self.depth:
@@ -70,8 +70,8 @@ class PressSet(Config):
 
     @property
     def lattice(self) -> Markers:
-        """The points whose flow is told: the sensor's dots, or every millimetre of its picture."""
-        flow_pitch = 1e-3  # of the points whose flow is told of a sensor without dots [m]
+        """The points at which flow is given: the sensor's dots, or every millimetre of its picture."""
+        flow_pitch = 1e-3  # of these points for a sensor without dots [m]
         if self.sensor.markers is not None:
             return self.sensor.markers
         grid = image_grid(self.sensor.geometry)
@@ -83,8 +83,9 @@ class PressSet(Config):
         """What each column of the set's files holds, by its name."""
         return press_columns(tuple(self.objects), self.sensor.geometry, self.lattice)
 
-    def placed(self, index: int) -> tuple[str, Scene, PressMotion]:
-        """The object of a press, its scene and its motion. More options draw no other numbers for the rest."""
+    def draw_press(self, index: int) -> tuple[str, Scene, PressMotion]:
+        """The object of a press, its scene and its motion. An additional option leaves the other random numbers as they
+        are."""
         names = list(self.objects)
         name = names[index % len(names)]
         assert self.scene.indenter is not None
@@ -92,23 +93,27 @@ class PressSet(Config):
         scene = self.scene.model_copy(update={"indenter": indenter})
         random = np.random.default_rng([self.seed, index])
         depth, x, y, yaw, tilt, tilted, shear, sheared, twist = random.random(9)
-        slide = _within(self.shear, shear) * _direction(sheared)
-        motion = PressMotion(_within(self.depth, depth), (float(slide[0]), float(slide[1])), _within(self.twist, twist))
+        slide = _interpolate_range(self.shear, shear) * _unit_vector(sheared)
+        motion = PressMotion(
+            _interpolate_range(self.depth, depth),
+            (float(slide[0]), float(slide[1])),
+            _interpolate_range(self.twist, twist),
+        )
         if self.pose == "centred":
             return name, scene, motion
-        low, high = self._room(self.objects[name])
+        low, high = self._placement_area(self.objects[name])
         at = low + (high - low) * [x, y]
-        about = _within(self.tilt, tilt) * _direction(tilted)
+        about = _interpolate_range(self.tilt, tilt) * _unit_vector(tilted)
         upright = se3.from_rotation_vector(np.zeros(3), [0.0, 0.0, 2 * np.pi * yaw])
         turned = se3.compose(se3.from_rotation_vector(np.zeros(3), [*about, 0.0]), upright)
-        if indenter.roll or indenter.pitch:  # which side is down is the scene's, yaw and tilt are drawn
+        if indenter.roll or indenter.pitch:  # the scene gives the side that presses; yaw and tilt are random
             turned = se3.compose(turned, Pose(quaternion=indenter.turn))
         turn = turned.quaternion
         return name, scene, replace(motion, at=(float(at[0]), float(at[1])), turn=turn)
 
-    def _room(self, geometry: Shape) -> tuple[Any, Any]:
-        """Where the middle of an object comes down, lowest and highest x, y [m]: half of its longer side away from the
-        border of gel and picture, which the corners of what is turned may so leave; for a larger object, amidst."""
+    def _placement_area(self, geometry: Shape) -> tuple[Any, Any]:
+        """Minimum and maximum x, y [m] of the centre of an object: half of its longer side away from the border of gel
+        and picture. The corners of a rotated object may pass that border. A larger object is placed in the centre."""
         grid, gel = image_grid(self.sensor.geometry), np.array(self.scene.gel.size[:2]) / 2
         low = np.maximum(-gel, [grid.x[0], grid.y[0]])
         high = np.minimum(gel, [grid.x[-1], grid.y[-1]])
@@ -153,7 +158,7 @@ class PressJob:
 
 
 class PressWorker:
-    """Makes files one after the other, and keeps what they share."""
+    """Makes files one after the other with one renderer."""
 
     def __init__(self, job: PressJob, folder: Path) -> None:
         self._job, self._set = job, job.settings.in_folder(folder)
@@ -163,20 +168,22 @@ class PressWorker:
         self._lattice = self._set.lattice
 
     def piece(self, number: int) -> Piece:
-        """The file of this number. A press that fails is none of its rows.
+        """The file with this number, without the presses that failed.
 
-        Files begin with different objects, so that workers who begin together do not all compute the distances of one.
+        Files start with different objects, so that workers that start together do not all compute the distances of
+        the same mesh.
         """
-        golden_ratio = 0.618034  # its multiples, without their whole parts, lie evenly in 0 to 1 however many there are
+        # the fractions of its multiples are evenly distributed in 0 to 1, whatever their number
+        golden_ratio = 0.618034
         rows: dict[int, Row] = {}
         failures: dict[int, str] = {}
         seconds = Seconds()
         numbers = self._job.numbers(number)
-        among = len(self._set.objects)
-        first = (int(golden_ratio * number % 1 * among) - numbers[0]) % among % len(numbers)
+        object_count = len(self._set.objects)
+        first = (int(golden_ratio * number % 1 * object_count) - numbers[0]) % object_count % len(numbers)
         for index in (*numbers[first:], *numbers[:first]):
             try:
-                rows[index] = self._row(index, seconds)
+                rows[index] = self._make_row(index, seconds)
             except (SimulationDiverged, ValueError, MemoryError) as failure:
                 failures[index] = f"{type(failure).__name__}: {failure}"
         began = time.perf_counter()
@@ -184,17 +191,17 @@ class PressWorker:
         seconds.add("file", time.perf_counter() - began)
         return Piece(number, data, dict(sorted(failures.items())), len(rows), seconds.by_part)
 
-    def _row(self, index: int, seconds: Seconds) -> Row:
-        name, scene, motion = self._set.placed(index)
+    def _make_row(self, index: int, seconds: Seconds) -> Row:
+        name, scene, motion = self._set.draw_press(index)
         began = time.perf_counter()
         pressed = press(scene, self._set.sensor, motion, self._render)
         seconds.add("press", time.perf_counter() - began)
         began = time.perf_counter()
-        row = self._labelled(index, name, motion, pressed)
+        row = self._label_press(index, name, motion, pressed)
         seconds.add("labels", time.perf_counter() - began)
         return row
 
-    def _labelled(self, index: int, name: str, motion: PressMotion, pressed: PressResult) -> Row:
+    def _label_press(self, index: int, name: str, motion: PressMotion, pressed: PressResult) -> Row:
         import cv2
 
         image = pressed.image
@@ -220,13 +227,13 @@ class PressWorker:
             "position": pose.position,
             "quaternion": pose.quaternion,
             "contact_area": float(pressed.contact.sum()) * pixel,
-            "unfelt": pressed.unfelt,
+            "unfelt": pressed.missed_depth_share,
             "folded": pressed.folded,
             "settled": all(move.settled for move in pressed.moves),
         }
 
 
-def reference(settings: PressSet, folder: Path) -> bytes:
+def render_reference(settings: PressSet, folder: Path) -> bytes:
     """The picture of the untouched gel, without noise (PNG)."""
     from tacsim.models.scene import GelSurface
 
@@ -240,9 +247,9 @@ def reference(settings: PressSet, folder: Path) -> bytes:
     return encode_png(Renderer(inside.sensor, (x, y))(flat))
 
 
-def _within(between: tuple[float, float], share: float) -> float:
+def _interpolate_range(between: tuple[float, float], share: float) -> float:
     return float(between[0] + (between[1] - between[0]) * share)
 
 
-def _direction(share: float) -> Any:
+def _unit_vector(share: float) -> Any:
     return np.array([math.cos(2 * math.pi * share), math.sin(2 * math.pi * share)])

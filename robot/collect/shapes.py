@@ -1,4 +1,4 @@
-"""Twenty things to press: balls, boxes, cylinders, and closed meshes made of an outline and a profile; 3 to 9 mm."""
+"""Twenty shapes to press: balls, boxes, cylinders, and closed meshes made of an outline and a profile; 3 to 9 mm."""
 
 from __future__ import annotations
 
@@ -25,34 +25,34 @@ CLOSED_FORMS: dict[str, Sphere | Cylinder | Box] = {
 }
 
 
-def meshes() -> dict[str, Trimesh]:
-    """By name [mm]. What is pressed is their lower side."""
+def make_meshes() -> dict[str, Trimesh]:
+    """Meshes by name, in mm. Their lower side presses the gel."""
     sides = 64  # corners of a circle
     from trimesh import creation, transformations
 
     lying = transformations.rotation_matrix(np.pi / 2, [0, 1, 0])  # type: ignore[no-untyped-call]
     made: dict[str, Callable[[], Trimesh]] = {
-        "cone": lambda: _lofted(_polygon(sides, 3.0), [(0.25, 0.0), (0.3, 0.1), (1.0, 3.0), (1.0, 4.0)]),
-        "pyramid": lambda: _lofted(_polygon(4, 3.5), [(0.25, 0.0), (0.3, 0.12), (1.0, 3.0), (1.0, 4.0)]),
+        "cone": lambda: _loft_outline(_polygon(sides, 3.0), [(0.25, 0.0), (0.3, 0.1), (1.0, 3.0), (1.0, 4.0)]),
+        "pyramid": lambda: _loft_outline(_polygon(4, 3.5), [(0.25, 0.0), (0.3, 0.12), (1.0, 3.0), (1.0, 4.0)]),
         "hexagon": lambda: _prism(_polygon(6, 3.0)),
         "triangle": lambda: _prism(_polygon(3, 3.5)),
         "star": lambda: _prism(_star(5, 4.0, 1.8)),
         "gear": lambda: _prism(_gear(8, 3.8, 2.8)),
         "cross": lambda: _prism(_cross(3.5, 1.0)),
-        "egg": lambda: _lofted(_polygon(sides, 1.0) * [2.2, 3.2], _round(2.0)),
+        "egg": lambda: _loft_outline(_polygon(sides, 1.0) * [2.2, 3.2], _ellipsoid_profile(2.0)),
         "roof": lambda: _roof(8.0, 4.0, 3.0, 0.4),
         "capsule": lambda: creation.capsule(4.0, 1.6, [32, 32], transform=lying),
         "torus": lambda: creation.torus(3.0, 1.0, sides, 32),
-        "bars": lambda: _joined([_moved(_prism(_rectangle(0.6, 3.5)), x, 0.0) for x in (-2.4, 0.0, 2.4)]),
-        "dots": lambda: _joined(
-            [_moved(creation.icosphere(3, 1.1), x, y) for x in (-1.6, 1.6) for y in (-1.6, 1.6)]
+        "bars": lambda: _join_meshes([_move_mesh(_prism(_rectangle(0.6, 3.5)), x, 0.0) for x in (-2.4, 0.0, 2.4)]),
+        "dots": lambda: _join_meshes(
+            [_move_mesh(creation.icosphere(3, 1.1), x, y) for x in (-1.6, 1.6) for y in (-1.6, 1.6)]
         ),
     }  # fmt: skip
     return {name: make() for name, make in made.items()}
 
 
 def _polygon(corners: int, radius: float) -> FloatArray:
-    """(n, 2), the first corner on the x axis."""
+    """Corners (n, 2) of a regular polygon, the first on the x axis."""
     angles = 2 * np.pi * np.arange(corners) / corners
     return radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
 
@@ -77,32 +77,32 @@ def _rectangle(half_x: float, half_y: float) -> FloatArray:
     return np.array([[half_x, -half_y], [half_x, half_y], [-half_x, half_y], [-half_x, -half_y]])
 
 
-def _round(half: float) -> list[tuple[float, float]]:
+def _ellipsoid_profile(half: float) -> list[tuple[float, float]]:
     """Profile of an ellipsoid: scale and height."""
     angles = np.linspace(-np.pi / 2, np.pi / 2, 34)[1:-1]
     return [(float(np.cos(angle)), half * float(np.sin(angle))) for angle in angles]
 
 
 def _prism(outline: FloatArray) -> Trimesh:
-    """4 mm high, with its lower edge cut off, which a sharp edge of a mesh that is slid would catch with."""
+    """A prism 4 mm high with a bevelled lower edge: a sharp edge of a sliding mesh would catch the gel."""
     bevel = 0.3  # [mm]
     narrow = 1.0 - bevel / float(np.linalg.norm(outline, axis=1).max())
-    return _lofted(outline, [(narrow, 0.0), (1.0, bevel), (1.0, 4.0)])
+    return _loft_outline(outline, [(narrow, 0.0), (1.0, bevel), (1.0, 4.0)])
 
 
 def _roof(length: float, width: float, height: float, ridge: float) -> Trimesh:
-    """A ridge along x, `ridge` wide, downwards."""
+    """A roof whose ridge points down and lies along x, `ridge` wide."""
     low, high = _rectangle(length / 2, ridge / 2), _rectangle(length / 2, width / 2)
-    return _walls([np.append(each, np.full((4, 1), z), axis=1) for each, z in ((low, 0.0), (high, height))])
+    return _close_surface([np.append(each, np.full((4, 1), z), axis=1) for each, z in ((low, 0.0), (high, height))])
 
 
-def _lofted(outline: FloatArray, profile: Sequence[tuple[float, float]]) -> Trimesh:
-    """The outline (n, 2), which sees each of its points from its origin, scaled at each height (scale, z)."""
-    return _walls([np.append(scale * outline, np.full((len(outline), 1), z), axis=1) for scale, z in profile])
+def _loft_outline(outline: FloatArray, profile: Sequence[tuple[float, float]]) -> Trimesh:
+    """The outline (n, 2), star-shaped about its origin, scaled at each height by `profile` (scale, z)."""
+    return _close_surface([np.append(scale * outline, np.full((len(outline), 1), z), axis=1) for scale, z in profile])
 
 
-def _walls(rings: Sequence[FloatArray]) -> Trimesh:
-    """The closed surface through rings of corners (n, 3), from below, with a middle point in the first and the last."""
+def _close_surface(rings: Sequence[FloatArray]) -> Trimesh:
+    """The closed surface through rings of corners (n, 3), lowest first, with a centre point in the first and last."""
     from trimesh import Trimesh
 
     count, last = len(rings[0]), len(rings) - 1
@@ -117,12 +117,12 @@ def _walls(rings: Sequence[FloatArray]) -> Trimesh:
     return Trimesh(np.concatenate([*rings, middles]), np.concatenate(faces), process=False)
 
 
-def _moved(mesh: Trimesh, x: float, y: float) -> Trimesh:
+def _move_mesh(mesh: Trimesh, x: float, y: float) -> Trimesh:
     mesh.apply_translation([x, y, 0.0])
     return mesh
 
 
-def _joined(parts: Sequence[Trimesh]) -> Trimesh:
+def _join_meshes(parts: Sequence[Trimesh]) -> Trimesh:
     from trimesh.util import concatenate
 
     whole: Any = concatenate(list(parts))

@@ -1,4 +1,4 @@
-"""The columns of a press set, and its files: parquet, read by `datasets`, pandas, DuckDB and others."""
+"""The columns of a press set, and its Parquet files, which `datasets`, pandas, DuckDB and others read."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from tacsim.models.sensor import Markers, SensorGeometry
 
 Row = dict[str, Any]
 
-# What each column is, for the card of a set
-WORDS = {
-    "index": "number of the press; the seed and it fix all that was drawn",
-    "object": "what was pressed",
+# description of each column in the data card
+COLUMN_TEXTS = {
+    "index": "number of the press; with the seed it determines all random numbers",
+    "object": "the object that was pressed",
     "image": "the sensor's picture, RGB",
     "height": "[m] of the gel's surface under each pixel: into the gel is positive, bulges are negative",
     "contact": "255 where the object touches the gel, 0 elsewhere, for each pixel",
@@ -24,21 +24,21 @@ WORDS = {
     "normal_force": "[N] on the gel, pressing is positive",
     "shear_force": "[N] on the gel along x and y",
     "torque": "[N m] on the gel about the middle of its rest surface, axes x, y, z (z is out of the gel)",
-    "depth": "[m] of the object's lowest point below the untouched gel",
-    "shear": "[m] that the object was then moved along x and y",
-    "twist": "[rad] that it was then turned about z",
+    "depth": "[m] of the object's lowest point below the undeformed surface",
+    "shear": "[m] tangential displacement of the object along x and y, after the press",
+    "twist": "[rad] rotation of the object about z, after the shear",
     "position": "[m] of the middle of the object's bounding box in the sensor's frame, at the end",
     "quaternion": "(x, y, z, w) of the object in that frame, at the end",
     "contact_area": "[m^2] of `contact`",
-    "unfelt": "share of the depth that no contact point of the gel feels; above 0.125 a tip or edge is too narrow for "
-    "the mesh, and the forces are too small",
+    "unfelt": "share of the depth that no contact point of the gel reaches; above 0.125 a tip or edge is too narrow "
+    "for the mesh, and the forces are too small",
     "folded": "whether the gel folds over itself; picture and height show the sheet that the camera sees",
     "settled": "whether all motions came to rest within the scene's tolerance",
 }
 
 
 def press_columns(objects: Sequence[str], geometry: SensorGeometry, lattice: Markers) -> dict[str, Feature]:
-    """What each column holds, by its name. `objects`: their names; `lattice`: the points whose flow is a column."""
+    """Type and shape of each column, by name. objects: their names. lattice: the points at which flow is given."""
     shape = (geometry.height, geometry.width)
     number, pair, triple = (Feature("float64", (n,), None) for n in (1, 2, 3))
     return {
@@ -64,8 +64,8 @@ def press_columns(objects: Sequence[str], geometry: SensorGeometry, lattice: Mar
 
 
 def parquet_bytes(columns: Mapping[str, Feature], rows: Sequence[Row]) -> bytes:
-    """A file of these rows. Numbers are as they are, pictures PNG: nothing is lost."""
-    rows_in_group = 25  # read at once by who wants one row: some 10 MB
+    """A Parquet file with these rows. Numbers keep their precision and pictures are PNG, so the file is lossless."""
+    rows_in_group = 25  # a reader of one row reads its whole group, about 10 MB
     from pyarrow import parquet
 
     values = {name: _column(feature, [row[name] for row in rows]) for name, feature in columns.items()}
@@ -77,8 +77,8 @@ def parquet_bytes(columns: Mapping[str, Feature], rows: Sequence[Row]) -> bytes:
         buffer,
         row_group_size=rows_in_group,
         compression="zstd",
-        use_dictionary=False,  # measured numbers repeat nowhere
-        column_encoding=dict.fromkeys(maps, "BYTE_STREAM_SPLIT"),  # bytes of one rank side by side: less by a third
+        use_dictionary=False,  # measured numbers do not repeat
+        column_encoding=dict.fromkeys(maps, "BYTE_STREAM_SPLIT"),  # groups bytes of equal significance: a third smaller
     )
     return buffer.getvalue()
 

@@ -1,4 +1,4 @@
-"""Pieces of a set made on this machine: in this process, or in several."""
+"""Pieces of a set made on this machine, in this process or in several."""
 
 from __future__ import annotations
 
@@ -16,21 +16,22 @@ from robot.collect.job import Job, Piece, Worker
 from robot.common.process import ProcessPool
 from tacsim.geometry.tiles import share_tiles
 
-AHEAD = 2  # pieces for each worker that wait or are being made
-ONE_THREAD = ("TACSIM_THREADS", "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS")  # of a worker: as many as cores work
+PIECES_PER_WORKER = 2  # pieces for each worker that are queued or being made
+# set to 1 in each worker, because there is a worker for each core
+ONE_THREAD = ("TACSIM_THREADS", "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS")
 Stop = Callable[[], bool]
 
 
 class CollectFailed(RuntimeError):
-    """What made the pieces failed. Those that are written are whole."""
+    """A worker or the cluster failed. The written pieces are complete."""
 
 
 class Stopped(Exception):
-    """The set was ended from outside."""
+    """A request to stop ended the set."""
 
 
-def in_this_process(job: Job, folder: Path, numbers: Sequence[int], stop: Stop) -> Iterator[Piece]:
-    """Makes the pieces one after the other. Raises Stopped, and what making them raises."""
+def make_in_this_process(job: Job, folder: Path, numbers: Sequence[int], stop: Stop) -> Iterator[Piece]:
+    """Makes the pieces one after the other. Raises Stopped, and the errors of the worker."""
     worker = job.worker(folder) if numbers else None
     for number in numbers:
         if stop():
@@ -39,38 +40,38 @@ def in_this_process(job: Job, folder: Path, numbers: Sequence[int], stop: Stop) 
         yield worker.piece(number)
 
 
-def in_processes(job: Job, folder: Path, numbers: Sequence[int], stop: Stop, workers: int) -> Iterator[Piece]:
-    """Makes the pieces in so many processes, and gives them as they are done. Raises Stopped, CollectFailed."""
+def make_in_processes(job: Job, folder: Path, numbers: Sequence[int], stop: Stop, workers: int) -> Iterator[Piece]:
+    """Makes the pieces in several processes, and yields them as they finish. Raises Stopped, CollectFailed."""
     waiting, running = deque(numbers), set[Future[Piece | str]]()
     with (
-        _one_thread(),
+        _limit_threads(),
         tempfile.TemporaryDirectory(prefix="tacsim-collect-", ignore_cleanup_errors=True) as shared,
-        ProcessPool(min(workers, max(1, len(numbers))), _begin, (job, folder, Path(shared))) as pool,
+        ProcessPool(min(workers, max(1, len(numbers))), _start_worker, (job, folder, Path(shared))) as pool,
     ):
         try:
             while waiting or running:
                 if stop():
                     raise Stopped
-                while waiting and len(running) < AHEAD * workers:
-                    running.add(pool.submit(_piece, waiting.popleft()))
+                while waiting and len(running) < PIECES_PER_WORKER * workers:
+                    running.add(pool.submit(_make_piece, waiting.popleft()))
                 done, running = wait(running, timeout=0.1, return_when=FIRST_COMPLETED)
                 for future in done:
-                    yield result_of(future.result())
+                    yield piece_of_result(future.result())
         except BrokenProcessPool as failure:
-            if stop():  # the signal was for all processes
+            if stop():  # the signal reached all processes
                 raise Stopped from failure
-            raise CollectFailed("a worker was killed; is there memory enough for all? (--workers)") from failure
+            raise CollectFailed("a worker was killed; is there enough memory for all workers (--workers)?") from failure
 
 
-def result_of(made: Piece | str) -> Piece:
-    """What a worker has sent. Raises CollectFailed with its error."""
+def piece_of_result(made: Piece | str) -> Piece:
+    """The piece that a worker sent. Raises CollectFailed with the error that it sent instead."""
     if isinstance(made, str):
         raise CollectFailed(made)
     return made
 
 
 @contextmanager
-def _one_thread() -> Iterator[None]:
+def _limit_threads() -> Iterator[None]:
     before = {name: os.environ.get(name) for name in ONE_THREAD}
     os.environ |= dict.fromkeys(ONE_THREAD, "1")
     try:
@@ -86,8 +87,8 @@ def _one_thread() -> Iterator[None]:
 _worker: Callable[[], Worker] | None = None  # of this process
 
 
-def _begin(job: Job, folder: Path, shared: Path) -> None:
-    """shared: where workers leave distances of meshes to each other, which take as long as ten presses each."""
+def _start_worker(job: Job, folder: Path, shared: Path) -> None:
+    """shared: folder in which workers share distance fields of meshes; one takes as long as ten presses."""
     global _worker
     share_tiles(shared)
     made: list[Worker] = []
@@ -100,14 +101,14 @@ def _begin(job: Job, folder: Path, shared: Path) -> None:
     _worker = worker
 
 
-def _piece(number: int) -> Piece | str:
-    """The piece, or an error as text: not every exception can be sent to another process."""
+def _make_piece(number: int) -> Piece | str:
+    """The piece, or an error as text: some exceptions cannot be pickled."""
     assert _worker is not None
     return piece_or_error(_worker, number, str(os.getpid()))
 
 
 def piece_or_error(worker: Callable[[], Worker], number: int, name: str) -> Piece | str:
-    """name: of the worker."""
+    """The piece, or an error as text. name: of the worker."""
     try:
         return replace(worker().piece(number), worker=name)
     except Exception as error:

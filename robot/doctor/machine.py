@@ -1,4 +1,4 @@
-"""Checks of the machine: what tacsim needs, whether it is there, and what to do where it is not."""
+"""Checks of the machine: what tacsim needs, whether it is available, and what to do if it is not."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ OPENCV = "opencv-contrib-python-headless"  # the distribution that provides cv2
 
 
 def examine() -> list[Check]:
-    """All checks, in the order in which problems should be mended. A check that itself breaks is a `fail`."""
+    """All checks, in the order in which to correct problems. A check that raises an error counts as `fail`."""
     functions = (
         *(python, packages, drivers, second_opencv, opencv, taichi, ur_rtde),
         *(processors, realtime, working_directory),
@@ -40,9 +40,9 @@ def as_json(checks: Iterable[Check]) -> dict[str, Any]:
 def _run(function: Callable[[], list[Check]]) -> list[Check]:
     try:
         return function()
-    except Exception as error:  # a broken installation can fail in any way, and that is the finding
+    except Exception as error:  # a broken installation can fail with any error; the error is the result of the check
         name = function.__name__.replace("_", " ")
-        advice = "reinstall the packages: make run builds the environment anew"
+        advice = "reinstall the packages: make run builds the environment again"
         return [Check(name, "fail", f"{type(error).__name__}: {error}", advice)]
 
 
@@ -80,41 +80,42 @@ def _package(need: Requirement) -> Check:
 
 
 def drivers() -> list[Check]:
-    """The installed drivers of sensors and arms, and why others are refused."""
+    """The installed drivers of sensors and arms, and the reasons why others are refused."""
     try:
         found = installed_drivers()
     except DriversMissing as missing:
         return [Check("drivers", "fail", "those of tacsim are not registered", str(missing))]
     words = "; ".join(f"{kind}s {', '.join(each)}" for kind, each in found.usable.items())
     refused = [
-        Check(f"driver {kind} {name}", "warn", f"refused: {why}", "mend or uninstall its distribution")
+        Check(f"driver {kind} {name}", "warn", f"refused: {reason}", "repair or uninstall its distribution")
         for kind, each in found.refused.items()
-        for name, why in each.items()
+        for name, reason in each.items()
     ]
     return [Check("drivers", "ok", words), *refused]
 
 
 def second_opencv() -> list[Check]:
-    """Other opencv-* distributions write into the same cv2 folder. Of one version they agree; else chance decides which
-    files win."""
+    """Other opencv-* distributions write into the same cv2 folder. With different versions, the order of installation
+    decides which files remain."""
     installed = {str(canonicalize_name(each.name)): each.version for each in metadata.distributions() if each.name}
     others = sorted(name for name in installed if name.startswith("opencv-") and name != OPENCV)
     if not others:
         return [Check("one cv2", "ok", "no other opencv package")]
-    ours = installed.get(OPENCV, "")
-    found = f"{', '.join(f'{name} {installed[name]}' for name in others)} beside {OPENCV} {ours}"
-    if all(installed[name] == ours for name in others):
+    own_version = installed.get(OPENCV, "")
+    found = f"{', '.join(f'{name} {installed[name]}' for name in others)} in addition to {OPENCV} {own_version}"
+    if all(installed[name] == own_version for name in others):
         return [Check("one cv2", "ok", f"{found}: the same version")]
-    alike = " ".join(f"{name}=={ours}" for name in others)
+    same_version = " ".join(f"{name}=={own_version}" for name in others)
     advice = (
-        f"if nothing needs it: python -m pip uninstall -y {' '.join(others)}; else bring all to one version: "
-        f"python -m pip install {alike}. Then: python -m pip install --force-reinstall --no-deps {OPENCV}=={ours}"
+        f"if nothing needs it: python -m pip uninstall -y {' '.join(others)}; else install one version of all: "
+        f"python -m pip install {same_version}. Then: python -m pip install --force-reinstall --no-deps "
+        f"{OPENCV}=={own_version}"
     )
     return [Check("one cv2", "fail", found, advice)]
 
 
 def opencv() -> list[Check]:
-    """cv2 imports and can do hand-eye calibration (5.0.0.93 lost it)."""
+    """cv2 can be imported and has hand-eye calibration (missing in 5.0.0.93)."""
     import cv2
 
     found = f"{cv2.__version__} at {Path(cv2.__file__).parent}"
@@ -126,7 +127,7 @@ def opencv() -> list[Check]:
 
 
 def taichi() -> list[Check]:
-    """Taichi starts, on which arch, and where its compiled kernels are kept."""
+    """Whether Taichi starts, on which arch, and where it stores compiled kernels."""
     if sys.platform == "linux" and platform.machine() == "aarch64":
         advice = "simulate on another machine; hardware and replay work here"
         return [Check("taichi", "warn", "no Taichi wheel exists for linux aarch64", advice)]
@@ -135,7 +136,7 @@ def taichi() -> list[Check]:
 
     if not is_available(DEVICE):
         advice = "unset TACSIM_DEVICE to compute on the processor, or install the device's driver"
-        return [Check("taichi", "fail", f"TACSIM_DEVICE is '{DEVICE}', which is not there", advice)]
+        return [Check("taichi", "fail", f"TACSIM_DEVICE is '{DEVICE}', which is not available", advice)]
     arch = start_taichi()
     version = ".".join(str(part) for part in ti.__version__)
     patches = "" if are_enabled() else ", without patches (docs/taichi-patches.md)"
@@ -153,7 +154,7 @@ def kernel_cache(folder: Path) -> Check:
 
 
 def ur_rtde() -> list[Check]:
-    """The driver of the UR arms imports."""
+    """The library of the UR arms can be imported."""
     try:
         for module in ("rtde_control", "rtde_receive"):
             importlib.import_module(module)
@@ -168,11 +169,11 @@ def processors() -> list[Check]:
     count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     if count > 1:
         return [Check("processors", "ok", f"{count}")]
-    return [Check("processors", "warn", f"{count}", "simulation is built for two or more; expect it to be slow")]
+    return [Check("processors", "warn", f"{count}", "simulation needs two or more; expect it to be slow")]
 
 
 def realtime() -> list[Check]:
-    """Whether the processes that talk to arms may run before all others."""
+    """Whether the processes that control arms may use real-time priority."""
     from robot.common.realtime import is_realtime_allowed
 
     if is_realtime_allowed():
@@ -191,5 +192,5 @@ def working_directory() -> list[Check]:
         with tempfile.TemporaryFile(dir=folder):
             return [Check("write permission", "ok", str(folder))]
     except OSError as error:
-        advice = "go to a folder of yours, or give --out"
+        advice = "change to a folder that you can write to, or give --out"
         return [Check("write permission", "fail", f"{folder}: {error.strerror}", advice)]

@@ -1,6 +1,6 @@
-"""Checks of a rig of hardware before anything moves: each driver checks its own part, and here what lies between them.
+"""Checks of a rig of hardware before anything moves. Each driver checks its own part; this module checks distances.
 
-Nothing is commanded, so a rig may be checked that another program drives.
+The checks send no command, so another program can drive the rig at the same time.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from tacsim.models.rig import RigConfig
 
 
 def examine_rig(config: RigConfig, file: str | None = None) -> list[Check]:
-    """All checks of one rig. Mocks that its file asks for are started for as long as it takes.
+    """All checks of one rig. The mocks of its file run while the checks do.
 
-    file: what the rig is called on the command line, for the commands to be typed next.
+    file: name of the rig on the command line, for the commands in the advice.
     """
     if config.clock != "wall":
         return [Check("rig", "ok", f"'{config.name}' has no hardware: nothing to check")]
@@ -31,12 +31,12 @@ def examine_rig(config: RigConfig, file: str | None = None) -> list[Check]:
             for driver in sensor_drivers(config).values():
                 checks += driver.checks()
     except (DeviceError, ValueError, RuntimeError) as failure:
-        return [Check("rig", "fail", str(failure), "mend the rig file")]
+        return [Check("rig", "fail", str(failure), "correct the rig file")]
     return checks
 
 
 def examine_arms(config: RigConfig, starts: Mapping[str, Pose], file: str) -> list[Check]:
-    """The checks of its arms alone. starts: where the scene of a mock rig has them."""
+    """The checks of the arms alone. starts: start poses from the scene of a mock rig."""
     found = {
         name: driver.examine(config.arms[name].start_pose or starts.get(name), file)
         for name, driver in arm_drivers(config).items()
@@ -47,11 +47,11 @@ def examine_arms(config: RigConfig, starts: Mapping[str, Pose], file: str) -> li
 
 
 def check_keep_out(rule: KeepOut, poses: Mapping[str, Pose], file: str) -> Check:
-    """Whether the sensors of two arms, which stand at `poses`, keep their distance."""
+    """Checks that the sensors of two arms at `poses` are farther apart than the keep-out distance."""
     first, second = rule.arms
     gap = float(np.linalg.norm(poses[first].position - poses[second].position))
-    words = f"the sensors are {1e3 * gap:.0f} mm apart, at least {1e3 * rule.distance:g} mm are asked for"
+    words = f"the sensors are {1e3 * gap:.0f} mm apart, at least {1e3 * rule.distance:g} mm are required"
     label = f"{first}, {second}: keep-out"
     if gap > rule.distance:
         return Check(label, "ok", words)
-    return Check(label, "fail", words, f"`tacsim start {file}` leads it to its start, after your yes")
+    return Check(label, "fail", words, f"`tacsim start {file}` moves it to its start, after you confirm")

@@ -1,4 +1,4 @@
-"""Episodes -> a LeRobot data set."""
+"""Writes episodes as a LeRobot data set."""
 
 from __future__ import annotations
 
@@ -43,33 +43,34 @@ def export_lerobot(
     video: bool = False,
     on_step: OnStep = lambda done, total: None,
 ) -> None:
-    """Writes the episodes, in this order, into a new folder: all of it, or nothing.
+    """Writes the episodes, in this order, into a new folder, completely or not at all.
 
-    An episode of n + 1 steps has n frames: what was observed after step k, and the action of step k + 1. One episode
-    at a time is in memory.
+    An episode of n + 1 steps has n frames: the observation after step k with the action of step k + 1. Only one episode
+    is in memory at a time.
 
     Args:
-        task: in words, for policies that read them; None: made of the task and goal of each episode.
-        maps: with heights, gradients and flow.
-        cut: take recordings that were cut off, up to there.
-        video: pictures as H.264 video, with loss, instead of PNG.
-        on_step: told (steps done, steps in all).
+        task: description for policies that read language; None: made from the task and goal of each episode.
+        maps: also write heights, gradients and flow.
+        cut: accept incomplete recordings, up to their last step.
+        video: write pictures as H.264 video, which is lossy, instead of PNG.
+        on_step: is called with the numbers of finished steps and of all steps.
 
-    Raises ValueError for episodes that make no data set, EpisodeError, OSError, VideoFailed, and what normalising
-    raises.
+    Raises:
+        ValueError: the episodes do not fit into one data set.
+        EpisodeError, OSError, VideoFailed, and the errors of normalising.
     """
     if util.find_spec("pyarrow") is None:
-        raise ValueError("data sets are written by pyarrow, which is not installed: pip install 'tacsim[export]'")
+        raise ValueError("writing data sets needs pyarrow, which is not installed: pip install 'tacsim[export]'")
     if video:
         require_video()
     episodes = [observe_episode(path) for path in paths]
-    fps = _check(episodes, cut)
+    fps = _check_episodes(episodes, cut)
     with whole_folder(folder) as partial:
-        _write(episodes, partial, fps, task, maps, video, on_step)
+        _write_episodes(episodes, partial, fps, task, maps, video, on_step)
 
 
-def _check(episodes: Sequence[ObservedEpisode], cut: bool) -> float:
-    """Frames per second of all of them. Raises ValueError for what can be known before anything is written."""
+def _check_episodes(episodes: Sequence[ObservedEpisode], cut: bool) -> float:
+    """Frames per second of all episodes. Checks them before anything is written. Raises ValueError."""
     if not episodes:
         raise ValueError("no episode to export")
     first = episodes[0]
@@ -77,7 +78,7 @@ def _check(episodes: Sequence[ObservedEpisode], cut: bool) -> float:
         episode, spec = each.episode, each.episode.meta.spec
         if not episode.complete and not cut:
             raise ValueError(
-                f"{each.path} was cut off after {len(episode.steps)} steps: leave it out, or take what is there (--cut)"
+                f"{each.path} was cut off after {len(episode.steps)} steps: leave it out, or export these steps (--cut)"
             )
         if len(episode.steps) < 2:
             raise ValueError(f"{each.path} has no action: at least two steps are needed, it has {len(episode.steps)}")
@@ -99,7 +100,7 @@ def _check(episodes: Sequence[ObservedEpisode], cut: bool) -> float:
     return frames_per_second(first.episode.meta.spec.period)
 
 
-def _write(
+def _write_episodes(
     episodes: Sequence[ObservedEpisode],
     folder: Path,
     fps: float,
@@ -120,7 +121,7 @@ def _write(
     for each in episodes:
         meta = each.episode.meta
         mapping = LeRobotMapping(meta.spec, each.canonical, maps=maps)
-        found, columns, images = _columns(each, mapping, count)
+        found, columns, images = _convert_episode(each, mapping, count)
         if data is None:
             features, data = found, DataSet(folder, fps, meta.rig, found, video=video)
         elif found != features:
@@ -128,16 +129,16 @@ def _write(
         data.add(columns, images, task_in_words(meta.task, meta.goal) if task is None else task)
     assert data is not None
     data.close()
-    about = _about(episodes, mapping)
+    provenance = _provenance(episodes, mapping)
     if video:
-        about["video_error"] = {name: each.error.told() for name, each in data.videos.items()}
-    write_json(folder / "meta" / "tacsim.json", about)
+        provenance["video_error"] = {name: each.error.summarise() for name, each in data.videos.items()}
+    write_json(folder / "meta" / "tacsim.json", provenance)
 
 
-def _columns(
+def _convert_episode(
     each: ObservedEpisode, mapping: LeRobotMapping, count: Callable[[], None]
 ) -> tuple[dict[str, Feature], dict[str, Column], dict[str, Statistics]]:
-    """The features, columns, and statistics of the pictures of one episode."""
+    """Features, columns, and statistics of the pictures of one episode."""
     features: dict[str, Feature] = {}
     rows: list[Row] = []
     pictures: dict[str, list[bytes]] = {}
@@ -148,12 +149,12 @@ def _columns(
         if before is not None:
             if step.action is None:
                 raise EpisodeError(f"{each.path}: step {step.index} has no action")
-            row = before | {"action": mapping.acted(step.action)} | outcome(step, step.index == last)
+            row = before | {"action": mapping.encode_action(step.action)} | outcome(step, step.index == last)
             found = mapping.features(row)
             features = features or found
             if found != features:
                 raise ValueError(
-                    f"{each.path}: step {step.index} is unlike those before: {_difference(features, found)}"
+                    f"{each.path}: step {step.index} differs from those before: {_difference(features, found)}"
                 )
             for name in [key for key in row if key.startswith(IMAGE)]:
                 picture: NDArray[np.uint8] = row.pop(name)
@@ -161,10 +162,10 @@ def _columns(
                 counts.setdefault(name, ImageCounts()).add(picture)
             rows.append(row)
         try:
-            before = mapping.begin(observation) if before is None else mapping.observed(observation)
+            before = mapping.begin(observation) if before is None else mapping.encode_observation(observation)
         except IncompatibleRig as unfit:
-            what = f"{each.path}: step {step.index} lacks what the recording says it has: {unfit}"
-            raise EpisodeError(what) from None
+            message = f"{each.path}: step {step.index} lacks data that the recording declares: {unfit}"
+            raise EpisodeError(message) from None
         count()
     columns: dict[str, Column] = {key: np.stack([row[key] for row in rows]) for key in rows[0]}
     for key, column in columns.items():
@@ -174,20 +175,20 @@ def _columns(
 
 
 def _difference(first: dict[str, Feature], second: dict[str, Feature]) -> str:
-    """The first difference, in words."""
+    """A description of the first difference."""
     for name in (*first, *second):
         if first.get(name) != second.get(name):
-            a, b = (_shown(each.get(name)) for each in (first, second))
-            return f"{name} is {a} in the one and {b} in the other"
+            a, b = (_describe_feature(each.get(name)) for each in (first, second))
+            return f"{name} is {a} in the first and {b} in the second"
     return "nothing"
 
 
-def _shown(feature: Feature | None) -> str:
+def _describe_feature(feature: Feature | None) -> str:
     return "missing" if feature is None else f"{feature.dtype} {feature.shape}"
 
 
-def _about(episodes: Sequence[ObservedEpisode], mapping: LeRobotMapping) -> dict[str, Any]:
-    """What LeRobot has no place for: the scale of each number, and where the episodes are from."""
+def _provenance(episodes: Sequence[ObservedEpisode], mapping: LeRobotMapping) -> dict[str, Any]:
+    """Data that LeRobot does not define: the scale of each number, and the source of each episode."""
     numbers = {"observation.state": mapping.state, "action": mapping.action}
     return {
         "scales": {key: dict(zip(each.names, each.scales, strict=True)) for key, each in numbers.items()},

@@ -1,4 +1,4 @@
-"""A task on a rig as LeRobot's environments are: pictures, the state's numbers, and actions as they are recorded."""
+"""A task on a rig as a LeRobot environment: pictures, the numbers of the state, and actions as in recordings."""
 
 from __future__ import annotations
 
@@ -22,11 +22,12 @@ from tacsim.models.rig import TaskConfig
 class LeRobotEnv(gymnasium.Env[dict[str, Any], NDArray[np.floating[Any]]]):
     """`robot.make_env` in the numbers of a data set, so that a policy of `lerobot-train` fits it.
 
-    Observation: `pixels`, the canonical picture of each sensor by name, and `agent_pos`, `observation.state`. Action:
-    where each arm shall be, relative to reset, `action` of a data set. Of it is done what the task leaves free, at most
-    its max_step. info: as of `TacsimEnv`, with `is_success` at reset and at each step.
+    Observation: `pixels`, the canonical picture of each sensor by name, and `agent_pos`, the `observation.state` of a
+    data set. Action: target pose of each arm relative to reset, the `action` of a data set; the arms move along the
+    free axes of the task, by at most its max_step. info: that of `TacsimEnv`, with `is_success` at reset and each step.
 
-    Raises what `make_env` raises, and IncompatibleRig as `LeRobotMapping`.
+    Raises:
+        IncompatibleRig: as by `LeRobotMapping`; and the errors of `make_env`.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
@@ -40,7 +41,7 @@ class LeRobotEnv(gymnasium.Env[dict[str, Any], NDArray[np.floating[Any]]]):
         randomise: RandomiseSettings = None,
     ) -> None:
         canonical = load_with_task(rig, task, overrides).config.canonical
-        # as the rig's file says: the data sets that a policy learned from were recorded so
+        # motion as in the rig file, with which the training data were recorded
         self._env = make_env(task, rig, overrides, render_mode, randomise=randomise, features=None, learning=False)
         spec, config = self._env.rig.spec, self._env.task.config
         self._mapping = LeRobotMapping(spec, canonical, maps=False)
@@ -56,31 +57,37 @@ class LeRobotEnv(gymnasium.Env[dict[str, Any], NDArray[np.floating[Any]]]):
         )
         self.action_space = spaces.Box(-np.inf, np.inf, action, np.float32)
         self.task = config.kind
-        self._max_episode_steps = config.steps  # LeRobot asks for it by this name
+        self._max_episode_steps = config.steps  # LeRobot reads this name
 
     @property
     def task_description(self) -> str:
-        """The task in words, with the goal of this episode."""
+        """Description of the task, with the goal of this episode."""
         return task_in_words(self.task, self._env.task.goal)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """The same seed gives the same episode. options: for LeRobot's own, which concern nothing here."""
+        """Starts an episode; the same seed gives the same episode. options: of LeRobot; they are ignored."""
         super().reset(seed=seed)
         _, info = self._env.reset(seed=seed)
-        return _observed(self._mapping.begin(self._env.observation)), info
+        return _env_observation(self._mapping.begin(self._env.observation)), info
 
     def step(self, action: NDArray[np.floating[Any]]) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        """One control period. Raises ActionError for what stands for no pose, ResetNeeded after the end."""
+        """One control period. Raises ActionError for numbers that are no pose, ResetNeeded after the end."""
         if np.shape(action) != self.action_space.shape:
             raise ActionError(f"an action has shape {self.action_space.shape}, got {np.shape(action)}")
-        asked = self._env.policy_action(_Fixed(self._mapping.decoded(action)))
-        _, reward, terminated, truncated, info = self._env.step(asked)
-        return _observed(self._mapping.observed(self._env.observation)), reward, terminated, truncated, info
+        action_of_task = self._env.policy_action(_Fixed(self._mapping.decode_action(action)))
+        _, reward, terminated, truncated, info = self._env.step(action_of_task)
+        return (
+            _env_observation(self._mapping.encode_observation(self._env.observation)),
+            reward,
+            terminated,
+            truncated,
+            info,
+        )
 
     def render(self) -> NDArray[np.uint8] | None:
-        """The pictures of all sensors as they come, side by side, (H, W, 3); None without a render_mode."""
+        """The camera images of all sensors in a row, (H, W, 3); None without a render_mode."""
         return self._env.render()
 
     def close(self) -> None:
@@ -88,7 +95,7 @@ class LeRobotEnv(gymnasium.Env[dict[str, Any], NDArray[np.floating[Any]]]):
 
 
 class _Fixed:
-    """A policy that asks for one action, whatever is observed."""
+    """A policy that returns one action for every observation."""
 
     needs = Needs()
 
@@ -101,6 +108,6 @@ class _Fixed:
         return self._action
 
 
-def _observed(row: Row) -> dict[str, Any]:
+def _env_observation(row: Row) -> dict[str, Any]:
     pictures = {name.removeprefix(IMAGE): value for name, value in row.items() if name.startswith(IMAGE)}
     return {"pixels": pictures, "agent_pos": row[STATE]}

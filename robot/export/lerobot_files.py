@@ -1,6 +1,6 @@
-"""The files of a LeRobot data set, v3.0, written by pyarrow alone.
+"""The files of a LeRobot data set, v3.0, written with pyarrow, without LeRobot.
 
-Format: https://huggingface.co/docs/lerobot/lerobot-dataset-v3, and where it differs from that page, LeRobot 0.6.
+Format: https://huggingface.co/docs/lerobot/lerobot-dataset-v3; where LeRobot 0.6 differs from that page, LeRobot 0.6.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from robot.export.lerobot_mapping import Column, Feature, Statistics, arrow_table, column_statistics, merged
+from robot.export.lerobot_mapping import Column, Feature, Statistics, arrow_table, column_statistics, merge_statistics
 from robot.export.lerobot_video import VideoColumn
 
 if TYPE_CHECKING:
@@ -24,19 +24,20 @@ CHUNK = 1000  # files in a folder
 FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 VIDEO = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 COUNTERS = {name: Feature("int64", (1,), None) for name in ("frame_index", "episode_index", "index", "task_index")}
-OWN = {"timestamp": Feature("float32", (1,), None), **COUNTERS}  # columns that every data set has
+INDEX_COLUMNS = {"timestamp": Feature("float32", (1,), None), **COUNTERS}  # columns that every data set has
 
 
 class DataSet:
-    """A data set in the making, in a folder of its own. `close` makes it whole.
+    """A data set that is being written. `close` completes it.
 
     Args:
         folder: exists, and is empty.
-        features: of the columns, without LeRobot's own (`OWN`).
-        file_size, video_size: [MB] at which a file is followed by another.
-        video: pictures as videos, instead of PNG in the data's files.
+        features: of the columns, without those of LeRobot (`INDEX_COLUMNS`).
+        file_size, video_size: [MB] at which a new file starts.
+        video: write pictures as videos, instead of PNG in the data files.
 
-    Raises OSError, VideoFailed.
+    Raises:
+        OSError, VideoFailed.
     """
 
     def __init__(
@@ -52,7 +53,7 @@ class DataSet:
     ) -> None:
         self._folder, self._fps, self._robot = folder, fps, robot
         self._file_size, self._video_size = file_size, video_size
-        self._features = {**features, **OWN}
+        self._features = {**features, **INDEX_COLUMNS}
         self.videos = {
             name: VideoColumn(self._video_path(name), fps, feature.shape, video_size, CHUNK)
             for name, feature in features.items()
@@ -66,27 +67,27 @@ class DataSet:
         self._meta = _Files(folder / "meta" / "episodes", file_size)
 
     def add(self, columns: Mapping[str, Column], images: Mapping[str, Statistics], task: str) -> None:
-        """One episode: its columns, and the statistics of its pictures by column."""
-        max_buffered = 100  # rows that meta/episodes gathers into one row group
+        """Adds an episode: its columns, and the statistics of its pictures by column."""
+        max_buffered = 100  # rows of meta/episodes in one row group
         count = len(next(iter(columns.values())))
         if task not in self._tasks:
             self._tasks.append(task)
         frame = np.arange(count)
-        own: dict[str, Column] = {
+        index_columns: dict[str, Column] = {
             "timestamp": (frame / self._fps).astype(np.float32),
             "frame_index": frame,
             "episode_index": np.full(count, self._episodes),
             "index": self._frames + frame,
             "task_index": np.full(count, self._tasks.index(task)),
         }
-        whole = {**columns, **{name: np.asarray(each)[:, None] for name, each in own.items()}}
+        whole = {**columns, **{name: np.asarray(each)[:, None] for name, each in index_columns.items()}}
         statistics = {
             name: images[name] if feature.dtype == "image" else column_statistics(np.asarray(whole[name]))
             for name, feature in self._features.items()
         }
         in_data = {name: feature for name, feature in self._features.items() if name not in self.videos}
         chunk, file = self._data.write(arrow_table(in_data, whole), count)
-        shown = {name: video.add(_pictures(columns[name])) for name, video in self.videos.items()}
+        video_places = {name: video.add(_pictures(columns[name])) for name, video in self.videos.items()}
         self._rows.append(
             {
                 "episode_index": self._episodes,
@@ -96,7 +97,7 @@ class DataSet:
                 "data/file_index": file,
                 "dataset_from_index": self._frames,
                 "dataset_to_index": self._frames + count,
-                **{f"videos/{name}/{key}": value for name, each in shown.items() for key, value in each.items()},
+                **{f"videos/{name}/{key}": value for name, each in video_places.items() for key, value in each.items()},
                 **{f"stats/{name}/{key}": v.tolist() for name, each in statistics.items() for key, v in each.items()},
             }
         )
@@ -106,7 +107,7 @@ class DataSet:
             self._write_rows()
 
     def close(self) -> None:
-        """Writes what belongs to the whole."""
+        """Writes the files that belong to the whole data set."""
         if self._rows:
             self._write_rows()
         for video in self.videos.values():
@@ -114,7 +115,7 @@ class DataSet:
         self._data.close()
         self._meta.close()
         _write_tasks(self._folder / "meta" / "tasks.parquet", self._tasks)
-        statistics = {name: merged([each[name] for each in self._statistics]) for name in self._features}
+        statistics = {name: merge_statistics([each[name] for each in self._statistics]) for name in self._features}
         texts = {name: {key: value.tolist() for key, value in each.items()} for name, each in statistics.items()}
         write_json(self._folder / "meta" / "stats.json", texts)
         write_json(self._folder / "meta" / "info.json", self._info())
@@ -133,15 +134,15 @@ class DataSet:
             "splits": {"train": f"0:{self._episodes}"},
             "data_path": f"data/{FILE}",
             "video_path": VIDEO if self.videos else None,
-            "features": {name: self._told(name, feature) for name, feature in self._features.items()},
+            "features": {name: self._feature_info(name, feature) for name, feature in self._features.items()},
         }
 
-    def _told(self, name: str, feature: Feature) -> dict[str, Any]:
-        told = {"dtype": feature.dtype, "shape": list(feature.shape), "names": feature.names and list(feature.names)}
-        return told | ({"dtype": "video", "info": self.videos[name].info} if name in self.videos else {})
+    def _feature_info(self, name: str, feature: Feature) -> dict[str, Any]:
+        info = {"dtype": feature.dtype, "shape": list(feature.shape), "names": feature.names and list(feature.names)}
+        return info | ({"dtype": "video", "info": self.videos[name].info} if name in self.videos else {})
 
     def _video_path(self, name: str) -> str:
-        """What its files are called, but for their numbers."""
+        """Path template of the video files of a column, without chunk and file numbers."""
         return str(self._folder / VIDEO.replace("{video_key}", name))
 
     def _write_rows(self) -> None:
@@ -157,8 +158,8 @@ class DataSet:
 
 @dataclass(slots=True)
 class _Files:
-    """Parquet files of one kind. A table is one row group; a file that would grow beyond its size with the next is
-    followed by another."""
+    """Parquet files of one kind. A table is one row group; a new file starts where the next table would exceed the
+    size."""
 
     folder: Path
     size: float  # [MB]
@@ -168,7 +169,7 @@ class _Files:
     _writer: Any = field(default=None)
 
     def place(self, count: int) -> tuple[int, int]:
-        """Chunk and file of the next `count` rows. Begins a new file where they would not fit."""
+        """Chunk and file of the next `count` rows. Starts a new file if they do not fit."""
         if self._path is not None and self._count:
             used = self._path.stat().st_size / 2**20
             if used * (1 + count / self._count) >= self.size:
@@ -177,14 +178,14 @@ class _Files:
         return divmod(self._number, CHUNK)
 
     def write(self, table: pa.Table, count: int) -> tuple[int, int]:
-        """Returns the chunk and the file that took it."""
+        """Writes a table. Returns its chunk and its file."""
         from pyarrow import parquet
 
         chunk, file = self.place(count)
         if self._path is None:
             self._path = self.folder / FILE.format(chunk_index=chunk, file_index=file)
             self._path.parent.mkdir(parents=True, exist_ok=True)
-            # Numbers of touch repeat nowhere, so a dictionary of them only takes room; pictures are PNG already.
+            # Measured numbers do not repeat, so a dictionary would only add size; pictures are already PNG.
             self._writer = parquet.ParquetWriter(self._path, table.schema, compression="zstd", use_dictionary=False)
         self._writer.write_table(table, row_group_size=max(count, 1))
         self._count += count
@@ -202,12 +203,12 @@ def _pictures(column: Column) -> Sequence[bytes]:
 
 
 def _write_tasks(path: Path, tasks: Sequence[str]) -> None:
-    """LeRobot reads this file with pandas, and wants `task` as its index."""
+    """Writes tasks.parquet. LeRobot reads it with pandas, and needs `task` as its index."""
     import pyarrow as pa
     from pyarrow import parquet
 
     types = {"task_index": ("int64", "int64"), "task": ("unicode", "object")}
-    told = {
+    info = {
         "index_columns": ["task"],
         "column_indexes": [],
         "columns": [
@@ -217,11 +218,11 @@ def _write_tasks(path: Path, tasks: Sequence[str]) -> None:
         "creator": {"library": "pyarrow", "version": pa.__version__},
         "pandas_version": "2.2.0",
     }
-    schema = pa.schema([("task_index", pa.int64()), ("task", pa.string())], metadata={"pandas": json.dumps(told)})
+    schema = pa.schema([("task_index", pa.int64()), ("task", pa.string())], metadata={"pandas": json.dumps(info)})
     parquet.write_table(pa.table([list(range(len(tasks))), list(tasks)], schema=schema), path)
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Raises OSError; ValueError for a number that JSON does not have."""
+    """Writes a JSON file. Raises OSError; ValueError for NaN or infinity, which JSON lacks."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(value, indent=4, allow_nan=False) + "\n", encoding="utf-8")

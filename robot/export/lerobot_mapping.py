@@ -1,22 +1,22 @@
-"""What an episode is called in LeRobot: the one place that knows its names; its columns as Arrow, and their statistics.
+"""Names and shapes of an episode's data in LeRobot, the columns as Arrow tables, and their statistics.
 
 | feature                         | what                                                               |
 |---------------------------------|--------------------------------------------------------------------|
 | `observation.state`             | (n,) f32: poses relative to reset, wrenches, low-dimensional touch |
 | `observation.images.{sensor}`   | (H, W, 3) u8: the canonical picture                                |
-| `observation.height.{sensor}`   | (h, w) f32 [m], where it is known                                  |
-| `observation.gradient.{sensor}` | (h, w, 2) f32 [-], where it is known                               |
+| `observation.height.{sensor}`   | (h, w) f32 [m], if the sensor measures it                          |
+| `observation.gradient.{sensor}` | (h, w, 2) f32 [-], if the sensor measures it                       |
 | `observation.flow.{sensor}`     | (m, n, 2) f32 [m], of sensors with markers                         |
-| `action`                        | (9 arms,) f32: where each arm is asked to be, relative to reset    |
+| `action`                        | (9 arms,) f32: target pose of each arm relative to reset           |
 | `next.reward`, `next.done`      | of the step that the action led to                                 |
 
-Numbers of `observation.state` and `action` are those of `tacsim.FeatureEncoder`: SI values over the scale of their
-quantity (`tacsim.gym.features.SCALES`). A pose is (9,): position, and what the first two columns of its rotation differ
-from those of no rotation. Policies such as ACT read the state, the images and the action, and leave the rest.
+Numbers of `observation.state` and `action` are those of `tacsim.FeatureEncoder`: SI values divided by the scale of
+their quantity (`tacsim.gym.features.SCALES`). A pose is (9,): position, and the first two columns of the rotation
+matrix minus those of the identity. Policies such as ACT read the state, the images and the action, not the rest.
 
-LeRobot's rollout hands on to a policy only numbers whose names end in `.pos` or `.vel`, and at its end drives the robot
-back by all that end in `.pos`. So the numbers of an action have names in `.pos`, in the state, too, and all others of
-the state, velocities or not, in `.vel`.
+LeRobot's rollout passes to a policy only numbers whose names end in `.pos` or `.vel`, and at its end moves the robot
+back by all numbers that end in `.pos`. So the numbers of an action end in `.pos`, in the state also, and all other
+numbers of the state, velocities or not, end in `.vel`.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ IMAGE = "observation.images."
 MAPS = {"height": "observation.height.", "gradient": "observation.gradient.", "flow": "observation.flow."}
 MAP_AXES = ("rows", "columns", "xy")
 DRIVEN, OTHER = ".pos", ".vel"
-LABEL = "label"  # dtype of a feature whose numbers stand for its names
+LABEL = "label"  # dtype of a feature whose numbers are indices of its names
 Column = NDArray[Any] | Sequence[bytes]  # (rows, ...), or PNG pictures
 Statistics = dict[str, NDArray[Any]]
 
@@ -55,8 +55,8 @@ QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 
 @dataclass(frozen=True, slots=True)
 class Feature:
-    """One column: kind of its numbers ("image": PNG in the file, uint8 here), shape, and names along its first axis
-    (of an image or a map: of its axes)."""
+    """One column: dtype ("image": PNG in the file, uint8 in memory), shape, and names of the entries of its first axis
+    (for an image or a map: names of its axes)."""
 
     dtype: str
     shape: tuple[int, ...]
@@ -64,11 +64,15 @@ class Feature:
 
 
 class LeRobotMapping:
-    """Observations and actions of a rig as LeRobot's features. It remembers the episode's start and where the arms were
-    last asked to go: `begin` it with the first observation of each episode.
+    """Converts observations and actions of a rig to LeRobot's features.
 
-    maps: with heights, gradients and flow.
-    Raises IncompatibleRig for a rig without a sensor or an arm, or with a name that LeRobot does not allow.
+    It stores the poses at the start of the episode and the last targets, so call `begin` with the first observation of
+    each episode.
+
+    maps: include heights, gradients and flow.
+
+    Raises:
+        IncompatibleRig: the rig has no sensor or no arm, or a name that LeRobot does not allow.
     """
 
     def __init__(self, spec: RigSpec, canonical: CanonicalGrid, *, maps: bool = True) -> None:
@@ -79,48 +83,48 @@ class LeRobotMapping:
                 if "/" in name:
                     raise IncompatibleRig(f"{kind} '{name}': LeRobot allows no '/' in names; rename it in the rig file")
         self._maps = maps
-        self._encoder = FeatureEncoder(_seen(spec), canonical)
+        self._encoder = FeatureEncoder(_sensor_features(spec), canonical)
         self._start: dict[str, Pose] = {}
-        self._asked: dict[str, Pose] = {}
+        self._targets: dict[str, Pose] = {}
 
     @property
     def state(self) -> Numbers:
-        """What the numbers of `observation.state` are."""
-        found, asked = self._encoder.inputs["touch"], set(self.action.names)
-        names = (name + DRIVEN if name + DRIVEN in asked else name + OTHER for name in found.names)
+        """Names and scales of the numbers of `observation.state`."""
+        found, targets = self._encoder.inputs["touch"], set(self.action.names)
+        names = (name + DRIVEN if name + DRIVEN in targets else name + OTHER for name in found.names)
         return Numbers(names=tuple(names), scales=found.scales)
 
     @property
     def action(self) -> Numbers:
-        """What the numbers of `action` are."""
+        """Names and scales of the numbers of `action`."""
         parts = [(f"{part}_{arm}{DRIVEN}", SCALES[kind]) for arm in self._encoder.features.arms for part, kind in _POSE]
         return Numbers(names=tuple(name for name, _ in parts), scales=tuple(scale for _, scale in parts))
 
     def begin(self, observation: Observation) -> Row:
-        """The first observation of an episode."""
+        """Starts an episode: the row of its first observation."""
         self._start = {arm: observation.arms[arm].pose for arm in self._encoder.features.arms}
-        self._asked = dict(self._start)
-        return self._row(observation, self._encoder.begin(observation)["touch"])
+        self._targets = dict(self._start)
+        return self._make_row(observation, self._encoder.begin(observation)["touch"])
 
-    def observed(self, observation: Observation) -> Row:
-        """Each later observation."""
-        return self._row(observation, self._encoder(observation)["touch"])
+    def encode_observation(self, observation: Observation) -> Row:
+        """The row of each later observation."""
+        return self._make_row(observation, self._encoder(observation)["touch"])
 
-    def acted(self, action: Action) -> NDArray[np.float32]:
-        """(9 arms,) where the arms are asked to be; one that holds is asked for the same once more."""
-        for arm in self._asked:
+    def encode_action(self, action: Action) -> NDArray[np.float32]:
+        """(9 arms,) target poses; an arm without a target keeps its last one."""
+        for arm in self._targets:
             target = action.tool.get(arm)
             if target is not None:
-                self._asked[arm] = target
-        return self.encoded(self._asked)
+                self._targets[arm] = target
+        return self.encode_poses(self._targets)
 
-    def encoded(self, poses: Mapping[str, Pose]) -> NDArray[np.float32]:
-        """(9 arms,) of the pose of each arm."""
+    def encode_poses(self, poses: Mapping[str, Pose]) -> NDArray[np.float32]:
+        """(9 arms,) the pose of each arm relative to its start."""
         each = [encode_pose_change(start, poses[arm]) for arm, start in self._start.items()]
         return np.concatenate(each).astype(np.float32)
 
-    def decoded(self, numbers: NDArray[np.floating[Any]]) -> Action:
-        """The action that (9 arms,) numbers stand for. Raises ActionError for numbers that stand for none."""
+    def decode_action(self, numbers: NDArray[np.floating[Any]]) -> Action:
+        """The action of (9 arms,) numbers. Raises ActionError for numbers that are no poses."""
         each = np.asarray(numbers, np.float64).reshape(len(self._start), -1)
         tool: dict[str, Pose | None] = {}
         for (arm, start), values in zip(self._start.items(), each, strict=True):
@@ -131,7 +135,7 @@ class LeRobotMapping:
         return Action(tool)
 
     def features(self, row: Mapping[str, NDArray[Any]]) -> dict[str, Feature]:
-        """Of the columns of `row`, one of this rig's."""
+        """The features of the columns of a row of this rig."""
         return {key: self._feature(key, value) for key, value in row.items()}
 
     def _feature(self, key: str, value: NDArray[Any]) -> Feature:
@@ -140,7 +144,7 @@ class LeRobotMapping:
         names = {STATE: self.state.names, ACTION: self.action.names}.get(key)
         return Feature(value.dtype.name, value.shape, MAP_AXES[: value.ndim] if value.ndim > 1 else names)
 
-    def _row(self, observation: Observation, state: NDArray[Any]) -> Row:
+    def _make_row(self, observation: Observation, state: NDArray[Any]) -> Row:
         row: Row = {STATE: state}
         row |= {IMAGE + name: touch.image for name, touch in observation.tactile.items()}
         for kind, key in MAPS.items() if self._maps else ():
@@ -152,8 +156,8 @@ class LeRobotMapping:
 _POSE = tuple(PARTS["moved"].items())
 
 
-def _seen(spec: RigSpec) -> Features:
-    """What each sensor delivers, and all arms."""
+def _sensor_features(spec: RigSpec) -> Features:
+    """All arms, and the quantities that every sensor measures."""
     sensors = spec.sensors.values()
     touch: list[Quantity] = ["moved", "wrench"]
     touch += ["between"] if len(spec.arms) > 1 else []
@@ -164,19 +168,19 @@ def _seen(spec: RigSpec) -> Features:
 
 
 def outcome(step: Step, last: bool) -> Row:
-    """What followed an action: reward, where the episode has one, and whether the episode ended with it."""
+    """Result of an action: the reward, if the episode has one, and whether the episode ended."""
     row: Row = {} if step.reward is None else {REWARD: np.array([step.reward], np.float32)}
     return row | {DONE: np.array([last])}
 
 
 def frames_per_second(period: float) -> int | float:
-    """Of a control period [s]: LeRobot wants a whole number, and gets it where there is one within a thousandth."""
+    """Rate of a control period [s], as an integer if it is within 0.1 % of one, because LeRobot needs an integer."""
     rate = 1.0 / period
     return round(rate) if abs(rate - round(rate)) <= 1e-3 * rate else rate
 
 
 def task_in_words(kind: str | None, goal: float | tuple[float, ...] | None) -> str:
-    """What policies that read language are told of a task with this goal [m]."""
+    """Description of a task with this goal [m], for policies that read language."""
     goal = () if goal is None else goal if isinstance(goal, tuple) else (goal,)
     sizes = [f"{1e3 * size:g} mm" for size in goal]
     if kind == "squeeze" and len(sizes) == 1:
@@ -189,19 +193,19 @@ def task_in_words(kind: str | None, goal: float | tuple[float, ...] | None) -> s
 
 
 def arrow_table(features: Mapping[str, Feature], columns: Mapping[str, Column]) -> pa.Table:
-    """One row group's worth of rows, in the order of `features`."""
+    """The rows of one row group, with columns in the order of `features`."""
     import pyarrow as pa
 
-    arrays = [_array(feature, columns[name]) for name, feature in features.items()]
-    told = {"info": {"features": {name: _told(feature) for name, feature in features.items()}}}
+    arrays = [_arrow_array(feature, columns[name]) for name, feature in features.items()]
+    info = {"info": {"features": {name: _feature_type(feature) for name, feature in features.items()}}}
     schema = pa.schema(
         [pa.field(name, array.type) for name, array in zip(features, arrays, strict=True)],
-        metadata={"huggingface": json.dumps(told)},
+        metadata={"huggingface": json.dumps(info)},
     )
     return pa.Table.from_arrays(arrays, schema=schema)
 
 
-def _array(feature: Feature, column: Column) -> pa.Array:
+def _arrow_array(feature: Feature, column: Column) -> pa.Array:
     import pyarrow as pa
 
     if feature.dtype == "image":
@@ -213,13 +217,13 @@ def _array(feature: Feature, column: Column) -> pa.Array:
         return array
     if len(feature.shape) == 1:
         return pa.FixedSizeListArray.from_arrays(array, feature.shape[0])
-    for side in reversed(feature.shape):  # `datasets` keeps maps as lists of lists
+    for side in reversed(feature.shape):  # `datasets` stores maps as lists of lists
         array = pa.ListArray.from_arrays(np.arange(0, len(array) + 1, side, dtype=np.int32), array)
     return array
 
 
-def _told(feature: Feature) -> dict[str, Any]:
-    """The feature in the words of `datasets`."""
+def _feature_type(feature: Feature) -> dict[str, Any]:
+    """Description of the feature in the format of `datasets`."""
     if feature.dtype == "image":
         return {"_type": "Image"}
     if feature.dtype == LABEL:
@@ -233,20 +237,20 @@ def _told(feature: Feature) -> dict[str, Any]:
 
 
 class ImageCounts:
-    """How often each value occurs in the pictures of an episode, by channel: all statistics follow, exactly."""
+    """Histogram of each channel over the pictures of an episode, from which all statistics follow exactly."""
 
     def __init__(self) -> None:
         self._counts = np.zeros((3, 256), np.int64)
         self._pictures = 0
 
     def add(self, image: NDArray[np.uint8]) -> None:
-        """(H, W, 3)."""
+        """Adds a picture (H, W, 3)."""
         self._pictures += 1
         for channel in range(3):
             self._counts[channel] += np.bincount(image[..., channel].ravel(), minlength=256)
 
     def statistics(self) -> Statistics:
-        """(3, 1, 1) each, of values / 255; `count` of pictures, (1,)."""
+        """Statistics of values / 255, (3, 1, 1) each; `count` of pictures, (1,)."""
         values = np.arange(256) / 255.0
         total = self._counts.sum(axis=1)
         mean = self._counts @ values / total
@@ -257,14 +261,14 @@ class ImageCounts:
             "std": np.sqrt((self._counts * (values - mean[:, None]) ** 2).sum(axis=1) / total),
         }
         below = self._counts.cumsum(axis=1)
-        for name, share in QUANTILES.items():  # the least value with at least this share at or below it
+        for name, share in QUANTILES.items():  # the smallest value with at least this share at or below it
             found[name] = values[(below >= share * total[:, None]).argmax(axis=1)]
         return {name: each.reshape(3, 1, 1) for name, each in found.items()} | {"count": np.array([self._pictures])}
 
 
 def column_statistics(values: NDArray[Any]) -> Statistics:
-    """Of the (frames, ...) of an episode: each number by itself; of a map (frames, h, w[, 2]) one for all its cells, in
-    a shape that spreads over the map."""
+    """Statistics of a column (frames, ...) of an episode: for each number; for a map (frames, h, w[, 2]) over all
+    cells, in a shape that broadcasts to the map."""
     numbers = values.astype(np.float64)
     over = (0,) if values.ndim <= 2 else (0, 1, 2)
 
@@ -282,9 +286,9 @@ def column_statistics(values: NDArray[Any]) -> Statistics:
     return found | {name: shaped(each) for name, each in zip(QUANTILES, quantiles, strict=True)}
 
 
-def merged(each: Sequence[Statistics]) -> Statistics:
-    """Of several episodes together, as LeRobot merges them: exact but for the quantiles, which are means of the
-    episodes', weighted by their frames."""
+def merge_statistics(each: Sequence[Statistics]) -> Statistics:
+    """Statistics of several episodes together, as LeRobot merges them: exact except for the quantiles, which are means
+    over the episodes, weighted by their frames."""
     counts = np.array([float(found["count"][0]) for found in each])
 
     def mean(name: str) -> NDArray[Any]:

@@ -1,4 +1,4 @@
-"""Pictures of a data set as H.264 video without colour subsampling, and how far it errs, measured as it is written."""
+"""Pictures of a data set as H.264 video without colour subsampling, and its error, measured while writing."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from numpy.typing import NDArray
 from tacsim.record.images import decode_image
 
 ENCODER, CODEC, PIXELS = "libx264", "h264", "yuv444p"
-QUALITY = 10  # crf: 0 is best; LeRobot's own default, AV1 yuv420p at 30, errs by 4.6 grey levels
-KEY_FRAMES = 2  # every so many frames, as LeRobot does: it loads single frames
+QUALITY = 10  # crf: 0 is best; LeRobot's default, AV1 yuv420p at 30, has an error of 4.6 grey levels
+KEY_FRAMES = 2  # distance of key frames, as in LeRobot, which loads single frames
 
 
 class VideoFailed(RuntimeError):
-    """The encoder failed. Nothing of the data set is left."""
+    """The encoder failed. The data set is removed."""
 
 
 def require_video() -> None:
-    """Raises ValueError where videos cannot be made."""
+    """Raises ValueError if videos cannot be written."""
     if util.find_spec("av") is None:
-        raise ValueError("videos are made by PyAV, which is not installed: pip install 'tacsim[video]'")
+        raise ValueError("writing videos needs PyAV, which is not installed: pip install 'tacsim[video]'")
     import av
 
     try:
@@ -42,32 +42,34 @@ class VideoError:
     """Differences between pictures and their video [grey levels of 255]."""
 
     def __init__(self) -> None:
-        self._squares = np.zeros(3)  # of the error, of the error in contact, of the signal there
-        self._counts = np.zeros(2, np.int64)  # numbers, and those in contact
-        self._most = 0
+        self._squares = np.zeros(3)  # sums of squares: of the error, of the error in contact, of the signal in contact
+        self._counts = np.zeros(2, np.int64)  # number of values, and of those in contact
+        self._max_error = 0
 
     def add(self, picture: NDArray[np.uint8], decoded: NDArray[np.uint8]) -> None:
-        """Both (H, W, 3)."""
-        min_change = 10  # grey levels; what differs more from GREY is taken for contact
+        """Adds a picture and its decoded video frame, both (H, W, 3)."""
+        min_change = 10  # grey levels; a larger difference from grey counts as contact
         grey = 128  # of a canonical picture where nothing changed
         error, signal = (each.astype(np.int64) - other for each, other in ((decoded, picture), (picture, grey)))
         contact = np.abs(signal) > min_change
         self._squares += [(error**2).sum(), (error[contact] ** 2).sum(), (signal[contact] ** 2).sum()]
         self._counts += np.array([error.size, contact.sum()])
-        self._most = max(self._most, int(np.abs(error).max()))
+        self._max_error = max(self._max_error, int(np.abs(error).max()))
 
-    def told(self) -> dict[str, float | int]:
-        """In contact: of numbers that differ from grey by more than 10 grey levels; 0 where there are none."""
+    def summarise(self) -> dict[str, float | int]:
+        """Errors by name. In contact: of values that differ from grey by more than 10 grey levels; 0 without any."""
         total, contact = (max(int(count), 1) for count in self._counts)
         rms = np.sqrt(self._squares / [total, contact, contact]).round(4).tolist()
-        return {"rms": rms[0], "rms_in_contact": rms[1], "signal_in_contact": rms[2], "most": self._most}
+        return {"rms": rms[0], "rms_in_contact": rms[1], "signal_in_contact": rms[2], "most": self._max_error}
 
 
 class VideoFile:
-    """One file in the making. What is written is decoded again on the way, and compared.
+    """One file that is being written. Each frame is decoded again and compared.
 
-    path: of a file that is not there yet. rate: frames a second. shape: (H, W, 3) of the pictures.
-    Raises VideoFailed, OSError.
+    path: of a new file. rate: frames a second. shape: (H, W, 3) of the pictures.
+
+    Raises:
+        VideoFailed, OSError.
     """
 
     def __init__(self, path: Path, rate: float, shape: tuple[int, ...], error: VideoError) -> None:
@@ -78,7 +80,11 @@ class VideoFile:
         self.frames = self.size = 0  # pictures taken, and bytes of them in the video
         self._waiting: dict[int, NDArray[np.uint8]] = {}  # by frame, until it is decoded
         exact = Fraction(rate).limit_denominator(1_000_000)
-        options = {"crf": str(QUALITY), "g": str(KEY_FRAMES), "threads": "1"}  # one thread: the same bytes everywhere
+        options = {
+            "crf": str(QUALITY),
+            "g": str(KEY_FRAMES),
+            "threads": "1",
+        }  # one thread: the same bytes on all machines
         with self._failing():
             self._container: Any = av.open(str(path), "w", format="mp4")
             self._stream: Any = self._container.add_stream(ENCODER, rate=exact, options=options)
@@ -88,7 +94,7 @@ class VideoFile:
         self._decoder: Any = av.CodecContext.create(CODEC, "r")
 
     def add(self, picture: NDArray[np.uint8]) -> None:
-        """(H, W, 3)."""
+        """Adds a picture (H, W, 3)."""
         import av
 
         frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
@@ -98,7 +104,7 @@ class VideoFile:
         self._encode(frame)
 
     def close(self) -> None:
-        """Writes what is left."""
+        """Writes the remaining frames."""
         self._encode(None)
         self._compare(None)
         with self._failing():
@@ -124,7 +130,7 @@ class VideoFile:
 
     @contextmanager
     def _failing(self) -> Iterator[None]:
-        """A full disk stays an OSError; all else that FFmpeg says is told as what it is."""
+        """Raises an OSError of FFmpeg, such as a full disk, with the path, and other errors as VideoFailed."""
         import av
 
         try:
@@ -136,10 +142,12 @@ class VideoFile:
 
 
 class VideoColumn:
-    """The pictures of one column, in files one after the other.
+    """The pictures of one column, in consecutive files.
 
-    template: of their paths, with chunk_index and file_index. size: [MB] at which a file is followed by another.
-    Raises VideoFailed, OSError.
+    template: of their paths, with chunk_index and file_index. size: [MB] at which a new file starts.
+
+    Raises:
+        VideoFailed, OSError.
     """
 
     def __init__(self, template: str, rate: float, shape: tuple[int, ...], size: float, chunk: int) -> None:
@@ -149,7 +157,7 @@ class VideoColumn:
         self.error = VideoError()
 
     def add(self, pictures: Sequence[bytes]) -> dict[str, int | float]:
-        """One episode's, as PNG. Returns where they are: chunk, file, and from when to when in it [s]."""
+        """Adds the PNG pictures of an episode. Returns chunk, file, and start and end time in the file [s]."""
         if self._file is not None and self._file.size * (1 + len(pictures) / self._file.frames) >= self._size * 2**20:
             self._file.close()
             self._file, self._number = None, self._number + 1
@@ -164,14 +172,14 @@ class VideoColumn:
         return {"chunk_index": chunk, "file_index": number, "from_timestamp": begins, "to_timestamp": ends}
 
     def close(self) -> None:
-        """Writes what is left."""
+        """Writes the remaining frames."""
         if self._file is not None:
             self._file.close()
             self._file = None
 
     @property
     def info(self) -> dict[str, Any]:
-        """What LeRobot keeps of a video column."""
+        """Description of a video column in LeRobot."""
         return {
             "video.height": self._shape[0],
             "video.width": self._shape[1],

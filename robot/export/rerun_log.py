@@ -1,15 +1,15 @@
-"""What an episode is in Rerun: its entities, and how they are laid out on the screen.
+"""The entities of an episode in Rerun, and their layout on the screen.
 
 | entity                              | what                                                                   |
 |-------------------------------------|------------------------------------------------------------------------|
 | `/world/{sensor}/gel`               | surface at the sensor's pose, coloured by height                       |
 | `/world/{sensor}/flow`              | displacement of its markers                                            |
 | `/world/{arm}`                      | pose of the sensor that the arm carries                                |
-| `/world/{arm}/force`                | what the object does to it, 1 mm a newton                              |
-| `/world/body`                       | particles of the plasticine; live, or where they were recorded         |
-| `/world/asked/{arm}`                | where the arm was asked to be                                          |
-| `/camera/{sensor}`                  | the picture as it came                                                 |
-| `/canonical/{sensor}`               | the picture as a policy sees it                                        |
+| `/world/{arm}/force`                | force of the object on it, 1 mm per newton                             |
+| `/world/body`                       | particles of the plasticine; live, or if they were recorded            |
+| `/world/asked/{arm}`                | target of the arm                                                      |
+| `/camera/{sensor}`                  | the camera image                                                       |
+| `/canonical/{sensor}`               | the canonical picture, input of a policy                               |
 | `/force`, `/torque`, `/joints`      | numbers of the arms [N, N m, rad]                                      |
 | `/task/reward`, `/task/distance`    | of the step [-, mm]                                                    |
 | `/limits/{arm}`                     | targets shortened or refused so far                                    |
@@ -45,9 +45,9 @@ ARROW = 0.1e-3  # radius [m]
 
 
 class EpisodeLog:
-    """Writes the steps of an episode into a recording of Rerun, each as it comes.
+    """Writes the steps of an episode into a Rerun recording.
 
-    lattices: by sensor, where its markers rest (m, n, 2), sensor frame [m]; without, no flow is drawn.
+    lattices: rest positions of the markers (m, n, 2) by sensor, sensor frame [m]; without them no flow is drawn.
     """
 
     def __init__(
@@ -64,55 +64,55 @@ class EpisodeLog:
         self._meshed: set[str] = set()
 
     def step(self, step: Step, observation: Observation, truth: Truth | None = None) -> None:
-        """All that is known of one step."""
+        """Logs all data of one step."""
         import rerun as rr
 
         if self._begin is None:
             self._begin = step.time
             self._recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        self._at(step.time)
+        self._set_time(step.time)
         self._recording.set_time("step", sequence=step.index)
         for name, state in observation.arms.items():
-            self._arm(name, state)
+            self._log_arm(name, state)
         for name, touch in observation.tactile.items():
-            self._sensor(name, touch, observation.arms)
-            self._picture(f"camera/{name}", step.frames[name].image)
-        for name, asked in ({} if step.action is None else step.action.tool).items():
-            if asked is not None:
-                self._points(f"world/asked/{name}", asked)
+            self._log_sensor(name, touch, observation.arms)
+            self._log_picture(f"camera/{name}", step.frames[name].image)
+        for name, target in ({} if step.action is None else step.action.tool).items():
+            if target is not None:
+                self._log_point(f"world/asked/{name}", target)
         particles = step.body if truth is None else truth.points
         if particles is not None:
             grains = rr.Points3D(particles, radii=[ARROW / 2], colors=[(200, 150, 110)])
             self._recording.log("world/body", grains)
-        self._numbers(step)
+        self._log_numbers(step)
         for name, packages in step.packages.items():
-            self._statuses(name, packages)
+            self._log_statuses(name, packages)
 
-    def _at(self, time: float) -> None:
+    def _set_time(self, time: float) -> None:
         assert self._begin is not None
         self._recording.set_time("time", duration=time - self._begin)
 
-    def _arm(self, name: str, state: ArmState) -> None:
-        metres_per_newton = 1e-3  # [m] of an arrow for each newton
+    def _log_arm(self, name: str, state: ArmState) -> None:
+        metres_per_newton = 1e-3  # length of an arrow [m/N]
         import rerun as rr
 
-        self._place(f"world/{name}", state.pose)
+        self._log_pose(f"world/{name}", state.pose)
         force = [metres_per_newton * state.wrench[:3]]
         arrow = rr.Arrows3D(vectors=force, origins=[(0, 0, 0)], radii=[3 * ARROW], colors=[(250, 140, 30)])
         self._recording.log(f"world/{name}/force", arrow)
         for kind, values in (("force", state.wrench[:3]), ("torque", state.wrench[3:])):
             for axis, value in zip(AXES, values, strict=True):
-                self._number(f"{kind}/{name}/{axis}", float(value))
+                self._log_number(f"{kind}/{name}/{axis}", float(value))
         for joint, angle in enumerate(() if state.joints is None else state.joints):
-            self._number(f"joints/{name}/joint_{joint + 1}", float(angle))
+            self._log_number(f"joints/{name}/joint_{joint + 1}", float(angle))
 
-    def _sensor(self, name: str, touch: TactileObservation, arms: Mapping[str, ArmState]) -> None:
+    def _log_sensor(self, name: str, touch: TactileObservation, arms: Mapping[str, ArmState]) -> None:
         import rerun as rr
 
-        self._picture(f"canonical/{name}", touch.image)
+        self._log_picture(f"canonical/{name}", touch.image)
         carrier = self._spec.sensors[name].arm
         if carrier is not None and carrier != name and carrier in arms:
-            self._place(f"world/{name}", arms[carrier].pose)
+            self._log_pose(f"world/{name}", arms[carrier].pose)
         if touch.height is None:
             return
         if name not in self._meshed:
@@ -130,46 +130,46 @@ class EpisodeLog:
             arrows = rr.Arrows3D(vectors=vectors, origins=origins, radii=[ARROW / 2], colors=[(240, 240, 240)])
             self._recording.log(f"world/{name}/flow", arrows)
 
-    def _numbers(self, step: Step) -> None:
+    def _log_numbers(self, step: Step) -> None:
         if step.reward is not None:
-            self._number("task/reward", step.reward)
+            self._log_number("task/reward", step.reward)
         if step.distance is not None:
-            self._number("task/distance", 1e3 * step.distance)
-        self._number("diagnostics/seconds", step.seconds)
+            self._log_number("task/distance", 1e3 * step.distance)
+        self._log_number("diagnostics/seconds", step.seconds)
         for name, value in step.info.items():
             limit = name.removeprefix(LIMITS_HIT)
-            self._number(f"diagnostics/{name}" if limit == name else f"limits/{limit}", value)
+            self._log_number(f"diagnostics/{name}" if limit == name else f"limits/{limit}", value)
 
-    def _statuses(self, name: str, packages: ArmPackages) -> None:
-        """Changes alone, at their own times."""
+    def _log_statuses(self, name: str, packages: ArmPackages) -> None:
+        """Logs each change of the status at its own time."""
         import rerun as rr
 
         for time, status in zip(packages.time.tolist(), packages.status.tolist(), strict=True):
             if self._status.get(name) != status:
                 self._status[name] = status
-                self._at(time)
+                self._set_time(time)
                 words = ArmStatus(status).name if status in set(ArmStatus) else f"status {status}"
                 fine = status < ArmStatus.FORCE_LIMIT
                 level = rr.TextLogLevel.INFO if fine else rr.TextLogLevel.ERROR
                 self._recording.log(f"status/{name}", rr.TextLog(words, level=level))
 
-    def _place(self, entity: str, pose: Pose) -> None:
+    def _log_pose(self, entity: str, pose: Pose) -> None:
         import rerun as rr
 
         turn = rr.Quaternion(xyzw=pose.quaternion)
         self._recording.log(entity, rr.Transform3D(translation=pose.position, quaternion=turn))
 
-    def _points(self, entity: str, pose: Pose) -> None:
+    def _log_point(self, entity: str, pose: Pose) -> None:
         import rerun as rr
 
         self._recording.log(entity, rr.Points3D([pose.position], radii=[5 * ARROW], colors=[(250, 80, 200)]))
 
-    def _picture(self, entity: str, image: NDArray[np.uint8]) -> None:
+    def _log_picture(self, entity: str, image: NDArray[np.uint8]) -> None:
         import rerun as rr
 
         self._recording.log(entity, rr.EncodedImage(contents=encode_png(image), media_type="image/png"))
 
-    def _number(self, entity: str, value: float) -> None:
+    def _log_number(self, entity: str, value: float) -> None:
         import rerun as rr
 
         self._recording.log(entity, rr.Scalars([value]))
@@ -212,8 +212,8 @@ def _triangles(valid: NDArray[np.bool_]) -> NDArray[np.uint32]:
 
 
 def _colours(height: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """(n, 3) by depth, from 0 to MOST_DEPTH."""
-    max_depth = 1e-3  # [m] drawn in the last colour
+    """(n, 3) colours by depth, from 0 to `max_depth`."""
+    max_depth = 1e-3  # drawn in the last colour [m]
     share = np.clip(height / max_depth, 0.0, 1.0) * (len(COLOURS) - 1)
     channels = [np.interp(share, np.arange(len(COLOURS)), COLOURS[:, channel]) for channel in range(3)]
     found: NDArray[np.uint8] = np.stack(channels, axis=1).astype(np.uint8)

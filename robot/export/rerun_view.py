@@ -1,6 +1,6 @@
-"""An episode, or a rig while it runs, in the Rerun viewer or in a file for it.
+"""An episode, or a running rig, in the Rerun viewer or in a file for it.
 
-A running rig is shown at no cost to the control loop: steps are handed to a process of their own, and those that it
+The view of a running rig does not delay the control loop: a separate process receives the steps, and steps that it
 cannot take in time are left out.
 """
 
@@ -39,45 +39,52 @@ if TYPE_CHECKING:
     import rerun as rr
 
 APPLICATION = "tacsim"
-WAITING = 2  # steps that wait to be handed over; a longer queue would show the past
+MAX_WAITING_STEPS = 2  # steps in the queue; a longer queue would show old steps
 
-Shown = tuple[Step, Observation, Truth | None]
+ViewedStep = tuple[Step, Observation, Truth | None]
 Log = Callable[[Step, Observation, Truth | None], None]
 
 
 def view_episode(path: Path, file: Path | None, on_step: Callable[[int, int], None] = lambda done, total: None) -> None:
-    """Shows the episode in a viewer that it starts; with a `file` (.rrd) it writes that instead: whole, or not at all.
+    """Shows the episode in a new viewer; with a `file` (.rrd), writes that file instead, completely or not at all.
 
-    Raises ValueError without rerun-sdk or for an empty episode, EpisodeError, FileExistsError, OSError, RuntimeError of
-    a viewer that cannot be started, and what normalising raises.
+    Raises:
+        ValueError: rerun-sdk is not installed, or the episode is empty.
+        RuntimeError: the viewer does not start.
+        EpisodeError, FileExistsError, OSError, and the errors of normalising.
     """
     require_rerun()
     observed = observe_episode(path)
     steps, spec = observed.episode.steps, observed.episode.meta.spec
     if not steps:
         raise ValueError(f"{path}: no step can be read, there is nothing to show")
-    with logged(spec, observed.canonical, observed.rig, file) as log:
+    with open_log(spec, observed.canonical, observed.rig, file) as log:
         for done, (step, observation) in enumerate(observed.steps(), start=1):
             log(step, observation, None)
             on_step(done, len(steps))
 
 
 class LiveView(Closing):
-    """Call it with each step. It never waits, and no failure of the viewer reaches the caller.
+    """Shows steps while a rig runs: call it with each step. The call never waits, and the viewer raises no error in it.
 
-    file: (.rrd) is written instead of a viewer started; whole also when this program is killed.
+    file: (.rrd) to write instead of starting a viewer; it is complete also if this program is killed.
 
-    Raises ValueError without rerun-sdk, FileExistsError, OSError and RuntimeError when the viewer does not start.
+    Raises:
+        ValueError: rerun-sdk is not installed.
+        RuntimeError: the viewer does not start.
+        FileExistsError, OSError.
     """
 
     def __init__(self, spec: RigSpec, config: RigConfig, file: Path | None) -> None:
         require_rerun()
-        self._line: queue.Queue[Shown | None] = queue.Queue(WAITING)
+        self._line: queue.Queue[ViewedStep | None] = queue.Queue(MAX_WAITING_STEPS)
         self.left_out = 0  # steps
-        self._ended = False  # the process has
+        self._ended = False  # the process has ended
         context = multiprocessing.get_context("spawn")
         self._pipe, other = context.Pipe()
-        self._process = context.Process(target=_show, args=(other, spec, config, file), name="view", daemon=True)
+        self._process = context.Process(
+            target=_run_viewer_process, args=(other, spec, config, file), name="view", daemon=True
+        )
         with blocking_signals():
             self._process.start()
         other.close()
@@ -97,11 +104,11 @@ class LiveView(Closing):
 
     @property
     def ended(self) -> bool:
-        """The viewer, or what feeds it, has ended by itself: nothing more is shown."""
+        """True if the viewer or its process has ended, so that no more steps are shown."""
         return self._ended
 
     def close(self) -> None:
-        """Waits for what was handed over, at most MAX_END for each part. A second call does nothing."""
+        """Waits until the queued steps are shown, at most `end_timeout` for each part. A second call does nothing."""
         end_timeout = 20.0  # longest wait for the last steps [s]
         with contextlib.suppress(queue.Full):
             self._line.put(None, timeout=end_timeout)
@@ -114,11 +121,11 @@ class LiveView(Closing):
     def _await_start(self) -> None:
         start_timeout = 60.0  # longest wait for the viewer [s]
         if not self._pipe.poll(start_timeout):
-            raise RuntimeError(f"the viewer did not begin within {start_timeout:g} s")
+            raise RuntimeError(f"the viewer did not start within {start_timeout:g} s")
         try:
             failure = self._pipe.recv()
         except EOFError:
-            raise RuntimeError("the process of the viewer ended before it began") from None
+            raise RuntimeError("the process of the viewer ended before it started") from None
         if failure is not None:
             raise failure
 
@@ -129,17 +136,17 @@ class LiveView(Closing):
                 continue
             try:
                 self._pipe.send(step)
-            except Exception:  # whatever the reason, the process can show no more
+            except Exception:  # after any error the process shows no more steps
                 self._ended = True
         with contextlib.suppress(OSError):
             self._pipe.send(None)
 
 
-def _show(pipe: Connection, spec: RigSpec, config: RigConfig, file: Path | None) -> None:
-    """The process: logs steps until None comes or the program at the other end is gone."""
+def _run_viewer_process(pipe: Connection, spec: RigSpec, config: RigConfig, file: Path | None) -> None:
+    """Main function of the process: logs steps until it receives None or the program at the other end has ended."""
     started = False
     try:
-        with logged(spec, config.canonical, config, file) as log:
+        with open_log(spec, config.canonical, config, file) as log:
             pipe.send(None)
             started = True
             while (step := _receive(pipe)) is not None:
@@ -150,26 +157,28 @@ def _show(pipe: Connection, spec: RigSpec, config: RigConfig, file: Path | None)
         pipe.send(failure)
 
 
-def _receive(pipe: Connection) -> Shown | None:
-    """A step; None at the end, also where the program was killed within a message."""
+def _receive(pipe: Connection) -> ViewedStep | None:
+    """A step; None at the end, also if the program was killed within a message."""
     try:
-        step: Shown | None = pipe.recv()
+        step: ViewedStep | None = pipe.recv()
     except (EOFError, OSError):
         return None
     return step
 
 
 @contextmanager
-def logged(spec: RigSpec, canonical: CanonicalGrid, rig: RigConfig | None, file: Path | None) -> Iterator[Log]:
-    """Gives what logs a step: into a viewer that it starts, or into a new `file`, which is whole in the end or absent.
+def open_log(spec: RigSpec, canonical: CanonicalGrid, rig: RigConfig | None, file: Path | None) -> Iterator[Log]:
+    """Yields a function that logs a step into a viewer, or into a new `file`, which is complete at the end or absent.
 
-    Raises FileExistsError, OSError that names the file, RuntimeError of a viewer that cannot be started.
+    Raises:
+        RuntimeError: the viewer does not start.
+        FileExistsError, OSError: the message names the file.
     """
     import rerun as rr
 
     recording = rr.RecordingStream(APPLICATION)
     episode = EpisodeLog(recording, spec, canonical, _lattices(rig))
-    with _viewer(recording) if file is None else _file(recording, file) as check:
+    with _show_in_viewer(recording) if file is None else _write_to_file(recording, file) as check:
         recording.send_blueprint(blueprint(spec))
         check()
 
@@ -181,15 +190,15 @@ def logged(spec: RigSpec, canonical: CanonicalGrid, rig: RigConfig | None, file:
 
 
 @contextmanager
-def _viewer(recording: rr.RecordingStream) -> Iterator[Callable[[], None]]:
+def _show_in_viewer(recording: rr.RecordingStream) -> Iterator[Callable[[], None]]:
     recording.spawn()
     yield lambda: None
     recording.disconnect()
 
 
 @contextmanager
-def _file(recording: rr.RecordingStream, file: Path) -> Iterator[Callable[[], None]]:
-    """Whole, or not at all. Gives what raises the OSError that has ended the writing."""
+def _write_to_file(recording: rr.RecordingStream, file: Path) -> Iterator[Callable[[], None]]:
+    """Writes the file completely or not at all. Yields a function that raises the OSError that ended the writing."""
     if file.exists():
         raise FileExistsError(EEXIST, "File exists", str(file))
     file.parent.mkdir(parents=True, exist_ok=True)
@@ -212,8 +221,9 @@ def _file(recording: rr.RecordingStream, file: Path) -> Iterator[Callable[[], No
 
 
 class _Copy(threading.Thread):
-    """Copies from a pipe, into which Rerun writes, into a file until the pipe is closed: Rerun itself reports no full
-    disk, or waits without end. Its binary stream is no way out: read more than once, it makes a damaged file (0.41)."""
+    """Copies from a pipe, into which Rerun writes, into a file until the pipe is closed. On a full disk Rerun itself
+    reports no error, or waits without end. Its binary stream cannot be used: read more than once, it makes a damaged
+    file (0.41)."""
 
     def __init__(self, pipe: Path, target: BinaryIO, file: Path) -> None:
         super().__init__(daemon=True)
@@ -228,23 +238,23 @@ class _Copy(threading.Thread):
                     if self._error is None:
                         self._target.write(data)
                         self._target.flush()
-                except OSError as failure:  # what follows is read and discarded
+                except OSError as failure:  # the rest of the pipe is read and discarded
                     self._error = OSError(failure.errno, failure.strerror, str(self._file))
 
     def check(self) -> None:
-        """Raises what went wrong."""
+        """Raises the error of the copy, if there is one."""
         if self._error is not None:
             raise self._error
 
 
 def require_rerun() -> None:
-    """Raises ValueError without rerun-sdk."""
+    """Raises ValueError if rerun-sdk is not installed."""
     if util.find_spec("rerun") is None:
-        raise ValueError("views are made by rerun-sdk, which is not installed: pip install 'tacsim[viz]'")
+        raise ValueError("a view needs rerun-sdk, which is not installed: pip install 'tacsim[viz]'")
 
 
 def _lattices(rig: RigConfig | None) -> Mapping[str, NDArray[np.float64]]:
-    """Where the markers of each sensor rest, of those that the rig knows."""
+    """Rest positions of the markers of each sensor whose markers the rig file gives."""
     found: dict[str, NDArray[np.float64]] = {}
     for name, sensor in ({} if rig is None else rig.sensors).items():
         markers = None

@@ -172,7 +172,8 @@ class _ContactMonitor:
 
 def _cell_means(image: Image) -> Float32:
     """Means over CELL x CELL pixels, (h, w, 3)."""
-    cell_side = 8  # pixels each way over which colour is averaged: removes noise and JPEG errors, keeps contacts
+    # side in pixels of the cells over which colour is averaged: removes noise and JPEG errors, keeps contacts
+    cell_side = 8
     import cv2
 
     size = (max(1, image.shape[1] // cell_side), max(1, image.shape[0] // cell_side))

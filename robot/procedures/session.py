@@ -106,8 +106,8 @@ def handheld_camera(config: RigConfig, sensor: str) -> CameraSensorConfig:
     camera = camera_sensor(config, sensor)
     if camera.mock is not None:
         raise CannotCalibrate(
-            f"rig '{config.name}': sensors.{sensor} has a mock camera with simulated pictures; nobody can press its "
-            "gel, and its model is known"
+            f"rig '{config.name}': sensors.{sensor} has a mock camera with simulated pictures; its gel cannot be "
+            "pressed by hand, and its model is known"
         )
     return camera
 

@@ -1,4 +1,4 @@
-"""What a dump of a diverged motion shows: a table, a picture, and whether the motion diverges again."""
+"""Analysis of a dump of a diverged motion: a table, a picture, and a repetition of the motion."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ TITLES = {"before": "before the motion", "good": "last good", "failed": "failed"
 def open_world(dump: Dump) -> World:
     """A world of the dump's scene in the state before the motion.
 
-    Raises DumpError for arrays that do not belong to the scene, and what making a world raises.
+    Raises DumpError for arrays that do not fit the scene, and the errors of making a world.
     """
     world = make_world(dump.info.scene)
     try:
@@ -38,11 +38,12 @@ def open_world(dump: Dump) -> World:
 
 
 def replay(dump: Dump, world: World) -> tuple[SimulationDiverged | None, str]:
-    """Runs the motion again, with all its retries: the failure, if it diverges again, and the outcome in words. Leaves
-    `world` in the state before the motion, or in the new one.
+    """Repeats the motion with all its retries. Returns the failure, if it diverges again, and a description of the
+    outcome. `world` ends in the state before the motion, or after it.
 
-    Raises DumpError for a command that makes no sense in this scene, and LoadNotReached (tacsim.physics.motion.load) if
-    it gets further this time, but a load is out of reach.
+    Raises:
+        DumpError: the command is not valid in this scene.
+        LoadNotReached: the motion does not diverge, but cannot reach a load (tacsim.physics.motion.load).
     """
     try:
         command = dump.command
@@ -54,17 +55,17 @@ def replay(dump: Dump, world: World) -> tuple[SimulationDiverged | None, str]:
             recorded = dump.states[moment]
             same = same and recorded.keys() == state.keys()
             same = same and all(recorded[name].tobytes() == a.tobytes() for name, a in state.items())
-        how = "exactly as recorded, to the last bit" if same else f"otherwise than recorded: {failure}"
+        how = "exactly as recorded, to the last bit" if same else f"differently from the recording: {failure}"
         return failure, f"diverges again, {how}"
     except (KeyError, ValueError) as error:
-        raise DumpError(f"the motion cannot be run again: {error.args[0]}") from None
+        raise DumpError(f"the motion cannot be repeated: {error.args[0]}") from None
     how = f"after {stats.retries} retries" if stats.retries else "at the first attempt"
     settled = "yes" if stats.settled else "no"
     return None, f"does not diverge: reached its targets {how}, settled: {settled}"
 
 
 def table(dump: Dump) -> dict[str, dict[str, str]]:
-    """Range of the volume ratios and of each array, by row and moment, of the moments that the dump holds."""
+    """Range of the volume ratios and of each array, by row and moment, for the moments in the dump."""
     rows: dict[str, dict[str, str]] = {}
     for moment in MOMENTS:
         for row, values in _quantities(dump.states[moment], dump.info.scene):
@@ -91,7 +92,7 @@ def _range(values: NDArray[Any]) -> str:
 
 
 def draw(dump: Dump, path: Path) -> None:
-    """Writes a picture: a cut through body and gels in the world's x-z plane, at every moment that the dump holds."""
+    """Writes a picture: a section of body and gels in the world's x-z plane, for every moment in the dump."""
     moments = [moment for moment in MOMENTS if dump.states[moment]]
     figure, scene = new_figure(5.2 * len(moments), 4.6), dump.info.scene
     figure.suptitle(dump.info.message[:200].replace("$", r"\$"), fontsize=9, color=INK, x=0.01, ha="left")
@@ -119,7 +120,7 @@ def _draw_gels(axes: Axes, state: State, scene: Scene, poses: Mapping[str, Pose]
         shares = np.meshgrid(*(np.linspace(0.0, 1.0, n) for n in u.shape[:3]), indexing="ij")
         at = (np.stack(shares, axis=-1) - [0.5, 0.5, 1.0]) * np.array(scene.gel_of(name).size) * 1e3 + u
         cut = at[:, u.shape[1] // 2]
-        cut = np.where(np.abs(cut) < 1e6, cut, np.nan)  # what is absurd is left out, and so is NaN
+        cut = np.where(np.abs(cut) < 1e6, cut, np.nan)  # huge values and NaN are not drawn
         pose = poses[name]
         world = cut @ Rotation.from_quat(pose.quaternion).as_matrix().T + pose.position * 1e3
         for lines in (world, world.swapaxes(0, 1)):

@@ -1,4 +1,4 @@
-"""The seed paper's experiment repeated: both tasks driven through their goal and beyond, by its scheme and by ours."""
+"""The experiment of the seed paper: both tasks are run through their goal and beyond, with its scheme and with ours."""
 
 from __future__ import annotations
 
@@ -21,9 +21,10 @@ from tacsim.models.rig import RigConfig
 from tacsim.report.figure4 import Moment, Trial
 from tacsim.tasks import Task, evaluate_outcome, make_task
 
-WHOLE_GEL = ("canonical.rows=80", "canonical.columns=80")  # heights from edge to edge of the gel, for the cut
-# The seed's scheme creeps: in reposition it takes some 1600 substeps after each motion until it counts as settled, ours
-# some 100. It gets a fixed time instead, faster than it settles; its body lags behind, the shape of its curve stays.
+# heights over the whole gel, for the section in the figure
+WHOLE_GEL_OVERRIDES = ("canonical.rows=80", "canonical.columns=80")
+# The seed's scheme creeps: in reposition it needs about 1600 substeps after each motion to settle, ours about 100. It
+# gets a fixed, shorter time; its body lags behind, but the shape of its reward curve stays the same.
 SETTLING_OVERRIDES = {"seed": ("scene.settling.mach=0.15", "scene.settling.max_substeps=60"), "hybrid": ()}
 
 
@@ -33,22 +34,22 @@ class Experiment:
 
     tolerance: float  # the closest distance to the goal must be at most this [m]
     overrides: tuple[str, ...]  # of the task
-    steps: int = 60  # a trial that has not gone through the goal after so many control steps has failed
+    steps: int = 60  # control steps after which a trial that has not passed the goal has failed
 
 
 EXPERIMENTS = {
     "squeeze": Experiment(0.05e-3, ("task.max_step=0.4 mm",)),
-    # Pressed well beyond a gentle touch: the cube is carried along, tips, and leaves a clear image.
+    # A strong press: the cube moves with the gels, tilts, and leaves a clear image.
     "reposition": Experiment(0.1e-3, ("task.goal=[1 mm, 1 mm]", "task.max_step=0.5 mm", "task.touch_force=1 N")),
 }
 
 
 class TrialFailed(RuntimeError):
-    """A trial could not be run to its end."""
+    """A trial did not run to its end."""
 
 
 class TrialsStopped(RuntimeError):
-    """The trials were ended from outside."""
+    """A request to stop ended the trials."""
 
 
 def run_trials(
@@ -56,18 +57,21 @@ def run_trials(
     on_step: Callable[[str, str], None] = lambda task, physics: None,
     stop: Callable[[], bool] = lambda: False,
 ) -> dict[tuple[str, str], Trial]:
-    """Runs trials (task, physics), each in a process of its own kind, as many at once as there are processors.
+    """Runs trials (task, physics), each in its own process, as many at once as there are processors.
 
-    `on_step` is called after each control step of a trial; `stop` is asked all the time, and ends everything.
-    Raises TrialFailed with the cause, Stopped.
+    on_step: is called after each control step of a trial. stop: is polled; True ends all trials.
+
+    Raises:
+        TrialFailed: the message gives the cause.
+        TrialsStopped.
     """
     context = multiprocessing.get_context("spawn")  # Taichi does not survive a fork
     workers = min(len(wanted), os.cpu_count() or 1)
-    with without_working_folder(), blocking_signals():  # starts the process that removes its semaphores in the end
+    with without_working_folder(), blocking_signals():  # starts the process that removes the semaphores at the end
         steps: multiprocessing.Queue[tuple[str, str]] = context.Queue()
     with ProcessPool(workers, _start_worker, (steps,)) as pool:
-        stop()  # once asked, a signal waits for its answer: it breaks no process off that is being started
-        running = {trial: pool.submit(_work, *trial) for trial in wanted}
+        stop()  # after this call a signal sets a flag, and so cannot interrupt the start of a process
+        running = {trial: pool.submit(_run_in_worker, *trial) for trial in wanted}
         while not all(future.done() for future in running.values()):
             if stop():
                 raise TrialsStopped("stopped before all trials were done")
@@ -78,9 +82,9 @@ def run_trials(
         try:
             result = future.result()
         except BrokenProcessPool as failure:
-            if stop():  # the signal was for all processes
+            if stop():  # the signal reached all processes
                 raise TrialsStopped("stopped before all trials were done") from failure
-            raise TrialFailed("a process of the trials was killed; is there memory enough for all?") from failure
+            raise TrialFailed("a process of the trials was killed; is there enough memory for all?") from failure
         if isinstance(result, str):
             raise TrialFailed(f"{trial[0]} by physics '{trial[1]}' failed: {result}")
         found[trial] = result
@@ -95,8 +99,8 @@ def _start_worker(steps: multiprocessing.Queue[tuple[str, str]]) -> None:
     _steps = steps
 
 
-def _work(task: str, physics: str) -> Trial | str:
-    """The trial, or its error as text: not every exception can be sent to another process."""
+def _run_in_worker(task: str, physics: str) -> Trial | str:
+    """The trial, or its error as text: some exceptions cannot be pickled."""
     try:
         return run_trial(task, physics, lambda: _steps.put((task, physics)) if _steps is not None else None)
     except Exception as error:
@@ -104,16 +108,16 @@ def _work(task: str, physics: str) -> Trial | str:
 
 
 def run_trial(task: str, physics: str, on_step: Callable[[], None] = lambda: None) -> Trial:
-    """Runs one task with one physics: the scripted policy goes through the goal and on, until the reward has fallen.
+    """Runs one task with one physics. The scripted policy moves through the goal and beyond until the reward falls.
 
-    The rate is constant, but finer near the goal.
+    Steps have a constant length, and a smaller one near the goal.
 
-    `on_step` is called after every control step. Raises what open_rig and Rig.step raise.
+    on_step: is called after every control step. Raises the errors of open_rig and Rig.step.
     """
     from robot.open import open_rig
 
     planned = EXPERIMENTS[task]
-    overrides = [f"scene.physics={physics}", *SETTLING_OVERRIDES[physics], *planned.overrides, *WHOLE_GEL]
+    overrides = [f"scene.physics={physics}", *SETTLING_OVERRIDES[physics], *planned.overrides, *WHOLE_GEL_OVERRIDES]
     config = load_rig("sim", task=task, overrides=overrides).config
     assert config.task is not None
     goal = make_task(config.task)
@@ -131,30 +135,30 @@ def run_trial(task: str, physics: str, on_step: Callable[[], None] = lambda: Non
             start = truth if start is None else start
             distances.append(evaluate_outcome(goal, truth, start).distance)
             differences.append(image_difference(rig.frames, rig.references))
-            moments.append(_moment(step, rig.frames, observation, truth))
+            moments.append(_record_moment(step, rig.frames, observation, truth))
             on_step()
             if _is_beyond_goal(distances, planned.tolerance) or step == planned.steps:
                 break
             share = FINE_STEP_SHARE if _is_near_goal(distances, planned.tolerance) else 1.0
-            longest = share * config.task.max_step / 2  # half of max_step is the policy's own rate
-            observation, _ = rig.step(_limited(policy(observation), observation, longest))
-    return _trial(config, goal, distances, differences, moments)
+            longest = share * config.task.max_step / 2  # the policy itself uses half of max_step
+            observation, _ = rig.step(_limit_motion(policy(observation), observation, longest))
+    return _make_trial(config, goal, distances, differences, moments)
 
 
 def _is_beyond_goal(distances: list[float], tolerance: float) -> bool:
-    """True when the peak lies early enough in the curve, and the curve has fallen far enough after it."""
+    """True if the peak is early enough in the curve, and the curve has fallen far enough after it."""
     peak, last = int(np.argmin(distances)), len(distances) - 1
     return peak <= PEAK_PLACE * last and distances[-1] - distances[peak] > 1.2 * MIN_REWARD_FALL * tolerance
 
 
 def _is_near_goal(distances: list[float], tolerance: float) -> bool:
-    """True where another whole step might pass the goal."""
+    """True if another full step might pass the goal."""
     longest = float(np.abs(np.diff(distances)).max(initial=0.0))
     return min(distances) > tolerance / 2 and distances[-1] < 1.2 * longest
 
 
-def _limited(action: Action, observation: Observation, longest: float) -> Action:
-    """The same motion, in which no arm moves farther than `longest` [m]. Orientations are those of the action."""
+def _limit_motion(action: Action, observation: Observation, longest: float) -> Action:
+    """The action with displacements of at most `longest` [m]. Orientations stay those of the action."""
     tool: dict[str, Pose | None] = {}
     for arm, target in action.tool.items():
         if target is not None:
@@ -166,7 +170,7 @@ def _limited(action: Action, observation: Observation, longest: float) -> Action
     return Action(tool)
 
 
-def _moment(step: int, frames: Mapping[str, TactileFrame], observation: Observation, truth: Truth) -> Moment:
+def _record_moment(step: int, frames: Mapping[str, TactileFrame], observation: Observation, truth: Truth) -> Moment:
     heights = {name: touch.height for name, touch in observation.tactile.items() if touch.height is not None}
     return Moment(
         step=step,
@@ -178,18 +182,18 @@ def _moment(step: int, frames: Mapping[str, TactileFrame], observation: Observat
     )
 
 
-def _trial(
+def _make_trial(
     config: RigConfig, task: Task, distances: list[float], differences: list[float], moments: list[Moment]
 ) -> Trial:
     assert config.scene is not None
-    shown = key_steps(len(moments), int(np.argmin(distances)))
+    steps = key_steps(len(moments), int(np.argmin(distances)))
     return Trial(
         step=list(range(len(distances))),
         reward=[-distance / task.config.reward_scale for distance in distances],
         distance=distances,
         image_difference=differences,
         goal=task.goal,
-        moments=[moments[k] for k in shown],
+        moments=[moments[k] for k in steps],
         pitch=config.canonical.pitch,
         gel_size=config.scene.gel.size,
         spacing=config.scene.spacing,
@@ -197,7 +201,7 @@ def _trial(
 
 
 def key_steps(count: int, peak: int) -> list[int]:
-    """Steps that the figure shows: first, half-way to the peak, peak, half-way to the end, last."""
+    """Steps in the figure: first, half-way to the peak, peak, half-way to the end, last."""
     return sorted({0, peak // 2, peak, (peak + count - 1) // 2, count - 1})
 
 
@@ -228,13 +232,13 @@ def as_json(results: Mapping[str, Mapping[str, Trial]]) -> dict[str, Any]:
 
 
 def shortcomings(task: str, trial: Trial) -> list[str]:
-    """What a curve lacks, in words: it must rise to a peak at the goal, then fall. Empty when it does."""
-    min_image_change = 1.0  # mean difference from the image without contact that contact must make [grey levels]
+    """Shortcomings of a curve, which must rise to a peak at the goal, then fall. Empty if it does."""
+    min_image_change = 1.0  # mean difference of the image in contact from the reference image [grey levels]
     allowed = EXPERIMENTS[task].tolerance
     peak, distance = trial.peak, trial.distance
     found = []
     if not distance[peak] <= allowed:
-        found.append(f"closest distance {distance[peak] * 1e3:.3f} mm, at most {allowed * 1e3:.2f} mm is wanted")
+        found.append(f"closest distance {distance[peak] * 1e3:.3f} mm, at most {allowed * 1e3:.2f} mm is required")
     for name, end in (("start", distance[0]), ("end", distance[-1])):
         if not end - distance[peak] > MIN_REWARD_FALL * allowed:
             found.append(

@@ -29,20 +29,20 @@ from tacsim.physics.worlds.tuning import INITIAL_GAP, MESH_GRID_SPACING, SAFE_PA
 from tacsim.report.press_pictures import write_height_picture, write_side_picture
 
 MAX_TWIST = math.radians(3600.0)
-# Share of the depth that the gel's contact points may leave unfelt. Balls of 1 mm and more, cylinders, boxes and stars
-# leave 11 % at most; wedges of 60 to 45 degrees 12 to 25 %, and press 10 to 25 % too little. More is refused.
-UNFELT = 0.125
+# Share of the depth that the gel's contact points may miss. Balls of 1 mm and more, cylinders, boxes and stars miss at
+# most 11 %; wedges of 60 to 45 degrees miss 12 to 25 %, and their forces are 10 to 25 % too small.
+MAX_MISSED_DEPTH_SHARE = 0.125
 
 
 @dataclass(frozen=True, slots=True)
 class PressMotion:
-    """How the indenter moves, once it touches the undeformed gel."""
+    """Motion of the indenter from its first contact with the undeformed gel."""
 
     depth: float = 0.5e-3  # of its lowest point below the undeformed surface [m]
-    slide: tuple[float, float] = (0.0, 0.0)  # then sideways, world x, y [m]
-    twist: float = 0.0  # then about the vertical axis [rad]
-    at: tuple[float, float] = (0.0, 0.0)  # where its centre comes down, world x, y [m]
-    turn: FloatArray | None = None  # (4,) how it is turned, instead of the scene's yaw: quaternion x, y, z, w
+    slide: tuple[float, float] = (0.0, 0.0)  # tangential displacement after the press, world x, y [m]
+    twist: float = 0.0  # rotation about the vertical axis after the slide [rad]
+    at: tuple[float, float] = (0.0, 0.0)  # position of its centre, world x, y [m]
+    turn: FloatArray | None = None  # (4,) orientation instead of the scene's yaw: quaternion x, y, z, w
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,25 +50,26 @@ class PressResult:
     """The gel under the indenter at the end."""
 
     image: NDArray[np.uint8]  # (H, W, 3) RGB
-    height: NDArray[np.float32]  # (H, W) into the gel, under each pixel [m]
+    height: NDArray[np.float32]  # (H, W) into the gel, at each pixel [m]
     contact: NDArray[np.bool_]  # (H, W) pixels where gel and indenter touch
-    wrench: FloatArray  # (6,) what the indenter does to the sensor, sensor axes [N, N m]
+    wrench: FloatArray  # (6,) of the indenter on the sensor, sensor axes [N, N m]
     contact_radius: float  # of the circle with the area of contact [m]
-    unfelt: float  # share of the depth of its lowest point that no contact point of the gel feels
+    missed_depth_share: float  # share of the depth of its lowest point that no contact point of the gel reaches
     moves: tuple[MoveStats, ...]
-    unfollowed: str  # why one of them has not settled, whatever its residual, and what to do
+    unsettled_reason: str  # why a motion does not count as settled, and what to do; else ""
     surface: GelSurface
-    folded: bool  # it folds over itself somewhere: picture and height show the sheet that the camera sees
+    folded: bool  # the surface folds over itself: picture and height show the sheet that the camera sees
     pose: Pose  # of the indenter in the sensor's frame: the centre of its bounding box
 
 
 def press(scene: Scene, sensor: SensorModel, motion: PressMotion, render: Renderer | None = None) -> PressResult:
     """Presses the scene's indenter, then slides and twists it.
 
-    render: of this sensor on this gel, for who presses often.
+    render: of this sensor on this gel, to reuse it for many presses.
 
-    Raises ValueError for a scene without indenter, a depth that is not within the gel, or a slide or twist beyond its
-    limit; SimulationDiverged.
+    Raises:
+        ValueError: the scene has no indenter, the depth is not within the gel, or slide or twist exceeds its limit.
+        SimulationDiverged.
     """
     if scene.indenter is None:
         raise ValueError(f"scene '{scene.name}' has no indenter; press needs one, and no body")
@@ -80,31 +81,31 @@ def press(scene: Scene, sensor: SensorModel, motion: PressMotion, render: Render
     if any(motion.at) or motion.turn is not None:
         world.place({"indenter": Pose(np.array([*motion.at, below + INITIAL_GAP]), turn)})
     targets = _targets(world.pose("indenter"), below - motion.depth, motion)
-    moves, unfollowed = [], ""
+    moves, unsettled_reason = [], ""
     try:
         for target in targets:
             moves.append(world.move({"indenter": target}))
-            unfollowed = world.unsettled_reason or unfollowed
+            unsettled_reason = world.unsettled_reason or unsettled_reason
     except SimulationDiverged as error:
         if error.poses:
-            came = below - float(se3.relative_pose(error.poses["lower"], error.poses["indenter"]).position[2])
-            error.advice += f"; it had come {came * 1e3:.3g} mm deep, of {motion.depth * 1e3:.3g} mm"
-            if not moves:  # it was the depth; a shift from where the indenter waits says less
-                error.depth, error.possible = came, ""
+            reached_depth = below - float(se3.relative_pose(error.poses["lower"], error.poses["indenter"]).position[2])
+            error.advice += f"; it had reached {reached_depth * 1e3:.3g} mm of {motion.depth * 1e3:.3g} mm depth"
+            if not moves:  # the depth is the cause; the possible share of the path from the start says less
+                error.depth, error.possible = reached_depth, ""
         raise
     surface = world.surface("lower")
-    seen = sample_surface(surface, image_grid(sensor.geometry))
-    contact = _contact(world, scene, seen, sensor)
+    sample = sample_surface(surface, image_grid(sensor.geometry))
+    contact = _contact_mask(world, scene, sample, sensor)
     area = float(contact.sum()) * sensor.geometry.pixel_pitch**2
     return PressResult(
         image=(render or Renderer(sensor, scene.gel.size[:2]))(surface),
-        height=seen.height,
+        height=sample.height,
         contact=contact,
         wrench=world.wrench("lower"),
         contact_radius=math.sqrt(area / math.pi),
-        unfelt=world.missed_depth_share,
+        missed_depth_share=world.missed_depth_share,
         moves=tuple(moves),
-        unfollowed=unfollowed,
+        unsettled_reason=unsettled_reason,
         surface=surface,
         folded=SurfaceTable(surface).folded,
         pose=se3.relative_pose(world.pose("lower"), world.pose("indenter")),
@@ -112,15 +113,15 @@ def press(scene: Scene, sensor: SensorModel, motion: PressMotion, render: Render
 
 
 def deepest_possible(scene: Scene, motion: PressMotion, failure: SimulationDiverged) -> float | None:
-    """A depth [m] that this press reaches, found by pressing again less deep than where it failed; None where the
-    failure was no matter of depth, or MAX_TRIALS found none."""
-    max_trials = 3  # of a depth that is possible
+    """A depth [m] that this press can reach, found by presses that are less deep than the failed one. None if the
+    failure does not depend on depth, or if `max_trials` presses failed."""
+    max_trials = 3
     if failure.depth is None or not failure.retry:
         return None
     depth = min(failure.depth, motion.depth)
     with dump_to_folder(None):
         for _ in range(max_trials):
-            depth = _rounded_down(SAFE_PATH_SHARE * depth)
+            depth = _round_down(SAFE_PATH_SHARE * depth)
             world = PressWorld(scene)
             pose = world.pose("indenter")
             below = world.lowest_point_depth(pose.quaternion)
@@ -132,27 +133,27 @@ def deepest_possible(scene: Scene, motion: PressMotion, failure: SimulationDiver
     return None
 
 
-def _rounded_down(depth: float) -> float:
-    """To two digits [m], as it is printed."""
+def _round_down(depth: float) -> float:
+    """The depth rounded down to two digits [m], as it is printed."""
     unit = 10.0 ** (math.floor(math.log10(depth)) - 1)
     return math.floor(depth / unit) * unit
 
 
 def require_reachable(gel: Gel, motion: PressMotion) -> None:
-    """Raises ValueError for a depth that is not within the gel, or a slide or twist beyond its limit."""
-    max_slide = 3.0  # widths of the gel: beyond, it has left the gel
+    """Raises ValueError for a depth that is not within the gel, or for a slide or twist beyond its limit."""
+    max_slide = 3.0  # widths of the gel; farther, the indenter has left the gel
     thickness, farthest, slide = gel.size[2], max_slide * max(gel.size[:2]), math.hypot(*motion.slide)
     if not 0 < motion.depth < thickness:
         raise ValueError(f"depth is {motion.depth:.4g} m; it must be above 0 and below the gel's {thickness:.4g} m")
     if not slide <= farthest:
         raise ValueError(f"slide is {slide:.4g} m long; at most {max_slide:g} widths of the gel, {farthest:.4g} m")
     if not abs(motion.twist) <= MAX_TWIST:
-        most = math.degrees(MAX_TWIST)
-        raise ValueError(f"twist is {math.degrees(motion.twist):.4g} deg; at most {most:g} deg either way")
+        limit = math.degrees(MAX_TWIST)
+        raise ValueError(f"twist is {math.degrees(motion.twist):.4g} deg; the limits are -{limit:g} and {limit:g} deg")
 
 
 def _targets(start: Pose, height: float, motion: PressMotion) -> list[Pose]:
-    """Poses of the indenter, in order; height: of its origin, pressed [m]."""
+    """Poses of the indenter, in order. height: of its origin at full depth [m]."""
     # a twist is cut into pieces of at most this: each motion takes the shorter rotation [rad]
     quarter_turn = math.pi / 2
     down = np.array([start.position[0], start.position[1], height])
@@ -166,9 +167,9 @@ def _targets(start: Pose, height: float, motion: PressMotion) -> list[Pose]:
     return targets
 
 
-def _contact(world: PressWorld, scene: Scene, seen: SurfaceSample, sensor: SensorModel) -> NDArray[np.bool_]:
-    """(H, W) True where the indenter presses on the surface seen by a pixel."""
-    contact_distance = 0.2  # elements: a surface point farther from the indenter is not pressed
+def _contact_mask(world: PressWorld, scene: Scene, sample: SurfaceSample, sensor: SensorModel) -> NDArray[np.bool_]:
+    """(H, W) True where the indenter presses on the surface at a pixel."""
+    contact_distance = 0.2  # in elements; a surface point farther from the indenter is not in contact
     assert scene.indenter is not None
     grid, margin = image_grid(sensor.geometry), contact_distance * scene.effective_element_size
     from_sensor = se3.relative_pose(world.pose("indenter"), world.pose("lower"))
@@ -178,33 +179,35 @@ def _contact(world: PressWorld, scene: Scene, seen: SurfaceSample, sensor: Senso
         slice(*np.searchsorted(places, (corners[:, axis].min(), corners[:, axis].max())))
         for places, axis in ((grid.y, 1), (grid.x, 0))
     )
-    gel = np.concatenate([grid.points()[rows, columns], -seen.height[rows, columns, None].astype(np.float64)], axis=-1)
-    valid = seen.valid[rows, columns]
+    gel = np.concatenate(
+        [grid.points()[rows, columns], -sample.height[rows, columns, None].astype(np.float64)], axis=-1
+    )
+    valid = sample.valid[rows, columns]
     at = se3.transform(from_sensor, gel.reshape(-1, 3))
     near = (np.abs(at) <= half).all(axis=1) & valid.ravel()
-    gaps = np.full(seen.valid.shape, np.inf)
+    gaps = np.full(sample.valid.shape, np.inf)
     if near.any():
         inner = np.full(len(at), np.inf)
-        inner[near] = _gaps(scene.indenter, at[near], scene.effective_element_size)
+        inner[near] = _indenter_distance(scene.indenter, at[near], scene.effective_element_size)
         gaps[rows, columns] = inner.reshape(valid.shape)
     table = SurfaceTable(world.surface("lower"))
     reach, _ = table.sample_on_grid(table.spline_values(world.reach().astype(np.float32)), grid)
-    return _filled(gaps < reach.reshape(gaps.shape), int(scene.effective_element_size / sensor.geometry.pixel_pitch))
+    return _fill_gaps(gaps < reach.reshape(gaps.shape), int(scene.effective_element_size / sensor.geometry.pixel_pitch))
 
 
-def _gaps(indenter: Indenter, points: FloatArray, element: float) -> FloatArray:
-    """(n,) distance of points (n, 3) from the indenter, in its frame; of a mesh, as physics has it [m]."""
+def _indenter_distance(indenter: Indenter, points: FloatArray, element: float) -> FloatArray:
+    """(n,) distance of points (n, 3) from the indenter, in its frame [m]; for a mesh, that of the physics."""
     geometry = indenter.geometry
     if not isinstance(geometry, Mesh):
         return shape_distance(geometry, points, indenter.effective_edge_radius(element))
     return cached_tiled_distance(geometry, MESH_GRID_SPACING).sample_distance(points)[0]
 
 
-def _filled(mask: NDArray[np.bool_], width: int) -> NDArray[np.bool_]:
-    """(H, W) `mask` with the gaps that are narrower than `width` pixels filled; what is convex stays as it is.
+def _fill_gaps(mask: NDArray[np.bool_], width: int) -> NDArray[np.bool_]:
+    """(H, W) `mask` with gaps narrower than `width` pixels filled; a convex mask does not change.
 
-    Behind a pressed edge the surface swings back within an element, by 10 µm from a face at elements of 0.5 mm: no
-    mesh can tell a gap from that.
+    Behind a pressed edge the surface oscillates within an element, by 10 µm from a face with elements of 0.5 mm: the
+    mesh cannot resolve a gap of that size.
     """
     if width < 2:
         return mask
@@ -216,9 +219,8 @@ def _filled(mask: NDArray[np.bool_], width: int) -> NDArray[np.bool_]:
 
 
 def press_report(scene: Scene, motion: PressMotion, pressed: PressResult, sensor: SensorModel) -> dict[str, Any]:
-    """The result as JSON, SI units. residual: None where nothing was held, so that none was measured; unfollowed: None
-    where friction was followed; edge_radius: None of a ball, which has no edges, and of a mesh, whose edges are as
-    drawn."""
+    """The result as JSON, SI units. residual: None without a hold, because none was measured. unfollowed: reason why a
+    motion does not count as settled, or None. edge_radius: None for a ball, and for a mesh, which has its own."""
     residual = max(move.residual for move in pressed.moves)
     return {
         "indenter": scene.indenter.model_dump(mode="json") if scene.indenter else None,
@@ -235,9 +237,9 @@ def press_report(scene: Scene, motion: PressMotion, pressed: PressResult, sensor
         "contact_radius": pressed.contact_radius,
         "deepest": float(pressed.height.max()),
         "pixel_pitch": sensor.geometry.pixel_pitch,
-        "unfelt": pressed.unfelt,
+        "unfelt": pressed.missed_depth_share,
         "folded": pressed.folded,
-        "unfollowed": pressed.unfollowed or None,
+        "unfollowed": pressed.unsettled_reason or None,
         "settled": all(move.settled for move in pressed.moves),
         "residual": residual if math.isfinite(residual) else None,
         "substeps": sum(move.substeps for move in pressed.moves),
@@ -245,7 +247,7 @@ def press_report(scene: Scene, motion: PressMotion, pressed: PressResult, sensor
 
 
 def _edge_radius(scene: Scene) -> float | None:
-    """Of the indenter's edges [m]; None where its geometry has none or says it."""
+    """Radius of the indenter's edges [m]; None for a geometry without edges or with its own."""
     assert scene.indenter is not None
     return (
         scene.indenter.effective_edge_radius(scene.effective_element_size)
@@ -260,7 +262,9 @@ def write(folder: Path, pressed: PressResult, config: dict[str, Any], scene: Sce
     from PIL import Image
 
     assert scene.indenter is not None
-    Image.fromarray(pressed.image).save(folder / "rgb.png", compress_level=4)  # as small as by 6, in half the time
+    Image.fromarray(pressed.image).save(
+        folder / "rgb.png", compress_level=4
+    )  # as small as with level 6, in half the time
     np.save(folder / "height.npy", pressed.height.astype(np.float32), allow_pickle=False)
     write_height_picture(folder / "height.png", pressed.height, pressed.contact, config["pixel_pitch"])
     lowest = se3.transform(pressed.pose, find_pressing_side(scene.indenter).lowest_point)[:2]

@@ -5,12 +5,12 @@ tests/robot/studies.
 """
 
 # experiment.py
-PEAK_PLACE = 0.7  # a trial goes on beyond the goal until its peak lies at this share of its curve
-FINE_STEP_SHARE = 0.25  # share of a step that is taken near the goal, so that the peak is not stepped over
-# both ends of a reward curve must lie more than this many times the distance allowed below its peak
+PEAK_PLACE = 0.7  # a trial continues beyond the goal until its peak is at this share of its curve
+FINE_STEP_SHARE = 0.25  # factor on a step near the goal, so that no step passes the peak
+# both ends of a reward curve must lie below its peak by more than this factor times the tolerance
 MIN_REWARD_FALL = 5.0
 
 # matched_press.py
-RADIUS_TOLERANCE = 0.25  # the contact is as wide as the real one when its radius differs by no more [px]
+RADIUS_TOLERANCE = 0.25  # contact radii that differ by less count as equal [px]
 MAX_DEPTH_SHARE = 0.7  # of the gel's thickness; from 0.75 the elements under the ball are crushed, at any preset
-MIN_DEPTH_MATCH = 0.97  # of the deepest press, and of a contact's radius: then it is as good as that
+MIN_DEPTH_MATCH = 0.97  # share of the maximum depth, and of a contact radius, that counts as reached

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from benchmarks.cases.press import layer
+from benchmarks.cases.press import solve_layer
 
 PITCH = 0.0625e-3  # of image and FFT grid alike [m]
 SIZE = 200  # px
@@ -23,7 +23,7 @@ def dented(
     def gap(r: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.where(r < ball, ball - np.sqrt(np.maximum(ball**2 - r**2, 0)), 1.0)
 
-    contact = layer(gap, depth, 0.48, thickness=thickness)
+    contact = solve_layer(gap, depth, 0.48, thickness=thickness)
     truth = float(np.sqrt((contact.pressure > 0).sum() / np.pi))
     by_x, by_y = np.gradient(contact.displacement, PITCH)
     x, y = (256 - round(c) for c in centre)

@@ -178,7 +178,7 @@ def test_reports_that_make_no_page_are_refused(cpu: Report, tmp_path: Path) -> N
         ([arms, gpu], "belong to one of the physics"),
         ([REFERENCE, tmp_path / "none.json"], "cannot be read: No such file"),
         ([REFERENCE, tmp_path], "cannot be read: "),
-        ([REFERENCE, tmp_path / "text.json"], "is no report of tacsim bench"),
+        ([REFERENCE, tmp_path / "text.json"], "is not a report of tacsim bench"),
     ):
         result = tacsim("bench", *(word for file in files for word in ("--from", file)), "--docs", docs)
         assert result.exit_code == 2, result.output

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.cases.squeeze import close, squeeze_scene, world_in_contact
+from benchmarks.cases.squeeze import close_sensors, squeeze_scene, world_in_contact
 from benchmarks.truth.gap import gaps
 from tacsim.physics.world import World
 
@@ -15,7 +15,7 @@ UM = 1e-6
 @pytest.fixture(scope="module")
 def squeezed() -> World:
     world = world_in_contact(squeeze_scene("draft"))
-    close(world, 1e-3)
+    close_sensors(world, 1e-3)
     return world
 
 

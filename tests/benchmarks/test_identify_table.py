@@ -17,7 +17,7 @@ ROW = identify.Row(
 )  # fmt: skip
 LINE = (
     "| body 3 | 2 | 88 | 795 s | stiffness -0.4 % (-6 to +5; 50 of 50); friction below +20.0 % (+10 to +30, MISSES; "
-    "3 of 50); friction above not told | drift | nothing wrong 0, drift of 0.2 N 49 of 50 |"
+    "3 of 50); friction above not identified | drift | nothing wrong 0, drift of 0.2 N 49 of 50 |"
 )
 
 

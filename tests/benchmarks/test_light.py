@@ -199,5 +199,5 @@ def test_presses_of_our_gel_beside_the_same_made_up_ones(
     assert rows["surfaces: rho, gradient"].error < 1
     assert rows["surfaces: rho, gradient"].figures["presses"] == 6
     monkeypatch.setattr(invariance, "MIN_PRESSES", 10)
-    with pytest.raises(BadData, match="6 presses; 10 are the least"):
+    with pytest.raises(BadData, match="6 presses; at least 10 are needed"):
         invariance.invariance(folder, hidden, (21e-3, 16e-3, 8e-3), 1)

@@ -16,7 +16,7 @@ from pydantic import ValidationError
 from benchmarks.cases.press import layer_press
 from benchmarks.cases.registry import CASES, description, select_cases
 from benchmarks.harness import cache, measure
-from benchmarks.harness.measure import Measurement, Timing, forget_peak_memory, peak_memory, timed
+from benchmarks.harness.measure import Measurement, Timing, peak_memory, reset_peak_memory, timed
 from benchmarks.harness.runner import NOT_MEASURED, Case, run_cases
 from benchmarks.harness.schema import GROUPS, Group, Report, Row, json_schema
 
@@ -49,13 +49,13 @@ def test_median_and_spread() -> None:
 
 @pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="only Linux forgets a peak")
 def test_peak_memory_sees_a_large_array_that_is_gone_until_it_is_forgotten() -> None:
-    forget_peak_memory()
+    reset_peak_memory()
     before = peak_memory()
     block = bytearray(100_000_000)
     block[::4096] = b"x" * len(block[::4096])
     del block
     assert peak_memory() > before + 50
-    forget_peak_memory()
+    reset_peak_memory()
     assert peak_memory() < before + 50
 
 

@@ -11,7 +11,7 @@ from benchmarks.pages import oracles as page
 
 def test_a_ball_is_beside_its_oracle(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(oracles.truth, "BALLS", {(4.0, 1.0): oracles.truth.BALLS[4.0, 1.0]})
-    monkeypatch.setattr(oracles.truth, "RUBBED_BALL", {})
+    monkeypatch.setattr(oracles.truth, "BALL_WITH_FRICTION", {})
     force, contact = oracles.balls("draft", 1)
     assert force.figures["truth_n"] == 0.9497
     assert force.figures["found_n"] == pytest.approx(0.9497, rel=0.03)

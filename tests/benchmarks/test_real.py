@@ -82,14 +82,14 @@ def test_what_is_missing_is_named(folder_of_frames: Folder) -> None:
     (folder / FRAME.parent.parent / "copy").mkdir()
     twin = folder / FRAME.parent.parent / "copy" / FRAME.name
     twin.write_bytes((folder / FRAME).read_bytes())
-    with pytest.raises(BadData, match="is there twice"):
+    with pytest.raises(BadData, match="exists twice"):
         read_frames(folder, labels)
     twin.unlink()
 
     (folder / "deep" / "empty.png").unlink()
     with pytest.raises(BadData, match=r"no frame without contact; looked for none\.png, \.\./empty\.png"):
         read_frames(folder, labels)
-    with pytest.raises(BadData, match="is no folder"):
+    with pytest.raises(BadData, match="is not a folder"):
         read_labels(folder / "elsewhere")
 
 
@@ -126,7 +126,7 @@ def test_a_frame_without_a_dent_is_named(folder_of_frames: Folder) -> None:
 def test_wrong_words_on_the_command_line(folder_of_frames: Folder, tmp_path: Path) -> None:
     for words, said in (
         (("real",), "--data DIR"),
-        (("press", "--data", tmp_path), "looks at no real frames"),
+        (("press", "--data", tmp_path), "uses no real frames"),
         (("real", "--data", tmp_path / "none"), "is no folder"),
         (("real", "--data", folder_of_frames[0] / "deep"), "holds them"),  # labels missing there
     ):

@@ -7,7 +7,7 @@ import math
 import pytest
 
 from benchmarks.cases import large_strain, scenes, slide, squeeze
-from benchmarks.cases.squeeze import close, squeeze_scene, world_in_contact
+from benchmarks.cases.squeeze import close_sensors, squeeze_scene, world_in_contact
 from tacsim.interface import Pose
 from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.physics.worlds.batch import Batch
@@ -73,11 +73,11 @@ def test_an_indenter_costs_and_presses(shape: object) -> None:
 @pytest.mark.deep
 def test_a_sheared_body_rests_where_it_is() -> None:
     world = world_in_contact(squeeze_scene("draft"))
-    close(world, 0.3e-3)
+    close_sensors(world, 0.3e-3)
     pose = world.pose("upper")
     world.move({"upper": Pose(pose.position + [0.2e-3, 0, 0], pose.quaternion)})
     before = world.truth()
-    stats = large_strain._rest(world, "draft", 60)
+    stats = large_strain._hold_still(world, "draft", 60)
     after = world.truth()
     assert stats.substeps == 60 and not stats.settled
     assert before is not None and after is not None

@@ -31,7 +31,7 @@ def target(name: str) -> Target:
 
 def judged(name: str, rows: list[Row]) -> tuple[float | None, Verdict]:
     value = target(name).find(rows)
-    return value, target(name).judge(value)
+    return value, target(name).evaluate(value)
 
 
 def test_met_missed_and_in_between() -> None:

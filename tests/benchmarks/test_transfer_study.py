@@ -22,7 +22,7 @@ def folder(tmp_path: Path) -> Path:
     return found
 
 
-@pytest.mark.parametrize("sight", transfer.SIGHTS)
+@pytest.mark.parametrize("sight", transfer.VIEWS)
 def test_cells_differ_in_their_materials_alone(sight: str, folder: Path) -> None:
     guessed, identified, drawn = (transfer.training(sight, each, folder) for each in transfer.MATERIALS)
     assert guessed.randomise is not None and drawn.randomise is not None

@@ -118,7 +118,7 @@ def test_mixed_sizes_empty_folders_and_other_files_are_refused(real: FrameSet, t
 
 def test_a_reference_alone_or_of_another_size_is_refused(real: FrameSet, tmp_path: Path) -> None:
     folder = save(replace(real, frames=()), tmp_path / "real")
-    with pytest.raises(BadFrames, match="no frame beside the one without contact"):
+    with pytest.raises(BadFrames, match="no frame except the one without contact"):
         read_frame_set(folder)
     pressed = save(replace(real, untouched=()), tmp_path / "pressed")
     Image.fromarray(real.reference[:150]).save(tmp_path / "small.png")

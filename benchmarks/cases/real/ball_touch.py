@@ -1,4 +1,4 @@
-"""Real group: where a sensor sits on its arm, from made-up touches of a ball with hidden truth; no frame is needed."""
+"""Real group: pose of a sensor on its arm, from synthetic touches of a ball with known truth; no frame is needed."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from tacsim.interface import Pose
 CASE = "touch_ball"
 BALL = 4e-3  # radius [m]
 TILT = np.radians(25.0)  # standard deviation
-SETS = 60  # of touches: the ratio is one of root mean squares
+SETS = 60  # of touches, for the root mean squares of the ratio
 
 
 def touch_ball(touches: int, repeat: int) -> list[Measurement]:
-    """Touches of one fixed ball from many tilts, with the noise that the fit weighs by."""
+    """Touches of one fixed ball at many tilts, with the noise that weights the fit."""
     from scipy.spatial.transform import Rotation
 
     from calibration.poses.ball_touch import BallTouch, TouchNoise, fit_touches

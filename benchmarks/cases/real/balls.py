@@ -1,8 +1,8 @@
-"""Real group: presses of a ball on a real sensor, predicted by a calibration that has not seen them; and the labels of
-such sets.
+"""Real group: presses of a ball on a real sensor, predicted by a calibration from other presses; and the labels of such
+sets.
 
-A folder of frames may carry its own labels, `balls.yaml`; without, those of public sets are taken
-(`references/balls.yaml`). Nothing but ball radius and pixel pitch is told: circles, skirt and light are found.
+A folder of frames may have its own labels, `balls.yaml`; otherwise those of public sets apply
+(`references/balls.yaml`). The labels give only ball radius and pixel pitch: circles, skirt and light are fitted.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from calibration.light.fit import LightFit
 CASE = "ball_presses"
 OWN = "balls.yaml"
 SHIPPED = Path(__file__).parents[2] / "references" / OWN
-MIN_PRESSES = 3  # presses
-LARGEST = 1 << 30  # [bytes] of an archive
+MIN_PRESSES = 3
+MAX_ARCHIVE_BYTES = 1 << 30  # size of an archive [bytes]
 
 Frames = tuple[tuple[str, Image], ...]
 
@@ -40,15 +40,14 @@ class BallSet(Config):
 
     name: str
     source: str = ""
-    frames: tuple[str, ...] = ()  # patterns below the user's folder; the first that finds any counts
-    backgrounds: tuple[str, ...] = ()  # seen from the folder of the frames; the first that exists counts
+    frames: tuple[str, ...] = ()  # patterns below the user's folder; the first with matches is used
+    backgrounds: tuple[str, ...] = ()  # relative to the folder of the frames; the first that exists is used
     archive: tuple[str, ...] = ()  # or an .npz with `images` (n, H, W, 3) and `background` (H, W, 3), uint8
-    circles: str = (
-        ""  # a table beside the frames, a heading, then name, x, y, radius [px] of the clicked contacts; of an
-    )
-    # archive, `contact_centre_px` (n, 2) and `contact_radius_px` (n,) are taken
-    blue_first: bool = False  # of an archive: its colours stand as B, G, R
-    dots: bool = False  # are printed on the gel: painted over in all pictures
+    # a table next to the frames: a heading, then name, x, y, radius [px] of the clicked contacts; an archive has
+    # `contact_centre_px` (n, 2) and `contact_radius_px` (n,) instead
+    circles: str = ""
+    blue_first: bool = False  # of an archive: its channels are B, G, R
+    dots: bool = False  # are printed on the gel: removed from all pictures
     ball_radius: Positive  # [m]
     pixel_pitch: Positive  # [m]
 
@@ -62,26 +61,26 @@ class BallSet(Config):
 
     @property
     def wanted(self) -> str:
-        """What is looked for, in words."""
+        """The file patterns, as text."""
         return " or ".join(self.frames or self.archive)
 
 
 class BallSets(Config):
-    """What a labels file holds."""
+    """The content of a labels file."""
 
     sets: Annotated[tuple[BallSet, ...], Field(min_length=1)]
 
 
 def read_sets(folder: Path) -> tuple[BallSet, ...]:
-    """The sets that hold for `folder`. Raises ConfigError for labels with mistakes."""
+    """The sets that apply to `folder`. Raises ConfigError for labels with errors."""
     from tacsim.config import load_model
 
     own = folder / OWN
     return load_model(BallSets, own if own.is_file() else SHIPPED).sets
 
 
-def is_there(folder: Path, of: BallSet) -> bool:
-    """True where `folder` holds frames of the set."""
+def has_frames(folder: Path, of: BallSet) -> bool:
+    """True if `folder` has frames of the set."""
     return any(next(folder.rglob(pattern), None) is not None for pattern in of.frames or of.archive)
 
 
@@ -90,14 +89,14 @@ def read_balls(folder: Path, of: BallSet) -> tuple[Image, Frames]:
     BadData."""
     reference, frames = _of_archive(folder, of) if of.archive else _of_pictures(folder, of)
     if len(frames) < MIN_PRESSES:
-        raise BadData(f"{of.name}: {len(frames)} presses; to leave one out, {MIN_PRESSES} are the least")
+        raise BadData(f"{of.name}: {len(frames)} presses; at least {MIN_PRESSES} are needed to leave one out")
     return _without_dots(of, reference, frames) if of.dots else (reference, frames)
 
 
 @lru_cache(maxsize=4)
 def calibrated(folder: Path, of: BallSet) -> tuple[LightFit, float, float]:
-    """The calibration by all presses of a set, and the wall and processor time it took [s], leaving out included.
-    Raises BadData."""
+    """The calibration by all presses of a set, and its wall and processor time [s], with the predictions of left-out
+    presses. Raises BadData."""
     from calibration.errors import BadFrames
     from calibration.light.calibrator import calibrate_light
 
@@ -111,15 +110,15 @@ def calibrated(folder: Path, of: BallSet) -> tuple[LightFit, float, float]:
 
 
 def ball_presses(folder: Path, of: BallSet, repeat: int) -> list[Measurement]:
-    """Each press of a ball predicted from all others: picture and normals. Seconds: to calibrate, leaving out too."""
+    """Each press of a ball predicted from all others: picture and normals. Seconds: of calibration and predictions."""
     fit, wall, cpu = calibrated(folder, of)
     if not fit.predictions:
-        raise BadData(f"{of.name}: one press alone can be used; the others: {fit.left_out}")
-    predictions, left = fit.predictions, f"{len(fit.left_out)} frames left out" if fit.left_out else ""
+        raise BadData(f"{of.name}: only one press can be used; the others: {fit.left_out}")
+    predictions, note = fit.predictions, f"{len(fit.left_out)} frames left out" if fit.left_out else ""
     timing = Timing((wall,), cpu)
     figures = {
-        "ncc": _mean(predictions, "correlation"),
-        "null_grey": _mean(predictions, "null_error"),
+        "ncc": _mean_of(predictions, "correlation"),
+        "null_grey": _mean_of(predictions, "null_error"),
         **_interval("grey", [prediction.error for prediction in predictions]),
         "presses": float(len(predictions)),
         "left_out": float(len(fit.left_out)),
@@ -127,38 +126,39 @@ def ball_presses(folder: Path, of: BallSet, repeat: int) -> list[Measurement]:
         "steepest": fit.forward.steepest if fit.forward else 0.0,
     }
     picture = Measurement(
-        timing, _mean(predictions, "error"), "grey", "the real frame where r < 1.5 contact radii, its drift removed; "
-        "light by all other presses, circles and skirt by all", f"{of.name}: picture", None, figures, left,
+        timing, _mean_of(predictions, "error"), "grey",
+        "the real frame where r < 1.5 contact radii, its drift removed; "
+        "light by all other presses, circles and skirt by all", f"{of.name}: picture", None, figures, note,
     )  # fmt: skip
     flat = [float(np.degrees(np.arctan(_usual_slope(prediction, of)))) for prediction in predictions]
     figures = {
         "null_deg": float(np.mean(flat)),
         **_interval("deg", [prediction.angle for prediction in predictions]),
-        "untouched_deg": _mean(predictions, "untouched_angle"),
+        "untouched_deg": _mean_of(predictions, "untouched_angle"),
     }
     normals = Measurement(
-        timing, _mean(predictions, "angle"), "deg", "normals of ball and skirt inside the contact circle",
-        f"{of.name}: normals", None, figures, left,
+        timing, _mean_of(predictions, "angle"), "deg", "normals of ball and skirt inside the contact circle",
+        f"{of.name}: normals", None, figures, note,
     )  # fmt: skip
     return [picture, normals]
 
 
 def cases(folder: Path) -> tuple[Case, ...]:
-    """A case a set, all but the first long; one whose frames are not there says so. Raises ConfigError."""
+    """A case for each set, all but the first long; sets without frames are marked as missing. Raises ConfigError."""
     sets = read_sets(folder)
-    there = [of for of in sets if is_there(folder, of)]
+    available = [of for of in sets if has_frames(folder, of)]
     return tuple(
         Case(
             "real", CASE, "tacsim", f"{of.pixel_pitch * 1e3:.3g} mm a pixel", partial(ball_presses, folder, of),
             cpu=True,
-            long=of in there[1:],
-            missing="" if of in there else f"{of.name}: no {of.wanted} below {folder}",
+            long=of in available[1:],
+            missing="" if of in available else f"{of.name}: no {of.wanted} below {folder}",
         )
         for of in sets
     )  # fmt: skip
 
 
-def _mean(predictions: Sequence[PressPrediction], what: str) -> float:
+def _mean_of(predictions: Sequence[PressPrediction], what: str) -> float:
     return float(np.mean([getattr(prediction, what) for prediction in predictions]))
 
 
@@ -171,7 +171,7 @@ def _interval(unit: str, values: Sequence[float]) -> dict[str, float]:
 
 
 def _usual_slope(prediction: PressPrediction, of: BallSet) -> float:
-    """Slope of the ball half-way between the middle and the rim, by area: what a flat guess misses."""
+    """Slope of the ball half-way between centre and rim, by area: the error of a flat surface."""
     ball, r = of.ball_radius / of.pixel_pitch, prediction.circle.radius / np.sqrt(2)
     return float(r / np.sqrt(ball**2 - r**2))
 
@@ -195,7 +195,7 @@ def _of_pictures(folder: Path, of: BallSet) -> tuple[Image, Frames]:
     if not paths:
         raise BadData(f"{folder} and the folders below it hold no {of.wanted}")
     if len(homes) > 1:
-        raise BadData(f"{of.name} is there twice: {' and '.join(map(str, sorted(homes)))}. Name the one that is meant")
+        raise BadData(f"{of.name} exists twice: {' and '.join(map(str, sorted(homes)))}. Name one of them")
     home = homes.pop()
     background = next((path for name in of.backgrounds if (path := home / name).is_file()), None)
     if background is None:
@@ -208,8 +208,8 @@ def _of_archive(folder: Path, of: BallSet) -> tuple[Image, Frames]:
     if path is None:
         raise BadData(f"{folder} and the folders below it hold no {of.wanted}")
     try:
-        if path.stat().st_size > LARGEST:
-            raise BadData(f"{path} is larger than {LARGEST >> 30} GiB")
+        if path.stat().st_size > MAX_ARCHIVE_BYTES:
+            raise BadData(f"{path} is larger than {MAX_ARCHIVE_BYTES >> 30} GiB")
         with np.load(path, allow_pickle=False) as archive:
             images, reference = archive["images"], archive["background"]
     except (OSError, ValueError, KeyError) as error:

@@ -1,7 +1,7 @@
-"""Left-out presses in the mask of the literature: inside circles that a person clicked, which took no part in any fit.
+"""Left-out presses in the mask of the literature: inside circles clicked by hand, which no fit uses.
 
-The circle of a left-out press is the clicked one, moved and scaled as those of the other presses ask for; light and
-thickness of the gel are theirs, too. So nothing of the press that is scored is known but where somebody saw it.
+The circle of a left-out press is the clicked one, moved and scaled by the median correction of the other presses. Light
+and thickness of the gel are also those of the other presses. So the scored press contributes only its clicked circle.
 """
 
 from __future__ import annotations
@@ -26,14 +26,13 @@ from calibration.light.tuning import FORWARD_BLUR, MAX_RIM_RATIO, RIM_BLUR
 from tacsim.models.photometric import PhotometricLight, image_grid_places
 
 FOLDS = 5
-WIDEST = (
-    0.95 * MAX_RIM_RATIO
-)  # contact radius over ball radius; clicked circles reach into the skirt, some beyond the ball
+# contact radius over ball radius; clicked circles contain a part of the skirt, some are larger than the ball
+MAX_RADIUS_RATIO = 0.95 * MAX_RIM_RATIO
 
 
 def clicked_errors(folder: Path, of: BallSet) -> list[float]:
-    """Mean |error| of each left-out press inside its clicked circle [grey levels]; one that no calibration would take
-    there (saturated, a second contact) is missing. Raises BadData."""
+    """Mean |error| of each left-out press inside its clicked circle [grey levels], without presses that a calibration
+    rejects there (saturated, a second contact). Raises BadData."""
     reference, frames = balls.read_balls(folder, of)
     clicked, ball, found = read_circles(folder, of), of.ball_radius / of.pixel_pitch, []
     missing = [name for name, _ in frames if name not in clicked]
@@ -51,19 +50,19 @@ def clicked_errors(folder: Path, of: BallSet) -> list[float]:
                 press = make_press(name, image, reference, mean_reference_colour(reference), circle)
             except BadFrames:
                 continue
-            found.append(_error(press, clicked[name], fit, ball))
+            found.append(_mask_error(press, clicked[name], fit, ball))
     return found
 
 
 def corrected(circle: ContactCircle, fit: LightFit, clicked: Mapping[str, ContactCircle], ball: float) -> ContactCircle:
-    """A clicked circle moved and scaled by what the presses of `fit` were, in the median."""
+    """A clicked circle, moved and scaled by the median correction of the presses of `fit`."""
     pairs = [(press.circle, clicked[press.name]) for press in fit.presses]
     x, y = (float(np.median([getattr(a, axis) - getattr(b, axis) for a, b in pairs])) for axis in "xy")
-    scale = float(np.median([found.radius / seen.radius for found, seen in pairs]))
-    return ContactCircle(circle.x + x, circle.y + y, min(circle.radius * scale, WIDEST * ball))
+    scale = float(np.median([found.radius / drawn.radius for found, drawn in pairs]))
+    return ContactCircle(circle.x + x, circle.y + y, min(circle.radius * scale, MAX_RADIUS_RATIO * ball))
 
 
-def _error(press: BallPress, inside: ContactCircle, fit: LightFit, ball: float) -> float:
+def _mask_error(press: BallPress, inside: ContactCircle, fit: LightFit, ball: float) -> float:
     assert fit.forward is not None
     rows, columns = press.shape
     mean = mean_reference_colour(fit.reference)
@@ -87,8 +86,8 @@ def has_circles(of: BallSet) -> bool:
 
 
 def read_circles(folder: Path, of: BallSet) -> dict[str, ContactCircle]:
-    """The clicked circle of each frame [px]: of a table beside the frames, whose first columns are name, x, y, radius,
-    or of the archive. Raises BadData."""
+    """The clicked circle of each frame [px], from a table next to the frames, whose first columns are name, x, y,
+    radius, or from the archive. Raises BadData."""
     try:
         if of.archive:
             with np.load(next(path for name in of.archive for path in folder.rglob(name)), allow_pickle=False) as found:

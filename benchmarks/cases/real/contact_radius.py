@@ -1,8 +1,8 @@
-"""Real group: contact radius of balls on a real sensor against the simulated gel; the user brings the frames.
+"""Real group: contact radius of balls on a real sensor against the simulated gel, with frames of the user.
 
-Two comparisons a press. `image`: the real frame against our rendered one, the circle found in both by the same fit
-(`calibration/light/circle.py`). `pressure`: the radius of the simulated contact itself, against the radius that the
-labels give.
+Two comparisons for each press. `image`: the real frame against our rendered one, with circles by the same fit
+(`calibration/light/circle.py`). `pressure`: the radius of the simulated contact itself, against the radius in the
+labels.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.cases.press import layer, press
+from benchmarks.cases.press import press, solve_layer
 from benchmarks.cases.real.labels import BadData, PressLabels, read_frames, read_labels
 from benchmarks.harness.measure import Measurement, timed
 from benchmarks.harness.runner import Case
@@ -29,14 +29,14 @@ CASE = "contact_radius"
 
 
 def contact_radius(folder: Path, ball: float, thickness: float, element: float, repeat: int) -> list[Measurement]:
-    """Balls pressed to the depths of real presses: radius of the contact, ours against the real one."""
+    """Balls pressed to the depths of real presses: contact radius, simulated against real."""
     labels = read_labels(folder)
     background, frames = read_frames(folder, labels)
     scene = ball_scene((*labels.gel_size, thickness), ball, element)
     press(ball_scene((*labels.gel_size, 2e-3), ball, 1e-3), 0.05e-3)  # compiles
     world = make_world(scene)
     camera = RenderedSensor(labels, background)
-    before = camera.see(world)
+    before = camera.render_image(world)
     rows = []
     for at in sorted((p for p in labels.presses if p.ball_radius == ball), key=lambda p: p.depth):
         timing, stats = timed(partial(press_to, world, ball, at.depth), 1, warm=lambda: None)
@@ -52,7 +52,7 @@ def contact_radius(folder: Path, ball: float, thickness: float, element: float, 
         note = "" if stats.settled else "not settled"
         if at in frames:
             real = camera.radius(frames[at], background, ball, f"the real frame of {at.name}")
-            ours = camera.radius(camera.see(world), before, ball, f"our image of {at.name}")
+            ours = camera.radius(camera.render_image(world), before, ball, f"our image of {at.name}")
             figures |= {"real_px": real, "image_px": ours}
             rows.append(
                 Measurement(
@@ -71,7 +71,7 @@ def contact_radius(folder: Path, ball: float, thickness: float, element: float, 
 
 
 def ball_scene(gel_size: tuple[float, float, float], ball: float, element: float) -> Scene:
-    """The default gel in this size, under a ball [m]."""
+    """The default gel with another size, under a ball [m]."""
     return Scene(
         body=None,
         indenter=Indenter(geometry=Sphere(radius=ball)),
@@ -90,8 +90,8 @@ def press_to(world: World, ball: float, depth: float) -> MoveStats:
 def pressed_radius(world: World) -> float:
     """Radius of a ball's contact [m]: that of the Hertz pressure with the same second moment, a^2 = 5/2 <r^2>.
 
-    r is taken where the surface has moved to. Single points of the quadrature may lift off within the contact, so
-    their area is no measure. Against the FFT layer's area the moment is 0.3 px of 0.06 mm off at most, 1 mm deep.
+    r is that of the deformed surface. The area is no good measure, because single quadrature points may lose contact
+    inside it. The radius differs from that of the FFT layer's area by at most 0.3 px of 0.06 mm, at 1 mm depth.
     """
     from tacsim.optics.spline import displacement_and_jacobian
 
@@ -112,13 +112,13 @@ def pressed_radius(world: World) -> float:
 
 
 def theories(ball: float, depth: float, thickness: float) -> dict[str, float]:
-    """Contact radius [m] by others: the cap cut off a ball by the rest plane (images made from a depth map), Hertz on a
-    half-space, and the FFT layer."""
+    """Contact radius [m] by other methods: the cap of a ball below the rest plane (images made from a depth map), Hertz
+    on a half-space, and the FFT layer."""
 
     def gap(r: FloatArray) -> FloatArray:
         return np.where(r < ball, ball - np.sqrt(np.maximum(ball**2 - r**2, 0.0)), 1.0)
 
-    contact = layer(gap, depth, GelMaterial().poisson_ratio, LAYER_PIXELS, thickness)
+    contact = solve_layer(gap, depth, GelMaterial().poisson_ratio, LAYER_PIXELS, thickness)
     return {
         "cap": float(np.sqrt(2 * ball * depth - depth**2)),
         "hertz": float(np.sqrt(ball * depth)),
@@ -127,7 +127,7 @@ def theories(ball: float, depth: float, thickness: float) -> dict[str, float]:
 
 
 class RenderedSensor:
-    """Our image of the gel, with as many pixels and the same pitch as the real one, and circles in such images."""
+    """Renders the gel with the size and pixel pitch of the real image, and finds circles in such images."""
 
     def __init__(self, labels: PressLabels, like: Image) -> None:
         from tacsim.models.sensor import SensorGeometry, SensorModel
@@ -138,11 +138,11 @@ class RenderedSensor:
         self._pitch = labels.pixel_pitch
         self._render = Renderer(SensorModel(geometry=geometry), labels.gel_size)
 
-    def see(self, world: World) -> Image:
+    def render_image(self, world: World) -> Image:
         return self._render(world.surface("lower"))
 
     def radius(self, image: Image, background: Image, ball: float, what: str) -> float:
-        """[px]. Raises BadData that says which image shows no contact."""
+        """Contact radius [px]. Raises BadData that names the image without contact."""
         try:
             return find_contact_circle(image, background, ball / self._pitch).radius
         except NoCircle as error:
@@ -152,7 +152,7 @@ class RenderedSensor:
 def cases(folder: Path) -> tuple[Case, ...]:
     """A case for each ball and gel. Raises BadData, ConfigError."""
     labels = read_labels(folder)
-    read_frames(folder, labels)  # all mistakes before the first press
+    read_frames(folder, labels)  # raises errors before the first press
     return tuple(
         Case(
             "real", CASE, "tacsim", f"ball R {ball * 1e3:g} mm, gel {thickness * 1e3:g} mm, h {ELEMENT * 1e3:g} mm",

@@ -1,5 +1,5 @@
-"""Real group: what a calibrated picture and an observation cost. No real frame is needed: weights of any value take as
-long, and the surface is that of our own press.
+"""Real group: cost of a calibrated picture and of an observation. No real frame is needed: the time does not depend on
+the weights, and the surface is that of a simulated press.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ if TYPE_CHECKING:
     from calibration.bundle import Calibration
 
 RENDER, NORMALISE = "calibrated_render", "normaliser"
-DEGREE, POSITION = 5, 2  # the largest model that a calibration chooses
-MIN_REPETITIONS = 25  # repetitions: a median of milliseconds needs more than a press
-VIEW = (20e-3, 15e-3)  # of the gel, by the pictures of both sizes [m]
+DEGREE, POSITION = 5, 2  # of the largest model that a calibration selects
+MIN_REPETITIONS = 25  # for a median of a few milliseconds
+VIEW = (20e-3, 15e-3)  # size of the gel in the pictures of both sizes [m]
 BALL, DEPTH = 4e-3, 1e-3  # [m]
 
 
 def made_up(width: int) -> Calibration:
-    """A calibration of the largest order for pictures of width x 3/4 width; its light is made up."""
+    """A calibration of the largest order for pictures of width x 3/4 width, with random light."""
     from calibration.bundle import Calibration, Provenance
     from calibration.height.slope_polynomial import InverseModel, fit_inverse, inverse_features, normal_of_slope
     from tacsim.models.photometric import PhotometricLight
@@ -70,8 +70,8 @@ def made_up(width: int) -> Calibration:
 
 
 def calibrated_render(width: int, repeat: int) -> list[Measurement]:
-    """A picture of our gel under a ball, by the largest model that a calibration chooses; of a surface not seen before,
-    as after each step."""
+    """A picture of our gel under a ball, by the largest model that a calibration selects, for a new surface, as after
+    each step."""
     import cv2
 
     from calibration.light.photometry import photometric_features
@@ -86,7 +86,7 @@ def calibrated_render(width: int, repeat: int) -> list[Measurement]:
     surface = world.surface("lower")
     model = SensorModel(geometry=calibration.geometry, photometric=forward, texture=0.0)
     render = Renderer(model, (20e-3, 20e-3))
-    # each a thousandth of a micrometre another: what is kept of the last surface is of no use
+    # each differs by 0.001 µm, so that the cache of the last surface is not used
     others = (replace(surface, displacement=surface.displacement * np.float32(1 + 1e-6 * k)) for k in count(1))
     timing, _ = timed(lambda: render(next(others)), max(repeat, MIN_REPETITIONS))
     image = render(surface)
@@ -111,7 +111,7 @@ def calibrated_render(width: int, repeat: int) -> list[Measurement]:
 
 
 def normaliser(repeat: int) -> list[Measurement]:
-    """A frame of 320 x 240 to an observation with height and gradient, found in the picture."""
+    """A frame of 320 x 240 to an observation with height and gradient from the picture."""
     from calibration.normaliser import normaliser_for_calibration
     from tacsim.optics.render import Renderer
     from tacsim.optics.surface import surface_map
@@ -125,10 +125,10 @@ def normaliser(repeat: int) -> list[Measurement]:
     flat = replace(surface, displacement=np.zeros_like(surface.displacement))
     normalise.take_reference(TactileFrame(render(flat), time=0.0, index=0))
     frame = TactileFrame(render(surface), time=0.0, index=0)
-    timing, seen = timed(partial(normalise, frame, 0.0), max(repeat, MIN_REPETITIONS))
+    timing, observation = timed(partial(normalise, frame, 0.0), max(repeat, MIN_REPETITIONS))
     truth = surface_map(surface, grid, None).height
-    assert seen.height is not None
-    error = float(np.sqrt(np.mean((seen.height - truth)[truth > 0.1 * DEPTH] ** 2))) / DEPTH * 100.0
+    assert observation.height is not None
+    error = float(np.sqrt(np.mean((observation.height - truth)[truth > 0.1 * DEPTH] ** 2))) / DEPTH * 100.0
     return [
         Measurement(
             timing, error, "% of depth", "the height that the simulation knows, rms where it is pressed", "320 x 240",

@@ -1,8 +1,8 @@
-"""Real group: the dots of a real gel, followed through a film of a press, and the noise of its camera; the user brings
-the film.
+"""Real group: tracking of the dots of a real gel in a film of a press, and the noise of its camera, with films of the
+user.
 
-What is followed is found in the first frame, which shows no contact, by nothing but that frame; the labels only say how
-many dots a person counts there.
+The dots are found in the first frame, without contact, from that frame alone. The labels only give the number of dots
+that were counted there by hand.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from tacsim.record.episode import EpisodeError
 CASE = "marker_film"
 OWN = "films.yaml"
 SHIPPED = Path(__file__).parents[2] / "references" / OWN
-STILL = 3.0  # a frame that differs less from the first, in the mean, shows the gel at rest [grey levels]
-REST_FRAMES = 8  # that tell the camera's noise
-MOST_FRAMES = 2000
+STILL = 3.0  # largest mean difference from the first frame of a gel at rest [grey levels]
+REST_FRAMES = 8  # for the camera's noise
+MAX_FRAMES = 2000
 
 
 class Film(Config):
@@ -50,8 +50,8 @@ class Films(Config):
 
 
 def read_films(folder: Path) -> dict[Film, Path]:
-    """The films that lie below `folder`, by its own labels or the shipped ones. Raises ConfigError for labels with
-    mistakes, BadData for a film that its own labels name and that is not there."""
+    """The films below `folder`, by its own labels or the shipped ones. Raises ConfigError for labels with errors,
+    BadData for a missing film that its own labels name."""
     from tacsim.config import load_model
 
     own = folder / OWN
@@ -68,14 +68,14 @@ def read_films(folder: Path) -> dict[Film, Path]:
 
 
 def marker_film(film: Film, path: Path, repeat: int) -> list[Measurement]:
-    """Dots followed through a real press: how many are kept, how still they are at rest, and the time of a frame."""
+    """Dots tracked through a real press: share tracked to the end, jitter at rest, and the time of a frame."""
     from calibration.light.noise import NoiseUnknown, measure_noise
     from calibration.markers.dots import DotFinder
     from calibration.markers.flow import find_markers
     from calibration.markers.lattice import NoLattice, median_pitch
     from calibration.markers.tracker import DotTracker
 
-    frames = _frames(path)
+    frames = _read_film(path)
     first = next(frames, None)
     if first is None:
         raise BadData(f"{path}: a film without frames")
@@ -87,17 +87,17 @@ def marker_film(film: Film, path: Path, repeat: int) -> list[Measurement]:
     rest = find(first).centres
     tracker = DotTracker(rest, median_pitch(rest))
     samples, processor, still, moved = [], [], [], np.zeros_like(rest)
-    seen = np.ones(len(rest), dtype=np.bool_)
-    always, fewest, out = seen.copy(), len(rest), np.zeros_like(seen)
+    always = np.ones(len(rest), dtype=np.bool_)
+    fewest, out = len(rest), np.zeros_like(always)
     resting, at_rest = True, [first]
-    for image in islice(frames, MOST_FRAMES):
+    for image in islice(frames, MAX_FRAMES):
         wall, cpu = perf_counter(), process_time()
         tracked = tracker(find(image).centres)
         samples.append(perf_counter() - wall)
         processor.append(process_time() - cpu)
         always &= tracked.visible
         fewest = min(fewest, int(tracked.visible.sum()))
-        out |= ~tracked.visible & _cut(rest + tracked.displacement, radius, image)
+        out |= ~tracked.visible & _is_cut(rest + tracked.displacement, radius, image)
         moved = np.where(np.abs(tracked.displacement) > np.abs(moved), tracked.displacement, moved)
         resting = resting and float(np.abs(image.astype(np.float32) - first).mean()) < STILL
         if resting:
@@ -105,12 +105,12 @@ def marker_film(film: Film, path: Path, repeat: int) -> list[Measurement]:
             at_rest = [*at_rest, image][:REST_FRAMES]
     if not samples:
         raise BadData(f"{path}: a film of a single frame")
-    kept = int(always.sum())
+    tracked_dots = int(always.sum())
     figures = {
         "dots": float(len(rest)),
-        "kept_percent": 100.0 * kept / film.dots,
+        "kept_percent": 100.0 * tracked_dots / film.dots,
         "worst_frame_percent": 100.0 * fewest / film.dots,
-        "kept_in_picture_percent": 100.0 * kept / max(1, len(rest) - int((out & ~always).sum())),
+        "kept_in_picture_percent": 100.0 * tracked_dots / max(1, len(rest) - int((out & ~always).sum())),
         "motion_px": float(np.linalg.norm(moved, axis=1).max()),
         "radius_px": radius,
         "frames": len(samples) + 1.0,
@@ -124,19 +124,19 @@ def marker_film(film: Film, path: Path, repeat: int) -> list[Measurement]:
     timing = Timing(tuple(samples), float(np.median(processor)))
     left = int((out & ~always).sum())
     note = f"{left} dots leave the picture" if left else ""
-    lost = 100.0 * (1.0 - kept / film.dots)
+    lost = 100.0 * (1.0 - tracked_dots / film.dots)
     against = f"{film.dots} dots counted in the first frame"
     return [Measurement(timing, max(0.0, lost), "% lost", against, film.name, None, figures, note)]
 
 
-def _cut(places: NDArray[np.float64], radius: float, image: Image) -> NDArray[np.bool_]:
-    """(n,) dots at `places` (n, 2) are not whole in the picture."""
+def _is_cut(places: NDArray[np.float64], radius: float, image: Image) -> NDArray[np.bool_]:
+    """(n,) True for dots at `places` (n, 2) that the border of the picture cuts."""
     rows, columns, _ = image.shape
     edge = np.array([columns - 1, rows - 1]) - radius
     return np.asarray(((places < radius) | (places > edge)).any(axis=1))
 
 
-def _frames(path: Path) -> Iterator[Image]:
+def _read_film(path: Path) -> Iterator[Image]:
     from tacsim.record.sources import folder_images, list_pictures, video_images
 
     try:

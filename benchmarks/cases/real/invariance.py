@@ -1,5 +1,5 @@
-"""Real group: would a policy notice that its frames are simulated? Presses of our gel beside the same presses of a real
-one, each seen through a calibration by other presses.
+"""Real group: can a policy distinguish simulated from real frames? Simulated presses are compared with the same real
+presses, both through a calibration by other presses.
 """
 
 from __future__ import annotations
@@ -29,31 +29,32 @@ if TYPE_CHECKING:
 CASE = "invariance"
 FOLDS = 5
 MIN_PRESSES = 10
-THICKNESS = (2e-3, 8e-3)  # of a gel that its slopes tell [m]
+THICKNESS = (2e-3, 8e-3)  # range of a thickness that is estimated from slopes [m]
 
 
 def invariance(
     folder: Path, of: BallSet, gel_size: tuple[float, float, float] | None, repeat: int
 ) -> list[Measurement]:
-    """Real presses beside the same by our gel, in five folds: distances, a classifier, drift. Seconds: of a press.
+    """Real presses and the same simulated presses, in five folds: distances, a classifier, drift. Seconds: of a press.
 
-    Whole presses are left out, of the calibration and of the classifier. `gel_size`: None: of a gel that is not known,
-    as large as the picture and as thick as the slopes round the contacts say; its variants begin with the set's name.
+    Whole presses are left out, of the calibration and of the classifier. gel_size: None for an unknown gel, which gets
+    the size of the picture and the thickness from the slopes around the contacts; its variants begin with the set's
+    name.
 
-    *pictures*: our surface is found in our picture, as the real one in its own. *surfaces*: our simulation says it.
+    *pictures*: our surface is found in our picture, as the real one in its own. *surfaces*: that of the simulation.
     """
     reference, frames = balls.read_balls(folder, of)
     if len(frames) < MIN_PRESSES:
-        raise BadData(f"{of.name}: {len(frames)} presses; {MIN_PRESSES} are the least that say something")
+        raise BadData(f"{of.name}: {len(frames)} presses; at least {MIN_PRESSES} are needed")
     named = "" if gel_size is not None else f"{of.name}, "
-    gel_size = _gel_of(folder, of, reference) if gel_size is None else gel_size
+    gel_size = _estimate_gel(folder, of, reference) if gel_size is None else gel_size
     wall, cpu, pressed, notes = 0.0, 0.0, 0, []
     by_source: dict[str, list[tuple[Comparison, Calibration | None]]] = {"pictures": [], "surfaces": []}
     for fold in range(FOLDS):
         train = tuple(frame for k, frame in enumerate(frames) if k % FOLDS != fold)
-        both, calibration, taken, said = _fold(of, reference, train, frames[fold::FOLDS], gel_size)
+        both, calibration, taken, fold_notes = _compare_fold(of, reference, train, frames[fold::FOLDS], gel_size)
         wall, cpu, pressed = wall + taken[0], cpu + taken[1], pressed + len(both["pictures"].pairs)
-        notes += said
+        notes += fold_notes
         for source, comparison in both.items():
             by_source[source].append((comparison, calibration))
     timing, note = Timing((wall / pressed,), cpu / pressed), "; ".join(notes)
@@ -63,8 +64,8 @@ def invariance(
     return rows
 
 
-def _gel_of(folder: Path, of: BallSet, reference: Image) -> tuple[float, float, float]:
-    """Size of a gel of which only pictures are known [m]. Raises BadData."""
+def _estimate_gel(folder: Path, of: BallSet, reference: Image) -> tuple[float, float, float]:
+    """Estimated size of a gel from its pictures [m]. Raises BadData."""
     fit, _, _ = balls.calibrated(folder, of)
     thickness = float(np.clip(fit.thickness * of.pixel_pitch, *THICKNESS))
     across, down = (round(length * of.pixel_pitch, 3) for length in (reference.shape[1], reference.shape[0]))
@@ -117,11 +118,11 @@ def _rows(
     return rows
 
 
-def _fold(
+def _compare_fold(
     of: BallSet, reference: Image, train: Frames, test: Frames, gel_size: tuple[float, float, float]
 ) -> tuple[dict[str, Comparison], Calibration, tuple[float, float], list[str]]:
-    """Left-out presses by our gel, compared with the real ones, by source; the calibration that has not seen them; wall
-    and processor time of pressing; what to look at."""
+    """Simulated left-out presses compared with the real ones, by source; the calibration without them; wall and
+    processor time of the simulation; notes."""
     from calibration.bundle import read_sensor_model, write_bundle
     from calibration.compare.compare import compare_frames
     from calibration.errors import BadFrames
@@ -141,23 +142,23 @@ def _fold(
     wall, cpu = perf_counter(), process_time()
     with TemporaryDirectory() as place:
         write_bundle(Path(place), calibration, reference)
-        ours, said = match_presses(real, scene, read_sensor_model(Path(place)), GRID)
+        ours, fold_notes = match_presses(real, scene, read_sensor_model(Path(place)), GRID)
     taken = perf_counter() - wall, process_time() - cpu
     both = {
         "pictures": compare_frames(ours, real, calibration, calibration),
         "surfaces": compare_frames(ours, real, None, calibration),
     }
-    return both, calibration, taken, said
+    return both, calibration, taken, fold_notes
 
 
 def cases(folder: Path) -> tuple[Case, ...]:
-    """The presses of the sensor whose gel is known, and of every other set with enough of them; says what is missing.
+    """Cases of the sensor with a known gel, and of every other set with enough presses; missing frames are reported.
     Raises ConfigError."""
     labels, resolution = read_labels(folder), f"{FOLDS} folds, h {ELEMENT * 1e3:g} mm"
     others = tuple(
         Case("real", CASE, "tacsim", f"{other.name}, {resolution}", partial(invariance, folder, other, None), long=True)
         for other in balls.read_sets(folder)
-        if other.name != labels.light and not other.dots and balls.is_there(folder, other)
+        if other.name != labels.light and not other.dots and balls.has_frames(folder, other)
     )
     try:
         of = light_of(folder, labels)

@@ -1,5 +1,5 @@
-"""Real group: balls pressed to a known depth, simulated from that depth alone, and seen through the light of a
-calibration by other presses; pictures and heights against the real ones.
+"""Real group: balls pressed to a known depth, simulated from that depth alone, and rendered with a calibration by other
+presses; pictures and heights against the real ones.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from benchmarks.cases.real.labels import BadData, PressLabel, PressLabels, read_
 from benchmarks.harness.measure import Measurement, Timing
 from benchmarks.harness.runner import Case
 from calibration.light.circle import Circle, NoCircle, find_contact_circle
-from robot.studies.matched_press import placed
+from robot.studies.matched_press import place_surface
 from tacsim.interface import FloatArray, Image, Mask
 from tacsim.models.scene import GelSurface
 from tacsim.models.sensor import CanonicalGrid
@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 
 CASE = "known_depth"
 GRID = CanonicalGrid()
-REACH = 1.3  # the mask of a picture reaches this far, in radii of the cap that the rest plane cuts off the ball
-HEIGHT_REACH = 1.5  # heights are compared this far from the middle, in radii of Hertz' contact
+REACH = 1.3  # radius of the mask of a picture, in radii of the cap of the ball below the rest plane
+HEIGHT_REACH = 1.5  # radius in which heights are compared, in radii of the Hertz contact
 
 
 def light_of(folder: Path, labels: PressLabels) -> BallSet:
@@ -41,13 +41,13 @@ def light_of(folder: Path, labels: PressLabels) -> BallSet:
     found = next((of for of in balls.read_sets(folder) if of.name == labels.light), None)
     if found is None:
         raise BadData(f"the labels of '{labels.name}' name no ball presses that calibrate its light (light:)")
-    if not balls.is_there(folder, found):
+    if not balls.has_frames(folder, found):
         raise BadData(f"no ball presses to calibrate the light by: no {found.wanted} below {folder}")
     return found
 
 
 def known_depth(folder: Path, ball: float, repeat: int) -> list[Measurement]:
-    """A ball pressed to a real press's depth, in calibrated light: picture and height. Seconds: to press and draw."""
+    """A ball pressed to a real press's depth, in calibrated light: picture and height. Seconds: press and picture."""
     labels = read_labels(folder)
     of = light_of(folder, labels)
     reference, frames = read_frames(folder, labels)
@@ -56,18 +56,18 @@ def known_depth(folder: Path, ball: float, repeat: int) -> list[Measurement]:
     camera = CalibratedSensor(of, fit, labels.gel_size, reference)
     rows = []
     for press in sorted((p for p in frames if p.ball_radius == ball), key=lambda p: p.depth):
-        real = _circle(press, frames[press], reference, labels)
+        real = _find_circle(press, frames[press], reference, labels)
         wall, cpu = perf_counter(), process_time()
         settled = press_to(world, ball, press.depth).settled
-        image = camera.see(placed(world.surface("lower"), real.x, real.y, camera.model))
+        image = camera.render_image(place_surface(world.surface("lower"), real.x, real.y, camera.model))
         timing = Timing((perf_counter() - wall,), process_time() - cpu)
-        ours = _circle(press, image, reference, labels)  # light pulls it aside, as it does the real one
+        ours = _find_circle(press, image, reference, labels)  # light shifts it in the same way as the real one
         x, y = 2 * real.x - ours.x, 2 * real.y - ours.y
-        surface = placed(world.surface("lower"), x, y, camera.model)
-        image = camera.see(surface)
+        surface = place_surface(world.surface("lower"), x, y, camera.model)
+        image = camera.render_image(surface)
         cap = float(np.sqrt(2 * ball * press.depth - press.depth**2)) / labels.pixel_pitch
         mask = circle_mask(reference.shape[:2], x, y, REACH * cap)
-        figures = pictures(image, frames[press], reference, mask) | {"depth_mm": press.depth * 1e3}
+        figures = compare_pictures(image, frames[press], reference, mask) | {"depth_mm": press.depth * 1e3}
         note = "" if settled else "not settled"
         rows.append(
             Measurement(
@@ -75,7 +75,7 @@ def known_depth(folder: Path, ball: float, repeat: int) -> list[Measurement]:
                 f"{press.name}: picture", None, figures, note,
             )
         )  # fmt: skip
-        rows.append(_height(camera, surface, frames[press], press, (x, y), timing))
+        rows.append(_height_row(camera, surface, frames[press], press, (x, y), timing))
     return rows
 
 
@@ -96,11 +96,11 @@ class CalibratedSensor:
         self._normalise = normaliser_for_calibration(calibration, GRID)
         self._normalise.take_reference(TactileFrame(reference, time=0.0, index=0))
 
-    def see(self, surface: GelSurface) -> Image:
+    def render_image(self, surface: GelSurface) -> Image:
         return self._render(surface)
 
     def height(self, image: Image) -> FloatArray:
-        """(h, w) [m] on the canonical grid, as the inverse model finds it."""
+        """(h, w) height [m] on the canonical grid, by the inverse model."""
         from tacsim.interface import TactileFrame
 
         found = self._normalise(TactileFrame(image, time=0.0, index=0), 0.0).height
@@ -108,8 +108,8 @@ class CalibratedSensor:
         return found.astype(np.float64)
 
 
-def _circle(press: PressLabel, image: Image, reference: Image, labels: PressLabels) -> Circle:
-    """Where the contact is found. Raises BadData."""
+def _find_circle(press: PressLabel, image: Image, reference: Image, labels: PressLabels) -> Circle:
+    """The contact circle in the image. Raises BadData."""
     try:
         return find_contact_circle(image, reference, press.ball_radius / labels.pixel_pitch)
     except NoCircle as error:
@@ -123,8 +123,8 @@ def circle_mask(shape: Iterable[int], x: float, y: float, radius: float) -> Mask
     return np.asarray(np.hypot(u - x, v - y) < radius)
 
 
-def pictures(image: Image, real: Image, reference: Image, mask: Mask) -> dict[str, float]:
-    """How alike two pictures are where `mask`, and what the picture without contact would score."""
+def compare_pictures(image: Image, real: Image, reference: Image, mask: Mask) -> dict[str, float]:
+    """Similarity of two pictures inside `mask`, and that of the picture without contact."""
     from calibration.compare import metrics
 
     still = reference.astype(np.float64)
@@ -137,7 +137,7 @@ def pictures(image: Image, real: Image, reference: Image, mask: Mask) -> dict[st
     }
 
 
-def _height(
+def _height_row(
     camera: CalibratedSensor,
     surface: GelSurface,
     real: Image,
@@ -145,7 +145,7 @@ def _height(
     at: tuple[float, float],
     timing: Timing,
 ) -> Measurement:
-    """Of the surface that the inverse finds in the real frame against the simulated one."""
+    """The row of the surface from the real frame, by the inverse model, against the simulated one."""
     from tacsim.optics.surface import surface_map
 
     (u0, v0), pitch = camera.model.geometry.principal, camera.model.geometry.pixel_pitch
@@ -172,7 +172,7 @@ def _height(
 
 
 def cases(folder: Path) -> tuple[Case, ...]:
-    """A case a ball; one that lacks frames or light says so. Raises ConfigError."""
+    """A case for each ball; balls without frames or light are marked as missing. Raises ConfigError."""
     labels = read_labels(folder)
     try:
         light_of(folder, labels)

@@ -1,6 +1,6 @@
-"""Real presses of a ball at known depth: what is known of them, and where their frames lie.
+"""Labels of real presses of a ball at known depth, and the paths of their frames.
 
-A folder of frames may carry its own labels, `presses.yaml`; without, those of a public set are taken
+A folder of frames may have its own labels, `presses.yaml`; otherwise those of a public set apply
 (`references/presses.yaml`). Frames are found by name anywhere below the folder.
 """
 
@@ -24,16 +24,16 @@ SHIPPED = Path(__file__).parents[2] / "references" / OWN
 
 
 class BadData(ValueError):
-    """A folder of real frames that cannot be used: what is missing, and where."""
+    """A folder of real frames cannot be used. The message says what is missing, and where."""
 
 
 class PressLabel(Config):
     """One press of a ball straight into the gel."""
 
-    frames: tuple[str, ...] = ()  # names of its frame, the first that exists counts
+    frames: tuple[str, ...] = ()  # possible names of its frame; the first that exists is used
     ball_radius: Positive  # [m]
     depth: Positive  # commanded [m]
-    radius_px: Annotated[float, Field(gt=0)] | None = None  # contact radius that somebody measured [px]
+    radius_px: Annotated[float, Field(gt=0)] | None = None  # measured contact radius [px]
 
     @property
     def name(self) -> str:
@@ -43,7 +43,9 @@ class PressLabel(Config):
 class PunchLabel(Config):
     """One press of a flat punch straight into the gel."""
 
-    frames: Annotated[tuple[str, ...], Field(min_length=1)]  # names of its frame, the first that exists counts
+    frames: Annotated[
+        tuple[str, ...], Field(min_length=1)
+    ]  # possible names of its frame; the first that exists is used
     mesh: Annotated[tuple[str, ...], Field(min_length=1)]  # names of an STL in mm whose highest face touches the gel; x
     # points right in the image and y up
     depth: Positive  # commanded [m]
@@ -66,16 +68,16 @@ class PressLabels(Config):
 
     @property
     def balls(self) -> list[float]:
-        """Ball radii [m], each once."""
+        """All ball radii [m], each once."""
         return list(dict.fromkeys(press.ball_radius for press in self.presses))
 
 
 def read_labels(folder: Path) -> PressLabels:
-    """The labels that hold for `folder`. Raises BadData without such a folder, ConfigError for labels with mistakes."""
+    """The labels that apply to `folder`. Raises BadData without such a folder, ConfigError for labels with errors."""
     from tacsim.config import load_model
 
     if not folder.is_dir():
-        raise BadData(f"{folder} is no folder; name the folder that holds the real frames")
+        raise BadData(f"{folder} is not a folder; name the folder with the real frames")
     own = folder / OWN
     return load_model(PressLabels, own if own.is_file() else SHIPPED)
 
@@ -83,7 +85,7 @@ def read_labels(folder: Path) -> PressLabels:
 def find_frames(folder: Path, labels: PressLabels) -> dict[PressLabel, Path]:
     """The frame of each press that has one below `folder`.
 
-    Raises BadData when there is none at all, when a name is there twice, or for a press with neither frame nor radius.
+    Raises BadData if there is no frame, if a name exists twice, or for a press with neither frame nor radius.
     """
     found = {press: path for press in labels.presses if (path := find(folder, press.frames)) is not None}
     if not found:
@@ -92,10 +94,10 @@ def find_frames(folder: Path, labels: PressLabels) -> dict[PressLabel, Path]:
             f"{folder} and the folders below it hold no frame of '{labels.name}': {wanted}. "
             f"Name the folder that holds them, or describe your own frames in {folder / OWN}"
         )
-    useless = [press.name for press in labels.presses if press not in found and press.radius_px is None]
-    if useless:
+    unused = [press.name for press in labels.presses if press not in found and press.radius_px is None]
+    if unused:
         raise BadData(
-            f"{folder}: no frame and no radius_px for {'; '.join(useless)}. Add the frame, or take the press out of "
+            f"{folder}: no frame and no radius_px for {'; '.join(unused)}. Add the frame, or remove the press from "
             f"{OWN}"
         )
     return found
@@ -108,7 +110,7 @@ def read_frames(folder: Path, labels: PressLabels) -> tuple[Image, dict[PressLab
     frames = {press: read_picture(path) for press, path in paths.items()}
     for press, frame in frames.items():
         if frame.shape != reference.shape:
-            raise BadData(f"{paths[press]} and {background} differ in size; they must be of one camera")
+            raise BadData(f"{paths[press]} and {background} differ in size; they must be from one camera")
     return reference, frames
 
 
@@ -139,11 +141,11 @@ def read_picture(path: Path) -> Image:
 
 
 def find(folder: Path, names: Iterable[str]) -> Path | None:
-    """The first of these names that is below `folder`; None without. Raises BadData for one that is there twice."""
+    """The first of these names that exists below `folder`, or None. Raises BadData for a name that exists twice."""
     for name in names:
         found = sorted(folder.rglob(name))
         if len(found) > 1:
-            raise BadData(f"'{name}' is there twice: {found[0]} and {found[1]}. Name the one folder that is meant")
+            raise BadData(f"'{name}' exists twice: {found[0]} and {found[1]}. Name the folder of one of them")
         if found:
             return found[0]
     return None

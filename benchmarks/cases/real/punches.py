@@ -1,7 +1,8 @@
 """Real group: flat punches of known outline and depth, in calibrated light, against real frames.
 
-The gel is the FFT elastic layer: elements that resolve a sharp edge would take minutes a press. Printed punches are not
-as large as their drawing, so a scale and a place are fitted, once for all frames of a punch; depth and light are not.
+The gel is the FFT elastic layer, because elements that resolve a sharp edge would take minutes for each press. Printed
+punches differ in size from their drawing, so one scale and one place are fitted for all frames of a punch; depth and
+light are not fitted.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.cases.real import balls
-from benchmarks.cases.real.known_depth import light_of, pictures
+from benchmarks.cases.real.known_depth import compare_pictures, light_of
 from benchmarks.cases.real.labels import (
     BadData,
     PressLabels,
@@ -37,13 +38,13 @@ if TYPE_CHECKING:
 
 
 CASE = "punch"
-BOX = 512  # pixels of the periodic square that the layer is solved on
-FINER = 8  # the outline is drawn on so many times as many points
-RIM = 12  # the mask reaches so far beyond the outline [px]
-FIT_RIM = 20  # ... and that of the fit
+BOX = 512  # pixels of the periodic square on which the layer is solved
+OUTLINE_SUBSAMPLING = 8  # samples per pixel along each axis, for the outline
+RIM = 12  # of the mask around the outline [px]
+FIT_RIM = 20  # of the mask of the fit [px]
 SCALES = (0.88, 0.92, 0.96, 1.0, 1.04)
-NEARER = 0.02  # and the two scales so far from the best
-STEPS = (4.0, 2.0, 1.0, 0.5)  # of the place [px]
+FINE_SCALE_STEP = 0.02  # from the best scale to the two fine ones
+STEPS = (4.0, 2.0, 1.0, 0.5)  # of the search for the place [px]
 EDGE_BLUR = 1.0  # by the gel's coating and the optics [px]
 
 
@@ -55,11 +56,11 @@ class PunchFace:
     triangles: NDArray[np.intp]  # (m, 3)
 
     def mask(self, shape: tuple[int, int], x: float, y: float, pitch: float, scale: float, rim: int = 0) -> Mask:
-        """(H, W) pixels more than half covered when its axis is at x, y [px], and up to `rim` pixels from these."""
+        """(H, W) pixels that are more than half covered with the axis at x, y [px], and those within `rim` pixels."""
         import cv2
 
-        drawn = np.zeros((shape[0] * FINER, shape[1] * FINER), dtype=np.uint8)
-        at = (self.points * scale / pitch + [x, y] + 0.5) * FINER - 0.5
+        drawn = np.zeros((shape[0] * OUTLINE_SUBSAMPLING, shape[1] * OUTLINE_SUBSAMPLING), dtype=np.uint8)
+        at = (self.points * scale / pitch + [x, y] + 0.5) * OUTLINE_SUBSAMPLING - 0.5
         for corners in at[self.triangles]:
             cv2.fillConvexPoly(drawn, np.rint(corners * 16).astype(np.int32), 255, shift=4)
         covered = cv2.resize(drawn, shape[::-1], interpolation=cv2.INTER_AREA) > 127
@@ -79,7 +80,7 @@ def read_face(path: Path) -> PunchFace:
     top = np.isclose(mesh.vertices[:, 2], mesh.vertices[:, 2].max(), atol=1e-6)
     triangles = mesh.faces[top[mesh.faces].all(axis=1)]
     if len(triangles) == 0:
-        raise BadData(f"{path}: its highest point is no flat face")
+        raise BadData(f"{path}: its highest points form no flat face")
     return PunchFace(np.asarray(mesh.vertices[:, :2] * [1.0, -1.0], dtype=np.float64), np.asarray(triangles))
 
 
@@ -99,8 +100,8 @@ class PunchRenderer:
         self._pitch, self._thickness = labels.pixel_pitch, labels.gel_thickness[0]
 
     def dent(self, face: PunchFace, scale: float, depth: float) -> Float32:
-        """(BOX, BOX, 3) slopes and height [widths of the picture] of the gel under the punch, whose axis is in the
-        middle."""
+        """(BOX, BOX, 3) slopes and height [widths of the picture] of the gel under the punch, with its axis at the
+        centre."""
         import cv2
 
         from benchmarks.truth.layer import layer_contact
@@ -121,8 +122,8 @@ class PunchRenderer:
         rows, columns, _ = self._still.shape
         v, u = np.mgrid[:rows, :columns].astype(np.float32)
         at = [np.float32(BOX // 2) + axis - np.float32(middle) for axis, middle in ((u, x), (v, y))]
-        seen = np.asarray(cv2.remap(dent, at[0], at[1], cv2.INTER_LINEAR), dtype=np.float32)
-        change, _ = self._light.change(seen[..., :2], *self._places, np.ascontiguousarray(seen[..., 2]))
+        remapped = np.asarray(cv2.remap(dent, at[0], at[1], cv2.INTER_LINEAR), dtype=np.float32)
+        change, _ = self._light.change(remapped[..., :2], *self._places, np.ascontiguousarray(remapped[..., 2]))
         if self._blur > 0:
             change = np.asarray(cv2.GaussianBlur(change, (0, 0), self._blur), dtype=np.float32)
         picture: Image = np.rint(np.clip(self._still + change, 0, 255)).astype(np.uint8)
@@ -131,18 +132,18 @@ class PunchRenderer:
 
 @dataclass(frozen=True, slots=True)
 class PunchPlacement:
-    """Where and how large a punch appears."""
+    """Place and scale of a punch in the picture."""
 
     scale: float
     x: float
     y: float
-    error: float  # mean |error| where it was fitted [grey levels]
+    error: float  # mean |error| in the mask of the fit [grey levels]
 
 
 def fit_placement(
     draw: PunchRenderer, face: PunchFace, depths: Sequence[float], frames: Sequence[Image], pitch: float
 ) -> PunchPlacement:
-    """Fits scale and place to all frames of a punch. Raises BadData when no contact is seen."""
+    """Fits scale and place to all frames of a punch. Raises BadData if no contact is visible."""
     from calibration.compare import metrics
 
     still = draw.reference.astype(np.float32)
@@ -150,10 +151,12 @@ def fit_placement(
     strongest = max(changes, key=lambda change: float((change**2).mean()))
     patch = metrics.circle_of_region(metrics.contact_region(strongest))
     if patch is None:
-        raise BadData("no contact is seen in the frames of the punch")
+        raise BadData("no contact is visible in the frames of the punch")
     middle = face.points[np.unique(face.triangles)].mean(axis=0) / pitch
     start = (patch.x - middle[0], patch.y - middle[1])
-    where = face.mask(frames[0].shape[:2], *start, pitch, max(SCALES), FIT_RIM)  # one mask, so that errors compare
+    where = face.mask(
+        frames[0].shape[:2], *start, pitch, max(SCALES), FIT_RIM
+    )  # one mask, so that errors can be compared
 
     def tried(scale: float) -> PunchPlacement:
         dents = [draw.dent(face, scale, depth) for depth in depths]
@@ -175,11 +178,13 @@ def fit_placement(
         return best
 
     best = min((tried(scale) for scale in SCALES), key=lambda one: one.error)
-    return min((best, tried(best.scale - NEARER), tried(best.scale + NEARER)), key=lambda one: one.error)
+    return min(
+        (best, tried(best.scale - FINE_SCALE_STEP), tried(best.scale + FINE_SCALE_STEP)), key=lambda one: one.error
+    )
 
 
 def punch(folder: Path, mesh: str, repeat: int) -> list[Measurement]:
-    """A flat punch pressed to a real press's depth, outline scaled once. Seconds: to press (FFT layer) and draw."""
+    """A flat punch pressed to the depth of a real press, with one fitted scale. Seconds: of FFT layer and picture."""
     labels = read_labels(folder)
     fit, _, _ = balls.calibrated(folder, light_of(folder, labels))
     found = {p: both for p, both in read_punches(folder, labels).items() if both[0].stem == mesh}
@@ -199,7 +204,7 @@ def punch(folder: Path, mesh: str, repeat: int) -> list[Measurement]:
         image = draw(draw.dent(face, placed.scale, one.depth), placed.x, placed.y)
         timing = Timing((perf_counter() - wall,), process_time() - cpu)
         mask = face.mask(reference.shape[:2], placed.x, placed.y, labels.pixel_pitch, placed.scale, RIM)
-        figures = pictures(image, found[one][1], reference, mask) | {
+        figures = compare_pictures(image, found[one][1], reference, mask) | {
             "depth_mm": one.depth * 1e3, "scale": placed.scale, "x_px": placed.x, "y_px": placed.y,
         }  # fmt: skip
         rows.append(
@@ -213,23 +218,24 @@ def punch(folder: Path, mesh: str, repeat: int) -> list[Measurement]:
 
 def _reference(folder: Path, labels: PressLabels, found: dict[PunchLabel, tuple[Path, Image]]) -> Image:
     path = find(folder, next(iter(found)).frames)
-    assert path is not None  # it was found before
+    assert path is not None  # the frame was found before
     return read_background(path.parent, labels)[1]
 
 
 def cases(folder: Path) -> tuple[Case, ...]:
-    """A case a mesh; one that lacks mesh, frames or light says so. Raises ConfigError."""
+    """A case for each mesh; punches without mesh, frames or light are marked as missing. Raises ConfigError."""
     labels = read_labels(folder)
     try:
         light_of(folder, labels)
-        there, lacking = {both[0].stem for both in read_punches(folder, labels).values()}, ""
+        available, lacking = {both[0].stem for both in read_punches(folder, labels).values()}, ""
     except BadData as error:
-        there, lacking = set(), str(error)
+        available, lacking = set(), str(error)
     names = dict.fromkeys(Path(one.mesh[0]).stem for one in labels.punches)
     return tuple(
         Case(
             "real", CASE, "layer", f"{labels.pixel_pitch * 1e3:.3g} mm a pixel", partial(punch, folder, name),
-            missing=lacking or ("" if name in there else f"no frame or no mesh of the punch '{name}' below {folder}"),
+            missing=lacking
+            or ("" if name in available else f"no frame or no mesh of the punch '{name}' below {folder}"),
             long=True,
         )
         for name in names

@@ -1,1 +1,1 @@
-"""Whether a calibration of light can be trusted: checks of its pictures, and the verdict."""
+"""Checks of a calibration of light: checks of its pictures, and the verdict."""

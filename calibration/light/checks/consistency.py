@@ -1,5 +1,5 @@
-"""Whether pictures belong together: presses that others do not predict, that are blurred, and a contact in the picture
-that shows none."""
+"""Checks that pictures belong together: presses that others do not predict, blurred presses, and a contact in the
+picture without contact."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ MIN_REFERENCE_CONTACT = 0.2  # where two such pictures differ
 
 def find_inconsistent_presses(presses: Sequence[BallPress], windows: Sequence[Window], ball: float) -> list[int]:
     """The presses that those of the largest group do not predict: each press alone gives a light, and two presses
-    belong together if the lights of both explain both. `ball`: its radius [px]."""
+    belong together if the lights of both explain both. ball: its radius [px]."""
     min_grouped = 4  # presses: fewer do not show which one is wrong
     ridge = 1e-3
     thick = 1e4  # of a gel that is taken to be thick [ball radii]
@@ -51,7 +51,7 @@ def find_inconsistent_presses(presses: Sequence[BallPress], windows: Sequence[Wi
 
 
 def _outside_largest_group(link_costs: FloatArray) -> list[int]:
-    """Single linkage: links of the least spanning tree that are too long are cut."""
+    """Groups by single linkage: links of the minimum spanning tree that are too long are cut."""
     from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 
     tree = minimum_spanning_tree(np.maximum(link_costs, 1e-9)).toarray()
@@ -70,8 +70,8 @@ def fine_power(picture: FloatArray, where: Mask) -> float:
 
 
 def find_blurred_presses(presses: Sequence[BallPress], reference: Image, mean: FloatArray) -> list[tuple[int, float]]:
-    """Presses whose pictures show less fine detail beside the contact than the others', and than the picture without
-    contact (H, W, 3) does if it is most of them; and the share of its power that is left."""
+    """Presses whose pictures have less fine detail outside the contact than the others, and, if these are most of them,
+    than the picture without contact (H, W, 3); and the share of its power that is left."""
     shares = []
     still = reference.astype(np.float64)
     for press in presses:
@@ -94,8 +94,9 @@ def find_blurred_presses(presses: Sequence[BallPress], reference: Image, mean: F
 def find_reference_contact(
     presses: Sequence[BallPress], reference: Image, mean: FloatArray, others: Sequence[Image], ball: float
 ) -> str | None:
-    """What speaks for a contact in a picture without contact: what all presses differ from `reference` (H, W, 3) by
-    where they do not touch, or two such pictures differ by, looks like a ball's dent. None: nothing does."""
+    """Evidence of a contact in a picture without contact: the common difference of all presses from `reference`
+    (H, W, 3) outside their contacts, or the difference of two such pictures, resembles a ball's dent. None without
+    evidence."""
     strength = float(np.median([np.abs(gaussian_blur(press.change, CONTACT_BLUR)).max() for press in presses]))
     for number, other in enumerate(others, start=2):
         where = _describe_dent(
@@ -127,7 +128,8 @@ def find_reference_contact(
 
 
 def _describe_dent(change: FloatArray, mean: FloatArray, reference: Image, ball: float, strength: float) -> str | None:
-    """Where a change (H, W, 3) [grey levels] is beyond `strength` [-] and a ball's dent explains it; in words."""
+    """Description of the place where a change (H, W, 3) [grey levels] exceeds `strength` [-] and a ball's dent explains
+    it."""
     change = change - np.median(change, axis=(0, 1))
     if not np.abs(gaussian_blur(change / mean, CONTACT_BLUR)).max() > strength:
         return None

@@ -1,4 +1,4 @@
-"""The verdict on a calibration as a page (one HTML file, nothing from outside), and the picture of residuals in it."""
+"""The verdict on a calibration as a page (one self-contained HTML file), with a picture of residuals."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ FILE = "verdict.html"
 def write_page(
     path: Path, name: str, fit: LightFit, scale: KnownScale, verdict: Verdict, residuals: Path | None, facts: list[str]
 ) -> None:
-    """Writes the page of sensor `name`; `residuals`: the picture that is shown in it; `facts`: more of what is known of
-    the sensor, in lines. Raises OSError."""
+    """Writes the page of sensor `name`. residuals: its picture. facts: lines with other data of the sensor. Raises
+    OSError."""
     ball = scale.ball_radius / scale.pixel_pitch
     ratios = [press.circle.radius / ball for press in fit.presses]
     picture = None if residuals is None else data_url(residuals.read_bytes())
@@ -34,8 +34,8 @@ def write_page(
 
 
 def draw_residuals(fit: LightFit, path: Path) -> None:
-    """Writes a PNG: of each press the change of colour as it was seen, as it is predicted by the others, and the
-    error, all in one scale. Raises ValueError for a fit of one press, which is predicted by none; OSError."""
+    """Writes a PNG: for each press the observed change of colour, its prediction by the others, and the error, all in
+    one scale. Raises ValueError for a fit of one press, which has no prediction; OSError."""
     half_side = 2.0  # of what is drawn [contact radii]
     max_drawn = 8  # drawn, the worst first
     from matplotlib.figure import Figure

@@ -29,5 +29,5 @@ MAX_CONTACT_RATIO = 0.95  # contact radius over the ball's: no gel is pressed so
 MAX_COMMON_CONTACT_RATIO = 0.9  # the same of all presses together: some are always lighter
 MIN_WIDEST_CONTACT_RATIO = 0.35
 MAX_DEPTH_RATIO = (0.5, 0.9)  # depth over the thickness of the gel
-MAX_IDENTIFIABLE_THICKNESS = 1.5  # thickness of a gel over the ball's radius, up to which the slopes tell it
+MAX_IDENTIFIABLE_THICKNESS = 1.5  # thickness of a gel over the ball's radius, up to which slopes identify it
 MAX_THICKNESS_RATIO = 2.5  # factor between the gel's thickness found by slopes and the configured one

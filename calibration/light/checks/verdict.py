@@ -1,4 +1,4 @@
-"""Whether a calibrated light can be trusted: limits that hold for every sensor, and what to do where one is passed."""
+"""Verdict on a calibrated light: limits for all sensors, and advice if one is exceeded."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ GREY = "the pictures are grey"
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One thing that lowers the verdict."""
+    """A finding that lowers the verdict."""
 
     word: Word
     what: str
@@ -65,19 +65,19 @@ class Verdict:
 
 @dataclass(frozen=True, slots=True)
 class KnownScale:
-    """What is known of lengths beside ball and pixel pitch; None: not known."""
+    """Known lengths in addition to ball and pixel pitch; None: not known."""
 
     pixel_pitch: float  # [m]
     ball_radius: float  # [m]
-    gel_size: tuple[float, float] | None = None  # that the picture should show [m]
+    gel_size: tuple[float, float] | None = None  # of the gel in the picture [m]
     gel_thickness: float | None = None  # [m]
     depths: tuple[tuple[str, float], ...] = ()  # frames whose indentation is known [m]
-    pitch_from_size: bool = False  # the pitch is published and follows from `gel_size`: neither checks the other
+    pitch_from_size: bool = False  # the pitch is the published one, computed from `gel_size`: neither checks the other
     marker_pitches: tuple[float, float] | None = None  # of printed dots: as found by the pixel pitch, as given [m]
 
 
 def evaluate_calibration(fit: LightFit, scale: KnownScale, *, dots: bool = False) -> Verdict:
-    """All findings, the worst first. `dots`: the pictures show dots that no option names."""
+    """All findings, the worst first. dots: the pictures show dots without an option for them."""
     found = [*_check_presses(fit), *_check_images(fit), *_check_shape(fit), *_check_scale(fit, scale)]
     found += [Finding("do not trust", *_split_warning(doubt)) for doubt in fit.image_warnings]
     if dots:  # a rig refuses such a bundle
@@ -119,7 +119,7 @@ def _check_images(fit: LightFit) -> Iterable[Finding]:
             "do not trust", f"{GREY}, and one number a pixel cannot tell slopes of two directions",
             "calibrate from the camera's own pictures, in colour",
         )  # fmt: skip
-    if fit.forward is not None and is_undirected(fit.forward):
+    if fit.forward is not None and is_isotropic(fit.forward):
         yield Finding(
             "do not trust", "this light tells no direction: all flanks of a dent change alike",
             "slopes cannot be found in such pictures; only how dark it is tells of depth",
@@ -249,18 +249,18 @@ def _check_thickness(fit: LightFit, scale: KnownScale, widest: float) -> Iterabl
 
 
 def _exceed_limits(limits: tuple[float, float], value: float, what: str, todo: str) -> Iterable[Finding]:
-    """A finding where `value` passes the first limit; NaN is nothing."""
+    """A finding if `value` exceeds the first limit; none for NaN."""
     if value > limits[0]:
         yield Finding("do not trust" if value > limits[1] else "usable", what.format(value), todo)
 
 
 def is_grey(image: Image) -> bool:
-    """True for a picture (H, W, 3) whose colours are all alike."""
+    """True for a picture (H, W, 3) with equal channels."""
     return bool((image == image[..., :1]).all())
 
 
-def is_undirected(model: PhotometricModel) -> bool:
-    """True where flanks to all sides have nearly one change of colour."""
+def is_isotropic(model: PhotometricModel) -> bool:
+    """True if flanks in all directions have nearly the same change of colour."""
     turn = np.arange(8) * np.pi / 4
     slopes = 0.6 * model.steepest * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
     middle = np.zeros(8, dtype=np.float32)
@@ -278,6 +278,6 @@ def _size_text(size: tuple[float, float]) -> str:
 
 
 def _split_warning(warning: str) -> tuple[str, str]:
-    """A warning "what: what to do" in two."""
+    """Splits a warning "finding: advice" into its two parts."""
     what, _, todo = warning.partition(": ")
     return what, todo

@@ -1,7 +1,7 @@
-"""Checks of a UR arm before anything moves: network, versions, remote control, where it stands, what it feels, limits.
+"""Checks of a UR arm before anything moves: network, versions, remote control, pose, force, limits.
 
-Connects to the dashboard and to the RTDE port. It never becomes a commander: no input register is claimed and no
-program is sent, so it may check an arm that another program drives.
+The checks connect to the dashboard and to the RTDE port. They claim no input register and send no program, so another
+program can drive the arm at the same time.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from robot.arm.controller.arm_placement import ArmPlacement, check_placement, measure_placement
 from robot.arm.controller.dashboard import PORT as DASHBOARD
 from robot.arm.controller.dashboard import Dashboard
 from robot.arm.controller.rtde import PORT as RTDE
 from robot.arm.controller.rtde import read_controller
-from robot.arm.controller.stand import Stand, compare, stand
 from robot.common import MOCK_SERIAL
 from robot.common.kinematics import Kinematics
 from robot.common.tcp import ArmFrames
@@ -31,15 +31,21 @@ TIMEOUT = 2.0  # of each connection [s]
 
 
 def examine(name: str, config: UrArmConfig, start: Pose | None, file: str) -> ArmExamination:
-    """The checks of one arm, and where its sensor is. start: world_from_sensor where an episode begins. file: the rig
-    file, for the commands to be typed next."""
-    stands: list[Stand] = []
-    checks = list(_checks(name, config, start, file, stands))
-    return ArmExamination(checks, se3.from_matrix(stands[0].sensor) if stands else None)
+    """The checks of one arm, and the pose of its sensor.
+
+    Args:
+        start: world_from_sensor at the start of an episode.
+        file: name of the rig file, for the commands in the advice.
+    """
+    placements: list[ArmPlacement] = []
+    checks = list(_run_checks(name, config, start, file, placements))
+    return ArmExamination(checks, se3.from_matrix(placements[0].sensor) if placements else None)
 
 
-def _checks(name: str, config: UrArmConfig, start: Pose | None, file: str, stands: list[Stand]) -> Iterator[Check]:
-    closed = [f"{port} ({what})" for port, what in PORTS.items() if not _open(config.host, port)]
+def _run_checks(
+    name: str, config: UrArmConfig, start: Pose | None, file: str, placements: list[ArmPlacement]
+) -> Iterator[Check]:
+    closed = [f"{port} ({what})" for port, what in PORTS.items() if not _is_open(config.host, port)]
     if closed:
         advice = "is the controller on, the address right, and the service allowed (Settings, Security, Services)?"
         yield Check(f"{name}: network", "fail", f"{config.host}: no answer at {', '.join(closed)}", advice)
@@ -47,22 +53,22 @@ def _checks(name: str, config: UrArmConfig, start: Pose | None, file: str, stand
     yield Check(f"{name}: network", "ok", f"{config.host}: ports {', '.join(map(str, PORTS))} answer")
     try:
         with Dashboard(config.host, TIMEOUT) as dashboard:
-            yield from _controller(name, config, dashboard)
+            yield from _check_controller(name, config, dashboard)
     except DeviceError as failure:
-        yield Check(f"{name}: dashboard", "fail", str(failure), "restart the controller, and look at its log")
+        yield Check(f"{name}: dashboard", "fail", str(failure), "restart the controller, and read its log")
     try:
-        now = stand(config, read_controller(config.host, TIMEOUT))
+        placement = measure_placement(config, read_controller(config.host, TIMEOUT))
     except DeviceError as failure:
         yield Check(f"{name}: RTDE", "fail", str(failure), "restart the controller")
     else:
-        stands.append(now)
+        placements.append(placement)
         yield Check(f"{name}: RTDE", "ok", "version 2")
-        yield from compare(name, config, now, start, file)
-    yield _limits(name, config)
-    yield _start(name, config)
+        yield from check_placement(name, config, placement, start, file)
+    yield _describe_limits(name, config)
+    yield _check_start(name, config)
 
 
-def _open(host: str, port: int) -> bool:
+def _is_open(host: str, port: int) -> bool:
     try:
         socket.create_connection((host, port), TIMEOUT).close()
     except OSError:
@@ -70,13 +76,13 @@ def _open(host: str, port: int) -> bool:
     return True
 
 
-def _controller(name: str, config: UrArmConfig, dashboard: Dashboard) -> Iterator[Check]:
-    min_polyscope = (5, 6)  # the first version that tells whether it is in remote control
+def _check_controller(name: str, config: UrArmConfig, dashboard: Dashboard) -> Iterator[Check]:
+    min_polyscope = (5, 6)  # the first version that reports remote control
     version = dashboard.request("PolyscopeVersion")
     found = re.search(r"(\d+)\.(\d+)\.\d+", version)
     fit = found is not None and (int(found[1]), int(found[2])) >= min_polyscope
     lowest = ".".join(map(str, min_polyscope))
-    advice = "" if fit else f"update PolyScope to {lowest} or later: older ones cannot be asked for remote control"
+    advice = "" if fit else f"update PolyScope to {lowest} or later: older versions do not report remote control"
     yield Check(f"{name}: PolyScope", "ok" if fit else "warn", version, advice)
     model, serial = dashboard.model(), dashboard.serial()
     wrong = model is not None and not config.model.startswith(model)
@@ -103,26 +109,30 @@ def _controller(name: str, config: UrArmConfig, dashboard: Dashboard) -> Iterato
         advice = "another program drives it: end that one before a run" if busy else ""
         yield Check(f"{name}: ready", "warn" if busy else "ok", f"{words}, program {program}", advice)
     except DeviceError as failure:
-        yield Check(f"{name}: ready", "fail", str(failure), "see to it at the pendant, then look again")
+        yield Check(f"{name}: ready", "fail", str(failure), "correct it at the pendant, then check again")
 
 
-def _limits(name: str, config: UrArmConfig) -> Check:
+def _describe_limits(name: str, config: UrArmConfig) -> Check:
     limits = config.limits
     size = 1e3 * (np.array(limits.workspace.upper) - limits.workspace.lower)
     words = (
         f"workspace {size[0]:.0f} x {size[1]:.0f} x {size[2]:.0f} mm, {len(limits.planes)} walls, "
         f"{1e3 * limits.speed:.0f} mm/s, {limits.acceleration:g} m/s², {limits.force:g} N, {limits.torque:g} N m"
     )
-    advice = "these guard the work, not people: set the safety limits on the pendant too" if config.mock is None else ""
+    advice = (
+        "these limits protect the work, not people: set the safety limits on the pendant too"
+        if config.mock is None
+        else ""
+    )
     return Check(f"{name}: limits", "ok", words, advice)
 
 
-def _start(name: str, config: UrArmConfig) -> Check:
-    """The start pose lies within the workspace and the reach."""
+def _check_start(name: str, config: UrArmConfig) -> Check:
+    """Checks that the start pose is in the workspace and within reach."""
     label = f"{name}: start"
     if config.start is None:
         if config.mock is not None:
-            return Check(label, "ok", "where the scene says")
+            return Check(label, "ok", "given by the scene")
         return Check(label, "fail", "missing", "give start: world_from_sensor, clear of everything")
     place = np.array(config.start.position)
     if (place < config.limits.workspace.lower).any() or (place > config.limits.workspace.upper).any():

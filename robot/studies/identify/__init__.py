@@ -1,1 +1,1 @@
-"""From recorded presses and squeezes to materials."""
+"""Materials from recorded presses and squeezes."""

@@ -1,4 +1,4 @@
-"""Recorded motions run again in simulation, with other materials, many at once."""
+"""Repeats recorded motions in simulation with other materials, many at once."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ Job = tuple[tuple[float, ...], float, float, int]  # values of the parameters, p
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Seen:
-    """How a sensor's heights and flow were found, so that the simulated ones are found alike."""
+class SensorView:
+    """Grid and markers with which a sensor measured height and flow, to compute the simulated ones in the same way."""
 
     grid: CanonicalGrid
     markers: Markers | None
@@ -35,28 +35,29 @@ class Seen:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Simulation:
-    """The presses by the simulator: what `estimate` calls.
+    """The simulated presses, as a function that `estimate_materials` calls.
 
     Quasi-static forces are proportional to all moduli and stresses together, and the shape depends on their ratios
-    alone. So a gel under a rigid indenter is run at the stiffness of the scene, and its forces are scaled: exactly.
+    alone. So a gel under a rigid indenter is simulated with the stiffness of the scene, and its forces are scaled,
+    which is exact.
     """
 
     scene: Scene
     parameters: tuple[Parameter, ...]
     presses: tuple[Press, ...]
-    seen: Mapping[str, Seen]
+    sensor_views: Mapping[str, SensorView]
     on_run: Callable[[int, int], None] = lambda done, total: None
 
     def __call__(self, points: Sequence[Point]) -> list[FloatArray]:
         """(m,) signals at each point, in the order of `signals_of`. Raises CannotSimulate."""
         batch_size = 16  # presses in one batch
-        keys = [[self._key(point, index) for index in range(len(self.presses))] for point in points]
+        keys = [[self._job_key(point, index) for index in range(len(self.presses))] for point in points]
         jobs = list(dict.fromkeys(key for each in keys for key in each))
         ran: dict[Job, FloatArray] = {}
         for begin in range(0, len(jobs), batch_size):
             part = jobs[begin : begin + batch_size]
             self.on_run(begin, len(jobs))
-            ran |= zip(part, self._run(part), strict=True)
+            ran |= zip(part, self._run_batch(part), strict=True)
         self.on_run(len(jobs), len(jobs))
         result = []
         for point, each in zip(points, keys, strict=True):
@@ -88,15 +89,15 @@ class Simulation:
     def _values(self, point: Point) -> dict[str, float]:
         return {each.name: each.value(float(free)) for each, free in zip(self.parameters, point.free, strict=True)}
 
-    def _key(self, point: Point, index: int) -> Job:
+    def _job_key(self, point: Point, index: int) -> Job:
         values = self._values(point)
         if self._scaled:
             values["youngs_modulus"] = self._stiffness
         return tuple(values[each.name] for each in self.parameters), float(point.places[index]), point.size, index
 
-    def _run(self, jobs: Sequence[Job]) -> list[FloatArray]:
+    def _run_batch(self, jobs: Sequence[Job]) -> list[FloatArray]:
         """(channels, moments) of each job."""
-        scenes = [self._scene(job) for job in jobs]
+        scenes = [self._job_scene(job) for job in jobs]
         batch = Batch([scene for scene, _ in scenes])
         paths = [
             _path(self.presses[index], place - raised)
@@ -119,19 +120,19 @@ class Simulation:
             for member, ended in enumerate(batch.move(targets)):
                 if isinstance(ended, SimulationDiverged):
                     values, *_, index = jobs[member]
-                    told = ", ".join(
+                    parameters = ", ".join(
                         f"{each.name} {value:.4g}" for each, value in zip(self.parameters, values, strict=True)
                     )
                     raise CannotSimulate(
-                        f"{self.presses[index].name}, moment {moment + 1}, with {told}: {ended}"
+                        f"{self.presses[index].name}, moment {moment + 1}, with {parameters}: {ended}"
                     ) from ended
                 if targets[member] is not None:
-                    found[member].append(self._signals(batch, member, self.presses[jobs[member][-1]]))
+                    found[member].append(self._simulated_signals(batch, member, self.presses[jobs[member][-1]]))
         return [np.array(rows).T for rows in found]
 
-    def _scene(self, job: Job) -> tuple[Scene, float]:
-        """The scene of a job; how far the centre of its indenter lies higher than recorded: a larger one has its lowest
-        point where that of the stated one was [m]."""
+    def _job_scene(self, job: Job) -> tuple[Scene, float]:
+        """The scene of a job, and the height of its indenter's centre above the recorded one [m], at which the lowest
+        point of an indenter of another size is in the same place."""
         values, _, size, index = job
         named = {each.name: value for each, value in zip(self.parameters, values, strict=True)}
         scene = scene_with(self.scene, named)
@@ -144,18 +145,18 @@ class Simulation:
         higher = depth_below_centre(shape, indenter.turn) - depth_below_centre(stated, indenter.turn)
         return scene.model_copy(update={"indenter": indenter}), higher
 
-    def _signals(self, batch: Batch, member: int, press: Press) -> list[float]:
-        """One number for each channel of the press, as the world is now."""
+    def _simulated_signals(self, batch: Batch, member: int, press: Press) -> list[float]:
+        """One number for each channel of the press, in the present state of the world."""
         world = batch.worlds[member]
-        felt: dict[str, float] = {}
+        readings: dict[str, float] = {}
         for sensor in world.sensors:
             wrench = world.wrench(sensor)
-            felt |= {f"{sensor}.{name}": float(wrench[k]) for k, name in enumerate(("fx", "fy", "fz"))}
-            if sensor in self.seen:
-                seen = self.seen[sensor]
-                surface = surface_map(world.surface(sensor), seen.grid, seen.markers)
-                felt |= shape_signals(sensor, surface.height, surface.flow, seen.valid, seen.grid.pitch)
-        return [felt[name] for name in press.readings]
+            readings |= {f"{sensor}.{name}": float(wrench[k]) for k, name in enumerate(("fx", "fy", "fz"))}
+            if sensor in self.sensor_views:
+                view = self.sensor_views[sensor]
+                surface = surface_map(world.surface(sensor), view.grid, view.markers)
+                readings |= shape_signals(sensor, surface.height, surface.flow, view.valid, view.grid.pitch)
+        return [readings[name] for name in press.readings]
 
 
 def shape_signals(
@@ -165,12 +166,12 @@ def shape_signals(
     valid: NDArray[np.bool_],
     pitch: float,
 ) -> dict[str, float]:
-    """What is fitted of a sensor's height map (points `pitch` apart) and flow, all in metres: the root mean square of
-    the height; the width of the dent, which is the radius of a circle of the area (sum h^2)^2 / sum h^4; the mean flow.
+    """The fitted signals of a sensor's height map (points `pitch` apart) and flow, all in metres: root mean square of
+    the height; width of the dent, which is the radius of a circle of the area (sum h^2)^2 / sum h^4; mean flow.
 
-    The width hardly depends on the material; it goes with the root of a ball's radius.
+    The width hardly depends on the material; it is proportional to the square root of a ball's radius.
     """
-    contact_share = 0.25  # of the deepest point: what is as deep counts as a dent's width
+    contact_share = 0.25  # of the largest depth; deeper points belong to the dent
     found = {}
     if height is not None:
         square = height[valid].astype(np.float64) ** 2
@@ -227,13 +228,13 @@ def scene_with(scene: Scene, values: Mapping[str, float]) -> Scene:
 
 
 def coarser(scene: Scene) -> Scene:
-    """The scene on a mesh twice as coarse, where each gel still has two layers of elements."""
+    """The scene with a mesh twice as coarse, but at least two layers of elements in each gel."""
     layers = {name: scene.gel_of(name).size[2] / 2 for name in scene.sensors}
     gels = {
-        name: own
-        if own.element_size is None
-        else own.model_copy(update={"element_size": min(2 * own.element_size, layers[name])})
-        for name, own in scene.gels.items()
+        name: gel
+        if gel.element_size is None
+        else gel.model_copy(update={"element_size": min(2 * gel.element_size, layers[name])})
+        for name, gel in scene.gels.items()
     }
     own = {name for name, each in gels.items() if each.element_size is not None}
     element = min([2 * scene.effective_element_size, *(layers[name] for name in scene.sensors if name not in own)])

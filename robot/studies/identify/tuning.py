@@ -8,16 +8,16 @@ docs/measurements/identification.md, and the tests in tests/robot/studies/identi
 # [-] friction at which a body slips on a gel: a slipping body determines the friction, the force of a sticking one does
 # not depend on it
 FIRST_FRICTION = 0.25
-FIRST_YIELD = 0.06  # of a body that the scene thinks elastic: where the fit begins, over its stiffness
+FIRST_YIELD = 0.06  # start of the fit for a body that is elastic in the scene, over its stiffness
 
 # motions.py
 PRESS_DEPTH, SLIDE_DEPTH = 0.25, 0.2  # of the gel's thickness
-# of the body's height: how far it is closed, to squeeze it and to slide on it
+# of the body's height: compression in a squeeze, and in a slide
 SQUEEZE_SHARE, SLIDE_SQUEEZE_SHARE = 0.4, 0.12
 BODY_SLIDE_SHARE = 0.5  # of its height: a step, a slide
-# of the body's height: how far a tilted gel is pressed in, and goes back before it slides
+# of the body's height: depth of a tilted gel, and its release before it slides
 TILT_DEPTH, TILT_RELEASE = 0.16, 0.06
-# of its height: how far a tilted gel is slid along the other's face, and during the motion back
+# of its height: slide of a tilted gel along the other's face, and back
 TILT_SLIDE, TILT_BACK = 0.3, 0.2
-SLIDE, STEP = 2.0e-3, 0.1e-3  # how far a gel is slid, and in what steps it is pressed [m]
+SLIDE, STEP = 2.0e-3, 0.1e-3  # length of a slide, and step of a press [m]
 BODY_STEP = 0.04  # of its height: a step, a slide

@@ -162,7 +162,7 @@ def test_a_press_that_does_not_slide_tells_no_friction() -> None:
 
 
 def test_noise_of_a_robots_own_sensor_is_refused() -> None:
-    with pytest.raises(NotIdentified, match="tell nothing of youngs_modulus"):
+    with pytest.raises(NotIdentified, match="do not identify youngs_modulus"):
         estimate_materials(
             [model(["youngs_modulus"])], recorded(4, noise=3.0), (STIFFNESS,), Priors(2e-5, 3.0), coarse_error=0.0
         )

@@ -137,12 +137,12 @@ def test_the_ball_is_found_in_the_surface(x: float, y: float, depth: float) -> N
 
 def test_what_is_no_ball_or_not_wholly_seen_is_refused() -> None:
     surface = _hertz(0.0, 0.0, 0.4e-3, BALL_RADIUS)
-    with pytest.raises(BadMeasurements, match="nothing is pressed"):
+    with pytest.raises(BadMeasurements, match="no contact in the gel"):
         locate_ball(0.0 * surface, EVERYWHERE, 0.25e-3, BALL_RADIUS)
-    with pytest.raises(BadMeasurements, match="reaches the rim"):
+    with pytest.raises(BadMeasurements, match="reaches the border"):
         locate_ball(_hertz(7.5e-3, 0.0, 0.4e-3, BALL_RADIUS), EVERYWHERE, 0.25e-3, BALL_RADIUS)
     box = 0.4e-3 * (np.abs(GRID) < (3e-3, 1e-3)).all(axis=-1)
-    with pytest.raises(BadMeasurements, match="no ball of 4 mm"):
+    with pytest.raises(BadMeasurements, match="not that of a ball of 4 mm"):
         locate_ball(box, EVERYWHERE, 0.25e-3, BALL_RADIUS)
     with pytest.raises(BadMeasurements, match="press deeper"):
         locate_ball(np.where(np.abs(GRID).max(axis=-1) < 0.3e-3, 1e-4, 0.0), EVERYWHERE, 0.25e-3, BALL_RADIUS)

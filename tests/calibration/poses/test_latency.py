@@ -115,11 +115,11 @@ def test_what_is_no_signal_is_refused() -> None:
     broken[3] = np.nan
     for given, text in (
         ((times, depth, seen_at, broken), "must be finite"),
-        ((times[::-1], depth, seen_at, touch), "times must grow"),
+        ((times[::-1], depth, seen_at, touch), "times must increase"),
         ((times, depth[:-1], seen_at, touch), "as many times as values"),
         ((times, depth, seen_at[:1], touch[:1]), "as many times as values"),
     ):
         with pytest.raises(ValueError, match=text):
             estimate_latency(*given)
-    with pytest.raises(ValueError, match="two growing bounds"):
+    with pytest.raises(ValueError, match="two increasing bounds"):
         estimate_latency(times, depth, seen_at, touch, search=(0.5, -0.1))

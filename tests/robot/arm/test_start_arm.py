@@ -7,7 +7,7 @@ import time
 import numpy as np
 import pytest
 
-from robot.arm.start_servo import distance_from_way
+from robot.arm.start_servo import distance_from_path
 from robot.arm.status import ArmStatus
 from robot.arm.trajectory import PERIOD
 from robot.arm.tuning import JOINT_SPEED
@@ -38,8 +38,8 @@ def test_an_arm_outside_its_box_goes_to_its_start_and_nowhere_else(mock: MockUR)
             arm.command(moved(arm.state().pose, 1e-3))
 
         def there(share: float) -> bool:
-            arm.go_on(share)
-            return arm.has_gone(share)
+            arm.continue_to(share)
+            return arm.has_reached(share)
 
         until(lambda: there(0.5), "half of the way")
         assert np.allclose(mock.faults.state().joints, here + 0.5 * TURN, atol=4e-3)
@@ -47,7 +47,7 @@ def test_an_arm_outside_its_box_goes_to_its_start_and_nowhere_else(mock: MockUR)
     assert np.allclose(mock.faults.state().joints, here + TURN, atol=4e-3)
     sent = servo_targets(mock.faults.received(before).entries)
     assert len(sent) > 100 and np.abs(np.diff(sent, axis=0)).max() <= JOINT_SPEED * PERIOD
-    assert max(distance_from_way(joints, here, here + TURN) for joints in sent) < 1e-5
+    assert max(distance_from_path(joints, here, here + TURN) for joints in sent) < 1e-5
 
 
 def test_an_arm_that_stands_off_its_way_is_refused(mock: MockUR) -> None:
@@ -64,7 +64,7 @@ def test_a_sensor_that_is_far_off_is_zeroed_first(mock: MockUR) -> None:
     with StartArm(away(), "left", here, here + TURN) as arm:
         assert arm.status() == ArmStatus.FORCE_LIMIT
         with pytest.raises(SafetyViolation):
-            arm.go_on(1.0)
+            arm.continue_to(1.0)
         time.sleep(0.05)
         assert np.allclose(mock.faults.state().joints, here, atol=1e-6)
         arm.zero_wrench()

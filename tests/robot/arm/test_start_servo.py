@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from robot.arm.channel import STATE, CommandKind, Partner, make_command_record
-from robot.arm.start_servo import distance_from_way
+from robot.arm.start_servo import distance_from_path
 from robot.arm.status import ArmStatus
 from robot.arm.trajectory import PERIOD
 from robot.arm.tuning import JOINT_SPEED, OFF_PATH
@@ -42,7 +42,7 @@ def test_it_reaches_its_start_straight_and_slowly_from_outside_its_box() -> None
     sent = np.array(made.sent)
     rates = np.diff(sent, axis=0) / PERIOD
     assert np.abs(rates).max() <= JOINT_SPEED
-    assert max(distance_from_way(q, HOME, END) for q in sent) < 1e-9
+    assert max(distance_from_path(q, HOME, END) for q in sent) < 1e-9
     velocity = np.diff(made.path(), axis=0) / PERIOD
     assert np.linalg.norm(velocity, axis=1).max() <= made.servo.config.speed
     assert np.linalg.norm(np.diff(velocity, axis=0), axis=1).max() / PERIOD <= made.servo.config.acceleration

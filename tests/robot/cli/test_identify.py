@@ -19,10 +19,10 @@ from tests.robot.cli.invoked import START, environment, tacsim
         (("gel", "gone", "--scene", "squeeze"), "has not an indenter"),
         (("body", "gone", "--scene", "press"), "has not a body"),
         (("body", "gone", "--set", "physics=seed"), "cannot be identified"),
-        (("gel", "a.csv", "--fit", "colour"), "'colour' is nothing that can be identified of a gel; allowed: youngs"),
+        (("gel", "a.csv", "--fit", "colour"), "'colour' is not a parameter of a gel; allowed: youngs"),
         (("gel", "gone", "--force-noise", "0 N"), "allowed: 1e-06 to 1000"),
         (("gel", "gone", "--ball", "6 mm"), "'6 mm' is not NAME=RADIUS"),
-        (("gel", "a.csv", "--ball", "b=6 mm"), "no recording 'b' that a ball belongs to; there are a"),
+        (("gel", "a.csv", "--ball", "b=6 mm"), "no recording 'b' that a ball belongs to; the recordings are a"),
     ],
 )
 def test_identify_invalid_input_is_reported(

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from robot.procedures.to_start import Guide, lead_to_start
+from robot.procedures.to_start import Operator, move_to_start
 from tacsim import pose as se3
 from tests.robot.cli.invoked import tacsim
 from tests.robot.cli.lab import Lab, copy_of
@@ -42,11 +42,11 @@ def test_start_moves_arms_to_start_then_dry_run(tmp_path: Path) -> None:
         here = lab.faults["arm"].state().joints
         with Terminal("start", str(file), folder=tmp_path, lines=80) as terminal:
             terminal.wait_for("outside:")
-            for question in ("Connect", "shall it be zeroed?", "of this way (Ctrl-C brakes it)?"):
+            for question in ("Connect", "zero it now?", "of this path (Ctrl-C brakes it)?"):
                 terminal.wait_for(question)
                 assert np.allclose(lab.faults["arm"].state().joints, here, atol=1e-6)
                 terminal.type("y\n")
-            terminal.wait_for("shall it go on to its start")
+            terminal.wait_for("Then continue to its start")
             terminal.type("y\n")
             terminal.wait_for("Next: tacsim run")
             assert terminal.end() == 0, terminal.picture
@@ -67,19 +67,19 @@ def test_start_ctrl_c_brakes_arm_and_no_moves_nothing(tmp_path: Path) -> None:
         with Terminal("start", str(file), folder=tmp_path, lines=80) as terminal:
             terminal.wait_for("Connect")
             terminal.type("y\n")
-            terminal.wait_for("of this way (Ctrl-C brakes it)?")
+            terminal.wait_for("of this path (Ctrl-C brakes it)?")
             terminal.type("n\n")
             terminal.wait_for("stays where it is")
             assert terminal.end() == 1
         assert np.allclose(faults.state().joints, here, atol=1e-6)
         with Terminal("start", str(file), folder=tmp_path, lines=80) as terminal:
-            for question in ("Connect", "of this way (Ctrl-C brakes it)?", "shall it go on to its start"):
+            for question in ("Connect", "of this path (Ctrl-C brakes it)?", "Then continue to its start"):
                 terminal.wait_for(question)
                 terminal.type("y\n")
             terminal.until(lambda: np.abs(np.array(faults.state().joints) - here).max() > 0.04, "most of the way")
             terminal.type("\x03")
             assert terminal.end() == 128 + signal.SIGINT
-            assert terminal.shows("was stopped on its way to the start"), terminal.picture
+            assert terminal.shows("was stopped before it reached its start"), terminal.picture
         state = faults.state()
         assert state.rests and not state.program and not np.allclose(state.joints, here, atol=1e-3)
 
@@ -97,7 +97,7 @@ def test_start_killed_process_brings_arm_to_rest(tmp_path: Path) -> None:
     with Lab(file, offset=AWAY) as lab:
         faults, here = lab.faults["arm"], np.array(lab.faults["arm"].state().joints)
         with Terminal("start", str(file), folder=tmp_path, lines=80) as terminal:
-            for question in ("Connect", "of this way (Ctrl-C brakes it)?", "shall it go on to its start"):
+            for question in ("Connect", "of this path (Ctrl-C brakes it)?", "Then continue to its start"):
                 terminal.wait_for(question)
                 terminal.type("y\n")
             terminal.until(lambda: np.abs(np.array(faults.state().joints) - here).max() > 0.04, "most of the way")
@@ -112,6 +112,6 @@ def test_start_without_zeroing_keeps_force_fault(tmp_path: Path) -> None:
     with Lab(file, offset=AWAY) as lab:
         lab.faults["arm"].wrench([0.0, OFFSET, 0.0, 0.0, 0.0, 0.0])
         here, said = lab.faults["arm"].state().joints, list[str]()
-        away = lead_to_start(lab.config, lab.starts, Guide(lambda question: "Connect" in question, said.append))
+        away = move_to_start(lab.config, lab.starts, Operator(lambda question: "Connect" in question, said.append))
         assert away["arm"] > 0.05 and "cannot be moved" in said[-1]
         assert np.allclose(lab.faults["arm"].state().joints, here, atol=1e-6)

@@ -49,7 +49,7 @@ def test_a_node_dies_and_nothing_is_lost_or_there_twice(
     second = next(node for node in cluster.list_all_nodes() if node is not cluster.head_node)
     before: list[int] = []
     after: list[str] = []
-    put = SetFolder.put
+    put = SetFolder.write_piece
 
     def spy(self: SetFolder, piece: Piece) -> None:
         put(self, piece)
@@ -60,10 +60,10 @@ def test_a_node_dies_and_nothing_is_lost_or_there_twice(
         elif before:
             after.append(by)
 
-    monkeypatch.setattr(SetFolder, "put", spy)
+    monkeypatch.setattr(SetFolder, "write_piece", spy)
     told: list[int] = []
     found = collect(
-        made, tmp_path / "set", {}, "x", cluster=cluster.address, tell=lambda done, total: told.append(done)
+        made, tmp_path / "set", {}, "x", cluster=cluster.address, report_progress=lambda done, total: told.append(done)
     )
     assert found.made == 80 and not found.failures
     assert before and before[0] < 70  # in the middle
@@ -76,12 +76,12 @@ def test_a_node_dies_and_nothing_is_lost_or_there_twice(
 
 def test_nodes_with_another_version_are_told(cluster: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("robot.collect.cluster.versions", lambda: {"tacsim": "9.9"})
-    with pytest.raises(CollectFailed, match=r"a node has tacsim .*, the command was given to 9\.9"):
+    with pytest.raises(CollectFailed, match=r"a node has tacsim .*, the command runs with 9\.9"):
         collect(job(2), tmp_path / "set", {}, "x", cluster=cluster.address)
     assert not (tmp_path / "set/data").exists()
 
 
 def test_no_cluster_at_the_address_is_an_error_in_words(tmp_path: Path) -> None:
-    with pytest.raises(SetError, match=r"--ray 127\.0\.0\.1:1: no Ray cluster answers there"):
+    with pytest.raises(SetError, match=r"--ray 127\.0\.0\.1:1: no Ray cluster answers at this address"):
         collect(job(2), tmp_path / "set", {}, "x", cluster="127.0.0.1:1")
     assert not (tmp_path / "set").exists()

@@ -77,7 +77,7 @@ def test_stopped_it_keeps_what_is_written_and_goes_on(whole: Path, tmp_path: Pat
         collect(job(5), tmp_path / "set", {}, "x", stop=lambda: next(asked))
     assert len(rows(tmp_path / "set")) == 4
     told: list[tuple[int, int]] = []
-    assert collect(job(5), tmp_path / "set", {}, "x", tell=lambda *now: told.append(now)).made == 1
+    assert collect(job(5), tmp_path / "set", {}, "x", report_progress=lambda *now: told.append(now)).made == 1
     assert told == [(4, 5), (5, 5)]
     assert contents(tmp_path / "set") == contents(whole)
 
@@ -86,7 +86,7 @@ def test_more_presses_make_a_set_longer(whole: Path, tmp_path: Path) -> None:
     collect(job(3), tmp_path / "set", {}, "x")
     assert collect(job(5), tmp_path / "set", {}, "x").made == 3  # the last file was cut short: made anew
     assert contents(tmp_path / "set") == contents(whole)
-    with pytest.raises(SetError, match="it has 5 already begun, 3 are asked for"):
+    with pytest.raises(SetError, match="its count is 5, the requested count is 3"):
         collect(job(3), tmp_path / "set", {}, "x")
 
 
@@ -104,7 +104,7 @@ def test_another_command_is_refused_and_nothing_changes(whole: Path) -> None:
 def test_a_folder_of_something_else_is_refused(tmp_path: Path) -> None:
     (tmp_path / "full").mkdir()
     (tmp_path / "full/thesis.txt").write_text("mine")
-    with pytest.raises(SetError, match="exists and holds no set"):
+    with pytest.raises(SetError, match="exists, but holds no set"):
         collect(job(1), tmp_path / "full", {}, "x")
     assert [path.name for path in (tmp_path / "full").iterdir()] == ["thesis.txt"]
     (tmp_path / "full/collect.json").write_text("{}")
@@ -137,7 +137,7 @@ def test_who_begins_at_the_same_time_waits_for_who_was_faster(tmp_path: Path, mo
         return str(real(**place))
 
     monkeypatch.setattr(whole_file.tempfile, "mkdtemp", late)
-    with ExitStack() as held, pytest.raises(SetError, match="another tacsim collect is at work"):
+    with ExitStack() as held, pytest.raises(SetError, match="another tacsim collect works in this folder"):
         collect(made, tmp_path / "set", {}, "x")
     assert [path.name for path in tmp_path.iterdir()] == ["set"]
 
@@ -146,7 +146,7 @@ def test_nobody_else_writes_meanwhile(tmp_path: Path) -> None:
     made = job(1)
     with (
         open_set(tmp_path / "set", made, made.settings.model_dump(mode="json"), {}, "x"),
-        pytest.raises(SetError, match="another tacsim collect is at work"),
+        pytest.raises(SetError, match="another tacsim collect works in this folder"),
     ):
         collect(made, tmp_path / "set", {}, "x")
 
@@ -270,7 +270,7 @@ def test_the_command_makes_a_set_of_a_folder_of_objects(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        (("--objects", "nothing"), "is no folder; give a folder of STL files, or 'shapes'"),
+        (("--objects", "nothing"), "is not a folder; give a folder of STL files, or 'shapes'"),
         (("--objects", "empty"), "empty holds no STL file"),
         (("--objects", "broken"), "stl: is no STL"),
         (("--depth", "1..0.1mm"), "goes from the larger to the smaller"),
@@ -311,6 +311,6 @@ def test_a_piece_that_comes_twice_is_written_once(tmp_path: Path) -> None:
     """As Ray may send it."""
     made = job(2)
     with open_set(tmp_path / "set", made, made.settings.model_dump(mode="json"), {}, "x") as place:
-        place.put(Piece(0, b"first", {}, 2))
-        place.put(Piece(0, b"second", {}, 2))
+        place.write_piece(Piece(0, b"first", {}, 2))
+        place.write_piece(Piece(0, b"second", {}, 2))
         assert place.missing == [] and (place.path / made.name(0)).read_bytes() == b"first"

@@ -15,9 +15,9 @@ from pyarrow import parquet
 
 from robot.collect.collect import collect
 from robot.collect.presses import PressSet
-from robot.collect.shapes import CLOSED_FORMS, meshes
-from robot.collect.table import WORDS
-from robot.studies.press import UNFELT, PressMotion, press
+from robot.collect.shapes import CLOSED_FORMS, make_meshes
+from robot.collect.table import COLUMN_TEXTS
+from robot.studies.press import MAX_MISSED_DEPTH_SHARE, PressMotion, press
 from tacsim import pose as se3
 from tacsim.config import load_scene, load_sensor
 from tacsim.geometry.mesh import load_mesh
@@ -44,7 +44,7 @@ def test_a_row_is_the_press_of_its_number(folder: Path) -> None:
     """Picture, height and force are those of the same press by itself, bit for bit."""
     made = settings(shear=(0.1e-3, 0.2e-3), twist=(-0.1, 0.1))
     for row in rows(folder)[3:5]:
-        _, scene, motion = made.placed(row["index"])
+        _, scene, motion = made.draw_press(row["index"])
         alone = press(scene, made.sensor, motion)
         assert np.array_equal(decoded(row["image"]), alone.image)
         assert np.array(row["height"], np.float32).tobytes() == alone.height.tobytes()
@@ -75,7 +75,7 @@ def test_the_side_that_presses_is_that_of_the_scene(pose: str) -> None:
     scene = load_scene("press", ["preset=draft", "indenter.roll=180 deg"])
     made = settings(scene=scene, pose=pose, tilt=(0.0, np.radians(5.0) if pose == "random" else 0.0))
     for index in range(4):
-        _, placed, motion = made.placed(index)
+        _, placed, motion = made.draw_press(index)
         assert placed.indenter is not None
         turn = placed.indenter.turn if motion.turn is None else motion.turn
         own_z = se3.rotate(Pose(quaternion=turn), [0.0, 0.0, 1.0])
@@ -92,7 +92,7 @@ def test_flow_is_told_on_the_lattice_that_the_card_names(folder: Path) -> None:
 def test_a_tilted_object_reaches_as_deep_as_it_shall() -> None:
     """A cube, tilted: its lowest corner or edge, by its corners alone (rounded edges: learn rounds by 1 mm)."""
     made = settings(tilt=(0.3, 0.3))
-    _, scene, motion = made.placed(1)
+    _, scene, motion = made.draw_press(1)
     assert scene.indenter is not None and motion.turn is not None
     pressed = press(scene, made.sensor, motion)
     radius = scene.indenter.effective_edge_radius(scene.effective_element_size)
@@ -104,15 +104,15 @@ def test_a_tilted_object_reaches_as_deep_as_it_shall() -> None:
 def test_more_options_change_no_other_draws() -> None:
     plain, more = settings(), settings(shear=(0.0, 0.3e-3), twist=(0.0, 0.2))
     for index in range(4):
-        a, b = plain.placed(index)[2], more.placed(index)[2]
+        a, b = plain.draw_press(index)[2], more.draw_press(index)[2]
         assert (a.depth, a.at) == (b.depth, b.at) and np.array_equal(np.array(a.turn), np.array(b.turn))
 
 
 def test_a_ball_is_in_the_picture_and_on_the_gel_and_a_larger_one_amidst() -> None:
     made = settings(objects={"ball": Sphere(radius=3e-3), "large": Sphere(radius=11e-3)})
-    places = np.array([made.placed(index)[2].at for index in range(0, 400, 2)])
+    places = np.array([made.draw_press(index)[2].at for index in range(0, 400, 2)])
     assert np.abs(places).max(axis=0) == pytest.approx([7e-3, 4.5e-3], rel=0.03)
-    assert np.allclose([made.placed(index)[2].at for index in range(1, 20, 2)], 0.0, atol=1e-12)
+    assert np.allclose([made.draw_press(index)[2].at for index in range(1, 20, 2)], 0.0, atol=1e-12)
 
 
 def test_the_mesh_of_a_ball_has_the_contact_of_the_ball(tmp_path: Path) -> None:
@@ -134,7 +134,7 @@ def test_the_files_tell_datasets_their_types(folder: Path) -> None:
     """And the card's head tells it where they are. (`datasets` itself is not needed here.)"""
     path = folder / "data/train-00000.parquet"
     told = json.loads(parquet.read_schema(path).metadata[b"huggingface"])["info"]["features"]
-    assert list(told) == list(WORDS) == parquet.read_schema(path).names
+    assert list(told) == list(COLUMN_TEXTS) == parquet.read_schema(path).names
     assert told["image"] == told["contact"] == {"_type": "Image"}
     assert told["object"] == {"names": ["ball", "cube"], "_type": "ClassLabel"}
     assert told["height"] == {"shape": [240, 320], "dtype": "float32", "_type": "Array2D"}
@@ -160,7 +160,7 @@ def test_a_press_whose_edge_the_gel_cannot_feel_is_told(tmp_path: Path) -> None:
     made = job(2, objects=objects, scene=load_scene("press", ["preset=draft"]), depth=(1e-3, 1e-3), pose="centred")
     collect(made, tmp_path / "set", {"objects/wedge.stl": wedge.export(file_type="stl")}, "x")
     ball, edge = rows(tmp_path / "set")
-    assert ball["unfelt"] < UNFELT < edge["unfelt"] < 0.25 and not (ball["folded"] or edge["folded"])
+    assert ball["unfelt"] < MAX_MISSED_DEPTH_SHARE < edge["unfelt"] < 0.25 and not (ball["folded"] or edge["folded"])
     assert "1 with forces too small" in (tmp_path / "set/README.md").read_text()
 
 
@@ -177,7 +177,7 @@ def test_a_press_that_fails_is_a_row_of_failures_and_the_set_goes_on(tmp_path: P
 
 
 def test_twenty_shapes_are_closed_meshes_that_a_gel_has_room_for(tmp_path: Path) -> None:
-    made = meshes()
+    made = make_meshes()
     assert len(CLOSED_FORMS) + len(made) == 20
     for name, mesh in made.items():
         mesh.export(tmp_path / f"{name}.stl")
@@ -188,10 +188,10 @@ def test_twenty_shapes_are_closed_meshes_that_a_gel_has_room_for(tmp_path: Path)
 @pytest.mark.parametrize(
     ("given", "words"),
     [
-        ({"depth": (0.5e-3, 0.1e-3)}, "depth goes from 0.0005 to 0.0001: say the smaller one first"),
+        ({"depth": (0.5e-3, 0.1e-3)}, "depth ranges from 0.0005 to 0.0001: give the smaller number first"),
         ({"depth": (0.1e-3, 4e-3)}, "depth is 0.004 m; it must be above 0 and below the gel's 0.004 m"),
         ({"tilt": (0.0, math.pi)}, "at most 45 deg"),
-        ({"shear": (-1e-3, 0.0)}, "shear begins at -0.001"),
+        ({"shear": (-1e-3, 0.0)}, "shear starts at -0.001"),
         ({"scene": Scene()}, "has no indenter"),
     ],
 )

@@ -15,7 +15,7 @@ import pytest
 from pyarrow import parquet
 
 from robot.export.lerobot_files import DataSet
-from robot.export.lerobot_mapping import Feature, ImageCounts, column_statistics, frames_per_second, merged
+from robot.export.lerobot_mapping import Feature, ImageCounts, column_statistics, frames_per_second, merge_statistics
 from robot.open import open_rig
 from tacsim import pose as se3
 from tacsim.interface import Action, RigSpec
@@ -107,7 +107,7 @@ def test_statistics_are_those_of_the_numbers() -> None:
     exact = np.quantile(whole, 0.9, axis=(0, 1, 2), method="inverted_cdf")
     assert np.array_equal(found["q90"].ravel(), exact) and found["count"].tolist() == [4]
     a, b = rng.normal(size=(5, 3)), rng.normal(3.0, 2.0, size=(8, 3))
-    both, together = merged([column_statistics(a), column_statistics(b)]), np.concatenate([a, b])
+    both, together = merge_statistics([column_statistics(a), column_statistics(b)]), np.concatenate([a, b])
     for name in ("min", "max", "mean", "std"):
         assert np.allclose(both[name], getattr(np, name)(together, axis=0))
     assert both["count"].tolist() == [13]
@@ -178,7 +178,7 @@ def without_surface() -> list[str]:
 
 
 BAD: list[tuple[Callable[[], list[str]], str]] = [
-    (cut_off, "cut.mcap was cut off after 5 steps: leave it out, or take what is there (--cut)"),
+    (cut_off, "cut.mcap was cut off after 5 steps: leave it out, or export these steps (--cut)"),
     (two_rates, "a data set has one rate, but a.mcap has a step every 0.1 s and b.mcap every 0.05 s"),
     (other_format, "a.mcap: episode format '99', but this tacsim reads"),
     (without_pictures, "a.mcap: no sensor"),
@@ -187,7 +187,7 @@ BAD: list[tuple[Callable[[], list[str]], str]] = [
     (lambda: [str(record("a.mcap")[0]), str(record("b.mcap", names=("upper",))[0])], "a.mcap and b.mcap do not fit"),
     (lambda: ["none.mcap"], "none.mcap: no such file"),
     (no_recording, "text.mcap: not an MCAP file"),
-    (without_surface, "b.mcap: step 2 lacks what the recording says it has: the policy sees heights"),
+    (without_surface, "b.mcap: step 2 lacks data that the recording declares: the policy sees heights"),
 ]
 
 

@@ -92,7 +92,7 @@ def test_episodes_lie_one_behind_the_other_and_files_are_followed_by_others(tmp_
     episodes = [smooth(7 + k, k) for k in range(5)]
     data = write(tmp_path / "one", episodes)
     _, columns = read_dataset(tmp_path / "one")
-    told = data.videos["observation.images.a"].error.told()
+    told = data.videos["observation.images.a"].error.summarise()
     error = columns["observation.images.a"].astype(int) - np.concatenate(episodes)
     assert told["most"] == np.abs(error).max() and told["rms"] < 1.57
     small = write(tmp_path / "many", episodes, video_size=0.01)

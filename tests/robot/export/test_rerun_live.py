@@ -39,7 +39,7 @@ class NoViewer:
         self.sent: list[Any] = []
         self.go = threading.Event()
         made: Any = object.__new__(LiveView)
-        made._line, made.left_out, made._ended = rerun_view.queue.Queue(rerun_view.WAITING), 0, False
+        made._line, made.left_out, made._ended = rerun_view.queue.Queue(rerun_view.MAX_WAITING_STEPS), 0, False
         made._pipe = made._process = self
         made._thread = threading.Thread(target=made._hand_over, daemon=True)
         made._thread.start()
@@ -73,7 +73,7 @@ def test_a_viewer_that_is_too_slow_is_not_waited_for() -> None:
         time.sleep(1e-3)
     for k in range(1, 10):
         stalled.view(*steps[k % 3])
-    assert stalled.view.left_out == 9 - rerun_view.WAITING and stalled.sent == []
+    assert stalled.view.left_out == 9 - rerun_view.MAX_WAITING_STEPS and stalled.sent == []
     stalled.go.set()
     stalled.view.close()
     assert [each if each is None else each[0].index for each in stalled.sent] == [0, 1, 2, None]

@@ -192,7 +192,7 @@ def test_presses_dark_reference_raises() -> None:
 def test_handheld_camera_without_gel_raises() -> None:
     with pytest.raises(CannotCalibrate, match="is not a sensor with a camera; such sensors: none"):
         handheld_camera(load_rig("sim").config, "lower")
-    with pytest.raises(CannotCalibrate, match="nobody can press its gel"):
+    with pytest.raises(CannotCalibrate, match="its gel cannot be pressed by hand"):
         handheld_camera(load_rig("mock").config, "lower")
     assert handheld_camera(load_rig("ur5e").config, "upper").driver == "camera"
 
@@ -364,7 +364,7 @@ def test_command_invalid_input_exits_2(tmp_path: Path) -> None:
         (["--camera", f"{rig}/finger", *ball], 2, "give --pixel-pitch or --view, or --kind"),
         (["--camera", "finger", *ball, *pitch], 2, "give rig and sensor"),
         (["--camera", f"{rig}/thumb", *ball, *pitch], 2, "'thumb' is not a sensor with a camera; such sensors: finger"),
-        (["--camera", "mock/lower", *ball, *pitch], 2, "nobody can press its gel"),
+        (["--camera", "mock/lower", *ball, *pitch], 2, "its gel cannot be pressed by hand"),
         (["--camera", f"{rig}/finger", *ball, *pitch], 1, "no picture from http://127.0.0.1:9/"),
     ):
         done = tacsim("calibrate", "sensor", *words, "--out", tmp_path / "out")

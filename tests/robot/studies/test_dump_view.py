@@ -127,8 +127,8 @@ def test_a_command_that_makes_no_sense_is_refused(tmp_path: Path, monkeypatch: p
     place = diverge(SCENES["press"], tmp_path, monkeypatch)
     info = json.loads((place / "dump.json").read_text())
     for change, said in (
-        ({"targets": {"other": [0.0] * 6 + [1.0]}}, "cannot be run again: no driven frame other"),
-        ({"loads": {"other": 1.0}}, "cannot be run again: no sensor 'other'"),
+        ({"targets": {"other": [0.0] * 6 + [1.0]}}, "cannot be repeated: no driven frame other"),
+        ({"loads": {"other": 1.0}}, "cannot be repeated: no sensor 'other'"),
         ({"loads": {"lower": -1.0}}, "load of 'lower' is -1 N"),
         ({"duration": 1e308}, "duration is 1e+308 s"),
         ({"duration": 1e-3, "flow": True}, "exclude one another"),

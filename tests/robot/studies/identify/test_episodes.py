@@ -37,7 +37,7 @@ def test_a_recording_simulated_again(
     press = merge_repeated_readings(recordings.read(Path("runs/one/episode.mcap")))
     assert press.name == "one" and {"lower.fx", "lower.fz", "lower.dent"} <= set(press.readings)
     signals = signals_of([press], Noise())
-    [again] = Simulation(known, (), (press,), recordings.seen)([Point(np.zeros(0), np.zeros(1))])
+    [again] = Simulation(known, (), (press,), recordings.sensor_views)([Point(np.zeros(0), np.zeros(1))])
     for index, channel in enumerate(signals.channels):
         rows = signals.channel == index
         size = np.abs(signals.values[rows]).max()

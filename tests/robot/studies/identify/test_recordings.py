@@ -14,8 +14,8 @@ from calibration.materials.presses import Noise, signals_of
 from robot.deploy.policy import load_policy
 from robot.deploy.python_policy import PolicyNotFound
 from robot.studies.identify import results
-from robot.studies.identify.identify import Identified, outlook, parameters_of
-from robot.studies.identify.motions import WHAT_TELLS, WORDS, motions
+from robot.studies.identify.identify import Identified, parameters_of, predict_intervals
+from robot.studies.identify.motions import MOTION_TEXTS, MOTIONS_FOR_PARAMETER, motions
 from robot.studies.identify.recordings import BadRecording, Recordings, find_recordings
 from robot.studies.identify.simulation import scene_with
 from tacsim.config import load_rig, load_scene
@@ -82,7 +82,7 @@ def test_motions_are_policies(kind: str, tmp_path: Path) -> None:
     """Each that is named to tell something is there, and its arm goes back first, then forward."""
     scene = load_scene(kind)
     tables = motions(scene)
-    assert set(WHAT_TELLS["gel" if kind == "press" else "body"].values()) <= set(tables) <= set(WORDS)
+    assert set(MOTIONS_FOR_PARAMETER["gel" if kind == "press" else "body"].values()) <= set(tables) <= set(MOTION_TEXTS)
     for name, table in tables.items():
         path = tmp_path / f"{name}.csv"
         path.write_text(table)
@@ -165,5 +165,5 @@ def test_a_write_that_fails_leaves_nothing(
 
 
 def test_a_coarser_force_sensor_tells_less(identified: Identified) -> None:
-    now, worse = outlook(identified, 1e-4), outlook(identified, 1e-2)
+    now, worse = predict_intervals(identified, 1e-4), predict_intervals(identified, 1e-2)
     assert all(worse[name] > 2 * now[name] for name in now)

@@ -11,13 +11,13 @@ from calibration.materials.fit import Point, Priors
 from calibration.materials.presses import Noise, Press
 from robot.studies.identify.identify import Identified, identify
 from robot.studies.identify.recordings import Recordings
-from robot.studies.identify.simulation import Seen, Simulation, shape_signals
+from robot.studies.identify.simulation import SensorView, Simulation, shape_signals
 from tacsim.config import load_scene
 from tacsim.interface import Pose
 from tacsim.models.scene import Scene
 from tacsim.models.sensor import CanonicalGrid
 
-SEEN = {"lower": Seen(CanonicalGrid(), None, np.ones((64, 64), np.bool_))}
+SEEN = {"lower": SensorView(CanonicalGrid(), None, np.ones((64, 64), np.bool_))}
 NOISE = Noise(force=0.02)
 DEPTHS = np.array([-0.2, -0.1, 0.3, 0.6, 0.9, -0.2]) * 1e-3
 
@@ -57,7 +57,7 @@ def recorded(
 
 def found(ball: Press, radius: float) -> Identified:
     recordings = Recordings(scene(radius))
-    recordings.seen = SEEN
+    recordings.sensor_views = SEEN
     return identify(
         "gel", scene(radius), recordings, [ball], NOISE, Priors(0.02e-3, 0.2), wanted=["youngs_modulus"]
     )  # fmt: skip

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from robot.arm.controller.arm_placement import MAX_ZERO_FORCE, check_placement, measure_placement, pendant_pose
 from robot.arm.controller.rtde import ControllerReading, read_controller
-from robot.arm.controller.stand import OFF_FORCE, compare, on_pendant, stand
 from robot.arm.ur import URArm
 from robot.camera.driver import CameraDriver
 from robot.common.kinematics import Kinematics, matrix, pose
@@ -70,11 +70,11 @@ def test_an_arm_out_of_its_box_is_told_with_all_that_differs_from_the_file(
     told = {name.removeprefix("arm: "): check for name, check in found.items()}
     box = told["workspace"]
     assert box.state == "fail" and "mm beyond the workspace's" in box.found and "on the pendant" in box.found
-    assert "`tacsim start my.yaml` leads it to its start" in box.advice
+    assert "`tacsim start my.yaml` moves it to its start" in box.advice
     assert told["force"].state == "fail"
     for untold, words in ((CARRIED[0], "of 20 N"), (CARRIED[0] - 0.3, "N, ")):  # now, and with the file's payload
         assert f"{np.hypot(OFFSET, 9.82 * untold):.1f} {words}" in told["force"].found
-    assert "no run can start so" in told["force"].advice and "`tacsim start my.yaml`" in told["force"].advice
+    assert "no run can start" in told["force"].advice and "`tacsim start my.yaml`" in told["force"].advice
     assert told["serial number"].state == "fail"
     assert told["serial number"].found == f"the robot has {SERIAL}, the file says 20190000001"
     assert told["payload"].state == "warn" and "has 0 kg" in told["payload"].found
@@ -91,14 +91,14 @@ def test_the_way_to_the_start_is_that_of_the_pendant(mock: MockUR) -> None:
     flange = Kinematics("ur5e").forward(JOINTS)
     reading = read_controller(HOST)
     assert np.allclose(reading.joints, JOINTS) and reading.tcp is not None
-    now = stand(config, _with(reading, tcp=told, tcp_pose=pose(flange @ matrix(told))))
+    now = measure_placement(config, _with(reading, tcp=told, tcp_pose=pose(flange @ matrix(told))))
     assert config.start is not None
-    target = on_pendant(config, now, config.start.pose)
+    target = pendant_pose(config, now, config.start.pose)
     frames = ArmFrames.of(config)
     sensor = frames.world_from_base @ matrix(target) @ np.linalg.inv(matrix(told))
     sensor = sensor @ frames.flange_from_tool @ frames.tool_from_sensor
     assert np.allclose(sensor, se3.to_matrix(config.start.pose), atol=1e-9)
-    way = by_name(list(compare("arm", config, now, config.start.pose, "f")))["arm: way to start"]
+    way = by_name(list(check_placement("arm", config, now, config.start.pose, "f")))["arm: way to start"]
     for axis, value in zip("XYZ", target[:3] - now.reading.tcp_pose[:3], strict=True):
         assert f"{axis} {round(1e3 * value):+d}" in way.found
     assert f"X {1e3 * target[0]:.1f} Y {1e3 * target[1]:.1f} Z {1e3 * target[2]:.1f} mm" in way.found
@@ -125,7 +125,9 @@ def _at_start(config: UrArmConfig, **changes: object) -> dict[str, Check]:
         tcp=tcp,
         speed_slider=1.0,
     )
-    checks = compare("arm", config, stand(config, _with(plain, **changes)), config.start.pose, "my.yaml")
+    checks = check_placement(
+        "arm", config, measure_placement(config, _with(plain, **changes)), config.start.pose, "my.yaml"
+    )
     return {check.name.removeprefix("arm: "): check for check in checks}
 
 
@@ -142,7 +144,7 @@ def test_what_an_old_controller_does_not_tell_is_said() -> None:
 
 @pytest.mark.parametrize(("newtons", "state"), [(0.9, "ok"), (1.5, "warn"), (19.0, "warn"), (20.5, "fail")])
 def test_a_force_at_rest_is_judged(newtons: float, state: str) -> None:
-    assert OFF_FORCE == 1.0
+    assert MAX_ZERO_FORCE == 1.0
     force = _at_start(shipped(), tcp_force=np.array([0.0, newtons, 0.0, 0.0, 0.0, 0.0]))["force"]
     assert force.state == state and f"{newtons:.1f} of 20 N" in force.found
 
@@ -202,7 +204,10 @@ def test_sensors_nearer_than_their_keep_out_fail() -> None:
     config = shipped()
     reading = read_plain(config)
     shifted = reading.tcp_pose + [2e-3, 0.0, 0.0, 0.0, 0.0, 0.0]
-    stands = {"left": stand(config, reading), "right": stand(config, _with(reading, tcp_pose=shifted))}
+    stands = {
+        "left": measure_placement(config, reading),
+        "right": measure_placement(config, _with(reading, tcp_pose=shifted)),
+    }
     poses = {name: se3.from_matrix(each.sensor) for name, each in stands.items()}
     for distance, state in ((3e-3, "fail"), (1e-3, "ok")):
         assert check_keep_out(KeepOut(arms=("left", "right"), distance=distance), poses, "f").state == state

@@ -1,7 +1,7 @@
-"""How well the distance that is felt agrees with the true one: `python -m benchmarks.felt_distance`.
+"""Agreement of the tactile distance of a task with the true one: `python -m benchmarks.tactile_distance`.
 
-Episodes of each task at `learn`, of bodies, clays and goals that are drawn anew, played by the scripted policy and by a
-random one; at every tenth step both distances are taken. Minutes; docs/learn.md has the figures.
+Runs episodes of each task at `learn` with random bodies, clays and goals, by the scripted and by a random policy, and
+compares both distances at every tenth step. It takes minutes; docs/learn.md has the figures.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ DRAWN: dict[str, dict[str, Any]] = {
 
 
 def agreement(task: str, rounds: int, seed: int) -> FloatArray:
-    """(n, 2) true and felt distance [m] of 16 `rounds` episodes, half of them scripted."""
+    """(n, 2) true and estimated distance [m] of 16 `rounds` episodes, half of them scripted."""
     overrides = ["scene.preset=learn", "motion=flowing", f"task.steps={STEPS[task]}"]
     overrides += [f"sensors.{n}.model.geometry.{w}=16" for n in ("lower", "upper") for w in ("width", "height")]
     overrides += [f"sensors.{n}.model.geometry.pixel_pitch=1 mm" for n in ("lower", "upper")]
@@ -71,7 +71,7 @@ def agreement(task: str, rounds: int, seed: int) -> FloatArray:
 def _episodes(envs: TacsimVectorEnv, steps: int, random: np.random.Generator) -> list[tuple[float, float]]:
     each = [env for env in envs.envs if isinstance(env, TacsimEnv)]
     starts = [env.rig.truth() for env in each]
-    feel = [env.task.estimator(CanonicalGrid()) for env in each]
+    estimators = [env.task.estimator(CanonicalGrid()) for env in each]
     scripted = [env.task.scripted(through=True) for env in each]
     drift, found = [np.zeros(len(env.task.axes)) for env in each], []
     for step in range(steps):
@@ -79,9 +79,9 @@ def _episodes(envs: TacsimVectorEnv, steps: int, random: np.random.Generator) ->
         for number, env in enumerate(each):
             observation, truth, start = env.rig.observe(), env.rig.truth(), starts[number]
             assert truth is not None and start is not None
-            felt = feel[number](observation)
-            if felt is not None and step % EVERY == 0 and env.phase == "running":
-                found.append((env.task.distance(truth, start), felt))
+            estimate = estimators[number](observation)
+            if estimate is not None and step % EVERY == 0 and env.phase == "running":
+                found.append((env.task.distance(truth, start), estimate))
             drift[number] = 0.8 * drift[number] + random.normal(0.0, 0.4, len(env.task.axes))
             vector = drift[number].clip(-1.0, 1.0)
             if env.task.config.kind == "knead":
@@ -92,22 +92,22 @@ def _episodes(envs: TacsimVectorEnv, steps: int, random: np.random.Generator) ->
             actions.append(vector.astype(np.float32))
         _, _, terminated, truncated, _ = envs.step(np.array(actions))
         ended = terminated | truncated
-        if ended.any() and step < steps - 1:  # a limit, or a divergence: what follows does not count
+        if ended.any() and step < steps - 1:  # after a limit or a divergence, the rest does not count
             envs.reset(options={"reset_mask": ended})
             for number in np.flatnonzero(ended).tolist():
-                feel[number] = lambda observation: None
+                estimators[number] = lambda observation: None
     return found
 
 
 def main(rounds: int = 3, seed: int = 77) -> None:
     typer.echo("| task | moments | r | rank | rms | true distances |\n|---|---|---|---|---|---|")
     for task in NAMES:
-        true, felt = 1e3 * agreement(task, rounds, seed).T
-        rms = float(np.sqrt(np.mean((true - felt) ** 2)))
+        true, estimated = 1e3 * agreement(task, rounds, seed).T
+        rms = float(np.sqrt(np.mean((true - estimated) ** 2)))
         low, high = np.percentile(true, [5, 95])
         typer.echo(
-            f"| `{task}` | {len(true)} | {np.corrcoef(true, felt)[0, 1]:.3f} | {stats.spearmanr(true, felt)[0]:.3f} | "
-            f"{rms:.3f} mm | {low:.2f} to {high:.2f} mm |"
+            f"| `{task}` | {len(true)} | {np.corrcoef(true, estimated)[0, 1]:.3f} | "
+            f"{stats.spearmanr(true, estimated)[0]:.3f} | {rms:.3f} mm | {low:.2f} to {high:.2f} mm |"
         )
 
 

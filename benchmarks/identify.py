@@ -45,7 +45,10 @@ TRUE_MESH = ("scene.element_size=0.4 mm", "scene.particle_spacing=0.2 mm")
 RIGS = {"gel": "press", "body": "sim"}
 MOTIONS = {"gel": ("press", "slide"), "body": ("squeeze", "tilt")}
 DRIFTS = {"gel": (0.05, 0.1, 0.2), "body": (0.2, 0.5, 1.0)}  # of the normal force during the first recording [N]
-PAGE, ROWS = Path("docs/measurements/identification.md"), "found.json"  # the page of all truths; the file of one truth, in its folder
+PAGE, ROWS = (
+    Path("docs/measurements/identification.md"),
+    "found.json",
+)  # the page of all truths; the file of one truth, in its folder
 BEGIN, END = "<!-- made by python -m benchmarks.identify docs -->", "<!-- end of the table -->"
 HEAD = (
     "| Truth | Recordings | Simulated | Time | Error (95 %; draws with the truth inside) | Contradictions | Detected |",

@@ -228,7 +228,9 @@ def _make_set(
 
         try:
             number = workers if workers is not None else core_count()
-            done = make(job, out, files, command, workers=number, cluster=ray, report_progress=report_progress, stop=interrupt)
+            done = make(
+                job, out, files, command, workers=number, cluster=ray, report_progress=report_progress, stop=interrupt
+            )
         except Stopped:
             print_error(
                 f"stopped by a signal; {done_count} of {job.count} are finished. Run the same command again to continue"

@@ -54,7 +54,7 @@ def comparison_as_json(comparison: Comparison, report: Report | None = None) -> 
     are null."""
     return {
         "format": FORMAT,
-        "describe_comparison": describe_comparison(comparison),
+        "judgement": describe_comparison(comparison),
         "a": {"name": comparison.a.name, "is": comparison.names[0], "reference": comparison.a.reference_from},
         "b": {"name": comparison.b.name, "is": comparison.names[1], "reference": comparison.b.reference_from},
         "units": {metric.key: metric.si for metric in METRICS},

@@ -324,6 +324,7 @@ def test_the_judgement_is_one_plain_sentence(
     compared: Comparison, other: FrameSet, good: FrameSet, real: FrameSet, tmp_path: Path
 ) -> None:
     close = describe_comparison(compared)
+    assert comparison_as_json(compared)["judgement"] == close
     assert close.startswith("In contact A looks like B: they differ by 1.") and "noise alone by 1." in close
     assert "no more like B than a picture without contact" in describe_comparison(compare_frames(other, real))
     dull = changed(good, lambda image: np.rint(0.5 * (image + np.float64(good.reference))).astype(np.uint8))

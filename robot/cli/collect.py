@@ -95,14 +95,20 @@ def press(
     out: OutSet,
     *,
     objects: Annotated[
-        str, typer.Option(metavar="DIR|shapes", help="A folder of STL files, or the twenty shapes of tacsim.")
+        str,
+        typer.Option(metavar="DIR|shapes", help="A folder of STL, OBJ or PLY files, or the twenty shapes of tacsim."),
     ] = "shapes",
     drawn: PressRanges,
     count: Count = 100,
     seed: Seed = 0,
     sensor: SensorModel = "ideal",
     preset: Preset = "standard",
-    scale: Annotated[float, typer.Option(help="Metres per unit of the STL files.")] = 1e-3,
+    scale: Annotated[
+        float | None,
+        typer.Option(
+            help="Metres per unit of the mesh files; guessed from their size if left out.", show_default=False
+        ),
+    ] = None,
     workers: Workers = None,
     ray: Ray = None,
     set_: Overrides = None,
@@ -120,7 +126,8 @@ def press(
         ("--twist", drawn.twist.text, "0"),
         ("--count", str(count), None), ("--seed", str(seed), None), ("--sensor", sensor, None),
         ("--preset", preset, None),
-        ("--scale", f"{scale:g}", "0.001"), *(("--set", text, None) for text in set_ or []), ("--out", str(out), None),
+        *([] if scale is None else [("--scale", f"{scale:g}", None)]),
+        *(("--set", text, None) for text in set_ or []), ("--out", str(out), None),
     ]  # fmt: skip
     require_packages("tacsim collect press", "export", "pyarrow")
     with busy("loading"):

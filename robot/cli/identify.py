@@ -148,7 +148,7 @@ class _IdentifyCommand:
 
     def __init__(self, kind: Kind, scene: str, options: Fitting, gel_error: float = 0.0) -> None:
         from tacsim.config import load_scene
-        from tacsim.config.load import describe_mesh_side
+        from tacsim.config.load import describe_scene_meshes
 
         self.kind, self.options, self.gel_error = kind, options, gel_error
         self.wanted = [] if options.fit is None else [name.strip() for name in options.fit.split(",")]
@@ -158,7 +158,7 @@ class _IdentifyCommand:
             raise typer.BadParameter(f"scene '{self.scene.name}' has not {needs}", param_hint="--scene")
         if self.scene.physics == "seed":
             raise typer.BadParameter("physics 'seed' cannot be identified; use 'hybrid'", param_hint="--set")
-        for words in describe_mesh_side(self.scene):
+        for words in describe_scene_meshes(self.scene):
             notes.print(words)
 
     def run(self, sources: list[Path], indenter: Pose | None = None, balls: Mapping[str, float] | None = None) -> None:

@@ -40,8 +40,10 @@ class IndenterShape(OptionGroup):
     ] = None
     edge_radius: Annotated[Any, length_option("Of a box's or cylinder's edges; half an element by default.")] = None
     scale: Annotated[
-        float | None, typer.Option(help="Metres per unit of the .stl file; 0.001 by default.", show_default=False)
+        float | None,
+        typer.Option(help="Metres per unit of the mesh file; guessed from its size by default.", show_default=False),
     ] = None
+    repair: Annotated[bool, typer.Option("--repair", help="Close holes of the mesh and turn triangles round.")] = False
     down: Annotated[
         Literal["-z", "+z", "-x", "+x", "-y", "+y"] | None,
         typer.Option(help="Side of the indenter, in its own axes, that presses; -z by default.", show_default=False),
@@ -58,7 +60,7 @@ class IndenterShape(OptionGroup):
 
 @with_option_groups
 def press(
-    indenter: Annotated[str, typer.Argument(help="sphere, cylinder, box, or the path of an .stl file.")],
+    indenter: Annotated[str, typer.Argument(help="sphere, cylinder, box, or the path of an STL, OBJ or PLY file.")],
     *,
     depth: Annotated[Any, length_option("Depth below the surface of the untouched gel.")] = "0.5 mm",
     slide: Annotated[
@@ -82,9 +84,11 @@ def press(
     """
     from tacsim.config import load_scene, load_sensor
     from tacsim.config.gel import fit_gel, overridden_gel_sizes
+    from tacsim.geometry.shapes import describe_meshes
 
     folder = new_directory(out, "press")
     given = {name: getattr(shape, name) for name in ("radius", "height", "size", "scale")}
+    given["repair"] = True if shape.repair else None
     changes = [_geometry_override(indenter, given), *_orientation_overrides(shape.down, shape.rotation)]
     if shape.edge_radius is not None:
         changes.append(f"indenter.edge_radius={shape.edge_radius!r}")
@@ -92,7 +96,7 @@ def press(
     model = load_sensor(sensor).model_copy(update={"view": None})
     sizes = overridden_gel_sizes(text.partition("=")[0].split(".") for text in set_ or [])
     scene, said = fit_gel(scene, {"lower": model}, given=sizes)
-    for words in said:
+    for words in [*said, *describe_meshes(scene)]:
         notes.print(words)
     with busy("pressing (the first run compiles the kernels, up to half a minute)") as say:
         from robot.studies import press as presses
@@ -154,10 +158,12 @@ def _geometry_override(indenter: str, given: dict[str, Any]) -> str:
         "cylinder": {"radius": 4e-3, "height": 5e-3},
         "box": {"size": (5e-3, 5e-3, 5e-3)},
     }
-    mesh = {"path": str(Path(indenter).absolute()), "scale": 1e-3}
-    if indenter not in usual and not indenter.lower().endswith(".stl"):
-        words = f"'{indenter}' is not an indenter; allowed: sphere, cylinder, box, or the path of an .stl file"
-        raise typer.BadParameter(words, param_hint="INDENTER")
+    from tacsim.geometry.mesh_file import SUFFIXES
+
+    mesh = {"path": str(Path(indenter).absolute()), "scale": None, "repair": False}
+    if indenter not in usual and not indenter.lower().endswith(SUFFIXES):
+        known = f"sphere, cylinder, box, or the path of a mesh file ({', '.join(SUFFIXES)})"
+        raise typer.BadParameter(f"'{indenter}' is not an indenter; allowed: {known}", param_hint="INDENTER")
     described = usual.get(indenter, mesh)
     for name, value in given.items():
         if value is not None and name not in described:
@@ -165,7 +171,7 @@ def _geometry_override(indenter: str, given: dict[str, Any]) -> str:
             words = f"'{indenter}' does not have it; it has {has}"
             raise typer.BadParameter(words, param_hint=f"--{name}")
     own = {name: value for name, value in given.items() if value is not None}
-    shape = indenter if indenter in usual else "stl"
+    shape = indenter if indenter in usual else "mesh"
     return f"indenter.geometry={json.dumps({'shape': shape, **described, **own})}"
 
 

@@ -73,7 +73,7 @@ def load_rig(rig: str | Path, *, task: str | TaskConfig | None = None, overrides
     if overrides and any(arm.is_real for arm in config.arms.values()):
         _require_limits(config, load_rig(rig, task=task).config)
     if config.scene is not None:
-        notes = [*notes, *describe_mesh_side(config.scene)]
+        notes = [*notes, *describe_scene_meshes(config.scene)]
     return LoadedRig(config, tuple(dict.fromkeys(state.sources)), tuple(notes))
 
 
@@ -172,16 +172,22 @@ def _check_scene(root: Node, own_scene: bool, state: LoadState) -> Node:
     return replace(root, value={name: entry for name, entry in root.items.items() if name != "scene"})
 
 
-def describe_mesh_side(scene: Scene) -> list[str]:
-    """Notes on the pressing side of a scene's mesh, which a file does not show. Empty without a readable mesh."""
-    from tacsim.geometry.pressing_side import describe_side
+def describe_scene_meshes(scene: Scene) -> list[str]:
+    """What the files of a scene's meshes do not show: their units, what was repaired, and which side presses.
 
-    if scene.indenter is None or not isinstance(scene.indenter.geometry, Mesh):
-        return []
+    Sentences; empty without a readable mesh.
+    """
+    from tacsim.geometry.pressing_side import describe_side
+    from tacsim.geometry.shapes import describe_meshes
+
     try:
-        return [f"pressing side: {describe_side(scene.indenter)}; indenter.roll and indenter.pitch choose another"]
-    except (OSError, ValueError):  # reported when the world is made
+        words = describe_meshes(scene)
+        if scene.indenter is not None and isinstance(scene.indenter.geometry, Mesh):
+            side = describe_side(scene.indenter)
+            words.append(f"pressing side: {side}; indenter.roll and indenter.pitch choose another")
+    except (OSError, ValueError):  # making the world raises it
         return []
+    return words
 
 
 def load_model(model: type[Model], source: str | Path, overrides: Sequence[str] = ()) -> Model:

@@ -1,15 +1,9 @@
-"""Closed triangle meshes from STL files: guarded loading, and the exact signed distance to their surface."""
+"""The exact signed distance to the surface of a closed triangle mesh."""
 
 from __future__ import annotations
 
-import hashlib
-import io
-import logging
-import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -24,145 +18,7 @@ if TYPE_CHECKING:
 IntArray = NDArray[np.int64]
 Axes = tuple[FloatArray, FloatArray, FloatArray]
 
-MAX_BYTES = 64 * 2**20
 _CHUNK = 500_000  # rows worked on at once, for memory
-_REPAIR = (
-    "repair it (for example Blender's 3D-Print Toolbox 'Make Manifold', or Meshmixer 'Inspector') and export again"
-)
-
-
-def file_fingerprint(path: str | Path) -> str:
-    """SHA-256 of an STL file's bytes as they are now, by which to remember what was made of them.
-
-    Raises FileNotFoundError; ValueError for what is no file, is not named .stl, is empty or larger than 64 MiB.
-    """
-    return hashlib.sha256(_read_stl(Path(path))).hexdigest()
-
-
-def load_mesh(path: str | Path, scale: float, expected: str | None = None) -> Trimesh:
-    """The closed mesh of an STL file (binary or text), vertices times `scale` [m per file unit].
-
-    Triangles that face inwards all together are turned round. Surfaces that cut through themselves are not detected.
-
-    Raises FileNotFoundError; ValueError for a file that is no STL, is larger than 64 MiB or 500,000 triangles, is
-    truncated, whose fingerprint is not the one `expected`, or whose mesh is empty, not closed, degenerate, not finite
-    or of absurd size.
-    """
-    path = Path(path)
-    data = _read_stl(path)
-    if expected is not None and hashlib.sha256(data).hexdigest() != expected:
-        raise ValueError(f"{path}: the file was changed while it was read; try again")
-    mesh = _decode_stl(data, path)
-    _require_closed(mesh, scale, path)
-    mesh.apply_scale(scale)  # type: ignore[no-untyped-call]
-    if mesh.volume < 0:
-        mesh.invert()
-    return mesh
-
-
-def _read_stl(path: Path) -> bytes:
-    if path.suffix.lower() != ".stl":
-        raise ValueError(f"{path}: is no STL file (its name ends in '{path.suffix}'); export the mesh as .stl")
-    if not path.exists():
-        raise FileNotFoundError(f"{path}: no such mesh file; give the path of an .stl file")
-    if not path.is_file():
-        raise ValueError(f"{path}: is no file; give the path of an .stl file")
-    size = path.stat().st_size
-    if size > MAX_BYTES:
-        raise ValueError(f"{path}: {size:,} bytes, the limit is {MAX_BYTES:,}; decimate the mesh or save as binary STL")
-    if size == 0:
-        raise ValueError(f"{path}: the file is empty; export the mesh again")
-    return path.read_bytes()
-
-
-def _decode_stl(data: bytes, path: Path) -> Trimesh:
-    max_triangles = 500_000
-    count = _count_triangles(data, path)
-    if count == 0:
-        raise ValueError(f"{path}: the mesh is empty (no triangles); export it again")
-    if count > max_triangles:
-        raise ValueError(f"{path}: {count:,} triangles, the limit is {max_triangles:,}; decimate the mesh")
-    import trimesh
-
-    try:
-        with _silence_trimesh():
-            loaded = trimesh.load_mesh(io.BytesIO(data), file_type="stl", process=False)
-    except Exception as error:  # the decoder raises whatever its parser stumbles over
-        raise ValueError(f"{path}: is no readable STL ({error}); export the mesh again") from error
-    if len(loaded.faces) != count:
-        raise ValueError(f"{path}: {count:,} triangles expected, {len(loaded.faces):,} read; export the mesh again")
-    return trimesh.Trimesh(loaded.vertices, loaded.faces, process=False)  # without the normals that the file claims
-
-
-@contextmanager
-def _silence_trimesh() -> Iterator[None]:
-    """Keeps trimesh off the terminal; numbers that its text parser would only warn of become errors."""
-    logger = logging.getLogger("trimesh")
-    level = logger.level
-    logger.setLevel(logging.CRITICAL)
-    try:
-        with warnings.catch_warnings(), np.errstate(all="ignore"):
-            warnings.simplefilter("error", DeprecationWarning)
-            yield
-    finally:
-        logger.setLevel(level)
-
-
-def _count_triangles(data: bytes, path: Path) -> int:
-    """Triangles of an STL file, from its structure alone. Binary files may begin with "solid": the length decides."""
-    header_size, record_size = 84, 50  # bytes of a binary STL: header with the count, one triangle
-    stated = int.from_bytes(data[80:header_size], "little") if len(data) >= header_size else None
-    if stated is not None and len(data) == header_size + record_size * stated:
-        return stated
-    lower = data.lower()
-    if lower.lstrip().startswith(b"solid") and b"\0" not in data:
-        starts, ends = lower.count(b"facet normal"), lower.count(b"endfacet")
-        if starts != ends or lower.count(b"vertex") != 3 * starts or b"endsolid" not in lower:
-            raise ValueError(
-                f"{path}: text STL is truncated ({starts} facets begin, {ends} end); export the mesh again"
-            )
-        return starts
-    if stated is None or b"\0" not in data:
-        raise ValueError(
-            f"{path}: is no STL (neither a binary header nor 'solid' at the start); export the mesh as .stl"
-        )
-    expected = header_size + record_size * stated
-    raise ValueError(
-        f"{path}: binary STL of {stated:,} triangles should have {expected:,} bytes but has {len(data):,} "
-        f"({'truncated' if len(data) < expected else 'too long'}); export or copy the mesh again"
-    )
-
-
-def _require_closed(mesh: Trimesh, scale: float, path: Path) -> None:
-    """Merges the corners that STL repeats, then refuses what has no well-defined inside. Coordinates in file units."""
-    resolution = 1e-7  # of float32, the number format of STL: what is thinner, relative to the mesh, has no area
-    sizes = (1e-5, 1.0)  # smallest and largest edge of the bounding box [m]
-    if not np.isfinite(mesh.vertices).all():
-        bad = int((~np.isfinite(mesh.vertices).all(axis=1)).sum())
-        raise ValueError(f"{path}: {bad} corners are not finite (NaN or infinite); {_REPAIR}")
-    size = np.ptp(mesh.vertices, axis=0)
-    smallest, largest = sizes
-    if size.min() * scale < smallest or size.max() * scale > largest:
-        raise ValueError(
-            f"{path}: the mesh measures {' x '.join(f'{s * scale:.3g}' for s in size)} m at scale {scale:g} m per file "
-            f"unit; allowed are {smallest:g} to {largest:g} m. Is the scale right (0.001 for mm) and the mesh a solid?"
-        )
-    mesh.merge_vertices(merge_norm=True, merge_tex=True)
-    collapsed = (mesh.faces == np.roll(mesh.faces, 1, axis=1)).any(axis=1)  # two corners the same: harmless, a line
-    mesh.update_faces(~collapsed)
-    if not mesh.is_watertight:
-        _, uses = np.unique(mesh.edges_sorted, axis=0, return_counts=True)
-        wrong = int((uses != 2).sum())
-        raise ValueError(f"{path}: the mesh is not closed ({wrong} edges do not join exactly two triangles); {_REPAIR}")
-    if not mesh.is_winding_consistent:
-        raise ValueError(f"{path}: neighbouring triangles face opposite ways; recalculate the normals, or {_REPAIR}")
-    edges = np.diff(mesh.triangles[:, [0, 1, 2, 0]], axis=1)
-    height = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) / np.linalg.norm(edges, axis=2).max(axis=1)
-    degenerate = int((height < resolution * size.max()).sum())
-    if degenerate:
-        raise ValueError(f"{path}: {degenerate} triangles are degenerate (three corners on a line); {_REPAIR}")
-    if abs(mesh.volume) < resolution * size.prod():
-        raise ValueError(f"{path}: the mesh encloses no volume; model a solid and export again")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -183,7 +39,8 @@ class Surface:
 
 
 def make_surface(mesh: Trimesh, pieces: int = 4_000) -> Surface:
-    """`mesh`: closed and consistently wound, as :func:`load_mesh` gives it; cut into `pieces` or a few times more."""
+    """`mesh`: closed and consistently wound, as :func:`tacsim.geometry.mesh_file.load_mesh` gives it; it is cut into
+    `pieces` or a few times more."""
     from scipy.spatial import KDTree
     from trimesh.remesh import subdivide_to_size
 

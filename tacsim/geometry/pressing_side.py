@@ -33,7 +33,7 @@ class PressingSide:
 
 
 def find_pressing_side(indenter: Indenter) -> PressingSide:
-    """Of an indenter as its scene turns it. Raises what :func:`tacsim.geometry.mesh.load_mesh` raises."""
+    """Of an indenter as its scene turns it. Raises what :func:`tacsim.geometry.mesh_file.load_mesh` raises."""
     level_share = 1e-4  # of the height: corners within it of the lowest are level with it
     pose = Pose(quaternion=indenter.turn)
     down = rotate(inverse(pose), [0.0, 0.0, -1.0])

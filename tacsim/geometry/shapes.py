@@ -1,4 +1,4 @@
-"""Box, sphere, cylinder and STL mesh as geometry: body particles, and signed distance for rigid indenters.
+"""Box, sphere, cylinder and mesh as geometry: body particles, and signed distance for rigid indenters.
 
 Everything here is in the shape's own frame: axes as in the scene, origin at the centre of the bounding box.
 """
@@ -7,21 +7,16 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tacsim.geometry.mesh import (
-    distance_gradient,
-    file_fingerprint,
-    load_mesh,
-    make_surface,
-    signed_distance,
-    signed_distance_on_grid,
-)
+from tacsim.geometry.mesh import distance_gradient, make_surface, signed_distance, signed_distance_on_grid
+from tacsim.geometry.mesh_file import describe_file, file_fingerprint, load_mesh
 from tacsim.interface import FloatArray, Pose
-from tacsim.models.scene import Box, Cylinder, Indenter, Mesh, Shape, Sphere
+from tacsim.models.scene import Box, Cylinder, Indenter, Mesh, Scene, Shape, Sphere
 from tacsim.models.text import millimetres
 from tacsim.pose import inverse, rotate, rotation_matrix
 
@@ -39,7 +34,7 @@ EXACT_BAND = 2  # grid spacings round a mesh in which the distance is exact
 
 
 def bounding_size(geometry: Shape) -> FloatArray:
-    """Size of the bounding box (3,) [m]. Raises what :func:`tacsim.geometry.mesh.load_mesh` raises."""
+    """Size of the bounding box (3,) [m]. Raises what :func:`tacsim.geometry.mesh_file.load_mesh` raises."""
     match geometry:
         case Box():
             return np.array(geometry.size, dtype=np.float64)
@@ -137,7 +132,7 @@ def _points_on_lines(pairs: FloatArray, spacing: float) -> FloatArray:
 
 
 def enclosed_volume(geometry: Shape) -> float:
-    """Enclosed volume [m^3]. Raises what :func:`tacsim.geometry.mesh.load_mesh` raises."""
+    """Enclosed volume [m^3]. Raises what :func:`tacsim.geometry.mesh_file.load_mesh` raises."""
     match geometry:
         case Box():
             return float(np.prod(geometry.size))
@@ -156,7 +151,8 @@ def lattice_particles(geometry: Shape, spacing: float) -> FloatArray:
     layer lies half a spacing inside the face. For particles without a lattice see :mod:`tacsim.geometry.sampling`.
 
     Raises ValueError when the lattice has fewer than MIN_LAYERS, misses the shape's size (or a mesh's volume) by
-    more than 10 %, holds no particle, or more than 5,000,000; and what :func:`tacsim.geometry.mesh.load_mesh` raises.
+    more than 10 %, holds no particle, or more than 5,000,000; and what
+    :func:`tacsim.geometry.mesh_file.load_mesh` raises.
     """
     size = bounding_size(geometry)
     estimate, lattice = enclosed_volume(geometry) / spacing**3, np.prod(size / spacing)
@@ -240,7 +236,7 @@ def shape_distance(geometry: Shape, points: ArrayLike, edge_radius: float = 0.0)
 
     edge_radius: of the edges of a box or cylinder, rounded within its size [m].
 
-    Raises what :func:`tacsim.geometry.mesh.load_mesh` raises.
+    Raises what :func:`tacsim.geometry.mesh_file.load_mesh` raises.
     """
     at = np.asarray(points, dtype=np.float64)
     match geometry:
@@ -281,11 +277,26 @@ def _outside_and_inside(beyond: FloatArray) -> FloatArray:
 def centred_mesh(geometry: Mesh, expected: str | None = None) -> Trimesh:
     """A mesh [m] in the shape's own frame; `expected`: fingerprint of its file, by which what is made is remembered.
 
-    Raises what :func:`tacsim.geometry.mesh.load_mesh` raises.
+    Raises what :func:`tacsim.geometry.mesh_file.load_mesh` raises.
     """
-    mesh = load_mesh(geometry.path, geometry.scale, expected)
+    mesh = load_mesh(geometry.path, geometry.scale, expected, geometry.repair)
     mesh.apply_translation(-mesh.bounds.mean(axis=0))
     return mesh
+
+
+def describe_meshes(scene: Scene) -> list[str]:
+    """What was assumed about the mesh files of a scene and repaired in them, a sentence each.
+
+    Raises what :func:`tacsim.geometry.mesh_file.load_mesh` raises.
+    """
+    parts = (scene.body, scene.indenter)
+    meshes = [part.geometry for part in parts if part is not None and isinstance(part.geometry, Mesh)]
+    return [
+        f"{Path(mesh.path).name}: {words}"
+        for mesh in meshes
+        if mesh.scale is None or mesh.repair
+        for words in describe_file(centred_mesh(mesh), mesh.scale)
+    ]
 
 
 @lru_cache(maxsize=64)

@@ -16,7 +16,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tacsim.geometry.mesh import file_fingerprint, make_surface, signed_distance_on_grid
+from tacsim.geometry.mesh import make_surface, signed_distance_on_grid
+from tacsim.geometry.mesh_file import file_fingerprint
 from tacsim.geometry.shapes import EXACT_BAND, LEVEL_SINE, MAX_NODES, centred_mesh
 from tacsim.interface import FloatArray
 from tacsim.models.scene import Mesh
@@ -58,7 +59,7 @@ class TiledDistance:
     """Nodes lie at origin + spacing * (i, j, k), i, j, k from 0 on, and reach BAND spacings beyond the mesh's box."""
 
     def __init__(self, geometry: Mesh, content: str, spacing: float) -> None:
-        """content: fingerprint of the file. Raises what :func:`tacsim.geometry.mesh.load_mesh` raises."""
+        """content: fingerprint of the file. Raises what :func:`tacsim.geometry.mesh_file.load_mesh` raises."""
         piece_count_range = (4_000, 100_000)  # at least, about at most
         piece_size = 4  # grid spacings: edge of the pieces that the surface is cut into for the search
         mesh = centred_mesh(geometry, content)

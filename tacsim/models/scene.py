@@ -106,11 +106,13 @@ class Cylinder(Config):
 
 
 class Mesh(Config):
-    """Closed triangle mesh (STL, in millimetres unless `scale` says otherwise)."""
+    """Closed triangle mesh of an STL, OBJ or PLY file."""
 
-    shape: Literal["stl"] = "stl"
+    shape: Literal["mesh"] = "mesh"
     path: str
-    scale: Annotated[float, Field(gt=0)] = 1e-3  # [m per file unit]
+    # [m per file unit]; None: 1 if the mesh's largest side is below one unit, otherwise 0.001
+    scale: Annotated[float, Field(gt=0)] | None = None
+    repair: bool = False  # close holes and turn triangles round
 
 
 Shape = Annotated[Box | Sphere | Cylinder | Mesh, Field(discriminator="shape")]
@@ -153,7 +155,7 @@ class Indenter(Config):
     def _require_small_edges(self) -> Self:
         geometry, radius = self.geometry, self.edge_radius or 0.0
         if radius > 0 and not isinstance(geometry, Box | Cylinder):
-            has = "a sphere has no edges" if isinstance(geometry, Sphere) else "the edges of an STL file are as drawn"
+            has = "a sphere has no edges" if isinstance(geometry, Sphere) else "the edges of a mesh are as drawn"
             raise ValueError(f"edge_radius is {radius:g} m, but {has}; leave it out")
         if isinstance(geometry, Box | Cylinder):
             half = _min_side(geometry) / 2

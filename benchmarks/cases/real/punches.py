@@ -71,7 +71,7 @@ class PunchFace:
 
 def read_face(path: Path) -> PunchFace:
     """The highest face of an STL in millimetres. Raises BadData."""
-    from tacsim.geometry.mesh import load_mesh
+    from tacsim.geometry.mesh_file import load_mesh
 
     try:
         mesh = load_mesh(path, 1e-3)

@@ -1,7 +1,7 @@
 """Dumps of diverged motions: data to inspect a motion and to run it again (`tacsim debug`).
 
 A dump is a folder: `dump.json` (scene, poses, command, message, versions) and `state.npz`, whose arrays are named
-`before.*` (before the motion), `good.*` and `failed.*` (at the start and end of the launch that failed). The STL file
+`before.*` (before the motion), `good.*` and `failed.*` (at the start and end of the launch that failed). The mesh file
 of a body or indenter is copied into it. Nothing in a dump is executed.
 """
 
@@ -32,7 +32,7 @@ from tacsim.physics.snapshot import State
 
 FOLDER = "TACSIM_DUMPS"  # environment variable: where dumps are written; without it, or if it is empty, none are
 MOMENTS = ("before", "good", "failed")
-MESH = "shape.stl"
+MESH = "shape"  # and the suffix of the file it is a copy of
 
 PoseNumbers = tuple[float, float, float, float, float, float, float]  # position [m], unit quaternion (x, y, z, w)
 Poses = Mapping[str, Pose]
@@ -128,9 +128,10 @@ def _new_folder(parent: Path) -> Path:
 def _write_files(
     folder: Path, scene: Scene, poses: Poses, command: MoveCommand, before: State, failure: SimulationDiverged
 ) -> None:
-    scene, mesh = _replace_mesh_path(scene, MESH)
-    if mesh is not None:
-        shutil.copyfile(mesh, folder / MESH)
+    if (mesh := _find_mesh(scene)) is not None:
+        name = f"{MESH}{Path(mesh).suffix.lower()}"
+        shutil.copyfile(mesh, folder / name)
+        scene = _with_mesh(scene, Path(name))
     arrays = {
         f"{moment}.{name}": np.asarray(a, order="C")  # copies of particles have the kernels' memory layout
         for moment, state in zip(MOMENTS, (before, failure.good, failure.failed), strict=True)
@@ -161,14 +162,18 @@ def _poses_of_numbers(numbers: Mapping[str, PoseNumbers]) -> dict[str, Pose]:
     return {name: Pose(np.array(v[:3]), np.array(v[3:])) for name, v in numbers.items()}
 
 
-def _replace_mesh_path(scene: Scene, path: str) -> tuple[Scene, str | None]:
-    """The scene with `path` as the path of its STL file, and the old path; None if it has no such file."""
-    part = "body" if scene.indenter is None else "indenter"
+def _find_mesh(scene: Scene) -> str | None:
+    """The path of the mesh file of the scene's body or indenter; None if neither has one."""
     owner = scene.body if scene.indenter is None else scene.indenter
-    if owner is None or not isinstance(owner.geometry, Mesh):
-        return scene, None
-    geometry = owner.geometry.model_copy(update={"path": path})
-    return scene.model_copy(update={part: owner.model_copy(update={"geometry": geometry})}), owner.geometry.path
+    return owner.geometry.path if owner is not None and isinstance(owner.geometry, Mesh) else None
+
+
+def _with_mesh(scene: Scene, path: Path) -> Scene:
+    """A scene that has a mesh file, with that file's path changed to `path`."""
+    part = "body" if scene.indenter is None else "indenter"
+    owner = getattr(scene, part)
+    geometry = owner.geometry.model_copy(update={"path": str(path)})
+    return scene.model_copy(update={part: owner.model_copy(update={"geometry": geometry})})
 
 
 def read_dump(folder: Path) -> Dump:
@@ -191,5 +196,7 @@ def read_dump(folder: Path) -> Dump:
                 states[moment][name] = archive[key]
     except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise DumpError(f"{arrays} is missing or damaged: {error}") from None
-    scene, _ = _replace_mesh_path(info.scene, str(folder / MESH))
-    return Dump(info.model_copy(update={"scene": scene}), states)
+    if _find_mesh(info.scene) is not None:  # whatever path it has: a dump names no file but its own
+        name = next(iter(sorted(folder.glob(f"{MESH}.*"))), folder / MESH)
+        info = info.model_copy(update={"scene": _with_mesh(info.scene, name)})
+    return Dump(info, states)

@@ -92,7 +92,7 @@ class Slide:
         if self.edge_radius < catching * (1 - 1e-9) and slid > MAX_BLOCKED_SLIDE * element:
             return (
                 f"an edge sharper than {catching:g} mm catches on the mesh in a slide; for a correct drag, give it an "
-                f"edge_radius of this size (--edge-radius; in an STL file: draw it round), or a smaller element_size"
+                f"edge_radius of this size (--edge-radius; in a mesh file: draw it round), or a smaller element_size"
             )
         walls, steep = math.isfinite(self.edge_radius), self.friction > STEEP_FRICTION
         deep = (DEEP_WITH_EDGES if walls or steep else DEEP_WITHOUT_EDGES) * thickness

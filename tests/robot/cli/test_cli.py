@@ -208,6 +208,23 @@ def test_press_reports_and_selects_pressing_side(tmp_path: Path) -> None:
     assert both.exit_code == 2 and "give --down or --rotation, not both" in " ".join(both.stderr.split())
 
 
+def test_press_repairs_and_measures_an_open_mesh_in_metres(tmp_path: Path) -> None:
+    import trimesh
+
+    bar = trimesh.creation.box((3e-3, 4e-3, 6e-3))
+    bar.update_faces(bar.face_normals[:, 2] < 0.9)
+    bar.export(tmp_path / "bar.obj")
+    press = ("press", "bar.obj", "--depth", "0.2 mm", "--preset", "draft", "--out", "out")
+    refused = tacsim(*press)
+    assert refused.exit_code == 2 and "the mesh is not closed" in refused.stderr and "--repair" in refused.stderr
+    done = tacsim(*press, "--repair")
+    assert done.exit_code == 0, done.output
+    words = " ".join(done.stderr.split())
+    assert "bar.obj: read in metres, guessed from its size (3 x 4 x 6 mm)" in words
+    assert "bar.obj: 1 holes were closed, the largest 5 mm wide with 4 edges" in words
+    assert "pressing side    -z of bar.obj, a flat face of 4 x 3 mm" in done.stdout
+
+
 def test_press_too_deep_reports_possible_depth(tmp_path: Path) -> None:
     deep = tacsim("press", "sphere", "--depth", "3.9 mm", "--preset", "draft", "--out", "deep")
     said = re.search(

@@ -270,8 +270,8 @@ def test_the_command_makes_a_set_of_a_folder_of_objects(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        (("--objects", "nothing"), "is not a folder; give a folder of STL files, or 'shapes'"),
-        (("--objects", "empty"), "empty holds no STL file"),
+        (("--objects", "nothing"), "is not a folder; give a folder of mesh files, or 'shapes'"),
+        (("--objects", "empty"), "empty holds no mesh file"),
         (("--objects", "broken"), "stl: is no STL"),
         (("--depth", "1..0.1mm"), "goes from the larger to the smaller"),
         (("--depth", "0.1..5mm"), "it must be above 0 and below the gel's 0.004 m"),
@@ -305,6 +305,18 @@ def test_all_broken_files_are_named_together(tmp_path: Path) -> None:
     (tmp_path / "stl/a.STL").write_text("no mesh")
     with pytest.raises(ValueError, match=r"(?s)a\.STL.*a\.stl.*b\.stl.*two files are called a"):
         find_objects("stl", 1e-3)
+
+
+def test_find_objects_reads_mesh_files_of_each_kind_and_unit(tmp_path: Path) -> None:
+    """A ball of 6 mm in millimetres as STL, and in metres as OBJ and PLY."""
+    from trimesh import creation
+
+    (tmp_path / "meshes").mkdir()
+    for name, unit in (("a.stl", 1e-3), ("b.OBJ", 1.0), ("c.ply", 1.0)):
+        creation.icosphere(1, 3e-3 / unit).export(tmp_path / "meshes" / name, file_type=name[2:].lower())
+    objects, files = find_objects("meshes", None)
+    assert {name: each.model_dump()["scale"] for name, each in objects.items()} == {"a": 1e-3, "b": 1.0, "c": 1.0}
+    assert list(files) == ["objects/a.stl", "objects/b.obj", "objects/c.ply"]
 
 
 def test_a_piece_that_comes_twice_is_written_once(tmp_path: Path) -> None:

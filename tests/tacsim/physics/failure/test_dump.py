@@ -108,11 +108,12 @@ def test_it_holds_all_that_a_replay_needs(made: Path) -> None:
         }, moment
 
 
-def test_an_stl_file_comes_along(tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", ["stl", "ply"])
+def test_dump_holds_the_mesh_file(tmp_path: Path, kind: str) -> None:
     import trimesh
 
-    path = tmp_path / "ball.stl"
-    path.write_bytes(trimesh.creation.icosphere(subdivisions=2, radius=3.0).export(file_type="stl"))
+    path = tmp_path / f"ball.{kind}"
+    path.write_bytes(trimesh.creation.icosphere(subdivisions=2, radius=3.0).export(file_type=kind))
     scene = SCENE.model_copy(update={"indenter": Indenter(geometry=Mesh(path=str(path)))})
     with dump_to_folder(tmp_path / "out"):
         press_through(PressWorld(scene))
@@ -120,7 +121,7 @@ def test_an_stl_file_comes_along(tmp_path: Path) -> None:
     found = read_dump(tmp_path / "out" / "00")
     assert found.info.scene.indenter is not None
     geometry = found.info.scene.indenter.geometry
-    assert isinstance(geometry, Mesh) and Path(geometry.path) == tmp_path / "out" / "00" / "shape.stl"
+    assert isinstance(geometry, Mesh) and Path(geometry.path) == tmp_path / "out" / "00" / f"shape.{kind}"
     assert press_through(PressWorld(found.info.scene)).cause in found.info.message
     edit(tmp_path / "out" / "00", lambda d: d["scene"]["indenter"]["geometry"].update(path="/etc/hosts"))
     assert read_dump(tmp_path / "out" / "00").info.scene == found.info.scene  # a dump names no file but its own

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
 
 class UrDriver(ArmDriver[UrArmConfig]):
+    """A UR arm (CB3 or e-Series) by RTDE, real or mock."""
+
     config_class = UrArmConfig
     keeps_distances = True
 

@@ -25,6 +25,8 @@ CHECK_TIME = 1.0  # for which it is then read [s]
 
 
 class CameraDriver(SensorDriver[CameraSensorConfig]):
+    """A camera of the GelSight kind: USB, or MJPEG over HTTP; real or mock."""
+
     config_class = CameraSensorConfig
 
     @property

@@ -13,6 +13,7 @@ from robot.cli.bench import bench
 from robot.cli.calibrate.lens import lens
 from robot.cli.calibrate.poses import hand_eye, latency, touch
 from robot.cli.calibrate.sensor import calibrate
+from robot.cli.catalogue import list_, new, show
 from robot.cli.collect import collect, episodes
 from robot.cli.collect import press as press_set
 from robot.cli.compare import compare
@@ -48,6 +49,9 @@ COMMANDS = {
         view,
         recover,
         mock,
+        list_,
+        show,
+        new,
         bench,
         compare,
         debug,
@@ -67,7 +71,8 @@ for group, commands in COMMANDS.items():
     for command in commands:
         # typer takes the first line of help from the docstring, and the example from the epilog
         text, _, example = (command.__doc__ or "").partition("Example:")
-        group.command(help=text, epilog=f"Example: [bold]{example.strip()}[/]")(command)
+        name = command.__name__.strip("_").replace("_", "-")
+        group.command(name, help=text, epilog=f"Example: [bold]{example.strip()}[/]")(command)
 
 
 def _print_version(wanted: bool) -> None:
@@ -105,6 +110,6 @@ def main() -> None:
 def _drop_all_but(words: list[str]) -> None:
     """Removes all commands except the called one, if the first word is its name: preparing all 27 commands takes as
     long as importing NumPy."""
-    called = [command for command in app.registered_commands if getattr(command.callback, "__name__", None) in words]
+    called = [command for command in app.registered_commands if command.name in words]
     if called:
         app.registered_commands, app.registered_groups = called, []

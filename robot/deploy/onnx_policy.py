@@ -146,6 +146,11 @@ def _list_axes(axes: Any) -> str:
     return ", ".join(f"{axis.arm} {tuple(axis.direction)}" for axis in axes)
 
 
+def read_policy_spec(path: Path) -> PolicySpec:
+    """What a learned policy's file says of itself. Raises PolicyNotFound for a file that is none."""
+    return _read_spec(path, _open_session(path))
+
+
 def _open_session(path: Path) -> InferenceSession:
     try:
         import onnxruntime

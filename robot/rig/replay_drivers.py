@@ -14,6 +14,8 @@ from tacsim.models.rig import ReplayArmConfig, ReplaySensorConfig
 
 
 class ReplaySensorPart(SensorPart[ReplaySensorConfig]):
+    """A sensor whose frames come from a recording, a video or a folder of pictures."""
+
     config_class = ReplaySensorConfig
     clocks = ("replay",)
 
@@ -45,5 +47,7 @@ class ReplaySensorPart(SensorPart[ReplaySensorConfig]):
 
 
 class ReplayArmPart(ArmPart[ReplayArmConfig]):
+    """An arm whose poses and forces come from a recording or a table."""
+
     config_class = ReplayArmConfig
     clocks = ("replay",)

@@ -16,6 +16,8 @@ SAMPLE_RATE = 10.0  # minimum of a sensor that is simulated on hardware [Hz]
 
 
 class SimSensorDriver(SensorDriver[SimSensorConfig]):
+    """A simulated sensor: its picture is rendered from the deformed gel."""
+
     config_class = SimSensorConfig
     clocks = ("sim", "wall")
 
@@ -49,5 +51,7 @@ class SimSensorDriver(SensorDriver[SimSensorConfig]):
 
 
 class SimArmPart(ArmPart[SimArmConfig]):
+    """A simulated arm: it reaches each target within a control step."""
+
     config_class = SimArmConfig
     clocks = ("sim",)

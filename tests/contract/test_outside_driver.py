@@ -1,6 +1,6 @@
 """A sensor and an arm that somebody else has written: installed beside tacsim, of which nothing is edited.
 
-The distribution is in `outside_driver/`; it is installed into a folder of the test by pip, without the network.
+`tacsim new driver` makes the distribution; pip installs it into a folder of the test, without the network.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ period: 100 ms
 canonical: {{ rows: 32, columns: 32, pitch: 0.5 mm }}
 arms:
   hand:
-    driver: gantry
+    driver: soft-touch
     start: {{ position: [0, 0, 0], rotation: [180 deg, 0, 0] }}
     limits: {{ workspace: {{ lower: [-20 mm, -20 mm, -20 mm], upper: [20 mm, 20 mm, 20 mm] }}, depth: {depth} }}
 sensors:
@@ -39,8 +39,11 @@ start: {{ touch_signal: {signal}, approach_speed: {speed} }}
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder where the distribution is installed."""
     folder = tmp_path_factory.mktemp("site")
+    made = folder.parent / f"{folder.name}-soft-touch"
+    done = python(folder, folder, *COMMAND, "new", "driver", "soft-touch", "--out", str(made))
+    assert done.returncode == 0, done.stderr
     command = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--no-build-isolation", "--no-index"]
-    command += ["--disable-pip-version-check", "--target", str(folder), str(HERE / "outside_driver")]
+    command += ["--disable-pip-version-check", "--target", str(folder), str(made), str(HERE / "refused_drivers")]
     done = subprocess.run(command, capture_output=True, text=True, timeout=100)
     assert done.returncode == 0, done.stderr
     return folder
@@ -55,7 +58,7 @@ def python(site: Path, folder: Path, *words: str, **more: str) -> subprocess.Com
 
 
 def write_rig(
-    folder: Path, driver: str = "skin", signal: str = "0.02", speed: str = "2 mm/s", depth: str = "2 mm"
+    folder: Path, driver: str = "soft-touch", signal: str = "0.02", speed: str = "2 mm/s", depth: str = "2 mm"
 ) -> Path:
     file = folder / "mine.yaml"
     file.write_text(RIG.format(driver=driver, signal=signal, speed=speed, depth=depth))
@@ -82,7 +85,7 @@ def test_outside_drivers_run_replay_and_pass_doctor(site: Path, tmp_path: Path) 
     assert len(episode.steps) == 4
     first = episode.steps[0]
     assert -2.0 < first.arms["hand"].wrench[2] < 0.0  # the approach has touched
-    assert first.info["skin_temperature_tip"] == 30.5
+    assert first.info["soft_touch_temperature_tip"] == 30.5
 
     done = python(site, tmp_path, *COMMAND, "replay", "first/episode.mcap", "--out", "again")
     assert done.returncode == 0, said(done)
@@ -94,7 +97,7 @@ def test_outside_drivers_run_replay_and_pass_doctor(site: Path, tmp_path: Path) 
 
     done = python(site, tmp_path, *COMMAND, "doctor", "--rig", rig)
     assert done.returncode == 0, said(done)
-    assert "hand: gantry" in done.stdout and "tip: skin" in done.stdout and "50 frames/s" in done.stdout
+    assert "hand: soft-touch" in done.stdout and "tip: soft-touch" in done.stdout and "50 frames/s" in done.stdout
 
 
 def _replayed(folder: Path) -> list[str]:
@@ -113,9 +116,15 @@ def test_an_approach_that_is_too_fast_for_an_outside_sensor_is_refused(site: Pat
 @pytest.mark.parametrize(
     ("driver", "words"),
     [
-        ("hasty", "is refused: the one of soft-touch (soft_touch.hasty:HastyDriver) does not state worst_latency, so"),
+        (
+            "hasty",
+            "the one of refused-drivers (refused_drivers.hasty:HastyDriver) does not state worst_latency, so",
+        ),
         ("torn", "cannot be loaded: ModuleNotFoundError: No module named 'no_such_vendor_library'"),
-        ("skinn", "driver 'skinn' is unknown; allowed: camera | replay | sim | skin; did you mean 'skin'?"),
+        (
+            "soft-touc",
+            "driver 'soft-touc' is unknown; allowed: camera | replay | sim | soft-touch; did you mean 'soft-touch'?",
+        ),
     ],
 )
 def test_an_unusable_driver_is_refused_with_its_reason(site: Path, tmp_path: Path, driver: str, words: str) -> None:

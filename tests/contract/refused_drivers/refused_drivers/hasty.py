@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from typing import Literal
 
-from soft_touch.skin import SkinConfig, SkinDriver
+from soft_touch.sensor import Config, Driver
+
 from tacsim import SensorDriver
 
 
-class HastyConfig(SkinConfig):
+class HastyConfig(Config):
     driver: Literal["hasty"]  # type: ignore[assignment]
 
 
-class HastyDriver(SkinDriver):
+class HastyDriver(Driver):
     config_class = HastyConfig
     worst_latency = SensorDriver.worst_latency

@@ -1,1 +1,0 @@
-"""A sensor whose picture is darker where its gel is pressed, and a gantry that carries it onto a hard, flat table."""

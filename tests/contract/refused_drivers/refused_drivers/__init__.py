@@ -1,0 +1,1 @@
+"""Drivers that are refused, beside those of a distribution that `tacsim new driver soft-touch` makes."""

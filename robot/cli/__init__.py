@@ -9,6 +9,15 @@ from typing import Annotated
 
 import typer
 
+import robot
+
+if "public_names" not in vars(robot):  # asked before other modules are imported, which may be replaced, too
+    raise SystemExit(
+        f"error: {robot.__file__} is not of tacsim but of another distribution with a package `robot`, such as "
+        "robotframework. Use another environment, or: python -m pip uninstall -y robotframework; "
+        "python -m pip install --force-reinstall --no-deps tacsim"
+    )
+
 from robot.cli.bench import bench
 from robot.cli.calibrate.lens import lens
 from robot.cli.calibrate.poses import hand_eye, latency, touch

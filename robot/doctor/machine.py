@@ -25,7 +25,7 @@ OPENCV = "opencv-contrib-python-headless"  # the distribution that provides cv2
 def examine() -> list[Check]:
     """All checks, in the order in which to correct problems. A check that raises an error counts as `fail`."""
     functions = (
-        *(python, packages, drivers, second_opencv, opencv, taichi, ur_rtde),
+        *(python, packages, drivers, robot_framework, second_opencv, opencv, taichi, ur_rtde),
         *(processors, realtime, working_directory),
     )
     return [check for function in functions for check in _run(function)]
@@ -92,6 +92,20 @@ def drivers() -> list[Check]:
         for name, reason in each.items()
     ]
     return [Check("drivers", "ok", words), *refused]
+
+
+def robot_framework() -> list[Check]:
+    """Robot Framework installs a package `robot`, too: its files replace ours, or ours replace its."""
+    try:
+        version = metadata.version("robotframework")
+    except metadata.PackageNotFoundError:
+        return [Check("one robot", "ok", "no other package named robot")]
+    advice = (
+        "install one of them into another environment. Here: python -m pip uninstall -y robotframework; "
+        "python -m pip install --force-reinstall --no-deps tacsim"
+    )
+    found = f"robotframework {version} has a package `robot`, too; both installed files into one folder"
+    return [Check("one robot", "fail", found, advice)]
 
 
 def second_opencv() -> list[Check]:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import re
+import shutil
 import subprocess
 import sys
 from itertools import pairwise
@@ -14,6 +16,7 @@ import pytest
 from matplotlib.image import imread
 from scipy.spatial.transform import Rotation
 
+import robot
 from robot.cli.errors import describe_error
 from robot.cli.output import writing
 from robot.studies.press import PressMotion, _targets
@@ -206,6 +209,21 @@ def test_press_reports_and_selects_pressing_side(tmp_path: Path) -> None:
     assert min(each.shape[1] for each in shown) > 800 and not np.array_equal(*(each[:200] for each in shown))
     both = tacsim(*press, "--down", "+x", "--rotation", "0,0,0", "--out", "both")
     assert both.exit_code == 2 and "give --down or --rotation, not both" in " ".join(both.stderr.split())
+
+
+def test_command_names_another_package_robot(tmp_path: Path) -> None:
+    """As robotframework leaves it: its files in place of those of the same name, ours beside them."""
+    site = tmp_path / "site"
+    shutil.copytree(Path(robot.__path__[0]), site / "robot", ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("__init__", "errors"):
+        (site / "robot" / f"{name}.py").write_text('"""Of Robot Framework."""\n')
+    paths = [str(site), *environment()["PYTHONPATH"].split(os.pathsep)]
+    done = subprocess.run(
+        [*START, "--version"], capture_output=True, text=True, cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)},
+    )  # fmt: skip
+    assert done.returncode == 1 and "site/robot/__init__.py is not of tacsim but of another distribution" in done.stderr
+    assert "pip uninstall -y robotframework" in done.stderr and "Traceback" not in done.stderr
 
 
 def test_press_repairs_and_measures_an_open_mesh_in_metres(tmp_path: Path) -> None:

@@ -76,6 +76,15 @@ def test_a_second_opencv_is_harmful_unless_of_the_same_version(
     assert (f"{machine.OPENCV}==4.13.0.92" in check.advice) == (state == "fail")
 
 
+def test_robot_framework_beside_tacsim_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert machine.robot_framework()[0].state == "ok"
+    monkeypatch.setattr(metadata, "version", lambda name: {"robotframework": "7.3"}[name])
+    (check,) = machine.robot_framework()
+    assert (
+        check.state == "fail" and "robotframework 7.3" in check.found and "uninstall -y robotframework" in check.advice
+    )
+
+
 def test_opencv_is_asked_for_as_lerobot_does_everywhere_alike(monkeypatch: pytest.MonkeyPatch) -> None:
     """Beside LeRobot 0.6, which asks for opencv-python-headless below 4.14, both builds can only be of one version."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]

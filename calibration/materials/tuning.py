@@ -1,7 +1,7 @@
 """Tuned constants of the fit of materials.
 
-Each entry: what it is, its unit, and what it was measured on where it was. Sources: docs/identify.md, and the tests in
-tests/calibration/materials.
+Each entry: quantity, unit, and the measurement behind it, if there is one. Sources:
+docs/measurements/identification.md, and the tests in tests/calibration/materials.
 """
 
 # checks.py

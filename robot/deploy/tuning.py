@@ -1,7 +1,7 @@
 """Tuned constants of policies on a rig, and of the range of training.
 
-Each entry: what it is, its unit, and what it was measured on where it was. Sources: docs/train.md, and the tests in
-tests/robot/deploy.
+Each entry: quantity, unit, and the measurement behind it, if there is one. Sources: docs/measurements/training.md,
+and the tests in tests/robot/deploy.
 """
 
 # training_range.py

@@ -1,8 +1,7 @@
 """How well the distance that is felt agrees with the true one: `python -m benchmarks.felt_distance`.
 
 Episodes of each task at `learn`, of bodies, clays and goals that are drawn anew, played by the scripted policy and by a
-random one; at every tenth step both distances are taken. Minutes; docs/measurements/learning.md has
-the figures.
+random one; at every tenth step both distances are taken. Minutes; docs/learn.md has the figures.
 """
 
 from __future__ import annotations

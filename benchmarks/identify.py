@@ -7,7 +7,7 @@ Then noise, zeros and places are drawn again many times: how often do the interv
 or a wrong ball noticed, how often something that is not there? No draw needs a simulation: near the estimate the
 simulation is the linear system that the fit ended with, and what is drawn is added to the recordings as they were. A
 gel takes a minute, a body a quarter of an hour. `friction` says which motion tells which friction. `docs` writes the
-table of docs/measurements/identification.md from the results in `--folder`, and measures those that are missing.
+table of docs/identify.md, of what was measured in `--folder` before; what lacks it measures.
 """
 
 from __future__ import annotations
@@ -47,8 +47,7 @@ DRIFTS = {"gel": (0.05, 0.1, 0.2), "body": (0.2, 0.5, 1.0)}  # of the normal for
 PAGE, ROWS = Path("docs/measurements/identification.md"), "found.json"  # of all truths; of each, in its folder
 BEGIN, END = "<!-- made by python -m benchmarks.identify docs -->", "<!-- end of the table -->"
 HEAD = (
-    "| Truth | Recordings | Simulated | Time | Error (95 % interval; draws whose interval contains the truth) "
-    "| Contradictions | Detected |",
+    "| Truth | Recordings | Simulated | Time | Off the truth (95 %; draws that hold it) | Told against it | Noticed |",
     "|---|---|---|---|---|---|---|",
 )
 WORDS = {
@@ -265,7 +264,7 @@ def row(
     def noticed_in(drawn: tuple[Fit, Signals]) -> bool:
         return bool(find_contradictions(replace(drawn[0], sigma=found.checked.sigma), drawn[1], names, found.by_size))
 
-    noticed = {"no fault": sum(map(noticed_in, again))}
+    noticed = {"nothing wrong": sum(map(noticed_in, again))}
     for what, change in _faults(found).items():
         noticed[what] = sum(noticed_in(redrawn(found, clean + change, k, priors)) for k in range(draws))
     return Row(
@@ -278,7 +277,7 @@ def line(row: Row) -> str:
     for name, found in row.parameters.items():
         words = WORDS.get(name, name)
         if found is None:
-            cells.append(f"{words} not identified")
+            cells.append(f"{words} not told")
             continue
         off, low, high, held, of = found
         miss = "" if low <= 0 <= high else ", MISSES"
@@ -286,7 +285,7 @@ def line(row: Row) -> str:
     noticed = ", ".join(f"{what} {count}" for what, count in row.noticed.items())
     seconds = "" if row.seconds is None else f"{row.seconds:.0f} s"
     return (f"| {row.name} | {row.recordings} | {row.simulated} | {seconds} | {'; '.join(cells)} | "
-            f"{', '.join(row.against) or 'none'} | {noticed} of {row.draws} |")  # fmt: skip
+            f"{', '.join(row.against) or 'nothing'} | {noticed} of {row.draws} |")  # fmt: skip
 
 
 def poisson(force_noise: float, heights: bool, balls: tuple[float, ...]) -> str:
@@ -307,7 +306,7 @@ def poisson(force_noise: float, heights: bool, balls: tuple[float, ...]) -> str:
     signals = replace(signals_of(presses, Noise(force_noise)), values=values)
     fit = estimate_materials([simulation], signals, parameters, Priors(PLACE, 10 * force_noise), SETTLING_ERROR)
     if any(each.name == "poisson_ratio" for each in fit.unidentified):
-        return "not identified"
+        return "not told"
     return "{:.3f} to {:.3f}".format(*fit.interval("poisson_ratio"))
 
 

@@ -3,8 +3,7 @@
 One clay and one gel, hidden in a twin. Their motions are recorded on it, `tacsim identify` finds what they are made of,
 and for each of {canonical touch, raw pictures} x {materials guessed, identified, drawn} a policy learns to squeeze.
 `tacsim transfer` then plays them all, each in its own simulation and over the wire on the twin. Killed anywhere, the
-same command goes on; `--only record`, `identify`, `train` or `play` does that part. The table stands in
-docs/measurements/training.md.
+same command goes on; `--only record`, `identify`, `train` or `play` does that part. The table stands in docs/train.md.
 """
 
 from __future__ import annotations

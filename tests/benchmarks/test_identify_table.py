@@ -1,4 +1,4 @@
-"""The table of docs/measurements/identification.md is written from the results."""
+"""The table of docs/identify.md is made of what was measured."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from benchmarks import identify
 ROW = identify.Row(
     "body 3", 2, 88, 795.0,
     {"youngs_modulus": (-0.004, -0.06, 0.05, 50, 50), "friction_lower": (0.2, 0.1, 0.3, 3, 50), "friction_upper": None},
-    ["drift"], {"no fault": 0, "drift of 0.2 N": 49}, 50,
+    ["drift"], {"nothing wrong": 0, "drift of 0.2 N": 49}, 50,
 )  # fmt: skip
 LINE = (
     "| body 3 | 2 | 88 | 795 s | stiffness -0.4 % (-6 to +5; 50 of 50); friction below +20.0 % (+10 to +30, MISSES; "
-    "3 of 50); friction above not identified | drift | no fault 0, drift of 0.2 N 49 of 50 |"
+    "3 of 50); friction above not told | drift | nothing wrong 0, drift of 0.2 N 49 of 50 |"
 )
 
 

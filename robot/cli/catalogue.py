@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from robot.cli.output import notes, results, print_files, show_table, writing
+from robot.cli.output import notes, print_files, results, show_table, writing
 
 Kind = Literal[
     "rig", "task", "scene", "sensor", "randomisation", "training", "material", "policy", "driver"

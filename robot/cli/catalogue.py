@@ -37,9 +37,7 @@ def list_(
         typer.echo(json.dumps(rows, indent=1))
         return
     show_table("", ("kind", "name", ""), [(each.kind, each.name, each.summary) for each in entries], left=(0, 1, 2))
-    notes.print(
-        "tacsim show NAME prints one of them; a path of a file of your own may stand for each name but a driver's"
-    )
+    notes.print("tacsim show NAME prints one of them; the path of a file may stand for each name, except a driver's")
 
 
 def show(
@@ -138,7 +136,7 @@ def new(
         Path | None, typer.Option(help="The new file; of a driver the new folder.", show_default="NAME")
     ] = None,
 ) -> None:
-    """Begin a file of your own as a copy of a shipped one, or a driver as a small distribution that works.
+    """Write a new file as a copy of a shipped one, or a driver as a small distribution that works.
 
     Example: tacsim new rig my-cell --from ur5e-one
     """

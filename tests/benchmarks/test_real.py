@@ -127,7 +127,7 @@ def test_wrong_words_on_the_command_line(folder_of_frames: Folder, tmp_path: Pat
     for words, said in (
         (("real",), "--data DIR"),
         (("press", "--data", tmp_path), "uses no real frames"),
-        (("real", "--data", tmp_path / "none"), "is no folder"),
+        (("real", "--data", tmp_path / "none"), "is not a folder"),
         (("real", "--data", folder_of_frames[0] / "deep"), "holds them"),  # labels missing there
     ):
         result = tacsim("bench", *words, "--json", tmp_path / "none.json")

@@ -123,7 +123,7 @@ def test_corners_undo_a_slanted_view(real: FrameSet) -> None:
     assert compare_frames(straight, real).overall["contact_ncc"].mean > 0.97
     assert rectified_shape(corners) == (182, 239)  # the longest sides: right and bottom
     outside = ((-20.0, 0.0), corners[1], corners[2], corners[3])
-    with pytest.raises(BadCorners, match="beyond the picture"):
+    with pytest.raises(BadCorners, match="outside the picture"):
         rectified_by_corners(slanted, outside, real.shape)
 
 

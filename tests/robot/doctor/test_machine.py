@@ -57,8 +57,8 @@ def test_an_unknown_distribution_is_a_warning() -> None:
 @pytest.mark.parametrize(
     ("other", "version", "state", "words"),
     [
-        ("opencv-python", "4.9.0", "fail", "opencv-python 4.9.0 beside"),
-        ("OpenCV_Python_Headless", "4.9.0", "fail", "opencv-python-headless 4.9.0 beside"),
+        ("opencv-python", "4.9.0", "fail", "opencv-python 4.9.0 in addition to"),
+        ("OpenCV_Python_Headless", "4.9.0", "fail", "opencv-python-headless 4.9.0 in addition to"),
         ("opencv-python-headless", "4.13.0.92", "ok", "the same version"),
         ("no-opencv", "4.9.0", "ok", "no other opencv package"),
     ],

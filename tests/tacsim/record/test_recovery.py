@@ -152,7 +152,7 @@ def test_a_step_is_not_completed_with_messages_of_another(
     with Recorder(tmp_path / "e.mcap", meta) as recorder:
         recorder.write(make_step(0))
         recorder.write(make_step(1))
-    with pytest.raises(EpisodeError, match=r"step number 1: a step names the message '/lower/image', which is not"):
+    with pytest.raises(EpisodeError, match=r"step number 1: a step names the message '/lower/image', which is missing"):
         read_episode(tmp_path / "e.mcap")
 
 

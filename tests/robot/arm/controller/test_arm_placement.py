@@ -169,7 +169,7 @@ def test_a_slow_slider_is_a_warning() -> None:
 
 def test_joints_of_another_model_are_told() -> None:
     found = _at_start(shipped(), joints=np.array(JOINTS))["pose"]
-    assert found.state == "fail" and "from where a ur5e would have it" in found.found
+    assert found.state == "fail" and "from the position for model ur5e" in found.found
 
 
 def test_connecting_refuses_another_robot_than_the_pinned_one(mock: MockUR, file: Path) -> None:

@@ -341,7 +341,7 @@ def test_sizes_that_do_not_fit_are_refused() -> None:
 
 
 def test_a_gel_of_one_element_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"makes 1 x 4 x 4 elements of 1 mm; .* element_size of at most 0\.5 mm"):
+    with pytest.raises(ValueError, match=r"gives 1 x 4 x 4 elements of 1 mm; .* element_size of at most 0\.5 mm"):
         gel_params(Gel(size=(1e-3, 4e-3, 4e-3)), 1e-3)
     assert gel_params(Gel(size=(1e-3, 4e-3, 4e-3)), 0.5e-3).elements == (2, 8, 8)
 

@@ -96,7 +96,7 @@ def test_version_option_prints_version() -> None:
         (("press", "sphere", "--depth", "9 mm"), "0.009"),
         (("press", "sphere", "--depth", "0"), "must be above 0"),
         (("press", "sphere", "--slide", "10 m, 0"), "at most 3 widths of the gel, 0.06 m"),
-        (("press", "sphere", "--twist", "1e9 deg"), "at most 3600 deg"),
+        (("press", "sphere", "--twist", "1e9 deg"), "the limits are -3600 and 3600 deg"),
         (("press", "sphere", "--radius", "0.05 mm", "--depth", "0.3 mm"), "choose element_size at most"),
         (("press", "sphere", "--set", "gel.size=[20 mm, 13.3 mm, 4 mm]"), "does not divide into cubes"),
         (("press", "sphere", "--edge-radius", "0.1 mm"), "a sphere has no edges"),

@@ -64,10 +64,10 @@ TEXTS = {
     "null": ("gel:", "a.yaml:1: gel: nothing (null) does not fit; allowed: a mapping with keys among size, material, housing"),
     "literal": ("physics: sed", "a.yaml:1: physics: 'sed' is unknown; allowed: hybrid | seed; did you mean 'seed'?"),
     "variant": ("body:\n  geometry: {shape: spere}",
-                "a.yaml:2: body.geometry: shape 'spere' is unknown; allowed: box | sphere | cylinder | stl; did you mean 'sphere'?"),
+                "a.yaml:2: body.geometry: shape 'spere' is unknown; allowed: box | sphere | cylinder | mesh; did you mean 'sphere'?"),
     "no variant": ("body:\n  geometry:\n    size: [1, 1, 1]",
-                   "a.yaml:2: body.geometry: 'shape' is missing; allowed: shape: box | sphere | cylinder | stl"),
-    "missing": ("body: {geometry: {shape: stl}}", "a.yaml:1: body.geometry.path: is missing; allowed: a text"),
+                   "a.yaml:2: body.geometry: 'shape' is missing; allowed: shape: box | sphere | cylinder | mesh"),
+    "missing": ("body: {geometry: {shape: mesh}}", "a.yaml:1: body.geometry.path: is missing; allowed: a text"),
     "short list": ("gel:\n  size: [1]", f"a.yaml:2: gel.size: has 1 entry; allowed: a list of 3, each a {LENGTH}"),
     "long list": ("gel:\n  size: [1, 1, 1, 1]", f"a.yaml:2: gel.size: has 4 entries; allowed: a list of 3, each a {LENGTH}"),
     "unit": ("element_size: 3 mn", "a.yaml:1: element_size: '3 mn': no unit 'mn' for a length; allowed: a number [m], "
@@ -303,7 +303,7 @@ def test_not_utf8(folder: Path) -> None:
 
 KEYS = ["name", "scene", "task", "arms", "sensors", "body", "gel", "geometry", "shape", "size", "material", "extends", "driver",
         "kind", "friction", "lights", "lighting", "model", "background", "upper", "lower", "goal", "x", "0", "<<"]  # fmt: skip
-VALUES = ["sim", "squeeze", "press", "ideal", "dough", "a.yaml", "../a.yaml", "box", "stl", "1", "-1e400", ".nan", "3 mm", "3 mn",
+VALUES = ["sim", "squeeze", "press", "ideal", "dough", "a.yaml", "../a.yaml", "box", "mesh", "1", "-1e400", ".nan", "3 mm", "3 mn",
           "null", "true", "", "*a", "&a b", "!t x", "[", "}", "'", '"', "|", "a: b", "[1, 2]", "{shape: sphere}", "\t", "é",
           "\x00", "\u2028", '"\\ud800"', '"\\Uffffffff"', "%YAML 1.1", "---", "? ", "- - "]  # fmt: skip
 tree = st.recursive(

@@ -35,7 +35,7 @@ def normaliser_for_simulation(
     model: SensorModel, gel_size: tuple[float, float], grid: CanonicalGrid
 ) -> FrameNormaliser:
     """The normaliser of a simulated sensor; `gel_size`: x, y [m]."""
-    return FrameNormaliser(_normaliser_of_model(model, gel_size, canonical_image(grid)), grid)
+    return FrameNormaliser(_rectification_of_model(model, gel_size, canonical_image(grid)), grid)
 
 
 def normaliser_for_pictures(
@@ -49,7 +49,7 @@ def normaliser_for_pictures(
             f"the light of model '{model.name}' is a calibrated one, whose inverse is in its bundle: give the "
             "camera `calibration: BUNDLE` in place of `model`"
         )
-    rectify = _normaliser_of_model(model, gel_size, extended_view(grid, gel_size)).within(region)
+    rectify = _rectification_of_model(model, gel_size, extended_view(grid, gel_size)).within(region)
     slopes: GradientModel
     if model.darkness is not None:
         shape = rectify.valid[visible_box(rectify.valid)].shape
@@ -62,8 +62,8 @@ def normaliser_for_pictures(
     )
 
 
-def _normaliser_of_model(model: SensorModel, gel_size: tuple[float, float], grid: PixelGrid) -> Rectification:
-    """The normaliser for pictures of a sensor of this model."""
+def _rectification_of_model(model: SensorModel, gel_size: tuple[float, float], grid: PixelGrid) -> Rectification:
+    """Native picture to grid, for a sensor of this model."""
     return (
         rectification_of_geometry(model.geometry, gel_size, grid)
         if model.view is None

@@ -55,8 +55,8 @@ def check_action(action: object, movable: Collection[str], rig: str) -> Action:
 
 
 def limit_step(target: Pose, current: Pose, max_step: float, max_turn: float) -> Pose:
-    """`target` itself if it is within `max_step` [m] and `max_turn` [rad] of `now`; otherwise the farthest such pose on
-    the straight path to it, translation and rotation in proportion."""
+    """`target` itself if it is within `max_step` [m] and `max_turn` [rad] of `current`; otherwise the farthest such
+    pose on the straight path to it, translation and rotation in proportion."""
     from tacsim import pose as se3  # SciPy takes half a second to load; the process that drives an arm needs none of it
 
     metres, radians = se3.pose_distance(current, target)
@@ -68,7 +68,7 @@ def limit_step(target: Pose, current: Pose, max_step: float, max_turn: float) ->
 
 def finite_targets(targets: ArrayLike) -> Mask:
     """(...,) which of `targets` (..., 7), position [m] and quaternion x y z w, are poses: finite, the position within
-    FARTHEST, the quaternion of unit length within 1e-3. All False for any other shape."""
+    MAX_POSITION, the quaternion of unit length within 1e-3. All False for any other shape."""
     try:
         given = np.asarray(targets, dtype=np.float64)
     except (TypeError, ValueError):
@@ -152,7 +152,7 @@ def fraction_clear(start: ArrayLike, end: ArrayLike, centre: ArrayLike, distance
 def clip_to_region(
     target: Pose, current: Pose, inside: Region | None, spheres: Iterable[tuple[ArrayLike, float]] = ()
 ) -> tuple[Pose, float]:
-    """`target` itself if the straight path from `now` stays `inside` (None: anywhere) and outside the `spheres`
+    """`target` itself if the straight path from `current` stays `inside` (None: anywhere) and outside the `spheres`
     (centre (3,), radius [m]); otherwise the farthest pose on it up to which it does. Also that fraction of the path."""
     fraction = 1.0 if inside is None else float(fraction_inside(current.position, target.position, inside))
     for centre, radius in spheres:

@@ -104,7 +104,7 @@ class Rig:
         self._addressable = set(arms) | {sensor for sensor, spec in specs.items() if spec.arm is None}
 
     def require(self, needs: Needs, requester: str) -> None:
-        """Raises IncompatibleRig with the difference when `who` needs what this rig does not deliver."""
+        """Raises IncompatibleRig with the difference when `requester` needs what this rig does not deliver."""
         require_needs(self.name, self.spec, needs, requester)
 
     def reset(self, seed: int = 0) -> Observation:
@@ -222,7 +222,7 @@ class Rig:
 
 
 def require_needs(rig: str, spec: RigSpec, needs: Needs, requester: str, advice: str = "") -> None:
-    """Raises IncompatibleRig with the difference, and `advice`, when `who` needs what the rig does not deliver."""
+    """Raises IncompatibleRig with the difference, and `advice`, if the rig does not deliver what `requester` needs."""
     missing = needs.missing(spec)
     if missing:
         has = f"sensors {', '.join(spec.sensors)}; arms {', '.join(spec.arms) or '(none)'}"

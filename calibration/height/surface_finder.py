@@ -110,7 +110,7 @@ class SurfaceFinder:
         )
 
     def _mean_angle(self, change: Float32) -> float:
-        """Mean angle [degrees] of the slopes that correspond to changes of colour (n, 3) at every STRIDE-th pixel."""
+        """Mean angle [degrees] of the slopes that belong to changes of colour (n, 3) at every PIXEL_STRIDE-th pixel."""
         slope = np.einsum("nsc,nc->ns", self._response, change)
         steepness = np.hypot(slope[:, 0], slope[:, 1])[~self._unseen[::PIXEL_STRIDE, ::PIXEL_STRIDE].ravel()]
         return float(np.degrees(np.arctan(steepness)).mean())
@@ -170,7 +170,7 @@ def _ink_mask(relative: Float32) -> Mask:
 
 
 def _slope_response(slopes: GradientModel, shape: tuple[int, int]) -> Float32:
-    """(n, 2, 3) derivative of the slope by colour, at every STRIDE-th row and column."""
+    """(n, 2, 3) derivative of the slope by colour, at every PIXEL_STRIDE-th row and column."""
     colour_step = 0.02  # of the finite differences of slope by colour [-]
     answers = []
     for channel in range(3):

@@ -49,7 +49,7 @@ class ModelSize:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NormalEquations:
-    """Normal equations of one press for the terms of LARGEST, and after them those of depth, of slopes at depth and of
+    """Normal equations of one press for the terms of MAX_SIZE, and after them those of depth, of slopes at depth and of
     cast shadows. Each channel has its own if pixels are saturated in one and not in another."""
 
     square: FloatArray  # (1, terms, terms) of all channels, or (3, terms, terms)
@@ -116,8 +116,8 @@ def _normal_sums_with_extra(
 def _normal_sums(
     gradient: FloatArray, u: FloatArray, v: FloatArray, change: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """F^T F and F^T `change` (n, any) for F = features(gradient, u, v, *LARGEST), without F: each of its 126 columns is
-    a term of the normal times one of the place, and of the products of two columns most are the same powers. What is
+    """F^T F and F^T `change` (n, any) for F = features(gradient, u, v, *MAX_SIZE), without F: each of its 126 columns
+    is a term of the normal times one of the place, and of the products of two columns most are the same powers. What is
     left are 87 products of the normal times 15 of the place, summed over CHUNK pixels at a time."""
     degree, position = MAX_SIZE
     normals, places = len(_normal_powers(degree)), len(_place_powers(position))

@@ -191,7 +191,7 @@ class MarkerFlow:
 
 
 def marker_grid(markers: Markers, gel_size: tuple[float, float]) -> PixelGrid:
-    """A grid of the whole gel (x, y [m]) on which a dot's radius is DOT_RADIUS pixels."""
+    """A grid of the whole gel (x, y [m]) on which a dot's radius is `dot_radius` pixels."""
     dot_radius = 2.5  # on the grid on which dots are sought [px]
     pitch = markers.radius / dot_radius
     columns, rows = (max(2, math.ceil(length / pitch)) for length in gel_size)

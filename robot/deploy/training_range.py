@@ -57,7 +57,7 @@ def number_names(spec: PolicySpec, goals: int) -> list[str]:
 
 
 def append_products(numbers: FloatArray) -> FloatArray:
-    """Appends the products of each pair to numbers (..., n), if n <= MAX_NUMBERS_WITH_PRODUCTS: (..., m)."""
+    """Appends the products of each pair to numbers (..., n), if n <= `max_numbers_with_products`: (..., m)."""
     max_numbers_with_products = 12  # with more numbers no products are added
     count = numbers.shape[-1]
     if count > max_numbers_with_products:

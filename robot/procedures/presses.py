@@ -102,7 +102,7 @@ class _ContactMonitor:
         self._reference = _cell_means(image)
 
     def wait_for_rest(self) -> tuple[Image, ...]:
-        """The last pictures, at most NOISE_FRAMES, of REFERENCE_REST_TIME without motion."""
+        """The last pictures, at most NOISE_FRAMES, of `rest_time` without motion."""
         rest_time = 1.5  # the same for the reference without contact [s]
         begin = None
         shown: deque[Image] = deque(maxlen=NOISE_FRAMES)

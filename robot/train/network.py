@@ -89,7 +89,7 @@ class PolicyNetwork(nn.Module):
 
 
 def _picture_layers(shape: tuple[int, ...]) -> nn.Sequential:
-    """(batch, *shape) -> (batch, OF_PICTURES)."""
+    """(batch, *shape) -> (batch, PICTURE_FEATURES)."""
     channels, rows, columns = shape
     layers = nn.Sequential(
         nn.Conv2d(channels, 16, 3, stride=2, padding=1), nn.ReLU(),
@@ -107,8 +107,8 @@ class ExportError(RuntimeError):
 
 def export(network: PolicyNetwork, spec: PolicySpec, shapes: Shapes, path: Path) -> float:
     """Writes the file and returns the maximum difference of its actions from the network's for random features. Raises
-    ExportError if that exceeds MAX_ACTION_DIFFERENCE or the file exceeds MAX_BYTES."""
-    max_action_difference = 1e-5  # between torch and ONNX [-] [-]
+    ExportError if that exceeds 1e-5 or the file exceeds MAX_BYTES."""
+    max_action_difference = 1e-5  # between torch and ONNX [-]
     opset = 17
     network.eval()
     random = torch.Generator().manual_seed(0)

@@ -24,10 +24,10 @@ FIELD_SHIFTS = 64  # of a field, in rows and in columns
 class NoiseSource:
     """Adds a camera's noise to the pictures of one sensor.
 
-    Drawing noise anew for each frame would cost more than rendering it. Therefore FIELDS fields somewhat larger than
-    the image are drawn once, and each frame takes one of them, shifted by up to SHIFTS pixels in rows and columns. That
-    makes FIELDS * SHIFTS^2 patterns; which one follows from seed, sensor, episode and frame alone. Single frames and
-    pairs have the noise of the model; a mean over hundreds of frames keeps more of it than it should.
+    Drawing noise anew for each frame would cost more than rendering it. Therefore NOISE_FIELDS fields somewhat larger
+    than the image are drawn once, and each frame takes one of them, shifted by up to FIELD_SHIFTS pixels in rows and
+    columns. That makes NOISE_FIELDS * FIELD_SHIFTS^2 patterns; seed, sensor, episode and frame alone decide which one.
+    Single frames and pairs have the noise of the model; a mean over hundreds of frames keeps more of it than it should.
 
     Rounding is part of the noise, so that the fields are of whole grey levels. Below a deviation of about one that
     makes them a little less correlated than the model says.

@@ -250,8 +250,8 @@ def phong_shading(gradient: Float32, lighting: Lighting, white: float = 1.0) -> 
 
 @lru_cache(maxsize=8)
 def light_table(lighting: Lighting) -> Float32 | None:
-    """(n, n, 3) light at slopes from -STEEPEST to STEEPEST, rows by y; 255 is white. None for highlights so narrow that
-    light between the points is more than MAX_TABLE_ERROR off."""
+    """(n, n, 3) light at slopes from -MAX_SLOPE to MAX_SLOPE, rows by y; 255 is white. None for highlights so narrow
+    that light between the points is more than `max_table_error` off."""
 
     max_table_error = 0.5  # largest error of the table [grey levels]; narrower highlights are computed without it
 
@@ -269,7 +269,7 @@ def light_table(lighting: Lighting) -> Float32 | None:
 
 
 def light_at(table: Float32, gradient: Float32) -> Float32:
-    """(H, W, 3) light at slopes (H, W, 2) no steeper than STEEPEST, linear in a table of :func:`light_table`."""
+    """(H, W, 3) light at slopes (H, W, 2) no steeper than MAX_SLOPE, linear in a table of :func:`light_table`."""
     return bilinear_lookup(
         table, gradient * np.float32(LIGHT_TABLE_POINTS / MAX_SLOPE) + np.float32(LIGHT_TABLE_POINTS)
     )

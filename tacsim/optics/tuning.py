@@ -18,7 +18,7 @@ INK_TRANSMISSION = 0.06  # fraction of the light that a dot lets through [-]
 # 54 um pixels, but they belong to the gel: an image of another size shows the same texture.
 TEXTURE_PITCH = 0.12e-3
 MAX_SLOPE = 2.0  # largest slope in the table of light
-LIGHT_TABLE_POINTS = 256  # of that table, from slope 0 to STEEPEST
+LIGHT_TABLE_POINTS = 256  # of that table, from slope 0 to MAX_SLOPE
 
 # surface.py
 # The table is this fine or finer [m], but has no more than so many points for each lattice spacing. Height errs by 0.2

@@ -103,7 +103,7 @@ def estimated_height(observation: Observation) -> float:
 def max_depth(touch: TactileObservation) -> float:
     """Greatest depth of the body in the gel [m]; 0 without contact."""
     if touch.height is None:
-        raise ValueError("indentation: this sensor delivers no surface height")
+        raise ValueError("the depth of an indentation needs a sensor that delivers the height of its surface")
     return max(0.0, float(touch.height.max(where=touch.valid, initial=0.0)))
 
 

@@ -274,7 +274,7 @@ def return_any_strain(e, plastic_strain, mu, bulk, yield_strain, hardening):
 def hencky_return(e, plastic_strain, mu, bulk, yield_strain, hardening):
     """Hencky elasticity with von Mises return mapping (seed paper, eq. 1 and 2), on e = b_e - I.
 
-    For tests and benchmarks: `particles_to_grid` calls the two parts separately.
+    For tests and benchmarks: `return_block` (transfers.py) calls the two parts separately.
 
     e: trial elastic left Cauchy-Green strain minus identity; plastic_strain: equivalent, before this step;
     yield_strain: sigma_y / (2 mu), Frobenius norm; linear isotropic hardening (Simo & Hughes 1998, box 3.1) adds

@@ -16,9 +16,9 @@ Floats = NDArray[np.floating]
 def gel_overlap(gels: Sequence[GelParams], surfaces: Sequence[Floats], rotations: Floats, origins: Floats) -> float:
     """Largest depth of a surface node of one gel below the surface of the other [mm]; 0 where they are separated.
 
-    tops: displacements of the surfaces of both `gels` (nx + 1, ny + 1, 3), each in its sensor's frame [mm]; rotations
-    (2, 3, 3) and origins (2, 3) [mm] of the sensors in the world. Heights between nodes are linear; they are taken at
-    the undeformed positions of the nodes, without the lateral displacement.
+    surfaces: displacements of the surfaces of both `gels` (nx + 1, ny + 1, 3), each in its sensor's frame [mm];
+    rotations (2, 3, 3) and origins (2, 3) [mm] of the sensors in the world. Heights between nodes are linear; they are
+    taken at the undeformed positions of the nodes, without the lateral displacement.
     """
     if are_separated(gels, displacement_bounds(surfaces[1]), float(surfaces[0][..., 2].max()), rotations, origins):
         return 0.0

@@ -152,7 +152,8 @@ def _describe_feature(feature: Any) -> str:
 
 def _describe_object(geometry: Shape) -> str:
     if isinstance(geometry, Mesh):
-        return f"`{_escape_cell(geometry.path)}`, {geometry.scale:g} m per unit"
+        unit = "unit guessed from its size" if geometry.scale is None else f"{geometry.scale:g} m per unit"
+        return f"`{_escape_cell(geometry.path)}`, {unit}"
     sizes = geometry.model_dump(mode="json")
     shape = sizes.pop("shape")
     return ", ".join(

@@ -114,7 +114,7 @@ def test_what_is_marked_in_the_materials_group_makes_a_single_block(monkeypatch:
     def refuse(cpu_only: str | None = None) -> str:
         raise RuntimeError(cpu_only or "")
 
-    monkeypatch.setattr(blocks, "start", refuse)
+    monkeypatch.setattr(blocks, "start_taichi", refuse)
     for case in select_cases(["materials"], baselines=False):
         if case.cpu:
             with pytest.raises(RuntimeError, match="a single block"):
@@ -132,7 +132,7 @@ def test_the_page_shows_a_device_and_how_much_faster_it_is(cpu: Report) -> None:
     assert page.startswith(markdown(cpu).partition("## Not measured")[0])  # nothing of the CPU's changes
     assert page.count("## On a GPU: ") == 1 and NO_DEVICE not in page and NO_DEVICE in markdown(cpu)
     section = page.partition("## On a GPU: Made-up 9000\n")[2].partition("\n## Not measured")[0]
-    assert f"Made-up 9000 (cuda, 24 GB, driver 555.1) beside {cpu.metadata.machine.cpu}," in section
+    assert f"Made-up 9000 (cuda, 24 GB, driver 555.1) next to {cpu.metadata.machine.cpu}," in section
     assert "| substeps | CPU / GPU |" in section
     lines = [line for line in section.splitlines() if line.startswith("| ")]
     assert next(line for line in lines if line.startswith("| sphere_press ")).endswith("| 4 x |")

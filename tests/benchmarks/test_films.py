@@ -45,7 +45,7 @@ def film(drawn: Path, tmp_path: Path) -> Path:
 
 def test_dots_are_followed_and_those_that_leave_are_told(film: Path) -> None:
     (case,) = (case for case in select_cases(["real"], baselines=False, data=film) if case.name == CASE)
-    assert description("real", case.name, "tacsim").startswith("Dots followed")
+    assert description("real", case.name, "tacsim").startswith("Dots tracked")
     (row,) = case.measure(1)
     assert row.figures["dots"] == 48
     assert row.figures["motion_px"] == pytest.approx(16.1, abs=0.3)

@@ -20,7 +20,7 @@ from robot.collect.table import COLUMN_TEXTS
 from robot.studies.press import MAX_MISSED_DEPTH_SHARE, PressMotion, press
 from tacsim import pose as se3
 from tacsim.config import load_scene, load_sensor
-from tacsim.geometry.mesh import load_mesh
+from tacsim.geometry.mesh_file import load_mesh
 from tacsim.geometry.shapes import shape_distance
 from tacsim.interface import Pose
 from tacsim.models.scene import Mesh, Scene, Sphere

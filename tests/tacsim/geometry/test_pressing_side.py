@@ -88,6 +88,6 @@ def test_a_section_lies_in_its_plane_and_closes(cone: Mesh) -> None:
 def test_the_pressing_side_of_a_mesh_is_said_when_a_rig_is_loaded(cone: Mesh, tmp_path: Path) -> None:
     from tacsim.config import load_rig
 
-    words = f'scene.indenter.geometry={{"shape": "stl", "path": "{cone.path}"}}'
+    words = f'scene.indenter.geometry={{"shape": "mesh", "path": "{cone.path}"}}'
     loaded = load_rig("press", overrides=[words, "scene.indenter.roll=180 deg"])
     assert any("pressing side: +z of cone.stl, a point" in note for note in loaded.notes)

@@ -12,7 +12,7 @@ import pytest
 import trimesh
 
 from tacsim.geometry import shapes
-from tacsim.geometry.mesh import file_fingerprint, load_mesh
+from tacsim.geometry.mesh_file import file_fingerprint, load_mesh
 from tacsim.geometry.shapes import (
     bounding_size,
     edge_points,

@@ -8,7 +8,8 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from tacsim.geometry import tiles
-from tacsim.geometry.mesh import file_fingerprint, signed_distance_on_grid
+from tacsim.geometry.mesh import signed_distance_on_grid
+from tacsim.geometry.mesh_file import file_fingerprint
 from tacsim.geometry.shapes import shape_distance
 from tacsim.geometry.tiles import (
     TILE_NODES,

@@ -18,8 +18,8 @@ IntArray = NDArray[np.int64]
 def repair_mesh(mesh: Trimesh, scale: float) -> list[str]:
     """Changes `mesh`, whose equal corners are merged, so that its surface is closed where that is possible.
 
-    Duplicate triangles and those without area are dropped, neighbours that face opposite ways are turned, and each hole
-    is closed by triangles from its edges to its middle.
+    Duplicate triangles and those without area are removed, triangles that face the other side than their neighbours are
+    reversed, and each hole is closed by triangles from its edges to its middle.
 
     Args:
         mesh: in file units.
@@ -35,11 +35,11 @@ def repair_mesh(mesh: Trimesh, scale: float) -> list[str]:
     before = len(mesh.faces)
     mesh.update_faces(mesh.unique_faces() & (mesh.area_faces > 0.0))
     if dropped := before - len(mesh.faces):
-        words.append(f"{dropped} superfluous triangles were dropped")
+        words.append(f"duplicate or flat triangles removed: {dropped}")
     if not mesh.is_winding_consistent:
         turned = _find_turned(mesh)
         mesh.faces = np.where(turned[:, None], mesh.faces[:, ::-1], mesh.faces)
-        words.append(f"{int(turned.sum())} triangles were turned to face as their neighbours do")
+        words.append(f"triangles reversed to match their neighbours: {int(turned.sum())}")
     rims = _find_rims(np.asarray(mesh.faces, np.int64))
     if rims:
         words.append(_close_holes(mesh, rims, scale))
@@ -113,7 +113,7 @@ def _close_holes(mesh: Trimesh, rims: list[IntArray], scale: float) -> str:
         count += 1
     mesh.vertices, mesh.faces = np.concatenate(corners), np.concatenate(faces)
     widths = [float(np.linalg.norm(np.ptp(corners[0][rim], axis=0))) * scale * 1e3 for rim in rims]
-    return f"{len(rims)} holes were closed, the largest {max(widths):.3g} mm wide with {max(map(len, rims))} edges"
+    return f"holes closed: {len(rims)}, the largest {max(widths):.3g} mm wide with {max(map(len, rims))} edges"
 
 
 def _middle_of_rim(rim: FloatArray, scale: float) -> FloatArray:

@@ -24,7 +24,7 @@ FIELD_SHIFTS = 64  # of a field, in rows and in columns
 class NoiseSource:
     """Adds a camera's noise to the pictures of one sensor.
 
-    Drawing noise anew for each frame would cost more than rendering it. Therefore NOISE_FIELDS fields somewhat larger
+    Drawing new noise for each frame would cost more than rendering it. Therefore NOISE_FIELDS fields somewhat larger
     than the image are drawn once, and each frame takes one of them, shifted by up to FIELD_SHIFTS pixels in rows and
     columns. That makes NOISE_FIELDS * FIELD_SHIFTS^2 patterns; seed, sensor, episode and frame alone decide which one.
     Single frames and pairs have the noise of the model; a mean over hundreds of frames keeps more of it than it should.

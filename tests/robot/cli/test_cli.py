@@ -239,7 +239,7 @@ def test_press_repairs_and_measures_an_open_mesh_in_metres(tmp_path: Path) -> No
     assert done.exit_code == 0, done.output
     words = " ".join(done.stderr.split())
     assert "bar.obj: read in metres, guessed from its size (3 x 4 x 6 mm)" in words
-    assert "bar.obj: 1 holes were closed, the largest 5 mm wide with 4 edges" in words
+    assert "bar.obj: holes closed: 1, the largest 5 mm wide with 4 edges" in words
     assert "pressing side    -z of bar.obj, a flat face of 4 x 3 mm" in done.stdout
 
 

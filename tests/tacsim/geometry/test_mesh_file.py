@@ -242,7 +242,7 @@ def test_load_mesh_repair_closes_holes_and_states_them(tmp_path: Path) -> None:
         load_mesh(open_file, 1e-3)
     mesh = load_mesh(open_file, 1e-3, repair=True)
     assert mesh.volume == pytest.approx(whole.volume * 1e-9, rel=1e-6)
-    assert mesh.metadata["repairs"] == ["1 holes were closed, the largest 8.49 mm wide with 48 edges"]
+    assert mesh.metadata["repairs"] == ["holes closed: 1, the largest 8.49 mm wide with 48 edges"]
 
 
 def test_load_mesh_repair_closes_a_missing_triangle_and_turns_others(tmp_path: Path) -> None:
@@ -253,7 +253,7 @@ def test_load_mesh_repair_closes_a_missing_triangle_and_turns_others(tmp_path: P
     turned.export(tmp_path / "ball.obj")
     mesh = load_mesh(tmp_path / "ball.obj", 1e-3, repair=True)
     assert mesh.volume == pytest.approx(ball.volume * 1e-9, rel=1e-6) and mesh.is_winding_consistent
-    assert [words.partition(" ")[0] for words in mesh.metadata["repairs"]] == ["1", "4", "1"]
+    assert [words.partition(": ")[2][:1] for words in mesh.metadata["repairs"]] == ["1", "4", "1"]
 
 
 def test_load_mesh_repair_leaves_a_closed_mesh_as_it_is(tmp_path: Path) -> None:

@@ -168,9 +168,10 @@ def test_hostile_targets_leave_limits_without_guard() -> None:
 
 
 def send_hostile(arm: URArm, mock: MockUR, targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Joints (n, 6) that the controller was really sent, and the control periods (n,) in which they arrived."""
-    since = mock.faults.received().last
-    joints, ticks = [], []
+    """Joints (n, 6) that the controller was really sent, and the control periods (n,) in which they arrived. The first
+    row is where the arm rested before: the first target is already one period of motion away from it."""
+    since, rest = mock.faults.received().last, mock.faults.state()
+    joints, ticks = [np.array([rest.joints])], [np.array([rest.tick])]
     for k, target in enumerate(targets):
         # Past the guards of the driver: the worker must stand alone.
         arm._channel.commands.write(make_command_record(time.monotonic(), CommandKind.TARGET, target))
@@ -183,15 +184,15 @@ def send_hostile(arm: URArm, mock: MockUR, targets: np.ndarray) -> tuple[np.ndar
             ticks.append(servo_ticks(page.entries))
     arm.stop()
     until(arm.at_rest, "rest")
-    rest = mock.faults.received(since).entries
-    sent = np.concatenate([*joints, servo_targets(rest)])
+    last = mock.faults.received(since).entries
+    sent = np.concatenate([*joints, servo_targets(last)])
     record = arm._channel.states.latest()
     assert record is not None and record["rejected"] > 0 and record["clipped"] > 0
     assert len(sent) > len(targets) / 100
     assert np.isfinite(sent).all()
     assert not arm.status().is_fault
     assert mock.faults.state().program
-    return sent, np.concatenate([*ticks, servo_ticks(rest)])
+    return sent, np.concatenate([*ticks, servo_ticks(last)])
 
 
 @pytest.mark.promise(1, 2)

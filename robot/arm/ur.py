@@ -90,7 +90,7 @@ class URArm(Closing):
         self._lock = threading.RLock()
         self._closed = False
         self._is_stop_reported = False  # recover() reported a protective stop; the next call unlocks it
-        self._worker: Child | None = None
+        self.worker: Child | None = None  # its process; None once it is closed
         self._worker_monitor = StatusHistory(config.link_timeout + 5 * POLL_PERIOD)  # on the present worker
         self._partner_names = tuple(keep_out or {})  # their segments are held: these arms may be opened again
         self._segments = [shared_segment(arm) for arm in (name, *self._partner_names)]
@@ -115,7 +115,7 @@ class URArm(Closing):
         """The present status of the arm. Never raises."""
         if self._closed:
             return ArmStatus.CLOSED
-        return self._worker_monitor.status(self._worker, self._channel.states.latest)
+        return self._worker_monitor.status(self.worker, self._channel.states.latest)
 
     def explain(self) -> str:
         """The present status as a sentence, with its numbers."""
@@ -262,7 +262,7 @@ class URArm(Closing):
     def _start_worker(self) -> None:
         """Starts a worker and waits until it is connected. Raises the error of a fault present at the start."""
         self._worker_monitor = StatusHistory(self.config.link_timeout + 5 * POLL_PERIOD)
-        self._worker = Child(
+        self.worker = Child(
             "robot.arm.worker",
             name=f"the worker of arm '{self.name}'",
             advice="find the cause, then recover()",
@@ -270,7 +270,7 @@ class URArm(Closing):
         )
         deadline = time.monotonic() + self._timeout
         try:
-            self._worker.request(asdict(self._worker_config), timeout=self._timeout)
+            self.worker.request(asdict(self._worker_config), timeout=self._timeout)
         except DeviceNotConnectedError as failure:
             if time.monotonic() < deadline:
                 raise
@@ -284,14 +284,14 @@ class URArm(Closing):
 
     def _end_worker(self) -> None:
         """Asks the worker to brake and end, then kills it."""
-        if self._worker is None:
+        if self.worker is None:
             return
         record = self._channel.states.latest()
-        connected = self._worker.running and record is not None and record["status"] != ArmStatus.CONNECTING
+        connected = self.worker.running and record is not None and record["status"] != ArmStatus.CONNECTING
         if connected:
             self._send_command(CommandKind.CLOSE)
-        self._worker.close(CLOSE_TIMEOUT if connected else 0.0)
-        self._worker = None
+        self.worker.close(CLOSE_TIMEOUT if connected else 0.0)
+        self.worker = None
 
     def _send_command(
         self, kind: CommandKind, target: Pose | None = None, speed: float = math.inf, fraction: float = 0.0
@@ -379,7 +379,7 @@ class URArm(Closing):
                 text += "".join(f" (arm '{name}' {fault.text})" for name, fault in self._partner_faults())
             elif status < ArmStatus.FORCE_LIMIT and (period := float(record["period"][0])) > slow_period:
                 text += f" (slowly: its loop takes {1e3 * period:.0f} ms, not 2; the machine is too busy)"
-        worker = self._worker
+        worker = self.worker
         if worker is not None and status == ArmStatus.WORKER_DEAD:
             text += f" ({worker.exit_report})"
         elif record is not None and status == ArmStatus.LINK_LOST:
@@ -387,7 +387,7 @@ class URArm(Closing):
         return text
 
     def _describe_lost_link(self, record: Record) -> str:
-        ended = 0 if self._worker is None else self._worker.exit_status
+        ended = 0 if self.worker is None else self.worker.exit_status
         return describe_lost_link(record, self.config, ended, time.monotonic())
 
     def _partner_faults(self) -> Iterator[tuple[str, ArmStatus]]:

@@ -23,9 +23,9 @@ def main(config: str, x: str) -> None:
     with URArm(UrArmConfig.model_validate_json(config), "observed") as arm:
         start = arm.state().pose
         target = Pose(start.position + [float(x), 0.0, 0.0], start.quaternion)
-        assert arm._worker is not None
+        assert arm.worker is not None
         last, commanded = arm.status(), 0.0
-        say(worker=arm._worker.pid, status=last.name)
+        say(worker=arm.worker.pid, status=last.name)
         while True:
             status = arm.status()
             if status != last:

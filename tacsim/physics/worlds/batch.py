@@ -37,13 +37,13 @@ class Batch(NotCopyable):
     def __init__(self, scenes: Sequence[Scene]) -> None:
         """Raises ValueError for scenes that cannot share a launch; the message names them."""
         _require_one_kind(scenes)
-        self._state: HybridState | PressState
+        self.state: HybridState | PressState
         self.worlds: tuple[HybridWorld | PressWorld, ...]
         if scenes[0].indenter is None:
-            self._state = hybrid = HybridState(scenes)
+            self.state = hybrid = HybridState(scenes)
             self.worlds = tuple(HybridWorld(scene, hybrid, index) for index, scene in enumerate(scenes))
         else:
-            self._state = press = PressState(scenes)
+            self.state = press = PressState(scenes)
             self.worlds = tuple(PressWorld(scene, press, index) for index, scene in enumerate(scenes))
 
     def replace(self, index: int, scene: Scene) -> None:
@@ -51,11 +51,11 @@ class Batch(NotCopyable):
 
         Raises ValueError for a scene that cannot share a launch with the others, or has an indenter.
         """
-        if not isinstance(self._state, HybridState) or scene.indenter is not None:
+        if not isinstance(self.state, HybridState) or scene.indenter is not None:
             raise ValueError("only worlds with a body can be replaced in a batch; make a new Batch for indenters")
         _require_one_kind([scene])
-        self._state.place(index, scene)
-        world = HybridWorld(scene, self._state, index)
+        self.state.place(index, scene)
+        world = HybridWorld(scene, self.state, index)
         self.worlds = (*self.worlds[:index], world, *self.worlds[index + 1 :])
 
     def move(
@@ -133,7 +133,7 @@ class Batch(NotCopyable):
             except SimulationDiverged as failure:
                 results[index] = failure
         if ready:
-            self._state.advance({index: prepared.drive for index, prepared in ready.items()})
+            self.state.advance({index: prepared.drive for index, prepared in ready.items()})
         for index, prepared in ready.items():
             try:
                 results[index] = self.worlds[index].outcome(prepared)

@@ -94,7 +94,7 @@ class FemWorld(BaseWorld):
     max_force_loss = math.inf  # of `Path`
     unsettled_reason = ""  # why the last motion has not settled, independent of its residual, and advice
 
-    _state: FemState
+    state: FemState
     _index: int
     _gels: tuple[GelParams, ...]  # by index
     _rates: NDArray[np.float64]  # (frames, 6) velocities at the end of a flowing motion [-, rad/mm]
@@ -161,32 +161,32 @@ class FemWorld(BaseWorld):
     def wrench(self, name: str) -> NDArray[np.float64]:
         first = FORCE + 6 * self._sensor(name)
         wrench: NDArray[np.float64] = (
-            self._state.partial[self._index, :, first : first + 6].astype(np.float64).sum(axis=0)
+            self.state.partial[self._index, :, first : first + 6].astype(np.float64).sum(axis=0)
         )
         wrench[3:] /= MM
         return wrench
 
     def surface(self, name: str) -> GelSurface:
         index = self._sensor(name)
-        return gel_surface(self._gels[index], self._state.surface_displacements(self._index)[index])
+        return gel_surface(self._gels[index], self.state.surface_displacements(self._index)[index])
 
     def _survey(self) -> Survey | None:
-        device = self._state.device
+        device = self.state.device
         return None if device is None else device.survey(self._index)
 
     def _snapshot_before_motion(self) -> State:
-        device = self._state.device
+        device = self.state.device
         if device is None:
             return self.snapshot()
         device.store_state(self._index)
-        sums = {"sums": self._state.partial[self._index]}
+        sums = {"sums": self.state.partial[self._index]}
         return self._state_before(device, "motion", snapshot_of({**sums, **self._scalars()}, self._poses))
 
     def _before_launch(self) -> State:
-        device = self._state.device
+        device = self.state.device
         if device is None:
             return copy_arrays(self.arrays())
-        return self._state_before(device, "launch", copy_arrays({"sums": self._state.partial[self._index]}))
+        return self._state_before(device, "launch", copy_arrays({"sums": self.state.partial[self._index]}))
 
     def _state_before(self, device: DeviceState, moment: str, extra: State) -> State:
         """This world's arrays as the device has stored them before the last "motion" or "launch", and `extra`."""
@@ -208,7 +208,7 @@ class FemWorld(BaseWorld):
     def _write_inertia(self, launch: Launch | None = None) -> None:
         """Writes the entries for `launch` into `params`."""
         entries = self._inertia.entries(launch)
-        self._state.params[self._index, list(entries)] = list(entries.values())
+        self.state.params[self._index, list(entries)] = list(entries.values())
 
     def _switch_inertia(self, inertia: Inertia) -> None:
         """Changes the inertia and sets all velocities to zero, since another inertia has another time scale."""
@@ -222,10 +222,10 @@ class FemWorld(BaseWorld):
         Edges along their directions at rest are computed first, which is fast; elements only if such an edge is too
         short.
         """
-        step = float(self._state.params[self._index, STEP])
+        step = float(self.state.params[self._index, STEP])
         with np.errstate(all="ignore"):  # check_launch reports what is not finite
             survey, waves = self._survey(), self._waves
-            lengths = list(survey.min_edge_length) if survey else self._state.gels.min_edge_length(self._index)
+            lengths = list(survey.min_edge_length) if survey else self.state.gels.min_edge_length(self._index)
             if len(lengths) < len(waves):  # gels with equal lattices were measured together
                 waves = (max(waves),)
             if any(length * MAX_COURANT < step * wave for length, wave in zip(lengths, waves, strict=True)):
@@ -240,7 +240,7 @@ class FemWorld(BaseWorld):
 
     def _damping(self) -> float:
         """Damping of the gels in the last launch: rate times the wave's time through the gel [-]."""
-        return float(self._state.params[self._index, GEL_DAMPING]) * self._gels[0].thickness
+        return float(self.state.params[self._index, GEL_DAMPING]) * self._gels[0].thickness
 
     @property
     def _waves(self) -> tuple[float, ...]:
@@ -321,7 +321,7 @@ class FemWorld(BaseWorld):
         In real time there is no damping of the velocities that the last hold has left, and contact is a spring without
         memory. Therefore the scene first comes to rest on these springs.
         """
-        forces = self._state.partial[self._index, :, FORCE : FORCE + 6 * len(self.sensors)]
+        forces = self.state.partial[self._index, :, FORCE : FORCE + 6 * len(self.sensors)]
         if self._inertia is not self._scaled or not forces.any():
             return 0
         settling = self.scene.settling
@@ -342,5 +342,5 @@ class FemWorld(BaseWorld):
     @launching()  # for the whole call: worlds of a batch share arrays, also the numbers of substeps
     def _advance(self, launch: Launch) -> list[ForceReading]:
         prepared = self.prepare(launch)
-        self._state.advance({self._index: prepared.drive})
+        self.state.advance({self._index: prepared.drive})
         return self.outcome(prepared)

@@ -86,9 +86,9 @@ class HybridWorld(FemWorld):
         """The environment of scene number `index` in a `state` of several; without `state`, a single environment."""
         assert scene.body is not None
         self.scene = scene
-        self._state: HybridState = HybridState([scene]) if state is None else state
+        self.state: HybridState = HybridState([scene]) if state is None else state
         self._index = index
-        self._gels, self._body = self._state.gel[index], self._state.body[index]
+        self._gels, self._body = self.state.gel[index], self.state.body[index]
         self.yields = math.isfinite(scene.body.material.elastic_limit)
         self.max_force_loss = MAX_FORCE_LOSS * self._body.spacing / max(gel.thickness for gel in self._gels)
         height = float(bounding_size(scene.body.geometry)[2])
@@ -104,13 +104,13 @@ class HybridWorld(FemWorld):
         )
         # Inertia is scaled, weight is not: rho g [1e-9 N/mm^3] over the kernel's density, the P-wave modulus [MPa].
         self._body_force = scene.body.material.density * np.array(scene.gravity) * MPA / MM  # [N/mm^3]
-        self._weight = self._body_force * self._body.volume * self._state.particle_counts[index]  # [N]
+        self._weight = self._body_force * self._body.volume * self.state.particle_counts[index]  # [N]
         params = self._body.params()
         for g, (name, gel) in enumerate(zip(self.sensors, gels, strict=True)):
             params |= self._gels[g].params(g)
             params[FRICTION + g] = scene.friction[name]  # type: ignore[index]
             params[HOUSING + g] = -1.0 if gel.housing is None else gel.housing * MM
-        self._state.params[index, list(params)] = list(params.values())
+        self.state.params[index, list(params)] = list(params.values())
         self._inertias = HybridInertia(scene, self._gels, self._body, self._body_force)
         self._scaled, self._true = (
             self._inertias.scaled_inertia(height * MM, yields=self.yields),
@@ -121,8 +121,8 @@ class HybridWorld(FemWorld):
     # ---------------------------------------------------------------- inertia
 
     def _stop(self) -> None:
-        b, i = self._state.particles, self._index
-        self._state.gels.clear(i, velocity_only=True)
+        b, i = self.state.particles, self._index
+        self.state.gels.clear(i, velocity_only=True)
         for moving in (b.v(i), b.c(i)):
             moving[...] = 0.0
         b.drop_grid_velocities(i)
@@ -144,7 +144,7 @@ class HybridWorld(FemWorld):
 
     def _switch_inertia(self, inertia: Inertia) -> None:
         """See FemWorld. Contacts keep their forces: the next launch starts with the present stiffness of springs."""
-        params = self._state.params[self._index]
+        params = self.state.params[self._index]
         gels = len(self._gels)
         springs, stiffness = params[STIFFNESS_RATIO : STIFFNESS_RATIO + gels], params[STIFFNESS : STIFFNESS + gels]
         before = springs * stiffness
@@ -157,11 +157,11 @@ class HybridWorld(FemWorld):
 
     def _reset_springs(self) -> None:
         """The next launch starts with contact forces from its own stiffness."""
-        self._state.params[self._index, STIFFNESS_RATIO : STIFFNESS_RATIO + len(self._gels)] = 1.0
+        self.state.params[self._index, STIFFNESS_RATIO : STIFFNESS_RATIO + len(self._gels)] = 1.0
 
     def _courant(self) -> float:
         """The larger of the gels' and the body's; the body's grid is not compressed with the body."""
-        params = self._state.params[self._index]
+        params = self.state.params[self._index]
         wave = math.sqrt(self._body.particle_mass / params[BODY_MASS])  # the speed of the body's pressure wave
         return max(super()._courant(), float(params[STEP]) * wave / self._body.cell)
 
@@ -198,7 +198,7 @@ class HybridWorld(FemWorld):
         limits = [friction * force for friction, force in zip(frictions, held, strict=True) if friction > 0.0]
         if not limits or min(held) == 0.0:
             return 0.0
-        params, count = self._scaled.params, self._state.particle_counts[self._index]
+        params, count = self._scaled.params, self.state.particle_counts[self._index]
         body = params[BODY_MASS] * count / (params[RIGID_MASS_SCALE] + FILTERED_RIGID)
         max_gel_mass = max(gel.density * gel.thickness for gel in self._gels)
         layer = max_gel_mass * (self._body.volume * count) ** (2 / 3) / (2.0 * LIGHTER_GEL)
@@ -207,7 +207,7 @@ class HybridWorld(FemWorld):
     # ------------------------------------------------------------------ state
 
     def arrays(self) -> dict[str, np.ndarray]:
-        state, i = self._state, self._index
+        state, i = self.state, self._index
         b = state.particles
         return {
             **state.gels.arrays(i),
@@ -217,13 +217,13 @@ class HybridWorld(FemWorld):
         }  # fmt: skip
 
     def _stored_grid_shape(self) -> tuple[int, int, int]:
-        return self._state.stored_grid_shape(self._index)
+        return self.state.stored_grid_shape(self._index)
 
     def _grid(self, shape: tuple[int, int, int]) -> dict[str, np.ndarray]:
-        return {"grid_velocity": self._state.particles.grid_velocity(self._index, shape)}
+        return {"grid_velocity": self.state.particles.grid_velocity(self._index, shape)}
 
     def _allocate_grid(self, state: State) -> dict[str, np.ndarray]:
-        own = self._state.particles.reference(self._index)
+        own = self.state.particles.reference(self._index)
         places = np.asarray(state.get("reference", own))
         if places.shape != own.shape or not np.can_cast(places.dtype, own.dtype, "same_kind"):
             places = own  # the state will be refused
@@ -235,7 +235,7 @@ class HybridWorld(FemWorld):
         return {"grid_velocity": np.empty((nx, ny, nz - NODES + 1, 3), np.float32)}
 
     def _restore_grid(self, grid: State) -> None:
-        state, i = self._state, self._index
+        state, i = self.state, self._index
         self._largest_volume = 1.0
         if not grid:
             state.particles.drop_grid_velocities(i)
@@ -244,7 +244,7 @@ class HybridWorld(FemWorld):
         state.particles.set_grid_velocities(i, state.counts, grid["grid_velocity"])
 
     def truth(self) -> Truth:
-        x, planes = self._state.positions_and_planes(self._index)
+        x, planes = self.state.positions_and_planes(self._index)
         height = float(np.ptp(surface_points(x, planes)[:, 2])) / MM
         return Truth(height, x.mean(axis=0, dtype=np.float64) / MM, (x / MM).astype(np.float32), dict(self._poses))
 
@@ -252,7 +252,7 @@ class HybridWorld(FemWorld):
 
     def prepare(self, launch: Launch) -> PreparedLaunch:
         """Fits the grid and sets this environment's parameters. Raises SimulationDiverged for a grid too large."""
-        state, index, path = self._state, self._index, launch.path
+        state, index, path = self.state, self._index, launch.path
         drive, where = path.drive(launch.first, launch.last), partial(launch.span, tuple(self._poses))
         cell = self._body.cell
         if state.partial[index, :, SQUARED_GREEN_STRAIN].max() > MAX_GREEN_STRAIN**2:
@@ -277,7 +277,7 @@ class HybridWorld(FemWorld):
 
     def _write_body_inertia(self, moments: Moments) -> None:
         """Writes centre, inverse moment of inertia and mean displacement gradient of the particles for the kernels."""
-        params = self._state.params[self._index]
+        params = self.state.params[self._index]
         params[REFERENCE_CENTRE : REFERENCE_CENTRE + 3] = moments.reference_centre
         params[MEAN_GRADIENT : MEAN_GRADIENT + 9] = moments.mean_displacement_gradient().ravel()
         inverse = moments.inverse_inertia(float(params[BODY_MASS]))
@@ -294,9 +294,9 @@ class HybridWorld(FemWorld):
 
     def outcome(self, prepared: PreparedLaunch) -> list[ForceReading]:
         """The forces in and after the launch. Raises SimulationDiverged if its state is unphysical."""
-        partial = self._state.partial[self._index]
+        partial = self.state.partial[self._index]
         survey = self._survey()
-        volumes = volume_range(self._state.particles.e(self._index)) if survey is None else survey.volumes
+        volumes = volume_range(self.state.particles.e(self._index)) if survey is None else survey.volumes
         sound = self._is_healthy(volumes[0]) if survey is None else survey.is_healthy
         health = Health.read(partial, self._courant(), sound=sound)
         check_launch(self.arrays, prepared.before, health, prepared.where)
@@ -308,7 +308,7 @@ class HybridWorld(FemWorld):
         backings = sums[..., BACKING : BACKING + 3].reshape(len(each), 2, -1, 3).sum(axis=2)  # includes the housing:
         backings += sums[..., HOUSING_FORCE : HOUSING_FORCE + 6].sum(axis=1).reshape(-1, 2, 3)
         contacts, backings, turns = (np.einsum("gij,ngj->ngi", rotations, of) for of in (forces, backings, moments))
-        torques = (turns + _cross(origins - self._state.centre(self._index), contacts)).sum(axis=1)
+        torques = (turns + _cross(origins - self.state.centre(self._index), contacts)).sum(axis=1)
         lever = self._lever
         gel_overlap = self._gel_overlap(prepared)
         hits = health.capped + (gel_overlap > 0.0) + self._exceeds_tension(volumes[1])
@@ -326,7 +326,7 @@ class HybridWorld(FemWorld):
 
     def _numbers(self, readings: int) -> np.ndarray:
         """(readings, PARTS, NUMBERS) of the parts; the last are those of the launch's end."""
-        state, i = self._state, self._index
+        state, i = self.state, self._index
         if readings == 1:
             return state.partial[i : i + 1]
         return np.concatenate([state.records[i, : readings - 1], state.partial[i : i + 1]])
@@ -337,7 +337,7 @@ class HybridWorld(FemWorld):
 
     def _is_healthy(self, smallest_volume: float) -> bool:
         """See `Health.sound`. It tests whole arrays, which is fast; `diagnosis` finds the fault and its place."""
-        state, i = self._state, self._index
+        state, i = self.state, self._index
         others = state.particles.particle_rows(i), state.contact_history[i], state.partial[i]
         return (
             smallest_volume > 2.0 * MIN_VOLUME_RATIO
@@ -363,7 +363,7 @@ class HybridWorld(FemWorld):
             self._gels, survey.surface_bounds[1], float(survey.surface_bounds[0, 3]), last[:, :3], last[:, 3]
         ):
             return 0.0
-        found = gel_overlap(self._gels, self._state.surface_displacements(self._index), last[:, :3], last[:, 3])
+        found = gel_overlap(self._gels, self.state.surface_displacements(self._index), last[:, :3], last[:, 3])
         max_overlap = MAX_GEL_OVERLAP * min(gel.thickness for gel in self._gels)
         if found > max_overlap:
             raise SimulationDiverged(

@@ -92,9 +92,9 @@ class PressWorld(FemWorld):
         """The environment of scene number `index` in a `state` of several; without `state`, a single environment."""
         assert scene.indenter is not None
         self.scene = scene
-        self._state: PressState = PressState([scene]) if state is None else state
+        self.state: PressState = PressState([scene]) if state is None else state
         self._index = index
-        self._gel = self._state.gel[index]
+        self._gel = self.state.gel[index]
         self._gels = (self._gel,)
         step = PRESS_COURANT * self._gel.spacing
         self._shear = math.sqrt(self._gel.mu / self._gel.density)  # speed of its shear wave, over its pressure wave's
@@ -108,7 +108,7 @@ class PressWorld(FemWorld):
             **self._gel.params(), STIFFNESS: contact_stiffness(self._gel, step),
             FRICTION: scene.indenter.friction,
         }  # fmt: skip
-        self._state.params[index, list(params)] = list(params.values())
+        self.state.params[index, list(params)] = list(params.values())
         self._use_inertia(self._scaled)
         self._rates = np.zeros((2, 6))
         # x, y of the indenter at the last state without contact, and length of all slides since then [mm]
@@ -119,7 +119,7 @@ class PressWorld(FemWorld):
         self._poses = {"lower": Pose(), "indenter": Pose(np.array([0.0, 0.0, above]), turned)}
 
     def _stop(self) -> None:
-        self._state.gels.clear(self._index, velocity_only=True)
+        self.state.gels.clear(self._index, velocity_only=True)
 
     def surface(self, name: str) -> GelSurface:
         """The surface of the contact points, which is smoothed less than the spline of the nodes."""
@@ -131,13 +131,13 @@ class PressWorld(FemWorld):
 
     def reach(self) -> np.ndarray:
         """Distance from the indenter up to which contact pressure acts [m], at the surface's nodes (nx + 1, ny + 1)."""
-        stiffness = float(self._state.params[self._index, STIFFNESS])
+        stiffness = float(self.state.params[self._index, STIFFNESS])
         return np.asarray(
-            self._state.gels.common_group.surface_pressure[self._index, 0] / (RIM_STIFFNESS * stiffness * MM)
+            self.state.gels.common_group.surface_pressure[self._index, 0] / (RIM_STIFFNESS * stiffness * MM)
         )
 
     def arrays(self) -> dict[str, np.ndarray]:
-        state, i = self._state, self._index
+        state, i = self.state, self._index
         return {
             **state.gels.arrays(i), "anchor": state.anchor[i],
             "pressure": state.pressure[i], "carried": state.gels.common_group.surface_pressure[i, 0],
@@ -204,7 +204,7 @@ class PressWorld(FemWorld):
         """Depth of the indenter's lowest point below its origin, the centre of its bounding box, with the orientation
         `turn` (4,), a quaternion [m]."""
         assert self.scene.indenter is not None
-        mesh = self._state.meshes[self._index]
+        mesh = self.state.meshes[self._index]
         if mesh is not None and turn[:2].any():
             return float((mesh.vertices @ rotate(inverse(Pose(quaternion=turn)), [0.0, 0.0, -1.0])).max())
         indenter = self.scene.indenter
@@ -226,11 +226,11 @@ class PressWorld(FemWorld):
             cause = f"no memory for the distances from the indenter's mesh ({error})"
             raise SimulationDiverged(cause, where(), MESH_ADVICE, retry=False) from None
         before = self._before_launch()
-        self._state.params[self._index, STEP] = path.step
-        self._state.params[self._index, LIMIT_RELAXATION_RATE] = self._limit_relaxation(launch) / self._gel.thickness
+        self.state.params[self._index, STEP] = path.step
+        self.state.params[self._index, LIMIT_RELAXATION_RATE] = self._limit_relaxation(launch) / self._gel.thickness
         damped = 1.0 if launch.is_held else 1.0 - path.turn_share * (1.0 - TURNING_ZETA_SHARE)
-        self._state.params[self._index, GEL_DAMPING] = damped * self._inertia.params[GEL_DAMPING]
-        Health.clear(self._state.partial[self._index])
+        self.state.params[self._index, GEL_DAMPING] = damped * self._inertia.params[GEL_DAMPING]
+        Health.clear(self.state.partial[self._index])
         return PreparedLaunch(launch, where, drive, before)
 
     def _limit_relaxation(self, launch: Launch) -> float:
@@ -242,7 +242,7 @@ class PressWorld(FemWorld):
 
     def _cover(self, drive: np.ndarray) -> None:
         """Computes a mesh's distances where the gel's surface may touch it in this launch."""
-        mesh = self._state.meshes[self._index]
+        mesh = self.state.meshes[self._index]
         if mesh is None:
             return
         margin, half = MESH_MARGIN * self._gel.spacing, mesh.half * MM
@@ -250,18 +250,18 @@ class PressWorld(FemWorld):
         at = np.concatenate([(nodes - rows[3]) @ rows[:3] for rows in drive[[0, -1], 0].astype(np.float64)])
         near = at[(np.abs(at) <= half + margin).all(axis=1)]
         if len(near):
-            self._state.cover(self._index, near.min(axis=0) - margin, near.max(axis=0) + margin)
+            self.state.cover(self._index, near.min(axis=0) - margin, near.max(axis=0) + margin)
 
     def _surface_nodes(self) -> np.ndarray:
         """Positions of the nodes of the gel's surface (n, 3) [mm], sensor frame."""
-        top = self._state.surface_displacements(self._index)[0].astype(np.float64)
+        top = self.state.surface_displacements(self._index)[0].astype(np.float64)
         axes = (self._gel.spacing * (np.arange(n) - (n - 1) / 2) for n in top.shape[:2])
         top[..., :2] += np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
         return np.asarray(top.reshape(-1, 3))
 
     def outcome(self, prepared: PreparedLaunch) -> list[ForceReading]:
         """The forces after the launch. Raises SimulationDiverged if its state is unphysical."""
-        partial = self._state.partial[self._index]
+        partial = self.state.partial[self._index]
         survey = self._survey()
         health = Health.read(partial, self._courant(), sound=survey is not None and survey.is_healthy)
         check_launch(self.arrays, prepared.before, health, prepared.where)
@@ -288,7 +288,7 @@ class PressWorld(FemWorld):
         rows, spacing = prepared.drive[-1, 0].astype(np.float64), self._gel.spacing
         down = rows[:3].T @ [0.0, 0.0, -1.0]
         half, self.missed_depth_share = np.array(self._gel.half) - spacing, 0.0  # not at the gel's rim
-        mesh, geometry = self._state.meshes[self._index], self.scene.indenter.geometry
+        mesh, geometry = self.state.meshes[self._index], self.scene.indenter.geometry
         if isinstance(geometry, Mesh):
             assert mesh is not None
             lowest = mesh.lowest(rows[:3], rows[3] / MM, half / MM)

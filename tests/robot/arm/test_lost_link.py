@@ -84,7 +84,7 @@ def test_describe_lost_link_cut_or_blocked_names_cause() -> None:
 @pytest.mark.parametrize(("printed", "expected"), [(SAID, ArmStatus.LINK_LOST), ("", ArmStatus.WORKER_DEAD)])
 def test_status_of_library_crash_with_report_is_lost_link(mock: MockUR, printed: str, expected: ArmStatus) -> None:
     with URArm(config(), "left") as arm:
-        worker = arm._worker
+        worker = arm.worker
         assert worker is not None
         worker._errors.write(printed.encode())
         worker._errors.flush()
@@ -97,7 +97,7 @@ def test_status_of_library_crash_with_report_is_lost_link(mock: MockUR, printed:
 
 def test_status_history_exit_after_lost_link_keeps_cause(mock: MockUR) -> None:
     with URArm(config(link_timeout=0.5), "left") as arm:
-        worker = arm._worker
+        worker = arm.worker
         assert worker is not None
         os.kill(worker.pid, signal.SIGSTOP)
         until(lambda: arm.status() == ArmStatus.LINK_LOST, "lost link")
@@ -109,7 +109,7 @@ def test_status_history_exit_after_lost_link_keeps_cause(mock: MockUR) -> None:
 
 def test_worker_late_periods_are_counted(mock: MockUR) -> None:
     with URArm(config(), "left") as arm:
-        worker = arm._worker
+        worker = arm.worker
         assert worker is not None
         os.kill(worker.pid, signal.SIGSTOP)
         time.sleep(0.15)
@@ -134,7 +134,7 @@ def test_arm_connection_reset_is_lost_link(mock: MockUR, ports: list[int] | None
             in_motion(arm, moved(arm.state().pose, x=0.1))
             mock.faults.cut(ports, reset=True)
             until(lambda arm=arm: arm.status().is_fault, "fault")  # type: ignore[misc]
-            worker = arm._worker
+            worker = arm.worker
             assert worker is not None
             until(lambda worker=worker: not worker.running, "end of the worker")  # type: ignore[misc]
             assert arm.status() == ArmStatus.LINK_LOST, arm.explain()

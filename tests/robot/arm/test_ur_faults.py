@@ -223,8 +223,8 @@ def test_arm_protective_stop_raises_until_recover(arm: URArm, mock: MockUR, figu
 
 @pytest.mark.promise(7)
 def test_recover_unreported_protective_stop_raises_before_unlock(arm: URArm, mock: MockUR) -> None:
-    assert arm._worker is not None
-    os.kill(arm._worker.pid, signal.SIGKILL)
+    assert arm.worker is not None
+    os.kill(arm.worker.pid, signal.SIGKILL)
     until(lambda: arm.status() == ArmStatus.WORKER_DEAD, "death")
     mock.faults.protective_stop()
     with pytest.raises(ProtectiveStop, match=r"protective stop.*next recover\(\) unlocks it"):

@@ -113,8 +113,8 @@ def test_arm_stopped_controller_is_lost_link(mock: MockUR) -> None:
         os.kill(mock.pid, signal.SIGSTOP)
         try:
             until(lambda: arm.status() == ArmStatus.LINK_LOST, "lost link")
-            assert arm._worker is not None
-            until(lambda: not arm._worker.running, "end of the worker")  # type: ignore[union-attr]
+            assert arm.worker is not None
+            until(lambda: not arm.worker.running, "end of the worker")  # type: ignore[union-attr]
             assert arm.status() == ArmStatus.LINK_LOST  # also where it was ended in the middle of a command
             begun = time.monotonic()
             with pytest.raises(DeviceError):

@@ -142,8 +142,8 @@ def test_pair_dead_worker_stops_moving_arm(pair: Pair) -> None:
     """The other arm counts as dead after link_timeout, 1 s here; this one moves for much longer."""
     left, right, _ = pair
     in_motion(left, moved(left.state().pose, x=-0.14))
-    assert right._worker is not None
-    os.kill(right._worker.pid, signal.SIGKILL)
+    assert right.worker is not None
+    os.kill(right.worker.pid, signal.SIGKILL)
     until(lambda: left.status() == ArmStatus.PARTNER_STOPPED, "stop")
 
 

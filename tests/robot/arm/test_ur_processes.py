@@ -55,8 +55,8 @@ def test_worker_killed_is_reported_and_replaced(mock: MockUR, measuring: bool, f
     with URArm(config(realtime=measuring, watchdog=10.0 if measuring else 1.0), "left") as arm:
         start = arm.state().pose
         at_full_speed(arm, moved(start, x=0.14))
-        assert arm._worker is not None
-        os.kill(arm._worker.pid, signal.SIGKILL)
+        assert arm.worker is not None
+        os.kill(arm.worker.pid, signal.SIGKILL)
         killed = time.monotonic()
         stood = until(lambda: stands(mock.faults.state()), "standstill", pause=5e-4)
         figure("worker killed at 0.1 m/s: the watchdog's stop", 1e3 * (stood - killed), "ms", at_most=250)
@@ -78,8 +78,8 @@ def test_worker_killed_is_reported_and_replaced(mock: MockUR, measuring: bool, f
 def test_worker_stopped_is_lost_link_and_replaced(mock: MockUR) -> None:
     with URArm(config(link_timeout=0.5), "left") as arm:
         start = arm.state().pose
-        assert arm._worker is not None
-        os.kill(arm._worker.pid, signal.SIGSTOP)
+        assert arm.worker is not None
+        os.kill(arm.worker.pid, signal.SIGSTOP)
         until(lambda: arm.status() == ArmStatus.LINK_LOST, "lost link")
         arm.recover()  # SIGKILL ends even a stopped process
         go(arm, moved(start, x=0.01))
@@ -93,7 +93,7 @@ from tests.robot.arm.mocked import at_full_speed, moved
 signal.signal(signal.SIGINT, signal.default_int_handler)  # also if the test runner ignores it
 arm = URArm(UrArmConfig.model_validate_json(sys.argv[1]), "policy")
 at_full_speed(arm, moved(arm.state().pose, x=0.14))
-print(arm._worker.pid, flush=True)
+print(arm.worker.pid, flush=True)
 time.sleep(60)
 """
 
@@ -138,7 +138,7 @@ with Interrupt() as stop:
     with URArm(UrArmConfig.model_validate_json(sys.argv[1]), "policy") as arm:
         at_full_speed(arm, moved(arm.state().pose, x=0.14))
         stop()
-        print(arm._worker.pid, flush=True)
+        print(arm.worker.pid, flush=True)
         while not stop():
             time.sleep(0.01)
     sys.exit(stop.exit_code)
@@ -186,13 +186,13 @@ def test_worker_signal_brakes_before_exit(mock: MockUR, program: str, number: si
 
 def test_zero_wrench_failed_is_not_repeated(mock: MockUR) -> None:
     with URArm(config(watchdog=0.2, link_timeout=0.5), "left") as arm:
-        assert arm._worker is not None
-        os.kill(arm._worker.pid, signal.SIGSTOP)
+        assert arm.worker is not None
+        os.kill(arm.worker.pid, signal.SIGSTOP)
         with pytest.raises(DeviceError, match=r"link_timeout|does not answer; its controller"):
             arm.zero_wrench()
         mark = mock.faults.received().last
-        os.kill(arm._worker.pid, signal.SIGCONT)
-        until(lambda: arm.status() == ArmStatus.HOLD or not arm._worker.running, "end of the stop")  # type: ignore[union-attr]
+        os.kill(arm.worker.pid, signal.SIGCONT)
+        until(lambda: arm.status() == ArmStatus.HOLD or not arm.worker.running, "end of the stop")  # type: ignore[union-attr]
         time.sleep(0.2)
         asked = [entry.values.get("input_int_register_0") for entry in mock.faults.received(mark).entries]
         assert ZERO not in asked
@@ -244,7 +244,7 @@ def test_close_frees_all_resources(
         monkeypatch.setattr(ur, "CLOSE_TIMEOUT", PATIENCE)
     arm = URArm(config(realtime=measuring), "left")
     at_full_speed(arm, moved(arm.state().pose, x=0.12))
-    worker = arm._worker
+    worker = arm.worker
     assert worker is not None and leftovers() == 1
     asked = time.monotonic()
     arm.close()
@@ -288,7 +288,7 @@ def test_worker_died_frees_all_resources(mock: MockUR) -> None:
     before = open_files()
     arm = URArm(config(), "left")
     in_motion(arm, moved(arm.state().pose, x=0.1))
-    worker = arm._worker
+    worker = arm.worker
     assert worker is not None
     os.kill(worker.pid, signal.SIGALRM)  # what ends it when the library does not come back
     until(lambda: arm.status() == ArmStatus.LINK_LOST, "end of the worker")
@@ -306,8 +306,8 @@ def test_worker_died_frees_all_resources(mock: MockUR) -> None:
 @pytest.mark.promise(14)
 def test_close_blocked_worker_is_killed(mock: MockUR) -> None:
     arm = URArm(config(), "left")
-    assert arm._worker is not None
-    worker = arm._worker
+    assert arm.worker is not None
+    worker = arm.worker
     os.kill(worker.pid, signal.SIGSTOP)
     begun = time.monotonic()
     arm.close()
@@ -324,7 +324,7 @@ def test_close_during_connect_ends_worker(mock: MockUR, monkeypatch: pytest.Monk
     true_start = URArm._start_worker
 
     def interrupted(self: URArm) -> None:
-        threading.Timer(0.5, lambda: (workers.append(self._worker), os.kill(os.getpid(), signal.SIGINT))).start()  # type: ignore[arg-type,func-returns-value]
+        threading.Timer(0.5, lambda: (workers.append(self.worker), os.kill(os.getpid(), signal.SIGINT))).start()  # type: ignore[arg-type,func-returns-value]
         true_start(self)
 
     monkeypatch.setattr(URArm, "_start_worker", interrupted)

@@ -65,12 +65,12 @@ def test_worker_after_stall_keeps_arm_limits(
         limits, start = arm.config.limits, arm.state().pose
         state = mock.faults.state()
         ahead, since = state.tick - round(state.time / PERIOD), mock.faults.received().last
-        assert arm._worker is not None
+        assert arm.worker is not None
         for k, stall in enumerate(stalls):
             at_full_speed(arm, moved(start, x=-0.12 * (-1) ** k))
-            os.kill(arm._worker.pid, signal.SIGSTOP)
+            os.kill(arm.worker.pid, signal.SIGSTOP)
             time.sleep(stall)
-            os.kill(arm._worker.pid, signal.SIGCONT)
+            os.kill(arm.worker.pid, signal.SIGCONT)
             time.sleep(0.3)  # until it is at full speed again
         arm.stop()
         until(arm.at_rest, "rest")

@@ -89,7 +89,7 @@ def one_killed(folder: Path, first: int, victim: Callable[[Opened], int]) -> Epi
     ("victim", "errors", "words"),
     [
         (lambda found: found.cell._controllers.pid, (LinkLost, DeviceNotConnectedError, DeviceError), "arm '"),
-        (lambda found: found.rig.arms["east"].driver._worker.pid, (DeviceError,), "worker|the other arm did"),
+        (lambda found: found.rig.arms["east"].driver.worker.pid, (DeviceError,), "worker|the other arm did"),
         (lambda found: found.cameras["west"].pid, (StaleFrame,), "sensor 'west'"),
     ],
     ids=["controllers", "worker", "camera"],

@@ -103,7 +103,7 @@ def of_contact(world: HybridWorld, state: Mapping[str, Array], params: Array, g:
 
 def total_energy(world: HybridWorld) -> float:
     """Kinetic, elastic and of contact [N mm], after a motion in real time."""
-    state, params = world.snapshot(), world._state.params[0].astype(float)
+    state, params = world.snapshot(), world.state.params[0].astype(float)
     material = [params[i] for i in (layout.GEL_SPACING, layout.GEL_MU, layout.GEL_LAMBDA, layout.GEL_DENSITY)]
     gels = zip(state["gel_displacement"].astype(float), state["gel_velocity"].astype(float), strict=True)
     contacts = (of_contact(world, state, params, g) for g in range(2))

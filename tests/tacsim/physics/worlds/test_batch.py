@@ -191,15 +191,15 @@ def test_state_with_nan_fails_in_its_environment_only(fresh: Batch) -> None:
 
 @pytest.mark.cpu
 def test_a_body_far_away_enlarges_no_array_but_the_grid(fresh: Batch) -> None:
-    arrays = fresh._state.particles.rows, fresh._state.contact_history, fresh._state.gels.common_group.nodes
-    nodes = fresh._state.particles.masses.shape[2]
+    arrays = fresh.state.particles.rows, fresh.state.contact_history, fresh.state.gels.common_group.nodes
+    nodes = fresh.state.particles.masses.shape[2]
     for place in ("position", "reference"):
         fresh.worlds[0].arrays()[place][-1] += [0.0, 60.0, 0.0]
     stats = fresh.move([STAY, closed(fresh.worlds[1], 0.4e-3), None])[1]
-    assert fresh._state.particles.masses.shape[2] > nodes
+    assert fresh.state.particles.masses.shape[2] > nodes
     assert all(a is b for a, b in zip(
         arrays,
-        (fresh._state.particles.rows, fresh._state.contact_history, fresh._state.gels.common_group.nodes),
+        (fresh.state.particles.rows, fresh.state.contact_history, fresh.state.gels.common_group.nodes),
         strict=True,
     ))  # fmt: skip
     alone = HybridWorld(SCENES[1])
@@ -225,7 +225,7 @@ def out_of_room(ends: Sequence[Any], batch: Batch, before: list[dict[str, bytes]
 def test_grid_above_share_fails_in_its_environment_only() -> None:
     """Its grid would be allowed in a world of its own; of four, in four copies, kernels could not count the nodes."""
     batch = Batch(SCENES[:1] * 4)
-    most = batch._state.particles.max_grid_nodes
+    most = batch.state.particles.max_grid_nodes
     assert most < MAX_GRID_NODES and 4 * COPIES * 4 * most <= MAX_NUMBERS
     way = (most ** (1 / 3) - 9) * 2 * SCENES[0].spacing * 1e3  # [mm]; body and borders are another 17 cells
     for place in ("position", "reference"):
@@ -252,7 +252,7 @@ def test_grid_without_memory_fails_in_its_environment_only(monkeypatch: pytest.M
     before = [state(world) for world in batch.worlds]
     failure = out_of_room(batch.move([closed(world, 0.3e-3) for world in batch.worlds]), batch, before, 2)
     assert "no memory for the grid around the particles (Unable to allocate)" in str(failure)
-    grid = batch._state.particles
+    grid = batch.state.particles
     assert grid.masses.shape[2] == grid.velocities.shape[1]
 
 
@@ -269,7 +269,7 @@ def test_mesh_without_memory_fails_in_its_environment_only(
         for shape in (Mesh(path=str(tmp_path / "plate.stl")), Sphere(radius=3e-3))
     )
     batch, alone = Batch([plate, ball]), PressWorld(ball)
-    before, counts, params = state(batch.worlds[0]), batch._state.counts.copy(), batch._state.params.copy()
+    before, counts, params = state(batch.worlds[0]), batch.state.counts.copy(), batch.state.params.copy()
     if lacks == "nodes":
         monkeypatch.setattr(tiles, "MAX_NODES", 1000)
         words = "nodes 0.1 mm apart would be needed where it can touch; the limit is 1,000; "
@@ -287,7 +287,7 @@ def test_mesh_without_memory_fails_in_its_environment_only(
     assert isinstance(failure, SimulationDiverged) and failure.refine == 1  # no smaller step would help
     assert words in str(failure) and "in a smaller batch each world has more memory" in str(failure)
     assert state(batch.worlds[0]) == before
-    assert np.array_equal(batch._state.counts[0], counts[0]) and np.array_equal(batch._state.params[0], params[0])
+    assert np.array_equal(batch.state.counts[0], counts[0]) and np.array_equal(batch.state.params[0], params[0])
     assert stats == alone.move(down[2])
     assert_same([batch.worlds[1]], [alone])
 
@@ -304,7 +304,7 @@ def test_loads_are_held_per_environment_and_unreachable_one_is_reported(fresh: B
 
 def test_interruption_restores_moving_worlds(fresh: Batch, monkeypatch: pytest.MonkeyPatch) -> None:
     before = [state(world) for world in fresh.worlds]
-    launches, advance = 0, type(fresh._state).advance
+    launches, advance = 0, type(fresh.state).advance
 
     def interrupted(kernels: Any, drives: Any) -> None:
         nonlocal launches
@@ -313,7 +313,7 @@ def test_interruption_restores_moving_worlds(fresh: Batch, monkeypatch: pytest.M
         if launches == 2:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(type(fresh._state), "advance", interrupted)
+    monkeypatch.setattr(type(fresh.state), "advance", interrupted)
     with pytest.raises(KeyboardInterrupt):
         fresh.move([closed(world, 0.4e-3) for world in fresh.worlds])
     assert [state(world) for world in fresh.worlds] == before

@@ -108,9 +108,9 @@ def all_outcomes(folder: Path) -> dict[str, Any]:
     note("interrupted", outcome(interrupted, interrupted.move(closer(interrupted, 0.2e-3))))
     meshed = PressWorld(press(egg(folder)))
     meshed.move(closer(meshed, 0.3e-3))
-    tiles = meshed._state.counts[0, SHAPE_FIRST]
+    tiles = meshed.state.counts[0, SHAPE_FIRST]
     note("mesh", outcome(meshed, meshed.move(closer(meshed, 0.05e-3, 0.2e-3))))
-    assert meshed._state.counts[0, SHAPE_FIRST] < tiles  # others were laid, and had to be sent
+    assert meshed.state.counts[0, SHAPE_FIRST] < tiles  # others were laid, and had to be sent
     # one environment alone would hide a wrong index of environments, equal bodies one of particles
     batch = Batch([squeeze(2e-3), squeeze(3e-3, 1e4)])
     first, second = batch.worlds
@@ -128,10 +128,10 @@ def all_outcomes(folder: Path) -> dict[str, Any]:
     for name, array, entry, value in (("race", "velocity", (-1, 2), 20.0), ("invert", "gel_displacement", last, -6.0)):
         before = first.snapshot()
         first.arrays()[array][entry] += value
-        first._state.particles.drop_grid_velocities(0)  # so that what particles know counts
+        first.state.particles.drop_grid_velocities(0)  # so that what particles know counts
         here = list(first._poses.values())
         prepared = first.prepare(Launch(first.plan(here, here), 0, 1))
-        first._state.advance({0: prepared.drive})
+        first.state.advance({0: prepared.drive})
         try:
             first.outcome(prepared)
             note(name, {"words": "nothing"})

@@ -79,7 +79,7 @@ def compared(world: FemWorld) -> dict[str, float]:
     torn(world)
     seen = world._survey()
     assert seen is not None
-    gels, index = world._state.gels, world._index
+    gels, index = world.state.gels, world._index
     displacements = gel_arrays(world.arrays(), "gel_displacement").items()
     corners = [diagnosis.corner_volumes(u, world._gels[g].thickness).min() for g, u in displacements]
     shortest, tops = gels.min_edge_length(index), gels.surface_displacements(index)
@@ -88,15 +88,15 @@ def compared(world: FemWorld) -> dict[str, float]:
         "shortest": largest(seen_shortest, shortest),
         "corner": largest(seen.smallest_corner, min(corners)),
         "tops": largest(seen.surface_bounds[: len(world.sensors)], [displacement_bounds(top) for top in tops]),
-        "surface": max(largest(*pair) for pair in zip(world._state.surface_displacements(index), tops, strict=True)),
+        "surface": max(largest(*pair) for pair in zip(world.state.surface_displacements(index), tops, strict=True)),
     }
-    if isinstance(world._state, HybridState):
-        particles, seen_moments = world._state.particles, seen.moments
+    if isinstance(world.state, HybridState):
+        particles, seen_moments = world.state.particles, seen.moments
         moments = moments_of(particles, index)
         found["extents"] = largest(seen.extents, particles.extents(index))
         for name in ("centre", "reference_centre", "second", "reference_second", "cross_moments"):
             found[name] = largest(getattr(seen_moments, name), getattr(moments, name))
-        x, planes = world._state.positions_and_planes(index)
+        x, planes = world.state.positions_and_planes(index)
         found["outside"] = max(largest(x, particles.x(index)), largest(planes, particles.plane(index)))
     return found
 
@@ -131,7 +131,7 @@ def verdicts(world: FemWorld) -> dict[str, tuple[bool, bool]]:
 
 def copied(world: FemWorld) -> dict[str, Any]:
     """Bytes sent and brought back by what one does with a world."""
-    device = world._state.device
+    device = world.state.device
     assert device is not None
     found: dict[str, Any] = {}
 

@@ -60,7 +60,7 @@ def test_what_an_earlier_grid_has_left_in_memory_moves_nothing() -> None:
     worlds = world(), world()
     for w, left in zip(worlds, (0.0, 7.0), strict=True):
         squeeze(w, 0.2e-3)
-        w._state._particles.changes[...] = left
+        w.state._particles.changes[...] = left
         squeeze(w, 0.4e-3)
     a, b = (w.snapshot() for w in worlds)
     assert all(a[name].tobytes() == b[name].tobytes() for name in a)

@@ -194,12 +194,12 @@ def test_mesh_distances_cover_both_ends_of_launch_or_none(tmp_path: Path, monkey
     with pytest.raises(ValueError, match="192 x 64 x 32 nodes"):
         w._cover(drive)
     w._cover(drive[:1])
-    assert w._state._values.shape == (1, 96, 64, 32)
+    assert w.state._values.shape == (1, 96, 64, 32)
 
 
 def test_the_grids_of_all_environments_together_are_bounded(tmp_path: Path) -> None:
     """Each has as much room along each axis as the one that needs most there."""
-    state = world(brick(tmp_path, (2, 2, 2))[1], preset="draft")._state
+    state = world(brick(tmp_path, (2, 2, 2))[1], preset="draft").state
     counts = state.counts.copy()
     laid = state._values = np.broadcast_to(np.float32(0), (1, 2**29, 1, 1))  # without memory
     with pytest.raises(MemoryError, match="the limit of kernels is"):
@@ -253,7 +253,7 @@ def test_a_press_allocates_no_particles_or_grid() -> None:
     """Its state is the gel, three numbers and one of each contact point on it, and little besides."""
     w = world(Sphere(radius=4e-3))
     move(w, (0, 0, -0.3e-3))
-    state = w._state
+    state = w.state
     nx, ny, _ = state.gel[0].elements
     points = 4 * POINTS**2 * nx * ny + (nx + 1) * (ny + 1)
     assert sum(a.size for a in owned(state)) < sum(a.size for a in owned(state.gels)) + points + 1000

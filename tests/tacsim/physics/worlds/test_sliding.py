@@ -393,7 +393,7 @@ def test_a_failed_attempt_leaves_nothing_behind() -> None:
     w = pressed_ball(0.3, "draft")
     before, wanted = w.snapshot(), slide(w, 0.1e-3)
     w.restore(before)
-    gels = w._state._gels
+    gels = w.state._gels
     gels.common_group.f[...] = float("nan")
     gels._corners[gels._corners != 0.0] = float("nan")
     assert slide(w, 0.1e-3) == wanted

@@ -17,7 +17,7 @@ EXTRAS := .venv-extras/installed-$(VERSION)
 PLUGINS := .venv-lerobot/installed
 
 .DEFAULT_GOAL := help
-.PHONY: help run test check test-deep test-all test-gpu extras test-extras plugins test-plugins reliability lock clean python
+.PHONY: help run test check test-slow test-deep test-all test-gpu extras test-extras plugins test-plugins reliability lock clean python
 # Two installations into one environment must not run at once.
 .NOTPARALLEL:
 
@@ -25,7 +25,8 @@ help:
 	@echo "make run          install, then squeeze plasticine between two tactile sensors   (ARGS=\"--task reposition\")"
 	@echo "make test         install with dev extras, then lint, types, import contract, vocabulary, tests   (ARGS=\"-k rig\")"
 	@echo "make check        the same without the tests"
-	@echo "make test-all     make test, then make test-deep: the long runs"
+	@echo "make test-slow    the tests that take over a second each   (CI runs them after make test)"
+	@echo "make test-all     make test, make test-slow, then make test-deep: the long runs"
 	@echo "make test-gpu     the physics tests and the benchmark on CUDA, for docs/benchmarks.md   (without CUDA: says so, and fails)"
 	@echo "make reliability  what is promised of arms and cameras, measured by its tests, for docs/reliability.md"
 	@echo "make test-extras  tests that need heavy extras (torch, rerun, ray, av), in an environment of their own"
@@ -51,18 +52,21 @@ PARALLEL := -n 2 --dist loadfile
 test: check
 	@$(BIN)/python -m pytest -q $(PARALLEL) $(ARGS)
 
+test-slow: $(DEV)
+	@$(BIN)/python -m pytest -q -m "slow and not deep" $(PARALLEL) $(ARGS) || [ $$? = 5 ]
+
 # Arms and mocks keep real time: their long tests share the machine with no others. 5: no test by that name among these.
 test-deep: $(DEV)
 	@$(BIN)/python -m pytest -q -m deep $(PARALLEL) --ignore=tests/robot --ignore=tests/stops $(ARGS) || [ $$? = 5 ]
 	@$(BIN)/python -m pytest -q -m deep tests/robot tests/stops $(ARGS) || [ $$? = 5 ]
 
-test-all: test test-deep
+test-all: test test-slow test-deep
 
 # Without a device nothing was tested, which must not look like a pass: 77, as automake's tests say "skipped".
 test-gpu: $(DEV)
 	@TACSIM_DEVICE=cuda $(BIN)/python -c 'from tacsim.compute.runtime import start; start()' >/dev/null 2>&1 || { \
 	  echo "make test-gpu: Taichi finds no CUDA device (or no driver) on this machine, so nothing was tested."; exit 77; }
-	@TACSIM_DEVICE=cuda $(BIN)/python -m pytest -q tests/tacsim/physics $(ARGS)
+	@TACSIM_DEVICE=cuda $(BIN)/python -m pytest -q -m "not deep" tests/tacsim/physics $(ARGS)
 	@TACSIM_DEVICE=cuda $(BIN)/tacsim bench all --long --json benchmarks/gpu/report.json
 	@$(BIN)/tacsim bench --from benchmarks/reference.json --from benchmarks/gpu/report.json --docs docs
 	@echo "To publish the figures, commit benchmarks/gpu and docs."
@@ -77,7 +81,7 @@ WITH_EXTRAS := tests/robot/train tests/robot/cli/test_learn.py tests/robot/expor
 extras: $(EXTRAS)
 
 test-extras: extras
-	@.venv-extras/bin/python -m pytest -q $(PARALLEL) $(WITH_EXTRAS) $(ARGS)
+	@.venv-extras/bin/python -m pytest -q -m "not deep" $(PARALLEL) $(WITH_EXTRAS) $(ARGS)
 
 # LeRobot is large (torch), wants Python 3.12, and other versions than constraints/py312.txt: an environment of its own.
 # Where pip finds torch for CPUs alone is the machine's affair (PIP_EXTRA_INDEX_URL). 77: nothing was tested.

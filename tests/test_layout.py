@@ -242,6 +242,7 @@ def contents(wheel: Path) -> dict[str, bytes]:
         return {name: archive.read(name) for name in archive.namelist()}
 
 
+@pytest.mark.slow
 def test_the_wheel_of_the_sdist_is_that_of_the_checkout(tmp_path: Path) -> None:
     """As `python -m build` and pip make it: from the sdist, unpacked, and from nothing else."""
     sdist = build("sdist", ROOT, tmp_path / "sdist")

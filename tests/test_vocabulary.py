@@ -54,6 +54,7 @@ def append(vocabulary: Vocabulary, name: str, text: str) -> None:
     path.write_text(path.read_text(encoding="utf-8") + text, encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_repository_has_no_problem() -> None:
     assert Vocabulary(ROOT).problems() == []
 

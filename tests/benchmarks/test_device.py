@@ -152,6 +152,7 @@ def test_a_ratio_is_of_the_very_same_row(cpu: Report) -> None:
         assert "| sphere_press" in section and " x |" not in section
 
 
+@pytest.mark.slow
 def test_the_command_puts_reports_together(cpu: Report, tmp_path: Path) -> None:
     press = on(GPU, cpu, [faster(row(cpu, "sphere_press"), 4.0)])
     squeeze = on(GPU, cpu, [faster(row(cpu, "squeeze"), 3.0)])

@@ -43,6 +43,7 @@ def film(drawn: Path, tmp_path: Path) -> Path:
     return shutil.copytree(drawn, tmp_path / "film")
 
 
+@pytest.mark.slow
 def test_dots_are_followed_and_those_that_leave_are_told(film: Path) -> None:
     (case,) = (case for case in select_cases(["real"], baselines=False, data=film) if case.name == CASE)
     assert description("real", case.name, "tacsim").startswith("Dots tracked")

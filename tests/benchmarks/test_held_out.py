@@ -43,6 +43,7 @@ def photographed(folder: Path, presses: int) -> list[Made]:
     return made
 
 
+@pytest.mark.slow
 def test_the_table_has_a_row_a_figure_of_each_set_that_is_there(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -62,6 +63,7 @@ def test_the_table_has_a_row_a_figure_of_each_set_that_is_there(
     assert len(capsys.readouterr().out.splitlines()) == 2
 
 
+@pytest.mark.slow
 def test_the_spread_of_radii_over_subsets(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -92,6 +94,7 @@ def test_the_spread_of_radii_over_subsets(
     ]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_clicked_circles_are_moved_and_scaled_as_the_other_presses_ask_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

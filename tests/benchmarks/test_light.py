@@ -77,6 +77,7 @@ def hidden(folder: Path) -> balls.BallSet:
     return balls.read_sets(folder)[0]
 
 
+@pytest.mark.slow
 def test_left_out_presses_are_scored_beside_a_picture_without_contact(folder: Path, hidden: balls.BallSet) -> None:
     picture, normals = balls.ball_presses(folder, hidden, 1)
     assert (picture.variant, normals.variant) == ("hidden: picture", "hidden: normals")

@@ -16,6 +16,7 @@ def orders(errors: list[float]) -> list[float]:
     return [math.log2(coarse / fine) for coarse, fine in pairwise(errors)]
 
 
+@pytest.mark.slow
 def test_a_squeezed_cube_yields_at_its_yield_stress_the_nearer_the_finer() -> None:
     """F/A = sigma_y between frictionless plates; volume shrinks by sigma_y / 3K, which plastic flow leaves alone.
 

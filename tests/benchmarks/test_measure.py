@@ -66,6 +66,7 @@ HANGS = Case("press", "hangs", "tacsim", "none", time.sleep)
 WORKS = Case("press", "sphere_press", "layer", "pixel 0.0625 mm", layer_press)
 
 
+@pytest.mark.slow
 def test_a_case_that_raises_or_dies_is_named_and_the_next_one_runs() -> None:
     report = run_cases([RAISES, DIES, WORKS], 3, baselines=False)
     assert [failure.case for failure in report.failures] == ["raises", "dies"]
@@ -105,6 +106,7 @@ def tell_process(path: Path, repeat: int) -> list[Measurement]:
     return [Measurement(Timing((1.0,), 1.0), 0.0, "%", "nothing")]
 
 
+@pytest.mark.slow
 def test_a_stop_ends_the_running_case_at_once_and_keeps_the_rows_of_those_before() -> None:
     begun: list[Case] = []
     stopped_at: list[float] = []

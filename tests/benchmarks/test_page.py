@@ -60,6 +60,7 @@ def test_a_row_is_shown_with_time_error_and_memory(report: Report) -> None:
     assert costs(bare) == ["75 ns wall a substep and particle"]
 
 
+@pytest.mark.slow
 def test_a_report_is_shown_and_written_again_without_measuring(tmp_path: Path, report: Report) -> None:
     result = tacsim(
         "bench", "--from", REFERENCE, "--json", tmp_path / "new" / "again.json", "--docs", tmp_path / "docs"
@@ -96,6 +97,7 @@ def test_what_is_no_report_is_refused(tmp_path: Path) -> None:
     assert tacsim("bench", "--repeat", "0").exit_code == 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "repetitions"),
     [(["robot"], 1), (["robot", "--long"], 5), (["press"], 5), (["robot", "--repeat", "3"], 3)],
@@ -159,6 +161,7 @@ def test_the_page_shows_how_long_a_group_takes(report: Report) -> None:
     assert f"| {name} |  | ≤ 40 |  | not measured |" in page()
 
 
+@pytest.mark.slow
 def test_real_rows_bring_their_picture(tmp_path: Path, report: Report) -> None:
     figures = {"depth_mm": 0.5, "ball_radius_mm": 3.0, "thickness_mm": 10.0, "real_px": 20.0, "pressure_px": 21.0}
     changes = {"group": "real", "case": "contact_radius", "variant": "R 3 mm: image", "figures": figures}

@@ -50,6 +50,7 @@ def test_verdicts(row: Row, cells: list[str]) -> None:
     assert found == ["3 Force", "standstill", *cells]
 
 
+@pytest.mark.slow
 def test_every_promise_has_tests_and_the_published_report_their_figures(report: Report) -> None:
     tests = marked_tests()
     assert sorted(tests) == list(range(1, len(PROMISES) + 1)) and len(PROMISES) == 15

@@ -49,6 +49,7 @@ def test_a_second_world_is_the_first_once_more() -> None:
     assert row.figures["second_ms"] > 0 and row.figures["first_ms"] > 0
 
 
+@pytest.mark.slow
 def test_a_first_motion_is_the_same_with_kernels_of_another_process() -> None:
     rows = scenes.first_motion(1)
     assert [row.variant for row in rows] == ["kernels compiled", "kernels kept"]

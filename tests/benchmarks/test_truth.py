@@ -77,12 +77,14 @@ def test_stress_of_a_prism() -> None:
     assert uniaxial_stress(3.0, 2e-6, 1e-2) == pytest.approx(3.0 / 2e-4)
 
 
+@pytest.mark.slow
 def test_confined_compression_meets_its_closed_form() -> None:
     (row,) = materials.oedometer(1e-3, 1)
     assert row.error < 1e-3  # %
     assert row.figures["stretch"] == pytest.approx(0.9, abs=1e-5)
 
 
+@pytest.mark.slow
 def test_a_free_body_keeps_its_momentum() -> None:
     """Angular momentum of what does not move affinely changes with the deformation since the grid's reference, here
     0.0005 while the body is torn about, and then no more."""

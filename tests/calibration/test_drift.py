@@ -65,6 +65,7 @@ def angle(seen: TactileObservation, press: Made) -> float:
     return float(normal_angle(normal_of_slope(seen.gradient.astype(float)), normal_of_slope(true))[inside].mean())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES)
 def test_a_stale_reference_is_seen_in_contact_and_without(
     change, normalise: FrameNormaliser, sensor: HiddenSensor, bundle

@@ -63,6 +63,7 @@ def bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_a_sensor_is_calibrated_within_its_region(bundle: Path) -> None:
     calibration, reference = read_bundle(bundle / "out")
     assert calibration.region == REGION and calibration.image_shape == SHAPE

@@ -33,6 +33,7 @@ def frame(image: np.ndarray) -> TactileFrame:
     return TactileFrame(image=image, time=0.0, index=0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("depth", [0.1e-3, 0.5e-3])
 def test_a_reference_that_shows_a_contact_is_told(
     sensor: HiddenSensor, normalise: FrameNormaliser, depth: float

@@ -167,6 +167,7 @@ def observations(episode: Episode) -> list[Observation]:
     return episode.observations
 
 
+@pytest.mark.slow
 @pytest.mark.promise(12)
 def test_the_spec_says_what_is_observed(rig: Rig, observations: list[Observation]) -> None:
     assert isinstance(rig.spec, RigSpec)
@@ -257,6 +258,7 @@ def test_references_are_without_contact(rig: Rig, episode: Episode) -> None:
         assert frame.image.shape == rig.frames[name].image.shape
 
 
+@pytest.mark.slow
 def test_a_second_episode_is_the_first_again(rig: Rig, live: bool, observations: list[Observation]) -> None:
     """To the bit; on a live rig as far as an arm comes twice to the same place."""
     again = [rig.reset(), *(rig.step(Action())[0] for _ in range(STEPS))]
@@ -281,6 +283,7 @@ def test_what_was_observed_does_not_change_later(episode: Episode) -> None:
         assert all(np.array_equal(observation.arms[name].pose.position, place) for name, place in poses.items())
 
 
+@pytest.mark.slow
 def test_what_was_sent_is_told_for_every_arm(rig: Rig) -> None:
     observation = rig.reset()
     targets = {
@@ -307,6 +310,7 @@ def test_truth_is_there_as_the_spec_says(rig: Rig, episode: Episode) -> None:
         assert set(truth.poses) == set(rig.spec.sensors)
 
 
+@pytest.mark.slow
 @pytest.mark.promise(12)
 def test_an_image_policy_runs_and_every_step_is_recorded(rig: Rig) -> None:
     episode = run_episode(rig, Grip(rig.spec), None, STEPS)
@@ -317,6 +321,7 @@ def test_an_image_policy_runs_and_every_step_is_recorded(rig: Rig) -> None:
         assert {f"contact_signal_{name}" for name in rig.spec.sensors} <= set(step.info)
 
 
+@pytest.mark.slow
 def test_it_ends_or_goes_on_but_never_hangs(rig: Rig) -> None:
     """Recordings end with EndOfEpisode; what is live takes any number of steps."""
     rig.reset()

@@ -69,6 +69,7 @@ def said(done: subprocess.CompletedProcess[str]) -> str:
     return " ".join(f"{done.stdout} {done.stderr}".replace("│", " ").split())
 
 
+@pytest.mark.slow
 def test_outside_drivers_pass_the_contract_suite(site: Path, tmp_path: Path) -> None:
     rig = write_rig(tmp_path, signal="null")
     suite: Sequence[str] = ("-m", "pytest", "-q", "-p", "no:cacheprovider", "-n", "0", "-k", "hardware")
@@ -77,6 +78,7 @@ def test_outside_drivers_pass_the_contract_suite(site: Path, tmp_path: Path) -> 
     assert "14 passed" in done.stdout, done.stdout
 
 
+@pytest.mark.slow
 def test_outside_drivers_run_replay_and_pass_doctor(site: Path, tmp_path: Path) -> None:
     rig = str(write_rig(tmp_path))
     done = python(site, tmp_path, *COMMAND, "run", rig, "--policy", "grip", "--steps", "3", "--out", "first")
@@ -113,6 +115,7 @@ def test_an_approach_that_is_too_fast_for_an_outside_sensor_is_refused(site: Pat
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("driver", "words"),
     [

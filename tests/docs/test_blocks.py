@@ -98,6 +98,7 @@ def require_success(block: Block, folder: Path) -> None:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(LIMIT + 30)
 @pytest.mark.parametrize("page", sorted(FIRST))
 def test_the_first_python_block_of_a_page_runs(page: str, tmp_path: Path) -> None:

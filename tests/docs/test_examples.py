@@ -59,6 +59,7 @@ def test_its_resolved_file_is_read_back(tmp_path: Path) -> None:
     assert load_with_task(tmp_path / "rig.yaml").config == loaded.config
 
 
+@pytest.mark.slow
 def test_it_is_an_environment() -> None:
     env = make_env(NAME, overrides=FEW, randomise={"values": {"task.goal": {"uniform": ["0.5 mm", "2 mm"]}}})
     _, info = env.reset(seed=3)

@@ -28,6 +28,7 @@ def run(program: Path, folder: Path) -> subprocess.CompletedProcess[str]:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(LIMIT + 30)
 @pytest.mark.parametrize("program", PROGRAMS, ids=lambda path: path.stem)
 def test_program_passes_its_own_check(program: Path, tmp_path: Path) -> None:

@@ -193,6 +193,7 @@ def test_a_number_of_environments_that_is_none_is_refused(number: Any) -> None:
         make_vector_env(number)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("first", "module"), [("", "tacsim.gym:"), ("import tacsim.gym\n", "")])
 def test_gymnasium_finds_the_environments_by_an_import_or_the_id(first: str, module: str) -> None:
     """In a fresh process, with a small scene."""
@@ -209,6 +210,7 @@ def test_gymnasium_finds_the_environments_by_an_import_or_the_id(first: str, mod
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("module", ["tacsim.gym.encode", "tacsim.gym.env", "gymnasium"])
 def test_any_of_ours_may_import_gymnasium_first(module: str) -> None:
     """Registration runs inside `import tacsim.gym`: it must not need a module of ours that is half imported."""

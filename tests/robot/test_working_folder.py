@@ -47,6 +47,7 @@ def test_mocks_start_there(monkeypatch: pytest.MonkeyPatch) -> None:
         assert arm.running and camera.running
 
 
+@pytest.mark.slow
 def test_the_processes_of_trials_start_there() -> None:
     with pytest.raises(TrialFailed, match="failed: KeyError"):
         run_trials([("no such task", "hybrid")])

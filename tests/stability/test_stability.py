@@ -234,6 +234,7 @@ PAIRS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "physics"), PAIRS)
 def test_hard_case(worker: Worker, name: str, physics: str) -> None:
     outcome = worker.run(name, physics, LONG.get(name, SECONDS))

@@ -40,6 +40,7 @@ CASES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.often
 @pytest.mark.promise(7)
 @pytest.mark.parametrize(("kind", "ports"), CASES)

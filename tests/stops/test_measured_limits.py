@@ -125,6 +125,7 @@ def largest_heap(ticks: np.ndarray) -> int:
     return int((surplus - before.min(axis=1)).max())
 
 
+@pytest.mark.slow
 @pytest.mark.promise(2)
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=() if name in STANDARD else pytest.mark.deep) for name in EVENTS]

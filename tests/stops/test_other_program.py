@@ -30,6 +30,7 @@ def start_script(faults: FaultClient, *, moves_first: bool) -> float:
     return now
 
 
+@pytest.mark.slow
 @pytest.mark.promise(7)
 @pytest.mark.parametrize(
     "moves_first",

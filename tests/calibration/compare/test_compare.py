@@ -72,6 +72,7 @@ def test_another_light_is_told_from_the_right_one(other: FrameSet, real: FrameSe
     assert math.hypot(*result.alignment.shift) < 3  # contacts are found in any light
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shift", [(0.0, 0.0), (3.4, -2.7), (-8.25, 5.5)])
 def test_a_known_shift_is_found_and_undone(good: FrameSet, real: FrameSet, shift: tuple[float, float]) -> None:
     moved = changed(good, lambda image: shifted(image, *shift), "all")
@@ -110,6 +111,7 @@ def test_geometries_place_both_on_the_gel() -> None:
     assert not covered[39, 59]  # 7.8 mm to the right of the axis; A reaches 5 mm
 
 
+@pytest.mark.slow
 def test_corners_undo_a_slanted_view(real: FrameSet) -> None:
     import cv2
 
@@ -179,6 +181,7 @@ def test_one_frame_has_numbers_but_no_interval(good: FrameSet, real: FrameSet) -
     assert "1 pair: too few for intervals; at least 3 are needed" in result.notes
 
 
+@pytest.mark.slow
 def test_saturated_frames_are_flagged(good: FrameSet, real: FrameSet) -> None:
     burnt = changed(real, lambda image: np.clip(image.astype(int) * 2, 0, 255).astype(np.uint8), "all")
     result = compare_frames(good, burnt)
@@ -205,6 +208,7 @@ def test_sizes_of_other_proportions_need_a_calibration(good: FrameSet, real: Fra
         compare_frames(cut, real)
 
 
+@pytest.mark.slow
 def test_pairs_that_are_none_are_not_shifted(real: FrameSet) -> None:
     elsewhere = side(HiddenSensor(3), places=[(190, 140), (70, 60), (60, 150), (200, 60), (130, 50)])
     result = compare_frames(elsewhere, real)
@@ -251,6 +255,7 @@ def test_the_columns_of_the_page_need_no_more_than_their_longest_word(compared: 
     assert pairs.count('<td class="name">') == 2 * len(compared.pairs)
 
 
+@pytest.mark.slow
 def test_names_of_files_are_no_markup(good: FrameSet, real: FrameSet, tmp_path: Path) -> None:
     evil = "<img src=x onerror=alert(1)>.png"
     frames = (replace(good.frames[0], name=evil), *good.frames[1:])
@@ -260,6 +265,7 @@ def test_names_of_files_are_no_markup(good: FrameSet, real: FrameSet, tmp_path: 
     assert "&lt;img src=x" in page
 
 
+@pytest.mark.slow
 def test_a_comparison_with_itself_can_be_written(real: FrameSet, tmp_path: Path) -> None:
     result = compare_frames(real, real)
     assert result.overall["psnr"].mean == math.inf
@@ -278,6 +284,7 @@ def test_every_metric_is_a_figure(compared: Comparison) -> None:
 # drift, sides, judgement
 
 
+@pytest.mark.slow
 def test_drift_of_the_light_is_no_contact(good: FrameSet, real: FrameSet) -> None:
     """A light that has changed by a quadratic of the place: 22 grey levels in one corner. The contact regions must be
     those without it."""
@@ -294,6 +301,7 @@ def test_drift_of_the_light_is_no_contact(good: FrameSet, real: FrameSet) -> Non
     assert found.alignment.shift == pytest.approx((0.0, 0.0), abs=0.15)
 
 
+@pytest.mark.slow
 def test_no_shift_is_sought_where_a_is_made_in_the_pixels_of_b(good: FrameSet, real: FrameSet) -> None:
     placed = replace(changed(good, lambda image: shifted(image, 3.0, 0.0), "all"), same_pixels=True)
     assert compare_frames(placed, real).alignment.shift == (0.0, 0.0)
@@ -311,6 +319,7 @@ def test_what_could_not_be_made_is_left_out_and_said(good: FrameSet, real: Frame
         compare_frames(replace(part, frames=()), real)
 
 
+@pytest.mark.slow
 def test_a_simulation_and_its_truth_are_called_so(good: FrameSet, real: FrameSet, tmp_path: Path) -> None:
     result = compare_frames(replace(good, simulated=True), real)
     assert result.names == ("simulated", "real")
@@ -320,6 +329,7 @@ def test_a_simulation_and_its_truth_are_called_so(good: FrameSet, real: FrameSet
     assert comparison_as_json(result)["a"]["is"] == "simulated"
 
 
+@pytest.mark.slow
 def test_the_judgement_is_one_plain_sentence(
     compared: Comparison, other: FrameSet, good: FrameSet, real: FrameSet, tmp_path: Path
 ) -> None:

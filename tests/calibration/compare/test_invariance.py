@@ -105,6 +105,7 @@ def report(good: Comparison, calibration: Calibration) -> Report:
     return measure_invariance([(good, calibration)])
 
 
+@pytest.mark.slow
 def test_a_good_simulation_is_nearer_than_the_next_press(report: Report) -> None:
     assert [view.view for view in report.views] == list(VIEWS)
     assert report.presses == 6 and report.patch == "5.2 mm"
@@ -115,6 +116,7 @@ def test_a_good_simulation_is_nearer_than_the_next_press(report: Report) -> None
         assert view.distance < view.neighbour < 2
 
 
+@pytest.mark.slow
 def test_another_light_is_seen_in_the_picture_but_hardly_in_the_surface(
     real: FrameSet, calibration: Calibration
 ) -> None:
@@ -136,6 +138,7 @@ def test_a_fresh_reference_saves_from_a_change_of_gain(report: Report) -> None:
     assert 0 < report.angle < 5
 
 
+@pytest.mark.slow
 def test_a_change_after_which_no_surface_is_found_is_named(
     real: FrameSet, calibration: Calibration, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -179,6 +182,7 @@ def test_the_report_is_in_all_files(good: Comparison, report: Report, tmp_path: 
     assert page.count("data:image/jpeg;base64,") == 8 * len(good.pairs)  # heights too
 
 
+@pytest.mark.slow
 def test_drift_of_the_light_does_not_give_the_source_away(real: FrameSet, calibration: Calibration) -> None:
     """A policy sees differences without drift; the classifier must too."""
     v, u = np.mgrid[-1:1:200j, -1:1:260j]

@@ -47,6 +47,7 @@ def test_low_contrast_is_helped_by_a_picture_without_the_board() -> None:
         find_board(picture, DOTS, reference[:240])
 
 
+@pytest.mark.slow
 @BOTH
 def test_a_lens_is_found_from_tilted_pictures(board: Board) -> None:
     points = {f"{i}.png": find_board(photograph(board, pose, seed=i), board) for i, pose in enumerate(tilted(board))}
@@ -65,6 +66,7 @@ def test_a_lens_is_found_from_tilted_pictures(board: Board) -> None:
     assert residual < 0.4 and metres < 0.6e-3 and np.degrees(radians) < 0.6
 
 
+@pytest.mark.slow
 def test_pictures_that_tell_no_lens_are_refused() -> None:
     points = {f"{i}": find_board(photograph(DOTS, pose, seed=i), DOTS) for i, pose in enumerate(tilted(DOTS, 6))}
     with pytest.raises(BadView, match=r"1 picture\(s\) of a board are too few"):
@@ -101,6 +103,7 @@ def test_the_view_of_the_plane_is_metric(board: Board, known: bool) -> None:
     assert step[0] > 0 and abs(step[1] / step[0]) < 1e-3
 
 
+@pytest.mark.slow
 def test_the_rectified_picture_shows_even_dots() -> None:
     pose = facing(DOTS, [0.2, -0.12, 0.1], 0.032)
     picture = photograph(DOTS, pose)
@@ -115,6 +118,7 @@ def test_the_rectified_picture_shows_even_dots() -> None:
     assert canonical(picture).shape == (128, 128, 3) and canonical.valid[40:88, 20:108].all()
 
 
+@pytest.mark.slow
 def test_distortion_is_fitted_only_where_it_pays() -> None:
     plain = Lens(width=640, height=480, focal=(600.0, 600.0), centre=(319.5, 239.5))
     pose = facing(DOTS, [0.2, -0.12, 0.1], 0.032)
@@ -124,6 +128,7 @@ def test_distortion_is_fitted_only_where_it_pays() -> None:
     assert bent.lens.distortion[0] < -0.1
 
 
+@pytest.mark.slow
 def test_a_wrong_board_is_refused() -> None:
     picture = photograph(DOTS, facing(DOTS, [0.1, 0.0, 0.0], 0.032))
     for board, words in (

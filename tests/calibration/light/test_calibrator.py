@@ -50,6 +50,7 @@ def calibrated(sensor: HiddenSensor) -> tuple[LightFit, list[Made]]:
     return calibrate_light(sensor.empty(), named(presses), BALL_PX), presses
 
 
+@pytest.mark.slow
 def test_circles_are_found_without_a_click(calibrated: tuple[LightFit, list[Made]]) -> None:
     fit, presses = calibrated
     assert fit.left_out == ()
@@ -73,6 +74,7 @@ def test_depth_of_an_unseen_press_comes_back(sensor: HiddenSensor, calibrated: t
     assert float(found.max()) == pytest.approx(float(unseen.height.max() - np.median(border)), rel=0.03)
 
 
+@pytest.mark.slow
 def test_thickness_of_a_thin_gel_comes_back() -> None:
     """Dents of an elastic layer whose skirts fall off faster than Hertz's."""
     sensor, thickness = HiddenSensor(5), 1.2 * BALL_PX
@@ -89,6 +91,7 @@ def test_thickness_of_a_thin_gel_comes_back() -> None:
         assert press.circle.radius == pytest.approx(circle.radius, rel=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spread", [0.0, 3.0], ids=["sharp", "light spreads in the gel"])
 def test_any_presses_give_the_same_circles(spread: float) -> None:
     """The skirt is not taken for a part of the contact, nor the reverse, whichever presses are used. (With a skirt
@@ -128,6 +131,7 @@ def test_left_out_scores_are_those_of_presses_nobody_has_seen(calibrated: tuple[
     assert np.median([prediction.angle for prediction in calibrated[0].predictions]) < 2.0
 
 
+@pytest.mark.slow
 def test_a_channel_that_saturates_spoils_neither_itself_nor_the_others() -> None:
     """The bright side of every press is white in one channel. The other two still show the slope there, and what the
     camera cut off is not asked of the model."""
@@ -152,6 +156,7 @@ def test_one_press_gives_a_plain_model(sensor: HiddenSensor) -> None:
     assert angle_in_contact(fit, sensor.press(0.45e-3, 110, 110)) < 2.0
 
 
+@pytest.mark.slow
 def test_a_drifting_lamp_does_no_harm(sensor: HiddenSensor) -> None:
     presses = sensor.presses(6)
     ramp = np.linspace(-8, 8, COLUMNS)[None, :, None] + np.array([5.0, -3.0, 0.0])
@@ -163,6 +168,7 @@ def test_a_drifting_lamp_does_no_harm(sensor: HiddenSensor) -> None:
     assert fit.predictions[2].error < 0.3 * fit.predictions[2].null_error
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("spoil", "why"),
     [
@@ -183,6 +189,7 @@ def test_a_bad_frame_is_left_out_and_says_why(sensor: HiddenSensor, spoil, why: 
     assert angle_in_contact(fit, sensor.press(0.5e-3, 150, 90)) < 1.3
 
 
+@pytest.mark.slow
 def test_a_speck_of_glare_is_no_second_contact(sensor: HiddenSensor) -> None:
     """16 white pixels in a corner, where the smoothing that noise asks for reflects them: as strong as the contact."""
     presses = sensor.presses(5)
@@ -195,6 +202,7 @@ def test_a_speck_of_glare_is_no_second_contact(sensor: HiddenSensor) -> None:
     assert np.hypot(found.x - x, found.y - y) < 0.5 and found.radius == pytest.approx(radius, rel=0.05)
 
 
+@pytest.mark.slow
 def test_a_picture_without_contact_of_another_light_is_doubted(sensor: HiddenSensor) -> None:
     stale = np.clip(sensor.empty() + np.array([15, 0, 3]), 0, 255).astype(np.uint8)
     fit = calibrate_light(stale, named(sensor.presses(5)), BALL_PX)
@@ -203,6 +211,7 @@ def test_a_picture_without_contact_of_another_light_is_doubted(sensor: HiddenSen
     assert angle_in_contact(fit, sensor.press(0.5e-3, 150, 90, drift=np.array([15.0, 0, 3]))) < 2.0  # it is removed
 
 
+@pytest.mark.slow
 def test_a_picture_without_contact_that_shows_one_is_doubted(sensor: HiddenSensor) -> None:
     presses = sensor.presses(5)
     with pytest.raises(BadFrames, match="second contact"):
@@ -223,12 +232,14 @@ def test_exchanged_colours_are_called_by_their_name(sensor: HiddenSensor, which:
         calibrate_light(reference, frames, BALL_PX)
 
 
+@pytest.mark.slow
 def test_presses_in_one_place_are_doubted(sensor: HiddenSensor) -> None:
     places = [(130, 100), (140, 104), (124, 96)]
     fit = calibrate_light(sensor.empty(), named([sensor.press(0.5e-3, *place) for place in places]), BALL_PX)
     assert any("all presses are in one place" in words for words in fit.warnings)
 
 
+@pytest.mark.slow
 def test_a_press_of_another_ball_is_left_out(sensor: HiddenSensor) -> None:
     other = sensor.press(0.5e-3, 60, 150, ball=2 * BALL_PX)
     fit = calibrate_light(sensor.empty(), [*named(sensor.presses(4)), ("other", other.image)], BALL_PX)
@@ -236,6 +247,7 @@ def test_a_press_of_another_ball_is_left_out(sensor: HiddenSensor) -> None:
     assert doubted == ["other"]
 
 
+@pytest.mark.slow
 def test_a_wrong_radius_scales_every_slope_and_nothing_gives_it_away(sensor: HiddenSensor) -> None:
     """Why the ball must be measured: the docs say so."""
     right, wrong = (calibrate_light(sensor.empty(), named(sensor.presses(4)), k * BALL_PX) for k in (1.0, 1.3))
@@ -257,6 +269,7 @@ def test_frames_of_another_size_are_named(sensor: HiddenSensor) -> None:
         calibrate_light(sensor.empty(), [*named(sensor.presses(1)), ("small", small)], BALL_PX)
 
 
+@pytest.mark.slow
 def test_printed_dots_that_move_are_erased() -> None:
     """Dots sink in and aside under a ball; taken for light, they would spoil circles and colours."""
     sensor = HiddenSensor(5)

@@ -54,6 +54,7 @@ def height_error(fit: LightFit, sensor: DarkSensor, unseen: Made) -> float:
     return float(np.sqrt(((off - off.mean()) ** 2).mean()) / unseen.height.max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [0.0, 0.4])
 def test_heights_of_an_unseen_press_come_back(share: float) -> None:
     sensor = DarkSensor(1, share)
@@ -100,6 +101,7 @@ def test_one_lamp_brighter_than_the_others_still_tells_direction() -> None:
         assert not is_direction_free(np.maximum(change, -0.05) for change in changes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [0.0, 0.4])
 def test_a_contact_is_found_by_its_darkness(share: float) -> None:
     sensor = DarkSensor(6, share)
@@ -124,6 +126,7 @@ def test_no_contact_is_found_in_what_darkness_does_not_tell() -> None:
         dark_circle(twice, sensor.empty(), BALL_PX)
 
 
+@pytest.mark.slow
 def test_flanks_that_are_dark_all_alike_tell_no_depth() -> None:
     with pytest.raises(NoDirection, match="this light tells no direction"):
         calibrated(RingSensor(4), 3)
@@ -135,6 +138,7 @@ def test_a_frame_without_contact_is_left_out() -> None:
     assert [name for name, _ in calibrate_light(sensor.empty(), frames, BALL_PX).left_out] == ["nothing"]
 
 
+@pytest.mark.slow
 def test_a_bundle_rendered_and_found_again_gives_the_same_heights(tmp_path: Path) -> None:
     fit, _ = calibrated(DarkSensor(5, 0.4), 4)
     write_bundle(tmp_path, fit.to_calibration("dark", BALL, PITCH), fit.reference)
@@ -168,6 +172,7 @@ def run(folder: Path, sensor: DarkSensor, *words: str) -> tuple[int, str]:
     return done.exit_code, " ".join(done.output.split())
 
 
+@pytest.mark.slow
 def test_the_command_says_which_light_it_found_and_what_was_expected(tmp_path: Path) -> None:
     code, output = run(tmp_path, DarkSensor(7, 0.4), "--kind", "digit", "--serial", "finger")
     assert code in (0, 3) and "this light does not depend on the direction of slopes: darkness gives depth" in output
@@ -177,6 +182,7 @@ def test_the_command_says_which_light_it_found_and_what_was_expected(tmp_path: P
     assert "<title>finger, DIGIT: " in page and "darkness tells depth" in page
 
 
+@pytest.mark.slow
 def test_no_bundle_is_written_where_nothing_is_told(tmp_path: Path) -> None:
     code, output = run(tmp_path, RingSensor(8))
     assert code == 3 and "this light tells no direction" in output and "no bundle is written" in output

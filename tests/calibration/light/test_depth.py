@@ -45,6 +45,7 @@ def drawn(fit: LightFit, slopes: np.ndarray, height: np.ndarray) -> np.ndarray:
     return fit.reference + gaussian_blur(change.astype(float), fit.forward.blur)
 
 
+@pytest.mark.slow
 def test_the_colour_of_depth_is_found_and_holds_for_what_is_no_ball() -> None:
     """Truth: a bar with a flat bottom, 0.35 mm deep; its picture by the slopes alone is 17 grey levels off there."""
     sensor = HiddenSensor(3, noise=0.5)
@@ -59,6 +60,7 @@ def test_the_colour_of_depth_is_found_and_holds_for_what_is_no_ball() -> None:
     assert np.abs(off[bottom].mean(axis=0)).max() < 2.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [3, 11])
 def test_slopes_at_depth_are_found_and_hold_for_what_is_no_ball(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Truth: lamps that fade with depth; a bar with steep edges and a wedge, that no ball presses."""
@@ -83,6 +85,7 @@ def test_slopes_at_depth_are_found_and_hold_for_what_is_no_ball(seed: int, monke
         assert off[0] < 0.9 * off[1]  # the bar 1.2 and 1.8 grey levels, the wedge 1.0 and 1.1
 
 
+@pytest.mark.slow
 def test_a_saturated_pixel_says_at_least(monkeypatch: pytest.MonkeyPatch) -> None:
     """Truth: lamps so bright that flanks are white. What nobody counts may be predicted dark."""
     sensor = HiddenSensor(3, noise=0.5, gain=2.5)
@@ -117,6 +120,7 @@ def test_which_saturated_pixels_are_predicted_too_dark() -> None:
     np.testing.assert_array_equal(counted[:, near], wanted[:, near])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [3, 11])
 def test_no_depth_is_found_where_it_changes_nothing(seed: int) -> None:
     sensor = HiddenSensor(seed)

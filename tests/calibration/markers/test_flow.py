@@ -138,6 +138,7 @@ def moved(far: float) -> np.ndarray:
     return np.exp(-(rest**2).sum(axis=2) / (4e-3) ** 2)[..., None] * np.array([far, -0.4 * far])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("drop", [0.0, 0.3])
 def test_drop_outs_are_filled_and_flagged(drop: float) -> None:
     rng = np.random.default_rng(3)

@@ -27,6 +27,7 @@ def test_without_noise_the_truth_comes_back_from_any_mounting() -> None:
         assert all(fit.used)
 
 
+@pytest.mark.slow
 def test_errors_are_those_of_the_bound_and_as_stated() -> None:
     errors = []
     for seed in range(25):

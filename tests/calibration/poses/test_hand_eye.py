@@ -55,6 +55,7 @@ def test_without_noise_the_truth_comes_back(fixed: bool) -> None:
     assert fit.residuals.max() < 1e-7 and all(fit.used)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fixed", [False, True])
 def test_errors_with_the_noise_of_the_notes_are_as_stated(fixed: bool) -> None:
     errors = []

@@ -51,6 +51,7 @@ def test_signals_without_noise_at_a_high_rate_give_a_tenth_of_a_millisecond() ->
     assert abs(estimate_latency(*record(3, noise=0.0, rate=200.0)).seconds - 0.115) < 1e-4
 
 
+@pytest.mark.slow
 def test_the_uncertainty_is_that_of_the_errors() -> None:
     found = [estimate_latency(*record(seed)) for seed in range(30)]
     errors = np.array([one.seconds - (CAMERA - ARM) for one in found])

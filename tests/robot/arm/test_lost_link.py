@@ -81,6 +81,7 @@ def test_describe_lost_link_cut_or_blocked_names_cause() -> None:
     assert "a command took longer than link_timeout" in describe_lost_link(newest, REAL, TIME_LIMIT_EXIT_STATUS, 250.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("printed", "expected"), [(SAID, ArmStatus.LINK_LOST), ("", ArmStatus.WORKER_DEAD)])
 def test_status_of_library_crash_with_report_is_lost_link(mock: MockUR, printed: str, expected: ArmStatus) -> None:
     with URArm(config(), "left") as arm:

@@ -147,6 +147,7 @@ def test_servo_command_after_push_starts_at_measured_pose() -> None:
     assert np.linalg.norm(first - here) <= 0.5 * PERIOD**2 * (1 + 1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.promise(2)
 def test_servo_singular_target_limits_joint_steps() -> None:
     bench = Bench(action_timeout=60.0, lower=[-2.0, -2.0, -1.0], upper=[2.0, 2.0, 2.0], speed=1.0, acceleration=5.0)

@@ -141,6 +141,7 @@ class Life:
             assert float(servo.region.excess(now.position)) <= 1e-8
 
 
+@pytest.mark.slow
 @pytest.mark.promise(1, 2, 5)
 @pytest.mark.parametrize("seed", [*range(3), *(pytest.param(seed, marks=pytest.mark.deep) for seed in range(3, 20))])
 def test_servo_random_events_keep_stopped_arm_at_rest(seed: int) -> None:

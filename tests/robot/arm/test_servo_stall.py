@@ -152,6 +152,7 @@ def way_back(arm: OnController, silent: int, fault: int, backlog: int = 0) -> fl
     return float(along.max() - along[-1])
 
 
+@pytest.mark.slow
 @pytest.mark.promise(3)
 @pytest.mark.parametrize(("speed", "lookahead"), [(0.1, 0.03), (0.1, 0.1), (0.3, 0.03)])
 def test_servo_fault_on_old_package_does_not_pull_arm_back(speed: float, lookahead: float) -> None:

@@ -57,6 +57,7 @@ def test_ring_records_keep_order_and_last_slots(segment: shared_ring.Segment) ->
     assert len(ring.since(20)[1]) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.promise(10)
 def test_ring_100000_reads_have_no_torn_record(segment: shared_ring.Segment) -> None:
     """Another process writes as fast as it can; every copy here is of one record."""
@@ -106,6 +107,7 @@ def descriptors() -> list[str]:
     return sorted(str(path.readlink()) for path in Path("/proc/self/fd").iterdir() if path.exists())
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="looks at open files as Linux shows them")
 def test_segment_is_freed_with_last_process() -> None:
     """There is no file: nothing to find for others, nothing to be squatted, nothing that a kill could leave."""

@@ -28,6 +28,7 @@ def away() -> UrArmConfig:
     return config(limits={"workspace": ELSEWHERE, "speed": 0.1})
 
 
+@pytest.mark.slow
 def test_an_arm_outside_its_box_goes_to_its_start_and_nowhere_else(mock: MockUR) -> None:
     with pytest.raises(SafetyViolation, match=r"outside its workspace.*`tacsim start FILE` moves it"):
         URArm(away(), "left")
@@ -56,6 +57,7 @@ def test_an_arm_that_stands_off_its_way_is_refused(mock: MockUR) -> None:
         StartArm(away(), "left", here, here + TURN)
 
 
+@pytest.mark.slow
 def test_a_sensor_that_is_far_off_is_zeroed_first(mock: MockUR) -> None:
     mock.faults.wrench([0.0, 0.0, 34.0, 0.0, 0.0, 0.0])
     with pytest.raises(SafetyViolation, match=r"`tacsim doctor --rig FILE` shows.*`tacsim start FILE` zeroes"):

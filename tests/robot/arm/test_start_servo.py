@@ -32,6 +32,7 @@ def go(made: Bench, share: float, periods: int) -> None:
         made.run(50)
 
 
+@pytest.mark.slow
 def test_it_reaches_its_start_straight_and_slowly_from_outside_its_box() -> None:
     made = bench()
     assert made.servo.status == ArmStatus.HOLD and not made.sent
@@ -176,6 +177,7 @@ def test_a_fault_found_on_an_old_package_does_not_draw_it_back(status: ArmStatus
     assert made.servo.is_at_rest and (made.q - there) @ (END - HOME) > -1e-6
 
 
+@pytest.mark.slow
 def test_it_stops_before_the_other_arm() -> None:
     made = bench(partners=[Partner(-1, 0.05)])
     other = np.zeros((), STATE)

@@ -63,6 +63,7 @@ def drive(
     return path
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=30)
 @given(inside, inside, turns, rates)
 def test_step_towards_from_rest_reaches_target_without_overshoot(
@@ -85,6 +86,7 @@ def test_step_towards_from_rest_reaches_target_without_overshoot(
         assert moving * PERIOD <= length / peak + peak / quick.acceleration + 4 * PERIOD
 
 
+@pytest.mark.slow
 @pytest.mark.promise(2)
 @settings(deadline=None, max_examples=30)
 @given(inside, st.lists(st.tuples(inside, turns, st.integers(1, 120)), min_size=2, max_size=8), rates)
@@ -129,6 +131,7 @@ def test_max_landing_speed_stops_exactly_at_distance(distance: float, accelerati
     assert covered == pytest.approx(distance, rel=1e-6)
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=30)
 @given(st.floats(0.0, 1.0), st.floats(0.05, 10.0), st.floats(0.0, 3.0))
 def test_step_braking_stops_at_stopping_point(speed: float, deceleration: float, spin: float) -> None:

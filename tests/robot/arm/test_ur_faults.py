@@ -44,6 +44,7 @@ from tests.robot.waiting import until
 # -- force -----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.promise(3)
 def test_arm_force_limit_stops_in_same_period(mock: MockUR, measuring: bool, figure: Record) -> None:
     stiffness, limit, speed = 2000.0, 20.0, 0.05
@@ -107,6 +108,7 @@ def test_arm_gel_limit_stops_pressing_arm(mock: MockUR) -> None:
         go(arm, start)  # what the last worker was shown is not held against this one
 
 
+@pytest.mark.slow
 def test_arm_without_new_observation_holds(mock: MockUR) -> None:
     with URArm(config(observation_timeout=0.5), "left") as arm:
         start = arm.state().pose
@@ -161,6 +163,7 @@ def test_arm_without_action_holds_and_continues(mock: MockUR, measuring: bool, f
         check_path(arm, sent)
 
 
+@pytest.mark.slow
 @pytest.mark.promise(5)
 def test_arm_after_last_action_stops_within_timeout_distance(mock: MockUR, measuring: bool, figure: Record) -> None:
     """A policy that hangs in full motion, its target far away."""
@@ -190,6 +193,7 @@ def test_arm_after_last_action_stops_within_timeout_distance(mock: MockUR, measu
 # -- stops of the controller -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.promise(7)
 def test_arm_protective_stop_raises_until_recover(arm: URArm, mock: MockUR, figure: Record) -> None:
     start = arm.state().pose
@@ -269,6 +273,7 @@ def test_arm_program_stopped_outside_raises(arm: URArm, mock: MockUR) -> None:
     assert arm.status() == ArmStatus.HOLD
 
 
+@pytest.mark.slow
 @pytest.mark.promise(7)
 def test_connect_stopped_arm_raises(mock: MockUR) -> None:
     mock.faults.protective_stop()

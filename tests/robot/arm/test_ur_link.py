@@ -38,6 +38,7 @@ from tests.robot.arm.mocked import (
 from tests.robot.waiting import PATIENCE, until
 
 
+@pytest.mark.slow
 @pytest.mark.promise(4)
 def test_arm_silent_link_raises_link_lost_in_time(mock: MockUR, measuring: bool, figure: Record) -> None:
     timeout = 0.05 if measuring else 0.5
@@ -67,6 +68,7 @@ def test_arm_silent_link_raises_link_lost_in_time(mock: MockUR, measuring: bool,
         go(arm, start)
 
 
+@pytest.mark.slow
 @pytest.mark.promise(4)
 @pytest.mark.parametrize(
     ("ports", "reset"), [(None, True), pytest.param([30004], True, marks=pytest.mark.deep), ([30004], False)]
@@ -106,6 +108,7 @@ def test_arm_unused_connection_may_close(mock: MockUR, port: int) -> None:
     until(lambda: not mock.faults.state().program, "end of the program")
 
 
+@pytest.mark.slow
 @pytest.mark.promise(4, 9)
 def test_arm_stopped_controller_is_lost_link(mock: MockUR) -> None:
     with URArm(config(link_timeout=0.5), "left") as arm:
@@ -127,6 +130,7 @@ def test_arm_stopped_controller_is_lost_link(mock: MockUR) -> None:
         go(arm, moved(start, x=0.01))
 
 
+@pytest.mark.slow
 @pytest.mark.promise(4)
 def test_arm_package_with_nan_is_ignored(mock: MockUR) -> None:
     with URArm(config(link_timeout=0.5), "left") as arm:
@@ -181,6 +185,7 @@ def gaps() -> Iterator[list[float]]:
     thread.join()
 
 
+@pytest.mark.slow
 @pytest.mark.promise(9)
 @pytest.mark.parametrize("fault", ["silent", "refusing", "black hole", "mute dashboard"])
 def test_connect_without_controller_raises_in_time(

@@ -195,6 +195,7 @@ def send_hostile(arm: URArm, mock: MockUR, targets: np.ndarray) -> tuple[np.ndar
     return sent, np.concatenate([*ticks, servo_ticks(last)])
 
 
+@pytest.mark.slow
 @pytest.mark.promise(1, 2)
 def test_command_hostile_targets_keep_limits(mock: MockUR, measuring: bool, figure: Record) -> None:
     given = config(realtime=measuring, limits={**SLOPED, "speed": 0.5, "acceleration": 5.0})
@@ -218,6 +219,7 @@ def test_command_100000_hostile_targets_keep_limits(mock: MockUR) -> None:
         assert restarts(arm, sent, ticks) <= arm.timing().overruns
 
 
+@pytest.mark.slow
 @pytest.mark.promise(1)
 def test_command_hostile_targets_keep_measured_arm_inside(mock: MockUR, measuring: bool, figure: Record) -> None:
     given = config(realtime=measuring, limits={"speed": 1.0, "acceleration": 10.0, "joint_speed": 3.0})
@@ -232,6 +234,7 @@ def test_command_hostile_targets_keep_measured_arm_inside(mock: MockUR, measurin
         assert not arm.status().is_fault
 
 
+@pytest.mark.slow
 def test_command_clipped_target_is_returned(arm: URArm) -> None:
     start = arm.state().pose
     beyond = moved(start, z=-1.0)
@@ -254,6 +257,7 @@ def test_command_invalid_target_raises(arm: URArm) -> None:
     assert arm.status() == ArmStatus.HOLD
 
 
+@pytest.mark.slow
 def test_command_target_out_of_reach_raises_and_program_runs(mock: MockUR) -> None:
     wide = {"workspace": Workspace(lower=(-3.0, -3.0, -1.0), upper=(3.0, 3.0, 3.0))}
     with URArm(config(limits=wide), "left") as arm:
@@ -281,6 +285,7 @@ def test_limits_without_workspace_are_refused() -> None:
         ArmLimits()  # type: ignore[call-arg]
 
 
+@pytest.mark.slow
 @pytest.mark.promise(1)
 def test_connect_outside_workspace_raises(mock: MockUR) -> None:
     elsewhere = {"workspace": Workspace(lower=(2.0, 2.0, 2.0), upper=(3.0, 3.0, 3.0))}

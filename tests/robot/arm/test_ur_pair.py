@@ -48,6 +48,7 @@ def apart(left: URArm, right: URArm) -> float:
     return float(np.linalg.norm(left.state().pose.position - right.state().pose.position))
 
 
+@pytest.mark.slow
 @pytest.mark.promise(15)
 def test_pair_keep_out_holds_for_either_moving_arm(pair: Pair, figure: Record) -> None:
     left, right, _ = pair
@@ -75,6 +76,7 @@ def test_pair_arm_waits_for_missing_partner(mock: MockUR) -> None:
             arm.command(moved(arm.state().pose, x=0.01))
 
 
+@pytest.mark.slow
 @pytest.mark.promise(15)
 def test_pair_fault_of_one_arm_stops_both(pair: Pair, figure: Record) -> None:
     left, right, other = pair
@@ -98,6 +100,7 @@ def test_pair_fault_of_one_arm_stops_both(pair: Pair, figure: Record) -> None:
     go(right, moved(b, x=0.01))
 
 
+@pytest.mark.slow
 @pytest.mark.promise(15)
 def test_pair_recover_of_faulty_arm_first_restores_both(pair: Pair, figure: Record) -> None:
     left, right, other = pair
@@ -123,6 +126,7 @@ def test_pair_recover_of_faulty_arm_first_restores_both(pair: Pair, figure: Reco
     go(right, moved(right.state().pose, x=-0.01))
 
 
+@pytest.mark.slow
 @pytest.mark.promise(1, 15)
 def test_pair_connect_with_fault_raises(mock: MockUR) -> None:
     """The other arm waits, without a stop or a fault."""
@@ -137,6 +141,7 @@ def test_pair_connect_with_fault_raises(mock: MockUR) -> None:
     assert leftovers() == 0
 
 
+@pytest.mark.slow
 @pytest.mark.promise(15)
 def test_pair_dead_worker_stops_moving_arm(pair: Pair) -> None:
     """The other arm counts as dead after link_timeout, 1 s here; this one moves for much longer."""

@@ -50,6 +50,7 @@ from tests.robot.waiting import PATIENCE, alive, until
 # -- death -----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.promise(6)
 def test_worker_killed_is_reported_and_replaced(mock: MockUR, measuring: bool, figure: Record) -> None:
     with URArm(config(realtime=measuring, watchdog=10.0 if measuring else 1.0), "left") as arm:
@@ -74,6 +75,7 @@ def test_worker_killed_is_reported_and_replaced(mock: MockUR, measuring: bool, f
         go(arm, start)
 
 
+@pytest.mark.slow
 @pytest.mark.promise(6)
 def test_worker_stopped_is_lost_link_and_replaced(mock: MockUR) -> None:
     with URArm(config(link_timeout=0.5), "left") as arm:
@@ -98,6 +100,7 @@ time.sleep(60)
 """
 
 
+@pytest.mark.slow
 @pytest.mark.promise(6, 14)
 @pytest.mark.parametrize("number", [signal.SIGKILL, pytest.param(signal.SIGINT, marks=pytest.mark.deep)])
 def test_driver_killed_leaves_arm_at_rest(mock: MockUR, number: int, measuring: bool, figure: Record) -> None:
@@ -145,6 +148,7 @@ with Interrupt() as stop:
 """
 
 
+@pytest.mark.slow
 @pytest.mark.promise(6, 14)
 @pytest.mark.parametrize(
     ("program", "number"),
@@ -201,6 +205,7 @@ def test_zero_wrench_failed_is_not_repeated(mock: MockUR) -> None:
 # -- one commander ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.promise(8)
 def test_connect_second_driver_raises_and_first_continues(arm: URArm, mock: MockUR, figure: Record) -> None:
     start = arm.state().pose
@@ -234,6 +239,7 @@ def open_files() -> int:
     return len(list(Path("/proc/self/fd").iterdir()))
 
 
+@pytest.mark.slow
 @pytest.mark.promise(14)
 @pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="counts open files as Linux shows them")
 def test_close_frees_all_resources(
@@ -282,6 +288,7 @@ def test_describe_status_slow_loop_names_period(mock: MockUR, monkeypatch: pytes
         monkeypatch.undo()
 
 
+@pytest.mark.slow
 @pytest.mark.promise(14)
 @pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="counts open files as Linux shows them")
 def test_worker_died_frees_all_resources(mock: MockUR) -> None:
@@ -303,6 +310,7 @@ def test_worker_died_frees_all_resources(mock: MockUR) -> None:
     until(lambda: set(mock.faults.state().clients) <= {30020}, "closed sockets")
 
 
+@pytest.mark.slow
 @pytest.mark.promise(14)
 def test_close_blocked_worker_is_killed(mock: MockUR) -> None:
     arm = URArm(config(), "left")
@@ -316,6 +324,7 @@ def test_close_blocked_worker_is_killed(mock: MockUR) -> None:
     assert leftovers() == 0
 
 
+@pytest.mark.slow
 @pytest.mark.promise(14)
 def test_close_during_connect_ends_worker(mock: MockUR, monkeypatch: pytest.MonkeyPatch) -> None:
     """Ctrl-C in the middle of connecting: no worker and no memory stay behind."""
@@ -338,6 +347,7 @@ def test_close_during_connect_ends_worker(mock: MockUR, monkeypatch: pytest.Monk
     assert leftovers() == 0
 
 
+@pytest.mark.slow
 def test_state_during_close_in_other_thread_raises_cleanly(mock: MockUR, monkeypatch: pytest.MonkeyPatch) -> None:
     arm = URArm(config(), "left")
     ended, closing = Child.exit_status.fget, iter([arm.close])

@@ -48,6 +48,7 @@ def judged(seen: np.ndarray, joints: np.ndarray, ticks: np.ndarray, ahead: int) 
     return np.array(found)
 
 
+@pytest.mark.slow
 @pytest.mark.promise(2)
 @pytest.mark.parametrize(
     "stalls", [(0.08,), pytest.param((0.02, 0.03, 0.05, 0.07, 0.09), marks=pytest.mark.deep)], ids=["80 ms", "several"]

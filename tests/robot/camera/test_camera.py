@@ -71,6 +71,7 @@ def test_status_reports_rate_and_times(mock: MockCamera, patient: None) -> None:
     assert frame.time > first.time and frame.index - first.index >= 19
 
 
+@pytest.mark.slow
 @pytest.mark.promise(11)
 def test_read_between_exposures_returns_same_index() -> None:
     with (
@@ -92,6 +93,7 @@ def test_wait_for_returns_requested_picture(mock: MockCamera) -> None:
             camera.wait_for(number + 1, 0.2)
 
 
+@pytest.mark.slow
 @pytest.mark.promise(11)
 def test_read_after_pause_returns_newest_frame(mock: MockCamera, figure: Record) -> None:
     """Counted in frames: at most two periods behind, most of the time, however long it has paused. A busy machine may
@@ -133,6 +135,7 @@ def test_status_delay_increases_age(mock: MockCamera) -> None:
         assert time.monotonic() - camera.read(WAIT).time > 0.299
 
 
+@pytest.mark.slow
 @pytest.mark.promise(4)
 def test_read_frame_beyond_max_age_raises(mock: MockCamera) -> None:
     with Camera(stamped(mock, max_age=0.25), "left") as camera:
@@ -186,6 +189,7 @@ def test_camera_cut_connection_reopens(mock: MockCamera, patient: None) -> None:
         assert camera.status.open
 
 
+@pytest.mark.slow
 @pytest.mark.promise(11)
 def test_camera_restarted_source_reopens(figure: Record) -> None:
     with MockCamera(host=HOST) as mock, Camera(stamped(mock, max_age=0.2), "left") as camera:
@@ -254,6 +258,7 @@ def test_camera_wrong_size_raises_until_corrected(mock: MockCamera) -> None:
         until(mended)
 
 
+@pytest.mark.slow
 def test_camera_missing_stamps_raise() -> None:
     with MockCamera(host=HOST, height=256, stamped=False) as mock:
         with pytest.raises(DeviceNotConnectedError, match="has no readable stamp"):

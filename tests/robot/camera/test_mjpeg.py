@@ -148,6 +148,7 @@ DRIPS = {
 }
 
 
+@pytest.mark.slow
 def test_mjpeg_slow_or_silent_server_times_out() -> None:
     """One byte now and then keeps a plain socket's time-out from passing; the deadline passes all the same. Side by
     side, because each takes its two seconds."""
@@ -169,6 +170,7 @@ def test_mjpeg_slow_or_silent_server_times_out() -> None:
     assert min(requests.values()) >= 2, requests  # it was tried again
 
 
+@pytest.mark.slow
 @pytest.mark.promise(9)
 def test_mjpeg_unanswered_connection_times_out(monkeypatch: pytest.MonkeyPatch) -> None:
     """A listener with a full queue drops connections: no answer, no refusal."""

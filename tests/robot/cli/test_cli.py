@@ -175,6 +175,7 @@ def test_schema_and_doctor_print_json() -> None:
     assert result.exit_code == (0 if report["ok"] else 1)
 
 
+@pytest.mark.slow
 def test_press_of_ball_measures_force_and_radius(tmp_path: Path) -> None:
     result = tacsim("press", "sphere", "--radius", "3 mm", "--depth", "0.5 mm", "--preset", "draft", "--out", "p")
     assert result.exit_code == 0, result.output
@@ -190,6 +191,7 @@ def test_press_of_ball_measures_force_and_radius(tmp_path: Path) -> None:
     assert imread(tmp_path / "p" / "height.png").shape[1] == 800
 
 
+@pytest.mark.slow
 def test_press_reports_and_selects_pressing_side(tmp_path: Path) -> None:
     import trimesh
 
@@ -243,6 +245,7 @@ def test_press_repairs_and_measures_an_open_mesh_in_metres(tmp_path: Path) -> No
     assert "pressing side    -z of bar.obj, a flat face of 4 x 3 mm" in done.stdout
 
 
+@pytest.mark.slow
 def test_press_too_deep_reports_possible_depth(tmp_path: Path) -> None:
     deep = tacsim("press", "sphere", "--depth", "3.9 mm", "--preset", "draft", "--out", "deep")
     said = re.search(
@@ -320,6 +323,7 @@ def test_press_without_hold_reports_it(tmp_path: Path) -> None:
     assert "not settled, not held" in result.stderr
 
 
+@pytest.mark.slow
 def test_diverged_press_leaves_dump(tmp_path: Path) -> None:
     result = tacsim("press", "box", "--size", "5 mm, 5 mm, 5 mm", "--depth", "3.9 mm", "--preset=draft", "--out=p")
     assert result.exit_code == 1

@@ -57,6 +57,7 @@ def test_compare_writes_files_and_table() -> None:
     assert compared("sim", "real", "--out", "out").exit_code == 2  # nothing is overwritten
 
 
+@pytest.mark.slow
 def test_compare_limits_set_exit_code() -> None:
     kept = tacsim(
         "compare", "sim", "real", "--fail-above", "contact_mae=5", "--fail-below", "contact_ncc=0.9", "--out", "kept"
@@ -70,6 +71,7 @@ def test_compare_limits_set_exit_code() -> None:
     assert below.exit_code == 1 and "below 0.9999" in told(below.output)
 
 
+@pytest.mark.slow
 def test_compare_blank_image_fails_limit(real: FrameSet) -> None:
     save(blank(real), Path("blank"))
     assert compared("blank", "real", "--fail-below", "ssim=0.8", "--out", "a").exit_code == 0
@@ -125,6 +127,7 @@ def test_compare_different_counts_need_pair_name(real: FrameSet) -> None:
     assert named.exit_code == 0 and "no partner of their name" in told(named.output)
 
 
+@pytest.mark.slow
 def test_compare_prints_warnings(good: FrameSet, real: FrameSet) -> None:
     save(changed(good, lambda image: np.ascontiguousarray(image[..., ::-1]), "all"), Path("bgr"))
     assert "red and blue look swapped" in told(compared("bgr", "real", "--out", "a").output)
@@ -132,6 +135,7 @@ def test_compare_prints_warnings(good: FrameSet, real: FrameSet) -> None:
     assert "A: no contact" in told(compared("blank", "real", "--out", "b").output)
 
 
+@pytest.mark.slow
 def test_compare_with_calibrations_adds_surfaces_and_invariance() -> None:
     calibration, reference = calibrated(HiddenSensor(3))
     Path("bundle").mkdir()
@@ -153,6 +157,7 @@ def test_compare_with_calibrations_adds_surfaces_and_invariance() -> None:
     assert "small is 260 x 100 px, the calibration of A is of 260 x 200" in told(wrong.output)
 
 
+@pytest.mark.slow
 def test_compare_episode_uses_its_surfaces(real: FrameSet) -> None:
     surface = SurfaceMap(
         height=np.full((64, 64), 1e-4, dtype=np.float32), gradient=np.zeros((64, 64, 2), dtype=np.float32), flow=None

@@ -40,6 +40,7 @@ def one_arm(folder: Path) -> Iterator[Lab]:
         yield lab
 
 
+@pytest.mark.slow
 def test_dry_run_on_one_arm_file_records_episode(one_arm: Lab, folder: Path, tmp_path: Path) -> None:
     result = tacsim("run", folder / "my.yaml", "--dry-run", "--steps", "2", "--out", "dry")
     assert result.exit_code == 0, result.output

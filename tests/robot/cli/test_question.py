@@ -50,6 +50,7 @@ def stays(screen: Terminal, words: str) -> None:
         time.sleep(0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("columns", [100, pytest.param(30, marks=pytest.mark.deep)])
 def test_question_stays_on_screen_and_bar_continues(tmp_path: Path, columns: int) -> None:
     with Terminal(program=ASKING, folder=tmp_path, columns=columns) as screen:

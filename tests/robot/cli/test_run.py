@@ -17,6 +17,7 @@ from tests.robot.cli.invoked import START, TINY, environment, tacsim
 pytestmark = pytest.mark.usefixtures("empty_folder")
 
 
+@pytest.mark.slow
 def test_run_records_given_steps_and_replay_shows_them(tmp_path: Path) -> None:
     result = tacsim("run", "--steps", "3", "--seed", "5", "--out", "r", *TINY)
     assert result.exit_code == 0, result.output
@@ -37,6 +38,7 @@ def test_run_records_given_steps_and_replay_shows_them(tmp_path: Path) -> None:
     assert again["force"] == config["force"]
 
 
+@pytest.mark.slow
 def test_run_without_out_makes_folder_in_runs(tmp_path: Path) -> None:
     result = tacsim("run", "--steps", "0", "--task", "reposition", *TINY)
     assert result.exit_code == 0, result.output
@@ -45,6 +47,7 @@ def test_run_without_out_makes_folder_in_runs(tmp_path: Path) -> None:
     assert f"runs/{folder.name}/report.html" in result.stdout
 
 
+@pytest.mark.slow
 def test_run_records_requested_particles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("robot.deploy.control_loop.MAX_PARTICLES", 7)
     for name, more in (("with", ["--set", "record.body=true"]), ("without", [])):
@@ -59,6 +62,7 @@ def test_run_records_requested_particles(tmp_path: Path, monkeypatch: pytest.Mon
         assert refused.exit_code == 2 and "only a simulated rig with a body" in refused.stderr.replace("\n", " ")
 
 
+@pytest.mark.slow
 def test_policy_error_keeps_finished_steps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "here.py").write_text("def act(observation):\n    raise RuntimeError('no idea')\n")
     result = tacsim("run", "--policy", "here:act", "--steps", "3", "--out", "r", *TINY)
@@ -105,6 +109,7 @@ def test_signal_ends_episode_and_saves_it(tmp_path: Path, number: signal.Signals
     assert "Traceback" not in errors
 
 
+@pytest.mark.slow
 def test_signal_in_process_ends_episode_and_saves_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     text = "import os, signal\nfrom tacsim.interface import Action\n"
     text += "def act(observation):\n    os.kill(os.getpid(), signal.SIGTERM)\n    return Action({})\n"

@@ -107,6 +107,7 @@ def test_start_killed_process_brings_arm_to_rest(tmp_path: Path) -> None:
         assert 0.04 < gone < 0.12  # of 0.157 rad
 
 
+@pytest.mark.slow
 def test_start_without_zeroing_keeps_force_fault(tmp_path: Path) -> None:
     file = fast(copy_of("ur5e-one", tmp_path, 66))
     with Lab(file, offset=AWAY) as lab:

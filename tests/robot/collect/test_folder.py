@@ -248,6 +248,7 @@ def _balls(folder: Path) -> None:
         creation.icosphere(2, radius).export(folder / f"{name}.stl")
 
 
+@pytest.mark.slow
 def test_the_command_makes_a_set_of_a_folder_of_objects(tmp_path: Path) -> None:
     _balls(tmp_path / "stl")
     words = ("collect", "press", "--objects", "stl", "--depth", "0.2..0.4mm", "--preset", "learn", "--count", "2")

@@ -17,6 +17,7 @@ SHIPPED = sorted((config_root() / "policies").glob("*.onnx"))
 MIN_IMPROVEMENT = {"squeeze": 0.95, "reposition": 0.95, "knead": 0.1}  # fraction of the initial distance
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
 def test_shipped_policy_solves_its_task(path: Path) -> None:
     """On the task's own body and goal, in the physics that it was trained in."""

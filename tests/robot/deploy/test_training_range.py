@@ -128,6 +128,7 @@ def ranged(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_measure_range_is_written_to_policy_file(ranged: Path) -> None:
     policy = OnnxPolicy(ranged, GRID, 2e-3)
     known = policy.range_monitor.known
@@ -155,6 +156,7 @@ def test_run_records_training_distance_and_summary(ranged: Path) -> None:
     assert shares["400 kPa"]["steps_outside"] == 3  # a goal that training never had
 
 
+@pytest.mark.slow
 def test_run_policy_without_range_is_reported_once(tmp_path: Path) -> None:
     path = written(tmp_path / "bare.onnx")
     assert not has_training_range(OnnxPolicy(path, GRID, 2e-3))

@@ -105,6 +105,7 @@ def test_a_sound_rig_passes_every_check(monkeypatch: pytest.MonkeyPatch, file: P
     assert "60 x 60 x 90 mm" in checks["left: limits"].found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("fault", "check", "words"),
     [
@@ -150,6 +151,7 @@ def test_a_mock_is_not_taken_for_a_robot(monkeypatch: pytest.MonkeyPatch, file: 
     assert found["left: kind"].state == "fail" and found["left: kind"].found == "a mock"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("override", "check", "words"),
     [
@@ -191,6 +193,7 @@ def test_a_rig_without_hardware_has_nothing_to_check() -> None:
     assert check.state == "ok" and "no hardware" in check.found
 
 
+@pytest.mark.slow
 def test_the_command_ends_with_1_if_something_must_be_mended(file: Path) -> None:
     for overrides, code in (((), 0), (("--set", "sensors.finger.width=100"), 1)):
         done = tacsim("doctor", "--rig", file, *overrides)

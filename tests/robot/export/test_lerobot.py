@@ -219,6 +219,7 @@ def test_an_existing_folder_is_left_alone(tmp_path: Path) -> None:
     assert list((tmp_path / "set").iterdir()) == []
 
 
+@pytest.mark.slow
 def test_a_full_disk_leaves_nothing_half(tmp_path: Path) -> None:
     path, _ = record("a.mcap", 4)
     process = subprocess.run(

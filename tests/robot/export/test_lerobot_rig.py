@@ -71,6 +71,7 @@ def test_a_rig_is_known_before_it_is_open(tmp_path: Path, monkeypatch: pytest.Mo
         assert rig_spec(load_rig(file).config) == rig.spec
 
 
+@pytest.mark.slow
 def test_what_is_sent_is_what_the_limits_let_through(bare: LeRobotRig) -> None:
     with pytest.raises(RuntimeError, match="not connected"):
         bare.observe()
@@ -123,6 +124,7 @@ def test_another_rate_is_refused_where_it_is_told(tmp_path: Path) -> None:
     LeRobotRig("sim", overrides=["period=33.333 ms"], fps=30)
 
 
+@pytest.mark.slow
 def test_another_rate_is_noticed_where_it_is_not(bare: LeRobotRig, caplog: pytest.LogCaptureFixture) -> None:
     bare.close()
     bare.connect()  # it is said once a connection

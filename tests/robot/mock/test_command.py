@@ -34,6 +34,7 @@ def test_mock_command_serves_until_ctrl_c() -> None:
         assert process.wait(TIMEOUT) == 128 + signal.SIGINT
 
 
+@pytest.mark.slow
 def test_mock_command_cameras_use_arm_addresses() -> None:
     host = wire_host(42)
     options = ["--host", host, "--cameras", "1", "--camera-port", "8090"]

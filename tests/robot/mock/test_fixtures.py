@@ -46,6 +46,7 @@ def test_mock_rig_fixture_takes_overrides(mock_rig, tmp_path):
 """
 
 
+@pytest.mark.slow
 def test_fixtures_work_as_plugin_of_other_tests(tmp_path: Path) -> None:
     (tmp_path / "conftest.py").write_text('pytest_plugins = ["robot.fixtures"]\n')
     (tmp_path / "test_theirs.py").write_text(THEIRS)

@@ -59,6 +59,7 @@ def touching(sim_server: SimServer) -> float:
     return 0.5 * (sim_server.initial["upper"].position[2] - sim_server.initial["lower"].position[2] - 4e-3)
 
 
+@pytest.mark.slow
 def test_sim_server_returns_images_surfaces_forces_and_truth(sim_server: SimServer, config: RigConfig) -> None:
     clear = sim_server.place(sim_server.initial)
     assert set(clear.images) == set(clear.surfaces) == set(clear.wrenches) == {"lower", "upper"}

@@ -108,6 +108,7 @@ def test_mock_ur_invalid_joints_are_refused() -> None:
             MockUR(wire_host(15), version=version)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("end", [signal.SIGKILL, pytest.param(signal.SIGTERM, marks=pytest.mark.deep)])
 def test_mock_ur_ends_with_its_parent(end: signal.Signals) -> None:
     code = (
@@ -124,6 +125,7 @@ def test_mock_ur_ends_with_its_parent(end: signal.Signals) -> None:
         until(lambda: not exists(pid), "the mock is gone")
 
 
+@pytest.mark.slow
 def test_stopped_mock_ur_process_is_killed() -> None:
     with MockUR(wire_host(17)) as mock:
         mock.faults.timeout = 0.2
@@ -154,6 +156,7 @@ def test_mock_process_without_parent_runs_until_signal() -> None:
         assert process.wait(TIMEOUT) == 0
 
 
+@pytest.mark.slow
 def test_client_killed_in_motion_stops_only_with_watchdog() -> None:
     """Without the watchdog the arm goes on for ever, as a real one does; with it, the program ends."""
     with MockUR(wire_host(20)) as mock:

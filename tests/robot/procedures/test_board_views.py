@@ -77,6 +77,7 @@ def moving(index: int) -> np.ndarray:
     return np.roll(views(3)[1], 5 * (index % 8), axis=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("move", "why"),
     [
@@ -103,6 +104,7 @@ def test_board_views_on_gel_takes_one_view_with_reference() -> None:
     assert len(record.measurements) == 1 and person.said[0] == f"View 1 of 1: {ON_GEL}."
 
 
+@pytest.mark.slow
 def test_board_views_end_on_stop_source_end_and_timeout() -> None:
     record, kept = Person(list(views(3)[:2])).led(6)
     assert len(record.measurements) == len(kept) == 2

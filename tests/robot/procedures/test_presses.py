@@ -170,6 +170,7 @@ def test_presses_early_end_keeps_measurements() -> None:
     assert len(record.measurements) == 2 and len(kept) == len(UNTOUCHED) + 2
 
 
+@pytest.mark.slow
 def test_presses_without_action_time_out() -> None:
     with pytest.raises(CannotCalibrate, match="nothing touched the gel"):
         Person([EMPTY]).led(1, timeout=20.0)
@@ -338,6 +339,7 @@ def test_command_tilted_camera_uses_view(tmp_path: Path) -> None:
     assert refused.exit_code == 2 and "the view was calibrated on 160 x 120 px" in " ".join(refused.stderr.split())
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_command_ctrl_c_keeps_measurements(tmp_path: Path) -> None:
     out = tmp_path / "out"
@@ -352,6 +354,7 @@ def test_command_ctrl_c_keeps_measurements(tmp_path: Path) -> None:
     assert any(f"tacsim calibrate sensor {out / 'frames'}" in line for line in lines)
 
 
+@pytest.mark.slow
 def test_command_invalid_input_exits_2(tmp_path: Path) -> None:
     (tmp_path / "frames").mkdir()
     rig = tmp_path / "bench.yaml"

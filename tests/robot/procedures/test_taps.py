@@ -126,6 +126,7 @@ class Hand(SeenArm):
         self._camera.push(np.full((HEIGHT, WIDTH, 3), 100 + min(100, int(1e5 * deep)), np.uint8))
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(find_spec("rtde_control") is None, reason="ur_rtde has no wheel for this Python and machine")
 def test_command_camera_delay_is_measured_and_printed(tmp_path: Path) -> None:
     host = mock_host(31)

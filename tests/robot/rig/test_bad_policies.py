@@ -77,6 +77,7 @@ def rests(rig: Opened) -> None:
         assert arm.state().pose.position == pytest.approx(before[name], abs=20e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("wrong", "words"),
     [
@@ -99,6 +100,7 @@ def test_bad_policy_holds_arms_and_names_error(shared: Opened, wrong: Callable[[
     shared.rig.reset()  # nothing else is in the way of the next episode
 
 
+@pytest.mark.slow
 def test_policy_with_nan_output_moves_no_arm(shared: Opened, tmp_path: Path) -> None:
     """It gives 0 / 0 from the first step on."""
     features = Features(sensors=(), arms=("left", "right"), maps=(), touch=("wrench",), goal=False)
@@ -131,6 +133,7 @@ def test_policy_with_nan_output_moves_no_arm(shared: Opened, tmp_path: Path) -> 
     rests(shared)
 
 
+@pytest.mark.slow
 def test_slow_policy_holds_arm_then_continues(tmp_path: Path) -> None:
     with opened(bare_file(tmp_path, first=43), action_timeout=0.3) as rig:
         arm = rig.rig.arms["east"]

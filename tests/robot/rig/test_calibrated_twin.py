@@ -103,6 +103,7 @@ def finds(bundle: Path) -> tuple[Callable[[GelSurface], np.ndarray], FrameNormal
     return render, normalise
 
 
+@pytest.mark.slow
 def test_heights_in_simulated_images_equal_rendered_heights(finger: Path) -> None:
     """Heights found in the twin's pictures are those that it rendered, in places and depths that no press had. The
     bounds are those of the calibration itself: 3.0 to 3.6 % of the depth, root mean square in contact, and 4 % at its
@@ -220,6 +221,7 @@ def test_gel_has_sensor_size_in_whole_elements(finger: Path) -> None:
     assert not load_rig("sim").notes
 
 
+@pytest.mark.slow
 def test_untrusted_calibration_is_reported_everywhere(finger: Path) -> None:
     calibration, untouched = read_bundle(finger)
     assert not read_sensor_model(finger).caution
@@ -284,6 +286,7 @@ def dotted(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return calibrate(tmp_path_factory.mktemp("dotted"), hidden(crooked()), "--markers", presses=3)
 
 
+@pytest.mark.slow
 def test_bundle_dots_are_at_printed_positions(dotted: Path) -> None:
     markers = load_sensor(dotted).markers
     assert markers is not None and markers.in_background and markers.places is not None
@@ -309,6 +312,7 @@ def test_bundle_dots_move_with_gel(dotted: Path) -> None:
         assert np.abs(render(surface).astype(float) - sensor(surface)).mean() < 1.5  # a dot is 80 grey levels dark
 
 
+@pytest.mark.slow
 def test_bundle_skin_moves_with_gel(tmp_path: Path) -> None:
     """Grain that presses have dragged along is found to be skin, and the twin's is dragged as the sensor's own."""
     light = np.array([110.0, 105.0, 100.0]) + np.random.default_rng(1).normal(0, 5, (190, 240, 1))

@@ -41,6 +41,7 @@ def bare(shared: Opened) -> Opened:
     return shared
 
 
+@pytest.mark.slow
 def test_rig_step_moves_arm_to_target(bare: Opened) -> None:
     observation = bare.rig.observe()
     start = observation.arms["right"].pose
@@ -116,6 +117,7 @@ def test_delayed_process_still_reads_state_at_time() -> None:
     assert state.pose.position[0] == pytest.approx(0.5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("stop", "error", "words"),
     [
@@ -157,6 +159,7 @@ def _refuses(arm: object, error: type[DeviceError]) -> bool:
     return False
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("fault", "why"),
     [
@@ -211,6 +214,7 @@ def test_reset_without_confirmation_does_not_approach(shared: Opened) -> None:
     assert shared.rig.observe().arms["right"].pose.position == pytest.approx([0, 0, 30e-3], abs=50e-6)
 
 
+@pytest.mark.slow
 def test_second_rig_at_same_addresses_is_refused(shared: Opened, tmp_path: Path) -> None:
     with pytest.raises(DeviceError, match="in use"):
         open_rig(bare_file(tmp_path))

@@ -24,6 +24,7 @@ pytestmark = pytest.mark.usefixtures("no_pause")
 MOTIONS = {1, 2, 3, 4, 6, 9, 10, 11, 12, 18, 24, 25, 41, 45, 51, 52, 66}  # of the library: all that move an arm
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("override", "words"),
     [
@@ -44,6 +45,7 @@ def test_invalid_rig_is_refused_and_leaves_no_process(tmp_path: Path, override: 
         until(lambda: belongings() == before, "what was started is gone")
 
 
+@pytest.mark.slow
 def test_dry_run_sends_no_motion(tmp_path: Path) -> None:
     with opened(bare_file(tmp_path, first=51), dry_run=True) as dry:
         observation = dry.rig.reset()
@@ -59,6 +61,7 @@ def test_dry_run_sends_no_motion(tmp_path: Path) -> None:
         assert not MOTIONS & set(commands)
 
 
+@pytest.mark.slow
 @needs_proc
 def test_rig_close_twice_leaves_no_process(tmp_path: Path) -> None:
     file = bare_file(tmp_path, first=53)

@@ -40,6 +40,7 @@ def simulated(loaded: Opened, monkeypatch: pytest.MonkeyPatch) -> Opened:
     return loaded
 
 
+@pytest.mark.slow
 def test_mock_rig_arms_hold_task_loads(loaded: Opened) -> None:
     start = loaded.rig.reset().arms["upper"].pose
     for count in range(1, 7):
@@ -50,6 +51,7 @@ def test_mock_rig_arms_hold_task_loads(loaded: Opened) -> None:
     assert arm.pose.position[0] - start.position[0] == pytest.approx(0.3e-3, abs=10e-6)
 
 
+@pytest.mark.slow
 def test_mock_rig_reset_ends_in_touch_with_truth(simulated: Opened) -> None:
     rig = simulated.rig
     observation = rig.reset()

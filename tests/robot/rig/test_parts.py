@@ -36,6 +36,7 @@ print("mocks:", [name for name in sys.modules if name.startswith("robot.mock")])
 """
 
 
+@pytest.mark.slow
 def test_rig_without_mocks_imports_no_mock(tmp_path: Path) -> None:
     """Up to the arm that does not answer, and in `tacsim doctor`."""
     done = subprocess.run(

@@ -62,6 +62,7 @@ def test_marker_pitch_without_dots_is_refused(tmp_path: Path) -> None:
     assert done.exit_code == 2 and "sensors.finger" in done.output and "no lattice of dark dots" in done.output
 
 
+@pytest.mark.slow
 def test_replay_with_bundle_shows_height_without_task(tmp_path: Path) -> None:
     frames = tmp_path / "frames"
     frames.mkdir()
@@ -79,6 +80,7 @@ def test_replay_with_bundle_shows_height_without_task(tmp_path: Path) -> None:
     assert again.exit_code == 0 and "finger: height" in (tmp_path / "again" / "report.html").read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_replay_reports_partial_maps_and_overrides(tmp_path: Path) -> None:
     """The picture shows 31.2 x 24.7 mm by its dots, the map is 16 x 16 mm."""
     said = "sensor finger: maps show the middle 16 x 16 mm of 31.2 x 24.7 mm of gel; for all of it: tacsim run ..."
@@ -93,6 +95,7 @@ def test_replay_reports_partial_maps_and_overrides(tmp_path: Path) -> None:
     assert whole.exit_code == 0 and "the middle" not in whole.output
 
 
+@pytest.mark.slow
 def test_replay_with_bundle_reports_partial_maps(tmp_path: Path) -> None:
     """Of 20.8 x 16 mm the map leaves out the left and right, or nothing where a region shows no more than 16 x 16."""
     frames = tmp_path / "frames"
@@ -111,6 +114,7 @@ def test_replay_with_bundle_reports_partial_maps(tmp_path: Path) -> None:
     assert "the middle" not in output
 
 
+@pytest.mark.slow
 def test_replay_with_untrusted_bundle_reports_it(tmp_path: Path) -> None:
     frames = tmp_path / "frames"
     frames.mkdir()

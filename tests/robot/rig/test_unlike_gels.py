@@ -57,6 +57,7 @@ def extent(valid: np.ndarray) -> tuple[int, int]:
     return int(valid.any(axis=0).sum()), int(valid.any(axis=1).sum())
 
 
+@pytest.mark.slow
 def test_rig_with_two_gel_types_runs_records_and_replays(rig_file: Path) -> None:
     done = tacsim("run", rig_file, "--steps", "3", "--out", rig_file.parent / "run")
     assert done.exit_code == 0, done.output
@@ -89,6 +90,7 @@ def moved(pose: Pose, z: float) -> Pose:
     return Pose(pose.position + [0.0, 0.0, z], pose.quaternion)
 
 
+@pytest.mark.slow
 def test_mock_cell_process_has_both_gels(rig_file: Path) -> None:
     config = load_rig(rig_file).config
     models: dict[str, SensorModel] = {name: sensor.model for name, sensor in config.sensors.items()}  # type: ignore[union-attr, misc]

@@ -40,6 +40,7 @@ def diverge(scene: Scene, folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path
     return folder / "00"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("physics", SCENES)
 def test_a_dump_is_shown_drawn_and_replayed(physics: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     place = diverge(SCENES[physics], tmp_path / "out", monkeypatch)
@@ -59,6 +60,7 @@ def test_a_dump_is_shown_drawn_and_replayed(physics: str, tmp_path: Path, monkey
     assert tacsim("debug", place, "--no-replay").exit_code == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("physics", SCENES)
 def test_a_motion_at_constant_load_is_replayed_with_its_load(
     physics: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -123,6 +125,7 @@ def test_a_run_that_diverges_leaves_a_dump_and_says_where(tmp_path: Path, monkey
     assert nowhere.exit_code == 2 and "is no dump: it has no dump.json" in nowhere.output
 
 
+@pytest.mark.slow
 def test_a_command_that_makes_no_sense_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     place = diverge(SCENES["press"], tmp_path, monkeypatch)
     info = json.loads((place / "dump.json").read_text())

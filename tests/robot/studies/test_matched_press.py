@@ -42,6 +42,7 @@ def frames() -> FrameSet:
     return FrameSet("real", sensor.empty(), "made up", (*frames, Frame("still.png", sensor.empty())))
 
 
+@pytest.mark.slow
 def test_a_scene_against_frames(frames: FrameSet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     save(frames, Path("real"))
@@ -64,6 +65,7 @@ def test_a_scene_against_frames(frames: FrameSet, tmp_path: Path, monkeypatch: p
     assert config["pairs"][2]["flags"] == ["simulated: no contact", "real: no contact"]
 
 
+@pytest.mark.slow
 def test_presses_under_a_light_that_tells_no_direction_are_found_by_their_darkness(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -87,6 +89,7 @@ def test_presses_under_a_light_that_tells_no_direction_are_found_by_their_darkne
     assert overall["surface_centroid"]["mean"] < 0.15e-3
 
 
+@pytest.mark.slow
 def test_ball_and_gel_are_those_of_the_bundle_unless_given(frames: FrameSet, tmp_path: Path, monkeypatch) -> None:
     """The calibration knows the ball of its presses, and how much gel its pictures show: 20.8 x 16 mm. A smaller gel
     would carry the motion of its border on to the picture's. The thickness nobody knows."""
@@ -232,6 +235,7 @@ def test_the_next_depth_follows_the_two_nearest_presses() -> None:
     assert _next_depth([(40.0, 2e-3), (39.9, 2.2e-3)], 44.0) == pytest.approx(1.21 * 2e-3)
 
 
+@pytest.mark.slow
 def test_a_bundle_with_noise_makes_presses_with_noise_and_the_same_again(frames: FrameSet) -> None:
     noise = CameraNoise(deviation=(2.0, 1.5, 1.0))
     quiet = sensor_of()

@@ -49,6 +49,7 @@ def test_the_contact_of_a_slid_cylinder_has_no_holes() -> None:
     assert 1.8e-3 < result.contact_radius < 2.0e-3
 
 
+@pytest.mark.slow
 def test_a_press_whose_surface_folds_over_has_a_picture_and_says_so() -> None:
     """A plate wider than the gel, half of it deep: the gel's rim rolls over, as that of rubber does: sooner at
     the default speed, whose force is 4 % above that at Mach 0.004."""
@@ -62,6 +63,7 @@ def test_a_press_whose_surface_folds_over_has_a_picture_and_says_so() -> None:
     assert np.median(result.image) == pytest.approx(128, abs=40)  # a flat face, lit as one
 
 
+@pytest.mark.slow
 def test_a_press_says_how_much_of_its_depth_the_gel_does_not_feel(tmp_path: Path) -> None:
     """A wedge of 60 degrees 1 mm deep at draft: 0.40 N, and 0.48 N with elements of 0.25 mm. A box comes out right."""
     import trimesh
@@ -92,6 +94,7 @@ def test_a_press_too_deep_for_the_gel_says_how_deep_it_came() -> None:
 BAR = (3.0, 4.0, 6.0)  # [mm]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("angles", "size"), [({"pitch": 90.0}, (6, 4, 3)), ({"roll": -90.0, "yaw": 90.0}, (6, 3, 4))])
 def test_a_mesh_that_is_turned_presses_as_a_box_and_as_a_mesh_saved_turned(
     angles: dict[str, float], size: tuple[float, float, float], tmp_path: Path
@@ -116,6 +119,7 @@ def test_a_mesh_that_is_turned_presses_as_a_box_and_as_a_mesh_saved_turned(
     assert abs(force["as it lies"] / force["turned"] - 1) > 0.2
 
 
+@pytest.mark.slow
 def test_a_depth_that_is_possible_is_found_for_one_that_is_not() -> None:
     scene = Scene.model_validate({"body": None, "preset": "draft", "indenter": Indenter(geometry=Sphere(radius=4e-3))})
     motion = PressMotion(3.9e-3)

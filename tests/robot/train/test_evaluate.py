@@ -45,6 +45,7 @@ def test_peak_force_is_mean_and_95th_percentile() -> None:
     assert judged(0, 21).peak_force == (10.0, 19.0)  # 0, 1, ... 20 N
 
 
+@pytest.mark.slow
 def test_evaluate_teacher_beats_random_in_equal_episodes() -> None:
     settings = training(randomise=None)
     teacher, random, again = evaluate(settings, ["teacher", "random", "teacher"], 5)

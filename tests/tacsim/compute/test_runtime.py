@@ -51,6 +51,7 @@ def run(code: str) -> str:
     return done.stdout.strip()
 
 
+@pytest.mark.slow
 def test_a_world_made_here_may_first_move_in_another_thread() -> None:
     """Where its kernels are compiled; and the thread in which Taichi was started may be gone by then."""
     code = """
@@ -62,6 +63,7 @@ print(len(set(forces)) == 1 and forces[0] < 0 or forces)
     assert run(code.replace("made = world()", "made, = in_threads(world)")) == "True"
 
 
+@pytest.mark.slow
 def test_threads_that_make_and_move_their_first_worlds_at_once_take_turns() -> None:
     code = """
 forces = in_threads(*[lambda: press(world())] * 3)
@@ -70,6 +72,7 @@ print(len(set(forces)) == 1 and forces[0] < 0 or forces)
     assert run(code) == "True"
 
 
+@pytest.mark.slow
 @pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="processes are never forked here")
 def test_a_world_is_not_moved_in_a_forked_child() -> None:
     """It says so, and the world is as it was: nothing waits for threads that are not there."""
@@ -144,6 +147,7 @@ def test_only_stale_lock_is_removed(tmp_path: Path, age: float, left: bool) -> N
     assert bool(list(lock.parent.glob("*.tic"))) != left
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [None, 0, 700], ids=["lost", "empty", "cut"])
 def test_damaged_cached_kernel_is_compiled_again(tmp_path: Path, size: int | None) -> None:
     """By itself Taichi compiles it in every process and never writes what its list says is there."""

@@ -292,6 +292,7 @@ plain = st.recursive(
 )  # fmt: skip
 
 
+@pytest.mark.slow
 @given(plain)
 def test_what_is_dumped_is_read_back(data: object) -> None:
     def values(node):

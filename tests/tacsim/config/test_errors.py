@@ -246,6 +246,7 @@ def test_alias_bomb(folder: Path) -> None:
     assert "a.yaml:1: anchors (&) and aliases (*) are not allowed" in quick()
 
 
+@pytest.mark.slow
 def test_a_bomb_of_references(folder: Path) -> None:
     (folder / "big.yaml").write_text("extends: ideal\nlighting: {lights: [" + "{direction: [0, 0, -1]}, " * 2000 + "]}")
     sensors = "\n".join(f"  s{i}: {{driver: sim, arm: upper, model: big.yaml}}" for i in range(2000))
@@ -267,6 +268,7 @@ def test_huge_nesting(folder: Path, text: str) -> None:
     assert quick() == "a.yaml:1: nested too deeply; at most 32 levels are allowed"
 
 
+@pytest.mark.slow
 def test_many_values(folder: Path) -> None:
     (folder / "a.yaml").write_text("x: [" + "1," * 200_000 + "]")
     assert quick() == "a.yaml:1: too many values; at most 20000 are allowed, referenced files included"
@@ -334,6 +336,7 @@ def test_any_content_loads_or_raises_config_error(content: str | bytes, load, fo
         check_printable(error)
 
 
+@pytest.mark.slow
 @settings(max_examples=100, deadline=None)
 @given(
     st.lists(

@@ -171,6 +171,7 @@ def test_a_rig_holds_the_load_whatever_the_policy_asks_along_z(open_springs: Cal
     assert np.array_equal(rig.reset().arms["upper"].pose.position, before.pose.position)
 
 
+@pytest.mark.slow
 def test_the_gels_hold_it_too_while_the_body_is_dragged() -> None:
     config = load_rig("sim", task="reposition", overrides=["task.loads={upper: 2 N}", "task.scene.preset=draft"])
     forces = []

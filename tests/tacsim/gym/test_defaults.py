@@ -25,6 +25,7 @@ FEW_PARTICLES = ("scene.gel.size=[8 mm, 8 mm, 4 mm]", "scene.body.geometry.size=
 assert tacsim.gym.env
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["Squeeze", "Reposition", "Knead"])
 def test_it_shows_a_few_numbers_of_order_one_and_how_exact_the_forces_are(
     name: str, monkeypatch: pytest.MonkeyPatch

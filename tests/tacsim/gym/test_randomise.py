@@ -46,6 +46,7 @@ def test_episodes_differ_as_drawn_and_come_again_by_their_seed() -> None:
         assert_equal(env.step(PUSH)[0], after)
 
 
+@pytest.mark.slow
 def test_what_cannot_be_is_refused_with_its_key_before_anything_is_simulated() -> None:
     with pytest.raises(ConfigError, match=r"scene\.friction\.upper.*-0\.\d+"):
         make(variants=(), randomise={"values": {"scene.friction.upper": {"uniform": [-0.5, -0.1]}}})

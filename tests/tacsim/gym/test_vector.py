@@ -40,6 +40,7 @@ def sync_of() -> Iterator[Any]:
         env.close()
 
 
+@pytest.mark.slow
 @pytest.mark.cpu
 @pytest.mark.parametrize(
     ("mode", "motion"), [("NextStep", "settled"), ("SameStep", "flowing"), ("Disabled", "settled")]

@@ -33,6 +33,7 @@ def test_dent_right_and_below_is_positive_there_and_slopes_away() -> None:
     assert sample.gradient[row - 12, column, 1] > 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("slide", [(0.0, 0.0), (0.6e-3, -0.4e-3)])
 @pytest.mark.parametrize(
     "grid", [IMAGE, IMAGE.refined(2), canonical_cells(CanonicalGrid())], ids=["image", "large", "canonical"]

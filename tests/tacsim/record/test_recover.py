@@ -69,6 +69,7 @@ def recovered(data: bytes, folder: Path) -> tuple[Recovery, Path] | None:
     return found, target
 
 
+@pytest.mark.slow
 def test_a_cut_anywhere_keeps_every_whole_step(whole: Path, tmp_path: Path) -> None:
     data, steps = whole.read_bytes(), official(whole)
     counts = []
@@ -91,6 +92,7 @@ def test_a_cut_anywhere_keeps_every_whole_step(whole: Path, tmp_path: Path) -> N
     assert counts == sorted(counts) and set(counts) == set(range(STEPS + 1))
 
 
+@pytest.mark.slow
 def test_changed_bytes_cost_their_own_step_alone(whole: Path, tmp_path: Path) -> None:
     data, steps = whole.read_bytes(), official(whole)
     rng = np.random.default_rng(0)

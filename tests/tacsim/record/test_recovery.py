@@ -70,6 +70,7 @@ def records(data: bytes) -> list[tuple[int, int]]:
     return found
 
 
+@pytest.mark.slow
 def test_a_cut_anywhere_leaves_the_steps_before_it(small: Path, tmp_path: Path) -> None:
     """At each byte round the beginning of a record, and at every eleventh between."""
     data, whole = small.read_bytes(), read_episode(small)
@@ -89,6 +90,7 @@ def test_a_cut_anywhere_leaves_the_steps_before_it(small: Path, tmp_path: Path) 
     assert set(counts) == {-1, 0, 1, 2, 3}
 
 
+@pytest.mark.slow
 def test_a_changed_byte_never_goes_unseen(small: Path, tmp_path: Path) -> None:
     data, whole = small.read_bytes(), read_episode(small)
     whole.steps = list(whole.steps)
@@ -105,6 +107,7 @@ def test_a_changed_byte_never_goes_unseen(small: Path, tmp_path: Path) -> None:
     assert set(outcomes) == {-1, 0, 1, 2, 3}
 
 
+@pytest.mark.slow
 def test_garbage_in_the_middle(small: Path, tmp_path: Path) -> None:
     data, whole = small.read_bytes(), read_episode(small)
     whole.steps = list(whole.steps)

@@ -192,6 +192,7 @@ def test_references_travel_as_attachments(tmp_path: Path, meta: EpisodeMeta) -> 
     assert reference_image(read, "upper") is None
 
 
+@pytest.mark.slow
 def test_picture_is_decoded_at_access_and_not_stored(
     tmp_path: Path, meta: EpisodeMeta, make_step: Callable[..., Step], monkeypatch: pytest.MonkeyPatch
 ) -> None:

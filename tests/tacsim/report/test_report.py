@@ -141,6 +141,7 @@ def test_correlation_is_undefined_when_nothing_changes() -> None:
     assert figure.signal_against_force(Series.from_episode(episode))["upper"][2] is None
 
 
+@pytest.mark.slow
 def test_report_of_two_sensors(tmp_path: Path) -> None:
     episode = made_up(steps=30)
     paths = write_report(episode, tmp_path / "new")
@@ -165,6 +166,7 @@ def _file(link: str, folder: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_report_of_one_sensor_without_arms_and_reward(tmp_path: Path) -> None:
     episode = made_up(("finger",), arms=False, reward=False)
     paths = write_report(episode, tmp_path)

@@ -15,6 +15,7 @@ from tacsim.sim.clock import SimClock
 MODEL = WrenchNoise(force=0.02, torque=0.5e-3)
 
 
+@pytest.mark.slow
 def test_readings_scatter_as_the_model_says() -> None:
     drawn = np.array([WrenchNoiseSource(MODEL, "lower")(k, 0.1, 7) for k in range(1500)])
     assert drawn.mean(axis=0) == pytest.approx(np.zeros(6), abs=3e-3)
@@ -23,6 +24,7 @@ def test_readings_scatter_as_the_model_says() -> None:
     assert abs(np.corrcoef(drawn[1:, 2], drawn[:-1, 2])[0, 1]) < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("period", [0.1, 0.5])
 def test_the_zero_wanders_from_where_it_was_at_reset(period: float) -> None:
     """After a minute by `drift` deviations, after a quarter of it by half as much, whatever the period."""

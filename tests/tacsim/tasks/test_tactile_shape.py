@@ -84,6 +84,7 @@ def volume_of_bar(half: FloatArray) -> float:
     return float(2 * np.pi * half.prod())
 
 
+@pytest.mark.slow
 def test_a_ball_that_rolls_in_all_directions_is_felt_as_a_ball() -> None:
     volume = 4 / 3 * np.pi * BALL**3
     shape = TactileShape(volume, GRID)

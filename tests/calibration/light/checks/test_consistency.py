@@ -74,6 +74,7 @@ def test_presses_of_another_ball_are_told(empty: np.ndarray, ratio: float, other
     assert size == pytest.approx(ratio, rel=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("turned", [np.flipud, np.fliplr, lambda image: image[::-1, ::-1]])
 def test_presses_of_a_turned_sensor_are_told(turned: object) -> None:
     """Under even light without a pattern of its own, so that the picture without contact gives nothing away."""
@@ -107,6 +108,7 @@ def test_a_contact_in_pictures_without_contact_is_told(empty: np.ndarray) -> Non
     assert told is not None and "(230, 165) px, which no press shows" in told
 
 
+@pytest.mark.slow
 def test_a_set_of_two_balls_and_wide_pixels_is_not_trusted(empty: np.ndarray) -> None:
     size = (round(1.08 * COLUMNS), ROWS)
     frames = [(f"press {k}", cv2.resize(image, size)) for k, image in enumerate(images([0.75] * 4 + [1.0] * 4))]

@@ -39,12 +39,14 @@ def said(fit: LightFit, scale: KnownScale, word: str) -> str:
     return str(verdict)
 
 
+@pytest.mark.slow
 def test_good_presses_are_good(fit: LightFit) -> None:
     told = KnownScale(PITCH, BALL, SIZE, 8e-3)
     assert "the ball's radius is not" in said(fit, told, "usable")  # half of it doubles each depth
     assert said(fit, SCALE, "good") == "good"
 
 
+@pytest.mark.slow
 def test_lengths_that_nothing_checks_are_not_called_good(fit: LightFit) -> None:
     """Truth: 0.08 mm a pixel; with 0.128 mm said for it the presses are explained as well, and all slopes are wrong."""
     wrong = calibrated(5, BALL_PX / 1.6)
@@ -90,6 +92,7 @@ def test_two_solutions_for_the_radii_are_told(fit: LightFit) -> None:
     assert "uncertain by 15%" in said(replace(fit, radius_uncertainty=0.15), SCALE, "do not trust")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("ball", "pitch", "words", "word"),
     [
@@ -116,6 +119,7 @@ def test_contacts_that_are_all_as_wide_as_the_ball_tell_a_wrong_length(fit: Ligh
     assert "press 4 is as wide as the ball" in told and "is it the radius that was given?" in told
 
 
+@pytest.mark.slow
 def test_a_press_of_known_depth_tells_a_wrong_pitch(fit: LightFit) -> None:
     """Hertz's depth of a half-space, of which the presses are made, is 0.65 mm for the third."""
     depth = (("press 2", 0.65e-3),)

@@ -37,6 +37,7 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_calibrate_lens_folder_gives_lens_and_image_gives_view(pictures: Path, tmp_path: Path) -> None:
     code, said, _ = run("lens", pictures, *BOARD, "--out", tmp_path / "lens")
     assert code == 0, said
@@ -54,6 +55,7 @@ def test_calibrate_lens_folder_gives_lens_and_image_gives_view(pictures: Path, t
     assert read_image(tmp_path / "view" / "rectified.png").shape == shape
 
 
+@pytest.mark.slow
 def test_calibrate_sensor_with_oblique_view_succeeds(tmp_path: Path) -> None:
     made = HiddenSensor(3)
     corners = np.array([(30.0, 22.0), (295.0, 15.0), (285.0, 220.0), (25.0, 225.0)], dtype=np.float32)
@@ -103,6 +105,7 @@ def test_calibrate_sensor_with_oblique_view_succeeds(tmp_path: Path) -> None:
     assert code == 2 and "the view was calibrated on 320 x 240 px" in err
 
 
+@pytest.mark.slow
 def test_calibrate_lens_invalid_input_exits_with_2(pictures: Path, tmp_path: Path) -> None:
     (tmp_path / "one").mkdir()
     (tmp_path / "one" / "a.png").write_bytes((pictures / "0.png").read_bytes())
@@ -145,6 +148,7 @@ def doctor(rig: Path) -> tuple[int, str]:
     return done.exit_code, told(done.output)
 
 
+@pytest.mark.slow
 def test_bundle_path_is_relative_to_rig_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "lab" / "gs").mkdir(parents=True)
     write_bundle(tmp_path / "lab" / "gs", calibration(), PICTURE)

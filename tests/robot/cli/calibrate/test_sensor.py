@@ -29,6 +29,7 @@ def folder(tmp_path: Path) -> Path:
     return write_presses(tmp_path / "frames")
 
 
+@pytest.mark.slow
 def test_calibrate_sensor_writes_bundle_and_image(folder: Path, tmp_path: Path) -> None:
     lengths = ["--ball-radius", f"{BALL * 1e3} mm", "--pixel-pitch", f"{PITCH * 1e3} mm"]
     out = tmp_path / "out"
@@ -55,6 +56,7 @@ def test_calibrate_sensor_writes_bundle_and_image(folder: Path, tmp_path: Path) 
     assert "Traceback" not in nothing.output
 
 
+@pytest.mark.slow
 def test_calibrate_sensor_keeps_folder_made_by_other_process(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -76,6 +78,7 @@ def test_calibrate_sensor_keeps_folder_made_by_other_process(
     assert (out / "calibration.yaml").read_text(encoding="utf-8") == "another's"
 
 
+@pytest.mark.slow
 def test_calibrate_sensor_grey_images_are_reported(folder: Path, tmp_path: Path) -> None:
     """Of coloured light they keep too little: neither direction nor depth."""
     for path in folder.glob("*.png"):
@@ -85,6 +88,7 @@ def test_calibrate_sensor_grey_images_are_reported(folder: Path, tmp_path: Path)
     assert ran.exit_code == 3 and "the pictures are grey" in ran.output
 
 
+@pytest.mark.slow
 def test_calibrate_sensor_prints_verdict(folder: Path, tmp_path: Path) -> None:
     """Two presses are not enough: the exit code is 3, the bundle and the page say why."""
     for number in (2, 3, 4):
@@ -137,6 +141,7 @@ def test_calibrate_sensor_camera_with_reference_is_refused() -> None:
     assert ran.exit_code == 2 and "taken first" in ran.output
 
 
+@pytest.mark.slow
 def test_calibrate_sensor_measures_camera_noise(folder: Path, tmp_path: Path) -> None:
     again = HiddenSensor(2)  # the same untouched gel, whose light drifts
     for number in (1, 2, 3):
@@ -185,6 +190,7 @@ def dotted(sensor: HiddenSensor, image: np.ndarray) -> np.ndarray:
     return np.clip(np.rint(image * ink), 0, 255).astype(np.uint8)
 
 
+@pytest.mark.slow
 def test_calibrate_sensor_measures_or_reports_markers(tmp_path: Path) -> None:
     sensor, home = HiddenSensor(2), tmp_path / "frames"
     home.mkdir()
@@ -217,6 +223,7 @@ def test_calibrate_sensor_measures_or_reports_markers(tmp_path: Path) -> None:
     assert not (tmp_path / "none").exists()
 
 
+@pytest.mark.slow
 def test_calibrate_sensor_fine_images_use_coarser_pitch(folder: Path, tmp_path: Path) -> None:
     """Eight times as many pixels each way: the same heights, and native pictures are what the bundle is for."""
     import cv2

@@ -43,6 +43,7 @@ def found(press: Press) -> Identified:
     return identify("body", scene, Recordings(scene), [press], NOISE, PRIORS, wanted=list(TRUTH))
 
 
+@pytest.mark.slow
 def test_stiffness_and_yield_of_a_body_in_some_tens_of_squeezes(squeeze: Press) -> None:
     result = found(squeeze)
     for name, truth in TRUTH.items():
@@ -51,6 +52,7 @@ def test_stiffness_and_yield_of_a_body_in_some_tens_of_squeezes(squeeze: Press) 
     assert result.findings == () and result.fit.runs < 30
 
 
+@pytest.mark.slow
 def test_a_zero_that_drifts_during_a_squeeze_is_noticed(squeeze: Press) -> None:
     drifting = squeeze.readings["lower.fz"] + 1.0 * np.linspace(0, 1, len(GAPS))
     result = found(replace(squeeze, readings=squeeze.readings | {"lower.fz": drifting}))

@@ -22,6 +22,7 @@ def test_on_the_way_back_the_tilted_gel_moves_along_its_own_face() -> None:
     assert steps[:, 1] == pytest.approx(-steps[:, 0] * math.tan(rows[:, 2].max()), rel=1e-3) and len(back) > 4
 
 
+@pytest.mark.slow
 def test_a_body_is_left_on_its_gel_and_feels_the_same_in_fewer_steps() -> None:
     """An edge that turned into the body threw it off the lower gel, and how far depended on the steps: forces were up
     to 60 % off."""

@@ -72,6 +72,7 @@ def test_a_ball_that_is_as_stated_is_not() -> None:
     assert result.findings == () and result.fit.value("youngs_modulus") == pytest.approx(190e3, rel=0.05)
 
 
+@pytest.mark.slow
 def test_without_heights_it_is_said_that_nothing_tells_the_ball() -> None:
     """Hertz: the force alone knows E sqrt(R)."""
     forces = ("fx", "fz")
@@ -79,6 +80,7 @@ def test_without_heights_it_is_said_that_nothing_tells_the_ball() -> None:
     assert wrong.findings == () and wrong.size_error > 0.1 > right.size_error
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("taken_for", [8.0, 5.0])
 def test_of_two_balls_one_that_is_wrong_is_noticed_by_forces_alone(taken_for: float) -> None:
     """By Hertz a ball of 8 mm for one of 5 mm makes the gel 26 % stiffer for it than for the other ball."""

@@ -139,6 +139,7 @@ def test_cached_kernels_are_those_of_taichi_itself(tmp_path: Path) -> None:
     assert ours[0].startswith("6.0\n36.0\n") and "6.0\n36.0\n" in theirs[0]
 
 
+@pytest.mark.slow
 def test_an_error_in_a_kernel_names_its_place(tmp_path: Path) -> None:
     printed, _ = run(tmp_path, "ours")
     assert printed.startswith("6.0\n36.0\n")

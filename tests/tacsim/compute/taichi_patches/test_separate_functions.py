@@ -83,6 +83,7 @@ def run(tmp_path: Path, shift: float = 1.0, seed: int = 0) -> tuple[str, set[str
 EXPECTED = "[0.5, 1.25, 2.0] [-1.0, 0.9375, 7.5]\n"
 
 
+@pytest.mark.slow
 def test_results_are_right_and_found_again_in_every_process(tmp_path: Path) -> None:
     first = run(tmp_path)
     assert first[0] == EXPECTED and len(first[1]) == 1

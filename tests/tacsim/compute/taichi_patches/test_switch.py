@@ -71,6 +71,7 @@ def run(tmp_path: Path, *, switch: str = "1", version: str = "", world: str = "b
     return printed.split()
 
 
+@pytest.mark.slow
 def test_results_are_the_same_bits_without_patches(tmp_path: Path) -> None:
     patched, unpatched = (run(tmp_path, switch=switch, world=PRESS) for switch in ("1", "0"))
     assert (patched[0], unpatched[0]) == (OWN, TAICHI)

@@ -108,6 +108,7 @@ def test_it_holds_all_that_a_replay_needs(made: Path) -> None:
         }, moment
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["stl", "ply"])
 def test_dump_holds_the_mesh_file(tmp_path: Path, kind: str) -> None:
     import trimesh

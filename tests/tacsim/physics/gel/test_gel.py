@@ -96,6 +96,7 @@ def nodes() -> np.ndarray:
     return np.stack(np.meshgrid(*[np.arange(n + 1.0) for n in params.elements], indexing="ij"), -1) * params.spacing
 
 
+@pytest.mark.slow
 def test_random_displacement_matches_the_reference() -> None:
     params = gel_params(GEL, 1e-3)
     u = np.random.default_rng(0).normal(scale=0.05, size=nodes().shape)
@@ -141,6 +142,7 @@ def test_narrow_corners_press_back_by_a_potential() -> None:
         assert np.abs(np.cross(nodes() + u, forces).sum(axis=(0, 1, 2))).max() < 1e-3 * largest
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("element", [1e-3, 0.5e-3])
 def test_each_gel_of_each_environment_has_its_own_forces(element: float) -> None:
     """However many parts share a gel, and wherever its nodes begin in memory."""

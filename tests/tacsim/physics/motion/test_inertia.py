@@ -175,6 +175,7 @@ def test_loads_and_the_seed_have_no_duration() -> None:
         SeedWorld(Scene(body=CUBE, gel=GEL, physics="seed")).move({}, duration=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("friction", "yield_stress"), [(0.02, None), (0.6, None), (3.0, None), (0.6, 3e4), (3.0, 5e3)])
 def test_a_squeezed_body_held_still_keeps_its_force_and_its_energy(friction: float, yield_stress: float | None) -> None:
     """With the memory of contact that quasi-static motions have, the force was 17 % off after 0.03 s; with radii of
@@ -218,6 +219,7 @@ def test_a_real_time_hold_begins_with_the_forces_of_the_rest_before_it() -> None
     assert [world.wrench(name)[2] for name in world.sensors] == pytest.approx(before, rel=5e-3)
 
 
+@pytest.mark.slow
 def test_a_pressed_gel_held_still_keeps_its_force() -> None:
     """Without friction its force swung, and fell from 0.92 to 0.88 N in a second."""
     ball = Indenter(geometry=Sphere(radius=4e-3), friction=0.0)

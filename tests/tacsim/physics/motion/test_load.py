@@ -45,6 +45,7 @@ def test_a_load_is_found_from_without_contact_and_given_up_again() -> None:
     assert world.pose("lower").position[2] < pressed[2]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("physics", ["hybrid", pytest.param("seed", marks=pytest.mark.cpu)])
 def test_the_load_stays_through_a_shear(physics: str) -> None:
     body = Body(geometry=Box(size=(4e-3, 4e-3, 3e-3)), material=BodyMaterial(yield_stress=30e3))

@@ -35,6 +35,7 @@ def test_slide_across_drag_gives_turn_share(by: list[float], force: list[float],
     assert turn_share(np.array(by), np.array(force), 0.6) == pytest.approx(turns)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("by", "force", "released"),
     [

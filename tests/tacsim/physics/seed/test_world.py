@@ -75,6 +75,7 @@ def test_a_free_body_keeps_its_momentum(monkeypatch):
     np.testing.assert_allclose(np.cross(arm, v).sum(axis=0) + held, spin, atol=2e-2 * np.linalg.norm(spin))
 
 
+@pytest.mark.slow
 def test_both_driven_gels_deform_alike_and_forces_balance(pressed):
     lower, upper = pressed.surface("lower").displacement, pressed.surface("upper").displacement
     assert lower[..., 2].min() < -0.05e-3
@@ -85,6 +86,7 @@ def test_both_driven_gels_deform_alike_and_forces_balance(pressed):
     assert pressed.truth().height < 4e-3 - 0.05e-3
 
 
+@pytest.mark.slow
 def test_it_does_not_matter_which_sensor_moves():
     depths, forces = [], []
     for share in (0.0, 0.5, 1.0):
@@ -103,6 +105,7 @@ def test_squeezed_body_reaches_uniaxial_yield_stress(pressed):
     assert 0.7 < -pressed.wrench("lower")[2] / area / CLAY.yield_stress < 1.0
 
 
+@pytest.mark.slow
 def test_parting_gels_hardly_stick(pressed):
     peak = -pressed.wrench("lower")[2]
     pulls = []
@@ -112,6 +115,7 @@ def test_parting_gels_hardly_stick(pressed):
     assert max(pulls) < 0.15 * peak
 
 
+@pytest.mark.slow
 def test_gels_return_when_released(pressed):
     before = np.abs(pressed.surface("lower").displacement).max()
     squeeze(pressed, -2e-3)
@@ -121,6 +125,7 @@ def test_gels_return_when_released(pressed):
     assert pressed.truth().height < 4e-3 - 0.03e-3  # plastic
 
 
+@pytest.mark.slow
 def test_a_sideways_move_shears_both_gels(pressed):
     goal = pressed.pose("upper").position + [0.4e-3, 0, 0]
     pressed.move({"upper": Pose(goal, HALF_TURN)})
@@ -135,6 +140,7 @@ def test_a_sideways_move_shears_both_gels(pressed):
     assert pressed.truth().position[0] == pytest.approx(0.2e-3, abs=0.05e-3)
 
 
+@pytest.mark.slow
 def test_yaw_twists_about_the_axis(pressed):
     before = pressed.surface("upper").displacement[0, 0]
     turn = Rotation.from_euler("z", 10, degrees=True) * Rotation.from_quat(HALF_TURN)

@@ -113,6 +113,7 @@ def test_frames_that_are_not_there_are_named(world: World) -> None:
         world.pose("middle")
 
 
+@pytest.mark.slow
 @pytest.mark.cpu
 def test_a_snapshot_makes_a_second_world(world: World) -> None:
     """As the error of a copy advises."""

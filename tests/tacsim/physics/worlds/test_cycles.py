@@ -97,6 +97,7 @@ def test_tension_that_a_squeeze_has_left_is_not_counted_again() -> None:
     assert opened.guard_hits == 0 and opened.largest_volume > 1.01
 
 
+@pytest.mark.slow
 def test_too_few_particle_layers_are_reported_once(caplog: pytest.LogCaptureFixture) -> None:
     """Over the mean height at the end, which is below that of the corners that stand up between soft gels."""
     warn_of_few_layers.cache_clear()
@@ -110,6 +111,7 @@ def test_too_few_particle_layers_are_reported_once(caplog: pytest.LogCaptureFixt
     assert "fewer than 12 layers" in caplog.text and len(caplog.records) == 1
 
 
+@pytest.mark.slow
 def test_what_sticks_comes_back_from_a_loop() -> None:
     """Nothing yields or slips here, so cycles take nothing once what is left of the first ones has gone. With an
     elastic slip that was summed up from velocities, the gel under the body's edge crept, and force fell by 0.1 % in
@@ -166,6 +168,7 @@ def test_a_hold_is_the_same_however_it_is_cut_into_launches() -> None:
     assert flowed(4) == pytest.approx(flowed(64), rel=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("preset", "by"),
     [

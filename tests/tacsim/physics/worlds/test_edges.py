@@ -40,6 +40,7 @@ def deep(shape: Shape, preset: str, rotation: Rotation, depth: float) -> PressWo
 BOX, PLATE = Box(size=(5e-3, 5e-3, 5e-3)), Box(size=(30e-3, 30e-3, 3e-3))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", ["draft", pytest.param("standard", marks=pytest.mark.deep)])
 @pytest.mark.parametrize(("shape", "tilt"), [(BOX, 0.0), (BOX, 30.0), (PLATE, 0.0)])
 def test_what_has_sharp_edges_comes_to_rest_in_half_the_gel(shape: Box, tilt: float, preset: str) -> None:
@@ -49,6 +50,7 @@ def test_what_has_sharp_edges_comes_to_rest_in_half_the_gel(shape: Box, tilt: fl
     assert corners.min() > 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", ["draft", pytest.param("standard", marks=pytest.mark.deep)])
 def test_a_star_comes_to_rest_in_half_the_gel(preset: str, tmp_path: Path) -> None:
     """A prism of five points, 4 and 2 mm from its axis."""
@@ -83,6 +85,7 @@ def test_an_edge_that_does_not_fit_is_refused(edge_radius: float, geometry: Shap
         world(geometry, edge_radius=edge_radius)
 
 
+@pytest.mark.slow
 def test_a_blade_that_sinks_between_the_contact_points_in_part_is_an_error(tmp_path: Path) -> None:
     """A wedge of 20 degrees: the points beside its edge feel its flanks, and what is below them nobody feels."""
     import trimesh
@@ -97,6 +100,7 @@ def test_a_blade_that_sinks_between_the_contact_points_in_part_is_an_error(tmp_p
         move(w, (0, 0, -1.1e-3))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("long", [11.0, 30.0])
 def test_blade_at_or_outside_gel_rim_is_error(long: float, tmp_path: Path) -> None:
     """A wedge of 33 degrees, 1 mm deep: elements of 1 mm give 55 % of its force with elements of 0.25 mm."""
@@ -111,6 +115,7 @@ def test_blade_at_or_outside_gel_rim_is_error(long: float, tmp_path: Path) -> No
         move(w, (0, 0, -1.1e-3))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [(30, 30, 3), (30, 2, 3)])
 def test_what_is_flat_and_wider_than_the_gel_is_none(size: tuple[float, float, float], tmp_path: Path) -> None:
     import trimesh

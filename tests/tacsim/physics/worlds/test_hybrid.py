@@ -66,6 +66,7 @@ def test_what_an_earlier_grid_has_left_in_memory_moves_nothing() -> None:
     assert all(a[name].tobytes() == b[name].tobytes() for name in a)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("flow", [False, True])
 def test_a_body_of_many_layers_stands_still_between_its_gels(flow: bool) -> None:
     """Forty layers: too light for its contact it went to and fro without end, with 3.8 N on one gel and 2.1 on the
@@ -92,6 +93,7 @@ def full(s: np.ndarray) -> np.ndarray:
     return s[:, [0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(-1, 3, 3).astype(float)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("by", [0.3e-3, 1e-3])
 def test_short_squeezes_end_where_slow_ones_do(by: float) -> None:
     """What plasticine keeps of the way must not depend on the speed that the controller picks."""
@@ -109,6 +111,7 @@ def test_short_squeezes_end_where_slow_ones_do(by: float) -> None:
     assert -fast.wrench("lower")[2] == pytest.approx(-slow.wrench("lower")[2], rel=0.01)
 
 
+@pytest.mark.slow
 def test_a_deep_squeeze_ends_near_the_slow_limit() -> None:
     """60 % of a 5 mm cube, where the speed costs most; the slow limit is 2.545 N, at Mach 0.001 to a residual of 3e-5.
     With velocities that go over particles in each substep it was 2.504, and these ended at 2.645 and 2.564; with light
@@ -122,6 +125,7 @@ def test_a_deep_squeeze_ends_near_the_slow_limit() -> None:
     assert forces == pytest.approx([2.545, 2.545], rel=0.035)
 
 
+@pytest.mark.slow
 def test_a_twisted_body_turns_as_far_as_in_the_slow_limit_and_soon_rests() -> None:
     """7.3 degrees at Mach 0.005; 5.9, after 390 substeps of hold, if rotations were as slow as the body is heavy."""
     w = world(Body(geometry=Box(size=(10e-3, 10e-3, 10e-3)), material=CLAY), settling={})
@@ -146,6 +150,7 @@ def test_twist_settles_when_both_sensors_have_same_torque() -> None:
     assert abs(about[0] - about[1]) <= w.scene.settling.tolerance * -w.wrench("lower")[2] * 0.01  # half the gel's width
 
 
+@pytest.mark.slow
 def test_a_stiff_body_is_not_flattened_by_its_scaled_inertia() -> None:
     """The stiffer, the heavier it is scaled, at the same yield stress; 3.79 mm at Mach 0.001, 3.67 at 0.03."""
     stiff = CLAY.model_copy(update={"youngs_modulus": 10e6})
@@ -216,6 +221,7 @@ def test_an_off_centre_body_shows_where_it_is_in_both_frames() -> None:
         assert wrench[3] / wrench[2] == pytest.approx(expected[1], abs=0.2e-3)
 
 
+@pytest.mark.slow
 def test_shear_is_held_by_friction_and_ends_at_the_coulomb_limit() -> None:
     # settled well, since the tolerance is a share of the normal force, of which shear is a small part
     w = world(friction={"lower": 0.2, "upper": 1.0}, settling={"tolerance": 1e-3, "mach": 0.01})
@@ -246,6 +252,7 @@ def tilt(w: HybridWorld, level: Pose, degrees: float) -> tuple[np.ndarray, np.nd
     return wrenches[0], wrenches[1]
 
 
+@pytest.mark.slow
 def test_a_tilted_sensor_presses_on_the_side_to_which_it_leans() -> None:
     w = world()
     squeeze(w, 1e-3)
@@ -286,6 +293,7 @@ def test_nothing_is_recompiled_for_a_second_scene() -> None:
     assert len(hybrid_kernels.substeps._primal.compiled_kernels) == compiled
 
 
+@pytest.mark.slow
 @pytest.mark.cpu
 def test_functions_compiled_separately_are_inlined(tmp_path: Path) -> None:
     """One that LLVM does not inline reads where its arrays are after each store, and merges no lanes: a quarter slower

@@ -106,6 +106,7 @@ def test_moving_the_sensor_is_moving_the_indenter() -> None:
     assert a.wrench("lower") == pytest.approx(b.wrench("lower"), abs=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("friction", "within"), [(0.6, 5e-4), (3.0, 1e-5)])
 def test_twists_to_and_fro_take_nothing(friction: float, within: float) -> None:
     """What sticks to the ball turns with it. With an elastic slip that was summed up from velocities, in the sensor's
@@ -135,6 +136,7 @@ def test_lift_off_leaves_nothing_behind() -> None:
     assert np.abs(w.surface("lower").displacement).max() < 2e-6
 
 
+@pytest.mark.slow
 def test_a_mesh_presses_like_its_closed_form(tmp_path: object) -> None:
     import trimesh
 
@@ -155,6 +157,7 @@ def brick(folder: Path, size: tuple[float, float, float]) -> tuple[Box, Mesh]:
     return Box(size=tuple(side * 1e-3 for side in size)), Mesh(path=str(folder / "brick.stl"))
 
 
+@pytest.mark.slow
 def test_a_mesh_wider_than_the_gel_is_there_wherever_it_is_moved(tmp_path: Path) -> None:
     """Its far ends, brought over the gel after it was pressed, and by a turn, press as those of the closed form.
 
@@ -171,6 +174,7 @@ def test_a_mesh_wider_than_the_gel_is_there_wherever_it_is_moved(tmp_path: Path)
     assert forces[1] == pytest.approx(forces[0], rel=0.02) and min(forces[0]) > 0.2
 
 
+@pytest.mark.slow
 def test_mesh_on_its_side_presses_like_closed_form(tmp_path: Path) -> None:
     lying, forces = np.array([0, np.sin(np.pi / 4), 0, np.cos(np.pi / 4)]), []
     for shape in brick(tmp_path, (2, 2, 10)):
@@ -181,6 +185,7 @@ def test_mesh_on_its_side_presses_like_closed_form(tmp_path: Path) -> None:
     assert forces[1] == pytest.approx(forces[0], rel=1e-3) and forces[0] < -0.2
 
 
+@pytest.mark.slow
 def test_mesh_distances_cover_both_ends_of_launch_or_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each alone would be allowed; the second must not stand in the place of the first."""
     w = world(brick(tmp_path, (18, 5, 2))[1], preset="draft", gel=Gel(size=(6e-3, 6e-3, 4e-3)))
@@ -207,6 +212,7 @@ def test_the_grids_of_all_environments_together_are_bounded(tmp_path: Path) -> N
     assert state._values is laid and np.array_equal(state.counts, counts)
 
 
+@pytest.mark.slow
 @pytest.mark.cpu
 def test_second_world_of_mesh_reads_file_without_new_distances(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """So it is ready in milliseconds, and a rewritten file is still seen."""
@@ -265,6 +271,7 @@ def test_a_press_allocates_no_particles_or_grid() -> None:
     }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["closed form", "mesh"])
 def test_contact_forgets_what_it_no_longer_touches(kind: str, tmp_path: Path) -> None:
     """Memory left behind would pull at the gel in the next touch. A mesh's distances end close to its surface."""

@@ -31,6 +31,7 @@ def pressed_ball(friction: float, preset: str, deep: float = 0.5e-3) -> PressWor
     return w
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("preset", "friction", "ratio"),
     [
@@ -88,6 +89,7 @@ def test_what_is_pressed_in_while_it_slides_is_dragged_as_slowly(
     assert stats.settled and math.hypot(force[0], force[1]) / -force[2] == pytest.approx(ratio, rel=0.015)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("yield_stress", "by", "lateral"),
     [
@@ -161,6 +163,7 @@ def test_edges_as_the_mesh_carries_them_end_a_long_slide_as_a_slow_one(
     assert ratios[0] == pytest.approx(ratios[1], rel=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("friction", "deep", "by", "ratio"), [(1.5, 0.3e-3, 2e-3, 1.639), (1.2, 0.4e-3, 1.9e-3, 1.376)]
 )
@@ -215,6 +218,7 @@ def test_a_slide_and_less_than_half_of_it_back_end_as_slow_ones(
     assert found == pytest.approx(ratios, rel=0.015)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("preset", "shape", "friction", "deep", "ways", "ratios"),
     [
@@ -325,6 +329,7 @@ def test_a_slide_of_a_deep_wall_has_not_settled() -> None:
         assert stats.residual <= 1e-2 and stats.settled == settled
 
 
+@pytest.mark.slow
 def test_edges_of_a_file_catch_as_they_are_drawn_where_they_touch(tmp_path: Path) -> None:
     """A cube's do; a ball of facets has none, and half a ball's is at its back."""
     ball = trimesh.creation.icosphere(subdivisions=3, radius=4.0)

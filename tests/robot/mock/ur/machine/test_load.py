@@ -36,6 +36,7 @@ def weight(bench: Bench, mass: float) -> FloatArray:
     return np.concatenate([force, np.cross(lever, force)])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", [17, 65])
 def test_configured_payload_is_compensated_and_other_is_not(bench: Bench, command: int) -> None:
     bench.call(29, [0.01, 0.02, 0.15, 0.4, 0, 0])  # a TCP far from the flange

@@ -74,6 +74,7 @@ def test_motion_beyond_joint_speed_is_not_started(bench: Bench, command: int, do
     usable(bench.machine)
 
 
+@pytest.mark.slow
 def test_arm_at_end_of_range_can_move_back(bench: Bench) -> None:
     begun = bench.arm.q.copy()
     bench.call(9, [0, 0, 0, 0, 0, 3.0, 10.0, 0])

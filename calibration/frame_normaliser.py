@@ -206,10 +206,10 @@ class FrameNormaliser:
         if frame.surface is None:
             return self._observation_from_image(frame, difference(), now)
         surface = frame.surface
-        self._update_stale(surface)
+        self._require_shape("height", surface.height, ())
         return TactileObservation(
             image=lambda: _encode_image(canonical_part(difference(), self._grid)),
-            gradient=surface.gradient,
+            gradient=partial(self._gradient_of, surface),
             height=surface.height,
             contact=(surface.height > MIN_CONTACT_HEIGHT) & self._valid,
             valid=self._valid,
@@ -295,12 +295,16 @@ class FrameNormaliser:
         calm = cv2.blur(cell, (3, 3))
         return np.asarray(np.abs(calm).max(axis=2) > MIN_CONTACT_DIFFERENCE, dtype=np.bool_) & self._valid
 
-    def _update_stale(self, surface: SurfaceMap) -> None:
-        shape = (self._grid.rows, self._grid.columns)
-        if surface.height.shape != shape or surface.gradient.shape != (*shape, 2):
+    def _gradient_of(self, surface: SurfaceMap) -> NDArray[np.float32]:
+        self._require_shape("gradient", surface.gradient, (2,))
+        return surface.gradient
+
+    def _require_shape(self, name: str, values: NDArray[np.float32], components: tuple[int, ...]) -> None:
+        shape = (self._grid.rows, self._grid.columns, *components)
+        if values.shape != shape:
             raise ValueError(
-                f"frame.surface has height {surface.height.shape} and gradient {surface.gradient.shape}, the canonical "
-                f"grid is {shape}; sample it on the grid of the rig"
+                f"frame.surface has {name} {values.shape}, the canonical grid is {shape}; sample it on the grid of the "
+                "rig"
             )
 
 

@@ -54,15 +54,6 @@ class Pose:
         object.__setattr__(self, "quaternion", quaternion)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SurfaceMap:
-    """The gel surface on the canonical grid, from a source that knows it by itself (the simulator)."""
-
-    height: NDArray[np.float32]  # (h, w) displacement into the gel, positive where pressed [m]
-    gradient: NDArray[np.float32]  # (h, w, 2) (d height/dx, d height/dy) [-]
-    flow: NDArray[np.float32] | None  # (m, n, 2) in-plane displacement at the marker lattice, sensor x, y [m]
-
-
 FieldValue = TypeVar("FieldValue")
 
 
@@ -98,6 +89,15 @@ class LazyFields:
 
 
 @dataclass(frozen=True, eq=False)
+class SurfaceMap(LazyFields):
+    """The gel surface on the canonical grid, from a source that knows it by itself (the simulator)."""
+
+    height: NDArray[np.float32]  # (h, w) displacement into the gel, positive where pressed [m]
+    gradient: LazyField[NDArray[np.float32]] = LazyField()  # (h, w, 2) (d height/dx, d height/dy) [-]
+    flow: NDArray[np.float32] | None = None  # (m, n, 2) in-plane displacement at the marker lattice, sensor x, y [m]
+
+
+@dataclass(frozen=True, eq=False)
 class TactileFrame(LazyFields):
     """What any source delivers: the picture as the camera gave it."""
 
@@ -116,7 +116,7 @@ class TactileObservation(LazyFields):
     # (H, W, 3) clip(128 + 128 (I - I0) / mean(I0)) over the canonical area
     image: LazyField[NDArray[np.uint8]] = LazyField()
     _: KW_ONLY
-    gradient: NDArray[np.float32] | None  # (h, w, 2) surface slope [-]
+    gradient: LazyField[NDArray[np.float32] | None] = LazyField()  # (h, w, 2) surface slope [-]
     height: NDArray[np.float32] | None  # (h, w) into the gel, 0 at the contact-free rim [m]
     contact: NDArray[np.bool_]  # (h, w)
     valid: NDArray[np.bool_]  # (h, w) False where the sensor has no gel or no pixels

@@ -144,9 +144,7 @@ class Renderer:
         if self.model.darkness is None:
             return self._phong_light(table, points, inside)
         # at the points of the surface's table, of which there are fewer than pixels, as for calibrated slopes
-        change, self._clipped_share = darken_by_depth(
-            self.model.darkness, np.ascontiguousarray(table.fields[..., 0]), table.pitch
-        )
+        change, self._clipped_share = darken_by_depth(self.model.darkness, table.height, table.pitch)
         return table.interpolate_at(change * self._mean, points, inside).__getitem__
 
     def _phong_light(self, table: SurfaceTable, points: Float32, inside: Mask) -> Callable[[slice], Float32]:
@@ -333,13 +331,13 @@ def shadow_colours(light: PhotometricLight, shadows: CastShadows, table: Surface
     width, flat = np.float32(image.columns * image.pitch), np.float32(image.rows / image.columns)
     # from places in picture widths, which start in the middle of the picture, to metres
     start_x, start_y = x[0, 0] - u[0, 0] * width, y[0, 0] - v[0, 0] * flat * width
-    height = np.ascontiguousarray(table.fields[..., 0])
+    height = table.height
 
     def height_at(x: Float32, y: Float32) -> Float32:
         return table.interpolate_at_rest(height, start_x + width * x, start_y + width * y) / width
 
     horizons = [horizon_slope(height_at, u, v * flat, lamp) for lamp in shadows.lamps]
-    rows, columns = (np.arange(n, dtype=np.float32) / stride for n in table.fields.shape[:2])
+    rows, columns = (np.arange(n, dtype=np.float32) / stride for n in table.height.shape[:2])
     return bilinear_lookup(light.shadow_change(horizons, u, v), np.stack(np.meshgrid(columns, rows), axis=-1))
 
 

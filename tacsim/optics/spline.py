@@ -8,13 +8,15 @@ repeats; beyond it the surface continues unchanged.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tacsim.interface import FloatArray
 from tacsim.models.scene import GelSurface
+
+MIN_JACOBIAN = 0.1  # det J of a sheet that is seen edge-on; its slope is as that of one this narrow in the picture
 
 
 def spline_weights(position: FloatArray, nodes: int) -> tuple[NDArray[np.intp], FloatArray, FloatArray]:
@@ -65,21 +67,21 @@ def line_matrices(position: FloatArray, nodes: int) -> tuple[LineMatrix, LineMat
     return LineMatrix(index.T, value), LineMatrix(index.T, derivative)
 
 
-def refine_spline(control: NDArray[np.float32], points: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """The spline through control values (nodes, m), and its slope by the position in lattice spacings, at every
-    1/`points` of a spacing, an even number: (n, m) both, n = (nodes - 1) points + 1.
+def refine_spline(control: NDArray[np.float32], points: int, *, derivative: bool = False) -> NDArray[np.float32]:
+    """The spline through control values (nodes, m), or its derivative by the position in lattice spacings, at every
+    1/`points` of a spacing, an even number: (n, m), n = (nodes - 1) points + 1.
 
-    Products of matrices three wide, node by node: so small that BLAS does each at once on this thread, where it would
+    A product of matrices three wide, node by node: so small that BLAS does each at once on this thread, where it would
     wait for others on a busy machine.
     """
     nodes, m = control.shape
     ends_repeat = np.concatenate([control[:1], control, control[-1:]])
     row, item = ends_repeat.strides
-    # sliding_window_view of NumPy takes longer than the products
+    # sliding_window_view of NumPy takes longer than the product
     neighbours = np.ndarray((nodes, 3, m), ends_repeat.dtype, ends_repeat, strides=(row, row, item))
     between = slice(points // 2, points // 2 + (nodes - 1) * points + 1)  # a node's points lie on both sides of it
-    value, slope = ((weights @ neighbours).reshape(-1, m)[between] for weights in _node_weights(points))
-    return value, slope
+    refined: NDArray[np.float32] = (_node_weights(points)[derivative] @ neighbours).reshape(-1, m)[between]
+    return refined
 
 
 @lru_cache(maxsize=8)
@@ -87,3 +89,73 @@ def _node_weights(points: int) -> tuple[NDArray[np.float32], NDArray[np.float32]
     """(points, 3) both: weights of a node and its neighbours at the points nearest to it, and their derivatives."""
     _, weight, slope = spline_weights(np.arange(points) / points + 0.5, 3)
     return weight.astype(np.float32), slope.astype(np.float32)
+
+
+class SplineTable:
+    """A surface and its derivatives at the points of a table, rows along y. Its arrays are shared: not to be written
+    to."""
+
+    height: NDArray[np.float32]  # (rows, columns) [m]
+    lateral: NDArray[np.float32]  # (rows, columns, 2) u_x, u_y [table points]
+
+    def __init__(self, control: NDArray[np.float32], spacing: float, points: int) -> None:
+        """control: displacements (nx, ny, 3) [m]; points: of the table, in each `spacing` [m]."""
+        self._control, self._spacing, self._points = control, spacing, points
+        value = self._refine()
+        self.height, self.lateral = -value[2], np.stack([value[0], value[1]], axis=-1) * np.float32(points / spacing)
+        for array in (self.height, self.lateral):
+            array.setflags(write=False)
+
+    def _refine(self, *, by_x: bool = False, by_y: bool = False) -> NDArray[np.float32]:
+        """(3, rows, columns) displacements, or their derivatives times `spacing` [m]."""
+        nx, ny, _ = self._control.shape
+        along_x = refine_spline(self._control.reshape(nx, -1), self._points, derivative=by_x)
+        # rows are nodes along y then, and columns x of one component after the other
+        rows = np.ascontiguousarray(along_x.reshape(-1, ny, 3).transpose(1, 2, 0)).reshape(ny, -1)
+        both = refine_spline(rows, self._points, derivative=by_y)
+        return both.reshape(len(both), 3, -1).transpose(1, 0, 2)
+
+    @cached_property
+    def _derivatives(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        return self._refine(by_x=True), self._refine(by_y=True)
+
+    @cached_property
+    def _determinant(self) -> NDArray[np.float32]:
+        """(rows, columns) det J, times `spacing` squared [m^2]."""
+        (x_by_x, y_by_x, _), (x_by_y, y_by_y, _) = self._derivatives
+        determinant: NDArray[np.float32] = (self._spacing + x_by_x) * (self._spacing + y_by_y) - x_by_y * y_by_x
+        return determinant
+
+    @cached_property
+    def folded(self) -> bool:
+        """True if det J <= 0 at some of the points.
+
+        The derivatives of a quadratic B-spline are means of the differences of neighbouring control values, so these
+        bound det J, nearly always far above 0; the derivatives themselves are needed only where they do not.
+        """
+        lateral = self._control[..., :2]
+        steps = [np.abs(np.diff(lateral, axis=axis)).max(axis=(0, 1)) / self._spacing for axis in (0, 1)]
+        (x_by_x, y_by_x), (x_by_y, y_by_y) = steps
+        if max(x_by_x, y_by_y) < 1.0 and (1.0 - x_by_x) * (1.0 - y_by_y) > x_by_y * y_by_x:
+            return False
+        return float(self._determinant.min()) <= 0.0
+
+    @cached_property
+    def fields(self) -> NDArray[np.float32]:
+        """(rows, columns, 3) height [m], its derivatives by x and y in the image [-]. The slope of what faces away is
+        that of a sheet seen edge-on: it is read only between such points and visible ones."""
+        (x_by_x, y_by_x, z_by_x), (x_by_y, y_by_y, z_by_y) = self._derivatives
+        determinant = self._determinant
+        if self.folded:
+            determinant = np.maximum(determinant, np.float32(MIN_JACOBIAN * self._spacing**2))
+        inverse = -1.0 / determinant  # the minus turns u_z into height
+        slope_x = ((self._spacing + y_by_y) * z_by_x - y_by_x * z_by_y) * inverse
+        slope_y = ((self._spacing + x_by_x) * z_by_y - x_by_y * z_by_x) * inverse
+        fields = np.stack([self.height, slope_x, slope_y], axis=-1)
+        fields.setflags(write=False)
+        return fields
+
+
+@lru_cache(maxsize=4)  # a picture and a map of one surface are asked one after the other
+def spline_table(displacement: bytes, shape: tuple[int, ...], spacing: float, points: int) -> SplineTable:
+    return SplineTable(np.frombuffer(displacement, np.float32).reshape(shape), spacing, points)

@@ -30,10 +30,8 @@ from tacsim.models.scene import GelSurface
 from tacsim.models.sensor import CanonicalGrid, Markers
 from tacsim.optics.grid import PixelGrid, canonical_cells
 from tacsim.optics.markers import marker_flow
-from tacsim.optics.spline import displacement_and_jacobian, refine_spline
+from tacsim.optics.spline import SplineTable, displacement_and_jacobian, refine_spline, spline_table
 from tacsim.optics.tuning import MAX_LAST_STEP, MAX_POINTS_PER_SPACING, SURFACE_TABLE_PITCH
-
-MIN_JACOBIAN = 0.1  # det J of a sheet that is seen edge-on; its slope is as that of one this narrow in the picture
 
 
 class SurfaceFolded(ValueError):
@@ -65,21 +63,33 @@ def sample_surface(surface: GelSurface, grid: PixelGrid) -> SurfaceSample:
 class SurfaceTable:
     """A gel surface at material points that halve the cells of its lattice; rows along y, columns along x."""
 
-    fields: Float32  # (rows, columns, 3) height [m], its derivatives by x and y in the image [-]
-    folded: bool  # the surface folds over itself somewhere
-
     def __init__(self, surface: GelSurface) -> None:
         """Raises what :func:`sample_surface` raises."""
         check_surface(surface)
-        self._surface = surface
-        self.fields, self._lateral, self.folded = _tabulate(surface)
+        self._surface, self._splines = surface, _tabulate(surface)
+        self._lateral = self._splines.lateral
         self.pitch = surface.spacing / _points_per_spacing(surface)  # [m]
+
+    @property
+    def folded(self) -> bool:
+        """True if the surface folds over itself at one of the points."""
+        return self._splines.folded
+
+    @property
+    def height(self) -> Float32:
+        """(rows, columns) [m]"""
+        return self._splines.height
+
+    @property
+    def fields(self) -> Float32:
+        """(rows, columns, 3) height [m], its derivatives by x and y in the image [-]"""
+        return self._splines.fields
 
     def spline_values(self, values: Float32) -> Float32:
         """(rows, columns, 1) at the table's points of the spline whose control values are `values` (nx, ny)."""
         points = _points_per_spacing(self._surface)
-        along_x, _ = refine_spline(values, points)
-        return refine_spline(np.ascontiguousarray(along_x.T), points)[0][..., None]
+        along_x = refine_spline(values, points)
+        return refine_spline(np.ascontiguousarray(along_x.T), points)[..., None]
 
     def visible_part(self, grid: PixelGrid) -> tuple[slice, slice]:
         """Rows and columns of the table in which all lies that is seen at the points of `grid`; at least one."""
@@ -91,12 +101,12 @@ class SurfaceTable:
             start, stop = (min(max(0, int(end)), points - 1) for end in (start, stop))
             return slice(start, stop + 1)
 
-        (rows, columns), (origin_x, origin_y) = self.fields.shape[:2], self._surface.origin
+        (rows, columns), (origin_x, origin_y) = self.height.shape[:2], self._surface.origin
         return along(grid.y0 - origin_y, grid.rows, rows), along(grid.x0 - origin_x, grid.columns, columns)
 
     def deformed_coordinates(self) -> tuple[Float32, Float32]:
         """x and y (rows, columns) where each point is seen [m]."""
-        (rows, columns), pitch = self.fields.shape[:2], np.float32(self.pitch)
+        (rows, columns), pitch = self.height.shape[:2], np.float32(self.pitch)
         origin_x, origin_y = (np.float32(each) for each in self._surface.origin)
         x = origin_x + pitch * (np.arange(columns, dtype=np.float32) + self._lateral[..., 0])
         y = origin_y + pitch * (np.arange(rows, dtype=np.float32)[:, None] + self._lateral[..., 1])
@@ -134,8 +144,8 @@ class SurfaceTable:
             except SurfaceFolded:  # between the points of the table
                 pass
         seen = _table_coordinates(self._surface.origin, self.pitch, grid)[0, 0].astype(np.float64)
-        at = np.indices(self.fields.shape[:2], dtype=np.float64)[::-1].transpose(1, 2, 0) + self._lateral
-        return visible_table_points((at - seen) * (self.pitch / grid.pitch), self.fields[..., 0], grid.shape)
+        at = np.indices(self.height.shape[:2], dtype=np.float64)[::-1].transpose(1, 2, 0) + self._lateral
+        return visible_table_points((at - seen) * (self.pitch / grid.pitch), self.height, grid.shape)
 
     def _unfolded_points(self, grid: PixelGrid, fine: bool) -> tuple[Float32, NDArray[np.bool_]]:
         """:meth:`table_points` of a surface that does not fold over. Raises SurfaceFolded where it does."""
@@ -183,7 +193,7 @@ class SurfaceTable:
         """(rows, columns) where material points [table points] lie on the table."""
         import cv2
 
-        rows, columns = self.fields.shape[:2]
+        rows, columns = self.height.shape[:2]
         first: Any = (-MAX_LAST_STEP, -MAX_LAST_STEP)  # OpenCV 4.13 declares arrays only, and takes these too
         last: Any = (columns - 1 + MAX_LAST_STEP, rows - 1 + MAX_LAST_STEP)
         inside = cv2.inRange(points, first, last)
@@ -195,9 +205,14 @@ def surface_map(surface: GelSurface, grid: CanonicalGrid, markers: Markers | Non
 
     Raises what :func:`sample_surface` raises.
     """
-    sample = sample_surface(surface, canonical_cells(grid))
+    table, cells = SurfaceTable(surface), canonical_cells(grid)
+    points, inside = table.table_points(cells)
     flow = None if markers is None else marker_flow(surface, markers)
-    return SurfaceMap(np.ascontiguousarray(sample.height), np.ascontiguousarray(sample.gradient), flow)
+
+    def gradient() -> Float32:
+        return np.ascontiguousarray(table.interpolate_at(table.fields, points, inside)[..., 1:])
+
+    return SurfaceMap(table.interpolate_at(table.height, points, inside), gradient, flow)
 
 
 def material_points(surface: GelSurface, points: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -245,40 +260,10 @@ def check_surface(surface: GelSurface) -> None:
         raise ValueError(f"gel surface moved {lateral:.3g} m sideways, more than the gel is wide ({width:.3g} m)")
 
 
-def _tabulate(surface: GelSurface) -> tuple[Float32, Float32, bool]:
-    """(height, gradient x, gradient y) and (u_x, u_y [table points]) at material points over the gel, rows along y; and
-    whether the surface folds over at some of them. The slope of what faces away is that of a sheet seen edge-on: it is
-    read only between such points and visible ones."""
+def _tabulate(surface: GelSurface) -> SplineTable:
     displacement = np.asarray(surface.displacement, dtype=np.float32)
-    return _cached_table(displacement.tobytes(), displacement.shape, surface.spacing, tuple(surface.origin))
-
-
-@lru_cache(maxsize=4)  # a picture and a map of one surface are asked one after the other
-def _cached_table(
-    displacement: bytes, shape: tuple[int, ...], spacing: float, origin: tuple[float, float]
-) -> tuple[Float32, Float32, bool]:
-    """The same for everybody: not to be written to."""
-    control = np.frombuffer(displacement, np.float32).reshape(shape)
-    surface = GelSurface(control, spacing, origin)
     points = _points_per_spacing(surface)
-    nx, ny, _ = shape
-    # along x, then along y, where rows are nodes along y, and columns x of one component after the other
-    in_x = (each.reshape(-1, ny, 3).transpose(1, 2, 0) for each in refine_spline(control.reshape(nx, -1), points))
-    (value, by_y), (by_x, _) = (refine_spline(np.ascontiguousarray(each).reshape(ny, -1), points) for each in in_x)
-    value, by_x, by_y = (each.reshape(len(each), 3, -1).transpose(1, 0, 2) for each in (value, by_x, by_y))
-    # by lattice spacings: J is `spacing` times itself, and a gradient, as a ratio, what it is
-    a, b, c, d = spacing + by_x[0], by_y[0], by_x[1], spacing + by_y[1]  # J = [[a, b], [c, d]]
-    determinant = a * d - b * c
-    folded = float(determinant.min()) <= 0.0
-    if folded:
-        determinant = np.maximum(determinant, np.float32(MIN_JACOBIAN * spacing**2))
-    inverse = -1.0 / determinant  # the minus turns u_z into height
-    gradient_x, gradient_y = (d * by_x[2] - c * by_y[2]) * inverse, (a * by_y[2] - b * by_x[2]) * inverse
-    fields = np.stack([-value[2], gradient_x, gradient_y], axis=-1)
-    lateral = np.stack([value[0], value[1]], axis=-1) * np.float32(points / spacing)
-    for array in (fields, lateral):
-        array.setflags(write=False)
-    return fields, lateral, folded
+    return spline_table(displacement.tobytes(), displacement.shape, surface.spacing, points)
 
 
 def _points_per_spacing(surface: GelSurface) -> int:

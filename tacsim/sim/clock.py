@@ -57,6 +57,7 @@ class SimClock:
         self.episode = 0  # the seed of the noise
         self.version = 0
         self.stats: MoveStats | None = None  # of the last motion
+        self._diagnostics: tuple[int, Mapping[str, float]] = -1, {}  # version, and those of it
         # (6,) by frame: mean of the last period, world axes [m/s, rad/s]
         self.velocities: Mapping[str, FloatArray] = {}
 
@@ -119,5 +120,7 @@ class SimClock:
         stats = self.stats
         if stats is None:
             return {}
-        found = {each.name: float(getattr(stats, each.name)) for each in fields(stats)}
-        return {**found, "shortened": float(sum(self._limited.values()))}
+        if self._diagnostics[0] != self.version:  # each sensor asks for them, and so does the rig
+            found = {each.name: float(getattr(stats, each.name)) for each in fields(stats)}
+            self._diagnostics = self.version, {**found, "shortened": float(sum(self._limited.values()))}
+        return self._diagnostics[1]

@@ -58,7 +58,7 @@ def test_line_matrices_agree_with_the_weights() -> None:
 @pytest.mark.parametrize("points", [2, 4, 8])
 def test_what_is_refined_agrees_with_the_weights(points: int) -> None:
     control = np.random.default_rng(0).normal(size=(6, 5)).astype(np.float32)
-    value, slope = refine_spline(control, points)
+    value, slope = refine_spline(control, points), refine_spline(control, points, derivative=True)
     of_values, of_slopes = line_matrices(np.arange(5 * points + 1) / points, nodes=6)
     np.testing.assert_allclose(value, of_values @ control, atol=1e-6)
     np.testing.assert_allclose(slope, of_slopes @ control, atol=1e-6)

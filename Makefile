@@ -14,10 +14,11 @@ INSTALL := $(BIN)/python -m pip install -qq --no-input --disable-pip-version-che
 CORE := .venv/installed-core-$(VERSION)
 DEV := .venv/installed-dev-$(VERSION)
 EXTRAS := .venv-extras/installed-$(VERSION)
+DOCS := .venv-docs/installed-$(VERSION)
 PLUGINS := .venv-lerobot/installed
 
 .DEFAULT_GOAL := help
-.PHONY: help run test check test-slow test-deep test-all test-gpu extras test-extras plugins test-plugins reliability lock clean python
+.PHONY: help run test check test-slow test-deep test-all test-gpu extras test-extras docs-tools docs plugins test-plugins reliability lock clean python
 # Two installations into one environment must not run at once.
 .NOTPARALLEL:
 
@@ -31,6 +32,7 @@ help:
 	@echo "make reliability  what is promised of arms and cameras, measured by its tests, for docs/reliability.md"
 	@echo "make test-extras  tests that need heavy extras (torch, rerun, ray, av), in an environment of their own"
 	@echo "make test-plugins tests of the plug-ins for LeRobot, which wants Python 3.12   (without one: says so, and fails)"
+	@echo "make docs         the documentation as a site in site/, in an environment of its own; warnings are errors"
 	@echo "make lock         renew constraints/ for each of: $(PYTHONS)"
 	@echo "make clean        remove the environment, caches and builds (runs/ stays)"
 	@echo "Choose a Python with PYTHON=python3.12 (3.11, 3.12 or 3.13; default: python3)."
@@ -83,6 +85,13 @@ extras: $(EXTRAS)
 test-extras: extras
 	@.venv-extras/bin/python -m pytest -q -m "not deep" $(PARALLEL) $(WITH_EXTRAS) $(ARGS)
 
+# The site reads the code: its pages of commands, files and the Python interface are generated.
+docs-tools: $(DOCS)
+
+docs: docs-tools
+	@NO_MKDOCS_2_WARNING=1 .venv-docs/bin/python -m mkdocs build --strict --site-dir site
+	@echo "The site is in site/. Read it with: $(PYTHON) -m http.server -d site -b 127.0.0.1 8000"
+
 # LeRobot is large (torch), wants Python 3.12, and other versions than constraints/py312.txt: an environment of its own.
 # Where pip finds torch for CPUs alone is the machine's affair (PIP_EXTRA_INDEX_URL). 77: nothing was tested.
 plugins: $(PLUGINS)
@@ -100,7 +109,7 @@ lock:
 	done
 
 clean:
-	rm -rf .venv .venv-extras .venv-lerobot .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis build dist
+	rm -rf .venv .venv-extras .venv-docs .venv-lerobot .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis build dist site
 
 # Stands before each installation: a clear word about the Python, and an environment made by that Python.
 python:
@@ -126,6 +135,13 @@ $(EXTRAS): pyproject.toml $(CONSTRAINTS) constraints/extras.txt | python
 	@rm -rf .venv-extras && $(PYTHON) -m venv .venv-extras
 	@.venv-extras/bin/python -m pip install -qq --no-input --disable-pip-version-check \
 	  -c $(CONSTRAINTS) -c constraints/extras.txt -e '.[dev,train,viz,cluster,video]'
+	@touch $@
+
+$(DOCS): pyproject.toml $(CONSTRAINTS) constraints/docs.txt | python
+	@echo "Installing tacsim and MkDocs into .venv-docs (a few minutes the first time)"
+	@rm -rf .venv-docs && $(PYTHON) -m venv .venv-docs
+	@.venv-docs/bin/python -m pip install -qq --no-input --disable-pip-version-check \
+	  -c $(CONSTRAINTS) -c constraints/docs.txt -e '.[docs]'
 	@touch $@
 
 $(PLUGINS): pyproject.toml constraints/lerobot.txt $(wildcard plugins/*/pyproject.toml)

@@ -21,7 +21,7 @@ from benchmarks.cases.registry import select_cases
 from benchmarks.harness.machine import backend
 from benchmarks.harness.runner import NOT_MEASURED, Case, run_cases
 from benchmarks.harness.schema import GROUPS, Report
-from benchmarks.pages.page import COLUMNS, cells, setting, write_page
+from benchmarks.pages.page import COLUMNS, cells, setting, write_pages
 from benchmarks.pages.picture import PICTURE, draw
 from benchmarks.pages.reliability import ROOT, write_reliability
 from robot.cli.errors import print_error
@@ -170,6 +170,6 @@ def write(reports: Sequence[Report], json: Path | None, docs: Path | None) -> No
                 draw(report.results, json.with_name(PICTURE))
                 written.append(json.with_name(PICTURE))
         if docs is not None:
-            written += write_page(report, docs, devices) if physics else []
+            written += write_pages(report, docs, devices) if physics else []
             written += [write_reliability(report, docs)] if "robot" in report.metadata.groups else []
     print_files(*written)

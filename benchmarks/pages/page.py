@@ -1,14 +1,15 @@
-"""docs/benchmarks.md and its pictures, from a report."""
+"""docs/benchmarks.md, the pages in docs/benchmarks/, and their pictures, from a report."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from benchmarks.cases.registry import description
 from benchmarks.harness.schema import Machine, Report, Row
 from benchmarks.pages import oracles, targets
-from benchmarks.pages.picture import PICTURE, RADII, draw, draw_radii
+from benchmarks.pages.picture import PICTURE, RADII, VERDICTS, draw, draw_radii, draw_verdicts
 
 GROUP_WORDS = {
     "press": "Press: a rigid indenter on one gel",
@@ -20,15 +21,18 @@ GROUP_WORDS = {
 }
 COLUMNS = ("case", "method", "resolution", "seconds", "CPU s", "error", "MB", "substeps")
 
+INDEX = "benchmarks.md"
+FIGURES_PAGE = "benchmarks/figures.md"
 FIGURES = (
-    "Requirements and aims of the project, from the rows below: the worst row of each kind, ratios within this run. "
+    "Requirements and aims of the project, from the rows of the tables: the worst row of each kind, ratios within this "
+    "run. "
     "*missed* is beyond *must*; *not measured* means that this run has no such row."
 )
 READING = (
     "- **A row** is one measurement by one method at one resolution. `tacsim` is ours; `seed`, `textbook`, "
     "`tacchi-settings` and `layer` are methods for comparison. The error belongs to the same run as the seconds: a "
     "fast row with a large error is not fast.\n"
-    "- **Time.** Compare seconds within this page only. On a busy machine compare CPU s, or ratios; rows of one case "
+    "- **Time.** Compare seconds of one run only. On a busy machine compare CPU s, or ratios; rows of one case "
     "ran one after the other.\n"
     "- **Error** is relative to the reference under each table: a closed form, a limit of fine meshes, a symmetry, or "
     "the same mesh at a speed without influence.\n"
@@ -36,10 +40,10 @@ READING = (
     "time (slow limits are cached). Other methods need `--baselines`, our own long rows (fine "
     "meshes, `standard` squeezes, the incline, 100,000 substeps of rest; of real presses punches, invariance and all "
     "but the first set of balls) `--long`; both take "
-    "many minutes. This page: `tacsim bench all --baselines --long --json benchmarks/reference.json`, then "
+    "many minutes. These pages: `tacsim bench all --baselines --long --json benchmarks/reference.json`, then "
     "`tacsim bench --from benchmarks/reference.json --docs docs`, with `--from "
     "benchmarks/gpu/report.json` too if it exists. That is the report of a GPU: `make test-gpu` measures it and "
-    "writes the page.\n"
+    "writes the pages.\n"
     "- **Real frames** are not shipped. `tacsim bench real --data DIR` finds those of the public set named in "
     "`benchmarks/references/presses.yaml` by their names anywhere below DIR; a `presses.yaml` in DIR itself describes "
     "other presses, on any sensor. With `all`, `--data DIR` adds the group to the rest. Rows ending in `image` compare "
@@ -52,11 +56,17 @@ READING = (
 )
 
 
+WRITTEN = "Written by `tacsim bench --from FILE --docs docs`; do not edit."
+MEASURED = (
+    "Every row is time, error and memory of one run, kernels compiled before the clock starts; another method and "
+    "every long case has a process of its own, our other cases of a group share one. Seconds are the median of wall "
+    "time ± interquartile range (none with fewer than three repetitions), CPU s the processor time of all threads."
+)
 ON_DEVICE = (
     "Kernels ran on the device; the processor renders the images, and MB is the memory of the process. "
-    "*CPU / GPU* is seconds of the same row in the tables above over seconds here: two runs, possibly on two machines."
+    "*CPU / GPU* is seconds of the same row on the CPU over seconds here: two runs, possibly on two machines."
 )
-NO_DEVICE = "No GPU has been measured yet: with CUDA, `make test-gpu` measures it and adds it to this page."
+NO_DEVICE = "No GPU has been measured yet: with CUDA, `make test-gpu` measures it and adds a page."
 
 
 def cells(row: Row) -> list[str]:
@@ -84,54 +94,88 @@ def costs(row: Row) -> list[str]:
     return found
 
 
-def write_page(report: Report, folder: Path, devices: Sequence[Report] = ()) -> list[Path]:
-    """Writes benchmarks.md, and its pictures into images/, below `folder`; returns their paths. Raises OSError."""
+def write_pages(report: Report, folder: Path, devices: Sequence[Report] = ()) -> list[Path]:
+    """Writes the pages, and their pictures into images/, below `folder`; returns their paths. Raises OSError."""
     images = folder / "images"
     images.mkdir(parents=True, exist_ok=True)
     draw(report.results, images / PICTURE)
-    pictures = [images / PICTURE]
+    draw_verdicts(report.results, images / VERDICTS)
+    pictures = [images / PICTURE, images / VERDICTS]
     if draw_radii(report.results, images / RADII):
         pictures.append(images / RADII)
-    page = folder / "benchmarks.md"
-    page.write_text(markdown(report, devices), encoding="utf-8")
-    return [page, *pictures]
+    written = []
+    for name, text in pages(report, devices).items():
+        path = folder / name
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+        written.append(path)
+    return [*written, *pictures]
 
 
-def markdown(report: Report, devices: Sequence[Report] = ()) -> str:
-    """The page of a report of the CPU and of reports of devices. The same reports give the same text."""
-    parts = [
-        "# Benchmarks",
-        "Written by `tacsim bench --from FILE --docs docs`; do not edit. Every row is time, error and memory of one "
-        "run, kernels compiled before the clock starts; another method and every long case has a process of its own, "
-        "our other cases of a group share one. Seconds are the median of wall time ± interquartile range (none with "
-        "fewer than three repetitions), CPU s the processor time of all threads.",
-        setting(report),
-        f"![Time against error, by method](images/{PICTURE})",
-        "## Figures",
-        FIGURES,
-        table(targets.HEADER, [*targets.lines(report.results), slowest_group(report)]),
-        "## How to read and rerun",
-        READING,
-    ]
-    for group, words in GROUP_WORDS.items():
-        rows = [row for row in report.results if row.group == group]
-        if rows:
-            text = table(*oracles.lines(rows)) if group == "oracles" else table(COLUMNS, map(cells, rows))
-            parts += [f"## {words}", text, *_remarks(rows)]
-        if group == "real" and rows:
-            parts.append(f"![Contact radius against depth: real, ours, and simpler theories](images/{RADII})")
-    if report.failures:
-        parts += ["## Failed", _failures(report)]
+def pages(report: Report, devices: Sequence[Report] = ()) -> dict[str, str]:
+    """The pages of a report of the CPU and of reports of devices, by path: an index, the figures, a page for each group
+    and for each device. The same reports give the same text."""
+    found = {FIGURES_PAGE: _join(_figures(report))}
+    for group in GROUP_WORDS:
+        if any(row.group == group for row in report.results):
+            found[f"benchmarks/{group}.md"] = _join(_of_group(group, report))
     for title in dict.fromkeys(_title(each) for each in devices):
-        parts += _on_device(title, [each for each in devices if _title(each) == title], report)
-    parts += [
+        name = re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")
+        parts = _on_device(title, [each for each in devices if _title(each) == title], report)
+        found[f"benchmarks/gpu-{name}.md"] = _join(parts)
+    return {INDEX: _join(_index(report, found, has_device=bool(devices))), **found}
+
+
+def _join(parts: Sequence[str]) -> str:
+    return "\n\n".join(parts) + "\n"
+
+
+def _index(report: Report, others: Mapping[str, str], *, has_device: bool) -> list[str]:
+    """The first page: pictures, the list of the other pages, and how to read them."""
+    rows = []
+    for name, text in others.items():
+        title = text.partition("\n")[0].removeprefix("# ")
+        group = Path(name).stem
+        count = "" if group not in GROUP_WORDS else str(sum(row.group == group for row in report.results))
+        rows.append([f"[{title}]({name})", count])
+    return [
+        "# Benchmarks",
+        f"{WRITTEN} Speed and error of tacsim next to other methods. Each page has the rows of one group.",
+        f"![Time against error, by method](images/{PICTURE})",
+        "*Lower left is better. `tacchi-settings`: one shared particle grid at the settings of Tacchi; `layer`: an "
+        "elastic layer by FFT; `seed`: the seed paper's scheme; `textbook`: MLS-MPM as in textbooks.*",
+        f"![Each figure over its requirement, by verdict](images/{VERDICTS})",
+        "*Each figure of the project, divided by its requirement. Left of the line it is met. "
+        f"[All figures]({FIGURES_PAGE}).*",
+        table(("page", "rows"), rows),
+        "## How to read and rerun",
+        MEASURED,
+        READING,
+        "## Machine",
+        setting(report),
+        *(["## Failed", _failures(report)] if report.failures else []),
         "## Not measured",
         *(["\n".join(f"- {m.case}: {m.cause}" for m in report.missing)] if report.missing else []),
         "Whether hard cases end their process is counted by a test, `test_no_case_ended_the_process` in "
         "`tests/stability`.",
-        *([] if devices else [NO_DEVICE]),
+        *([] if has_device else [NO_DEVICE]),
     ]
-    return "\n\n".join(parts) + "\n"
+
+
+def _figures(report: Report) -> list[str]:
+    """The page of the requirements and aims."""
+    lines = [*targets.lines(report.results), slowest_group(report)]
+    return ["# Requirements and aims", f"{WRITTEN} {FIGURES}", setting(report), table(targets.HEADER, lines)]
+
+
+def _of_group(group: str, report: Report) -> list[str]:
+    """The page of one group of cases."""
+    rows = [row for row in report.results if row.group == group]
+    parts = [f"# {GROUP_WORDS[group]}", f"{WRITTEN} [How to read the rows](../{INDEX}#how-to-read-and-rerun)."]
+    if group == "real":
+        parts.append(f"![Contact radius against depth: real, ours, and simpler theories](../images/{RADII})")
+    text = table(*oracles.lines(rows)) if group == "oracles" else table(COLUMNS, map(cells, rows))
+    return [*parts, text, "## Cases", *_remarks(rows)]
 
 
 def slowest_group(report: Report) -> list[str]:
@@ -145,21 +189,21 @@ def slowest_group(report: Report) -> list[str]:
 
 
 def _on_device(title: str, reports: Sequence[Report], cpu: Report) -> list[str]:
-    """The section of one device."""
+    """The page of one device."""
     usual = {_identity(row): row.seconds for row in cpu.results}
 
     def ratio(row: Row) -> str:
         seconds = usual.get(_identity(row))
         return "" if seconds is None or row.seconds == 0 else f"{seconds / row.seconds:.3g} x"
 
-    parts = [f"## On a GPU: {title}", *dict.fromkeys(map(setting, reports)), ON_DEVICE]
+    parts = [f"# On a GPU: {title}", WRITTEN, *dict.fromkeys(map(setting, reports)), ON_DEVICE]
     for group, words in GROUP_WORDS.items():
         rows = [row for report in reports for row in report.results if row.group == group]
         if rows:
             lines = ([*cells(row), ratio(row)] for row in rows)
-            parts += [f"### {words}", table((*COLUMNS, "CPU / GPU"), lines), *_remarks(rows)]
+            parts += [f"## {words}", table((*COLUMNS, "CPU / GPU"), lines), *_remarks(rows)]
     failed = [_failures(report) for report in reports if report.failures]
-    parts += ["### Failed there", *failed] if failed else []
+    parts += ["## Failed there", *failed] if failed else []
     missing = [lack for report in reports for lack in report.missing]
     for cause in dict.fromkeys(lack.cause for lack in missing):
         cases = dict.fromkeys(f"{lack.case}, {lack.method}" for lack in missing if lack.cause == cause)

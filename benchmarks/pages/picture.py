@@ -7,9 +7,12 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from benchmarks.harness.schema import Row
+from benchmarks.pages.targets import TARGETS, Target
 
 PICTURE = "speed_vs_error.png"
 RADII = "contact_radius.png"
+VERDICTS = "figures.png"
+VERDICT_COLOURS = {"aim met": "C2", "met": "C0", "aim missed": "C1", "missed": "C3"}
 # of each panel: case, variant ("" for any), title, unit of the error
 PANELS = (
     ("sphere_press", "", "Ball R 4 mm, 1 mm deep", "error of the surface [µm rms]"),
@@ -40,7 +43,7 @@ def draw(rows: Sequence[Row], path: Path) -> None:
     panels = [(panel, _points(rows, *panel[:2])) for panel in PANELS]
     drawn = [(panel, points) for panel, points in panels if points] or [(PANELS[0], [])]
     methods = list(dict.fromkeys(row.method for _, points in drawn for row in points))
-    figure = new_figure(4.6 * len(drawn), 3.8)
+    figure = new_figure(4.1 * len(drawn), 3.8)
     figure.set_layout_engine("constrained")
     for index, ((_, _, title, unit), points) in enumerate(drawn):
         axes = style_axes(figure.add_subplot(1, len(drawn), index + 1), title, "seconds (wall)", unit)
@@ -78,6 +81,41 @@ def _points(rows: Iterable[Row], case: str, variant: str) -> list[Row]:
         row for row in rows
         if row.case == case and (not variant or row.variant == variant) and row.error > 0 and row.seconds > 0
     ]  # fmt: skip
+
+
+def draw_verdicts(rows: Sequence[Row], path: Path, targets: Iterable[Target] = TARGETS) -> None:
+    """Each figure over its requirement (or, without one, its aim), sorted, a colour for each verdict.
+
+    A figure that must be large is turned round: in the picture, less is better for all. Raises OSError.
+    """
+    from tacsim.report.figure import new_figure, save_figure, style_axes
+
+    found = sorted(
+        ((share, each) for each in targets if (share := _share_of_limit(each, rows)) is not None),
+        key=lambda pair: pair[0],
+    )
+    figure = new_figure(10, 3.6)
+    figure.set_layout_engine("constrained")
+    words = "below 1: within the requirement (without one: the aim)"
+    axes = style_axes(figure.add_subplot(), "Figures over their requirements", words, "figures")
+    axes.set(xscale="log", yticks=[])
+    axes.axvline(1.0, color="k", linewidth=0.8)
+    for verdict, colour in VERDICT_COLOURS.items():
+        here = [(share, k) for k, (share, target) in enumerate(found) if target.evaluate(target.find(rows)) == verdict]
+        if here:
+            axes.plot(*zip(*here, strict=True), "o", color=colour, markersize=4, label=f"{verdict}: {len(here)}")
+    if found:
+        axes.legend(fontsize=8, frameon=False, loc="lower right")
+    save_figure(figure, path)
+
+
+def _share_of_limit(target: Target, rows: Sequence[Row]) -> float | None:
+    """The value over the limit, turned round where more is better; None without a value, or where it is zero."""
+    limit = target.aim if target.must is None else target.must
+    value = target.find(rows)
+    if not value or not limit:
+        return None
+    return limit / value if target.at_least else value / limit
 
 
 def draw_radii(rows: Sequence[Row], path: Path) -> bool:

@@ -32,7 +32,7 @@ MAX_REPLAY_STEPS = 1_000_000  # of a replay, which ends with its recording
 
 def run(
     rig: Annotated[
-        str, typer.Argument(help="A rig (sim, press, mock, ur5e, ur5e-one, replay), or the path of its file.")
+        str, typer.Argument(help="A rig (sim, press, mock, ur5e, ur5e-one, stand, replay), or the path of its file.")
     ] = "sim",
     task: Annotated[
         str | None,

@@ -69,7 +69,7 @@ def press(scene: Scene, sensor: SensorModel, motion: PressMotion, render: Render
 
     Raises:
         ValueError: the scene has no indenter, the depth is not within the gel, or slide or twist exceeds its limit.
-        SimulationDiverged.
+        SimulationDiverged: the motion did not reach a physical state.
     """
     if scene.indenter is None:
         raise ValueError(f"scene '{scene.name}' has no indenter; press needs one, and no body")

@@ -1,6 +1,6 @@
 """Tuned constants of scenes: how fast motions are by default, and what a scene may ask for.
 
-Each entry: what it is, its unit, and what it was measured on where it was. Sources: docs/physics.md ("Speed"),
+Each entry: what it is, its unit, and what it was measured on where it was. Sources: docs/physics-motion.md ("Speed"),
 docs/measurements/physics.md, docs/decisions/0002-quasi-static-controller.md, and the tests in tests/tacsim/models.
 """
 

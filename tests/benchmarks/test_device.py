@@ -12,7 +12,7 @@ from benchmarks.cases.registry import CPU_ONLY, select_cases
 from benchmarks.harness import machine
 from benchmarks.harness.runner import run_cases
 from benchmarks.harness.schema import Device, Failure, Missing, Report, Row, json_schema
-from benchmarks.pages.page import NO_DEVICE, markdown
+from benchmarks.pages.page import INDEX, NO_DEVICE, pages
 from tests.robot.cli.invoked import tacsim, told
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -128,10 +128,12 @@ def test_the_page_shows_a_device_and_how_much_faster_it_is(cpu: Report) -> None:
     lack = Missing(group="materials", case="momentum", method="tacsim", resolution="dx", cause=CPU_ONLY)
     first = on(GPU, cpu, [faster(press, 4.0), new], failures=[lost])
     second = on(GPU, cpu, [faster(step, 12.5)], missing=[lack])
-    page = markdown(cpu, [first, second])
-    assert page.startswith(markdown(cpu).partition("## Not measured")[0])  # nothing of the CPU's changes
-    assert page.count("## On a GPU: ") == 1 and NO_DEVICE not in page and NO_DEVICE in markdown(cpu)
-    section = page.partition("## On a GPU: Made-up 9000\n")[2].partition("\n## Not measured")[0]
+    found, alone = pages(cpu, [first, second]), pages(cpu)
+    assert [name for name in alone if alone[name] != found[name]] == [INDEX]  # nothing of the CPU's changes
+    assert set(found) - set(alone) == {"benchmarks/gpu-made-up-9000.md"}
+    assert NO_DEVICE not in found[INDEX] and NO_DEVICE in alone[INDEX]
+    section = found["benchmarks/gpu-made-up-9000.md"]
+    assert section.startswith("# On a GPU: Made-up 9000\n")
     assert f"Made-up 9000 (cuda, 24 GB, driver 555.1) next to {cpu.metadata.machine.cpu}," in section
     assert "| substeps | CPU / GPU |" in section
     lines = [line for line in section.splitlines() if line.startswith("| ")]
@@ -141,14 +143,13 @@ def test_the_page_shows_a_device_and_how_much_faster_it_is(cpu: Report) -> None:
     assert "- flat_punch, tacsim, h: it broke" in section
     assert f"Not measured there ({CPU_ONLY}): momentum, tacsim." in section
     other = on(Device(backend="vulkan"), cpu, [press])
-    assert "## On a GPU: a vulkan device\n" in markdown(cpu, [first, other, second])
+    assert "benchmarks/gpu-a-vulkan-device.md" in pages(cpu, [first, other, second])
 
 
 def test_a_ratio_is_of_the_very_same_row(cpu: Report) -> None:
     press = row(cpu, "sphere_press")
     for changes in ({"resolution": "h 9 mm"}, {"variant": "other"}, {"method": "other"}, {"seconds": 0.0}):
-        page = markdown(cpu, [on(GPU, cpu, [faster(press, 4.0, **changes)])])
-        section = page.partition("## On a GPU")[2]
+        section = pages(cpu, [on(GPU, cpu, [faster(press, 4.0, **changes)])])["benchmarks/gpu-made-up-9000.md"]
         assert "| sphere_press" in section and " x |" not in section
 
 
@@ -159,8 +160,8 @@ def test_the_command_puts_reports_together(cpu: Report, tmp_path: Path) -> None:
     gpu, more = saved(tmp_path, gpu=press, more=squeeze)
     result = tacsim("bench", "--from", gpu, "--from", REFERENCE, "--from", more, "--docs", tmp_path / "docs")
     assert result.exit_code == 0, result.output
-    page = (tmp_path / "docs" / "benchmarks.md").read_text(encoding="utf-8")
-    assert page == markdown(cpu, [press, squeeze])
+    for name, text in pages(cpu, [press, squeeze]).items():
+        assert (tmp_path / "docs" / name).read_text(encoding="utf-8") == text
     shown = tacsim("bench", "--from", REFERENCE, "--from", gpu)
     assert shown.exit_code == 0 and "tacchi-settings" in shown.stdout
     assert shown.stdout.index("tacchi-settings") < shown.stdout.index("Made-up 9000 (cuda, 24 GB, driver 555.1)")

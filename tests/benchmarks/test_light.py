@@ -13,7 +13,7 @@ from benchmarks.cases.real import balls, costs, invariance, known_depth, punches
 from benchmarks.cases.real.labels import BadData, read_labels
 from benchmarks.cases.registry import description, select_cases
 from benchmarks.harness.runner import run_cases
-from benchmarks.pages.page import markdown
+from benchmarks.pages.page import INDEX, pages
 from benchmarks.truth.layer import layer_contact
 from tests.calibration.presses import BALL, COLUMNS, PITCH, ROWS, HiddenSensor
 
@@ -164,7 +164,7 @@ def test_what_a_folder_lacks_is_said_and_is_no_failure(folder: Path) -> None:
     report = run_cases([case for case in cases if case.missing], 1, baselines=False)
     assert report.failures == [] and report.results == []
     assert {one.cause for one in report.missing} == set(lacking.values())
-    assert "- ball_presses: lost: no nowhere" in markdown(report)
+    assert "- ball_presses: lost: no nowhere" in pages(report)[INDEX]
     there = {case.name for case in cases if not case.missing}
     assert {balls.CASE, known_depth.CASE, punches.CASE, invariance.CASE, costs.RENDER, costs.NORMALISE} <= there
     assert all(description("real", case.name, case.method) for case in cases)

@@ -5,15 +5,17 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from matplotlib.image import imread
 
-from benchmarks.harness.schema import Report
+from benchmarks.harness.schema import Report, Row
 from benchmarks.pages import reliability
-from benchmarks.pages.page import cells, costs, markdown
-from benchmarks.pages.picture import PICTURE, RADII, draw, draw_radii
+from benchmarks.pages.page import FIGURES_PAGE, INDEX, cells, costs, pages
+from benchmarks.pages.picture import PICTURE, RADII, VERDICTS, draw, draw_radii, draw_verdicts
+from benchmarks.pages.targets import TARGETS
 from tests.robot.cli.invoked import tacsim
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -28,9 +30,12 @@ def report() -> Report:
 def test_the_published_pages_are_those_of_the_published_reports(report: Report) -> None:
     gpus = [Report.model_validate_json(p.read_bytes()) for p in sorted((ROOT / "benchmarks" / "gpu").glob("*.json"))]
     robot = Report.model_validate_json((ROOT / "benchmarks" / "reliability.json").read_bytes())
-    pages = {"benchmarks.md": markdown(report, gpus), "reliability.md": reliability.markdown(robot)}
-    stale = [name for name, made in pages.items() if (ROOT / "docs" / name).read_text(encoding="utf-8") != made]
-    assert stale == [], "run `tacsim bench --from benchmarks/NAME.json --docs docs`, with every report of the page"
+    made = {**pages(report, gpus), "reliability.md": reliability.markdown(robot)}
+    stale = [name for name, text in made.items() if (ROOT / "docs" / name).read_text(encoding="utf-8") != text]
+    left = {f"benchmarks/{path.name}" for path in (ROOT / "docs/benchmarks").glob("*.md")} - set(made)
+    assert stale == [] and left == set(), (
+        "run `tacsim bench --from benchmarks/NAME.json --docs docs`, with every report of the page"
+    )
 
 
 def test_the_published_report_is_whole(report: Report) -> None:
@@ -70,12 +75,37 @@ def test_a_report_is_shown_and_written_again_without_measuring(tmp_path: Path, r
     again = Report.model_validate_json((tmp_path / "new" / "again.json").read_bytes())
     assert again == report
     assert imread(tmp_path / "new" / PICTURE).std() > 0.01
-    assert (tmp_path / "docs" / "benchmarks.md").is_file() and (tmp_path / "docs" / "images" / PICTURE).is_file()
+    made = {name: (tmp_path / "docs" / name).read_text(encoding="utf-8") for name in pages(report)}
+    assert made == pages(report)
+    assert all((tmp_path / "docs" / "images" / name).is_file() for name in (PICTURE, VERDICTS, RADII))
 
 
-def test_a_picture_of_nothing_is_drawn_too(tmp_path: Path) -> None:
-    draw([], tmp_path / "empty.png")
+@pytest.mark.parametrize("make", [draw, draw_verdicts])
+def test_a_picture_of_nothing_is_drawn_too(make: Callable[[list[Row], Path], None], tmp_path: Path) -> None:
+    make([], tmp_path / "empty.png")
     assert imread(tmp_path / "empty.png").shape[2] in (3, 4)
+
+
+def test_every_row_is_on_one_page_and_the_index_leads_to_all(report: Report) -> None:
+    found = pages(report)
+    names = {f"benchmarks/{group}.md" for group in {row.group for row in report.results}} | {FIGURES_PAGE}
+    assert set(found) == names | {INDEX}
+    assert all(f"]({name})" in found[INDEX] for name in names)
+    assert f"](images/{PICTURE})" in found[INDEX] and f"](images/{VERDICTS})" in found[INDEX]
+    for group in {row.group for row in report.results} - {"oracles"}:  # there a line is a case
+        lines = [line for line in found[f"benchmarks/{group}.md"].splitlines() if line.startswith("| ")]
+        assert len(lines) == 1 + sum(row.group == group for row in report.results)
+
+
+def test_the_picture_of_figures_shows_how_many_met_their_requirement(tmp_path: Path, report: Report) -> None:
+    """A figure twice its requirement moves a point to the right of the line."""
+    target = next(each for each in TARGETS if each.must is not None and each.find(report.results) is not None)
+    limit = target.find(report.results)
+    shown = []
+    for must in (2 * limit, limit / 2):
+        draw_verdicts(report.results, tmp_path / "one.png", [target.model_copy(update={"must": must, "aim": None})])
+        shown.append(imread(tmp_path / "one.png"))
+    assert abs(shown[0] - shown[1]).max() > 0.1
 
 
 def test_a_failure_is_shown_and_is_the_exit_code(tmp_path: Path, report: Report) -> None:
@@ -142,18 +172,19 @@ def test_a_foreign_package_of_that_name_is_not_taken(tmp_path: Path) -> None:
 
 
 def test_the_page_shows_figures_and_a_missed_one(report: Report) -> None:
-    page = markdown(report)
-    assert "| figure | measured | must | aim | verdict |" in page and "## How to read and rerun" in page
+    found = pages(report)
+    assert "| figure | measured | must | aim | verdict |" in found[FIGURES_PAGE]
+    assert "## How to read and rerun" in found[INDEX]
     late = {"figures": {"second_ms": 99.0}}
     slow = [row.model_copy(update=late) for row in report.results if row.case == "second_world"]
-    missed = markdown(report.model_copy(update={"results": slow}))
+    missed = pages(report.model_copy(update={"results": slow}))[FIGURES_PAGE]
     assert "| a second world is ready | 99 ms | ≤ 50 |  | **missed** |" in missed
 
 
 def test_the_page_shows_how_long_a_group_takes(report: Report) -> None:
     def page(**seconds: float) -> str:
-        return markdown(report.model_copy(update={"metadata": report.metadata.model_copy(
-            update={"group_seconds": seconds})}))  # fmt: skip
+        metadata = report.metadata.model_copy(update={"group_seconds": seconds})
+        return pages(report.model_copy(update={"metadata": metadata}))[FIGURES_PAGE]
 
     name = "a group without `--baselines` and `--long`"
     assert f"| {name} (press 12 s, squeeze 39 s) | 39.4 s | ≤ 40 |  | met |" in page(press=12.3, squeeze=39.4)
@@ -168,7 +199,7 @@ def test_real_rows_bring_their_picture(tmp_path: Path, report: Report) -> None:
     row = report.results[0].model_copy(update=changes)
     made_up = report.model_copy(update={"results": [row for row in report.results if row.group != "real"]})
     more = made_up.model_copy(update={"results": [*made_up.results, row]})
-    assert f"](images/{RADII})" in markdown(more) and f"](images/{RADII})" not in markdown(made_up)
+    assert f"](../images/{RADII})" in pages(more)["benchmarks/real.md"] and "benchmarks/real.md" not in pages(made_up)
     assert not draw_radii(made_up.results, tmp_path / RADII) and not (tmp_path / RADII).exists()
     (tmp_path / "real.json").write_text(more.model_dump_json(), encoding="utf-8")
     result = tacsim("bench", "--from", tmp_path / "real.json", "--docs", tmp_path)

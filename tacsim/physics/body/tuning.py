@@ -1,6 +1,6 @@
 """Tuned constants of the elastoplastic body and its grid.
 
-Each entry: what it is, its unit, and the error without it. Sources: docs/physics.md ("Plasticine"),
+Each entry: what it is, its unit, and the error without it. Sources: docs/physics-body.md,
 docs/measurements/physics.md, and the tests in tests/tacsim/physics/body.
 """
 

@@ -3,7 +3,7 @@
 Each surface cell has 3 x 3 points of equal area. The normal pressure is the pressure stored at the surface's nodes (a
 multiplier; augmented Lagrangian, Simo & Laursen 1992) plus a penalty of the overlap at the point, which stands for the
 compliance of a half-space between the nodes. Friction stores the point of the indenter to which a point sticks. All
-else is in the sensor frame [mm, MPa]. Why: docs/physics.md.
+else is in the sensor frame [mm, MPa]. Why: docs/physics-contact.md.
 """
 
 from typing import Any, NamedTuple

@@ -1,6 +1,6 @@
 """Tuned constants of contact.
 
-Each entry: what it is, its unit, and the error without it. Sources: docs/physics.md ("Contact"),
+Each entry: what it is, its unit, and the error without it. Sources: docs/physics-contact.md,
 docs/measurements/physics.md, and the tests in tests/tacsim/physics/contact.
 """
 

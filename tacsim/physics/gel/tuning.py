@@ -1,6 +1,6 @@
 """Tuned constants of the gel's elements.
 
-Each entry: what it is, its unit, and the error without it. Sources: docs/physics.md ("Gel"),
+Each entry: what it is, its unit, and the error without it. Sources: docs/physics-gel.md,
 docs/measurements/physics.md, and the tests in tests/tacsim/physics/gel.
 """
 

@@ -1,6 +1,6 @@
 """Slides of an indenter with friction over a gel: reductions of their speed, and limits of the quasi-static motion.
 
-A contact that slips keeps the shear at the end of a motion. Reasons for each rule: docs/physics.md, "Controller".
+A contact that slips keeps the shear at the end of a motion. Reasons for each rule: docs/physics-motion.md.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Tuned constants of motions: controller, paths, slides and motions at constant load.
 
-Each entry: what it is, its unit, and the error without it. Sources: docs/physics.md ("Controller"),
+Each entry: what it is, its unit, and the error without it. Sources: docs/physics-motion.md,
 docs/measurements/physics.md, docs/decisions/0002-quasi-static-controller.md, and the tests in
 tests/tacsim/physics/motion.
 """

@@ -1,6 +1,6 @@
 """Tuned constants of the seed paper's scheme.
 
-Each entry: what it is, its unit, and the error without it. Sources: docs/physics.md ("The seed paper's scheme"), and
+Each entry: what it is, its unit, and the error without it. Sources: docs/physics-execution.md, and
 the tests in tests/tacsim/physics/seed.
 """
 

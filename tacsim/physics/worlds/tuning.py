@@ -1,6 +1,6 @@
 """Tuned constants of worlds: time step, damping, and limits within which a motion counts as settled.
 
-Each entry: what it is, its unit, and the error without it. Sources: docs/physics.md ("Contact", "Controller"),
+Each entry: what it is, its unit, and the error without it. Sources: docs/physics-contact.md, docs/physics-motion.md,
 docs/measurements/physics.md, docs/decisions/0002-quasi-static-controller.md, and the tests in
 tests/tacsim/physics/worlds.
 """

@@ -23,7 +23,7 @@ from tests.robot.cli.terminal import Terminal
 if find_spec("rtde_control") is None:
     pytest.skip("ur_rtde has no wheel for this Python and machine", allow_module_level=True)
 
-PAGES = ("README.md", "bringup.md", "hand-eye.md")
+PAGES = ("uses.md", "bringup.md", "hand-eye.md")
 
 pytestmark = pytest.mark.usefixtures("empty_folder")
 

@@ -200,7 +200,7 @@ def test_outputs_of_a_notebook_are_shown(tmp_path: Path) -> None:
     assert notebook.markdown(tmp_path / "one.ipynb") == "```python\n1 + 1\n```\n\n```text\n2\n```\n"
 
 
-@pytest.mark.deep
+@pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_the_cells_of_the_notebook_run(tmp_path: Path) -> None:
     """In one program, as a notebook runs them."""

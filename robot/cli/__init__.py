@@ -32,7 +32,7 @@ from robot.cli.identify import body, gel, identify
 from robot.cli.learn import evaluate, export, policy, policy_range, train, transfer
 from robot.cli.mock import mock
 from robot.cli.recordings import lerobot, recover, view
-from robot.cli.run import replay, run
+from robot.cli.run import film, replay, run
 from robot.cli.simulate import debug, press, reproduce
 
 app = typer.Typer(
@@ -55,6 +55,7 @@ COMMANDS = {
         press,
         reproduce,
         replay,
+        film,
         view,
         recover,
         mock,

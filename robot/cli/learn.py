@@ -43,16 +43,23 @@ def train(
     resume: Annotated[
         Path | None, typer.Option(help="The folder of a run that was stopped: it is continued to the same result.")
     ] = None,
+    tensorboard: Annotated[
+        bool,
+        typer.Option("--tensorboard", help="PPO, SAC: also log for TensorBoard, to OUT/tensorboard (its package)."),
+    ] = False,
     set_: Overrides = None,
     out: Out = None,
 ) -> None:
     """Train a policy in simulation, and write it as a file for `tacsim run RIG --policy FILE`.
 
-    A checkpoint is written after each round; `--resume` continues a run that was stopped. Needs the extra `train`.
+    A checkpoint and the learning curve (curve.png) are written after each round; `--resume` continues a run that was
+    stopped. Needs the extra `train`.
 
     Example: tacsim train squeeze --out runs/squeeze-0
     """
     require_packages("tacsim train", "train", *TRAINING)
+    if tensorboard:
+        _require_tensorboard()
     own = [f"algorithm={algorithm}"] * (algorithm is not None) + [f"seed={seed}"] * (seed is not None) + (set_ or [])
     if resume is not None:
         if task is not None or own or out is not None:
@@ -64,6 +71,7 @@ def train(
             from robot.train.run_folder import RunFolder
 
             run = RunFolder(resume)
+        _require_logged(run.settings.training.algorithm, tensorboard)
     else:
         if task is None:
             raise typer.BadParameter("name a task (squeeze, reposition, knead), or a run to continue (--resume)")
@@ -71,6 +79,7 @@ def train(
         from tacsim.models.training import Training
 
         training = load_model(Training, task, own)
+        _require_logged(training.algorithm, tensorboard)
         folder = new_directory(out, f"train-{training.task}")
         with busy("loading"):
             from robot.train.train import begin_run
@@ -79,7 +88,7 @@ def train(
     from tacsim.tasks.task import BadDraws
 
     try:
-        path = _run_training(run)
+        path = _run_training(run, tensorboard)
     except BadDraws:
         if run.load_checkpoint()[0]:
             notes.print(f"The last checkpoint is kept. Write it as a file: tacsim export policy {run.folder}")
@@ -87,11 +96,28 @@ def train(
     except (KeyboardInterrupt, OSError):
         notes.print(f"The last checkpoint is kept. Continue: tacsim train --resume {run.folder}")
         raise
-    print_files(path, run.folder / "curve.json")
+    print_files(path, run.folder / "curve.png", run.folder / "curve.json")
     notes.print(f"Next: tacsim evaluate {task or run.settings.training.task} --policy {path} --policy scripted")
 
 
-def _run_training(run: RunFolder) -> Path:
+def _require_tensorboard() -> None:
+    from importlib.util import find_spec
+
+    from robot.open import CannotOpen
+
+    if find_spec("tensorboard") is None:
+        raise CannotOpen("--tensorboard needs tensorboard, which is not installed: pip install tensorboard")
+
+
+def _require_logged(algorithm: str, tensorboard: bool) -> None:
+    if tensorboard and algorithm == "dagger":
+        raise typer.BadParameter(
+            "dagger writes no log for TensorBoard: see curve.png, or choose --algorithm ppo or sac",
+            param_hint="--tensorboard",
+        )
+
+
+def _run_training(run: RunFolder, tensorboard: bool) -> Path:
     from robot.train.train import train as continue_training
 
     def print_result(figures: Mapping[str, float]) -> None:
@@ -103,7 +129,7 @@ def _run_training(run: RunFolder) -> Path:
         )
 
     with one_bar("starting") as bar:
-        return continue_training(run, bar.report, print_result, warn)
+        return continue_training(run, bar.report, print_result, warn, tensorboard)
 
 
 def policy(

@@ -12,7 +12,20 @@ import typer
 
 from robot.cli.errors import EXIT_FAILED, print_error
 from robot.cli.options import Out, Overrides
-from robot.cli.output import Bar, busy, new_directory, notes, one_bar, report_mesh_measuring, results, warn, writing
+from robot.cli.output import (
+    Bar,
+    busy,
+    counted,
+    new_directory,
+    notes,
+    one_bar,
+    print_files,
+    report_mesh_measuring,
+    require_writable,
+    results,
+    warn,
+    writing,
+)
 from robot.cli.terminal import Interrupt, ask_operator, require_operator
 
 if TYPE_CHECKING:
@@ -56,6 +69,9 @@ def run(
         bool,
         typer.Option("--dry-run", help="Hardware: connect, observe, measure periods and record, but send no motion."),
     ] = False,
+    film: Annotated[
+        Path | None, typer.Option(metavar="FILE.mp4|gif", help="Also write a film of it (mp4: extra 'video').")
+    ] = None,
     view: Annotated[bool, typer.Option("--view", help="Show it live in Rerun (extra 'viz').")] = False,
     save_view: Annotated[
         Path | None,
@@ -76,6 +92,8 @@ def run(
 
     if save_view is not None and save_view.suffix != ".rrd":
         raise typer.BadParameter(f"{save_view} must end in .rrd, as the viewer's files do", param_hint="--save-view")
+    if film is not None:
+        _require_film(film, "--film")
     sys.path.append(str(Path.cwd()))  # --policy mine:act finds mine.py here, as with `python -m`; last on the path
     loaded = load_with_task(rig, task, set_ or [])
     for words in loaded.notes:
@@ -90,7 +108,7 @@ def run(
     name = policy if policy is not None else ("grip" if own_task is None else "scripted")
     with Interrupt() as interrupt:
         views = [None] * view + [save_view] * (save_view is not None)
-        failed = _run(loaded, name, steps, seed, folder, interrupt, dry_run, views)
+        failed = _run(loaded, name, steps, seed, folder, interrupt, dry_run, views, film)
         if interrupt():
             print_error("stopped by a signal before the last step; all finished steps are saved")
             raise typer.Exit(interrupt.exit_code)
@@ -107,6 +125,7 @@ def _run(
     interrupt: Interrupt,
     dry_run: bool,
     views: Sequence[Path | None],
+    film: Path | None,
 ) -> bool:
     """Runs and reports the episode; returns True if it or its recording failed. The folder is made when the episode
     starts, so a run that cannot start leaves none."""
@@ -122,7 +141,7 @@ def _run(
         notes.print(begun)
     task = None if loaded.config.task is None else make_task(loaded.config.task)
     setup = EpisodeSetup(
-        policy, seed, {"rig.yaml": loaded.text.encode()}, loaded.config.canonical, loaded.config.record.body
+        policy, seed, {"rig.yaml": loaded.text.encode()}, loaded.config.canonical, loaded.config.records_body
     )
     recorder: Recorder | None = None
     fitting: list[Policy] = []
@@ -162,6 +181,8 @@ def _run(
         return True
     episode.dropped = recorder.dropped
     _write_report(episode, folder, [folder / "episode.mcap"])
+    if film is not None:
+        _write_film(episode, film)
     return bool(failure or lost)
 
 
@@ -246,6 +267,44 @@ def replay(
     _write_report(episode, folder, [])
 
 
+def film(
+    file: Annotated[Path, typer.Argument(metavar="EPISODE", help="An episode.mcap; one that was cut off will do.")],
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE.mp4|gif", help="The film.", show_default="EPISODE with .gif")
+    ] = None,
+) -> None:
+    """Make a film of a recorded episode: the body between its gels, pictures, force and reward.
+
+    The body is recorded by simulated rigs. An MP4 needs the extra 'video'.
+
+    Example: tacsim film runs/first/episode.mcap --out first.gif
+    """
+    target = file.with_suffix(".gif") if out is None else out
+    _require_film(target, "--out")
+    with busy("reading"):
+        from tacsim.record.reader import read_episode
+
+        episode = read_episode(file)
+    _write_film(episode, target)
+
+
+def _require_film(path: Path, option: str) -> None:
+    from tacsim.report.film import require_film
+
+    require_film(path)
+    require_writable(path, option, new=True)
+
+
+def _write_film(episode: Episode, path: Path) -> None:
+    from robot.rig.recorded import RecordedSurfaces
+    from tacsim.report.film import write_film
+
+    with counted("film") as on_frame, writing(path.parent):
+        surfaces = RecordedSurfaces(episode.meta)
+        write_film(episode, path, surfaces, surfaces.gels, on_frame)
+    print_files(path)
+
+
 def _write_report(episode: Episode, folder: Path, files: Sequence[Path]) -> None:
     """Writes the report and prints its table."""
     import json
@@ -255,7 +314,7 @@ def _write_report(episode: Episode, folder: Path, files: Sequence[Path]) -> None
 
     with busy("writing the report"), writing(folder):
         surfaces = RecordedSurfaces(episode.meta)
-        paths = write_report(episode, folder, surfaces)
+        paths = write_report(episode, folder, surfaces, surfaces.gels)
         stats = json.loads(paths["summary.json"].read_text(encoding="utf-8"))
     for words in surfaces.notes:
         notes.print(words)

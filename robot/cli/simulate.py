@@ -73,8 +73,10 @@ def press(
     set_: Overrides = None,
     out: Out = None,
 ) -> None:  # fmt: skip
-    """Press a rigid indenter on one gel: rgb.png, height.npy, height.png, press.json with force and contact radius, and
-    side.png, which shows the side that presses.
+    """Press a rigid indenter on one gel: press.html, a page with picture, height in 3-D and force over depth.
+
+    Also rgb.png, height.npy, height.png, press.json with force and contact radius, and side.png, which shows the side
+    that presses.
 
     --set changes the scene, for example --set indenter.friction=0.3 (see tacsim schema scene).
 
@@ -115,9 +117,10 @@ def press(
                         f"{possible * 1e3:g} mm is possible, as tested: --depth '{possible * 1e3:g} mm'"
                     )
                 raise
+        curve = presses.force_curve(scene, motion)
     config = presses.press_report(scene, motion, pressed, model)
     with writing(folder, new=True):
-        presses.write(folder, pressed, config, scene, model)
+        presses.write(folder, pressed, config, scene, model, curve)
     results.print(f"pressing side    {config['pressing_side']}")
     results.print(f"force            {config['force']:.4f} N")
     results.print(f"contact radius   {config['contact_radius'] * 1e3:.3f} mm")

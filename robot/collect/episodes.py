@@ -112,7 +112,7 @@ class EpisodeWorker:
             policy, task = _load_policy_and_task(settings, loaded, rig.spec, rig.name, number)
             canonical = loaded.config.canonical
             attached = {"rig.yaml": loaded.text.encode()}
-            setup = EpisodeSetup(settings.policy, seed, attached, canonical, loaded.config.record.body)
+            setup = EpisodeSetup(settings.policy, seed, attached, canonical, bool(loaded.config.record.body))
             recorders: list[Recorder] = []
 
             def record(meta: EpisodeMeta) -> Recorder:

@@ -22,7 +22,7 @@ Time lines: `time` [s] since reset, on the rig's clock, and `step`.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +42,9 @@ if TYPE_CHECKING:
 AXES = {"x": (220, 60, 60), "y": (60, 180, 60), "z": (70, 110, 240)}
 COLOURS = np.array([(70, 70, 90), (60, 120, 190), (90, 200, 130), (250, 230, 60)], np.float64)  # by depth
 ARROW = 0.1e-3  # radius [m]
+GEL_WIDTH = 20e-3  # about, for the distance of the camera [m]
+PLOTS = {"force": "force [N]", "task": "reward, distance [mm]"}  # entity and name
+MORE_PLOTS = {"limits": "limits hit", "diagnostics": "diagnostics"}
 
 
 class EpisodeLog:
@@ -175,32 +178,41 @@ class EpisodeLog:
         self._recording.log(entity, rr.Scalars([value]))
 
 
-def blueprint(spec: RigSpec) -> rrb.Blueprint:
-    """The gels in space on the left, pictures in the middle, numbers on the right."""
+def blueprint(spec: RigSpec, arms: Mapping[str, ArmState]) -> rrb.Blueprint:
+    """Two tabs: the episode (gels in space, camera pictures, force and reward), and the diagnostics.
+
+    arms: those of the first step, at which the camera of the view in space looks.
+    """
     import rerun.blueprint as rrb
 
-    pictures = [
-        rrb.Spatial2DView(origin=f"/{kind}/{name}", name=f"{kind} {name}")
-        for name in spec.sensors
-        for kind in ("camera", "canonical")
-    ]
-    plots = {
-        "force": "force [N]",
-        "task": "reward, distance [mm]",
-        "limits": "limits hit",
-        "diagnostics": "diagnostics",
-    }
-    numbers = [rrb.TimeSeriesView(origin=f"/{origin}", name=name) for origin, name in plots.items()]
-    return rrb.Blueprint(
-        rrb.Horizontal(
-            rrb.Spatial3DView(origin="/world", name="gels"),
-            rrb.Grid(*pictures, grid_columns=2),
-            rrb.Vertical(*numbers, rrb.TextLogView(origin="/status", name="status")),
-            column_shares=[3, 3, 2],
-        ),
-        rrb.TimePanel(state="collapsed"),
-        collapse_panels=True,
+    space = rrb.Spatial3DView(origin="/world", name="gels", **_camera_option(arms))
+    cameras = [rrb.Spatial2DView(origin=f"/camera/{name}", name=name) for name in spec.sensors]
+    canonical = [rrb.Spatial2DView(origin=f"/canonical/{name}", name=f"canonical {name}") for name in spec.sensors]
+    plots = [rrb.TimeSeriesView(origin=f"/{origin}", name=name) for origin, name in PLOTS.items()]
+    more = [rrb.TimeSeriesView(origin=f"/{origin}", name=name) for origin, name in MORE_PLOTS.items()]
+    episode = rrb.Horizontal(
+        space, rrb.Vertical(rrb.Horizontal(*cameras), *plots), column_shares=[3, 2], name="episode"
     )
+    diagnostics = rrb.Vertical(
+        rrb.Horizontal(*canonical), rrb.Horizontal(*more, rrb.TextLogView(origin="/status", name="status")),
+        name="diagnostics",
+    )  # fmt: skip
+    return rrb.Blueprint(
+        rrb.Tabs(episode, diagnostics, active_tab=0), rrb.TimePanel(state="collapsed"), collapse_panels=True
+    )
+
+
+def _camera_option(arms: Mapping[str, ArmState]) -> dict[str, Any]:
+    """The option of a view in space that puts its camera in front of the gels; Rerun before 0.27 has none."""
+    import rerun.blueprint as rrb
+
+    if not hasattr(rrb, "EyeControls3D"):
+        return {}
+    positions = np.array([state.pose.position for state in arms.values()]) if arms else np.zeros((1, 3))
+    middle = positions.mean(axis=0)
+    distance = 2.5 * max(GEL_WIDTH, float(np.ptp(positions, axis=0).max()))
+    eye = middle + distance * np.array([-0.45, -0.8, 0.4])
+    return {"eye_controls": rrb.EyeControls3D(position=eye, look_target=middle, eye_up=(0, 0, 1))}
 
 
 def _triangles(valid: NDArray[np.bool_]) -> NDArray[np.uint32]:

@@ -179,10 +179,13 @@ def open_log(spec: RigSpec, canonical: CanonicalGrid, rig: RigConfig | None, fil
     recording = rr.RecordingStream(APPLICATION)
     episode = EpisodeLog(recording, spec, canonical, _lattices(rig))
     with _show_in_viewer(recording) if file is None else _write_to_file(recording, file) as check:
-        recording.send_blueprint(blueprint(spec))
-        check()
+        is_laid_out = False
 
         def log(step: Step, observation: Observation, truth: Truth | None) -> None:
+            nonlocal is_laid_out
+            if not is_laid_out:
+                recording.send_blueprint(blueprint(spec, observation.arms))
+                is_laid_out = True
             episode.step(step, observation, truth)
             check()
 

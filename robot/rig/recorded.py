@@ -26,6 +26,7 @@ from tacsim.models.sensor import CanonicalGrid
 from tacsim.record.episode import Episode, EpisodeError, EpisodeMeta, Step
 from tacsim.record.images import reference_image
 from tacsim.record.reader import read_episode
+from tacsim.report.section import GelShape
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,13 +74,15 @@ class RecordedSurfaces:
     """Surfaces of an episode's gels, called with sensor and frame: the frame's own surface, or one that the sensor's
     normaliser in the episode's rig estimates from the image; None if neither exists.
 
-    Frames of a sensor may be skipped, but not go back in time. `notes`: texts about what a sensor lacks.
+    Frames of a sensor may be skipped, but not go back in time. `notes`: texts about what a sensor lacks. `gels`: the
+    shape of each simulated gel.
     """
 
     def __init__(self, meta: EpisodeMeta) -> None:
         """Raises EpisodeError for a reference image that cannot be read. An unreadable rig file is noted in `notes`."""
         self._normalisers: dict[str, Normaliser] = {}
         self.notes: list[str] = []
+        self.gels: dict[str, GelShape] = {}
         try:
             rig = rig_of(meta)
         except ConfigError as why:
@@ -89,6 +92,12 @@ class RecordedSurfaces:
             return
         if rig is None:
             return
+        if rig.scene is not None:
+            self.gels = {
+                name: GelShape(rig.scene.gel_of(name).size, rig.canonical.pitch, spec.arm)
+                for name, spec in meta.spec.sensors.items()
+                if spec.arm is not None
+            }
         for name, sensor in rig.sensors.items():
             untouched = reference_image(meta.attachments, name)
             if untouched is None or sensor.is_simulated or name not in meta.spec.sensors:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -256,10 +257,40 @@ def _edge_radius(scene: Scene) -> float | None:
     )
 
 
-def write(folder: Path, pressed: PressResult, config: dict[str, Any], scene: Scene, sensor: SensorModel) -> None:
-    """Writes rgb.png, height.npy (float32 [m], one value a pixel), height.png, side.png and press.json. Raises
-    OSError."""
+def force_curve(scene: Scene, motion: PressMotion) -> list[tuple[float, float]]:
+    """Depth [m] and normal force [N] at points of a press of its own, in which the gel settles at each depth. Stops
+    before a depth at which the simulation diverges."""
+    count = 6
+    world = PressWorld(scene)
+    start = world.pose("indenter")
+    below = world.lowest_point_depth(start.quaternion)
+    found = []
+    with dump_to_folder(None):
+        for depth in np.linspace(0.0, motion.depth, count + 1)[1:].tolist():
+            target = Pose(np.array([*start.position[:2], below - depth]), start.quaternion)
+            try:
+                world.move({"indenter": target})
+            except SimulationDiverged:
+                break
+            found.append((depth, -float(world.wrench("lower")[2])))
+    return found
+
+
+def write(
+    folder: Path,
+    pressed: PressResult,
+    config: dict[str, Any],
+    scene: Scene,
+    sensor: SensorModel,
+    curve: Sequence[tuple[float, float]],
+) -> None:
+    """Writes rgb.png, height.npy (float32 [m], one value a pixel), height.png, side.png, press.json and press.html.
+
+    curve: depth [m] and normal force [N] of points, see `force_curve`. Raises OSError.
+    """
     from PIL import Image
+
+    from tacsim.report.press_page import write_press_page
 
     assert scene.indenter is not None
     Image.fromarray(pressed.image).save(
@@ -272,4 +303,6 @@ def write(folder: Path, pressed: PressResult, config: dict[str, Any], scene: Sce
         folder / "side.png", scene.indenter.geometry, pressed.pose, lowest, pressed.height,
         image_grid(sensor.geometry), scene.gel, f"pressing side: {config['pressing_side']}",
     )  # fmt: skip
+    config = {**config, "force_curve": [list(point) for point in curve]}
     (folder / "press.json").write_text(json.dumps(config, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    write_press_page(folder / "press.html", folder, pressed.height, config, curve)

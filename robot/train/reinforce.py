@@ -26,9 +26,14 @@ Arrays = dict[str, NDArray[Any]]
 
 
 class Reinforce:
-    """PPO or SAC in `envs`. `actor` is exported as the policy file. SAC stores its replay buffer in `folder`."""
+    """PPO or SAC in `envs`. `actor` is exported as the policy file. SAC stores its replay buffer in `folder`.
 
-    def __init__(self, envs: TacsimVectorEnv, training: Training, actor: PolicyNetwork, folder: Path) -> None:
+    tensorboard: logs for TensorBoard are written to `folder/tensorboard`.
+    """
+
+    def __init__(
+        self, envs: TacsimVectorEnv, training: Training, actor: PolicyNetwork, folder: Path, tensorboard: bool = False
+    ) -> None:
         replay_steps = 50_000  # control steps in the replay buffer of SAC
         warm_up_steps = 1000  # control steps with random actions before SAC learns
         settings = training.reinforce
@@ -47,6 +52,7 @@ class Reinforce:
             "policy_kwargs": shape,
             "device": "cpu",
             "seed": training.seed,
+            "tensorboard_log": str(folder / "tensorboard") if tensorboard else None,
         }
         if training.algorithm == "ppo":
             self._model: Any = PPO("MultiInputPolicy", self._envs, n_steps=self._steps, **common)
@@ -63,15 +69,19 @@ class Reinforce:
         model.set_random_seed(int(random.integers(2**31)))  # of NumPy, torch, and the next reset of the environments
         model._last_obs = None  # so episodes start again
         watch = _EpisodeWatch(lambda done: report_progress(f"round {number + 1} of {self.rounds}", done, total))
-        model.learn(total, callback=watch, reset_num_timesteps=False)
+        model.learn(total, callback=watch, reset_num_timesteps=False, tb_log_name=type(model).__name__.lower())
         self._copy_actor()
         if isinstance(model, SAC):
             write_whole(self._folder / f"memory-{number % 2}.npz", self._write_memory)
         rewards, distances, successes, forces = np.array(watch.ends).T
-        return {
+        figures = {
             "steps": float(total), "distance": float(distances.mean()), "success": float(successes.mean()),
             "peak_force": float(forces.mean()), "return": float(rewards.mean()),
         }  # fmt: skip
+        for name, value in figures.items():
+            model.logger.record(f"round/{name}", value)
+        model.logger.dump(model.num_timesteps)
+        return figures
 
     def state(self) -> dict[str, Any]:
         return {

@@ -19,6 +19,7 @@ from gymnasium.vector import AutoresetMode
 
 from robot.common.whole_file import write_whole
 from robot.open import load_with_task, make_vector_env
+from robot.train.curve_picture import write_curve_picture
 from robot.train.dagger import Dagger
 from robot.train.measure_range import measure_range, write_range
 from robot.train.network import PolicyNetwork, export
@@ -37,7 +38,7 @@ from tacsim.models.text import printable_line
 from tacsim.models.training import Training
 from tacsim.tasks import GoalOutOfReach, make_task
 
-POLICY, CURVE = "policy.onnx", "curve.json"  # in the folder of a run
+POLICY, CURVE, CURVE_PICTURE = "policy.onnx", "curve.json", "curve.png"  # in the folder of a run
 Figures = Mapping[str, float]
 
 
@@ -124,11 +125,13 @@ def train(
     report_progress: ReportProgress = lambda words, done, of: None,
     report_result: Callable[[Figures], None] = lambda figures: None,
     warn: Callable[[str], None] = lambda words: None,
+    tensorboard: bool = False,
 ) -> Path:
     """Continues a run to its end, writes its policy to its folder and returns the file.
 
     report_result: called with the figures of each round: its number `round`, those of the learner, `refused` (draws
     that could not begin an episode and were repeated), and `seconds`. warn: called once for each refused draw.
+    tensorboard: the log of stable-baselines3 is written to `tensorboard/` in the run's folder.
     Raises RunError, BadDraws for too many refused draws, and OSError if the disk is full: the last checkpoint remains
     complete.
     """
@@ -136,7 +139,7 @@ def train(
     done, state, curve = run.load_checkpoint()
     envs = make_environments(run.settings.training)
     try:
-        learner = _make_learner(envs, run)
+        learner = _make_learner(envs, run, tensorboard)
         if done:
             with _checking_fit(run):
                 learner.restore(state)
@@ -153,6 +156,7 @@ def train(
             curve.append({"round": number + 1, **figures, "refused": count, "seconds": time.perf_counter() - began})
             # before the checkpoint: a completed round is not reported again
             write_whole(run.folder / CURVE, json.dumps(curve, indent=1).encode())
+            write_curve_picture(run.folder / CURVE_PICTURE, run.settings, curve)
             run.save_checkpoint(number, learner.state(), curve)
             report_result(curve[-1])
     finally:
@@ -204,9 +208,9 @@ def _checking_fit(run: RunFolder) -> Iterator[None]:
         raise RunError(f"{run.folder}: its checkpoint does not fit its settings: {words}") from None
 
 
-def _make_learner(envs: TacsimVectorEnv, run: RunFolder) -> Learner:
+def _make_learner(envs: TacsimVectorEnv, run: RunFolder, tensorboard: bool) -> Learner:
     if run.settings.training.algorithm == "dagger":
         return Dagger(envs, run.settings.training, new_actor(run), run.folder)
     from robot.train.reinforce import Reinforce
 
-    return Reinforce(envs, run.settings.training, new_actor(run), run.folder)
+    return Reinforce(envs, run.settings.training, new_actor(run), run.folder, tensorboard)

@@ -188,7 +188,9 @@ class RecordConfig(Config):
     """What a recording holds beyond pictures, states and actions."""
 
     arm_packages: bool = False  # every package of the controllers of UR arms, as it came (500 Hz)
-    body: bool = False  # of simulated rigs: some thousand particles of the body a step, to look at
+    # Of simulated rigs: some thousand particles of the body a step, to look at (60 kB). None: `tacsim run` records them
+    # where there is a body, data sets do not
+    body: bool | None = None
 
 
 class RigConfig(Config):
@@ -233,7 +235,7 @@ class RigConfig(Config):
                 "this rig has no UR arm, whose packages could be recorded; leave it out",
                 {"at": ("record", "arm_packages")},
             )
-        if self.record.body and (self.clock != "sim" or self.scene is None or self.scene.body is None):
+        if self.record.body and not self._has_body():
             raise PydanticCustomError(
                 "no_body", "only a simulated rig with a body knows its body; leave it out", {"at": ("record", "body")}
             )
@@ -253,6 +255,14 @@ class RigConfig(Config):
         for name, load in ({} if self.task is None else self.task.held_loads).items():
             self._check_load(name, load)
         return self
+
+    @property
+    def records_body(self) -> bool:
+        """Whether the particles of the body are recorded."""
+        return self._has_body() if self.record.body is None else self.record.body
+
+    def _has_body(self) -> bool:
+        return self.clock == "sim" and self.scene is not None and self.scene.body is not None
 
     def _require_arm(self, arm: str, *at: str | int) -> None:
         """`at`: the entry that names the arm, as pydantic writes locations (tacsim.config shows its line)."""

@@ -80,6 +80,13 @@ def encode_image(image: NDArray[np.uint8]) -> bytes:
     return file.getvalue()
 
 
+def encode_jpeg(image: NDArray[np.uint8], quality: int = 80) -> bytes:
+    """JPEG file of an (H, W, 3) RGB image."""
+    file = io.BytesIO()
+    Image.fromarray(image).save(file, "JPEG", quality=quality)
+    return file.getvalue()
+
+
 def encode_figure(figure: Figure) -> bytes:
     """PNG file of a figure."""
     file = io.BytesIO()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import hashlib
 import json
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -25,11 +26,12 @@ from tacsim.report.diagnostics import (
 from tacsim.report.series import Series
 
 if TYPE_CHECKING:
+    from markupsafe import Markup
     from rich.table import Table
 
-    from tacsim.report.strips import Strip
+    from tacsim.report.section import GelShape
+    from tacsim.report.strips import Find, Known, Strip
 
-FRAMES_PER_SENSOR = 12  # frames a sensor in report.html
 # Of the gels: key in the summary, label, and displayed unit
 SURFACE = (
     ("deepest", "deepest", 1e3, " mm"),
@@ -89,36 +91,38 @@ def write_report(
     episode: Episode,
     directory: Path,
     find: Callable[[str, TactileFrame], SurfaceMap | TactileObservation | None] = lambda sensor, frame: frame.surface,
+    gels: Mapping[str, GelShape] | None = None,
 ) -> dict[str, Path]:
     """Writes `summary.json`, `report.png` and `report.html` into `directory`; returns their paths by name. The steps of
     a recording are read one by one, so that a long episode takes little memory.
 
-    find: returns the surface of a sensor's gel in a frame, if known; by default the surface in the frame.
+    find: returns the surface of a sensor's gel in a frame, if known; by default the surface in the frame. It is called
+    once for a frame, in the order of time. gels: the shape of each gel that is drawn with the body.
 
     Raises OSError if the directory cannot be written, ValueError for an episode without steps, EpisodeError for a
     recording that cannot be read.
     """
     from tacsim.report import figure
+    from tacsim.report.playback import moments_of, playback_data
     from tacsim.report.strips import sensor_strips
 
     if not len(episode.steps):
         raise ValueError("the episode has no steps, there is nothing to report; record at least the state after reset")
     series = Series.from_episode(episode)
     stats = summarise(series, complete=episode.complete, dropped=episode.dropped)
-    rows = sensor_strips(episode, series, FRAMES_PER_SENSOR, find)
+    moments, find_once = moments_of(episode), _FindOnce(find)
+    player = playback_data(episode, series, find_once, gels or {}, moments)
+    rows = sensor_strips(episode, series, figure.COLUMNS, find_once, moments)
     paths = {name: directory / name for name in ("summary.json", "report.png", "report.html")}
     directory.mkdir(parents=True, exist_ok=True)
     subtitle = " · ".join(f"{key}: {value}" for key, value in _headline_rows(stats, series))
-    shown_rows = [
-        (row.label, [row.pictures[k] for k in figure.select_positions(len(row.pictures), figure.COLUMNS)])
-        for row in rows
-    ]
+    shown_rows = [(row.label, row.pictures) for row in rows]
     try:
         paths["summary.json"].write_text(json.dumps(stats, indent=1, allow_nan=False) + "\n", encoding="utf-8")
         figure.save_figure(
             figure.draw_overview(shown_rows, series, _report_title(stats), subtitle), paths["report.png"]
         )
-        paths["report.html"].write_text(_render_html(series, stats, rows), encoding="utf-8")
+        paths["report.html"].write_text(_render_html(player, series, stats, rows), encoding="utf-8")
     except OSError:  # such as a full disk: an incomplete report is removed
         for path in paths.values():
             path.unlink(missing_ok=True)
@@ -249,9 +253,10 @@ def render_page(template: Path, **values: Any) -> str:
     return page.from_string(template.read_text(encoding="utf-8")).render(**values)
 
 
-def _render_html(series: Series, stats: Mapping[str, Any], strips: Sequence[Strip]) -> str:
+def _render_html(recorded: Mapping[str, Any], series: Series, stats: Mapping[str, Any], strips: Sequence[Strip]) -> str:
     from tacsim.report import figure
 
+    script = Path(__file__).with_name("player.js").read_text(encoding="utf-8")
     return render_page(
         Path(__file__).with_name("report.html.jinja"),
         title=_report_title(stats),
@@ -262,9 +267,47 @@ def _render_html(series: Series, stats: Mapping[str, Any], strips: Sequence[Stri
             {
                 "title": strip.title,
                 "note": strip.note,
-                "frames": [(picture.index, data_url(figure.encode_image(picture.image))) for picture in strip.pictures],
+                "frames": [
+                    (picture.index, data_url(figure.encode_jpeg(picture.image), "jpeg")) for picture in strip.pictures
+                ],
             }
             for strip in strips
         ],
         plots=data_url(figure.encode_figure(figure.draw_plots(series))),
+        episode=to_script_json(recorded),
+        script=script_text(script),
+        script_hash=script_hash(script),
     )
+
+
+def to_script_json(data: Mapping[str, Any]) -> Markup:
+    """JSON for a page's <script> element: no text in it can end the element."""
+    from markupsafe import Markup
+
+    return Markup(json.dumps(data, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c"))
+
+
+def script_text(script: str) -> Markup:
+    """A script of ours for a page's <script> element."""
+    from markupsafe import Markup
+
+    return Markup(script)
+
+
+def script_hash(script: str) -> str:
+    """What a page's Content-Security-Policy allows it by, after `sha256-`."""
+    return base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
+
+
+class _FindOnce:
+    """Remembers surfaces, so that the second reader of a frame does not go back in time."""
+
+    def __init__(self, find: Find) -> None:
+        self._find = find
+        self._found: dict[tuple[str, int, float], Known | None] = {}
+
+    def __call__(self, sensor: str, frame: TactileFrame) -> Known | None:
+        key = sensor, frame.index, frame.time
+        if key not in self._found:
+            self._found[key] = self._find(sensor, frame)
+        return self._found[key]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,11 +31,18 @@ class Strip:
     pictures: Sequence[Picture]
 
 
-def sensor_strips(episode: Episode, series: Series, max_count: int, find: Find) -> list[Strip]:
-    """Strips of every sensor with at most `max_count` steps over the episode; one picture is decoded at a time."""
+def sensor_strips(
+    episode: Episode, series: Series, max_count: int, find: Find, among: Collection[int] | None = None
+) -> list[Strip]:
+    """Strips of every sensor with at most `max_count` steps over the episode; one picture is decoded at a time.
+
+    among: positions of the steps to select from; by default all.
+    """
     found: list[Strip] = []
     for sensor in series.sensors:
         positions = series.steps_with_image(sensor)
+        if among is not None:
+            positions = [at for at in positions if at in among] or positions[:1]
         pictures: list[Picture] = []
         surfaces: list[tuple[int, Known]] = []
         for k in select_positions(len(positions), max_count):
@@ -58,7 +65,7 @@ def _map_strips(sensor: str, surfaces: Sequence[tuple[int, Known]]) -> list[Stri
     if heights:
         deepest = max(float(height.max()) for _, height in heights)
         words = f"into the gel, dark 0, bright {deepest * 1e3:.3g} mm"
-        pictures = [Picture(index, _height_image(height, deepest)) for index, height in heights]
+        pictures = [Picture(index, height_image(height, deepest)) for index, height in heights]
         made.append(Strip(f"{sensor}: height", f"{sensor}: height", words, pictures))
     slopes = [(index, surface.gradient) for index, surface in surfaces if surface.gradient is not None]
     if slopes:
@@ -75,7 +82,8 @@ def _map_strips(sensor: str, surfaces: Sequence[tuple[int, Known]]) -> list[Stri
     return made
 
 
-def _height_image(height: NDArray[np.float32], deepest: float) -> Rgb:
+def height_image(height: NDArray[np.float32], deepest: float) -> Rgb:
+    """Colours of a height map (h, w) [m], from 0 to `deepest`; enlarged."""
     import cv2
 
     levels = np.clip(255 * height / max(deepest, 1e-9), 0, 255).astype(np.uint8)

@@ -10,9 +10,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from tacsim.record.reader import read_episode
-from tests.robot.cli.invoked import START, TINY, environment, tacsim
+from tests.robot.cli.invoked import START, TINY, environment, tacsim, told
 
 pytestmark = pytest.mark.usefixtures("empty_folder")
 
@@ -48,9 +49,42 @@ def test_run_without_out_makes_folder_in_runs(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_run_records_requested_particles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_run_writes_film_and_film_of_recording_has_same_frames(tmp_path: Path) -> None:
+    result = tacsim("run", "--steps", "2", "--out", "r", "--film", "first.gif", *TINY)
+    assert result.exit_code == 0, result.output
+    assert "first.gif" in result.stdout
+    result = tacsim("film", "r/episode.mcap")
+    assert result.exit_code == 0, result.output
+    assert "r/episode.gif" in result.stdout
+    with Image.open(tmp_path / "first.gif") as first, Image.open(tmp_path / "r/episode.gif") as again:
+        assert first.n_frames == again.n_frames == 3  # type: ignore[attr-defined]
+        assert np.array_equal(np.asarray(first.convert("RGB")), np.asarray(again.convert("RGB")))
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("run", "--film", "a.avi"), "a.avi must end in .gif or .mp4"),
+        (("run", "--film", "mine.gif"), "exists already"),
+        (("film", "missing.mcap"), "missing.mcap: no such file"),
+        (("film", "missing.mcap", "--out", "a.txt"), "a.txt must end in .gif or .mp4"),
+    ],
+)
+def test_film_that_cannot_be_made_is_refused_before_anything_runs(
+    words: tuple[str, ...], said: str, tmp_path: Path
+) -> None:
+    (tmp_path / "mine.gif").write_text("keep")
+    result = tacsim(*words)
+    assert result.exit_code == 2
+    assert said in told(result.stderr)
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.gif"]
+    assert (tmp_path / "mine.gif").read_text() == "keep"
+
+
+@pytest.mark.slow
+def test_simulated_body_is_recorded_unless_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("robot.deploy.control_loop.MAX_PARTICLES", 7)
-    for name, more in (("with", ["--set", "record.body=true"]), ("without", [])):
+    for name, more in (("with", []), ("without", ["--set", "record.body=false"])):
         result = tacsim("run", "--steps", "1", "--out", name, *TINY, *more)
         assert result.exit_code == 0, result.output
     first, last = (step.body for step in read_episode(tmp_path / "with/episode.mcap").steps)

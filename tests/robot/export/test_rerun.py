@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from robot.export.rerun_log import EpisodeLog, _colours, _triangles
+from robot.export.rerun_log import EpisodeLog, _colours, _triangles, blueprint
 from robot.rig.recorded import observe_episode
 from tacsim.optics.grid import canonical_cells
 from tests.robot.cli.invoked import START, environment, tacsim, told
@@ -88,6 +88,25 @@ def test_all_of_a_step_is_logged_at_its_time() -> None:
     assert height is not None
     assert np.allclose(corners[:, 2], -height[valid]) and np.ptp(corners[:, 2]) > 1e-3  # pressed in: below the rest
     assert np.allclose(corners[:, :2], canonical_cells(observed.canonical).points()[valid])
+
+
+@needs_rerun
+def test_view_opens_at_the_gels_with_diagnostics_in_another_tab() -> None:
+    import rerun.blueprint as rrb
+
+    path, steps = record("a.mcap", 2)
+    spec = observe_episode(path).episode.meta.spec
+    tabs = blueprint(spec, steps[0].arms).root_container
+    assert isinstance(tabs, rrb.Tabs) and tabs.active_tab == 0
+    episode, diagnostics = tabs.contents
+    assert (episode.name, diagnostics.name) == ("episode", "diagnostics")
+    space = episode.contents[0]
+    eye = space.properties["EyeControls3D"]
+    positions = np.array([state.pose.position for state in steps[0].arms.values()])
+    target = np.array(eye.look_target.as_arrow_array().to_pylist()[0])
+    assert np.allclose(target, positions.mean(axis=0))
+    distance = np.linalg.norm(np.array(eye.position.as_arrow_array().to_pylist()[0]) - target)
+    assert 0.1 < np.ptp(positions, axis=0).max() / 2 / distance < 0.4  # half of what is looked at fills 6 to 22 degrees
 
 
 @needs_rerun

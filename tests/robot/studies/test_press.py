@@ -1,5 +1,8 @@
 """`tacsim press`: what its result says of edges, and the outline of a contact."""
 
+import base64
+import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +10,16 @@ import pytest
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
-from robot.studies.press import MAX_MISSED_DEPTH_SHARE, PressMotion, PressResult, deepest_possible, press, press_report
+from robot.studies.press import (
+    MAX_MISSED_DEPTH_SHARE,
+    PressMotion,
+    PressResult,
+    deepest_possible,
+    force_curve,
+    press,
+    press_report,
+    write,
+)
 from tacsim.config import load_sensor
 from tacsim.interface import Pose
 from tacsim.models.scene import Box, Cylinder, Gel, Indenter, Mesh, Scene, Shape, Sphere
@@ -138,3 +150,34 @@ def test_a_move_that_fails_says_how_far_it_came() -> None:
         world.move({"indenter": Pose(start.position - [0.0, 0.0, 3.9e-3], start.quaternion)})
     possible = float(str(failed.value).split("no more than about ")[1].split()[0])
     world.move({"indenter": Pose(start.position - [0.0, 0.0, 1e-3 * possible], start.quaternion)})
+
+
+@pytest.mark.slow
+def test_page_of_a_press_has_picture_height_and_force_over_depth(tmp_path: Path) -> None:
+    motion = PressMotion(0.4e-3)
+    scene, result = pressed("draft", motion, Sphere(radius=4e-3))
+    curve = force_curve(scene, motion)
+    depths, forces = np.array(curve).T
+    assert depths == pytest.approx(np.linspace(0, 0.4e-3, 7)[1:])
+    assert (np.diff(forces) > 0).all() and np.diff(forces)[-1] > np.diff(forces)[0]  # a ball: stiffer with depth
+    assert forces[-1] == pytest.approx(-result.wrench[2], rel=0.01)  # as the press in one motion
+    write(tmp_path, result, press_report(scene, motion, result, SENSOR), scene, SENSOR, curve)
+    page = (tmp_path / "press.html").read_text()
+    assert base64.b64encode((tmp_path / "rgb.png").read_bytes()).decode() in page
+    assert page.count("<circle") == 7 and f"{forces[-1]:.3g} N" in page and "0.4 mm" in page
+    (text,) = re.findall(r'<script type="application/json" id="data">(.*?)</script>', page, re.DOTALL)
+    surface = json.loads(text)
+    heights = np.array(surface["depths"]).reshape(surface["rows"], surface["columns"])
+    assert heights.max() == pytest.approx(1e3 * result.height.max(), rel=0.03)
+    row, column = np.unravel_index(heights.argmax(), heights.shape)
+    assert abs(row - surface["rows"] / 2) <= 1 and abs(column - surface["columns"] / 2) <= 1
+    assert not re.search(r"https?://|fetch\(", page) and len(page) < 1_000_000
+
+
+@pytest.mark.slow
+def test_force_curve_ends_before_a_depth_that_is_not_possible() -> None:
+    scene = Scene.model_validate(
+        {"body": None, "preset": "draft", "indenter": Indenter(geometry=Sphere(radius=4e-3)), "gel": Gel()}
+    )
+    curve = force_curve(scene, PressMotion(3.9e-3))
+    assert 0 < len(curve) < 6

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 torch = pytest.importorskip("torch")
 pytest.importorskip("stable_baselines3")
@@ -75,6 +76,32 @@ def test_train_killed_run_continues_bit_for_bit(algorithm: str, tmp_path: Path) 
     assert weights(cut) == weights(whole) != {}
     assert (tmp_path / "cut/policy.onnx").read_bytes() == (tmp_path / "whole/policy.onnx").read_bytes()
     assert len(json.loads((tmp_path / "cut/curve.json").read_text())) == 3
+
+
+@pytest.mark.slow
+def test_learning_curve_is_drawn_after_each_round(tmp_path: Path) -> None:
+    run = begin_run(training(algorithm="ppo"), tmp_path / "run")
+    drawn: list[Image.Image] = []
+    train(run, report_result=lambda figures: drawn.append(Image.open(run.folder / "curve.png").convert("RGB")))
+    assert len(drawn) == 3
+    assert drawn[0].size == (1200, 340)
+    lines = [(np.asarray(each) == (0x2A, 0x6D, 0xB5)).all(axis=2).sum() for each in drawn]  # of the distance
+    assert 0 < lines[0] < lines[1] < lines[2]
+
+
+@pytest.mark.slow
+def test_tensorboard_has_the_figures_of_each_round(tmp_path: Path) -> None:
+    pytest.importorskip("tensorboard")
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    run = begin_run(training(algorithm="ppo"), tmp_path / "run")
+    train(run, tensorboard=True)
+    (folder,) = (run.folder / "tensorboard").iterdir()
+    log = EventAccumulator(str(folder)).Reload()
+    curve = json.loads((run.folder / "curve.json").read_text())
+    shown = [event.value for event in log.Scalars("round/distance")]
+    assert shown == pytest.approx([row["distance"] for row in curve])
+    assert "train/loss" in log.Tags()["scalars"]  # what stable-baselines3 logs itself
 
 
 def test_train_kill_after_last_checkpoint_keeps_curve(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import keyword
 import re
 from pathlib import Path
@@ -10,12 +9,12 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from robot.cli.output import notes, print_files, results, show_table, writing
+from robot.cli.options import AsJson
+from robot.cli.output import notes, print_files, print_json, results, show_table, writing
 
 Kind = Literal[
     "rig", "task", "scene", "sensor", "randomisation", "training", "material", "policy", "driver"
 ]  # tacsim.config.catalogue.CATALOGUE_KINDS, without importing it for each command
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 
 def list_(
@@ -34,7 +33,7 @@ def list_(
             {"kind": each.kind, "name": each.name, "summary": each.summary, "path": _text(each.path)}
             for each in entries
         ]
-        typer.echo(json.dumps(rows, indent=1))
+        print_json(rows)
         return
     show_table("", ("kind", "name", ""), [(each.kind, each.name, each.summary) for each in entries], left=(0, 1, 2))
     notes.print("tacsim show NAME prints one of them; the path of a file may stand for each name, except a driver's")
@@ -54,7 +53,7 @@ def show(
     found = find_entries(name, kind)
     described = [{"kind": each.kind, "name": each.name, "path": _text(each.path), **_describe(each)} for each in found]
     if as_json:
-        typer.echo(json.dumps(described, indent=1))
+        print_json(described)
         return
     for number, each in enumerate(described):
         if number:
@@ -135,6 +134,7 @@ def new(
     out: Annotated[
         Path | None, typer.Option(help="The new file; of a driver the new folder.", show_default="NAME")
     ] = None,
+    as_json: AsJson = False,
 ) -> None:
     """Write a new file as a copy of a shipped one, or a driver as a small distribution that works.
 
@@ -161,6 +161,7 @@ def new(
         opened.write(text)
     notes.print(f"a copy of the shipped {kind} {path.stem}; use its path wherever a name of a {kind} stands")
     print_files(file)
+    print_json({}, [file])
 
 
 def _new_driver(name: str, folder: Path) -> None:
@@ -185,3 +186,4 @@ def _new_driver(name: str, folder: Path) -> None:
             file.write_text(page.render(name=name.lower(), package=package), encoding="utf-8")
     notes.print(f"install it: pip install -e {folder}; then run it: tacsim run {folder / 'rig.yaml'} --policy grip")
     print_files(*files)
+    print_json({}, list(files))

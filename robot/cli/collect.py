@@ -12,6 +12,7 @@ import typer
 
 from robot.cli.errors import EXIT_FAILED, print_error
 from robot.cli.options import (
+    AsJson,
     OptionGroup,
     Overrides,
     Preset,
@@ -20,7 +21,7 @@ from robot.cli.options import (
     require_packages,
     with_option_groups,
 )
-from robot.cli.output import busy, notes, one_bar, results
+from robot.cli.output import busy, notes, one_bar, print_json, results
 from robot.cli.terminal import Interrupt
 
 if TYPE_CHECKING:
@@ -112,6 +113,7 @@ def press(
     workers: Workers = None,
     ray: Ray = None,
     set_: Overrides = None,
+    as_json: AsJson = False,
 ) -> None:
     """Press objects on a gel at random poses: images with heights, forces, contact, flow and poses, in parquet files.
 
@@ -182,6 +184,7 @@ def episodes(
     workers: Workers = None,
     ray: Ray = None,
     set_: Overrides = None,
+    as_json: AsJson = False,
 ) -> None:
     """Run episodes on a simulated rig: DIR/episode-00000.mcap and so on, for tacsim export lerobot DIR.
 
@@ -260,6 +263,8 @@ def _print_summary(done: Collected, count: int, seconds: float, out: Path) -> No
     if done.failures:
         notes.print(f"{len(done.failures)} of {count} failed; the reasons are in {out / 'failures.jsonl'}")
     results.print(str(out))
+    figures = {"count": count, "made": done.made, "seconds": seconds, "workers": len(done.workers), "bytes": done.bytes}
+    print_json({**figures, "failures": done.failures}, [out])
 
 
 def _validate(model: Any, **values: Any) -> Any:

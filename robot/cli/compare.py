@@ -10,8 +10,19 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from robot.cli.errors import print_error
-from robot.cli.options import OptionGroup, Out, Overrides, with_option_groups
-from robot.cli.output import busy, counted, new_directory, notes, print_files, results, show_table, warn, writing
+from robot.cli.options import AsJson, OptionGroup, Out, Overrides, with_option_groups
+from robot.cli.output import (
+    busy,
+    counted,
+    new_directory,
+    notes,
+    print_files,
+    print_json,
+    results,
+    show_table,
+    warn,
+    writing,
+)
 
 if TYPE_CHECKING:
     from calibration.bundle import Calibration
@@ -68,6 +79,7 @@ def compare(
     ] = None,
     set_: Overrides = None,
     out: Out = None,
+    as_json: AsJson = False,
 ) -> None:
     """Compare frames of A with frames of B; each figure is shown with its values for no contact and for noise alone.
 
@@ -83,7 +95,7 @@ def compare(
         from calibration.compare.compare import Options, Pairing
         from calibration.compare.compare import compare_frames as run
         from calibration.compare.invariance import measure_invariance
-        from calibration.compare.report import comparison_figures, write_comparison
+        from calibration.compare.report import comparison_as_json, comparison_figures, write_comparison
         from calibration.errors import BadFrames
     limits = [*_parse_limits(fail_above, "--fail-above"), *_parse_limits(fail_below, "--fail-below")]
     bundles = [
@@ -113,6 +125,7 @@ def compare(
         written = write_comparison(folder, result, report)
     _print_comparison(result, report)
     print_files(*written)
+    print_json({**comparison_as_json(result, report), "beyond_limits": beyond}, written)
     for words in beyond:
         print_error(words)
     if beyond:

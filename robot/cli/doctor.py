@@ -8,8 +8,8 @@ import typer
 
 from robot.cli.bench import from_checkout, require_checkout
 from robot.cli.errors import print_error
-from robot.cli.options import HardwareRig, Overrides
-from robot.cli.output import SafeConsole, busy, notes
+from robot.cli.options import AsJson, HardwareRig, Overrides
+from robot.cli.output import SafeConsole, busy, notes, print_json, results
 from robot.cli.terminal import Interrupt, ask_operator, has_operator
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ def doctor(
         typer.Option("--rig", metavar="FILE", help="Check this rig instead: arms, their forces, cameras, limits."),
     ] = None,
     set_: Overrides = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the checks as JSON.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Check Python, packages, OpenCV, Taichi and the machine, or a rig; exit code 1 if something must be repaired.
 
@@ -54,8 +54,6 @@ def doctor(
 
     Example: tacsim doctor --rig ur5e
     """
-    import json
-
     from robot.doctor import machine
 
     if rig is None:
@@ -70,10 +68,8 @@ def doctor(
             check_sensors(config)
             checks = examine_rig(config, rig)
     report = machine.as_json(checks)
-    if as_json:
-        typer.echo(json.dumps(report, indent=2))
-    else:
-        print_checks(checks)
+    print_checks(checks)
+    print_json(report)
     raise typer.Exit(0 if report["ok"] else 1)
 
 
@@ -87,12 +83,13 @@ def print_checks(checks: list[Check]) -> None:
         if check.advice:
             words.append(f"\n→ {check.advice}", style="italic")
         table.add_row(MARKS[check.state], check.name, words)
-    SafeConsole().print(table)
+    SafeConsole(quiet=results.quiet).print(table)
 
 
 def start(
     rig: HardwareRig,
     set_: Overrides = None,
+    as_json: AsJson = False,
 ) -> None:
     """Move the arms of a rig from their present position to the start of an episode.
 
@@ -102,6 +99,7 @@ def start(
     Example: tacsim start my.yaml
     """
     with busy("looking at the rig"):
+        from robot.doctor.machine import as_json as checks_as_json
         from robot.doctor.rig import examine_arms
         from robot.open import CannotOpen
         from robot.procedures.to_start import Halted, Operator, move_to_start
@@ -135,6 +133,7 @@ def start(
         except Halted as halted:
             print_error(str(halted))
             raise typer.Exit(interrupt.exit_code or 1) from None
+    print_json({**checks_as_json(checks), "distance_from_start": away})  # [m]
     if any(distance > 5e-3 for distance in away.values()) or not away:
         print_error("not every arm is at its start")
         raise typer.Exit(1)

@@ -10,6 +10,7 @@ import typer
 
 from robot.cli.errors import EXIT_USAGE, print_error
 from robot.cli.options import (
+    AsJson,
     OptionGroup,
     Out,
     Overrides,
@@ -18,7 +19,18 @@ from robot.cli.options import (
     quantity_parser,
     with_option_groups,
 )
-from robot.cli.output import busy, new_directory, notes, one_bar, print_files, results, show_table, warn, writing
+from robot.cli.output import (
+    busy,
+    new_directory,
+    notes,
+    one_bar,
+    print_files,
+    print_json,
+    results,
+    show_table,
+    warn,
+    writing,
+)
 
 if TYPE_CHECKING:
     from calibration.materials.presses import Noise
@@ -77,6 +89,7 @@ class Fitting(OptionGroup):
     ] = None
     set_: Overrides = None
     out: Out = None
+    as_json: AsJson = False
 
 
 @with_option_groups
@@ -201,7 +214,7 @@ class _IdentifyCommand:
         max_size_deviation = 0.1
         from robot.studies.identify.identify import predict_intervals
         from robot.studies.identify.motions import MOTION_TEXTS, MOTIONS_FOR_PARAMETER
-        from robot.studies.identify.results import describe_parameters, write
+        from robot.studies.identify.results import as_json, describe_parameters, write
 
         with busy("drawing"), writing(folder.parent):
             files = write(folder, found)
@@ -225,6 +238,7 @@ class _IdentifyCommand:
                 "wrong size would not be detected: measure it, or record heights (a calibrated sensor)"
             )
         print_files(*files)
+        print_json(as_json(found), files)
         for finding in found.findings:
             print_error(finding.text)
         if found.findings:
@@ -239,12 +253,15 @@ class _IdentifyCommand:
 
         new_directory(folder, "motions")
         rig = "press" if self.kind == "gel" else "sim"
+        commands: list[str] = []
         with writing(folder, new=True):
             for name, table in motions(self.scene).items():
                 path = folder / f"{name}.csv"
                 path.write_text(table, encoding="utf-8")
                 steps = len(table.splitlines()) - 1
-                results.print(f"tacsim run {rig} --policy {path} --steps {steps} --out runs/{name}")
+                commands.append(f"tacsim run {rig} --policy {path} --steps {steps} --out runs/{name}")
+                results.print(commands[-1])
+        print_json({"commands": commands}, sorted(folder.iterdir()))
 
 
 def _half_interval_text(half: float) -> str:

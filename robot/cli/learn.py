@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from robot.cli.options import Out, Overrides, TrainingFile, require_packages
+from robot.cli.options import AsJson, Out, Overrides, TrainingFile, require_packages
 from robot.cli.output import (
     busy,
+    choose_json_file,
     new_directory,
     notes,
     one_bar,
     print_files,
+    print_json,
     require_writable,
     results,
     show_table,
@@ -45,6 +47,7 @@ def train(
     ] = None,
     set_: Overrides = None,
     out: Out = None,
+    as_json: AsJson = False,
 ) -> None:
     """Train a policy in simulation, and write it as a file for `tacsim run RIG --policy FILE`.
 
@@ -79,7 +82,7 @@ def train(
     from tacsim.tasks.task import BadDraws
 
     try:
-        path = _run_training(run)
+        path, rounds = _run_training(run)
     except BadDraws:
         if run.load_checkpoint()[0]:
             notes.print(f"The last checkpoint is kept. Write it as a file: tacsim export policy {run.folder}")
@@ -88,13 +91,18 @@ def train(
         notes.print(f"The last checkpoint is kept. Continue: tacsim train --resume {run.folder}")
         raise
     print_files(path, run.folder / "curve.json")
+    print_json({"rounds": rounds}, [path, run.folder / "curve.json"])
     notes.print(f"Next: tacsim evaluate {task or run.settings.training.task} --policy {path} --policy scripted")
 
 
-def _run_training(run: RunFolder) -> Path:
+def _run_training(run: RunFolder) -> tuple[Path, list[Mapping[str, float]]]:
+    """Trains; returns the file of the policy and the figures of each round."""
     from robot.train.train import train as continue_training
 
+    rounds: list[Mapping[str, float]] = []
+
     def print_result(figures: Mapping[str, float]) -> None:
+        rounds.append(figures)
         results.print(
             f"round {figures['round']:.0f}: {1e3 * figures['distance']:.3f} mm from the goal, success "
             f"{100 * figures['success']:.0f} %, {figures['peak_force']:.1f} N at most, "
@@ -103,12 +111,13 @@ def _run_training(run: RunFolder) -> Path:
         )
 
     with one_bar("starting") as bar:
-        return continue_training(run, bar.report, print_result, warn)
+        return continue_training(run, bar.report, print_result, warn), rounds
 
 
 def policy(
     run: Annotated[Path, typer.Argument(help="The folder of a training run, finished or not.")],
     out: Annotated[Path, typer.Option("--out", help="The file to be written, FILE.onnx; it must not exist.")],
+    as_json: AsJson = False,
 ) -> None:
     """Write the policy of a training run as one ONNX file, which contains a description of its inputs and outputs.
 
@@ -124,6 +133,7 @@ def policy(
 
         worst = export_policy(RunFolder(run), out)
     results.print(f"{out} ({out.stat().st_size / 1024:.0f} KiB), within {worst:.1g} of the network")
+    print_json({"error": worst}, [out])
 
 
 def policy_range(
@@ -137,6 +147,7 @@ def policy_range(
         int | None, typer.Option(min=2, max=10_000, help="Number of episodes.", show_default="4 of each environment")
     ] = None,
     set_: Overrides = None,
+    as_json: AsJson = False,
 ) -> None:
     """Write a policy again, with the range of its observations in episodes of its training.
 
@@ -158,6 +169,7 @@ def policy_range(
         found = measure_range(policy, settings, episodes, bar.report)
     write_range(policy, out, found)
     results.print(f"{out}: range of {found.episodes} episodes")
+    print_json({"episodes": found.episodes}, [out])
 
 
 def _require_new(out: Path) -> None:
@@ -180,7 +192,13 @@ def evaluate(
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same episodes.")] = 0,
     json_: Annotated[
         Path | None,
-        typer.Option("--json", help="Write the result of each episode, during the evaluation.", show_default=False),
+        typer.Option(
+            "--json",
+            metavar="FILE|-",
+            callback=choose_json_file,
+            help="Write the result of each episode, during the evaluation; or -: print the result as JSON.",
+            show_default=False,
+        ),
     ] = None,
     set_: Overrides = None,
 ) -> None:
@@ -192,7 +210,8 @@ def evaluate(
 
     Example: tacsim evaluate squeeze --policy learned --policy scripted --episodes 50
     """
-    require_writable(json_, "--json", new=True)
+    file = None if json_ == Path("-") else json_
+    require_writable(file, "--json", new=True)
     from robot.train.evaluate import evaluate as evaluate_policies
     from tacsim.config import load_model
     from tacsim.models.training import Training
@@ -203,8 +222,8 @@ def evaluate(
 
         def print_result(so_far: EvaluationResult) -> None:
             played[so_far.policy] = so_far
-            if json_ is not None:
-                _write_results(json_, played.values())
+            if file is not None:
+                _write_results(file, played.values())
             done, success = len(so_far.episodes), _interval_text(so_far.success, 100, 0)
             notes.print(f"{so_far.policy}: {done} of {episodes} episodes, success {success} %")
 
@@ -212,6 +231,7 @@ def evaluate(
             training, policy or ["teacher", "scripted", "random"], episodes, seed, bar.report, print_result, warn
         )
     _show_evaluation(evaluation_results)
+    print_json({each.policy: _describe_evaluation(each) for each in evaluation_results})
 
 
 def _write_results(path: Path, evaluation_results: Iterable[EvaluationResult]) -> None:
@@ -221,6 +241,18 @@ def _write_results(path: Path, evaluation_results: Iterable[EvaluationResult]) -
 
     ends = {each.policy: [end._asdict() for end in each.episodes] for each in evaluation_results}
     write_whole(path, (json.dumps(ends, indent=1) + "\n").encode())
+
+
+def _describe_evaluation(found: EvaluationResult) -> dict[str, Any]:
+    mean, quantile = found.peak_force
+    return {
+        "success": found.success,
+        "distance": found.distance,  # [m]
+        "improvement": found.improvement,
+        "peak_force": {"mean": mean, "quantile_95": quantile},  # [N]
+        "outside_training": found.outside,
+        "episodes": [each._asdict() for each in found.episodes],
+    }
 
 
 def _show_evaluation(evaluation_results: list[EvaluationResult]) -> None:
@@ -268,6 +300,7 @@ def transfer(
     workers: Annotated[int, typer.Option(min=1, max=64, help="Parallel rigs, each in a separate process.")] = 1,
     out: Annotated[Path, typer.Option(help="Folder; a study in it is continued.")] = Path("runs/transfer"),
     set_: Overrides = None,
+    as_json: AsJson = False,
 ) -> None:
     """Compare results of policies in simulation and on mock hardware, with the real protocols and another hidden twin.
 
@@ -297,12 +330,13 @@ def transfer(
                 notes.print(f"{done} of {of}: {words}")
 
         rows = summarise(play_study(study, out, report, workers))
+    table, picture = out / "transfer.json", out / "transfer.png"
     with writing(out):
-        (out / "transfer.json").write_text(json.dumps([asdict(row) for row in rows], indent=1) + "\n", encoding="utf-8")
-        draw_figure(rows, out / "transfer.png")
+        table.write_text(json.dumps([asdict(row) for row in rows], indent=1) + "\n", encoding="utf-8")
+        draw_figure(rows, picture)
     _show_transfer(rows, episodes)
-    for name in ("transfer.json", "transfer.png"):
-        results.print(str(out / name))
+    print_files(table, picture)
+    print_json({"rows": rows}, [table, picture])
 
 
 def _show_transfer(rows: list[SummaryRow], episodes: int) -> None:

@@ -11,6 +11,11 @@ from typing import Annotated, Any, Literal, get_type_hints
 
 import typer
 
+from robot.cli.output import choose_json
+
+AsJson = Annotated[
+    bool, typer.Option("--json", callback=choose_json, help="Print the result as one JSON document instead of text.")
+]
 Out = Annotated[
     Path | None,
     typer.Option("--out", help="New folder for the results; by default one below runs/.", show_default=False),

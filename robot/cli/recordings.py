@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from robot.cli.options import Out, Overrides
-from robot.cli.output import busy, counted, new_directory, notes, print_files, results
+from robot.cli.options import AsJson, Out, Overrides
+from robot.cli.output import busy, counted, new_directory, notes, print_files, print_json, results
 from robot.cli.run import run
 
 
@@ -26,6 +27,7 @@ def view(
     ] = None,
     set_: Overrides = None,
     out: Out = None,
+    as_json: AsJson = False,
 ) -> None:
     """Show an episode or a rig in Rerun: gels, flow and forces in space, images, plots, on one time line.
 
@@ -51,6 +53,7 @@ def view(
         view_episode(path, save, on_step)
     if save is not None:
         print_files(save)
+    print_json({}, [] if save is None else [save])
 
 
 def _view_live(
@@ -78,6 +81,7 @@ def lerobot(
     video: Annotated[
         bool, typer.Option("--video", help="Images as H.264 video: a sixth of the size, error about 1 grey level.")
     ] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Make a LeRobot data set (v3.0) of recorded episodes; for lerobot-train, Hugging Face datasets, pandas.
 
@@ -93,6 +97,7 @@ def lerobot(
         export_lerobot(_find_recordings(episodes), folder, task=task, maps=maps, cut=cut, video=video, on_step=on_step)
     notes.print(f'Load it: LeRobotDataset("{folder.name}", root="{folder}")')
     print_files(folder)
+    print_json({}, [folder])
 
 
 def _find_recordings(given: list[Path]) -> list[Path]:
@@ -113,6 +118,7 @@ def recover(
     out: Annotated[
         Path | None, typer.Option(metavar="FILE", help="The new file.", show_default="FILE.recovered.mcap next to it")
     ] = None,
+    as_json: AsJson = False,
 ) -> None:
     """Make a finished MCAP file of a recording that was cut off (killed, power, full disk) or damaged.
 
@@ -128,6 +134,7 @@ def recover(
         found = recover_file(file, new)
     if found.is_whole:
         results.print(f"{file} is complete: {found.steps} steps, its end and its index; nothing to recover")
+        print_json(asdict(found), [])
         return
     lost = [] if found.finished else ["the end: the recording was cut off, or its index is damaged"]
     lost += [f"bytes {begin} to {end}: a step that was not finished, or is damaged" for begin, end in found.damaged]
@@ -139,3 +146,4 @@ def recover(
     ]:
         results.print(f"  {words}")
     print_files(new)
+    print_json(asdict(found), [new])

@@ -11,8 +11,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from robot.cli.errors import EXIT_FAILED, print_error
-from robot.cli.options import Out, Overrides
-from robot.cli.output import Bar, busy, new_directory, notes, one_bar, report_mesh_measuring, results, warn, writing
+from robot.cli.options import AsJson, Out, Overrides
+from robot.cli.output import (
+    Bar,
+    busy,
+    new_directory,
+    notes,
+    one_bar,
+    print_json,
+    report_mesh_measuring,
+    results,
+    warn,
+    writing,
+)
 from robot.cli.terminal import Interrupt, ask_operator, require_operator
 
 if TYPE_CHECKING:
@@ -63,6 +74,7 @@ def run(
     ] = None,
     set_: Overrides = None,
     out: Out = None,
+    as_json: AsJson = False,
 ) -> None:
     """Run one episode: a policy on a rig. Records it and writes a report.
 
@@ -227,6 +239,7 @@ def _run_steps(
 def replay(
     file: Annotated[Path, typer.Argument(help="An episode.mcap, complete or cut off.")],
     out: Out = None,
+    as_json: AsJson = False,
 ) -> None:
     """Write the report of a recorded episode again. Nothing is executed.
 
@@ -261,3 +274,4 @@ def _write_report(episode: Episode, folder: Path, files: Sequence[Path]) -> None
         notes.print(words)
     listed = [paths["report.html"], paths["report.png"], *files, paths["summary.json"]]
     results.print(summary_table(stats, listed))
+    print_json({"summary": stats}, listed)

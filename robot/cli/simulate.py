@@ -10,6 +10,7 @@ import typer
 
 from robot.cli.errors import EXIT_FAILED, print_error
 from robot.cli.options import (
+    AsJson,
     OptionGroup,
     Out,
     Overrides,
@@ -20,7 +21,17 @@ from robot.cli.options import (
     quantities_parser,
     with_option_groups,
 )
-from robot.cli.output import busy, new_directory, notes, print_files, progress, report_mesh_measuring, results, writing
+from robot.cli.output import (
+    busy,
+    new_directory,
+    notes,
+    print_files,
+    print_json,
+    progress,
+    report_mesh_measuring,
+    results,
+    writing,
+)
 from robot.cli.terminal import Interrupt
 
 if TYPE_CHECKING:
@@ -72,6 +83,7 @@ def press(
     sensor: SensorModel = "ideal",
     set_: Overrides = None,
     out: Out = None,
+    as_json: AsJson = False,
 ) -> None:  # fmt: skip
     """Press a rigid indenter on one gel: rgb.png, height.npy, height.png, press.json with force and contact radius, and
     side.png, which shows the side that presses.
@@ -137,7 +149,9 @@ def press(
     if not config["settled"]:
         held = "not held" if config["residual"] is None else f"relative residual {config['residual']:.2g}"
         notes.print(f"warning: not settled, {config['unfollowed'] or f'{held}; raise settling.max_substeps'}")
-    print_files(*sorted(folder.iterdir()))
+    written = sorted(folder.iterdir())
+    print_files(*written)
+    print_json(config, written)
 
 
 def _orientation_overrides(down: str | None, rotation: tuple[float, ...] | None) -> list[str]:
@@ -180,6 +194,7 @@ def reproduce(
         Literal["both", "hybrid", "seed"], typer.Option(help="The seed's scheme, that of tacsim (hybrid), or both.")
     ] = "both",
     out: Out = None,
+    as_json: AsJson = False,
 ) -> None:
     """Repeat the seed paper's experiment: fig4.png and fig4.json; exit code 1 if its result is not reproduced.
 
@@ -211,27 +226,30 @@ def reproduce(
         table.write_text(json.dumps(experiment.as_json(trials), indent=1, allow_nan=False) + "\n", encoding="utf-8")
         draw_figure4(trials, picture)
     print_files(picture, table)
-    if _report_trials(trials):
+    problems = _report_trials(trials)
+    print_json({"trials": experiment.as_json(trials), "problems": problems}, [picture, table])
+    if problems:
         raise typer.Exit(1)
 
 
-def _report_trials(trials: dict[str, dict[str, Trial]]) -> bool:
-    """Prints one line per trial; returns True if one of them failed."""
+def _report_trials(trials: dict[str, dict[str, Trial]]) -> list[str]:
+    """Prints one line per trial; returns what is wrong with them."""
     from robot.studies.experiment import shortcomings
 
-    failed = False
+    found: list[str] = []
     for task, schemes in trials.items():
         for scheme, trial in schemes.items():
             problems = shortcomings(task, trial)
             said = "; ".join(problems) or f"closest {trial.distance[trial.peak] * 1e3:.3f} mm at step {trial.peak}"
             results.print(f"{'FAILED' if problems else 'ok':8}{task}, {scheme}: {said}")
-            failed = failed or bool(problems)
-    return failed
+            found += [f"{task}, {scheme}: {problem}" for problem in problems]
+    return found
 
 
 def debug(
     dump: Annotated[Path, typer.Argument(help="Folder of a dump, named in the error: OUT/diverged/00.")],
     again: Annotated[bool, typer.Option("--replay/--no-replay", help="Run the motion again.")] = True,
+    as_json: AsJson = False,
 ) -> None:
     """Inspect a diverged simulation: a table, a section through body and gels (debug.png), and a replay of the motion.
 
@@ -248,17 +266,21 @@ def debug(
         world = dump_view.open_world(found)
     results.print(found.info.message)
     results.print(", ".join(f"{name} {version}" for name, version in found.info.versions.items()))
-    for row, values in {"": dump_view.TITLES, **dump_view.table(found)}.items():
+    table = dump_view.table(found)
+    for row, values in {"": dump_view.TITLES, **table}.items():
         shown = "".join(f"{values.get(moment, ''):50}" for moment in dump_view.TITLES)
         results.print(f"{row:38}{shown.rstrip()}")
     picture = (dump.parent if dump.name == "dump.json" else dump) / "debug.png"
     with busy("drawing"):
         dump_view.draw(found, picture)
-    failure = None
+    failure, outcome = None, None
     if again:
         with busy("running the motion again"):
             failure, outcome = dump_view.replay(found, world)
         results.print(f"replay    {outcome}")
     print_files(picture)
+    print_json(
+        {"message": found.info.message, "versions": found.info.versions, "table": table, "replay": outcome}, [picture]
+    )
     if failure is not None:
         raise typer.Exit(EXIT_FAILED)

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from robot.cli.calibrate.session import guided_session, image_writer, named_camera
-from robot.cli.options import Out, Overrides, quantities_parser
-from robot.cli.output import busy, new_directory, print_files, progress, results, show_table, writing
+from robot.cli.options import AsJson, Out, Overrides, quantities_parser
+from robot.cli.output import busy, new_directory, print_files, print_json, progress, results, show_table, writing
 
 if TYPE_CHECKING:
     import numpy as np
@@ -57,6 +57,7 @@ def lens(
     ] = None,
     set_: Overrides = None,
     out: Out = None,
+    as_json: AsJson = False,
 ) -> None:
     """Calibrate a camera's lens, or its view of a gel, from pictures of a board.
 
@@ -169,7 +170,9 @@ def _fit_lens(pictures: Path, board: Board, folder: Path) -> None:
         f"{lens_.centre[1]:.1f} px; residual {lens_.residual:.2f} px"
     )
     with writing(folder):
-        print_files(_write_yaml(folder / "lens.yaml", lens_))
+        path = _write_yaml(folder / "lens.yaml", lens_)
+    print_files(path)
+    print_json({**lens_.model_dump(mode="json"), "residuals": each, "left_out": missing}, [path])
 
 
 def _fit_view(
@@ -216,7 +219,9 @@ def _report_view(view: GelView, image: NDArray[np.uint8], folder: Path) -> None:
     )
     with writing(folder):
         (folder / "rectified.png").write_bytes(encode_png(np.rint(metric_rectification(view)(image)).astype(np.uint8)))
-        print_files(_write_yaml(folder / "view.yaml", view), folder / "rectified.png")
+        written = [_write_yaml(folder / "view.yaml", view), folder / "rectified.png"]
+    print_files(*written)
+    print_json(view.model_dump(mode="json"), written)
 
 
 def _read_picture(path: Path) -> NDArray[np.uint8]:

@@ -7,6 +7,7 @@ import math
 import shlex
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,8 +15,17 @@ import typer
 
 from robot.cli.calibrate.session import confirm_motion, guided_session
 from robot.cli.errors import print_error
-from robot.cli.options import HardwareRig, OptionGroup, Out, Overrides, angle_option, length_option, with_option_groups
-from robot.cli.output import busy, new_directory, notes, print_files, results, show_table, writing
+from robot.cli.options import (
+    AsJson,
+    HardwareRig,
+    OptionGroup,
+    Out,
+    Overrides,
+    angle_option,
+    length_option,
+    with_option_groups,
+)
+from robot.cli.output import busy, new_directory, notes, print_files, print_json, results, show_table, writing
 from robot.cli.terminal import Interrupt, ask_operator, require_operator
 
 if TYPE_CHECKING:
@@ -65,6 +75,7 @@ def touch(
     errors: TouchErrors,
     set_: Overrides = None,
     out: Out = None,
+    as_json: AsJson = False,
 ) -> None:
     """Find the pose of a sensor on its arm (tool_from_sensor), from touches of one fixed ball with many tilts.
 
@@ -203,6 +214,7 @@ def hand_eye(
     errors: BoardErrors,
     set_: Overrides = None,
     out: Out = None,
+    as_json: AsJson = False,
 ) -> None:
     """Find the pose of a camera on an arm's flange, or of a fixed camera, from poses in which it saw one board.
 
@@ -317,6 +329,7 @@ def _write_report(folder: Path, name: str, report: dict[str, Any]) -> None:
     with writing(folder):
         path.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
     print_files(path)
+    print_json(report, [path])
 
 
 def latency(
@@ -327,6 +340,7 @@ def latency(
     depth: Annotated[Any, length_option("Depth beyond the first touch.", 1e-6, 5e-3)] = "0.2 mm",
     lift: Annotated[Any, length_option("Retreat between taps.", 1e-6, 5e-3)] = "1 mm",
     set_: Overrides = None,
+    as_json: AsJson = False,
 ) -> None:
     """Measure the latency of a camera: its arm taps on a rigid object, and the two recordings are correlated.
 
@@ -361,5 +375,7 @@ def latency(
         if measured.seconds > 3.0 * measured.uncertainty:
             notes.print("warning: they still seem later than the arm; is the arm's own latency in the file too large?")
     results.print("Write into the rig file:")
-    for key, seconds in latency_entries(measured, record.clock, arm, hardware_arm(config, arm), sensor).items():
+    entries = latency_entries(measured, record.clock, arm, hardware_arm(config, arm), sensor)
+    for key, seconds in entries.items():
         results.print(f"  {key}: {1e3 * seconds:.1f} ms")
+    print_json({**asdict(measured), "clock": record.clock, "entries": entries})

@@ -22,6 +22,7 @@ from robot.cli.calibrate.light import (
 )
 from robot.cli.calibrate.session import confirm_free_gel, guided_session, image_writer, named_camera
 from robot.cli.options import (
+    AsJson,
     OptionGroup,
     Out,
     Overrides,
@@ -131,6 +132,7 @@ def sensor(
     ] = None,
     set_: Overrides = None,
     out: Out = None,
+    as_json: AsJson = False,
 ) -> None:
     """Calibrate a sensor's light from presses of a ball: colour as a function of slope, and slope of colour.
 

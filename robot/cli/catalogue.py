@@ -5,11 +5,11 @@ from __future__ import annotations
 import keyword
 import re
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import typer
 
-from robot.cli.options import AsJson
+from robot.cli.options import AsJson, complete_names
 from robot.cli.output import notes, print_files, print_json, results, show_table, writing
 
 Kind = Literal[
@@ -40,7 +40,10 @@ def list_(
 
 
 def show(
-    name: Annotated[str, typer.Argument(help="A name that tacsim list prints.")],
+    name: Annotated[
+        str,
+        typer.Argument(help="A name that tacsim list prints.", autocompletion=complete_names(*get_args(Kind))),
+    ],
     kind: Annotated[Kind | None, typer.Option(help="Where several kinds have that name.", show_default=False)] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -129,7 +132,12 @@ def new(
     name: Annotated[str, typer.Argument(help="Its name: letters, digits, - and _.")],
     source: Annotated[
         str | None,
-        typer.Option("--from", help="The shipped file to copy (tacsim list KIND).", show_default="one of that kind"),
+        typer.Option(
+            "--from",
+            help="The shipped file to copy (tacsim list KIND).",
+            show_default="one of that kind",
+            autocompletion=complete_names(*get_args(Kind)),
+        ),
     ] = None,
     out: Annotated[
         Path | None, typer.Option(help="The new file; of a driver the new folder.", show_default="NAME")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from robot.cli.errors import print_error
-from robot.cli.options import AsJson, OptionGroup, Out, Overrides, with_option_groups
+from robot.cli.options import AsJson, OptionGroup, Out, Overrides, complete_names, with_option_groups
 from robot.cli.output import (
     busy,
     counted,
@@ -58,7 +58,14 @@ class Sources(OptionGroup):
 
 @with_option_groups
 def compare(
-    a: Annotated[str, typer.Argument(metavar="A", help="Folder of pictures, video, episode, or scene with a ball.")],
+    a: Annotated[
+        str,
+        typer.Argument(
+            metavar="A",
+            help="Folder of pictures, video, episode, or scene with a ball.",
+            autocompletion=complete_names("scene"),
+        ),
+    ],
     b: Annotated[Path, typer.Argument(metavar="B", help="Folder, video or episode that counts as ground truth.")],
     *,
     sources: Sources,

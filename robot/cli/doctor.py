@@ -8,7 +8,7 @@ import typer
 
 from robot.cli.bench import from_checkout, require_checkout
 from robot.cli.errors import print_error
-from robot.cli.options import AsJson, HardwareRig, Overrides
+from robot.cli.options import AsJson, HardwareRig, Overrides, complete_names
 from robot.cli.output import SafeConsole, busy, notes, print_json, results
 from robot.cli.terminal import Interrupt, ask_operator, has_operator
 
@@ -18,8 +18,19 @@ if TYPE_CHECKING:
 MARKS = {"ok": "[green]ok[/]", "warn": "[yellow]warn[/]", "fail": "[bold red]fail[/]"}
 
 
+def _complete_schema() -> list[str]:
+    from tacsim.config import KINDS
+
+    return [*KINDS, "bench"]
+
+
 def schema(
-    kind: Annotated[str, typer.Argument(help="What the file describes, for example rig or scene; or bench.")] = "rig",
+    kind: Annotated[
+        str,
+        typer.Argument(
+            help="What the file describes, for example rig or scene; or bench.", autocompletion=_complete_schema
+        ),
+    ] = "rig",
 ) -> None:
     """Print the JSON schema of a configuration file; editors complete and check YAML with it.
 
@@ -43,7 +54,12 @@ def schema(
 def doctor(
     rig: Annotated[
         str | None,
-        typer.Option("--rig", metavar="FILE", help="Check this rig instead: arms, their forces, cameras, limits."),
+        typer.Option(
+            "--rig",
+            metavar="FILE",
+            help="Check this rig instead: arms, their forces, cameras, limits.",
+            autocompletion=complete_names("rig"),
+        ),
     ] = None,
     set_: Overrides = None,
     as_json: AsJson = False,

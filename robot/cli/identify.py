@@ -14,6 +14,7 @@ from robot.cli.options import (
     OptionGroup,
     Out,
     Overrides,
+    complete_names,
     length_option,
     quantities_parser,
     quantity_parser,
@@ -95,7 +96,9 @@ class Fitting(OptionGroup):
 @with_option_groups
 def gel(
     presses: Recorded = None,
-    scene: Annotated[str, typer.Option(help="The scene that was pressed, with an indenter.")] = "press",
+    scene: Annotated[
+        str, typer.Option(help="The scene that was pressed, with an indenter.", autocompletion=complete_names("scene"))
+    ] = "press",
     indenter: Annotated[
         Any,
         typer.Option(
@@ -128,7 +131,9 @@ def gel(
 @with_option_groups
 def body(
     squeezes: Recorded = None,
-    scene: Annotated[str, typer.Option(help="The scene that was squeezed, with a body.")] = "squeeze",
+    scene: Annotated[
+        str, typer.Option(help="The scene that was squeezed, with a body.", autocompletion=complete_names("scene"))
+    ] = "squeeze",
     gel_error: Annotated[
         float, typer.Option(min=0.0, max=1.0, help="Relative standard deviation of the gels' stiffness.")
     ] = 0.0,

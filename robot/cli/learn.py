@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from robot.cli.options import AsJson, Out, Overrides, TrainingFile, require_packages
+from robot.cli.options import AsJson, Out, Overrides, TrainingFile, complete_names, require_packages
 from robot.cli.output import (
     busy,
     choose_json_file,
@@ -35,11 +35,19 @@ export = typer.Typer(no_args_is_help=True, help="Write policies and recordings a
 
 def train(
     task: Annotated[
-        str | None, typer.Argument(help="squeeze, reposition, knead, or the path of a training file.")
+        str | None,
+        typer.Argument(
+            help="squeeze, reposition, knead, or the path of a training file.",
+            autocompletion=complete_names("training"),
+        ),
     ] = None,
     algorithm: Annotated[
         str | None,
-        typer.Option(help="dagger (from a teacher), ppo or sac (from the reward).", show_default="the file's"),
+        typer.Option(
+            help="dagger (from a teacher), ppo or sac (from the reward).",
+            show_default="the file's",
+            autocompletion=complete_names(words=("dagger", "ppo", "sac")),
+        ),
     ] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Same seed, same policy.", show_default="the file's")] = None,
     resume: Annotated[
@@ -186,6 +194,7 @@ def evaluate(
         typer.Option(
             help="teacher (uses the truth), random, scripted, learned (the shipped one), FILE.onnx; may be repeated.",
             show_default="teacher, scripted, random",
+            autocompletion=complete_names(words=("teacher", "random", "scripted", "learned")),
         ),
     ] = None,
     episodes: Annotated[int, typer.Option(min=2, max=10_000, help="Of each policy.")] = 200,
@@ -281,16 +290,27 @@ def _interval_text(interval: Interval, scale: float, digits: int) -> str:
 
 
 def transfer(
-    task: Annotated[str, typer.Argument(help="squeeze, reposition, knead, or the path of a task file.")],
+    task: Annotated[
+        str,
+        typer.Argument(
+            help="squeeze, reposition, knead, or the path of a task file.", autocompletion=complete_names("task")
+        ),
+    ],
     policy: Annotated[
         list[str] | None,
         typer.Option(
-            help="learned (the shipped one), scripted, FILE.onnx; may be repeated.", show_default="learned, scripted"
+            help="learned (the shipped one), scripted, FILE.onnx; may be repeated.",
+            show_default="learned, scripted",
+            autocompletion=complete_names(words=("learned", "scripted")),
         ),
     ] = None,
     twin: Annotated[
         str | None,
-        typer.Option(help="Randomisation that draws the hidden twins: a name or path.", show_default="TASK-twin"),
+        typer.Option(
+            help="Randomisation that draws the hidden twins: a name or path.",
+            show_default="TASK-twin",
+            autocompletion=complete_names("randomisation"),
+        ),
     ] = None,
     episodes: Annotated[int, typer.Option(min=2, max=10_000, help="Of each policy on each side.")] = 20,
     every: Annotated[int, typer.Option(min=1, max=10_000, help="Number of episodes with the same hidden twin.")] = 5,

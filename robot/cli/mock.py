@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from robot.cli.options import complete_names
 from robot.cli.output import results
 from robot.cli.terminal import Interrupt
 
@@ -23,7 +24,9 @@ def mock(
         list[str] | None,
         typer.Option("--host", help="Address of an arm, instead of --arms; may be repeated.", show_default=False),
     ] = None,
-    model: Annotated[str, typer.Option(help="ur3e, ur5e or ur10e.")] = "ur5e",
+    model: Annotated[
+        str, typer.Option(help="ur3e, ur5e or ur10e.", autocompletion=complete_names(words=("ur3e", "ur5e", "ur10e")))
+    ] = "ur5e",
     cameras: Annotated[
         int, typer.Option("--cameras", min=0, max=16, help="How many: at the arms' addresses, then the next ones.")
     ] = 0,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import cached_property, update_wrapper
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_type_hints
@@ -13,6 +13,20 @@ import typer
 
 from robot.cli.output import choose_json
 
+
+def complete_names(*kinds: str, words: Iterable[str] = ()) -> Callable[[], list[tuple[str, str]]]:
+    """Completion in a shell of `words` and of the names of these kinds (of `tacsim list`), with their summaries."""
+
+    def complete() -> list[tuple[str, str]]:
+        from tacsim.config.catalogue import list_entries
+
+        named = [(entry.name, entry.summary) for kind in kinds for entry in list_entries(kind)]
+        return [*((word, "") for word in words), *named]
+
+    return complete
+
+
+TASK_POLICIES = ("scripted", "grip", "learned")  # names of policies of `tacsim run`
 AsJson = Annotated[
     bool, typer.Option("--json", callback=choose_json, help="Print the result as one JSON document instead of text.")
 ]
@@ -26,10 +40,25 @@ Overrides = Annotated[
 ]
 Preset = Annotated[Literal["learn", "draft", "standard"], typer.Option("--preset", help="Resolution.")]
 SensorModel = Annotated[
-    str, typer.Option("--sensor", help="Its name, the path of a YAML file, or of a calibrated bundle.")
+    str,
+    typer.Option(
+        "--sensor",
+        help="Its name, the path of a YAML file, or of a calibrated bundle.",
+        autocompletion=complete_names("sensor"),
+    ),
 ]
-HardwareRig = Annotated[str, typer.Argument(help="A rig of hardware (ur5e, ur5e-one, mock), or the path of its file.")]
-TrainingFile = Annotated[str, typer.Argument(help="squeeze, reposition, knead, or the path of a training file.")]
+HardwareRig = Annotated[
+    str,
+    typer.Argument(
+        help="A rig of hardware (ur5e, ur5e-one, mock), or the path of its file.", autocompletion=complete_names("rig")
+    ),
+]
+TrainingFile = Annotated[
+    str,
+    typer.Argument(
+        help="squeeze, reposition, knead, or the path of a training file.", autocompletion=complete_names("training")
+    ),
+]
 
 
 def quantity_parser(kind: str, low: float = -math.inf, high: float = math.inf) -> Callable[[str], float]:

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from robot.cli.options import AsJson, Out, Overrides
+from robot.cli.options import AsJson, Out, Overrides, complete_names
 from robot.cli.output import busy, counted, new_directory, notes, print_files, print_json, results
 from robot.cli.run import run
 
@@ -16,12 +16,21 @@ from robot.cli.run import run
 def view(
     episode: Annotated[
         str,
-        typer.Argument(metavar="EPISODE|RIG", help="An episode.mcap, complete or cut off; or a rig, shown live."),
+        typer.Argument(
+            metavar="EPISODE|RIG",
+            help="An episode.mcap, complete or cut off; or a rig, shown live.",
+            autocompletion=complete_names("rig"),
+        ),
     ],
     save: Annotated[
         Path | None, typer.Option(metavar="FILE.rrd", help="Write a file for the viewer instead of starting one.")
     ] = None,
-    task: Annotated[str | None, typer.Option(help="Of a rig, as in tacsim run.", show_default="the rig's own")] = None,
+    task: Annotated[
+        str | None,
+        typer.Option(
+            help="Of a rig, as in tacsim run.", show_default="the rig's own", autocompletion=complete_names("task")
+        ),
+    ] = None,
     steps: Annotated[
         int | None, typer.Option(min=0, help="Of a rig: control steps.", show_default="the task's; else 40")
     ] = None,

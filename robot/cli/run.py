@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from robot.cli.errors import EXIT_FAILED, print_error
-from robot.cli.options import AsJson, Out, Overrides
+from robot.cli.options import TASK_POLICIES, AsJson, Out, Overrides, complete_names
 from robot.cli.output import (
     Bar,
     busy,
@@ -43,13 +43,18 @@ MAX_REPLAY_STEPS = 1_000_000  # of a replay, which ends with its recording
 
 def run(
     rig: Annotated[
-        str, typer.Argument(help="A rig (sim, press, mock, ur5e, ur5e-one, replay), or the path of its file.")
+        str,
+        typer.Argument(
+            help="A rig (sim, press, mock, ur5e, ur5e-one, replay), or the path of its file.",
+            autocompletion=complete_names("rig"),
+        ),
     ] = "sim",
     task: Annotated[
         str | None,
         typer.Option(
             help="squeeze, reposition, knead, the path of a task file, or package.module:name.",
             show_default="the rig's own",
+            autocompletion=complete_names("task"),
         ),
     ] = None,
     policy: Annotated[
@@ -57,6 +62,7 @@ def run(
         typer.Option(
             help="scripted, grip, learned (the shipped one), FILE.onnx, a motion (FILE.csv), or package.module:name.",
             show_default="scripted; grip without a task",
+            autocompletion=complete_names(words=TASK_POLICIES),
         ),
     ] = None,
     steps: Annotated[

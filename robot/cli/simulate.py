@@ -17,6 +17,7 @@ from robot.cli.options import (
     Preset,
     SensorModel,
     angle_option,
+    complete_names,
     length_option,
     quantities_parser,
     with_option_groups,
@@ -71,7 +72,13 @@ class IndenterShape(OptionGroup):
 
 @with_option_groups
 def press(
-    indenter: Annotated[str, typer.Argument(help="sphere, cylinder, box, or the path of an STL, OBJ or PLY file.")],
+    indenter: Annotated[
+        str,
+        typer.Argument(
+            help="sphere, cylinder, box, or the path of an STL, OBJ or PLY file.",
+            autocompletion=complete_names(words=("sphere", "cylinder", "box")),
+        ),
+    ],
     *,
     depth: Annotated[Any, length_option("Depth below the surface of the untouched gel.")] = "0.5 mm",
     slide: Annotated[

@@ -22,6 +22,7 @@ from robot.cli.options import (
     Out,
     Overrides,
     angle_option,
+    complete_names,
     length_option,
     with_option_groups,
 )
@@ -37,7 +38,12 @@ if TYPE_CHECKING:
     from tacsim.interface import Pose
 
 Rig = Annotated[
-    str | None, typer.Option("--rig", help="A rig of hardware, or the path of its file: measure now, with its arm.")
+    str | None,
+    typer.Option(
+        "--rig",
+        help="A rig of hardware, or the path of its file: measure now, with its arm.",
+        autocompletion=complete_names("rig"),
+    ),
 ]
 
 

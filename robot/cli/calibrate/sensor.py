@@ -26,6 +26,7 @@ from robot.cli.options import (
     OptionGroup,
     Out,
     Overrides,
+    complete_names,
     length_option,
     quantities_parser,
     quantity_parser,
@@ -60,6 +61,7 @@ class Description(OptionGroup):
         typer.Option(
             "--kind",
             metavar="KIND",
+            autocompletion=complete_names(words=("mini", "mini-markers", "r1.5", "digit", "9dtact", "other")),
             help="mini, mini-markers, r1.5, digit, 9dtact or other: gives published properties, such as the part "
             "of the picture that shows the gel, an approximate pixel pitch, dots.",
         ),

@@ -19,9 +19,9 @@ from tacsim.config.annotation import (
     union_models,
 )
 from tacsim.config.document import LoadState, Node
-from tacsim.config.errors import join_keys, suggest_word
+from tacsim.config.errors import join_keys
 from tacsim.models.driver import refused_driver
-from tacsim.models.text import printable_line
+from tacsim.models.text import printable_line, suggest_word
 
 
 @dataclass(frozen=True, slots=True)

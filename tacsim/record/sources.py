@@ -127,7 +127,9 @@ def list_pictures(folder: Path) -> list[Path]:
 def _suggest_files(folder: Path) -> str:
     """Text with other files of a folder without pictures, which may explain the error."""
     if (bags := visible_files(folder, EPISODES)) and (folder / "metadata.yaml").is_file():
-        return f"; it is the folder of a ROS 2 bag ({bags[0].name}), whose topics are not read: export its pictures"
+        return (
+            f"; it is the folder of a ROS 2 bag ({bags[0].name}): replay it (tacsim run replay), or export its pictures"
+        )
     if other := visible_files(folder, OTHER_PICTURES):
         return f", but {len(other)} like {other[0].name}; save them as PNG with 8 bits a channel"
     return ""

@@ -23,6 +23,7 @@ from robot.cli.output import (
     warn,
     writing,
 )
+from tacsim.models.text import suggest_word
 
 if TYPE_CHECKING:
     from calibration.bundle import Calibration
@@ -104,10 +105,14 @@ def compare(
         from calibration.compare.invariance import measure_invariance
         from calibration.compare.report import comparison_as_json, comparison_figures, write_comparison
         from calibration.errors import BadFrames
+        from tacsim.config import shipped_names
     limits = [*_parse_limits(fail_above, "--fail-above"), *_parse_limits(fail_below, "--fail-below")]
     bundles = [
         None if path is None else read_bundle(path)[0] for path in (sources.calibration_a, sources.calibration_b)
     ]
+    if not Path(a).exists() and not _is_scene(a):
+        hint = suggest_word(a, shipped_names("scene"))
+        raise BadFrames(f"{a}: no such file or folder, and no shipped scene{hint}")
     truth = _read_frames(b, sources.reference_b, sources.sensor_b, bundles[1])
     if _is_scene(a):
         if sources.corners_a or sources.corners_b or sources.reference_a or sources.sensor_a:
@@ -232,7 +237,8 @@ def _parse_limits(texts: list[str] | None, option: str) -> list[Limit]:
         name, equals, value = text.partition("=")
         if name not in figure_names():
             raise typer.BadParameter(
-                f"'{name}' is not a figure; allowed: {', '.join(figure_names())}", param_hint=option
+                f"'{name}' is not a figure; allowed: {', '.join(figure_names())}{suggest_word(name, figure_names())}",
+                param_hint=option,
             )
         try:
             number = parse_quantity(value.strip(), "length") if name in LENGTHS else float(value)

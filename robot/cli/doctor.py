@@ -11,6 +11,7 @@ from robot.cli.errors import print_error
 from robot.cli.options import AsJson, HardwareRig, Overrides, complete_names
 from robot.cli.output import SafeConsole, busy, notes, print_json, results
 from robot.cli.terminal import Interrupt, ask_operator, has_operator
+from tacsim.models.text import suggest_word
 
 if TYPE_CHECKING:
     from tacsim.models.driver import Check
@@ -47,7 +48,9 @@ def schema(
         typer.echo(json.dumps(from_checkout("benchmarks.harness.schema").json_schema(), indent=2))
         return
     if kind not in KINDS:
-        raise typer.BadParameter(f"no kind '{kind}'; allowed: {', '.join(KINDS)}, bench", param_hint="KIND")
+        known = (*KINDS, "bench")
+        words = f"no kind '{kind}'; allowed: {', '.join(known)}{suggest_word(kind, known)}"
+        raise typer.BadParameter(words, param_hint="KIND")
     typer.echo(json.dumps(json_schema(kind), indent=2))
 
 

@@ -11,6 +11,7 @@ import typer
 from robot.cli.options import complete_names
 from robot.cli.output import results
 from robot.cli.terminal import Interrupt
+from tacsim.models.text import suggest_word
 
 if TYPE_CHECKING:
     from robot.mock import FaultClient
@@ -58,7 +59,8 @@ def mock(
     from robot.mock.ur.wire.controller import PORTS
 
     if model not in MODELS:
-        raise typer.BadParameter(f"no model '{model}'; allowed: {', '.join(MODELS)}", param_hint="--model")
+        words = f"no model '{model}'; allowed: {', '.join(MODELS)}{suggest_word(model, MODELS)}"
+        raise typer.BadParameter(words, param_hint="--model")
     try:
         claimed = VERSION if version is None else parse_version(version)
     except ValueError as error:

@@ -34,6 +34,7 @@ from robot.cli.output import (
     writing,
 )
 from robot.cli.terminal import Interrupt
+from tacsim.models.text import suggest_word
 
 if TYPE_CHECKING:
     from tacsim.report.figure4 import Trial
@@ -184,7 +185,8 @@ def _geometry_override(indenter: str, given: dict[str, Any]) -> str:
     mesh = {"path": str(Path(indenter).absolute()), "scale": None, "repair": False}
     if indenter not in usual and not indenter.lower().endswith(SUFFIXES):
         known = f"sphere, cylinder, box, or the path of a mesh file ({', '.join(SUFFIXES)})"
-        raise typer.BadParameter(f"'{indenter}' is not an indenter; allowed: {known}", param_hint="INDENTER")
+        words = f"'{indenter}' is not an indenter; allowed: {known}{suggest_word(indenter, usual)}"
+        raise typer.BadParameter(words, param_hint="INDENTER")
     described = usual.get(indenter, mesh)
     for name, value in given.items():
         if value is not None and name not in described:

@@ -33,6 +33,7 @@ from robot.cli.options import (
     with_option_groups,
 )
 from robot.cli.output import new_directory, notes, warn
+from tacsim.models.text import suggest_word
 
 if TYPE_CHECKING:
     from calibration.frame_set import FrameSet
@@ -220,7 +221,8 @@ def _check_options(given: Description, out: Path | None) -> _SensorOptions:
         what = "give the ball's diameter (or its radius, not both): without it no slope is known"
         raise typer.BadParameter(what, param_hint="--ball-diameter")
     if given.kind is not None and given.kind not in PROFILES:
-        raise typer.BadParameter(f"'{given.kind}'; known: {', '.join(PROFILES)}", param_hint="--kind")
+        words = f"'{given.kind}'; known: {', '.join(PROFILES)}{suggest_word(given.kind, PROFILES)}"
+        raise typer.BadParameter(words, param_hint="--kind")
     profile = PROFILES["other" if given.kind is None else given.kind]
     if given.pixel_pitch is not None and given.view is not None:
         raise typer.BadParameter("give either --pixel-pitch or --view")

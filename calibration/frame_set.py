@@ -18,7 +18,7 @@ from calibration.lens.rectification import metric_rectification, rectification_o
 from calibration.lens.view import BadCorners, Corners, GelView
 from calibration.reference import is_contact_image_swapped
 from calibration.tuning import MAX_REFERENCE_CHANGE, MIN_CONTACT_SHARE, SATURATED_LEVEL
-from tacsim.interface import Image, SurfaceMap
+from tacsim.interface import Image, SurfaceMap, short_repr
 from tacsim.models.geometry import PictureRegion
 from tacsim.optics.grid import PixelGrid
 from tacsim.record.episode import EpisodeError
@@ -43,6 +43,7 @@ MAX_FRAMES = 500
 class Frame:
     """One picture."""
 
+    __repr__ = short_repr
     name: str
     image: Image  # (H, W, 3) RGB
     surface: SurfaceMap | None = None  # only from simulations
@@ -52,6 +53,7 @@ class Frame:
 class FrameSet:
     """The frames of one sensor, all of one size."""
 
+    __repr__ = short_repr
     name: str
     reference: Image  # (H, W, 3) RGB without contact
     reference_from: str  # description of its source

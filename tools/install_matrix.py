@@ -121,7 +121,10 @@ def main() -> None:
         folder = (Path(place) if options.dist is None else options.dist).resolve()
         if not list(folder.glob("tacsim-*.whl")):
             build_distributions(folder, pythons[0])
-        rows = [row for python in pythons for row in try_wheels(sorted(folder.glob("*.whl")), python)]
+        wheels = sorted(folder.glob("*.whl"))
+        if len({wheel.name.partition("-")[0] for wheel in wheels}) < len(wheels):
+            parser.error(f"{folder} holds several wheels of one distribution; name a new folder by --dist")
+        rows = [row for python in pythons for row in try_wheels(wheels, python)]
     sys.stdout.write("| Python | wheel | step | time [s] | result |\n|---|---|---|---|---|\n")
     for row in rows:
         sys.stdout.write(f"| {row.python} | {row.wheel} | {row.step} | {row.seconds:.0f} | {row.result} |\n")

@@ -32,6 +32,7 @@ from robot.cli.errors import Guarded
 from robot.cli.identify import body, gel, identify
 from robot.cli.learn import evaluate, export, policy, policy_range, train, transfer
 from robot.cli.mock import mock
+from robot.cli.options import with_json_option
 from robot.cli.recordings import lerobot, recover, view
 from robot.cli.run import replay, run
 from robot.cli.simulate import debug, press, reproduce
@@ -70,12 +71,17 @@ GROUPS = {
 }
 
 
+# No result, a result that is JSON anyway, and two commands whose --json names a file
+WITHOUT_JSON_OPTION = (mock, schema, bench, evaluate)
+
+
 def _add_command(group: typer.Typer, command: Callable[..., None], heading: str | None = None) -> None:
     # typer takes the first line of help from the docstring, and the example from the epilog
     text, _, example = (command.__doc__ or "").partition("Example:")
     name = command.__name__.strip("_").replace("_", "-")
     epilog = f"Example: [bold]{example.strip()}[/]"
-    group.command(name, help=text, epilog=epilog, rich_help_panel=heading)(command)
+    given = command if command in WITHOUT_JSON_OPTION else with_json_option(command)
+    group.command(name, help=text, epilog=epilog, rich_help_panel=heading)(given)
 
 
 for heading, commands in HEADINGS.items():

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, get_args
 
 import typer
 
-from robot.cli.options import AsJson, complete_names
+from robot.cli.options import complete_names
 from robot.cli.output import notes, print_files, print_json, results, show_table, writing
 
 Kind = Literal[
@@ -19,7 +19,6 @@ Kind = Literal[
 
 def list_(
     kind: Annotated[Kind | None, typer.Argument(help="All kinds if left out.", show_default=False)] = None,
-    as_json: AsJson = False,
 ) -> None:
     """List what is shipped or installed by name: rigs, tasks, scenes, sensors, materials, policies, drivers.
 
@@ -28,13 +27,9 @@ def list_(
     from tacsim.config.catalogue import CATALOGUE_KINDS, list_entries
 
     entries = [entry for each in ([kind] if kind else CATALOGUE_KINDS) for entry in list_entries(each)]
-    if as_json:
-        rows = [
-            {"kind": each.kind, "name": each.name, "summary": each.summary, "path": _text(each.path)}
-            for each in entries
-        ]
-        print_json(rows)
-        return
+    print_json(
+        [{"kind": each.kind, "name": each.name, "summary": each.summary, "path": _text(each.path)} for each in entries]
+    )
     show_table("", ("kind", "name", ""), [(each.kind, each.name, each.summary) for each in entries], left=(0, 1, 2))
     notes.print("tacsim show NAME prints one of them; the path of a file may stand for each name, except a driver's")
 
@@ -45,7 +40,6 @@ def show(
         typer.Argument(help="A name that tacsim list prints.", autocompletion=complete_names(*get_args(Kind))),
     ],
     kind: Annotated[Kind | None, typer.Option(help="Where several kinds have that name.", show_default=False)] = None,
-    as_json: AsJson = False,
 ) -> None:
     """Print what a name stands for: the file of a rig, task, sensor ..., the fields of a driver, a policy's inputs.
 
@@ -55,9 +49,7 @@ def show(
 
     found = find_entries(name, kind)
     described = [{"kind": each.kind, "name": each.name, "path": _text(each.path), **_describe(each)} for each in found]
-    if as_json:
-        print_json(described)
-        return
+    print_json(described)
     for number, each in enumerate(described):
         if number:
             results.print("")
@@ -142,7 +134,6 @@ def new(
     out: Annotated[
         Path | None, typer.Option(help="The new file; of a driver the new folder.", show_default="NAME")
     ] = None,
-    as_json: AsJson = False,
 ) -> None:
     """Write a new file as a copy of a shipped one, or a driver as a small distribution that works.
 

@@ -13,7 +13,6 @@ import typer
 from robot.cli.errors import EXIT_FAILED, print_error
 from robot.cli.options import (
     TASK_POLICIES,
-    AsJson,
     OptionGroup,
     Overrides,
     Preset,
@@ -115,7 +114,6 @@ def press(
     workers: Workers = None,
     ray: Ray = None,
     set_: Overrides = None,
-    as_json: AsJson = False,
 ) -> None:
     """Press objects on a gel at random poses: images with heights, forces, contact, flow and poses, in parquet files.
 
@@ -202,7 +200,6 @@ def episodes(
     workers: Workers = None,
     ray: Ray = None,
     set_: Overrides = None,
-    as_json: AsJson = False,
 ) -> None:
     """Run episodes on a simulated rig: DIR/episode-00000.mcap and so on, for tacsim export lerobot DIR.
 

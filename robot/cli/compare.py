@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from robot.cli.errors import print_error
-from robot.cli.options import AsJson, OptionGroup, Out, Overrides, complete_names, with_option_groups
+from robot.cli.options import OptionGroup, Out, Overrides, complete_names, with_option_groups
 from robot.cli.output import (
     busy,
     counted,
@@ -87,7 +87,6 @@ def compare(
     ] = None,
     set_: Overrides = None,
     out: Out = None,
-    as_json: AsJson = False,
 ) -> None:
     """Compare frames of A with frames of B; each figure is shown with its values for no contact and for noise alone.
 

@@ -8,7 +8,7 @@ import typer
 
 from robot.cli.bench import from_checkout, require_checkout
 from robot.cli.errors import print_error
-from robot.cli.options import AsJson, HardwareRig, Overrides, complete_names
+from robot.cli.options import HardwareRig, Overrides, complete_names
 from robot.cli.output import SafeConsole, busy, notes, print_json, results
 from robot.cli.terminal import Interrupt, ask_operator, has_operator
 from tacsim.models.text import suggest_word
@@ -65,7 +65,6 @@ def doctor(
         ),
     ] = None,
     set_: Overrides = None,
-    as_json: AsJson = False,
 ) -> None:
     """Check Python, packages, OpenCV, Taichi and the machine, or a rig; exit code 1 if something must be repaired.
 
@@ -108,7 +107,6 @@ def print_checks(checks: list[Check]) -> None:
 def start(
     rig: HardwareRig,
     set_: Overrides = None,
-    as_json: AsJson = False,
 ) -> None:
     """Move the arms of a rig from their present position to the start of an episode.
 

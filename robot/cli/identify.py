@@ -10,7 +10,6 @@ import typer
 
 from robot.cli.errors import EXIT_USAGE, print_error
 from robot.cli.options import (
-    AsJson,
     OptionGroup,
     Out,
     Overrides,
@@ -90,7 +89,6 @@ class Fitting(OptionGroup):
     ] = None
     set_: Overrides = None
     out: Out = None
-    as_json: AsJson = False
 
 
 @with_option_groups

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from robot.cli.options import AsJson, Out, Overrides, TrainingFile, complete_names, require_packages
+from robot.cli.options import Out, Overrides, TrainingFile, complete_names, require_packages
 from robot.cli.output import (
     busy,
     choose_json_file,
@@ -55,7 +55,6 @@ def train(
     ] = None,
     set_: Overrides = None,
     out: Out = None,
-    as_json: AsJson = False,
 ) -> None:
     """Train a policy in simulation, and write it as a file for `tacsim run RIG --policy FILE`.
 
@@ -125,7 +124,6 @@ def _run_training(run: RunFolder) -> tuple[Path, list[Mapping[str, float]]]:
 def policy(
     run: Annotated[Path, typer.Argument(help="The folder of a training run, finished or not.")],
     out: Annotated[Path, typer.Option("--out", help="The file to be written, FILE.onnx; it must not exist.")],
-    as_json: AsJson = False,
 ) -> None:
     """Write the policy of a training run as one ONNX file, which contains a description of its inputs and outputs.
 
@@ -155,7 +153,6 @@ def policy_range(
         int | None, typer.Option(min=2, max=10_000, help="Number of episodes.", show_default="4 of each environment")
     ] = None,
     set_: Overrides = None,
-    as_json: AsJson = False,
 ) -> None:
     """Write a policy again, with the range of its observations in episodes of its training.
 
@@ -320,7 +317,6 @@ def transfer(
     workers: Annotated[int, typer.Option(min=1, max=64, help="Parallel rigs, each in a separate process.")] = 1,
     out: Annotated[Path, typer.Option(help="Folder; a study in it is continued.")] = Path("runs/transfer"),
     set_: Overrides = None,
-    as_json: AsJson = False,
 ) -> None:
     """Compare results of policies in simulation and on mock hardware, with the real protocols and another hidden twin.
 

@@ -96,6 +96,29 @@ def length_option(help_: str, low: float = -math.inf, high: float = math.inf) ->
     return typer.Option(parser=quantity_parser("length", low, high), metavar="LENGTH", help=help_)
 
 
+def with_json_option(command: Callable[..., None]) -> Callable[..., None]:
+    """Makes a command with the option --json, by which `print_json` prints the result."""
+    return _JsonCommand(command)
+
+
+class _JsonCommand:
+    """Reads the signature only when it is needed."""
+
+    def __init__(self, command: Callable[..., None]) -> None:
+        update_wrapper(self, command)
+        self._command = command
+
+    def __call__(self, *, as_json: bool, **given: Any) -> None:  # the option's callback has used it
+        self._command(**given)
+
+    @property
+    def __signature__(self) -> inspect.Signature:
+        own = inspect.signature(self._command, eval_str=True).parameters.values()
+        keyword = inspect.Parameter.KEYWORD_ONLY
+        added = inspect.Parameter("as_json", keyword, default=False, annotation=AsJson)
+        return inspect.Signature([*(each.replace(kind=keyword) for each in own), added])
+
+
 class OptionGroup:
     """Options of one or several commands, as annotated attributes with defaults; see `with_option_groups`."""
 

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from robot.cli.options import AsJson, Out, Overrides, complete_names
+from robot.cli.options import Out, Overrides, complete_names
 from robot.cli.output import busy, counted, new_directory, notes, print_files, print_json, results
 from robot.cli.run import run
 
@@ -36,7 +36,6 @@ def view(
     ] = None,
     set_: Overrides = None,
     out: Out = None,
-    as_json: AsJson = False,
 ) -> None:
     """Show an episode or a rig in Rerun: gels, flow and forces in space, images, plots, on one time line.
 
@@ -90,7 +89,6 @@ def lerobot(
     video: Annotated[
         bool, typer.Option("--video", help="Images as H.264 video: a sixth of the size, error about 1 grey level.")
     ] = False,
-    as_json: AsJson = False,
 ) -> None:
     """Make a LeRobot data set (v3.0) of recorded episodes; for lerobot-train, Hugging Face datasets, pandas.
 
@@ -127,7 +125,6 @@ def recover(
     out: Annotated[
         Path | None, typer.Option(metavar="FILE", help="The new file.", show_default="FILE.recovered.mcap next to it")
     ] = None,
-    as_json: AsJson = False,
 ) -> None:
     """Make a finished MCAP file of a recording that was cut off (killed, power, full disk) or damaged.
 

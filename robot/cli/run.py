@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from robot.cli.errors import EXIT_FAILED, print_error
-from robot.cli.options import TASK_POLICIES, AsJson, Out, Overrides, complete_names
+from robot.cli.options import TASK_POLICIES, Out, Overrides, complete_names
 from robot.cli.output import (
     Bar,
     busy,
@@ -80,7 +80,6 @@ def run(
     ] = None,
     set_: Overrides = None,
     out: Out = None,
-    as_json: AsJson = False,
 ) -> None:
     """Run one episode: a policy on a rig. Records it and writes a report.
 
@@ -245,7 +244,6 @@ def _run_steps(
 def replay(
     file: Annotated[Path, typer.Argument(help="An episode.mcap, complete or cut off.")],
     out: Out = None,
-    as_json: AsJson = False,
 ) -> None:
     """Write the report of a recorded episode again. Nothing is executed.
 

@@ -10,7 +10,6 @@ import typer
 
 from robot.cli.errors import EXIT_FAILED, print_error
 from robot.cli.options import (
-    AsJson,
     OptionGroup,
     Out,
     Overrides,
@@ -91,7 +90,6 @@ def press(
     sensor: SensorModel = "ideal",
     set_: Overrides = None,
     out: Out = None,
-    as_json: AsJson = False,
 ) -> None:  # fmt: skip
     """Press a rigid indenter on one gel: rgb.png, height.npy, height.png, press.json with force and contact radius, and
     side.png, which shows the side that presses.
@@ -203,7 +201,6 @@ def reproduce(
         Literal["both", "hybrid", "seed"], typer.Option(help="The seed's scheme, that of tacsim (hybrid), or both.")
     ] = "both",
     out: Out = None,
-    as_json: AsJson = False,
 ) -> None:
     """Repeat the seed paper's experiment: fig4.png and fig4.json; exit code 1 if its result is not reproduced.
 
@@ -258,7 +255,6 @@ def _report_trials(trials: dict[str, dict[str, Trial]]) -> list[str]:
 def debug(
     dump: Annotated[Path, typer.Argument(help="Folder of a dump, named in the error: OUT/diverged/00.")],
     again: Annotated[bool, typer.Option("--replay/--no-replay", help="Run the motion again.")] = True,
-    as_json: AsJson = False,
 ) -> None:
     """Inspect a diverged simulation: a table, a section through body and gels (debug.png), and a replay of the motion.
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from robot.cli.calibrate.session import guided_session, image_writer, named_camera
-from robot.cli.options import AsJson, Out, Overrides, quantities_parser
+from robot.cli.options import Out, Overrides, quantities_parser
 from robot.cli.output import busy, new_directory, print_files, print_json, progress, results, show_table, writing
 
 if TYPE_CHECKING:
@@ -57,7 +57,6 @@ def lens(
     ] = None,
     set_: Overrides = None,
     out: Out = None,
-    as_json: AsJson = False,
 ) -> None:
     """Calibrate a camera's lens, or its view of a gel, from pictures of a board.
 

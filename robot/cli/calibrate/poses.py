@@ -16,7 +16,6 @@ import typer
 from robot.cli.calibrate.session import confirm_motion, guided_session
 from robot.cli.errors import print_error
 from robot.cli.options import (
-    AsJson,
     HardwareRig,
     OptionGroup,
     Out,
@@ -81,7 +80,6 @@ def touch(
     errors: TouchErrors,
     set_: Overrides = None,
     out: Out = None,
-    as_json: AsJson = False,
 ) -> None:
     """Find the pose of a sensor on its arm (tool_from_sensor), from touches of one fixed ball with many tilts.
 
@@ -220,7 +218,6 @@ def hand_eye(
     errors: BoardErrors,
     set_: Overrides = None,
     out: Out = None,
-    as_json: AsJson = False,
 ) -> None:
     """Find the pose of a camera on an arm's flange, or of a fixed camera, from poses in which it saw one board.
 
@@ -346,7 +343,6 @@ def latency(
     depth: Annotated[Any, length_option("Depth beyond the first touch.", 1e-6, 5e-3)] = "0.2 mm",
     lift: Annotated[Any, length_option("Retreat between taps.", 1e-6, 5e-3)] = "1 mm",
     set_: Overrides = None,
-    as_json: AsJson = False,
 ) -> None:
     """Measure the latency of a camera: its arm taps on a rigid object, and the two recordings are correlated.
 

@@ -22,7 +22,6 @@ from robot.cli.calibrate.light import (
 )
 from robot.cli.calibrate.session import confirm_free_gel, guided_session, image_writer, named_camera
 from robot.cli.options import (
-    AsJson,
     OptionGroup,
     Out,
     Overrides,
@@ -30,6 +29,7 @@ from robot.cli.options import (
     length_option,
     quantities_parser,
     quantity_parser,
+    with_json_option,
     with_option_groups,
 )
 from robot.cli.output import new_directory, notes, warn
@@ -110,6 +110,7 @@ class Description(OptionGroup):
 @calibrate.command(
     epilog='Example: [bold]tacsim calibrate sensor frames --ball-diameter "5.84 mm" --pixel-pitch "0.0593 mm"[/]'
 )
+@with_json_option
 @with_option_groups
 def sensor(
     frames: Annotated[
@@ -135,7 +136,6 @@ def sensor(
     ] = None,
     set_: Overrides = None,
     out: Out = None,
-    as_json: AsJson = False,
 ) -> None:
     """Calibrate a sensor's light from presses of a ball: colour as a function of slope, and slope of colour.
 

@@ -85,10 +85,9 @@ class PictureTopic:
         """Median time between two pictures [s], of the first ones: by the headers if their times increase, otherwise by
         the log. None if neither increases. Raises EpisodeError."""
         considered = 200  # pictures; a median needs no more
-        first = list(islice(self._messages(), considered))
-        headers = [_header_time(_decode_message(message, what)) for message, what in first]
-        for times in (headers, [message.log_time * 1e-9 for message, _ in first]):
-            steps = np.diff(times)
+        first = islice(self._messages(), considered)
+        times = [(_header_time(_decode_message(each, what)), each.log_time * 1e-9) for each, what in first]
+        for steps in np.diff(np.array(times), axis=0).T:
             if len(steps) and steps.min() > 0.0:
                 return float(np.median(steps))
         return None
@@ -105,11 +104,10 @@ class PictureTopic:
 def _read_messages(path: Path, topic: str) -> Iterator[Message]:
     with open_file(path) as file:
         reader = SeekingReader(file, validate_crcs=True, record_size_limit=MAX_CHUNK)
-        messages = reader.iter_messages(topics=[topic])
+        messages = _messages_of_topic(reader, path, topic)
         while True:
             try:
-                _require_chunk_sizes(reader, path)
-                _, _, message = next(messages)
+                message = next(messages)
             except StopIteration:
                 return
             except EpisodeError:
@@ -168,11 +166,12 @@ def _repair_advice(path: Path) -> str:
     return f"repair it: mcap recover {path.name} -o repaired.mcap"
 
 
-def _require_chunk_sizes(reader: SeekingReader, path: Path) -> None:
+def _messages_of_topic(reader: SeekingReader, path: Path, topic: str) -> Iterator[Message]:
     summary = reader.get_summary()
     largest = max((each.uncompressed_size for each in summary.chunk_indexes), default=0) if summary else 0
     if largest > MAX_CHUNK:
         raise EpisodeError(f"{path}: a chunk of {largest} bytes; at most {MAX_CHUNK} are read")
+    yield from (message for _, _, message in reader.iter_messages(topics=[topic]))
 
 
 @cache

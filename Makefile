@@ -18,7 +18,7 @@ DOCS := .venv-docs/installed-$(VERSION)
 PLUGINS := .venv-lerobot/installed
 
 .DEFAULT_GOAL := help
-.PHONY: help run test check test-slow test-deep test-all test-gpu extras test-extras docs-tools docs plugins test-plugins reliability lock clean python
+.PHONY: help run test check test-slow test-deep test-all test-gpu extras test-extras docs-tools docs plugins test-plugins reliability lock clean python try-wheels
 # Two installations into one environment must not run at once.
 .NOTPARALLEL:
 
@@ -33,6 +33,7 @@ help:
 	@echo "make test-extras  tests that need heavy extras (torch, rerun, ray, av), in an environment of their own"
 	@echo "make test-plugins tests of the plug-ins for LeRobot, which wants Python 3.12   (without one: says so, and fails)"
 	@echo "make docs         the documentation as a site in site/, in an environment of its own; warnings are errors"
+	@echo "make try-wheels   build the distributions, use their wheels in clean environments for each of: $(PYTHONS)"
 	@echo "make lock         renew constraints/ for each of: $(PYTHONS)"
 	@echo "make clean        remove the environment, caches and builds (runs/ stays)"
 	@echo "Choose a Python with PYTHON=python3.12 (3.11, 3.12 or 3.13; default: python3)."
@@ -101,6 +102,9 @@ test-plugins:
 	  echo "make test-plugins: LeRobot wants Python 3.12, and '$(PYTHON312)' is not found, so nothing was tested."; exit 77; }
 	@$(MAKE) --no-print-directory plugins
 	@.venv-lerobot/bin/python -m pytest -q -m "" tests/plugins tests/robot/export/test_lerobot_video.py $(ARGS)
+
+try-wheels:
+	@$(PYTHON) tools/install_matrix.py $(addprefix --python ,$(PYTHONS)) $(ARGS)
 
 lock:
 	@for each in $(PYTHONS); do \

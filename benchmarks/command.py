@@ -143,7 +143,7 @@ def show(reports: Sequence[Report]) -> None:
         for row in report.results:
             table.add_row(*cells(row))
         # a file or a pipe has no width, and a table folded to 80 columns is hard to read
-        console = Console(width=None if results.is_terminal else 160, highlight=False)
+        console = Console(width=None if results.is_terminal else 160, highlight=False, quiet=results.quiet)
         if len(reports) > 1:
             console.print(setting(report))
         console.print(table)

@@ -18,11 +18,12 @@ from calibration.lens.rectification import metric_rectification, rectification_o
 from calibration.lens.view import BadCorners, Corners, GelView
 from calibration.reference import is_contact_image_swapped
 from calibration.tuning import MAX_REFERENCE_CHANGE, MIN_CONTACT_SHARE, SATURATED_LEVEL
-from tacsim.interface import Image, SurfaceMap
+from tacsim.interface import Image, SurfaceMap, short_repr
 from tacsim.models.geometry import PictureRegion
 from tacsim.optics.grid import PixelGrid
 from tacsim.record.episode import EpisodeError
 from tacsim.record.images import read_image, reference_image
+from tacsim.record.ros_bag import is_ros_bag, open_topic
 from tacsim.record.sources import (
     EPISODES,
     VIDEOS,
@@ -42,6 +43,7 @@ MAX_FRAMES = 500
 class Frame:
     """One picture."""
 
+    __repr__ = short_repr
     name: str
     image: Image  # (H, W, 3) RGB
     surface: SurfaceMap | None = None  # only from simulations
@@ -51,6 +53,7 @@ class Frame:
 class FrameSet:
     """The frames of one sensor, all of one size."""
 
+    __repr__ = short_repr
     name: str
     reference: Image  # (H, W, 3) RGB without contact
     reference_from: str  # description of its source
@@ -73,14 +76,19 @@ class FrameSet:
 
 
 def read_frame_set(path: Path, reference: Path | None = None, sensor: str = "") -> FrameSet:
-    """Reads a folder of pictures, a video, or an episode's `sensor` (not needed where there is one only).
+    """Reads a folder of pictures, a video, an episode's `sensor` (not needed where there is one only), or the topic
+    `sensor` of a ROS 2 bag.
 
     `reference`: the picture without contact; None: the episode's own, a picture of the folder with one of
     UNTOUCHED_NAMES, or the median of all frames. Raises BadFrames.
     """
-    if path.is_dir():
-        return read_folder(path, reference)
     try:
+        if is_ros_bag(path):
+            topic = open_topic(path, sensor or None, "sensor")
+            frames = _read_limited(path, (Frame(f"message {each.index}", each.image) for each in topic.frames()))
+            return _make_frame_set(path, frames, reference, None)
+        if path.is_dir():
+            return read_folder(path, reference)
         if path.is_file() and path.suffix.lower() in EPISODES:
             meta = episode_meta(path)
             name = select_name(list(meta.spec.sensors), sensor, path, "sensor")

@@ -11,8 +11,9 @@ x along image columns, y along image rows, z out of the gel towards the object. 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import KW_ONLY, dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass, field, fields
+from textwrap import indent
 from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
@@ -25,6 +26,50 @@ Image = NDArray[np.uint8]  # (H, W, 3) RGB
 Mask = NDArray[np.bool_]
 
 
+def short_repr(self: Any) -> str:
+    """`__repr__` of a dataclass: one line, or a line a field; of an array its shape, type and range."""
+    own = getattr(self, "__dict__", None)  # with a LazyField as it was given: it is not made for its description
+    values = {each.name: getattr(self, each.name) if own is None else own[each.name] for each in fields(self)}
+    parts = [f"{name}={_describe_value(value)}" for name, value in values.items()]
+    return _join_parts(f"{type(self).__name__}(", parts, ")")
+
+
+def _join_parts(begin: str, parts: list[str], end: str) -> str:
+    max_line = 80  # [characters]
+    line = f"{begin}{', '.join(parts)}{end}"
+    if len(line) <= max_line and "\n" not in line:
+        return line
+    return "\n".join([begin, *(indent(f"{part},", "    ") for part in parts), end])
+
+
+def _describe_value(value: Any) -> str:
+    max_entries = 8  # of an array or a sequence that is written out
+    if isinstance(value, np.ndarray):
+        return _describe_array(value, max_entries)
+    if isinstance(value, Mapping):
+        return _join_parts("{", [f"{key!r}: {_describe_value(each)}" for key, each in value.items()], "}")
+    if isinstance(value, bytes):
+        return f"{len(value)} bytes"
+    if isinstance(value, Sequence) and not isinstance(value, str) and len(value) > max_entries:
+        return f"{type(value).__name__} of {len(value)}"
+    if isinstance(value, np.generic):
+        value = value.item()
+    return "not made yet" if callable(value) else repr(value)
+
+
+def _describe_array(array: NDArray[Any], max_entries: int) -> str:
+    if array.ndim == 1 and len(array) <= max_entries and array.dtype.kind in "iuf":
+        return f"[{', '.join(f'{value:.4g}' for value in array + 0.0)}]"  # + 0.0: no minus before a zero
+    text = f"{array.dtype} {array.shape}"
+    if array.dtype == np.bool_ and array.size:
+        return f"{text} {100 * array.mean():.3g} % true"
+    if array.dtype.kind not in "iuf" or not array.size:
+        return text
+    finite = array[np.isfinite(array)]
+    scope = f" {finite.min():.4g} to {finite.max():.4g}" if finite.size else ""
+    return f"{text}{scope}{f', {array.size - finite.size} not finite' if finite.size < array.size else ''}"
+
+
 def _unit_quaternion() -> FloatArray:
     return np.array([0.0, 0.0, 0.0, 1.0])
 
@@ -33,6 +78,7 @@ def _unit_quaternion() -> FloatArray:
 class Pose:
     """A rigid transform ``a_from_b``: the origin and axes of b, written in a. Operations: :mod:`tacsim.pose`."""
 
+    __repr__ = short_repr
     position: FloatArray = field(default_factory=lambda: np.zeros(3))  # (3,) [m]
     quaternion: FloatArray = field(default_factory=_unit_quaternion)  # (4,) unit, x y z w
 
@@ -92,6 +138,7 @@ class LazyFields:
 class SurfaceMap(LazyFields):
     """The gel surface on the canonical grid, from a source that knows it by itself (the simulator)."""
 
+    __repr__ = short_repr
     height: NDArray[np.float32]  # (h, w) displacement into the gel, positive where pressed [m]
     gradient: LazyField[NDArray[np.float32]] = LazyField()  # (h, w, 2) (d height/dx, d height/dy) [-]
     flow: NDArray[np.float32] | None = None  # (m, n, 2) in-plane displacement at the marker lattice, sensor x, y [m]
@@ -101,6 +148,7 @@ class SurfaceMap(LazyFields):
 class TactileFrame(LazyFields):
     """What any source delivers: the picture as the camera gave it."""
 
+    __repr__ = short_repr
     image: LazyField[NDArray[np.uint8]] = LazyField()  # (H, W, 3) RGB
     _: KW_ONLY
     time: float  # exposure time on the rig's monotonic clock [s]
@@ -113,6 +161,7 @@ class TactileFrame(LazyFields):
 class TactileObservation(LazyFields):
     """Canonical touch: what a policy sees, the same for every source. What a sensor does not deliver is None."""
 
+    __repr__ = short_repr
     # (H, W, 3) clip(128 + 128 (I - I0) / mean(I0)) over the canonical area
     image: LazyField[NDArray[np.uint8]] = LazyField()
     _: KW_ONLY
@@ -132,6 +181,7 @@ class ArmState:
     """One controller package of an arm. ``pose``, ``twist`` and ``wrench`` speak of one frame: the sensor that the arm
     carries (the tool, if it carries none)."""
 
+    __repr__ = short_repr
     pose: Pose  # world_from_sensor
     twist: FloatArray  # (6,) linear then angular velocity of the sensor, world axes [m/s, rad/s]
     wrench: FloatArray  # (6,) what the object does to the sensor, about its origin, sensor axes [N, N m]
@@ -141,6 +191,7 @@ class ArmState:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observation:
+    __repr__ = short_repr
     tactile: Mapping[str, TactileObservation]  # by sensor name
     arms: Mapping[str, ArmState]  # by arm name
     time: float  # [s]
@@ -150,6 +201,7 @@ class Observation:
 class Action:
     """Desired world_from_sensor (not the TCP) at the end of the control period, by arm name; None or absent: hold."""
 
+    __repr__ = short_repr
     tool: Mapping[str, Pose | None] = field(default_factory=dict)
 
 
@@ -157,6 +209,7 @@ class Action:
 class Truth:
     """What only a simulation knows. Tasks may use it, policies never see it."""
 
+    __repr__ = short_repr
     height: float  # z-extent of the body, particle radius included [m]
     position: FloatArray  # (3,) centre of mass, world [m]
     points: NDArray[np.float32]  # (n, 3) body particles, world [m]

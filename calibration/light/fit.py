@@ -16,7 +16,7 @@ from calibration.light.photometry import ModelSize
 from calibration.light.press import BallPress
 from calibration.light.press_shapes import Stretch
 from calibration.light.tuning import UNTOUCHED_RADIUS
-from tacsim.interface import Float32, FloatArray, Image
+from tacsim.interface import Float32, FloatArray, Image, short_repr
 from tacsim.models.photometric import DarknessModel, PhotometricModel
 from tacsim.models.sensor import CameraNoise, Markers, SensorGeometry
 
@@ -40,6 +40,7 @@ class PressPrediction:
 class LightFit:
     """A calibrated light."""
 
+    __repr__ = short_repr
     forward: PhotometricModel | None  # None, as the next two, for a light without direction
     inverse: InverseModel | None
     size: ModelSize | None

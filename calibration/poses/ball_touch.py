@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from calibration.poses.robust_fit import BadMeasurements, RobustFit, angular_spread, perturb_pose, robust_fit
 from calibration.poses.tuning import MAX_CAP_MISFIT, MIN_CONTACT_SPREAD, MIN_TOUCHES
 from tacsim import pose as se3
-from tacsim.interface import FloatArray, Mask, Pose
+from tacsim.interface import FloatArray, Mask, Pose, short_repr
 
 MIN_SPREAD = np.radians(5.0)  # of the tilts, see angular_spread [rad]
 
@@ -43,6 +43,7 @@ class BallTouch:
 class TouchFit:
     """Pose of the sensor and position of the ball, with their uncertainty."""
 
+    __repr__ = short_repr
     tool_from_sensor: Pose
     ball: FloatArray  # (3,) its centre in the world [m]
     covariance: FloatArray  # (6, 6) of tool_from_sensor: shift [m] and rotation vector [rad], along the tool's axes

@@ -24,7 +24,7 @@ from calibration.poses.robust_fit import (
 )
 from calibration.poses.tuning import MIN_POSES
 from tacsim import pose as se3
-from tacsim.interface import FloatArray, Pose
+from tacsim.interface import FloatArray, Pose, short_repr
 
 MIN_SPREAD = np.radians(15.0)  # of the flange, see angular_spread [rad]
 
@@ -51,6 +51,7 @@ class BoardPose:
 class HandEyeFit:
     """Poses of camera and board, with their uncertainty."""
 
+    __repr__ = short_repr
     camera: Pose  # flange_from_camera; of a fixed camera base_from_camera
     board: Pose  # base_from_board; with a fixed camera flange_from_board
     covariance: FloatArray  # (6, 6) of `camera`: shift [m] and rotation vector [rad], axes of the frame it is given in

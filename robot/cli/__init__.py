@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import os
 import sys
+from collections.abc import Callable
 from typing import Annotated
 
 import typer
@@ -31,6 +32,7 @@ from robot.cli.errors import Guarded
 from robot.cli.identify import body, gel, identify
 from robot.cli.learn import evaluate, export, policy, policy_range, train, transfer
 from robot.cli.mock import mock
+from robot.cli.options import with_json_option
 from robot.cli.recordings import lerobot, recover, view
 from robot.cli.run import film, replay, run
 from robot.cli.simulate import debug, press, reproduce
@@ -45,44 +47,50 @@ app = typer.Typer(
     epilog="Example: [bold]tacsim run --task squeeze --out runs/first[/]   "
     "· [bold]--debug[/], anywhere on the line, shows tracebacks.",
 )
-app.add_typer(calibrate, name="calibrate")
-app.add_typer(collect, name="collect")
-app.add_typer(export, name="export")
-app.add_typer(identify, name="identify")
-COMMANDS = {
-    app: (
-        run,
-        press,
-        reproduce,
-        replay,
-        film,
-        view,
-        recover,
-        mock,
-        list_,
-        show,
-        new,
-        bench,
-        compare,
-        debug,
-        schema,
-        doctor,
-        start,
-        train,
-        evaluate,
-        transfer,
-    ),
-    calibrate: (latency, lens, touch, hand_eye),
-    collect: (press_set, episodes),
-    export: (policy, policy_range, lerobot),
-    identify: (gel, body),
+SEE, ROBOTS, CALIBRATE, LEARN, FILES, DEVELOP = (
+    "See: simulate, run, replay",
+    "Robots: real and mock hardware",
+    "Calibrate: sensors, cameras, materials",
+    "Learn: data, policies",
+    "Files: names, schemas, recordings",
+    "Develop: figures, failures",
+)
+HEADINGS = {  # of `tacsim --help`, with their commands, both in the order of the page
+    SEE: (run, press, replay, film, view),
+    ROBOTS: (doctor, start, mock),
+    CALIBRATE: (compare,),
+    LEARN: (train, evaluate, transfer),
+    FILES: (list_, show, new, schema, recover),
+    DEVELOP: (bench, reproduce, debug),
 }
-for group, commands in COMMANDS.items():
+GROUPS = {
+    "calibrate": (calibrate, CALIBRATE, (latency, lens, touch, hand_eye)),
+    "identify": (identify, CALIBRATE, (gel, body)),
+    "collect": (collect, LEARN, (press_set, episodes)),
+    "export": (export, LEARN, (policy, policy_range, lerobot)),
+}
+
+
+# No result, a result that is JSON anyway, and two commands whose --json names a file
+WITHOUT_JSON_OPTION = (mock, schema, bench, evaluate)
+
+
+def _add_command(group: typer.Typer, command: Callable[..., None], heading: str | None = None) -> None:
+    # typer takes the first line of help from the docstring, and the example from the epilog
+    text, _, example = (command.__doc__ or "").partition("Example:")
+    name = command.__name__.strip("_").replace("_", "-")
+    epilog = f"Example: [bold]{example.strip()}[/]"
+    given = command if command in WITHOUT_JSON_OPTION else with_json_option(command)
+    group.command(name, help=text, epilog=epilog, rich_help_panel=heading)(given)
+
+
+for heading, commands in HEADINGS.items():
     for command in commands:
-        # typer takes the first line of help from the docstring, and the example from the epilog
-        text, _, example = (command.__doc__ or "").partition("Example:")
-        name = command.__name__.strip("_").replace("_", "-")
-        group.command(name, help=text, epilog=f"Example: [bold]{example.strip()}[/]")(command)
+        _add_command(app, command, heading)
+for name, (group, heading, commands) in GROUPS.items():
+    app.add_typer(group, name=name, rich_help_panel=heading)
+    for command in commands:
+        _add_command(group, command)
 
 
 def _print_version(wanted: bool) -> None:

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from robot.cli.errors import EXIT_USAGE, print_error
-from robot.cli.output import busy, notes, require_writable
+from robot.cli.output import busy, choose_json_file, notes, print_json, require_writable
 
 Group = Literal["all", "press", "squeeze", "materials", "scenes", "oracles", "real", "robot"]
 
@@ -20,7 +20,10 @@ def bench(
     json_: Annotated[
         Path | None,
         typer.Option(
-            "--json", metavar="FILE", help="Write the report here, and speed_vs_error.png next to it (not for robot)."
+            "--json",
+            metavar="FILE|-",
+            callback=choose_json_file,
+            help="Write the report here, and speed_vs_error.png next to it (not for robot); or -: print the report.",
         ),
     ] = None,
     baselines: Annotated[bool, typer.Option("--baselines", help="Also other methods: many minutes.")] = False,
@@ -71,7 +74,8 @@ def bench(
     Example: tacsim bench press --json press.json
     """
     require_checkout("tacsim bench")
-    require_writable(json_, "--json")
+    file = None if json_ == Path("-") else json_
+    require_writable(file, "--json")
     with busy("loading"):
         bench = from_checkout("benchmarks.command")
     stopped = 0
@@ -91,7 +95,8 @@ def bench(
         reports = [report]
     bench.show(reports)
     if reports[0].results or not stopped:
-        bench.write(reports, json_, docs if not stopped else None)
+        bench.write(reports, file, docs if not stopped else None)
+    print_json(reports[0])
     if stopped or any(report.failures for report in reports):
         raise typer.Exit(stopped or 1)
 

@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-import json
 import keyword
 import re
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import typer
 
-from robot.cli.output import notes, print_files, results, show_table, writing
+from robot.cli.options import complete_names
+from robot.cli.output import notes, print_files, print_json, results, show_table, writing
 
 Kind = Literal[
     "rig", "task", "scene", "sensor", "randomisation", "training", "material", "policy", "driver"
 ]  # tacsim.config.catalogue.CATALOGUE_KINDS, without importing it for each command
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 
 def list_(
     kind: Annotated[Kind | None, typer.Argument(help="All kinds if left out.", show_default=False)] = None,
-    as_json: AsJson = False,
 ) -> None:
     """List what is shipped or installed by name: rigs, tasks, scenes, sensors, materials, policies, drivers.
 
@@ -29,21 +27,19 @@ def list_(
     from tacsim.config.catalogue import CATALOGUE_KINDS, list_entries
 
     entries = [entry for each in ([kind] if kind else CATALOGUE_KINDS) for entry in list_entries(each)]
-    if as_json:
-        rows = [
-            {"kind": each.kind, "name": each.name, "summary": each.summary, "path": _text(each.path)}
-            for each in entries
-        ]
-        typer.echo(json.dumps(rows, indent=1))
-        return
+    print_json(
+        [{"kind": each.kind, "name": each.name, "summary": each.summary, "path": _text(each.path)} for each in entries]
+    )
     show_table("", ("kind", "name", ""), [(each.kind, each.name, each.summary) for each in entries], left=(0, 1, 2))
     notes.print("tacsim show NAME prints one of them; the path of a file may stand for each name, except a driver's")
 
 
 def show(
-    name: Annotated[str, typer.Argument(help="A name that tacsim list prints.")],
+    name: Annotated[
+        str,
+        typer.Argument(help="A name that tacsim list prints.", autocompletion=complete_names(*get_args(Kind))),
+    ],
     kind: Annotated[Kind | None, typer.Option(help="Where several kinds have that name.", show_default=False)] = None,
-    as_json: AsJson = False,
 ) -> None:
     """Print what a name stands for: the file of a rig, task, sensor ..., the fields of a driver, a policy's inputs.
 
@@ -53,9 +49,7 @@ def show(
 
     found = find_entries(name, kind)
     described = [{"kind": each.kind, "name": each.name, "path": _text(each.path), **_describe(each)} for each in found]
-    if as_json:
-        typer.echo(json.dumps(described, indent=1))
-        return
+    print_json(described)
     for number, each in enumerate(described):
         if number:
             results.print("")
@@ -130,7 +124,12 @@ def new(
     name: Annotated[str, typer.Argument(help="Its name: letters, digits, - and _.")],
     source: Annotated[
         str | None,
-        typer.Option("--from", help="The shipped file to copy (tacsim list KIND).", show_default="one of that kind"),
+        typer.Option(
+            "--from",
+            help="The shipped file to copy (tacsim list KIND).",
+            show_default="one of that kind",
+            autocompletion=complete_names(*get_args(Kind)),
+        ),
     ] = None,
     out: Annotated[
         Path | None, typer.Option(help="The new file; of a driver the new folder.", show_default="NAME")
@@ -161,6 +160,7 @@ def new(
         opened.write(text)
     notes.print(f"a copy of the shipped {kind} {path.stem}; use its path wherever a name of a {kind} stands")
     print_files(file)
+    print_json({}, [file])
 
 
 def _new_driver(name: str, folder: Path) -> None:
@@ -185,3 +185,4 @@ def _new_driver(name: str, folder: Path) -> None:
             file.write_text(page.render(name=name.lower(), package=package), encoding="utf-8")
     notes.print(f"install it: pip install -e {folder}; then run it: tacsim run {folder / 'rig.yaml'} --policy grip")
     print_files(*files)
+    print_json({}, list(files))

@@ -12,15 +12,17 @@ import typer
 
 from robot.cli.errors import EXIT_FAILED, print_error
 from robot.cli.options import (
+    TASK_POLICIES,
     OptionGroup,
     Overrides,
     Preset,
     SensorModel,
+    complete_names,
     quantity_parser,
     require_packages,
     with_option_groups,
 )
-from robot.cli.output import busy, notes, one_bar, results
+from robot.cli.output import busy, notes, one_bar, print_json, results
 from robot.cli.terminal import Interrupt
 
 if TYPE_CHECKING:
@@ -163,13 +165,25 @@ def press(
 
 
 def episodes(
-    rig: Annotated[str, typer.Argument(help="A simulated rig (sim), or the path of its file.")],
+    rig: Annotated[
+        str,
+        typer.Argument(help="A simulated rig (sim), or the path of its file.", autocompletion=complete_names("rig")),
+    ],
     out: OutSet,
     policy: Annotated[
-        str, typer.Option(help="scripted, random, grip, learned, FILE.onnx, FILE.csv, or package.module:name.")
+        str,
+        typer.Option(
+            help="scripted, random, grip, learned, FILE.onnx, FILE.csv, or package.module:name.",
+            autocompletion=complete_names(words=(*TASK_POLICIES, "random")),
+        ),
     ] = "scripted",
     task: Annotated[
-        str | None, typer.Option(help="squeeze, reposition, knead, or a path.", show_default="the rig's own")
+        str | None,
+        typer.Option(
+            help="squeeze, reposition, knead, or a path.",
+            show_default="the rig's own",
+            autocompletion=complete_names("task"),
+        ),
     ] = None,
     count: Count = 10,
     steps: Annotated[
@@ -177,7 +191,11 @@ def episodes(
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of the first episode; each next one adds 1.")] = 0,
     randomise: Annotated[
-        str | None, typer.Option(help="Randomisation of the episodes: squeeze, reposition, or a path.")
+        str | None,
+        typer.Option(
+            help="Randomisation of the episodes: squeeze, reposition, or a path.",
+            autocompletion=complete_names("randomisation"),
+        ),
     ] = None,
     workers: Workers = None,
     ray: Ray = None,
@@ -260,6 +278,8 @@ def _print_summary(done: Collected, count: int, seconds: float, out: Path) -> No
     if done.failures:
         notes.print(f"{len(done.failures)} of {count} failed; the reasons are in {out / 'failures.jsonl'}")
     results.print(str(out))
+    figures = {"count": count, "made": done.made, "seconds": seconds, "workers": len(done.workers), "bytes": done.bytes}
+    print_json({**figures, "failures": done.failures}, [out])
 
 
 def _validate(model: Any, **values: Any) -> Any:

@@ -10,8 +10,20 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from robot.cli.errors import print_error
-from robot.cli.options import OptionGroup, Out, Overrides, with_option_groups
-from robot.cli.output import busy, counted, new_directory, notes, print_files, results, show_table, warn, writing
+from robot.cli.options import OptionGroup, Out, Overrides, complete_names, with_option_groups
+from robot.cli.output import (
+    busy,
+    counted,
+    new_directory,
+    notes,
+    print_files,
+    print_json,
+    results,
+    show_table,
+    warn,
+    writing,
+)
+from tacsim.models.text import suggest_word
 
 if TYPE_CHECKING:
     from calibration.bundle import Calibration
@@ -47,7 +59,14 @@ class Sources(OptionGroup):
 
 @with_option_groups
 def compare(
-    a: Annotated[str, typer.Argument(metavar="A", help="Folder of pictures, video, episode, or scene with a ball.")],
+    a: Annotated[
+        str,
+        typer.Argument(
+            metavar="A",
+            help="Folder of pictures, video, episode, or scene with a ball.",
+            autocompletion=complete_names("scene"),
+        ),
+    ],
     b: Annotated[Path, typer.Argument(metavar="B", help="Folder, video or episode that counts as ground truth.")],
     *,
     sources: Sources,
@@ -83,12 +102,16 @@ def compare(
         from calibration.compare.compare import Options, Pairing
         from calibration.compare.compare import compare_frames as run
         from calibration.compare.invariance import measure_invariance
-        from calibration.compare.report import comparison_figures, write_comparison
+        from calibration.compare.report import comparison_as_json, comparison_figures, write_comparison
         from calibration.errors import BadFrames
+        from tacsim.config import shipped_names
     limits = [*_parse_limits(fail_above, "--fail-above"), *_parse_limits(fail_below, "--fail-below")]
     bundles = [
         None if path is None else read_bundle(path)[0] for path in (sources.calibration_a, sources.calibration_b)
     ]
+    if not Path(a).exists() and not _is_scene(a):
+        hint = suggest_word(a, shipped_names("scene"))
+        raise BadFrames(f"{a}: no such file or folder, and no shipped scene{hint}")
     truth = _read_frames(b, sources.reference_b, sources.sensor_b, bundles[1])
     if _is_scene(a):
         if sources.corners_a or sources.corners_b or sources.reference_a or sources.sensor_a:
@@ -113,6 +136,7 @@ def compare(
         written = write_comparison(folder, result, report)
     _print_comparison(result, report)
     print_files(*written)
+    print_json({**comparison_as_json(result, report), "beyond_limits": beyond}, written)
     for words in beyond:
         print_error(words)
     if beyond:
@@ -212,7 +236,8 @@ def _parse_limits(texts: list[str] | None, option: str) -> list[Limit]:
         name, equals, value = text.partition("=")
         if name not in figure_names():
             raise typer.BadParameter(
-                f"'{name}' is not a figure; allowed: {', '.join(figure_names())}", param_hint=option
+                f"'{name}' is not a figure; allowed: {', '.join(figure_names())}{suggest_word(name, figure_names())}",
+                param_hint=option,
             )
         try:
             number = parse_quantity(value.strip(), "length") if name in LENGTHS else float(value)

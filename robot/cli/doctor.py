@@ -8,9 +8,10 @@ import typer
 
 from robot.cli.bench import from_checkout, require_checkout
 from robot.cli.errors import print_error
-from robot.cli.options import HardwareRig, Overrides
-from robot.cli.output import SafeConsole, busy, notes
+from robot.cli.options import HardwareRig, Overrides, complete_names
+from robot.cli.output import SafeConsole, busy, notes, print_json, results
 from robot.cli.terminal import Interrupt, ask_operator, has_operator
+from tacsim.models.text import suggest_word
 
 if TYPE_CHECKING:
     from tacsim.models.driver import Check
@@ -18,8 +19,19 @@ if TYPE_CHECKING:
 MARKS = {"ok": "[green]ok[/]", "warn": "[yellow]warn[/]", "fail": "[bold red]fail[/]"}
 
 
+def _complete_schema() -> list[str]:
+    from tacsim.config import KINDS
+
+    return [*KINDS, "bench"]
+
+
 def schema(
-    kind: Annotated[str, typer.Argument(help="What the file describes, for example rig or scene; or bench.")] = "rig",
+    kind: Annotated[
+        str,
+        typer.Argument(
+            help="What the file describes, for example rig or scene; or bench.", autocompletion=_complete_schema
+        ),
+    ] = "rig",
 ) -> None:
     """Print the JSON schema of a configuration file; editors complete and check YAML with it.
 
@@ -36,17 +48,23 @@ def schema(
         typer.echo(json.dumps(from_checkout("benchmarks.harness.schema").json_schema(), indent=2))
         return
     if kind not in KINDS:
-        raise typer.BadParameter(f"no kind '{kind}'; allowed: {', '.join(KINDS)}, bench", param_hint="KIND")
+        known = (*KINDS, "bench")
+        words = f"no kind '{kind}'; allowed: {', '.join(known)}{suggest_word(kind, known)}"
+        raise typer.BadParameter(words, param_hint="KIND")
     typer.echo(json.dumps(json_schema(kind), indent=2))
 
 
 def doctor(
     rig: Annotated[
         str | None,
-        typer.Option("--rig", metavar="FILE", help="Check this rig instead: arms, their forces, cameras, limits."),
+        typer.Option(
+            "--rig",
+            metavar="FILE",
+            help="Check this rig instead: arms, their forces, cameras, limits.",
+            autocompletion=complete_names("rig"),
+        ),
     ] = None,
     set_: Overrides = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the checks as JSON.")] = False,
 ) -> None:
     """Check Python, packages, OpenCV, Taichi and the machine, or a rig; exit code 1 if something must be repaired.
 
@@ -54,8 +72,6 @@ def doctor(
 
     Example: tacsim doctor --rig ur5e
     """
-    import json
-
     from robot.doctor import machine
 
     if rig is None:
@@ -70,10 +86,8 @@ def doctor(
             check_sensors(config)
             checks = examine_rig(config, rig)
     report = machine.as_json(checks)
-    if as_json:
-        typer.echo(json.dumps(report, indent=2))
-    else:
-        print_checks(checks)
+    print_checks(checks)
+    print_json(report)
     raise typer.Exit(0 if report["ok"] else 1)
 
 
@@ -87,7 +101,7 @@ def print_checks(checks: list[Check]) -> None:
         if check.advice:
             words.append(f"\n→ {check.advice}", style="italic")
         table.add_row(MARKS[check.state], check.name, words)
-    SafeConsole().print(table)
+    SafeConsole(quiet=results.quiet).print(table)
 
 
 def start(
@@ -102,6 +116,7 @@ def start(
     Example: tacsim start my.yaml
     """
     with busy("looking at the rig"):
+        from robot.doctor.machine import as_json as checks_as_json
         from robot.doctor.rig import examine_arms
         from robot.open import CannotOpen
         from robot.procedures.to_start import Halted, Operator, move_to_start
@@ -135,6 +150,7 @@ def start(
         except Halted as halted:
             print_error(str(halted))
             raise typer.Exit(interrupt.exit_code or 1) from None
+    print_json({**checks_as_json(checks), "distance_from_start": away})  # [m]
     if any(distance > 5e-3 for distance in away.values()) or not away:
         print_error("not every arm is at its start")
         raise typer.Exit(1)

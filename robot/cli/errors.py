@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from rich.text import Text
 from typer.core import TyperGroup
 
 from robot.cli.output import SafeConsole
-from tacsim.models.text import printable_line
+from tacsim.models.text import printable_line, suggest_word
 
 OWN_PACKAGES = {"tacsim", "calibration", "robot"}
 EXIT_USAGE, EXIT_FAILED, EXIT_INTERRUPTED = 2, 1, 130  # exit codes: bad configuration or usage, failure, Ctrl-C
@@ -35,6 +36,9 @@ class Guarded(TyperGroup):
         except KeyboardInterrupt:
             print_error("interrupted")
             raise typer.Exit(EXIT_INTERRUPTED) from None
+        except typer.BadParameter as error:
+            error.message += _suggest_choice(error.message)
+            raise
         except Exception as error:
             of_typer = isinstance(error, typer.Abort) or hasattr(error, "exit_code")  # typer handles these
             if of_typer or ctx.meta["tacsim.debug"]:
@@ -42,6 +46,12 @@ class Guarded(TyperGroup):
             message, code = describe_error(error)
             print_error(message)
             raise typer.Exit(code) from None
+
+
+def _suggest_choice(message: str) -> str:
+    """The nearest of the words that an option allows, for typer's message about another word; else an empty text."""
+    given, _, choices = message.partition(" is not one of ")
+    return suggest_word(given.rpartition(" ")[2].strip("'"), re.findall(r"'([^']+)'", choices))
 
 
 def describe_error(error: Exception) -> tuple[str, int]:

@@ -13,12 +13,24 @@ from robot.cli.options import (
     OptionGroup,
     Out,
     Overrides,
+    complete_names,
     length_option,
     quantities_parser,
     quantity_parser,
     with_option_groups,
 )
-from robot.cli.output import busy, new_directory, notes, one_bar, print_files, results, show_table, warn, writing
+from robot.cli.output import (
+    busy,
+    new_directory,
+    notes,
+    one_bar,
+    print_files,
+    print_json,
+    results,
+    show_table,
+    warn,
+    writing,
+)
 
 if TYPE_CHECKING:
     from calibration.materials.presses import Noise
@@ -82,7 +94,9 @@ class Fitting(OptionGroup):
 @with_option_groups
 def gel(
     presses: Recorded = None,
-    scene: Annotated[str, typer.Option(help="The scene that was pressed, with an indenter.")] = "press",
+    scene: Annotated[
+        str, typer.Option(help="The scene that was pressed, with an indenter.", autocompletion=complete_names("scene"))
+    ] = "press",
     indenter: Annotated[
         Any,
         typer.Option(
@@ -115,7 +129,9 @@ def gel(
 @with_option_groups
 def body(
     squeezes: Recorded = None,
-    scene: Annotated[str, typer.Option(help="The scene that was squeezed, with a body.")] = "squeeze",
+    scene: Annotated[
+        str, typer.Option(help="The scene that was squeezed, with a body.", autocompletion=complete_names("scene"))
+    ] = "squeeze",
     gel_error: Annotated[
         float, typer.Option(min=0.0, max=1.0, help="Relative standard deviation of the gels' stiffness.")
     ] = 0.0,
@@ -201,7 +217,7 @@ class _IdentifyCommand:
         max_size_deviation = 0.1
         from robot.studies.identify.identify import predict_intervals
         from robot.studies.identify.motions import MOTION_TEXTS, MOTIONS_FOR_PARAMETER
-        from robot.studies.identify.results import describe_parameters, write
+        from robot.studies.identify.results import as_json, describe_parameters, write
 
         with busy("drawing"), writing(folder.parent):
             files = write(folder, found)
@@ -225,6 +241,7 @@ class _IdentifyCommand:
                 "wrong size would not be detected: measure it, or record heights (a calibrated sensor)"
             )
         print_files(*files)
+        print_json(as_json(found), files)
         for finding in found.findings:
             print_error(finding.text)
         if found.findings:
@@ -239,12 +256,15 @@ class _IdentifyCommand:
 
         new_directory(folder, "motions")
         rig = "press" if self.kind == "gel" else "sim"
+        commands: list[str] = []
         with writing(folder, new=True):
             for name, table in motions(self.scene).items():
                 path = folder / f"{name}.csv"
                 path.write_text(table, encoding="utf-8")
                 steps = len(table.splitlines()) - 1
-                results.print(f"tacsim run {rig} --policy {path} --steps {steps} --out runs/{name}")
+                commands.append(f"tacsim run {rig} --policy {path} --steps {steps} --out runs/{name}")
+                results.print(commands[-1])
+        print_json({"commands": commands}, sorted(folder.iterdir()))
 
 
 def _half_interval_text(half: float) -> str:

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from robot.cli.options import Out, Overrides, TrainingFile, require_packages
+from robot.cli.options import Out, Overrides, TrainingFile, complete_names, require_packages
 from robot.cli.output import (
     busy,
+    choose_json_file,
     new_directory,
     notes,
     one_bar,
     print_files,
+    print_json,
     require_writable,
     results,
     show_table,
@@ -33,11 +35,19 @@ export = typer.Typer(no_args_is_help=True, help="Write policies and recordings a
 
 def train(
     task: Annotated[
-        str | None, typer.Argument(help="squeeze, reposition, knead, or the path of a training file.")
+        str | None,
+        typer.Argument(
+            help="squeeze, reposition, knead, or the path of a training file.",
+            autocompletion=complete_names("training"),
+        ),
     ] = None,
     algorithm: Annotated[
         str | None,
-        typer.Option(help="dagger (from a teacher), ppo or sac (from the reward).", show_default="the file's"),
+        typer.Option(
+            help="dagger (from a teacher), ppo or sac (from the reward).",
+            show_default="the file's",
+            autocompletion=complete_names(words=("dagger", "ppo", "sac")),
+        ),
     ] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Same seed, same policy.", show_default="the file's")] = None,
     resume: Annotated[
@@ -88,7 +98,7 @@ def train(
     from tacsim.tasks.task import BadDraws
 
     try:
-        path = _run_training(run, tensorboard)
+        path, rounds = _run_training(run, tensorboard)
     except BadDraws:
         if run.load_checkpoint()[0]:
             notes.print(f"The last checkpoint is kept. Write it as a file: tacsim export policy {run.folder}")
@@ -97,6 +107,7 @@ def train(
         notes.print(f"The last checkpoint is kept. Continue: tacsim train --resume {run.folder}")
         raise
     print_files(path, run.folder / "curve.png", run.folder / "curve.json")
+    print_json({"rounds": rounds}, [path, run.folder / "curve.png", run.folder / "curve.json"])
     notes.print(f"Next: tacsim evaluate {task or run.settings.training.task} --policy {path} --policy scripted")
 
 
@@ -117,10 +128,14 @@ def _require_logged(algorithm: str, tensorboard: bool) -> None:
         )
 
 
-def _run_training(run: RunFolder, tensorboard: bool) -> Path:
+def _run_training(run: RunFolder, tensorboard: bool) -> tuple[Path, list[Mapping[str, float]]]:
+    """Trains; returns the file of the policy and the figures of each round."""
     from robot.train.train import train as continue_training
 
+    rounds: list[Mapping[str, float]] = []
+
     def print_result(figures: Mapping[str, float]) -> None:
+        rounds.append(figures)
         results.print(
             f"round {figures['round']:.0f}: {1e3 * figures['distance']:.3f} mm from the goal, success "
             f"{100 * figures['success']:.0f} %, {figures['peak_force']:.1f} N at most, "
@@ -129,7 +144,7 @@ def _run_training(run: RunFolder, tensorboard: bool) -> Path:
         )
 
     with one_bar("starting") as bar:
-        return continue_training(run, bar.report, print_result, warn, tensorboard)
+        return continue_training(run, bar.report, print_result, warn, tensorboard), rounds
 
 
 def policy(
@@ -150,6 +165,7 @@ def policy(
 
         worst = export_policy(RunFolder(run), out)
     results.print(f"{out} ({out.stat().st_size / 1024:.0f} KiB), within {worst:.1g} of the network")
+    print_json({"error": worst}, [out])
 
 
 def policy_range(
@@ -184,6 +200,7 @@ def policy_range(
         found = measure_range(policy, settings, episodes, bar.report)
     write_range(policy, out, found)
     results.print(f"{out}: range of {found.episodes} episodes")
+    print_json({"episodes": found.episodes}, [out])
 
 
 def _require_new(out: Path) -> None:
@@ -200,13 +217,20 @@ def evaluate(
         typer.Option(
             help="teacher (uses the truth), random, scripted, learned (the shipped one), FILE.onnx; may be repeated.",
             show_default="teacher, scripted, random",
+            autocompletion=complete_names(words=("teacher", "random", "scripted", "learned")),
         ),
     ] = None,
     episodes: Annotated[int, typer.Option(min=2, max=10_000, help="Of each policy.")] = 200,
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same episodes.")] = 0,
     json_: Annotated[
         Path | None,
-        typer.Option("--json", help="Write the result of each episode, during the evaluation.", show_default=False),
+        typer.Option(
+            "--json",
+            metavar="FILE|-",
+            callback=choose_json_file,
+            help="Write the result of each episode, during the evaluation; or -: print the result as JSON.",
+            show_default=False,
+        ),
     ] = None,
     set_: Overrides = None,
 ) -> None:
@@ -218,7 +242,8 @@ def evaluate(
 
     Example: tacsim evaluate squeeze --policy learned --policy scripted --episodes 50
     """
-    require_writable(json_, "--json", new=True)
+    file = None if json_ == Path("-") else json_
+    require_writable(file, "--json", new=True)
     from robot.train.evaluate import evaluate as evaluate_policies
     from tacsim.config import load_model
     from tacsim.models.training import Training
@@ -229,8 +254,8 @@ def evaluate(
 
         def print_result(so_far: EvaluationResult) -> None:
             played[so_far.policy] = so_far
-            if json_ is not None:
-                _write_results(json_, played.values())
+            if file is not None:
+                _write_results(file, played.values())
             done, success = len(so_far.episodes), _interval_text(so_far.success, 100, 0)
             notes.print(f"{so_far.policy}: {done} of {episodes} episodes, success {success} %")
 
@@ -238,6 +263,7 @@ def evaluate(
             training, policy or ["teacher", "scripted", "random"], episodes, seed, bar.report, print_result, warn
         )
     _show_evaluation(evaluation_results)
+    print_json({each.policy: _describe_evaluation(each) for each in evaluation_results})
 
 
 def _write_results(path: Path, evaluation_results: Iterable[EvaluationResult]) -> None:
@@ -247,6 +273,18 @@ def _write_results(path: Path, evaluation_results: Iterable[EvaluationResult]) -
 
     ends = {each.policy: [end._asdict() for end in each.episodes] for each in evaluation_results}
     write_whole(path, (json.dumps(ends, indent=1) + "\n").encode())
+
+
+def _describe_evaluation(found: EvaluationResult) -> dict[str, Any]:
+    mean, quantile = found.peak_force
+    return {
+        "success": found.success,
+        "distance": found.distance,  # [m]
+        "improvement": found.improvement,
+        "peak_force": {"mean": mean, "quantile_95": quantile},  # [N]
+        "outside_training": found.outside,
+        "episodes": [each._asdict() for each in found.episodes],
+    }
 
 
 def _show_evaluation(evaluation_results: list[EvaluationResult]) -> None:
@@ -275,16 +313,27 @@ def _interval_text(interval: Interval, scale: float, digits: int) -> str:
 
 
 def transfer(
-    task: Annotated[str, typer.Argument(help="squeeze, reposition, knead, or the path of a task file.")],
+    task: Annotated[
+        str,
+        typer.Argument(
+            help="squeeze, reposition, knead, or the path of a task file.", autocompletion=complete_names("task")
+        ),
+    ],
     policy: Annotated[
         list[str] | None,
         typer.Option(
-            help="learned (the shipped one), scripted, FILE.onnx; may be repeated.", show_default="learned, scripted"
+            help="learned (the shipped one), scripted, FILE.onnx; may be repeated.",
+            show_default="learned, scripted",
+            autocompletion=complete_names(words=("learned", "scripted")),
         ),
     ] = None,
     twin: Annotated[
         str | None,
-        typer.Option(help="Randomisation that draws the hidden twins: a name or path.", show_default="TASK-twin"),
+        typer.Option(
+            help="Randomisation that draws the hidden twins: a name or path.",
+            show_default="TASK-twin",
+            autocompletion=complete_names("randomisation"),
+        ),
     ] = None,
     episodes: Annotated[int, typer.Option(min=2, max=10_000, help="Of each policy on each side.")] = 20,
     every: Annotated[int, typer.Option(min=1, max=10_000, help="Number of episodes with the same hidden twin.")] = 5,
@@ -323,12 +372,13 @@ def transfer(
                 notes.print(f"{done} of {of}: {words}")
 
         rows = summarise(play_study(study, out, report, workers))
+    table, picture = out / "transfer.json", out / "transfer.png"
     with writing(out):
-        (out / "transfer.json").write_text(json.dumps([asdict(row) for row in rows], indent=1) + "\n", encoding="utf-8")
-        draw_figure(rows, out / "transfer.png")
+        table.write_text(json.dumps([asdict(row) for row in rows], indent=1) + "\n", encoding="utf-8")
+        draw_figure(rows, picture)
     _show_transfer(rows, episodes)
-    for name in ("transfer.json", "transfer.png"):
-        results.print(str(out / name))
+    print_files(table, picture)
+    print_json({"rows": rows}, [table, picture])
 
 
 def _show_transfer(rows: list[SummaryRow], episodes: int) -> None:

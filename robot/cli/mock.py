@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from robot.cli.options import complete_names
 from robot.cli.output import results
 from robot.cli.terminal import Interrupt
+from tacsim.models.text import suggest_word
 
 if TYPE_CHECKING:
     from robot.mock import FaultClient
@@ -23,7 +25,9 @@ def mock(
         list[str] | None,
         typer.Option("--host", help="Address of an arm, instead of --arms; may be repeated.", show_default=False),
     ] = None,
-    model: Annotated[str, typer.Option(help="ur3e, ur5e or ur10e.")] = "ur5e",
+    model: Annotated[
+        str, typer.Option(help="ur3e, ur5e or ur10e.", autocompletion=complete_names(words=("ur3e", "ur5e", "ur10e")))
+    ] = "ur5e",
     cameras: Annotated[
         int, typer.Option("--cameras", min=0, max=16, help="How many: at the arms' addresses, then the next ones.")
     ] = 0,
@@ -55,7 +59,8 @@ def mock(
     from robot.mock.ur.wire.controller import PORTS
 
     if model not in MODELS:
-        raise typer.BadParameter(f"no model '{model}'; allowed: {', '.join(MODELS)}", param_hint="--model")
+        words = f"no model '{model}'; allowed: {', '.join(MODELS)}{suggest_word(model, MODELS)}"
+        raise typer.BadParameter(words, param_hint="--model")
     try:
         claimed = VERSION if version is None else parse_version(version)
     except ValueError as error:

@@ -4,13 +4,32 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import cached_property, update_wrapper
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_type_hints
 
 import typer
 
+from robot.cli.output import choose_json
+
+
+def complete_names(*kinds: str, words: Iterable[str] = ()) -> Callable[[], list[tuple[str, str]]]:
+    """Completion in a shell of `words` and of the names of these kinds (of `tacsim list`), with their summaries."""
+
+    def complete() -> list[tuple[str, str]]:
+        from tacsim.config.catalogue import list_entries
+
+        named = [(entry.name, entry.summary) for kind in kinds for entry in list_entries(kind)]
+        return [*((word, "") for word in words), *named]
+
+    return complete
+
+
+TASK_POLICIES = ("scripted", "grip", "learned")  # names of policies of `tacsim run`
+AsJson = Annotated[
+    bool, typer.Option("--json", callback=choose_json, help="Print the result as one JSON document instead of text.")
+]
 Out = Annotated[
     Path | None,
     typer.Option("--out", help="New folder for the results; by default one below runs/.", show_default=False),
@@ -21,10 +40,25 @@ Overrides = Annotated[
 ]
 Preset = Annotated[Literal["learn", "draft", "standard"], typer.Option("--preset", help="Resolution.")]
 SensorModel = Annotated[
-    str, typer.Option("--sensor", help="Its name, the path of a YAML file, or of a calibrated bundle.")
+    str,
+    typer.Option(
+        "--sensor",
+        help="Its name, the path of a YAML file, or of a calibrated bundle.",
+        autocompletion=complete_names("sensor"),
+    ),
 ]
-HardwareRig = Annotated[str, typer.Argument(help="A rig of hardware (ur5e, ur5e-one, mock), or the path of its file.")]
-TrainingFile = Annotated[str, typer.Argument(help="squeeze, reposition, knead, or the path of a training file.")]
+HardwareRig = Annotated[
+    str,
+    typer.Argument(
+        help="A rig of hardware (ur5e, ur5e-one, mock), or the path of its file.", autocompletion=complete_names("rig")
+    ),
+]
+TrainingFile = Annotated[
+    str,
+    typer.Argument(
+        help="squeeze, reposition, knead, or the path of a training file.", autocompletion=complete_names("training")
+    ),
+]
 
 
 def quantity_parser(kind: str, low: float = -math.inf, high: float = math.inf) -> Callable[[str], float]:
@@ -60,6 +94,29 @@ def quantities_parser(kind: str, count: int) -> Callable[[str], tuple[float, ...
 def length_option(help_: str, low: float = -math.inf, high: float = math.inf) -> Any:
     """An option that is a length, `low` to `high` [m]."""
     return typer.Option(parser=quantity_parser("length", low, high), metavar="LENGTH", help=help_)
+
+
+def with_json_option(command: Callable[..., None]) -> Callable[..., None]:
+    """Makes a command with the option --json, by which `print_json` prints the result."""
+    return _JsonCommand(command)
+
+
+class _JsonCommand:
+    """Reads the signature only when it is needed."""
+
+    def __init__(self, command: Callable[..., None]) -> None:
+        update_wrapper(self, command)
+        self._command = command
+
+    def __call__(self, *, as_json: bool, **given: Any) -> None:  # the option's callback has used it
+        self._command(**given)
+
+    @property
+    def __signature__(self) -> inspect.Signature:
+        own = inspect.signature(self._command, eval_str=True).parameters.values()
+        keyword = inspect.Parameter.KEYWORD_ONLY
+        added = inspect.Parameter("as_json", keyword, default=False, annotation=AsJson)
+        return inspect.Signature([*(each.replace(kind=keyword) for each in own), added])
 
 
 class OptionGroup:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import typer
 from rich.console import Console, ConsoleOptions, RenderableType
@@ -41,6 +41,42 @@ results = SafeConsole(markup=False, emoji=False, highlight=False, soft_wrap=True
 notes = SafeConsole(
     stderr=True, markup=False, emoji=False, highlight=False, soft_wrap=True
 )  # stderr: progress and notes
+
+
+def choose_json(context: typer.Context, chosen: bool) -> bool:
+    """Callback of the option --json: `print_json` prints, and texts for people are left out of stdout until the command
+    ends."""
+    results.quiet = chosen
+    context.call_on_close(_print_texts_again)
+    return chosen
+
+
+def choose_json_file(context: typer.Context, file: Path | None) -> Path | None:
+    """Callback of the option --json FILE: the file `-` is stdout, as for `choose_json`."""
+    choose_json(context, file == Path("-"))
+    return file
+
+
+def _print_texts_again() -> None:
+    results.quiet = False
+
+
+def print_json(document: Any, files: Iterable[Path] | None = None) -> None:
+    """With --json prints the result of the command as one JSON document, otherwise nothing.
+
+    document: dictionaries, sequences, dataclasses, pydantic models and arrays; NaN and infinity become null.
+    files: written files; they are added to a dictionary as `files`.
+    """
+    if not results.quiet:
+        return
+    import json
+
+    from pydantic_core import to_json
+
+    if files is not None:
+        document = {**document, "files": [str(path) for path in files]}
+    text = to_json(document, inf_nan_mode="null", fallback=lambda value: value.tolist())
+    typer.echo(json.dumps(json.loads(text), indent=1))  # ASCII: a name from a file must not control the terminal
 
 
 def new_directory(out: Path | None, what: str) -> Path:
@@ -230,4 +266,4 @@ def show_table(
         table.add_column(Text(column), justify="left" if number in left else "right")
     for row in rows:
         table.add_row(*map(Text, row))
-    SafeConsole(width=width, highlight=False).print(table, crop=False)
+    SafeConsole(width=width, highlight=False, quiet=results.quiet).print(table, crop=False)

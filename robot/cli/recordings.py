@@ -2,25 +2,35 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from robot.cli.options import Out, Overrides
-from robot.cli.output import busy, counted, new_directory, notes, print_files, results
+from robot.cli.options import Out, Overrides, complete_names
+from robot.cli.output import busy, counted, new_directory, notes, print_files, print_json, results
 from robot.cli.run import run
 
 
 def view(
     episode: Annotated[
         str,
-        typer.Argument(metavar="EPISODE|RIG", help="An episode.mcap, complete or cut off; or a rig, shown live."),
+        typer.Argument(
+            metavar="EPISODE|RIG",
+            help="An episode.mcap, complete or cut off; or a rig, shown live.",
+            autocompletion=complete_names("rig"),
+        ),
     ],
     save: Annotated[
         Path | None, typer.Option(metavar="FILE.rrd", help="Write a file for the viewer instead of starting one.")
     ] = None,
-    task: Annotated[str | None, typer.Option(help="Of a rig, as in tacsim run.", show_default="the rig's own")] = None,
+    task: Annotated[
+        str | None,
+        typer.Option(
+            help="Of a rig, as in tacsim run.", show_default="the rig's own", autocompletion=complete_names("task")
+        ),
+    ] = None,
     steps: Annotated[
         int | None, typer.Option(min=0, help="Of a rig: control steps.", show_default="the task's; else 40")
     ] = None,
@@ -51,6 +61,7 @@ def view(
         view_episode(path, save, on_step)
     if save is not None:
         print_files(save)
+    print_json({}, [] if save is None else [save])
 
 
 def _view_live(
@@ -93,6 +104,7 @@ def lerobot(
         export_lerobot(_find_recordings(episodes), folder, task=task, maps=maps, cut=cut, video=video, on_step=on_step)
     notes.print(f'Load it: LeRobotDataset("{folder.name}", root="{folder}")')
     print_files(folder)
+    print_json({}, [folder])
 
 
 def _find_recordings(given: list[Path]) -> list[Path]:
@@ -128,6 +140,7 @@ def recover(
         found = recover_file(file, new)
     if found.is_whole:
         results.print(f"{file} is complete: {found.steps} steps, its end and its index; nothing to recover")
+        print_json(asdict(found), [])
         return
     lost = [] if found.finished else ["the end: the recording was cut off, or its index is damaged"]
     lost += [f"bytes {begin} to {end}: a step that was not finished, or is damaged" for begin, end in found.damaged]
@@ -139,3 +152,4 @@ def recover(
     ]:
         results.print(f"  {words}")
     print_files(new)
+    print_json(asdict(found), [new])

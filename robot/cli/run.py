@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from robot.cli.errors import EXIT_FAILED, print_error
-from robot.cli.options import Out, Overrides
+from robot.cli.options import TASK_POLICIES, Out, Overrides, complete_names
 from robot.cli.output import (
     Bar,
     busy,
@@ -20,6 +20,7 @@ from robot.cli.output import (
     notes,
     one_bar,
     print_files,
+    print_json,
     report_mesh_measuring,
     require_writable,
     results,
@@ -45,13 +46,18 @@ MAX_REPLAY_STEPS = 1_000_000  # of a replay, which ends with its recording
 
 def run(
     rig: Annotated[
-        str, typer.Argument(help="A rig (sim, press, mock, ur5e, ur5e-one, stand, replay), or the path of its file.")
+        str,
+        typer.Argument(
+            help="A rig (sim, press, mock, ur5e, ur5e-one, stand, replay), or the path of its file.",
+            autocompletion=complete_names("rig"),
+        ),
     ] = "sim",
     task: Annotated[
         str | None,
         typer.Option(
             help="squeeze, reposition, knead, the path of a task file, or package.module:name.",
             show_default="the rig's own",
+            autocompletion=complete_names("task"),
         ),
     ] = None,
     policy: Annotated[
@@ -59,6 +65,7 @@ def run(
         typer.Option(
             help="scripted, grip, learned (the shipped one), FILE.onnx, a motion (FILE.csv), or package.module:name.",
             show_default="scripted; grip without a task",
+            autocompletion=complete_names(words=TASK_POLICIES),
         ),
     ] = None,
     steps: Annotated[
@@ -180,9 +187,7 @@ def _run(
     if recorder is None or not episode.steps:
         return True
     episode.dropped = recorder.dropped
-    _write_report(episode, folder, [folder / "episode.mcap"])
-    if film is not None:
-        _write_film(episode, film)
+    _write_report(episode, folder, [folder / "episode.mcap"], film)
     return bool(failure or lost)
 
 
@@ -286,6 +291,8 @@ def film(
 
         episode = read_episode(file)
     _write_film(episode, target)
+    print_files(target)
+    print_json({"steps": len(episode.steps)}, [target])
 
 
 def _require_film(path: Path, option: str) -> None:
@@ -302,11 +309,10 @@ def _write_film(episode: Episode, path: Path) -> None:
     with counted("film") as on_frame, writing(path.parent):
         surfaces = RecordedSurfaces(episode.meta)
         write_film(episode, path, surfaces, surfaces.gels, on_frame)
-    print_files(path)
 
 
-def _write_report(episode: Episode, folder: Path, files: Sequence[Path]) -> None:
-    """Writes the report and prints its table."""
+def _write_report(episode: Episode, folder: Path, files: Sequence[Path], film: Path | None = None) -> None:
+    """Writes the report, then the film, and prints the table."""
     import json
 
     from robot.rig.recorded import RecordedSurfaces
@@ -319,4 +325,8 @@ def _write_report(episode: Episode, folder: Path, files: Sequence[Path]) -> None
     for words in surfaces.notes:
         notes.print(words)
     listed = [paths["report.html"], paths["report.png"], *files, paths["summary.json"]]
+    if film is not None:
+        _write_film(episode, film)
+        listed.append(film)
     results.print(summary_table(stats, listed))
+    print_json({"summary": stats}, listed)

@@ -16,12 +16,24 @@ from robot.cli.options import (
     Preset,
     SensorModel,
     angle_option,
+    complete_names,
     length_option,
     quantities_parser,
     with_option_groups,
 )
-from robot.cli.output import busy, new_directory, notes, print_files, progress, report_mesh_measuring, results, writing
+from robot.cli.output import (
+    busy,
+    new_directory,
+    notes,
+    print_files,
+    print_json,
+    progress,
+    report_mesh_measuring,
+    results,
+    writing,
+)
 from robot.cli.terminal import Interrupt
+from tacsim.models.text import suggest_word
 
 if TYPE_CHECKING:
     from tacsim.report.figure4 import Trial
@@ -60,7 +72,13 @@ class IndenterShape(OptionGroup):
 
 @with_option_groups
 def press(
-    indenter: Annotated[str, typer.Argument(help="sphere, cylinder, box, or the path of an STL, OBJ or PLY file.")],
+    indenter: Annotated[
+        str,
+        typer.Argument(
+            help="sphere, cylinder, box, or the path of an STL, OBJ or PLY file.",
+            autocompletion=complete_names(words=("sphere", "cylinder", "box")),
+        ),
+    ],
     *,
     depth: Annotated[Any, length_option("Depth below the surface of the untouched gel.")] = "0.5 mm",
     slide: Annotated[
@@ -140,7 +158,9 @@ def press(
     if not config["settled"]:
         held = "not held" if config["residual"] is None else f"relative residual {config['residual']:.2g}"
         notes.print(f"warning: not settled, {config['unfollowed'] or f'{held}; raise settling.max_substeps'}")
-    print_files(*sorted(folder.iterdir()))
+    written = sorted(folder.iterdir())
+    print_files(*written)
+    print_json(config, written)
 
 
 def _orientation_overrides(down: str | None, rotation: tuple[float, ...] | None) -> list[str]:
@@ -166,7 +186,8 @@ def _geometry_override(indenter: str, given: dict[str, Any]) -> str:
     mesh = {"path": str(Path(indenter).absolute()), "scale": None, "repair": False}
     if indenter not in usual and not indenter.lower().endswith(SUFFIXES):
         known = f"sphere, cylinder, box, or the path of a mesh file ({', '.join(SUFFIXES)})"
-        raise typer.BadParameter(f"'{indenter}' is not an indenter; allowed: {known}", param_hint="INDENTER")
+        words = f"'{indenter}' is not an indenter; allowed: {known}{suggest_word(indenter, usual)}"
+        raise typer.BadParameter(words, param_hint="INDENTER")
     described = usual.get(indenter, mesh)
     for name, value in given.items():
         if value is not None and name not in described:
@@ -214,22 +235,24 @@ def reproduce(
         table.write_text(json.dumps(experiment.as_json(trials), indent=1, allow_nan=False) + "\n", encoding="utf-8")
         draw_figure4(trials, picture)
     print_files(picture, table)
-    if _report_trials(trials):
+    problems = _report_trials(trials)
+    print_json({"trials": experiment.as_json(trials), "problems": problems}, [picture, table])
+    if problems:
         raise typer.Exit(1)
 
 
-def _report_trials(trials: dict[str, dict[str, Trial]]) -> bool:
-    """Prints one line per trial; returns True if one of them failed."""
+def _report_trials(trials: dict[str, dict[str, Trial]]) -> list[str]:
+    """Prints one line per trial; returns what is wrong with them."""
     from robot.studies.experiment import shortcomings
 
-    failed = False
+    found: list[str] = []
     for task, schemes in trials.items():
         for scheme, trial in schemes.items():
             problems = shortcomings(task, trial)
             said = "; ".join(problems) or f"closest {trial.distance[trial.peak] * 1e3:.3f} mm at step {trial.peak}"
             results.print(f"{'FAILED' if problems else 'ok':8}{task}, {scheme}: {said}")
-            failed = failed or bool(problems)
-    return failed
+            found += [f"{task}, {scheme}: {problem}" for problem in problems]
+    return found
 
 
 def debug(
@@ -251,17 +274,21 @@ def debug(
         world = dump_view.open_world(found)
     results.print(found.info.message)
     results.print(", ".join(f"{name} {version}" for name, version in found.info.versions.items()))
-    for row, values in {"": dump_view.TITLES, **dump_view.table(found)}.items():
+    table = dump_view.table(found)
+    for row, values in {"": dump_view.TITLES, **table}.items():
         shown = "".join(f"{values.get(moment, ''):50}" for moment in dump_view.TITLES)
         results.print(f"{row:38}{shown.rstrip()}")
     picture = (dump.parent if dump.name == "dump.json" else dump) / "debug.png"
     with busy("drawing"):
         dump_view.draw(found, picture)
-    failure = None
+    failure, outcome = None, None
     if again:
         with busy("running the motion again"):
             failure, outcome = dump_view.replay(found, world)
         results.print(f"replay    {outcome}")
     print_files(picture)
+    print_json(
+        {"message": found.info.message, "versions": found.info.versions, "table": table, "replay": outcome}, [picture]
+    )
     if failure is not None:
         raise typer.Exit(EXIT_FAILED)

@@ -161,7 +161,7 @@ def _load_policy_and_task(
             raise SetError(f"policy 'random' moves along a task's axes, and rig '{rig}' has no task: give one (--task)")
         policy: Policy = RandomPolicy(task, settings.seed + number)
     else:
-        policy = load_policy(settings.policy, task, spec, config.canonical)
+        policy = load_policy(settings.policy, task, spec, config.canonical, (RANDOM,))
     try:
         require_fit(rig, spec, policy, settings.policy, task)
     except IncompatibleRig as unfit:

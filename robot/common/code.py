@@ -6,6 +6,8 @@ import importlib
 import re
 from pathlib import Path
 
+from tacsim.models.text import suggest_word
+
 PACKAGES = ("tacsim", "calibration", "robot")
 
 
@@ -32,7 +34,10 @@ def load_attribute(name: str) -> object:
         raise CodeNotFound(f"'{name}': {why}") from failure
     for part in path.split("."):
         if not hasattr(found, part):
-            raise CodeNotFound(f"'{name}': '{module_name}' has no '{path}'{_describe_shadowing_file(module_name)}")
+            hint = suggest_word(part, [key for key in dir(found) if not key.startswith("_")])
+            raise CodeNotFound(
+                f"'{name}': '{module_name}' has no '{path}'{hint}{_describe_shadowing_file(module_name)}"
+            )
         found = getattr(found, part)
     return found
 

@@ -14,12 +14,21 @@ from tacsim.config import config_root
 from tacsim.interface import IncompatibleRig, Policy, RigSpec
 from tacsim.models.scene import Scene
 from tacsim.models.sensor import CanonicalGrid
+from tacsim.models.text import suggest_word
 from tacsim.record.step_info import TRAINING_DISTANCE, TRAINING_KNOWN
 from tacsim.rig import require_needs
 from tacsim.tasks import Task
 
+NAMES = ("scripted", "grip", "learned")
 
-def load_policy(name: str, task: Task | None, spec: RigSpec, canonical: CanonicalGrid | None = None) -> Policy:
+
+def load_policy(
+    name: str,
+    task: Task | None,
+    spec: RigSpec,
+    canonical: CanonicalGrid | None = None,
+    other_names: Sequence[str] = (),
+) -> Policy:
     """Loads the policy called `name`, for a rig with `spec` and this canonical grid (None: the default grid).
 
     "scripted": the scripted policy of the task. "grip": closes until contact, on any rig. "path/to/file.onnx": a
@@ -28,6 +37,7 @@ def load_policy(name: str, task: Task | None, spec: RigSpec, canonical: Canonica
     (created without arguments), or a function from Observation to Action. This runs code of that module, so use only
     modules that you trust; of an ONNX file only its operators are run.
 
+    other_names: more names that the caller knows, which an error may suggest.
     Raises PolicyNotFound, and IncompatibleRig for a learned policy with another grid.
     """
     if name == "scripted":
@@ -50,7 +60,8 @@ def load_policy(name: str, task: Task | None, spec: RigSpec, canonical: Canonica
         allowed = (
             "'scripted', 'grip', 'learned', 'path/to/file.onnx', 'path/to/file.csv', or 'package.module:attribute'"
         )
-        raise PolicyNotFound(f"no policy '{name}'; allowed: {allowed}")
+        hint = suggest_word(name, (*NAMES, *other_names))
+        raise PolicyNotFound(f"no policy '{name}'; allowed: {allowed}{hint}")
     return policy_of_code(name)
 
 

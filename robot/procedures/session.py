@@ -20,6 +20,7 @@ from tacsim import pose as se3
 from tacsim.interface import Arm, EndOfEpisode, Pose, TactileFrame
 from tacsim.models.hardware import CameraSensorConfig, UrArmConfig, parts_of
 from tacsim.models.rig import RigConfig
+from tacsim.models.text import suggest_word
 
 Measurement = TypeVar("Measurement")
 Part = TypeVar("Part")
@@ -115,7 +116,8 @@ def handheld_camera(config: RigConfig, sensor: str) -> CameraSensorConfig:
 def _part(config: RigConfig, parts: Mapping[str, object], name: str, kind: type[Part], what: str) -> Part:
     found = parts_of(parts, kind)
     if name not in found:
-        raise CannotCalibrate(f"rig '{config.name}': '{name}' is {what}: {', '.join(found) or 'none'}")
+        listed = f"{', '.join(found) or 'none'}{suggest_word(name, found)}"
+        raise CannotCalibrate(f"rig '{config.name}': '{name}' is {what}: {listed}")
     return found[name]
 
 

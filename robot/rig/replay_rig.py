@@ -17,6 +17,7 @@ from tacsim.models.hardware import parts_of
 from tacsim.models.rig import ReplayArmConfig, ReplaySensorConfig, RigConfig
 from tacsim.record.episode import EpisodeMeta
 from tacsim.record.replay import ReplayArm, ReplayClock, ReplaySensor, match_sources, recorded_period
+from tacsim.record.ros_bag import is_ros_bag
 from tacsim.record.sources import EPISODES, episode_meta
 from tacsim.rig import Rig
 
@@ -86,7 +87,7 @@ def _common_period(rig: str, sensors: Mapping[str, ReplaySensorConfig]) -> float
 
 def recorded_rig(source: Path) -> RigConfig | None:
     """The rig that an episode was recorded with; None if it is unknown."""
-    if source.suffix.lower() not in EPISODES:
+    if source.suffix.lower() not in EPISODES or is_ros_bag(source):
         return None
     return rig_of(episode_meta(source))
 

@@ -16,6 +16,7 @@ from tacsim.models.hardware import Placement, parts_of
 from tacsim.models.rig import RigConfig, SimArmConfig, SimSensorConfig
 from tacsim.models.scene import Scene
 from tacsim.models.sensor import SensorModel
+from tacsim.models.text import suggest_word
 from tacsim.optics.noise import NoiseSource, noise_source
 from tacsim.optics.render import Renderer
 from tacsim.optics.surface import surface_map
@@ -139,6 +140,7 @@ def _frame_of_arm(config: RigConfig, scene: Scene) -> dict[str, str]:
         if name not in frames:
             raise CannotOpen(
                 f"rig '{config.name}': arms.{name} carries no sensor; name it in sensors.NAME.arm, or leave it out"
+                f"{suggest_word(name, frames)}"
             )
     carried = [sensor.arm for sensor in config.sensors.values()]
     doubled = sorted({arm for arm in carried if arm is not None and carried.count(arm) > 1})

@@ -16,7 +16,7 @@ from tacsim import pose as se3
 from tacsim.geometry.pressing_side import describe_side, find_pressing_side
 from tacsim.geometry.shapes import bounding_size, shape_distance
 from tacsim.geometry.tiles import cached_tiled_distance
-from tacsim.interface import FloatArray, Pose
+from tacsim.interface import FloatArray, Pose, short_repr
 from tacsim.models.scene import Box, Cylinder, Gel, GelSurface, Indenter, Mesh, Scene
 from tacsim.models.sensor import SensorModel
 from tacsim.optics.grid import image_grid
@@ -39,6 +39,7 @@ MAX_MISSED_DEPTH_SHARE = 0.125
 class PressMotion:
     """Motion of the indenter from its first contact with the undeformed gel."""
 
+    __repr__ = short_repr
     depth: float = 0.5e-3  # of its lowest point below the undeformed surface [m]
     slide: tuple[float, float] = (0.0, 0.0)  # tangential displacement after the press, world x, y [m]
     twist: float = 0.0  # rotation about the vertical axis after the slide [rad]
@@ -50,6 +51,7 @@ class PressMotion:
 class PressResult:
     """The gel under the indenter at the end."""
 
+    __repr__ = short_repr
     image: NDArray[np.uint8]  # (H, W, 3) RGB
     height: NDArray[np.float32]  # (H, W) into the gel, at each pixel [m]
     contact: NDArray[np.bool_]  # (H, W) pixels where gel and indenter touch

@@ -195,7 +195,7 @@ def _make_actor(name: str, env: TacsimEnv, policy: Policy | None, seed: int) -> 
 def _load_fitting_policy(name: str, env: TacsimEnv, canonical: CanonicalGrid) -> Policy | None:
     if name in (TEACHER, RANDOM):
         return None
-    policy = load_policy(name, env.task, env.rig.spec, canonical)
+    policy = load_policy(name, env.task, env.rig.spec, canonical, (TEACHER, RANDOM))
     require_fit(env.rig.name, env.rig.spec, policy, name, env.task)
     return policy
 

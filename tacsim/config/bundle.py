@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from tacsim.config.document import LoadState, Node, display_path, node_of_data, parse_text, plain_data
-from tacsim.config.errors import Place, suggest_word
+from tacsim.config.errors import Place
+from tacsim.models.text import suggest_word
 
 FILE, REFERENCE = "calibration.yaml", "reference.png"
 FORMAT = 8  # written and read

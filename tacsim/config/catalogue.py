@@ -8,9 +8,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from tacsim.config.errors import suggest_word
 from tacsim.config.kinds import KINDS, NotFound, config_root
 from tacsim.models.driver import BASE_CLASSES, installed_drivers
+from tacsim.models.text import suggest_word
 
 POLICY, DRIVER = "policy", "driver"
 CATALOGUE_KINDS = (*KINDS, POLICY, DRIVER)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from tacsim.models.text import printable_line
@@ -45,15 +44,6 @@ class ConfigError(ValueError):
         if len(self.problems) > max_shown:
             lines.append(f"... and {len(self.problems) - max_shown} more problems")
         super().__init__("\n".join(lines))
-
-
-def suggest_word(word: str, allowed: Iterable[str]) -> str:
-    """ "; did you mean 'x'?" when one of `allowed` is close to `word`, else an empty text."""
-    if len(word) > 100:  # comparison takes quadratic time, and no allowed word is that long
-        return ""
-    by_lower = {name.lower(): name for name in allowed}
-    close = difflib.get_close_matches(word.lower(), by_lower, n=1, cutoff=0.6)
-    return f"; did you mean '{by_lower[close[0]]}'?" if close else ""
 
 
 def join_keys(key: str, name: str | int) -> str:

@@ -14,12 +14,12 @@ from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 from pydantic_core import core_schema
 
 from tacsim.config.bundle import FILE, SENSORS_FOLDER, is_bundle, user_sensor_names
-from tacsim.config.errors import suggest_word
 from tacsim.models.material import BodyMaterial, GelMaterial
 from tacsim.models.randomisation import Randomisation
 from tacsim.models.rig import TASKS, RigConfig, rig_model, task_annotation
 from tacsim.models.scene import Scene
 from tacsim.models.sensor import SensorModel
+from tacsim.models.text import suggest_word
 from tacsim.models.training import Training
 
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_-]{0,99}")

@@ -19,9 +19,9 @@ from tacsim.config.annotation import (
     union_models,
 )
 from tacsim.config.document import LoadState, Node
-from tacsim.config.errors import join_keys, suggest_word
+from tacsim.config.errors import join_keys
 from tacsim.models.driver import refused_driver
-from tacsim.models.text import printable_line
+from tacsim.models.text import printable_line, suggest_word
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,7 +148,10 @@ def _wrong_variant(location: Location) -> str:
     name, options = tags[0][0], [tag[1] for tag in tags]
     given = location.node.items.get(name)
     if given is None:
-        return f"'{name}' is missing; allowed: {name}: {' | '.join(options)}"
+        beside = location.holder.items if location.holder is not None else {}
+        others = [key for key, node in beside.items() if node is not location.node]
+        hint = suggest_word(location.key.rpartition(".")[2], others)  # a mistyped name makes a new entry
+        return f"'{name}' is missing; allowed: {name}: {' | '.join(options)}{hint}"
     if name == "driver" and (reason := refused_driver(location.key.partition(".")[0], given.text)) is not None:
         return f"driver {given.describe()} is refused: {reason}; allowed: {' | '.join(options)}"
     hint = suggest_word(given.text, options)

@@ -21,9 +21,10 @@ from tacsim.config.annotation import (
     union_models,
 )
 from tacsim.config.document import MAX_NODES, LoadState, Node, display_path, node_of_data, parse_text, read_text
-from tacsim.config.errors import Place, join_keys, suggest_word
+from tacsim.config.errors import Place, join_keys
 from tacsim.config.kinds import Kind, NotFound, kind_of, resolve_reference
 from tacsim.models.quantity import Quantity
+from tacsim.models.text import suggest_word
 
 METRE_PARTS = ("arms", "keep_out", "start")  # parts of a rig whose lengths can be metres
 

@@ -80,10 +80,11 @@ class SimSensorConfig(SensorConfig):
 
 
 class ReplaySensorConfig(SensorConfig):
-    """Recorded frames: an episode (.mcap), a folder of images, or a video."""
+    """Recorded frames: an episode (.mcap), a folder of images, a video, or a ROS 2 bag in MCAP."""
 
     driver: Literal["replay"]
     source: str | None = None
+    topic: str | None = None  # of a ROS 2 bag, of type sensor_msgs/msg/CompressedImage; None: its only one
     fps: Annotated[float, Field(gt=0, le=1000)] = 30.0  # of a folder of images
     # Gel corners in the image (u, v) [px]: top left, top right, bottom right, bottom left; None: the whole image.
     corners: tuple[tuple[float, float], tuple[float, float], tuple[float, float], tuple[float, float]] | None = None

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, Self, cast
 import numpy as np
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
-from tacsim.interface import Float32, FloatArray
+from tacsim.interface import Float32, FloatArray, short_repr
 from tacsim.models.material import BodyMaterial, GelMaterial, elastic_constants, shear_impedance
 from tacsim.models.quantity import Acceleration, Angle, Config, Length
 from tacsim.models.tuning import (
@@ -359,6 +359,8 @@ class GelSurface:
 
     Between nodes the surface is the C1 quadratic B-spline with these control values; contact and renderer use the same.
     """
+
+    __repr__ = short_repr
 
     displacement: Float32  # (nx, ny, 3) [m]; x grows with the first index, y with the second
     spacing: float  # [m]

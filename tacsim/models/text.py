@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Iterable
+
 
 def escape_text(text: str, kept: str = "") -> str:
     """`text` with control characters, and those that turn the direction of writing, written out (``\\x1b``), except
@@ -34,3 +37,12 @@ def printable_line(text: str, limit: int = 600) -> str:
 def millimetres(*lengths: float, digits: str = ".4g") -> str:
     """Lengths [m] for a message: "4 x 3.5 mm"."""
     return " x ".join(f"{1e3 * length:{digits}}" for length in lengths) + " mm"
+
+
+def suggest_word(word: str, allowed: Iterable[str]) -> str:
+    """ "; did you mean 'x'?" when one of `allowed` is close to `word`, else an empty text."""
+    if len(word) > 100:  # comparison takes quadratic time, and no allowed word is that long
+        return ""
+    by_lower = {name.lower(): name for name in allowed}
+    close = difflib.get_close_matches(word.lower(), by_lower, n=1, cutoff=0.6)
+    return f"; did you mean '{by_lower[close[0]]}'?" if close else ""

@@ -10,7 +10,7 @@ from typing import Any, Generic, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from tacsim.interface import Action, ArmState, FloatArray, Pose, RigSpec, TactileFrame
+from tacsim.interface import Action, ArmState, FloatArray, Pose, RigSpec, TactileFrame, short_repr
 
 T = TypeVar("T")
 _VECTORS = ("joints", "joint_speeds", "tcp_pose", "tcp_speed", "tcp_force")
@@ -25,6 +25,7 @@ class ArmPackages:
     """Packages of an arm's controller during a control step: a row for each package, oldest first, unchanged (base
     axes, not sensor axes)."""
 
+    __repr__ = short_repr
     time: FloatArray  # (n,) when it was read, rig clock [s]
     stamp: FloatArray  # (n,) time on the controller's own clock [s]
     joints: FloatArray  # (n, 6) [rad]
@@ -72,6 +73,7 @@ class LazyRecords(Mapping[str, T], Generic[T]):
 class Step:
     """One control step: the action, and what the rig delivered after it. Step 0 follows reset and has no action."""
 
+    __repr__ = short_repr
     index: int
     time: float  # of the observation, rig clock [s]
     frames: Mapping[str, TactileFrame]  # native, by sensor
@@ -97,6 +99,7 @@ class Step:
 class EpisodeMeta:
     """Data of the whole episode."""
 
+    __repr__ = short_repr
     rig: str
     task: str | None
     policy: str
@@ -113,6 +116,7 @@ class EpisodeMeta:
 class Episode:
     """The steps of an episode: in memory, or in its recording, from which each is read at each access."""
 
+    __repr__ = short_repr
     meta: EpisodeMeta
     steps: Sequence[Step] = field(default_factory=list)
     complete: bool = True  # False: the recorder was killed; these are the steps written before

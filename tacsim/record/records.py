@@ -46,33 +46,34 @@ def check_magic(file: BinaryIO, what: str) -> None:
     program, such as a ROS 2 bag: tacsim's files have no profile."""
     if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
         raise EpisodeError(f"{what}: not an MCAP file (it does not begin with the MCAP magic bytes)")
+    if read_profile(file):
+        raise foreign_file_error(file, what)
+    file.seek(len(MCAP0_MAGIC))
+
+
+def read_profile(file: BinaryIO) -> str:
+    """Profile of an MCAP file, such as "ros2"; empty for files of tacsim, and for an unreadable header."""
     size = file.seek(0, io.SEEK_END)
     file.seek(len(MCAP0_MAGIC))
     with contextlib.suppress(_BadRecord):
         _, first = next(_records(file, size - file.tell()), (0, None))
-        if isinstance(first, Header) and first.profile:
-            raise foreign_file_error(file, what)
-    file.seek(len(MCAP0_MAGIC))
+        return first.profile if isinstance(first, Header) else ""
+    return ""
 
 
 def foreign_file_error(file: BinaryIO, what: str) -> EpisodeError:
     """The error for an MCAP file of another program: its kind, its topics, and advice."""
     max_topics = 20  # named in an error
-    size = file.seek(0, io.SEEK_END)
-    file.seek(len(MCAP0_MAGIC))
-    profile = ""
-    with contextlib.suppress(_BadRecord):
-        _, first = next(_records(file, size - file.tell()), (0, None))
-        profile = first.profile if isinstance(first, Header) else ""
-    kind = {"ros1": "a ROS 1 bag", "ros2": "a ROS 2 bag"}.get(profile, "a recording of another program")
+    kind = {"ros1": "a ROS 1 bag", "ros2": "a ROS 2 bag"}.get(read_profile(file), "a recording of another program")
     topics = listed_topics(file)
     listed = sorted(f"{topic} ({schema})" if schema else topic for topic, schema in topics.items())
     more = f" and {len(listed) - max_topics} more" if len(listed) > max_topics else ""
     has = ", ".join(listed[:max_topics]) + more if listed else "not listed (the file was cut off before its index)"
     return EpisodeError(
-        f"{what}: {kind} in MCAP, no episode of tacsim, whose topics are not read. Its topics: {has}. Export the "
+        f"{what}: {kind} in MCAP, no episode of tacsim. Its topics: {has}. Export the "
         "camera's pictures to a folder of 8-bit PNG files, or to a video, and forces to a CSV file with a row a "
-        "picture; then replay those (docs/recording.md)"
+        "picture; then replay those. `tacsim run replay` also plays the compressed pictures of a ROS 2 bag itself "
+        "(docs/recording.md)"
     )
 
 

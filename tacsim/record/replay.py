@@ -14,6 +14,7 @@ from tacsim.models.rig import ReplayArmConfig, ReplaySensorConfig
 from tacsim.record.episode import EpisodeError
 from tacsim.record.images import read_image, reference_image
 from tacsim.record.numbering import Numbering, match_numbers, numbers_in_names
+from tacsim.record.ros_bag import PictureTopic, is_ros_bag, open_topic
 from tacsim.record.sources import (
     EPISODES,
     VIDEOS,
@@ -59,7 +60,8 @@ class ReplayClock:
 class ReplaySensor:
     """Recorded frames as a TactileSource.
 
-    The source is an episode (the sensor of this name, or its only one), a folder of pictures of one size, or a video.
+    The source is an episode (the sensor of this name, or its only one), a folder of pictures of one size, a video, or a
+    ROS 2 bag in MCAP (one topic of compressed pictures).
     `spec` has height and flow if the recorded frames have them; robot.open adds the outputs of the normaliser.
 
     Raises EpisodeError if the source is missing, empty, unreadable, too large, or has no such sensor.
@@ -70,6 +72,7 @@ class ReplaySensor:
         self._path = _require_source(config.source, f"sensors.{name}")
         self._reference = None if config.reference is None else read_image(Path(config.reference))
         self._pictures: list[Path] | None = None  # of a folder
+        self._topic = _bag_topic(config, self._path, name)
         self._frames = Cursor(self._frame_starter(), str(self._path))
         self._first, _ = _first_item(self._frames, self._path)
         rows, columns, _ = self._first.image.shape
@@ -103,6 +106,8 @@ class ReplaySensor:
     def numbering(self, expected: int | None) -> Numbering | None:
         """Numbers of its frames; None for an episode, whose steps are complete and numbered from 0. expected: count of
         the other sources, None if none has a count. Raises EpisodeError."""
+        if self._topic is not None:
+            return Numbering(f"{self._path}: {self._topic.topic}", self._topic.count(), None)
         if self._pictures is not None:
             given = None if self._config.reference is None else Path(self._config.reference).resolve()
             places = [k for k, path in enumerate(self._pictures) if path.resolve() == given]
@@ -128,6 +133,8 @@ class ReplaySensor:
         """A function that starts an iterator of frames, each with its age at its step [s]; 0 for pictures and
         videos."""
         path = self._path
+        if (topic := self._topic) is not None:
+            return lambda: ((frame, 0.0) for frame in topic.frames())
         if path.is_dir():
             self._pictures = list_pictures(path)
             return lambda: _number_images(folder_images(self._pictures or []))
@@ -222,13 +229,25 @@ def match_sources(sensors: Mapping[str, ReplaySensor], arms: Mapping[str, Replay
 def recorded_period(config: ReplaySensorConfig, name: str) -> float:
     """Time between two frames of a recording [s], which sets the rig's period. Raises EpisodeError.
 
-    Episodes and most videos contain it; otherwise it is taken from `fps` of the rig file.
+    Episodes, bags and most videos contain it; otherwise it is taken from `fps` of the rig file.
     """
     path = _require_source(config.source, f"sensors.{name}")
+    if (topic := _bag_topic(config, path, name)) is not None:
+        return topic.period() or 1.0 / config.fps
     if path.suffix.lower() in EPISODES:
         return episode_meta(path).spec.period
     rate = video_rate(path) if path.suffix.lower() in VIDEOS and path.is_file() else None
     return 1.0 / (config.fps if rate is None else rate)
+
+
+def _bag_topic(config: ReplaySensorConfig, path: Path, name: str) -> PictureTopic | None:
+    """The topic of a ROS 2 bag; None for another recording. Raises EpisodeError."""
+    option = f"sensors.{name}.topic"
+    if is_ros_bag(path):
+        return open_topic(path, config.topic, option)
+    if config.topic is not None:
+        raise EpisodeError(f"{option}: a topic is one of a ROS 2 bag in MCAP, and {path} is none; leave it out")
+    return None
 
 
 def _first_item(cursor: Cursor[T], path: Path) -> T:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Generic, TypeVar
 import numpy as np
 
 from tacsim.interface import ArmState, EndOfEpisode, Image, Pose, TactileFrame
+from tacsim.models.text import suggest_word
 from tacsim.optics.picture_file import FORMATS, MAX_SIDE
 from tacsim.record.episode import EpisodeError, EpisodeMeta
 from tacsim.record.images import image_size, read_image
@@ -97,7 +98,7 @@ def select_name(names: list[str], name: str, path: Path, kind: str) -> str:
         return name
     if len(names) == 1:
         return names[0]
-    wrong = f"no {kind} '{name}'" if name else f"which {kind}? Name one"
+    wrong = f"no {kind} '{name}'{suggest_word(name, names)}" if name else f"which {kind}? Name one"
     raise EpisodeError(f"{path}: {wrong}; the recording has: {', '.join(names) or '(none)'}")
 
 
@@ -127,7 +128,9 @@ def list_pictures(folder: Path) -> list[Path]:
 def _suggest_files(folder: Path) -> str:
     """Text with other files of a folder without pictures, which may explain the error."""
     if (bags := visible_files(folder, EPISODES)) and (folder / "metadata.yaml").is_file():
-        return f"; it is the folder of a ROS 2 bag ({bags[0].name}), whose topics are not read: export its pictures"
+        return (
+            f"; it is the folder of a ROS 2 bag ({bags[0].name}): replay it (tacsim run replay), or export its pictures"
+        )
     if other := visible_files(folder, OTHER_PICTURES):
         return f", but {len(other)} like {other[0].name}; save them as PNG with 8 bits a channel"
     return ""

@@ -9,7 +9,7 @@ import typer
 
 from robot.cli.calibrate.session import guided_session, image_writer, named_camera
 from robot.cli.options import Out, Overrides, quantities_parser
-from robot.cli.output import busy, new_directory, print_files, progress, results, show_table, writing
+from robot.cli.output import busy, new_directory, print_files, print_json, progress, results, show_table, writing
 
 if TYPE_CHECKING:
     import numpy as np
@@ -169,7 +169,9 @@ def _fit_lens(pictures: Path, board: Board, folder: Path) -> None:
         f"{lens_.centre[1]:.1f} px; residual {lens_.residual:.2f} px"
     )
     with writing(folder):
-        print_files(_write_yaml(folder / "lens.yaml", lens_))
+        path = _write_yaml(folder / "lens.yaml", lens_)
+    print_files(path)
+    print_json({**lens_.model_dump(mode="json"), "residuals": each, "left_out": missing}, [path])
 
 
 def _fit_view(
@@ -216,7 +218,9 @@ def _report_view(view: GelView, image: NDArray[np.uint8], folder: Path) -> None:
     )
     with writing(folder):
         (folder / "rectified.png").write_bytes(encode_png(np.rint(metric_rectification(view)(image)).astype(np.uint8)))
-        print_files(_write_yaml(folder / "view.yaml", view), folder / "rectified.png")
+        written = [_write_yaml(folder / "view.yaml", view), folder / "rectified.png"]
+    print_files(*written)
+    print_json(view.model_dump(mode="json"), written)
 
 
 def _read_picture(path: Path) -> NDArray[np.uint8]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from robot.cli.errors import EXIT_UNTRUSTED, EXIT_UNVERIFIED
-from robot.cli.output import busy, notes, print_files, results, show_table, warn, writing
+from robot.cli.output import busy, notes, print_files, print_json, results, show_table, warn, writing
 
 if TYPE_CHECKING:
     from calibration.frame_set import FrameSet
@@ -59,6 +59,7 @@ def fit_light(read: FrameSet, ball: float, dot: float | None) -> LightFit:
         grey = f"; {GREY}: give the camera's own, in colour" if is_grey(read.reference) else ""
         notes.print(f"{why}{grey}")
         results.print("verdict: do not trust; no bundle is written")
+        print_json({"verdict": "do not trust", "findings": [{"word": "do not trust", "what": str(why)}]}, [])
         raise typer.Exit(EXIT_UNTRUSTED) from None
 
 
@@ -137,6 +138,8 @@ def write_calibration(
         notes.print(f"{finding.word}: {finding.what}.{todo}")
     results.print(f"verdict: {verdict.word}")
     print_files(*written)
+    calibration = bundle.model_dump(mode="json", include={"serial", "gel_size", "provenance", "residuals"})
+    print_json({"verdict": verdict.word, "findings": verdict.findings, **calibration}, written)
     if verdict.word == "do not trust":
         raise typer.Exit(EXIT_UNTRUSTED)
     if verdict.word == "unverified scale":

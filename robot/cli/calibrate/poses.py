@@ -7,6 +7,7 @@ import math
 import shlex
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,8 +15,17 @@ import typer
 
 from robot.cli.calibrate.session import confirm_motion, guided_session
 from robot.cli.errors import print_error
-from robot.cli.options import HardwareRig, OptionGroup, Out, Overrides, angle_option, length_option, with_option_groups
-from robot.cli.output import busy, new_directory, notes, print_files, results, show_table, writing
+from robot.cli.options import (
+    HardwareRig,
+    OptionGroup,
+    Out,
+    Overrides,
+    angle_option,
+    complete_names,
+    length_option,
+    with_option_groups,
+)
+from robot.cli.output import busy, new_directory, notes, print_files, print_json, results, show_table, writing
 from robot.cli.terminal import Interrupt, ask_operator, require_operator
 
 if TYPE_CHECKING:
@@ -27,7 +37,12 @@ if TYPE_CHECKING:
     from tacsim.interface import Pose
 
 Rig = Annotated[
-    str | None, typer.Option("--rig", help="A rig of hardware, or the path of its file: measure now, with its arm.")
+    str | None,
+    typer.Option(
+        "--rig",
+        help="A rig of hardware, or the path of its file: measure now, with its arm.",
+        autocompletion=complete_names("rig"),
+    ),
 ]
 
 
@@ -317,6 +332,7 @@ def _write_report(folder: Path, name: str, report: dict[str, Any]) -> None:
     with writing(folder):
         path.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
     print_files(path)
+    print_json(report, [path])
 
 
 def latency(
@@ -361,5 +377,7 @@ def latency(
         if measured.seconds > 3.0 * measured.uncertainty:
             notes.print("warning: they still seem later than the arm; is the arm's own latency in the file too large?")
     results.print("Write into the rig file:")
-    for key, seconds in latency_entries(measured, record.clock, arm, hardware_arm(config, arm), sensor).items():
+    entries = latency_entries(measured, record.clock, arm, hardware_arm(config, arm), sensor)
+    for key, seconds in entries.items():
         results.print(f"  {key}: {1e3 * seconds:.1f} ms")
+    print_json({**asdict(measured), "clock": record.clock, "entries": entries})

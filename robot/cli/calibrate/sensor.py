@@ -25,12 +25,15 @@ from robot.cli.options import (
     OptionGroup,
     Out,
     Overrides,
+    complete_names,
     length_option,
     quantities_parser,
     quantity_parser,
+    with_json_option,
     with_option_groups,
 )
 from robot.cli.output import new_directory, notes, warn
+from tacsim.models.text import suggest_word
 
 if TYPE_CHECKING:
     from calibration.frame_set import FrameSet
@@ -59,6 +62,7 @@ class Description(OptionGroup):
         typer.Option(
             "--kind",
             metavar="KIND",
+            autocompletion=complete_names(words=("mini", "mini-markers", "r1.5", "digit", "9dtact", "other")),
             help="mini, mini-markers, r1.5, digit, 9dtact or other: gives published properties, such as the part "
             "of the picture that shows the gel, an approximate pixel pitch, dots.",
         ),
@@ -106,6 +110,7 @@ class Description(OptionGroup):
 @calibrate.command(
     epilog='Example: [bold]tacsim calibrate sensor frames --ball-diameter "5.84 mm" --pixel-pitch "0.0593 mm"[/]'
 )
+@with_json_option
 @with_option_groups
 def sensor(
     frames: Annotated[
@@ -216,7 +221,8 @@ def _check_options(given: Description, out: Path | None) -> _SensorOptions:
         what = "give the ball's diameter (or its radius, not both): without it no slope is known"
         raise typer.BadParameter(what, param_hint="--ball-diameter")
     if given.kind is not None and given.kind not in PROFILES:
-        raise typer.BadParameter(f"'{given.kind}'; known: {', '.join(PROFILES)}", param_hint="--kind")
+        words = f"'{given.kind}'; known: {', '.join(PROFILES)}{suggest_word(given.kind, PROFILES)}"
+        raise typer.BadParameter(words, param_hint="--kind")
     profile = PROFILES["other" if given.kind is None else given.kind]
     if given.pixel_pitch is not None and given.view is not None:
         raise typer.BadParameter("give either --pixel-pitch or --view")

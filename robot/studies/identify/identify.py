@@ -20,6 +20,7 @@ from robot.studies.identify.tuning import FIRST_FRICTION, FIRST_YIELD
 from tacsim.interface import FloatArray
 from tacsim.models.material import elastic_constants
 from tacsim.models.scene import Scene
+from tacsim.models.text import suggest_word
 
 Kind = Literal["gel", "body"]
 # noise that removes the width of a dent from a fit: width identifies indenters, not materials [m]
@@ -111,7 +112,8 @@ def identify(
     names = [each.name for each in parameters]
     unknown = [name for name in wanted if name not in names]
     if unknown:
-        raise ValueError(f"'{unknown[0]}' is not a parameter of a {kind}; allowed: {', '.join(names)}")
+        hint = suggest_word(unknown[0], names)
+        raise ValueError(f"'{unknown[0]}' is not a parameter of a {kind}; allowed: {', '.join(names)}{hint}")
     parameters = tuple(each for each in parameters if not wanted or each.name in wanted)
     taken = tuple(downsample_press(merge_repeated_readings(press), max_moments) for press in presses)
     signals = signals_of(taken, noise)

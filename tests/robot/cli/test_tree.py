@@ -33,6 +33,8 @@ def tree(command: Any) -> dict[str, Any]:
 CHANGED = {("tacsim compare", "--shift")}
 # Defaults are None, so that a size of another indenter can be refused; the result is as before
 CHANGED |= {("tacsim press", option) for option in ("--radius", "--height", "--size", "--scale")}
+# The file `-` prints the document on stdout, as --json of the other commands
+CHANGED |= {("tacsim bench", "--json"), ("tacsim evaluate", "--json")}
 
 
 @pytest.mark.deep

@@ -68,7 +68,7 @@ def record(
         policy="scripted",
         seed=seed,
         spec=RigSpec(sensors, tuple(names), truth=True, period=PERIOD),
-        versions={"tacsim": "0.1.0"},
+        versions={"tacsim": "0.2.0"},
         attachments={"rig.yaml": LOADED.text.encode(), **{f"reference/{name}.png": reference for name in names}},
         goal=7e-3,
     )

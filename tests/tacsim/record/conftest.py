@@ -90,7 +90,7 @@ def meta() -> EpisodeMeta:
         policy="scripted",
         seed=7,
         spec=RigSpec(sensors=sensors, arms=("lower", "upper"), truth=True, period=0.1),
-        versions={"tacsim": "0.1.0", "numpy": "2.4"},
+        versions={"tacsim": "0.2.0", "numpy": "2.4"},
         attachments={"rig.yaml": b"name: sim\n", "calibration/lower.npz": bytes(range(256)), "empty": b""},
         goal=(2e-3, 1 / 3),
         started=datetime(2026, 3, 4, 5, 6, 7, 891234, timezone(timedelta(hours=-3, minutes=-30))),

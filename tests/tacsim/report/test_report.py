@@ -39,7 +39,7 @@ def made_up(
     """Force 0.5 N more each step on every arm, contact signal in proportion; closest to the goal at step 5."""
     carried = {name: SensorSpec((48, width), True, False, name if arms else None) for name in sensors}
     spec = RigSpec(carried, sensors if arms else (), truth=reward, period=0.1)
-    meta = EpisodeMeta(rig, "squeeze", "scripted", 3, spec, {"tacsim": "0.1.0"}, goal=7e-3)
+    meta = EpisodeMeta(rig, "squeeze", "scripted", 3, spec, {"tacsim": "0.2.0"}, goal=7e-3)
     return Episode(meta, [_step(k, sensors, arms, reward, width) for k in range(steps + 1)])
 
 

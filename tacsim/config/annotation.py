@@ -66,7 +66,7 @@ def select_variant(annotation: Any, node: Node | None) -> type[BaseModel] | None
 
 def child_annotation(annotation: Any, node: Node | None, key: str | int) -> Any:
     """The annotation of an entry of a mapping or a list; None for an unknown one."""
-    model = select_variant(annotation, node)
+    model = None if isinstance(key, int) else select_variant(annotation, node)
     if model is not None:
         field = model.model_fields.get(str(key))
         if field is None:

@@ -23,7 +23,7 @@ from robot.cli.calibrate.lens import lens
 from robot.cli.calibrate.poses import hand_eye, latency, touch
 from robot.cli.calibrate.sensor import calibrate
 from robot.cli.catalogue import list_, new, show
-from robot.cli.collect import collect, episodes
+from robot.cli.collect import collect, episodes, samples
 from robot.cli.collect import press as press_set
 from robot.cli.compare import compare
 from robot.cli.doctor import doctor, schema, start
@@ -72,7 +72,7 @@ COMMANDS = {
         transfer,
     ),
     calibrate: (latency, lens, touch, hand_eye),
-    collect: (press_set, episodes),
+    collect: (press_set, episodes, samples),
     export: (policy, policy_range, lerobot),
     identify: (gel, body),
 }

@@ -53,8 +53,10 @@ def tag_of(model: type[BaseModel]) -> tuple[str, str] | None:
 
 
 def select_variant(annotation: Any, node: Node | None) -> type[BaseModel] | None:
-    """The model of a mapping node: the only one, or the one of a union that the node's tag names."""
+    """The model of a mapping node: the only one, or the one of a union that the node's tag names; None for a list."""
     options = union_models(annotation)
+    if node is not None and isinstance(node.value, list):
+        return None
     if len(options) == 1:
         return options[0]
     for model in options:
@@ -66,7 +68,7 @@ def select_variant(annotation: Any, node: Node | None) -> type[BaseModel] | None
 
 def child_annotation(annotation: Any, node: Node | None, key: str | int) -> Any:
     """The annotation of an entry of a mapping or a list; None for an unknown one."""
-    model = None if isinstance(key, int) else select_variant(annotation, node)
+    model = select_variant(annotation, node)
     if model is not None:
         field = model.model_fields.get(str(key))
         if field is None:

@@ -43,8 +43,9 @@ def fit_gel(
 ) -> tuple[Scene, list[str]]:  # fmt: skip
     """The scene with the gel sizes of the sensors' models, x and y (`gel_size`) in whole elements and the thickness
     (`gel_thickness`) where a model gives it, and notes about them, with the cautions of calibrations. If the models
-    give one size only, `gel` has it, and so both sensors, unless the scene gives a sensor another size. Sizes that were `given` on the command line stay: "gel", or the names of
-    sensors. Raises ConfigError for a gel that the scene cannot mesh."""
+    give one size only, `gel` has it, and so both sensors, unless the scene gives a sensor another size. Sizes that were
+    `given` on the command line stay: "gel", or the names of sensors. Raises ConfigError for a gel that the scene cannot
+    mesh."""
     notes = [f"sensor {name}: {model.name}: {model.caution}" for name, model in models.items() if model.caution]
     sizes = {name: model.gel_size for name, model in models.items() if model.gel_size is not None}
     origins = {

@@ -40,7 +40,8 @@ sensors:
   upper:
     driver: sim
     arm: upper
-    model: {extends: digit, gel_size: [18.8 mm, 25 mm], gel_thickness: null, geometry: {width: 60, height: 80, pixel_pitch: 0.35 mm}}
+    model: {extends: digit, gel_size: [18.8 mm, 25 mm], gel_thickness: null,
+            geometry: {width: 60, height: 80, pixel_pitch: 0.35 mm}}
 canonical: {rows: 32, columns: 32, pitch: 1 mm, image_scale: 1}
 """
 

@@ -106,17 +106,18 @@ def fit_inverse(sets: Sequence[tuple[FloatArray, FloatArray]], *, with_position:
 
 
 def inverse_of_light(model: PhotometricModel) -> InverseModel:
-    """The inverse of a forward model whose presses are not at hand: a polynomial through its colours at random slopes,
+    """The inverse of a forward model whose presses are not available: a polynomial through its colours at random slopes,
     up to its steepest, and random places. It does not see cast shadows or the colour of depth."""
     sample_count = 20_000  # of slopes and places; the weights have 56 rows
     rng = np.random.default_rng(0)
-    steepness = model.steepest * np.sqrt(rng.random(sample_count, dtype=np.float32))
-    angle = 2 * np.pi * rng.random(sample_count, dtype=np.float32)
-    slopes = np.stack([steepness * np.cos(angle), steepness * np.sin(angle)], axis=-1).astype(np.float32)
-    u, v = rng.random((2, sample_count), dtype=np.float32) - np.float32(0.5)
-    change = PhotometricLight(model).change(slopes, u, v)[0]
-    terms = inverse_features(change.astype(np.float64), 2.0 * u, 2.0 * v)
-    weights = fit_inverse([(terms.T @ terms, terms.T @ normal_of_slope(slopes))], with_position=True)
+    steepness, angle = model.steepest * np.sqrt(rng.random(sample_count)), 2 * np.pi * rng.random(sample_count)
+    slopes: FloatArray = np.stack([steepness * np.cos(angle), steepness * np.sin(angle)], axis=-1)
+    u, v = rng.random((2, sample_count)) - 0.5
+    seen = PhotometricLight(model).change(*(each.astype(np.float32) for each in (slopes, u, v)))[0]
+    terms: FloatArray = inverse_features(seen.astype(np.float64), 2.0 * u, 2.0 * v)
+    square: FloatArray = terms.T @ terms
+    right: FloatArray = terms.T @ normal_of_slope(slopes)
+    weights = fit_inverse([(square, right)], with_position=True)
     return InverseModel(weights=tuple((float(x), float(y)) for x, y in weights), steepest=model.steepest)
 
 

@@ -223,19 +223,19 @@ def samples(out: Out = None) -> None:
     """
     folder = new_directory(out, "samples")
     with busy("loading (the first run compiles the kernels, up to half a minute)"):
-        from robot.studies.sample_presses import BALL_RADIUS, FOLDERS, PRESSES, SENSOR, draw_samples, sample_lengths
+        from robot.studies.sample_presses import BALL_RADIUS, SERIES, PRESSES, SENSOR, draw_samples, sample_lengths
         from tacsim.config import load_sensor
         from tacsim.record.images import encode_png
 
         model = load_sensor(SENSOR)
     with writing(folder), counted("drawing presses") as on_press:
-        for name in FOLDERS:
+        for name in SERIES:
             (folder / name).mkdir()
         for name, image in draw_samples(on_press):
             (folder / f"{name}.png").write_bytes(encode_png(image))
         (folder / "lengths.json").write_text(json.dumps(sample_lengths(model), indent=1) + "\n", encoding="utf-8")
-    print_files(*(folder / name for name in FOLDERS), folder / "lengths.json")
-    sensor, simulation = (shlex.quote(str(folder / name)) for name in FOLDERS)
+    print_files(*(folder / name for name in SERIES), folder / "lengths.json")
+    sensor, simulation = (shlex.quote(str(folder / name)) for name in SERIES)
     notes.print(
         f'calibrate: tacsim calibrate sensor {sensor} --ball-diameter "{2e3 * BALL_RADIUS:g} mm" --pixel-pitch '
         f'"{1e3 * model.geometry.pixel_pitch:g} mm" --depth "press_0.png={PRESSES[0][2]:g} mm"'

@@ -31,15 +31,15 @@ PRESSES = (
     (-1.9, 4.2, 0.85),
     (2.3, 4.3, 0.75),
 )
-FOLDERS = ("sensor", "simulation")  # the names of both series
+SERIES = ("sensor", "simulation")  # the names of both series
 NOISE = CameraNoise(deviation=(1.5, 1.2, 1.5), neighbours=(0.3, 0.3))  # less than a real DIGIT has
 
 
 def draw_samples(on_press: Callable[[int, int], None] = lambda done, total: None) -> Iterator[tuple[str, Image]]:
     """Path without suffix and RGB picture of each sample; `on_press` gets the number of finished presses and of all."""
-    model, total = load_sensor(SENSOR), len(FOLDERS) * len(PRESSES)
+    model, total = load_sensor(SENSOR), len(SERIES) * len(PRESSES)
     for series, preset in enumerate(("standard", "draft")):
-        folder, has_noise = FOLDERS[series], series == 0
+        folder, has_noise = SERIES[series], series == 0
         scene, _ = fit_gel(
             load_scene("press", [f"preset={preset}", f"indenter.geometry={{shape: sphere, radius: {BALL_RADIUS} m}}"]),
             {"lower": model},

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from calibration.light.circle import find_contact_circle
-from robot.studies.sample_presses import FOLDERS, PRESSES
+from robot.studies.sample_presses import SERIES, PRESSES
 from tacsim.record.images import read_image
 from tests.robot.cli.invoked import tacsim
 
@@ -49,6 +49,6 @@ def test_samples_are_the_same_each_time(monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setattr("robot.studies.sample_presses.PRESSES", PRESSES[:1])
     for name in ("a", "b"):
         assert tacsim("collect", "samples", "--out", name).exit_code == 0
-    for folder in FOLDERS:
+    for folder in SERIES:
         for path in Path("a", folder).iterdir():
             assert path.read_bytes() == Path("b", folder, path.name).read_bytes()

@@ -223,7 +223,7 @@ def samples(out: Out = None) -> None:
     """
     folder = new_directory(out, "samples")
     with busy("loading (the first run compiles the kernels, up to half a minute)"):
-        from robot.studies.sample_presses import BALL_RADIUS, SERIES, PRESSES, SENSOR, draw_samples, sample_lengths
+        from robot.studies.sample_presses import BALL_RADIUS, PRESSES, SENSOR, SERIES, draw_samples, sample_lengths
         from tacsim.config import load_sensor
         from tacsim.record.images import encode_png
 

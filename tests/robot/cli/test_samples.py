@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from calibration.light.circle import find_contact_circle
-from robot.studies.sample_presses import SERIES, PRESSES
+from robot.studies.sample_presses import PRESSES, SERIES
 from tacsim.record.images import read_image
 from tests.robot.cli.invoked import tacsim
 

@@ -106,8 +106,8 @@ def fit_inverse(sets: Sequence[tuple[FloatArray, FloatArray]], *, with_position:
 
 
 def inverse_of_light(model: PhotometricModel) -> InverseModel:
-    """The inverse of a forward model whose presses are not available: a polynomial through its colours at random slopes,
-    up to its steepest, and random places. It does not see cast shadows or the colour of depth."""
+    """The inverse of a forward model whose presses are not available: a polynomial through its colours at random
+    slopes, up to its steepest, and random places. It does not see cast shadows or the colour of depth."""
     sample_count = 20_000  # of slopes and places; the weights have 56 rows
     rng = np.random.default_rng(0)
     steepness, angle = model.steepest * np.sqrt(rng.random(sample_count)), 2 * np.pi * rng.random(sample_count)

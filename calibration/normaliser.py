@@ -13,7 +13,7 @@ from calibration.frame_normaliser import FrameNormaliser
 from calibration.height.colour_table import GradientModel, table_of_model
 from calibration.height.darkness import DarknessSlopes
 from calibration.height.forward_steps import ForwardSteps
-from calibration.height.slope_polynomial import PolynomialSlopes
+from calibration.height.slope_polynomial import InverseModel, PolynomialSlopes, inverse_of_light
 from calibration.height.surface_finder import SurfaceFinder, extended_view
 from calibration.lens.rectification import (
     Rectification,
@@ -24,8 +24,9 @@ from calibration.lens.rectification import (
 )
 from calibration.markers.flow import NoMarkers, marker_flow, view_of_dots
 from tacsim.interface import Image
-from tacsim.models.geometry import PictureRegion
+from tacsim.models.geometry import PictureRegion, SensorGeometry
 from tacsim.models.hardware import CameraSensorConfig
+from tacsim.models.photometric import PhotometricModel
 from tacsim.models.rig import ReplaySensorConfig
 from tacsim.models.sensor import CanonicalGrid, SensorModel
 from tacsim.optics.grid import PixelGrid, canonical_image
@@ -43,23 +44,34 @@ def normaliser_for_pictures(
 ) -> FrameNormaliser:
     """The normaliser of a simulated sensor of which only pictures are available, from a camera or a recording. The
     inverse of the model's light gives height and gradient, its markers give flow. Raises ValueError for a light without
-    inverse, a calibrated one (its inverse is in its bundle), or markers too small for the image."""
-    if model.photometric is not None:
-        raise ValueError(
-            f"the light of model '{model.name}' is a calibrated one, whose inverse is in its bundle: give the "
-            "camera `calibration: BUNDLE` in place of `model`"
-        )
-    rectify = _rectification_of_model(model, gel_size, extended_view(grid, gel_size)).within(region)
+    inverse, or markers too small for the image."""
+    wide = extended_view(grid, gel_size)
+    rectify = _rectification_of_model(model, gel_size, wide).within(region)
     slopes: GradientModel
-    if model.darkness is not None:
+    better = None
+    if model.photometric is not None:
+        inverse = inverse_of_light(model.photometric)
+        slopes, better = _calibrated_slopes(inverse, model.photometric, model.geometry, wide, rectify)
+    elif model.darkness is not None:
         shape = rectify.valid[visible_box(rectify.valid)].shape
         slopes = DarknessSlopes(model.darkness, shape, grid.pitch / grid.image_scale)
     else:
         slopes = table_of_model(model)
-    find = SurfaceFinder(slopes, rectify.valid, grid, dots=model.markers is not None)
+    find = SurfaceFinder(slopes, rectify.valid, grid, dots=model.markers is not None, better=better)
     return FrameNormaliser(
         rectify, grid, find, marker_flow(model.markers, model.geometry, gel_size, model.view, region)
     )
+
+
+def _calibrated_slopes(
+    inverse: InverseModel, forward: PhotometricModel, geometry: SensorGeometry, wide: PixelGrid, rectify: Rectification
+) -> tuple[PolynomialSlopes, ForwardSteps]:
+    """Both models of a calibrated light on the pixels of `wide` that show gel."""
+    pixels = (wide.points() / geometry.pixel_pitch + geometry.principal + 0.5) / (geometry.width, geometry.height)
+    x, y = np.moveaxis(2.0 * pixels[visible_box(rectify.valid)] - 1.0, -1, 0)
+    u, v = (np.asarray(place / 2, dtype=np.float32) for place in (x, y))
+    steps = ForwardSteps(forward, u, v, wide.pitch, geometry.width * geometry.pixel_pitch)
+    return PolynomialSlopes(inverse, x, y), steps
 
 
 def _rectification_of_model(model: SensorModel, gel_size: tuple[float, float], grid: PixelGrid) -> Rectification:
@@ -86,17 +98,14 @@ def normaliser_for_calibration(
     else:
         rectify = rectification_of_view(calibration.view, wide)
     rectify = rectify.within(calibration.region)
-    pixels = (wide.points() / geometry.pixel_pitch + geometry.principal + 0.5) / (geometry.width, geometry.height)
-    x, y = np.moveaxis(2.0 * pixels[visible_box(rectify.valid)] - 1.0, -1, 0)
     slopes: GradientModel
     better = None
     if calibration.darkness is not None:
-        slopes = DarknessSlopes(calibration.darkness, x.shape, wide.pitch)
+        shape = rectify.valid[visible_box(rectify.valid)].shape
+        slopes = DarknessSlopes(calibration.darkness, shape, wide.pitch)
     else:
         assert calibration.inverse is not None and calibration.forward is not None
-        slopes = PolynomialSlopes(calibration.inverse, x, y)
-        u, v = (np.asarray(place / 2, dtype=np.float32) for place in (x, y))
-        better = ForwardSteps(calibration.forward, u, v, wide.pitch, geometry.width * geometry.pixel_pitch)
+        slopes, better = _calibrated_slopes(calibration.inverse, calibration.forward, geometry, wide, rectify)
     dots = calibration.markers is not None
     find = SurfaceFinder(slopes, rectify.valid, grid, dots=dots, drifts=True, better=better)
     flow = marker_flow(calibration.markers, geometry, calibration.gel_size, calibration.view, calibration.region)

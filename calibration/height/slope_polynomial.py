@@ -15,6 +15,7 @@ from pydantic import Field
 
 from calibration.height.tuning import MAX_EXTRAPOLATION
 from tacsim.interface import Float32, FloatArray, Mask
+from tacsim.models.photometric import PhotometricLight, PhotometricModel
 from tacsim.models.quantity import Config
 
 DEGREE = 3
@@ -102,6 +103,22 @@ def fit_inverse(sets: Sequence[tuple[FloatArray, FloatArray]], *, with_position:
     weights = np.zeros((TERMS, 2))
     weights[use] = np.linalg.solve(square + ridge_weight * square[0, 0] * np.eye(len(use)), right)
     return weights
+
+
+def inverse_of_light(model: PhotometricModel) -> InverseModel:
+    """The inverse of a forward model whose presses are not available: a polynomial through its colours at random
+    slopes, up to its steepest, and random places. It does not see cast shadows or the colour of depth."""
+    sample_count = 20_000  # of slopes and places; the weights have 56 rows
+    rng = np.random.default_rng(0)
+    steepness, angle = model.steepest * np.sqrt(rng.random(sample_count)), 2 * np.pi * rng.random(sample_count)
+    slopes: FloatArray = np.stack([steepness * np.cos(angle), steepness * np.sin(angle)], axis=-1)
+    u, v = rng.random((2, sample_count)) - 0.5
+    seen = PhotometricLight(model).change(*(each.astype(np.float32) for each in (slopes, u, v)))[0]
+    terms: FloatArray = inverse_features(seen.astype(np.float64), 2.0 * u, 2.0 * v)
+    square: FloatArray = terms.T @ terms
+    right: FloatArray = terms.T @ normal_of_slope(slopes)
+    weights = fit_inverse([(square, right)], with_position=True)
+    return InverseModel(weights=tuple((float(x), float(y)) for x, y in weights), steepest=model.steepest)
 
 
 def _colour_products() -> list[tuple[int, ...]]:

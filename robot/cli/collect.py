@@ -1,7 +1,8 @@
-"""`tacsim collect`: sets of presses and of episodes, many at once."""
+"""`tacsim collect`: sets of presses and of episodes, many at once; sample presses."""
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
 from collections.abc import Callable, Sequence
@@ -14,6 +15,7 @@ from robot.cli.errors import EXIT_FAILED, print_error
 from robot.cli.options import (
     TASK_POLICIES,
     OptionGroup,
+    Out,
     Overrides,
     Preset,
     SensorModel,
@@ -22,7 +24,7 @@ from robot.cli.options import (
     require_packages,
     with_option_groups,
 )
-from robot.cli.output import busy, notes, one_bar, print_json, results
+from robot.cli.output import busy, counted, new_directory, notes, one_bar, print_files, print_json, results, writing
 from robot.cli.terminal import Interrupt
 
 if TYPE_CHECKING:
@@ -30,7 +32,9 @@ if TYPE_CHECKING:
     from robot.collect.episodes import EpisodeJob
     from robot.collect.presses import PressJob
 
-collect = typer.Typer(no_args_is_help=True, help="Make sets of presses or of episodes, many at once.")
+collect = typer.Typer(
+    no_args_is_help=True, help="Make sets of presses or of episodes, many at once; or sample presses."
+)
 
 NUMBER = re.compile(r"\s*[-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?\s*")
 
@@ -225,6 +229,39 @@ def episodes(
         job = EpisodeJob(settings, count)
         job.check()
     _make_set(job, out, {}, _command_line(f"episodes {shlex.quote(rig)}", given), workers, ray)
+
+
+def samples(out: Out = None) -> None:
+    """Draw sample presses of a ball, to try tacsim calibrate sensor and tacsim compare without a sensor.
+
+    sensor/ holds the pictures of a simulated DIGIT with camera noise, simulation/ the same presses in a coarser
+    simulation without noise; lengths.json has the true lengths. They are the same each time.
+
+    Example: tacsim collect samples --out samples
+    """
+    folder = new_directory(out, "samples")
+    with busy("loading (the first run compiles the kernels, up to half a minute)"):
+        from robot.studies.sample_presses import BALL_RADIUS, PRESSES, SENSOR, SERIES, draw_samples, sample_lengths
+        from tacsim.config import load_sensor
+        from tacsim.record.images import encode_png
+
+        model = load_sensor(SENSOR)
+    with writing(folder), counted("drawing presses") as on_press:
+        for name in SERIES:
+            (folder / name).mkdir()
+        for name, image in draw_samples(on_press):
+            (folder / f"{name}.png").write_bytes(encode_png(image))
+        lengths = sample_lengths(model)
+        (folder / "lengths.json").write_text(json.dumps(lengths, indent=1) + "\n", encoding="utf-8")
+    files = [*(folder / name for name in SERIES), folder / "lengths.json"]
+    print_files(*files)
+    print_json({"lengths": lengths}, files)
+    sensor, simulation = (shlex.quote(str(folder / name)) for name in SERIES)
+    notes.print(
+        f'calibrate: tacsim calibrate sensor {sensor} --ball-diameter "{2e3 * BALL_RADIUS:g} mm" --pixel-pitch '
+        f'"{1e3 * model.geometry.pixel_pitch:g} mm" --depth "press_0.png={PRESSES[0][2]:g} mm"'
+    )
+    notes.print(f"compare: tacsim compare {simulation} {sensor}")
 
 
 def _make_set(

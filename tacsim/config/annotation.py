@@ -53,8 +53,11 @@ def tag_of(model: type[BaseModel]) -> tuple[str, str] | None:
 
 
 def select_variant(annotation: Any, node: Node | None) -> type[BaseModel] | None:
-    """The model of a mapping node: the only one, or the one of a union that the node's tag names."""
+    """The model of a mapping node: the only one, or the one of a union that the node's tag names. None for
+    another node, where it may be something else than a model."""
     options = union_models(annotation)
+    if node is not None and not isinstance(node.value, dict) and len(union_members(annotation)) > len(options):
+        return None
     if len(options) == 1:
         return options[0]
     for model in options:

@@ -1,4 +1,4 @@
-"""The gel size of a simulated scene, from a calibrated sensor."""
+"""The gel size of a simulated scene, from the models of its sensors."""
 
 from __future__ import annotations
 
@@ -41,14 +41,15 @@ def fit_gels_to_sensors(
 def fit_gel(
     scene: Scene, models: Mapping[str, SensorModel], *, given: Collection[str] = ()
 ) -> tuple[Scene, list[str]]:  # fmt: skip
-    """The scene with the gel sizes along x, y of the sensors' models (`gel_size`), in whole elements, and notes about
-    them, with the cautions of calibrations. If the models give one size only, `gel` has it, and so both sensors, unless
-    the scene gives a sensor another size. Sizes that were `given` on the command line stay: "gel", or the names of
-    sensors. Raises ConfigError for a gel that the scene cannot mesh."""
+    """The scene with the gel sizes of the sensors' models, x and y (`gel_size`) in whole elements and the thickness
+    (`gel_thickness`) where a model gives it, and notes about them, with the cautions of calibrations. If the models
+    give one size only, `gel` has it, and so both sensors, unless the scene gives a sensor another size. Sizes that were
+    `given` on the command line stay: "gel", or the names of sensors. Raises ConfigError for a gel that the scene cannot
+    mesh."""
     notes = [f"sensor {name}: {model.name}: {model.caution}" for name, model in models.items() if model.caution]
     sizes = {name: model.gel_size for name, model in models.items() if model.gel_size is not None}
     origins = {
-        name: f"{millimetres(*size)} by the calibration of {models[name].name} (sensor {name})"
+        name: f"{millimetres(*size)} by the model of {models[name].name} (sensor {name})"
         for name, size in sizes.items()
     }
     fixed = _overridden_sensors(scene, models, given)
@@ -57,7 +58,7 @@ def fit_gel(
         of = [words for name, words in fixed_origins.items() if millimetres(*scene.gel_of(name).size[:2]) == size]
         notes.insert(0, f"gel {size}, as given on the command line; {'; '.join(of)}")
     wanted = {
-        name: _round_to_elements(size, scene.fitted_element_size(name))
+        name: _fitted_size(scene, name, size, models[name].gel_thickness)
         for name, size in sizes.items()
         if name not in fixed
     }
@@ -68,17 +69,22 @@ def fit_gel(
     groups = [list(wanted)] if shared else [[name] for name in wanted]
     for names in reversed(groups):
         name, origin_text = names[0], "; ".join(origins[name] for name in names)
-        x, y = wanted[name]
-        thickness, element = scene.gel_of(name).size[2], scene.fitted_element_size(name)
-        scene = _set_gel_size(scene, "gel" if shared else f"gels.{name}", (x, y, thickness), origin_text)
+        x, y, thickness = wanted[name]
+        element = scene.fitted_element_size(name, thickness)
+        scene = _set_gel_size(scene, "gel" if shared else f"gels.{name}", wanted[name], origin_text)
         words = f"gel {millimetres(x, y)} in whole elements of {element * 1e3:.3g} mm, {thickness * 1e3:.3g} mm thick"
-        notes.insert(0, f"{words}: {origin_text}; the thickness is the scene's")
+        source = "scene" if models[name].gel_thickness is None else "sensor"
+        notes.insert(0, f"{words}: {origin_text}; the thickness is the {source}'s")
     return scene, notes
 
 
-def _round_to_elements(size: tuple[float, float], element: float) -> tuple[float, float]:
+def _fitted_size(
+    scene: Scene, name: str, size: tuple[float, float], thickness: float | None
+) -> tuple[float, float, float]:
+    """x, y in whole elements and thickness of the gel of a sensor; None: the scene's thickness."""
+    element = scene.fitted_element_size(name, thickness)
     x, y = (max(2, round(side / element)) * element for side in size)
-    return x, y
+    return x, y, scene.gel_of(name).size[2] if thickness is None else thickness
 
 
 def _set_gel_size(scene: Scene, key: str, size: tuple[float, ...], reason: str) -> Scene:

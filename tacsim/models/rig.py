@@ -76,7 +76,8 @@ class SimSensorConfig(SensorConfig):
         return self.model
 
     def without_gel_size(self) -> Self:
-        return self.model_copy(update={"model": self.model.model_copy(update={"gel_size": None})})
+        model = self.model.model_copy(update={"gel_size": None, "gel_thickness": None})
+        return self.model_copy(update={"model": model})
 
 
 class ReplaySensorConfig(SensorConfig):

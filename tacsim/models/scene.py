@@ -347,9 +347,9 @@ class Scene(Config):
         own = self.gels.get(cast(SensorName, sensor))
         return self.effective_element_size if own is None or own.element_size is None else own.element_size
 
-    def fitted_element_size(self, sensor: str) -> float:
-        """The same as the gel's thickness allows: whole layers, two at least [m]."""
-        thickness = self.gel_of(sensor).size[2]
+    def fitted_element_size(self, sensor: str, thickness: float | None = None) -> float:
+        """The same as the gel's thickness allows: whole layers, two at least [m]. `thickness` [m]: another one."""
+        thickness = self.gel_of(sensor).size[2] if thickness is None else thickness
         return thickness / max(2, round(thickness / self.element_size_of(sensor)))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Any, Self
 
 import numpy as np
@@ -10,7 +11,7 @@ from pydantic import Discriminator, Field, Tag, model_validator
 from tacsim.interface import FloatArray
 from tacsim.models.geometry import GelView
 from tacsim.models.geometry import SensorGeometry as SensorGeometry
-from tacsim.models.photometric import DarknessModel, PhotometricModel
+from tacsim.models.photometric import DarknessModel, PhotometricModel, Weight
 from tacsim.models.quantity import Config, Length
 
 Side = Annotated[Length, Field(gt=0)]
@@ -21,12 +22,30 @@ Correlation = Annotated[float, Field(ge=-1, le=1)]
 Neighbour = Annotated[float, Field(ge=-0.95, le=0.95)]
 
 
-def _colour_or_picture(value: Any) -> str:
-    return "picture" if isinstance(value, str) else "colour"
+class BackgroundPolynomial(Config):
+    """The colour of an untouched gel as a polynomial in the place u, v, each from -1/2 to 1/2 across the image."""
+
+    degree: Annotated[int, Field(ge=0, le=8)]
+    # Of R, G, B, 1 is white; one row a term: 1, u, v, u^2, u v, v^2, u^3, ... up to `degree`.
+    weights: tuple[tuple[Weight, Weight, Weight], ...]
+
+    @model_validator(mode="after")
+    def _require_weight_count(self) -> Self:
+        wanted = math.comb(self.degree + 2, 2)
+        if len(self.weights) != wanted:
+            raise ValueError(f"weights has {len(self.weights)} rows; a polynomial of degree {self.degree} has {wanted}")
+        return self
+
+
+def _background_kind(value: Any) -> str:
+    if isinstance(value, str):
+        return "picture"
+    return "polynomial" if isinstance(value, (dict, BackgroundPolynomial)) else "colour"
 
 
 Background = Annotated[
-    Annotated[Rgb, Tag("colour")] | Annotated[str, Tag("picture")], Discriminator(_colour_or_picture)
+    Annotated[Rgb, Tag("colour")] | Annotated[str, Tag("picture")] | Annotated[BackgroundPolynomial, Tag("polynomial")],
+    Discriminator(_background_kind),
 ]
 
 
@@ -65,7 +84,8 @@ class Lighting(Config):
     lights: tuple[Light, ...] = Field(default=THREE_LIGHTS, max_length=64)
     ambient: Channel = 0.0  # grey level of unlit gel; only without a background
     shininess: Annotated[float, Field(ge=1, le=1000)] = 10.0
-    background: Background | None = (0.42, 0.44, 0.46)  # colour of the untouched gel, or the path of a picture
+    # of the untouched gel: a colour, a polynomial, or the path of a picture
+    background: Background | None = (0.42, 0.44, 0.46)
 
     @model_validator(mode="after")
     def _require_one_base(self) -> Self:
@@ -119,6 +139,7 @@ class SensorModel(Config):
     name: str = "ideal"
     geometry: SensorGeometry = SensorGeometry()
     gel_size: tuple[Side, Side] | None = None  # x, y of its gel; a rig's scene takes it [m]; None: the scene's
+    gel_thickness: Side | None = None  # of the same gel [m]; None: the scene's
     lighting: Lighting = Lighting()
     # Calibrated on a real sensor: takes the place of the lights; the background stays that of `lighting`.
     photometric: PhotometricModel | None = None
@@ -145,6 +166,8 @@ class SensorModel(Config):
 
     @model_validator(mode="after")
     def _parts_agree(self) -> Self:
+        if self.gel_thickness is not None and self.gel_size is None:
+            raise ValueError("gel_thickness is given without gel_size; give both, or neither")
         if self.view is not None and self.view.geometry != self.geometry:
             raise ValueError(f"geometry is {self.geometry}, its view gives {self.view.geometry}")
         if self.markers is not None and self.markers.in_background:

@@ -23,9 +23,17 @@ from numpy.typing import NDArray
 
 from tacsim.interface import Float32, Mask
 from tacsim.models.geometry import GelView
-from tacsim.models.photometric import CastShadows, DarknessModel, PhotometricLight, horizon_slope, image_grid_places
+from tacsim.models.photometric import (
+    CastShadows,
+    DarknessModel,
+    PhotometricLight,
+    horizon_slope,
+    image_axes,
+    image_grid_places,
+    position_terms,
+)
 from tacsim.models.scene import GelSurface
-from tacsim.models.sensor import Lighting, SensorModel
+from tacsim.models.sensor import BackgroundPolynomial, Lighting, SensorModel
 from tacsim.optics.grid import PixelGrid, image_grid, image_strips
 from tacsim.optics.ink import separate_ink, separate_skin
 from tacsim.optics.markers import marker_transmission, require_dots_on_gel
@@ -279,6 +287,8 @@ def unlit_image(lighting: Lighting, shape: tuple[int, int]) -> Float32:
         return np.full((*shape, 3), lighting.ambient, dtype=np.float32)
     if isinstance(lighting.background, str):
         background = read_background(lighting.background, shape)
+    elif isinstance(lighting.background, BackgroundPolynomial):
+        background = polynomial_image(lighting.background, shape)
     else:
         background = np.broadcast_to(np.array(lighting.background, dtype=np.float32), (*shape, 3))
     flat = phong_shading(np.zeros((1, 1, 2), dtype=np.float32), lighting)
@@ -290,6 +300,13 @@ def untouched_image(lighting: Lighting, shape: tuple[int, int]) -> Float32:
     flat = phong_shading(np.zeros((1, 1, 2), dtype=np.float32), lighting)
     untouched: Float32 = np.clip(unlit_image(lighting, shape) + flat, 0.0, 1.0)
     return untouched
+
+
+def polynomial_image(background: BackgroundPolynomial, shape: tuple[int, int]) -> Float32:
+    """(H, W, 3) RGB, 1 is white, not limited to 0..1."""
+    u, v = np.meshgrid(*image_axes(shape[1], shape[0]))
+    terms = position_terms(u, v, background.degree)
+    return np.einsum("thw,tc->hwc", terms, np.array(background.weights), optimize=True).astype(np.float32)
 
 
 def read_background(path: str, shape: tuple[int, int]) -> Float32:

@@ -3,8 +3,9 @@ import numpy as np
 import pytest
 
 from calibration.frame_normaliser import FrameNormaliser, NoReference
-from calibration.normaliser import normaliser_for_recording, normaliser_for_simulation
+from calibration.normaliser import normaliser_for_pictures, normaliser_for_recording, normaliser_for_simulation
 from calibration.reference import UnusableReference
+from tacsim.config import load_sensor
 from tacsim.control.contact_signal import contact_signal
 from tacsim.interface import SurfaceMap, TactileFrame
 from tacsim.models.rig import ReplaySensorConfig
@@ -174,3 +175,18 @@ def test_glare_is_refused_where_colour_is_measured_and_not_where_dots_alone_are_
     flow = normalise(TactileFrame(image=slid, time=0.1, index=1), now=0.1).flow
     assert flow is not None and normalise.visible_markers is not None and normalise.visible_markers.all()
     np.testing.assert_allclose(flow, np.broadcast_to((0.15e-3, 0.0), flow.shape), atol=0.01e-3)
+
+
+@pytest.mark.parametrize("name", ["digit", "gelsight-mini", "gelsight-wedge", "9dtact"])
+def test_pictures_of_a_shipped_sensor_give_its_height(name: str) -> None:
+    """The inverse of a calibrated light is made from its forward model where there is no bundle."""
+    model, surface = load_sensor(name), dent(centre=(1e-3, 0.5e-3))
+    model = model.model_copy(update={"texture": 0.0})
+    normalise, render = normaliser_for_pictures(model, GEL, GRID), Renderer(model, GEL)
+    normalise.take_reference(_frame(render(flat())))
+    found = normalise(_frame(render(surface), time=2.1), 2.1).height
+    true = surface_map(surface, GRID, None).height
+    assert found is not None and true is not None
+    assert found.max() == pytest.approx(true.max(), rel=0.06)
+    seen = true > 0.1e-3
+    assert np.sqrt(np.mean((found[seen] - true[seen]) ** 2)) < 0.08 * true.max()

@@ -212,7 +212,7 @@ def test_gel_has_sensor_size_in_whole_elements(finger: Path) -> None:
     assert scene is not None and scene.gel.size == pytest.approx((16e-3, 12e-3, 4e-3))  # 15.6 x 12.35 mm
     assert loaded.config.task is not None and loaded.config.task.scene == scene
     (note,) = loaded.notes
-    assert "gel 16 x 12 mm in whole elements of 1 mm" in note and "15.6 x 12.35 mm by the calibration of gs-7" in note
+    assert "gel 16 x 12 mm in whole elements of 1 mm" in note and "15.6 x 12.35 mm by the model of gs-7" in note
     fine = load_rig("sim", overrides=["sensors.lower.model=finger", "scene.preset=standard"]).config.scene
     assert fine is not None and fine.gel.size == pytest.approx((15.5e-3, 12.5e-3, 4e-3))
     said = load_rig("sim", overrides=["sensors.lower.model=finger", "scene.gel.size=[20 mm, 20 mm, 4 mm]"])

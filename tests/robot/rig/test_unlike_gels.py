@@ -35,12 +35,13 @@ sensors:
   lower:
     driver: sim
     arm: lower
-    model: {extends: gelsight-mini, gel_size: [20.3 mm, 15.2 mm],
+    model: {extends: gelsight-mini, gel_size: [20.3 mm, 15.2 mm], gel_thickness: null,
             geometry: {width: 80, height: 60, pixel_pitch: 0.3 mm}}
   upper:
     driver: sim
     arm: upper
-    model: {extends: digit, gel_size: [18.8 mm, 25 mm], geometry: {width: 60, height: 80, pixel_pitch: 0.35 mm}}
+    model: {extends: digit, gel_size: [18.8 mm, 25 mm], gel_thickness: null,
+            geometry: {width: 60, height: 80, pixel_pitch: 0.35 mm}}
 canonical: {rows: 32, columns: 32, pitch: 1 mm, image_scale: 1}
 """
 

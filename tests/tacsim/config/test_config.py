@@ -56,14 +56,15 @@ def test_every_shipped_sensor_loads(name: str) -> None:
     assert load_sensor(name).name == name
 
 
-@pytest.mark.parametrize("name", ["digit", "gelsight-mini", "gelsight-wedge"])
-def test_geometries_like_known_sensors_name_their_public_source(name: str) -> None:
+@pytest.mark.parametrize("name", ["digit", "gelsight-mini", "gelsight-wedge", "9dtact"])
+def test_sensors_that_exist_have_a_gel_of_their_own_and_name_their_public_sources(name: str) -> None:
     sensor = load_sensor(name)
-    assert "github.com" in sensor.source and "calibrate it" in sensor.source.replace(
-        "calibrate the sensor", "calibrate it"
-    )
-    shown = [1e3 * side * sensor.geometry.pixel_pitch for side in (sensor.geometry.width, sensor.geometry.height)]
-    assert all(10.0 < side < 30.0 for side in shown)  # a finger's gel [mm]
+    assert "github.com" in sensor.source and "`tacsim calibrate sensor`" in sensor.source
+    assert "licence" in sensor.source or "GPL" in sensor.source
+    assert sensor.gel_size is not None and sensor.gel_thickness is not None
+    sides = (sensor.geometry.width, sensor.geometry.height)
+    shown = [side * sensor.geometry.pixel_pitch for side in sides]
+    assert all(10e-3 < side <= own for side, own in zip(shown, sensor.gel_size, strict=True))  # a finger's gel [m]
 
 
 @pytest.mark.parametrize("name", shipped_names("material"))

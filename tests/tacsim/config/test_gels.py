@@ -57,8 +57,8 @@ def test_what_is_written_of_a_gel_means_the_same_again(folder: Path) -> None:
 def test_gels_are_as_large_as_their_own_sensors(folder: Path) -> None:
     """Two sensors with two sizes: each in whole elements of its own; one size alone is that of both, as ever."""
     mini, digit = (
-        "{extends: gelsight-mini, gel_size: [20.3 mm, 15.2 mm]}",
-        "{extends: digit, gel_size: [18.8 mm, 25 mm]}",
+        "{extends: gelsight-mini, gel_size: [20.3 mm, 15.2 mm], gel_thickness: null}",
+        "{extends: digit, gel_size: [18.8 mm, 25 mm], gel_thickness: null}",
     )
     models = [f"sensors.lower.model={mini}", f"sensors.upper.model={digit}"]
     thin = "scene.gels={upper: {size: [20 mm, 20 mm, 2 mm], element_size: 0.5 mm}}"

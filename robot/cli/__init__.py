@@ -35,6 +35,7 @@ from robot.cli.mock import mock
 from robot.cli.options import with_json_option
 from robot.cli.recordings import lerobot, recover, view
 from robot.cli.run import film, replay, run
+from robot.cli.serve import serve
 from robot.cli.simulate import debug, press, reproduce
 
 app = typer.Typer(
@@ -57,7 +58,7 @@ SEE, ROBOTS, CALIBRATE, LEARN, FILES, DEVELOP = (
 )
 HEADINGS = {  # of `tacsim --help`, with their commands, both in the order of the page
     SEE: (run, press, replay, film, view),
-    ROBOTS: (doctor, start, mock),
+    ROBOTS: (doctor, start, serve, mock),
     CALIBRATE: (compare,),
     LEARN: (train, evaluate, transfer),
     FILES: (list_, show, new, schema, recover),
@@ -72,7 +73,7 @@ GROUPS = {
 
 
 # No result, a result that is JSON anyway, and two commands whose --json names a file
-WITHOUT_JSON_OPTION = (mock, schema, bench, evaluate)
+WITHOUT_JSON_OPTION = (mock, serve, schema, bench, evaluate)
 
 
 def _add_command(group: typer.Typer, command: Callable[..., None], heading: str | None = None) -> None:

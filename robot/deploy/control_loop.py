@@ -71,7 +71,7 @@ def run_episode(
     rig: Rig,
     policy: Policy,
     task: Task | None,
-    steps: int,
+    steps: int | None,
     *,
     setup: EpisodeSetup = EpisodeSetup(),
     recorder: Callable[[EpisodeMeta], StepRecorder] | None = None,
@@ -79,11 +79,11 @@ def run_episode(
     watch: Callable[[Step, Observation, Truth | None], None] | None = None,
     stop: Callable[[], bool] = lambda: False,
 ) -> Episode:
-    """Resets rig and policy, then runs exactly `steps` control steps; fewer only at the end of a replayed recording, if
-    `stop` returns True, or on Ctrl-C. Step 0 of the episode is the state after reset. If the rig knows the truth of the
-    body, its task judges by that. If the sensors measure enough, `Step.info` also has the distance estimated from touch
-    alone (`felt_distance`). For a learned policy it has `training_distance`: above 1 the observation is outside the
-    range of its training.
+    """Resets rig and policy, then runs exactly `steps` control steps (None: until it is stopped); fewer only at the end
+    of a replayed recording, if `stop` returns True, or on Ctrl-C. Step 0 of the episode is the state after reset. If
+    the rig knows the truth of the body, its task judges by that. If the sensors measure enough, `Step.info` also has
+    the distance estimated from touch alone (`felt_distance`). For a learned policy it has `training_distance`: above 1
+    the observation is outside the range of its training.
 
     With a recorder the steps of the episode are read from its file on access, so a long episode needs no memory.
     Without one they are stored in memory, with their pictures.
@@ -99,7 +99,7 @@ def run_episode(
         GoalOutOfReach: no policy could bring this body to the task's goal; only the reset was done.
         EpisodeFailed: policy, rig or recorder failed; the arms are stopped, the exception has the episode.
     """
-    if steps < 0:
+    if steps is not None and steps < 0:
         raise ValueError(f"steps must be 0 or more, got {steps}")
     require_fit(rig.name, rig.spec, policy, setup.policy, task)
     started = time.perf_counter()
@@ -125,7 +125,7 @@ def run_episode(
     try:
         policy.reset()
         add_step(observation, None, {}, {})
-        while log.count <= steps and not stop():
+        while (steps is None or log.count <= steps) and not stop():
             started = time.perf_counter()
             is_in_policy = True
             action = policy(observation)
@@ -140,7 +140,8 @@ def run_episode(
         reason = f"{type(failure).__name__}: {failure}"
         if is_in_policy:
             reason = f"policy '{setup.policy}' raised {reason}; the arms hold. Correct it, and test it in simulation"
-        raise EpisodeFailed(f"episode ended after {steps_done} of {steps} steps: {reason}", log.episode) from failure
+        count = f"{steps_done} steps" if steps is None else f"{steps_done} of {steps} steps"
+        raise EpisodeFailed(f"episode ended after {count}: {reason}", log.episode) from failure
     finally:
         rig.stop()
         log.flush()

@@ -80,6 +80,7 @@ def _find_shipped_policy(task: Task | None) -> Path:
 
 def training_info(policy: Policy) -> dict[str, float]:
     """Entries of `Step.info`: last observation of a learned policy against its training range; else empty."""
+    policy = getattr(policy, "inner", policy)  # of one that an operator may pause (robot.serve)
     if not isinstance(policy, OnnxPolicy):
         return {}
     return (

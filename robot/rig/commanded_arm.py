@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Mapping
 
@@ -9,6 +10,10 @@ from robot.errors import DeviceError
 from tacsim import pose as se3
 from tacsim.interface import ArmState, HardwareArm, Pose
 from tacsim.limits import ActionError
+
+
+class ArmHalted(DeviceError):
+    """A command for an arm that was halted and does not accept commands yet."""
 
 
 class CommandedArm:
@@ -21,6 +26,8 @@ class CommandedArm:
         self.driver, self._dry_run = driver, dry_run
         self.target: Pose | None = None
         self.limits_hit = 0  # targets that were shortened or refused
+        self._gate = threading.Lock()  # held while a command is sent, so that none follows a halt
+        self._is_halted = False
 
     def state(self, at: float | None = None) -> ArmState:
         """Raises DeviceError for a time without a recorded state."""
@@ -41,15 +48,41 @@ class CommandedArm:
 
     def send(self, target: Pose | None, speed: float | None = None) -> Pose | None:
         """`command` for motions of a reset, at most at `speed` [m/s]; limited targets are not counted."""
-        self.target = self.driver.command(target, speed)
-        return self.target
+        self._require_not_halted()  # at once, also while the driver takes long to stop
+        with self._gate:
+            self._require_not_halted()
+            self.target = self.driver.command(target, speed)
+            return self.target
+
+    def _require_not_halted(self) -> None:
+        if self._is_halted:
+            raise ArmHalted("the operator has stopped the arm; start again")
+
+    def refuse_commands(self) -> None:
+        """Until `accept_commands` every command that begins from now on raises ArmHalted. Waits for nothing."""
+        self._is_halted = True
+
+    def halt(self) -> None:
+        """Refuses commands, waits for one that is being sent, then brakes the arm to rest. In any thread."""
+        self.refuse_commands()
+        with self._gate:
+            self.stop()
+
+    def accept_commands(self) -> None:
+        """Ends `halt`. Moves nothing."""
+        self._is_halted = False
+
+    @property
+    def is_halted(self) -> bool:
+        """Commands are refused."""
+        return self._is_halted
 
     def advance(self) -> bool:
         """Repeats the last command before it times out; returns True once the arm rests at its target."""
         if self.at_target():
             return True
         if self.target is not None:
-            self.driver.command(self.target)
+            self.send(self.target)
         return False
 
     def at_target(self) -> bool:

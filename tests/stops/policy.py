@@ -11,6 +11,7 @@ import sys
 import time
 
 from robot.arm.ur import URArm
+from robot.errors import LinkLost
 from tacsim.interface import Pose
 from tacsim.models.hardware import UrArmConfig
 
@@ -19,8 +20,19 @@ def say(**words: object) -> None:
     print(json.dumps({"time": time.monotonic(), **words}), flush=True)
 
 
+def connect(config: UrArmConfig, tries: int = 5) -> URArm:
+    """A machine that stands still for longer than link_timeout looks like a lost link. Opening is tested elsewhere."""
+    for left in reversed(range(tries)):
+        try:
+            return URArm(config, "observed")
+        except LinkLost:
+            if not left:
+                raise
+    raise AssertionError("unreachable")
+
+
 def main(config: str, x: str) -> None:
-    with URArm(UrArmConfig.model_validate_json(config), "observed") as arm:
+    with connect(UrArmConfig.model_validate_json(config)) as arm:
         start = arm.state().pose
         target = Pose(start.position + [float(x), 0.0, 0.0], start.quaternion)
         assert arm.worker is not None

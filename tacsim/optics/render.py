@@ -306,7 +306,8 @@ def polynomial_image(background: BackgroundPolynomial, shape: tuple[int, int]) -
     """(H, W, 3) RGB, 1 is white, not limited to 0..1."""
     u, v = np.meshgrid(*image_axes(shape[1], shape[0]))
     terms = position_terms(u, v, background.degree)
-    return np.einsum("thw,tc->hwc", terms, np.array(background.weights), optimize=True).astype(np.float32)
+    image = np.einsum("thw,tc->hwc", terms, np.array(background.weights), optimize=True)
+    return np.asarray(image, dtype=np.float32)
 
 
 def read_background(path: str, shape: tuple[int, int]) -> Float32:

@@ -160,7 +160,7 @@ def press(
         notes.print(f"warning: not settled, {config['unfollowed'] or f'{held}; raise settling.max_substeps'}")
     written = sorted(folder.iterdir())
     print_files(*written)
-    print_json(config, written)
+    print_json({**config, "force_curve": curve}, written)
 
 
 def _orientation_overrides(down: str | None, rotation: tuple[float, ...] | None) -> list[str]:

@@ -69,7 +69,7 @@ def _estimate_gel(folder: Path, of: BallSet, reference: Image) -> tuple[float, f
     fit, _, _ = balls.calibrated(folder, of)
     thickness = float(np.clip(fit.thickness * of.pixel_pitch, *THICKNESS))
     across, down = (round(length * of.pixel_pitch, 3) for length in (reference.shape[1], reference.shape[0]))
-    return across, down, round(thickness, 4)
+    return across, down, round(thickness / ELEMENT) * ELEMENT
 
 
 def _rows(

@@ -203,7 +203,7 @@ def test_text_of_a_wrong_override(override: str, message: str) -> None:
 def test_a_file_that_is_not_there_lists_the_names() -> None:
     assert (
         complaint(load_rig, "simm")
-        == "simm: no rig 'simm'; allowed: mock, press, replay, sim, ur5e, ur5e-one; did you mean 'sim'?"
+        == "simm: no rig 'simm'; allowed: mock, press, replay, sim, stand, ur5e, ur5e-one; did you mean 'sim'?"
     )
     assert complaint(load_rig, "my/rig.yaml") == "my/rig.yaml: there is no file 'my/rig.yaml'"
     wrong_task = complaint(load_rig, "sim", task="sqeeze")

@@ -115,7 +115,7 @@ def test_the_map_fits_any_canonical_grid(rows: int, columns: int) -> None:
 
 
 def test_the_error_of_each_preset_is_that_of_the_physics_page() -> None:
-    page = (ROOT / "docs" / "physics.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "physics-body.md").read_text(encoding="utf-8")
     table = page.partition("| closed by | 1 mm | 2 mm | 3 mm |")[2].partition("\n\n")[0]
     for preset, (least, greatest) in PRESET_FORCE_ERROR.items():
         (row,) = re.findall(rf"^\| `?{preset}`? \|(.*)\|$", table, re.MULTILINE)

@@ -72,7 +72,19 @@ def said(done: subprocess.CompletedProcess[str]) -> str:
 @pytest.mark.slow
 def test_outside_drivers_pass_the_contract_suite(site: Path, tmp_path: Path) -> None:
     rig = write_rig(tmp_path, signal="null")
-    suite: Sequence[str] = ("-m", "pytest", "-q", "-p", "no:cacheprovider", "-n", "0", "-m", "not deep", "-k", "hardware")
+    suite: Sequence[str] = (
+        "-m",
+        "pytest",
+        "-q",
+        "-p",
+        "no:cacheprovider",
+        "-n",
+        "0",
+        "-m",
+        "not deep",
+        "-k",
+        "hardware",
+    )
     done = python(site, ROOT, *suite, str(HERE / "test_contract.py"), TACSIM_CONTRACT_RIG=str(rig))
     assert done.returncode == 0, said(done)
     assert "14 passed" in done.stdout, done.stdout

@@ -7,6 +7,7 @@ import pytest
 from benchmarks.cases import environments
 
 
+@pytest.mark.slow
 def test_random_actions_are_those_of_one_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     for name, value in {"NUMBER": 2, "STEPS": 1, "ROUNDS": 2, "BODIES": environments.BODIES[:2]}.items():
         monkeypatch.setattr(environments, name, value)

@@ -27,6 +27,7 @@ def report() -> Report:
     return Report.model_validate_json(REFERENCE.read_bytes())
 
 
+@pytest.mark.slow
 def test_the_published_pages_are_those_of_the_published_reports(report: Report) -> None:
     gpus = [Report.model_validate_json(p.read_bytes()) for p in sorted((ROOT / "benchmarks" / "gpu").glob("*.json"))]
     robot = Report.model_validate_json((ROOT / "benchmarks" / "reliability.json").read_bytes())
@@ -108,6 +109,7 @@ def test_the_picture_of_figures_shows_how_many_met_their_requirement(tmp_path: P
     assert abs(shown[0] - shown[1]).max() > 0.1
 
 
+@pytest.mark.slow
 def test_a_failure_is_shown_and_is_the_exit_code(tmp_path: Path, report: Report) -> None:
     failure = {"group": "press", "case": "lost", "method": "tacsim", "resolution": "h", "cause": "it broke | here"}
     broken = json.loads(report.model_dump_json()) | {"failures": [failure]}

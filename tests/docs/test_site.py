@@ -71,6 +71,7 @@ def test_readme_is_one_screen() -> None:
     assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 120
 
 
+@pytest.mark.slow
 def test_names_of_generated_pages_are_those_that_are_made(made: dict[str, str]) -> None:
     assert list(made) == generated_names()
     assert all(text.startswith("# ") for text in made.values())

@@ -135,6 +135,7 @@ def test_what_has_the_wrong_shape_is_no_target(bad: object) -> None:
     assert not finite_targets(bad).any()  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_many_hostile_targets_are_refused_or_shortened_into_the_box() -> None:
     """What is admitted ends in the box, on the straight way."""
     now = Pose(np.array([0.05, 0.0, 0.15]))
@@ -151,6 +152,7 @@ def test_many_hostile_targets_are_refused_or_shortened_into_the_box() -> None:
     assert shortened > 1_000
 
 
+@pytest.mark.slow
 @pytest.mark.promise(1)
 def test_a_million_hostile_ways_end_inside(figure: Record) -> None:
     rows = hostile(1_000_000, seed=2)

@@ -171,6 +171,7 @@ def test_dirt_is_no_marker() -> None:
     assert np.median(np.linalg.norm(found - true, axis=2)) < 5e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("jump", [1.5, 2.0])
 def test_a_jump_in_time_and_place_keeps_who_is_who(jump: float) -> None:
     """All dots 1.5 pitches on, 50 frames later; those that left the picture are lost, none is taken for another."""
@@ -184,6 +185,7 @@ def test_a_jump_in_time_and_place_keeps_who_is_who(jump: float) -> None:
     assert flow.visible_share == 1.0
 
 
+@pytest.mark.slow
 def test_a_fresh_reference_is_rest() -> None:
     flow, rest = plain_flow(), rest_positions(MARKERS)
     flow.take_reference(draw(in_pixels(rest), 4.0))

@@ -104,6 +104,7 @@ def test_servo_rising_slider_keeps_limits_of_fast_arm(low: float) -> None:
     assert max(shares(arm, begin)) <= MARGIN
 
 
+@pytest.mark.slow
 @pytest.mark.promise(2)
 @pytest.mark.parametrize("seed", range(2))
 def test_servo_random_slider_keeps_limits(seed: int) -> None:

@@ -151,6 +151,7 @@ def test_describe_error_returns_exit_codes() -> None:
     assert "no room" in describe_error(ExceptionGroup("two", [OSError("no room"), EpisodeError("bad")]))[0]
 
 
+@pytest.mark.slow
 def test_missing_working_folder_is_reported() -> None:
     code = (
         "import os, tempfile; os.chdir(tempfile.mkdtemp()); os.rmdir(os.getcwd()); from robot.cli import main; main()"
@@ -228,6 +229,7 @@ def test_command_names_another_package_robot(tmp_path: Path) -> None:
     assert "pip uninstall -y robotframework" in done.stderr and "Traceback" not in done.stderr
 
 
+@pytest.mark.slow
 def test_press_repairs_and_measures_an_open_mesh_in_metres(tmp_path: Path) -> None:
     import trimesh
 

@@ -65,6 +65,7 @@ def test_values_without_a_json_number_become_null(capsys: pytest.CaptureFixture[
     assert out.isascii() and "\x1b" not in out
 
 
+@pytest.mark.slow
 def test_episode_its_report_and_its_recovery(tmp_path: Path) -> None:
     ran = document("run", *TINY, "--steps", "1", "--out", "first")
     assert ran["summary"]["task"] == "squeeze" and ran["summary"]["step"] == [1]

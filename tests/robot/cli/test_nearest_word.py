@@ -11,6 +11,7 @@ from tests.robot.cli.invoked import TINY, tacsim, told
 pytestmark = pytest.mark.usefixtures("empty_folder")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("command", "nearest"),
     [
@@ -60,10 +61,11 @@ def test_the_nearest_word_is_offered(command: str, nearest: str, tmp_path: Path)
 
 
 @pytest.mark.parametrize(
-    ("policy", "right"), [("scriptd", "scripted"), ("lerned", "learned"), ("mine:atc", "act"), ("mine:Pol.mak", None)]
+    ("policy", "right"),
+    [("scriptd", "scripted"), ("lerned", "learned"), ("nearby:atc", "act"), ("nearby:Pol.mak", None)],
 )
 def test_a_policy_of_a_run(tmp_path: Path, policy: str, right: str | None) -> None:
-    (tmp_path / "mine.py").write_text("def act(observation): ...\nclass Pol: ...\n")
+    (tmp_path / "nearby.py").write_text("def act(observation): ...\nclass Pol: ...\n")
     done = tacsim("run", "--policy", policy, *TINY)
     assert done.exit_code == 2
     assert right is None or f"did you mean '{right}'?" in done.stderr

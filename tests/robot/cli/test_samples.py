@@ -17,6 +17,7 @@ from tests.robot.cli.invoked import tacsim
 pytestmark = pytest.mark.usefixtures("empty_folder")
 
 
+@pytest.mark.slow
 def test_samples_are_calibrated_and_compared_by_the_commands_that_are_printed() -> None:
     drawn = tacsim("collect", "samples", "--out", "s")
     assert drawn.exit_code == 0, drawn.output
@@ -45,6 +46,7 @@ def test_samples_are_calibrated_and_compared_by_the_commands_that_are_printed() 
     assert again.exit_code == 2 and "s exists already" in again.output
 
 
+@pytest.mark.slow
 def test_samples_are_the_same_each_time(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("robot.studies.sample_presses.PRESSES", PRESSES[:1])
     for name in ("a", "b"):

@@ -203,6 +203,7 @@ def test_run_episode_records_steps_meta_and_references() -> None:
     assert {"python", "numpy"} <= set(meta.versions)
 
 
+@pytest.mark.slow
 def test_run_episode_with_recorder_keeps_no_picture_in_memory(tmp_path: Path) -> None:
     """Of 200 steps only those that still wait for the disk may be there; each is read again on access."""
     pictures: list[weakref.ref[Any]] = []

@@ -76,6 +76,7 @@ def test_hertz_cell_ball_through_gel_is_refused(cell: HertzCell) -> None:
         cell.move(pressed(4e-3))
 
 
+@pytest.mark.slow
 def test_hertz_cell_process_reports_errors() -> None:
     scene = load_rig("mock").config.scene
     assert scene is not None

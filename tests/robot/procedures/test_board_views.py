@@ -97,6 +97,7 @@ def test_board_views_unusable_view_is_skipped_with_reason(move: Move, why: str) 
     np.testing.assert_array_equal(record.measurements[1][1], views(3)[2])
 
 
+@pytest.mark.slow
 def test_board_views_on_gel_takes_one_view_with_reference() -> None:
     faint = np.clip(128 + 0.1 * (views(1)[0].astype(float) - 128), 0, 255).astype(np.uint8)
     person = Person([faint])

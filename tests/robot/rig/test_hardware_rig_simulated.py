@@ -73,6 +73,7 @@ def test_mock_rig_reset_ends_in_touch_with_truth(simulated: Opened) -> None:
         assert observation.arms[name].pose.position == pytest.approx(pose.position, abs=5e-6)
 
 
+@pytest.mark.slow
 def test_mock_rig_approach_without_touch_returns_to_start(simulated: Opened) -> None:
     reset = simulated.rig._reset
     config = reset._config  # type: ignore[attr-defined]

@@ -107,6 +107,7 @@ def test_mock_cell_process_has_both_gels(rig_file: Path) -> None:
         ball.move({"upper": moved(ball.poses()["upper"], -2e-3)})
 
 
+@pytest.mark.slow
 def test_dump_contains_both_gels(rig_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TACSIM_DUMPS", str(rig_file.parent / "dumps"))
     scene = load_rig(rig_file).config.scene

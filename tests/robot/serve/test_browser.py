@@ -47,6 +47,7 @@ def until_moved(browser: Browser, before: float) -> None:
     browser.until(f"Math.abs(state.arms.upper.position[0] - {before}) > 1e-4")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("width", "height"), SIZES)
 def test_page_operates_the_rig(served: Served, tmp_path: Path, width: int, height: int) -> None:
     assert PROGRAM is not None
@@ -78,6 +79,7 @@ def test_page_operates_the_rig(served: Served, tmp_path: Path, width: int, heigh
         assert browser.messages == []
 
 
+@pytest.mark.slow
 def test_a_policy_is_started_stopped_and_its_recording_kept(served: Served, tmp_path: Path) -> None:
     assert PROGRAM is not None
     with Browser(PROGRAM, tmp_path / "profile", 1280, 800) as browser:
@@ -96,6 +98,7 @@ def test_a_policy_is_started_stopped_and_its_recording_kept(served: Served, tmp_
         assert browser.messages == []
 
 
+@pytest.mark.slow
 def test_a_hostile_page_moves_nothing(served: Served, tmp_path: Path) -> None:
     """A page of another origin, in the browser of the operator; it even knows the token."""
     assert PROGRAM is not None

@@ -77,6 +77,7 @@ def joint_speed(arm: FaultClient) -> float:
     return float(np.abs(arm.state().joint_speeds).max())
 
 
+@pytest.mark.slow
 def test_page_is_served_and_shows_pictures(served: Served, page: Page) -> None:
     status, text = served.ask("GET", "/", token="")
     assert status == 200 and "STOP" in text and "/page/live.js" in text
@@ -120,6 +121,7 @@ def test_a_page_without_token_looks_and_keeps_no_motion_alive(served: Served, pa
     assert served.ask("GET", "/", token="")[0] == 200
 
 
+@pytest.mark.slow
 def test_motion_stops_when_the_page_is_lost(served: Served, page: Page, upper: FaultClient) -> None:
     with Page(served) as other:
         other.until_rest()
@@ -156,6 +158,7 @@ def test_a_jog_that_is_not_repeated_ends(served: Served, page: Page, upper: Faul
     assert page.until_rest()["words"] == "the motion by hand has ended"
 
 
+@pytest.mark.slow
 def test_teleoperation_moves_along_the_axes_of_the_sensor_within_limits(
     served: Served, page: Page, upper: FaultClient
 ) -> None:
@@ -172,6 +175,7 @@ def test_teleoperation_moves_along_the_axes_of_the_sensor_within_limits(
     assert page.view["phase"] == "running"
 
 
+@pytest.mark.slow
 def test_an_episode_is_paused_stepped_and_taken_over_by_hand(served: Served, page: Page) -> None:
     status, answer = served.post("/start", mode="paused", steps=3)
     assert status == 200, answer
@@ -186,6 +190,7 @@ def test_an_episode_is_paused_stepped_and_taken_over_by_hand(served: Served, pag
     assert page.until_rest()["words"] == "the episode has ended"
 
 
+@pytest.mark.slow
 def test_a_recording_is_kept_with_a_note_or_discarded(served: Served, page: Page) -> None:
     for keeps in (True, False):
         start_by_hand(served, page, record=True, seed=3)
@@ -208,6 +213,7 @@ def test_a_recording_is_kept_with_a_note_or_discarded(served: Served, page: Page
         assert served.post("/keep")[0] == 409
 
 
+@pytest.mark.slow
 def test_a_reference_is_taken_of_a_free_gel_only(served: Served, page: Page) -> None:
     start_by_hand(served, page)  # its reset approaches until the gels touch
     page.until(lambda view: view["sensors"]["upper"].get("signal", 0.0) > 0.01)
@@ -228,6 +234,7 @@ def test_a_reference_is_taken_of_a_free_gel_only(served: Served, page: Page) -> 
     assert page.until_rest()["words"] == "references taken"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("path", "body", "status"),
     [

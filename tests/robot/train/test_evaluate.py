@@ -58,6 +58,7 @@ def test_evaluate_teacher_beats_random_in_equal_episodes() -> None:
     assert other.episodes != random.episodes
 
 
+@pytest.mark.slow
 def test_evaluate_episodes_differ_from_training() -> None:
     drawn = training()
     ends = {seed: [each.distance for each in evaluate(drawn, ["teacher"], 4, seed)[0].episodes] for seed in (0, 1)}

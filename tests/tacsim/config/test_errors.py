@@ -126,6 +126,7 @@ def test_all_problems_are_listed_in_the_order_of_lines(folder: Path) -> None:
     ]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_thousands_of_problems_are_cut_short(folder: Path) -> None:
     (folder / "a.yaml").write_text("\n".join(f"key{i}: 1" for i in range(5000)))
     lines = complaint().splitlines()

@@ -54,6 +54,7 @@ def test_what_is_written_of_a_gel_means_the_same_again(folder: Path) -> None:
     assert other != load_scene("squeeze", ["gels={upper: {}}"])
 
 
+@pytest.mark.slow
 def test_gels_are_as_large_as_their_own_sensors(folder: Path) -> None:
     """Two sensors with two sizes: each in whole elements of its own; one size alone is that of both, as ever."""
     mini, digit = (

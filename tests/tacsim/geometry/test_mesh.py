@@ -12,6 +12,7 @@ from tacsim.geometry.mesh import make_surface, signed_distance, signed_distance_
 from tacsim.geometry.mesh_file import load_mesh
 
 
+@pytest.mark.slow
 def test_a_grid_that_the_surface_does_not_enter_has_the_distance_from_its_nearest_node(tmp_path: Path) -> None:
     """In a ball and beside it: the node that is nearest to the surface is exact, and none is too near."""
     trimesh.creation.icosphere(4, 8.0).export(tmp_path / "ball.stl")

@@ -63,6 +63,7 @@ def test_a_linear_field_comes_back_and_nothing_is_known_outside() -> None:
     assert (gradient == 0).all()
 
 
+@pytest.mark.slow
 def test_a_tile_is_the_same_whatever_it_is_laid_with(
     mesh: Mesh, tiled: TiledDistance, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -83,6 +84,7 @@ def test_a_tile_far_from_the_surface_is_all_inside(tmp_path: Path) -> None:
     assert values.max() < -3e-3
 
 
+@pytest.mark.slow
 def test_the_latest_tiles_of_all_meshes_are_kept_and_others_are_laid_again_alike(
     mesh: Mesh, tiled: TiledDistance, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -113,6 +115,7 @@ def test_a_grid_beyond_memory_is_refused(tiled: TiledDistance) -> None:
         tiled.values(np.zeros(3, int), np.full(3, 100))
 
 
+@pytest.mark.slow
 def test_a_tile_that_another_process_has_left_is_not_computed_again(
     mesh: Mesh, tiled: TiledDistance, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

@@ -88,6 +88,7 @@ def test_the_renderer_uses_it_in_place_of_the_lights() -> None:
     assert phong.clipped_share == 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("width", "spacing"), [(640, 1e-3), (640, 0.5e-3), (320, 0.5e-3), (160, 0.5e-3)])
 def test_light_is_within_half_a_grey_level_of_the_formula(width: int, spacing: float) -> None:
     """Of the polynomial written out term by term at every pixel in double precision, then blurred."""

@@ -69,6 +69,7 @@ def called() -> Iterator[MockUR]:
         yield mock
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=[] if name in QUICK else pytest.mark.deep) for name in CASES]
 )

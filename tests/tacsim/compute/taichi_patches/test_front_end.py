@@ -158,6 +158,7 @@ def test_the_lines_of_a_function_are_those_that_inspect_finds(tmp_path: Path, mo
         assert function_source(function) is None  # inspect is asked
 
 
+@pytest.mark.slow
 def test_modules_that_taichi_rarely_uses_are_imported_at_first_use() -> None:
     code = """
 import sys

@@ -91,6 +91,7 @@ def test_results_are_right_and_found_again_in_every_process(tmp_path: Path) -> N
         assert run(tmp_path, seed=seed) == first
 
 
+@pytest.mark.slow
 def test_another_body_of_a_function_is_another_kernel(tmp_path: Path) -> None:
     assert run(tmp_path)[0] == EXPECTED
     printed, kept = run(tmp_path, shift=2.0)

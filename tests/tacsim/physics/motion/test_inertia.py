@@ -75,6 +75,7 @@ def test_the_period_of_a_gel_converges_at_second_order_in_element_and_step() -> 
     assert errors[0] < 0.01
 
 
+@pytest.mark.slow
 def test_bounced_body_has_momentum_measured_by_gel() -> None:
     """Thrown at the lower gel, an elastic cube comes back; what it gained is the impulse of the contact force, and in
     the air it loses none of it."""

@@ -284,6 +284,7 @@ print(arrays.upload("state", host, ti.f32).to_numpy()[1, 2])
 """
 
 
+@pytest.mark.slow
 def test_only_changed_arrays_are_sent_to_device() -> None:
     done = subprocess.run([sys.executable, "-c", SENT], capture_output=True, text=True, timeout=SECONDS, check=True)
     words = done.stdout.split("\n")

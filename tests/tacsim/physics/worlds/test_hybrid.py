@@ -54,6 +54,7 @@ def test_forces_balance_and_point_into_the_gels(squeezed: HybridWorld) -> None:
     assert np.abs([*lower[:2], *upper[:2]]).max() < 5e-3 * abs(lower[2])
 
 
+@pytest.mark.slow
 @pytest.mark.cpu
 def test_what_an_earlier_grid_has_left_in_memory_moves_nothing() -> None:
     """The memory of the body's grid is used again by grids of other shapes, laid anew where the body has deformed."""

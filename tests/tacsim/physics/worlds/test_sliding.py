@@ -49,6 +49,7 @@ def test_a_slid_ball_is_dragged_by_all_its_friction_at_the_default_speed(
     assert slide(pressed_ball(friction, preset), 2e-3) == pytest.approx(ratio, rel=0.02)
 
 
+@pytest.mark.slow
 def test_a_steep_slide_in_two_is_one_and_nothing_shakes_apart() -> None:
     """At mu = 1.5 corners of elements get narrow after 1.6 mm; 1.302 and 1.656 at Mach 0.001. They shook apart, and a
     motion so retried ended at 1.60, one that came to rest again at 1.38."""
@@ -139,6 +140,7 @@ def test_what_has_edges_ends_a_slide_as_a_slow_one(shape: Shape, friction: float
     assert ratios[0] == pytest.approx(ratios[1], rel=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("shape", "friction", "by"),
     [
@@ -279,6 +281,7 @@ def test_catching_edge_is_reported_after_reversed_slide() -> None:
     assert w.move({"indenter": Pose(pose.position, pose.quaternion)}).settled
 
 
+@pytest.mark.slow
 def test_many_small_slides_that_come_as_far_have_not_settled_either() -> None:
     """How far it is from where it came to the gel counts, and a snapshot knows that; lifted, it begins anew."""
     w = pressed_ball(1.1, "draft")

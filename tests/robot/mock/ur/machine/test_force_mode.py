@@ -74,6 +74,7 @@ def test_force_mode_compliant_speed_is_limited(bench: Bench) -> None:
     np.testing.assert_allclose(bench.arm.twist, [0, 0, -0.03, 0, 0, 0], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_force_mode_on_spring_follows_differential_equation(bench: Bench) -> None:
     stiffness, force = 200.0, 10.0
     top = float(bench.arm.frame[2, 3])
@@ -88,6 +89,7 @@ def test_force_mode_on_spring_follows_differential_equation(bench: Bench) -> Non
         assert bench.machine.load.zeroed_wrench[2] == pytest.approx(force * (1 + share), rel=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stiffness", [1e3, 10e3, 50e3])
 def test_force_mode_reaches_desired_force(bench: Bench, stiffness: float) -> None:
     start = bench.arm.target_frame.copy()
@@ -122,6 +124,7 @@ MOTIONS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("motion", MOTIONS)
 def test_force_mode_other_axes_follow_motion_at_constant_force(bench: Bench, motion: str) -> None:
     """Sideways along a table, while it is pressed with 10 N."""
@@ -156,6 +159,7 @@ def test_force_mode_ignores_motion_along_compliant_axis(bench: Bench) -> None:
     assert bench.arm.frame[2, 3] == pytest.approx(z, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_force_mode_type_1_presses_towards_point(bench: Bench) -> None:
     """y of the task frame points from the TCP to the point, wherever the TCP is."""
     point = bench.arm.frame[:3, 3] + [0.2, 0.1, -0.1]

@@ -117,7 +117,7 @@ def relative_pose(a: Pose, b: Pose) -> Pose:
 
 
 def relative_position(a: Pose, b: Pose) -> FloatArray:
-    """(3,) `relative_pose(a, b).position` [m], in a fifth of its time."""
+    """(3,) `relative_pose(a, b).position` [m], without the rotation."""
     offset: FloatArray = (b.position - a.position) @ rotation_matrix(a)  # by the transposed matrix, its inverse
     return offset
 

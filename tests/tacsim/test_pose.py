@@ -150,3 +150,8 @@ def test_interpolation_divides_the_way(a: Pose, b: Pose, s: float) -> None:
     assert se3.pose_distance(a, at) == pytest.approx((s * metres, s * radians), abs=1e-6)
     assert se3.pose_distance(at, b) == pytest.approx(((1 - s) * metres, (1 - s) * radians), abs=1e-6)
     assert radians <= math.pi + 1e-9
+
+
+@given(poses, poses)
+def test_relative_position_is_that_of_the_relative_pose(a: Pose, b: Pose) -> None:
+    assert se3.relative_position(a, b) == pytest.approx(se3.relative_pose(a, b).position, abs=1e-12)

@@ -115,7 +115,7 @@ def test_no_stop_is_lost(tmp_path: Path, record_property: object) -> None:
 @pytest.mark.deep
 @pytest.mark.timeout(5400)
 def test_no_stop_of_many_is_lost(tmp_path: Path, record_property: object) -> None:
-    """The figure of docs/serve.md: `pytest -m deep -s tests/robot/serve/test_stops.py`, on an idle machine."""
+    """Prints its figures: `pytest -m deep -s tests/robot/serve/test_stops.py`, on an idle machine."""
     found, lost, unsuited = stop_and_judge(tmp_path, MANY, record_property)
     assert lost == 0 and len(found) == MANY - unsuited > MANY / 2
     assert statistics.median(found) < 0.1

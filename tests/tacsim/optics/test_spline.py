@@ -3,7 +3,13 @@ import pytest
 from scipy.ndimage import map_coordinates
 
 from tacsim.models.scene import GelSurface
-from tacsim.optics.spline import displacement_and_jacobian, line_matrices, refine_spline, spline_weights
+from tacsim.optics.spline import (
+    SplineTable,
+    displacement_and_jacobian,
+    line_matrices,
+    refine_spline,
+    spline_weights,
+)
 
 
 def _random_surface() -> GelSurface:
@@ -62,3 +68,15 @@ def test_what_is_refined_agrees_with_the_weights(points: int) -> None:
     of_values, of_slopes = line_matrices(np.arange(5 * points + 1) / points, nodes=6)
     np.testing.assert_allclose(value, of_values @ control, atol=1e-6)
     np.testing.assert_allclose(slope, of_slopes @ control, atol=1e-6)
+
+
+@pytest.mark.parametrize("size", [0.05, 0.3, 0.6, 1.5])
+def test_a_fold_is_found_as_by_the_determinant_of_the_surface(size: float) -> None:
+    """In lattice spacings of 1; 0.05 is decided by the control values alone, the others by the derivatives."""
+    rng, points = np.random.default_rng(4), 4
+    at = np.stack(np.meshgrid(np.arange(21) / points, np.arange(21) / points, indexing="ij"), axis=-1).reshape(-1, 2)
+    for _ in range(20):
+        control = rng.uniform(-size, size, (6, 6, 3)).astype(np.float32)
+        _, by_place = displacement_and_jacobian(GelSurface(control, 1.0, (0.0, 0.0)), at)
+        folds = float(np.linalg.det(np.eye(2) + by_place[:, :2]).min()) <= 0.0
+        assert SplineTable(control, 1.0, points).folded == folds

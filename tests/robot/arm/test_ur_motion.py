@@ -78,17 +78,16 @@ def test_state_twist_is_rate_of_pose(arm: URArm) -> None:
     turned = se3.compose(moved(start, x=0.05), se3.from_rotation_vector([0, 0, 0], [0.2, 0.0, 0.3]))
     go(arm, turned)
     states = arm.history()
-    checked = 0
+    speed_ratios = []
     for a, b, c in zip(states, states[1:], states[2:], strict=False):
         if 0.0 < c.time - a.time < 0.1 and float(np.linalg.norm(b.twist[:3])) > 0.02:
-            checked += 1
-            # Packages may be skipped or late, so the path is compared by direction, and the speed by its limits.
-            way = se3.pose_difference(a.pose, c.pose)
-            assert way[:3] @ b.twist[:3] > 0.9 * np.linalg.norm(way[:3]) * np.linalg.norm(b.twist[:3])
-            assert way[3:] @ b.twist[3:] > 0.9 * np.linalg.norm(way[3:]) * np.linalg.norm(b.twist[3:])
-            # A controller that is late meets several targets in one of its periods, and hurries after the last.
-            assert np.linalg.norm(b.twist[:3]) <= arm.config.limits.speed * 1.5
-    assert checked > 5
+            path = se3.pose_difference(a.pose, c.pose)
+            assert path[:3] @ b.twist[:3] > 0.9 * np.linalg.norm(path[:3]) * np.linalg.norm(b.twist[:3])
+            assert path[3:] @ b.twist[3:] > 0.9 * np.linalg.norm(path[3:]) * np.linalg.norm(b.twist[3:])
+            speed_ratios.append(np.linalg.norm(path) / (c.time - a.time) / np.linalg.norm(b.twist))
+    assert len(speed_ratios) > 5
+    # A late package spoils a ratio of its own: a controller that missed its period meets several targets in the next.
+    assert 0.8 < np.median(speed_ratios) < 1.25
 
 
 @pytest.mark.promise(10)

@@ -54,6 +54,7 @@ if TYPE_CHECKING:
     from robot.open import CannotOpen as CannotOpen
     from robot.open import check_sensors as check_sensors
     from robot.open import make_env as make_env
+    from robot.open import make_sharded_env as make_sharded_env
     from robot.open import make_vector_env as make_vector_env
     from robot.open import open_rig as open_rig
     from robot.studies.press import PressMotion as PressMotion

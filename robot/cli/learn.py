@@ -57,6 +57,12 @@ def train(
         bool,
         typer.Option("--tensorboard", help="PPO, SAC: also log for TensorBoard, to OUT/tensorboard (its package)."),
     ] = False,
+    processes: Annotated[
+        int | None,
+        typer.Option(
+            "--processes", min=1, help="Processes that simulate; the policy does not depend on it. One a core."
+        ),
+    ] = None,
     set_: Overrides = None,
     out: Out = None,
 ) -> None:
@@ -98,7 +104,7 @@ def train(
     from tacsim.tasks.task import BadDraws
 
     try:
-        path, rounds = _run_training(run, tensorboard)
+        path, rounds = _run_training(run, tensorboard, processes)
     except BadDraws:
         if run.load_checkpoint()[0]:
             notes.print(f"The last checkpoint is kept. Write it as a file: tacsim export policy {run.folder}")
@@ -128,7 +134,7 @@ def _require_logged(algorithm: str, tensorboard: bool) -> None:
         )
 
 
-def _run_training(run: RunFolder, tensorboard: bool) -> tuple[Path, list[Mapping[str, float]]]:
+def _run_training(run: RunFolder, tensorboard: bool, processes: int | None) -> tuple[Path, list[Mapping[str, float]]]:
     """Trains; returns the file of the policy and the figures of each round."""
     from robot.train.train import train as continue_training
 
@@ -144,7 +150,7 @@ def _run_training(run: RunFolder, tensorboard: bool) -> tuple[Path, list[Mapping
         )
 
     with one_bar("starting") as bar:
-        return continue_training(run, bar.report, print_result, warn, tensorboard), rounds
+        return continue_training(run, bar.report, print_result, warn, tensorboard, processes), rounds
 
 
 def policy(

@@ -150,6 +150,12 @@ class Child(Closing):
         if not self.running:
             raise self._make_error(f"has ended, {self._describe_end()}")
 
+    def wait(self, timeout: float) -> bool:
+        """Waits for the end of the process, for `timeout` [s]; returns whether it has ended."""
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(timeout)
+        return not self.running
+
     def receive(self, timeout: float) -> Message:
         """The child's next message; its first message reports that it is ready.
 

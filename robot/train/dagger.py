@@ -17,9 +17,9 @@ import torch
 from numpy.typing import NDArray
 
 from robot.common.whole_file import write_whole
+from robot.rig.sharded_env import Environments
 from robot.train.network import PolicyNetwork
 from robot.train.run_folder import ReportProgress, RunError
-from tacsim.gym.vector import TacsimVectorEnv
 from tacsim.models.text import printable_line
 from tacsim.models.training import Training
 
@@ -30,7 +30,7 @@ Arrays = dict[str, NDArray[Any]]
 class Dagger:
     """Trains a student in `envs`. Visited states are stored in `folder`, one file per round."""
 
-    def __init__(self, envs: TacsimVectorEnv, training: Training, actor: PolicyNetwork, folder: Path) -> None:
+    def __init__(self, envs: Environments, training: Training, actor: PolicyNetwork, folder: Path) -> None:
         self._envs, self._settings, self._folder = envs, training.dagger, folder
         self._seed, self.actor = training.seed, actor
         self.rounds = training.dagger.rounds
@@ -59,13 +59,13 @@ class Dagger:
         envs = self._envs
         random = np.random.default_rng([self._seed, number])
         features, _ = envs.reset(seed=int(random.integers(2**31)))
-        steps = envs.members[0].task.config.steps
+        steps = envs.get_attr("task")[0].config.steps
         states: list[Arrays] = []
         labels: list[NDArray[np.float32]] = []
         ends: list[NDArray[np.float64]] = []
         for step in range(steps):
             report_progress(f"round {number + 1} of {self.rounds}: acting", step, steps)
-            teacher = self._settings.pace * np.stack([member.expert() for member in envs.members])
+            teacher = self._settings.pace * np.stack(envs.call("expert")).astype(np.float32)
             states.append({key: value.copy() for key, value in features.items()})
             labels.append(teacher)
             if number == 0:

@@ -17,9 +17,9 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import VecEnv
 
 from robot.common.whole_file import write_whole
+from robot.rig.sharded_env import Environments
 from robot.train.network import FeatureLayers, PolicyNetwork
 from robot.train.run_folder import ReportProgress
-from tacsim.gym.vector import TacsimVectorEnv
 from tacsim.models.training import Training
 
 Arrays = dict[str, NDArray[Any]]
@@ -32,7 +32,7 @@ class Reinforce:
     """
 
     def __init__(
-        self, envs: TacsimVectorEnv, training: Training, actor: PolicyNetwork, folder: Path, tensorboard: bool = False
+        self, envs: Environments, training: Training, actor: PolicyNetwork, folder: Path, tensorboard: bool = False
     ) -> None:
         replay_steps = 50_000  # control steps in the replay buffer of SAC
         warm_up_steps = 1000  # control steps with random actions before SAC learns
@@ -40,7 +40,7 @@ class Reinforce:
         self.rounds, self.actor = settings.rounds, actor
         self._seed, self._folder = training.seed, folder
         self._envs = SharedVecEnv(envs)
-        self._steps = settings.episodes * envs.members[0].task.config.steps  # of each environment in a round
+        self._steps = settings.episodes * envs.get_attr("task")[0].config.steps  # of each environment in a round
         shape: dict[str, Any] = {
             "net_arch": [training.width, training.width],
             "activation_fn": torch.nn.ReLU,
@@ -160,7 +160,7 @@ class _EpisodeWatch(BaseCallback):
 class SharedVecEnv(VecEnv):
     """Environments that share kernel launches, as a VecEnv of stable-baselines3.
 
-    envs = SharedVecEnv(robot.make_vector_env(16, "squeeze", features={}, autoreset_mode="SameStep",
+    envs = SharedVecEnv(robot.make_sharded_env(16, "squeeze", features={}, autoreset_mode="SameStep",
                                               randomise="squeeze"))
     PPO("MultiInputPolicy", envs, policy_kwargs={"features_extractor_class": FeaturesExtractor}).learn(10_000)
 
@@ -168,7 +168,7 @@ class SharedVecEnv(VecEnv):
     entries of `TacsimEnv.step`. Raises ValueError for environments that are not reset in the step in which they end.
     """
 
-    def __init__(self, envs: TacsimVectorEnv) -> None:
+    def __init__(self, envs: Environments) -> None:
         if envs.autoreset_mode != AutoresetMode.SAME_STEP:
             raise ValueError(f"stable-baselines3 needs autoreset_mode 'SameStep', got '{envs.autoreset_mode.value}'")
         self.envs = envs
@@ -207,21 +207,23 @@ class SharedVecEnv(VecEnv):
         self.envs.close()
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        return [getattr(self.envs.members[index], attr_name) for index in self._get_indices(indices)]
+        return list(self.envs.call_selected(list(self._get_indices(indices)), attr_name))
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        values = list(self.envs.get_attr(attr_name))
         for index in self._get_indices(indices):
-            setattr(self.envs.members[index], attr_name, value)
+            values[index] = value
+        self.envs.set_attr(attr_name, values)
 
     def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
-        chosen = (self.envs.members[index] for index in self._get_indices(indices))
-        return [getattr(member, method_name)(*method_args, **method_kwargs) for member in chosen]
+        indices = list(self._get_indices(indices))
+        return list(self.envs.call_selected(indices, method_name, *method_args, **method_kwargs))
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: Any = None) -> list[bool]:
         return [False for _ in self._get_indices(indices)]
 
     def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
-        return [member.render() for member in self.envs.members]
+        return list(self.envs.call("render"))
 
 
 class FeaturesExtractor(BaseFeaturesExtractor):

@@ -10,6 +10,7 @@ import json
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -18,7 +19,8 @@ import torch
 from gymnasium.vector import AutoresetMode
 
 from robot.common.whole_file import write_whole
-from robot.open import load_with_task, make_vector_env
+from robot.open import load_with_task, make_sharded_env, make_vector_env
+from robot.rig.sharded_env import Environments
 from robot.train.curve_picture import write_curve_picture
 from robot.train.dagger import Dagger
 from robot.train.measure_range import measure_range, write_range
@@ -29,7 +31,6 @@ from tacsim.config.errors import Place, Problem
 from tacsim.geometry.shapes import bounding_size
 from tacsim.gym.encode import space_of_features
 from tacsim.gym.features import FeatureEncoder
-from tacsim.gym.vector import TacsimVectorEnv
 from tacsim.interface import Pose, Truth
 from tacsim.models.policy import ActionAxis, PolicySpec
 from tacsim.models.rig import TaskConfig
@@ -59,9 +60,11 @@ class Learner(Protocol):
     def restore(self, state: Mapping[str, Any]) -> None: ...
 
 
-def make_environments(training: Training) -> TacsimVectorEnv:
-    """Creates the environments of a training. Raises ConfigError, CannotOpen, IncompatibleRig, ValueError."""
-    return make_vector_env(
+def make_environments(training: Training, processes: int | None = 1) -> Environments:
+    """Creates the environments of a training; `processes`: see `robot.make_sharded_env`, 1: in this one. Raises
+    ConfigError, CannotOpen, IncompatibleRig, ValueError, WorkerFailed."""
+    make = make_vector_env if processes == 1 else partial(make_sharded_env, processes=processes)
+    return make(
         training.environments,
         training.task,
         training.rig,
@@ -77,10 +80,11 @@ def begin_run(training: Training, folder: Path) -> RunFolder:
     """Creates the folder of a new run. Raises the errors of `make_environments`, GoalOutOfReach for a goal that can be
     drawn but not reached, and FileExistsError."""
     envs = make_environments(training)  # reports errors before the folder is created
+    variants = envs.get_attr("variants")[0]
     envs.close()
     config = load_with_task(training.rig, training.task, training.overrides).config
     assert config.task is not None
-    _require_playable(training, [(each.task, each.scene, each.description) for each in envs.members[0].variants])
+    _require_playable(training, [(each.task, each.scene, each.description) for each in variants])
     task, encoder = make_task(config.task), FeatureEncoder(training.features, config.canonical)
     spec = PolicySpec(
         task=config.task.kind,
@@ -126,18 +130,20 @@ def train(
     report_result: Callable[[Figures], None] = lambda figures: None,
     warn: Callable[[str], None] = lambda words: None,
     tensorboard: bool = False,
+    processes: int | None = 1,
 ) -> Path:
     """Continues a run to its end, writes its policy to its folder and returns the file.
 
     report_result: called with the figures of each round: its number `round`, those of the learner, `refused` (draws
     that could not begin an episode and were repeated), and `seconds`. warn: called once for each refused draw.
     tensorboard: the log of stable-baselines3 is written to `tensorboard/` in the run's folder.
-    Raises RunError, BadDraws for too many refused draws, and OSError if the disk is full: the last checkpoint remains
-    complete.
+    processes: of the environments; see `make_environments`. The result does not depend on it.
+    Raises RunError, WorkerFailed, BadDraws for too many refused draws, and OSError if the disk is full: the last
+    checkpoint remains complete.
     """
     torch.set_num_threads(1)  # small networks; sums have the same order on any machine
     done, state, curve = run.load_checkpoint()
-    envs = make_environments(run.settings.training)
+    envs = make_environments(run.settings.training, processes)
     try:
         learner = _make_learner(envs, run, tensorboard)
         if done:
@@ -166,8 +172,8 @@ def train(
     return path
 
 
-def _refused_draws(envs: TacsimVectorEnv) -> list[str]:
-    return [words for env in envs.members for words in env.refused]
+def _refused_draws(envs: Environments) -> list[str]:
+    return [words for refused in envs.get_attr("refused") for words in refused]
 
 
 def export_policy(run: RunFolder, path: Path, report_progress: ReportProgress = lambda words, done, of: None) -> float:
@@ -208,7 +214,7 @@ def _checking_fit(run: RunFolder) -> Iterator[None]:
         raise RunError(f"{run.folder}: its checkpoint does not fit its settings: {words}") from None
 
 
-def _make_learner(envs: TacsimVectorEnv, run: RunFolder, tensorboard: bool) -> Learner:
+def _make_learner(envs: Environments, run: RunFolder, tensorboard: bool) -> Learner:
     if run.settings.training.algorithm == "dagger":
         return Dagger(envs, run.settings.training, new_actor(run), run.folder)
     from robot.train.reinforce import Reinforce

@@ -45,6 +45,10 @@ class ConfigError(ValueError):
             lines.append(f"... and {len(self.problems) - max_shown} more problems")
         super().__init__("\n".join(lines))
 
+    def __reduce__(self) -> tuple[type[ConfigError], tuple[tuple[Problem, ...]]]:
+        """By its problems, not by its text: it is sent from one process to another."""
+        return type(self), (self.problems,)
+
 
 def join_keys(key: str, name: str | int) -> str:
     """Dotted key of an entry."""

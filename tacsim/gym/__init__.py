@@ -17,8 +17,9 @@ def make_env(**options: Any) -> Any:
 
 
 def make_vector_env(**options: Any) -> Any:
-    """The same of robot.open.make_vector_env."""
-    return _opener().make_vector_env(**options)
+    """The same of robot.open.make_vector_env; with `processes`, of make_sharded_env."""
+    opener = _opener()
+    return opener.make_sharded_env(**options) if "processes" in options else opener.make_vector_env(**options)
 
 
 def _opener() -> ModuleType:

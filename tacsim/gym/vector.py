@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -13,7 +14,6 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.vector.utils import iterate
 
 from tacsim.gym.env import TacsimEnv, copy_reset_options
-from tacsim.interface import Float32
 from tacsim.models.scene import Scene
 from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.physics.move import MoveCommand
@@ -75,6 +75,7 @@ class TacsimVectorEnv(SyncVectorEnv):
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
     ) -> None:
         self._members, self._batch = tuple(members), batch
+        self._stepping: Mapping[int, Member] = {}  # those that the present step moves
         super().__init__([partial(getattr, member, "env") for member in members], autoreset_mode=autoreset_mode)
         self.metadata["reset_mask"] = True  # reset(options={"reset_mask": ...}) is understood
 
@@ -82,6 +83,11 @@ class TacsimVectorEnv(SyncVectorEnv):
     def members(self) -> tuple[TacsimEnv, ...]:
         """The environments, as what they are."""
         return tuple(member.env for member in self._members)
+
+    def call_selected(self, indices: Sequence[int], name: str, *arguments: Any, **options: Any) -> tuple[Any, ...]:
+        """`call` of some environments: the results of a method, or its attribute `name`."""
+        found = (getattr(self._members[index].env, name) for index in indices)
+        return tuple(each(*arguments, **options) if callable(each) else each for each in found)
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
@@ -100,13 +106,15 @@ class TacsimVectorEnv(SyncVectorEnv):
         """One control period of all. Raises what `TacsimEnv.step` raises for one of the actions, before anything
         moves. Any other error (a picture that cannot be made, a reset that cannot begin) comes when some have moved and
         some may have been reset: reset all of them then."""
-        self._advance(list(iterate(self.action_space, actions)))
-        return super().step(actions)  # takes what is done now, resets what is to be reset, and puts it together
+        self.begin_step(actions)
+        return self.end_step(actions)
 
-    def _advance(self, actions: Sequence[Float32]) -> None:
-        """The step of all environments but those that are to be reset; their `step` then returns its result."""
-        if len(actions) != self.num_envs:
-            raise ValueError(f"{len(actions)} actions for {self.num_envs} environments; give one each")
+    def begin_step(self, actions: Any) -> None:
+        """The first part of a step: commands the arms of all environments but those that are to be reset. Next is
+        `end_step`, or `cancel_step`. Raises what `TacsimEnv.step` raises for an action."""
+        each = list(iterate(self.action_space, actions))
+        if len(each) != self.num_envs:
+            raise ValueError(f"{len(each)} actions for {self.num_envs} environments; give one each")
         resets = self.autoreset_mode == AutoresetMode.NEXT_STEP
         phases = [member.env.phase for member in self._members]
         over = [i for i, phase in enumerate(phases) if phase == "new" or (phase == "over" and not resets)]
@@ -114,26 +122,47 @@ class TacsimVectorEnv(SyncVectorEnv):
             raise ResetNeeded(
                 f"no episode runs in environment {_list_indices(over)}: call reset(), or with a reset_mask"
             )
-        stepping = {i: m for i, m in enumerate(self._members) if phases[i] == "running"}
+        self._stepping = {i: m for i, m in enumerate(self._members) if phases[i] == "running"}
+        with self._cancel_on_failure():
+            for index, member in self._stepping.items():
+                member.env.begin_step(each[index])
+
+    def cancel_step(self) -> None:
+        """Forgets what `begin_step` has commanded."""
+        for member in self._stepping.values():
+            member.env.rig.stop()
+        self._stepping = {}
+
+    def end_step(self, actions: Any) -> tuple[Any, ...]:
+        """The rest of a step: moves, observes, judges and resets. Raises as `step`."""
+        self._advance()
+        return super().step(actions)  # takes what is done now, resets what is to be reset, and puts it together
+
+    def _advance(self) -> None:
+        """The step of all environments but those that are to be reset; their `step` then returns its result."""
         commands: list[MoveCommand | None] = [None] * self.num_envs
-        try:
-            for index, member in stepping.items():
-                member.env.begin_step(actions[index])
-            for index, member in stepping.items():
+        with self._cancel_on_failure():
+            for index, member in self._stepping.items():
                 if member.env.commanded:
                     commands[index] = member.clock.begin()
             ends = self._batch.move(commands)
-        except BaseException:
-            for member in stepping.values():
-                member.env.rig.stop()  # nothing of this step is left
-            raise
-        for index, member in stepping.items():
+        for index, member in self._stepping.items():
             if isinstance(ends[index], SimulationDiverged):
                 member.env.fail(ends[index])
             elif member.env.commanded:
                 member.clock.finish(ends[index])
-        for member in stepping.values():  # on threads they would wait for the interpreter more than they would win
+        for (
+            member
+        ) in self._stepping.values():  # on threads they would wait for the interpreter more than they would win
             member.env.end_step()
+
+    @contextmanager
+    def _cancel_on_failure(self) -> Iterator[None]:
+        try:
+            yield
+        except BaseException:
+            self.cancel_step()
+            raise
 
 
 def _list_indices(indices: Sequence[int]) -> str:

@@ -29,7 +29,7 @@ BRAKING = 0.75  # of its speed at STOP: the arm has begun to brake when it is sl
 SLACK = 10e-6  # a standing arm moves by less [m]
 MAX_GAP = 0.1  # between two packages, beyond which nothing can be said of a STOP [s]
 QUIET = 0.25  # after it has come to rest, a motion that goes on is looked for so long [s]
-FEW, MANY = 20, 200  # stops of the two tests
+FEW, MANY = 20, 1000  # stops of the two tests
 
 
 @contextmanager

@@ -23,8 +23,8 @@ from robot.mock.ur.fault_client import FAULT_PORT
 from robot.mock.ur.fault_server import FaultServer
 from robot.mock.ur.handle import check_hosts
 from robot.mock.ur.machine.arm import HOME, PERIOD
-from robot.mock.ur.machine.load import Mass
-from robot.mock.ur.machine.version import VERSION, parse_version, version_text
+from robot.mock.ur.machine.forces import Mass
+from robot.mock.ur.machine.state import VERSION, parse_version, version_text
 from robot.mock.ur.wire.controller import Controller, ControllerConfig
 
 if TYPE_CHECKING:

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from robot.deploy.control_loop import EpisodeSetup, run_episode
-from robot.mock.fixtures import rig_addresses
+from robot.fixtures import rig_addresses
 from robot.open import RIG_ATTACHMENT, open_rig
 from tacsim.config import load_rig
 from tacsim.control.contact_signal import contact_signal

@@ -14,7 +14,7 @@ from robot.common.loopback import require_loopback
 from robot.common.process import END_TIMEOUT, Child
 from robot.errors import DeviceError
 from robot.mock.ur.fault_client import FAULT_PORT, FaultClient
-from robot.mock.ur.machine.version import VERSION, Version, check_version, version_text
+from robot.mock.ur.machine.state import VERSION, Version, check_version, version_text
 
 if TYPE_CHECKING:
     from tacsim.models.hardware import Model  # pydantic and SciPy: half a second of start-up

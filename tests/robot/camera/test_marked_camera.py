@@ -11,8 +11,8 @@ import pytest
 
 from calibration.reference import UnusableReference
 from robot.deploy.control_loop import run_episode
+from robot.fixtures import mock_host
 from robot.mock import MockCamera
-from robot.mock.fixtures import mock_host
 from robot.open import open_rig
 from tacsim.config import load_rig
 from tacsim.interface import Action, Observation

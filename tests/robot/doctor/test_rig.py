@@ -12,9 +12,9 @@ import robot.arm.controller.examine
 import robot.camera.driver
 import robot.mock.cell.cell
 from robot.doctor.rig import examine_rig
+from robot.fixtures import mock_host
 from robot.mock import FaultClient, MockCamera, MockUR
 from robot.mock.cell.cell import MockCell
-from robot.mock.fixtures import mock_host
 from tacsim.config import load_rig
 from tacsim.models.driver import Check
 from tacsim.models.rig import RigConfig

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from typing import Self
 
 from robot.common.loopback import loopback_host
-from robot.mock.ur.machine.registry import COMMANDS
+from robot.mock.ur.machine.program import COMMANDS
 from robot.mock.ur.wire.controller import DASHBOARD, RTDE, SCRIPTS
 from robot.mock.ur.wire.fields import FORMATS, INPUTS
 from robot.mock.ur.wire.rtde import DATA, INPUT_RECIPE, OUTPUT_RECIPE, PAUSE, PROTOCOL, START, make_package

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from robot.mock.fixtures import rig_addresses
+from robot.fixtures import rig_addresses
 from tacsim.control.contact_signal import NoTouch
 from tacsim.interface import Action, Pose
 from tests.robot.rig.bare_rig import Opened, failing, opened

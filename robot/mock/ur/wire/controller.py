@@ -19,20 +19,19 @@ import numpy as np
 from robot.common import MOCK_SERIAL
 from robot.common.kinematics import JOINT_RANGE
 from robot.mock.ur.machine.arm import HOME, PERIOD
-from robot.mock.ur.machine.load import NO_MASS, Mass
+from robot.mock.ur.machine.forces import NO_MASS, Mass
 from robot.mock.ur.machine.machine import Machine
-from robot.mock.ur.machine.version import VERSION, Version
-from robot.mock.ur.wire import dashboard, primary
+from robot.mock.ur.machine.state import VERSION, Version
+from robot.mock.ur.wire import messages
 from robot.mock.ur.wire.connection import Connection
 from robot.mock.ur.wire.fields import apply_inputs
-from robot.mock.ur.wire.inputs import Inputs
-from robot.mock.ur.wire.rtde import BadPackage, InputRecipe, Session, take_packages
+from robot.mock.ur.wire.rtde import BadPackage, InputRecipe, Inputs, Session, take_packages
 
 if TYPE_CHECKING:
     from tacsim.models.hardware import Model  # pydantic and SciPy: half a second of start-up
 
 RTDE, DASHBOARD, REALTIME = 30004, 29999, 30003
-SCRIPTS = (*primary.PORTS, REALTIME)
+SCRIPTS = (*messages.PRIMARY_PORTS, REALTIME)
 PORTS = (RTDE, DASHBOARD, *SCRIPTS)
 MAX_CLIENTS = 256  # of one controller; further ones are closed at once
 BURST = 16  # packages or lines of one client served at once; others wait, and no more data are read
@@ -211,9 +210,9 @@ class Controller:
         register, then sends its control script again. Its connection is closed, so that its call raises now."""
         while self.machine.script_errors:
             error = self.machine.script_errors.popleft()
-            data = primary.runtime_exception(self.machine.time, error)
+            data = messages.runtime_exception(self.machine.time, error)
             for client in self.clients:
-                if client.port in primary.PORTS:
+                if client.port in messages.PRIMARY_PORTS:
                     client.send(data, due=self._due())
             if error.users and self._author is not None and self._author.port == REALTIME:
                 self._drop(self._author, reset=True)
@@ -254,7 +253,7 @@ class Controller:
         self.clients[client] = session
         self._watch(client.socket, partial(self._serve, client))
         if port == DASHBOARD and not self.faults.dashboard_mute:
-            client.send(dashboard.GREETING.encode() + b"\n", due=self._due())
+            client.send(messages.GREETING.encode() + b"\n", due=self._due())
 
     def _drop(self, client: Connection, *, reset: bool = False) -> None:
         if client in self.clients:
@@ -311,7 +310,7 @@ class Controller:
                 client.send(b"Disconnected\n" if request.lower() == "quit" else b"Shutting down\n")
                 self._drop(client)
                 return False
-            reply = dashboard.answer(self.machine, request, self.config.serial, remote=self.faults.remote_control)
+            reply = messages.answer(self.machine, request, self.config.serial, remote=self.faults.remote_control)
             client.send(reply.encode() + b"\n", due=self._due())
         behind = b"\n" in client.received
         if not behind and len(client.received) > max_line:

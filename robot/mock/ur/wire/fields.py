@@ -18,10 +18,9 @@ import numpy as np
 
 from robot.common.kinematics import pose
 from robot.mock.ur.machine.arm import PERIOD
-from robot.mock.ur.machine.load import GRAVITY
+from robot.mock.ur.machine.forces import GRAVITY
 from robot.mock.ur.machine.machine import Machine
-from robot.mock.ur.machine.modes import Mode
-from robot.mock.ur.machine.state import REGISTERS
+from robot.mock.ur.machine.state import REGISTERS, Mode
 
 FORMATS = {  # struct codes, big endian
     "DOUBLE": "d",

@@ -1,4 +1,4 @@
-"""Real-Time Data Exchange, protocol version 2 (port 30004): packages, recipes, the stream.
+"""Real-Time Data Exchange, protocol version 2 (port 30004): packages, recipes, the stream, the newest input packages.
 
 A package is uint16 size (with the three bytes of the header), uint8 type, payload; all big endian.
 """
@@ -7,9 +7,12 @@ from __future__ import annotations
 
 import math
 import struct
+from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from itertools import islice
 
+from robot.mock.ur.fault_client import Input
 from robot.mock.ur.machine.arm import PERIOD
 from robot.mock.ur.machine.machine import Machine
 from robot.mock.ur.wire.fields import FORMATS, INPUTS, OUTPUTS, Output, Value
@@ -195,3 +198,37 @@ _HANDLERS: dict[int, Callable[[Session, bytes], bytes | None]] = {
     DATA: Session._data,
     MESSAGE: Session._message,
 }
+
+
+MAX_STORED_BYTES = 1 << 24  # of one controller; 1.5 minutes of a driver at 500 Hz [bytes]
+PACKAGE_OVERHEAD = 256  # of a stored package, in addition to its payload [bytes]
+
+
+class Inputs:
+    """A ring buffer: new packages replace the oldest ones. Numbers count from 1 and continue after `clear`."""
+
+    def __init__(self) -> None:
+        self.arrived = 0  # number of packages so far
+        self._packages: deque[tuple[int, InputRecipe, bytes]] = deque()  # control period, recipe and payload of each
+        self._size = 0  # of the stored packages [bytes]
+
+    def add(self, tick: int, recipe: InputRecipe, payload: bytes) -> None:
+        self.arrived += 1
+        self._packages.append((tick, recipe, payload))
+        self._size += PACKAGE_OVERHEAD + len(payload)
+        while self._size > MAX_STORED_BYTES:
+            self._size -= PACKAGE_OVERHEAD + len(self._packages.popleft()[2])
+
+    def after(self, number: int, count: int) -> tuple[list[Input], int]:
+        """At most `count` packages after the one with this number; and how many after it are no longer stored."""
+        oldest = self.arrived - len(self._packages)  # number of the last package that was removed
+        begin = max(number, oldest)
+        page = islice(self._packages, begin - oldest, begin - oldest + count)
+        entries = [
+            Input(begin + place, tick, recipe.unpack(payload)) for place, (tick, recipe, payload) in enumerate(page, 1)
+        ]
+        return entries, max(0, oldest - number)
+
+    def clear(self) -> None:
+        self._packages.clear()
+        self._size = 0

@@ -17,8 +17,8 @@ from robot.common.kinematics import Kinematics, matrix, pose
 from robot.common.tcp import ArmFrames
 from robot.doctor.rig import check_keep_out, examine_rig
 from robot.errors import DeviceNotConnectedError
+from robot.fixtures import mock_host
 from robot.mock import MockUR
-from robot.mock.fixtures import mock_host
 from tacsim import pose as se3
 from tacsim.config import ConfigError, config_root, load_rig
 from tacsim.models.driver import Check

@@ -1,11 +1,13 @@
-"""The dashboard server: one line of text per request and reply (Dashboard Server e-Series, Universal Robots)."""
+"""The dashboard server: one line of text per request and reply (Dashboard Server e-Series, Universal Robots); and the
+messages of the primary and secondary interface (30001, 30002): only the exceptions of scripts (client interfaces)."""
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable
 
 from robot.mock.ur.machine.machine import Machine
-from robot.mock.ur.machine.modes import Runtime, Safety
+from robot.mock.ur.machine.state import Runtime, Safety, ScriptError
 
 GREETING = "Connected: Universal Robots Dashboard Server"
 _ROBOT = {"ur3e": "UR3", "ur5e": "UR5", "ur10e": "UR10"}  # `get robot model` omits the e
@@ -97,3 +99,15 @@ _COMMANDS: dict[str, tuple[Callable[[Machine], object], str]] = {  # action and 
     "close safety popup": (lambda machine: None, "closing safety popup"),
 }
 _ATTEMPTS = {"pause": _pause, "play": _play, "unlock protective stop": _unlock}  # their replies depend on success
+
+
+PRIMARY_PORTS = (30001, 30002)
+ROBOT_MESSAGE, RUNTIME_EXCEPTION, CONTROLLER = 20, 10, 0xFE
+_HEAD = struct.Struct(">iBQBBii")  # size, type, time [us], source, kind, line and column of the script
+
+
+def runtime_exception(time: float, error: ScriptError) -> bytes:
+    """A package with the error that ended or prevented a program; time: since power-on [s]."""
+    words = error.text.encode()
+    head = ROBOT_MESSAGE, round(1e6 * time), CONTROLLER, RUNTIME_EXCEPTION, error.line, error.column
+    return _HEAD.pack(_HEAD.size + len(words), *head) + words

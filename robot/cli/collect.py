@@ -323,7 +323,7 @@ def _validate(model: Any, **values: Any) -> Any:
     """A model of these values. Raises SetError with the first message of the validation."""
     from pydantic import ValidationError
 
-    from robot.collect.job import SetError
+    from robot.collect.workers import SetError
 
     try:
         return model(**values)

@@ -14,7 +14,7 @@ import yaml
 from pydantic import Field, model_validator
 
 from calibration.errors import CalibrationError
-from calibration.height.slope_polynomial import InverseModel
+from calibration.height.slopes import InverseModel
 from calibration.lens.view import GelView
 from tacsim.config import ConfigError, load_model, load_sensor
 from tacsim.config.bundle import (

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.drift import DriftFinder, contact_area, max_mean_change
 from calibration.height.surface_finder import SurfaceFinder, canonical_part
 from calibration.lens.rectification import (
     Rectification,
@@ -21,12 +20,15 @@ from calibration.lens.rectification import (
 )
 from calibration.markers.flow import MarkerFlow, require_no_markers
 from calibration.reference import (
+    DriftFinder,
     Reference,
     StaleReference,
     UnusableReference,
+    contact_area,
     is_channel_order_swapped,
     is_contact_image_swapped,
     make_reference,
+    max_mean_change,
 )
 from calibration.tuning import (
     MAX_COLOUR_CHANGE,

@@ -10,10 +10,15 @@ import numpy as np
 from calibration.bundle import BadBundle, Calibration, read_bundle
 from calibration.errors import BadFrames
 from calibration.frame_normaliser import FrameNormaliser
-from calibration.height.colour_table import GradientModel, table_of_model
-from calibration.height.darkness import DarknessSlopes
-from calibration.height.forward_steps import ForwardSteps
-from calibration.height.slope_polynomial import InverseModel, PolynomialSlopes, inverse_of_light
+from calibration.height.integration import ForwardSteps
+from calibration.height.slopes import (
+    DarknessSlopes,
+    GradientModel,
+    InverseModel,
+    PolynomialSlopes,
+    inverse_of_light,
+    table_of_model,
+)
 from calibration.height.surface_finder import SurfaceFinder, extended_view
 from calibration.lens.rectification import (
     Rectification,

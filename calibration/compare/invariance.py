@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from calibration.bundle import Calibration
 from calibration.compare import metrics
 from calibration.compare.compare import BOOTSTRAP_DRAWS, Comparison
-from calibration.compare.surfaces import GRID, estimate_surfaces
-from calibration.drift import subtract_drift
+from calibration.compare.scorer import GRID, estimate_surfaces
 from calibration.errors import BadFrames
+from calibration.reference import subtract_drift
 from tacsim.control.tuning import MIN_CONTACT_HEIGHT
 from tacsim.interface import FloatArray, Image
 

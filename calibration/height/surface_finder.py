@@ -14,12 +14,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.drift import PIXEL_STRIDE, DriftFinder, max_mean_change
-from calibration.height.colour_table import GradientModel
-from calibration.height.forward_steps import ForwardSteps
-from calibration.height.integration import Integrator, slopes_of
+from calibration.height.integration import ForwardSteps, Integrator, slopes_of
+from calibration.height.slopes import GradientModel
 from calibration.height.tuning import MAX_INK_LEVEL
 from calibration.lens.rectification import visible_box
+from calibration.reference import PIXEL_STRIDE, DriftFinder, max_mean_change
 from tacsim.interface import Float32, Mask
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.optics.grid import PixelGrid, canonical_image

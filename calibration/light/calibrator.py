@@ -16,18 +16,16 @@ from functools import partial
 import numpy as np
 
 from calibration.errors import BadFrames
-from calibration.height.darkness import DarknessSlopes
-from calibration.height.forward_steps import ForwardSteps
-from calibration.height.integration import Integrator, slopes_of
-from calibration.height.slope_polynomial import (
+from calibration.height.integration import ForwardSteps, Integrator, slopes_of
+from calibration.height.slopes import (
+    DarknessSlopes,
     InverseModel,
     PolynomialSlopes,
     normal_of_slope,
 )
 from calibration.light.checks.consistency import find_blurred_presses, find_inconsistent_presses, find_reference_contact
-from calibration.light.circle import NoCircle
 from calibration.light.darkness import find_dark_press, fit_darkness, is_direction_free
-from calibration.light.dent import dent_gradient, dent_height, max_dent_slope
+from calibration.light.dent import NoCircle, dent_gradient, dent_height, max_dent_slope
 from calibration.light.fit import LightFit, PressPrediction, compare_with_prediction, normal_angle
 from calibration.light.labels import (
     contact_and_skirt,
@@ -43,8 +41,7 @@ from calibration.light.labels import (
 from calibration.light.photometry import SLOPE_TERMS, ModelSize, NormalEquations, choose_size, solve_weights
 from calibration.light.press import BallPress, Window, find_press, gaussian_blur, mean_reference_colour
 from calibration.light.press_shapes import find_other_balls, fit_stretch
-from calibration.light.refinement import RefinedGeometry, refine_geometry
-from calibration.light.shadows import DentShade, find_lamps
+from calibration.light.refinement import DentShade, RefinedGeometry, find_lamps, refine_geometry
 from calibration.light.tuning import (
     FORWARD_BLUR,
     INVERSE_BLUR,

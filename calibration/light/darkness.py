@@ -16,8 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calibration.errors import BadFrames
-from calibration.light.circle import Circle, NoCircle
-from calibration.light.dent import ContactCircle, depth_profile
+from calibration.light.dent import Circle, ContactCircle, NoCircle, depth_profile
 from calibration.light.press import BallPress, gaussian_blur, make_press, mean_reference_colour
 from calibration.light.refinement import MAX_GROUPS
 from calibration.light.tuning import (
@@ -98,7 +97,7 @@ def find_dark_press(name: str, image: Image, reference: Image, mean: FloatArray,
 
 def dark_circle(image: Image, reference: Image, ball: float) -> Circle:
     """Finds the contact of a ball of radius `ball` [px] in `image` (H, W, 3), as a calibration from this press alone
-    would: :func:`calibration.light.circle.find_contact_circle` for a light without direction. `reference`
+    would: :func:`calibration.light.dent.find_contact_circle` for a light without direction. `reference`
     (H, W, 3) is the same without contact.
 
     Raises BadFrames for a reference that is dark or saturated, NoCircle if no ball's contact is visible.

@@ -9,7 +9,7 @@ from importlib import metadata
 import numpy as np
 
 from calibration.bundle import Calibration, Provenance, Residual
-from calibration.height.slope_polynomial import InverseModel
+from calibration.height.slopes import InverseModel
 from calibration.lens.view import GelView
 from calibration.light.dent import ContactCircle
 from calibration.light.photometry import ModelSize

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from calibration.height.slope_polynomial import InverseModel, fit_inverse, inverse_features, normal_of_slope
+from calibration.height.slopes import InverseModel, fit_inverse, inverse_features, normal_of_slope
 from calibration.light.dent import cached_profile, dent_gradient, dent_height
 from calibration.light.photometry import (
     MAX_SIZE,
@@ -19,8 +19,7 @@ from calibration.light.photometry import (
     terms_of,
 )
 from calibration.light.press import BallPress, gaussian_blur
-from calibration.light.refinement import RefinedGeometry
-from calibration.light.shadows import DentShade
+from calibration.light.refinement import DentShade, RefinedGeometry
 from calibration.light.tuning import (
     DEEP_SLOPE_SCALE,
     FORWARD_BLUR,

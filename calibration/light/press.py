@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibration.errors import BadFrames
-from calibration.light.circle import find_contact_circle
-from calibration.light.dent import ContactCircle
+from calibration.light.dent import ContactCircle, find_contact_circle
 from calibration.light.tuning import (
     MAX_RIM_RATIO,
     MAX_SATURATED_CONTACT,

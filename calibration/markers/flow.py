@@ -1,7 +1,7 @@
 """Tactile flow from pictures: displacement of each dot printed on the gel, in metres.
 
 Dots are detected on a separate metric grid, whose resolution depends on their size, not on the canonical grid. The
-reference gives row and column of each dot (:mod:`calibration.markers.lattice`), and its rest position;
+reference gives row and column of each dot (:mod:`calibration.markers.dots`), and its rest position;
 :mod:`calibration.markers.tracker` tracks it. A dot that is not visible gets the mean motion of its neighbours: flow is
 finite everywhere, and `visible` marks the measured part.
 """
@@ -22,8 +22,8 @@ from calibration.lens.rectification import (
     visible_box,
 )
 from calibration.lens.view import GelView
-from calibration.markers.dots import DotFinder
-from calibration.markers.lattice import (
+from calibration.markers.dots import (
+    DotFinder,
     Lattice,
     NoLattice,
     describe_missing_line,

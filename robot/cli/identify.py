@@ -33,7 +33,7 @@ from robot.cli.output import (
 )
 
 if TYPE_CHECKING:
-    from calibration.materials.presses import Noise
+    from calibration.materials.fit import Noise
     from robot.studies.identify.identify import Identified, Kind
     from tacsim.interface import Pose
     from tacsim.models.scene import Scene
@@ -189,8 +189,7 @@ class _IdentifyCommand:
             )
         folder = new_directory(options.out, f"identify-{self.kind}")
         with busy("loading"):
-            from calibration.materials.fit import Priors
-            from calibration.materials.presses import Noise
+            from calibration.materials.fit import Noise, Priors
             from robot.studies.identify.identify import identify
             from robot.studies.identify.recordings import Recordings, find_recordings, read_all
             from tacsim.physics.failure.dump import dump_to_folder

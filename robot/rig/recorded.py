@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from calibration.bundle import read_sensor_model
 from calibration.errors import CalibrationError, error_context
+from calibration.markers.dots import NoLattice
 from calibration.markers.flow import TooFewMarkers, find_markers
-from calibration.markers.lattice import NoLattice
 from calibration.reference import StaleReference
 from robot.rig.parts import sensor_of
 from robot.rig.replay_rig import recorded_rig, rig_of

@@ -14,8 +14,7 @@ from calibration.light.checks.tuning import (
     MIN_EXPLAINED_SHARE,
     MIN_FINE_POWER_RATIO,
 )
-from calibration.light.circle import NoCircle, find_contact_circle
-from calibration.light.dent import dent_gradient
+from calibration.light.dent import NoCircle, dent_gradient, find_contact_circle
 from calibration.light.photometry import photometric_features
 from calibration.light.press import BallPress, Window, gaussian_blur
 from calibration.light.tuning import RIM_BLUR, SKIRT_RADIUS

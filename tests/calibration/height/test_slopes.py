@@ -1,7 +1,11 @@
+"""Slopes from colours: the table of a light, and the polynomial of labelled presses."""
+
+import itertools
+
 import numpy as np
 import pytest
 
-from calibration.height.colour_table import table_of_lighting, table_of_model
+from calibration.height.slopes import COLOUR_SCALE, TERMS, inverse_features, table_of_lighting, table_of_model
 from calibration.height.tuning import MAX_TABLE_SLOPE
 from tacsim.models.sensor import Light, Lighting, SensorModel
 from tacsim.optics.render import phong_shading
@@ -87,3 +91,17 @@ def test_a_light_that_tells_no_slope_is_refused(lights: tuple[Light, ...]) -> No
 def test_a_black_gel_is_refused() -> None:
     with pytest.raises(ValueError, match="black in a channel"):
         table_of_lighting(Lighting(), (0.4, 0.0, 0.4))
+
+
+def test_the_terms_are_all_products_of_at_most_three() -> None:
+    rng = np.random.default_rng(0)
+    change, (x, y) = rng.normal(0, 0.3, (40, 3)), rng.uniform(-1, 1, (2, 40))
+    inputs = [*(COLOUR_SCALE * change).T, x, y]
+    products = [
+        np.prod([np.ones(40), *factors], axis=0)
+        for order in range(4)
+        for factors in itertools.combinations_with_replacement(inputs, order)
+    ]
+    found = inverse_features(change, x, y)
+    assert found.shape == (40, TERMS) == (40, len(products))
+    np.testing.assert_allclose(np.array(sorted(found.T.tolist())), np.array(sorted(p.tolist() for p in products)))

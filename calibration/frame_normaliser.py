@@ -38,7 +38,7 @@ from calibration.tuning import (
     STALE_COLOUR,
     STALE_SLOPE,
 )
-from tacsim.control.tuning import MIN_CONTACT_DIFFERENCE, MIN_CONTACT_HEIGHT
+from tacsim.control import MIN_CONTACT_DIFFERENCE, MIN_CONTACT_HEIGHT
 from tacsim.interface import SurfaceMap, TactileFrame, TactileObservation
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.optics.grid import canonical_cells

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from tacsim.config import load_scene as load_scene
     from tacsim.config import load_sensor as load_sensor
     from tacsim.config import load_task as load_task
-    from tacsim.control.contact_signal import NoTouch as NoTouch
-    from tacsim.control.contact_signal import contact_signal as contact_signal
+    from tacsim.control import NoTouch as NoTouch
+    from tacsim.control import contact_signal as contact_signal
     from tacsim.gym.env import TacsimEnv as TacsimEnv
     from tacsim.gym.features import FeatureEncoder as FeatureEncoder
     from tacsim.gym.vector import TacsimVectorEnv as TacsimVectorEnv

@@ -31,7 +31,7 @@ from calibration.compare.scorer import (
 from calibration.errors import BadFrames
 from calibration.frame_set import Frame, FrameSet, find_touched_references
 from calibration.reference import subtract_drift
-from tacsim.control.tuning import MIN_CONTACT_HEIGHT
+from tacsim.control import MIN_CONTACT_HEIGHT
 from tacsim.interface import FloatArray, Image
 from tacsim.record.numbering import numbers_in_names
 

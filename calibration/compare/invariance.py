@@ -24,7 +24,7 @@ from calibration.compare.compare import BOOTSTRAP_DRAWS, Comparison
 from calibration.compare.scorer import GRID, estimate_surfaces
 from calibration.errors import BadFrames
 from calibration.reference import subtract_drift
-from tacsim.control.tuning import MIN_CONTACT_HEIGHT
+from tacsim.control import MIN_CONTACT_HEIGHT
 from tacsim.interface import FloatArray, Image
 
 PATCH_SIDE = 5.2e-3  # if pixels have a known pitch [m]

@@ -19,7 +19,7 @@ from calibration.frame_set import Frame, FrameSet, frame_warnings
 from calibration.markers.flow import TooFewMarkers
 from calibration.normaliser import normaliser_for_calibration
 from calibration.reference import StaleReference, UnusableReference, subtract_drift
-from tacsim.control.tuning import MIN_CONTACT_HEIGHT
+from tacsim.control import MIN_CONTACT_HEIGHT
 from tacsim.interface import Float32, FloatArray, Mask, TactileFrame
 from tacsim.models.sensor import CanonicalGrid
 

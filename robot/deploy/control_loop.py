@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robot.deploy.policy import require_fit, training_info
-from tacsim.control.contact_signal import contact_signal
+from tacsim.control import contact_signal
 from tacsim.interface import Action, EndOfEpisode, Observation, Policy, Pose, Truth
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.record.episode import Episode, EpisodeMeta, Step

@@ -13,8 +13,7 @@ from robot.rig.commanded_arm import CommandedArm
 from robot.rig.parts import arm_drivers, companion_class, sensor_drivers, start_companion
 from robot.rig.reset import HardwareReset
 from robot.rig.touch import ForceTouch, PictureTouch, TouchSensing
-from tacsim.control.gel_monitor import GelMonitor
-from tacsim.control.load_controller import load_controller
+from tacsim.control import GelMonitor, load_controller
 from tacsim.interface import Normaliser, Pose, RigSpec, SensorSpec, TactileSource
 from tacsim.models.driver import ArmDriver, Companion, SensorDriver
 from tacsim.models.hardware import ArmLimits

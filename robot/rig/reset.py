@@ -16,7 +16,7 @@ from robot.errors import DeviceError
 from robot.rig.commanded_arm import CommandedArm, wait_for_arrival
 from robot.rig.touch import TouchSensing
 from tacsim import pose as se3
-from tacsim.control.contact_signal import NoTouch, approach
+from tacsim.control import NoTouch, approach
 from tacsim.interface import Pose, TactileFrame, TactileSource
 from tacsim.models.hardware import ResetConfig
 

@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 
 from robot.rig.commanded_arm import CommandedArm
-from tacsim.control.contact_signal import contact_signal
+from tacsim.control import contact_signal
 from tacsim.interface import Normaliser, TactileObservation, TactileSource
 
 READ_TIMEOUT = 1.0  # of an image [s]

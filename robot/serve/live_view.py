@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from robot.arm.status import ArmStatus
 from robot.rig.commanded_arm import CommandedArm
 from robot.serve.errors import describe
-from tacsim.control.contact_signal import contact_signal
+from tacsim.control import contact_signal
 from tacsim.interface import Arm, ArmState, FloatArray, Image, Observation, TactileFrame, TactileObservation
 from tacsim.record.episode import Step
 from tacsim.record.step_info import ALIGNMENT, LIMITS_HIT

@@ -152,7 +152,7 @@ class RepositionConfig(TaskConfig):
 
     kind: Literal["reposition"]
     goal: tuple[Length, Length] = (2e-3, 2e-3)  # desired displacement of the centre of mass, world x, y [m]
-    # Normal forces along the z of their sensors (tacsim.control.load_controller), by arm; an arm without one holds its
+    # Normal forces along the z of their sensors (tacsim.control), by arm; an arm without one holds its
     # height. [N]
     loads: dict[Name, Annotated[Force, Field(gt=0)]] = {}
     touch_force: Annotated[Force, Field(gt=0)] = 1.0  # at less, the upper gel slides

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from tacsim import pose as se3
-from tacsim.control.contact_signal import contact_signal
+from tacsim.control import contact_signal
 from tacsim.interface import Action, Needs, Observation, Pose, RigSpec
 from tacsim.tasks.tuning import CLOSING_STEP, FIRM_GRIP_SIGNAL
 
@@ -20,7 +20,7 @@ class Grip:
 
     Args:
         spec: of the rig; says which arm carries which sensor.
-        target: contact signal (tacsim.control.contact_signal) that ends the closing [-].
+        target: contact signal (tacsim.control) that ends the closing [-].
         step: motion of each sensor in a control period [m].
     """
 

@@ -23,7 +23,7 @@ from robot.deploy.control_loop import EpisodeSetup, run_episode
 from robot.fixtures import rig_addresses
 from robot.open import RIG_ATTACHMENT, open_rig
 from tacsim.config import load_rig
-from tacsim.control.contact_signal import contact_signal
+from tacsim.control import contact_signal
 from tacsim.interface import Action, EndOfEpisode, Observation, Pose, RigSpec
 from tacsim.limits import ActionError
 from tacsim.record.writer import Recorder

@@ -28,7 +28,7 @@ from robot.procedures.ball_touches import BallTouchPlan, schedule, without_task
 from robot.procedures.session import CannotCalibrate, Session
 from tacsim import pose as se3
 from tacsim.config import ConfigError, load_rig
-from tacsim.control.contact_signal import NoTouch
+from tacsim.control import NoTouch
 from tacsim.interface import Pose
 from tacsim.models.hardware import Placement
 from tacsim.models.sensor import SensorModel

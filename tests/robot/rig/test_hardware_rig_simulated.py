@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import pytest
 
 from robot.fixtures import rig_addresses
-from tacsim.control.contact_signal import NoTouch
+from tacsim.control import NoTouch
 from tacsim.interface import Action, Pose
 from tests.robot.rig.bare_rig import Opened, failing, opened
 from tests.robot.waiting import until

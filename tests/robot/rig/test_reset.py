@@ -15,7 +15,7 @@ from robot.rig.commanded_arm import CommandedArm
 from robot.rig.reset import RETREAT_DISTANCE, HardwareReset, NotConfirmed
 from robot.rig.touch import Touch
 from tacsim import pose as se3
-from tacsim.control.contact_signal import NoTouch
+from tacsim.control import NoTouch
 from tacsim.interface import ArmState, Pose, SensorSpec, TactileFrame
 from tacsim.models.hardware import ResetConfig
 

@@ -1,7 +1,8 @@
-"""Arms that hold a load: on springs, with noise, tilted, shortened by limits, out of reach, and on simulated gels."""
+"""Control of an arm on any rig: the contact signal, the approach until touch, guards of the gels, constant load."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -12,11 +13,141 @@ from scipy.spatial.transform import Rotation
 from robot.open import open_rig
 from tacsim import pose as se3
 from tacsim.config import ConfigError, load_rig
-from tacsim.control.load_controller import LoadController, load_controller
-from tacsim.control.tuning import LOAD_TOLERANCE, MAX_TRAVEL
-from tacsim.interface import Action, ArmState, Pose
+from tacsim.control import (
+    LOAD_TOLERANCE,
+    MAX_TRAVEL,
+    GelMonitor,
+    LoadController,
+    NoTouch,
+    approach,
+    contact_signal,
+    load_controller,
+    pixel_mask,
+)
+from tacsim.interface import Action, ArmState, GelReading, Pose, SensorSpec, TactileObservation
 from tacsim.limits import LimitExceeded
+from tacsim.models.hardware import ArmLimits, Workspace
 from tacsim.models.rig import RepositionConfig, SqueezeConfig
+
+
+def _observation(image: np.ndarray, valid: np.ndarray) -> TactileObservation:
+    return TactileObservation(
+        image=image, gradient=None, height=None, contact=np.zeros_like(valid), valid=valid, flow=None, time=0.0, age=0.0
+    )
+
+
+def test_signal_is_the_mean_relative_change_over_valid_pixels() -> None:
+    image = np.full((8, 12, 3), 128, dtype=np.uint8)
+    valid = np.ones((4, 6), dtype=bool)
+    assert contact_signal(_observation(image, valid)) == 0.0
+    image[:2, :, 0] = 128 + 64  # a quarter of the rows, one channel of three, half of mean(I0)
+    assert contact_signal(_observation(image, valid)) == pytest.approx(0.5 / 4 / 3)
+    image[:2, :, 0] = 128 - 64  # darker counts as much
+    assert contact_signal(_observation(image, valid)) == pytest.approx(0.5 / 4 / 3)
+    valid[0] = False  # the changed rows are no gel
+    assert contact_signal(_observation(image, valid)) == 0.0
+
+
+def test_no_valid_pixel_is_an_error() -> None:
+    with pytest.raises(ValueError, match="no valid pixel"):
+        contact_signal(_observation(np.zeros((8, 8, 3), dtype=np.uint8), np.zeros((4, 4), dtype=bool)))
+
+
+def test_mask_needs_whole_cells() -> None:
+    cells = np.array([[True, False], [False, False]])
+    np.testing.assert_array_equal(pixel_mask(cells, (4, 4))[:2, :2], True)
+    assert pixel_mask(cells, (4, 4)).sum() == 4
+    with pytest.raises(ValueError, match="no whole multiple"):
+        pixel_mask(cells, (4, 5))
+
+
+@pytest.mark.parametrize(("surface", "steps"), [(0.0, []), (2.5, [1.0, 2.0, 3.0])])
+def test_an_approach_ends_at_the_first_step_that_touches(surface: float, steps: list[float]) -> None:
+    went: list[float] = []
+    assert approach(lambda: max(went, default=0.0) >= surface, went.append, 1.0, 5.0, "") == max(steps, default=0.0)
+    assert went == steps
+
+
+def test_an_approach_that_meets_nothing_ends_at_its_bound() -> None:
+    went: list[float] = []
+    with pytest.raises(NoTouch, match=r"no touch after an approach of 2.5e[+]03 mm; look"):
+        approach(lambda: False, went.append, 1.0, 2.5, "look")
+    assert went == [1.0, 2.0]
+
+
+BOX = Workspace(lower=(-1.0, -1.0, -1.0), upper=(1.0, 1.0, 1.0))
+
+
+def limits(depth: float | None = None, shear: float | None = None) -> ArmLimits:
+    return ArmLimits(workspace=BOX, depth=depth, shear=shear)
+
+
+def sensors(height: bool = True, flow: bool = True) -> dict[str, SensorSpec]:
+    return {name: SensorSpec((4, 4), height, flow, name) for name in ("lower", "upper")}
+
+
+def touch(depth: float, drag: float, hidden: float = 0.0, time: float = 0.0) -> TactileObservation:
+    height = np.zeros((4, 4), np.float32)
+    valid = np.ones((4, 4), bool)
+    height[1, 1], height[3, 3], valid[3, 3] = depth, hidden, False
+    flow = np.zeros((2, 2, 2), np.float32)
+    flow[0, 1] = (0.6 * drag, -0.8 * drag)
+    flow[1, 1] = np.nan  # a marker that was lost
+    image = np.zeros((4, 4, 3), np.uint8)
+    return TactileObservation(
+        image,
+        gradient=np.zeros((4, 4, 2), np.float32),
+        height=height,
+        contact=valid,
+        valid=valid,
+        flow=flow,
+        time=time,
+        age=0.0,
+    )
+
+
+def blind() -> TactileObservation:
+    seen = touch(0.0, 0.0)
+    return TactileObservation(
+        seen.image, gradient=None, height=None, contact=seen.contact, valid=seen.valid, flow=None, time=0.0, age=0.0
+    )
+
+
+def test_a_gel_pressed_or_dragged_too_far_ends_the_episode() -> None:
+    watch = GelMonitor(sensors(), {"upper": limits(1e-3, 0.5e-3)}, {})
+    good = touch(0.9e-3, 0.4e-3, hidden=5e-3)
+    watch({"lower": touch(3e-3, 3e-3), "upper": good})  # nothing was said of the lower arm
+    with pytest.raises(LimitExceeded, match=r"sensor 'upper': depth 1\.1 mm, limits\.depth of arm 'upper' is 1 mm"):
+        watch({"lower": good, "upper": touch(1.1e-3, 0.0)})
+    with pytest.raises(LimitExceeded, match=r"shear 0\.6 mm"):
+        watch({"lower": good, "upper": touch(0.0, 0.6e-3)})
+
+
+def test_what_is_watched_and_cannot_be_seen_is_too_much() -> None:
+    watch = GelMonitor(sensors(), {"upper": limits(depth=1e-3)}, {})
+    with pytest.raises(LimitExceeded, match=r"depth is not measured"):
+        watch({"lower": touch(0.0, 0.0), "upper": blind()})
+
+
+def test_arms_are_told_before_anything_is_raised() -> None:
+    told: dict[str, GelReading] = {}
+    tell = {name: lambda shown, name=name: told.__setitem__(name, shown) for name in ("lower", "upper")}
+    watch = GelMonitor(sensors(), {"lower": limits(depth=1e-3)}, tell)
+    with pytest.raises(LimitExceeded):
+        watch({"lower": touch(2e-3, 1e-4, time=5.0), "upper": touch(3e-4, 2e-4, time=4.0)})
+    assert told["lower"].depth == pytest.approx(2e-3)
+    assert told["upper"].shear == pytest.approx(2e-4)
+    assert told["lower"].exposed == told["upper"].exposed == 4.0  # the oldest picture of the rig
+    watch({"lower": touch(1e-4, 0.0), "upper": blind()})
+    assert math.isnan(told["upper"].depth)
+
+
+def test_a_limit_that_no_sensor_can_tell_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"arms\.upper\.limits\.depth: sensor 'upper' does not measure it"):
+        GelMonitor(sensors(height=False), {"upper": limits(depth=1e-3)}, {})
+    with pytest.raises(ValueError, match=r"arms\.lower\.limits\.shear"):
+        GelMonitor(sensors(flow=False), {"lower": limits(shear=1e-3)}, {})
+
 
 STIFFNESS, LOAD, LONGEST = 3e3, 2.0, 0.2e-3  # [N/m], [N], [m]
 

@@ -29,11 +29,10 @@ from calibration.lens.rectification import (
 )
 from calibration.markers.flow import NoMarkers, marker_flow, view_of_dots
 from tacsim.interface import Image
-from tacsim.models.geometry import PictureRegion, SensorGeometry
 from tacsim.models.hardware import CameraSensorConfig
 from tacsim.models.photometric import PhotometricModel
 from tacsim.models.rig import ReplaySensorConfig
-from tacsim.models.sensor import CanonicalGrid, SensorModel
+from tacsim.models.sensor import CanonicalGrid, PictureRegion, SensorGeometry, SensorModel
 from tacsim.optics.grid import PixelGrid, canonical_image
 
 

@@ -29,6 +29,8 @@ from calibration.tuning import (
 )
 from tacsim.interface import Float32, Mask
 
+PIXEL_STRIDE = 5  # of the measured pixels
+
 
 class UnusableReference(ValueError):
     """A reference image cannot be used for measurements."""
@@ -140,9 +142,6 @@ def _block_pattern(image: Float32, valid: Mask) -> Float32:
     """(n, 3) brightness of each block of the gel in each colour, relative to the mean."""
     parts = _block_levels(image, valid)
     return np.asarray(parts / parts.mean(axis=0) - 1.0, dtype=np.float32)
-
-
-PIXEL_STRIDE = 5  # of the measured pixels
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -27,6 +27,9 @@ from tacsim.models.sensor import Lighting, SensorModel
 from tacsim.optics.render import phong_shading, untouched_image
 
 TABLE_CELLS = 48  # along each colour
+DEGREE = 3
+TERMS = 56
+COLOUR_SCALE = 2.4  # brings changes of colour to about -2..2, the size of x and y
 
 
 class GradientModel(Protocol):
@@ -150,10 +153,6 @@ def _maximum_likelihood_slope(
     nearest_known = np.ravel_multi_index(tuple(where.reshape(3, -1)), (TABLE_CELLS, TABLE_CELLS, TABLE_CELLS))
     return np.asarray(index, dtype=np.intp)[nearest_known], np.asarray(off_gamut)
 
-
-DEGREE = 3
-TERMS = 56
-COLOUR_SCALE = 2.4  # brings changes of colour to about -2..2, the size of x and y
 
 Weight = Annotated[float, Field(allow_inf_nan=False)]
 

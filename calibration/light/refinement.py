@@ -21,6 +21,8 @@ from calibration.light.tuning import FIRST_THINNESS, MAX_ALTERNATIVE_COST, MAX_R
 from tacsim.interface import FloatArray
 from tacsim.models.photometric import Floats, horizon_slope, shadow_terms
 
+MAX_GROUPS = 8  # that are left out in turn to estimate the uncertainty of radii
+
 
 @dataclass(frozen=True, slots=True)
 class DentShade:
@@ -117,9 +119,6 @@ def _downsample_window(window: Window) -> Window:
     pixels_of_press = 600  # of each press, approximately, for the positions of lamps
     keep = slice(None, None, max(1, len(window.u) // pixels_of_press))
     return Window(window.u[keep], window.v[keep], window.change[keep])
-
-
-MAX_GROUPS = 8  # that are left out in turn to estimate the uncertainty of radii
 
 
 @dataclass(frozen=True, slots=True)

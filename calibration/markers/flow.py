@@ -35,8 +35,7 @@ from calibration.markers.tracker import DotTracker
 from calibration.markers.tuning import MAX_EXTRA_SHARE, MAX_MISSING, MIN_PRESENT_SHARE, MIN_VISIBLE_SHARE
 from calibration.reference import UnusableReference
 from tacsim.interface import Float32, FloatArray, Image, Mask
-from tacsim.models.geometry import PictureRegion
-from tacsim.models.sensor import CanonicalGrid, Markers, SensorGeometry
+from tacsim.models.sensor import CanonicalGrid, Markers, PictureRegion, SensorGeometry
 from tacsim.optics.grid import PixelGrid, canonical_image
 from tacsim.optics.tuning import MIN_RADIUS
 

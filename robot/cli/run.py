@@ -225,7 +225,7 @@ def _run_steps(
     """Runs the episode with a progress bar; returns it and the error that ended it early ("" without an error)."""
     from robot.deploy.control_loop import EpisodeFailed, run_episode
     from robot.deploy.policy import describe_outside
-    from tacsim.record.step_info import TRAINING_DISTANCE
+    from tacsim.record.episode import TRAINING_DISTANCE
 
     is_reported = False
 

@@ -17,6 +17,10 @@ from typing import Protocol
 from robot.common.process import ProcessPool
 from tacsim.geometry.tiles import share_tiles
 
+PIECES_PER_WORKER = 2  # pieces for each worker that are queued or being made
+# set to 1 in each worker, because there is a worker for each core
+ONE_THREAD = ("TACSIM_THREADS", "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS")
+
 
 class SetError(ValueError):
     """A set cannot be started or continued."""
@@ -70,9 +74,6 @@ class Seconds:
         self.by_part[part] = self.by_part.get(part, 0.0) + seconds
 
 
-PIECES_PER_WORKER = 2  # pieces for each worker that are queued or being made
-# set to 1 in each worker, because there is a worker for each core
-ONE_THREAD = ("TACSIM_THREADS", "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS")
 Stop = Callable[[], bool]
 
 

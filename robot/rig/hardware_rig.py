@@ -18,7 +18,7 @@ from tacsim.interface import Normaliser, Pose, RigSpec, SensorSpec, TactileSourc
 from tacsim.models.driver import ArmDriver, Companion, SensorDriver
 from tacsim.models.hardware import ArmLimits
 from tacsim.models.rig import RigConfig
-from tacsim.record.step_info import ALIGNMENT, LIMITS_HIT
+from tacsim.record.episode import ALIGNMENT, LIMITS_HIT
 from tacsim.rig import Rig
 
 Confirm = Callable[[str], bool]

@@ -27,8 +27,7 @@ from tacsim.config import LoadedRig, load_rig
 from tacsim.interface import RigSpec
 from tacsim.models.randomisation import Randomisation
 from tacsim.models.training import Training
-from tacsim.record.episode import Episode
-from tacsim.record.step_info import TACTILE_DISTANCE
+from tacsim.record.episode import TACTILE_DISTANCE, Episode
 from tacsim.rig import Rig
 from tacsim.tasks import make_task
 

@@ -10,11 +10,10 @@ from pydantic import ConfigDict, Field, GetCoreSchemaHandler, model_validator
 from pydantic_core import CoreSchema, PydanticCustomError
 
 from tacsim.models.driver import installed_drivers
-from tacsim.models.geometry import PictureRegion
 from tacsim.models.hardware import ArmConfig, ArmLimits, KeepOut, Name, Placement, ResetConfig, SensorConfig
 from tacsim.models.quantity import Config, Force, Length, Speed, Time
 from tacsim.models.scene import Scene
-from tacsim.models.sensor import CanonicalGrid, SensorModel
+from tacsim.models.sensor import CanonicalGrid, PictureRegion, SensorModel
 
 Delay = Annotated[int, Field(ge=0, le=20)]
 

@@ -16,8 +16,7 @@ if TYPE_CHECKING:
     from calibration.light.checks.verdict import KnownScale
     from calibration.light.fit import LightFit
     from calibration.profiles import SensorProfile
-    from tacsim.models.geometry import PictureRegion
-    from tacsim.models.sensor import CameraNoise, Markers
+    from tacsim.models.sensor import CameraNoise, Markers, PictureRegion
 
 UNKNOWN = "unknown"  # serial number of a sensor without a given name
 FRAMES = "frames"  # folder in a bundle with its camera images

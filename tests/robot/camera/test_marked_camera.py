@@ -23,9 +23,8 @@ from tacsim.optics.render import Renderer
 from tacsim.optics.surface import surface_map
 from tacsim.record.reader import read_episode
 from tacsim.record.writer import Recorder
-from tacsim.report.diagnostics import sensor_diagnostics
 from tacsim.report.report import summarise, summary_table
-from tacsim.report.series import Series
+from tacsim.report.series import Series, sensor_diagnostics
 from tacsim.rig import Rig
 from tacsim.tasks.grip import Grip
 from tests.tacsim.optics.surfaces import dent, flat

@@ -40,6 +40,9 @@ from robot.mock.ur.machine.state import SAFETY_BITS, MachineState, Mode, Runtime
 from robot.mock.ur.machine.user_script import CompileError
 from tacsim.interface import FloatArray
 
+POWER_UP = 50  # periods from power on to idle
+SLIDER_RATE = 5.0  # maximum rate of change of the speed scaling [1/s]
+
 
 def make_program(machine: MachineState, text: str) -> Program:
     """Makes the program of a text. Raises ProgramError if it cannot be compiled."""
@@ -79,10 +82,6 @@ def _run_command(program: Program, command: int) -> MotionSteps:
     known = COMMANDS.get(command)
     if known is not None and known.needs in program.text:
         yield from known.work(program) or ()
-
-
-POWER_UP = 50  # periods from power on to idle
-SLIDER_RATE = 5.0  # maximum rate of change of the speed scaling [1/s]
 
 
 class Machine(MachineState):

@@ -20,6 +20,8 @@ from tacsim.models.text import printable_line
 if TYPE_CHECKING:
     from tacsim.models.hardware import Model  # pydantic and SciPy: half a second of start-up
 
+REGISTERS = 48  # of each kind and direction
+
 
 class Mode(IntEnum):
     """robot_mode of the RTDE."""
@@ -86,9 +88,6 @@ def parse_version(text: str) -> Version:
         raise ValueError(f"a version of PolyScope is like 5.11 or 5.11.0.108150, got '{text[:40]}'")
     numbers = [int(number) for number in text.split(".")]
     return check_version([*numbers, *[0] * (4 - len(numbers))])
-
-
-REGISTERS = 48  # of each kind and direction
 
 
 class Outputs:

@@ -21,6 +21,8 @@ HEADER = struct.Struct(">HB")
 PROTOCOL, VERSION, MESSAGE, DATA = ord("V"), ord("v"), ord("M"), ord("U")
 OUTPUT_RECIPE, INPUT_RECIPE, START, PAUSE = ord("O"), ord("I"), ord("S"), ord("P")
 MAX_NAMES = 2048  # of one recipe (manual of PolyScope X 10.10, chapter RTDE, which does not give the reaction) [bytes]
+MAX_STORED_BYTES = 1 << 24  # of one controller; 1.5 minutes of a driver at 500 Hz [bytes]
+PACKAGE_OVERHEAD = 256  # of a stored package, in addition to its payload [bytes]
 
 
 class BadPackage(ValueError):
@@ -198,10 +200,6 @@ _HANDLERS: dict[int, Callable[[Session, bytes], bytes | None]] = {
     DATA: Session._data,
     MESSAGE: Session._message,
 }
-
-
-MAX_STORED_BYTES = 1 << 24  # of one controller; 1.5 minutes of a driver at 500 Hz [bytes]
-PACKAGE_OVERHEAD = 256  # of a stored package, in addition to its payload [bytes]
 
 
 class Inputs:

@@ -11,7 +11,7 @@ from contextlib import ExitStack
 
 import pytest
 
-from robot.common.loopback import loopback_host
+from robot.common import loopback_host
 from robot.mock.camera.camera import MockCamera
 from robot.mock.ur.handle import MockUR
 from robot.open import open_rig

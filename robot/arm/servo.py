@@ -26,9 +26,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from robot.arm.channel import CommandKind, WorkerConfig
+from robot.arm.channel import CommandKind, Record, WorkerConfig
 from robot.arm.following import FollowingMonitor, SpeedScaling, is_standing_still
-from robot.arm.shared_ring import Record
 from robot.arm.status import ArmStatus, is_healthy
 from robot.arm.trajectory import (
     PERIOD,

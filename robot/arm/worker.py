@@ -23,11 +23,10 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from robot.arm.channel import STATE, STATISTICS_PERIODS, Channel, WorkerConfig
+from robot.arm.channel import STATE, STATISTICS_PERIODS, Channel, Segment, WorkerConfig
 from robot.arm.confinement import TimeLimit, enable_time_limits, forbid_later_connections
-from robot.arm.controller.dashboard import Dashboard
+from robot.arm.connections import Dashboard
 from robot.arm.servo import Servo
-from robot.arm.shared_ring import Segment
 from robot.arm.start_servo import StartServo
 from robot.arm.status import ArmStatus, is_healthy
 from robot.arm.trajectory import PERIOD

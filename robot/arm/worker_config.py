@@ -6,9 +6,8 @@ import os
 from collections.abc import Sequence
 
 from robot.arm.channel import Partner, WorkerConfig
-from robot.common import MOCK_SERIAL
+from robot.common import MOCK_SERIAL, is_loopback
 from robot.common.kinematics import pose
-from robot.common.loopback import is_loopback
 from robot.errors import DeviceNotConnectedError
 from tacsim import pose as se3
 from tacsim.interface import FloatArray

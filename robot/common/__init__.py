@@ -1,7 +1,10 @@
-"""Names that drivers and mocks share, so that neither imports the other."""
+"""Names that drivers and mocks share, so that neither imports the other; and loopback addresses, which only this
+machine reaches: mocks listen on them."""
 
 from __future__ import annotations
 
+import ipaddress
+import os
 from abc import ABC, abstractmethod
 from typing import Self
 
@@ -19,3 +22,25 @@ class Closing(ABC):
 
     def __exit__(self, *exception: object) -> None:
         self.close()
+
+
+def is_loopback(host: str) -> bool:
+    """True for 127.x.y.z, ::1 and localhost; False for any other name, which may resolve to any machine."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host.lower().rstrip(".") == "localhost"
+
+
+def require_loopback(host: str, what: str, *, allow_network: bool) -> None:
+    """Raises ValueError for an address that other machines reach, unless the network is allowed."""
+    if not (allow_network or is_loopback(host)):
+        raise ValueError(
+            f"{what}: {host} is not a loopback address, so the whole network could take the mock for a real device; "
+            "use 127.x.y.z, or allow it with --allow-network (allow_network=True)"
+        )
+
+
+def loopback_host(number: int, room: int) -> str:
+    """A loopback address for this process only, `number` and `room` 1 to 254: parallel processes do not collide."""
+    return f"127.{room}.{os.getpid() % 250 + 1}.{number}"

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from robot.arm.channel import CommandKind
-from robot.arm.controller.rtde import ControllerReading, read_controller
+from robot.arm.connections import ControllerReading, read_controller
 from robot.arm.start_servo import path_rates, sensor_path
 from robot.arm.status import ArmStatus
 from robot.arm.ur import URArm

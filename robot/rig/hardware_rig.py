@@ -11,8 +11,7 @@ from robot.errors import DeviceError, SafetyViolation
 from robot.rig.clock import LockStep, WallClock
 from robot.rig.commanded_arm import CommandedArm
 from robot.rig.parts import arm_drivers, companion_class, sensor_drivers, start_companion
-from robot.rig.reset import HardwareReset
-from robot.rig.touch import ForceTouch, PictureTouch, TouchSensing
+from robot.rig.reset import ForceTouch, HardwareReset, PictureTouch, TouchSensing
 from tacsim.control import GelMonitor, load_controller
 from tacsim.interface import Normaliser, Pose, RigSpec, SensorSpec, TactileSource
 from tacsim.models.driver import ArmDriver, Companion, SensorDriver

@@ -16,7 +16,7 @@ from typing import Literal
 
 import numpy as np
 
-from robot.common.loopback import loopback_host
+from robot.common import loopback_host
 from robot.common.process import ProcessPool
 from robot.deploy.control_loop import EpisodeFailed, EpisodeSetup, run_episode
 from robot.deploy.onnx_policy import OnnxPolicy

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from robot.common import MOCK_SERIAL
-from robot.common.loopback import require_loopback
+from robot.common import MOCK_SERIAL, require_loopback
 from robot.common.process import END_TIMEOUT, Child
 from robot.errors import DeviceError
 from robot.mock.ur.fault_client import FAULT_PORT, FaultClient

@@ -26,7 +26,7 @@ from calibration.materials.fit import (
 from calibration.materials.tuning import COARSE_SIMULATION_ERROR
 from robot.studies.identify.recordings import Recordings
 from robot.studies.identify.simulation import Simulation, coarser, scene_with
-from robot.studies.identify.tuning import FIRST_FRICTION, FIRST_YIELD
+from robot.studies.tuning import FIRST_FRICTION, FIRST_YIELD
 from tacsim.interface import FloatArray
 from tacsim.models.material import elastic_constants
 from tacsim.models.scene import Scene

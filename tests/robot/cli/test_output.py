@@ -17,7 +17,7 @@ from rich.text import Text
 from robot.cli import app, errors
 from robot.cli.doctor import print_checks
 from robot.cli.output import SafeConsole, require_writable, show_table
-from robot.doctor.machine import Check
+from robot.doctor import Check
 from tacsim.interface import RigSpec, SensorSpec, TactileFrame
 from tacsim.record import schemas
 from tacsim.record.episode import EpisodeMeta, Step

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Self
 
-from robot.common.loopback import loopback_host
+from robot.common import loopback_host
 from robot.mock.ur.machine.program import COMMANDS
 from robot.mock.ur.wire.controller import DASHBOARD, RTDE, SCRIPTS
 from robot.mock.ur.wire.fields import FORMATS, INPUTS

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from robot.arm.controller.arm_placement import MAX_ZERO_FORCE, check_placement, measure_placement, pendant_pose
-from robot.arm.controller.rtde import ControllerReading, read_controller
+from robot.arm.connections import ControllerReading, read_controller
+from robot.arm.examine import MAX_ZERO_FORCE, check_placement, measure_placement, pendant_pose
 from robot.arm.ur import URArm
 from robot.camera.driver import CameraDriver
 from robot.common.kinematics import Kinematics, matrix, pose
 from robot.common.tcp import ArmFrames
-from robot.doctor.rig import check_keep_out, examine_rig
+from robot.doctor import check_keep_out, examine_rig
 from robot.errors import DeviceNotConnectedError
 from robot.fixtures import mock_host
 from robot.mock import MockUR

@@ -198,7 +198,7 @@ def processors() -> list[Check]:
 
 def realtime() -> list[Check]:
     """Whether the processes that control arms may use real-time priority."""
-    from robot.common.realtime import is_realtime_allowed
+    from robot.common import is_realtime_allowed
 
     if is_realtime_allowed():
         return [Check("real-time priority", "ok", "allowed")]

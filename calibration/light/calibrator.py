@@ -26,8 +26,10 @@ from calibration.height.slopes import (
 from calibration.light.checks.consistency import find_blurred_presses, find_inconsistent_presses, find_reference_contact
 from calibration.light.darkness import find_dark_press, fit_darkness, is_direction_free
 from calibration.light.dent import NoCircle, dent_gradient, dent_height, max_dent_slope
-from calibration.light.fit import LightFit, PressPrediction, compare_with_prediction, normal_angle
-from calibration.light.labels import (
+from calibration.light.fit import (
+    LightFit,
+    PressPrediction,
+    compare_with_prediction,
     contact_and_skirt,
     counted_pixels,
     deepest_dent,
@@ -37,6 +39,7 @@ from calibration.light.labels import (
     inverse_equations,
     inverse_model,
     label_slopes,
+    normal_angle,
 )
 from calibration.light.photometry import SLOPE_TERMS, ModelSize, NormalEquations, choose_size, solve_weights
 from calibration.light.press import BallPress, Window, find_press, gaussian_blur, mean_reference_colour

@@ -28,7 +28,7 @@ MIN_CIRCLE_RADIUS = 4.0  # of a circle that differs from noise [px]
 MIN_EXPLAINED_SHARE = 0.7  # share of the difference that a ball's dent must explain
 MAX_CONTACT_RATIO = 0.98  # contact radius over the largest that a ball can have, from which a larger ball is tried
 
-# labels.py
+# fit.py
 FORWARD_BLUR = 0.8  # of the camera, and of what the forward model is fitted to [px]
 INVERSE_BLUR = 1.2  # of what the inverse is fitted to [px]
 RIM_MARGIN = 5.0  # added to contact and skirt for every radius [px]

@@ -25,7 +25,7 @@ class UrDriver(ArmDriver[UrArmConfig]):
         return None if self.config.mock is None else "robot.mock.cell.cell:MockCell"
 
     def require(self) -> None:
-        from robot.arm.worker_config import check_host
+        from robot.arm.channel import check_host
 
         check_host(self.config, self.name)
 

@@ -27,14 +27,16 @@ from dataclasses import replace
 import numpy as np
 
 from robot.arm.channel import CommandKind, Record, WorkerConfig
-from robot.arm.following import FollowingMonitor, SpeedScaling, is_standing_still
 from robot.arm.status import ArmStatus, is_healthy
 from robot.arm.trajectory import (
     PERIOD,
+    FollowingMonitor,
     MotionLimits,
     MotionState,
+    SpeedScaling,
     find_stopping_point,
     is_at_target,
+    is_standing_still,
     limit_speed,
     motion_at_rest,
     rotation_from_quaternion,

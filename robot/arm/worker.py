@@ -30,9 +30,9 @@ from robot.arm.servo import Servo
 from robot.arm.start_servo import StartServo
 from robot.arm.status import ArmStatus, is_healthy
 from robot.arm.trajectory import PERIOD
+from robot.common import WORKER_PRIORITY, request_realtime
 from robot.common.kinematics import Kinematics, displacement, matrix
 from robot.common.process import Parent, ParentMonitor
-from robot.common.realtime import WORKER, request_realtime
 from robot.errors import DeviceBusyError, DeviceError, DeviceNotConnectedError
 from tacsim.interface import FloatArray
 
@@ -376,7 +376,7 @@ def main() -> NoReturn:
     parent = Parent()  # the library prints
     enable_time_limits()
     config = WorkerConfig.from_dict(parent.receive())
-    realtime = config.realtime and request_realtime(WORKER)  # before the library starts its threads
+    realtime = config.realtime and request_realtime(WORKER_PRIORITY)  # before the library starts its threads
     try:
         worker = Worker(config)
         worker.record["realtime"] = realtime

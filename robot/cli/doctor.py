@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from robot.cli.bench import from_checkout, require_checkout
-from robot.cli.errors import print_error
 from robot.cli.options import HardwareRig, Overrides, complete_names
 from robot.cli.output import SafeConsole, busy, notes, print_json, results
-from robot.cli.terminal import Interrupt, ask_operator, has_operator
+from robot.cli.terminal import Interrupt, ask_operator, has_operator, print_error
 from tacsim.models.text import suggest_word
 
 if TYPE_CHECKING:

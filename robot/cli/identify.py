@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from robot.cli.errors import EXIT_USAGE, print_error
 from robot.cli.options import (
     OptionGroup,
     Out,
@@ -31,6 +30,7 @@ from robot.cli.output import (
     warn,
     writing,
 )
+from robot.cli.terminal import EXIT_USAGE, print_error
 
 if TYPE_CHECKING:
     from calibration.materials.fit import Noise

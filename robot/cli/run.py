@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from robot.cli.errors import EXIT_FAILED, print_error
 from robot.cli.options import TASK_POLICIES, Out, Overrides, complete_names
 from robot.cli.output import (
     Bar,
@@ -27,7 +26,7 @@ from robot.cli.output import (
     warn,
     writing,
 )
-from robot.cli.terminal import Interrupt, ask_operator, require_operator
+from robot.cli.terminal import EXIT_FAILED, Interrupt, ask_operator, print_error, require_operator
 
 if TYPE_CHECKING:
     from robot.deploy.control_loop import EpisodeSetup

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from robot.cli.errors import EXIT_UNTRUSTED, EXIT_UNVERIFIED
 from robot.cli.output import busy, notes, print_files, print_json, results, show_table, warn, writing
+from robot.cli.terminal import EXIT_UNTRUSTED, EXIT_UNVERIFIED
 
 if TYPE_CHECKING:
     from calibration.frame_set import FrameSet

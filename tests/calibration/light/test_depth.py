@@ -7,8 +7,7 @@ import pytest
 
 from calibration.light.calibrator import calibrate_light
 from calibration.light.dent import ContactCircle
-from calibration.light.fit import LightFit
-from calibration.light.labels import counted_pixels
+from calibration.light.fit import LightFit, counted_pixels
 from calibration.light.photometry import SLOPE_TERMS, ModelSize
 from calibration.light.press import BallPress, gaussian_blur
 from tacsim.models.photometric import DEPTH_TERMS, PhotometricLight, image_grid_places

@@ -15,9 +15,9 @@ import pytest
 
 from robot.arm import channel, worker
 from robot.arm.channel import Channel, WorkerConfig
+from robot.arm.channel import make_worker_config as config_of
 from robot.arm.status import ArmStatus
 from robot.arm.trajectory import PERIOD
-from robot.arm.worker_config import make_worker_config as config_of
 from robot.mock import MOCK_SERIAL, MockUR
 from tacsim.models.hardware import ArmLimits, MockArmConfig, Placement, UrArmConfig, Workspace
 from tests.robot.arm.mocked import HOST

@@ -15,18 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.tuning import (
-    CONTACT_BLUR,
-    MAX_EXCHANGED_RATIO,
-    MAX_SAME_CHANGE,
-    MAX_SATURATED_SHARE,
-    MAX_UNTOUCHED_CHANGE,
-    MIN_CONTACT_CHANGE,
-    MIN_MEAN_LEVEL,
-    MIN_SWAPPED_CHANGE,
-    MIN_UNTOUCHED_SHARE,
-    SATURATED_LEVEL,
-)
+from calibration import tuning
 from tacsim.interface import Float32, Mask
 
 PIXEL_STRIDE = 5  # of the measured pixels
@@ -84,17 +73,17 @@ def make_reference(
     if not np.isfinite(gel).all():
         raise UnusableReference("reference is not finite")
     mean = gel.mean(axis=0)
-    if (mean < MIN_MEAN_LEVEL).any():
+    if (mean < tuning.MIN_MEAN_LEVEL).any():
         levels = ", ".join(f"{level:.1f}" for level in mean)
         raise UnusableReference(
-            f"reference is dark: mean R, G, B over the gel {levels}, at least {MIN_MEAN_LEVEL:g} each; are the "
+            f"reference is dark: mean R, G, B over the gel {levels}, at least {tuning.MIN_MEAN_LEVEL:g} each; are the "
             "sensor's lights on, and is the exposure right?"
         )
-    saturated = float((gel >= SATURATED_LEVEL).any(axis=1).mean())
-    if colour and saturated > MAX_SATURATED_SHARE:
+    saturated = float((gel >= tuning.SATURATED_LEVEL).any(axis=1).mean())
+    if colour and saturated > tuning.MAX_SATURATED_SHARE:
         raise UnusableReference(
-            f"reference is saturated on {saturated:.1%} of the gel, at most {MAX_SATURATED_SHARE:.0%}: shorten the "
-            "exposure or dim the lights"
+            f"reference is saturated on {saturated:.1%} of the gel, at most {tuning.MAX_SATURATED_SHARE:.0%}: shorten "
+            "the exposure or dim the lights"
         )
     mean = mean.astype(np.float32)
     scale = np.where(valid[..., None], 1.0 / mean, 0.0).astype(np.float32)
@@ -110,7 +99,7 @@ def is_channel_order_swapped(image: Float32, known: Float32, valid: Mask) -> boo
     one, other = (_block_pattern(picture, valid) for picture in (image, known))
     apart = float(np.sqrt(((one - other) ** 2).mean()))
     exchanged_apart = float(np.sqrt(((one[:, ::-1] - other) ** 2).mean()))
-    return apart > MAX_SAME_CHANGE and exchanged_apart < MAX_EXCHANGED_RATIO * apart
+    return apart > tuning.MAX_SAME_CHANGE and exchanged_apart < tuning.MAX_EXCHANGED_RATIO * apart
 
 
 def is_contact_image_swapped(image: Float32, known: Float32, valid: Mask) -> bool:
@@ -125,7 +114,7 @@ def is_contact_image_swapped(image: Float32, known: Float32, valid: Mask) -> boo
     apart, swapped = (
         float(np.median((np.abs(levels - wanted) / mean).max(axis=1))) for levels in (seen * gain, seen[:, ::-1])
     )
-    return apart > MIN_SWAPPED_CHANGE and swapped < MAX_EXCHANGED_RATIO * apart
+    return apart > tuning.MIN_SWAPPED_CHANGE and swapped < tuning.MAX_EXCHANGED_RATIO * apart
 
 
 def _block_levels(image: Float32, valid: Mask) -> Float32:
@@ -192,8 +181,8 @@ class DriftFinder:
         measured = False
         for _ in range(2):
             rest = np.abs(seen - np.einsum("ni,ic->cn", self._few, weights))
-            untouched = on_gel & (np.maximum(np.maximum(rest[0], rest[1]), rest[2]) < MAX_UNTOUCHED_CHANGE)
-            measured = bool(untouched.mean() >= MIN_UNTOUCHED_SHARE)
+            untouched = on_gel & (np.maximum(np.maximum(rest[0], rest[1]), rest[2]) < tuning.MAX_UNTOUCHED_CHANGE)
+            measured = bool(untouched.mean() >= tuning.MIN_UNTOUCHED_SHARE)
             if not measured:
                 break
             terms = self._few[untouched].astype(np.float64)
@@ -237,7 +226,7 @@ def contact_area(change: Float32, ignored: NDArray[np.bool_], pitch: float) -> f
     find = DriftFinder(ignored.shape)
     find.remove(planes, find(planes, ignored))
     planes[:, ignored] = 0.0
-    smooth = [cv2.GaussianBlur(plane, (0, 0), CONTACT_BLUR) for plane in planes]
-    strong = (np.abs(smooth).max(axis=0) > MIN_CONTACT_CHANGE) & ~ignored
+    smooth = [cv2.GaussianBlur(plane, (0, 0), tuning.CONTACT_BLUR) for plane in planes]
+    strong = (np.abs(smooth).max(axis=0) > tuning.MIN_CONTACT_CHANGE) & ~ignored
     _, _, stats, _ = cv2.connectedComponentsWithStats(strong.astype(np.uint8))
     return float(stats[1:, cv2.CC_STAT_AREA].max(initial=0)) * pitch**2

@@ -30,13 +30,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.light.tuning import (
-    MAX_CONTACT_RATIO,
-    MAX_RADIUS_RATIO,
-    MAX_RIM_RATIO,
-    MIN_CIRCLE_RADIUS,
-    MIN_EXPLAINED_SHARE,
-)
+from calibration.light import tuning
 from tacsim.interface import FloatArray
 
 
@@ -140,7 +134,7 @@ def depth_profile(radii: FloatArray, contact: float, ball: float, thickness: flo
 def cached_profile(contact: float, ball: float, thickness: float) -> tuple[FloatArray, FloatArray]:
     """Radii up to FAR ball radii and the depth of a dent there [px]; cached, so do not write to them."""
     depth_step = 1.0  # of those at which the depth is found [px]
-    radii = np.arange(0.0, MAX_RADIUS_RATIO * ball, depth_step)
+    radii = np.arange(0.0, tuning.MAX_RADIUS_RATIO * ball, depth_step)
     return radii, depth_profile(radii, contact, ball, thickness)
 
 
@@ -202,18 +196,18 @@ def find_contact_circle(image: NDArray[np.uint8], reference: NDArray[np.uint8], 
     rows = np.arange(max(round(y) - window, 0), min(round(y) + window + 1, image.shape[0]))
     observed = np.ascontiguousarray(difference[np.ix_(rows, columns)].reshape(-1, 3).T)
     circle = _fit_circle(observed, columns, rows, (x, y, size), ball_radius)
-    if circle.explained_share >= MIN_EXPLAINED_SHARE and circle.radius >= MIN_CIRCLE_RADIUS:
+    if circle.explained_share >= tuning.MIN_EXPLAINED_SHARE and circle.radius >= tuning.MIN_CIRCLE_RADIUS:
         return circle
-    if circle.radius > MAX_CONTACT_RATIO * MAX_RIM_RATIO * ball_radius:
+    if circle.radius > tuning.MAX_CONTACT_RATIO * tuning.MAX_RIM_RATIO * ball_radius:
         larger = _fit_circle(observed, columns, rows, (x, y, size), 2 * ball_radius)
-        if larger.explained_share >= MIN_EXPLAINED_SHARE:
+        if larger.explained_share >= tuning.MIN_EXPLAINED_SHARE:
             raise NoCircle(
                 "the contact is wider than the ball can be: pixel pitch or the ball's radius is wrong (or no ball was "
                 "pressed)"
             )
     raise NoCircle(
         f"no ball's contact is seen: a dent explains {max(circle.explained_share, 0.0):.0%} of the difference to the "
-        f"image without contact, {MIN_EXPLAINED_SHARE:.0%} are needed"
+        f"image without contact, {tuning.MIN_EXPLAINED_SHARE:.0%} are needed"
     )
 
 
@@ -228,10 +222,10 @@ def _fit_circle(
     from scipy.optimize import minimize
 
     power = float((observed**2).sum()), float(((observed - observed.mean(axis=1, keepdims=True)) ** 2).sum())
-    largest = MAX_RIM_RATIO * ball
+    largest = tuning.MAX_RIM_RATIO * ball
 
     def residual_share(guess: FloatArray) -> float:
-        if not MIN_CIRCLE_RADIUS / 2 < guess[2] < largest:
+        if not tuning.MIN_CIRCLE_RADIUS / 2 < guess[2] < largest:
             return 2.0
         return _residual_share(observed, power, columns - guess[0], rows - guess[1], float(guess[2]), ball)
 

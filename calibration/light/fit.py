@@ -13,6 +13,7 @@ import numpy as np
 from calibration.bundle import Calibration, Provenance, Residual
 from calibration.height.slopes import InverseModel, fit_inverse, inverse_features, normal_of_slope
 from calibration.lens.view import GelView
+from calibration.light import tuning
 from calibration.light.dent import ContactCircle, cached_profile, dent_gradient, dent_height
 from calibration.light.photometry import (
     MAX_SIZE,
@@ -26,16 +27,6 @@ from calibration.light.photometry import (
 from calibration.light.press import BallPress, gaussian_blur
 from calibration.light.press_shapes import Stretch
 from calibration.light.refinement import DentShade, RefinedGeometry
-from calibration.light.tuning import (
-    DEEP_SLOPE_SCALE,
-    FORWARD_BLUR,
-    INVERSE_BLUR,
-    MAX_FEW_PRESSES,
-    RIM_BLUR,
-    RIM_MARGIN,
-    SKIRT_RADIUS,
-    UNTOUCHED_RADIUS,
-)
 from tacsim.interface import Float32, FloatArray, Image, Mask, short_repr
 from tacsim.models.photometric import (
     CastShadows,
@@ -54,7 +45,7 @@ Rows = tuple[tuple[float, float, float], ...]  # weights of R, G, B, one row for
 def label_slopes(press: BallPress, refined: RefinedGeometry, ball: float) -> FloatArray:
     """(H, W, 2) reference slopes."""
     v, u = np.mgrid[: press.shape[0], : press.shape[1]].astype(np.float64)
-    return dent_gradient(u, v, press.circle, refined.thickness, ball, RIM_BLUR)
+    return dent_gradient(u, v, press.circle, refined.thickness, ball, tuning.RIM_BLUR)
 
 
 def deepest_dent(refined: RefinedGeometry, ball: float) -> float:
@@ -71,7 +62,7 @@ def extra_forward_terms(
     height = dent_height(u, v, press.circle, refined.thickness, ball)
     places = np.meshgrid(*image_axes(press.shape[1], press.shape[0]))
     terms = depth_terms(height, deepest_dent(refined, ball), *places)
-    slopes = DEEP_SLOPE_SCALE * terms[0] * normal_terms(gradient, MAX_SIZE[0])
+    slopes = tuning.DEEP_SLOPE_SCALE * terms[0] * normal_terms(gradient, MAX_SIZE[0])
     deep = np.ascontiguousarray(np.moveaxis(np.concatenate([terms, slopes]), 0, -1), dtype=np.float64)
     if shade is None:
         return deep
@@ -81,7 +72,7 @@ def extra_forward_terms(
 
 def contact_and_skirt(press: BallPress) -> Mask:
     """(H, W) contact and skirt."""
-    return np.asarray(press.distance() < SKIRT_RADIUS * press.circle.radius + RIM_MARGIN)
+    return np.asarray(press.distance() < tuning.SKIRT_RADIUS * press.circle.radius + tuning.RIM_MARGIN)
 
 
 def _image_places(mask: Mask) -> tuple[FloatArray, FloatArray]:
@@ -96,7 +87,7 @@ def forward_equations(
 ) -> NormalEquations:
     """counted: (H, W, 3) used values; None: those that are not saturated."""
     near = contact_and_skirt(press)
-    change = gaussian_blur(press.change, FORWARD_BLUR)[near]
+    change = gaussian_blur(press.change, tuning.FORWARD_BLUR)[near]
     lit = press.lit if counted is None else counted
     return normal_equations(gradient[near], *_image_places(near), change, lit[near], extra_terms[near])
 
@@ -110,7 +101,7 @@ def counted_pixels(
     where = contact_and_skirt(press) & ~press.lit.all(axis=2)
     light = photometric_features(gradient[where], *_image_places(where), *MAX_SIZE)
     said = np.concatenate([light, extra_terms[where]], axis=1)[:, terms_of(size)] @ weights
-    seen = gaussian_blur(press.change, FORWARD_BLUR)[where]
+    seen = gaussian_blur(press.change, tuning.FORWARD_BLUR)[where]
     counted[where] |= (seen > 0) & (said < seen)
     return counted
 
@@ -118,13 +109,13 @@ def counted_pixels(
 def _inverse_terms(press: BallPress, where: Mask) -> FloatArray:
     """(n, terms) of the inverse at the pixels of a mask (H, W)."""
     u, v = _image_places(where)
-    return inverse_features(gaussian_blur(press.change, INVERSE_BLUR)[where], 2 * u, 2 * v)
+    return inverse_features(gaussian_blur(press.change, tuning.INVERSE_BLUR)[where], 2 * u, 2 * v)
 
 
 def inverse_equations(press: BallPress, gradient: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Normal equations from contact and skirt, and from a tenth as many untouched pixels, whose slope is 0."""
     v, u = np.mgrid[: press.shape[0], : press.shape[1]]
-    near, far = contact_and_skirt(press), press.distance() > UNTOUCHED_RADIUS * press.circle.radius
+    near, far = contact_and_skirt(press), press.distance() > tuning.UNTOUCHED_RADIUS * press.circle.radius
     far &= (u + 7 * v) % max(1, round(10 * int(far.sum()) / max(int(near.sum()), 1))) == 0
     target = np.where(far[..., None], 0.0, normal_of_slope(gradient))
     terms = _inverse_terms(press, near | far)
@@ -143,20 +134,23 @@ def forward_model(
     if shade is not None and size.shadows:
         shadows = CastShadows(lamps=shade.lamps, weights=weights[dark:])
     return PhotometricModel(
-        degree=size.degree, position=size.position, weights=weights[:light], steepest=steepest, blur=FORWARD_BLUR,
-        shadows=shadows, depth=_depth_colour(deepest, weights[light:slopes], weights[slopes:dark]),
+        degree=size.degree, position=size.position, weights=weights[:light], steepest=steepest,
+        blur=tuning.FORWARD_BLUR, shadows=shadows,
+        depth=_depth_colour(deepest, weights[light:slopes], weights[slopes:dark]),
     )  # fmt: skip
 
 
 def _depth_colour(deepest: float, weights: Rows, slopes: Rows) -> DepthColour | None:
     if not weights:
         return None
-    unscaled = tuple((DEEP_SLOPE_SCALE * r, DEEP_SLOPE_SCALE * g, DEEP_SLOPE_SCALE * b) for r, g, b in slopes)
+    unscaled = tuple(
+        (tuning.DEEP_SLOPE_SCALE * r, tuning.DEEP_SLOPE_SCALE * g, tuning.DEEP_SLOPE_SCALE * b) for r, g, b in slopes
+    )
     return DepthColour(deepest=deepest, weights=weights, slopes=unscaled)
 
 
 def inverse_model(sets: Sequence[tuple[FloatArray, FloatArray]], steepest: float) -> InverseModel:
-    weights = fit_inverse(sets, with_position=len(sets) > MAX_FEW_PRESSES)
+    weights = fit_inverse(sets, with_position=len(sets) > tuning.MAX_FEW_PRESSES)
     return InverseModel(weights=tuple((float(x), float(y)) for x, y in weights), steepest=steepest)
 
 
@@ -253,7 +247,7 @@ def compare_with_prediction(
     untouched_here = np.float64(reference) + press.drift  # what this frame would show without contact
     predicted = np.clip(untouched_here + predicted, 0.0, 255.0) - untouched_here
     real = press.change * mean
-    contact, far = distance < 1.5, distance > UNTOUCHED_RADIUS
+    contact, far = distance < 1.5, distance > tuning.UNTOUCHED_RADIUS
     return PressPrediction(
         press.name,
         press.circle,

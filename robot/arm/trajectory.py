@@ -23,17 +23,8 @@ from typing import Protocol
 
 import numpy as np
 
+from robot.arm import tuning
 from robot.arm.channel import WorkerConfig
-from robot.arm.tuning import (
-    MAX_PACKAGE_GAP,
-    MAX_REST_SPEED,
-    MAX_REST_TURN_RATE,
-    OTHER_PROGRAM_SHIFT,
-    OTHER_PROGRAM_SPEED,
-    SCALING_RATE,
-    SLOW_LAG_RATIO,
-    TARGET_DELAY,
-)
 from robot.common.kinematics import Kinematics, rotation_vector
 from robot.common.kinematics import rotation as turn
 from robot.common.tcp import ArmFrames, Measured
@@ -187,7 +178,7 @@ def rotation_from_quaternion(quaternion: FloatArray) -> FloatArray:
 
 # The target follows a rising scaling more slowly: an arm that starts while the scaling rises accelerates by both,
 # 1.45 times as much as its target.
-RISE_RATE = SCALING_RATE / 1.5
+RISE_RATE = tuning.SCALING_RATE / 1.5
 
 
 class SpeedScaling:
@@ -201,13 +192,13 @@ class SpeedScaling:
         scaling falls."""
         before = self.value
         change = min(1.0, max(0.0, reported)) - before
-        self.value += min(RISE_RATE * PERIOD, max(-SCALING_RATE * PERIOD, change))
+        self.value += min(RISE_RATE * PERIOD, max(-tuning.SCALING_RATE * PERIOD, change))
         return min(1.0, self.value / before) if before > 0.0 else 1.0
 
     def speed(self, speed: float, acceleration: float) -> float:
         """Maximum speed [m/s or rad/s] of a target. Below full scaling it is small enough that the arm stays within
         `acceleration` when the scaling rises at its full rate."""
-        return speed if self.value == 1.0 else self.value * min(speed, acceleration / SCALING_RATE)
+        return speed if self.value == 1.0 else self.value * min(speed, acceleration / tuning.SCALING_RATE)
 
 
 class FollowingMonitor:
@@ -229,7 +220,7 @@ class FollowingMonitor:
     def update(self, sent_joints: FloatArray | None, stamp: float, scaling: float) -> None:
         """Takes a new package with time `stamp` [s]. `sent_joints` (6,): the newest target; None: nothing is sent."""
         elapsed = stamp - self._last_stamp
-        elapsed = elapsed if 0.0 <= elapsed <= MAX_PACKAGE_GAP else PERIOD
+        elapsed = elapsed if 0.0 <= elapsed <= tuning.MAX_PACKAGE_GAP else PERIOD
         self._last_stamp = stamp
         if sent_joints is None:
             return
@@ -240,7 +231,7 @@ class FollowingMonitor:
         self._rest_time_constants = (
             self._rest_time_constants + scaling * elapsed / self._lookahead if is_resting else 0.0
         )
-        share = np.exp(-elapsed / (TARGET_DELAY + SLOW_LAG_RATIO * self._lookahead / max(scaling, 1e-3)))
+        share = np.exp(-elapsed / (tuning.TARGET_DELAY + tuning.SLOW_LAG_RATIO * self._lookahead / max(scaling, 1e-3)))
         self._expected_joints = sent_joints + share * (self._expected_joints - sent_joints)
         self._sent_joints = sent_joints
 
@@ -263,8 +254,8 @@ class FollowingMonitor:
         servoJ has settled: another program moves the arm."""
         if self._sent_joints is None or not self.has_settled:
             return False
-        is_moving = float(np.abs(target_speeds).max()) > OTHER_PROGRAM_SPEED
-        return is_moving or float(np.abs(target_joints - self._sent_joints).max()) > OTHER_PROGRAM_SHIFT
+        is_moving = float(np.abs(target_speeds).max()) > tuning.OTHER_PROGRAM_SPEED
+        return is_moving or float(np.abs(target_joints - self._sent_joints).max()) > tuning.OTHER_PROGRAM_SHIFT
 
 
 def _distance_to_segment(begin: FloatArray, end: FloatArray) -> float:
@@ -277,4 +268,4 @@ def _distance_to_segment(begin: FloatArray, end: FloatArray) -> float:
 def is_standing_still(measured: Measured) -> bool:
     """True if the measured speeds of the arm are those of rest."""
     twist = np.abs(measured.twist)
-    return bool(twist[:3].max() <= MAX_REST_SPEED and twist[3:].max() <= MAX_REST_TURN_RATE)
+    return bool(twist[:3].max() <= tuning.MAX_REST_SPEED and twist[3:].max() <= tuning.MAX_REST_TURN_RATE)

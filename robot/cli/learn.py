@@ -86,7 +86,7 @@ def train(
         if task is None:
             raise typer.BadParameter("name a task (squeeze, reposition, knead), or a run to continue (--resume)")
         from tacsim.config import load_model
-        from tacsim.models.training import Training
+        from tacsim.models.policy import Training
 
         training = load_model(Training, task, own)
         _require_logged(training.algorithm, tensorboard)
@@ -193,7 +193,7 @@ def policy_range(
         raise typer.BadParameter("--set changes a training file: name it with --training", param_hint="--set")
     from robot.train.measure_range import measure_range, write_range
     from tacsim.config import load_model
-    from tacsim.models.training import Training
+    from tacsim.models.policy import Training
 
     settings = None if training is None else load_model(Training, training, set_ or [])
     with one_bar("starting") as bar:
@@ -246,7 +246,7 @@ def evaluate(
     require_writable(file, "--json", new=True)
     from robot.train.evaluate import evaluate as evaluate_policies
     from tacsim.config import load_model
-    from tacsim.models.training import Training
+    from tacsim.models.policy import Training
 
     training = load_model(Training, task, set_ or [])
     played: dict[str, EvaluationResult] = {}

@@ -18,13 +18,13 @@ from typing import TYPE_CHECKING, cast
 from robot.common import CONTROLLER_PRIORITY, MOCK_SERIAL, request_realtime
 from robot.common.kinematics import MODELS
 from robot.common.process import write_message
+from robot.mock.ur.controller import Controller, ControllerConfig
 from robot.mock.ur.fault_client import FAULT_PORT
 from robot.mock.ur.fault_server import FaultServer
 from robot.mock.ur.handle import check_hosts
 from robot.mock.ur.machine.arm import HOME, PERIOD
 from robot.mock.ur.machine.forces import Mass
 from robot.mock.ur.machine.state import VERSION, parse_version, version_text
-from robot.mock.ur.wire.controller import Controller, ControllerConfig
 
 if TYPE_CHECKING:
     from tacsim.models.hardware import Model

@@ -25,8 +25,8 @@ from robot.open import open_rig
 from robot.train.evaluate import HELD_OUT_SEED_OFFSET, Interval, bootstrap_interval, wilson_interval
 from tacsim.config import LoadedRig, load_rig
 from tacsim.interface import RigSpec
+from tacsim.models.policy import Training
 from tacsim.models.randomisation import Randomisation
-from tacsim.models.training import Training
 from tacsim.record.episode import TACTILE_DISTANCE, Episode
 from tacsim.rig import Rig
 from tacsim.tasks import make_task

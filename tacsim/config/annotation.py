@@ -12,8 +12,7 @@ from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails, to_jsonable_python
 
-from tacsim.config.document import LoadState, Node
-from tacsim.config.errors import join_keys
+from tacsim.config.document import LoadState, Node, join_keys
 from tacsim.config.kinds import kind_of, shipped_names
 from tacsim.models.driver import refused_driver
 from tacsim.models.quantity import UNITS, Quantity, list_units

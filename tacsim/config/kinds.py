@@ -18,12 +18,12 @@ from pydantic_core import core_schema
 from tacsim.config.bundle import FILE, SENSORS_FOLDER, is_bundle, user_sensor_names
 from tacsim.models.driver import BASE_CLASSES, installed_drivers
 from tacsim.models.material import BodyMaterial, GelMaterial
+from tacsim.models.policy import Training
 from tacsim.models.randomisation import Randomisation
 from tacsim.models.rig import TASKS, RigConfig, rig_model, task_annotation
 from tacsim.models.scene import Scene
 from tacsim.models.sensor import SensorModel
 from tacsim.models.text import suggest_word
-from tacsim.models.training import Training
 
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_-]{0,99}")
 

@@ -15,10 +15,10 @@ from types import SimpleNamespace
 import pytest
 
 from robot.mock import FaultClient, FaultError, MockArms
-from robot.mock.ur.wire import rtde
-from robot.mock.ur.wire.connection import Connection
-from robot.mock.ur.wire.controller import Controller
-from robot.mock.ur.wire.rtde import MAX_NAMES, InputRecipe, Inputs, make_package
+from robot.mock.ur import rtde
+from robot.mock.ur.connection import Connection
+from robot.mock.ur.controller import Controller
+from robot.mock.ur.rtde import MAX_NAMES, InputRecipe, Inputs, make_package
 from tests.robot.mock.innocent import Innocent
 from tests.robot.mock.wire_client import TIMEOUT, ControlClient, RtdeClient, wire_host
 from tests.robot.waiting import until

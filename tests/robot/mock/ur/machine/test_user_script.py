@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from robot.mock import MockUR
+from robot.mock.ur import messages
 from robot.mock.ur.machine.arm import HOME, PERIOD
 from robot.mock.ur.machine.forces import Mass
-from robot.mock.ur.wire import messages
 from tests.robot.mock.machine_bench import Bench
 from tests.robot.mock.wire_client import TIMEOUT
 

@@ -13,9 +13,9 @@ from dataclasses import dataclass, field
 from itertools import islice
 
 from robot.mock.ur.fault_client import Input
+from robot.mock.ur.fields import FORMATS, INPUTS, OUTPUTS, Output, Value
 from robot.mock.ur.machine.arm import PERIOD
 from robot.mock.ur.machine.machine import Machine
-from robot.mock.ur.wire.fields import FORMATS, INPUTS, OUTPUTS, Output, Value
 
 HEADER = struct.Struct(">HB")
 PROTOCOL, VERSION, MESSAGE, DATA = ord("V"), ord("v"), ord("M"), ord("U")

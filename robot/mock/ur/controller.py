@@ -18,14 +18,14 @@ import numpy as np
 
 from robot.common import MOCK_SERIAL
 from robot.common.kinematics import JOINT_RANGE
+from robot.mock.ur import messages
+from robot.mock.ur.connection import Connection
+from robot.mock.ur.fields import apply_inputs
 from robot.mock.ur.machine.arm import HOME, PERIOD
 from robot.mock.ur.machine.forces import NO_MASS, Mass
 from robot.mock.ur.machine.machine import Machine
 from robot.mock.ur.machine.state import VERSION, Version
-from robot.mock.ur.wire import messages
-from robot.mock.ur.wire.connection import Connection
-from robot.mock.ur.wire.fields import apply_inputs
-from robot.mock.ur.wire.rtde import BadPackage, InputRecipe, Inputs, Session, take_packages
+from robot.mock.ur.rtde import BadPackage, InputRecipe, Inputs, Session, take_packages
 
 if TYPE_CHECKING:
     from tacsim.models.hardware import Model  # pydantic and SciPy: half a second of start-up

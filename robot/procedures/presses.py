@@ -87,9 +87,6 @@ class PressCollection:
         return place
 
 
-# presses.py
-
-
 @dataclass(frozen=True, slots=True)
 class BallPressPlan:
     ball: float  # radius [px of the metric picture]

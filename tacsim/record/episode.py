@@ -124,6 +124,7 @@ class Episode:
     dropped: int = 0  # steps that the recorder dropped
 
 
+# Keys of `Step.info`: numbers of a step in addition to frames, states and actions.
 # Before the name of an arm
 ALIGNMENT = "alignment_"  # time from its state to the nearest package [s]
 LIMITS_HIT = "limits_hit_"  # targets that were shortened or refused so far

@@ -31,7 +31,7 @@ def record(value: float) -> channel.Record:
 
 
 def child(code: str, segment: channel.Segment, *arguments: str) -> subprocess.Popen[str]:
-    text = "import sys, time, os, numpy as np\nfrom robot.arm import shared_ring\n" + textwrap.dedent(code)
+    text = "import sys, time, os, numpy as np\nfrom robot.arm import channel\n" + textwrap.dedent(code)
     return subprocess.Popen(
         [sys.executable, "-c", text, str(segment.descriptor), *arguments],
         pass_fds=[segment.descriptor],
@@ -64,7 +64,7 @@ def test_ring_100000_reads_have_no_torn_record(segment: channel.Segment) -> None
     writer = child(
         """
         record = np.dtype([("a", np.float64, 40), ("b", np.uint64)])
-        ring = shared_ring.Ring(shared_ring.Segment(int(sys.argv[1])).memory, record, 8)
+        ring = channel.Ring(channel.Segment(int(sys.argv[1])).memory, record, 8)
         value, made = 0, np.zeros((), record)
         print("writing", flush=True)
         while os.getppid() == int(sys.argv[2]):
@@ -117,8 +117,8 @@ def test_segment_is_freed_with_last_process() -> None:
     ring.write(record(7.0))
     assert all(path.endswith("(deleted)") for path in set(descriptors()) - set(before))
     code = """
-    held = shared_ring.Segment(int(sys.argv[1]))
-    ring = shared_ring.Ring(held.memory, np.dtype([("a", np.float64, 40), ("b", np.uint64)]), 8)
+    held = channel.Segment(int(sys.argv[1]))
+    ring = channel.Ring(held.memory, np.dtype([("a", np.float64, 40), ("b", np.uint64)]), 8)
     print(int(ring.latest()["b"]), flush=True)
     time.sleep(60)
     """
@@ -136,8 +136,8 @@ def test_segment_without_standard_streams_reaches_child() -> None:
     code = """
     import os
     os.closerange(0, 3)
-    from robot.arm import shared_ring
-    os._exit(shared_ring.create_segment(64).descriptor)
+    from robot.arm import channel
+    os._exit(channel.create_segment(64).descriptor)
     """
     done = subprocess.run([sys.executable, "-c", textwrap.dedent(code)], env={**os.environ, "PYTHONPATH": ROOT})
     assert done.returncode >= 3

@@ -10,7 +10,6 @@ import numpy as np
 from calibration.bundle import BadBundle, Calibration, read_bundle
 from calibration.errors import BadFrames
 from calibration.frame_normaliser import FrameNormaliser
-from calibration.height.integration import ForwardSteps
 from calibration.height.slopes import (
     DarknessSlopes,
     GradientModel,
@@ -19,7 +18,7 @@ from calibration.height.slopes import (
     inverse_of_light,
     table_of_model,
 )
-from calibration.height.surface_finder import SurfaceFinder, extended_view
+from calibration.height.surface_finder import ForwardSteps, SurfaceFinder, extended_view
 from calibration.lens.rectification import (
     Rectification,
     rectification_of_corners,

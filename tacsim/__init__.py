@@ -120,6 +120,6 @@ if TYPE_CHECKING:
     from tacsim.tasks import evaluate_outcome as evaluate_outcome
     from tacsim.tasks import make_task as make_task
     from tacsim.tasks import register_task as register_task
-    from tacsim.tasks.grip import Grip as Grip
+    from tacsim.tasks.squeeze import Grip as Grip
 else:
     __getattr__, __dir__ = public_names(__name__)

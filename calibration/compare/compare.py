@@ -17,7 +17,7 @@ import numpy as np
 
 from calibration.bundle import Calibration
 from calibration.compare import metrics
-from calibration.compare.alignment import Alignment, align_by_geometry, align_by_size, find_shift
+from calibration.compare.metrics import Alignment, align_by_geometry, align_by_size, find_shift
 from calibration.compare.scorer import (
     GRID,
     Numbers,

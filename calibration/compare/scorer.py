@@ -12,7 +12,7 @@ import numpy as np
 
 from calibration.bundle import Calibration
 from calibration.compare import metrics
-from calibration.compare.alignment import Alignment
+from calibration.compare.metrics import Alignment
 from calibration.compare.tuning import MIN_SWAPPED_GAIN
 from calibration.errors import BadFrames
 from calibration.frame_set import Frame, FrameSet, frame_warnings

@@ -11,11 +11,9 @@ MAX_COLOUR_DISTANCE = 0.2  # between a colour and the nearest that the light can
 MAX_TABLE_SLOPE = 1.5  # along each axis [-]
 MAX_EXTRAPOLATION = 1.1  # slopes reach up to this times the steepest calibrated one
 
-# integration.py
+# surface_finder.py
+MAX_INK_LEVEL = 0.6  # a printed dot is darker in all channels, relative to the mean of the gel [-]
 RIM_WIDTH = 0.5e-3  # width of the band along the border of the view that counts as untouched [m]
 PRIOR_WEIGHT = 0.4  # (error of colour that is usual / error of slope that is usual)^2
 MAX_CERTAIN_ERROR = 0.2  # error of colour above which a channel has little weight [-]
 MIN_CONTACT_CHANGE = 0.1
-
-# surface_finder.py
-MAX_INK_LEVEL = 0.6  # a printed dot is darker in all channels, relative to the mean of the gel [-]

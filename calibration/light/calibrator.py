@@ -16,13 +16,13 @@ from functools import partial
 import numpy as np
 
 from calibration.errors import BadFrames
-from calibration.height.integration import ForwardSteps, Integrator, slopes_of
 from calibration.height.slopes import (
     DarknessSlopes,
     InverseModel,
     PolynomialSlopes,
     normal_of_slope,
 )
+from calibration.height.surface_finder import ForwardSteps, Integrator, slopes_of
 from calibration.light import tuning
 from calibration.light.checks.consistency import find_blurred_presses, find_inconsistent_presses, find_reference_contact
 from calibration.light.darkness import find_dark_press, fit_darkness, is_direction_free

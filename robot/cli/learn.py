@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 TRAINING = ("torch", "stable_baselines3", "onnx", "onnxruntime")  # packages of the extra `train`
 export = typer.Typer(no_args_is_help=True, help="Write policies and recordings as files for others.")
 
+NewPolicyFile = Annotated[Path, typer.Option("--out", help="The file to be written, FILE.onnx; it must not exist.")]
+
 
 def train(
     task: Annotated[
@@ -149,7 +151,7 @@ def _run_training(run: RunFolder, tensorboard: bool) -> tuple[Path, list[Mapping
 
 def policy(
     run: Annotated[Path, typer.Argument(help="The folder of a training run, finished or not.")],
-    out: Annotated[Path, typer.Option("--out", help="The file to be written, FILE.onnx; it must not exist.")],
+    out: NewPolicyFile,
 ) -> None:
     """Write the policy of a training run as one ONNX file, which contains a description of its inputs and outputs.
 
@@ -170,7 +172,7 @@ def policy(
 
 def policy_range(
     policy: Annotated[Path, typer.Argument(help="A policy, FILE.onnx.")],
-    out: Annotated[Path, typer.Option("--out", help="The file to be written, FILE.onnx; it must not exist.")],
+    out: NewPolicyFile,
     training: Annotated[
         str | None,
         typer.Option(help="Name or path of the training file.", show_default="as recorded in the policy"),

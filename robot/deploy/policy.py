@@ -47,7 +47,7 @@ def load_policy(
             )
         return task.scripted()
     if name == "grip":
-        from tacsim.tasks.grip import Grip
+        from tacsim.tasks.squeeze import Grip
 
         return Grip(spec)
     if name == "learned":

@@ -29,7 +29,7 @@ from tacsim.limits import ActionError
 from tacsim.record.writer import Recorder
 from tacsim.rig import Rig
 from tacsim.tasks import make_task
-from tacsim.tasks.grip import Grip
+from tacsim.tasks.squeeze import Grip
 
 STEPS = 3
 PERIOD = 0.1  # of every rig here [s]

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from calibration.height.integration import ForwardSteps, Integrator, slopes_of
+from calibration.height.surface_finder import ForwardSteps, Integrator, slopes_of
 from tacsim.models.photometric import (
     DEPTH_TERMS,
     SHADOW_SLOPES,

@@ -26,7 +26,7 @@ from tacsim.record.writer import Recorder
 from tacsim.report.report import summarise, summary_table
 from tacsim.report.series import Series, sensor_diagnostics
 from tacsim.rig import Rig
-from tacsim.tasks.grip import Grip
+from tacsim.tasks.squeeze import Grip
 from tests.tacsim.optics.surfaces import dent, flat
 
 RIG = """

@@ -39,8 +39,7 @@ from tacsim.record.schemas import Step as StepMessage
 from tacsim.record.writer import Recorder as FileRecorder
 from tacsim.rig import Rig
 from tacsim.tasks import make_task
-from tacsim.tasks.grip import Grip
-from tacsim.tasks.squeeze import ScriptedSqueeze
+from tacsim.tasks.squeeze import Grip, ScriptedSqueeze
 
 
 class Hand:

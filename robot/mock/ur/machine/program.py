@@ -22,7 +22,7 @@ _ENDED = object()
 
 
 class Program:
-    """One program. `step` is one control period. `script.make_program` sets `main`."""
+    """One program. `step` is one control period. `machine.make_program` sets `main`."""
 
     def __init__(self, machine: MachineState, text: str) -> None:
         self.machine: MachineState = machine

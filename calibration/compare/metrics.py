@@ -17,16 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.compare.tuning import (
-    CONTACT_BLUR,
-    MAX_ASPECT_ERROR,
-    MAX_SHIFT,
-    MAX_SHIFT_SCATTER,
-    MIN_CHANGE,
-    MIN_CHANGE_SHARE,
-    MIN_CHANGE_TO_NOISE,
-    MIN_PATCH_AREA,
-)
+from calibration.compare import tuning
 from calibration.errors import BadFrames
 from tacsim.interface import Float32, FloatArray, Mask
 from tacsim.models.sensor import SensorGeometry
@@ -156,19 +147,21 @@ def contact_region(change: NDArray[np.floating]) -> Mask:
     import cv2
     from scipy.ndimage import binary_closing, binary_fill_holes, label
 
-    smooth = np.asarray(cv2.GaussianBlur(np.asarray(change, dtype=np.float32), (0, 0), CONTACT_BLUR), dtype=np.float32)
+    smooth = np.asarray(
+        cv2.GaussianBlur(np.asarray(change, dtype=np.float32), (0, 0), tuning.CONTACT_BLUR), dtype=np.float32
+    )
     red, green, blue = (np.abs(smooth[..., k] - level) for k, level in enumerate(untouched_change(smooth)))
     strength = np.maximum(np.maximum(red, green), blue)
     # the noise is the spread of the half of the pixels that changes least
     noise = 1.4826 * float(np.median(strength[strength <= np.median(strength)]))
-    share = MIN_CHANGE_SHARE * float(np.percentile(strength, 99.8))
-    found = strength > max(MIN_CHANGE, MIN_CHANGE_TO_NOISE * noise, share)
+    share = tuning.MIN_CHANGE_SHARE * float(np.percentile(strength, 99.8))
+    found = strength > max(tuning.MIN_CHANGE, tuning.MIN_CHANGE_TO_NOISE * noise, share)
     padded = np.pad(found, gap)  # closing erodes what touches the border
     closed = binary_closing(padded, iterations=gap)[gap:-gap, gap:-gap]
     parts, _ = label(binary_fill_holes(closed | found))
     sizes = np.bincount(parts.ravel())
     sizes[0] = 0
-    return np.asarray(sizes[parts] >= MIN_PATCH_AREA)
+    return np.asarray(sizes[parts] >= tuning.MIN_PATCH_AREA)
 
 
 def untouched_change(change: NDArray[np.floating]) -> NDArray[np.floating]:
@@ -267,7 +260,7 @@ def align_by_size(source: tuple[int, int], shape: tuple[int, int]) -> Alignment:
     if source == shape:
         return Alignment(np.eye(2, 3), shape, source)
     across, down = source[1] / shape[1], source[0] / shape[0]
-    if abs(across / down - 1) > MAX_ASPECT_ERROR:
+    if abs(across / down - 1) > tuning.MAX_ASPECT_ERROR:
         raise BadFrames(
             f"A is {source[1]} x {source[0]} px, B {shape[1]} x {shape[0]}: no scale makes these the same picture. "
             "Give the sensors' calibrations (--calibration-a, --calibration-b) or the corners of the gel (--corners-a, "
@@ -302,9 +295,9 @@ def find_shift(changes: Iterable[tuple[Float32, Float32]], alignment: Alignment)
     scatter = float(np.median(np.linalg.norm(shifts - middle, axis=1)))
     size = max(alignment.shape)
     words = f"({middle[0]:+.2f}, {middle[1]:+.2f}) px"
-    if scatter > MAX_SHIFT_SCATTER * size:
+    if scatter > tuning.MAX_SHIFT_SCATTER * size:
         return alignment.shifted((0.0, 0.0), f"not shifted: the pairs disagree by {scatter:.0f} px; are they pairs?")
-    if float(np.linalg.norm(middle)) > MAX_SHIFT * size:
+    if float(np.linalg.norm(middle)) > tuning.MAX_SHIFT * size:
         return alignment.shifted((0.0, 0.0), f"not shifted: {words} is too far; are these pairs?")
     x, y = (float(value) for value in middle)
     return alignment.shifted((x, y), f"shifted by {words}, the pairs agree within {scatter:.2f} px")

@@ -26,15 +26,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.height import tuning
 from calibration.height.slopes import GradientModel
-from calibration.height.tuning import (
-    MAX_CERTAIN_ERROR,
-    MAX_EXTRAPOLATION,
-    MAX_INK_LEVEL,
-    MIN_CONTACT_CHANGE,
-    PRIOR_WEIGHT,
-    RIM_WIDTH,
-)
 from calibration.lens.rectification import visible_box
 from calibration.reference import PIXEL_STRIDE, DriftFinder, max_mean_change
 from tacsim.interface import Float32, Mask
@@ -59,7 +52,7 @@ class Integrator:
         inverse = pitch / eigenvalue
         inverse[0, 0] = 0.0  # slopes determine no constant
         self._inverse = inverse.astype(np.float32)
-        width = max(1, round(RIM_WIDTH / pitch))
+        width = max(1, round(tuning.RIM_WIDTH / pitch))
         rim = np.ones(shape, dtype=np.bool_)
         rim[width:-width, width:-width] = False
         self._rim = np.flatnonzero(rim)
@@ -120,7 +113,7 @@ class ForwardSteps:
         `integrate`: slopes (H, W, 2) -> height, in the unit of `pitch`."""
         step_count = 3
         chunk = 256  # pixels that are evaluated at a time
-        seen = np.flatnonzero((np.abs(change).max(axis=0) > MIN_CONTACT_CHANGE) & ~hidden)
+        seen = np.flatnonzero((np.abs(change).max(axis=0) > tuning.MIN_CONTACT_CHANGE) & ~hidden)
         if not len(seen):
             return height
         rows = np.resize(seen, (-(-len(seen) // chunk), chunk))  # the last row is filled up with pixels of the first
@@ -150,17 +143,17 @@ class ForwardSteps:
         by_x, by_y = (at_x - here) / np.float32(slope_step), (at_y - here) / np.float32(slope_step)
         if shadow_change is not None:
             here = here + shadow_change
-        xx = yy = np.full_like(colour[0], PRIOR_WEIGHT)
+        xx = yy = np.full_like(colour[0], tuning.PRIOR_WEIGHT)
         xy = right_x = right_y = np.zeros_like(colour[0])
         for channel, seen in enumerate(colour):
             error, x, y = seen - here[..., channel], by_x[..., channel], by_y[..., channel]
-            weight = 1 / (1 + (error / np.float32(MAX_CERTAIN_ERROR)) ** 2)
+            weight = 1 / (1 + (error / np.float32(tuning.MAX_CERTAIN_ERROR)) ** 2)
             xx, xy, yy = xx + weight * x * x, xy + weight * x * y, yy + weight * y * y
             right_x, right_y = right_x + weight * x * error, right_y + weight * y * error
         step = np.stack([yy * right_x - xy * right_y, xx * right_y - xy * right_x], axis=-1)
         better = slope + step / (xx * yy - xy * xy)[..., None]
         steepness = np.hypot(better[..., 0], better[..., 1])
-        least = np.minimum(1, MAX_EXTRAPOLATION * self._model.steepest / np.maximum(steepness, 1e-9))
+        least = np.minimum(1, tuning.MAX_EXTRAPOLATION * self._model.steepest / np.maximum(steepness, 1e-9))
         return np.asarray(better * least[..., None], dtype=np.float32)
 
     def _shadow_change(self, relative: Float32, place: tuple[Float32, Float32]) -> Float32 | None:
@@ -320,7 +313,7 @@ def _ink_mask(relative: Float32) -> Mask:
     dot_rim = 1  # width of the blurred edge of a dot [px]
     import cv2
 
-    dark = (np.maximum(np.maximum(relative[0], relative[1]), relative[2]) < MAX_INK_LEVEL).view(np.uint8)
+    dark = (np.maximum(np.maximum(relative[0], relative[1]), relative[2]) < tuning.MAX_INK_LEVEL).view(np.uint8)
     side = 2 * dot_rim + 1
     return np.asarray(cv2.dilate(dark, np.ones((side, side), dtype=np.uint8))).view(np.bool_)
 

@@ -204,7 +204,7 @@ def check_placement(
     commands in the advice."""
     place = placement.sensor[:3, 3]
     shown = _format_pose(placement.reading.tcp_pose)
-    words = f"sensor at {_millimetres(place)} mm in the world; the pendant (feature Base) shows {shown}"
+    words = f"sensor at {format_millimetres(place)} mm in the world; the pendant (feature Base) shows {shown}"
     yield _check_model(name, config, placement) or Check(f"{name}: pose", "ok", words)
     yield _check_workspace(name, config, place, file)
     if start is not None:
@@ -274,10 +274,10 @@ def _check_force(name: str, config: UrArmConfig, placement: ArmPlacement, file: 
 def _check_payload(name: str, config: UrArmConfig, placement: ArmPlacement) -> Check:
     max_mass_error, max_centre_error = 0.05, 10e-3  # payloads within these differences are the same [kg, m]
     label, configured, reading = f"{name}: payload", config.payload, placement.reading
-    wanted = f"{configured.mass:g} kg at {_millimetres(np.array(configured.centre))} mm"
+    wanted = f"{configured.mass:g} kg at {format_millimetres(np.array(configured.centre))} mm"
     if reading.payload is None or reading.payload_centre is None:
         return Check(label, "ok", f"not reported by this controller; connecting sets the file's, {wanted}")
-    found = f"{reading.payload:.3g} kg at {_millimetres(reading.payload_centre)} mm"
+    found = f"{reading.payload:.3g} kg at {format_millimetres(reading.payload_centre)} mm"
     away = float(np.linalg.norm(reading.payload_centre - np.array(configured.centre)))
     is_centre_equal = configured.mass <= max_mass_error or away <= max_centre_error
     if abs(reading.payload - configured.mass) <= max_mass_error and is_centre_equal:
@@ -328,8 +328,9 @@ def _magnitudes(wrench: FloatArray) -> tuple[float, float]:
     return force, torque
 
 
-def _millimetres(vector: FloatArray) -> str:
-    return "[" + ", ".join(f"{round(1e3 * value) + 0}" for value in vector) + "]"
+def format_millimetres(point: FloatArray) -> str:
+    """A point (3,) [m] as text in whole millimetres, without the unit."""
+    return "[" + ", ".join(str(round(1e3 * value)) for value in point) + "]"
 
 
 def _format_shift(shift: FloatArray) -> str:

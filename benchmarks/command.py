@@ -24,9 +24,8 @@ from benchmarks.harness.schema import GROUPS, Report
 from benchmarks.pages.page import COLUMNS, cells, setting, write_pages
 from benchmarks.pages.picture import PICTURE, draw
 from benchmarks.pages.reliability import ROOT, write_reliability
-from robot.cli.errors import print_error
 from robot.cli.output import busy, notes, print_files, progress, results
-from robot.cli.terminal import Interrupt
+from robot.cli.terminal import Interrupt, print_error
 
 
 def read(paths: Sequence[Path]) -> list[Report]:

@@ -21,7 +21,7 @@ from benchmarks.cases.real.balls import BallSet
 from benchmarks.cases.real.clicked import clicked_errors, has_circles
 from benchmarks.cases.real.labels import BadData, read_picture
 from calibration.errors import BadFrames
-from calibration.height.darkness import DarknessSlopes
+from calibration.height.slopes import DarknessSlopes
 from calibration.light.calibrator import calibrate_light
 from calibration.light.dent import dent_height
 from calibration.light.fit import LightFit

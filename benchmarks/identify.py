@@ -27,8 +27,19 @@ import typer
 
 from calibration.materials.checks import find_contradictions
 from calibration.materials.estimate import SETTLING_ERROR, estimate_materials
-from calibration.materials.fit import Fit, Point, Priors, Signals, covariance_of, start_values
-from calibration.materials.presses import Noise, Press, downsample_press, merge_repeated_readings, signals_of
+from calibration.materials.fit import (
+    Fit,
+    Noise,
+    Point,
+    Press,
+    Priors,
+    Signals,
+    covariance_of,
+    downsample_press,
+    merge_repeated_readings,
+    signals_of,
+    start_values,
+)
 from calibration.materials.tuning import MAX_IDENTIFIED_HALF_INTERVAL
 from robot.studies.identify.identify import MOMENTS, Identified, Kind, identify, parameters_of
 from robot.studies.identify.motions import motions

@@ -21,8 +21,8 @@ import typer
 from robot.studies.identify.motions import motions
 from tacsim.config import load_model, load_scene
 from tacsim.models.material import BodyMaterial, GelMaterial
+from tacsim.models.policy import Training
 from tacsim.models.randomisation import Randomisation
-from tacsim.models.training import Training
 
 VIEWS = {"canonical": "squeeze", "raw": "squeeze-pictures"}  # training files
 MATERIALS = ("guessed", "identified", "drawn")

@@ -14,7 +14,7 @@ import yaml
 from pydantic import Field, model_validator
 
 from calibration.errors import CalibrationError
-from calibration.height.slope_polynomial import InverseModel
+from calibration.height.slopes import InverseModel
 from calibration.lens.view import GelView
 from tacsim.config import ConfigError, load_model, load_sensor
 from tacsim.config.bundle import (
@@ -28,11 +28,10 @@ from tacsim.config.bundle import (
     require_unchanged,
 )
 from tacsim.interface import Image
-from tacsim.models.geometry import PictureRegion
 from tacsim.models.hardware import Placement
 from tacsim.models.photometric import DarknessModel, PhotometricModel
 from tacsim.models.quantity import Config, Length, Time
-from tacsim.models.sensor import CameraNoise, Markers, SensorGeometry, SensorModel
+from tacsim.models.sensor import CameraNoise, Markers, PictureRegion, SensorGeometry, SensorModel
 from tacsim.record.episode import EpisodeError
 from tacsim.record.images import decode_image, encode_png
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.drift import DriftFinder, contact_area, max_mean_change
+from calibration import tuning
 from calibration.height.surface_finder import SurfaceFinder, canonical_part
 from calibration.lens.rectification import (
     Rectification,
@@ -21,22 +21,17 @@ from calibration.lens.rectification import (
 )
 from calibration.markers.flow import MarkerFlow, require_no_markers
 from calibration.reference import (
+    DriftFinder,
     Reference,
     StaleReference,
     UnusableReference,
+    contact_area,
     is_channel_order_swapped,
     is_contact_image_swapped,
     make_reference,
+    max_mean_change,
 )
-from calibration.tuning import (
-    MAX_COLOUR_CHANGE,
-    MAX_DOT_LEVEL,
-    MAX_SLOPE_CHANGE,
-    MIN_CONTACT_AREA,
-    STALE_COLOUR,
-    STALE_SLOPE,
-)
-from tacsim.control.tuning import MIN_CONTACT_DIFFERENCE, MIN_CONTACT_HEIGHT
+from tacsim.control import MIN_CONTACT_DIFFERENCE, MIN_CONTACT_HEIGHT
 from tacsim.interface import SurfaceMap, TactileFrame, TactileObservation
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.optics.grid import canonical_cells
@@ -117,7 +112,7 @@ class FrameNormaliser:
     @property
     def stale(self) -> bool:
         """True if the reference is outdated: take a new one as soon as there is no contact."""
-        return (self.drift or 0.0) > STALE_COLOUR or (self.drift_slope or 0.0) > STALE_SLOPE
+        return (self.drift or 0.0) > tuning.STALE_COLOUR or (self.drift_slope or 0.0) > tuning.STALE_SLOPE
 
     @property
     def visible_markers(self) -> NDArray[np.bool_] | None:
@@ -167,7 +162,7 @@ class FrameNormaliser:
         if self._markers is not None:  # printed dots may have moved
             dark = _dot_mask(reference.relative) | _dot_mask(known)
         area = contact_area(reference.relative - known, ~valid | dark, self._grid.pitch / self._grid.image_scale)
-        if area > MIN_CONTACT_AREA:
+        if area > tuning.MIN_CONTACT_AREA:
             self.reference_doubt = (
                 f"the reference shows a contact of {area * 1e6:.1f} mm^2: it differs there from the picture without "
                 "contact that belongs to the calibration; take a reference of the free gel"
@@ -277,8 +272,8 @@ class FrameNormaliser:
     def _require_stable_light(self) -> None:
         """Raises StaleReference."""
         for measured, limit, words in (
-            (self.drift_slope, MAX_SLOPE_CHANGE, "slopes of {:.0f} degrees"),
-            (self.drift, MAX_COLOUR_CHANGE, "{:.0%} of its colour"),
+            (self.drift_slope, tuning.MAX_SLOPE_CHANGE, "slopes of {:.0f} degrees"),
+            (self.drift, tuning.MAX_COLOUR_CHANGE, "{:.0%} of its colour"),
         ):
             if measured is not None and measured > limit:
                 raise StaleReference(
@@ -325,7 +320,7 @@ def _dot_mask(relative: NDArray[np.float32]) -> NDArray[np.bool_]:
     """(H, W) True for pixels of an image (H, W, 3), relative to its mean, in or next to printed dots."""
     import cv2
 
-    dark = (relative.max(axis=2) < MAX_DOT_LEVEL).astype(np.uint8)
+    dark = (relative.max(axis=2) < tuning.MAX_DOT_LEVEL).astype(np.uint8)
     return np.asarray(cv2.dilate(dark, np.ones((5, 5), dtype=np.uint8)), dtype=np.bool_)
 
 

@@ -12,14 +12,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.drift import contact_area
 from calibration.errors import BadFrames
 from calibration.lens.rectification import metric_rectification, rectification_of_corners, region_mask
 from calibration.lens.view import BadCorners, Corners, GelView
-from calibration.reference import is_contact_image_swapped
+from calibration.reference import contact_area, is_contact_image_swapped
 from calibration.tuning import MAX_REFERENCE_CHANGE, MIN_CONTACT_SHARE, SATURATED_LEVEL
 from tacsim.interface import Image, SurfaceMap, short_repr
-from tacsim.models.geometry import PictureRegion
+from tacsim.models.sensor import PictureRegion
 from tacsim.optics.grid import PixelGrid
 from tacsim.record.episode import EpisodeError
 from tacsim.record.images import read_image, reference_image

@@ -10,11 +10,15 @@ import numpy as np
 from calibration.bundle import BadBundle, Calibration, read_bundle
 from calibration.errors import BadFrames
 from calibration.frame_normaliser import FrameNormaliser
-from calibration.height.colour_table import GradientModel, table_of_model
-from calibration.height.darkness import DarknessSlopes
-from calibration.height.forward_steps import ForwardSteps
-from calibration.height.slope_polynomial import InverseModel, PolynomialSlopes, inverse_of_light
-from calibration.height.surface_finder import SurfaceFinder, extended_view
+from calibration.height.slopes import (
+    DarknessSlopes,
+    GradientModel,
+    InverseModel,
+    PolynomialSlopes,
+    inverse_of_light,
+    table_of_model,
+)
+from calibration.height.surface_finder import ForwardSteps, SurfaceFinder, extended_view
 from calibration.lens.rectification import (
     Rectification,
     rectification_of_corners,
@@ -24,11 +28,10 @@ from calibration.lens.rectification import (
 )
 from calibration.markers.flow import NoMarkers, marker_flow, view_of_dots
 from tacsim.interface import Image
-from tacsim.models.geometry import PictureRegion, SensorGeometry
 from tacsim.models.hardware import CameraSensorConfig
 from tacsim.models.photometric import PhotometricModel
 from tacsim.models.rig import ReplaySensorConfig
-from tacsim.models.sensor import CanonicalGrid, SensorModel
+from tacsim.models.sensor import CanonicalGrid, PictureRegion, SensorGeometry, SensorModel
 from tacsim.optics.grid import PixelGrid, canonical_image
 
 

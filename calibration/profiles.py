@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from tacsim.models.geometry import Pair
+from tacsim.models.sensor import Pair
 
 
 @dataclass(frozen=True, slots=True)

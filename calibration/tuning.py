@@ -4,14 +4,6 @@ Each entry: what it is, its unit, and what it was measured on where it was.
 Sources: docs/measurements/calibration.md, and the tests in tests/calibration.
 """
 
-# drift.py
-MAX_UNTOUCHED_CHANGE = 0.08  # change of an untouched pixel without drift [-]
-MIN_UNTOUCHED_SHARE = 0.15  # of the view, to measure a drift
-# A contact in a picture that must show none is a patch that differs from a known picture ...
-MIN_CONTACT_CHANGE = 0.06  # by this amount, without drift and noise [-]
-CONTACT_BLUR = 1.5  # of a change of colour before the search for a contact [px]
-MIN_CONTACT_AREA = 0.6e-6  # and that has this area, the contact of a ball of 8 mm at 0.05 mm depth [m^2]
-
 # frame_normaliser.py
 MAX_DOT_LEVEL = 0.7  # of the mean: printed dots are darker
 
@@ -35,3 +27,9 @@ MAX_SAME_CHANGE = 0.02  # unless the difference is this small without it, each c
 MIN_SWAPPED_CHANGE = (
     0.01  # of each colour relative to its mean, in addition to another gain; a smaller one does not show a swap [-]
 )
+MAX_UNTOUCHED_CHANGE = 0.08  # change of an untouched pixel without drift [-]
+MIN_UNTOUCHED_SHARE = 0.15  # of the view, to measure a drift
+# A contact in a picture that must show none is a patch that differs from a known picture ...
+MIN_CONTACT_CHANGE = 0.06  # by this amount, without drift and noise [-]
+CONTACT_BLUR = 1.5  # of a change of colour before the search for a contact [px]
+MIN_CONTACT_AREA = 0.6e-6  # and that has this area, the contact of a ball of 8 mm at 0.05 mm depth [m^2]

@@ -15,7 +15,7 @@ from robot.rig import RIG_ATTACHMENT as RIG_ATTACHMENT
 from robot.rig import CannotOpen as CannotOpen
 from robot.rig.parts import check_parts, sensor_drivers
 from tacsim.config import ConfigError, LoadedRig, load_model, load_rig
-from tacsim.config.errors import Place, Problem
+from tacsim.config.document import Place, Problem
 from tacsim.config.kinds import is_name
 from tacsim.config.load import require_texts
 from tacsim.interface import RigSpec

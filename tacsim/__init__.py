@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from tacsim.config import load_scene as load_scene
     from tacsim.config import load_sensor as load_sensor
     from tacsim.config import load_task as load_task
-    from tacsim.control.contact_signal import NoTouch as NoTouch
-    from tacsim.control.contact_signal import contact_signal as contact_signal
+    from tacsim.control import NoTouch as NoTouch
+    from tacsim.control import contact_signal as contact_signal
     from tacsim.gym.env import TacsimEnv as TacsimEnv
     from tacsim.gym.features import FeatureEncoder as FeatureEncoder
     from tacsim.gym.vector import TacsimVectorEnv as TacsimVectorEnv
@@ -120,6 +120,6 @@ if TYPE_CHECKING:
     from tacsim.tasks import evaluate_outcome as evaluate_outcome
     from tacsim.tasks import make_task as make_task
     from tacsim.tasks import register_task as register_task
-    from tacsim.tasks.grip import Grip as Grip
+    from tacsim.tasks.squeeze import Grip as Grip
 else:
     __getattr__, __dir__ = public_names(__name__)

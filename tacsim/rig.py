@@ -27,7 +27,7 @@ from tacsim.interface import (
 from tacsim.limits import check_action
 
 if TYPE_CHECKING:
-    from tacsim.control.load_controller import LoadController
+    from tacsim.control import LoadController
     from tacsim.record.episode import ArmPackages
 
 

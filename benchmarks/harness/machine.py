@@ -14,7 +14,7 @@ from pathlib import Path
 
 from benchmarks.harness.cache import fingerprint
 from benchmarks.harness.schema import Device, Group, Machine, Metadata
-from robot.common.realtime import is_realtime_allowed
+from robot.common import is_realtime_allowed
 
 PACKAGES = ("tacsim", "taichi", "numpy", "scipy")  # whose versions are recorded
 CODE = ("tacsim", "robot", "calibration")

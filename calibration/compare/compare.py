@@ -17,13 +17,21 @@ import numpy as np
 
 from calibration.bundle import Calibration
 from calibration.compare import metrics
-from calibration.compare.alignment import Alignment, align_by_geometry, align_by_size, find_shift
-from calibration.compare.scorer import Numbers, Pair, Scorer, surface_errors
-from calibration.compare.surfaces import GRID, SurfaceEstimate, estimate_surfaces, undeformed_surface
-from calibration.drift import subtract_drift
+from calibration.compare.metrics import Alignment, align_by_geometry, align_by_size, find_shift
+from calibration.compare.scorer import (
+    GRID,
+    Numbers,
+    Pair,
+    Scorer,
+    SurfaceEstimate,
+    estimate_surfaces,
+    surface_errors,
+    undeformed_surface,
+)
 from calibration.errors import BadFrames
 from calibration.frame_set import Frame, FrameSet, find_touched_references
-from tacsim.control.tuning import MIN_CONTACT_HEIGHT
+from calibration.reference import subtract_drift
+from tacsim.control import MIN_CONTACT_HEIGHT
 from tacsim.interface import FloatArray, Image
 from tacsim.record.numbering import numbers_in_names
 

@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 from calibration.bundle import Calibration
 from calibration.compare import metrics
 from calibration.compare.compare import BOOTSTRAP_DRAWS, Comparison
-from calibration.compare.surfaces import GRID, estimate_surfaces
-from calibration.drift import subtract_drift
+from calibration.compare.scorer import GRID, estimate_surfaces
 from calibration.errors import BadFrames
-from tacsim.control.tuning import MIN_CONTACT_HEIGHT
+from calibration.reference import subtract_drift
+from tacsim.control import MIN_CONTACT_HEIGHT
 from tacsim.interface import FloatArray, Image
 
 PATCH_SIDE = 5.2e-3  # if pixels have a known pitch [m]

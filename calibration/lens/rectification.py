@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.lens.view import BadCorners, Corners, GelView, check_corners
-from tacsim.models.geometry import PictureRegion
-from tacsim.models.sensor import SensorGeometry
+from tacsim.models.sensor import PictureRegion, SensorGeometry
 from tacsim.optics.grid import PixelGrid, image_grid
 
 

@@ -18,9 +18,9 @@ from calibration.lens.board import Points
 from calibration.lens.tuning import MAX_FOCAL_DEVIATION, MAX_PLANE_MISFIT, MAX_RESIDUAL, MIN_REDUCTION
 from tacsim import pose as se3
 from tacsim.interface import FloatArray, Pose
-from tacsim.models.geometry import GelView as GelView
-from tacsim.models.geometry import Lens as Lens
-from tacsim.models.geometry import Pair, ray_slopes
+from tacsim.models.sensor import GelView as GelView
+from tacsim.models.sensor import Lens as Lens
+from tacsim.models.sensor import Pair, ray_slopes
 
 MIN_PICTURES = 6  # for a lens
 MIN_TILT = np.radians(8.0)  # of the board between pictures, root mean square [rad]

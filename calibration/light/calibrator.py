@@ -16,20 +16,21 @@ from functools import partial
 import numpy as np
 
 from calibration.errors import BadFrames
-from calibration.height.darkness import DarknessSlopes
-from calibration.height.forward_steps import ForwardSteps
-from calibration.height.integration import Integrator, slopes_of
-from calibration.height.slope_polynomial import (
+from calibration.height.slopes import (
+    DarknessSlopes,
     InverseModel,
     PolynomialSlopes,
     normal_of_slope,
 )
+from calibration.height.surface_finder import ForwardSteps, Integrator, slopes_of
+from calibration.light import tuning
 from calibration.light.checks.consistency import find_blurred_presses, find_inconsistent_presses, find_reference_contact
-from calibration.light.circle import NoCircle
 from calibration.light.darkness import find_dark_press, fit_darkness, is_direction_free
-from calibration.light.dent import dent_gradient, dent_height, max_dent_slope
-from calibration.light.fit import LightFit, PressPrediction, compare_with_prediction, normal_angle
-from calibration.light.labels import (
+from calibration.light.dent import NoCircle, dent_gradient, dent_height, max_dent_slope
+from calibration.light.fit import (
+    LightFit,
+    PressPrediction,
+    compare_with_prediction,
     contact_and_skirt,
     counted_pixels,
     deepest_dent,
@@ -39,25 +40,12 @@ from calibration.light.labels import (
     inverse_equations,
     inverse_model,
     label_slopes,
+    normal_angle,
 )
 from calibration.light.photometry import SLOPE_TERMS, ModelSize, NormalEquations, choose_size, solve_weights
 from calibration.light.press import BallPress, Window, find_press, gaussian_blur, mean_reference_colour
 from calibration.light.press_shapes import find_other_balls, fit_stretch
-from calibration.light.refinement import RefinedGeometry, refine_geometry
-from calibration.light.shadows import DentShade, find_lamps
-from calibration.light.tuning import (
-    FORWARD_BLUR,
-    INVERSE_BLUR,
-    MAX_DARKNESS_RESIDUAL,
-    MAX_FEW_PRESSES,
-    MAX_GOOD_RESIDUAL,
-    MAX_NORMAL_ERROR,
-    MAX_RESIDUAL_RATIO,
-    MAX_RESIDUAL_SHARE,
-    MIN_SHADOW_RESIDUAL,
-    MIN_SPREAD,
-    SHADED_PIXELS,
-)
+from calibration.light.refinement import DentShade, RefinedGeometry, find_lamps, refine_geometry
 from calibration.reference import is_channel_order_swapped
 from calibration.tuning import STALE_COLOUR
 from tacsim.interface import FloatArray, Image
@@ -120,7 +108,7 @@ def calibrate_light(
     _leave_out_outliers(found, left_out, reference, mean, ball)
     presses, refined = _leave_out_other_balls(*_refine_without_outlier(found, left_out, ball), left_out, ball)
     contact = find_reference_contact(presses, reference, mean, untouched, ball)
-    thin = [_press_window(press, SHADED_PIXELS) for press in presses]
+    thin = [_press_window(press, tuning.SHADED_PIXELS) for press in presses]
     stretch = fit_stretch(thin, refined.circles, refined.thickness, ball, presses[0].shape)
     presses, refined, shade = _fit_shadows(presses, refined, ball)
     labels = [label_slopes(press, refined, ball) for press in presses]
@@ -170,7 +158,9 @@ def _leave_out_outliers(
     for k, share in reversed(find_blurred_presses(found, reference, mean)):
         why = f"blurred: {share:.0%} of the fine detail of other pictures; press again, held still and in focus"
         left_out.append((found.pop(k).name, why))
-    for k in reversed(find_inconsistent_presses(found, [_press_window(press, SHADED_PIXELS) for press in found], ball)):
+    for k in reversed(
+        find_inconsistent_presses(found, [_press_window(press, tuning.SHADED_PIXELS) for press in found], ball)
+    ):
         why = "most other presses do not explain it: another sensor or ball, turned, or red and blue swapped?"
         left_out.append((found.pop(k).name, why))
 
@@ -179,7 +169,7 @@ def _leave_out_other_balls(
     presses: list[BallPress], refined: RefinedGeometry, left_out: list[tuple[str, str]], ball: float
 ) -> tuple[list[BallPress], RefinedGeometry]:
     """The presses without those of another ball."""
-    windows = [_press_window(press, SHADED_PIXELS) for press in presses]
+    windows = [_press_window(press, tuning.SHADED_PIXELS) for press in presses]
     others, ratio = find_other_balls(windows, refined.circles, refined.thickness, ball, presses[0].shape)
     if not others:
         return presses, refined
@@ -216,7 +206,7 @@ def _calibrate_darkness(
         raise _no_presses_error(left_out)
     try:
         fit = fit_darkness(found, ball)
-        while max(fit.residual_shares) > MAX_DARKNESS_RESIDUAL and len(found) > 1:
+        while max(fit.residual_shares) > tuning.MAX_DARKNESS_RESIDUAL and len(found) > 1:
             worst = int(np.argmax(fit.residual_shares))
             left_out.append(
                 (found.pop(worst).name, f"depth explains only {1 - fit.residual_shares[worst]:.0%} of its darkness")
@@ -224,7 +214,7 @@ def _calibrate_darkness(
             fit = fit_darkness(found, ball)
     except BadFrames as why:
         raise NoDirection(f"{NO_DIRECTION}, and {why}") from None
-    if max(fit.residual_shares) > MAX_DARKNESS_RESIDUAL:
+    if max(fit.residual_shares) > tuning.MAX_DARKNESS_RESIDUAL:
         raise NoDirection(
             f"{NO_DIRECTION}, and depth explains only {1 - max(fit.residual_shares):.0%} of how dark it gets: is the "
             "ball round, its radius right, and exposure fixed?"
@@ -292,9 +282,12 @@ def _refine_without_outlier(
     """Refines all circles, removes the worst outlier, and refines again. Raises BadFrames if no press is left."""
     while found:
         refined = refine_geometry([_press_window(press) for press in found], [press.circle for press in found], ball)
-        limit = MAX_RESIDUAL_SHARE
+        limit = tuning.MAX_RESIDUAL_SHARE
         if len(found) > 2:
-            limit = min(limit, max(MAX_RESIDUAL_RATIO * float(np.median(refined.residual_shares)), MAX_GOOD_RESIDUAL))
+            limit = min(
+                limit,
+                max(tuning.MAX_RESIDUAL_RATIO * float(np.median(refined.residual_shares)), tuning.MAX_GOOD_RESIDUAL),
+            )
         worst = int(np.argmax(refined.residual_shares))
         if refined.residual_shares[worst] <= limit:
             return [replace(p, circle=c) for p, c in zip(found, refined.circles, strict=True)], refined
@@ -312,9 +305,9 @@ def _fit_shadows(
     """The circles refined with cast shadows, and the lamps of these; without shadows the given circles, and None.
     Without lamps, circles would grow into a shadow, as if it were skirt."""
     round_count = 2  # of refining circles and lamps in turn
-    if len(presses) <= MAX_FEW_PRESSES or np.mean(refined.residual_shares) < MIN_SHADOW_RESIDUAL:
+    if len(presses) <= tuning.MAX_FEW_PRESSES or np.mean(refined.residual_shares) < tuning.MIN_SHADOW_RESIDUAL:
         return presses, refined, None
-    windows, circles = [_press_window(press, SHADED_PIXELS) for press in presses], refined.circles
+    windows, circles = [_press_window(press, tuning.SHADED_PIXELS) for press in presses], refined.circles
     shade = find_lamps(windows, circles, refined.thickness, ball, presses[0].shape)
     slopes = [label_slopes(press, refined, ball) for press in presses]
     sets = [
@@ -343,14 +336,17 @@ def _warnings(presses: Sequence[BallPress], mean: FloatArray, left_out: int) -> 
     if len(presses) == 1:
         return found
     height, width = presses[0].shape
-    if max(np.ptp([p.circle.x for p in presses]) / width, np.ptp([p.circle.y for p in presses]) / height) < MIN_SPREAD:
+    if (
+        max(np.ptp([p.circle.x for p in presses]) / width, np.ptp([p.circle.y for p in presses]) / height)
+        < tuning.MIN_SPREAD
+    ):
         found.append("all presses are in one place: nothing is known of light elsewhere on the gel; spread them")
     return found
 
 
 def _poorly_predicted(predictions: Sequence[PressPrediction]) -> list[str]:
     """A note on presses with bad predictions, from three presses on: of two, either may be the bad one."""
-    bad = [prediction for prediction in predictions if prediction.angle > MAX_NORMAL_ERROR]
+    bad = [prediction for prediction in predictions if prediction.angle > tuning.MAX_NORMAL_ERROR]
     if len(predictions) < 3 or not bad:
         return []
     worst = max(prediction.angle for prediction in bad)
@@ -366,7 +362,7 @@ def _press_window(press: BallPress, pixels: int = 2500) -> Window:
     thin = max(1, round(np.sqrt(len(u) / pixels)))
     keep = (u % thin == 0) & (v % thin == 0) & press.lit[v, u].all(axis=1)
     u, v = u[keep], v[keep]
-    return Window(u.astype(np.float64), v.astype(np.float64), gaussian_blur(press.change, FORWARD_BLUR)[v, u])
+    return Window(u.astype(np.float64), v.astype(np.float64), gaussian_blur(press.change, tuning.FORWARD_BLUR)[v, u])
 
 
 def _predict_press(
@@ -387,8 +383,8 @@ def _predict_press(
     predicted = light.astype(np.float64)
     if forward.shadows is not None:
         predicted += extra_terms[..., DEPTH_TERMS + SLOPE_TERMS :] @ np.array(forward.shadows.weights)
-    predicted = gaussian_blur(predicted, FORWARD_BLUR) * mean
-    seen = gaussian_blur(press.change, INVERSE_BLUR).astype(np.float32)
+    predicted = gaussian_blur(predicted, tuning.FORWARD_BLUR) * mean
+    seen = gaussian_blur(press.change, tuning.INVERSE_BLUR).astype(np.float32)
     slopes, _ = PolynomialSlopes(inverse, *(2 * place.astype(np.float64) for place in places))(seen)
     integrate, nothing = Integrator(press.shape, 1.0), np.zeros(press.shape, dtype=np.bool_)
     steps = ForwardSteps(forward, *places, 1.0, float(press.shape[1]))

@@ -16,23 +16,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calibration.errors import BadFrames
-from calibration.light.circle import Circle, NoCircle
-from calibration.light.dent import ContactCircle, depth_profile
+from calibration.light import tuning
+from calibration.light.dent import Circle, ContactCircle, NoCircle, depth_profile
 from calibration.light.press import BallPress, gaussian_blur, make_press, mean_reference_colour
 from calibration.light.refinement import MAX_GROUPS
-from calibration.light.tuning import (
-    DARKNESS_BLUR,
-    FIRST_THINNESS,
-    MAX_ALTERNATIVE_COST,
-    MAX_DARKNESS_RESIDUAL,
-    MAX_FEW_PRESSES,
-    MAX_RADIUS_RATIO,
-    MAX_RIM_RATIO,
-    MAX_UNIFORM_SHARE,
-    MIN_DARK_CONTRAST,
-    PRESS_RADIUS,
-    THINNESS_BOUNDS,
-)
 from tacsim.interface import FloatArray, Image
 from tacsim.models.photometric import DarknessModel
 
@@ -54,9 +41,9 @@ def rough_contact(change: FloatArray) -> ContactCircle:
     edge_ratio = 1.3  # contact radius over the radius where a press is half as dark as in its middle, about
     import cv2
 
-    strength = np.abs(gaussian_blur(change, DARKNESS_BLUR)).mean(axis=2)
+    strength = np.abs(gaussian_blur(change, tuning.DARKNESS_BLUR)).mean(axis=2)
     peak = float(strength.max())
-    if not peak > MIN_DARK_CONTRAST:
+    if not peak > tuning.MIN_DARK_CONTRAST:
         raise NoCircle(f"no ball's contact is seen: colours change by {peak:.1%} at most")
     _, patches = cv2.connectedComponents((strength > peak / 2).astype(np.uint8))
     numbers = np.asarray(patches, dtype=np.intp)
@@ -81,10 +68,10 @@ def is_direction_free(changes: Iterable[FloatArray]) -> bool:
         near = distance < looked_at * circle.radius
         rings = (distance[near] * (12 / circle.radius)).astype(np.intp)
         count = np.maximum(np.bincount(rings), 1)
-        observed = gaussian_blur(change, DARKNESS_BLUR)[near]
+        observed = gaussian_blur(change, tuning.DARKNESS_BLUR)[near]
         means = np.stack([np.bincount(rings, channel) / count for channel in observed.T])
         shares.append(float(((count * means**2).sum(axis=1) / np.maximum((observed**2).sum(axis=0), 1e-300)).min()))
-    return bool(shares) and float(np.median(shares)) > MAX_UNIFORM_SHARE
+    return bool(shares) and float(np.median(shares)) > tuning.MAX_UNIFORM_SHARE
 
 
 def find_dark_press(name: str, image: Image, reference: Image, mean: FloatArray, ball: float) -> BallPress:
@@ -92,13 +79,13 @@ def find_dark_press(name: str, image: Image, reference: Image, mean: FloatArray,
     calibration.light.press. Raises NoCircle, BadFrames."""
     raw = image.astype(np.float64) - reference
     circle = rough_contact((raw - np.median(raw, axis=(0, 1))) / mean)
-    circle = replace(circle, radius=min(circle.radius, 0.9 * MAX_RIM_RATIO * ball))
-    return make_press(name, image, reference, mean, circle, PRESS_RADIUS)
+    circle = replace(circle, radius=min(circle.radius, 0.9 * tuning.MAX_RIM_RATIO * ball))
+    return make_press(name, image, reference, mean, circle, tuning.PRESS_RADIUS)
 
 
 def dark_circle(image: Image, reference: Image, ball: float) -> Circle:
     """Finds the contact of a ball of radius `ball` [px] in `image` (H, W, 3), as a calibration from this press alone
-    would: :func:`calibration.light.circle.find_contact_circle` for a light without direction. `reference`
+    would: :func:`calibration.light.dent.find_contact_circle` for a light without direction. `reference`
     (H, W, 3) is the same without contact.
 
     Raises BadFrames for a reference that is dark or saturated, NoCircle if no ball's contact is visible.
@@ -109,10 +96,10 @@ def dark_circle(image: Image, reference: Image, ball: float) -> Circle:
     except BadFrames as why:
         raise NoCircle(f"no ball's contact is seen: {why}") from None
     explained = 1.0 - fit.residual_shares[0]
-    if explained < 1.0 - MAX_DARKNESS_RESIDUAL:
+    if explained < 1.0 - tuning.MAX_DARKNESS_RESIDUAL:
         raise NoCircle(
             f"no ball's contact is seen: the depth of a dent explains {max(explained, 0.0):.0%} of how dark it gets, "
-            f"{1 - MAX_DARKNESS_RESIDUAL:.0%} are needed"
+            f"{1 - tuning.MAX_DARKNESS_RESIDUAL:.0%} are needed"
         )
     found = fit.presses[0].circle
     return Circle(found.x, found.y, found.radius, explained)
@@ -122,9 +109,11 @@ def fit_darkness(presses: Sequence[BallPress], ball: float) -> DarknessFit:
     """Circles, thickness and model of presses; `ball`: its radius [px]. Raises BadFrames if darkness does not
     increase with depth."""
     problem = _Problem(presses, ball)
-    ends = sorted((problem.refined(problem.start(thinness)) for thinness in FIRST_THINNESS), key=lambda end: end[1])
+    ends = sorted(
+        (problem.refined(problem.start(thinness)) for thinness in tuning.FIRST_THINNESS), key=lambda end: end[1]
+    )
     best, cost = ends[0]
-    rivals = [_log_ratio(end, best) for end, other in ends[1:] if other < MAX_ALTERNATIVE_COST * cost]
+    rivals = [_log_ratio(end, best) for end, other in ends[1:] if other < tuning.MAX_ALTERNATIVE_COST * cost]
     depths = [problem.local_depth(i, best) for i in range(len(presses))]
     observed = [problem.windows[i].change for i in range(len(presses))]
     whole = _fit_table(depths, observed)
@@ -177,8 +166,8 @@ class _Problem:
         for press in self.presses:
             side = 0.3 * press.circle.radius
             low += [press.circle.x - side, press.circle.y - side, 0.05 * self._ball]
-            high += [press.circle.x + side, press.circle.y + side, MAX_RIM_RATIO * self._ball]
-        low, high = [*low, THINNESS_BOUNDS[0], *bounds[0]], [*high, THINNESS_BOUNDS[1], *bounds[1]]
+            high += [press.circle.x + side, press.circle.y + side, tuning.MAX_RIM_RATIO * self._ball]
+        low, high = [*low, tuning.THINNESS_BOUNDS[0], *bounds[0]], [*high, tuning.THINNESS_BOUNDS[1], *bounds[1]]
         start = np.clip(start, np.array(low) + 1e-6, np.array(high) - 1e-6)
         scale = np.array([1.0, 1.0, 1.0] * len(self.presses) + [0.3, 0.1, 0.1])
         found = least_squares(
@@ -219,7 +208,7 @@ class _Problem:
     def _new_features(self, i: int, at: tuple[float, ...]) -> FloatArray:
         deep = self.local_depth(i, np.array([*([0.0] * 3 * i), *at])) / self._ball
         above, below = np.maximum(deep, 0.0), np.minimum(deep, 0.0)
-        return np.stack([above, below, above**2][: 3 if len(self.presses) > MAX_FEW_PRESSES else 2], axis=-1)
+        return np.stack([above, below, above**2][: 3 if len(self.presses) > tuning.MAX_FEW_PRESSES else 2], axis=-1)
 
     def _residual(self, at: FloatArray) -> FloatArray:
         shared = tuple(map(float, at[-3:]))
@@ -238,17 +227,17 @@ def _log_ratio(one: FloatArray, other: FloatArray, *, signed: bool = False) -> f
 
 def _press_window(press: BallPress) -> _Window:
     pixels_of_press = 1200  # of each press, about
-    v, u = np.nonzero((press.distance() < PRESS_RADIUS * press.circle.radius) & press.lit.all(axis=2))
+    v, u = np.nonzero((press.distance() < tuning.PRESS_RADIUS * press.circle.radius) & press.lit.all(axis=2))
     thin = max(1, round(np.sqrt(len(u) / pixels_of_press)))
     keep = (u % thin == 0) & (v % thin == 0)
     u, v = u[keep], v[keep]
-    return _Window(u.astype(np.float64), v.astype(np.float64), gaussian_blur(press.change, DARKNESS_BLUR)[v, u])
+    return _Window(u.astype(np.float64), v.astype(np.float64), gaussian_blur(press.change, tuning.DARKNESS_BLUR)[v, u])
 
 
 @functools.cache
 def _profile_radii() -> FloatArray:
     radius_step = 1 / 30  # of radii [ball radii]
-    return np.arange(0.0, MAX_RADIUS_RATIO, radius_step)
+    return np.arange(0.0, tuning.MAX_RADIUS_RATIO, radius_step)
 
 
 @functools.lru_cache(maxsize=64)

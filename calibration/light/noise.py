@@ -9,9 +9,9 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.drift import DriftFinder
 from calibration.light.press import BallPress, mean_reference_colour
 from calibration.light.tuning import UNTOUCHED_RADIUS
+from calibration.reference import DriftFinder
 from calibration.tuning import SATURATED_LEVEL
 from tacsim.interface import FloatArray, Image
 from tacsim.models.sensor import CameraNoise

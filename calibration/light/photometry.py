@@ -14,13 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.light.tuning import (
-    MAX_FEW_PRESSES,
-    MIN_DEPTH_IMPROVEMENT,
-    MIN_SHADOW_IMPROVEMENT,
-    MIN_SIZE_IMPROVEMENT,
-    MIN_SLOPES_IMPROVEMENT,
-)
+from calibration.light import tuning
 from tacsim.interface import FloatArray
 from tacsim.models.photometric import DEPTH_TERMS, normal_terms, position_terms, term_count
 
@@ -204,22 +198,22 @@ def choose_size(presses: Sequence[NormalEquations]) -> ModelSize:
     are among the terms, are added if they improve it by a large factor; then depth, and then slopes at depth, if they
     improve it."""
     ridge_of_few_presses = 1e-3
-    if len(presses) <= MAX_FEW_PRESSES:
+    if len(presses) <= tuning.MAX_FEW_PRESSES:
         return ModelSize(3, 0, ridge_of_few_presses)
     error, size = _best_size(presses, 0)
     extra_terms = len(presses[0].right) - term_count(*MAX_SIZE)
     shadows = max(extra_terms - DEPTH_TERMS - SLOPE_TERMS, 0)
     if shadows:
         other_error, other = _best_size(presses, shadows)
-        if other_error < MIN_SHADOW_IMPROVEMENT * error:
+        if other_error < tuning.MIN_SHADOW_IMPROVEMENT * error:
             error, size = other_error, other
     if not extra_terms:
         return size
     deep_error, deep = _best_ridge(presses, replace(size, depth=DEPTH_TERMS))
     other_error, other = _best_ridge(presses, replace(deep, slopes=term_count(size.degree, 0)))
-    if other_error < MIN_SLOPES_IMPROVEMENT * min(deep_error, MIN_DEPTH_IMPROVEMENT * error):
+    if other_error < tuning.MIN_SLOPES_IMPROVEMENT * min(deep_error, tuning.MIN_DEPTH_IMPROVEMENT * error):
         return other
-    return deep if deep_error < MIN_DEPTH_IMPROVEMENT * error else size
+    return deep if deep_error < tuning.MIN_DEPTH_IMPROVEMENT * error else size
 
 
 def _best_size(presses: Sequence[NormalEquations], shadows: int) -> tuple[float, ModelSize]:
@@ -229,7 +223,7 @@ def _best_size(presses: Sequence[NormalEquations], shadows: int) -> tuple[float,
     best: tuple[float, ModelSize] | None = None
     for degree, position in sorted(sizes, key=lambda size: term_count(*size)):
         error, size = _best_ridge(presses, ModelSize(degree, position, RIDGES[0], shadows=shadows))
-        if best is None or error < MIN_SIZE_IMPROVEMENT * best[0]:
+        if best is None or error < tuning.MIN_SIZE_IMPROVEMENT * best[0]:
             best = (error, size)
     assert best is not None
     return best

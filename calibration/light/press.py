@@ -7,17 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibration.errors import BadFrames
-from calibration.light.circle import find_contact_circle
-from calibration.light.dent import ContactCircle
-from calibration.light.tuning import (
-    MAX_RIM_RATIO,
-    MAX_SATURATED_CONTACT,
-    MIN_SECOND_AREA,
-    MIN_SECOND_CONTACT,
-    MIN_UNTOUCHED_SHARE,
-    SKIRT_RADIUS,
-    UNTOUCHED_RADIUS,
-)
+from calibration.light import tuning
+from calibration.light.dent import ContactCircle, find_contact_circle
 from calibration.reference import UnusableReference, make_reference
 from calibration.tuning import SATURATED_LEVEL
 from tacsim.interface import FloatArray, Image, Mask
@@ -73,12 +64,17 @@ def find_press(name: str, image: Image, reference: Image, mean: FloatArray, ball
     Raises NoCircle, BadFrames.
     """
     half = find_contact_circle(_halve_image(image), _halve_image(reference), ball / 2)
-    circle = ContactCircle(2 * half.x + 0.5, 2 * half.y + 0.5, min(2 * half.radius, 0.95 * MAX_RIM_RATIO * ball))
+    circle = ContactCircle(2 * half.x + 0.5, 2 * half.y + 0.5, min(2 * half.radius, 0.95 * tuning.MAX_RIM_RATIO * ball))
     return make_press(name, image, reference, mean, circle)
 
 
 def make_press(
-    name: str, image: Image, reference: Image, mean: FloatArray, circle: ContactCircle, reach: float = SKIRT_RADIUS
+    name: str,
+    image: Image,
+    reference: Image,
+    mean: FloatArray,
+    circle: ContactCircle,
+    reach: float = tuning.SKIRT_RADIUS,
 ) -> BallPress:
     """The same with an approximately known contact. reach: radius of its effect on the gel [contact radii]. Raises
     BadFrames."""
@@ -92,16 +88,16 @@ def make_press(
     drift = _fit_drift(raw, (distance > reach * circle.radius) & lit.all(axis=2))
     contact = distance < circle.radius
     saturated = 1.0 - float(lit[contact].all(axis=1).mean()) if contact.any() else 1.0
-    if saturated > MAX_SATURATED_CONTACT:
+    if saturated > tuning.MAX_SATURATED_CONTACT:
         raise BadFrames(f"{saturated:.0%} of the contact is saturated: shorten the exposure or press less")
     change = (raw - drift) / mean
     strength = np.abs(gaussian_blur(change, 3.0)).max(axis=2)
     near, far = (
         np.where(part, strength, 0.0)
-        for part in (distance < 1.5 * circle.radius, distance > UNTOUCHED_RADIUS * circle.radius)
+        for part in (distance < 1.5 * circle.radius, distance > tuning.UNTOUCHED_RADIUS * circle.radius)
     )
-    strong = MIN_SECOND_CONTACT * float(near.max())
-    if _patch_area(far, strong) > MIN_SECOND_AREA * _patch_area(near, strong):
+    strong = tuning.MIN_SECOND_CONTACT * float(near.max())
+    if _patch_area(far, strong) > tuning.MIN_SECOND_AREA * _patch_area(near, strong):
         raise BadFrames(
             "there is a second contact in the picture, or one in the picture without contact; press one ball at a time"
         )
@@ -121,7 +117,7 @@ def _patch_area(strength: FloatArray, strong: float) -> int:
 def _fit_drift(difference: FloatArray, untouched: Mask) -> FloatArray:
     """(H, W, 3) change between reference and frame outside the contact: a quadratic in the place, or the median if too
     little is untouched."""
-    if untouched.mean() < MIN_UNTOUCHED_SHARE:
+    if untouched.mean() < tuning.MIN_UNTOUCHED_SHARE:
         level = np.median(difference[untouched], axis=0) if untouched.any() else np.zeros(3)
         return np.broadcast_to(level, difference.shape).copy()
     u, v = np.meshgrid(*image_axes(difference.shape[1], difference.shape[0]))

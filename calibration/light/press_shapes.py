@@ -12,18 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from calibration.light import tuning
 from calibration.light.dent import ContactCircle, dent_gradient, dent_height
 from calibration.light.photometry import photometric_features
 from calibration.light.press import Window
-from calibration.light.tuning import (
-    MAX_FEW_PRESSES,
-    MAX_RIM_RATIO,
-    MIN_BALL_GAP,
-    MIN_GAP_DEVIATIONS,
-    RIM_BLUR,
-    SCALE_PRIOR,
-    THINNESS_BOUNDS,
-)
 from tacsim.interface import FloatArray
 
 DEGREE, RIDGE = 3, 1e-4  # of the light that is eliminated
@@ -58,7 +50,7 @@ def fit_stretch(
     windows: Sequence[Window], circles: Sequence[ContactCircle], thickness: float, ball: float, shape: tuple[int, int]
 ) -> Stretch:
     """The common ratio of axes of contacts. ball: its radius. thickness: of the gel [px]."""
-    position = 1 if len(windows) > MAX_FEW_PRESSES else 0
+    position = 1 if len(windows) > tuning.MAX_FEW_PRESSES else 0
     free = ((0, 1, 2, 4), (0, 1, 2))
 
     def parts(chosen: slice) -> FloatArray:
@@ -66,7 +58,7 @@ def fit_stretch(
         return np.asarray(common[1:], dtype=np.float64)
 
     found, spread = parts(slice(None)), float("nan")
-    if len(windows) > MAX_FEW_PRESSES:
+    if len(windows) > tuning.MAX_FEW_PRESSES:
         one, other = (parts(slice(start, None, 2)) for start in (0, 1))
         spread = float(np.hypot(*(one - other)))  # half the difference; a ratio is twice the logarithm
     # the fit squeezes a picture until contacts are round, so the picture is stretched by its inverse
@@ -79,7 +71,7 @@ def find_other_balls(
 ) -> tuple[tuple[int, ...], float]:
     """The presses, a minority, with a ball of another radius than the rest, and the ratio of the radii. Under one light
     the slopes of a press identify its ball. No press if one ball explains all."""
-    if len(windows) <= MAX_FEW_PRESSES:
+    if len(windows) <= tuning.MAX_FEW_PRESSES:
         return (), 1.0
     free = ((0, 1, 2, 3, 4), (0, 1, 2))
     balls = _minimise(windows, circles, ball / thickness, ball, shape, 0, free).presses[:, 3]
@@ -88,7 +80,7 @@ def find_other_balls(
     cut = int(np.argmax(gaps)) + 1
     low, high = balls[order[:cut]], balls[order[cut:]]
     within = np.sqrt((((low - low.mean()) ** 2).sum() + ((high - high.mean()) ** 2).sum()) / (len(balls) - 2))
-    if gaps[cut - 1] < max(MIN_BALL_GAP, MIN_GAP_DEVIATIONS * within):
+    if gaps[cut - 1] < max(tuning.MIN_BALL_GAP, tuning.MIN_GAP_DEVIATIONS * within):
         return (), 1.0
     ratio = float(np.exp(low.mean() - high.mean()))
     few, ratio = (order[:cut], ratio) if cut <= len(balls) / 2 else (order[cut:], 1 / ratio)
@@ -108,8 +100,8 @@ def _minimise(
     parameters, and of the common ones, that are fitted; `position`: degree of the light in the place."""
     model = _Model(windows, ball, shape, position)
     fit = _Fit(
-        np.array([[c.x, c.y, c.radius, 0.0, RIM_BLUR] for c in circles]),
-        np.array([np.clip(thinness, *THINNESS_BOUNDS), 0.0, 0.0]),
+        np.array([[c.x, c.y, c.radius, 0.0, tuning.RIM_BLUR] for c in circles]),
+        np.array([np.clip(thinness, *tuning.THINNESS_BOUNDS), 0.0, 0.0]),
     )
     cost, damping, own = model.cost(fit), 1e-2, len(free[0]) * len(windows)
     for _ in range(MAX_STEPS):
@@ -139,8 +131,8 @@ def _step_fit(
     common[list(free[1])] += common_by
     presses[:, 3] = np.clip(presses[:, 3], -1.2, 1.2)
     presses[:, 4] = np.clip(presses[:, 4], *blur_bounds)
-    presses[:, 2] = np.clip(presses[:, 2], 1.0, MAX_RIM_RATIO * ball * np.exp(presses[:, 3]))
-    common[0] = np.clip(common[0], *THINNESS_BOUNDS)
+    presses[:, 2] = np.clip(presses[:, 2], 1.0, tuning.MAX_RIM_RATIO * ball * np.exp(presses[:, 3]))
+    common[0] = np.clip(common[0], *tuning.THINNESS_BOUNDS)
     common[1:] = np.clip(common[1:], -0.5, 0.5)
     return _Fit(presses, common)
 
@@ -154,7 +146,7 @@ class _Model:
 
     def cost(self, fit: _Fit) -> float:
         _, _, residuals, _ = self._solve_light(fit)
-        prior = SCALE_PRIOR * self._power * len(self._windows) * float(fit.presses[:, 3].mean()) ** 2
+        prior = tuning.SCALE_PRIOR * self._power * len(self._windows) * float(fit.presses[:, 3].mean()) ** 2
         return sum(float((residual**2).sum()) for residual in residuals) + prior
 
     def normal_equations(
@@ -180,8 +172,8 @@ class _Model:
         curvature -= np.einsum("cpk,kl,cql->pq", onto, np.linalg.inv(square), onto, optimize=True)
         if 3 in own:
             at = np.array([len(own) * i + own.index(3) for i in range(count)])
-            gradient[at] += SCALE_PRIOR * self._power * fit.presses[:, 3].mean()
-            curvature[np.ix_(at, at)] += SCALE_PRIOR * self._power / count
+            gradient[at] += tuning.SCALE_PRIOR * self._power * fit.presses[:, 3].mean()
+            curvature[np.ix_(at, at)] += tuning.SCALE_PRIOR * self._power / count
         return gradient, curvature
 
     def _solve_light(self, fit: _Fit) -> tuple[list[FloatArray], FloatArray, list[FloatArray], FloatArray]:
@@ -201,7 +193,7 @@ class _Model:
         dx, dy = window.u - x, window.v - y
         u, v = (even + odd * along) * dx + odd * across * dy, odd * across * dx + (even - odd * along) * dy
         ball, thickness = self._ball * float(np.exp(scale)), self._ball / float(thinness)
-        circle = ContactCircle(0.0, 0.0, min(float(radius), MAX_RIM_RATIO * ball))
+        circle = ContactCircle(0.0, 0.0, min(float(radius), tuning.MAX_RIM_RATIO * ball))
         gradient = dent_gradient(u, v, circle, thickness, ball, float(blur))
         depth = dent_height(u, v, circle, thickness, ball)[:, None] / self._ball
         rows, columns = self._shape

@@ -14,11 +14,6 @@ MAX_GOOD_RESIDUAL = 0.05  # share of the change: a press that is explained so we
 MIN_SPREAD = 0.2  # share of the picture that presses spread over; else nothing is known of the rest
 MAX_NORMAL_ERROR = 8.0  # errors of a press's normals that deserve a warning [degrees]
 
-# circle.py
-MIN_CIRCLE_RADIUS = 4.0  # of a circle that differs from noise [px]
-MIN_EXPLAINED_SHARE = 0.7  # share of the difference that a ball's dent must explain
-MAX_CONTACT_RATIO = 0.98  # contact radius over the largest that a ball can have, from which a larger ball is tried
-
 # darkness.py
 MAX_UNIFORM_SHARE = 0.6
 DARKNESS_BLUR = 2.0  # through which the darkness of presses is looked at [px]
@@ -29,8 +24,11 @@ MAX_DARKNESS_RESIDUAL = 0.1  # share of darkness that is no function of a dent's
 # dent.py
 MAX_RIM_RATIO = 0.98  # contact radius over ball radius; the slope is infinite at 1
 MAX_RADIUS_RATIO = 6.0  # up to which a dent is followed [ball radii]
+MIN_CIRCLE_RADIUS = 4.0  # of a circle that differs from noise [px]
+MIN_EXPLAINED_SHARE = 0.7  # share of the difference that a ball's dent must explain
+MAX_CONTACT_RATIO = 0.98  # contact radius over the largest that a ball can have, from which a larger ball is tried
 
-# labels.py
+# fit.py
 FORWARD_BLUR = 0.8  # of the camera, and of what the forward model is fitted to [px]
 INVERSE_BLUR = 1.2  # of what the inverse is fitted to [px]
 RIM_MARGIN = 5.0  # added to contact and skirt for every radius [px]
@@ -53,7 +51,7 @@ MAX_SATURATED_CONTACT = 0.4  # share of a contact that may be saturated; beyond,
 MIN_SECOND_CONTACT = 0.7  # strength of a second patch, over that of the contact, that makes it a contact too ...
 MIN_SECOND_AREA = 0.3  # ... if it also is so large, over the contact's patch: specks of dirt or glare are smaller
 
-# press_collection.py
+# robot.procedures.presses
 MIN_SEPARATION = 0.5  # of two presses' centres [larger contact radius]
 
 # refinement.py

@@ -1,7 +1,7 @@
 """Tactile flow from pictures: displacement of each dot printed on the gel, in metres.
 
 Dots are detected on a separate metric grid, whose resolution depends on their size, not on the canonical grid. The
-reference gives row and column of each dot (:mod:`calibration.markers.lattice`), and its rest position;
+reference gives row and column of each dot (:mod:`calibration.markers.dots`), and its rest position;
 :mod:`calibration.markers.tracker` tracks it. A dot that is not visible gets the mean motion of its neighbours: flow is
 finite everywhere, and `visible` marks the measured part.
 """
@@ -22,8 +22,8 @@ from calibration.lens.rectification import (
     visible_box,
 )
 from calibration.lens.view import GelView
-from calibration.markers.dots import DotFinder
-from calibration.markers.lattice import (
+from calibration.markers.dots import (
+    DotFinder,
     Lattice,
     NoLattice,
     describe_missing_line,
@@ -35,8 +35,7 @@ from calibration.markers.tracker import DotTracker
 from calibration.markers.tuning import MAX_EXTRA_SHARE, MAX_MISSING, MIN_PRESENT_SHARE, MIN_VISIBLE_SHARE
 from calibration.reference import UnusableReference
 from tacsim.interface import Float32, FloatArray, Image, Mask
-from tacsim.models.geometry import PictureRegion
-from tacsim.models.sensor import CanonicalGrid, Markers, SensorGeometry
+from tacsim.models.sensor import CanonicalGrid, Markers, PictureRegion, SensorGeometry
 from tacsim.optics.grid import PixelGrid, canonical_image
 from tacsim.optics.tuning import MIN_RADIUS
 

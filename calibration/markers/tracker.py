@@ -14,21 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.markers.tuning import (
-    EXTRAPOLATION_RADIUS,
-    MATCH_RADIUS,
-    MAX_DIRT_GAIN,
-    MAX_JUMP,
-    MAX_STRETCH,
-    MAX_STRETCH_TRACKED,
-    MIN_DIRT_MISFIT,
-    MIN_DIRT_MISFIT_RATIO,
-    MIN_JUMP_SHARE,
-    NEIGHBOUR_RADIUS,
-    OUTLIER_MISFIT,
-    OUTLIER_MISFIT_RATIO,
-    STRICT_MATCH_RADIUS,
-)
+from calibration.markers import tuning
 from tacsim.interface import FloatArray, Mask
 
 Index = NDArray[np.intp]
@@ -62,7 +48,7 @@ class DotTracker:
 
         if len(rest) < 4:
             raise ValueError(f"{len(rest)} dots are no lattice, at least 4 are needed")
-        pairs = KDTree(rest).query_pairs(NEIGHBOUR_RADIUS * pitch, output_type="ndarray")
+        pairs = KDTree(rest).query_pairs(tuning.NEIGHBOUR_RADIUS * pitch, output_type="ndarray")
         self._rest, self._pitch = rest, pitch
         self._in_view = in_view or (lambda places: np.ones(places.shape[:-1], dtype=np.bool_))
         self._first, self._second = pairs.T
@@ -70,7 +56,7 @@ class DotTracker:
         self._linked = np.zeros((count, count))
         self._linked[self._first, self._second] = self._linked[self._second, self._first] = 1.0
         if not self._linked.any(axis=1).all():
-            raise ValueError(f"no lattice: some dots have no neighbour within {NEIGHBOUR_RADIUS * pitch:.3g}")
+            raise ValueError(f"no lattice: some dots have no neighbour within {tuning.NEIGHBOUR_RADIUS * pitch:.3g}")
         near = min(neighbour_count, count - 1)
         away, index = KDTree(rest).query(rest, k=near + 1)
         self._nearest = np.asarray(index, dtype=np.intp)[:, 1:]  # without the dot itself
@@ -91,7 +77,7 @@ class DotTracker:
         predicted = 0 <= ahead <= max_predicted_frames
         expected = self._rest + self._displacement + (ahead * self._velocity if predicted else 0.0)
         partner = self._match_points(expected, points)
-        coherent = self._coherent_part(partner, points, MAX_STRETCH)
+        coherent = self._coherent_part(partner, points, tuning.MAX_STRETCH)
         if not predicted or self._may_have_jumped(partner, points) or (coherent != (partner >= 0)).any():
             partner = self._best_match(expected, points, predicted)
         elif int((partner >= 0).sum()) < min(len(partner), len(points)):
@@ -110,7 +96,7 @@ class DotTracker:
         self._displacement = displacement
         return Tracked(displacement.copy(), visible)
 
-    def _match_points(self, expected: FloatArray, points: FloatArray, radius: float = MATCH_RADIUS) -> Index:
+    def _match_points(self, expected: FloatArray, points: FloatArray, radius: float = tuning.MATCH_RADIUS) -> Index:
         """(n,) the point of each dot, -1 if none is near: the minimum of the sum of squared distances (Kuhn 1955)."""
         from scipy.optimize import linear_sum_assignment
 
@@ -134,13 +120,13 @@ class DotTracker:
         found = [self._grow_match(expected, points)]
         if predicted:
             matched = self._match_points(expected, points)
-            found.append(np.where(self._coherent_part(matched, points, MAX_STRETCH_TRACKED), matched, -1))
+            found.append(np.where(self._coherent_part(matched, points, tuning.MAX_STRETCH_TRACKED), matched, -1))
             best = max(found, key=lambda partner: self._match_score(partner, points))
             if not self._may_have_jumped(best, points):
                 return best
         found.append(self._grow_match(self._rest, points))
         best = max(found, key=lambda partner: self._match_score(partner, points))
-        if self._match_score(best, points)[0] < (1.0 - MIN_JUMP_SHARE) * len(
+        if self._match_score(best, points)[0] < (1.0 - tuning.MIN_JUMP_SHARE) * len(
             best
         ):  # else all the rest is dirt and drop-outs
             last = self._rest + self._displacement
@@ -163,8 +149,10 @@ class DotTracker:
     def _grow_match(self, guess: FloatArray, points: FloatArray) -> Index:
         """Partners of the largest coherent part of the dots that are close to their guess, and of those found by
         extrapolation from it."""
-        partner = self._match_points(guess, points, STRICT_MATCH_RADIUS)
-        partner = self._extend_match(np.where(self._coherent_part(partner, points, MAX_STRETCH), partner, -1), points)
+        partner = self._match_points(guess, points, tuning.STRICT_MATCH_RADIUS)
+        partner = self._extend_match(
+            np.where(self._coherent_part(partner, points, tuning.MAX_STRETCH), partner, -1), points
+        )
         smooth = self._remove_far_points(partner, points)
         return partner if smooth is partner else self._remove_far_points(self._extend_match(smooth, points), points)
 
@@ -180,7 +168,7 @@ class DotTracker:
             if not (len(requested) and len(free)):
                 break
             moved = self._extrapolate(requested, known, points[partner] - self._rest)
-            found = self._match_points(self._rest[requested] + moved, points[free], EXTRAPOLATION_RADIUS)
+            found = self._match_points(self._rest[requested] + moved, points[free], tuning.EXTRAPOLATION_RADIUS)
             partner[requested[found >= 0]] = free[found[found >= 0]]
             refused[requested[found < 0]] = True
         return partner
@@ -193,7 +181,7 @@ class DotTracker:
             known = checked >= 0
             moved = np.where(known[:, None], points[checked] - self._rest, 0.0)
             misfit = np.where(known, np.linalg.norm(self._extrapolate(every, known, moved) - moved, axis=1), 0.0)
-            if misfit.max() <= EXTRAPOLATION_RADIUS * self._pitch:
+            if misfit.max() <= tuning.EXTRAPOLATION_RADIUS * self._pitch:
                 break
             checked = np.where(misfit > 0.9 * misfit.max(), -1, checked)
         return checked
@@ -206,7 +194,9 @@ class DotTracker:
             return partner
         moved = np.where(known[:, None], points[partner] - self._rest, 0.0)
         misfit = np.linalg.norm(self._extrapolate(np.arange(len(partner)), known, moved) - moved, axis=1)
-        limit = max(MIN_DIRT_MISFIT * self._pitch, MIN_DIRT_MISFIT_RATIO * float(np.median(misfit[known])))
+        limit = max(
+            tuning.MIN_DIRT_MISFIT * self._pitch, tuning.MIN_DIRT_MISFIT_RATIO * float(np.median(misfit[known]))
+        )
         suspects = np.flatnonzero(known & (misfit > limit))
         if not len(suspects):
             return partner
@@ -215,10 +205,10 @@ class DotTracker:
         free = np.setdiff1d(np.arange(len(points)), cleaned[cleaned >= 0])
         moved[suspects] = 0.0  # their neighbours must not be extrapolated from them
         there = self._rest[suspects] + self._extrapolate(suspects, cleaned >= 0, moved)
-        found = self._match_points(there, points[free], STRICT_MATCH_RADIUS)
+        found = self._match_points(there, points[free], tuning.STRICT_MATCH_RADIUS)
         other = free[found]
         away = [np.linalg.norm(points[p] - there, axis=1) for p in (other, partner[suspects])]
-        better = (found >= 0) & (away[0] < MAX_DIRT_GAIN * away[1])
+        better = (found >= 0) & (away[0] < tuning.MAX_DIRT_GAIN * away[1])
         cleaned[suspects] = np.where(better, other, partner[suspects])
         once = np.bincount(cleaned[cleaned >= 0], minlength=len(points)).max() <= 1
         return cleaned if once else partner
@@ -231,9 +221,9 @@ class DotTracker:
             return partner
         moved = np.where(known[:, None], points[partner] - self._rest, 0.0)
         misfit = np.linalg.norm(self._extrapolate(np.arange(len(partner)), known, moved) - moved, axis=1)
-        limit = max(OUTLIER_MISFIT * self._pitch, MIN_DIRT_MISFIT_RATIO * float(np.median(misfit[known])))
+        limit = max(tuning.OUTLIER_MISFIT * self._pitch, tuning.MIN_DIRT_MISFIT_RATIO * float(np.median(misfit[known])))
         around = (self._linked * np.where(known, misfit, 0.0)).max(axis=1)
-        return np.where(known & (misfit > np.maximum(limit, OUTLIER_MISFIT_RATIO * around)), -1, partner)
+        return np.where(known & (misfit > np.maximum(limit, tuning.OUTLIER_MISFIT_RATIO * around)), -1, partner)
 
     def _extrapolate(self, requested: Index, known: Mask, moved: FloatArray) -> FloatArray:
         """(k, 2) displacement of the dots `requested`, by an affine map through that (n, 2) of the `known` ones
@@ -289,7 +279,7 @@ class DotTracker:
     def _may_have_jumped(self, partner: Index, points: FloatArray) -> bool:
         """True if both dots and points are unmatched, so that they may belong together."""
         lost, spare = int((partner < 0).sum()), len(points) - int((partner >= 0).sum())
-        return min(lost, spare) > max(1.0, MIN_JUMP_SHARE * len(partner))
+        return min(lost, spare) > max(1.0, tuning.MIN_JUMP_SHARE * len(partner))
 
     def _propose_jumps(self, points: FloatArray, start: FloatArray) -> list[FloatArray]:
         """Shifts (2,) of the whole lattice that bring most dots near a point or out of view, the best first."""
@@ -300,15 +290,15 @@ class DotTracker:
         middle = np.argsort(((self._rest - self._rest.mean(axis=0)) ** 2).sum(axis=1))[:jump_seeds]
         shifts = (points[None, :, :] - start[middle][:, None, :]).reshape(-1, 2)
         length = np.linalg.norm(shifts, axis=1)
-        shifts = shifts[(length < MAX_JUMP * self._pitch) & (length > STRICT_MATCH_RADIUS * self._pitch)]
+        shifts = shifts[(length < tuning.MAX_JUMP * self._pitch) & (length > tuning.STRICT_MATCH_RADIUS * self._pitch)]
         if not len(shifts):
             return []
         there = start[None, :, :] + shifts[:, None, :]
-        away, _ = KDTree(points).query(there, distance_upper_bound=STRICT_MATCH_RADIUS * self._pitch)
+        away, _ = KDTree(points).query(there, distance_upper_bound=tuning.STRICT_MATCH_RADIUS * self._pitch)
         explained = (np.isfinite(away) | ~self._in_view(there)).sum(axis=1)
         chosen: list[FloatArray] = []
         for shift in shifts[np.argsort(-explained, kind="stable")]:
-            if all(float(np.linalg.norm(shift - other)) > STRICT_MATCH_RADIUS * self._pitch for other in chosen):
+            if all(float(np.linalg.norm(shift - other)) > tuning.STRICT_MATCH_RADIUS * self._pitch for other in chosen):
                 chosen.append(shift)
             if len(chosen) == max_candidates:
                 break

@@ -7,17 +7,15 @@ tracker.md, and the tests in tests/calibration/markers.
 # dots.py
 # A dot is darker than its surroundings by at least this share of their light; the higher levels part it from others
 DARKNESS_LEVELS = (0.2, 0.35, 0.5)
+MAX_STEP_ERROR = 0.3  # of a neighbour from one step along the lattice [pitches]
+MIN_ROW_SHARE = 0.5  # dots of a row or column of the lattice [number of dots of the fullest one]
+MAX_PITCH_ERROR = 0.25  # of the distance of regular neighbours [pitches]
 
 # flow.py
 MAX_MISSING = 0.3  # share of the dots in view that a reference may lack
 MAX_EXTRA_SHARE = 0.1  # dots beyond the lattice's rows and columns [number of its dots]
 MIN_PRESENT_SHARE = 0.75  # share of its dots that an unknown lattice must show
 MIN_VISIBLE_SHARE = 0.25  # share of the dots that must be seen for a flow
-
-# lattice.py
-MAX_STEP_ERROR = 0.3  # of a neighbour from one step along the lattice [pitches]
-MIN_ROW_SHARE = 0.5  # dots of a row or column of the lattice [number of dots of the fullest one]
-MAX_PITCH_ERROR = 0.25  # of the distance of regular neighbours [pitches]
 
 # tracker.py
 NEIGHBOUR_RADIUS = 1.6  # dots this near at rest are neighbours: the diagonal of a square is one [pitches]

@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calibration.errors import CalibrationError
+from calibration.materials import tuning
 from calibration.materials.fit import (
     MESH_ERROR_SHARE,
     Fit,
@@ -27,16 +28,6 @@ from calibration.materials.fit import (
     covariance_of,
     fit_start_values,
     start_values,
-)
-from calibration.materials.tuning import (
-    COARSE_SIMULATION_ERROR,
-    MAX_IDENTIFIED_HALF_INTERVAL,
-    MAX_START_HALF_INTERVAL,
-    MAX_STEP,
-    MIN_GAIN,
-    MIN_STEP_DEVIATIONS,
-    PARAMETER_DIFFERENCE,
-    PLACE_STEP,
 )
 from tacsim.interface import FloatArray
 
@@ -76,13 +67,17 @@ class _Fitter:
 
     def linearise(self, predict: Predict, point: Point, zeros: FloatArray) -> _State:
         """Linearises by one batch: the point itself, a small change of each free number, and one of all places."""
-        steps = np.where(point.free + PARAMETER_DIFFERENCE > self.high, -PARAMETER_DIFFERENCE, PARAMETER_DIFFERENCE)
+        steps = np.where(
+            point.free + tuning.PARAMETER_DIFFERENCE > self.high,
+            -tuning.PARAMETER_DIFFERENCE,
+            tuning.PARAMETER_DIFFERENCE,
+        )
         points = [point, *(replace(point, free=point.free + step) for step in np.diag(steps))]
-        points.append(replace(point, places=point.places + PLACE_STEP))
+        points.append(replace(point, places=point.places + tuning.PLACE_STEP))
         found = self.run(predict, points)
         base = found[0]
         columns = [(found[1 + k] - base) / step for k, step in enumerate(steps)]
-        by_place = (found[-1] - base) / PLACE_STEP
+        by_place = (found[-1] - base) / tuning.PLACE_STEP
         columns += [np.where(self.signals.press == p, by_place, 0.0) for p in range(self.signals.presses)]
         return _State(point, zeros, base, np.column_stack([*columns, self.zero_columns]))
 
@@ -93,12 +88,12 @@ class _Fitter:
         p, system = len(self.held), before.system.copy()
         step = np.concatenate([point.free - before.point.free, point.places - before.point.places])
         missed = predicted - before.predicted - system[:, : len(step)] @ step
-        scale = np.append(np.ones(p), PLACE_STEP / PARAMETER_DIFFERENCE)
+        scale = np.append(np.ones(p), tuning.PLACE_STEP / tuning.PARAMETER_DIFFERENCE)
         for press in range(self.signals.presses):
             rows, columns = np.flatnonzero(self.signals.press == press), [*range(p), p + press]
             scaled = step[columns] / scale
             weight = (
-                scaled @ scaled + PARAMETER_DIFFERENCE**2
+                scaled @ scaled + tuning.PARAMETER_DIFFERENCE**2
             )  # the residual after a smaller step is noise of the simulation
             system[np.ix_(rows, columns)] += np.outer(missed[rows], scaled / scale / weight)
         return _State(point, zeros, predicted, system)
@@ -137,12 +132,12 @@ class _Fitter:
         """True if a step changes each free number by less than `limit`, or than a part of its standard deviation."""
         p = len(self.held)
         spread = np.sqrt(np.diag(covariance_of(state.system, self.sigma, self.priors, self.held, 0.0))[:p])
-        return bool((np.abs(step[:p]) < np.maximum(limit, MIN_STEP_DEVIATIONS * spread)).all())
+        return bool((np.abs(step[:p]) < np.maximum(limit, tuning.MIN_STEP_DEVIATIONS * spread)).all())
 
     def moved(self, state: _State, step: FloatArray) -> tuple[Point, FloatArray]:
         """Point and zeros after a step, within the bounds."""
         p, t = len(self.held), self.signals.presses
-        free = np.clip(state.point.free + np.clip(step[:p], -MAX_STEP, MAX_STEP), self.low, self.high)
+        free = np.clip(state.point.free + np.clip(step[:p], -tuning.MAX_STEP, tuning.MAX_STEP), self.low, self.high)
         return Point(free, state.point.places + step[p : p + t]), state.zeros + step[p + t :]
 
     def after_full_step(self, state: _State) -> _State:
@@ -183,7 +178,7 @@ def estimate_materials(
     signals: Signals,
     parameters: Sequence[Parameter],
     priors: Priors,
-    coarse_error: float = COARSE_SIMULATION_ERROR,
+    coarse_error: float = tuning.COARSE_SIMULATION_ERROR,
     on_step: Callable[[str], None] = lambda words: None,
 ) -> Fit:
     """Fits the parameters to the signals.
@@ -205,7 +200,7 @@ def estimate_materials(
     begin = Point(fit_start_values(parameters), np.zeros(signals.presses))
     on_step("first run")
     state = fitter.linearise(levels[0], begin, np.zeros(fitter.zero_columns.shape[1]))
-    while fitter.hold(state, fitter.reach(state), MAX_START_HALF_INTERVAL):
+    while fitter.hold(state, fitter.reach(state), tuning.MAX_START_HALF_INTERVAL):
         pass
     kept = np.where(fitter.held, start_values(parameters), begin.free)
     if (kept != begin.free).any():
@@ -217,13 +212,15 @@ def estimate_materials(
         state = _restore_unidentified(fitter, level, found)
         max_steps = max_fine_steps if state is found else 2 * max_fine_steps
         state = fitter.after_full_step(_fit_coarse(fitter, level, state, coarse_error / 2, on_step, max_steps))
-    while fitter.hold(state, fitter.reach(state), MAX_IDENTIFIED_HALF_INTERVAL):
+    while fitter.hold(state, fitter.reach(state), tuning.MAX_IDENTIFIED_HALF_INTERVAL):
         state = fitter.after_full_step(state)
     while True:
         fit = _refine_fit(fitter, state, levels[-1] if len(levels) > 1 else None, on_step)
         plain = fit.with_sigma(fit.sigma)  # large scatter of the signals does not mean that data are missing
         if not fitter.hold(
-            state, np.array([plain.half_interval(each.name) for each in parameters]), MAX_IDENTIFIED_HALF_INTERVAL
+            state,
+            np.array([plain.half_interval(each.name) for each in parameters]),
+            tuning.MAX_IDENTIFIED_HALF_INTERVAL,
         ):
             return fit
         state = fitter.after_full_step(state)
@@ -234,13 +231,13 @@ def _restore_unidentified(fitter: _Fitter, predict: Predict, state: _State) -> _
     start if that identifies them, because a step was too large."""
     begun, lost = (
         fit_start_values(fitter.parameters),
-        ~fitter.held & (fitter.reach(state) > MAX_IDENTIFIED_HALF_INTERVAL),
+        ~fitter.held & (fitter.reach(state) > tuning.MAX_IDENTIFIED_HALF_INTERVAL),
     )
     if not (lost & (state.point.free != begun)).any():
         return state
     point = replace(state.point, free=np.where(lost, begun, state.point.free))
     back = fitter.linearise(predict, point, state.zeros)
-    return back if (fitter.reach(back)[lost] <= MAX_IDENTIFIED_HALF_INTERVAL).any() else state
+    return back if (fitter.reach(back)[lost] <= tuning.MAX_IDENTIFIED_HALF_INTERVAL).any() else state
 
 
 def _fit_coarse(
@@ -275,7 +272,7 @@ def _fit_coarse(
         else:
             state = replace(state, system=after.system) if secant else state
             damping = max(damping, 1e-3) * 10
-        if abs(gain) < max(MIN_GAIN, MIN_GAIN_SHARE * fitter.cost(state)):
+        if abs(gain) < max(tuning.MIN_GAIN, MIN_GAIN_SHARE * fitter.cost(state)):
             break
     return state
 

@@ -10,7 +10,7 @@ from tacsim.models.driver import ArmDriver, ArmExamination
 from tacsim.models.hardware import UrArmConfig
 
 if TYPE_CHECKING:
-    from robot.arm.lost_link import PackageLog
+    from robot.arm.status import PackageLog
     from robot.arm.ur import URArm
 
 
@@ -25,7 +25,7 @@ class UrDriver(ArmDriver[UrArmConfig]):
         return None if self.config.mock is None else "robot.mock.cell.cell:MockCell"
 
     def require(self) -> None:
-        from robot.arm.worker_config import check_host
+        from robot.arm.channel import check_host
 
         check_host(self.config, self.name)
 
@@ -38,7 +38,7 @@ class UrDriver(ArmDriver[UrArmConfig]):
         return BRAKING_REACTION_TIME
 
     def examine(self, start: Pose | None, file: str) -> ArmExamination:
-        from robot.arm.controller.examine import examine
+        from robot.arm.examine import examine
 
         return examine(self.name, self.config, start, file)
 

@@ -26,30 +26,23 @@ from dataclasses import replace
 
 import numpy as np
 
-from robot.arm.channel import CommandKind, WorkerConfig
-from robot.arm.following import FollowingMonitor, SpeedScaling, is_standing_still
-from robot.arm.shared_ring import Record
+from robot.arm import tuning
+from robot.arm.channel import CommandKind, Record, WorkerConfig
 from robot.arm.status import ArmStatus, is_healthy
 from robot.arm.trajectory import (
     PERIOD,
+    FollowingMonitor,
     MotionLimits,
     MotionState,
+    SpeedScaling,
     find_stopping_point,
     is_at_target,
+    is_standing_still,
     limit_speed,
     motion_at_rest,
     rotation_from_quaternion,
     step_braking,
     step_towards,
-)
-from robot.arm.tuning import (
-    FAULT_DECELERATION,
-    FAULT_TURN_DECELERATION,
-    MAX_HELD_DISPLACEMENT,
-    MAX_HELD_ROTATION,
-    MAX_OVERSHOOT,
-    MAX_STALL_PERIODS,
-    ZERO_REQUEST_TIMEOUT,
 )
 from robot.common.kinematics import Kinematics, SingularityGuard, inverse_frame, rotation, rotation_vector
 from robot.common.tcp import Measured
@@ -91,8 +84,8 @@ class Servo:
         self._tactile_read, self._exposure_time = tactile_read, math.nan  # reports read; oldest exposure [s]
         self._singularity = SingularityGuard(self.kinematics)
         self._hard_braking = (
-            max(FAULT_DECELERATION, config.acceleration),
-            max(FAULT_TURN_DECELERATION, config.turn_acceleration),
+            max(tuning.FAULT_DECELERATION, config.acceleration),
+            max(tuning.FAULT_TURN_DECELERATION, config.turn_acceleration),
         )
         self._fault_braking: tuple[float, float] | None = None  # None: not yet reset after a fault
         self._scaling = SpeedScaling()
@@ -154,7 +147,7 @@ class Servo:
         elif self.status in (ArmStatus.CONNECTING, ArmStatus.WAITING):
             self.status = ArmStatus.HOLD
         for partner, record in zip(config.partners, partners, strict=True):
-            min_gap = partner.distance - MAX_OVERSHOOT
+            min_gap = partner.distance - tuning.MAX_OVERSHOOT
             if record is not None and float(np.linalg.norm(here - record["position"])) < min_gap:
                 approach = float(measured.twist[:3] @ (record["position"] - here))
                 if approach > 0.0 and not self.is_at_rest:
@@ -162,7 +155,7 @@ class Servo:
 
     def _check_position(self, measured: Measured) -> None:
         end = stopping_position(measured.sensor[:3, 3], measured.twist[:3], self._hard_braking[0])
-        if self.region.excess(end) > MAX_OVERSHOOT:
+        if self.region.excess(end) > tuning.MAX_OVERSHOOT:
             self.enter_fault(ArmStatus.WORKSPACE_LIMIT)
 
     def on_tactile(self, number: int, report: Record | None) -> None:
@@ -200,7 +193,7 @@ class Servo:
 
     def take_zero_request(self, time: float) -> bool:
         """True, once, if the newest command is a recent request to zero the wrench and the target is at rest."""
-        is_due = self.is_at_rest and time - self._zero_request_time <= ZERO_REQUEST_TIMEOUT
+        is_due = self.is_at_rest and time - self._zero_request_time <= tuning.ZERO_REQUEST_TIMEOUT
         if is_due:
             self._zero_request_time = -math.inf
         return is_due
@@ -288,7 +281,7 @@ class Servo:
             age = 0.5 * PERIOD if is_new_fault else PACKAGE_DELAY  # longer than usual
             is_fresh = measured.stamp - stamp > max(0.0, time - new - PERIOD - age)
             self._waited_periods += not is_fresh
-            if not is_fresh and self._waited_periods < MAX_STALL_PERIODS:
+            if not is_fresh and self._waited_periods < tuning.MAX_STALL_PERIODS:
                 return True
             if is_new_fault:
                 self._reset_after_fault(measured if is_fresh else None)
@@ -334,7 +327,7 @@ class Servo:
             return False
         shift = np.abs(measured.sensor[:3, 3] - held.position).max()
         turn = np.abs(rotation_vector(measured.sensor[:3, :3] @ held.rotation.T)).max()
-        return bool(shift > MAX_HELD_DISPLACEMENT or turn > MAX_HELD_ROTATION)
+        return bool(shift > tuning.MAX_HELD_DISPLACEMENT or turn > tuning.MAX_HELD_ROTATION)
 
     def _brake(self, measured: Measured) -> FloatArray | None:
         """Brakes for one period. Sends the last joints again if the next pose has no allowed joints."""

@@ -16,12 +16,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from robot.arm.channel import CommandKind, WorkerConfig
-from robot.arm.following import is_standing_still
+from robot.arm.channel import CommandKind, Record, WorkerConfig
 from robot.arm.servo import Servo
-from robot.arm.shared_ring import Record
 from robot.arm.status import ArmStatus
-from robot.arm.trajectory import PERIOD, MotionState, motion_at_rest, reduce_speed, step_velocity, stopping_distance
+from robot.arm.trajectory import (
+    PERIOD,
+    MotionState,
+    is_standing_still,
+    motion_at_rest,
+    reduce_speed,
+    step_velocity,
+    stopping_distance,
+)
 from robot.arm.tuning import JOINT_ACCELERATION, JOINT_SPEED, OFF_PATH
 from robot.common.kinematics import Kinematics, inverse_frame, rotation_vector
 from robot.common.tcp import ArmFrames, Measured

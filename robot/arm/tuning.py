@@ -4,7 +4,7 @@ Each entry: what it is, its unit, and what it was measured on where it was. Sour
 docs/reliability.md, and the tests in tests/robot/arm.
 """
 
-# following.py
+# trajectory.py
 # Rate of change of the speed scaling [1/s]: Universal Robots' ROS driver raises it by 0.01 in each period of 2 ms.
 SCALING_RATE = 5.0
 SLOW_LAG_RATIO = 1.5  # time constant of the model divided by that of servoJ

@@ -20,18 +20,18 @@ from robot.arm.channel import (
     Channel,
     CommandKind,
     Partner,
+    Record,
     Timing,
+    check_host,
     make_command_record,
     make_tactile_record,
+    make_worker_config,
     shared_segment,
 )
-from robot.arm.controller.dashboard import Dashboard
-from robot.arm.lost_link import PackageLog, StatusHistory, describe_lost_link
-from robot.arm.shared_ring import Record
-from robot.arm.status import CONNECTING_ADVICE, ArmStatus
+from robot.arm.connections import Dashboard
+from robot.arm.status import CONNECTING_ADVICE, ArmStatus, PackageLog, StatusHistory, describe_lost_link
 from robot.arm.time_alignment import await_state_at
 from robot.arm.trajectory import PERIOD
-from robot.arm.worker_config import check_host, make_worker_config
 from robot.common import Closing
 from robot.common.kinematics import Kinematics
 from robot.common.process import Child

@@ -23,17 +23,16 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from robot.arm.channel import STATE, STATISTICS_PERIODS, Channel, WorkerConfig
+from robot.arm.channel import STATE, STATISTICS_PERIODS, Channel, Segment, WorkerConfig
 from robot.arm.confinement import TimeLimit, enable_time_limits, forbid_later_connections
-from robot.arm.controller.dashboard import Dashboard
+from robot.arm.connections import Dashboard
 from robot.arm.servo import Servo
-from robot.arm.shared_ring import Segment
 from robot.arm.start_servo import StartServo
 from robot.arm.status import ArmStatus, is_healthy
 from robot.arm.trajectory import PERIOD
+from robot.common import WORKER_PRIORITY, request_realtime
 from robot.common.kinematics import Kinematics, displacement, matrix
 from robot.common.process import Parent, ParentMonitor
-from robot.common.realtime import WORKER, request_realtime
 from robot.errors import DeviceBusyError, DeviceError, DeviceNotConnectedError
 from tacsim.interface import FloatArray
 
@@ -377,7 +376,7 @@ def main() -> NoReturn:
     parent = Parent()  # the library prints
     enable_time_limits()
     config = WorkerConfig.from_dict(parent.receive())
-    realtime = config.realtime and request_realtime(WORKER)  # before the library starts its threads
+    realtime = config.realtime and request_realtime(WORKER_PRIORITY)  # before the library starts its threads
     try:
         worker = Worker(config)
         worker.record["realtime"] = realtime

@@ -13,7 +13,7 @@ from robot.errors import DeviceError
 from tacsim.interface import Normaliser, SensorSpec, TactileSource
 from tacsim.models.driver import Check, Companion, SensorDriver
 from tacsim.models.hardware import CameraSensorConfig
-from tacsim.record.step_info import PICTURES_DAMAGED, PICTURES_LOST, PICTURES_REPEATED
+from tacsim.record.episode import PICTURES_DAMAGED, PICTURES_LOST, PICTURES_REPEATED
 
 if TYPE_CHECKING:
     from calibration.frame_normaliser import FrameNormaliser

@@ -28,7 +28,6 @@ from robot.cli.collect import collect, episodes, samples
 from robot.cli.collect import press as press_set
 from robot.cli.compare import compare
 from robot.cli.doctor import doctor, schema, start
-from robot.cli.errors import Guarded
 from robot.cli.identify import body, gel, identify
 from robot.cli.learn import evaluate, export, policy, policy_range, train, transfer
 from robot.cli.mock import mock
@@ -37,6 +36,7 @@ from robot.cli.recordings import lerobot, recover, view
 from robot.cli.run import film, replay, run
 from robot.cli.serve import serve
 from robot.cli.simulate import debug, press, reproduce
+from robot.cli.terminal import Guarded
 
 app = typer.Typer(
     name="tacsim",

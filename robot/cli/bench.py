@@ -9,8 +9,8 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from robot.cli.errors import EXIT_USAGE, print_error
 from robot.cli.output import busy, choose_json_file, notes, print_json, require_writable
+from robot.cli.terminal import EXIT_USAGE, print_error
 
 Group = Literal["all", "press", "squeeze", "materials", "scenes", "oracles", "real", "robot"]
 

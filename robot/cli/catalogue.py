@@ -14,7 +14,7 @@ from robot.cli.output import notes, print_files, print_json, results, show_table
 
 Kind = Literal[
     "rig", "task", "scene", "sensor", "randomisation", "training", "material", "policy", "driver"
-]  # tacsim.config.catalogue.CATALOGUE_KINDS, without importing it for each command
+]  # tacsim.config.kinds.CATALOGUE_KINDS, without importing it for each command
 
 
 def list_(
@@ -24,7 +24,7 @@ def list_(
 
     Example: tacsim list rig
     """
-    from tacsim.config.catalogue import CATALOGUE_KINDS, list_entries
+    from tacsim.config.kinds import CATALOGUE_KINDS, list_entries
 
     entries = [entry for each in ([kind] if kind else CATALOGUE_KINDS) for entry in list_entries(each)]
     print_json(
@@ -45,7 +45,7 @@ def show(
 
     Example: tacsim show gelsight-mini
     """
-    from tacsim.config.catalogue import find_entries
+    from tacsim.config.kinds import find_entries
 
     found = find_entries(name, kind)
     described = [{"kind": each.kind, "name": each.name, "path": _text(each.path), **_describe(each)} for each in found]
@@ -76,7 +76,7 @@ def _text(path: Path | None) -> str | None:
 
 def _describe(entry: Any) -> dict[str, Any]:
     """What is printed of an entry after its name: the text of its file, or its fields in words."""
-    from tacsim.config.catalogue import DRIVER, POLICY
+    from tacsim.config.kinds import DRIVER, POLICY
 
     if entry.kind == POLICY:
         from robot.deploy.onnx_policy import read_policy_spec

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import typer
 
-from robot.cli.errors import EXIT_FAILED, print_error
 from robot.cli.options import (
     TASK_POLICIES,
     OptionGroup,
@@ -25,7 +24,7 @@ from robot.cli.options import (
     with_option_groups,
 )
 from robot.cli.output import busy, counted, new_directory, notes, one_bar, print_files, print_json, results, writing
-from robot.cli.terminal import Interrupt
+from robot.cli.terminal import EXIT_FAILED, Interrupt, print_error
 
 if TYPE_CHECKING:
     from robot.collect.collect import Collected
@@ -323,7 +322,7 @@ def _validate(model: Any, **values: Any) -> Any:
     """A model of these values. Raises SetError with the first message of the validation."""
     from pydantic import ValidationError
 
-    from robot.collect.job import SetError
+    from robot.collect.workers import SetError
 
     try:
         return model(**values)

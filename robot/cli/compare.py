@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from robot.cli.errors import print_error
 from robot.cli.options import OptionGroup, Out, Overrides, complete_names, with_option_groups
 from robot.cli.output import (
     busy,
@@ -23,6 +22,7 @@ from robot.cli.output import (
     warn,
     writing,
 )
+from robot.cli.terminal import print_error
 from tacsim.models.text import suggest_word
 
 if TYPE_CHECKING:

@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from robot.cli.bench import from_checkout, require_checkout
-from robot.cli.errors import print_error
 from robot.cli.options import HardwareRig, Overrides, complete_names
 from robot.cli.output import SafeConsole, busy, notes, print_json, results
-from robot.cli.terminal import Interrupt, ask_operator, has_operator
+from robot.cli.terminal import Interrupt, ask_operator, has_operator, print_error
 from tacsim.models.text import suggest_word
 
 if TYPE_CHECKING:
@@ -72,12 +71,11 @@ def doctor(
 
     Example: tacsim doctor --rig ur5e
     """
-    from robot.doctor import machine
+    from robot.doctor import as_json, examine_machine, examine_rig
 
     if rig is None:
-        checks = machine.examine()
+        checks = examine_machine()
     else:
-        from robot.doctor.rig import examine_rig
         from robot.open import check_sensors
         from tacsim.config import load_rig
 
@@ -85,7 +83,7 @@ def doctor(
             config = load_rig(rig, overrides=set_ or []).config
             check_sensors(config)
             checks = examine_rig(config, rig)
-    report = machine.as_json(checks)
+    report = as_json(checks)
     print_checks(checks)
     print_json(report)
     raise typer.Exit(0 if report["ok"] else 1)
@@ -116,8 +114,7 @@ def start(
     Example: tacsim start my.yaml
     """
     with busy("looking at the rig"):
-        from robot.doctor.machine import as_json as checks_as_json
-        from robot.doctor.rig import examine_arms
+        from robot.doctor import as_json, examine_arms
         from robot.open import CannotOpen
         from robot.procedures.to_start import Halted, Operator, move_to_start
         from robot.rig.parts import companion_of
@@ -150,7 +147,7 @@ def start(
         except Halted as halted:
             print_error(str(halted))
             raise typer.Exit(interrupt.exit_code or 1) from None
-    print_json({**checks_as_json(checks), "distance_from_start": away})  # [m]
+    print_json({**as_json(checks), "distance_from_start": away})  # [m]
     if any(distance > 5e-3 for distance in away.values()) or not away:
         print_error("not every arm is at its start")
         raise typer.Exit(1)

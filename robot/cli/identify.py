@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from robot.cli.errors import EXIT_USAGE, print_error
 from robot.cli.options import (
     OptionGroup,
     Out,
@@ -31,9 +30,10 @@ from robot.cli.output import (
     warn,
     writing,
 )
+from robot.cli.terminal import EXIT_USAGE, print_error
 
 if TYPE_CHECKING:
-    from calibration.materials.presses import Noise
+    from calibration.materials.fit import Noise
     from robot.studies.identify.identify import Identified, Kind
     from tacsim.interface import Pose
     from tacsim.models.scene import Scene
@@ -189,8 +189,7 @@ class _IdentifyCommand:
             )
         folder = new_directory(options.out, f"identify-{self.kind}")
         with busy("loading"):
-            from calibration.materials.fit import Priors
-            from calibration.materials.presses import Noise
+            from calibration.materials.fit import Noise, Priors
             from robot.studies.identify.identify import identify
             from robot.studies.identify.recordings import Recordings, find_recordings, read_all
             from tacsim.physics.failure.dump import dump_to_folder

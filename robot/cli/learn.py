@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 TRAINING = ("torch", "stable_baselines3", "onnx", "onnxruntime")  # packages of the extra `train`
 export = typer.Typer(no_args_is_help=True, help="Write policies and recordings as files for others.")
 
+NewPolicyFile = Annotated[Path, typer.Option("--out", help="The file to be written, FILE.onnx; it must not exist.")]
+
 
 def train(
     task: Annotated[
@@ -92,7 +94,7 @@ def train(
         if task is None:
             raise typer.BadParameter("name a task (squeeze, reposition, knead), or a run to continue (--resume)")
         from tacsim.config import load_model
-        from tacsim.models.training import Training
+        from tacsim.models.policy import Training
 
         training = load_model(Training, task, own)
         _require_logged(training.algorithm, tensorboard)
@@ -155,7 +157,7 @@ def _run_training(run: RunFolder, tensorboard: bool, processes: int | None) -> t
 
 def policy(
     run: Annotated[Path, typer.Argument(help="The folder of a training run, finished or not.")],
-    out: Annotated[Path, typer.Option("--out", help="The file to be written, FILE.onnx; it must not exist.")],
+    out: NewPolicyFile,
 ) -> None:
     """Write the policy of a training run as one ONNX file, which contains a description of its inputs and outputs.
 
@@ -176,7 +178,7 @@ def policy(
 
 def policy_range(
     policy: Annotated[Path, typer.Argument(help="A policy, FILE.onnx.")],
-    out: Annotated[Path, typer.Option("--out", help="The file to be written, FILE.onnx; it must not exist.")],
+    out: NewPolicyFile,
     training: Annotated[
         str | None,
         typer.Option(help="Name or path of the training file.", show_default="as recorded in the policy"),
@@ -199,7 +201,7 @@ def policy_range(
         raise typer.BadParameter("--set changes a training file: name it with --training", param_hint="--set")
     from robot.train.measure_range import measure_range, write_range
     from tacsim.config import load_model
-    from tacsim.models.training import Training
+    from tacsim.models.policy import Training
 
     settings = None if training is None else load_model(Training, training, set_ or [])
     with one_bar("starting") as bar:
@@ -252,7 +254,7 @@ def evaluate(
     require_writable(file, "--json", new=True)
     from robot.train.evaluate import evaluate as evaluate_policies
     from tacsim.config import load_model
-    from tacsim.models.training import Training
+    from tacsim.models.policy import Training
 
     training = load_model(Training, task, set_ or [])
     played: dict[str, EvaluationResult] = {}

@@ -53,10 +53,10 @@ def mock(
     """
     from robot.common.kinematics import MODELS
     from robot.mock import MockArms, MockCamera
+    from robot.mock.ur.controller import PORTS
     from robot.mock.ur.fault_client import FAULT_PORT
-    from robot.mock.ur.machine.load import Mass
-    from robot.mock.ur.machine.version import VERSION, parse_version
-    from robot.mock.ur.wire.controller import PORTS
+    from robot.mock.ur.machine.forces import Mass
+    from robot.mock.ur.machine.state import VERSION, parse_version
 
     if model not in MODELS:
         words = f"no model '{model}'; allowed: {', '.join(MODELS)}{suggest_word(model, MODELS)}"

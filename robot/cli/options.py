@@ -18,7 +18,7 @@ def complete_names(*kinds: str, words: Iterable[str] = ()) -> Callable[[], list[
     """Completion in a shell of `words` and of the names of these kinds (of `tacsim list`), with their summaries."""
 
     def complete() -> list[tuple[str, str]]:
-        from tacsim.config.catalogue import list_entries
+        from tacsim.config.kinds import list_entries
 
         named = [(entry.name, entry.summary) for kind in kinds for entry in list_entries(kind)]
         return [*((word, "") for word in words), *named]

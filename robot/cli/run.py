@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from robot.cli.errors import EXIT_FAILED, print_error
 from robot.cli.options import TASK_POLICIES, Out, Overrides, complete_names
 from robot.cli.output import (
     Bar,
@@ -27,7 +26,7 @@ from robot.cli.output import (
     warn,
     writing,
 )
-from robot.cli.terminal import Interrupt, ask_operator, require_operator
+from robot.cli.terminal import EXIT_FAILED, Interrupt, ask_operator, print_error, require_operator
 
 if TYPE_CHECKING:
     from robot.deploy.control_loop import EpisodeSetup
@@ -225,7 +224,7 @@ def _run_steps(
     """Runs the episode with a progress bar; returns it and the error that ended it early ("" without an error)."""
     from robot.deploy.control_loop import EpisodeFailed, run_episode
     from robot.deploy.policy import describe_outside
-    from tacsim.record.step_info import TRAINING_DISTANCE
+    from tacsim.record.episode import TRAINING_DISTANCE
 
     is_reported = False
 

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from robot.cli.errors import EXIT_FAILED, print_error
 from robot.cli.options import (
     OptionGroup,
     Out,
@@ -32,7 +31,7 @@ from robot.cli.output import (
     results,
     writing,
 )
-from robot.cli.terminal import Interrupt
+from robot.cli.terminal import EXIT_FAILED, Interrupt, print_error
 from tacsim.models.text import suggest_word
 
 if TYPE_CHECKING:

@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 
 from robot.collect.folder import FAILURES, SetFolder
-from robot.collect.job import SetError
-from robot.collect.presses import PressSet
-from robot.collect.table import COLUMN_TEXTS
+from robot.collect.presses import COLUMN_TEXTS, PressSet
+from robot.collect.workers import SetError
 from robot.studies.press import MAX_MISSED_DEPTH_SHARE
 from tacsim.models.scene import Mesh, Shape
 from tacsim.models.text import millimetres, printable_line

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from robot.collect.job import Piece, Seconds, SetError
+from robot.collect.workers import Piece, Seconds, SetError
 from robot.common.code import CodeNotFound
 from robot.deploy.control_loop import EpisodeFailed, EpisodeSetup, run_episode
 from robot.deploy.policy import load_policy, require_fit

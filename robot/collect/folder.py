@@ -11,7 +11,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from robot.collect.job import Job, Piece, SetError
+from robot.collect.workers import Job, Piece, SetError
 from robot.common.whole_file import whole_folder, write_whole
 from robot.deploy.control_loop import versions
 from tacsim.models.text import printable_line

@@ -15,11 +15,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robot.deploy.policy import require_fit, training_info
-from tacsim.control.contact_signal import contact_signal
+from tacsim.control import contact_signal
 from tacsim.interface import Action, EndOfEpisode, Observation, Policy, Pose, Truth
 from tacsim.models.sensor import CanonicalGrid
-from tacsim.record.episode import Episode, EpisodeMeta, Step
-from tacsim.record.step_info import MAX_DEPTH, MAX_FLOW, MAX_SLOPE, PACKAGES_LOST, TACTILE_DISTANCE
+from tacsim.record.episode import (
+    MAX_DEPTH,
+    MAX_FLOW,
+    MAX_SLOPE,
+    PACKAGES_LOST,
+    TACTILE_DISTANCE,
+    Episode,
+    EpisodeMeta,
+    Step,
+)
 from tacsim.rig import Rig
 from tacsim.tasks import GoalOutOfReach, Task, evaluate_outcome
 

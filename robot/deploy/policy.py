@@ -15,7 +15,7 @@ from tacsim.interface import IncompatibleRig, Policy, RigSpec
 from tacsim.models.scene import Scene
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.models.text import suggest_word
-from tacsim.record.step_info import TRAINING_DISTANCE, TRAINING_KNOWN
+from tacsim.record.episode import TRAINING_DISTANCE, TRAINING_KNOWN
 from tacsim.rig import require_needs
 from tacsim.tasks import Task
 
@@ -47,7 +47,7 @@ def load_policy(
             )
         return task.scripted()
     if name == "grip":
-        from tacsim.tasks.grip import Grip
+        from tacsim.tasks.squeeze import Grip
 
         return Grip(spec)
     if name == "learned":

@@ -15,11 +15,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robot.deploy.tuning import MAX_FALSE_ALARMS, ROUNDING
 from tacsim.interface import FloatArray
 from tacsim.models.policy import PolicySpec, TrainingRange
 from tacsim.models.scene import Scene
 
+MAX_FALSE_ALARMS = 0.03  # fraction of training episodes that may exceed the limit
+ROUNDING = 1e-6  # of a scene's number, for rounding [fraction]
 MIN_DEVIATION = 0.01  # of a number in training; a smaller one is replaced by it [encoded]
 MIN_VARIANCE = 0.01  # of a direction, relative to 1 of a number; smaller ones are noise
 PHYSICAL = ("gel", "gels", "body", "friction", "gravity")  # parts of a scene that affect observations

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from robot.camera.camera import Camera, StaleFrame
 from robot.export.lerobot_mapping import IMAGE, STATE, LeRobotMapping
 from robot.open import load_with_task, open_rig, rig_spec
-from robot.rig.clock import WallClock
+from robot.rig.hardware_rig import WallClock
 from robot.rig.parts import sensor_of
 from tacsim.gym.features import SCALES
 from tacsim.interface import IncompatibleRig, Observation, Pose

@@ -31,9 +31,8 @@ from robot.arm.status import ArmStatus
 from tacsim.interface import ArmState, Observation, Pose, RigSpec, TactileObservation, Truth
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.optics.grid import canonical_cells
-from tacsim.record.episode import ArmPackages, Step
+from tacsim.record.episode import LIMITS_HIT, ArmPackages, Step
 from tacsim.record.images import encode_png
-from tacsim.record.step_info import LIMITS_HIT
 
 if TYPE_CHECKING:
     import rerun as rr

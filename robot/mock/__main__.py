@@ -15,17 +15,16 @@ import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, cast
 
-from robot.common import MOCK_SERIAL
+from robot.common import CONTROLLER_PRIORITY, MOCK_SERIAL, request_realtime
 from robot.common.kinematics import MODELS
 from robot.common.process import write_message
-from robot.common.realtime import CONTROLLER, request_realtime
+from robot.mock.ur.controller import Controller, ControllerConfig
 from robot.mock.ur.fault_client import FAULT_PORT
 from robot.mock.ur.fault_server import FaultServer
 from robot.mock.ur.handle import check_hosts
 from robot.mock.ur.machine.arm import HOME, PERIOD
-from robot.mock.ur.machine.load import Mass
-from robot.mock.ur.machine.version import VERSION, parse_version, version_text
-from robot.mock.ur.wire.controller import Controller, ControllerConfig
+from robot.mock.ur.machine.forces import Mass
+from robot.mock.ur.machine.state import VERSION, parse_version, version_text
 
 if TYPE_CHECKING:
     from tacsim.models.hardware import Model
@@ -115,7 +114,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--realtime", action="store_true", help="request real-time priority, to measure timing")
     options = parser.parse_args(arguments)
     if options.realtime:
-        request_realtime(CONTROLLER)
+        request_realtime(CONTROLLER_PRIORITY)
     try:
         check_hosts(options.hosts, options.allow_network)
         models = _one_for_each_host(options.model or ["ur5e"], options.hosts, "models")

@@ -31,7 +31,7 @@ from robot.procedures.session import (
     move_to,
 )
 from tacsim import pose as se3
-from tacsim.control.contact_signal import NoTouch, approach
+from tacsim.control import NoTouch, approach
 from tacsim.interface import FloatArray, Pose, TactileObservation
 from tacsim.limits import ActionError
 from tacsim.models.rig import RigConfig

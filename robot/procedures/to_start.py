@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from robot.arm.channel import CommandKind
-from robot.arm.controller.rtde import ControllerReading, read_controller
+from robot.arm.connections import ControllerReading, read_controller
+from robot.arm.examine import format_millimetres
 from robot.arm.start_servo import path_rates, sensor_path
 from robot.arm.status import ArmStatus
 from robot.arm.ur import URArm
@@ -54,7 +55,7 @@ class JointPath:
     def describe(self) -> str:
         """A description of the motion, for the operator who watches it."""
         turns = np.degrees(self.end - self.begin)
-        first, last = (_mm(self.sensor_positions[k]) for k in (0, -1))
+        first, last = (format_millimetres(self.sensor_positions[k]) for k in (0, -1))
         joint = int(np.abs(turns).argmax())
         lowest, highest = self.sensor_positions[:, 2].min(), self.sensor_positions[:, 2].max()
         length = float(np.linalg.norm(np.diff(self.sensor_positions, axis=0), axis=1).sum())
@@ -122,10 +123,6 @@ def require_clear(name: str, path: JointPath, others: Mapping[str, FloatArray], 
                 f"arm '{name}': on its path its sensor would come within {1e3 * gaps.min():.0f} mm of that of arm "
                 f"'{other}'; jog one of them away by hand first"
             )
-
-
-def _mm(point: FloatArray) -> str:
-    return "[" + ", ".join(str(round(1e3 * value)) for value in point) + "]"
 
 
 class StartArm(URArm):

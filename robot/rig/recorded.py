@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 
 from calibration.bundle import read_sensor_model
 from calibration.errors import CalibrationError, error_context
+from calibration.markers.dots import NoLattice
 from calibration.markers.flow import TooFewMarkers, find_markers
-from calibration.markers.lattice import NoLattice
 from calibration.reference import StaleReference
 from robot.rig.parts import sensor_of
 from robot.rig.replay_rig import recorded_rig, rig_of
-from tacsim.config.errors import ConfigError
+from tacsim.config import ConfigError
 from tacsim.interface import Normaliser, Observation, SurfaceMap, TactileFrame, TactileObservation
 from tacsim.models.driver import sensor_part
 from tacsim.models.hardware import SensorConfig

@@ -9,8 +9,7 @@ from functools import partial
 from calibration.normaliser import normaliser_for_simulation
 from robot.rig import CannotOpen
 from tacsim.compute.threads import map_parallel, map_serial
-from tacsim.control.gel_monitor import GelMonitor
-from tacsim.control.load_controller import load_controller
+from tacsim.control import GelMonitor, load_controller
 from tacsim.interface import Pose, SensorSpec
 from tacsim.models.hardware import Placement, parts_of
 from tacsim.models.rig import RigConfig, SimArmConfig, SimSensorConfig

@@ -12,8 +12,7 @@ from robot.deploy.policy import describe_outside, load_policy, require_fit
 from robot.serve.operated_policy import Mode, OperatedPolicy, make_operated_policy
 from tacsim.config import LoadedRig
 from tacsim.interface import Observation, RigSpec
-from tacsim.record.episode import EpisodeMeta, Step
-from tacsim.record.step_info import TRAINING_DISTANCE
+from tacsim.record.episode import TRAINING_DISTANCE, EpisodeMeta, Step
 from tacsim.record.writer import Recorder
 from tacsim.rig import Rig
 from tacsim.tasks import Task, make_task

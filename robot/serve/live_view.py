@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 from robot.arm.status import ArmStatus
 from robot.rig.commanded_arm import CommandedArm
 from robot.serve.errors import describe
-from tacsim.control.contact_signal import contact_signal
+from tacsim.control import contact_signal
 from tacsim.interface import Arm, ArmState, FloatArray, Image, Observation, TactileFrame, TactileObservation
-from tacsim.record.episode import Step
-from tacsim.record.step_info import ALIGNMENT, LIMITS_HIT
+from tacsim.record.episode import ALIGNMENT, LIMITS_HIT, Step
 
 QUALITY = 85  # of JPEG
 MAX_WIDTH = 640  # of a picture [px]

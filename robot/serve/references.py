@@ -9,7 +9,7 @@ import numpy as np
 
 from calibration.reference import StaleReference, UnusableReference
 from robot.serve.errors import Refused
-from tacsim.control.contact_signal import contact_signal
+from tacsim.control import contact_signal
 from tacsim.interface import TactileFrame
 from tacsim.rig import READ_TIMEOUT, Rig
 

@@ -29,7 +29,7 @@ from robot.serve.recordings import Recordings
 from robot.serve.references import References
 from robot.serve.stop_switch import StopSwitch
 from tacsim.config import LoadedRig
-from tacsim.control.load_controller import load_controller
+from tacsim.control import load_controller
 from tacsim.interface import FloatArray, Observation
 from tacsim.record.episode import Step
 from tacsim.rig import READ_TIMEOUT, Rig

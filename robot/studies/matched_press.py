@@ -14,8 +14,8 @@ import numpy as np
 
 from calibration.errors import BadFrames
 from calibration.frame_set import Frame, FrameSet
-from calibration.light.circle import Circle, NoCircle, find_contact_circle
 from calibration.light.darkness import dark_circle
+from calibration.light.dent import Circle, NoCircle, find_contact_circle
 from robot.studies.tuning import MAX_DEPTH_SHARE, MIN_DEPTH_MATCH, RADIUS_TOLERANCE
 from tacsim.interface import Image, Pose, SurfaceMap
 from tacsim.models.scene import GelSurface, Scene, Sphere

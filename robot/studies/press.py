@@ -27,7 +27,7 @@ from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.physics.move import MoveStats
 from tacsim.physics.worlds.press import PressWorld
 from tacsim.physics.worlds.tuning import INITIAL_GAP, MESH_GRID_SPACING, SAFE_PATH_SHARE
-from tacsim.report.press_pictures import write_height_picture, write_side_picture
+from tacsim.report.press_page import write_height_picture, write_side_picture
 
 MAX_TWIST = math.radians(3600.0)
 # Share of the depth that the gel's contact points may miss. Balls of 1 mm and more, cylinders, boxes and stars miss at

@@ -20,8 +20,8 @@ from robot.common.whole_file import write_whole
 from robot.rig.sharded_env import Environments
 from robot.train.network import PolicyNetwork
 from robot.train.run_folder import ReportProgress, RunError
+from tacsim.models.policy import Training
 from tacsim.models.text import printable_line
-from tacsim.models.training import Training
 
 MIN_SPREAD = 0.02  # of the actions of an axis; a smaller spread is replaced by it
 Arrays = dict[str, NDArray[Any]]

@@ -23,10 +23,9 @@ from robot.open import load_with_task, make_vector_env
 from tacsim.gym.env import TacsimEnv
 from tacsim.gym.vector import TacsimVectorEnv
 from tacsim.interface import Policy
-from tacsim.models.policy import Features
+from tacsim.models.policy import Features, Training
 from tacsim.models.scene import Scene
 from tacsim.models.sensor import CanonicalGrid
-from tacsim.models.training import Training
 
 TEACHER, RANDOM = "teacher", "random"  # besides the policies of load_policy
 HELD_OUT_SEED_OFFSET = 1_000_000  # added to the training seeds: other bodies, other episodes

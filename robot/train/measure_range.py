@@ -15,10 +15,9 @@ from robot.deploy.training_range import extract_numbers, fit_training_range
 from robot.open import load_with_task, make_vector_env
 from tacsim.gym.vector import TacsimVectorEnv
 from tacsim.interface import FloatArray
-from tacsim.models.policy import METADATA_KEY, TrainingRange
+from tacsim.models.policy import METADATA_KEY, Training, TrainingRange
 from tacsim.models.scene import Scene
 from tacsim.models.sensor import CanonicalGrid
-from tacsim.models.training import Training
 from tacsim.tasks import make_task
 from tacsim.tasks.task import BadDraws
 

@@ -20,7 +20,7 @@ from robot.common.whole_file import write_whole
 from robot.rig.sharded_env import Environments
 from robot.train.network import FeatureLayers, PolicyNetwork
 from robot.train.run_folder import ReportProgress
-from tacsim.models.training import Training
+from tacsim.models.policy import Training
 
 Arrays = dict[str, NDArray[Any]]
 

@@ -11,10 +11,9 @@ from typing import Any, Self
 from pydantic import Field, ValidationError
 
 from robot.common.whole_file import write_whole
-from tacsim.models.policy import PolicySpec
+from tacsim.models.policy import PolicySpec, Training
 from tacsim.models.quantity import Config
 from tacsim.models.text import printable_line
-from tacsim.models.training import Training
 
 FORMAT = 1  # of run.json and of checkpoints; other versions are refused
 CHECKPOINT = "checkpoint.pt"

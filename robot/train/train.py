@@ -27,16 +27,15 @@ from robot.train.measure_range import measure_range, write_range
 from robot.train.network import PolicyNetwork, export
 from robot.train.run_folder import ReportProgress, RunError, RunFolder, version
 from tacsim.config import ConfigError
-from tacsim.config.errors import Place, Problem
+from tacsim.config.document import Place, Problem
 from tacsim.geometry.shapes import bounding_size
 from tacsim.gym.encode import space_of_features
 from tacsim.gym.features import FeatureEncoder
 from tacsim.interface import Pose, Truth
-from tacsim.models.policy import ActionAxis, PolicySpec
+from tacsim.models.policy import ActionAxis, PolicySpec, Training
 from tacsim.models.rig import TaskConfig
 from tacsim.models.scene import Scene
 from tacsim.models.text import printable_line
-from tacsim.models.training import Training
 from tacsim.tasks import GoalOutOfReach, make_task
 
 POLICY, CURVE, CURVE_PICTURE = "policy.onnx", "curve.json", "curve.png"  # in the folder of a run

@@ -16,7 +16,7 @@ from typing import Literal
 
 import numpy as np
 
-from robot.common.loopback import loopback_host
+from robot.common import loopback_host
 from robot.common.process import ProcessPool
 from robot.deploy.control_loop import EpisodeFailed, EpisodeSetup, run_episode
 from robot.deploy.onnx_policy import OnnxPolicy
@@ -25,10 +25,9 @@ from robot.open import open_rig
 from robot.train.evaluate import HELD_OUT_SEED_OFFSET, Interval, bootstrap_interval, wilson_interval
 from tacsim.config import LoadedRig, load_rig
 from tacsim.interface import RigSpec
+from tacsim.models.policy import Training
 from tacsim.models.randomisation import Randomisation
-from tacsim.models.training import Training
-from tacsim.record.episode import Episode
-from tacsim.record.step_info import TACTILE_DISTANCE
+from tacsim.record.episode import TACTILE_DISTANCE, Episode
 from tacsim.rig import Rig
 from tacsim.tasks import make_task
 

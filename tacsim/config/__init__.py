@@ -5,7 +5,7 @@ its own folder), ``scene: {extends: squeeze, preset: standard}`` (that file with
 Every problem is a line ``file:line: key: what is wrong; what is allowed; did you mean``, all in one ConfigError.
 """
 
-from tacsim.config.errors import ConfigError as ConfigError
+from tacsim.config.document import ConfigError as ConfigError
 from tacsim.config.kinds import KINDS as KINDS
 from tacsim.config.kinds import config_root as config_root
 from tacsim.config.kinds import json_schema as json_schema

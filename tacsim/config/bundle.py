@@ -12,8 +12,7 @@ import stat
 from pathlib import Path
 from typing import Any
 
-from tacsim.config.document import LoadState, Node, display_path, node_of_data, parse_text, plain_data
-from tacsim.config.errors import Place
+from tacsim.config.document import LoadState, Node, Place, display_path, node_of_data, parse_text, plain_data
 from tacsim.models.text import suggest_word
 
 FILE, REFERENCE = "calibration.yaml", "reference.png"

@@ -1,4 +1,5 @@
-"""YAML text -> a tree of nodes with their lines. Nothing is executed, and sizes are checked first.
+"""YAML text -> a tree of nodes with their lines, and problems of a configuration with their places. Nothing is
+executed, and sizes are checked first. All problems are collected, then raised as one ConfigError.
 
 A subset of YAML: numbers, booleans and null as in YAML 1.2 (so ``1e5`` is a number, ``no`` and ``12:30`` are
 texts); no anchors, aliases, merge keys, tags or duplicate keys; at most 1 MB, 32 levels and 20,000 values.
@@ -10,17 +11,64 @@ import json
 import math
 import re
 import stat
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
 
 import yaml
 
-from tacsim.config.errors import Place, Problem
 from tacsim.models.text import printable_line
 
 MAX_NODES = 20_000  # of one load, with referenced files
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where something was written: a line of a file, or the command line (``--set key=value``, which has no line)."""
+
+    source: str
+    line: int | None = None
+
+    def __str__(self) -> str:
+        return self.source if self.line is None else f"{self.source}:{self.line}"
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """One problem, at `place`, of the value with the dotted `key` (empty: of the whole file)."""
+
+    place: Place
+    key: str
+    text: str
+
+    def __str__(self) -> str:
+        return printable_line(": ".join(part for part in (str(self.place), self.key, self.text) if part))
+
+
+class ConfigError(ValueError):
+    """The configuration cannot be used. ``str(error)`` is the complete message: lines ``file:line: key: what``."""
+
+    def __init__(self, problems: Sequence[Problem]) -> None:
+        max_shown = 30  # a broken file can have thousands of problems
+        sources = list(dict.fromkeys(problem.place.source for problem in problems))
+        self.problems = tuple(
+            sorted(dict.fromkeys(problems), key=lambda p: (sources.index(p.place.source), p.place.line or 0))
+        )
+        lines = [str(problem) for problem in self.problems[:max_shown]]
+        if len(self.problems) > max_shown:
+            lines.append(f"... and {len(self.problems) - max_shown} more problems")
+        super().__init__("\n".join(lines))
+
+    def __reduce__(self) -> tuple[type[ConfigError], tuple[tuple[Problem, ...]]]:
+        """By its problems, not by its text: it is sent from one process to another."""
+        return type(self), (self.problems,)
+
+
+def join_keys(key: str, name: str | int) -> str:
+    """Dotted key of an entry."""
+    return f"{key}.{name}" if key else str(name)
+
 
 _FLOAT = re.compile(
     r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?$|[-+]?\.(?:inf|Inf|INF)$|\.(?:nan|NaN|NAN)$"

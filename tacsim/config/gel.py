@@ -7,7 +7,7 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from tacsim.config.errors import ConfigError, Place, Problem
+from tacsim.config.document import ConfigError, Place, Problem
 from tacsim.models.rig import RigConfig
 from tacsim.models.scene import Scene
 from tacsim.models.sensor import SensorModel

@@ -1,9 +1,11 @@
-"""The kinds of configuration files: their folders, the files of names, and their JSON schema for editors."""
+"""The kinds of configuration files: their folders, the files of names, and their JSON schema for editors; and what is
+shipped and installed, by kind and name (configuration files, learned policies, drivers)."""
 
 from __future__ import annotations
 
+import inspect
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -14,13 +16,14 @@ from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 from pydantic_core import core_schema
 
 from tacsim.config.bundle import FILE, SENSORS_FOLDER, is_bundle, user_sensor_names
+from tacsim.models.driver import BASE_CLASSES, installed_drivers
 from tacsim.models.material import BodyMaterial, GelMaterial
+from tacsim.models.policy import Training
 from tacsim.models.randomisation import Randomisation
 from tacsim.models.rig import TASKS, RigConfig, rig_model, task_annotation
 from tacsim.models.scene import Scene
 from tacsim.models.sensor import SensorModel
 from tacsim.models.text import suggest_word
-from tacsim.models.training import Training
 
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_-]{0,99}")
 
@@ -198,3 +201,61 @@ class _Generator(GenerateJsonSchema):
         union.pop("discriminator", None)  # a keyword of OpenAPI, not of JSON schema
         union["anyOf"] = union.pop("oneOf")  # a reference by name fits every variant
         return union
+
+
+POLICY, DRIVER = "policy", "driver"
+CATALOGUE_KINDS = (*KINDS, POLICY, DRIVER)
+
+
+@dataclass(frozen=True, slots=True)
+class CatalogueEntry:
+    """Something with a name that a command or a file may use."""
+
+    kind: str  # of CATALOGUE_KINDS
+    name: str  # as it is written in files and commands; of drivers "sensor.NAME" or "arm.NAME"
+    summary: str  # one sentence
+    path: Path | None  # its file; of a driver the module; None if it is not known
+
+
+def list_entries(kind: str) -> list[CatalogueEntry]:
+    """What there is of a kind of CATALOGUE_KINDS, sorted by name. Raises KeyError for another kind."""
+    if kind == DRIVER:
+        return list(_installed_drivers())
+    if kind == POLICY:
+        paths = sorted((config_root() / "policies").glob("*.onnx"))
+        return [CatalogueEntry(kind, path.stem, f"Learned policy of the task {path.stem}.", path) for path in paths]
+    paths = sorted((config_root() / KINDS[kind].folder).glob("*.yaml"))
+    return [CatalogueEntry(kind, path.stem, _first_sentence(path.read_text("utf-8")), path) for path in paths]
+
+
+def find_entries(name: str, kind: str | None = None) -> list[CatalogueEntry]:
+    """Every entry of that name, of one kind or (None) of all. Raises NotFound, with the nearest name."""
+    kinds = CATALOGUE_KINDS if kind is None else (kind,)
+    known = [entry for each in kinds for entry in list_entries(each)]
+    found = [entry for entry in known if entry.name == name]
+    if not found:
+        names = [entry.name for entry in known]
+        what = "nothing is" if kind is None else f"no {kind} is"
+        where = "tacsim list" if kind is None else f"tacsim list {kind}"
+        raise NotFound(f"{what} called '{name}'{suggest_word(name, names)}; `{where}` prints all names")
+    return found
+
+
+def _installed_drivers() -> Iterable[CatalogueEntry]:
+    drivers = installed_drivers()
+    for kind in sorted(BASE_CLASSES):
+        for name, driver in sorted(drivers.usable[kind].items()):
+            summary = inspect.cleandoc(driver.__doc__ or "").partition("\n\n")[0].replace("\n", " ")
+            yield CatalogueEntry(DRIVER, f"{kind}.{name}", summary, Path(inspect.getfile(driver)))
+        for name, why in sorted(drivers.refused[kind].items()):
+            yield CatalogueEntry(DRIVER, f"{kind}.{name}", f"Refused: {why}", None)
+
+
+def _first_sentence(text: str) -> str:
+    """The first sentence of the comment that a file begins with; empty without one."""
+    lines = []
+    for line in text.splitlines():
+        if not line.startswith("#"):
+            break
+        lines.append(line.lstrip("# ").rstrip())
+    return re.split(r"(?<=[.!?]) ", " ".join(lines), maxsplit=1)[0]

@@ -9,13 +9,11 @@ from typing import Any, TypeVar, cast
 
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
-from tacsim.config.annotation import field_default, union_models
+from tacsim.config.annotation import field_default, report_errors, union_models
 from tacsim.config.bundle import find_bundle
-from tacsim.config.document import LoadState, Node, dump_yaml, node_as_json, node_of_data
-from tacsim.config.errors import ConfigError, Place, Problem
+from tacsim.config.document import ConfigError, LoadState, Node, Place, Problem, dump_yaml, node_as_json, node_of_data
 from tacsim.config.gel import fit_gels_to_sensors, overridden_gel_sizes
 from tacsim.config.kinds import NotFound, is_name, kind_of, resolve_reference, shipped_file
-from tacsim.config.messages import report_errors
 from tacsim.config.references import Override, apply_override, parse_override, read_file
 from tacsim.models.driver import DriversMissing
 from tacsim.models.rig import RigConfig, TaskConfig, rig_model, task_annotation

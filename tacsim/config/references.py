@@ -20,8 +20,17 @@ from tacsim.config.annotation import (
     select_variant,
     union_models,
 )
-from tacsim.config.document import MAX_NODES, LoadState, Node, display_path, node_of_data, parse_text, read_text
-from tacsim.config.errors import Place, join_keys
+from tacsim.config.document import (
+    MAX_NODES,
+    LoadState,
+    Node,
+    Place,
+    display_path,
+    join_keys,
+    node_of_data,
+    parse_text,
+    read_text,
+)
 from tacsim.config.kinds import Kind, NotFound, kind_of, resolve_reference
 from tacsim.models.quantity import Quantity
 from tacsim.models.text import suggest_word

@@ -10,7 +10,7 @@ import gymnasium
 import numpy as np
 from gymnasium.error import ResetNeeded
 
-from tacsim.control.contact_signal import NoTouch
+from tacsim.control import NoTouch
 from tacsim.gym import encode
 from tacsim.gym.features import FeatureEncoder
 from tacsim.interface import Float32, Image, Needs, Observation, Policy, Pose, Truth

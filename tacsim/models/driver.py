@@ -160,7 +160,7 @@ class SensorDriver(SensorPart[SensorC]):
         """What `tacsim doctor` says of it. Connects, looks, and closes; raises nothing."""
 
     def diagnostics(self, source: TactileSource) -> Mapping[str, float]:
-        """Numbers of an open one that are recorded with each step, by key (tacsim.record.step_info)."""
+        """Numbers of an open one that are recorded with each step, by key (tacsim.record.episode)."""
         return {}
 
 

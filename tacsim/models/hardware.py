@@ -14,9 +14,8 @@ from pydantic import BeforeValidator, Field, field_validator, model_validator
 from tacsim import pose as se3
 from tacsim.interface import Pose
 from tacsim.limits import Region, box_region
-from tacsim.models.geometry import PictureRegion
 from tacsim.models.quantity import Acceleration, Angle, Config, Force, Length, Speed, Time
-from tacsim.models.sensor import SensorModel
+from tacsim.models.sensor import PictureRegion, SensorModel
 from tacsim.models.text import MAX_NAME
 
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=MAX_NAME)]

@@ -10,11 +10,10 @@ from pydantic import ConfigDict, Field, GetCoreSchemaHandler, model_validator
 from pydantic_core import CoreSchema, PydanticCustomError
 
 from tacsim.models.driver import installed_drivers
-from tacsim.models.geometry import PictureRegion
 from tacsim.models.hardware import ArmConfig, ArmLimits, KeepOut, Name, Placement, ResetConfig, SensorConfig
 from tacsim.models.quantity import Config, Force, Length, Speed, Time
 from tacsim.models.scene import Scene
-from tacsim.models.sensor import CanonicalGrid, SensorModel
+from tacsim.models.sensor import CanonicalGrid, PictureRegion, SensorModel
 
 Delay = Annotated[int, Field(ge=0, le=20)]
 
@@ -152,7 +151,7 @@ class RepositionConfig(TaskConfig):
 
     kind: Literal["reposition"]
     goal: tuple[Length, Length] = (2e-3, 2e-3)  # desired displacement of the centre of mass, world x, y [m]
-    # Normal forces along the z of their sensors (tacsim.control.load_controller), by arm; an arm without one holds its
+    # Normal forces along the z of their sensors (tacsim.control), by arm; an arm without one holds its
     # height. [N]
     loads: dict[Name, Annotated[Force, Field(gt=0)]] = {}
     touch_force: Annotated[Force, Field(gt=0)] = 1.0  # at less, the upper gel slides

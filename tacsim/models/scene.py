@@ -10,22 +10,9 @@ import numpy as np
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from tacsim.interface import Float32, FloatArray, short_repr
+from tacsim.models import tuning
 from tacsim.models.material import BodyMaterial, GelMaterial, elastic_constants, shear_impedance
 from tacsim.models.quantity import Acceleration, Angle, Config, Length
-from tacsim.models.tuning import (
-    DEFAULT_TOLERANCE,
-    FLOW_MACH,
-    GEL_STRESS_SHARE,
-    LIGHT_FLOW_GAIN,
-    LIGHT_SPEED_GAIN,
-    MACH_BY_SHEAR,
-    MACH_BY_STRESS,
-    MAX_ELEMENTS,
-    MAX_GEL_STRESS_SHARE,
-    MAX_MACH,
-    MIN_EDGE_RADIUS,
-    MIN_MACH,
-)
 
 Edge = Annotated[Length, Field(ge=1e-5, le=10.0)]  # of a body or an indenter [m]
 Size3 = tuple[Annotated[Length, Field(gt=0)], Annotated[Length, Field(gt=0)], Annotated[Length, Field(gt=0)]]
@@ -172,7 +159,7 @@ class Indenter(Config):
             return 0.0
         if self.edge_radius is not None:
             return self.edge_radius
-        return min(MIN_EDGE_RADIUS * element, _min_side(self.geometry) / 4)
+        return min(tuning.MIN_EDGE_RADIUS * element, _min_side(self.geometry) / 4)
 
 
 def _min_side(geometry: Box | Cylinder) -> float:
@@ -241,10 +228,10 @@ class Scene(Config):
         )
         edge = min(edge, size[2] / 2)  # a thin gel is resolved finer than its preset
         cells, of = math.prod(side / edge for side in size), f" of sensor '{sensor}'" if sensor in self.gels else ""
-        if cells > MAX_ELEMENTS:
+        if cells > tuning.MAX_ELEMENTS:
             raise ValueError(
                 f"a gel{of} of {' x '.join(f'{side:g}' for side in size)} m has {cells:.3g} cells at "
-                f"{name} {edge:g} m, the limit is {MAX_ELEMENTS:,}; choose a larger {name} or a smaller gel"
+                f"{name} {edge:g} m, the limit is {tuning.MAX_ELEMENTS:,}; choose a larger {name} or a smaller gel"
             )
         given = self.element_size if own.element_size is None else own.element_size
         if given is not None and given > size[2] / 2 * (1 + 1e-9):
@@ -257,10 +244,10 @@ class Scene(Config):
     def _require_settling_speed(self) -> Self:
         """What yields can be followed at the speed that its stress asks for, or a speed is given."""
         allowed = self._mach_by_stress
-        if self.settling.mach is None and allowed < MIN_MACH:
+        if self.settling.mach is None and allowed < tuning.MIN_MACH:
             raise ValueError(
                 f"this body yields at so small a stress for its stiffness that it must be moved at Mach {allowed:.2g} "
-                f"(default speeds end at {MIN_MACH:g}), or the speed itself makes it yield; give it a higher "
+                f"(default speeds end at {tuning.MIN_MACH:g}), or the speed itself makes it yield; give it a higher "
                 f"yield_stress, a lower youngs_modulus or poisson_ratio, or set settling.mach and see what it costs"
             )
         return self
@@ -278,8 +265,8 @@ class Scene(Config):
         mu, lam = elastic_constants(self.body.material)
         body = lam + 2 * mu
         gel = max(shear_impedance(self.gel_of(name).material) for name in self.sensors)
-        stress = body + min(GEL_STRESS_SHARE * gel, MAX_GEL_STRESS_SHARE * body)
-        return MACH_BY_STRESS * 2 * mu * self.body.material.elastic_limit / stress
+        stress = body + min(tuning.GEL_STRESS_SHARE * gel, tuning.MAX_GEL_STRESS_SHARE * body)
+        return tuning.MACH_BY_STRESS * 2 * mu * self.body.material.elastic_limit / stress
 
     @property
     def sensors(self) -> tuple[str, ...]:
@@ -298,8 +285,8 @@ class Scene(Config):
             return self.settling.mach
         if not math.isfinite(self._mach_by_stress):
             slowest = min(math.sqrt(mu / (lam + 2 * mu)) for mu, lam in self._gel_moduli)
-            return min(MAX_MACH, MACH_BY_SHEAR * slowest)
-        return max(min(1.0, self.settling.tolerance / DEFAULT_TOLERANCE) * self.max_mach, MIN_MACH)
+            return min(tuning.MAX_MACH, tuning.MACH_BY_SHEAR * slowest)
+        return max(min(1.0, self.settling.tolerance / tuning.DEFAULT_TOLERANCE) * self.max_mach, tuning.MIN_MACH)
 
     @property
     def _gel_moduli(self) -> list[tuple[float, float]]:
@@ -309,7 +296,9 @@ class Scene(Config):
     @property
     def max_mach(self) -> float:
         """The most that this is for a body that yields, at any tolerance."""
-        return min(self._mach_by_stress, MAX_MACH * (LIGHT_SPEED_GAIN if self.physics == "hybrid" else 1.0))
+        return min(
+            self._mach_by_stress, tuning.MAX_MACH * (tuning.LIGHT_SPEED_GAIN if self.physics == "hybrid" else 1.0)
+        )
 
     @property
     def preset_error(self) -> str:
@@ -325,7 +314,7 @@ class Scene(Config):
         """Mean speed of motions that flow into one another, over the wave speed; slower on short paths."""
         if self.settling.flow_mach is not None:
             return self.settling.flow_mach
-        return FLOW_MACH if self.body is None else LIGHT_FLOW_GAIN * FLOW_MACH
+        return tuning.FLOW_MACH if self.body is None else tuning.LIGHT_FLOW_GAIN * tuning.FLOW_MACH
 
     @property
     def spacing(self) -> float:

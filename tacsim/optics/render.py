@@ -22,7 +22,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tacsim.interface import Float32, Mask
-from tacsim.models.geometry import GelView
 from tacsim.models.photometric import (
     CastShadows,
     DarknessModel,
@@ -33,7 +32,7 @@ from tacsim.models.photometric import (
     position_terms,
 )
 from tacsim.models.scene import GelSurface
-from tacsim.models.sensor import BackgroundPolynomial, Lighting, SensorModel
+from tacsim.models.sensor import BackgroundPolynomial, GelView, Lighting, SensorModel
 from tacsim.optics.grid import PixelGrid, image_grid, image_strips
 from tacsim.optics.ink import separate_ink, separate_skin
 from tacsim.optics.markers import marker_transmission, require_dots_on_gel

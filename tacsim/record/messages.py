@@ -22,8 +22,10 @@ from tacsim.interface import Action, ArmState, Float32, Pose, SurfaceMap, Tactil
 from tacsim.models.text import printable_line
 from tacsim.record.episode import ArmPackages, EpisodeError, LazyRecords, Step
 from tacsim.record.images import decode_image, encode_png
-from tacsim.record.protobuf import (
+from tacsim.record.schemas import (
+    BODY_TOPIC,
     PACKAGE_FIELDS,
+    STEP_TOPIC,
     TWIST,
     WRENCH,
     Arm,
@@ -37,8 +39,7 @@ from tacsim.record.protobuf import (
     set_pose,
     vectors_of,
 )
-from tacsim.record.protobuf import Step as StepMessage
-from tacsim.record.schemas import BODY_TOPIC, STEP_TOPIC
+from tacsim.record.schemas import Step as StepMessage
 
 Messages = Mapping[str, Sequence[bytes]]  # of one step, by topic; only packages have several
 

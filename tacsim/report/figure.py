@@ -13,7 +13,6 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.gridspec import SubplotSpec
-from matplotlib.image import imsave
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from PIL import Image
@@ -71,13 +70,6 @@ def shrink_image(image: NDArray[np.uint8], max_width: int) -> NDArray[np.uint8]:
     factor = min(-(-image.shape[1] // max_width), image.shape[0])
     rows, columns = (image.shape[0] // factor) * factor, (image.shape[1] // factor) * factor
     return np.asarray(Image.fromarray(image[:rows, :columns]).reduce(factor))
-
-
-def encode_image(image: NDArray[np.uint8]) -> bytes:
-    """PNG file of an (H, W, 3) RGB image."""
-    file = io.BytesIO()
-    imsave(file, image, format="png")
-    return file.getvalue()
 
 
 def encode_jpeg(image: NDArray[np.uint8], quality: int = 80) -> bytes:

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tacsim.interface import FloatArray, SurfaceMap, TactileFrame, TactileObservation
-from tacsim.record.episode import Episode
-from tacsim.record.step_info import SETTLED
-from tacsim.report.diagnostics import (
+from tacsim.record.episode import SETTLED, Episode
+from tacsim.report.series import (
+    Series,
     sensor_diagnostics,
     sensor_warnings,
     timing_rows,
@@ -23,7 +23,6 @@ from tacsim.report.diagnostics import (
     training_range_statistics,
     training_rows,
 )
-from tacsim.report.series import Series
 
 if TYPE_CHECKING:
     from markupsafe import Markup
@@ -46,7 +45,7 @@ def summarise(series: Series, *, complete: bool = True, dropped: int = 0) -> dic
     `reward` [-], `distance` [m], `felt_distance` (the tactile estimate [m]), `force` (arm -> |Fz| [N]), `seconds`
     [s], `contact_signal` (sensor -> list), `deepest` point and longest `flow` of a gel (sensor -> list [m]), its
     `steepest` slope (sensor -> list), `correlation` (sensor -> r between contact signal and force), `timing`
-    (tacsim.report.diagnostics; null unless the rig is live), `trust` (the same; null if sensors give their surface),
+    (tacsim.report.series; null unless the rig is live), `trust` (the same; null if sensors give their surface),
     `training_range` (the same; null for a policy that is not learned),
     `started` (ISO date and time with its zone).
     Unknown and infinite values are null.

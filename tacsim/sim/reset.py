@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from tacsim import pose as se3
-from tacsim.control.contact_signal import NoTouch
+from tacsim.control import NoTouch
 from tacsim.interface import Pose, TactileFrame, Truth
 from tacsim.physics.move import MoveStats
 from tacsim.physics.world import World

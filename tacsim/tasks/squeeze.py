@@ -1,16 +1,20 @@
-"""Squeeze: bring the body to a desired height by moving both sensors along world z."""
+"""Squeeze: bring the body to a desired height by moving both sensors along world z. Grip: close the sensors until they
+feel a firm contact, then hold; it needs images only, and so runs on any rig."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from tacsim.interface import Action, FloatArray, Needs, Observation, Policy, Pose, TactileObservation, Truth
+from tacsim import pose as se3
+from tacsim.control import contact_signal
+from tacsim.interface import Action, FloatArray, Needs, Observation, Policy, Pose, RigSpec, TactileObservation, Truth
 from tacsim.models.rig import SqueezeConfig
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.tasks.task import Axis, Estimator, GoalOutOfReach, Task
-from tacsim.tasks.tuning import ARRIVAL_HEIGHT_ERROR, MIN_BODY_SHARE
+from tacsim.tasks.tuning import ARRIVAL_HEIGHT_ERROR, CLOSING_STEP, FIRM_GRIP_SIGNAL, MIN_BODY_SHARE
 
 BOTH = frozenset({"lower", "upper"})
 
@@ -110,3 +114,42 @@ def max_depth(touch: TactileObservation) -> float:
 def _sensor_gap(truth: Truth) -> float:
     """Between the sensors, along world z [m]."""
     return float(truth.poses["upper"].position[2] - truth.poses["lower"].position[2])
+
+
+class Grip:
+    """Moves every sensor along its own z until the mean contact signal reaches the target, then holds to the end.
+
+    On a recording, its actions are what it would have done. A sensor that no arm carries is addressed by its own name,
+    with a target relative to where it is.
+
+    Args:
+        spec: of the rig; says which arm carries which sensor.
+        target: contact signal (tacsim.control) that ends the closing [-].
+        step: motion of each sensor in a control period [m].
+    """
+
+    def __init__(self, spec: RigSpec, target: float = FIRM_GRIP_SIGNAL, step: float = CLOSING_STEP) -> None:
+        if not target > 0 or not step > 0:
+            raise ValueError(f"grip: target and step must be positive, got target {target}, step {step} m")
+        self._carriers: Mapping[str, str | None] = {name: sensor.arm for name, sensor in spec.sensors.items()}
+        self._target, self._step = target, step
+        self._holding = False
+
+    @property
+    def needs(self) -> Needs:
+        return Needs()
+
+    def reset(self) -> None:
+        self._holding = False
+
+    def __call__(self, observation: Observation) -> Action:
+        signals = [contact_signal(touch) for touch in observation.tactile.values()]
+        self._holding = self._holding or float(np.mean(signals)) >= self._target
+        if self._holding:
+            return Action({arm or sensor: None for sensor, arm in self._carriers.items()})
+        return Action(
+            {
+                arm or sensor: se3.translated_along_z(Pose() if arm is None else observation.arms[arm].pose, self._step)
+                for sensor, arm in self._carriers.items()
+            }
+        )

@@ -11,10 +11,6 @@ MAX_PRESSURE_SHARE = 0.9
 CLOSING_STEPS = 30.0  # of the teacher: it takes so large a part of the height that is left in each control step
 ARRIVAL_SHARE = 0.2  # of max_step: so near to where it goes, the scripted policy turns
 
-# grip.py
-FIRM_GRIP_SIGNAL = 0.05  # contact signal of a firm grip: five times what camera noise of 2 % gives [-]
-CLOSING_STEP = 0.1e-3  # motion of each sensor in a control period [m]
-
 # reposition.py
 MIN_FORCE = 0.01  # a smaller normal force counts as no contact [N]
 ARRIVAL_DISTANCE = 0.02e-3  # the scripted policy holds when its estimate is this close to the goal [m]
@@ -22,3 +18,5 @@ ARRIVAL_DISTANCE = 0.02e-3  # the scripted policy holds when its estimate is thi
 # squeeze.py
 MIN_BODY_SHARE = 0.1  # of the sensors' way that a body is taken to give
 ARRIVAL_HEIGHT_ERROR = 0.01e-3  # the scripted policy holds when its estimate is this close to the goal [m]
+FIRM_GRIP_SIGNAL = 0.05  # contact signal of a firm grip: five times what camera noise of 2 % gives [-]
+CLOSING_STEP = 0.1e-3  # motion of each sensor in a control period [m]

@@ -16,7 +16,7 @@ from calibration.bundle import (
     read_sensor_model,
     write_bundle,
 )
-from calibration.height.slope_polynomial import TERMS, InverseModel
+from calibration.height.slopes import TERMS, InverseModel
 from calibration.lens.rectification import metric_rectification
 from calibration.lens.view import GelView, pinhole_lens, view_of_corners
 from calibration.normaliser import normaliser_for_calibration, normaliser_for_camera

@@ -6,7 +6,7 @@ from calibration.frame_normaliser import FrameNormaliser, NoReference
 from calibration.normaliser import normaliser_for_pictures, normaliser_for_recording, normaliser_for_simulation
 from calibration.reference import UnusableReference
 from tacsim.config import load_sensor
-from tacsim.control.contact_signal import contact_signal
+from tacsim.control import contact_signal
 from tacsim.interface import SurfaceMap, TactileFrame
 from tacsim.models.rig import ReplaySensorConfig
 from tacsim.models.scene import GelSurface

@@ -20,16 +20,16 @@ import numpy as np
 import pytest
 
 from robot.deploy.control_loop import EpisodeSetup, run_episode
-from robot.mock.fixtures import rig_addresses
+from robot.fixtures import rig_addresses
 from robot.open import RIG_ATTACHMENT, open_rig
 from tacsim.config import load_rig
-from tacsim.control.contact_signal import contact_signal
+from tacsim.control import contact_signal
 from tacsim.interface import Action, EndOfEpisode, Observation, Pose, RigSpec
 from tacsim.limits import ActionError
 from tacsim.record.writer import Recorder
 from tacsim.rig import Rig
 from tacsim.tasks import make_task
-from tacsim.tasks.grip import Grip
+from tacsim.tasks.squeeze import Grip
 
 STEPS = 3
 PERIOD = 0.1  # of every rig here [s]

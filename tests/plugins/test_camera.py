@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from robot.fixtures import mock_host
 from robot.mock import MockCamera
-from robot.mock.fixtures import mock_host
 from tests.plugins.commands import LIMIT, surroundings
 
 FILE = """

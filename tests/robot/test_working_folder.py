@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 from robot.deploy.policy import PolicyNotFound, load_policy
+from robot.fixtures import mock_host, rig_addresses
 from robot.mock import MockCamera, MockUR
-from robot.mock.fixtures import mock_host, rig_addresses
 from robot.open import open_rig
 from robot.studies.experiment import TrialFailed, run_trials
 from tacsim.interface import RigSpec

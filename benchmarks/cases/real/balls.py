@@ -177,9 +177,8 @@ def _usual_slope(prediction: PressPrediction, of: BallSet) -> float:
 
 
 def _without_dots(of: BallSet, reference: Image, frames: Frames) -> tuple[Image, Frames]:
-    from calibration.markers.dots import DotEraser
+    from calibration.markers.dots import DotEraser, NoLattice
     from calibration.markers.flow import find_markers
-    from calibration.markers.lattice import NoLattice
 
     try:
         _, radius = find_markers(reference)

@@ -21,7 +21,7 @@ from calibration.light.calibrator import calibrate_light
 from calibration.light.dent import ContactCircle, dent_gradient, dent_height
 from calibration.light.fit import LightFit
 from calibration.light.press import BallPress, gaussian_blur, make_press, mean_reference_colour
-from calibration.light.shadows import DentShade
+from calibration.light.refinement import DentShade
 from calibration.light.tuning import FORWARD_BLUR, MAX_RIM_RATIO, RIM_BLUR
 from tacsim.models.photometric import PhotometricLight, image_grid_places
 

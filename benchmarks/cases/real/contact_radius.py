@@ -1,7 +1,7 @@
 """Real group: contact radius of balls on a real sensor against the simulated gel, with frames of the user.
 
 Two comparisons for each press. `image`: the real frame against our rendered one, with circles by the same fit
-(`calibration/light/circle.py`). `pressure`: the radius of the simulated contact itself, against the radius in the
+(`calibration/light/dent.py`). `pressure`: the radius of the simulated contact itself, against the radius in the
 labels.
 """
 
@@ -16,7 +16,7 @@ from benchmarks.cases.press import press, solve_layer
 from benchmarks.cases.real.labels import BadData, PressLabels, read_frames, read_labels
 from benchmarks.harness.measure import Measurement, timed
 from benchmarks.harness.runner import Case
-from calibration.light.circle import NoCircle, find_contact_circle
+from calibration.light.dent import NoCircle, find_contact_circle
 from tacsim.interface import FloatArray, Image, Pose
 from tacsim.models.material import GelMaterial
 from tacsim.models.scene import Gel, Indenter, Scene, Settling, Sphere

@@ -40,7 +40,7 @@ BALL, DEPTH = 4e-3, 1e-3  # [m]
 def made_up(width: int) -> Calibration:
     """A calibration of the largest order for pictures of width x 3/4 width, with random light."""
     from calibration.bundle import Calibration, Provenance
-    from calibration.height.slope_polynomial import InverseModel, fit_inverse, inverse_features, normal_of_slope
+    from calibration.height.slopes import InverseModel, fit_inverse, inverse_features, normal_of_slope
     from tacsim.models.photometric import PhotometricLight
 
     shape = (3 * width // 4, width)

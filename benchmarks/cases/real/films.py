@@ -70,9 +70,8 @@ def read_films(folder: Path) -> dict[Film, Path]:
 def marker_film(film: Film, path: Path, repeat: int) -> list[Measurement]:
     """Dots tracked through a real press: share tracked to the end, jitter at rest, and the time of a frame."""
     from calibration.light.noise import NoiseUnknown, measure_noise
-    from calibration.markers.dots import DotFinder
+    from calibration.markers.dots import DotFinder, NoLattice, median_pitch
     from calibration.markers.flow import find_markers
-    from calibration.markers.lattice import NoLattice, median_pitch
     from calibration.markers.tracker import DotTracker
 
     frames = _read_film(path)

@@ -19,7 +19,7 @@ from benchmarks.cases.real.contact_radius import ELEMENT, ball_scene, press_to
 from benchmarks.cases.real.labels import BadData, PressLabel, PressLabels, read_frames, read_labels
 from benchmarks.harness.measure import Measurement, Timing
 from benchmarks.harness.runner import Case
-from calibration.light.circle import Circle, NoCircle, find_contact_circle
+from calibration.light.dent import Circle, NoCircle, find_contact_circle
 from robot.studies.matched_press import place_surface
 from tacsim.interface import FloatArray, Image, Mask
 from tacsim.models.scene import GelSurface

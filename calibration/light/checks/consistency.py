@@ -7,15 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from calibration.light.checks.tuning import (
-    CONTACT_BLUR,
-    MAX_LINK_RATIO,
-    MIN_COMMON_CONTACT,
-    MIN_EXPLAINED_SHARE,
-    MIN_FINE_POWER_RATIO,
-)
-from calibration.light.circle import NoCircle, find_contact_circle
-from calibration.light.dent import dent_gradient
+from calibration.light.checks import tuning
+from calibration.light.dent import NoCircle, dent_gradient, find_contact_circle
 from calibration.light.photometry import photometric_features
 from calibration.light.press import BallPress, Window, gaussian_blur
 from calibration.light.tuning import RIM_BLUR, SKIRT_RADIUS
@@ -55,7 +48,7 @@ def _outside_largest_group(link_costs: FloatArray) -> list[int]:
     from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 
     tree = minimum_spanning_tree(np.maximum(link_costs, 1e-9)).toarray()
-    limit = max(MAX_LINK, MAX_LINK_RATIO * float(np.median(tree[tree > 0])))
+    limit = max(MAX_LINK, tuning.MAX_LINK_RATIO * float(np.median(tree[tree > 0])))
     count, group = connected_components(np.where(tree <= limit, tree, 0.0), directed=False)
     if count == 1:
         return []
@@ -86,9 +79,9 @@ def find_blurred_presses(presses: Sequence[BallPress], reference: Image, mean: F
         own = fine_power(still + press.change * mean, beside)
         shares.append(own / max(fine_power(still, beside), 1e-12))
     usual = max(float(np.median(shares)), 1.0) if shares else 1.0  # most of them may be blurred
-    if max(shares, default=0.0) < MIN_FINE_POWER_RATIO:
+    if max(shares, default=0.0) < tuning.MIN_FINE_POWER_RATIO:
         usual = 1.0
-    return [(k, share / usual) for k, share in enumerate(shares) if share < MIN_FINE_POWER_RATIO * usual]
+    return [(k, share / usual) for k, share in enumerate(shares) if share < tuning.MIN_FINE_POWER_RATIO * usual]
 
 
 def find_reference_contact(
@@ -97,7 +90,7 @@ def find_reference_contact(
     """Evidence of a contact in a picture without contact: the common difference of all presses from `reference`
     (H, W, 3) outside their contacts, or the difference of two such pictures, resembles a ball's dent. None without
     evidence."""
-    strength = float(np.median([np.abs(gaussian_blur(press.change, CONTACT_BLUR)).max() for press in presses]))
+    strength = float(np.median([np.abs(gaussian_blur(press.change, tuning.CONTACT_BLUR)).max() for press in presses]))
     for number, other in enumerate(others, start=2):
         where = _describe_dent(
             other.astype(np.float64) - reference, mean, reference, ball, MIN_REFERENCE_CONTACT * strength
@@ -118,7 +111,7 @@ def find_reference_contact(
     seen = np.isfinite(changes[..., 0]).sum(axis=0) >= min(3, len(presses))
     changes[:, ~seen] = 0.0
     usual = np.nanmedian(changes, axis=0).astype(np.float64)
-    where = _describe_dent(usual * mean, mean, reference, ball, MIN_COMMON_CONTACT * strength)
+    where = _describe_dent(usual * mean, mean, reference, ball, tuning.MIN_COMMON_CONTACT * strength)
     if where is None:
         return None
     return (
@@ -131,7 +124,7 @@ def _describe_dent(change: FloatArray, mean: FloatArray, reference: Image, ball:
     """Description of the place where a change (H, W, 3) [grey levels] exceeds `strength` [-] and a ball's dent explains
     it."""
     change = change - np.median(change, axis=(0, 1))
-    if not np.abs(gaussian_blur(change / mean, CONTACT_BLUR)).max() > strength:
+    if not np.abs(gaussian_blur(change / mean, tuning.CONTACT_BLUR)).max() > strength:
         return None
     level = np.full_like(reference, 128)
     try:
@@ -140,6 +133,6 @@ def _describe_dent(change: FloatArray, mean: FloatArray, reference: Image, ball:
         return None
     height, width = reference.shape[:2]
     inside = min(circle.x, circle.y, width - 1 - circle.x, height - 1 - circle.y) >= circle.radius
-    if circle.explained_share < MIN_EXPLAINED_SHARE or not inside:
+    if circle.explained_share < tuning.MIN_EXPLAINED_SHARE or not inside:
         return None
     return f"({circle.x:.0f}, {circle.y:.0f}) px"

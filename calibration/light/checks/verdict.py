@@ -1,42 +1,28 @@
-"""Verdict on a calibrated light: limits for all sensors, and advice if one is exceeded."""
+"""Verdict on a calibrated light: limits for all sensors, advice if one is exceeded, and a page (one self-contained HTML
+file) with a picture of residuals."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
-from calibration.light.checks.tuning import (
-    GOOD_PRESSES,
-    MAX_COMMON_CONTACT_RATIO,
-    MAX_CONTACT_RATIO,
-    MAX_DEPTH_RATIO,
-    MAX_ERROR_RATIO,
-    MAX_IDENTIFIABLE_THICKNESS,
-    MAX_LEFT_OUT,
-    MAX_NORMAL_ERROR,
-    MAX_RADIUS_UNCERTAINTY,
-    MAX_RESIDUAL_SHARE,
-    MAX_SCALE_ERROR,
-    MAX_STRETCH,
-    MAX_THICKNESS_RATIO,
-    MIN_CORRELATION,
-    MIN_DIRECTED_SHARE,
-    MIN_PRESSES,
-    MIN_WIDEST_CONTACT_RATIO,
-)
+from calibration.light.checks import tuning
 from calibration.light.dent import contact_depth
 from calibration.light.fit import LightFit
 from tacsim.interface import Image
 from tacsim.models.photometric import PhotometricLight, PhotometricModel
+from tacsim.report.report import data_url, render_page
 
 Word = Literal["good", "usable", "unverified scale", "do not trust"]
 ORDER: tuple[Word, ...] = ("do not trust", "unverified scale", "usable", "good")  # the worst first
 
 GREY = "the pictures are grey"
+PAGE_FILE = "verdict.html"
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,24 +76,24 @@ def evaluate_calibration(fit: LightFit, scale: KnownScale, *, dots: bool = False
 
 def _check_presses(fit: LightFit) -> Iterable[Finding]:
     count = len(fit.presses)
-    if count < GOOD_PRESSES:
+    if count < tuning.GOOD_PRESSES:
         # depth needs one table, which one press gives; slopes need colours of all directions everywhere
-        word: Word = "do not trust" if count < MIN_PRESSES and fit.darkness is None else "usable"
+        word: Word = "do not trust" if count < tuning.MIN_PRESSES and fit.darkness is None else "usable"
         todo = "press five at least, eight are good"
         if fit.darkness is not None:
             todo = "that gives the table of darkness, five presses tell whether it holds"
         yield Finding(word, f"{count} press{'es' * (count > 1)} could be used", todo)
     yield from _exceed_limits(
-        MAX_RADIUS_UNCERTAINTY, fit.radius_uncertainty, "the contact radii are uncertain by {:.0%}",
+        tuning.MAX_RADIUS_UNCERTAINTY, fit.radius_uncertainty, "the contact radii are uncertain by {:.0%}",
         "press more often and deeper; is each picture of one ball, held still?",
     )  # fmt: skip
     share = len(fit.left_out) / (count + len(fit.left_out))
-    if share > MAX_LEFT_OUT:
+    if share > tuning.MAX_LEFT_OUT:
         yield Finding(
             "do not trust", f"{len(fit.left_out)} of {count + len(fit.left_out)} presses were left out",
             "see why below, and press again: one ball, one sensor, one setting of its camera",
         )  # fmt: skip
-    misfit = [press.name for press in fit.predictions if press.error > MAX_ERROR_RATIO * press.null_error]
+    misfit = [press.name for press in fit.predictions if press.error > tuning.MAX_ERROR_RATIO * press.null_error]
     if misfit:
         yield Finding("usable", f"the circle of {_join_names(misfit)} does not fit", "look at it, and leave it out")
 
@@ -125,19 +111,19 @@ def _check_images(fit: LightFit) -> Iterable[Finding]:
             "slopes cannot be found in such pictures; only how dark it is tells of depth",
         )  # fmt: skip
     yield from _exceed_limits(
-        MAX_RESIDUAL_SHARE, unexplained, "{:.0%} of what the presses change is no smooth function of the slope",
+        tuning.MAX_RESIDUAL_SHARE, unexplained, "{:.0%} of what the presses change is no smooth function of the slope",
         "shadows, or a light that tells no direction; is the ball a ball, and exposure fixed?",
     )  # fmt: skip
     if not fit.predictions:
         return
     yield from _exceed_limits(
-        MAX_NORMAL_ERROR, float(np.mean([press.angle for press in fit.predictions])),
+        tuning.MAX_NORMAL_ERROR, float(np.mean([press.angle for press in fit.predictions])),
         "normals of presses that took no part are off by {:.1f} degrees",
         "look at residuals.png: what do the worst show?",
     )  # fmt: skip
     correlation = float(np.mean([press.correlation for press in fit.predictions]))
     yield from _exceed_limits(
-        (-MIN_CORRELATION[0], -MIN_CORRELATION[1]), -correlation,
+        (-tuning.MIN_CORRELATION[0], -tuning.MIN_CORRELATION[1]), -correlation,
         f"pictures of presses that took no part are predicted with a correlation of {correlation:.3f}",
         "exposure and white balance fixed? a picture without contact of the same session?",
     )  # fmt: skip
@@ -147,9 +133,9 @@ def _check_shape(fit: LightFit) -> Iterable[Finding]:
     if fit.stretch is not None:
         unsure = 0.0 if math.isnan(fit.stretch.uncertainty) else 2 * fit.stretch.uncertainty
         yield from _exceed_limits(
-            MAX_STRETCH, fit.stretch.ratio - 1.0 - unsure,
+            tuning.MAX_STRETCH, fit.stretch.ratio - 1.0 - unsure,
             f"contacts of the ball are no circles: the ratio of their axes is {fit.stretch}; only below "
-            f"{1 + MAX_STRETCH[0] + unsure:.3f} it cannot be distinguished from 1",
+            f"{1 + tuning.MAX_STRETCH[0] + unsure:.3f} it cannot be distinguished from 1",
             "give pictures whose pixels are square, or the view of the gel (--view)",
         )  # fmt: skip
 
@@ -157,8 +143,10 @@ def _check_shape(fit: LightFit) -> Iterable[Finding]:
 def _check_scale(fit: LightFit, scale: KnownScale) -> Iterable[Finding]:
     ball = scale.ball_radius / scale.pixel_pitch
     ratios = [press.circle.radius / ball for press in fit.presses]
-    wide = [press.name for press, ratio in zip(fit.presses, ratios, strict=True) if ratio > MAX_CONTACT_RATIO]
-    if len(wide) > len(ratios) / 3 or (len(ratios) >= MIN_PRESSES and min(ratios) > MAX_COMMON_CONTACT_RATIO):
+    wide = [press.name for press, ratio in zip(fit.presses, ratios, strict=True) if ratio > tuning.MAX_CONTACT_RATIO]
+    if len(wide) > len(ratios) / 3 or (
+        len(ratios) >= tuning.MIN_PRESSES and min(ratios) > tuning.MAX_COMMON_CONTACT_RATIO
+    ):
         yield Finding(
             "do not trust", f"pitch or radius is wrong: contact radius over ball radius a/R = {np.median(ratios):.2f}",
             "measure the ball by a calliper (its radius is half of that) and the pitch by a board or a ruler",
@@ -168,7 +156,7 @@ def _check_scale(fit: LightFit, scale: KnownScale) -> Iterable[Finding]:
             "usable", f"the contact of {_join_names(wide)} is as wide as the ball",
             "measure ball (is it the radius that was given?) and pitch; if both are right, leave it out",
         )  # fmt: skip
-    elif max(ratios) < MIN_WIDEST_CONTACT_RATIO:
+    elif max(ratios) < tuning.MIN_WIDEST_CONTACT_RATIO:
         yield Finding(
             "usable", f"no contact is wider than {max(ratios):.2f} of the ball: light presses, a diameter given for "
             "the radius, or too small a pixel pitch", "measure ball and pitch; press as deep as the work will",
@@ -196,7 +184,7 @@ def _check_scale(fit: LightFit, scale: KnownScale) -> Iterable[Finding]:
     if scale.marker_pitches is not None:
         found, given = scale.marker_pitches
         yield from _exceed_limits(
-            MAX_SCALE_ERROR, abs(math.log(found / given)),
+            tuning.MAX_SCALE_ERROR, abs(math.log(found / given)),
             f"at this pixel pitch the dots are {found * 1e3:.3g} mm apart, and {given * 1e3:.3g} mm were given",
             "measure the pixel pitch by a board or a ruler",
         )  # fmt: skip
@@ -205,7 +193,7 @@ def _check_scale(fit: LightFit, scale: KnownScale) -> Iterable[Finding]:
         shown = columns * scale.pixel_pitch, rows * scale.pixel_pitch
         off = max(abs(math.log(one / other)) for one, other in zip(shown, scale.gel_size, strict=True))
         yield from _exceed_limits(
-            MAX_SCALE_ERROR, off,
+            tuning.MAX_SCALE_ERROR, off,
             f"at this pitch the picture shows {_size_text(shown)}, and {_size_text(scale.gel_size)} of the gel "
             "are to be seen",
             "measure the pitch by a board or a ruler",
@@ -214,7 +202,7 @@ def _check_scale(fit: LightFit, scale: KnownScale) -> Iterable[Finding]:
         yield from _check_thickness(fit, scale, max(ratios))
     known = dict(scale.depths)
     # What slopes say of a thick gel is too uncertain for this: the far end of its skirts is taken for drift
-    layer = fit.thickness if fit.thickness < MAX_IDENTIFIABLE_THICKNESS * ball else 1e4 * ball
+    layer = fit.thickness if fit.thickness < tuning.MAX_IDENTIFIABLE_THICKNESS * ball else 1e4 * ball
     if scale.gel_thickness is not None:
         layer = scale.gel_thickness / scale.pixel_pitch
     factors = [
@@ -225,7 +213,7 @@ def _check_scale(fit: LightFit, scale: KnownScale) -> Iterable[Finding]:
     if factors:
         factor = float(np.median(factors))
         yield from _exceed_limits(
-            MAX_SCALE_ERROR, abs(math.log(factor)),
+            tuning.MAX_SCALE_ERROR, abs(math.log(factor)),
             f"pitch or radius is wrong: by the depth that is known contacts are {factor:.2f} times as wide as found "
             f"(a/R = {np.median(ratios):.2f})", "measure pitch and ball; is the depth counted from the first touch?",
         )  # fmt: skip
@@ -236,12 +224,12 @@ def _check_thickness(fit: LightFit, scale: KnownScale, widest: float) -> Iterabl
     assert configured is not None
     depth = widest**2 * scale.ball_radius
     yield from _exceed_limits(
-        MAX_DEPTH_RATIO, depth / configured,
+        tuning.MAX_DEPTH_RATIO, depth / configured,
         f"the deepest press is {depth * 1e3:.1f} mm deep in a gel of {configured * 1e3:.1f} mm",
         "measure ball and pitch; press less deep",
     )  # fmt: skip
     by_slopes = fit.thickness * scale.pixel_pitch
-    if by_slopes < configured / MAX_THICKNESS_RATIO:
+    if by_slopes < configured / tuning.MAX_THICKNESS_RATIO:
         yield Finding(
             "usable", f"near the contacts the gel moves like one of {by_slopes * 1e3:.1f} mm, its given thickness "
             f"is {configured * 1e3:.1f} mm", "is the pixel pitch right?",
@@ -266,7 +254,7 @@ def is_isotropic(model: PhotometricModel) -> bool:
     middle = np.zeros(8, dtype=np.float32)
     change, _ = PhotometricLight(model).change(slopes.astype(np.float32), middle, middle)
     away = change - change.mean(axis=0)
-    return float((away**2).sum()) < MIN_DIRECTED_SHARE * float((change**2).sum())
+    return float((away**2).sum()) < tuning.MIN_DIRECTED_SHARE * float((change**2).sum())
 
 
 def _join_names(names: list[str]) -> str:
@@ -281,3 +269,51 @@ def _split_warning(warning: str) -> tuple[str, str]:
     """Splits a warning "finding: advice" into its two parts."""
     what, _, todo = warning.partition(": ")
     return what, todo
+
+
+def write_page(
+    path: Path, name: str, fit: LightFit, scale: KnownScale, verdict: Verdict, residuals: Path | None, facts: list[str]
+) -> None:
+    """Writes the page of sensor `name`. residuals: its picture. facts: lines with other data of the sensor. Raises
+    OSError."""
+    ball = scale.ball_radius / scale.pixel_pitch
+    ratios = [press.circle.radius / ball for press in fit.presses]
+    picture = None if residuals is None else data_url(residuals.read_bytes())
+    means = {
+        what: float(np.mean([getattr(press, what) for press in fit.predictions])) if fit.predictions else None
+        for what in ("angle", "correlation", "error", "null_error")
+    }
+    page = render_page(
+        Path(__file__).with_name("verdict.html.jinja"), name=name, fit=fit, scale=scale, verdict=verdict,
+        picture=picture, facts=facts, ratios=ratios, means=means,
+        rows=sorted(fit.predictions, key=lambda press: -press.angle),
+    )  # fmt: skip
+    path.write_text(page, encoding="utf-8")
+
+
+def draw_residuals(fit: LightFit, path: Path) -> None:
+    """Writes a PNG: for each press the observed change of colour, its prediction by the others, and the error, all in
+    one scale. Raises ValueError for a fit of one press, which has no prediction; OSError."""
+    half_side = 2.0  # of what is drawn [contact radii]
+    max_drawn = 8  # drawn, the worst first
+    from matplotlib.figure import Figure
+
+    predictions = sorted(fit.predictions, key=lambda press: -press.error)[:max_drawn]
+    if not predictions:
+        raise ValueError("a calibration from one press leaves none out: there is nothing to draw")
+    figure = Figure(figsize=(6.4, 1.9 * len(predictions)), layout="constrained")
+    axes = figure.subplots(len(predictions), 3, squeeze=False)
+    for row, press in zip(axes, predictions, strict=True):
+        reach = half_side * press.circle.radius
+        rows = slice(max(0, round(press.circle.y - reach)), round(press.circle.y + reach) + 1)
+        columns = slice(max(0, round(press.circle.x - reach)), round(press.circle.x + reach) + 1)
+        seen, predicted = press.real[rows, columns], press.predicted[rows, columns]
+        for axis, change in zip(row, (seen, predicted, predicted - seen), strict=True):
+            axis.imshow(np.clip(128 + change, 0, 255).astype(np.uint8))
+            axis.set_xticks([])
+            axis.set_yticks([])
+        row[0].set_ylabel(press.name, fontsize=7)
+        row[2].set_title(f"{press.error:.1f} of {press.null_error:.1f} grey levels, {press.angle:.1f}°", fontsize=7)
+    axes[0, 0].set_title("seen", fontsize=8)
+    axes[0, 1].set_title("predicted by the other presses", fontsize=8)
+    figure.savefig(path, dpi=120)

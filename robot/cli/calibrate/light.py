@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from robot.cli.errors import EXIT_UNTRUSTED, EXIT_UNVERIFIED
 from robot.cli.output import busy, notes, print_files, print_json, results, show_table, warn, writing
+from robot.cli.terminal import EXIT_UNTRUSTED, EXIT_UNVERIFIED
 
 if TYPE_CHECKING:
     from calibration.frame_set import FrameSet
@@ -16,8 +16,7 @@ if TYPE_CHECKING:
     from calibration.light.checks.verdict import KnownScale
     from calibration.light.fit import LightFit
     from calibration.profiles import SensorProfile
-    from tacsim.models.geometry import PictureRegion
-    from tacsim.models.sensor import CameraNoise, Markers
+    from tacsim.models.sensor import CameraNoise, Markers, PictureRegion
 
 UNKNOWN = "unknown"  # serial number of a sensor without a given name
 FRAMES = "frames"  # folder in a bundle with its camera images
@@ -65,8 +64,8 @@ def fit_light(read: FrameSet, ball: float, dot: float | None) -> LightFit:
 
 def find_lattice(read: FrameSet, pitch: float) -> Markers:
     """The lattice of dots in the reference image."""
+    from calibration.markers.dots import NoLattice
     from calibration.markers.flow import find_markers
-    from calibration.markers.lattice import NoLattice
     from tacsim.models.sensor import Markers
 
     try:
@@ -95,9 +94,7 @@ def write_calibration(
     """Prints the calibration, writes its bundle and the page of its verdict. Exits with EXIT_UNTRUSTED or
     EXIT_UNVERIFIED according to the verdict."""
     from calibration.bundle import write_bundle
-    from calibration.light.checks import page
-    from calibration.light.checks.page import draw_residuals
-    from calibration.light.checks.verdict import evaluate_calibration
+    from calibration.light.checks.verdict import PAGE_FILE, draw_residuals, evaluate_calibration, write_page
     from calibration.light.noise import measure_skin
 
     verdict = evaluate_calibration(fit, scale, dots=found is None and _has_dots(fit))
@@ -130,9 +127,9 @@ def write_calibration(
         if residuals is not None:
             draw_residuals(fit, residuals)
             written.append(residuals)
-        written.append(folder / page.FILE)
+        written.append(folder / PAGE_FILE)
         title = _title(serial, folder, profile)
-        page.write_page(written[-1], title, fit, scale, verdict, residuals, facts)
+        write_page(written[-1], title, fit, scale, verdict, residuals, facts)
     for finding in verdict.findings:
         todo = f" Next: {finding.todo}" if finding.todo else ""
         notes.print(f"{finding.word}: {finding.what}.{todo}")

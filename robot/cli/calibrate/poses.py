@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from robot.cli.calibrate.session import confirm_motion, guided_session
-from robot.cli.errors import print_error
 from robot.cli.options import (
     HardwareRig,
     OptionGroup,
@@ -26,7 +25,7 @@ from robot.cli.options import (
     with_option_groups,
 )
 from robot.cli.output import busy, new_directory, notes, print_files, print_json, results, show_table, writing
-from robot.cli.terminal import Interrupt, ask_operator, require_operator
+from robot.cli.terminal import Interrupt, ask_operator, print_error, require_operator
 
 if TYPE_CHECKING:
     from calibration.poses.ball_touch import TouchNoise

@@ -39,8 +39,8 @@ if TYPE_CHECKING:
     from calibration.frame_set import FrameSet
     from calibration.lens.view import Corners, GelView
     from calibration.profiles import SensorProfile
-    from tacsim.models.geometry import PictureRegion
     from tacsim.models.hardware import CameraSensorConfig
+    from tacsim.models.sensor import PictureRegion
 
 calibrate = typer.Typer(no_args_is_help=True, help="Calibrate sensors, cameras and arms of a rig.")
 

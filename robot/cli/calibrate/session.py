@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from robot.cli.errors import print_error
 from robot.cli.output import notes, progress, writing
-from robot.cli.terminal import Interrupt, ask_operator, has_operator, has_real_arm
+from robot.cli.terminal import Interrupt, ask_operator, has_operator, has_real_arm, print_error
 
 if TYPE_CHECKING:
     import numpy as np

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robot.common.loopback import require_loopback
+from robot.common import require_loopback
 from robot.common.process import Child
 
 STREAM = "/?action=stream"  # path of the stream of mjpg-streamer

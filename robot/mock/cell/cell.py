@@ -24,7 +24,7 @@ from robot.mock.camera.camera import MockCamera
 from robot.mock.cell.sim_server import SceneFrame, SimServer
 from robot.mock.ur.fault_client import FaultClient
 from robot.mock.ur.handle import MockArms
-from robot.mock.ur.machine.version import VERSION, Version, parse_version
+from robot.mock.ur.machine.state import VERSION, Version, parse_version
 from tacsim import pose as se3
 from tacsim.config import load_sensor
 from tacsim.interface import FloatArray, Pose, SensorSpec, TactileFrame, Truth

@@ -16,12 +16,12 @@ from typing import Any
 
 import numpy as np
 
-from robot.mock.ur.machine.load import Mass, Wall
+from robot.mock.ur.connection import Connection
+from robot.mock.ur.controller import PORTS, Controller, accept_client, open_port, take_lines
+from robot.mock.ur.fields import INPUTS
+from robot.mock.ur.machine.forces import Mass, Wall
 from robot.mock.ur.machine.program import MAX_NUMBER
-from robot.mock.ur.machine.version import check_version
-from robot.mock.ur.wire.connection import Connection
-from robot.mock.ur.wire.controller import PORTS, Controller, accept_client, open_port, take_lines
-from robot.mock.ur.wire.fields import INPUTS
+from robot.mock.ur.machine.state import check_version
 from tacsim.interface import FloatArray
 
 PAGE = 500  # input packages in one reply

@@ -9,12 +9,11 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from robot.common import MOCK_SERIAL
-from robot.common.loopback import require_loopback
+from robot.common import MOCK_SERIAL, require_loopback
 from robot.common.process import END_TIMEOUT, Child
 from robot.errors import DeviceError
 from robot.mock.ur.fault_client import FAULT_PORT, FaultClient
-from robot.mock.ur.machine.version import VERSION, Version, check_version, version_text
+from robot.mock.ur.machine.state import VERSION, Version, check_version, version_text
 
 if TYPE_CHECKING:
     from tacsim.models.hardware import Model  # pydantic and SciPy: half a second of start-up

@@ -11,12 +11,22 @@ import numpy as np
 
 from calibration.materials.checks import Finding, find_contradictions, indenter_size_error
 from calibration.materials.estimate import estimate_materials
-from calibration.materials.fit import Fit, Parameter, Point, Priors, Signals
-from calibration.materials.presses import Noise, Press, downsample_press, merge_repeated_readings, signals_of
+from calibration.materials.fit import (
+    Fit,
+    Noise,
+    Parameter,
+    Point,
+    Press,
+    Priors,
+    Signals,
+    downsample_press,
+    merge_repeated_readings,
+    signals_of,
+)
 from calibration.materials.tuning import COARSE_SIMULATION_ERROR
 from robot.studies.identify.recordings import Recordings
 from robot.studies.identify.simulation import Simulation, coarser, scene_with
-from robot.studies.identify.tuning import FIRST_FRICTION, FIRST_YIELD
+from robot.studies.tuning import FIRST_FRICTION, FIRST_YIELD
 from tacsim.interface import FloatArray
 from tacsim.models.material import elastic_constants
 from tacsim.models.scene import Scene

@@ -8,7 +8,7 @@ import math
 from collections.abc import Sequence
 from itertools import pairwise
 
-from robot.studies.identify.tuning import (
+from robot.studies.tuning import (
     BODY_SLIDE_SHARE,
     BODY_STEP,
     PRESS_DEPTH,

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from calibration.errors import CalibrationError
-from calibration.materials.presses import Press
+from calibration.materials.fit import Press
 from robot.rig.replay_rig import open_replay, recorded_rig
 from robot.studies.identify.simulation import SensorView, shape_signals
 from tacsim import pose as se3

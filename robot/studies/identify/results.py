@@ -12,8 +12,7 @@ import numpy as np
 import yaml
 from matplotlib.axes import Axes
 
-from calibration.materials.fit import Parameter
-from calibration.materials.presses import Press
+from calibration.materials.fit import Parameter, Press
 from robot.common.whole_file import whole_folder
 from robot.studies.identify.identify import Identified
 from robot.studies.identify.motions import MOTIONS_FOR_PARAMETER

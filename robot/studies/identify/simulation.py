@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.materials.estimate import CannotSimulate
-from calibration.materials.fit import Parameter, Point
-from calibration.materials.presses import Press
+from calibration.materials.fit import Parameter, Point, Press
 from tacsim import pose as se3
 from tacsim.geometry.shapes import depth_below_centre
 from tacsim.interface import FloatArray, Pose

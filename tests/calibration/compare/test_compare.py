@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibration.compare.alignment import align_by_geometry, align_by_size
 from calibration.compare.compare import METRICS, Comparison, Options, bootstrap_interval, compare_frames
+from calibration.compare.metrics import align_by_geometry, align_by_size
 from calibration.compare.report import comparison_as_json, comparison_figures, describe_comparison, write_comparison
 from calibration.errors import BadFrames
 from calibration.frame_set import Frame, FrameSet, rectified_by_corners, rectified_shape

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from calibration.frame_normaliser import FrameNormaliser
-from calibration.height.colour_table import table_of_model
+from calibration.height.slopes import table_of_model
 from calibration.height.surface_finder import SurfaceFinder, extended_view
 from calibration.normaliser import normaliser_for_camera, normaliser_for_pictures, normaliser_for_simulation
 from tacsim.interface import TactileFrame, TactileObservation

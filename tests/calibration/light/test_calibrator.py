@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from calibration.errors import BadFrames
-from calibration.height.integration import Integrator
-from calibration.height.slope_polynomial import PolynomialSlopes, normal_of_slope
+from calibration.height.slopes import PolynomialSlopes, normal_of_slope
+from calibration.height.surface_finder import Integrator
 from calibration.light.calibrator import calibrate_light
 from calibration.light.dent import ContactCircle, dent_gradient
 from calibration.light.fit import LightFit, normal_angle

@@ -7,8 +7,7 @@ import pytest
 
 from calibration.light.calibrator import calibrate_light
 from calibration.light.dent import ContactCircle
-from calibration.light.fit import LightFit
-from calibration.light.labels import counted_pixels
+from calibration.light.fit import LightFit, counted_pixels
 from calibration.light.photometry import SLOPE_TERMS, ModelSize
 from calibration.light.press import BallPress, gaussian_blur
 from tacsim.models.photometric import DEPTH_TERMS, PhotometricLight, image_grid_places
@@ -67,7 +66,7 @@ def test_slopes_at_depth_are_found_and_hold_for_what_is_no_ball(seed: int, monke
     sensor = HiddenSensor(seed, noise=0.5)
     presses = [faded(sensor, made) for made in sensor.presses(8)]
     fit = fitted(sensor, presses)
-    monkeypatch.setattr("calibration.light.photometry.MIN_SLOPES_IMPROVEMENT", 0.0)
+    monkeypatch.setattr("calibration.light.tuning.MIN_SLOPES_IMPROVEMENT", 0.0)
     without = fitted(sensor, presses)
     assert fit.forward is not None and fit.forward.depth is not None and fit.forward.depth.slopes
     assert without.forward is not None and (without.forward.depth is None or not without.forward.depth.slopes)

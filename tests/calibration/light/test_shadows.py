@@ -41,7 +41,7 @@ def test_shadows_are_found_and_hold_for_what_is_no_ball(monkeypatch: pytest.Monk
     presses = [replace(made, image=in_shade(made.image, made.height / PITCH, lamps)) for made in sensor.presses(8)]
     named = [(f"press {i}", press.image) for i, press in enumerate(presses)]
     fit = calibrate_light(sensor.empty(), named, BALL_PX)
-    monkeypatch.setattr("calibration.light.calibrator.MIN_SHADOW_RESIDUAL", 1.0)
+    monkeypatch.setattr("calibration.light.tuning.MIN_SHADOW_RESIDUAL", 1.0)
     without = calibrate_light(sensor.empty(), named, BALL_PX)
     assert fit.forward is not None and without.forward is not None
     assert fit.forward.shadows is not None and without.forward.shadows is None

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from calibration.markers.dots import NoLattice, find_lattice
 from calibration.markers.flow import MarkerFlow, NoMarkers, find_markers, marker_flow
-from calibration.markers.lattice import NoLattice, find_lattice
 from calibration.markers.tracker import DotTracker
 from tacsim.models.sensor import Markers, SensorGeometry
 from tests.calibration.dotted import draw, lattice_points

@@ -12,8 +12,7 @@ import time
 import numpy as np
 
 from robot.arm import channel
-from robot.arm.channel import HISTORY
-from robot.arm.shared_ring import Record
+from robot.arm.channel import HISTORY, Record
 from robot.arm.status import ArmStatus
 from robot.arm.trajectory import PERIOD
 from robot.arm.tuning import FAULT_DECELERATION, MAX_STALL_PERIODS

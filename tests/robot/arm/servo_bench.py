@@ -6,9 +6,8 @@ import math
 
 import numpy as np
 
-from robot.arm.channel import STATE, CommandKind, WorkerConfig, make_command_record
+from robot.arm.channel import STATE, CommandKind, Record, WorkerConfig, make_command_record
 from robot.arm.servo import Servo
-from robot.arm.shared_ring import Record
 from robot.arm.start_servo import StartServo
 from robot.arm.status import ArmStatus
 from robot.arm.trajectory import PERIOD

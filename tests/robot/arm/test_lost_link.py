@@ -9,10 +9,8 @@ import time
 import numpy as np
 import pytest
 
-from robot.arm.channel import STATE, STATISTICS_PERIODS
-from robot.arm.lost_link import TIME_LIMIT_EXIT_STATUS, describe_lost_link, ended_by_lost_link
-from robot.arm.shared_ring import Record
-from robot.arm.status import ArmStatus, status_of
+from robot.arm.channel import STATE, STATISTICS_PERIODS, Record
+from robot.arm.status import TIME_LIMIT_EXIT_STATUS, ArmStatus, describe_lost_link, ended_by_lost_link, status_of
 from robot.arm.ur import URArm
 from robot.mock import MockUR
 from tests.robot.arm.mocked import config, go, in_motion, moved

@@ -8,9 +8,8 @@ from dataclasses import fields
 import numpy as np
 import pytest
 
-from robot.arm.channel import STATE
-from robot.arm.lost_link import PackageLog
-from robot.arm.shared_ring import Ring, create_segment
+from robot.arm.channel import STATE, Ring, create_segment
+from robot.arm.status import PackageLog
 from robot.arm.ur import URArm
 from tests.robot.waiting import until
 

@@ -13,25 +13,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from robot.arm import shared_ring
+from robot.arm import channel
 
 RECORD = np.dtype([("a", np.float64, 40), ("b", np.uint64)])
-ROOT = str(Path(shared_ring.__file__).parents[2])
+ROOT = str(Path(channel.__file__).parents[2])
 
 
 @pytest.fixture
-def segment() -> shared_ring.Segment:
-    return shared_ring.create_segment(shared_ring.Ring.size(RECORD, 8))
+def segment() -> channel.Segment:
+    return channel.create_segment(channel.Ring.size(RECORD, 8))
 
 
-def record(value: float) -> shared_ring.Record:
+def record(value: float) -> channel.Record:
     made = np.zeros((), RECORD)
     made["a"], made["b"] = value, int(value)
     return made
 
 
-def child(code: str, segment: shared_ring.Segment, *arguments: str) -> subprocess.Popen[str]:
-    text = "import sys, time, os, numpy as np\nfrom robot.arm import shared_ring\n" + textwrap.dedent(code)
+def child(code: str, segment: channel.Segment, *arguments: str) -> subprocess.Popen[str]:
+    text = "import sys, time, os, numpy as np\nfrom robot.arm import channel\n" + textwrap.dedent(code)
     return subprocess.Popen(
         [sys.executable, "-c", text, str(segment.descriptor), *arguments],
         pass_fds=[segment.descriptor],
@@ -42,8 +42,8 @@ def child(code: str, segment: shared_ring.Segment, *arguments: str) -> subproces
     )
 
 
-def test_ring_records_keep_order_and_last_slots(segment: shared_ring.Segment) -> None:
-    ring = shared_ring.Ring(segment.memory, RECORD, 8)
+def test_ring_records_keep_order_and_last_slots(segment: channel.Segment) -> None:
+    ring = channel.Ring(segment.memory, RECORD, 8)
     assert ring.latest() is None
     assert len(ring.recent(100)) == 0
     for value in range(1, 21):
@@ -59,12 +59,12 @@ def test_ring_records_keep_order_and_last_slots(segment: shared_ring.Segment) ->
 
 @pytest.mark.slow
 @pytest.mark.promise(10)
-def test_ring_100000_reads_have_no_torn_record(segment: shared_ring.Segment) -> None:
+def test_ring_100000_reads_have_no_torn_record(segment: channel.Segment) -> None:
     """Another process writes as fast as it can; every copy here is of one record."""
     writer = child(
         """
         record = np.dtype([("a", np.float64, 40), ("b", np.uint64)])
-        ring = shared_ring.Ring(shared_ring.Segment(int(sys.argv[1])).memory, record, 8)
+        ring = channel.Ring(channel.Segment(int(sys.argv[1])).memory, record, 8)
         value, made = 0, np.zeros((), record)
         print("writing", flush=True)
         while os.getppid() == int(sys.argv[2]):
@@ -77,7 +77,7 @@ def test_ring_100000_reads_have_no_torn_record(segment: shared_ring.Segment) -> 
     )
     try:
         assert writer.stdout is not None and writer.stdout.readline() == "writing\n"
-        ring = shared_ring.Ring(segment.memory, RECORD, 8)
+        ring = channel.Ring(segment.memory, RECORD, 8)
         while ring.latest() is None:
             time.sleep(1e-3)
         torn, backwards, seen, last = 0, 0, set(), 0
@@ -112,13 +112,13 @@ def descriptors() -> list[str]:
 def test_segment_is_freed_with_last_process() -> None:
     """There is no file: nothing to find for others, nothing to be squatted, nothing that a kill could leave."""
     before = descriptors()
-    segment = shared_ring.create_segment(shared_ring.Ring.size(RECORD, 8))
-    ring = shared_ring.Ring(segment.memory, RECORD, 8)
+    segment = channel.create_segment(channel.Ring.size(RECORD, 8))
+    ring = channel.Ring(segment.memory, RECORD, 8)
     ring.write(record(7.0))
     assert all(path.endswith("(deleted)") for path in set(descriptors()) - set(before))
     code = """
-    held = shared_ring.Segment(int(sys.argv[1]))
-    ring = shared_ring.Ring(held.memory, np.dtype([("a", np.float64, 40), ("b", np.uint64)]), 8)
+    held = channel.Segment(int(sys.argv[1]))
+    ring = channel.Ring(held.memory, np.dtype([("a", np.float64, 40), ("b", np.uint64)]), 8)
     print(int(ring.latest()["b"]), flush=True)
     time.sleep(60)
     """
@@ -136,8 +136,8 @@ def test_segment_without_standard_streams_reaches_child() -> None:
     code = """
     import os
     os.closerange(0, 3)
-    from robot.arm import shared_ring
-    os._exit(shared_ring.create_segment(64).descriptor)
+    from robot.arm import channel
+    os._exit(channel.create_segment(64).descriptor)
     """
     done = subprocess.run([sys.executable, "-c", textwrap.dedent(code)], env={**os.environ, "PYTHONPATH": ROOT})
     assert done.returncode >= 3

@@ -261,7 +261,7 @@ def test_recover_emergency_stop_raises_until_released(arm: URArm, mock: MockUR) 
 
 @pytest.mark.promise(7)
 def test_arm_program_stopped_outside_raises(arm: URArm, mock: MockUR) -> None:
-    from robot.arm.controller.dashboard import Dashboard
+    from robot.arm.connections import Dashboard
 
     in_motion(arm, moved(arm.state().pose, x=0.1))
     with Dashboard(HOST) as dashboard:

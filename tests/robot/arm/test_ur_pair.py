@@ -155,8 +155,8 @@ def test_pair_dead_worker_stops_moving_arm(pair: Pair) -> None:
 EMPTY = """
 import time
 import numpy as np
-from robot.common.realtime import WORKER, request_realtime
-request_realtime(WORKER)
+from robot.common import WORKER_PRIORITY, request_realtime
+request_realtime(WORKER_PRIORITY)
 beats = [time.monotonic()]
 deadline = beats[0] + 2e-3
 while len(beats) <= 500:

@@ -13,11 +13,11 @@ from pathlib import Path
 
 import pytest
 
-from robot.arm import shared_ring, worker
+from robot.arm import channel, worker
 from robot.arm.channel import Channel, WorkerConfig
+from robot.arm.channel import make_worker_config as config_of
 from robot.arm.status import ArmStatus
 from robot.arm.trajectory import PERIOD
-from robot.arm.worker_config import make_worker_config as config_of
 from robot.mock import MOCK_SERIAL, MockUR
 from tacsim.models.hardware import ArmLimits, MockArmConfig, Placement, UrArmConfig, Workspace
 from tests.robot.arm.mocked import HOST
@@ -73,7 +73,7 @@ def test_variables_are_known_to_library() -> None:
 
 
 def test_worker_failure_prints_one_json_line() -> None:
-    segment = shared_ring.create_segment(Channel.SIZE)
+    segment = channel.create_segment(Channel.SIZE)
     done = start(worker_config(segment.descriptor))
     assert done.returncode == worker.FAILED_EXIT_STATUS
     told = json.loads(done.stdout)
@@ -98,7 +98,7 @@ def test_worker_without_memory_reports_error() -> None:
 
 def test_worker_driver_died_during_connect_exits(mock: MockUR) -> None:
     """The first message of the worker is not read: it still ends its program."""
-    segment = shared_ring.create_segment(Channel.SIZE)
+    segment = channel.create_segment(Channel.SIZE)
     config = worker_config(segment.descriptor, host=HOST, parent=1)  # not this process
     reader, writer = os.pipe()
     os.close(reader)
@@ -121,7 +121,7 @@ UNSEEN = "from robot.arm import worker; worker.Dashboard.require_identity = lamb
 
 def test_worker_wrong_model_keeps_controller_settings(mock: MockUR) -> None:
     """Also if the dashboard does not report the model."""
-    segment, before = shared_ring.create_segment(Channel.SIZE), mock.faults.state().payload
+    segment, before = channel.create_segment(Channel.SIZE), mock.faults.state().payload
     given = worker_config(segment.descriptor, host=HOST, model="ur10e", mass=2.0, tcp=[0.0, 0.0, 0.1, 0.0, 0.0, 0.0])
     done = start(given, "-c", UNSEEN)
     assert done.returncode == worker.FAILED_EXIT_STATUS
@@ -160,7 +160,7 @@ class Packages:
 
 def test_worker_first_wrench_uses_payload(monkeypatch: pytest.MonkeyPatch) -> None:
     """Packages that were measured before arrive after the controller's word that it has taken it."""
-    segment, packages = shared_ring.create_segment(Channel.SIZE), Packages()
+    segment, packages = channel.create_segment(Channel.SIZE), Packages()
     made = worker.Worker(worker_config(os.dup(segment.descriptor)))  # which closes its own
     monkeypatch.setattr(worker.time, "sleep", packages.sleep)
     made.receive = packages
@@ -172,7 +172,7 @@ def test_worker_first_wrench_uses_payload(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_worker_wrong_serial_number_is_refused(mock: MockUR) -> None:
-    segment = shared_ring.create_segment(Channel.SIZE)
+    segment = channel.create_segment(Channel.SIZE)
     done = start(worker_config(segment.descriptor, host=HOST, serial="20225500001"))
     assert f"has the serial number {MOCK_SERIAL}, but the file of arm 'left' says serial: 20225500001" in done.stdout
     assert not mock.faults.received().entries

@@ -11,8 +11,8 @@ import pytest
 
 from calibration.reference import UnusableReference
 from robot.deploy.control_loop import run_episode
+from robot.fixtures import mock_host
 from robot.mock import MockCamera
-from robot.mock.fixtures import mock_host
 from robot.open import open_rig
 from tacsim.config import load_rig
 from tacsim.interface import Action, Observation
@@ -23,11 +23,10 @@ from tacsim.optics.render import Renderer
 from tacsim.optics.surface import surface_map
 from tacsim.record.reader import read_episode
 from tacsim.record.writer import Recorder
-from tacsim.report.diagnostics import sensor_diagnostics
 from tacsim.report.report import summarise, summary_table
-from tacsim.report.series import Series
+from tacsim.report.series import Series, sensor_diagnostics
 from tacsim.rig import Rig
-from tacsim.tasks.grip import Grip
+from tacsim.tasks.squeeze import Grip
 from tests.tacsim.optics.surfaces import dent, flat
 
 RIG = """

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from robot.common.kinematics import Kinematics, matrix
 from robot.common.tcp import ArmFrames, pose_of
+from robot.fixtures import mock_host
 from robot.mock import FaultClient, MockArms, MockCamera
-from robot.mock.fixtures import mock_host
 from tacsim import pose as se3
 from tacsim.config import config_root, load_rig
 from tacsim.interface import Pose

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from tacsim.config import config_root, load_rig, load_scene, load_sensor
-from tacsim.config.catalogue import CATALOGUE_KINDS
+from tacsim.config.kinds import CATALOGUE_KINDS
 from tests.robot.cli.invoked import tacsim
 
 pytestmark = pytest.mark.usefixtures("empty_folder")

@@ -17,8 +17,8 @@ from matplotlib.image import imread
 from scipy.spatial.transform import Rotation
 
 import robot
-from robot.cli.errors import describe_error
 from robot.cli.output import writing
+from robot.cli.terminal import describe_error
 from robot.studies.press import PressMotion, _targets
 from tacsim.config import ConfigError
 from tacsim.interface import IncompatibleRig, Pose

@@ -85,7 +85,7 @@ def test_nohup_process_ignores_hangup() -> None:
 LOST = """
 import sys, time
 from pathlib import Path
-from robot.cli.errors import print_error
+from robot.cli.terminal import print_error
 from robot.cli.terminal import Interrupt
 from robot.cli.output import progress, results
 with Interrupt() as interrupt, progress() as bar:

@@ -91,7 +91,7 @@ def test_new_names_its_file() -> None:
 
 
 def test_doctor_keeps_its_exit_code(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("robot.doctor.machine.as_json", lambda checks: {"ok": False, "checks": []})
+    monkeypatch.setattr("robot.doctor.as_json", lambda checks: {"ok": False, "checks": []})
     assert document("doctor", exit_code=1) == {"ok": False, "checks": []}
 
 

@@ -14,10 +14,10 @@ from rich.progress import Progress, TextColumn
 from rich.table import Table
 from rich.text import Text
 
-from robot.cli import app, errors
+from robot.cli import app, terminal
 from robot.cli.doctor import print_checks
 from robot.cli.output import SafeConsole, require_writable, show_table
-from robot.doctor.machine import Check
+from robot.doctor import Check
 from tacsim.interface import RigSpec, SensorSpec, TactileFrame
 from tacsim.record import schemas
 from tacsim.record.episode import EpisodeMeta, Step
@@ -55,11 +55,11 @@ def test_console_keeps_own_colours_and_cursor() -> None:
 
 
 def test_errors_and_checks_print_control_characters_as_text(capsys: pytest.CaptureFixture[str]) -> None:
-    errors.print_error(EVIL)
+    terminal.print_error(EVIL)
     check(capsys.readouterr().err)
     print_checks([Check("serial", "warn", EVIL, "do this")])
     check(capsys.readouterr().out)
-    message, _ = errors.describe_error(FileNotFoundError(2, "No such file", "x\ny" + EVIL))
+    message, _ = terminal.describe_error(FileNotFoundError(2, "No such file", "x\ny" + EVIL))
     check(message)
     assert "\n" not in message
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibration.light.circle import find_contact_circle
+from calibration.light.dent import find_contact_circle
 from robot.studies.sample_presses import PRESSES, SERIES
 from tacsim.record.images import read_image
 from tests.robot.cli.invoked import tacsim

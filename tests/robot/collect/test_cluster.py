@@ -17,8 +17,7 @@ from ray.cluster_utils import Cluster  # noqa: E402
 
 from robot.collect.collect import collect  # noqa: E402
 from robot.collect.folder import SetFolder  # noqa: E402
-from robot.collect.job import Piece, SetError  # noqa: E402
-from robot.collect.workers import CollectFailed  # noqa: E402
+from robot.collect.workers import CollectFailed, Piece, SetError  # noqa: E402
 from tests.robot.cli.invoked import environment  # noqa: E402
 from tests.robot.collect.small import contents, job, rows  # noqa: E402
 
@@ -75,7 +74,7 @@ def test_a_node_dies_and_nothing_is_lost_or_there_twice(
 
 
 def test_nodes_with_another_version_are_told(cluster: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("robot.collect.cluster.versions", lambda: {"tacsim": "9.9"})
+    monkeypatch.setattr("robot.collect.collect.versions", lambda: {"tacsim": "9.9"})
     with pytest.raises(CollectFailed, match=r"a node has tacsim .*, the command runs with 9\.9"):
         collect(job(2), tmp_path / "set", {}, "x", cluster=cluster.address)
     assert not (tmp_path / "set/data").exists()

@@ -18,9 +18,8 @@ import pytest
 
 from robot.collect.collect import collect
 from robot.collect.folder import open_set
-from robot.collect.job import Piece, SetError
 from robot.collect.objects import find_objects
-from robot.collect.workers import Stopped
+from robot.collect.workers import Piece, SetError, Stopped
 from robot.common import whole_file
 from tacsim.config import load_scene
 from tacsim.models.scene import Sphere

@@ -14,9 +14,8 @@ from PIL import Image
 from pyarrow import parquet
 
 from robot.collect.collect import collect
-from robot.collect.presses import PressSet
-from robot.collect.shapes import CLOSED_FORMS, make_meshes
-from robot.collect.table import COLUMN_TEXTS
+from robot.collect.objects import CLOSED_FORMS, make_meshes
+from robot.collect.presses import COLUMN_TEXTS, PressSet
 from robot.studies.press import MAX_MISSED_DEPTH_SHARE, PressMotion, press
 from tacsim import pose as se3
 from tacsim.config import load_scene, load_sensor

@@ -34,13 +34,12 @@ from tacsim.interface import (
 from tacsim.models.rig import SqueezeConfig
 from tacsim.record.episode import EpisodeMeta, Step
 from tacsim.record.images import reference_image
-from tacsim.record.protobuf import Step as StepMessage
 from tacsim.record.reader import read_episode
+from tacsim.record.schemas import Step as StepMessage
 from tacsim.record.writer import Recorder as FileRecorder
 from tacsim.rig import Rig
 from tacsim.tasks import make_task
-from tacsim.tasks.grip import Grip
-from tacsim.tasks.squeeze import ScriptedSqueeze
+from tacsim.tasks.squeeze import Grip, ScriptedSqueeze
 
 
 class Hand:

@@ -10,7 +10,7 @@ from robot.deploy.control_loop import EpisodeSetup, run_episode
 from robot.deploy.policy import PolicyNotFound, describe_outside, load_policy, require_fit, training_notes
 from robot.open import open_rig
 from tacsim.config import config_root, load_model, load_rig
-from tacsim.models.training import Training
+from tacsim.models.policy import Training
 from tacsim.tasks import make_task
 
 SHIPPED = sorted((config_root() / "policies").glob("*.onnx"))

@@ -10,8 +10,8 @@ import pytest
 
 from robot.camera.camera import Camera, StaleFrame
 from robot.export.lerobot_rig import TactileCamera
+from robot.fixtures import mock_host
 from robot.mock import MockCamera
-from robot.mock.fixtures import mock_host
 from tacsim.interface import IncompatibleRig
 from tacsim.models.hardware import CameraSensorConfig
 

@@ -10,7 +10,7 @@ import numpy as np
 from robot.common.kinematics import pose
 from robot.mock.ur.machine.arm import PERIOD, Arm
 from robot.mock.ur.machine.machine import Machine
-from robot.mock.ur.machine.registry import COMMANDS
+from robot.mock.ur.machine.program import COMMANDS
 from tacsim.interface import FloatArray
 from tests.robot.mock.wire_client import control_script
 

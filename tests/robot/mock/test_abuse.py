@@ -15,11 +15,10 @@ from types import SimpleNamespace
 import pytest
 
 from robot.mock import FaultClient, FaultError, MockArms
-from robot.mock.ur.wire import inputs
-from robot.mock.ur.wire.connection import Connection
-from robot.mock.ur.wire.controller import Controller
-from robot.mock.ur.wire.inputs import Inputs
-from robot.mock.ur.wire.rtde import MAX_NAMES, InputRecipe, make_package
+from robot.mock.ur import rtde
+from robot.mock.ur.connection import Connection
+from robot.mock.ur.controller import Controller
+from robot.mock.ur.rtde import MAX_NAMES, InputRecipe, Inputs, make_package
 from tests.robot.mock.innocent import Innocent
 from tests.robot.mock.wire_client import TIMEOUT, ControlClient, RtdeClient, wire_host
 from tests.robot.waiting import until
@@ -130,7 +129,7 @@ def test_program_end_is_searched_once() -> None:
 
 
 def test_stored_inputs_are_limited_and_losses_reported(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(inputs, "MAX_STORED_BYTES", 1000 * (inputs.PACKAGE_OVERHEAD + 4))
+    monkeypatch.setattr(rtde, "MAX_STORED_BYTES", 1000 * (rtde.PACKAGE_OVERHEAD + 4))
     kept, recipe = Inputs(), InputRecipe(("input_int_register_5",), struct.Struct(">i"), (1,))
     for value in range(1, 5001):
         kept.add(value, recipe, struct.pack(">i", value))

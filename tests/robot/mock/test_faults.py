@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from robot.mock import FaultClient, FaultError, MockUR
-from robot.mock.ur.wire.controller import PORTS
+from robot.mock.ur.controller import PORTS
 from tests.robot.mock.wire_client import TIMEOUT, ControlClient, RtdeClient, control_script, dashboard, wire_host
 from tests.robot.waiting import until
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from robot.mock.fixtures import mock_host, rig_addresses
+from robot.fixtures import mock_host, rig_addresses
 from tacsim.config import load_rig
 
 ROOT = Path(__file__).resolve().parents[3]

@@ -13,10 +13,10 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from robot.mock import MockArms
+from robot.mock.ur.controller import DASHBOARD, RTDE, SCRIPTS
 from robot.mock.ur.fault_server import ACTIONS
-from robot.mock.ur.wire.controller import DASHBOARD, RTDE, SCRIPTS
-from robot.mock.ur.wire.fields import FORMATS, INPUTS, OUTPUTS
-from robot.mock.ur.wire.rtde import (
+from robot.mock.ur.fields import FORMATS, INPUTS, OUTPUTS
+from robot.mock.ur.rtde import (
     DATA,
     INPUT_RECIPE,
     MESSAGE,

@@ -12,10 +12,10 @@ import pytest
 
 from robot.common.kinematics import Kinematics, matrix
 from robot.mock import MOCK_SERIAL, FaultClient, MockUR
+from robot.mock.ur.controller import MAX_CLIENTS, PORTS
+from robot.mock.ur.fields import INPUTS, OUTPUTS
 from robot.mock.ur.machine.arm import HOME
-from robot.mock.ur.wire.controller import MAX_CLIENTS, PORTS
-from robot.mock.ur.wire.fields import INPUTS, OUTPUTS
-from robot.mock.ur.wire.rtde import BadPackage, make_package, take_packages
+from robot.mock.ur.rtde import BadPackage, make_package, take_packages
 from tests.robot.mock.wire_client import TIMEOUT, ControlClient, RtdeClient, control_script, dashboard
 from tests.robot.waiting import until
 

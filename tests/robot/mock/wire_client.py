@@ -8,11 +8,11 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Self
 
-from robot.common.loopback import loopback_host
-from robot.mock.ur.machine.registry import COMMANDS
-from robot.mock.ur.wire.controller import DASHBOARD, RTDE, SCRIPTS
-from robot.mock.ur.wire.fields import FORMATS, INPUTS
-from robot.mock.ur.wire.rtde import DATA, INPUT_RECIPE, OUTPUT_RECIPE, PAUSE, PROTOCOL, START, make_package
+from robot.common import loopback_host
+from robot.mock.ur.controller import DASHBOARD, RTDE, SCRIPTS
+from robot.mock.ur.fields import FORMATS, INPUTS
+from robot.mock.ur.machine.program import COMMANDS
+from robot.mock.ur.rtde import DATA, INPUT_RECIPE, OUTPUT_RECIPE, PAUSE, PROTOCOL, START, make_package
 
 TIMEOUT = 60.0  # of whatever a test waits for [s]
 

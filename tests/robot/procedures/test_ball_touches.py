@@ -21,14 +21,14 @@ from scipy.spatial.transform import Rotation
 from calibration.poses.records import read_touches, touch_file, write_record
 from calibration.poses.robust_fit import BadMeasurements
 from robot.errors import DeviceError
+from robot.fixtures import mock_host
 from robot.mock import MockCamera
-from robot.mock.fixtures import mock_host
 from robot.procedures import ball_touches
 from robot.procedures.ball_touches import BallTouchPlan, schedule, without_task
 from robot.procedures.session import CannotCalibrate, Session
 from tacsim import pose as se3
 from tacsim.config import ConfigError, load_rig
-from tacsim.control.contact_signal import NoTouch
+from tacsim.control import NoTouch
 from tacsim.interface import Pose
 from tacsim.models.hardware import Placement
 from tacsim.models.sensor import SensorModel

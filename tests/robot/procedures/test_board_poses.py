@@ -12,8 +12,8 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from calibration.poses.records import board_pose_file, write_record
+from robot.fixtures import mock_host
 from robot.mock import MockCamera, MockState
-from robot.mock.fixtures import mock_host
 from robot.procedures.boards import BoardPosePlan, record_board_poses, schedule
 from robot.procedures.session import CannotCalibrate, Session
 from tacsim import pose as se3

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from calibration.lens.view import GelView, Lens
+from robot.fixtures import mock_host
 from robot.mock import MockCamera
-from robot.mock.fixtures import mock_host
 from robot.procedures.boards import ON_GEL, PROMPTS, BoardViewPlan, record_board_views
 from robot.procedures.session import CannotCalibrate, Session
 from tacsim.config import load_model

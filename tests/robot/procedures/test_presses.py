@@ -20,8 +20,8 @@ from calibration.bundle import FILE, read_bundle
 from calibration.errors import BadFrames
 from calibration.lens.view import view_of_corners
 from calibration.light.noise import measure_noise
+from robot.fixtures import mock_host
 from robot.mock import MockCamera
-from robot.mock.fixtures import mock_host
 from robot.procedures.presses import NOISE_FRAMES, REFERENCE, BallPressPlan, record_presses
 from robot.procedures.session import CannotCalibrate, Session, handheld_camera
 from tacsim.config import load_rig

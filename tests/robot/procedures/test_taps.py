@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from calibration.poses.latency import Latency
+from robot.fixtures import mock_host, rig_addresses
 from robot.mock import MockCamera, MockState
-from robot.mock.fixtures import mock_host, rig_addresses
 from robot.procedures.session import CannotCalibrate
 from robot.procedures.taps import (
     CONTACT_TIME,

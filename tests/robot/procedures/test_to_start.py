@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from robot.arm.controller.rtde import ControllerReading
+from robot.arm.connections import ControllerReading
 from robot.common.kinematics import Kinematics, pose
 from robot.common.tcp import ArmFrames
 from robot.procedures.to_start import (

@@ -17,9 +17,9 @@ import pytest
 
 import robot.mock.cell.cell
 from robot.deploy.control_loop import EpisodeFailed, run_episode
+from robot.fixtures import mock_host
 from robot.mock.camera.camera import MockCamera
 from robot.mock.cell.cell import MockCell
-from robot.mock.fixtures import mock_host
 from robot.open import open_rig
 from tacsim.config import load_rig
 from tacsim.interface import Action, Needs, Observation

@@ -9,10 +9,10 @@ import pytest
 
 from robot.errors import DeviceError, ProtectiveStop
 from robot.mock.cell.cell import MockCell
-from robot.rig import clock as clocks
 from robot.rig import commanded_arm
-from robot.rig.clock import LockStep, WallClock
+from robot.rig import hardware_rig as clocks
 from robot.rig.commanded_arm import CommandedArm, wait_for_arrival
+from robot.rig.hardware_rig import LockStep, WallClock
 from tacsim.interface import Pose
 
 PERIOD = 0.1  # [s]

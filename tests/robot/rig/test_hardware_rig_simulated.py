@@ -8,8 +8,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from robot.mock.fixtures import rig_addresses
-from tacsim.control.contact_signal import NoTouch
+from robot.fixtures import rig_addresses
+from tacsim.control import NoTouch
 from tacsim.interface import Action, Pose
 from tests.robot.rig.bare_rig import Opened, failing, opened
 from tests.robot.waiting import until

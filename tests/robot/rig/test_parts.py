@@ -19,7 +19,7 @@ ROOT = Path(__file__).resolve().parents[3]
 REAL = """
 import sys, numpy as np
 from PIL import Image
-from robot.doctor.rig import examine_rig
+from robot.doctor import examine_rig
 from robot.errors import DeviceError
 from robot.open import open_rig
 from tacsim.config import load_rig

@@ -12,10 +12,9 @@ import pytest
 from robot.errors import DeviceError, EmergencyStop
 from robot.rig import reset as resets
 from robot.rig.commanded_arm import CommandedArm
-from robot.rig.reset import RETREAT_DISTANCE, HardwareReset, NotConfirmed
-from robot.rig.touch import Touch
+from robot.rig.reset import RETREAT_DISTANCE, HardwareReset, NotConfirmed, Touch
 from tacsim import pose as se3
-from tacsim.control.contact_signal import NoTouch
+from tacsim.control import NoTouch
 from tacsim.interface import ArmState, Pose, SensorSpec, TactileFrame
 from tacsim.models.hardware import ResetConfig
 

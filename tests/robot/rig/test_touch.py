@@ -14,13 +14,12 @@ from typing import cast
 import numpy as np
 import pytest
 
-from robot.arm.channel import HISTORY
-from robot.arm.shared_ring import Record
+from robot.arm.channel import HISTORY, Record
 from robot.arm.trajectory import PERIOD
 from robot.camera.camera import StaleFrame
 from robot.camera.driver import CameraDriver
 from robot.open import open_rig
-from robot.rig import touch
+from robot.rig import reset
 from robot.rig.commanded_arm import CommandedArm
 from tacsim.interface import TactileSource
 from tacsim.rig import Rig
@@ -134,9 +133,9 @@ def test_invalid_latency_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 def test_nan_contact_signal_is_not_hidden_by_other_sensor(monkeypatch: pytest.MonkeyPatch) -> None:
     signals = iter([0.5, math.nan, 0.2])
-    monkeypatch.setattr(touch, "contact_signal", lambda seen: next(signals))
+    monkeypatch.setattr(reset, "contact_signal", lambda seen: next(signals))
     frame = SimpleNamespace(index=1, time=0.0)
     sensor = SimpleNamespace(spec=SimpleNamespace(arm="arm"), read=lambda timeout: frame)
     sensors = dict.fromkeys("abc", cast(TactileSource, sensor))
-    sense = touch.PictureTouch(sensors, dict.fromkeys("abc", lambda *_: None), lambda seen: None, 1.0, 0.1)  # type: ignore[arg-type]
+    sense = reset.PictureTouch(sensors, dict.fromkeys("abc", lambda *_: None), lambda seen: None, 1.0, 0.1)  # type: ignore[arg-type]
     assert math.isnan(sense.measure_touch(guarded=False).pressed["arm"])

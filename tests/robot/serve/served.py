@@ -19,7 +19,7 @@ from typing import Any, Self
 from websockets import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
-from robot.mock.fixtures import rig_addresses
+from robot.fixtures import rig_addresses
 from tests.robot.cli.invoked import environment
 from tests.robot.waiting import PATIENCE
 

@@ -11,8 +11,8 @@ import pytest
 from websockets import ConnectionClosed
 from websockets.sync.client import ClientConnection
 
+from robot.fixtures import mock_host
 from robot.mock import FaultClient
-from robot.mock.fixtures import mock_host
 from tacsim.record.reader import read_episode
 from tests.robot.serve.served import HEARTBEAT, REAL_TIME, Page, Served
 from tests.robot.waiting import PATIENCE, until

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from robot.mock.fixtures import mock_host
+from robot.fixtures import mock_host
 from tests.robot.serve.served import REAL_TIME, Page, Served
 from tests.robot.serve.test_serve import drive
 from tests.stops import observer

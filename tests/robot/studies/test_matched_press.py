@@ -14,8 +14,7 @@ from calibration.bundle import write_bundle
 from calibration.compare.compare import compare_frames
 from calibration.errors import BadFrames
 from calibration.frame_set import Frame, FrameSet
-from calibration.light.circle import Circle, find_contact_circle
-from calibration.light.dent import dent_slope
+from calibration.light.dent import Circle, dent_slope, find_contact_circle
 from robot.studies import matched_press
 from robot.studies.matched_press import ELEMENT, _next_depth, _PressedGel, match_presses
 from tacsim.config import load_scene

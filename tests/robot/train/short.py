@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from tacsim.models.training import Training
+from tacsim.models.policy import Training
 from tests.tacsim.gym.small import SMALL
 
 DRAWN = {"draws": 3, "values": {"scene.body.material.yield_stress": {"uniform": ["5 kPa", "20 kPa"]}}}

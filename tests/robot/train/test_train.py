@@ -27,8 +27,8 @@ from robot.train.network import MAX_BYTES, MAX_DEVIATIONS, ExportError, FeatureL
 from robot.train.run_folder import RunError, RunFolder  # noqa: E402
 from robot.train.train import begin_run, export_policy, make_environments, new_actor, train  # noqa: E402
 from tacsim.config import ConfigError  # noqa: E402
-from tacsim.control.contact_signal import NoTouch  # noqa: E402
-from tacsim.models.training import Training  # noqa: E402
+from tacsim.control import NoTouch  # noqa: E402
+from tacsim.models.policy import Training  # noqa: E402
 from tacsim.tasks import BadDraws, GoalOutOfReach  # noqa: E402
 from tests.robot.cli.invoked import START, environment, tacsim  # noqa: E402
 from tests.robot.train.short import training  # noqa: E402

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from robot.deploy.python_policy import FunctionPolicy
+from robot.fixtures import rig_addresses
 from robot.mock.cell.cell import MockCell, _actual_frames
 from robot.mock.cell.sim_server import SceneFrame
-from robot.mock.fixtures import rig_addresses
 from robot.open import open_rig
 from robot.train import transfer
 from robot.train.transfer import EpisodeResult, Side, Study, _load_rig, draw_figure, play_study, summarise

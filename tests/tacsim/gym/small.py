@@ -10,7 +10,7 @@ import pytest
 
 import tacsim.gym.env  # registers
 import tacsim.sim.reset as resets
-from tacsim.control.contact_signal import NoTouch
+from tacsim.control import NoTouch
 
 SMALL = (
     *(f"sensors.{name}.model.geometry.{what}" for name in ("lower", "upper") for what in ("width=20", "height=16")),

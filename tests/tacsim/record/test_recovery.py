@@ -18,9 +18,8 @@ from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 from tacsim.record import writer
 from tacsim.record.episode import Episode, EpisodeError, EpisodeMeta, Step
 from tacsim.record.messages import Encoded, decode_step, encode_step
-from tacsim.record.protobuf import Scalar
 from tacsim.record.reader import read_episode
-from tacsim.record.schemas import META, add_checksum, encode_meta
+from tacsim.record.schemas import META, Scalar, add_checksum, encode_meta
 from tacsim.record.writer import Recorder
 
 

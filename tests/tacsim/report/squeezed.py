@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tacsim.interface import ArmState, Pose, RigSpec, SensorSpec, SurfaceMap, TactileFrame
-from tacsim.record.episode import Episode, EpisodeMeta, Step
-from tacsim.record.step_info import MAX_DEPTH
+from tacsim.record.episode import MAX_DEPTH, Episode, EpisodeMeta, Step
 from tacsim.report.section import GelShape
 
 GELS = {name: GelShape((20e-3, 20e-3, 4e-3), 1e-3, name) for name in ("lower", "upper")}

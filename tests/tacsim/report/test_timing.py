@@ -10,8 +10,7 @@ import pytest
 
 from tacsim.interface import RigSpec, SensorSpec, TactileFrame
 from tacsim.record.episode import Episode, EpisodeMeta, Step
-from tacsim.report.diagnostics import timing_rows, timing_statistics
-from tacsim.report.series import Series
+from tacsim.report.series import Series, timing_rows, timing_statistics
 
 FRAMES = {"pictures_lost_lower": 0.0, "pictures_damaged_lower": 3.0}
 IMAGE = np.zeros((4, 4, 3), np.uint8)

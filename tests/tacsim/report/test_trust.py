@@ -13,9 +13,8 @@ from tacsim.interface import RigSpec, SensorSpec, TactileFrame
 from tacsim.record.episode import Episode, EpisodeMeta, Step
 from tacsim.record.reader import read_episode
 from tacsim.record.writer import Recorder
-from tacsim.report.diagnostics import sensor_diagnostics, sensor_warnings
 from tacsim.report.report import summarise, summary_table, write_report
-from tacsim.report.series import Series
+from tacsim.report.series import Series, sensor_diagnostics, sensor_warnings
 
 IMAGE = np.zeros((40, 40, 3), np.uint8)
 

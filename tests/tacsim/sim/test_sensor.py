@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tacsim.control.contact_signal import NoTouch
+from tacsim.control import NoTouch
 from tacsim.interface import Pose, SensorSpec
 from tacsim.limits import LimitExceeded
 from tacsim.models.hardware import ArmLimits, Workspace

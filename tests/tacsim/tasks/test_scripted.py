@@ -14,9 +14,8 @@ from tacsim.interface import Action, Observation, Truth
 from tacsim.models.rig import RepositionConfig, SqueezeConfig
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.tasks import make_task
-from tacsim.tasks.grip import Grip
 from tacsim.tasks.reposition import centre_of_pressure, estimated_position
-from tacsim.tasks.squeeze import estimated_height
+from tacsim.tasks.squeeze import Grip, estimated_height
 from tacsim.tasks.task import action_of_vector
 
 SQUEEZE = SqueezeConfig(kind="squeeze", goal=9.7e-3, max_step=0.2e-3)

@@ -11,8 +11,7 @@ from tacsim.interface import ArmState, FloatArray, Observation, Pose, TactileObs
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.optics.grid import canonical_cells
 from tacsim.pose import HALF_TURN_X
-from tacsim.tasks.knead import TactileShape
-from tacsim.tasks.solids import Solid, chamfer_distance
+from tacsim.tasks.knead import Solid, TactileShape, chamfer_distance
 
 GRID = CanonicalGrid()
 DEPTH = 0.3e-3  # of the body in each gel [m]

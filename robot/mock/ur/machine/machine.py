@@ -4,6 +4,10 @@
 
 Changes of power and brakes take 50 control periods each; a real robot needs seconds. A protective stop ends the program
 (a real controller may only pause it).
+
+The text of ur_rtde's control script is not interpreted. It only gives the registers, the calls that its `$version`
+lines leave in it, and the path in it. Its loop is here, its threads and answers are in `program`, `motion_commands` and
+`state_commands`, with the command numbers of ur_rtde 1.6.5.
 """
 
 from __future__ import annotations
@@ -17,6 +21,7 @@ from functools import partial
 import numpy as np
 
 from robot.common.kinematics import JOINT_RANGE
+from robot.mock.ur.machine import motion_commands, state_commands, user_script  # noqa: F401  # they register COMMANDS
 from robot.mock.ur.machine.arm import (
     BRAKE_DECELERATION,
     COAST_DECELERATION,
@@ -24,21 +29,59 @@ from robot.mock.ur.machine.arm import (
     MAX_SPEED_RATIO,
     PERIOD,
     Arm,
+    MotionSteps,
     ProgramError,
     TooFast,
 )
-from robot.mock.ur.machine.load import Load, at_flange
-from robot.mock.ur.machine.modes import SAFETY_BITS, Mode, Runtime, Safety
+from robot.mock.ur.machine.forces import Load, at_flange
 from robot.mock.ur.machine.motion import FREEDRIVE_DAMPING, FREEDRIVE_TURN_DAMPING, move_with_compliance
-from robot.mock.ur.machine.program import CONTROL_SCRIPT, DONE
-from robot.mock.ur.machine.registry import COMMANDS
-from robot.mock.ur.machine.script import make_program
-from robot.mock.ur.machine.state import MachineState, ScriptError
+from robot.mock.ur.machine.program import COMMANDS, CONTROL_SCRIPT, DONE, READY, Program
+from robot.mock.ur.machine.state import SAFETY_BITS, MachineState, Mode, Runtime, Safety, ScriptError
 from robot.mock.ur.machine.user_script import CompileError
 from tacsim.interface import FloatArray
 
 POWER_UP = 50  # periods from power on to idle
 SLIDER_RATE = 5.0  # maximum rate of change of the speed scaling [1/s]
+
+
+def make_program(machine: MachineState, text: str) -> Program:
+    """Makes the program of a text. Raises ProgramError if it cannot be compiled."""
+    program = Program(machine, text)
+    program.main = _control_loop(program) if program.name == CONTROL_SCRIPT else user_script.run(program)
+    return program
+
+
+def _control_loop(program: Program) -> MotionSteps:
+    """The loop of the control script: runs the commands of the client one after the other."""
+    stop_script = 255  # the command that ends the script
+    program.signal(-1)
+    program.answer_integer(READY, 0)
+    executing = False
+    while True:
+        command = program.integer(0)
+        if command == 0:
+            command, program.internal = program.internal, 0
+        work = _run_command(program, command)
+        if command in COMMANDS and COMMANDS[command].every_cycle:
+            yield from work
+            program.answer_integer(READY, 0)
+        elif command == 0:
+            executing = False
+            program.answer_integer(READY, 0)
+        elif not executing:
+            if command == stop_script:
+                return
+            yield from work
+            program.answer_integer(DONE, 0)
+            executing = True
+        yield
+
+
+def _run_command(program: Program, command: int) -> MotionSteps:
+    """Runs a command; does nothing if this controller does not have it."""
+    known = COMMANDS.get(command)
+    if known is not None and known.needs in program.text:
+        yield from known.work(program) or ()
 
 
 class Machine(MachineState):

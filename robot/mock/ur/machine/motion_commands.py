@@ -15,10 +15,9 @@ import numpy as np
 from robot.common.kinematics import matrix
 from robot.mock.ur.machine import motion
 from robot.mock.ur.machine.arm import PERIOD, MotionSteps, ProgramError
-from robot.mock.ur.machine.force_mode import ForceMode
+from robot.mock.ur.machine.forces import ForceMode
 from robot.mock.ur.machine.motion import Waypoint
-from robot.mock.ur.machine.program import MAX_NUMBER, Program
-from robot.mock.ur.machine.registry import command
+from robot.mock.ur.machine.program import MAX_NUMBER, Program, command
 from tacsim.interface import FloatArray
 
 CONTACT_FOUND = 254  # the script sets it itself

@@ -1,9 +1,11 @@
-"""A program that runs on the robot: its text, its registers, and its threads."""
+"""A program that runs on the robot: its text, its registers, its threads; and the commands of ur_rtde's control script
+(ur_rtde 1.6.5), by the number that the client writes."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
@@ -20,7 +22,7 @@ _ENDED = object()
 
 
 class Program:
-    """One program. `step` is one control period. `script.make_program` sets `main`."""
+    """One program. `step` is one control period. `machine.make_program` sets `main`."""
 
     def __init__(self, machine: MachineState, text: str) -> None:
         self.machine: MachineState = machine
@@ -141,3 +143,26 @@ def _filter_by_version(text: str, version: tuple[int, ...]) -> str:
         return line[2] if has(line[1]) else ""
 
     return re.sub(r"^[ \t]*\$([\d.|]{1,99})(.*)", select_line, text, flags=re.M)
+
+
+Work = Callable[[Program], MotionSteps | None]
+
+
+@dataclass(frozen=True)
+class Command:
+    work: Work
+    needs: str  # a call that older controllers lack: if the script's text does not contain it, the command does nothing
+    every_cycle: bool  # True: run in every cycle of the script; False: once, until the client writes 0
+
+
+COMMANDS: dict[int, Command] = {}
+
+
+def command(*numbers: int, needs: str = "", every_cycle: bool = False) -> Callable[[Work], Work]:
+    """Registers a function in COMMANDS. Its result is a motion for which the script waits, or None."""
+
+    def enter(work: Work) -> Work:
+        COMMANDS.update(dict.fromkeys(numbers, Command(work, needs, every_cycle)))
+        return work
+
+    return enter

@@ -1,4 +1,4 @@
-"""The state of the robot at one time, and how its program ends.
+"""The state of the robot at one time, its modes by the numbers that the RTDE sends, and how its program ends.
 
 Programs and their commands change it; `machine.py` computes one control period.
 """
@@ -6,15 +6,14 @@ Programs and their commands change it; `machine.py` computes one control period.
 from __future__ import annotations
 
 import math
+import re
 from collections import deque
 from collections.abc import Sequence
+from enum import IntEnum
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 from robot.mock.ur.machine.arm import HOME, PERIOD, Arm
-from robot.mock.ur.machine.force_mode import ForceMode
-from robot.mock.ur.machine.load import NO_MASS, Load, Mass
-from robot.mock.ur.machine.modes import Mode, Safety
-from robot.mock.ur.machine.version import VERSION, Version
+from robot.mock.ur.machine.forces import NO_MASS, ForceMode, Load, Mass
 from tacsim.interface import FloatArray
 from tacsim.models.text import printable_line
 
@@ -22,6 +21,73 @@ if TYPE_CHECKING:
     from tacsim.models.hardware import Model  # pydantic and SciPy: half a second of start-up
 
 REGISTERS = 48  # of each kind and direction
+
+
+class Mode(IntEnum):
+    """robot_mode of the RTDE."""
+
+    BOOTING = 2
+    POWER_OFF = 3
+    POWER_ON = 4
+    IDLE = 5
+    RUNNING = 7
+
+
+class Safety(IntEnum):
+    """safety_mode of the RTDE."""
+
+    NORMAL = 1
+    REDUCED = 2
+    PROTECTIVE_STOP = 3
+    SAFEGUARD_STOP = 5
+    ROBOT_EMERGENCY_STOP = 7
+    FAULT = 9
+
+
+SAFETY_BITS = {  # safety_status_bits: bit 10 is "stopped due to safety"
+    Safety.NORMAL: 1 << 0,
+    Safety.REDUCED: 1 << 1,
+    Safety.PROTECTIVE_STOP: 1 << 2 | 1 << 10,
+    Safety.SAFEGUARD_STOP: 1 << 4 | 1 << 10,
+    Safety.ROBOT_EMERGENCY_STOP: 1 << 6 | 1 << 7 | 1 << 10,
+    Safety.FAULT: 1 << 9 | 1 << 10,
+}
+
+
+class Runtime(IntEnum):
+    """runtime_state of the RTDE."""
+
+    STOPPED = 1
+    PLAYING = 2
+    PAUSING = 3
+    PAUSED = 4
+
+
+Version = tuple[int, int, int, int]  # major, minor, bugfix, build
+
+VERSION: Version = (5, 11, 0, 108150)
+
+
+def check_version(numbers: Sequence[float]) -> Version:
+    """Checks that a version is four integers that the RTDE can send. Raises ValueError."""
+    max_number = 2**32 - 1  # the RTDE sends each as a uint32
+    if len(numbers) != 4 or not all(0 <= number <= max_number and number == int(number) for number in numbers):
+        raise ValueError(f"a version is four whole numbers from 0 to {max_number}, got {list(numbers)}")
+    major, minor, bugfix, build = map(int, numbers)
+    return major, minor, bugfix, build
+
+
+def version_text(version: Version) -> str:
+    """Text such as 5.11.0.108150."""
+    return ".".join(map(str, version))
+
+
+def parse_version(text: str) -> Version:
+    """Parses "5.11", "5.11.0" or "5.11.0.108150"; missing numbers are 0. Raises ValueError."""
+    if re.fullmatch(r"\d{1,10}(\.\d{1,10}){1,3}", text, re.ASCII) is None:
+        raise ValueError(f"a version of PolyScope is like 5.11 or 5.11.0.108150, got '{text[:40]}'")
+    numbers = [int(number) for number in text.split(".")]
+    return check_version([*numbers, *[0] * (4 - len(numbers))])
 
 
 class Outputs:

@@ -8,9 +8,8 @@ import numpy as np
 
 from robot.common.kinematics import pose
 from robot.mock.ur.machine.arm import PERIOD, ProgramError
-from robot.mock.ur.machine.load import MAX_PAYLOAD, Mass
-from robot.mock.ur.machine.program import Program
-from robot.mock.ur.machine.registry import command
+from robot.mock.ur.machine.forces import MAX_PAYLOAD, Mass
+from robot.mock.ur.machine.program import Program, command
 from tacsim.interface import FloatArray
 
 # -- settings --------------------------------------------------------------------------------------------------------

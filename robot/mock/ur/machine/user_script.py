@@ -22,7 +22,7 @@ import numpy as np
 from robot.common.kinematics import matrix
 from robot.mock.ur.machine import motion
 from robot.mock.ur.machine.arm import PERIOD, MotionSteps, ProgramError
-from robot.mock.ur.machine.load import Mass
+from robot.mock.ur.machine.forces import Mass
 from robot.mock.ur.machine.program import MAX_NUMBER, Program
 from tacsim.interface import FloatArray
 

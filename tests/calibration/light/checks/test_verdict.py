@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from calibration.light.calibrator import calibrate_light
-from calibration.light.checks.page import write_page
-from calibration.light.checks.verdict import KnownScale, evaluate_calibration
+from calibration.light.checks.verdict import KnownScale, evaluate_calibration, write_page
 from calibration.light.dent import contact_depth
 from calibration.light.fit import LightFit
 from calibration.light.press_shapes import Stretch

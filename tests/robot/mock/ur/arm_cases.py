@@ -9,7 +9,7 @@ import numpy as np
 
 from robot.common.kinematics import pose
 from robot.mock.ur.machine.arm import HOME
-from robot.mock.ur.machine.load import GRAVITY
+from robot.mock.ur.machine.forces import GRAVITY
 from tests.robot.mock.ur.cases import Robot, Verdict, case
 
 CONTROL = "RTDEControlInterface"

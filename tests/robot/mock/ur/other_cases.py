@@ -13,7 +13,7 @@ import pytest
 from robot.common.kinematics import matrix
 from robot.mock import MOCK_SERIAL
 from robot.mock.ur.machine.arm import HOME
-from robot.mock.ur.machine.load import GRAVITY
+from robot.mock.ur.machine.forces import GRAVITY
 from tests.robot.mock.ur.cases import Robot, Verdict, case
 from tests.robot.mock.wire_client import RtdeClient
 

@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibration.materials.fit import Point
-from calibration.materials.presses import Noise, merge_repeated_readings, signals_of
+from calibration.materials.fit import Noise, Point, merge_repeated_readings, signals_of
 from robot.studies.identify.recordings import Recordings
 from robot.studies.identify.simulation import Simulation
 from tacsim.config import load_scene

@@ -9,8 +9,7 @@ import pytest
 
 from calibration.materials.checks import Finding
 from calibration.materials.estimate import estimate_materials
-from calibration.materials.fit import Point, Priors
-from calibration.materials.presses import Noise, signals_of
+from calibration.materials.fit import Noise, Point, Priors, signals_of
 from robot.deploy.policy import load_policy
 from robot.deploy.python_policy import PolicyNotFound
 from robot.studies.identify import results

@@ -5,8 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibration.materials.fit import Parameter, Point
-from calibration.materials.presses import Noise, Press, downsample_press, merge_repeated_readings, signals_of
+from calibration.materials.fit import (
+    Noise,
+    Parameter,
+    Point,
+    Press,
+    downsample_press,
+    merge_repeated_readings,
+    signals_of,
+)
 from robot.studies.identify.identify import parameters_of
 from robot.studies.identify.simulation import Simulation, coarser, scene_with
 from tacsim.config import load_scene

@@ -10,9 +10,8 @@ import pytest
 
 from robot.common.kinematics import displacement, matrix, pose, rotation
 from robot.mock.ur.machine.arm import PERIOD
-from robot.mock.ur.machine.force_mode import FULL_DAMPING, MASS
-from robot.mock.ur.machine.load import Wall
-from robot.mock.ur.machine.modes import Runtime, Safety
+from robot.mock.ur.machine.forces import FULL_DAMPING, MASS, Wall
+from robot.mock.ur.machine.state import Runtime, Safety
 from tacsim.interface import FloatArray
 from tests.robot.mock.machine_bench import Bench
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from robot.mock import MockError, MockUR
-from robot.mock.ur.machine.load import GRAVITY, Mass
+from robot.mock.ur.machine.forces import GRAVITY, Mass
 from tacsim.interface import FloatArray
 from tests.robot.mock.machine_bench import Bench
 from tests.robot.mock.wire_client import ControlClient, wire_host

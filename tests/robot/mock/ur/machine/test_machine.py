@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from robot.common.kinematics import displacement, matrix, pose
+from robot.mock.ur.fields import OUTPUTS
 from robot.mock.ur.machine.arm import PERIOD
-from robot.mock.ur.machine.load import Mass
+from robot.mock.ur.machine.forces import Mass
 from robot.mock.ur.machine.machine import Machine
-from robot.mock.ur.machine.modes import Safety
-from robot.mock.ur.wire.fields import OUTPUTS
+from robot.mock.ur.machine.state import Safety
 from tacsim.interface import FloatArray
 from tests.robot.mock.machine_bench import DOWN, Bench
 from tests.robot.mock.wire_client import control_script

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from robot.mock.ur.machine.machine import Machine
-from robot.mock.ur.machine.modes import Safety
+from robot.mock.ur.machine.state import Safety
 from tests.robot.mock.machine_bench import DOWN, Bench
 from tests.robot.mock.wire_client import control_script
 

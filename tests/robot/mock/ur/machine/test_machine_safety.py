@@ -9,8 +9,8 @@ import pytest
 
 from robot.common.kinematics import displacement, matrix
 from robot.mock.ur.machine.arm import PERIOD
-from robot.mock.ur.machine.load import GRAVITY, Mass, Wall
-from robot.mock.ur.machine.modes import Mode, Runtime, Safety
+from robot.mock.ur.machine.forces import GRAVITY, Mass, Wall
+from robot.mock.ur.machine.state import Mode, Runtime, Safety
 from tests.robot.mock.machine_bench import Bench
 from tests.robot.mock.wire_client import control_script
 

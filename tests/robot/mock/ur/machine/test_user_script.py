@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from robot.mock import MockUR
+from robot.mock.ur import messages
 from robot.mock.ur.machine.arm import HOME, PERIOD
-from robot.mock.ur.machine.load import Mass
-from robot.mock.ur.wire import primary
+from robot.mock.ur.machine.forces import Mass
 from tests.robot.mock.machine_bench import Bench
 from tests.robot.mock.wire_client import TIMEOUT
 
@@ -110,7 +110,7 @@ def test_primary_interface_reports_script_error(mock: MockUR) -> None:
         while len(data) < 4 or len(data) < struct.unpack_from(">i", data)[0]:
             data += listener.recv(4096)
     kind, _, _, what, row, column = struct.unpack_from(">BQBBii", data, 4)
-    assert (kind, what, row, column) == (primary.ROBOT_MESSAGE, primary.RUNTIME_EXCEPTION, 3, 4)
+    assert (kind, what, row, column) == (messages.ROBOT_MESSAGE, messages.RUNTIME_EXCEPTION, 3, 4)
     assert b"compile_error_name_not_found:socket_open:" in data
     assert "socket_open" in mock.faults.state().stop_reason
 

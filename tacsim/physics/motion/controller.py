@@ -212,6 +212,9 @@ def move_and_settle(path: Path, settling: Settling, *, balanced: bool, max_readi
         if len(readings) > COMPARED_READINGS:
             earlier = readings[-1 - COMPARED_READINGS : -1]
             worst = max(residual(readings[-1], each, balanced) for each in earlier)
+        if worst > settling.tolerance and held < settling.max_substeps:
+            continue
+        if len(readings) > COMPARED_READINGS:
             worst = max(worst, remaining_contact_creep(*readings[-3:]))
         if path.is_creeping:
             age = (path.substeps / 2 + held) / path.interval

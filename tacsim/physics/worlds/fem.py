@@ -268,14 +268,15 @@ class FemWorld(BaseWorld):
         begin, goals, settling = dict(self._poses), dict(end), self.scene.settling
         balanced, max_readings, self.unsettled_reason = self.balanced, self._readings, ""
         a, b = list(begin.values()), list(end.values())
-        path = None  # of a dynamic motion; others are planned again for each attempt
+        path = planned = None  # of a dynamic motion, of a quasi-static one
         if command.duration is not None:
             path = plan_real_time(a, b, command.duration, self._true, self._lever)
         elif not command.flow:
-            self.plan(a, b)  # raises ValueError for a path that is far too long, before a stop
+            planned = self.plan(a, b)  # raises ValueError for a path that is far too long, before a stop
         flowing = self._plan_flow(a, b if command.flow else a)  # or to the present poses: a stop
 
         def from_rest(refine: int) -> Motion:
+            nonlocal planned
             if path is not None:
                 rest = Path(a, a, 0, self._scaled.step, refine, flowing.interval, is_creeping=self.yields)
                 held = yield from self._hold_at_rest(rest)
@@ -290,7 +291,9 @@ class FemWorld(BaseWorld):
                         self, begin, end, command.loads, refine, balanced=balanced, max_readings=max_readings
                     )
                 )
-            quasi_static = replace(self.plan(a, b), refine=refine)
+            if planned is None or self._rates.any():  # contact forces have changed in the stop
+                planned = self.plan(a, b)
+            quasi_static = replace(planned, refine=refine)
             return (yield from move_and_settle(quasi_static, settling, balanced=balanced, max_readings=max_readings))
 
         def attempt(refine: int) -> Motion:

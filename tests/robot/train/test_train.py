@@ -79,6 +79,25 @@ def test_train_killed_run_continues_bit_for_bit(algorithm: str, tmp_path: Path) 
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_train_in_processes_gives_the_same_policy(algorithm: str, tmp_path: Path) -> None:
+    one, two = (begin_run(training(algorithm=algorithm), tmp_path / name) for name in ("one", "two"))
+    train(one)
+    train(two, processes=2)
+    assert weights(one) == weights(two) != {}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("algorithm", ["ppo", "sac"])
+def test_reinforcement_normalises_features(algorithm: str, tmp_path: Path) -> None:
+    run = begin_run(training(algorithm=algorithm), tmp_path / "run")
+    train(run)
+    actor = run.load_checkpoint()[1]["actor"]
+    changed = [key for key, value in actor.items() if key.startswith("layers.mean") and bool((value != 0.0).any())]
+    assert len(changed) == len(run.settings.shapes)
+
+
+@pytest.mark.slow
 def test_learning_curve_is_drawn_after_each_round(tmp_path: Path) -> None:
     run = begin_run(training(algorithm="ppo"), tmp_path / "run")
     drawn: list[Image.Image] = []

@@ -17,8 +17,27 @@ Kind = Literal[
 ]  # tacsim.config.catalogue.CATALOGUE_KINDS, without importing it for each command
 
 
+def parse_kind(text: str) -> str:
+    """A kind, also from its plural. Raises typer.BadParameter."""
+    kinds = get_args(Kind)
+    singular = f"{text[:-3]}y" if text.endswith("ies") else text.removesuffix("s")
+    for word in (text, singular):
+        if word in kinds:
+            return word
+    raise typer.BadParameter(f"'{text}' is not one of {', '.join(map(repr, kinds))}")
+
+
 def list_(
-    kind: Annotated[Kind | None, typer.Argument(help="All kinds if left out.", show_default=False)] = None,
+    kind: Annotated[
+        str | None,
+        typer.Argument(
+            parser=parse_kind,
+            metavar="KIND",
+            help=f"{', '.join(get_args(Kind))}; all of them if left out.",
+            show_default=False,
+            autocompletion=complete_names(words=get_args(Kind)),
+        ),
+    ] = None,
 ) -> None:
     """List what is shipped or installed by name: rigs, tasks, scenes, sensors, materials, policies, drivers.
 

@@ -23,7 +23,7 @@ from robot.cli.output import (
     warn,
     writing,
 )
-from tacsim.models.text import suggest_word
+from tacsim.models.text import suggest_file, suggest_word
 
 if TYPE_CHECKING:
     from calibration.bundle import Calibration
@@ -110,7 +110,7 @@ def compare(
         None if path is None else read_bundle(path)[0] for path in (sources.calibration_a, sources.calibration_b)
     ]
     if not Path(a).exists() and not _is_scene(a):
-        hint = suggest_word(a, shipped_names("scene"))
+        hint = suggest_word(a, shipped_names("scene")) or suggest_file(Path(a), (".mcap", ".mp4", ".avi"))
         raise BadFrames(f"{a}: no such file or folder, and no shipped scene{hint}")
     truth = _read_frames(b, sources.reference_b, sources.sensor_b, bundles[1])
     if _is_scene(a):

@@ -37,7 +37,9 @@ class Guarded(TyperGroup):
             print_error("interrupted")
             raise typer.Exit(EXIT_INTERRUPTED) from None
         except typer.BadParameter as error:
-            error.message += _suggest_choice(error.message)
+            message = error.message.replace("Value error, ", "")  # of the library that checks choices
+            suggestion = _suggest_choice(message)
+            error.message = f"{message.removesuffix('.') if suggestion else message}{suggestion}"
             raise
         except Exception as error:
             of_typer = isinstance(error, typer.Abort) or hasattr(error, "exit_code")  # typer handles these

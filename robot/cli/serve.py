@@ -49,11 +49,14 @@ def serve(
     require_packages("tacsim serve", "web", "starlette", "uvicorn", "websockets")
     token = _token(bind)
     with busy("loading"):
+        from robot.deploy.policy import require_policy_name
         from robot.open import load_with_task
         from robot.serve.app import make_server
         from robot.serve.guard import Guard
         from robot.serve.session import Session
 
+    if policy is not None:
+        require_policy_name(policy)
     sys.path.append(str(Path.cwd()))  # --policy mine:act finds mine.py here
     loaded = load_with_task(rig, task, set_ or [])
     for words in loaded.notes:

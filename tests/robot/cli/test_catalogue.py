@@ -29,6 +29,11 @@ def test_list_names_every_shipped_file_with_a_summary() -> None:
     assert {"arm.ur", "arm.sim", "sensor.camera", "sensor.replay"} <= {each["name"] for each in rows("driver")}
 
 
+@pytest.mark.parametrize(("plural", "kind"), [("rigs", "rig"), ("policies", "policy")])
+def test_a_kind_may_be_a_plural(plural: str, kind: str) -> None:
+    assert rows(plural) == rows(kind) != []
+
+
 def test_list_prints_a_table_of_one_kind() -> None:
     done = tacsim("list", "sensor")
     assert "gelsight-mini" in done.stdout and "ur5e" not in done.stdout and "┃" not in done.stdout

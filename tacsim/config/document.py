@@ -134,8 +134,8 @@ def read_text(
 ) -> str | None:
     """The text of a file, checked before and while reading; None after a reported problem.
 
-    `refuse` reports a problem of the file itself, at the place that refers to it. `describe_missing` gives the end of the message
-    about a missing file.
+    `refuse` reports a problem of the file itself, at the place that refers to it. `describe_missing` gives the end of
+    the message about a missing file.
     """
     max_bytes = 1_000_000
     try:

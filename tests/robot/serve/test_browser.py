@@ -98,6 +98,7 @@ def test_a_policy_is_started_stopped_and_its_recording_kept(served: Served, tmp_
         assert browser.messages == []
 
 
+@pytest.mark.promise(16)
 @pytest.mark.slow
 def test_a_hostile_page_moves_nothing(served: Served, tmp_path: Path) -> None:
     """A page of another origin, in the browser of the operator; it even knows the token."""

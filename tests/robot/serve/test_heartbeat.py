@@ -106,6 +106,7 @@ def run_server(session: Session, clock: Clock, page: Any) -> Any:
         return runner.run(serve())
 
 
+@pytest.mark.promise(16)
 def test_motion_stops_when_the_page_is_silent_for_a_second(session: Session, clock: Clock) -> None:
     async def live_then_die() -> float:
         session.start(StartOptions())
@@ -124,6 +125,7 @@ def test_motion_stops_when_the_page_is_silent_for_a_second(session: Session, clo
     until(lambda: shown(session)["phase"] == "watching")
 
 
+@pytest.mark.promise(16)
 def test_a_start_is_a_sign_of_life(session: Session, clock: Clock) -> None:
     """Else a motion that is started after a long time without a page would be stopped at once."""
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.robot.serve.browser import NAMES, Browser, find_browser
+from tests.browser import NAMES, Browser, find_browser
 from tests.robot.serve.served import REAL_TIME, Served
 from tests.robot.waiting import PATIENCE
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from types import FrameType, TracebackType
@@ -29,9 +30,12 @@ class Interrupt:
     once. After the first call, the signal is only stored: the next call returns True, and the caller ends its work in
     order. A second signal always raises KeyboardInterrupt. A KeyboardInterrupt that leaves the block becomes the exit
     of the command.
+
+    on_signal: called in the signal handler when a signal is stored, for work that does not ask this object.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, on_signal: Callable[[], None] = lambda: None) -> None:
+        self._on_signal = on_signal
         self._signal: int | None = None
         self._was_called = False
         self._before: dict[int, Any] = {}
@@ -53,6 +57,7 @@ class Interrupt:
             _redirect_lost_terminal()
         if not (first and self._was_called):
             raise KeyboardInterrupt
+        self._on_signal()
 
     def __enter__(self) -> Self:
         for number in SIGNALS:

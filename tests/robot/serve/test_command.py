@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import signal
 import socket
+from pathlib import Path
 
 import pytest
 
 from robot.cli.serve import TOKEN
-from tests.robot.cli.invoked import plain_text, tacsim
+from tests.robot.cli.invoked import TINY, plain_text, tacsim
+from tests.robot.serve.served import Page, Served
+from tests.robot.waiting import PATIENCE
 
 
 @pytest.mark.parametrize("address", ["0.0.0.0", "192.0.2.1", "::"])
@@ -40,3 +44,16 @@ def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     result = tacsim("serve", "mock")
     assert result.exit_code == 2
     assert "tacsim serve needs uvicorn, which is not installed: pip install 'tacsim[web]'" in plain_text(result.output)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_ends_the_server_in_order(number: signal.Signals, tmp_path: Path) -> None:
+    """Nothing of the rig is left: Python would warn of its semaphores. A service manager sends SIGTERM."""
+    served = Served(tmp_path, "sim", *TINY)
+    with Page(served) as page:
+        page.until_rest()
+    served.process.send_signal(number)
+    errors = served.process.communicate(timeout=PATIENCE)[1]
+    assert served.process.returncode == 128 + number
+    assert "leaked" not in errors and "Traceback" not in errors

@@ -23,7 +23,7 @@ from benchmarks.harness.runner import NOT_MEASURED, Case, run_cases
 from benchmarks.harness.schema import GROUPS, Report
 from benchmarks.pages.page import COLUMNS, cells, setting, write_pages
 from benchmarks.pages.picture import PICTURE, draw
-from benchmarks.pages.reliability import ROOT, write_reliability
+from benchmarks.pages.reliability import PROMISES, ROOT, marked_tests, replace_promise, write_reliability
 from robot.cli.output import busy, notes, print_files, progress, results
 from robot.cli.terminal import Interrupt, print_error
 
@@ -76,7 +76,7 @@ def measure(group: str, repeat: int | None, *, baselines: bool, long: bool, data
     if group not in ("real", "all") and data is not None:
         raise typer.BadParameter(f"the group {group} uses no real frames", param_hint="--data")
     if group == "robot":
-        return _measure_robot(repeat or (5 if long else 1)), 0
+        return _measure_robot(_repetitions(repeat, long=long)), 0
     wanted = [name for name in GROUPS if group == name or (group == "all" and name != "robot")]
     try:
         cases = select_cases(wanted, baselines=baselines, long=long, data=data)
@@ -98,11 +98,44 @@ def measure(group: str, repeat: int | None, *, baselines: bool, long: bool, data
     return report, interrupt.exit_code
 
 
+def measure_promise(number: int, repeat: int | None, *, long: bool, file: Path | None) -> Report:
+    """The report in `file` of all promises, in which those of one promise are measured again. Raises BadParameter;
+    Exit if it is stopped."""
+    if not 1 <= number <= len(PROMISES):
+        words = f"there is no promise {number}; docs/reliability.md lists 1 to {len(PROMISES)}"
+        raise typer.BadParameter(words, param_hint="--promise")
+    if file is None or not file.is_file():
+        words = "one promise is measured into the report of all of them: --json benchmarks/reliability.json"
+        raise typer.BadParameter(words, param_hint="--json")
+    report = _read(file)
+    if report.metadata.groups != ["robot"]:
+        raise typer.BadParameter(f"{file} is not a report of the group robot", param_hint="--json")
+    _require_tests()
+    with tempfile.TemporaryDirectory() as folder, Interrupt() as interrupt:
+        found = Path(folder) / "promise.json"
+        new = _run_promises("promise", _repetitions(repeat, long=long), found, interrupt, *marked_tests()[number])
+    if not any(row.case == PROMISES[number - 1][0] for row in new.results):
+        for failure in new.failures:
+            print_error(f"{failure.case}: {failure.cause}")
+        print_error(f"no figure of promise {number} was recorded; {file} stays as it is")
+        raise typer.Exit(1)
+    return replace_promise(report, new, number)
+
+
+def _repetitions(repeat: int | None, *, long: bool) -> int:
+    return repeat or (5 if long else 1)
+
+
+def _require_tests() -> None:
+    """Raises BadParameter where the tests of the promises cannot run."""
+    if find_spec("pytest") is None or not (ROOT / "tests").is_dir():
+        raise typer.BadParameter("the group robot is measured by tests: pip install -e '.[dev]'", param_hint="GROUP")
+
+
 def _measure_robot(repeat: int) -> Report:
     """Runs the tests of the promises, which record figures (tests/promises.py). Those marked `often` mostly wait, so
     three of them run at a time, after the others."""
-    if find_spec("pytest") is None or not (ROOT / "tests").is_dir():
-        raise typer.BadParameter("the group robot is measured by tests: pip install -e '.[dev]'", param_hint="GROUP")
+    _require_tests()
     with tempfile.TemporaryDirectory() as folder, Interrupt() as interrupt:
         once = _run_promises("promise and not often", repeat, Path(folder) / "once.json", interrupt)
         often = _run_promises("promise and often", repeat, Path(folder) / "often.json", interrupt, "-n", "3")

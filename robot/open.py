@@ -84,7 +84,7 @@ def open_rig(
         task, overrides: as for `load_with_task`; not for a configuration that is loaded already.
         confirm: asks the operator a question and returns the answer; real arms approach only after True.
         dry_run: a rig of hardware does everything except motion.
-        check: gets the specification of the rig before any hardware is opened; raises to refuse it.
+        check: gets the specification of the rig before any hardware or simulated world is opened; raises to refuse it.
         report: gets a short text about what the arms of hardware are doing in a reset, repeatedly.
 
     Raises:
@@ -109,11 +109,10 @@ def open_rig(
     if config.clock == "sim":
         from robot.rig.sim_rig import open_sim
 
-        opened = open_sim(config)
-    else:
-        from robot.rig.replay_rig import open_replay
+        return open_sim(config, check)
+    from robot.rig.replay_rig import open_replay
 
-        opened = open_replay(config)
+    opened = open_replay(config)
     if check is not None:
         try:
             check(opened.spec)

@@ -71,6 +71,11 @@ PROMISES: tuple[tuple[str, str], ...] = (  # promise n is the n-th
         "Closing ends quickly, may be repeated, and leaves no process or file; an episode is readable after a kill.",
     ),
     ("Two arms", "They keep their distance if either moves, and both stop when one does."),
+    (
+        "Live page",
+        "STOP of `tacsim serve` brakes every arm, whatever runs; it needs no permission, and none is lost. Nothing "
+        "moves before the next start. Motion stops when the page is lost, and no page of another site starts one.",
+    ),
 )
 SAFETY = (
     "**None of this is a safety function.** These checks are software on an ordinary computer; they protect the work "
@@ -154,12 +159,13 @@ def markdown(report: Report) -> str:
     failures = [failure for failure in report.failures if failure.group == "robot"]
     parts = [
         "# Reliability",
-        "Fifteen promises of arms and cameras, as figures that their own tests record. Written by `make reliability`, "
-        "or `tacsim bench --from FILE --docs docs`; do not edit.",
+        f"{len(PROMISES)} promises of arms, cameras and the live page, as figures that their own tests record. Written "
+        "by `make reliability`, or `tacsim bench --from FILE --docs docs`; do not edit.",
         SAFETY,
         setting(report) + _load_note(report),
         "## Figures",
         table(HEADER, lines([row for row in measured if EVENT not in row.variant])),
+        *_separate_runs(measured),
         *_events(measured),
         "## How to read and rerun",
         READING.format(repeat=_format_repetitions(count)),
@@ -180,6 +186,27 @@ def lines(measured: Sequence[Row]) -> list[list[str]]:
         if not mine:
             found.append([f"{number} {promise}", "no figure: see its tests below", "", "", "", ""])
     return found
+
+
+def replace_promise(report: Report, new: Report, number: int) -> Report:
+    """`report` with the rows and failures of one promise taken from `new`, a later run of that promise alone. Each of
+    its rows notes when, of which commit and under which load it was measured."""
+    made, name = new.metadata, PROMISES[number - 1][0]
+    loads = [f"{load[0]:.1f}" for load in (made.machine.load_before, made.machine.load_after) if load is not None]
+    load = f"; load average {' to '.join(loads)}" if loads else ""
+    commit = f"{made.commit}{' with changes' if made.modified else ''}"
+    note = f"{made.date:%Y-%m-%d}, commit {commit}, {made.machine.cpu}{load}"
+    rows = [row for row in report.results if row.case != name]
+    rows += [row.model_copy(update={"note": note}) for row in new.results if row.case == name]
+    tests = set(marked_tests()[number])
+    kept = [failure for failure in report.failures if failure.case.partition("[")[0] not in tests]
+    return report.model_copy(update={"results": rows, "failures": [*kept, *new.failures]})
+
+
+def _separate_runs(measured: Sequence[Row]) -> list[str]:
+    """A paragraph on promises that were measured in a run of their own; empty without any."""
+    notes = dict.fromkeys((row.case, row.note) for row in measured if row.note)
+    return [f"Measured in a run of its own: {'; '.join(f'*{case}*, {note}' for case, note in notes)}."] if notes else []
 
 
 def _events(measured: Sequence[Row]) -> list[str]:

@@ -19,6 +19,7 @@ from robot.camera.picture import READ_TIMEOUT, Picture, WrongSource, decode_jpeg
 from robot.errors import DeviceNotConnectedError
 from tacsim.interface import EndOfEpisode
 from tacsim.models.hardware import CameraSensorConfig
+from tacsim.models.text import suggest_file
 
 
 class Capture(Protocol):
@@ -66,7 +67,7 @@ def source_kind(config: CameraSensorConfig, name: str) -> str:
     else:
         path = Path(source)
         if not path.exists():
-            raise WrongSource(f"{where}: no such file or folder")
+            raise WrongSource(f"{where}: no such file or folder{suggest_file(path)}")
         kind = "folder" if path.is_dir() else "video"
     if kind != "uvc" and (config.exposure is not None or config.white_balance is not None):
         raise WrongSource(

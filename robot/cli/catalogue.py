@@ -17,8 +17,27 @@ Kind = Literal[
 ]  # tacsim.config.kinds.CATALOGUE_KINDS, without importing it for each command
 
 
+def parse_kind(text: str) -> str:
+    """A kind, also from its plural. Raises typer.BadParameter."""
+    kinds = get_args(Kind)
+    singular = f"{text[:-3]}y" if text.endswith("ies") else text.removesuffix("s")
+    for word in (text, singular):
+        if word in kinds:
+            return word
+    raise typer.BadParameter(f"'{text}' is not one of {', '.join(map(repr, kinds))}")
+
+
 def list_(
-    kind: Annotated[Kind | None, typer.Argument(help="All kinds if left out.", show_default=False)] = None,
+    kind: Annotated[
+        str | None,
+        typer.Argument(
+            parser=parse_kind,
+            metavar="KIND",
+            help=f"{', '.join(get_args(Kind))}; all of them if left out.",
+            show_default=False,
+            autocompletion=complete_names(words=get_args(Kind)),
+        ),
+    ] = None,
 ) -> None:
     """List what is shipped or installed by name: rigs, tasks, scenes, sensors, materials, policies, drivers.
 
@@ -48,7 +67,10 @@ def show(
     from tacsim.config.kinds import find_entries
 
     found = find_entries(name, kind)
-    described = [{"kind": each.kind, "name": each.name, "path": _text(each.path), **_describe(each)} for each in found]
+    described = [
+        {"kind": each.kind, "name": each.name, "path": _text(each.path), **_describe(each, is_alone=len(found) == 1)}
+        for each in found
+    ]
     print_json(described)
     for number, each in enumerate(described):
         if number:
@@ -74,26 +96,40 @@ def _text(path: Path | None) -> str | None:
     return None if path is None else str(path)
 
 
-def _describe(entry: Any) -> dict[str, Any]:
-    """What is printed of an entry after its name: the text of its file, or its fields in words."""
+def _describe(entry: Any, *, is_alone: bool) -> dict[str, Any]:
+    """What is printed of an entry after its name: the text of its file, or its fields in words.
+
+    Raises PolicyNotFound for a policy that cannot be read and is alone; among others it is only described as such.
+    """
     from tacsim.config.kinds import DRIVER, POLICY
 
     if entry.kind == POLICY:
-        from robot.deploy.onnx_policy import read_policy_spec
+        from robot.deploy.python_policy import PolicyNotFound
 
-        spec = read_policy_spec(entry.path)
-        return {
-            "task": spec.task,
-            "period": f"{spec.period:g} s",
-            "inputs": {key: list(numbers.names) for key, numbers in spec.inputs.items()},
-            "axes": [f"{axis.arm} {list(axis.direction)}" for axis in spec.axes],
-            "max_step": f"{spec.max_step * 1e3:g} mm",
-            "trained": spec.trained,  # settings of `tacsim train`
-            "training range": "recorded" if spec.range is not None else "unknown",
-        }
+        try:
+            return _describe_policy(entry.path)
+        except PolicyNotFound as failure:
+            if is_alone:
+                raise
+            return {"not read": str(failure)}
     if entry.kind == DRIVER:
         return _describe_driver(entry.name)
     return {"text": entry.path.read_text("utf-8")}
+
+
+def _describe_policy(path: Path) -> dict[str, Any]:
+    from robot.deploy.onnx_policy import read_policy_spec
+
+    spec = read_policy_spec(path)
+    return {
+        "task": spec.task,
+        "period": f"{spec.period:g} s",
+        "inputs": {key: list(numbers.names) for key, numbers in spec.inputs.items()},
+        "axes": [f"{axis.arm} {list(axis.direction)}" for axis in spec.axes],
+        "max_step": f"{spec.max_step * 1e3:g} mm",
+        "trained": spec.trained,  # settings of `tacsim train`
+        "training range": "recorded" if spec.range is not None else "unknown",
+    }
 
 
 def _describe_driver(name: str) -> dict[str, Any]:

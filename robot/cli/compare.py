@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -23,7 +24,7 @@ from robot.cli.output import (
     writing,
 )
 from robot.cli.terminal import print_error
-from tacsim.models.text import suggest_word
+from tacsim.models.text import suggest_file, suggest_word
 
 if TYPE_CHECKING:
     from calibration.bundle import Calibration
@@ -103,24 +104,11 @@ def compare(
         from calibration.compare.compare import compare_frames as run
         from calibration.compare.invariance import measure_invariance
         from calibration.compare.report import comparison_as_json, comparison_figures, write_comparison
-        from calibration.errors import BadFrames
-        from tacsim.config import shipped_names
     limits = [*_parse_limits(fail_above, "--fail-above"), *_parse_limits(fail_below, "--fail-below")]
     bundles = [
         None if path is None else read_bundle(path)[0] for path in (sources.calibration_a, sources.calibration_b)
     ]
-    if not Path(a).exists() and not _is_scene(a):
-        hint = suggest_word(a, shipped_names("scene"))
-        raise BadFrames(f"{a}: no such file or folder, and no shipped scene{hint}")
-    truth = _read_frames(b, sources.reference_b, sources.sensor_b, bundles[1])
-    if _is_scene(a):
-        if sources.corners_a or sources.corners_b or sources.reference_a or sources.sensor_a:
-            raise BadFrames(f"A is the scene '{a}': it has no corners, reference or sensor, and B must be calibrated")
-        made = _simulate_presses(a, truth, sources.calibration_b, set_ or [])
-    else:
-        if set_:
-            raise BadFrames(f"--set changes a scene, but A is no scene: {a}")
-        made = _read_frames(Path(a), sources.reference_a, sources.sensor_a, bundles[0])
+    made, truth = _read_sources(a, b, sources, bundles, set_ or [])
     # from here on all images with a calibration are metric
     bundles = [None if each is None else each.model_copy(update={"view": None}) for each in bundles]
     made, truth = _rectify_corners(made, truth, (sources.corners_a, sources.corners_b), bundles)
@@ -141,6 +129,29 @@ def compare(
         print_error(words)
     if beyond:
         raise typer.Exit(1)
+
+
+def _read_sources(
+    a: str, b: Path, sources: Sources, bundles: Sequence[Calibration | None], overrides: list[str]
+) -> tuple[FrameSet, FrameSet]:
+    """The frames of A and of B. Those of a scene are presses where B shows a contact, with `overrides` of the scene.
+
+    Raises BadFrames.
+    """
+    from calibration.errors import BadFrames
+    from tacsim.config import shipped_names
+
+    if not Path(a).exists() and not _is_scene(a):
+        hint = suggest_word(a, shipped_names("scene")) or suggest_file(Path(a), (".mcap", ".mp4", ".avi"))
+        raise BadFrames(f"{a}: no such file or folder, and no shipped scene{hint}")
+    truth = _read_frames(b, sources.reference_b, sources.sensor_b, bundles[1])
+    if not _is_scene(a):
+        if overrides:
+            raise BadFrames(f"--set changes a scene, but A is no scene: {a}")
+        return _read_frames(Path(a), sources.reference_a, sources.sensor_a, bundles[0]), truth
+    if sources.corners_a or sources.corners_b or sources.reference_a or sources.sensor_a:
+        raise BadFrames(f"A is the scene '{a}': it has no corners, reference or sensor, and B must be calibrated")
+    return _simulate_presses(a, truth, sources.calibration_b, overrides), truth
 
 
 def _read_frames(path: Path, reference: Path | None, sensor: str, bundle: Calibration | None) -> FrameSet:

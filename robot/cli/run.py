@@ -94,8 +94,11 @@ def run(
     Example: tacsim run sim --task squeeze --steps 30 --out runs/first
     """
     default_steps = 40  # number of steps without a task and without a recording
+    from robot.deploy.policy import require_policy_name
     from robot.open import load_with_task
 
+    if policy is not None:
+        require_policy_name(policy)
     if save_view is not None and save_view.suffix != ".rrd":
         raise typer.BadParameter(f"{save_view} must end in .rrd, as the viewer's files do", param_hint="--save-view")
     if film is not None:

@@ -13,6 +13,7 @@ import typer
 
 from robot.cli.options import Overrides, require_packages
 from robot.cli.output import busy, notes, results
+from robot.cli.terminal import Interrupt
 
 TOKEN = "TACSIM_TOKEN"  # environment variable
 MIN_TOKEN = 16  # characters of a token that the user gives
@@ -49,11 +50,14 @@ def serve(
     require_packages("tacsim serve", "web", "starlette", "uvicorn", "websockets")
     token = _token(bind)
     with busy("loading"):
+        from robot.deploy.policy import require_policy_name
         from robot.open import load_with_task
         from robot.serve.app import make_server
         from robot.serve.guard import Guard
         from robot.serve.session import Session
 
+    if policy is not None:
+        require_policy_name(policy)
     sys.path.append(str(Path.cwd()))  # --policy mine:act finds mine.py here
     loaded = load_with_task(rig, task, set_ or [])
     for words in loaded.notes:
@@ -65,17 +69,19 @@ def serve(
     guard = Guard({_with_port(each, port) for each in _names(bind, host or [])}, token)
     session = Session(loaded, name, out, on_failure=lambda: setattr(server, "should_exit", True))
     server = make_server(session, guard)
-    with session:
+    with Interrupt(server.end) as interrupt, session:
         shown = (host or ["127.0.0.1"])[0] if bind in ANY_ADDRESS else bind
         results.print(f"http://{_with_port(shown, port)}/#token={token}")
         if bind in ANY_ADDRESS and not host:
             notes.print("Other machines are refused: give the name or address by which they open the page, --host NAME")
         notes.print("Ctrl-C stops the arms and ends the server.")
-        server.run(sockets=[listening])
+        if not interrupt():  # from here on a signal ends the server in order
+            server.run(sockets=[listening])
         if words := session.recordings.report_state:
             notes.print(f"{words}; Ctrl-C again ends without it, the recording is complete")
     if session.failure is not None:
         raise session.failure
+    raise typer.Exit(interrupt.exit_code)
 
 
 def _names(bind: str, more: list[str]) -> set[str]:

@@ -35,6 +35,8 @@ from robot.cli.terminal import EXIT_FAILED, Interrupt, print_error
 from tacsim.models.text import suggest_word
 
 if TYPE_CHECKING:
+    from tacsim.models.scene import Scene
+    from tacsim.models.sensor import SensorModel as Sensor
     from tacsim.report.figure4 import Trial
 
 AXES = ("roll", "pitch", "yaw")
@@ -101,22 +103,8 @@ def press(
 
     Example: tacsim press sphere --radius '3 mm' --depth '0.4 mm' --slide '1 mm, 0'
     """
-    from tacsim.config import load_scene, load_sensor
-    from tacsim.config.gel import fit_gel, overridden_gel_sizes
-    from tacsim.geometry.shapes import describe_meshes
-
     folder = new_directory(out, "press")
-    given = {name: getattr(shape, name) for name in ("radius", "height", "size", "scale")}
-    given["repair"] = True if shape.repair else None
-    changes = [_geometry_override(indenter, given), *_orientation_overrides(shape.down, shape.rotation)]
-    if shape.edge_radius is not None:
-        changes.append(f"indenter.edge_radius={shape.edge_radius!r}")
-    scene = load_scene("press", [f"preset={preset}", *changes, *(set_ or [])])
-    model = load_sensor(sensor).model_copy(update={"view": None})
-    sizes = overridden_gel_sizes(text.partition("=")[0].split(".") for text in set_ or [])
-    scene, said = fit_gel(scene, {"lower": model}, given=sizes)
-    for words in [*said, *describe_meshes(scene)]:
-        notes.print(words)
+    scene, model = _scene_of_press(indenter, shape, preset, sensor, set_ or [])
     with busy("pressing (the first run compiles the kernels, up to half a minute)") as say:
         from robot.studies import press as presses
         from tacsim.physics.failure.dump import dump_to_folder
@@ -138,6 +126,36 @@ def press(
     config = presses.press_report(scene, motion, pressed, model)
     with writing(folder, new=True):
         presses.write(folder, pressed, config, scene, model, curve)
+    _print_press(config, presses.MAX_MISSED_DEPTH_SHARE)
+    written = sorted(folder.iterdir())
+    print_files(*written)
+    print_json({**config, "force_curve": curve}, written)
+
+
+def _scene_of_press(
+    indenter: str, shape: IndenterShape, preset: str, sensor: str, overrides: list[str]
+) -> tuple[Scene, Sensor]:
+    """The scene of a press and the sensor that feels it, which gives the scene its gel. Prints notes about both."""
+    from tacsim.config import load_scene, load_sensor
+    from tacsim.config.gel import fit_gel, overridden_gel_sizes
+    from tacsim.geometry.shapes import describe_meshes
+
+    given = {name: getattr(shape, name) for name in ("radius", "height", "size", "scale")}
+    given["repair"] = True if shape.repair else None
+    changes = [_geometry_override(indenter, given), *_orientation_overrides(shape.down, shape.rotation)]
+    if shape.edge_radius is not None:
+        changes.append(f"indenter.edge_radius={shape.edge_radius!r}")
+    scene = load_scene("press", [f"preset={preset}", *changes, *overrides])
+    model = load_sensor(sensor).model_copy(update={"view": None})
+    sizes = overridden_gel_sizes(text.partition("=")[0].split(".") for text in overrides)
+    scene, said = fit_gel(scene, {"lower": model}, given=sizes)
+    for words in [*said, *describe_meshes(scene)]:
+        notes.print(words)
+    return scene, model
+
+
+def _print_press(config: dict[str, Any], max_missed: float) -> None:
+    """Prints the result of a press, and what limits its trust. max_missed: share of the depth that the gel may miss."""
     results.print(f"pressing side    {config['pressing_side']}")
     results.print(f"force            {config['force']:.4f} N")
     results.print(f"contact radius   {config['contact_radius'] * 1e3:.3f} mm")
@@ -146,7 +164,7 @@ def press(
         requested = config["indenter"]["edge_radius"]
         words = " (smallest for this mesh; --edge-radius '0 mm' for sharp edges)" if requested is None else ""
         results.print(f"edge radius      {config['edge_radius'] * 1e3:.3f} mm{' (sharp)' if requested == 0 else words}")
-    if config["unfelt"] > presses.MAX_MISSED_DEPTH_SHARE:
+    if config["unfelt"] > max_missed:
         notes.print(
             f"warning: the gel is pressed by {1 - config['unfelt']:.0%} of the depth: a tip or edge is too narrow for "
             f"elements of {config['element_size'] * 1e3:g} mm, the force too small (a wedge's by 10 to 25 %); lower "
@@ -157,9 +175,6 @@ def press(
     if not config["settled"]:
         held = "not held" if config["residual"] is None else f"relative residual {config['residual']:.2g}"
         notes.print(f"warning: not settled, {config['unfollowed'] or f'{held}; raise settling.max_substeps'}")
-    written = sorted(folder.iterdir())
-    print_files(*written)
-    print_json({**config, "force_curve": curve}, written)
 
 
 def _orientation_overrides(down: str | None, rotation: tuple[float, ...] | None) -> list[str]:

@@ -7,6 +7,7 @@ import os
 import re
 import signal
 import sys
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from types import FrameType, TracebackType
@@ -45,7 +46,9 @@ class Guarded(TyperGroup):
             print_error("interrupted")
             raise typer.Exit(EXIT_INTERRUPTED) from None
         except typer.BadParameter as error:
-            error.message += _suggest_choice(error.message)
+            message = error.message.replace("Value error, ", "")  # of the library that checks choices
+            suggestion = _suggest_choice(message)
+            error.message = f"{message.removesuffix('.') if suggestion else message}{suggestion}"
             raise
         except Exception as error:
             of_typer = isinstance(error, typer.Abort) or hasattr(error, "exit_code")  # typer handles these
@@ -125,9 +128,12 @@ class Interrupt:
     once. After the first call, the signal is only stored: the next call returns True, and the caller ends its work in
     order. A second signal always raises KeyboardInterrupt. A KeyboardInterrupt that leaves the block becomes the exit
     of the command.
+
+    on_signal: called in the signal handler when a signal is stored, for work that does not ask this object.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, on_signal: Callable[[], None] = lambda: None) -> None:
+        self._on_signal = on_signal
         self._signal: int | None = None
         self._was_called = False
         self._before: dict[int, Any] = {}
@@ -149,6 +155,7 @@ class Interrupt:
             _redirect_lost_terminal()
         if not (first and self._was_called):
             raise KeyboardInterrupt
+        self._on_signal()
 
     def __enter__(self) -> Self:
         for number in SIGNALS:

@@ -56,13 +56,20 @@ def load_policy(
         return OnnxPolicy(Path(name), canonical or CanonicalGrid(), None if task is None else task.goal)
     if name.endswith(".csv"):
         return TargetScript(Path(name))
-    if ":" not in name:
-        allowed = (
-            "'scripted', 'grip', 'learned', 'path/to/file.onnx', 'path/to/file.csv', or 'package.module:attribute'"
-        )
-        hint = suggest_word(name, (*NAMES, *other_names))
-        raise PolicyNotFound(f"no policy '{name}'; allowed: {allowed}{hint}")
+    require_policy_name(name, other_names)
     return policy_of_code(name)
+
+
+def require_policy_name(name: str, other_names: Sequence[str] = ()) -> None:
+    """Raises PolicyNotFound for a text that `load_policy` takes for no policy. Opens no file and imports no code."""
+    if name in (*NAMES, *other_names) or name.endswith((".onnx", ".csv")) or ":" in name:
+        return
+    allowed = "'scripted', 'grip', 'learned', 'path/to/file.onnx', 'path/to/file.csv', or 'package.module:attribute'"
+    if name.endswith(".py"):
+        hint = f"; name what the file defines: '{Path(name).stem}:NAME'"
+    else:
+        hint = suggest_word(name, (*NAMES, *other_names))
+    raise PolicyNotFound(f"no policy '{name}'; allowed: {allowed}{hint}")
 
 
 def _find_shipped_policy(task: Task | None) -> Path:

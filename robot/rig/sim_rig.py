@@ -10,7 +10,7 @@ from calibration.normaliser import normaliser_for_simulation
 from robot.rig import CannotOpen
 from tacsim.compute.threads import map_parallel, map_serial
 from tacsim.control import GelMonitor, load_controller
-from tacsim.interface import Pose, SensorSpec
+from tacsim.interface import Pose, RigSpec, SensorSpec
 from tacsim.models.hardware import Placement, parts_of
 from tacsim.models.rig import RigConfig, SimArmConfig, SimSensorConfig
 from tacsim.models.scene import Scene
@@ -49,9 +49,14 @@ class Simulation:
             self.arms[name].set_measurement_errors(_pose_error(arm), arm.delay, wrench_noise_source(arm.noise, name))
 
 
-def open_sim(config: RigConfig) -> Rig:
-    """A rig of sensors, arms and a clock in one simulated world. Raises CannotOpen."""
+def open_sim(config: RigConfig, check: Callable[[RigSpec], None] | None = None) -> Rig:
+    """A rig of sensors, arms and a clock in one simulated world. Raises CannotOpen.
+
+    check: gets its specification before the world is made, which takes seconds; raises to refuse it.
+    """
     simulation = simulate(config)
+    if check is not None:
+        check(simulation.rig.spec)
     simulation.scene_world.world()
     return simulation.rig
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 import asyncio
 import json
 import threading
-from collections.abc import AsyncIterator, Awaitable, Callable
-from contextlib import asynccontextmanager, suppress
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from contextlib import asynccontextmanager, contextmanager, suppress
 from functools import partial
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -110,15 +109,26 @@ def make_app(session: Session, guard: Guard) -> Starlette:
     )
 
 
-def make_server(session: Session, guard: Guard) -> uvicorn.Server:
-    """A server of the application, which stops the arms first when a signal ends it."""
+class Server(uvicorn.Server):
+    """Serves an application. Signals are handled by the command, which calls `end`."""
 
-    class Server(uvicorn.Server):
-        def handle_exit(self, number: int, frame: FrameType | None) -> None:
-            # In a thread: the signal may have interrupted this one while it held a lock of the session.
-            threading.Thread(target=session.stop, args=("the server ends",)).start()
-            super().handle_exit(number, frame)
+    def __init__(self, config: uvicorn.Config, session: Session) -> None:
+        super().__init__(config)
+        self._session = session
 
+    @contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        yield  # uvicorn would end the process by the signal, before the rig is closed
+
+    def end(self) -> None:
+        """Stops the arms, then ends the server. May be called in a signal handler."""
+        # In a thread: the signal may have interrupted this one while it held a lock of the session.
+        threading.Thread(target=self._session.stop, args=("the server ends",)).start()
+        self.should_exit = True
+
+
+def make_server(session: Session, guard: Guard) -> Server:
+    """A server of the application."""
     config = uvicorn.Config(
         make_app(session, guard),
         log_level="warning",
@@ -126,7 +136,7 @@ def make_server(session: Session, guard: Guard) -> uvicorn.Server:
         ws_max_size=MAX_BODY,
         timeout_graceful_shutdown=2,  # for its connections [s]
     )
-    return Server(config)
+    return Server(config, session)
 
 
 def _command(guard: Guard, call: Callable[[Any], Any], body: type[_Body]) -> Callable[[Request], Awaitable[Response]]:

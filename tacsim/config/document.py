@@ -177,10 +177,13 @@ def dump_yaml(data: Any) -> str:
     return text
 
 
-def read_text(path: Path, refuse: Callable[[str], None], state: LoadState) -> str | None:
+def read_text(
+    path: Path, refuse: Callable[[str], None], state: LoadState, describe_missing: Callable[[Path], str]
+) -> str | None:
     """The text of a file, checked before and while reading; None after a reported problem.
 
-    `refuse` reports a problem of the file itself, at the place that refers to it.
+    `refuse` reports a problem of the file itself, at the place that refers to it. `describe_missing` gives the end of
+    the message about a missing file.
     """
     max_bytes = 1_000_000
     try:
@@ -204,7 +207,8 @@ def read_text(path: Path, refuse: Callable[[str], None], state: LoadState) -> st
         what = f"byte 0x{content[error.start]:02x} is not UTF-8; save the file as UTF-8 text"
         state.report(Place(display_path(path), line), "", what)
     except FileNotFoundError:
-        refuse(f"there is no file '{display_path(path)}'")
+        shown = display_path(path)
+        refuse(f"there is no file '{shown}'{describe_missing(Path(shown))}")
     except (OSError, ValueError) as error:
         what = getattr(error, "strerror", None) or str(error)
         refuse(f"cannot read '{display_path(path)}': {what}")

@@ -86,13 +86,16 @@ def is_name(text: str) -> bool:
     return _NAME.fullmatch(text) is not None
 
 
-def shipped_file(kind: Kind, name: str) -> Path:
-    """The shipped file of that name. Raises NotFound."""
+def shipped_file(kind: Kind, name: str, folder: Path | None = None) -> Path:
+    """The shipped file of that name. Raises NotFound, which hints at a file of that name in `folder`."""
     path = config_root() / kind.folder / f"{name}.yaml"
     if path.is_file():
         return path
     known = shipped_names(kind.name)
-    raise NotFound(f"no {kind.name} '{name}'; allowed: {', '.join(known) or '(none)'}{suggest_word(name, known)}")
+    hint = suggest_word(name, known)
+    if folder is not None and (folder / f"{name}.yaml").is_file():
+        hint = f"; did you mean the file '{name}.yaml'?"
+    raise NotFound(f"no {kind.name} '{name}'; allowed: {', '.join(known) or '(none)'}{hint}")
 
 
 def resolve_reference(kind: Kind, reference: str, folder: Path) -> Path:
@@ -107,7 +110,7 @@ def resolve_reference(kind: Kind, reference: str, folder: Path) -> Path:
     if kind.name == "sensor" and is_bundle(folder / reference):
         return folder / reference
     if is_name(reference):
-        return shipped_file(kind, reference)
+        return shipped_file(kind, reference, folder)
     if not reference.endswith((".yaml", ".yml")) or "\0" in reference:
         known = ", ".join(shipped_names(kind.name))
         raise NotFound(f"{reference!r} is no {kind.name}; allowed: a name ({known}), or a path ending in .yaml")

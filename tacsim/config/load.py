@@ -246,7 +246,7 @@ def _open_tree(annotation: Any, source: str | Path, state: LoadState) -> Node:
         if kind is not None and kind.name == "sensor" and path.suffix not in (".yaml", ".yml"):
             path = resolve_reference(kind, str(source), Path.cwd())
         elif kind is not None and isinstance(source, str) and is_name(source):
-            path = shipped_file(kind, source)
+            path = shipped_file(kind, source, Path.cwd())
     except NotFound as error:
         raise ConfigError([Problem(place, "", str(error))]) from None
     return read_file(path, annotation, state, lambda what: state.report(place, "", what))

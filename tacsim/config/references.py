@@ -31,9 +31,9 @@ from tacsim.config.document import (
     parse_text,
     read_text,
 )
-from tacsim.config.kinds import Kind, NotFound, kind_of, resolve_reference
+from tacsim.config.kinds import Kind, NotFound, kind_of, resolve_reference, shipped_names
 from tacsim.models.quantity import Quantity
-from tacsim.models.text import suggest_word
+from tacsim.models.text import suggest_file, suggest_word
 
 METRE_PARTS = ("arms", "keep_out", "start")  # parts of a rig whose lengths can be metres
 
@@ -120,7 +120,7 @@ def read_file(
     elif len(chain) >= max_chain:
         refuse(f"more than {max_chain} files refer to each other in a row; shorten the chain")
     elif state.nodes <= MAX_NODES:  # otherwise reported already; each further file would report it again
-        text = read_text(path, refuse, state)
+        text = read_text(path, refuse, state, partial(_describe_missing_file, kind=kind))
     if text is None:
         return broken
     root = parse_text(text, display_path(path), path.parent, state)
@@ -128,6 +128,16 @@ def read_file(
         state.report(root.place, key, "the file is empty; allowed: a mapping of keys to values")
         return broken
     return expand_references(root, annotation, state, key, (*chain, resolved))
+
+
+def _describe_missing_file(path: Path, kind: Kind | None) -> str:
+    """What to do where there is no file of this kind."""
+    if kind is not None and path.stem in shipped_names(kind.name):
+        return f"; the shipped {kind.name} is called '{path.stem}', without an ending"
+    near = suggest_file(path, (".yaml", ".yml"))
+    if near.endswith("?") or kind is None:
+        return near
+    return f"{near}; `tacsim new {kind.name} NAME` writes one, `tacsim list {kind.name}` prints the shipped ones"
 
 
 def _extend_node(node: Node, kind: Kind, annotation: Any, state: LoadState, key: str, chain: tuple[Path, ...]) -> Node:

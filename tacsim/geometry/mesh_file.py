@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tacsim.interface import FloatArray
+from tacsim.models.text import suggest_file
 
 if TYPE_CHECKING:
     from trimesh import Trimesh
@@ -108,7 +109,8 @@ def _read_bytes(path: Path) -> bytes:
         raise ValueError(f"{path}: is no mesh file that is read here (its name ends in '{path.suffix}'); use {known}")
     if not path.exists():
         raise FileNotFoundError(
-            f"{path}: no such mesh file; give the path of a file that ends in {', '.join(SUFFIXES)}"
+            f"{path}: no such mesh file{suggest_file(path, SUFFIXES)}; give the path of a file that ends in "
+            f"{', '.join(SUFFIXES)}"
         )
     if not path.is_file():
         raise ValueError(f"{path}: is no file; give the path of a mesh file")

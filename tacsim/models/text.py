@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
+from itertools import islice
+from pathlib import Path
 
 
 def escape_text(text: str, kept: str = "") -> str:
@@ -41,8 +43,31 @@ def millimetres(*lengths: float, digits: str = ".4g") -> str:
 
 def suggest_word(word: str, allowed: Iterable[str]) -> str:
     """ "; did you mean 'x'?" when one of `allowed` is close to `word`, else an empty text."""
+    near = _nearest_word(word, allowed)
+    return "" if near is None else f"; did you mean '{near}'?"
+
+
+def suggest_file(path: Path, endings: Collection[str] = ()) -> str:
+    """Where to look instead of a missing `path`: the file with the nearest name, else some files with one of these
+    endings (".yaml"), in its folder; or that the folder is missing. Begins with "; "; empty if there is nothing to
+    say."""
+    max_read, max_listed = 10_000, 4
+    folder = path.parent
+    try:
+        names = sorted(each.name for each in islice(folder.iterdir(), max_read) if not each.name.startswith("."))
+    except OSError:
+        return "" if folder.exists() else f"; there is no folder '{printable_line(str(folder))}' either"
+    by_stem = {Path(name).stem: name for name in names}  # equal endings do not make two names similar
+    if (near := _nearest_word(path.stem, by_stem)) is not None:
+        return f"; did you mean '{printable_line(str(folder / by_stem[near]))}'?"
+    fitting = [str(folder / name) for name in names if Path(name).suffix.lower() in endings]
+    shown = [*fitting[:max_listed], *["..."] * (len(fitting) > max_listed)]
+    return f"; files there: {printable_line(', '.join(shown))}" if shown else ""
+
+
+def _nearest_word(word: str, allowed: Iterable[str]) -> str | None:
     if len(word) > 100:  # comparison takes quadratic time, and no allowed word is that long
-        return ""
+        return None
     by_lower = {name.lower(): name for name in allowed}
     close = difflib.get_close_matches(word.lower(), by_lower, n=1, cutoff=0.6)
-    return f"; did you mean '{by_lower[close[0]]}'?" if close else ""
+    return by_lower[close[0]] if close else None

@@ -11,6 +11,7 @@ from typing import BinaryIO, NamedTuple, Self, overload
 
 from mcap.records import Attachment, Channel, Footer, Header, Message, Metadata
 
+from tacsim.models.text import suggest_file
 from tacsim.record.episode import Episode, EpisodeError, EpisodeMeta, Step
 from tacsim.record.messages import Messages, decode_step
 from tacsim.record.records import check_magic, foreign_file_error, listed_topics, read_records
@@ -184,10 +185,16 @@ def open_file(path: Path) -> BinaryIO:
     """Raises EpisodeError."""
     try:
         if not path.is_file():
-            raise EpisodeError(f"{path}: {'is no file' if path.exists() else 'no such file'}")
+            raise EpisodeError(_describe_no_file(path))
         return path.open("rb")
     except OSError as failure:
         raise EpisodeError(f"{path}: cannot be opened: {failure.strerror}") from failure
+
+
+def _describe_no_file(path: Path) -> str:
+    if not path.exists():
+        return f"{path}: no such file{suggest_file(path, ('.mcap',)) or '; `tacsim run` records an episode.mcap'}"
+    return f"{path}: is {'a folder; name the episode.mcap in it' if path.is_dir() else 'no file'}"
 
 
 def closing_counts(record: Metadata) -> dict[str, int] | None:

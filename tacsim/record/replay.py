@@ -11,6 +11,7 @@ from pathlib import Path
 
 from tacsim.interface import ArmState, EndOfEpisode, Image, Pose, SensorSpec, TactileFrame
 from tacsim.models.rig import ReplayArmConfig, ReplaySensorConfig
+from tacsim.models.text import suggest_file
 from tacsim.record.episode import EpisodeError
 from tacsim.record.images import read_image, reference_image
 from tacsim.record.numbering import Numbering, match_numbers, numbers_in_names
@@ -202,7 +203,7 @@ class ReplayArm:
             arm = select_name(list(episode_meta(path).spec.arms), self._name, path, "arm")
             return lambda: ((state, time - state.time) for state, time in episode_states(path, arm))
         if not path.is_file():
-            raise EpisodeError(f"{path}: no such file")
+            raise EpisodeError(f"{path}: no such file{suggest_file(path, (*EPISODES, '.csv'))}")
         if path.suffix.lower() != ".csv":
             raise EpisodeError(f"{path}: no record of an arm; give an episode ({', '.join(EPISODES)}) or a .csv file")
         columns = [self._config.force_column]

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Generic, TypeVar
 import numpy as np
 
 from tacsim.interface import ArmState, EndOfEpisode, Image, Pose, TactileFrame
-from tacsim.models.text import suggest_word
+from tacsim.models.text import suggest_file, suggest_word
 from tacsim.optics.picture_file import FORMATS, MAX_SIDE
 from tacsim.record.episode import EpisodeError, EpisodeMeta
 from tacsim.record.images import image_size, read_image
@@ -204,7 +204,7 @@ def _natural_order(path: Path) -> list[str | int]:
 def unknown_source_error(path: Path) -> EpisodeError:
     """The error for a path that is no recording."""
     if not path.exists():
-        return EpisodeError(f"{path}: no such file or folder")
+        return EpisodeError(f"{path}: no such file or folder{suggest_file(path, (*EPISODES, *VIDEOS))}")
     return EpisodeError(
         f"{path}: no recording; give an episode ({', '.join(EPISODES)}), a folder of pictures ({', '.join(FORMATS)}) "
         f"or a video ({', '.join(VIDEOS)})"

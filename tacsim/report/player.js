@@ -194,7 +194,7 @@ element("scene").onpointermove = (event) => {
   drawScene();
 };
 if (!hasScene) element("player").classList.add("flat");
-addEventListener("resize", () => show(now));
 const force = data.curves.length ? Object.values(data.curves[0].lines) : []; // the page opens at the largest force
 show(data.moments.reduce((best, moment, k) => (force.some((line) => line[moment.at] > Math.max(...force.map((each) => each[data.moments[best].at]))) ? k : best), 0));
 isFresh = true;
+new ResizeObserver(() => { const fresh = isFresh; show(now); isFresh = fresh; }).observe(element("player")); // also when pictures have loaded

@@ -13,7 +13,7 @@ from benchmarks.harness import machine
 from benchmarks.harness.runner import run_cases
 from benchmarks.harness.schema import Device, Failure, Missing, Report, Row, json_schema
 from benchmarks.pages.page import INDEX, NO_DEVICE, pages
-from tests.robot.cli.invoked import tacsim, told
+from tests.robot.cli.invoked import plain_text, tacsim
 
 ROOT = Path(__file__).resolve().parents[2]
 REFERENCE = ROOT / "benchmarks" / "reference.json"
@@ -184,11 +184,11 @@ def test_reports_that_make_no_page_are_refused(cpu: Report, tmp_path: Path) -> N
     ):
         result = tacsim("bench", *(word for file in files for word in ("--from", file)), "--docs", docs)
         assert result.exit_code == 2, result.output
-        assert words in told(result.output) and "Traceback" not in result.output
+        assert words in plain_text(result.output) and "Traceback" not in result.output
     both = tacsim("bench", "--from", REFERENCE, "--from", gpu, "--json", tmp_path / "both.json")
-    assert both.exit_code == 2 and "one file holds one report" in told(both.output)
+    assert both.exit_code == 2 and "one file holds one report" in plain_text(both.output)
     measured = tacsim("bench", "press", "--docs", docs, TACSIM_DEVICE="cuda")
-    assert measured.exit_code == 2 and "needs the CPU's report too" in told(measured.output)
+    assert measured.exit_code == 2 and "needs the CPU's report too" in plain_text(measured.output)
     assert not docs.exists() and not (tmp_path / "both.json").exists()
 
 

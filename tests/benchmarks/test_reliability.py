@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from benchmarks.harness.schema import Report, Row
+from benchmarks.harness.schema import Failure, Report, Row
 from benchmarks.pages import reliability
 from benchmarks.pages.reliability import COUNT, PROMISES, Figure, marked_tests
 
@@ -53,7 +53,7 @@ def test_verdicts(row: Row, cells: list[str]) -> None:
 @pytest.mark.slow
 def test_every_promise_has_tests_and_the_published_report_their_figures(report: Report) -> None:
     tests = marked_tests()
-    assert sorted(tests) == list(range(1, len(PROMISES) + 1)) and len(PROMISES) == 15
+    assert sorted(tests) == list(range(1, len(PROMISES) + 1)) and len(PROMISES) == 16
     recorded = set()
     for file in {test.partition("::")[0] for found in tests.values() for test in found}:
         text = (ROOT / file).read_text(encoding="utf-8")
@@ -64,6 +64,25 @@ def test_every_promise_has_tests_and_the_published_report_their_figures(report: 
     missing = {pattern for pattern in patterns if not any(re.fullmatch(pattern, name) for name in names)}
     assert not unknown and not missing, "run: make reliability"
     assert {row.case for row in report.results} == {name for name, _ in PROMISES} - {"One contract"}
+
+
+def test_a_promise_that_is_measured_alone_replaces_its_rows_and_says_so(report: Report) -> None:
+    row, (test, *_) = figures(7.0, 8.0, 9.0), marked_tests()[3]
+    lost = [Failure(group="robot", case=f"{case}[1]", method="tacsim", resolution="mock", cause="late")
+            for case in (test, marked_tests()[1][0])]  # fmt: skip
+    before = report.model_copy(update={"failures": lost})
+    of_another = row.model_copy(update={"case": "Box"})
+    alone = report.model_copy(update={"results": [row, of_another], "failures": []})
+    after = reliability.replace_promise(before, alone, 3)
+    assert [each.case for each in after.results if each.case != "Force"] == [
+        each.case for each in report.results if each.case != "Force"
+    ]
+    (replaced,) = [each for each in after.results if each.case == "Force"]
+    assert (replaced.error, replaced.variant) == (8.0, "standstill") and str(report.metadata.commit) in replaced.note
+    assert after.failures == lost[1:] and after.metadata == report.metadata
+    page = reliability.markdown(after)
+    assert f"Measured in a run of its own: *Force*, {replaced.note}." in page
+    assert "of its own" not in reliability.markdown(before)
 
 
 def test_events_have_a_table_of_their_own(report: Report) -> None:

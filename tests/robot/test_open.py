@@ -12,7 +12,7 @@ import pytest
 
 from robot.open import RIG_ATTACHMENT, CannotOpen, make_env, make_vector_env, open_rig
 from tacsim.config import ConfigError, load_rig
-from tacsim.interface import Action, Needs
+from tacsim.interface import Action, IncompatibleRig, Needs, RigSpec
 from tacsim.record.episode import EpisodeMeta, Step
 from tacsim.record.images import reference_attachments
 from tacsim.record.writer import Recorder
@@ -50,6 +50,18 @@ def test_a_real_world_resets_to_the_same_bits() -> None:
         for name in ("lower", "upper"):
             assert np.array_equal(runs[0].tactile[name].image, runs[1].tactile[name].image)
             assert np.array_equal(runs[0].arms[name].wrench, runs[1].arms[name].wrench)
+
+
+@pytest.mark.parametrize("rig", ["sim", "press"])
+def test_a_rig_that_is_refused_makes_no_world(rig: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A world takes seconds, a refusal none."""
+    monkeypatch.setattr("robot.rig.sim_rig.make_world", lambda scene: pytest.fail("a world was made"))
+
+    def refuse(spec: RigSpec) -> None:
+        raise IncompatibleRig(", ".join(spec.sensors))
+
+    with pytest.raises(IncompatibleRig, match="lower"):
+        open_rig(rig, check=refuse)
 
 
 def test_a_rigid_press_is_a_rig_too(tmp_path: Path) -> None:

@@ -21,6 +21,7 @@ from tacsim.models.hardware import UrArmConfig, parts_of
 from tacsim.models.rig import ReplayArmConfig, ReplaySensorConfig, RigConfig
 from tacsim.models.scene import Scene
 from tacsim.models.sensor import CanonicalGrid, Markers
+from tacsim.models.text import suggest_file
 from tacsim.physics.worlds.tuning import INITIAL_GAP
 from tacsim.record.reader import EpisodeFile
 from tacsim.record.sources import read_columns
@@ -269,7 +270,7 @@ def find_recordings(sources: Sequence[Path]) -> list[Path]:
                 raise BadRecording(f"{source}: no recordings in this folder ({TABLE} or {EPISODE})")
             found += inside
         elif not source.is_file():
-            raise BadRecording(f"{source}: no such file or folder")
+            raise BadRecording(f"{source}: no such file or folder{suggest_file(source, (TABLE, EPISODE))}")
         elif source.suffix.lower() not in (TABLE, EPISODE):
             raise BadRecording(f"{source}: no recording; allowed: {TABLE}, {EPISODE}, or a folder of them")
         else:

@@ -18,7 +18,7 @@ def tacsim(*words: object, **environment: str) -> Result:
     return CliRunner().invoke(app, [str(word) for word in words], env={"COLUMNS": "200", **environment})
 
 
-def told(output: str) -> str:
+def plain_text(output: str) -> str:
     """Without the frame and line breaks of an error's box."""
     return " ".join(output.replace("│", " ").split())
 

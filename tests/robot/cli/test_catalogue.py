@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 
 import pytest
 
 from tacsim.config import config_root, load_rig, load_scene, load_sensor
 from tacsim.config.kinds import CATALOGUE_KINDS
-from tests.robot.cli.invoked import tacsim
+from tests.robot.cli.invoked import plain_text, tacsim
 
 pytestmark = pytest.mark.usefixtures("empty_folder")
 
@@ -27,6 +28,11 @@ def test_list_names_every_shipped_file_with_a_summary() -> None:
     assert {each["kind"] for each in found} == set(CATALOGUE_KINDS)
     assert all(len(each["summary"]) > 10 for each in found)
     assert {"arm.ur", "arm.sim", "sensor.camera", "sensor.replay"} <= {each["name"] for each in rows("driver")}
+
+
+@pytest.mark.parametrize(("plural", "kind"), [("rigs", "rig"), ("policies", "policy")])
+def test_a_kind_may_be_a_plural(plural: str, kind: str) -> None:
+    assert rows(plural) == rows(kind) != []
 
 
 def test_list_prints_a_table_of_one_kind() -> None:
@@ -51,6 +57,15 @@ def test_show_prints_all_kinds_of_a_name_or_the_chosen_one() -> None:
     assert kinds == ["task", "scene", "randomisation", "training", "policy"]
     (policy,) = json.loads(tacsim("show", "squeeze", "--kind", "policy", "--json").stdout)
     assert policy["task"] == "squeeze" and policy["inputs"] and policy["axes"]
+
+
+def test_show_needs_no_package_for_kinds_that_need_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    done = tacsim("show", "squeeze")
+    assert done.exit_code == 0
+    assert "task squeeze" in done.stdout and "goal" in done.stdout
+    assert "pip install 'tacsim[policy]'" in plain_text(done.stdout)
+    assert tacsim("show", "squeeze", "--kind", "policy").exit_code == 2
 
 
 def test_show_unknown_name_suggests_the_nearest() -> None:

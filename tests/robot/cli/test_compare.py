@@ -19,7 +19,7 @@ from tacsim.record.images import reference_attachments
 from tacsim.record.writer import Recorder
 from tests.calibration.presses import HiddenSensor
 from tests.calibration.sources import blank, calibrated, changed, save, side
-from tests.robot.cli.invoked import tacsim, told
+from tests.robot.cli.invoked import plain_text, tacsim
 
 
 @pytest.fixture(scope="module")
@@ -65,10 +65,10 @@ def test_compare_limits_set_exit_code() -> None:
     assert kept.exit_code == 0, kept.output
     above = compared("sim", "real", "--fail-above", "contact_mae=0.5", "--out", "above")
     assert above.exit_code == 1
-    assert "contact_mae is 1." in told(above.output) and "above 0.5" in told(above.output)
+    assert "contact_mae is 1." in plain_text(above.output) and "above 0.5" in plain_text(above.output)
     assert Path("above/compare.html").is_file()  # to see why
     below = compared("sim", "real", "--fail-below", "contact_ssim=0.9999", "--out", "below")
-    assert below.exit_code == 1 and "below 0.9999" in told(below.output)
+    assert below.exit_code == 1 and "below 0.9999" in plain_text(below.output)
 
 
 @pytest.mark.slow
@@ -93,7 +93,7 @@ def test_compare_blank_image_fails_limit(real: FrameSet) -> None:
 def test_compare_invalid_limits_are_refused(limit: str, words: str) -> None:
     result = compared("sim", "real", "--fail-above", limit, "--out", "out")
     assert result.exit_code == 2
-    assert words in told(result.output)
+    assert words in plain_text(result.output)
     assert not Path("out").exists()
 
 
@@ -114,7 +114,7 @@ def test_compare_invalid_limits_are_refused(limit: str, words: str) -> None:
 def test_compare_invalid_input_is_reported(words: tuple[str, ...], message: str) -> None:
     result = compared(*words, "--out", "out")
     assert result.exit_code == 2
-    assert message in told(result.output)
+    assert message in plain_text(result.output)
     assert "Traceback" not in result.output
     assert not Path("out").exists()
 
@@ -122,17 +122,17 @@ def test_compare_invalid_input_is_reported(words: tuple[str, ...], message: str)
 def test_compare_different_counts_need_pair_name(real: FrameSet) -> None:
     Path("sim/press_4.png").unlink()
     refused = compared("sim", "real", "--out", "out")
-    assert refused.exit_code == 2 and "--pair name" in told(refused.output)
+    assert refused.exit_code == 2 and "--pair name" in plain_text(refused.output)
     named = compared("sim", "real", "--pair", "name", "--out", "out")
-    assert named.exit_code == 0 and "no partner of their name" in told(named.output)
+    assert named.exit_code == 0 and "no partner of their name" in plain_text(named.output)
 
 
 @pytest.mark.slow
 def test_compare_prints_warnings(good: FrameSet, real: FrameSet) -> None:
     save(changed(good, lambda image: np.ascontiguousarray(image[..., ::-1]), "all"), Path("bgr"))
-    assert "red and blue look swapped" in told(compared("bgr", "real", "--out", "a").output)
+    assert "red and blue look swapped" in plain_text(compared("bgr", "real", "--out", "a").output)
     save(blank(real), Path("blank"))
-    assert "A: no contact" in told(compared("blank", "real", "--out", "b").output)
+    assert "A: no contact" in plain_text(compared("blank", "real", "--out", "b").output)
 
 
 @pytest.mark.slow
@@ -154,7 +154,7 @@ def test_compare_with_calibrations_adds_surfaces_and_invariance() -> None:
         Image.fromarray(reference[:100]).save(Path("small") / name)
     wrong = compared("small", "real", *both, "--pair", "name", "--out", "wrong")
     assert wrong.exit_code == 2
-    assert "small is 260 x 100 px, the calibration of A is of 260 x 200" in told(wrong.output)
+    assert "small is 260 x 100 px, the calibration of A is of 260 x 200" in plain_text(wrong.output)
 
 
 @pytest.mark.slow

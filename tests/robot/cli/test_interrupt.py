@@ -48,6 +48,18 @@ def test_signal_before_first_poll_ends_command_at_once(
 
 
 @pytest.mark.parametrize("number", NUMBERS)
+def test_stored_signal_is_passed_on_once(number: signal.Signals) -> None:
+    passed_on: list[bool] = []
+    with Interrupt(lambda: passed_on.append(True)) as interrupt:
+        assert not interrupt()
+        os.kill(os.getpid(), number)
+        assert passed_on == [True]
+        with pytest.raises(KeyboardInterrupt):
+            os.kill(os.getpid(), number)
+    assert passed_on == [True]
+
+
+@pytest.mark.parametrize("number", NUMBERS)
 def test_polled_signal_ends_in_order_and_second_at_once(number: signal.Signals) -> None:
     with Interrupt() as interrupt:
         assert not interrupt() and interrupt.exit_code == 0

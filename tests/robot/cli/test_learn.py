@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from tests.robot.cli.invoked import tacsim, told
+from tests.robot.cli.invoked import plain_text, tacsim
 
 
 @pytest.mark.parametrize("words", [("train", "squeeze"), ("export", "policy", "runs/x", "--out", "x.onnx")])
@@ -35,7 +35,7 @@ def test_tensorboard_without_its_package_names_it(tmp_path: Path, monkeypatch: p
     monkeypatch.setattr(importlib.util, "find_spec", find)
     result = tacsim("train", "squeeze", "--algorithm", "ppo", "--tensorboard", "--out", tmp_path / "run")
     assert result.exit_code == 2
-    assert "needs tensorboard, which is not installed: pip install tensorboard" in told(result.stderr)
+    assert "needs tensorboard, which is not installed: pip install tensorboard" in plain_text(result.stderr)
     assert not (tmp_path / "run").exists()
 
 
@@ -45,5 +45,5 @@ def test_tensorboard_of_dagger_is_refused(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: name or there(name, *rest))
     result = tacsim("train", "squeeze", "--tensorboard", "--out", tmp_path / "run")
     assert result.exit_code == 2
-    assert "dagger writes no log for TensorBoard" in told(result.stderr)
+    assert "dagger writes no log for TensorBoard" in plain_text(result.stderr)
     assert not (tmp_path / "run").exists()

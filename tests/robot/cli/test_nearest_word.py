@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.robot.cli.invoked import TINY, tacsim, told
+from tests.robot.cli.invoked import TINY, plain_text, tacsim
 
 pytestmark = pytest.mark.usefixtures("empty_folder")
 
@@ -57,18 +57,30 @@ def test_the_nearest_word_is_offered(command: str, nearest: str, tmp_path: Path)
     (tmp_path / "pictures").mkdir()
     done = tacsim(*command.split())
     assert done.exit_code == 2, done.output
-    assert nearest in told(done.stderr)
+    assert nearest in plain_text(done.stderr)
 
 
 @pytest.mark.parametrize(
     ("policy", "right"),
-    [("scriptd", "scripted"), ("lerned", "learned"), ("nearby:atc", "act"), ("nearby:Pol.mak", None)],
-)
-def test_a_policy_of_a_run(tmp_path: Path, policy: str, right: str | None) -> None:
+    [
+        ("scriptd", "scripted"), ("lerned", "learned"), ("nearby:atc", "act"), ("nearby:Pol.mak", None),
+        ("move.cvs.csv", "move.csv"), ("min.onnx", "mine.onnx"),
+    ],
+)  # fmt: skip
+def test_a_policy_of_a_run(tmp_path: Path, policy: str, right: str | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("robot.rig.sim_rig.make_world", lambda scene: pytest.fail("the simulation was opened"))
+    for name in ("move.csv", "mine.onnx"):
+        (tmp_path / name).touch()
     (tmp_path / "nearby.py").write_text("def act(observation): ...\nclass Pol: ...\n")
     done = tacsim("run", "--policy", policy, *TINY)
     assert done.exit_code == 2
     assert right is None or f"did you mean '{right}'?" in done.stderr
+
+
+def test_a_file_of_code_is_no_policy_but_holds_one(tmp_path: Path) -> None:
+    (tmp_path / "mine.py").touch()
+    done = tacsim("run", "--policy", "mine.py")
+    assert done.exit_code == 2 and "name what the file defines: 'mine:NAME'" in done.stderr
 
 
 def test_a_rig_file(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from tacsim.record.reader import read_episode
-from tests.robot.cli.invoked import START, TINY, environment, tacsim, told
+from tests.robot.cli.invoked import START, TINY, environment, plain_text, tacsim
 
 pytestmark = pytest.mark.usefixtures("empty_folder")
 
@@ -76,7 +76,7 @@ def test_film_that_cannot_be_made_is_refused_before_anything_runs(
     (tmp_path / "mine.gif").write_text("keep")
     result = tacsim(*words)
     assert result.exit_code == 2
-    assert said in told(result.stderr)
+    assert said in plain_text(result.stderr)
     assert [path.name for path in tmp_path.iterdir()] == ["mine.gif"]
     assert (tmp_path / "mine.gif").read_text() == "keep"
 

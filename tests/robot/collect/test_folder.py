@@ -23,7 +23,7 @@ from robot.collect.workers import Piece, SetError, Stopped
 from robot.common import whole_file
 from tacsim.config import load_scene
 from tacsim.models.scene import Sphere
-from tests.robot.cli.invoked import START, environment, tacsim, told
+from tests.robot.cli.invoked import START, environment, plain_text, tacsim
 from tests.robot.collect.small import contents, job, rows
 
 pytestmark = pytest.mark.usefixtures("empty_folder")
@@ -293,7 +293,7 @@ def test_bad_input_is_refused_before_anything_is_written(words: tuple[str, ...],
     if own:
         _balls(tmp_path / "few")
     done = tacsim("collect", "press", "--preset", "learn", "--count", "1", *own, *words, "--out", "set")
-    assert done.exit_code == 2 and says in told(done.output)
+    assert done.exit_code == 2 and says in plain_text(done.output)
     if "--ray" not in words:
         assert not (tmp_path / "set").exists()
 

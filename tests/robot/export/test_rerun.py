@@ -16,7 +16,7 @@ import pytest
 from robot.export.rerun_log import EpisodeLog, _colours, _triangles, blueprint
 from robot.rig.recorded import observe_episode
 from tacsim.optics.grid import canonical_cells
-from tests.robot.cli.invoked import START, environment, tacsim, told
+from tests.robot.cli.invoked import START, environment, plain_text, tacsim
 from tests.robot.export.made_up import NAMES, record
 
 needs_rerun = pytest.mark.skipif(util.find_spec("rerun") is None, reason="needs the extra 'viz'")
@@ -133,7 +133,7 @@ def test_a_rig_is_looked_at_live_and_hardware_does_not_move(monkeypatch: pytest.
     wrong = tacsim("view", "no-such-rig")
     assert wrong.exit_code == 2 and "no rig 'no-such-rig'" in wrong.stderr.replace("\n", " ")
     Path("first").mkdir()
-    assert "name the episode.mcap in it" in told(tacsim("view", "first").stderr)
+    assert "name the episode.mcap in it" in plain_text(tacsim("view", "first").stderr)
     path, _ = record("a.mcap", 2)
     assert "for rigs" in tacsim("view", str(path), "--steps", "3").stderr
 

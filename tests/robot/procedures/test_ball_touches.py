@@ -33,7 +33,7 @@ from tacsim.interface import Pose
 from tacsim.models.hardware import Placement
 from tacsim.models.sensor import SensorModel
 from tests.calibration.touches import BALL_RADIUS, made_touches, posed
-from tests.robot.cli.invoked import tacsim, told
+from tests.robot.cli.invoked import plain_text, tacsim
 from tests.robot.procedures.ball_on_post import BallOnPost
 
 RIG = """
@@ -151,7 +151,7 @@ def test_touch_file_invalid_line_is_named(damage: Callable[[str], str], said: st
     path = write_record(tmp_path / "touches.yaml", touch_file(touches, BALL_RADIUS))
     path.write_text(damage(path.read_text()))
     done = tacsim("calibrate", "touch", path, "--out", tmp_path / "out")
-    assert done.exit_code == 2 and re.search(said, told(done.stderr)), done.output
+    assert done.exit_code == 2 and re.search(said, plain_text(done.stderr)), done.output
     assert not (tmp_path / "out").exists()
 
 
@@ -175,7 +175,7 @@ def test_command_invalid_input_exits_2_without_traceback(tmp_path: Path) -> None
     ):
         done = tacsim("calibrate", "touch", *words, "--out", tmp_path / "out")
         assert done.exit_code == 2, (words, done.output)
-        assert said in told(done.stderr), (words, done.output)
+        assert said in plain_text(done.stderr), (words, done.output)
         assert not (tmp_path / "out").exists()
 
 
@@ -246,7 +246,7 @@ def test_ball_touches_mock_arm_finds_sensor_pose(tmp_path: Path) -> None:
     assert np.degrees(se3.pose_distance(Pose(), off)[1]) < 0.8 < 5.0 < np.degrees(se3.pose_distance(true, nominal)[1])
     kept = tmp_path / "out" / "touches.yaml"
     assert len(read_touches(kept).touches) == len(report["used"]) >= 6
-    assert f"without the arm: tacsim calibrate touch {kept}" in told(done.stderr)
+    assert f"without the arm: tacsim calibrate touch {kept}" in plain_text(done.stderr)
     words = ["calibrate", "touch", str(kept), "--out", str(tmp_path / "again")]
     again = tacsim(*words)
     assert again.exit_code == 0, again.output
@@ -277,7 +277,7 @@ def test_ball_touches_interrupted_keep_measurements(ends: str, tmp_path: Path, m
     words = ["calibrate", "touch", "--rig", "mock", "--arm", "upper", "--sensor", "upper", "--ball-radius", "4 mm"]
     done = tacsim(*words, "--out", tmp_path / "out")
     assert done.exit_code == (130 if ends == "stopped" else 1), done.output
-    said = told(done.stderr)
+    said = plain_text(done.stderr)
     assert f"recorded: {tmp_path / 'out' / 'touches.yaml'}; to calibrate from it again" in said
     assert ("5 touches are kept, nothing is calibrated" if ends == "stopped" else "most touches failed") in said
     assert len(read_touches(tmp_path / "out" / "touches.yaml").touches) == 5

@@ -21,7 +21,7 @@ from tacsim.interface import Pose
 from tests.calibration.boards import CHARUCO, LENS, facing, photograph
 from tests.calibration.poses.test_hand_eye import CAMERA, made_sights
 from tests.calibration.touches import posed
-from tests.robot.cli.invoked import tacsim, told
+from tests.robot.cli.invoked import plain_text, tacsim
 from tests.robot.procedures.seen_arm import SeenArm
 
 RIG = """
@@ -50,7 +50,7 @@ sensors:
 def run(*words: object) -> tuple[int, str, str]:
     done = tacsim("calibrate", "hand-eye", *words)
     assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
-    return done.exit_code, done.stdout, told(done.stderr)
+    return done.exit_code, done.stdout, plain_text(done.stderr)
 
 
 @pytest.mark.parametrize("fixed", [False, True])

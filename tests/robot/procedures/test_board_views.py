@@ -21,7 +21,7 @@ from tacsim.config import load_model
 from tacsim.interface import EndOfEpisode, TactileFrame
 from tacsim.record.images import encode_png, read_image
 from tests.calibration.boards import DOTS, LENS, facing, photograph, tilted
-from tests.robot.cli.invoked import START, tacsim, told
+from tests.robot.cli.invoked import START, plain_text, tacsim
 
 Move = np.ndarray | Callable[[int], np.ndarray]
 EMPTY = np.full((480, 640, 3), 128, np.uint8)
@@ -189,5 +189,5 @@ def test_command_invalid_input_exits_2(tmp_path: Path) -> None:
     ):
         done = tacsim("calibrate", "lens", *words, "--out", tmp_path / "out")
         assert done.exit_code == 2, (words, done.output)
-        assert said in told(done.stderr), (words, done.output)
+        assert said in plain_text(done.stderr), (words, done.output)
         assert not (tmp_path / "out").exists()

@@ -29,7 +29,7 @@ from tacsim.interface import EndOfEpisode, TactileFrame
 from tacsim.record.images import read_image
 from tests.calibration.dotted import draw, lattice_points
 from tests.calibration.presses import BALL, BALL_PX, COLUMNS, PITCH, ROWS, HiddenSensor
-from tests.robot.cli.invoked import START, tacsim, told
+from tests.robot.cli.invoked import START, plain_text, tacsim
 
 SENSOR = HiddenSensor(3)
 EMPTY = SENSOR.empty()
@@ -372,5 +372,5 @@ def test_command_invalid_input_exits_2(tmp_path: Path) -> None:
     ):
         done = tacsim("calibrate", "sensor", *words, "--out", tmp_path / "out")
         assert done.exit_code == code, (words, done.output)
-        assert said in told(done.stderr), (words, done.output)
+        assert said in plain_text(done.stderr), (words, done.output)
         assert not (tmp_path / "out").exists()

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.robot.serve.browser import NAMES, Browser, find_browser
+from tests.browser import NAMES, Browser, find_browser
 from tests.robot.serve.served import REAL_TIME, Served
 from tests.robot.waiting import PATIENCE
 
@@ -98,6 +98,7 @@ def test_a_policy_is_started_stopped_and_its_recording_kept(served: Served, tmp_
         assert browser.messages == []
 
 
+@pytest.mark.promise(16)
 @pytest.mark.slow
 def test_a_hostile_page_moves_nothing(served: Served, tmp_path: Path) -> None:
     """A page of another origin, in the browser of the operator; it even knows the token."""

@@ -87,6 +87,7 @@ def test_page_is_served_and_shows_pictures(served: Served, page: Page) -> None:
     assert page.pictures["upper/picture"].startswith(b"\xff\xd8") and page.view["rig"] == "mock"
 
 
+@pytest.mark.promise(16)
 @pytest.mark.parametrize("path", POSTS)
 def test_commands_need_the_token_and_the_own_page(served: Served, page: Page, path: str) -> None:
     before = page.view["phase"]
@@ -121,6 +122,7 @@ def test_a_page_without_token_looks_and_keeps_no_motion_alive(served: Served, pa
     assert served.ask("GET", "/", token="")[0] == 200
 
 
+@pytest.mark.promise(16)
 @pytest.mark.slow
 def test_motion_stops_when_the_page_is_lost(served: Served, page: Page, upper: FaultClient) -> None:
     with Page(served) as other:
@@ -136,6 +138,7 @@ def test_motion_stops_when_the_page_is_lost(served: Served, page: Page, upper: F
     page.until(lambda view: view["phase"] == "watching" and f"silent for {HEARTBEAT:g} s" in view["words"])
 
 
+@pytest.mark.promise(16)
 def test_a_stop_right_after_a_start_prevents_its_motion(served: Served, page: Page, upper: FaultClient) -> None:
     for _ in range(5):
         until(lambda: served.post("/start")[0] == 200, "start", pause=0.05)  # the last one has ended

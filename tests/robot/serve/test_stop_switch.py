@@ -39,6 +39,7 @@ def make_arm(driver: Driver) -> CommandedArm:
     return CommandedArm(cast(HardwareArm, cast(Any, driver)))
 
 
+@pytest.mark.promise(16)
 def test_an_arm_that_does_not_answer_delays_no_other() -> None:
     blocked, free = Driver(), Driver()
     blocked.block.clear()
@@ -55,6 +56,7 @@ def test_an_arm_that_does_not_answer_delays_no_other() -> None:
     until(lambda: blocked.calls == ["stop"])
 
 
+@pytest.mark.promise(16)
 def test_commands_pass_again_after_release() -> None:
     driver = Driver()
     switch, arm = StopSwitch(pytest.fail), make_arm(driver)
@@ -65,6 +67,7 @@ def test_commands_pass_again_after_release() -> None:
     assert arm.send(HERE) is HERE
 
 
+@pytest.mark.promise(16)
 def test_a_start_before_a_stop_does_not_end_it() -> None:
     driver = Driver()
     switch, arm = StopSwitch(pytest.fail), make_arm(driver)
@@ -76,6 +79,7 @@ def test_a_start_before_a_stop_does_not_end_it() -> None:
         arm.send(HERE)
 
 
+@pytest.mark.promise(16)
 def test_an_arm_that_does_not_take_the_stop_is_reported() -> None:
     reported: list[str] = []
     switch = StopSwitch(reported.append)

@@ -17,6 +17,7 @@ from tacsim.config import ConfigError, config_root, load_rig, load_scene, load_s
 SCENE_KEYS = (
     "name, physics, preset, particle_spacing, element_size, gel, gels, body, indenter, friction, gravity, settling"
 )
+NEW_SCENE = "; `tacsim new scene NAME` writes one, `tacsim list scene` prints the shipped ones"
 LENGTH = "length > 0 m, bare in m or with a unit (m, mm, cm, um)"
 
 
@@ -82,7 +83,7 @@ TEXTS = {
     "half of a mapping": ("friction: {upper: 1}", "a.yaml:1: friction of the surface 'lower' is missing; give both lower and upper"),
     "unknown name": ("body:\n  material: doh", "a.yaml:2: body.material: no material 'doh'; allowed: cold-plasticine, dough, "
                      "modelling-clay, seed, silicone, soft-clay; did you mean 'dough'?"),
-    "missing file": ("body:\n  material: my/clay.yaml", "a.yaml:2: body.material: there is no file 'my/clay.yaml'"),
+    "missing file": ("body:\n  material: my/clay.yaml", "a.yaml:2: body.material: there is no file 'my/clay.yaml'; there is no folder 'my' either; `tacsim new material NAME` writes one, `tacsim list material` prints the shipped ones"),
     "no name": ("body: {material: a b}", "a.yaml:1: body.material: 'a b' is no material; allowed: a name (cold-plasticine, dough, "
                 "modelling-clay, seed, silicone, soft-clay), or a path ending in .yaml"),
     "unknown base": ("name: x\nextends: sqeeze", "a.yaml:2: extends: no scene 'sqeeze'; allowed: knead, press, reposition, squeeze; did you mean 'squeeze'?"),
@@ -180,7 +181,7 @@ OVERRIDES = {
     "scne.preset=draft": "scne: unknown key; allowed: name, clock, period, task, scene, arms, sensors, canonical, motion, lock_step, contact, keep_out, start, record; did you mean 'scene'?",
     "scene.body.material=doh": "scene.body.material: no material 'doh'; allowed: cold-plasticine, dough, modelling-clay, seed, silicone, "
     "soft-clay; did you mean 'dough'?",
-    "scene=missing.yaml": "scene: there is no file 'missing.yaml'",
+    "scene=missing.yaml": f"scene: there is no file 'missing.yaml'{NEW_SCENE}",
     "period=3 mm": "period: '3 mm' is a length, not a time; allowed: a number [s], or a text with its unit (s, ms, us, min) such as '1.5 ms'",
     "record.arm_packages=true": "record.arm_packages: this rig has no UR arm, whose packages could be recorded; leave it out",
     "name.x=1": "name.x: 'name' is 'sim', which has no keys",
@@ -197,7 +198,7 @@ OVERRIDES = {
 
 
 @pytest.mark.parametrize(("override", "message"), OVERRIDES.items())
-def test_text_of_a_wrong_override(override: str, message: str) -> None:
+def test_text_of_a_wrong_override(override: str, message: str, empty_folder: Path) -> None:
     assert complaint(load_rig, "sim", overrides=[override]) == f"--set {override}: {message}"
 
 
@@ -206,7 +207,10 @@ def test_a_file_that_is_not_there_lists_the_names() -> None:
         complaint(load_rig, "simm")
         == "simm: no rig 'simm'; allowed: mock, press, replay, sim, stand, ur5e, ur5e-one; did you mean 'sim'?"
     )
-    assert complaint(load_rig, "my/rig.yaml") == "my/rig.yaml: there is no file 'my/rig.yaml'"
+    assert complaint(load_rig, "my/rig.yaml") == (
+        "my/rig.yaml: there is no file 'my/rig.yaml'; there is no folder 'my' either; `tacsim new rig NAME` writes one, "
+        "`tacsim list rig` prints the shipped ones"
+    )
     wrong_task = complaint(load_rig, "sim", task="sqeeze")
     assert (
         wrong_task
@@ -370,3 +374,14 @@ def check_printable(error: ConfigError) -> None:
     assert "Traceback" not in text
     assert all(line.isprintable() and ": " in line for line in text.split("\n") if not line.startswith("... and"))
     assert isinstance(error, ValueError)
+
+
+def test_a_file_that_is_not_there_hints_at_a_near_one(folder: Path) -> None:
+    (folder / "cell.yaml").write_text("extends: sim")
+    near = "cel.yaml: there is no file 'cel.yaml'; did you mean 'cell.yaml'?"
+    assert complaint(load_rig, "cel.yaml") == near
+    assert complaint(load_rig, "cell").endswith("; did you mean the file 'cell.yaml'?")
+    shipped = "; the shipped rig is called 'mock', without an ending"
+    assert complaint(load_rig, "mock.yaml") == f"mock.yaml: there is no file 'mock.yaml'{shipped}"
+    others = "; files there: cell.yaml; `tacsim new rig NAME` writes one"
+    assert others in complaint(load_rig, "x.yaml")

@@ -174,7 +174,7 @@ def test_a_lying_length_allocates_nothing(small: Path, tmp_path: Path, opcode: i
 def test_file_that_is_no_episode_is_refused_with_reason(tmp_path: Path, meta: EpisodeMeta) -> None:
     with pytest.raises(EpisodeError, match="no such file"):
         read_episode(tmp_path / "missing.mcap")
-    with pytest.raises(EpisodeError, match="is no file"):
+    with pytest.raises(EpisodeError, match="is a folder; name the episode"):
         read_episode(tmp_path)
     for content, message in (
         (b"", "magic"),

@@ -31,12 +31,12 @@ def episode(times: list[float], age: float = 0.03, live: bool = True) -> Episode
     return Episode(EpisodeMeta("bench", None, "none", 0, spec, {}), steps)
 
 
-def told(given: Episode) -> dict[str, Any] | None:
+def plain_text(given: Episode) -> dict[str, Any] | None:
     return timing_statistics(Series.from_episode(given))
 
 
 def test_period_age_alignment_and_limits() -> None:
-    config = told(episode([50.0, 50.1, 50.2, 50.3, 50.7]))
+    config = plain_text(episode([50.0, 50.1, 50.2, 50.3, 50.7]))
     assert config is not None
     assert config["period"]["median"] == pytest.approx(0.1)
     assert config["period"]["max"] == pytest.approx(0.4)
@@ -51,13 +51,13 @@ def test_period_age_alignment_and_limits() -> None:
 
 
 def test_a_slow_twin_shows_in_the_real_time_factor() -> None:
-    config = told(episode([0.0, 0.4, 0.8, 1.2]))
+    config = plain_text(episode([0.0, 0.4, 0.8, 1.2]))
     assert config is not None and config["real_time_factor"] == pytest.approx(0.25)
 
 
 def test_what_is_not_live_has_no_timing() -> None:
-    assert told(episode([0.0, 0.1, 0.2], live=False)) is None
-    assert told(replace_steps(episode([0.0, 0.1, 0.2]), 1)) is None
+    assert plain_text(episode([0.0, 0.1, 0.2], live=False)) is None
+    assert plain_text(replace_steps(episode([0.0, 0.1, 0.2]), 1)) is None
 
 
 def replace_steps(given: Episode, number: int) -> Episode:

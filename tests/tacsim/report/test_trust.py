@@ -34,7 +34,7 @@ def episode(*infos: dict[str, float]) -> Episode:
     return Episode(EpisodeMeta("bench", None, "none", 0, spec, {}), steps)
 
 
-def told(given: Episode) -> dict[str, dict[str, Any]] | None:
+def plain_text(given: Episode) -> dict[str, dict[str, Any]] | None:
     return sensor_diagnostics(Series.from_episode(given))
 
 
@@ -43,7 +43,7 @@ BAD = {"stale_left_2": 1.0, "drift_left_2": 0.12, "background_left_2": 4.25, "be
 
 
 def test_worst_values_of_episode_are_reported() -> None:
-    config = told(episode(FINE, BAD, FINE))
+    config = plain_text(episode(FINE, BAD, FINE))
     assert config == {
         "left_2": {"stale": 1, "steps": 3, "drift": 0.12, "background": 4.25, "beyond": 0.06, "kept": 0.5}
     }
@@ -55,10 +55,10 @@ def test_worst_values_of_episode_are_reported() -> None:
 
 
 def test_no_warning_without_faults_or_without_diagnostics() -> None:
-    config = told(episode(FINE, FINE))
+    config = plain_text(episode(FINE, FINE))
     assert config is not None and sensor_warnings(config) == []
-    assert told(episode({}, {})) is None and told(episode()) is None
-    blind = told(episode({"stale_left_2": 1.0}))  # a sensor without slopes and markers
+    assert plain_text(episode({}, {})) is None and plain_text(episode()) is None
+    blind = plain_text(episode({"stale_left_2": 1.0}))  # a sensor without slopes and markers
     assert blind is not None and blind["left_2"]["background"] is None
     assert [value.startswith("left_2: stale reference in 1 of 1") for _, value in sensor_warnings(blind)] == [True]
 
@@ -70,9 +70,9 @@ def test_it_survives_the_record_and_stands_in_the_report(infos, tmp_path: Path) 
         for step in made.steps:
             assert recorder.write(step)
     read = read_episode(tmp_path / "episode.mcap")
-    assert told(read) == told(made)
+    assert plain_text(read) == plain_text(made)
     paths = write_report(read, tmp_path / "report")
-    assert json.loads(paths["summary.json"].read_text())["trust"] == told(made)
+    assert json.loads(paths["summary.json"].read_text())["trust"] == plain_text(made)
     shown = [str(cell) for cell in summary_table(summarise(Series.from_episode(read)), []).columns[1].cells]
     assert any("stale reference in 1 of 2" in cell for cell in shown) == (BAD in infos)
     assert ("stale reference in 1 of 2" in paths["report.html"].read_text()) == (BAD in infos)

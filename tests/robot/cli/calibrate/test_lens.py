@@ -17,7 +17,7 @@ from tacsim.record.images import encode_png, read_image
 from tests.calibration.boards import DOTS, LENS, facing, photograph, tilted
 from tests.calibration.presses import BALL, COLUMNS, PITCH, ROWS, HiddenSensor
 from tests.calibration.test_bundle import PICTURE, calibration
-from tests.robot.cli.invoked import tacsim, told
+from tests.robot.cli.invoked import plain_text, tacsim
 
 BOARD = ["--board", "dots:9x7:2.5 mm"]
 
@@ -25,7 +25,7 @@ BOARD = ["--board", "dots:9x7:2.5 mm"]
 def run(*words: object) -> tuple[int, str, str]:
     done = tacsim("calibrate", *words)
     assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
-    return done.exit_code, done.stdout, told(done.stderr)
+    return done.exit_code, done.stdout, plain_text(done.stderr)
 
 
 @pytest.fixture(scope="module")
@@ -145,7 +145,7 @@ sensors:
 
 def doctor(rig: Path) -> tuple[int, str]:
     done = tacsim("doctor", "--rig", rig)
-    return done.exit_code, told(done.output)
+    return done.exit_code, plain_text(done.output)
 
 
 @pytest.mark.slow
@@ -184,4 +184,4 @@ def test_wrong_calibration_exits_with_2(camera: str, words: str, tmp_path: Path)
     code, said = doctor(rig)
     assert code == 2 and re.search(words, said), said
     done = tacsim("run", rig, "--out", tmp_path / "o")
-    assert done.exit_code == 2 and re.search(words, told(done.output)), done.output
+    assert done.exit_code == 2 and re.search(words, plain_text(done.output)), done.output

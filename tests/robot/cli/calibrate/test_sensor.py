@@ -18,7 +18,7 @@ from tacsim.sim.sensor import SimSensor
 from tests.calibration.dotted import draw, lattice_points
 from tests.calibration.presses import BALL, COLUMNS, PITCH, ROWS, HiddenSensor
 from tests.calibration.sources import save_picture, write_presses
-from tests.robot.cli.invoked import tacsim, told
+from tests.robot.cli.invoked import plain_text, tacsim
 from tests.tacsim.optics.surfaces import flat
 
 SIZE = f"{COLUMNS * PITCH * 1e3} mm, {ROWS * PITCH * 1e3} mm"  # of the gel that the pictures show
@@ -219,7 +219,7 @@ def test_calibrate_sensor_measures_or_reports_markers(tmp_path: Path) -> None:
     for path in home.iterdir():
         save_picture(path, sensor.presses(1)[0].image if path.stem != "background" else sensor.empty())
     ran = tacsim(*words, "--markers", "--out", tmp_path / "none")
-    assert ran.exit_code == 2 and "leave --markers out" in told(ran.stderr)
+    assert ran.exit_code == 2 and "leave --markers out" in plain_text(ran.stderr)
     assert not (tmp_path / "none").exists()
 
 

@@ -16,6 +16,7 @@ from websockets.sync.client import connect
 
 from tests.robot.waiting import PATIENCE
 
+CODES = {"ArrowLeft": 37, "ArrowRight": 39, "PageUp": 33, "PageDown": 34, "Home": 36, "End": 35, " ": 32}  # of keys
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 
 
@@ -25,10 +26,12 @@ def find_browser() -> str | None:
 
 
 class Browser:
-    """One page of a browser. `messages` holds errors and warnings of its console."""
+    """One page of a browser. `messages` holds errors and warnings of its console, `requests` the addresses that it
+    asked for; those of data in the page itself are left out."""
 
     def __init__(self, program: str, folder: Path, width: int, height: int) -> None:
         self.messages: list[str] = []
+        self.requests: list[str] = []
         self._number = 0
         self._process = subprocess.Popen(
             [program, "--headless=new", "--no-sandbox", "--disable-gpu", "--remote-debugging-port=0",
@@ -45,7 +48,7 @@ class Browser:
             (page,) = (each for each in json.load(answer) if each["type"] == "page")
         self._stack = ExitStack()
         self._socket = self._stack.enter_context(connect(page["webSocketDebuggerUrl"], max_size=None))
-        for domain in ("Page", "Runtime", "Log"):
+        for domain in ("Page", "Runtime", "Log", "Network"):
             self.call(f"{domain}.enable")
         self.call(
             "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=width < 500
@@ -86,6 +89,31 @@ class Browser:
             assert time.monotonic() < end, f"{script}: {self.run('document.body.innerText')}"
             time.sleep(0.05)
 
+    def press(self, key: str) -> None:
+        """Presses and releases a key, as "a", "End" or "ArrowLeft", in what has the focus."""
+        text = {"text": key} if len(key) == 1 else {}
+        code = CODES.get(key, 0)
+        self.call("Input.dispatchKeyEvent", type="keyDown", key=key, windowsVirtualKeyCode=code, **text)
+        self.call("Input.dispatchKeyEvent", type="keyUp", key=key, windowsVirtualKeyCode=code)
+
+    def click(self, selector: str, share: float = 0.5, drag: tuple[float, float] | None = None) -> None:
+        """Presses the mouse on an element, at `share` of its width and in the middle of its height; moves it by `drag`
+        [px], and releases it."""
+        box = f"document.querySelector({json.dumps(selector)}).getBoundingClientRect()"
+        self.run(f"document.querySelector({json.dumps(selector)}).scrollIntoView({{block: 'center'}})")
+        left, top, width, height = self.run(f"[{box}.left, {box}.top, {box}.width, {box}.height]")
+        x, y = left + share * width, top + height / 2
+        self._mouse("mouseMoved", x, y, buttons=0)
+        self._mouse("mousePressed", x, y)
+        if drag is not None:
+            for part in (0.5, 1.0):
+                self._mouse("mouseMoved", x + part * drag[0], y + part * drag[1])
+            x, y = x + drag[0], y + drag[1]
+        self._mouse("mouseReleased", x, y, buttons=0)
+
+    def _mouse(self, kind: str, x: float, y: float, buttons: int = 1) -> None:
+        self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=buttons, clickCount=1)
+
     def picture(self, file: Path) -> None:
         file.write_bytes(base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"]))
 
@@ -95,5 +123,8 @@ class Browser:
             self.messages.append(str(parameters["exceptionDetails"]))
         if message.get("method") == "Runtime.consoleAPICalled" and parameters["type"] in ("error", "warning"):
             self.messages.append(str(parameters["args"]))
+        if message.get("method") == "Network.requestWillBeSent":
+            address = parameters["request"]["url"]
+            self.requests += [] if address.startswith(("data:", "about:")) else [address]
         if message.get("method") == "Log.entryAdded" and parameters["entry"]["level"] in ("error", "warning"):
             self.messages.append(str(parameters["entry"]))

@@ -57,11 +57,20 @@ class FeatureLayers(nn.Module):
         return torch.cat(parts, dim=1)
 
     def normalise_by(self, examples: Mapping[str, Tensor]) -> None:
-        """Sets mean and deviation from `examples` (batch, ...); deviations below 1e-3 are replaced by 1."""
+        """Sets mean and deviation from `examples` (batch, ...)."""
+        axes = {key: (0, 2, 3) if key in PICTURES else (0,) for key in self.keys}
+        self.set_normalisation(
+            {
+                key: (examples[key].mean(dim=axes[key]), examples[key].std(dim=axes[key], unbiased=False))
+                for key in self.keys
+            }
+        )
+
+    def set_normalisation(self, moments: Mapping[str, tuple[Tensor, Tensor]]) -> None:
+        """Sets mean and deviation (channels,) of each key; deviations up to 1e-3 are replaced by 1."""
         for key in self.keys:
-            axes = (0, 2, 3) if key in PICTURES else (0,)
-            getattr(self, f"mean_{key}").copy_(examples[key].mean(dim=axes))
-            deviation = examples[key].std(dim=axes, unbiased=False)
+            mean, deviation = moments[key]
+            getattr(self, f"mean_{key}").copy_(mean)
             getattr(self, f"deviation_{key}").copy_(
                 torch.where(deviation > 1e-3, deviation, torch.ones_like(deviation))
             )

@@ -40,6 +40,7 @@ class Reinforce:
         self.rounds, self.actor = settings.rounds, actor
         self._seed, self._folder = training.seed, folder
         self._envs = SharedVecEnv(envs)
+        self._moments = _RunningMoments()
         self._episode_steps = envs.get_attr("task")[0].config.steps
         self._steps = settings.episodes * self._episode_steps  # of each environment in a round
         shape: dict[str, Any] = {
@@ -69,11 +70,13 @@ class Reinforce:
         model, total = self._model, self._steps * self._envs.num_envs
         model.set_random_seed(int(random.integers(2**31)))  # of NumPy, torch, and the next reset of the environments
         if number == 0:
-            self._normalise_features(random)
+            self._envs.reset()
+            self._normalise_features(self._play_randomly(random))
         model._last_obs = None  # so episodes start again
         watch = _EpisodeWatch(lambda done: report_progress(f"round {number + 1} of {self.rounds}", done, total))
         model.learn(total, callback=watch, reset_num_timesteps=False, tb_log_name=type(model).__name__.lower())
-        self._copy_actor()
+        self._copy_actor()  # as it acted, before its features are normalised anew
+        self._normalise_features(watch.features())
         if isinstance(model, SAC):
             write_whole(self._folder / f"memory-{number % 2}.npz", self._write_memory)
         rewards, distances, successes, forces = np.array(watch.ends).T
@@ -92,6 +95,8 @@ class Reinforce:
             "model": self._model.get_parameters(),
             "timesteps": self._model.num_timesteps,
             "updates": self._model._n_updates,
+            "moments": self._moments.moments,
+            "rounds": self._moments.rounds,
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
@@ -100,21 +105,24 @@ class Reinforce:
         model.set_parameters(state["model"], device="cpu")
         model.num_timesteps, model._n_updates = int(state["timesteps"]), int(state["updates"])
         self.actor.load_state_dict(state["actor"])
+        self._moments.moments, self._moments.rounds = dict(state["moments"]), int(state["rounds"])
         if isinstance(model, SAC):
             self._read_memory(self._folder / f"memory-{(model.num_timesteps // total - 1) % 2}.npz")
 
-    def _normalise_features(self, random: np.random.Generator) -> None:
-        """Normalises the features by episodes in which each environment repeats one random action. A goal is met within
-        a hundredth of a feature's range: without this PPO does not learn, with it in 150,000 steps (docs/train.md)."""
-        envs, episodes = self._envs, 2
-        parts = [envs.reset()]
-        for _ in range(episodes):
-            actions = random.uniform(-1.0, 1.0, (envs.num_envs, *(envs.action_space.shape or ()))).astype(np.float32)
-            parts += [envs.step(actions)[0] for _ in range(self._episode_steps)]
-        examples = {key: torch.from_numpy(np.concatenate([part[key] for part in parts])) for key in parts[0]}
+    def _play_randomly(self, random: np.random.Generator) -> Arrays:
+        """Features (n, ...) of an episode of random actions in each environment."""
+        envs = self._envs
+        shape = self._episode_steps, envs.num_envs, *(envs.action_space.shape or ())
+        parts = [envs.step(actions)[0] for actions in random.uniform(-1.0, 1.0, shape).astype(np.float32)]
+        return {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+
+    def _normalise_features(self, features: Arrays) -> None:
+        """Normalises the features of all networks by the mean of the moments of all rounds until now. A goal is met
+        within a hundredth of a feature's range: with features as they are PPO does not learn to meet it."""
+        self._moments.add(features)
         for module in self._model.policy.modules():
             if isinstance(module, FeatureLayers):
-                module.normalise_by(examples)
+                module.set_normalisation(self._moments.normalisation())
 
     def _copy_actor(self) -> None:
         policy = self._model.policy
@@ -153,16 +161,39 @@ def _batch_size(total: int, max_size: int) -> int:
 _MEMORY_ARRAYS = ("actions", "rewards", "dones", "timeouts")
 
 
+class _RunningMoments:
+    """Mean and mean square of each channel of features, over rounds of equal weight."""
+
+    def __init__(self) -> None:
+        self.rounds = 0
+        self.moments: dict[str, torch.Tensor] = {}  # (2, channels)
+
+    def add(self, features: Arrays) -> None:
+        """A round with features (n, ...)."""
+        self.rounds += 1
+        for key, values in features.items():
+            channels = np.moveaxis(values, 1, 0).reshape(values.shape[1], -1).astype(np.float64)
+            found = torch.from_numpy(np.stack([channels.mean(axis=1), (channels**2).mean(axis=1)]))
+            before = self.moments.get(key, found)
+            self.moments[key] = before + (found - before) / self.rounds
+
+    def normalisation(self) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
+        """Mean and standard deviation of each channel."""
+        return {key: (mean, (square - mean**2).clamp(min=0.0).sqrt()) for key, (mean, square) in self.moments.items()}
+
+
 class _EpisodeWatch(BaseCallback):
-    """Collects the end of each episode: sum of rewards, distance [m], success, peak force [N]."""
+    """Collects the end of each episode (sum of rewards, distance [m], success, peak force [N]), and all features."""
 
     def __init__(self, report_progress: Any) -> None:
         super().__init__()
         self.ends: list[tuple[float, float, float, float]] = []
+        self._seen: list[Arrays] = []
         self._tell, self._done = report_progress, 0
 
     def _on_step(self) -> bool:
         rewards = self.locals["rewards"]
+        self._seen.append(self.locals["new_obs"])
         self._sums = getattr(self, "_sums", 0.0) + np.asarray(rewards, float)
         self._done += len(rewards)
         for index in np.flatnonzero(self.locals["dones"]).tolist():
@@ -171,6 +202,10 @@ class _EpisodeWatch(BaseCallback):
             self._sums[index] = 0.0
         self._tell(self._done)
         return True
+
+    def features(self) -> Arrays:
+        """(n, ...) of all steps."""
+        return {key: np.concatenate([seen[key] for seen in self._seen]) for key in self._seen[0]}
 
 
 class SharedVecEnv(VecEnv):

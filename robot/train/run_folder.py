@@ -15,7 +15,7 @@ from tacsim.models.policy import PolicySpec, Training
 from tacsim.models.quantity import Config
 from tacsim.models.text import printable_line
 
-FORMAT = 1  # of run.json and of checkpoints; other versions are refused
+FORMAT = 2  # of run.json and of checkpoints; other versions are refused
 CHECKPOINT = "checkpoint.pt"
 ReportProgress = Callable[[str, int, int], None]  # text, amount done, total amount
 

@@ -24,7 +24,7 @@ import onnxruntime  # noqa: E402
 from robot.deploy.onnx_policy import OnnxPolicy  # noqa: E402
 from robot.train.dagger import MIN_SPREAD, infer_actions  # noqa: E402
 from robot.train.network import MAX_BYTES, MAX_DEVIATIONS, ExportError, FeatureLayers, PolicyNetwork, export  # noqa: E402  # noqa: E402
-from robot.train.run_folder import RunError, RunFolder  # noqa: E402
+from robot.train.run_folder import FORMAT, RunError, RunFolder  # noqa: E402
 from robot.train.train import begin_run, export_policy, make_environments, new_actor, train  # noqa: E402
 from tacsim.config import ConfigError  # noqa: E402
 from tacsim.control import NoTouch  # noqa: E402
@@ -337,7 +337,7 @@ def test_begin_run_invalid_range_limit_raises(
 
 def other_format(folder: Path) -> None:
     text = json.loads((folder / "run.json").read_text())
-    (folder / "run.json").write_text(json.dumps({**text, "format": 2}))
+    (folder / "run.json").write_text(json.dumps({**text, "format": FORMAT + 1}))
 
 
 def cut_off(folder: Path) -> None:
@@ -353,7 +353,7 @@ def code(folder: Path) -> None:
         def __reduce__(self) -> Any:
             return os.system, (f"touch {folder}/ran",)
 
-    torch.save({"format": 1, "rounds": 1, "state": Evil(), "curve": []}, folder / "checkpoint.pt")
+    torch.save({"format": FORMAT, "rounds": 1, "state": Evil(), "curve": []}, folder / "checkpoint.pt")
 
 
 def misfit(folder: Path) -> None:
@@ -365,7 +365,7 @@ def misfit(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("spoil", "said"),
     [
-        (other_format, "has format 2, this version of tacsim continues format 1"),
+        (other_format, f"has format {FORMAT + 1}, this version of tacsim continues format {FORMAT}"),
         (lambda folder: (folder / "run.json").write_text("{"), "run.json cannot be read"),
         (cut_off, "is not a checkpoint of this version"),
         (other_checkpoint, "has format 7"),

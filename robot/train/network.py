@@ -59,14 +59,14 @@ class FeatureLayers(nn.Module):
     def normalise_by(self, examples: Mapping[str, Tensor]) -> None:
         """Sets mean and deviation from `examples` (batch, ...)."""
         axes = {key: (0, 2, 3) if key in PICTURES else (0,) for key in self.keys}
-        self.set_normalisation(
+        self.set_moments(
             {
                 key: (examples[key].mean(dim=axes[key]), examples[key].std(dim=axes[key], unbiased=False))
                 for key in self.keys
             }
         )
 
-    def set_normalisation(self, moments: Mapping[str, tuple[Tensor, Tensor]]) -> None:
+    def set_moments(self, moments: Mapping[str, tuple[Tensor, Tensor]]) -> None:
         """Sets mean and deviation (channels,) of each key; deviations up to 1e-3 are replaced by 1."""
         for key in self.keys:
             mean, deviation = moments[key]

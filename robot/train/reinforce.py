@@ -71,11 +71,11 @@ class Reinforce:
         model.set_random_seed(int(random.integers(2**31)))  # of NumPy, torch, and the next reset of the environments
         if number == 0:
             self._envs.reset()
-            self._normalise_features(self._play_randomly(random))
+            self._normalise_features(self._play_random_episode(random))
         model._last_obs = None  # so episodes start again
         watch = _EpisodeWatch(lambda done: report_progress(f"round {number + 1} of {self.rounds}", done, total))
         model.learn(total, callback=watch, reset_num_timesteps=False, tb_log_name=type(model).__name__.lower())
-        self._copy_actor()  # as it acted, before its features are normalised anew
+        self._copy_actor()  # as it acted, before its features are normalised again
         self._normalise_features(watch.features())
         if isinstance(model, SAC):
             write_whole(self._folder / f"memory-{number % 2}.npz", self._write_memory)
@@ -109,7 +109,7 @@ class Reinforce:
         if isinstance(model, SAC):
             self._read_memory(self._folder / f"memory-{(model.num_timesteps // total - 1) % 2}.npz")
 
-    def _play_randomly(self, random: np.random.Generator) -> Arrays:
+    def _play_random_episode(self, random: np.random.Generator) -> Arrays:
         """Features (n, ...) of an episode of random actions in each environment."""
         envs = self._envs
         shape = self._episode_steps, envs.num_envs, *(envs.action_space.shape or ())
@@ -122,7 +122,7 @@ class Reinforce:
         self._moments.add(features)
         for module in self._model.policy.modules():
             if isinstance(module, FeatureLayers):
-                module.set_normalisation(self._moments.normalisation())
+                module.set_moments(self._moments.mean_and_deviation())
 
     def _copy_actor(self) -> None:
         policy = self._model.policy
@@ -177,7 +177,7 @@ class _RunningMoments:
             before = self.moments.get(key, found)
             self.moments[key] = before + (found - before) / self.rounds
 
-    def normalisation(self) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
+    def mean_and_deviation(self) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
         """Mean and standard deviation of each channel."""
         return {key: (mean, (square - mean**2).clamp(min=0.0).sqrt()) for key, (mean, square) in self.moments.items()}
 

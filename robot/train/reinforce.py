@@ -39,9 +39,14 @@ class Reinforce:
         settings = training.reinforce
         self.rounds, self.actor = settings.rounds, actor
         self._seed, self._folder = training.seed, folder
-        self._envs = SharedVecEnv(envs)
-        self._moments = _RunningMoments()
         self._episode_steps = envs.get_attr("task")[0].config.steps
+        discount = 0.99  # of the reward of one control step later
+        # PPO: returns of the size of a reward. Its value network starts at 0, and the gradients of large errors, which
+        # are clipped together with those of the actions, would hide these.
+        ppo = training.algorithm == "ppo"
+        self._reward_scale = (1.0 - discount) / (1.0 - discount**self._episode_steps) if ppo else 1.0
+        self._envs = SharedVecEnv(envs, self._reward_scale)
+        self._moments = _RunningMoments()
         self._steps = settings.episodes * self._episode_steps  # of each environment in a round
         shape: dict[str, Any] = {
             "net_arch": [training.width, training.width],
@@ -50,13 +55,14 @@ class Reinforce:
         }
         common: dict[str, Any] = {
             "learning_rate": settings.rate,
+            "gamma": discount,
             "batch_size": _batch_size(self._steps * envs.num_envs, settings.batch),
             "policy_kwargs": shape,
             "device": "cpu",
             "seed": training.seed,
             "tensorboard_log": str(folder / "tensorboard") if tensorboard else None,
         }
-        if training.algorithm == "ppo":
+        if ppo:
             self._model: Any = PPO("MultiInputPolicy", self._envs, n_steps=self._steps, **common)
         else:
             self._model = SAC(
@@ -82,7 +88,7 @@ class Reinforce:
         rewards, distances, successes, forces = np.array(watch.ends).T
         figures = {
             "steps": float(total), "distance": float(distances.mean()), "success": float(successes.mean()),
-            "peak_force": float(forces.mean()), "return": float(rewards.mean()),
+            "peak_force": float(forces.mean()), "return": float(rewards.mean()) / self._reward_scale,
         }  # fmt: skip
         for name, value in figures.items():
             model.logger.record(f"round/{name}", value)
@@ -217,12 +223,14 @@ class SharedVecEnv(VecEnv):
 
     infos have `terminal_observation`, `TimeLimit.truncated` and `is_success` at the end of an episode, and the other
     entries of `TacsimEnv.step`. Raises ValueError for environments that are not reset in the step in which they end.
+
+    reward_scale: factor of all rewards.
     """
 
-    def __init__(self, envs: Environments) -> None:
+    def __init__(self, envs: Environments, reward_scale: float = 1.0) -> None:
         if envs.autoreset_mode != AutoresetMode.SAME_STEP:
             raise ValueError(f"stable-baselines3 needs autoreset_mode 'SameStep', got '{envs.autoreset_mode.value}'")
-        self.envs = envs
+        self.envs, self._reward_scale = envs, reward_scale
         self._actions: NDArray[np.float32] | None = None
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
 
@@ -252,7 +260,7 @@ class SharedVecEnv(VecEnv):
             else:
                 info = select_environment(step_info, index)
             infos.append(info)
-        return copy_arrays(seen), rewards.astype(np.float32), done, infos
+        return copy_arrays(seen), (self._reward_scale * rewards).astype(np.float32), done, infos
 
     def close(self) -> None:
         self.envs.close()

@@ -46,6 +46,10 @@ def random_actions(preset: str, motion: str, repeat: int) -> list[Measurement]:
     160 x 120, and, for flowing motion, their resets, each with a random choice of eight materials, sizes and goals."""
     words = f"{motion}, heights and forces"
     rows = _random_actions(preset, [f"motion={motion}"], words, resets=False, features=TOUCH_FEATURES)
+    several = f"{words}, a process for each core"
+    rows += _random_actions(
+        preset, [f"motion={motion}"], several, resets=False, features=TOUCH_FEATURES, in_processes=True
+    )
     if preset == "learn":
         picture_words = f"{motion}, two pictures of 160 x 120"
         rows += _random_actions(
@@ -55,8 +59,9 @@ def random_actions(preset: str, motion: str, repeat: int) -> list[Measurement]:
 
 
 def _random_actions(
-    preset: str, more: list[str], words: str, *, resets: bool, features: dict[str, Any] | None = None
-) -> list[Measurement]:
+    preset: str, more: list[str], words: str, *, resets: bool, features: dict[str, Any] | None = None,
+    in_processes: bool = False,
+) -> list[Measurement]:  # fmt: skip
     """Rows of a step and, with `resets`, of a reset."""
     import gymnasium
 
@@ -65,7 +70,8 @@ def _random_actions(
     overrides = [f"scene.preset={preset}", "task.steps=1000", *more]
     options: dict[str, Any] = {"overrides": overrides, "variants": list(BODIES), "features": features}
     forces, newtons = ("wrench_upper", 1.0) if features is None else ("touch", SCALES["force"])
-    many = gymnasium.make_vec("tacsim/Squeeze-v0", NUMBER, autoreset_mode="Disabled", **options)
+    processes = {"processes": None} if in_processes else {}  # None: one for each core
+    many = gymnasium.make_vec("tacsim/Squeeze-v0", NUMBER, autoreset_mode="Disabled", **options, **processes)
     alone = gymnasium.make("tacsim/Squeeze-v0", **options).unwrapped
     rng = np.random.default_rng(0)
     actions = rng.uniform(-1.0, 1.0, (WARM + STEPS, NUMBER, 2)).astype(np.float32)
@@ -83,7 +89,8 @@ def _random_actions(
     rows = [
         Measurement(
             timing, difference, "N difference", "the first of them alone", f"{words}: a step of {NUMBER}",
-            figures={"env_steps_per_s": 1 / share, "cpu_ms_per_env_step": timing.processor / NUMBER * 1e3},
+            figures={"env_steps_per_s": 1 / share}
+            | ({} if in_processes else {"cpu_ms_per_env_step": timing.processor / NUMBER * 1e3}),
         )
     ]  # fmt: skip
     if resets:

@@ -24,7 +24,7 @@ from calibration.height.slopes import (
 )
 from calibration.height.surface_finder import ForwardSteps, Integrator, slopes_of
 from calibration.light import tuning
-from calibration.light.checks.consistency import find_blurred_presses, find_inconsistent_presses, find_reference_contact
+from calibration.light.consistency import find_blurred_presses, find_inconsistent_presses, find_reference_contact
 from calibration.light.darkness import find_dark_press, fit_darkness, is_direction_free
 from calibration.light.dent import NoCircle, dent_gradient, dent_height, max_dent_slope
 from calibration.light.fit import (
@@ -323,7 +323,7 @@ def _fit_shadows(
 
 
 def _warnings(presses: Sequence[BallPress], mean: FloatArray, left_out: int) -> list[str]:
-    """Notes on frames to check by eye; calibration.light.checks.verdict judges the figures."""
+    """Notes on frames to check by eye; calibration.light.verdict judges the figures."""
     found = []
     drift = float(np.abs(np.median([(p.drift / mean).mean(axis=(0, 1)) for p in presses], axis=0)).max())
     if drift > STALE_COLOUR:

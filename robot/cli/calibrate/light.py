@@ -13,8 +13,8 @@ from robot.cli.terminal import EXIT_UNTRUSTED, EXIT_UNVERIFIED
 if TYPE_CHECKING:
     from calibration.frame_set import FrameSet
     from calibration.lens.view import GelView
-    from calibration.light.checks.verdict import KnownScale
     from calibration.light.fit import LightFit
+    from calibration.light.verdict import KnownScale
     from calibration.profiles import SensorProfile
     from tacsim.models.sensor import CameraNoise, Markers, PictureRegion
 
@@ -53,7 +53,7 @@ def fit_light(read: FrameSet, ball: float, dot: float | None) -> LightFit:
             more = [frame.image for frame in read.untouched]
             return calibrate_light(read.reference, named, ball, erase, more)
     except NoDirection as why:
-        from calibration.light.checks.verdict import GREY, is_grey
+        from calibration.light.verdict import GREY, is_grey
 
         grey = f"; {GREY}: give the camera's own, in colour" if is_grey(read.reference) else ""
         notes.print(f"{why}{grey}")
@@ -94,8 +94,8 @@ def write_calibration(
     """Prints the calibration, writes its bundle and the page of its verdict. Exits with EXIT_UNTRUSTED or
     EXIT_UNVERIFIED according to the verdict."""
     from calibration.bundle import write_bundle
-    from calibration.light.checks.verdict import PAGE_FILE, draw_residuals, evaluate_calibration, write_page
     from calibration.light.noise import measure_skin
+    from calibration.light.verdict import PAGE_FILE, draw_residuals, evaluate_calibration, write_page
 
     verdict = evaluate_calibration(fit, scale, dots=found is None and _has_dots(fit))
     _print_fit(fit, scale.pixel_pitch, found)

@@ -177,7 +177,7 @@ def _calibrate(
     read = rectify_frames(read, options.region, seen)
     found = find_lattice(read, pitch) if options.markers else None
     fit = fit_light(read, options.ball / pitch, None if found is None else found.radius / pitch)
-    from calibration.light.checks.verdict import KnownScale
+    from calibration.light.verdict import KnownScale
 
     published = options.pitch is None and options.view is None and options.size is None
     dots = None if found is None or options.marker_pitch is None else (found.pitch, options.marker_pitch)

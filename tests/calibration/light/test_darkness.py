@@ -13,10 +13,10 @@ from typer.testing import CliRunner
 from calibration.bundle import read_bundle, read_sensor_model, write_bundle
 from calibration.height.slopes import DarknessSlopes
 from calibration.light.calibrator import NoDirection, calibrate_light
-from calibration.light.checks.verdict import KnownScale, evaluate_calibration, write_page
 from calibration.light.darkness import dark_circle, is_direction_free
 from calibration.light.dent import NoCircle
 from calibration.light.fit import LightFit
+from calibration.light.verdict import KnownScale, evaluate_calibration, write_page
 from calibration.normaliser import normaliser_for_calibration, normaliser_for_pictures
 from robot.cli import app
 from tacsim.interface import TactileFrame

@@ -7,11 +7,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from calibration.light.checks import tuning
+from calibration.light import tuning
 from calibration.light.dent import NoCircle, dent_gradient, find_contact_circle
 from calibration.light.photometry import photometric_features
 from calibration.light.press import BallPress, Window, gaussian_blur
-from calibration.light.tuning import RIM_BLUR, SKIRT_RADIUS
 from tacsim.interface import FloatArray, Image, Mask
 
 # Two presses are of one sensor if the light of each explains the other up to the larger of these shares of its power
@@ -30,7 +29,7 @@ def find_inconsistent_presses(presses: Sequence[BallPress], windows: Sequence[Wi
         return []
     sets = []
     for press, window in zip(presses, windows, strict=True):
-        gradient = dent_gradient(window.u, window.v, press.circle, thick * ball, ball, RIM_BLUR)
+        gradient = dent_gradient(window.u, window.v, press.circle, thick * ball, ball, tuning.RIM_BLUR)
         terms = photometric_features(gradient, window.u, window.v, 3, 0)
         sets.append((terms.T @ terms, terms.T @ window.change, float((window.change**2).sum())))
     unexplained = np.zeros((len(sets), len(sets)))
@@ -69,7 +68,7 @@ def find_blurred_presses(presses: Sequence[BallPress], reference: Image, mean: F
     still = reference.astype(np.float64)
     for press in presses:
         beside = np.asarray(
-            (press.distance() > SKIRT_RADIUS * press.circle.radius) & press.lit.all(axis=2), dtype=np.bool_
+            (press.distance() > tuning.SKIRT_RADIUS * press.circle.radius) & press.lit.all(axis=2), dtype=np.bool_
         )
         if not beside.any():
             beside = np.asarray(press.lit.all(axis=2), dtype=np.bool_)
@@ -102,9 +101,9 @@ def find_reference_contact(
             )
     changes = np.stack(
         [
-            np.where((press.distance() > SKIRT_RADIUS * press.circle.radius)[..., None], press.change, np.nan).astype(
-                np.float32
-            )
+            np.where(
+                (press.distance() > tuning.SKIRT_RADIUS * press.circle.radius)[..., None], press.change, np.nan
+            ).astype(np.float32)
             for press in presses
         ]
     )
@@ -133,6 +132,6 @@ def _describe_dent(change: FloatArray, mean: FloatArray, reference: Image, ball:
         return None
     height, width = reference.shape[:2]
     inside = min(circle.x, circle.y, width - 1 - circle.x, height - 1 - circle.y) >= circle.radius
-    if circle.explained_share < tuning.MIN_EXPLAINED_SHARE or not inside:
+    if circle.explained_share < tuning.MIN_EXPLAINED_REFERENCE or not inside:
         return None
     return f"({circle.x:.0f}, {circle.y:.0f}) px"

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from calibration.light.calibrator import calibrate_light
-from calibration.light.checks.verdict import KnownScale, evaluate_calibration, write_page
 from calibration.light.dent import contact_depth
 from calibration.light.fit import LightFit
 from calibration.light.press_shapes import Stretch
+from calibration.light.verdict import KnownScale, evaluate_calibration, write_page
 from tests.calibration.presses import BALL, BALL_PX, COLUMNS, PITCH, ROWS, HiddenSensor
 
 SIZE = (COLUMNS * PITCH, ROWS * PITCH)  # of the gel that the pictures show

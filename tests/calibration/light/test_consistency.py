@@ -8,10 +8,10 @@ import pytest
 
 from calibration.errors import BadFrames
 from calibration.light.calibrator import calibrate_light
-from calibration.light.checks.consistency import find_blurred_presses, find_inconsistent_presses, find_reference_contact
-from calibration.light.checks.verdict import KnownScale, evaluate_calibration
+from calibration.light.consistency import find_blurred_presses, find_inconsistent_presses, find_reference_contact
 from calibration.light.press import BallPress, Window, find_press, gaussian_blur, mean_reference_colour
 from calibration.light.press_shapes import find_other_balls, fit_stretch
+from calibration.light.verdict import KnownScale, evaluate_calibration
 from tests.calibration.presses import BALL, BALL_PX, COLUMNS, PITCH, ROWS, HiddenSensor
 
 SCALE = KnownScale(PITCH, BALL, (COLUMNS * PITCH, ROWS * PITCH))

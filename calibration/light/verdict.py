@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from calibration.light.checks import tuning
+from calibration.light import tuning
 from calibration.light.dent import contact_depth
 from calibration.light.fit import LightFit
 from tacsim.interface import Image
@@ -111,13 +111,13 @@ def _check_images(fit: LightFit) -> Iterable[Finding]:
             "slopes cannot be found in such pictures; only how dark it is tells of depth",
         )  # fmt: skip
     yield from _exceed_limits(
-        tuning.MAX_RESIDUAL_SHARE, unexplained, "{:.0%} of what the presses change is no smooth function of the slope",
+        tuning.RESIDUAL_LIMITS, unexplained, "{:.0%} of what the presses change is no smooth function of the slope",
         "shadows, or a light that tells no direction; is the ball a ball, and exposure fixed?",
     )  # fmt: skip
     if not fit.predictions:
         return
     yield from _exceed_limits(
-        tuning.MAX_NORMAL_ERROR, float(np.mean([press.angle for press in fit.predictions])),
+        tuning.NORMAL_ERROR_LIMITS, float(np.mean([press.angle for press in fit.predictions])),
         "normals of presses that took no part are off by {:.1f} degrees",
         "look at residuals.png: what do the worst show?",
     )  # fmt: skip
@@ -143,7 +143,9 @@ def _check_shape(fit: LightFit) -> Iterable[Finding]:
 def _check_scale(fit: LightFit, scale: KnownScale) -> Iterable[Finding]:
     ball = scale.ball_radius / scale.pixel_pitch
     ratios = [press.circle.radius / ball for press in fit.presses]
-    wide = [press.name for press, ratio in zip(fit.presses, ratios, strict=True) if ratio > tuning.MAX_CONTACT_RATIO]
+    wide = [
+        press.name for press, ratio in zip(fit.presses, ratios, strict=True) if ratio > tuning.MAX_PRESS_CONTACT_RATIO
+    ]
     if len(wide) > len(ratios) / 3 or (
         len(ratios) >= tuning.MIN_PRESSES and min(ratios) > tuning.MAX_COMMON_CONTACT_RATIO
     ):

@@ -1,1 +1,0 @@
-"""Checks of a calibration of light: checks of its pictures, and the verdict."""

@@ -3,6 +3,8 @@ options."""
 
 from __future__ import annotations
 
+import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -155,7 +157,7 @@ def _run_promises(marked: str, repeat: int, file: Path, interrupt: Interrupt, *o
     with subprocess.Popen(words, cwd=ROOT, stdout=sys.stderr, start_new_session=True) as tests:
         while tests.poll() is None:
             if interrupt():
-                tests.terminate()
+                os.killpg(tests.pid, signal.SIGTERM)  # also the servers and mocks that the tests have started
                 tests.wait()
                 print_error("stopped by a signal; no file is written")
                 raise typer.Exit(interrupt.exit_code)

@@ -183,7 +183,6 @@ def require_packages(command: str, extra: str, *modules: str) -> None:
     from robot.open import CannotOpen
 
     if missing := [name for name in modules if find_spec(name) is None]:
-        verb = "is" if len(missing) == 1 else "are"
-        raise CannotOpen(
-            f"{command} needs {' and '.join(missing)}, which {verb} not installed: pip install 'tacsim[{extra}]'"
-        )
+        *others, last = missing
+        named = f"{', '.join(others)} and {last}, which are" if others else f"{last}, which is"
+        raise CannotOpen(f"{command} needs {named} not installed: pip install 'tacsim[{extra}]'")

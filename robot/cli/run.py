@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from robot.cli.options import TASK_POLICIES, Out, Overrides, complete_names
+from robot.cli.options import TASK_POLICIES, Out, Overrides, complete_names, require_packages
 from robot.cli.output import (
     Bar,
     busy,
@@ -103,6 +103,8 @@ def run(
         raise typer.BadParameter(f"{save_view} must end in .rrd, as the viewer's files do", param_hint="--save-view")
     if film is not None:
         _require_film(film, "--film")
+    if view or save_view is not None:
+        require_packages("a view", "viz", "rerun")
     sys.path.append(str(Path.cwd()))  # --policy mine:act finds mine.py here, as with `python -m`; last on the path
     loaded = load_with_task(rig, task, set_ or [])
     for words in loaded.notes:

@@ -200,7 +200,9 @@ def _geometry_override(indenter: str, given: dict[str, Any]) -> str:
     mesh = {"path": str(Path(indenter).absolute()), "scale": None, "repair": False}
     if indenter not in usual and not indenter.lower().endswith(SUFFIXES):
         known = f"sphere, cylinder, box, or the path of a mesh file ({', '.join(SUFFIXES)})"
-        words = f"'{indenter}' is not an indenter; allowed: {known}{suggest_word(indenter, usual)}"
+        other_words = {"ball": "sphere", "cube": "box", "cuboid": "box", "rod": "cylinder"}
+        hint = suggest_word(other_words.get(indenter.lower(), indenter), usual)
+        words = f"'{indenter}' is not an indenter; allowed: {known}{hint}"
         raise typer.BadParameter(words, param_hint="INDENTER")
     described = usual.get(indenter, mesh)
     for name, value in given.items():

@@ -19,6 +19,7 @@ from tacsim.geometry.tiles import cached_tiled_distance
 from tacsim.interface import FloatArray, Pose, short_repr
 from tacsim.models.scene import Box, Cylinder, Gel, GelSurface, Indenter, Mesh, Scene
 from tacsim.models.sensor import SensorModel
+from tacsim.models.text import millimetres
 from tacsim.optics.grid import image_grid
 from tacsim.optics.render import Renderer
 from tacsim.optics.surface import SurfaceSample, SurfaceTable, sample_surface
@@ -147,7 +148,8 @@ def require_reachable(gel: Gel, motion: PressMotion) -> None:
     max_slide = 3.0  # widths of the gel; farther, the indenter has left the gel
     thickness, farthest, slide = gel.size[2], max_slide * max(gel.size[:2]), math.hypot(*motion.slide)
     if not 0 < motion.depth < thickness:
-        raise ValueError(f"depth is {motion.depth:.4g} m; it must be above 0 and below the gel's {thickness:.4g} m")
+        words = f"depth is {millimetres(motion.depth)}; it must be above 0 and below the gel's {millimetres(thickness)}"
+        raise ValueError(f"{words}; a thicker gel: gel.size of the scene")
     if not slide <= farthest:
         raise ValueError(f"slide is {slide:.4g} m long; at most {max_slide:g} widths of the gel, {farthest:.4g} m")
     if not abs(motion.twist) <= MAX_TWIST:

@@ -70,4 +70,10 @@ def _nearest_word(word: str, allowed: Iterable[str]) -> str | None:
         return None
     by_lower = {name.lower(): name for name in allowed}
     close = difflib.get_close_matches(word.lower(), by_lower, n=1, cutoff=0.6)
+    if not close and len(word) > 2:  # "simulation" for "sim", and "mod" for "modelling-clay"
+        close = [
+            name
+            for name in by_lower
+            if len(name) > 2 and (word.lower().startswith(name) or name.startswith(word.lower()))
+        ]
     return by_lower[close[0]] if close else None

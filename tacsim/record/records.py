@@ -45,7 +45,9 @@ def check_magic(file: BinaryIO, what: str) -> None:
     """Raises EpisodeError for a file that does not begin like an MCAP file, and for one with the profile of another
     program, such as a ROS 2 bag: tacsim's files have no profile."""
     if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
-        raise EpisodeError(f"{what}: not an MCAP file (it does not begin with the MCAP magic bytes)")
+        raise EpisodeError(
+            f"{what}: not an MCAP file (it does not begin with the MCAP magic bytes); name the episode.mcap of a run"
+        )
     if read_profile(file):
         raise foreign_file_error(file, what)
     file.seek(len(MCAP0_MAGIC))

@@ -93,7 +93,7 @@ def test_version_option_prints_version() -> None:
         (("run", "--set", "arms.upper.driver=replay"), "arms.upper"),
         (("run", "replay"), "sensors.finger.source"),
         (("press", "missing.stl"), "missing.stl: no such mesh file"),
-        (("press", "sphere", "--depth", "9 mm"), "0.009"),
+        (("press", "sphere", "--depth", "9 mm"), "9 mm"),
         (("press", "sphere", "--depth", "0"), "must be above 0"),
         (("press", "sphere", "--slide", "10 m, 0"), "at most 3 widths of the gel, 0.06 m"),
         (("press", "sphere", "--twist", "1e9 deg"), "the limits are -3600 and 3600 deg"),

@@ -37,6 +37,8 @@ pytestmark = pytest.mark.usefixtures("empty_folder")
         ("run --set scene.gel.materail.density=1000", "did you mean 'material'?"),
         ("run --set clock=sm", "did you mean 'sim'?"),
         ("press shpere", "did you mean 'sphere'?"),
+        ("press ball", "did you mean 'sphere'?"),
+        ("run simulation", "did you mean 'sim'?"),
         ("press sphere --sensor digt", "did you mean 'digit'?"),
         ("compare pres pictures", "did you mean 'press'?"),
         ("collect episodes sim --randomise sqeeze --out set", "did you mean 'squeeze'?"),

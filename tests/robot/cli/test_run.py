@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import signal
 import subprocess
@@ -66,7 +67,8 @@ def test_run_writes_film_and_film_of_recording_has_same_frames(tmp_path: Path) -
     [
         (("run", "--film", "a.avi"), "a.avi must end in .gif or .mp4"),
         (("run", "--film", "mine.gif"), "exists already"),
-        (("film", "missing.mcap"), "missing.mcap: no such file"),
+        (("film", "missing.mcap"), "missing.mcap: no such file; `tacsim run` records an episode.mcap"),
+        (("film", "mine.gif", "--out", "b.gif"), "name the episode.mcap of a run"),
         (("film", "missing.mcap", "--out", "a.txt"), "a.txt must end in .gif or .mp4"),
     ],
 )
@@ -79,6 +81,17 @@ def test_film_that_cannot_be_made_is_refused_before_anything_runs(
     assert said in plain_text(result.stderr)
     assert [path.name for path in tmp_path.iterdir()] == ["mine.gif"]
     assert (tmp_path / "mine.gif").read_text() == "keep"
+
+
+@pytest.mark.parametrize("option", [("--view",), ("--save-view", "a.rrd")])
+def test_a_view_that_cannot_be_shown_is_refused_before_the_simulation(
+    option: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "rerun" else find(name))
+    monkeypatch.setattr("robot.rig.sim_rig.make_world", lambda scene: pytest.fail("the simulation was opened"))
+    result = tacsim("run", *option)
+    assert result.exit_code == 2 and "a view needs rerun, which is not installed" in result.stderr
 
 
 @pytest.mark.slow

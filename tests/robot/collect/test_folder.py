@@ -274,7 +274,7 @@ def test_the_command_makes_a_set_of_a_folder_of_objects(tmp_path: Path) -> None:
         (("--objects", "empty"), "empty holds no mesh file"),
         (("--objects", "broken"), "stl: is no STL"),
         (("--depth", "1..0.1mm"), "goes from the larger to the smaller"),
-        (("--depth", "0.1..5mm"), "it must be above 0 and below the gel's 0.004 m"),
+        (("--depth", "0.1..5mm"), "it must be above 0 and below the gel's 4 mm"),
         (("--depth", "0.1..1"), "has no unit"),
         (("--shear", "0.1..1deg"), "'0.1deg'"),
         (("--sensor", "nobody"), "nobody"),

@@ -188,7 +188,7 @@ def test_twenty_shapes_are_closed_meshes_that_a_gel_has_room_for(tmp_path: Path)
     ("given", "words"),
     [
         ({"depth": (0.5e-3, 0.1e-3)}, "depth ranges from 0.0005 to 0.0001: give the smaller number first"),
-        ({"depth": (0.1e-3, 4e-3)}, "depth is 0.004 m; it must be above 0 and below the gel's 0.004 m"),
+        ({"depth": (0.1e-3, 4e-3)}, "depth is 4 mm; it must be above 0 and below the gel's 4 mm"),
         ({"tilt": (0.0, math.pi)}, "at most 45 deg"),
         ({"shear": (-1e-3, 0.0)}, "shear starts at -0.001"),
         ({"scene": Scene()}, "has no indenter"),

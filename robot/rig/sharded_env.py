@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from robot.common.process import PARENT, Child, end_with_parent
 from robot.errors import DeviceNotConnectedError
-from tacsim.compute.threads import core_count
+from tacsim.compute.threads import thread_count
 from tacsim.gym.vector import TacsimVectorEnv
 
 Infos = dict[str, Any]
@@ -79,9 +79,13 @@ class _Worker:
             raise error
         return result
 
+    def disconnect(self) -> None:
+        """Asks the process to end."""
+        self._connection.close()
+
     def close(self) -> None:
         write_timeout = 20.0  # for compiled kernels, which Taichi writes at its end [s]
-        self._connection.close()
+        self.disconnect()
         self._child.close(write_timeout)
 
     def _ended(self) -> WorkerFailed:
@@ -103,14 +107,14 @@ class ShardedVectorEnv(VectorEnv[Any, Any, Any]):
         make: makes the environments of a process, from `num_envs` and `options`: `robot.make_vector_env`. Both are
             pickled.
         num_envs: number of environments.
-        processes: at most one for each environment. None: one for each core.
+        processes: at most one for each environment. None: one for each core, at most TACSIM_THREADS.
 
     Raises the errors of `make`, WorkerFailed.
     """
 
     def __init__(self, make: MakeEnvs, options: Mapping[str, Any], num_envs: int, processes: int | None) -> None:
         if processes is None:
-            processes = core_count()
+            processes = thread_count()
         elif type(processes) is not int or processes < 1:
             raise ValueError(f"processes is a number from 1, or None for one for each core; got {processes!r}")
         count = min(processes, max(1, num_envs))
@@ -120,7 +124,7 @@ class ShardedVectorEnv(VectorEnv[Any, Any, Any]):
         reported: set[str] = set()
         try:
             for number in range(count):
-                self._workers.append(_Worker(number, max(1, core_count() // count), reported))
+                self._workers.append(_Worker(number, max(1, thread_count() // count), reported))
             made = self._request_parts("make", [(make, {**options, "num_envs": size}) for size in self._sizes])
         except BaseException:
             self._close_workers()
@@ -250,6 +254,8 @@ class ShardedVectorEnv(VectorEnv[Any, Any, Any]):
 
     def _close_workers(self) -> None:
         for worker in self._workers:
+            worker.disconnect()
+        for worker in self._workers:
             worker.close()
 
 
@@ -364,6 +370,7 @@ def _sendable(failure: Exception) -> Exception:
 
 
 if __name__ == "__main__":
+    os.dup2(2, 1)  # nobody reads standard output
     end_with_parent(int(os.environ[PARENT]))
     with contextlib.closing(Connection(int(sys.argv[1]))) as opened:
         _serve(opened)

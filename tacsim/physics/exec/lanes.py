@@ -123,6 +123,39 @@ def store_lanes(array: ti.template(), at, values, zero):
 
 
 @ti.func
+def load_strip(array: ti.template(), at):
+    """The numbers of a strip of nodes, from index `at`."""
+    start = bounded(at, 1)
+    return strip([array[start + c] for c in range(4 * NODES)])
+
+
+@ti.func
+def store_strip(array: ti.template(), at, values, zero):
+    start = bounded(at, 1)
+    kept = strip([overwrite(zero, array[start + c], values[c]) for c in range(4 * NODES)])
+    for c in ti.static(range(4 * NODES)):
+        array[start + c] = kept[c]
+
+
+@ti.func
+def tile_vector(a):
+    """A strip with a vector of four for every node."""
+    return strip([a[c % 4] for c in range(4 * NODES)])
+
+
+@ti.func
+def tile_numbers(first, second):
+    """A strip with the numbers of its nodes, each four times."""
+    return strip([(first, second)[c // 4] for c in range(4 * NODES)])
+
+
+@ti.func
+def where_nonzero(condition, numbers):
+    """The numbers of a strip where those of another one are not 0, else 0."""
+    return strip([ti.select(condition[c] != 0.0, numbers[c], 0.0) for c in range(4 * NODES)])
+
+
+@ti.func
 def load_rows(particles: ti.template(), at, stride, first: ti.template(), count: ti.template(), rows: ti.template()):
     """Loads `count` rows of a block of LANES particles, beginning with row `first`. In short loops: LLVM would split a
     longer one across the rows and gather."""
@@ -151,12 +184,11 @@ def read_three(rows: ti.template(), row: ti.template(), lane):
 
 
 @ti.func
-def read_four(rows: ti.template(), row: ti.template(), lane, spare):
-    """Four numbers of one lane. The write between the reads prevents LLVM from gathering; spare: number of a row, not
-    known to the compiler."""
-    first = vec2(rows[row, lane], rows[row + 1, lane])
-    rows[spare, lane] = first[0]
-    return vec4(first[0], first[1], rows[row + 2, lane], rows[row + 3, lane])
+def write_four(numbers: ti.template(), lane, first: ti.template(), fourth):
+    """Writes four numbers of one lane side by side."""
+    for d in ti.static(range(3)):
+        numbers[lane, d] = first[d]
+    numbers[lane, 3] = fourth
 
 
 @ti.func

@@ -15,11 +15,11 @@ from tacsim.physics.exec.lanes import (
     bounded,
     hide_from_compiler,
     load_strip,
+    mask_strip,
     part_range,
     store_strip,
     strip,
     tile_numbers,
-    where_nonzero,
 )
 
 # In `changes` (environments, 3, nodes, 4): momentum change and mass of a node; mean velocity change of the cell whose
@@ -65,7 +65,7 @@ def grid_changes(env: ti.template(), part, body: ti.template()):
 
 
 @ti.func
-def sum_of_eight(changes: ti.template(), at, line, plane, zero):
+def sum_around(changes: ti.template(), at, line, plane, zero):
     """Sum of a strip over eight nodes, or cells, of which the first is at `at`."""
     total = load_strip(changes, hide_from_compiler(zero, at))
     for p, q, r in ti.static([(0, 0, 1), (0, 1, 0), (0, 1, 1), (1, 0, 0), (1, 0, 1), (1, 1, 0), (1, 1, 1)]):
@@ -90,7 +90,7 @@ def cell_means(env: ti.template(), part, which, body: ti.template()):
             here, first, last = i * plane + j * line, low[2] // NODES, (ti.min(high[2], nz - 1) + NODES - 1) // NODES
             for n in range(first, last):
                 at = here + 4 * NODES * n
-                store_strip(body.changes, to + at, sum_of_eight(body.changes, source + at, line, plane, zero), zero)
+                store_strip(body.changes, to + at, sum_around(body.changes, source + at, line, plane, zero), zero)
             for n in range(first, last):
                 total = load_strip(body.changes, to + here + 4 * NODES * n)
                 inverse0, inverse1 = inverse_mass(total[3]), inverse_mass(total[4 * NODES - 1])
@@ -134,9 +134,9 @@ def second_changes(env: ti.template(), part, body: ti.template()):
             for n in range(low[2] // NODES, high[2] // NODES):
                 node = (i * ny + j) * nz + NODES * n
                 change, cells = load_strip(body.changes, changes_at(env, CHANGE, node)), changes_at(env, CELL, node)
-                mean = sum_of_eight(body.changes, cells - plane - line - 4, line, plane, zero)
+                mean = sum_around(body.changes, cells - plane - line - 4, line, plane, zero)
                 mass = 0.5 * tile_numbers(change[3], change[4 * NODES - 1])
-                mean = where_nonzero(nodes_inside(env, i, j, n), mean)
+                mean = mask_strip(nodes_inside(env, i, j, n), mean)
                 second = motion * mass * mean + (1.0 - 2.0 * motion) * change
                 store_strip(body.changes, changes_at(env, SECOND, node), second, zero)
 
@@ -148,11 +148,11 @@ def filter_strip(env: ti.template(), body: ti.template(), it, i, j, n):
     node, line, plane, motion = (i * ny + j) * nz + NODES * n, 4 * nz, 4 * nz * ny, motion_of(env)
     at, cells = changes_at(env, CHANGE, node), changes_at(env, CELL, node) - plane - line - 4
     change, second = load_strip(body.changes, at), load_strip(body.changes, changes_at(env, SECOND, node))
-    mean = sum_of_eight(body.changes, cells, line, plane, zero)
+    mean = sum_around(body.changes, cells, line, plane, zero)
     inverse = motion * tile_numbers(inverse_mass(change[3]), inverse_mass(change[4 * NODES - 1]))
     own, filtered = 1.0, 0.0
     if has_velocities(env, it):
         own, filtered = env.param(layout.OWN_WEIGHT), env.param(layout.FILTERED_WEIGHT)
     weight = (own - 1.0) * nodes_inside(env, i, j, n) + 1.0
-    wanted = filtered * where_nonzero(nodes_inside(env, i, j, n) * inverse, 0.5 * mean - inverse * second)
+    wanted = filtered * mask_strip(nodes_inside(env, i, j, n) * inverse, 0.5 * mean - inverse * second)
     store_strip(body.changes, at, weight * inverse * change + wanted + (1.0 - motion) * change, zero)

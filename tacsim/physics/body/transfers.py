@@ -61,6 +61,7 @@ from tacsim.physics.exec.lanes import (
     min_over_lanes,
     overwrite,
     part_range,
+    read_four,
     read_three,
     slot_of,
     store_rows,
@@ -68,13 +69,13 @@ from tacsim.physics.exec.lanes import (
     tile_numbers,
     tile_vector,
     vec3,
-    vec4,
-    write_four,
     write_rows,
 )
 
 Strips = ti.types.ndarray(dtype=strip, ndim=1)  # masses, velocities
 
+# Node (i, j, n) receives w_i w_j w_n (q + i ax + j ay + n az); each of these is momentum x, y, z and mass.
+MOMENTUM, MOMENTUM_X, MOMENTUM_Y, MOMENTUM_Z = range(0, 16, 4)
 # Sums over the stencil: plain, and by x, y, z with the node's number as a factor
 SUM, BY_X, BY_Y, BY_Z = range(4)
 
@@ -144,14 +145,14 @@ def return_block(
 
 @ti.func
 def scatter_particle(
-    env: ti.template(), body: ti.template(), momenta: ti.template(), grid: ti.template(), shares: ti.template(),
-    indices: ti.template(), lane, float_zero,
+    env: ti.template(), body: ti.template(), momentum: ti.template(), grid: ti.template(), shares: ti.template(),
+    indices: ti.template(), lane,
 ):  # fmt: skip
-    """Adds momentum and mass of one particle to the nodes of its stencil: node (i, j, n) receives
-    w_i w_j w_n (q + i ax + j ay + n az). momenta: local arrays of q, ax, ay, az, each momentum x, y, z and mass;
-    shares: weights of the stencil's lines along z. float_zero: 0 that the compiler does not know; with a known 0 this
-    lane would differ from its neighbours."""
-    q, ax, ay, az = [vec4([momenta[m][lane, c] for c in range(4)]) for m in range(4)]
+    """Adds momentum and mass of one particle to the nodes of its stencil; shares: weights of its lines along z."""
+    # 0 that the compiler does not know: with a known 0 this lane would differ from its neighbours
+    float_zero = ti.cast(env.count(layout.ZERO), ti.f32)
+    spare = hide_from_compiler(env.count(layout.ZERO), 16)
+    q, ax, ay, az = [read_four(momentum, row, lane, spare) for row in (MOMENTUM, MOMENTUM_X, MOMENTUM_Y, MOMENTUM_Z)]
     for s in ti.static(range(LINE)):
         w = tile_numbers(grid[W_Z + NODES * s, lane], grid[W_Z + NODES * s + NODES - 1, lane])
         by_x, by_y = w * tile_vector(ax), w * tile_vector(ay)
@@ -195,13 +196,12 @@ def particles_to_grid(env: ti.template(), part, it, body: ti.template()):
     stress = filled(0.0, 6, LANES)
     rate = filled(0.0, 12, LANES)  # velocity, affine velocity
     push = filled(0.0, 3, LANES)
-    # Four numbers of each lane, side by side: at most this many become vector stores with shuffles, not scatters
-    q_of, ax_of, ay_of, az_of = [filled(0.0, LANES, 4) for _ in range(4)]
-    momenta = ti.static((q_of, ax_of, ay_of, az_of))
-    float_zero = ti.cast(zero, ti.f32)
+    momentum = filled(0.0, 17, LANES)
     grid = filled(0.0, STENCIL, LANES)
     shares = filled(0.0, 9, LANES)  # of the stencil's lines
     indices = filled(0, INDICES, LANES)
+    for lane in range(LANES):
+        momentum[MOMENTUM + 3, lane] = mass
     for block in range(first_block, last_block):
         start = env.index * layout.PARTICLE_ROWS * stride + block * LANES
         load_rows(body.particles, start, stride, layout.STRAIN, 7, old)
@@ -222,17 +222,17 @@ def particles_to_grid(env: ti.template(), part, it, body: ti.template()):
             q = mass * (read_three(rate, 0, lane) + read_three(push, 0, lane))
             write_rows(push, 0, lane, vec3(0.0))
             q -= grid[OFFSET_ROW, lane] * ax + grid[OFFSET_ROW + 1, lane] * ay + grid[OFFSET_ROW + 2, lane] * az
-            write_four(q_of, lane, q, mass)
-            write_four(ax_of, lane, ax, 0.0)
-            write_four(ay_of, lane, ay, 0.0)
-            write_four(az_of, lane, az, 0.0)
+            write_rows(momentum, MOMENTUM, lane, q)
+            write_rows(momentum, MOMENTUM_X, lane, ax)
+            write_rows(momentum, MOMENTUM_Y, lane, ay)
+            write_rows(momentum, MOMENTUM_Z, lane, az)
             for i, j in ti.static(ti.ndrange(3, 3)):
                 shares[3 * i + j, lane] = grid[W_X + i, lane] * grid[W_Y + j, lane]
         store_rows(body.particles, start, stride, layout.STRAIN, 7, new, zero)
         store_rows(body.particles, start, stride, layout.PUSH, 3, push, zero)
         for lane in range(ti.min(LANES, env.count(layout.PARTICLES) - block * LANES)):
             lost += indices[OFF_GRID_INDEX, lane]
-            scatter_particle(env, body, momenta, grid, shares, indices, lane, float_zero)
+            scatter_particle(env, body, momentum, grid, shares, indices, lane)
     record_addition(env, slot_of(part), layout.OFF_GRID, float(lost))
 
 

@@ -150,7 +150,7 @@ def tile_numbers(first, second):
 
 
 @ti.func
-def where_nonzero(condition, numbers):
+def mask_strip(condition, numbers):
     """The numbers of a strip where those of another one are not 0, else 0."""
     return strip([ti.select(condition[c] != 0.0, numbers[c], 0.0) for c in range(4 * NODES)])
 
@@ -184,11 +184,12 @@ def read_three(rows: ti.template(), row: ti.template(), lane):
 
 
 @ti.func
-def write_four(numbers: ti.template(), lane, first: ti.template(), fourth):
-    """Writes four numbers of one lane side by side."""
-    for d in ti.static(range(3)):
-        numbers[lane, d] = first[d]
-    numbers[lane, 3] = fourth
+def read_four(rows: ti.template(), row: ti.template(), lane, spare):
+    """Four numbers of one lane. The write between the reads prevents LLVM from gathering; spare: number of a row, not
+    known to the compiler."""
+    first = vec2(rows[row, lane], rows[row + 1, lane])
+    rows[spare, lane] = first[0]
+    return vec4(first[0], first[1], rows[row + 2, lane], rows[row + 3, lane])
 
 
 @ti.func

@@ -9,13 +9,13 @@ from tacsim.physics.exec.lanes import (
     PARTS,
     hide_from_compiler,
     load_strip,
+    mask_strip,
     overwrite,
     strip,
     tile_numbers,
     tile_vector,
     vec3,
     vec4,
-    where_nonzero,
 )
 from tacsim.physics.worlds.tuning import ROTATION_BOOST
 
@@ -140,10 +140,10 @@ def grid_update(env: ti.template(), part, it, drive: ti.template(), body: ti.tem
                 k = numbers + ti.cast(NODES * n, ti.f32)
                 before = body.velocities[at]
                 change = load_strip(body.changes, changes_at(env, CHANGE, NODES * node))
-                velocity = where_nonzero(known, before) + change + line_value(lift, lifts, i, j, k)
+                velocity = mask_strip(known, before) + change + line_value(lift, lifts, i, j, k)
                 t = only_upper + share * ti.max(0.0, ti.min(1.0, place + i * places[0] + j * places[1] + k * places[2]))
                 imposed = (1.0 - t) * line_value(lower, lowers, i, j, k) + t * line_value(upper, uppers, i, j, k)
                 velocity -= damping * dt * (velocity - imposed - tile_vector(four_of(across)))
                 masses = motion * tile_numbers(change[3], change[4 * NODES - 1])
                 # a mass that is not 0: true of NaN, which must not be hidden
-                body.velocities[at] = overwrite(zero, before, where_nonzero(masses, velocity))
+                body.velocities[at] = overwrite(zero, before, mask_strip(masses, velocity))

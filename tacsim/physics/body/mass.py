@@ -7,7 +7,7 @@ new grid has no earlier velocities and is not filtered. Why: docs/decisions/0002
 """
 
 from tacsim.compute.runtime import ti
-from tacsim.physics.body.transfers import has_velocities, node_sum
+from tacsim.physics.body.transfers import node_sum
 from tacsim.physics.exec import layout
 from tacsim.physics.exec.lanes import (
     NODES,
@@ -77,13 +77,9 @@ def sum_around(changes: ti.template(), at, line, plane, zero):
 def cell_means(env: ti.template(), part, which, body: ti.template()):
     """Mean velocity change of the cells whose first nodes are this part's, from the momentum changes at `which`. Cells
     behind the last node of a line, which whole strips include, are not read."""
-    nx, ny, nz, zero = (
-        env.count(layout.GRID),
-        env.count(layout.GRID + 1),
-        env.count(layout.GRID + 2),
-        env.count(layout.ZERO),
-    )
+    nx, ny, nz = env.count(layout.GRID), env.count(layout.GRID + 1), env.count(layout.GRID + 2)
     source, to, line, plane = changes_at(env, which, 0), changes_at(env, CELL, 0), 4 * nz, 4 * nz * ny
+    zero = env.count(layout.ZERO)
     low, high = box_of_part(env, part)
     for i in range(low[0], ti.min(high[0], nx - 1)):
         for j in range(low[1], ti.min(high[1], ny - 1)):
@@ -93,14 +89,8 @@ def cell_means(env: ti.template(), part, which, body: ti.template()):
                 store_strip(body.changes, to + at, sum_around(body.changes, source + at, line, plane, zero), zero)
             for n in range(first, last):
                 total = load_strip(body.changes, to + here + 4 * NODES * n)
-                inverse0, inverse1 = inverse_mass(total[3]), inverse_mass(total[4 * NODES - 1])
-                mean = tile_numbers(inverse0, inverse1) * total
-                store_strip(body.changes, to + here + 4 * NODES * n, mean, zero)
-
-
-@ti.func
-def inverse_mass(mass):
-    return ti.select(mass != 0.0, 1.0 / mass, 0.0)  # true of NaN
+                mass = tile_numbers(total[3], total[4 * NODES - 1])
+                store_strip(body.changes, to + here + 4 * NODES * n, mask_strip(mass, total / mass), zero)
 
 
 @ti.func
@@ -142,17 +132,16 @@ def second_changes(env: ti.template(), part, body: ti.template()):
 
 
 @ti.func
-def filter_strip(env: ti.template(), body: ti.template(), it, i, j, n):
-    """Replaces the momentum changes of a strip of nodes by their velocity changes in this substep."""
+def filter_strip(env: ti.template(), body: ti.template(), motion, own, filtered, i, j, n):
+    """Replaces the momentum changes of a strip of nodes by their velocity changes in this substep. motion: of
+    `motion_of`; own, filtered: weights of nodes that are not at the border of the grid."""
     ny, nz, zero = env.count(layout.GRID + 1), env.count(layout.GRID + 2), env.count(layout.ZERO)
-    node, line, plane, motion = (i * ny + j) * nz + NODES * n, 4 * nz, 4 * nz * ny, motion_of(env)
+    node, line, plane = (i * ny + j) * nz + NODES * n, 4 * nz, 4 * nz * ny
     at, cells = changes_at(env, CHANGE, node), changes_at(env, CELL, node) - plane - line - 4
     change, second = load_strip(body.changes, at), load_strip(body.changes, changes_at(env, SECOND, node))
     mean = sum_around(body.changes, cells, line, plane, zero)
-    inverse = motion * tile_numbers(inverse_mass(change[3]), inverse_mass(change[4 * NODES - 1]))
-    own, filtered = 1.0, 0.0
-    if has_velocities(env, it):
-        own, filtered = env.param(layout.OWN_WEIGHT), env.param(layout.FILTERED_WEIGHT)
-    weight = (own - 1.0) * nodes_inside(env, i, j, n) + 1.0
-    wanted = filtered * mask_strip(nodes_inside(env, i, j, n) * inverse, 0.5 * mean - inverse * second)
-    store_strip(body.changes, at, weight * inverse * change + wanted + (1.0 - motion) * change, zero)
+    mass, inside = tile_numbers(change[3], change[4 * NODES - 1]), nodes_inside(env, i, j, n)
+    wanted = ((own - 1.0) * inside + 1.0) * (change / mass)
+    wanted += filtered * mask_strip(inside, 0.5 * mean - second / mass)
+    # a mass that is not 0: true of NaN, which must not be hidden
+    store_strip(body.changes, at, motion * mask_strip(mass, wanted) + (1.0 - motion) * change, zero)

@@ -89,13 +89,13 @@ def grid_update(env: ti.template(), part, it, drive: ti.template(), body: ti.tem
     origin = env.param3(layout.ORIGIN)
     weight = env.param3(layout.GRAVITY)
     force0, force1 = part_sum(env, layout.FORCE), part_sum(env, layout.FORCE + 6)
-    mass, particles = env.param(layout.BODY_MASS), env.count(layout.PARTICLES)
-    push = mass * particles * weight  # total force on the body: weight and contact
+    particle_mass, particles = env.param(layout.BODY_MASS), env.count(layout.PARTICLES)
+    push = particle_mass * particles * weight  # total force on the body: weight and contact
     push -= drive_rotation(drive, env, it, 0) @ force0
     push -= drive_rotation(drive, env, it, 1) @ force1
     touches0, touches1 = force0.norm_sqr() > 0.0, force1.norm_sqr() > 0.0
     mean = part_sum(env, layout.VELOCITY_SUM) / particles
-    boost = ((env.param(layout.RIGID_MASS_SCALE) - 1.0) * dt / (mass * particles)) * push
+    boost = ((env.param(layout.RIGID_MASS_SCALE) - 1.0) * dt / (particle_mass * particles)) * push
     p0, p1 = drive_row(drive, env, it, 0, 3), drive_row(drive, env, it, 1, 3)
     centre = env.param3(layout.CENTRE)
     torque = -moment_about(centre, p0, drive_rotation(drive, env, it, 0), force0, part_sum(env, layout.FORCE + 3))
@@ -125,25 +125,28 @@ def grid_update(env: ti.template(), part, it, drive: ti.template(), body: ti.tem
     lower, lowers = along @ (v0 + w0.cross(x - p0)), along @ cross_columns(w0, edges)
     upper, uppers = along @ (v1 + w1.cross(x - p1)), along @ cross_columns(w1, edges)
     place, places = (x - p0).dot(axis) / length2, edges.transpose() @ axis / length2
+    # Damped: (1 - d) (velocity + lift) + d (lower + t (upper - lower) + across), with t between the sensors
+    d = damping * dt
+    lift, lifts = (1.0 - d) * lift + d * (lower + across), (1.0 - d) * lifts + d * lowers
+    pull, pulls = d * (upper - lower), d * (uppers - lowers)
+    own, filtered, kept = 1.0, 0.0, 0.0
+    if has_velocities(env, it):
+        own, filtered, kept = env.param(layout.OWN_WEIGHT), env.param(layout.FILTERED_WEIGHT), 1.0
     ny, nz, zero = env.count(layout.GRID + 1), env.count(layout.GRID + 2), env.count(layout.ZERO)
     base, motion = env.index * env.count(layout.CAPACITY), motion_of(env)
     numbers = tile_numbers(ti.cast(zero, ti.f32), ti.cast(zero + 1, ti.f32))  # of nodes in a strip; see `motion_of`
-    known = strip(ti.select(has_velocities(env, it), 1.0, 0.0))
     low, high = box_of_part(env, part)
     for i in range(low[0], high[0]):
         for j in range(low[1], high[1]):
             for n in range(low[2] // NODES, high[2] // NODES):
-                filter_strip(env, body, it, i, j, n)
+                filter_strip(env, body, motion, own, filtered, i, j, n)
             for n in range(low[2] // NODES, high[2] // NODES):
                 node = (i * ny + j) * (nz // NODES) + n
-                at = hide_from_compiler(zero, base + node)
-                k = numbers + ti.cast(NODES * n, ti.f32)
-                before = body.velocities[at]
-                change = load_strip(body.changes, changes_at(env, CHANGE, NODES * node))
-                velocity = mask_strip(known, before) + change + line_value(lift, lifts, i, j, k)
+                at, k = hide_from_compiler(zero, base + node), numbers + ti.cast(NODES * n, ti.f32)
+                before, change = body.velocities[at], load_strip(body.changes, changes_at(env, CHANGE, NODES * node))
                 t = only_upper + share * ti.max(0.0, ti.min(1.0, place + i * places[0] + j * places[1] + k * places[2]))
-                imposed = (1.0 - t) * line_value(lower, lowers, i, j, k) + t * line_value(upper, uppers, i, j, k)
-                velocity -= damping * dt * (velocity - imposed - tile_vector(four_of(across)))
-                masses = motion * tile_numbers(change[3], change[4 * NODES - 1])
+                velocity = (1.0 - d) * (mask_strip(strip(kept), before) + change)
+                velocity += line_value(lift, lifts, i, j, k) + t * line_value(pull, pulls, i, j, k)
                 # a mass that is not 0: true of NaN, which must not be hidden
-                body.velocities[at] = overwrite(zero, before, mask_strip(masses, velocity))
+                mass = motion * tile_numbers(change[3], change[4 * NODES - 1])
+                body.velocities[at] = overwrite(zero, before, mask_strip(mass, velocity))

@@ -66,6 +66,8 @@ from tacsim.physics.exec.lanes import (
     slot_of,
     store_rows,
     strip,
+    tile_numbers,
+    tile_vector,
     vec3,
     write_rows,
 )
@@ -87,18 +89,6 @@ class Body(NamedTuple):
     changes: Any = None  # see tacsim.physics.body.mass
     ends: Any = None  # this and the next: see tacsim.physics.body.tied_nodes
     shares: Any = None
-
-
-@ti.func
-def tile_vector(a):
-    """A vector of four for every node of a strip."""
-    return strip([a[c % 4] for c in range(4 * NODES)])
-
-
-@ti.func
-def tile_numbers(first, second):
-    """The numbers of the nodes of a strip, each four times."""
-    return strip([(first, second)[c // 4] for c in range(4 * NODES)])
 
 
 @ti.func

@@ -123,6 +123,39 @@ def store_lanes(array: ti.template(), at, values, zero):
 
 
 @ti.func
+def load_strip(array: ti.template(), at):
+    """The numbers of a strip of nodes, from index `at`."""
+    start = bounded(at, 1)
+    return strip([array[start + c] for c in range(4 * NODES)])
+
+
+@ti.func
+def store_strip(array: ti.template(), at, values, zero):
+    start = bounded(at, 1)
+    kept = strip([overwrite(zero, array[start + c], values[c]) for c in range(4 * NODES)])
+    for c in ti.static(range(4 * NODES)):
+        array[start + c] = kept[c]
+
+
+@ti.func
+def tile_vector(a):
+    """A strip with a vector of four for every node."""
+    return strip([a[c % 4] for c in range(4 * NODES)])
+
+
+@ti.func
+def tile_numbers(first, second):
+    """A strip with the numbers of its nodes, each four times."""
+    return strip([(first, second)[c // 4] for c in range(4 * NODES)])
+
+
+@ti.func
+def mask_strip(condition, numbers):
+    """The numbers of a strip where those of another one are not 0, else 0."""
+    return strip([ti.select(condition[c] != 0.0, numbers[c], 0.0) for c in range(4 * NODES)])
+
+
+@ti.func
 def load_rows(particles: ti.template(), at, stride, first: ti.template(), count: ti.template(), rows: ti.template()):
     """Loads `count` rows of a block of LANES particles, beginning with row `first`. In short loops: LLVM would split a
     longer one across the rows and gather."""

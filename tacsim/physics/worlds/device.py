@@ -38,14 +38,8 @@ from tacsim.physics.gel.kernels import (
     surface_at,
 )
 from tacsim.physics.gel.mass import gel_advance_filtered, gel_filter_first_pass, gel_means
-from tacsim.physics.worlds.hybrid_kernels import (
-    ContactHistories,
-    Drive,
-    Records,
-    gel_contact,
-    grid_update,
-    store_record,
-)
+from tacsim.physics.worlds.grid_motion import Drive, grid_update
+from tacsim.physics.worlds.hybrid_kernels import ContactHistories, Records, gel_contact, store_record
 from tacsim.physics.worlds.survey import BLOCKS
 from tacsim.physics.worlds.survey_kernels import Sums
 

@@ -2,7 +2,13 @@
 
 from tacsim.compute.runtime import ti
 from tacsim.compute.taichi_patches.separate_functions import compiled_separately
-from tacsim.physics.body.mass import CHANGE, SECOND, cell_means, filtered_change, grid_changes, second_changes
+from tacsim.physics.body.mass import (
+    CHANGE,
+    SECOND,
+    cell_means,
+    grid_changes,
+    second_changes,
+)
 from tacsim.physics.body.tied_node_kernels import Ends, set_tied_velocities, transfer_impulses
 from tacsim.physics.body.transfers import (
     Body,
@@ -10,7 +16,6 @@ from tacsim.physics.body.transfers import (
     block_range,
     clear_masses,
     grid_to_particles,
-    has_velocities,
     particles_to_grid,
 )
 from tacsim.physics.contact.contact import ContactHistory, max_surface_height, particle_contact, support_radius
@@ -26,18 +31,15 @@ from tacsim.physics.exec.environment import (
 )
 from tacsim.physics.exec.lanes import (
     LANES,
-    NODES,
-    ON_DEVICE,
     PARTS,
+    add_to,
     copy_of,
     filled,
     ivec3,
     load_rows,
     min_over_lanes,
-    part_range,
     read_three,
     slot_of,
-    strip,
     vec2,
     vec3,
 )
@@ -53,9 +55,8 @@ from tacsim.physics.exec.team import (
 )
 from tacsim.physics.gel.kernels import GelArrays, Gels, Lattice, contact_force_start, gel_forces, gel_of
 from tacsim.physics.gel.mass import gel_advance_filtered, gel_filter_first_pass, gel_means
-from tacsim.physics.worlds.tuning import ROTATION_BOOST
+from tacsim.physics.worlds.grid_motion import Drive, drive_rotation, drive_row, grid_update
 
-Drive = ti.types.ndarray(dtype=ti.f32, ndim=5)
 Records = ti.types.ndarray(dtype=ti.f32, ndim=4)
 STAGES = 7  # of a substep
 
@@ -67,119 +68,9 @@ BodyArrays = ti.types.argpack(
 
 
 @ti.func
-def drive_row(drive: ti.template(), env: ti.template(), it, g, r):
-    return vec3([drive[env.index, it, g, r, c] for c in range(3)])
-
-
-@ti.func
 def three_rows(particles: ti.template(), at, stride):
     """Three rows of one particle, from index `at`."""
     return vec3(particles[at], particles[at + stride], particles[at + 2 * stride])
-
-
-@ti.func
-def drive_rotation(drive: ti.template(), env: ti.template(), it, g):
-    return ti.Matrix.rows(
-        [drive_row(drive, env, it, g, 0), drive_row(drive, env, it, g, 1), drive_row(drive, env, it, g, 2)]
-    )
-
-
-@ti.func
-def part_sum(env: ti.template(), first):
-    """Sum of three numbers over all parts, in their order."""
-    total = vec3(0.0)
-    for part in ti.static(range(PARTS)):
-        total += vec3([env.partial[env.index, part, first + c] for c in range(3)])
-    return total
-
-
-@ti.func
-def moment_about(centre, origin, rotate, force, moment):
-    """Moment about `centre`, world axes, of a force and a moment about a sensor's `origin`, both in sensor axes."""
-    return rotate @ moment + (origin - centre).cross(rotate @ force)
-
-
-@ti.func
-def symmetric(env: ti.template(), first):
-    """A symmetric matrix from six numbers: xx, yy, zz, xy, xz, yz."""
-    xx, yy, zz, xy, xz, yz = [env.param(first + c) for c in range(6)]
-    return ti.Matrix([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-
-
-@ti.func
-def grid_update(env: ti.template(), part, it, drive: ti.template(), body: ti.template()):
-    """Computes node velocities from momenta; damps towards the affine motion that the two sensors impose.
-
-    A boost is added to each velocity: selective mass scaling of the slowest modes, the rigid motions of a body between
-    two soft gels. The inertia is artificial; the state at rest does not depend on it.
-
-    Only a sensor that touches the body imposes a motion; a body without contact is damped towards rest. Normal to the
-    sensors' axis, while a sensor moves, the target velocity is the body's mean velocity: a body on one sensor must not
-    be dragged by the other.
-    """
-    dt, cell, damping = env.param(layout.STEP), env.param(layout.BODY_CELL), env.param(layout.BODY_DAMPING)
-    origin = env.param3(layout.ORIGIN)
-    weight = env.param3(layout.GRAVITY)
-    force0, force1 = part_sum(env, layout.FORCE), part_sum(env, layout.FORCE + 6)
-    mass, particles = env.param(layout.BODY_MASS), env.count(layout.PARTICLES)
-    push = mass * particles * weight  # total force on the body: weight and contact
-    push -= drive_rotation(drive, env, it, 0) @ force0
-    push -= drive_rotation(drive, env, it, 1) @ force1
-    touches0, touches1 = force0.norm_sqr() > 0.0, force1.norm_sqr() > 0.0
-    mean = part_sum(env, layout.VELOCITY_SUM) / particles
-    boost = ((env.param(layout.RIGID_MASS_SCALE) - 1.0) * dt / (mass * particles)) * push
-    p0, p1 = drive_row(drive, env, it, 0, 3), drive_row(drive, env, it, 1, 3)
-    centre = env.param3(layout.CENTRE)
-    torque = -moment_about(centre, p0, drive_rotation(drive, env, it, 0), force0, part_sum(env, layout.FORCE + 3))
-    torque -= moment_about(centre, p1, drive_rotation(drive, env, it, 1), force1, part_sum(env, layout.FORCE + 9))
-    turn = (
-        (ROTATION_BOOST * (env.param(layout.RIGID_MASS_SCALE) - 1.0) * dt)
-        * symmetric(env, layout.INVERSE_INERTIA)
-        @ torque
-    )
-    v0, v1 = drive_row(drive, env, it, 0, 4), drive_row(drive, env, it, 1, 4)
-    w0, w1 = drive_row(drive, env, it, 0, 5), drive_row(drive, env, it, 1, 5)
-    axis = p1 - p0
-    length2 = axis.norm_sqr() + 1e-12
-    share = ti.select(touches0 and touches1, 1.0, 0.0)  # 1: interpolate between the sensors; 0: one sensor
-    only_upper = ti.select(touches1 and not touches0, 1.0, 0.0)
-    held = ti.select(touches0 or touches1, 1.0, 0.0)
-    driven = held * (v0.norm_sqr() + v1.norm_sqr() + w0.norm_sqr() + w1.norm_sqr()) > 0.0
-    mean_across = mean - axis * (mean.dot(axis) / length2)
-    reference_centre = env.param3(layout.REFERENCE_CENTRE)
-    carried = ti.Matrix([[env.param(layout.MEAN_GRADIENT + 3 * i + j) for j in range(3)] for i in range(3)])
-    nx, ny, nz = env.count(layout.GRID), env.count(layout.GRID + 1), env.count(layout.GRID + 2)
-    base = env.index * env.count(layout.CAPACITY)
-    nz = nz // NODES  # strips
-    i0, i1, j0, j1, k0, k1 = 0, 0, 0, ny, 0, nz
-    if ti.static(ON_DEVICE):  # one node
-        i0, j0, k0 = part // (ny * nz), part // nz % ny, part % nz
-        i1, j1, k1 = i0 + 1, j0 + 1, k0 + 1
-    else:
-        i0, i1 = part_range(nx, part)
-    for i in range(i0, i1):
-        for j in range(j0, j1):
-            for k in range(k0, k1):
-                at = (i * ny + j) * nz + k
-                old = strip(0.0)
-                if has_velocities(env, it):
-                    old = body.velocities[base + at]
-                moved = strip(0.0)
-                for n in ti.static(range(NODES)):
-                    change, m = filtered_change(env, body, it, i, j, k * NODES + n)
-                    if m != 0.0:  # true of NaN, which must not be hidden
-                        arm = origin + cell * vec3(i, j, k * NODES + n) - reference_centre
-                        x = centre + arm + carried @ arm
-                        velocity = vec3(old[4 * n], old[4 * n + 1], old[4 * n + 2]) + change
-                        velocity += boost + turn.cross(x - centre)
-                        t = only_upper + share * ti.max(0.0, ti.min(1.0, (x - p0).dot(axis) / length2))
-                        imposed = held * ((1.0 - t) * (v0 + w0.cross(x - p0)) + t * (v1 + w1.cross(x - p1)))
-                        if driven:
-                            imposed = axis * (imposed.dot(axis) / length2) + mean_across
-                        velocity -= damping * dt * (velocity - imposed)
-                        for d in ti.static(range(3)):
-                            moved[4 * n + d] = velocity[d]
-                body.velocities[base + at] = moved
 
 
 @ti.func
@@ -238,7 +129,7 @@ def gel_contact(
                 if in_contact:
                     kick = rate * (rotate @ force)
                     for d in ti.static(range(3)):
-                        body.particles[at + (layout.PUSH + d) * stride] += kick[d]
+                        add_to(body.particles, at + (layout.PUSH + d) * stride, kick[d])
                     total -= force
                     moment -= local.cross(force)
                     if housed:

@@ -16,7 +16,7 @@ from tacsim.physics.exec.team import (
     report_work_done,
 )
 from tacsim.physics.gel.kernels import GelArrays, Gels, gel_advance, gel_forces, gel_of
-from tacsim.physics.worlds.hybrid_kernels import Drive
+from tacsim.physics.worlds.grid_motion import Drive
 
 
 @ti.kernel

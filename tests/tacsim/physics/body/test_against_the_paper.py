@@ -22,7 +22,7 @@ from tacsim.physics.body.transfers import (
 from tacsim.physics.exec import layout
 from tacsim.physics.exec.environment import Counts, Environment, Floats, Params, Partial
 from tacsim.physics.exec.lanes import NODES, PARTS
-from tacsim.physics.worlds.hybrid_kernels import Drive, grid_update
+from tacsim.physics.worlds.grid_motion import Drive, grid_update
 
 pytestmark = pytest.mark.cpu
 

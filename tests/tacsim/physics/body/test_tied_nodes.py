@@ -16,7 +16,7 @@ from tacsim.physics.body.tuning import MAX_TIED_NODE_MASS, STENCIL_REACH
 from tacsim.physics.exec import layout
 from tacsim.physics.exec.environment import Counts, Environment, Floats, Params, Partial
 from tacsim.physics.exec.lanes import COPIES, NODES, PARTS
-from tacsim.physics.worlds.hybrid_kernels import Drive, grid_update
+from tacsim.physics.worlds.grid_motion import Drive, grid_update
 
 SPACING = 0.5  # of particles [mm]
 CELL = 2 * SPACING

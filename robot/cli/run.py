@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from robot.cli.errors import EXIT_FAILED, print_error
-from robot.cli.options import TASK_POLICIES, Out, Overrides, complete_names, require_packages
+from robot.cli.options import TASK_POLICIES, Out, Overrides, complete_names
 from robot.cli.output import (
     Bar,
     busy,
@@ -133,7 +133,10 @@ def _require_possible(policy: str | None, film: Path | None, views: Sequence[Pat
     if film is not None:
         _require_film(film, "--film")
     if views:
-        require_packages("a view", "viz", "rerun")
+        from robot.export.rerun_view import require_viewer
+
+        for file in views:
+            require_viewer(file)
 
 
 def _run(

@@ -363,12 +363,15 @@ def transfer(
     import json
     from dataclasses import asdict
 
+    from robot.deploy.policy import require_policy_name
     from robot.train.transfer import Study, draw_figure, play_study, summarise
     from tacsim.config import load_model
     from tacsim.models.randomisation import Randomisation
 
     twins = load_model(Randomisation, f"{task}-twin" if twin is None else twin)
     policies = tuple(policy or ("learned", "scripted"))
+    for name in policies:
+        require_policy_name(name)
     study = Study(task, policies, twins, episodes, every, steps, tuple(set_ or ()))
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)

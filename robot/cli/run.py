@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from robot.cli.options import TASK_POLICIES, Out, Overrides, complete_names, require_packages
+from robot.cli.options import TASK_POLICIES, Out, Overrides, complete_names
 from robot.cli.output import (
     Bar,
     busy,
@@ -94,17 +94,10 @@ def run(
     Example: tacsim run sim --task squeeze --steps 30 --out runs/first
     """
     default_steps = 40  # number of steps without a task and without a recording
-    from robot.deploy.policy import require_policy_name
     from robot.open import load_with_task
 
-    if policy is not None:
-        require_policy_name(policy)
-    if save_view is not None and save_view.suffix != ".rrd":
-        raise typer.BadParameter(f"{save_view} must end in .rrd, as the viewer's files do", param_hint="--save-view")
-    if film is not None:
-        _require_film(film, "--film")
-    if view or save_view is not None:
-        require_packages("a view", "viz", "rerun")
+    views = [None] * view + [save_view] * (save_view is not None)
+    _require_possible(policy, film, views)
     sys.path.append(str(Path.cwd()))  # --policy mine:act finds mine.py here, as with `python -m`; last on the path
     loaded = load_with_task(rig, task, set_ or [])
     for words in loaded.notes:
@@ -118,13 +111,31 @@ def run(
         steps = endless if own_task is None else own_task.steps
     name = policy if policy is not None else ("grip" if own_task is None else "scripted")
     with Interrupt() as interrupt:
-        views = [None] * view + [save_view] * (save_view is not None)
         failed = _run(loaded, name, steps, seed, folder, interrupt, dry_run, views, film)
         if interrupt():
             print_error("stopped by a signal before the last step; all finished steps are saved")
             raise typer.Exit(interrupt.exit_code)
     if failed:
         raise typer.Exit(EXIT_FAILED)
+
+
+def _require_possible(policy: str | None, film: Path | None, views: Sequence[Path | None]) -> None:
+    """Refuses what cannot be done, before a file is read or a rig opened. Raises typer.BadParameter, PolicyNotFound,
+    CannotOpen, NoFilm."""
+    from robot.deploy.policy import require_policy_name
+
+    if policy is not None:
+        require_policy_name(policy)
+    for file in views:
+        if file is not None and file.suffix != ".rrd":
+            raise typer.BadParameter(f"{file} must end in .rrd, as the viewer's files do", param_hint="--save-view")
+    if film is not None:
+        _require_film(film, "--film")
+    if views:
+        from robot.export.rerun_view import require_viewer
+
+        for file in views:
+            require_viewer(file)
 
 
 def _run(

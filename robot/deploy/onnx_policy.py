@@ -22,7 +22,7 @@ from tacsim.gym.features import FeatureEncoder
 from tacsim.interface import Action, Needs, Observation, Pose, RigSpec
 from tacsim.models.policy import METADATA_KEY, Numbers, PolicySpec
 from tacsim.models.sensor import CanonicalGrid
-from tacsim.models.text import printable_line, suggest_file
+from tacsim.models.text import printable_line
 from tacsim.tasks import Task
 from tacsim.tasks.task import Axis, action_of_vector
 
@@ -164,8 +164,7 @@ def _open_session(path: Path) -> InferenceSession:
             raise PolicyNotFound(f"policy '{path}' has {size / 2**20:,.0f} MiB, the maximum is {MAX_BYTES >> 20} MiB")
         data = path.read_bytes()
     except OSError as failure:
-        hint = "" if path.exists() else f"{suggest_file(path, ('.onnx',))}; `tacsim train` writes one"
-        raise PolicyNotFound(f"policy '{path}' cannot be read: {failure.strerror or failure}{hint}") from None
+        raise PolicyNotFound(f"policy '{path}' cannot be read: {failure.strerror or failure}") from None
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1  # small networks; other cores simulate
     options.log_severity_level = 4  # errors are reported here

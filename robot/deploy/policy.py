@@ -14,7 +14,7 @@ from tacsim.config import config_root
 from tacsim.interface import IncompatibleRig, Policy, RigSpec
 from tacsim.models.scene import Scene
 from tacsim.models.sensor import CanonicalGrid
-from tacsim.models.text import suggest_word
+from tacsim.models.text import suggest_file, suggest_word
 from tacsim.record.episode import TRAINING_DISTANCE, TRAINING_KNOWN
 from tacsim.rig import require_needs
 from tacsim.tasks import Task
@@ -40,6 +40,7 @@ def load_policy(
     other_names: more names that the caller knows, which an error may suggest.
     Raises PolicyNotFound, and IncompatibleRig for a learned policy with another grid.
     """
+    require_policy_name(name, other_names)
     if name == "scripted":
         if task is None:
             raise PolicyNotFound(
@@ -56,17 +57,25 @@ def load_policy(
         return OnnxPolicy(Path(name), canonical or CanonicalGrid(), None if task is None else task.goal)
     if name.endswith(".csv"):
         return TargetScript(Path(name))
-    require_policy_name(name, other_names)
     return policy_of_code(name)
 
 
 def require_policy_name(name: str, other_names: Sequence[str] = ()) -> None:
-    """Raises PolicyNotFound for a text that `load_policy` takes for no policy. Opens no file and imports no code."""
-    if name in (*NAMES, *other_names) or name.endswith((".onnx", ".csv")) or ":" in name:
+    """Raises PolicyNotFound for a text that `load_policy` takes for no policy, and for a file that is not there. Reads
+    no file and imports no code."""
+    path = Path(name)
+    if path.suffix in (".onnx", ".csv"):
+        if not path.exists():
+            hint = suggest_file(path, (path.suffix,)) or (
+                "; `tacsim train` writes one" if path.suffix == ".onnx" else ""
+            )
+            raise PolicyNotFound(f"policy '{name}': no such file{hint}")
+        return
+    if name in (*NAMES, *other_names) or ":" in name:
         return
     allowed = "'scripted', 'grip', 'learned', 'path/to/file.onnx', 'path/to/file.csv', or 'package.module:attribute'"
     if name.endswith(".py"):
-        hint = f"; name what the file defines: '{Path(name).stem}:NAME'"
+        hint = f"; name what the file defines: '{path.stem}:NAME'"
     else:
         hint = suggest_word(name, (*NAMES, *other_names))
     raise PolicyNotFound(f"no policy '{name}'; allowed: {allowed}{hint}")

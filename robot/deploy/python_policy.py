@@ -12,7 +12,6 @@ import numpy as np
 from robot.common.code import CodeNotFound, load_attribute
 from tacsim import pose as se3
 from tacsim.interface import Action, FloatArray, Needs, Observation, Policy, Pose
-from tacsim.models.text import suggest_file
 from tacsim.record.sources import read_columns
 
 AXES = ("x", "y", "z", "rx", "ry", "rz")  # [m], and a rotation vector [rad]
@@ -84,8 +83,7 @@ class TargetScript:
             with path.open(newline="", encoding="utf-8-sig") as file:
                 header = [name.strip() for name in next(csv.reader(file), [])]
         except (OSError, UnicodeDecodeError, csv.Error) as failure:
-            hint = "" if path.exists() else suggest_file(path, (".csv",))
-            raise PolicyNotFound(f"policy '{path}': not a readable CSV file: {failure}{hint}") from failure
+            raise PolicyNotFound(f"policy '{path}': not a readable CSV file: {failure}") from failure
         split = [tuple(name.rpartition(".")[::2]) for name in header]
         wrong = [name for name, (arm, axis) in zip(header, split, strict=True) if not arm or axis not in AXES]
         if wrong or not header:

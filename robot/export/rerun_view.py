@@ -10,6 +10,7 @@ import contextlib
 import multiprocessing
 import os
 import queue
+import sys
 import tempfile
 import threading
 from collections.abc import Callable, Iterator, Mapping
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
 
 APPLICATION = "tacsim"
 MAX_WAITING_STEPS = 2  # steps in the queue; a longer queue would show old steps
+DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")  # one of them is set where a window can be shown on Linux
 
 ViewedStep = tuple[Step, Observation, Truth | None]
 Log = Callable[[Step, Observation, Truth | None], None]
@@ -49,11 +51,11 @@ def view_episode(path: Path, file: Path | None, on_step: Callable[[int, int], No
     """Shows the episode in a new viewer; with a `file` (.rrd), writes that file instead, completely or not at all.
 
     Raises:
-        ValueError: rerun-sdk is not installed, or the episode is empty.
+        ValueError: rerun-sdk is not installed, there is no display, or the episode is empty.
         RuntimeError: the viewer does not start.
         EpisodeError, FileExistsError, OSError, and the errors of normalising.
     """
-    require_rerun()
+    require_viewer(file)
     observed = observe_episode(path)
     steps, spec = observed.episode.steps, observed.episode.meta.spec
     if not steps:
@@ -70,13 +72,13 @@ class LiveView(Closing):
     file: (.rrd) to write instead of starting a viewer; it is complete also if this program is killed.
 
     Raises:
-        ValueError: rerun-sdk is not installed.
+        ValueError: rerun-sdk is not installed, or there is no display.
         RuntimeError: the viewer does not start.
         FileExistsError, OSError.
     """
 
     def __init__(self, spec: RigSpec, config: RigConfig, file: Path | None) -> None:
-        require_rerun()
+        require_viewer(file)
         self._line: queue.Queue[ViewedStep | None] = queue.Queue(MAX_WAITING_STEPS)
         self.left_out = 0  # steps
         self._ended = False  # the process has ended
@@ -250,10 +252,16 @@ class _Copy(threading.Thread):
             raise self._error
 
 
-def require_rerun() -> None:
-    """Raises ValueError if rerun-sdk is not installed."""
+def require_viewer(file: Path | None) -> None:
+    """Raises ValueError if rerun-sdk is not installed, or if its viewer would be shown (`file` None) without a
+    display."""
     if util.find_spec("rerun") is None:
         raise ValueError("a view needs rerun-sdk, which is not installed: pip install 'tacsim[viz]'")
+    if file is None and sys.platform == "linux" and not any(os.environ.get(name) for name in DISPLAYS):
+        raise ValueError(
+            f"a view needs a display, and none of {', '.join(DISPLAYS)} is set; write a file for the viewer of another "
+            "machine instead: tacsim run --save-view FILE.rrd, tacsim view --save FILE.rrd"
+        )
 
 
 def _lattices(rig: RigConfig | None) -> Mapping[str, NDArray[np.float64]]:

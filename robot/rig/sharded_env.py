@@ -370,7 +370,7 @@ def _sendable(failure: Exception) -> Exception:
 
 
 if __name__ == "__main__":
-    os.dup2(2, 1)  # nobody reads standard output
+    os.dup2(2, 1)  # the parent does not read standard output
     end_with_parent(int(os.environ[PARENT]))
     with contextlib.closing(Connection(int(sys.argv[1]))) as opened:
         _serve(opened)

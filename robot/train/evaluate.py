@@ -17,6 +17,7 @@ from robot.deploy.policy import (
     has_training_range,
     load_policy,
     require_fit,
+    require_policy_name,
     training_notes,
 )
 from robot.open import load_with_task, make_vector_env
@@ -107,6 +108,8 @@ def evaluate(
     warn: called once for each learned policy with scenes outside its training, or with an unknown range.
     Raises PolicyNotFound, IncompatibleRig, and the errors of `make_vector_env`.
     """
+    for name in policies:
+        require_policy_name(name, (TEACHER, RANDOM))  # before the worlds are made, which takes a minute
     config = load_with_task(training.rig, training.task, training.overrides).config
     drawn = training.randomise
     if drawn is not None:

@@ -1,6 +1,6 @@
 """The drawings of the pages, as SVG files in docs/images: python -m tools.site.drawings
 
-frames.svg: the frames of a rig with two arms. setups.svg: three set-ups.
+frames.svg: the frames of a rig with two arms. setups.svg: three set-ups. mock.svg: what stands behind mock hardware.
 """
 
 from __future__ import annotations
@@ -130,6 +130,46 @@ def draw_setups(path: Path) -> None:
     save(figure, path)
 
 
+def draw_mock(path: Path) -> None:
+    """Your code, the sockets, the mock devices, and the simulator behind them."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9.0, 2.9), layout="constrained")
+    axes = new_axes(figure, 1, 1, "")
+    blocks = [
+        (1.6, 2.0, 2.8, 3.2, BODY, "your code\n\npolicy, driver,\ncontroller, test"),
+        (7.4, 3.1, 3.6, 1.4, GREY, "mock UR controller\na process, 500 Hz"),
+        (7.4, 0.9, 3.6, 1.4, GREY, "mock camera\na process, MJPEG"),
+        (12.8, 2.0, 2.8, 3.2, GEL, "simulator\n\ngels and body,\nor Hertz"),
+    ]
+    for x, y, width, height, colour, words in blocks:
+        box(axes, x, y, width, height, colour)
+        axes.text(x, y, words, ha="center", va="center", fontsize=9, color=TEXT)
+    both, right, left = "<|-|>", "-|>", "<|-"
+    arrows = [
+        (3.0, 5.6, 3.1, both, "RTDE 30004, script,\ndashboard 29999"),
+        (3.0, 5.6, 0.9, left, "HTTP 8081"),
+        (9.2, 11.4, 3.35, right, "poses"),
+        (9.2, 11.4, 2.85, left, "forces"),
+        (9.2, 11.4, 0.9, left, "pictures"),
+    ]
+    for start, end, y, style, words in arrows:
+        axes.annotate("", (end, y), (start, y), arrowprops={"arrowstyle": style, "color": INK, "lw": 1.4})
+        below = words == "forces"
+        at, side = (y - 0.1, "top") if below else (y + 0.1, "bottom")
+        axes.text((start + end) / 2, at, words, va=side, ha="center", fontsize=8, color=TEXT)
+    axes.annotate(
+        "faults on request: port 30020, or methods of the mock",
+        (7.4, -0.35),
+        ha="center",
+        fontsize=8.5,
+        color="#c62828",
+    )
+    axes.annotate("", (7.4, 0.15), (7.4, -0.15), arrowprops={"arrowstyle": "-|>", "color": "#c62828", "lw": 1.4})
+    axes.set(xlim=(0.0, 14.4), ylim=(-0.7, 4.2))
+    save(figure, path)
+
+
 def save(figure: Figure, path: Path) -> None:
     """Writes the same bytes for the same drawing."""
     with matplotlib.rc_context({"svg.hashsalt": path.name, "svg.fonttype": "path"}):
@@ -140,6 +180,7 @@ def main() -> None:
     images = ROOT / "docs" / "images"
     draw_frames(images / "frames.svg")
     draw_setups(images / "setups.svg")
+    draw_mock(images / "mock.svg")
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """The pictures of the guides, in docs/images: python -m tools.site.guides
 
-tasks.jpg: the body before and after each shipped task. observation.jpg: what a policy gets of a sensor. report.png and
-compare.png: pages that tacsim writes, as a browser shows them (Chromium must be installed). collect.jpg: some presses
+tasks.jpg: the body before and after each shipped task. observation.jpg: what a policy gets of a sensor. report.jpg and
+compare.jpg: pages that tacsim writes, as a browser shows them (Chromium must be installed). collect.jpg: some presses
 of a collected set (needs the extra 'export').
 """
 
@@ -28,7 +28,7 @@ from tools.site.gallery import save
 from tools.site.pages import ROOT
 
 TASKS = {
-    "squeeze": "squeeze: thinner by a given height",
+    "squeeze": "squeeze: to a given height",
     "reposition": "reposition: moved along the gels",
     "knead": "knead: squeezed and moved",
 }
@@ -80,7 +80,7 @@ def draw_observation(path: Path) -> None:
         "gradient along x": touch.gradient[..., 0],
         "contact": touch.contact,
     }
-    figure = new_figure(12.0, 2.5)
+    figure = new_figure(12.0, 3.0)
     figure.set_layout_engine("constrained")
     for place, (title, values) in enumerate(shown.items(), start=1):
         axes = figure.add_subplot(1, len(shown) + 1, place)
@@ -113,7 +113,7 @@ def draw_presses(path: Path, folder: Path) -> None:
     save(figure, path)
 
 
-def photograph(page: Path, path: Path, size: tuple[int, int], width: int) -> None:
+def draw_page(page: Path, path: Path, size: tuple[int, int], width: int) -> None:
     """A page as a browser of this size shows it [px], `width` wide."""
     program = next((found for name in BROWSERS if (found := shutil.which(name)) is not None), None)
     if program is None:
@@ -129,7 +129,7 @@ def photograph(page: Path, path: Path, size: tuple[int, int], width: int) -> Non
         )
         picture = Image.open(taken).convert("RGB").crop((0, 0, *size))
     smaller = picture.resize((width, round(width * size[1] / size[0])), Image.Resampling.LANCZOS)
-    smaller.quantize(128).save(path, optimize=True)
+    smaller.save(path, quality=88, optimize=True)
 
 
 def main() -> None:
@@ -139,10 +139,10 @@ def main() -> None:
         for task in TASKS:
             call(folder, "run", "--task", task, "--out", task)
         draw_tasks(images / "tasks.jpg", folder)
-        photograph(folder / "squeeze" / "report.html", images / "report.png", (1280, 860), 900)
+        draw_page(folder / "squeeze" / "report.html", images / "report.jpg", (1280, 860), 900)
         call(folder, "collect", "samples", "--out", "samples")
         call(folder, "compare", "samples/simulation", "samples/sensor", "--out", "compared")
-        photograph(folder / "compared" / "compare.html", images / "compare.png", (1280, 1480), 900)
+        draw_page(folder / "compared" / "compare.html", images / "compare.jpg", (1280, 1480), 900)
         call(folder, "collect", "press", "--count", "12", "--preset", "standard", "--sensor", "gelsight-mini",
              "--depth", "0.5..1.0mm", "--out", "set")  # fmt: skip
         draw_presses(images / "collect.jpg", folder / "set")

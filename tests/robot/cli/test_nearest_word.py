@@ -45,6 +45,7 @@ pytestmark = pytest.mark.usefixtures("empty_folder")
         ("collect episodes sim --policy randm --out set", "did you mean 'random'?"),
         ("evaluate sqeeze", "did you mean 'squeeze'?"),
         ("evaluate squeeze --policy techer", "did you mean 'teacher'?"),
+        ("evaluate squeeze --policy teacher.onnx", "policy 'teacher.onnx': no such file"),
         ("transfer squeeze --policy lerned", "did you mean 'learned'?"),
         ("transfer squeeze --twin squeeze-twn", "did you mean 'squeeze-twin'?"),
         ("identify gel --scene pres x.csv", "did you mean 'press'?"),

@@ -6,6 +6,7 @@ import importlib.util
 import json
 import signal
 import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from robot.export.rerun_view import DISPLAYS
 from tacsim.record.reader import read_episode
 from tests.robot.cli.invoked import START, TINY, environment, plain_text, tacsim
 
@@ -91,7 +93,19 @@ def test_a_view_that_cannot_be_shown_is_refused_before_the_simulation(
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "rerun" else find(name))
     monkeypatch.setattr("robot.rig.sim_rig.make_world", lambda scene: pytest.fail("the simulation was opened"))
     result = tacsim("run", *option)
-    assert result.exit_code == 2 and "a view needs rerun, which is not installed" in result.stderr
+    assert result.exit_code == 2 and "a view needs rerun-sdk, which is not installed" in result.stderr
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems need no variable for a window")
+def test_a_view_without_a_display_is_refused_before_the_simulation(monkeypatch: pytest.MonkeyPatch) -> None:
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: find("json") if name == "rerun" else find(name))
+    monkeypatch.setattr("robot.rig.sim_rig.make_world", lambda scene: pytest.fail("the simulation was opened"))
+    for name in DISPLAYS:
+        monkeypatch.delenv(name, raising=False)
+    result = tacsim("run", "--view")
+    assert result.exit_code == 2
+    assert "a view needs a display" in result.stderr and "--save-view FILE.rrd" in result.stderr
 
 
 @pytest.mark.slow

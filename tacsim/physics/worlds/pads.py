@@ -118,7 +118,7 @@ class GelPads(NotCopyable):
         sums[:, 3:] /= MM
         self._wrenches = sums / self._last_substeps[:, None]
         self._poses, self._steps = list(ends), self._steps + 1
-        self._motions = np.array([_motion(each[:, 0]) for each in drive]) * self.substeps * self._substep
+        self._motions = _velocities(drive) * self.substeps * self._substep
         for index in range(len(self)):
             if self._wrenches[index].any():
                 self._require_off_housing(index, drive[index, -1, 0])
@@ -347,10 +347,10 @@ def _reach(scene: Scene) -> float:
     return float(np.linalg.norm(bounding_size(scene.indenter.geometry))) / 2
 
 
-def _motion(drive: NDArray[np.float32]) -> Floats:
-    """(6,) velocity at a pad's origin and spin of an object, in the middle of a drive (substeps, 6, 3)."""
-    place, velocity, spin = drive[[0, -1], 3:].astype(np.float64).mean(axis=0)
-    return np.concatenate([velocity - np.cross(spin, place), spin])
+def _velocities(drives: NDArray[np.float32]) -> Floats:
+    """(n, 6) velocity at the pads' origins and spin of the objects, in the middle of drives (n, substeps, 1, 6, 3)."""
+    place, velocity, spin = np.moveaxis(drives[:, [0, -1], 0, 3:].astype(np.float64).mean(axis=1), 1, 0)
+    return np.concatenate([velocity - np.cross(spin, place), spin], axis=1)
 
 
 def _check_poses(poses: ArrayLike, count: int) -> Floats:

@@ -134,13 +134,17 @@ def test_a_pad_gives_pictures_and_surfaces_by_its_name() -> None:
 MESH = '<mesh name="m" file="{file}" scale=".001 .001 .001"/>'
 
 
-def test_what_mujoco_and_the_gels_describe_differently_is_refused(tmp_path: Path) -> None:
+def test_what_mujoco_and_the_gels_describe_differently_is_refused() -> None:
     with pytest.raises(ValueError, match=r"'thing' is a box of 20 mm x 12 mm x 16 mm in MuJoCo and a box of 20 mm x"):
         sensor(scene(), geometry={"thing": Box(size=(20e-3, 12e-3, 20e-3))})
     with pytest.raises(ValueError, match=r"is a box of .* in MuJoCo and a sphere of 10 mm for the gels"):
         sensor(scene(), geometry={"thing": Sphere(radius=10e-3)})
     with pytest.raises(ValueError, match="'thing' is a capsule; gels know box, sphere, cylinder and mesh"):
         sensor(scene("type='capsule' size='.01 .01'"))
+
+
+@pytest.mark.slow
+def test_a_mesh_must_be_the_same_in_mujoco_and_the_gels(tmp_path: Path) -> None:
     file = tmp_path / "part.stl"
     part = trimesh.util.concatenate([trimesh.creation.box((20.0, 12.0, 16.0))])
     part.apply_translation([0.0, 2.0, 1.0])

@@ -52,7 +52,8 @@ def constraint_hessian(model: Any, data: Any) -> FloatArray:
     else:
         jacobian[:] = data.efc_J.reshape(rows, model.nv)
     states = mujoco.mjtConstraintState
-    active = np.isin(data.efc_state, (int(states.mjCNSTRSTATE_QUADRATIC), int(states.mjCNSTRSTATE_CONE)))
+    quadratic, cone = int(states.mjCNSTRSTATE_QUADRATIC), int(states.mjCNSTRSTATE_CONE)
+    active = (data.efc_state == quadratic) | (data.efc_state == cone)
     return np.asarray(jacobian.T @ ((data.efc_D * active)[:, None] * jacobian))
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from tacsim.interface import FloatArray, Image
 from tacsim.models.scene import Gel, GelSurface, Indenter, Preset, Scene, Shape
 from tacsim.models.sensor import SensorModel
+from tacsim.physics.failure.health import LaunchSpan, SimulationDiverged
 from tacsim.sim.engines.implicit_step import Response, step_with_wrenches
 from tacsim.sim.engines.mujoco_module import load_mujoco
 from tacsim.sim.engines.mujoco_objects import (
@@ -134,14 +135,34 @@ class TouchSensor:
 
     def begin_step(self) -> FloatArray:
         """MuJoCo's part of a step that depends on places and velocities. Returns the objects' poses in the frames of
-        the pads (n, 7). Raises ValueError if the model's timestep has changed."""
+        the pads (n, 7).
+
+        Raises ValueError if the model's timestep has changed, SimulationDiverged if MuJoCo's state was not finite.
+        """
         if float(self.model.opt.timestep) != self.pads.step_time:
             raise ValueError(
                 f"timestep is {self.model.opt.timestep:g} s and was {self.pads.step_time:g} s when the sensor was made:"
                 f" make a new TouchSensor"
             )
         load_mujoco().mj_step1(self.model, self.data)
+        self._require_finite()
         return self.poses()
+
+    def _require_finite(self) -> None:
+        """Raises SimulationDiverged where MuJoCo has found a state that is not finite, after which it starts again."""
+        kinds = load_mujoco().mjtWarning
+        whats = {
+            "position": kinds.mjWARN_BADQPOS, "velocity": kinds.mjWARN_BADQVEL, "acceleration": kinds.mjWARN_BADQACC
+        }  # fmt: skip
+        for what, kind in whats.items():
+            if self.data.warning[kind].number:
+                raise SimulationDiverged(
+                    f"MuJoCo found the {what} not finite or huge at degree of freedom "
+                    f"{self.data.warning[kind].lastinfo}, and has reset its data",
+                    LaunchSpan("in the step before"),
+                    "take shorter timesteps, look for missing masses and stiff servos, then reset data and sensor",
+                    retry=False,
+                )
 
     def end_step(self, responses: Sequence[Response | None]) -> None:
         """The rest of the step, with the responses (n,) of the pads, see `GelPads.responses`."""

@@ -14,6 +14,7 @@ import trimesh
 from tacsim.config import load_sensor
 from tacsim.models.material import GelMaterial
 from tacsim.models.scene import Box, Gel, Mesh, Sphere
+from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.sim.engines.mujoco_module import load_mujoco, require_major
 from tacsim.sim.engines.touch import ObjectDropped, TouchSensor, step_together
 from tests.tacsim.sim.engines.gripper import BALL, BOX, ROD, grip, hold, load, object_dofs, scene
@@ -194,6 +195,16 @@ def test_integrators_and_timesteps_that_the_coupling_does_not_know_are_refused()
     touch = sensor(scene())
     touch.model.opt.timestep = 2e-3
     with pytest.raises(ValueError, match=r"timestep is 0.002 s and was 0.001 s when the sensor was made"):
+        touch.step()
+
+
+def test_a_reset_by_mujoco_itself_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes a log
+    touch = sensor(scene())
+    touch.step()
+    touch.data.qfrc_applied[0] = 1e20
+    touch.step()
+    with pytest.raises(SimulationDiverged, match=r"MuJoCo found the acceleration .* at degree of freedom 0"):
         touch.step()
 
 

@@ -84,6 +84,25 @@ def test_light_and_heavy_boxes_are_held_through_pokes(mass: float) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("mass", [0.005, 0.2])
+def test_a_held_box_is_pressed_on_a_table_and_all_forces_balance(mass: float) -> None:
+    """The contact with the table is MuJoCo's, and stiff."""
+    touch = sensor(scene(mass=mass, table=True))
+    mujoco, table = load_mujoco(), np.zeros(6)
+    for number in range(600):
+        touch.data.ctrl[:2] = 3.0 * min(1.0, number / 100)
+        touch.data.ctrl[2] = -0.3e-3 * min(1.0, max(0.0, (number - 200) / 200))
+        touch.step()
+    pushed = 0.0
+    for number in range(touch.data.ncon):
+        mujoco.mj_contactForce(touch.model, touch.data, number, table)
+        pushed += table[0]
+    held = touch.world_forces[:, 2].sum()
+    assert held > 0.15 and pushed == pytest.approx(held + mass * 9.81, rel=1e-3)
+    assert np.abs(touch.data.qvel[object_dofs(touch.model)]).max() < 1e-4
+
+
+@pytest.mark.slow
 def test_a_dropped_object_is_reported() -> None:
     touch = sensor(scene())
     touch.require_held()  # nothing was held so far

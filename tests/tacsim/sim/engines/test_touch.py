@@ -64,6 +64,25 @@ def test_a_pushed_box_slips_where_coulombs_law_says() -> None:
 
 
 @pytest.mark.slow
+def test_a_sliding_box_is_braked_by_the_friction_that_the_gels_feel() -> None:
+    """Stiffness along the surface, without a limit, would brake it like a viscous fluid."""
+    touch = sensor(scene(mass=0.1, gravity=(0, 0, 0)), gel=Gel(housing=None))
+    grip(touch, 3.0, 0.3)
+    dofs, push, speeds, drags = object_dofs(touch.model), 1.2 * 2 * COULOMB * 3.0, list[float](), list[float]()
+
+    def watch(time: float) -> None:
+        touch.data.qfrc_applied[dofs.start + 2] = -push
+        speeds.append(-float(touch.data.qvel[dofs.start + 2]))
+        drags.append(-float(touch.world_forces[:, 2].sum()))
+
+    hold(touch, 0.03, lambda time: 3.0, watch=watch)
+    sliding = slice(12, 29)
+    assert np.array(drags[sliding]) == pytest.approx(push / 1.2, rel=0.15)
+    gained = (speeds[29] - speeds[12]) * 0.1 / 17e-3
+    assert gained == pytest.approx(push - np.mean(drags[13:30]), abs=0.03 * push)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("mass", [0.005, 0.05, 0.5])
 def test_light_and_heavy_boxes_are_held_through_pokes(mass: float) -> None:
     touch = sensor(scene(mass=mass, finger=0.05))

@@ -110,6 +110,10 @@ if TYPE_CHECKING:
     from tacsim.report.report import write_report as write_report
     from tacsim.rig import Reset as Reset
     from tacsim.rig import Rig as Rig
+    from tacsim.sim.engines.touch import ObjectDropped as ObjectDropped
+    from tacsim.sim.engines.touch import TouchSensor as TouchSensor
+    from tacsim.sim.engines.touch import step_together as step_together
+    from tacsim.sim.pads import TactilePads as TactilePads
     from tacsim.tasks import Axis as Axis
     from tacsim.tasks import Estimator as Estimator
     from tacsim.tasks import Knead as Knead

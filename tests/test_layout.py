@@ -18,7 +18,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("tacsim", "calibration", "robot")  # each imports only itself and those before it
-HEAVY = {"taichi", "cv2", "rtde_control", "rtde_receive", "rtde_io", "dashboard_client", "script_client"}
+HEAVY = {"taichi", "cv2", "mujoco", "rtde_control", "rtde_receive", "rtde_io", "dashboard_client", "script_client"}
 LIGHT_IMPORTS = (
     *(*PACKAGES, "tacsim.interface", "tacsim.config", "tacsim.record.replay", "tacsim.geometry.shapes"),
     *(

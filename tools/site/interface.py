@@ -9,7 +9,7 @@ import inspect
 SUBJECTS = {  # page: title, introduction, package, modules that the names come from
     "contract": ("Observations, actions, rigs", "tacsim", ("interface", "rig", "limits", "pose", "control")),
     "configuration": ("Configuration", "tacsim", ("config", "models")),
-    "simulation": ("Simulation", "tacsim", ("physics", "optics")),
+    "simulation": ("Simulation", "tacsim", ("physics", "optics", "sim")),
     "episodes": ("Episodes and reports", "tacsim", ("record", "report")),
     "tasks": ("Tasks", "tacsim", ("tasks",)),
     "environments": ("Environments", "tacsim", ("gym",)),

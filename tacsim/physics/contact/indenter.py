@@ -22,7 +22,7 @@ from tacsim.physics.contact.tuning import (
     SURFACE_SMOOTHING,
 )
 from tacsim.physics.exec import layout
-from tacsim.physics.exec.environment import record_max, record_sum
+from tacsim.physics.exec.environment import record_addition, record_max, record_sum
 from tacsim.physics.exec.lanes import (
     COPIES,
     LANES,
@@ -335,3 +335,5 @@ def apply_indenter(env: ti.template(), part, it, drive: ti.template(), gel: ti.t
     for d in ti.static(range(3)):
         record_sum(env, slot, layout.FORCE + d, total[d])
         record_sum(env, slot, layout.FORCE + 3 + d, moment[d])
+        record_addition(env, slot, layout.FORCE_SUM + d, total[d])
+        record_addition(env, slot, layout.FORCE_SUM + 3 + d, moment[d])

@@ -86,6 +86,7 @@ PEAK_SPEED = _partial.place()  # largest component of a particle's velocity
 CAPPED = _partial.place()  # number of contact overlaps that were limited
 OVERLAP = _partial.place()  # largest of the last substep [mm]
 FORCE = _partial.place(12)  # on gel 0, gel 1: force x, y, z [N], moment x, y, z [N mm]; of the last substep
+FORCE_SUM = _partial.place(6)  # of an indenter: FORCE of gel 0, summed over the substeps of this launch
 BACKING = _partial.place(3)  # force of this part's gel on its backing [N], of the last substep
 VELOCITY_SUM = _partial.place(3)  # sum of the particles' velocities
 HOUSING_FORCE = _partial.place(6)  # force on the housing of gel 0, gel 1: x, y, z [N]; of the last substep

@@ -58,6 +58,7 @@ class Health:
         partial[
             ..., [layout.OFF_GRID, layout.PEAK_SPEED, layout.CAPPED, layout.OVERLAP, layout.SQUARED_GREEN_STRAIN]
         ] = 0.0
+        partial[..., layout.FORCE_SUM : layout.FORCE_SUM + 6] = 0.0
 
     @classmethod
     def read(cls, partial: NDArray[np.float32], courant: float = 0.0, *, sound: bool = False) -> Health:

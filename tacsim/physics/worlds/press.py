@@ -1,7 +1,7 @@
 """A rigid indenter pressed, slid or twisted on one gel: no particles, no grid."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -22,13 +22,14 @@ from tacsim.physics.exec.layout import (
     STEP,
     STIFFNESS,
 )  # fmt: skip
-from tacsim.physics.failure.health import Health, SimulationDiverged, check_launch
+from tacsim.physics.failure.health import Health, LaunchSpan, SimulationDiverged, check_launch
 from tacsim.physics.gel.gel import GelParams
 from tacsim.physics.motion.controller import ForceReading, Integration, Launch, PreparedLaunch, force_floor
 from tacsim.physics.motion.inertia import Inertia, kernel_second
 from tacsim.physics.motion.path import Path, path_length, plan_path, tangential_path_length
 from tacsim.physics.motion.slide import Slide, growth_share, speed_share, turn_share, wall_slowdown
 from tacsim.physics.motion.tuning import SHORT_SLIDE, SLOWED_WALL_LENGTH
+from tacsim.physics.snapshot import State
 from tacsim.physics.units import MM, MPA
 from tacsim.physics.worlds.fem import FemWorld
 from tacsim.physics.worlds.press_state import PressState
@@ -219,7 +220,7 @@ class PressWorld(FemWorld):
         both = path.drive(launch.first, launch.last)
         drive = relative_drive(both[:, 0], both[:, 1])
         try:
-            self._cover(drive)
+            self.cover(drive)
         except ValueError as error:
             raise SimulationDiverged(str(error), where(), MESH_ADVICE, retry=False) from None
         except MemoryError as error:
@@ -235,13 +236,19 @@ class PressWorld(FemWorld):
 
     def _limit_relaxation(self, launch: Launch) -> float:
         """Rate at which the friction limit follows the pressure, times the time of a wave through the gel."""
-        indenter = self.scene.indenter
-        assert indenter is not None
-        steady = FLUTTER_FRICTION / min(max(indenter.friction, FLUTTER_FRICTION / MAX_LIMIT_RATE), FLUTTER_FRICTION)
+        steady = self.steady_limit_relaxation
         return steady if launch.is_held else steady + launch.path.growth_share * (MAX_LIMIT_RATE - steady)
 
-    def _cover(self, drive: np.ndarray) -> None:
-        """Computes a mesh's distances where the gel's surface may touch it in this launch."""
+    @property
+    def steady_limit_relaxation(self) -> float:
+        """Rate at which the friction limit follows a steady pressure, times the time of a wave through the gel."""
+        assert self.scene.indenter is not None
+        friction = max(self.scene.indenter.friction, FLUTTER_FRICTION / MAX_LIMIT_RATE)
+        return FLUTTER_FRICTION / min(friction, FLUTTER_FRICTION)
+
+    def cover(self, drive: np.ndarray) -> None:
+        """Computes a mesh's distances where the gel's surface may touch it in this launch. Raises ValueError for too
+        many, MemoryError where there is no memory for them."""
         mesh = self.state.meshes[self._index]
         if mesh is None:
             return
@@ -261,9 +268,7 @@ class PressWorld(FemWorld):
 
     def outcome(self, prepared: PreparedLaunch) -> list[ForceReading]:
         """The forces after the launch. Raises SimulationDiverged if its state is unphysical."""
-        partial = self.state.partial[self._index]
-        survey = self._survey()
-        health = Health.read(partial, self._courant(), sound=survey is not None and survey.is_healthy)
+        partial, health = self.state.partial[self._index], self.read_health()
         check_launch(self.arrays, prepared.before, health, prepared.where)
         sums = partial.astype(np.float64).sum(axis=0)
         force, moment = sums[None, FORCE : FORCE + 3], sums[None, FORCE + 3 : FORCE + 6]
@@ -274,18 +279,30 @@ class PressWorld(FemWorld):
         else:
             self._touched[2] += np.linalg.norm(prepared.drive[:, 0, 4, :2], axis=1).sum() * prepared.launch.path.step
         if prepared.launch.is_held or (not force.any() and prepared.launch.last == prepared.launch.path.substeps):
-            self._require_contact_resolution(prepared, health.overlap)
+            self.require_contact_resolution(prepared.drive[-1, 0], health.overlap, prepared.where, prepared.before)
         reading = ForceReading(
             force, backing, self._floor, health.overlap, health.capped, moment / max(self._gel.half),
             integration=Integration(prepared.launch.path.step, self._damping(), health.courant),
         )  # fmt: skip
         return [reading]
 
-    def _require_contact_resolution(self, prepared: PreparedLaunch, overlap: float) -> None:
+    def read_health(self) -> Health:
+        """Results of the kernels in the last launch."""
+        survey = self._survey()
+        return Health.read(
+            self.state.partial[self._index], self._courant(), sound=survey is not None and survey.is_healthy
+        )
+
+    def require_contact_resolution(
+        self, motion: np.ndarray, overlap: float, where: Callable[[], LaunchSpan], before: State
+    ) -> None:
         """Raises SimulationDiverged if the indenter's lowest point is in the gel between the contact points, the
-        deepest of which has this `overlap` [mm]."""
+        deepest of which has this `overlap` [mm].
+
+        motion: of the indenter (6, 3), as in a drive; where, before: of the launch, for the error.
+        """
         assert self.scene.indenter is not None
-        rows, spacing = prepared.drive[-1, 0].astype(np.float64), self._gel.spacing
+        rows, spacing = motion.astype(np.float64), self._gel.spacing
         down = rows[:3].T @ [0.0, 0.0, -1.0]
         half, self.missed_depth_share = np.array(self._gel.half) - spacing, 0.0  # not at the gel's rim
         mesh, geometry = self.state.meshes[self._index], self.scene.indenter.geometry
@@ -324,5 +341,4 @@ class PressWorld(FemWorld):
                 f"these lie {spacing / POINTS:.3g} mm apart (element_size / {POINTS}), and its tip or edge is between "
                 f"them: use a smaller element_size, such as {finer:.4g} mm"
             )
-            before = prepared.before
-            raise SimulationDiverged(cause, prepared.where(), advice, retry=False, good=before, failed=self.arrays())
+            raise SimulationDiverged(cause, where(), advice, retry=False, good=before, failed=self.arrays())

@@ -197,8 +197,8 @@ def test_mesh_distances_cover_both_ends_of_launch_or_none(tmp_path: Path, monkey
             module, "MAX_NODES", 8 * tiles.TILE_NODES**3
         )  # an end has 6 tiles, both and what is between 12
     with pytest.raises(ValueError, match="192 x 64 x 32 nodes"):
-        w._cover(drive)
-    w._cover(drive[:1])
+        w.cover(drive)
+    w.cover(drive[:1])
     assert w.state._values.shape == (1, 96, 64, 32)
 
 

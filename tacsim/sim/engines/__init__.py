@@ -1,0 +1,1 @@
+"""Bodies moved by other engines, with the gels of tacsim between them. Only this room imports MuJoCo."""

@@ -17,7 +17,7 @@ TREES = {
 PHYSICS_ROOMS = ("worlds", "motion", "contact", "body", "gel", "failure", "seed")
 UNTUNED = {  # sizes of arrays, properties of a formula, and sentinels: they stand beside the code that they belong to
     "UNREACHABLE_LIMIT", "UNKNOWN_DISTANCE", "POINTS", "SPLINE_SMOOTHING", "QUANTITIES", "LATTICE_ROWS",
-    "PEAK_SLOPE", "PEAK_BRAKING", "PAD", "SWEEPS", "STAGES", "BLOCKS",
+    "PEAK_SLOPE", "PEAK_BRAKING", "PAD", "SWEEPS", "STAGES", "BLOCKS", "MOTION",
 }  # fmt: skip
 
 

@@ -11,8 +11,8 @@ from benchmarks.cases import environments
 def test_random_actions_are_those_of_one_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     for name, value in {"NUMBER": 2, "STEPS": 1, "ROUNDS": 2, "BODIES": environments.BODIES[:2]}.items():
         monkeypatch.setattr(environments, name, value)
-    blind, step, reset = environments.random_actions("learn", "flowing", 1)
-    assert blind.error == step.error == 0.0  # to the bit
+    blind, in_processes, step, reset = environments.random_actions("learn", "flowing", 1)
+    assert blind.error == in_processes.error == step.error == 0.0  # to the bit
     assert step.figures["env_steps_per_s"] == pytest.approx(2 / step.timing.median)
     assert reset.figures["kept_ms"] < reset.figures["first_ms"]
 

@@ -15,3 +15,4 @@ STENCIL_REACH = 1.501  # [cells] from a particle: nodes at this distance have we
 # Largest arguments of the power series of log1p, log and exp [-]: errors are below float32's rounding, 1.4e-5 relative,
 # 3e-6 absolute (test_material.py)
 MAX_LOG1P_ARGUMENT, MAX_LOG_ARGUMENT, MAX_EXP_ARGUMENT = 0.4, 0.5, 0.2
+ROTATION_BOOST = 1.0 / 3.0  # [-] of the rigid motions' boost, for rotations: with more, bodies overshoot after a slide

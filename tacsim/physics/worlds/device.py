@@ -8,6 +8,7 @@ Its arrays: tacsim.physics.worlds.device_state.
 """
 
 from tacsim.compute.runtime import ti
+from tacsim.physics.body.grid_motion import Drive, grid_update
 from tacsim.physics.body.mass import CHANGE, SECOND, cell_means, grid_changes, second_changes
 from tacsim.physics.body.tied_node_kernels import Ends, set_tied_velocities, transfer_impulses
 from tacsim.physics.body.transfers import Body, Strips, grid_to_particles, particles_to_grid
@@ -38,7 +39,6 @@ from tacsim.physics.gel.kernels import (
     surface_at,
 )
 from tacsim.physics.gel.mass import gel_advance_filtered, gel_filter_first_pass, gel_means
-from tacsim.physics.worlds.grid_motion import Drive, grid_update
 from tacsim.physics.worlds.hybrid_kernels import ContactHistories, Records, gel_contact, store_record
 from tacsim.physics.worlds.survey import BLOCKS
 from tacsim.physics.worlds.survey_kernels import Sums

@@ -2,6 +2,7 @@
 
 from tacsim.compute.runtime import ti
 from tacsim.compute.taichi_patches.separate_functions import compiled_separately
+from tacsim.physics.body.grid_motion import Drive, drive_rotation, drive_row, grid_update
 from tacsim.physics.body.mass import (
     CHANGE,
     SECOND,
@@ -55,7 +56,6 @@ from tacsim.physics.exec.team import (
 )
 from tacsim.physics.gel.kernels import GelArrays, Gels, Lattice, contact_force_start, gel_forces, gel_of
 from tacsim.physics.gel.mass import gel_advance_filtered, gel_filter_first_pass, gel_means
-from tacsim.physics.worlds.grid_motion import Drive, drive_rotation, drive_row, grid_update
 
 Records = ti.types.ndarray(dtype=ti.f32, ndim=4)
 STAGES = 7  # of a substep

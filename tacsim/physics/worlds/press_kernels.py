@@ -1,6 +1,7 @@
 """Kernel of a rigid indenter on one gel."""
 
 from tacsim.compute.runtime import ti
+from tacsim.physics.body.grid_motion import Drive
 from tacsim.physics.contact.indenter import Indenter, IndenterArrays, apply_indenter, update_node_pressure
 from tacsim.physics.exec import layout
 from tacsim.physics.exec.environment import Environment, EnvironmentArrays
@@ -16,7 +17,6 @@ from tacsim.physics.exec.team import (
     report_work_done,
 )
 from tacsim.physics.gel.kernels import GelArrays, Gels, gel_advance, gel_forces, gel_of
-from tacsim.physics.worlds.grid_motion import Drive
 
 
 @ti.kernel

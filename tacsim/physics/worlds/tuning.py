@@ -48,7 +48,6 @@ MAX_GEL_OVERLAP = 0.25  # [gel thicknesses] there is no contact between gels: a 
 # strains that no grid node resolves, and a motion is not settled. The second: smallest growth [-], above rounding.
 MAX_TENSION, MIN_TENSION_GROWTH = 3.0, 1.01
 MAX_GREEN_STRAIN = 0.3  # [-] norm of F^T F - I since the grid's reference: above it, the grid gets a new reference
-ROTATION_BOOST = 1.0 / 3.0  # [-] of the rigid motions' boost, for rotations: with more, bodies overshoot after a slide
 
 # An indenter on a gel
 # [-] dt / (element size / wave speed). Edges of a box tear the surface at 0.6, without a NaN; 0.5 costs overlap.

@@ -10,6 +10,7 @@ from tacsim.geometry.sampling import body_points
 from tacsim.models.material import BodyMaterial
 from tacsim.models.scene import Body as BodyModel
 from tacsim.models.scene import Box
+from tacsim.physics.body.grid_motion import Drive, grid_update
 from tacsim.physics.body.mass import grid_changes
 from tacsim.physics.body.plasticine import BodyState, body_params
 from tacsim.physics.body.transfers import (
@@ -22,7 +23,6 @@ from tacsim.physics.body.transfers import (
 from tacsim.physics.exec import layout
 from tacsim.physics.exec.environment import Counts, Environment, Floats, Params, Partial
 from tacsim.physics.exec.lanes import NODES, PARTS
-from tacsim.physics.worlds.grid_motion import Drive, grid_update
 
 pytestmark = pytest.mark.cpu
 

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from tacsim.compute.runtime import start_taichi, ti
+from tacsim.physics.body.grid_motion import Drive, grid_update
 from tacsim.physics.body.mass import CHANGE, SECOND, cell_means, second_changes
 from tacsim.physics.body.transfers import Body, Strips
+from tacsim.physics.body.tuning import ROTATION_BOOST
 from tacsim.physics.exec import layout
 from tacsim.physics.exec.environment import Counts, Environment, Floats, Params, Partial
 from tacsim.physics.exec.lanes import NODES, PARTS, aligned_zeros
-from tacsim.physics.worlds.grid_motion import Drive, grid_update
-from tacsim.physics.worlds.tuning import ROTATION_BOOST
 
 SHAPE = (7, 6, 8)  # nodes; strips are whole
 INSIDE = (slice(1, -1),) * 3  # nodes at the border have no mass

@@ -7,6 +7,7 @@ from tacsim.compute.runtime import start_taichi, ti
 from tacsim.geometry.sampling import body_points
 from tacsim.models.scene import Body as BodyModel
 from tacsim.models.scene import Box, Cylinder, Shape, Sphere
+from tacsim.physics.body.grid_motion import Drive, grid_update
 from tacsim.physics.body.mass import grid_changes
 from tacsim.physics.body.plasticine import BodyState, bounds_of_points, grid_around
 from tacsim.physics.body.tied_node_kernels import Ends, set_tied_velocities, transfer_impulses
@@ -16,7 +17,6 @@ from tacsim.physics.body.tuning import MAX_TIED_NODE_MASS, STENCIL_REACH
 from tacsim.physics.exec import layout
 from tacsim.physics.exec.environment import Counts, Environment, Floats, Params, Partial
 from tacsim.physics.exec.lanes import COPIES, NODES, PARTS
-from tacsim.physics.worlds.grid_motion import Drive, grid_update
 
 SPACING = 0.5  # of particles [mm]
 CELL = 2 * SPACING

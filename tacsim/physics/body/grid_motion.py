@@ -3,6 +3,7 @@
 from tacsim.compute.runtime import ti
 from tacsim.physics.body.mass import CHANGE, box_of_part, changes_at, filter_strip, motion_of
 from tacsim.physics.body.transfers import has_velocities
+from tacsim.physics.body.tuning import ROTATION_BOOST
 from tacsim.physics.exec import layout
 from tacsim.physics.exec.lanes import (
     NODES,
@@ -17,7 +18,6 @@ from tacsim.physics.exec.lanes import (
     vec3,
     vec4,
 )
-from tacsim.physics.worlds.tuning import ROTATION_BOOST
 
 Drive = ti.types.ndarray(dtype=ti.f32, ndim=5)  # (environments, substeps, gels, rows, 3)
 

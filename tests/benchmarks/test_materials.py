@@ -54,6 +54,7 @@ def test_waves_run_at_the_speed_of_the_continuum_to_second_order(monkeypatch: py
         assert truths == pytest.approx([8.0, 8.0 * math.sqrt(2 * (1 - 0.45) / (1 - 2 * 0.45))])
 
 
+@pytest.mark.slow
 def test_a_cube_drawn_apart_yields_and_keeps_its_momentum() -> None:
     (row,) = materials.plasticine_alone(4e-3, 0.5e-3, 1)
     assert row.figures["yielded"] > 0.5

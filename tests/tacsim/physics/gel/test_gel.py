@@ -119,6 +119,7 @@ def corner_energy(u: np.ndarray, h: float, modulus: float) -> float:
     return energy
 
 
+@pytest.mark.slow
 def test_narrow_corners_press_back_by_a_potential() -> None:
     """So their forces add up to none, and do not turn the gel; the other forces are as ever. With a long step they are
     less, and still add up to none."""
@@ -157,6 +158,7 @@ def test_each_gel_of_each_environment_has_its_own_forces(element: float) -> None
         assert np.abs(state.common_group.f[environment, gel] - truth).max() < 3e-6 * np.abs(truth).max()
 
 
+@pytest.mark.slow
 def test_gels_that_are_cut_differently_have_their_own_forces() -> None:
     """Of three environments: each gel at its place in memory, with its own spacing and material."""
     fine = Gel(size=(3.5e-3, 2e-3, 1.5e-3), material=GelMaterial(youngs_modulus=0.5e6, poisson_ratio=0.3))

@@ -113,11 +113,13 @@ class ShardedVectorEnv(VectorEnv[Any, Any, Any]):
     """
 
     def __init__(self, make: MakeEnvs, options: Mapping[str, Any], num_envs: int, processes: int | None) -> None:
+        if type(num_envs) is not int or num_envs < 1:
+            raise ValueError(f"num_envs is a number from 1; got {num_envs!r}")
         if processes is None:
             processes = thread_count()
         elif type(processes) is not int or processes < 1:
             raise ValueError(f"processes is a number from 1, or None for one for each core; got {processes!r}")
-        count = min(processes, max(1, num_envs))
+        count = min(processes, num_envs)
         self._bounds = [num_envs * number // count for number in range(count + 1)]
         self._sizes = [int(size) for size in np.diff(self._bounds)]
         self._workers: list[_Worker] = []

@@ -134,6 +134,12 @@ def test_a_wrong_number_of_processes_is_refused(processes: Any) -> None:
         make_sharded_env(2, processes=processes)
 
 
+@pytest.mark.parametrize("number", [0, -2, 1.5, "3", None])
+def test_a_wrong_number_of_environments_is_refused(number: Any) -> None:
+    with pytest.raises(ValueError, match="num_envs is a number from 1"):
+        make_sharded_env(number)
+
+
 def test_infos_of_parts_are_filled_where_one_has_no_entry() -> None:
     first = {"a": np.array([1.0]), "_a": np.array([True]), "final_info": {"b": np.array(["x"], object)}}
     second = {"a": np.array([2.0, 3.0]), "_a": np.array([True, True]), "c": np.ones((2, 4), np.int8)}

@@ -48,8 +48,8 @@ def observing(host: str, file: Path) -> Iterator[None]:
 
 
 def stop_often(served: Served, page: Page, count: int) -> list[tuple[float, float]]:
-    """Moves the upper arm up and down by hand and stops it `count` times. Returns when each STOP was sent, and until
-    when nothing was started after it [s]."""
+    """Moves the upper arm up and down by hand and stops it `count` times. Returns when each STOP was sent [s],
+    and the controller's time until which nothing was started after it [s]."""
     asked = []
     draw = random.Random(1)
     controller = FaultClient(mock_host(12))
@@ -65,7 +65,7 @@ def stop_often(served: Served, page: Page, count: int) -> list[tuple[float, floa
         shown = controller.state().time  # on a busy machine a mock controller is slower than real time
         until(lambda shown=shown: controller.state().time > shown + QUIET, pause=0.02)  # type: ignore[misc]
         page.jog = None
-        asked.append((moment, time.monotonic()))
+        asked.append((moment, controller.state().time))
     controller.close()
     return asked
 
@@ -76,7 +76,8 @@ def latencies(seen: NDArray[np.void], asked: list[tuple[float, float]]) -> tuple
     times, clock, speeds = seen["received"], seen["timestamp"], np.linalg.norm(seen["velocity"], axis=1)
     found, lost, unsuited = [], 0, 0
     for moment, quiet in asked:
-        start, end = np.searchsorted(times, [moment, quiet])
+        # The end by the controller's clock: an observer that was stalled receives the packages before it later.
+        start, end = int(np.searchsorted(times, moment)), int(np.searchsorted(clock, quiet))
         apart = np.linalg.norm(seen["position"][start:end] - seen["position"][end - 1], axis=1)
         standing = start + int(np.flatnonzero(apart > SLACK)[-1]) + 1 if (apart > SLACK).any() else start
         if clock[end - 1] - clock[min(standing, end - 1)] < 0.5 * QUIET:

@@ -31,6 +31,9 @@ if TYPE_CHECKING:
     from tacsim.interface import Clock as Clock
     from tacsim.interface import EndOfEpisode as EndOfEpisode
     from tacsim.interface import GelReading as GelReading
+    from tacsim.interface import Gripper as Gripper
+    from tacsim.interface import GripperState as GripperState
+    from tacsim.interface import GripperTarget as GripperTarget
     from tacsim.interface import HardwareArm as HardwareArm
     from tacsim.interface import IncompatibleRig as IncompatibleRig
     from tacsim.interface import Needs as Needs
@@ -52,6 +55,7 @@ if TYPE_CHECKING:
     from tacsim.models.driver import Check as Check
     from tacsim.models.driver import Companion as Companion
     from tacsim.models.driver import SensorDriver as SensorDriver
+    from tacsim.models.gripper import GripperConfig as GripperConfig
     from tacsim.models.hardware import ArmConfig as ArmConfig
     from tacsim.models.hardware import ArmLimits as ArmLimits
     from tacsim.models.hardware import CameraSensorConfig as CameraSensorConfig
@@ -68,6 +72,7 @@ if TYPE_CHECKING:
     from tacsim.models.randomisation import Randomisation as Randomisation
     from tacsim.models.rig import KneadConfig as KneadConfig
     from tacsim.models.rig import ReplayArmConfig as ReplayArmConfig
+    from tacsim.models.rig import ReplayGripperConfig as ReplayGripperConfig
     from tacsim.models.rig import ReplaySensorConfig as ReplaySensorConfig
     from tacsim.models.rig import RepositionConfig as RepositionConfig
     from tacsim.models.rig import RigConfig as RigConfig
@@ -116,6 +121,7 @@ if TYPE_CHECKING:
     from tacsim.sim.pads import TactilePads as TactilePads
     from tacsim.tasks import Axis as Axis
     from tacsim.tasks import Estimator as Estimator
+    from tacsim.tasks import GripAxis as GripAxis
     from tacsim.tasks import Knead as Knead
     from tacsim.tasks import Outcome as Outcome
     from tacsim.tasks import Reposition as Reposition

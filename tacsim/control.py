@@ -185,7 +185,7 @@ class LoadController:
         """`action` with each loaded arm's displacement along z replaced. Raises LimitExceeded when a load is out of
         reach, or a force is not finite."""
         held = {name: self._loaded_target(name, action.tool.get(name), arms[name]) for name in self.loads}
-        return Action({**action.tool, **held})
+        return Action({**action.tool, **held}, action.grippers)
 
     def record_sent_poses(self, poses: Mapping[str, Pose | None]) -> None:
         """What the arms were really sent, after their limits; None: nothing was executed."""

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tacsim.interface import Action, FloatArray, Mask, Pose
+from tacsim.interface import Action, FloatArray, GripperTarget, Mask, Pose
 
 MAX_POSITION = 1e3  # from the origin: no sensor is sent beyond [m]
 ROUNDING = 1e-9  # of positions: this far outside still counts as inside [m]
@@ -28,8 +28,9 @@ class LimitExceeded(RuntimeError):
     `recover`, a simulated one as long as it is exceeded."""
 
 
-def check_action(action: object, movable: Collection[str], rig: str) -> Action:
-    """`action`, if rig `rig` can take it: an Action that addresses only `movable` arms, each with a Pose or None.
+def check_action(action: object, movable: Collection[str], rig: str, grippers: Collection[str] = ()) -> Action:
+    """`action`, if rig `rig` can take it: an Action that addresses only `movable` arms, each with a Pose or None, and
+    only its `grippers`, each with a GripperTarget or None.
 
     Raises ActionError.
     """
@@ -51,7 +52,45 @@ def check_action(action: object, movable: Collection[str], rig: str) -> Action:
                 f"target of arm '{name}' is at {target.position.tolist()} m, more than {MAX_POSITION:g} m from the "
                 "origin; poses are in metres, in the world frame"
             )
+    _check_grippers(action, grippers, rig)
     return action
+
+
+def _check_grippers(action: Action, grippers: Collection[str], rig: str) -> None:
+    if not isinstance(action.grippers, Mapping):
+        raise ActionError(
+            "Action.grippers must map names of grippers to targets, such as {'hand': GripperTarget(0.0, 5.0)}, "
+            f"got {type(action.grippers).__name__}"
+        )
+    for name, target in action.grippers.items():
+        if name not in grippers:
+            names = ", ".join(sorted(grippers)) or "(none)"
+            raise ActionError(f"action for gripper '{name}', but rig '{rig}' has only the grippers: {names}")
+        if target is not None and not is_gripper_target(target):
+            raise ActionError(
+                f"action for gripper '{name}' must be a tacsim.GripperTarget with a width [m] and a force [N], finite "
+                f"and not negative, or None (holds), got {target!r}"
+            )
+
+
+def is_gripper_target(target: object) -> bool:
+    """Whether `target` is a GripperTarget with two finite numbers, neither negative."""
+    if not isinstance(target, GripperTarget):
+        return False
+    try:
+        return all(math.isfinite(value) and value >= 0.0 for value in (target.width, target.force))
+    except TypeError:
+        return False
+
+
+def limit_gripper_target(
+    target: GripperTarget, width_range: tuple[float, float], force_range: tuple[float, float]
+) -> GripperTarget:
+    """`target`, its width [m] and force [N] brought into these ranges: what is sent to a gripper, and reported."""
+    width, force = (
+        min(max(value, low), high) for value, (low, high) in ((target.width, width_range), (target.force, force_range))
+    )
+    return target if (width, force) == (target.width, target.force) else GripperTarget(width, force)
 
 
 def limit_step(target: Pose, current: Pose, max_step: float, max_turn: float) -> Pose:

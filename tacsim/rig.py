@@ -13,6 +13,9 @@ from tacsim.interface import (
     Arm,
     ArmState,
     Clock,
+    Gripper,
+    GripperState,
+    GripperTarget,
     IncompatibleRig,
     Needs,
     Normaliser,
@@ -61,15 +64,18 @@ class Rig:
         on_tactile: called with every tactile observation before anybody acts on it; raises what ends the episode.
         on_close: closes what the rig needs besides sensors and arms, after them.
         load_control: holds normal forces, whatever the actions ask along the z axis of the sensors.
+        grippers: by name.
     """
 
     # By name; for calibration and inspection only.
     sensors: Mapping[str, TactileSource]
     arms: Mapping[str, Arm]
+    grippers: Mapping[str, Gripper]
     normalisers: Mapping[str, Normaliser]  # by sensor
     # Native, by sensor; empty before the first.
     frames: Mapping[str, TactileFrame]  # of the last observation
     references: Mapping[str, TactileFrame]  # without contact, that the last reset took
+    sent_grippers: Mapping[str, GripperTarget | None]  # what the last command really sent; None: nothing was executed
 
     def __init__(
         self,
@@ -87,11 +93,13 @@ class Rig:
         on_tactile: Callable[[Mapping[str, TactileObservation]], None] | None = None,
         on_close: Callable[[], None] | None = None,
         load_control: LoadController | None = None,
+        grippers: Mapping[str, Gripper] | None = None,
     ) -> None:
         if set(normalisers) != set(sensors):
             raise ValueError(f"rig '{name}': sensors {sorted(sensors)} but normalisers {sorted(normalisers)}")
         self.name = name
         self.sensors, self.arms, self.normalisers = dict(sensors), dict(arms), dict(normalisers)
+        self.grippers, self.sent_grippers = dict(grippers or {}), {}
         self._clock, self._reset, self._truth, self._diagnostics = clock, reset, truth, diagnostics
         self._read_all, self._load_control, self._packages = read_all, load_control, packages
         self._on_tactile, self._on_close = on_tactile, on_close
@@ -99,9 +107,11 @@ class Rig:
         self._closed = False
         self.frames = self.references = {}
         specs = {sensor: source.spec for sensor, source in sensors.items()}
-        self.spec = RigSpec(sensors=specs, arms=tuple(arms), truth=truth is not None, period=clock.period)
+        self.spec = RigSpec(specs, tuple(arms), truth is not None, clock.period, tuple(self.grippers))
         # A sensor that no arm carries may be addressed by its own name: the action is recorded, nothing moves.
-        self._addressable = set(arms) | {sensor for sensor, spec in specs.items() if spec.arm is None}
+        self._addressable = set(arms) | {
+            sensor for sensor, spec in specs.items() if spec.arm is None and spec.gripper is None
+        }
 
     def require(self, needs: Needs, requester: str) -> None:
         """Raises IncompatibleRig with the difference when `requester` needs what this rig does not deliver."""
@@ -120,7 +130,8 @@ class Rig:
         return self.observe()
 
     def observe(self) -> Observation:
-        """The newest tactile observations, and the states that the arms had when those pictures were exposed.
+        """The newest tactile observations, the states that the arms had when those pictures were exposed, and the
+        newest ones of the grippers.
 
         Raises TimeoutError without a frame, EndOfEpisode after a recording.
         """
@@ -128,17 +139,19 @@ class Rig:
         frames = dict(zip(self.sensors, self._read_all(reads), strict=True))
         exposed = {self.sensors[name].spec.arm: frame.time for name, frame in frames.items()}
         arms: dict[str, ArmState] = {name: arm.state(exposed.get(name)) for name, arm in self.arms.items()}
+        grippers: dict[str, GripperState] = {name: gripper.state() for name, gripper in self.grippers.items()}
         now = self._clock.now()
         tactile = {name: self.normalisers[name](frame, now) for name, frame in frames.items()}
         self.frames, self._arm_states = frames, arms
         if self._on_tactile is not None:
             self._on_tactile(tactile)
-        return Observation(tactile=tactile, arms=arms, time=now)
+        return Observation(tactile=tactile, arms=arms, time=now, grippers=grippers)
 
     def step(self, action: Action) -> tuple[Observation, Mapping[str, Pose | None]]:
-        """One control period: commands the arms, lets the clock run, observes.
+        """One control period: commands arms and grippers, lets the clock run, observes.
 
-        Returns the observation and what each arm was really sent (None: nothing was executed).
+        Returns the observation and what each arm was really sent (None: nothing was executed); what the grippers were
+        sent is in `sent_grippers`.
         Raises ActionError for an action that this rig cannot take, RuntimeError once it is closed, whatever observe
         raises, and SimulationDiverged. An arm that cannot follow stops the others.
         """
@@ -147,12 +160,15 @@ class Rig:
         return self.observe(), sent
 
     def command(self, action: Action) -> Mapping[str, Pose | None]:
-        """The first part of a step: commands the arms; returns and raises as `step`."""
-        check_action(action, self._addressable, self.name)
+        """The first part of a step: commands arms and grippers; returns and raises as `step`."""
+        check_action(action, self._addressable, self.name, self.grippers)
         if self._load_control is not None:
             action = self._load_control(action, self._arm_states)
         with self._stop_all_on_failure():
             sent = {name: arm.command(action.tool.get(name)) for name, arm in self.arms.items()}
+            self.sent_grippers = {
+                name: gripper.command(action.grippers.get(name)) for name, gripper in self.grippers.items()
+            }
         if self._load_control is not None:
             self._load_control.record_sent_poses(sent)
         return sent
@@ -187,13 +203,15 @@ class Rig:
         return found
 
     def stop(self) -> None:
-        """Stops all arms, each even when another fails to stop."""
-        _call_all([arm.stop for arm in self.arms.values()])
+        """Stops all arms and grippers, each even when another fails to stop."""
+        _call_all([*(arm.stop for arm in self.arms.values()), *(gripper.stop for gripper in self.grippers.values())])
 
     def close(self) -> None:
-        """Stops all arms, then closes everything, each even when another fails. A step in another thread ends."""
+        """Stops all arms and grippers, then closes everything, each even when another fails. A step in another thread
+        ends."""
         self._closed = True
-        arms = [*(arm.stop for arm in self.arms.values()), *(arm.close for arm in self.arms.values())]
+        moving: list[Arm | Gripper] = [*self.arms.values(), *self.grippers.values()]
+        arms = [*(part.stop for part in moving), *(part.close for part in moving)]
         others = [] if self._on_close is None else [self._on_close]
         _call_all([*arms, *(sensor.close for sensor in self.sensors.values()), *others])
 
@@ -226,6 +244,7 @@ def require_needs(rig: str, spec: RigSpec, needs: Needs, requester: str, advice:
     missing = needs.missing(spec)
     if missing:
         has = f"sensors {', '.join(spec.sensors)}; arms {', '.join(spec.arms) or '(none)'}"
+        has += f"; grippers {', '.join(spec.grippers)}" if spec.grippers else ""
         words = f"{requester} cannot run on rig '{rig}': it lacks {'; '.join(missing)}. It has {has}"
         raise IncompatibleRig(f"{words}. {advice}" if advice else words)
 

@@ -77,7 +77,9 @@ class Camera(Closing):
         played = source_kind(config, name) in ("folder", "video")
         self._can_repeat = config.repeats or played
         self._config, self._name = config, name
-        self.spec = SensorSpec(image_shape=(config.height, config.width), height=False, flow=False, arm=config.arm)
+        self.spec = SensorSpec(
+            image_shape=(config.height, config.width), height=False, flow=False, arm=config.arm, gripper=config.gripper
+        )
         self._stop_event = threading.Event()
         self._changed = threading.Condition()  # guards the attributes below
         self._capture: Capture | None = None

@@ -53,7 +53,7 @@ class CameraDriver(SensorDriver[CameraSensorConfig]):
 
     def spec(self, normaliser: Normaliser) -> SensorSpec:
         shape = self.config.height, self.config.width
-        return SensorSpec(shape, normaliser.finds_height, normaliser.finds_flow, self.config.arm)
+        return SensorSpec(shape, normaliser.finds_height, normaliser.finds_flow, self.config.arm, self.config.gripper)
 
     def open(self, spec: SensorSpec, companion: Companion | None) -> Camera:
         from robot.camera.camera import Camera

@@ -119,13 +119,19 @@ def _describe(entry: Any, *, is_alone: bool) -> dict[str, Any]:
 
 def _describe_policy(path: Path) -> dict[str, Any]:
     from robot.deploy.onnx_policy import read_policy_spec
+    from tacsim.models.policy import ActionAxis
 
     spec = read_policy_spec(path)
     return {
         "task": spec.task,
         "period": f"{spec.period:g} s",
         "inputs": {key: list(numbers.names) for key, numbers in spec.inputs.items()},
-        "axes": [f"{axis.arm} {list(axis.direction)}" for axis in spec.axes],
+        "axes": [
+            f"{axis.arm} {list(axis.direction)}"
+            if isinstance(axis, ActionAxis)
+            else f"{axis.gripper} {axis.min_force:g} to {axis.max_force:g} N"
+            for axis in spec.axes
+        ],
         "max_step": f"{spec.max_step * 1e3:g} mm",
         "trained": spec.trained,  # settings of `tacsim train`
         "training range": "recorded" if spec.range is not None else "unknown",

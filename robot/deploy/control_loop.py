@@ -283,6 +283,8 @@ class _EpisodeLog:
             info=info,
             seconds=seconds,
             packages=packages,
+            grippers=observation.grippers,
+            sent_grippers={} if action is None else self._rig.sent_grippers,
             body=_subsample(truth.points) if self._has_body and truth is not None else None,
         )
 

@@ -20,11 +20,11 @@ from robot.deploy.training_range import RangeMonitor, number_names
 from tacsim import pose as se3
 from tacsim.gym.features import FeatureEncoder
 from tacsim.interface import Action, Needs, Observation, Pose, RigSpec
-from tacsim.models.policy import METADATA_KEY, Numbers, PolicySpec
+from tacsim.models.policy import METADATA_KEY, ActionAxis, Numbers, PolicySpec
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.models.text import printable_line
 from tacsim.tasks import Task
-from tacsim.tasks.task import Axis, action_of_vector
+from tacsim.tasks.task import ActionAxes, Axis, GripAxis, action_of_vector, needs_of_axes
 
 if TYPE_CHECKING:
     from onnxruntime import InferenceSession
@@ -58,8 +58,9 @@ class OnnxPolicy:
         self.spec = _read_spec(path, self._session)
         self._name, self._goal = path.name, goal
         self._encoder = FeatureEncoder(self.spec.features, canonical)
-        self._axes = tuple(Axis(axis.arm, axis.direction) for axis in self.spec.axes)
+        self._axes = _axes_of(self.spec)
         self._targets: dict[str, Pose] = {}
+        self._is_new = True  # no observation of this episode was seen yet
         _require_same_inputs(path, self.spec, self._encoder.inputs, self._session, goal)
         names = number_names(self.spec, 0 if goal is None else np.size(goal))
         try:
@@ -74,24 +75,24 @@ class OnnxPolicy:
 
     @property
     def needs(self) -> Needs:
-        features = self._encoder.needs
-        arms = features.arms | {axis.arm for axis in self._axes}
-        return Needs(features.sensors, arms, height=features.height, flow=features.flow)
+        features, moved = self._encoder.needs, needs_of_axes(self._axes)
+        arms, grippers = features.arms | moved.arms, features.grippers | moved.grippers
+        return Needs(features.sensors, arms, height=features.height, flow=features.flow, grippers=grippers)
 
     def reset(self) -> None:
-        self._targets = {}
+        self._targets, self._is_new = {}, True
         self.range_monitor.reset()
 
     def __call__(self, observation: Observation) -> Action:
         """The action for an observation. Raises PolicyFailed if the graph fails or returns no valid action."""
         max_deviation = 2.0  # between target and pose of an arm; beyond it the next target starts at the pose
-        first = not self._targets
+        first, self._is_new = self._is_new, False
         features = self._encoder.begin(observation, self._goal) if first else self._encoder(observation)
         self.range_monitor(features)
-        for axis in self._axes:
-            now = observation.arms[axis.arm].pose
-            if first or se3.pose_distance(self._targets[axis.arm], now)[0] > max_deviation * self.spec.max_step:
-                self._targets[axis.arm] = now
+        for arm in sorted(needs_of_axes(self._axes).arms):
+            now = observation.arms[arm].pose
+            if first or se3.pose_distance(self._targets[arm], now)[0] > max_deviation * self.spec.max_step:
+                self._targets[arm] = now
         action = action_of_vector(self._infer(features), self._axes, self.spec.max_step, self._targets)
         self._targets = {arm: pose for arm, pose in action.tool.items() if pose is not None}
         return action
@@ -133,8 +134,8 @@ def find_mismatches(policy: OnnxPolicy, rig: RigSpec, task: Task | None) -> list
         )
     if task.config.kind != spec.task:
         found.append(f"task '{spec.task}', this is '{task.config.kind}'")
-    if tuple(Axis(axis.arm, axis.direction) for axis in spec.axes) != task.axes:
-        found.append(f"actions along {_list_axes(spec.axes)}, this task has {_list_axes(task.axes)}")
+    if _axes_of(spec) != task.axes:
+        found.append(f"actions along {_list_axes(_axes_of(spec))}, this task has {_list_axes(task.axes)}")
     if spec.max_step > task.config.max_step * (1 + 1e-6):
         found.append(
             f"steps of up to {1e3 * spec.max_step:g} mm, this task allows {1e3 * task.config.max_step:g} mm (max_step)"
@@ -142,8 +143,22 @@ def find_mismatches(policy: OnnxPolicy, rig: RigSpec, task: Task | None) -> list
     return found
 
 
-def _list_axes(axes: Any) -> str:
-    return ", ".join(f"{axis.arm} {tuple(axis.direction)}" for axis in axes)
+def _axes_of(spec: PolicySpec) -> tuple[Axis | GripAxis, ...]:
+    return tuple(
+        Axis(axis.arm, axis.direction)
+        if isinstance(axis, ActionAxis)
+        else GripAxis(axis.gripper, axis.min_force, axis.max_force)
+        for axis in spec.axes
+    )
+
+
+def _list_axes(axes: ActionAxes) -> str:
+    return ", ".join(
+        f"{axis.arm} {tuple(axis.direction)}"
+        if isinstance(axis, Axis)
+        else f"{axis.gripper} {axis.min_force:g} to {axis.max_force:g} N"
+        for axis in axes
+    )
 
 
 def read_policy_spec(path: Path) -> PolicySpec:

@@ -14,6 +14,7 @@ from tacsim.models.driver import (
     SensorDriver,
     SensorPart,
     arm_part,
+    gripper_part,
     installed_drivers,
     sensor_part,
 )
@@ -43,7 +44,8 @@ def check_parts(config: RigConfig) -> None:
     """Checks that all parts of a rig support its clock, and that each sensor can be opened. Raises CannotOpen."""
     sensors = {name: sensor_of(config, name) for name in config.sensors}
     arms = {name: arm_part(arm, name) for name, arm in config.arms.items()}
-    for kind, parts in (("arm", arms), ("sensor", sensors)):
+    grippers = {name: gripper_part(gripper, name) for name, gripper in config.grippers.items()}
+    for kind, parts in (("arm", arms), ("gripper", grippers), ("sensor", sensors)):
         for name, part in parts.items():
             if config.clock in part.clocks:
                 continue

@@ -57,7 +57,9 @@ class ObservedEpisode:
             if not normalisers:
                 normalisers = {name: self._normaliser(name, frame) for name, frame in frames.items()}
             tactile = {name: normalisers[name](frame, step.time) for name, frame in frames.items()}
-            yield step, Observation(tactile, {name: step.arms[name] for name in spec.arms}, step.time)
+            arms = {name: step.arms[name] for name in spec.arms}
+            grippers = {name: step.grippers[name] for name in spec.grippers}
+            yield step, Observation(tactile, arms, step.time, grippers)
 
     def _normaliser(self, name: str, first: TactileFrame) -> Normaliser:
         """With the episode's reference image, or else with the first frame as reference."""

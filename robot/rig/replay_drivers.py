@@ -1,4 +1,4 @@
-"""The driver `replay`: recorded arms and sensors. The rig of a recording opens them (replay_rig.py)."""
+"""The driver `replay`: recorded arms, grippers and sensors. The rig of a recording opens them (replay_rig.py)."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tacsim.interface import Normaliser
-from tacsim.models.driver import ArmPart, SensorPart
-from tacsim.models.rig import ReplayArmConfig, ReplaySensorConfig
+from tacsim.models.driver import ArmPart, GripperPart, SensorPart
+from tacsim.models.rig import ReplayArmConfig, ReplayGripperConfig, ReplaySensorConfig
 
 
 class ReplaySensorPart(SensorPart[ReplaySensorConfig]):
@@ -50,4 +50,11 @@ class ReplayArmPart(ArmPart[ReplayArmConfig]):
     """An arm whose poses and forces come from a recording or a table."""
 
     config_class = ReplayArmConfig
+    clocks = ("replay",)
+
+
+class ReplayGripperPart(GripperPart[ReplayGripperConfig]):
+    """A gripper whose width and force come from a recording."""
+
+    config_class = ReplayGripperConfig
     clocks = ("replay",)

@@ -14,9 +14,16 @@ from tacsim.config import load_rig
 from tacsim.interface import Normaliser, TactileFrame
 from tacsim.models.driver import sensor_part
 from tacsim.models.hardware import parts_of
-from tacsim.models.rig import ReplayArmConfig, ReplaySensorConfig, RigConfig
+from tacsim.models.rig import ReplayArmConfig, ReplayGripperConfig, ReplaySensorConfig, RigConfig
 from tacsim.record.episode import EpisodeMeta
-from tacsim.record.replay import ReplayArm, ReplayClock, ReplaySensor, match_sources, recorded_period
+from tacsim.record.replay import (
+    ReplayArm,
+    ReplayClock,
+    ReplayGripper,
+    ReplaySensor,
+    match_sources,
+    recorded_period,
+)
 from tacsim.record.ros_bag import is_ros_bag
 from tacsim.record.sources import EPISODES, episode_meta
 from tacsim.rig import Rig
@@ -37,12 +44,23 @@ class ReplayReset:
 
 
 def open_replay(config: RigConfig) -> Rig:
-    """Recorded sensors and arms. The control period is that of the recording. Raises CannotOpen, EpisodeError."""
+    """Recorded sensors, arms and grippers. The control period is that of the recording. Raises CannotOpen and
+    EpisodeError."""
     recorded_arms = {
         name: arm for name, arm in parts_of(config.arms, ReplayArmConfig).items() if arm.source is not None
     }
+    recorded_grippers = {
+        name: gripper
+        for name, gripper in parts_of(config.grippers, ReplayGripperConfig).items()
+        if gripper.source is not None
+    }
     recorded = {
-        name: sensor if sensor.arm in recorded_arms else sensor.model_copy(update={"arm": None})
+        name: sensor.model_copy(
+            update={
+                "arm": sensor.arm if sensor.arm in recorded_arms else None,
+                "gripper": sensor.gripper if sensor.gripper in recorded_grippers else None,
+            }
+        )
         for name, sensor in parts_of(config.sensors, ReplaySensorConfig).items()
     }
     clock = ReplayClock(_common_period(config.name, recorded))
@@ -61,6 +79,10 @@ def open_replay(config: RigConfig) -> Rig:
         for name, arm in recorded_arms.items():
             arms[name] = ReplayArm(arm, name, clock)
             stack.callback(arms[name].close)
+        grippers: dict[str, ReplayGripper] = {}
+        for name, gripper in recorded_grippers.items():
+            grippers[name] = ReplayGripper(gripper, name, clock)
+            stack.callback(grippers[name].close)
         match_sources(sensors, arms)
         rig = Rig(
             name=config.name,
@@ -69,6 +91,7 @@ def open_replay(config: RigConfig) -> Rig:
             clock=clock,
             normalisers=normalisers,
             reset=ReplayReset(clock, sensors),
+            grippers=dict(grippers),
         )
         stack.pop_all()
         return rig

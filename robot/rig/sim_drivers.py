@@ -34,7 +34,13 @@ class SimSensorDriver(SensorDriver[SimSensorConfig]):
 
     def spec(self, normaliser: Normaliser) -> SensorSpec:
         model = self.config.model
-        return SensorSpec(model.image_shape, height=True, flow=model.markers is not None, arm=self.config.arm)
+        return SensorSpec(
+            model.image_shape,
+            height=True,
+            flow=model.markers is not None,
+            arm=self.config.arm,
+            gripper=self.config.gripper,
+        )
 
     def open(self, spec: SensorSpec, companion: Companion | None) -> TactileSource:
         assert companion is not None

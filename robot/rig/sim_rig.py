@@ -156,7 +156,9 @@ def _frame_of_arm(config: RigConfig, scene: Scene) -> dict[str, str]:
 def _make_sensor(world: World, clock: SimClock, name: str, config: SimSensorConfig, rig: RigConfig) -> SimSensor:
     assert rig.scene is not None
     model = config.model
-    spec = SensorSpec(model.image_shape, height=True, flow=model.markers is not None, arm=config.arm)
+    spec = SensorSpec(
+        model.image_shape, height=True, flow=model.markers is not None, arm=config.arm, gripper=config.gripper
+    )
     sample = partial(surface_map, grid=rig.canonical, markers=model.markers)
     render, noise = _renderer_and_noise(model, name, rig.scene)
     return SimSensor(world, clock, name, spec, render, sample, noise, config.delay)

@@ -32,11 +32,11 @@ from tacsim.geometry.shapes import bounding_size
 from tacsim.gym.encode import space_of_features
 from tacsim.gym.features import FeatureEncoder
 from tacsim.interface import Pose, Truth
-from tacsim.models.policy import ActionAxis, PolicySpec, Training
+from tacsim.models.policy import ActionAxis, ActionGrip, PolicySpec, Training
 from tacsim.models.rig import TaskConfig
 from tacsim.models.scene import Scene
 from tacsim.models.text import printable_line
-from tacsim.tasks import GoalOutOfReach, make_task
+from tacsim.tasks import Axis, GoalOutOfReach, make_task
 
 POLICY, CURVE, CURVE_PICTURE = "policy.onnx", "curve.json", "curve.png"  # in the folder of a run
 Figures = Mapping[str, float]
@@ -90,7 +90,12 @@ def begin_run(training: Training, folder: Path) -> RunFolder:
         period=config.period,
         features=training.features,
         inputs=encoder.inputs,
-        axes=tuple(ActionAxis(arm=axis.arm, direction=axis.direction) for axis in task.axes),
+        axes=tuple(
+            ActionAxis(arm=axis.arm, direction=axis.direction)
+            if isinstance(axis, Axis)
+            else ActionGrip(gripper=axis.gripper, min_force=axis.min_force, max_force=axis.max_force)
+            for axis in task.axes
+        ),
         max_step=config.task.max_step,
         trained={"by": f"tacsim {version()}".strip(), "training": training.model_dump(mode="json")},
     )

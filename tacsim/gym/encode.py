@@ -15,6 +15,7 @@ has no key.
 | twist_ARM       | (6,) float32 [m/s, rad/s]                                                         |
 | wrench_ARM      | (6,) float32 [N, N m]                                                             |
 | joints_ARM      | (n,) float32 [rad]                                                                |
+| grip_GRIPPER    | (2,) float32, width [m] and force [N]; (1,) where the force is not measured       |
 """
 
 from __future__ import annotations
@@ -44,6 +45,7 @@ BOUNDS = {
     "twist": 100.0,  # [m/s, rad/s]
     "wrench": 1e4,  # [N, N m]
     "joints": 4 * math.pi,  # [rad]
+    "grip": 1e4,  # [m, N]
 }
 
 
@@ -54,6 +56,9 @@ def flatten_observation(observation: Observation, start: Mapping[str, Pose]) -> 
         flat |= {f"{key}_{name}": value for key, value in _flatten_touch(touch).items()}
     for name, arm in observation.arms.items():
         flat |= {f"{key}_{name}": value for key, value in _flatten_arm(arm, start[name]).items()}
+    for name, gripper in observation.grippers.items():
+        numbers = [gripper.width] if gripper.force is None else [gripper.width, gripper.force]
+        flat[f"grip_{name}"] = np.array(numbers, np.float32)
     return flat
 
 

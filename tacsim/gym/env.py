@@ -13,7 +13,7 @@ from gymnasium.error import ResetNeeded
 from tacsim.control import NoTouch
 from tacsim.gym import encode
 from tacsim.gym.features import FeatureEncoder
-from tacsim.interface import Float32, Image, Needs, Observation, Policy, Pose, Truth
+from tacsim.interface import Float32, GripperTarget, Image, Needs, Observation, Policy, Pose, Truth
 from tacsim.limits import LimitExceeded
 from tacsim.models.rig import RigConfig, TaskConfig
 from tacsim.models.scene import Scene
@@ -200,6 +200,7 @@ class TacsimEnv(gymnasium.Env[encode.FlatObservation, Float32]):
         self.phase, self._failure, self._done = "new", None, None
         observation = self.rig.reset(seed)
         self._targets: dict[str, Pose] = {name: arm.pose for name, arm in observation.arms.items()}  # last sent there
+        self._grips: dict[str, GripperTarget] = {}  # last sent
         self._truth_at_start = self._require_truth()
         self.task.require_reachable(self._truth_at_start)
         self._effort = Effort(observation.arms)
@@ -274,6 +275,7 @@ class TacsimEnv(gymnasium.Env[encode.FlatObservation, Float32]):
             )
             return
         self._targets |= {name: pose for name, pose in self._sent.items() if pose is not None}
+        self._grips |= {name: grip for name, grip in self.rig.sent_grippers.items() if grip is not None}
         self._observation = observation
         self._effort.add(observation.arms)
         self._flat = self._view(observation)
@@ -329,7 +331,7 @@ class TacsimEnv(gymnasium.Env[encode.FlatObservation, Float32]):
         """What `policy` does here, as an action of this environment. A policy with a memory must be asked in every step
         of the episode, and reset before."""
         action = policy(self._observation)
-        return vector_of_action(action, self.task.axes, self.task.config.max_step, self._targets)
+        return vector_of_action(action, self.task.axes, self.task.config.max_step, self._targets, self._grips)
 
     def render(self) -> Image | None:
         """The native pictures of all sensors side by side, (H, W, 3) uint8 RGB, in the order of the rig; smaller ones

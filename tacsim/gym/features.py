@@ -21,7 +21,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tacsim import pose as se3
-from tacsim.interface import ArmState, FloatArray, IncompatibleRig, Needs, Observation, Pose, TactileObservation
+from tacsim.gym.cell_means import CellMeans, image_means
+from tacsim.interface import (
+    ArmState,
+    FloatArray,
+    GripperState,
+    IncompatibleRig,
+    Needs,
+    Observation,
+    Pose,
+    TactileObservation,
+)
 from tacsim.models.policy import Channel, Features, MapGrid, Numbers, Quantity
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.tasks.reposition import centre_of_pressure_in_sensor
@@ -47,6 +57,7 @@ SCALES = {
     "stepped": 0.5e-3,  # of an arm since the last observation, in the axes of its sensor at reset [m]
     "between": 10e-3,  # from the first arm's sensor to another's, in the axes of the first [m]
     "turn": 0.1,  # first two columns of a rotation, less those of no rotation [-]
+    "width": 20e-3,  # of a gripper [m]
     "goal": 10e-3,  # [m]
 }
 # What each quantity consists of, and the scale of each part.
@@ -67,6 +78,7 @@ PARTS: dict[str, dict[str, str]] = {
     | {f"turn_{column}{axis}": "turn" for column in "xy" for axis in "xyz"},
     "stepped": {f"stepped_{axis}": "stepped" for axis in "xyz"},
     "between": {f"between_{axis}": "between" for axis in "xyz"},
+    "grip": {"width": "width", "grip_force": "force"},
 }
 _IDENTITY_COLUMNS = np.array([1.0, 0.0, 0.0, 0.0, 1.0, 0.0])
 _SENSOR_QUANTITIES = ("area", "depth", "centroid", "shear")
@@ -104,7 +116,7 @@ class FeatureEncoder:
     def __init__(self, features: Features, canonical: CanonicalGrid) -> None:
         self.features = features
         canonical_maps = set(features.maps) - {"picture"}
-        self._cell_means = _CellMeans(features.grid, canonical) if canonical_maps else None
+        self._cell_means = CellMeans(features.grid, canonical) if canonical_maps else None
         self._rows, self._columns = (_cell_centres(n, canonical.pitch) for n in (canonical.rows, canonical.columns))
         self._cell_area = canonical.pitch**2
         self._goal: Arrays = {}
@@ -120,7 +132,8 @@ class FeatureEncoder:
         wanted = self.features
         height = bool({"height", "slope"} & set(wanted.maps) or {"depth", "centroid"} & set(wanted.touch))
         flow = wanted.flow or "shear" in wanted.touch
-        return Needs(frozenset(wanted.sensors), frozenset(wanted.arms), height=height, flow=flow)
+        sensors, arms, grippers = map(frozenset, (wanted.sensors, wanted.arms, wanted.grippers))
+        return Needs(sensors, arms, height=height, flow=flow, grippers=grippers)
 
     @property
     def inputs(self) -> dict[str, Numbers]:
@@ -149,7 +162,10 @@ class FeatureEncoder:
     def _touch_parts(self, quantities: Sequence[Quantity]) -> list[tuple[str, float]]:
         """Name and scale of all that `touch` says of them."""
         wanted = self.features
-        owners = {kind: wanted.sensors if kind in _SENSOR_QUANTITIES else wanted.arms for kind in quantities}
+        owners = {
+            kind: wanted.sensors if kind in _SENSOR_QUANTITIES else wanted.grippers if kind == "grip" else wanted.arms
+            for kind in quantities
+        }
         return [
             part
             for kind, names in owners.items()
@@ -195,7 +211,10 @@ class FeatureEncoder:
         if wanted.touch:
             arms = {name: observation.arms[name] for name in wanted.arms}
             quantities: dict[str, FloatArray] = {
-                quantity: self._encode_quantity(quantity, touches, arms) for quantity in wanted.touch
+                quantity: _encode_grips([observation.grippers[name] for name in wanted.grippers])
+                if quantity == "grip"
+                else self._encode_quantity(quantity, touches, arms)
+                for quantity in wanted.touch
             }
             if wanted.remembered:
                 self._sums = self._sums + np.concatenate([quantities[quantity] for quantity in wanted.remembered])
@@ -208,7 +227,7 @@ class FeatureEncoder:
     def _encode_map(self, touch: TactileObservation, kind: Channel) -> FloatArray:
         """(channels, h, w) of one sensor."""
         if kind == "picture":
-            return _image_means(touch.picture, self.features.grid) / SCALES["picture"] - 1.0
+            return image_means(touch.picture, self.features.grid) / SCALES["picture"] - 1.0
         assert self._cell_means is not None
         return self._cell_means(_encode_channel(touch, kind), touch.valid)
 
@@ -259,59 +278,14 @@ class FeatureEncoder:
         return np.array([pressed.sum(axis=0) @ self._columns, pressed.sum(axis=1) @ self._rows]) / total
 
 
-class _CellMeans:
-    """Means over the cells of a finer grid with the same centre.
-
-    Raises IncompatibleRig when a cell is no whole number of the finer cells, or lies beyond them.
-    """
-
-    def __init__(self, grid: MapGrid, canonical: CanonicalGrid) -> None:
-        self._shape, self._every = (grid.rows, grid.columns), round(grid.pitch / canonical.pitch)
-        finer = (canonical.rows, canonical.columns)
-        margins = [have - want * self._every for have, want in zip(finer, self._shape, strict=True)]
-        whole = self._every >= 1 and abs(self._every * canonical.pitch - grid.pitch) <= 1e-6 * grid.pitch
-        if not whole or min(margins) < 0 or any(margin % 2 for margin in margins):
-            raise IncompatibleRig(
-                f"maps of {grid.rows} x {grid.columns} cells of {1e3 * grid.pitch:g} mm cannot be put together from "
-                f"the rig's canonical grid of {canonical.rows} x {canonical.columns} cells of "
-                f"{1e3 * canonical.pitch:g} mm: give the rig a grid whose cells are a whole part of these, and that "
-                "spans them (canonical)"
-            )
-        self._inside = tuple(
-            slice(margin // 2, have - margin // 2) for margin, have in zip(margins, finer, strict=True)
-        )
-
-    def __call__(self, values: FloatArray, valid: NDArray[np.bool_]) -> FloatArray:
-        """(channels, h, w) means of (rows, columns, channels) over valid cells; 0 where none is."""
-        if valid.all():
-            return self._block_sums(values[self._inside]).transpose(2, 0, 1) / self._every**2
-        weights = valid[self._inside].astype(np.float64)[..., None]
-        total, count = self._block_sums(values[self._inside] * weights), self._block_sums(weights)
-        means: FloatArray = np.divide(total, count, out=np.zeros_like(total), where=count > 0)
-        return means.transpose(2, 0, 1)
-
-    def _block_sums(self, values: FloatArray) -> FloatArray:
-        (rows, columns), every, channels = self._shape, self._every, values.shape[-1]
-        down = values.reshape(rows, every, columns * every, channels).sum(axis=1)  # one axis after the other is quicker
-        total: FloatArray = down.reshape(rows, columns, every, channels).sum(axis=2)
-        return total
-
-
-def _image_means(picture: NDArray[np.uint8] | None, grid: MapGrid) -> FloatArray:
-    """(3, h, w) means over the parts of a picture [grey levels], which differ in size by a pixel at most."""
-    if picture is None:
-        raise IncompatibleRig("the policy sees pictures as the camera gave them, and this sensor delivers none")
-    rows, columns = picture.shape[:2]
-    if rows < grid.rows or columns < grid.columns:
-        raise IncompatibleRig(
-            f"the policy's picture of {rows} x {columns} px has fewer than {grid.rows} x {grid.columns} parts: "
-            "give the sensor a larger picture"
-        )
-    down, right = np.arange(grid.rows) * rows // grid.rows, np.arange(grid.columns) * columns // grid.columns
-    sums = np.add.reduceat(np.add.reduceat(picture, down, axis=0, dtype=np.float64), right, axis=1)
-    pixels = np.outer(np.diff(down, append=rows), np.diff(right, append=columns))
-    means: FloatArray = sums.transpose(2, 0, 1) / pixels
-    return means
+def _encode_grips(grippers: Sequence[GripperState]) -> FloatArray:
+    """Width and force of each. Raises IncompatibleRig for a gripper that does not measure its force."""
+    numbers: list[float] = []
+    for gripper in grippers:
+        if gripper.force is None:
+            raise IncompatibleRig("the policy sees grip forces, and this gripper does not measure its own")
+        numbers += [gripper.width / SCALES["width"], gripper.force / SCALES["force"]]
+    return np.array(numbers)
 
 
 def _named_parts(kind: str, owner: str) -> list[tuple[str, float]]:

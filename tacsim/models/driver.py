@@ -1,8 +1,9 @@
-"""Drivers of sensors and arms: what a rig asks of one, and how the installed ones are found.
+"""Drivers of sensors, arms and grippers: what a rig asks of one, and how the installed ones are found.
 
-A driver is a class that an installed distribution names in its entry point group `tacsim.drivers`, as "sensor.NAME" or
-"arm.NAME"; ours are found in the same way. NAME is the `driver:` of a rig file, and that of the class's `config_class`.
-Its module is imported whenever a rig file is read, so it imports what is heavy (a camera's SDK, OpenCV) in `open`.
+A driver is a class that an installed distribution names in its entry point group `tacsim.drivers`, as "sensor.NAME",
+"arm.NAME" or "gripper.NAME"; ours are found in the same way. NAME is the `driver:` of a rig file, and that of the
+class's `config_class`. Its module is imported whenever a rig file is read, so it imports what is heavy (a camera's
+SDK, OpenCV) in `open`.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tacsim.interface import HardwareArm, Normaliser, Pose, SensorSpec, TactileSource, Truth
+from tacsim.models.gripper import GripperConfig
 from tacsim.models.hardware import ArmConfig, SensorConfig
 from tacsim.models.sensor import CanonicalGrid
 
@@ -30,6 +32,7 @@ WHY_LATENCY = (
 
 SensorC = TypeVar("SensorC", bound=SensorConfig)
 ArmC = TypeVar("ArmC", bound=ArmConfig)
+GripperC = TypeVar("GripperC", bound=GripperConfig)
 State = Literal["ok", "warn", "fail"]
 ClockName = Literal["sim", "wall", "replay"]
 
@@ -217,8 +220,23 @@ class ArmDriver(ArmPart[ArmC], ABC):
         return None
 
 
-AnyPart = type[SensorPart[Any]] | type[ArmPart[Any]]
-BASE_CLASSES: dict[str, tuple[type, type]] = {"sensor": (SensorPart, SensorDriver), "arm": (ArmPart, ArmDriver)}
+class GripperPart(Generic[GripperC]):
+    """A parallel gripper as its rig file describes it; making one opens nothing."""
+
+    config_class: ClassVar[type[GripperConfig]]
+    clocks: ClassVar[tuple[ClockName, ...]]
+
+    def __init__(self, config: GripperC, name: str) -> None:
+        self.config, self.name = config, name
+
+
+AnyPart = type[SensorPart[Any]] | type[ArmPart[Any]] | type[GripperPart[Any]]
+# The class of all of a kind, and that of hardware; hardware of grippers is not supported yet
+BASE_CLASSES: dict[str, tuple[type, type | None]] = {
+    "sensor": (SensorPart, SensorDriver),
+    "arm": (ArmPart, ArmDriver),
+    "gripper": (GripperPart, None),
+}
 
 
 class DriversMissing(ValueError):
@@ -227,7 +245,7 @@ class DriversMissing(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Drivers:
-    """The installed drivers, by kind ("sensor", "arm") and name, and why others are refused."""
+    """The installed drivers, by kind ("sensor", "arm", "gripper") and name, and why others are refused."""
 
     usable: Mapping[str, dict[str, AnyPart]] = field(default_factory=lambda: {kind: {} for kind in BASE_CLASSES})
     refused: Mapping[str, dict[str, str]] = field(default_factory=lambda: {kind: {} for kind in BASE_CLASSES})
@@ -241,7 +259,8 @@ def installed_drivers() -> Drivers:
         kind, _, name = entry.name.partition(".")
         home = "an unknown distribution" if entry.dist is None else entry.dist.name
         if kind not in BASE_CLASSES:
-            why = f"{home} calls it '{entry.name}' in the group {GROUP}; call it 'sensor.{name}' or 'arm.{name}'"
+            kinds = ", ".join(f"'{each}.{name}'" for each in BASE_CLASSES)
+            why = f"{home} calls it '{entry.name}' in the group {GROUP}; call it one of {kinds}"
             for each in BASE_CLASSES:
                 found.refused[each][name] = why
             continue
@@ -256,7 +275,7 @@ def installed_drivers() -> Drivers:
             found.refused[kind][name] = f"the one of {home} ({entry.value}) {why}"
         else:
             found.usable[kind][name] = driver
-    if OWN not in homes.values():
+    if OWN not in homes.values() or not all(found.usable.values()):  # one of each kind is ours
         raise DriversMissing(
             f"the drivers of tacsim are not registered: this installation is older than its code. In the checkout, run "
             f"`{INSTALL}`; an installed tacsim: `python -m pip install --force-reinstall --no-deps tacsim`"
@@ -272,11 +291,13 @@ def _load(entry: metadata.EntryPoint, kind: str, name: str, *, is_own: bool) -> 
     except Exception as failure:  # whatever a distribution of another author raises: other drivers still work
         return None, f"cannot be loaded: {type(failure).__name__}: {failure}"
     if not (isinstance(found, type) and issubclass(found, part)):
-        return None, f"is no class that derives from tacsim.{driver.__name__}"
+        return None, f"is no class that derives from tacsim.{(driver or part).__name__}"
     clocks = getattr(found, "clocks", ())
     if clocks != ("wall",) and not is_own:
         return None, f"goes by the clocks {clocks}; simulations and replays have drivers of tacsim alone, so ('wall',)"
-    if "wall" in clocks and not issubclass(found, driver):
+    if "wall" in clocks and driver is None:
+        return None, f"goes by the wall clock, and tacsim opens no {kind} of hardware yet"
+    if "wall" in clocks and driver is not None and not issubclass(found, driver):
         return None, f"goes by the wall clock and does not derive from tacsim.{driver.__name__}"
     missing = sorted(getattr(found, "__abstractmethods__", ()))
     if missing:
@@ -290,7 +311,8 @@ def _load(entry: metadata.EntryPoint, kind: str, name: str, *, is_own: bool) -> 
 
 
 def refused_driver(parts: str, name: str) -> str | None:
-    """Why an installed driver of that name is refused; None for one that is not. parts: "sensors" or "arms"."""
+    """Why an installed driver of that name is refused; None for one that is not. parts: "sensors", "arms" or
+    "grippers"."""
     return installed_drivers().refused.get(parts.removesuffix("s"), {}).get(name)
 
 
@@ -308,7 +330,13 @@ def arm_part(config: ArmConfig, name: str, keep_out: Mapping[str, float] | None 
     return made
 
 
-def _class_of(config: SensorConfig | ArmConfig, kind: str, name: str) -> Any:
+def gripper_part(config: GripperConfig, name: str) -> GripperPart[Any]:
+    """The driver of one gripper of a rig. Raises ValueError for one that is not installed."""
+    made: GripperPart[Any] = _class_of(config, "gripper", name)(config, name)
+    return made
+
+
+def _class_of(config: SensorConfig | ArmConfig | GripperConfig, kind: str, name: str) -> Any:
     drivers = installed_drivers()
     found = drivers.usable[kind].get(config.driver)
     if found is None:

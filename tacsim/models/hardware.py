@@ -122,6 +122,7 @@ class SensorConfig(Config):
     is_simulated: ClassVar[bool] = False  # its frames come from the simulation of the rig's scene
     driver: str
     arm: Name | None = None  # that carries it
+    gripper: Name | None = None  # that carries it, where no arm does directly
 
     @property
     def sensor_model(self) -> SensorModel | None:
@@ -184,7 +185,7 @@ Part = TypeVar("Part")
 
 
 def parts_of(parts: Mapping[str, object], config_class: type[Part]) -> dict[str, Part]:
-    """The arms or sensors of a rig whose configuration is of this class, by name."""
+    """The arms, grippers or sensors of a rig whose configuration is of this class, by name."""
     return {name: part for name, part in parts.items() if isinstance(part, config_class)}
 
 

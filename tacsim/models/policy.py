@@ -10,11 +10,11 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Field, model_validator
 
 from tacsim.models.hardware import Name
-from tacsim.models.quantity import Config, Length, Time
+from tacsim.models.quantity import Config, Force, Length, Time
 from tacsim.models.randomisation import Randomisation
 
 Channel = Literal["height", "slope", "contact", "image", "picture"]
-Quantity = Literal["area", "depth", "centroid", "shear", "wrench", "pressure", "moved", "stepped", "between"]
+Quantity = Literal["area", "depth", "centroid", "shear", "wrench", "pressure", "moved", "stepped", "between", "grip"]
 
 METADATA_KEY = "tacsim.spec"  # of an ONNX file
 
@@ -33,6 +33,7 @@ class Features(Config):
 
     sensors: tuple[Name, ...] = Field(default=("lower", "upper"), max_length=16)
     arms: tuple[Name, ...] = Field(default=("lower", "upper"), max_length=16)
+    grippers: tuple[Name, ...] = Field(default=(), max_length=16)
     maps: tuple[Channel, ...] = ("height",)  # of each sensor, on `grid`
     grid: MapGrid = MapGrid()
     flow: bool = False  # tactile flow of each sensor, on the lattice of its markers
@@ -46,6 +47,7 @@ class Features(Config):
         for name, listed in {
             "sensors": self.sensors,
             "arms": self.arms,
+            "grippers": self.grippers,
             "maps": self.maps,
             "touch": self.touch,
             "remembered": self.remembered,
@@ -56,6 +58,8 @@ class Features(Config):
             raise ValueError("maps and flow are those of sensors: name some, or leave both out")
         if "between" in self.touch and len(self.arms) < 2:
             raise ValueError("touch 'between' is of two arms and more: name them, or leave it out")
+        if "grip" in self.touch and not self.grippers:
+            raise ValueError("touch 'grip' is of grippers: name some, or leave it out")
         unseen = [name for name in self.remembered if name not in self.touch]
         if unseen:
             raise ValueError(f"remembered is of what touch names; add {', '.join(unseen)} to touch, or leave it out")
@@ -93,6 +97,20 @@ class ActionAxis(Config):
         return self
 
 
+class ActionGrip(Config):
+    """One number of an action: the force of `gripper`, from `min_force` at -1 to `max_force` at 1."""
+
+    gripper: Name
+    min_force: Annotated[Force, Field(ge=0)]  # [N]
+    max_force: Annotated[Force, Field(gt=0)]  # [N]
+
+    @model_validator(mode="after")
+    def _require_range(self) -> Self:
+        if not self.min_force < self.max_force:
+            raise ValueError(f"min_force {self.min_force:g} N must be below max_force, {self.max_force:g} N")
+        return self
+
+
 class TrainingRange(Config):
     """What a policy observed in its training, and what was simulated there; `robot.deploy.training_range` says how an
     observation is compared with it. `tacsim export policy-range` measures it."""
@@ -124,7 +142,7 @@ class PolicySpec(Config):
     features: Features
     # Of each input of the graph; so a change of the encoder's own conventions is noticed.
     inputs: dict[str, Numbers]
-    axes: Annotated[tuple[ActionAxis, ...], Field(min_length=1, max_length=64)]
+    axes: Annotated[tuple[ActionAxis | ActionGrip, ...], Field(min_length=1, max_length=64)]
     max_step: Annotated[Length, Field(gt=0)]  # an action of 1 moves its arm so far [m]
     trained: dict[str, Any] = {}  # how it was made, for people
     range: TrainingRange | None = None  # of its training; None: unknown

@@ -10,7 +10,16 @@ from pydantic import ConfigDict, Field, GetCoreSchemaHandler, model_validator
 from pydantic_core import CoreSchema, PydanticCustomError
 
 from tacsim.models.driver import installed_drivers
-from tacsim.models.hardware import ArmConfig, ArmLimits, KeepOut, Name, Placement, ResetConfig, SensorConfig
+from tacsim.models.gripper import GripperConfig
+from tacsim.models.hardware import (
+    ArmConfig,
+    ArmLimits,
+    KeepOut,
+    Name,
+    Placement,
+    ResetConfig,
+    SensorConfig,
+)
 from tacsim.models.quantity import Config, Force, Length, Speed, Time
 from tacsim.models.scene import Scene
 from tacsim.models.sensor import CanonicalGrid, PictureRegion, SensorModel
@@ -54,6 +63,17 @@ class ReplayArmConfig(ArmConfig):
     source: str | None = None  # None: the recording has no such arm, the rig is opened without it
     force_column: str = "force_N"  # normal force, positive when pressed [N]
     width_column: str | None = "gripper_width_m"  # opening of a parallel gripper [m]
+
+    @property
+    def is_real(self) -> bool:
+        return False
+
+
+class ReplayGripperConfig(GripperConfig):
+    """The gripper states of an episode (.mcap)."""
+
+    driver: Literal["replay"]
+    source: str | None = None  # None: the recording has no such gripper, the rig is opened without it
 
     @property
     def is_real(self) -> bool:
@@ -195,8 +215,8 @@ class RecordConfig(Config):
 
 
 class RigConfig(Config):
-    """One rig file. Its arms and sensors are of the installed drivers, which are looked up when the first rig is read
-    or made (tacsim.models.driver)."""
+    """One rig file. Its arms, grippers and sensors are of the installed drivers, which are looked up when the first rig
+    is read or made (tacsim.models.driver)."""
 
     model_config = ConfigDict(defer_build=True)
 
@@ -206,6 +226,7 @@ class RigConfig(Config):
     task: Annotated[SqueezeConfig | RepositionConfig | KneadConfig, Field(discriminator="kind")] | None = None
     scene: Scene | None = None  # overrides the task's scene
     arms: dict[Name, ArmConfig] = {}
+    grippers: dict[Name, GripperConfig] = {}
     sensors: dict[Name, SensorConfig] = Field(min_length=1)
     canonical: CanonicalGrid = CanonicalGrid()
     motion: SimMotion = "settled"  # of simulated rigs, during a control period; a reset always settles
@@ -227,6 +248,11 @@ class RigConfig(Config):
         for name, sensor in self.sensors.items():
             if sensor.arm is not None:
                 self._require_arm(sensor.arm, "sensors", name, sensor.driver, "arm")
+            if sensor.gripper is not None:
+                self._require_gripper(sensor, "sensors", name, sensor.driver, "gripper")
+        for name, gripper in self.grippers.items():
+            if gripper.arm is not None:
+                self._require_arm(gripper.arm, "grippers", name, gripper.driver, "arm")
         for index, apart in enumerate(self.keep_out):
             for name in apart.arms:
                 self._require_arm(name, "keep_out", index, "arms")
@@ -270,6 +296,18 @@ class RigConfig(Config):
         if arm not in self.arms:
             context = {"arm": arm, "arms": ", ".join(self.arms) or "(none)", "at": at}
             raise PydanticCustomError("no_such_arm", "no arm '{arm}'; allowed: {arms}", context)
+
+    def _require_gripper(self, sensor: SensorConfig, *at: str | int) -> None:
+        """As `_require_arm`, of the gripper that carries a sensor."""
+        context = {"gripper": sensor.gripper, "grippers": ", ".join(self.grippers) or "(none)", "at": at}
+        if sensor.gripper not in self.grippers:
+            raise PydanticCustomError("no_such_gripper", "no gripper '{gripper}'; allowed: {grippers}", context)
+        if sensor.arm is not None:
+            raise PydanticCustomError(
+                "two_carriers",
+                "gripper '{gripper}' carries this sensor; leave out `arm`, which is the gripper's",
+                context,
+            )
 
     def _check_load(self, name: str, load: float) -> None:
         """The arm that holds a load of the task must exist, and must not stop at that force."""
@@ -318,7 +356,7 @@ def rebuild_rig_config() -> None:
 
 def rig_model() -> type[RigConfig]:
     """RigConfig, whose annotations name the configurations of all installed drivers. Raises DriversMissing."""
-    for kind, configs in ((kind, _config_classes(kind)) for kind in ("arm", "sensor")):
+    for kind, configs in ((kind, _config_classes(kind)) for kind in ("arm", "gripper", "sensor")):
         part: Any = Annotated[Union[tuple(configs)], Field(discriminator="driver")]  # noqa: UP007  # of as many as there are
         RigConfig.model_fields[f"{kind}s"].annotation = dict[Name, part]
     return RigConfig

@@ -11,7 +11,17 @@ from typing import Any, Generic, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from tacsim.interface import Action, ArmState, FloatArray, Pose, RigSpec, TactileFrame, short_repr
+from tacsim.interface import (
+    Action,
+    ArmState,
+    FloatArray,
+    GripperState,
+    GripperTarget,
+    Pose,
+    RigSpec,
+    TactileFrame,
+    short_repr,
+)
 
 T = TypeVar("T")
 _VECTORS = ("joints", "joint_speeds", "tcp_pose", "tcp_speed", "tcp_force")
@@ -87,6 +97,8 @@ class Step:
     seconds: float = 0.0  # wall time of the step [s]
     packages: Mapping[str, ArmPackages] = field(default_factory=dict)  # by arm, if the rig file requests them
     body: NDArray[np.float32] | None = None  # (n, 3) particles of a simulated body, if requested; world [m]
+    grippers: Mapping[str, GripperState] = field(default_factory=dict)
+    sent_grippers: Mapping[str, GripperTarget | None] = field(default_factory=dict)  # as executed, by gripper
 
     @property
     def exposed(self) -> Mapping[str, float]:

@@ -18,7 +18,7 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import DecodeError, Message
 from google.protobuf.timestamp_pb2 import Timestamp
 
-from tacsim.interface import Action, ArmState, Float32, Pose, SurfaceMap, TactileFrame
+from tacsim.interface import Action, ArmState, Float32, GripperState, GripperTarget, Pose, SurfaceMap, TactileFrame
 from tacsim.models.text import printable_line
 from tacsim.record.episode import ArmPackages, EpisodeError, LazyRecords, Step
 from tacsim.record.images import decode_image, encode_png
@@ -30,6 +30,7 @@ from tacsim.record.schemas import (
     WRENCH,
     Arm,
     ArmPackage,
+    Gripper,
     Scalar,
     arm_message,
     joints_of,
@@ -95,6 +96,9 @@ def encode_step(step: Step, pitch: float, wall_offset: int = 0) -> list[Encoded]
         messages += _encode_frame(name, frame, pitch, clock)
     for name, arm in step.arms.items():
         messages += _encode_arm(name, arm, clock)
+    for name, gripper in step.grippers.items():
+        data = Gripper(time=gripper.time, width=gripper.width, force=gripper.force).SerializeToString()
+        messages.append(Encoded(f"/{name}/gripper", Gripper, clock.now, clock(gripper.time), data))
     for name, packages in step.packages.items():
         messages += _encode_packages(name, packages, clock)
     if step.body is not None:
@@ -132,13 +136,15 @@ def decode_step(
                 partial(_decode_frame, frames, messages, what, {} if sizes is None else sizes),
             ),
             arms={name: _decode_arm(name, messages) for name in record.arms},
-            action=Action(_decode_poses(record.asked)) if record.acted else None,
+            action=Action(_decode_poses(record.asked), _decode_grips(record.asked_grips)) if record.acted else None,
             sent=_decode_poses(record.sent),
             reward=record.reward if record.HasField("reward") else None,
             distance=record.distance if record.HasField("distance") else None,
             info=info,
             seconds=record.seconds,
             body=_decode_points(_last_message(messages, BODY_TOPIC)) if record.body else None,
+            grippers={name: _decode_gripper(name, messages) for name in record.grippers},
+            sent_grippers=_decode_grips(record.sent_grips),
             packages=LazyRecords(
                 {name: each.lost for name, each in packages.items()},
                 partial(_decode_packages, packages, messages, what),
@@ -161,6 +167,11 @@ def _step_message(step: Step) -> Any:
             target = targets.add(arm=name)
             if pose is not None:
                 set_pose(target, pose.position.tolist(), pose.quaternion.tolist())
+    asked_grips = step.action.grippers if step.action else {}
+    for grips, targets in ((made.asked_grips, asked_grips), (made.sent_grips, step.sent_grippers)):
+        for name, each in targets.items():
+            grips.add(gripper=name, **({} if each is None else {"width": each.width, "force": each.force}))
+    made.grippers.extend(step.grippers)
     for name, frame in step.frames.items():
         surface = frame.surface
         flow = surface is not None and surface.flow is not None
@@ -312,6 +323,15 @@ def _decode_arm(name: str, messages: Messages) -> ArmState:
         joints=np.array(joints_of(arm.joints)) if arm.HasField("joints") else None,
         time=arm.time,
     )
+
+
+def _decode_gripper(name: str, messages: Messages) -> GripperState:
+    gripper = parse_message(Gripper, _last_message(messages, f"/{name}/gripper"))
+    return GripperState(gripper.width, gripper.force if gripper.HasField("force") else None, gripper.time)
+
+
+def _decode_grips(grips: Any) -> dict[str, GripperTarget | None]:
+    return {each.gripper: GripperTarget(each.width, each.force) if each.HasField("width") else None for each in grips}
 
 
 def _encode_packages(name: str, packages: ArmPackages, clock: _Clock) -> Iterator[Encoded]:

@@ -1,16 +1,26 @@
-"""Recorded sensors and arms as parts of a rig. Frame k of every source belongs to tick k of one clock.
+"""Recorded sensors, arms and grippers as parts of a rig. Frame k of every source belongs to tick k of one clock.
 
 Times are on the replay's clock: a picture that was exposed 20 ms before its step is 20 ms old in the replay.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from tacsim.interface import ArmState, EndOfEpisode, Image, Pose, SensorSpec, TactileFrame
-from tacsim.models.rig import ReplayArmConfig, ReplaySensorConfig
+from tacsim.interface import (
+    ArmState,
+    EndOfEpisode,
+    GripperState,
+    GripperTarget,
+    Image,
+    Pose,
+    SensorSpec,
+    TactileFrame,
+)
+from tacsim.models.rig import ReplayArmConfig, ReplayGripperConfig, ReplaySensorConfig
 from tacsim.models.text import suggest_file
 from tacsim.record.episode import EpisodeError
 from tacsim.record.images import read_image, reference_image
@@ -22,6 +32,7 @@ from tacsim.record.sources import (
     Cursor,
     T,
     episode_frames,
+    episode_gripper_states,
     episode_meta,
     episode_states,
     finger_states,
@@ -85,7 +96,9 @@ class ReplaySensor:
             )
         surface = self._first.surface
         flow = surface is not None and surface.flow is not None
-        self.spec = SensorSpec(image_shape=(rows, columns), height=surface is not None, flow=flow, arm=config.arm)
+        self.spec = SensorSpec(
+            image_shape=(rows, columns), height=surface is not None, flow=flow, arm=config.arm, gripper=config.gripper
+        )
 
     def read(self, timeout: float) -> TactileFrame:
         """The frame of this tick, without waiting. Raises EndOfEpisode after the last, EpisodeError for an unreadable
@@ -211,6 +224,42 @@ class ReplayArm:
         rows, self._numbers = read_table(path, columns)
         self._rows = finger_states(rows, self._clock.period, self._name == "lower", self._numbers)
         return lambda: ((state, 0.0) for state in self._rows or [])
+
+
+class ReplayGripper:
+    """The recorded states of a gripper as a Gripper that executes nothing. The source is an episode (the gripper of
+    this name, or its only one).
+
+    Raises EpisodeError if the source is missing, empty, unreadable, or has no such gripper.
+    """
+
+    width_range = force_range = (0.0, math.inf)
+
+    def __init__(self, config: ReplayGripperConfig, name: str, clock: ReplayClock) -> None:
+        self._clock, path = clock, _require_source(config.source, f"grippers.{name}")
+        gripper = select_name(list(episode_meta(path).spec.grippers), name, path, "gripper")
+        self._states = Cursor(
+            lambda: ((state, time - state.time) for state, time in episode_gripper_states(path, gripper)), str(path)
+        )
+        _first_item(self._states, path)
+
+    def state(self) -> GripperState:
+        """The state of this tick. Raises EndOfEpisode after the last."""
+        state, age = self._states.seek(self._clock.index)
+        return replace(state, time=self._clock.now() - age)
+
+    def command(self, target: GripperTarget | None) -> GripperTarget | None:
+        """Executes nothing and returns None."""
+        return None
+
+    def stop(self) -> None:
+        """Has no effect: nothing moves."""
+
+    def recover(self) -> None:
+        """Has no effect: there are no faults."""
+
+    def close(self) -> None:
+        self._states.close()
 
 
 def match_sources(sensors: Mapping[str, ReplaySensor], arms: Mapping[str, ReplayArm]) -> None:

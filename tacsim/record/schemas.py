@@ -2,10 +2,10 @@
 
 Topics: /{sensor}/image foxglove.CompressedImage (PNG), /{sensor}/surface and /{sensor}/flow foxglove.Grid (float32),
 /{sensor}/height foxglove.RawImage (the same height once more, float32 [mm], for viewers that draw no grid),
-/{arm}/pose foxglove.PoseInFrame, /{arm}/transform foxglove.FrameTransform (the same pose as a tree of frames),
-/{arm}/arm tacsim.Arm; if requested, /{arm}/packages tacsim.ArmPackage (each package of the controller) and /body
-foxglove.PointCloud (particles of a simulated body, float32 [m]); /step/{name} tacsim.Scalar (each number of the step's
-info), and at the end of a step /step tacsim.Step, which names the others.
+/{gripper}/gripper tacsim.Gripper, /{arm}/pose foxglove.PoseInFrame, /{arm}/transform foxglove.FrameTransform (the
+same pose as a tree of frames), /{arm}/arm tacsim.Arm; if requested, /{arm}/packages tacsim.ArmPackage (each package
+of the controller) and /body foxglove.PointCloud (particles of a simulated body, float32 [m]); /step/{name}
+tacsim.Scalar (each number of the step's info), and at the end of a step /step tacsim.Step, which names the others.
 
 Clocks: each `time` in tacsim's messages is on the rig's clock [s], exact; a rig of hardware uses its computer's
 monotonic clock. Times of MCAP and of Foxglove's messages are on the wall clock [ns since 1970, UTC]: the rig's clock
@@ -123,15 +123,17 @@ def decode_meta(record: Mapping[str, str], what: str) -> tuple[EpisodeMeta, tupl
 def _check_parts(meta: EpisodeMeta, attachments: tuple[str, ...]) -> None:
     """Raises ValueError for more parts, or longer names, than a report supports."""
     max_file_name = 300  # characters of the name of an attachment
-    max_parts = 64  # sensors, and arms, of an episode
-    if max(len(meta.spec.sensors), len(meta.spec.arms)) > max_parts:
-        raise ValueError(f"more than {max_parts} sensors or arms")
+    max_parts = 64  # sensors, arms, and grippers of an episode
+    if max(len(meta.spec.sensors), len(meta.spec.arms), len(meta.spec.grippers)) > max_parts:
+        raise ValueError(f"more than {max_parts} sensors, arms or grippers")
     if max(len(attachments), len(meta.versions)) > MAX_FILES:
         raise ValueError(f"more than {MAX_FILES} attachments or versions")
     for name in meta.spec.sensors:
         check_name(name, "sensor")
     for name in meta.spec.arms:
         check_name(name, "arm")
+    for name in meta.spec.grippers:
+        check_name(name, "gripper")
     for name in attachments:
         check_name(name, "attachment", max_file_name)
 
@@ -173,8 +175,18 @@ _MESSAGES: dict[str, dict[str, str]] = {
         "safety_bits": "int64",  # safety_status_bits of the controller
         "status": "int64",  # status by the driver: robot.ArmStatus
     },
+    "Gripper": {
+        "time": "optional double",  # rig clock [s]; always set
+        "width": "double",  # between the surfaces that grip [m]
+        "force": "optional double",  # of each finger [N]; absent: not measured
+    },
     "Scalar": {"value": "optional double"},  # always set
     "Target": {"arm": "string", "pose": "foxglove.Pose"},  # world_from_sensor [m]; no pose: the arm holds
+    "Grip": {
+        "gripper": "string",
+        "width": "optional double",  # [m]; absent: the gripper holds
+        "force": "double",  # [N]
+    },
     "Frame": {
         "sensor": "string",
         "time": "double",  # of exposure, rig clock [s]
@@ -201,6 +213,9 @@ _MESSAGES: dict[str, dict[str, str]] = {
         "info": "repeated string",  # each is a Scalar /step/{name}
         "packages": "repeated tacsim.Packages",
         "body": "bool",  # this step has /body
+        "grippers": "repeated string",
+        "asked_grips": "repeated tacsim.Grip",  # the action
+        "sent_grips": "repeated tacsim.Grip",  # the executed part of the action
     },
 }
 
@@ -236,7 +251,7 @@ def _add_file(pool: DescriptorPool, file: Any) -> None:
 
 
 _made = _make_classes()
-Arm, ArmPackage, Scalar, Step = (_made[name] for name in ("Arm", "ArmPackage", "Scalar", "Step"))
+Arm, ArmPackage, Gripper, Scalar, Step = (_made[name] for name in ("Arm", "ArmPackage", "Gripper", "Scalar", "Step"))
 
 # Two vectors of a message hold six numbers.
 TWIST, WRENCH = ("linear", "angular"), ("force", "torque")

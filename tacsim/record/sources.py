@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Generic, TypeVar
 
 import numpy as np
 
-from tacsim.interface import ArmState, EndOfEpisode, Image, Pose, TactileFrame
+from tacsim.interface import ArmState, EndOfEpisode, GripperState, Image, Pose, TactileFrame
 from tacsim.models.text import suggest_file, suggest_word
 from tacsim.optics.picture_file import FORMATS, MAX_SIDE
 from tacsim.record.episode import EpisodeError, EpisodeMeta
@@ -90,6 +90,15 @@ def episode_states(path: Path, arm: str) -> Iterator[tuple[ArmState, float]]:
             if arm not in step.arms:
                 raise EpisodeError(f"{path}: step {step.index} has no state of arm '{arm}'")
             yield step.arms[arm], step.time
+
+
+def episode_gripper_states(path: Path, gripper: str) -> Iterator[tuple[GripperState, float]]:
+    """States of one gripper and the time of their steps [s, clock of the recording]."""
+    with EpisodeFile(path) as file:
+        for step in file.steps():
+            if gripper not in step.grippers:
+                raise EpisodeError(f"{path}: step {step.index} has no state of gripper '{gripper}'")
+            yield step.grippers[gripper], step.time
 
 
 def select_name(names: list[str], name: str, path: Path, kind: str) -> str:

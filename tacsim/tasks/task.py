@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tacsim import pose as se3
-from tacsim.interface import Action, ArmState, FloatArray, Needs, Observation, Policy, Pose, Truth
+from tacsim.interface import Action, ArmState, FloatArray, GripperTarget, Needs, Observation, Policy, Pose, Truth
 from tacsim.limits import ActionError
 from tacsim.models.rig import TaskConfig
 from tacsim.models.sensor import CanonicalGrid
@@ -28,6 +28,27 @@ class Axis:
 
     arm: str
     direction: tuple[float, float, float]  # unit vector, world
+
+
+@dataclass(frozen=True, slots=True)
+class GripAxis:
+    """The grip force as one component of an action vector: -1 is `min_force` and 1 is `max_force`, whatever came
+    before."""
+
+    gripper: str
+    min_force: float  # [N]
+    max_force: float  # [N]
+
+    def target(self, component: float) -> GripperTarget:
+        """To grip with the force of a component."""
+        return GripperTarget(0.0, self.min_force + 0.5 * (component + 1.0) * (self.max_force - self.min_force))
+
+    def component(self, target: GripperTarget) -> float:
+        """The component that asks for the force of a target."""
+        return 2.0 * (target.force - self.min_force) / (self.max_force - self.min_force) - 1.0
+
+
+ActionAxes = Sequence[Axis | GripAxis]
 
 
 class BadDraws(ValueError):
@@ -48,7 +69,7 @@ class Task(ABC):
 
     @property
     @abstractmethod
-    def axes(self) -> tuple[Axis, ...]:
+    def axes(self) -> tuple[Axis | GripAxis, ...]:
         """Of its action."""
 
     @property
@@ -66,8 +87,8 @@ class Task(ABC):
 
     @property
     def needs(self) -> Needs:
-        """What it needs of a rig, the arms that it moves by default; the policy has needs of its own."""
-        return Needs(arms=frozenset(axis.arm for axis in self.axes))
+        """What it needs of a rig, the arms and grippers that it moves by default; the policy has needs of its own."""
+        return needs_of_axes(self.axes)
 
     @property
     def touch_needs(self) -> Needs:
@@ -126,10 +147,19 @@ def tolerance_reward(x: float, bounds: tuple[float, float], margin: float) -> fl
     return math.exp(math.log(0.1) * (outside / margin) ** 2)
 
 
+def needs_of_axes(axes: ActionAxes) -> Needs:
+    """The arms and grippers that axes move."""
+    return Needs(
+        arms=frozenset(axis.arm for axis in axes if isinstance(axis, Axis)),
+        grippers=frozenset(axis.gripper for axis in axes if isinstance(axis, GripAxis)),
+    )
+
+
 def action_of_vector(
-    vector: NDArray[np.floating[Any]], axes: Sequence[Axis], max_step: float, poses: Mapping[str, Pose]
+    vector: NDArray[np.floating[Any]], axes: ActionAxes, max_step: float, poses: Mapping[str, Pose]
 ) -> Action:
-    """Component i moves its arm from `poses` by vector[i] * max_step [m] along its axis, rotation kept.
+    """Component i moves its arm from `poses` by vector[i] * max_step [m] along its axis, rotation kept; of a
+    GripAxis it is the grip force.
 
     Raises ActionError for a wrong shape, a component that is not finite, or one outside [-1, 1].
     """
@@ -145,19 +175,33 @@ def action_of_vector(
             f"action components must be finite and within [-1, 1], got {values.tolist()}; "
             "bound the policy's output (gymnasium.wrappers.ClipAction does it)"
         )
-    positions = {axis.arm: np.array(poses[axis.arm].position) for axis in axes}
+    positions: dict[str, FloatArray] = {}
+    grips: dict[str, GripperTarget | None] = {}
     for axis, value in zip(axes, values, strict=True):
-        positions[axis.arm] += value * max_step * np.array(axis.direction)
-    return Action({arm: Pose(position, poses[arm].quaternion) for arm, position in positions.items()})
+        if isinstance(axis, GripAxis):
+            grips[axis.gripper] = axis.target(float(value.clip(-1.0, 1.0)))
+        else:
+            before = positions.get(axis.arm, poses[axis.arm].position)
+            positions[axis.arm] = before + value * max_step * np.array(axis.direction)
+    return Action({arm: Pose(position, poses[arm].quaternion) for arm, position in positions.items()}, grips)
 
 
 def vector_of_action(
-    action: Action, axes: Sequence[Axis], max_step: float, poses: Mapping[str, Pose]
+    action: Action,
+    axes: ActionAxes,
+    max_step: float,
+    poses: Mapping[str, Pose],
+    grips: Mapping[str, GripperTarget] | None = None,
 ) -> NDArray[np.float32]:
-    """The vector that asks for `action` from `poses`: the inverse of `action_of_vector`. What is longer than max_step
-    is cut to it, and what is not along an axis is left out; an arm that holds has zeros."""
+    """The vector that asks for `action` from `poses` and the grippers' last targets: the inverse of `action_of_vector`.
+    What is longer than max_step, or beyond the forces of an axis, is cut, and what is not along an axis is left out; an
+    arm that holds has zeros."""
     vector = np.zeros(len(axes), np.float32)
     for number, axis in enumerate(axes):
+        if isinstance(axis, GripAxis):
+            grip = action.grippers.get(axis.gripper) or (grips or {}).get(axis.gripper)
+            vector[number] = -1.0 if grip is None else axis.component(grip)
+            continue
         target = action.tool.get(axis.arm)
         if target is not None:
             vector[number] = (target.position - poses[axis.arm].position) @ np.array(axis.direction) / max_step

@@ -47,8 +47,8 @@ def test_an_observation_is_a_line_a_field() -> None:
     ("value", "text"),
     [
         (Pose(), "Pose(position=[0, 0, 0], quaternion=[0, 0, 0, 1])"),
-        (Action({"upper": None}), "Action(tool={'upper': None})"),
-        (Action(), "Action(tool={})"),
+        (Action({"upper": None}), "Action(tool={'upper': None}, grippers={})"),
+        (Action(), "Action(tool={}, grippers={})"),
         (
             SurfaceMap(np.array([[np.nan, 1.0] * 4], np.float32), np.zeros((2, 2, 2), np.float32), None),
             "SurfaceMap(\n    height=float32 (1, 8) 1 to 1, 4 not finite,\n    gradient=float32 (2, 2, 2) 0 to 0,\n"

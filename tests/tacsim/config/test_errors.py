@@ -178,7 +178,7 @@ def test_an_arm_that_is_not_there_is_reported_at_the_sensor(folder: Path) -> Non
 
 OVERRIDES = {
     "scene.presett=draft": f"scene.presett: unknown key; allowed: {SCENE_KEYS}; did you mean 'preset'?",
-    "scne.preset=draft": "scne: unknown key; allowed: name, clock, period, task, scene, arms, sensors, canonical, motion, lock_step, contact, keep_out, start, record; did you mean 'scene'?",
+    "scne.preset=draft": "scne: unknown key; allowed: name, clock, period, task, scene, arms, grippers, sensors, canonical, motion, lock_step, contact, keep_out, start, record; did you mean 'scene'?",
     "scene.body.material=doh": "scene.body.material: no material 'doh'; allowed: cold-plasticine, dough, modelling-clay, seed, silicone, "
     "soft-clay; did you mean 'dough'?",
     "scene=missing.yaml": f"scene: there is no file 'missing.yaml'{NEW_SCENE}",

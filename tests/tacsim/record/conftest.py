@@ -10,7 +10,17 @@ import cv2
 import numpy as np
 import pytest
 
-from tacsim.interface import Action, ArmState, Pose, RigSpec, SensorSpec, SurfaceMap, TactileFrame
+from tacsim.interface import (
+    Action,
+    ArmState,
+    GripperState,
+    GripperTarget,
+    Pose,
+    RigSpec,
+    SensorSpec,
+    SurfaceMap,
+    TactileFrame,
+)
 from tacsim.record.episode import ArmPackages, EpisodeMeta, Step
 from tacsim.record.images import encode_png
 from tests.tacsim.record.replayed import picture
@@ -61,12 +71,21 @@ def random_step(
         time=time,
         frames={name: frame(surface) for name, surface in surfaces.items()},
         arms={"lower": arm(joints=False), "upper": arm(joints=True)},
-        action=None if index == 0 else Action({"upper": random_pose(rng), "lower": None}),
+        action=None
+        if index == 0
+        else Action(
+            {"upper": random_pose(rng), "lower": None}, {"hand": GripperTarget(0.0, float(rng.uniform())), "foot": None}
+        ),
         sent={"upper": None if index == 0 else random_pose(rng), "lower": None},
         reward=None if index == 0 else float(rng.normal()),
         distance=None if index == 0 else float(rng.normal()),
         info={"residual": float(rng.normal()), "worst": float("nan"), "most": float("inf"), "hits": 1.0},
         seconds=float(rng.uniform()),
+        grippers={
+            "hand": GripperState(float(rng.uniform()), float(rng.uniform()), time - 2e-3),
+            "foot": GripperState(0.0, None, time),
+        },
+        sent_grippers={} if index == 0 else {"hand": GripperTarget(0.01, 0.0), "foot": None},
         packages={"upper": random_packages(rng, 3 * index, time)} if packages else {},
         body=rng.normal(size=(40 + index, 3)).astype(np.float32) if body else None,
     )
@@ -89,7 +108,7 @@ def meta() -> EpisodeMeta:
         task="squeeze",
         policy="scripted",
         seed=7,
-        spec=RigSpec(sensors=sensors, arms=("lower", "upper"), truth=True, period=0.1),
+        spec=RigSpec(sensors=sensors, arms=("lower", "upper"), truth=True, period=0.1, grippers=("hand", "foot")),
         versions={"tacsim": "0.2.0", "numpy": "2.4"},
         attachments={"rig.yaml": b"name: sim\n", "calibration/lower.npz": bytes(range(256)), "empty": b""},
         goal=(2e-3, 1 / 3),

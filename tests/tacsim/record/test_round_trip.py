@@ -109,8 +109,8 @@ def test_stock_reader_finds_order_types_and_content(
         assert names["/upper/pose"] == "foxglove.PoseInFrame"
         assert names["/step"] == "tacsim.Step"
         topics = [channel.topic for _, channel, _ in reader.iter_messages()]
-        assert len(topics) == 3 * 19
-        assert topics[18::19] == ["/step"] * 3
+        assert len(topics) == 3 * 21
+        assert topics[20::21] == ["/step"] * 3
         decoded = list(reader.iter_decoded_messages(topics=["/lower/image", "/lower/surface", "/upper/pose"]))
         image, surface, pose = (entry.decoded_message for entry in decoded[-3:])
         assert image.format == "png"

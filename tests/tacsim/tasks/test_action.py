@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tacsim.interface import Action, Pose
+from tacsim.interface import Action, GripperTarget, Pose
 from tacsim.limits import ActionError
-from tacsim.tasks.task import Axis, action_of_vector, vector_of_action
+from tacsim.tasks.task import Axis, GripAxis, action_of_vector, vector_of_action
 
 AXES = (Axis("lower", (0.0, 0.0, 1.0)), Axis("upper", (1.0, 0.0, 0.0)), Axis("upper", (0.0, 1.0, 0.0)))
 POSES = {
@@ -50,3 +50,15 @@ def test_the_vector_of_an_action_asks_for_it_as_far_as_axes_and_lengths_allow() 
     )
     far = Pose(POSES["upper"].position + [1e-3, -1e-4, 5e-3], POSES["upper"].quaternion)
     assert vector_of_action(Action({"upper": far, "lower": None}), AXES, 2e-4, POSES).tolist() == [0.0, 1.0, -0.5]
+
+
+def test_a_component_of_a_gripper_is_its_force() -> None:
+    axes = (Axis("upper", (0.0, 0.0, 1.0)), GripAxis("hand", 1.0, 9.0))
+    action = action_of_vector(np.array([1.0, -0.5]), axes, 2e-4, POSES)
+    assert action.grippers == {"hand": GripperTarget(0.0, 3.0)} and set(action.tool) == {"upper"}
+    assert vector_of_action(action, axes, 2e-4, POSES) == pytest.approx([1.0, -0.5])
+    # A gripper that holds keeps the force of its last target; before the first it has the least force.
+    assert vector_of_action(Action(), axes, 2e-4, POSES, {"hand": GripperTarget(0.0, 9.0)})[1] == 1.0
+    assert vector_of_action(Action(), axes, 2e-4, POSES)[1] == -1.0
+    # Forces beyond the axis are cut to it.
+    assert vector_of_action(Action({}, {"hand": GripperTarget(0.0, 50.0)}), axes, 2e-4, POSES)[1] == 1.0

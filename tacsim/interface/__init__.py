@@ -1,0 +1,32 @@
+"""The contract between policies and rigs: its values, and the parts of a rig as protocols. NumPy only."""
+
+from tacsim.interface.description import short_repr as short_repr
+from tacsim.interface.lazy_field import LazyField as LazyField
+from tacsim.interface.lazy_field import LazyFields as LazyFields
+from tacsim.interface.parts import Arm as Arm
+from tacsim.interface.parts import Clock as Clock
+from tacsim.interface.parts import GelReading as GelReading
+from tacsim.interface.parts import Gripper as Gripper
+from tacsim.interface.parts import HardwareArm as HardwareArm
+from tacsim.interface.parts import Normaliser as Normaliser
+from tacsim.interface.parts import Policy as Policy
+from tacsim.interface.parts import TactileSource as TactileSource
+from tacsim.interface.values import Action as Action
+from tacsim.interface.values import ArmState as ArmState
+from tacsim.interface.values import EndOfEpisode as EndOfEpisode
+from tacsim.interface.values import Float32 as Float32
+from tacsim.interface.values import FloatArray as FloatArray
+from tacsim.interface.values import GripperState as GripperState
+from tacsim.interface.values import GripperTarget as GripperTarget
+from tacsim.interface.values import Image as Image
+from tacsim.interface.values import IncompatibleRig as IncompatibleRig
+from tacsim.interface.values import Mask as Mask
+from tacsim.interface.values import Needs as Needs
+from tacsim.interface.values import Observation as Observation
+from tacsim.interface.values import Pose as Pose
+from tacsim.interface.values import RigSpec as RigSpec
+from tacsim.interface.values import SensorSpec as SensorSpec
+from tacsim.interface.values import SurfaceMap as SurfaceMap
+from tacsim.interface.values import TactileFrame as TactileFrame
+from tacsim.interface.values import TactileObservation as TactileObservation
+from tacsim.interface.values import Truth as Truth

@@ -21,7 +21,8 @@ from tacsim.config.load import require_texts
 from tacsim.interface import RigSpec
 from tacsim.models.policy import Features
 from tacsim.models.randomisation import Randomisation
-from tacsim.models.rig import RigConfig, TaskConfig
+from tacsim.models.rig import RigConfig
+from tacsim.models.task import TaskConfig
 from tacsim.rig import Rig
 
 if TYPE_CHECKING:

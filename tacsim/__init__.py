@@ -70,16 +70,12 @@ if TYPE_CHECKING:
     from tacsim.models.policy import MapGrid as MapGrid
     from tacsim.models.quantity import Length as Length
     from tacsim.models.randomisation import Randomisation as Randomisation
-    from tacsim.models.rig import KneadConfig as KneadConfig
     from tacsim.models.rig import ReplayArmConfig as ReplayArmConfig
     from tacsim.models.rig import ReplayGripperConfig as ReplayGripperConfig
     from tacsim.models.rig import ReplaySensorConfig as ReplaySensorConfig
-    from tacsim.models.rig import RepositionConfig as RepositionConfig
     from tacsim.models.rig import RigConfig as RigConfig
     from tacsim.models.rig import SimArmConfig as SimArmConfig
     from tacsim.models.rig import SimSensorConfig as SimSensorConfig
-    from tacsim.models.rig import SqueezeConfig as SqueezeConfig
-    from tacsim.models.rig import TaskConfig as TaskConfig
     from tacsim.models.scene import Body as Body
     from tacsim.models.scene import Box as Box
     from tacsim.models.scene import Cylinder as Cylinder
@@ -97,6 +93,10 @@ if TYPE_CHECKING:
     from tacsim.models.sensor import Markers as Markers
     from tacsim.models.sensor import SensorGeometry as SensorGeometry
     from tacsim.models.sensor import SensorModel as SensorModel
+    from tacsim.models.task import KneadConfig as KneadConfig
+    from tacsim.models.task import RepositionConfig as RepositionConfig
+    from tacsim.models.task import SqueezeConfig as SqueezeConfig
+    from tacsim.models.task import TaskConfig as TaskConfig
     from tacsim.optics.render import Renderer as Renderer
     from tacsim.optics.surface import surface_map as surface_map
     from tacsim.physics.failure.health import SimulationDiverged as SimulationDiverged

@@ -23,7 +23,7 @@ from tacsim.limits import LimitExceeded, exceeds_limit
 
 if TYPE_CHECKING:
     from tacsim.models.hardware import ArmLimits
-    from tacsim.models.rig import TaskConfig
+    from tacsim.models.task import TaskConfig
 
 # Tuned constants. Sources: the tests in tests/tacsim/test_control.py.
 MIN_CONTACT_HEIGHT = 20e-6  # deeper than this counts as contact: ten times the usual gel texture of 2 um [m]

@@ -15,7 +15,7 @@ from benchmarks.harness.runner import Case
 from tacsim import pose as se3
 from tacsim.gym.features import SCALES
 from tacsim.interface import Action, Pose
-from tacsim.models.rig import SqueezeConfig
+from tacsim.models.task import SqueezeConfig
 from tacsim.rig import Rig
 from tacsim.tasks import Squeeze
 

@@ -139,13 +139,15 @@ def _require_logged(algorithm: str, tensorboard: bool) -> None:
 def _run_training(run: RunFolder, tensorboard: bool, processes: int | None) -> tuple[Path, list[Mapping[str, float]]]:
     """Trains; returns the file of the policy and the figures of each round."""
     from robot.train.train import train as continue_training
+    from tacsim.models.task import unit_of
 
     rounds: list[Mapping[str, float]] = []
+    unit = unit_of(run.settings.spec.task)
 
     def print_result(figures: Mapping[str, float]) -> None:
         rounds.append(figures)
         results.print(
-            f"round {figures['round']:.0f}: {1e3 * figures['distance']:.3f} mm from the goal, success "
+            f"round {figures['round']:.0f}: {unit.show(figures['distance'])} from the goal, success "
             f"{100 * figures['success']:.0f} %, {figures['peak_force']:.1f} N at most, "
             f"{figures['steps'] / figures['seconds']:.0f} steps/s"
             + (f", {figures['refused']:.0f} draws refused" if figures["refused"] else "")
@@ -305,13 +307,14 @@ def _show_evaluation(evaluation_results: list[EvaluationResult]) -> None:
             (
                 name,
                 _interval_text(each.success, 100, 0),
-                _interval_text(each.distance, 1e3, 3),
+                _interval_text(each.distance, each.unit.factor, 3),
                 _interval_text(each.improvement, 100, 0),
                 f"{mean:.1f}, {quantile:.1f}",
                 "–" if each.outside is None else f"{100 * each.outside:.0f}",
             )
         )
-    columns = ("policy", "success [%]", "distance [mm]", "improvement [%]", "peak force [N]", "outside training [%]")
+    distance = f"distance [{evaluation_results[0].unit.symbol}]"
+    columns = ("policy", "success [%]", distance, "improvement [%]", "peak force [N]", "outside training [%]")
     show_table(f"{len(evaluation_results[0].episodes)} unseen episodes, 95 % intervals", columns, rows, left={0})
 
 

@@ -16,7 +16,7 @@ from robot.export.lerobot_rig import picture_shape
 from robot.open import RandomiseSettings, load_with_task, make_env
 from tacsim.interface import Action, Needs, Observation
 from tacsim.limits import ActionError
-from tacsim.models.rig import TaskConfig
+from tacsim.models.task import TaskConfig
 
 
 class LeRobotEnv(gymnasium.Env[dict[str, Any], NDArray[np.floating[Any]]]):

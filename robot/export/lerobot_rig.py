@@ -27,8 +27,9 @@ from tacsim.gym.features import SCALES
 from tacsim.interface import IncompatibleRig, Observation, Pose
 from tacsim.limits import ActionError
 from tacsim.models.hardware import CameraSensorConfig, parts_of
-from tacsim.models.rig import RigConfig, TaskConfig
+from tacsim.models.rig import RigConfig
 from tacsim.models.sensor import CanonicalGrid
+from tacsim.models.task import TaskConfig
 from tacsim.rig import Rig
 
 Values = dict[str, float | NDArray[np.uint8]]

@@ -9,13 +9,15 @@ import numpy as np
 
 from robot.common.whole_file import write_whole
 from robot.train.run_folder import RunSettings
+from tacsim.models.task import LENGTH, SHARE, Unit, unit_of
 from tacsim.report.figure import COLOURS, encode_figure, new_figure, style_axes
 
+# Figures of a round: key, title, unit
 PANELS = (
-    ("distance", "distance from the goal", "mm", 1e3),
-    ("success", "success", "%", 100.0),
-    ("peak_force", "peak normal force", "N", 1.0),
-)  # of the figures of a round: key, title, unit, factor
+    ("distance", "distance from the goal", LENGTH),
+    ("success", "success", SHARE),
+    ("peak_force", "peak normal force", Unit("N", 1.0)),
+)
 
 
 def write_curve_picture(path: Path, settings: RunSettings, curve: Sequence[Mapping[str, float]]) -> None:
@@ -24,9 +26,10 @@ def write_curve_picture(path: Path, settings: RunSettings, curve: Sequence[Mappi
     steps = np.cumsum([row["steps"] for row in curve])
     figure = new_figure(12.0, 3.4)
     figure.suptitle(f"{settings.spec.task}, {training.algorithm}, seed {training.seed}", x=0.05, ha="left", fontsize=12)
-    for number, (key, title, unit, factor) in enumerate(PANELS):
-        axes = style_axes(figure.add_subplot(1, len(PANELS), number + 1), title, "control steps", unit)
-        values = [factor * row[key] for row in curve]
+    for number, (key, title, usual) in enumerate(PANELS):
+        unit = unit_of(settings.spec.task) if key == "distance" else usual
+        axes = style_axes(figure.add_subplot(1, len(PANELS), number + 1), title, "control steps", unit.symbol)
+        values = [unit.factor * row[key] for row in curve]
         axes.plot(steps, values, "o-", color=COLOURS[number], markersize=4, clip_on=False)
         axes.set_xlim(left=0.0)
         axes.set_ylim(0.0, 100.0 if key == "success" else 1.05 * max(*values, 1e-9))

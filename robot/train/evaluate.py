@@ -27,6 +27,7 @@ from tacsim.interface import Policy
 from tacsim.models.policy import Features, Training
 from tacsim.models.scene import Scene
 from tacsim.models.sensor import CanonicalGrid
+from tacsim.models.task import LENGTH, Unit
 
 TEACHER, RANDOM = "teacher", "random"  # besides the policies of load_policy
 HELD_OUT_SEED_OFFSET = 1_000_000  # added to the training seeds: other bodies, other episodes
@@ -59,6 +60,7 @@ class EvaluationResult:
 
     policy: str
     episodes: tuple[EpisodeResult, ...]
+    unit: Unit = LENGTH  # in which distances are shown
 
     @property
     def success(self) -> Interval:
@@ -67,7 +69,7 @@ class EvaluationResult:
 
     @property
     def distance(self) -> Interval:
-        """Mean distance [m], with a bootstrap interval."""
+        """Mean distance [SI], with a bootstrap interval."""
         return bootstrap_interval(np.array([each.distance for each in self.episodes]))
 
     @property
@@ -173,8 +175,9 @@ def _evaluate_policy(
                         bool(describe_outside(loaded_policies[i])) if has_training_range(loaded_policies[i]) else None,
                     )
         rows += [ends[i] for i in range(count)]
-        report_result(EvaluationResult(name, tuple(rows[:episodes])))
-    return EvaluationResult(name, tuple(rows[:episodes]))
+        result = EvaluationResult(name, tuple(rows[:episodes]), members[0].task.config.unit)
+        report_result(result)
+    return result
 
 
 def _scenes(env: TacsimEnv) -> list[Scene]:

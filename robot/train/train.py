@@ -33,8 +33,8 @@ from tacsim.gym.encode import space_of_features
 from tacsim.gym.features import FeatureEncoder
 from tacsim.interface import Pose, Truth
 from tacsim.models.policy import ActionAxis, ActionGrip, PolicySpec, Training
-from tacsim.models.rig import TaskConfig
 from tacsim.models.scene import Scene
+from tacsim.models.task import TaskConfig
 from tacsim.models.text import printable_line
 from tacsim.tasks import Axis, GoalOutOfReach, make_task
 

@@ -20,9 +20,10 @@ from tacsim.models.driver import BASE_CLASSES, installed_drivers
 from tacsim.models.material import BodyMaterial, GelMaterial
 from tacsim.models.policy import Training
 from tacsim.models.randomisation import Randomisation
-from tacsim.models.rig import TASKS, RigConfig, rig_model, task_annotation
+from tacsim.models.rig import RigConfig, rig_model
 from tacsim.models.scene import Scene
 from tacsim.models.sensor import SensorModel
+from tacsim.models.task import TASKS, task_annotation
 from tacsim.models.text import suggest_word
 
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_-]{0,99}")

@@ -16,9 +16,10 @@ from tacsim.config.gel import fit_gels_to_sensors, overridden_gel_sizes
 from tacsim.config.kinds import NotFound, is_name, kind_of, resolve_reference, shipped_file
 from tacsim.config.references import Override, apply_override, parse_override, read_file
 from tacsim.models.driver import DriversMissing
-from tacsim.models.rig import RigConfig, TaskConfig, rig_model, task_annotation
+from tacsim.models.rig import RigConfig, rig_model
 from tacsim.models.scene import Mesh, Scene
 from tacsim.models.sensor import SensorModel
+from tacsim.models.task import TaskConfig, task_annotation
 
 Model = TypeVar("Model", bound=BaseModel)
 

@@ -15,8 +15,9 @@ from tacsim.gym import encode
 from tacsim.gym.features import FeatureEncoder
 from tacsim.interface import Float32, GripperTarget, Image, Needs, Observation, Policy, Pose, Truth
 from tacsim.limits import LimitExceeded
-from tacsim.models.rig import RigConfig, TaskConfig
+from tacsim.models.rig import RigConfig
 from tacsim.models.scene import Scene
+from tacsim.models.task import TaskConfig
 from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.rig import Rig
 from tacsim.sim.scene_world import SceneWorld

@@ -160,6 +160,7 @@ class Truth:
     points: NDArray[np.float32]  # (n, 3) its particles, or points of its surface, world [m]
     poses: Mapping[str, Pose]  # world_from_sensor
     objects: Mapping[str, Pose] = field(default_factory=dict)  # world_from_object of rigid objects, by name
+    forces: Mapping[str, float] = field(default_factory=dict)  # normal force on a sensor that touches one, by name [N]
 
 
 @dataclass(frozen=True, slots=True)

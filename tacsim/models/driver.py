@@ -242,6 +242,12 @@ BASE_CLASSES: dict[str, tuple[type, type | None]] = {
 class DriversMissing(ValueError):
     """The shipped drivers are not registered: the installation is older than its code."""
 
+    def __init__(self) -> None:
+        super().__init__(
+            f"the drivers of tacsim are not registered: this installation is older than its code. In the checkout, run "
+            f"`{INSTALL}`; an installed tacsim: `python -m pip install --force-reinstall --no-deps tacsim`"
+        )
+
 
 @dataclass(frozen=True, slots=True)
 class Drivers:
@@ -275,11 +281,8 @@ def installed_drivers() -> Drivers:
             found.refused[kind][name] = f"the one of {home} ({entry.value}) {why}"
         else:
             found.usable[kind][name] = driver
-    if OWN not in homes.values() or not all(found.usable.values()):  # one of each kind is ours
-        raise DriversMissing(
-            f"the drivers of tacsim are not registered: this installation is older than its code. In the checkout, run "
-            f"`{INSTALL}`; an installed tacsim: `python -m pip install --force-reinstall --no-deps tacsim`"
-        )
+    if OWN not in homes.values():
+        raise DriversMissing
     return found
 
 

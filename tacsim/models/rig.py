@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self, Union, get_args
 
 from pydantic import ConfigDict, Field, GetCoreSchemaHandler, model_validator
 from pydantic_core import CoreSchema, PydanticCustomError
 
-from tacsim.models.driver import installed_drivers
+from tacsim.models.driver import DriversMissing, installed_drivers
 from tacsim.models.gripper import GripperConfig
 from tacsim.models.hardware import (
     ArmConfig,
@@ -23,6 +23,7 @@ from tacsim.models.hardware import (
 from tacsim.models.quantity import Config, Force, Length, Speed, Time
 from tacsim.models.scene import Scene
 from tacsim.models.sensor import CanonicalGrid, PictureRegion, SensorModel
+from tacsim.models.task import TASKS, TaskConfig, task_annotation
 
 Delay = Annotated[int, Field(ge=0, le=20)]
 
@@ -129,79 +130,6 @@ class ReplaySensorConfig(SensorConfig):
         return self
 
 
-class TaskConfig(Config):
-    """What every task has. One of your own derives from it, says its `kind: Literal["..."]`, adds what it is about, and
-    is made known by `tacsim.register_task`."""
-
-    kind: str
-    scene: Scene = Scene()
-    max_step: Annotated[Length, Field(gt=0)] = 0.2e-3  # largest motion of one sensor in a control step, each axis [m]
-    touch_force: Annotated[Force, Field(gt=0)] = 0.05  # reset approaches until this [N]
-    placement: Annotated[Length, Field(ge=0)] = 0.0  # reset starts at most this far beside the body, by the seed [m]
-    success: Annotated[Length, Field(gt=0)] = 0.1e-3  # distance that counts as reached [m]
-    reward_scale: Annotated[Length, Field(gt=0)] = 1e-3  # reward = -distance / reward_scale
-    force_limit: Annotated[Force, Field(gt=0)] | None = (
-        None  # of a normal force: an environment's episode fails beyond it (arms have limits of their own)
-    )
-    steps: Annotated[int, Field(ge=1, le=1_000_000)] = 40  # length of an episode
-
-    @property
-    def held_loads(self) -> Mapping[str, float]:
-        """Normal forces that arms hold while they move, by arm [N]."""
-        return {}
-
-    @model_validator(mode="after")
-    def _require_touch_below_limit(self) -> Self:
-        if self.force_limit is not None and not self.touch_force < self.force_limit:
-            raise ValueError(
-                f"force_limit {self.force_limit:g} N: a reset presses by touch_force, {self.touch_force:g} N; give more"
-            )
-        return self
-
-
-class SqueezeConfig(TaskConfig):
-    """Squeeze the body to a height: distance = |height - goal|; actions move both sensors along world z."""
-
-    kind: Literal["squeeze"]
-    goal: Annotated[Length, Field(gt=0)] = 7e-3  # desired height [m]
-
-
-class RepositionConfig(TaskConfig):
-    """Move the body in the plane: distance = |position - goal|_2; actions move the upper sensor in world x, y."""
-
-    kind: Literal["reposition"]
-    goal: tuple[Length, Length] = (2e-3, 2e-3)  # desired displacement of the centre of mass, world x, y [m]
-    # Normal forces along the z of their sensors (tacsim.control), by arm; an arm without one holds its
-    # height. [N]
-    loads: dict[Name, Annotated[Force, Field(gt=0)]] = {}
-    touch_force: Annotated[Force, Field(gt=0)] = 1.0  # at less, the upper gel slides
-
-    @property
-    def held_loads(self) -> Mapping[str, float]:
-        return self.loads
-
-
-class KneadConfig(TaskConfig):
-    """Knead the body to a rod or a ball of its volume: distance = Chamfer's, between them; actions move both sensors
-    along world z, and the upper one in x, y."""
-
-    kind: Literal["knead"]
-    shape: Literal["rod", "ball"] = "rod"  # a rod lies along world x
-    slenderness: Annotated[float, Field(ge=0.5, le=10)] = 2.0  # of a rod: length over diameter
-    max_step: Annotated[Length, Field(gt=0)] = 0.5e-3
-    touch_force: Annotated[Force, Field(gt=0)] = 0.2
-    success: Annotated[Length, Field(gt=0)] = 0.2e-3
-    steps: Annotated[int, Field(ge=1, le=1_000_000)] = 200
-
-
-TASKS: list[type[TaskConfig]] = [SqueezeConfig, RepositionConfig, KneadConfig]  # shipped ones, and those made known
-
-
-def task_annotation() -> Any:
-    """The annotation of a task of any known kind."""
-    return Annotated[Union[tuple(TASKS)], Field(discriminator="kind")]  # noqa: UP007  # of as many as there are
-
-
 SimMotion = Literal["settled", "flowing", "dynamic"]
 
 
@@ -223,7 +151,7 @@ class RigConfig(Config):
     name: str
     clock: Literal["sim", "wall", "replay"]
     period: Annotated[Time, Field(gt=0)] = 0.1  # control period; a replay takes that of its recording [s]
-    task: Annotated[SqueezeConfig | RepositionConfig | KneadConfig, Field(discriminator="kind")] | None = None
+    task: TaskConfig | None = None
     scene: Scene | None = None  # overrides the task's scene
     arms: dict[Name, ArmConfig] = {}
     grippers: dict[Name, GripperConfig] = {}
@@ -350,12 +278,13 @@ def register_task_config(config: type[TaskConfig]) -> None:
 
 def rebuild_rig_config() -> None:
     """RigConfig takes the tasks that TASKS lists."""
-    RigConfig.model_fields["task"].annotation = task_annotation() | None
     RigConfig.model_rebuild(force=True)
 
 
 def rig_model() -> type[RigConfig]:
-    """RigConfig, whose annotations name the configurations of all installed drivers. Raises DriversMissing."""
+    """RigConfig, whose annotations name the configurations of all known tasks and installed drivers. Raises
+    DriversMissing."""
+    RigConfig.model_fields["task"].annotation = task_annotation() | None
     for kind, configs in ((kind, _config_classes(kind)) for kind in ("arm", "gripper", "sensor")):
         part: Any = Annotated[Union[tuple(configs)], Field(discriminator="driver")]  # noqa: UP007  # of as many as there are
         RigConfig.model_fields[f"{kind}s"].annotation = dict[Name, part]
@@ -363,7 +292,10 @@ def rig_model() -> type[RigConfig]:
 
 
 def _config_classes(kind: str) -> list[type[Config]]:
-    return [driver.config_class for driver in installed_drivers().usable[kind].values()]
+    found: list[type[Config]] = [driver.config_class for driver in installed_drivers().usable[kind].values()]
+    if not found:  # tacsim brings some of each kind
+        raise DriversMissing
+    return found
 
 
 def _config_path(config: type[TaskConfig]) -> str:

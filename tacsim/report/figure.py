@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from tacsim.interface import FloatArray
+from tacsim.models.task import unit_of
 from tacsim.report.series import Series, sort_upper_first
 
 INK, MUTED, GRID = "#22262b", "#6b737c", "#e3e6e9"
@@ -165,15 +166,17 @@ def _draw_reward(axes: Axes, series: Series) -> None:
 
 def _draw_distance(axes: Axes, series: Series) -> None:
     known = {"squeeze": "|height − goal|", "reposition": "|position − goal|"}
-    style_axes(axes, f"distance: {known.get(series.meta.task or '', 'from the goal')}", "step", "mm")
+    unit = unit_of(series.meta.task)
+    style_axes(axes, f"distance: {known.get(series.meta.task or '', 'from the goal')}", "step", unit.symbol)
     axes.axhline(0.0, color=GOAL, linestyle="--", linewidth=1)
     if np.isfinite(series.tactile_distance).any():
-        _draw_line(axes, series, series.tactile_distance * 1e3, MUTED, "by touch alone")
+        _draw_line(axes, series, series.tactile_distance * unit.factor, MUTED, "by touch alone")
     if np.isfinite(series.distance).any():
-        _draw_line(axes, series, series.distance * 1e3, INK)
+        _draw_line(axes, series, series.distance * unit.factor, INK)
         best = int(np.nanargmin(series.distance))
-        at, least = series.index[best], series.distance[best] * 1e3
-        axes.plot([at], [least], "o", color=GOAL, markersize=6, label=f"best {least:.3f} mm at step {at}")
+        at, least = series.index[best], series.distance[best]
+        label = f"best {unit.show(least)} at step {at}"
+        axes.plot([at], [least * unit.factor], "o", color=GOAL, markersize=6, label=label)
     _draw_legend(axes)
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from tacsim import pose as se3
 from tacsim.interface import FloatArray
+from tacsim.models.task import unit_of
 from tacsim.record.episode import Episode, Step
 from tacsim.report.figure import encode_jpeg, select_positions, shrink_image
 from tacsim.report.section import GelShape, GelState, gel_states, layer_numbers, particle_spacing
@@ -171,10 +172,12 @@ def _pack_gel(gel: GelState) -> dict[str, Any]:
 
 def _curves(series: Series) -> list[dict[str, Any]]:
     """Title, unit and values of each curve, None where a step has none."""
+    shown = unit_of(series.meta.task)
+    distances = {"truth": shown.factor * series.distance, "by touch": shown.factor * series.tactile_distance}
     groups: list[tuple[str, str, Mapping[str, FloatArray]]] = [
         ("force |Fz|", "N", series.force),
         ("reward", "", {"": series.reward}),
-        ("distance", "mm", {"truth": 1e3 * series.distance, "by touch": 1e3 * series.tactile_distance}),
+        ("distance", shown.symbol, distances),
         ("depth", "mm", {name: 1e3 * values for name, values in series.max_depth.items()}),
         ("contact signal", "", series.signals),
     ]

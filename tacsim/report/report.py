@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tacsim.interface import FloatArray, SurfaceMap, TactileFrame, TactileObservation
+from tacsim.models.task import unit_of
 from tacsim.record.episode import SETTLED, Episode
 from tacsim.report.series import (
     Series,
@@ -199,7 +200,7 @@ def _surface_rows(stats: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 def _describe_min(stats: Mapping[str, Any], key: str) -> str:
     known = [(value, k) for k, value in zip(stats["step"], stats[key], strict=True) if value is not None]
-    return f"{1e3 * min(known)[0]:.3f} mm at step {min(known)[1]}" if known else "–"
+    return f"{unit_of(stats['task']).show(min(known)[0])} at step {min(known)[1]}" if known else "–"
 
 
 def _signal_text(stats: Mapping[str, Any]) -> str:

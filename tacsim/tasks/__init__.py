@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from tacsim.models.rig import KneadConfig, RepositionConfig, SqueezeConfig, TaskConfig, register_task_config
+from tacsim.models.rig import register_task_config
+from tacsim.models.task import KneadConfig, RepositionConfig, SqueezeConfig, TaskConfig
 from tacsim.tasks.knead import Knead
 from tacsim.tasks.reposition import Reposition
 from tacsim.tasks.squeeze import Squeeze

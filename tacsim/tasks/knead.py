@@ -19,9 +19,9 @@ from numpy.typing import ArrayLike
 from tacsim import pose as se3
 from tacsim.geometry import shapes
 from tacsim.interface import Action, ArmState, FloatArray, Needs, Observation, Policy, Pose, TactileObservation, Truth
-from tacsim.models.rig import KneadConfig
 from tacsim.models.scene import Cylinder, Sphere
 from tacsim.models.sensor import CanonicalGrid
+from tacsim.models.task import KneadConfig
 from tacsim.optics.grid import canonical_cells
 from tacsim.tasks.squeeze import BOTH, estimated_height
 from tacsim.tasks.task import Axis, Estimator, GoalOutOfReach, Task

@@ -9,8 +9,8 @@ import numpy as np
 
 from tacsim import pose as se3
 from tacsim.interface import Action, ArmState, FloatArray, Needs, Observation, Policy, Pose, Truth
-from tacsim.models.rig import RepositionConfig
 from tacsim.models.sensor import CanonicalGrid
+from tacsim.models.task import RepositionConfig
 from tacsim.tasks.task import Axis, Estimator, GoalOutOfReach, Task
 from tacsim.tasks.tuning import ARRIVAL_DISTANCE, MIN_FORCE
 

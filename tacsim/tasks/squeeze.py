@@ -11,8 +11,8 @@ import numpy as np
 from tacsim import pose as se3
 from tacsim.control import contact_signal
 from tacsim.interface import Action, FloatArray, Needs, Observation, Policy, Pose, RigSpec, TactileObservation, Truth
-from tacsim.models.rig import SqueezeConfig
 from tacsim.models.sensor import CanonicalGrid
+from tacsim.models.task import SqueezeConfig
 from tacsim.tasks.task import Axis, Estimator, GoalOutOfReach, Task
 from tacsim.tasks.tuning import ARRIVAL_HEIGHT_ERROR, CLOSING_STEP, FIRM_GRIP_SIGNAL, MIN_BODY_SHARE
 

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from tacsim import pose as se3
 from tacsim.interface import Action, ArmState, FloatArray, GripperTarget, Needs, Observation, Policy, Pose, Truth
 from tacsim.limits import ActionError
-from tacsim.models.rig import TaskConfig
 from tacsim.models.sensor import CanonicalGrid
+from tacsim.models.task import TaskConfig
 
 # Observations of one episode, in order from the reset on -> the distance of each, felt [m]; None: nothing tells it.
 Estimator = Callable[[Observation], float | None]

@@ -13,7 +13,8 @@ import pytest
 from robot.deploy.control_loop import run_episode
 from robot.open import CodeNotFound, load_with_task, make_env, make_vector_env, open_rig
 from tacsim.config import ConfigError, json_schema
-from tacsim.models.rig import TASKS, TaskConfig, rebuild_rig_config
+from tacsim.models.rig import rebuild_rig_config
+from tacsim.models.task import TASKS, TaskConfig
 from tacsim.tasks import make_task, register_task
 from tests.tacsim.gym.small import SMALL
 
@@ -104,7 +105,9 @@ def test_one_kind_has_one_task() -> None:
         pass
 
     before, task = list(TASKS), make_task
-    with pytest.raises(ValueError, match=r"there is a task of kind 'squeeze' already, tacsim.models.rig.SqueezeConfig"):
+    with pytest.raises(
+        ValueError, match=r"there is a task of kind 'squeeze' already, tacsim.models.task.SqueezeConfig"
+    ):
         register_task(Other, task)
     with pytest.raises(ValueError, match=r"Kindless must derive from tacsim.TaskConfig and say its kind: Literal"):
         register_task(Kindless, task)

@@ -27,7 +27,7 @@ from tacsim.control import (
 from tacsim.interface import Action, ArmState, GelReading, Pose, SensorSpec, TactileObservation
 from tacsim.limits import LimitExceeded
 from tacsim.models.hardware import ArmLimits, Workspace
-from tacsim.models.rig import RepositionConfig, SqueezeConfig
+from tacsim.models.task import RepositionConfig, SqueezeConfig
 
 
 def _observation(image: np.ndarray, valid: np.ndarray) -> TactileObservation:

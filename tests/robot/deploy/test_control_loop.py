@@ -31,7 +31,7 @@ from tacsim.interface import (
     TactileObservation,
     Truth,
 )
-from tacsim.models.rig import SqueezeConfig
+from tacsim.models.task import SqueezeConfig
 from tacsim.record.episode import EpisodeMeta, Step
 from tacsim.record.images import reference_image
 from tacsim.record.reader import read_episode

@@ -20,8 +20,8 @@ from robot.open import open_rig
 from tacsim.gym.features import FeatureEncoder
 from tacsim.interface import IncompatibleRig, Needs
 from tacsim.models.policy import ActionAxis, Features, MapGrid, PolicySpec
-from tacsim.models.rig import SqueezeConfig
 from tacsim.models.sensor import CanonicalGrid
+from tacsim.models.task import SqueezeConfig
 from tacsim.tasks import make_task
 from tests.tacsim.gym.small import SMALL, make
 

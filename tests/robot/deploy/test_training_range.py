@@ -19,8 +19,8 @@ from robot.open import open_rig
 from robot.train.evaluate import evaluate
 from robot.train.measure_range import measure_range, write_range
 from tacsim.config import load_rig
-from tacsim.models.rig import SqueezeConfig
 from tacsim.models.scene import Scene
+from tacsim.models.task import SqueezeConfig
 from tacsim.report.report import summarise
 from tacsim.report.series import Series
 from tacsim.tasks import make_task

@@ -27,8 +27,9 @@ from tacsim.config.document import LoadState, _Loader, dump_yaml, node_as_json, 
 from tacsim.config.load import load_task
 from tacsim.models.hardware import UrArmConfig
 from tacsim.models.material import BodyMaterial, GelMaterial
-from tacsim.models.rig import ReplaySensorConfig, RepositionConfig, SimSensorConfig, SqueezeConfig
+from tacsim.models.rig import ReplaySensorConfig, SimSensorConfig
 from tacsim.models.scene import Box, Cylinder, Sphere
+from tacsim.models.task import RepositionConfig, SqueezeConfig
 from tests.tacsim.config.files import write
 
 # Shipped files

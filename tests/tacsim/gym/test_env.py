@@ -15,7 +15,7 @@ from tacsim.gym import ENVIRONMENTS, register_envs
 from tacsim.gym.env import TacsimEnv
 from tacsim.interface import IncompatibleRig
 from tacsim.limits import ActionError
-from tacsim.models.rig import RepositionConfig, SqueezeConfig
+from tacsim.models.task import RepositionConfig, SqueezeConfig
 from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.tasks import Task, make_task
 

@@ -99,7 +99,7 @@ def test_registry_with_one_name_twice_refuses_both(registered: dict[str, object]
     [
         (
             "other: arms.crane",
-            "other calls it 'arms.crane' in the group tacsim.drivers; call it 'sensor.crane' or 'arm.",
+            "other calls it 'arms.crane' in the group tacsim.drivers; call it one of 'sensor.crane', 'arm.",
         ),
         ("other: arm.crane", "goes by the clocks ('sim',); simulations and replays have drivers of tacsim alone"),
     ],

@@ -10,9 +10,10 @@ from pydantic import ValidationError
 
 from tacsim.models.material import BodyMaterial, GelMaterial, elastic_constants, shear_impedance
 from tacsim.models.quantity import Config
-from tacsim.models.rig import RepositionConfig, RigConfig, SimArmConfig, SqueezeConfig
+from tacsim.models.rig import RigConfig, SimArmConfig
 from tacsim.models.scene import Body, Box, Gel, Indenter, Mesh, Scene, Settling, Sphere
 from tacsim.models.sensor import CanonicalGrid
+from tacsim.models.task import RepositionConfig, SqueezeConfig
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from robot.open import make_env, open_rig
 from tacsim.config import ConfigError, load_rig
 from tacsim.interface import Truth
 from tacsim.limits import ActionError
-from tacsim.models.rig import KneadConfig, RepositionConfig, SqueezeConfig
+from tacsim.models.task import KneadConfig, RepositionConfig, SqueezeConfig
 from tacsim.pose import Pose
 from tacsim.tasks import GoalOutOfReach, make_task
 from tests.robot.cli.invoked import TINY, tacsim

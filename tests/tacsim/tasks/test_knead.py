@@ -14,8 +14,8 @@ from robot.open import open_rig
 from tacsim.config import load_rig
 from tacsim.interface import ArmState, FloatArray, Pose, Truth
 from tacsim.models.material import BodyMaterial
-from tacsim.models.rig import KneadConfig
 from tacsim.models.scene import Body, Box, Indenter, Scene
+from tacsim.models.task import KneadConfig
 from tacsim.tasks import evaluate_outcome, make_task
 from tacsim.tasks.knead import (
     SAMPLE_POINTS,

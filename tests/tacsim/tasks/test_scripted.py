@@ -11,8 +11,8 @@ import pytest
 
 from robot.deploy.control_loop import run_episode
 from tacsim.interface import Action, Observation, Truth
-from tacsim.models.rig import RepositionConfig, SqueezeConfig
 from tacsim.models.sensor import CanonicalGrid
+from tacsim.models.task import RepositionConfig, SqueezeConfig
 from tacsim.tasks import make_task
 from tacsim.tasks.reposition import centre_of_pressure, estimated_position
 from tacsim.tasks.squeeze import Grip, estimated_height

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tacsim.interface import Truth
-from tacsim.models.rig import RepositionConfig, SqueezeConfig
+from tacsim.models.task import RepositionConfig, SqueezeConfig
 from tacsim.tasks import evaluate_outcome, make_task, tolerance_reward
 
 

@@ -9,11 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from robot.deploy.control_loop import run_episode
 from robot.open import CannotOpen, make_env, make_vector_env, open_rig, rig_spec
 from tacsim.config import ConfigError, load_rig
 from tacsim.interface import Action, GripperTarget, Pose
 from tacsim.limits import ActionError
 from tacsim.rig import Rig
+from tacsim.tasks.squeeze import Grip
 from tests.robot.rig.lift import LiftConfig
 from tests.tacsim.sim.cell.cells import write_clamp
 
@@ -137,6 +139,15 @@ def test_an_environment_takes_variants_of_its_object() -> None:
     assert weights[0] == pytest.approx(0.05 * 9.81, abs=0.01)
     assert weights[1] == pytest.approx(0.981, abs=0.5)
     assert abs(weights[1] - 0.981) > 1e-3
+
+
+def test_the_policy_grip_closes_the_hand_until_it_feels_the_object() -> None:
+    with open_rig("hand", overrides=SMALL) as rig:
+        episode = run_episode(rig, Grip(rig.spec, step=0.3e-3), None, 12)
+        last = episode.steps[-1]
+        assert last.grippers["hand"].width == pytest.approx(0.0197, abs=0.2e-3)
+        assert last.info["contact_signal_left"] > 0.01
+        assert last.info["max_force_left"] > 0.5
 
 
 # --------------------------------------------------------------- what is refused

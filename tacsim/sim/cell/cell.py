@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -169,6 +170,14 @@ class Cell:
         if self.item.pedestal > 0:
             self.model.geom_contype[self._pedestal] = self.model.geom_conaffinity[self._pedestal] = int(not away)
             self.model.geom_rgba[self._pedestal, 3] = float(not away)
+
+    @contextmanager
+    def show_pedestal(self, *, present: bool) -> Iterator[None]:
+        """While a picture is rendered: with the pedestal, or without it."""
+        before = self.has_pedestal
+        self.take_pedestal_away(away=not present)
+        yield
+        self.take_pedestal_away(away=not before)
 
     # ---------------------------------------------------------------- results
 

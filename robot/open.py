@@ -111,6 +111,10 @@ def open_rig(
         from robot.rig.sim_rig import open_sim
 
         return open_sim(config, check)
+    if config.clock == "mujoco":
+        from robot.rig.mujoco_rig import open_mujoco
+
+        return open_mujoco(config, check)
     from robot.rig.replay_rig import open_replay
 
     opened = open_replay(config)
@@ -137,6 +141,10 @@ def rig_spec(config: RigConfig) -> RigSpec:
         from robot.rig.sim_rig import simulate
 
         return simulate(config).rig.spec
+    if config.clock == "mujoco":
+        from robot.rig.mujoco_rig import simulate_cell
+
+        return simulate_cell(config).rig.spec
     from robot.rig.replay_rig import open_replay
 
     with open_replay(config) as opened:
@@ -170,7 +178,7 @@ def make_env(
     episodes = _rigs_of_episodes(task, rig, overrides, _draw_variants(variants, randomise), learning)
     first = episodes[0][0]
     features_of_rig = _resolve_features(features, first)
-    if first.clock == "sim":
+    if first.clock in ("sim", "mujoco"):
         from robot.rig.sim_env import open_env
 
         return open_env(episodes, render_mode, features_of_rig)
@@ -197,8 +205,9 @@ def make_vector_env(
     """
     episodes = _rigs_of_episodes(task, rig, overrides, _draw_variants(variants, randomise), learning)
     if episodes[0][0].clock != "sim":
+        why = "is not simulated" if episodes[0][0].clock != "mujoco" else "is simulated in MuJoCo, scene by scene"
         raise CannotOpen(
-            f"rig '{episodes[0][0].name}' is not simulated: only simulations run many at once; use robot.make_env"
+            f"rig '{episodes[0][0].name}' {why}: only rigs with clock 'sim' run many at once; use robot.make_env"
         )
     from robot.rig.sim_env import open_vector_env
 

@@ -57,6 +57,10 @@ class NoTouch(RuntimeError):
     """An approach met nothing, or found no gentle contact."""
 
 
+class ObjectDropped(RuntimeError):
+    """A rigid object that was held falls, or no pad touches it any more."""
+
+
 def approach(
     touches: Callable[[], bool], advance: Callable[[float], None], step: float, longest: float, advice: str
 ) -> float:

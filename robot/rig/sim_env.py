@@ -9,12 +9,14 @@ from functools import partial
 from gymnasium.vector import AutoresetMode
 
 from robot.rig import CannotOpen
+from robot.rig.mujoco_rig import CellSimulation, simulate_cell
 from robot.rig.sim_rig import Simulation, simulate
 from tacsim.gym import encode
 from tacsim.gym.env import TacsimEnv, Variant, require_compatible_task
 from tacsim.gym.features import FeatureEncoder
 from tacsim.gym.vector import Member, SharedBatch, TacsimVectorEnv
 from tacsim.models.hardware import ArmConfig, Placement, SensorConfig, parts_of
+from tacsim.models.mujoco import MujocoSensorConfig
 from tacsim.models.policy import Features
 from tacsim.models.rig import RigConfig, SimSensorConfig, WrenchNoise
 from tacsim.models.sensor import Lighting
@@ -27,7 +29,8 @@ Episodes = Sequence[tuple[RigConfig, str]]  # rigs, each with a description
 def open_env(episodes: Episodes, render_mode: str | None, features: Features | None) -> TacsimEnv:
     """An environment of the first of `episodes`; the others are its variants. Raises CannotOpen, ValueError."""
     config = episodes[0][0]
-    return _make_env(simulate(config), config, _make_variants(episodes), render_mode, features)
+    simulation = simulate_cell(config) if config.clock == "mujoco" else simulate(config)
+    return _make_env(simulation, config, _make_variants(episodes), render_mode, features)
 
 
 def open_vector_env(
@@ -59,7 +62,7 @@ def open_vector_env(
 
 
 def _make_env(
-    simulation: Simulation,
+    simulation: Simulation | CellSimulation,
     config: RigConfig,
     variants: Sequence[Variant],
     render_mode: str | None,
@@ -122,7 +125,10 @@ def _fixed_settings(config: RigConfig) -> RigConfig:
     }
     sensors: dict[str, SensorConfig] = {}
     arms: dict[str, ArmConfig] = {}
-    for name, sensor in parts_of(config.sensors, SimSensorConfig).items():
+    simulated: dict[str, SimSensorConfig | MujocoSensorConfig] = {
+        **parts_of(config.sensors, SimSensorConfig), **parts_of(config.sensors, MujocoSensorConfig)
+    }  # fmt: skip
+    for name, sensor in simulated.items():
         sensors[name] = sensor.model_copy(
             update={"model": sensor.model.model_copy(update=neutral_appearance), "delay": 0}
         )

@@ -43,10 +43,12 @@ class Simulation:
         from the next episode on. Everything else does not change."""
         for name, sensor in parts_of(config.sensors, SimSensorConfig).items():
             self.sensors[name].apply_variation(
-                *_renderer_and_noise(sensor.model, name, self.scene_world.scene), sensor.delay
+                *renderer_and_noise(sensor.model, name, self.scene_world.scene), sensor.delay
             )
         for name, arm in parts_of(config.arms, SimArmConfig).items():
-            self.arms[name].set_measurement_errors(_pose_error(arm), arm.delay, wrench_noise_source(arm.noise, name))
+            self.arms[name].set_measurement_errors(
+                pose_error(arm.error), arm.delay, wrench_noise_source(arm.noise, name)
+            )
 
 
 def open_sim(config: RigConfig, check: Callable[[RigSpec], None] | None = None) -> Rig:
@@ -77,6 +79,11 @@ def simulate(
     scene = config.scene
     if scene is None:
         raise CannotOpen(f"rig '{config.name}' simulates, but has no scene; give scene, or a task (which has one)")
+    if scene.object is not None:
+        raise CannotOpen(
+            f"rig '{config.name}': scene '{scene.name}' has a rigid object, which only MuJoCo moves; use clock "
+            "'mujoco' and drivers 'mujoco', as the rig 'hand' does"
+        )
     if config.motion != "settled" and scene.physics == "seed":
         raise CannotOpen(
             f"rig '{config.name}': physics 'seed' settles every motion, so motion '{config.motion}' is not possible; "
@@ -96,7 +103,7 @@ def simulate(
         max_shift, max_turn = speed * config.period, turn_rate * config.period
         noise = wrench_noise_source(arm.noise, name)
         arms[name] = SimArm(
-            world, clock, frames[name], max_shift, max_turn, limits, keep_out, _pose_error(arm), arm.delay, noise
+            world, clock, frames[name], max_shift, max_turn, limits, keep_out, pose_error(arm.error), arm.delay, noise
         )
     task = config.task
     touch_force, placement = (None, 0.0) if task is None else (task.touch_force, task.placement)
@@ -113,17 +120,19 @@ def simulate(
         truth=None if scene.body is None else world.truth,
         diagnostics=clock.diagnostics,
         read_all=map_parallel if parallel else map_serial,
-        on_tactile=_make_gel_monitor(config, sensors),
+        on_tactile=make_gel_monitor(config, sensors),
         load_control=load_controller(config.task),
     )
     return Simulation(rig, clock, world, sensors, arms)
 
 
-def _pose_error(arm: SimArmConfig) -> Pose | None:
-    return None if arm.error == Placement() else arm.error.pose
+def pose_error(error: Placement) -> Pose | None:
+    """The pose of its frame that an arm reports, in the true one; None: no error."""
+    return None if error == Placement() else error.pose
 
 
-def _make_gel_monitor(config: RigConfig, sensors: Mapping[str, SimSensor]) -> GelMonitor | None:
+def make_gel_monitor(config: RigConfig, sensors: Mapping[str, SimSensor]) -> GelMonitor | None:
+    """Of the arms that have limits; None without. Raises CannotOpen."""
     limits = {name: arm.stop_limits for name, arm in config.arms.items() if arm.stop_limits is not None}
     try:
         return GelMonitor({name: sensor.spec for name, sensor in sensors.items()}, limits, {}) if limits else None
@@ -160,9 +169,10 @@ def _make_sensor(world: World, clock: SimClock, name: str, config: SimSensorConf
         model.image_shape, height=True, flow=model.markers is not None, arm=config.arm, gripper=config.gripper
     )
     sample = partial(surface_map, grid=rig.canonical, markers=model.markers)
-    render, noise = _renderer_and_noise(model, name, rig.scene)
+    render, noise = renderer_and_noise(model, name, rig.scene)
     return SimSensor(world, clock, name, spec, render, sample, noise, config.delay)
 
 
-def _renderer_and_noise(model: SensorModel, name: str, scene: Scene) -> tuple[Renderer, NoiseSource | None]:
+def renderer_and_noise(model: SensorModel, name: str, scene: Scene) -> tuple[Renderer, NoiseSource | None]:
+    """What a simulated sensor's pictures are made with."""
     return Renderer(model, scene.gel_of(name).size[:2]), noise_source(model, name)

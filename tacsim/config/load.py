@@ -22,6 +22,7 @@ from tacsim.models.sensor import SensorModel
 from tacsim.models.task import TaskConfig, task_annotation
 
 Model = TypeVar("Model", bound=BaseModel)
+SIMULATED = ("sim", "mujoco")  # drivers of parts that a scene is simulated for
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,6 +114,7 @@ def _require_limits(config: RigConfig, file: RigConfig) -> None:
 def _absolute_calibrations(root: Node) -> Node:
     """Makes the paths of calibrations absolute. Like references, they are relative to the folder of their file, those
     of options to the current folder; a bundle in the folder `sensors/` there may be given by its name."""
+    root = _absolute_models(root)
     sensors = root.items.get("sensors")
     if sensors is None or not sensors.items:
         return root
@@ -126,14 +128,29 @@ def _absolute_calibrations(root: Node) -> Node:
     return replace(root, value={**root.items, "sensors": replace(sensors, value=anchored)})
 
 
+def _absolute_models(root: Node) -> Node:
+    """Makes the paths of MJCF files of arms absolute, in the same way."""
+    arms = root.items.get("arms")
+    if arms is None or not arms.items:
+        return root
+    anchored = {}
+    for name, arm in arms.items.items():
+        path = arm.items.get("model")
+        if path is not None and isinstance(path.value, str) and path.value.endswith(".xml"):
+            absolute = replace(path, value=str((path.folder / path.value).resolve()))
+            arm = replace(arm, value={**arm.items, "model": absolute})
+        anchored[name] = arm
+    return replace(root, value={**root.items, "arms": replace(arms, value=anchored)})
+
+
 def _has_value(root: Node, key: str) -> bool:
     return key in root.items and root.items[key].value is not None
 
 
 def _has_simulated_part(root: Node) -> bool:
-    """True with a driver 'sim', or with a mock sensor, which has simulated pictures."""
+    """True with a driver 'sim' or 'mujoco', or with a mock sensor, which has simulated pictures."""
     parts = [*_mapping_values(root, "arms"), *_mapping_values(root, "sensors")]
-    return any(part.items["driver"].value == "sim" for part in parts if "driver" in part.items) or any(
+    return any(part.items["driver"].value in SIMULATED for part in parts if "driver" in part.items) or any(
         _has_value(sensor, "mock") for sensor in _mapping_values(root, "sensors")
     )
 
@@ -160,13 +177,13 @@ def _check_scene(root: Node, own_scene: bool, state: LoadState) -> Node:
         root = _take_scene_of_task(root)  # an override may have removed it
         if not _has_value(root, "scene") and not root.items.get("task", root).broken:
             what = (
-                "is missing: something here is simulated (driver 'sim', or a camera's `mock`); allowed: a scene, or a "
-                "task (which has one)"
+                "is missing: something here is simulated (driver 'sim' or 'mujoco', or a camera's `mock`); allowed: a "
+                "scene, or a task (which has one)"
             )
             state.report(root.place, "scene", what)
         return root
     if own_scene and _has_value(root, "scene"):
-        what = "no arm and no sensor of this rig has driver 'sim', so nothing is simulated; leave scene out"
+        what = "no arm and no sensor of this rig has driver 'sim' or 'mujoco', so nothing is simulated; leave scene out"
         state.report(root.items["scene"].place, "scene", what)
     return replace(root, value={name: entry for name, entry in root.items.items() if name != "scene"})
 

@@ -30,7 +30,15 @@ from numpy.typing import NDArray
 
 from tacsim import pose as se3
 from tacsim.gym.features import FeatureEncoder
-from tacsim.interface import ArmState, IncompatibleRig, Needs, Observation, Pose, TactileObservation
+from tacsim.interface import (
+    ArmState,
+    GripperState,
+    IncompatibleRig,
+    Needs,
+    Observation,
+    Pose,
+    TactileObservation,
+)
 from tacsim.models.rig import RigConfig
 from tacsim.tasks import make_task
 
@@ -115,8 +123,13 @@ def space_of_rig(config: RigConfig) -> spaces.Space[FlatObservation]:
             valid=contact, flow=None if dots is None else np.zeros((dots.rows, dots.columns, 2), np.float32),
             time=0.0, age=0.0,
         )  # fmt: skip
-    arms = dict.fromkeys(config.arms, ArmState(Pose(), np.zeros(6), np.zeros(6), None, 0.0))
-    return space_of(flatten_observation(Observation(touches, arms, 0.0), dict.fromkeys(config.arms, Pose())))
+    arms = {
+        name: ArmState(Pose(), np.zeros(6), np.zeros(6), np.zeros(arm.joint_count) if arm.joint_count else None, 0.0)
+        for name, arm in config.arms.items()
+    }
+    grippers = dict.fromkeys(config.grippers, GripperState(0.0, 0.0, 0.0))
+    observation = Observation(touches, arms, 0.0, grippers)
+    return space_of(flatten_observation(observation, dict.fromkeys(config.arms, Pose())))
 
 
 def space_of_features(encoder: FeatureEncoder, config: RigConfig) -> spaces.Space[FlatObservation]:

@@ -10,7 +10,7 @@ import gymnasium
 import numpy as np
 from gymnasium.error import ResetNeeded
 
-from tacsim.control import NoTouch
+from tacsim.control import NoTouch, ObjectDropped
 from tacsim.gym import encode
 from tacsim.gym.features import FeatureEncoder
 from tacsim.interface import Float32, GripperTarget, Image, Needs, Observation, Policy, Pose, Truth
@@ -20,12 +20,14 @@ from tacsim.models.scene import Scene
 from tacsim.models.task import TaskConfig
 from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.rig import Rig
-from tacsim.sim.scene_world import SceneWorld
+from tacsim.sim.scene_world import SimulatedScene
 from tacsim.tasks import BadDraws, GoalOutOfReach, make_task
 from tacsim.tasks.task import Effort, Task, action_of_vector, evaluate_outcome, vector_of_action
 
 Result = tuple[encode.FlatObservation, float, bool, bool, dict[str, Any]]  # of a step
-RESET_ERRORS = (GoalOutOfReach, NoTouch, SimulationDiverged)  # with this draw
+RESET_ERRORS = (GoalOutOfReach, NoTouch, SimulationDiverged, ObjectDropped)  # with this draw
+StepError = LimitExceeded | SimulationDiverged | ObjectDropped  # that ends an episode
+STEP_ERRORS = (LimitExceeded, SimulationDiverged, ObjectDropped)
 
 
 def copy_reset_options(options: Mapping[str, Any] | None) -> dict[str, Any]:
@@ -50,9 +52,9 @@ class TacsimEnv(gymnasium.Env[encode.FlatObservation, Float32]):
     Box(-1, 1), one component for each free axis of the task, in units of its max_step from the last commanded pose.
 
     An episode terminates only when a limit of an arm, or the task's force_limit, is exceeded (info["limit"] says
-    which). Its last reward then stands for all steps that are left too, each at most -1: no end is better than going
-    on. It is truncated after the task's steps, or when the simulation diverges (info["diverged"] says why; the
-    observation is the last good one).
+    which), or a rigid object is dropped (info["dropped"] says how). Its last reward then stands for all steps that are
+    left too, each at most -1: no end is better than going on. It is truncated after the task's steps, or when the
+    simulation diverges (info["diverged"] says why; the observation is the last good one).
 
     info: distance [m], is_success, score, body_height [m], peak_force [N] and work [J] of the arms since reset, the
     preset of a simulated scene and its known force error (`preset`, `preset_error`), the rig's diagnostics, and at the
@@ -81,7 +83,7 @@ class TacsimEnv(gymnasium.Env[encode.FlatObservation, Float32]):
         space: gymnasium.Space[encode.FlatObservation] | None = None,
         encoder: FeatureEncoder | None = None,
         variants: Sequence[Variant] = (),
-        scene_world: SceneWorld | None = None,
+        scene_world: SimulatedScene | None = None,
         apply_variation: Callable[[RigConfig | None], None] = lambda config: None,
     ) -> None:
         if render_mode not in (None, *self.metadata["render_modes"]):
@@ -106,7 +108,7 @@ class TacsimEnv(gymnasium.Env[encode.FlatObservation, Float32]):
         self.phase: Literal["new", "running", "over"] = "new"  # of the episode; over: terminated or truncated
         self._teacher: Policy | None = None  # of this episode, once it is asked
         self._sent: Mapping[str, Pose | None] = {}  # by the last begin_step
-        self._failure: LimitExceeded | SimulationDiverged | None = None
+        self._failure: StepError | None = None
         self._done: Result | None = None  # a step that is done, but not taken yet
 
     @property
@@ -224,7 +226,7 @@ class TacsimEnv(gymnasium.Env[encode.FlatObservation, Float32]):
             if self.commanded:
                 try:
                     self.rig.tick()
-                except SimulationDiverged as failure:
+                except STEP_ERRORS as failure:
                     self.fail(failure)
             self.end_step()
         assert self._done is not None
@@ -248,7 +250,7 @@ class TacsimEnv(gymnasium.Env[encode.FlatObservation, Float32]):
         """The arms have taken what the last `begin_step` asked."""
         return self._failure is None
 
-    def fail(self, failure: LimitExceeded | SimulationDiverged) -> None:
+    def fail(self, failure: StepError) -> None:
         """The step that was begun comes to this end, and the episode with it."""
         self._failure = failure
 
@@ -262,10 +264,11 @@ class TacsimEnv(gymnasium.Env[encode.FlatObservation, Float32]):
                 self.fail(failure)
         if self._failure is not None:
             self.phase = "over"
-            exceeded = isinstance(self._failure, LimitExceeded)
+            exceeded = not isinstance(self._failure, SimulationDiverged)
+            word = "dropped" if isinstance(self._failure, ObjectDropped) else "limit" if exceeded else "diverged"
             reward, info = self._evaluate_state()
             flat = {key: value.copy() for key, value in self._flat.items()}
-            info |= {"limit" if exceeded else "diverged": str(self._failure)}
+            info |= {word: str(self._failure)}
             info["is_success"] = info["is_success"] and not exceeded
             self._done = (
                 flat,

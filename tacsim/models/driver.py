@@ -34,7 +34,7 @@ SensorC = TypeVar("SensorC", bound=SensorConfig)
 ArmC = TypeVar("ArmC", bound=ArmConfig)
 GripperC = TypeVar("GripperC", bound=GripperConfig)
 State = Literal["ok", "warn", "fail"]
-ClockName = Literal["sim", "wall", "replay"]
+ClockName = Literal["sim", "mujoco", "wall", "replay"]
 
 
 @dataclass(frozen=True, slots=True)

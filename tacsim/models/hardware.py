@@ -166,6 +166,11 @@ class ArmConfig(Config):
         return True
 
     @property
+    def joint_count(self) -> int:
+        """Of a simulated arm: how many joint angles its state has."""
+        return 0
+
+    @property
     def stop_limits(self) -> ArmLimits | None:
         """Its limits, where it has some."""
         return getattr(self, "limits", None)

@@ -149,7 +149,7 @@ class RigConfig(Config):
     model_config = ConfigDict(defer_build=True)
 
     name: str
-    clock: Literal["sim", "wall", "replay"]
+    clock: Literal["sim", "mujoco", "wall", "replay"]
     period: Annotated[Time, Field(gt=0)] = 0.1  # control period; a replay takes that of its recording [s]
     task: TaskConfig | None = None
     scene: Scene | None = None  # overrides the task's scene

@@ -6,18 +6,25 @@ import math
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, Self, cast
 
-import numpy as np
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
-from tacsim.interface import Float32, FloatArray, short_repr
+from tacsim.interface import Float32, short_repr
 from tacsim.models import tuning
 from tacsim.models.material import BodyMaterial, GelMaterial, elastic_constants, shear_impedance
-from tacsim.models.quantity import Acceleration, Angle, Config, Length
+from tacsim.models.quantity import Acceleration, Config, Length, Time
+from tacsim.models.rigid import Fixture, RigidObject
+from tacsim.models.shape import Box as Box
+from tacsim.models.shape import Cylinder as Cylinder
+from tacsim.models.shape import Mesh as Mesh
+from tacsim.models.shape import Oriented, min_side
+from tacsim.models.shape import Shape as Shape
+from tacsim.models.shape import Sphere as Sphere
 
-Edge = Annotated[Length, Field(ge=1e-5, le=10.0)]  # of a body or an indenter [m]
 Size3 = tuple[Annotated[Length, Field(gt=0)], Annotated[Length, Field(gt=0)], Annotated[Length, Field(gt=0)]]
 Along = Annotated[Acceleration, Field(ge=-1e5, le=1e5)]  # one axis [m/s^2]
 SensorName = Literal["lower", "upper"]
+SIDES = ("left", "right")  # the fingers of a gripper, each with a gel
+FixtureName = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_-]{0,63}$")]
 
 Preset = Literal["learn", "draft", "standard"]
 # particle spacing and gel element size [m] of each preset
@@ -74,37 +81,6 @@ class GelOverride(Config):
         return hash(self.model_dump_json())
 
 
-class Box(Config):
-    shape: Literal["box"] = "box"
-    size: tuple[Edge, Edge, Edge] = (10e-3, 10e-3, 10e-3)  # [m]
-
-
-class Sphere(Config):
-    shape: Literal["sphere"] = "sphere"
-    radius: Edge = 5e-3  # [m]
-
-
-class Cylinder(Config):
-    """Upright cylinder: axis along z."""
-
-    shape: Literal["cylinder"] = "cylinder"
-    radius: Edge = 5e-3  # [m]
-    height: Edge = 10e-3  # [m]
-
-
-class Mesh(Config):
-    """Closed triangle mesh of an STL, OBJ or PLY file."""
-
-    shape: Literal["mesh"] = "mesh"
-    path: str
-    # [m per file unit]; None: 1 if the mesh's largest side is below one unit, otherwise 0.001
-    scale: Annotated[float, Field(gt=0)] | None = None
-    repair: bool = False  # close holes and turn triangles round
-
-
-Shape = Annotated[Box | Sphere | Cylinder | Mesh, Field(discriminator="shape")]
-
-
 class Body(Config):
     """The plasticine between the sensors."""
 
@@ -114,29 +90,14 @@ class Body(Config):
     seed: Annotated[int, Field(ge=0)] = 0  # of random sampling
 
 
-class Indenter(Config):
-    """A rigid body pressed on one gel; no particles are needed for it."""
+class Indenter(Oriented):
+    """A rigid body pressed on one gel; no particles are needed for it. Unturned, its own -z side presses."""
 
     geometry: Shape = Sphere(radius=4e-3)
     # of a box's or cylinder's edges, rounded within its size [m]; None: as the mesh carries them
     # (`effective_edge_radius`); 0: sharp
     edge_radius: Annotated[Length, Field(ge=0)] | None = None
     friction: Annotated[float, Field(ge=0, le=5)] = 0.6
-    # Orientation: turned about world x by `roll`, then y by `pitch`, then z by `yaw`. 0, 0, 0: its own -z side presses.
-    roll: Angle = 0.0
-    pitch: Angle = 0.0
-    yaw: Angle = 0.0
-
-    @property
-    def turn(self) -> FloatArray:
-        """Its orientation in world as a quaternion (4,), x, y, z, w."""
-        (sx, sy, sz), (cx, cy, cz) = (
-            [of(angle / 2) for angle in (self.roll, self.pitch, self.yaw)] for of in (math.sin, math.cos)
-        )
-        return np.array([
-            sx * cy * cz - cx * sy * sz, cx * sy * cz + sx * cy * sz,
-            cx * cy * sz - sx * sy * cz, cx * cy * cz + sx * sy * sz,
-        ])  # fmt: skip
 
     @model_validator(mode="after")
     def _require_small_edges(self) -> Self:
@@ -145,7 +106,7 @@ class Indenter(Config):
             has = "a sphere has no edges" if isinstance(geometry, Sphere) else "the edges of a mesh are as drawn"
             raise ValueError(f"edge_radius is {radius:g} m, but {has}; leave it out")
         if isinstance(geometry, Box | Cylinder):
-            half = _min_side(geometry) / 2
+            half = min_side(geometry) / 2
             if radius > half:
                 raise ValueError(
                     f"edge_radius is {radius:g} m; at most half the shortest side of the {geometry.shape}, {half:g} m"
@@ -159,11 +120,7 @@ class Indenter(Config):
             return 0.0
         if self.edge_radius is not None:
             return self.edge_radius
-        return min(tuning.MIN_EDGE_RADIUS * element, _min_side(self.geometry) / 4)
-
-
-def _min_side(geometry: Box | Cylinder) -> float:
-    return min(geometry.size if isinstance(geometry, Box) else (2 * geometry.radius, geometry.height))
+        return min(tuning.MIN_EDGE_RADIUS * element, min_side(self.geometry) / 4)
 
 
 class Settling(Config):
@@ -176,7 +133,8 @@ class Settling(Config):
 
 
 class Scene(Config):
-    """What is simulated. Either a `body` between two gels, or a rigid `indenter` on the lower gel alone."""
+    """What is simulated. One of three: a `body` between two gels, a rigid `indenter` on the lower gel alone, or a rigid
+    `object` that moves by itself between the fingers of a gripper, in MuJoCo."""
 
     name: str = "scene"
     physics: Literal["hybrid", "seed"] = "hybrid"
@@ -187,25 +145,41 @@ class Scene(Config):
     gels: dict[SensorName, GelOverride] = {}  # where one differs
     body: Body | None = Body()
     indenter: Indenter | None = None
+    object: RigidObject | None = None
+    fixtures: dict[FixtureName, Fixture] = Field(default={}, max_length=100)  # what else an object may touch
+    timestep: Annotated[Time, Field(ge=1e-4, le=5e-3)] = 1e-3  # of MuJoCo, in a scene with an object [s]
     friction: dict[SensorName, Annotated[float, Field(ge=0, le=5)]] = {"lower": 0.6, "upper": 0.6}
-    gravity: tuple[Along, Along, Along] = (0.0, 0.0, 0.0)  # world axes [m/s^2]; acts on the body
+    gravity: tuple[Along, Along, Along] = (0.0, 0.0, 0.0)  # world axes [m/s^2]; acts on body and object
     settling: Settling = Settling()
 
     @model_validator(mode="after")
     def _require_consistent(self) -> Self:
-        if (self.body is None) == (self.indenter is None):
-            raise ValueError("give a body (between two gels) or an indenter (on one gel), not both and not neither")
-        hardens = self.body is not None and self.body.material.hardening_modulus > 0
-        asked = {"rigid indenter": self.indenter is not None, "hardening": hardens, "gravity": any(self.gravity)}
-        lacking = [what for what, wanted in asked.items() if wanted]
-        if self.gels and (self.physics == "seed" or self.indenter is not None):
-            which = (
-                "an indenter presses the gel 'lower' alone" if self.indenter else "physics 'seed' has one gel for both"
+        given = [name for name in ("body", "indenter", "object") if getattr(self, name) is not None]
+        if len(given) != 1:
+            raise ValueError(
+                "give one of body (between two gels), indenter (on one gel) and object (between the fingers of a "
+                f"gripper), the others null; here are {' and '.join(given) or 'none of them'}"
             )
+        if self.object is not None and self.element_size is not None:
+            raise ValueError("element_size: gels that hold an object have the preset's; leave it out, choose a preset")
+        if self.fixtures and self.object is None:
+            raise ValueError("fixtures: only an object meets them; give the scene an object, or leave them out")
+        hardens = self.body is not None and self.body.material.hardening_modulus > 0
+        asked = {
+            "rigid indenter": self.indenter is not None,
+            "rigid object": self.object is not None,
+            "hardening": hardens,
+            "gravity": any(self.gravity),
+        }
+        lacking = [what for what, wanted in asked.items() if wanted]
+        if self.gels and (self.physics == "seed" or self.body is None):
+            which = "physics 'seed' has one gel for both"
+            if self.body is None:
+                which = "an indenter presses the gel 'lower' alone" if self.indenter else "both pads have the same gel"
             raise ValueError(f"gels: {which}; write what is in gels.{next(iter(self.gels))} into gel, leave out gels")
         if self.physics == "seed" and lacking:
             raise ValueError(f"physics 'seed' has no {lacking[0]}; use physics 'hybrid'")
-        if any(self.gravity) and self.body is None:
+        if any(self.gravity) and self.indenter is not None:
             raise ValueError("gravity has no body to act on; give the scene a body, or set gravity to [0, 0, 0]")
         missing = [name for name in ("lower", "upper") if self.body is not None and name not in self.friction]
         if missing:
@@ -270,6 +244,8 @@ class Scene(Config):
 
     @property
     def sensors(self) -> tuple[str, ...]:
+        if self.object is not None:
+            return SIDES
         return ("lower", "upper") if self.indenter is None else ("lower",)
 
     @property

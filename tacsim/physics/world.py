@@ -75,7 +75,12 @@ class World(Protocol):
 
 
 def make_world(scene: Scene) -> World:
-    """The world of a scene, by the scheme named in `physics`."""
+    """The world of a scene, by the scheme named in `physics`. Raises ValueError for one with a rigid object."""
+    if scene.object is not None:
+        raise ValueError(
+            f"scene '{scene.name}' has a rigid object, which only MuJoCo moves: open a rig with clock 'mujoco' "
+            "(robot.open_rig('hand')), or press its shape as an `indenter`"
+        )
     return SCHEMES[scene.physics](scene)
 
 

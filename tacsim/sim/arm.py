@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Iterable
+from typing import Protocol
 
 import numpy as np
 
@@ -12,8 +13,19 @@ from tacsim.interface import ArmState, FloatArray, Pose
 from tacsim.limits import LimitExceeded, clip_to_region, exceeds_wrench, limit_step
 from tacsim.models.hardware import ArmLimits
 from tacsim.models.rig import WrenchNoise
-from tacsim.physics.world import World
-from tacsim.sim.clock import Delayed, SimClock
+from tacsim.sim.clock import Delayed, StateClock
+
+
+class FrameWorld(Protocol):
+    """A simulated world as an arm sees it."""
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """The frames that feel a wrench."""
+        ...
+
+    def pose(self, name: str) -> Pose: ...
+    def wrench(self, name: str) -> FloatArray: ...
 
 
 class WrenchNoiseSource:
@@ -53,7 +65,7 @@ def wrench_noise_source(noise: WrenchNoise, arm: str) -> WrenchNoiseSource | Non
 
 
 class SimArm:
-    """Carries one frame of the world (a sensor, or "indenter") exactly to its commanded pose.
+    """Carries one frame of the world (a sensor, a gripper, or "indenter") to its commanded pose.
 
     Args:
         max_step, max_turn: longest motion of one control period [m, rad]; longer ones are shortened, and counted.
@@ -67,8 +79,8 @@ class SimArm:
 
     def __init__(
         self,
-        world: World,
-        clock: SimClock,
+        world: FrameWorld,
+        clock: StateClock,
         frame: str,
         max_step: float,
         max_turn: float,
@@ -103,9 +115,13 @@ class SimArm:
             pose=self._measured_pose(),
             twist=self._clock.velocities.get(self._frame, np.zeros(6)).copy(),
             wrench=wrench,
-            joints=None,
+            joints=self._joints(),
             time=self._clock.now(),
         )
+
+    def _joints(self) -> FloatArray | None:
+        """(n,) [rad]; None without joints."""
+        return None
 
     def _measured_pose(self) -> Pose:
         here = self._world.pose(self._frame)

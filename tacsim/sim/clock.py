@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
-from typing import Generic, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 from tacsim import pose as se3
 from tacsim.interface import FloatArray, Pose
@@ -16,6 +16,22 @@ from tacsim.physics.world import World
 Value = TypeVar("Value")
 
 
+class StateClock(Protocol):
+    """Simulated time as sensors and arms see it."""
+
+    period: float  # [s]
+    periods: int  # since time zero
+    episode: int  # the seed of the noise
+    version: int  # counts the states of the world
+    velocities: Mapping[str, FloatArray]  # by frame, see SimClock
+
+    def now(self) -> float: ...
+    def command(self, frame: str, pose: Pose, limited: bool) -> None: ...
+    def commanded(self, frame: str) -> Pose | None: ...
+    def drop_commands(self) -> None: ...
+    def diagnostics(self) -> Mapping[str, float]: ...
+
+
 class Delayed(Generic[Value]):
     """What was seen `delay` periods ago; in the first periods of an episode, what was seen first."""
 
@@ -23,7 +39,7 @@ class Delayed(Generic[Value]):
         self._past: deque[Value] = deque(maxlen=delay + 1)
         self._version = -1
 
-    def __call__(self, clock: SimClock, observe: Callable[[], Value]) -> Value:
+    def __call__(self, clock: StateClock, observe: Callable[[], Value]) -> Value:
         """`observe` is called once for each state of the world."""
         if self._version != clock.version or not self._past:
             if clock.now() == 0.0:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,16 @@ from tacsim.physics.move import MoveStats
 from tacsim.physics.world import World, make_world
 
 State = Mapping[str, NDArray[Any]]
+
+
+class SimulatedScene(Protocol):
+    """What is simulated, to be exchanged between episodes."""
+
+    scene: Scene
+
+    def set_scene(self, scene: Scene) -> None:
+        """From the next episode on. Raises ValueError for a scene that the rig cannot go to."""
+        ...
 
 
 class SceneWorld:
@@ -89,6 +99,7 @@ def require_same_gels(scene: Scene, other: Scene) -> None:
     unchanging: dict[str, tuple[object, object]] = {
         "physics": (scene.physics, other.physics),
         "a body": (scene.body is not None, other.body is not None),
+        "an object": (scene.object is not None, other.object is not None),
     }
     for name in scene.sensors:
         unchanging[f"gel.size of sensor '{name}' [m]"] = scene.gel_of(name).size, other.gel_of(name).size

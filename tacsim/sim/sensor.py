@@ -5,12 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
+from typing import Protocol
 
 from tacsim.interface import Image, SensorSpec, SurfaceMap, TactileFrame
 from tacsim.models.scene import GelSurface
 from tacsim.optics.noise import NoiseSource
-from tacsim.physics.world import World
-from tacsim.sim.clock import Delayed, SimClock
+from tacsim.sim.clock import Delayed, StateClock
+
+
+class GelWorld(Protocol):
+    """A simulated world as a sensor sees it."""
+
+    def surface(self, name: str) -> GelSurface: ...
 
 
 @dataclass
@@ -48,8 +54,8 @@ class SimSensor:
 
     def __init__(
         self,
-        world: World,
-        clock: SimClock,
+        world: GelWorld,
+        clock: StateClock,
         frame: str,
         spec: SensorSpec,
         render: Callable[[GelSurface], Image],

@@ -10,11 +10,23 @@ import numpy as np
 
 from tacsim import pose as se3
 from tacsim.control import contact_signal
-from tacsim.interface import Action, FloatArray, Needs, Observation, Policy, Pose, RigSpec, TactileObservation, Truth
+from tacsim.interface import (
+    Action,
+    FloatArray,
+    GripperState,
+    GripperTarget,
+    Needs,
+    Observation,
+    Policy,
+    Pose,
+    RigSpec,
+    TactileObservation,
+    Truth,
+)
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.models.task import SqueezeConfig
 from tacsim.tasks.task import Axis, Estimator, GoalOutOfReach, Task
-from tacsim.tasks.tuning import ARRIVAL_HEIGHT_ERROR, CLOSING_STEP, FIRM_GRIP_SIGNAL, MIN_BODY_SHARE
+from tacsim.tasks.tuning import ARRIVAL_HEIGHT_ERROR, CLOSING_STEP, FIRM_GRIP_SIGNAL, MAX_GRIP_FORCE, MIN_BODY_SHARE
 
 BOTH = frozenset({"lower", "upper"})
 
@@ -120,10 +132,10 @@ class Grip:
     """Moves every sensor along its own z until the mean contact signal reaches the target, then holds to the end.
 
     On a recording, its actions are what it would have done. A sensor that no arm carries is addressed by its own name,
-    with a target relative to where it is.
+    with a target relative to where it is. Sensors on a gripper are closed by it.
 
     Args:
-        spec: of the rig; says which arm carries which sensor.
+        spec: of the rig; says which arm or gripper carries which sensor.
         target: contact signal (tacsim.control) that ends the closing [-].
         step: motion of each sensor in a control period [m].
     """
@@ -131,16 +143,20 @@ class Grip:
     def __init__(self, spec: RigSpec, target: float = FIRM_GRIP_SIGNAL, step: float = CLOSING_STEP) -> None:
         if not target > 0 or not step > 0:
             raise ValueError(f"grip: target and step must be positive, got target {target}, step {step} m")
-        self._carriers: Mapping[str, str | None] = {name: sensor.arm for name, sensor in spec.sensors.items()}
+        self._carriers: Mapping[str, str | None] = {
+            name: sensor.arm for name, sensor in spec.sensors.items() if sensor.gripper is None
+        }
+        self._grippers = sorted({each.gripper for each in spec.sensors.values() if each.gripper is not None})
         self._target, self._step = target, step
         self._holding = False
+        self._widths: dict[str, float] = {}  # that grippers were sent to [m]
 
     @property
     def needs(self) -> Needs:
         return Needs()
 
     def reset(self) -> None:
-        self._holding = False
+        self._holding, self._widths = False, {}
 
     def __call__(self, observation: Observation) -> Action:
         signals = [contact_signal(touch) for touch in observation.tactile.values()]
@@ -151,5 +167,11 @@ class Grip:
             {
                 arm or sensor: se3.translated_along_z(Pose() if arm is None else observation.arms[arm].pose, self._step)
                 for sensor, arm in self._carriers.items()
-            }
+            },
+            {name: self._next_grip(name, observation.grippers[name]) for name in self._grippers},
         )
+
+    def _next_grip(self, name: str, gripper: GripperState) -> GripperTarget:
+        """A step narrower than before: each finger goes as far as an arm would."""
+        self._widths[name] = max(self._widths.get(name, gripper.width) - 2 * self._step, 0.0)
+        return GripperTarget(self._widths[name], MAX_GRIP_FORCE)

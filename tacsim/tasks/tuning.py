@@ -20,3 +20,4 @@ MIN_BODY_SHARE = 0.1  # of the sensors' way that a body is taken to give
 ARRIVAL_HEIGHT_ERROR = 0.01e-3  # the scripted policy holds when its estimate is this close to the goal [m]
 FIRM_GRIP_SIGNAL = 0.05  # contact signal of a firm grip: five times what camera noise of 2 % gives [-]
 CLOSING_STEP = 0.1e-3  # motion of each sensor in a control period [m]
+MAX_GRIP_FORCE = 5.0  # of a gripper that closes: it holds 0.5 kg, and presses a gel of 4 mm by some tenths of a mm [N]

@@ -8,6 +8,7 @@ from typing import Any, NoReturn, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from tacsim.control import ObjectDropped as ObjectDropped
 from tacsim.interface import FloatArray, Image
 from tacsim.models.scene import Gel, GelSurface, Indenter, Preset, Scene, Shape
 from tacsim.models.sensor import SensorModel
@@ -22,10 +23,6 @@ from tacsim.sim.engines.mujoco_objects import (
     require_stable_step,
 )
 from tacsim.sim.pads import TactilePads
-
-
-class ObjectDropped(RuntimeError):
-    """No pad touches an object that was held."""
 
 
 class TouchSensor:

@@ -14,9 +14,7 @@ from hypothesis import strategies as st
 
 from tacsim.config import ConfigError, config_root, load_rig, load_scene, load_sensor
 
-SCENE_KEYS = (
-    "name, physics, preset, particle_spacing, element_size, gel, gels, body, indenter, friction, gravity, settling"
-)
+SCENE_KEYS = "name, physics, preset, particle_spacing, element_size, gel, gels, body, indenter, object, fixtures, timestep, friction, gravity, settling"
 NEW_SCENE = "; `tacsim new scene NAME` writes one, `tacsim list scene` prints the shipped ones"
 LENGTH = "length > 0 m, bare in m or with a unit (m, mm, cm, um)"
 

@@ -1,0 +1,222 @@
+"""What moves in a cell: a free flange, the joints of an arm, the fingers of a gripper; each for one control period."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacsim import pose as se3
+from tacsim.interface import FloatArray, Pose
+from tacsim.limits import LimitExceeded
+from tacsim.sim.cell import tuning
+from tacsim.sim.cell.description import ArmDescription, GripperDescription
+from tacsim.sim.cell.ramp import Ramp
+from tacsim.sim.engines.implicit_step import inertia
+from tacsim.sim.engines.mujoco_module import load_mujoco
+
+State = Mapping[str, NDArray[Any]]
+
+
+def site_pose(data: Any, site: int) -> Pose:
+    """world_from_site, as MuJoCo has computed its frames last."""
+    return _pose_of(data.site_xpos[site], data.site_xmat[site])
+
+
+def _pose_of(position: FloatArray, axes: FloatArray) -> Pose:
+    frame = np.eye(4)
+    frame[:3, :3], frame[:3, 3] = axes.reshape(3, 3), position
+    return se3.from_matrix(frame)
+
+
+class FreeDrive:
+    """A free flange that reaches every commanded pose exactly: its velocity is set, and it is too heavy to be
+    disturbed."""
+
+    joints = None
+
+    def __init__(self, model: Any, data: Any, name: str, tool: int) -> None:
+        self._model, self._data, self._tool = model, data, tool
+        joint = model.joint(f"{name}/flange")
+        self._places, self._speeds = int(joint.qposadr[0]), int(joint.dofadr[0])
+        self._flange_from_tool = Pose(model.site_pos[tool], np.roll(model.site_quat[tool], -1))
+        self._target = self._start = Pose()
+        self._shift = self._turn = Ramp.rest(3)
+        self._last_speed = np.zeros(6)
+
+    def place(self, tool: Pose) -> None:
+        """Puts it there at once, at rest."""
+        flange = se3.compose(tool, se3.inverse(self._flange_from_tool))
+        self._data.qpos[self._places : self._places + 7] = [*flange.position, *np.roll(flange.quaternion, 1)]
+        self._data.qvel[self._speeds : self._speeds + 6] = 0.0
+        self._target, self._last_speed = tool, np.zeros(6)
+
+    def begin(self, target: Pose | None, seconds: float) -> None:
+        """Plans the next `seconds`: to a pose of the tool; None: to its last target."""
+        self._target = self._target if target is None else target
+        self._start = site_pose(self._data, self._tool)
+        way = se3.pose_difference(self._start, self._target)
+        self._shift = Ramp.plan(way[:3], self._last_speed[:3], seconds)
+        self._turn = Ramp.plan(way[3:], self._last_speed[3:], seconds)
+
+    def apply(self, time: float) -> None:
+        """Before a step that begins `time` [s] after `begin`: what makes it follow its plan."""
+        dt = float(self._model.opt.timestep)
+        self._last_speed = np.concatenate([self._shift.speed(time + dt), self._turn.speed(time + dt)])
+        turned = se3.from_rotation_vector(np.zeros(3), self._turn.displacement(time + dt))
+        tool = Pose(
+            self._start.position + self._shift.displacement(time + dt),
+            se3.compose(turned, Pose(quaternion=self._start.quaternion)).quaternion,
+        )
+        to = se3.compose(tool, se3.inverse(self._flange_from_tool))
+        place = self._data.qpos[self._places : self._places + 7]
+        here = Pose(place[:3], np.roll(place[3:], -1))
+        way = se3.pose_difference(here, to)
+        way[3:] = se3.rotation_matrix(here).T @ way[3:]  # MuJoCo has a free body's spin in its own axes
+        self._data.qvel[self._speeds : self._speeds + 6] = way / dt
+
+    def snapshot(self) -> dict[str, NDArray[Any]]:
+        return {"target": np.concatenate([self._target.position, self._target.quaternion]), "speed": self._last_speed}
+
+    def restore(self, state: State) -> None:
+        self._target = Pose(state["target"][:3], state["target"][3:])
+        self._last_speed = np.array(state["speed"])
+
+
+class JointDrive:
+    """The joints of an arm: each is controlled to follow its path, with the inertia of the arm known (computed torque),
+    and up to its greatest torque."""
+
+    def __init__(self, model: Any, data: Any, joints: tuple[str, ...], tool: int, description: ArmDescription) -> None:
+        mujoco = load_mujoco()
+        self._model, self._data, self._tool = model, data, tool
+        found = [model.joint(name) for name in joints]
+        self._places = np.array([int(joint.qposadr[0]) for joint in found])
+        self._speeds = np.array([int(joint.dofadr[0]) for joint in found])
+        self._ranges = np.array([joint.range if joint.limited[0] else (-2 * np.pi, 2 * np.pi) for joint in found])
+        torques = [link.max_torque for link in description.links]
+        self._max_torque = np.array(torques) if torques else np.full(len(found), np.inf)
+        self._scratch = mujoco.MjData(model)
+        self._reference = self._start = np.zeros(len(found))
+        self._speed = np.zeros(len(found))
+        self._ramp = Ramp.rest(len(found))
+        self.limited = 0  # steps in which a joint had its greatest torque
+
+    @property
+    def joints(self) -> FloatArray:
+        return np.array(self._data.qpos[self._places])
+
+    def place(self, joints: FloatArray) -> None:
+        """Puts the joints there at once, at rest."""
+        self._data.qpos[self._places], self._data.qvel[self._speeds] = joints, 0.0
+        self._reference, self._speed = np.array(joints), np.zeros(len(joints))
+
+    def find_joints(self, tool: Pose, seed: FloatArray) -> FloatArray:
+        """Joints that bring the tool to a pose, from `seed` (n,) by damped least squares. Raises LimitExceeded."""
+        mujoco, scratch = load_mujoco(), self._scratch
+        scratch.qpos[:] = self._data.qpos
+        joints, jacobian = np.array(seed), np.zeros((6, self._model.nv))
+        for _ in range(tuning.MAX_JOINT_STEPS):
+            scratch.qpos[self._places] = joints
+            mujoco.mj_kinematics(self._model, scratch)
+            mujoco.mj_comPos(self._model, scratch)
+            error = se3.pose_difference(site_pose(scratch, self._tool), tool)
+            size = float(np.linalg.norm(error))
+            if size < tuning.JOINT_TOLERANCE:
+                break
+            mujoco.mj_jacSite(self._model, scratch, jacobian[:3], jacobian[3:], self._tool)
+            columns = jacobian[:, self._speeds]
+            damping = 1e-4 * min(size, 1.0) * np.eye(6)
+            joints = joints + (columns.T @ np.linalg.solve(columns @ columns.T + damping, error)).clip(-0.3, 0.3)
+        inside = (joints >= self._ranges[:, 0]).all() and (joints <= self._ranges[:, 1]).all()
+        if size >= tuning.JOINT_TOLERANCE or not inside:
+            why = "is out of reach" if size >= tuning.JOINT_TOLERANCE else "needs a joint beyond its range"
+            at = ", ".join(f"{each:.4g}" for each in tool.position)
+            raise LimitExceeded(f"the pose of the tool at ({at}) m {why}; choose one nearer to the arm's base")
+        return joints
+
+    def begin(self, target: Pose | None, seconds: float) -> None:
+        """As of a free flange. Raises LimitExceeded for a pose that no joints give."""
+        goal = self._reference if target is None else self.find_joints(target, self._reference)
+        self._ramp = Ramp.plan(goal - self._reference, self._speed, seconds)
+        self._start = self._reference
+
+    def apply(self, time: float) -> None:
+        """As of a free flange."""
+        after = time + float(self._model.opt.timestep)
+        self._reference, self._speed = self._start + self._ramp.displacement(after), self._ramp.speed(after)
+        data, frequency = self._data, tuning.ARM_FREQUENCY
+        wanted = frequency**2 * (self._reference - data.qpos[self._places])
+        wanted += 2 * frequency * (self._speed - data.qvel[self._speeds])
+        own = inertia(self._model, data)[np.ix_(self._speeds, self._speeds)]
+        torque = own @ wanted
+        allowed = torque.clip(-self._max_torque, self._max_torque)
+        self.limited += int((allowed != torque).any())
+        data.qfrc_applied[self._speeds] = allowed
+
+    def snapshot(self) -> dict[str, NDArray[Any]]:
+        return {"reference": self._reference, "speed": self._speed, "limited": np.array([self.limited])}
+
+    def restore(self, state: State) -> None:
+        self._reference, self._speed = np.array(state["reference"]), np.array(state["speed"])
+        self.limited = int(state["limited"][0])
+
+
+class GripperDrive:
+    """Two fingers that close or open at most at their speed, and press with at most a force. The joints grow as the
+    gripper opens; the force is positive when it closes."""
+
+    def __init__(
+        self, model: Any, data: Any, joints: tuple[str, str], pads: tuple[int, int], description: GripperDescription
+    ) -> None:
+        self._model, self._data, self._pads = model, data, pads
+        found = [model.joint(name) for name in joints]
+        self._places = np.array([int(joint.qposadr[0]) for joint in found])
+        self._speeds = np.array([int(joint.dofadr[0]) for joint in found])
+        self._max_speed, self._mass, self.max_width = description.speed, description.finger_mass, description.stroke
+        self.target = (description.stroke, description.max_force)  # width [m], greatest force [N]
+        self._reference = description.stroke / 2  # of each joint [m]
+        self.force = 0.0  # of each finger, as it was in the last step [N]
+
+    @property
+    def width(self) -> float:
+        """Between the pads' undeformed surfaces [m]."""
+        left, right = (site_pose(self._data, pad) for pad in self._pads)
+        return float((right.position - left.position) @ se3.rotation_matrix(left)[:, 2])
+
+    def place(self, width: float) -> None:
+        """Opens or closes it at once, at rest."""
+        self._data.qpos[self._places], self._data.qvel[self._speeds] = width / 2, 0.0
+        self._reference, self.target = width / 2, (width, self.target[1])
+
+    def command(self, width: float, max_force: float) -> None:
+        """Goes to a width [m], and presses with at most a force [N]. Where it turns round, nothing stays of the force
+        before."""
+        here = float(self._data.qpos[self._places].mean())
+        if (width / 2 - here) * (self._reference - here) < 0:
+            self._reference = here
+        self.target = (width, max_force)
+
+    def apply(self) -> None:
+        """Before each step."""
+        width, max_force = self.target
+        goal, dt, frequency = width / 2, float(self._model.opt.timestep), tuning.FINGER_FREQUENCY
+        places, speeds = self._data.qpos[self._places], self._data.qvel[self._speeds]
+        here, stiffness = float(places.mean()), self._mass * frequency**2
+        reach = max_force / stiffness  # beyond, the force has its greatest value already
+        before = min(max(self._reference, here - reach), here + reach)
+        step = min(max(goal - before, -self._max_speed * dt), self._max_speed * dt)
+        self._reference = before + step
+        damping = 2 * self._mass * frequency
+        pushed = stiffness * (self._reference - here) + damping * (step / dt - speeds.mean())
+        self.force = -min(max(pushed, -max_force), max_force)
+        self._data.qfrc_applied[self._speeds] = -self.force
+
+    def snapshot(self) -> dict[str, NDArray[Any]]:
+        return {"gripper": np.array([*self.target, self._reference, self.force])}
+
+    def restore(self, state: State) -> None:
+        width, most, self._reference, self.force = (float(each) for each in state["gripper"])
+        self.target = width, most

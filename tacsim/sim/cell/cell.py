@@ -290,8 +290,10 @@ class Cell:
 
 
 def grip_pose(scene: Scene) -> Pose:
-    """world_from_tool where a gripper grips the object: at its centre, from above, closing along world x."""
-    return Pose(object_start(scene).position, se3.HALF_TURN_X.quaternion)
+    """world_from_tool where a gripper grips the object: at its centre or next to it, from above, closing along world
+    x."""
+    assert scene.object is not None
+    return Pose(object_start(scene).position + scene.object.grip, se3.HALF_TURN_X.quaternion)
 
 
 def surface_points(geometry: Any) -> Float32:

@@ -84,7 +84,7 @@ TEXTS = {
     "missing file": ("body:\n  material: my/clay.yaml", "a.yaml:2: body.material: there is no file 'my/clay.yaml'; there is no folder 'my' either; `tacsim new material NAME` writes one, `tacsim list material` prints the shipped ones"),
     "no name": ("body: {material: a b}", "a.yaml:1: body.material: 'a b' is no material; allowed: a name (cold-plasticine, dough, "
                 "modelling-clay, seed, silicone, soft-clay), or a path ending in .yaml"),
-    "unknown base": ("name: x\nextends: sqeeze", "a.yaml:2: extends: no scene 'sqeeze'; allowed: knead, press, reposition, squeeze; did you mean 'squeeze'?"),
+    "unknown base": ("name: x\nextends: sqeeze", "a.yaml:2: extends: no scene 'sqeeze'; allowed: hold, knead, press, reposition, squeeze; did you mean 'squeeze'?"),
     "base of a wrong type": ("extends: [squeeze]", "a.yaml:1: extends: a list of 1 does not fit; allowed: the name of a scene, or a path"),
     "itself": ("a.yaml", "a.yaml:1: the references form a circle: a.yaml -> a.yaml; break it in one of them"),
     "duplicate": ("name: x\npreset: draft\nname: y", "a.yaml:3: name: the key occurs twice, first at a.yaml:1; keep one"),
@@ -101,7 +101,7 @@ TEXTS = {
     "key that is a list": ("? [a]\n: 1", "a.yaml:1: a key must be a plain text, not a list or a mapping"),
     "empty": ("", "a.yaml:1: the file is empty; allowed: a mapping of keys to values"),
     "only comments": ("# nothing\n\n", "a.yaml:1: the file is empty; allowed: a mapping of keys to values"),
-    "no mapping": ("5", "a.yaml:1: 5 does not fit; allowed: the name of a scene (knead, press, reposition, squeeze), or a mapping with keys among " + SCENE_KEYS),
+    "no mapping": ("5", "a.yaml:1: 5 does not fit; allowed: the name of a scene (hold, knead, press, reposition, squeeze), or a mapping with keys among " + SCENE_KEYS),
     "deep": ("\n".join(" " * i + "a:" for i in range(40)), "a.yaml:32: nested too deeply; at most 32 levels are allowed"),
     "escape code": ('"\\e[31mred": 1', f"a.yaml:1: \\x1b[31mred: unknown key; allowed: {SCENE_KEYS}"),
 }  # fmt: skip
@@ -185,7 +185,7 @@ OVERRIDES = {
     "name.x=1": "name.x: 'name' is 'sim', which has no keys",
     "sensors.upper.model.lighting.lights.3.colour=[1, 1, 1]": "sensors.upper.model.lighting.lights.3: no such entry; "
     "allowed: an index from 0 to 2",
-    "clock={a: 1}": "clock: a mapping does not fit; allowed: sim | wall | replay",
+    "clock={a: 1}": "clock: a mapping does not fit; allowed: sim | mujoco | wall | replay",
     "scene.friction.upper=.nan": ".nan is not finite; give a finite number",
     "period=[": "not valid YAML: while parsing a flow node, expected the node content, but found '<stream end>'",
     "period=&a 1": "anchors (&) and aliases (*) are not allowed; write the value out, or refer to a file by its name",
@@ -203,7 +203,7 @@ def test_text_of_a_wrong_override(override: str, message: str, empty_folder: Pat
 def test_a_file_that_is_not_there_lists_the_names() -> None:
     assert (
         complaint(load_rig, "simm")
-        == "simm: no rig 'simm'; allowed: mock, press, replay, sim, stand, ur5e, ur5e-one; did you mean 'sim'?"
+        == "simm: no rig 'simm'; allowed: hand, mock, press, replay, sim, stand, ur5e, ur5e-one; did you mean 'sim'?"
     )
     assert complaint(load_rig, "my/rig.yaml") == (
         "my/rig.yaml: there is no file 'my/rig.yaml'; there is no folder 'my' either; `tacsim new rig NAME` writes one, "

@@ -13,7 +13,7 @@ from robot.cli.options import complete_names
 from robot.cli.output import notes, print_files, print_json, results, show_table, writing
 
 Kind = Literal[
-    "rig", "task", "scene", "sensor", "randomisation", "training", "material", "policy", "driver"
+    "rig", "task", "scene", "sensor", "randomisation", "training", "benchmark", "material", "policy", "driver"
 ]  # tacsim.config.kinds.CATALOGUE_KINDS, without importing it for each command
 
 

@@ -18,7 +18,7 @@ from tacsim.gym.vector import Member, SharedBatch, TacsimVectorEnv
 from tacsim.models.hardware import ArmConfig, Placement, SensorConfig, parts_of
 from tacsim.models.mujoco import MujocoSensorConfig
 from tacsim.models.policy import Features
-from tacsim.models.rig import RigConfig, SimSensorConfig, WrenchNoise
+from tacsim.models.rig import MountConfig, RigConfig, SimSensorConfig, WrenchNoise
 from tacsim.models.sensor import Lighting
 from tacsim.sim.scene_world import StatePool, require_same_gels
 from tacsim.tasks import make_task
@@ -133,5 +133,7 @@ def _fixed_settings(config: RigConfig) -> RigConfig:
             update={"model": sensor.model.model_copy(update=neutral_appearance), "delay": 0}
         )
     for name, arm in config.arms.items():
-        arms[name] = arm.model_copy(update={"error": Placement(), "noise": WrenchNoise(), "delay": 0})
+        arms[name] = arm.model_copy(
+            update={"error": Placement(), "noise": WrenchNoise(), "mount": MountConfig(), "delay": 0}
+        )
     return config.model_copy(update={"scene": None, "task": None, "sensors": sensors, "arms": arms})

@@ -23,6 +23,7 @@ from tacsim.physics.world import World, make_world
 from tacsim.rig import Rig
 from tacsim.sim.arm import SimArm, wrench_noise_source
 from tacsim.sim.clock import SimClock
+from tacsim.sim.mount import elastic_mount
 from tacsim.sim.reset import SimReset
 from tacsim.sim.scene_world import SceneWorld, StatePool
 from tacsim.sim.sensor import SimSensor
@@ -49,6 +50,7 @@ class Simulation:
             self.arms[name].set_measurement_errors(
                 pose_error(arm.error), arm.delay, wrench_noise_source(arm.noise, name)
             )
+            self.arms[name].set_mount(elastic_mount(arm.mount, self.clock.period))
 
 
 def open_sim(config: RigConfig, check: Callable[[RigSpec], None] | None = None) -> Rig:
@@ -105,6 +107,7 @@ def simulate(
         arms[name] = SimArm(
             world, clock, frames[name], max_shift, max_turn, limits, keep_out, pose_error(arm.error), arm.delay, noise
         )
+        arms[name].set_mount(elastic_mount(arm.mount, config.period))
     task = config.task
     touch_force, placement = (None, 0.0) if task is None else (task.touch_force, task.placement)
     rig = Rig(

@@ -16,6 +16,7 @@ from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 from pydantic_core import core_schema
 
 from tacsim.config.bundle import FILE, SENSORS_FOLDER, is_bundle, user_sensor_names
+from tacsim.models.benchmark import BenchmarkTask
 from tacsim.models.driver import BASE_CLASSES, installed_drivers
 from tacsim.models.material import BodyMaterial, GelMaterial
 from tacsim.models.policy import Training
@@ -48,6 +49,7 @@ KINDS = {
         Kind("sensor", "sensors", (SensorModel,), lambda: SensorModel),
         Kind("randomisation", "randomisations", (Randomisation,), lambda: Randomisation),
         Kind("training", "trainings", (Training,), lambda: Training),
+        Kind("benchmark", "benchmark/v1", (BenchmarkTask,), lambda: BenchmarkTask),
         Kind("material", "materials", (GelMaterial, BodyMaterial), lambda: GelMaterial | BodyMaterial),
     )
 }

@@ -20,6 +20,7 @@ UNITS: dict[str, dict[str, float]] = {
     "speed": {"m/s": 1.0, "mm/s": 1e-3},
     "acceleration": {"m/s^2": 1.0, "mm/s^2": 1e-3},
     "density": {"kg/m^3": 1.0, "g/cm^3": 1e3},
+    "stiffness": {"N/m": 1.0, "N/mm": 1e3},
 }
 # pydantic leaves the bounds of a validated number under its own names in the JSON schema.
 _BOUNDS = {"gt": "exclusiveMinimum", "ge": "minimum", "lt": "exclusiveMaximum", "le": "maximum"}
@@ -115,6 +116,7 @@ Force = Annotated[float, Quantity("force")]  # [N]
 Speed = Annotated[float, Quantity("speed")]  # [m/s]
 Acceleration = Annotated[float, Quantity("acceleration")]  # [m/s^2]
 Density = Annotated[float, Quantity("density")]  # [kg/m^3]
+Stiffness = Annotated[float, Quantity("stiffness")]  # [N/m]
 
 
 class Config(BaseModel):

@@ -22,7 +22,7 @@ from tacsim.models.hardware import (
     SensorConfig,
     Vector,
 )
-from tacsim.models.quantity import Angle, Config, Force, Length, Speed, Time
+from tacsim.models.quantity import Angle, Config, Force, Length, Speed, Stiffness, Time
 from tacsim.models.scene import Scene
 from tacsim.models.sensor import CanonicalGrid, PictureRegion, SensorModel
 from tacsim.models.task import TASKS, TaskConfig, task_annotation
@@ -41,6 +41,15 @@ class WrenchNoise(Config):
     seed: Annotated[int, Field(ge=0)] = 0
 
 
+class MountConfig(Config):
+    """What holds a sensor to its arm: a spring with a damper, the same along all axes. The arm does not observe how far
+    it gives way."""
+
+    # None: rigid. A stiffness far below that of the contact (some N/mm) would oscillate, so 500 N/m is the minimum.
+    stiffness: Annotated[Stiffness, Field(ge=500.0)] | None = None
+    damping_time: Annotated[Time, Field(ge=0.1)] = 0.3  # of the displacement to 63 % of what the force asks [s]
+
+
 class SimArmConfig(ArmConfig):
     """A simulated arm: reaches every commanded pose exactly, within the motion that one control period allows."""
 
@@ -53,6 +62,7 @@ class SimArmConfig(ArmConfig):
     # Where the arm believes its sensor to be, seen from where it is: what a calibration leaves of error.
     error: Placement = Placement()
     noise: WrenchNoise = WrenchNoise()
+    mount: MountConfig = MountConfig()  # between arm and sensor
     delay: Delay = 0  # its states are those of so many control periods ago
 
     @property

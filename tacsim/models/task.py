@@ -9,7 +9,7 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self, Union, g
 from pydantic import Field, model_validator
 
 from tacsim.models.hardware import Name
-from tacsim.models.quantity import Config, Force, Length
+from tacsim.models.quantity import Config, Force, Length, Stiffness
 from tacsim.models.scene import Scene
 
 
@@ -64,6 +64,8 @@ class SqueezeConfig(TaskConfig):
 
     kind: Literal["squeeze"]
     goal: Annotated[Length, Field(gt=0)] = 7e-3  # desired height [m]
+    # Of the mount of each sensor, as rules without learning assume it (`arms.NAME.mount` is the real one); None: rigid
+    assumed_stiffness: Annotated[Stiffness, Field(gt=0)] | None = None  # [N/m]
 
 
 class RepositionConfig(TaskConfig):

@@ -14,6 +14,7 @@ from tacsim.limits import LimitExceeded, clip_to_region, exceeds_wrench, limit_s
 from tacsim.models.hardware import ArmLimits
 from tacsim.models.rig import WrenchNoise
 from tacsim.sim.clock import Delayed, StateClock
+from tacsim.sim.mount import ElasticMount
 
 
 class FrameWorld(Protocol):
@@ -94,7 +95,12 @@ class SimArm:
         self._max_step, self._max_turn = max_step, max_turn
         self._limits, self._keep_out = limits, tuple(keep_out)
         self._region = None if limits is None else limits.region
+        self._mount: ElasticMount | None = None
         self.set_measurement_errors(error, delay, noise)
+
+    def set_mount(self, mount: ElasticMount | None) -> None:
+        """What holds the frame to the arm, from the next episode on; None: it is rigid. A mount belongs to one arm."""
+        self._mount = mount
 
     def set_measurement_errors(self, error: Pose | None, delay: int, noise: WrenchNoiseSource | None = None) -> None:
         """Another error, delay and noise, from the next episode on."""
@@ -106,6 +112,8 @@ class SimArm:
         return self._past(self._clock, self._state)
 
     def _state(self) -> ArmState:
+        if self._mount is not None and self._clock.periods == 0:
+            self._mount.begin()
         wrench = self._wrench()
         if self._error is not None:
             wrench = se3.transform_wrench(se3.inverse(self._error), wrench)
@@ -125,7 +133,13 @@ class SimArm:
 
     def _measured_pose(self) -> Pose:
         here = self._world.pose(self._frame)
+        if self._mount is not None:
+            here = Pose(self._mount.arm_position(here.position, self._world_force()), here.quaternion)
         return here if self._error is None else se3.compose(here, self._error)
+
+    def _world_force(self) -> FloatArray:
+        """(3,) on the frame, world axes [N]."""
+        return se3.rotate(self._world.pose(self._frame), self._wrench()[:3])
 
     def _wrench(self) -> FloatArray:
         """(6,) on the sensor; on the indenter, the reaction of all sensors. About its origin, in its axes [N, N m]."""
@@ -144,13 +158,25 @@ class SimArm:
         """Takes effect at the next tick; None holds. Returns the pose after the limits. Raises LimitExceeded."""
         self._check_wrench()
         if target is None:
+            if self._mount is not None:  # it goes on giving way
+                self._command_frame(self._arm_pose(self._measured_pose()), limited=False)
             return None
         measured = self._measured_pose()
         allowed, _ = clip_to_region(target, measured, self._region, self._spheres())
         allowed = limit_step(allowed, measured, self._max_step, self._max_turn)
-        real = allowed if self._error is None else se3.compose(allowed, se3.inverse(self._error))
-        self._clock.command(self._frame, real, limited=allowed is not target)
+        self._command_frame(self._arm_pose(allowed), limited=allowed is not target)
         return allowed
+
+    def _arm_pose(self, measured: Pose) -> Pose:
+        """Where the arm holds the frame if it measures this pose."""
+        return measured if self._error is None else se3.compose(measured, se3.inverse(self._error))
+
+    def _command_frame(self, arm: Pose, limited: bool) -> None:
+        """Moves the frame to where it is once the arm holds it at `arm`."""
+        if self._mount is not None:
+            here = self._world.pose(self._frame).position
+            arm = Pose(self._mount.move_arm(arm.position, here, self._world_force()), arm.quaternion)
+        self._clock.command(self._frame, arm, limited=limited)
 
     def stop(self) -> None:
         self._clock.drop_commands()

@@ -197,6 +197,9 @@ class Knead(Task):
     def scripted(self, *, through: bool = False) -> Policy:
         return ScriptedKnead(self, through)
 
+    def analytic(self) -> Policy:
+        return AnalyticKnead(self, False)
+
     def teacher(self) -> Policy:
         body = self.config.scene.body
         yields = None if body is None else body.material.yield_stress
@@ -276,6 +279,15 @@ class ScriptedKnead:
         golden_angle = np.pi * (3.0 - 5.0**0.5)  # no two strokes of a ball's go one way
         turn = 0.5 * np.pi if self._task.config.shape == "rod" else golden_angle * self._strokes
         return np.array([np.cos(turn), np.sin(turn)])
+
+
+class AnalyticKnead(ScriptedKnead):
+    """Rolls to and fro, and closes by a fixed share of the height that is left to the solid's."""
+
+    def _closing_step(self, observation: Observation) -> float:
+        longest = self._task.config.max_step
+        left = estimated_height(observation) - self._task.goal[2]
+        return float(np.clip(0.5 * left / CLOSING_STEPS, -longest, longest))
 
 
 class KneadTeacher(ScriptedKnead):

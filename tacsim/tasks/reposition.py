@@ -68,6 +68,9 @@ class Reposition(Task):
     def scripted(self, *, through: bool = False) -> Policy:
         return ScriptedReposition(self.config, through)
 
+    def analytic(self) -> Policy:
+        return AnalyticReposition(self.config)
+
 
 class ScriptedReposition:
     """Moves the upper sensor at half of max_step until the estimated position of the body is the goal, then holds.
@@ -103,6 +106,32 @@ class ScriptedReposition:
         step = direction * (self._rate / longest if self._reached or longest > self._rate else 1.0)
         now = observation.arms["upper"].pose
         return Action({"upper": Pose(now.position + np.append(step, 0.0), now.quaternion)})
+
+
+class AnalyticReposition:
+    """Position = midway between the centres of pressure on the two faces; the upper sensor moves by what is left to the
+    goal, again in each step."""
+
+    def __init__(self, config: RepositionConfig) -> None:
+        self._goal, self._max_step = np.array(config.goal), config.max_step
+        self._start: FloatArray | None = None
+
+    @property
+    def needs(self) -> Needs:
+        return Needs(arms=frozenset({"lower", "upper"}))
+
+    def reset(self) -> None:
+        self._start = None
+
+    def __call__(self, observation: Observation) -> Action:
+        position = estimated_position(observation)
+        if position is None:
+            return Action({"upper": None})
+        if self._start is None:
+            self._start = position
+        left = (self._goal - (position - self._start)).clip(-self._max_step, self._max_step)
+        now = observation.arms["upper"].pose
+        return Action({"upper": Pose(now.position + np.append(left, 0.0), now.quaternion)})
 
 
 def estimated_position(observation: Observation) -> FloatArray | None:

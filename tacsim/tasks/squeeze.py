@@ -79,6 +79,9 @@ class Squeeze(Task):
     def scripted(self, *, through: bool = False) -> Policy:
         return ScriptedSqueeze(self.config, through)
 
+    def analytic(self) -> Policy:
+        return AnalyticSqueeze(self.config)
+
 
 class ScriptedSqueeze:
     """Closes both sensors alike at half of max_step until the estimated height of the body is the goal, then holds.
@@ -103,6 +106,33 @@ class ScriptedSqueeze:
         if self._reached and not self._through:
             return Action({"lower": None, "upper": None})
         step = self._rate if self._reached else min(self._rate, above / 2)
+        up = np.array([0.0, 0.0, step])
+        lower, upper = observation.arms["lower"].pose, observation.arms["upper"].pose
+        return Action(
+            {"lower": Pose(lower.position + up, lower.quaternion), "upper": Pose(upper.position - up, upper.quaternion)}
+        )
+
+
+class AnalyticSqueeze:
+    """Height = gap between the sensors + both depths + what both mounts give way if they have the assumed stiffness;
+    each sensor moves by half of what is left to the goal. It opens
+    again if the body is too low."""
+
+    def __init__(self, config: SqueezeConfig) -> None:
+        self._goal, self._max_step = config.goal, config.max_step
+        self._compliance = 0.0 if config.assumed_stiffness is None else 1.0 / config.assumed_stiffness
+
+    @property
+    def needs(self) -> Needs:
+        return Needs(BOTH, BOTH, height=True)
+
+    def reset(self) -> None:
+        """It has no memory."""
+
+    def __call__(self, observation: Observation) -> Action:
+        force = -float(observation.arms["lower"].wrench[2] + observation.arms["upper"].wrench[2])
+        height = estimated_height(observation) + self._compliance * force
+        step = float(np.clip((height - self._goal) / 2, -self._max_step, self._max_step))
         up = np.array([0.0, 0.0, step])
         lower, upper = observation.arms["lower"].pose, observation.arms["upper"].pose
         return Action(

@@ -112,6 +112,11 @@ class Task(ABC):
         ValueError where there is none."""
         raise ValueError(f"task '{self.config.kind}' has no scripted policy; name one of your own")
 
+    def analytic(self) -> Policy:
+        """A rule of one or two formulas on what a policy observes, without memory of earlier touches: what learning has
+        to be compared with. Raises ValueError where there is none."""
+        raise ValueError(f"task '{self.config.kind}' has no analytic rule; define Task.analytic")
+
     def teacher(self) -> Policy:
         """A policy that may know what only a simulation does: shows what to do where `expert` knows no rule."""
         return self.scripted()

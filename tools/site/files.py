@@ -20,6 +20,7 @@ from tools.site.comments import comments_of_fields
 TITLES = {
     "material": "Material files", "scene": "Scene files", "sensor": "Sensor files", "task": "Task files",
     "rig": "Rig files", "randomisation": "Randomisation files", "training": "Training files",
+    "benchmark": "Benchmark task files",
 }  # fmt: skip
 INTRODUCTION = """Generated from the models that read these files, and from the comments in their code.
 `tacsim schema {kind}` prints the same as a JSON schema, which completes and checks the file in an editor. Every value

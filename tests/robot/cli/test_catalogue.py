@@ -54,7 +54,7 @@ def test_show_prints_what_a_name_stands_for(name: str) -> None:
 
 def test_show_prints_all_kinds_of_a_name_or_the_chosen_one() -> None:
     kinds = [each["kind"] for each in json.loads(tacsim("show", "squeeze", "--json").stdout)]
-    assert kinds == ["task", "scene", "randomisation", "training", "policy"]
+    assert kinds == ["task", "scene", "randomisation", "training", "benchmark", "policy"]
     (policy,) = json.loads(tacsim("show", "squeeze", "--kind", "policy", "--json").stdout)
     assert policy["task"] == "squeeze" and policy["inputs"] and policy["axes"]
 

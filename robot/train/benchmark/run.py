@@ -1,0 +1,113 @@
+"""Runs policies on splits, and writes their scores round by round: a run that was stopped continues where it was."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from robot.train.benchmark.episodes import Split, load_split, subset_size
+from robot.train.benchmark.fingerprint import machine, physics
+from robot.train.benchmark.play import SplitPlayer, Warn
+from robot.train.benchmark.policies import hash_policy
+from robot.train.benchmark.score import Score, read_score, score_path, write_score
+
+Subset = Literal["quick", "full"]
+ReportProgress = Callable[[str, int, int], None]
+ReportScore = Callable[[Path, Score], None]
+
+
+class OtherRun(ValueError):
+    """A score that was begun with other settings cannot be continued."""
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """What is to be run, and where the scores go."""
+
+    task: str  # name or path of a task file
+    policies: tuple[str, ...]
+    splits: tuple[str, ...]
+    subset: Subset
+    folder: Path
+    environments: int = 8  # episodes that move together; results do not depend on it
+
+
+def new_score(split: Split, policy: str, subset: Subset) -> Score:
+    """The score of a policy without episodes. Raises PolicyNotFound."""
+    config = split.load_config()
+    assert config.task is not None
+    return Score(
+        task=split.task_name,
+        split=split.name,
+        subset=subset,
+        policy=policy,
+        policy_sha256=hash_policy(policy, split.file, config.task.kind),
+        task_sha256=split.task_sha256,
+        split_sha256=split.sha256,
+        sensors_sha256=split.sensors_sha256,
+        physics=physics(),
+        machine=machine(),
+        number=subset_size(subset, len(split.episodes)),
+    )
+
+
+def run_benchmark(
+    run: Run,
+    report_progress: ReportProgress = lambda words, done, of: None,
+    report_score: ReportScore = lambda path, score: None,
+    warn: Warn = lambda words: None,
+) -> list[tuple[Path, Score]]:
+    """Plays all episodes that the score files in the folder do not have. Returns all scores.
+
+    An episode in which the policy raises is a failed episode, with the reason in its score; the run continues.
+    report_score: called with each score when it is complete.
+    Raises PolicyNotFound, IncompatibleRig, SplitChanged, OtherRun, ScoreEdited, and the errors of `SplitPlayer`.
+    """
+    found: list[tuple[Path, Score]] = []
+    for name in run.splits:
+        split = load_split(run.task, name)
+        wanted = [open_score(run.folder, new_score(split, policy, run.subset)) for policy in run.policies]
+        numbers = sorted({number for _, score in wanted for number in score.missing})
+        if numbers:
+            with SplitPlayer(split, numbers, run.environments) as player:
+                for _, score in wanted:
+                    player.require_policy(score.policy, warn)
+                wanted = [_complete(player, path, score, report_progress) for path, score in wanted]
+        for path, score in wanted:
+            report_score(path, score)
+        found += wanted
+    return found
+
+
+def open_score(folder: Path, new: Score) -> tuple[Path, Score]:
+    """The score file of this subject, or `new` if there is none yet. Raises OtherRun if the file there has another
+    subject: another physics, task, split, sensors or vector width."""
+    path = score_path(folder, new.task, new.split, new.policy, new.policy_sha256, new.subset)
+    if not path.exists():
+        return path, new
+    there = read_score(path)
+    if there.subject != new.subject:
+        differing = [key for key, value in new.subject.items() if there.subject[key] != value]
+        raise OtherRun(
+            f"{path}: has a score with another {', '.join(differing)}; nothing is overwritten, give another --out"
+        )
+    return path, there
+
+
+def _complete(player: SplitPlayer, path: Path, score: Score, report: ReportProgress) -> tuple[Path, Score]:
+    missing: Sequence[int] = score.missing
+    done = score.number - len(missing)
+    started = time.perf_counter()
+    words = f"{score.policy}, {score.split}"
+    rounds = player.play(
+        score.policy, missing, lambda step, steps: report(f"{words}: step {step} of {steps}", done, score.number)
+    )
+    for episodes, seconds in rounds:
+        now = time.perf_counter()
+        score = write_score(path, score.with_episodes(episodes, now - started, seconds))
+        started, done = now, score.number - len(score.missing)
+        report(words, done, score.number)
+    return path, score

@@ -250,6 +250,7 @@ class Cell:
             points=se3.transform(here, self._points).astype(np.float32),
             poses={name: self.pose(name) for name in self._pads},
             objects={OBJECT: here},
+            forces={name: self.normal_force(name) for name in self._pads},
         )
 
     # ------------------------------------------------------------------ state
@@ -281,8 +282,10 @@ class Cell:
 
 
 def grip_pose(scene: Scene) -> Pose:
-    """world_from_tool where a gripper grips the object: at its centre, from above, closing along world x."""
-    return Pose(object_start(scene).position, se3.HALF_TURN_X.quaternion)
+    """world_from_tool where a gripper grips the object: `grip_offset` from its centre, from above, closing along world
+    x."""
+    assert scene.object is not None
+    return Pose(object_start(scene).position + scene.object.grip_offset, se3.HALF_TURN_X.quaternion)
 
 
 def surface_points(geometry: Any) -> Float32:

@@ -225,6 +225,8 @@ def examine_rig(config: RigConfig, file: str | None = None) -> list[Check]:
 
     file: name of the rig on the command line, for the commands in the advice.
     """
+    if config.clock == "mujoco":
+        return mujoco_checks(config)
     if config.clock != "wall":
         return [Check("rig", "ok", f"'{config.name}' has no hardware: nothing to check")]
     try:
@@ -236,6 +238,24 @@ def examine_rig(config: RigConfig, file: str | None = None) -> list[Check]:
     except (DeviceError, ValueError, RuntimeError) as failure:
         return [Check("rig", "fail", str(failure), "correct the rig file")]
     return checks
+
+
+def mujoco_checks(config: RigConfig) -> list[Check]:
+    """MuJoCo, and how it renders pictures for the cameras of a rig."""
+    from tacsim.sim.engines.mujoco_module import load_mujoco
+    from tacsim.sim.engines.picture import NoRendering, require_rendering
+
+    try:
+        found = [Check("MuJoCo", "ok", f"version {load_mujoco().__version__}")]
+    except ImportError as failure:
+        return [Check("MuJoCo", "fail", str(failure), "install the extra: pip install 'tacsim[mujoco]'")]
+    if config.cameras:
+        try:
+            require_rendering()
+            found.append(Check("pictures", "ok", f"of cameras {', '.join(config.cameras)}, without a window"))
+        except NoRendering as failure:
+            found.append(Check("pictures", "fail", str(failure), "install libegl1 or libosmesa6, or leave out cameras"))
+    return found
 
 
 def examine_arms(config: RigConfig, starts: Mapping[str, Pose], file: str) -> list[Check]:

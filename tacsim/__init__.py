@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     from tacsim.interface import TactileObservation as TactileObservation
     from tacsim.interface import TactileSource as TactileSource
     from tacsim.interface import Truth as Truth
+    from tacsim.interface import View as View
     from tacsim.limits import ActionError as ActionError
     from tacsim.limits import LimitExceeded as LimitExceeded
     from tacsim.models.driver import ArmDriver as ArmDriver

@@ -26,6 +26,7 @@ from tacsim.interface import (
     TactileObservation,
     TactileSource,
     Truth,
+    View,
 )
 from tacsim.limits import check_action
 
@@ -65,6 +66,7 @@ class Rig:
         on_close: closes what the rig needs besides sensors and arms, after them.
         load_control: holds normal forces, whatever the actions ask along the z axis of the sensors.
         grippers: by name.
+        views: of the cameras that look at the scene, by name; each gives what it sees now.
     """
 
     # By name; for calibration and inspection only.
@@ -94,12 +96,13 @@ class Rig:
         on_close: Callable[[], None] | None = None,
         load_control: LoadController | None = None,
         grippers: Mapping[str, Gripper] | None = None,
+        views: Mapping[str, Callable[[], View]] | None = None,
     ) -> None:
         if set(normalisers) != set(sensors):
             raise ValueError(f"rig '{name}': sensors {sorted(sensors)} but normalisers {sorted(normalisers)}")
         self.name = name
         self.sensors, self.arms, self.normalisers = dict(sensors), dict(arms), dict(normalisers)
-        self.grippers, self.sent_grippers = dict(grippers or {}), {}
+        self.grippers, self.sent_grippers, self._views = dict(grippers or {}), {}, dict(views or {})
         self._clock, self._reset, self._truth, self._diagnostics = clock, reset, truth, diagnostics
         self._read_all, self._load_control, self._packages = read_all, load_control, packages
         self._on_tactile, self._on_close = on_tactile, on_close
@@ -107,7 +110,9 @@ class Rig:
         self._closed = False
         self.frames = self.references = {}
         specs = {sensor: source.spec for sensor, source in sensors.items()}
-        self.spec = RigSpec(specs, tuple(arms), truth is not None, clock.period, tuple(self.grippers))
+        self.spec = RigSpec(
+            specs, tuple(arms), truth is not None, clock.period, tuple(self.grippers), tuple(self._views)
+        )
         # A sensor that no arm carries may be addressed by its own name: the action is recorded, nothing moves.
         self._addressable = set(arms) | {
             sensor for sensor, spec in specs.items() if spec.arm is None and spec.gripper is None
@@ -145,7 +150,8 @@ class Rig:
         self.frames, self._arm_states = frames, arms
         if self._on_tactile is not None:
             self._on_tactile(tactile)
-        return Observation(tactile=tactile, arms=arms, time=now, grippers=grippers)
+        views = {name: read() for name, read in self._views.items()}
+        return Observation(tactile=tactile, arms=arms, time=now, grippers=grippers, views=views)
 
     def step(self, action: Action) -> tuple[Observation, Mapping[str, Pose | None]]:
         """One control period: commands arms and grippers, lets the clock run, observes.

@@ -168,7 +168,7 @@ def _run(
     recorder: Recorder | None = None
     fitting: list[Policy] = []
     scene = loaded.config.scene
-    simulated = [scene] if scene is not None and loaded.config.clock == "sim" else []
+    simulated = [scene] if scene is not None and loaded.config.clock in ("sim", "mujoco") else []
 
     def fit(spec: RigSpec) -> None:
         fitting.append(load_policy(policy, task, spec, loaded.config.canonical))

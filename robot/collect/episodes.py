@@ -74,7 +74,7 @@ class EpisodeJob:
         """Checks the settings before anything is simulated. Raises SetError, ConfigError, PolicyNotFound,
         IncompatibleRig."""
         loaded = self.settings.load_episode_rig(0)
-        if loaded.config.clock != "sim":
+        if loaded.config.clock not in ("sim", "mujoco"):
             raise SetError(
                 f"rig '{loaded.config.name}' is not simulated, so its episodes cannot run in several processes at "
                 "once; record its episodes with tacsim run"

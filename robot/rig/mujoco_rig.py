@@ -32,6 +32,7 @@ from tacsim.sim.cell.description import (
     TWO_FINGER_85,
     ArmDescription,
     GripperDescription,
+    ViewDescription,
     ur5e_links,
 )
 from tacsim.sim.cell.gripper import CellGripper
@@ -39,7 +40,9 @@ from tacsim.sim.cell.motion import MOTIONS
 from tacsim.sim.cell.reset import CellReset
 from tacsim.sim.cell.scene_cell import SceneCell
 from tacsim.sim.cell.user_model import first_joints
+from tacsim.sim.cell.view import CellView
 from tacsim.sim.engines.mujoco_module import load_mujoco
+from tacsim.sim.engines.picture import require_rendering
 from tacsim.sim.scene_world import StatePool
 from tacsim.sim.sensor import SimSensor
 
@@ -78,6 +81,8 @@ def open_mujoco(config: RigConfig, check: Callable[[RigSpec], None] | None = Non
     if check is not None:
         check(simulation.rig.spec)
     try:
+        if config.cameras:
+            require_rendering()
         assert simulation.scene_world.cell is not None
     except (ValueError, RuntimeError, ImportError) as failure:
         raise CannotOpen(f"rig '{config.name}': {failure}") from failure
@@ -107,6 +112,7 @@ def simulate_cell(config: RigConfig, pool: StatePool | None = None, *, parallel:
         name: CellGripper(scene_cell, clock, name, _width_range(gripper), _force_range(gripper))
         for name, gripper in gripper_configs.items()
     }
+    views = {name: CellView(scene_cell, clock, name, view.size) for name, view in config.cameras.items()}
     task = config.task
     touch_force, placement = (None, 0.0) if task is None else (task.touch_force, task.placement)
     arm_of_gripper = {name: arm for name, arm in carriers.items() if arm_configs[arm].start is None}
@@ -127,6 +133,8 @@ def simulate_cell(config: RigConfig, pool: StatePool | None = None, *, parallel:
         on_tactile=make_gel_monitor(config, sensors),
         load_control=load_controller(config.task),
         grippers=grippers,
+        views={name: view.read for name, view in views.items()},
+        on_close=partial(_close_views, views),
     )
     return CellSimulation(rig, clock, scene_cell, sensors, arms)
 
@@ -232,7 +240,11 @@ def _make_cell(config: RigConfig, grippers: Mapping[str, GripperDescription], sc
         starts[name] = grip_pose(scene) if arm.start is None else arm.start.pose
         gripper = next(each for each in grippers.values() if each.arm == name)
         arms[name] = _describe_arm(name, arm, gripper, starts[name])
-    return Cell(scene, arms, grippers, starts=starts)
+    views = {
+        name: ViewDescription(view.position, view.target, view.field_of_view, view.size)
+        for name, view in config.cameras.items()
+    }
+    return Cell(scene, arms, grippers, views, starts)
 
 
 def _describe_arm(name: str, arm: MujocoArmConfig, gripper: GripperDescription, start: Pose) -> ArmDescription:
@@ -280,6 +292,11 @@ def _make_arm(scene_cell: SceneCell, clock: CellClock, name: str, arm: MujocoArm
         scene_cell, clock, name, speed * config.period, turn_rate * config.period, limits,
         config.keep_out_distances(name).items(), pose_error(arm.error), arm.delay, wrench_noise_source(arm.noise, name),
     )  # fmt: skip
+
+
+def _close_views(views: Mapping[str, CellView]) -> None:
+    for view in views.values():
+        view.close()
 
 
 def _truth(scene_cell: SceneCell, frames: Mapping[str, str]) -> Truth:

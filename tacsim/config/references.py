@@ -35,7 +35,7 @@ from tacsim.config.kinds import Kind, NotFound, kind_of, resolve_reference, ship
 from tacsim.models.quantity import Quantity
 from tacsim.models.text import suggest_file, suggest_word
 
-METRE_PARTS = ("arms", "keep_out", "start")  # parts of a rig whose lengths can be metres
+METRE_PARTS = ("arms", "cameras", "keep_out", "start")  # parts of a rig whose lengths can be metres
 
 
 def expand_references(

@@ -15,6 +15,7 @@ has no key.
 | twist_ARM       | (6,) float32 [m/s, rad/s]                                                         |
 | wrench_ARM      | (6,) float32 [N, N m]                                                             |
 | joints_ARM      | (n,) float32 [rad]                                                                |
+| view_CAMERA     | (H, W, 3) uint8 RGB, of a camera that looks at the scene                          |
 | grip_GRIPPER    | (2,) float32, width [m] and force [N]; (1,) where the force is not measured       |
 """
 
@@ -38,6 +39,7 @@ from tacsim.interface import (
     Observation,
     Pose,
     TactileObservation,
+    View,
 )
 from tacsim.models.rig import RigConfig
 from tacsim.tasks import make_task
@@ -67,7 +69,7 @@ def flatten_observation(observation: Observation, start: Mapping[str, Pose]) -> 
     for name, gripper in observation.grippers.items():
         numbers = [gripper.width] if gripper.force is None else [gripper.width, gripper.force]
         flat[f"grip_{name}"] = np.array(numbers, np.float32)
-    return flat
+    return flat | {f"view_{name}": view.image.copy() for name, view in observation.views.items()}
 
 
 def _flatten_touch(touch: TactileObservation) -> FlatObservation:
@@ -128,7 +130,10 @@ def space_of_rig(config: RigConfig) -> spaces.Space[FlatObservation]:
         for name, arm in config.arms.items()
     }
     grippers = dict.fromkeys(config.grippers, GripperState(0.0, 0.0, 0.0))
-    observation = Observation(touches, arms, 0.0, grippers)
+    views = {
+        name: View(np.zeros((*reversed(view.size), 3), np.uint8), time=0.0) for name, view in config.cameras.items()
+    }
+    observation = Observation(touches, arms, 0.0, grippers, views)
     return space_of(flatten_observation(observation, dict.fromkeys(config.arms, Pose())))
 
 

@@ -30,3 +30,4 @@ from tacsim.interface.values import SurfaceMap as SurfaceMap
 from tacsim.interface.values import TactileFrame as TactileFrame
 from tacsim.interface.values import TactileObservation as TactileObservation
 from tacsim.interface.values import Truth as Truth
+from tacsim.interface.values import View as View

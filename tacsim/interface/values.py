@@ -121,6 +121,16 @@ class GripperState:
     time: float  # [s]
 
 
+@dataclass(frozen=True, eq=False)
+class View(LazyFields):
+    """What a camera sees that looks at the scene, not through a gel."""
+
+    __repr__ = short_repr
+    image: LazyField[NDArray[np.uint8]] = LazyField()  # (H, W, 3) RGB
+    _: KW_ONLY
+    time: float  # exposure time [s]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Observation:
     __repr__ = short_repr
@@ -128,6 +138,7 @@ class Observation:
     arms: Mapping[str, ArmState]  # by arm name
     time: float  # [s]
     grippers: Mapping[str, GripperState] = field(default_factory=dict)  # by gripper name
+    views: Mapping[str, View] = field(default_factory=dict)  # by name of the camera; not recorded
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,6 +194,7 @@ class RigSpec:
     truth: bool
     period: float  # control period [s]
     grippers: tuple[str, ...] = ()
+    views: tuple[str, ...] = ()  # cameras that look at the scene
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,12 +207,14 @@ class Needs:
     flow: bool = False
     truth: bool = False
     grippers: frozenset[str] = frozenset()
+    views: frozenset[str] = frozenset()
 
     def missing(self, spec: RigSpec) -> list[str]:
         """What `spec` does not deliver, each as a phrase for a person; empty when all is there."""
         missing = [f"sensor '{name}'" for name in sorted(self.sensors - set(spec.sensors))]
         missing += [f"arm '{name}'" for name in sorted(self.arms - set(spec.arms))]
         missing += [f"gripper '{name}'" for name in sorted(self.grippers - set(spec.grippers))]
+        missing += [f"camera '{name}' that looks at the scene" for name in sorted(self.views - set(spec.views))]
         for name, sensor in spec.sensors.items():
             if self.height and not sensor.height:
                 missing.append(f"surface height of sensor '{name}' (it has no photometric calibration)")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self, Union, get_args
@@ -19,13 +20,15 @@ from tacsim.models.hardware import (
     Placement,
     ResetConfig,
     SensorConfig,
+    Vector,
 )
-from tacsim.models.quantity import Config, Force, Length, Speed, Stiffness, Time
+from tacsim.models.quantity import Angle, Config, Force, Length, Speed, Stiffness, Time
 from tacsim.models.scene import Scene
 from tacsim.models.sensor import CanonicalGrid, PictureRegion, SensorModel
 from tacsim.models.task import TASKS, TaskConfig, task_annotation
 
 Delay = Annotated[int, Field(ge=0, le=20)]
+Pixels = Annotated[int, Field(ge=16, le=4096)]
 
 
 class WrenchNoise(Config):
@@ -143,6 +146,21 @@ class ReplaySensorConfig(SensorConfig):
 SimMotion = Literal["settled", "flowing", "dynamic"]
 
 
+class ViewConfig(Config):
+    """A camera that looks at the scene of a rig in MuJoCo."""
+
+    position: Vector  # world [m]
+    target: Vector = (0.0, 0.0, 0.0)  # in the middle of its picture, world [m]
+    field_of_view: Annotated[Angle, Field(gt=0.01, lt=2.8)] = math.pi / 4  # from the top to the bottom [rad]
+    size: tuple[Pixels, Pixels] = (320, 240)  # width, height [px]
+
+    @model_validator(mode="after")
+    def _require_direction(self) -> Self:
+        if math.dist(self.position, self.target) < 1e-6:
+            raise ValueError("position and target are the same point; it must look somewhere")
+        return self
+
+
 class RecordConfig(Config):
     """What a recording holds beyond pictures, states and actions."""
 
@@ -166,6 +184,8 @@ class RigConfig(Config):
     arms: dict[Name, ArmConfig] = {}
     grippers: dict[Name, GripperConfig] = {}
     sensors: dict[Name, SensorConfig] = Field(min_length=1)
+    # Cameras that look at the scene of a rig in MuJoCo: `Observation.views`, rendered when they are looked at
+    cameras: dict[Name, ViewConfig] = Field(default={}, max_length=8)
     canonical: CanonicalGrid = CanonicalGrid()
     motion: SimMotion = "settled"  # of simulated rigs, during a control period; a reset always settles
     # Mock rigs: a control period ends when the arms rest and the picture of just that pose is rendered.
@@ -183,6 +203,12 @@ class RigConfig(Config):
 
     @model_validator(mode="after")
     def _require_consistent(self) -> Self:
+        if self.cameras and self.clock != "mujoco":
+            raise PydanticCustomError(
+                "no_views",
+                "only a rig with clock 'mujoco' has cameras that look at its scene; cameras of gels are sensors",
+                {"at": ("cameras",)},
+            )
         for name, sensor in self.sensors.items():
             if sensor.arm is not None:
                 self._require_arm(sensor.arm, "sensors", name, sensor.driver, "arm")

@@ -33,6 +33,8 @@ class RigidObject(Oriented):
     position: tuple[Coordinate, Coordinate] = (0.0, 0.0)  # of its centre at the start, world x, y [m]
     # It stands so high above the table (z = 0), on a pedestal narrower than itself; 0: on the table [m]
     pedestal: Annotated[Length, Field(ge=0, le=2)] = 0.0
+    # Where a gripper begins around it: the middle between its pads, from the object's centre, along world axes [m]
+    grip: tuple[Coordinate, Coordinate, Coordinate] = (0.0, 0.0, 0.0)
     lift: Annotated[Length, Field(ge=0, le=1)] = 0.0  # a reset lifts it so far, once it is gripped [m]
     guide: Guide | None = None  # None: it moves freely
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -170,6 +171,14 @@ class Cell:
             self.model.geom_contype[self._pedestal] = self.model.geom_conaffinity[self._pedestal] = int(not away)
             self.model.geom_rgba[self._pedestal, 3] = float(not away)
 
+    @contextmanager
+    def show_pedestal(self, *, present: bool) -> Iterator[None]:
+        """While a picture is rendered: with the pedestal, or without it."""
+        before = self.has_pedestal
+        self.take_pedestal_away(away=not present)
+        yield
+        self.take_pedestal_away(away=not before)
+
     # ---------------------------------------------------------------- results
 
     @property
@@ -282,10 +291,10 @@ class Cell:
 
 
 def grip_pose(scene: Scene) -> Pose:
-    """world_from_tool where a gripper grips the object: `grip_offset` from its centre, from above, closing along world
+    """world_from_tool where a gripper grips the object: at its centre or next to it, from above, closing along world
     x."""
     assert scene.object is not None
-    return Pose(object_start(scene).position + scene.object.grip_offset, se3.HALF_TURN_X.quaternion)
+    return Pose(object_start(scene).position + scene.object.grip, se3.HALF_TURN_X.quaternion)
 
 
 def surface_points(geometry: Any) -> Float32:

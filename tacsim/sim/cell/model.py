@@ -65,6 +65,8 @@ def make_spec(
                 _add_gripper(spec, flange or find_flange(spec, name, arm), label, gripper, scene.gel.size)
     for name, view in views.items():
         _add_camera(spec, name, view)
+        screen = spec.visual.global_  # large enough for all of them
+        screen.offwidth, screen.offheight = max(screen.offwidth, view.size[0]), max(screen.offheight, view.size[1])
     return spec
 
 
@@ -81,6 +83,10 @@ def _add_table_and_lights(spec: Any) -> None:
     spec.worldbody.add_geom(
         name=TABLE, type=mujoco.mjtGeom.mjGEOM_PLANE, size=[1.0, 1.0, 0.05], rgba=[0.55, 0.5, 0.45, 1],
         friction=[0.0, 0.0, 0.0], **_stiff_contact(spec),
+    )  # fmt: skip
+    spec.add_texture(
+        name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+        rgb1=[0.85, 0.88, 0.92], rgb2=[0.55, 0.62, 0.7], width=64, height=64,
     )  # fmt: skip
     kind = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
     for position, strength in (((0.6, -0.8, 1.5), 0.6), ((-0.8, 0.4, 1.2), 0.35)):
@@ -195,7 +201,7 @@ def _add_gripper(
         name=f"{name}/palm", gravcomp=1.0, mass=gripper.body_mass, ipos=[0, 0, palm / 2], explicitinertial=True,
         inertia=[gripper.body_mass * 0.04**2] * 3,
     )  # fmt: skip
-    _add_visual(body, box, [0.045, 0.03, palm / 2], [0, 0, palm / 2], DARK)
+    _add_visual(body, box, [gripper.stroke / 2 + 0.01, 0.025, palm / 2], [0, 0, palm / 2], DARK)
     body.add_site(name=f"{name}/tool", pos=[0, 0, gripper.length], size=[1e-3] * 3, rgba=[0, 0, 0, 0])
     for side, sign in SIDES.items():
         finger = body.add_body(

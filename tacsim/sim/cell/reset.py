@@ -10,6 +10,7 @@ from tacsim import pose as se3
 from tacsim.control import NoTouch
 from tacsim.geometry.shapes import rotated_bounding_size
 from tacsim.interface import Pose, TactileFrame
+from tacsim.limits import LimitExceeded
 from tacsim.sim.cell import tuning
 from tacsim.sim.cell.cell import Cell
 from tacsim.sim.cell.clock import CellClock
@@ -52,13 +53,16 @@ class CellReset:
         return {name: sensor.read(0.0) for name, sensor in self._sensors.items()}
 
     def touch(self) -> None:
-        """Raises NoTouch where no grip is found that holds the object."""
+        """Raises NoTouch where no grip is found that holds the object, ObjectDropped for one that slips."""
         if self._touch_force is None or not self._arm_of_gripper:
             return
         start = self._scene_cell.scene.model_dump_json(), *self._offset.tolist(), self._touch_force
         touched = self._pool.find(start)
         if touched is None:
-            grip(self._scene_cell.cell, self._arm_of_gripper, self._touch_force)
+            try:
+                grip(self._scene_cell.cell, self._arm_of_gripper, self._touch_force)
+            except LimitExceeded as failure:  # the object reaches the housing of a gel
+                raise NoTouch(f"no grip with touch_force {self._touch_force:g} N: {failure}") from failure
             self._pool.store(start, self._scene_cell.cell.snapshot(), None)
         else:
             self._scene_cell.cell.restore(touched[0])

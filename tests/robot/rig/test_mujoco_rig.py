@@ -9,10 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from robot.deploy.control_loop import run_episode
+from robot.deploy.control_loop import EpisodeFailed, run_episode
+from robot.deploy.python_policy import FunctionPolicy
+from robot.doctor import examine_rig
 from robot.open import CannotOpen, make_env, make_vector_env, open_rig, rig_spec
 from tacsim.config import ConfigError, load_rig
-from tacsim.interface import Action, GripperTarget, Pose
+from tacsim.control import NoTouch, ObjectDropped
+from tacsim.interface import Action, GripperTarget, Observation, Pose
 from tacsim.limits import ActionError
 from tacsim.rig import Rig
 from tacsim.tasks.squeeze import Grip
@@ -127,6 +130,44 @@ def test_an_environment_lifts_and_ends_when_its_object_is_dropped() -> None:
     assert reward < before * 10  # it stands for all steps that are left
     env.reset(seed=1)
     assert "dropped" not in env.step(np.zeros(2, np.float32))[4]
+
+
+def test_an_episode_ends_and_says_so_when_its_object_is_dropped() -> None:
+    def release(observation: Observation) -> Action:
+        return Action({}, {"hand": GripperTarget(0.05, 1.0)})
+
+    with open_rig("hand", task=LiftConfig(), overrides=SMALL) as rig:
+        with pytest.raises(EpisodeFailed, match="of 20 steps: ObjectDropped: object 'object' was dropped") as caught:
+            run_episode(rig, FunctionPolicy(release), None, 20)
+        assert 1 <= len(caught.value.episode.steps) <= 10
+        assert isinstance(caught.value.__cause__, ObjectDropped)
+
+
+def test_an_object_wider_than_the_gel_finds_no_grip() -> None:
+    wide = "scene.object.geometry.size=[20 mm, 30 mm, 30 mm]"
+    with (
+        open_rig("hand", task=LiftConfig(touch_force=40.0), overrides=(*SMALL, wide)) as rig,
+        pytest.raises(NoTouch, match=r"no grip with touch_force 40 N: the object of pad .* is wider than the gel"),
+    ):
+        rig.reset()
+
+
+def test_a_gripper_begins_where_the_object_says() -> None:
+    with open_rig("hand", overrides=(*SMALL, "scene.object.grip=[0, 3 mm, 5 mm]")) as rig:
+        assert rig.reset().arms["hand"].pose.position == pytest.approx([0, 3e-3, 0.043])
+
+
+def test_a_start_of_its_own_leaves_the_hand_open_there() -> None:
+    start = "arms.hand.start={position: [0, 0, 0.12], rotation: [180 deg, 0, 0]}"
+    with open_rig("hand", task=LiftConfig(), overrides=(*SMALL, start)) as rig:
+        observation = rig.reset()
+        assert observation.arms["hand"].pose.position == pytest.approx([0, 0, 0.12])
+        assert observation.grippers["hand"].width == pytest.approx(0.06)
+
+
+def test_the_doctor_looks_for_mujoco() -> None:
+    checks = examine_rig(load_rig("hand").config)
+    assert [(check.name, check.state) for check in checks] == [("MuJoCo", "ok")]
 
 
 def test_an_environment_takes_variants_of_its_object() -> None:

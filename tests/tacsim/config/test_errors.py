@@ -176,7 +176,7 @@ def test_an_arm_that_is_not_there_is_reported_at_the_sensor(folder: Path) -> Non
 
 OVERRIDES = {
     "scene.presett=draft": f"scene.presett: unknown key; allowed: {SCENE_KEYS}; did you mean 'preset'?",
-    "scne.preset=draft": "scne: unknown key; allowed: name, clock, period, task, scene, arms, grippers, sensors, canonical, motion, lock_step, contact, keep_out, start, record; did you mean 'scene'?",
+    "scne.preset=draft": "scne: unknown key; allowed: name, clock, period, task, scene, arms, grippers, sensors, cameras, canonical, motion, lock_step, contact, keep_out, start, record; did you mean 'scene'?",
     "scene.body.material=doh": "scene.body.material: no material 'doh'; allowed: cold-plasticine, dough, modelling-clay, seed, silicone, "
     "soft-clay; did you mean 'dough'?",
     "scene=missing.yaml": f"scene: there is no file 'missing.yaml'{NEW_SCENE}",
@@ -203,7 +203,7 @@ def test_text_of_a_wrong_override(override: str, message: str, empty_folder: Pat
 def test_a_file_that_is_not_there_lists_the_names() -> None:
     assert (
         complaint(load_rig, "simm")
-        == "simm: no rig 'simm'; allowed: hand, mock, press, replay, sim, stand, ur5e, ur5e-one; did you mean 'sim'?"
+        == "simm: no rig 'simm'; allowed: hand, mock, press, replay, sim, stand, ur5e, ur5e-mujoco, ur5e-one; did you mean 'sim'?"
     )
     assert complaint(load_rig, "my/rig.yaml") == (
         "my/rig.yaml: there is no file 'my/rig.yaml'; there is no folder 'my' either; `tacsim new rig NAME` writes one, "

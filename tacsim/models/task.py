@@ -102,7 +102,7 @@ class RigidTaskConfig(TaskConfig):
     arm: Name = "hand"  # that carries the gripper
     gripper: Name = "hand"
     # The grip force of an action, at -1 and at 1 [N]
-    force_range: tuple[Annotated[Force, Field(ge=0)], Annotated[Force, Field(gt=0)]] = (0.2, 12.0)
+    force_range: tuple[Annotated[Force, Field(ge=0)], Annotated[Force, Field(gt=0)]] = (0.2, 8.0)
     max_slip: Annotated[Length, Field(gt=0)] = 3e-3  # of the object in the grip; beyond it nothing is reached [m]
     touch_force: Annotated[Force, Field(gt=0)] = 6.0
 
@@ -127,20 +127,8 @@ class HoldConfig(RigidTaskConfig):
     steps: Annotated[int, Field(ge=1, le=1_000_000)] = 60
 
 
-class DrawerConfig(RigidTaskConfig):
-    """Pull a drawer of unknown resistance by its handle: distance = |travel - goal|; actions move the hand along the
-    drawer's axis, and are the grip force."""
-
-    kind: Literal["drawer"]
-    goal: Annotated[Length, Field(gt=0)] = 20e-3  # travel [m]
-    max_step: Annotated[Length, Field(gt=0)] = 1e-3
-    success: Annotated[Length, Field(gt=0)] = 1e-3
-    reward_scale: Annotated[Length, Field(gt=0)] = 10e-3
-    steps: Annotated[int, Field(ge=1, le=1_000_000)] = 60
-
-
 class TurnConfig(RigidTaskConfig):
-    """Let an object that is gripped beside its centre turn in the grip by an angle: distance = |angle - goal|; actions
+    """Let an object that is gripped off its centre turn in the grip by an angle: distance = |angle - goal|; actions
     are the grip force, gravity turns."""
 
     unit: ClassVar[Unit] = ANGLE
@@ -152,27 +140,8 @@ class TurnConfig(RigidTaskConfig):
     steps: Annotated[int, Field(ge=1, le=1_000_000)] = 80
 
 
-class PegConfig(RigidTaskConfig):
-    """Put the gripped object into a hole: distance = that of its centre from where it ends in the hole; actions move
-    the hand along x, y and z, and are the grip force."""
-
-    kind: Literal["peg"]
-    goal: tuple[Length, Length, Length] = (0.0, 0.0, 10e-3)  # of the object's centre, world [m]
-    max_step: Annotated[Length, Field(gt=0)] = 1e-3
-    success: Annotated[Length, Field(gt=0)] = 1e-3
-    reward_scale: Annotated[Length, Field(gt=0)] = 10e-3
-    steps: Annotated[int, Field(ge=1, le=1_000_000)] = 80
-
-
-TASKS: list[type[TaskConfig]] = [
-    SqueezeConfig,
-    RepositionConfig,
-    KneadConfig,
-    HoldConfig,
-    TurnConfig,
-    PegConfig,
-    DrawerConfig,
-]  # shipped ones, and those made known
+# Shipped ones, and those made known
+TASKS: list[type[TaskConfig]] = [SqueezeConfig, RepositionConfig, KneadConfig, HoldConfig, TurnConfig]
 
 
 def task_annotation() -> Any:

@@ -8,7 +8,7 @@ import numpy as np
 
 from tacsim.interface import Action, FloatArray, GripperTarget, Needs, Observation, Policy, Truth
 from tacsim.models.task import HoldConfig
-from tacsim.tasks.rigid import RigidTask, grip_component, grip_force, least_grip_force
+from tacsim.tasks.rigid import RigidTask, grip_component, grip_force, min_grip_force
 from tacsim.tasks.task import GoalOutOfReach, GripAxis
 from tacsim.tasks.tuning import FORCE_DECREASE, MIN_FLOW, SLIP_FLOW_CHANGE
 
@@ -28,7 +28,7 @@ class Hold(RigidTask):
         return self.config.margin
 
     def require_reachable(self, start: Truth) -> None:
-        force, (low, high) = self.config.margin * least_grip_force(self.config), self.config.force_range
+        force, (low, high) = self.config.margin * min_grip_force(self.config), self.config.force_range
         if not low <= force <= high:
             raise GoalOutOfReach(
                 f"task.margin: this object needs a grip of {force:.3g} N, and the task's force_range is {low:g} to "
@@ -36,11 +36,11 @@ class Hold(RigidTask):
             )
 
     def remaining(self, truth: Truth, start: Truth) -> float:
-        return abs(grip_force(truth) / least_grip_force(self.config) - self.config.margin)
+        return abs(grip_force(truth) / min_grip_force(self.config) - self.config.margin)
 
     def expert(self, truth: Truth, start: Truth) -> FloatArray:
         """The force that is wanted, at once."""
-        return np.array([grip_component(self.config, self.config.margin * least_grip_force(self.config))])
+        return np.array([grip_component(self.config, self.config.margin * min_grip_force(self.config))])
 
     def scripted(self, *, through: bool = False) -> Policy:
         return ScriptedHold(self.config, through)

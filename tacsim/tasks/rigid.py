@@ -85,7 +85,7 @@ def turn_in_grip(truth: Truth, start: Truth) -> float:
     return float(turned.as_rotvec()[2])
 
 
-def least_grip_force(config: RigidTaskConfig) -> float:
+def min_grip_force(config: RigidTaskConfig) -> float:
     """Force of each of two fingers that just holds the scene's object against gravity, by Coulomb [N]: m g / (2 mu)."""
     item, gravity = config.scene.object, np.linalg.norm(config.scene.gravity)
     assert item is not None

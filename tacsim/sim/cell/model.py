@@ -210,7 +210,7 @@ def _add_gripper(
         )  # fmt: skip
         finger.add_joint(
             name=f"{name}/{side}", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[sign, 0, 0], limited=True,
-            range=[0.0, gripper.stroke / 2 + STOP_GAP],
+            range=[0.0, gripper.stroke / 2 + STOP_GAP], damping=gripper.finger_mass * tuning.FINGER_DAMPING_RATE,
         )  # fmt: skip
         finger.add_site(
             name=f"{name}/{side}_pad", quat=_quaternion(se3.from_matrix(_square(PAD_AXES[side])).quaternion),

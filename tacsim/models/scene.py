@@ -12,11 +12,10 @@ from tacsim.interface import Float32, short_repr
 from tacsim.models import tuning
 from tacsim.models.material import BodyMaterial, GelMaterial, elastic_constants, shear_impedance
 from tacsim.models.quantity import Acceleration, Config, Length, Time
-from tacsim.models.rigid import Fixture, RigidObject
 from tacsim.models.shape import Box as Box
 from tacsim.models.shape import Cylinder as Cylinder
+from tacsim.models.shape import Fixture, Oriented, RigidObject, min_side
 from tacsim.models.shape import Mesh as Mesh
-from tacsim.models.shape import Oriented, min_side
 from tacsim.models.shape import Shape as Shape
 from tacsim.models.shape import Sphere as Sphere
 

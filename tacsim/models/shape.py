@@ -1,4 +1,5 @@
-"""Shapes of bodies, indenters and rigid objects, and how they are turned."""
+"""Shapes of bodies, indenters and rigid objects, and how they are turned; rigid objects that move by themselves, and
+what stands around them: MuJoCo moves and holds them."""
 
 from __future__ import annotations
 
@@ -9,7 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from tacsim.interface import FloatArray
-from tacsim.models.quantity import Angle, Config, Length
+from tacsim.models.quantity import Angle, Config, Force, Length
 
 Edge = Annotated[Length, Field(ge=1e-5, le=10.0)]  # of a body, an indenter or an object [m]
 
@@ -67,3 +68,41 @@ class Oriented(Config):
             sx * cy * cz - cx * sy * sz, cx * sy * cz + sx * cy * sz,
             cx * cy * sz - sx * sy * cz, cx * cy * cz + sx * sy * sz,
         ])  # fmt: skip
+
+
+Coefficient = Annotated[float, Field(ge=0, le=5)]
+Coordinate = Annotated[Length, Field(ge=-10, le=10)]  # world [m]
+
+
+class Guide(Config):
+    """An object that slides along one line only, as a drawer does."""
+
+    axis: Literal["x", "y", "z"] = "x"  # of world
+    travel: Annotated[Length, Field(gt=0, le=10)] = 0.1  # from where it begins, one way [m]
+    friction: Annotated[Force, Field(ge=0)] = 0.0  # that resists it, however it is loaded [N]
+    damping: Annotated[float, Field(ge=0)] = 1.0  # [N s/m]
+
+
+class RigidObject(Oriented):
+    """A rigid object between the fingers of a gripper. It begins at rest: on the table, or on a pedestal, which is
+    taken away once it is gripped."""
+
+    geometry: Shape = Box(size=(20e-3, 14e-3, 16e-3))
+    mass: Annotated[float, Field(ge=1e-4, le=100)] = 0.1  # evenly spread [kg]
+    friction: Coefficient = 0.6  # Coulomb coefficient between object and gels
+    table_friction: Coefficient = 0.4  # between object and table, pedestal or fixture: the larger of both counts
+    position: tuple[Coordinate, Coordinate] = (0.0, 0.0)  # of its centre at the start, world x, y [m]
+    # It stands so high above the table (z = 0), on a pedestal narrower than itself; 0: on the table [m]
+    pedestal: Annotated[Length, Field(ge=0, le=2)] = 0.0
+    # Where a gripper begins around it: the middle between its pads, from the object's centre, along world axes [m]
+    grip: tuple[Coordinate, Coordinate, Coordinate] = (0.0, 0.0, 0.0)
+    lift: Annotated[Length, Field(ge=0, le=1)] = 0.0  # a reset lifts it so far, once it is gripped [m]
+    guide: Guide | None = None  # None: it moves freely
+
+
+class Fixture(Oriented):
+    """What stands in the scene and never moves."""
+
+    geometry: Shape = Box()
+    position: tuple[Coordinate, Coordinate, Coordinate] = (0.0, 0.0, 0.0)  # of its centre, world [m]
+    friction: Coefficient = 0.4

@@ -277,6 +277,7 @@ class Cell:
             raise ValueError("snapshot: 'cell' is missing; is it of another world?")
         self._untouched = int(state["cell"][0])
         self.take_pedestal_away(away=not state["cell"][1])
+        load_mujoco().mj_resetData(self.model, self.data)  # warnings, too, that a divergence has left
         self.touch.restore(state)
         for name, drive in self._drives():
             own = {key.removeprefix(f"{name}:"): value for key, value in state.items() if key.startswith(f"{name}:")}

@@ -25,6 +25,7 @@ class Link:
     mass: float  # [kg]
     centre: tuple[float, float, float]  # of mass [m]
     max_torque: float  # [N m]
+    max_speed: float  # [rad/s]
     capsules: tuple[tuple[tuple[float, float, float], tuple[float, float, float], float], ...]
 
 
@@ -84,6 +85,7 @@ _UR5E_CENTRES = (
     (0.0, -0.02561, 0.00193), (0.2125, 0.0, 0.11336), (0.15, 0.0, 0.0265),
     (0.0, -0.0018, 0.01634), (0.0, 0.0018, 0.01634), (0.0, 0.0, -0.001159),
 )  # of mass, in the frame at the end of each link [m]  # fmt: skip
+_UR5E_SPEED = math.pi  # of each joint (user manual) [rad/s]
 _UR5E_TORQUES = (150.0, 150.0, 150.0, 28.0, 28.0, 28.0)  # [N m]
 
 
@@ -112,7 +114,7 @@ def ur5e_links(a2: float, a3: float, d1: float, d4: float, d5: float, d6: float)
     ):
         turn = np.array([[1, 0, 0], [0, math.cos(alpha), -math.sin(alpha)], [0, math.sin(alpha), math.cos(alpha)]])
         x, y, z = (turn @ np.array(centre) + [a, 0.0, d]).tolist()
-        links.append(Link(a, d, alpha, mass, (x, y, z), torque, shape))
+        links.append(Link(a, d, alpha, mass, (x, y, z), torque, _UR5E_SPEED, shape))
     return tuple(links)
 
 

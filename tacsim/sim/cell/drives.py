@@ -98,6 +98,8 @@ class JointDrive:
         self._ranges = np.array([joint.range if joint.limited[0] else (-2 * np.pi, 2 * np.pi) for joint in found])
         torques = [link.max_torque for link in description.links]
         self._max_torque = np.array(torques) if torques else np.full(len(found), np.inf)
+        speeds = [link.max_speed for link in description.links]
+        self._max_speed = np.array(speeds) if speeds else np.full(len(found), np.inf)
         self._scratch = mujoco.MjData(model)
         self._reference = self._start = np.zeros(len(found))
         self._speed = np.zeros(len(found))
@@ -138,8 +140,16 @@ class JointDrive:
         return joints
 
     def begin(self, target: Pose | None, seconds: float) -> None:
-        """As of a free flange. Raises LimitExceeded for a pose that no joints give."""
+        """As of a free flange. Raises LimitExceeded for a pose that no joints give, or not as fast."""
         goal = self._reference if target is None else self.find_joints(target, self._reference)
+        speed = np.abs(goal - self._reference) / seconds
+        if (speed > self._max_speed).any():
+            joint = int(np.argmax(speed / self._max_speed))
+            raise LimitExceeded(
+                f"joint {joint + 1} would turn with {speed[joint]:.3g} rad/s, its greatest speed is "
+                f"{self._max_speed[joint]:.3g} rad/s: go slower, or pass farther from where the arm is stretched or "
+                "folded"
+            )
         self._ramp = Ramp.plan(goal - self._reference, self._speed, seconds)
         self._start = self._reference
 

@@ -13,6 +13,7 @@ from tacsim import pose as se3
 from tacsim.control import NoTouch, ObjectDropped
 from tacsim.interface import Pose
 from tacsim.limits import LimitExceeded
+from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.sim.cell.cell import Cell
 from tacsim.sim.cell.reset import grip, open_around
 from tests.tacsim.sim.cell.cells import above, hand, let_pass, scene, ur5e
@@ -192,6 +193,22 @@ def test_a_guided_object_slides_along_its_axis_and_resists() -> None:
     assert force[1] == pytest.approx(-1.0, abs=0.02)
 
 
+def test_a_cell_that_has_diverged_begins_again() -> None:
+    cell = hand()
+    state = cell.snapshot()
+    cell.data.qvel[0] = np.nan
+    with pytest.raises(SimulationDiverged, match="velocity not finite"):
+        let_pass(cell, 0.05)
+    cell.restore(state)
+    let_pass(cell, 0.05)
+    assert cell.object_pose().position == pytest.approx([0, 0, 0.038], abs=50e-6)
+
+
+def test_a_state_of_something_else_is_refused() -> None:
+    with pytest.raises(ValueError, match="'cell' is missing; is it of another world"):
+        hand().restore({})
+
+
 # ------------------------------------------------------------------- arms
 
 
@@ -203,6 +220,14 @@ def test_the_arm_has_the_kinematics_of_the_controller() -> None:
     flange = cell.data.body("robot/flange")
     assert flange.xpos - [-0.45, 0.0, 0.0] == pytest.approx(frame[:3, 3], abs=1e-12)
     assert flange.xmat.reshape(3, 3) == pytest.approx(frame[:3, :3], abs=1e-12)
+
+
+def test_joints_that_would_turn_too_fast_are_refused() -> None:
+    cell = ur5e()
+    here = cell.pose("robot")
+    turned = Pose(here.position, se3.compose(here, se3.from_rotation_vector(np.zeros(3), [0, 0, 0.4])).quaternion)
+    with pytest.raises(LimitExceeded, match=r"joint 6 would turn with 8 rad/s, its greatest speed is 3.14 rad/s"):
+        let_pass(cell, 0.05, {"robot": turned})
 
 
 @pytest.mark.slow

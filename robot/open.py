@@ -204,10 +204,9 @@ def make_vector_env(
     Raises the errors of `make_env`, and CannotOpen for a rig that is not simulated, or with physics 'seed'.
     """
     episodes = _rigs_of_episodes(task, rig, overrides, _draw_variants(variants, randomise), learning)
-    if episodes[0][0].clock != "sim":
-        why = "is not simulated" if episodes[0][0].clock != "mujoco" else "is simulated in MuJoCo, scene by scene"
+    if episodes[0][0].clock not in ("sim", "mujoco"):
         raise CannotOpen(
-            f"rig '{episodes[0][0].name}' {why}: only rigs with clock 'sim' run many at once; use robot.make_env"
+            f"rig '{episodes[0][0].name}' is not simulated: only simulations run many at once; use robot.make_env"
         )
     from robot.rig.sim_env import open_vector_env
 

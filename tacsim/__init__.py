@@ -101,6 +101,10 @@ if TYPE_CHECKING:
     from tacsim.optics.render import Renderer as Renderer
     from tacsim.optics.surface import surface_map as surface_map
     from tacsim.physics.failure.health import SimulationDiverged as SimulationDiverged
+    from tacsim.physics.grip.model import HeldObject as HeldObject
+    from tacsim.physics.grip.model import HeldStates as HeldStates
+    from tacsim.physics.grip.model import Support as Support
+    from tacsim.physics.grip.model import facing_pads as facing_pads
     from tacsim.physics.motion.load import LoadNotReached as LoadNotReached
     from tacsim.physics.move import MoveStats as MoveStats
     from tacsim.physics.world import World as World
@@ -119,6 +123,7 @@ if TYPE_CHECKING:
     from tacsim.sim.engines.touch import ObjectDropped as ObjectDropped
     from tacsim.sim.engines.touch import TouchSensor as TouchSensor
     from tacsim.sim.engines.touch import step_together as step_together
+    from tacsim.sim.held import HeldObjects as HeldObjects
     from tacsim.sim.pads import TactilePads as TactilePads
     from tacsim.tasks import Axis as Axis
     from tacsim.tasks import Estimator as Estimator

@@ -14,7 +14,7 @@ from robot.rig.sim_rig import Simulation, simulate
 from tacsim.gym import encode
 from tacsim.gym.env import TacsimEnv, Variant, require_compatible_task
 from tacsim.gym.features import FeatureEncoder
-from tacsim.gym.vector import Member, SharedBatch, TacsimVectorEnv
+from tacsim.gym.vector import CellBatch, Member, SharedBatch, TacsimVectorEnv
 from tacsim.models.hardware import ArmConfig, Placement, SensorConfig, parts_of
 from tacsim.models.mujoco import MujocoSensorConfig
 from tacsim.models.policy import Features
@@ -53,8 +53,13 @@ def open_vector_env(
             f"rig '{config.name}': physics 'seed' does not run in a batch; use physics 'hybrid', or "
             "gymnasium.make_vec(..., vectorization_mode='sync')"
         )
-    batch, pool = SharedBatch([config.scene] * int(number)), StatePool()
-    members = []
+    pool, members = StatePool(), list[Member]()
+    if config.clock == "mujoco":
+        for _ in range(int(number)):
+            cell = simulate_cell(config, pool, parallel=False)
+            members.append(Member(_make_env(cell, config, variants, render_mode, features), cell.clock))
+        return TacsimVectorEnv(members, CellBatch(), autoreset_mode)
+    batch = SharedBatch([config.scene] * int(number))
     for index in range(int(number)):
         simulation = simulate(config, partial(batch.world, index), pool, parallel=False)
         members.append(Member(_make_env(simulation, config, variants, render_mode, features), simulation.clock))

@@ -117,7 +117,7 @@ def evaluate(
     if drawn is not None:
         drawn = drawn.model_copy(update={"draws": episodes, "seed": HELD_OUT_SEED_OFFSET + seed})
     number = min(training.environments, episodes)
-    features = Features(maps=(), touch=("moved",), arms=tuple(config.arms)[:1], goal=False)  # not used by the policies
+    features = Features(sensors=(), maps=(), touch=("moved",), arms=tuple(config.arms)[:1], goal=False)  # not used
     envs = make_vector_env(
         number, training.task, training.rig, training.overrides, randomise=drawn, features=features, learning=False
     )

@@ -6,20 +6,28 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.vector.utils import iterate
 
-from tacsim.gym.env import TacsimEnv, copy_reset_options
+from tacsim.gym.env import STEP_ERRORS, TacsimEnv, copy_reset_options
 from tacsim.models.scene import Scene
-from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.physics.move import MoveCommand
 from tacsim.physics.world import World
 from tacsim.physics.worlds.batch import Batch
-from tacsim.sim.clock import SimClock
+from tacsim.sim.cell.motion import CellPeriod
+
+
+class MemberBatch(Protocol):
+    """The worlds of all members."""
+
+    def move(self, commands: Sequence[Any]) -> list[Any]:
+        """Carries out what the clocks' `begin` returned, None: nothing. Returns what their `finish` takes, or the error
+        that ends the member's episode."""
+        ...
 
 
 class SharedBatch:
@@ -48,12 +56,34 @@ class SharedBatch:
         return list(self._batch.move(targets, duration=requested[0].duration, flow=requested[0].flow))
 
 
+class CellBatch:
+    """Cells of MuJoCo, one after the other."""
+
+    def move(self, commands: Sequence[CellPeriod | None]) -> list[Any]:
+        """See MemberBatch."""
+        ends: list[Any] = [None] * len(commands)
+        for number, command in enumerate(commands):
+            try:
+                if command is not None:
+                    command.advance()
+            except STEP_ERRORS as failure:
+                ends[number] = failure
+        return ends
+
+
+class MemberClock(Protocol):
+    """The clock of a rig whose world moves together with others."""
+
+    def begin(self) -> Any: ...
+    def finish(self, outcome: Any) -> None: ...
+
+
 @dataclass(frozen=True, slots=True)
 class Member:
     """One environment, and the clock of its rig."""
 
     env: TacsimEnv
-    clock: SimClock
+    clock: MemberClock
 
 
 class TacsimVectorEnv(SyncVectorEnv):
@@ -71,7 +101,7 @@ class TacsimVectorEnv(SyncVectorEnv):
     def __init__(
         self,
         members: Sequence[Member],
-        batch: SharedBatch,
+        batch: MemberBatch,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
     ) -> None:
         self._members, self._batch = tuple(members), batch
@@ -140,14 +170,14 @@ class TacsimVectorEnv(SyncVectorEnv):
 
     def _advance(self) -> None:
         """The step of all environments but those that are to be reset; their `step` then returns its result."""
-        commands: list[MoveCommand | None] = [None] * self.num_envs
+        commands: list[Any] = [None] * self.num_envs
         with self._cancel_on_failure():
             for index, member in self._stepping.items():
                 if member.env.commanded:
                     commands[index] = member.clock.begin()
             ends = self._batch.move(commands)
         for index, member in self._stepping.items():
-            if isinstance(ends[index], SimulationDiverged):
+            if isinstance(ends[index], STEP_ERRORS):
                 member.env.fail(ends[index])
             elif member.env.commanded:
                 member.clock.finish(ends[index])

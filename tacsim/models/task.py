@@ -9,7 +9,7 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self, Union, g
 from pydantic import Field, model_validator
 
 from tacsim.models.hardware import Name
-from tacsim.models.quantity import Config, Force, Length, Stiffness
+from tacsim.models.quantity import Angle, Config, Force, Length, Stiffness
 from tacsim.models.scene import Scene
 
 
@@ -96,7 +96,52 @@ class KneadConfig(TaskConfig):
     steps: Annotated[int, Field(ge=1, le=1_000_000)] = 200
 
 
-TASKS: list[type[TaskConfig]] = [SqueezeConfig, RepositionConfig, KneadConfig]  # shipped ones, and those made known
+class RigidTaskConfig(TaskConfig):
+    """A task for a gripper with a rigid object between its fingers. `touch_force` is the grip at the start."""
+
+    arm: Name = "hand"  # that carries the gripper
+    gripper: Name = "hand"
+    # The grip force of an action, at -1 and at 1 [N]
+    force_range: tuple[Annotated[Force, Field(ge=0)], Annotated[Force, Field(gt=0)]] = (0.2, 8.0)
+    max_slip: Annotated[Length, Field(gt=0)] = 3e-3  # of the object in the grip; beyond it nothing is reached [m]
+    touch_force: Annotated[Force, Field(gt=0)] = 6.0
+
+    @model_validator(mode="after")
+    def _require_force_range(self) -> Self:
+        low, high = self.force_range
+        if not low < high:
+            raise ValueError(f"force_range runs from {low:g} to {high:g} N: the first must be below the second")
+        return self
+
+
+class HoldConfig(RigidTaskConfig):
+    """Hold an object of unknown mass and friction with the least force: distance = |force / least force - margin|;
+    actions are the grip force."""
+
+    unit: ClassVar[Unit] = SHARE
+
+    kind: Literal["hold"]
+    margin: Annotated[float, Field(gt=1)] = 1.25  # desired grip force over the least that holds
+    success: Annotated[float, Field(gt=0)] = 0.2
+    reward_scale: Annotated[float, Field(gt=0)] = 1.0
+    steps: Annotated[int, Field(ge=1, le=1_000_000)] = 60
+
+
+class TurnConfig(RigidTaskConfig):
+    """Let an object that is gripped off its centre turn in the grip by an angle: distance = |angle - goal|; actions
+    are the grip force, gravity turns."""
+
+    unit: ClassVar[Unit] = ANGLE
+
+    kind: Literal["turn"]
+    goal: Annotated[Angle, Field(gt=0, le=math.pi / 2)] = math.radians(30)  # about the line between the fingers [rad]
+    success: Annotated[Angle, Field(gt=0)] = math.radians(3)
+    reward_scale: Annotated[Angle, Field(gt=0)] = math.radians(30)
+    steps: Annotated[int, Field(ge=1, le=1_000_000)] = 80
+
+
+# Shipped ones, and those made known
+TASKS: list[type[TaskConfig]] = [SqueezeConfig, RepositionConfig, KneadConfig, HoldConfig, TurnConfig]
 
 
 def task_annotation() -> Any:

@@ -6,7 +6,8 @@ from collections.abc import Callable
 from typing import Any
 
 from tacsim.models.rig import register_task_config
-from tacsim.models.task import KneadConfig, RepositionConfig, SqueezeConfig, TaskConfig
+from tacsim.models.task import HoldConfig, KneadConfig, RepositionConfig, SqueezeConfig, TaskConfig, TurnConfig
+from tacsim.tasks.hold import Hold
 from tacsim.tasks.knead import Knead
 from tacsim.tasks.reposition import Reposition
 from tacsim.tasks.squeeze import Squeeze
@@ -21,6 +22,7 @@ from tacsim.tasks.task import (
     evaluate_outcome,
     tolerance_reward,
 )
+from tacsim.tasks.turn import Turn
 
 __all__ = [
     "Axis",
@@ -43,6 +45,8 @@ _TASK_OF_CONFIG: dict[type[TaskConfig], Callable[[Any], Task]] = {
     SqueezeConfig: Squeeze,
     RepositionConfig: Reposition,
     KneadConfig: Knead,
+    HoldConfig: Hold,
+    TurnConfig: Turn,
 }
 
 

@@ -21,3 +21,14 @@ ARRIVAL_HEIGHT_ERROR = 0.01e-3  # the scripted policy holds when its estimate is
 FIRM_GRIP_SIGNAL = 0.05  # contact signal of a firm grip: five times what camera noise of 2 % gives [-]
 CLOSING_STEP = 0.1e-3  # motion of each sensor in a control period [m]
 MAX_GRIP_FORCE = 5.0  # of a gripper that closes: it holds 0.5 kg, and presses a gel of 4 mm by some tenths of a mm [N]
+
+# hold.py
+FORCE_DECREASE = 0.92  # force of a step over that of the step before, while nothing slips
+SLIP_FLOW_CHANGE = 0.02  # relative change of the mean flow of a sensor in a step that shows a slip
+MIN_FLOW = 2e-6  # a smaller mean flow says nothing [m]
+
+# turn.py
+MAX_TURN_STEP = 0.05  # turn of the object in a control step that the scripted policy aims at [rad]
+LOOSENING = 0.95  # force of a step over that of the step before, while it turns too slowly
+TIGHTENING = 1.12  # the same while it turns too fast
+STOPPING_STEPS = 0.5  # it turns on by so many steps after the grip is tightened

@@ -55,6 +55,8 @@ class Indenter(NamedTuple):
     anchor: Any
     pressure: Any
     values: Any
+    has_patches: Any = False
+    patches: Any = None  # moments of the points that touch, of each part (tacsim.physics.grip.layout), if it has them
 
 
 class Shape(NamedTuple):
@@ -270,6 +272,14 @@ def point_push(env: ti.template(), gel: ti.template(), indenter: ti.template(), 
 
 
 @ti.func
+def add_to_patch(env: ti.template(), part, indenter: ti.template(), x):
+    """Adds a point at x that touches to the moments of this part's patch."""
+    moments = [1.0, x[0], x[1], x[2], x[0] * x[0], x[1] * x[1], x[2] * x[2], x[1] * x[2], x[0] * x[2], x[0] * x[1]]
+    for c in ti.static(range(len(moments))):
+        indenter.patches[env.index, part, c] += moments[c]
+
+
+@ti.func
 def apply_indenter(env: ti.template(), part, it, drive: ti.template(), gel: ti.template(), indenter: ti.template()):
     """Contact of the indenter with this part's cells of the gel. Records force and moment on the sensor, sensor axes.
 
@@ -282,6 +292,9 @@ def apply_indenter(env: ti.template(), part, it, drive: ti.template(), gel: ti.t
     first_cell, last_cell, low, high = 0, 0, 0, ny
     points = filled(0.0, 2 * POINTS * POINTS, 4)  # of one cell: values at its points, and forces of its points
     pushes = filled(0.0, POINTS * POINTS, 4)
+    if ti.static(indenter.has_patches):
+        for c in range(indenter.patches.shape[2]):
+            indenter.patches[env.index, part, c] = 0.0
     if ti.static(ON_DEVICE):
         first_cell, low = part // ny, part % ny
         last_cell, high = first_cell + 1, low + 1
@@ -316,6 +329,8 @@ def apply_indenter(env: ti.template(), part, it, drive: ti.template(), gel: ti.t
                         force = vec3(push[0], push[1], push[2])
                         total += force
                         moment += x.cross(force)
+                        if ti.static(indenter.has_patches):
+                            add_to_patch(env, part, indenter, x)
                         deepest = ti.max(deepest, overlap)
                     if ti.static(not ON_DEVICE):
                         for c in ti.static(range(4)):

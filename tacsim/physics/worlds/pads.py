@@ -55,9 +55,12 @@ class GelPads(NotCopyable):
 
     _instead = "GelPads(scenes, step) and restore(pads.snapshot())"
 
-    def __init__(self, scenes: Sequence[Scene], step: float, substeps: int | None = None) -> None:
+    def __init__(
+        self, scenes: Sequence[Scene], step: float, substeps: int | None = None, *, state: PressState | None = None
+    ) -> None:  # fmt: skip
         """scenes: of each pad, with the object that it touches as `indenter` (its orientation has no effect). step:
         time of a step [s]. substeps: of the gels in a step; None: as many as PAD_SECOND asks for.
+        state: arrays of these scenes; None: new ones.
 
         Raises ValueError for a step that is not positive, scenes without an indenter, gels with different lattices, an
         object too narrow for a gel's mesh, and what :func:`tacsim.geometry.mesh_file.load_mesh` raises.
@@ -69,15 +72,15 @@ class GelPads(NotCopyable):
             which = f"pad {lacking[0]} has none" if lacking else "there is no pad"
             raise ValueError(f"each pad needs a scene with an `indenter`, the object that it touches; {which}")
         self.scenes, self.step_time = tuple(scenes), step
-        self._state = PressState(self.scenes)
-        self._worlds = tuple(PressWorld(scene, self._state, i) for i, scene in enumerate(self.scenes))
-        gel = self._state.gel[0]
+        self.state = PressState(self.scenes) if state is None else state
+        self.worlds = tuple(PressWorld(scene, self.state, i) for i, scene in enumerate(self.scenes))
+        gel = self.state.gel[0]
         self._substep = PRESS_COURANT * gel.spacing  # [mm]
         wanted = math.ceil(step * PAD_SECOND / self._substep - 1e-6)
         self.substeps = max(1, wanted) if substeps is None else substeps
         if self.substeps < 1:
             raise ValueError(f"substeps is {substeps}; give at least 1, or None for {wanted}")
-        for world, params in zip(self._worlds, self._state.params, strict=True):
+        for world, params in zip(self.worlds, self.state.params, strict=True):
             params[LIMIT_RELAXATION_RATE] = world.steady_limit_relaxation / gel.thickness
         self._reaches = [_reach(scene) for scene in self.scenes]
         self._poses: list[Floats | None] = [None] * len(scenes)  # (7,) of the object in each pad's frame
@@ -85,7 +88,7 @@ class GelPads(NotCopyable):
         self._motions = np.zeros((len(scenes), 6))  # of the objects in the last step, at the pads' origins [mm, rad]
 
     def __len__(self) -> int:
-        return len(self._worlds)
+        return len(self.worlds)
 
     @property
     def wrenches(self) -> Floats:
@@ -114,16 +117,16 @@ class GelPads(NotCopyable):
         self._require_travel(starts, ends)
         drive = self._drive(starts, ends, self.substeps)
         for index in [i for i, pose in enumerate(self._poses) if pose is None]:
-            self._require_clear(index, drive[index, -1, 0])
+            self.require_clear(index, drive[index, -1, 0])
         self._advance(starts, ends, drive)
-        sums = self._state.partial[:, :, FORCE_SUM : FORCE_SUM + 6].astype(np.float64).sum(axis=1)
+        sums = self.state.partial[:, :, FORCE_SUM : FORCE_SUM + 6].astype(np.float64).sum(axis=1)
         sums[:, 3:] /= MM
         self._wrenches = sums / self._last_substeps[:, None]
         self._poses, self._steps = list(ends), self._steps + 1
         self._motions = _velocities(drive) * self.substeps * self._substep
         for index in range(len(self)):
             if self._wrenches[index].any():
-                self._require_off_housing(index, drive[index, -1, 0])
+                self.require_off_housing(index, drive[index, -1, 0])
         return self._wrenches.copy()
 
     def stiffness(self) -> Floats:
@@ -135,10 +138,10 @@ class GelPads(NotCopyable):
     def responses(self) -> list[PatchResponse | None]:
         """How the wrench of each pad follows a motion of its object within a step, with the limit of friction [m, rad,
         N, N m]; None where nothing touches."""
-        time, found, gels = self.substeps * self._substep, list[PatchResponse | None](), self._state.gel
+        time, found, gels = self.substeps * self._substep, list[PatchResponse | None](), self.state.gel
         for index, scene in enumerate(self.scenes):
             assert scene.indenter is not None
-            patch = self._patch(index) if self._wrenches[index].any() else None
+            patch = self.patch(index) if self._wrenches[index].any() else None
             if patch is None or patch.area == 0.0:
                 found.append(None)
                 continue
@@ -148,29 +151,30 @@ class GelPads(NotCopyable):
             )
         return found
 
-    def _patch(self, index: int) -> Patch:
-        nodes = self._state.gels.common_group.surface_pressure[index, 0]
-        top = self._state.surface_displacements(index)[0][..., 2].astype(np.float64)
-        return Patch.measure(self._state.gel[index], self._state.pressure[index], nodes, top)
+    def patch(self, index: int) -> Patch:
+        """The contact patch on a pad."""
+        nodes = self.state.gels.common_group.surface_pressure[index, 0]
+        top = self.state.surface_displacements(index)[0][..., 2].astype(np.float64)
+        return Patch.measure(self.state.gel[index], self.state.pressure[index], nodes, top)
 
     def slip_share(self, index: int) -> float:
         """Share of the limit of friction that a pad uses: 0 without drag, about 1 while its object slides [-]. 1 too
         where nothing touches."""
         indenter = self.scenes[index].indenter
         assert indenter is not None
-        return self._patch(index).used_friction(self._wrenches[index] * [1, 1, 1, MM, MM, MM], indenter.friction)
+        return self.patch(index).used_friction(self._wrenches[index] * [1, 1, 1, MM, MM, MM], indenter.friction)
 
     def surface(self, index: int) -> GelSurface:
         """The deformed surface of a pad's gel."""
-        return self._worlds[index].surface("lower")
+        return self.worlds[index].surface("lower")
 
     # ------------------------------------------------------------------ state
 
     def reset(self, index: int | None = None) -> None:
         """Makes the gel of one pad, or of all, as new: undeformed, untouched. The next pose is where its object is."""
         for i in range(len(self)) if index is None else [index]:
-            self._state.gels.clear(i)
-            for array in self._worlds[i].arrays().values():
+            self.state.gels.clear(i)
+            for array in self.worlds[i].arrays().values():
                 array[...] = 0
             self._poses[i], self._steps[i] = None, 0
             self._wrenches[i] = self._motions[i] = 0.0
@@ -178,7 +182,7 @@ class GelPads(NotCopyable):
     def snapshot(self, index: int) -> dict[str, NDArray[Any]]:
         """A copy of the whole state of one pad, as named arrays."""
         pose = self._poses[index]
-        state = snapshot_of(self._worlds[index].arrays(), {})
+        state = snapshot_of(self.worlds[index].arrays(), {})
         state["poses"] = np.zeros((1, 7)) if pose is None else pose[None].copy()
         numbers = {"wrench": self._wrenches[index], "motion": self._motions[index], "steps": self._steps[[index]]}
         return state | copy_arrays(numbers)
@@ -186,7 +190,7 @@ class GelPads(NotCopyable):
     def restore(self, index: int, state: Mapping[str, NDArray[Any]]) -> None:
         """Raises ValueError if `state` is no snapshot of such a pad; the pad is then unchanged."""
         wrench, motion, steps = np.zeros(6), np.zeros(6), np.zeros(1, np.int64)
-        arrays = {**self._worlds[index].arrays(), "wrench": wrench, "motion": motion, "steps": steps}
+        arrays = {**self.worlds[index].arrays(), "wrench": wrench, "motion": motion, "steps": steps}
         placed = "steps" in state and bool(np.any(state["steps"]))
         known = dict(state) if placed else {**state, "poses": np.array([[0.0, 0, 0, 0, 0, 0, 1]])}
         restore_arrays(arrays, ["object"], known, finite=["wrench", "motion"])
@@ -212,7 +216,7 @@ class GelPads(NotCopyable):
     @property
     def max_travel(self) -> float:
         """How far a point of an object may move in a step, relative to a pad [m]."""
-        return MAX_PAD_TRAVEL * self._state.gel[0].spacing * self.substeps / MM
+        return MAX_PAD_TRAVEL * self.state.gel[0].spacing * self.substeps / MM
 
     def _require_travel(self, starts: Floats, ends: Floats) -> None:
         cosine = np.minimum(np.abs((starts[:, 3:] * ends[:, 3:]).sum(axis=1)), 1.0)
@@ -230,7 +234,7 @@ class GelPads(NotCopyable):
         """Advances all pads; those whose state becomes unphysical again from the state before, with half the time step,
         as often as MAX_RETRIES."""
         self._last_substeps = np.full(len(self), self.substeps)
-        before = [copy_arrays(world.arrays()) for world in self._worlds]
+        before = [copy_arrays(world.arrays()) for world in self.worlds]
         waiting = {i: drive[i] for i in range(len(self))}
         for retry in range(MAX_RETRIES + 1):
             failures = self._launch(waiting, before)
@@ -248,12 +252,12 @@ class GelPads(NotCopyable):
             self._last_substeps[again] *= 2
             finer = self._drive(starts[again], ends[again], self.substeps * 2 ** (retry + 1))
             waiting = dict(zip(again, finer, strict=True))
-        self._state.params[:, STEP] = self._substep
+        self.state.params[:, STEP] = self._substep
 
     def _restore_arrays(self, index: int, state: State) -> None:
-        for name, array in self._worlds[index].arrays().items():
+        for name, array in self.worlds[index].arrays().items():
             array[...] = state[name]
-        self._state.params[index, STEP] = self._substep
+        self.state.params[index, STEP] = self._substep
 
     def _launch(
         self, drives: Mapping[int, NDArray[np.float32]], before: Sequence[State]
@@ -261,16 +265,16 @@ class GelPads(NotCopyable):
         """One launch of some pads. Returns the failures."""
         failures: dict[int, SimulationDiverged] = {}
         for index, drive in drives.items():
-            self._state.params[index, STEP] = self._substep * self.substeps / len(drive)
-            Health.clear(self._state.partial[index])
+            self.state.params[index, STEP] = self._substep * self.substeps / len(drive)
+            Health.clear(self.state.partial[index])
             try:
-                self._worlds[index].cover(drive)
+                self.worlds[index].cover(drive)
             except (ValueError, MemoryError) as error:
                 failures[index] = SimulationDiverged(str(error), self._where(index, drive), MESH_ADVICE, retry=False)
         ready = {index: drive for index, drive in drives.items() if index not in failures}
         if ready:
-            self._state.advance(ready)
-        healthy = self._are_healthy()
+            self.state.advance(ready)
+        healthy = self.are_healthy()
         for index, drive in ready.items():
             try:
                 self._check(index, drive, before[index], healthy=bool(healthy[index]))
@@ -278,10 +282,10 @@ class GelPads(NotCopyable):
                 failures[index] = failure
         return failures
 
-    def _are_healthy(self) -> NDArray[np.bool_]:
+    def are_healthy(self) -> NDArray[np.bool_]:
         """(n,) whether a pad's state is physical without doubt, by the limits of `check_launch`, of all pads together:
         a quarter of the time of a step would go into single checks. On a device: unknown, False."""
-        state = self._state
+        state = self.state
         if state.device is not None:
             return np.zeros(len(self), np.bool_)
         nx, ny, _ = state.gel[0].elements
@@ -298,10 +302,10 @@ class GelPads(NotCopyable):
 
     def _check(self, index: int, drive: NDArray[np.float32], before: State, *, healthy: bool) -> None:
         """Raises SimulationDiverged for an unphysical state, or a tip that the gel does not resolve."""
-        world, where = self._worlds[index], partial(self._where, index, drive)
+        world, where = self.worlds[index], partial(self._where, index, drive)
         if not healthy:
             check_launch(world.arrays, before, world.read_health(), where)
-        overlap = float(self._state.partial[index, :, OVERLAP].max())
+        overlap = float(self.state.partial[index, :, OVERLAP].max())
         if overlap <= 0.0 or self._steps[index] % CHECKED_STEPS == 0:
             world.require_contact_resolution(drive[-1, 0], overlap, where, before)
 
@@ -315,7 +319,7 @@ class GelPads(NotCopyable):
 
     def _distances(self, index: int, points: Floats, rows: NDArray[np.float32]) -> Floats:
         """Distance (k,) [mm] of points (k, 3) [mm] in a pad's frame from its object; rows: its motion (6, 3)."""
-        indenter, mesh = self.scenes[index].indenter, self._state.meshes[index]
+        indenter, mesh = self.scenes[index].indenter, self.state.meshes[index]
         assert indenter is not None
         motion = rows.astype(np.float64)
         at = (points - motion[3]) @ motion[:3] / MM
@@ -329,22 +333,26 @@ class GelPads(NotCopyable):
         edge = indenter.effective_edge_radius(self.scenes[index].effective_element_size)
         return shape_distance(indenter.geometry, at, edge) * MM
 
-    def _require_clear(self, index: int, rows: NDArray[np.float32]) -> None:
-        """Raises ValueError for a first pose in which the object is inside the gel."""
-        gel = self._state.gel[index]
+    def clearance(self, index: int, rows: NDArray[np.float32]) -> float:
+        """Distance of an object from the undeformed surface of a pad's gel [mm], negative inside; rows: see
+        `_distances`."""
+        gel = self.state.gel[index]
         x, y = (gel.spacing * (np.arange(3 * n + 1) / 3 - n / 2) for n in gel.elements[:2])
         points = np.stack([*np.meshgrid(x, y, indexing="ij"), np.zeros((len(x), len(y)))], axis=-1).reshape(-1, 3)
-        deepest = float(-self._distances(index, points, rows).min())
-        if deepest > MAX_START_OVERLAP * gel.thickness:
+        return float(self._distances(index, points, rows).min())
+
+    def require_clear(self, index: int, rows: NDArray[np.float32]) -> None:
+        """Raises ValueError for a first pose in which the object is inside the gel."""
+        limit, deepest = MAX_START_OVERLAP * self.state.gel[index].thickness, -self.clearance(index, rows)
+        if deepest > limit:
             raise ValueError(
-                f"the first pose of the object of pad {index} is {deepest:.3g} mm inside its gel (limit "
-                f"{MAX_START_OVERLAP * gel.thickness:.3g} mm): begin with the object clear of the gels and close them, "
-                f"or restore a snapshot"
+                f"the first pose of the object of pad {index} is {deepest:.3g} mm inside its gel (limit {limit:.3g} "
+                f"mm): begin with the object clear of the gels and close them, or restore a snapshot"
             )
 
-    def _require_off_housing(self, index: int, rows: NDArray[np.float32]) -> None:
+    def require_off_housing(self, index: int, rows: NDArray[np.float32]) -> None:
         """Raises ValueError for an object that reaches the rigid housing around the gel, which is not simulated."""
-        scene, half = self.scenes[index], np.array(self._state.gel[index].half)
+        scene, half = self.scenes[index], np.array(self.state.gel[index].half)
         housing = scene.gel.housing
         if housing is None or (np.abs(rows[3, :2]) + MM * self._reaches[index] <= half).all():
             return

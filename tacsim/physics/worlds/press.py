@@ -246,13 +246,13 @@ class PressWorld(FemWorld):
         friction = max(self.scene.indenter.friction, FLUTTER_FRICTION / MAX_LIMIT_RATE)
         return FLUTTER_FRICTION / min(friction, FLUTTER_FRICTION)
 
-    def cover(self, drive: np.ndarray) -> None:
-        """Computes a mesh's distances where the gel's surface may touch it in this launch. Raises ValueError for too
-        many, MemoryError where there is no memory for them."""
+    def cover(self, drive: np.ndarray, elements: float = MESH_MARGIN) -> None:
+        """Computes a mesh's distances where the gel's surface may touch it in this launch, up to a number of `elements`
+        from it. Raises ValueError for too many, MemoryError where there is no memory for them."""
         mesh = self.state.meshes[self._index]
         if mesh is None:
             return
-        margin, half = MESH_MARGIN * self._gel.spacing, mesh.half * MM
+        margin, half = elements * self._gel.spacing, mesh.half * MM
         nodes = self._surface_nodes()
         at = np.concatenate([(nodes - rows[3]) @ rows[:3] for rows in drive[[0, -1], 0].astype(np.float64)])
         near = at[(np.abs(at) <= half + margin).all(axis=1)]

@@ -259,6 +259,7 @@ class Cell:
             points=se3.transform(here, self._points).astype(np.float32),
             poses={name: self.pose(name) for name in self._pads},
             objects={OBJECT: here},
+            forces={name: self.normal_force(name) for name in self._pads},
         )
 
     # ------------------------------------------------------------------ state

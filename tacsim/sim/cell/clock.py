@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from tacsim import pose as se3
 from tacsim.interface import FloatArray, Pose
-from tacsim.sim.cell.motion import CellMotion
+from tacsim.sim.cell.motion import CellMotion, CellPeriod
 from tacsim.sim.cell.scene_cell import SceneCell
 
 
@@ -25,6 +25,7 @@ class CellClock:
         self.velocities: Mapping[str, FloatArray] = {}
         self._targets: dict[str, Pose] = {}
         self._limited: dict[str, bool] = {}
+        self._before: dict[str, Pose] = {}  # of arms, at the beginning of the period
         self._time = 0.0
 
     def now(self) -> float:
@@ -42,12 +43,22 @@ class CellClock:
 
     def tick(self) -> None:
         """One period. Raises what `CellMotion.advance` raises."""
+        self.begin().advance()
+        self.finish()
+
+    def begin(self) -> CellPeriod:
+        """Takes the commands of this period. After its `advance`, call `finish`; if that fails, the period does not
+        pass."""
         targets, self._targets = self._targets, {}
         cell = self._scene_cell.cell
-        before = {name: cell.pose(name) for name in cell.arms}
-        self._motion.advance(cell, targets, self.period)
+        self._before = {name: cell.pose(name) for name in cell.arms}
+        return CellPeriod(self._motion, cell, targets, self.period)
+
+    def finish(self, outcome: None = None) -> None:
+        """The period is over."""
+        cell = self._scene_cell.cell
         self.velocities = {
-            name: se3.pose_difference(old, cell.pose(name)) / self.period for name, old in before.items()
+            name: se3.pose_difference(old, cell.pose(name)) / self.period for name, old in self._before.items()
         }
         self._time += self.period
         self.periods += 1

@@ -215,6 +215,8 @@ class GripperDrive:
         goal, dt, frequency = width / 2, float(self._model.opt.timestep), tuning.FINGER_FREQUENCY
         places, speeds = self._data.qpos[self._places], self._data.qvel[self._speeds]
         here, stiffness = float(places.mean()), self._mass * frequency**2
+        # A grip that loosens at once would be thrown open by the gels.
+        max_force = max(max_force, abs(self.force) - tuning.MAX_LOOSENING * dt)
         reach = max_force / stiffness  # beyond, the force has its greatest value already
         before = min(max(self._reference, here - reach), here + reach)
         step = min(max(goal - before, -self._max_speed * dt), self._max_speed * dt)

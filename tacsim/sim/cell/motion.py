@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Protocol
 
 from tacsim.interface import Pose
@@ -30,6 +31,20 @@ class DynamicMotion:
         for number in range(cell.steps_of(seconds)):
             cell.step(number * cell.timestep)
         cell.refresh()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CellPeriod:
+    """One control period of a cell that is to pass."""
+
+    motion: CellMotion
+    cell: Cell
+    targets: Mapping[str, Pose]
+    seconds: float
+
+    def advance(self) -> None:
+        """See `CellMotion.advance`."""
+        self.motion.advance(self.cell, self.targets, self.seconds)
 
 
 MOTIONS: dict[str, type[CellMotion]] = {"dynamic": DynamicMotion}  # by RigConfig.motion

@@ -15,6 +15,10 @@ HAND_INERTIA = 1e2  # the same about each axis [kg m^2]
 # UR5e move it by less than 0.1 mm, and steps of 2 ms are stable
 ARM_FREQUENCY = 150.0
 FINGER_FREQUENCY = 200.0
+# Of the gears of fingers, over their mass [1/s], and the rate at which a grip force falls [N/s]. Without them a grip of
+# 8 N that loosens to 0.5 N is thrown open by the gels, and drops an object of 30 g.
+FINGER_DAMPING_RATE = 400.0
+MAX_LOOSENING = 200.0
 JOINT_TOLERANCE = 1e-9  # of poses that joints are found for [m, rad]
 MAX_JOINT_STEPS = 200  # of Newton's method, at most
 

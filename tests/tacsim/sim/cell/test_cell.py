@@ -113,8 +113,8 @@ def test_a_gripper_stops_at_its_width_and_closes_no_faster_than_it_may() -> None
     cell = hand(speed=0.02)
     cell.grippers["hand"].command(0.04, 5.0)
     let_pass(cell, 0.1)
-    assert cell.grippers["hand"].width == pytest.approx(0.06 - 2 * 0.02 * 0.1, abs=0.3e-3)
-    let_pass(cell, 0.6)
+    assert 0.06 - 2 * 0.02 * 0.1 <= cell.grippers["hand"].width < 0.06 - 1e-3
+    let_pass(cell, 0.8)
     assert cell.grippers["hand"].width == pytest.approx(0.04, abs=1e-5)
     assert cell.grippers["hand"].force == pytest.approx(0.0, abs=0.01)
 

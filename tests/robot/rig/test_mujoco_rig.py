@@ -239,9 +239,20 @@ def test_the_rig_sim_moves_no_object() -> None:
         open_rig("sim", overrides=("scene=hold",))
 
 
-def test_many_at_once_are_refused() -> None:
-    with pytest.raises(CannotOpen, match="'hand' is simulated in MuJoCo, scene by scene"):
-        make_vector_env(2, "squeeze", "hand")
+@pytest.mark.slow
+def test_two_hands_of_a_vector_environment_do_what_one_does_alone() -> None:
+    envs = make_vector_env(2, LiftConfig(steps=30), "hand", overrides=SMALL, features=None)
+    alone = make_env(LiftConfig(steps=30), "hand", overrides=SMALL, features=None)
+    both, _ = envs.reset(seed=[3, 4])
+    one, _ = alone.reset(seed=4)
+    ended = np.zeros(2, bool)
+    for number in range(8):
+        up, hold, open_hand = [1.0, 0.0], [0.0, 0.0], [0.0, -1.0]
+        if not ended[0]:
+            both, _, ended, _, _ = envs.step(np.array([open_hand, up if number < 4 else hold], np.float32))
+            one, *_ = alone.step(np.array(up if number < 4 else hold, np.float32))
+        assert all(np.array_equal(both[key][1], one[key]) for key in one)
+    assert ended.tolist() == [True, False]  # one is dropped, the other goes on
 
 
 @pytest.mark.parametrize(("version", "message"), [("None", "MuJoCo is missing"), ("'3.3.0'", "MuJoCo 3.3.0 is inst")])

@@ -67,6 +67,7 @@ if TYPE_CHECKING:
     from tacsim.models.quantity import Length as Length
     from tacsim.models.randomisation import Randomisation as Randomisation
     from tacsim.models.rig import KneadConfig as KneadConfig
+    from tacsim.models.rig import LengthenConfig as LengthenConfig
     from tacsim.models.rig import ReplayArmConfig as ReplayArmConfig
     from tacsim.models.rig import ReplaySensorConfig as ReplaySensorConfig
     from tacsim.models.rig import RepositionConfig as RepositionConfig
@@ -117,6 +118,7 @@ if TYPE_CHECKING:
     from tacsim.tasks import Axis as Axis
     from tacsim.tasks import Estimator as Estimator
     from tacsim.tasks import Knead as Knead
+    from tacsim.tasks import Lengthen as Lengthen
     from tacsim.tasks import Outcome as Outcome
     from tacsim.tasks import Reposition as Reposition
     from tacsim.tasks import Squeeze as Squeeze

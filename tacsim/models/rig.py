@@ -186,7 +186,20 @@ class KneadConfig(TaskConfig):
     steps: Annotated[int, Field(ge=1, le=1_000_000)] = 200
 
 
-TASKS: list[type[TaskConfig]] = [SqueezeConfig, RepositionConfig, KneadConfig]  # shipped ones, and those made known
+class LengthenConfig(TaskConfig):
+    """Press the body to a length along world x: distance = |length - goal|; actions move both sensors along world z."""
+
+    kind: Literal["lengthen"]
+    goal: Annotated[Length, Field(gt=0)] = 11e-3  # desired length along x [m]
+    success: Annotated[Length, Field(gt=0)] = 0.2e-3
+
+
+TASKS: list[type[TaskConfig]] = [
+    SqueezeConfig,
+    RepositionConfig,
+    KneadConfig,
+    LengthenConfig,
+]  # shipped ones, and those made known
 
 
 def task_annotation() -> Any:
@@ -215,7 +228,9 @@ class RigConfig(Config):
     name: str
     clock: Literal["sim", "wall", "replay"]
     period: Annotated[Time, Field(gt=0)] = 0.1  # control period; a replay takes that of its recording [s]
-    task: Annotated[SqueezeConfig | RepositionConfig | KneadConfig, Field(discriminator="kind")] | None = None
+    task: (
+        Annotated[SqueezeConfig | RepositionConfig | KneadConfig | LengthenConfig, Field(discriminator="kind")] | None
+    ) = None
     scene: Scene | None = None  # overrides the task's scene
     arms: dict[Name, ArmConfig] = {}
     sensors: dict[Name, SensorConfig] = Field(min_length=1)

@@ -5,8 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from tacsim.models.rig import KneadConfig, RepositionConfig, SqueezeConfig, TaskConfig, register_task_config
+from tacsim.models.rig import (
+    KneadConfig,
+    LengthenConfig,
+    RepositionConfig,
+    SqueezeConfig,
+    TaskConfig,
+    register_task_config,
+)
 from tacsim.tasks.knead import Knead
+from tacsim.tasks.lengthen import Lengthen
 from tacsim.tasks.reposition import Reposition
 from tacsim.tasks.squeeze import Squeeze
 from tacsim.tasks.task import (
@@ -26,6 +34,7 @@ __all__ = [
     "Estimator",
     "GoalOutOfReach",
     "Knead",
+    "Lengthen",
     "Outcome",
     "Reposition",
     "Squeeze",
@@ -40,6 +49,7 @@ _TASK_OF_CONFIG: dict[type[TaskConfig], Callable[[Any], Task]] = {
     SqueezeConfig: Squeeze,
     RepositionConfig: Reposition,
     KneadConfig: Knead,
+    LengthenConfig: Lengthen,
 }
 
 

@@ -191,7 +191,7 @@ class LengthenConfig(TaskConfig):
 
     kind: Literal["lengthen"]
     goal: Annotated[Length, Field(gt=0)] = 11e-3  # desired length along x [m]
-    success: Annotated[Length, Field(gt=0)] = 0.2e-3
+    success: Annotated[Length, Field(gt=0)] = 0.3e-3
 
 
 TASKS: list[type[TaskConfig]] = [

@@ -8,12 +8,12 @@ from functools import cached_property
 import numpy as np
 
 from tacsim.geometry import shapes
-from tacsim.interface import Action, FloatArray, Needs, Observation, Policy, Pose, TactileObservation, Truth
+from tacsim.interface import Action, FloatArray, Needs, Observation, Policy, Pose, Truth
 from tacsim.models.rig import LengthenConfig
 from tacsim.models.sensor import CanonicalGrid
-from tacsim.tasks.squeeze import BOTH
+from tacsim.tasks.squeeze import BOTH, estimated_height
 from tacsim.tasks.task import Axis, Estimator, GoalOutOfReach, Task
-from tacsim.tasks.tuning import MEAN_BULGE, MIN_LENGTH_SHARE
+from tacsim.tasks.tuning import LENGTH_RULE, MEAN_BULGE, MIN_LENGTH_SHARE
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class Lengthen(Task):
         return ContactLength(self.config, through)
 
     def analytic(self) -> Policy:
-        return ContactLength(self.config, False)
+        return LengthRule(self.config)
 
 
 class ContactLength:
@@ -100,27 +100,65 @@ class ContactLength:
         length = estimated_length(observation, CanonicalGrid())
         left = self._max_step if length is None else self._goal - length
         step = self._max_step if self._through and left <= 0.0 else float(np.clip(left / 2, 0.0, self._max_step))
-        up = np.array([0.0, 0.0, step])
-        lower, upper = observation.arms["lower"].pose, observation.arms["upper"].pose
-        return Action(
-            {"lower": Pose(lower.position + up, lower.quaternion), "upper": Pose(upper.position - up, upper.quaternion)}
-        )
+        return closing_action(observation, step)
+
+
+def closing_action(observation: Observation, step: float) -> Action:
+    """Both sensors move towards each other by `step` [m]."""
+    up = np.array([0.0, 0.0, step])
+    lower, upper = observation.arms["lower"].pose, observation.arms["upper"].pose
+    return Action(
+        {"lower": Pose(lower.position + up, lower.quaternion), "upper": Pose(upper.position - up, upper.quaternion)}
+    )
+
+
+class LengthRule:
+    """Length = a + b * L0 * sqrt(H0 / height) + c * extent of the contact, with length L0 and height H0 at the first
+    touch: the volume is kept, and the contact shows two faces. Least squares on training draws. Each sensor closes by
+    half of what is left."""
+
+    def __init__(self, config: LengthenConfig) -> None:
+        self._goal, self._max_step = config.goal, config.max_step
+        self.reset()
+
+    @property
+    def needs(self) -> Needs:
+        return Needs(BOTH, BOTH, height=True)
+
+    def reset(self) -> None:
+        self._first: tuple[float, float] | None = None  # length and height at the first touch [m]
+
+    def __call__(self, observation: Observation) -> Action:
+        constant, of_volume, of_contact = LENGTH_RULE
+        extent, height = pressed_extent(observation, CanonicalGrid()), estimated_height(observation)
+        if self._first is None:
+            self._first = extent, height
+        by_volume = self._first[0] * float(np.sqrt(max(self._first[1] / max(height, 1e-3), 0.0)))
+        left = self._goal - (constant + of_volume * by_volume + of_contact * extent)
+        return closing_action(observation, float(np.clip(left / 2, 0.0, self._max_step)))
 
 
 def estimated_length(observation: Observation, canonical: CanonicalGrid) -> float | None:
     """Length of the body along x [m] by touch: the extent of the part of each gel that is pressed at least half as deep
     as its deepest point, the mean of both, plus what bodies bulge beyond it on average. None without contact."""
-    extents = [_pressed_extent(observation.tactile[name], canonical) for name in ("lower", "upper")]
-    return None if 0.0 in extents else float(np.mean(extents)) + MEAN_BULGE
+    if not all(observation.tactile[name].contact.any() for name in BOTH):
+        return None
+    return pressed_extent(observation, canonical) + MEAN_BULGE
 
 
-def _pressed_extent(touch: TactileObservation, canonical: CanonicalGrid) -> float:
-    """Of one gel, along the x of its sensor [m]; 0 without contact. Raises ValueError for a sensor without height."""
-    if touch.height is None:
-        raise ValueError("the length of a body is found from the gel's height, and this sensor delivers none")
-    deepest = float(touch.height.max(where=touch.valid, initial=0.0))
-    columns = np.flatnonzero((touch.contact & (touch.height > 0.5 * deepest)).any(axis=0))
-    return float(columns[-1] - columns[0] + 1) * canonical.pitch if len(columns) else 0.0
+def pressed_extent(observation: Observation, canonical: CanonicalGrid) -> float:
+    """Extent along the x of the sensors [m], the mean of both gels, of the part that is pressed at least half as deep
+    as the deepest point; 0 for a gel that is not pressed. Raises ValueError for a sensor without height."""
+    extents = []
+    for name in sorted(BOTH):
+        touch = observation.tactile[name]
+        if touch.height is None:
+            raise ValueError("the length of a body is found from the gel's height, and this sensor delivers none")
+        deepest = float(touch.height.max(where=touch.valid, initial=0.0))
+        pressed = touch.valid & (touch.height > 0.5 * deepest) & (deepest > 0.0)
+        columns = np.flatnonzero(pressed.any(axis=0))
+        extents.append(float(columns[-1] - columns[0] + 1) * canonical.pitch if len(columns) else 0.0)
+    return float(np.mean(extents))
 
 
 def _sensor_gap(truth: Truth) -> float:

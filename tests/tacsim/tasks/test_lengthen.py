@@ -36,11 +36,11 @@ def truth(scale: float = 1.0, gap: float = 10e-3) -> Truth:
 def test_length_is_that_of_the_box() -> None:
     assert task().length(truth()) == pytest.approx(8e-3, rel=1e-5)
     assert task(8.6e-3).distance(truth(), truth()) == pytest.approx(0.6e-3, rel=1e-4)
-    assert evaluate_outcome(task(8.15e-3), truth(), truth()).success
-    assert not evaluate_outcome(task(8.25e-3), truth(), truth()).success
+    assert evaluate_outcome(task(8.25e-3), truth(), truth()).success
+    assert not evaluate_outcome(task(8.35e-3), truth(), truth()).success
 
 
-@pytest.mark.parametrize("goal", [7.7e-3, 20.5e-3])
+@pytest.mark.parametrize("goal", [7.6e-3, 20.5e-3])
 def test_goal_out_of_reach_is_refused(goal: float) -> None:
     with pytest.raises(GoalOutOfReach, match="give a goal between them"):
         task(goal).require_reachable(truth())

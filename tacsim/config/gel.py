@@ -66,6 +66,11 @@ def fit_gel(
         return scene, notes
     own = any(each.size is not None or each.element_size is not None for each in scene.gels.values())
     shared = len(set(wanted.values())) == 1 and not own and not fixed
+    if scene.object is not None and not shared:
+        what = (
+            f"both fingers have one gel, and their sensors differ: {'; '.join(origins.values())}; give both one model"
+        )
+        raise ConfigError([Problem(Place("sensors"), "", f"{what}, or --set scene.gel.size")])
     groups = [list(wanted)] if shared else [[name] for name in wanted]
     for names in reversed(groups):
         name, origin_text = names[0], "; ".join(origins[name] for name in names)

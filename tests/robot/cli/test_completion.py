@@ -30,9 +30,9 @@ def complete(words: str) -> set[str]:
         ("tacsim tra", {"train", "transfer"}),
         ("tacsim calibrate t", {"touch"}),
         ("tacsim run --see", {"--seed"}),
-        ("tacsim run ur", {"ur5e", "ur5e-one"}),
+        ("tacsim run ur", {"ur5e", "ur5e-mujoco", "ur5e-one"}),
         ("tacsim doctor --rig moc", {"mock"}),
-        ("tacsim calibrate latency ur5e-", {"ur5e-one"}),
+        ("tacsim calibrate latency ur5e-", {"ur5e-mujoco", "ur5e-one"}),
         ("tacsim run --task ", {"squeeze", "reposition", "knead"}),
         ("tacsim run --policy ", {"scripted", "grip", "learned"}),
         ("tacsim evaluate squeeze --policy te", {"teacher"}),
@@ -40,8 +40,8 @@ def complete(words: str) -> set[str]:
         ("tacsim press sphere --preset ", {"learn", "draft", "standard"}),
         ("tacsim show arm.", {"arm.ur", "arm.sim", "arm.replay"}),
         ("tacsim list dr", {"driver"}),
-        ("tacsim new rig mine --from ur5e-", {"ur5e-one"}),
-        ("tacsim schema be", {"bench"}),
+        ("tacsim new rig mine --from ur5e-", {"ur5e-mujoco", "ur5e-one"}),
+        ("tacsim schema be", {"bench", "benchmark"}),
         ("tacsim run my.ya", set()),  # the shell then completes files
     ],
 )
@@ -62,7 +62,7 @@ def test_bash_completes_by_the_script_that_the_command_prints(tmp_path: Path) ->
         '_tacsim_completion tacsim\nprintf "%s\\n" "${COMPREPLY[@]}"\n'
     )
     done = subprocess.run(["bash", "-c", script], capture_output=True, text=True, env=environment(), check=True)
-    assert set(done.stdout.split()) == {"ur5e", "ur5e-one"}, done.stderr
+    assert set(done.stdout.split()) == {"ur5e", "ur5e-mujoco", "ur5e-one"}, done.stderr
 
 
 def test_completion_costs_the_start_nothing() -> None:

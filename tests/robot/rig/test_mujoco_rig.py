@@ -214,6 +214,10 @@ def test_the_policy_grip_closes_the_hand_until_it_feels_the_object() -> None:
         ),
         (("arms.hand.model=ur5e", "arms.hand.world_from_base.position=[2, 0, 0]"), "does not reach its start"),
         (("clock=sim",), "which does not support clock 'sim'"),
+        (
+            ("sensors.left.model=gelsight-mini", "sensors.right.model=digit"),
+            "one gel, and their sensors differ: 25.25 x",
+        ),
     ],
 )
 def test_a_rig_that_cannot_be_simulated_is_refused(overrides: tuple[str, ...], message: str) -> None:

@@ -16,8 +16,8 @@ from tacsim.models.sensor import CanonicalGrid
 from tacsim.models.task import LengthenConfig
 from tacsim.pose import Pose
 from tacsim.tasks import GoalOutOfReach, Lengthen, evaluate_outcome
-from tacsim.tasks.lengthen import estimated_length
-from tacsim.tasks.tuning import MEAN_BULGE
+from tacsim.tasks.lengthen import LengthEstimate, pressed_extent
+from tacsim.tasks.tuning import LENGTH_RULE
 from tests.tacsim.gym.small import SMALL
 
 BOX = Box(size=(8e-3, 6e-3, 10e-3))
@@ -55,17 +55,24 @@ def test_teacher_closes_by_what_is_left_over_the_growth() -> None:
     assert task(8.4e-3).expert(grown, truth())[0] < 0
 
 
-def test_estimate_is_the_extent_of_the_deep_part() -> None:
-    """A plateau of 20 columns, of 0.25 mm, in a wider shallow rim."""
-    height = np.zeros((64, 64), np.float32)
-    height[20:40, 10:50] = 0.1e-3
-    height[20:40, 20:40] = 0.4e-3
-    touch: Any = SimpleNamespace(height=height, valid=np.ones_like(height, bool), contact=height > 0)
-    seen: Any = SimpleNamespace(tactile={"lower": touch, "upper": touch})
-    assert estimated_length(seen, CanonicalGrid()) == pytest.approx(20 * 0.25e-3 + MEAN_BULGE)
-    none: Any = SimpleNamespace(height=height, valid=touch.valid, contact=np.zeros_like(touch.contact))
-    seen.tactile["upper"] = none
-    assert estimated_length(seen, CanonicalGrid()) is None
+def test_estimate_follows_volume_and_contact() -> None:
+    """A plateau of 20 columns, of 0.25 mm, in a wider shallow rim; later of 22, and the gap is 4 mm instead of 9 mm."""
+    constant, of_volume, of_contact = LENGTH_RULE
+
+    def observation(columns: int, gap: float) -> Any:
+        height = np.zeros((64, 64), np.float32)
+        height[20:40, 5:55] = 0.1e-3
+        height[20:40, 20 : 20 + columns] = 0.4e-3
+        touch = SimpleNamespace(height=height, valid=np.ones_like(height, bool), contact=height > 0)
+        arms = {"lower": SimpleNamespace(pose=Pose()), "upper": SimpleNamespace(pose=Pose(np.array([0.0, 0.0, gap])))}
+        return SimpleNamespace(tactile={"lower": touch, "upper": touch}, arms=arms)
+
+    first, later = observation(20, 9e-3), observation(22, 4e-3)
+    assert pressed_extent(first, CanonicalGrid()) == pytest.approx(20 * 0.25e-3)
+    estimate = LengthEstimate(CanonicalGrid())
+    assert estimate(first) == pytest.approx(constant + (of_volume + of_contact) * 5e-3)
+    by_volume = 5e-3 * np.sqrt(9.8 / 4.8)  # heights: gap and twice 0.4 mm
+    assert estimate(later) == pytest.approx(constant + of_volume * by_volume + of_contact * 5.5e-3)
 
 
 @pytest.mark.slow

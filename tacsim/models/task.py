@@ -110,7 +110,7 @@ class RigidTaskConfig(TaskConfig):
     arm: Name = "hand"  # that carries the gripper
     gripper: Name = "hand"
     # The grip force of an action, at -1 and at 1 [N]
-    force_range: tuple[Annotated[Force, Field(ge=0)], Annotated[Force, Field(gt=0)]] = (0.2, 8.0)
+    force_range: tuple[Annotated[Force, Field(gt=0)], Annotated[Force, Field(gt=0)]] = (0.2, 8.0)
     max_slip: Annotated[Length, Field(gt=0)] = 3e-3  # of the object in the grip; beyond it nothing is reached [m]
     touch_force: Annotated[Force, Field(gt=0)] = 6.0
 

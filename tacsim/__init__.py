@@ -95,6 +95,7 @@ if TYPE_CHECKING:
     from tacsim.models.sensor import SensorGeometry as SensorGeometry
     from tacsim.models.sensor import SensorModel as SensorModel
     from tacsim.models.task import KneadConfig as KneadConfig
+    from tacsim.models.task import LengthenConfig as LengthenConfig
     from tacsim.models.task import RepositionConfig as RepositionConfig
     from tacsim.models.task import SqueezeConfig as SqueezeConfig
     from tacsim.models.task import TaskConfig as TaskConfig
@@ -129,6 +130,7 @@ if TYPE_CHECKING:
     from tacsim.tasks import Estimator as Estimator
     from tacsim.tasks import GripAxis as GripAxis
     from tacsim.tasks import Knead as Knead
+    from tacsim.tasks import Lengthen as Lengthen
     from tacsim.tasks import Outcome as Outcome
     from tacsim.tasks import Reposition as Reposition
     from tacsim.tasks import Squeeze as Squeeze

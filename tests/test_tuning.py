@@ -18,7 +18,7 @@ PHYSICS_ROOMS = ("grip", "worlds", "motion", "contact", "body", "gel", "failure"
 UNTUNED = {  # sizes of arrays, properties of a formula, and sentinels: they stand beside the code that they belong to
     "UNREACHABLE_LIMIT", "UNKNOWN_DISTANCE", "POINTS", "SPLINE_SMOOTHING", "QUANTITIES", "LATTICE_ROWS",
     "PEAK_SLOPE", "PEAK_BRAKING", "PAD", "SWEEPS", "STAGES", "BLOCKS", "MOTION",
-    "FRAME_ROWS",
+    "FRAME_ROWS", "PATCH_MOMENTS",
 }  # fmt: skip
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -103,6 +104,11 @@ def run(
         if failed:
             first = next(each for each in score.episodes if each.end in ("error", "not begun"))
             warn(f"{score.policy}: {failed} episodes failed; episode {first.episode}: {first.reason}")
+        if outside := sum(bool(each.outside) for each in score.episodes):
+            warn(
+                f"{score.policy}: in {outside} of {len(score.episodes)} episodes of {score.split} its observations "
+                "leave the range of its training"
+            )
 
     with Interrupt(), one_bar("starting") as bar:
         found = run_benchmark(work, bar.report, report_score, warn)
@@ -130,16 +136,10 @@ def verify(
 
     Example: tacsim benchmark verify runs/benchmark/squeeze/test/analytic.quick.json
     """
-    from robot.cli.terminal import print_error
-    from robot.train.benchmark.score import ScoreEdited
     from robot.train.benchmark.verify import verify_score
 
-    try:
-        with one_bar("reading") as bar:
-            found = verify_score(score, None if all_ else episodes or 3, policy, task, bar.report)
-    except ScoreEdited as failure:
-        print_error(str(failure))
-        raise typer.Exit(EXIT_UNTRUSTED) from None
+    with _refuse_edited_scores(), one_bar("reading") as bar:
+        found = verify_score(score, None if all_ else episodes or 3, policy, task, bar.report)
     for check in found.checks:
         if check.is_equal:
             continue
@@ -178,7 +178,8 @@ def compare(first: ScoreFile, second: ScoreFile) -> None:
     from robot.train.benchmark.compare import compare_scores
     from robot.train.benchmark.score import read_score
 
-    one, two = read_score(first), read_score(second)
+    with _refuse_edited_scores():
+        one, two = read_score(first), read_score(second)
     found = compare_scores(one, two)
     if not found.same_physics:
         warn("the two scores were computed with another simulator or another vector width (tacsim benchmark verify)")
@@ -206,7 +207,8 @@ def table(
     from robot.train.benchmark.compare import make_rows
     from robot.train.benchmark.score import find_scores
 
-    scores = find_scores(folder)
+    with _refuse_edited_scores():
+        scores = find_scores(folder)
     if not scores:
         raise typer.BadParameter(f"{folder} has no score files; tacsim benchmark run writes them", param_hint="FOLDER")
     rows = make_rows([score for _, score in scores])
@@ -249,6 +251,19 @@ def fit_blind(
         path = fit_task(task, episodes, environments, bar.report)
     print_files(path)
     print_json({}, [path])
+
+
+@contextmanager
+def _refuse_edited_scores() -> Iterator[None]:
+    """Ends the command with the exit code of a result that is not to be trusted."""
+    from robot.cli.terminal import print_error
+    from robot.train.benchmark.score import ScoreEdited
+
+    try:
+        yield
+    except ScoreEdited as failure:
+        print_error(str(failure))
+        raise typer.Exit(EXIT_UNTRUSTED) from None
 
 
 _COLUMNS = [

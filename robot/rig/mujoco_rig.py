@@ -38,6 +38,7 @@ from tacsim.sim.cell.description import (
 from tacsim.sim.cell.gripper import CellGripper
 from tacsim.sim.cell.motion import MOTIONS
 from tacsim.sim.cell.reset import CellReset
+from tacsim.sim.cell.resting import RestingCell
 from tacsim.sim.cell.scene_cell import SceneCell
 from tacsim.sim.cell.user_model import first_joints
 from tacsim.sim.cell.view import CellView
@@ -102,7 +103,7 @@ def simulate_cell(config: RigConfig, pool: StatePool | None = None, *, parallel:
     models = parts_of(config.sensors, MujocoSensorConfig)
     carriers = _carriers_of(config, gripper_configs, models)
     described = {name: _describe_gripper(gripper, scene) for name, gripper in gripper_configs.items()}
-    motion = MOTIONS[config.motion]()
+    motion = MOTIONS[config.motion]
     scene_cell = SceneCell(scene, partial(_make_cell, config, described))
     frames = {name: f"{sensor.gripper}/{sensor.side}" for name, sensor in models.items()}
     clock = CellClock(scene_cell, config.period, motion, {frame: name for name, frame in frames.items()})
@@ -126,7 +127,7 @@ def simulate_cell(config: RigConfig, pool: StatePool | None = None, *, parallel:
             name: normaliser_for_simulation(sensor.model, scene.gel_of(name).size[:2], config.canonical)
             for name, sensor in models.items()
         },
-        reset=CellReset(scene_cell, clock, sensors, arm_of_gripper, touch_force, placement, pool),
+        reset=CellReset(scene_cell, clock, sensors, arm_of_gripper, touch_force, placement, pool, motion),
         truth=partial(_truth, scene_cell, frames),
         diagnostics=clock.diagnostics,
         read_all=map_parallel if parallel else map_serial,
@@ -153,7 +154,7 @@ def _require_scene(config: RigConfig) -> Scene:
             f"{' or '.join(MOTIONS)}"
         )
     steps = config.period / scene.timestep
-    if round(steps) < 1 or abs(steps - round(steps)) > 1e-6 * steps:
+    if config.motion == "dynamic" and (round(steps) < 1 or abs(steps - round(steps)) > 1e-6 * steps):
         raise CannotOpen(
             f"rig '{config.name}': its period of {config.period:g} s is no whole number of timesteps of "
             f"{scene.timestep:g} s; change period, or scene.timestep"
@@ -244,7 +245,8 @@ def _make_cell(config: RigConfig, grippers: Mapping[str, GripperDescription], sc
         name: ViewDescription(view.position, view.target, view.field_of_view, view.size)
         for name, view in config.cameras.items()
     }
-    return Cell(scene, arms, grippers, views, starts)
+    make = Cell if config.motion == "dynamic" else RestingCell
+    return make(scene, arms, grippers, views, starts)
 
 
 def _describe_arm(name: str, arm: MujocoArmConfig, gripper: GripperDescription, start: Pose) -> ArmDescription:

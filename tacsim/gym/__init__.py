@@ -8,7 +8,12 @@ from typing import Any
 
 import gymnasium
 
-ENVIRONMENTS = {"tacsim/Squeeze-v0": "squeeze", "tacsim/Reposition-v0": "reposition", "tacsim/Knead-v0": "knead"}
+ENVIRONMENTS = {
+    "tacsim/Squeeze-v0": "squeeze",
+    "tacsim/Reposition-v0": "reposition",
+    "tacsim/Knead-v0": "knead",
+    "tacsim/Lengthen-v0": "lengthen",
+}
 
 
 def make_env(**options: Any) -> Any:

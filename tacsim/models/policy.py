@@ -101,7 +101,7 @@ class ActionGrip(Config):
     """One number of an action: the force of `gripper`, from `min_force` at -1 to `max_force` at 1."""
 
     gripper: Name
-    min_force: Annotated[Force, Field(ge=0)]  # [N]
+    min_force: Annotated[Force, Field(gt=0)]  # [N]
     max_force: Annotated[Force, Field(gt=0)]  # [N]
 
     @model_validator(mode="after")

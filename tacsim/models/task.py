@@ -96,13 +96,21 @@ class KneadConfig(TaskConfig):
     steps: Annotated[int, Field(ge=1, le=1_000_000)] = 200
 
 
+class LengthenConfig(TaskConfig):
+    """Press the body to a length along world x: distance = |length - goal|; actions move both sensors along world z."""
+
+    kind: Literal["lengthen"]
+    goal: Annotated[Length, Field(gt=0)] = 11e-3  # desired length along x [m]
+    success: Annotated[Length, Field(gt=0)] = 0.3e-3
+
+
 class RigidTaskConfig(TaskConfig):
     """A task for a gripper with a rigid object between its fingers. `touch_force` is the grip at the start."""
 
     arm: Name = "hand"  # that carries the gripper
     gripper: Name = "hand"
     # The grip force of an action, at -1 and at 1 [N]
-    force_range: tuple[Annotated[Force, Field(ge=0)], Annotated[Force, Field(gt=0)]] = (0.2, 8.0)
+    force_range: tuple[Annotated[Force, Field(gt=0)], Annotated[Force, Field(gt=0)]] = (0.2, 8.0)
     max_slip: Annotated[Length, Field(gt=0)] = 3e-3  # of the object in the grip; beyond it nothing is reached [m]
     touch_force: Annotated[Force, Field(gt=0)] = 6.0
 
@@ -141,7 +149,7 @@ class TurnConfig(RigidTaskConfig):
 
 
 # Shipped ones, and those made known
-TASKS: list[type[TaskConfig]] = [SqueezeConfig, RepositionConfig, KneadConfig, HoldConfig, TurnConfig]
+TASKS: list[type[TaskConfig]] = [SqueezeConfig, RepositionConfig, KneadConfig, LengthenConfig, HoldConfig, TurnConfig]
 
 
 def task_annotation() -> Any:

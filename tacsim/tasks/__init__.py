@@ -6,9 +6,18 @@ from collections.abc import Callable
 from typing import Any
 
 from tacsim.models.rig import register_task_config
-from tacsim.models.task import HoldConfig, KneadConfig, RepositionConfig, SqueezeConfig, TaskConfig, TurnConfig
+from tacsim.models.task import (
+    HoldConfig,
+    KneadConfig,
+    LengthenConfig,
+    RepositionConfig,
+    SqueezeConfig,
+    TaskConfig,
+    TurnConfig,
+)
 from tacsim.tasks.hold import Hold
 from tacsim.tasks.knead import Knead
+from tacsim.tasks.lengthen import Lengthen
 from tacsim.tasks.reposition import Reposition
 from tacsim.tasks.squeeze import Squeeze
 from tacsim.tasks.task import (
@@ -31,6 +40,7 @@ __all__ = [
     "GoalOutOfReach",
     "GripAxis",
     "Knead",
+    "Lengthen",
     "Outcome",
     "Reposition",
     "Squeeze",
@@ -47,6 +57,7 @@ _TASK_OF_CONFIG: dict[type[TaskConfig], Callable[[Any], Task]] = {
     KneadConfig: Knead,
     HoldConfig: Hold,
     TurnConfig: Turn,
+    LengthenConfig: Lengthen,
 }
 
 

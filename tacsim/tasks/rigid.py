@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from tacsim import pose as se3
-from tacsim.interface import FloatArray, Needs, Pose, Truth
+from tacsim.interface import FloatArray, GripperTarget, Needs, Pose, Truth
 from tacsim.models.task import RigidTaskConfig
 from tacsim.tasks.task import Axis, GripAxis, Task
 
@@ -94,8 +94,8 @@ def min_grip_force(config: RigidTaskConfig) -> float:
 
 def grip_component(config: RigidTaskConfig, force: float) -> float:
     """The component of an action that asks for a grip force [N], as far as the task allows."""
-    low, high = config.force_range
-    return float(np.clip(2.0 * (force - low) / (high - low) - 1.0, -1.0, 1.0))
+    axis = GripAxis(config.gripper, *config.force_range)
+    return float(np.clip(axis.component(GripperTarget(0.0, force)), -1.0, 1.0))
 
 
 def steps_towards(offset: FloatArray, max_step: float) -> FloatArray:

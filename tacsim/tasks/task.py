@@ -32,20 +32,21 @@ class Axis:
 
 @dataclass(frozen=True, slots=True)
 class GripAxis:
-    """The grip force as one component of an action vector: -1 is `min_force` and 1 is `max_force`, whatever came
-    before."""
+    """The grip force as one component of an action vector: -1 is `min_force` and 1 is `max_force`, in between evenly in
+    the logarithm, since least forces of objects differ by their ratio. It does not depend on the force before."""
 
     gripper: str
-    min_force: float  # [N]
+    min_force: float  # above 0 [N]
     max_force: float  # [N]
 
     def target(self, component: float) -> GripperTarget:
         """To grip with the force of a component."""
-        return GripperTarget(0.0, self.min_force + 0.5 * (component + 1.0) * (self.max_force - self.min_force))
+        return GripperTarget(0.0, self.min_force * (self.max_force / self.min_force) ** (0.5 * (component + 1.0)))
 
     def component(self, target: GripperTarget) -> float:
         """The component that asks for the force of a target."""
-        return 2.0 * (target.force - self.min_force) / (self.max_force - self.min_force) - 1.0
+        force = max(target.force, self.min_force)
+        return 2.0 * math.log(force / self.min_force) / math.log(self.max_force / self.min_force) - 1.0
 
 
 ActionAxes = Sequence[Axis | GripAxis]

@@ -46,6 +46,7 @@ Values = ti.types.ndarray(dtype=ti.f32, ndim=4)  # (environments, x, y, z)
 IndenterArrays = ti.types.argpack(anchor=Anchor, pressure=Pressure, values=Values)
 
 POINTS = 3  # quadrature points along one edge of a surface cell
+PATCH_MOMENTS = 10  # of the points that touch: their number, sums of their coordinates and of the products of these
 SPLINE_SMOOTHING = 0.125  # of the quadratic B-spline over the same nodes
 
 
@@ -275,7 +276,7 @@ def point_push(env: ti.template(), gel: ti.template(), indenter: ti.template(), 
 def add_to_patch(env: ti.template(), part, indenter: ti.template(), x):
     """Adds a point at x that touches to the moments of this part's patch."""
     moments = [1.0, x[0], x[1], x[2], x[0] * x[0], x[1] * x[1], x[2] * x[2], x[1] * x[2], x[0] * x[2], x[0] * x[1]]
-    for c in ti.static(range(len(moments))):
+    for c in ti.static(range(PATCH_MOMENTS)):
         indenter.patches[env.index, part, c] += moments[c]
 
 
@@ -293,7 +294,7 @@ def apply_indenter(env: ti.template(), part, it, drive: ti.template(), gel: ti.t
     points = filled(0.0, 2 * POINTS * POINTS, 4)  # of one cell: values at its points, and forces of its points
     pushes = filled(0.0, POINTS * POINTS, 4)
     if ti.static(indenter.has_patches):
-        for c in range(indenter.patches.shape[2]):
+        for c in range(PATCH_MOMENTS):
             indenter.patches[env.index, part, c] = 0.0
     if ti.static(ON_DEVICE):
         first_cell, low = part // ny, part % ny

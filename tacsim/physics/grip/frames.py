@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from tacsim.physics.grip.layout import FRAME_ROWS
+from tacsim.physics.grip.poses import matrices_of
 
 Floats = NDArray[np.float64]
 
@@ -44,8 +45,8 @@ class PadMotions:
         shift, turn = (weights * carried).sum(axis=1), (weights * turns).sum(axis=1)
         back = np.swapaxes(_matrices(turn), -1, -2)[:, None]
         last = (back @ (ends[..., :3] - (centres + shift)[:, None])[..., None])[..., 0]
-        axes = before.as_matrix().reshape(*count, 3, 3)
-        turned = back @ after.as_matrix().reshape(*count, 3, 3) @ np.swapaxes(axes, -1, -2)
+        axes = matrices_of(starts)
+        turned = back @ matrices_of(ends) @ np.swapaxes(axes, -1, -2)
         own = Rotation.from_matrix(turned.reshape(-1, 3, 3)).as_rotvec().reshape(*count, 3)
         return cls(centres, shift, turn, -arms, axes, last + arms, own)
 

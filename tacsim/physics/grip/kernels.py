@@ -18,7 +18,16 @@ from tacsim.physics.exec.team import (
 )
 from tacsim.physics.gel.kernels import GelArrays, Gels, gel_advance, gel_forces, gel_of
 from tacsim.physics.grip import layout
-from tacsim.physics.grip.object_kernels import Constants, Frames, Grip, Objects, Whole, move_object, write_drive
+from tacsim.physics.grip.object_kernels import (
+    Constants,
+    Frames,
+    Grip,
+    Objects,
+    Whole,
+    measure_lag,
+    move_object,
+    write_drive,
+)
 
 Patches = ti.types.ndarray(dtype=ti.f32, ndim=3)  # (gels, PARTS, PATCH)
 GripArrays = ti.types.argpack(frames=Frames, constants=Constants, whole=Whole, objects=Objects, patches=Patches)
@@ -79,6 +88,8 @@ def substeps(
                 for _first in range(one_if(stage == 0 and part == 0)):
                     write_drive(grip, 0, drive)
                 for _forces in range(one_if(stage % 2 == 1 and goes_on)):
+                    for _lag in range(one_if(part == 0 and it > 0)):
+                        measure_lag(grip)
                     for g in range(pads):
                         gel_index = index * pads + g
                         env = ti.static(Environment(gel_index, *shared))

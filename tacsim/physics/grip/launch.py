@@ -120,6 +120,8 @@ class GripLauncher:
 
     def _cover(self, index: int, g: int, frames: NDArray[np.float32], step: GripStep) -> None:
         """Computes the distances of a mesh where a pad may touch it in this launch."""
+        if self._state.meshes[self._state.gels_of(index)[g]] is None:
+            return
         turn, rows = matrices_of(step.objects[index]), np.zeros((2, 1, 6, 3))
         for row, frame in zip(rows, frames[[0, -1], g].astype(np.float64), strict=True):
             place = frame[3] + step.starts[index, layout.CLOSING] * frame[:3, 2]

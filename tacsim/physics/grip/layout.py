@@ -49,6 +49,7 @@ CLOSING_SPEED = _object.place()  # [-]
 STRETCH = _object.place(
     6
 )  # displacement and turn of the object from where its support is without load [mm, rad], world
+LAG = _object.place()  # largest difference of contact force and reaction of the backing, in the substep before [N]
 IMBALANCE = _object.place()  # largest of forces, relative to the largest contact force [-]
 OBJECT = _object.size
 
@@ -58,6 +59,7 @@ COUNT = _patch.place()  # points
 FIRST = _patch.place(3)  # sums of x, y, z [mm]
 SQUARES = _patch.place(3)  # sums of x x, y y, z z [mm^2]
 PRODUCTS = _patch.place(3)  # sums of y z, x z, x y [mm^2]
+CONTACT = _patch.place(3)  # force on the gel in the last substep x, y, z [N]; of part 0 alone
 PATCH = _patch.size
 
 # rows of `frames` (grips, moving substeps + 1, pads + 1, FRAME_ROWS, 3): a pad's axes in the grip's frame (3 rows of a

@@ -179,10 +179,9 @@ def contact_load(grip: ti.template(), it, system: ti.template()):
     """Adds inertia of all patches to `system` (6, 7), and the pads' forces and moments on the object to its last
     column.
 
-    Returns the mass of the patches, the sum of the normal forces on the pads, the largest contact force, and the
-    largest difference of a contact force from the reaction of the gel's backing [N].
+    Returns the mass of the patches, the sum of the normal forces on the pads, and the largest contact force [N].
     """
-    mass, along, largest, lag = 0.0, 0.0, 0.0, 0.0
+    mass, along, largest = 0.0, 0.0, 0.0
     centre = object3(grip, layout.PLACE)
     pads = grip.frames.shape[2] - 1
     for g in range(pads):
@@ -191,7 +190,8 @@ def contact_load(grip: ti.template(), it, system: ti.template()):
         axes = frame_axes(grip, it, g)
         arm = pad_place(grip, it, g, axes) - centre
         force, moment = part_sum(env, press.FORCE), part_sum(env, press.FORCE + 3)
-        lag = ti.max(lag, (force - part_sum(env, press.BACKING)).norm())
+        for c in ti.static(range(3)):
+            grip.patches[gel_index, 0, layout.CONTACT + c] = force[c]
         largest, along = ti.max(largest, force.norm()), along + force[2]
         push = -(axes @ force)
         turning = arm.cross(push) - axes @ moment
@@ -208,7 +208,21 @@ def contact_load(grip: ti.template(), it, system: ti.template()):
         layer = LAYER_SHARE * env.param(press.GEL_DENSITY) * spacing * spacing * spacing / 18.0
         add_layer_mass(system, layer, sums[0], arm, axes, first, second)
         mass += layer * sums[0]
-    return mass, along, largest, lag
+    return mass, along, largest
+
+
+@ti.func
+def measure_lag(grip: ti.template()):
+    """Records how much the gels still deform. Called in the stage of the forces, since the reactions of the backings
+    are written in the stage of the motion."""
+    pads = grip.frames.shape[2] - 1
+    lag = 0.0
+    for g in range(pads):
+        gel_index = grip.index * pads + g
+        env = ti.static(Environment(gel_index, *grip.shared))
+        force = vec3([grip.patches[gel_index, 0, layout.CONTACT + c] for c in range(3)])
+        lag = ti.max(lag, (force - part_sum(env, press.BACKING)).norm())
+    grip.objects[grip.index, layout.LAG] = lag
 
 
 @ti.func
@@ -252,7 +266,7 @@ def add_support(grip: ti.template(), axes, velocity, spin, step, system: ti.temp
 
 
 @ti.func
-def balance(grip: ti.template(), touched, closing_load, largest, lag, system: ti.template()):
+def balance(grip: ti.template(), touched, closing_load, largest, system: ti.template()):
     """Records the imbalance of the substep, and whether the launch may end.
 
     The measure is that of `tacsim.physics.motion.controller.residual`, without the change of forces: here many substeps
@@ -262,7 +276,7 @@ def balance(grip: ti.template(), touched, closing_load, largest, lag, system: ti
     reach = grip.constants[index, layout.REACH]
     net = vec3(system[0, 6], system[1, 6], system[2, 6]).norm()
     turning = vec3(system[3, 6], system[4, 6], system[5, 6]).norm() / reach
-    worst = ti.max(lag, ti.abs(closing_load))
+    worst = ti.max(grip.objects[index, layout.LAG], ti.abs(closing_load))
     if touched:
         worst = ti.max(worst, net, turning)
     share = worst / ti.max(largest, grip.constants[index, layout.MIN_FORCE])
@@ -313,7 +327,7 @@ def move_object(grip: ti.template(), it):
     pads = grip.frames.shape[2] - 1
     step = ti.static(Environment(index * pads, *grip.shared)).param(press.STEP)
     system = filled(0.0, 6, 7)
-    mass, along, largest, lag = contact_load(grip, it, system)
+    mass, along, largest = contact_load(grip, it, system)
     touched = mass > 0.0
     least = grip.constants[index, layout.MIN_MASS]
     for c in ti.static(range(3)):
@@ -334,7 +348,7 @@ def move_object(grip: ti.template(), it):
     closing_load = 0.0
     if grip.whole[index, layout.IS_CLOSING] == 1:
         closing_load = move_closing(grip, step, mass + least, along)
-    balanced = balance(grip, touched or supported, closing_load, largest, lag, system)
+    balanced = balance(grip, touched or supported, closing_load, largest, system)
     solve(system)
     moving, turning = vec3(0.0), vec3(0.0)
     if touched or supported:

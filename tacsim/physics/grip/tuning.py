@@ -10,7 +10,7 @@ LAYER_SHARE = 0.75
 CLOSING_ZETA = 1.0  # damping ratio of pads that a force closes, against the gels' stiffness
 SUPPORT_ZETA = 1.0  # damping ratio of an object on the springs of its support
 # Time of a step, in times of the gel's pressure wave through its thickness: with less, shear lags behind the pads
-STEP_TIME = 4.0
+STEP_TIME = 3.5
 MOVING_SHARE = 0.75  # [-] of the substeps of a step in which the pads move; in the rest all relaxes
 MAX_SUBSTEPS = 4000  # of a step: a validity limit
 # [-] speed of a pad relative to the others in a step, and the path [gel thicknesses] below which it is slower, so

@@ -59,15 +59,18 @@ class Cell:
         for name, arm in arms.items():
             self._add_arm(name, arm, (starts or {}).get(name, grip_pose(scene)))
         self.refresh()
-        self.touch = TouchSensor(
-            self.model, self.data, list(self._pads.values()), OBJECT,
-            gel=scene.gel, friction=self.item.friction, geometry={OBJECT: self.item.geometry}, preset=scene.preset,
-        )  # fmt: skip
+        self._add_gels()
         self._body = int(self.model.body(OBJECT).id)
         self._untouched = 0  # steps since anything touched the object
         self._max_forces = np.zeros(len(self._pads))  # normal to each pad, since `begin` [N]
         self._points = surface_points(self.item.geometry)
         mujoco.mj_forward(self.model, self.data)
+
+    def _add_gels(self) -> None:
+        self.touch = TouchSensor(
+            self.model, self.data, list(self._pads.values()), OBJECT, gel=self.scene.gel, friction=self.item.friction,
+            geometry={OBJECT: self.item.geometry}, preset=self.scene.preset,
+        )  # fmt: skip
 
     def _add_gripper(self, name: str, gripper: GripperDescription) -> None:
         frames = tuple(f"{name}/{side}" for side in SIDES)
@@ -193,7 +196,7 @@ class Cell:
     def wrench(self, name: str) -> FloatArray:
         """(6,) what the object does to a pad; to the tool of an arm, what it does to both pads; in its frame, about its
         origin [N, N m]."""
-        wrenches: dict[str, FloatArray] = dict(zip(self._pads, self.touch.wrenches, strict=True))
+        wrenches: dict[str, FloatArray] = dict(zip(self._pads, self._pad_wrenches(), strict=True))
         if name in wrenches:
             return wrenches[name]
         here, total = self.pose(name), np.zeros(6)
@@ -201,6 +204,10 @@ class Cell:
             if self._arm_of_pad[pad] == name:
                 total += se3.transform_wrench(se3.relative_pose(here, self.pose(pad)), wrench)
         return total
+
+    def _pad_wrenches(self) -> FloatArray:
+        """(n, 6) of the object on each pad, about its origin, in its axes [N, N m]."""
+        return self.touch.wrenches
 
     def normal_force(self, pad: str) -> float:
         """Positive when pressed [N]."""
@@ -266,7 +273,7 @@ class Cell:
 
     def snapshot(self) -> dict[str, NDArray[Any]]:
         """A copy of the whole state, as named arrays."""
-        state = dict(self.touch.snapshot())
+        state = self._gel_snapshot()
         for name, drive in self._drives():
             state |= {f"{name}:{key}": np.array(value) for key, value in drive.snapshot().items()}
         return state | {"cell": np.array([self._untouched, self.has_pedestal])}
@@ -278,11 +285,18 @@ class Cell:
         self._untouched = int(state["cell"][0])
         self.take_pedestal_away(away=not state["cell"][1])
         load_mujoco().mj_resetData(self.model, self.data)  # warnings, too, that a divergence has left
-        self.touch.restore(state)
+        self._restore_gels(state)
         for name, drive in self._drives():
             own = {key.removeprefix(f"{name}:"): value for key, value in state.items() if key.startswith(f"{name}:")}
             drive.restore(own)
         self.refresh()
+
+    def _gel_snapshot(self) -> dict[str, NDArray[Any]]:
+        """Of the gels and of MuJoCo."""
+        return dict(self.touch.snapshot())
+
+    def _restore_gels(self, state: State) -> None:
+        self.touch.restore(state)
 
     def _drives(self) -> list[tuple[str, FreeDrive | JointDrive | GripperDrive]]:
         return [

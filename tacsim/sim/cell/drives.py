@@ -185,7 +185,7 @@ class GripperDrive:
         found = [model.joint(name) for name in joints]
         self._places = np.array([int(joint.qposadr[0]) for joint in found])
         self._speeds = np.array([int(joint.dofadr[0]) for joint in found])
-        self._max_speed, self._mass, self.max_width = description.speed, description.finger_mass, description.stroke
+        self.max_speed, self._mass, self.max_width = description.speed, description.finger_mass, description.stroke
         self.target = (description.stroke, description.max_force)  # width [m], greatest force [N]
         self._reference = description.stroke / 2  # of each joint [m]
         self.force = 0.0  # of each finger, as it was in the last step [N]
@@ -197,9 +197,14 @@ class GripperDrive:
         return float((right.position - left.position) @ se3.rotation_matrix(left)[:, 2])
 
     def place(self, width: float) -> None:
-        """Opens or closes it at once, at rest."""
+        """Opens or closes it at once, at rest, and that is its target."""
+        self.set_width(width)
+        self.target = width, self.target[1]
+
+    def set_width(self, width: float) -> None:
+        """Opens or closes it at once, at rest; its target stays."""
         self._data.qpos[self._places], self._data.qvel[self._speeds] = width / 2, 0.0
-        self._reference, self.target = width / 2, (width, self.target[1])
+        self._reference = width / 2
 
     def command(self, width: float, max_force: float) -> None:
         """Goes to a width [m], and presses with at most a force [N]. Where it turns round, nothing stays of the force
@@ -219,7 +224,7 @@ class GripperDrive:
         max_force = max(max_force, abs(self.force) - tuning.MAX_LOOSENING * dt)
         reach = max_force / stiffness  # beyond, the force has its greatest value already
         before = min(max(self._reference, here - reach), here + reach)
-        step = min(max(goal - before, -self._max_speed * dt), self._max_speed * dt)
+        step = min(max(goal - before, -self.max_speed * dt), self.max_speed * dt)
         self._reference = before + step
         damping = 2 * self._mass * frequency
         pushed = stiffness * (self._reference - here) + damping * (step / dt - speeds.mean())

@@ -8,10 +8,17 @@ from typing import Protocol
 
 from tacsim.interface import Pose
 from tacsim.sim.cell.cell import Cell
+from tacsim.sim.cell.grip import grip_in_time
+from tacsim.sim.cell.resting import RestingCell
 
 
 class CellMotion(Protocol):
     """Advances a cell by a control period: all that is different between the words of a rig's `motion`."""
+
+    def grip(self, cell: Cell, arm_of_gripper: Mapping[str, str], force: float) -> None:
+        """Closes grippers until they hold the object with `force` [N], takes away what it stands on, and lifts it.
+        arm_of_gripper: name of the arm, by gripper. Raises NoTouch, LimitExceeded, ObjectDropped."""
+        ...
 
     def advance(self, cell: Cell, targets: Mapping[str, Pose], seconds: float) -> None:
         """Arms go to the poses of their tools `targets`, by name, within `seconds`; others to their last
@@ -26,11 +33,33 @@ class CellMotion(Protocol):
 class DynamicMotion:
     """`dynamic`: everything is lived through in MuJoCo's timesteps, the object's inertia included."""
 
+    def grip(self, cell: Cell, arm_of_gripper: Mapping[str, str], force: float) -> None:
+        """See CellMotion."""
+        grip_in_time(cell, arm_of_gripper, force, self)
+
     def advance(self, cell: Cell, targets: Mapping[str, Pose], seconds: float) -> None:
         cell.begin(targets, seconds)
         for number in range(cell.steps_of(seconds)):
             cell.step(number * cell.timestep)
         cell.refresh()
+
+
+@dataclass(frozen=True, slots=True)
+class RestingMotion:
+    """`settled`, `flowing`: object and gels come to rest in each period (RestingCell), settled until forces balance,
+    flowing as far as a fixed number of substeps goes."""
+
+    settle: bool
+
+    def grip(self, cell: Cell, arm_of_gripper: Mapping[str, str], force: float) -> None:
+        """See CellMotion."""
+        assert isinstance(cell, RestingCell)
+        cell.grip(force)
+
+    def advance(self, cell: Cell, targets: Mapping[str, Pose], seconds: float) -> None:
+        """See CellMotion."""
+        assert isinstance(cell, RestingCell)
+        cell.move(targets, seconds, settle=self.settle)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,4 +76,9 @@ class CellPeriod:
         self.motion.advance(self.cell, self.targets, self.seconds)
 
 
-MOTIONS: dict[str, type[CellMotion]] = {"dynamic": DynamicMotion}  # by RigConfig.motion
+# By RigConfig.motion
+MOTIONS: dict[str, CellMotion] = {
+    "dynamic": DynamicMotion(),
+    "flowing": RestingMotion(settle=False),
+    "settled": RestingMotion(settle=True),
+}

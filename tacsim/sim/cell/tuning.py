@@ -25,6 +25,9 @@ MAX_JOINT_STEPS = 200  # of Newton's method, at most
 # cell.py
 FALL_TIME = 20e-3  # an object that nothing touches for so long has been dropped: it has fallen by 2 mm [s]
 
+# resting.py
+PEDESTAL_STIFFNESS = (1e4, 1e4, 1e4, 1.0, 1.0, 1.0)  # of what the object stands on, as springs [N/m, N m/rad]
+
 # reset.py
 CLOSING_SPEED = 20e-3  # of each finger towards the object [m/s]
 LIFT_SPEED = 40e-3  # of the object [m/s]

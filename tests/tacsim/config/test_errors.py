@@ -212,7 +212,7 @@ def test_a_file_that_is_not_there_lists_the_names() -> None:
     wrong_task = complaint(load_rig, "sim", task="sqeeze")
     assert (
         wrong_task
-        == "--task sqeeze: task: no task 'sqeeze'; allowed: knead, reposition, squeeze; did you mean 'squeeze'?"
+        == "--task sqeeze: task: no task 'sqeeze'; allowed: knead, lengthen, reposition, squeeze; did you mean 'squeeze'?"
     )
 
 

@@ -26,7 +26,7 @@ assert tacsim.gym.env
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["Squeeze", "Reposition", "Knead"])
+@pytest.mark.parametrize("name", ["Squeeze", "Reposition", "Knead", "Lengthen"])
 def test_it_shows_a_few_numbers_of_order_one_and_how_exact_the_forces_are(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

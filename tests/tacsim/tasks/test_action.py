@@ -55,7 +55,7 @@ def test_the_vector_of_an_action_asks_for_it_as_far_as_axes_and_lengths_allow() 
 def test_a_component_of_a_gripper_is_its_force() -> None:
     axes = (Axis("upper", (0.0, 0.0, 1.0)), GripAxis("hand", 1.0, 9.0))
     action = action_of_vector(np.array([1.0, -0.5]), axes, 2e-4, POSES)
-    assert action.grippers == {"hand": GripperTarget(0.0, 3.0)} and set(action.tool) == {"upper"}
+    assert action.grippers["hand"].force == pytest.approx(9.0**0.25) and set(action.tool) == {"upper"}
     assert vector_of_action(action, axes, 2e-4, POSES) == pytest.approx([1.0, -0.5])
     # A gripper that holds keeps the force of its last target; before the first it has the least force.
     assert vector_of_action(Action(), axes, 2e-4, POSES, {"hand": GripperTarget(0.0, 9.0)})[1] == 1.0

@@ -97,5 +97,8 @@ def test_compare_and_table_commands(tmp_path: Path) -> None:
     assert result.exit_code == 0 and "0.0312" in result.stdout and "6 episodes of small, test" in result.stdout
     result = tacsim("benchmark", "table", tmp_path, "--markdown")
     assert "| small | test | a | 6 (not complete) | 100 (61 to 100) |" in result.stdout
+    two.write_text(two.read_text(encoding="utf-8").replace('"success": false', '"success": true'), encoding="utf-8")
+    assert tacsim("benchmark", "compare", one, two).exit_code == 3
+    assert tacsim("benchmark", "table", tmp_path).exit_code == 3
     write_score(two, score("b", episode(0, False), task="large"))
     assert tacsim("benchmark", "compare", one, two).exit_code == 2

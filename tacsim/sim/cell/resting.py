@@ -1,0 +1,178 @@
+"""A cell in which the object comes to rest in each control period: for learning, in a twentieth of the time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacsim.control import NoTouch, ObjectDropped
+from tacsim.interface import FloatArray, Pose
+from tacsim.limits import LimitExceeded
+from tacsim.models.scene import GelSurface, Scene
+from tacsim.physics.grip.model import HeldObject, HeldStates, Support
+from tacsim.physics.grip.world import GripWorld
+from tacsim.sim.cell import tuning
+from tacsim.sim.cell.cell import Cell
+from tacsim.sim.cell.description import ArmDescription, GripperDescription, ViewDescription
+from tacsim.sim.cell.drives import State
+from tacsim.sim.cell.grip import min_grip_force, require_enough
+from tacsim.sim.cell.model import OBJECT
+from tacsim.sim.engines.mujoco_module import load_mujoco
+
+
+class RestingCell(Cell):
+    """As a Cell, but nothing has momentum: arms and fingers go where they are sent, and object and gels are solved
+    together until they rest (tacsim.physics.grip). MuJoCo has the places of all for joints and pictures.
+
+    Raises ValueError in addition for two grippers, for an object on a guide, and for fixtures.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        arms: Mapping[str, ArmDescription],
+        grippers: Mapping[str, GripperDescription],
+        views: Mapping[str, ViewDescription] | None = None,
+        starts: Mapping[str, Pose] | None = None,
+    ) -> None:
+        _require_free(scene, grippers)
+        super().__init__(scene, arms, grippers, views, starts)
+        (self._gripper,) = self.grippers.values()
+
+    def _add_gels(self) -> None:
+        item = HeldObject(self.item.geometry, self.item.mass, self.item.friction)
+        self._held = GripWorld([item], self.scene.gel, preset=self.scene.preset, gravity=self.scene.gravity)
+        self._joint = int(self.model.joint(OBJECT).qposadr[0])
+        self._states: HeldStates | None = None  # None: not put in place since the cell was made or rewound
+
+    # ------------------------------------------------------------------- time
+
+    def grip(self, force: float) -> None:
+        """Closes the gripper around the object with a force [N], takes away what it stands on, and lifts it.
+
+        Raises NoTouch where it is not held, LimitExceeded for an object that reaches the housing of a gel.
+        """
+        require_enough(self, force, len(self.grippers))
+        self._put_in_place()
+        width = self._gripper.width
+        try:
+            self._take(self._held.grasp(self._pad_poses(), [force]), width)
+        except ValueError as failure:
+            raise LimitExceeded(str(failure)) from failure
+        self._gripper.command(0.0, force)
+        self.take_pedestal_away()
+        if self.item.lift:
+            (arm,) = self.arms
+            here = self.pose(arm)
+            self.move({arm: Pose(here.position + [0.0, 0.0, self.item.lift], here.quaternion)}, 0.0, settle=True)
+        states = self._states
+        assert states is not None
+        if not states.at_rest[0] or not states.touching[0].all():
+            raise NoTouch(
+                f"a grip of {force:.4g} N does not hold the object at rest: forces are out of balance by "
+                f"{float(states.imbalances[0]):.2g} of the largest; grip it with more touch_force, or nearer to its "
+                "centre of mass"
+            )
+
+    def move(self, targets: Mapping[str, Pose], seconds: float, *, settle: bool) -> None:
+        """One control period. Raises ObjectDropped, LimitExceeded for a pose out of reach or an object on the housing
+        of a gel, and SimulationDiverged."""
+        if self._states is None:
+            self._put_in_place()
+        for arm, target in targets.items():
+            self.place(arm, target)
+        (width, force), here = self._gripper.target, self._gripper.width
+        way = 2 * self._gripper.max_speed * seconds
+        try:
+            if width < here:
+                before = self._held.snapshot(0)
+                states, from_width = self._step(here, force, settle=settle), here
+                if here - 2 * float(states.closings[0]) < width:  # it meets nothing before its width
+                    self._held.restore(0, before)
+                    from_width = max(width, here - way)
+                    states = self._step(from_width, None, settle=settle)
+            else:
+                from_width = min(width, here + way)
+                states = self._step(from_width, None, settle=settle)
+        except ValueError as failure:
+            raise LimitExceeded(str(failure)) from failure
+        self._take(states, from_width)
+        self.data.time += seconds
+        if states.dropped[0]:
+            raise ObjectDropped(
+                f"the object was dropped: no pad touches it any more. Two pads hold {self.item.mass:.3g} kg still with "
+                f"at least {min_grip_force(self, len(self.grippers)):.3g} N each"
+            )
+
+    def _put_in_place(self) -> None:
+        here = self.object_pose()
+        self._held.reset([[*here.position, *here.quaternion]], self._pad_poses())
+        self._states = self._held.states
+
+    def _step(self, width: float, force: float | None, *, settle: bool) -> HeldStates:
+        """force: from `width` the pads close until they press with it [N]; None: they stay there."""
+        self._gripper.set_width(width)
+        self.refresh()
+        support = Support(tuning.PEDESTAL_STIFFNESS) if self.has_pedestal else None
+        forces = None if force is None else [force]
+        return self._held.step(self._pad_poses(), forces=forces, support=support, settle=settle)
+
+    def _pad_poses(self) -> FloatArray:
+        """(1, 2, 7)"""
+        poses = [self.pose(pad) for pad in self._pads]
+        return np.array([[[*pose.position, *pose.quaternion] for pose in poses]])
+
+    def _take(self, states: HeldStates, width: float) -> None:
+        """Puts object and fingers where they are after a step from `width`."""
+        self._states = states
+        place = states.objects[0]
+        self.data.qpos[self._joint : self._joint + 7] = [*place[:3], *np.roll(place[3:], 1)]
+        self._gripper.set_width(width - 2 * float(states.closings[0]))
+        self._gripper.force = float(np.mean([self.normal_force(pad) for pad in self._pads]))
+        self._max_forces = np.maximum(0.0, -states.wrenches[0, :, 2])
+        self.refresh()
+
+    # ---------------------------------------------------------------- results
+
+    def _pad_wrenches(self) -> FloatArray:
+        return np.zeros((len(self._pads), 6)) if self._states is None else self._states.wrenches[0]
+
+    def surface(self, name: str) -> GelSurface:
+        return self._held.surface(0, list(self._pads).index(name))
+
+    def slip_share(self, name: str) -> float:
+        return 1.0 if self._states is None else float(self._states.slip_shares[0, list(self._pads).index(name)])
+
+    def object_speed(self) -> tuple[float, float]:
+        return 0.0, 0.0
+
+    # ------------------------------------------------------------------ state
+
+    def _gel_snapshot(self) -> dict[str, NDArray[Any]]:
+        held = {f"held/{name}": value for name, value in self._held.snapshot(0).items()}
+        return {"qpos": self.data.qpos.copy(), "time": np.array([self.data.time]), **held}
+
+    def _restore_gels(self, state: State) -> None:
+        self._held.restore(0, {name.removeprefix("held/"): v for name, v in state.items() if name.startswith("held/")})
+        self.data.qpos[:], self.data.time = state["qpos"], float(state["time"][0])
+        self._states = self._held.states if bool(state["held/placed"].any()) else None
+        load_mujoco().mj_forward(self.model, self.data)
+
+
+def _require_free(scene: Scene, grippers: Mapping[str, GripperDescription]) -> None:
+    item = scene.object
+    assert item is not None
+    wrong = {
+        f"{len(grippers)} grippers": len(grippers) != 1,
+        "an object on a guide": item.guide is not None,
+        "fixtures": bool(scene.fixtures),
+    }
+    for what, is_there in wrong.items():
+        if is_there:
+            raise ValueError(
+                f"with motion settled or flowing a scene has one gripper and a free object, not {what}: use motion "
+                "dynamic"
+            )

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
+from typing import TYPE_CHECKING
 
 from gymnasium.vector import AutoresetMode
 
 from robot.rig import CannotOpen
-from robot.rig.mujoco_rig import CellSimulation, simulate_cell
 from robot.rig.sim_rig import Simulation, simulate
 from tacsim.gym import encode
 from tacsim.gym.env import TacsimEnv, Variant, require_compatible_task
@@ -23,14 +23,24 @@ from tacsim.models.sensor import Lighting
 from tacsim.sim.scene_world import StatePool, require_same_gels
 from tacsim.tasks import make_task
 
+if TYPE_CHECKING:  # MuJoCo's rigs bring much that others do not need
+    from robot.rig.mujoco_rig import CellSimulation
+
 Episodes = Sequence[tuple[RigConfig, str]]  # rigs, each with a description
 
 
 def open_env(episodes: Episodes, render_mode: str | None, features: Features | None) -> TacsimEnv:
     """An environment of the first of `episodes`; the others are its variants. Raises CannotOpen, ValueError."""
     config = episodes[0][0]
-    simulation = simulate_cell(config) if config.clock == "mujoco" else simulate(config)
-    return _make_env(simulation, config, _make_variants(episodes), render_mode, features)
+    return _make_env(_simulate(config), config, _make_variants(episodes), render_mode, features)
+
+
+def _simulate(config: RigConfig) -> Simulation | CellSimulation:
+    if config.clock != "mujoco":
+        return simulate(config)
+    from robot.rig.mujoco_rig import simulate_cell
+
+    return simulate_cell(config)
 
 
 def open_vector_env(
@@ -55,6 +65,8 @@ def open_vector_env(
         )
     pool, members = StatePool(), list[Member]()
     if config.clock == "mujoco":
+        from robot.rig.mujoco_rig import simulate_cell
+
         for _ in range(int(number)):
             cell = simulate_cell(config, pool, parallel=False)
             members.append(Member(_make_env(cell, config, variants, render_mode, features), cell.clock))

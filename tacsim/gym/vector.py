@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from gymnasium.error import ResetNeeded
@@ -18,7 +18,9 @@ from tacsim.models.scene import Scene
 from tacsim.physics.move import MoveCommand
 from tacsim.physics.world import World
 from tacsim.physics.worlds.batch import Batch
-from tacsim.sim.cell.motion import CellPeriod
+
+if TYPE_CHECKING:
+    from tacsim.sim.cell.motion import CellPeriod
 
 
 class MemberBatch(Protocol):

@@ -1,4 +1,4 @@
-"""A task for tests: to lift an object, with a grip force of 0 to 6 N."""
+"""A task for tests: to lift an object, with a grip force of 0.05 to 6 N."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Lift(Task):
 
     @property
     def axes(self) -> tuple[Axis | GripAxis, ...]:
-        return Axis("hand", (0.0, 0.0, 1.0)), GripAxis("hand", 0.0, 6.0)
+        return Axis("hand", (0.0, 0.0, 1.0)), GripAxis("hand", 0.05, 6.0)
 
     @property
     def goal(self) -> float:

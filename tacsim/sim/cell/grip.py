@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
@@ -12,26 +11,25 @@ from tacsim.interface import Pose
 from tacsim.sim.cell import tuning
 from tacsim.sim.cell.cell import Cell
 
-if TYPE_CHECKING:
-    from tacsim.sim.cell.motion import CellMotion
+Advance = Callable[[Mapping[str, Pose], float], None]  # to poses of tools, by arm, in a time [s]
 
 
-def grip_in_time(cell: Cell, arm_of_gripper: Mapping[str, str], force: float, motion: CellMotion) -> None:
+def grip_in_time(cell: Cell, arm_of_gripper: Mapping[str, str], force: float, advance: Advance) -> None:
     """Closes grippers slowly until they hold the object with `force` [N], takes away what it stands on, and lifts it.
-    arm_of_gripper: name of the arm, by gripper. Raises NoTouch."""
+    arm_of_gripper: name of the arm, by gripper. advance: lets the cell move. Raises NoTouch."""
     require_enough(cell, force, len(arm_of_gripper))
-    _close(cell, arm_of_gripper, force, motion)
+    _close(cell, arm_of_gripper, force, advance)
     if cell.has_pedestal:
         cell.take_pedestal_away()
-        _wait_for_rest(cell, motion, "its pedestal was taken away")
+        _wait_for_rest(cell, advance, "its pedestal was taken away")
     height, seconds = cell.item.lift, 0.05
     starts = {arm: cell.pose(arm) for arm in arm_of_gripper.values()}
     steps = int(np.ceil(height / (tuning.LIFT_SPEED * seconds)))
     for number in range(steps):
         up = np.array([0.0, 0.0, height * (number + 1) / steps])
-        motion.advance(cell, {arm: Pose(at.position + up, at.quaternion) for arm, at in starts.items()}, seconds)
+        advance({arm: Pose(at.position + up, at.quaternion) for arm, at in starts.items()}, seconds)
     if steps:
-        _wait_for_rest(cell, motion, "it was lifted")
+        _wait_for_rest(cell, advance, "it was lifted")
 
 
 def min_grip_force(cell: Cell, grippers: int) -> float:
@@ -50,7 +48,7 @@ def require_enough(cell: Cell, force: float, grippers: int) -> None:
         )
 
 
-def _close(cell: Cell, arm_of_gripper: Mapping[str, str], force: float, motion: CellMotion) -> None:
+def _close(cell: Cell, arm_of_gripper: Mapping[str, str], force: float, advance: Advance) -> None:
     seconds = 0.01
     widths = {gripper: cell.grippers[gripper].width for gripper in arm_of_gripper}
     pads = [f"{gripper}/{side}" for gripper in arm_of_gripper for side in ("left", "right")]
@@ -60,7 +58,7 @@ def _close(cell: Cell, arm_of_gripper: Mapping[str, str], force: float, motion: 
             touches = all(cell.normal_force(f"{gripper}/{side}") > 0 for side in ("left", "right"))
             widths[gripper] = 0.0 if touches else max(width - 2 * tuning.CLOSING_SPEED * seconds, 0.0)
             cell.grippers[gripper].command(widths[gripper], force)
-        motion.advance(cell, {}, seconds)
+        advance({}, seconds)
         forces = [cell.normal_force(pad) for pad in pads]
         rested = rested + seconds if min(forces) >= least and cell.is_at_rest() else 0.0
         if rested >= tuning.MIN_REST_TIME:
@@ -72,10 +70,10 @@ def _close(cell: Cell, arm_of_gripper: Mapping[str, str], force: float, motion: 
     )
 
 
-def _wait_for_rest(cell: Cell, motion: CellMotion, what: str) -> None:
+def _wait_for_rest(cell: Cell, advance: Advance, what: str) -> None:
     seconds, rested = 0.01, 0.0
     for _ in range(round(tuning.MAX_REST_TIME / seconds)):
-        motion.advance(cell, {}, seconds)
+        advance({}, seconds)
         rested = rested + seconds if cell.is_at_rest() else 0.0
         if rested >= tuning.MIN_REST_TIME:
             return

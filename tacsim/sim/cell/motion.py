@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Protocol
 
 from tacsim.interface import Pose
@@ -35,7 +36,7 @@ class DynamicMotion:
 
     def grip(self, cell: Cell, arm_of_gripper: Mapping[str, str], force: float) -> None:
         """See CellMotion."""
-        grip_in_time(cell, arm_of_gripper, force, self)
+        grip_in_time(cell, arm_of_gripper, force, partial(self.advance, cell))
 
     def advance(self, cell: Cell, targets: Mapping[str, Pose], seconds: float) -> None:
         cell.begin(targets, seconds)

@@ -61,7 +61,7 @@ class Cell:
         self.refresh()
         self._add_gels()
         self._body = int(self.model.body(OBJECT).id)
-        self._untouched = 0  # steps since anything touched the object
+        self._touched_at = self._fallen()  # along gravity, where a pad touched the object last, or it began [m]
         self._max_forces = np.zeros(len(self._pads))  # normal to each pad, since `begin` [N]
         self._points = surface_points(self.item.geometry)
         mujoco.mj_forward(self.model, self.data)
@@ -142,23 +142,20 @@ class Cell:
         except ValueError as failure:  # the state is finite and fits: what else is refused is where the object is
             raise LimitExceeded(str(failure)) from failure
         self._max_forces = np.maximum(self._max_forces, -self.touch.wrenches[:, 2])
-        self._untouched = 0 if self._is_touched() else self._untouched + 1
-        if self._untouched * self.timestep > tuning.FALL_TIME:
-            self.touch.require_held()
-            self._report_fall()
-
-    def _is_touched(self) -> bool:
-        """Anything touches the object: a gel, or by MuJoCo's contacts."""
         if self.touch.wrenches.any():
-            return True
-        bodies = self.model.geom_bodyid[self.data.contact.geom[: self.data.ncon]]
-        return bool((bodies == self._body).any()) or self.item.guide is not None
+            self._touched_at = self._fallen()
+        elif self._fallen() - self._touched_at > tuning.FALL_HEIGHT and self.item.guide is None:
+            self.touch.require_held()
+            raise ObjectDropped(
+                f"the object falls: at {self.data.time:.4g} s no pad has touched it yet, and it is at z = "
+                f"{float(self.data.xpos[self._body, 2]):.4g} m; was its pedestal taken away before it was gripped?"
+            )
 
-    def _report_fall(self) -> None:
-        raise ObjectDropped(
-            f"the object falls: at {self.data.time:.4g} s neither a pad nor the table touches it, and it is at z = "
-            f"{float(self.data.xpos[self._body, 2]):.4g} m; was its pedestal taken away before it was gripped?"
-        )
+    def _fallen(self) -> float:
+        """Where the object is, along gravity [m]."""
+        gravity = np.array(self.scene.gravity)
+        size = float(np.linalg.norm(gravity))
+        return float(self.data.xpos[self._body] @ gravity) / size if size else 0.0
 
     @property
     def has_pedestal(self) -> bool:
@@ -276,13 +273,13 @@ class Cell:
         state = self._gel_snapshot()
         for name, drive in self._drives():
             state |= {f"{name}:{key}": np.array(value) for key, value in drive.snapshot().items()}
-        return state | {"cell": np.array([self._untouched, self.has_pedestal])}
+        return state | {"cell": np.array([self._touched_at, self.has_pedestal])}
 
     def restore(self, state: State) -> None:
         """Raises ValueError if `state` is no snapshot of such a cell."""
         if "cell" not in state:
             raise ValueError("snapshot: 'cell' is missing; is it of another world?")
-        self._untouched = int(state["cell"][0])
+        self._touched_at = float(state["cell"][0])
         self.take_pedestal_away(away=not state["cell"][1])
         load_mujoco().mj_resetData(self.model, self.data)  # warnings, too, that a divergence has left
         self._restore_gels(state)

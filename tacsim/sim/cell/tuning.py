@@ -23,7 +23,7 @@ JOINT_TOLERANCE = 1e-9  # of poses that joints are found for [m, rad]
 MAX_JOINT_STEPS = 200  # of Newton's method, at most
 
 # cell.py
-FALL_TIME = 20e-3  # an object that nothing touches for so long has been dropped: it has fallen by 2 mm [s]
+FALL_HEIGHT = 2e-3  # an object that falls so far, and that no pad touches on its way, has been dropped [m]
 
 # resting.py
 PEDESTAL_STIFFNESS = (1e4, 1e4, 1e4, 1.0, 1.0, 1.0)  # of what the object stands on, as springs [N/m, N m/rad]

@@ -15,7 +15,8 @@ from tacsim.interface import Pose
 from tacsim.limits import LimitExceeded
 from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.sim.cell.cell import Cell
-from tacsim.sim.cell.reset import grip, open_around
+from tacsim.sim.cell.motion import DynamicMotion
+from tacsim.sim.cell.reset import open_around
 from tests.tacsim.sim.cell.cells import above, hand, let_pass, scene, ur5e
 
 WEIGHT = 0.1 * 9.81
@@ -23,7 +24,7 @@ WEIGHT = 0.1 * 9.81
 
 def gripped(cell: Cell, force: float, arm: str = "hand") -> Cell:
     open_around(cell, "hand", arm, np.zeros(2))
-    grip(cell, {"hand": arm}, force)
+    DynamicMotion().grip(cell, {"hand": arm}, force)
     return cell
 
 
@@ -93,6 +94,15 @@ def test_an_opened_hand_drops_its_object(held: Cell) -> None:
     held.restore(state)
 
 
+def test_an_object_that_has_landed_within_milliseconds_was_dropped_too() -> None:
+    cell = hand(scene({"pedestal": 0.004}))
+    open_around(cell, "hand", "hand", np.zeros(2))
+    DynamicMotion().grip(cell, {"hand": "hand"}, 3.0)
+    cell.grippers["hand"].command(0.05, 1.0)
+    with pytest.raises(ObjectDropped, match="'object' was dropped"):
+        let_pass(cell, 0.3)
+
+
 def test_an_object_without_pedestal_and_grip_falls() -> None:
     cell = hand()
     cell.take_pedestal_away()
@@ -103,7 +113,7 @@ def test_an_object_without_pedestal_and_grip_falls() -> None:
 def test_an_object_that_is_put_down_is_not_dropped() -> None:
     cell = hand(scene({"pedestal": 0.0}))
     open_around(cell, "hand", "hand", np.zeros(2))
-    grip(cell, {"hand": "hand"}, 3.0)
+    DynamicMotion().grip(cell, {"hand": "hand"}, 3.0)
     cell.grippers["hand"].command(0.05, 1.0)
     let_pass(cell, 0.3)
     assert cell.object_pose().position[2] == pytest.approx(0.008, abs=50e-6)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from tacsim.interface import FloatArray
-from tacsim.models.task import unit_of
+from tacsim.models.task import LENGTH, Unit, unit_of
 from tacsim.report.series import Series, sort_upper_first
 
 INK, MUTED, GRID = "#22262b", "#6b737c", "#e3e6e9"
@@ -102,14 +102,14 @@ def _assign_colours(names: Collection[str]) -> list[tuple[str, str]]:
     return [(name, COLOURS[number % len(COLOURS)]) for number, name in enumerate(sort_upper_first(names))]
 
 
-def goal_text(goal: float | tuple[float, ...] | None) -> str:
-    """A goal [m] in millimetres; a dash if there is none."""
+def goal_text(goal: float | tuple[float, ...] | None, unit: Unit = LENGTH) -> str:
+    """A goal [SI] in the unit of its task; a dash if there is none."""
     if goal is None:
         return "–"
     if isinstance(goal, (int, float)):
-        return f"{goal * 1e3:.2f} mm"
+        return f"{goal * unit.factor:.2f} {unit.symbol}"
     more = ", ..." if len(goal) > MAX_GOAL else ""
-    return f"({', '.join(f'{value * 1e3:.2f}' for value in goal[:MAX_GOAL])}{more}) mm"
+    return f"({', '.join(f'{value * unit.factor:.2f}' for value in goal[:MAX_GOAL])}{more}) {unit.symbol}"
 
 
 def signal_against_force(series: Series) -> dict[str, tuple[FloatArray, FloatArray, float | None]]:

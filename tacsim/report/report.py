@@ -225,7 +225,7 @@ def _headline_rows(stats: Mapping[str, Any], series: Series) -> list[tuple[str, 
         ("policy", str(stats["policy"])),
         ("seed", str(stats["seed"])),
         ("steps", str(stats["steps"])),
-        *_task_rows(stats, [("goal", goal_text(series.meta.goal))]),
+        *_task_rows(stats, [("goal", goal_text(series.meta.goal, unit_of(series.meta.task)))]),
     ]
     started = stats["started"]
     return lines if started is None else [*lines, ("started", f"{started[:10]} {started[11:19]} {started[23:]}")]

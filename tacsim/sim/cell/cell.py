@@ -61,7 +61,7 @@ class Cell:
         self.refresh()
         self._add_gels()
         self._body = int(self.model.body(OBJECT).id)
-        self._touched_at = self._fallen()  # along gravity, where a pad touched the object last, or it began [m]
+        self._touched_at = self._depth_of_fall()  # along gravity, where a pad touched the object last, or it began [m]
         self._max_forces = np.zeros(len(self._pads))  # normal to each pad, since `begin` [N]
         self._points = surface_points(self.item.geometry)
         mujoco.mj_forward(self.model, self.data)
@@ -143,15 +143,15 @@ class Cell:
             raise LimitExceeded(str(failure)) from failure
         self._max_forces = np.maximum(self._max_forces, -self.touch.wrenches[:, 2])
         if self.touch.wrenches.any():
-            self._touched_at = self._fallen()
-        elif self._fallen() - self._touched_at > tuning.FALL_HEIGHT and self.item.guide is None:
+            self._touched_at = self._depth_of_fall()
+        elif self._depth_of_fall() - self._touched_at > tuning.FALL_HEIGHT and self.item.guide is None:
             self.touch.require_held()
             raise ObjectDropped(
                 f"the object falls: at {self.data.time:.4g} s no pad has touched it yet, and it is at z = "
                 f"{float(self.data.xpos[self._body, 2]):.4g} m; was its pedestal taken away before it was gripped?"
             )
 
-    def _fallen(self) -> float:
+    def _depth_of_fall(self) -> float:
         """Where the object is, along gravity [m]."""
         gravity = np.array(self.scene.gravity)
         size = float(np.linalg.norm(gravity))

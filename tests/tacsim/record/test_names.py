@@ -7,9 +7,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from tacsim.interface import Action
+from tacsim.models.task import unit_of
 from tacsim.models.text import MAX_NAME, check_name
 from tacsim.record import schemas
 from tacsim.record.episode import EpisodeError, EpisodeMeta, Step
@@ -88,4 +90,5 @@ def test_names_and_goals() -> None:
     with pytest.raises(ValueError, match=r"the sensor name 'a\\x1b' holds control characters"):
         check_name("a\x1b", "sensor")
     assert goal_text((1e-3,) * 3) == "(1.00, 1.00, 1.00) mm"
+    assert goal_text(np.pi / 6, unit_of("turn")) == "30.00 °" and goal_text(1.25, unit_of("hold")) == "125.00 %"
     assert goal_text((1e-3,) * 100_000) == f"({', '.join(['1.00'] * MAX_GOAL)}, ...) mm"

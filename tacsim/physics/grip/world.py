@@ -93,6 +93,7 @@ class GripWorld(NotCopyable):
         ]
         self._state = GripState(scenes, pads)
         self._gels = GelPads(scenes, 1.0, 1, state=self._state)  # its steps are not used
+        self._gels.names = [f"pad {g} of grip {index}" for index in range(len(objects)) for g in range(pads)]
         lattice = self._state.gel[0]
         self._substep = PRESS_COURANT * lattice.spacing  # [mm]
         self._launcher = GripLauncher(self._state, self._gels, self._substep)

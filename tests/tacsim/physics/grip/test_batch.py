@@ -99,8 +99,9 @@ def test_an_unphysical_state_is_rolled_back_and_says_what_to_do() -> None:
     before = [world.snapshot(index) for index in range(2)]
     pads = pads_at(count=2)
     pads[1] = pads_at(-6e-3)[0]
-    with pytest.raises(SimulationDiverged, match=r"(?s)grip 1 in step .*move less far"):
+    with pytest.raises(SimulationDiverged, match=r"(?s)grip 1 in step .*move less far") as caught:
         world.step(pads)
+    assert caught.value.environment == 1
     for index in range(2):
         now = world.snapshot(index)
         assert all(np.array_equal(now[name], array) for name, array in before[index].items())

@@ -121,8 +121,8 @@ class SensorConfig(Config):
 
     is_simulated: ClassVar[bool] = False  # its frames come from the simulation of the rig's scene
     driver: str
-    arm: Name | None = None  # that carries it
-    gripper: Name | None = None  # that carries it, where no arm does directly
+    arm: Name | None = None  # that carries it, or:
+    gripper: Name | None = None
 
     @property
     def sensor_model(self) -> SensorModel | None:

@@ -43,6 +43,26 @@ class Mesh(Config):
     repair: bool = False  # close holes and turn triangles round
 
 
+class Socket(Config):
+    """A block with a rectangular hole along z, open at both ends. Its frame is in the middle of the hole's mouth, z out
+    of it."""
+
+    shape: Literal["socket"] = "socket"
+    opening: tuple[Edge, Edge] = (10.5e-3, 10.5e-3)  # of the hole, x and y [m]
+    depth: Edge = 15e-3  # of the block and its hole [m]
+    wall: Edge = 10e-3  # of the block on each side of the hole [m]
+
+    def walls(self) -> list[tuple[FloatArray, Box]]:
+        """The four boxes that it consists of, each after its centre (3,) in the frame of the socket [m]."""
+        (x, y), wall, depth = self.opening, self.wall, self.depth
+        along_y, along_x = Box(size=(wall, y + 2 * wall, depth)), Box(size=(x, wall, depth))
+        return [
+            (np.array([sign * place, 0.0, -depth / 2])[[axis, 1 - axis, 2]], box)
+            for axis, place, box in ((0, (x + wall) / 2, along_y), (1, (y + wall) / 2, along_x))
+            for sign in (-1.0, 1.0)
+        ]
+
+
 Shape = Annotated[Box | Sphere | Cylinder | Mesh, Field(discriminator="shape")]
 
 
@@ -103,6 +123,7 @@ class RigidObject(Oriented):
 class Fixture(Oriented):
     """What stands in the scene and never moves."""
 
-    geometry: Shape = Box()
-    position: tuple[Coordinate, Coordinate, Coordinate] = (0.0, 0.0, 0.0)  # of its centre, world [m]
+    geometry: Annotated[Box | Sphere | Cylinder | Mesh | Socket, Field(discriminator="shape")] = Box()
+    # Of its centre, of a socket of its mouth, world [m]
+    position: tuple[Coordinate, Coordinate, Coordinate] = (0.0, 0.0, 0.0)
     friction: Coefficient = 0.4

@@ -135,6 +135,28 @@ class HoldConfig(RigidTaskConfig):
     steps: Annotated[int, Field(ge=1, le=1_000_000)] = 60
 
 
+class DrawerConfig(RigidTaskConfig):
+    """Pull a drawer of unknown resistance by its handle: distance = |travel - goal|, and more where the grip is not
+    between the least that pulls and `max_excess` times that; actions move the hand along the drawer's axis, and are the
+    grip force."""
+
+    kind: Literal["drawer"]
+    goal: Annotated[Length, Field(gt=0)] = 30e-3  # travel [m]
+    margin: Annotated[float, Field(gt=1)] = 1.3  # desired grip force over the least that pulls
+    max_excess: Annotated[float, Field(gt=1)] = 1.7  # of the grip force over the least
+    grip_scale: Annotated[Length, Field(gt=0)] = 10e-3  # distance of a grip that is off by the least force [m]
+    max_step: Annotated[Length, Field(gt=0)] = 0.5e-3
+    success: Annotated[Length, Field(gt=0)] = 1e-3
+    reward_scale: Annotated[Length, Field(gt=0)] = 10e-3
+    steps: Annotated[int, Field(ge=1, le=1_000_000)] = 100
+
+    @model_validator(mode="after")
+    def _require_margin(self) -> Self:
+        if not self.margin < self.max_excess:
+            raise ValueError(f"margin {self.margin:g} must be below max_excess, {self.max_excess:g}")
+        return self
+
+
 class TurnConfig(RigidTaskConfig):
     """Let an object that is gripped off its centre turn in the grip by an angle: distance = |angle - goal|; actions
     are the grip force, gravity turns."""
@@ -148,8 +170,31 @@ class TurnConfig(RigidTaskConfig):
     steps: Annotated[int, Field(ge=1, le=1_000_000)] = 80
 
 
+class PegConfig(RigidTaskConfig):
+    """Put the gripped object into a socket: distance = that of the middle of its lower end from where it should be,
+    `goal` below the mouth on the axis of the hole; actions move the hand along x, y and z, and are the grip force."""
+
+    kind: Literal["peg"]
+    goal: Annotated[Length, Field(gt=0)] = 10e-3  # depth of the object's lower end in the hole [m]
+    max_step: Annotated[Length, Field(gt=0)] = 1e-3
+    success: Annotated[Length, Field(gt=0)] = 1e-3
+    reward_scale: Annotated[Length, Field(gt=0)] = 10e-3
+    force_range: tuple[Annotated[Force, Field(gt=0)], Annotated[Force, Field(gt=0)]] = (0.2, 20.0)
+    touch_force: Annotated[Force, Field(gt=0)] = 12.0
+    steps: Annotated[int, Field(ge=1, le=1_000_000)] = 150
+
+
 # Shipped ones, and those made known
-TASKS: list[type[TaskConfig]] = [SqueezeConfig, RepositionConfig, KneadConfig, LengthenConfig, HoldConfig, TurnConfig]
+TASKS: list[type[TaskConfig]] = [
+    SqueezeConfig,
+    RepositionConfig,
+    KneadConfig,
+    LengthenConfig,
+    HoldConfig,
+    TurnConfig,
+    PegConfig,
+    DrawerConfig,
+]
 
 
 def task_annotation() -> Any:

@@ -7,17 +7,21 @@ from typing import Any
 
 from tacsim.models.rig import register_task_config
 from tacsim.models.task import (
+    DrawerConfig,
     HoldConfig,
     KneadConfig,
     LengthenConfig,
+    PegConfig,
     RepositionConfig,
     SqueezeConfig,
     TaskConfig,
     TurnConfig,
 )
+from tacsim.tasks.drawer import Drawer
 from tacsim.tasks.hold import Hold
 from tacsim.tasks.knead import Knead
 from tacsim.tasks.lengthen import Lengthen
+from tacsim.tasks.peg import Peg
 from tacsim.tasks.reposition import Reposition
 from tacsim.tasks.squeeze import Squeeze
 from tacsim.tasks.task import (
@@ -57,7 +61,9 @@ _TASK_OF_CONFIG: dict[type[TaskConfig], Callable[[Any], Task]] = {
     KneadConfig: Knead,
     HoldConfig: Hold,
     TurnConfig: Turn,
+    DrawerConfig: Drawer,
     LengthenConfig: Lengthen,
+    PegConfig: Peg,
 }
 
 

@@ -36,3 +36,33 @@ MAX_TURN_STEP = 0.05  # turn of the object in a control step that the scripted p
 LOOSENING = 0.95  # force of a step over that of the step before, while it turns too slowly
 TIGHTENING = 1.12  # the same while it turns too fast
 STOPPING_STEPS = 0.5  # it turns on by so many steps after the grip is tightened
+
+# peg.py, on the scene `peg`
+MAX_LATERAL_ERROR = 0.15e-3  # the expert goes down where the bar's end is this close to the hole's axis [m]
+PEG_LIFT = 0.5e-3  # and lifts it so far above the block before it goes sideways [m]
+MAX_PEG_SHIFT = 0.2e-3  # sideways in a control step while it goes down [m]
+
+# peg_policy.py, on the scene `peg`
+MIN_PRESS = 0.5  # less force along the fingers is no contact [N]
+SEARCH_PRESS = (
+    5.0  # force along the fingers at a place that it tries: lays a bar flat on a block turned by 3 degrees [N]
+)
+INSERTION_PRESS = 8.0  # force along the fingers while it pushes the bar down, at most [N]
+GRIP_STIFFNESS = 5000.0  # of the gels along the fingers, by which the bar gives way [N/m]
+COMPLIANCE = (0.05e-3, 0.2e-3)  # the hand's way along a lateral force, world x and y [m/N]
+MAX_CORRECTION = 0.3e-3  # of that way in a control step [m]
+RELAXATION = 1e-3  # the hand's way along a lateral force, world y, that lays the bar flat where it can lie [m/N]
+SEARCH_STEP = 0.4e-3  # between two places: less than the play of the bar in the hole [m]
+SEARCH_RANGE = 2.4e-3  # from the start, to either side along world x [m]
+TIPPED_RANGE = 3.2e-3  # the same along world y, where the bar's end stays behind the hand [m]
+TIPPED_SHARE = 0.7  # of half the bar's width: support further out shows that it tips
+MIN_HOLE_DEPTH = 0.8e-3  # of the bar's end below the surface: it is in the hole [m]
+STUCK_STEPS = 8  # in which it goes less than MIN_PROGRESS deeper: it is stuck
+MIN_PROGRESS = 0.1e-3  # [m]
+
+# drawer.py, on the scene `drawer`
+USUAL_PERIOD = 50e-3  # control period in which a task's max_step is the greatest speed [s]
+GRIP_DECREASE = 0.9  # force of a step over that of the step before, while nothing slips
+ARRIVAL_LEFT = 0.1e-3  # the scripted policy stops where so little of the travel is left [m]
+SLIP_SHARE = 0.25  # of max_step: a handle that lags by more than this in a step slips
+SECOND_INCREASE = 1.15  # force of a step over that of the step before, where the handle slips again

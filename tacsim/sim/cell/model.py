@@ -13,6 +13,7 @@ from tacsim.geometry.mesh_file import load_mesh
 from tacsim.geometry.shapes import rotated_bounding_size
 from tacsim.interface import FloatArray, Pose
 from tacsim.models.scene import Box, Cylinder, Mesh, Scene, Shape, Sphere
+from tacsim.models.shape import Socket
 from tacsim.sim.cell import tuning
 from tacsim.sim.cell.description import ArmDescription, GripperDescription, ViewDescription
 from tacsim.sim.cell.user_model import attach, find_flange
@@ -46,7 +47,11 @@ def make_spec(
     _add_table_and_lights(spec)
     for name, fixture in scene.fixtures.items():
         body = spec.worldbody.add_body(name=name, pos=list(fixture.position), quat=_quaternion(fixture.turn))
-        _add_shape(spec, body, name, fixture.geometry, friction=fixture.friction, colour=LIGHT)
+        if isinstance(fixture.geometry, Socket):
+            for number, (centre, wall) in enumerate(fixture.geometry.walls()):
+                _add_shape(spec, body, f"{name}/{number}", wall, friction=fixture.friction, colour=LIGHT, centre=centre)
+        else:
+            _add_shape(spec, body, name, fixture.geometry, friction=fixture.friction, colour=LIGHT)
     _add_object(spec, scene)
     for name, arm in arms.items():
         carried = {label: gripper for label, gripper in grippers.items() if gripper.arm == name}
@@ -115,7 +120,8 @@ def _add_object(spec: Any, scene: Scene) -> None:
         body.add_joint(
             name=OBJECT, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=(se3.rotation_matrix(start).T @ along).tolist(),
             limited=True, range=[0.0, item.guide.travel], frictionloss=item.guide.friction,
-            damping=item.guide.damping,
+            damping=item.guide.damping, solref_friction=[max(2 * spec.option.timestep, 4e-3), 1.0],
+            solimp_friction=[0.99, 0.999, 1e-4, 0.5, 2.0],  # else what is light creeps below the friction
         )  # fmt: skip
     _add_shape(spec, body, OBJECT, item.geometry, mass=item.mass, friction=item.table_friction, colour=OBJECT_COLOUR)
     if item.pedestal > 0:
@@ -127,12 +133,15 @@ def _add_object(spec: Any, scene: Scene) -> None:
 
 
 def _add_shape(
-    spec: Any, body: Any, name: str, geometry: Shape, *, friction: float, colour: tuple[float, ...], mass: float = 0.0
-) -> None:
+    spec: Any, body: Any, name: str, geometry: Shape, *, friction: float, colour: tuple[float, ...], mass: float = 0.0,
+    centre: FloatArray | None = None,
+) -> None:  # fmt: skip
     kinds = load_mujoco().mjtGeom
+    place = np.zeros(3) if centre is None else centre
     geom = body.add_geom(
-        name=name, mass=mass, friction=[friction, 5e-3, 1e-4], rgba=colour, condim=4, **_stiff_contact(spec)
-    )
+        name=name, pos=place.tolist(), mass=mass, friction=[friction, 5e-3, 1e-4], rgba=colour, condim=4,
+        **_stiff_contact(spec),
+    )  # fmt: skip
     match geometry:
         case Box():
             geom.type, geom.size = kinds.mjGEOM_BOX, [side / 2 for side in geometry.size]

@@ -98,21 +98,9 @@ def run(
     splits = known if split == ["all"] else tuple(dict.fromkeys(split or ["test"]))
     work = Run(task, policies, splits, "full" if full else "quick", out, environments)
 
-    def report_score(path: Path, score: Score) -> None:
-        failed = sum(each.end in ("error", "not begun") for each in score.episodes)
-        notes.print(f"{score.policy}, {score.split}: success {_percent(score.success)} %, {path}")
-        if failed:
-            first = next(each for each in score.episodes if each.end in ("error", "not begun"))
-            warn(f"{score.policy}: {failed} episodes failed; episode {first.episode}: {first.reason}")
-        if outside := sum(bool(each.outside) for each in score.episodes):
-            warn(
-                f"{score.policy}: in {outside} of {len(score.episodes)} episodes of {score.split} its observations "
-                "leave the range of its training"
-            )
-
     with Interrupt(), one_bar("starting") as bar:
         try:
-            found = run_benchmark(work, bar.report, report_score, warn)
+            found = run_benchmark(work, bar.report, _report_score, warn)
         except KeyboardInterrupt:
             notes.print(f"The episodes that are done are kept in {out}. The same command continues.")
             raise
@@ -120,6 +108,20 @@ def run(
     _show_rows(rows)
     print_files(*(path for path, _ in found))
     print_json({"rows": rows}, [path for path, _ in found])
+
+
+def _report_score(path: Path, score: Score) -> None:
+    """Prints the success of a complete score, and what must be checked before it is trusted."""
+    failed = sum(each.end in ("error", "not begun") for each in score.episodes)
+    notes.print(f"{score.policy}, {score.split}: success {_percent(score.success)} %, {path}")
+    if failed:
+        first = next(each for each in score.episodes if each.end in ("error", "not begun"))
+        warn(f"{score.policy}: {failed} episodes failed; episode {first.episode}: {first.reason}")
+    if outside := sum(bool(each.outside) for each in score.episodes):
+        warn(
+            f"{score.policy}: in {outside} of {len(score.episodes)} episodes of {score.split} its observations "
+            "leave the range of its training"
+        )
 
 
 def verify(

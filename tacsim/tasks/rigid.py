@@ -6,7 +6,6 @@ from abc import abstractmethod
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from tacsim import pose as se3
 from tacsim.interface import FloatArray, GripperTarget, Needs, Pose, Truth
@@ -81,8 +80,7 @@ def turn_in_grip(truth: Truth, start: Truth) -> float:
     """How far the object has turned about the line between the pads since `start`, right-handed about the z axis of the
     first pad [rad]."""
     now, before = (se3.relative_pose(grip_of(each), object_pose(each)) for each in (truth, start))
-    turned = Rotation.from_quat(np.array(now.quaternion)) * Rotation.from_quat(np.array(before.quaternion)).inv()
-    return float(turned.as_rotvec()[2])
+    return float(se3.pose_difference(before, now)[5])
 
 
 def min_grip_force(config: RigidTaskConfig) -> float:

@@ -111,7 +111,11 @@ def run(
             )
 
     with Interrupt(), one_bar("starting") as bar:
-        found = run_benchmark(work, bar.report, report_score, warn)
+        try:
+            found = run_benchmark(work, bar.report, report_score, warn)
+        except KeyboardInterrupt:
+            notes.print(f"The episodes that are done are kept in {out}. The same command continues.")
+            raise
     rows = make_rows([score for _, score in found])
     _show_rows(rows)
     print_files(*(path for path, _ in found))

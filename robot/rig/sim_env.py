@@ -108,7 +108,7 @@ def _make_variants(episodes: Episodes) -> list[Variant]:
         if _fixed_settings(config) != fixed:
             raise ValueError(
                 f"variant {number} may change nothing but scene, task, light, texture, noise and delay of the sensors, "
-                "error, noise and delay of the arms; make another environment for it"
+                "error, noise, mount and delay of the arms; make another environment for it"
             )
         assert first.scene is not None and first.task is not None and config.scene is not None
         assert config.task is not None

@@ -40,8 +40,8 @@ class Simulation:
     arms: Mapping[str, SimArm]
 
     def apply_variation(self, config: RigConfig) -> None:
-        """Takes light, texture, noise and delay of the sensors, and error, noise and delay of the arms from `config`,
-        from the next episode on. Everything else does not change."""
+        """Takes light, texture, noise and delay of the sensors, and error, noise, mount, delay of the arms from
+        `config`, from the next episode on. Everything else does not change."""
         for name, sensor in parts_of(config.sensors, SimSensorConfig).items():
             self.sensors[name].apply_variation(
                 *renderer_and_noise(sensor.model, name, self.scene_world.scene), sensor.delay

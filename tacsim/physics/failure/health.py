@@ -91,6 +91,7 @@ class SimulationDiverged(RuntimeError):
         self.possible = ""  # text with the possible length of the motion, if known: printed first
         self.depth: float | None = None  # that an indenter had reached in the untouched gel, of a press that failed [m]
         self.place = ""  # of the worst entry: which particle or node, where [mm]
+        self.environment: int | None = None  # which of a batch, where one step advances all
         self.refine = 1  # substeps for one nominal substep at the last attempt
         self.dump: Path | None = None  # the folder that `tacsim debug` reads, if one was written
         self.no_dump = ""  # reason if there is none

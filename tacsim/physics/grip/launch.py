@@ -59,8 +59,8 @@ class GripLauncher:
                 if not failures:
                     break
                 if retry == MAX_RETRIES or any(not failure.retry for failure in failures.values()):
-                    failure = next(iter(failures.values()))
-                    failure.refine = 2**retry
+                    index, failure = next(iter(failures.items()))
+                    failure.environment, failure.refine = index, 2**retry
                     raise failure
                 waiting = list(failures)
                 self._restore(waiting, before)

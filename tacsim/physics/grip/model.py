@@ -37,7 +37,7 @@ class HeldStates:
 
     objects: Floats  # (n, 7) position of the centre of the bounding box [m], quaternion x, y, z, w, world
     pads: Floats  # (n, k, 7) poses of the pads in world, closed as far as they are
-    wrenches: Floats  # (n, k, 6) force and moment of the object on each pad, about its origin, in its axes [N, N m]
+    wrenches: Floats  # (n, k, 6) of the object on each pad at the end, about its origin, in its axes [N, N m]
     closings: Floats  # (n,) of each pad along its z axis from the pose that was asked for [m]; 0 without a grip force
     touching: NDArray[np.bool_]  # (n, k)
     slip_shares: Floats  # (n, k) share of the limit of friction that is used; 1: the object slides, or nothing touches

@@ -25,7 +25,7 @@ SETTLED_TOLERANCE = 2e-4  # [-] imbalance of forces at rest: at 2e-3 the weight 
 REFERENCE_FORCE = 0.5
 MAX_HOLD = 2000  # [substeps] of a step that settles
 # [elements] up to which the distances of a mesh are known beyond a gel's surface; how far pads close on it in a step
-MESH_MARGIN, MESH_TRAVEL = 2.5, 1.0
+MESH_MARGIN, MESH_TRAVEL = 1.5, 0.75
 MAX_MASS = 1e3  # [kg] of an object: a validity limit
 GRASP_SPRINGS = (50.0, 0.01)  # [N/m, N m/rad] springs that keep an object in place while it is grasped
 MAX_GRASP_STEPS = 50  # that settle, until pads have closed: on a mesh, each closes them by MESH_TRAVEL at most

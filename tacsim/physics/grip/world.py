@@ -93,6 +93,7 @@ class GripWorld(NotCopyable):
         ]
         self._state = GripState(scenes, pads)
         self._gels = GelPads(scenes, 1.0, 1, state=self._state)  # its steps are not used
+        self._gels.names = [f"pad {g} of grip {index}" for index in range(len(objects)) for g in range(pads)]
         lattice = self._state.gel[0]
         self._substep = PRESS_COURANT * lattice.spacing  # [mm]
         self._launcher = GripLauncher(self._state, self._gels, self._substep)
@@ -189,7 +190,8 @@ class GripWorld(NotCopyable):
         Raises:
             ValueError: before `reset`; for arguments of another shape or that are not finite; for pads that move too
                 far in a step; for an object that rests on the housing of a gel.
-            SimulationDiverged: where a gel's state becomes unphysical; all grips are then as they were before.
+            SimulationDiverged: where a gel's state becomes unphysical; `environment` is the index of the grip, and all
+                are then as they were before: reset that one.
         """
         if not self._placed.all():
             raise ValueError(f"grip {int(np.argmin(self._placed))} has no object in place yet: call reset() first")

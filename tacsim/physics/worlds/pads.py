@@ -74,6 +74,7 @@ class GelPads(NotCopyable):
         self.scenes, self.step_time = tuple(scenes), step
         self.state = PressState(self.scenes) if state is None else state
         self.worlds = tuple(PressWorld(scene, self.state, i) for i, scene in enumerate(self.scenes))
+        self.names = [f"pad {index}" for index in range(len(self.scenes))]  # in messages
         gel = self.state.gel[0]
         self._substep = PRESS_COURANT * gel.spacing  # [mm]
         wanted = math.ceil(step * PAD_SECOND / self._substep - 1e-6)
@@ -346,8 +347,8 @@ class GelPads(NotCopyable):
         limit, deepest = MAX_START_OVERLAP * self.state.gel[index].thickness, -self.clearance(index, rows)
         if deepest > limit:
             raise ValueError(
-                f"the first pose of the object of pad {index} is {deepest:.3g} mm inside its gel (limit {limit:.3g} "
-                f"mm): begin with the object clear of the gels and close them, or restore a snapshot"
+                f"the first pose of the object of {self.names[index]} is {deepest:.3g} mm inside its gel (limit "
+                f"{limit:.3g} mm): begin with the object clear of the gels and close them, or restore a snapshot"
             )
 
     def require_off_housing(self, index: int, rows: NDArray[np.float32]) -> None:
@@ -362,9 +363,9 @@ class GelPads(NotCopyable):
         depth = float(-self._distances(index, np.insert(rim, 2, -housing * MM, axis=1), rows).min())
         if depth > 0.0:
             raise ValueError(
-                f"the object of pad {index} is wider than the gel and reaches {depth:.3g} mm into the housing around "
-                f"it, which is {millimetres(housing)} below the gel's surface and is not simulated: press with less "
-                f"force, give the pad a larger gel, or `housing: null` if there is none"
+                f"the object of {self.names[index]} is wider than the gel and reaches {depth:.3g} mm into the housing "
+                f"around it, which is {millimetres(housing)} below the gel's surface and is not simulated: press with "
+                f"less force, give the pad a larger gel, or `housing: null` if there is none"
             )
 
 

@@ -15,6 +15,8 @@ from tacsim.physics.grip.model import HeldObject, HeldStates, Support
 from tacsim.physics.grip.world import GripWorld
 from tests.tacsim.physics.grip.gripping import BALL, BOX, HOME, held, make_grip, pads_at
 
+pytestmark = pytest.mark.cpu
+
 ITEMS = (
     HeldObject(BOX, 0.1),
     HeldObject(BALL, 0.02, friction=1.0),
@@ -49,7 +51,6 @@ def same(a: HeldStates, b: HeldStates, index: int, other: int) -> bool:
     )
 
 
-@pytest.mark.cpu
 def test_a_grip_in_a_batch_has_the_bits_that_it_has_alone() -> None:
     together = GripWorld(ITEMS, GELS)
     together.reset(np.tile(HOME, (3, 1)), pads_at(count=3))
@@ -64,7 +65,6 @@ def test_a_grip_in_a_batch_has_the_bits_that_it_has_alone() -> None:
         assert np.array_equal(alone.surface(0, 1).displacement, together.surface(index, 1).displacement)
 
 
-@pytest.mark.cpu
 def test_a_restored_grip_continues_with_the_same_bits_and_the_others_as_they_were() -> None:
     world = GripWorld(ITEMS, GELS)
     world.reset(np.tile(HOME, (3, 1)), pads_at(count=3))
@@ -99,8 +99,9 @@ def test_an_unphysical_state_is_rolled_back_and_says_what_to_do() -> None:
     before = [world.snapshot(index) for index in range(2)]
     pads = pads_at(count=2)
     pads[1] = pads_at(-6e-3)[0]
-    with pytest.raises(SimulationDiverged, match=r"(?s)grip 1 in step .*move less far"):
+    with pytest.raises(SimulationDiverged, match=r"(?s)grip 1 in step .*move less far") as caught:
         world.step(pads)
+    assert caught.value.environment == 1
     for index in range(2):
         now = world.snapshot(index)
         assert all(np.array_equal(now[name], array) for name, array in before[index].items())

@@ -32,8 +32,9 @@ def draw(path: Path) -> None:
     with open_rig("ur5e-mujoco", overrides=(FRONT,)) as rig:
         arm = lift(rig, 20.0).views["front"].image
     ball = "scene.object.geometry={shape: sphere, radius: 10 mm}"
+    bare = "task=null", "scene=hold", "scene.preset=draft"
     sensors = [f"sensors.{side}.model=gelsight-mini" for side in ("left", "right")]
-    with open_rig("hand", overrides=(CLOSE, ball, "scene.object.mass=0.2", "scene.preset=draft", *sensors)) as rig:
+    with open_rig("hand", overrides=(*bare, CLOSE, ball, "scene.object.mass=0.2", *sensors)) as rig:
         held = lift(rig, 5.0)
         hand, touch = held.views["close"].image, held.tactile["left"].picture
     assert touch is not None

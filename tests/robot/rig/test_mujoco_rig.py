@@ -228,6 +228,15 @@ def test_a_rig_that_cannot_be_simulated_is_refused(overrides: tuple[str, ...], m
         rig.reset()
 
 
+@pytest.mark.parametrize("rig", ["hand", "ur5e-mujoco"])
+@pytest.mark.parametrize("more", [(), ("--task",)], ids=["as shipped", "with a task"])
+def test_the_shipped_rigs_describe_themselves(rig: str, more: tuple[str, ...]) -> None:
+    task, force = ("hold", ("grippers.hand.force=[1 N, 235 N]",)) if more else (None, ())
+    spec = rig_spec(load_rig(rig, task=task, overrides=force).config)
+    assert spec.grippers == spec.arms == ("hand",)
+    assert spec.views == (("front",) if rig == "ur5e-mujoco" else ())
+
+
 def test_a_grip_weaker_than_the_gripper_can_is_refused_before_anything_is_made() -> None:
     config = load_rig("hand", task=LiftConfig(), overrides=("grippers.hand.model=2f85",)).config
     with pytest.raises(CannotOpen, match=r"task.touch_force, 3 N, and grippers.hand has forces of 20 to 235 N"):

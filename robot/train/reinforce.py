@@ -34,14 +34,15 @@ class Reinforce:
     def __init__(
         self, envs: Environments, training: Training, actor: PolicyNetwork, folder: Path, tensorboard: bool = False
     ) -> None:
+        rounds = {"ppo": 120, "sac": 24}  # where the training file names no number
         replay_steps = 50_000  # control steps in the replay buffer of SAC
         warm_up_steps = 1000  # control steps with random actions before SAC learns
         settings = training.reinforce
-        self.rounds, self.actor = settings.rounds, actor
-        self._seed, self._folder = training.seed, folder
+        self.rounds, self.actor = settings.rounds or rounds[training.algorithm], actor
+        self._seed, self._folder, self._rate = training.seed, folder, settings.rate
         self._episode_steps = envs.get_attr("task")[0].config.steps
         # PPO: the gradients of large errors of the value network, which are clipped together with those of the actions,
-        # would hide these (docs/measurements/training.md: 0.1 meets more goals than 1 and than 0.03).
+        # would hide these (docs/measurements/training.md, "From the reward alone").
         ppo = training.algorithm == "ppo"
         self._reward_scale = 0.1 if ppo else 1.0
         self._envs = SharedVecEnv(envs, self._reward_scale)
@@ -53,7 +54,7 @@ class Reinforce:
             "features_extractor_class": FeaturesExtractor,
         }
         common: dict[str, Any] = {
-            "learning_rate": settings.rate,
+            "gamma": settings.discount,
             "batch_size": _batch_size(self._steps * envs.num_envs, settings.batch),
             "policy_kwargs": shape,
             "device": "cpu",
@@ -61,6 +62,7 @@ class Reinforce:
             "tensorboard_log": str(folder / "tensorboard") if tensorboard else None,
         }
         if ppo:
+            shape["log_std_init"] = -1.0  # deviation of the first actions 0.37: at 1 most of them are clipped
             self._model: Any = PPO("MultiInputPolicy", self._envs, n_steps=self._steps, **common)
         else:
             self._model = SAC(
@@ -71,11 +73,13 @@ class Reinforce:
     def round(self, number: int, report_progress: ReportProgress) -> dict[str, float]:
         """Plays episodes from their start and learns from them."""
         random = np.random.default_rng([self._seed, number])
+        rate = self._rate * (1.0 - number / self.rounds)
         model, total = self._model, self._steps * self._envs.num_envs
         model.set_random_seed(int(random.integers(2**31)))  # of NumPy, torch, and the next reset of the environments
         if number == 0:
             self._envs.reset()
             self._normalise_features(self._play_random_episode(random))
+        model.lr_schedule = lambda _: rate
         model._last_obs = None  # so episodes start again
         watch = _EpisodeWatch(lambda done: report_progress(f"round {number + 1} of {self.rounds}", done, total))
         model.learn(total, callback=watch, reset_num_timesteps=False, tb_log_name=type(model).__name__.lower())

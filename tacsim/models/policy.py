@@ -166,10 +166,11 @@ class DaggerConfig(Config):
 class ReinforceConfig(Config):
     """PPO (Schulman et al. 2017) or SAC (Haarnoja et al. 2018), of stable-baselines3: from the reward alone."""
 
-    rounds: Count = 20  # in each, every environment plays `episodes` from their start
+    rounds: Count | None = None  # in each, every environment plays `episodes`; None: 120 of ppo, 24 of sac
     episodes: Count = 2
     batch: Count = 256
-    rate: Rate = 3e-4
+    rate: Rate = 3e-4  # of Adam; it falls to zero over the rounds
+    discount: Annotated[float, Field(ge=0, lt=1)] = 0.9  # weight of a reward, over that of one control step before
 
 
 class Training(Config):

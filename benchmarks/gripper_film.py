@@ -1,0 +1,96 @@
+"""Films of the tasks for a gripper: `python -m benchmarks.gripper_film turn turn.gif [key=value ...]`.
+
+Each frame has the scene, the picture of the left gel (its change since the reference), the flow of its markers, and
+grip force and distance so far. A film that ends in .jpg is a strip of six frames.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from io import BytesIO
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+from PIL import Image as Picture
+
+from robot.open import load_with_task, open_rig
+from tacsim.interface import Image, Observation, Truth
+from tacsim.tasks import Task, make_task
+
+CLOSE = "cameras.close={position: [0.12, -0.22, 0.14], target: [0, 0, 0.06], field_of_view: 38 deg, size: [360, 360]}"
+SENSORS = tuple(f"sensors.{side}.model={{extends: gelsight-mini, markers: {{}}}}" for side in ("left", "right"))
+FLOW_SCALE = 5.0  # arrows are so many times as long as the displacements
+STRIP = 6
+
+
+def play(name: str, overrides: Sequence[str]) -> tuple[Task, list[Observation], list[Truth]]:
+    """An episode of the scripted policy on the rig `hand`, in dynamic motion."""
+    loaded = load_with_task("hand", name, ["scene.preset=learn", CLOSE, *overrides])
+    assert loaded.config.task is not None
+    task = make_task(loaded.config.task)
+    with open_rig(loaded) as rig:
+        observation, policy = rig.reset(), task.scripted()
+        policy.reset()
+        seen, truths = [], []
+        for _ in range(task.config.steps + 1):
+            truth = rig.truth()
+            assert truth is not None
+            _ = observation.views["close"].image, observation.tactile["left"].image  # rendered now: the scene moves on
+            seen.append(observation)
+            truths.append(truth)
+            observation, _ = rig.step(policy(observation))
+    return task, seen, truths
+
+
+def draw_frame(task: Task, seen: Sequence[Observation], truths: Sequence[Truth], number: int) -> Image:
+    figure, axes = plt.subplots(1, 4, figsize=(11, 2.9), dpi=80, layout="constrained")
+    touch = seen[number].tactile["left"]
+    axes[0].imshow(seen[number].views["close"].image)
+    axes[1].imshow(touch.image)
+    for axis, title in zip(axes, (f"step {number}", "left gel, change", "flow of its markers, x 5"), strict=False):
+        axis.set_title(title, fontsize=9)
+        axis.set_axis_off()
+    if touch.flow is not None:
+        rows, columns = touch.flow.shape[:2]
+        x, y = np.meshgrid(np.arange(columns), np.arange(rows))
+        arrows = FLOW_SCALE * 1e3 * touch.flow  # about a millimetre from marker to marker
+        axes[2].quiver(x, y, arrows[..., 0], arrows[..., 1], angles="xy", scale_units="xy", scale=1.0, width=5e-3)
+        axes[2].set(xlim=(-1, columns), ylim=(rows, -1), aspect="equal")
+    draw_curves(axes[3], task, seen, truths, number)
+    buffer = BytesIO()
+    figure.savefig(buffer)
+    plt.close(figure)
+    return np.asarray(Picture.open(buffer).convert("RGB"))
+
+
+def draw_curves(
+    axes: plt.Axes, task: Task, seen: Sequence[Observation], truths: Sequence[Truth], number: int
+) -> None:
+    unit = task.config.unit
+    forces = [each.grippers["hand"].force for each in seen[: number + 1]]
+    distances = [unit.factor * task.distance(truth, truths[0]) for truth in truths[: number + 1]]
+    axes.plot(forces, color="#1f3a5f")
+    axes.set(xlim=(0, len(seen)), ylim=(0, 1.1 * task.config.touch_force), xlabel="step")
+    axes.set_ylabel("grip force [N]", color="#1f3a5f", fontsize=8)
+    other = axes.twinx()
+    other.plot(distances, color="#c0572b")
+    highest = unit.factor * max(task.distance(truth, truths[0]) for truth in truths)
+    other.set(ylim=(0, 1.1 * highest))
+    other.set_ylabel(f"distance [{unit.symbol}]", color="#c0572b", fontsize=8)
+
+
+def write(path: Path, task: Task, seen: Sequence[Observation], truths: Sequence[Truth]) -> None:
+    if path.suffix == ".jpg":
+        chosen = np.linspace(0, len(seen) - 1, STRIP).astype(int)
+        frames = [draw_frame(task, seen, truths, number) for number in chosen]
+        Picture.fromarray(np.concatenate(frames)).save(path, quality=85)
+        return
+    frames = [draw_frame(task, seen, truths, number) for number in range(0, len(seen), 2)]
+    first, *others = (Picture.fromarray(frame).quantize(128) for frame in frames)
+    first.save(path, save_all=True, append_images=others, duration=100, loop=0, optimize=True)
+
+
+if __name__ == "__main__":
+    write(Path(sys.argv[2]), *play(sys.argv[1], sys.argv[3:]))

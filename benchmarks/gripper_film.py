@@ -1,7 +1,7 @@
 """Films of the tasks for a gripper: `python -m benchmarks.gripper_film turn turn.gif [key=value ...]`.
 
 Each frame has the scene, the picture of the left gel (its change since the reference), the flow of its markers, and
-grip force and distance so far. A film that ends in .jpg is a strip of six frames.
+grip force and distance so far. A film that ends in .jpg is a strip of some frames.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.axes import Axes
 from PIL import Image as Picture
 
 from robot.open import load_with_task, open_rig
@@ -22,7 +23,7 @@ from tacsim.tasks import Task, make_task
 CLOSE = "cameras.close={position: [0.12, -0.22, 0.14], target: [0, 0, 0.06], field_of_view: 38 deg, size: [360, 360]}"
 SENSORS = tuple(f"sensors.{side}.model={{extends: gelsight-mini, markers: {{}}}}" for side in ("left", "right"))
 FLOW_SCALE = 5.0  # arrows are so many times as long as the displacements
-STRIP = 6
+STRIP = 3
 
 
 def play(name: str, overrides: Sequence[str]) -> tuple[Task, list[Observation], list[Truth]]:
@@ -65,9 +66,7 @@ def draw_frame(task: Task, seen: Sequence[Observation], truths: Sequence[Truth],
     return np.asarray(Picture.open(buffer).convert("RGB"))
 
 
-def draw_curves(
-    axes: plt.Axes, task: Task, seen: Sequence[Observation], truths: Sequence[Truth], number: int
-) -> None:
+def draw_curves(axes: Axes, task: Task, seen: Sequence[Observation], truths: Sequence[Truth], number: int) -> None:
     unit = task.config.unit
     forces = [each.grippers["hand"].force for each in seen[: number + 1]]
     distances = [unit.factor * task.distance(truth, truths[0]) for truth in truths[: number + 1]]
@@ -83,7 +82,7 @@ def draw_curves(
 
 def write(path: Path, task: Task, seen: Sequence[Observation], truths: Sequence[Truth]) -> None:
     if path.suffix == ".jpg":
-        chosen = np.linspace(0, len(seen) - 1, STRIP).astype(int)
+        chosen = np.linspace(len(seen) / 5, len(seen) - 1, STRIP).astype(int)
         frames = [draw_frame(task, seen, truths, number) for number in chosen]
         Picture.fromarray(np.concatenate(frames)).save(path, quality=85)
         return

@@ -68,7 +68,7 @@ def draw_frame(task: Task, seen: Sequence[Observation], truths: Sequence[Truth],
 
 def draw_curves(axes: Axes, task: Task, seen: Sequence[Observation], truths: Sequence[Truth], number: int) -> None:
     unit = task.config.unit
-    forces = [each.grippers["hand"].force for each in seen[: number + 1]]
+    forces = [float(each.grippers["hand"].force or 0.0) for each in seen[: number + 1]]
     distances = [unit.factor * task.distance(truth, truths[0]) for truth in truths[: number + 1]]
     axes.plot(forces, color="#1f3a5f")
     axes.set(xlim=(0, len(seen)), ylim=(0, 1.1 * task.config.touch_force), xlabel="step")

@@ -34,21 +34,21 @@ def play(name: str, overrides: Sequence[str]) -> tuple[Task, list[Observation], 
     with open_rig(loaded) as rig:
         observation, policy = rig.reset(), task.scripted()
         policy.reset()
-        seen, truths = [], []
+        observed, truths = [], []
         for _ in range(task.config.steps + 1):
             truth = rig.truth()
             assert truth is not None
             _ = observation.views["close"].image, observation.tactile["left"].image  # rendered now: the scene moves on
-            seen.append(observation)
+            observed.append(observation)
             truths.append(truth)
             observation, _ = rig.step(policy(observation))
-    return task, seen, truths
+    return task, observed, truths
 
 
-def draw_frame(task: Task, seen: Sequence[Observation], truths: Sequence[Truth], number: int) -> Image:
+def draw_frame(task: Task, observed: Sequence[Observation], truths: Sequence[Truth], number: int) -> Image:
     figure, axes = plt.subplots(1, 4, figsize=(11, 2.9), dpi=80, layout="constrained")
-    touch = seen[number].tactile["left"]
-    axes[0].imshow(seen[number].views["close"].image)
+    touch = observed[number].tactile["left"]
+    axes[0].imshow(observed[number].views["close"].image)
     axes[1].imshow(touch.image)
     for axis, title in zip(axes, (f"step {number}", "left gel, change", "flow of its markers, x 5"), strict=False):
         axis.set_title(title, fontsize=9)
@@ -59,19 +59,19 @@ def draw_frame(task: Task, seen: Sequence[Observation], truths: Sequence[Truth],
         arrows = FLOW_SCALE * 1e3 * touch.flow  # about a millimetre from marker to marker
         axes[2].quiver(x, y, arrows[..., 0], arrows[..., 1], angles="xy", scale_units="xy", scale=1.0, width=5e-3)
         axes[2].set(xlim=(-1, columns), ylim=(rows, -1), aspect="equal")
-    draw_curves(axes[3], task, seen, truths, number)
+    draw_curves(axes[3], task, observed, truths, number)
     buffer = BytesIO()
     figure.savefig(buffer)
     plt.close(figure)
     return np.asarray(Picture.open(buffer).convert("RGB"))
 
 
-def draw_curves(axes: Axes, task: Task, seen: Sequence[Observation], truths: Sequence[Truth], number: int) -> None:
+def draw_curves(axes: Axes, task: Task, observed: Sequence[Observation], truths: Sequence[Truth], number: int) -> None:
     unit = task.config.unit
-    forces = [float(each.grippers["hand"].force or 0.0) for each in seen[: number + 1]]
+    forces = [float(each.grippers["hand"].force or 0.0) for each in observed[: number + 1]]
     distances = [unit.factor * task.distance(truth, truths[0]) for truth in truths[: number + 1]]
     axes.plot(forces, color="#1f3a5f")
-    axes.set(xlim=(0, len(seen)), ylim=(0, 1.1 * task.config.touch_force), xlabel="step")
+    axes.set(xlim=(0, len(observed)), ylim=(0, 1.1 * task.config.touch_force), xlabel="step")
     axes.set_ylabel("grip force [N]", color="#1f3a5f", fontsize=8)
     other = axes.twinx()
     other.plot(distances, color="#c0572b")
@@ -80,13 +80,13 @@ def draw_curves(axes: Axes, task: Task, seen: Sequence[Observation], truths: Seq
     other.set_ylabel(f"distance [{unit.symbol}]", color="#c0572b", fontsize=8)
 
 
-def write(path: Path, task: Task, seen: Sequence[Observation], truths: Sequence[Truth]) -> None:
+def write(path: Path, task: Task, observed: Sequence[Observation], truths: Sequence[Truth]) -> None:
     if path.suffix == ".jpg":
-        chosen = np.linspace(len(seen) / 5, len(seen) - 1, STRIP).astype(int)
-        frames = [draw_frame(task, seen, truths, number) for number in chosen]
+        chosen = np.linspace(len(observed) / 5, len(observed) - 1, STRIP).astype(int)
+        frames = [draw_frame(task, observed, truths, number) for number in chosen]
         Picture.fromarray(np.concatenate(frames)).save(path, quality=85)
         return
-    frames = [draw_frame(task, seen, truths, number) for number in range(0, len(seen), 2)]
+    frames = [draw_frame(task, observed, truths, number) for number in range(0, len(observed), 2)]
     first, *others = (Picture.fromarray(frame).quantize(128) for frame in frames)
     first.save(path, save_all=True, append_images=others, duration=100, loop=0, optimize=True)
 

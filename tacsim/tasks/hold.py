@@ -39,8 +39,10 @@ class Hold(RigidTask):
         return abs(grip_force(truth) / min_grip_force(self.config) - self.config.margin)
 
     def expert(self, truth: Truth, start: Truth) -> FloatArray:
-        """The force that is wanted, at once."""
-        return np.array([grip_component(self.config, self.config.margin * min_grip_force(self.config))])
+        """Lowers the force as the scripted policy does, down to what is wanted: only near its limit does friction show
+        in a gel, so that a student can learn where to stop."""
+        wanted = self.config.margin * min_grip_force(self.config)
+        return np.array([grip_component(self.config, max(wanted, FORCE_DECREASE * grip_force(truth)))])
 
     def scripted(self, *, through: bool = False) -> Policy:
         return ScriptedHold(self.config, through)

@@ -138,7 +138,8 @@ def test_an_approach_that_is_too_fast_for_an_outside_sensor_is_refused(site: Pat
         ("torn", "cannot be loaded: ModuleNotFoundError: No module named 'no_such_vendor_library'"),
         (
             "soft-touc",
-            "driver 'soft-touc' is unknown; allowed: camera | mujoco | replay | sim | soft-touch; did you mean 'soft-touch'?",
+            "driver 'soft-touc' is unknown; allowed: camera | mujoco | replay | sim | soft-touch; did you mean "
+            "'soft-touch'?",
         ),
     ],
 )

@@ -28,6 +28,8 @@ DRAWN = {
     "/upper/transform": "Transform3D:translation",
     "/lower/arm": "tacsim.Arm:message",
     "/upper/arm": "tacsim.Arm:message",
+    "/hand/gripper": "tacsim.Gripper:message",
+    "/foot/gripper": "tacsim.Gripper:message",
     "/body": "Points3D:positions",
     "/upper/packages": "tacsim.ArmPackage:message",
     "/step": "tacsim.Step:message",

@@ -70,7 +70,7 @@ class Drawer(RigidTask):
 
     def measures(self, truth: Truth, start: Truth) -> dict[str, float]:
         measured = RigidTask.measures(self, truth, start)
-        return {**measured, "travel": self.travel(truth, start), "least_grip": min_pulling_grip(self.config)}
+        return {**measured, "travel": self.travel(truth, start), "min_grip": min_pulling_grip(self.config)}
 
     def expert(self, truth: Truth, start: Truth) -> FloatArray:
         """As far as is left, with a grip in the middle of what is wanted and what is allowed: a start needs more."""

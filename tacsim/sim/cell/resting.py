@@ -16,7 +16,6 @@ from tacsim.physics.grip.model import HeldObject, HeldStates, Support
 from tacsim.physics.grip.world import GripWorld
 from tacsim.sim.cell import tuning
 from tacsim.sim.cell.cell import Cell
-from tacsim.sim.cell.description import ArmDescription, GripperDescription, ViewDescription
 from tacsim.sim.cell.drives import State
 from tacsim.sim.cell.grip import min_grip_force, require_enough
 from tacsim.sim.cell.model import OBJECT
@@ -30,19 +29,9 @@ class RestingCell(Cell):
     Raises ValueError in addition for two grippers, for an object on a guide, and for fixtures.
     """
 
-    def __init__(
-        self,
-        scene: Scene,
-        arms: Mapping[str, ArmDescription],
-        grippers: Mapping[str, GripperDescription],
-        views: Mapping[str, ViewDescription] | None = None,
-        starts: Mapping[str, Pose] | None = None,
-    ) -> None:
-        _require_free(scene, grippers)
-        super().__init__(scene, arms, grippers, views, starts)
-        (self._gripper,) = self.grippers.values()
-
     def _add_gels(self) -> None:
+        _require_free(self.scene, len(self.grippers))
+        (self._gripper,) = self.grippers.values()
         item = HeldObject(self.item.geometry, self.item.mass, self.item.friction)
         self._held = GripWorld([item], self.scene.gel, preset=self.scene.preset, gravity=self.scene.gravity)
         self._joint = int(self.model.joint(OBJECT).qposadr[0])
@@ -162,11 +151,11 @@ class RestingCell(Cell):
         load_mujoco().mj_forward(self.model, self.data)
 
 
-def _require_free(scene: Scene, grippers: Mapping[str, GripperDescription]) -> None:
+def _require_free(scene: Scene, grippers: int) -> None:
     item = scene.object
     assert item is not None
     wrong = {
-        f"{len(grippers)} grippers": len(grippers) != 1,
+        f"{grippers} grippers": grippers != 1,
         "an object on a guide": item.guide is not None,
         "fixtures": bool(scene.fixtures),
     }

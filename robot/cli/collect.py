@@ -183,7 +183,7 @@ def episodes(
     task: Annotated[
         str | None,
         typer.Option(
-            help="squeeze, reposition, knead, lengthen, or a path.",
+            help="squeeze, reposition, knead, lengthen, relief, or a path.",
             show_default="the rig's own",
             autocompletion=complete_names("task"),
         ),

@@ -22,13 +22,7 @@ State = Mapping[str, NDArray[Any]]
 
 def site_pose(data: Any, site: int) -> Pose:
     """world_from_site, as MuJoCo has computed its frames last."""
-    return _pose_of(data.site_xpos[site], data.site_xmat[site])
-
-
-def _pose_of(position: FloatArray, axes: FloatArray) -> Pose:
-    frame = np.eye(4)
-    frame[:3, :3], frame[:3, 3] = axes.reshape(3, 3), position
-    return se3.from_matrix(frame)
+    return se3.from_axes(data.site_xpos[site], data.site_xmat[site].reshape(3, 3))
 
 
 class FreeDrive:

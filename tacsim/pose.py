@@ -156,7 +156,9 @@ def transform_wrench(a_from_b: Pose, wrench: ArrayLike) -> FloatArray:
     if load.shape != (6,):
         raise ValueError(f"transform_wrench: need 3 forces [N] and 3 torques [N m], got shape {load.shape}")
     force, torque = rotate(a_from_b, load.reshape(2, 3))
-    return np.concatenate([force, torque + np.cross(a_from_b.position, force)])
+    (x, y, z), (fx, fy, fz) = a_from_b.position.tolist(), force.tolist()
+    about_a = np.array([y * fz - z * fy, z * fx - x * fz, x * fy - y * fx])  # np.cross takes ten times as long
+    return np.concatenate([force, torque + about_a])
 
 
 def pose_difference(before: Pose, after: Pose) -> FloatArray:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -362,16 +362,23 @@ class GelPads(NotCopyable):
         housing = scene.gel.housing
         if housing is None or (np.abs(rows[3, :2]) + MM * self._reaches[index] <= half).all():
             return
-        share = np.linspace(-1.0, 1.0, RIM_POINTS)
-        sides = [np.stack([share, np.full(RIM_POINTS, s)], axis=1) for s in (-1.0, 1.0)]
-        rim = np.concatenate([*sides, *(side[:, ::-1] for side in sides)]) * half
-        depth = float(-self._distances(index, np.insert(rim, 2, -housing * MM, axis=1), rows).min())
+        rim = _rim_points(self.state.gel[index].half, -housing * MM)
+        depth = float(-self._distances(index, rim, rows).min())
         if depth > 0.0:
             raise ValueError(
                 f"the object of {self.names[index]} is wider than the gel and reaches {depth:.3g} mm into the housing "
                 f"around it, which is {millimetres(housing)} below the gel's surface and is not simulated: press with "
                 f"less force, give the pad a larger gel, or `housing: null` if there is none"
             )
+
+
+@lru_cache(maxsize=8)
+def _rim_points(half: tuple[float, float], z: float) -> Floats:
+    """(n, 3) around a gel, at a height [mm]."""
+    share = np.linspace(-1.0, 1.0, RIM_POINTS)
+    sides = [np.stack([share, np.full(RIM_POINTS, s)], axis=1) for s in (-1.0, 1.0)]
+    rim = np.concatenate([*sides, *(side[:, ::-1] for side in sides)]) * half
+    return np.insert(rim, 2, z, axis=1)
 
 
 def _reach(scene: Scene) -> float:

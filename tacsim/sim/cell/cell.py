@@ -208,7 +208,7 @@ class Cell:
 
     def normal_force(self, pad: str) -> float:
         """Positive when pressed [N]."""
-        return -float(self.wrench(pad)[2])
+        return -float(self._pad_wrenches()[list(self._pads).index(pad), 2])
 
     def surface(self, name: str) -> GelSurface:
         """The deformed surface of a pad's gel."""

@@ -103,6 +103,7 @@ if TYPE_CHECKING:
     from tacsim.optics.render import Renderer as Renderer
     from tacsim.optics.surface import surface_map as surface_map
     from tacsim.physics.failure.health import SimulationDiverged as SimulationDiverged
+    from tacsim.physics.grip.model import GripCommand as GripCommand
     from tacsim.physics.grip.model import HeldObject as HeldObject
     from tacsim.physics.grip.model import HeldStates as HeldStates
     from tacsim.physics.grip.model import Support as Support

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,7 @@ from tacsim.physics.exec.layout import FORCE_SUM, LIMIT_RELAXATION_RATE, OVERLAP
 from tacsim.physics.failure.health import Health, LaunchSpan, SimulationDiverged, check_launch
 from tacsim.physics.failure.tuning import MAX_COURANT, MAX_SPEED
 from tacsim.physics.gel.tuning import MIN_VOLUME_RATIO
+from tacsim.physics.motion.even import even_drive, mean_velocities
 from tacsim.physics.snapshot import State, copy_arrays, restore_arrays, snapshot_of
 from tacsim.physics.units import MM
 from tacsim.physics.worlds.base import NotCopyable
@@ -81,8 +82,8 @@ class GelPads(NotCopyable):
         self.substeps = max(1, wanted) if substeps is None else substeps
         if self.substeps < 1:
             raise ValueError(f"substeps is {substeps}; give at least 1, or None for {wanted}")
-        for world, params in zip(self.worlds, self.state.params, strict=True):
-            params[LIMIT_RELAXATION_RATE] = world.steady_limit_relaxation / gel.thickness
+        for index in range(len(scenes)):
+            self._write_limit_relaxation(index)
         self._reaches = [_reach(scene) for scene in self.scenes]
         self._poses: list[Floats | None] = [None] * len(scenes)  # (7,) of the object in each pad's frame
         self._wrenches, self._steps = np.zeros((len(scenes), 6)), np.zeros(len(scenes), np.int64)
@@ -90,6 +91,20 @@ class GelPads(NotCopyable):
 
     def __len__(self) -> int:
         return len(self.worlds)
+
+    def _write_limit_relaxation(self, index: int) -> None:
+        rate = self.worlds[index].steady_limit_relaxation / self.state.gel[index].thickness
+        self.state.params[index, LIMIT_RELAXATION_RATE] = rate
+
+    def replace(self, index: int, scene: Scene) -> None:
+        """Makes one pad a new one, of another scene on the same lattice. Raises ValueError; nothing is changed then."""
+        self.state.place(index, scene)
+        world = PressWorld(scene, self.state, index)
+        self.worlds = (*self.worlds[:index], world, *self.worlds[index + 1 :])
+        self.scenes = (*self.scenes[:index], scene, *self.scenes[index + 1 :])
+        self._reaches[index] = _reach(scene)
+        self._write_limit_relaxation(index)
+        self.reset(index)
 
     @property
     def wrenches(self) -> Floats:
@@ -124,7 +139,7 @@ class GelPads(NotCopyable):
         sums[:, 3:] /= MM
         self._wrenches = sums / self._last_substeps[:, None]
         self._poses, self._steps = list(ends), self._steps + 1
-        self._motions = _velocities(drive) * self.substeps * self._substep
+        self._motions = mean_velocities(drive) * self.substeps * self._substep
         for index in range(len(self)):
             if self._wrenches[index].any():
                 self.require_off_housing(index, drive[index, -1, 0])
@@ -202,17 +217,7 @@ class GelPads(NotCopyable):
 
     def _drive(self, starts: Floats, ends: Floats, substeps: int) -> NDArray[np.float32]:
         """Even motion of objects from one pose to another, both (k, 7), in kernel units (k, substeps, 1, 6, 3)."""
-        from scipy.spatial.transform import Rotation
-
-        time, share = self.substeps * self._substep, np.arange(1, substeps + 1) / substeps
-        before, after = Rotation.from_quat(starts[:, 3:]), Rotation.from_quat(ends[:, 3:])
-        shift, turn = (ends[:, :3] - starts[:, :3]) * MM, (after * before.inv()).as_rotvec()
-        drive = np.empty((len(ends), substeps, 1, 6, 3))
-        between = Rotation.from_rotvec((share[:, None] * turn[:, None]).reshape(-1, 3)).as_matrix()
-        drive[:, :, 0, :3] = between.reshape(len(ends), substeps, 3, 3) @ before.as_matrix()[:, None]
-        drive[:, :, 0, 3] = starts[:, None, :3] * MM + share[:, None] * shift[:, None]
-        drive[:, :, 0, 4], drive[:, :, 0, 5] = (shift / time)[:, None], (turn / time)[:, None]
-        return drive.astype(np.float32)
+        return even_drive(starts, ends, substeps, self.substeps * self._substep)
 
     @property
     def max_travel(self) -> float:
@@ -357,10 +362,8 @@ class GelPads(NotCopyable):
         housing = scene.gel.housing
         if housing is None or (np.abs(rows[3, :2]) + MM * self._reaches[index] <= half).all():
             return
-        share = np.linspace(-1.0, 1.0, RIM_POINTS)
-        sides = [np.stack([share, np.full(RIM_POINTS, s)], axis=1) for s in (-1.0, 1.0)]
-        rim = np.concatenate([*sides, *(side[:, ::-1] for side in sides)]) * half
-        depth = float(-self._distances(index, np.insert(rim, 2, -housing * MM, axis=1), rows).min())
+        rim = _rim_points(self.state.gel[index].half, -housing * MM)
+        depth = float(-self._distances(index, rim, rows).min())
         if depth > 0.0:
             raise ValueError(
                 f"the object of {self.names[index]} is wider than the gel and reaches {depth:.3g} mm into the housing "
@@ -369,19 +372,21 @@ class GelPads(NotCopyable):
             )
 
 
+@lru_cache(maxsize=8)
+def _rim_points(half: tuple[float, float], z: float) -> Floats:
+    """(n, 3) around a gel, at a height [mm]."""
+    share = np.linspace(-1.0, 1.0, RIM_POINTS)
+    sides = [np.stack([share, np.full(RIM_POINTS, s)], axis=1) for s in (-1.0, 1.0)]
+    rim = np.concatenate([*sides, *(side[:, ::-1] for side in sides)]) * half
+    return np.insert(rim, 2, z, axis=1)
+
+
 def _reach(scene: Scene) -> float:
     """Largest distance of a point of the object from its own origin [m], at most."""
     from tacsim.geometry.shapes import bounding_size
 
     assert scene.indenter is not None
     return float(np.linalg.norm(bounding_size(scene.indenter.geometry))) / 2
-
-
-def _velocities(drives: NDArray[np.float32]) -> Floats:
-    """(n, 6) velocity at the pads' origins and spin of the objects, in the middle of drives (n, substeps, 1, 6, 3)."""
-    ends = drives[:, [0, -1], 0, 3:].astype(np.float64)
-    (x, y, z), (vx, vy, vz), (rx, ry, rz) = (0.5 * (ends[:, 0] + ends[:, 1])).transpose(1, 2, 0)
-    return np.stack([vx - ry * z + rz * y, vy - rz * x + rx * z, vz - rx * y + ry * x, rx, ry, rz], axis=1)
 
 
 def _check_poses(poses: ArrayLike, count: int) -> Floats:

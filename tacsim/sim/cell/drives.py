@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -22,13 +23,12 @@ State = Mapping[str, NDArray[Any]]
 
 def site_pose(data: Any, site: int) -> Pose:
     """world_from_site, as MuJoCo has computed its frames last."""
-    return _pose_of(data.site_xpos[site], data.site_xmat[site])
+    return _pose_of(data.site_xpos[site].tobytes(), data.site_xmat[site].tobytes())
 
 
-def _pose_of(position: FloatArray, axes: FloatArray) -> Pose:
-    frame = np.eye(4)
-    frame[:3, :3], frame[:3, 3] = axes.reshape(3, 3), position
-    return se3.from_matrix(frame)
+@lru_cache(maxsize=256)  # each pose is asked several times a step
+def _pose_of(position: bytes, axes: bytes) -> Pose:
+    return se3.from_axes(np.frombuffer(position), np.frombuffer(axes).reshape(3, 3))
 
 
 class FreeDrive:

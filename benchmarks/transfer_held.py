@@ -18,7 +18,7 @@ from benchmarks.transfer import run_tacsim, set_options
 from tacsim.config import load_model
 from tacsim.models.policy import Training
 
-ROUNDS = 6  # of each training: 5,760 control steps
+ROUNDS = 4  # of each training: 3,840 control steps
 # Pictures are what one policy sees: 320 x 240 px of a sensor, four by four in one. The others see none.
 PICTURES = [
     f"sensors.{side}.model.geometry.{key}"

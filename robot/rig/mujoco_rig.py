@@ -9,18 +9,19 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.normaliser import normaliser_for_simulation
+from calibration.normaliser import normaliser_for_pictures, normaliser_for_simulation
 from robot.common.kinematics import MODELS, Kinematics, matrix
 from robot.rig import CannotOpen
 from robot.rig.sim_rig import make_gel_monitor, pose_error, renderer_and_noise
 from tacsim import pose as se3
 from tacsim.compute.threads import map_parallel, map_serial
 from tacsim.control import load_controller
-from tacsim.interface import FloatArray, Pose, RigSpec, SensorSpec, Truth
+from tacsim.interface import FloatArray, Normaliser, Pose, RigSpec, SensorSpec, Truth
 from tacsim.models.hardware import parts_of
 from tacsim.models.mujoco import MujocoArmConfig, MujocoGripperConfig, MujocoSensorConfig
 from tacsim.models.rig import RigConfig
 from tacsim.models.scene import Scene
+from tacsim.models.sensor import CanonicalGrid
 from tacsim.optics.surface import surface_map
 from tacsim.physics.grip.shared import GripPlace
 from tacsim.rig import Rig
@@ -127,7 +128,7 @@ def simulate_cell(
         arms=arms,
         clock=clock,
         normalisers={
-            name: normaliser_for_simulation(sensor.model, scene.gel_of(name).size[:2], config.canonical)
+            name: _make_normaliser(name, sensor, scene.gel_of(name).size[:2], config.canonical)
             for name, sensor in models.items()
         },
         reset=CellReset(scene_cell, clock, sensors, arm_of_gripper, touch_force, placement, pool, motion),
@@ -281,13 +282,24 @@ def _ur5e_joints(name: str, base_from_tool: Pose, length: float) -> FloatArray:
     return found
 
 
+def _make_normaliser(
+    name: str, sensor: MujocoSensorConfig, gel_size: tuple[float, float], grid: CanonicalGrid
+) -> Normaliser:
+    """Raises CannotOpen for a model whose pictures do not tell height and flow."""
+    make = normaliser_for_simulation if sensor.surface == "gel" else normaliser_for_pictures
+    try:
+        return make(sensor.model, gel_size, grid)
+    except ValueError as failure:
+        raise CannotOpen(f"sensors.{name}.surface is picture: {failure}") from failure
+
+
 def _make_sensor(
     scene_cell: SceneCell, clock: CellClock, name: str, config: MujocoSensorConfig, rig: RigConfig
 ) -> SimSensor:
     assert rig.scene is not None
     model = config.model
     spec = SensorSpec(model.image_shape, height=True, flow=model.markers is not None, arm=None, gripper=config.gripper)
-    sample = partial(surface_map, grid=rig.canonical, markers=model.markers)
+    sample = partial(surface_map, grid=rig.canonical, markers=model.markers) if config.surface == "gel" else None
     render, noise = renderer_and_noise(model, name, rig.scene)
     return SimSensor(scene_cell, clock, f"{config.gripper}/{config.side}", spec, render, sample, noise, config.delay)
 

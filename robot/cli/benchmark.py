@@ -1,4 +1,5 @@
-"""The benchmark of policies: `tacsim benchmark run`, `verify`, `compare`, `table`, `tasks`, `draw`, `fit-blind`."""
+"""The benchmark of policies: `tacsim benchmark run`, `verify`, `compare`, `table`, `rank`, `tasks`,
+`draw`, `fit-blind`."""
 
 from __future__ import annotations
 
@@ -226,6 +227,47 @@ def table(
     print_json({"rows": rows})
 
 
+def rank(
+    folder: Annotated[Path, typer.Argument(exists=True, file_okay=False, help="Folder with score files.")],
+    other: Annotated[
+        Path | None,
+        typer.Argument(exists=True, file_okay=False, help="Folder with those of the twin.", show_default="the same"),
+    ] = None,
+    split: Annotated[str, typer.Option(help="Split in simulation.")] = "test",
+    other_split: Annotated[str, typer.Option(help="Split of the twin.")] = "shift-all",
+    out: Annotated[Path | None, typer.Option(help="Draw the figure here (PNG).", show_default=False)] = None,
+) -> None:
+    """Compare the order of policies in simulation with their order on a twin: Spearman's and Kendall's correlation.
+
+    Example: tacsim benchmark rank runs/benchmark --out ranking.png
+    """
+    from robot.train.benchmark.rank import draw_ranking, rank_policies
+    from robot.train.benchmark.score import find_scores
+
+    with _refuse_edited_scores():
+        here, there = ([score for _, score in find_scores(each)] for each in (folder, other or folder))
+    found = rank_policies(
+        [each for each in here if each.split == split], [each for each in there if each.split == other_split]
+    )
+    for each in found:
+        rows = [(pair.policy, str(pair.episodes), *map(_percent, pair.success)) for pair in each.pairs]
+        show_table(each.task, ("policy", "episodes", f"{split} [%]", f"{other_split} [%]"), rows, left={0})
+    rows = [
+        (each.task, measure, str(len(each.pairs)), *map(_correlation, (order.spearman, order.kendall)), violation)
+        for each in found
+        for measure, order, violation in (
+            ("success", each.by_success, f"{100 * each.by_success.violation:.1f} %"),
+            ("distance", each.by_distance, _millimetres(each.by_distance.violation)),
+        )
+    ]
+    columns = ("task", "order by", "policies", "Spearman", "Kendall", "mean largest violation")
+    show_table("95 % intervals by a bootstrap over episodes", columns, rows, left={0, 1})
+    if out is not None:
+        draw_ranking(found, out, (split, other_split))
+        print_files(out)
+    print_json({"rankings": found}, [] if out is None else [out])
+
+
 def draw(
     task: Annotated[str, typer.Argument(metavar="TASK.yaml", help="Path of a task file.")],
     episodes: Annotated[int, typer.Option(min=2, max=10_000, help="Of each split.")] = 200,
@@ -305,6 +347,10 @@ def _percent(interval: Interval) -> str:
 def _interval(interval: Interval, scale: float, digits: int) -> str:
     value, low, high = (f"{scale * number:.{digits}f}" for number in (interval.value, interval.low, interval.high))
     return f"{value} ({low} to {high})"
+
+
+def _correlation(interval: Interval | None) -> str:
+    return "–" if interval is None else _interval(interval, 1, 2)
 
 
 def _millimetres(distance: float | None) -> str:

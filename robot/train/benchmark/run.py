@@ -49,7 +49,7 @@ def new_score(split: Split, policy: str, subset: Subset) -> Score:
         split_sha256=split.sha256,
         sensors_sha256=split.sensors_sha256,
         physics=physics(),
-        machine=machine(),
+        machine=machine(config.clock),
         number=subset_size(subset, len(split.episodes)),
     )
 

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from robot.train.benchmark.compare import Row
     from robot.train.benchmark.score import Score
     from robot.train.evaluate import Interval
+    from tacsim.models.task import Unit
 
 benchmark = typer.Typer(
     no_args_is_help=True, help="Rank policies: frozen episodes, scores with hashes, paired comparison (version v1)."
@@ -155,11 +156,11 @@ def verify(
             *["states"] * (not check.same_states),
             *["numbers in the file"] * (check.same_states and not check.same_numbers),
         ]
-        recorded, now = check.recorded, check.found
+        recorded, now, unit = check.recorded, check.found, found.score.unit
         warn(
             f"episode {check.episode}: {', '.join(what) or 'numbers'} differ; in the file a distance of "
-            f"{_millimetres(recorded.distance)}, here {_millimetres(now.distance)}; success {recorded.success} and "
-            f"{now.success}"
+            f"{_distance(recorded.distance, unit)}, here {_distance(now.distance, unit)}; success "
+            f"{recorded.success} and {now.success}"
         )
     for words in found.differences:
         notes.print(f"differs from where it was computed: {words}")
@@ -199,7 +200,7 @@ def compare(first: ScoreFile, second: ScoreFile) -> None:
     columns = ("episodes", "both", f"{one.policy} alone", f"{two.policy} alone", "neither", "p (McNemar, exact)")
     show_table(f"{found.episodes} episodes of {one.task}, {one.split}", columns, rows, left={0})
     if found.difference is not None:
-        results.print(f"distance of {one.policy} minus that of {two.policy}: {_interval(found.difference, 1e3, 3)} mm")
+        results.print(f"distance of {one.policy} minus that of {two.policy}: {_with_unit(found.difference, one.unit)}")
     print_json(found)
 
 
@@ -257,7 +258,7 @@ def rank(
         for each in found
         for measure, order, violation in (
             ("success", each.by_success, f"{100 * each.by_success.violation:.1f} %"),
-            ("distance", each.by_distance, _millimetres(each.by_distance.violation)),
+            ("distance", each.by_distance, each.unit.show(each.by_distance.violation)),
         )
     ]
     columns = ("task", "order by", "policies", "Spearman", "Kendall", "mean largest violation")
@@ -315,7 +316,7 @@ def _refuse_edited_scores() -> Iterator[None]:
 
 
 _COLUMNS = [
-    "task", "split", "policy", "episodes", "success [%]", "safe [%]", "distance [mm]", "normalised",
+    "task", "split", "policy", "episodes", "success [%]", "safe [%]", "distance", "normalised",
     "peak force [N]", "steps to goal", "outside [%]",
 ]  # fmt: skip
 
@@ -328,7 +329,7 @@ def _cells(row: Row) -> list[str]:
         f"{row.episodes}{'' if row.complete else ' (not complete)'}",
         _percent(row.success),
         _percent(row.safe_success),
-        "–" if row.distance is None else _interval(row.distance, 1e3, 3),
+        "–" if row.distance is None else _with_unit(row.distance, row.unit),
         "–" if row.normalised is None else f"{row.normalised:.2f}",
         f"{row.peak_force:.1f}",
         "–" if row.steps != row.steps else f"{row.steps:.0f}",
@@ -353,5 +354,9 @@ def _correlation(interval: Interval | None) -> str:
     return "–" if interval is None else _interval(interval, 1, 2)
 
 
-def _millimetres(distance: float | None) -> str:
-    return "–" if distance is None else f"{1e3 * distance:.6g} mm"
+def _with_unit(interval: Interval, unit: Unit) -> str:
+    return f"{_interval(interval, unit.factor, 3)} {unit.symbol}"
+
+
+def _distance(distance: float | None, unit: Unit) -> str:
+    return "–" if distance is None else f"{unit.factor * distance:.6g} {unit.symbol}"

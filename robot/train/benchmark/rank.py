@@ -13,6 +13,7 @@ from robot.train.benchmark.compare import NotComparable
 from robot.train.benchmark.score import Score
 from robot.train.evaluate import Interval, wilson_interval
 from tacsim.interface import FloatArray
+from tacsim.models.task import Unit
 
 MIN_POLICIES = 3  # fewer have hardly an order
 DRAWS = 2000  # of the bootstrap
@@ -43,9 +44,10 @@ class Ranking:
     """One task."""
 
     task: str
+    unit: Unit  # in which distances are shown
     pairs: tuple[Pair, ...]
     by_success: Correlation
-    by_distance: Correlation  # of the mean distance at the end; it has no ties [its violation in m]
+    by_distance: Correlation  # of the mean distance at the end; it has no ties
 
 
 def rank_policies(first: Sequence[Score], second: Sequence[Score]) -> list[Ranking]:
@@ -93,6 +95,7 @@ def _rank_task(task: str, scores: Sequence[tuple[Score, Score]]) -> Ranking:
     ]
     return Ranking(
         task=task,
+        unit=scores[0][0].unit,
         pairs=tuple(sorted(pairs, key=lambda pair: -pair.success[0].value)),
         by_success=_correlate(success),
         by_distance=_correlate(-distance),

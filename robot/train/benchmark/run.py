@@ -41,6 +41,7 @@ def new_score(split: Split, policy: str, subset: Subset) -> Score:
     assert config.task is not None
     return Score(
         task=split.task_name,
+        kind=config.task.kind,
         split=split.name,
         subset=subset,
         policy=policy,

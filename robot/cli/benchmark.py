@@ -262,7 +262,7 @@ def rank(
         )
     ]
     columns = ("task", "order by", "policies", "Spearman", "Kendall", "mean largest violation")
-    show_table("95 % intervals by a bootstrap over episodes", columns, rows, left={0, 1})
+    show_table("95 % intervals by a bootstrap over episodes", columns, rows, left={0, 1}, width=170)
     if out is not None:
         draw_ranking(found, out, (split, other_split))
         print_files(out)

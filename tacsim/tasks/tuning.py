@@ -11,6 +11,9 @@ MAX_PRESSURE_SHARE = 0.9
 CLOSING_STEPS = 30.0  # of the teacher: it takes so large a part of the height that is left in each control step
 ARRIVAL_SHARE = 0.2  # of max_step: so near to where it goes, the scripted policy turns
 
+BALL_HEIGHT_SHARE = 0.9  # of a ball's diameter, to which the gels close: 0.83 and 1 leave more (8 bodies, 160 steps)
+BALL_CIRCLE_SHARE = 0.8  # of a ball's diameter: radius of the circle on which it is rolled
+
 # lengthen.py
 LENGTH_RULE = (0.93e-3, 0.2454, 0.7268)  # [m, -, -] of 16 training draws, from 8 steps on; deviation 0.66 mm
 MIN_LENGTH_SHARE = 0.2  # of the sensors' way that the body is taken to grow; it grows by 0.3 to 1.1 of it

@@ -14,9 +14,9 @@ from tacsim.physics.exec.layout import FORCE, OVERLAP, STEP
 from tacsim.physics.failure.health import Health, LaunchSpan, SimulationDiverged, check_launch
 from tacsim.physics.grip import layout
 from tacsim.physics.grip.frames import PadMotions
-from tacsim.physics.grip.poses import matrices_of
 from tacsim.physics.grip.state import GripState
 from tacsim.physics.grip.tuning import MESH_MARGIN, QUIET_TIME
+from tacsim.physics.motion.even import matrices_of
 from tacsim.physics.snapshot import State, copy_arrays
 from tacsim.physics.worlds.pads import GelPads
 from tacsim.physics.worlds.press import MESH_ADVICE

@@ -23,7 +23,6 @@ from tacsim.physics.grip.poses import (
     checked_poses,
     half_widths,
     in_mm,
-    matrices_of,
     max_closings,
     relative_rows,
     z_axes,
@@ -41,6 +40,7 @@ from tacsim.physics.grip.tuning import (
     SETTLED_TOLERANCE,
     SHORT_MOTION,
 )
+from tacsim.physics.motion.even import matrices_of
 from tacsim.physics.units import MM
 
 Floats = NDArray[np.float64]

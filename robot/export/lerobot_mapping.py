@@ -2,7 +2,8 @@
 
 | feature                         | what                                                               |
 |---------------------------------|--------------------------------------------------------------------|
-| `observation.state`             | (n,) f32: poses relative to reset, wrenches, low-dimensional touch |
+| `observation.state`             | (n,) f32: poses relative to reset, wrenches, touch, goal of a task |
+| `observation.environment_state` | (k,) f32: of the state what is no pose of an arm, if wanted        |
 | `observation.images.{sensor}`   | (H, W, 3) u8: the canonical picture                                |
 | `observation.height.{sensor}`   | (h, w) f32 [m], if the sensor measures it                          |
 | `observation.gradient.{sensor}` | (h, w, 2) f32 [-], if the sensor measures it                       |
@@ -30,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tacsim.gym.features import PARTS, SCALES, FeatureEncoder, decode_pose_change, encode_pose_change
-from tacsim.interface import Action, IncompatibleRig, Observation, Pose, RigSpec
+from tacsim.interface import Action, IncompatibleRig, Needs, Observation, Pose, RigSpec
 from tacsim.limits import ActionError
 from tacsim.models.policy import Features, Numbers, Quantity
 from tacsim.models.sensor import CanonicalGrid
@@ -40,8 +41,10 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 Row = dict[str, NDArray[Any]]
+Goal = float | tuple[float, ...] | None  # of a task [m]
 
 STATE, ACTION, REWARD, DONE = "observation.state", "action", "next.reward", "next.done"
+ENVIRONMENT = "observation.environment_state"
 IMAGE = "observation.images."
 MAPS = {"height": "observation.height.", "gradient": "observation.gradient.", "flow": "observation.flow."}
 MAP_AXES = ("rows", "columns", "xy")
@@ -70,35 +73,62 @@ class LeRobotMapping:
     each episode.
 
     maps: include heights, gradients and flow.
+    goal: of the task [m], the last numbers of the state, as policies such as ACT read no words; None without a task.
+    environment: give what is no pose of an arm (touch, goal) as the state of the environment too, with which LeRobot's
+        ACT needs no pictures.
 
     Raises:
         IncompatibleRig: the rig has no sensor or no arm, or a name that LeRobot does not allow.
     """
 
-    def __init__(self, spec: RigSpec, canonical: CanonicalGrid, *, maps: bool = True) -> None:
+    def __init__(
+        self,
+        spec: RigSpec,
+        canonical: CanonicalGrid,
+        *,
+        maps: bool = True,
+        goal: Goal = None,
+        environment: bool = False,
+    ) -> None:
         for kind, names in (("sensor", tuple(spec.sensors)), ("arm", spec.arms)):
             if not names:
                 raise IncompatibleRig(f"no {kind}: LeRobot's policies learn from pictures and actions of arms")
             for name in names:
                 if "/" in name:
                     raise IncompatibleRig(f"{kind} '{name}': LeRobot allows no '/' in names; rename it in the rig file")
-        self._maps = maps
+        self._maps, self._has_environment = maps, environment
+        self.set_goal(goal)
         self._encoder = FeatureEncoder(_sensor_features(spec), canonical)
         self._start: dict[str, Pose] = {}
         self._targets: dict[str, Pose] = {}
 
     @property
+    def needs(self) -> Needs:
+        """What an observation must have."""
+        return self._encoder.needs
+
+    @property
     def state(self) -> Numbers:
         """Names and scales of the numbers of `observation.state`."""
         found, targets = self._encoder.inputs["touch"], set(self.action.names)
-        names = (name + DRIVEN if name + DRIVEN in targets else name + OTHER for name in found.names)
-        return Numbers(names=tuple(names), scales=found.scales)
+        names = [name + DRIVEN if name + DRIVEN in targets else name + OTHER for name in found.names]
+        names += [f"goal_{number}{OTHER}" for number in range(len(self._goal))]
+        return Numbers(names=tuple(names), scales=(*found.scales, *[SCALES["goal"]] * len(self._goal)))
 
     @property
     def action(self) -> Numbers:
         """Names and scales of the numbers of `action`."""
         parts = [(f"{part}_{arm}{DRIVEN}", SCALES[kind]) for arm in self._encoder.features.arms for part, kind in _POSE]
         return Numbers(names=tuple(name for name, _ in parts), scales=tuple(scale for _, scale in parts))
+
+    @property
+    def environment(self) -> tuple[str, ...]:
+        """Names of the numbers of the state that are no pose of an arm."""
+        return tuple(name for name in self.state.names if name.endswith(OTHER))
+
+    def set_goal(self, goal: Goal) -> None:
+        """The goal [m] of the next observations; it has as many numbers as that of the constructor."""
+        self._goal = np.atleast_1d(np.asarray(() if goal is None else goal, np.float32) / np.float32(SCALES["goal"]))
 
     def begin(self, observation: Observation) -> Row:
         """Starts an episode: the row of its first observation."""
@@ -141,11 +171,13 @@ class LeRobotMapping:
     def _feature(self, key: str, value: NDArray[Any]) -> Feature:
         if key.startswith(IMAGE):
             return Feature("image", value.shape, ("height", "width", "channels"))
-        names = {STATE: self.state.names, ACTION: self.action.names}.get(key)
+        names = {STATE: self.state.names, ACTION: self.action.names, ENVIRONMENT: self.environment}.get(key)
         return Feature(value.dtype.name, value.shape, MAP_AXES[: value.ndim] if value.ndim > 1 else names)
 
     def _make_row(self, observation: Observation, state: NDArray[Any]) -> Row:
-        row: Row = {STATE: state}
+        row: Row = {STATE: np.concatenate([state, self._goal])}
+        if self._has_environment:
+            row[ENVIRONMENT] = row[STATE][[name.endswith(OTHER) for name in self.state.names]]
         row |= {IMAGE + name: touch.image for name, touch in observation.tactile.items()}
         for kind, key in MAPS.items() if self._maps else ():
             found = {key + name: getattr(touch, kind) for name, touch in observation.tactile.items()}
@@ -179,7 +211,7 @@ def frames_per_second(period: float) -> int | float:
     return round(rate) if abs(rate - round(rate)) <= 1e-3 * rate else rate
 
 
-def task_in_words(kind: str | None, goal: float | tuple[float, ...] | None) -> str:
+def task_in_words(kind: str | None, goal: Goal) -> str:
     """Description of a task with this goal [m], for policies that read language."""
     goal = () if goal is None else goal if isinstance(goal, tuple) else (goal,)
     sizes = [f"{1e3 * size:g} mm" for size in goal]

@@ -31,6 +31,7 @@ from tacsim.models.rig import RigConfig
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.models.task import TaskConfig
 from tacsim.rig import Rig
+from tacsim.tasks import make_task
 
 Values = dict[str, float | NDArray[np.uint8]]
 
@@ -92,7 +93,8 @@ class LeRobotRig:
         self.config = rig if isinstance(rig, RigConfig) else load_with_task(rig, task, overrides).config
         if fps is not None:
             require_rate(self.config, fps)
-        self._mapping = LeRobotMapping(rig_spec(self.config), self.config.canonical, maps=False)
+        goal = None if self.config.task is None else make_task(self.config.task).goal
+        self._mapping = LeRobotMapping(rig_spec(self.config), self.config.canonical, maps=False, goal=goal)
         self._rig: Rig | None = None
         self._poses: Mapping[str, Pose] = {}  # the last measured ones
         self._has_observed = False  # since the last action

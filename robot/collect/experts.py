@@ -16,6 +16,7 @@ from robot.collect.workers import SetError
 from robot.common.whole_file import write_whole
 from robot.deploy.control_loop import versions
 from robot.export.lerobot import export_lerobot
+from robot.export.lerobot_mapping import IMAGE
 from robot.open import load_with_task
 from tacsim.config import load_model
 from tacsim.models.benchmark import TEST_SPLIT, BenchmarkTask
@@ -45,9 +46,13 @@ def write_expert_data(
     is there already, of as many episodes, stays. Raises SetError, and the errors of `export_lerobot`."""
     recordings, data = sorted((folder / RECORDINGS).glob("*.mcap")), folder / DATA_SET
     if data.exists():
-        there = json.loads((data / "meta/info.json").read_text(encoding="utf-8"))["total_episodes"]
-        if there != len(recordings):
-            raise SetError(f"{data} has {there} episodes, {len(recordings)} are recorded: delete it, then repeat")
+        there = json.loads((data / "meta/info.json").read_text(encoding="utf-8"))
+        episodes, has_pictures = there["total_episodes"], any(key.startswith(IMAGE) for key in there["features"])
+        if episodes != len(recordings) or has_pictures != pictures:
+            raise SetError(
+                f"{data} has {episodes} episodes with{'' if has_pictures else 'out'} pictures, now these are "
+                f"{len(recordings)} with{'' if pictures else 'out'}: delete it, then repeat"
+            )
     else:
         export_lerobot(recordings, data, maps=False, environment=True, pictures=pictures, on_step=on_step)
     digest = hash_data(data)
@@ -83,9 +88,11 @@ def _card(task: str, recordings: list[Path], data: Path, command: str, digest: s
         f"| `{key}` | {json.dumps(each.model_dump(mode='json', exclude_none=True))} |"
         for key, each in known.values.items()
     )
+    # `datasets` stores what it has read by the names of folder and configuration, whatever the files are: with the hash
+    # in the name no other set of that folder name is taken for this one.
     return f"""---
 configs:
-- config_name: default
+- config_name: {name}-{digest[:12]}
   data_files:
   - split: train
     path: data/*/*.parquet

@@ -125,7 +125,12 @@ def test_a_data_set_of_experts_has_a_card_and_a_hash(tmp_path: Path) -> None:
     found, again = (json.loads(each.stdout) for each in (first, second))
     assert found["sha256"] == again["sha256"] == hash_data(Path("one/lerobot"))
     card = Path("one/lerobot/README.md").read_text()
-    assert found["sha256"] in card and "path: data/*/*.parquet" in card and "reaches the goal in" in card
+    assert (
+        found["sha256"] in card
+        and f"config_name: small-{found['sha256'][:12]}" in card
+        and "path: data/*/*.parquet" in card
+        and "reaches the goal in" in card
+    )
     info = json.loads(Path("one/lerobot/meta/info.json").read_text())
     state, environment = (info["features"][f"observation.{key}"]["names"] for key in ("state", "environment_state"))
     assert info["total_episodes"] == 2 and state[-1] == "goal_0.vel"
@@ -136,5 +141,5 @@ def test_a_data_set_of_experts_has_a_card_and_a_hash(tmp_path: Path) -> None:
     shutil.rmtree("one/lerobot")
     assert tacsim(*words, "--no-pictures", "--out", "one").exit_code == 0
     assert "observation.images.lower" not in Path("one/lerobot/meta/info.json").read_text()
-    more = tacsim(*words[:4], "3", *words[5:], "--out", "one")
-    assert more.exit_code == 2 and "has 2 episodes, 3 are recorded" in " ".join(more.output.split())
+    more = tacsim(*words[:4], "3", *words[5:], "--no-pictures", "--out", "one")
+    assert more.exit_code == 2 and "2 episodes without pictures, now these are 3" in " ".join(more.output.split())

@@ -49,7 +49,7 @@ class DynamicMotion:
         cell.refresh()
 
     def advance_together(self, periods: Sequence[CellPeriod]) -> list[PeriodError | None]:
-        """See CellMotion. One after the other: MuJoCo and the coupling take most of the time, not the launches."""
+        """See CellMotion. One after the other: gel pads of a batch advance all together or not at all (GelPads)."""
         failures: list[PeriodError | None] = [None] * len(periods)
         for number, period in enumerate(periods):
             try:

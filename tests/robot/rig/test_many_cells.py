@@ -50,7 +50,7 @@ def test_a_batch_of_grips_gives_the_bits_of_cells_apart(mode: str, motion: str) 
     apart = SyncVectorEnv([partial(make_env, **options)] * number, autoreset_mode=AutoresetMode(mode))
     assert_equal(batched.reset(seed=7), apart.reset(seed=7))
     played, ended, dropped = set(), 0, 0
-    for _ in range(12):
+    for _ in range(16):
         given = wander(random, number)
         given[0, 1] = -1.0  # lets go
         found, wanted = batched.step(given), apart.step(given)

@@ -18,6 +18,15 @@ BALL_CIRCLE_SHARE = 0.8  # of a ball's diameter: radius of the circle on which i
 LENGTH_RULE = (0.93e-3, 0.2454, 0.7268)  # [m, -, -] of 16 training draws, from 8 steps on; deviation 0.66 mm
 MIN_LENGTH_SHARE = 0.2  # of the sensors' way that the body is taken to grow; it grows by 0.3 to 1.1 of it
 
+# relief.py
+MIN_RELIEF_FORCE = 0.05  # of the upper gel: a light touch [N]
+RELIEF_CLEARANCE = 0.8e-3  # above the body while the sensor moves sideways [m]
+TOUCH_STEP = 0.05e-3  # of the sensor close to the surface [m]
+RELIEF_TOLERANCE = 0.07e-3  # a dent that lacks less is deep enough [m]
+FIRST_EXCESS = 0.25e-3  # by which the first press of a dent goes deeper than its goal [m]
+ONLY_EXCESS = 0.6e-3  # the same where no other follows: 5 of 16 training draws of the benchmark; 0.9e-3: 2 [m]
+MAX_PRESSES = 6  # of a dent at one visit
+
 # reposition.py
 MIN_FORCE = 0.01  # a smaller normal force counts as no contact [N]
 ARRIVAL_DISTANCE = 0.02e-3  # the scripted policy holds when its estimate is this close to the goal [m]

@@ -11,7 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from robot.open import load_with_task, open_rig
 from tacsim import Task, Truth, evaluate_outcome, load_task, make_task
+from tacsim.gym.features import FeatureEncoder
 from tacsim.interface import ArmState, GripperState, Observation, Pose, TactileObservation
+from tacsim.models.policy import Features
+from tacsim.models.sensor import CanonicalGrid
 from tacsim.models.task import HoldConfig, TurnConfig
 from tacsim.tasks import GoalOutOfReach
 from tacsim.tasks.rigid import slip_of, turn_in_grip
@@ -134,7 +137,31 @@ def test_the_turn_is_seen_by_the_edges_in_the_gel_past_a_quarter_turn() -> None:
     for angle in np.radians(np.arange(0.0, 121.0, 10.0)):
         assert estimate(edge_seen(angle)) == pytest.approx(angle, abs=math.radians(1.0))
     blank = edge_seen(0.0).tactile["left"]
+    assert estimate(Observation({"left": replace(blank, contact=~blank.contact)}, {}, 0.0)) == pytest.approx(
+        math.radians(120.0), abs=math.radians(1.0)
+    )
     assert TurnEstimate()(Observation({"left": replace(blank, contact=~blank.contact)}, {}, 0.0)) is None
+
+
+def test_a_learned_policy_sees_the_turn_of_the_edges_with_its_sign() -> None:
+    asked = FeatureEncoder(
+        Features(sensors=("left",), arms=(), maps=(), touch=("turned",), goal=False, frames=2), CanonicalGrid()
+    )
+    assert asked.needs.height and asked.inputs["touch"].names == ("turned_left -1", "turned_left")
+    assert asked.begin(edge_seen(0.3))["touch"].tolist() == [0.0, 0.0]
+    for angle in (0.9, 1.5, 2.1):  # past a quarter turn
+        seen = asked(edge_seen(angle))["touch"]
+    assert seen == pytest.approx([2.4, 3.6], abs=0.04)  # over 0.5 rad
+    assert asked.begin(edge_seen(0.3))["touch"].tolist() == [0.0, 0.0]  # another episode
+    assert asked(edge_seen(-0.2))["touch"][1] == pytest.approx(-1.0, abs=0.04)
+
+
+def test_the_teacher_of_a_turn_goes_on_from_the_force_that_there_is() -> None:
+    turn, grips = task("turn"), {"hand": GripperState(0.02, 2.0, 0.0)}
+    for policy, force in ((turn.teacher(), 2.0), (turn.scripted(), turn.config.touch_force)):
+        policy.reset()
+        target = policy(replace(edge_seen(0.0), grippers=grips)).grippers["hand"]
+        assert target is not None and target.force == pytest.approx(0.95 * force)
 
 
 @pytest.mark.slow

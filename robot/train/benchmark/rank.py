@@ -176,7 +176,7 @@ def draw_ranking(rankings: Sequence[Ranking], path: Path, names: tuple[str, str]
     """
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(7.0, 5.2), layout="constrained")
+    figure = Figure(figsize=(7.6, 5.2), layout="constrained")
     axes = figure.subplots()
     axes.plot([0, 100], [0, 100], color="#bbbbbb", linewidth=1, zorder=0)
     policies = list(dict.fromkeys(pair.policy for ranking in rankings for pair in ranking.pairs))
@@ -203,7 +203,7 @@ def draw_ranking(rankings: Sequence[Ranking], path: Path, names: tuple[str, str]
     axes.set_ylabel(f"success, {names[1]} [%]")
     axes.set_xlim(-4, 104)
     axes.set_ylim(-4, 104)
-    axes.set_aspect("equal")
+    axes.set_box_aspect(1)
     figure.legend(loc="outside right upper", fontsize=8, frameon=False)
     figure.savefig(path, dpi=110)
 

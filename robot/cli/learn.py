@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from robot.cli.options import Out, Overrides, TrainingFile, complete_names, require_packages
+from robot.cli.options import Out, Overrides, RayCluster, TrainingFile, complete_names, require_packages
 from robot.cli.output import (
     busy,
     choose_json_file,
@@ -66,6 +66,7 @@ def train(
             "--processes", min=1, help="Processes that simulate; the policy does not depend on it. One a core."
         ),
     ] = None,
+    ray: RayCluster = None,
     set_: Overrides = None,
     out: Out = None,
 ) -> None:
@@ -77,6 +78,10 @@ def train(
     Example: tacsim train squeeze --out runs/squeeze-0
     """
     require_packages("tacsim train", "train", *TRAINING)
+    if ray is not None:
+        from robot.common.cluster import require_cluster
+
+        require_cluster(ray)
     if tensorboard:
         _require_tensorboard()
     own = [f"algorithm={algorithm}"] * (algorithm is not None) + [f"seed={seed}"] * (seed is not None) + (set_ or [])
@@ -104,16 +109,19 @@ def train(
             from robot.train.train import begin_run
 
             run = begin_run(training, folder)
+    from robot.common.cluster import ClusterError
+    from robot.rig.env_workers import WorkerFailed
     from tacsim.tasks.task import BadDraws
 
     try:
-        path, rounds = _run_training(run, tensorboard, processes)
+        path, rounds = _run_training(run, tensorboard, processes, ray)
     except BadDraws:
         if run.load_checkpoint()[0]:
             notes.print(f"The last checkpoint is kept. Write it as a file: tacsim export policy {run.folder}")
         raise
-    except (KeyboardInterrupt, OSError):
-        notes.print(f"The last checkpoint is kept. Continue: tacsim train --resume {run.folder}")
+    except (KeyboardInterrupt, OSError, WorkerFailed, ClusterError):
+        where = "" if ray is None else f" --ray {ray}"
+        notes.print(f"The last checkpoint is kept. Continue: tacsim train --resume {run.folder}{where}")
         raise
     print_files(path, run.folder / "curve.png", run.folder / "curve.json")
     print_json({"rounds": rounds}, [path, run.folder / "curve.png", run.folder / "curve.json"])
@@ -137,7 +145,9 @@ def _require_logged(algorithm: str, tensorboard: bool) -> None:
         )
 
 
-def _run_training(run: RunFolder, tensorboard: bool, processes: int | None) -> tuple[Path, list[Mapping[str, float]]]:
+def _run_training(
+    run: RunFolder, tensorboard: bool, processes: int | None, cluster: str | None
+) -> tuple[Path, list[Mapping[str, float]]]:
     """Trains; returns the file of the policy and the figures of each round."""
     from robot.train.train import train as continue_training
     from tacsim.models.task import unit_of
@@ -155,7 +165,7 @@ def _run_training(run: RunFolder, tensorboard: bool, processes: int | None) -> t
         )
 
     with one_bar("starting") as bar:
-        return continue_training(run, bar.report, print_result, warn, tensorboard, processes), rounds
+        return continue_training(run, bar.report, print_result, warn, tensorboard, processes, cluster), rounds
 
 
 def policy(

@@ -23,6 +23,7 @@ from tacsim.models.rig import RigConfig
 from tacsim.models.scene import Scene
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.optics.surface import surface_map
+from tacsim.physics.grip.shared import GripPlace
 from tacsim.rig import Rig
 from tacsim.sim.arm import SimArm, wrench_noise_source
 from tacsim.sim.cell.arm import CellArm
@@ -91,9 +92,11 @@ def open_mujoco(config: RigConfig, check: Callable[[RigSpec], None] | None = Non
     return simulation.rig
 
 
-def simulate_cell(config: RigConfig, pool: StatePool | None = None, *, parallel: bool = True) -> CellSimulation:
-    """A rig in MuJoCo whose cell is made when it is first needed; arguments as of `simulate` (sim_rig.py). Raises
-    CannotOpen, also where MuJoCo is missing."""
+def simulate_cell(
+    config: RigConfig, pool: StatePool | None = None, place: GripPlace | None = None, *, parallel: bool = True
+) -> CellSimulation:
+    """A rig in MuJoCo whose cell is made when it is first needed; place: of its grip among those of others, where it
+    rests in each period; the rest as of `simulate` (sim_rig.py). Raises CannotOpen, also where MuJoCo is missing."""
     scene = _require_scene(config)
     try:
         load_mujoco()
@@ -105,7 +108,7 @@ def simulate_cell(config: RigConfig, pool: StatePool | None = None, *, parallel:
     carriers = _carriers_of(config, gripper_configs, models)
     described = {name: _describe_gripper(gripper, scene) for name, gripper in gripper_configs.items()}
     motion = MOTIONS[config.motion]
-    scene_cell = SceneCell(scene, partial(_make_cell, config, described))
+    scene_cell = SceneCell(scene, partial(_make_cell, config, described, place))
     frames = {name: f"{sensor.gripper}/{sensor.side}" for name, sensor in models.items()}
     clock = CellClock(scene_cell, config.period, motion, {frame: name for name, frame in frames.items()})
     sensors = {name: _make_sensor(scene_cell, clock, name, sensor, config) for name, sensor in models.items()}
@@ -234,7 +237,9 @@ def _describe_gripper(gripper: MujocoGripperConfig, scene: Scene) -> GripperDesc
     )
 
 
-def _make_cell(config: RigConfig, grippers: Mapping[str, GripperDescription], scene: Scene) -> Cell:
+def _make_cell(
+    config: RigConfig, grippers: Mapping[str, GripperDescription], place: GripPlace | None, scene: Scene
+) -> Cell:
     """Raises what `Cell` raises."""
     arms: dict[str, ArmDescription] = {}
     starts: dict[str, Pose] = {}
@@ -246,8 +251,9 @@ def _make_cell(config: RigConfig, grippers: Mapping[str, GripperDescription], sc
         name: ViewDescription(view.position, view.target, view.field_of_view, view.size)
         for name, view in config.cameras.items()
     }
-    make = Cell if config.motion == "dynamic" else RestingCell
-    return make(scene, arms, grippers, views, starts)
+    if config.motion == "dynamic":
+        return Cell(scene, arms, grippers, views, starts)
+    return RestingCell(scene, arms, grippers, views, starts, place)
 
 
 def _describe_arm(name: str, arm: MujocoArmConfig, gripper: GripperDescription, start: Pose) -> ArmDescription:

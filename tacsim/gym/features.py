@@ -340,7 +340,8 @@ def _depths(touch: TactileObservation) -> FloatArray:
     """(2,) greatest depth, and mean depth where there is contact [m]; 0 without contact."""
     height = _require_height(touch)
     greatest = height.max(where=touch.valid, initial=0.0)
-    mean = height.mean(where=touch.contact) if touch.contact.any() else 0.0
+    touching = height[touch.contact]  # `mean(where=...)` takes three times as long
+    mean = touching.mean() if touching.size else 0.0
     return np.array([greatest, mean])
 
 

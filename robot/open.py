@@ -213,17 +213,22 @@ def make_vector_env(
     return open_vector_env(episodes, num_envs, render_mode, autoreset_mode, _resolve_features(features, episodes[0][0]))
 
 
-def make_sharded_env(num_envs: int, *arguments: Any, processes: int | None = None, **options: Any) -> ShardedVectorEnv:
+def make_sharded_env(
+    num_envs: int, *arguments: Any, processes: int | None = None, cluster: str | None = None, **options: Any
+) -> ShardedVectorEnv:
     """`make_vector_env` with its environments in several processes, each with a part of them. The results are the same,
-    bit for bit; on several cores they come earlier. processes: None: one for each core.
+    bit for bit; on several cores they come earlier.
 
-    Raises the errors of `make_vector_env`, and robot.rig.sharded_env.WorkerFailed.
+    processes: None: one for each core, or for each CPU of the cluster.
+    cluster: address of a Ray cluster on whose nodes they run: "HOST:PORT", "auto" or "local".
+
+    Raises the errors of `make_vector_env`, robot.rig.sharded_env.WorkerFailed, robot.common.cluster.ClusterError.
     """
     from robot.rig.sharded_env import ShardedVectorEnv
 
     given = inspect.signature(make_vector_env).bind(num_envs, *arguments, **options).arguments
     del given["num_envs"]
-    return ShardedVectorEnv(make_vector_env, given, num_envs, processes)
+    return ShardedVectorEnv(make_vector_env, given, num_envs, processes, cluster)
 
 
 def _draw_variants(variants: Sequence[Sequence[str]], randomise: RandomiseSettings) -> Sequence[Sequence[str]]:

@@ -21,6 +21,7 @@ from tacsim.tasks import Squeeze
 
 NUMBER = 16  # environments of a batch
 STEPS = 6  # timed steps of the batch
+MANY, STEPS_OF_MANY = 64, 2  # a larger batch has fewer timed steps
 WARM = 2  # untimed steps before those
 ROUNDS = 10  # resets of each environment
 TOUCH_FEATURES = {"maps": ("height",), "touch": ("wrench",)}  # features of a policy without pictures
@@ -58,23 +59,32 @@ def random_actions(preset: str, motion: str, repeat: int) -> list[Measurement]:
     return rows
 
 
+def flowing_actions(number: int, repeat: int) -> list[Measurement]:
+    """Squeezes at learn in one batch under random actions, flowing, with heights and forces: steps a second."""
+    words = "flowing, heights and forces"
+    more = ["motion=flowing"]
+    return _random_actions("learn", more, words, resets=False, features=TOUCH_FEATURES, number=number)
+
+
 def _random_actions(
     preset: str, more: list[str], words: str, *, resets: bool, features: dict[str, Any] | None = None,
-    in_processes: bool = False,
+    in_processes: bool = False, number: int | None = None,
 ) -> list[Measurement]:  # fmt: skip
     """Rows of a step and, with `resets`, of a reset."""
     import gymnasium
 
     import tacsim.gym  # noqa: F401  registers
 
+    number = number or NUMBER
+    steps = STEPS if number <= MANY else STEPS_OF_MANY
     overrides = [f"scene.preset={preset}", "task.steps=1000", *more]
     options: dict[str, Any] = {"overrides": overrides, "variants": list(BODIES), "features": features}
     forces, newtons = ("wrench_upper", 1.0) if features is None else ("touch", SCALES["force"])
     processes = {"processes": None} if in_processes else {}  # None: one for each core
-    many = gymnasium.make_vec("tacsim/Squeeze-v0", NUMBER, autoreset_mode="Disabled", **options, **processes)
+    many = gymnasium.make_vec("tacsim/Squeeze-v0", number, autoreset_mode="Disabled", **options, **processes)
     alone = gymnasium.make("tacsim/Squeeze-v0", **options).unwrapped
     rng = np.random.default_rng(0)
-    actions = rng.uniform(-1.0, 1.0, (WARM + STEPS, NUMBER, 2)).astype(np.float32)
+    actions = rng.uniform(-1.0, 1.0, (WARM + steps, number, 2)).astype(np.float32)
     began = time.perf_counter()
     many.reset(seed=1)
     first = time.perf_counter() - began
@@ -84,24 +94,24 @@ def _random_actions(
         forces_of_batch, forces_alone = (flats[forces] for flats in (many.step(action)[0], alone.step(action[0])[0]))
         difference = max(difference, newtons * float(np.abs(forces_of_batch[0] - forces_alone).max()))
     each = [once(partial(many.step, action))[0] for action in actions[WARM:]]
-    timing = Timing(tuple(step.samples[0] for step in each), sum(step.processor for step in each) / STEPS)
-    share = sum(timing.samples) / STEPS / NUMBER  # of one environment in a mean step, because random steps differ
+    timing = Timing(tuple(step.samples[0] for step in each), sum(step.processor for step in each) / steps)
+    share = sum(timing.samples) / steps / number  # of one environment in a mean step, because random steps differ
     rows = [
         Measurement(
-            timing, difference, "N difference", "the first of them alone", f"{words}: a step of {NUMBER}",
+            timing, difference, "N difference", "the first of them alone", f"{words}: a step of {number}",
             figures={"env_steps_per_s": 1 / share}
-            | ({} if in_processes else {"cpu_ms_per_env_step": timing.processor / NUMBER * 1e3}),
+            | ({} if in_processes else {"cpu_ms_per_env_step": timing.processor / number * 1e3}),
         )
     ]  # fmt: skip
     if resets:
         again, _ = once(lambda: [many.reset() for _ in range(ROUNDS - 1)])
-        later = again.median / (ROUNDS - 1) / NUMBER
-        mean = (first / NUMBER + (ROUNDS - 1) * later) / ROUNDS
+        later = again.median / (ROUNDS - 1) / number
+        mean = (first / number + (ROUNDS - 1) * later) / ROUNDS
         rows.append(
             Measurement(
-                Timing((mean,), again.processor / (ROUNDS - 1) / NUMBER), mean / share, "control steps",
+                Timing((mean,), again.processor / (ROUNDS - 1) / number), mean / share, "control steps",
                 "one environment's share of a step", f"{words}: a reset, mean of {ROUNDS} rounds with the first",
-                figures={"kept_ms": later * 1e3, "first_ms": first / NUMBER * 1e3},
+                figures={"kept_ms": later * 1e3, "first_ms": first / number * 1e3},
             )
         )  # fmt: skip
     many.close()

@@ -23,7 +23,7 @@ from benchmarks.cases.squeeze import (
     squeeze_scene,
     world_in_contact,
 )
-from benchmarks.harness.measure import Measurement, Timing, timed
+from benchmarks.harness.measure import Measurement, Timing, step_cost, timed
 from benchmarks.harness.runner import Case
 from tacsim.models.material import BodyMaterial
 from tacsim.models.scene import Body, Box, Cylinder, Mesh, Scene, Shape, Sphere
@@ -177,13 +177,15 @@ def first_motion(repeat: int) -> list[Measurement]:
     return rows
 
 
-def batch(count: int, repeat: int) -> list[Measurement]:
-    """Draft squeezes moved by one launch, each closed by 0.1 mm without a hold: cost of a substep for each of them."""
+def batch(count: int, repeat: int, preset: str = "draft") -> list[Measurement]:
+    """Squeezes moved by one launch, each closed by 0.1 mm without a hold: cost of a substep for each of them."""
     from tacsim.physics.worlds.batch import Batch
 
-    begin = world_in_contact(squeeze_scene("draft"))
+    begin = world_in_contact(squeeze_scene(preset))
+    truth = begin.truth()
+    assert truth is not None
     close_sensors(begin, 0.5e-3)
-    scene = squeeze_scene("draft", max_substeps=0)
+    scene = squeeze_scene(preset, max_substeps=0)
     alone, many = make_world(scene), Batch([scene] * count)
     for world in (alone, *many.worlds):
         world.restore(begin.snapshot())
@@ -203,6 +205,7 @@ def batch(count: int, repeat: int) -> list[Measurement]:
     error = max(abs(float(normal_forces(world).mean()) / force - 1) for world in many.worlds) * 100
     each = timing.median * 1e6 / (stats.substeps * count)
     figures = {"wall_per_environment_substep_us": each, "force_n": force}
+    figures |= step_cost(timing, stats.substeps * count, len(truth.points), "particle")
     return [Measurement(timing, error, "% of force", "the same motions of a world alone", "", stats.substeps, figures)]
 
 

@@ -62,9 +62,11 @@ NOT_MEASURED = "the run was stopped before it was measured"
 
 def run_cases(
     cases: Sequence[Case], repeat: int, *, baselines: bool, long: bool = False,
-    on_start: Callable[[Case], None] = lambda case: None, stop: Callable[[], bool] = lambda: False,
+    on_start: Callable[[Case], None] = lambda case: None, on_rows: Callable[[list[Row]], None] = lambda rows: None,
+    stop: Callable[[], bool] = lambda: False,
 ) -> Report:  # fmt: skip
-    """Runs `cases` in turn until `stop`. A case that raises, dies or is not reached becomes a failure of the report."""
+    """Runs `cases` in turn until `stop`. A case that raises, dies or is not reached becomes a failure of the report.
+    on_rows: gets the rows of a case as soon as they are measured."""
     run = Run()
     rows: list[Row] = []
     failures: list[Failure] = []
@@ -78,6 +80,7 @@ def run_cases(
                 failures.append(Failure(**_names(case), cause=found))
             else:
                 rows += found
+                on_rows(found)
         if together[0].short:
             group = together[0].group
             group_seconds[group] = group_seconds.get(group, 0.0) + time.perf_counter() - started

@@ -42,8 +42,8 @@ READING = (
     "but the first set of balls) `--long`; both take "
     "many minutes. These pages: `tacsim bench all --baselines --long --json benchmarks/reference.json`, then "
     "`tacsim bench --from benchmarks/reference.json --docs docs`, with `--from "
-    "benchmarks/gpu/report.json` too if it exists. That is the report of a GPU: `make test-gpu` measures it and "
-    "writes the pages.\n"
+    "benchmarks/gpu/report.json` too if it exists. That is the report of a GPU: `python -m benchmarks.device_run --all "
+    "--budget 7200 --json benchmarks/gpu/report.json` measures it.\n"
     "- **Real frames** are not shipped. `tacsim bench real --data DIR` finds those of the public set named in "
     "`benchmarks/references/presses.yaml` by their names anywhere below DIR; a `presses.yaml` in DIR itself describes "
     "other presses, on any sensor. With `all`, `--data DIR` adds the group to the rest. Rows ending in `image` compare "
@@ -66,7 +66,7 @@ ON_DEVICE = (
     "Kernels ran on the device; the processor renders the images, and MB is the memory of the process. "
     "*CPU / GPU* is seconds of the same row on the CPU over seconds here: two runs, possibly on two machines."
 )
-NO_DEVICE = "No GPU has been measured yet: with CUDA, `make test-gpu` measures it and adds a page."
+NO_DEVICE = "No GPU has been measured yet: with CUDA, `make test-gpu` measures it."
 
 
 def cells(row: Row) -> list[str]:

@@ -20,7 +20,7 @@ if "public_names" not in vars(robot):  # asked before other modules are imported
     )
 
 from robot.cli.bench import bench
-from robot.cli.benchmark import benchmark, draw, fit_blind, table, tasks, verify
+from robot.cli.benchmark import benchmark, draw, fit_blind, rank, table, tasks, verify
 from robot.cli.benchmark import compare as compare_policies
 from robot.cli.benchmark import run as run_benchmark
 from robot.cli.calibrate.lens import lens
@@ -72,7 +72,7 @@ GROUPS = {
     "identify": (identify, CALIBRATE, (gel, body)),
     "collect": (collect, LEARN, (press_set, episodes, experts, samples)),
     "export": (export, LEARN, (policy, policy_range, lerobot)),
-    "benchmark": (benchmark, LEARN, (run_benchmark, tasks, verify, compare_policies, table, draw, fit_blind)),
+    "benchmark": (benchmark, LEARN, (run_benchmark, tasks, verify, compare_policies, table, rank, draw, fit_blind)),
 }
 
 

@@ -17,6 +17,7 @@ from robot.cli.options import (
     Out,
     Overrides,
     Preset,
+    RayCluster,
     SensorModel,
     complete_names,
     quantity_parser,
@@ -45,10 +46,6 @@ OutSet = Annotated[
 Seed = Annotated[int, typer.Option(min=0, help="Same seed, same set.")]
 Workers = Annotated[
     int | None, typer.Option(min=1, max=1024, help="Processes on this machine.", show_default="one per core")
-]
-Ray = Annotated[
-    str | None,
-    typer.Option("--ray", metavar="ADDRESS", help="Use a Ray cluster: HOST:PORT, auto, or local (extra cluster)."),
 ]
 
 
@@ -115,7 +112,7 @@ def press(
         ),
     ] = None,
     workers: Workers = None,
-    ray: Ray = None,
+    ray: RayCluster = None,
     set_: Overrides = None,
 ) -> None:
     """Press objects on a gel at random poses: images with heights, forces, contact, flow and poses, in parquet files.
@@ -183,7 +180,7 @@ def episodes(
     task: Annotated[
         str | None,
         typer.Option(
-            help="squeeze, reposition, knead, lengthen, or a path.",
+            help="squeeze, reposition, knead, lengthen, relief, or a path.",
             show_default="the rig's own",
             autocompletion=complete_names("task"),
         ),
@@ -201,7 +198,7 @@ def episodes(
         ),
     ] = None,
     workers: Workers = None,
-    ray: Ray = None,
+    ray: RayCluster = None,
     set_: Overrides = None,
 ) -> None:
     """Run episodes on a simulated rig: DIR/episode-00000.mcap and so on, for tacsim export lerobot DIR.

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from robot.cli.options import Out, Overrides, TrainingFile, complete_names, require_packages
+from robot.cli.options import Out, Overrides, RayCluster, TrainingFile, complete_names, require_packages
 from robot.cli.output import (
     busy,
     choose_json_file,
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from robot.train.evaluate import EvaluationResult, Interval
     from robot.train.run_folder import RunFolder
     from robot.train.transfer import SummaryRow
+    from tacsim.models.task import Unit
 
 TRAINING = ("torch", "stable_baselines3", "onnx", "onnxruntime")  # packages of the extra `train`
 export = typer.Typer(no_args_is_help=True, help="Write policies and recordings as files for others.")
@@ -65,6 +66,7 @@ def train(
             "--processes", min=1, help="Processes that simulate; the policy does not depend on it. One a core."
         ),
     ] = None,
+    ray: RayCluster = None,
     set_: Overrides = None,
     out: Out = None,
 ) -> None:
@@ -76,6 +78,10 @@ def train(
     Example: tacsim train squeeze --out runs/squeeze-0
     """
     require_packages("tacsim train", "train", *TRAINING)
+    if ray is not None:
+        from robot.common.cluster import require_cluster
+
+        require_cluster(ray)
     if tensorboard:
         _require_tensorboard()
     own = [f"algorithm={algorithm}"] * (algorithm is not None) + [f"seed={seed}"] * (seed is not None) + (set_ or [])
@@ -103,16 +109,19 @@ def train(
             from robot.train.train import begin_run
 
             run = begin_run(training, folder)
+    from robot.common.cluster import ClusterError
+    from robot.rig.env_workers import WorkerFailed
     from tacsim.tasks.task import BadDraws
 
     try:
-        path, rounds = _run_training(run, tensorboard, processes)
+        path, rounds = _run_training(run, tensorboard, processes, ray)
     except BadDraws:
         if run.load_checkpoint()[0]:
             notes.print(f"The last checkpoint is kept. Write it as a file: tacsim export policy {run.folder}")
         raise
-    except (KeyboardInterrupt, OSError):
-        notes.print(f"The last checkpoint is kept. Continue: tacsim train --resume {run.folder}")
+    except (KeyboardInterrupt, OSError, WorkerFailed, ClusterError):
+        where = "" if ray is None else f" --ray {ray}"
+        notes.print(f"The last checkpoint is kept. Continue: tacsim train --resume {run.folder}{where}")
         raise
     print_files(path, run.folder / "curve.png", run.folder / "curve.json")
     print_json({"rounds": rounds}, [path, run.folder / "curve.png", run.folder / "curve.json"])
@@ -136,7 +145,9 @@ def _require_logged(algorithm: str, tensorboard: bool) -> None:
         )
 
 
-def _run_training(run: RunFolder, tensorboard: bool, processes: int | None) -> tuple[Path, list[Mapping[str, float]]]:
+def _run_training(
+    run: RunFolder, tensorboard: bool, processes: int | None, cluster: str | None
+) -> tuple[Path, list[Mapping[str, float]]]:
     """Trains; returns the file of the policy and the figures of each round."""
     from robot.train.train import train as continue_training
     from tacsim.models.task import unit_of
@@ -154,7 +165,7 @@ def _run_training(run: RunFolder, tensorboard: bool, processes: int | None) -> t
         )
 
     with one_bar("starting") as bar:
-        return continue_training(run, bar.report, print_result, warn, tensorboard, processes), rounds
+        return continue_training(run, bar.report, print_result, warn, tensorboard, processes, cluster), rounds
 
 
 def policy(
@@ -327,7 +338,7 @@ def transfer(
     task: Annotated[
         str,
         typer.Argument(
-            help="squeeze, reposition, knead, or the path of a task file.", autocompletion=complete_names("task")
+            help="squeeze, reposition, knead, hold, or the path of a task file.", autocompletion=complete_names("task")
         ),
     ],
     policy: Annotated[
@@ -355,7 +366,8 @@ def transfer(
     out: Annotated[Path, typer.Option(help="Folder; a study in it is continued.")] = Path("runs/transfer"),
     set_: Overrides = None,
 ) -> None:
-    """Compare results of policies in simulation and on mock hardware, with the real protocols and another hidden twin.
+    """Compare results of policies in simulation and on a hidden twin: mock hardware with the real protocols, or for a
+    task with a rigid object another simulated hand.
 
     Each episode runs on both sides; the simulation knows only the goal and the body's size of the twin. After an
     interruption, the same command continues, also with more policies. Writes transfer.json, transfer.png and the
@@ -389,23 +401,24 @@ def transfer(
     table, picture = out / "transfer.json", out / "transfer.png"
     with writing(out):
         table.write_text(json.dumps([asdict(row) for row in rows], indent=1) + "\n", encoding="utf-8")
-        draw_figure(rows, picture)
-    _show_transfer(rows, episodes)
+        draw_figure(rows, picture, study.config.unit)
+    _show_transfer(rows, episodes, study.config.unit)
     print_files(table, picture)
     print_json({"rows": rows}, [table, picture])
 
 
-def _show_transfer(rows: list[SummaryRow], episodes: int) -> None:
+def _show_transfer(rows: list[SummaryRow], episodes: int, unit: Unit) -> None:
     shown = [
         (
             row.policy,
             row.side,
             _interval_text(row.success, 100, 0),
-            "–" if row.distance is None else _interval_text(row.distance, 1e3, 3),
-            "–" if row.agreement is None else f"{1e3 * row.agreement:.3f}",
+            "–" if row.distance is None else _interval_text(row.distance, unit.factor, 3),
+            "–" if row.agreement is None else f"{unit.factor * row.agreement:.3f}",
             str(row.failures),
         )
         for row in rows
     ]
-    columns = ("policy", "", "success [%]", "distance [mm]", "tactile - true, rms [mm]", "errors")
+    distances = (f"{what} [{unit.symbol}]" for what in ("distance", "tactile - true, rms"))
+    columns = ("policy", "", "success [%]", *distances, "errors")
     show_table(f"{episodes} episodes each, 95 % intervals", columns, shown, left={0, 1})

@@ -59,6 +59,10 @@ TrainingFile = Annotated[
         help="squeeze, reposition, knead, or the path of a training file.", autocompletion=complete_names("training")
     ),
 ]
+RayCluster = Annotated[
+    str | None,
+    typer.Option("--ray", metavar="ADDRESS", help="Use a Ray cluster: HOST:PORT, auto, or local (extra cluster)."),
+]
 
 
 def quantity_parser(kind: str, low: float = -math.inf, high: float = math.inf) -> Callable[[str], float]:

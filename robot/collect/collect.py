@@ -4,13 +4,11 @@ them."""
 from __future__ import annotations
 
 import os
-import socket
 import tempfile
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib import util
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +30,7 @@ from robot.collect.workers import (
     piece_of_result,
     piece_or_error,
 )
+from robot.common.cluster import connected_to_cluster, describe_ray_error, require_cluster, tacsim_version
 from robot.common.whole_file import write_whole
 from robot.deploy.control_loop import versions
 
@@ -45,54 +44,31 @@ def make_on_cluster(
 
     Args:
         address: of a cluster ("HOST:6379", "ray://..."), "auto" for the cluster that this machine belongs to, "local"
-            for one on this machine alone. Call `require_cluster` first.
+            for one on this machine alone.
         files: that the workers need, by path in the set's folder.
 
     Raises:
-        SetError, CollectFailed, Stopped.
+        ClusterError, CollectFailed, Stopped.
     """
     poll_interval = 0.5  # between two checks for finished pieces and for a request to stop [s]
-    import ray
-
-    try:
-        ray.init(address=address, log_to_driver=False, configure_logging=False)
-    except (ConnectionError, ValueError, RuntimeError) as failure:
-        raise SetError(f"--ray {address}: no Ray cluster answers at this address: {failure}") from None
-    try:
-        kit = [
-            ray.put((job, dict(files), versions().get("tacsim", "")))
-        ]  # in a list: Ray fetches it only where it is needed
-        make: Any = ray.remote(num_cpus=1, max_retries=-1)(_make_piece)
-        waiting, running = deque(numbers), list[Any]()
-        while waiting or running:
-            if stop():
-                raise Stopped
-            max_running = PIECES_PER_WORKER * max(1, int(ray.cluster_resources().get("CPU", 1)))
-            while waiting and len(running) < max_running:
-                running.append(make.remote(kit, waiting.popleft()))
-            done, running = ray.wait(running, timeout=poll_interval)
-            for each in done:
-                yield piece_of_result(ray.get(each))
-    except ray.exceptions.RayError as failure:
-        words = f"{type(failure).__name__}: {failure}".splitlines()
-        raise CollectFailed(
-            f"Ray: {words[0]} {words[-1] if len(words) > 1 else ''}\nIs tacsim installed on all nodes, in one version?"
-        ) from failure
-    finally:
-        ray.shutdown()
-
-
-def require_cluster(address: str) -> None:
-    """Raises SetError if Ray is not installed, or no server listens at HOST:PORT; Ray itself would try for a minute."""
-    timeout = 5.0  # for a cluster to answer [s]
-    if util.find_spec("ray") is None:
-        raise SetError("--ray needs ray, which is not installed: pip install 'tacsim[cluster]'")
-    host, colon, port = address.removeprefix("ray://").rpartition(":")
-    if colon and port.isdecimal():
+    with connected_to_cluster(address) as ray:
         try:
-            socket.create_connection((host, int(port)), timeout).close()
-        except (OSError, OverflowError) as failure:
-            raise SetError(f"--ray {address}: no Ray cluster answers at this address: {failure}") from None
+            kit = [ray.put((job, dict(files), tacsim_version()))]  # in a list: Ray fetches it only where it is needed
+            make: Any = ray.remote(num_cpus=1, max_retries=-1)(_make_piece)
+            waiting, running = deque(numbers), list[Any]()
+            while waiting or running:
+                if stop():
+                    raise Stopped
+                max_running = PIECES_PER_WORKER * max(1, int(ray.cluster_resources().get("CPU", 1)))
+                while waiting and len(running) < max_running:
+                    running.append(make.remote(kit, waiting.popleft()))
+                done, running = ray.wait(running, timeout=poll_interval)
+                for each in done:
+                    yield piece_of_result(ray.get(each))
+        except ray.exceptions.RayError as failure:
+            raise CollectFailed(
+                f"Ray: {describe_ray_error(failure)}\nIs tacsim installed on all nodes, in one version?"
+            ) from failure
 
 
 _workers: dict[str, tuple[Any, Worker]] = {}  # of this process of a node, each with its folder of files
@@ -113,7 +89,7 @@ def _find_worker(kit: Any) -> Worker:
         import ray
 
         job, files, version = ray.get(kit)
-        if (here := versions().get("tacsim", "")) != version:
+        if (here := tacsim_version()) != version:
             raise SetError(f"a node has tacsim {here or 'unknown'}, the command runs with {version or 'unknown'}")
         folder = tempfile.TemporaryDirectory(prefix="tacsim-collect-")
         for place, data in files.items():
@@ -158,7 +134,8 @@ def collect(
         stop: is polled; True ends the call.
 
     Raises:
-        SetError, CollectFailed, Stopped, OSError: written pieces stay valid; the same call continues the set.
+        SetError, ClusterError, CollectFailed, Stopped, OSError: written pieces stay valid; the same call continues the
+            set.
     """
     settings = job.settings.model_dump(mode="json")
     found = Collected()

@@ -14,7 +14,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from robot.deploy.policy import require_fit, training_info
+from robot.deploy.policy import require_fit, reset_policy, training_info
 from tacsim.control import contact_signal
 from tacsim.interface import Action, EndOfEpisode, Observation, Policy, Pose, Truth
 from tacsim.limits import ActionError
@@ -134,7 +134,7 @@ def run_episode(
 
     try:
         is_in_policy = True
-        policy.reset()
+        reset_policy(policy, task)
         is_in_policy = False
         add_step(observation, None, {}, {})
         while (steps is None or log.count <= steps) and not stop():

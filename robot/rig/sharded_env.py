@@ -1,18 +1,13 @@
 """Vector environments in several processes: each holds a part of the environments, whose worlds share launches.
 
-Kernels of one process run on all cores, but its Python code runs on one. With a process for each core, both do.
+Kernels of one process run on all cores, but its Python code runs on one. With a process for each core, both do. The
+processes are on this machine, or on the nodes of a Ray cluster.
 """
 
 from __future__ import annotations
 
-import contextlib
-import logging
-import os
-import pickle
-import socket
-import sys
-from collections.abc import Callable, Mapping, Sequence
-from multiprocessing.connection import Connection
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -21,81 +16,14 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from robot.common.process import PARENT, Child, end_with_parent
-from robot.errors import DeviceNotConnectedError
+from robot.common.cluster import connected_to_cluster
+from robot.rig.env_server import Infos, MakeEnvs
+from robot.rig.env_workers import Worker, result_of, start_processes, start_ray_workers
+from robot.rig.env_workers import WorkerFailed as WorkerFailed
 from tacsim.compute.threads import thread_count
 from tacsim.gym.vector import TacsimVectorEnv
 
-Infos = dict[str, Any]
-MakeEnvs = Callable[..., TacsimVectorEnv]
 Environments: TypeAlias = "TacsimVectorEnv | ShardedVectorEnv"
-
-
-class WorkerFailed(DeviceNotConnectedError):
-    """A process of the environments has ended, or failed in a way that cannot be sent."""
-
-
-class _Worker:
-    """One process, and the connection to it."""
-
-    def __init__(self, number: int, threads: int, reported: set[str]) -> None:
-        """threads: of its kernels. reported: texts that this program's log has, of all processes."""
-        self._reported = reported
-        ours, theirs = socket.socketpair()
-        with ours, theirs:
-            self._child = Child(
-                __name__,
-                [str(theirs.fileno())],
-                name=f"environment process {number}",
-                error=WorkerFailed,
-                advice="make the environments again; is there enough memory for all processes?",
-                environment={"TACSIM_THREADS": str(threads), "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"},
-                descriptors=[theirs.fileno()],
-            )
-            self._connection = Connection(ours.detach())
-
-    @property
-    def pid(self) -> int:
-        return self._child.pid
-
-    def send(self, name: str, *arguments: Any) -> None:
-        """Requests a method of its vector environment."""
-        try:
-            self._connection.send((name, arguments))
-        except OSError as failure:
-            raise self._ended() from failure
-
-    def receive(self) -> Any:
-        """The result of the last request. Raises the method's error, or WorkerFailed."""
-        try:
-            error, result, records = self._connection.recv()
-        except (EOFError, OSError) as failure:
-            raise self._ended() from failure
-        for record in records:
-            if record.getMessage() not in self._reported:  # each process warns once
-                self._reported.add(record.getMessage())
-                logging.getLogger(record.name).handle(record)
-        if error is not None:
-            raise error
-        return result
-
-    def disconnect(self) -> None:
-        """Asks the process to end."""
-        self._connection.close()
-
-    def close(self) -> None:
-        write_timeout = 20.0  # for compiled kernels, which Taichi writes at its end [s]
-        self.disconnect()
-        self._child.close(write_timeout)
-
-    def _ended(self) -> WorkerFailed:
-        """The error of a process that does not answer any more."""
-        try:
-            self._child.wait(exit_timeout := 5.0)
-            self._child.check()
-        except WorkerFailed as failure:
-            return failure
-        return WorkerFailed(f"environment process {self.pid} ends its answers, but not itself within {exit_timeout} s")
 
 
 class ShardedVectorEnv(VectorEnv[Any, Any, Any]):
@@ -107,26 +35,36 @@ class ShardedVectorEnv(VectorEnv[Any, Any, Any]):
         make: makes the environments of a process, from `num_envs` and `options`: `robot.make_vector_env`. Both are
             pickled.
         num_envs: number of environments.
-        processes: at most one for each environment. None: one for each core, at most TACSIM_THREADS.
+        processes: at most one for each environment. None: one for each core, at most TACSIM_THREADS; with `cluster` one
+            for each CPU of the cluster.
+        cluster: address of a Ray cluster on whose nodes the processes run (`connected_to_cluster`); None: this machine.
 
-    Raises the errors of `make`, WorkerFailed.
+    Raises the errors of `make`, WorkerFailed, ClusterError.
     """
 
-    def __init__(self, make: MakeEnvs, options: Mapping[str, Any], num_envs: int, processes: int | None) -> None:
+    def __init__(
+        self,
+        make: MakeEnvs,
+        options: Mapping[str, Any],
+        num_envs: int,
+        processes: int | None,
+        cluster: str | None = None,
+    ) -> None:
         if type(num_envs) is not int or num_envs < 1:
             raise ValueError(f"num_envs is a number from 1; got {num_envs!r}")
-        if processes is None:
-            processes = thread_count()
-        elif type(processes) is not int or processes < 1:
+        if processes is not None and (type(processes) is not int or processes < 1):
             raise ValueError(f"processes is a number from 1, or None for one for each core; got {processes!r}")
-        count = min(processes, num_envs)
-        self._bounds = [num_envs * number // count for number in range(count + 1)]
-        self._sizes = [int(size) for size in np.diff(self._bounds)]
-        self._workers: list[_Worker] = []
-        reported: set[str] = set()
+        self._workers: list[Worker] = []
+        self._reported: set[str] = set()  # texts of warnings, of all processes
+        self._connection = ExitStack()
         try:
-            for number in range(count):
-                self._workers.append(_Worker(number, max(1, thread_count() // count), reported))
+            if cluster is None:
+                self._assign_environments(num_envs, processes or thread_count())
+                start_processes(self._workers, len(self._sizes))
+            else:
+                ray = self._connection.enter_context(connected_to_cluster(cluster))
+                self._assign_environments(num_envs, processes or int(ray.cluster_resources().get("CPU", 1)))
+                start_ray_workers(self._workers, len(self._sizes), ray)
             made = self._request_parts("make", [(make, {**options, "num_envs": size}) for size in self._sizes])
         except BaseException:
             self._close_workers()
@@ -216,6 +154,12 @@ class ShardedVectorEnv(VectorEnv[Any, Any, Any]):
     def close_extras(self, **_: Any) -> None:
         self._close_workers()
 
+    def _assign_environments(self, num_envs: int, processes: int) -> None:
+        """Gives each process a part of the environments."""
+        count = min(processes, num_envs)
+        self._bounds = [num_envs * number // count for number in range(count + 1)]
+        self._sizes = [int(size) for size in np.diff(self._bounds)]
+
     def _require_mask(self, mask: Any) -> None:
         """Raises TypeError, ValueError, ResetNeeded as `TacsimVectorEnv.reset` does."""
         if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_:
@@ -240,7 +184,7 @@ class ShardedVectorEnv(VectorEnv[Any, Any, Any]):
                 worker.send(name, *given)
             for worker in self._workers:
                 try:
-                    results.append(worker.receive())
+                    results.append(result_of(worker.receive(), self._reported))
                 except WorkerFailed:
                     raise
                 except Exception as failure:
@@ -259,6 +203,7 @@ class ShardedVectorEnv(VectorEnv[Any, Any, Any]):
             worker.disconnect()
         for worker in self._workers:
             worker.close()
+        self._connection.close()
 
 
 def merge_infos(parts: Sequence[Infos], sizes: Sequence[int]) -> Infos:
@@ -284,95 +229,3 @@ def merge_infos(parts: Sequence[Infos], sizes: Sequence[int]) -> Infos:
 def _join(parts: Sequence[Mapping[str, NDArray[Any]]]) -> dict[str, NDArray[Any]]:
     """The observations of all environments."""
     return {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
-
-
-class _Log(logging.Handler):
-    """Keeps the warnings of a worker for its parent."""
-
-    def __init__(self) -> None:
-        super().__init__(logging.WARNING)
-        self._records: list[logging.LogRecord] = []
-
-    def emit(self, record: logging.LogRecord) -> None:
-        record.msg, record.args, record.exc_info = record.getMessage(), None, None  # what can be pickled
-        self._records.append(record)
-
-    def take(self) -> list[logging.LogRecord]:
-        records, self._records = self._records, []
-        return records
-
-
-class _Methods:
-    """The methods of a worker."""
-
-    def __init__(self) -> None:
-        self._envs: TacsimVectorEnv | None = None
-        self._seen: Any = None  # the last observations
-
-    def make(self, make: MakeEnvs, options: Mapping[str, Any]) -> tuple[Any, Any, dict[str, Any], str | None]:
-        """Makes the environments; returns what all processes have in common."""
-        self._envs = make(**options)
-        return (
-            self._envs.single_observation_space,
-            self._envs.single_action_space,
-            self._envs.metadata,
-            self._envs.render_mode,
-        )
-
-    def reset(self, seeds: list[int | None], options: dict[str, Any]) -> tuple[Any, Infos]:
-        mask = options.get("reset_mask")
-        if mask is not None and not mask.any():
-            return self._seen, {}
-        self._seen, infos = self.envs.reset(seed=seeds, options=options)
-        return self._seen, infos
-
-    def end_step(self, actions: Any) -> tuple[Any, ...]:
-        self._seen, *others = self.envs.end_step(actions)
-        return self._seen, *others
-
-    def call(
-        self, indices: list[int], name: str, arguments: tuple[Any, ...], options: dict[str, Any]
-    ) -> tuple[Any, ...]:
-        return self.envs.call_selected(indices, name, *arguments, **options)
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.envs, name)
-
-    @property
-    def envs(self) -> TacsimVectorEnv:
-        assert self._envs is not None
-        return self._envs
-
-
-def _serve(connection: Connection) -> None:
-    """Answers requests (method, arguments) by (error, result, records of the log) until the connection ends."""
-    methods, log = _Methods(), _Log()
-    logging.getLogger().addHandler(log)
-    logging.captureWarnings(True)
-    while True:
-        try:
-            name, arguments = connection.recv()
-        except EOFError:
-            return
-        error = result = None
-        try:
-            result = getattr(methods, name)(*arguments)
-        except Exception as failure:
-            error = _sendable(failure)
-        connection.send((error, result, log.take()))
-
-
-def _sendable(failure: Exception) -> Exception:
-    """The error, or its text where it cannot be pickled."""
-    try:
-        pickle.loads(pickle.dumps(failure))  # noqa: S301  # our own bytes
-    except Exception:
-        return RuntimeError(f"{type(failure).__name__}: {failure}")
-    return failure
-
-
-if __name__ == "__main__":
-    os.dup2(2, 1)  # the parent does not read standard output
-    end_with_parent(int(os.environ[PARENT]))
-    with contextlib.closing(Connection(int(sys.argv[1]))) as opened:
-        _serve(opened)

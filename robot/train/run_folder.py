@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
-from importlib import metadata
 from pathlib import Path
 from typing import Any, Self
 
 from pydantic import Field, ValidationError
 
+from robot.common.cluster import tacsim_version
 from robot.common.whole_file import write_whole
 from tacsim.models.policy import PolicySpec, Training
 from tacsim.models.quantity import Config
@@ -60,7 +60,7 @@ class RunFolder:
     @classmethod
     def make(cls, folder: Path, training: Training, spec: PolicySpec, shapes: Mapping[str, tuple[int, ...]]) -> Self:
         """Creates a new run. Raises FileExistsError if the folder exists."""
-        settings = RunSettings(tacsim=version(), training=training, spec=spec, shapes=dict(shapes))
+        settings = RunSettings(tacsim=tacsim_version(), training=training, spec=spec, shapes=dict(shapes))
         folder.mkdir(parents=True)
         text = settings.model_dump_json(indent=1)
         write_whole(folder / "run.json", text.encode())
@@ -90,11 +90,3 @@ class RunFolder:
         except Exception as failure:  # torch has no common base class for damaged files
             words = printable_line((str(failure).splitlines() or [repr(failure)])[0][:200])
             raise RunError(f"{path} is not a checkpoint of this version: {words}; start a new training") from None
-
-
-def version() -> str:
-    """Version of tacsim; empty if it is not installed."""
-    try:
-        return metadata.version("tacsim")
-    except metadata.PackageNotFoundError:
-        return ""

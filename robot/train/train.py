@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from gymnasium.vector import AutoresetMode
 
+from robot.common.cluster import tacsim_version
 from robot.common.whole_file import write_whole
 from robot.open import load_with_task, make_sharded_env, make_vector_env
 from robot.rig.sharded_env import Environments
@@ -25,7 +26,7 @@ from robot.train.curve_picture import write_curve_picture
 from robot.train.dagger import Dagger
 from robot.train.measure_range import measure_range, write_range
 from robot.train.network import PolicyNetwork, export
-from robot.train.run_folder import ReportProgress, RunError, RunFolder, version
+from robot.train.run_folder import ReportProgress, RunError, RunFolder
 from tacsim.config import ConfigError
 from tacsim.config.document import Place, Problem
 from tacsim.geometry.shapes import bounding_size
@@ -59,10 +60,11 @@ class Learner(Protocol):
     def restore(self, state: Mapping[str, Any]) -> None: ...
 
 
-def make_environments(training: Training, processes: int | None = 1) -> Environments:
-    """Creates the environments of a training; `processes`: see `robot.make_sharded_env`, 1: in this one. Raises
-    ConfigError, CannotOpen, IncompatibleRig, ValueError, WorkerFailed."""
-    make = make_vector_env if processes == 1 else partial(make_sharded_env, processes=processes)
+def make_environments(training: Training, processes: int | None = 1, cluster: str | None = None) -> Environments:
+    """Creates the environments of a training; `processes`, `cluster`: see `robot.make_sharded_env`; 1 without a
+    cluster: in this process. Raises its errors."""
+    alone = processes == 1 and cluster is None
+    make = make_vector_env if alone else partial(make_sharded_env, processes=processes, cluster=cluster)
     return make(
         training.environments,
         training.task,
@@ -97,7 +99,7 @@ def begin_run(training: Training, folder: Path) -> RunFolder:
             for axis in task.axes
         ),
         max_step=config.task.max_step,
-        trained={"by": f"tacsim {version()}".strip(), "training": training.model_dump(mode="json")},
+        trained={"by": f"tacsim {tacsim_version()}".strip(), "training": training.model_dump(mode="json")},
     )
     space: Any = space_of_features(encoder, config)
     return RunFolder.make(folder, training, spec, {key: box.shape for key, box in space.items()})
@@ -135,19 +137,20 @@ def train(
     warn: Callable[[str], None] = lambda words: None,
     tensorboard: bool = False,
     processes: int | None = 1,
+    cluster: str | None = None,
 ) -> Path:
     """Continues a run to its end, writes its policy to its folder and returns the file.
 
     report_result: called with the figures of each round: its number `round`, those of the learner, `refused` (draws
     that could not begin an episode and were repeated), and `seconds`. warn: called once for each refused draw.
     tensorboard: the log of stable-baselines3 is written to `tensorboard/` in the run's folder.
-    processes: of the environments; see `make_environments`. The result does not depend on it.
-    Raises RunError, WorkerFailed, BadDraws for too many refused draws, and OSError if the disk is full: the last
-    checkpoint remains complete.
+    processes, cluster: of the environments; see `make_environments`. The result does not depend on them.
+    Raises RunError, WorkerFailed, ClusterError, BadDraws for too many refused draws, and OSError if the disk is full:
+    the last checkpoint remains complete.
     """
     torch.set_num_threads(1)  # small networks; sums have the same order on any machine
     done, state, curve = run.load_checkpoint()
-    envs = make_environments(run.settings.training, processes)
+    envs = make_environments(run.settings.training, processes, cluster)
     try:
         learner = _make_learner(envs, run, tensorboard)
         if done:

@@ -17,7 +17,8 @@ from ray.cluster_utils import Cluster  # noqa: E402
 
 from robot.collect.collect import collect  # noqa: E402
 from robot.collect.folder import SetFolder  # noqa: E402
-from robot.collect.workers import CollectFailed, Piece, SetError  # noqa: E402
+from robot.collect.workers import CollectFailed, Piece  # noqa: E402
+from robot.common.cluster import ClusterError  # noqa: E402
 from tests.robot.cli.invoked import environment  # noqa: E402
 from tests.robot.collect.small import contents, job, rows  # noqa: E402
 
@@ -74,13 +75,13 @@ def test_a_node_dies_and_nothing_is_lost_or_there_twice(
 
 
 def test_nodes_with_another_version_are_told(cluster: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("robot.collect.collect.versions", lambda: {"tacsim": "9.9"})
+    monkeypatch.setattr("robot.collect.collect.tacsim_version", lambda: "9.9")
     with pytest.raises(CollectFailed, match=r"a node has tacsim .*, the command runs with 9\.9"):
         collect(job(2), tmp_path / "set", {}, "x", cluster=cluster.address)
     assert not (tmp_path / "set/data").exists()
 
 
 def test_no_cluster_at_the_address_is_an_error_in_words(tmp_path: Path) -> None:
-    with pytest.raises(SetError, match=r"--ray 127\.0\.0\.1:1: no Ray cluster answers at this address"):
+    with pytest.raises(ClusterError, match=r"--ray 127\.0\.0\.1:1: no Ray cluster answers at this address"):
         collect(job(2), tmp_path / "set", {}, "x", cluster="127.0.0.1:1")
     assert not (tmp_path / "set").exists()

@@ -21,6 +21,7 @@ from robot.collect.folder import open_set
 from robot.collect.objects import find_objects
 from robot.collect.workers import Piece, SetError, Stopped
 from robot.common import whole_file
+from robot.common.cluster import ClusterError
 from tacsim.config import load_scene
 from tacsim.models.scene import Sphere
 from tests.robot.cli.invoked import START, environment, plain_text, tacsim
@@ -189,7 +190,7 @@ def test_a_piece_where_all_fails_is_done_without_a_file(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(find_spec("ray") is not None, reason="ray is here")
 def test_without_ray_it_says_what_to_install_and_begins_nothing(tmp_path: Path) -> None:
-    with pytest.raises(SetError, match=r"pip install 'tacsim\[cluster\]'"):
+    with pytest.raises(ClusterError, match=r"pip install 'tacsim\[cluster\]'"):
         collect(job(2), tmp_path / "set", {}, "x", cluster="auto")
     assert not (tmp_path / "set").exists()
 

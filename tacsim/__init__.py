@@ -96,12 +96,14 @@ if TYPE_CHECKING:
     from tacsim.models.sensor import SensorModel as SensorModel
     from tacsim.models.task import KneadConfig as KneadConfig
     from tacsim.models.task import LengthenConfig as LengthenConfig
+    from tacsim.models.task import ReliefConfig as ReliefConfig
     from tacsim.models.task import RepositionConfig as RepositionConfig
     from tacsim.models.task import SqueezeConfig as SqueezeConfig
     from tacsim.models.task import TaskConfig as TaskConfig
     from tacsim.optics.render import Renderer as Renderer
     from tacsim.optics.surface import surface_map as surface_map
     from tacsim.physics.failure.health import SimulationDiverged as SimulationDiverged
+    from tacsim.physics.grip.model import GripCommand as GripCommand
     from tacsim.physics.grip.model import HeldObject as HeldObject
     from tacsim.physics.grip.model import HeldStates as HeldStates
     from tacsim.physics.grip.model import Support as Support
@@ -132,6 +134,7 @@ if TYPE_CHECKING:
     from tacsim.tasks import Knead as Knead
     from tacsim.tasks import Lengthen as Lengthen
     from tacsim.tasks import Outcome as Outcome
+    from tacsim.tasks import Relief as Relief
     from tacsim.tasks import Reposition as Reposition
     from tacsim.tasks import Squeeze as Squeeze
     from tacsim.tasks import Task as Task

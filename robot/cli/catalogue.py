@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import keyword
 import re
+from hashlib import sha256
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
@@ -122,7 +123,9 @@ def _describe_policy(path: Path) -> dict[str, Any]:
     from tacsim.models.policy import ActionAxis
 
     spec = read_policy_spec(path)
+    scene = {} if spec.range is None else spec.range.scene
     return {
+        "sha256": sha256(path.read_bytes()).hexdigest(),
         "task": spec.task,
         "period": f"{spec.period:g} s",
         "inputs": {key: list(numbers.names) for key, numbers in spec.inputs.items()},
@@ -135,6 +138,7 @@ def _describe_policy(path: Path) -> dict[str, Any]:
         "max_step": f"{spec.max_step * 1e3:g} mm",
         "trained": spec.trained,  # settings of `tacsim train`
         "training range": "recorded" if spec.range is not None else "unknown",
+        "scenes of training": {key: f"{low:g} to {high:g}" for key, (low, high) in scene.items()},  # [SI]
     }
 
 

@@ -173,14 +173,14 @@ def episodes(
     policy: Annotated[
         str,
         typer.Option(
-            help="scripted, random, grip, learned, FILE.onnx, FILE.csv, or package.module:name.",
-            autocompletion=complete_names(words=(*TASK_POLICIES, "random")),
+            help="scripted, random, teacher, grip, learned, FILE.onnx, FILE.csv, or package.module:name.",
+            autocompletion=complete_names(words=(*TASK_POLICIES, "random", "teacher")),
         ),
     ] = "scripted",
     task: Annotated[
         str | None,
         typer.Option(
-            help="squeeze, reposition, knead, lengthen, or a path.",
+            help="squeeze, reposition, knead, lengthen, relief, or a path.",
             show_default="the rig's own",
             autocompletion=complete_names("task"),
         ),
@@ -227,6 +227,46 @@ def episodes(
     _make_set(job, out, {}, _command_line(f"episodes {shlex.quote(rig)}", given), workers, ray)
 
 
+def experts(
+    task: Annotated[
+        str,
+        typer.Argument(
+            help="A task of the benchmark (tacsim benchmark tasks), or the path of a task file.",
+            autocompletion=complete_names("benchmark"),
+        ),
+    ],
+    out: OutSet,
+    count: Count = 200,
+    pictures: Annotated[
+        bool, typer.Option("--pictures/--no-pictures", help="Without pictures it loads faster: numbers alone.")
+    ] = True,
+    workers: Workers = None,
+    ray: Ray = None,
+    set_: Overrides = None,
+) -> None:
+    """Make a data set of expert episodes of a task, for LeRobot and Hugging Face datasets, with a card and its hash.
+
+    The teacher acts, by the ground truth; no episode is one of a test. DIR/episodes has the recordings, DIR/lerobot the
+    data set. After an interruption, the same command continues. Needs the extra 'export'.
+
+    Example: tacsim collect experts squeeze --out experts-squeeze
+    """
+    require_packages("tacsim collect experts", "export", "pyarrow")
+    with busy("loading"):
+        from robot.collect.episodes import EpisodeJob
+        from robot.collect.experts import DATA_SET, RECORDINGS, expert_set, write_expert_data
+
+        job = EpisodeJob(expert_set(task, tuple(set_ or ())), count)
+        job.check()
+    given = [("--count", str(count), None), *(("--set", text, None) for text in set_ or []), ("--out", str(out), None)]
+    command = _command_line(f"experts {shlex.quote(task)}{'' if pictures else ' --no-pictures'}", given)
+    _make_set(job, out / RECORDINGS, {}, command, workers, ray, is_last=False)
+    with counted("exporting") as on_step:
+        digest = write_expert_data(out, task, command, on_step, pictures=pictures)
+    results.print(f"{out / DATA_SET}  SHA-256 of data/: {digest}")
+    print_json({"sha256": digest}, [out / DATA_SET])
+
+
 def samples(out: Out = None) -> None:
     """Draw sample presses of a ball, to try tacsim calibrate sensor and tacsim compare without a sensor.
 
@@ -261,9 +301,16 @@ def samples(out: Out = None) -> None:
 
 
 def _make_set(
-    job: PressJob | EpisodeJob, out: Path, files: dict[str, bytes], command: str, workers: int | None, ray: str | None
+    job: PressJob | EpisodeJob,
+    out: Path,
+    files: dict[str, bytes],
+    command: str,
+    workers: int | None,
+    ray: str | None,
+    *,
+    is_last: bool = True,
 ) -> None:
-    """Makes the set, and shows its progress and a summary."""
+    """Makes the set, and shows its progress and a summary. is_last: nothing follows, so the JSON document is its."""
     report_interval = 10.0  # between two lines of progress without a terminal [s]
     import time
 
@@ -294,13 +341,13 @@ def _make_set(
                 f"stopped by a signal; {done_count} of {job.count} are finished. Run the same command again to continue"
             )
             raise typer.Exit(interrupt.exit_code) from None
-    _print_summary(done, job.count, time.perf_counter() - begun, out)
+    _print_summary(done, job.count, time.perf_counter() - begun, out, is_last)
     if len(done.failures) == job.count:
         print_error(f"all failed; the first error: {done.failures[min(done.failures)]}")
         raise typer.Exit(EXIT_FAILED)
 
 
-def _print_summary(done: Collected, count: int, seconds: float, out: Path) -> None:
+def _print_summary(done: Collected, count: int, seconds: float, out: Path, is_last: bool) -> None:
     if done.made:
         spent = sum(done.seconds.values())
         parts = ", ".join(f"{name} {100 * part / spent:.0f} %" for name, part in done.seconds.most_common())
@@ -310,6 +357,8 @@ def _print_summary(done: Collected, count: int, seconds: float, out: Path) -> No
         )
     if done.failures:
         notes.print(f"{len(done.failures)} of {count} failed; the reasons are in {out / 'failures.jsonl'}")
+    if not is_last:
+        return
     results.print(str(out))
     figures = {"count": count, "made": done.made, "seconds": seconds, "workers": len(done.workers), "bytes": done.bytes}
     print_json({**figures, "failures": done.failures}, [out])

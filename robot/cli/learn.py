@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from robot.train.evaluate import EvaluationResult, Interval
     from robot.train.run_folder import RunFolder
     from robot.train.transfer import SummaryRow
+    from tacsim.models.task import Unit
 
 TRAINING = ("torch", "stable_baselines3", "onnx", "onnxruntime")  # packages of the extra `train`
 export = typer.Typer(no_args_is_help=True, help="Write policies and recordings as files for others.")
@@ -337,7 +338,7 @@ def transfer(
     task: Annotated[
         str,
         typer.Argument(
-            help="squeeze, reposition, knead, or the path of a task file.", autocompletion=complete_names("task")
+            help="squeeze, reposition, knead, hold, or the path of a task file.", autocompletion=complete_names("task")
         ),
     ],
     policy: Annotated[
@@ -365,7 +366,8 @@ def transfer(
     out: Annotated[Path, typer.Option(help="Folder; a study in it is continued.")] = Path("runs/transfer"),
     set_: Overrides = None,
 ) -> None:
-    """Compare results of policies in simulation and on mock hardware, with the real protocols and another hidden twin.
+    """Compare results of policies in simulation and on a hidden twin: mock hardware with the real protocols, or for a
+    task with a rigid object another simulated hand.
 
     Each episode runs on both sides; the simulation knows only the goal and the body's size of the twin. After an
     interruption, the same command continues, also with more policies. Writes transfer.json, transfer.png and the
@@ -399,23 +401,24 @@ def transfer(
     table, picture = out / "transfer.json", out / "transfer.png"
     with writing(out):
         table.write_text(json.dumps([asdict(row) for row in rows], indent=1) + "\n", encoding="utf-8")
-        draw_figure(rows, picture)
-    _show_transfer(rows, episodes)
+        draw_figure(rows, picture, study.config.unit)
+    _show_transfer(rows, episodes, study.config.unit)
     print_files(table, picture)
     print_json({"rows": rows}, [table, picture])
 
 
-def _show_transfer(rows: list[SummaryRow], episodes: int) -> None:
+def _show_transfer(rows: list[SummaryRow], episodes: int, unit: Unit) -> None:
     shown = [
         (
             row.policy,
             row.side,
             _interval_text(row.success, 100, 0),
-            "–" if row.distance is None else _interval_text(row.distance, 1e3, 3),
-            "–" if row.agreement is None else f"{1e3 * row.agreement:.3f}",
+            "–" if row.distance is None else _interval_text(row.distance, unit.factor, 3),
+            "–" if row.agreement is None else f"{unit.factor * row.agreement:.3f}",
             str(row.failures),
         )
         for row in rows
     ]
-    columns = ("policy", "", "success [%]", "distance [mm]", "tactile - true, rms [mm]", "errors")
+    distances = (f"{what} [{unit.symbol}]" for what in ("distance", "tactile - true, rms"))
+    columns = ("policy", "", "success [%]", *distances, "errors")
     show_table(f"{episodes} episodes each, 95 % intervals", columns, shown, left={0, 1})

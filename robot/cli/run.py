@@ -54,7 +54,7 @@ def run(
     task: Annotated[
         str | None,
         typer.Option(
-            help="squeeze, reposition, knead, lengthen, the path of a task file, or package.module:name.",
+            help="squeeze, reposition, knead, lengthen, relief, the path of a task file, or package.module:name.",
             show_default="the rig's own",
             autocompletion=complete_names("task"),
         ),

@@ -18,16 +18,17 @@ from robot.deploy.control_loop import EpisodeFailed, EpisodeSetup, run_episode
 from robot.deploy.policy import load_policy, require_fit
 from robot.open import CannotOpen, load_with_task, open_rig
 from tacsim.config import ConfigError, LoadedRig
-from tacsim.interface import Action, IncompatibleRig, Needs, Observation, Policy, RigSpec
+from tacsim.interface import Action, GripperTarget, IncompatibleRig, Needs, Observation, Policy, Pose, Truth
 from tacsim.models.quantity import Config
 from tacsim.models.randomisation import Randomisation
 from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.record.episode import EpisodeMeta, Step
 from tacsim.record.writer import Recorder
+from tacsim.rig import Rig
 from tacsim.tasks import GoalOutOfReach, Task, make_task
-from tacsim.tasks.task import action_of_vector
+from tacsim.tasks.task import action_of_vector, vector_of_action
 
-RANDOM = "random"
+RANDOM, TEACHER = "random", "teacher"  # in addition to the policies of load_policy
 
 
 class EpisodeSet(Config):
@@ -80,7 +81,7 @@ class EpisodeJob:
                 "once; record its episodes with tacsim run"
             )
         with open_rig(loaded) as rig:
-            _load_policy_and_task(self.settings, loaded, rig.spec, rig.name, 0)
+            _load_policy_and_task(self.settings, loaded, rig, 0)
 
 
 class EpisodeWorker:
@@ -109,7 +110,7 @@ class EpisodeWorker:
         with tempfile.TemporaryDirectory(prefix="tacsim-collect-") as folder, ExitStack() as stack:
             path = Path(folder) / "episode.mcap"
             rig = stack.enter_context(open_rig(loaded))
-            policy, task = _load_policy_and_task(settings, loaded, rig.spec, rig.name, number)
+            policy, task = _load_policy_and_task(settings, loaded, rig, number)
             canonical = loaded.config.canonical
             attached = {"rig.yaml": loaded.text.encode()}
             setup = EpisodeSetup(settings.policy, seed, attached, canonical, bool(loaded.config.record.body))
@@ -150,20 +151,54 @@ class RandomPolicy:
         return action_of_vector(vector, self._task.axes, self._task.config.max_step, poses)
 
 
-def _load_policy_and_task(
-    settings: EpisodeSet, loaded: LoadedRig, spec: RigSpec, rig: str, number: int
-) -> tuple[Policy, Task | None]:
+class TeacherPolicy:
+    """The best action by the ground truth of a simulated rig (`Task.expert`), or where the task knows no rule, what
+    its `teacher` does: as the policy `teacher` of `tacsim evaluate`. Each reset begins a new episode."""
+
+    needs = Needs(truth=True)
+
+    def __init__(self, rig: Rig, task: Task) -> None:
+        self._rig, self._task = rig, task
+        self.reset()
+
+    def reset(self) -> None:
+        self._start: Truth | None = None
+        self._targets: dict[str, Pose] = {}
+        self._grips: dict[str, GripperTarget] = {}
+        self._teacher: Policy | None = None
+
+    def __call__(self, observation: Observation) -> Action:
+        truth, task = self._rig.truth(), self._task
+        assert truth is not None  # the rig has promised it
+        if self._start is None:
+            self._start, self._targets = truth, {name: arm.pose for name, arm in observation.arms.items()}
+        vector: Any = task.expert(truth, self._start)
+        if vector is None:
+            self._teacher = self._teacher or task.teacher()
+            asked = self._teacher(observation)
+            vector = vector_of_action(asked, task.axes, task.config.max_step, self._targets, self._grips)
+        action = action_of_vector(vector, task.axes, task.config.max_step, self._targets)
+        self._targets |= {name: pose for name, pose in action.tool.items() if pose is not None}
+        self._grips |= {name: grip for name, grip in action.grippers.items() if grip is not None}
+        return action
+
+
+def _load_policy_and_task(settings: EpisodeSet, loaded: LoadedRig, rig: Rig, number: int) -> tuple[Policy, Task | None]:
     """The policy of an episode, and its task. Raises SetError, PolicyNotFound, IncompatibleRig."""
     config = loaded.config
     task = None if config.task is None else make_task(config.task)
-    if settings.policy == RANDOM:
+    if settings.policy in (RANDOM, TEACHER):
         if task is None:
-            raise SetError(f"policy 'random' moves along a task's axes, and rig '{rig}' has no task: give one (--task)")
-        policy: Policy = RandomPolicy(task, settings.seed + number)
+            raise SetError(
+                f"policy '{settings.policy}' moves along a task's axes, and rig '{rig.name}' has no task: give one "
+                "(--task)"
+            )
+        chosen = RandomPolicy(task, settings.seed + number) if settings.policy == RANDOM else TeacherPolicy(rig, task)
+        policy: Policy = chosen
     else:
-        policy = load_policy(settings.policy, task, spec, config.canonical, (RANDOM,))
+        policy = load_policy(settings.policy, task, rig.spec, config.canonical, (RANDOM, TEACHER))
     try:
-        require_fit(rig, spec, policy, settings.policy, task)
+        require_fit(rig.name, rig.spec, policy, settings.policy, task)
     except IncompatibleRig as unfit:
         raise SetError(str(unfit)) from None
     return policy, task

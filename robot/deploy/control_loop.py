@@ -14,9 +14,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from robot.deploy.policy import require_fit, training_info
+from robot.deploy.policy import require_fit, reset_policy, training_info
 from tacsim.control import contact_signal
 from tacsim.interface import Action, EndOfEpisode, Observation, Policy, Pose, Truth
+from tacsim.limits import ActionError
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.record.episode import (
     MAX_DEPTH,
@@ -36,11 +37,12 @@ PACKAGES = ("tacsim", "numpy", "taichi", "opencv-contrib-python-headless", "gymn
 
 
 class EpisodeFailed(RuntimeError):
-    """An error, the `__cause__`, ended an episode early. `episode` has the steps done; the arms are stopped."""
+    """An error, the `__cause__`, ended an episode early. `episode` has the steps done; the arms are stopped.
+    `by_policy`: the policy raised it, or asked for an action that is none."""
 
-    def __init__(self, message: str, episode: Episode) -> None:
+    def __init__(self, message: str, episode: Episode, *, by_policy: bool = False) -> None:
         super().__init__(message)
-        self.episode = episode
+        self.episode, self.by_policy = episode, by_policy
 
 
 class RecordingFailed(RuntimeError):
@@ -131,7 +133,9 @@ def run_episode(
             watch(step, observation, truth)
 
     try:
-        policy.reset()
+        is_in_policy = True
+        reset_policy(policy, task)
+        is_in_policy = False
         add_step(observation, None, {}, {})
         while (steps is None or log.count <= steps) and not stop():
             started = time.perf_counter()
@@ -149,7 +153,8 @@ def run_episode(
         if is_in_policy:
             reason = f"policy '{setup.policy}' raised {reason}; the arms hold. Correct it, and test it in simulation"
         count = f"{steps_done} steps" if steps is None else f"{steps_done} of {steps} steps"
-        raise EpisodeFailed(f"episode ended after {count}: {reason}", log.episode) from failure
+        by_policy = is_in_policy or isinstance(failure, ActionError)
+        raise EpisodeFailed(f"episode ended after {count}: {reason}", log.episode, by_policy=by_policy) from failure
     finally:
         rig.stop()
         log.flush()

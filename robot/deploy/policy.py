@@ -60,6 +60,15 @@ def load_policy(
     return policy_of_code(name)
 
 
+def reset_policy(policy: Policy, task: Task | None) -> None:
+    """Resets a policy for an episode of a task. One with a method `set_goal` gets the goal [m] before, one number or a
+    tuple."""
+    actor = getattr(policy, "inner", policy)  # of one that an operator may pause (robot.serve)
+    if task is not None and hasattr(actor, "set_goal"):
+        actor.set_goal(task.goal)
+    policy.reset()
+
+
 def require_policy_name(name: str, other_names: Sequence[str] = ()) -> None:
     """Raises PolicyNotFound for a text that `load_policy` takes for no policy, and for a file that is not there. Reads
     no file and imports no code."""

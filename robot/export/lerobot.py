@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from importlib import util
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,17 @@ from tacsim.record.images import encode_png
 OnStep = Callable[[int, int], None]
 
 
+@dataclass(frozen=True, slots=True)
+class Content:
+    """What a data set holds, as the arguments of `export_lerobot`."""
+
+    task: str | None
+    maps: bool
+    video: bool
+    environment: bool
+    pictures: bool
+
+
 def export_lerobot(
     paths: Sequence[Path],
     folder: Path,
@@ -41,6 +53,8 @@ def export_lerobot(
     maps: bool = True,
     cut: bool = False,
     video: bool = False,
+    environment: bool = False,
+    pictures: bool = True,
     on_step: OnStep = lambda done, total: None,
 ) -> None:
     """Writes the episodes, in this order, into a new folder, completely or not at all.
@@ -52,6 +66,8 @@ def export_lerobot(
         task: description for policies that read language; None: made from the task and goal of each episode.
         maps: also write heights, gradients and flow.
         cut: accept incomplete recordings, up to their last step.
+        pictures: also write the canonical pictures; without, a policy that reads numbers alone loads them faster.
+        environment: also write `observation.environment_state`: touch and goal.
         video: write pictures as H.264 video, which is lossy, instead of PNG.
         on_step: is called with the numbers of finished steps and of all steps.
 
@@ -66,7 +82,8 @@ def export_lerobot(
     episodes = [observe_episode(path) for path in paths]
     fps = _check_episodes(episodes, cut)
     with whole_folder(folder) as partial:
-        _write_episodes(episodes, partial, fps, task, maps, video, on_step)
+        chosen = Content(task, maps, video, environment, pictures)
+        _write_episodes(episodes, partial, fps, chosen, on_step)
 
 
 def _check_episodes(episodes: Sequence[ObservedEpisode], cut: bool) -> float:
@@ -104,9 +121,7 @@ def _write_episodes(
     episodes: Sequence[ObservedEpisode],
     folder: Path,
     fps: float,
-    task: str | None,
-    maps: bool,
-    video: bool,
+    chosen: Content,
     on_step: OnStep,
 ) -> None:
     total, done = sum(len(each.episode.steps) for each in episodes), 0
@@ -120,33 +135,37 @@ def _write_episodes(
 
     for each in episodes:
         meta = each.episode.meta
-        mapping = LeRobotMapping(meta.spec, each.canonical, maps=maps)
-        found, columns, images = _convert_episode(each, mapping, count)
+        mapping = LeRobotMapping(
+            meta.spec, each.canonical, maps=chosen.maps, goal=meta.goal, environment=chosen.environment
+        )
+        found, columns, images = _convert_episode(each, mapping, chosen.pictures, count)
         if data is None:
-            features, data = found, DataSet(folder, fps, meta.rig, found, video=video)
+            features, data = found, DataSet(folder, fps, meta.rig, found, video=chosen.video)
         elif found != features:
             raise ValueError(f"{episodes[0].path} and {each.path} do not fit together: {_difference(features, found)}")
-        data.add(columns, images, task_in_words(meta.task, meta.goal) if task is None else task)
+        data.add(columns, images, task_in_words(meta.task, meta.goal) if chosen.task is None else chosen.task)
     assert data is not None
     data.close()
     provenance = _provenance(episodes, mapping)
-    if video:
+    if chosen.video:
         provenance["video_error"] = {name: each.error.summarise() for name, each in data.videos.items()}
     write_json(folder / "meta" / "tacsim.json", provenance)
 
 
 def _convert_episode(
-    each: ObservedEpisode, mapping: LeRobotMapping, count: Callable[[], None]
+    each: ObservedEpisode, mapping: LeRobotMapping, pictures: bool, count: Callable[[], None]
 ) -> tuple[dict[str, Feature], dict[str, Column], dict[str, Statistics]]:
     """Features, columns, and statistics of the pictures of one episode."""
     features: dict[str, Feature] = {}
     rows: list[Row] = []
-    pictures: dict[str, list[bytes]] = {}
+    encoded: dict[str, list[bytes]] = {}
     counts: dict[str, ImageCounts] = {}
     before: Row | None = None
     last = each.episode.steps[-1].index
     for step, observation in each.steps():
         if before is not None:
+            if not pictures:
+                before = {key: value for key, value in before.items() if not key.startswith(IMAGE)}
             if step.action is None:
                 raise EpisodeError(f"{each.path}: step {step.index} has no action")
             row = before | {"action": mapping.encode_action(step.action)} | outcome(step, step.index == last)
@@ -158,7 +177,7 @@ def _convert_episode(
                 )
             for name in [key for key in row if key.startswith(IMAGE)]:
                 picture: NDArray[np.uint8] = row.pop(name)
-                pictures.setdefault(name, []).append(encode_png(picture))
+                encoded.setdefault(name, []).append(encode_png(picture))
                 counts.setdefault(name, ImageCounts()).add(picture)
             rows.append(row)
         try:
@@ -171,7 +190,7 @@ def _convert_episode(
     for key, column in columns.items():
         if not np.isfinite(column).all():
             raise ValueError(f"{each.path}: {key} holds numbers that are not finite")
-    return features, columns | pictures, {key: found.statistics() for key, found in counts.items()}
+    return features, columns | encoded, {key: found.statistics() for key, found in counts.items()}
 
 
 def _difference(first: dict[str, Feature], second: dict[str, Feature]) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from robot.export.lerobot_mapping import IMAGE, STATE, LeRobotMapping, Row, task_in_words
+from robot.export.lerobot_mapping import ENVIRONMENT, IMAGE, STATE, LeRobotMapping, Row, task_in_words
 from robot.export.lerobot_rig import picture_shape
 from robot.open import RandomiseSettings, load_with_task, make_env
 from tacsim.interface import Action, Needs, Observation
@@ -22,9 +22,10 @@ from tacsim.models.task import TaskConfig
 class LeRobotEnv(gymnasium.Env[dict[str, Any], NDArray[np.floating[Any]]]):
     """`robot.make_env` in the numbers of a data set, so that a policy of `lerobot-train` fits it.
 
-    Observation: `pixels`, the canonical picture of each sensor by name, and `agent_pos`, the `observation.state` of a
-    data set. Action: target pose of each arm relative to reset, the `action` of a data set; the arms move along the
-    free axes of the task, by at most its max_step. info: that of `TacsimEnv`, with `is_success` at reset and each step.
+    Observation: `pixels`, the canonical picture of each sensor by name; `agent_pos`, the `observation.state` of a data
+    set; and `environment_state`, the part of it that is no pose of an arm. Action: target pose of each arm relative to
+    reset, the `action` of a data set; the arms move along the free axes of the task, by at most its max_step. info:
+    that of `TacsimEnv`, with `is_success` at reset and each step.
 
     Raises:
         IncompatibleRig: as by `LeRobotMapping`; and the errors of `make_env`.
@@ -44,15 +45,17 @@ class LeRobotEnv(gymnasium.Env[dict[str, Any], NDArray[np.floating[Any]]]):
         # motion as in the rig file, with which the training data were recorded
         self._env = make_env(task, rig, overrides, render_mode, randomise=randomise, features=None, learning=False)
         spec, config = self._env.rig.spec, self._env.task.config
-        self._mapping = LeRobotMapping(spec, canonical, maps=False)
+        self._mapping = LeRobotMapping(spec, canonical, maps=False, goal=self._env.task.goal, environment=True)
         self.metadata = {**self.metadata, "render_fps": round(1.0 / spec.period)}
         self.render_mode = render_mode
         picture = spaces.Box(0, 255, picture_shape(canonical), np.uint8)
         state, action = ((len(each.names),) for each in (self._mapping.state, self._mapping.action))
+        environment = (len(self._mapping.environment),)
         self.observation_space = spaces.Dict(
             {
                 "pixels": spaces.Dict(dict.fromkeys(spec.sensors, picture)),
                 "agent_pos": spaces.Box(-np.inf, np.inf, state, np.float32),
+                "environment_state": spaces.Box(-np.inf, np.inf, environment, np.float32),
             }
         )
         self.action_space = spaces.Box(-np.inf, np.inf, action, np.float32)
@@ -70,6 +73,7 @@ class LeRobotEnv(gymnasium.Env[dict[str, Any], NDArray[np.floating[Any]]]):
         """Starts an episode; the same seed gives the same episode. options: of LeRobot; they are ignored."""
         super().reset(seed=seed)
         _, info = self._env.reset(seed=seed)
+        self._mapping.set_goal(self._env.task.goal)
         return _env_observation(self._mapping.begin(self._env.observation)), info
 
     def step(self, action: NDArray[np.floating[Any]]) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
@@ -110,4 +114,4 @@ class _Fixed:
 
 def _env_observation(row: Row) -> dict[str, Any]:
     pictures = {name.removeprefix(IMAGE): value for name, value in row.items() if name.startswith(IMAGE)}
-    return {"pixels": pictures, "agent_pos": row[STATE]}
+    return {"pixels": pictures, "agent_pos": row[STATE], "environment_state": row[ENVIRONMENT]}

@@ -2,12 +2,14 @@
 
 | feature                         | what                                                               |
 |---------------------------------|--------------------------------------------------------------------|
-| `observation.state`             | (n,) f32: poses relative to reset, wrenches, low-dimensional touch |
+| `observation.state`             | (n,) f32: poses relative to reset, wrenches, touch, goal of a task |
+| `observation.environment_state` | (k,) f32: of the state what is no pose of an arm, if wanted        |
 | `observation.images.{sensor}`   | (H, W, 3) u8: the canonical picture                                |
 | `observation.height.{sensor}`   | (h, w) f32 [m], if the sensor measures it                          |
 | `observation.gradient.{sensor}` | (h, w, 2) f32 [-], if the sensor measures it                       |
 | `observation.flow.{sensor}`     | (m, n, 2) f32 [m], of sensors with markers                         |
-| `action`                        | (9 arms,) f32: target pose of each arm relative to reset           |
+| `action`                        | (9 arms + 2 grippers,) f32: target pose of each arm relative to    |
+|                                 | reset; target width and largest force of each gripper              |
 | `next.reward`, `next.done`      | of the step that the action led to                                 |
 
 Numbers of `observation.state` and `action` are those of `tacsim.FeatureEncoder`: SI values divided by the scale of
@@ -30,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tacsim.gym.features import PARTS, SCALES, FeatureEncoder, decode_pose_change, encode_pose_change
-from tacsim.interface import Action, IncompatibleRig, Observation, Pose, RigSpec
+from tacsim.interface import Action, GripperTarget, IncompatibleRig, Needs, Observation, Pose, RigSpec
 from tacsim.limits import ActionError
 from tacsim.models.policy import Features, Numbers, Quantity
 from tacsim.models.sensor import CanonicalGrid
@@ -40,8 +42,10 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 Row = dict[str, NDArray[Any]]
+Goal = float | tuple[float, ...] | None  # of a task [m]
 
 STATE, ACTION, REWARD, DONE = "observation.state", "action", "next.reward", "next.done"
+ENVIRONMENT = "observation.environment_state"
 IMAGE = "observation.images."
 MAPS = {"height": "observation.height.", "gradient": "observation.gradient.", "flow": "observation.flow."}
 MAP_AXES = ("rows", "columns", "xy")
@@ -70,40 +74,72 @@ class LeRobotMapping:
     each episode.
 
     maps: include heights, gradients and flow.
+    goal: of the task [m], the last numbers of the state, as policies such as ACT read no words; None without a task.
+    environment: give what is no pose of an arm (touch, goal) as the state of the environment too, with which LeRobot's
+        ACT needs no pictures.
 
     Raises:
         IncompatibleRig: the rig has no sensor or no arm, or a name that LeRobot does not allow.
     """
 
-    def __init__(self, spec: RigSpec, canonical: CanonicalGrid, *, maps: bool = True) -> None:
+    def __init__(
+        self,
+        spec: RigSpec,
+        canonical: CanonicalGrid,
+        *,
+        maps: bool = True,
+        goal: Goal = None,
+        environment: bool = False,
+    ) -> None:
         for kind, names in (("sensor", tuple(spec.sensors)), ("arm", spec.arms)):
             if not names:
                 raise IncompatibleRig(f"no {kind}: LeRobot's policies learn from pictures and actions of arms")
             for name in names:
                 if "/" in name:
                     raise IncompatibleRig(f"{kind} '{name}': LeRobot allows no '/' in names; rename it in the rig file")
-        self._maps = maps
+        self._maps, self._has_environment = maps, environment
+        self.set_goal(goal)
         self._encoder = FeatureEncoder(_sensor_features(spec), canonical)
         self._start: dict[str, Pose] = {}
         self._targets: dict[str, Pose] = {}
+        self._grips: dict[str, GripperTarget] = {}
+
+    @property
+    def needs(self) -> Needs:
+        """What an observation must have."""
+        return self._encoder.needs
 
     @property
     def state(self) -> Numbers:
         """Names and scales of the numbers of `observation.state`."""
         found, targets = self._encoder.inputs["touch"], set(self.action.names)
-        names = (name + DRIVEN if name + DRIVEN in targets else name + OTHER for name in found.names)
-        return Numbers(names=tuple(names), scales=found.scales)
+        names = [name + DRIVEN if name + DRIVEN in targets else name + OTHER for name in found.names]
+        names += [f"goal_{number}{OTHER}" for number in range(len(self._goal))]
+        return Numbers(names=tuple(names), scales=(*found.scales, *[SCALES["goal"]] * len(self._goal)))
 
     @property
     def action(self) -> Numbers:
         """Names and scales of the numbers of `action`."""
         parts = [(f"{part}_{arm}{DRIVEN}", SCALES[kind]) for arm in self._encoder.features.arms for part, kind in _POSE]
+        grippers = self._encoder.features.grippers
+        parts += [(f"{part}_{name}{DRIVEN}", SCALES[kind]) for name in grippers for part, kind in _GRIP]
         return Numbers(names=tuple(name for name, _ in parts), scales=tuple(scale for _, scale in parts))
+
+    @property
+    def environment(self) -> tuple[str, ...]:
+        """Names of the numbers of the state that are no pose of an arm."""
+        return tuple(name for name in self.state.names if name.endswith(OTHER))
+
+    def set_goal(self, goal: Goal) -> None:
+        """The goal [m] of the next observations; it has as many numbers as that of the constructor."""
+        self._goal = np.atleast_1d(np.asarray(() if goal is None else goal, np.float32) / np.float32(SCALES["goal"]))
 
     def begin(self, observation: Observation) -> Row:
         """Starts an episode: the row of its first observation."""
         self._start = {arm: observation.arms[arm].pose for arm in self._encoder.features.arms}
         self._targets = dict(self._start)
+        states = {name: observation.grippers[name] for name in self._encoder.features.grippers}
+        self._grips = {name: GripperTarget(each.width, each.force or 0.0) for name, each in states.items()}
         return self._make_row(observation, self._encoder.begin(observation)["touch"])
 
     def encode_observation(self, observation: Observation) -> Row:
@@ -111,28 +147,38 @@ class LeRobotMapping:
         return self._make_row(observation, self._encoder(observation)["touch"])
 
     def encode_action(self, action: Action) -> NDArray[np.float32]:
-        """(9 arms,) target poses; an arm without a target keeps its last one."""
-        for arm in self._targets:
-            target = action.tool.get(arm)
-            if target is not None:
-                self._targets[arm] = target
-        return self.encode_poses(self._targets)
+        """(9 arms + 2 grippers,) targets; what has none keeps its last one."""
+        self._targets |= {arm: pose for arm in self._targets if (pose := action.tool.get(arm)) is not None}
+        self._grips |= {name: grip for name in self._grips if (grip := action.grippers.get(name)) is not None}
+        return self.encode_targets(self._targets, self._grips)
 
-    def encode_poses(self, poses: Mapping[str, Pose]) -> NDArray[np.float32]:
-        """(9 arms,) the pose of each arm relative to its start."""
+    def encode_targets(self, poses: Mapping[str, Pose], grips: Mapping[str, GripperTarget]) -> NDArray[np.float32]:
+        """(9 arms + 2 grippers,) the pose of each arm relative to its start, width and force of each gripper; of one
+        that is not in `grips`, its last target."""
         each = [encode_pose_change(start, poses[arm]) for arm, start in self._start.items()]
+        found = {**self._grips, **grips}
+        pairs = [(found[name].width, found[name].force) for name in self._grips]
+        each += [np.array(pair) / [SCALES[kind] for _, kind in _GRIP] for pair in pairs]
         return np.concatenate(each).astype(np.float32)
 
     def decode_action(self, numbers: NDArray[np.floating[Any]]) -> Action:
-        """The action of (9 arms,) numbers. Raises ActionError for numbers that are no poses."""
-        each = np.asarray(numbers, np.float64).reshape(len(self._start), -1)
+        """The action of (9 arms + 2 grippers,) numbers; a width or a force below 0 is 0. Raises ActionError for numbers
+        that are no poses, or not finite."""
+        values = np.asarray(numbers, np.float64)
+        poses, pairs = np.split(values, [len(_POSE) * len(self._start)])
         tool: dict[str, Pose | None] = {}
-        for (arm, start), values in zip(self._start.items(), each, strict=True):
+        for (arm, start), of_arm in zip(self._start.items(), poses.reshape(-1, len(_POSE)), strict=True):
             try:
-                tool[arm] = decode_pose_change(start, values)
+                tool[arm] = decode_pose_change(start, of_arm)
             except ValueError as failure:
-                raise ActionError(f"the action of arm '{arm}', {values.tolist()}, is no pose: {failure}") from None
-        return Action(tool)
+                raise ActionError(f"the action of arm '{arm}', {of_arm.tolist()}, is no pose: {failure}") from None
+        grips: dict[str, GripperTarget | None] = {}
+        for name, pair in zip(self._grips, pairs.reshape(-1, len(_GRIP)), strict=True):
+            if not np.isfinite(pair).all():
+                raise ActionError(f"the action of gripper '{name}', {pair.tolist()}, is no width and force")
+            width, force = (max(float(v) * SCALES[kind], 0.0) for v, (_, kind) in zip(pair, _GRIP, strict=True))
+            grips[name] = GripperTarget(width, force)
+        return Action(tool, grips)
 
     def features(self, row: Mapping[str, NDArray[Any]]) -> dict[str, Feature]:
         """The features of the columns of a row of this rig."""
@@ -141,11 +187,13 @@ class LeRobotMapping:
     def _feature(self, key: str, value: NDArray[Any]) -> Feature:
         if key.startswith(IMAGE):
             return Feature("image", value.shape, ("height", "width", "channels"))
-        names = {STATE: self.state.names, ACTION: self.action.names}.get(key)
+        names = {STATE: self.state.names, ACTION: self.action.names, ENVIRONMENT: self.environment}.get(key)
         return Feature(value.dtype.name, value.shape, MAP_AXES[: value.ndim] if value.ndim > 1 else names)
 
     def _make_row(self, observation: Observation, state: NDArray[Any]) -> Row:
-        row: Row = {STATE: state}
+        row: Row = {STATE: np.concatenate([state, self._goal])}
+        if self._has_environment:
+            row[ENVIRONMENT] = row[STATE][[name.endswith(OTHER) for name in self.state.names]]
         row |= {IMAGE + name: touch.image for name, touch in observation.tactile.items()}
         for kind, key in MAPS.items() if self._maps else ():
             found = {key + name: getattr(touch, kind) for name, touch in observation.tactile.items()}
@@ -154,17 +202,26 @@ class LeRobotMapping:
 
 
 _POSE = tuple(PARTS["moved"].items())
+_GRIP = tuple(PARTS["grip"].items())
 
 
 def _sensor_features(spec: RigSpec) -> Features:
-    """All arms, and the quantities that every sensor measures."""
+    """All arms and grippers, and the quantities that every sensor measures."""
     sensors = spec.sensors.values()
     touch: list[Quantity] = ["moved", "wrench"]
     touch += ["between"] if len(spec.arms) > 1 else []
     touch += ["area"]
     touch += ["depth", "centroid"] if all(sensor.height for sensor in sensors) else []
     touch += ["shear"] if all(sensor.flow for sensor in sensors) else []
-    return Features(sensors=tuple(spec.sensors), arms=spec.arms, maps=(), touch=tuple(touch), goal=False)
+    touch += ["grip"] if spec.grippers else []
+    return Features(
+        sensors=tuple(spec.sensors),
+        arms=spec.arms,
+        grippers=tuple(spec.grippers),
+        maps=(),
+        touch=tuple(touch),
+        goal=False,
+    )
 
 
 def outcome(step: Step, last: bool) -> Row:
@@ -179,7 +236,7 @@ def frames_per_second(period: float) -> int | float:
     return round(rate) if abs(rate - round(rate)) <= 1e-3 * rate else rate
 
 
-def task_in_words(kind: str | None, goal: float | tuple[float, ...] | None) -> str:
+def task_in_words(kind: str | None, goal: Goal) -> str:
     """Description of a task with this goal [m], for policies that read language."""
     goal = () if goal is None else goal if isinstance(goal, tuple) else (goal,)
     sizes = [f"{1e3 * size:g} mm" for size in goal]

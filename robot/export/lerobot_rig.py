@@ -31,6 +31,7 @@ from tacsim.models.rig import RigConfig
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.models.task import TaskConfig
 from tacsim.rig import Rig
+from tacsim.tasks import make_task
 
 Values = dict[str, float | NDArray[np.uint8]]
 
@@ -92,7 +93,8 @@ class LeRobotRig:
         self.config = rig if isinstance(rig, RigConfig) else load_with_task(rig, task, overrides).config
         if fps is not None:
             require_rate(self.config, fps)
-        self._mapping = LeRobotMapping(rig_spec(self.config), self.config.canonical, maps=False)
+        goal = None if self.config.task is None else make_task(self.config.task).goal
+        self._mapping = LeRobotMapping(rig_spec(self.config), self.config.canonical, maps=False, goal=goal)
         self._rig: Rig | None = None
         self._poses: Mapping[str, Pose] = {}  # the last measured ones
         self._has_observed = False  # since the last action
@@ -161,7 +163,8 @@ class LeRobotRig:
             rig.tick()
         self._has_observed = False
         poses = {name: sent.get(name) or pose for name, pose in self._poses.items()}
-        return dict(zip(names, self._mapping.encode_poses(poses).tolist(), strict=True))
+        grips = {name: grip for name, grip in rig.sent_grippers.items() if grip is not None}
+        return dict(zip(names, self._mapping.encode_targets(poses, grips).tolist(), strict=True))
 
     def close(self) -> None:
         """Stops the arms and closes the rig. A second call does nothing."""
@@ -292,7 +295,7 @@ class Jog:
         arms: that move, each along the axes of its sensor; empty: all.
 
     Raises:
-        IncompatibleRig: the rig has no arm of this name.
+        IncompatibleRig: the rig has no arm of this name, or it has a gripper, which small steps do not move.
         ValueError: the step is not between 0 and 10 mm.
     """
 
@@ -300,6 +303,10 @@ class Jog:
         names = rig.config.arms
         if unknown := sorted(set(arms) - set(names)):
             raise IncompatibleRig(f"rig '{rig.config.name}' has no arm '{unknown[0]}'; it has {', '.join(names)}")
+        if rig.config.grippers:
+            raise IncompatibleRig(
+                f"rig '{rig.config.name}' has a gripper; small steps by keys or a gamepad move arms only"
+            )
         if not 0.0 < step < 0.01:
             raise ValueError(f"step must be a length below 10 mm, in m, got {step!r}")
         self.names = tuple(rig.action_features)

@@ -9,19 +9,21 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.normaliser import normaliser_for_simulation
+from calibration.normaliser import normaliser_for_pictures, normaliser_for_simulation
 from robot.common.kinematics import MODELS, Kinematics, matrix
 from robot.rig import CannotOpen
 from robot.rig.sim_rig import make_gel_monitor, pose_error, renderer_and_noise
 from tacsim import pose as se3
 from tacsim.compute.threads import map_parallel, map_serial
 from tacsim.control import load_controller
-from tacsim.interface import FloatArray, Pose, RigSpec, SensorSpec, Truth
+from tacsim.interface import FloatArray, Normaliser, Pose, RigSpec, SensorSpec, Truth
 from tacsim.models.hardware import parts_of
 from tacsim.models.mujoco import MujocoArmConfig, MujocoGripperConfig, MujocoSensorConfig
 from tacsim.models.rig import RigConfig
 from tacsim.models.scene import Scene
+from tacsim.models.sensor import CanonicalGrid
 from tacsim.optics.surface import surface_map
+from tacsim.physics.grip.shared import GripPlace
 from tacsim.rig import Rig
 from tacsim.sim.arm import SimArm, wrench_noise_source
 from tacsim.sim.cell.arm import CellArm
@@ -90,9 +92,11 @@ def open_mujoco(config: RigConfig, check: Callable[[RigSpec], None] | None = Non
     return simulation.rig
 
 
-def simulate_cell(config: RigConfig, pool: StatePool | None = None, *, parallel: bool = True) -> CellSimulation:
-    """A rig in MuJoCo whose cell is made when it is first needed; arguments as of `simulate` (sim_rig.py). Raises
-    CannotOpen, also where MuJoCo is missing."""
+def simulate_cell(
+    config: RigConfig, pool: StatePool | None = None, place: GripPlace | None = None, *, parallel: bool = True
+) -> CellSimulation:
+    """A rig in MuJoCo whose cell is made when it is first needed; place: of its grip among those of others, where it
+    rests in each period; the rest as of `simulate` (sim_rig.py). Raises CannotOpen, also where MuJoCo is missing."""
     scene = _require_scene(config)
     try:
         load_mujoco()
@@ -104,7 +108,7 @@ def simulate_cell(config: RigConfig, pool: StatePool | None = None, *, parallel:
     carriers = _carriers_of(config, gripper_configs, models)
     described = {name: _describe_gripper(gripper, scene) for name, gripper in gripper_configs.items()}
     motion = MOTIONS[config.motion]
-    scene_cell = SceneCell(scene, partial(_make_cell, config, described))
+    scene_cell = SceneCell(scene, partial(_make_cell, config, described, place))
     frames = {name: f"{sensor.gripper}/{sensor.side}" for name, sensor in models.items()}
     clock = CellClock(scene_cell, config.period, motion, {frame: name for name, frame in frames.items()})
     sensors = {name: _make_sensor(scene_cell, clock, name, sensor, config) for name, sensor in models.items()}
@@ -124,7 +128,7 @@ def simulate_cell(config: RigConfig, pool: StatePool | None = None, *, parallel:
         arms=arms,
         clock=clock,
         normalisers={
-            name: normaliser_for_simulation(sensor.model, scene.gel_of(name).size[:2], config.canonical)
+            name: _make_normaliser(name, sensor, scene.gel_of(name).size[:2], config.canonical)
             for name, sensor in models.items()
         },
         reset=CellReset(scene_cell, clock, sensors, arm_of_gripper, touch_force, placement, pool, motion),
@@ -233,7 +237,9 @@ def _describe_gripper(gripper: MujocoGripperConfig, scene: Scene) -> GripperDesc
     )
 
 
-def _make_cell(config: RigConfig, grippers: Mapping[str, GripperDescription], scene: Scene) -> Cell:
+def _make_cell(
+    config: RigConfig, grippers: Mapping[str, GripperDescription], place: GripPlace | None, scene: Scene
+) -> Cell:
     """Raises what `Cell` raises."""
     arms: dict[str, ArmDescription] = {}
     starts: dict[str, Pose] = {}
@@ -245,8 +251,9 @@ def _make_cell(config: RigConfig, grippers: Mapping[str, GripperDescription], sc
         name: ViewDescription(view.position, view.target, view.field_of_view, view.size)
         for name, view in config.cameras.items()
     }
-    make = Cell if config.motion == "dynamic" else RestingCell
-    return make(scene, arms, grippers, views, starts)
+    if config.motion == "dynamic":
+        return Cell(scene, arms, grippers, views, starts)
+    return RestingCell(scene, arms, grippers, views, starts, place)
 
 
 def _describe_arm(name: str, arm: MujocoArmConfig, gripper: GripperDescription, start: Pose) -> ArmDescription:
@@ -275,13 +282,24 @@ def _ur5e_joints(name: str, base_from_tool: Pose, length: float) -> FloatArray:
     return found
 
 
+def _make_normaliser(
+    name: str, sensor: MujocoSensorConfig, gel_size: tuple[float, float], grid: CanonicalGrid
+) -> Normaliser:
+    """Raises CannotOpen for a model whose pictures do not tell height and flow."""
+    make = normaliser_for_simulation if sensor.surface == "gel" else normaliser_for_pictures
+    try:
+        return make(sensor.model, gel_size, grid)
+    except ValueError as failure:
+        raise CannotOpen(f"sensors.{name}.surface is picture: {failure}") from failure
+
+
 def _make_sensor(
     scene_cell: SceneCell, clock: CellClock, name: str, config: MujocoSensorConfig, rig: RigConfig
 ) -> SimSensor:
     assert rig.scene is not None
     model = config.model
     spec = SensorSpec(model.image_shape, height=True, flow=model.markers is not None, arm=None, gripper=config.gripper)
-    sample = partial(surface_map, grid=rig.canonical, markers=model.markers)
+    sample = partial(surface_map, grid=rig.canonical, markers=model.markers) if config.surface == "gel" else None
     render, noise = renderer_and_noise(model, name, rig.scene)
     return SimSensor(scene_cell, clock, f"{config.gripper}/{config.side}", spec, render, sample, noise, config.delay)
 

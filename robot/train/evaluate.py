@@ -18,6 +18,7 @@ from robot.deploy.policy import (
     load_policy,
     require_fit,
     require_policy_name,
+    reset_policy,
     training_notes,
 )
 from robot.open import load_with_task, make_vector_env
@@ -193,7 +194,7 @@ def _make_actor(name: str, env: TacsimEnv, policy: Policy | None, seed: int) -> 
         random = np.random.default_rng([HELD_OUT_SEED_OFFSET, seed])
         return lambda env: random.uniform(-1.0, 1.0, len(env.task.axes)).astype(np.float32)
     assert policy is not None
-    policy.reset()
+    reset_policy(policy, env.task)
     return lambda env: env.policy_action(policy)
 
 

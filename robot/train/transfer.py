@@ -1,8 +1,8 @@
-"""Compares policies in simulation and on the mock rig, whose hidden twin differs: the loss of success by transfer.
+"""Compares policies in simulation and on a hidden twin, which differs: the loss of success by transfer.
 
 Each policy plays each episode twice: in the simulation of its training, which knows of the twin only what a person can
-see (the task and the shape of the body), and on the mock rig, over the real wire, with all parameters drawn for the
-twin.
+see (the task and the shape of the body or the object), and on the twin, with all parameters drawn. The twin of the rig
+`sim` is the mock rig, over the real wire; the twin of a rig in MuJoCo is the same rig with other parameters.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import as_completed
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
@@ -27,6 +28,7 @@ from tacsim.config import LoadedRig, load_rig
 from tacsim.interface import RigSpec
 from tacsim.models.policy import Training
 from tacsim.models.randomisation import Randomisation
+from tacsim.models.task import LENGTH, TaskConfig, Unit
 from tacsim.record.episode import TACTILE_DISTANCE, Episode
 from tacsim.rig import Rig
 from tacsim.tasks import make_task
@@ -34,11 +36,11 @@ from tacsim.tasks import make_task
 Side = Literal["simulation", "twin"]
 SIDES: tuple[Side, ...] = ("simulation", "twin")
 RIGS = {"simulation": "sim", "twin": "mock"}
-KNOWN_KEYS = ("task.", "scene.body.geometry")  # of a twin, visible to a person
+KNOWN_KEYS = ("task.", "scene.body.geometry", "scene.object.geometry")  # of a twin, visible to a person
 ROWS_FILE = "episodes.jsonl"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Study:
     """Settings of a comparison. Its folder can continue only with the same settings, except for the policies."""
 
@@ -49,6 +51,17 @@ class Study:
     episodes_per_twin: int  # a new twin after this number of episodes
     steps: int | None  # of an episode; None: the task's
     overrides: tuple[str, ...]  # of both rigs
+
+    @cached_property
+    def config(self) -> TaskConfig:
+        """Of its task."""
+        task = load_rig("sim", task=self.task).config.task
+        assert task is not None
+        return task
+
+    def rig(self, side: Side) -> str:
+        """Name of the rig of a side: of a task with a rigid object the hand in MuJoCo on both."""
+        return "hand" if self.config.scene.object is not None else RIGS[side]
 
     @property
     def json_text(self) -> str:
@@ -64,8 +77,8 @@ class EpisodeResult:
     policy: str
     side: Side
     episode: int
-    distance: float | None  # by the truth [m]; None if it did not begin
-    tactile_distance: float | None  # estimated from touch alone [m]
+    distance: float | None  # by the truth [SI]; None if it did not begin
+    tactile_distance: float | None  # estimated from touch alone [SI]
     success: bool
     peak_force: float  # [N]
     error: str = ""  # that ended it early
@@ -101,7 +114,9 @@ def play_study(
             file.write(_json_line(each))
             file.flush()
             ready = sum(each in done for each in requested)
-            report_progress(f"{each.policy}, {each.side}: {_describe_result(each)}", ready, len(requested))
+            report_progress(
+                f"{each.policy}, {each.side}: {_describe_result(each, study.config.unit)}", ready, len(requested)
+            )
     return [done[each] for each in requested]
 
 
@@ -128,17 +143,17 @@ def _play_in_process(study: Study, side: Side, twin: int, remaining: Sequence[tu
     """Plays in a separate process, whose mocks have separate addresses."""
     address = 77  # second number of mock addresses in parallel processes
     overrides: list[str] = []
-    if side == "twin":
+    if study.rig(side) == RIGS["twin"]:
         for number, name in enumerate(load_rig(RIGS[side]).config.arms, start=1):
             host = loopback_host(number, address)
             overrides += [f"arms.{name}.host={host}", f"sensors.{name}.source=http://{host}:8081/?action=stream"]
     return list(_play_on_hidden_rig(replace(study, overrides=(*study.overrides, *overrides)), side, twin, remaining))
 
 
-def _describe_result(results: EpisodeResult) -> str:
+def _describe_result(results: EpisodeResult, unit: Unit) -> str:
     if results.error or results.distance is None:
         return results.error or "it did not begin"
-    return f"{1e3 * results.distance:.3f} mm from the goal{'' if results.success else ', not reached'}"
+    return f"{unit.show(results.distance)} from the goal{'' if results.success else ', not reached'}"
 
 
 def _read_rows(rows: Path) -> Iterator[EpisodeResult]:
@@ -180,15 +195,15 @@ def _load_rig(study: Study, side: Side, twin: int, number: int, policy: str | No
     overrides += [word for word in drawn[number] if word.startswith("task.")]
     if side == "simulation":
         overrides = [word for word in overrides if word.startswith(KNOWN_KEYS)]
-        overrides = [*_training_overrides(policy, study.task, number), *overrides]
-    return load_rig(RIGS[side], task=study.task, overrides=[*study.overrides, *overrides])
+        overrides = [*_training_overrides(policy, study, number), *overrides]
+    return load_rig(study.rig(side), task=study.task, overrides=[*study.overrides, *overrides])
 
 
-def _training_overrides(policy: str | None, task: str, number: int) -> list[str]:
+def _training_overrides(policy: str | None, study: Study, number: int) -> list[str]:
     """Overrides of the training rig of a learned policy, for draw `number`; empty for other policies."""
     if policy is None or not (policy == "learned" or policy.endswith(".onnx")):
         return []
-    loaded = load_rig(RIGS["simulation"], task=task)
+    loaded = load_rig(study.rig("simulation"), task=study.task)
     assert loaded.config.task is not None
     nothing = RigSpec({}, (), truth=False, period=loaded.config.period)
     loaded_policy = load_policy(policy, make_task(loaded.config.task), nothing, loaded.config.canonical)
@@ -243,8 +258,8 @@ class SummaryRow:
     policy: str
     side: Side
     success: Interval  # rate
-    distance: Interval | None  # mean [m]; None if no episode began
-    agreement: float | None  # root mean square of tactile minus true distance [m]
+    distance: Interval | None  # mean [SI]; None if no episode began
+    agreement: float | None  # root mean square of tactile minus true distance [SI]
     failures: int  # episodes ended by an error
 
 
@@ -272,14 +287,14 @@ def summarise(results: Sequence[EpisodeResult]) -> list[SummaryRow]:
     return rows
 
 
-def draw_figure(rows: Sequence[SummaryRow], path: Path) -> None:
+def draw_figure(rows: Sequence[SummaryRow], path: Path, unit: Unit = LENGTH) -> None:
     """Draws success and distance of each policy on both sides, with intervals."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9, 1.6 + 0.7 * len(rows) / 2), layout="constrained")
     names = list(dict.fromkeys(row.policy for row in rows))
-    for axes, what, scale, unit in zip(
-        figure.subplots(1, 2, sharey=True), ("success", "distance"), (100, 1e3), ("%", "mm"), strict=True
+    for axes, what, scale, symbol in zip(
+        figure.subplots(1, 2, sharey=True), ("success", "distance"), (100, unit.factor), ("%", unit.symbol), strict=True
     ):
         for side, colour, shift in (("simulation", "#9fb4c8", -0.15), ("twin", "#1f3a5f", 0.15)):
             there = [(row, getattr(row, what)) for row in rows if row.side == side]
@@ -290,7 +305,7 @@ def draw_figure(rows: Sequence[SummaryRow], path: Path) -> None:
             errors = scale * np.abs(np.array([[i.value - i.low, i.high - i.value] for _, i in selected]).T)
             axes.errorbar(values, [y for y, _ in selected], xerr=errors, fmt="o", color=colour, label=side, capsize=3)
         axes.set_title(what, loc="left", fontsize=10)
-        axes.set_xlabel(unit)
+        axes.set_xlabel(symbol)
         axes.set_yticks(range(len(names)), [Path(name).stem.replace("$", r"\$") for name in names])
         axes.set_xlim(left=0)
     axes.invert_yaxis()

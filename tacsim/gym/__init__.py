@@ -13,6 +13,7 @@ ENVIRONMENTS = {
     "tacsim/Reposition-v0": "reposition",
     "tacsim/Knead-v0": "knead",
     "tacsim/Lengthen-v0": "lengthen",
+    "tacsim/Relief-v0": "relief",
 }
 
 

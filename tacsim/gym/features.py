@@ -35,6 +35,7 @@ from tacsim.interface import (
 from tacsim.models.policy import Channel, Features, MapGrid, Numbers, Quantity
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.tasks.reposition import centre_of_pressure_in_sensor
+from tacsim.tasks.turn import EdgeTurn
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -50,6 +51,7 @@ SCALES = {
     "depth": 1e-3,  # greatest, and mean over the contact [m]
     "centroid": 5e-3,  # of the indented volume, sensor x and y [m]
     "shear": 0.2e-3,  # mean flow of all markers, sensor x and y [m]
+    "turned": 0.5,  # of the edges in the gel since the first observation, from sensor x to y [rad]
     "force": 10.0,  # [N]
     "torque": 0.05,  # [N m]
     "pressure": 5e-3,  # where the normal force acts, less where it did at the first touch; sensor x and y [m]
@@ -72,6 +74,7 @@ PARTS: dict[str, dict[str, str]] = {
     "depth": {"depth_greatest": "depth", "depth_mean": "depth"},
     "centroid": {"centroid_x": "centroid", "centroid_y": "centroid"},
     "shear": {"shear_x": "shear", "shear_y": "shear"},
+    "turned": {"turned": "turned"},
     "wrench": {f"{what}_{axis}": what for what in ("force", "torque") for axis in "xyz"},
     "pressure": {"pressure_x": "pressure", "pressure_y": "pressure"},
     "moved": {f"moved_{axis}": "moved" for axis in "xyz"}
@@ -81,7 +84,7 @@ PARTS: dict[str, dict[str, str]] = {
     "grip": {"width": "width", "grip_force": "force"},
 }
 _IDENTITY_COLUMNS = np.array([1.0, 0.0, 0.0, 0.0, 1.0, 0.0])
-_SENSOR_QUANTITIES = ("area", "depth", "centroid", "shear")
+_SENSOR_QUANTITIES = ("area", "depth", "centroid", "shear", "turned")
 
 
 def default_features(canonical: CanonicalGrid, sensors: Sequence[str], arms: Sequence[str]) -> Features:
@@ -122,6 +125,7 @@ class FeatureEncoder:
         self._goal: Arrays = {}
         self._start: Mapping[str, Pose] = {}
         self._pressed: dict[str, FloatArray] = {}  # where the normal force acted first
+        self._turns: list[EdgeTurn] = []  # of each sensor
         self._before: Mapping[str, Pose] = {}  # poses of the last observation
         self._sums: FloatArray | float = 0.0  # of what is remembered, since the episode began
         self._count = 0
@@ -130,7 +134,7 @@ class FeatureEncoder:
     @property
     def needs(self) -> Needs:
         wanted = self.features
-        height = bool({"height", "slope"} & set(wanted.maps) or {"depth", "centroid"} & set(wanted.touch))
+        height = bool({"height", "slope"} & set(wanted.maps) or {"depth", "centroid", "turned"} & set(wanted.touch))
         flow = wanted.flow or "shear" in wanted.touch
         sensors, arms, grippers = map(frozenset, (wanted.sensors, wanted.arms, wanted.grippers))
         return Needs(sensors, arms, height=height, flow=flow, grippers=grippers)
@@ -184,6 +188,7 @@ class FeatureEncoder:
             self._goal = {"goal": np.atleast_1d(np.asarray(goal, np.float32) / np.float32(SCALES["goal"]))}
         self._start = {name: observation.arms[name].pose for name in self.features.arms}
         self._pressed, self._before = {}, self._start
+        self._turns = [EdgeTurn() for _ in self.features.sensors]
         self._sums, self._count = 0.0, 0
         self._frames.extend([self._encode(observation)] * self.features.frames)
         return self._stack_frames()
@@ -244,6 +249,9 @@ class FeatureEncoder:
             each = [self._centroid(touch) / SCALES["centroid"] for touch in touches]
         elif quantity == "shear":
             each = [_require_flow(touch).mean(axis=(0, 1)) / SCALES["shear"] for touch in touches]
+        elif quantity == "turned":
+            turns = zip(self._turns, touches, strict=True)
+            each = [np.array([turn(touch) / SCALES["turned"]]) for turn, touch in turns]
         elif quantity == "wrench":
             each = [
                 np.concatenate([a.wrench[:3] / SCALES["force"], a.wrench[3:] / SCALES["torque"]]) for a in arms.values()
@@ -332,7 +340,8 @@ def _depths(touch: TactileObservation) -> FloatArray:
     """(2,) greatest depth, and mean depth where there is contact [m]; 0 without contact."""
     height = _require_height(touch)
     greatest = height.max(where=touch.valid, initial=0.0)
-    mean = height.mean(where=touch.contact) if touch.contact.any() else 0.0
+    touching = height[touch.contact]  # `mean(where=...)` takes three times as long
+    mean = touching.mean() if touching.size else 0.0
     return np.array([greatest, mean])
 
 

@@ -59,18 +59,15 @@ class SharedBatch:
 
 
 class CellBatch:
-    """Cells of MuJoCo, one after the other."""
+    """Cells of MuJoCo of one rig file. Those that rest in each period share launches."""
 
     def move(self, commands: Sequence[CellPeriod | None]) -> list[Any]:
         """See MemberBatch."""
-        ends: list[Any] = [None] * len(commands)
-        for number, command in enumerate(commands):
-            try:
-                if command is not None:
-                    command.advance()
-            except STEP_ERRORS as failure:
-                ends[number] = failure
-        return ends
+        requested = [command for command in commands if command is not None]
+        if not requested:
+            return [None] * len(commands)
+        ends = iter(requested[0].motion.advance_together(requested))
+        return [None if command is None else next(ends) for command in commands]
 
 
 class MemberClock(Protocol):

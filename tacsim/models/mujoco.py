@@ -103,6 +103,8 @@ class MujocoSensorConfig(SensorConfig):
     side: Literal["left", "right"]  # its finger
     model: SensorModel = SensorModel()
     delay: Delay = 0
+    # Where height and flow come from. gel: the simulated gel; picture: found in its picture, as on a robot
+    surface: Literal["gel", "picture"] = "gel"
 
     @property
     def sensor_model(self) -> SensorModel | None:

@@ -14,7 +14,9 @@ from tacsim.models.quantity import Config, Force, Length, Time
 from tacsim.models.randomisation import Randomisation
 
 Channel = Literal["height", "slope", "contact", "image", "picture"]
-Quantity = Literal["area", "depth", "centroid", "shear", "wrench", "pressure", "moved", "stepped", "between", "grip"]
+Quantity = Literal[
+    "area", "depth", "centroid", "shear", "turned", "wrench", "pressure", "moved", "stepped", "between", "grip"
+]
 
 METADATA_KEY = "tacsim.spec"  # of an ONNX file
 

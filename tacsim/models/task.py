@@ -104,6 +104,18 @@ class LengthenConfig(TaskConfig):
     success: Annotated[Length, Field(gt=0)] = 0.3e-3
 
 
+class ReliefConfig(TaskConfig):
+    """Press dents into the body: distance = rms over the dents of (depth - goal); actions move the upper sensor along
+    world x and z."""
+
+    kind: Literal["relief"]
+    places: tuple[Length, Length] = (-4.5e-3, 4.5e-3)  # of the dents, along world x from the body's middle [m]
+    goal: tuple[Annotated[Length, Field(gt=0)], Annotated[Length, Field(gt=0)]] = (0.6e-3, 0.4e-3)  # depths at rest [m]
+    max_step: Annotated[Length, Field(gt=0)] = 0.4e-3
+    success: Annotated[Length, Field(gt=0)] = 0.12e-3
+    steps: Annotated[int, Field(ge=1, le=1_000_000)] = 300
+
+
 class RigidTaskConfig(TaskConfig):
     """A task for a gripper with a rigid object between its fingers. `touch_force` is the grip at the start."""
 
@@ -190,6 +202,7 @@ TASKS: list[type[TaskConfig]] = [
     RepositionConfig,
     KneadConfig,
     LengthenConfig,
+    ReliefConfig,
     HoldConfig,
     TurnConfig,
     PegConfig,

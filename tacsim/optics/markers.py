@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from tacsim.interface import Float32, FloatArray, Mask
 from tacsim.models.scene import GelSurface
 from tacsim.models.sensor import Markers, SensorGeometry
-from tacsim.optics.spline import displacement_and_jacobian
+from tacsim.optics.spline import SplinePoints
 from tacsim.optics.tuning import INK_TRANSMISSION
 
 
@@ -58,9 +60,17 @@ def marker_discs(surface: GelSurface, markers: Markers, geometry: SensorGeometry
 
 def _dot_displacement(surface: GelSurface, markers: Markers) -> FloatArray:
     """(rows, columns, 3) of the dots, sensor axes [m]."""
-    rest = rest_positions(markers)
-    displacement, _ = displacement_and_jacobian(surface, rest.reshape(-1, 2))
-    return displacement.reshape(*rest.shape[:2], 3)
+    dots = _dots_on_lattice(markers, surface.displacement.shape, surface.spacing, surface.origin)
+    return dots.displacement(surface).reshape(markers.rows, markers.columns, 3)
+
+
+@lru_cache(maxsize=16)  # dots stay where they are printed
+def _dots_on_lattice(
+    markers: Markers, shape: tuple[int, ...], spacing: float, origin: tuple[float, float]
+) -> SplinePoints:
+    return SplinePoints.of(
+        GelSurface(np.zeros(shape, np.float32), spacing, origin), rest_positions(markers).reshape(-1, 2)
+    )
 
 
 def marker_coverage(positions: FloatArray, radius: float | FloatArray, shape: tuple[int, int]) -> Float32:

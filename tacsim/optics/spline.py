@@ -31,12 +31,36 @@ def spline_weights(position: FloatArray, nodes: int) -> tuple[NDArray[np.intp], 
     return index, weight, slope
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class SplinePoints:
+    """Material points of a lattice: along x and along y their nodes (n, 3), weights and the derivatives of those."""
+
+    x: tuple[NDArray[np.intp], FloatArray, FloatArray]
+    y: tuple[NDArray[np.intp], FloatArray, FloatArray]
+
+    @classmethod
+    def of(cls, surface: GelSurface, points: FloatArray) -> SplinePoints:
+        """Points (n, 2) [m]."""
+        nx, ny, _ = surface.displacement.shape
+        return cls(
+            spline_weights((points[:, 0] - surface.origin[0]) / surface.spacing, nx),
+            spline_weights((points[:, 1] - surface.origin[1]) / surface.spacing, ny),
+        )
+
+    def control(self, surface: GelSurface) -> FloatArray:
+        """(n, 3, 3, 3) displacements of their nodes [m]."""
+        return surface.displacement[self.x[0][:, :, None], self.y[0][:, None, :]].astype(np.float64)
+
+    def displacement(self, surface: GelSurface) -> FloatArray:
+        """(n, 3) [m]"""
+        return np.asarray(np.einsum("nijc,ni,nj->nc", self.control(surface), self.x[1], self.y[1]))
+
+
 def displacement_and_jacobian(surface: GelSurface, points: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Displacement (n, 3) [m] and its derivative (n, 3, 2) by X, Y at material points (n, 2) [m]."""
-    nx, ny, _ = surface.displacement.shape
-    i, wx, dx = spline_weights((points[:, 0] - surface.origin[0]) / surface.spacing, nx)
-    j, wy, dy = spline_weights((points[:, 1] - surface.origin[1]) / surface.spacing, ny)
-    control = surface.displacement[i[:, :, None], j[:, None, :]].astype(np.float64)  # (n, 3, 3, 3)
+    at = SplinePoints.of(surface, points)
+    (_, wx, dx), (_, wy, dy) = at.x, at.y
+    control = at.control(surface)
     value = np.einsum("nijc,ni,nj->nc", control, wx, wy)
     by_x = np.einsum("nijc,ni,nj->nc", control, dx, wy) / surface.spacing
     by_y = np.einsum("nijc,ni,nj->nc", control, wx, dy) / surface.spacing

@@ -47,7 +47,7 @@ class SimSensor:
 
     Args:
         render: gel surface -> (H, W, 3) uint8 RGB.
-        sample: gel surface -> height, gradient and flow on the canonical grid.
+        sample: gel surface -> height, gradient and flow on the canonical grid; None: its frames have pictures only.
         noise: of its camera, drawn from the seed of the episode and the index of the frame; None: no noise.
         delay: its pictures are those of so many periods ago.
     """
@@ -59,7 +59,7 @@ class SimSensor:
         frame: str,
         spec: SensorSpec,
         render: Callable[[GelSurface], Image],
-        sample: Callable[[GelSurface], SurfaceMap],
+        sample: Callable[[GelSurface], SurfaceMap] | None,
         noise: NoiseSource | None = None,
         delay: int = 0,
     ) -> None:
@@ -79,7 +79,7 @@ class SimSensor:
             image=partial(self._camera, surface, self._index - 1, self._episode),
             time=self._clock.now(),
             index=self._index - 1,
-            surface=self._sample(surface),
+            surface=None if self._sample is None else self._sample(surface),
             stats=self._clock.diagnostics(),
         )
 

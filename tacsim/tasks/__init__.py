@@ -12,6 +12,7 @@ from tacsim.models.task import (
     KneadConfig,
     LengthenConfig,
     PegConfig,
+    ReliefConfig,
     RepositionConfig,
     SqueezeConfig,
     TaskConfig,
@@ -22,6 +23,7 @@ from tacsim.tasks.hold import Hold
 from tacsim.tasks.knead import Knead
 from tacsim.tasks.lengthen import Lengthen
 from tacsim.tasks.peg import Peg
+from tacsim.tasks.relief import Relief
 from tacsim.tasks.reposition import Reposition
 from tacsim.tasks.squeeze import Squeeze
 from tacsim.tasks.task import (
@@ -46,6 +48,7 @@ __all__ = [
     "Knead",
     "Lengthen",
     "Outcome",
+    "Relief",
     "Reposition",
     "Squeeze",
     "Task",
@@ -63,6 +66,7 @@ _TASK_OF_CONFIG: dict[type[TaskConfig], Callable[[Any], Task]] = {
     TurnConfig: Turn,
     DrawerConfig: Drawer,
     LengthenConfig: Lengthen,
+    ReliefConfig: Relief,
     PegConfig: Peg,
 }
 

@@ -10,7 +10,7 @@ from tacsim.interface import Action, FloatArray, GripperTarget, Needs, Observati
 from tacsim.models.task import HoldConfig
 from tacsim.tasks.rigid import RigidTask, grip_component, grip_force, min_grip_force
 from tacsim.tasks.task import GoalOutOfReach, GripAxis
-from tacsim.tasks.tuning import FORCE_DECREASE, MIN_FLOW, SLIP_FLOW_CHANGE
+from tacsim.tasks.tuning import FORCE_DECREASE, GRIP_RULE, MIN_FLOW, MIN_WEIGHT, SLIP_FLOW_CHANGE
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +46,9 @@ class Hold(RigidTask):
 
     def scripted(self, *, through: bool = False) -> Policy:
         return ScriptedHold(self.config, through)
+
+    def analytic(self) -> Policy:
+        return AnalyticHold(self.config)
 
 
 class ScriptedHold:
@@ -90,3 +93,43 @@ class ScriptedHold:
             if name in before
         ]
         return max(changes, default=0.0)
+
+
+class AnalyticHold:
+    """Grip force over the least that holds = A * (force / weight)^B * (greatest difference of the flow of neighbouring
+    markers / greatest flow)^C, with the constants of GRIP_RULE: the rim of the contact slips first, and there
+    neighbours part. It asks for `margin` times the least, and lowers the force in steps, because only near the limit
+    does the rule tell anything."""
+
+    def __init__(self, config: HoldConfig) -> None:
+        self._config = config
+
+    @property
+    def needs(self) -> Needs:
+        return Needs(arms=frozenset({self._config.arm}), flow=True, grippers=frozenset({self._config.gripper}))
+
+    def reset(self) -> None:
+        """It has no memory."""
+
+    def __call__(self, observation: Observation) -> Action:
+        config = self._config
+        force = observation.grippers[config.gripper].force
+        if force is None:
+            raise ValueError(f"the rule for '{config.kind}' needs a gripper that measures its force")
+        weight = max(float(np.linalg.norm(observation.arms[config.arm].wrench[:3])), MIN_WEIGHT)
+        scale, of_force, of_flow = GRIP_RULE
+        excess = scale * (force / weight) ** of_force * _flow_difference(observation) ** of_flow
+        wanted = force * config.margin / excess
+        return Action({}, {config.gripper: GripperTarget(0.0, max(wanted, FORCE_DECREASE * force))})
+
+
+def _flow_difference(observation: Observation) -> float:
+    """Greatest difference of the flow of two neighbouring markers over the greatest flow, mean of the sensors [-]."""
+    shares = []
+    for touch in observation.tactile.values():
+        if touch.flow is None:
+            continue
+        flow = touch.flow.astype(np.float64)
+        parted = max(float(np.linalg.norm(np.diff(flow, axis=axis), axis=-1).max()) for axis in (0, 1))
+        shares.append(parted / max(float(np.linalg.norm(flow, axis=-1).max()), MIN_FLOW))
+    return float(np.mean(shares)) if shares else 1.0

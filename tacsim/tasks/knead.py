@@ -25,7 +25,15 @@ from tacsim.models.task import KneadConfig
 from tacsim.optics.grid import canonical_cells
 from tacsim.tasks.squeeze import BOTH, estimated_height
 from tacsim.tasks.task import Axis, Estimator, GoalOutOfReach, Task
-from tacsim.tasks.tuning import ARRIVAL_SHARE, CLOSING_STEPS, MAX_PRESSURE_SHARE, MAX_TOUCHES, MIN_TOUCH_DEPTH
+from tacsim.tasks.tuning import (
+    ARRIVAL_SHARE,
+    BALL_CIRCLE_SHARE,
+    BALL_HEIGHT_SHARE,
+    CLOSING_STEPS,
+    MAX_PRESSURE_SHARE,
+    MAX_TOUCHES,
+    MIN_TOUCH_DEPTH,
+)
 
 SAMPLE_POINTS = 500  # of the earth mover's distance
 
@@ -207,9 +215,9 @@ class Knead(Task):
 
 
 class ScriptedKnead:
-    """Rolls the body between the gels, a quarter turn to each side, at a light normal force: for a rod across its axis,
-    for a ball in ever other directions. It lets go when the estimated height is that of the solid; with `through` it
-    goes on rolling.
+    """Rolls the body between the gels at a light normal force: for a rod across its axis, a quarter turn to each side,
+    for a ball on a circle. It lets go when the estimated height is that of the solid; with `through` it goes on
+    rolling.
 
     pressure: the force that it holds, over the face of a cube of the body's volume [Pa]. Well below the yield stress it
     kneads nothing; clay that is pressed harder is flattened, not rolled.
@@ -220,10 +228,13 @@ class ScriptedKnead:
     def __init__(self, task: Knead, through: bool, pressure: float = 12e3) -> None:
         self._task, self._through = task, through
         self._force = pressure * task.volume ** (2 / 3)
-        # The body turns by half of the sensor's way over its own radius.
+        self._is_ball = task.config.shape == "ball"
+        # Clay between the gels springs back: a ball is rolled a little flatter than it is to become.
+        self._goal_height = (BALL_HEIGHT_SHARE if self._is_ball else 1.0) * task.goal[2]
+        # The body turns by half of the sensor's displacement over its own radius.
         self._reach = 0.5 * np.pi * task.goal[2]
         self._start: FloatArray | None = None
-        self._before, self._strokes = np.zeros(2), 0
+        self._before = 0.0
 
     @property
     def needs(self) -> Needs:
@@ -231,14 +242,15 @@ class ScriptedKnead:
 
     def reset(self) -> None:
         self._start = None
-        self._before, self._strokes = np.zeros(2), 0
+        self._before = 0.0
 
     def __call__(self, observation: Observation) -> Action:
         lower, upper = observation.arms["lower"], observation.arms["upper"]
         if self._start is None:
             self._start = np.array(upper.pose.position)
         closing = self._closing_step(observation)
-        lateral = self._lateral_step(upper.pose.position[:2] - self._start[:2])
+        moved = upper.pose.position[:2] - self._start[:2]
+        lateral = self._circle_step(moved) if self._is_ball else self._stroke_step(moved)
         return Action(
             {
                 "lower": Pose(lower.pose.position + [0.0, 0.0, closing], lower.pose.quaternion),
@@ -248,7 +260,7 @@ class ScriptedKnead:
 
     def _closing_step(self, observation: Observation) -> float:
         """How far each sensor goes towards the other [m]."""
-        if not self._through and estimated_height(observation) <= self._task.goal[2]:
+        if not self._through and estimated_height(observation) <= self._goal_height:
             return -0.2 * self._task.config.max_step
         return self._force_step(observation)
 
@@ -258,27 +270,31 @@ class ScriptedKnead:
         force = -0.5 * float(observation.arms["lower"].wrench[2] + observation.arms["upper"].wrench[2])
         return float(np.clip(self.gain * (self._force - force), -longest, longest))
 
-    def _lateral_step(self, now: FloatArray) -> FloatArray:
-        """(2,) step of the upper sensor, `now` its lateral distance from where it began [m]: to one side, to the other,
-        and through the middle again. It goes on as the sensor moves, not by a clock, and a learner sees that."""
+    def _stroke_step(self, now: FloatArray) -> FloatArray:
+        """(2,) step of the upper sensor along y, `now` its lateral distance from where it began [m]: to one side, the
+        other, and back to the middle. It depends on the sensor's motion, not on a clock, so a learner can see it."""
         aims = (1.0, -1.0, 0.0)  # of a stroke: to one side, to the other, to the middle
-        longest = self._task.config.max_step
-        moved, self._before = now - self._before, now
-        along = float(moved @ self._stroke_direction())
-        part = 1 if along < -ARRIVAL_SHARE * longest else 2 if float(now @ self._stroke_direction()) < 0 else 0
-        while (
-            float(np.linalg.norm(left := aims[part] * self._reach * self._stroke_direction() - now))
-            < ARRIVAL_SHARE * longest
-        ):
+        longest, place = self._task.config.max_step, float(now[1])
+        moved, self._before = place - self._before, place
+        part = 1 if moved < -ARRIVAL_SHARE * longest else 2 if place < 0 else 0
+        while np.linalg.norm(left := np.array([0.0, aims[part] * self._reach]) - now) < ARRIVAL_SHARE * longest:
             part = (part + 1) % 3
-            self._strokes += part == 0
-        return left * min(1.0, 0.9 * longest / float(np.linalg.norm(left)))
+        step: FloatArray = left * min(1.0, 0.9 * longest / float(np.linalg.norm(left)))
+        return step
 
-    def _stroke_direction(self) -> FloatArray:
-        """(2,) where the first half of this stroke goes, unit vector."""
-        golden_angle = np.pi * (3.0 - 5.0**0.5)  # no two strokes of a ball's go one way
-        turn = 0.5 * np.pi if self._task.config.shape == "rod" else golden_angle * self._strokes
-        return np.array([np.cos(turn), np.sin(turn)])
+    def _circle_step(self, now: FloatArray) -> FloatArray:
+        """The same on a circle around the start, to which it spirals out: the body rolls about ever other axes."""
+        longest, radius = 0.9 * self._task.config.max_step, BALL_CIRCLE_SHARE * self._task.goal[2]
+        distance = float(np.linalg.norm(now))
+        outwards = now / distance if distance > 0.0 else np.array([1.0, 0.0])
+        onwards = np.array([-outwards[1], outwards[0]])
+        if distance < radius - longest:
+            spiral: FloatArray = longest * (outwards + onwards) / np.sqrt(2.0)
+            return spiral
+        angle = longest / radius
+        left = radius * (np.cos(angle) * outwards + np.sin(angle) * onwards) - now
+        step: FloatArray = left * min(1.0, longest / float(np.linalg.norm(left)))
+        return step
 
 
 class AnalyticKnead(ScriptedKnead):
@@ -286,7 +302,7 @@ class AnalyticKnead(ScriptedKnead):
 
     def _closing_step(self, observation: Observation) -> float:
         longest = self._task.config.max_step
-        left = estimated_height(observation) - self._task.goal[2]
+        left = estimated_height(observation) - self._goal_height
         return float(np.clip(0.5 * left / CLOSING_STEPS, -longest, longest))
 
 
@@ -295,7 +311,7 @@ class KneadTeacher(ScriptedKnead):
     the height from the solid's, and it stays there. `pressure` is only a limit."""
 
     def _closing_step(self, observation: Observation) -> float:
-        left = estimated_height(observation) - self._task.goal[2]
+        left = estimated_height(observation) - self._goal_height
         return min(self._force_step(observation), 0.5 * left / CLOSING_STEPS)
 
 

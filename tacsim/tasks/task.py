@@ -217,27 +217,28 @@ def vector_of_action(
 class Effort:
     """The greatest normal force of a sensor, and the work that the arms do, from the states after each control step.
 
-    Work is the sum over arms and steps of the force on the body times the way of its sensor, the force taken as the
-    mean of before and after (trapezoidal rule); turns are left out.
+    Work is the sum over arms and steps of the force on the body times the displacement of its sensor, the force taken
+    as the mean of before and after (trapezoidal rule); turns are left out.
     """
 
     def __init__(self, arms: Mapping[str, ArmState]) -> None:
-        self._before = arms
+        self._before, self._forces = arms, _world_forces(arms)
         self.peak = _max_normal_force(arms)  # [N]
         self.work = 0.0  # [J]
 
     def add(self, arms: Mapping[str, ArmState]) -> None:
         """The next states of the same arms."""
+        forces = _world_forces(arms)
         for name, now in arms.items():
-            before = self._before[name]
-            force = -0.5 * (_world_force(before) + _world_force(now))  # on the body
-            self.work += float(force @ (now.pose.position - before.pose.position))
-        self._before, self.peak = arms, max(self.peak, _max_normal_force(arms))
+            force = -0.5 * (self._forces[name] + forces[name])  # on the body
+            self.work += float(force @ (now.pose.position - self._before[name].pose.position))
+        self._before, self._forces = arms, forces
+        self.peak = max(self.peak, _max_normal_force(arms))
 
 
-def _world_force(arm: ArmState) -> np.ndarray:
-    """(3,) on the sensor, world axes [N]."""
-    return se3.rotate(arm.pose, arm.wrench[:3])
+def _world_forces(arms: Mapping[str, ArmState]) -> dict[str, FloatArray]:
+    """(3,) on the sensor of each arm, world axes [N]."""
+    return {name: se3.rotate(arm.pose, arm.wrench[:3]) for name, arm in arms.items()}
 
 
 def _max_normal_force(arms: Mapping[str, ArmState]) -> float:

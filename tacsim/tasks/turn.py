@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from dataclasses import dataclass
 
 import numpy as np
@@ -49,27 +50,46 @@ class Turn(RigidTask):
     def scripted(self, *, through: bool = False) -> Policy:
         return ScriptedTurn(self.config, through)
 
+    def teacher(self) -> Policy:
+        """The scripted policy, which goes on from the force that there is, even if a learned policy asked for it."""
+        return ScriptedTurn(self.config, through=False, follows=True)
+
+
+class EdgeTurn:
+    """The angle by which the edges in a gel have turned since its first observation with an edge: their direction from
+    the structure tensor of the slopes (Bigun & Granlund 1987)."""
+
+    def __init__(self) -> None:
+        self._before: float | None = None  # direction of the edges at the last observation [rad]
+        self._turned = 0.0
+
+    @property
+    def is_known(self) -> bool:
+        """An edge was seen."""
+        return self._before is not None
+
+    def __call__(self, touch: TactileObservation) -> float:
+        """[rad], from sensor x to y; as before where the gel shows no edge."""
+        direction = edge_direction(touch)
+        if direction is not None:
+            if self._before is not None:  # a direction is known but for half a turn
+                self._turned += (direction - self._before + math.pi / 2) % math.pi - math.pi / 2
+            self._before = direction
+        return self._turned
+
 
 class TurnEstimate:
     """The angle by which an object with straight edges has turned in the grip since the first observation, by touch:
-    the direction of its edges in the gels, from the structure tensor of the slopes (Bigun & Granlund 1987)."""
+    the mean of its gels."""
 
     def __init__(self) -> None:
-        self._before: dict[str, float] = {}  # direction of the edges at the last observation, by sensor [rad]
-        self._turned: dict[str, float] = {}  # since the first [rad]
+        self._turns: defaultdict[str, EdgeTurn] = defaultdict(EdgeTurn)  # by sensor
 
     def __call__(self, observation: Observation) -> float | None:
-        """[rad], not negative; None where no sensor shows an edge."""
-        for name, touch in observation.tactile.items():
-            direction = edge_direction(touch)
-            if direction is None:
-                continue
-            if name in self._before:  # a direction is known but for half a turn
-                change = (direction - self._before[name] + math.pi / 2) % math.pi - math.pi / 2
-                self._turned[name] = self._turned.get(name, 0.0) + change
-            self._before[name] = direction
-            self._turned.setdefault(name, 0.0)
-        return float(np.mean(np.abs(list(self._turned.values())))) if self._turned else None
+        """[rad], not negative; None where no sensor has shown an edge."""
+        turned = {name: self._turns[name](touch) for name, touch in observation.tactile.items()}
+        known = [abs(angle) for name, angle in turned.items() if self._turns[name].is_known]
+        return float(np.mean(known)) if known else None
 
 
 def edge_direction(touch: TactileObservation) -> float | None:
@@ -84,10 +104,11 @@ def edge_direction(touch: TactileObservation) -> float | None:
 
 class ScriptedTurn:
     """Loosens the grip until the object turns as fast as it should, slower near the goal, and tightens it there. Needs
-    the height of the gels. With `through` it does not tighten at the goal."""
+    the height of the gels. With `through` it does not tighten at the goal, with `follows` it changes the measured force
+    instead of the one that it asked for."""
 
-    def __init__(self, config: TurnConfig, through: bool) -> None:
-        self._config, self._through = config, through
+    def __init__(self, config: TurnConfig, through: bool, follows: bool = False) -> None:
+        self._config, self._through, self._follows = config, through, follows
         self.reset()
 
     @property
@@ -103,6 +124,9 @@ class ScriptedTurn:
         angle = self._estimate(observation) or 0.0
         turned, self._angle = angle - self._angle, angle
         left = self._config.goal - angle
+        measured = observation.grippers[self._config.gripper].force
+        if self._follows and measured is not None:
+            self._force = measured
         self._reached = self._reached or left <= STOPPING_STEPS * turned
         if self._reached and not self._through:
             self._force = self._config.touch_force

@@ -1,4 +1,4 @@
-"""What differs between the cells of the study of transfer, and only that."""
+"""What differs between the cells of the studies of transfer, and only that."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import transfer
+from benchmarks import transfer, transfer_held
 from tacsim.config import load_rig
+from tacsim.gym.features import FeatureEncoder
 
 
 @pytest.fixture
@@ -39,3 +40,18 @@ def test_cells_differ_in_their_materials_alone(sight: str, folder: Path) -> None
     assert scene.friction == {"lower": 0.5, "upper": 0.7}
     usual = load_rig(guessed.rig, task=guessed.task, overrides=guessed.overrides).config.scene
     assert usual is not None and usual.gel.material.youngs_modulus == 0.145e6
+
+
+def test_policies_of_a_held_object_differ_in_what_they_see_alone() -> None:
+    found = {name: transfer_held.training(name) for name in transfer_held.POLICIES}
+    flow = found["flow"]
+    assert {each.task for each in found.values()} == {"hold"}
+    assert all(each.randomise == flow.randomise and each.environments == flow.environments for each in found.values())
+    assert {each.dagger.rounds for each in found.values()} == {transfer_held.ROUNDS}
+    assert {name for name, each in found.items() if each.features.flow} == {"flow"}
+    assert [found[name].features.maps for name in found] == [(), (), ("image",), ()]
+    assert found["blind"].features.sensors == ()
+    for each in found.values():
+        config = load_rig(each.rig, task=each.task, overrides=each.overrides).config
+        FeatureEncoder(each.features, config.canonical)  # the maps fit
+        assert config.motion == "flowing"

@@ -6,8 +6,12 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from robot.export.lerobot_env import LeRobotEnv
+from robot.export.lerobot_mapping import ENVIRONMENT, IMAGE, STATE
+from robot.open import make_env
 from tests.plugins.commands import refused, run
 from tests.robot.cli.invoked import tacsim
 from tests.tacsim.gym.small import SMALL
@@ -65,3 +69,31 @@ def test_a_policy_drives_a_rig(policy: Path, tmp_path: Path) -> None:
         "--duration=2", "--play_sounds=false", "--return_to_initial_position=false",
     )  # fmt: skip
     assert "Duration limit reached" in said and "Rollout finished" in said
+
+
+def test_a_policy_is_one_of_tacsim(policy: Path, tmp_path: Path) -> None:
+    """It acts in an environment of tacsim as LeRobot's own pipeline does on the same observation."""
+    from lerobot_env_tacsim import TrainedPolicy, _batch
+
+    mine = TrainedPolicy(policy, task="squeeze", overrides=OVERRIDES)
+    env, other = (
+        make_env("squeeze", "sim", OVERRIDES, features=None, learning=False),
+        LeRobotEnv("squeeze", "sim", OVERRIDES),
+    )
+    env.reset(seed=1)
+    seen, _ = other.reset(seed=1)
+    mine.set_goal(env.task.goal)
+    mine.reset()
+    rig = env.rig
+    rig.require(mine.needs, "the policy")
+    action = mine(env.observation)
+    assert set(action.tool) == {"lower", "upper"}
+    row = {STATE: seen["agent_pos"], ENVIRONMENT: seen["environment_state"]}
+    row |= {IMAGE + name: picture for name, picture in seen["pixels"].items()}
+    mine.reset()
+    numbers = mine._after(mine._policy.select_action(mine._before(_batch(row))))
+    wanted = other._mapping.decode_action(numbers.detach().numpy()[0])
+    for name in action.tool:
+        assert np.allclose(action.tool[name].position, wanted.tool[name].position, atol=1e-7)
+    with pytest.raises(ValueError, match="has no model.safetensors"):
+        TrainedPolicy(tmp_path)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from tacsim import pose as se3
 from tacsim.interface import Pose
@@ -24,6 +25,14 @@ QUARTER = se3.from_rotation_vector([1.0, 2.0, 3.0], [0.0, 0.0, math.pi / 2])
 def same(a: Pose, b: Pose) -> bool:
     """Equal as transforms: a quaternion and its negative are one rotation."""
     return np.allclose(se3.to_matrix(a), se3.to_matrix(b), atol=1e-9)
+
+
+@given(poses)
+def test_axes_give_the_pose_that_scipy_finds(pose: Pose) -> None:
+    axes = se3.rotation_matrix(pose)
+    found = se3.from_axes(pose.position, axes)
+    assert same(found, pose)
+    assert found.quaternion == pytest.approx(Rotation.from_matrix(axes).as_quat(), abs=1e-15)
 
 
 # worked examples

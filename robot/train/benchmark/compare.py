@@ -9,6 +9,7 @@ import numpy as np
 
 from robot.train.benchmark.score import EpisodeScore, Score
 from robot.train.evaluate import Interval, bootstrap_interval
+from tacsim.models.task import Unit
 
 SAME = ("task", "split", "task_sha256", "split_sha256", "sensors_sha256")
 
@@ -30,7 +31,7 @@ class Comparison:
     safe_first_alone: int
     safe_second_alone: int
     safe_p_value: float
-    difference: Interval | None  # mean of distance of the first minus that of the second, same episode [m]
+    difference: Interval | None  # mean of distance of the first minus that of the second, same episode [SI]
     same_physics: bool
 
 
@@ -107,7 +108,8 @@ class Row:
     complete: bool
     success: Interval
     safe_success: Interval
-    distance: Interval | None  # [m]
+    distance: Interval | None  # [SI]
+    unit: Unit  # in which the distance is shown
     normalised: float | None
     peak_force: float  # mean over the episodes [N]
     steps: float  # mean number of steps until the goal was reached for good, of the successes; NaN without any
@@ -159,6 +161,7 @@ def _make_row(score: Score, normalised: float | None) -> Row:
         success=score.success,
         safe_success=score.safe_success,
         distance=score.distance,
+        unit=score.unit,
         normalised=normalised,
         peak_force=float(np.mean([each.peak_force for each in score.episodes])),
         steps=float(np.mean(arrivals)) if arrivals else float("nan"),

@@ -51,8 +51,8 @@ def physics() -> Physics:
 
 
 @cache
-def machine() -> Machine:
-    """This machine."""
+def machine(clock: str = "sim") -> Machine:
+    """This machine. clock: of the rig; with `mujoco` the version of MuJoCo counts."""
     from tacsim.physics.exec.lanes import LANES, NODES, ON_DEVICE
 
     floats = LANES if ON_DEVICE else 4 * NODES
@@ -60,8 +60,9 @@ def machine() -> Machine:
     from importlib import metadata
     from importlib.util import find_spec
 
-    if find_spec("onnxruntime") is not None:
-        found["onnxruntime"] = metadata.version("onnxruntime")
+    for package in ("onnxruntime", *["mujoco"] * (clock == "mujoco")):
+        if find_spec(package) is not None:
+            found[package] = metadata.version(package)
     from tacsim.compute.runtime import DEVICE
 
     return Machine(

@@ -96,6 +96,8 @@ class RunningEpisode:
         if truth is not None and scene is not None and scene.body is not None:
             self._states.update(np.ascontiguousarray(truth.points, "<f4").tobytes())
             broken = is_broken(truth.points, enclosed_volume(scene.body.geometry))
+        for pose in () if truth is None else truth.objects.values():
+            self._states.update(np.concatenate([pose.position, pose.quaternion]).astype("<f8").tobytes())
         success = end == "steps" and bool(self._info["is_success"])
         peak = float(self._info["peak_force"])
         self.score = EpisodeScore.model_validate(
@@ -129,7 +131,8 @@ class SplitPlayer:
     def __init__(self, split: Split, numbers: Sequence[int], environments: int) -> None:
         self._split, self._numbers = split, list(dict.fromkeys(numbers))
         self.config: RigConfig = split.load_config()
-        features = Features(maps=(), touch=("moved",), arms=tuple(self.config.arms)[:1], goal=False)  # not used
+        arms = tuple(self.config.arms)[:1]
+        features = Features(sensors=(), maps=(), touch=("moved",), arms=arms, goal=False)  # not used
         self._envs = make_vector_env(
             max(1, min(environments, len(self._numbers))),
             split.task.task,

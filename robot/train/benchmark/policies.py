@@ -9,7 +9,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from robot.deploy.policy import describe_outside, has_training_range, load_policy, require_fit, require_policy_name
+from robot.deploy.policy import (
+    describe_outside,
+    has_training_range,
+    load_policy,
+    require_fit,
+    require_policy_name,
+    reset_policy,
+)
 from robot.train.benchmark.blind import BlindMotion, blind_path, load_blind
 from robot.train.benchmark.hashing import hash_document, hash_file, uniform_numbers
 from tacsim.config import config_root
@@ -27,8 +34,7 @@ class PolicyError(RuntimeError):
 
 
 class Actor:
-    """A policy in one episode of one environment. A policy with a method `set_goal` gets the goal of the task [m], one
-    number or a tuple, before its `reset`."""
+    """A policy in one episode of one environment."""
 
     def __init__(self, name: str, task: str, number: int, env: TacsimEnv, canonical: CanonicalGrid) -> None:
         """Raises PolicyNotFound, IncompatibleRig; PolicyError if the policy cannot be reset."""
@@ -49,9 +55,7 @@ class Actor:
             )
             self._act = lambda env: env.policy_action(policy)
             try:
-                if hasattr(policy, "set_goal"):
-                    policy.set_goal(env.task.goal)
-                policy.reset()
+                reset_policy(policy, env.task)
             except (Exception, SystemExit) as failure:
                 raise PolicyError(f"{type(failure).__name__} in reset: {failure}") from failure
 

@@ -41,6 +41,7 @@ def new_score(split: Split, policy: str, subset: Subset) -> Score:
     assert config.task is not None
     return Score(
         task=split.task_name,
+        kind=config.task.kind,
         split=split.name,
         subset=subset,
         policy=policy,
@@ -49,7 +50,7 @@ def new_score(split: Split, policy: str, subset: Subset) -> Score:
         split_sha256=split.sha256,
         sensors_sha256=split.sensors_sha256,
         physics=physics(),
-        machine=machine(),
+        machine=machine(config.clock),
         number=subset_size(subset, len(split.episodes)),
     )
 

@@ -15,6 +15,7 @@ from robot.train.benchmark.hashing import hash_document
 from robot.train.evaluate import Interval, bootstrap_interval, wilson_interval
 from tacsim.models.benchmark import VERSION
 from tacsim.models.quantity import Config
+from tacsim.models.task import Unit, unit_of
 from tacsim.models.text import printable_line
 
 MAX_BYTES = 32 * 2**20  # of a file; 200 episodes have 100 kB
@@ -49,6 +50,7 @@ class Score(Config):
     format: Literal[1] = 1
     version: Literal["v1"] = VERSION
     task: str  # name of the task file
+    kind: str = ""  # of the task: the unit of its distances; "" in scores of lengths that do not say it
     split: str
     subset: Literal["quick", "full"]
     policy: str  # as given to --policy
@@ -69,13 +71,18 @@ class Score(Config):
         return len(self.episodes) == self.number
 
     @property
+    def unit(self) -> Unit:
+        """In which its distances are shown."""
+        return unit_of(self.kind)
+
+    @property
     def missing(self) -> list[int]:
         """Numbers of the episodes that are not played yet."""
         done = {each.episode for each in self.episodes}
         return [number for number in range(self.number) if number not in done]
 
     def computed_seal(self) -> str:
-        return hash_document(self.model_dump(mode="json", exclude={"seal"}))
+        return hash_document(self.model_dump(mode="json", exclude={"seal"} if self.kind else {"seal", "kind"}))
 
     def with_episodes(self, more: Sequence[EpisodeScore], wall: float, policy: float) -> Score:
         """With more episodes and the seconds that they took [s]."""
@@ -97,7 +104,7 @@ class Score(Config):
     def subject(self) -> dict[str, Any]:
         """What must be equal for more episodes to belong to this score."""
         return self.model_dump(
-            mode="json", exclude={"episodes", "wall_seconds", "policy_seconds", "seal", "machine", "policy"}
+            mode="json", exclude={"episodes", "wall_seconds", "policy_seconds", "seal", "machine", "policy", "kind"}
         ) | {"vector_width": self.machine.vector_width, "device": self.machine.device}
 
     @property

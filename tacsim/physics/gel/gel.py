@@ -8,7 +8,7 @@ scaled so that the P-wave speed is 1.
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 
 import numpy as np
 
@@ -56,6 +56,10 @@ class GelParams:
     def half(self) -> tuple[float, float]:
         return self.elements[0] * self.spacing / 2, self.elements[1] * self.spacing / 2
 
+    def rim_points(self, z: float, count: int) -> np.ndarray:
+        """(4 count, 3) around the gel at a height [mm]."""
+        return _rim_points(self.half, z, count)
+
     def params(self, index: int = 0) -> dict[int, float]:
         """Entries of the array `params` (tacsim.physics.exec.layout), of an environment's gel number `index`."""
         entries = {GEL_SPACING: self.spacing, GEL_MU: self.mu, GEL_LAMBDA: self.lam, GEL_DENSITY: self.density}
@@ -84,6 +88,14 @@ def gel_params(gel: Gel, element: float) -> GelParams:
         )
     mu, lam = elastic_constants(gel.material)
     return GelParams((nx, ny, layers), spacing * MM, mu * MPA, lam * MPA)
+
+
+@lru_cache(maxsize=8)
+def _rim_points(half: tuple[float, float], z: float, count: int) -> np.ndarray:
+    share = np.linspace(-1.0, 1.0, count)
+    sides = [np.stack([share, np.full(count, s)], axis=1) for s in (-1.0, 1.0)]
+    rim = np.concatenate([*sides, *(side[:, ::-1] for side in sides)]) * half
+    return np.insert(rim, 2, z, axis=1)
 
 
 def common_lattices(worlds: Sequence[Sequence[GelParams]]) -> Sequence[GelParams]:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from tacsim.physics.grip.layout import FRAME_ROWS
-from tacsim.physics.grip.poses import matrices_of
+from tacsim.physics.motion.even import matrices_of
 
 Floats = NDArray[np.float64]
 

@@ -12,12 +12,12 @@ from tacsim.physics.worlds.tuning import MIN_LEVER
 Floats = NDArray[np.float64]
 
 
-def used_friction(state: PressState, wrenches: Floats, friction: Floats) -> Floats:
+def used_friction(state: PressState, gels: NDArray[np.int64], wrenches: Floats, friction: Floats) -> Floats:
     """(n, k) shares, as `tacsim.physics.worlds.patch.Patch.used_friction` has it; 1 where nothing touches.
 
-    wrenches: (n, k, 6) on the pads [N, N mm]; friction: (n,).
+    gels: (n k,) numbers of the gels; wrenches: (n, k, 6) on the pads [N, N mm]; friction: (n,).
     """
-    pressure = state.pressure.astype(np.float64)
+    pressure = state.pressure[gels].astype(np.float64)
     side = state.gel[0].spacing / POINTS
     x, y = ((np.arange(count) - (count - 1) / 2) * side for count in pressure.shape[1:])
     totals = np.maximum(pressure.sum(axis=(1, 2)), np.finfo(np.float64).tiny)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,9 +14,9 @@ from tacsim.physics.exec.layout import FORCE, OVERLAP, STEP
 from tacsim.physics.failure.health import Health, LaunchSpan, SimulationDiverged, check_launch
 from tacsim.physics.grip import layout
 from tacsim.physics.grip.frames import PadMotions
-from tacsim.physics.grip.poses import matrices_of
 from tacsim.physics.grip.state import GripState
 from tacsim.physics.grip.tuning import MESH_MARGIN, QUIET_TIME
+from tacsim.physics.motion.even import matrices_of
 from tacsim.physics.snapshot import State, copy_arrays
 from tacsim.physics.worlds.pads import GelPads
 from tacsim.physics.worlds.press import MESH_ADVICE
@@ -27,8 +27,9 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GripStep:
-    """One step of all grips."""
+    """One step of some grips; rows of all arrays are these."""
 
+    grips: NDArray[np.int64]  # (n,) their numbers
     motions: PadMotions
     moving: NDArray[np.int64]  # (n,) substeps in which the pads move
     resting: NDArray[np.int64]  # (n,) further ones, at most
@@ -45,55 +46,82 @@ class GripLauncher:
         """gels: of all pads; substep: nominal step of time [mm]."""
         self._state, self._gels, self._substep = state, gels, substep
 
-    def advance(self, step: GripStep) -> NDArray[np.int64]:
-        """Advances all grips; those whose state becomes unphysical again from the state before, with half the time
-        step, as often as MAX_RETRIES. Returns their substeps (n,).
+    def advance(self, step: GripStep, *, undo_all: bool) -> dict[int, ValueError | SimulationDiverged]:
+        """Advances grips; those whose state becomes unphysical again from the state before, with half the time step, as
+        often as MAX_RETRIES.
 
-        Raises SimulationDiverged, and ValueError for an object that rests on the housing of a gel.
+        Returns the failures by grip: SimulationDiverged, and ValueError for an object that rests on the housing of a
+        gel. Those grips are as they were, with undo_all all.
         """
-        before = [copy_arrays(world.arrays()) for world in self._gels.worlds]
-        kept, waiting = self._state.objects.copy(), list(range(len(step.objects)))
+        grips = step.grips.tolist()
+        before = {
+            gel: copy_arrays(self._gels.worlds[gel].arrays()) for grip in grips for gel in self._state.gels_of(grip)
+        }
+        kept = self._state.objects.copy()
+        failed: dict[int, ValueError | SimulationDiverged] = {}
         try:
-            for retry in range(MAX_RETRIES + 1):
-                failures = self._launch(waiting, step, 2**retry, before)
-                if not failures:
-                    break
-                if retry == MAX_RETRIES or any(not failure.retry for failure in failures.values()):
-                    index, failure = next(iter(failures.items()))
-                    failure.environment, failure.refine = index, 2**retry
-                    raise failure
-                waiting = list(failures)
-                self._restore(waiting, before)
-            for gel in np.flatnonzero(self.find_touching()):
-                self._gels.require_off_housing(int(gel), self._state.drive[gel, 0, 0])
+            failed |= self._try_until_healthy(step, before)
+            failed |= self._find_on_housing([grip for grip in grips if grip not in failed])
+            wrong = grips if failed and undo_all else list(failed)
         except BaseException:
-            self._restore(range(len(step.objects)), before)
-            self._state.objects[...] = kept
+            wrong = grips
             raise
         finally:
+            self._restore(wrong, before)
+            self._state.objects[wrong] = kept[wrong]
             self._state.params[:, STEP] = self._substep
-        return self._state.whole[:, layout.LAST].astype(np.int64) + 1
+        return failed
 
-    def find_touching(self) -> NDArray[np.bool_]:
-        """(gels,) whether its object touches it."""
-        return np.asarray(self._state.partial[:, :, FORCE : FORCE + 3].any(axis=(1, 2)))
+    def _try_until_healthy(self, step: GripStep, before: Mapping[int, State]) -> dict[int, SimulationDiverged]:
+        """Launches, and again with smaller steps. Returns the failures that remain."""
+        waiting, failed = list(range(len(step.grips))), dict[int, SimulationDiverged]()
+        for retry in range(MAX_RETRIES + 1):
+            failures = self._launch(waiting, step, 2**retry, before)
+            waiting = []
+            for row, failure in failures.items():
+                grip = int(step.grips[row])
+                if retry == MAX_RETRIES or not failure.retry:
+                    failure.environment, failure.refine = grip, 2**retry
+                    failed[grip] = failure
+                else:
+                    waiting.append(row)
+                    self._restore([grip], before)
+            if not waiting:
+                break
+        return failed
 
-    def _restore(self, grips: Sequence[int], before: Sequence[State]) -> None:
+    def _find_on_housing(self, grips: Sequence[int]) -> dict[int, ValueError]:
+        found = {}
+        for grip in grips:
+            gels = np.array(self._state.gels_of(grip))
+            try:
+                for gel in gels[self.find_touching(gels)].tolist():
+                    self._gels.require_off_housing(gel, self._state.drive[gel, 0, 0])
+            except ValueError as failure:
+                found[grip] = failure
+        return found
+
+    def find_touching(self, gels: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """(m,) whether its object touches each of these gels (m,)."""
+        return np.asarray(self._state.partial[gels, :, FORCE : FORCE + 3].any(axis=(1, 2)))
+
+    def _restore(self, grips: Sequence[int], before: Mapping[int, State]) -> None:
         for index in grips:
             for gel in self._state.gels_of(index):
                 for name, array in self._gels.worlds[gel].arrays().items():
                     array[...] = before[gel][name]
 
     def _launch(
-        self, grips: Sequence[int], step: GripStep, finer: int, before: Sequence[State]
+        self, rows: Sequence[int], step: GripStep, finer: int, before: Mapping[int, State]
     ) -> dict[int, SimulationDiverged]:
-        """One launch of some grips, with 1 / finer of the time step. Returns the failures."""
+        """One launch of some rows of a step, with 1 / finer of the time step. Returns the failures by row."""
         state, failures, time_step = self._state, dict[int, SimulationDiverged](), self._substep / finer
         frames = step.motions.frames(step.moving * finer, time_step)
         quiet = math.ceil(QUIET_TIME * state.gel[0].thickness / time_step) if step.settles else 0
-        for index in grips:
-            state.objects[index] = step.starts[index]
-            moving, total = int(step.moving[index]) * finer, int(step.moving[index] + step.resting[index]) * finer
+        for row in rows:
+            index = int(step.grips[row])
+            state.objects[index] = step.starts[row]
+            moving, total = int(step.moving[row]) * finer, int(step.moving[row] + step.resting[row]) * finer
             values = {
                 layout.SUBSTEPS: total, layout.MOVING: moving, layout.LAST: total - 1,
                 layout.QUIET_SUBSTEPS: quiet, layout.QUIET: 0, layout.LIMITED: 0,
@@ -103,41 +131,42 @@ class GripLauncher:
                 state.params[gel, STEP] = time_step
                 Health.clear(state.partial[gel])
                 try:
-                    self._cover(index, g, frames[index], step)
+                    self._cover(row, g, frames[row], step)
                 except (ValueError, MemoryError) as error:
-                    failures[index] = SimulationDiverged(str(error), _where(index, step), MESH_ADVICE, retry=False)
-        ready = [index for index in grips if index not in failures]
+                    failures[row] = SimulationDiverged(str(error), _where(row, step), MESH_ADVICE, retry=False)
+        ready = [row for row in rows if row not in failures]
         if ready:
-            state.advance_grips({index: frames[index] for index in ready})
+            state.advance_grips({int(step.grips[row]): frames[row] for row in ready})
         healthy = self._gels.are_healthy()
-        for index in ready:
+        for row in ready:
             try:
-                for gel in state.gels_of(index):
-                    self._check(index, gel, step, before[gel], healthy=bool(healthy[gel]))
+                for gel in state.gels_of(int(step.grips[row])):
+                    self._check(row, gel, step, before[gel], healthy=bool(healthy[gel]))
             except SimulationDiverged as failure:
-                failures[index] = failure
+                failures[row] = failure
         return failures
 
-    def _cover(self, index: int, g: int, frames: NDArray[np.float32], step: GripStep) -> None:
+    def _cover(self, row: int, g: int, frames: NDArray[np.float32], step: GripStep) -> None:
         """Computes the distances of a mesh where a pad may touch it in this launch."""
-        if self._state.meshes[self._state.gels_of(index)[g]] is None:
+        gel = self._state.gels_of(int(step.grips[row]))[g]
+        if self._state.meshes[gel] is None:
             return
-        turn, rows = matrices_of(step.objects[index]), np.zeros((2, 1, 6, 3))
-        for row, frame in zip(rows, frames[[0, -1], g].astype(np.float64), strict=True):
-            place = frame[3] + step.starts[index, layout.CLOSING] * frame[:3, 2]
-            row[0, :3], row[0, 3] = frame[:3].T @ turn, -frame[:3].T @ place
-        self._gels.worlds[self._state.gels_of(index)[g]].cover(rows, MESH_MARGIN)
+        turn, rows = matrices_of(step.objects[row]), np.zeros((2, 1, 6, 3))
+        for each, frame in zip(rows, frames[[0, -1], g].astype(np.float64), strict=True):
+            place = frame[3] + step.starts[row, layout.CLOSING] * frame[:3, 2]
+            each[0, :3], each[0, 3] = frame[:3].T @ turn, -frame[:3].T @ place
+        self._gels.worlds[gel].cover(rows, MESH_MARGIN)
 
-    def _check(self, index: int, gel: int, step: GripStep, before: State, *, healthy: bool) -> None:
+    def _check(self, row: int, gel: int, step: GripStep, before: State, *, healthy: bool) -> None:
         """Raises SimulationDiverged for an unphysical state, or a tip that the gel does not resolve."""
         world, state = self._gels.worlds[gel], self._state
         if not healthy:
-            check_launch(world.arrays, before, world.read_health(), lambda: _where(index, step))
+            check_launch(world.arrays, before, world.read_health(), lambda: _where(row, step))
         overlap = float(state.partial[gel, :, OVERLAP].max())
-        if overlap <= 0.0 or step.numbers[index] % CHECKED_STEPS == 0:
-            world.require_contact_resolution(state.drive[gel, 0, 0], overlap, lambda: _where(index, step), before)
+        if overlap <= 0.0 or step.numbers[row] % CHECKED_STEPS == 0:
+            world.require_contact_resolution(state.drive[gel, 0, 0], overlap, lambda: _where(row, step), before)
 
 
-def _where(index: int, step: GripStep) -> LaunchSpan:
-    pose = step.objects[index]
-    return LaunchSpan(f"grip {index} in step {step.numbers[index]}", {"object": Pose(pose[:3], pose[3:])})
+def _where(row: int, step: GripStep) -> LaunchSpan:
+    pose = step.objects[row]
+    return LaunchSpan(f"grip {step.grips[row]} in step {step.numbers[row]}", {"object": Pose(pose[:3], pose[3:])})

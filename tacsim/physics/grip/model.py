@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -47,6 +47,10 @@ class HeldStates:
     substeps: NDArray[np.int64]  # (n,) that the step took
     limited_substeps: NDArray[np.int64]  # (n,) of them in which a guard limited the speed of an object that falls
 
+    def row(self, index: int) -> HeldStates:
+        """One of the grips."""
+        return HeldStates(**{each.name: getattr(self, each.name)[index : index + 1] for each in fields(self)})
+
 
 @dataclass(frozen=True)
 class Support:
@@ -75,6 +79,20 @@ class Support:
         if not (np.isfinite(stiffness).all() and (stiffness >= 0.0).all() and (limits >= 0.0).all()):
             raise ValueError("stiffness of a support must be finite, and none of its numbers negative")
         return stiffness, limits
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GripCommand:
+    """One control step of one grip, see `GripWorld.step`."""
+
+    pads: Floats  # (k, 7) poses at the end, world [m]
+    force: float | None = None  # grip force [N]; None: the pads stay at their poses
+    support: Support | None = None
+
+
+def support_rows(support: Support | None, count: int) -> tuple[Floats, Floats]:
+    """(n, 6) stiffness and (n, 2) limits, zeros without a support. Raises ValueError as `Support.rows`."""
+    return (np.zeros((count, 6)), np.zeros((count, 2))) if support is None else support.rows(count)
 
 
 def centre_of_mass(item: HeldObject) -> Floats:

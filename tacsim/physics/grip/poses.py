@@ -2,29 +2,13 @@
 
 from __future__ import annotations
 
-import itertools
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from tacsim.physics.motion.even import matrices_of
 from tacsim.physics.units import MM
 
 Floats = NDArray[np.float64]
-
-
-def matrices_of(poses: Floats) -> Floats:
-    """Rotation matrices (..., 3, 3) of poses (..., 7) with unit quaternions: faster than SciPy's for few."""
-    x, y, z, w = (poses[..., number] for number in range(3, 7))
-    xx, yy, zz, xy, zw, xz, yw, yz, xw = x * x, y * y, z * z, x * y, z * w, x * z, y * w, y * z, x * w
-    rows = (
-        (1 - 2 * (yy + zz), 2 * (xy - zw), 2 * (xz + yw)),
-        (2 * (xy + zw), 1 - 2 * (xx + zz), 2 * (yz - xw)),
-        (2 * (xz - yw), 2 * (yz + xw), 1 - 2 * (xx + yy)),
-    )
-    found = np.empty((*poses.shape[:-1], 3, 3))
-    for r, c in itertools.product(range(3), range(3)):
-        found[..., r, c] = rows[r][c]
-    return found
 
 
 def z_axes(poses: Floats) -> Floats:

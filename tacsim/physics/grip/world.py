@@ -3,169 +3,59 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tacsim.compute.runtime import launching
-from tacsim.geometry.shapes import bounding_size
-from tacsim.models.scene import Gel, GelSurface, Indenter, Mesh, Preset, Scene, Shape
-from tacsim.physics.exec.layout import FORCE
+from tacsim.models.scene import Mesh
+from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.physics.grip import layout
 from tacsim.physics.grip.frames import PadMotions
-from tacsim.physics.grip.friction import used_friction
-from tacsim.physics.grip.launch import GripLauncher, GripStep
-from tacsim.physics.grip.model import HeldObject, HeldStates, Support, centre_of_mass
+from tacsim.physics.grip.grips import Grips
+from tacsim.physics.grip.launch import GripStep
+from tacsim.physics.grip.model import GripCommand, HeldStates, Support, support_rows
 from tacsim.physics.grip.poses import (
     checked_forces,
     checked_numbers,
     checked_poses,
     half_widths,
     in_mm,
-    matrices_of,
     max_closings,
     relative_rows,
     z_axes,
 )
-from tacsim.physics.grip.state import GripState
 from tacsim.physics.grip.tuning import (
     CLEAR_MARGIN,
-    CLOSING_ZETA,
-    EARTH,
     GRASP_SPRINGS,
-    LAYER_SHARE,
     MAX_CLOSING_SPEED,
     MAX_GRASP_STEPS,
     MAX_HOLD,
-    MAX_OBJECT_SPEED,
     MAX_SUBSTEPS,
     MESH_TRAVEL,
-    MIN_POINTS,
     MOVING_SHARE,
     PAD_MACH,
-    REFERENCE_FORCE,
     SETTLED_TOLERANCE,
     SHORT_MOTION,
-    STEP_TIME,
 )
-from tacsim.physics.snapshot import copy_arrays, restore_arrays
-from tacsim.physics.units import MM, MPA
-from tacsim.physics.worlds.base import NotCopyable
-from tacsim.physics.worlds.pads import GelPads
-from tacsim.physics.worlds.tuning import PRESS_COURANT
+from tacsim.physics.motion.even import matrices_of
+from tacsim.physics.units import MM
 
 Floats = NDArray[np.float64]
+Float32 = NDArray[np.float32]
+Indices = NDArray[np.int64]
+Failures = dict[int, ValueError | SimulationDiverged]  # by grip
 
 
-class GripWorld(NotCopyable):
+class GripWorld(Grips):
     """Objects, each between pads with one gel each: a grip. All grips advance in one launch, and each has the bits that
     it would have alone.
 
     In a step the pads move evenly to their new poses; objects and gels come to rest together. What cannot be held
     slides or falls, as slowly as the gels' scaled inertia lets it.
     """
-
-    _instead = "GripWorld(objects) and restore(world.snapshot())"
-
-    def __init__(
-        self, objects: Sequence[HeldObject], gel: Gel | Sequence[Gel] | None = None, *, pads: int = 2,
-        preset: Preset = "learn", substeps: int | None = None, gravity: ArrayLike = EARTH,
-    ) -> None:  # fmt: skip
-        """objects: one for each grip. gel: of all pads, or one for each grip. pads: of a grip. preset: mesh of the
-        gels. substeps: of a step, at least; None: as many as STEP_TIME asks for. gravity: (3,) world axes [m/s^2].
-
-        Raises ValueError for no object, no pad, numbers of gels and objects that differ, gels of different lattices, an
-        object too narrow for the mesh, gravity that is not finite; RuntimeError on a GPU.
-        """
-        gels = [gel or Gel()] * len(objects) if gel is None or isinstance(gel, Gel) else list(gel)
-        if not objects or pads < 1 or len(gels) != len(objects):
-            raise ValueError(
-                f"give at least one object and one pad, and a gel for each object or one for all; got {len(objects)} "
-                f"objects, {pads} pads, {len(gels)} gels"
-            )
-        self.objects, self._gravity = tuple(objects), checked_numbers(gravity, (3,), "gravity")
-        scenes = [
-            Scene(preset=preset, body=None, gel=own, indenter=_indenter(item))
-            for item, own in zip(objects, gels, strict=True)
-            for _ in range(pads)
-        ]
-        self._state = GripState(scenes, pads)
-        self._gels = GelPads(scenes, 1.0, 1, state=self._state)  # its steps are not used
-        self._gels.names = [f"pad {g} of grip {index}" for index in range(len(objects)) for g in range(pads)]
-        lattice = self._state.gel[0]
-        self._substep = PRESS_COURANT * lattice.spacing  # [mm]
-        self._launcher = GripLauncher(self._state, self._gels, self._substep)
-        wanted = math.ceil(STEP_TIME * lattice.thickness / self._substep)
-        self.substeps = wanted if substeps is None else substeps
-        if self.substeps < 2:
-            raise ValueError(f"substeps is {substeps}; give at least 2, or None for {wanted}")
-        self._objects, self._pads = np.zeros((len(objects), 7)), np.zeros((len(objects), pads, 7))
-        self._velocities = np.zeros((len(objects), 2, 3))  # of objects relative to the pads' mean, and spins
-        self._stretches = np.zeros((len(objects), 6))  # of supports [mm, rad]
-        self._closing_speeds = np.zeros(len(objects))
-        self._closings, self._steps = np.zeros(len(objects)), np.zeros(len(objects), np.int64)
-        self._ran = np.zeros(len(objects), np.int64)
-        self._placed, self._was_held, self._touching = (
-            np.zeros(len(objects), np.bool_),
-            np.zeros(len(objects), np.bool_),
-            np.zeros((len(objects), pads), np.bool_),
-        )
-        self._write_constants()
-
-    def __len__(self) -> int:
-        return len(self.objects)
-
-    def _write_constants(self) -> None:
-        constants = self._state.constants
-        for index, item in enumerate(self.objects):
-            gel, reach = self._state.gel[index * self._state.pads], MM * _reach(item.geometry)
-            least = MIN_POINTS * LAYER_SHARE * gel.density * gel.spacing**3 / 18.0
-            scene = self._gels.scenes[index * self._state.pads]
-            values = {
-                layout.MIN_MASS: least,
-                layout.MIN_INERTIA: least * (reach / 2) ** 2,
-                layout.REACH: reach,
-                layout.MAX_SPEED: MAX_OBJECT_SPEED,
-                layout.MAX_CLOSING_SPEED: MAX_CLOSING_SPEED,
-                layout.CLOSING_RATE: 2 * CLOSING_ZETA / math.sqrt(LAYER_SHARE * gel.thickness * gel.spacing),
-                layout.TOLERANCE: SETTLED_TOLERANCE,
-                layout.MIN_FORCE: REFERENCE_FORCE * scene.gel.material.youngs_modulus * MPA * gel.thickness**2,
-            }
-            constants[index, list(values)] = list(values.values())
-        weights = np.array([item.mass for item in self.objects])[:, None] * self._gravity
-        constants[:, layout.WEIGHT : layout.WEIGHT + 3] = weights
-        self._arms = MM * np.array([centre_of_mass(item) for item in self.objects])
-
-    # ------------------------------------------------------------------- step
-
-    def reset(self, objects: ArrayLike, pads: ArrayLike, index: int | None = None) -> None:
-        """Puts new gels and the object of one grip, or of all, in place, at rest and clear of each other.
-
-        Args:
-            objects: (n, 7) position of the centre of each object's bounding box [m] and quaternion x, y, z, w, world;
-                (7,) of one grip.
-            pads: (n, k, 7) of the pads, or (k, 7): the origin is the middle of the gel's surface, z points out of it.
-
-        Raises ValueError for poses of another shape, that are not finite, or with an object inside a gel.
-        """
-        which = list(range(len(self))) if index is None else [index]
-        count = self._state.pads
-        placed = checked_poses(objects, (len(self), 7) if index is None else (7,), "objects").reshape(-1, 7)
-        around = checked_poses(pads, (len(self), count, 7) if index is None else (count, 7), "pads").reshape(
-            -1, count, 7
-        )
-        for i, item, own in zip(which, placed, around, strict=True):
-            for g, gel in enumerate(self._state.gels_of(i)):
-                self._gels.require_clear(gel, relative_rows(item, own[g]))
-        for i, item, own in zip(which, placed, around, strict=True):
-            for gel in self._state.gels_of(i):
-                self._gels.reset(gel)
-            self._objects[i], self._pads[i] = item, own
-            for array in (self._velocities, self._stretches, self._closing_speeds, self._steps, self._was_held):
-                array[i] = 0
-            self._touching[i], self._placed[i] = False, True
 
     @launching()
     def step(
@@ -193,105 +83,136 @@ class GripWorld(NotCopyable):
             SimulationDiverged: where a gel's state becomes unphysical; `environment` is the index of the grip, and all
                 are then as they were before: reset that one.
         """
-        if not self._placed.all():
-            raise ValueError(f"grip {int(np.argmin(self._placed))} has no object in place yet: call reset() first")
+        every = np.arange(len(self))
+        self._require_placed(every)
         ends = checked_poses(pads, self._pads.shape, "pads")
         grip_forces = np.full(len(self), np.nan) if forces is None else checked_forces(forces, len(self))
-        closings = self._begin_closing(ends, grip_forces)
-        self._write_loads(loads, support)
-        starts = self._pads.copy()
-        outward = z_axes(starts)
-        starts[..., :3] -= closings[:, None, None] * outward
-        motions = PadMotions.between(MM * self._objects[:, :3], in_mm(starts), in_mm(ends), self._find_carrying())
-        moving = self._plan(motions)
-        self._write_objects(grip_forces, closings, max_closings(ends))
-        self._ran = self._launcher.advance(self._describe_step(motions, moving, settle=settle))
-        self._finish(motions, ends, grip_forces)
+        given = np.zeros((len(self), 6)) if loads is None else checked_numbers(loads, (len(self), 6), "loads")
+        springs = support_rows(support, len(self))
+        failures = self._advance(every, ends, grip_forces, given, springs, settle=settle, undo_all=True)
+        for failure in failures.values():
+            raise failure
         return self.states
 
-    def grasp(self, pads: ArrayLike, forces: ArrayLike) -> HeldStates:
+    @launching()
+    def step_each(
+        self, commands: Mapping[int, GripCommand], *, settle: bool = False
+    ) -> dict[int, HeldStates | ValueError | SimulationDiverged]:
+        """One control step of some grips, by index, in one launch; the others stay as they are. A grip that fails is as
+        it was before, and has no effect on the others.
+
+        Returns the state of each (of one grip), or the error that `step` would raise. Raises ValueError before `reset`,
+        and for commands of another shape or that are not finite.
+        """
+        which = np.array(sorted(commands), np.int64)
+        own = [commands[index] for index in which.tolist()]
+        self._require_placed(which)
+        ends = checked_poses([each.pads for each in own], (len(own), *self._pads.shape[1:]), "pads")
+        forces = checked_forces([np.nan if each.force is None else each.force for each in own], len(own))
+        rows = [support_rows(each.support, 1) for each in own]
+        springs = np.concatenate([row[0] for row in rows]), np.concatenate([row[1] for row in rows])
+        failures = self._advance(which, ends, forces, np.zeros((len(own), 6)), springs, settle=settle)
+        states = self._states_of(which)
+        found = {index: states.row(row) for row, index in enumerate(which.tolist())}
+        return {**found, **failures}
+
+    @launching()
+    def grasp(self, pads: ArrayLike, forces: ArrayLike, index: int | None = None) -> HeldStates:
         """Closes the pads from poses (n, k, 7), clear of the objects, with grip forces (n,) [N], until all is at rest;
-        then lets the weight of the objects act. Objects are carried at the same time, by weak springs."""
-        weights = self._state.constants[:, layout.WEIGHT : layout.WEIGHT + 3]
-        carried = np.concatenate([-weights, np.zeros_like(weights)], axis=1)
-        springs = Support([GRASP_SPRINGS[0]] * 3 + [GRASP_SPRINGS[1]] * 3)
+        then lets the weight of the objects act. Objects are carried at the same time, by weak springs.
+
+        index: of one grip, with pads (1, k, 7) and forces (1,), the others stay as they are; None: all. Returns the
+        states of these. Raises what `step` raises.
+        """
+        which = np.arange(len(self)) if index is None else np.array([index])
+        self._require_placed(which)
+        ends = checked_poses(pads, (len(which), *self._pads.shape[1:]), "pads")
+        grip_forces, free = checked_forces(forces, len(which)), np.zeros((len(which), 6))
+        carried = free.copy()
+        carried[:, :3] = -self._state.constants[which, layout.WEIGHT : layout.WEIGHT + 3]
+        springs = support_rows(Support([GRASP_SPRINGS[0]] * 3 + [GRASP_SPRINGS[1]] * 3), len(which))
+        rests = support_rows(None, len(which))
         for _ in range(MAX_GRASP_STEPS):
-            if self.step(pads, forces=forces, loads=carried, support=springs, settle=True).at_rest.all():
+            self._advance_all(which, ends, grip_forces, carried, springs)
+            if (self._state.objects[which, layout.IMBALANCE] <= SETTLED_TOLERANCE).all():
                 break
-        return self.step(pads, forces=forces, settle=True)
+        self._advance_all(which, ends, grip_forces, free, rests)
+        return self._states_of(which)
 
-    @property
-    def states(self) -> HeldStates:
-        """After the last step, or `reset`."""
-        count = self._state.pads
-        sums = self._state.partial[:, :, FORCE : FORCE + 6].astype(np.float64).sum(axis=1).reshape(-1, count, 6)
-        touching = self._touching
-        wrenches = np.where(touching[..., None], sums, 0.0)
-        shares = used_friction(self._state, wrenches, np.array([item.friction for item in self.objects]))
-        imbalances = self._state.objects[:, layout.IMBALANCE].astype(np.float64)
-        return HeldStates(
-            objects=self._objects.copy(),
-            pads=self._pads.copy(),
-            wrenches=wrenches / [1, 1, 1, MM, MM, MM],
-            closings=self._closings.copy(),
-            touching=touching.copy(),
-            slip_shares=shares,
-            dropped=self._was_held & ~touching.any(axis=1),
-            imbalances=imbalances,
-            at_rest=imbalances <= SETTLED_TOLERANCE,
-            substeps=self._ran.copy(),
-            limited_substeps=self._state.whole[:, layout.LIMITED].astype(np.int64),
+    # ------------------------------------------ parts of a step of grips `which` (m,)
+
+    def _advance_all(self, which: Indices, *given: Any) -> None:
+        """A step that settles. Raises the first failure; all are then as they were."""
+        for failure in self._advance(which, *given, settle=True, undo_all=True).values():
+            raise failure
+
+    def _advance(
+        self, which: Indices, ends: Floats, forces: Floats, loads: Floats, springs: tuple[Floats, Floats], *,
+        settle: bool, undo_all: bool = False,
+    ) -> Failures:  # fmt: skip
+        """One step; returns the failures by grip. undo_all: a failure of one leaves all as they were."""
+        closings = self._begin_closing(which, ends, forces)
+        self._write_loads(which, loads, springs)
+        starts = self._pads[which]
+        outward = z_axes(starts)
+        starts[..., :3] -= closings[:, None, None] * outward
+        motions = PadMotions.between(
+            MM * self._objects[which, :3], in_mm(starts), in_mm(ends), self._find_carrying(which)
         )
+        moving, too_far = self._plan(which, motions)
+        if too_far:
+            able = np.array([index not in too_far for index in which.tolist()])
+            if undo_all or not able.any():
+                return dict(too_far)
+            given = ends[able], forces[able], loads[able], (springs[0][able], springs[1][able])
+            return {**too_far, **self._advance(which[able], *given, settle=settle)}
+        starting = self._write_objects(which, forces, closings, max_closings(ends))
+        step = self._describe_step(which, motions, moving, starting, settle=settle)
+        failures = self._launcher.advance(step, undo_all=undo_all)
+        if not (failures and undo_all):
+            done = np.array([index not in failures for index in which.tolist()])
+            self._finish(which, motions, ends, forces, done)
+        return failures
 
-    def surface(self, index: int, pad: int) -> GelSurface:
-        """The deformed surface of a pad's gel."""
-        return self._gels.surface(self._state.gels_of(index)[pad])
-
-    def gel_size(self, index: int) -> tuple[float, float]:
-        """Length and width of the gels of a grip [m]."""
-        return self._gels.scenes[self._state.gels_of(index)[0]].gel.size[:2]
-
-    def _begin_closing(self, ends: Floats, forces: Floats) -> Floats:
-        """(n,) how far the pads are closed already, from the poses at the end of the step [m]; 0 without a force."""
-        closed = self._closings if self._state.pads == 1 else half_widths(ends) - half_widths(self._pads)
+    def _begin_closing(self, which: Indices, ends: Floats, forces: Floats) -> Floats:
+        """(m,) how far the pads are closed already, from the poses at the end of the step [m]; 0 without a force."""
+        alone = self._state.pads == 1
+        closed = self._closings[which] if alone else half_widths(ends) - half_widths(self._pads[which])
         return np.where(np.isnan(forces), 0.0, closed)
 
-    def _write_loads(self, loads: ArrayLike | None, support: Support | None) -> None:
-        count, constants = len(self), self._state.constants
-        given = np.zeros((count, 6)) if loads is None else checked_numbers(loads, (count, 6), "loads")
-        stiffness, limits = (np.zeros((count, 6)), np.zeros((count, 2))) if support is None else support.rows(count)
-        weights = constants[:, layout.WEIGHT : layout.WEIGHT + 3]
-        constants[:, layout.LOAD : layout.LOAD + 3] = weights + given[:, :3]
-        constants[:, layout.TORQUE : layout.TORQUE + 3] = given[:, 3:] * MM
-        constants[:, layout.SUPPORT : layout.SUPPORT + 6] = stiffness * [*[1 / MM] * 3, *[MM] * 3]
-        constants[:, layout.SUPPORT_LIMIT : layout.SUPPORT_LIMIT + 2] = np.minimum(
+    def _write_loads(self, which: Indices, loads: Floats, springs: tuple[Floats, Floats]) -> None:
+        constants, (stiffness, limits) = self._state.constants, springs
+        weights = constants[which, layout.WEIGHT : layout.WEIGHT + 3]
+        constants[which, layout.LOAD : layout.LOAD + 3] = weights + loads[:, :3]
+        constants[which, layout.TORQUE : layout.TORQUE + 3] = loads[:, 3:] * MM
+        constants[which, layout.SUPPORT : layout.SUPPORT + 6] = stiffness * [*[1 / MM] * 3, *[MM] * 3]
+        constants[which, layout.SUPPORT_LIMIT : layout.SUPPORT_LIMIT + 2] = np.minimum(
             limits * [1.0, MM], np.finfo(np.float32).max
         )
 
-    def _plan(self, motions: PadMotions) -> NDArray[np.int64]:
-        """(n,) substeps in which the pads move. Raises ValueError for pads that move too far."""
+    def _plan(self, which: Indices, motions: PadMotions) -> tuple[NDArray[np.int64], dict[int, ValueError]]:
+        """(m,) substeps in which the pads move, and errors of grips whose pads move too far, the worst first."""
         lengths = motions.lengths(max(self._state.gel[0].half))
-        for index in np.flatnonzero(~self._touching.any(axis=1)):
-            if self._is_clear(int(index), lengths[index]):
-                lengths[index] = 0.0
+        for row in np.flatnonzero(~self._touching[which].any(axis=1)):
+            if self._is_clear(int(which[row]), lengths[row]):
+                lengths[row] = 0.0
         least = math.ceil(MOVING_SHARE * self.substeps)
         braked = np.sqrt(lengths * np.maximum(lengths, SHORT_MOTION * self._state.gel[0].thickness))
         moving = np.maximum(np.ceil(braked / (PAD_MACH * self._substep) - 1e-6), least)
-        worst = int(np.argmax(moving))
-        if not moving[worst] <= MAX_SUBSTEPS:
-            raise ValueError(
-                f"a pad of grip {worst} moves by {lengths[worst]:.3g} mm in a step, relative to the others; the limit "
-                f"is {MAX_SUBSTEPS * PAD_MACH * self._substep:.3g} mm: are the poses in metres? if so, take more steps"
+        too_far = {
+            int(which[row]): ValueError(
+                f"a pad of grip {which[row]} moves by {lengths[row]:.3g} mm in a step, relative to the others; the "
+                f"limit is {MAX_SUBSTEPS * PAD_MACH * self._substep:.3g} mm: are the poses in metres? if so, take more "
+                "steps"
             )
-        return moving.astype(np.int64)
+            for row in np.argsort(-moving, kind="stable")
+            if not moving[row] <= MAX_SUBSTEPS
+        }
+        return np.minimum(moving, MAX_SUBSTEPS).astype(np.int64), too_far
 
-    def _find_carrying(self) -> NDArray[np.bool_]:
-        """(n, k) whether a pad touches an object that nothing else holds."""
-        return self._touching & ~self._find_supported()[:, None]
-
-    def _find_supported(self) -> NDArray[np.bool_]:
-        """(n,)"""
-        return np.asarray(self._state.constants[:, layout.SUPPORT : layout.SUPPORT + 6].any(axis=1))
+    def _find_carrying(self, which: Indices) -> NDArray[np.bool_]:
+        """(m, k) whether a pad touches an object that nothing else holds."""
+        return self._touching[which] & ~self._find_supported(which)[:, None]
 
     def _is_clear(self, index: int, length: float) -> bool:
         """Whether no pad of a grip can touch its object after a motion of this length [mm]."""
@@ -301,84 +222,60 @@ class GripWorld(NotCopyable):
             for g, gel in enumerate(self._state.gels_of(index))
         )
 
-    def _write_objects(self, forces: Floats, closings: Floats, max_closed: Floats) -> None:
-        """Puts the state before the step into the arrays of the kernel."""
+    def _write_objects(self, which: Indices, forces: Floats, closings: Floats, max_closed: Floats) -> Float32:
+        """Puts the state before the step into the arrays of the kernel. Returns (m, OBJECT) where objects begin."""
         state, closes = self._state, np.isfinite(forces)
-        state.constants[:, layout.TURN : layout.TURN + 9] = matrices_of(self._objects).reshape(-1, 9)
-        state.constants[:, layout.WEIGHT_ARM : layout.WEIGHT_ARM + 3] = (
-            matrices_of(self._objects) @ self._arms[..., None]
-        )[..., 0]
-        state.constants[:, layout.CLOSING_RANGE] = -np.finfo(np.float32).max
-        state.constants[:, layout.CLOSING_RANGE + 1] = MM * max_closed
-        state.constants[:, layout.CLOSING_FORCE] = np.where(closes, forces, 0.0)
-        state.whole[:, layout.IS_CLOSING] = closes
-        self._starts = np.zeros((len(self), layout.OBJECT), np.float32)
-        self._starts[:, layout.TURNED + 3] = 1.0
-        self._starts[:, layout.VELOCITY : layout.VELOCITY + 6] = self._velocities.reshape(-1, 6)
-        self._starts[:, layout.CLOSING] = MM * closings
-        self._starts[:, layout.CLOSING_SPEED] = np.where(closes, self._closing_speeds, 0.0)
-        self._starts[:, layout.STRETCH : layout.STRETCH + 6] = self._stretches
+        turns = matrices_of(self._objects[which])
+        state.constants[which, layout.TURN : layout.TURN + 9] = turns.reshape(-1, 9)
+        state.constants[which, layout.WEIGHT_ARM : layout.WEIGHT_ARM + 3] = (turns @ self._arms[which][..., None])[
+            ..., 0
+        ]
+        state.constants[which, layout.CLOSING_RANGE] = -np.finfo(np.float32).max
+        state.constants[which, layout.CLOSING_RANGE + 1] = MM * max_closed
+        state.constants[which, layout.CLOSING_FORCE] = np.where(closes, forces, 0.0)
+        state.whole[which, layout.IS_CLOSING] = closes
+        starts = np.zeros((len(which), layout.OBJECT), np.float32)
+        starts[:, layout.TURNED + 3] = 1.0
+        starts[:, layout.VELOCITY : layout.VELOCITY + 6] = self._velocities[which].reshape(-1, 6)
+        starts[:, layout.CLOSING] = MM * closings
+        starts[:, layout.CLOSING_SPEED] = np.where(closes, self._closing_speeds[which], 0.0)
+        starts[:, layout.STRETCH : layout.STRETCH + 6] = self._stretches[which]
+        return starts
 
-    def _describe_step(self, motions: PadMotions, moving: NDArray[np.int64], *, settle: bool) -> GripStep:
-        resting = np.full(len(self), MAX_HOLD if settle else self.substeps - math.ceil(MOVING_SHARE * self.substeps))
-        for index, item in enumerate(self.objects):
-            if isinstance(item.geometry, Mesh) and self._state.whole[index, layout.IS_CLOSING]:
+    def _describe_step(
+        self, which: Indices, motions: PadMotions, moving: Indices, starting: Float32, *, settle: bool
+    ) -> GripStep:
+        resting = np.full(len(which), MAX_HOLD if settle else self.substeps - math.ceil(MOVING_SHARE * self.substeps))
+        for row, index in enumerate(which.tolist()):
+            if isinstance(self.objects[index].geometry, Mesh) and self._state.whole[index, layout.IS_CLOSING]:
                 # the distances of a mesh are known in some depth only
                 most = MESH_TRAVEL * self._state.gel[0].spacing / (MAX_CLOSING_SPEED * self._substep)
-                resting[index] = min(resting[index], math.ceil(most))
-        return GripStep(motions, moving, resting, settle, self._starts, self._objects.copy(), self._steps.copy())
+                resting[row] = min(resting[row], math.ceil(most))
+        return GripStep(which, motions, moving, resting, settle, starting, self._objects[which], self._steps[which])
 
-    def _finish(self, motions: PadMotions, ends: Floats, forces: Floats) -> None:
-        """Takes the state after the step from the arrays of the kernel."""
+    def _finish(
+        self, which: Indices, motions: PadMotions, ends: Floats, forces: Floats, done: NDArray[np.bool_]
+    ) -> None:
+        """Takes the state after the step from the arrays of the kernel, of those that are `done` (m,)."""
         from scipy.spatial.transform import Rotation
 
-        found = self._state.objects.astype(np.float64)
+        own, found = which[done], self._state.objects[which].astype(np.float64)
         moving = found[:, layout.VELOCITY : layout.VELOCITY + 6].reshape(-1, 2, 3)
-        at, self._velocities, turned = motions.to_world(found[:, :3], moving)
-        self._objects[:, :3] = at / MM
-        before, own = Rotation.from_quat(self._objects[:, 3:]), found[:, layout.TURNED : layout.TURNED + 4]
-        self._objects[:, 3:] = (Rotation.from_matrix(turned) * Rotation.from_quat(own) * before).as_quat()
-        self._closings = np.where(np.isnan(forces), 0.0, found[:, layout.CLOSING] / MM)
-        self._closing_speeds = found[:, layout.CLOSING_SPEED].copy()
-        self._stretches = np.where(self._find_supported()[:, None], found[:, layout.STRETCH : layout.STRETCH + 6], 0.0)
-        self._pads = ends.copy()
-        self._pads[..., :3] += self._closings[:, None, None] * z_axes(ends)
-        self._steps += 1
-        self._touching = self._launcher.find_touching().reshape(self._touching.shape)
-        self._was_held |= self._touching.any(axis=1)
-
-    # ------------------------------------------------------------------ state
-
-    def snapshot(self, index: int) -> dict[str, NDArray[Any]]:
-        """A copy of the whole state of one grip, as named arrays."""
-        return copy_arrays(self._arrays(index))
-
-    def restore(self, index: int, state: Mapping[str, NDArray[Any]]) -> None:
-        """Raises ValueError if `state` is no snapshot of such a grip; the grip is then unchanged."""
-        arrays = self._arrays(index)
-        restore_arrays(arrays, [], {**state, "poses": np.empty((0, 7))}, finite=["object", "pads", "velocity"])
-
-    def _arrays(self, index: int) -> dict[str, NDArray[Any]]:
-        """Views of the whole state of one grip."""
-        gels = self._state.gels_of(index)
-        found = {
-            f"{name}_{g}": array
-            for g, gel in enumerate(gels)
-            for name, array in self._gels.worlds[gel].arrays().items()
-        }
-        own = {
-            "object": self._objects, "pads": self._pads, "velocity": self._velocities, "stretch": self._stretches,
-            "closing_speed": self._closing_speeds, "closing": self._closings, "steps": self._steps,
-            "placed": self._placed, "held": self._was_held, "touching": self._touching, "ran": self._ran,
-            "kernel": self._state.objects,
-        }  # fmt: skip
-        return found | {name: array[index : index + 1] for name, array in own.items()}
-
-
-def _reach(geometry: Shape) -> float:
-    """Largest distance of a point of the object from its own origin [m], at most."""
-    return float(np.linalg.norm(bounding_size(geometry))) / 2
-
-
-def _indenter(item: HeldObject) -> Indenter:
-    return Indenter(geometry=item.geometry, friction=item.friction, edge_radius=item.edge_radius)
+        at, velocities, turned = motions.to_world(found[:, :3], moving)
+        found, ends, forces = found[done], ends[done], forces[done]
+        self._velocities[own], self._objects[own, :3] = velocities[done], at[done] / MM
+        before = Rotation.from_quat(self._objects[own, 3:])
+        in_step = Rotation.from_quat(found[:, layout.TURNED : layout.TURNED + 4])
+        self._objects[own, 3:] = (Rotation.from_matrix(turned[done]) * in_step * before).as_quat()
+        closings = np.where(np.isnan(forces), 0.0, found[:, layout.CLOSING] / MM)
+        self._closings[own], self._closing_speeds[own] = closings, found[:, layout.CLOSING_SPEED]
+        stretches = found[:, layout.STRETCH : layout.STRETCH + 6]
+        self._stretches[own] = np.where(self._find_supported(own)[:, None], stretches, 0.0)
+        pads = ends.copy()
+        pads[..., :3] += closings[:, None, None] * z_axes(ends)
+        self._pads[own] = pads
+        self._steps[own] += 1
+        self._ran[own] = self._state.whole[own, layout.LAST] + 1
+        touching = self._launcher.find_touching(self._gels_of(own)).reshape(-1, self._state.pads)
+        self._touching[own] = touching
+        self._was_held[own] |= touching.any(axis=1)

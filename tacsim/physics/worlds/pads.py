@@ -24,6 +24,7 @@ from tacsim.physics.exec.layout import FORCE_SUM, LIMIT_RELAXATION_RATE, OVERLAP
 from tacsim.physics.failure.health import Health, LaunchSpan, SimulationDiverged, check_launch
 from tacsim.physics.failure.tuning import MAX_COURANT, MAX_SPEED
 from tacsim.physics.gel.tuning import MIN_VOLUME_RATIO
+from tacsim.physics.motion.even import EvenMotion, check_poses
 from tacsim.physics.snapshot import State, copy_arrays, restore_arrays, snapshot_of
 from tacsim.physics.units import MM
 from tacsim.physics.worlds.base import NotCopyable
@@ -81,15 +82,29 @@ class GelPads(NotCopyable):
         self.substeps = max(1, wanted) if substeps is None else substeps
         if self.substeps < 1:
             raise ValueError(f"substeps is {substeps}; give at least 1, or None for {wanted}")
-        for world, params in zip(self.worlds, self.state.params, strict=True):
-            params[LIMIT_RELAXATION_RATE] = world.steady_limit_relaxation / gel.thickness
-        self._reaches = [_reach(scene) for scene in self.scenes]
+        for index in range(len(scenes)):
+            self._write_limit_relaxation(index)
+        self._half_sizes = [_half_size(scene) for scene in self.scenes]
         self._poses: list[Floats | None] = [None] * len(scenes)  # (7,) of the object in each pad's frame
         self._wrenches, self._steps = np.zeros((len(scenes), 6)), np.zeros(len(scenes), np.int64)
         self._motions = np.zeros((len(scenes), 6))  # of the objects in the last step, at the pads' origins [mm, rad]
 
     def __len__(self) -> int:
         return len(self.worlds)
+
+    def _write_limit_relaxation(self, index: int) -> None:
+        rate = self.worlds[index].steady_limit_relaxation / self.state.gel[index].thickness
+        self.state.params[index, LIMIT_RELAXATION_RATE] = rate
+
+    def replace(self, index: int, scene: Scene) -> None:
+        """Makes one pad a new one, of another scene on the same lattice. Raises ValueError; nothing is changed then."""
+        self.state.place(index, scene)
+        world = PressWorld(scene, self.state, index)
+        self.worlds = (*self.worlds[:index], world, *self.worlds[index + 1 :])
+        self.scenes = (*self.scenes[:index], scene, *self.scenes[index + 1 :])
+        self._half_sizes[index] = _half_size(scene)
+        self._write_limit_relaxation(index)
+        self.reset(index)
 
     @property
     def wrenches(self) -> Floats:
@@ -113,18 +128,19 @@ class GelPads(NotCopyable):
                 gels can follow; for a first pose inside a gel; for an object that would rest on the housing of a gel.
             SimulationDiverged: where a gel's state becomes unphysical; all pads are then as they were before.
         """
-        ends = _check_poses(poses, len(self))
+        ends = check_poses(poses, len(self))
         starts = np.array([end if pose is None else pose for pose, end in zip(self._poses, ends, strict=True)])
-        self._require_travel(starts, ends)
-        drive = self._drive(starts, ends, self.substeps)
+        motion = EvenMotion.between(starts, ends)
+        self._require_travel(motion)
+        drive = motion.drive(self.substeps, self._time)
         for index in [i for i, pose in enumerate(self._poses) if pose is None]:
             self.require_clear(index, drive[index, -1, 0])
-        self._advance(starts, ends, drive)
+        self._advance(motion, drive)
         sums = self.state.partial[:, :, FORCE_SUM : FORCE_SUM + 6].astype(np.float64).sum(axis=1)
         sums[:, 3:] /= MM
         self._wrenches = sums / self._last_substeps[:, None]
         self._poses, self._steps = list(ends), self._steps + 1
-        self._motions = _velocities(drive) * self.substeps * self._substep
+        self._motions = motion.at_origin(self.substeps)
         for index in range(len(self)):
             if self._wrenches[index].any():
                 self.require_off_housing(index, drive[index, -1, 0])
@@ -139,31 +155,37 @@ class GelPads(NotCopyable):
     def responses(self) -> list[PatchResponse | None]:
         """How the wrench of each pad follows a motion of its object within a step, with the limit of friction [m, rad,
         N, N m]; None where nothing touches."""
-        time, found, gels = self.substeps * self._substep, list[PatchResponse | None](), self.state.gel
-        for index, scene in enumerate(self.scenes):
-            assert scene.indenter is not None
-            patch = self.patch(index) if self._wrenches[index].any() else None
-            if patch is None or patch.area == 0.0:
-                found.append(None)
-                continue
-            wrench = self._wrenches[index] * [1, 1, 1, MM, MM, MM]
-            found.append(
-                patch.response(gels[index], time, wrench, scene.indenter.friction, self._motions[index]).in_metres()
-            )
+        touching = np.flatnonzero(self._wrenches.any(axis=1))
+        found: list[PatchResponse | None] = [None] * len(self)
+        wrenches = self._wrenches * [1, 1, 1, MM, MM, MM]
+        for index, patch in zip(touching.tolist(), self._patches(touching), strict=True):
+            friction = self._friction(index)
+            if patch.area > 0.0:
+                gel, motion = self.state.gel[index], self._motions[index]
+                found[index] = patch.response(gel, self._time, wrenches[index], friction, motion).in_metres()
         return found
+
+    def _friction(self, index: int) -> float:
+        indenter = self.scenes[index].indenter
+        assert indenter is not None
+        return indenter.friction
+
+    def _patches(self, which: NDArray[np.intp]) -> list[Patch]:
+        """The contact patches on some pads."""
+        group = self.state.gels.common_group
+        tops = group.u[which, 0, :, :, -1, 2]
+        return Patch.measure(self.state.gel[0], self.state.pressure[which], group.surface_pressure[which, 0], tops)
 
     def patch(self, index: int) -> Patch:
         """The contact patch on a pad."""
-        nodes = self.state.gels.common_group.surface_pressure[index, 0]
-        top = self.state.surface_displacements(index)[0][..., 2].astype(np.float64)
-        return Patch.measure(self.state.gel[index], self.state.pressure[index], nodes, top)
+        (found,) = self._patches(np.array([index]))
+        return found
 
     def slip_share(self, index: int) -> float:
         """Share of the limit of friction that a pad uses: 0 without drag, about 1 while its object slides [-]. 1 too
         where nothing touches."""
-        indenter = self.scenes[index].indenter
-        assert indenter is not None
-        return self.patch(index).used_friction(self._wrenches[index] * [1, 1, 1, MM, MM, MM], indenter.friction)
+        wrench = self._wrenches[index] * [1, 1, 1, MM, MM, MM]
+        return self.patch(index).used_friction(wrench, self._friction(index))
 
     def surface(self, index: int) -> GelSurface:
         """The deformed surface of a pad's gel."""
@@ -200,29 +222,19 @@ class GelPads(NotCopyable):
 
     # ------------------------------------------------------------------- step
 
-    def _drive(self, starts: Floats, ends: Floats, substeps: int) -> NDArray[np.float32]:
-        """Even motion of objects from one pose to another, both (k, 7), in kernel units (k, substeps, 1, 6, 3)."""
-        from scipy.spatial.transform import Rotation
-
-        time, share = self.substeps * self._substep, np.arange(1, substeps + 1) / substeps
-        before, after = Rotation.from_quat(starts[:, 3:]), Rotation.from_quat(ends[:, 3:])
-        shift, turn = (ends[:, :3] - starts[:, :3]) * MM, (after * before.inv()).as_rotvec()
-        drive = np.empty((len(ends), substeps, 1, 6, 3))
-        between = Rotation.from_rotvec((share[:, None] * turn[:, None]).reshape(-1, 3)).as_matrix()
-        drive[:, :, 0, :3] = between.reshape(len(ends), substeps, 3, 3) @ before.as_matrix()[:, None]
-        drive[:, :, 0, 3] = starts[:, None, :3] * MM + share[:, None] * shift[:, None]
-        drive[:, :, 0, 4], drive[:, :, 0, 5] = (shift / time)[:, None], (turn / time)[:, None]
-        return drive.astype(np.float32)
-
     @property
     def max_travel(self) -> float:
         """How far a point of an object may move in a step, relative to a pad [m]."""
         return MAX_PAD_TRAVEL * self.state.gel[0].spacing * self.substeps / MM
 
-    def _require_travel(self, starts: Floats, ends: Floats) -> None:
-        cosine = np.minimum(np.abs((starts[:, 3:] * ends[:, 3:]).sum(axis=1)), 1.0)
-        turned = MM * np.array(self._reaches) * 2 * np.arccos(cosine)
-        travel = MM * np.linalg.norm(ends[:, :3] - starts[:, :3], axis=1) + turned
+    @property
+    def _time(self) -> float:
+        """Of a step, in the kernel [mm]."""
+        return self.substeps * self._substep
+
+    def _require_travel(self, motion: EvenMotion) -> None:
+        turned, shifted = np.linalg.norm([motion.turns, motion.shifts], axis=2)
+        travel = shifted + np.linalg.norm(self._half_sizes, axis=1) * turned
         worst = int(np.argmax(travel))
         if travel[worst] > self.max_travel * MM:
             raise ValueError(
@@ -231,7 +243,7 @@ class GelPads(NotCopyable):
                 f"steps"
             )
 
-    def _advance(self, starts: Floats, ends: Floats, drive: NDArray[np.float32]) -> None:
+    def _advance(self, motion: EvenMotion, drive: NDArray[np.float32]) -> None:
         """Advances all pads; those whose state becomes unphysical again from the state before, with half the time step,
         as often as MAX_RETRIES."""
         self._last_substeps = np.full(len(self), self.substeps)
@@ -251,7 +263,7 @@ class GelPads(NotCopyable):
                 raise failure
             again = list(failures)
             self._last_substeps[again] *= 2
-            finer = self._drive(starts[again], ends[again], self.substeps * 2 ** (retry + 1))
+            finer = motion.of(again).drive(self.substeps * 2 ** (retry + 1), self._time)
             waiting = dict(zip(again, finer, strict=True))
         self.state.params[:, STEP] = self._substep
 
@@ -265,9 +277,12 @@ class GelPads(NotCopyable):
     ) -> dict[int, SimulationDiverged]:
         """One launch of some pads. Returns the failures."""
         failures: dict[int, SimulationDiverged] = {}
+        own = list(drives)
+        self.state.params[own, STEP] = [self._time / len(drive) for drive in drives.values()]
+        cleared = self.state.partial[own]
+        Health.clear(cleared)
+        self.state.partial[own] = cleared
         for index, drive in drives.items():
-            self.state.params[index, STEP] = self._substep * self.substeps / len(drive)
-            Health.clear(self.state.partial[index])
             try:
                 self.worlds[index].cover(drive)
             except (ValueError, MemoryError) as error:
@@ -291,10 +306,16 @@ class GelPads(NotCopyable):
             return np.zeros(len(self), np.bool_)
         nx, ny, _ = state.gel[0].elements
         nodes = state.gels.common_group.nodes[:, 0, :2, :, :, : (nx + 1) * (ny + 1)]
-        u, v = np.moveaxis(nodes.reshape(*nodes.shape[:-1], nx + 1, ny + 1), 1, 0)
+        u, v = nodes[:, 0].reshape(len(self), *nodes.shape[2:4], nx + 1, ny + 1), nodes[:, 1]
         edges = (
             u[:, 0, :, 1:] - u[:, 0, :, :-1], u[:, 1, ..., 1:] - u[:, 1, ..., :-1], u[:, 2, 1:] - u[:, 2, :-1]
         )  # fmt: skip
+        least = state.gel[0].spacing + min(edge.min() for edge in edges)
+        if (
+            max(v.max(), -v.min()) < MAX_SPEED and least * MAX_COURANT > state.params[:, STEP].max()
+            and state.partial[:, :, SMALLEST_VOLUME].min() > MIN_VOLUME_RATIO and math.isfinite(state.partial.sum())
+        ):  # fmt: skip
+            return np.ones(len(self), np.bool_)  # nearly always
         shortest = state.gel[0].spacing + np.min([edge.reshape(len(self), -1).min(axis=1) for edge in edges], axis=0)
         slow = np.abs(v).reshape(len(self), -1).max(axis=1) < MAX_SPEED
         whole = state.partial[:, :, SMALLEST_VOLUME].min(axis=1) > MIN_VOLUME_RATIO
@@ -355,12 +376,11 @@ class GelPads(NotCopyable):
         """Raises ValueError for an object that reaches the rigid housing around the gel, which is not simulated."""
         scene, half = self.scenes[index], np.array(self.state.gel[index].half)
         housing = scene.gel.housing
-        if housing is None or (np.abs(rows[3, :2]) + MM * self._reaches[index] <= half).all():
+        reach = np.abs(rows[:2]) @ self._half_sizes[index]  # along x and y of the pad
+        if housing is None or (np.abs(rows[3, :2]) + reach <= half).all():
             return
-        share = np.linspace(-1.0, 1.0, RIM_POINTS)
-        sides = [np.stack([share, np.full(RIM_POINTS, s)], axis=1) for s in (-1.0, 1.0)]
-        rim = np.concatenate([*sides, *(side[:, ::-1] for side in sides)]) * half
-        depth = float(-self._distances(index, np.insert(rim, 2, -housing * MM, axis=1), rows).min())
+        rim = self.state.gel[index].rim_points(-housing * MM, RIM_POINTS)
+        depth = float(-self._distances(index, rim, rows).min())
         if depth > 0.0:
             raise ValueError(
                 f"the object of {self.names[index]} is wider than the gel and reaches {depth:.3g} mm into the housing "
@@ -369,32 +389,9 @@ class GelPads(NotCopyable):
             )
 
 
-def _reach(scene: Scene) -> float:
-    """Largest distance of a point of the object from its own origin [m], at most."""
+def _half_size(scene: Scene) -> Floats:
+    """(3,) half of the object's bounding box, along its axes [mm]."""
     from tacsim.geometry.shapes import bounding_size
 
     assert scene.indenter is not None
-    return float(np.linalg.norm(bounding_size(scene.indenter.geometry))) / 2
-
-
-def _velocities(drives: NDArray[np.float32]) -> Floats:
-    """(n, 6) velocity at the pads' origins and spin of the objects, in the middle of drives (n, substeps, 1, 6, 3)."""
-    ends = drives[:, [0, -1], 0, 3:].astype(np.float64)
-    (x, y, z), (vx, vy, vz), (rx, ry, rz) = (0.5 * (ends[:, 0] + ends[:, 1])).transpose(1, 2, 0)
-    return np.stack([vx - ry * z + rz * y, vy - rz * x + rx * z, vz - rx * y + ry * x, rx, ry, rz], axis=1)
-
-
-def _check_poses(poses: ArrayLike, count: int) -> Floats:
-    """(n, 7) with quaternions of length 1. Raises ValueError."""
-    given = np.array(poses, dtype=np.float64)
-    if given.shape != (count, 7):
-        raise ValueError(f"poses must have shape ({count}, 7), position and quaternion of each pad; got {given.shape}")
-    length = np.linalg.norm(given[:, 3:], axis=1)
-    bad = np.flatnonzero(~(np.isfinite(given).all(axis=1) & (np.abs(length - 1.0) <= 1e-3)))
-    if len(bad):
-        raise ValueError(
-            f"the pose of the object of pad {bad[0]} is {given[bad[0]].tolist()}: it needs finite numbers and a "
-            f"quaternion (x, y, z, w) of length 1; has the engine diverged?"
-        )
-    given[:, 3:] /= length[:, None]
-    return given
+    return np.asarray(0.5 * MM * bounding_size(scene.indenter.geometry))

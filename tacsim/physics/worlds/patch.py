@@ -6,7 +6,8 @@ Units: mm, N, MPa; wrenches and motions about the sensor's origin, in sensor axe
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import lru_cache
 from typing import Self
 
 import numpy as np
@@ -27,6 +28,8 @@ from tacsim.physics.worlds.tuning import (
 
 Floats = NDArray[np.float64]
 
+_TO_METRES = np.array([1.0, 1.0, 1.0, 1 / MM, 1 / MM, 1 / MM])  # of wrenches [N, N mm]
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Patch:
@@ -40,27 +43,30 @@ class Patch:
     lever: float  # mean distance from `centre`, by pressure [mm]
 
     @classmethod
-    def measure(cls, gel: GelParams, points: NDArray[np.float32], nodes: NDArray[np.float32], top: Floats) -> Self:
-        """points: stored pressure of the contact points (3 nx, 3 ny) [MPa]; nodes: of the surface's nodes (nx + 1,
-        ny + 1); top: their height [mm]."""
+    def measure(
+        cls, gel: GelParams, points: NDArray[np.float32], nodes: NDArray[np.float32], tops: NDArray[np.float32]
+    ) -> list[Self]:
+        """Of k pads together. points: stored pressure of the contact points (k, 3 nx, 3 ny) [MPa]; nodes: of the
+        surface's nodes (k, nx + 1, ny + 1); tops: their height [mm]."""
         side = gel.spacing / POINTS
-        x, y = ((np.arange(count) - (count - 1) / 2) * side for count in points.shape)
-        touching, weight = (points > 0.0).astype(np.float64), points.astype(np.float64)
-        area = float(touching.sum())
-        total = float(weight.sum())
-        if area == 0.0:
-            return cls(0.0, np.zeros(2), np.zeros((2, 2)), 0.0, np.zeros(2), 0.0)
-        along_x, along_y = touching.sum(axis=1), touching.sum(axis=0)
-        crossed = float(x @ touching @ y)
-        centre = np.array([x @ weight.sum(axis=1), weight.sum(axis=0) @ y]) / total
-        distance = np.hypot((x - centre[0])[:, None], y - centre[1])
-        carried = float(nodes.sum(dtype=np.float64))
-        return cls(
-            side**2 * area, side**2 * np.array([x @ along_x, along_y @ y]),
-            side**2 * np.array([[x**2 @ along_x, crossed], [crossed, along_y @ y**2]]),
-            float((nodes * top).sum(dtype=np.float64)) / carried if carried > 0.0 else 0.0,
-            centre, float((weight * distance).sum()) / total,
-        )  # fmt: skip
+        x, y = _powers(points.shape[1], side), _powers(points.shape[2], side)
+        weight = points.astype(np.float64)
+        # (k, 3, 3) sums of 1, x, x^2 times 1, y, y^2 over points that touch, and by pressure
+        sums, weighted = x.T @ (points > 0.0).astype(np.float64) @ y, x.T @ weight @ y
+        totals = np.where(sums[:, 0, 0] > 0.0, weighted[:, 0, 0], 1.0)
+        centres = np.stack([weighted[:, 1, 0], weighted[:, 0, 1]], axis=1) / totals[:, None]
+        distances = np.hypot((x[:, 1] - centres[:, :1])[:, :, None], (y[:, 1] - centres[:, 1:])[:, None, :])
+        levers = np.einsum("kij,kij->k", weight, distances) / totals
+        carried, raised = (
+            nodes.sum(axis=(1, 2), dtype=np.float64),
+            np.einsum("kij,kij->k", nodes, tops, dtype=np.float64),
+        )
+        heights = np.where(carried > 0.0, raised / np.where(carried > 0.0, carried, 1.0), 0.0)
+        found, square = list[Self](), side**2
+        for s, centre, height, lever in zip(square * sums, centres, heights.tolist(), levers.tolist(), strict=True):
+            second = np.array([[s[2, 0], s[1, 1]], [s[1, 1], s[0, 2]]])
+            found.append(cls(float(s[0, 0]), np.array([s[1, 0], s[0, 1]]), second, height, centre, lever))
+        return found
 
     @property
     def shear_directions(self) -> Floats:
@@ -115,6 +121,13 @@ class Patch:
         return modulus * matrix
 
 
+@lru_cache(maxsize=8)
+def _powers(count: int, side: float) -> Floats:
+    """(count, 3) 1, x and x^2 of the contact points along an axis [mm]."""
+    at = (np.arange(count) - (count - 1) / 2) * side
+    return np.stack([np.ones(count), at, at**2], axis=1)
+
+
 def _viscous_part(load: Floats, grown: Floats) -> Floats:
     """The part of a load that a motion has added, `grown` (3,), at most the load's component along it: the load of a
     contact that slides has not grown so much."""
@@ -160,10 +173,9 @@ class PatchResponse:
 
     def in_metres(self) -> PatchResponse:
         """The same for motions in m and rad, wrenches in N and N m."""
-        scale = np.array([1.0, 1.0, 1.0, 1 / MM, 1 / MM, 1 / MM])
-        return replace(
-            self, wrench=self.wrench * scale, normal=MM * self.normal * np.outer(scale, scale),
-            directions=self.directions * scale[:, None], stiffness=MM * self.stiffness,
+        return PatchResponse(
+            self.wrench * _TO_METRES, MM * self.normal * _TO_METRES * _TO_METRES[:, None],
+            self.directions * _TO_METRES[:, None], MM * self.stiffness, self.load, self.limit, self.stick,
         )  # fmt: skip
 
 

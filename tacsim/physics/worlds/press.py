@@ -63,7 +63,8 @@ def subtract_second_differences(nodes: np.ndarray, share: float) -> np.ndarray:
     """(nx, ny, 3) minus `share` of their second differences along both axes; values at the rim are repeated outside."""
     out = np.asarray(nodes, np.float64)
     for axis in (0, 1):
-        padded = np.pad(out, [(int(d == axis),) * 2 for d in range(3)], mode="edge")
+        ends = (out[:1], out[-1:]) if axis == 0 else (out[:, :1], out[:, -1:])
+        padded = np.concatenate([ends[0], out, ends[1]], axis=axis)  # np.pad takes ten times as long
         out = out - share * np.diff(padded, 2, axis=axis)
     return out.astype(np.float32)
 

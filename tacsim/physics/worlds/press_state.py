@@ -78,6 +78,23 @@ class PressState(FemState):
         self._copy_to_host()
         return self._pressure
 
+    def place(self, index: int, scene: Scene) -> None:
+        """Puts the initial state of another scene into one environment. Raises what the constructor raises; nothing is
+        changed then."""
+        gel = gel_params(scene.gel, scene.effective_element_size)
+        common_lattices([*((each,) for each in self.gel), (gel,)])
+        assert scene.indenter is not None
+        _require_resolved(scene.indenter, gel)
+        _shape_params(scene.indenter.geometry)  # a mesh that cannot be read fails here
+        self.gel[index] = gel
+        self.params[index], self.counts[index], self.partial[index] = 0.0, 0, 0.0
+        self._gels.write_layout(self.counts)
+        self._tiles.pop(index, None)
+        self.meshes[index] = self._set_shape(index, scene)
+        self.gels.clear(index)
+        self.gels.common_group.surface_pressure[index] = 0.0
+        self.anchor[index], self.pressure[index] = 0.0, 0.0
+
     def _set_shape(self, index: int, scene: Scene) -> TiledDistance | None:
         """Writes one environment's indenter into params and counts; returns the distances of its mesh."""
         assert scene.indenter is not None

@@ -208,7 +208,7 @@ class Cell:
 
     def normal_force(self, pad: str) -> float:
         """Positive when pressed [N]."""
-        return -float(self.wrench(pad)[2])
+        return -float(self._pad_wrenches()[list(self._pads).index(pad), 2])
 
     def surface(self, name: str) -> GelSurface:
         """The deformed surface of a pad's gel."""
@@ -273,7 +273,7 @@ class Cell:
         state = self._gel_snapshot()
         for name, drive in self._drives():
             state |= {f"{name}:{key}": np.array(value) for key, value in drive.snapshot().items()}
-        return state | {"cell": np.array([self._touched_at, self.has_pedestal])}
+        return state | {"cell": np.array([self._touched_at, self.has_pedestal, *self._max_forces])}
 
     def restore(self, state: State) -> None:
         """Raises ValueError if `state` is no snapshot of such a cell."""
@@ -281,6 +281,7 @@ class Cell:
             raise ValueError("snapshot: 'cell' is missing; is it of another world?")
         self._touched_at = float(state["cell"][0])
         self.take_pedestal_away(away=not state["cell"][1])
+        self._max_forces = np.array(state["cell"][2:])
         load_mujoco().mj_resetData(self.model, self.data)  # warnings, too, that a divergence has left
         self._restore_gels(state)
         for name, drive in self._drives():

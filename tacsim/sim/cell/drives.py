@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -16,19 +17,19 @@ from tacsim.sim.cell.description import ArmDescription, GripperDescription
 from tacsim.sim.cell.ramp import Ramp
 from tacsim.sim.engines.implicit_step import inertia
 from tacsim.sim.engines.mujoco_module import load_mujoco
+from tacsim.sim.engines.quaternion import product, rotated, rotation_vector, turned_by
 
 State = Mapping[str, NDArray[Any]]
 
 
 def site_pose(data: Any, site: int) -> Pose:
     """world_from_site, as MuJoCo has computed its frames last."""
-    return _pose_of(data.site_xpos[site], data.site_xmat[site])
+    return _pose_of(data.site_xpos[site].tobytes(), data.site_xmat[site].tobytes())
 
 
-def _pose_of(position: FloatArray, axes: FloatArray) -> Pose:
-    frame = np.eye(4)
-    frame[:3, :3], frame[:3, 3] = axes.reshape(3, 3), position
-    return se3.from_matrix(frame)
+@lru_cache(maxsize=256)  # each pose is asked several times a step
+def _pose_of(position: bytes, axes: bytes) -> Pose:
+    return se3.from_axes(np.frombuffer(position), np.frombuffer(axes).reshape(3, 3))
 
 
 class FreeDrive:
@@ -42,13 +43,14 @@ class FreeDrive:
         joint = model.joint(f"{name}/flange")
         self._places, self._speeds = int(joint.qposadr[0]), int(joint.dofadr[0])
         self._flange_from_tool = Pose(model.site_pos[tool], np.roll(model.site_quat[tool], -1))
+        self._tool_from_flange = se3.inverse(self._flange_from_tool)
         self._target = self._start = Pose()
         self._shift = self._turn = Ramp.rest(3)
         self._last_speed = np.zeros(6)
 
     def place(self, tool: Pose) -> None:
         """Puts it there at once, at rest."""
-        flange = se3.compose(tool, se3.inverse(self._flange_from_tool))
+        flange = se3.compose(tool, self._tool_from_flange)
         self._data.qpos[self._places : self._places + 7] = [*flange.position, *np.roll(flange.quaternion, 1)]
         self._data.qvel[self._speeds : self._speeds + 6] = 0.0
         self._target, self._last_speed = tool, np.zeros(6)
@@ -64,18 +66,18 @@ class FreeDrive:
     def apply(self, time: float) -> None:
         """Before a step that begins `time` [s] after `begin`: what makes it follow its plan."""
         dt = float(self._model.opt.timestep)
-        self._last_speed = np.concatenate([self._shift.speed(time + dt), self._turn.speed(time + dt)])
-        turned = se3.from_rotation_vector(np.zeros(3), self._turn.displacement(time + dt))
-        tool = Pose(
-            self._start.position + self._shift.displacement(time + dt),
-            se3.compose(turned, Pose(quaternion=self._start.quaternion)).quaternion,
-        )
-        to = se3.compose(tool, se3.inverse(self._flange_from_tool))
+        after = time + dt
+        self._last_speed = np.concatenate([self._shift.speed(after), self._turn.speed(after)])
+        # quaternions as plain numbers: this is called in each timestep
+        tool = turned_by(self._start.quaternion.tolist(), self._turn.displacement(after).tolist())
+        arm = rotated(self._tool_from_flange.position.tolist(), tool)
+        to = product(tool, self._tool_from_flange.quaternion.tolist())
         place = self._data.qpos[self._places : self._places + 7]
-        here = Pose(place[:3], np.roll(place[3:], -1))
-        way = se3.pose_difference(here, to)
-        way[3:] = se3.rotation_matrix(here).T @ way[3:]  # MuJoCo has a free body's spin in its own axes
-        self._data.qvel[self._speeds : self._speeds + 6] = way / dt
+        w, x, y, z = place[3:].tolist()
+        way = self._data.qvel[self._speeds : self._speeds + 6]
+        way[:3] = (self._start.position + self._shift.displacement(after) + arm - place[:3]) / dt
+        # MuJoCo has a free body's spin in its own axes
+        way[3:] = np.array(rotation_vector(product((-x, -y, -z, w), to))) / dt
 
     def snapshot(self) -> dict[str, NDArray[Any]]:
         return {"target": np.concatenate([self._target.position, self._target.quaternion]), "speed": self._last_speed}
@@ -218,8 +220,8 @@ class GripperDrive:
         """Before each step."""
         width, max_force = self.target
         goal, dt, frequency = width / 2, float(self._model.opt.timestep), tuning.FINGER_FREQUENCY
-        places, speeds = self._data.qpos[self._places], self._data.qvel[self._speeds]
-        here, stiffness = float(places.mean()), self._mass * frequency**2
+        left, right = self._places.tolist()
+        here, stiffness = 0.5 * float(self._data.qpos[left] + self._data.qpos[right]), self._mass * frequency**2
         # A grip that loosens at once would be thrown open by the gels.
         max_force = max(max_force, abs(self.force) - tuning.MAX_LOOSENING * dt)
         reach = max_force / stiffness  # beyond, the force has its greatest value already
@@ -227,9 +229,11 @@ class GripperDrive:
         step = min(max(goal - before, -self.max_speed * dt), self.max_speed * dt)
         self._reference = before + step
         damping = 2 * self._mass * frequency
-        pushed = stiffness * (self._reference - here) + damping * (step / dt - speeds.mean())
+        left, right = self._speeds.tolist()
+        speed = 0.5 * float(self._data.qvel[left] + self._data.qvel[right])
+        pushed = stiffness * (self._reference - here) + damping * (step / dt - speed)
         self.force = -min(max(pushed, -max_force), max_force)
-        self._data.qfrc_applied[self._speeds] = -self.force
+        self._data.qfrc_applied[left] = self._data.qfrc_applied[right] = -self.force
 
     def snapshot(self) -> dict[str, NDArray[Any]]:
         return {"gripper": np.array([*self.target, self._reference, self.force])}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Protocol
@@ -10,7 +10,7 @@ from typing import Protocol
 from tacsim.interface import Pose
 from tacsim.sim.cell.cell import Cell
 from tacsim.sim.cell.grip import grip_in_time
-from tacsim.sim.cell.resting import RestingCell
+from tacsim.sim.cell.resting import PERIOD_ERRORS, PeriodError, RestingCell, move_together
 
 
 class CellMotion(Protocol):
@@ -19,6 +19,10 @@ class CellMotion(Protocol):
     def grip(self, cell: Cell, arm_of_gripper: Mapping[str, str], force: float) -> None:
         """Closes grippers until they hold the object with `force` [N], takes away what it stands on, and lifts it.
         arm_of_gripper: name of the arm, by gripper. Raises NoTouch, LimitExceeded, ObjectDropped."""
+        ...
+
+    def advance_together(self, periods: Sequence[CellPeriod]) -> list[PeriodError | None]:
+        """`advance` of several cells; one that fails leaves the others alone. Returns what each would raise."""
         ...
 
     def advance(self, cell: Cell, targets: Mapping[str, Pose], seconds: float) -> None:
@@ -44,6 +48,16 @@ class DynamicMotion:
             cell.step(number * cell.timestep)
         cell.refresh()
 
+    def advance_together(self, periods: Sequence[CellPeriod]) -> list[PeriodError | None]:
+        """See CellMotion. One after the other: MuJoCo and the coupling take most of the time, not the launches."""
+        failures: list[PeriodError | None] = [None] * len(periods)
+        for number, period in enumerate(periods):
+            try:
+                period.advance()
+            except PERIOD_ERRORS as failure:
+                failures[number] = failure
+        return failures
+
 
 @dataclass(frozen=True, slots=True)
 class RestingMotion:
@@ -61,6 +75,12 @@ class RestingMotion:
         """See CellMotion."""
         assert isinstance(cell, RestingCell)
         cell.move(targets, seconds, settle=self.settle)
+
+    def advance_together(self, periods: Sequence[CellPeriod]) -> list[PeriodError | None]:
+        """See CellMotion: cells that share one world of grips, in one launch."""
+        cells = [period.cell for period in periods if isinstance(period.cell, RestingCell)]
+        motions = [cell.motion(each.targets, each.seconds) for cell, each in zip(cells, periods, strict=True)]
+        return move_together(cells, motions, settle=self.settle)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Generator, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,14 +13,20 @@ from tacsim.control import NoTouch, ObjectDropped
 from tacsim.interface import FloatArray, Pose
 from tacsim.limits import LimitExceeded
 from tacsim.models.scene import GelSurface, Scene
-from tacsim.physics.grip.model import HeldObject, HeldStates, Support
-from tacsim.physics.grip.world import GripWorld
+from tacsim.physics.failure.health import SimulationDiverged
+from tacsim.physics.grip.model import GripCommand, HeldObject, HeldStates, Support
+from tacsim.physics.grip.shared import GripPlace, SharedGrips
 from tacsim.sim.cell import tuning
 from tacsim.sim.cell.cell import Cell
+from tacsim.sim.cell.description import ArmDescription, GripperDescription, ViewDescription
 from tacsim.sim.cell.drives import State
 from tacsim.sim.cell.grip import min_grip_force, require_enough
 from tacsim.sim.cell.model import OBJECT
 from tacsim.sim.engines.mujoco_module import load_mujoco
+
+GripMotion = Generator[GripCommand, HeldStates, None]
+PeriodError = LimitExceeded | SimulationDiverged | ObjectDropped  # that ends a control period
+PERIOD_ERRORS = (LimitExceeded, SimulationDiverged, ObjectDropped)
 
 
 class RestingCell(Cell):
@@ -29,11 +36,24 @@ class RestingCell(Cell):
     Raises ValueError in addition for two grippers, for an object on a guide, and for fixtures.
     """
 
+    def __init__(
+        self,
+        scene: Scene,
+        arms: Mapping[str, ArmDescription],
+        grippers: Mapping[str, GripperDescription],
+        views: Mapping[str, ViewDescription] | None = None,
+        starts: Mapping[str, Pose] | None = None,
+        place: GripPlace | None = None,
+    ) -> None:
+        """place: of its grip among those of other cells; None: it has a world of its own. The rest: see Cell."""
+        self._place = GripPlace(SharedGrips(), 0) if place is None else place
+        super().__init__(scene, arms, grippers, views, starts)
+
     def _add_gels(self) -> None:
         _require_free(self.scene, len(self.grippers))
         (self._gripper,) = self.grippers.values()
         item = HeldObject(self.item.geometry, self.item.mass, self.item.friction)
-        self._held = GripWorld([item], self.scene.gel, preset=self.scene.preset, gravity=self.scene.gravity)
+        self.held, self.grip_number = self._place.fill(item, self.scene), self._place.index
         self._joint = int(self.model.joint(OBJECT).qposadr[0])
         self._states: HeldStates | None = None  # None: not put in place since the cell was made or rewound
 
@@ -48,7 +68,7 @@ class RestingCell(Cell):
         self._put_in_place()
         width = self._gripper.width
         try:
-            self._take(self._held.grasp(self._pad_poses(), [force]), width)
+            self._take(self.held.grasp(self._pad_poses()[None], [force], self.grip_number), width)
         except ValueError as failure:
             raise LimitExceeded(str(failure)) from failure
         self._gripper.command(0.0, force)
@@ -69,6 +89,13 @@ class RestingCell(Cell):
     def move(self, targets: Mapping[str, Pose], seconds: float, *, settle: bool) -> None:
         """One control period. Raises ObjectDropped, LimitExceeded for a pose out of reach or an object on the housing
         of a gel, and SimulationDiverged."""
+        (failure,) = move_together([self], [self.motion(targets, seconds)], settle=settle)
+        if failure is not None:
+            raise failure
+
+    def motion(self, targets: Mapping[str, Pose], seconds: float) -> GripMotion:
+        """`move` in parts: yields the command of its grip, and is sent its state after that; an error is thrown into
+        it. Raises as `move`."""
         if self._states is None:
             self._put_in_place()
         for arm, target in targets.items():
@@ -77,15 +104,15 @@ class RestingCell(Cell):
         way = 2 * self._gripper.max_speed * seconds
         try:
             if width < here:
-                before = self._held.snapshot(0)
-                states, from_width = self._step(here, force, settle=settle), here
+                before = self.held.snapshot(self.grip_number)
+                states, from_width = (yield self._command(here, force)), here
                 if here - 2 * float(states.closings[0]) < width:  # it meets nothing before its width
-                    self._held.restore(0, before)
+                    self.held.restore(self.grip_number, before)
                     from_width = max(width, here - way)
-                    states = self._step(from_width, None, settle=settle)
+                    states = yield self._command(from_width, None)
             else:
                 from_width = min(width, here + way)
-                states = self._step(from_width, None, settle=settle)
+                states = yield self._command(from_width, None)
         except ValueError as failure:
             raise LimitExceeded(str(failure)) from failure
         self._take(states, from_width)
@@ -98,21 +125,19 @@ class RestingCell(Cell):
 
     def _put_in_place(self) -> None:
         here = self.object_pose()
-        self._held.reset([[*here.position, *here.quaternion]], self._pad_poses())
-        self._states = self._held.states
+        self.held.reset([*here.position, *here.quaternion], self._pad_poses(), self.grip_number)
+        self._states = self.held.state_of(self.grip_number)
 
-    def _step(self, width: float, force: float | None, *, settle: bool) -> HeldStates:
+    def _command(self, width: float, force: float | None) -> GripCommand:
         """force: from `width` the pads close until they press with it [N]; None: they stay there."""
         self._gripper.set_width(width)
         self.refresh()
-        support = Support(tuning.PEDESTAL_STIFFNESS) if self.has_pedestal else None
-        forces = None if force is None else [force]
-        return self._held.step(self._pad_poses(), forces=forces, support=support, settle=settle)
+        return GripCommand(self._pad_poses(), force, Support(tuning.PEDESTAL_STIFFNESS) if self.has_pedestal else None)
 
     def _pad_poses(self) -> FloatArray:
-        """(1, 2, 7)"""
+        """(2, 7)"""
         poses = [self.pose(pad) for pad in self._pads]
-        return np.array([[[*pose.position, *pose.quaternion] for pose in poses]])
+        return np.array([[*pose.position, *pose.quaternion] for pose in poses])
 
     def _take(self, states: HeldStates, width: float) -> None:
         """Puts object and fingers where they are after a step from `width`."""
@@ -130,7 +155,7 @@ class RestingCell(Cell):
         return np.zeros((len(self._pads), 6)) if self._states is None else self._states.wrenches[0]
 
     def surface(self, name: str) -> GelSurface:
-        return self._held.surface(0, list(self._pads).index(name))
+        return self.held.surface(self.grip_number, list(self._pads).index(name))
 
     def slip_share(self, name: str) -> float:
         return 1.0 if self._states is None else float(self._states.slip_shares[0, list(self._pads).index(name)])
@@ -141,14 +166,44 @@ class RestingCell(Cell):
     # ------------------------------------------------------------------ state
 
     def _gel_snapshot(self) -> dict[str, NDArray[Any]]:
-        held = {f"held/{name}": value for name, value in self._held.snapshot(0).items()}
+        held = {f"held/{name}": value for name, value in self.held.snapshot(self.grip_number).items()}
         return {"qpos": self.data.qpos.copy(), "time": np.array([self.data.time]), **held}
 
     def _restore_gels(self, state: State) -> None:
-        self._held.restore(0, {name.removeprefix("held/"): v for name, v in state.items() if name.startswith("held/")})
+        own = {name.removeprefix("held/"): v for name, v in state.items() if name.startswith("held/")}
+        self.held.restore(self.grip_number, own)
         self.data.qpos[:], self.data.time = state["qpos"], float(state["time"][0])
-        self._states = self._held.states if bool(state["held/placed"].any()) else None
+        self._states = self.held.state_of(self.grip_number) if bool(state["held/placed"].any()) else None
         load_mujoco().mj_forward(self.model, self.data)
+
+
+def move_together(
+    cells: Sequence[RestingCell], motions: Sequence[GripMotion], *, settle: bool
+) -> list[PeriodError | None]:
+    """Carries out motions of cells that share one world of grips, in common launches; one that fails leaves the others
+    alone. Returns how each has failed."""
+    failures: list[PeriodError | None] = [None] * len(cells)
+    wanted: dict[int, GripCommand] = {}
+
+    def resume(number: int, go_on: Callable[[], GripCommand]) -> None:
+        """Runs a motion to its next launch, or to its end."""
+        try:
+            wanted[number] = go_on()
+        except StopIteration:
+            pass
+        except PERIOD_ERRORS as failure:
+            failures[number] = failure
+
+    for number, motion in enumerate(motions):
+        resume(number, partial(next, motion))
+    while wanted:
+        commands = {cells[number].grip_number: command for number, command in wanted.items()}
+        waiting, wanted = list(wanted), {}
+        ends = cells[0].held.step_each(commands, settle=settle)
+        for number in waiting:
+            end, motion = ends[cells[number].grip_number], motions[number]
+            resume(number, partial(motion.send, end) if isinstance(end, HeldStates) else partial(motion.throw, end))
+    return failures
 
 
 def _require_free(scene: Scene, grippers: int) -> None:

@@ -61,9 +61,9 @@ def velocity_gain(model: Any, data: Any, mass: FloatArray) -> FloatArray:
     """Change of the velocity over dt, for one of MuJoCo's acceleration (nv, nv): the integrators treat damping of
     joints and of servos implicitly."""
     mujoco = load_mujoco()
-    damping = np.diag(model.dof_damping)
-    integrators = mujoco.mjtIntegrator
-    if int(model.opt.integrator) != int(integrators.mjINT_EULER):
+    damping = np.zeros((model.nv, model.nv))
+    np.fill_diagonal(damping, model.dof_damping)
+    if model.nu and int(model.opt.integrator) != int(mujoco.mjtIntegrator.mjINT_EULER):
         servos = np.where(
             model.actuator_biastype == int(mujoco.mjtBias.mjBIAS_AFFINE), -model.actuator_biasprm[:, 2], 0
         )
@@ -113,7 +113,7 @@ def step_with_wrenches(model: Any, data: Any, jacobian: FloatArray, responses: S
         if solutions > 1:
             least = size
         slope = jacobian.T @ tangent @ to_motion
-        hessian = mass + constraint_hessian(model, data)
+        hessian = mass + constraint_hessian(model, data) if data.nefc else mass
         change = error - slope @ np.linalg.solve(hessian + slope, error)
         applied = applied + change
     mujoco.mj_step2(model, data)

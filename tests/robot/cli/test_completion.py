@@ -33,7 +33,10 @@ def complete(words: str) -> set[str]:
         ("tacsim run ur", {"ur5e", "ur5e-mujoco", "ur5e-one"}),
         ("tacsim doctor --rig moc", {"mock"}),
         ("tacsim calibrate latency ur5e-", {"ur5e-mujoco", "ur5e-one"}),
-        ("tacsim run --task ", {"squeeze", "reposition", "knead", "lengthen", "hold", "turn", "peg", "drawer"}),
+        (
+            "tacsim run --task ",
+            {"squeeze", "reposition", "knead", "lengthen", "relief", "hold", "turn", "peg", "drawer"},
+        ),
         ("tacsim run --policy ", {"scripted", "grip", "learned"}),
         ("tacsim evaluate squeeze --policy te", {"teacher"}),
         ("tacsim press sphere --sensor gelsight-m", {"gelsight-mini"}),

@@ -18,6 +18,7 @@ from mcap.reader import make_reader
 from robot.deploy.control_loop import EpisodeFailed, EpisodeSetup, run_episode, versions
 from robot.deploy.policy import PolicyNotFound, load_policy
 from robot.deploy.python_policy import FunctionPolicy
+from robot.serve.operated_policy import OperatedPolicy
 from tacsim.interface import (
     Action,
     ArmState,
@@ -153,6 +154,37 @@ def test_run_episode_has_requested_steps_after_reset() -> None:
     assert last.frames["lower"].image.max() == 4
     assert last.seconds > 0
     assert run_episode(make_rig(Hand()), FunctionPolicy(lift), TASK, 0).steps[-1].index == 0
+
+
+class Told:
+    """A policy that is told its goal."""
+
+    needs = Needs()
+
+    def __init__(self) -> None:
+        self.calls: list[object] = []
+
+    def set_goal(self, goal: float) -> None:
+        self.calls.append(goal)
+
+    def reset(self) -> None:
+        self.calls.append("reset")
+
+    def __call__(self, observation: Observation) -> Action:
+        return lift(observation)
+
+
+def test_policy_is_told_the_goal_before_its_reset() -> None:
+    """As in the benchmark; also one that an operator may pause."""
+    told, operated = Told(), Told()
+    run_episode(make_rig(Hand()), told, TASK, 1)
+    assert told.calls == [TASK.goal, "reset"]
+    inner = OperatedPolicy(operated, "policy", 1e-3, 0.1, None, is_live=False)
+    run_episode(make_rig(Hand()), inner, TASK, 1)
+    assert operated.calls == [TASK.goal, "reset"]
+    alone = Told()
+    run_episode(make_rig(Hand()), alone, None, 1)
+    assert alone.calls == ["reset"]
 
 
 def test_run_episode_failed_recording_stops_arms() -> None:

@@ -27,6 +27,7 @@ SMALL = (
     *(f"sensors.{name}.model.geometry.{what}" for name in ("left", "right") for what in ("width=20", "height=16")),
     *(f"sensors.{name}.model.geometry.pixel_pitch=1 mm" for name in ("left", "right")),
 )  # fmt: skip
+SIDES = ("left", "right")
 HOLD = 0.71  # of a LiftConfig: about 3 N
 BARE = (*SMALL, "task=null", "scene=hold")  # no grip at the reset
 
@@ -76,6 +77,29 @@ def test_a_task_begins_with_a_grip_that_carries_the_object() -> None:
         found = rig.diagnostics()
         assert found["max_force_left"] == pytest.approx(3.0, rel=0.05)
         assert found["slip_share_left"] == pytest.approx(0.981 / 2 / 1.8, rel=0.05)
+
+
+@pytest.mark.slow
+def test_height_and_flow_can_be_found_in_the_picture_as_on_a_robot() -> None:
+    """In the same state: within some per cent of what the gel itself has."""
+    seen = []
+    for surface in ("gel", "picture"):
+        with open_rig(
+            "hand", task="hold", overrides=("motion=flowing", *(f"sensors.{s}.surface={surface}" for s in SIDES))
+        ) as rig:
+            seen.append(rig.reset(1).tactile["left"])
+            assert rig.spec.sensors["left"].height and rig.spec.sensors["left"].flow
+    gel, picture = seen
+    assert gel.height is not None and picture.height is not None and gel.flow is not None and picture.flow is not None
+    assert picture.height.max() == pytest.approx(gel.height.max(), rel=0.15)
+    assert float(np.abs(picture.height - gel.height).max()) > 0.0
+    assert picture.flow[..., 1].mean() == pytest.approx(gel.flow[..., 1].mean(), rel=0.15)
+    assert float(np.sqrt(np.square(picture.flow - gel.flow).mean())) < 0.15 * float(np.abs(gel.flow).max())
+
+
+def test_a_picture_without_visible_dots_gives_no_flow() -> None:
+    with pytest.raises(CannotOpen, match=r"sensors\.left\.surface is picture: markers of radius"):
+        open_rig("hand", overrides=(*BARE, "sensors.left.surface=picture"))
 
 
 def test_the_same_seed_has_the_same_bits() -> None:

@@ -20,6 +20,7 @@ from robot.train.transfer import EpisodeResult, Side, Study, _load_rig, draw_fig
 from tacsim.config import load_model, load_rig
 from tacsim.interface import Action, Observation, Pose
 from tacsim.models.hardware import UrArmConfig
+from tacsim.models.mujoco import MujocoArmConfig, MujocoSensorConfig
 from tacsim.models.randomisation import Randomisation
 from tests.robot.cli.invoked import tacsim
 from tests.robot.rig.test_hardware_rig_simulated import SMALL, TINY
@@ -74,6 +75,39 @@ def test_load_rig_shipped_twin_fits_both_rigs() -> None:
             config = _load_rig(study(twins=load_model(Randomisation, "squeeze-twin")), side, number, number).config
             assert config.scene is not None
             assert config.scene.preset == ("standard" if side == "twin" else "draft")
+
+
+def test_the_twin_of_a_hand_is_another_hand() -> None:
+    held = study(task="hold", policies=("learned",), twins=load_model(Randomisation, "hold-twin"))
+    assert (held.rig("simulation"), held.rig("twin"), study().rig("twin")) == ("hand", "hand", "mock")
+    hidden, own = (_load_rig(held, side, 1, 3, "learned").config for side in transfer.SIDES[::-1])
+    assert own.motion == "flowing" and hidden.motion == "dynamic"  # that of its training, and the rig's
+    assert hidden.scene is not None and own.scene is not None and hidden.scene.object is not None
+    assert own.scene.object is not None and hidden.scene.object.grip != (0.0, 0.0, 0.0) == own.scene.object.grip
+    for name in ("left", "right"):
+        seen, usual = (each.sensors[name] for each in (hidden, own))
+        assert isinstance(seen, MujocoSensorConfig) and isinstance(usual, MujocoSensorConfig)
+        assert (seen.surface, usual.surface) == ("picture", "gel")
+        assert seen.model.lighting != usual.model.lighting and usual.model.noise is None is not seen.model.noise
+    arm = hidden.arms["hand"]
+    assert isinstance(arm, MujocoArmConfig) and any(arm.error.position)
+
+
+@pytest.mark.slow
+def test_a_study_of_a_hand_plays_both_sides(tmp_path: Path) -> None:
+    values = {"scene.object.mass": {"choice": [0.05]}, "sensors.left.delay": {"choice": [1]}}
+    held = study(
+        task="hold", policies=("learned", "scripted"), episodes=1, episodes_per_twin=1, overrides=("motion=flowing",),
+        twins=Randomisation.model_validate({"draws": 1, "values": values}),
+    )  # fmt: skip
+    told: list[str] = []
+    rows = play_study(held, tmp_path, lambda words, done, of: told.append(words))
+    assert [(row.policy, row.side, row.error) for row in rows] == [
+        (policy, side, "") for policy in held.policies for side in transfer.SIDES
+    ]
+    assert len(told) == 4 and all("% from the goal, not reached" in words for words in told)
+    hidden = next(row for row in rows if (row.policy, row.side) == ("scripted", "twin"))
+    assert hidden.distance == pytest.approx(0.92**2 * 8.0 * 2 * 0.6 / (0.05 * 9.81) - 1.25, rel=0.02)  # after two steps
 
 
 def test_twin_sensor_pose_error_is_applied() -> None:

@@ -84,7 +84,7 @@ TEXTS = {
     "missing file": ("body:\n  material: my/clay.yaml", "a.yaml:2: body.material: there is no file 'my/clay.yaml'; there is no folder 'my' either; `tacsim new material NAME` writes one, `tacsim list material` prints the shipped ones"),
     "no name": ("body: {material: a b}", "a.yaml:1: body.material: 'a b' is no material; allowed: a name (cold-plasticine, dough, "
                 "modelling-clay, seed, silicone, soft-clay), or a path ending in .yaml"),
-    "unknown base": ("name: x\nextends: sqeeze", "a.yaml:2: extends: no scene 'sqeeze'; allowed: drawer, hold, knead, peg, press, reposition, squeeze, turn; did you mean 'squeeze'?"),
+    "unknown base": ("name: x\nextends: sqeeze", "a.yaml:2: extends: no scene 'sqeeze'; allowed: drawer, hold, knead, peg, press, relief, reposition, squeeze, turn; did you mean 'squeeze'?"),
     "base of a wrong type": ("extends: [squeeze]", "a.yaml:1: extends: a list of 1 does not fit; allowed: the name of a scene, or a path"),
     "itself": ("a.yaml", "a.yaml:1: the references form a circle: a.yaml -> a.yaml; break it in one of them"),
     "duplicate": ("name: x\npreset: draft\nname: y", "a.yaml:3: name: the key occurs twice, first at a.yaml:1; keep one"),
@@ -101,7 +101,7 @@ TEXTS = {
     "key that is a list": ("? [a]\n: 1", "a.yaml:1: a key must be a plain text, not a list or a mapping"),
     "empty": ("", "a.yaml:1: the file is empty; allowed: a mapping of keys to values"),
     "only comments": ("# nothing\n\n", "a.yaml:1: the file is empty; allowed: a mapping of keys to values"),
-    "no mapping": ("5", "a.yaml:1: 5 does not fit; allowed: the name of a scene (drawer, hold, knead, peg, press, reposition, squeeze, turn), or a mapping with keys among " + SCENE_KEYS),
+    "no mapping": ("5", "a.yaml:1: 5 does not fit; allowed: the name of a scene (drawer, hold, knead, peg, press, relief, reposition, squeeze, turn), or a mapping with keys among " + SCENE_KEYS),
     "deep": ("\n".join(" " * i + "a:" for i in range(40)), "a.yaml:32: nested too deeply; at most 32 levels are allowed"),
     "escape code": ('"\\e[31mred": 1', f"a.yaml:1: \\x1b[31mred: unknown key; allowed: {SCENE_KEYS}"),
 }  # fmt: skip
@@ -212,7 +212,7 @@ def test_a_file_that_is_not_there_lists_the_names() -> None:
     wrong_task = complaint(load_rig, "sim", task="sqeeze")
     assert (
         wrong_task
-        == "--task sqeeze: task: no task 'sqeeze'; allowed: drawer, hold, knead, lengthen, peg, reposition, squeeze, turn; did you mean 'squeeze'?"
+        == "--task sqeeze: task: no task 'sqeeze'; allowed: drawer, hold, knead, lengthen, peg, relief, reposition, squeeze, turn; did you mean 'squeeze'?"
     )
 
 

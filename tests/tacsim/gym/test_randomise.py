@@ -64,8 +64,8 @@ def test_what_cannot_be_is_refused_with_its_key_before_anything_is_simulated() -
 def test_every_shipped_one_fits_its_task(name: str) -> None:
     found = load_model(Randomisation, name)
     for overrides in found.draw_overrides()[:3]:
-        rig = "mock" if name.endswith("-twin") else "hand" if name in ("hold", "turn", "peg", "drawer") else "sim"
         task = name.removesuffix("-twin")
+        rig = "hand" if task in ("hold", "turn", "peg", "drawer") else "mock" if name.endswith("-twin") else "sim"
         assert load_rig(rig, task=task, overrides=overrides).config.scene is not None
 
 

@@ -232,11 +232,26 @@ def test_the_scripted_policy_turns_where_the_sensor_stands_not_by_the_clock() ->
     for share in (1.0, 0.5):
         policy, now, way = ScriptedKnead(task, True), np.zeros(2), []
         for _ in range(int(300 / share)):
-            step = policy._lateral_step(now)
+            step = policy._stroke_step(now)
             assert np.linalg.norm(step) <= 0.9 * task.config.max_step + 1e-12
             now = now + share * step
             way.append(now.copy())
         assert np.ptp(way, axis=0) == pytest.approx([0, np.pi * diameter], abs=2 * 0.2 * task.config.max_step)
+
+
+def test_a_ball_is_rolled_on_a_circle() -> None:
+    """From the middle it spirals out to 0.8 of the diameter, then goes round, with steps of 0.9 max_step."""
+    task = make_task(config(shape="ball"))
+    assert isinstance(task, Knead)
+    policy, now, path = ScriptedKnead(task, True), np.zeros(2), []
+    for _ in range(300):
+        step = policy._circle_step(now)
+        assert np.linalg.norm(step) == pytest.approx(0.9 * task.config.max_step, rel=0.02)
+        now = now + step
+        path.append(now.copy())
+    radius = np.linalg.norm(path[100:], axis=1)
+    assert radius == pytest.approx(0.8 * task.goal[2], rel=1e-6)
+    assert np.ptp(path[100:], axis=0) == pytest.approx([2 * radius[0]] * 2, rel=0.01)
 
 
 def taught(height: float, force: float, yields: float | None) -> float:

@@ -11,10 +11,14 @@ from scipy.spatial.transform import Rotation
 
 from robot.open import load_with_task, open_rig
 from tacsim import Task, Truth, evaluate_outcome, load_task, make_task
-from tacsim.interface import Observation, Pose, TactileObservation
+from tacsim.gym.features import FeatureEncoder
+from tacsim.interface import ArmState, GripperState, Observation, Pose, TactileObservation
+from tacsim.models.policy import Features
+from tacsim.models.sensor import CanonicalGrid
 from tacsim.models.task import HoldConfig, TurnConfig
 from tacsim.tasks import GoalOutOfReach
 from tacsim.tasks.rigid import slip_of, turn_in_grip
+from tacsim.tasks.tuning import FORCE_DECREASE, GRIP_RULE
 from tacsim.tasks.turn import TurnEstimate
 
 # The pads look at each other along world x; their y axes point down, as on a hand above a table.
@@ -66,6 +70,38 @@ def test_hold_wants_little_more_than_the_force_that_holds() -> None:
     assert hold.measures(slipped, start) == pytest.approx({"slip": 6e-3, "grip_force": 1.25 * needed})
 
 
+def held(force: float | None, weight: float, rim: float) -> Observation:
+    """A box of this weight [N], gripped by this force [N]: its markers have a flow of 0.2 mm, those at the rim differ
+    from their neighbours by `rim` of that."""
+    flow = np.zeros((9, 11, 2), np.float32)
+    flow[..., 1] = 0.2e-3
+    flow[0, :, 1] -= rim * 0.2e-3
+    grid = np.zeros((64, 64))
+    touch = TactileObservation(
+        np.zeros((128, 128, 3), np.uint8), gradient=None, height=None, contact=grid > 0, valid=grid == 0, flow=flow,
+        time=0.0, age=0.0,
+    )  # fmt: skip
+    arm = ArmState(Pose(), np.zeros(6), np.array([0.0, 0.6 * weight, 0.8 * weight, 0, 0, 0]), None, 0.0)
+    gripper = GripperState(width=0.02, force=force, time=0.0)
+    return Observation({"left": touch, "right": touch}, {"hand": arm}, 0.0, grippers={"hand": gripper})
+
+
+def test_the_rule_for_hold_asks_for_less_the_less_the_rim_slips() -> None:
+    rule = make_task(load_task("hold")).analytic()
+    scale, of_force, of_flow = GRIP_RULE
+
+    def asked(force: float | None, rim: float) -> float:
+        grip = rule(held(force, 1.0, rim)).grippers["hand"]
+        assert grip is not None
+        return grip.force
+
+    excess = scale * 2.0**of_force * 0.1**of_flow
+    assert asked(2.0, 0.1) == pytest.approx(2.0 * 1.25 / excess)
+    assert asked(2.0, 0.1) > 2.0 > asked(2.0, 0.9) == pytest.approx(FORCE_DECREASE * 2.0)
+    with pytest.raises(ValueError, match="measures its force"):
+        asked(None, 0.1)
+
+
 def test_hold_refuses_an_object_that_no_force_of_the_task_holds() -> None:
     heavy = load_task("hold").model_copy(update={"force_range": (0.2, 0.9)})
     with pytest.raises(GoalOutOfReach, match=r"needs a grip of 1.02 N, and the task's force_range is 0.2 to 0.9 N"):
@@ -101,7 +137,31 @@ def test_the_turn_is_seen_by_the_edges_in_the_gel_past_a_quarter_turn() -> None:
     for angle in np.radians(np.arange(0.0, 121.0, 10.0)):
         assert estimate(edge_seen(angle)) == pytest.approx(angle, abs=math.radians(1.0))
     blank = edge_seen(0.0).tactile["left"]
+    assert estimate(Observation({"left": replace(blank, contact=~blank.contact)}, {}, 0.0)) == pytest.approx(
+        math.radians(120.0), abs=math.radians(1.0)
+    )
     assert TurnEstimate()(Observation({"left": replace(blank, contact=~blank.contact)}, {}, 0.0)) is None
+
+
+def test_a_learned_policy_sees_the_turn_of_the_edges_with_its_sign() -> None:
+    asked = FeatureEncoder(
+        Features(sensors=("left",), arms=(), maps=(), touch=("turned",), goal=False, frames=2), CanonicalGrid()
+    )
+    assert asked.needs.height and asked.inputs["touch"].names == ("turned_left -1", "turned_left")
+    assert asked.begin(edge_seen(0.3))["touch"].tolist() == [0.0, 0.0]
+    for angle in (0.9, 1.5, 2.1):  # past a quarter turn
+        seen = asked(edge_seen(angle))["touch"]
+    assert seen == pytest.approx([2.4, 3.6], abs=0.04)  # over 0.5 rad
+    assert asked.begin(edge_seen(0.3))["touch"].tolist() == [0.0, 0.0]  # another episode
+    assert asked(edge_seen(-0.2))["touch"][1] == pytest.approx(-1.0, abs=0.04)
+
+
+def test_the_teacher_of_a_turn_goes_on_from_the_force_that_there_is() -> None:
+    turn, grips = task("turn"), {"hand": GripperState(0.02, 2.0, 0.0)}
+    for policy, force in ((turn.teacher(), 2.0), (turn.scripted(), turn.config.touch_force)):
+        policy.reset()
+        target = policy(replace(edge_seen(0.0), grippers=grips)).grippers["hand"]
+        assert target is not None and target.force == pytest.approx(0.95 * force)
 
 
 @pytest.mark.slow

@@ -89,6 +89,20 @@ def test_body_is_broken_if_a_part_is_apart() -> None:
     assert loose_share(crumb, volume) == pytest.approx(0.005) and not is_broken(crumb, volume)
 
 
+def test_distances_have_the_unit_of_the_task(tmp_path: Path) -> None:
+    """Of `hold` a distance is a share. A score that does not say the kind of its task, as of earlier versions, is one
+    of lengths, and its seal holds."""
+    write_score(tmp_path / "a.json", score("a", episode(0, True, 0.05), kind="hold"))
+    earlier = tmp_path / "b.json"
+    write_score(earlier, score("b", episode(0, True, 0.05e-3)))
+    text = earlier.read_text(encoding="utf-8")
+    earlier.write_text(text.replace(' "kind": "",\n', ""), encoding="utf-8")
+    assert '"kind"' not in earlier.read_text(encoding="utf-8") and '"kind"' in text
+    result = tacsim("benchmark", "table", tmp_path, "--markdown")
+    assert result.exit_code == 0, result.stderr
+    assert "| 5.000 (5.000 to 5.000) % |" in result.stdout and "| 0.050 (0.050 to 0.050) mm |" in result.stdout
+
+
 def test_compare_and_table_commands(tmp_path: Path) -> None:
     one, two = tmp_path / "a.json", tmp_path / "b.json"
     write_score(one, score("a", *(episode(n, True) for n in range(6))))

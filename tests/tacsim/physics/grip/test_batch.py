@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from tacsim.models.material import GelMaterial
 from tacsim.models.scene import Box, Cylinder, Gel, Sphere
 from tacsim.physics.failure.health import SimulationDiverged
-from tacsim.physics.grip.model import HeldObject, HeldStates, Support
+from tacsim.physics.grip.model import GripCommand, HeldObject, HeldStates, Support
 from tacsim.physics.grip.world import GripWorld
 from tests.tacsim.physics.grip.gripping import BALL, BOX, HOME, held, make_grip, pads_at
 
@@ -80,6 +80,58 @@ def test_a_restored_grip_continues_with_the_same_bits_and_the_others_as_they_wer
     assert list(world.states.touching.any(axis=1)) == [True, False, True]
     with pytest.raises(ValueError, match="snapshot: 'gel_displacement_0' must have shape"):
         world.restore(0, {"object": np.zeros((1, 7))})
+
+
+def test_a_replaced_grip_is_a_new_one_and_the_others_stay_as_they_were() -> None:
+    world = GripWorld(ITEMS, GELS)
+    world.reset(np.tile(HOME, (3, 1)), pads_at(count=3))
+    wander(world, [0, 1, 2], 4)
+    kept = [world.snapshot(index) for index in (0, 2)]
+    tilted = (0.5, 0.0, -9.0)
+    world.replace(1, ITEMS[2], GELS[0], tilted)
+    with pytest.raises(ValueError, match="grip 1 has no object in place yet"):
+        world.step(pads_at(count=3))
+    world.reset(HOME, pads_at()[0], 1)
+    new = GripWorld(ITEMS[2:], GELS[0], gravity=tilted)
+    new.reset(HOME[None], pads_at())
+    grasped = world.grasp(pads_at(), [8.0], 1), new.grasp(pads_at(), [8.0])
+    assert same(*grasped, 0, 0)
+    for number in range(3):
+        up = HOME + [0, 0, 1e-3 * number, 0, 0, 0, 0]
+        command = GripCommand(pads_at(pose=up)[0], 6.0 - number)
+        found, wanted = world.step_each({1: command})[1], new.step_each({0: command})[0]
+        assert isinstance(found, HeldStates)
+        assert isinstance(wanted, HeldStates)
+        assert same(found, wanted, 0, 0)
+    assert np.array_equal(world.surface(1, 0).displacement, new.surface(0, 0).displacement)
+    for index, state in zip((0, 2), kept, strict=True):
+        assert all(np.array_equal(state[name], array) for name, array in world.snapshot(index).items())
+    with pytest.raises(ValueError, match="environments of a batch need one gel lattice"):
+        world.replace(1, ITEMS[0], Gel(size=(16e-3, 20e-3, 4e-3)))
+    assert world.step_each({1: command})[1].touching.all()  # type: ignore[union-attr]
+
+
+def test_some_grips_step_and_one_that_fails_stays_alone() -> None:
+    world, other = (GripWorld(ITEMS, GELS) for _ in range(2))
+    for each in (world, other):
+        each.reset(np.tile(HOME, (3, 1)), pads_at(count=3))
+        each.grasp(pads_at(count=3), [3.0, 3.0, 8.0])
+    good = {index: GripCommand(pads_at(-0.05e-3)[0], 5.0) for index in (0, 1)}
+    wanted = other.step_each(good)
+    kept = world.snapshot(2)
+    crushed = GripCommand(pads_at(-6e-3)[0])
+    far = GripCommand(one_pad_far_away()[0])
+    found = world.step_each({**good, 2: crushed})
+    assert isinstance(found[2], SimulationDiverged)
+    assert found[2].environment == 2
+    for index in (0, 1):
+        assert same(found[index], wanted[index], 0, 0)  # type: ignore[arg-type]
+    assert all(np.array_equal(kept[name], array) for name, array in world.snapshot(2).items())
+    found, wanted = world.step_each({**good, 2: far}), other.step_each(good)
+    assert "take more steps" in str(found[2])
+    assert same(found[0], wanted[0], 0, 0)  # type: ignore[arg-type]
+    assert all(np.array_equal(kept[name], array) for name, array in world.snapshot(2).items())
+    assert same(world.states, other.states, 1, 1)
 
 
 def test_a_step_that_settles_ends_when_forces_balance_and_another_has_a_fixed_length() -> None:

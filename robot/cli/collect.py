@@ -241,7 +241,7 @@ def experts(
         bool, typer.Option("--pictures/--no-pictures", help="Without pictures it loads faster: numbers alone.")
     ] = True,
     workers: Workers = None,
-    ray: Ray = None,
+    ray: RayCluster = None,
     set_: Overrides = None,
 ) -> None:
     """Make a data set of expert episodes of a task, for LeRobot and Hugging Face datasets, with a card and its hash.

@@ -287,6 +287,14 @@ def summarise(results: Sequence[EpisodeResult]) -> list[SummaryRow]:
     return rows
 
 
+def label_policies(names: Sequence[str]) -> list[str]:
+    """Short names: those of the files, with their folders where files have the same name."""
+    stems = [Path(name).stem for name in names]
+    if len(set(stems)) == len(stems):
+        return stems
+    return [Path(*Path(name).with_suffix("").parts[-2:]).as_posix() for name in names]
+
+
 def draw_figure(rows: Sequence[SummaryRow], path: Path, unit: Unit = LENGTH) -> None:
     """Draws success and distance of each policy on both sides, with intervals."""
     from matplotlib.figure import Figure
@@ -306,7 +314,7 @@ def draw_figure(rows: Sequence[SummaryRow], path: Path, unit: Unit = LENGTH) -> 
             axes.errorbar(values, [y for y, _ in selected], xerr=errors, fmt="o", color=colour, label=side, capsize=3)
         axes.set_title(what, loc="left", fontsize=10)
         axes.set_xlabel(symbol)
-        axes.set_yticks(range(len(names)), [Path(name).stem.replace("$", r"\$") for name in names])
+        axes.set_yticks(range(len(names)), [label.replace("$", r"\$") for label in label_policies(names)])
         axes.set_xlim(left=0)
     axes.invert_yaxis()
     axes.legend(fontsize=8, frameon=False)

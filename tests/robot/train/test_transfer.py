@@ -16,7 +16,16 @@ from robot.mock.cell.cell import MockCell, _actual_frames
 from robot.mock.cell.sim_server import SceneFrame
 from robot.open import open_rig
 from robot.train import transfer
-from robot.train.transfer import EpisodeResult, Side, Study, _load_rig, draw_figure, play_study, summarise
+from robot.train.transfer import (
+    EpisodeResult,
+    Side,
+    Study,
+    _load_rig,
+    draw_figure,
+    label_policies,
+    play_study,
+    summarise,
+)
 from tacsim.config import load_model, load_rig
 from tacsim.interface import Action, Observation, Pose
 from tacsim.models.hardware import UrArmConfig
@@ -200,6 +209,13 @@ def test_summarise_gives_success_distance_and_agreement(tmp_path: Path) -> None:
     assert (nothing.distance, nothing.agreement, nothing.failures) == (None, None, 1)
     draw_figure([one, other, nothing], tmp_path / "transfer.png")
     assert (tmp_path / "transfer.png").stat().st_size > 5000
+
+
+def test_policies_of_one_file_name_are_told_apart_by_their_folders() -> None:
+    assert label_policies(["scripted", "runs/flow.onnx"]) == ["scripted", "flow"]
+    assert label_policies(["scripted", "/r/flow/policy.onnx", "r/depth/policy.onnx"]) == [
+        "scripted", "flow/policy", "depth/policy"
+    ]  # fmt: skip
 
 
 @pytest.mark.deep

@@ -203,7 +203,7 @@ def draw_ranking(rankings: Sequence[Ranking], path: Path, names: tuple[str, str]
     axes.set_ylabel(f"success, {names[1]} [%]")
     axes.set_xlim(-4, 104)
     axes.set_ylim(-4, 104)
-    axes.set_aspect("equal")
+    axes.set_box_aspect(1)
     figure.legend(loc="outside right upper", fontsize=8, frameon=False)
     figure.savefig(path, dpi=110)
 

@@ -86,7 +86,11 @@ class Record:
 def run_tests(path: Path, stop: Callable[[], bool]) -> tuple[list[Row], str]:
     """Runs the tests below `path` until `stop`, and prints their output. Returns a row with their numbers, and a text:
     what went wrong, or ""."""
-    words = [sys.executable, "-m", "pytest", "-q", "-m", "not deep", "-p", "no:cacheprovider", str(path)]
+    program = (  # a killed run leaves no tests behind
+        f"import sys, pytest; from robot.common.process import end_with_parent; end_with_parent({os.getpid()}); "
+        "sys.exit(pytest.main(sys.argv[1:]))"
+    )
+    words = [sys.executable, "-c", program, "-q", "-m", "not deep", "-p", "no:cacheprovider", str(path)]
     began, stopped = time.perf_counter(), ""
     with tempfile.TemporaryFile("w+", encoding="utf-8") as output:
         tests = subprocess.Popen(words, cwd=ROOT, stdout=output, stderr=subprocess.STDOUT)

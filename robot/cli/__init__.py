@@ -32,7 +32,8 @@ from robot.cli.collect import press as press_set
 from robot.cli.compare import compare
 from robot.cli.doctor import doctor, schema, start
 from robot.cli.identify import body, gel, identify
-from robot.cli.learn import evaluate, export, policy, policy_range, train, transfer
+from robot.cli.learn.evaluate import evaluate, transfer
+from robot.cli.learn.train import export, policy, policy_range, train
 from robot.cli.mock import mock
 from robot.cli.options import with_json_option
 from robot.cli.recordings import lerobot, recover, view

@@ -418,7 +418,8 @@ def test_torch_is_imported_only_by_train() -> None:
     program = """
 import sys
 import robot.cli, robot.open, robot.deploy.policy, robot.train.evaluate, robot.train.run_folder
-from robot.cli.learn import evaluate, export, train
+from robot.cli.learn.evaluate import evaluate
+from robot.cli.learn.train import export, train
 assert not {"torch", "stable_baselines3", "onnx", "onnxruntime"} & set(sys.modules)
 """
     done = subprocess.run(

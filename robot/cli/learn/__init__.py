@@ -1,0 +1,1 @@
+"""`tacsim train`, `evaluate`, `transfer`, and the export of policies."""

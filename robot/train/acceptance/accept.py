@@ -132,11 +132,11 @@ def _play_pairs(
     together = TOGETHER if request.rig == "sim" else 1
     for first in range(0, len(numbers), together):
         chosen = numbers[first : first + together]
-        own = list(player.play(request.policy, chosen))
+        own = list(player.play_episodes(request.policy, chosen))
         if request.against is None:
             yield from ((each, None) for each in own)
         else:
-            yield from zip(own, player.play(request.against, chosen), strict=True)
+            yield from zip(own, player.play_episodes(request.against, chosen), strict=True)
 
 
 def load_checked_split(request: Acceptance) -> Split:

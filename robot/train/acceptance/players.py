@@ -54,7 +54,7 @@ class Player(Protocol):
         does not fit the rig."""
         ...
 
-    def play(self, policy: str, numbers: Sequence[int]) -> Iterator[PlayedEpisode]:
+    def play_episodes(self, policy: str, numbers: Sequence[int]) -> Iterator[PlayedEpisode]:
         """Plays these episodes, in order. Raises RigFailed."""
         ...
 
@@ -70,8 +70,8 @@ class SimulatedPlayer(SplitPlayer):
         self.require_policy(policy, notes.append)
         return notes
 
-    def play(self, policy: str, numbers: Sequence[int]) -> Iterator[PlayedEpisode]:  # type: ignore[override]
-        for scores, _ in super().play(policy, numbers):
+    def play_episodes(self, policy: str, numbers: Sequence[int]) -> Iterator[PlayedEpisode]:
+        for scores, _ in self.play(policy, numbers):
             for each in scores:
                 yield PlayedEpisode(
                     each.episode,
@@ -112,7 +112,7 @@ class MockPlayer:
         scenes = [each.config.scene for each in loaded if each.config.scene is not None]
         return training_notes(found, policy, scenes)
 
-    def play(self, policy: str, numbers: Sequence[int]) -> Iterator[PlayedEpisode]:
+    def play_episodes(self, policy: str, numbers: Sequence[int]) -> Iterator[PlayedEpisode]:
         for number in numbers:
             yield self._play_episode(policy, number)
 

@@ -156,8 +156,8 @@ def test_run_episode_has_requested_steps_after_reset() -> None:
     assert run_episode(make_rig(Hand()), FunctionPolicy(lift), TASK, 0).steps[-1].index == 0
 
 
-class Told:
-    """A policy that is told its goal."""
+class GoalRecorder:
+    """A policy that gets a goal, and records its calls."""
 
     needs = Needs()
 
@@ -174,15 +174,15 @@ class Told:
         return lift(observation)
 
 
-def test_policy_is_told_the_goal_before_its_reset() -> None:
+def test_policy_gets_the_goal_before_its_reset() -> None:
     """As in the benchmark; also one that an operator may pause."""
-    told, operated = Told(), Told()
-    run_episode(make_rig(Hand()), told, TASK, 1)
-    assert told.calls == [TASK.goal, "reset"]
+    recorder, operated = GoalRecorder(), GoalRecorder()
+    run_episode(make_rig(Hand()), recorder, TASK, 1)
+    assert recorder.calls == [TASK.goal, "reset"]
     inner = OperatedPolicy(operated, "policy", 1e-3, 0.1, None, is_live=False)
     run_episode(make_rig(Hand()), inner, TASK, 1)
     assert operated.calls == [TASK.goal, "reset"]
-    alone = Told()
+    alone = GoalRecorder()
     run_episode(make_rig(Hand()), alone, None, 1)
     assert alone.calls == ["reset"]
 

@@ -109,12 +109,12 @@ def test_a_study_of_a_hand_plays_both_sides(tmp_path: Path) -> None:
         task="hold", policies=("learned", "scripted"), episodes=1, episodes_per_twin=1, overrides=("motion=flowing",),
         twins=Randomisation.model_validate({"draws": 1, "values": values}),
     )  # fmt: skip
-    told: list[str] = []
-    rows = play_study(held, tmp_path, lambda words, done, of: told.append(words))
+    reported: list[str] = []
+    rows = play_study(held, tmp_path, lambda words, done, of: reported.append(words))
     assert [(row.policy, row.side, row.error) for row in rows] == [
         (policy, side, "") for policy in held.policies for side in transfer.SIDES
     ]
-    assert len(told) == 4 and all("% from the goal, not reached" in words for words in told)
+    assert len(reported) == 4 and all("% from the goal, not reached" in words for words in reported)
     hidden = next(row for row in rows if (row.policy, row.side) == ("scripted", "twin"))
     assert hidden.distance == pytest.approx(0.92**2 * 8.0 * 2 * 0.6 / (0.05 * 9.81) - 1.25, rel=0.02)  # after two steps
 
@@ -156,13 +156,13 @@ def fake(study: Study, side: Side, twin: int, left: Sequence[tuple[str, int]]) -
 
 def test_play_study_killed_continues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(transfer, "_play_on_hidden_rig", fake)
-    told: list[str] = []
-    whole = play_study(study(), tmp_path, lambda words, done, of: told.append(f"{done} of {of}, {words}"))
-    assert told[:2] == [
+    reported: list[str] = []
+    whole = play_study(study(), tmp_path, lambda words, done, of: reported.append(f"{done} of {of}, {words}"))
+    assert reported[:2] == [
         "1 of 20, scripted, simulation: 0.000 mm from the goal",
         "2 of 20, scripted, simulation: 0.100 mm from the goal",
     ]
-    assert told[-1] == "20 of 20, grip, twin: 0.500 mm from the goal, not reached"
+    assert reported[-1] == "20 of 20, grip, twin: 0.500 mm from the goal, not reached"
     assert [(each.policy, each.side, each.episode) for each in whole] == [
         (policy, side, n) for policy in ("scripted", "grip") for side in ("simulation", "twin") for n in range(5)
     ]
@@ -211,7 +211,7 @@ def test_summarise_gives_success_distance_and_agreement(tmp_path: Path) -> None:
     assert (tmp_path / "transfer.png").stat().st_size > 5000
 
 
-def test_policies_of_one_file_name_are_told_apart_by_their_folders() -> None:
+def test_policies_of_one_file_name_have_labels_with_their_folders() -> None:
     assert label_policies(["scripted", "runs/flow.onnx"]) == ["scripted", "flow"]
     assert label_policies(["scripted", "/r/flow/policy.onnx", "r/depth/policy.onnx"]) == [
         "scripted", "flow/policy", "depth/policy"

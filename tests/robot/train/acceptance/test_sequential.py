@@ -57,7 +57,7 @@ def test_clear_cases_end_after_few_episodes() -> None:
 @pytest.mark.parametrize("discordant", [0.2, 0.3, 0.5])
 @pytest.mark.parametrize("worse", [True, False])
 def test_paired_test_keeps_its_error_rates(discordant: float, worse: bool) -> None:
-    """Whatever the share of episodes in which the policies differ, which nobody knows before."""
+    """Whatever the share of episodes in which the policies differ, which is unknown beforehand."""
     margin, errors = 0.2, Errors()
     difference = -margin if worse else 0.0
     won, lost = (discordant + difference) / 2, (discordant - difference) / 2

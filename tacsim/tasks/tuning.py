@@ -24,7 +24,7 @@ RELIEF_CLEARANCE = 0.8e-3  # above the body while the sensor moves sideways [m]
 TOUCH_STEP = 0.05e-3  # of the sensor close to the surface [m]
 RELIEF_TOLERANCE = 0.07e-3  # a dent that lacks less is deep enough [m]
 FIRST_EXCESS = 0.25e-3  # by which the first press of a dent goes deeper than its goal [m]
-ONLY_EXCESS = 0.6e-3  # the same where no other follows: reaches 5 of 16 draws like the benchmark's; 0.9e-3, 1.2e-3: 2 [m]
+ONLY_EXCESS = 0.6e-3  # the same where no other follows: 5 of 16 draws like the benchmark's; 0.9e-3, 1.2e-3: 2 [m]
 MAX_PRESSES = 6  # of a dent at one visit
 
 # reposition.py

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Mapping
+import math
+from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -84,23 +85,27 @@ class Relief(Task):
         return {f"depth_{number}": float(depth) for number, depth in enumerate(self.depths(truth, start), 1)}
 
     def scripted(self, *, through: bool = False) -> Policy:
-        return ScriptedRelief(self.config, MAX_PRESSES, FIRST_EXCESS)
+        goal = (math.inf,) * len(self.config.goal) if through else self.config.goal
+        return ScriptedRelief(self.config, goal, MAX_PRESSES, FIRST_EXCESS)
 
     def analytic(self) -> Policy:
-        return ScriptedRelief(self.config, 1, ONLY_EXCESS)
+        return ScriptedRelief(self.config, self.config.goal, 1, ONLY_EXCESS)
 
 
 class ScriptedRelief:
     """Presses each dent, lifts until the gel hardly touches, and measures by that what has remained of the dent; then
     presses deeper by what is missing.
 
-    max_presses: of a dent at one visit; 1: each dent is pressed once. first_excess: by which the first press of a dent
-    goes deeper than its goal [m].
+    goal: depths [m]; infinite: it presses the first dent on and on. max_presses: of a dent at one visit; 1: each dent
+    is pressed once. first_excess: by which the first press of a dent goes deeper than its goal [m].
     """
 
-    def __init__(self, config: ReliefConfig, max_presses: int, first_excess: float) -> None:
-        self._config, self._max_presses, self._first_excess = config, max_presses, first_excess
+    def __init__(self, config: ReliefConfig, goal: Sequence[float], max_presses: int, first_excess: float) -> None:
+        self._config, self._goal, self._max_presses, self._first_excess = config, goal, max_presses, first_excess
         self._motion: Motion | None = None
+        body = config.scene.body
+        assert body is not None  # the task refuses a scene without one
+        self._max_depth = float(shapes.bounding_size(body.geometry)[2]) / 2  # no goal is deeper [m]
 
     @property
     def needs(self) -> Needs:
@@ -118,16 +123,19 @@ class ScriptedRelief:
     def _press_all(self, observation: Observation) -> Motion:
         """All dents, again and again until each has its depth, since a dent lifts or sinks those next to it."""
         surface = _height(observation)  # a reset ends with a light touch
+        lowest = surface - self._max_depth
         heights, pressed = dict[int, float](), dict[int, float]()
         is_done = False
         while not is_done:
             is_done = True
-            for number, (place, goal) in enumerate(zip(self._config.places, self._config.goal, strict=True)):
+            for number, (place, goal) in enumerate(zip(self._config.places, self._goal, strict=True)):
                 observation = yield from self._go(observation, _place(observation), surface + RELIEF_CLEARANCE)
                 observation = yield from self._go(observation, place, surface + RELIEF_CLEARANCE)
                 observation = yield from self._touch(
-                    observation, heights.get(number, surface) - pressed.get(number, 0.0)
+                    observation, heights.get(number, surface) - pressed.get(number, 0.0), lowest
                 )
+                if _normal_force(observation) < MIN_RELIEF_FORCE:  # there is no clay
+                    continue
                 top = heights.setdefault(number, _height(observation))
                 if goal - (top - _height(observation)) > RELIEF_TOLERANCE:
                     is_done = self._max_presses == 1
@@ -157,10 +165,11 @@ class ScriptedRelief:
             observation = yield self._step(observation, x - _place(observation), height - _height(observation))
         return observation
 
-    def _touch(self, observation: Observation, surface: float) -> Motion:
-        """Down until the gel touches, slowly from near the height [m] at which it is expected to."""
+    def _touch(self, observation: Observation, surface: float, lowest: float) -> Motion:
+        """Down until the gel touches, slowly from near the height [m] at which it is expected to; no further down than
+        the height `lowest` [m], where there is no clay."""
         observation = yield from self._go(observation, _place(observation), surface + 2.0 * TOUCH_STEP)
-        while _normal_force(observation) < MIN_RELIEF_FORCE:
+        while _normal_force(observation) < MIN_RELIEF_FORCE and _height(observation) > lowest:
             observation = yield self._step(observation, 0.0, -TOUCH_STEP)
         return observation
 

@@ -100,3 +100,34 @@ def test_the_analytic_rule_presses_each_dent_once() -> None:
         ends.append(clay.dents[-1.0])
     pressed = 0.6e-3 + ONLY_EXCESS - 0.05e-3  # from a light touch; 0.1 mm of it is elastic
     assert ends == pytest.approx([0.8 * pressed, 0.3 * pressed], rel=0.02)
+
+
+def test_beside_the_clay_it_does_not_descend_without_end() -> None:
+    class HalfOfTheClay(SpringyClay):
+        def observation(self) -> SimpleNamespace:
+            seen = super().observation()
+            if self.position[0] > 0.0:
+                seen.arms["upper"] = ArmState(Pose(self.position.copy()), np.zeros(6), np.zeros(6), None, 0.0)
+            return seen
+
+    clay = HalfOfTheClay(0.5)
+    policy = relief().scripted()
+    policy.reset()
+    heights = []
+    for _ in range(600):
+        target = policy(clay.observation()).tool["upper"]  # type: ignore[arg-type]
+        assert target is not None
+        clay.position = np.array(target.position)
+        heights.append(clay.position[2])
+    assert min(heights) == pytest.approx(clay.top - 3.5e-3, abs=0.06e-3)  # half of the body's height
+
+
+def test_through_the_goal_it_presses_on() -> None:
+    clay = SpringyClay(0.5)
+    policy = relief().scripted(through=True)
+    policy.reset()
+    for _ in range(100):
+        target = policy(clay.observation()).tool["upper"]  # type: ignore[arg-type]
+        assert target is not None
+        clay.position = np.array(target.position)
+    assert clay.position[2] < clay.top - 2e-3 - max(relief().goal)

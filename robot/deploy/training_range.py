@@ -23,8 +23,17 @@ MAX_FALSE_ALARMS = 0.03  # fraction of training episodes that may exceed the lim
 ROUNDING = 1e-6  # of a scene's number, for rounding [fraction]
 MIN_DEVIATION = 0.01  # of a number in training; a smaller one is replaced by it [encoded]
 MIN_VARIANCE = 0.01  # of a direction, relative to 1 of a number; smaller ones are noise
-PHYSICAL = ("gel", "gels", "body", "friction", "gravity")  # parts of a scene that affect observations
+PHYSICAL = (
+    "gel",
+    "gels",
+    "body",
+    "object",
+    "fixtures",
+    "friction",
+    "gravity",
+)  # parts of a scene that affect observations
 QUASI_STATIC_IRRELEVANT = ("density", "seed")  # numbers without effect on quasi-static motions
+BEFORE_GRIP = ("object.position", "object.pedestal", "object.lift")  # where an object stands until it is gripped
 EncodedFeatures = Mapping[str, NDArray[Any]]
 
 
@@ -167,19 +176,19 @@ class RangeMonitor:
 
 
 def scene_numbers(scene: Scene) -> dict[str, float | str]:
-    """Parameters of a scene that affect observations: each number of its gels, body, friction and gravity [SI], and the
-    shape of the body, by its key in the scene file. A parameter that is not given has no key."""
+    """Parameters of a scene that affect observations: each number of its gels, body or object, friction and gravity
+    [SI], and its shape, by its key in the scene file. A parameter that is not given has no key."""
     found: dict[str, float | str] = {}
 
     def walk(key: str, value: Any) -> None:
         if isinstance(value, Mapping):
             for name, each in value.items():
                 walk(f"{key}.{name}", each)
+        elif key.rpartition(".")[2] in QUASI_STATIC_IRRELEVANT or key in BEFORE_GRIP or isinstance(value, bool):
+            return
         elif isinstance(value, Sequence) and not isinstance(value, str):
             for at, each in enumerate(value):
                 walk(f"{key}[{at}]", each)
-        elif key.rpartition(".")[2] in QUASI_STATIC_IRRELEVANT or isinstance(value, bool):
-            return
         elif isinstance(value, int | float):
             found[key] = float(value)
         elif key.endswith(".shape"):

@@ -9,6 +9,7 @@ could be another one.
 from __future__ import annotations
 
 import hashlib
+import logging
 import platform
 import re
 from functools import cache
@@ -47,7 +48,14 @@ class Machine(Config):
 @cache
 def physics() -> Physics:
     """Of this installation. Computes the reference motion: seconds, most of them to compile."""
-    return Physics(motion=_hash_reference_motion(), source=hash_physics_source(), tacsim=versions().get("tacsim", ""))
+    log = logging.getLogger("tacsim")
+    level = log.level
+    log.setLevel(logging.ERROR)  # its coarse mesh is no choice of the user's
+    try:
+        motion = _hash_reference_motion()
+    finally:
+        log.setLevel(level)
+    return Physics(motion=motion, source=hash_physics_source(), tacsim=versions().get("tacsim", ""))
 
 
 @cache

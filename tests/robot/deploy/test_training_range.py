@@ -18,7 +18,7 @@ from robot.deploy.training_range import RangeMonitor, describe_scenes_outside, e
 from robot.open import open_rig
 from robot.train.evaluate import evaluate
 from robot.train.measure_range import measure_range, write_range
-from tacsim.config import load_rig
+from tacsim.config import load_rig, load_scene
 from tacsim.models.scene import Scene
 from tacsim.models.task import SqueezeConfig
 from tacsim.report.report import summarise
@@ -109,6 +109,18 @@ def test_describe_scenes_outside_names_parameter(override: str, said: str) -> No
     known = fit_training_range([np.random.default_rng(0).normal(size=(9, 2)) for _ in range(4)], met)
     assert describe_scenes_outside(known, [scene(f"{SCENE}.yield_stress=12 kPa", "scene.preset=learn")]) == []
     assert any(re.match(said, each) for each in describe_scenes_outside(known, [scene(override)]))
+
+
+def test_describe_scenes_outside_names_mass_and_friction_of_a_held_object() -> None:
+    trained = [load_scene("hold", [f"object.mass={mass}", "object.friction=0.5"]) for mass in (0.05, 0.2)]
+    known = fit_training_range([np.random.default_rng(0).normal(size=(9, 2)) for _ in range(4)], trained)
+    within = load_scene("hold", ["object.mass=0.1", "object.friction=0.5", "object.position=[3 mm, 0 mm]"])
+    assert describe_scenes_outside(known, [within]) == []
+    outside = load_scene("hold", ["object.mass=0.3", "object.friction=0.2"])
+    assert describe_scenes_outside(known, [outside]) == [
+        "object.mass is 0.3, in training 0.05 to 0.2",
+        "object.friction is 0.2, in training 0.5",
+    ]
 
 
 def written(path: Path, **changed: Any) -> Path:

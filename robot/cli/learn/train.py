@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -78,30 +78,8 @@ def train(
     if tensorboard:
         _require_tensorboard()
     own = [f"algorithm={algorithm}"] * (algorithm is not None) + [f"seed={seed}"] * (seed is not None) + (set_ or [])
-    if resume is not None:
-        if task is not None or own or out is not None:
-            raise typer.BadParameter(
-                f"a run keeps its settings ({resume / 'run.json'}): omit other options, or start a new run",
-                param_hint="--resume",
-            )
-        with busy("loading"):
-            from robot.train.run_folder import RunFolder
-
-            run = RunFolder(resume)
-        _require_logged(run.settings.training.algorithm, tensorboard)
-    else:
-        if task is None:
-            raise typer.BadParameter("name a task (squeeze, reposition, knead), or a run to continue (--resume)")
-        from tacsim.config import load_model
-        from tacsim.models.policy import Training
-
-        training = load_model(Training, task, own)
-        _require_logged(training.algorithm, tensorboard)
-        folder = new_directory(out, f"train-{training.task}")
-        with busy("loading"):
-            from robot.train.train import begin_run
-
-            run = begin_run(training, folder)
+    run = _open_run(resume, bool(task or own or out)) if resume is not None else _begin_run(task, own, out, tensorboard)
+    _require_logged(run.settings.training.algorithm, tensorboard)
     from robot.common.cluster import ClusterError
     from robot.rig.env_workers import WorkerFailed
     from tacsim.tasks.task import BadDraws
@@ -119,6 +97,35 @@ def train(
     print_files(path, run.folder / "curve.png", run.folder / "curve.json")
     print_json({"rounds": rounds}, [path, run.folder / "curve.png", run.folder / "curve.json"])
     notes.print(f"Next: tacsim evaluate {task or run.settings.training.task} --policy {path} --policy scripted")
+
+
+def _open_run(folder: Path, has_other_options: bool) -> RunFolder:
+    """The run in `folder`, to be continued."""
+    if has_other_options:
+        raise typer.BadParameter(
+            f"a run keeps its settings ({folder / 'run.json'}): omit other options, or start a new run",
+            param_hint="--resume",
+        )
+    with busy("loading"):
+        from robot.train.run_folder import RunFolder
+
+        return RunFolder(folder)
+
+
+def _begin_run(task: str | None, overrides: Sequence[str], out: Path | None, tensorboard: bool) -> RunFolder:
+    """A new run in a new folder."""
+    if task is None:
+        raise typer.BadParameter("name a task (squeeze, reposition, knead), or a run to continue (--resume)")
+    from tacsim.config import load_model
+    from tacsim.models.policy import Training
+
+    training = load_model(Training, task, overrides)
+    _require_logged(training.algorithm, tensorboard)  # before there is a folder
+    folder = new_directory(out, f"train-{training.task}")
+    with busy("loading"):
+        from robot.train.train import begin_run
+
+        return begin_run(training, folder)
 
 
 def _require_tensorboard() -> None:

@@ -81,9 +81,9 @@ def find_lamps(
     from scipy.optimize import minimize
 
     thin = [_downsample_window(window) for window in windows]
-    nobody = DentShade((), shape)
+    no_contact = DentShade((), shape)
     light = [
-        nobody.light(dent_gradient(s.u, s.v, circle, thickness, ball), s.u, s.v)
+        no_contact.light(dent_gradient(s.u, s.v, circle, thickness, ball), s.u, s.v)
         for s, circle in zip(thin, circles, strict=True)
     ]
     lit = np.concatenate(light)

@@ -91,7 +91,7 @@ def default_features(canonical: CanonicalGrid, sensors: Sequence[str], arms: Seq
     """What an environment shows where its user names no features: the heights of all sensors, and what is felt, as
     numbers of order 1. The map has at most 16 x 16 cells, each of whole cells of the canonical grid; a grid
     that cannot be divided so has no map."""
-    max_map_cells = 16  # along a side of a map that nobody chose
+    max_map_cells = 16  # along a side of the default map
     position: Quantity = "between" if len(arms) > 1 else "moved"
     finer = (canonical.rows, canonical.columns)
     every = -(-max(finer) // max_map_cells)
@@ -184,7 +184,7 @@ class FeatureEncoder:
         """
         if self.features.goal:
             if goal is None:
-                raise IncompatibleRig("the policy is told a goal, but the rig has no task: name one (--task)")
+                raise IncompatibleRig("the policy needs a goal, but the rig has no task: name one (--task)")
             self._goal = {"goal": np.atleast_1d(np.asarray(goal, np.float32) / np.float32(SCALES["goal"]))}
         self._start = {name: observation.arms[name].pose for name in self.features.arms}
         self._pressed, self._before = {}, self._start

@@ -268,11 +268,11 @@ class SensorModel(Config):
 
     @model_validator(mode="after")
     def _require_calibration_base(self) -> Self:
-        told = [name for name in ("photometric", "darkness") if getattr(self, name) is not None]
-        if len(told) == 2:
+        given = [name for name in ("photometric", "darkness") if getattr(self, name) is not None]
+        if len(given) == 2:
             raise ValueError("photometric and darkness are two lights; give one of them")
-        if told and self.lighting.background is None:
-            raise ValueError(f"{told[0]} tells changes of colour, so it needs lighting.background: the untouched gel")
+        if given and self.lighting.background is None:
+            raise ValueError(f"{given[0]} tells changes of colour, so it needs lighting.background: the untouched gel")
         return self
 
     @model_validator(mode="after")

@@ -72,7 +72,7 @@ def high_pass(picture: Float32, pixel_pitch: float) -> Float32:
 def separate_skin(picture: Float32, share: float, pixel_pitch: float) -> tuple[Float32, Float32]:
     """The picture (H, W, 3) of an untouched gel without its skin, which is `share` of its fine part, and (H, W, 3) the
     share of light that the skin lets through, about 1: the product is the picture."""
-    min_light = 1.0  # least light that skin is told from [grey levels]
+    min_light = 1.0  # least light with which skin can be distinguished [grey levels]
     bare = picture - np.float32(share) * high_pass(picture, pixel_pitch)
     clean = np.maximum(bare, np.float32(min_light)).astype(np.float32)
     return clean, (picture / clean).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Tuned constants of the way from a deformed gel to pictures.
+"""Tuned constants of rendering: from a deformed gel to pictures.
 
 Each entry: what it is, its unit, and what it was measured on where it was. Sources: docs/decisions/0010-cast-
 shadows.md, docs/decisions/0019-skin.md, docs/benchmarks.md, and the tests in tests/tacsim/optics.

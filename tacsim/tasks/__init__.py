@@ -84,7 +84,7 @@ def register_task(config: type[TaskConfig], task: Callable[[Any], Task]) -> None
 
 
 def make_task(config: TaskConfig) -> Task:
-    """The task that `config` describes. Raises ValueError for one that nobody registered."""
+    """The task that `config` describes. Raises ValueError for a kind that is not registered."""
     if type(config) not in _TASK_OF_CONFIG:
         raise ValueError(f"no task is made of {type(config).__name__}: register_task makes yours known")
     return _TASK_OF_CONFIG[type(config)](config)

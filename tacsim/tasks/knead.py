@@ -102,12 +102,12 @@ def chamfer_distance(body: FloatArray, solid: Solid, volume: float) -> float:
 
 
 def earth_movers_distance(one: FloatArray, other: FloatArray) -> float:
-    """Mean way that the points of one cloud have to go to become the other, of as many points, at best [m]."""
+    """Smallest mean distance by which the points of one cloud must move to become the other, of as many points [m]."""
     from scipy.optimize import linear_sum_assignment
     from scipy.spatial.distance import cdist
 
-    ways = cdist(one, other)
-    return float(ways[linear_sum_assignment(ways)].mean())
+    distances = cdist(one, other)
+    return float(distances[linear_sum_assignment(distances)].mean())
 
 
 def select_evenly(points: FloatArray, number: int = SAMPLE_POINTS) -> FloatArray:
@@ -383,13 +383,15 @@ class TactileShape:
         there = touch.contact & (touch.height > MIN_TOUCH_DEPTH * deepest)
         return se3.transform(arm.pose, np.column_stack([self._cells[there], -touch.height[there]]))
 
-    def _rotate_body(self, way: FloatArray, below: FloatArray, above: FloatArray, height: float) -> None:
+    def _rotate_body(self, displacement: FloatArray, below: FloatArray, above: FloatArray, height: float) -> None:
         """By the displacement (2,) of the upper gel over the lower [m]."""
-        length = float(np.linalg.norm(way))
+        length = float(np.linalg.norm(displacement))
         if length == 0.0:
             return
         # Of evenly spread points the width is sqrt(12) times the deviation.
-        width = np.sqrt(3.0) * sum(float((points[:, :2] @ (way / length)).std()) for points in (below, above))
+        width = np.sqrt(3.0) * sum(float((points[:, :2] @ (displacement / length)).std()) for points in (below, above))
         angle = length / height / (1.0 + (width / height) ** 4)
-        turned = se3.from_rotation_vector(np.zeros(3), np.array([-way[1], way[0], 0.0]) * (angle / length))
+        turned = se3.from_rotation_vector(
+            np.zeros(3), np.array([-displacement[1], displacement[0], 0.0]) * (angle / length)
+        )
         self._world_from_body = se3.rotate(turned, self._world_from_body.T).T

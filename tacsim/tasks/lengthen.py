@@ -70,8 +70,8 @@ class Lengthen(Task):
         return tactile_estimate
 
     def expert(self, truth: Truth, start: Truth) -> FloatArray:
-        """Both sensors close by what is left of the length, over what the body has grown for each length of their way
-        since `start`."""
+        """Both sensors close by what is left of the length, over the growth of the body per displacement of the
+        sensors since `start`."""
         closed = _sensor_gap(start) - _sensor_gap(truth)
         grown, left = self.length(truth) - self.length(start), self.config.goal - self.length(truth)
         share = max(grown / closed, MIN_LENGTH_SHARE) if closed > 0 else 1.0

@@ -27,7 +27,7 @@ class Reposition(Task):
         if there is not None and (np.abs(there[:2]) > half).any():
             goal = ", ".join(f"{1e3 * each:g}" for each in self.config.goal)
             raise GoalOutOfReach(
-                f"task.goal: the body would leave the gel of sensor 'lower' on its way by ({goal}) mm, which reaches "
+                f"task.goal: the body would leave the gel of sensor 'lower' if it moved by ({goal}) mm, which reaches "
                 f"{1e3 * half[0]:g} and {1e3 * half[1]:g} mm from its middle; give a nearer goal"
             )
 

@@ -68,9 +68,9 @@ class Squeeze(Task):
         return tactile_estimate
 
     def expert(self, truth: Truth, start: Truth) -> FloatArray:
-        """Both sensors close by what is left of the height, over the share of their way that the body has taken since
-        `start` (the gels take the rest), as fast as they may. Where that share stays what it was, nobody is there
-        sooner."""
+        """Both sensors close by the height that is left, divided by the share of their displacement since `start` that
+        compressed the body (the gels take the rest), at most by `max_step`. No policy is faster while this share is
+        constant."""
         closed, taken = _sensor_gap(start) - _sensor_gap(truth), start.height - truth.height
         share = min(max(taken / closed, MIN_BODY_SHARE), 1.0) if closed > 0 else 1.0
         half = np.clip((truth.height - self.config.goal) / share / 2 / self.config.max_step, -1.0, 1.0)

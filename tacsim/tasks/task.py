@@ -76,7 +76,7 @@ class Task(ABC):
     @property
     @abstractmethod
     def goal(self) -> float | tuple[float, ...]:
-        """In numbers [m]: what a learned policy is told."""
+        """In numbers [m]: an input of learned policies."""
 
     @abstractmethod
     def distance(self, truth: Truth, start: Truth) -> float:

@@ -16,7 +16,9 @@ BALL_CIRCLE_SHARE = 0.8  # of a ball's diameter: radius of the circle on which i
 
 # lengthen.py
 LENGTH_RULE = (0.93e-3, 0.2454, 0.7268)  # [m, -, -] of 16 training draws, from 8 steps on; deviation 0.66 mm
-MIN_LENGTH_SHARE = 0.2  # of the sensors' way that the body is taken to grow; it grows by 0.3 to 1.1 of it
+MIN_LENGTH_SHARE = (
+    0.2  # assumed growth of the body over the displacement of the sensors, at least; measured: 0.3 to 1.1
+)
 
 # relief.py
 MIN_RELIEF_FORCE = 0.05  # of the upper gel: a light touch [N]
@@ -32,7 +34,7 @@ MIN_FORCE = 0.01  # a smaller normal force counts as no contact [N]
 ARRIVAL_DISTANCE = 0.02e-3  # the scripted policy holds when its estimate is this close to the goal [m]
 
 # squeeze.py
-MIN_BODY_SHARE = 0.1  # of the sensors' way that a body is taken to give
+MIN_BODY_SHARE = 0.1  # assumed compression of a body over the displacement of the sensors, at least
 ARRIVAL_HEIGHT_ERROR = 0.01e-3  # the scripted policy holds when its estimate is this close to the goal [m]
 FIRM_GRIP_SIGNAL = 0.05  # contact signal of a firm grip: five times what camera noise of 2 % gives [-]
 CLOSING_STEP = 0.1e-3  # motion of each sensor in a control period [m]
@@ -65,9 +67,9 @@ SEARCH_PRESS = (
 )
 INSERTION_PRESS = 8.0  # force along the fingers while it pushes the bar down, at most [N]
 GRIP_STIFFNESS = 5000.0  # of the gels along the fingers, by which the bar gives way [N/m]
-COMPLIANCE = (0.05e-3, 0.2e-3)  # the hand's way along a lateral force, world x and y [m/N]
-MAX_CORRECTION = 0.3e-3  # of that way in a control step [m]
-RELAXATION = 1e-3  # the hand's way along a lateral force, world y, that lays the bar flat where it can lie [m/N]
+COMPLIANCE = (0.05e-3, 0.2e-3)  # displacement of the hand along a lateral force, world x and y [m/N]
+MAX_CORRECTION = 0.3e-3  # largest of these displacements in a control step [m]
+RELAXATION = 1e-3  # displacement of the hand along a lateral force, world y, so that the bar can lie flat [m/N]
 SEARCH_STEP = 0.4e-3  # between two places: less than the play of the bar in the hole [m]
 SEARCH_RANGE = 2.4e-3  # from the start, to either side along world x [m]
 TIPPED_RANGE = 3.2e-3  # the same along world y, where the bar's end stays behind the hand [m]

@@ -117,9 +117,9 @@ def facing_pads(poses: ArrayLike, widths: ArrayLike) -> Floats:
     half = np.broadcast_to(np.asarray(widths, np.float64), given.shape[:-1]) / 2
     turns = Rotation.from_quat(given[..., 3:].reshape(-1, 4))
     found = np.empty((*given.shape[:-1], 2, 7))
-    for pad, way in enumerate((-1.0, 1.0)):
-        arms = np.multiply.outer(way * half.ravel(), [1.0, 0.0, 0.0])
+    for pad, side in enumerate((-1.0, 1.0)):
+        arms = np.multiply.outer(side * half.ravel(), [1.0, 0.0, 0.0])
         found[..., pad, :3] = given[..., :3] + turns.apply(arms).reshape(*given.shape[:-1], 3)
-        own = turns * Rotation.from_euler("y", -way * np.pi / 2)
+        own = turns * Rotation.from_euler("y", -side * np.pi / 2)
         found[..., pad, 3:] = own.as_quat().reshape(*given.shape[:-1], 4)
     return found

@@ -29,7 +29,7 @@ START = Truth(10e-3, np.array([1e-3, 0.0, 5e-3]), np.zeros((1, 3), np.float32), 
         (SqueezeConfig(kind="squeeze", goal=11e-3), "11 mm is above the body, which is 10 mm high"),
         (
             RepositionConfig(kind="reposition", goal=(9.1e-3, 0)),
-            r"leave the gel of sensor 'lower' on its way by \(9.1, 0",
+            r"leave the gel of sensor 'lower' if it moved by \(9.1, 0",
         ),
         (RepositionConfig(kind="reposition", goal=(0, -10.1e-3)), "give a nearer goal"),
         (KneadConfig(kind="knead", slenderness=10), "the rod would be 50.3 mm long along x, the gels are 20 mm"),

@@ -85,7 +85,7 @@ class Row:
     # the truth, and number of draws. None: not identified
     parameters: dict[str, tuple[float, ...] | None]
     against: list[str]
-    noticed: dict[str, int]  # number of draws with a detection, by error
+    detected: dict[str, int]  # number of draws with a detection, by error
     draws: int
 
 
@@ -297,7 +297,7 @@ def table_line(row: Row) -> str:
         cells.append(
             f"{words} {100 * error:+.1f} % ({100 * low:+.0f} to {100 * high:+.0f}{miss}; {contained:g} of {draws:g})"
         )
-    detections = ", ".join(f"{what} {count}" for what, count in row.noticed.items())
+    detections = ", ".join(f"{what} {count}" for what, count in row.detected.items())
     seconds = "" if row.seconds is None else f"{row.seconds:.0f} s"
     return (f"| {row.name} | {row.recordings} | {row.simulated} | {seconds} | {'; '.join(cells)} | "
             f"{', '.join(row.against) or 'nothing'} | {detections} of {row.draws} |")  # fmt: skip

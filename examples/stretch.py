@@ -36,7 +36,7 @@ class StretchConfig(TaskConfig):
     """What a file, `--set` or a randomisation may say of the task, beyond what every task has."""
 
     kind: Literal["stretch"] = "stretch"
-    goal: Annotated[Length, Field(gt=0)] = 1.5e-3  # so much longer shall the body become along x [m]
+    goal: Annotated[Length, Field(gt=0)] = 1.5e-3  # elongation of the body along x [m]
     success: Annotated[Length, Field(gt=0)] = 0.3e-3
 
 

@@ -63,7 +63,7 @@ class Rig:
         packages: what the controllers of the arms sent since the last call, for the record.
         read_all: how the sensors are read: one by one, or in parallel where that is faster (tacsim.compute.threads).
         on_tactile: called with every tactile observation before anybody acts on it; raises what ends the episode.
-        on_close: closes what the rig needs besides sensors and arms, after them.
+        on_close: closes the other resources of the rig, after sensors and arms.
         load_control: holds normal forces, whatever the actions ask along the z axis of the sensors.
         grippers: by name.
         views: of the cameras that look at the scene, by name; each gives what it sees now.
@@ -223,8 +223,8 @@ class Rig:
 
     @contextmanager
     def _stop_all_on_failure(self) -> Iterator[None]:
-        """No arm goes on when something fails that concerns all of them, or when the rig was closed meanwhile: what an
-        arm was asked after its stop is stopped here."""
+        """No arm goes on when something fails that concerns all of them, or when the rig was closed at the same time: a
+        motion commanded after its stop is stopped here."""
         try:
             self._require_open()
             yield

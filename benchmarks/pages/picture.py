@@ -115,7 +115,7 @@ def _share_of_limit(target: Target, rows: Sequence[Row]) -> float | None:
     value = target.find(rows)
     if not value or not limit:
         return None
-    return limit / value if target.at_least else value / limit
+    return limit / value if target.is_min_limit else value / limit
 
 
 def draw_radii(rows: Sequence[Row], path: Path) -> bool:

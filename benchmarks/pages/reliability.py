@@ -21,7 +21,7 @@ PAGE = "reliability.md"
 ROOT = Path(__file__).resolve().parents[2]
 HEADER = ("promise", "figure", "measured", "worst", "promised", "verdict")
 EVENT = " · "  # between event and column, in the name of a figure in the table of events
-EVENTS = ("event", "still after", "path", "told after", "moved after standstill", "programs left running")
+EVENTS = ("event", "still after", "path", "reported after", "moved after standstill", "programs left running")
 WATCHED = (
     "An arm at 0.1 m/s, measured by an RTDE client in a separate process: median / worst of {repeat}. The driver runs "
     "in a user's program behind a proxy that breaks its connections; the proxy restores them after 0.1, 1 or 3 s, or "

@@ -63,7 +63,7 @@ class Target(_Frozen):
     aim: float | None = None
     value: Selection | None = None
     over: Selection | None = None  # divisor of the value
-    at_least: bool = False  # larger is better
+    is_min_limit: bool = False  # larger is better
     remark: str = ""  # shown if it is missed
     elsewhere: str = ""  # reason why no row has it
 
@@ -87,7 +87,7 @@ class Target(_Frozen):
         return "aim missed" if self.must is None else "met"
 
     def _within(self, value: float, limit: float) -> bool:
-        return value >= limit if self.at_least else value <= limit
+        return value >= limit if self.is_min_limit else value <= limit
 
     def cells(self, value: float | None) -> list[str]:
         """A line of the table, as text."""
@@ -98,7 +98,7 @@ class Target(_Frozen):
         return [self.name, text, *map(self._limit, (self.must, self.aim)), words + (f": {reason}" if reason else "")]
 
     def _limit(self, limit: float | None) -> str:
-        return "" if limit is None else f"{'≥' if self.at_least else '≤'} {limit:g}"
+        return "" if limit is None else f"{'≥' if self.is_min_limit else '≤'} {limit:g}"
 
 
 def _number(row: Row, what: str) -> float | None:

@@ -34,7 +34,7 @@ class SafeConsole(Console):
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterator[Segment]:
         for segment in super().render(renderable, options):
-            yield segment if segment.control else segment._replace(text=escape_text(segment.text, kept="\n\t"))
+            yield segment if segment.control else segment._replace(text=escape_text(segment.text, allowed="\n\t"))
 
 
 results = SafeConsole(markup=False, emoji=False, highlight=False, soft_wrap=True)  # stdout: results

@@ -30,7 +30,7 @@ from tacsim.models.scene import Scene
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.models.task import LENGTH, Unit
 
-TEACHER, RANDOM = "teacher", "random"  # besides the policies of load_policy
+TEACHER, RANDOM = "teacher", "random"  # in addition to the policies of load_policy
 HELD_OUT_SEED_OFFSET = 1_000_000  # added to the training seeds: other bodies, other episodes
 ReportProgress = Callable[[str, int, int], None]
 Act = Callable[[TacsimEnv], NDArray[np.float32]]

@@ -196,12 +196,12 @@ class _EpisodeWatch(BaseCallback):
     def __init__(self, report_progress: Any) -> None:
         super().__init__()
         self.ends: list[tuple[float, float, float, float]] = []
-        self._seen: list[Arrays] = []
+        self._observations: list[Arrays] = []
         self._tell, self._done = report_progress, 0
 
     def _on_step(self) -> bool:
         rewards = self.locals["rewards"]
-        self._seen.append(self.locals["new_obs"])
+        self._observations.append(self.locals["new_obs"])
         self._sums = getattr(self, "_sums", 0.0) + np.asarray(rewards, float)
         self._done += len(rewards)
         for index in np.flatnonzero(self.locals["dones"]).tolist():
@@ -213,7 +213,7 @@ class _EpisodeWatch(BaseCallback):
 
     def features(self) -> Arrays:
         """(n, ...) of all steps."""
-        return {key: np.concatenate([seen[key] for seen in self._seen]) for key in self._seen[0]}
+        return {key: np.concatenate([arrays[key] for arrays in self._observations]) for key in self._observations[0]}
 
 
 class SharedVecEnv(VecEnv):
@@ -241,17 +241,17 @@ class SharedVecEnv(VecEnv):
         seeds = list(self._seeds)
         if any(self._options):
             raise ValueError("reset options apply to all environments: set them on the environments themselves")
-        seen, infos = self.envs.reset(seed=None if all(seed is None for seed in seeds) else seeds)
+        arrays, infos = self.envs.reset(seed=None if all(seed is None for seed in seeds) else seeds)
         self.reset_infos = [select_environment(infos, index) for index in range(self.num_envs)]
         self._reset_seeds()
         self._reset_options()
-        return copy_arrays(seen)
+        return copy_arrays(arrays)
 
     def step_async(self, actions: NDArray[np.float32]) -> None:
         self._actions = actions
 
     def step_wait(self) -> tuple[Arrays, NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
-        seen, rewards, terminated, truncated, step_info = self.envs.step(self._actions)
+        arrays, rewards, terminated, truncated, step_info = self.envs.step(self._actions)
         done = terminated | truncated
         infos = []
         for index in range(self.num_envs):
@@ -262,7 +262,7 @@ class SharedVecEnv(VecEnv):
             else:
                 info = select_environment(step_info, index)
             infos.append(info)
-        return copy_arrays(seen), (self._reward_scale * rewards).astype(np.float32), done, infos
+        return copy_arrays(arrays), (self._reward_scale * rewards).astype(np.float32), done, infos
 
     def close(self) -> None:
         self.envs.close()
@@ -309,5 +309,5 @@ def select_environment(infos: Mapping[str, Any], index: int) -> dict[str, Any]:
     }
 
 
-def copy_arrays(seen: Mapping[str, NDArray[Any]]) -> Arrays:
-    return {key: value.copy() for key, value in seen.items()}
+def copy_arrays(arrays: Mapping[str, NDArray[Any]]) -> Arrays:
+    return {key: value.copy() for key, value in arrays.items()}

@@ -104,7 +104,7 @@ def edge_radius(indenter: Indenter, element: float) -> float:
 
 
 def edge_points(geometry: Shape, spacing: float) -> FloatArray:
-    """Points (n, 3) [m] on the edges that `edge_radius` speaks of, `spacing` [m] apart at most; none of a ball."""
+    """Points (n, 3) [m] on the edges that `edge_radius` rounds, `spacing` [m] apart at most; none of a ball."""
     match geometry:
         case Box():
             corners = (

@@ -38,7 +38,8 @@ _on_tile: Callable[[str, int, int], None] | None = None
 
 def share_tiles(folder: Path | None) -> None:
     """From now on tiles are also written into this folder, and taken from there: what one process has computed, others
-    with the same folder need not. A tile has the same bits either way; a folder that is full or gone costs time alone.
+    with the same folder need not. Computed and stored tiles have the same bits; a folder that is full or gone costs
+    time only.
     """
     global _shared_folder
     _shared_folder = folder
@@ -77,7 +78,7 @@ class TiledDistance:
     def lowest(self, axes: FloatArray, place: FloatArray, half: FloatArray) -> FloatArray | None:
         """The lowest point (3,) of the mesh turned by `axes` (3, 3) and then moved by `place` (3,) [m].
 
-        Where that lies beside a rectangle of half sides `half` (2,) round the origin: the lowest point of the mesh's
+        Where that lies outside a rectangle of half sides `half` (2,) round the origin: the lowest point of the mesh's
         edges over the rectangle, of a level edge the middle; None where there is no edge."""
         at = self.vertices @ axes.T + place
         tip: FloatArray = at[np.argmin(at[:, 2])]

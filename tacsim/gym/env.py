@@ -132,7 +132,7 @@ class TacsimEnv(gymnasium.Env[encode.FlatObservation, Float32]):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[encode.FlatObservation, dict[str, Any]]:
         """The same seed gives the same episode. A drawn variant that cannot begin (a goal out of reach, no gentle
-        contact, a simulation that diverges) is drawn anew.
+        contact, a simulation that diverges) is drawn again.
 
         options: `variant`, the number of one of the environment's variants, in place of a drawn one; or `task`
         (SqueezeConfig, RepositionConfig) and `scene` (Scene), which hold until others are given. Raises ValueError for

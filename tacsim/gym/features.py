@@ -88,8 +88,8 @@ _SENSOR_QUANTITIES = ("area", "depth", "centroid", "shear", "turned")
 
 
 def default_features(canonical: CanonicalGrid, sensors: Sequence[str], arms: Sequence[str]) -> Features:
-    """What an environment shows where its user names no features: the heights of all sensors, and what is felt, as
-    numbers of order 1. The map has at most 16 x 16 cells, each of whole cells of the canonical grid; a grid
+    """What an environment shows where its user names no features: the heights of all sensors, contacts and
+    forces, as numbers of order 1. The map has at most 16 x 16 cells, each of whole cells of the canonical grid; a grid
     that cannot be divided so has no map."""
     max_map_cells = 16  # along a side of the default map
     position: Quantity = "between" if len(arms) > 1 else "moved"

@@ -26,7 +26,7 @@ from tacsim.models.sensor import CanonicalGrid
 GROUP = "tacsim.drivers"
 OWN = "tacsim"  # the distribution that brings the shipped drivers
 INSTALL = "python -m pip install -e . --no-deps --no-build-isolation"  # in the checkout
-WHY_LATENCY = (
+LATENCY_ADVICE = (
     "so how deep a gel is pressed before the arm brakes cannot be computed (state the longest time in seconds)"
 )
 
@@ -305,7 +305,7 @@ def _load(entry: metadata.EntryPoint, kind: str, name: str, *, is_own: bool) -> 
     missing = sorted(getattr(found, "__abstractmethods__", ()))
     if missing:
         words = f"does not state {', '.join(missing)}"
-        return None, f"{words}, {WHY_LATENCY}" if "worst_latency" in missing else words
+        return None, f"{words}, {LATENCY_ADVICE}" if "worst_latency" in missing else words
     usable = cast(AnyPart, found)  # it derives from one of the two
     config = getattr(usable, "config_class", None)
     if config is None or get_args(config.model_fields["driver"].annotation) != (name,):

@@ -97,7 +97,7 @@ class ArmLimits(Config):
     @property
     def max_following_error(self) -> float:
         """`following_error`, or 1 mm + `speed` x 10 ms + `acceleration` x (50 ms)^2 [m]: servoJ leads joints that
-        are to speed up fast a little beside the straight line."""
+        accelerate fast a little off the straight line."""
         usual = 1e-3 + 10e-3 * self.speed + 50e-3**2 * self.acceleration
         return usual if self.following_error is None else self.following_error
 
@@ -207,7 +207,7 @@ class MockArmConfig(Config):
     joints: tuple[Angle, Angle, Angle, Angle, Angle, Angle] | None = None  # at power-on; None: at the arm's `start`
     # Of PolyScope, which the controller claims: "5.11", "5.11.0.108150". A text: YAML reads 5.10 without quotes as 5.1.
     version: str | None = None
-    # Where the file believes the sensor to be, seen from where the mock has it: what a calibration leaves of error.
+    # Pose of the sensor by the file, relative to its true pose in the mock: the error that a calibration leaves.
     error: Placement = Placement()
     # Controller and worker ask for real-time priority, as the worker of a real arm does: to measure timing. Otherwise
     # they share a busy machine with whatever else the mock rig needs.
@@ -303,14 +303,14 @@ class CameraSensorConfig(SensorConfig):
     size: tuple[Annotated[Length, Field(gt=0)], Annotated[Length, Field(gt=0)]] = (16e-3, 16e-3)  # between them [m]
     calibration: Annotated[str, Field(min_length=1, max_length=4096)] | None = None
     marker_pitch: Annotated[Length, Field(gt=0)] | None = None  # [m]
-    region: PictureRegion | None = None  # what of the picture shows gel; None: all of it between the corners
+    region: PictureRegion | None = None  # part of the picture that shows gel; None: all of it between the corners
     width: Annotated[int, Field(ge=16, le=8192)] = 640  # of the frames that are expected; others are refused [px]
     height: Annotated[int, Field(ge=16, le=8192)] = 480
     fps: Annotated[float, Field(gt=0, le=1000)] = 30.0  # asked of the camera; of a folder: how fast it is played
     exposure: float | None = None  # fixed, in the driver's own unit, and read back; None: left as it is
     white_balance: Annotated[float, Field(gt=0)] | None = None  # colour temperature, fixed and read back [K]
     stamped: bool = False  # frames carry the strip with number and clock that tacsim's mock camera burns in
-    # The source may show the very same picture for long, as no real sensor does: whether it has frozen cannot be told.
+    # The source may show the very same picture for long, as no real sensor does: a frozen one cannot be detected.
     repeats: bool = False
     max_age: Annotated[Time, Field(gt=0, le=60.0)] = 0.2  # an older frame is refused [s]
     latency: Annotated[Time, Field(ge=0, le=2.0)] = 0.0  # from exposure to arrival [s]

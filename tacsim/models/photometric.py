@@ -30,17 +30,17 @@ Weight = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class DarknessModel(Config):
-    """A light that tells depth and no direction: a translucent skin that darkens where it is pressed in.
+    """A light that shows depth and no direction: a translucent skin that darkens where it is pressed in.
 
     What counts is the depth y of a point beyond a share of the mean depth round it,
 
         y = h - share * (Gaussian mean of h, standard deviation `reach`),
 
-    because a dent throws light back on the gel beside it: real pictures are brighter round a contact than without one.
+    because a dent throws light back on the gel around it: real pictures are brighter round a contact than without one.
     The relative change of colour is a table of y, the same everywhere. It is monotone, so it works both ways.
     """
 
-    depths: Annotated[tuple[Length, ...], Field(min_length=2, max_length=256)]  # y, rising; below 0 beside a dent [m]
+    depths: Annotated[tuple[Length, ...], Field(min_length=2, max_length=256)]  # y, rising; below 0 next to a dent [m]
     changes: tuple[tuple[Weight, Weight, Weight], ...]  # of R, G, B at each depth; their mean falls
     share: Annotated[float, Field(ge=0, le=0.8)] = 0.0  # of the mean depth round a point
     reach: Annotated[Length, Field(gt=0)] = 1e-3  # of that mean [m]
@@ -70,7 +70,7 @@ SHADOW_PLACES = 3  # position terms: 1, u, v
 
 
 class CastShadows(Config):
-    """The shadows of one sensor, whose lamps stand low beside the gel, as in a DIGIT: to the camera a dent is a bump.
+    """The shadows of one sensor, whose lamps stand low next to the gel, as in a DIGIT: to the camera a dent is a bump.
 
     A place of the surface is darker where the path to the lamp is steep:
 
@@ -132,7 +132,7 @@ class DepthColour(Config):
 
     With w = height into the gel / `deepest`, in 0..1 (beyond, as at the end), the relative change in each channel is
     the sum over DEPTH_TERMS w, w u, w v, w^2, w^3 of weight * term, whatever the slope; and w times the sum over the
-    normal terms of `slopes` * term: w is a third coordinate of the place, beside u and v.
+    normal terms of `slopes` * term: w is a third coordinate of the place, in addition to u and v.
     """
 
     deepest: Annotated[float, Field(gt=0, le=10)]  # height up to which it was calibrated [widths of the picture]
@@ -292,7 +292,7 @@ def _weights_by_place(weights: Sequence[Sequence[float]], terms: int, mean: Sequ
 
 def _append_depth_weights(surface: Float32, depth: DepthColour, mean: Sequence[float]) -> Float32:
     """(places, 3, terms) weights of the `surface` with those of a colour of depth: w, w^2 and w^3 are DEPTH_POWERS more
-    terms beside those of the normal, and w one more place if slopes look otherwise at depth."""
+    terms in addition to those of the normal, and w one more place if slopes look otherwise at depth."""
     linear, by_u, by_v, square, cube = (np.array(depth.weights) * mean).astype(np.float32)
     places, _, terms = surface.shape
     slopes = _weights_by_place(depth.slopes, terms, mean)

@@ -59,7 +59,7 @@ class SimArmConfig(ArmConfig):
     # Those of the real arm, so that a policy meets them in simulation too: workspace, planes, speed, turn_rate, force,
     # torque, depth, shear. Accelerations and joints are not simulated; limits are checked once a period.
     limits: ArmLimits | None = None
-    # Where the arm believes its sensor to be, seen from where it is: what a calibration leaves of error.
+    # Measured pose of the sensor, relative to its true one: the error that a calibration leaves.
     error: Placement = Placement()
     noise: WrenchNoise = WrenchNoise()
     mount: MountConfig = MountConfig()  # between arm and sensor
@@ -123,7 +123,7 @@ class ReplaySensorConfig(SensorConfig):
     # Gel corners in the image (u, v) [px]: top left, top right, bottom right, bottom left; None: the whole image.
     corners: tuple[tuple[float, float], tuple[float, float], tuple[float, float], tuple[float, float]] | None = None
     size: tuple[Annotated[Length, Field(gt=0)], Annotated[Length, Field(gt=0)]] = (16e-3, 16e-3)  # between them [m]
-    region: PictureRegion | None = None  # what of the picture shows gel; None: all of it between the corners
+    region: PictureRegion | None = None  # part of the picture that shows gel; None: all of it between the corners
     reference: str | None = None  # picture without contact; None: the first frame
     calibration: str | None = None  # bundle of `tacsim calibrate sensor`, instead of corners: height is found by it
     # Distance of the dots printed on the gel [m], instead of corners or calibration: they are found in the reference,

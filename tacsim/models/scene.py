@@ -30,7 +30,7 @@ Preset = Literal["learn", "draft", "standard"]
 PRESETS: dict[Preset, tuple[float, float]] = {
     "learn": (1.0e-3, 2.0e-3), "draft": (0.5e-3, 1.0e-3), "standard": (0.25e-3, 0.5e-3),
 }  # fmt: skip
-# Least and greatest error of the normal force of each preset [share], beside independent finite elements: a plasticine
+# Least and greatest error of the normal force of each preset [share], against independent finite elements: a plasticine
 # cylinder between two gels, closed by 1, 2 and 3 mm (docs/physics-body.md, the table "closed by").
 PRESET_FORCE_ERROR: dict[Preset, tuple[float, float]] = {
     "learn": (0.031, 0.108), "draft": (0.005, 0.041), "standard": (-0.006, 0.021),

@@ -201,7 +201,9 @@ class Lighting(Config):
     @model_validator(mode="after")
     def _require_one_base(self) -> Self:
         if self.ambient > 0 and self.background is not None:
-            raise ValueError("ambient has no effect beside a background; set background to null, or ambient to 0")
+            raise ValueError(
+                "ambient has no effect where there is a background; set background to null, or ambient to 0"
+            )
         return self
 
 
@@ -305,4 +307,4 @@ class CanonicalGrid(Config):
     rows: Annotated[int, Field(ge=8, le=1024)] = 64
     columns: Annotated[int, Field(ge=8, le=1024)] = 64
     pitch: Annotated[Length, Field(ge=1e-6, le=1e-2)] = 0.25e-3  # [m]
-    image_scale: Annotated[int, Field(ge=1, le=8)] = 2  # image pixels per grid cell, each way
+    image_scale: Annotated[int, Field(ge=1, le=8)] = 2  # image pixels per grid cell, along each axis

@@ -8,12 +8,12 @@ from itertools import islice
 from pathlib import Path
 
 
-def escape_text(text: str, kept: str = "") -> str:
+def escape_text(text: str, allowed: str = "") -> str:
     """`text` with control characters, and those that turn the direction of writing, written out (``\\x1b``), except
-    those in `kept`. What is escaped already stays as it is."""
+    those in `allowed`. What is escaped already stays as it is."""
     if text.isprintable():
         return text
-    return "".join(c if c.isprintable() or c in kept else c.encode("unicode_escape").decode("ascii") for c in text)
+    return "".join(c if c.isprintable() or c in allowed else c.encode("unicode_escape").decode("ascii") for c in text)
 
 
 MAX_NAME = 100  # characters of the name of a sensor or an arm

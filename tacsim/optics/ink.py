@@ -54,7 +54,7 @@ class DotEraser:
 
 def separate_ink(picture: Image, radius: float) -> tuple[Image, Float32]:
     """The picture (H, W, 3) of an untouched gel without its dots of about `radius` [px], and (H, W, 3) the share of
-    their light that they let through, 1 beside them: the product is the picture. Raises ValueError for dots too small
+    their light that they let through, 1 around them: the product is the picture. Raises ValueError for dots too small
     to be found."""
     clean = DotEraser(radius)(picture)
     share = picture.astype(np.float32) / np.maximum(clean, 1).astype(np.float32)
@@ -62,7 +62,7 @@ def separate_ink(picture: Image, radius: float) -> tuple[Image, Float32]:
 
 
 def high_pass(picture: Float32, pixel_pitch: float) -> Float32:
-    """(H, W, 3) what of a picture is finer than light; `pixel_pitch` [m]."""
+    """(H, W, 3) the part of a picture that is finer than light; `pixel_pitch` [m]."""
     import cv2
 
     slow = cv2.GaussianBlur(picture, (0, 0), GRAIN_BLUR / pixel_pitch, borderType=cv2.BORDER_REPLICATE)

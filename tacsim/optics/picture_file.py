@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from PIL.Image import Image
 
 FORMATS = ("PNG", "JPEG", "BMP")
-MAX_SIDE = 4096  # [px] of a picture, each way
+MAX_SIDE = 4096  # [px] of a picture, along each axis
 TRANSPOSED = range(5, 9)  # values of that tag that exchange rows and columns
 MODES = ("RGB", "RGBA", "L", "LA", "P")  # of Pillow, with up to 8 bits a channel
 # First bytes of formats that cameras write and that are not read here: they may hold 16 bits or floats.
@@ -68,9 +68,11 @@ def upright_rgb(picture: Image, what: str) -> NDArray[np.uint8]:
 
 
 def check_size(columns: int, rows: int, what: str) -> None:
-    """Raises BadPicture for a picture without pixels, or with more than MAX_SIDE either way."""
+    """Raises BadPicture for a picture without pixels, or with a side longer than MAX_SIDE."""
     if not (0 < columns <= MAX_SIDE and 0 < rows <= MAX_SIDE):
-        raise BadPicture(f"{what}: {columns} x {rows} pixels; at least 1 and at most {MAX_SIDE} are allowed each way")
+        raise BadPicture(
+            f"{what}: {columns} x {rows} pixels; at least 1 and at most {MAX_SIDE} are allowed along each side"
+        )
 
 
 def _check_depth(picture: Image, what: str) -> None:

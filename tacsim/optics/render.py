@@ -50,7 +50,7 @@ class Renderer:
 
     The texture is fixed in the image: reference and contact frames share it, also under sideways motion. Dots and skin
     that the background shows are lifted off it and move with the gel. Of a model with a `view` it is the camera's own
-    picture, black beside the gel. The noise of the camera is added by the sensor (tacsim.optics.noise).
+    picture, black around the gel. The noise of the camera is added by the sensor (tacsim.optics.noise).
     Raises ValueError when markers do not fit on the gel or the background picture does not fit the image.
     """
 
@@ -101,7 +101,7 @@ class Renderer:
 
         table = SurfaceTable(surface)
         # Calibrated light is looked up at the middles of blocks of pixels, two for each cell of the table along a side:
-        # its kinks lie at the table's points, and blocks as large as cells were up to 6 grey levels off beside them
+        # its kinks lie at the table's points, and blocks as large as cells were up to 6 grey levels off next to them
         block = 1 if self._light is None or table.folded else max(1, table.points_per_cell(self._grid) // 2)
         visible = table.table_points(block_centres(self._grid, block), fine=False)
         if (
@@ -215,7 +215,7 @@ def _blur_blocks(colours: Float32, blur: float, block: int) -> Float32:
 
 
 def _view_map(view: GelView) -> tuple[NDArray[np.int16], NDArray[np.uint16]]:
-    """Where each pixel of the camera's picture lies in the metric one, in OpenCV's fixed point; far off beside it."""
+    """Where each pixel of the camera's picture lies in the metric one, in OpenCV's fixed point; far off outside it."""
     import cv2
 
     geometry, (rows, columns) = view.geometry, view.image_shape
@@ -339,8 +339,8 @@ def texture_gradient(grid: PixelGrid, gel_size: tuple[float, float], deviation: 
 def shadow_colours(light: PhotometricLight, shadows: CastShadows, table: SurfaceTable, image: PixelGrid) -> Float32:
     """(rows, columns, 3) change of colour by cast shadows at the table's points, of an image with these pixels.
 
-    The path to a lamp is followed over the surface as if it had moved only up and down: sideways motion is small beside
-    the length of a shadow.
+    The path to a lamp is followed over the surface as if it had moved only up and down: sideways motion is small
+    against the length of a shadow.
     """
     stride = 2  # every so many points of the table along each side: shadows have soft edges
     x, y = (each[::stride, ::stride] for each in table.deformed_coordinates())

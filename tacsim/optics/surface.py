@@ -137,7 +137,7 @@ class SurfaceTable:
         return seen
 
     def table_points(self, grid: PixelGrid, *, fine: bool = True) -> tuple[Float32, NDArray[np.bool_]]:
-        """(H, W, 2) column, row in the table of what is seen at the points of `grid`; (H, W) False outside the gel."""
+        """(H, W, 2) column, row in the table for each point of `grid`; (H, W) False outside the gel."""
         if not self.folded:
             try:
                 return self._unfolded_points(grid, fine)
@@ -332,7 +332,7 @@ def visible_table_points(
 
     Returns (H, W, 2) column and row in the table, and (H, W) False where no sheet faces the camera.
     """
-    outside = -1e3  # column and row of what lies beside the gel
+    outside = -1e3  # column and row of points outside the gel
     found = np.full((shape[0] * shape[1], 2), outside, dtype=np.float32)
     deepest = np.full(len(found), -np.inf)
     for row in range(len(places) - 1):

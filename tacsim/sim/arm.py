@@ -73,7 +73,7 @@ class SimArm:
         limits: guards the arm as a real one is guarded (robot.arm.ur), by the same functions: targets are shortened at
             the faces of its workspace, and too much force or torque stops it. None: no guard.
         keep_out: frames to stay away from, and how far [m]; targets are shortened at these spheres.
-        error: where it believes its frame to be, seen from where it is; None: it knows.
+        error: measured pose of its frame, relative to the true one; None: no error.
         delay: its states are those of so many periods ago.
         noise: of its force sensor, in what it tells; its guard feels the force itself. None: no noise.
     """

@@ -33,7 +33,7 @@ class StateClock(Protocol):
 
 
 class Delayed(Generic[Value]):
-    """What was seen `delay` periods ago; in the first periods of an episode, what was seen first."""
+    """The observation of `delay` periods ago; in the first periods of an episode, the first one."""
 
     def __init__(self, delay: int) -> None:
         self._past: deque[Value] = deque(maxlen=delay + 1)
@@ -81,7 +81,7 @@ class SimClock:
         return self._time
 
     def command(self, frame: str, pose: Pose, limited: bool) -> None:
-        """Sets the pose of `frame` at the end of the period; `limited`: a guard has changed what was asked."""
+        """Sets the pose of `frame` at the end of the period; `limited`: a guard has changed the command."""
         self._targets[frame] = pose
         self._limited[frame] = limited
 

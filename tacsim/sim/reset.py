@@ -24,7 +24,7 @@ class SimReset:
 
     Args:
         touch_force: normal force that ends the approach [N]; None leaves the gels clear.
-        placement: the gels start at most this far beside the body in world x and y, drawn from the seed [m].
+        placement: the gels start at most this far from the body in world x and y, drawn from the seed [m].
         pool: of touched states; of this reset alone, or of several.
     """
 

@@ -38,7 +38,7 @@ class SimCamera:
         else:
             if self._untouched is None:
                 self._untouched = self.render(surface)
-            image = self._untouched.copy()  # nobody writes into what is kept
+            image = self._untouched.copy()  # the stored picture must not be written to
         return image if self.noise is None else self.noise(image, index, episode)
 
 

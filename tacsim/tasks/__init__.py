@@ -72,7 +72,7 @@ _TASK_OF_CONFIG: dict[type[TaskConfig], Callable[[Any], Task]] = {
 
 
 def register_task(config: type[TaskConfig], task: Callable[[Any], Task]) -> None:
-    """Makes a task of your own known: files, rigs and environments may name it from now on, in this process.
+    """Registers a user-defined task: files, rigs and environments may name it from now on, in this process.
 
     config: derives from TaskConfig, says ``kind: Literal["..."]`` and has a default for all else.
     task: makes the task of such a config; a class that derives from Task and takes the config alone.

@@ -63,7 +63,7 @@ class GoalOutOfReach(ValueError):
 class Task(ABC):
     """A goal for the body between the sensors. Immutable: the state of an episode is in the two truths.
 
-    One of your own derives from it, and must have `config`, `axes`, `goal` and `distance`; all else has a default.
+    A user-defined task derives from it, and must have `config`, `axes`, `goal` and `distance`; all else has a default.
     """
 
     config: TaskConfig
@@ -93,7 +93,7 @@ class Task(ABC):
 
     @property
     def touch_needs(self) -> Needs:
-        """What `estimator` needs besides; a rig that does not know the truth must have it."""
+        """What `estimator` needs in addition; a rig that does not know the truth must have it."""
         return Needs(truth=True)
 
     def measures(self, truth: Truth, start: Truth) -> Mapping[str, float]:
@@ -111,7 +111,7 @@ class Task(ABC):
     def scripted(self, *, through: bool = False) -> Policy:
         """A policy that reaches the goal by touch alone, then holds; with `through` it moves on past the goal. Raises
         ValueError where there is none."""
-        raise ValueError(f"task '{self.config.kind}' has no scripted policy; name one of your own")
+        raise ValueError(f"task '{self.config.kind}' has no scripted policy; give a user-defined one")
 
     def analytic(self) -> Policy:
         """A rule of one or two formulas on what a policy observes, without memory of earlier touches: what learning has

@@ -109,7 +109,7 @@ def test_targets_have_names_of_their_own_and_an_aim_no_laxer_than_the_must() -> 
     for each in TARGETS:
         assert each.must is not None or each.aim is not None
         if each.must is not None and each.aim is not None:
-            assert each.aim >= each.must if each.at_least else each.aim <= each.must
+            assert each.aim >= each.must if each.is_min_limit else each.aim <= each.must
 
 
 NOT_YET = {"hard cases that end their process"}

@@ -47,7 +47,7 @@ class Outcome:
     path: float  # covered until then [m]
     moved: float  # farthest from there that it was later [m]
     ended: float | None  # when the program had ended for good; None: it runs at the end of the watch
-    told: float | None  # when the user's program saw another status; None: it never did
+    reported: float | None  # when the user's program saw another status; None: it never did
     statuses: tuple[str, ...]  # that it saw
 
 
@@ -176,7 +176,7 @@ def outcome(seen: np.ndarray, event: float, said: list[dict[str, Any]]) -> Outco
         path=float(np.linalg.norm(np.diff(seen["position"][now : first + 1], axis=0), axis=1).sum()),
         moved=float(np.linalg.norm(seen["position"][first + PACKAGES - 1 :] - rest, axis=1).max()),
         ended=None if runs[-1] == len(seen) - 1 else float(max(stamps[runs[-1]], 0.0)),
-        told=said[0]["time"] - event if said else None,
+        reported=said[0]["time"] - event if said else None,
         statuses=tuple(each["status"] for each in said),
     )
 
@@ -196,13 +196,13 @@ def judge(event: str, seen: Outcome, figure: Record, *, goes_on: bool = False) -
     """Records a row of the table of events, and checks what must hold on any machine.
 
     goes_on: the program may run on: the driver holds the arm, or was not disturbed at all."""
-    if seen.told is None and goes_on:
+    if seen.reported is None and goes_on:
         figure(f"{event} · goes on", 1, "", at_most=None)
         return
     figure(f"{event} · still after", 1e3 * seen.still, "ms", at_most=None)
     figure(f"{event} · path", 1e3 * seen.path, "mm", at_most=None)
-    if seen.told is not None:
-        figure(f"{event} · told after", 1e3 * seen.told, "ms", at_most=None)
+    if seen.reported is not None:
+        figure(f"{event} · reported after", 1e3 * seen.reported, "ms", at_most=None)
     figure(f"{event} · moved after standstill", 1e3 * seen.moved, "mm", at_most=1e3 * SETTLES)
     figure(f"{event} · programs left running", float(seen.ended is None and not goes_on))
     assert seen.moved <= SETTLES, seen

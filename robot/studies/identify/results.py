@@ -79,7 +79,7 @@ def as_json(identified: Identified) -> dict[str, Any]:
             for index, each in enumerate(fit.parameters)
             if each in fit.identified
         },
-        "untold": {each.name: MOTIONS_FOR_PARAMETER[identified.kind][each.name] for each in fit.unidentified},
+        "unidentified": {each.name: MOTIONS_FOR_PARAMETER[identified.kind][each.name] for each in fit.unidentified},
         "findings": [{"kind": each.kind, "words": each.text} for each in identified.findings],
         "noise": {"force": identified.noise.force, "dent": identified.noise.dent, "slip": identified.noise.slip},
         "presses": [press.name for press in identified.presses],

@@ -49,7 +49,7 @@ class Health:
     capped: int  # number of contact overlaps that were limited
     overlap: float  # of the last substep [mm]
     courant: float = 0.0  # time step / time of the pressure wave through the most compressed element or grid cell [-]
-    sound: bool = False  # all numbers are finite, gel nodes are slow enough and no particle is crushed
+    is_healthy: bool = False  # all numbers are finite, gel nodes are slow enough and no particle is crushed
 
     @staticmethod
     def clear(partial: NDArray[np.float32]) -> None:
@@ -61,13 +61,13 @@ class Health:
         partial[..., layout.FORCE_SUM : layout.FORCE_SUM + 6] = 0.0
 
     @classmethod
-    def read(cls, partial: NDArray[np.float32], courant: float = 0.0, *, sound: bool = False) -> Health:
+    def read(cls, partial: NDArray[np.float32], courant: float = 0.0, *, is_healthy: bool = False) -> Health:
         """Combines all parts of one environment (PARTS, NUMBERS); NaN in one of them gives NaN."""
         least, most, total = partial.min(axis=0), partial.max(axis=0), partial.sum(axis=0, dtype=np.float64)
         counts = [int(total[i]) if math.isfinite(total[i]) else -1 for i in (layout.OFF_GRID, layout.CAPPED)]
         return cls(
             float(least[layout.SMALLEST_VOLUME]), counts[0], float(least[layout.SMALLEST_STEP_VOLUME]),
-            float(most[layout.PEAK_SPEED]), counts[1], float(most[layout.OVERLAP]), courant, sound,
+            float(most[layout.PEAK_SPEED]), counts[1], float(most[layout.OVERLAP]), courant, is_healthy,
         )  # fmt: skip
 
 
@@ -139,7 +139,7 @@ def _find_fault(read_arrays: Callable[[], State], health: Health) -> tuple[str, 
     if health.courant > MAX_COURANT:
         words = f"the time step is {health.courant:.3g} of the pressure wave's time through the most compressed"
         return f"{words} element or grid cell (limit {MAX_COURANT:g})", "element length"
-    if health.sound:
+    if health.is_healthy:
         return None
     arrays = read_arrays()
     entry = diagnosis.describe_non_finite(arrays)

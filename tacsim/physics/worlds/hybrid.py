@@ -297,8 +297,8 @@ class HybridWorld(FemWorld):
         partial = self.state.partial[self._index]
         survey = self._survey()
         volumes = volume_range(self.state.particles.e(self._index)) if survey is None else survey.volumes
-        sound = self._is_healthy(volumes[0]) if survey is None else survey.is_healthy
-        health = Health.read(partial, self._courant(), sound=sound)
+        is_healthy = self._is_healthy(volumes[0]) if survey is None else survey.is_healthy
+        health = Health.read(partial, self._courant(), is_healthy=is_healthy)
         check_launch(self.arrays, prepared.before, health, prepared.where)
         self._reset_springs()
         each, drive = self._numbers(prepared.launch.readings), prepared.drive[-1]
@@ -336,7 +336,7 @@ class HybridWorld(FemWorld):
         return 1 + RECORDS
 
     def _is_healthy(self, smallest_volume: float) -> bool:
-        """See `Health.sound`. It tests whole arrays, which is fast; `diagnosis` finds the fault and its place."""
+        """See `Health.is_healthy`. It tests whole arrays, which is fast; `diagnosis` finds the fault and its place."""
         state, i = self.state, self._index
         others = state.particles.particle_rows(i), state.contact_history[i], state.partial[i]
         return (

@@ -291,7 +291,7 @@ class PressWorld(FemWorld):
         """Results of the kernels in the last launch."""
         survey = self._survey()
         return Health.read(
-            self.state.partial[self._index], self._courant(), sound=survey is not None and survey.is_healthy
+            self.state.partial[self._index], self._courant(), is_healthy=survey is not None and survey.is_healthy
         )
 
     def require_contact_resolution(

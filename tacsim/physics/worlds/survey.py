@@ -60,7 +60,7 @@ def survey_of(
 ) -> Survey:  # fmt: skip
     """The survey from an environment's numbers (NUMBERS,) of the kernels; spacings: of its gels' nodes [mm]."""
     finite = not numbers[NOT_FINITE]
-    sound = bool(
+    is_healthy = bool(
         finite and numbers[NODE_SPEED] <= MAX_SPEED and numbers[SQUARED_VOLUME] > (2.0 * MIN_VOLUME_RATIO) ** 2
     )
     volumes = numbers[[SQUARED_VOLUME, LARGEST_SQUARED_VOLUME]]
@@ -68,7 +68,7 @@ def survey_of(
         volumes = np.ones(2, np.float32)
     least, largest = (float(volume) for volume in np.sqrt(volumes))
     return Survey(
-        finite, sound, tuple(h + float(numbers[MIN_EDGE + g]) for g, h in enumerate(spacings)),
+        finite, is_healthy, tuple(h + float(numbers[MIN_EDGE + g]) for g, h in enumerate(spacings)),
         float(numbers[CORNER]), numbers[TOP : TOP + 8].reshape(2, 4), numbers[LOW : LOW + 6].reshape(1, 2, 3),
         _moments(numbers[SUMS:].astype(np.float64), particles, np.asarray(base, np.float64)) if particles else None,
         (least, largest),

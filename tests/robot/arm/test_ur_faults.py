@@ -145,7 +145,7 @@ def test_arm_without_action_holds_and_continues(mock: MockUR, measuring: bool, f
         until(lambda: arm.status() == ArmStatus.HOLD, "hold")
         seen = records(arm)
         held_at = seen[(seen["status"] == ArmStatus.HOLD) & (seen["written"] > asked + 0.5 * timeout)][0]["written"]
-        figure("hold told after the last action (time-out 200 ms)", 1e3 * float(held_at - asked), "ms", at_most=210)
+        figure("hold reported after the last action (time-out 200 ms)", 1e3 * float(held_at - asked), "ms", at_most=210)
         until(arm.at_rest, "rest")
         held = arm.state().pose
         assert 2e-3 < se3.pose_distance(start, held)[0] < 0.1  # stopped on its path
@@ -201,7 +201,7 @@ def test_arm_protective_stop_raises_until_recover(arm: URArm, mock: MockUR, figu
     asked = time.monotonic()
     mock.faults.protective_stop()
     told = until(lambda: arm.status() == ArmStatus.PROTECTIVE_STOP, "protective stop", pause=2e-4)
-    figure("protective stop told", 1e3 * (told - asked), "ms", at_most=20)
+    figure("protective stop reported", 1e3 * (told - asked), "ms", at_most=20)
     until(lambda: mock.faults.state().rests, "rest")
     before, mark = mock.faults.state(), mock.faults.received().last
     for _ in range(20):

@@ -189,5 +189,5 @@ def test_image_sizes_show_the_same_scene(width: int, height: int) -> None:
 def test_light_that_cannot_reach_the_gel_is_refused() -> None:
     with pytest.raises(ValidationError, match="lights stand behind the gel"):
         Light(direction=(1.0, 0.0, 0.45), colour=(1.0, 1.0, 1.0))
-    with pytest.raises(ValidationError, match="ambient has no effect beside a background"):
+    with pytest.raises(ValidationError, match="ambient has no effect where there is a background"):
         Lighting(ambient=0.2)

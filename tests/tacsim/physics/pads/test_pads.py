@@ -14,7 +14,7 @@ from tacsim.interface import Pose
 from tacsim.models.material import GelMaterial
 from tacsim.models.scene import Box, Cylinder, Gel, Indenter, Mesh, Scene, Shape, Sphere
 from tacsim.physics.failure.health import SimulationDiverged
-from tacsim.physics.worlds.pads import GelPads
+from tacsim.physics.pads.pads import GelPads
 from tacsim.physics.worlds.press import PressWorld
 
 SIDEWAYS = Rotation.from_euler("x", 90, degrees=True).as_quat()  # a cylinder whose axis is along the gel

@@ -22,8 +22,8 @@ from tacsim.interface import FloatArray, Pose
 from tacsim.models.material import GelMaterial
 from tacsim.models.scene import Box, Cylinder, Gel, Indenter, Preset, Scene, Sphere
 from tacsim.physics.failure.health import SimulationDiverged
+from tacsim.physics.pads.pads import GelPads
 from tacsim.physics.world import make_world
-from tacsim.physics.worlds.pads import GelPads
 from tacsim.sim.engines.touch import ObjectDropped, TouchSensor, step_together
 
 GRAVITY, FRICTION = 9.81, 0.6

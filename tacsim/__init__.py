@@ -125,6 +125,7 @@ if TYPE_CHECKING:
     from tacsim.rig import Rig as Rig
     from tacsim.sim.engines.touch import ObjectDropped as ObjectDropped
     from tacsim.sim.engines.touch import TouchSensor as TouchSensor
+    from tacsim.sim.engines.touch import step_each as step_each
     from tacsim.sim.engines.touch import step_together as step_together
     from tacsim.sim.held import HeldObjects as HeldObjects
     from tacsim.sim.pads import TactilePads as TactilePads

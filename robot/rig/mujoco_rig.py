@@ -23,7 +23,7 @@ from tacsim.models.rig import RigConfig
 from tacsim.models.scene import Scene
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.optics.surface import surface_map
-from tacsim.physics.grip.shared import GripPlace
+from tacsim.physics.grip.shared import GripPlace, SharedGrips
 from tacsim.rig import Rig
 from tacsim.sim.arm import SimArm, wrench_noise_source
 from tacsim.sim.cell.arm import CellArm
@@ -46,10 +46,12 @@ from tacsim.sim.cell.user_model import first_joints
 from tacsim.sim.cell.view import CellView
 from tacsim.sim.engines.mujoco_module import load_mujoco
 from tacsim.sim.engines.picture import require_rendering
+from tacsim.sim.pads import PadPlace, SharedPads
 from tacsim.sim.scene_world import StatePool
 from tacsim.sim.sensor import SimSensor
 
 GRIPPERS = {"parallel": (FREE_HAND, (0.0, 60.0)), "2f85": (TWO_FINGER_85, (20.0, 235.0))}  # and their forces [N]
+Place = GripPlace | PadPlace  # of what one simulation shares with others, by its motion
 UR5E_SEED = np.array([np.pi, -1.2, 1.6, -1.97, -np.pi / 2, 0.0])  # elbow up, the tool down, in front of the base [rad]
 
 
@@ -93,10 +95,11 @@ def open_mujoco(config: RigConfig, check: Callable[[RigSpec], None] | None = Non
 
 
 def simulate_cell(
-    config: RigConfig, pool: StatePool | None = None, place: GripPlace | None = None, *, parallel: bool = True
+    config: RigConfig, pool: StatePool | None = None, place: Place | None = None, *, parallel: bool = True
 ) -> CellSimulation:
-    """A rig in MuJoCo whose cell is made when it is first needed; place: of its grip among those of others, where it
-    rests in each period; the rest as of `simulate` (sim_rig.py). Raises CannotOpen, also where MuJoCo is missing."""
+    """A rig in MuJoCo whose cell is made when it is first needed; place: of its pads among those of others, or of its
+    grip, where it rests in each period; the rest as of `simulate` (sim_rig.py). Raises CannotOpen, also where MuJoCo
+    is missing."""
     scene = _require_scene(config)
     try:
         load_mujoco()
@@ -142,6 +145,15 @@ def simulate_cell(
         on_close=partial(_close_views, views),
     )
     return CellSimulation(rig, clock, scene_cell, sensors, arms)
+
+
+def places_of(config: RigConfig, count: int) -> list[Place]:
+    """Of a number of simulations of a rig, whose launches then are common."""
+    if config.motion == "dynamic":
+        pads = SharedPads(count)
+        return [PadPlace(pads, index) for index in range(count)]
+    grips = SharedGrips(count)
+    return [GripPlace(grips, index) for index in range(count)]
 
 
 def _require_scene(config: RigConfig) -> Scene:
@@ -238,7 +250,7 @@ def _describe_gripper(gripper: MujocoGripperConfig, scene: Scene) -> GripperDesc
 
 
 def _make_cell(
-    config: RigConfig, grippers: Mapping[str, GripperDescription], place: GripPlace | None, scene: Scene
+    config: RigConfig, grippers: Mapping[str, GripperDescription], place: Place | None, scene: Scene
 ) -> Cell:
     """Raises what `Cell` raises."""
     arms: dict[str, ArmDescription] = {}
@@ -252,7 +264,9 @@ def _make_cell(
         for name, view in config.cameras.items()
     }
     if config.motion == "dynamic":
-        return Cell(scene, arms, grippers, views, starts)
+        assert not isinstance(place, GripPlace)
+        return Cell(scene, arms, grippers, views, starts, place)
+    assert not isinstance(place, PadPlace)
     return RestingCell(scene, arms, grippers, views, starts, place)
 
 

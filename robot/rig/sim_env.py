@@ -65,12 +65,10 @@ def open_vector_env(
         )
     pool, members = StatePool(), list[Member]()
     if config.clock == "mujoco":
-        from robot.rig.mujoco_rig import simulate_cell
-        from tacsim.physics.grip.shared import GripPlace, SharedGrips
+        from robot.rig.mujoco_rig import places_of, simulate_cell
 
-        grips = SharedGrips(int(number))
-        for index in range(int(number)):
-            cell = simulate_cell(config, pool, GripPlace(grips, index), parallel=False)
+        for place in places_of(config, int(number)):
+            cell = simulate_cell(config, pool, place, parallel=False)
             members.append(Member(_make_env(cell, config, variants, render_mode, features), cell.clock))
         return TacsimVectorEnv(members, CellBatch(), autoreset_mode)
     batch = SharedBatch([config.scene] * int(number))

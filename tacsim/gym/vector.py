@@ -59,7 +59,7 @@ class SharedBatch:
 
 
 class CellBatch:
-    """Cells of MuJoCo of one rig file. Those that rest in each period share launches."""
+    """Cells of MuJoCo of one rig file. Their gels share launches."""
 
     def move(self, commands: Sequence[CellPeriod | None]) -> list[Any]:
         """See MemberBatch."""

@@ -4,7 +4,8 @@ The first launch is Taichi's own; it fixes the types and numbers of dimensions o
 """
 
 import inspect
-from collections.abc import Sequence
+import weakref
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 from tacsim.compute.runtime import ti
@@ -19,11 +20,13 @@ class _Compiled(NamedTuple):
 
     kernel: Any
     program: Any
-    packs: list[tuple[int, Any]]  # index of the parameter, an argument pack of its type
     slots: list[tuple[int, int]]  # of each number and array: index; INTEGER, FLOAT or the axes inside its elements
+    context: Any  # of all launches: it keeps the arguments of the last one
+    given: list[Callable[[], Any]]  # weak references to these: no launch keeps an array alive
 
 
 _compiled: dict[Any, _Compiled] = {}  # by kernel
+_packs: list[Any] = []  # argument packs of their contexts
 
 
 def launch_kernel(kernel: Any, *arguments: Argument) -> None:
@@ -33,20 +36,18 @@ def launch_kernel(kernel: Any, *arguments: Argument) -> None:
         if are_enabled():
             _compiled[kernel] = _describe_kernel(kernel)
         return
-    compiled, program, packs, slots = _compiled[kernel]
-    context = compiled.make_launch_context()
-    for index, pack in packs:
-        context.set_arg_argpack((index,), pack)
+    compiled, program, slots, context, given = _compiled[kernel]
     flat = [each for argument in arguments for each in (argument if isinstance(argument, tuple) else (argument,))]
-    for argument, (index, role) in zip(flat, slots, strict=True):
+    for number, (argument, (index, role)) in enumerate(zip(flat, slots, strict=True)):
         if role == INTEGER:
             context.set_arg_int((index,), argument)
         elif role == FLOAT:
             context.set_arg_float((index,), argument)
-        else:
+        elif argument is not given[number]():
             shape = argument.shape[: argument.ndim - role]
             address: int = argument.__array_interface__["data"][0]
             context.set_arg_external_array_with_shape((index,), address, argument.nbytes, shape, 0)
+            given[number] = weakref.ref(argument)
     program.launch_kernel(program.compile_kernel(program.config(), program.get_device_caps(), compiled), context)
 
 
@@ -64,17 +65,24 @@ def _with_packs(kernel: Any, arguments: Sequence[Argument]) -> Sequence[Argument
 def _describe_kernel(kernel: Any) -> _Compiled:
     (compiled,) = kernel._primal.compiled_kernels.values()
     program = kernel._primal.runtime.prog
-    packs, slots = [], []
+    slots: list[tuple[int, int]] = []
+    context = compiled.make_launch_context()
     behind = len(kernel._primal.arguments)  # where Taichi puts the next array of an argument pack
     for index, argument in enumerate(kernel._primal.arguments):
         kind = argument.annotation
         if isinstance(kind, ti.lang.argpack.ArgPackType):
-            packs.append((index, program.create_argpack(kind.dtype)))
+            pack = program.create_argpack(kind.dtype)
+            _packs.append(pack)
+            context.set_arg_argpack((index,), pack)
             slots += [(behind + n, _argument_role(member)) for n, member in enumerate(kind.members.values())]
             behind += len(kind.members)
         else:
             slots.append((index, _argument_role(kind)))
-    return _Compiled(compiled, program, packs, slots)
+    return _Compiled(compiled, program, slots, context, [_nothing] * len(slots))
+
+
+def _nothing() -> None:
+    """Stands for a reference to an array of an earlier launch."""
 
 
 def _argument_role(kind: Any) -> int:

@@ -60,6 +60,17 @@ class Indenter(NamedTuple):
     patches: Any = None  # moments of the points that touch, of each part (tacsim.physics.grip.layout), if it has them
 
 
+class Law(NamedTuple):
+    """Numbers of one environment's contact inside a kernel, which are the same at all points."""
+
+    spacing: Any  # of the surface's nodes
+    area: Any  # of a point
+    stiffness: Any
+    damping: Any  # of the dashpots
+    friction: Any
+    relaxation: Any  # share of a change of the pressure that the limit of friction takes over in a substep
+
+
 class Shape(NamedTuple):
     """One environment's indenter inside a kernel: its shape, and its motion in the sensor frame."""
 
@@ -83,6 +94,7 @@ def point_weights() -> tuple[tuple[float, ...], ...]:
 
 
 POINT_WEIGHTS = point_weights()
+MAX_WEIGHT_SUM = max(sum(map(abs, weights)) for weights in POINT_WEIGHTS) ** 2  # of the nodes' numbers at a point
 WEIGHTS_OF_NODES = tuple(zip(*POINT_WEIGHTS, strict=True))  # of the three points, for each of the four nodes
 
 
@@ -196,13 +208,25 @@ def shape_of(env: ti.template(), it, drive: ti.template(), indenter: ti.template
 
 
 @ti.func
-def clearance(env: ti.template(), gel: ti.template(), i, j, shape: ti.template()):
-    """Lower bound of the distance of the points of cell (i, j) from the indenter, minus MAX_TOUCH_DISTANCE [mm].
+def law_of(env: ti.template()):
+    h, dt = env.param(layout.GEL_SPACING), env.param(layout.STEP)
+    # without this delay, slides oscillate (Prakash & Clifton 1993)
+    relaxation = ti.min(dt * env.param(layout.LIMIT_RELAXATION_RATE), 1.0)
+    damping = CONTACT_DAMPING * env.param(layout.GEL_DENSITY) * h / (2.0 * dt)
+    area, stiffness, friction = h * h / (POINTS * POINTS), env.param(layout.STIFFNESS), env.param(layout.FRICTION)
+    return ti.static(Law(h, area, stiffness, damping, friction, relaxation))
 
-    The bound uses the distance of the cell's middle, since most cells are far from the indenter; for a mesh, whose
-    distances are valid only near it, the distance from its bounding box.
+
+@ti.func
+def clearance(env: ti.template(), gel: ti.template(), i, j, shape: ti.template(), law: ti.template()):
+    """Lower bound of the distance of the points of cell (i, j) from the indenter [mm], and of the distance from which
+    none of them touches.
+
+    The first uses the distance of the cell's middle, since most cells are far from the indenter; for a mesh, whose
+    distances are valid only near it, the distance from its bounding box. The second: outside, a point touches only
+    where pressure or dashpot exceed the spring of its distance.
     """
-    h = env.param(layout.GEL_SPACING)
+    h = law.spacing
     middle = vec3(0.0)
     for p, q in ti.static(ti.ndrange(2, 2)):
         node = surface_at(gel, i + p + 1, j + q + 1)
@@ -220,7 +244,20 @@ def clearance(env: ti.template(), gel: ti.template(), i, j, shape: ti.template()
         node = surface_at(gel, i + p + 1, j + q + 1)
         corner = vec3([gel.surface[node + c] for c in range(3)]) - middle
         reach = ti.max(reach, (corner + h * vec3(p - 0.5, q - 0.5, 0.0)).norm_sqr())
-    return far - ti.sqrt(reach) - MAX_TOUCH_DISTANCE * h
+    reach = ti.sqrt(reach)
+    gap, touch = far - reach, MAX_TOUCH_DISTANCE * h
+    if gap > 0.0 and gap < touch:
+        pressure, speed = 0.0, 0.0
+        for p in range(4):
+            for q in ti.static(range(4)):
+                node, moving = surface_at(gel, i + p, j + q), surface_at(gel, gel.nx + 3 + i + p, j + q)
+                velocity = vec3([gel.surface[moving + c] for c in range(3)])
+                pressure = ti.max(pressure, gel.surface[node + 3])
+                speed = ti.max(speed, velocity.norm_sqr())
+        closing = MAX_WEIGHT_SUM * ti.sqrt(speed) + shape.velocity.norm() + shape.spin.norm() * (y.norm() + reach)
+        push = MAX_WEIGHT_SUM * pressure + law.damping * closing
+        touch = ti.min(touch, 1.01 * push / (RIM_STIFFNESS * law.stiffness))  # above the error of rounding
+    return gap, touch
 
 
 @ti.func
@@ -231,17 +268,15 @@ def clear_contact_memory(env: ti.template(), indenter: ti.template(), i, j):
 
 
 @ti.func
-def point_push(env: ti.template(), gel: ti.template(), indenter: ti.template(), shape: ti.template(), i, j, x, us, vs):
+def point_push(
+    env: ti.template(), indenter: ti.template(), shape: ti.template(), law: ti.template(), i, j, x, us, vs
+):  # fmt: skip
     """Contact of the indenter with the gel at the quadrature point (i, j), which is at x: whether it touches, force and
     pressure times area as a vector of four [N], overlap [mm].
 
     us: displacement of the point and the stored pressure of the nodes; vs: velocity of the point.
     """
-    h, k_n, dt = env.param(layout.GEL_SPACING), env.param(layout.STIFFNESS), env.param(layout.STEP)
-    area = h * h / (POINTS * POINTS)
-    # without this delay, slides oscillate (Prakash & Clifton 1993)
-    relaxation = ti.min(dt * env.param(layout.LIMIT_RELAXATION_RATE), 1.0)
-    c_n = CONTACT_DAMPING * env.param(layout.GEL_DENSITY) * h / (2.0 * dt)
+    h, k_n, c_n = law.spacing, law.stiffness, law.damping
     y = shape.rotate.transpose() @ (x - shape.centre)
     phi, n_local = signed_distance(env, shape.kind, shape.size, y, shape.grid)
     touching, push = False, vec4(0.0)
@@ -260,13 +295,13 @@ def point_push(env: ti.template(), gel: ti.template(), indenter: ti.template(), 
             anchor = indenter.anchor[env.index, i, j] if memory > 0.0 else y
             slip = anchor - y
             slip -= slip.dot(n_local) * n_local
-            memory += relaxation * (rest - memory)
-            limit = env.param(layout.FRICTION) * memory
+            memory += law.relaxation * (rest - memory)
+            limit = law.friction * memory
             ft, left = coulomb_friction(shape.rotate @ slip, sliding, limit, INDENTER_TANGENTIAL_STIFFNESS * k_n, c_n)
             indenter.anchor[env.index, i, j] = anchor - (1.0 - left) * slip
             indenter.pressure[env.index, i, j] = memory
-            force = area * (normal * n - ft)
-            push = vec4(force[0], force[1], force[2], area * rest)
+            force = law.area * (normal * n - ft)
+            push = vec4(force[0], force[1], force[2], law.area * rest)
     if not touching:
         clear_contact_memory(env, indenter, i, j)
     return touching, push, -phi
@@ -286,8 +321,9 @@ def apply_indenter(env: ti.template(), part, it, drive: ti.template(), gel: ti.t
 
     drive: pose and velocity of the indenter in the sensor frame.
     """
-    nx, ny, h = gel.nx, gel.ny, env.param(layout.GEL_SPACING)
+    law = ti.static(law_of(env))
     shape = ti.static(shape_of(env, it, drive, indenter))
+    nx, ny, h = gel.nx, gel.ny, law.spacing
     total, moment, deepest = vec3(0.0), vec3(0.0), 0.0
     forces = contact_force_start(gel, copy_of(part))
     first_cell, last_cell, low, high = 0, 0, 0, ny
@@ -303,9 +339,9 @@ def apply_indenter(env: ti.template(), part, it, drive: ti.template(), gel: ti.t
         first_cell, last_cell = part_range(nx, part)
     for cell_i in range(first_cell, last_cell):
         for cell_j in range(low, high):
-            spare = clearance(env, gel, cell_i, cell_j, shape)
-            if spare > 0.0:
-                if spare < MAX_SUBSTEP_TRAVEL * h:
+            gap, touch = clearance(env, gel, cell_i, cell_j, shape, law)
+            if gap > touch:
+                if gap < (MAX_TOUCH_DISTANCE + MAX_SUBSTEP_TRAVEL) * h:
                     for p, q in ti.static(ti.ndrange(POINTS, POINTS)):
                         clear_contact_memory(env, indenter, cell_i * POINTS + p, cell_j * POINTS + q)
             else:
@@ -324,7 +360,7 @@ def apply_indenter(env: ti.template(), part, it, drive: ti.template(), gel: ti.t
                         vs = vec4([points[POINTS * POINTS + point, c] for c in range(4)])
                     at_rest = vec3((i + 0.5) / POINTS - 0.5 * nx, (j + 0.5) / POINTS - 0.5 * ny, 0.0)
                     x = h * at_rest + vec3(us[0], us[1], us[2])
-                    touching, push, overlap = point_push(env, gel, indenter, shape, i, j, x, us, vs)
+                    touching, push, overlap = point_push(env, indenter, shape, law, i, j, x, us, vs)
                     if touching:
                         pushed = True
                         force = vec3(push[0], push[1], push[2])

@@ -7,7 +7,7 @@ takes no time when the kernel runs (docs/decisions/0012).
 from typing import Any, NamedTuple
 
 from tacsim.compute.runtime import ti
-from tacsim.physics.exec.lanes import ON_DEVICE, vec3
+from tacsim.physics.exec.lanes import ON_DEVICE, PARTS, vec3
 
 # Large arrays have one axis, and kernels compute the index: with several axes the compiler does not find neighbours.
 Floats = ti.types.ndarray(dtype=ti.f32, ndim=1)
@@ -75,6 +75,13 @@ def record_min(env: ti.template(), slot, number, value):
             ti.atomic_min(env.partial[env.index, slot, number], value)
     else:
         env.partial[env.index, slot, number] = ti.min(env.partial[env.index, slot, number], value)
+
+
+@ti.func
+def share_min(env: ti.template(), part, number):
+    """Gives a part the smallest of what all parts have recorded: in a stage after that, by all parts."""
+    for other in ti.static(range(PARTS)):
+        record_min(env, part, number, env.partial[env.index, other, number])
 
 
 @ti.func

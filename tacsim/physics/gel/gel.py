@@ -161,16 +161,15 @@ class GelGroup:
         moving = self.nodes[environment, :, :2]
         return bool(np.isfinite(moving).all()) and bool(np.abs(moving[:, 1]).max() <= max_speed)
 
-    def copy_surface(self) -> None:
+    def copy_surface(self, environment: int | slice = slice(None)) -> None:
         """See GelState."""
         nx1, ny1 = self._shape
-        self.nodes[..., nx1 * ny1 :] = 0.0
+        self.nodes[environment, ..., nx1 * ny1 :] = 0.0
         for quantity, nodes in enumerate((self.u, self.v)):
-            top = nodes[..., -1, :]
-            surface = self.surface[:, :, quantity]
-            surface[:, :, 1:-1, 1:-1, :3] = top
-            surface[:, :, [0, -1], 1:-1] = surface[:, :, [1, -2], 1:-1]
-            surface[:, :, :, [0, -1]] = surface[:, :, :, [1, -2]]
+            surface = self.surface[environment, :, quantity]
+            surface[..., 1:-1, 1:-1, :3] = nodes[environment, ..., -1, :]
+            surface[..., [0, -1], 1:-1, :] = surface[..., [1, -2], 1:-1, :]
+            surface[..., [0, -1], :] = surface[..., [1, -2], :]
 
 
 class GelState:
@@ -253,14 +252,14 @@ class GelState:
         """See `GelGroup.is_slow_and_finite`."""
         return all(group.is_slow_and_finite(environment, max_speed) for group in self.groups)
 
-    def copy_surface(self) -> None:
-        """Copies the nodes' top layer and its rim to `surface`. Called before a launch, since users may write to
-        `nodes`.
+    def copy_surface(self, environment: int | slice = slice(None)) -> None:
+        """Copies the nodes' top layer and its rim to `surface`, of one environment or of all. Called before a launch,
+        since users may write to `nodes`.
 
         Writes zeros after the last node: these entries are in sums with weight 0, so they must be finite.
         """
         for group in self.groups:
-            group.copy_surface()
+            group.copy_surface(environment)
 
     def arguments(self) -> tuple[np.ndarray, ...]:
         """Arguments of every kernel with gels, in this order: nodes and corners with their margins."""

@@ -119,10 +119,27 @@ def node_block(gel: ti.template(), to, i, j, below, above, row, zero):
 
 @ti.func
 def gel_forces(env: ti.template(), part, gels: ti.template()):
-    """Internal forces on this part's nodes of its gel. A layer of elements, then the nodes below it, and so on up."""
+    """Internal forces on this part's nodes of its gel."""
     pieces = PARTS // gels.number
-    piece = part % pieces
     gel = ti.static(gel_of(env, gels, part // pieces))
+    record_min(env, part, layout.SMALLEST_VOLUME, piece_forces(env, gel, part % pieces, pieces, 1))
+
+
+@ti.func
+def only_gel_forces(env: ti.template(), part, gels: ti.template(), team):
+    """The same of an environment with one gel and `team` threads: in no more pieces than threads, since elements at the
+    border of a piece are computed twice. Only some parts have work: `share_min` must follow in the next stage."""
+    pieces = ti.select(team > 2, PARTS, team)
+    each = PARTS // pieces  # parts for a piece
+    has_work = 1 - ti.min(part % each, 1)
+    gel = ti.static(gel_of(env, gels, 0))
+    record_min(env, part, layout.SMALLEST_VOLUME, piece_forces(env, gel, part // each, pieces, has_work))
+
+
+@ti.func
+def piece_forces(env: ti.template(), gel: ti.template(), piece, pieces, has_work):
+    """Internal forces on the nodes of a piece of a gel: a layer of elements, then the nodes below it, and so on up.
+    Returns the smallest det F of its elements. has_work: 1; 0: does nothing."""
     zero, ny, layers, blocks = env.count(layout.ZERO), gel.ny, gel.layers, columns_of(gel)
     first, last = share_start(blocks, piece, pieces), share_start(blocks, piece + 1, pieces)
     halo = (ny + 1 + LANES) // LANES  # blocks before `first` whose elements reach into it
@@ -133,9 +150,13 @@ def gel_forces(env: ti.template(), part, gels: ti.template()):
     rows = filled(0.0, ROWS, LANES)
     for lane in range(LANES):
         rows[MIN_VOLUME_ROW, lane] = 1e9
-    for k in range(layers + 1):
+    for k in range((layers + 1) * has_work):
         here = corners + (2 * piece + k % 2) * 24 * row + (halo - first) * LANES
         before = corners + (2 * piece + (k + 1) % 2) * 24 * row + (halo - first) * LANES
+        # before the first element: a launch with another number of pieces has written there
+        for block in range(first - halo, 0):
+            for r in range(24):
+                store_lanes(gel.corners, here + block * LANES + r * row, lanes(0.0), zero)
         if k < layers:
             for block in range(ti.max(first - halo, 0), last):
                 element_block(
@@ -147,7 +168,7 @@ def gel_forces(env: ti.template(), part, gels: ti.template()):
             for d in range(3):
                 to = u + (6 + d) * axis + k * layer + block * LANES
                 node_block(gel, to, i + d * row, j + d * row, below, above, row, zero)
-    record_min(env, part, layout.SMALLEST_VOLUME, min_over_lanes(rows, MIN_VOLUME_ROW))
+    return min_over_lanes(rows, MIN_VOLUME_ROW)
 
 
 @ti.func

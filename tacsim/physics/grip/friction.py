@@ -6,14 +6,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tacsim.physics.contact.indenter import POINTS
+from tacsim.physics.pads.tuning import MIN_LEVER
 from tacsim.physics.worlds.press_state import PressState
-from tacsim.physics.worlds.tuning import MIN_LEVER
 
 Floats = NDArray[np.float64]
 
 
 def used_friction(state: PressState, gels: NDArray[np.int64], wrenches: Floats, friction: Floats) -> Floats:
-    """(n, k) shares, as `tacsim.physics.worlds.patch.Patch.used_friction` has it; 1 where nothing touches.
+    """(n, k) shares, as `tacsim.physics.pads.patch.Patches.used_friction` has it; 1 where nothing touches.
 
     gels: (n k,) numbers of the gels; wrenches: (n, k, 6) on the pads [N, N mm]; friction: (n,).
     """

@@ -30,10 +30,10 @@ from tacsim.physics.grip.tuning import (
     SETTLED_TOLERANCE,
     STEP_TIME,
 )
+from tacsim.physics.pads.gels import PadGels
 from tacsim.physics.snapshot import copy_arrays, restore_arrays
 from tacsim.physics.units import MM, MPA
 from tacsim.physics.worlds.base import NotCopyable
-from tacsim.physics.worlds.pads import GelPads
 from tacsim.physics.worlds.tuning import PRESS_COURANT
 
 Floats = NDArray[np.float64]
@@ -65,7 +65,7 @@ class Grips(NotCopyable):
         self._gravity = np.tile(checked_numbers(gravity, (3,), "gravity"), (len(objects), 1))
         scenes = [pad_scene(item, own, preset) for item, own in zip(objects, gels, strict=True) for _ in range(pads)]
         self._state = GripState(scenes, pads)
-        self._gels = GelPads(scenes, 1.0, 1, state=self._state)  # its steps are not used
+        self._gels = PadGels(scenes, state=self._state)
         self._gels.names = [f"pad {g} of grip {index}" for index in range(len(objects)) for g in range(pads)]
         lattice = self._state.gel[0]
         self._substep = PRESS_COURANT * lattice.spacing  # [mm]

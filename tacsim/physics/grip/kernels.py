@@ -3,8 +3,9 @@
 from tacsim.compute.runtime import ti
 from tacsim.physics.body.grid_motion import Drive
 from tacsim.physics.contact.indenter import Indenter, IndenterArrays, apply_indenter, update_node_pressure
-from tacsim.physics.exec.environment import Environment, EnvironmentArrays
+from tacsim.physics.exec.environment import Environment, EnvironmentArrays, share_min
 from tacsim.physics.exec.lanes import PARTS
+from tacsim.physics.exec.layout import SMALLEST_VOLUME
 from tacsim.physics.exec.team import (
     CHUNK,
     DONE,
@@ -16,7 +17,7 @@ from tacsim.physics.exec.team import (
     one_if,
     report_work_done,
 )
-from tacsim.physics.gel.kernels import GelArrays, Gels, gel_advance, gel_forces, gel_of
+from tacsim.physics.gel.kernels import GelArrays, Gels, gel_advance, gel_of, only_gel_forces
 from tacsim.physics.grip import layout
 from tacsim.physics.grip.object_kernels import (
     Constants,
@@ -95,12 +96,13 @@ def substeps(
                         env = ti.static(Environment(gel_index, *shared))
                         gel = ti.static(gel_of(env, gels, 0))
                         apply_indenter(env, part, 0, drive, gel, indenter)
-                        gel_forces(env, part, gels)
+                        only_gel_forces(env, part, gels, team)
                 for _motion in range(one_if(stage > 0 and stage % 2 == 0 and goes_on)):
                     for g in range(pads):
                         gel_index = index * pads + g
                         env = ti.static(Environment(gel_index, *shared))
                         gel = ti.static(gel_of(env, gels, 0))
+                        share_min(env, part, SMALLEST_VOLUME)
                         update_node_pressure(env, part, gel)
                         gel_advance(env, part, gels)
                     for _object in range(one_if(part == 0)):

@@ -17,10 +17,11 @@ from tacsim.physics.grip.frames import PadMotions
 from tacsim.physics.grip.state import GripState
 from tacsim.physics.grip.tuning import MESH_MARGIN, QUIET_TIME
 from tacsim.physics.motion.even import matrices_of
+from tacsim.physics.pads.gels import PadGels
+from tacsim.physics.pads.tuning import CHECKED_STEPS
 from tacsim.physics.snapshot import State, copy_arrays
-from tacsim.physics.worlds.pads import GelPads
 from tacsim.physics.worlds.press import MESH_ADVICE
-from tacsim.physics.worlds.tuning import CHECKED_STEPS, MAX_RETRIES
+from tacsim.physics.worlds.tuning import MAX_RETRIES
 
 Floats = NDArray[np.float64]
 
@@ -42,7 +43,7 @@ class GripStep:
 class GripLauncher:
     """Advances the gels and objects of all grips, or leaves them as they were."""
 
-    def __init__(self, state: GripState, gels: GelPads, substep: float) -> None:
+    def __init__(self, state: GripState, gels: PadGels, substep: float) -> None:
         """gels: of all pads; substep: nominal step of time [mm]."""
         self._state, self._gels, self._substep = state, gels, substep
 
@@ -137,7 +138,7 @@ class GripLauncher:
         ready = [row for row in rows if row not in failures]
         if ready:
             state.advance_grips({int(step.grips[row]): frames[row] for row in ready})
-        healthy = self._gels.are_healthy()
+        healthy = self._gels.are_healthy(slice(None))
         for row in ready:
             try:
                 for gel in state.gels_of(int(step.grips[row])):

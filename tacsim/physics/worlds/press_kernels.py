@@ -4,7 +4,7 @@ from tacsim.compute.runtime import ti
 from tacsim.physics.body.grid_motion import Drive
 from tacsim.physics.contact.indenter import Indenter, IndenterArrays, apply_indenter, update_node_pressure
 from tacsim.physics.exec import layout
-from tacsim.physics.exec.environment import Environment, EnvironmentArrays
+from tacsim.physics.exec.environment import Environment, EnvironmentArrays, share_min
 from tacsim.physics.exec.lanes import PARTS
 from tacsim.physics.exec.team import (
     CHUNK,
@@ -16,7 +16,7 @@ from tacsim.physics.exec.team import (
     one_if,
     report_work_done,
 )
-from tacsim.physics.gel.kernels import GelArrays, Gels, gel_advance, gel_forces, gel_of
+from tacsim.physics.gel.kernels import GelArrays, Gels, gel_advance, gel_of, only_gel_forces
 
 
 @ti.kernel
@@ -49,8 +49,9 @@ def substeps(
                 stage, part = piece // PARTS, piece % PARTS
                 for _forces in range(one_if(stage % 2 == 0)):
                     apply_indenter(env, part, stage // 2, drive, gel, indenter)
-                    gel_forces(env, part, gels)
+                    only_gel_forces(env, part, gels, team)
                 for _motion in range(one_if(stage % 2 == 1)):
+                    share_min(env, part, layout.SMALLEST_VOLUME)
                     update_node_pressure(env, part, gel)
                     gel_advance(env, part, gels)
                 report_work_done(sync, turn)

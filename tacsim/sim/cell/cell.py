@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -16,13 +16,18 @@ from tacsim.geometry.shapes import centred_mesh, edge_points, rotated_bounding_s
 from tacsim.interface import Float32, FloatArray, Pose, Truth
 from tacsim.limits import LimitExceeded
 from tacsim.models.scene import SIDES, GelSurface, Mesh, Scene, Sphere
+from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.sim.cell import tuning
 from tacsim.sim.cell.description import ArmDescription, GripperDescription, ViewDescription
 from tacsim.sim.cell.drives import FreeDrive, GripperDrive, JointDrive, State, site_pose
 from tacsim.sim.cell.model import OBJECT, PEDESTAL, make_spec, object_start
 from tacsim.sim.engines.mujoco_module import load_mujoco
 from tacsim.sim.engines.mujoco_objects import find_site
-from tacsim.sim.engines.touch import TouchSensor
+from tacsim.sim.engines.touch import TouchSensor, step_each
+from tacsim.sim.pads import PadPlace, SharedPads
+
+PeriodError = LimitExceeded | SimulationDiverged | ObjectDropped  # that ends a control period
+PERIOD_ERRORS = (LimitExceeded, SimulationDiverged, ObjectDropped)
 
 
 class Cell:
@@ -42,8 +47,11 @@ class Cell:
         grippers: Mapping[str, GripperDescription],
         views: Mapping[str, ViewDescription] | None = None,
         starts: Mapping[str, Pose] | None = None,
+        pads: PadPlace | None = None,
     ) -> None:
-        """starts: world_from_tool of arms where an episode begins, by name; others are where they grip the object."""
+        """starts: world_from_tool of arms where an episode begins, by name; others are where they grip the object.
+        pads: their place among those of other cells; None: it has its own."""
+        self._pad_place = PadPlace(SharedPads(1), 0) if pads is None else pads
         mujoco = load_mujoco()
         assert scene.object is not None
         self.scene, self.item = scene, scene.object
@@ -61,15 +69,17 @@ class Cell:
         self.refresh()
         self._add_gels()
         self._body = int(self.model.body(OBJECT).id)
+        gravity = np.array(scene.gravity)
+        self._down = gravity / (float(np.linalg.norm(gravity)) or 1.0)
         self._touched_at = self._depth_of_fall()  # along gravity, where a pad touched the object last, or it began [m]
         self._max_forces = np.zeros(len(self._pads))  # normal to each pad, since `begin` [N]
         self._points = surface_points(self.item.geometry)
         mujoco.mj_forward(self.model, self.data)
 
     def _add_gels(self) -> None:
-        self.touch = TouchSensor(
-            self.model, self.data, list(self._pads.values()), OBJECT, gel=self.scene.gel, friction=self.item.friction,
-            geometry={OBJECT: self.item.geometry}, preset=self.scene.preset,
+        self.touch = TouchSensor.in_place(
+            self._pad_place, self.model, self.data, list(self._pads.values()), OBJECT, gel=self.scene.gel,
+            friction=self.item.friction, geometry={OBJECT: self.item.geometry}, preset=self.scene.preset,
         )  # fmt: skip
 
     def _add_gripper(self, name: str, gripper: GripperDescription) -> None:
@@ -130,19 +140,18 @@ class Cell:
         for name, arm in self.arms.items():
             arm.begin(targets.get(name), seconds)
 
-    def step(self, time: float) -> None:
-        """One timestep, `time` [s] after `begin`. Raises ObjectDropped; LimitExceeded for an object that reaches the
-        housing of a gel; and what `TouchSensor.step` raises."""
+    def drive(self, time: float) -> None:
+        """Before a timestep that begins `time` [s] after `begin`: arms and fingers follow their plans."""
         for arm in self.arms.values():
             arm.apply(time)
         for gripper in self.grippers.values():
             gripper.apply()
-        try:
-            self.touch.step()
-        except ValueError as failure:  # the state is finite and fits: what else is refused is where the object is
-            raise LimitExceeded(str(failure)) from failure
-        self._max_forces = np.maximum(self._max_forces, -self.touch.wrenches[:, 2])
-        if self.touch.wrenches.any():
+
+    def watch(self) -> None:
+        """After a timestep: counts for `diagnostics`. Raises ObjectDropped."""
+        wrenches = self.touch.wrenches
+        if wrenches.any():
+            self._max_forces = np.maximum(self._max_forces, -wrenches[:, 2])
             self._touched_at = self._depth_of_fall()
         elif self._depth_of_fall() - self._touched_at > tuning.FALL_HEIGHT and self.item.guide is None:
             self.touch.require_held()
@@ -153,9 +162,7 @@ class Cell:
 
     def _depth_of_fall(self) -> float:
         """Where the object is, along gravity [m]."""
-        gravity = np.array(self.scene.gravity)
-        size = float(np.linalg.norm(gravity))
-        return float(self.data.xpos[self._body] @ gravity) / size if size else 0.0
+        return float(self.data.xpos[self._body] @ self._down)
 
     @property
     def has_pedestal(self) -> bool:
@@ -301,6 +308,29 @@ class Cell:
             *((f"arms.{name}", arm) for name, arm in self.arms.items()),
             *((f"grippers.{name}", gripper) for name, gripper in self.grippers.items()),
         ]
+
+
+def step_cells(cells: Sequence[Cell], time: float) -> list[PeriodError | None]:
+    """One timestep, `time` [s] after their `begin`, of cells whose pads are in one list, in increasing order.
+
+    Returns how each has failed: ObjectDropped; LimitExceeded for an object that reaches the housing of a gel, or that
+    moves faster than the gels follow; SimulationDiverged. The others are not affected.
+    """
+    for cell in cells:
+        cell.drive(time)
+    failures: list[PeriodError | None] = []
+    for cell, failure in zip(cells, step_each([cell.touch for cell in cells]), strict=True):
+        if isinstance(failure, ValueError):  # the state is finite and fits: what else is refused is where the object is
+            failures.append(LimitExceeded(str(failure)))
+        elif failure is not None:
+            failures.append(failure)
+        else:
+            try:
+                cell.watch()
+                failures.append(None)
+            except ObjectDropped as dropped:
+                failures.append(dropped)
+    return failures
 
 
 def grip_pose(scene: Scene) -> Pose:

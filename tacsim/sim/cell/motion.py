@@ -8,9 +8,10 @@ from functools import partial
 from typing import Protocol
 
 from tacsim.interface import Pose
-from tacsim.sim.cell.cell import Cell
+from tacsim.limits import LimitExceeded
+from tacsim.sim.cell.cell import Cell, PeriodError, step_cells
 from tacsim.sim.cell.grip import grip_in_time
-from tacsim.sim.cell.resting import PERIOD_ERRORS, PeriodError, RestingCell, move_together
+from tacsim.sim.cell.resting import RestingCell, move_together
 
 
 class CellMotion(Protocol):
@@ -43,20 +44,45 @@ class DynamicMotion:
         grip_in_time(cell, arm_of_gripper, force, partial(self.advance, cell))
 
     def advance(self, cell: Cell, targets: Mapping[str, Pose], seconds: float) -> None:
-        cell.begin(targets, seconds)
-        for number in range(cell.steps_of(seconds)):
-            cell.step(number * cell.timestep)
-        cell.refresh()
+        """See CellMotion."""
+        (failure,) = self.advance_together([CellPeriod(self, cell, targets, seconds)])
+        if failure is not None:
+            raise failure
 
     def advance_together(self, periods: Sequence[CellPeriod]) -> list[PeriodError | None]:
-        """See CellMotion. One after the other: gel pads of a batch advance all together or not at all (GelPads)."""
+        """See CellMotion: the gels of cells whose pads are in one list advance in one launch a timestep."""
         failures: list[PeriodError | None] = [None] * len(periods)
+        lists: dict[int, list[int]] = {}  # numbers of the periods, by the list of their pads
         for number, period in enumerate(periods):
-            try:
-                period.advance()
-            except PERIOD_ERRORS as failure:
+            lists.setdefault(id(period.cell.touch.pads), []).append(number)
+        for numbers in lists.values():
+            for number, failure in zip(numbers, _advance([periods[each] for each in numbers]), strict=True):
                 failures[number] = failure
         return failures
+
+
+def _advance(periods: Sequence[CellPeriod]) -> list[PeriodError | None]:
+    """One control period, of the same length, of cells whose pads are in one list. Returns how each has failed."""
+    failures: list[PeriodError | None] = [None] * len(periods)
+    steps = periods[0].cell.steps_of(periods[0].seconds)
+    running: dict[int, Cell] = {}
+    for number, period in enumerate(periods):
+        try:
+            period.cell.begin(period.targets, period.seconds)
+            running[number] = period.cell
+        except LimitExceeded as failure:
+            failures[number] = failure
+    for step in range(steps):
+        if not running:
+            break
+        ends = step_cells(list(running.values()), step * periods[0].cell.timestep)
+        for number, end in zip(list(running), ends, strict=True):
+            if end is not None:
+                failures[number] = end
+                del running[number]
+    for cell in running.values():
+        cell.refresh()
+    return failures
 
 
 @dataclass(frozen=True, slots=True)

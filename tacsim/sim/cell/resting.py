@@ -13,11 +13,10 @@ from tacsim.control import NoTouch, ObjectDropped
 from tacsim.interface import FloatArray, Pose
 from tacsim.limits import LimitExceeded
 from tacsim.models.scene import GelSurface, Scene
-from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.physics.grip.model import GripCommand, HeldObject, HeldStates, Support
 from tacsim.physics.grip.shared import GripPlace, SharedGrips
 from tacsim.sim.cell import tuning
-from tacsim.sim.cell.cell import Cell
+from tacsim.sim.cell.cell import PERIOD_ERRORS, Cell, PeriodError
 from tacsim.sim.cell.description import ArmDescription, GripperDescription, ViewDescription
 from tacsim.sim.cell.drives import State
 from tacsim.sim.cell.grip import min_grip_force, require_enough
@@ -25,8 +24,6 @@ from tacsim.sim.cell.model import OBJECT
 from tacsim.sim.engines.mujoco_module import load_mujoco
 
 GripMotion = Generator[GripCommand, HeldStates, None]
-PeriodError = LimitExceeded | SimulationDiverged | ObjectDropped  # that ends a control period
-PERIOD_ERRORS = (LimitExceeded, SimulationDiverged, ObjectDropped)
 
 
 class RestingCell(Cell):

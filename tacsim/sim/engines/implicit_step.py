@@ -13,7 +13,7 @@ until they agree, with the Hessian of its active constraints added to M.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from functools import cache
 from typing import Any, Protocol
 
 import numpy as np
@@ -25,44 +25,48 @@ MAX_SOLUTIONS = 8  # of MuJoCo's constraints in one step
 TOLERANCE = 1e-6  # of the generalised force, relative to the largest
 
 
-class Response(Protocol):
-    """How the wrench of a pad follows a motion of its object: `tacsim.physics.worlds.patch.PatchResponse`."""
+class Responses(Protocol):
+    """How the wrenches of k pads follow motions of their objects: `tacsim.physics.pads.patch.PatchResponses`."""
 
-    def after(self, motion: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The wrench (6,) after a motion (6,), and its change by a further one (6, 6)."""
+    def after(self, motions: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The wrenches (k, 6) after motions (k, 6), and their changes by further ones (k, 6, 6)."""
         ...
 
 
 def inertia(model: Any, data: Any) -> FloatArray:
     """The mass matrix (nv, nv)."""
-    matrix = np.zeros((model.nv, model.nv))
+    matrix = np.empty((model.nv, model.nv))
     load_mujoco().mj_fullM(model, data, matrix)
     return matrix
 
 
 def constraint_hessian(model: Any, data: Any) -> FloatArray:
     """Second derivative (nv, nv) of the cost of MuJoCo's active constraints by the acceleration."""
-    mujoco = load_mujoco()
-    rows = int(data.nefc)
+    mujoco, rows = load_mujoco(), int(data.nefc)
     if rows == 0:
         return np.zeros((model.nv, model.nv))
-    jacobian = np.zeros((rows, model.nv))
     if mujoco.mj_isSparse(model):
+        jacobian = np.zeros((rows, model.nv))
         mujoco.mju_sparse2dense(jacobian, data.efc_J, data.efc_J_rownnz, data.efc_J_rowadr, data.efc_J_colind)
     else:
-        jacobian[:] = data.efc_J.reshape(rows, model.nv)
-    states = mujoco.mjtConstraintState
-    quadratic, cone = int(states.mjCNSTRSTATE_QUADRATIC), int(states.mjCNSTRSTATE_CONE)
-    active = (data.efc_state == quadratic) | (data.efc_state == cone)
-    return np.asarray(jacobian.T @ ((data.efc_D * active)[:, None] * jacobian))
+        jacobian = data.efc_J.reshape(rows, model.nv)
+    states, (quadratic, cone) = data.efc_state, _active_states()
+    weights = data.efc_D * ((states == quadratic) | (states == cone))
+    return np.asarray((jacobian.T * weights) @ jacobian)
 
 
-def velocity_gain(model: Any, data: Any, mass: FloatArray) -> FloatArray:
-    """Change of the velocity over dt, for one of MuJoCo's acceleration (nv, nv): the integrators treat damping of
-    joints and of servos implicitly."""
-    mujoco = load_mujoco()
-    damping = np.zeros((model.nv, model.nv))
-    np.fill_diagonal(damping, model.dof_damping)
+@cache
+def _active_states() -> tuple[int, int]:
+    """Of MuJoCo's constraints."""
+    states = load_mujoco().mjtConstraintState
+    return int(states.mjCNSTRSTATE_QUADRATIC), int(states.mjCNSTRSTATE_CONE)
+
+
+def damping_of(model: Any, data: Any) -> FloatArray | None:
+    """(nv, nv) change of the generalised force, without its sign, by the velocity: of what MuJoCo's integrators treat
+    implicitly, damping of joints and of servos. None: there is none."""
+    mujoco, joints = load_mujoco(), model.dof_damping
+    damping = np.diag(joints) if joints.any() else None
     if model.nu and int(model.opt.integrator) != int(mujoco.mjtIntegrator.mjINT_EULER):
         servos = np.where(
             model.actuator_biastype == int(mujoco.mjtBias.mjBIAS_AFFINE), -model.actuator_biasprm[:, 2], 0
@@ -71,37 +75,45 @@ def velocity_gain(model: Any, data: Any, mass: FloatArray) -> FloatArray:
             moment = np.zeros((model.nu, model.nv))
             rows = data.moment_rownnz, data.moment_rowadr, data.moment_colind
             mujoco.mju_sparse2dense(moment, data.actuator_moment, *rows)
-            damping = damping + moment.T @ (servos[:, None] * moment)
-    if not damping.any():
-        return np.eye(model.nv)
-    return np.asarray(np.linalg.solve(mass + model.opt.timestep * damping, mass))
+            own = (moment.T * servos) @ moment
+            damping = own if damping is None else damping + own
+    return damping
 
 
-def step_with_wrenches(model: Any, data: Any, jacobian: FloatArray, responses: Sequence[Response]) -> int:
+def _motion_gain(model: Any, data: Any, mass: FloatArray, jacobian: FloatArray) -> FloatArray:
+    """(6 k, nv) motions in a step by one of MuJoCo's accelerations. MuJoCo adds (M + dt D)^-1 M dt of it to the
+    velocity, with the damping D."""
+    dt, damping = float(model.opt.timestep), damping_of(model, data)
+    if damping is None:
+        return dt * dt * jacobian
+    return np.asarray(dt * dt * (jacobian @ np.linalg.solve(mass + dt * damping, mass)))
+
+
+def step_with_wrenches(model: Any, data: Any, jacobian: FloatArray, responses: Responses) -> int:
     """Ends a step that `mj_step1` has begun. jacobian: (6 k, nv) of the motions of objects relative to pads; responses:
     of these k pads. Returns how often constraints were solved.
 
     `data.qfrc_applied` of the user counts, and is as before afterwards.
     """
-    mujoco = load_mujoco()
-    dt, user = float(model.opt.timestep), data.qfrc_applied.copy()
+    mujoco, push = load_mujoco(), data.qfrc_applied
+    user, backward = push.copy(), -jacobian.T
     mass = inertia(model, data)
-    moving = dt * (jacobian @ data.qvel)
-    to_motion = dt * dt * (jacobian @ velocity_gain(model, data, mass))  # motion in the step by an acceleration
-    wrench, tangent = _predict(responses, np.zeros(len(jacobian)))
-    applied, change, least, solutions = -jacobian.T @ wrench, np.zeros(model.nv), math.inf, 0
+    moving = float(model.opt.timestep) * (jacobian @ data.qvel)
+    to_motion = _motion_gain(model, data, mass, jacobian)
+    wrenches, tangents = responses.after(np.zeros((len(jacobian) // 6, 6)))
+    applied, change, least, solutions = backward @ wrenches.ravel(), np.zeros(model.nv), math.inf, 0
     mujoco.mj_fwdActuation(model, data)
     while True:
-        data.qfrc_applied[:] = user + applied
+        push[:] = user + applied
         mujoco.mj_fwdAcceleration(model, data)
         mujoco.mj_fwdConstraint(model, data)
         solutions += 1
-        motion = moving + to_motion @ data.qacc
+        motions = (moving + to_motion @ data.qacc).reshape(-1, 6)
         if solutions == 1:  # by springs alone: from the side of sliding, Newton would jump to and fro
-            error = -jacobian.T @ (tangent @ motion)
+            error = backward @ (tangents @ motions[..., None]).ravel()
         else:
-            wrench, tangent = _predict(responses, motion)
-            error = -jacobian.T @ wrench - applied
+            wrenches, tangents = responses.after(motions)
+            error = backward @ wrenches.ravel() - applied
         size = float(np.abs(error).max())
         if solutions == MAX_SOLUTIONS or size <= TOLERANCE * np.abs(applied).max():
             break
@@ -112,20 +124,10 @@ def step_with_wrenches(model: Any, data: Any, jacobian: FloatArray, responses: S
             continue
         if solutions > 1:
             least = size
-        slope = jacobian.T @ tangent @ to_motion
+        slope = backward @ (tangents @ to_motion.reshape(-1, 6, model.nv)).reshape(-1, model.nv)
         hessian = mass + constraint_hessian(model, data) if data.nefc else mass
-        change = error - slope @ np.linalg.solve(hessian + slope, error)
+        change = error + slope @ np.linalg.solve(hessian - slope, error)
         applied = applied + change
     mujoco.mj_step2(model, data)
-    data.qfrc_applied[:] = user
+    push[:] = user
     return solutions
-
-
-def _predict(responses: Sequence[Response], motion: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Wrenches (6 k,) after a motion (6 k,), and their change by a further one (6 k, 6 k)."""
-    count = len(responses)
-    wrenches, tangents = np.empty(6 * count), np.zeros((6 * count, 6 * count))
-    for at, response in enumerate(responses):
-        own = slice(6 * at, 6 * at + 6)
-        wrenches[own], tangents[own, own] = response.after(motion[own])
-    return wrenches, tangents

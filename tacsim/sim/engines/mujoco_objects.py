@@ -14,7 +14,7 @@ from tacsim.interface import FloatArray
 from tacsim.models.material import elastic_constants
 from tacsim.models.scene import Box, Cylinder, Gel, Mesh, Shape, Sphere
 from tacsim.models.text import millimetres
-from tacsim.physics.worlds.tuning import PATCH_NORMAL_SHARE
+from tacsim.physics.pads.tuning import PATCH_NORMAL_SHARE
 from tacsim.sim.engines.mujoco_module import load_mujoco
 
 SIZE_TOLERANCE = 1e-6  # [m] by which sizes may differ

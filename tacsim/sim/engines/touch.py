@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import cache
 from typing import Any, NoReturn, Self
 
 import numpy as np
@@ -13,7 +14,8 @@ from tacsim.interface import FloatArray, Image
 from tacsim.models.scene import Gel, GelSurface, Indenter, Preset, Scene, Shape
 from tacsim.models.sensor import SensorModel
 from tacsim.physics.failure.health import LaunchSpan, SimulationDiverged
-from tacsim.sim.engines.implicit_step import Response, step_with_wrenches
+from tacsim.physics.pads.launch import StepError
+from tacsim.sim.engines.implicit_step import Responses, step_with_wrenches
 from tacsim.sim.engines.mujoco_module import load_mujoco
 from tacsim.sim.engines.mujoco_objects import (
     MujocoObject,
@@ -22,7 +24,7 @@ from tacsim.sim.engines.mujoco_objects import (
     require_no_contact,
     require_stable_step,
 )
-from tacsim.sim.pads import TactilePads
+from tacsim.sim.pads import PadPlace, TactilePads
 
 
 class TouchSensor:
@@ -38,11 +40,20 @@ class TouchSensor:
         substeps: int | None = None, sensor: SensorModel | None = None,
     ) -> None:  # fmt: skip
         """See :meth:`batch`, which makes several."""
-        self._join(
-            *self._describe(model, data, sites, objects, gel or Gel(), friction, geometry or {}, preset),
-            substeps,
-            sensor,
-        )
+        scenes, step = self._describe(model, data, sites, objects, gel or Gel(), friction, geometry or {}, preset)
+        self._use(TactilePads(scenes, step, substeps, sensor=sensor), 0)
+
+    @classmethod
+    def in_place(
+        cls, place: PadPlace, model: Any, data: Any, sites: Sequence[str], objects: str | Sequence[str], *,
+        gel: Gel | None = None, friction: float | None = None, geometry: Mapping[str, Shape] | None = None,
+        preset: Preset = "learn",
+    ) -> Self:  # fmt: skip
+        """A sensor whose pads have a place among those of other simulations, see :meth:`batch`."""
+        made = cls.__new__(cls)
+        described = made._describe(model, data, sites, objects, gel or Gel(), friction, geometry or {}, preset)
+        made._use(*place.fill(*described))
+        return made
 
     @classmethod
     def batch(
@@ -50,8 +61,8 @@ class TouchSensor:
         gel: Gel | None = None, friction: float | None = None, geometry: Mapping[str, Shape] | None = None,
         preset: Preset = "learn", substeps: int | None = None, sensor: SensorModel | None = None,
     ) -> list[Self]:  # fmt: skip
-        """Sensors in several scenes, whose gels `step_together` advances in one launch; each has the bits that it has
-        alone.
+        """Sensors in several scenes, whose gels `step_each` and `step_together` advance in one launch; each has the
+        bits that it has alone.
 
         Args:
             scenes: MjModel and MjData of each. They belong to the caller: gravity, controls and applied forces act as
@@ -105,6 +116,9 @@ class TouchSensor:
         found = {name: find_object(model, name, geometry.get(name), friction) for name in dict.fromkeys(names)}
         self._sites = [find_site(model, site) for site in self.sites]
         self._objects = [found[name] for name in names]
+        self._geoms = [item.geom for item in self._objects]
+        self._places = np.array([item.place for item in self._objects])[..., None]  # (n, 3, 1)
+        self._turns = np.array([item.turn for item in self._objects])
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
         mujoco.mj_makeM(model, data)
@@ -117,18 +131,20 @@ class TouchSensor:
             scenes.append(Scene(name=name, preset=preset, body=None, indenter=indenter, gel=gel))
         return scenes, float(model.opt.timestep)
 
-    def _join(self, scenes: list[Scene], step: float, substeps: int | None, sensor: SensorModel | None) -> None:
-        self._use(TactilePads(scenes, step, substeps, sensor=sensor), 0)
-
     def _use(self, pads: TactilePads, first: int) -> None:
-        self.pads, self._first = pads, first
+        self.pads, self._numbers = pads, range(first, first + len(self.sites))
         self._was_held = [False] * len(self.sites)
+        for number, site in zip(self._numbers, self.sites, strict=True):
+            pads.names[number] = f"pad '{site}'"
 
     # ------------------------------------------------------------------- step
 
     def step(self) -> None:
-        """One step of MuJoCo's time with the gels, in place of `mj_step`. Raises what `GelPads.step` raises."""
-        step_together([self])
+        """One step of MuJoCo's time with the gels, in place of `mj_step`. Raises what `GelPads.step` raises, and
+        SimulationDiverged if MuJoCo's state was not finite; nothing has then moved."""
+        (failure,) = step_each([self])
+        if failure is not None:
+            raise failure
 
     def begin_step(self) -> FloatArray:
         """MuJoCo's part of a step that depends on places and velocities. Returns the objects' poses in the frames of
@@ -147,12 +163,9 @@ class TouchSensor:
 
     def _require_finite(self) -> None:
         """Raises SimulationDiverged where MuJoCo has found a state that is not finite, after which it starts again."""
-        kinds = load_mujoco().mjtWarning
-        whats = {
-            "position": kinds.mjWARN_BADQPOS, "velocity": kinds.mjWARN_BADQVEL, "acceleration": kinds.mjWARN_BADQACC
-        }  # fmt: skip
-        for what, kind in whats.items():
-            if self.data.warning[kind].number:
+        numbers = self.data.warning.number
+        for what, kind in _state_warnings().items():
+            if numbers[kind]:
                 raise SimulationDiverged(
                     f"MuJoCo found the {what} not finite or huge at degree of freedom "
                     f"{self.data.warning[kind].lastinfo}, and has reset its data",
@@ -161,53 +174,59 @@ class TouchSensor:
                     retry=False,
                 )
 
-    def end_step(self, responses: Sequence[Response | None]) -> None:
-        """The rest of the step, with the responses (n,) of the pads, see `GelPads.responses`."""
-        touching = {i: response for i, response in enumerate(responses) if response is not None}
-        for i in touching:
-            self._was_held[i] = True
-        if not touching:
+    def end_step(self, touching: NDArray[np.intp], responses: Responses) -> None:
+        """The rest of the step. touching: numbers of own pads, among those of the batch, that touch their objects;
+        responses: of these, see `GelPads.responses`."""
+        if not len(touching):
             load_mujoco().mj_step2(self.model, self.data)
             return
-        jacobian = np.concatenate([self._jacobian(i) for i in touching])
-        step_with_wrenches(self.model, self.data, jacobian, list(touching.values()))
+        own = (touching - self._numbers.start).tolist()
+        for i in own:
+            self._was_held[i] = True
+        step_with_wrenches(self.model, self.data, self._jacobian(own), responses)
 
     def poses(self) -> FloatArray:
         """(n, 7) position [m] and quaternion (x, y, z, w) of each pad's object in the pad's frame, as MuJoCo has
         computed its frames last."""
-        found = np.empty((len(self.sites), 7))
-        turned = np.empty(4)
-        for i, (site, item) in enumerate(zip(self._sites, self._objects, strict=True)):
-            axes = self.data.site_xmat[site].reshape(3, 3)
-            place, turn = item.pose(self.data)
-            found[i, :3] = axes.T @ (place - self.data.site_xpos[site])
-            load_mujoco().mju_mat2Quat(turned, np.ascontiguousarray(axes.T @ turn).ravel())
-            found[i, 3:] = turned[[1, 2, 3, 0]]
+        data, mujoco = self.data, load_mujoco()
+        found, turned = np.empty((len(self.sites), 7)), np.empty(4)
+        axes = data.site_xmat[self._sites].reshape(-1, 3, 3)
+        theirs = data.geom_xmat[self._geoms].reshape(-1, 3, 3)
+        places = data.geom_xpos[self._geoms] + (theirs @ self._places)[..., 0] - data.site_xpos[self._sites]
+        found[:, :3] = (places[:, None] @ axes)[:, 0]
+        for i, turn in enumerate((axes.transpose(0, 2, 1) @ (theirs @ self._turns)).reshape(-1, 9)):
+            mujoco.mju_mat2Quat(turned, turn)
+            found[i, 3:6], found[i, 6] = turned[1:], turned[0]
         return found
 
-    def _jacobian(self, index: int) -> FloatArray:
-        """(6, nv) of the motion of a pad's object relative to the pad: of its point at the pad's origin, and its turn,
-        in the pad's axes."""
-        site, nv = self._sites[index], self.model.nv
-        ours, theirs = np.zeros((2, 3, nv)), np.zeros((2, 3, nv))
-        mujoco = load_mujoco()
-        mujoco.mj_jacSite(self.model, self.data, ours[0], ours[1], site)
-        place = self.data.site_xpos[site].copy()
-        mujoco.mj_jac(self.model, self.data, theirs[0], theirs[1], place, self._objects[index].body)
-        back = self.data.site_xmat[site].reshape(3, 3).T
-        return np.asarray((back @ (theirs - ours)).reshape(6, nv))
+    def _jacobian(self, pads: Sequence[int]) -> FloatArray:
+        """(6 k, nv) of the motions of objects relative to some pads: of the point at the pad's origin, and the turn, in
+        the pad's axes."""
+        mujoco, model, data = load_mujoco(), self.model, self.data
+        both = np.zeros((2, len(pads), 2, 3, model.nv))
+        for ours, theirs, i in zip(*both, pads, strict=True):
+            site = self._sites[i]
+            mujoco.mj_jacSite(model, data, ours[0], ours[1], site)
+            mujoco.mj_jac(model, data, theirs[0], theirs[1], data.site_xpos[site], self._objects[i].body)
+        back = data.site_xmat[[self._sites[i] for i in pads]].reshape(-1, 1, 3, 3).transpose(0, 1, 3, 2)
+        return np.asarray((back @ (both[1] - both[0])).reshape(-1, model.nv))
 
     # ---------------------------------------------------------------- results
+
+    @property
+    def numbers(self) -> range:
+        """Of its pads among those of the batch."""
+        return self._numbers
 
     def _index(self, site: str) -> int:
         if site not in self.sites:
             raise KeyError(f"no pad '{site}'; this sensor has {', '.join(self.sites)}")
-        return self._first + self.sites.index(site)
+        return self._numbers[self.sites.index(site)]
 
     @property
     def wrenches(self) -> FloatArray:
         """(n, 6) force and moment of the object on each pad, about its site, in the site's axes [N, N m]."""
-        return self.pads.wrenches[self._first : self._first + len(self.sites)]
+        return self.pads.wrenches_of(self._numbers)
 
     @property
     def world_forces(self) -> FloatArray:
@@ -248,8 +267,8 @@ class TouchSensor:
 
     def reset(self) -> None:
         """Makes the gels as new: to be called after MuJoCo's state was reset, with the objects clear of the pads."""
-        for i in range(len(self.sites)):
-            self.pads.reset(self._first + i)
+        for number in self._numbers:
+            self.pads.reset(number)
         self._was_held = [False] * len(self.sites)
 
     def snapshot(self) -> dict[str, NDArray[Any]]:
@@ -259,8 +278,8 @@ class TouchSensor:
         numbers = np.empty(mujoco.mj_stateSize(self.model, spec))
         mujoco.mj_getState(self.model, self.data, numbers, spec)
         state: dict[str, NDArray[Any]] = {"mujoco": numbers, "held": np.array(self._was_held)}
-        for i, site in enumerate(self.sites):
-            state |= {f"{site}/{name}": value for name, value in self.pads.snapshot(self._first + i).items()}
+        for number, site in zip(self._numbers, self.sites, strict=True):
+            state |= {f"{site}/{name}": value for name, value in self.pads.snapshot(number).items()}
         return state
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
@@ -270,24 +289,64 @@ class TouchSensor:
         numbers = np.asarray(state.get("mujoco", ()), np.float64)
         if numbers.shape != (mujoco.mj_stateSize(self.model, spec),):
             raise ValueError("snapshot: 'mujoco' does not fit this model; is it of another scene?")
-        for i, site in enumerate(self.sites):
+        for number, site in zip(self._numbers, self.sites, strict=True):
             own = {name.removeprefix(f"{site}/"): v for name, v in state.items() if name.startswith(f"{site}/")}
-            self.pads.restore(self._first + i, own)
+            self.pads.restore(number, own)
         self._was_held = [bool(held) for held in state["held"]]
         mujoco.mj_setState(self.model, self.data, numbers, spec)
         mujoco.mj_forward(self.model, self.data)
 
 
 def step_together(sensors: Sequence[TouchSensor]) -> None:
-    """One step of all sensors of a batch, their gels in one launch. Raises what `GelPads.step` raises; MuJoCo's states
-    have then not moved."""
+    """One step of all sensors of a batch, their gels in one launch. Raises what `GelPads.step` raises; nothing has then
+    moved, in none of them."""
     pads = sensors[0].pads
     count = sum(len(each.sites) for each in sensors)
     if any(each.pads is not pads for each in sensors) or count != len(pads):
         raise ValueError("step_together needs all sensors of one batch (TouchSensor.batch)")
-    poses = np.concatenate([each.begin_step() for each in sensors])
-    pads.step(poses)
-    responses, first = pads.responses(), 0
+    pads.step(np.concatenate([each.begin_step() for each in sensors]))
+    _end_steps(sensors)
+
+
+def step_each(sensors: Sequence[TouchSensor]) -> list[StepError | None]:
+    """One step of some sensors of a batch, their gels in one launch; those that are not given stay as they are.
+
+    sensors: in the order of the batch. Returns of each the error that `TouchSensor.step` would raise: its scene has
+    then not moved, and the others are not affected. Raises ValueError for sensors of several batches, and if the
+    timestep of a model has changed.
+    """
+    if any(each.pads is not sensors[0].pads for each in sensors):
+        raise ValueError("step_each needs sensors of one batch (TouchSensor.batch)")
+    failures: list[StepError | None] = [None] * len(sensors)
+    poses: dict[int, FloatArray] = {}
+    for number, each in enumerate(sensors):
+        try:
+            poses[number] = each.begin_step()
+        except SimulationDiverged as failure:
+            failures[number] = failure
+    if poses:
+        begun = [sensors[number] for number in poses]
+        ends = begun[0].pads.step_scenes([each.numbers for each in begun], np.concatenate(list(poses.values())))
+        for number, end in zip(poses, ends, strict=True):
+            failures[number] = end
+    _end_steps([each for each, failure in zip(sensors, failures, strict=True) if failure is None])
+    return failures
+
+
+def _end_steps(sensors: Sequence[TouchSensor]) -> None:
+    if not sensors:
+        return
+    touching, responses = sensors[0].pads.responses([number for each in sensors for number in each.numbers])
     for each in sensors:
-        each.end_step(responses[first : first + len(each.sites)])
-        first += len(each.sites)
+        first, end = np.searchsorted(touching, [each.numbers.start, each.numbers.stop]).tolist()
+        each.end_step(touching[first:end], responses.of(slice(first, end)))
+
+
+@cache
+def _state_warnings() -> dict[str, int]:
+    """MuJoCo's warnings of what is not finite, by name."""
+    kinds = load_mujoco().mjtWarning
+    return {
+        "position": int(kinds.mjWARN_BADQPOS), "velocity": int(kinds.mjWARN_BADQVEL),
+        "acceleration": int(kinds.mjWARN_BADQACC),
+    }  # fmt: skip

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -13,6 +14,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from robot.open import make_env, make_vector_env
 from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.physics.grip.world import GripWorld
+from tacsim.physics.pads.pads import GelPads
 from tests.robot.rig.lift import LiftConfig
 from tests.robot.rig.test_mujoco_rig import HOLD, SMALL
 from tests.tacsim.gym.small import assert_equal
@@ -25,6 +27,9 @@ VARIANTS = (
     ("scene.object.geometry={shape: sphere, radius: 9 mm}", "scene.gel.material.youngs_modulus=2e5", "task.steps=4"),
     ("scene.object.geometry.size=[16 mm, 14 mm, 8 mm]", "scene.gravity=[0.5, 0, -9.7]"),
 )
+
+
+SLOW_CLOCK = ("scene.timestep=2 ms", "scene.object.mass=0.12")  # its pads are in another list
 
 
 def options_of(motion: str, steps: int, variants: Any = VARIANTS) -> dict[str, Any]:
@@ -41,11 +46,17 @@ def wander(random: np.random.Generator, number: int) -> np.ndarray:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("mode", "motion"), [("NextStep", "flowing"), ("SameStep", "settled"), ("Disabled", "flowing")]
-)
+    ("mode", "motion"),
+    [
+        ("NextStep", "flowing"), ("SameStep", "settled"), ("Disabled", "flowing"), ("NextStep", "dynamic"),
+        ("SameStep", "dynamic"), ("Disabled", "dynamic"),
+    ],
+)  # fmt: skip
 def test_a_batch_of_grips_gives_the_bits_of_cells_apart(mode: str, motion: str) -> None:
-    """In all modes, with variants of object, friction, modulus and gravity, over ends by drops and by steps."""
-    number, random, options = 3, np.random.default_rng(4), options_of(motion, 12)
+    """In all modes, with variants of object, friction, modulus and gravity, in `dynamic` of the timestep too, over ends
+    by drops and by steps."""
+    variants = (*VARIANTS, SLOW_CLOCK) if motion == "dynamic" else VARIANTS
+    number, random, options = 3, np.random.default_rng(4), options_of(motion, 12, variants)
     batched = make_vector_env(number, autoreset_mode=mode, **options)
     apart = SyncVectorEnv([partial(make_env, **options)] * number, autoreset_mode=AutoresetMode(mode))
     assert_equal(batched.reset(seed=7), apart.reset(seed=7))
@@ -62,27 +73,35 @@ def test_a_batch_of_grips_gives_the_bits_of_cells_apart(mode: str, motion: str) 
         if mode == "Disabled" and over.any():
             mask = {"reset_mask": over.copy()}
             assert_equal(batched.reset(options=mask), apart.reset(options=dict(mask)))
-    assert played == {0, 1, 2}
+    assert played == set(range(len(variants)))
     assert 0 < dropped < ended
     batched.close()
     apart.close()
 
 
 def fail_one(monkeypatch: pytest.MonkeyPatch, index: int) -> None:
-    """The next steps of this grip fail."""
-    step_each = GripWorld.step_each
+    """The next steps of this grip fail, and of its pads."""
+    step_each, step_scenes, calls = GripWorld.step_each, GelPads.step_scenes, itertools.count()
 
     def fails(self: GripWorld, commands: Any, **options: Any) -> Any:
         others = {number: command for number, command in commands.items() if number != index}
         failure = {index: SimulationDiverged("NaN", "substep 3", "move less")} if index in commands else {}  # type: ignore[arg-type]
         return {**step_each(self, others, **options), **failure}
 
+    def diverges(self: GelPads, scenes: Any, poses: Any) -> Any:
+        if next(calls) == 20 and scenes[0][0] == 2 * index:  # in the middle of a period
+            poses = np.array(poses)
+            poses[0, 2] -= 6e-3  # through the gel
+        return step_scenes(self, scenes, poses)
+
     monkeypatch.setattr(GripWorld, "step_each", fails)
+    monkeypatch.setattr(GelPads, "step_scenes", diverges)
 
 
 @pytest.mark.slow
-def test_one_that_diverges_ends_its_own_episode(monkeypatch: pytest.MonkeyPatch) -> None:
-    options = options_of("flowing", 30, ())
+@pytest.mark.parametrize("motion", ["flowing", "dynamic"])
+def test_one_that_diverges_ends_its_own_episode(monkeypatch: pytest.MonkeyPatch, motion: str) -> None:
+    options = options_of(motion, 30, ())
     hit, other = (make_vector_env(2, **options) for _ in range(2))
     assert_equal(hit.reset(seed=3), other.reset(seed=3))
     both = np.array([[0.5, HOLD], [1.0, HOLD]], np.float32)
@@ -92,7 +111,7 @@ def test_one_that_diverges_ends_its_own_episode(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.undo()
     wanted = other.step(both)
     assert found[3].tolist() == [True, False]
-    assert "NaN; substep 3" in found[4]["diverged"][0]
+    assert ("NaN; substep 3" if motion == "flowing" else "pad 'hand/left_pad' in step") in found[4]["diverged"][0]
     for key, value in found[0].items():
         assert np.array_equal(value[1], wanted[0][key][1])
     found, wanted = hit.step(both), other.step(both)  # the first is reset
@@ -115,3 +134,23 @@ def test_cells_of_a_batch_share_launches(monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setattr(GripWorld, "step_each", count)
     envs.step(np.tile(np.array([0.5, HOLD], np.float32), (3, 1)))
     assert launched == [3]
+
+
+@pytest.mark.slow
+def test_dynamic_cells_of_a_batch_share_launches(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And a reset of one of them steps it alone."""
+    envs = make_vector_env(3, autoreset_mode="Disabled", **options_of("dynamic", 30, ()))
+    envs.reset(seed=1)
+    launched: list[int] = []
+    step_scenes: Callable[..., Any] = GelPads.step_scenes
+
+    def count(self: GelPads, scenes: Any, poses: Any) -> Any:
+        launched.append(len(scenes))
+        return step_scenes(self, scenes, poses)
+
+    monkeypatch.setattr(GelPads, "step_scenes", count)
+    envs.step(np.tile(np.array([0.5, HOLD], np.float32), (3, 1)))
+    assert launched == [3] * 50
+    launched.clear()
+    envs.reset(seed=2, options={"reset_mask": np.array([False, True, False])})
+    assert set(launched) <= {1}

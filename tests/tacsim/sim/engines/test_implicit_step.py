@@ -35,10 +35,10 @@ class Spring:
     def __init__(self, force: float, stiffness: float) -> None:
         self.force, self.stiffness = force, stiffness
 
-    def after(self, motion: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        along = np.zeros((6, 6))
-        along[0, 0] = self.stiffness
-        return np.array([self.force, 0, 0, 0, 0, 0]) + along @ motion, along
+    def after(self, motions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        along = np.zeros((1, 6, 6))
+        along[0, 0, 0] = self.stiffness
+        return np.array([self.force, 0, 0, 0, 0, 0]) + motions @ along[0], along
 
 
 JACOBIAN = np.array([[1.0, -1.0], *[[0.0, 0.0]] * 5])  # motion of the thing relative to the finger
@@ -47,7 +47,7 @@ JACOBIAN = np.array([[1.0, -1.0], *[[0.0, 0.0]] * 5])  # motion of the thing rel
 def step(model: Any, data: Any, spring: float) -> int:
     """With a spring between both bodies."""
     load_mujoco().mj_step1(model, data)
-    return step_with_wrenches(model, data, JACOBIAN, [Spring(spring * (data.qpos[0] - data.qpos[1]), spring)])
+    return step_with_wrenches(model, data, JACOBIAN, Spring(spring * (data.qpos[0] - data.qpos[1]), spring))
 
 
 @pytest.mark.parametrize("integrator", ["Euler", "implicit", "implicitfast"])
@@ -88,7 +88,7 @@ def test_what_presses_a_light_thing_on_a_table_presses_with_its_whole_force() ->
     data.qfrc_applied[1] = -3.0  # what presses the finger
     for _ in range(300):
         load_mujoco().mj_step1(model, data)
-        solutions = step_with_wrenches(model, data, JACOBIAN, [Spring(3.0, 40e3)])
+        solutions = step_with_wrenches(model, data, JACOBIAN, Spring(3.0, 40e3))
         assert abs(data.qfrc_constraint[0]) < 20.0
     assert solutions < MAX_SOLUTIONS
     assert data.qfrc_constraint[0] == pytest.approx(3.0, rel=1e-3)

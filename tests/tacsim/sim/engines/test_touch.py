@@ -16,7 +16,7 @@ from tacsim.models.material import GelMaterial
 from tacsim.models.scene import Box, Gel, Mesh, Sphere
 from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.sim.engines.mujoco_module import load_mujoco, require_major
-from tacsim.sim.engines.touch import ObjectDropped, TouchSensor, step_together
+from tacsim.sim.engines.touch import ObjectDropped, TouchSensor, step_each, step_together
 from tests.tacsim.sim.engines.gripper import BALL, BOX, ROD, grip, hold, load, object_dofs, scene
 
 SITES = ("left", "right")
@@ -158,6 +158,17 @@ def test_a_scene_of_a_batch_has_the_bits_that_it_has_alone_and_after_a_restore()
     assert np.array_equal(ends[1], np.concatenate([alone.data.qpos, alone.data.qvel, alone.wrenches.ravel()]))
     with pytest.raises(ValueError, match="needs all sensors of one batch"):
         step_together(sensors[:1])
+    kept = sensors[0].snapshot()
+    drive([alone], 80, 90)
+    for number in range(80, 90):
+        sensors[1].data.ctrl[:2] = 3.0 * min(1.0, number / 40)
+        assert step_each(sensors[1:]) == [None]
+    assert np.array_equal(sensors[1].data.qpos, alone.data.qpos) and np.array_equal(sensors[1].wrenches, alone.wrenches)
+    assert all(np.array_equal(kept[name], value) for name, value in sensors[0].snapshot().items())
+    sensors[0].data.qpos[-7] += 0.1  # the object jumps
+    (jumped, moved), time = step_each(sensors), float(sensors[1].data.time)
+    assert "pad 'left' moves by 100 mm" in str(jumped) and moved is None
+    assert time > float(sensors[0].data.time) + 9.5e-3
 
 
 def test_a_pad_gives_pictures_and_surfaces_by_its_name() -> None:

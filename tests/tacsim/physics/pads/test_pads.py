@@ -14,7 +14,7 @@ from tacsim.interface import Pose
 from tacsim.models.material import GelMaterial
 from tacsim.models.scene import Box, Cylinder, Gel, Indenter, Mesh, Scene, Shape, Sphere
 from tacsim.physics.failure.health import SimulationDiverged
-from tacsim.physics.worlds.pads import GelPads
+from tacsim.physics.pads.pads import GelPads
 from tacsim.physics.worlds.press import PressWorld
 
 SIDEWAYS = Rotation.from_euler("x", 90, degrees=True).as_quat()  # a cylinder whose axis is along the gel
@@ -104,6 +104,43 @@ def test_a_pad_in_a_batch_has_the_bits_that_it_has_alone() -> None:
         assert np.array_equal(np.array([alone.step(each[[index]])[0] for each in poses]), wrenches[:, index])
         assert np.array_equal(alone.surface(0).displacement, together.surface(index).displacement)
         assert np.array_equal(alone.stiffness()[0], together.stiffness()[index])
+
+
+@pytest.mark.cpu
+def test_scenes_of_a_batch_step_or_fail_without_an_effect_on_the_others() -> None:
+    """Some of them at a time; one whose object jumps, and one whose object goes through its gel, are as before."""
+    scenes = [pad(BALL, 0.6), pad(BALL, 0.3), pad(BALL, 0.9, 0.3e6)]
+    poses, both = wander(6, 3), [[0, 1], [2, 3], [4, 5]]
+    together, alone = (
+        GelPads([each for each in scenes for _ in range(2)], 1e-3),
+        [GelPads([s] * 2, 1e-3) for s in scenes],
+    )
+    far, deep = poses[12].copy(), poses[12].copy()
+    far[2, 0] += 10e-3
+    deep[4, 2] = 1.5e-3
+    for step, each in enumerate(poses):
+        moving = [number for number in range(3) if (step + number) % 3 or step < 3]
+        if step == 12:
+            ends = together.step_scenes(both[:2], far[:4])
+            assert ends[0] is None and "pad 2 moves by 10 mm" in str(ends[1])
+            ends = together.step_scenes([both[0], both[2]], np.delete(deep, both[1], axis=0))
+            assert ends[0] is None and isinstance(ends[1], SimulationDiverged) and "pad 4 in step" in str(ends[1])
+            for _ in range(2):
+                alone[0].step(each[:2])
+        ends = together.step_scenes(
+            [both[number] for number in moving], np.concatenate([each[both[n]] for n in moving])
+        )
+        assert ends == [None] * len(moving)
+        for number in moving:
+            alone[number].step(each[both[number]])
+    for own, single in zip(both, alone, strict=True):
+        assert np.array_equal(single.wrenches, together.wrenches[own]) and (single.wrenches[:, 2] < -0.05).all()
+        assert np.array_equal(single.stiffness(), together.stiffness()[own])
+        for number, pad_number in enumerate(own):
+            kept, other = single.snapshot(number), together.snapshot(pad_number)
+            assert all(np.array_equal(kept[name], other[name]) for name in kept if name != "sums")
+    with pytest.raises(ValueError, match="each larger than the one before"):
+        together.step_scenes([both[1], both[0]], poses[0, :4])
 
 
 @pytest.mark.cpu

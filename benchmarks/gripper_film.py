@@ -18,17 +18,28 @@ from PIL import Image as Picture
 
 from robot.open import load_with_task, open_rig
 from tacsim.interface import Image, Observation, Truth
+from tacsim.sim.cell.cell import grip_pose
 from tacsim.tasks import Task, make_task
 
-CLOSE = "cameras.close={position: [0.12, -0.22, 0.14], target: [0, 0, 0.06], field_of_view: 38 deg, size: [360, 360]}"
+CAMERA = (0.12, -0.22, 0.07)  # from where the object is gripped [m]
 SENSORS = tuple(f"sensors.{side}.model={{extends: gelsight-mini, markers: {{}}}}" for side in ("left", "right"))
 FLOW_SCALE = 5.0  # arrows are so many times as long as the displacements
 STRIP = 3
+LARGEST_DISTANCE = 10.0  # that is drawn, over what counts as reached
+
+
+def close_camera(name: str, overrides: Sequence[str]) -> str:
+    """The setting of a camera that looks at where the object is gripped."""
+    scene = load_with_task("hand", name, overrides).config.scene
+    assert scene is not None
+    target = grip_pose(scene).position
+    words = [[round(float(each), 4) for each in place] for place in (target + CAMERA, target)]
+    return f"cameras.close={{position: {words[0]}, target: {words[1]}, field_of_view: 30 deg, size: [360, 360]}}"
 
 
 def play(name: str, overrides: Sequence[str]) -> tuple[Task, list[Observation], list[Truth]]:
     """An episode of the scripted policy on the rig `hand`, in dynamic motion."""
-    loaded = load_with_task("hand", name, ["scene.preset=learn", CLOSE, *overrides])
+    loaded = load_with_task("hand", name, ["scene.preset=learn", close_camera(name, overrides), *overrides])
     assert loaded.config.task is not None
     task = make_task(loaded.config.task)
     with open_rig(loaded) as rig:
@@ -75,8 +86,9 @@ def draw_curves(axes: Axes, task: Task, observed: Sequence[Observation], truths:
     axes.set_ylabel("grip force [N]", color="#1f3a5f", fontsize=8)
     other = axes.twinx()
     other.plot(distances, color="#c0572b")
-    highest = unit.factor * max(task.distance(truth, truths[0]) for truth in truths)
-    other.set(ylim=(0, 1.1 * highest))
+    highest = max(task.distance(truth, truths[0]) for truth in truths)
+    other.axhline(unit.factor * task.config.success, color="#c0572b", linewidth=0.8, linestyle="--")  # reached below it
+    other.set(ylim=(0, 1.1 * unit.factor * min(highest, LARGEST_DISTANCE * task.config.success)))
     other.set_ylabel(f"distance [{unit.symbol}]", color="#c0572b", fontsize=8)
 
 

@@ -104,6 +104,7 @@ if TYPE_CHECKING:
     from tacsim.optics.surface import surface_map as surface_map
     from tacsim.physics.failure.health import SimulationDiverged as SimulationDiverged
     from tacsim.physics.grip.model import GripCommand as GripCommand
+    from tacsim.physics.grip.model import GuideSupport as GuideSupport
     from tacsim.physics.grip.model import HeldObject as HeldObject
     from tacsim.physics.grip.model import HeldStates as HeldStates
     from tacsim.physics.grip.model import Support as Support

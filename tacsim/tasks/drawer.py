@@ -73,10 +73,12 @@ class Drawer(RigidTask):
         return {**measured, "travel": self.travel(truth, start), "min_grip": min_pulling_grip(self.config)}
 
     def expert(self, truth: Truth, start: Truth) -> FloatArray:
-        """As far as is left, with a grip in the middle of what is wanted and what is allowed: a start needs more."""
+        """As far as is left. Lowers the grip as the scripted policy does, down to the middle of what is wanted and what
+        is allowed: only near its limit does friction show in a gel, so that a student can learn where to stop."""
         left = (self.config.goal - self.travel(truth, start)) / self.config.max_step
         config = self.config
-        grip = 0.5 * (config.margin + config.max_excess) * min_pulling_grip(config)
+        wanted = 0.5 * (config.margin + config.max_excess) * min_pulling_grip(config)
+        grip = max(wanted, tuning.GRIP_DECREASE * grip_force(truth))
         return np.array([float(np.clip(left, -1.0, 1.0)), grip_component(config, grip)])
 
     def scripted(self, *, through: bool = False) -> Policy:

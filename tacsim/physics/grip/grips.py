@@ -77,6 +77,7 @@ class Grips(NotCopyable):
         self._objects, self._pads = np.zeros((len(objects), 7)), np.zeros((len(objects), pads, 7))
         self._velocities = np.zeros((len(objects), 2, 3))  # of objects relative to the pads' mean, and spins
         self._stretches = np.zeros((len(objects), 6))  # of supports [mm, rad]
+        self._follow_shares = np.zeros(len(objects))  # of the pads' last motion, that an object on a support has made
         self._closing_speeds = np.zeros(len(objects))
         self._closings, self._steps = np.zeros(len(objects)), np.zeros(len(objects), np.int64)
         self._ran = np.zeros(len(objects), np.int64)
@@ -137,7 +138,10 @@ class Grips(NotCopyable):
             for gel in self._state.gels_of(i):
                 self._gels.reset(gel)
             self._objects[i], self._pads[i] = item, own
-            for array in (self._velocities, self._stretches, self._closing_speeds, self._steps, self._was_held):
+            for array in (
+                self._velocities, self._stretches, self._follow_shares, self._closing_speeds, self._steps,
+                self._was_held,
+            ):  # fmt: skip
                 array[i] = 0
             self._touching[i], self._placed[i] = False, True
 
@@ -220,6 +224,7 @@ class Grips(NotCopyable):
         }
         own = {
             "object": self._objects, "pads": self._pads, "velocity": self._velocities, "stretch": self._stretches,
+            "follow_share": self._follow_shares,
             "closing_speed": self._closing_speeds, "closing": self._closings, "steps": self._steps,
             "placed": self._placed, "held": self._was_held, "touching": self._touching, "ran": self._ran,
             "kernel": self._state.objects,

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tacsim.models.scene import Mesh, Shape
-from tacsim.physics.grip.tuning import MAX_MASS
+from tacsim.physics.grip import layout
+from tacsim.physics.grip.tuning import GUIDE_STIFFNESS, MAX_MASS
 
 Floats = NDArray[np.float64]
 
@@ -63,8 +64,9 @@ class Support:
     max_force: ArrayLike = math.inf  # [N] above which it slides along
     max_moment: ArrayLike = math.inf  # [N m]
 
-    def rows(self, count: int) -> tuple[Floats, Floats]:
-        """(n, 6) stiffness and (n, 2) limits. Raises ValueError for numbers that are negative or not finite."""
+    def rows(self, count: int) -> Floats:
+        """(n, SUPPORT_NUMBERS + 1), as in grip.layout (the last: `GuideSupport.drag`). Raises ValueError for
+        numbers that are negative or not finite."""
         try:
             stiffness = np.broadcast_to(np.asarray(self.stiffness, np.float64), (count, 6))
             limits = np.stack(
@@ -78,7 +80,46 @@ class Support:
             ) from None
         if not (np.isfinite(stiffness).all() and (stiffness >= 0.0).all() and (limits >= 0.0).all()):
             raise ValueError("stiffness of a support must be finite, and none of its numbers negative")
-        return stiffness, limits
+        free = np.broadcast_to([1.0, 1.0, 1.0, -math.inf, math.inf, 0.0], (count, 6))
+        return np.hstack([stiffness, limits, free])
+
+
+@dataclass(frozen=True)
+class GuideSupport:
+    """A guide along one world axis, as of a drawer: it lets an object slide along that axis, between two stops, against
+    dry friction and a damper, and holds it otherwise.
+
+    Each number is of all grips, or one for each.
+    """
+
+    axis: ArrayLike  # 0, 1, 2: world x, y, z
+    friction: ArrayLike = 0.0  # [N], however the object is loaded
+    # Of the damper, over the time that a step stands for: it resists by the share of the pads' way that the object went
+    # in the step before [N/m]
+    drag: ArrayLike = 0.0
+    room: ArrayLike = (-math.inf, math.inf)  # (2,) or (n, 2) stops, along the axis from where the object is now [m]
+
+    def rows(self, count: int) -> Floats:
+        """As `Support.rows`. Raises ValueError for another axis, negative numbers, or stops in the wrong order."""
+        try:
+            axis = np.broadcast_to(np.asarray(self.axis), count)
+            friction, drag = (
+                np.broadcast_to(np.asarray(each, np.float64), count) for each in (self.friction, self.drag)
+            )
+            room = np.broadcast_to(np.asarray(self.room, np.float64), (count, 2))
+        except ValueError:
+            raise ValueError(
+                f"a guide needs an axis, a friction and a drag of one number or ({count},), and a room (2,) or "
+                f"({count}, 2); got {np.shape(self.axis)}, {np.shape(self.friction)}, {np.shape(self.drag)} and "
+                f"{np.shape(self.room)}"
+            ) from None
+        if not (np.isin(axis, (0, 1, 2)).all() and (friction >= 0.0).all() and (drag >= 0.0).all()):
+            raise ValueError("the axis of a guide is 0, 1 or 2, and neither its friction nor its drag is negative")
+        if not (room[:, 0] <= room[:, 1]).all():
+            raise ValueError("the room of a guide ends before it begins: give the lower stop first")
+        stiffness = np.broadcast_to(GUIDE_STIFFNESS, (count, 6))
+        limits = np.stack([friction, np.full(count, math.inf)], axis=1)
+        return np.hstack([stiffness, limits, np.eye(3)[axis.astype(np.int64)], room, drag[:, None]])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,12 +128,12 @@ class GripCommand:
 
     pads: Floats  # (k, 7) poses at the end, world [m]
     force: float | None = None  # grip force [N]; None: the pads stay at their poses
-    support: Support | None = None
+    support: Support | GuideSupport | None = None
 
 
-def support_rows(support: Support | None, count: int) -> tuple[Floats, Floats]:
-    """(n, 6) stiffness and (n, 2) limits, zeros without a support. Raises ValueError as `Support.rows`."""
-    return (np.zeros((count, 6)), np.zeros((count, 2))) if support is None else support.rows(count)
+def support_rows(support: Support | GuideSupport | None, count: int) -> Floats:
+    """As `Support.rows`, zeros without a support."""
+    return np.zeros((count, layout.SUPPORT_NUMBERS + 1)) if support is None else support.rows(count)
 
 
 def centre_of_mass(item: HeldObject) -> Floats:

@@ -236,24 +236,37 @@ def world_motion(grip: ti.template(), it, axes):
 
 
 @ti.func
-def add_support(grip: ti.template(), axes, velocity, spin, step, system: ti.template()):
+def add_support(grip: ti.template(), axes, path, velocity, spin, step, system: ti.template()):
     """Adds force and moment of the object's support to `system` (6, 7): springs with dashpots in world axes, up to a
-    limit, beyond which the support slides along. They are integrated implicitly, so they may be stiff."""
+    limit, beyond which the support slides along; and the stops of a guide. They are integrated implicitly, so they
+    may be stiff.
+
+    path: of the object's centre since the start of the step, world axes.
+    """
     for half in ti.static(range(2)):
         stiffness = constant3(grip, layout.SUPPORT + 3 * half)
         stretch = object3(grip, layout.STRETCH + 3 * half)
         limit = grip.constants[grip.index, layout.SUPPORT_LIMIT + half]
+        limited = constant3(grip, layout.SUPPORT_AXES) if half == 0 else vec3(1.0)
+        moving = velocity if half == 0 else spin
         masses = vec3([system[3 * half + c, 3 * half + c] for c in ti.static(range(3))])
-        dashpot = 2.0 * SUPPORT_ZETA * ti.sqrt(stiffness * masses)
+        rate = 2.0 * SUPPORT_ZETA * ti.sqrt(stiffness * masses) + step * stiffness
         spring = -stiffness * stretch
-        load = spring - dashpot * (velocity if half == 0 else spin)
-        size, held = load.norm(), spring.norm()
+        load = spring - rate * moving
+        size, held = (limited * load).norm(), (limited * spring).norm()
         if held > limit:
-            write3(grip, layout.STRETCH + 3 * half, stretch * (limit / held))
-        grown = step * (dashpot + step * stiffness)
+            write3(grip, layout.STRETCH + 3 * half, stretch * (1.0 - limited * (1.0 - limit / held)))
+        grown = step * rate
         if size > limit:
-            load *= limit / size
-            grown = vec3(0.0)
+            load *= 1.0 - limited * (1.0 - limit / size)
+            grown *= 1.0 - limited
+        if half == 0:
+            low, high = grip.constants[grip.index, layout.GUIDE_ROOM], grip.constants[grip.index, layout.GUIDE_ROOM + 1]
+            at = limited.dot(path)
+            beyond = at - ti.max(low, ti.min(high, at))
+            if beyond != 0.0:
+                load -= limited * (stiffness * beyond + rate * moving)
+                grown += step * rate * limited
         back = axes.transpose()
         push = back @ load
         for r in ti.static(range(3)):
@@ -337,7 +350,8 @@ def move_object(grip: ti.template(), it):
     velocity, spin = world_motion(grip, it, axes)
     supported = constant3(grip, layout.SUPPORT).norm() + constant3(grip, layout.SUPPORT + 3).norm() > 0.0
     if supported:
-        add_support(grip, axes, velocity, spin, step, system)
+        path = frame_row(grip, it, pads, 3) + axes @ object3(grip, layout.PLACE)
+        add_support(grip, axes, path, velocity, spin, step, system)
     load = axes.transpose() @ constant3(grip, layout.LOAD)
     torque = axes.transpose() @ constant3(grip, layout.TORQUE)
     arm = turned_axes(grip) @ constant3(grip, layout.WEIGHT_ARM)
@@ -360,6 +374,8 @@ def move_object(grip: ti.template(), it):
         if fastest > limit:
             moving, turning = moving * (limit / fastest), turning * (limit / fastest)
             grip.whole[index, layout.LIMITED] += 1
+    if supported and it + 1 == grip.whole[index, layout.MOVING]:  # it stops with the pads: it has no momentum
+        moving, turning = vec3(0.0), vec3(0.0)
     write3(grip, layout.VELOCITY, moving)
     write3(grip, layout.SPIN, turning)
     write3(grip, layout.PLACE, object3(grip, layout.PLACE) + step * moving)

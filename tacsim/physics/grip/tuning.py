@@ -9,6 +9,8 @@ tests/tacsim/physics/grip.
 LAYER_SHARE = 0.75
 CLOSING_ZETA = 1.0  # damping ratio of pads that a force closes, against the gels' stiffness
 SUPPORT_ZETA = 1.0  # damping ratio of an object on the springs of its support
+# Of a guide, as springs [N/m, N m/rad]: 3 N of friction hold it within 0.03 mm; with 1e4 N/m within 0.3 mm
+GUIDE_STIFFNESS = (1e5, 1e5, 1e5, 100.0, 100.0, 100.0)
 # Time of a step, in times of the gel's pressure wave through its thickness: with less, shear lags behind the pads
 STEP_TIME = 3.5
 MOVING_SHARE = 0.75  # [-] of the substeps of a step in which the pads move; in the rest all relaxes

@@ -16,7 +16,7 @@ from tacsim.physics.grip import layout
 from tacsim.physics.grip.frames import PadMotions
 from tacsim.physics.grip.grips import Grips
 from tacsim.physics.grip.launch import GripStep
-from tacsim.physics.grip.model import GripCommand, HeldStates, Support, support_rows
+from tacsim.physics.grip.model import GripCommand, GuideSupport, HeldStates, Support, support_rows
 from tacsim.physics.grip.poses import (
     checked_forces,
     checked_numbers,
@@ -60,7 +60,7 @@ class GripWorld(Grips):
     @launching()
     def step(
         self, pads: ArrayLike, *, forces: ArrayLike | None = None, loads: ArrayLike | None = None,
-        support: Support | None = None, settle: bool = False,
+        support: Support | GuideSupport | None = None, settle: bool = False,
     ) -> HeldStates:  # fmt: skip
         """One control step: the pads move evenly to their poses, and objects and gels come to rest as far as the step
         allows.
@@ -109,17 +109,19 @@ class GripWorld(Grips):
         self._require_placed(which)
         ends = checked_poses([each.pads for each in own], (len(own), *self._pads.shape[1:]), "pads")
         forces = checked_forces([np.nan if each.force is None else each.force for each in own], len(own))
-        rows = [support_rows(each.support, 1) for each in own]
-        springs = np.concatenate([row[0] for row in rows]), np.concatenate([row[1] for row in rows])
+        springs = np.concatenate([support_rows(each.support, 1) for each in own])
         failures = self._advance(which, ends, forces, np.zeros((len(own), 6)), springs, settle=settle)
         states = self._states_of(which)
         found = {index: states.row(row) for row, index in enumerate(which.tolist())}
         return {**found, **failures}
 
     @launching()
-    def grasp(self, pads: ArrayLike, forces: ArrayLike, index: int | None = None) -> HeldStates:
+    def grasp(
+        self, pads: ArrayLike, forces: ArrayLike, index: int | None = None, *, guide: GuideSupport | None = None
+    ) -> HeldStates:
         """Closes the pads from poses (n, k, 7), clear of the objects, with grip forces (n,) [N], until all is at rest;
-        then lets the weight of the objects act. Objects are carried at the same time, by weak springs.
+        then lets the weight of the objects act. Objects are carried at the same time, by weak springs, or by the guide
+        on which they are.
 
         index: of one grip, with pads (1, k, 7) and forces (1,), the others stay as they are; None: all. Returns the
         states of these. Raises what `step` raises.
@@ -129,9 +131,10 @@ class GripWorld(Grips):
         ends = checked_poses(pads, (len(which), *self._pads.shape[1:]), "pads")
         grip_forces, free = checked_forces(forces, len(which)), np.zeros((len(which), 6))
         carried = free.copy()
-        carried[:, :3] = -self._state.constants[which, layout.WEIGHT : layout.WEIGHT + 3]
-        springs = support_rows(Support([GRASP_SPRINGS[0]] * 3 + [GRASP_SPRINGS[1]] * 3), len(which))
-        rests = support_rows(None, len(which))
+        if guide is None:
+            carried[:, :3] = -self._state.constants[which, layout.WEIGHT : layout.WEIGHT + 3]
+        weak = Support([GRASP_SPRINGS[0]] * 3 + [GRASP_SPRINGS[1]] * 3)
+        springs, rests = support_rows(guide or weak, len(which)), support_rows(guide, len(which))
         for _ in range(MAX_GRASP_STEPS):
             self._advance_all(which, ends, grip_forces, carried, springs)
             if (self._state.objects[which, layout.IMBALANCE] <= SETTLED_TOLERANCE).all():
@@ -147,7 +150,7 @@ class GripWorld(Grips):
             raise failure
 
     def _advance(
-        self, which: Indices, ends: Floats, forces: Floats, loads: Floats, springs: tuple[Floats, Floats], *,
+        self, which: Indices, ends: Floats, forces: Floats, loads: Floats, springs: Floats, *,
         settle: bool, undo_all: bool = False,
     ) -> Failures:  # fmt: skip
         """One step; returns the failures by grip. undo_all: a failure of one leaves all as they were."""
@@ -164,14 +167,21 @@ class GripWorld(Grips):
             able = np.array([index not in too_far for index in which.tolist()])
             if undo_all or not able.any():
                 return dict(too_far)
-            given = ends[able], forces[able], loads[able], (springs[0][able], springs[1][able])
+            given = ends[able], forces[able], loads[able], springs[able]
             return {**too_far, **self._advance(which[able], *given, settle=settle)}
         starting = self._write_objects(which, forces, closings, max_closings(ends))
+        paths = self._find_support_paths(which, motions)
+        follows = self._follow_shares[which][:, None] * paths
+        self._state.constants[which, layout.SUPPORT_LIMIT] += springs[:, -1] / MM * np.linalg.norm(follows, axis=1)
+        follows /= moving[:, None]  # in the first substep
+        for first, part in ((layout.PLACE, 1.0), (layout.STRETCH, 1.0), (layout.VELOCITY, 1.0 / self._substep)):
+            starting[:, first : first + 3] += part * follows
         step = self._describe_step(which, motions, moving, starting, settle=settle)
         failures = self._launcher.advance(step, undo_all=undo_all)
         if not (failures and undo_all):
             done = np.array([index not in failures for index in which.tolist()])
             self._finish(which, motions, ends, forces, done)
+            self._update_follow_shares(which[done], paths[done])
         return failures
 
     def _begin_closing(self, which: Indices, ends: Floats, forces: Floats) -> Floats:
@@ -180,15 +190,14 @@ class GripWorld(Grips):
         closed = self._closings[which] if alone else half_widths(ends) - half_widths(self._pads[which])
         return np.where(np.isnan(forces), 0.0, closed)
 
-    def _write_loads(self, which: Indices, loads: Floats, springs: tuple[Floats, Floats]) -> None:
-        constants, (stiffness, limits) = self._state.constants, springs
+    def _write_loads(self, which: Indices, loads: Floats, springs: Floats) -> None:
+        constants = self._state.constants
         weights = constants[which, layout.WEIGHT : layout.WEIGHT + 3]
         constants[which, layout.LOAD : layout.LOAD + 3] = weights + loads[:, :3]
         constants[which, layout.TORQUE : layout.TORQUE + 3] = loads[:, 3:] * MM
-        constants[which, layout.SUPPORT : layout.SUPPORT + 6] = stiffness * [*[1 / MM] * 3, *[MM] * 3]
-        constants[which, layout.SUPPORT_LIMIT : layout.SUPPORT_LIMIT + 2] = np.minimum(
-            limits * [1.0, MM], np.finfo(np.float32).max
-        )
+        units, most = [*[1 / MM] * 3, *[MM] * 3, 1.0, MM, *[1.0] * 3, MM, MM], np.finfo(np.float32).max
+        numbers = np.clip(springs[:, :-1] * units, -most, most)
+        constants[which, layout.SUPPORT : layout.SUPPORT + layout.SUPPORT_NUMBERS] = numbers
 
     def _plan(self, which: Indices, motions: PadMotions) -> tuple[NDArray[np.int64], dict[int, ValueError]]:
         """(m,) substeps in which the pads move, and errors of grips whose pads move too far, the worst first."""
@@ -213,6 +222,19 @@ class GripWorld(Grips):
     def _find_carrying(self, which: Indices) -> NDArray[np.bool_]:
         """(m, k) whether a pad touches an object that nothing else holds."""
         return self._touching[which] & ~self._find_supported(which)[:, None]
+
+    def _find_support_paths(self, which: Indices, motions: PadMotions) -> Floats:
+        """(m, 3) mean motion of the pads, as far as an object on a support can follow it by sliding, world [mm]."""
+        sliding = self._state.constants[which, layout.SUPPORT_AXES : layout.SUPPORT_AXES + 3].astype(np.float64)
+        return np.asarray(self._find_supported(which)[:, None] * sliding * motions.shifts.mean(axis=1))
+
+    def _update_follow_shares(self, which: Indices, paths: Floats) -> None:
+        """An object that pads pull along its support begins the next step as fast as they do: each step has its own
+        start and stop, and the object no momentum that could make it lag and overshoot."""
+        found = self._state.objects[which, layout.PLACE : layout.PLACE + 3].astype(np.float64)
+        squares = (paths**2).sum(axis=1)
+        shares = (found * paths).sum(axis=1) / np.where(squares > 0.0, squares, 1.0)
+        self._follow_shares[which] = np.clip(shares, 0.0, 1.0)
 
     def _is_clear(self, index: int, length: float) -> bool:
         """Whether no pad of a grip can touch its object after a motion of this length [mm]."""

@@ -13,14 +13,14 @@ from tacsim.control import NoTouch, ObjectDropped
 from tacsim.interface import FloatArray, Pose
 from tacsim.limits import LimitExceeded
 from tacsim.models.scene import GelSurface, Scene
-from tacsim.physics.grip.model import GripCommand, HeldObject, HeldStates, Support
+from tacsim.physics.grip.model import GripCommand, GuideSupport, HeldObject, HeldStates, Support
 from tacsim.physics.grip.shared import GripPlace, SharedGrips
 from tacsim.sim.cell import tuning
 from tacsim.sim.cell.cell import PERIOD_ERRORS, Cell, PeriodError
 from tacsim.sim.cell.description import ArmDescription, GripperDescription, ViewDescription
 from tacsim.sim.cell.drives import State
 from tacsim.sim.cell.grip import min_grip_force, require_enough
-from tacsim.sim.cell.model import OBJECT
+from tacsim.sim.cell.model import OBJECT, object_start
 from tacsim.sim.engines.mujoco_module import load_mujoco
 
 GripMotion = Generator[GripCommand, HeldStates, None]
@@ -30,7 +30,7 @@ class RestingCell(Cell):
     """As a Cell, but nothing has momentum: arms and fingers go where they are sent, and object and gels are solved
     together until they rest (tacsim.physics.grip). MuJoCo has the places of all for joints and pictures.
 
-    Raises ValueError in addition for two grippers, for an object on a guide, and for fixtures.
+    Raises ValueError in addition for two grippers and for fixtures.
     """
 
     def __init__(
@@ -65,7 +65,8 @@ class RestingCell(Cell):
         self._put_in_place()
         width = self._gripper.width
         try:
-            self._take(self.held.grasp(self._pad_poses()[None], [force], self.grip_number), width)
+            guide = self._guide(0.0)
+            self._take(self.held.grasp(self._pad_poses()[None], [force], self.grip_number, guide=guide), width)
         except ValueError as failure:
             raise LimitExceeded(str(failure)) from failure
         self._gripper.command(0.0, force)
@@ -102,19 +103,19 @@ class RestingCell(Cell):
         try:
             if width < here:
                 before = self.held.snapshot(self.grip_number)
-                states, from_width = (yield self._command(here, force)), here
+                states, from_width = (yield self._command(here, force, seconds)), here
                 if here - 2 * float(states.closings[0]) < width:  # it meets nothing before its width
                     self.held.restore(self.grip_number, before)
                     from_width = max(width, here - way)
-                    states = yield self._command(from_width, None)
+                    states = yield self._command(from_width, None, seconds)
             else:
                 from_width = min(width, here + way)
-                states = yield self._command(from_width, None)
+                states = yield self._command(from_width, None, seconds)
         except ValueError as failure:
             raise LimitExceeded(str(failure)) from failure
         self._take(states, from_width)
         self.data.time += seconds
-        if states.dropped[0]:
+        if states.dropped[0] and self.item.guide is None:
             raise ObjectDropped(
                 f"the object was dropped: no pad touches it any more. Two pads hold {self.item.mass:.3g} kg still with "
                 f"at least {min_grip_force(self, len(self.grippers)):.3g} N each"
@@ -125,11 +126,21 @@ class RestingCell(Cell):
         self.held.reset([*here.position, *here.quaternion], self._pad_poses(), self.grip_number)
         self._states = self.held.state_of(self.grip_number)
 
-    def _command(self, width: float, force: float | None) -> GripCommand:
-        """force: from `width` the pads close until they press with it [N]; None: they stay there."""
+    def _command(self, width: float, force: float | None, seconds: float) -> GripCommand:
+        """force: from `width` the pads close until they press with it [N]; None: they stay there. seconds: of the
+        period."""
         self._gripper.set_width(width)
         self.refresh()
-        return GripCommand(self._pad_poses(), force, Support(tuning.PEDESTAL_STIFFNESS) if self.has_pedestal else None)
+        pedestal = Support(tuning.PEDESTAL_STIFFNESS) if self.has_pedestal else None
+        return GripCommand(self._pad_poses(), force, self._guide(seconds) or pedestal)
+
+    def _guide(self, seconds: float) -> GuideSupport | None:
+        """The object's guide in a period; 0 s: without its damper."""
+        guide = self.item.guide
+        if guide is None:
+            return None
+        travel, drag = float(self.data.qpos[self._joint]), guide.damping / seconds if seconds else 0.0
+        return GuideSupport("xyz".index(guide.axis), guide.friction, drag, (-travel, guide.travel - travel))
 
     def _pad_poses(self) -> FloatArray:
         """(2, 7)"""
@@ -139,8 +150,12 @@ class RestingCell(Cell):
     def _take(self, states: HeldStates, width: float) -> None:
         """Puts object and fingers where they are after a step from `width`."""
         self._states = states
-        place = states.objects[0]
-        self.data.qpos[self._joint : self._joint + 7] = [*place[:3], *np.roll(place[3:], 1)]
+        place, guide = states.objects[0], self.item.guide
+        if guide is None:
+            self.data.qpos[self._joint : self._joint + 7] = [*place[:3], *np.roll(place[3:], 1)]
+        else:
+            axis = "xyz".index(guide.axis)
+            self.data.qpos[self._joint] = place[axis] - object_start(self.scene).position[axis]
         self._gripper.set_width(width - 2 * float(states.closings[0]))
         self._gripper.force = float(np.mean([self.normal_force(pad) for pad in self._pads]))
         self._max_forces = np.maximum(0.0, -states.wrenches[0, :, 2])
@@ -204,16 +219,10 @@ def move_together(
 
 
 def _require_free(scene: Scene, grippers: int) -> None:
-    item = scene.object
-    assert item is not None
-    wrong = {
-        f"{grippers} grippers": grippers != 1,
-        "an object on a guide": item.guide is not None,
-        "fixtures": bool(scene.fixtures),
-    }
+    wrong = {f"{grippers} grippers": grippers != 1, "fixtures": bool(scene.fixtures)}
     for what, is_there in wrong.items():
         if is_there:
             raise ValueError(
-                f"with motion settled or flowing a scene has one gripper and a free object, not {what}: use motion "
+                f"with motion settled or flowing a scene has one gripper and nothing fixed, not {what}: use motion "
                 "dynamic"
             )

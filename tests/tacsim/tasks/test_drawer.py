@@ -13,6 +13,7 @@ from robot.deploy.control_loop import run_episode
 from robot.open import load_with_task
 from tacsim.config import load_task
 from tacsim.interface import Pose, TactileObservation, Truth
+from tacsim.record.episode import Episode
 from tacsim.tasks import GoalOutOfReach, make_task
 from tacsim.tasks.drawer import Drawer, middle_of_contact, min_pulling_grip
 
@@ -62,8 +63,13 @@ def test_the_expert_pulls_as_far_as_is_left() -> None:
     made, start = task(), truth()
     assert made.expert(truth(10e-3), start)[0] == 1.0
     assert made.expert(truth(29.75e-3), start)[0] == pytest.approx(0.5)
-    grip = made.grip_axis.target(float(made.expert(start, start)[1]))
-    assert grip.force == pytest.approx(1.5 * LEAST)
+
+
+@pytest.mark.parametrize(("grip", "asked"), [(6.0, 5.4), (1.6 * LEAST, 1.5 * LEAST), (0.5 * LEAST, 1.5 * LEAST)])
+def test_the_expert_lowers_the_grip_to_what_is_wanted(grip: float, asked: float) -> None:
+    made = task()
+    action = made.expert(truth(grip=grip), truth())
+    assert made.grip_axis.target(float(action[1])).force == pytest.approx(asked)
 
 
 def test_axes_follow_the_guide() -> None:
@@ -107,9 +113,9 @@ def replace_height(touch: TactileObservation, height: Any) -> TactileObservation
     return replace(touch, height=height)
 
 
-@pytest.mark.slow
-def test_the_scripted_policy_opens_the_drawer_with_little_grip() -> None:
-    loaded = load_with_task("hand", "drawer", ["task.goal=20 mm", "task.touch_force=3 N", "scene.object.mass=0.1"])
+def play(motion: str) -> Episode:
+    changed = ["task.goal=20 mm", "task.touch_force=3 N", "scene.object.mass=0.1", f"motion={motion}"]
+    loaded = load_with_task("hand", "drawer", changed)
     assert loaded.config.task is not None
     made = make_task(loaded.config.task)
     assert isinstance(made, Drawer)
@@ -119,3 +125,13 @@ def test_the_scripted_policy_opens_the_drawer_with_little_grip() -> None:
     assert episode.steps[-1].distance <= made.config.success
     pulled = [float(np.linalg.norm(step.arms["hand"].wrench[:3])) for step in episode.steps[25:35]]
     assert pulled == pytest.approx([1.51] * len(pulled), rel=0.02)  # a light drawer resists as much as a heavy one
+    return episode
+
+
+@pytest.mark.slow
+def test_the_scripted_policy_opens_the_drawer_with_little_grip_at_rest_as_in_time() -> None:
+    rested, lived = play("flowing"), play("dynamic")
+    for number in (20, 30, 40, 50):
+        ours, theirs = rested.steps[number], lived.steps[number]
+        assert ours.distance == pytest.approx(theirs.distance, abs=0.2e-3)
+        assert ours.grippers["hand"].force == pytest.approx(theirs.grippers["hand"].force, rel=0.01)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tacsim import pose as se3
 from tacsim.control import NoTouch, ObjectDropped
 from tacsim.interface import Pose
 from tacsim.limits import LimitExceeded
@@ -109,16 +110,34 @@ def test_a_restored_cell_goes_on_with_the_same_bits() -> None:
     assert go_on() == first
 
 
-@pytest.mark.parametrize(
-    ("thing", "values", "message"),
-    [
-        ({"guide": {"axis": "y"}, "pedestal": 0.0}, {}, "an object on a guide: use motion dynamic"),
-        ({}, {"fixtures": {"wall": {"position": [0, 0.1, 0.05]}}}, "not fixtures: use motion dynamic"),
-    ],
-)
-def test_what_needs_time_is_refused(thing: dict[str, Any], values: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        resting(scene(thing, **values))
+def test_fixtures_are_refused() -> None:
+    with pytest.raises(ValueError, match="nothing fixed, not fixtures: use motion dynamic"):
+        resting(scene(fixtures={"wall": {"position": [0, 0.1, 0.05]}}))
+
+
+def test_a_guided_object_resists_slides_and_stops() -> None:
+    guide = {"axis": "y", "travel": 5e-3, "friction": 1.0, "damping": 10.0}
+    cell = held(3.0, scene({"guide": guide}))
+    begin, flowing = cell.pose("hand"), RestingMotion(settle=False)
+
+    def pull_to(way: float) -> float:
+        """Returns the force of the object on the hand along world y."""
+        flowing.advance(cell, {"hand": Pose(begin.position + [0, way, 0], begin.quaternion)}, 0.05)
+        return float(se3.rotate(cell.pose("hand"), cell.wrench("hand")[:3])[1])
+
+    forces = [pull_to(0.5e-3 * number) for number in range(1, 9)]
+    assert forces[-3:] == pytest.approx([-1.1] * 3, rel=5e-3)  # 10 mm/s
+    assert cell.truth().objects["object"].position[1] == pytest.approx(4e-3, abs=0.5e-3)
+    assert weight_on(cell) == pytest.approx(0.0, abs=5e-3)
+    state = cell.snapshot()
+    for number in range(9, 14):
+        force = pull_to(0.5e-3 * number)
+    assert force < -2.0 and cell.object_pose().position[1] == pytest.approx(5e-3, abs=0.05e-3)
+    cell.restore(state)
+    cell.grippers["hand"].command(0.03, 3.0)
+    flowing.advance(cell, {}, 0.05)
+    assert not weight_on(cell)  # it lets go: the guide holds the object where it is
+    assert cell.object_pose().position[1] == pytest.approx(float(state["qpos"][0]), abs=20e-6)
 
 
 def test_a_grip_that_cannot_carry_is_refused() -> None:

@@ -88,14 +88,14 @@ class PadGels(NotCopyable):
         if state.device is not None:
             return np.zeros(len(steps), np.bool_)
         moving, spacing = state.gels.common_group.nodes[rows, 0, :2], state.gel[0].spacing
-        u, v = moving[:, 0], moving[:, 1]
-        far = max(u.max(), -u.min())
+        far, fast = np.abs(moving).max(axis=(0, 2, 3, 4))
         if (
-            max(v.max(), -v.min()) < MAX_SPEED and (spacing - 2 * far) * MAX_COURANT > steps.max()
+            fast < MAX_SPEED and (spacing - 2 * far) * MAX_COURANT > steps.max()
             and partial[:, :, SMALLEST_VOLUME].min() > MIN_VOLUME_RATIO and math.isfinite(partial.sum())
         ):  # fmt: skip
             return np.ones(len(steps), np.bool_)  # nearly always: no edge is as short as the displacements allow
         nx, ny, _ = state.gel[0].elements
+        u, v = moving[:, 0], moving[:, 1]
         u = u[..., : (nx + 1) * (ny + 1)].reshape(*u.shape[:3], nx + 1, ny + 1)
         edges = (
             u[:, 0, :, 1:] - u[:, 0, :, :-1], u[:, 1, ..., 1:] - u[:, 1, ..., :-1], u[:, 2, 1:] - u[:, 2, :-1]

@@ -135,9 +135,12 @@ class PadLauncher:
     ) -> NDArray[np.bool_]:
         """(m,) whether a gel may not resolve a tip of its object, which is to be checked: in some steps where they
         touch, and where they do not, although the object reaches below the surface. ends: (m, 6, 3)."""
+        in_turn = numbers % CHECKED_STEPS == 0
+        if overlap.min() > 0.0:
+            return np.asarray(in_turn)
         lowest = ends[:, 3, 2] - self._gels.reaches(rows, ends[:, 2:3])[:, 0]
         tops = self._state.gels.common_group.u[rows, 0, :, :, -1, 2].reshape(len(numbers), -1).max(axis=1)
-        return np.asarray(np.where(overlap > 0.0, numbers % CHECKED_STEPS == 0, ~(lowest > tops)))
+        return np.asarray(np.where(overlap > 0.0, in_turn, ~(lowest > tops)))
 
     def _check(
         self, step: PadStep, row: int, drive: Drive, overlap: float, stored: _StoredGels, *, healthy: bool

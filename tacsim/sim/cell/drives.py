@@ -45,7 +45,7 @@ class FreeDrive:
         self._flange_from_tool = Pose(model.site_pos[tool], np.roll(model.site_quat[tool], -1))
         self._tool_from_flange = se3.inverse(self._flange_from_tool)
         self._target = self._start = Pose()
-        self._shift = self._turn = Ramp.rest(3)
+        self._ramp = Ramp.rest(6)  # shift and rotation vector
         self._last_speed = np.zeros(6)
 
     def place(self, tool: Pose) -> None:
@@ -60,24 +60,23 @@ class FreeDrive:
         self._target = self._target if target is None else target
         self._start = site_pose(self._data, self._tool)
         way = se3.pose_difference(self._start, self._target)
-        self._shift = Ramp.plan(way[:3], self._last_speed[:3], seconds)
-        self._turn = Ramp.plan(way[3:], self._last_speed[3:], seconds)
+        self._ramp = Ramp.plan(way, self._last_speed, seconds)
 
     def apply(self, time: float) -> None:
         """Before a step that begins `time` [s] after `begin`: what makes it follow its plan."""
         dt = float(self._model.opt.timestep)
         after = time + dt
-        self._last_speed = np.concatenate([self._shift.speed(after), self._turn.speed(after)])
+        self._last_speed, way = self._ramp.speed(after), self._ramp.displacement(after)
         # quaternions as plain numbers: this is called in each timestep
-        tool = turned_by(self._start.quaternion.tolist(), self._turn.displacement(after).tolist())
+        tool = turned_by(self._start.quaternion.tolist(), way[3:].tolist())
         arm = rotated(self._tool_from_flange.position.tolist(), tool)
         to = product(tool, self._tool_from_flange.quaternion.tolist())
         place = self._data.qpos[self._places : self._places + 7]
         w, x, y, z = place[3:].tolist()
-        way = self._data.qvel[self._speeds : self._speeds + 6]
-        way[:3] = (self._start.position + self._shift.displacement(after) + arm - place[:3]) / dt
+        speed = self._data.qvel[self._speeds : self._speeds + 6]
+        speed[:3] = (self._start.position + way[:3] + arm - place[:3]) / dt
         # MuJoCo has a free body's spin in its own axes
-        way[3:] = np.array(rotation_vector(product((-x, -y, -z, w), to))) / dt
+        speed[3:] = np.array(rotation_vector(product((-x, -y, -z, w), to))) / dt
 
     def snapshot(self) -> dict[str, NDArray[Any]]:
         return {"target": np.concatenate([self._target.position, self._target.quaternion]), "speed": self._last_speed}

@@ -141,12 +141,14 @@ class ScriptedDrawer:
 
     def __call__(self, observation: Observation) -> Action:
         arm = observation.arms[self._config.arm]
+        lag, before = 0.0, self._lag
         if self._start is None:
             self._start = arm.pose
             for name, touch in observation.tactile.items():
                 self._first[name] = middle_of_contact(touch)
                 self._pitch[name] = math.sqrt(self._face / max(int(touch.contact.sum()), 1))
-        lag, before = self._measure_lag(observation), self._lag
+        else:  # before the first pull, the flow does not show its direction
+            lag = self._measure_lag(observation)
         self._lag = lag
         if not self._arrived:
             self._change_force(lag - before)

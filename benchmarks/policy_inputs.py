@@ -17,10 +17,7 @@ from benchmarks.transfer import run_tacsim, set_options
 
 SPLITS = ("test", "shift-all")
 MAPS = ["features.maps=[height]", "dagger.epochs=20"]  # a network with maps learns in fewer epochs
-DRAWS = """randomise={draws: 128, values: {
-    scene.object.geometry.size: {uniform: [[20 mm, 8 mm, 8 mm], [20 mm, 18 mm, 18 mm]]},
-    scene.object.mass: {log_uniform: [0.03, 0.25]}, scene.object.friction: {uniform: [0.35, 0.9]},
-    scene.gel.material.youngs_modulus: {normal: [0.145 MPa, 0.02 MPa], within: [0.1 MPa, 0.2 MPa]}}}"""
+EQUAL_BUDGET = ["randomise.draws=128", "dagger.rounds=20"]  # of the students of hold: 19,200 control steps
 # task -> what the student sees -> training file and its changes
 POLICIES: dict[str, dict[str, tuple[str, list[str]]]] = {
     "squeeze": {
@@ -49,8 +46,8 @@ POLICIES: dict[str, dict[str, tuple[str, list[str]]]] = {
     },
     "lengthen": {"maps": ("lengthen", ["dagger.epochs=20"])},
     "hold": {
-        "flow": ("hold", [DRAWS]),
-        "depth": ("hold", [DRAWS, "features.flow=false", "features.touch=[area, depth, wrench, grip]"]),
+        "flow": ("hold", EQUAL_BUDGET),
+        "depth": ("hold", [*EQUAL_BUDGET, "features.flow=false", "features.touch=[area, depth, wrench, grip]"]),
     },
 }
 

@@ -19,6 +19,10 @@ from tacsim.config import load_model
 from tacsim.models.policy import Training
 
 ROUNDS = 4  # of each training: 3,840 control steps
+# One box, as of the twins: the shipped training has boxes of many sizes.
+ONE_BOX = """randomise={draws: 128, values: {
+    scene.object.mass: {log_uniform: [0.03, 0.25]}, scene.object.friction: {uniform: [0.35, 0.9]},
+    scene.gel.material.youngs_modulus: {normal: [0.145 MPa, 0.02 MPa], within: [0.1 MPa, 0.2 MPa]}}}"""
 # Pictures are what one policy sees: 320 x 240 px of a sensor, four by four in one. The others see none.
 PICTURES = [
     f"sensors.{side}.model.geometry.{key}"
@@ -41,8 +45,8 @@ POLICIES = {
 
 
 def training(policy: str) -> Training:
-    """The shipped training of `hold`, with what this policy sees."""
-    return load_model(Training, "hold", [*POLICIES[policy], f"dagger.rounds={ROUNDS}"])
+    """The shipped training of `hold` with one box, and the features of this policy."""
+    return load_model(Training, "hold", [ONE_BOX, *POLICIES[policy], f"dagger.rounds={ROUNDS}"])
 
 
 def train(folder: Path, policies: list[str]) -> None:

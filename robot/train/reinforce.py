@@ -34,7 +34,7 @@ class Reinforce:
     def __init__(
         self, envs: Environments, training: Training, actor: PolicyNetwork, folder: Path, tensorboard: bool = False
     ) -> None:
-        rounds = {"ppo": 120, "sac": 24}  # where the training file names no number
+        rounds = {"ppo": 70, "sac": 24}  # where the training file names no number
         replay_steps = 50_000  # control steps in the replay buffer of SAC
         warm_up_steps = 1000  # control steps with random actions before SAC learns
         settings = training.reinforce

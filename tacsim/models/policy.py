@@ -168,7 +168,7 @@ class DaggerConfig(Config):
 class ReinforceConfig(Config):
     """PPO (Schulman et al. 2017) or SAC (Haarnoja et al. 2018), of stable-baselines3: from the reward alone."""
 
-    rounds: Count | None = None  # in each, every environment plays `episodes`; None: 120 of ppo, 24 of sac
+    rounds: Count | None = None  # in each, every environment plays `episodes`; None: 70 of ppo, 24 of sac
     episodes: Count = 2
     batch: Count = 256
     rate: Rate = 3e-4  # of Adam; it falls to zero over the rounds

@@ -170,42 +170,50 @@ def max_rank_violation(simulated: FloatArray, real: FloatArray) -> float:
 
 
 def draw_ranking(rankings: Sequence[Ranking], path: Path, names: tuple[str, str]) -> None:
-    """A scatter of success in simulation against success on the twin: a marker for each task, a colour for each policy.
+    """Success in simulation against success on the twin: a panel for each task, a colour for each name of a policy.
 
     names: of both sides, for the axes.
     """
+    from matplotlib import colormaps
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(7.6, 5.2), layout="constrained")
-    axes = figure.subplots()
-    axes.plot([0, 100], [0, 100], color="#bbbbbb", linewidth=1, zorder=0)
-    policies = list(dict.fromkeys(pair.policy for ranking in rankings for pair in ranking.pairs))
-    for ranking, marker in zip(rankings, "os^DvPX*<>" * len(rankings), strict=False):
+    columns = min(3, len(rankings))
+    rows = -(-len(rankings) // columns)
+    figure = Figure(figsize=(2.9 * columns + 1.8, 2.9 * rows + 0.4), layout="constrained")
+    panels = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
+    policies = list(dict.fromkeys(_short_name(pair.policy) for ranking in rankings for pair in ranking.pairs))
+    colours = {policy: colormaps["tab20"](number % 20) for number, policy in enumerate(policies)}
+    for panel in panels.flat[len(rankings) :]:
+        panel.set_visible(False)
+    for ranking, panel in zip(rankings, panels.flat, strict=False):
+        panel.plot([0, 100], [0, 100], color="#bbbbbb", linewidth=1, zorder=0)
         rho = ranking.by_success.spearman
-        label = f"{ranking.task}: {'no order' if rho is None else f'ρ = {rho.value:.2f}'}"
-        axes.plot([], [], marker, color="#555555", label=label)
+        panel.set_title(f"{ranking.task}: {'no order' if rho is None else f'ρ = {rho.value:.2f}'}", fontsize=10)
         for pair in ranking.pairs:
             one, two = pair.success
-            axes.errorbar(
+            panel.errorbar(
                 100 * one.value,
                 100 * two.value,
                 xerr=_error_lengths(one),
                 yerr=_error_lengths(two),
-                fmt=marker,
-                color=f"C{policies.index(pair.policy)}",
-                markersize=8,
+                fmt="o",
+                color=colours[_short_name(pair.policy)],
+                markersize=7,
                 elinewidth=0.6,
-                alpha=0.85,
+                alpha=0.9,
             )
-    for number, policy in enumerate(policies):
-        axes.plot([], [], "s", color=f"C{number}", label=policy if ":" in policy else Path(policy).name)
-    axes.set_xlabel(f"success, {names[0]} [%]")
-    axes.set_ylabel(f"success, {names[1]} [%]")
-    axes.set_xlim(-4, 104)
-    axes.set_ylim(-4, 104)
-    axes.set_box_aspect(1)
+        panel.set(xlim=(-5, 105), ylim=(-5, 105), box_aspect=1)
+    figure.supxlabel(f"success, {names[0]} [%]", fontsize=10)
+    figure.supylabel(f"success, {names[1]} [%]", fontsize=10)
+    for policy, colour in colours.items():
+        panels[0, 0].plot([], [], "o", color=colour, label=policy)
     figure.legend(loc="outside right upper", fontsize=8, frameon=False)
     figure.savefig(path, dpi=110)
+
+
+def _short_name(policy: str) -> str:
+    """As the table calls it: without folder and ending of a file."""
+    return policy if ":" in policy else Path(policy).name.removesuffix(".onnx")
 
 
 def _error_lengths(interval: Interval) -> list[list[float]]:

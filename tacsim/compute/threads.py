@@ -26,6 +26,11 @@ def thread_count() -> int:
     return min(int(wanted), core_count())
 
 
+def has_one_thread() -> bool:
+    """Whether only one thread may compute; False where `thread_count` raises."""
+    return os.environ.get("TACSIM_THREADS") == "1" or core_count() == 1
+
+
 def map_serial(calls: Sequence[Callable[[], Result]]) -> list[Result]:
     """Results of the calls; after the first failure, the rest is not called."""
     return [call() for call in calls]

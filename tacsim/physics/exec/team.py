@@ -14,7 +14,7 @@ import numpy as np
 
 from tacsim.compute.runtime import launching, ti
 from tacsim.compute.taichi_patches.repeated_launch import launch_kernel
-from tacsim.compute.threads import thread_count
+from tacsim.compute.threads import has_one_thread, thread_count
 from tacsim.physics.exec.lanes import PARTS
 
 CHUNK = 512  # iterations of a loop that Taichi runs on one thread: each thread gets a chunk and executes its first one
@@ -22,6 +22,10 @@ MAX_POLLS = 8_000  # of a stage that is not done; then a thread leaves, after ab
 
 # Columns of `sync`; it has a row (one cache line) for each environment with substeps in the launch
 ENVIRONMENT, DONE, CLAIMED = range(3)  # index; pieces done; stages claimed of part 0, 1, ...
+
+# Whether short kernels run on the thread that launches them. Taichi's own thread may be on another core, to which all
+# arrays must go and back: on a machine in use a timestep of gel pads took 1.4 times the CPU time.
+SERIAL = has_one_thread()
 
 Sync = ti.types.ndarray(dtype=ti.i32, ndim=2)
 

@@ -9,6 +9,7 @@ from tacsim.physics.exec.lanes import PARTS
 from tacsim.physics.exec.team import (
     CHUNK,
     ENVIRONMENT,
+    SERIAL,
     Sync,
     claim_work,
     first_in_chunk,
@@ -25,6 +26,7 @@ def substeps(
     environments: EnvironmentArrays, sync: Sync,
 ):  # fmt: skip
     """Explicit substeps in one launch by `team` threads; drive: pose and velocity of the indenter, sensor frame."""
+    ti.loop_config(serialize=SERIAL)
     for task in range(sync.shape[0] * team * CHUNK):
         for _ in range(first_in_chunk(task)):
             turn = task // CHUNK // team

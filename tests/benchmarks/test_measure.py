@@ -51,12 +51,12 @@ def test_median_and_spread() -> None:
 def test_peak_memory_sees_a_large_array_that_is_gone_until_it_is_forgotten() -> None:
     reset_peak_memory()
     before = peak_memory()
-    block = bytearray(100_000_000)
+    block = bytearray(400_000_000)  # far more than other threads of the process allocate at the same time
     block[::4096] = b"x" * len(block[::4096])
     del block
-    assert peak_memory() > before + 50
+    assert peak_memory() > before + 250
     reset_peak_memory()
-    assert peak_memory() < before + 50
+    assert peak_memory() < before + 250
 
 
 # Importable by name, as a spawned process needs it: json.loads(3) raises, os._exit(3) dies, time.sleep(30) hangs.

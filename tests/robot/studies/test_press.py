@@ -146,8 +146,12 @@ def test_a_move_that_fails_says_how_far_it_came() -> None:
     scene = Scene.model_validate({"body": None, "preset": "draft", "indenter": Indenter(geometry=Sphere(radius=4e-3))})
     world = PressWorld(scene)
     start = world.pose("indenter")
-    with pytest.raises(SimulationDiverged, match=r"^'indenter' moved (\d\.\d+) mm of the 3\.9 mm .* about") as failed:
-        world.move({"indenter": Pose(start.position - [0.0, 0.0, 3.9e-3], start.quaternion)})
+    before = world.snapshot()
+    words = r"^'indenter' moved (\d\.\d+) mm of the 3\.[789] mm .* about"
+    with pytest.raises(SimulationDiverged, match=words) as failed:  # noqa: PT012
+        for depth in (3.7e-3, 3.8e-3, 3.9e-3):  # which of these fail depends on the processor, by rounding
+            world.restore(before)
+            world.move({"indenter": Pose(start.position - [0.0, 0.0, depth], start.quaternion)})
     possible = float(str(failed.value).split("no more than about ")[1].split()[0])
     world.move({"indenter": Pose(start.position - [0.0, 0.0, 1e-3 * possible], start.quaternion)})
 

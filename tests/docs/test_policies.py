@@ -28,6 +28,9 @@ def test_each_shipped_policy_has_its_card(path: Path) -> None:
     if "body.material.yield_stress" in scene and path.stem != "reposition":  # there it is that of the scene
         low, high = scene["body.material.yield_stress"]
         assert f"yield stress {1e-3 * low:g} to {1e-3 * high:g} kPa" in card
+    if "object.mass" in scene:
+        low, high = scene["object.mass"]
+        assert f"{1e3 * low:g} to {1e3 * high:g} g" in card
     low, high = scene["gel.material.youngs_modulus"]
     assert f"gels {1e-6 * low:.2g} to {1e-6 * high:.2g} MPa" in card
     assert all(f"| {row} |" in card for row in ("Does", "Observes", "Range", "Success", "Limits"))

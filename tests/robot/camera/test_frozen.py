@@ -49,7 +49,7 @@ def test_camera_frozen_picture_is_reported_as_stale(server: Server, figure: Reco
         frozen.set()
         began = time.monotonic()
         until(lambda: camera.status.error is not None)
-        figure("frozen picture told (max_age 200 ms)", 1e3 * (time.monotonic() - began), "ms", at_most=300)
+        figure("frozen picture reported (max_age 200 ms)", 1e3 * (time.monotonic() - began), "ms", at_most=300)
         before, status = camera.status.frames, camera.status
         until(lambda: camera.status.repeated > status.repeated + 20)
         figure("stale frames delivered, or passed as new", camera.status.frames - before)

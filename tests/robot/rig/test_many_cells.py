@@ -56,7 +56,8 @@ def test_a_batch_of_grips_gives_the_bits_of_cells_apart(mode: str, motion: str) 
     """In all modes, with variants of object, friction, modulus and gravity, in `dynamic` of the timestep too, over ends
     by drops and by steps."""
     variants = (*VARIANTS, SLOW_CLOCK) if motion == "dynamic" else VARIANTS
-    number, random, options = 3, np.random.default_rng(4), options_of(motion, 12, variants)
+    steps = 6 if motion == "settled" else 12  # in 16 steps some end, although most objects slip at rest
+    number, random, options = 3, np.random.default_rng(4), options_of(motion, steps, variants)
     batched = make_vector_env(number, autoreset_mode=mode, **options)
     apart = SyncVectorEnv([partial(make_env, **options)] * number, autoreset_mode=AutoresetMode(mode))
     assert_equal(batched.reset(seed=7), apart.reset(seed=7))

@@ -223,6 +223,5 @@ def _require_free(scene: Scene, grippers: int) -> None:
     for what, is_there in wrong.items():
         if is_there:
             raise ValueError(
-                f"with motion settled or flowing a scene has one gripper and nothing fixed, not {what}: use motion "
-                "dynamic"
+                f"motion settled or flowing takes one gripper and no fixtures, and here are {what}: use motion dynamic"
             )

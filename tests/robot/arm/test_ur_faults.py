@@ -200,8 +200,8 @@ def test_arm_protective_stop_raises_until_recover(arm: URArm, mock: MockUR, figu
     at_full_speed(arm, moved(start, x=0.12))
     asked = time.monotonic()
     mock.faults.protective_stop()
-    told = until(lambda: arm.status() == ArmStatus.PROTECTIVE_STOP, "protective stop", pause=2e-4)
-    figure("protective stop reported", 1e3 * (told - asked), "ms", at_most=20)
+    reported = until(lambda: arm.status() == ArmStatus.PROTECTIVE_STOP, "protective stop", pause=2e-4)
+    figure("protective stop reported", 1e3 * (reported - asked), "ms", at_most=20)
     until(lambda: mock.faults.state().rests, "rest")
     before, mark = mock.faults.state(), mock.faults.received().last
     for _ in range(20):

@@ -47,9 +47,9 @@ def test_arm_silent_link_raises_link_lost_in_time(mock: MockUR, measuring: bool,
         at_full_speed(arm, moved(start, x=0.12))
         mock.faults.silence(True)
         last = mock.faults.received().last
-        told = until(lambda: arm.status() == ArmStatus.LINK_LOST, "lost link", pause=2e-4)
+        reported = until(lambda: arm.status() == ArmStatus.LINK_LOST, "lost link", pause=2e-4)
         newest = float(arm._channel.states.latest()["time"])  # type: ignore[index]
-        figure("silent link reported (link_timeout 50 ms)", 1e3 * (told - newest), "ms", at_most=60)
+        figure("silent link reported (link_timeout 50 ms)", 1e3 * (reported - newest), "ms", at_most=60)
         with pytest.raises(StaleObservationError, match=rf"the link is lost.*link_timeout = {1e3 * timeout:g} ms"):
             arm.state()
         with pytest.raises(LinkLost, match="does not answer; its controller"):

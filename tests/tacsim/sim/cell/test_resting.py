@@ -111,7 +111,7 @@ def test_a_restored_cell_goes_on_with_the_same_bits() -> None:
 
 
 def test_fixtures_are_refused() -> None:
-    with pytest.raises(ValueError, match="nothing fixed, not fixtures: use motion dynamic"):
+    with pytest.raises(ValueError, match="no fixtures, and here are fixtures: use motion dynamic"):
         resting(scene(fixtures={"wall": {"position": [0, 0.1, 0.05]}}))
 
 

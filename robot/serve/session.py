@@ -174,7 +174,7 @@ class Session:
 
     def take_references(self) -> None:
         """Makes the present pictures the references I0. Raises Refused while a gel is touched, or during an episode."""
-        done, failures = threading.Event(), list[Exception]()
+        failures: list[Exception] = []
 
         def take(rig: Rig) -> str:
             try:
@@ -184,11 +184,11 @@ class Session:
             except Exception as failure:
                 failures.append(failure)
                 return f"no new reference: {describe(failure)}"
-            finally:
-                done.set()
 
         self._begin("busy", "taking references", take)
-        if not done.wait(REFERENCE_TIMEOUT):
+        with self._change:  # until the rig is at rest again: a request that follows at once is not refused
+            is_done = self._change.wait_for(lambda: self._phase != "busy", REFERENCE_TIMEOUT)
+        if not is_done:
             raise Refused(f"no picture for {REFERENCE_TIMEOUT:g} s; check the cameras")
         if failures:
             raise Refused(describe(failures[0])) from failures[0]

@@ -68,6 +68,9 @@ def make_spec(
         for label, gripper in carried.items():
             if gripper.joints is None:
                 _add_gripper(spec, flange or find_flange(spec, name, arm), label, gripper, scene.gel.size)
+                _add_gripper_link(spec, (f"{label}/left", f"{label}/right"))
+            else:
+                _add_gripper_link(spec, (f"{name}/{gripper.joints[0]}", f"{name}/{gripper.joints[1]}"))
     for name, view in views.items():
         _add_camera(spec, name, view)
         screen = spec.visual.global_  # large enough for all of them
@@ -231,8 +234,13 @@ def _add_gripper(
         _add_visual(finger, box, [5e-3, width + 2e-3, height + 2e-3], [sign * back, 0, 0], DARK)
         rod = 0.5 * (gripper.length - palm - height)
         _add_visual(finger, box, [4e-3, width * 0.7, rod], [sign * back, 0, -height - rod], LIGHT)
+
+
+def _add_gripper_link(spec: Any, joints: tuple[str, str]) -> None:
+    """Fingers move alike. Else they slide with every turn of the arm, which its control does not expect."""
+    mujoco = load_mujoco()
     link = spec.add_equality(
-        name=f"{name}/fingers", type=mujoco.mjtEq.mjEQ_JOINT, name1=f"{name}/left", name2=f"{name}/right",
+        type=mujoco.mjtEq.mjEQ_JOINT, name1=joints[0], name2=joints[1],
         objtype=mujoco.mjtObj.mjOBJ_JOINT, data=[0.0, 1.0] + [0.0] * 10,
     )  # fmt: skip
     link.solref = [max(2 * spec.option.timestep, 4e-3), 1.0]

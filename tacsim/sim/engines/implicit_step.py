@@ -17,6 +17,7 @@ from functools import cache
 from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tacsim.interface import FloatArray
 from tacsim.sim.engines.mujoco_module import load_mujoco
@@ -50,16 +51,23 @@ def constraint_hessian(model: Any, data: Any) -> FloatArray:
         mujoco.mju_sparse2dense(jacobian, data.efc_J, data.efc_J_rownnz, data.efc_J_rowadr, data.efc_J_colind)
     else:
         jacobian = data.efc_J.reshape(rows, model.nv)
-    states, (quadratic, cone) = data.efc_state, _active_states()
-    weights = data.efc_D * ((states == quadratic) | (states == cone))
-    return np.asarray((jacobian.T * weights) @ jacobian)
+    return np.asarray((jacobian.T * (data.efc_D * _is_active(data))) @ jacobian)
+
+
+def _is_active(data: Any) -> NDArray[np.bool_]:
+    """(rows,) constraints whose force changes with the acceleration. By their forces: where MuJoCo solves by islands,
+    `efc_state` is that of its first guess."""
+    equality, dry_friction = _constraint_types()
+    types, forces = data.efc_type, data.efc_force
+    slides = np.isin(types, dry_friction) & (np.abs(forces) >= data.efc_frictionloss)
+    return np.asarray((types == equality) | ((forces != 0.0) & ~slides))
 
 
 @cache
-def _active_states() -> tuple[int, int]:
-    """Of MuJoCo's constraints."""
-    states = load_mujoco().mjtConstraintState
-    return int(states.mjCNSTRSTATE_QUADRATIC), int(states.mjCNSTRSTATE_CONE)
+def _constraint_types() -> tuple[int, list[int]]:
+    """Of MuJoCo's equalities, and of dry friction in joints and tendons."""
+    types = load_mujoco().mjtConstraint
+    return int(types.mjCNSTR_EQUALITY), [int(types.mjCNSTR_FRICTION_DOF), int(types.mjCNSTR_FRICTION_TENDON)]
 
 
 def damping_of(model: Any, data: Any) -> FloatArray | None:

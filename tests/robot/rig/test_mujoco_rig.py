@@ -191,6 +191,32 @@ def test_a_start_of_its_own_leaves_the_hand_open_there() -> None:
         assert observation.grippers["hand"].width == pytest.approx(0.06)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("timestep", ["1 ms", "2 ms"])
+def test_a_light_bar_pressed_on_the_edge_of_its_hole_stays_in_the_grip(timestep: str) -> None:
+    """It touches a strip 20 mm below the grip: with a wrong prediction of this contact it turns and slips."""
+    with open_rig("hand", task="peg", overrides=(*SMALL, f"scene.timestep={timestep}")) as rig:
+        begin = rig.reset().arms["hand"].pose
+        for x, z in (
+            (0.8, 0),
+            (1.6, 0),
+            (1.6, -1),
+            (1.6, -2),
+            (1.6, -3),
+            (1.6, -4),
+            (1.6, -5),
+            (1.6, -5),
+            *3 * [(1.6, 0)],
+        ):
+            pose = Pose(begin.position + 1e-3 * np.array([x, 0, z]), begin.quaternion)
+            observation, _ = rig.step(Action({"hand": pose}, {"hand": GripperTarget(0.0, 12.0)}))
+            if z == -5:  # [mm]: the gels give way by 1 mm
+                assert observation.arms["hand"].wrench[2] == pytest.approx(-5.2, abs=0.4)
+        truth = rig.truth()
+        assert truth is not None
+        assert begin.position[2] - truth.objects["object"].position[2] == pytest.approx(2e-3, abs=0.1e-3)
+
+
 def test_the_doctor_looks_for_mujoco() -> None:
     checks = examine_rig(load_rig("hand").config)
     assert [(check.name, check.state) for check in checks] == [("MuJoCo", "ok")]
@@ -224,7 +250,7 @@ def test_the_policy_grip_closes_the_hand_until_it_feels_the_object() -> None:
     ("overrides", "message"),
     [
         (("scene=squeeze",), "the scene 'squeeze', which has no object; give scene: hold"),
-        (("period=50.5 ms",), "0.0505 s is no whole number of timesteps of 0.001 s"),
+        (("period=50.5 ms",), "0.0505 s is no whole number of timesteps of 0.002 s"),
         (("sensors.right.side=left",), "sensors left and right are both on the left finger of 'hand'"),
         (("grippers.hand.model=null",), "model: null.*needs it"),
         (("grippers.hand.width=[20 mm, 10 mm]",), "width: the least, 0.02, must be below the greatest, 0.01"),

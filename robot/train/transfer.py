@@ -139,7 +139,9 @@ def _play_in_parallel(study: Study, parts: Parts, workers: int) -> Iterator[Epis
             yield from future.result()
 
 
-def _play_in_process(study: Study, side: Side, twin: int, remaining: Sequence[tuple[str, int]]) -> list[EpisodeResult]:
+def _play_in_process(
+    study: Study, side: Side, hidden_rig: int, remaining: Sequence[tuple[str, int]]
+) -> list[EpisodeResult]:
     """Plays in a separate process, whose mocks have separate addresses."""
     address = 77  # second number of mock addresses in parallel processes
     overrides: list[str] = []
@@ -147,7 +149,9 @@ def _play_in_process(study: Study, side: Side, twin: int, remaining: Sequence[tu
         for number, name in enumerate(load_rig(RIGS[side]).config.arms, start=1):
             host = loopback_host(number, address)
             overrides += [f"arms.{name}.host={host}", f"sensors.{name}.source=http://{host}:8081/?action=stream"]
-    return list(_play_on_hidden_rig(replace(study, overrides=(*study.overrides, *overrides)), side, twin, remaining))
+    return list(
+        _play_on_hidden_rig(replace(study, overrides=(*study.overrides, *overrides)), side, hidden_rig, remaining)
+    )
 
 
 def _describe_result(results: EpisodeResult, unit: Unit) -> str:
@@ -176,22 +180,22 @@ def _json_line(results: EpisodeResult) -> str:
 
 
 def _play_on_hidden_rig(
-    study: Study, side: Side, twin: int, remaining: Sequence[tuple[str, int]]
+    study: Study, side: Side, hidden_rig: int, remaining: Sequence[tuple[str, int]]
 ) -> Iterator[EpisodeResult]:
     """Uses one rig for all episodes on a twin; in simulation one per episode, because each policy has its own."""
     groups = [remaining] if side == "twin" else [[each] for each in remaining]
     for group in groups:
-        loaded = [_load_rig(study, side, twin, number, policy) for policy, number in group]
+        loaded = [_load_rig(study, side, hidden_rig, number, policy) for policy, number in group]
         with open_rig(loaded[0]) as rig:
             for (policy, number), each in zip(group, loaded, strict=True):
                 yield _play_episode(study, side, rig, each, policy, number)
 
 
-def _load_rig(study: Study, side: Side, twin: int, number: int, policy: str | None = None) -> LoadedRig:
+def _load_rig(study: Study, side: Side, hidden_rig: int, number: int, policy: str | None = None) -> LoadedRig:
     """The rig of an episode. Values of the task, and values drawn only by the training of a policy, are drawn for each
     episode, all others for each twin."""
-    drawn = study.twins.model_copy(update={"draws": max(study.episodes, twin + 1)}).draw_overrides()
-    overrides = [word for word in drawn[twin] if not word.startswith("task.")]
+    drawn = study.twins.model_copy(update={"draws": max(study.episodes, hidden_rig + 1)}).draw_overrides()
+    overrides = [word for word in drawn[hidden_rig] if not word.startswith("task.")]
     overrides += [word for word in drawn[number] if word.startswith("task.")]
     if side == "simulation":
         overrides = [word for word in overrides if word.startswith(KNOWN_KEYS)]

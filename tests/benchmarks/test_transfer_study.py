@@ -7,8 +7,9 @@ from pathlib import Path
 import pytest
 
 from benchmarks import transfer, transfer_held
-from tacsim.config import load_rig
+from tacsim.config import load_model, load_rig
 from tacsim.gym.features import FeatureEncoder
+from tacsim.models.policy import Training
 
 
 @pytest.fixture
@@ -42,16 +43,22 @@ def test_cells_differ_in_their_materials_alone(sight: str, folder: Path) -> None
     assert usual is not None and usual.gel.material.youngs_modulus == 0.145e6
 
 
-def test_policies_of_a_held_object_differ_in_what_they_see_alone() -> None:
-    found = {name: transfer_held.training(name) for name in transfer_held.POLICIES}
-    flow = found["flow"]
-    assert {each.task for each in found.values()} == {"hold"}
+@pytest.mark.parametrize("task", transfer_held.HeldTask)
+def test_policies_of_a_held_object_differ_in_what_they_see_alone(task: transfer_held.HeldTask) -> None:
+    found = {name: transfer_held.training(name, task.value) for name in transfer_held.POLICIES}
+    flow, shipped = found["flow"], load_model(Training, task.value).features
+    assert {each.task for each in found.values()} == {task.value}
     assert all(each.randomise == flow.randomise and each.environments == flow.environments for each in found.values())
     assert {each.dagger.rounds for each in found.values()} == {transfer_held.ROUNDS}
     assert {name for name, each in found.items() if each.features.flow} == {"flow"}
     assert [found[name].features.maps for name in found] == [(), (), ("image",), ()]
     assert found["blind"].features.sensors == ()
+    of_hand = set(found["blind"].features.touch)
     for each in found.values():
         config = load_rig(each.rig, task=each.task, overrides=each.overrides).config
         FeatureEncoder(each.features, config.canonical)  # the maps fit
         assert config.motion == "flowing"
+        assert of_hand <= set(each.features.touch) and each.features.frames == shipped.frames
+    # together they see all that the shipped student sees
+    assert set(shipped.touch) <= set(flow.features.touch) | set(found["depth"].features.touch)
+    assert not (set(flow.features.touch) & set(found["depth"].features.touch)) - of_hand

@@ -65,7 +65,8 @@ class Dagger:
         ends: list[NDArray[np.float64]] = []
         for step in range(steps):
             report_progress(f"round {number + 1} of {self.rounds}: acting", step, steps)
-            teacher = self._settings.pace * np.stack(envs.call("expert")).astype(np.float32)
+            shown = envs.call("expert", self._settings.teacher == "truth")
+            teacher = self._settings.pace * np.stack(shown).astype(np.float32)
             states.append({key: value.copy() for key, value in features.items()})
             labels.append(teacher)
             if number == 0:

@@ -317,14 +317,14 @@ class TacsimEnv(gymnasium.Env[encode.FlatObservation, Float32]):
             info |= self.task.measures(truth, self._truth_at_start)
         return outcome.reward, info | dict(self.rig.diagnostics())
 
-    def expert(self) -> Float32:
-        """What a teacher does here: by the truth, or where the task knows no rule, its `teacher`.
+    def expert(self, knows_truth: bool = True) -> Float32:
+        """What a teacher does here: by the truth; where the task has no such rule, or not `knows_truth`, its `teacher`.
 
         Zeros where no episode is running.
         """
         if self.phase != "running":
             return np.zeros(len(self.task.axes), np.float32)
-        best = self.task.expert(self._require_truth(), self._truth_at_start)
+        best = self.task.expert(self._require_truth(), self._truth_at_start) if knows_truth else None
         if best is not None:
             return np.asarray(best, np.float32)
         if self._teacher is None:

@@ -155,7 +155,11 @@ Rate = Annotated[float, Field(gt=0, le=1)]
 
 
 class DaggerConfig(Config):
-    """A teacher that knows the truth shows a student that only feels what to do (Ross et al. 2011)."""
+    """A teacher shows a student that only feels what to do (Ross et al. 2011)."""
+
+    # truth: the task's expert, which knows the state of the simulation; touch: the task's policy that searches by
+    # touch, for what no student can feel before it has searched.
+    teacher: Literal["truth", "touch"] = "truth"
 
     rounds: Count = 10  # in each, every environment plays one episode
     epochs: Count = 60  # passes over all that was met so far, after each round

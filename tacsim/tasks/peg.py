@@ -92,3 +92,7 @@ class Peg(RigidTask):
 
     def scripted(self, *, through: bool = False) -> Policy:
         return ScriptedPeg(self.config, through)
+
+    def teacher(self) -> Policy:
+        """The scripted policy, which goes on from where the hand is, even if a learned policy moved it."""
+        return ScriptedPeg(self.config, through=False, follows=True)

@@ -17,12 +17,13 @@ class ScriptedPeg:
     Where the block supports the bar, seen from the bar's axis, follows from force and moment on the hand: a bar whose
     end is over the hole but for a strip rests on that strip, so the hole is on the other side. With both directions
     off, it rests on a corner of the hole and stays upright; going along one axis then brings it to where it tips along
-    the other. With `through` it pushes on past the goal.
+    the other. With `through` it pushes on past the goal. With `follows` it moves from where the hand is instead of
+    where it sent the hand, and searches on in the direction in which the hand moved last.
     """
 
-    def __init__(self, config: PegConfig, through: bool) -> None:
+    def __init__(self, config: PegConfig, through: bool, follows: bool = False) -> None:
         assert config.scene.object is not None
-        self._config, self._through = config, through
+        self._config, self._through, self._follows = config, through, follows
         size = bounding_size(config.scene.object.geometry)
         self._half = size[:2] / 2  # of the bar's end [m]
         self._below = size[2] / 2 + config.scene.object.grip[2]  # the bar's end, below the grip [m]
@@ -37,6 +38,7 @@ class ScriptedPeg:
         self._at_rest: FloatArray | None = None  # (6,) wrench before anything touches, world axes [N, N m]
         self._start = np.zeros(3)
         self._target = np.zeros(3)  # of the hand [m]
+        self._last = np.zeros(3)  # where the hand was in the last control period [m]
         self._surface: float | None = None  # z of the hand where the bar's end is at the surface [m]
         self._direction = np.zeros(2)  # of the search, along world x and y
         self._place: FloatArray | None = None  # of the hand, before it let the bar lie down (3,) [m]
@@ -48,6 +50,12 @@ class ScriptedPeg:
         wrench = np.concatenate([se3.rotate(arm.pose, arm.wrench[:3]), se3.rotate(arm.pose, arm.wrench[3:])])
         if self._at_rest is None:
             self._at_rest, self._start, self._target = wrench, arm.pose.position, np.array(arm.pose.position)
+            self._last = arm.pose.position
+        if self._follows:
+            moved = float(arm.pose.position[0] - self._last[0])
+            self._target, self._last = np.array(arm.pose.position), arm.pose.position
+            if abs(moved) > tuning.SEARCH_STEP / 4:
+                self._direction[0] = np.sign(moved)
         force, moment = np.split(wrench - self._at_rest, 2)
         self._target = self._target + self._move(arm, force, moment)
         grip = GripperTarget(0.0, self._config.touch_force)
@@ -91,6 +99,8 @@ class ScriptedPeg:
                 self._direction[1] = -np.sign(moved[1])
             return np.array([0.0, tuning.SEARCH_STEP * self._direction[1]])
         self._direction[1] = 0.0
+        if abs(moved[1]) > tuning.TIPPED_RANGE:  # a learned policy went too far
+            return np.array([0.0, -tuning.SEARCH_STEP * np.sign(moved[1])])
         if abs(moved[0]) > tuning.SEARCH_RANGE:
             self._direction[0] = -np.sign(moved[0])
         return np.array([tuning.SEARCH_STEP * self._direction[0], 0.0])

@@ -236,6 +236,8 @@ def test_the_expert_is_the_tasks_by_the_truth_and_holds_where_nothing_runs(open_
     best = env.task.expert(env._require_truth(), env._truth_at_start)
     assert best is not None
     assert env.expert().tolist() == best.astype(np.float32).tolist()
+    by_touch = env.policy_action(env.task.teacher())
+    assert env.expert(knows_truth=False).tolist() == by_touch.tolist() != best.astype(np.float32).tolist()
     for _ in range(env.task.config.steps):
         env.step(env.expert())
     assert env.phase == "over"

@@ -12,7 +12,7 @@ from robot.deploy.control_loop import run_episode
 from robot.open import load_with_task
 from tacsim import pose as se3
 from tacsim.config import load_task
-from tacsim.interface import FloatArray, Pose, Truth
+from tacsim.interface import ArmState, FloatArray, Observation, Pose, Truth
 from tacsim.models.task import PegConfig
 from tacsim.tasks import make_task
 from tacsim.tasks.peg import Peg
@@ -85,6 +85,22 @@ def test_support_is_where_the_block_presses_the_bar(place: tuple[float, float]) 
     force = np.array([0.7, -1.1, 5.0])
     moment = np.cross([*place, -(LENGTH / 2 + 2e-3)], force)
     assert policy.support(force, moment) == pytest.approx(place)
+
+
+@pytest.mark.parametrize("way", [-1.0, 1.0])
+def test_the_teacher_goes_on_from_where_a_learned_policy_moved_the_hand(way: float) -> None:
+    """It searches in the direction of the last motion; the scripted policy goes on from where it sent the hand."""
+    made = task()
+    teacher, scripted = made.teacher(), made.scripted()
+    down = se3.from_rotation_vector(np.zeros(3), [math.pi, 0.0, 0.0]).quaternion
+    for x, height, press in ((0.0, 50.0, 0.0), (0.0, 46.0, 5.0), (0.0, 47.0, 0.0), (0.4 * way, 46.0, 5.0)):
+        wrench = np.array([0.0, 0.0, -press, 0.0, 0.0, 0.0])  # in the hand's axes: z points down
+        pose = Pose(1e-3 * np.array([x, 0.0, height]), down)
+        arms = {"hand": ArmState(pose, np.zeros(6), wrench, None, 0.0)}
+        asked = [policy(Observation({}, arms, 0.0)).tool["hand"] for policy in (teacher, scripted)]
+    assert all(each is not None for each in asked)
+    assert 1e3 * asked[0].position == pytest.approx([0.8 * way, 0.0, 47.0])  # type: ignore[union-attr]
+    assert 1e3 * asked[1].position[0] == pytest.approx(0.8)  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize(

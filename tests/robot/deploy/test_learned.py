@@ -15,7 +15,11 @@ from tacsim.tasks import make_task
 
 SHIPPED = sorted((config_root() / "policies").glob("*.onnx"))
 # fraction of the initial distance
-MIN_IMPROVEMENT = {"squeeze": 0.95, "reposition": 0.95, "knead": 0.1, "hold": 0.95, "turn": 0.9, "drawer": 0.95}
+MIN_IMPROVEMENT = {
+    "squeeze": 0.95, "reposition": 0.95, "knead": 0.1, "hold": 0.95, "turn": 0.9, "drawer": 0.95, "peg": 0.9,
+}  # fmt: skip
+# What makes the task's own scene as hard as others: a hole that is aside
+CHANGES = {"peg": ("scene.fixtures.hole.position=[0.5 mm, 1.5 mm, 20 mm]",)}
 
 
 @pytest.mark.slow
@@ -23,7 +27,7 @@ MIN_IMPROVEMENT = {"squeeze": 0.95, "reposition": 0.95, "knead": 0.1, "hold": 0.
 def test_shipped_policy_solves_its_task(path: Path) -> None:
     """On the task's own body and goal, in the physics that it was trained in."""
     training = load_model(Training, path.stem)
-    loaded = load_rig(training.rig, task=training.task, overrides=training.overrides)
+    loaded = load_rig(training.rig, task=training.task, overrides=[*training.overrides, *CHANGES.get(path.stem, ())])
     assert loaded.config.task is not None
     task = make_task(loaded.config.task)
     steps = min(task.config.steps, 80)

@@ -97,9 +97,10 @@ class PadGels(NotCopyable):
         nx, ny, _ = state.gel[0].elements
         u, v = moving[:, 0], moving[:, 1]
         u = u[..., : (nx + 1) * (ny + 1)].reshape(*u.shape[:3], nx + 1, ny + 1)
-        edges = (
-            u[:, 0, :, 1:] - u[:, 0, :, :-1], u[:, 1, ..., 1:] - u[:, 1, ..., :-1], u[:, 2, 1:] - u[:, 2, :-1]
-        )  # fmt: skip
+        with np.errstate(invalid="ignore"):  # of a gel that has diverged; a comparison with it is False
+            edges = (
+                u[:, 0, :, 1:] - u[:, 0, :, :-1], u[:, 1, ..., 1:] - u[:, 1, ..., :-1], u[:, 2, 1:] - u[:, 2, :-1]
+            )  # fmt: skip
         shortest = spacing + np.min([edge.reshape(len(steps), -1).min(axis=1) for edge in edges], axis=0)
         slow = np.abs(v).reshape(len(steps), -1).max(axis=1) < MAX_SPEED
         whole = partial[:, :, SMALLEST_VOLUME].min(axis=1) > MIN_VOLUME_RATIO

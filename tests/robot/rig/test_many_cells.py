@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -29,7 +30,7 @@ VARIANTS = (
 )
 
 
-SLOW_CLOCK = ("scene.timestep=2 ms", "scene.object.mass=0.12")  # its pads are in another list
+OTHER_CLOCK = ("scene.timestep=1 ms", "scene.object.mass=0.12")  # its pads are in another list
 
 
 def options_of(motion: str, steps: int, variants: Any = VARIANTS) -> dict[str, Any]:
@@ -44,6 +45,15 @@ def wander(random: np.random.Generator, number: int) -> np.ndarray:
     return np.stack([random.uniform(-1, 1, number), random.uniform(0.1, 0.8, number)], axis=1).astype(np.float32)
 
 
+def without_numbers(given: Any) -> Any:
+    """An error names its grip by the number in its batch."""
+    if isinstance(given, dict):
+        return {key: without_numbers(value) for key, value in given.items()}
+    if isinstance(given, tuple | list) or (isinstance(given, np.ndarray) and given.dtype == object):
+        return [without_numbers(each) for each in given]
+    return re.sub(r"\bgrip \d+", "grip", given) if isinstance(given, str) else given
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("mode", "motion"),
@@ -55,7 +65,7 @@ def wander(random: np.random.Generator, number: int) -> np.ndarray:
 def test_a_batch_of_grips_gives_the_bits_of_cells_apart(mode: str, motion: str) -> None:
     """In all modes, with variants of object, friction, modulus and gravity, in `dynamic` of the timestep too, over ends
     by drops and by steps."""
-    variants = (*VARIANTS, SLOW_CLOCK) if motion == "dynamic" else VARIANTS
+    variants = (*VARIANTS, OTHER_CLOCK) if motion == "dynamic" else VARIANTS
     steps = 6 if motion == "settled" else 12  # in 16 steps some end, although most objects slip at rest
     number, random, options = 3, np.random.default_rng(4), options_of(motion, steps, variants)
     batched = make_vector_env(number, autoreset_mode=mode, **options)
@@ -66,7 +76,7 @@ def test_a_batch_of_grips_gives_the_bits_of_cells_apart(mode: str, motion: str) 
         given = wander(random, number)
         given[0, 1] = -1.0  # lets go
         found, wanted = batched.step(given), apart.step(given)
-        assert_equal(found, wanted)
+        assert_equal(without_numbers(found), without_numbers(wanted))
         info = found[4].get("final_info", found[4]) if mode == "SameStep" else found[4]
         over = found[2] | found[3]
         ended, dropped = ended + int(over.sum()), dropped + int(np.sum(info.get("_dropped", 0)))
@@ -151,7 +161,7 @@ def test_dynamic_cells_of_a_batch_share_launches(monkeypatch: pytest.MonkeyPatch
 
     monkeypatch.setattr(GelPads, "step_scenes", count)
     envs.step(np.tile(np.array([0.5, HOLD], np.float32), (3, 1)))
-    assert launched == [3] * 50
+    assert launched == [3] * 25  # of 2 ms
     launched.clear()
     envs.reset(seed=2, options={"reset_mask": np.array([False, True, False])})
     assert set(launched) <= {1}

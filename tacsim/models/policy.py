@@ -157,8 +157,8 @@ Rate = Annotated[float, Field(gt=0, le=1)]
 class DaggerConfig(Config):
     """A teacher shows a student that only feels what to do (Ross et al. 2011)."""
 
-    # truth: the task's expert, which knows the state of the simulation; touch: the task's policy that searches by
-    # touch, for what no student can feel before it has searched.
+    # truth: `Task.expert`, which knows the state of the simulation, where the task has one; touch: `Task.teacher`, of
+    # most tasks the scripted policy, for what no student can feel before it has searched.
     teacher: Literal["truth", "touch"] = "truth"
 
     rounds: Count = 10  # in each, every environment plays one episode

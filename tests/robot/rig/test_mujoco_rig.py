@@ -197,20 +197,11 @@ def test_a_light_bar_pressed_on_the_edge_of_its_hole_stays_in_the_grip(timestep:
     """It touches a strip 20 mm below the grip: with a wrong prediction of this contact it turns and slips."""
     with open_rig("hand", task="peg", overrides=(*SMALL, f"scene.timestep={timestep}")) as rig:
         begin = rig.reset().arms["hand"].pose
-        for x, z in (
-            (0.8, 0),
-            (1.6, 0),
-            (1.6, -1),
-            (1.6, -2),
-            (1.6, -3),
-            (1.6, -4),
-            (1.6, -5),
-            (1.6, -5),
-            *3 * [(1.6, 0)],
-        ):
+        pressed = [(1.6, -depth) for depth in (1, 2, 3, 4, 5, 5)]
+        for x, z in [(0.8, 0), (1.6, 0), *pressed, *3 * [(1.6, 0)]]:  # [mm]
             pose = Pose(begin.position + 1e-3 * np.array([x, 0, z]), begin.quaternion)
             observation, _ = rig.step(Action({"hand": pose}, {"hand": GripperTarget(0.0, 12.0)}))
-            if z == -5:  # [mm]: the gels give way by 1 mm
+            if z == -5:  # the gels give way by 1 mm
                 assert observation.arms["hand"].wrench[2] == pytest.approx(-5.2, abs=0.4)
         truth = rig.truth()
         assert truth is not None

@@ -87,20 +87,22 @@ def test_support_is_where_the_block_presses_the_bar(place: tuple[float, float]) 
     assert policy.support(force, moment) == pytest.approx(place)
 
 
-@pytest.mark.parametrize("way", [-1.0, 1.0])
-def test_the_teacher_goes_on_from_where_a_learned_policy_moved_the_hand(way: float) -> None:
+@pytest.mark.parametrize("direction", [-1.0, 1.0])
+def test_the_teacher_goes_on_from_where_a_learned_policy_moved_the_hand(direction: float) -> None:
     """It searches in the direction of the last motion; the scripted policy goes on from where it sent the hand."""
     made = task()
-    teacher, scripted = made.teacher(), made.scripted()
+    policies, targets = (made.teacher(), made.scripted()), np.zeros((2, 3))  # [mm]
     down = se3.from_rotation_vector(np.zeros(3), [math.pi, 0.0, 0.0]).quaternion
-    for x, height, press in ((0.0, 50.0, 0.0), (0.0, 46.0, 5.0), (0.0, 47.0, 0.0), (0.4 * way, 46.0, 5.0)):
+    for x, height, press in ((0.0, 50.0, 0.0), (0.0, 46.0, 5.0), (0.0, 47.0, 0.0), (0.4 * direction, 46.0, 5.0)):
         wrench = np.array([0.0, 0.0, -press, 0.0, 0.0, 0.0])  # in the hand's axes: z points down
         pose = Pose(1e-3 * np.array([x, 0.0, height]), down)
         arms = {"hand": ArmState(pose, np.zeros(6), wrench, None, 0.0)}
-        asked = [policy(Observation({}, arms, 0.0)).tool["hand"] for policy in (teacher, scripted)]
-    assert all(each is not None for each in asked)
-    assert 1e3 * asked[0].position == pytest.approx([0.8 * way, 0.0, 47.0])  # type: ignore[union-attr]
-    assert 1e3 * asked[1].position[0] == pytest.approx(0.8)  # type: ignore[union-attr]
+        for number, policy in enumerate(policies):
+            target = policy(Observation({}, arms, 0.0)).tool["hand"]
+            assert target is not None
+            targets[number] = 1e3 * target.position
+    assert targets[0] == pytest.approx([0.8 * direction, 0.0, 47.0])
+    assert targets[1, 0] == pytest.approx(0.8)
 
 
 @pytest.mark.parametrize(

@@ -56,15 +56,15 @@ if TYPE_CHECKING:
     from tacsim.models.driver import Check as Check
     from tacsim.models.driver import Companion as Companion
     from tacsim.models.driver import SensorDriver as SensorDriver
-    from tacsim.models.gripper import GripperConfig as GripperConfig
     from tacsim.models.hardware import ArmConfig as ArmConfig
-    from tacsim.models.hardware import ArmLimits as ArmLimits
     from tacsim.models.hardware import CameraSensorConfig as CameraSensorConfig
+    from tacsim.models.hardware import GripperConfig as GripperConfig
     from tacsim.models.hardware import KeepOut as KeepOut
     from tacsim.models.hardware import Placement as Placement
     from tacsim.models.hardware import SensorConfig as SensorConfig
     from tacsim.models.hardware import UrArmConfig as UrArmConfig
-    from tacsim.models.hardware import Workspace as Workspace
+    from tacsim.models.limits import ArmLimits as ArmLimits
+    from tacsim.models.limits import Workspace as Workspace
     from tacsim.models.material import BodyMaterial as BodyMaterial
     from tacsim.models.material import GelMaterial as GelMaterial
     from tacsim.models.policy import Features as Features

@@ -22,7 +22,7 @@ from tacsim.interface import Action, ArmState, FloatArray, GelReading, Mask, Pos
 from tacsim.limits import LimitExceeded, exceeds_limit
 
 if TYPE_CHECKING:
-    from tacsim.models.hardware import ArmLimits
+    from tacsim.models.limits import ArmLimits
     from tacsim.models.task import TaskConfig
 
 # Tuned constants. Sources: the tests in tests/tacsim/test_control.py.

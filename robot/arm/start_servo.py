@@ -34,7 +34,7 @@ from robot.common.tcp import ArmFrames, Measured
 from tacsim.interface import FloatArray
 
 if TYPE_CHECKING:
-    from tacsim.models.hardware import ArmLimits  # pydantic: a worker starts without it
+    from tacsim.models.limits import ArmLimits  # pydantic: a worker starts without it
 
 
 def sensor_path(kinematics: Kinematics, frames: ArmFrames, joints: FloatArray) -> FloatArray:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -23,6 +24,15 @@ if TYPE_CHECKING:
 benchmark = typer.Typer(
     no_args_is_help=True, help="Rank policies: frozen episodes, scores with hashes, paired comparison (version v1)."
 )
+
+
+class RigChoice(StrEnum):
+    """Where episodes are played."""
+
+    sim = "sim"
+    mock = "mock"
+
+
 POLICIES = ("random", "blind", "analytic", "scripted", "teacher", "learned")
 TaskFile = Annotated[
     str,
@@ -77,8 +87,12 @@ def run(
         list[str] | None, typer.Option(help="test, shift-..., or all; may be repeated.", show_default="test")
     ] = None,
     full: Annotated[bool, typer.Option("--full", help="All 200 episodes of a split, not the first 24.")] = False,
+    episodes: Annotated[
+        int | None, typer.Option(min=1, help="Only the first N for now; a later run continues.", show_default="all")
+    ] = None,
+    rig: Annotated[RigChoice, typer.Option(help="mock: over the real wire on loopback.")] = RigChoice.sim,
     environments: Annotated[
-        int, typer.Option(min=1, max=1024, help="Episodes that move together; results do not depend on it.")
+        int, typer.Option(min=1, max=1024, help="Simulated episodes that move together; results do not depend on it.")
     ] = 8,
     out: Annotated[Path, typer.Option(help="Folder of the scores; what it has is not played again.")] = Path(
         "runs/benchmark"
@@ -98,7 +112,7 @@ def run(
     policies = tuple(dict.fromkeys(policy or POLICIES[:5]))
     known = load_task_file(task).splits
     splits = known if split == ["all"] else tuple(dict.fromkeys(split or ["test"]))
-    work = Run(task, policies, splits, "full" if full else "quick", out, environments)
+    work = Run(task, policies, splits, "full" if full else "quick", out, environments, rig.value, episodes)
 
     with Interrupt(), one_bar("starting") as bar:
         try:
@@ -115,7 +129,7 @@ def run(
 def _report_score(path: Path, score: Score) -> None:
     """Prints the success of a complete score, and what must be checked before it is trusted."""
     failed = sum(each.end in ("error", "not begun") for each in score.episodes)
-    notes.print(f"{score.policy}, {score.split}: success {_percent(score.success)} %, {path}")
+    notes.print(f"{score.policy}, {score.where}: success {_percent(score.success)} %, {path}")
     if failed:
         first = next(each for each in score.episodes if each.end in ("error", "not begun"))
         warn(f"{score.policy}: {failed} episodes failed; episode {first.episode}: {first.reason}")
@@ -236,6 +250,7 @@ def rank(
     ] = None,
     split: Annotated[str, typer.Option(help="Split in simulation.")] = "test",
     other_split: Annotated[str, typer.Option(help="Split of the twin.")] = "shift-all",
+    other_rig: Annotated[RigChoice, typer.Option(help="Rig of the twin.")] = RigChoice.sim,
     out: Annotated[Path | None, typer.Option(help="Draw the figure here (PNG).", show_default=False)] = None,
 ) -> None:
     """Compare the order of policies in simulation with their order on a twin: Spearman's and Kendall's correlation.
@@ -247,12 +262,12 @@ def rank(
 
     with _refuse_edited_scores():
         here, there = ([score for _, score in find_scores(each)] for each in (folder, other or folder))
-    found = rank_policies(
-        [each for each in here if each.split == split], [each for each in there if each.split == other_split]
-    )
+    twins = [each for each in there if (each.split, each.rig) == (other_split, other_rig.value)]
+    found = rank_policies([each for each in here if (each.split, each.rig) == (split, "sim")], twins)
+    names = split, other_split if other_rig == RigChoice.sim else f"{other_split} ({other_rig.value})"
     for each in found:
         rows = [(pair.policy, str(pair.episodes), *map(_percent, pair.success)) for pair in each.pairs]
-        show_table(each.task, ("policy", "episodes", f"{split} [%]", f"{other_split} [%]"), rows, left={0})
+        show_table(each.task, ("policy", "episodes", *(f"{name} [%]" for name in names)), rows, left={0})
     rows = [
         (each.task, measure, str(len(each.pairs)), *map(_correlation, (order.spearman, order.kendall)), violation)
         for each in found
@@ -264,7 +279,7 @@ def rank(
     columns = ("task", "order by", "policies", "Spearman", "Kendall", "mean largest violation")
     show_table("95 % intervals by a bootstrap over episodes", columns, rows, left={0, 1}, width=170)
     if out is not None:
-        draw_ranking(found, out, (split, other_split))
+        draw_ranking(found, out, names)
         print_files(out)
     print_json({"rankings": found}, [] if out is None else [out])
 

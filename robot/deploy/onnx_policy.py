@@ -15,16 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
+from robot.deploy.axis_motion import AxisMotion
 from robot.deploy.python_policy import PolicyNotFound
 from robot.deploy.training_range import RangeMonitor, number_names
-from tacsim import pose as se3
 from tacsim.gym.features import FeatureEncoder
-from tacsim.interface import Action, Needs, Observation, Pose, RigSpec
+from tacsim.interface import Action, Needs, Observation, RigSpec
 from tacsim.models.policy import METADATA_KEY, ActionAxis, Numbers, PolicySpec
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.models.text import printable_line
 from tacsim.tasks import Task
-from tacsim.tasks.task import ActionAxes, Axis, GripAxis, action_of_vector, needs_of_axes
+from tacsim.tasks.task import ActionAxes, Axis, GripAxis, needs_of_axes
 
 if TYPE_CHECKING:
     from onnxruntime import InferenceSession
@@ -43,9 +43,8 @@ class PolicyFailed(RuntimeError):
 class OnnxPolicy:
     """The policy in `path`, on a rig with this canonical grid.
 
-    An action moves an arm from its last target, as in training, or from its pose if a limit has kept it from the
-    target. The same file returns the same action for the same observations on any rig. `range_monitor` compares the
-    observations of the episode with those of training.
+    An action moves an arm as in training (AxisMotion). The same file returns the same action for the same observations
+    on any rig. `range_monitor` compares the observations of the episode with those of training.
 
     Args:
         goal: of the task [m]; None without one.
@@ -59,7 +58,7 @@ class OnnxPolicy:
         self._name, self._goal = path.name, goal
         self._encoder = FeatureEncoder(self.spec.features, canonical)
         self._axes = _axes_of(self.spec)
-        self._targets: dict[str, Pose] = {}
+        self._motion = AxisMotion(self._axes, self.spec.max_step)
         self._is_new = True  # no observation of this episode was seen yet
         _require_same_inputs(path, self.spec, self._encoder.inputs, self._session, goal)
         names = number_names(self.spec, 0 if goal is None else np.size(goal))
@@ -80,22 +79,16 @@ class OnnxPolicy:
         return Needs(features.sensors, arms, height=features.height, flow=features.flow, grippers=grippers)
 
     def reset(self) -> None:
-        self._targets, self._is_new = {}, True
+        self._motion.begin()
+        self._is_new = True
         self.range_monitor.reset()
 
     def __call__(self, observation: Observation) -> Action:
         """The action for an observation. Raises PolicyFailed if the graph fails or returns no valid action."""
-        max_deviation = 2.0  # between target and pose of an arm; beyond it the next target starts at the pose
         first, self._is_new = self._is_new, False
         features = self._encoder.begin(observation, self._goal) if first else self._encoder(observation)
         self.range_monitor(features)
-        for arm in sorted(needs_of_axes(self._axes).arms):
-            now = observation.arms[arm].pose
-            if first or se3.pose_distance(self._targets[arm], now)[0] > max_deviation * self.spec.max_step:
-                self._targets[arm] = now
-        action = action_of_vector(self._infer(features), self._axes, self.spec.max_step, self._targets)
-        self._targets = {arm: pose for arm, pose in action.tool.items() if pose is not None}
-        return action
+        return self._motion.action(self._infer(features), observation)
 
     def _infer(self, features: Mapping[str, NDArray[Any]]) -> NDArray[np.float32]:
         not_finite = sorted(key for key, value in features.items() if not np.isfinite(value).all())

@@ -18,7 +18,7 @@ from robot.rig.reset import ForceTouch, HardwareReset, PictureTouch, TouchSensin
 from tacsim.control import GelMonitor, load_controller
 from tacsim.interface import Normaliser, Pose, RigSpec, SensorSpec, TactileFrame, TactileSource
 from tacsim.models.driver import ArmDriver, Companion, SensorDriver
-from tacsim.models.hardware import ArmLimits
+from tacsim.models.limits import ArmLimits
 from tacsim.models.rig import RigConfig
 from tacsim.record.episode import ALIGNMENT, LIMITS_HIT
 from tacsim.rig import Rig

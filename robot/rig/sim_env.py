@@ -15,10 +15,10 @@ from tacsim.gym import encode
 from tacsim.gym.env import TacsimEnv, Variant, require_compatible_task
 from tacsim.gym.features import FeatureEncoder
 from tacsim.gym.vector import CellBatch, Member, SharedBatch, TacsimVectorEnv
-from tacsim.models.hardware import ArmConfig, Placement, SensorConfig, parts_of
+from tacsim.models.hardware import ArmConfig, MountConfig, Placement, SensorConfig, parts_of
 from tacsim.models.mujoco import MujocoSensorConfig
 from tacsim.models.policy import Features
-from tacsim.models.rig import MountConfig, RigConfig, SimSensorConfig, WrenchNoise
+from tacsim.models.rig import RigConfig, SimSensorConfig, WrenchNoise
 from tacsim.models.sensor import Lighting
 from tacsim.sim.scene_world import StatePool, require_same_gels
 from tacsim.tasks import make_task

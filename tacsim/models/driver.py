@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tacsim.interface import HardwareArm, Normaliser, Pose, SensorSpec, TactileSource, Truth
-from tacsim.models.gripper import GripperConfig
-from tacsim.models.hardware import ArmConfig, SensorConfig
+from tacsim.models.hardware import ArmConfig, GripperConfig, SensorConfig
 from tacsim.models.sensor import CanonicalGrid
 
 GROUP = "tacsim.drivers"

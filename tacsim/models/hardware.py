@@ -1,4 +1,4 @@
-"""Configuration of arms and sensors: what all have, limits, UR arms, cameras, the reset. Drivers: models/driver.py."""
+"""Configuration of arms, sensors and grippers: UR arms, cameras, the reset. Drivers: models/driver.py."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from tacsim import pose as se3
 from tacsim.interface import Pose
-from tacsim.limits import Region, box_region
-from tacsim.models.quantity import Acceleration, Angle, Config, Force, Length, Speed, Time
+from tacsim.models.limits import ArmLimits, Vector
+from tacsim.models.quantity import Angle, Config, Length, Speed, Stiffness, Time
 from tacsim.models.sensor import PictureRegion, SensorModel
 from tacsim.models.text import MAX_NAME
 
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=MAX_NAME)]
-Vector = tuple[Length, Length, Length]
 Corner = tuple[float, float]
+Delay = Annotated[int, Field(ge=0, le=20)]  # [control periods]
 
 POLYSCOPE = r"[0-9]{1,9}(\.[0-9]{1,9}){1,3}"  # a version of it
 
@@ -42,77 +42,6 @@ class Placement(Config):
     @property
     def pose(self) -> Pose:
         return se3.from_rotation_vector(self.position, self.rotation)
-
-
-class Workspace(Config):
-    """A box along the world axes. The origin of the sensor (the middle of its gel) must stay inside."""
-
-    lower: Vector  # corner of the least x, y, z [m]
-    upper: Vector  # the opposite corner [m]
-
-    @model_validator(mode="after")
-    def _require_volume(self) -> Self:
-        for axis, low, high in zip("xyz", self.lower, self.upper, strict=True):
-            if not low < high:
-                raise ValueError(f"no inside: {axis} runs from {low:g} to {high:g} m; lower must be below upper")
-        return self
-
-
-class Plane(Config):
-    """The origin of the sensor must stay on the side of this plane to which the normal points. World axes."""
-
-    point: Vector  # any point of the plane [m]
-    normal: tuple[float, float, float]  # of any length
-
-    @model_validator(mode="after")
-    def _require_normal(self) -> Self:
-        if float(np.linalg.norm(self.normal)) < 1e-9:
-            raise ValueError("normal must not be zero")
-        return self
-
-
-class ArmLimits(Config):
-    """What an arm may do. These limits guard the work, not people: they are no safety function.
-
-    The workspace has no default, because none suits every cell. Speeds and accelerations are those of the sensor's
-    origin; force and torque are what the object does to the sensor.
-    """
-
-    workspace: Workspace
-    planes: tuple[Plane, ...] = Field(default=(), max_length=16)
-    speed: Annotated[Speed, Field(gt=0, le=1.0)] = 50e-3  # [m/s]
-    turn_rate: Annotated[float, Field(gt=0, le=3.0)] = 0.5  # [rad/s]
-    acceleration: Annotated[Acceleration, Field(gt=0, le=10.0)] = 0.5  # [m/s^2]
-    turn_acceleration: Annotated[float, Field(gt=0, le=50.0)] = 5.0  # [rad/s^2]
-    joint_speed: Annotated[float, Field(gt=0, le=3.14)] = 1.0  # of any joint; bounds the step of each period [rad/s]
-    force: Annotated[Force, Field(gt=0, le=250.0)] = 30.0  # |force| beyond it stops the arm [N]
-    torque: Annotated[float, Field(gt=0, le=50.0)] = 3.0  # |torque| about the sensor's origin [N m]
-    # How far the arm may be from where it was sent, its usual lag not counted; beyond it stops. None: as
-    # `max_following_error` and `max_following_turn` say.
-    following_error: Annotated[Length, Field(gt=0)] | None = None  # of the sensor's origin [m]
-    following_turn: Annotated[float, Field(gt=0)] | None = None  # of its axes [rad]
-    depth: Annotated[Length, Field(gt=0)] | None = None  # deepest the gel may be pressed; None: not monitored [m]
-    shear: Annotated[Length, Field(gt=0)] | None = None  # farthest its surface may be dragged; None: not monitored [m]
-
-    @property
-    def max_following_error(self) -> float:
-        """`following_error`, or 1 mm + `speed` x 10 ms + `acceleration` x (50 ms)^2 [m]: servoJ leads joints that
-        accelerate fast a little off the straight line."""
-        usual = 1e-3 + 10e-3 * self.speed + 50e-3**2 * self.acceleration
-        return usual if self.following_error is None else self.following_error
-
-    @property
-    def max_following_turn(self) -> float:
-        """`following_turn`, or 0.01 rad + `turn_rate` x 10 ms + `max_following_error` / 0.4 m [rad]."""
-        usual = 0.01 + 10e-3 * self.turn_rate + self.max_following_error / 0.4
-        return usual if self.following_turn is None else self.following_turn
-
-    @property
-    def region(self) -> Region:
-        """Where the sensor's origin may be: the workspace, cut by the planes."""
-        return box_region(
-            self.workspace.lower, self.workspace.upper, [(each.point, each.normal) for each in self.planes]
-        )
 
 
 class SensorConfig(Config):
@@ -186,6 +115,18 @@ class ArmConfig(Config):
         return _weakened(before, self, LIMIT_KEYS)
 
 
+class GripperConfig(Config):
+    """What a rig file says of one parallel gripper; see SensorConfig."""
+
+    driver: str
+    arm: Name | None = None  # that carries it
+
+    @property
+    def is_real(self) -> bool:
+        """As of an arm."""
+        return True
+
+
 Part = TypeVar("Part")
 
 
@@ -201,6 +142,15 @@ class Payload(Config):
     centre: Vector = (0.0, 0.0, 0.0)  # centre of gravity, flange axes [m]
 
 
+class MountConfig(Config):
+    """What holds a sensor to its arm: a spring with a damper, the same along all axes. The arm does not observe how far
+    it gives way."""
+
+    # None: rigid. A stiffness far below that of the contact (some N/mm) would oscillate, so 500 N/m is the minimum.
+    stiffness: Annotated[Stiffness, Field(ge=500.0)] | None = None
+    damping_time: Annotated[Time, Field(ge=0.1)] = 0.3  # of the displacement to 63 % of what the force asks [s]
+
+
 class MockArmConfig(Config):
     """A mock controller on loopback is started for this arm and stopped with the rig."""
 
@@ -209,6 +159,7 @@ class MockArmConfig(Config):
     version: str | None = None
     # Pose of the sensor by the file, relative to its true pose in the mock: the error that a calibration leaves.
     error: Placement = Placement()
+    mount: MountConfig = MountConfig()  # between the arm and its sensor, in the mock; needs `lock_step`
     # Controller and worker ask for real-time priority, as the worker of a real arm does: to measure timing. Otherwise
     # they share a busy machine with whatever else the mock rig needs.
     realtime: bool = False
@@ -286,7 +237,7 @@ class MockCameraConfig(Config):
 
     fps: Annotated[float, Field(gt=0, le=240)] = 30.0
     quality: Annotated[int, Field(ge=50, le=100)] = 95  # of JPEG
-    delay: Annotated[int, Field(ge=0, le=1)] = 0  # 1: its pictures are those of one motion of the cell ago
+    delay: Delay = 0  # its pictures are those of so many motions of the cell ago
 
 
 class CameraSensorConfig(SensorConfig):

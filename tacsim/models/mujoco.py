@@ -8,10 +8,10 @@ from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
-from tacsim.models.gripper import GripperConfig
-from tacsim.models.hardware import ArmConfig, ArmLimits, Name, Placement, SensorConfig
+from tacsim.models.hardware import ArmConfig, Delay, GripperConfig, Name, Placement, SensorConfig
+from tacsim.models.limits import ArmLimits
 from tacsim.models.quantity import Force, Length, Speed
-from tacsim.models.rig import Delay, WrenchNoise
+from tacsim.models.rig import WrenchNoise
 from tacsim.models.sensor import SensorModel
 
 ElementName = Annotated[str, Field(min_length=1, max_length=200)]  # in a model of MuJoCo

@@ -11,23 +11,23 @@ from pydantic import ConfigDict, Field, GetCoreSchemaHandler, model_validator
 from pydantic_core import CoreSchema, PydanticCustomError
 
 from tacsim.models.driver import DriversMissing, installed_drivers
-from tacsim.models.gripper import GripperConfig
 from tacsim.models.hardware import (
     ArmConfig,
-    ArmLimits,
+    Delay,
+    GripperConfig,
     KeepOut,
+    MountConfig,
     Name,
     Placement,
     ResetConfig,
     SensorConfig,
-    Vector,
 )
-from tacsim.models.quantity import Angle, Config, Force, Length, Speed, Stiffness, Time
+from tacsim.models.limits import ArmLimits, Vector
+from tacsim.models.quantity import Angle, Config, Force, Length, Speed, Time
 from tacsim.models.scene import Scene
 from tacsim.models.sensor import CanonicalGrid, PictureRegion, SensorModel
 from tacsim.models.task import TASKS, TaskConfig, task_annotation
 
-Delay = Annotated[int, Field(ge=0, le=20)]
 Pixels = Annotated[int, Field(ge=16, le=4096)]
 
 
@@ -39,15 +39,6 @@ class WrenchNoise(Config):
     # The zero wanders from where it is at reset (a random walk): its standard deviation after a minute, in those above.
     drift: Annotated[float, Field(ge=0)] = 0.0
     seed: Annotated[int, Field(ge=0)] = 0
-
-
-class MountConfig(Config):
-    """What holds a sensor to its arm: a spring with a damper, the same along all axes. The arm does not observe how far
-    it gives way."""
-
-    # None: rigid. A stiffness far below that of the contact (some N/mm) would oscillate, so 500 N/m is the minimum.
-    stiffness: Annotated[Stiffness, Field(ge=500.0)] | None = None
-    damping_time: Annotated[Time, Field(ge=0.1)] = 0.3  # of the displacement to 63 % of what the force asks [s]
 
 
 class SimArmConfig(ArmConfig):
@@ -242,6 +233,13 @@ class RigConfig(Config):
                         "touch": f"{self.task.touch_force:g}",
                         "at": ("arms", name, arm.driver, "limits", "force"),
                     },
+                )
+            mount = getattr(getattr(arm, "mock", None), "mount", None)
+            if not self.lock_step and mount is not None and mount.stiffness is not None:
+                raise PydanticCustomError(
+                    "free_mount",
+                    "a mock mount gives way once in a control period, so it needs lock_step: true; or leave it out",
+                    {"at": ("arms", name, arm.driver, "mock", "mount")},
                 )
         for name, load in ({} if self.task is None else self.task.held_loads).items():
             self._check_load(name, load)

@@ -11,7 +11,7 @@ import numpy as np
 from tacsim import pose as se3
 from tacsim.interface import ArmState, FloatArray, Pose
 from tacsim.limits import LimitExceeded, clip_to_region, exceeds_wrench, limit_step
-from tacsim.models.hardware import ArmLimits
+from tacsim.models.limits import ArmLimits
 from tacsim.models.rig import WrenchNoise
 from tacsim.sim.clock import Delayed, StateClock
 from tacsim.sim.mount import ElasticMount

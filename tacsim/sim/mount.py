@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from tacsim.interface import FloatArray
-from tacsim.models.rig import MountConfig
+from tacsim.models.hardware import MountConfig
 
 
 class ElasticMount:

@@ -26,7 +26,7 @@ from tacsim.control import (
 )
 from tacsim.interface import Action, ArmState, GelReading, Pose, SensorSpec, TactileObservation
 from tacsim.limits import LimitExceeded
-from tacsim.models.hardware import ArmLimits, Workspace
+from tacsim.models.limits import ArmLimits, Workspace
 from tacsim.models.task import RepositionConfig, SqueezeConfig
 
 

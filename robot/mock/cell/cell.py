@@ -31,6 +31,7 @@ from tacsim.interface import FloatArray, Pose, SensorSpec, TactileFrame, Truth
 from tacsim.models.hardware import CameraSensorConfig, MockCameraConfig, UrArmConfig, parts_of
 from tacsim.models.rig import RigConfig
 from tacsim.models.sensor import SensorModel
+from tacsim.sim.mount import elastic_mount
 
 MIN_STEP_INTERVAL = 5e-3  # between two steps in `run_free` [s]
 
@@ -59,6 +60,9 @@ class MockCell(Closing):
         self._sim_server: SimServer | None = None
         self._delays = {name: mock.delay for name, (_, mock) in cameras.items()}
         self._scene_frame: SceneFrame | None = None
+        self._placed: dict[str, Pose] = {}  # world_from_sensor of the simulated sensors after the last motion
+        mounts = {name: elastic_mount(arm.mock.mount, config.period) for name, arm in self._arms.items() if arm.mock}
+        self._mounts = {name: mount for name, mount in mounts.items() if mount is not None}
         self._pushed: dict[str, tuple[NDArray[np.uint8], int]] = {}  # by camera: its image, and the number of the image
         self._late: dict[str, deque[NDArray[np.uint8]]] = {}  # by camera: the last images, oldest first
         self._lock = threading.Lock()  # held while results of a step are distributed
@@ -164,7 +168,10 @@ class MockCell(Closing):
         if self._sim_server is not None:
             with self._lock:
                 self._late.clear()
-                self._distribute(self._sim_server.place(self.poses()))
+                for mount in self._mounts.values():
+                    mount.begin()
+                self._placed = self.poses()
+                self._distribute(self._sim_server.place(self._placed))
 
     def step(self, pause: float = 0.0) -> Mapping[str, int]:
         """Moves the simulated sensors to the poses of the arms. Sends forces to the controllers and, after a `pause`
@@ -175,7 +182,20 @@ class MockCell(Closing):
         if self._sim_server is None:
             return {}
         with self._lock:
-            return self._distribute(self._sim_server.move(self.poses()), pause)
+            self._placed = self._poses_of_sensors()
+            return self._distribute(self._sim_server.move(self._placed), pause)
+
+    def _poses_of_sensors(self) -> dict[str, Pose]:
+        """As `poses`, where the mounts have given way under the present forces."""
+        poses = self.poses()
+        if self._scene_frame is None:  # nothing was touched yet
+            return poses
+        for arm, mount in self._mounts.items():
+            sensor = self._sensor_on[arm]
+            held, here = poses[sensor], self._placed[sensor]
+            force = se3.rotate(here, self._scene_frame.wrenches[sensor][:3])
+            poses[sensor] = Pose(mount.move_arm(held.position, here.position, force), held.quaternion)
+        return poses
 
     def _distribute(self, scene_frame: SceneFrame, pause: float = 0.0) -> Mapping[str, int]:
         self._scene_frame = scene_frame

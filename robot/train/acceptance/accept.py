@@ -8,10 +8,12 @@ from typing import Literal
 
 from robot.deploy.policy import require_policy_name
 from robot.deploy.python_policy import PolicyNotFound
-from robot.train.acceptance.players import TOGETHER, MockPlayer, PlayedEpisode, Player, SimulatedPlayer
+from robot.train.acceptance.players import TOGETHER, EpisodePlayer, PlayedEpisode
 from robot.train.acceptance.sequential import Errors, PairedTest, RateTest
 from robot.train.benchmark.episodes import Split, load_split
-from robot.train.benchmark.policies import BASELINES, SCRIPTED
+from robot.train.benchmark.policies import BASELINES
+from robot.train.benchmark.score import RigName
+from robot.train.benchmark.wire import require_mock
 from tacsim.interface import IncompatibleRig
 from tacsim.models.benchmark import TEST_SPLIT
 
@@ -33,7 +35,7 @@ class Acceptance:
     policy: str
     task: str  # of the benchmark: a name or the path of a task file
     against: str | None = None  # the earlier policy; None: a rate of success is asked
-    rig: Literal["sim", "mock"] = "sim"
+    rig: RigName = "sim"
     split: str = TEST_SPLIT
     success: float = 0.9  # rate that a good policy has
     indifference: float = 0.2  # a policy that is worse by this is too bad
@@ -91,7 +93,7 @@ def accept_policy(request: Acceptance, report_episode: ReportEpisode = lambda ep
         return Report(request, verdict, cause, test, tuple(played), tuple(earlier), tuple(notes), contract_error)
 
     notes: list[str] = []
-    with _make_player(request, split) as player:
+    with EpisodePlayer(split, numbers, request.rig) as player:
         try:
             notes += player.examine(request.policy)
         except (IncompatibleRig, PolicyNotFound) as unfit:
@@ -126,7 +128,7 @@ def find_cause(misses: list[PlayedEpisode]) -> Cause:
 
 
 def _play_pairs(
-    player: Player, request: Acceptance, numbers: range
+    player: EpisodePlayer, request: Acceptance, numbers: range
 ) -> Iterator[tuple[PlayedEpisode, PlayedEpisode | None]]:
     """Each episode of the policy, with the same one of the earlier policy."""
     together = TOGETHER if request.rig == "sim" else 1
@@ -142,21 +144,18 @@ def _play_pairs(
 def load_checked_split(request: Acceptance) -> Split:
     """The split, after the names of policies, task and split and the numbers are checked. Raises BadRequest."""
     request.make_test()
-    others = BASELINES if request.rig == "sim" else (SCRIPTED,)
     for option, name in (("--policy", request.policy), ("--against", request.against)):
         if name is not None:
             try:
-                require_policy_name(name, others)
+                require_policy_name(name, BASELINES)
             except PolicyNotFound as failure:
                 raise BadRequest(f"{option}: {failure}") from None
     try:
         split = load_split(request.task, request.split)
+        if request.rig == "mock":
+            require_mock(split)
     except (ValueError, OSError) as failure:
         raise BadRequest(f"--task, --split: {failure}") from None
-    if request.rig != "sim" and split.task.rig != "sim":
-        raise BadRequest(
-            f"--rig mock: task '{request.task}' is of rig '{split.task.rig}', which has no mock; use --rig sim"
-        )
     if not 1 <= request.max_episodes <= len(split.episodes):
         raise BadRequest(
             f"--max-episodes: the split '{split.name}' of '{split.task_name}' has {len(split.episodes)} episodes; give "
@@ -165,14 +164,7 @@ def load_checked_split(request: Acceptance) -> Split:
     return split
 
 
-def _make_player(request: Acceptance, split: Split) -> Player:
-    numbers = range(request.max_episodes)
-    if request.rig == "sim":
-        return SimulatedPlayer(split, numbers)
-    return MockPlayer(split, numbers)
-
-
-def _require_earlier(player: Player, name: str) -> None:
+def _require_earlier(player: EpisodePlayer, name: str) -> None:
     try:
         player.examine(name)
     except (IncompatibleRig, PolicyNotFound) as unfit:

@@ -86,8 +86,8 @@ class AcceptanceItem(pytest.Item):
     def runtest(self) -> None:
         """Raises NotAccepted, and pytest.UsageError for what cannot be done."""
         from robot.train.acceptance.accept import BadRequest, accept_policy
-        from robot.train.acceptance.players import RigFailed
         from robot.train.acceptance.words import describe_report
+        from robot.train.benchmark.wire import RigFailed
         from tacsim.config import ConfigError
 
         try:

@@ -16,8 +16,7 @@ from pydantic import ValidationError
 
 from robot.common.whole_file import write_whole
 from robot.train.benchmark.episodes import task_path
-from tacsim.gym.env import TacsimEnv
-from tacsim.interface import Float32, FloatArray
+from tacsim.interface import Float32, FloatArray, Observation
 from tacsim.models.quantity import Config
 from tacsim.tasks import Task
 
@@ -55,26 +54,25 @@ def blind_path(task_name: str) -> Path:
     return found
 
 
-def start_numbers(env: TacsimEnv) -> FloatArray:
+def start_numbers(goal: float | tuple[float, ...], observation: Observation) -> FloatArray:
     """(n,) what is known without touch when an episode begins [m]: the goal, and the poses of the arms as the robot
     assumes them, relative to the first arm."""
-    arms = list(env.observation.arms.values())
-    goal = np.atleast_1d(np.asarray(env.task.goal, np.float64)).ravel()
+    arms = list(observation.arms.values())
     between = [arm.pose.position - arms[0].pose.position for arm in arms[1:]]
-    numbers: FloatArray = np.concatenate([goal, *between])
+    numbers: FloatArray = np.concatenate([np.atleast_1d(goal), *between])
     return numbers
 
 
 class BlindMotion:
-    """The motion in one episode, as a function of the environment."""
+    """The motion in one episode. `start`: (n,) its `start_numbers`."""
 
-    def __init__(self, weights: BlindWeights, env: TacsimEnv) -> None:
+    def __init__(self, weights: BlindWeights, start: FloatArray) -> None:
         mean, deviation = np.array(weights.mean), np.array(weights.deviation)
-        scaled = np.where(deviation > 0, (start_numbers(env) - mean) / np.where(deviation > 0, deviation, 1.0), 0.0)
+        scaled = np.where(deviation > 0, (start - mean) / np.where(deviation > 0, deviation, 1.0), 0.0)
         self._actions: FloatArray = np.array(weights.weights) @ np.append(1.0, scaled)
         self._step = 0
 
-    def __call__(self, env: TacsimEnv) -> Float32:
+    def __call__(self, observation: Observation) -> Float32:
         action = self._actions[min(self._step, len(self._actions) - 1)]
         self._step += 1
         return np.asarray(action.clip(-1.0, 1.0), np.float32)

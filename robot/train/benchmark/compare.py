@@ -11,7 +11,7 @@ from robot.train.benchmark.score import EpisodeScore, Score
 from robot.train.evaluate import Interval, bootstrap_interval
 from tacsim.models.task import Unit
 
-SAME = ("task", "split", "task_sha256", "split_sha256", "sensors_sha256")
+SAME = ("task", "split", "rig", "task_sha256", "split_sha256", "sensors_sha256")
 
 
 class NotComparable(ValueError):
@@ -102,7 +102,7 @@ class Row:
     """One policy on one split in the table of results."""
 
     task: str
-    split: str
+    split: str  # and the rig, if it is not the simulation
     policy: str
     episodes: int
     complete: bool
@@ -154,7 +154,7 @@ def _make_row(score: Score, normalised: float | None) -> Row:
     known = [each.outside for each in score.episodes if each.outside is not None]
     return Row(
         task=score.task,
-        split=score.split,
+        split=score.where,
         policy=score.policy,
         episodes=len(score.episodes),
         complete=score.complete,

@@ -191,7 +191,7 @@ class SplitPlayer:
             for env, index in zip(members, range(first, first + len(members)), strict=True):
                 env.next_variant = index
             self._envs.reset(seed=[self._split.episode_seed(self._numbers[first + at]) for at in range(len(members))])
-            starts += [start_numbers(env) for env in members]
+            starts += [start_numbers(env.task.goal, env.observation) for env in members]
             taken = []
             for _ in range(members[0].task.config.steps):
                 taken.append(np.stack([env.expert() for env in members]))
@@ -211,7 +211,7 @@ class SplitPlayer:
         for at, (env, number, index) in enumerate(zip(self._envs.members, numbers, indices, strict=True)):
             info = _info_of(batched, at)
             if int(info["variant"]) != index:  # another draw has replaced it
-                begun.append(_not_begun(number, env.refused[-1] if env.refused else "the reset failed"))
+                begun.append(score_not_begun(number, env.refused[-1] if env.refused else "the reset failed"))
                 continue
             actor, failure = None, ""
             try:
@@ -239,7 +239,8 @@ def _info_of(batched: Mapping[str, Any], at: int) -> dict[str, Any]:
     }
 
 
-def _not_begun(number: int, reason: str) -> EpisodeScore:
+def score_not_begun(number: int, reason: str) -> EpisodeScore:
+    """Of an episode whose reset failed."""
     return EpisodeScore(
         episode=number, success=False, safe=False, distance=None, start=None, peak_force=0.0, broken=False, steps=0,
         arrival=None, end="not begun", reason=reason[:500], actions="", states="",

@@ -17,12 +17,13 @@ from robot.deploy.policy import (
     require_policy_name,
     reset_policy,
 )
-from robot.train.benchmark.blind import BlindMotion, blind_path, load_blind
+from robot.train.benchmark.blind import BlindMotion, blind_path, load_blind, start_numbers
 from robot.train.benchmark.hashing import hash_document, hash_file, uniform_numbers
 from tacsim.config import config_root
 from tacsim.gym.env import TacsimEnv
-from tacsim.interface import Policy
+from tacsim.interface import Float32, Policy
 from tacsim.models.sensor import CanonicalGrid
+from tacsim.tasks import Task
 
 RANDOM, BLIND, ANALYTIC, SCRIPTED, TEACHER = "random", "blind", "analytic", "scripted", "teacher"
 BASELINES = (RANDOM, BLIND, ANALYTIC, SCRIPTED, TEACHER)
@@ -43,12 +44,11 @@ class Actor:
         if name == TEACHER:
             self._act: Act = lambda env: env.expert()
         elif name == RANDOM:
-            count = len(env.task.axes)
-            drawn = uniform_numbers(f"{Path(task).stem}:{number}", count * env.task.config.steps)
-            self._actions = iter(np.array(drawn, np.float32).reshape(-1, count))
+            self._actions = iter(random_vectors(task, number, env.task))
             self._act = lambda env: next(self._actions)
         elif name == BLIND:
-            self._act = BlindMotion(load_blind(task, env.task), env)
+            motion = BlindMotion(load_blind(task, env.task), start_numbers(env.task.goal, env.observation))
+            self._act = lambda env: motion(env.observation)
         else:
             self._policy = policy = (
                 env.task.analytic() if name == ANALYTIC else load_fitting_policy(name, env, canonical)
@@ -80,6 +80,13 @@ class Actor:
     def policy(self) -> Policy | None:
         """As loaded; None for those that act by the environment."""
         return self._policy
+
+
+def random_vectors(task_name: str, number: int, task: Task) -> Float32:
+    """(steps, axes) the actions of `random` in episode `number` of a task file."""
+    count = len(task.axes)
+    drawn = uniform_numbers(f"{Path(task_name).stem}:{number}", count * task.config.steps)
+    return np.array(drawn, np.float32).reshape(-1, count)
 
 
 def load_fitting_policy(name: str, env: TacsimEnv, canonical: CanonicalGrid) -> Policy:

@@ -75,8 +75,8 @@ def _by_policy(scores: Sequence[Score], task: str) -> dict[str, Score]:
     found: dict[str, Score] = {}
     for score in sorted((each for each in scores if each.task == task), key=lambda each: len(each.episodes)):
         other = found.get(score.policy_sha256)
-        if other is not None and other.split != score.split:
-            raise NotComparable(f"'{score.policy}' has scores of {other.split} and {score.split}: choose one split")
+        if other is not None and other.where != score.where:
+            raise NotComparable(f"'{score.policy}' has scores of {other.where} and {score.where}: choose one")
         found[score.policy_sha256] = score
     return found
 

@@ -12,7 +12,8 @@ from robot.train.benchmark.episodes import Split, load_split, subset_size
 from robot.train.benchmark.fingerprint import machine, physics
 from robot.train.benchmark.play import SplitPlayer, Warn
 from robot.train.benchmark.policies import hash_policy
-from robot.train.benchmark.score import Score, read_score, score_path, write_score
+from robot.train.benchmark.score import RigName, Score, read_score, score_path, write_score
+from robot.train.benchmark.wire import WirePlayer, require_mock
 
 Subset = Literal["quick", "full"]
 ReportProgress = Callable[[str, int, int], None]
@@ -32,10 +33,12 @@ class Run:
     splits: tuple[str, ...]
     subset: Subset
     folder: Path
-    environments: int = 8  # episodes that move together; results do not depend on it
+    environments: int = 8  # simulated episodes that move together; results do not depend on it
+    rig: RigName = "sim"
+    first: int | None = None  # only so many episodes of the subset, for now; None: all
 
 
-def new_score(split: Split, policy: str, subset: Subset) -> Score:
+def new_score(split: Split, policy: str, subset: Subset, rig: RigName = "sim") -> Score:
     """The score of a policy without episodes. Raises PolicyNotFound."""
     config = split.load_config()
     assert config.task is not None
@@ -44,6 +47,7 @@ def new_score(split: Split, policy: str, subset: Subset) -> Score:
         kind=config.task.kind,
         split=split.name,
         subset=subset,
+        rig=rig,
         policy=policy,
         policy_sha256=hash_policy(policy, split.file, config.task.kind),
         task_sha256=split.task_sha256,
@@ -65,28 +69,41 @@ def run_benchmark(
 
     An episode in which the policy raises is a failed episode, with the reason in its score; the run continues.
     report_score: called with each score when it is complete.
-    Raises PolicyNotFound, IncompatibleRig, SplitChanged, OtherRun, ScoreEdited, and the errors of `SplitPlayer`.
+    Raises PolicyNotFound, IncompatibleRig, SplitChanged, OtherRun, ScoreEdited, and the errors of `SplitPlayer` and
+    `WirePlayer`.
     """
     found: list[tuple[Path, Score]] = []
     for name in run.splits:
         split = load_split(run.task, name)
-        wanted = [open_score(run.folder, new_score(split, policy, run.subset)) for policy in run.policies]
-        numbers = sorted({number for _, score in wanted for number in score.missing})
+        if run.rig == "mock":
+            require_mock(split)
+        wanted = [open_score(run.folder, new_score(split, policy, run.subset, run.rig)) for policy in run.policies]
+        numbers = sorted({number for _, score in wanted for number in _missing(score, run.first)})
         if numbers:
-            with SplitPlayer(split, numbers, run.environments) as player:
+            with _make_player(split, numbers, run) as player:
                 for _, score in wanted:
                     player.require_policy(score.policy, warn)
-                wanted = [_complete(player, path, score, report_progress) for path, score in wanted]
+                for chosen in [[number] for number in numbers] if run.rig == "mock" else [numbers]:
+                    wanted = [_play(player, path, score, chosen, report_progress) for path, score in wanted]
         for path, score in wanted:
             report_score(path, score)
         found += wanted
     return found
 
 
+def _make_player(split: Split, numbers: Sequence[int], run: Run) -> SplitPlayer | WirePlayer:
+    return WirePlayer(split, numbers) if run.rig == "mock" else SplitPlayer(split, numbers, run.environments)
+
+
+def _missing(score: Score, first: int | None) -> list[int]:
+    """Numbers of the episodes to play, of the first so many."""
+    return [number for number in score.missing if first is None or number < first]
+
+
 def open_score(folder: Path, new: Score) -> tuple[Path, Score]:
     """The score file of this subject, or `new` if there is none yet. Raises OtherRun if the file there has another
     subject: another physics, task, split, sensors or vector width."""
-    path = score_path(folder, new.task, new.split, new.policy, new.policy_sha256, new.subset)
+    path = score_path(folder, new)
     if not path.exists():
         return path, new
     there = read_score(path)
@@ -98,17 +115,21 @@ def open_score(folder: Path, new: Score) -> tuple[Path, Score]:
     return path, there
 
 
-def _complete(player: SplitPlayer, path: Path, score: Score, report: ReportProgress) -> tuple[Path, Score]:
-    missing: Sequence[int] = score.missing
-    done = score.number - len(missing)
+def _play(
+    player: SplitPlayer | WirePlayer, path: Path, score: Score, numbers: Sequence[int], report: ReportProgress
+) -> tuple[Path, Score]:
+    """Plays those of the episodes that the score does not have."""
+    missing = [number for number in score.missing if number in numbers]
     started = time.perf_counter()
-    words = f"{score.policy}, {score.split}"
+    words = f"{score.policy}, {score.where}"
     rounds = player.play(
-        score.policy, missing, lambda step, steps: report(f"{words}: step {step} of {steps}", done, score.number)
+        score.policy,
+        missing,
+        lambda step, steps: report(f"{words}: step {step} of {steps}", len(score.episodes), score.number),
     )
     for episodes, seconds in rounds:
         now = time.perf_counter()
         score = write_score(path, score.with_episodes(episodes, now - started, seconds))
-        started, done = now, score.number - len(score.missing)
-        report(words, done, score.number)
+        started = now
+        report(words, len(score.episodes), score.number)
     return path, score

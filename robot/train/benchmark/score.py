@@ -21,6 +21,7 @@ from tacsim.models.text import printable_line
 MAX_BYTES = 32 * 2**20  # of a file; 200 episodes have 100 kB
 # How an episode ended: after its steps, at a limit of force, by divergence of the simulation, by an error of the
 # policy, or before its first step because the reset failed.
+RigName = Literal["sim", "mock"]
 End = Literal["steps", "limit", "diverged", "error", "not begun"]
 
 
@@ -53,6 +54,7 @@ class Score(Config):
     kind: str = ""  # of the task: the unit of its distances; "" in scores of lengths that do not say it
     split: str
     subset: Literal["quick", "full"]
+    rig: RigName = "sim"  # mock: over the real wire; its bits are not hashed
     policy: str  # as given to --policy
     policy_sha256: str  # of its file; of a built-in policy of its name
     task_sha256: str
@@ -81,8 +83,15 @@ class Score(Config):
         done = {each.episode for each in self.episodes}
         return [number for number in range(self.number) if number not in done]
 
+    @property
+    def where(self) -> str:
+        """Its split, and its rig where that is not the simulation."""
+        return self.split if self.rig == "sim" else f"{self.split} ({self.rig})"
+
     def computed_seal(self) -> str:
-        return hash_document(self.model_dump(mode="json", exclude={"seal"} if self.kind else {"seal", "kind"}))
+        # Scores of earlier versions have neither kind nor rig.
+        unknown = {key for key, default in (("kind", ""), ("rig", "sim")) if getattr(self, key) == default}
+        return hash_document(self.model_dump(mode="json", exclude={"seal", *unknown}))
 
     def with_episodes(self, more: Sequence[EpisodeScore], wall: float, policy: float) -> Score:
         """With more episodes and the seconds that they took [s]."""
@@ -171,11 +180,13 @@ def write_score(path: Path, score: Score) -> Score:
     return sealed
 
 
-def score_path(folder: Path, task: str, split: str, policy: str, policy_sha256: str, subset: str) -> Path:
-    """Where the score of a policy is; a policy in a file has the beginning of its hash in the name."""
+def score_path(folder: Path, score: Score) -> Path:
+    """Where a score is; that of a policy in a file has the beginning of its hash in the name."""
+    policy = score.policy
     name = re.sub(r"[^A-Za-z0-9_.-]+", ".", Path(policy).stem if policy.endswith((".onnx", ".csv")) else policy)
-    mark = f"-{policy_sha256[:8]}" if re.search(r"[:/.]", policy) else ""
-    return folder / task / split / f"{name}{mark}{'' if subset == 'full' else '.quick'}.json"
+    mark = f"-{score.policy_sha256[:8]}" if re.search(r"[:/.]", policy) else ""
+    kinds = f"{'' if score.rig == 'sim' else '.mock'}{'' if score.subset == 'full' else '.quick'}"
+    return folder / score.task / score.split / f"{name}{mark}{kinds}.json"
 
 
 def find_scores(folder: Path) -> list[tuple[Path, Score]]:

@@ -66,6 +66,11 @@ def verify_score(
     score = read_score(path)
     if not score.episodes:
         raise NotAScore(f"{path}: has no episodes yet; run the benchmark again, and it continues")
+    if score.rig != "sim":
+        raise NotAScore(
+            f"{path}: of the rig '{score.rig}', where no two runs have the same bits; play it again into another "
+            f"folder: tacsim benchmark run {score.task} --rig {score.rig}"
+        )
     split = load_split(task or score.task, score.split)
     here = new_score(split, policy or score.policy, score.subset)
     _require_subject(path, score, here)

@@ -21,7 +21,8 @@ from robot.common.kinematics import Kinematics
 from robot.mock import Input, MockState
 from tacsim import pose as se3
 from tacsim.interface import Pose
-from tacsim.models.hardware import ArmLimits, MockArmConfig, Payload, Placement, UrArmConfig, Workspace
+from tacsim.models.hardware import MockArmConfig, Payload, Placement, UrArmConfig
+from tacsim.models.limits import ArmLimits, Workspace
 from tests.robot.waiting import until
 
 HOST, OTHER = (f"127.{net}.{os.getpid() >> 8 & 255}.{os.getpid() & 255}" for net in (23, 123))

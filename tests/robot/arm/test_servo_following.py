@@ -15,7 +15,7 @@ from robot.common.kinematics import rotation
 from robot.mock.ur.machine.motion import movej, speedj
 from tacsim import pose as se3
 from tacsim.interface import FloatArray, Pose
-from tacsim.models.hardware import ArmLimits, Workspace
+from tacsim.models.limits import ArmLimits, Workspace
 from tests.robot.arm.servo_bench import OnController, shifted
 
 WIDE = {"action_timeout": 60.0, "lower": [-1.0, -1.0, 0.0], "upper": [1.0, 1.0, 1.5]}

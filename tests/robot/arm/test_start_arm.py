@@ -15,7 +15,8 @@ from robot.arm.ur import URArm
 from robot.errors import DeviceError, SafetyViolation
 from robot.mock import MockUR
 from robot.procedures.to_start import StartArm
-from tacsim.models.hardware import UrArmConfig, Workspace
+from tacsim.models.hardware import UrArmConfig
+from tacsim.models.limits import Workspace
 from tests.robot.arm.mocked import config, moved, servo_targets
 from tests.robot.waiting import until
 

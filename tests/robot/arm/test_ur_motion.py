@@ -19,7 +19,7 @@ from robot.mock import MockUR
 from tacsim import pose as se3
 from tacsim.interface import Pose
 from tacsim.limits import ActionError
-from tacsim.models.hardware import ArmLimits, Plane, Workspace
+from tacsim.models.limits import ArmLimits, Plane, Workspace
 from tests.promises import Record
 from tests.robot.arm.mocked import (
     KINEMATICS,

@@ -19,7 +19,7 @@ from robot.errors import (
     SafetyViolation,
 )
 from robot.mock import MockUR
-from tacsim.models.hardware import Workspace
+from tacsim.models.limits import Workspace
 from tests.promises import Record
 from tests.robot.arm.mocked import BASE, CARRIED, OTHER, config, go, in_motion, leftovers, moved, records
 from tests.robot.waiting import PATIENCE, until

@@ -19,7 +19,8 @@ from robot.arm.channel import make_worker_config as config_of
 from robot.arm.status import ArmStatus
 from robot.arm.trajectory import PERIOD
 from robot.mock import MOCK_SERIAL, MockUR
-from tacsim.models.hardware import ArmLimits, MockArmConfig, Placement, UrArmConfig, Workspace
+from tacsim.models.hardware import MockArmConfig, Placement, UrArmConfig
+from tacsim.models.limits import ArmLimits, Workspace
 from tests.robot.arm.mocked import HOST
 from tests.robot.waiting import PATIENCE, until
 

@@ -24,7 +24,8 @@ from robot.procedures.to_start import (
 from tacsim import pose as se3
 from tacsim.config import load_rig
 from tacsim.interface import FloatArray, Pose
-from tacsim.models.hardware import Placement, Plane, UrArmConfig
+from tacsim.models.hardware import Placement, UrArmConfig
+from tacsim.models.limits import Plane
 from tests.robot.cli.lab import Lab, copy_of
 from tests.robot.cli.test_start import AWAY, fast
 

@@ -74,6 +74,23 @@ def test_mock_rig_reset_ends_in_touch_with_truth(simulated: Opened) -> None:
 
 
 @pytest.mark.slow
+def test_mock_mount_gives_way_and_the_arm_does_not_observe_it() -> None:
+    """A spring of 2 N/mm: the sensor is where the arm reports it, plus force / stiffness."""
+    mount = [f"arms.upper.mock.mount.{word}" for word in ("stiffness=2 N/mm", "damping_time=0.1 s")]
+    with opened("mock", *SMALL, *TINY, *mount, *rig_addresses(), "start.approach_step=0.2 mm") as found:
+        arms = found.rig.reset().arms
+        pose = arms["upper"].pose
+        found.rig.step(Action({"upper": Pose(pose.position - [0.0, 0.0, 0.3e-3], pose.quaternion)}))
+        for _ in range(8):  # of 0.1 s each: at rest
+            observation, _ = found.rig.step(Action({}))
+        truth, arm, below = found.rig.truth(), observation.arms["upper"], observation.arms["lower"]
+    assert truth is not None
+    given = truth.poses["upper"].position - arm.pose.position
+    assert given[2] == pytest.approx(-arm.wrench[2] / 2000.0, rel=0.02) and given[2] > 0.1e-3
+    assert truth.poses["lower"].position == pytest.approx(below.pose.position, abs=5e-6)
+
+
+@pytest.mark.slow
 def test_mock_rig_approach_without_touch_returns_to_start(simulated: Opened) -> None:
     reset = simulated.rig._reset
     config = reset._config  # type: ignore[attr-defined]

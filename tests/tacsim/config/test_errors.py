@@ -200,6 +200,14 @@ def test_text_of_a_wrong_override(override: str, message: str, empty_folder: Pat
     assert complaint(load_rig, "sim", overrides=[override]) == f"--set {override}: {message}"
 
 
+def test_a_mount_of_a_mock_needs_lock_step() -> None:
+    free = ["lock_step=false", "arms.upper.mock.mount.stiffness=2 N/mm"]
+    assert "a mock mount gives way once in a control period, so it needs lock_step: true" in complaint(
+        load_rig, "mock", overrides=free
+    )
+    assert load_rig("mock", overrides=free[1:])
+
+
 def test_a_file_that_is_not_there_lists_the_names() -> None:
     assert (
         complaint(load_rig, "simm")

@@ -9,7 +9,7 @@ import pytest
 
 from tacsim import pose as se3
 from tacsim.interface import Pose, SensorSpec
-from tacsim.models.hardware import ArmLimits, Workspace
+from tacsim.models.limits import ArmLimits, Workspace
 from tacsim.sim.arm import SimArm
 from tacsim.sim.clock import SimClock
 from tacsim.sim.sensor import SimSensor

@@ -8,7 +8,7 @@ from pydantic import ValidationError
 
 from robot.open import open_rig
 from tacsim import Action, Pose
-from tacsim.models.rig import MountConfig
+from tacsim.models.hardware import MountConfig
 from tacsim.sim.mount import ElasticMount, elastic_mount
 from tests.tacsim.gym.small import SMALL
 

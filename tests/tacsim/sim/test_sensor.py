@@ -10,7 +10,7 @@ import pytest
 from tacsim.control import NoTouch
 from tacsim.interface import Pose, SensorSpec
 from tacsim.limits import LimitExceeded
-from tacsim.models.hardware import ArmLimits, Workspace
+from tacsim.models.limits import ArmLimits, Workspace
 from tacsim.physics.move import MoveStats
 from tacsim.sim.arm import SimArm
 from tacsim.sim.clock import SimClock

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tacsim.models.hardware import ArmLimits, Workspace
+from tacsim.models.limits import ArmLimits, Workspace
 from tacsim.models.rig import WrenchNoise
 from tacsim.sim.arm import SimArm, WrenchNoiseSource, wrench_noise_source
 from tacsim.sim.clock import SimClock

@@ -85,7 +85,7 @@ def test_an_earlier_policy_that_does_not_work_is_a_bad_request(task: str) -> Non
         ({"split": "shift-nothing"}, "has no split 'shift-nothing'"),
         ({"policy": "lerned"}, "did you mean 'learned'"),
         ({"against": "nowhere.onnx"}, "--against: policy 'nowhere.onnx': no such file"),
-        ({"rig": "mock", "policy": "teacher"}, "no policy 'teacher'"),
+        ({"rig": "mock", "task": "hold"}, "which has no mock"),
         ({"max_episodes": 201}, "has 200 episodes"),
         ({"max_episodes": 0}, "has 200 episodes"),
         ({"success": 1.0}, "--success and --indifference"),

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 import robot.train.benchmark.play as play
-from robot.train.benchmark.blind import BlindMotion, BlindWeights
+from robot.train.benchmark.blind import BlindMotion, BlindWeights, start_numbers
 from robot.train.benchmark.hashing import hash_document
 from robot.train.benchmark.run import OtherRun, Run, run_benchmark
 from robot.train.benchmark.score import NotAScore, Score, ScoreEdited, read_score, write_score
 from robot.train.benchmark.verify import WrongSubject, verify_score
-from tacsim.interface import Pose
+from tacsim.interface import Observation, Pose
 from tests.robot.cli.invoked import tacsim
 from tests.robot.train.benchmark.small import Raises, write_task
 
@@ -204,7 +204,6 @@ def test_blind_motion_does_not_depend_on_observations() -> None:
         weights=(((0.1, 0.2, 9.0, 9.0, -0.4),), ((-0.5, 0.0, 9.0, 9.0, 0.0),)),
     )  # fmt: skip
     arms = {name: SimpleNamespace(pose=Pose(np.array([0.0, 0.0, z]))) for name, z in (("lower", 1.0), ("upper", 3.5))}
-    env: Any = SimpleNamespace(observation=SimpleNamespace(arms=arms), task=SimpleNamespace(goal=1.5))
-    motion = BlindMotion(weights, env)
-    env.observation = None
-    assert [float(motion(env)[0]) for _ in range(3)] == pytest.approx([0.1 + 0.2 * 1.0 - 0.4 * 0.5, -0.5, -0.5])
+    first, other = (Observation(time=0.0, tactile={}, arms=each) for each in (arms, {}))  # type: ignore[arg-type]
+    motion = BlindMotion(weights, start_numbers(1.5, first))
+    assert [float(motion(other)[0]) for _ in range(3)] == pytest.approx([0.1 + 0.2 * 1.0 - 0.4 * 0.5, -0.5, -0.5])

@@ -18,6 +18,7 @@ from robot.rig.reset import ForceTouch, HardwareReset, PictureTouch, TouchSensin
 from tacsim.control import GelMonitor, load_controller
 from tacsim.interface import Normaliser, Pose, RigSpec, SensorSpec, TactileFrame, TactileSource
 from tacsim.models.driver import ArmDriver, Companion, SensorDriver
+from tacsim.models.hardware import CameraSensorConfig, parts_of
 from tacsim.models.limits import ArmLimits
 from tacsim.models.rig import RigConfig
 from tacsim.record.episode import ALIGNMENT, LIMITS_HIT
@@ -98,9 +99,12 @@ class LockStep(_MonotonicClock):
         arms: Mapping[str, CommandedArm],
         sensors: Mapping[str, TactileSource],
         companion: Companion,
+        late_images: int = 0,
     ) -> None:
-        """sensors: those whose images the companion renders; each is a NumberedSource."""
+        """sensors: those whose images the companion renders; each is a NumberedSource. late_images: how many motions of
+        the companion the latest of them is behind."""
         super().__init__(period)
+        self._late_images = late_images
         self._arms, self._companion = arms, companion
         self._sensors = {name: cast(NumberedSource, sensor) for name, sensor in sensors.items()}
 
@@ -108,10 +112,15 @@ class LockStep(_MonotonicClock):
         """Raises DeviceError if an arm does not arrive or is stopped, the cell fails, or an image does not arrive."""
         arrival_timeout = 10.0  # longest motion of a control period in lock step [s]
         wait_for_arrival(self._arms, arrival_timeout)
-        self.wait_for_data()
+        self._step_cell()
 
     def wait_for_data(self) -> None:
-        """Moves the cell to the poses of the arms, and waits until forces and images have arrived over the wire."""
+        """Moves the cell to the poses of the arms, and waits until forces and images of them have arrived over the
+        wire, also images that are late."""
+        for _ in range(1 + self._late_images):
+            self._step_cell()
+
+    def _step_cell(self) -> None:
         for name, number in self._companion.step(pause=FORCE_DELAY).items():
             self._sensors[name].wait_for(number, timeout=5.0)
 
@@ -231,7 +240,10 @@ def _make_clock(
     if companion is None or not companion.is_simulated:
         return WallClock(config.period)
     if config.lock_step and not is_real:
-        return LockStep(config.period, arms, {name: sensors[name] for name in companion.picture_sources}, companion)
+        cameras = parts_of(config.sensors, CameraSensorConfig).values()
+        late = max((camera.mock.delay for camera in cameras if camera.mock is not None), default=0)
+        rendered = {name: sensors[name] for name in companion.picture_sources}
+        return LockStep(config.period, arms, rendered, companion, late)
     companion.run_free()
     return WallClock(config.period, companion.wait_for_fresh_step, real_time=config.contact == "hertz")
 

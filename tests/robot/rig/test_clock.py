@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from typing import Any
 
 import numpy as np
 import pytest
@@ -153,9 +154,13 @@ def test_lock_step_waits_for_arms_then_forces_then_images(time: Time) -> None:
             log.append(("picture", number))
 
     arm = StubArm(4)
-    clock = LockStep(PERIOD, {"left": commanded(arm, Pose())}, {"finger": StubCamera()}, Cell())  # type: ignore[dict-item, arg-type]
+    stubs: Any = ({"left": commanded(arm, Pose())}, {"finger": StubCamera()}, Cell())
+    clock = LockStep(PERIOD, *stubs, late_images=2)
     clock.tick()
-    assert log == [("step", 4, clocks.FORCE_DELAY), ("picture", 17)]
+    step = [("step", 4, clocks.FORCE_DELAY), ("picture", 17)]
+    assert log == step
+    clock.wait_for_data()  # outside an episode also of late images
+    assert log == 4 * step
     assert clock.period == PERIOD and clock.diagnostics() == {}
 
 

@@ -6,6 +6,7 @@ import os
 import signal
 from collections.abc import Iterator
 
+import numpy as np
 import pytest
 
 from robot.fixtures import rig_addresses
@@ -71,6 +72,20 @@ def test_mock_rig_reset_ends_in_touch_with_truth(simulated: Opened) -> None:
     for name, pose in sent.items():
         assert pose is not None
         assert observation.arms[name].pose.position == pytest.approx(pose.position, abs=5e-6)
+
+
+@pytest.mark.slow
+def test_second_reset_has_the_references_of_the_first_with_late_pictures() -> None:
+    """Not those of the last contact."""
+    with opened("mock", *SMALL, *TINY, "sensors.upper.mock.delay=2", *rig_addresses()) as found:
+        rig = found.rig
+        pose = rig.reset().arms["upper"].pose
+        first = rig.references["upper"].image.astype(int)
+        for _ in range(3):  # the last picture is that of the first motion
+            rig.step(Action({"upper": Pose(pose.position - [0.0, 0.0, 0.3e-3], pose.quaternion)}))
+        contact = np.abs(rig.frames["upper"].image - first).mean()
+        rig.reset()
+        assert np.abs(rig.references["upper"].image - first).mean() < 0.2 * contact
 
 
 @pytest.mark.slow

@@ -50,6 +50,7 @@ SCALES = {
     "area": 1e-4,  # in contact [m^2]
     "depth": 1e-3,  # greatest, and mean over the contact [m]
     "centroid": 5e-3,  # of the indented volume, sensor x and y [m]
+    "dragged": 1e-3,  # of the centroid since the first observation with contact, sensor x and y [m]
     "shear": 0.2e-3,  # mean flow of all markers, sensor x and y [m]
     "turned": 0.5,  # of the edges in the gel since the first observation, from sensor x to y [rad]
     "force": 10.0,  # [N]
@@ -73,6 +74,7 @@ PARTS: dict[str, dict[str, str]] = {
     "area": {"area": "area"},
     "depth": {"depth_greatest": "depth", "depth_mean": "depth"},
     "centroid": {"centroid_x": "centroid", "centroid_y": "centroid"},
+    "dragged": {"dragged_x": "dragged", "dragged_y": "dragged"},
     "shear": {"shear_x": "shear", "shear_y": "shear"},
     "turned": {"turned": "turned"},
     "wrench": {f"{what}_{axis}": what for what in ("force", "torque") for axis in "xyz"},
@@ -84,7 +86,8 @@ PARTS: dict[str, dict[str, str]] = {
     "grip": {"width": "width", "grip_force": "force"},
 }
 _IDENTITY_COLUMNS = np.array([1.0, 0.0, 0.0, 0.0, 1.0, 0.0])
-_SENSOR_QUANTITIES = ("area", "depth", "centroid", "shear", "turned")
+_SENSOR_QUANTITIES = ("area", "depth", "centroid", "dragged", "shear", "turned")
+_OF_HEIGHT = {"height", "slope", "depth", "centroid", "dragged", "turned"}
 
 
 def default_features(canonical: CanonicalGrid, sensors: Sequence[str], arms: Sequence[str]) -> Features:
@@ -125,6 +128,7 @@ class FeatureEncoder:
         self._goal: Arrays = {}
         self._start: Mapping[str, Pose] = {}
         self._pressed: dict[str, FloatArray] = {}  # where the normal force acted first
+        self._gripped: dict[str, FloatArray] = {}  # centroid of each sensor's first contact
         self._turns: list[EdgeTurn] = []  # of each sensor
         self._before: Mapping[str, Pose] = {}  # poses of the last observation
         self._sums: FloatArray | float = 0.0  # of what is remembered, since the episode began
@@ -134,7 +138,7 @@ class FeatureEncoder:
     @property
     def needs(self) -> Needs:
         wanted = self.features
-        height = bool({"height", "slope"} & set(wanted.maps) or {"depth", "centroid", "turned"} & set(wanted.touch))
+        height = not _OF_HEIGHT.isdisjoint((*wanted.maps, *wanted.touch))
         flow = wanted.flow or "shear" in wanted.touch
         sensors, arms, grippers = map(frozenset, (wanted.sensors, wanted.arms, wanted.grippers))
         return Needs(sensors, arms, height=height, flow=flow, grippers=grippers)
@@ -187,7 +191,7 @@ class FeatureEncoder:
                 raise IncompatibleRig("the policy needs a goal, but the rig has no task: name one (--task)")
             self._goal = {"goal": np.atleast_1d(np.asarray(goal, np.float32) / np.float32(SCALES["goal"]))}
         self._start = {name: observation.arms[name].pose for name in self.features.arms}
-        self._pressed, self._before = {}, self._start
+        self._pressed, self._gripped, self._before = {}, {}, self._start
         self._turns = [EdgeTurn() for _ in self.features.sensors]
         self._sums, self._count = 0.0, 0
         self._frames.extend([self._encode(observation)] * self.features.frames)
@@ -246,7 +250,10 @@ class FeatureEncoder:
         elif quantity == "depth":
             each = [_depths(touch) / SCALES["depth"] for touch in touches]
         elif quantity == "centroid":
-            each = [self._centroid(touch) / SCALES["centroid"] for touch in touches]
+            each = [_or_middle(self._centroid(touch)) / SCALES["centroid"] for touch in touches]
+        elif quantity == "dragged":
+            named = zip(self.features.sensors, touches, strict=True)
+            each = [self._centroid_shift(name, touch) / SCALES["dragged"] for name, touch in named]
         elif quantity == "shear":
             each = [_require_flow(touch).mean(axis=(0, 1)) / SCALES["shear"] for touch in touches]
         elif quantity == "turned":
@@ -277,13 +284,23 @@ class FeatureEncoder:
         now, before = (se3.relative_position(self._start[name], each) for each in (pose, self._before[name]))
         return now - before
 
-    def _centroid(self, touch: TactileObservation) -> FloatArray:
-        """(2,) of what is pressed in where there is contact [m]; the middle without contact."""
+    def _centroid_shift(self, name: str, touch: TactileObservation) -> FloatArray:
+        """(2,) since the episode's first observation with contact [m]; 0 without contact."""
+        here = self._centroid(touch)
+        return np.zeros(2) if here is None else here - self._gripped.setdefault(name, here)
+
+    def _centroid(self, touch: TactileObservation) -> FloatArray | None:
+        """(2,) of what is pressed in where there is contact [m]; None without contact."""
         pressed = _require_height(touch).clip(min=0.0) * touch.contact
         total = float(pressed.sum())
         if total == 0.0:
-            return np.zeros(2)
+            return None
         return np.array([pressed.sum(axis=0) @ self._columns, pressed.sum(axis=1) @ self._rows]) / total
+
+
+def _or_middle(centroid: FloatArray | None) -> FloatArray:
+    """(2,) [m]; the middle of the gel without contact."""
+    return np.zeros(2) if centroid is None else centroid
 
 
 def _encode_grips(grippers: Sequence[GripperState]) -> FloatArray:

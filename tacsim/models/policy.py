@@ -15,7 +15,18 @@ from tacsim.models.randomisation import Randomisation
 
 Channel = Literal["height", "slope", "contact", "image", "picture"]
 Quantity = Literal[
-    "area", "depth", "centroid", "shear", "turned", "wrench", "pressure", "moved", "stepped", "between", "grip"
+    "area",
+    "depth",
+    "centroid",
+    "dragged",
+    "shear",
+    "turned",
+    "wrench",
+    "pressure",
+    "moved",
+    "stepped",
+    "between",
+    "grip",
 ]
 
 METADATA_KEY = "tacsim.spec"  # of an ONNX file

@@ -179,6 +179,25 @@ def test_pressure_is_where_the_force_acts_since_reset() -> None:
     assert asked(pressed(2.5e-3, -2e-3, -1.0))["touch"] == pytest.approx([0.2, 0, 0, 0], abs=1e-7)
 
 
+def test_dragged_is_how_far_the_contact_has_gone_since_the_first_in_the_episode() -> None:
+    def pressed(row: int, column: int, depth: float = 1e-4) -> Observation:
+        height = np.zeros((8, 12), np.float32)
+        height[row : row + 2, column : column + 2] = depth
+        return observation(height=height, contact=height > 0)
+
+    asked = encoder(touch=("dragged",))
+    names = asked.inputs["touch"].names
+    assert names == ("dragged_x_lower", "dragged_y_lower", "dragged_x_upper", "dragged_y_upper")
+    assert asked.needs.height
+    assert asked.begin(pressed(2, 7))["touch"].tolist() == [0.0] * 4  # wherever it begins
+    assert asked(pressed(1, 9))["touch"] == pytest.approx([1.0, -0.5, 0, 0], abs=1e-6)  # cells of 0.5 mm
+    assert asked(pressed(1, 9, depth=0.0))["touch"].tolist() == [0.0] * 4  # nothing touches
+    assert asked(pressed(3, 7))["touch"] == pytest.approx([0, 0.5, 0, 0], abs=1e-6)  # since the first, still
+    asked.begin(pressed(4, 4, depth=0.0))
+    assert asked(pressed(4, 4))["touch"].tolist() == [0.0] * 4  # the first contact of a new episode
+    assert asked(pressed(5, 4))["touch"] == pytest.approx([0, 0.5, 0, 0], abs=1e-6)
+
+
 def test_stepped_is_the_way_since_the_last_observation_along_the_axes_of_the_sensor_at_reset() -> None:
     asked = encoder(touch=("stepped",), arms=("upper",))
     assert asked.inputs["touch"].names == ("stepped_x_upper", "stepped_y_upper", "stepped_z_upper")
@@ -193,8 +212,8 @@ def test_stepped_is_the_way_since_the_last_observation_along_the_axes_of_the_sen
 def test_without_contact_nothing_is_felt_and_all_is_finite() -> None:
     flat = np.zeros((8, 12), np.float32)
     seen = observation(height=flat, contact=flat > 0)
-    asked = encoder(sensors=("lower",), touch=("area", "depth", "centroid"))
-    assert asked.begin(seen)["touch"].tolist() == [0.0] * 5
+    asked = encoder(sensors=("lower",), touch=("area", "depth", "centroid", "dragged"))
+    assert asked.begin(seen)["touch"].tolist() == [0.0] * 7
 
 
 def test_frames_are_stacked_oldest_first_and_begin_alike() -> None:

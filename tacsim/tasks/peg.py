@@ -57,6 +57,13 @@ class Peg(RigidTask):
         return found[0]
 
     @property
+    def _height_of_start(self) -> float:
+        """Of the bar's lower end above the mouth of the hole when an episode begins [m]."""
+        item = self.config.scene.object
+        assert item is not None
+        return item.pedestal + item.lift - float(self._find_hole()[1].position[2])
+
+    @property
     def axes(self) -> tuple[Axis | GripAxis, ...]:
         return (*self.hand_axes("xyz"), self.grip_axis)
 
@@ -91,8 +98,8 @@ class Peg(RigidTask):
         return np.array([*steps_towards(offset, step), grip_component(self.config, self.config.touch_force)])
 
     def scripted(self, *, through: bool = False) -> Policy:
-        return ScriptedPeg(self.config, through)
+        return ScriptedPeg(self.config, self._height_of_start, through)
 
     def teacher(self) -> Policy:
         """The scripted policy, which goes on from where the hand is, even if a learned policy moved it."""
-        return ScriptedPeg(self.config, through=False, follows=True)
+        return ScriptedPeg(self.config, self._height_of_start, through=False, follows=True)

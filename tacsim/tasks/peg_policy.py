@@ -17,12 +17,15 @@ class ScriptedPeg:
     Where the block supports the bar, seen from the bar's axis, follows from force and moment on the hand: a bar whose
     end is over the hole but for a strip rests on that strip, so the hole is on the other side. With both directions
     off, it rests on a corner of the hole and stays upright; going along one axis then brings it to where it tips along
-    the other. With `through` it pushes on past the goal. With `follows` it moves from where the hand is instead of
-    where it sent the hand, and searches on in the direction in which the hand moved last.
+    the other. A bar that goes further down than the mouth of the hole without a touch is in it. With `through` it
+    pushes on past the goal. With `follows` it moves from where the hand is instead of where it sent the hand, and
+    searches on in the direction in which the hand moved last.
     """
 
-    def __init__(self, config: PegConfig, through: bool, follows: bool = False) -> None:
+    def __init__(self, config: PegConfig, height_of_start: float, through: bool, follows: bool = False) -> None:
+        """height_of_start: of the bar's end above the mouth of the hole when an episode begins [m]."""
         assert config.scene.object is not None
+        self._height_of_start = height_of_start
         self._config, self._through, self._follows = config, through, follows
         size = bounding_size(config.scene.object.geometry)
         self._half = size[:2] / 2  # of the bar's end [m]
@@ -66,9 +69,13 @@ class ScriptedPeg:
         step, press, height = self._config.max_step, float(force[2]), float(arm.pose.position[2])
         given_way = press / tuning.GRIP_STIFFNESS
         if self._surface is None:
-            if press < tuning.MIN_PRESS:
+            mouth = float(self._start[2]) - self._height_of_start
+            if press >= tuning.MIN_PRESS:
+                self._surface = height + given_way
+            elif height > mouth - 2.0 * tuning.MIN_HOLE_DEPTH:
                 return np.array([0.0, 0.0, -step])
-            self._surface = height + given_way
+            else:
+                self._surface = mouth
         depth = self._surface - height - given_way
         if depth > tuning.MIN_HOLE_DEPTH:
             self._place = None

@@ -134,6 +134,17 @@ def test_two_holes_are_refused() -> None:
 
 
 @pytest.mark.slow
+def test_the_scripted_policy_stops_in_a_hole_that_is_right_below() -> None:
+    """The bar goes in without a touch: what is met next is not the mouth of the hole."""
+    loaded = load_with_task("hand", "peg", [])
+    assert loaded.config.task is not None
+    made = make_task(loaded.config.task)
+    with open_rig(loaded) as rig:
+        episode = run_episode(rig, made.scripted(), made, 25)
+    assert max(step.distance for step in episode.steps[16:]) <= made.config.success
+
+
+@pytest.mark.slow
 def test_the_scripted_policy_finds_a_hole_that_is_aside_and_turned() -> None:
     """By force and moment alone: the hole is 1.6 mm aside, where a bar that goes straight down rests on the block."""
     hole = "scene.fixtures.hole"

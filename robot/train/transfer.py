@@ -48,7 +48,7 @@ class Study:
     policies: tuple[str, ...]
     twins: Randomisation
     episodes: int  # of each policy on each side
-    episodes_per_twin: int  # a new twin after this number of episodes
+    episodes_per_hidden_rig: int  # a new twin after this number of episodes
     steps: int | None  # of an episode; None: the task's
     overrides: tuple[str, ...]  # of both rigs
 
@@ -106,7 +106,7 @@ def play_study(
     remaining = [each for each in requested if each not in done]
     parts: dict[tuple[Side, int], list[tuple[str, int]]] = {}
     for policy, side, number in sorted(remaining, key=lambda each: SIDES.index(each[1])):
-        parts.setdefault((side, number // study.episodes_per_twin), []).append((policy, number))
+        parts.setdefault((side, number // study.episodes_per_hidden_rig), []).append((policy, number))
     results = _play_in_turn(study, parts) if workers == 1 else _play_in_parallel(study, parts, workers)
     with rows.open("a", encoding="utf-8") as file:
         for each in results:

@@ -47,8 +47,8 @@ TWINS = Randomisation.model_validate({"draws": 8, "values": TWIN})
 
 def study(**changed: Any) -> Study:
     whole: dict[str, Any] = {
-        "task": "squeeze", "policies": ("scripted", "grip"), "twins": TWINS, "episodes": 5, "episodes_per_hidden_rig": 2,
-        "steps": 2, "overrides": (),
+        "task": "squeeze", "policies": ("scripted", "grip"), "twins": TWINS, "episodes": 5,
+        "episodes_per_hidden_rig": 2, "steps": 2, "overrides": (),
     }  # fmt: skip
     return Study(**{**whole, **changed})
 
@@ -108,7 +108,8 @@ def test_the_twin_of_a_hand_is_another_hand(task: str) -> None:
 def test_a_study_of_a_hand_plays_both_sides(tmp_path: Path) -> None:
     values = {"scene.object.mass": {"choice": [0.05]}, "sensors.left.delay": {"choice": [1]}}
     held = study(
-        task="hold", policies=("learned", "scripted"), episodes=1, episodes_per_hidden_rig=1, overrides=("motion=flowing",),
+        task="hold", policies=("learned", "scripted"), episodes=1, episodes_per_hidden_rig=1,
+        overrides=("motion=flowing",),
         twins=Randomisation.model_validate({"draws": 1, "values": values}),
     )  # fmt: skip
     reported: list[str] = []

@@ -100,7 +100,7 @@ def test_worker_without_memory_reports_error() -> None:
 def test_worker_driver_died_during_connect_exits(mock: MockUR) -> None:
     """The first message of the worker is not read: it still ends its program."""
     segment = channel.create_segment(Channel.SIZE)
-    config = worker_config(segment.descriptor, host=HOST, parent=1)  # not this process
+    config = worker_config(segment.descriptor, host=HOST, parent=1, link_timeout=2.0)  # not this process
     reader, writer = os.pipe()
     os.close(reader)
     with subprocess.Popen(

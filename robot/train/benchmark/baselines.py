@@ -38,9 +38,16 @@ class VectorPolicy:
         return self._motion.action(self._vectors(observation), observation)
 
 
+def require_baseline(name: str, task_name: str, task: Task) -> None:
+    """Raises BlindMissing; ValueError for a task without a rule (`analytic`)."""
+    if name == ANALYTIC:
+        task.analytic()
+    elif name == BLIND:
+        load_blind(task_name, task)
+
+
 def load_baseline(name: str, task_name: str, number: int, rig: Rig, task: Task) -> Policy:
-    """A baseline in episode `number` of a task file. Raises BlindMissing; ValueError for a task without a rule
-    (`analytic`)."""
+    """A baseline in episode `number` of a task file. Raises as `require_baseline`."""
     if name == ANALYTIC:
         return task.analytic()
     if name == TEACHER:

@@ -11,7 +11,7 @@ from robot.common import loopback_host
 from robot.deploy.control_loop import EpisodeFailed, EpisodeSetup, run_episode
 from robot.deploy.policy import describe_outside, has_training_range, load_policy, require_fit, training_notes
 from robot.open import load_with_task, open_rig, rig_spec
-from robot.train.benchmark.baselines import load_baseline
+from robot.train.benchmark.baselines import load_baseline, require_baseline
 from robot.train.benchmark.episodes import Split
 from robot.train.benchmark.integrity import is_broken
 from robot.train.benchmark.play import ReportSteps, Warn, score_not_begun
@@ -21,6 +21,7 @@ from tacsim.config import LoadedRig
 from tacsim.control import NoTouch
 from tacsim.geometry.shapes import enclosed_volume
 from tacsim.limits import LimitExceeded
+from tacsim.models.sensor import CanonicalGrid
 from tacsim.record.episode import Step
 from tacsim.rig import Rig
 from tacsim.tasks import GoalOutOfReach, Task, make_task
@@ -68,12 +69,13 @@ class WirePlayer:
 
     def require_policy(self, name: str, warn: Warn) -> None:
         """As `SplitPlayer.require_policy`; opens no device."""
-        if _is_baseline(name):
-            return
         loaded = [self._load(number) for number in self._numbers]
         config = loaded[0].config
         assert config.task is not None
         task, spec = make_task(config.task), rig_spec(config)
+        if _is_baseline(name):
+            require_baseline(name, self._split.file, task)
+            return
         policy = load_policy(name, task, spec, config.canonical, BASELINES)
         require_fit(config.name, spec, policy, name, task)
         for words in training_notes(policy, name, [each.config.scene for each in loaded if each.config.scene]):
@@ -90,7 +92,7 @@ class WirePlayer:
             task = make_task(loaded.config.task)
             rig = self._open_rig(loaded, number)
             try:
-                score = self._play_episode(rig, task, policy, number, report)
+                score = self._play_episode(rig, loaded.config.canonical, task, policy, number, report)
             except BaseException:
                 self._close_rig()
                 raise
@@ -112,12 +114,14 @@ class WirePlayer:
         words = [_mock_override(word) for word in [*self._split.overrides, *self._split.episode_overrides(number)]]
         return load_with_task(MOCK_RIG, self._split.task.task, [*filter(None, words), *_addresses(), *_pictures(words)])
 
-    def _play_episode(self, rig: Rig, task: Task, name: str, number: int, report: ReportSteps) -> EpisodeScore:
+    def _play_episode(
+        self, rig: Rig, canonical: CanonicalGrid, task: Task, name: str, number: int, report: ReportSteps
+    ) -> EpisodeScore:
         if _is_baseline(name):
             policy = load_baseline(name, self._split.file, number, rig, task)
         else:
-            policy = load_policy(name, task, rig.spec, self._split.load_config().canonical, BASELINES)
-        setup = EpisodeSetup(name, self._split.episode_seed(number))
+            policy = load_policy(name, task, rig.spec, canonical, BASELINES)
+        setup = EpisodeSetup(name, self._split.episode_seed(number), canonical=canonical)
         steps: list[Step] = []
 
         def add(step: Step) -> None:

@@ -17,6 +17,7 @@ from robot.train.benchmark.verify import verify_score
 from robot.train.benchmark.wire import WirePlayer
 from tests.robot.cli.invoked import tacsim
 from tests.robot.train.benchmark.small import TASK, write_task
+from tests.tacsim.gym.small import SMALL
 
 # What only a hidden twin has: an elastic mount, an error of an arm, and pictures that are two periods late.
 VALUES = {
@@ -30,14 +31,13 @@ POLICIES = ("teacher", "analytic", "random")
 
 @pytest.fixture(scope="module")
 def task(tmp_path_factory: pytest.TempPathFactory) -> str:
-    return write_task(tmp_path_factory.mktemp("task"), episodes=3, values=VALUES)
+    return write_task(tmp_path_factory.mktemp("task"), episodes=3, values=VALUES, overrides=[*SMALL])
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)  # two rigs, each with processes of its own
 def test_scores_over_the_wire_are_those_of_the_simulation(task: str, tmp_path: Path) -> None:
-    """With the mount, error and delay of each episode. The body differs: the mock's rests after each motion, the
-    simulated one flows."""
+    """With the mount, error and delay of each episode; motions settle on both sides."""
     pytest.importorskip("rtde_control", reason="ur_rtde has no wheel here")
     simulated = run_benchmark(Run(task, POLICIES, ("test",), "quick", tmp_path, first=2))
     wired = run_benchmark(Run(task, POLICIES, ("test",), "quick", tmp_path, rig="mock", first=2))
@@ -46,8 +46,10 @@ def test_scores_over_the_wire_are_those_of_the_simulation(task: str, tmp_path: P
         assert (other.rig, len(other.episodes), other.complete) == ("mock", 2, False)
         for here, there in zip(one.episodes, other.episodes, strict=True):
             assert (here.end, here.steps, here.success) == (there.end, there.steps, there.success)
-            assert here.distance == pytest.approx(there.distance, abs=20e-6)  # of some tenths of a millimetre
-            assert here.peak_force == pytest.approx(there.peak_force, rel=0.1)
+            # `analytic` sees heights that are found in pictures with noise.
+            tolerance = 0.1e-3 if one.policy == "analytic" else 20e-6
+            assert here.distance == pytest.approx(there.distance, abs=tolerance), one.policy
+            assert here.peak_force == pytest.approx(there.peak_force, rel=0.15), one.policy
     with pytest.raises(NotAScore, match="no two runs have the same bits"):
         verify_score(wired[0][0], 1, task=task)
     result = tacsim("benchmark", "rank", tmp_path, "--other-split", "test", "--other-rig", "mock")

@@ -86,7 +86,7 @@ def test_a_batch_of_grips_gives_the_bits_of_cells_apart(mode: str, motion: str) 
             assert_equal(batched.reset(options=mask), apart.reset(options=dict(mask)))
     assert played == set(range(len(variants)))
     assert dropped < ended
-    # In slow motion it depends on the processor's rounding whether an object that slips is lost within an episode.
+    # In flowing motion objects were lost on an AMD EPYC and not on an Intel Xeon.
     assert dropped > 0 or motion == "flowing"
     batched.close()
     apart.close()

@@ -203,7 +203,9 @@ def test_blind_motion_does_not_depend_on_observations() -> None:
         task="x", episodes=8, axes=1, mean=(1.0, 0.0, 0.0, 2.0), deviation=(0.5, 0.0, 0.0, 1.0),
         weights=(((0.1, 0.2, 9.0, 9.0, -0.4),), ((-0.5, 0.0, 9.0, 9.0, 0.0),)),
     )  # fmt: skip
-    arms = {name: SimpleNamespace(pose=Pose(np.array([0.0, 0.0, z]))) for name, z in (("lower", 1.0), ("upper", 3.5))}
-    first, other = (Observation(time=0.0, tactile={}, arms=each) for each in (arms, {}))  # type: ignore[arg-type]
+    arms: Any = {
+        name: SimpleNamespace(pose=Pose(np.array([0.0, 0.0, z]))) for name, z in (("lower", 1.0), ("upper", 3.5))
+    }
+    first, other = (Observation(time=0.0, tactile={}, arms=each) for each in (arms, {}))
     motion = BlindMotion(weights, start_numbers(1.5, first))
     assert [float(motion(other)[0]) for _ in range(3)] == pytest.approx([0.1 + 0.2 * 1.0 - 0.4 * 0.5, -0.5, -0.5])

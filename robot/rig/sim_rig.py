@@ -119,7 +119,7 @@ def simulate(
             name: normaliser_for_simulation(sensor.model, scene.gel_of(name).size[:2], config.canonical)
             for name, sensor in models.items()
         },
-        reset=SimReset(world, clock, sensors, touch_force, placement, pool),
+        reset=SimReset(world, clock, sensors, arms, touch_force, placement, pool),
         truth=None if scene.body is None else world.truth,
         diagnostics=clock.diagnostics,
         read_all=map_parallel if parallel else map_serial,

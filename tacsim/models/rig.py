@@ -50,7 +50,8 @@ class SimArmConfig(ArmConfig):
     # Those of the real arm, so that a policy meets them in simulation too: workspace, planes, speed, turn_rate, force,
     # torque, depth, shear. Accelerations and joints are not simulated; limits are checked once a period.
     limits: ArmLimits | None = None
-    # Measured pose of the sensor, relative to its true one: the error that a calibration leaves.
+    # Measured pose of the sensor, relative to its true one: the error that a calibration leaves. An episode begins
+    # where the arm measures its start; a hand in MuJoCo begins at its true one, around the object.
     error: Placement = Placement()
     noise: WrenchNoise = WrenchNoise()
     mount: MountConfig = MountConfig()  # between arm and sensor

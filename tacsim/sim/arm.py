@@ -91,7 +91,7 @@ class SimArm:
         delay: int = 0,
         noise: WrenchNoiseSource | None = None,
     ) -> None:
-        self._world, self._clock, self._frame = world, clock, frame
+        self._world, self._clock, self.frame = world, clock, frame
         self._max_step, self._max_turn = max_step, max_turn
         self._limits, self._keep_out = limits, tuple(keep_out)
         self._region = None if limits is None else limits.region
@@ -121,7 +121,7 @@ class SimArm:
             wrench = wrench + self._noise(self._clock.periods, self._clock.period, self._clock.episode)
         return ArmState(
             pose=self._measured_pose(),
-            twist=self._clock.velocities.get(self._frame, np.zeros(6)).copy(),
+            twist=self._clock.velocities.get(self.frame, np.zeros(6)).copy(),
             wrench=wrench,
             joints=self._joints(),
             time=self._clock.now(),
@@ -132,21 +132,21 @@ class SimArm:
         return None
 
     def _measured_pose(self) -> Pose:
-        here = self._world.pose(self._frame)
+        here = self._world.pose(self.frame)
         if self._mount is not None:
             here = Pose(self._mount.arm_position(here.position, self._world_force()), here.quaternion)
         return here if self._error is None else se3.compose(here, self._error)
 
     def _world_force(self) -> FloatArray:
         """(3,) on the frame, world axes [N]."""
-        return se3.rotate(self._world.pose(self._frame), self._wrench()[:3])
+        return se3.rotate(self._world.pose(self.frame), self._wrench()[:3])
 
     def _wrench(self) -> FloatArray:
         """(6,) on the sensor; on the indenter, the reaction of all sensors. About its origin, in its axes [N, N m]."""
         world = self._world
-        if self._frame in world.sensors:
-            return np.array(world.wrench(self._frame), dtype=np.float64)
-        here = world.pose(self._frame)
+        if self.frame in world.sensors:
+            return np.array(world.wrench(self.frame), dtype=np.float64)
+        here = world.pose(self.frame)
         parts = [
             se3.transform_wrench(se3.relative_pose(here, world.pose(name)), world.wrench(name))
             for name in world.sensors
@@ -159,24 +159,29 @@ class SimArm:
         self._check_wrench()
         if target is None:
             if self._mount is not None:  # it goes on giving way
-                self._command_frame(self._arm_pose(self._measured_pose()), limited=False)
+                self._command_frame(self.true_pose(self._measured_pose()), limited=False)
             return None
         measured = self._measured_pose()
         allowed, _ = clip_to_region(target, measured, self._region, self._spheres())
         allowed = limit_step(allowed, measured, self._max_step, self._max_turn)
-        self._command_frame(self._arm_pose(allowed), limited=allowed is not target)
+        self._command_frame(self.true_pose(allowed), limited=allowed is not target)
         return allowed
 
-    def _arm_pose(self, measured: Pose) -> Pose:
+    @property
+    def has_error(self) -> bool:
+        """Its measured pose differs from the true one."""
+        return self._error is not None
+
+    def true_pose(self, measured: Pose) -> Pose:
         """Where the arm holds the frame if it measures this pose."""
         return measured if self._error is None else se3.compose(measured, se3.inverse(self._error))
 
     def _command_frame(self, arm: Pose, limited: bool) -> None:
         """Moves the frame to where it is once the arm holds it at `arm`."""
         if self._mount is not None:
-            here = self._world.pose(self._frame).position
+            here = self._world.pose(self.frame).position
             arm = Pose(self._mount.move_arm(arm.position, here, self._world_force()), arm.quaternion)
-        self._clock.command(self._frame, arm, limited=limited)
+        self._clock.command(self.frame, arm, limited=limited)
 
     def stop(self) -> None:
         self._clock.drop_commands()
@@ -203,7 +208,7 @@ class SimArm:
             self.stop()
             force, torque = np.linalg.norm(wrench.reshape(2, 3), axis=1)
             raise LimitExceeded(
-                f"arm of '{self._frame}' felt more than limits.force or limits.torque and stopped ({force:.1f} of "
+                f"arm of '{self.frame}' felt more than limits.force or limits.torque and stopped ({force:.1f} of "
                 f"{limits.force:g} N, {torque:.2f} of {limits.torque:g} N m); begin a new episode, or move the other "
                 "sensor away"
             )

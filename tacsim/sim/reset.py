@@ -12,6 +12,7 @@ from tacsim.control import NoTouch
 from tacsim.interface import Pose, TactileFrame, Truth
 from tacsim.physics.move import MoveStats
 from tacsim.physics.world import World
+from tacsim.sim.arm import SimArm
 from tacsim.sim.clock import SimClock
 from tacsim.sim.scene_world import SceneWorld, StatePool
 from tacsim.sim.sensor import SimSensor
@@ -19,10 +20,11 @@ from tacsim.sim.tuning import APPROACH_GAP, FIRST_TOUCH_STEP, MAX_STEP, TOUCH_TO
 
 
 class SimReset:
-    """Starts a simulated episode: the world as it was made, then an approach until gentle contact. An approach that was
-    made before, in the same scene and from the same place, is not made again.
+    """Starts a simulated episode: the world as it was made, with each arm where it measures its start, then an approach
+    until gentle contact. An approach that was made before, in the same scene from the same poses, is not made again.
 
     Args:
+        arms: of the rig. As on a robot, an arm with an error of its pose measures that it is at its start, and is not.
         touch_force: normal force that ends the approach [N]; None leaves the gels clear.
         placement: the gels start at most this far from the body in world x and y, drawn from the seed [m].
         pool: of touched states; of this reset alone, or of several.
@@ -33,37 +35,45 @@ class SimReset:
         scene_world: SceneWorld,
         clock: SimClock,
         sensors: Mapping[str, SimSensor],
+        arms: Mapping[str, SimArm],
         touch_force: float | None,
         placement: float = 0.0,
         pool: StatePool | None = None,
     ) -> None:
-        self._scene_world, self._clock, self._sensors = scene_world, clock, sensors
+        self._scene_world, self._clock, self._sensors, self._arms = scene_world, clock, sensors, arms
         self._touch_force, self._placement = touch_force, placement
         self._pool = StatePool() if pool is None else pool
-        self._offset = np.zeros(2)
+        self._starts: dict[str, Pose] = {}  # of frames that do not begin where the scene has them
 
     def clear(self, seed: int) -> Mapping[str, TactileFrame]:
         scene_world = self._scene_world
         scene_world.rewind()
-        self._offset = self._placement * np.random.default_rng(seed).uniform(-1.0, 1.0, size=2)
-        if self._offset.any():
-            shift = np.append(self._offset, 0.0)
-            poses = {name: scene_world.pose(name) for name in scene_world.sensors}
-            scene_world.place({name: Pose(pose.position + shift, pose.quaternion) for name, pose in poses.items()})
+        self._starts = self._find_starts(seed)
+        if self._starts:
+            scene_world.place(self._starts)
         self._clock.restart(episode=seed)
         for sensor in self._sensors.values():
             sensor.restart(seed)
         return {name: sensor.read(0.0) for name, sensor in self._sensors.items()}
 
+    def _find_starts(self, seed: int) -> dict[str, Pose]:
+        """By frame, of those that do not begin where the scene has them."""
+        world, starts = self._scene_world, dict[str, Pose]()
+        offset = self._placement * np.random.default_rng(seed).uniform(-1.0, 1.0, size=2)
+        if offset.any():
+            poses = {name: world.pose(name) for name in world.sensors}
+            starts = {name: Pose(pose.position + [*offset, 0.0], pose.quaternion) for name, pose in poses.items()}
+        for arm in self._arms.values():
+            if arm.has_error:
+                starts[arm.frame] = arm.true_pose(starts.get(arm.frame) or world.pose(arm.frame))
+        return starts
+
     def touch(self) -> None:
         """Raises NoTouch when no gentle contact is found."""
         if self._touch_force is None:
             return
-        start = (
-            self._scene_world.scene.model_dump_json(),
-            *self._offset.tolist(),
-            self._touch_force,
-        )  # numbers: -0.0 is 0.0
+        poses = [(name, *pose.position.tolist(), *pose.quaternion.tolist()) for name, pose in self._starts.items()]
+        start = (self._scene_world.scene.model_dump_json(), *poses, self._touch_force)  # numbers: -0.0 is 0.0
         touched = self._pool.find(start)
         if touched is None:
             stats = approach_force(self._scene_world, self._touch_force)

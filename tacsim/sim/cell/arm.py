@@ -14,4 +14,4 @@ class CellArm(SimArm):
     gripper."""
 
     def _joints(self) -> FloatArray | None:
-        return cast(SceneCell, self._world).cell.arms[self._frame].joints
+        return cast(SceneCell, self._world).cell.arms[self.frame].joints

@@ -198,9 +198,22 @@ def test_placement_follows_the_seed(open_springs: Any) -> None:
     assert np.array_equal(upper, places[0])
 
 
+def test_an_arm_with_an_error_measures_its_start_and_is_not_there(open_springs: Any) -> None:
+    """As on a robot; the next episode begins at the same place."""
+    nominal = open_springs("squeeze").reset(0).arms["lower"].pose.position[:2]
+    rig = open_springs("squeeze", "arms.lower.error.position=[0.6 mm, 0.3 mm, 0]")
+    for seed in (0, 1):
+        assert rig.reset(seed).arms["lower"].pose.position[:2] == pytest.approx(nominal, abs=1e-12)
+        assert rig.world.pose("lower").position[:2] == pytest.approx(nominal - [0.6e-3, 0.3e-3], abs=1e-12)
+    placed = open_springs("squeeze", "task.placement=1 mm").reset(1).arms["lower"].pose.position
+    error = "arms.lower.error.position=[0.6 mm, 0.3 mm, 0]"
+    found = open_springs("squeeze", "task.placement=1 mm", error).reset(1).arms["lower"].pose.position
+    assert found == pytest.approx(placed, abs=1e-9)
+
+
 def test_without_touch_force_the_gels_stay_clear(spring_world: Any) -> None:
     clock = SimClock(spring_world, 0.1)
-    SimReset(SceneWorld(spring_world.scene, lambda scene: spring_world), clock, {}, None).touch()
+    SimReset(SceneWorld(spring_world.scene, lambda scene: spring_world), clock, {}, {}, None).touch()
     assert spring_world.moves == []
 
 

@@ -134,7 +134,7 @@ def simulate_cell(
             name: _make_normaliser(name, sensor, scene.gel_of(name).size[:2], config.canonical)
             for name, sensor in models.items()
         },
-        reset=CellReset(scene_cell, clock, sensors, arm_of_gripper, touch_force, placement, pool, motion),
+        reset=CellReset(scene_cell, clock, sensors, arms, arm_of_gripper, touch_force, placement, pool, motion),
         truth=partial(_truth, scene_cell, frames),
         diagnostics=clock.diagnostics,
         read_all=map_parallel if parallel else map_serial,

@@ -51,7 +51,7 @@ class SimArmConfig(ArmConfig):
     # torque, depth, shear. Accelerations and joints are not simulated; limits are checked once a period.
     limits: ArmLimits | None = None
     # Measured pose of the sensor, relative to its true one: the error that a calibration leaves. An episode begins
-    # where the arm measures its start; a hand in MuJoCo begins at its true one, around the object.
+    # where the arm measures its start.
     error: Placement = Placement()
     noise: WrenchNoise = WrenchNoise()
     mount: MountConfig = MountConfig()  # between arm and sensor

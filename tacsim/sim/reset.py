@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 
 import numpy as np
 
 from tacsim import pose as se3
 from tacsim.control import NoTouch
 from tacsim.interface import Pose, TactileFrame, Truth
+from tacsim.models.scene import Scene
 from tacsim.physics.move import MoveStats
 from tacsim.physics.world import World
 from tacsim.sim.arm import SimArm
@@ -48,7 +49,8 @@ class SimReset:
     def clear(self, seed: int) -> Mapping[str, TactileFrame]:
         scene_world = self._scene_world
         scene_world.rewind()
-        self._starts = self._find_starts(seed)
+        arms, sensors = self._arms.values(), scene_world.sensors
+        self._starts = find_starts(scene_world.pose, arms, sensors, self._placement, seed)
         if self._starts:
             scene_world.place(self._starts)
         self._clock.restart(episode=seed)
@@ -56,24 +58,11 @@ class SimReset:
             sensor.restart(seed)
         return {name: sensor.read(0.0) for name, sensor in self._sensors.items()}
 
-    def _find_starts(self, seed: int) -> dict[str, Pose]:
-        """By frame, of those that do not begin where the scene has them."""
-        world, starts = self._scene_world, dict[str, Pose]()
-        offset = self._placement * np.random.default_rng(seed).uniform(-1.0, 1.0, size=2)
-        if offset.any():
-            poses = {name: world.pose(name) for name in world.sensors}
-            starts = {name: Pose(pose.position + [*offset, 0.0], pose.quaternion) for name, pose in poses.items()}
-        for arm in self._arms.values():
-            if arm.has_error:
-                starts[arm.frame] = arm.true_pose(starts.get(arm.frame) or world.pose(arm.frame))
-        return starts
-
     def touch(self) -> None:
         """Raises NoTouch when no gentle contact is found."""
         if self._touch_force is None:
             return
-        poses = [(name, *pose.position.tolist(), *pose.quaternion.tolist()) for name, pose in self._starts.items()]
-        start = (self._scene_world.scene.model_dump_json(), *poses, self._touch_force)  # numbers: -0.0 is 0.0
+        start = start_key(self._scene_world.scene, self._starts, self._touch_force)
         touched = self._pool.find(start)
         if touched is None:
             stats = approach_force(self._scene_world, self._touch_force)
@@ -82,6 +71,27 @@ class SimReset:
             self._scene_world.restore(touched[0])
             stats = touched[1]
         self._clock.restart(stats)
+
+
+def find_starts(
+    pose: Callable[[str], Pose], arms: Iterable[SimArm], shifted: Collection[str], placement: float, seed: int
+) -> dict[str, Pose]:
+    """By frame, of those that do not begin at `pose(frame)`, where the scene has them: frames in `shifted` by at most
+    `placement` [m] along world x and y, drawn from the seed, and those of arms with an error."""
+    offset = placement * np.random.default_rng(seed).uniform(-1.0, 1.0, size=2)
+    starts: dict[str, Pose] = {}
+    if offset.any():
+        starts = {name: Pose(pose(name).position + [*offset, 0.0], pose(name).quaternion) for name in shifted}
+    for arm in arms:
+        if arm.has_error:
+            starts[arm.frame] = arm.true_pose(starts.get(arm.frame) or pose(arm.frame))
+    return starts
+
+
+def start_key(scene: Scene, starts: Mapping[str, Pose], touch_force: float) -> tuple[object, ...]:
+    """Equal for episodes that begin alike."""
+    poses = [(name, *pose.position.tolist(), *pose.quaternion.tolist()) for name, pose in starts.items()]
+    return scene.model_dump_json(), *poses, touch_force  # numbers: -0.0 is 0.0
 
 
 def approach_force(world: World, touch_force: float) -> MoveStats | None:

@@ -4,27 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-import numpy as np
-
 from tacsim import pose as se3
 from tacsim.control import NoTouch
 from tacsim.geometry.shapes import rotated_bounding_size
 from tacsim.interface import Pose, TactileFrame
 from tacsim.limits import LimitExceeded
+from tacsim.sim.arm import SimArm
 from tacsim.sim.cell import tuning
 from tacsim.sim.cell.cell import Cell
 from tacsim.sim.cell.clock import CellClock
 from tacsim.sim.cell.motion import CellMotion, DynamicMotion
 from tacsim.sim.cell.scene_cell import SceneCell
+from tacsim.sim.reset import find_starts, start_key
 from tacsim.sim.scene_world import StatePool
 from tacsim.sim.sensor import SimSensor
 
 
 class CellReset:
-    """Starts an episode in a cell. A grip that was made before, in the same scene and from the same place, is not made
-    again.
+    """Starts an episode in a cell, with each hand where it measures its start. A grip that was made before, in the same
+    scene and from the same pose, is not made again.
 
     Args:
+        arms: of the rig. As on a robot, an arm with an error of its pose measures that it is at its start, and is not.
         touch_force: with which grippers grip the object [N]; None leaves them open.
         placement: grippers start at most this far from the object along world x and y, drawn from the seed [m].
         arm_of_gripper: of the grippers that begin around the object, by name; others stay where they are, open.
@@ -33,22 +34,27 @@ class CellReset:
 
     def __init__(
         self, scene_cell: SceneCell, clock: CellClock, sensors: Mapping[str, SimSensor],
-        arm_of_gripper: Mapping[str, str], touch_force: float | None, placement: float = 0.0,
-        pool: StatePool | None = None, motion: CellMotion | None = None,
+        arms: Mapping[str, SimArm], arm_of_gripper: Mapping[str, str], touch_force: float | None,
+        placement: float = 0.0, pool: StatePool | None = None, motion: CellMotion | None = None,
     ) -> None:  # fmt: skip
         self._scene_cell, self._clock, self._sensors = scene_cell, clock, sensors
-        self._arm_of_gripper = dict(arm_of_gripper)
+        self._arms, self._arm_of_gripper = arms, dict(arm_of_gripper)
         self._touch_force, self._placement = touch_force, placement
         self._pool = StatePool() if pool is None else pool
         self._motion = DynamicMotion() if motion is None else motion
-        self._offset = np.zeros(2)
+        self._starts: dict[str, Pose] = {}  # of arms that do not begin where the scene has them
 
     def clear(self, seed: int) -> Mapping[str, TactileFrame]:
         """Raises ValueError for an object that is wider than a gripper opens."""
         self._scene_cell.rewind()
-        self._offset = self._placement * np.random.default_rng(seed).uniform(-1.0, 1.0, size=2)
-        for gripper, arm in self._arm_of_gripper.items():
-            open_around(self._scene_cell.cell, gripper, arm, self._offset)
+        cell = self._scene_cell.cell
+        before = {name: cell.pose(name) for name in self._arms}
+        around = self._arm_of_gripper.values()
+        self._starts = find_starts(cell.pose, self._arms.values(), around, self._placement, seed)
+        for name, start in self._starts.items():
+            cell.place(name, start)
+        for gripper, name in self._arm_of_gripper.items():
+            open_around(cell, gripper, name, before[name])
         self._clock.restart(episode=seed)
         for sensor in self._sensors.values():
             sensor.restart(seed)
@@ -58,7 +64,7 @@ class CellReset:
         """Raises NoTouch where no grip is found that holds the object, ObjectDropped for one that slips."""
         if self._touch_force is None or not self._arm_of_gripper:
             return
-        start = self._scene_cell.scene.model_dump_json(), *self._offset.tolist(), self._touch_force
+        start = start_key(self._scene_cell.scene, self._starts, self._touch_force)
         touched = self._pool.find(start)
         if touched is None:
             try:
@@ -71,15 +77,12 @@ class CellReset:
         self._clock.restart()
 
 
-def open_around(cell: Cell, gripper: str, arm: str, offset: np.ndarray) -> None:
-    """Moves a gripper sideways from where it grips, by `offset` (2,) [m], open by a gap. Raises ValueError for an
-    object that is too wide for it."""
-    start = cell.pose(arm)
-    if offset.any():
-        cell.place(arm, Pose(start.position + [*offset, 0.0], start.quaternion))
-    here = cell.object_pose()
-    turn = se3.relative_pose(cell.pose(arm), here).quaternion
-    along = se3.rotation_matrix(start)[:2, 0] @ offset
+def open_around(cell: Cell, gripper: str, arm: str, before: Pose) -> None:
+    """Opens a gripper by a gap on both sides of the object, wherever it has moved from `before`, where the object is in
+    its middle. Raises ValueError for an object that is too wide for it."""
+    here = cell.pose(arm)
+    turn = se3.relative_pose(here, cell.object_pose()).quaternion
+    along = float(se3.relative_position(before, here)[0])
     size = float(rotated_bounding_size(cell.item.geometry, turn)[0])
     width, drive = size + 2 * (tuning.OPEN_GAP + abs(along)), cell.grippers[gripper]
     if width > drive.max_width:
